@@ -9,9 +9,11 @@ from sfm_app.atomic_io import is_made_from, replace_atomically
 from sfm_app.colmap.dense import map_file, read_color, read_depth, read_views
 from sfm_app.colmap.surface import FUSED, fuse, poisson_surface, read_fused, simplify
 from sfm_app.errors import ReconstructionError
+from sfm_app.geometry.culling import cluster
 from sfm_app.geometry.triangles import median_edge_length, vertex_normals
 from sfm_app.hashing import digest_files, load_arrays
 from sfm_app.meshing import (
+    NO_EVIDENCE,
     DepthView,
     Paint,
     Support,
@@ -134,18 +136,23 @@ def color_and_confirm(surface: Surface, dense_dir: Path, views: list[View], run:
         run: the run.
     """
     normals = vertex_normals(surface.vertices, surface.faces)
+    clusters = cluster(surface.vertices[:, None, :])
     tolerance = run.settings.depth.consistency
 
-    def judge_view(view: View) -> tuple[NDArray[np.uint8], Paint]:
+    def judge_view(view: View) -> tuple[NDArray[np.int64], NDArray[np.uint8], Paint]:
         eye = DepthView(view.K, view.R, view.t, read_depth(dense_dir, view, "geometric"), view.sample_px)
-        verdict = judge(surface.vertices, normals, eye, tolerance)
-        return verdict, sample_colors(surface.vertices, normals, verdict, eye, read_color(dense_dir, view))
+        near = clusters.in_cone(eye.center, eye.axis, eye.widest_angle)
+        points, ways = surface.vertices[near], normals[near]
+        verdict = judge(points, ways, eye, tolerance)
+        paint = sample_colors(points, ways, verdict, eye, read_color(dense_dir, view))
+        said = verdict != NO_EVIDENCE
+        return near[said], verdict[said], Paint(paint.total[said], paint.weight[said])
 
     support, paint = Support.zeros(len(normals)), Paint.zeros(len(normals))
     found = ordered_map(run.executor, judge_view, views, ahead=run.workers)
-    for verdict, colors in track(run.progress, found, "confirming the surface", len(views)):
-        support.add(verdict)
-        paint.add(colors)
+    for at, verdict, colors in track(run.progress, found, "confirming the surface", len(views)):
+        support.add(at, verdict)
+        paint.add(at, colors)
     return Surface(surface.vertices, surface.faces, paint.mean_colors(surface.colors)), support
 
 

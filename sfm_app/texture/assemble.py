@@ -1,17 +1,19 @@
 """From a surface and photos to a textured surface: the steps of texturing in order."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.culling import morton_order
 from sfm_app.geometry.triangles import select_faces
 from sfm_app.settings import TextureSettings
 from sfm_app.texture.appearance.exposure import photo_gains
 from sfm_app.texture.appearance.photo_consistency import outlier_mask
+from sfm_app.texture.appearance.sightings import Sightings, list_sightings
 from sfm_app.texture.appearance.view_scoring import FaceView, OcclusionTest, score_faces, sharpness_factors
 from sfm_app.texture.atlas import Pages
 from sfm_app.texture.blending import Blend, blend_weights
@@ -21,7 +23,7 @@ from sfm_app.texture.packing import Layout, pack
 from sfm_app.texture.painting import Canvas, canvas, fill_background, finish_page, paint
 from sfm_app.texture.seam_leveling import level_seams
 from sfm_app.texture.store import Store
-from sfm_app.texture.unseen_faces import block_sizes, morton_order, square_texels, squares, vertex_colors
+from sfm_app.texture.unseen_faces import block_sizes, square_texels, squares, vertex_colors
 from sfm_app.texture.view_selection import choose_photos
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import Model, Rejected, Surface, Texture
@@ -32,37 +34,15 @@ ParallelMap = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FaceViews:
-    """The views of all triangles in all photos."""
-
-    worth: NDArray[np.float32]
-    """(P, T) pixels times cosine; 0 where a photo does not see a triangle."""
-    colors: NDArray[np.uint8]
-    """(P, T, 3)"""
-    sharpness: FloatArray
-    """(P,) from `FaceView`; 0 for photos that cannot be read."""
-    rejected: Sequence[Rejected | None]
-    """(P,) reason why a photo cannot be read, or None."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class CheckedViews:
-    """The views of all triangles, weighted by sharpness, with gains and outliers."""
+    """The views of triangles, weighted by sharpness, with gains and outliers."""
 
-    worth: NDArray[np.float32]
-    """(P, T) pixels times cosine times sharpness factor; 0 where a photo does not see a triangle, negative for
-    outliers, which show something other than the surface."""
-    colors: NDArray[np.uint8]
-    """(P, T, 3)"""
+    all: Sightings
+    """Negative worth for outliers, which show something other than the surface."""
     gains: FloatArray
     """(P, 3)"""
     outliers: int
     """Number of outliers: views of triangles that show something other than the surface."""
-
-    @property
-    def usable(self) -> NDArray[np.bool_]:
-        """(P, T) whether a photo sees a triangle and shows the surface there."""
-        return np.asarray(self.worth > 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,13 +90,11 @@ def texture_surface(
     mesh = facets(surface)
     looks = _score_photos(views, mesh, store, hidden, spread)
     seen = _check_views(looks, mesh)
-    chosen = absorb_small_charts(choose_photos(seen.worth, mesh), seen.usable, mesh.neighbors)
+    chosen = absorb_small_charts(choose_photos(seen.all, mesh), seen.all, mesh.neighbors)
     unseen = chosen == NONE
     if options.unseen_faces == "cut" and not unseen.all():
         mesh = facets(select_faces(surface, ~unseen))
-        kept = ~unseen
-        seen = CheckedViews(seen.worth[:, kept], seen.colors[:, kept], seen.gains, seen.outliers)
-        chosen = chosen[kept]
+        seen, chosen = replace(seen, all=seen.all.among(~unseen)), chosen[~unseen]
     plan = _plan(mesh, seen, chosen, views, options)
     canvases = [
         canvas(size, np.flatnonzero((plan.page == page) & (chosen != NONE)), plan.corners)
@@ -124,52 +102,46 @@ def texture_surface(
     ]
     pages = Pages(canvases, len(views), store)
     work = partial(_paint_photo, plan=plan, views=views, store=store, pages=pages)
-    spread(work, [photo for photo, reason in enumerate(looks.rejected) if reason is None], "painting")
-    return _finish(plan, canvases), _figures(plan, views, looks.rejected, int(unseen.sum()))
+    rejected = [look if isinstance(look, Rejected) else None for look in looks]
+    spread(work, [photo for photo, reason in enumerate(rejected) if reason is None], "painting")
+    return _finish(plan, canvases), _figures(plan, views, rejected, int(unseen.sum()))
 
 
 def _score_photos(
     views: Sequence[PhotoView], mesh: Facets, store: Store, hidden: OcclusionTest, spread: ParallelMap
-) -> FaceViews:
-    shape = (len(views), len(mesh.faces))
-    worth, colors = np.zeros(shape, np.float32), np.zeros((*shape, 3), np.uint8)
-    sharpness = np.zeros(len(views))
+) -> list[FaceView | Rejected]:
+    def score(photo: int) -> FaceView | Rejected:
+        return _score_photo(f"look{photo}", views[photo], mesh, store, hidden)
 
-    def score(photo: int) -> Rejected | None:
-        found = _score_photo(f"look{photo}", views[photo], mesh, store, hidden)
-        if isinstance(found, Rejected):
-            return found
-        worth[photo], colors[photo], sharpness[photo] = found.worth, found.color, found.sharpness
-        return None
-
-    rejected = spread(score, range(len(views)), "looking at the surface")
-    return FaceViews(worth, colors, sharpness, rejected)
+    return spread(score, range(len(views)), "looking at the surface")
 
 
 def _score_photo(name: str, view: PhotoView, mesh: Facets, store: Store, hidden: OcclusionTest) -> FaceView | Rejected:
     kept = store.recall(name)
     if kept is not None:
-        return FaceView(kept["worth"], kept["color"], float(kept["sharpness"]))
+        return FaceView(kept["face"], kept["worth"], kept["color"], float(kept["sharpness"]))
     try:
         photo, used = store.photo(view), store.usable_pixels(view)
     except OSError as err:
         return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
     found = score_faces(view, photo, used, mesh, hidden)
-    store.keep(name, {"worth": found.worth, "color": found.color, "sharpness": np.array(found.sharpness)})
+    arrays = {"face": found.face, "worth": found.worth, "color": found.color}
+    store.keep(name, arrays | {"sharpness": np.array(found.sharpness)})
     return found
 
 
-def _check_views(looks: FaceViews, mesh: Facets) -> CheckedViews:
-    """Adjust the worths by sharpness, in place, estimate gains, and mark outliers by negative worths."""
-    worth, colors = looks.worth, looks.colors
-    read = looks.sharpness > 0
+def _check_views(looks: Sequence[FaceView | Rejected], mesh: Facets) -> CheckedViews:
+    """Adjust the worths by sharpness, estimate gains, and mark outliers by negative worths."""
+    found = [None if isinstance(look, Rejected) else look for look in looks]
+    sharpness = np.array([0.0 if look is None else look.sharpness for look in found])
+    read = sharpness > 0
     sharp = np.zeros(len(read))
-    sharp[read] = sharpness_factors(looks.sharpness[read])
-    worth *= sharp[:, None].astype(np.float32)
-    gains = photo_gains(colors, worth > 0)
-    strange = outlier_mask(colors, gains, worth > 0, mesh.neighbors)
-    worth[strange] *= -1.0
-    return CheckedViews(worth, colors, gains, int(strange.sum()))
+    sharp[read] = sharpness_factors(sharpness[read])
+    seen = list_sightings([look if use else None for look, use in zip(found, read, strict=True)], len(mesh.faces))
+    seen = seen.with_worth(seen.worth * sharp[seen.photo].astype(np.float32))
+    gains = photo_gains(seen)
+    strange = outlier_mask(seen, gains, mesh.neighbors)
+    return CheckedViews(seen.with_worth(np.where(strange, -seen.worth, seen.worth)), gains, int(strange.sum()))
 
 
 def _plan(
@@ -185,8 +157,8 @@ def _plan(
     cells = np.empty((int((~drawn).sum()), 3), np.int64)
     cells[morton_order(mesh.vertices[mesh.faces[~drawn]].mean(axis=1))] = squares(places, blocks, len(cells))
     page[~drawn] = cells[:, 0]
-    blend = level_seams(blend_weights(chosen, seen.usable, mesh), seen.colors, seen.gains, seen.usable, mesh)
-    allowed = _allowed_weight(blend, seen.usable, chosen, mesh)
+    blend = level_seams(blend_weights(chosen, seen.all, mesh), seen.all, seen.gains, mesh)
+    allowed = _allowed_weight(blend, seen.all, chosen, mesh)
     return TexturePlan(mesh, seen, chosen, charts, layout, corners, page, cells, blend, allowed)
 
 
@@ -198,7 +170,7 @@ def _paint_photo(photo: int, plan: TexturePlan, views: Sequence[PhotoView], stor
     if not len(triangles):
         return
     beside = plan.mesh.neighbors[triangles]
-    rims = (beside == NONE) | (plan.seen.worth[photo, beside] == 0)
+    rims = (beside == NONE) | (plan.seen.all.find(np.int64(photo), beside) == NONE)
     view, scale = views[photo], plan.layout.scale
     if scale < 1.0:
         view = view.with_size(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
@@ -216,23 +188,26 @@ def _shares(photo: int, plan: TexturePlan) -> tuple[NDArray[np.int64], NDArray[n
     weight = np.zeros(len(mesh.vertices), np.float32)
     offset = np.zeros((len(mesh.vertices), 3), np.float32)
     weight[plan.blend.vertex[part]], offset[plan.blend.vertex[part]] = plan.blend.weight[part], plan.blend.offset[part]
-    own = plan.chosen == photo
-    allowed = ((plan.seen.worth[photo] > 0) | own) & (plan.chosen != NONE)
-    shares = np.where(allowed[:, None], weight[mesh.faces], 0.0)
+    near = np.union1d(np.flatnonzero(plan.chosen == photo), mesh.faces_at(plan.blend.vertex[part]))
+    own = plan.chosen[near] == photo
+    allowed = (plan.seen.all.is_usable(np.int64(photo), near) | own) & (plan.chosen[near] != NONE)
+    shares = np.where(allowed[:, None], weight[mesh.faces[near]], 0.0)
+    whole = plan.allowed_weight[near]
     with np.errstate(invalid="ignore", divide="ignore"):
-        shares = np.where(plan.allowed_weight > 0, shares / plan.allowed_weight, own[:, None]).astype(np.float32)
-    triangles = np.flatnonzero((shares > 0).any(axis=1))
-    return triangles, np.concatenate([shares[triangles][:, :, None], offset[mesh.faces[triangles]]], axis=2)
+        shares = np.where(whole > 0, shares / whole, own[:, None]).astype(np.float32)
+    some = (shares > 0).any(axis=1)
+    return near[some], np.concatenate([shares[some][:, :, None], offset[mesh.faces[near[some]]]], axis=2)
 
 
-def _allowed_weight(blend: Blend, usable: NDArray[np.bool_], chosen: IntArray, mesh: Facets) -> NDArray[np.float32]:
+def _allowed_weight(blend: Blend, seen: Sightings, chosen: IntArray, mesh: Facets) -> NDArray[np.float32]:
     total = np.zeros(mesh.faces.shape, np.float32)
     weight = np.zeros(len(mesh.vertices), np.float32)
-    for photo in range(len(usable)):
+    for photo in range(seen.photos):
         part = blend.photo_rows(photo)
+        near = mesh.faces_at(blend.vertex[part])
+        near = near[seen.is_usable(np.int64(photo), near) | (chosen[near] == photo)]
         weight[blend.vertex[part]] = blend.weight[part]
-        allowed = usable[photo] | (chosen == photo)
-        total += np.where(allowed[:, None], weight[mesh.faces], 0.0)
+        total[near] += weight[mesh.faces[near]]
         weight[blend.vertex[part]] = 0.0
     return total
 

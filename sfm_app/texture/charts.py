@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
+from sfm_app.texture.appearance.sightings import Sightings
 from sfm_app.texture.facets import NONE, Facets, IntArray
 from sfm_app.texture.views import project
 
 FloatArray = NDArray[np.float64]
+Views = tuple[NDArray[np.int64], NDArray[np.int64], IntArray, NDArray[np.float32]]
+"""The views by triangle, for kernels: starts, rows, photo and worth of each row."""
 
 MOST_LAYERS = 4
 """Layers of overlapping triangles that are separated; further ones share their pixels."""
@@ -118,21 +121,22 @@ def components(group: NDArray[np.int64], neighbors: IntArray) -> tuple[IntArray,
     return of, _flood(group, neighbors, of)
 
 
-def absorb_small_charts(chosen: IntArray, usable: NDArray[np.bool_], neighbors: IntArray) -> IntArray:
+def absorb_small_charts(chosen: IntArray, seen: Sightings, neighbors: IntArray) -> IntArray:
     """Give small charts the photo of a neighboring chart that may be used for all their triangles.
 
     Args:
         chosen: (T,) photo of each triangle, -1 for none.
-        usable: (P, T) whether a photo may be used for a triangle.
+        seen: which photos see which triangles; not used where the worth is negative.
         neighbors: (T, 3) triangle across each edge, -1 for none.
     """
     chosen = chosen.copy()
+    views = seen.face_starts, seen.face_rows, seen.photo, seen.worth
     for _ in range(ROUNDS):
         of, count = components(chosen.astype(np.int64), neighbors)
         sizes = np.bincount(of[of != NONE], minlength=count)
         order = np.argsort(of, kind="stable").astype(np.int32)
         starts = np.concatenate([[0], np.cumsum(sizes)]) + int(np.count_nonzero(of == NONE))
-        if not _absorb(sizes, starts, order, usable, neighbors, chosen):
+        if not _absorb(sizes, starts, order, views, neighbors, chosen):
             break
     return chosen
 
@@ -177,34 +181,48 @@ def _absorb(
     sizes: NDArray[np.int64],
     starts: NDArray[np.int64],
     order: IntArray,
-    usable: NDArray[np.bool_],
+    views: Views,
     neighbors: IntArray,
     chosen: IntArray,
 ) -> int:
     """Give small components the neighboring photo with the longest common border; return how many changed."""
     absorbed = 0
-    border = np.zeros(len(usable), np.int64)
+    around = np.empty(3 * SMALL, np.int64)
     for c in range(len(sizes)):
         if sizes[c] >= SMALL:
             continue
-        border[:] = 0
+        count = 0
         own = chosen[order[starts[c]]]
         for at in range(starts[c], starts[c + 1]):
             for k in range(3):
                 g = neighbors[order[at], k]
                 if g != NONE and chosen[g] != NONE and chosen[g] != own:
-                    border[chosen[g]] += 1
-        best = NONE
-        for p in range(len(usable)):
-            if border[p] == 0 or (best != NONE and border[p] <= border[best]):
+                    around[count] = chosen[g]
+                    count += 1
+        best, longest = NONE, 0
+        for k in range(count):
+            p, border = around[k], 0
+            for j in range(count):
+                border += around[j] == p
+            if border < longest or (border == longest and p >= best):
                 continue
             possible = True
             for at in range(starts[c], starts[c + 1]):
-                possible = possible and usable[p, order[at]]
+                possible = possible and _is_usable(views, p, order[at])
             if possible:
-                best = p
+                best, longest = p, border
         if best != NONE:
             for at in range(starts[c], starts[c + 1]):
                 chosen[order[at]] = best
             absorbed += 1
     return absorbed
+
+
+@kernel
+def _is_usable(views: Views, photo: int, face: int) -> bool:
+    """Return whether a photo sees a triangle and shows the surface there."""
+    starts, rows, photos, worth = views
+    for row in rows[starts[face] : starts[face + 1]]:
+        if photos[row] == photo:
+            return bool(worth[row] > 0)
+    return False
