@@ -167,7 +167,12 @@ class MeshSettings(Section):
     max_error_edges: float = Field(
         0.15, ge=0, le=10, description="most that simplification may move the surface, in edges of Poisson's triangles"
     )
-    faces: int = Field(200_000, ge=100, le=50_000_000, description="most triangles of the finished mesh")
+    faces: int = Field(
+        200_000, ge=100, le=50_000_000, description="most triangles of the finished mesh, or of each of its blocks"
+    )
+    block_points: int = Field(
+        12_000_000, ge=1000, le=1_000_000_000, description="more points of depth maps than these are meshed in blocks"
+    )
 
 
 class TextureSettings(Section):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sfm_app.retrieval.choice import expected_pairs
-from sfm_app.settings import Settings
+from sfm_app.settings import MeshSettings, Settings
 from sfm_app.types import Photo
 
 MEGA = 1e6
@@ -20,6 +20,8 @@ SHARE_OF_MACHINE = 0.8
 FEATURES_PER_MP = 4500
 """Photos with little texture have fewer."""
 
+BLOCK_MB_PER_POINT = 300 / MEGA
+"""Memory of Poisson's reconstruction and of the surface that it gives, for each point."""
 SERIAL_STAGES = ("scene", "mesh")
 """Stages in which more workers are of little use."""
 
@@ -67,6 +69,17 @@ def cache_gb(limit_mb: float) -> float:
     200 photos were not done after half an hour with 2 GB.
     """
     return min(64.0, max(0.25, (limit_mb - 1500) / 1000))
+
+
+def block_workers(workers: int, limit_mb: float, options: MeshSettings) -> int:
+    """Return how many blocks of the surface are made at once.
+
+    Args:
+        workers: the most.
+        limit_mb: most memory.
+        options: points of a block.
+    """
+    return max(1, min(workers, int((limit_mb - 1000) / (BLOCK_MB_PER_POINT * options.block_points))))
 
 
 def make_plan(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb: float = math.inf) -> Plan:
