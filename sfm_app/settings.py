@@ -179,7 +179,9 @@ class TextureSettings(Section):
     """The texture of the surface."""
 
     max_atlas_px: int = Field(4096, ge=256, le=16384, description="longest side of a page of texture, in pixels")
-    max_pages: int = Field(4, ge=1, le=64, description="most pages of texture; more detail is scaled down to fit")
+    max_pages: int = Field(
+        4, ge=1, le=64, description="most pages of texture for each 400 000 triangles; more detail is scaled down"
+    )
     unseen_faces: Literal["color", "cut"] = Field(
         "color", description="triangles that no photo sees: color: painted like what is around them; cut: left out"
     )

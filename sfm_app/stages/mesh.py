@@ -105,7 +105,7 @@ def digest(place: Workspace) -> str:
 
 
 def _fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray[np.void]:
-    """Return the records (N,) of the points fused from all depth maps; fuse again only where a map or their folder is newer."""
+    """Return the records (N,) of the fused points; fuse again only where a map or their folder is newer."""
     if not views:
         raise ReconstructionError("no photo has a depth map", hint=HINT)
     place = run.workspace.surface

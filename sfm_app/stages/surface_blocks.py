@@ -21,8 +21,16 @@ from sfm_app.geometry.culling import Clusters, border_angle
 from sfm_app.geometry.triangles import select_faces
 from sfm_app.hashing import fingerprint, load_arrays
 from sfm_app.meshing import drop_islands, make_manifold, trim
-from sfm_app.meshing.blocks.partition import Cube, Partition, Split, cell_sizes, cube_around, occupied_cells, split_points
-from sfm_app.meshing.blocks.weld import weld
+from sfm_app.meshing.blocks.partition import (
+    Cube,
+    Partition,
+    Split,
+    cell_sizes,
+    cube_around,
+    occupied_cells,
+    split_points,
+)
+from sfm_app.meshing.blocks.weld import close_cracks, weld
 from sfm_app.meshing.components import MIN_POINTS
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_workers
@@ -40,6 +48,8 @@ HALO = 24
 and Poisson's surface no longer depends on where the points end. Chosen by hand."""
 GIVE_WAY = 8.0
 """Cells over which a block gives way to its neighbor. Chosen by hand."""
+AT_PLANE = 2.0
+"""Cells from a plane within which small holes are cracks from joining. Chosen by hand."""
 MOST_LEVELS = 20
 """Of the grid over all points; blocks with more than `poisson_depth` levels get coarser cells. Chosen by hand."""
 CHUNK = 4_000_000
@@ -111,8 +121,8 @@ def mesh_in_blocks(
         raw = few.map(mesh_block, tasks, "finding the surface in blocks")
     with run.step("joining the blocks"):
         joined, lost = join_blocks(partition.root, tasks, cell)
-        share = options.min_island / len(tasks)  # of the triangles of a block
-        surface = make_manifold(drop_islands(joined, share))
+        joined = drop_islands(joined, options.min_island / len(tasks))  # a share of the triangles of a block
+        surface = close_cracks(joined, partition.near_planes(joined.vertices, AT_PLANE * cell))
     if not len(surface.faces):
         raise ReconstructionError(
             "the photos confirm no part of the surface", hint="take more photos, a step apart, with more overlap"

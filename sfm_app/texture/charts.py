@@ -23,6 +23,8 @@ MOST_LAYERS = 4
 SMALL = 12
 """Charts of fewer triangles take the photo of a neighboring chart, if it sees them."""
 ROUNDS = 3
+LAYER_BITS, BLOCK_BITS = 40, 44
+"""Bits of a group's number above which the layer and the block are counted. By definition."""
 EDGE = 1e-6
 """Points with a smaller barycentric coordinate count as on the edge."""
 
@@ -39,7 +41,7 @@ class Charts:
     """(T, 3, 2) corners in the photo, in pixels."""
 
 
-def make_charts(chosen: IntArray, cameras: FloatArray, mesh: Facets, tile_px: float) -> Charts:
+def make_charts(chosen: IntArray, cameras: FloatArray, mesh: Facets, tile_px: float, block_of: IntArray) -> Charts:
     """Build charts from one photo per triangle.
 
     Args:
@@ -47,17 +49,19 @@ def make_charts(chosen: IntArray, cameras: FloatArray, mesh: Facets, tile_px: fl
         cameras: (P, 26) from `PhotoView.row`.
         mesh: the surface.
         tile_px: charts are cut at multiples of this in the photo, so that each fits on a page.
+        block_of: (T,) block of each triangle; no chart lies in two.
     """
     corners = np.zeros((len(mesh.faces), 3, 2))
     _project_corners(chosen, cameras, mesh.vertices, mesh.faces, corners)
     tiles = np.floor(corners.mean(axis=1) / tile_px).astype(np.int64)
     group = np.where(chosen == NONE, NONE, (chosen * 4096 + tiles[:, 1]) * 4096 + tiles[:, 0])
+    group = np.where(chosen == NONE, NONE, group + (block_of.astype(np.int64) << BLOCK_BITS))
     of, count = components(group, mesh.neighbors)
     for layer in range(1, MOST_LAYERS):
         folded = folds(of, count, corners)
         if not folded.any():
             break
-        group[folded] += layer << 40
+        group[folded] += layer << LAYER_BITS
         of, count = components(group, mesh.neighbors)
     photo = np.full(count, NONE, np.int32)
     photo[of[of != NONE]] = chosen[of != NONE]

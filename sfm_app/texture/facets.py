@@ -57,7 +57,7 @@ class Facets:
         found = ranges(first, end)
         other = self.edges[found, 1]
         at = np.minimum(np.searchsorted(vertices, other), max(len(vertices) - 1, 0))
-        return found[vertices[at] == other] if len(found) else found
+        return np.asarray(found[vertices[at] == other]) if len(found) else found
 
 
 def facets(surface: Surface) -> Facets:

@@ -104,7 +104,7 @@ def _gaps(
         at = blend.vertex[others[rows]]
         head_photo[at], place[at] = photo_of[heads[rows]], np.arange(len(rows))
         around = mesh.faces_at(at)
-        near = around[seen.is_usable(np.int64(photo), around)]
+        near = around[seen.is_usable(photo, around)]
         corners = head_photo[mesh.faces[near]], place[mesh.faces[near]]
         gaps[rows] = _photo_gaps(photo, near, corners, seen, gains, len(rows))
         head_photo[at] = NONE
@@ -128,7 +128,7 @@ def _photo_gaps(
     head, place = corners
     row = seen.find(head, np.where(head == NONE, NONE, near[:, None]))
     both = (row != NONE) & (seen.worth[row] > 0)
-    own = seen.colors[seen.find(np.int64(photo), near)] / gains[photo]
+    own = seen.colors[seen.find(photo, near)] / gains[photo]
     difference = seen.colors[row] / gains[head] - own[:, None]
     count = np.bincount(place[both], minlength=size)
     found = np.full((size, 3), np.nan)

@@ -48,6 +48,22 @@ class Partition:
         low, high = self.boxes[number]
         return np.asarray(((points >= low) & (points < high)).all(axis=1))
 
+    def near_planes(self, points: FloatArray, distance: float) -> NDArray[np.bool_]:
+        """Return (N,) whether points lie close to a plane between blocks.
+
+        Args:
+            points: (N, 3).
+            distance: up to which they are close.
+        """
+        near = np.zeros(len(points), np.bool_)
+        waiting = [self.root]
+        while waiting:
+            node = waiting.pop()
+            if isinstance(node, Split):
+                near |= np.abs(points[:, node.axis] - node.at) <= distance
+                waiting += [node.low, node.high]
+        return near
+
 
 def split_points(points: FloatArray, blocks: int) -> Partition:
     """Cut space into boxes with about as many points each, across their longest sides.

@@ -6,11 +6,13 @@ distance; then each border gets the vertices of the other.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.triangles import select_faces, unique_edges
+from sfm_app.meshing.manifold import make_manifold
 from sfm_app.meshing.trimming import cut
 from sfm_app.types import Surface
 
@@ -87,6 +89,24 @@ def weld(below: Surface, above: Surface, axis: int, at: float, cell: float, halo
     return select_faces(joined, np.ones(len(joined.faces), np.bool_)), lost
 
 
+def close_cracks(surface: Surface, at_planes: NDArray[np.bool_]) -> Surface:
+    """Return the surface as an oriented manifold, with the short loops of open edges closed that touch a plane.
+
+    Triangles that welding has folded are removed, and the hole that each leaves is closed with larger ones.
+
+    Args:
+        surface: welded.
+        at_planes: (V,) which of its vertices may be at a crack.
+    """
+    found = make_manifold(Surface(surface.vertices, surface.faces, np.column_stack([surface.colors, at_planes])))
+    for _ in range(ROUNDS):
+        fills = _crack_fills(found.faces, np.flatnonzero(found.colors[:, 3]))
+        if not len(fills):
+            break
+        found = make_manifold(Surface(found.vertices, np.concatenate([found.faces, fills]), found.colors))
+    return Surface(found.vertices, found.faces, found.colors[:, :3])
+
+
 def cut_at_plane(surface: Surface, axis: int, at: float, *, keep_below: bool) -> tuple[Surface, Border]:
     """Return the part of a surface on one side of a plane, and its border there.
 
@@ -154,7 +174,7 @@ def _drag(points: FloatArray, from_: FloatArray, shift: FloatArray, halo: float)
 
     found = np.zeros_like(points)
     if len(from_):
-        away, at = cKDTree(from_).query(points, distance_upper_bound=halo)
+        away, at = (np.asarray(part) for part in cKDTree(from_).query(points, distance_upper_bound=halo))
         near = np.isfinite(away)
         found[near] = shift[at[near]] * (1.0 - away[near] / halo)[:, None]
     return found
@@ -182,7 +202,7 @@ def _split_first(
     """
     moving, edge, share = places
     same = np.arange(len(vertices))
-    taken: set[int] = set()
+    taken, movable = set[int](), set(moving.tolist())
     ends = one.ends[edge]
     far = np.linalg.norm(vertices[ends] - vertices[moving][:, None], axis=2)
     for k in np.flatnonzero(far.min(axis=1) <= tiny):
@@ -204,16 +224,16 @@ def _split_first(
         turned = [(a, b) for a, b in turned if _next_matched(b, follow, matched) != a]
         if not turned:
             break
-        for start, end in turned:
-            start, end = int(same[start]), int(same[end])
-            first, last = (start, end) if start in set(moving.tolist()) else (end, start)
+        for pair in turned:
+            start, end = same[list(pair)].tolist()
+            first, last = (start, end) if start in movable else (end, start)
             same[same == first] = last
     return chains, same
 
 
 def _successors(chains: list[list[int]]) -> dict[int, int]:
     """Return the next vertex of the first border after each one."""
-    return {a: b for chain in chains for a, b in zip(chain, chain[1:], strict=False)}
+    return {a: b for chain in chains for a, b in pairwise(chain)}
 
 
 def _next_matched(start: int, follow: dict[int, int], matched: set[int]) -> int:
@@ -266,7 +286,7 @@ def _crack_fills(faces: IndexArray, at_plane: IndexArray) -> IndexArray:
             way.append(follow[way[-1]].pop())
             if way[-1] in way[:-1]:
                 loop = way[way.index(way[-1]) : -1]
-                fills += [(loop[0], b, a) for a, b in zip(loop[1:], loop[2:], strict=False)]
+                fills += [(loop[0], b, a) for a, b in pairwise(loop[1:])]
                 way = way[: way.index(way[-1]) + 1]
     return np.array(fills, np.int64).reshape(-1, 3)
 
@@ -276,5 +296,5 @@ def _fans(faces: IndexArray, border: Border, chains: list[list[int]]) -> list[tu
     fans = []
     for face, side, chain in zip(border.faces, border.sides, chains, strict=True):
         top = int(faces[face, (side + 2) % 3])
-        fans += [(a, b, top) for a, b in zip(chain, chain[1:], strict=False) if len({a, b, top}) == 3]
+        fans += [(a, b, top) for a, b in pairwise(chain) if len({a, b, top}) == 3]
     return fans

@@ -42,8 +42,8 @@ def outlier_mask(seen: Sightings, gains: NDArray[np.float64], neighbors: IntArra
         rows = seen.rows(photo)
         face = seen.face[rows]
         row_of[face] = np.arange(len(face))
-        beside = neighbors[face]
-        beside = np.where(beside == NONE, NONE, row_of[beside])
+        across = neighbors[face]
+        beside = np.where(across == NONE, NONE, row_of[across])
         row_of[face] = NONE
         smooth = score[rows].copy()
         for _ in range(ROUNDS):

@@ -49,7 +49,7 @@ class Sightings:
         """Return the rows of a photo."""
         return slice(int(self.starts[photo]), int(self.starts[photo + 1]))
 
-    def find(self, photos: IndexArray, faces: IndexArray) -> IndexArray:
+    def find(self, photos: IndexArray | int, faces: NDArray[np.integer]) -> IndexArray:
         """Return the rows of views, -1 for those that are not there.
 
         Args:
@@ -57,10 +57,11 @@ class Sightings:
             faces: (M,) triangle of each view; -1 for none.
         """
         found = np.full(faces.shape, NONE, np.int64)
-        _find(self.starts, self.face, np.broadcast_to(photos, faces.shape).ravel(), faces.ravel(), found.ravel())
+        _find(self.starts, self.face, np.broadcast_to(np.asarray(photos, np.int64), faces.shape).ravel(),
+              faces.ravel().astype(np.int64), found.ravel())  # fmt: skip
         return found
 
-    def is_usable(self, photos: IndexArray, faces: IndexArray) -> NDArray[np.bool_]:
+    def is_usable(self, photos: IndexArray | int, faces: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Return (M,) whether photos see triangles and show the surface there.
 
         Args:
