@@ -1,5 +1,6 @@
 """COLMAP's fusion of depth maps, Poisson surface reconstruction from the fused points, and mesh simplification."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -71,13 +72,31 @@ def write_points(records: NDArray[np.void], path: Path) -> None:
         records: (N,).
         path: of the file.
     """
-    kinds = {"f": "float", "u": "uchar"}
-    fields = [(name, kinds[kind[0].kind]) for name, kind in (records.dtype.fields or {}).items()]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(records)}"]
-    lines += [*(f"property {kind} {name}" for name, kind in fields), "end_header", ""]
     with path.open("wb") as file:
-        file.write("\n".join(lines).encode("ascii"))
+        file.write(_header(records.dtype, len(records)))
         file.write(np.ascontiguousarray(records).tobytes())
+
+
+def _header(fields: np.dtype[np.void], count: int) -> bytes:
+    """Return the header of a PLY file of points."""
+    kinds = {"f": "float", "u": "uchar"}
+    said = [f"property {kinds[kind[0].kind]} {name}" for name, kind in (fields.fields or {}).items()]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *said, "end_header", ""]
+    return "\n".join(lines).encode("ascii")
+
+
+def join_points(parts: Sequence[Path], target: Path) -> None:
+    """Write the points of several files into one, without holding them all.
+
+    Args:
+        parts: files with the same fields, at least one.
+        target: PLY file.
+    """
+    records = [open_points(path) for path in parts]
+    with target.open("wb") as file:
+        file.write(_header(records[0].dtype, sum(map(len, records))))
+        for part in records:
+            file.write(np.ascontiguousarray(part).tobytes())
 
 
 def positions(records: NDArray[np.void]) -> NDArray[np.float64]:

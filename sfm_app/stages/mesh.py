@@ -7,18 +7,18 @@ from numpy.typing import NDArray
 
 from sfm_app.atomic_io import is_made_from, replace_atomically
 from sfm_app.colmap.dense import map_file, read_views
-from sfm_app.colmap.surface import FUSED, fuse, open_points, poisson_surface, positions
+from sfm_app.colmap.surface import FUSED, open_points, poisson_surface, positions
 from sfm_app.errors import ReconstructionError
 from sfm_app.hashing import digest_files, load_arrays
 from sfm_app.meshing import drop_islands, make_manifold, octree_depth, trim
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.cost_estimate import cache_gb
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.runtime.workspace import Workspace
-from sfm_app.stages.surface_blocks import mesh_in_blocks
-from sfm_app.stages.surface_parts import SurfaceJudge, simplify_mesh
-from sfm_app.stereo import View, region
+from sfm_app.stages.blocks.fusion import fuse_maps
+from sfm_app.stages.blocks.judging import SurfaceJudge, simplify_mesh
+from sfm_app.stages.blocks.surface import mesh_in_blocks
+from sfm_app.stereo import View
 from sfm_app.types import Surface
 
 SURFACE = "surface.npz"
@@ -115,8 +115,7 @@ def _fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArra
     whole = place / FUSED_DIGEST
     sound = target.exists() and is_made_from(whole, digest_files(place, FUSED))
     if not sound or target.stat().st_mtime_ns <= youngest:
-        with run.step("fusing depth maps"), replace_atomically(target) as path:
-            fuse(dense_dir, _min_views(views, run), region(views), path, cache_gb(run.memory_mb))
+        fuse_maps(dense_dir, views, _min_views(views, run), target, run)
         whole.write_text(digest_files(place, FUSED), encoding="utf-8")
     points = open_points(target)
     run.record(fused_points=len(points))

@@ -84,7 +84,7 @@ def ranges(starts: NDArray[np.int64], ends: NDArray[np.int64]) -> NDArray[np.int
     """Return (M,) the numbers from each start (N,) up to, but without, its end (N,), one after the other."""
     counts = ends - starts
     total = np.cumsum(counts)
-    return np.arange(total[-1] if len(total) else 0) + np.repeat(starts - total + counts, counts)
+    return np.asarray(np.arange(total[-1] if len(total) else 0) + np.repeat(starts - total + counts, counts))
 
 
 def sum_at_vertices(values: FloatArray, faces: NDArray[np.int64], size: int) -> FloatArray:

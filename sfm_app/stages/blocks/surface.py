@@ -35,7 +35,7 @@ from sfm_app.meshing.components import MIN_POINTS
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_workers
 from sfm_app.settings import MeshSettings
-from sfm_app.stages.surface_parts import SurfaceJudge, simplify_mesh
+from sfm_app.stages.blocks.judging import SurfaceJudge, simplify_mesh
 from sfm_app.stereo import View
 from sfm_app.types import Surface
 
