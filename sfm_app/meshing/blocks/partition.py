@@ -48,6 +48,16 @@ class Partition:
         low, high = self.boxes[number]
         return np.asarray(((points >= low) & (points < high)).all(axis=1))
 
+    def planes(self) -> list[tuple[int, float]]:
+        """Return axis and coordinate of all planes between blocks, those of the first cuts first."""
+        found, waiting = list[tuple[int, float]](), [self.root]
+        while waiting:
+            node = waiting.pop(0)
+            if isinstance(node, Split):
+                found.append((node.axis, node.at))
+                waiting += [node.low, node.high]
+        return found
+
     def near_planes(self, points: FloatArray, distance: float) -> NDArray[np.bool_]:
         """Return (N,) whether points lie close to a plane between blocks.
 
@@ -56,12 +66,8 @@ class Partition:
             distance: up to which they are close.
         """
         near = np.zeros(len(points), np.bool_)
-        waiting = [self.root]
-        while waiting:
-            node = waiting.pop()
-            if isinstance(node, Split):
-                near |= np.abs(points[:, node.axis] - node.at) <= distance
-                waiting += [node.low, node.high]
+        for axis, at in self.planes():
+            near |= np.abs(points[:, axis] - at) <= distance
         return near
 
 

@@ -127,7 +127,8 @@ def mesh_in_blocks(
         raise ReconstructionError(
             "the photos confirm no part of the surface", hint="take more photos, a step apart, with more overlap"
         )
-    run.record(blocks=len(tasks), cell=cell, raw_triangles=sum(raw), open_border_edges=lost)
+    run.record(blocks=len(tasks), planes=[list(plane) for plane in partition.planes()])
+    run.record(cell=cell, raw_triangles=sum(raw), open_border_edges=lost)
     shutil.rmtree(folder)
     return surface
 
