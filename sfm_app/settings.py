@@ -171,7 +171,10 @@ class MeshSettings(Section):
         200_000, ge=100, le=50_000_000, description="most triangles of the finished mesh, or of each of its blocks"
     )
     block_points: int = Field(
-        12_000_000, ge=1000, le=1_000_000_000, description="more points of depth maps than these are meshed in blocks"
+        4_000_000,
+        ge=1000,
+        le=1_000_000_000,
+        description="more points of depth maps than these are meshed in blocks of half as many",
     )
 
 

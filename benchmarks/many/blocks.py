@@ -1,7 +1,7 @@
 """Dense half of thousands of photos: CPU seconds and memory per photo of depth maps, surface and texture in blocks.
 
     python -m benchmarks.many.blocks --cache CACHE
-    python -m benchmarks.many.blocks --cache CACHE --megapixels 3 --counts 250 1000 --block-points 12000000
+    python -m benchmarks.many.blocks --cache CACHE --megapixels 3 --counts 250 1000 --block-points 4000000
 
 The first photos of a walk through the rendered town, with their true poses, so that only the dense stages run.
 """

@@ -13,6 +13,7 @@ from sfm_app.hashing import digest_files, load_arrays
 from sfm_app.meshing import drop_islands, make_manifold, octree_depth, trim
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.cost_estimate import block_count
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.stages.blocks.fusion import fuse_maps
@@ -48,7 +49,7 @@ def make(dense_dir: Path, run: RunContext) -> Surface:
     place.mkdir(exist_ok=True)
     views = [view for view in read_views(dense_dir) if map_file(dense_dir, view).exists()]
     points = _fused_points(dense_dir, views, run)
-    if len(points) > options.block_points:
+    if block_count(len(points), options) > 1:
         surface = mesh_in_blocks(dense_dir, views, points, _min_confirmed(views, run), run)
     else:
         surface = _mesh_at_once(dense_dir, views, points, run)

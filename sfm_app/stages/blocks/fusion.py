@@ -20,13 +20,13 @@ from sfm_app.colmap.surface import fuse, join_points
 from sfm_app.hashing import fingerprint
 from sfm_app.meshing.blocks.partition import split_points
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.cost_estimate import cache_gb
+from sfm_app.runtime.cost_estimate import FUSED_AT_ONCE_MP, cache_gb
 from sfm_app.stereo import DepthMap, View, region
 
 FloatArray = NDArray[np.float64]
 
-MOST_PIXELS = 150_000_000
-"""Pixels of depth maps that are fused at once; more are fused in blocks. Chosen by hand: COLMAP needs 4 GB for them."""
+MOST_PIXELS = int(1e6 * FUSED_AT_ONCE_MP)
+"""Pixels of depth maps that are fused at once."""
 STRIDE = 16
 """Rows and columns of a map from one sample to the next. Chosen by hand."""
 BEYOND = 0.03

@@ -33,7 +33,7 @@ from sfm_app.meshing.blocks.partition import (
 from sfm_app.meshing.blocks.weld import close_cracks, weld
 from sfm_app.meshing.components import MIN_POINTS
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.cost_estimate import block_workers
+from sfm_app.runtime.cost_estimate import block_count, block_workers
 from sfm_app.settings import MeshSettings
 from sfm_app.stages.blocks.judging import SurfaceJudge, simplify_mesh
 from sfm_app.stereo import View
@@ -105,7 +105,7 @@ def mesh_in_blocks(
     made_from = fingerprint(run.fingerprint, len(points), options.model_dump())
     if not resume_or_clear(folder, made_from):
         mark_unfinished(folder, made_from)
-    partition = split_points(_sample(points), -(-len(points) // options.block_points))
+    partition = split_points(_sample(points), block_count(len(points), options))
     bounds = _bounds(points, partition)
     cell = choose_cell(points, partition, bounds, options.poisson_depth)
     bounds = _with_halo(bounds, cell)

@@ -167,8 +167,8 @@ def test_a_ball_in_blocks_is_the_ball(dense, ball, tmp_path):
     for name in ("dense", "surface"):
         shutil.copytree(dense.parent / name, tmp_path / name)
 
-    found, counts = made(tmp_path / "dense", block_points=4000)
-    again, _ = made(tmp_path / "dense", workers=1, block_points=4000)
+    found, counts = made(tmp_path / "dense", block_points=8000)
+    again, _ = made(tmp_path / "dense", workers=1, block_points=8000)
 
     edges, edge_of = unique_edges(found.faces)
     assert counts["blocks"] >= 4
@@ -199,10 +199,10 @@ def test_a_run_that_was_killed_makes_the_missing_blocks_only(dense, ball, tmp_pa
 
     monkeypatch.setattr(blocks, "mesh_block", stop_at_third)
     with pytest.raises(KeyboardInterrupt):
-        made(tmp_path / "dense", workers=1, block_points=4000)
+        made(tmp_path / "dense", workers=1, block_points=8000)
     done.clear()
     monkeypatch.setattr(blocks, "mesh_block", count)
-    found, _ = made(tmp_path / "dense", workers=1, block_points=4000)
+    found, _ = made(tmp_path / "dense", workers=1, block_points=8000)
 
     assert done[:2] == [True, True]
     assert not any(done[2:])
