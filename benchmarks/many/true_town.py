@@ -73,7 +73,7 @@ def _observations(
     near, angle = cluster(where[:, None, :]), border_angle(camera.K, camera.width, camera.height)
     found = []
     for pose in views.cam_from_world.values():
-        which = near.in_cone(camera_center(pose), pose[2, :3], angle)
+        which = near.find_in_cone(camera_center(pose), pose[2, :3], angle)
         local = where[which] @ pose[:, :3].T + pose[:, 3]
         ahead = (local[:, 2] > 0.1) & (local[:, 2] < REACH_M)
         which, local = which[ahead], local[ahead] @ camera.K.T

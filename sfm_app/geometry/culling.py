@@ -14,6 +14,7 @@ IndexArray = NDArray[np.int64]
 CLUSTER = 256
 """Members of a cluster. Chosen by hand: of 100 000 triangles, the 400 balls are tested in no time."""
 CURVE_BITS = 12
+"""Cells along a side of the grid of the Morton curve, as a power of two. Chosen by hand."""
 SLACK = 1e-6
 """Radians, and share of a ball's radius, by which rounding may be off. By definition."""
 
@@ -31,7 +32,7 @@ class Clusters:
     radii: FloatArray
     """(C,) of the balls, which contain all corners of their members."""
 
-    def in_cone(self, apex: FloatArray, axis: FloatArray, half_angle: float) -> IndexArray:
+    def find_in_cone(self, apex: FloatArray, axis: FloatArray, half_angle: float) -> IndexArray:
         """Return (M,) the members, ascending, of all clusters that reach into a cone; it misses none inside.
 
         Args:

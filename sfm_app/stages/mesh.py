@@ -72,7 +72,7 @@ def _mesh_at_once(dense_dir: Path, views: list[View], points: NDArray[np.void], 
     depth = octree_depth(positions(points), options.poisson_depth)
     with run.step("finding the surface"):
         raw = _check_nonempty(poisson_surface(place, depth), "the fused points span no surface")
-    judges = SurfaceJudge.of(raw, dense_dir, run.settings.depth.consistency)
+    judges = SurfaceJudge.prepare(raw, dense_dir, run.settings.depth.consistency)
     found = ordered_map(run.executor, judges.judge, views, ahead=run.workers)
     colored, support = judges.sum_up(track(run.progress, found, "confirming the surface", len(views)))
     least = _min_confirmed(views, run)

@@ -57,7 +57,7 @@ def texture_surface(
     unseen = chosen == NONE
     if options.unseen_faces == "cut" and not unseen.all():
         mesh = facets(select_faces(surface, ~unseen))
-        seen, chosen = replace(seen, all=seen.all.among(~unseen)), chosen[~unseen]
+        seen, chosen = replace(seen, all=seen.all.select_triangles(~unseen)), chosen[~unseen]
     plan = _plan(mesh, seen, chosen, views, options)
     rejected = [look if isinstance(look, Rejected) else None for look in looks]
     painted = paint_blocks(plan, views, store, spread, [reason is None for reason in rejected])

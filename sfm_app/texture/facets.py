@@ -81,7 +81,12 @@ def facets(surface: Surface) -> Facets:
 
 
 def ranges(starts: NDArray[np.int64], ends: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return (M,) the numbers from each start (N,) up to, but without, its end (N,), one after the other."""
+    """Return (M,) the numbers from each start (N,) up to, but without, its end (N,), one after the other.
+
+    Args:
+        starts: (N,) first number of each range.
+        ends: (N,) number after the last of each range.
+    """
     counts = ends - starts
     total = np.cumsum(counts)
     return np.asarray(np.arange(total[-1] if len(total) else 0) + np.repeat(starts - total + counts, counts))

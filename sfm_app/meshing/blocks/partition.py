@@ -72,7 +72,7 @@ class Partition:
 
 
 def split_points(points: FloatArray, blocks: int) -> Partition:
-    """Cut space into boxes with about as many points each, across their longest sides.
+    """Divide space into boxes with about as many points each, across their longest sides.
 
     Args:
         points: (N, 3).

@@ -247,7 +247,7 @@ def _next_matched(start: int, follow: dict[int, int], matched: set[int]) -> int:
 
 
 def _split_second(ends: IndexArray, follow: dict[int, int], matched: set[int]) -> tuple[list[list[int]], int]:
-    """Follow the first border, backwards, along each edge of the second one.
+    """Find the vertices of the first border, backwards, along each edge of the second one.
 
     Args:
         ends: (E, 2) vertices of the edges of the second border.
@@ -292,7 +292,7 @@ def _crack_fills(faces: IndexArray, at_plane: IndexArray) -> IndexArray:
 
 
 def _fans(faces: IndexArray, border: Border, chains: list[list[int]]) -> list[tuple[int, int, int]]:
-    """Split the triangles at a border at the vertices along their edges."""
+    """Divide the triangles at a border at the vertices along their edges."""
     fans = []
     for face, side, chain in zip(border.faces, border.sides, chains, strict=True):
         top = int(faces[face, (side + 2) % 3])

@@ -88,7 +88,7 @@ def fuse_maps(dense_dir: Path, views: Sequence[View], min_views: int, target: Pa
 def plan_fusion(
     dense_dir: Path, views: Sequence[View], min_views: int, folder: Path, run: RunContext
 ) -> list[FusionTask]:
-    """Cut the space that the depth maps show into blocks.
+    """Divide the space that the depth maps show into blocks.
 
     Args:
         dense_dir: dense workspace.
@@ -181,7 +181,12 @@ def world_points(view: View, depth: NDArray[np.float32], step: int = 1) -> Float
 
 
 def link_tree(source: Path, target: Path) -> None:
-    """Make a folder with the files of another, which share their bytes where the system can."""
+    """Make a folder with the files of another, which share their bytes where the system can.
+
+    Args:
+        source: the other folder.
+        target: made; its parent, too.
+    """
     target.mkdir(parents=True)
     for path in sorted(source.iterdir()):
         if path.is_file():
@@ -189,7 +194,12 @@ def link_tree(source: Path, target: Path) -> None:
 
 
 def link_file(source: Path, target: Path) -> None:
-    """Make a file with the bytes of another, which they share where the system can."""
+    """Make a file with the bytes of another, which they share where the system can.
+
+    Args:
+        source: the other file.
+        target: in a folder that is there.
+    """
     try:
         os.link(source, target)
     except OSError:

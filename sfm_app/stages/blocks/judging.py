@@ -35,7 +35,7 @@ class SurfaceJudge:
     """Relative difference in depth."""
 
     @classmethod
-    def of(cls, surface: Surface, dense_dir: Path, tolerance: float) -> "SurfaceJudge":
+    def prepare(cls, surface: Surface, dense_dir: Path, tolerance: float) -> "SurfaceJudge":
         """Prepare for a surface from Poisson reconstruction.
 
         Args:
@@ -47,9 +47,9 @@ class SurfaceJudge:
         return cls(surface, normals, cluster(surface.vertices[:, None, :]), dense_dir, tolerance)
 
     def judge(self, view: View) -> Judgment:
-        """Ask one photo about the vertices that it has in view."""
+        """Let one photo judge the vertices that it has in view."""
         eye = DepthView(view.K, view.R, view.t, read_depth(self.dense_dir, view, "geometric"), view.sample_px)
-        near = self.clusters.in_cone(eye.center, eye.axis, eye.widest_angle)
+        near = self.clusters.find_in_cone(eye.center, eye.axis, eye.widest_angle)
         points, normals = self.surface.vertices[near], self.normals[near]
         verdict = judge(points, normals, eye, self.tolerance)
         paint = sample_colors(points, normals, verdict, eye, read_color(self.dense_dir, view))

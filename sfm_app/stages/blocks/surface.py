@@ -143,7 +143,7 @@ def mesh_block(task: BlockTask) -> int:
     raw = poisson_surface(scratch, task.cube.depth)
     inside = ((raw.vertices >= task.bounds[0]) & (raw.vertices <= task.bounds[1])).all(axis=1)
     near = select_faces(raw, inside[raw.faces].all(axis=1))
-    judge = SurfaceJudge.of(near, task.dense_dir, task.tolerance)
+    judge = SurfaceJudge.prepare(near, task.dense_dir, task.tolerance)
     found, support = judge.sum_up(map(judge.judge, task.views))
     if task.options.trim and len(found.faces):
         found = trim(found, support, task.options.max_gap_triangles, task.least)
@@ -252,7 +252,7 @@ def _photos_in_reach(views: Sequence[View], farthest: Sequence[float], bounds: F
     found: list[list[View]] = [[] for _ in bounds]
     for view, far in zip(views, farthest, strict=True):
         bare = replace(view, point_ids=np.empty(0, np.int64), points=np.empty((0, 3)))
-        for number in blocks.in_cone(view.center, view.R[2], border_angle(view.K, view.width, view.height)):
+        for number in blocks.find_in_cone(view.center, view.R[2], border_angle(view.K, view.width, view.height)):
             if (centers[number] - view.center) @ view.R[2] - radii[number] <= far:
                 found[number].append(bare)
     return found

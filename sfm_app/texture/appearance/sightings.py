@@ -76,11 +76,7 @@ class Sightings:
         rows = self.rows(photo)
         return self.face[rows][self.worth[rows] > 0].astype(np.int64)
 
-    def without_outliers(self) -> "Sightings":
-        """Return the views that show the surface."""
-        return _gather(self, self.worth > 0, np.arange(self.triangles), self.triangles)
-
-    def among(self, kept: NDArray[np.bool_]) -> "Sightings":
+    def select_triangles(self, kept: NDArray[np.bool_]) -> "Sightings":
         """Return the views of some triangles, which are numbered anew.
 
         Args:
@@ -114,7 +110,7 @@ def list_sightings(looks: Sequence[FaceView | None], triangles: int) -> Sighting
 def make_sightings(
     counts: IndexArray, face: IntArray, worth: NDArray[np.float32], colors: NDArray[np.uint8], triangles: int
 ) -> Sightings:
-    """Index lists of views by triangle.
+    """List views by photo and by triangle.
 
     Args:
         counts: (P,) views of each photo.

@@ -56,7 +56,7 @@ def score_faces(
         mesh: the surface.
         hidden: the occlusion test.
     """
-    near = mesh.clusters.in_cone(view.center, view.axis, view.widest_angle)
+    near = mesh.clusters.find_in_cone(view.center, view.axis, view.widest_angle)
     worth, color = np.zeros(len(near), np.float32), np.zeros((len(near), 3), np.uint8)
     _measure(view.row, photo, mesh.vertices, mesh.faces[near], worth, color)
     if used is not None:
@@ -73,7 +73,7 @@ def score_faces(
 
 
 def _lower_rims(face: NDArray[np.int64], worth: NDArray[np.float32], mesh: Facets) -> None:
-    """Lower the worth of seen triangles, in place, ring by ring from those that the photo does not see."""
+    """Weigh seen triangles less, in place, ring by ring from those that the photo does not see."""
     inner = np.arange(len(face))
     for _ in range(RIM_RINGS):
         corners = mesh.faces[face[inner]]

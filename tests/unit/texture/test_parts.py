@@ -305,3 +305,32 @@ def test_points_near_each_other_come_after_each_other():
     steps = np.linalg.norm(np.diff(points[morton_order(points)], axis=0), axis=1)
     assert np.median(steps) < 0.15 * np.median(np.linalg.norm(np.diff(points, axis=0), axis=1))
     assert len(morton_order(np.empty((0, 3)))) == 0
+
+
+@pytest.mark.parametrize("k1", [-0.2, 0.0, 0.1])
+def test_the_widest_angle_bounds_what_a_photo_shows(k1):
+    view = around(1, k1=k1)[0]
+    rays = np.random.default_rng(0).normal(size=(4000, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    inside = [
+        angle
+        for ray, angle in zip(rays, np.arccos(rays @ view.axis), strict=True)
+        for u, v, depth in [project(view.row, *(view.center + ray))]
+        if depth > 0 and 0 <= u <= view.width and 0 <= v <= view.height
+    ]
+    assert max(inside) <= view.widest_angle < max(inside) + np.radians(8)
+
+
+def test_views_are_found_by_photo_and_triangle():
+    worth = np.array([[0, 2, 0, 5.0], [1, 0, 0, -3], [0, 0, 0, 0]])
+    seen = sightings(worth)
+    photo, face = (part.ravel() for part in np.indices(worth.shape))
+
+    rows = seen.find(photo, face)
+    np.testing.assert_array_equal(rows != NONE, worth.ravel() != 0)
+    np.testing.assert_array_equal(seen.worth[rows[rows != NONE]], worth.ravel()[rows != NONE])
+    np.testing.assert_array_equal(seen.is_usable(photo, face), worth.ravel() > 0)
+    assert seen.find(0, np.array([NONE, 3])).tolist() == [NONE, 1]
+    part = seen.select_triangles(np.array([False, True, False, True]))
+    assert (part.photos, part.triangles, part.face.tolist()) == (3, 2, [0, 1, 1])
+    assert part.face_rows.tolist() == [0, 1, 2]
