@@ -75,7 +75,7 @@ def _score_photos(
 
 def _score_photo(name: str, view: PhotoView, mesh: Facets, store: Store, hidden: OcclusionTest) -> FaceView | Rejected:
     kept = store.recall(name)
-    if kept is not None:
+    if kept is not None and "face" in kept:
         return FaceView(kept["face"], kept["worth"], kept["color"], float(kept["sharpness"]))
     try:
         photo, used = store.photo(view), store.usable_pixels(view)

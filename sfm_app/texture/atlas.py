@@ -25,7 +25,7 @@ class Pages:
         self.canvases, self.has = canvases, np.zeros(photos, np.bool_)
         self._store, self._lock, self._block = store, Lock(), block
         kept = store.recall(GROUP_NAME)
-        if kept is not None and kept["block"] == block:
+        if kept is not None and kept.get("block") == block:
             self.has[:] = kept["has"]
             for number, page in enumerate(canvases):
                 page.total[:] = kept[f"page{number}"]
