@@ -167,14 +167,24 @@ class MeshSettings(Section):
     max_error_edges: float = Field(
         0.15, ge=0, le=10, description="most that simplification may move the surface, in edges of Poisson's triangles"
     )
-    faces: int = Field(200_000, ge=100, le=50_000_000, description="most triangles of the finished mesh")
+    faces: int = Field(
+        200_000, ge=100, le=50_000_000, description="most triangles of the finished mesh, or of each of its blocks"
+    )
+    block_points: int = Field(
+        4_000_000,
+        ge=1000,
+        le=1_000_000_000,
+        description="more points of depth maps than these are meshed in blocks of half as many",
+    )
 
 
 class TextureSettings(Section):
     """The texture of the surface."""
 
     max_atlas_px: int = Field(4096, ge=256, le=16384, description="longest side of a page of texture, in pixels")
-    max_pages: int = Field(4, ge=1, le=64, description="most pages of texture; more detail is scaled down to fit")
+    max_pages: int = Field(
+        4, ge=1, le=64, description="most pages of texture for each 400 000 triangles; more detail is scaled down"
+    )
     unseen_faces: Literal["color", "cut"] = Field(
         "color", description="triangles that no photo sees: color: painted like what is around them; cut: left out"
     )

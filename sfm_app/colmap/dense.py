@@ -169,6 +169,21 @@ def read_depth(dense_dir: Path, view: View, kind: Kind) -> NDArray[np.float32]:
     return _read_depth_format(dense_dir, DEPTHS, view, kind)
 
 
+def read_normals(dense_dir: Path, view: View) -> NDArray[np.float32]:
+    """Read the normals of a view, (H, W, 3), as `write_maps` takes them.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        view: a photo with maps.
+    """
+    with translate_errors(f"reading the normal map of {view.name}"):
+        stored = pycolmap.NormalMap()
+        stored.read(_map_path(dense_dir, NORMALS, view))
+    planes = np.array(stored.to_array(), np.float32)
+    height, width = planes.shape[:2]
+    return np.ascontiguousarray(planes.reshape(3, height, width).transpose(1, 2, 0))
+
+
 def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
     """Write the confirmed depths and the normals of a view, as COLMAP's fusion expects them.
 

@@ -1,5 +1,6 @@
 """COLMAP's fusion of depth maps, Poisson surface reconstruction from the fused points, and mesh simplification."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -43,12 +44,64 @@ def fuse(
     target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # which photos see which point; not used
 
 
-def read_fused(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Read fused points (N, 3) and their unit normals (N, 3), which point to the photos that see them."""
-    with translate_errors("reading the fused points"):
-        vertex = trimesh.load(folder / FUSED).metadata["_ply_raw"]["vertex"]["data"]
-        points, normals = (np.stack([vertex[c] for c in names], axis=1) for names in ("xyz", ("nx", "ny", "nz")))
-    return points.astype(np.float64), normals.astype(np.float64)
+def open_points(path: Path) -> NDArray[np.void]:
+    """Return the records (N,) of COLMAP's points with their fields x, y, z, nx, ..., read from the file as needed.
+
+    Raises:
+        BackendError: it is no binary PLY file of points.
+    """
+    with translate_errors(f"reading {path.name}"), path.open("rb") as file:
+        count, fields = -1, list[tuple[str, str]]()
+        while (words := file.readline().split()) != [b"end_header"]:
+            if not words:
+                raise ValueError(f"{path} has no end of its header")
+            if words[:2] == [b"element", b"vertex"]:
+                count = int(words[2])
+            elif words[0] == b"property":
+                fields.append((words[2].decode("ascii"), {b"float": "<f4", b"uchar": "u1"}[words[1]]))
+        start = file.tell()
+        if count < 1:
+            return np.empty(0, fields)
+        return np.memmap(path, np.dtype(fields), "r", start, (count,))
+
+
+def write_points(records: NDArray[np.void], path: Path) -> None:
+    """Write records with the fields of `open_points` as a PLY file.
+
+    Args:
+        records: (N,).
+        path: of the file.
+    """
+    with path.open("wb") as file:
+        file.write(_header(records.dtype, len(records)))
+        file.write(np.ascontiguousarray(records).tobytes())
+
+
+def _header(fields: np.dtype[np.void], count: int) -> bytes:
+    """Return the header of a PLY file of points."""
+    kinds = {"f": "float", "u": "uchar"}
+    said = [f"property {kinds[kind[0].kind]} {name}" for name, kind in (fields.fields or {}).items()]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *said, "end_header", ""]
+    return "\n".join(lines).encode("ascii")
+
+
+def join_points(parts: Sequence[Path], target: Path) -> None:
+    """Write the points of several files into one, without holding them all.
+
+    Args:
+        parts: files with the same fields, at least one.
+        target: PLY file.
+    """
+    records = [open_points(path) for path in parts]
+    with target.open("wb") as file:
+        file.write(_header(records[0].dtype, sum(map(len, records))))
+        for part in records:
+            file.write(np.ascontiguousarray(part).tobytes())
+
+
+def positions(records: NDArray[np.void]) -> NDArray[np.float64]:
+    """Return the positions (N, 3) of records."""
+    return np.stack([records[c] for c in "xyz"], axis=1).astype(np.float64)
 
 
 def poisson_surface(folder: Path, depth: int) -> Surface:

@@ -42,11 +42,16 @@ class Support:
         """Make the zero counts of `count` vertices."""
         return cls(*(np.zeros(count, np.int32) for _ in range(3)))
 
-    def add(self, verdict: NDArray[np.uint8]) -> None:
-        """Add the verdict of one photo, from `judge`."""
-        self.confirmed += verdict == CONFIRMED
-        self.seen_through += verdict == SEEN_THROUGH
-        self.empty += verdict == EMPTY
+    def add(self, at: IndexArray, verdict: NDArray[np.uint8]) -> None:
+        """Add the verdict of one photo, from `judge`.
+
+        Args:
+            at: (N,) the vertices that were judged, each once.
+            verdict: (N,) of each.
+        """
+        self.confirmed[at] += verdict == CONFIRMED
+        self.seen_through[at] += verdict == SEEN_THROUGH
+        self.empty[at] += verdict == EMPTY
 
     @property
     def is_free(self) -> NDArray[np.bool_]:

@@ -26,10 +26,15 @@ class Paint:
         """Make the zero sums of `count` vertices."""
         return cls(np.zeros((count, 3), np.float32), np.zeros(count, np.float32))
 
-    def add(self, other: "Paint") -> None:
-        """Add the colors of another photo."""
-        self.total += other.total
-        self.weight += other.weight
+    def add(self, at: NDArray[np.int64], other: "Paint") -> None:
+        """Add the colors of another photo.
+
+        Args:
+            at: (N,) the vertices that it sampled, each once.
+            other: its colors at these.
+        """
+        self.total[at] += other.total
+        self.weight[at] += other.weight
 
     def mean_colors(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return (V, 3) mean colors of the photos; vertices that no photo shows keep their color from `colors`."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.culling import border_angle
 from sfm_app.jit import kernel
 
 FloatArray = NDArray[np.float64]
@@ -42,6 +43,16 @@ class DepthView:
     def center(self) -> FloatArray:
         """(3,) center of projection in the world."""
         return np.asarray(-self.R.T @ self.t)
+
+    @property
+    def axis(self) -> FloatArray:
+        """(3,) unit vector along which it looks, in the world."""
+        return np.asarray(self.R[2])
+
+    @property
+    def widest_angle(self) -> float:
+        """Upper bound in radians of the angle between the axis and what the photo shows."""
+        return border_angle(self.K, self.depth.shape[1], self.depth.shape[0])
 
     @property
     def focal_px(self) -> float:

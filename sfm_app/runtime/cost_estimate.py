@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sfm_app.retrieval.choice import expected_pairs
-from sfm_app.settings import Settings
+from sfm_app.settings import MeshSettings, Settings
 from sfm_app.types import Photo
 
 MEGA = 1e6
@@ -20,6 +20,13 @@ SHARE_OF_MACHINE = 0.8
 FEATURES_PER_MP = 4500
 """Photos with little texture have fewer."""
 
+FUSED_AT_ONCE_MP = 150.0
+"""Megapixels of depth maps that are fused at once; more are fused in blocks. Chosen by hand: COLMAP needs 4 GB."""
+POINTS_PER_MP = 70_000
+"""Fused points of each megapixel of depth maps: 70 000 of a walk through a town, 58 000 of fountain-P11."""
+BLOCK_MB_PER_POINT = 1200 / MEGA
+"""Memory of Poisson's reconstruction and of the surface that it gives, for each point of a block: COLMAP's process had
+950 bytes for each of 1.3 million points of a town."""
 SERIAL_STAGES = ("scene", "mesh")
 """Stages in which more workers are of little use."""
 
@@ -69,6 +76,30 @@ def cache_gb(limit_mb: float) -> float:
     return min(64.0, max(0.25, (limit_mb - 1500) / 1000))
 
 
+def block_count(points: float, options: MeshSettings) -> int:
+    """Return the number of blocks of the surface: one, or such as have half as many points as one may have.
+
+    Two workers then need no more memory than one does for the largest surface that is made at once.
+
+    Args:
+        points: fused from all depth maps.
+        options: most points of a surface that is made at once.
+    """
+    return 1 if points <= options.block_points else math.ceil(2 * points / options.block_points)
+
+
+def block_workers(workers: int, limit_mb: float, options: MeshSettings) -> int:
+    """Return how many blocks of the surface are made at once.
+
+    Args:
+        workers: the most.
+        limit_mb: most memory.
+        options: most points of a surface that is made at once.
+    """
+    fit = (limit_mb - 1000) / (BLOCK_MB_PER_POINT * options.block_points / 2)
+    return max(1, int(min(workers, fit)))
+
+
 def make_plan(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb: float = math.inf) -> Plan:
     """Estimate the costs of all stages after the photos stage.
 
@@ -85,6 +116,11 @@ def make_plan(photos: Iterable[Photo], settings: Settings, workers: int, limit_m
     mapped = [_megapixels(size, settings.depth.max_image_size_px) for size in sizes]
     features = sum(min(settings.matching.max_features, FEATURES_PER_MP * one) for one in searched) / max(count, 1)
     pages = settings.texture.max_pages * settings.texture.max_atlas_px**2 / MEGA
+    dense, points = sum(mapped), POINTS_PER_MP * sum(mapped)
+    blocks = block_count(points, settings.mesh)
+    together = block_workers(workers, limit_mb, settings.mesh) if blocks > 1 else 1
+    block_mb = BLOCK_MB_PER_POINT * points / blocks * min(together, blocks)
+    fused_mb = 28 * (dense if dense <= FUSED_AT_ONCE_MP else min(dense, workers * FUSED_AT_ONCE_MP))
     return Plan(
         count,
         pairs,
@@ -95,7 +131,7 @@ def make_plan(photos: Iterable[Photo], settings: Settings, workers: int, limit_m
             "intrinsics": 0.03 * pairs,
             "scene": 2.0 * count,
             "depth_maps": 3.0 * sum(mapped) * settings.depth.neighbors,
-            "mesh": 15 + 2.0 * sum(mapped),
+            "mesh": 15 + (2.0 if dense <= FUSED_AT_ONCE_MP else 2.7) * dense,
             "texture": 0.1 * sum(width * height for width, height in sizes) / MEGA,
             "files": 1.0,
         },
@@ -105,9 +141,9 @@ def make_plan(photos: Iterable[Photo], settings: Settings, workers: int, limit_m
             "intrinsics": 500 + 0.06 * pairs,
             "scene": 700 + 15.5 * count * features / 8192,
             "depth_maps": 750 + workers * 150 * max(mapped, default=0) + 5.0 * count,
-            "mesh": 950 + min(1000 * cache_gb(limit_mb), 28 * sum(mapped)),
-            "texture": 1000 + 8 * pages + workers * 8 * largest + 9.0 * count,
-            "files": 850 + 8 * pages + 5.0 * count,
+            "mesh": 950 + max(min(1000 * cache_gb(limit_mb), fused_mb), block_mb),
+            "texture": 1000 + (8 + 3 * (blocks - 1)) * pages + workers * 8 * largest + 3.0 * count,
+            "files": 850 + (8 + 3 * (blocks - 1)) * pages + 5.0 * count,
         },
     )
 

@@ -6,29 +6,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.atomic_io import is_made_from, replace_atomically
-from sfm_app.colmap.dense import map_file, read_color, read_depth, read_views
-from sfm_app.colmap.surface import FUSED, fuse, poisson_surface, read_fused, simplify
+from sfm_app.colmap.dense import map_file, read_views
+from sfm_app.colmap.surface import FUSED, open_points, poisson_surface, positions
 from sfm_app.errors import ReconstructionError
-from sfm_app.geometry.triangles import median_edge_length, vertex_normals
 from sfm_app.hashing import digest_files, load_arrays
-from sfm_app.meshing import (
-    DepthView,
-    Paint,
-    Support,
-    drop_islands,
-    judge,
-    make_manifold,
-    octree_depth,
-    sample_colors,
-    trim,
-)
+from sfm_app.meshing import drop_islands, make_manifold, octree_depth, trim
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.cost_estimate import cache_gb
+from sfm_app.runtime.cost_estimate import block_count
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.runtime.workspace import Workspace
-from sfm_app.settings import MeshSettings
-from sfm_app.stereo import View, region
+from sfm_app.stages.blocks.fusion import fuse_maps
+from sfm_app.stages.blocks.judging import SurfaceJudge, simplify_mesh
+from sfm_app.stages.blocks.surface import mesh_in_blocks
+from sfm_app.stereo import View
 from sfm_app.types import Surface
 
 SURFACE = "surface.npz"
@@ -58,20 +49,38 @@ def make(dense_dir: Path, run: RunContext) -> Surface:
     place.mkdir(exist_ok=True)
     views = [view for view in read_views(dense_dir) if map_file(dense_dir, view).exists()]
     points = _fused_points(dense_dir, views, run)
-    depth = octree_depth(points, options.poisson_depth)
-    with run.step("finding the surface"):
-        raw = _check_nonempty(poisson_surface(place, depth), "the fused points span no surface")
-    colored, support = color_and_confirm(raw, dense_dir, views, run)
-    least = CONFIRMED_SHARE * _min_views(views, run)
-    trimmed = trim(colored, support, options.max_gap_triangles, least) if options.trim else colored
-    detailed = _check_nonempty(drop_islands(trimmed, options.min_island), "the photos confirm no part of the surface")
-    run.record(poisson_depth=depth, raw_triangles=len(raw.faces), detailed_triangles=len(detailed.faces))
-    with run.step("simplifying"):
-        surface = _check_nonempty(make_manifold(simplify_mesh(detailed, options, place)), "the surface has no extent")
+    if block_count(len(points), options) > 1:
+        surface = mesh_in_blocks(dense_dir, views, points, _min_confirmed(views, run), run)
+    else:
+        surface = _mesh_at_once(dense_dir, views, points, run)
     run.record(vertices=len(surface.vertices), triangles=len(surface.faces))
     with replace_atomically(place / SURFACE) as path:
         np.savez(path, vertices=surface.vertices, faces=surface.faces, colors=surface.colors)
     return surface
+
+
+def _mesh_at_once(dense_dir: Path, views: list[View], points: NDArray[np.void], run: RunContext) -> Surface:
+    """Return the surface of all points.
+
+    Args:
+        dense_dir: dense workspace with depth maps.
+        views: photos with a depth map.
+        points: (N,) records of the fused points.
+        run: the run.
+    """
+    place, options = run.workspace.surface, run.settings.mesh
+    depth = octree_depth(positions(points), options.poisson_depth)
+    with run.step("finding the surface"):
+        raw = _check_nonempty(poisson_surface(place, depth), "the fused points span no surface")
+    judges = SurfaceJudge.prepare(raw, dense_dir, run.settings.depth.consistency)
+    found = ordered_map(run.executor, judges.judge, views, ahead=run.workers)
+    colored, support = judges.sum_up(track(run.progress, found, "confirming the surface", len(views)))
+    least = _min_confirmed(views, run)
+    trimmed = trim(colored, support, options.max_gap_triangles, least) if options.trim else colored
+    detailed = _check_nonempty(drop_islands(trimmed, options.min_island), "the photos confirm no part of the surface")
+    run.record(poisson_depth=depth, raw_triangles=len(raw.faces), detailed_triangles=len(detailed.faces))
+    with run.step("simplifying"):
+        return _check_nonempty(make_manifold(simplify_mesh(detailed, options, place)), "the surface has no extent")
 
 
 def _check_nonempty(surface: Surface, otherwise: str) -> Surface:
@@ -96,8 +105,8 @@ def digest(place: Workspace) -> str:
     return digest_files(place.surface, SURFACE)
 
 
-def _fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray[np.float64]:
-    """Return the (N, 3) points fused from all depth maps; fuse again only where a map or their folder is newer."""
+def _fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray[np.void]:
+    """Return the records (N,) of the fused points; fuse again only where a map or their folder is newer."""
     if not views:
         raise ReconstructionError("no photo has a depth map", hint=HINT)
     place = run.workspace.surface
@@ -107,10 +116,9 @@ def _fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArra
     whole = place / FUSED_DIGEST
     sound = target.exists() and is_made_from(whole, digest_files(place, FUSED))
     if not sound or target.stat().st_mtime_ns <= youngest:
-        with run.step("fusing depth maps"), replace_atomically(target) as path:
-            fuse(dense_dir, _min_views(views, run), region(views), path, cache_gb(run.memory_mb))
+        fuse_maps(dense_dir, views, _min_views(views, run), target, run)
         whole.write_text(digest_files(place, FUSED), encoding="utf-8")
-    points, _ = read_fused(place)
+    points = open_points(target)
     run.record(fused_points=len(points))
     if len(points) < MIN_POINTS:
         raise ReconstructionError(
@@ -124,43 +132,6 @@ def _min_views(views: list[View], run: RunContext) -> int:
     return min(1 + run.settings.depth.min_agreeing, len(views))
 
 
-def color_and_confirm(surface: Surface, dense_dir: Path, views: list[View], run: RunContext) -> tuple[Surface, Support]:
-    """Return the surface with colors from the photos, and their support for each of its vertices.
-
-    Args:
-        surface: from Poisson reconstruction.
-        dense_dir: folder with undistorted photos and their maps.
-        views: photos with a depth map.
-        run: the run.
-    """
-    normals = vertex_normals(surface.vertices, surface.faces)
-    tolerance = run.settings.depth.consistency
-
-    def judge_view(view: View) -> tuple[NDArray[np.uint8], Paint]:
-        eye = DepthView(view.K, view.R, view.t, read_depth(dense_dir, view, "geometric"), view.sample_px)
-        verdict = judge(surface.vertices, normals, eye, tolerance)
-        return verdict, sample_colors(surface.vertices, normals, verdict, eye, read_color(dense_dir, view))
-
-    support, paint = Support.zeros(len(normals)), Paint.zeros(len(normals))
-    found = ordered_map(run.executor, judge_view, views, ahead=run.workers)
-    for verdict, colors in track(run.progress, found, "confirming the surface", len(views)):
-        support.add(verdict)
-        paint.add(colors)
-    return Surface(surface.vertices, surface.faces, paint.mean_colors(surface.colors)), support
-
-
-def simplify_mesh(surface: Surface, options: MeshSettings, scratch: Path) -> Surface:
-    """Simplify to as few triangles as the error allows, and no more than asked for.
-
-    Args:
-        surface: detailed triangles.
-        options: largest error, and most triangles.
-        scratch: folder for temporary files.
-    """
-    simple = surface
-    if options.max_error_edges:
-        edge = median_edge_length(surface.vertices, surface.faces)
-        simple = simplify(surface, 1.0 / len(surface.faces), options.max_error_edges * edge, scratch)
-    if len(simple.faces) > options.faces:
-        simple = simplify(simple, options.faces / len(simple.faces), 0.0, scratch)
-    return simple
+def _min_confirmed(views: list[View], run: RunContext) -> float:
+    """Return how many photos have to confirm the average vertex of a part."""
+    return CONFIRMED_SHARE * _min_views(views, run)

@@ -26,17 +26,27 @@ def rank_neighbors(views: Sequence[View], count: int) -> list[list[int]]:
         views: all photos, with their sparse points.
         count: most neighbors per view.
     """
-    return [_rank(view, views, count) for view in views]
+    ids = np.concatenate([np.empty(0, np.int64), *(view.point_ids for view in views)])
+    order = np.argsort(ids, kind="stable")
+    seers = np.repeat(np.arange(len(views)), [len(view.point_ids) for view in views])[order]
+    ranked = ids[order]
+    found = []
+    for index, view in enumerate(views):
+        ends = zip(*(np.searchsorted(ranked, view.point_ids, side) for side in ("left", "right")), strict=True)
+        others, shared = np.unique(np.concatenate([seers[:0], *(seers[a:b] for a, b in ends)]), return_counts=True)
+        found.append(_rank(index, [k for k in others[shared >= MIN_SHARED_POINTS] if k != index], views, count))
+    return found
 
 
-def _rank(view: View, views: Sequence[View], count: int) -> list[int]:
+def _rank(index: int, others: Sequence[int], views: Sequence[View], count: int) -> list[int]:
+    """Return the best neighbors of a view among those that share points with it."""
+    view = views[index]
     weights: dict[int, FloatArray] = {}
-    for index, other in enumerate(views):
-        if other is view:
-            continue
-        shared = np.isin(view.point_ids, other.point_ids, assume_unique=True)
-        if np.count_nonzero(shared) >= MIN_SHARED_POINTS and not _is_same_place(view, other):
-            weights[index] = np.where(shared, point_weights(view, other, view.points), 0.0)
+    for number in map(int, others):
+        other = views[number]
+        if not _is_same_place(view, other):
+            shared = np.isin(view.point_ids, other.point_ids, assume_unique=True)
+            weights[number] = np.where(shared, point_weights(view, other, view.points), 0.0)
     value, chosen = np.ones(len(view.point_ids)), list[int]()
     while weights and len(chosen) < count:
         # ties go to the lower index, so that the choice never depends on the order of a dictionary

@@ -1,7 +1,8 @@
 """Texture of a surface, from the photos that show it best."""
 
 from sfm_app.texture.appearance.view_scoring import OcclusionTest
-from sfm_app.texture.assemble import ParallelMap, texture_surface
+from sfm_app.texture.assemble import texture_surface
+from sfm_app.texture.page_painting import ParallelMap
 from sfm_app.texture.store import Store
 from sfm_app.texture.views import PhotoView, part_view, photo_view
 

@@ -1,8 +1,7 @@
 """From a surface and photos to a textured surface: the steps of texturing in order."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,78 +11,22 @@ from sfm_app.geometry.triangles import select_faces
 from sfm_app.settings import TextureSettings
 from sfm_app.texture.appearance.exposure import photo_gains
 from sfm_app.texture.appearance.photo_consistency import outlier_mask
+from sfm_app.texture.appearance.sightings import Sightings, list_sightings
 from sfm_app.texture.appearance.view_scoring import FaceView, OcclusionTest, score_faces, sharpness_factors
-from sfm_app.texture.atlas import Pages
 from sfm_app.texture.blending import Blend, blend_weights
-from sfm_app.texture.charts import Charts, absorb_small_charts, make_charts
+from sfm_app.texture.blocks import block_of_faces, lay_out
+from sfm_app.texture.charts import absorb_small_charts, make_charts
 from sfm_app.texture.facets import NONE, Facets, IntArray, facets
-from sfm_app.texture.packing import Layout, pack
-from sfm_app.texture.painting import Canvas, canvas, fill_background, finish_page, paint
+from sfm_app.texture.page_painting import CheckedViews, ParallelMap, TexturePlan, paint_blocks
+from sfm_app.texture.painting import fill_background
 from sfm_app.texture.seam_leveling import level_seams
 from sfm_app.texture.store import Store
-from sfm_app.texture.unseen_faces import block_sizes, morton_order, square_texels, squares, vertex_colors
+from sfm_app.texture.unseen_faces import square_texels, vertex_colors
 from sfm_app.texture.view_selection import choose_photos
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import Model, Rejected, Surface, Texture
 
 FloatArray = NDArray[np.float64]
-ParallelMap = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
-"""Applies a function to all items, possibly in parallel, and returns results in order; the label names the progress."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FaceViews:
-    """The views of all triangles in all photos."""
-
-    worth: NDArray[np.float32]
-    """(P, T) pixels times cosine; 0 where a photo does not see a triangle."""
-    colors: NDArray[np.uint8]
-    """(P, T, 3)"""
-    sharpness: FloatArray
-    """(P,) from `FaceView`; 0 for photos that cannot be read."""
-    rejected: Sequence[Rejected | None]
-    """(P,) reason why a photo cannot be read, or None."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CheckedViews:
-    """The views of all triangles, weighted by sharpness, with gains and outliers."""
-
-    worth: NDArray[np.float32]
-    """(P, T) pixels times cosine times sharpness factor; 0 where a photo does not see a triangle, negative for
-    outliers, which show something other than the surface."""
-    colors: NDArray[np.uint8]
-    """(P, T, 3)"""
-    gains: FloatArray
-    """(P, 3)"""
-    outliers: int
-    """Number of outliers: views of triangles that show something other than the surface."""
-
-    @property
-    def usable(self) -> NDArray[np.bool_]:
-        """(P, T) whether a photo sees a triangle and shows the surface there."""
-        return np.asarray(self.worth > 0)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TexturePlan:
-    """Everything that is computed before photos are painted."""
-
-    mesh: Facets
-    seen: CheckedViews
-    chosen: IntArray
-    """(T,) photo of each triangle, -1 for none."""
-    charts: Charts
-    layout: Layout
-    corners: FloatArray
-    """(T, 3, 2) corners in texels, of the triangles that photos see."""
-    page: IntArray
-    """(T,) page of each triangle."""
-    squares: NDArray[np.int64]
-    """(U, 3) page, x, y of the squares of the triangles that no photo sees."""
-    blend: Blend
-    allowed_weight: NDArray[np.float32]
-    """(T, 3) sum of weights at each corner over the photos that may be used for the triangle."""
 
 
 def texture_surface(
@@ -110,137 +53,87 @@ def texture_surface(
     mesh = facets(surface)
     looks = _score_photos(views, mesh, store, hidden, spread)
     seen = _check_views(looks, mesh)
-    chosen = absorb_small_charts(choose_photos(seen.worth, mesh), seen.usable, mesh.neighbors)
+    chosen = absorb_small_charts(choose_photos(seen.all, mesh), seen.all, mesh.neighbors)
     unseen = chosen == NONE
     if options.unseen_faces == "cut" and not unseen.all():
         mesh = facets(select_faces(surface, ~unseen))
-        kept = ~unseen
-        seen = CheckedViews(seen.worth[:, kept], seen.colors[:, kept], seen.gains, seen.outliers)
-        chosen = chosen[kept]
+        seen, chosen = replace(seen, all=seen.all.select_triangles(~unseen)), chosen[~unseen]
     plan = _plan(mesh, seen, chosen, views, options)
-    canvases = [
-        canvas(size, np.flatnonzero((plan.page == page) & (chosen != NONE)), plan.corners)
-        for page, size in enumerate(plan.layout.sizes)
-    ]
-    pages = Pages(canvases, len(views), store)
-    work = partial(_paint_photo, plan=plan, views=views, store=store, pages=pages)
-    spread(work, [photo for photo, reason in enumerate(looks.rejected) if reason is None], "painting")
-    return _finish(plan, canvases), _figures(plan, views, looks.rejected, int(unseen.sum()))
+    rejected = [look if isinstance(look, Rejected) else None for look in looks]
+    painted = paint_blocks(plan, views, store, spread, [reason is None for reason in rejected])
+    return _finish(plan, painted), _figures(plan, views, rejected, int(unseen.sum()))
 
 
 def _score_photos(
     views: Sequence[PhotoView], mesh: Facets, store: Store, hidden: OcclusionTest, spread: ParallelMap
-) -> FaceViews:
-    shape = (len(views), len(mesh.faces))
-    worth, colors = np.zeros(shape, np.float32), np.zeros((*shape, 3), np.uint8)
-    sharpness = np.zeros(len(views))
+) -> list[FaceView | Rejected]:
+    def score(photo: int) -> FaceView | Rejected:
+        return _score_photo(f"look{photo}", views[photo], mesh, store, hidden)
 
-    def score(photo: int) -> Rejected | None:
-        found = _score_photo(f"look{photo}", views[photo], mesh, store, hidden)
-        if isinstance(found, Rejected):
-            return found
-        worth[photo], colors[photo], sharpness[photo] = found.worth, found.color, found.sharpness
-        return None
-
-    rejected = spread(score, range(len(views)), "looking at the surface")
-    return FaceViews(worth, colors, sharpness, rejected)
+    return spread(score, range(len(views)), "looking at the surface")
 
 
 def _score_photo(name: str, view: PhotoView, mesh: Facets, store: Store, hidden: OcclusionTest) -> FaceView | Rejected:
     kept = store.recall(name)
-    if kept is not None:
-        return FaceView(kept["worth"], kept["color"], float(kept["sharpness"]))
+    if kept is not None and "face" in kept:
+        return FaceView(kept["face"], kept["worth"], kept["color"], float(kept["sharpness"]))
     try:
         photo, used = store.photo(view), store.usable_pixels(view)
     except OSError as err:
         return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
     found = score_faces(view, photo, used, mesh, hidden)
-    store.keep(name, {"worth": found.worth, "color": found.color, "sharpness": np.array(found.sharpness)})
+    sharp = np.array(found.sharpness)
+    store.keep(name, {"face": found.face, "worth": found.worth, "color": found.color, "sharpness": sharp})
     return found
 
 
-def _check_views(looks: FaceViews, mesh: Facets) -> CheckedViews:
-    """Adjust the worths by sharpness, in place, estimate gains, and mark outliers by negative worths."""
-    worth, colors = looks.worth, looks.colors
-    read = looks.sharpness > 0
+def _check_views(looks: Sequence[FaceView | Rejected], mesh: Facets) -> CheckedViews:
+    """Adjust the worths by sharpness, estimate gains, and mark outliers by negative worths."""
+    found = [None if isinstance(look, Rejected) else look for look in looks]
+    sharpness = np.array([0.0 if look is None else look.sharpness for look in found])
+    read = sharpness > 0
     sharp = np.zeros(len(read))
-    sharp[read] = sharpness_factors(looks.sharpness[read])
-    worth *= sharp[:, None].astype(np.float32)
-    gains = photo_gains(colors, worth > 0)
-    strange = outlier_mask(colors, gains, worth > 0, mesh.neighbors)
-    worth[strange] *= -1.0
-    return CheckedViews(worth, colors, gains, int(strange.sum()))
+    sharp[read] = sharpness_factors(sharpness[read])
+    seen = list_sightings([look if use else None for look, use in zip(found, read, strict=True)], len(mesh.faces))
+    seen = seen.with_worth(seen.worth * sharp[seen.photo].astype(np.float32))
+    gains = photo_gains(seen)
+    strange = outlier_mask(seen, gains, mesh.neighbors)
+    return CheckedViews(seen.with_worth(np.where(strange, -seen.worth, seen.worth)), gains, int(strange.sum()))
 
 
 def _plan(
     mesh: Facets, seen: CheckedViews, chosen: IntArray, views: Sequence[PhotoView], options: TextureSettings
 ) -> TexturePlan:
-    charts = make_charts(chosen, np.array([view.row for view in views]), mesh, options.max_atlas_px / 2)
-    blocks = block_sizes(int((chosen == NONE).sum()))
-    layout, places = pack(charts, blocks, options.max_atlas_px, options.max_pages)
+    block_of = block_of_faces(mesh)
+    charts = make_charts(chosen, np.array([view.row for view in views]), mesh, options.max_atlas_px / 2, block_of)
+    layout, cells, block_of_page = lay_out(charts, block_of, mesh, options)
     corners, page = charts.corners * layout.scale, np.zeros(len(chosen), np.int32)
     drawn = chosen != NONE
     corners[drawn] += layout.shift[charts.chart_of_face[drawn]][:, None, :]
     page[drawn] = layout.page[charts.chart_of_face[drawn]]
-    cells = np.empty((int((~drawn).sum()), 3), np.int64)
-    cells[morton_order(mesh.vertices[mesh.faces[~drawn]].mean(axis=1))] = squares(places, blocks, len(cells))
     page[~drawn] = cells[:, 0]
-    blend = level_seams(blend_weights(chosen, seen.usable, mesh), seen.colors, seen.gains, seen.usable, mesh)
-    allowed = _allowed_weight(blend, seen.usable, chosen, mesh)
-    return TexturePlan(mesh, seen, chosen, charts, layout, corners, page, cells, blend, allowed)
+    blend = level_seams(blend_weights(chosen, seen.all, mesh), seen.all, seen.gains, mesh)
+    allowed = _allowed_weight(blend, seen.all, chosen, mesh)
+    return TexturePlan(mesh, seen, chosen, charts, layout, corners, page, block_of_page, cells, blend, allowed)
 
 
-def _paint_photo(photo: int, plan: TexturePlan, views: Sequence[PhotoView], store: Store, pages: Pages) -> None:
-    """Add one photo to all pages, unless they contain it; photos are read in parallel and painted one at a time."""
-    if pages.has[photo]:
-        return
-    triangles, shares = _shares(photo, plan)
-    if not len(triangles):
-        return
-    beside = plan.mesh.neighbors[triangles]
-    rims = (beside == NONE) | (plan.seen.worth[photo, beside] == 0)
-    view, scale = views[photo], plan.layout.scale
-    if scale < 1.0:
-        view = view.with_size(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
-    pixels, points = store.photo(view), plan.mesh.vertices[plan.mesh.faces[triangles]]
-    with pages.lock_canvases(photo) as canvases:
-        for number, page in enumerate(canvases):
-            there = plan.page[triangles] == number
-            what = triangles[there], plan.corners, points[there], shares[there], rims[there]
-            paint(pixels, view.row, 1.0 / plan.seen.gains[photo], *what, page.owner, page.total)
-
-
-def _shares(photo: int, plan: TexturePlan) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the triangles that a photo contributes to, and its weight and offsets (N, 3, 4) at their corners."""
-    mesh, part = plan.mesh, plan.blend.photo_rows(photo)
-    weight = np.zeros(len(mesh.vertices), np.float32)
-    offset = np.zeros((len(mesh.vertices), 3), np.float32)
-    weight[plan.blend.vertex[part]], offset[plan.blend.vertex[part]] = plan.blend.weight[part], plan.blend.offset[part]
-    own = plan.chosen == photo
-    allowed = ((plan.seen.worth[photo] > 0) | own) & (plan.chosen != NONE)
-    shares = np.where(allowed[:, None], weight[mesh.faces], 0.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        shares = np.where(plan.allowed_weight > 0, shares / plan.allowed_weight, own[:, None]).astype(np.float32)
-    triangles = np.flatnonzero((shares > 0).any(axis=1))
-    return triangles, np.concatenate([shares[triangles][:, :, None], offset[mesh.faces[triangles]]], axis=2)
-
-
-def _allowed_weight(blend: Blend, usable: NDArray[np.bool_], chosen: IntArray, mesh: Facets) -> NDArray[np.float32]:
+def _allowed_weight(blend: Blend, seen: Sightings, chosen: IntArray, mesh: Facets) -> NDArray[np.float32]:
     total = np.zeros(mesh.faces.shape, np.float32)
     weight = np.zeros(len(mesh.vertices), np.float32)
-    for photo in range(len(usable)):
+    for photo in range(seen.photos):
         part = blend.photo_rows(photo)
+        near = mesh.faces_at(blend.vertex[part])
+        near = near[seen.is_usable(photo, near) | (chosen[near] == photo)]
         weight[blend.vertex[part]] = blend.weight[part]
-        allowed = usable[photo] | (chosen == photo)
-        total += np.where(allowed[:, None], weight[mesh.faces], 0.0)
+        total[near] += weight[mesh.faces[near]]
         weight[blend.vertex[part]] = 0.0
     return total
 
 
-def _finish(plan: TexturePlan, canvases: Sequence[Canvas]) -> Model:
+def _finish(plan: TexturePlan, finished: Sequence[tuple[NDArray[np.uint8], NDArray[np.bool_]]]) -> Model:
     """Round the pages, color triangles that no photo sees, and fill the space between charts."""
     drawn = plan.chosen != NONE
-    pages, painted = (list(part) for part in zip(*(finish_page(page) for page in canvases), strict=True))
+    pages, painted = (list(part) for part in zip(*finished, strict=True))
     corner_colors = np.zeros((len(drawn), 3, 3))
     for number, page in enumerate(pages):
         there = np.flatnonzero(drawn & (plan.page == number))

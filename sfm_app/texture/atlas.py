@@ -20,12 +20,12 @@ MOST_OF_THE_TIME = 0.05
 class Pages:
     """Canvases with sums over photos; sums of integers do not depend on the order of the photos."""
 
-    def __init__(self, canvases: Sequence[Canvas], photos: int, store: Store) -> None:
-        """Fill empty canvases from the checkpoint of a killed run."""
+    def __init__(self, canvases: Sequence[Canvas], photos: int, store: Store, block: int = 0) -> None:
+        """Fill empty canvases from the checkpoint of a killed run, if it was at this block."""
         self.canvases, self.has = canvases, np.zeros(photos, np.bool_)
-        self._store, self._lock = store, Lock()
+        self._store, self._lock, self._block = store, Lock(), block
         kept = store.recall(GROUP_NAME)
-        if kept is not None:
+        if kept is not None and kept.get("block") == block:
             self.has[:] = kept["has"]
             for number, page in enumerate(canvases):
                 page.total[:] = kept[f"page{number}"]
@@ -43,6 +43,6 @@ class Pages:
     def _keep(self) -> None:
         start = time.monotonic()
         totals = {f"page{number}": page.total for number, page in enumerate(self.canvases)}
-        self._store.keep(GROUP_NAME, {"has": self.has, **totals})
+        self._store.keep(GROUP_NAME, {"block": np.array(self._block), "has": self.has, **totals})
         end = time.monotonic()
         self._due_s = end + max(EVERY_S, (end - start) / MOST_OF_THE_TIME)

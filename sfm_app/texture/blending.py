@@ -10,9 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.texture.facets import NONE, Facets, IntArray, sum_at_vertices
+from sfm_app.texture.appearance.sightings import Sightings
+from sfm_app.texture.facets import NONE, Facets, IntArray
 
 FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
 
 RINGS = 3
 """Rings of vertices on either side of a seam over which photos are blended."""
@@ -38,35 +40,60 @@ class Blend:
         return slice(int(self.starts[photo]), int(self.starts[photo + 1]))
 
 
-def blend_weights(chosen: IntArray, usable: NDArray[np.bool_], mesh: Facets) -> Blend:
+def blend_weights(chosen: IntArray, seen: Sightings, mesh: Facets) -> Blend:
     """Compute weights of the photos that blend them across seams.
 
     Args:
         chosen: (T,) photo of each triangle, -1 for none.
-        usable: (P, T) whether a photo may be used for a triangle.
+        seen: which photos see which triangles; not used where the worth is negative.
         mesh: the surface.
     """
     size = len(mesh.vertices)
-    valence = np.maximum(sum_at_vertices(np.ones(len(chosen)), mesh.faces, size), 1.0)
     degree = np.maximum(np.bincount(mesh.edges.ravel(), minlength=size), 1)
+    order = np.argsort(chosen, kind="stable")
+    starts = np.searchsorted(chosen[order], np.arange(seen.photos + 1))
     vertices, weights = [], []
-    for photo in range(len(usable)):
-        own = chosen == photo
-        allowed = usable[photo] | own | (chosen == NONE)
-        barred = sum_at_vertices((~allowed).astype(np.float64), mesh.faces, size) > 0
-        share = sum_at_vertices(own.astype(np.float64), mesh.faces, size) / valence
-        for _ in range(RINGS):
-            share = np.where(barred, 0.0, _spread(share, mesh.edges, degree))
-        at = np.flatnonzero(share > FAINT)
-        vertices.append(at)
-        weights.append(share[at])
-    starts = np.concatenate([[0], np.cumsum([len(at) for at in vertices])]).astype(np.int64)
+    for photo in range(seen.photos):
+        own = order[starts[photo] : starts[photo + 1]]
+        at, share = _photo_weights(photo, own, chosen, seen, mesh, degree)
+        vertices.append(at[share > FAINT])
+        weights.append(share[share > FAINT])
+    rows = np.concatenate([[0], np.cumsum([len(at) for at in vertices])]).astype(np.int64)
     vertex, weight = np.concatenate(vertices).astype(np.int64), np.concatenate(weights)
     total = np.bincount(vertex, weight, size)
-    return Blend(starts, vertex, (weight / total[vertex]).astype(np.float32), np.zeros((len(vertex), 3), np.float32))
+    return Blend(rows, vertex, (weight / total[vertex]).astype(np.float32), np.zeros((len(vertex), 3), np.float32))
 
 
-def _spread(share: FloatArray, edges: NDArray[np.int64], degree: NDArray[np.int64]) -> FloatArray:
+def _photo_weights(
+    photo: int, own: IndexArray, chosen: IntArray, seen: Sightings, mesh: Facets, degree: IndexArray
+) -> tuple[IndexArray, FloatArray]:
+    """Return the vertices (N,) to which the share of a photo spreads, ascending, and its share (N,) at each.
+
+    Args:
+        photo: its number.
+        own: (M,) triangles that it colors, ascending.
+        chosen: (T,) photo of each triangle.
+        seen: which photos see which triangles.
+        mesh: the surface.
+        degree: (V,) number of edges at each vertex.
+    """
+    at = np.unique(mesh.faces[own])
+    for _ in range(RINGS):
+        at = np.unique(mesh.faces[mesh.faces_at(at)])
+    near = mesh.faces_at(at)
+    allowed = np.isin(near, seen.usable_faces(photo), assume_unique=True) | np.isin(chosen[near], (photo, NONE))
+    corners = np.searchsorted(at, mesh.faces[near][~allowed].ravel()).clip(max=max(len(at) - 1, 0))
+    barred = np.zeros(len(at), np.bool_)
+    barred[corners[at[corners] == mesh.faces[near][~allowed].ravel()]] = True
+    count = np.bincount(np.searchsorted(at, mesh.faces[own].ravel()), minlength=len(at)).astype(np.float64)
+    share = count / np.maximum(mesh.valence[at], 1.0)
+    edges = np.searchsorted(at, mesh.edges[mesh.edges_among(at)])
+    for _ in range(RINGS):
+        share = np.where(barred, 0.0, _spread(share, edges, degree[at]))
+    return at, share
+
+
+def _spread(share: FloatArray, edges: IndexArray, degree: IndexArray) -> FloatArray:
     """Average each value with the mean of its neighboring vertices."""
     one, other = edges[:, 0], edges[:, 1]
     around = np.bincount(one, share[other], len(share)) + np.bincount(other, share[one], len(share))

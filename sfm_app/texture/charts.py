@@ -10,16 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
+from sfm_app.texture.appearance.sightings import Sightings
 from sfm_app.texture.facets import NONE, Facets, IntArray
 from sfm_app.texture.views import project
 
 FloatArray = NDArray[np.float64]
+Views = tuple[NDArray[np.int64], NDArray[np.int64], IntArray, NDArray[np.float32]]
+"""The views by triangle, for kernels: starts, rows, photo and worth of each row."""
 
 MOST_LAYERS = 4
 """Layers of overlapping triangles that are separated; further ones share their pixels."""
 SMALL = 12
 """Charts of fewer triangles take the photo of a neighboring chart, if it sees them."""
 ROUNDS = 3
+LAYER_BITS, BLOCK_BITS = 40, 44
+"""Bits of a group's number above which the layer and the block are counted. By definition."""
 EDGE = 1e-6
 """Points with a smaller barycentric coordinate count as on the edge."""
 
@@ -36,7 +41,7 @@ class Charts:
     """(T, 3, 2) corners in the photo, in pixels."""
 
 
-def make_charts(chosen: IntArray, cameras: FloatArray, mesh: Facets, tile_px: float) -> Charts:
+def make_charts(chosen: IntArray, cameras: FloatArray, mesh: Facets, tile_px: float, block_of: IntArray) -> Charts:
     """Build charts from one photo per triangle.
 
     Args:
@@ -44,17 +49,19 @@ def make_charts(chosen: IntArray, cameras: FloatArray, mesh: Facets, tile_px: fl
         cameras: (P, 26) from `PhotoView.row`.
         mesh: the surface.
         tile_px: charts are cut at multiples of this in the photo, so that each fits on a page.
+        block_of: (T,) block of each triangle; no chart lies in two.
     """
     corners = np.zeros((len(mesh.faces), 3, 2))
     _project_corners(chosen, cameras, mesh.vertices, mesh.faces, corners)
     tiles = np.floor(corners.mean(axis=1) / tile_px).astype(np.int64)
     group = np.where(chosen == NONE, NONE, (chosen * 4096 + tiles[:, 1]) * 4096 + tiles[:, 0])
+    group = np.where(chosen == NONE, NONE, group + (block_of.astype(np.int64) << BLOCK_BITS))
     of, count = components(group, mesh.neighbors)
     for layer in range(1, MOST_LAYERS):
         folded = folds(of, count, corners)
         if not folded.any():
             break
-        group[folded] += layer << 40
+        group[folded] += layer << LAYER_BITS
         of, count = components(group, mesh.neighbors)
     photo = np.full(count, NONE, np.int32)
     photo[of[of != NONE]] = chosen[of != NONE]
@@ -118,21 +125,22 @@ def components(group: NDArray[np.int64], neighbors: IntArray) -> tuple[IntArray,
     return of, _flood(group, neighbors, of)
 
 
-def absorb_small_charts(chosen: IntArray, usable: NDArray[np.bool_], neighbors: IntArray) -> IntArray:
+def absorb_small_charts(chosen: IntArray, seen: Sightings, neighbors: IntArray) -> IntArray:
     """Give small charts the photo of a neighboring chart that may be used for all their triangles.
 
     Args:
         chosen: (T,) photo of each triangle, -1 for none.
-        usable: (P, T) whether a photo may be used for a triangle.
+        seen: which photos see which triangles; not used where the worth is negative.
         neighbors: (T, 3) triangle across each edge, -1 for none.
     """
     chosen = chosen.copy()
+    views = seen.face_starts, seen.face_rows, seen.photo, seen.worth
     for _ in range(ROUNDS):
         of, count = components(chosen.astype(np.int64), neighbors)
         sizes = np.bincount(of[of != NONE], minlength=count)
         order = np.argsort(of, kind="stable").astype(np.int32)
         starts = np.concatenate([[0], np.cumsum(sizes)]) + int(np.count_nonzero(of == NONE))
-        if not _absorb(sizes, starts, order, usable, neighbors, chosen):
+        if not _absorb(sizes, starts, order, views, neighbors, chosen):
             break
     return chosen
 
@@ -177,34 +185,48 @@ def _absorb(
     sizes: NDArray[np.int64],
     starts: NDArray[np.int64],
     order: IntArray,
-    usable: NDArray[np.bool_],
+    views: Views,
     neighbors: IntArray,
     chosen: IntArray,
 ) -> int:
     """Give small components the neighboring photo with the longest common border; return how many changed."""
     absorbed = 0
-    border = np.zeros(len(usable), np.int64)
+    around = np.empty(3 * SMALL, np.int64)
     for c in range(len(sizes)):
         if sizes[c] >= SMALL:
             continue
-        border[:] = 0
+        count = 0
         own = chosen[order[starts[c]]]
         for at in range(starts[c], starts[c + 1]):
             for k in range(3):
                 g = neighbors[order[at], k]
                 if g != NONE and chosen[g] != NONE and chosen[g] != own:
-                    border[chosen[g]] += 1
-        best = NONE
-        for p in range(len(usable)):
-            if border[p] == 0 or (best != NONE and border[p] <= border[best]):
+                    around[count] = chosen[g]
+                    count += 1
+        best, longest = NONE, 0
+        for k in range(count):
+            p, border = around[k], 0
+            for j in range(count):
+                border += around[j] == p
+            if border < longest or (border == longest and p >= best):
                 continue
             possible = True
             for at in range(starts[c], starts[c + 1]):
-                possible = possible and usable[p, order[at]]
+                possible = possible and _is_usable(views, p, order[at])
             if possible:
-                best = p
+                best, longest = p, border
         if best != NONE:
             for at in range(starts[c], starts[c + 1]):
                 chosen[order[at]] = best
             absorbed += 1
     return absorbed
+
+
+@kernel
+def _is_usable(views: Views, photo: int, face: int) -> bool:
+    """Return whether a photo sees a triangle and shows the surface there."""
+    starts, rows, photos, worth = views
+    for row in rows[starts[face] : starts[face + 1]]:
+        if photos[row] == photo:
+            return bool(worth[row] > 0)
+    return False

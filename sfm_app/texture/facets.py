@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.culling import Clusters, cluster
 from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
@@ -24,6 +25,12 @@ class Facets:
     """(E, 2) vertices of every edge, each once, smaller first."""
     spacing: float
     """Median length of an edge."""
+    clusters: Clusters
+    """The triangles in clusters of neighbors."""
+    fan_starts: NDArray[np.int64]
+    """(V + 1,) the triangles at vertex v are fans[fan_starts[v]] to fans[fan_starts[v + 1] - 1]."""
+    fans: NDArray[np.int64]
+    """(3 T,)"""
 
     @property
     def vertices(self) -> FloatArray:
@@ -34,6 +41,23 @@ class Facets:
     def faces(self) -> NDArray[np.int64]:
         """(T, 3) vertex indices."""
         return self.surface.faces
+
+    @property
+    def valence(self) -> NDArray[np.int64]:
+        """(V,) number of triangles at each vertex."""
+        return np.asarray(np.diff(self.fan_starts))
+
+    def faces_at(self, vertices: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return (M,) the triangles at some vertices (N,), each once, ascending."""
+        return np.unique(self.fans[ranges(self.fan_starts[vertices], self.fan_starts[vertices + 1])])
+
+    def edges_among(self, vertices: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return (M,) the edges between vertices (N,) of a set, ascending; the vertices ascend."""
+        first, end = (np.searchsorted(self.edges[:, 0], vertices, side) for side in ("left", "right"))
+        found = ranges(first, end)
+        other = self.edges[found, 1]
+        at = np.minimum(np.searchsorted(vertices, other), max(len(vertices) - 1, 0))
+        return np.asarray(found[vertices[at] == other]) if len(found) else found
 
 
 def facets(surface: Surface) -> Facets:
@@ -50,7 +74,22 @@ def facets(surface: Surface) -> Facets:
     edges = np.column_stack(np.divmod(ranked[first], np.int64(max(len(surface.vertices), 1))))
     lengths = np.linalg.norm(surface.vertices[edges[:, 0]] - surface.vertices[edges[:, 1]], axis=1)
     spacing = float(np.median(lengths)) if len(lengths) else 0.0
-    return Facets(surface, neighbors.reshape(-1, 3), edges, spacing)
+    fans = np.argsort(starts, kind="stable") // 3
+    fan_starts = np.concatenate([[0], np.cumsum(np.bincount(starts, minlength=len(surface.vertices)))])
+    near = cluster(surface.vertices[surface.faces])
+    return Facets(surface, neighbors.reshape(-1, 3), edges, spacing, near, fan_starts.astype(np.int64), fans)
+
+
+def ranges(starts: NDArray[np.int64], ends: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return (M,) the numbers from each start (N,) up to, but without, its end (N,), one after the other.
+
+    Args:
+        starts: (N,) first number of each range.
+        ends: (N,) number after the last of each range.
+    """
+    counts = ends - starts
+    total = np.cumsum(counts)
+    return np.asarray(np.arange(total[-1] if len(total) else 0) + np.repeat(starts - total + counts, counts))
 
 
 def sum_at_vertices(values: FloatArray, faces: NDArray[np.int64], size: int) -> FloatArray:

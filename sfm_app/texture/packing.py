@@ -41,7 +41,9 @@ class Layout:
     """(width, height) of each page."""
 
 
-def pack(charts: Charts, blocks: IntArray, max_atlas_px: int, max_pages: int) -> tuple[Layout, IntArray]:
+def pack(
+    charts: Charts, blocks: IntArray, max_atlas_px: int, max_pages: int, largest_scale: float = 1.0
+) -> tuple[Layout, IntArray]:
     """Place charts and additional rectangles on few pages; reduce the scale of the charts if they do not fit.
 
     Args:
@@ -49,11 +51,12 @@ def pack(charts: Charts, blocks: IntArray, max_atlas_px: int, max_pages: int) ->
         blocks: (B, 2) widths and heights of rectangles in texels, which are never scaled.
         max_atlas_px: longest side of a page.
         max_pages: largest number of pages, exceeded only if the charts do not fit at `LEAST_SCALE`.
+        largest_scale: most texels per pixel of the photos.
 
     Returns:
         The layout of the charts, and (B, 3) page, x and y of the rectangles.
     """
-    scale = min(1.0, float(np.sqrt(FILL * max_pages * max_atlas_px**2 / max(_area(charts), 1.0))))
+    scale = min(largest_scale, float(np.sqrt(FILL * max_pages * max_atlas_px**2 / max(_area(charts), 1.0))))
     while True:
         placed = _try_to_pack(charts, blocks, scale, max_atlas_px, max_pages)
         if placed is not None:

@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.texture.appearance.sightings import Sightings
 from sfm_app.texture.blending import Blend
-from sfm_app.texture.facets import Facets, sum_at_vertices
+from sfm_app.texture.facets import NONE, Facets
 
 FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
 
 STIFFNESS = 4.0
 """Weight of differences of offsets along a chart, relative to 1 for differences at seams."""
@@ -19,19 +21,16 @@ RESIDUAL_TOLERANCE = 1e-2
 """Norm of the preconditioned residual at which the solver stops, relative to its initial value."""
 
 
-def level_seams(
-    blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: NDArray[np.bool_], mesh: Facets
-) -> Blend:
+def level_seams(blend: Blend, seen: Sightings, gains: FloatArray, mesh: Facets) -> Blend:
     """Estimate the offsets of a blend by least squares.
 
     Args:
         blend: weights of the photos at the vertices.
-        colors: (P, T, 3) RGB of the triangles in the photos.
+        seen: which photos see which triangles, in which colors; not used where the worth is negative.
         gains: (P, 3) of the photos.
-        usable: (P, T) whether a photo may be used for a triangle.
         mesh: the surface.
     """
-    first, second, gap = _gaps(blend, colors, gains, usable, mesh)
+    first, second, gap = _gaps(blend, seen, gains, mesh)
     start, end = _ties(blend, mesh)
     right = np.zeros((len(blend.vertex), 3))
     for channel in range(3):
@@ -84,7 +83,7 @@ def _ratio(above: FloatArray, below: FloatArray) -> FloatArray:
 
 
 def _gaps(
-    blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: NDArray[np.bool_], mesh: Facets
+    blend: Blend, seen: Sightings, gains: FloatArray, mesh: Facets
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
     """Find nodes where two photos meet at a vertex, and their color differences.
 
@@ -94,24 +93,49 @@ def _gaps(
         (M,) node, (M,) node of the largest weight at its vertex, and (M, 3) color of the latter minus the former.
     """
     others, heads = _seam_pairs(blend, len(mesh.vertices))
-    photo_of = np.repeat(np.arange(len(usable)), np.diff(blend.starts))
+    photo_of = np.repeat(np.arange(seen.photos), np.diff(blend.starts))
+    order = np.argsort(photo_of[others], kind="stable")
+    starts = np.searchsorted(photo_of[others][order], np.arange(seen.photos + 1))
+    head_photo = np.full(len(mesh.vertices), NONE, np.int64)
+    place = np.zeros(len(mesh.vertices), np.int64)
     gaps = np.full((len(others), 3), np.nan)
-    for photo in range(len(usable)):
-        rows = np.flatnonzero(photo_of[others] == photo)
-        head_photo = np.full(len(mesh.vertices), -1, np.int64)
-        head_photo[blend.vertex[others[rows]]] = photo_of[heads[rows]]
-        near = np.flatnonzero(usable[photo] & (head_photo[mesh.faces] >= 0).any(axis=1))
-        corners = mesh.faces[near]
-        head = head_photo[corners]
-        both = (head >= 0) & usable[head, near[:, None]]
-        difference = colors[head, near[:, None]] / gains[head] - (colors[photo, near] / gains[photo])[:, None]
+    for photo in range(seen.photos):
+        rows = order[starts[photo] : starts[photo + 1]]
         at = blend.vertex[others[rows]]
-        count = sum_at_vertices(both.astype(np.float64), corners, len(mesh.vertices))[at]
-        for channel in range(3):
-            total = sum_at_vertices(np.where(both, difference[..., channel], 0.0), corners, len(mesh.vertices))[at]
-            gaps[rows, channel] = np.divide(total, count, out=np.full(len(rows), np.nan), where=count > 0)
+        head_photo[at], place[at] = photo_of[heads[rows]], np.arange(len(rows))
+        around = mesh.faces_at(at)
+        near = around[seen.is_usable(photo, around)]
+        corners = head_photo[mesh.faces[near]], place[mesh.faces[near]]
+        gaps[rows] = _photo_gaps(photo, near, corners, seen, gains, len(rows))
+        head_photo[at] = NONE
     known = np.isfinite(gaps[:, 0])
     return others[known], heads[known], gaps[known]
+
+
+def _photo_gaps(
+    photo: int, near: IndexArray, corners: tuple[IndexArray, IndexArray], seen: Sightings, gains: FloatArray, size: int
+) -> FloatArray:
+    """Return (size, 3) mean color of other photos at vertices minus that of one photo; NaN where unknown.
+
+    Args:
+        photo: number of the one photo.
+        near: (M,) triangles that it may be used for.
+        corners: (M, 3) the other photo at each corner, -1 for none; and (M, 3) number of the vertex there.
+        seen: views of triangles in photos.
+        gains: (P, 3) of the photos.
+        size: number of vertices.
+    """
+    head, place = corners
+    row = seen.find(head, np.where(head == NONE, NONE, near[:, None]))
+    both = (row != NONE) & (seen.worth[row] > 0)
+    own = seen.colors[seen.find(photo, near)] / gains[photo]
+    difference = seen.colors[row] / gains[head] - own[:, None]
+    count = np.bincount(place[both], minlength=size)
+    found = np.full((size, 3), np.nan)
+    for channel in range(3):
+        total = np.bincount(place[both], difference[..., channel][both], size)
+        np.divide(total, count, out=found[:, channel], where=count > 0)
+    return found
 
 
 def _seam_pairs(blend: Blend, size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -131,10 +155,9 @@ def _ties(blend: Blend, mesh: Facets) -> tuple[NDArray[np.int64], NDArray[np.int
     node = np.full(len(mesh.vertices), -1, np.int64)
     for photo in range(len(blend.starts) - 1):
         part = blend.photo_rows(photo)
-        node[blend.vertex[part]] = np.arange(part.start, part.stop)
-        ends = node[mesh.edges]
-        both = (ends >= 0).all(axis=1)
-        start.append(ends[both, 0])
-        end.append(ends[both, 1])
-        node[blend.vertex[part]] = -1
+        vertices = blend.vertex[part]
+        node[vertices] = np.arange(part.start, part.stop)
+        ends = node[mesh.edges[mesh.edges_among(vertices)]]
+        start.append(ends[:, 0])
+        end.append(ends[:, 1])
     return np.concatenate(start), np.concatenate(end)

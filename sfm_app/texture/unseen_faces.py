@@ -12,7 +12,6 @@ CELL = 2
 """Side of the square of an unseen triangle, in texels; bilinear interpolation inside it is exact."""
 BLOCK = 64
 """Largest number of squares along a side of a block."""
-CURVE_BITS = 12
 PRIOR_WEIGHT = 1e-4
 """Weight of the previous color of an unseen vertex, relative to 1 per neighbor, for parts that no photo sees."""
 
@@ -76,21 +75,6 @@ def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int)
         row, column = np.divmod(np.arange(count), width // CELL)
         found.append(np.column_stack([np.full(count, page), left + CELL * column, top + CELL * row]))
     return np.concatenate(found).astype(np.int64) if found else np.empty((0, 3), np.int64)
-
-
-def morton_order(points: FloatArray) -> NDArray[np.int64]:
-    """Return the Morton order (N,) of points (N, 3), in which nearby points are mostly adjacent (Morton 1966).
-
-    Adjacent squares then have similar colors, and lossy compression of the page does little harm.
-    """
-    low = points.min(axis=0, initial=np.inf)
-    span = max(float(np.max(points.max(axis=0, initial=-np.inf) - low, initial=0.0)), 1e-300)
-    grid = ((points - low) / span * (2**CURVE_BITS - 1)).astype(np.int64)
-    code = np.zeros(len(points), np.int64)
-    for bit in range(CURVE_BITS):
-        for axis in range(3):
-            code |= ((grid[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
 
 
 def square_texels(corner_colors: FloatArray) -> NDArray[np.uint8]:

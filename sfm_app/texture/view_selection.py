@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
+from sfm_app.texture.appearance.sightings import Sightings
 from sfm_app.texture.facets import NONE, Facets, IntArray
 
 FloatArray = NDArray[np.float64]
@@ -23,20 +24,19 @@ ROUNDS = 12
 TINY = 1e-30
 
 
-def choose_photos(worth: NDArray[np.float32], mesh: Facets) -> IntArray:
+def choose_photos(seen: Sightings, mesh: Facets) -> IntArray:
     """Choose the photo that colors each triangle.
 
     Args:
-        worth: (P, T) of each photo for each triangle, at most 0 where it must not be used.
+        seen: which photos see which triangles; not used where the worth is negative.
         mesh: the surface.
 
     Returns:
         (T,) index of a photo, -1 where none may be used.
     """
-    photos, triangles = worth.shape
-    kept = min(CANDIDATES, photos)
+    triangles, kept = seen.triangles, min(CANDIDATES, seen.photos)
     labels, values = np.full((triangles, kept), NONE, np.int32), np.zeros((triangles, kept), np.float32)
-    _keep_best(worth, labels, values)
+    _keep_best(seen.starts, seen.face, seen.worth, labels, values)
     lost = np.log(np.maximum(values[:, :1], TINY) / np.maximum(values, TINY))
     cost = (PRICE_OF_DETAIL * _relative_size(mesh)[:, None] * np.minimum(lost, MAX_LOSS)).astype(np.float32)
     price = _edge_prices(mesh)
@@ -75,19 +75,21 @@ def _reverse_edge_indices(neighbors: IntArray) -> IntArray:
 
 
 @kernel
-def _keep_best(worth: NDArray[np.float32], labels: IntArray, values: NDArray[np.float32]) -> None:
+def _keep_best(
+    starts: NDArray[np.int64], face: IntArray, worth: NDArray[np.float32], labels: IntArray, values: NDArray[np.float32]
+) -> None:
     """Keep the photos of largest worth for each triangle, best first; ties go to the lower index."""
-    photos, triangles = worth.shape
     kept = labels.shape[1]
-    for p in range(photos):
-        for f in range(triangles):
-            if worth[p, f] <= values[f, kept - 1]:
+    for p in range(len(starts) - 1):
+        for row in range(starts[p], starts[p + 1]):
+            f = face[row]
+            if worth[row] <= values[f, kept - 1]:
                 continue
             at = kept - 1
-            while at > 0 and worth[p, f] > values[f, at - 1]:
+            while at > 0 and worth[row] > values[f, at - 1]:
                 values[f, at], labels[f, at] = values[f, at - 1], labels[f, at - 1]
                 at -= 1
-            values[f, at], labels[f, at] = worth[p, f], p
+            values[f, at], labels[f, at] = worth[row], p
 
 
 @kernel

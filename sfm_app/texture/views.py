@@ -1,6 +1,7 @@
 """Views for texturing: lens and pose of a photo, and kernels that project and sample."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ LENS, KIND, LIMIT, POSE = 12, 12, 13, 14
 """A camera row begins with the parameters of COLMAP's FULL_OPENCV or THIN_PRISM_FISHEYE: fx, fy, cx, cy, k1, k2, p1,
 p2, k3, k4, then k5, k6 or sx1, sy1. The kind of lens follows, the squared radius before distortion up to which it
 shows anything, and the pose [R | t]."""
+ANGLES, TURNS = 360, 720
+"""Rays on which the widest angle of a photo is looked for: half a degree apart from its axis, and around it."""
 OPENCV, RATIONAL, ANGULAR = 0.0, 1.0, 2.0
 """Kinds of lenses: polynomial and rational perspective ones, and fisheyes."""
 KINDS = {
@@ -64,6 +67,16 @@ class PhotoView:
     def center(self) -> FloatArray:
         """(3,) center of projection in the world."""
         return np.asarray(-self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3], np.float64)
+
+    @property
+    def axis(self) -> FloatArray:
+        """(3,) unit vector along which it looks, in the world."""
+        return np.asarray(self.cam_from_world[2, :3], np.float64)
+
+    @property
+    def widest_angle(self) -> float:
+        """Upper bound in radians of the angle between the axis and what the photo shows."""
+        return _widest_angle(self.lens, self.kind, self.limit, self.width, self.height)
 
     def with_size(self, width: int, height: int) -> "PhotoView":
         """Return the same view for a photo of another size.
@@ -116,6 +129,27 @@ def _shown_limit(lens: FloatArray, kind: float, width: int, height: int) -> floa
     reach = float(np.linalg.norm(corners, axis=1).max())
     angle = shown_angle(lens, FISHEYE if kind == ANGULAR else PERSPECTIVE, reach)
     return float(angle if kind == ANGULAR else np.tan(angle)) ** 2
+
+
+@cache
+def _widest_angle(lens: tuple[float, ...], kind: float, limit: float, width: int, height: int) -> float:
+    """Return the largest angle from the axis that a photo shows, found on rays all round, and two steps more."""
+    row = PhotoView("", lens, np.eye(3, 4), width, height, kind, limit).row
+    return min(np.pi, _largest_shown(row, width, height) + 2.0 * np.pi / ANGLES)
+
+
+@kernel
+def _largest_shown(camera: FloatArray, width: float, height: float) -> float:
+    largest = 0.0
+    for j in range(TURNS):
+        turn = 2.0 * np.pi * j / TURNS
+        for i in range(ANGLES):
+            angle = np.pi * (i + 1) / ANGLES
+            side = np.sin(angle)
+            x, y, depth = project(camera, side * np.cos(turn), side * np.sin(turn), np.cos(angle))
+            if depth > 0.0 and 0.0 <= x <= width and 0.0 <= y <= height:
+                largest = max(largest, angle)
+    return largest
 
 
 @kernel

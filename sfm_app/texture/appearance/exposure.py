@@ -11,11 +11,15 @@ from numpy.typing import NDArray
 from sfm_app.geometry.spd_solve import solve_positive
 from sfm_app.jit import kernel
 from sfm_app.texture.appearance.median import median
+from sfm_app.texture.appearance.sightings import Sightings
+from sfm_app.texture.facets import ranges
 
 FloatArray = NDArray[np.float64]
 
 SAMPLES = 30_000
 """Approximate number of sampled triangles, evenly spaced."""
+SAMPLES_PER_PHOTO = 100
+"""Triangles for each photo of a large set. Chosen by hand: a third of what each of a hundred photos has."""
 DARKEST, BRIGHTEST = 8, 247
 """Gray levels outside this range are nearly clipped and do not determine the gain."""
 NOISE = 0.05
@@ -25,33 +29,36 @@ PRIOR = 0.01
 """Weight of "no gain", as a share of the mean weight of a photo: keeps undetermined gains at 1."""
 
 
-def photo_gains(colors: NDArray[np.uint8], seen: NDArray[np.bool_]) -> FloatArray:
+def photo_gains(seen: Sightings) -> FloatArray:
     """Estimate the gain of every photo and channel; the geometric mean of the gains is 1.
 
     Args:
-        colors: (P, T, 3) RGB of the triangles in the photos.
-        seen: (P, T) whether a photo sees a triangle.
+        seen: which photos see which triangles, in which colors.
 
     Returns:
         (P, 3) gains; dividing a photo by its gains makes it consistent with the others.
     """
-    shared = np.flatnonzero(seen.sum(axis=0) > 1)
-    picked = shared[:: max(1, len(shared) // SAMPLES)]
-    gains = np.zeros((len(colors), 3))
+    counts = np.diff(seen.face_starts)
+    shared = np.flatnonzero(counts > 1)
+    samples = max(SAMPLES, SAMPLES_PER_PHOTO * seen.photos)
+    picked = shared[:: max(1, len(shared) // samples)]
+    rows = seen.face_rows[ranges(seen.face_starts[picked], seen.face_starts[picked + 1])]
+    starts = np.concatenate([[0], np.cumsum(counts[picked])]).astype(np.int64)
+    photo = seen.photo[rows].astype(np.int64)
+    gains = np.zeros((seen.photos, 3))
     for channel in range(3):
-        values = colors[:, picked, channel].T
-        usable = seen[:, picked].T & (values >= DARKEST) & (values <= BRIGHTEST)
-        logs = np.where(usable, np.log(np.maximum(values, 1).astype(np.float64)), 0.0)
-        gains[:, channel] = _log_gains(logs, usable)
+        values = seen.colors[rows, channel]
+        usable = (values >= DARKEST) & (values <= BRIGHTEST)
+        left = np.concatenate([[0], np.cumsum(usable)])[starts]
+        gains[:, channel] = _log_gains(np.log(values[usable].astype(np.float64)), photo[usable], left, seen.photos)
     return np.exp(gains)
 
 
-def _log_gains(logs: FloatArray, usable: NDArray[np.bool_]) -> FloatArray:
-    photos = logs.shape[1]
+def _log_gains(logs: FloatArray, photo: NDArray[np.int64], starts: NDArray[np.int64], photos: int) -> FloatArray:
     gains = np.zeros(photos)
     for _ in range(ROUNDS):
         normal, right = np.zeros((photos, photos)), np.zeros(photos)
-        _add_equations(logs, usable, gains, normal, right)
+        _add_equations(logs, photo, starts, gains, normal, right)
         prior = PRIOR * max(np.trace(normal) / photos, 1e-12)
         gains = solve_positive(normal + prior * np.eye(photos), right[:, None])[:, 0]
         gains -= gains.mean()
@@ -60,32 +67,32 @@ def _log_gains(logs: FloatArray, usable: NDArray[np.bool_]) -> FloatArray:
 
 @kernel
 def _add_equations(
-    logs: FloatArray, usable: NDArray[np.bool_], gains: FloatArray, normal: FloatArray, right: FloatArray
+    logs: FloatArray,
+    photo: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    gains: FloatArray,
+    normal: FloatArray,
+    right: FloatArray,
 ) -> None:
     """Add the normal equations of the gains at the present weights, with the color of each triangle eliminated."""
-    photos = logs.shape[1]
-    weight, level = np.empty(photos), np.empty(photos)
-    for f in range(len(logs)):
-        count = 0
-        for p in range(photos):
-            if usable[f, p]:
-                level[count] = logs[f, p] - gains[p]
-                count += 1
+    weight, level = np.empty(len(right)), np.empty(len(right))
+    for f in range(len(starts) - 1):
+        first, count = starts[f], starts[f + 1] - starts[f]
         if count < 2:
             continue
+        for k in range(count):
+            level[k] = logs[first + k] - gains[photo[first + k]]
         middle = median(level, count)
         total = mean = 0.0
-        for p in range(photos):
-            weight[p] = 0.0
-            if usable[f, p]:
-                weight[p] = 1.0 / (1.0 + ((logs[f, p] - gains[p] - middle) / NOISE) ** 2)
-                total += weight[p]
-                mean += weight[p] * logs[f, p]
+        for k in range(count):
+            row = first + k
+            weight[k] = 1.0 / (1.0 + ((logs[row] - gains[photo[row]] - middle) / NOISE) ** 2)
+            total += weight[k]
+            mean += weight[k] * logs[row]
         mean /= total
-        for p in range(photos):
-            if weight[p] == 0.0:
-                continue
-            right[p] += weight[p] * (logs[f, p] - mean)
-            normal[p, p] += weight[p]
-            for q in range(photos):
-                normal[p, q] -= weight[p] * weight[q] / total
+        for k in range(count):
+            p = photo[first + k]
+            right[p] += weight[k] * (logs[first + k] - mean)
+            normal[p, p] += weight[k]
+            for j in range(count):
+                normal[p, photo[first + j]] -= weight[k] * weight[j] / total

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.texture.appearance.median import median
+from sfm_app.texture.appearance.sightings import Sightings
 from sfm_app.texture.facets import NONE, IntArray
 
 LEAST_VIEWS = 3
@@ -22,110 +23,100 @@ ROUNDS = 4
 """Rounds of averaging over neighbors: about the number of adjacent triangles that make an outlier."""
 
 
-def outlier_mask(
-    colors: NDArray[np.uint8], gains: NDArray[np.float64], seen: NDArray[np.bool_], neighbors: IntArray
-) -> NDArray[np.bool_]:
+def outlier_mask(seen: Sightings, gains: NDArray[np.float64], neighbors: IntArray) -> NDArray[np.bool_]:
     """Mark photos at the triangles where they show something other than the surface.
 
     Args:
-        colors: (P, T, 3) RGB of the triangles in the photos.
+        seen: which photos see which triangles, in which colors.
         gains: (P, 3) of the photos.
-        seen: (P, T) whether a photo sees a triangle.
         neighbors: (T, 3) triangles beside each triangle, -1 for none.
 
     Returns:
-        (P, T), True only where seen.
+        (N,) for each of the views.
     """
-    score = np.zeros(seen.shape, np.float32)
-    _deviations(colors, 1.0 / gains, seen, score)
-    found = np.zeros(seen.shape, np.bool_)
-    for photo in range(len(seen)):
-        smooth = score[photo].copy()
+    score = np.zeros(len(seen.face), np.float32)
+    _deviations(seen.face_starts, seen.face_rows, seen.colors, seen.photo, 1.0 / gains, score)
+    found = np.zeros(len(seen.face), np.bool_)
+    row_of = np.full(seen.triangles, NONE, np.int64)
+    for photo in range(seen.photos):
+        rows = seen.rows(photo)
+        face = seen.face[rows]
+        row_of[face] = np.arange(len(face))
+        across = neighbors[face]
+        beside = np.where(across == NONE, NONE, row_of[across])
+        row_of[face] = NONE
+        smooth = score[rows].copy()
         for _ in range(ROUNDS):
             before = smooth.copy()
-            _average(before, seen[photo], neighbors, smooth)
-        _mark(smooth, seen[photo], neighbors, found[photo])
-    found &= seen.sum(axis=0) >= LEAST_VIEWS
-    _keep_majority(found, seen)
+            _average(before, beside, smooth)
+        _mark(smooth, beside, found[rows])
+    found &= np.diff(seen.face_starts)[seen.face] >= LEAST_VIEWS
+    _keep_majority(seen.face_starts, seen.face_rows, found)
     return found
 
 
 @kernel
 def _deviations(
+    starts: NDArray[np.int64],
+    rows: NDArray[np.int64],
     colors: NDArray[np.uint8],
+    photo: IntArray,
     scale: NDArray[np.float64],
-    seen: NDArray[np.bool_],
     score: NDArray[np.float32],
 ) -> None:
     """Write the largest deviation from the median color over all channels, divided by the usual deviation."""
-    photos, triangles = seen.shape
-    level, far = np.empty(photos), np.empty(photos)
-    for f in range(triangles):
-        count = 0
-        for p in range(photos):
-            far[p] = 0.0
-            count += seen[p, f]
+    level, far = np.empty(len(scale)), np.empty(len(scale))
+    for f in range(len(starts) - 1):
+        count = starts[f + 1] - starts[f]
         if count < LEAST_VIEWS:
             continue
+        here = rows[starts[f] : starts[f + 1]]
+        for k in range(count):
+            far[k] = 0.0
         for channel in range(3):
-            count = 0
-            for p in range(photos):
-                if seen[p, f]:
-                    level[count] = colors[p, f, channel] * scale[p, channel]
-                    count += 1
+            for k in range(count):
+                level[k] = colors[here[k], channel] * scale[photo[here[k]], channel]
             middle = median(level, count)
-            for p in range(photos):
-                if seen[p, f]:
-                    far[p] = max(far[p], abs(colors[p, f, channel] * scale[p, channel] - middle))
-        count = 0
-        for p in range(photos):
-            if seen[p, f]:
-                level[count] = far[p]
-                count += 1
+            for k in range(count):
+                far[k] = max(far[k], abs(colors[here[k], channel] * scale[photo[here[k]], channel] - middle))
+        for k in range(count):
+            level[k] = far[k]
         usual = LEVELS + median(level, count)
-        for p in range(photos):
-            if seen[p, f]:
-                score[p, f] = far[p] / usual
+        for k in range(count):
+            score[here[k]] = far[k] / usual
 
 
 @kernel
-def _average(
-    before: NDArray[np.float32], seen: NDArray[np.bool_], neighbors: IntArray, after: NDArray[np.float32]
-) -> None:
+def _average(before: NDArray[np.float32], beside: NDArray[np.int64], after: NDArray[np.float32]) -> None:
     """Average over each triangle and its neighbors that the photo sees."""
     for f in range(len(before)):
-        if not seen[f]:
-            continue
         total, count = before[f], 1
         for k in range(3):
-            g = neighbors[f, k]
-            if g != NONE and seen[g]:
+            g = beside[f, k]
+            if g != NONE:
                 total += before[g]
                 count += 1
         after[f] = total / count
 
 
 @kernel
-def _mark(score: NDArray[np.float32], seen: NDArray[np.bool_], neighbors: IntArray, found: NDArray[np.bool_]) -> None:
+def _mark(score: NDArray[np.float32], beside: NDArray[np.int64], found: NDArray[np.bool_]) -> None:
     """Mark triangles that deviate, and their neighbors, which the outlier may cover in part."""
     for f in range(len(score)):
-        if not seen[f]:
-            continue
         found[f] = score[f] > OUTLIER_FACTOR
         for k in range(3):
-            g = neighbors[f, k]
-            if g != NONE and seen[g] and score[g] > OUTLIER_FACTOR:
+            g = beside[f, k]
+            if g != NONE and score[g] > OUTLIER_FACTOR:
                 found[f] = True
 
 
 @kernel
-def _keep_majority(found: NDArray[np.bool_], seen: NDArray[np.bool_]) -> None:
+def _keep_majority(starts: NDArray[np.int64], rows: NDArray[np.int64], found: NDArray[np.bool_]) -> None:
     """Keep all photos of a triangle where at most half would remain: without agreement none is an outlier."""
-    for f in range(found.shape[1]):
-        left = total = 0
-        for p in range(len(found)):
-            total += seen[p, f]
-            left += seen[p, f] and not found[p, f]
+    for f in range(len(starts) - 1):
+        left, total = 0, starts[f + 1] - starts[f]
+        for row in rows[starts[f] : starts[f + 1]]:
+            left += not found[row]
         if 2 * left <= total:
-            for p in range(len(found)):
-                found[p, f] = False
+            for row in rows[starts[f] : starts[f + 1]]:
+                found[row] = False

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.texture.facets import Facets
+from sfm_app.texture.facets import Facets, IntArray
 from sfm_app.texture.views import POSE, PhotoView, project, sample
 
 FloatArray = NDArray[np.float64]
@@ -32,12 +32,14 @@ SHARPNESS_RANGE = (0.2, 1.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceView:
-    """One photo's view of all triangles."""
+    """One photo's view of the triangles that it sees."""
 
+    face: IntArray
+    """(M,) the triangles, ascending."""
     worth: NDArray[np.float32]
-    """(T,) pixels times cosine of the viewing angle; 0 where the photo does not see the triangle."""
+    """(M,) pixels times cosine of the viewing angle, > 0."""
     color: NDArray[np.uint8]
-    """(T, 3) mean RGB; 0 where not seen."""
+    """(M, 3) mean RGB."""
     sharpness: float
     """Energy of the finest detail relative to that at half size; decreases with blur, hardly depends on content."""
 
@@ -45,7 +47,7 @@ class FaceView:
 def score_faces(
     view: PhotoView, photo: NDArray[np.uint8], used: NDArray[np.bool_] | None, mesh: Facets, hidden: OcclusionTest
 ) -> FaceView:
-    """Score every triangle in one photo.
+    """Score the triangles in one photo.
 
     Args:
         view: lens and pose.
@@ -54,23 +56,34 @@ def score_faces(
         mesh: the surface.
         hidden: the occlusion test.
     """
-    worth = np.zeros(len(mesh.faces), np.float32)
-    color = np.zeros((len(mesh.faces), 3), np.uint8)
-    _measure(view.row, photo, mesh.vertices, mesh.faces, worth, color)
+    near = mesh.clusters.find_in_cone(view.center, view.axis, view.widest_angle)
+    worth, color = np.zeros(len(near), np.float32), np.zeros((len(near), 3), np.uint8)
+    _measure(view.row, photo, mesh.vertices, mesh.faces[near], worth, color)
     if used is not None:
         masked = np.zeros((view.height + 1, view.width + 1), np.int32)
         np.cumsum(np.cumsum(~used, axis=0, dtype=np.int32), axis=1, out=masked[1:, 1:])
-        _drop_masked(view.row, masked, mesh.vertices, mesh.faces, worth)
+        _drop_masked(view.row, masked, mesh.vertices, mesh.faces[near], worth)
     candidates = np.flatnonzero(worth)
-    worth[candidates[_occluded_mask(candidates, mesh, partial(hidden, view.center, SLACK * mesh.spacing))]] = 0.0
-    color[worth == 0] = 0
-    beyond = worth == 0
+    occluded = _occluded_mask(near[candidates], mesh, partial(hidden, view.center, SLACK * mesh.spacing))
+    seen = candidates[~occluded]
+    face, worth = near[seen], worth[seen]
+    _lower_rims(face, worth, mesh)
+    shown = worth > 0
+    return FaceView(face[shown].astype(np.int32), worth[shown], color[seen[shown]], sharpness(photo, used))
+
+
+def _lower_rims(face: NDArray[np.int64], worth: NDArray[np.float32], mesh: Facets) -> None:
+    """Weigh seen triangles less, in place, ring by ring from those that the photo does not see."""
+    inner = np.arange(len(face))
     for _ in range(RIM_RINGS):
-        touched = np.zeros(len(mesh.vertices), np.bool_)
-        touched[mesh.faces[beyond]] = True
-        beyond = touched[mesh.faces].any(axis=1)
+        corners = mesh.faces[face[inner]]
+        vertices, at = np.unique(corners, return_inverse=True)
+        whole = np.bincount(at.ravel(), minlength=len(vertices)) == mesh.valence[vertices]
+        inside = whole[at.reshape(-1, 3)].all(axis=1)
+        beyond = np.ones(len(face), np.bool_)
+        beyond[inner[inside]] = False
         worth[beyond] *= RIM_WORTH
-    return FaceView(worth, color, sharpness(photo, used))
+        inner = inner[inside]
 
 
 def _occluded_mask(
@@ -78,11 +91,8 @@ def _occluded_mask(
 ) -> NDArray[np.bool_]:
     """Mark triangles that are hidden at the center or at two corners, (N,)."""
     corners = mesh.faces[candidates]
-    covered = np.zeros(len(mesh.vertices), np.bool_)
-    covered[corners] = True
-    points = np.flatnonzero(covered)
-    covered[points] = hidden(mesh.vertices[points])
-    blocked = covered[corners].sum(axis=1, dtype=np.int8) > 1
+    points, at = np.unique(corners, return_inverse=True)
+    blocked = hidden(mesh.vertices[points])[at.reshape(-1, 3)].sum(axis=1, dtype=np.int8) > 1
     open_ones = np.flatnonzero(~blocked)
     blocked[open_ones] = hidden(mesh.vertices[corners[open_ones]].mean(axis=1))
     return np.asarray(blocked, np.bool_)

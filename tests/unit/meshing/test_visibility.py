@@ -70,6 +70,6 @@ def test_colors_are_those_of_the_pixels_and_the_closer_photo_weighs_more(eye):
     )
     np.testing.assert_allclose(large.total[:2], paint.total[:2], rtol=0.02)
     both = Paint.zeros(3)
-    both.add(paint)
-    both.add(closer)
+    both.add(np.arange(3), paint)
+    both.add(np.arange(3), closer)
     np.testing.assert_allclose(both.mean_colors(np.zeros((3, 3), np.uint8))[0, 0], (79 + 4 * 255) / 5, atol=1)

@@ -5,9 +5,11 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.dense import map_file, read_views, write_fusion_views, write_maps
+from sfm_app.colmap.surface import open_points, positions
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.triangles import unique_edges, vertex_normals
 from sfm_app.plugins import load_plugins
@@ -16,6 +18,8 @@ from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import mesh
+from sfm_app.stages.blocks import fusion
+from sfm_app.stages.blocks import surface as blocks
 from sfm_app.stereo import DepthMap
 from sfm_app.synthetic.cameras import look_at
 
@@ -157,3 +161,65 @@ def test_without_depth_maps_there_is_no_surface(dense, tmp_path):
 
     with pytest.raises(ReconstructionError, match="no photo has a depth map"):
         made(tmp_path / "dense")
+
+
+def test_a_ball_in_blocks_is_the_ball(dense, ball, tmp_path):
+    for name in ("dense", "surface"):
+        shutil.copytree(dense.parent / name, tmp_path / name)
+
+    found, counts = made(tmp_path / "dense", block_points=8000)
+    again, _ = made(tmp_path / "dense", workers=1, block_points=8000)
+
+    edges, edge_of = unique_edges(found.faces)
+    assert counts["blocks"] >= 4
+    assert np.array_equal(np.bincount(edge_of.ravel()), np.full(len(edges), 2))
+    assert len(found.vertices) - len(edges) + len(found.faces) == 2
+    assert np.percentile(np.abs(np.linalg.norm(found.vertices, axis=1) - 1), 95) < 0.01
+    assert 0.5 * len(ball[0].faces) < len(found.faces) < 2.0 * len(ball[0].faces)
+    normals = vertex_normals(found.vertices, found.faces)
+    assert np.quantile(np.sum(normals * found.vertices, axis=1), 0.005) > 0.95
+    np.testing.assert_array_equal(np.median(found.colors, axis=0), [200, 90, 40])
+    np.testing.assert_array_equal(again.vertices, found.vertices)
+
+
+def test_a_run_that_was_killed_makes_the_missing_blocks_only(dense, ball, tmp_path, monkeypatch):
+    for name in ("dense", "surface"):
+        shutil.copytree(dense.parent / name, tmp_path / name)
+    done, whole = [], blocks.mesh_block
+
+    def stop_at_third(task):
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        done.append(task.number)
+        return whole(task)
+
+    def count(task):
+        done.append(task.path.exists())
+        return whole(task)
+
+    monkeypatch.setattr(blocks, "mesh_block", stop_at_third)
+    with pytest.raises(KeyboardInterrupt):
+        made(tmp_path / "dense", workers=1, block_points=8000)
+    done.clear()
+    monkeypatch.setattr(blocks, "mesh_block", count)
+    found, _ = made(tmp_path / "dense", workers=1, block_points=8000)
+
+    assert done[:2] == [True, True]
+    assert not any(done[2:])
+    assert len(found.faces) > 1000
+    assert not (tmp_path / "surface" / blocks.BLOCKS).exists()
+
+
+def test_fused_in_blocks_the_points_are_the_same_but_for_their_rims(dense, ball, tmp_path, monkeypatch):
+    shutil.copytree(dense, tmp_path / "dense")
+    whole = positions(open_points(dense.parent / "surface" / "fused.ply"))
+    monkeypatch.setattr(fusion, "MOST_PIXELS", WIDTH * HEIGHT * len(WAYS) // 3)
+
+    _, counts = made(tmp_path / "dense")
+    parts = positions(open_points(tmp_path / "surface" / "fused.ply"))
+
+    assert counts["fusion_blocks"] == 3
+    assert len(parts) == pytest.approx(len(whole), rel=0.05)
+    assert np.mean(cKDTree(whole).query(parts)[0] < 1e-6) > 0.8
+    assert np.percentile(cKDTree(parts).query(whole)[0], 99) < 0.02
+    assert not (tmp_path / "surface" / fusion.FUSING).exists()

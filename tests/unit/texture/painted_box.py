@@ -6,10 +6,19 @@ from functools import cache
 import numpy as np
 
 from sfm_app.texture import PhotoView
+from sfm_app.texture.appearance.sightings import make_sightings
 from sfm_app.types import Surface
 
 HALF = np.array([1.0, 0.7, 0.8])
 BACKGROUND = 25
+
+
+def sightings(worth, colors=None):
+    """What photos see, from (P, T) worths, 0 where a photo does not see a triangle, and (P, T, 3) colors."""
+    photo, face = np.nonzero(worth)
+    shown = np.zeros((len(face), 3), np.uint8) if colors is None else colors[photo, face]
+    counts = np.bincount(photo, minlength=len(worth))
+    return make_sightings(counts, face.astype(np.int32), worth[photo, face].astype(np.float32), shown, worth.shape[1])
 
 
 def paint_at(points):

@@ -10,7 +10,7 @@ from painted_box import HALF, Album, around, box, on_surface, one_by_one, paint_
 
 from sfm_app.meshing.occlusion import Occluders
 from sfm_app.settings import TextureSettings
-from sfm_app.texture import texture_surface
+from sfm_app.texture import blocks, texture_surface
 from sfm_app.types import Model
 
 pytestmark = pytest.mark.slow
@@ -222,3 +222,29 @@ def _pixels(view, points):
     local = points @ view.cam_from_world[:, :3].T + view.cam_from_world[:, 3]
     plane = local[..., :2] / local[..., 2:]
     return plane * np.array(view.lens[:2]) + np.array(view.lens[2:4])
+
+
+def test_in_blocks_every_point_has_its_color_too(plain, monkeypatch):
+    monkeypatch.setattr(blocks, "TRIANGLES", 600)
+    model, figures = textured(Album())
+
+    assert len(model.texture.pages) == len(figures["pages"]) == 3
+    assert figures["strange_views_of_triangles"] == plain[1]["strange_views_of_triangles"]
+    assert np.quantile(errors(model), 0.99) < 6.0
+    above = model.surface.vertices[:, 1] > -0.99 * HALF[1]
+    wrong = np.abs(model.surface.colors[above] - paint_at(model.surface.vertices[above])).max(axis=1)
+    assert np.quantile(wrong, 0.95) < 6.0
+
+
+def test_a_finished_block_is_not_painted_again(monkeypatch):
+    monkeypatch.setattr(blocks, "TRIANGLES", 600)
+    album = Album()
+    first, _ = textured(album)
+    assert {"block0", "block1", "block2"} <= set(album.kept)
+    album.asked.clear()
+
+    again, _ = textured(album)
+
+    assert album.asked == []
+    for ours, theirs in zip(again.texture.pages, first.texture.pages, strict=True):
+        np.testing.assert_array_equal(ours, theirs)

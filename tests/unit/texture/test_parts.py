@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from painted_box import around, box
+from painted_box import around, box, sightings
 
 from sfm_app.errors import ReconstructionError
+from sfm_app.geometry.culling import morton_order
 from sfm_app.texture import PhotoView, photo_view
 from sfm_app.texture.appearance.exposure import photo_gains
 from sfm_app.texture.appearance.median import median
@@ -21,7 +22,7 @@ from sfm_app.texture.facets import NONE, facets
 from sfm_app.texture.packing import MARGIN, pack
 from sfm_app.texture.painting import canvas, fill_background
 from sfm_app.texture.seam_leveling import level_seams, solve_ties
-from sfm_app.texture.unseen_faces import block_sizes, morton_order, square_texels, squares
+from sfm_app.texture.unseen_faces import block_sizes, square_texels, squares
 from sfm_app.texture.view_selection import PRICE_OF_DETAIL, choose_photos
 from sfm_app.texture.views import project, sample
 from sfm_app.types import CameraModel, Surface
@@ -107,7 +108,7 @@ def test_gains_come_back_through_noise_and_strays(strays):
     first = np.arange(3000) * 5 // 3000  # a chain: each triangle is seen by two photos next to each other
     seen = np.zeros((6, 3000), bool)
     seen[first, np.arange(3000)] = seen[first + 1, np.arange(3000)] = True
-    found = photo_gains(np.clip(colors, 0, 255).astype(np.uint8), seen)
+    found = photo_gains(sightings(seen, np.clip(colors, 0, 255).astype(np.uint8)))
     np.testing.assert_allclose(found, truth, rtol=0.08 if strays else 0.03)
 
 
@@ -116,7 +117,7 @@ def test_photos_that_share_nothing_keep_their_exposure():
     colors[2] = 200
     seen = np.zeros((3, 100), bool)
     seen[:2, :50] = seen[2, 50:] = True
-    np.testing.assert_allclose(photo_gains(colors, seen), 1.0)
+    np.testing.assert_allclose(photo_gains(sightings(seen, colors)), 1.0)
 
 
 def test_strangers_are_areas_not_specks():
@@ -130,11 +131,11 @@ def test_strangers_are_areas_not_specks():
     speck = int(np.argmax(centers[:, 1]))
     colors[1, speck] = 200
     seen = np.ones((4, count), bool)
-    found = outlier_mask(colors, np.ones((4, 3)), seen, mesh.neighbors)
+    found = outlier_mask(sightings(seen, colors), np.ones((4, 3)), mesh.neighbors).reshape(seen.shape)
     assert found[2, person].all()
     assert 0 < found[2].sum() - person.sum() < 0.6 * person.sum()  # a rim around it, no more
     assert not found[[0, 1, 3]].any()
-    two = outlier_mask(colors[1:3], np.ones((2, 3)), seen[:2], mesh.neighbors)
+    two = outlier_mask(sightings(seen[:2], colors[1:3]), np.ones((2, 3)), mesh.neighbors)
     assert not two.any()
 
 
@@ -156,7 +157,7 @@ def test_labels_are_the_cheapest_of_all(seed):
     mesh = strip(3)
     worth = np.exp(np.random.default_rng(seed).normal(0, 4, (3, 6))).astype(np.float32)
     least = min(energy(np.array(labels), worth, mesh) for labels in itertools.product(range(3), repeat=6))
-    found = choose_photos(worth, mesh)
+    found = choose_photos(sightings(worth), mesh)
     assert energy(found, worth, mesh) == pytest.approx(least, abs=1e-4)
 
 
@@ -165,7 +166,7 @@ def test_photos_that_must_not_be_used_are_not():
     worth = np.full((2, 8), 5.0, np.float32)
     worth[0, :3] = 0.0
     worth[1, :2] = -9.0
-    found = choose_photos(worth, mesh)
+    found = choose_photos(sightings(worth), mesh)
     assert (found[:2] == NONE).all()
     assert found[2] == 1
     assert (found[3:] != NONE).all()
@@ -177,7 +178,7 @@ def test_specks_go_over_to_their_neighbors():
     chosen[100], chosen[200] = 1, 1
     usable = np.ones((2, len(chosen)), bool)
     usable[0, 200] = False
-    found = absorb_small_charts(chosen, usable, mesh.neighbors)
+    found = absorb_small_charts(chosen, sightings(usable), mesh.neighbors)
     assert np.flatnonzero(found).tolist() == [200]
 
 
@@ -259,7 +260,7 @@ def test_background_takes_the_color_next_to_it():
 def test_weights_blend_near_the_seam_only():
     mesh = strip(12)
     chosen = np.tile((np.arange(12) >= 6).astype(np.int32), 2)
-    blend = blend_weights(chosen, np.ones((2, 24), bool), mesh)
+    blend = blend_weights(chosen, sightings(np.ones((2, 24))), mesh)
     sums = np.bincount(blend.vertex, blend.weight)
     np.testing.assert_allclose(sums, 1.0, atol=1e-6)
     first = np.zeros(26)
@@ -273,11 +274,10 @@ def test_weights_blend_near_the_seam_only():
 def test_leveling_takes_the_step_out_of_a_seam():
     mesh = strip(40)
     chosen = np.tile((np.arange(40) >= 20).astype(np.int32), 2)
-    usable = np.ones((2, 80), bool)
     colors = np.empty((2, 80, 3), np.uint8)
     colors[0], colors[1] = 100, 120
-    gains = np.ones((2, 3))
-    blend = level_seams(blend_weights(chosen, usable, mesh), colors, gains, usable, mesh)
+    gains, seen = np.ones((2, 3)), sightings(np.ones((2, 80)), colors)
+    blend = level_seams(blend_weights(chosen, seen, mesh), seen, gains, mesh)
     both = np.intersect1d(blend.vertex[blend.photo_rows(0)], blend.vertex[blend.photo_rows(1)])
     for vertex in both:
         one, other = (blend.offset[blend.photo_rows(p)][blend.vertex[blend.photo_rows(p)] == vertex] for p in (0, 1))
@@ -305,3 +305,32 @@ def test_points_near_each_other_come_after_each_other():
     steps = np.linalg.norm(np.diff(points[morton_order(points)], axis=0), axis=1)
     assert np.median(steps) < 0.15 * np.median(np.linalg.norm(np.diff(points, axis=0), axis=1))
     assert len(morton_order(np.empty((0, 3)))) == 0
+
+
+@pytest.mark.parametrize("k1", [-0.2, 0.0, 0.1])
+def test_the_widest_angle_bounds_what_a_photo_shows(k1):
+    view = around(1, k1=k1)[0]
+    rays = np.random.default_rng(0).normal(size=(4000, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    inside = [
+        angle
+        for ray, angle in zip(rays, np.arccos(rays @ view.axis), strict=True)
+        for u, v, depth in [project(view.row, *(view.center + ray))]
+        if depth > 0 and 0 <= u <= view.width and 0 <= v <= view.height
+    ]
+    assert max(inside) <= view.widest_angle < max(inside) + np.radians(8)
+
+
+def test_views_are_found_by_photo_and_triangle():
+    worth = np.array([[0, 2, 0, 5.0], [1, 0, 0, -3], [0, 0, 0, 0]])
+    seen = sightings(worth)
+    photo, face = (part.ravel() for part in np.indices(worth.shape))
+
+    rows = seen.find(photo, face)
+    np.testing.assert_array_equal(rows != NONE, worth.ravel() != 0)
+    np.testing.assert_array_equal(seen.worth[rows[rows != NONE]], worth.ravel()[rows != NONE])
+    np.testing.assert_array_equal(seen.is_usable(photo, face), worth.ravel() > 0)
+    assert seen.find(0, np.array([NONE, 3])).tolist() == [NONE, 1]
+    part = seen.select_triangles(np.array([False, True, False, True]))
+    assert (part.photos, part.triangles, part.face.tolist()) == (3, 2, [0, 1, 1])
+    assert part.face_rows.tolist() == [0, 1, 2]

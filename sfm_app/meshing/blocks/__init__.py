@@ -1,0 +1,1 @@
+"""Surfaces too large for one reconstruction: cut into blocks, and joined along their faces."""

@@ -1,0 +1,150 @@
+"""Blocks of points: boxes with about as many points each, the leaves of a k-d tree (Bentley, CACM 1975)."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+MARGIN = 1.1
+"""Width of Poisson's cube in extents of its points."""
+ALIGNMENT = 16
+"""Cells at whose multiples Poisson's cubes begin, so that the cells of blocks side by side are the same down to a few
+levels. Chosen by hand."""
+DEEPEST = 24
+"""Levels of a grid over all points: 16 million cells along a side. Chosen by hand."""
+SAMPLE = 2_000_000
+"""Points by which the blocks are laid out. Chosen by hand."""
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """A plane between two halves, each a block or split again."""
+
+    axis: int
+    at: float
+    low: "Split | int"
+    """Half with the smaller coordinates; a number is that of a block."""
+    high: "Split | int"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Partition:
+    """All space in blocks."""
+
+    root: Split | int
+    boxes: FloatArray
+    """(B, 2, 3) lowest and highest coordinates of each block; infinite at the outside."""
+
+    def contains(self, number: int, points: FloatArray) -> NDArray[np.bool_]:
+        """Return (N,) whether points lie in a block.
+
+        Args:
+            number: of the block.
+            points: (N, 3).
+        """
+        low, high = self.boxes[number]
+        return np.asarray(((points >= low) & (points < high)).all(axis=1))
+
+    def planes(self) -> list[tuple[int, float]]:
+        """Return axis and coordinate of all planes between blocks, those of the first cuts first."""
+        found, waiting = list[tuple[int, float]](), [self.root]
+        while waiting:
+            node = waiting.pop(0)
+            if isinstance(node, Split):
+                found.append((node.axis, node.at))
+                waiting += [node.low, node.high]
+        return found
+
+    def near_planes(self, points: FloatArray, distance: float) -> NDArray[np.bool_]:
+        """Return (N,) whether points lie close to a plane between blocks.
+
+        Args:
+            points: (N, 3).
+            distance: up to which they are close.
+        """
+        near = np.zeros(len(points), np.bool_)
+        for axis, at in self.planes():
+            near |= np.abs(points[:, axis] - at) <= distance
+        return near
+
+
+def split_points(points: FloatArray, blocks: int) -> Partition:
+    """Divide space into boxes with about as many points each, across their longest sides.
+
+    Args:
+        points: (N, 3).
+        blocks: number of boxes, >= 1.
+    """
+    sample = points[:: max(1, len(points) // SAMPLE)]
+    boxes: list[FloatArray] = []
+
+    def grow(inside: FloatArray, box: FloatArray, count: int) -> Split | int:
+        if count == 1 or len(inside) < 2:
+            boxes.append(box)
+            return len(boxes) - 1
+        axis = int(np.argmax(np.percentile(inside, 99, axis=0) - np.percentile(inside, 1, axis=0)))
+        left = count // 2
+        at = float(np.quantile(inside[:, axis], left / count))
+        below, above = box.copy(), box.copy()
+        below[1, axis] = above[0, axis] = at
+        low = inside[:, axis] < at
+        return Split(axis, at, grow(inside[low], below, left), grow(inside[~low], above, count - left))
+
+    whole = np.stack([np.full(3, -np.inf), np.full(3, np.inf)])
+    root = grow(sample, whole, blocks)
+    return Partition(root, np.stack(boxes))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cube:
+    """Poisson's cube around the points of a block, on the common grid."""
+
+    depth: int
+    """Of the octree."""
+    anchors: FloatArray
+    """(2, 3) lowest and highest corner of the points that give the octree this cube."""
+
+
+def cube_around(low: FloatArray, high: FloatArray, cell: float) -> Cube:
+    """Return the smallest cube on the common grid that holds the points of a block.
+
+    Args:
+        low: (3,) lowest coordinates of the points.
+        high: (3,) highest coordinates of the points.
+        cell: side of the finest cells.
+    """
+    step = ALIGNMENT * cell
+    depth = 5
+    while True:
+        side = cell * 2.0**depth
+        start = np.floor((0.5 * (low + high) - 0.5 * side) / step + 0.5) * step
+        inner = np.stack([start + 0.5 * (side - side / MARGIN), start + 0.5 * (side + side / MARGIN)])
+        if (inner[0] <= low).all() and (inner[1] >= high).all():
+            return Cube(depth, inner)
+        depth += 1
+
+
+def cell_sizes(extent: float, depth: int) -> Iterator[float]:
+    """Yield sides of cells, the finest first, each twice the one before.
+
+    Args:
+        extent: largest of all points.
+        depth: greatest depth of an octree over them all.
+    """
+    for level in range(min(depth, DEEPEST), 1, -1):
+        yield MARGIN * extent / 2.0**level
+
+
+def occupied_cells(points: FloatArray, cell: float) -> int:
+    """Return how many cells of a grid hold points (N, 3).
+
+    Args:
+        points: (N, 3).
+        cell: side of a cell.
+    """
+    at = np.floor(points / cell).astype(np.int64)
+    at -= at.min(axis=0, initial=0)
+    return len(np.unique((at[:, 0] << 42) + (at[:, 1] << 21) + at[:, 2]))

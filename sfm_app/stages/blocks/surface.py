@@ -1,0 +1,258 @@
+"""The surface in blocks: each is a task of its own, and they are joined along their faces.
+
+A block reads the fused points and the depth maps, and writes its surface into a file; a killed run resumes at the
+blocks that are missing.
+"""
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_clear
+from sfm_app.colmap.dense import read_depth
+from sfm_app.colmap.surface import FUSED, open_points, poisson_surface, positions, write_points
+from sfm_app.errors import ReconstructionError
+from sfm_app.geometry.culling import Clusters, border_angle
+from sfm_app.geometry.triangles import select_faces
+from sfm_app.hashing import fingerprint, load_arrays
+from sfm_app.meshing import drop_islands, make_manifold, trim
+from sfm_app.meshing.blocks.partition import (
+    Cube,
+    Partition,
+    Split,
+    cell_sizes,
+    cube_around,
+    occupied_cells,
+    split_points,
+)
+from sfm_app.meshing.blocks.weld import close_cracks, weld
+from sfm_app.meshing.components import MIN_POINTS
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.cost_estimate import block_count, block_workers
+from sfm_app.settings import MeshSettings
+from sfm_app.stages.blocks.judging import SurfaceJudge, simplify_mesh
+from sfm_app.stereo import View
+from sfm_app.types import Surface
+
+FloatArray = NDArray[np.float64]
+
+BLOCKS = "blocks"
+"""Folder beside the surface while its blocks are made."""
+HALO = 24
+"""Cells that a block shares with its neighbors. Gaps of twenty triangles are closed in the same way from both sides,
+and Poisson's surface no longer depends on where the points end. Chosen by hand."""
+GIVE_WAY = 8.0
+"""Cells over which a block gives way to its neighbor. Chosen by hand."""
+AT_PLANE = 2.0
+"""Cells from a plane within which small holes are cracks from joining. Chosen by hand."""
+MOST_LEVELS = 20
+"""Of the grid over all points; blocks with more than `poisson_depth` levels get coarser cells. Chosen by hand."""
+CHUNK = 4_000_000
+"""Points that are read at once."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BlockTask:
+    """Everything that one block needs besides the files; it can be sent to another process."""
+
+    folder: Path
+    """Where its files go."""
+    fused: Path
+    """The points of all blocks."""
+    dense_dir: Path
+    views: Sequence[View]
+    """The photos that may see it."""
+    number: int
+    bounds: FloatArray
+    """(2, 3) of its points and halo."""
+    cell: float
+    """Side of the finest cells."""
+    cube: Cube
+    options: MeshSettings
+    tolerance: float
+    """Relative difference in depth within which a photo confirms a vertex."""
+    least: float
+    """Photos that have to confirm the average vertex of a part."""
+
+    @property
+    def path(self) -> Path:
+        """The surface of the block."""
+        return self.folder / f"{self.number}.npz"
+
+
+def mesh_in_blocks(
+    dense_dir: Path, views: Sequence[View], points: NDArray[np.void], least: float, run: RunContext
+) -> Surface:
+    """Return the surface of all points, made block by block.
+
+    Args:
+        dense_dir: dense workspace with depth maps.
+        views: photos with a depth map.
+        points: (N,) records of the fused points.
+        least: photos that have to confirm the average vertex of a part.
+        run: the run.
+
+    Raises:
+        ReconstructionError: there is no surface.
+    """
+    place, options = run.workspace.surface, run.settings.mesh
+    folder = place / BLOCKS
+    made_from = fingerprint(run.fingerprint, len(points), options.model_dump())
+    if not resume_or_clear(folder, made_from):
+        mark_unfinished(folder, made_from)
+    partition = split_points(_sample(points), block_count(len(points), options))
+    bounds = _bounds(points, partition)
+    cell = choose_cell(points, partition, bounds, options.poisson_depth)
+    bounds = _with_halo(bounds, cell)
+    cubes = [cube_around(low, high, cell) for low, high in bounds]
+    farthest = run.map(partial(farthest_depth, dense_dir), views, "measuring depths")
+    seers = _photos_in_reach(views, farthest, bounds)
+    tasks = [
+        BlockTask(folder, place / FUSED, dense_dir, seers[k], k, bounds[k], cell, cubes[k], options,
+                  run.settings.depth.consistency, least)
+        for k in range(len(cubes))
+    ]  # fmt: skip
+    with run.with_workers(block_workers(run.workers, run.memory_mb, options)) as few:
+        raw = few.map(mesh_block, tasks, "finding the surface in blocks")
+    with run.step("joining the blocks"):
+        joined, lost = join_blocks(partition.root, tasks, cell)
+        joined = drop_islands(joined, options.min_island / len(tasks))  # a share of the triangles of a block
+        surface = close_cracks(joined, partition.near_planes(joined.vertices, AT_PLANE * cell))
+    if not len(surface.faces):
+        raise ReconstructionError(
+            "the photos confirm no part of the surface", hint="take more photos, a step apart, with more overlap"
+        )
+    run.record(blocks=len(tasks), planes=[list(plane) for plane in partition.planes()])
+    run.record(cell=cell, raw_triangles=sum(raw), open_border_edges=lost)
+    shutil.rmtree(folder)
+    return surface
+
+
+def mesh_block(task: BlockTask) -> int:
+    """Write the surface of a block and its halo, unless a killed run has; return the triangles that Poisson found."""
+    if task.path.exists():
+        return int(load_arrays(task.path)["raw"])
+    scratch = task.folder / str(task.number)
+    scratch.mkdir(exist_ok=True)
+    _write_block_points(task, scratch / FUSED)
+    raw = poisson_surface(scratch, task.cube.depth)
+    inside = ((raw.vertices >= task.bounds[0]) & (raw.vertices <= task.bounds[1])).all(axis=1)
+    near = select_faces(raw, inside[raw.faces].all(axis=1))
+    judge = SurfaceJudge.prepare(near, task.dense_dir, task.tolerance)
+    found, support = judge.sum_up(map(judge.judge, task.views))
+    if task.options.trim and len(found.faces):
+        found = trim(found, support, task.options.max_gap_triangles, task.least)
+    if len(found.faces):
+        found = make_manifold(simplify_mesh(found, task.options, scratch))
+    with replace_atomically(task.path) as path:
+        np.savez(path, vertices=found.vertices, faces=found.faces, colors=found.colors, raw=len(raw.faces))
+    shutil.rmtree(scratch)
+    return len(raw.faces)
+
+
+def _write_block_points(task: BlockTask, path: Path) -> None:
+    """Write the points of a block and its halo, and two more that make Poisson's cube the one on the common grid."""
+    points = open_points(task.fused)
+    anchors = np.zeros(2, points.dtype)
+    for axis, name in enumerate("xyz"):
+        anchors[name] = task.cube.anchors[:, axis]
+        anchors[f"n{name}"] = 3.0**-0.5
+    parts = [anchors]
+    for start in range(0, len(points), CHUNK):
+        chunk = np.asarray(points[start : start + CHUNK])
+        where = positions(chunk)
+        parts.append(chunk[((where >= task.bounds[0]) & (where <= task.bounds[1])).all(axis=1)])
+    write_points(np.concatenate(parts), path)
+
+
+def join_blocks(node: Split | int, tasks: Sequence[BlockTask], cell: float) -> tuple[Surface, int]:
+    """Return the joined surface of all blocks below a node, and how many edges at their faces stayed open.
+
+    Args:
+        node: of the partition.
+        tasks: the blocks, all written.
+        cell: side of the finest cells.
+    """
+    if not isinstance(node, Split):
+        stored = load_arrays(tasks[node].path)
+        return Surface(stored["vertices"], stored["faces"], stored["colors"]), 0
+    (low, lost), (high, also) = (join_blocks(half, tasks, cell) for half in (node.low, node.high))
+    joined, here = weld(low, high, node.axis, node.at, cell, GIVE_WAY * cell)
+    return joined, here + lost + also
+
+
+def choose_cell(points: NDArray[np.void], partition: Partition, bounds: FloatArray, most: int) -> float:
+    """Return the side of the finest cells: as `octree_depth` has it, but with an octree for each block.
+
+    Args:
+        points: (N,) records of the fused points.
+        partition: the blocks.
+        bounds: (B, 2, 3) of the points of each block.
+        most: greatest depth of a block's octree.
+    """
+    extent = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
+    cell = extent
+    for cell in cell_sizes(extent, MOST_LEVELS):
+        if max(cube_around(low, high, cell).depth for low, high in _with_halo(bounds, cell)) > most:
+            continue
+        occupied = 0
+        for number in range(len(bounds)):
+            parts = [
+                own[partition.contains(number, own)]
+                for start in range(0, len(points), CHUNK)
+                for own in [positions(points[start : start + CHUNK])]
+            ]
+            occupied += occupied_cells(np.concatenate(parts), cell)
+        if len(points) >= MIN_POINTS * occupied:
+            break
+    return cell
+
+
+def farthest_depth(dense_dir: Path, view: View) -> float:
+    """Return the largest depth that the map of a photo knows; beyond, it is no evidence.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        view: a photo with a map.
+    """
+    return float(read_depth(dense_dir, view, "geometric").max(initial=0.0))
+
+
+def _sample(points: NDArray[np.void]) -> FloatArray:
+    return positions(points[:: max(1, len(points) // CHUNK)])
+
+
+def _bounds(points: NDArray[np.void], partition: Partition) -> FloatArray:
+    """Return (B, 2, 3) lowest and highest coordinates of the points of each block."""
+    found = np.stack([np.full((len(partition.boxes), 3), np.inf), np.full((len(partition.boxes), 3), -np.inf)], axis=1)
+    for start in range(0, len(points), CHUNK):
+        chunk = positions(points[start : start + CHUNK])
+        for number in range(len(found)):
+            own = chunk[partition.contains(number, chunk)]
+            found[number, 0] = np.minimum(found[number, 0], own.min(axis=0, initial=np.inf))
+            found[number, 1] = np.maximum(found[number, 1], own.max(axis=0, initial=-np.inf))
+    return found
+
+
+def _with_halo(bounds: FloatArray, cell: float) -> FloatArray:
+    """Return (B, 2, 3) bounds that contain the halo of each block."""
+    return bounds + HALO * cell * np.array([-1.0, 1.0])[None, :, None]
+
+
+def _photos_in_reach(views: Sequence[View], farthest: Sequence[float], bounds: FloatArray) -> list[list[View]]:
+    """Return for each block the photos that have it in view, and not only behind all that they know."""
+    centers = bounds.mean(axis=1)
+    radii = 0.5 * np.linalg.norm(bounds[:, 1] - bounds[:, 0], axis=1)
+    blocks = Clusters(np.arange(len(bounds)), np.arange(len(bounds) + 1), centers, radii)
+    found: list[list[View]] = [[] for _ in bounds]
+    for view, far in zip(views, farthest, strict=True):
+        bare = replace(view, point_ids=np.empty(0, np.int64), points=np.empty((0, 3)))
+        for number in blocks.find_in_cone(view.center, view.R[2], border_angle(view.K, view.width, view.height)):
+            if (centers[number] - view.center) @ view.R[2] - radii[number] <= far:
+                found[number].append(bare)
+    return found
