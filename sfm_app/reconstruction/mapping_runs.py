@@ -128,6 +128,18 @@ def map_group(group: Group, run: RunContext) -> list[MappingResult]:
     return found
 
 
+def complete_attempt(group: Group, attempt: Attempt, run: RunContext) -> list[MappingResult]:
+    """Continue a model photo by photo, with the photos that it lacks.
+
+    Args:
+        group: a connected group of photos, with their matches and poses.
+        attempt: its model so far.
+        run: the run.
+    """
+    with _attempt_runner(group, run) as made:
+        return made(partial(_attempt_completion, group, attempt, run))
+
+
 def best_attempt(found: Sequence[MappingResult]) -> Attempt | None:
     """Return the attempt with the largest support; among equal ones, the one with most photos and points."""
     models = [attempt for attempt in found if isinstance(attempt, Attempt)]
