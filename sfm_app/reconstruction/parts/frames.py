@@ -88,7 +88,7 @@ def _main_group(fragments: Sequence[Fragment], joins: Sequence[Join]) -> set[int
     def owned(group: set[int]) -> int:
         return len({photo for number in group for photo in fragments[number].placed.photos.tolist()})
 
-    return max(groups, key=lambda group: (owned(group), -min(group)))
+    return max(groups, key=lambda group: (owned(group), -min(group)), default=set())
 
 
 def join_error(join: Join, frames: Mapping[int, Similarity], radii: Sequence[float]) -> JoinError:

@@ -20,9 +20,7 @@ def graph_of(counts, doubtful=()):
 
 
 def row(photos, reach, inliers=100, start=0):
-    return {
-        (start + a, start + b): inliers for a in range(photos) for b in range(a + 1, min(a + reach + 1, photos))
-    }
+    return {(start + a, start + b): inliers for a in range(photos) for b in range(a + 1, min(a + reach + 1, photos))}
 
 
 def clusters(count, size, bridge=20):
