@@ -27,7 +27,7 @@ PHOTOS, PART = 90, 30
 
 @pytest.fixture(scope="module")
 def town():
-    return make_town_graph(TownOptions(photos=PHOTOS, look_alikes=0.0, neighbors=16), 0)
+    return make_town_graph(TownOptions(photos=PHOTOS, step_m=0.75, look_alikes=0.0), 0)
 
 
 @pytest.fixture(scope="module")
