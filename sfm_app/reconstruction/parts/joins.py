@@ -5,7 +5,7 @@ its points the scale. The similarity with which most of the shared photos agree 
 one of the parts has misplaced, as among look-alikes, does not agree.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -191,52 +191,57 @@ def _observation_keys(model: PlacedPhotos, photos: IndexArray) -> tuple[IndexArr
     return keys, rows[first]
 
 
-def count_across(
-    join: Join, fragments: Sequence[Fragment], matches: MatchGraph, views: ViewGraph, max_error_px: float
-) -> tuple[int, int]:
-    """Return how many matches across a join it explains, and how many inliers it contradicts.
-
-    Only photos that one of the two holds alone are asked: the shared ones made the join.
+class AcrossJoins:
+    """Matches of photos that only one of two fragments holds: they bear out a join, or contradict it.
 
     Args:
-        join: of two fragments.
-        fragments: all of them.
         matches: keypoints and raw matches.
         views: fundamental matrices.
         max_error_px: largest Sampson distance of an inlier.
     """
-    a, b = fragments[join.first].placed, fragments[join.second].placed
-    explained = contradicted = 0
-    for photo_a, photo_b in _pairs_across(a, b, views):
-        pair = min(photo_a, photo_b), max(photo_a, photo_b)
-        rows = matches.matches[pair] if pair[0] == photo_a else matches.matches[pair][:, ::-1]
-        lines = np.hstack(
-            [
-                a.bearings(photo_a, matches.keypoints[photo_a][rows[:, 0]]),
-                b.bearings(photo_b, matches.keypoints[photo_b][rows[:, 1]]),
-            ]
-        )
-        at_a, at_b = np.searchsorted(a.photos, photo_a), np.searchsorted(b.photos, photo_b)
-        Rb = b.R[at_b] @ join.similarity.R.T
-        t = Rb @ (a.centers[at_a] - join.similarity(b.centers[at_b][None])[0])
-        R, t = Rb @ a.R[at_a].T, t / max(float(np.linalg.norm(t)), 1e-300)
-        right = (pose_distances(lines, R, t) <= LOOSE_FACTOR * max_error_px) & is_in_front(lines, R, t)
-        explained += int(np.count_nonzero(right))
-        contradicted += int(np.count_nonzero(views.fits[pair].inliers & ~right))
-    return explained, contradicted
 
+    def __init__(self, matches: MatchGraph, views: ViewGraph, max_error_px: float) -> None:
+        self.matches, self.views, self.max_error_px = matches, views, max_error_px
+        self.partners: dict[int, list[int]] = {}
+        for a, b in views.fits:
+            self.partners.setdefault(a, []).append(b)
+            self.partners.setdefault(b, []).append(a)
 
-def _pairs_across(a: PlacedPhotos, b: PlacedPhotos, views: ViewGraph) -> list[PairId]:
-    """Return the pairs with most inliers between photos that only one of the models holds, the first model's first."""
-    here, there = set(a.photos.tolist()), set(b.photos.tolist())
-    found = [(-views.fits[min(i, j), max(i, j)].inlier_count, i, j) for i, j in _pairs_between(here, there, views)]
-    return [(i, j) for _, i, j in sorted(found)[:MOST_CHECKED]]
+    def count(self, join: Join, fragments: Sequence[Fragment]) -> tuple[int, int]:
+        """Return how many matches across a join it explains, and how many inliers it contradicts.
 
+        The shared photos are not asked: they made the join.
 
-def _pairs_between(here: set[int], there: set[int], views: ViewGraph) -> Iterator[PairId]:
-    here, there = here - there, there - here
-    for i, j in views.fits:
-        if i in here and j in there:
-            yield i, j
-        elif j in here and i in there:
-            yield j, i
+        Args:
+            join: of two fragments.
+            fragments: all of them.
+        """
+        a, b = fragments[join.first].placed, fragments[join.second].placed
+        explained = contradicted = 0
+        for photo_a, photo_b in self._pairs(a, b):
+            pair = min(photo_a, photo_b), max(photo_a, photo_b)
+            rows = self.matches.matches[pair]
+            rows = rows if pair[0] == photo_a else rows[:, ::-1]
+            x_a, x_b = self.matches.keypoints[photo_a][rows[:, 0]], self.matches.keypoints[photo_b][rows[:, 1]]
+            lines = np.hstack([a.bearings(photo_a, x_a), b.bearings(photo_b, x_b)])
+            at_a, at_b = np.searchsorted(a.photos, photo_a), np.searchsorted(b.photos, photo_b)
+            turned = b.R[at_b] @ join.similarity.R.T
+            t = turned @ (a.centers[at_a] - join.similarity(b.centers[at_b][None])[0])
+            R, t = turned @ a.R[at_a].T, t / max(float(np.linalg.norm(t)), 1e-300)
+            near = pose_distances(lines, R, t) <= LOOSE_FACTOR * self.max_error_px
+            right = near & is_in_front(lines, R, t)
+            explained += int(np.count_nonzero(right))
+            contradicted += int(np.count_nonzero(self.views.fits[pair].inliers & ~right))
+        return explained, contradicted
+
+    def _pairs(self, a: PlacedPhotos, b: PlacedPhotos) -> list[PairId]:
+        """Return the pairs with most inliers between photos that only one model holds, the first model's first."""
+        here, there = set(a.photos.tolist()), set(b.photos.tolist())
+        alone = there - here
+        found = [
+            (-self.views.fits[min(i, j), max(i, j)].inlier_count, i, j)
+            for i in sorted(here - there)
+            for j in self.partners.get(i, ())
+            if j in alone
+        ]
+        return [(i, j) for _, i, j in sorted(found)[:MOST_CHECKED]]

@@ -1,7 +1,7 @@
 """The inputs of one part as a file, so that any process, here or elsewhere, can map it."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -29,16 +29,34 @@ INPUTS, RESULT = "inputs.npz", "result.json"
 Arrays = dict[str, NDArray[Any]]
 
 
-def part_of_group(group: Group, photos: Sequence[int]) -> Group:
+def pairs_of_parts(pairs: Iterable[PairId], parts: Sequence[Sequence[int]]) -> list[list[PairId]]:
+    """Return the pairs within each part, in their order; one look at each pair, however many parts there are.
+
+    Args:
+        pairs: of photos.
+        parts: ids of their photos; parts may share photos.
+    """
+    members: dict[int, set[int]] = {}
+    for number, photos in enumerate(parts):
+        for photo in photos:
+            members.setdefault(photo, set()).add(number)
+    found: list[list[PairId]] = [[] for _ in parts]
+    nowhere: set[int] = set()
+    for a, b in pairs:
+        for number in members.get(a, nowhere) & members.get(b, nowhere):
+            found[number].append((a, b))
+    return found
+
+
+def part_of_group(group: Group, photos: Sequence[int], pairs: Sequence[PairId]) -> Group:
     """Return what concerns some photos of a group.
 
     Args:
         group: photos with their matches, geometry and cameras.
         photos: ids of the part.
+        pairs: those with matches, within the part.
     """
-    members, matches, views = set(photos), group.matches, group.views
-    poses = {pair: pose for pair, pose in group.graph.poses.items() if members.issuperset(pair)}
-    fits = {pair: fit for pair, fit in views.fits.items() if members.issuperset(pair)}
+    matches, fits, poses = group.matches, group.views.fits, group.graph.poses
     images = {photo: matches.images[photo] for photo in photos}
     names = {image.name: group.intrinsics.camera_name(image) for image in images.values()}
     used = set(names.values())
@@ -48,10 +66,10 @@ def part_of_group(group: Group, photos: Sequence[int]) -> Group:
         MatchGraph(
             images,
             {photo: matches.keypoints[photo] for photo in photos},
-            {pair: rows for pair, rows in matches.matches.items() if members.issuperset(pair)},
+            {pair: matches.matches[pair] for pair in pairs},
         ),
-        ViewGraph(fits, {}),
-        PoseGraph(poses, {}, (tuple(photos),)),
+        ViewGraph({pair: fits[pair] for pair in pairs if pair in fits}, {}),
+        PoseGraph({pair: poses[pair] for pair in pairs if pair in poses}, {}, (tuple(photos),)),
         Intrinsics(cameras, names, {photo: image.name for photo, image in images.items()}),
     )
 

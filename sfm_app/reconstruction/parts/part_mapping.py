@@ -12,7 +12,7 @@ from sfm_app.errors import BackendError
 from sfm_app.hashing import digest_file
 from sfm_app.reconstruction.mapping_runs import Group
 from sfm_app.reconstruction.parts.cut import Part
-from sfm_app.reconstruction.parts.part_files import INPUTS, RESULT, part_of_group, write_inputs
+from sfm_app.reconstruction.parts.part_files import INPUTS, RESULT, pairs_of_parts, part_of_group, write_inputs
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import PoseGraph
 
@@ -57,7 +57,9 @@ def map_parts(group: Group, parts: Sequence[Part], mapped: PoseGraph, run: RunCo
     """
     place = run.workspace.root / FOLDER
     (place / STOP).unlink(missing_ok=True)
-    tasks = [_prepare_part(group, part, mapped, place, run) for part in parts]
+    within = pairs_of_parts(group.matches.matches, [part.photos for part in parts])
+    members = (part_of_group(group, part.photos, pairs) for part, pairs in zip(parts, within, strict=True))
+    tasks = [_prepare_part(one, mapped, place, run) for one in members]
     try:
         return run.map(map_part, tasks, f"mapping {len(parts)} parts")
     except BaseException:  # also Ctrl-C: the processes end when they see the file
@@ -65,10 +67,9 @@ def map_parts(group: Group, parts: Sequence[Part], mapped: PoseGraph, run: RunCo
         raise
 
 
-def _prepare_part(group: Group, part: Part, mapped: PoseGraph, place: Path, run: RunContext) -> PartTask:
+def _prepare_part(members: Group, mapped: PoseGraph, place: Path, run: RunContext) -> PartTask:
     """Write the inputs of a part, in a folder that is called after what they are."""
     beside = place / INPUTS
-    members = part_of_group(group, part.photos)
     write_inputs(beside, members, [pair for pair in members.graph.poses if pair in mapped.poses], run.settings)
     folder = place / digest_file(beside)[:16]
     folder.mkdir(exist_ok=True)

@@ -22,7 +22,7 @@ from sfm_app.reconstruction.mapping_runs import (
 )
 from sfm_app.reconstruction.parts.cut import Part, cut_group
 from sfm_app.reconstruction.parts.frames import Alignment, JoinError, align_fragments, loop_errors
-from sfm_app.reconstruction.parts.joins import Fragment, Join, count_across, find_join
+from sfm_app.reconstruction.parts.joins import AcrossJoins, Fragment, Join, find_join
 from sfm_app.reconstruction.parts.merge import merge_fragments
 from sfm_app.reconstruction.parts.part_mapping import PartResult, map_parts, remove_parts
 from sfm_app.reconstruction.unregistered import are_worth_another_try, photo_names
@@ -132,14 +132,14 @@ def join_parts(group: Group, parts: Sequence[Part], results: Sequence[PartResult
         for number, (part, result) in enumerate(zip(parts, results, strict=True))
         for folder in result.models
     ]
-    limit = run.settings.epipolar.max_error_px
+    across = AcrossJoins(group.matches, group.views, run.settings.epipolar.max_error_px)
     kept: list[Join] = []
     refused: list[Join] = []
     for first, second in combinations(range(len(fragments)), 2):
         join = find_join(first, second, fragments)
         if join is None:
             continue
-        explained, contradicted = count_across(join, fragments, group.matches, group.views, limit)
+        explained, contradicted = across.count(join, fragments)
         join = replace(join, explained=explained, contradicted=contradicted)
         wrong = contradicted > max(explained, LEAST_SUPPORTED)
         (refused if wrong else kept).append(join)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_app.geometry.similarity import Similarity
-from sfm_app.reconstruction.parts.joins import Fragment, count_across, find_join
+from sfm_app.reconstruction.parts.joins import AcrossJoins, Fragment, find_join
 
 
 def off(found, true):
@@ -50,12 +50,12 @@ def test_three_shared_photos_join_two_do_not(street, shared):
 
 
 def test_matches_across_bear_out_a_right_join_and_contradict_a_wrong_one(street, two_parts):
-    matches, views = street.graphs()
+    across = AcrossJoins(*street.graphs(), 1.5)
     join = find_join(0, 1, two_parts.fragments)
 
-    explained, contradicted = count_across(join, two_parts.fragments, matches, views, 1.5)
+    explained, contradicted = across.count(join, two_parts.fragments)
     assert explained > 800 and contradicted < 0.01 * explained
 
     aside = Similarity(join.similarity.scale, join.similarity.R, join.similarity.t + np.array([0.0, 3.0, 0.0]))
-    explained, contradicted = count_across(replace(join, similarity=aside), two_parts.fragments, matches, views, 1.5)
+    explained, contradicted = across.count(replace(join, similarity=aside), two_parts.fragments)
     assert contradicted > 3 * explained

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sfm_app.reconstruction.mapping_runs import Group
-from sfm_app.reconstruction.parts.part_files import part_of_group, read_inputs, write_inputs
+from sfm_app.reconstruction.parts.part_files import pairs_of_parts, part_of_group, read_inputs, write_inputs
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, Intrinsics, PoseGraph, RelativePose
 from tests.unit.reconstruction.parts.conftest import K
@@ -22,15 +22,25 @@ def group_of(street):
 
 
 def test_a_part_of_a_group_has_what_concerns_its_photos(street):
-    part = part_of_group(group_of(street), (3, 4, 5))
+    group = group_of(street)
+    pairs, _ = pairs_of_parts(group.matches.matches, [(3, 4, 5), (5, 6)])
+    part = part_of_group(group, (3, 4, 5), pairs)
 
     assert list(part.matches.images) == list(part.matches.keypoints) == [3, 4, 5]
     assert list(part.matches.matches) == list(part.views.fits) == list(part.graph.poses) == [(3, 4), (3, 5), (4, 5)]
     assert part.graph.groups == ((3, 4, 5),) and list(part.intrinsics.cameras) == ["one"]
 
 
+def test_pairs_belong_to_every_part_that_has_both_photos():
+    pairs = [(1, 2), (2, 3), (3, 4), (1, 4), (4, 5)]
+
+    assert pairs_of_parts(pairs, [(1, 2, 3), (2, 3, 4), (9,)]) == [[(1, 2), (2, 3)], [(2, 3), (3, 4)], []]
+
+
 def test_inputs_are_read_back_as_they_were(street, tmp_path):
-    part = part_of_group(group_of(street), range(21, 41))
+    group = group_of(street)
+    (pairs,) = pairs_of_parts(group.matches.matches, [range(21, 41)])
+    part = part_of_group(group, range(21, 41), pairs)
     settings = Settings.from_mapping({"seed": 7, "scene": {"part_photos": 33}})
 
     write_inputs(tmp_path / "a.npz", part, [(21, 22), (21, 23)], settings)
