@@ -68,16 +68,9 @@ def read_placed(model_dir: Path) -> PlacedPhotos:
         X = np.array([point.xyz for _, point in points], np.float64).reshape(-1, 3)
     seen = np.array([element for track in tracks for element in track], np.int64).reshape(-1, 2)
     R = poses[:, :, :3]
-    return PlacedPhotos(
-        photos=np.array([image.image_id for image in images], np.int64),
-        R=R,
-        centers=-np.einsum("nji,nj->ni", R, poses[:, :, 3]),
-        X=X,
-        point=np.repeat(np.arange(len(tracks)), [len(track) for track in tracks]),
-        photo=seen[:, 0],
-        keypoint=seen[:, 1],
-        cameras=cameras,
-    )
+    centers = -np.einsum("nji,nj->ni", R, poses[:, :, 3])
+    point = np.repeat(np.arange(len(tracks)), [len(track) for track in tracks])
+    return PlacedPhotos(np.array(sorted(cameras), np.int64), R, centers, X, point, seen[:, 0], seen[:, 1], cameras)
 
 
 def write_placed(database: Path, placed: PlacedPhotos) -> pycolmap.Reconstruction:

@@ -89,7 +89,12 @@ def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray
 
 
 def bearing_vectors(camera: pycolmap.Camera, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return bearing vectors (N, 9) of pixels x (N, 2), as `geometry.lenses.bearings` does."""
+    """Return bearing vectors (N, 9), as `geometry.lenses.bearings` does.
+
+    Args:
+        camera: COLMAP's camera.
+        x: (N, 2) pixels.
+    """
     if camera.is_perspective_fisheye() or camera.is_spherical():
         steps = np.vstack([x + step for step in ([0.0, 0.0], [STEP_PX, 0.0], [0.0, STEP_PX])])
         here, right, down = np.asarray(camera.cam_ray_from_img(steps), np.float64).reshape(3, -1, 3)

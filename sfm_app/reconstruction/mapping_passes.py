@@ -18,7 +18,6 @@ from sfm_app.reconstruction.camera_per_photo import (
     with_two_cameras,
 )
 from sfm_app.reconstruction.look_alikes import drop_look_alikes, with_earlier_look_alikes
-from sfm_app.reconstruction.mapped_pairs import pairs_to_map
 from sfm_app.reconstruction.mapping_runs import (
     Attempt,
     Group,
@@ -27,6 +26,7 @@ from sfm_app.reconstruction.mapping_runs import (
     best_attempt,
     choice_reason,
     map_group,
+    pairs_to_map,
 )
 from sfm_app.reconstruction.model_merge import join_models
 from sfm_app.reconstruction.model_split import sound_parts

@@ -121,7 +121,7 @@ def _farthest_photo(start: int, photos: set[int], links: Links) -> int:
 
 
 def _best_growth(start: int, photos: set[int], links: Links) -> tuple[float, set[int]]:
-    """Grow a side from a photo; return the least normalized cut that it passes through, and the side there."""
+    """Return the least normalized cut that a side passes through as it grows from a photo, and the side there."""
     degree = {photo: sum(w for b, w in sorted(links[photo].items()) if b in photos) for photo in sorted(photos)}
     total, inside = sum(degree.values()), dict.fromkeys(degree, 0.0)
     waiting, order, grown = [(0.0, start)], list[int](), set[int]()

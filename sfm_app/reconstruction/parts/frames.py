@@ -74,21 +74,18 @@ def align_fragments(fragments: Sequence[Fragment], joins: Sequence[Join]) -> Ali
             break
         dropped.append((left.pop(worst), errors[worst]))
     main = _main_group(fragments, left)
-    return Alignment(
-        {number: frames[number] for number in sorted(main)},
-        tuple(zip(left, errors, strict=True)),
-        tuple(dropped),
-    )
+    kept = tuple(zip(left, errors, strict=True))
+    return Alignment({number: frames[number] for number in sorted(main)}, kept, tuple(dropped))
 
 
 def _main_group(fragments: Sequence[Fragment], joins: Sequence[Join]) -> set[int]:
-    """Return the joined fragments that own most photos together."""
+    """Return the joined fragments that have most photos together."""
     groups = connected_groups([(join.first, join.second) for join in joins], range(len(fragments)))
 
-    def owned(group: set[int]) -> int:
+    def count_photos(group: set[int]) -> int:
         return len({photo for number in group for photo in fragments[number].placed.photos.tolist()})
 
-    return max(groups, key=lambda group: (owned(group), -min(group)), default=set())
+    return max(groups, key=lambda group: (count_photos(group), -min(group)), default=set())
 
 
 def join_error(join: Join, frames: Mapping[int, Similarity], radii: Sequence[float]) -> JoinError:

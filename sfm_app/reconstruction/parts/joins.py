@@ -107,17 +107,11 @@ def find_join(first: int, second: int, fragments: Sequence[Fragment]) -> Join | 
         similarity, agreeing = refined, now
     _, angles, shifts = shared.agreement(similarity)
     seen = np.flatnonzero(agreeing[shared.photo])
-    return Join(
-        first,
-        second,
-        similarity,
-        photos=int(np.count_nonzero(agreeing)),
-        shared=len(photos),
-        points=len(np.unique(shared.rows_a[seen])),
-        off_deg=float(np.median(angles[agreeing])),
-        off=float(np.median(shifts[agreeing])),
-        middle=shared.cb[agreeing].mean(axis=0)[None],
-    )
+    points_seen = len(np.unique(shared.rows_a[seen]))
+    deviations = float(np.median(angles[agreeing])), float(np.median(shifts[agreeing]))
+    middle = shared.cb[agreeing].mean(axis=0)[None]
+    count = int(np.count_nonzero(agreeing))
+    return Join(first, second, similarity, count, len(photos), points_seen, *deviations, middle)
 
 
 class _SharedPhotos:

@@ -59,8 +59,7 @@ def part_of_group(group: Group, photos: Sequence[int], pairs: Sequence[PairId]) 
     matches, fits, poses = group.matches, group.views.fits, group.graph.poses
     images = {photo: matches.images[photo] for photo in photos}
     names = {image.name: group.intrinsics.camera_name(image) for image in images.values()}
-    used = set(names.values())
-    cameras = {name: camera for name, camera in group.intrinsics.cameras.items() if name in used}
+    cameras = {name: camera for name, camera in group.intrinsics.cameras.items() if name in set(names.values())}
     return Group(
         tuple(photos),
         MatchGraph(

@@ -177,31 +177,34 @@ def part_figures(group: Group, joined: JoinedParts, found: Sequence[MappingResul
         joined: models of parts and their joins.
         found: models of all.
     """
-    placed = [set(fragment.placed.photos.tolist()) for fragment in joined.fragments]
-    parts: list[Json] = [
-        {
-            "photos": len(part.photos),
-            "own": len(part.own),
-            "first": photo_names(part.own[:1], group.matches)[0],
-            "placed": [len(placed[k]) for k, one in enumerate(joined.fragments) if one.part == number],
-            "mapper": result.mapper,
-            "tried": list(result.tried),
-        }
-        for number, (part, result) in enumerate(zip(joined.parts, joined.results, strict=True))
-    ]
     aligned = joined.alignment
     loops = loop_errors(joined.fragments, [join for join, _ in (*aligned.kept, *aligned.dropped)])
     return {
-        "parts": parts,
+        "parts": _part_entries(group, joined),
         "joins": [_join_entry(join, joined, off) for join, off in aligned.kept],
         "dropped_joins": [
             *(_join_entry(join, joined, off) | {"because": "contradicts other joins"} for join, off in aligned.dropped),
             *(_join_entry(join, joined) | {"because": "matches contradict it"} for join in joined.refused),
         ],
         "loops": [{"through": [joined.fragments[k].part for k in way]} | _error_entry(off) for way, off in loops],
-        "left_out": [joined.fragments[k].part for k in range(len(placed)) if k not in aligned.frames],
+        "left_out": [joined.fragments[k].part for k in range(len(joined.fragments)) if k not in aligned.frames],
         "models": [one.note for one in found if isinstance(one, Attempt)],
     }
+
+
+def _part_entries(group: Group, joined: JoinedParts) -> list[Json]:
+    placed = [(fragment.part, len(fragment.placed.photos)) for fragment in joined.fragments]
+    return [
+        {
+            "photos": len(part.photos),
+            "own": len(part.own),
+            "first": photo_names(part.own[:1], group.matches)[0],
+            "placed": [count for owner, count in placed if owner == number],
+            "mapper": result.mapper,
+            "tried": list(result.tried),
+        }
+        for number, (part, result) in enumerate(zip(joined.parts, joined.results, strict=True))
+    ]
 
 
 def _join_entry(join: Join, joined: JoinedParts, off: JoinError | None = None) -> dict[str, Json]:
