@@ -129,6 +129,13 @@ class SceneSettings(Section):
     min_seed_angle_deg: float = Field(
         2.0, gt=0, le=90, description="least median triangulation angle of a seed pair, in degrees"
     )
+    part_photos: int = Field(
+        0,
+        ge=0,
+        le=100_000,
+        description="photos of a part, where more than half as many again are mapped in parts that are joined "
+        "afterwards; 0: parts of 150 for more than 400 photos",
+    )
     min_points: int = Field(30, ge=6, le=10000, description="a model with fewer points counts as failed")
     second_look: bool = Field(
         True, description="find finer features in unplaced photos and their neighbors, and map again"

@@ -8,7 +8,12 @@ from sfm_app.types import Scene
 
 NAMES_SHOWN = 4
 """Most photos of a group that are named."""
-MAPPERS = {"incremental": "photo after photo", "global": "all at once", "colmap": "as COLMAP does by itself"}
+MAPPERS = {
+    "incremental": "photo after photo",
+    "global": "all at once",
+    "colmap": "as COLMAP does by itself",
+    "parts": "in parts that were joined",
+}
 CONTRADICTED_WARNING_SHARE = 0.1
 """Share of contradicted matches above which the text warns."""
 CAMERA_PER_PHOTO_TEXTS = {
@@ -73,6 +78,8 @@ def _remark_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iter
         dropped = sum(summary.get("pairs_dropped", {}).values())
         because = f": {counts['mapper_reason']}" if counts.get("mapper_reason") else ""
         yield f"mapped {MAPPERS[summary['mapper']]}{because}"
+        for left in (one["dropped_joins"] for one in counts.get("parts", ()) if one["dropped_joins"]):
+            yield f"joins between parts left out because other joins or matches contradict them: {len(left)}"
         if counts.get("rival_tried_because"):
             yield f"COLMAP's own mapper was tried, too: {counts['rival_tried_because']}"
         if counts.get("one_camera_each") in CAMERA_PER_PHOTO_TEXTS:

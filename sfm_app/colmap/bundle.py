@@ -75,7 +75,7 @@ def adjust(model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RUL
     if rules:
         apply_rules(model, rules)
     drop_infinite_points(model)
-    graph = _correspondences(model, database)
+    graph = find_correspondences(model, database)
     rounds = adjust_in_rounds(model, graph, rules)
     open_points = rounds.open_points
     families = best_families(model, rounds, rules)
@@ -113,7 +113,13 @@ def drop_infinite_points(model: pycolmap.Reconstruction) -> None:
         model.delete_point3D(point_id)
 
 
-def _correspondences(model: pycolmap.Reconstruction, database: Path) -> pycolmap.CorrespondenceGraph:
+def find_correspondences(model: pycolmap.Reconstruction, database: Path) -> pycolmap.CorrespondenceGraph:
+    """Return the graph of all matches between the photos of a model.
+
+    Args:
+        model: COLMAP's reconstruction.
+        database: has all keypoints and matches.
+    """
     options = pycolmap.DatabaseCacheOptions()
     options.load_all_images = True  # else photos that no pair in the database connects would be missing
     options.image_names = {model.images[image_id].name for image_id in model.reg_image_ids()}

@@ -83,13 +83,18 @@ def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray
     found = {}
     for image in posed_images(model):
         camera, pose = model.cameras[image.camera_id], image.cam_from_world().matrix()
-        lines = _bearings(camera, keypoints[image.image_id])
+        lines = bearing_vectors(camera, keypoints[image.image_id])
         found[image.image_id] = PlacedView(pose[:, :3].copy(), pose[:, 3].copy(), lines)
     return found
 
 
-def _bearings(camera: pycolmap.Camera, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N, 9) as `geometry.lenses.bearings` does."""
+def bearing_vectors(camera: pycolmap.Camera, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return bearing vectors (N, 9), as `geometry.lenses.bearings` does.
+
+    Args:
+        camera: COLMAP's camera.
+        x: (N, 2) pixels.
+    """
     if camera.is_perspective_fisheye() or camera.is_spherical():
         steps = np.vstack([x + step for step in ([0.0, 0.0], [STEP_PX, 0.0], [0.0, STEP_PX])])
         here, right, down = np.asarray(camera.cam_ray_from_img(steps), np.float64).reshape(3, -1, 3)
@@ -293,7 +298,7 @@ def viewing_rays(model: pycolmap.Reconstruction, image_id: int, x: NDArray[np.fl
     """
     image = model.images[image_id]
     R = image.cam_from_world().matrix()[:, :3]
-    return np.asarray(_bearings(model.cameras[image.camera_id], np.asarray(x, np.float64))[:, RAY] @ R)
+    return np.asarray(bearing_vectors(model.cameras[image.camera_id], np.asarray(x, np.float64))[:, RAY] @ R)
 
 
 def focal_px(model: pycolmap.Reconstruction, image_id: int) -> float:

@@ -18,12 +18,21 @@ from sfm_app.reconstruction.camera_per_photo import (
     with_two_cameras,
 )
 from sfm_app.reconstruction.look_alikes import drop_look_alikes, with_earlier_look_alikes
-from sfm_app.reconstruction.mapping_runs import Attempt, Group, NoModel, best_attempt, choice_reason, map_group
+from sfm_app.reconstruction.mapping_runs import (
+    Attempt,
+    Group,
+    MappingResult,
+    NoModel,
+    best_attempt,
+    choice_reason,
+    map_group,
+    pairs_to_map,
+)
 from sfm_app.reconstruction.model_merge import join_models
 from sfm_app.reconstruction.model_split import sound_parts
+from sfm_app.reconstruction.parts import is_convincing, map_in_parts, part_size
 from sfm_app.reconstruction.support import model_poses
 from sfm_app.reconstruction.unregistered import are_worth_another_try, photo_names
-from sfm_app.retrieval.choice import choose_by_rank
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PoseGraph, ViewGraph
 
@@ -34,8 +43,6 @@ MOST_PASSES = 4
 (true 3318), and the third places all photos with it."""
 OTHER_FOCALS = (0.6, 2.4, 4.8)
 """Guesses of the focal besides the usual one, in longer sides: steps of a factor of two over the range of cameras."""
-MOST_FULLY_MAPPED, MAPPED_PARTNERS = 250, 16
-"""Photos up to which mapping uses all pairs, and partners of each photo above. Chosen by hand."""
 FOCAL_TOLERANCE = 0.01
 """Relative change of a focal in mapping above which another pass over the pairs is worth it."""
 
@@ -264,7 +271,7 @@ def _run_pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run
     for number, photos in enumerate(graph.groups):
         if number and len(photos) < MIN_PHOTOS:
             continue
-        found = map_group(Group(photos, matches, views, graph, intrinsics), run)
+        found = _map_by_size(Group(photos, matches, views, graph, intrinsics), run)
         tried += [attempt.note for attempt in found]
         best = best_attempt(found)
         if best is not None:
@@ -277,6 +284,14 @@ def _run_pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run
     models.sort(key=lambda attempt: (-attempt.photos, -attempt.support))
     reason = reasons[models[0].note] if models else ""
     return Outcome(tuple(models), graph, intrinsics, tuple(tried), reason, tuple(cuts))
+
+
+def _map_by_size(group: Group, run: RunContext) -> list[MappingResult]:
+    """Map a large group in parts, and a small one, or one that parts do not explain, as a whole."""
+    if not part_size(len(group.photos), run.settings.scene):
+        return map_group(group, run)
+    found = map_in_parts(group, pairs_to_map(group.graph), run)
+    return found if is_convincing(found, len(group.photos)) else [*found, *map_group(group, run)]
 
 
 def split_attempt(attempt: Attempt) -> list[Attempt]:
@@ -308,22 +323,6 @@ def _update_graph(models: Sequence[Attempt], graph: PoseGraph, matches: MatchGra
         poses = model_poses(attempt.model, matches, epipolar.max_error_px, epipolar.min_inliers)
         graph = with_model(graph, set(posed_photo_ids(attempt.model)), poses)
     return graph
-
-
-def pairs_to_map(graph: PoseGraph) -> PoseGraph:
-    """Return the pose graph with as many pairs as mapping needs; all of them in small sets.
-
-    Tracks join along a few pairs of each photo. COLMAP follows all pairs of every point again and again.
-
-    Args:
-        graph: relative poses.
-    """
-    photos = {photo for pair in graph.poses for photo in pair}
-    if len(photos) <= MOST_FULLY_MAPPED:
-        return graph
-    counts = {pair: pose.inlier_count for pair, pose in graph.poses.items()}
-    chosen = choose_by_rank(counts, 0, MAPPED_PARTNERS)
-    return replace(graph, poses={pair: pose for pair, pose in graph.poses.items() if pair in chosen})
 
 
 def _write_graph(graph: PoseGraph, intrinsics: Intrinsics, matches: MatchGraph, run: RunContext) -> None:

@@ -5,7 +5,7 @@ import logging
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeAlias
 
@@ -20,6 +20,7 @@ from sfm_app.numerical import FAILURES, error_reason
 from sfm_app.reconstruction.initial_pairs import Candidate, rank_seeds, triangulate_seed
 from sfm_app.reconstruction.support import PairSupport, explained_pairs, support
 from sfm_app.reconstruction.unregistered import photo_names
+from sfm_app.retrieval.choice import choose_by_rank
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, PoseGraph, ViewGraph
 
@@ -37,6 +38,8 @@ MAX_CONTRADICTED_SHARE = 0.01
 """Share of the inliers of fundamental matrices that may contradict a complete model before others are tried."""
 MAX_FOCAL_DEVIATION = 0.01
 """Relative standard deviation of a focal up to which mapping holds it fixed."""
+MOST_FULLY_MAPPED, MAPPED_PARTNERS = 250, 16
+"""Photos up to which mapping uses all pairs, and partners of each photo above. Chosen by hand."""
 INCREMENTAL_FOLDER, GLOBAL_FOLDER = "incremental", "global"
 
 
@@ -99,6 +102,22 @@ class StopSignal:
         return self.needless or self.token.is_cancelled
 
 
+def pairs_to_map(graph: PoseGraph) -> PoseGraph:
+    """Return the pose graph with as many pairs as mapping needs; all of them in small sets.
+
+    Tracks join along a few pairs of each photo. COLMAP follows all pairs of every point again and again.
+
+    Args:
+        graph: relative poses.
+    """
+    photos = {photo for pair in graph.poses for photo in pair}
+    if len(photos) <= MOST_FULLY_MAPPED:
+        return graph
+    counts = {pair: pose.inlier_count for pair, pose in graph.poses.items()}
+    chosen = choose_by_rank(counts, 0, MAPPED_PARTNERS)
+    return replace(graph, poses={pair: pose for pair, pose in graph.poses.items() if pair in chosen})
+
+
 def map_group(group: Group, run: RunContext) -> list[MappingResult]:
     """Return the results of the mappers on a group.
 
@@ -126,6 +145,18 @@ def map_group(group: Group, run: RunContext) -> list[MappingResult]:
         if best is not None and best.mapper == "global" and best.photos < len(group.photos):
             found += made(partial(_attempt_completion, group, best, run))
     return found
+
+
+def complete_attempt(group: Group, attempt: Attempt, run: RunContext) -> list[MappingResult]:
+    """Continue a model photo by photo, with the photos that it lacks.
+
+    Args:
+        group: a connected group of photos, with their matches and poses.
+        attempt: its model so far.
+        run: the run.
+    """
+    with _attempt_runner(group, run) as made:
+        return made(partial(_attempt_completion, group, attempt, run))
 
 
 def best_attempt(found: Sequence[MappingResult]) -> Attempt | None:

@@ -194,10 +194,10 @@ def _look_alikes(
 def _with_outliers(
     rows: IndexArray, keypoints: list[int], share: float, rng: np.random.Generator
 ) -> NDArray[np.uint32]:
-    """Return (M, 2) matches with wrong ones among them."""
-    wrong = round(len(rows) * share / (1.0 - share))
-    drawn = np.column_stack([rng.integers(0, count, wrong) for count in keypoints])
-    return np.concatenate([rows, drawn]).astype(np.uint32)
+    """Return (M, 2) matches with wrong ones among them; as of a matcher, no keypoint has two."""
+    left = [rng.permutation(np.setdiff1d(np.arange(count), rows[:, side])) for side, count in enumerate(keypoints)]
+    wrong = min(round(len(rows) * share / (1.0 - share)), *map(len, left))
+    return np.concatenate([rows, np.column_stack([free[:wrong] for free in left])]).astype(np.uint32)
 
 
 def _pair_matrix(pair: PairId, walk: TownWalk, K: FloatArray) -> FloatArray:

@@ -1,6 +1,6 @@
 """Rounds of the last bundle adjustment: a step of everything, then tracks are completed and filtered."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -76,7 +76,7 @@ def adjust_in_rounds(
         write_bundle(model, ids, best_step(bundle, reduced, found.params, LOSS_SCALE_PX))
         if found.step > LONG_STEP:
             solve(model)
-        changed = _improve_tracks(model, graph) if graph else 0
+        changed = improve_tracks(model, graph) if graph else 0
         if model.num_points3D() <= MIN_KEPT_SHARE * points:
             raise NumericalError(f"it left {model.num_points3D()} of {points} points")
         if found.step < STEP and changed < CHANGED_SHARE * len(bundle.x):
@@ -84,8 +84,13 @@ def adjust_in_rounds(
     return Rounds(ids, bundle, found, reduced.noise_px, open_points[0])
 
 
-def solve(model: pycolmap.Reconstruction) -> None:
-    """Adjust poses and points in place, on one thread: the order of sums over several threads is not fixed."""
+def solve(model: pycolmap.Reconstruction, refined: Collection[int] = ()) -> None:
+    """Adjust poses and points in place, on one thread: the order of sums over several threads is not fixed.
+
+    Args:
+        model: COLMAP's reconstruction.
+        refined: ids of the cameras whose focal is adjusted, too.
+    """
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
@@ -96,16 +101,21 @@ def solve(model: pycolmap.Reconstruction) -> None:
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
         config.add_image(image_id)
-    for camera_id in photos_per_camera(model):
+    options.refine_principal_point = options.refine_extra_params = False
+    for camera_id in sorted(photos_per_camera(model).keys() - set(refined)):
         config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     run_in_daemon_thread(pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve)
 
 
-def _improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph) -> int:
+def improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph) -> int:
     """Continue, merge and triangulate tracks, filter them, and return by how many observations their number changed.
 
     Observations that are added and filtered again do not count: near the limits they come and go forever.
+
+    Args:
+        model: changed in place.
+        graph: of all matches.
     """
     before = model.compute_num_observations()
     observations = pycolmap.ObservationManager(model, graph)

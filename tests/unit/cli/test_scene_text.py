@@ -36,6 +36,14 @@ def test_people_read_how_many_photos_are_placed_how_and_how_sure_the_camera_is()
     assert summary["mapper"] == "global" and summary["cameras"]["one"]["K"][0][0] == 900.0
 
 
+def test_parts_and_their_wrong_joins_are_told():
+    text, _ = told(mapper="parts", parts=[{"dropped_joins": [{}, {}]}, {"dropped_joins": []}])
+
+    assert "mapped in parts that were joined: it explains more\n" in text
+    assert text.count("joins between parts left out because other joins or matches contradict them: 2") == 1
+    assert "joins between parts" not in told(parts=[{"dropped_joins": []}])[0]
+
+
 def test_other_models_and_cuts_are_named():
     text, summary = told(
         other_models=[[f"b{n}.jpg" for n in range(6)], ["c.jpg", "d.jpg", "e.jpg"]], cut_apart=["a, b"]

@@ -103,7 +103,7 @@ def test_what_fails_in_our_numbers_is_a_reason_and_what_fails_in_colmap_an_error
         raise error
 
     model, database = mapped()
-    where, name = (bundle_rounds, "reduce") if expected is None else (bundle, "_correspondences")
+    where, name = (bundle_rounds, "reduce") if expected is None else (bundle, "find_correspondences")
     monkeypatch.setattr(where, name, failing)
     if expected:
         with pytest.raises(expected, match=str(error)):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sfm_app.posegraph.groups import connected_groups
-from sfm_app.reconstruction import mapping_passes as module
-from sfm_app.reconstruction.mapping_passes import pairs_to_map
+from sfm_app.reconstruction import mapping_runs as module
+from sfm_app.reconstruction.mapping_runs import pairs_to_map
 from sfm_app.reconstruction.unregistered import are_worth_another_try
 from sfm_app.types import PoseGraph, RelativePose
 

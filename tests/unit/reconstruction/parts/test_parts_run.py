@@ -1,0 +1,178 @@
+"""Mapping in parts from end to end, on a walk through a town; and what happens where parts fail."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
+from sfm_app.colmap.model import poses_and_points
+from sfm_app.geometry.similarity import umeyama
+from sfm_app.plugins import load_plugins
+from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
+from sfm_app.reconstruction import mapping_passes
+from sfm_app.reconstruction.mapping_runs import Attempt, Group, NoModel, best_attempt
+from sfm_app.reconstruction.parts import is_convincing, map_in_parts, part_size, parts_run
+from sfm_app.reconstruction.parts.part_mapping import FOLDER, PartResult, PartTask, map_part
+from sfm_app.reconstruction.support import PairSupport
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.parallel import make_executor
+from sfm_app.runtime.workspace import Workspace
+from sfm_app.settings import SceneSettings, Settings
+from sfm_app.synthetic.town_graph import TownOptions, make_town_graph
+from sfm_app.types import Calibration, Intrinsics
+
+PHOTOS, PART = 90, 30
+
+
+@pytest.fixture(scope="module")
+def town():
+    return make_town_graph(TownOptions(photos=PHOTOS, step_m=0.75, look_alikes=0.0), 0)
+
+
+@pytest.fixture(scope="module")
+def group(town):
+    width, height = TownOptions().size
+    camera = Calibration(town.K, width, height, "zero-curves", True, spread={"fx": 1.0})
+    intrinsics = Intrinsics({"camera": camera})
+    graph = build_pose_graph(
+        town.matches, town.views, intrinsics, PoseGraphOptions(1.5, 16, 0), lambda f, items, _: list(map(f, items))
+    )
+    return Group(graph.groups[0], town.matches, town.views, graph, intrinsics)
+
+
+@pytest.fixture
+def start(group, tmp_path):
+    """Maps the group in parts with some workers, in a folder of its own."""
+
+    def run_with(workers=2):
+        place = Workspace(tmp_path / f"of-{workers}")
+        place.photos.mkdir(parents=True)
+        write_match_graph(place.database, group.matches)
+        write_calibrations(place.database, group.matches, group.intrinsics)
+        write_pose_graph(place.database, group.matches, group.graph)
+        settings = Settings.from_mapping({"scene": {"part_photos": PART}})
+        with make_executor(workers) as executor:
+            run = RunContext(settings, place, load_plugins(installed=False), executor, workers)
+            return map_in_parts(group, group.graph, run), run
+
+    return run_with
+
+
+def model_arrays(found):
+    poses, points = poses_and_points(best_attempt(found).model)
+    return np.array(list(poses.values())), points, list(poses)
+
+
+@pytest.mark.slow
+def test_parts_become_one_exact_model_with_all_photos_whatever_the_workers(town, group, start):
+    (found, run), (again, other) = start(2), start(1)
+
+    poses, _, photos = model_arrays(found)
+    assert photos == sorted(group.photos) and len(photos) >= PHOTOS - 2
+    centers = -np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3])
+    true = town.centers[np.array(photos) - 1]
+    away = np.linalg.norm(umeyama(centers, true)(centers) - true, axis=1)
+    assert 0.0005 < np.median(away) < 0.1 and away.max() < 0.5
+    assert is_convincing(found, len(group.photos))
+    (figures,) = run.statistics["parts"]
+    assert len(figures["parts"]) >= 3 and len(figures["joins"]) >= len(figures["parts"]) - 1
+    assert not figures["dropped_joins"] and not figures["left_out"]
+    assert all(join["photos"] >= 5 and join["explained"] > join["contradicted"] for join in figures["joins"])
+    assert not (run.workspace.root / FOLDER).exists()
+    for one, two in zip(model_arrays(found), model_arrays(again), strict=True):
+        assert np.array_equal(one, two)
+    assert other.statistics["parts"] == [figures]
+
+
+@pytest.mark.slow
+def test_a_part_that_fails_is_left_to_the_others(start, monkeypatch):
+    made = []
+
+    def some_fail(tasks):
+        made.append(tasks)
+        return PartResult((), "", ("failed: no memory",)) if len(made) == 2 else map_part(tasks)
+
+    monkeypatch.setattr("sfm_app.reconstruction.parts.part_mapping.map_part", some_fail)
+    found, run = start(1)
+
+    (figures,) = run.statistics["parts"]
+    assert [part["tried"] for part in figures["parts"]][1] == ["failed: no memory"]
+    joined, completed = found
+    assert joined.photos < completed.photos
+    assert best_attempt(found) is completed and completed.photos >= PHOTOS - 4
+
+
+def test_where_no_part_is_mapped_the_reason_is_told(group, start, monkeypatch):
+    failed = PartResult((), "", ("failed: no memory",))
+    monkeypatch.setattr(parts_run, "map_parts", lambda *_: [failed] * 9)
+    monkeypatch.setattr(parts_run, "cut_group", lambda *_: [parts_run.Part((k,), (k,)) for k in range(1, 10)])
+
+    (found,) = start()[0]
+
+    assert isinstance(found, NoModel) and found.note == "in 9 parts: none was mapped; failed: no memory"
+    assert not is_convincing([found], PHOTOS)
+
+
+def test_the_size_of_parts_is_that_of_the_settings_or_usual_for_large_groups():
+    auto, own = SceneSettings(), SceneSettings(part_photos=60)
+
+    assert [part_size(count, auto) for count in (3, 400, 401, 9000)] == [0, 0, 150, 150]
+    assert [part_size(count, own) for count in (90, 91, 1000)] == [0, 60, 60]
+    assert part_size(100, SceneSettings(part_photos=1)) == 20
+
+
+class _Model:
+    def __init__(self, photos):
+        self.photos = photos
+
+    def num_reg_images(self):
+        return self.photos
+
+    def num_points3D(self):
+        return 100
+
+
+def attempt(photos, contradicted=0, mapper="parts", matches=100):
+    return Attempt(mapper, _Model(photos), {(1, 2): PairSupport(matches, 100, contradicted)}, f"{photos} photos")
+
+
+@pytest.mark.parametrize(("found", "good"), [
+    ([attempt(200)], True), ([attempt(195)], True), ([attempt(180)], False), ([attempt(200, 6)], False), ([], False),
+])  # fmt: skip
+def test_a_model_of_parts_convinces_with_nearly_all_photos_and_few_contradictions(found, good):
+    assert is_convincing(found, 200) is good
+
+
+@pytest.mark.parametrize(("of_parts", "taken"), [(attempt(200), "parts"), (attempt(100, matches=50), "whole")])
+def test_the_whole_is_mapped_where_parts_do_not_explain_it(group, start, monkeypatch, of_parts, taken):
+    whole = []
+
+    def map_whole(*_):
+        whole.append(attempt(190, mapper="whole"))
+        return whole
+
+    monkeypatch.setattr(mapping_passes, "map_group", map_whole)
+    monkeypatch.setattr(mapping_passes, "map_in_parts", lambda *_: [of_parts])
+    monkeypatch.setattr(mapping_passes, "part_size", lambda *_: 100)
+
+    found = mapping_passes._map_by_size(replace(group, photos=tuple(range(200))), _run())
+
+    assert best_attempt(found).mapper == taken
+    assert len(whole) == (taken == "whole")
+
+
+def _run():
+    class Run:
+        settings = Settings()
+
+    return Run()
+
+
+def test_a_task_is_small_and_travels(tmp_path):
+    import pickle
+
+    task = PartTask(str(tmp_path), str(tmp_path / "photos"))
+
+    assert len(pickle.dumps((map_part, task))) < 1000
+    assert pickle.loads(pickle.dumps((map_part, task))) == (map_part, task)  # noqa: S301
