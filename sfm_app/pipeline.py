@@ -33,6 +33,7 @@ MATCH_GRAPH: Stage[MatchGraph] = Stage(
     make=lambda given, run: match_graph.make(given[PHOTOS], run),
     load=lambda given, run: match_graph.load(given[PHOTOS], run),
     digest=match_graph.digest,
+    grows=True,
 )
 VIEW_GRAPH: Stage[ViewGraph] = Stage(
     name="view_graph",
@@ -42,6 +43,7 @@ VIEW_GRAPH: Stage[ViewGraph] = Stage(
     make=lambda given, run: view_graph.make(given[MATCH_GRAPH], run),
     load=lambda _, run: view_graph.load(run),
     digest=view_graph.digest,
+    grows=True,
 )
 INTRINSICS: Stage[Intrinsics] = Stage(
     name="intrinsics",
@@ -51,6 +53,7 @@ INTRINSICS: Stage[Intrinsics] = Stage(
     make=lambda given, run: intrinsics.make(given[MATCH_GRAPH], given[VIEW_GRAPH], run),
     load=lambda _, run: intrinsics.load(run),
     digest=intrinsics.digest,
+    grows=True,
 )
 SCENE: Stage[Scene] = Stage(
     name="scene",
@@ -60,6 +63,7 @@ SCENE: Stage[Scene] = Stage(
     make=lambda given, run: scene.make(given[MATCH_GRAPH], given[VIEW_GRAPH], given[INTRINSICS], run),
     load=lambda _, run: scene.load(run),
     digest=scene.digest,
+    grows=True,
 )
 DEPTH_MAPS: Stage[Path] = Stage(
     name="depth_maps",
