@@ -37,14 +37,15 @@ def match_probable_pairs(method: FeatureMethod, load: Callable[[], MatchGraph], 
     """
     before = load()
     known = run.earlier.known if run.earlier is not None else frozenset[str]()
-    first = first_pairs(before.images, lambda photo: _descriptors(method, before.images[photo], run), run)
+    news = {photo for photo, image in before.images.items() if image.name not in known}
+    first = first_pairs(before.images, lambda photo: _descriptors(method, before.images[photo], run), run, news)
     first = pairs_with_news(first, before.images, known)
     in_force = match_pairs(method, run, first)
     seen, asked = load(), set(first)
     asked |= seen.matches.keys() - set(pairs_with_news(seen.matches, before.images, known))
     matches = {pair: rows for pair, rows in seen.matches.items() if pair in asked}
     counts = {photo: len(points) for photo, points in seen.keypoints.items()}
-    second = pairs_with_news(second_pairs(counts, matches, asked, run.settings.matching), before.images, known)
+    second = second_pairs(counts, matches, asked, run.settings.matching, news)
     in_force |= match_pairs(method, run, second)
     run.record(matched_pairs=len(first) + len(second), rounds=[len(first), len(second)])
     return in_force

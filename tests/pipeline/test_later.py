@@ -80,7 +80,7 @@ def test_new_photos_are_placed_in_the_model_that_is_there(first, folder, monkeyp
     assert largest_error(run, first.truth) < 0.01
     assert counts(run, "match_graph")["known_photos"] == FIRST and counts(run, "match_graph")["new_photos"] == 2
     assert counts(run, "view_graph")["known_pairs"] == FIRST * (FIRST - 1) // 2
-    assert list(counts(run, "intrinsics")["cameras"].values())[0]["method"] == "earlier run"
+    assert next(iter(counts(run, "intrinsics")["cameras"].values()))["method"] == "earlier run"
     assert counts(run, "scene")["mapper"] == "grown" and counts(run, "scene")["mapped_again_because"] == ""
     after = read_features(out / "database.db")
     assert all(np.array_equal(after[1][pair], rows) for pair, rows in before[1].items())
@@ -96,7 +96,7 @@ def test_the_same_history_gives_the_same_bytes(first, folder, tmp_path):
     results = []
     for place, workers in ((out, 1), (tmp_path / "other", 2)):
         run = reconstruct(photos, place, Settings.from_mapping({"quality": "draft", "workers": workers}))
-        files = [path for path in sorted((place / "sparse").iterdir())] + [place / "view_graph.npz", place / "scene.json"]
+        files = [*sorted((place / "sparse").iterdir()), place / "view_graph.npz", place / "scene.json"]
         results.append(([path.read_bytes() for path in files], run.scene.cam_from_world.keys()))
 
     assert results[0] == results[1]

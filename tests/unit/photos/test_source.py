@@ -77,7 +77,14 @@ def test_a_photo_is_the_same_if_bytes_size_group_and_mask_are(folder, tmp_path):
 
     before = hash_of(used)
     assert hash_of(replace(used, notes=("read without color",))) == before
-    changes = {"width": 61, "group": "another", "mask": "b.png", "turn_deg": 90, "name": "_a.jpg", "shown": (1, 1, 9, 9)}
+    changes = {
+        "width": 61,
+        "group": "another",
+        "mask": "b.png",
+        "turn_deg": 90,
+        "name": "_a.jpg",
+        "shown": (1, 1, 9, 9),
+    }
     assert len({hash_of(replace(used, **{key: value})) for key, value in changes.items()} - {before}) == len(changes)
     assert hash_of(used, masks=tmp_path / "masks") != before
     (folder / "a.jpg").write_text("a better photo of the same name")

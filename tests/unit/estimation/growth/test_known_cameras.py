@@ -42,7 +42,7 @@ def run(tmp_path):
     return SimpleNamespace(
         earlier=earlier, given=GivenCameras(), settings=Settings(), seed=0, said=said, figures=figures,
         progress=SimpleNamespace(say=said.append), record=lambda **more: figures.update(more),
-        plugins=SimpleNamespace(calibrator=lambda name: SimpleNamespace(calibrate=None, together=True)),
+        plugins=SimpleNamespace(calibrator=lambda _: SimpleNamespace(calibrate=None, together=True)),
     )  # fmt: skip
 
 
@@ -79,9 +79,11 @@ def test_exif_of_the_new_photos_may_contradict_it(run):
     assert "EXIF says 1800" in run.said[0]
 
 
-@pytest.mark.parametrize(("focal", "stays"), [(903.0, True), (1100.0, False)])
+@pytest.mark.parametrize(("focal", "stays"), [(903.0, True), (870.0, True), (1100.0, False)])
 def test_pairs_of_the_new_photos_may_contradict_it(run, monkeypatch, focal, stays):
-    own = Calibration(camera_matrix(focal, focal, 500.0, 375.0), 1000, 750, "zero-curves", True, spread={"fx": 8.0})
+    own = Calibration(
+        camera_matrix(focal, focal, 500.0, 475.0), 1000, 750, "zero-curves", True, spread={"fx": 8.0, "cy": 5.0}
+    )
     monkeypatch.setattr(module, "photo_pairs", lambda *_: SimpleNamespace(photos=((5, 6),)))
     monkeypatch.setattr(module, "calibrate_photo_set", lambda *_, **__: [CalibratedCamera("one", (5, 6), own)])
     camera = {**REFINED, "params": [900.0, 900.0, 500.0, 375.0, 0.0, 0.0, 0.0, 0.0]}
@@ -96,7 +98,9 @@ def test_pairs_of_the_new_photos_may_contradict_it(run, monkeypatch, focal, stay
 def test_new_groups_are_calibrated_and_known_ones_are_not(run, monkeypatch):
     matches = photo_graph(*KNOWN, "e")
     phone = {k: MatchedImage(k, f"phone {k}", "phone", 800, 600) for k in (6, 7)}
-    matches = replace(matches, images=dict(matches.images) | phone, keypoints=dict.fromkeys(range(1, 8), np.zeros((0, 2))))
+    matches = replace(
+        matches, images=dict(matches.images) | phone, keypoints=dict.fromkeys(range(1, 8), np.zeros((0, 2)))
+    )
     asked = []
 
     def find(some, views, run):
