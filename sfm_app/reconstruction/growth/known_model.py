@@ -4,6 +4,7 @@ The poses of known photos are a start, not a given: the last adjustment refines 
 keep the errors that the new photos could correct.
 """
 
+import logging
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
@@ -13,6 +14,7 @@ from sfm_app.colmap.growth.grown_model import model_in_database
 from sfm_app.colmap.mapping import map_incrementally
 from sfm_app.colmap.model import posed_photo_ids, submodel
 from sfm_app.colmap.types import Reconstruction
+from sfm_app.errors import BackendError
 from sfm_app.estimation.calibrating import find_intrinsics
 from sfm_app.estimation.growth.same_matches import find_same_matches
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
@@ -33,6 +35,8 @@ from sfm_app.reconstruction.support import explained_pairs, model_poses, support
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.earlier import Earlier
 from sfm_app.types import Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
+
+logger = logging.getLogger("sfm_app")
 
 LEAST_KNOWN = 0.5
 """Share of the photos that the earlier model must hold for it to be a start: by definition, most of them."""
@@ -180,6 +184,9 @@ def _place(start: Reconstruction, group: Group, run: RunContext) -> Reconstructi
                 ),
                 lambda: None,
             )
+    except BackendError as err:  # all photos are mapped again
+        logger.info("the earlier model could not be extended: %s", err)
+        return None
     finally:
         run.progress.finish()
     return found[0]
