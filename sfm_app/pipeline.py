@@ -112,11 +112,8 @@ def run_stages(
     """Turn a folder of photos, or a video, into products.
 
     Args:
-        photo_dir: folder or video.
-        run: the run.
-        first: stage from which on everything is redone; empty for none.
-        last: stage to stop after.
-        wanted: stages whose products are loaded before returning.
+        photo_dir, run, wanted: folder or video; the run; stages whose products are loaded before returning.
+        first, last: stage from which on everything is redone, empty for none; stage to stop after.
     """
     options, place = run.settings.photos, run.workspace
     place.check_no_overlap(photo_dir)
@@ -144,9 +141,8 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
     place.manifest.check_format()
     needed, what = (SCENE, "points") if points else (TEXTURE, "model")
     if place.manifest.record(needed.name) is None:
-        hint = resume_hint(run)
-        if place.manifest.record(SCENE.name):
-            hint += "; `--points` exports the points and cameras"
+        more = "; `--points` exports the points and cameras" if place.manifest.record(SCENE.name) else ""
+        hint = resume_hint(run) + more
         raise InputError(f"{place.root} holds no {what} yet: stage `{needed.name}` is missing", hint=hint)
     if not points:
         return Products(run)[TEXTURE]

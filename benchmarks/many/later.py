@@ -27,12 +27,12 @@ from sfm_app.synthetic.cameras import make_camera
 from sfm_app.synthetic.photo_folder import save_truth, write_photo_folder
 from sfm_app.synthetic.scenes.statue import statue, statue_views
 
-PHOTOS, STEP, KITCHEN_STEP, SIZE = 120, 6, 8, (480, 640)
+PHOTOS, STEP, KITCHEN_STEP, SIZE = 120, 6, 8, (360, 480)
 STATUE, KITCHEN = "statue", "kitchen1000"
 FIRST, GROWN, FRESH = "100 photos", "20 more", "all 120 afresh"
 ABOUT = (
     "`sfm-app run` on 100 photos, again after 20 more have been put into the folder, and on all 120 in a new output "
-    "folder. CPU seconds of every stage, as in the manifest, with one worker. statue: rendered, 480 x 640 pixels, "
+    "folder. CPU seconds of every stage, as in the manifest, with one worker. statue: rendered, 360 x 480 pixels, "
     "AUC@5. kitchen1000: every 8th photo of a video, 640 x 480, against a camera fixed beside it."
 )
 

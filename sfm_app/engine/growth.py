@@ -56,16 +56,16 @@ def find_earlier(
     if not place.root.is_dir():
         return None
     _move_files(stages, run)
-    names = [stage.name for stage in stages]
-    before = stages if not first else stages[: names.index(first)] if first in names else ()
+    before = takewhile(
+        lambda stage: stage.name != first, stages if first in ["", *(stage.name for stage in stages)] else ()
+    )
     usable = list(takewhile(lambda stage: _is_usable(stage, run), (stage for stage in before if stage.grows)))
     if not usable:
         forget_earlier(run)
         return None
     records = [record for stage in usable if (record := place.manifest.record(stage.name)) is not None]
-    known, new, gone = split_names(records[0].photos, photos)
     made_from = fingerprint([record.fingerprint for record in records])
-    return Earlier(place, tuple(stage.name for stage in usable), made_from, known, new, gone)
+    return Earlier(place, tuple(stage.name for stage in usable), made_from, *split_names(records[0].photos, photos))
 
 
 def forget_earlier(run: RunContext, *, if_finished: bool = False) -> None:

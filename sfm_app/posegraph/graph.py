@@ -119,10 +119,10 @@ def build_pose_graph(
     for pair in _unconfirmed_pairs(poses, WEAK_FACTOR * options.min_inliers):
         dropped[pair] = UNCONFIRMED
         del poses[pair]
-    return PoseGraph(poses, dropped, _groups(poses), apart.joins, _left_of(apart.doubtful, poses))
+    return PoseGraph(poses, dropped, _groups(poses), apart.joins, _joins_left(apart.doubtful, poses))
 
 
-def _left_of(joins: Iterable[LookAlikes], poses: Collection[PairId]) -> tuple[LookAlikes, ...]:
+def _joins_left(joins: Iterable[LookAlikes], poses: Collection[PairId]) -> tuple[LookAlikes, ...]:
     stayed = (replace(join, pairs=tuple(pair for pair in join.pairs if pair in poses)) for join in joins)
     return tuple(join for join in stayed if join.pairs)
 

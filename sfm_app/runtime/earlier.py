@@ -29,7 +29,7 @@ class Earlier:
         left = f", {len(self.gone - self.new)} left" if self.gone - self.new else ""
         return f"{len(self.known)} photos are known, {len(self.new)} are new{left}"
 
-    def without(self, names: Collection[str]) -> "Earlier":
+    def with_replaced(self, names: Collection[str]) -> "Earlier":
         """Return the same, with some known photos as replaced ones.
 
         Args:

@@ -43,7 +43,7 @@ def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
     in_force = find_all_features(method, run)
     if run.earlier is not None:
         changed = forget_changed_matches(place.database, run.earlier.place.database)
-        earlier = run.earlier.without(changed)
+        earlier = run.earlier.with_replaced(changed)
         run = replace(run, earlier=earlier)
         run.record(known_photos=len(earlier.known), new_photos=len(earlier.new), gone_photos=len(earlier.gone))
     if wants_all_pairs(len(photos.photos), options):

@@ -51,7 +51,7 @@ def grow_database(path: Path, earlier: Path, photos: PhotoSet, known: Collection
 
 
 def forget_changed_matches(path: Path, earlier: Path) -> frozenset[str]:
-    """Delete the matches of photos whose keypoints are not those of an earlier run, and return the names of these.
+    """Remove the matches of photos whose keypoints are not those of an earlier run, and return the names of these.
 
     A method that finds features again may find others, and matches are rows of keypoints.
 

@@ -1,7 +1,7 @@
 """Cameras of an earlier run, which its last adjustment has refined, as those of the photos that came later."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -42,14 +42,18 @@ def find_or_keep_intrinsics(
         CalibratedCamera(group, tuple(image.id for image in images if image.group == group), camera)
         for group, camera in kept.items()
     ]
-    others = {image.id: image for image in images if image.group not in kept}
-    if others:
+    if others := {image.id: image for image in images if image.group not in kept}:
         cameras += find_intrinsics(*_part(matches, views, others), run)[1]
-    cameras.sort(key=lambda one: (-len(one.photos), one.name))
+    return _assemble(cameras, matches)
+
+
+def _assemble(cameras: list[CalibratedCamera], matches: MatchGraph) -> tuple[Intrinsics, Sequence[CalibratedCamera]]:
+    """Return the cameras as those of a run, the one with most photos first."""
+    cameras = sorted(cameras, key=lambda one: (-len(one.photos), one.name))
     found = Intrinsics(
         cameras={camera.name: camera.found for camera in cameras},
         camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
-        photos={image.id: image.name for image in images},
+        photos={image.id: image.name for image in matches.images.values()},
     )
     return found, cameras
 
@@ -68,7 +72,7 @@ def known_cameras(matches: MatchGraph, views: ViewGraph, run: RunContext, earlie
     for group, (images, _) in mostly_known_groups(matches, earlier).items():
         names = {values["camera_of"].get(image.name, group) for image in images if image.name in earlier.known}
         camera = refined_camera(values["cameras"].get(group)) if names == {group} else None
-        if camera is not None and not _is_contradicted(camera, images, matches, views, run, earlier):
+        if camera is not None and not _is_contradicted(camera, images, matches, views, run, earlier.known):
             found[group] = camera
     return found
 
@@ -90,29 +94,35 @@ def refined_camera(entry: Mapping[str, Any] | None) -> Calibration | None:
 
 def _is_contradicted(
     camera: Calibration, images: Sequence[MatchedImage], matches: MatchGraph, views: ViewGraph, run: RunContext,
-    earlier: Earlier,
+    known: Collection[str],
 ) -> bool:  # fmt: skip
     """Return whether the new photos of a group say that another camera took them: their EXIF, or their own pairs."""
-    new = [image for image in images if image.name not in earlier.known]
-    claims = [
+    new = [image for image in images if image.name not in known]
+    claim, before = (
         focal_claim(some, camera.focal_px, camera.spread["fx"])
-        for some in (new, [image for image in images if image.name in earlier.known])
-    ]
-    zoomed = claims[0] is not None and claims[0].is_contradicted
-    if zoomed and not (claims[1] is not None and claims[1].is_contradicted):
-        run.progress.say(f"the new photos {images[0].group}: {claims[0].text if claims[0] else ''}")
-        return True
-    pairs = photo_pairs(new, matches, views)
-    if not pairs.photos or images[0].group in views.lenses:
-        return False
-    options = run.settings.calibration
+        for some in (new, [image for image in images if image.name in known])
+    )
+    against = []
+    if claim is not None and claim.is_contradicted and not (before is not None and before.is_contradicted):
+        against.append(claim.text)
+    if not against and images[0].group not in views.lenses:
+        against += [one.text for one in _pair_contradictions(camera, new, matches, views, run)]
+    for text in against:
+        run.progress.say(f"the new photos contradict the camera {images[0].group} so far: {text}")
+    return bool(against)
+
+
+def _pair_contradictions(
+    camera: Calibration, new: list[MatchedImage], matches: MatchGraph, views: ViewGraph, run: RunContext
+) -> list[Contradiction]:
+    """Return in what the camera that the pairs of new photos determine differs from that of the known ones."""
+    pairs, options = photo_pairs(new, matches, views), run.settings.calibration
+    if not pairs.photos:
+        return []
     calibrator = run.plugins.calibrator(options.calibrator)
     own = calibrate_photo_set(pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=False)
     cameras = [to_whole_photo(mine, new[0]).found for mine in own]
-    against = [one for found in cameras for one in find_contradictions(camera, found) if _is_zoom(one)]
-    for one in against:
-        run.progress.say(f"the new photos contradict the camera {images[0].group} so far: {one.text}")
-    return bool(against)
+    return [one for found in cameras for one in find_contradictions(camera, found) if _is_zoom(one)]
 
 
 def _is_zoom(one: Contradiction) -> bool:

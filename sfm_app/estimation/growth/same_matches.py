@@ -22,16 +22,14 @@ class SameMatches:
 
 
 def find_same_matches(matches: MatchGraph, earlier: Earlier) -> SameMatches:
-    """Compare keypoints and matches with those in the database of an earlier run.
+    """Find photos and pairs with the keypoints and matches that are in the database of an earlier run.
 
     Args:
         matches: of this run.
         earlier: what the earlier run left behind.
     """
-    database = earlier.place.database
     with translate_errors("reading the earlier database"):
-        names = photo_names(database)
-        keypoints, rows = read_features(database)
+        names, (keypoints, rows) = photo_names(earlier.place.database), read_features(earlier.place.database)
     photos = frozenset(
         photo
         for photo, image in matches.images.items()

@@ -13,7 +13,7 @@ from sfm_app.colmap.database import write_calibrations, write_match_graph, write
 from sfm_app.colmap.growth.grown_model import model_in_database
 from sfm_app.colmap.mapping import map_incrementally
 from sfm_app.colmap.model import posed_photo_ids, submodel
-from sfm_app.colmap.types import Reconstruction
+from sfm_app.colmap.types import CancellationToken, Reconstruction
 from sfm_app.errors import BackendError
 from sfm_app.estimation.calibrating import find_intrinsics
 from sfm_app.estimation.growth.same_matches import find_same_matches
@@ -125,11 +125,7 @@ def _doubt(
 ) -> str:
     """Return why a grown model is not to be relied on, in a few words; empty where nothing speaks against it.
 
-    Args:
-        found: the grown model.
-        placed: photos that it began with.
-        before: support of the model that it began with.
-        intrinsics, matches, views: cameras; matches and fundamental matrices without look-alikes.
+    It began with the photos `placed`, and had the support `before` among these.
     """
     parts = split_attempt(found)
     if len(parts) != 1 or parts[0].photos != found.photos:
@@ -161,35 +157,27 @@ def _place(start: Reconstruction, group: Group, run: RunContext) -> Reconstructi
     left = len(set(group.photos).difference(placed))
     if not left:
         return submodel(start, placed)
-    place, found = run.workspace, list[Reconstruction | None]()
-    cameras = {photo: group.intrinsics.camera(group.matches.images[photo]) for photo in group.photos}
-    kept = {start.images[photo].camera_id for photo, camera in cameras.items() if camera.is_kept}
-    is_known = all(is_well_known(camera) for camera in cameras.values())
+    found = list[Reconstruction | None]()
     run.progress.start("mapping", left)
     try:
         with translate_errors("mapping photos"):
-            run_interruptible(
-                lambda token: found.append(
-                    map_incrementally(
-                        place.database,
-                        place.photos,
-                        start,
-                        place.root / INCREMENTAL_FOLDER,
-                        run.seed,
-                        run.progress.advance,
-                        token,
-                        known=is_known,
-                        kept=kept,
-                    )
-                ),
-                lambda: None,
-            )
+            run_interruptible(lambda token: found.append(_extend(start, group, run, token)), lambda: None)
     except BackendError as err:  # all photos are mapped again
         logger.info("the earlier model could not be extended: %s", err)
         return None
     finally:
         run.progress.finish()
     return found[0]
+
+
+def _extend(start: Reconstruction, group: Group, run: RunContext, token: CancellationToken) -> Reconstruction | None:
+    cameras = {photo: group.intrinsics.camera(group.matches.images[photo]) for photo in group.photos}
+    kept = {start.images[photo].camera_id for photo, camera in cameras.items() if camera.is_kept}
+    place, is_known = run.workspace, all(is_well_known(camera) for camera in cameras.values())
+    return map_incrementally(
+        place.database, place.photos, start, place.root / INCREMENTAL_FOLDER, run.seed, run.progress.advance, token,
+        known=is_known, kept=kept,
+    )  # fmt: skip
 
 
 def _map_others(graph: PoseGraph, taken: Collection[int], inputs: _Inputs) -> list[Attempt]:

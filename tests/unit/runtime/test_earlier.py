@@ -23,6 +23,6 @@ def test_people_read_how_many_photos_are_known_new_and_left():
 def test_photos_whose_features_are_others_count_as_replaced():
     earlier = Earlier(Workspace(Path()), (), "", frozenset("abc"), frozenset("d"), frozenset())
 
-    other = earlier.without({"b", "d"})
+    other = earlier.with_replaced({"b", "d"})
 
     assert (other.known, other.new, other.gone) == (frozenset("ac"), frozenset("bd"), frozenset("b"))
