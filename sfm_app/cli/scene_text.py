@@ -8,7 +8,10 @@ from sfm_app.types import Scene
 
 NAMES_SHOWN = 4
 """Most photos of a group that are named."""
-MAPPERS = {"incremental": "photo after photo", "global": "all at once", "colmap": "as COLMAP does by itself"}
+MAPPERS = {
+    "incremental": "photo after photo", "global": "all at once", "colmap": "as COLMAP does by itself",
+    "grown": "by placing new photos in the model that was there",
+}  # fmt: skip
 CONTRADICTED_WARNING_SHARE = 0.1
 """Share of contradicted matches above which the text warns."""
 CAMERA_PER_PHOTO_TEXTS = {

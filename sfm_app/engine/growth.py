@@ -56,10 +56,8 @@ def find_earlier(
     if not place.root.is_dir():
         return None
     _move_files(stages, run)
-    before = takewhile(
-        lambda stage: stage.name != first, stages if first in ["", *(stage.name for stage in stages)] else ()
-    )
-    usable = list(takewhile(lambda stage: _is_usable(stage, run), (stage for stage in before if stage.grows)))
+    growing = (stage for stage in _stages_before(first, stages) if stage.grows)
+    usable = list(takewhile(lambda stage: _is_usable(stage, run), growing))
     if not usable:
         forget_earlier(run)
         return None
@@ -78,6 +76,12 @@ def forget_earlier(run: RunContext, *, if_finished: bool = False) -> None:
     here, there = (place.manifest.read().get("stages", {}) for place in (run.workspace, run.workspace.earlier))
     if not if_finished or here.keys() >= there.keys():
         shutil.rmtree(run.workspace.earlier.root, ignore_errors=True)
+
+
+def _stages_before(first: str, stages: Sequence[Stage[object]]) -> Sequence[Stage[object]]:
+    """Return the stages before one of them; all of them before none, and none before any other, such as the photos."""
+    names = [stage.name for stage in stages]
+    return stages if not first else stages[: names.index(first)] if first in names else ()
 
 
 def _move_files(stages: Sequence[Stage[object]], run: RunContext) -> None:

@@ -36,14 +36,17 @@ def find_or_keep_intrinsics(
     kept = {} if run.earlier is None or run.given.source else known_cameras(matches, views, run, run.earlier)
     if not kept:
         return find_intrinsics(matches, views, run)
-    run.record(kept_cameras=sorted(kept))
     images = matches.images.values()
     cameras = [
         CalibratedCamera(group, tuple(image.id for image in images if image.group == group), camera)
         for group, camera in kept.items()
     ]
     if others := {image.id: image for image in images if image.group not in kept}:
-        cameras += find_intrinsics(*_part(matches, views, others), run)[1]
+        new = find_intrinsics(*_part(matches, views, others), run)[1]
+        if not all(camera.found.is_estimated for camera in new):  # pairs with the known cameras may tell more
+            return find_intrinsics(matches, views, run)
+        cameras += new
+    run.record(kept_cameras=sorted(kept))
     return _assemble(cameras, matches)
 
 

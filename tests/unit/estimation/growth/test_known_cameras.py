@@ -95,22 +95,25 @@ def test_pairs_of_the_new_photos_may_contradict_it(run, monkeypatch, focal, stay
     assert bool(run.said) is not stays
 
 
-def test_new_groups_are_calibrated_and_known_ones_are_not(run, monkeypatch):
+@pytest.mark.parametrize("told", [True, False])
+def test_new_groups_are_calibrated_alone_or_all_together_where_that_fails(run, monkeypatch, told):
     matches = photo_graph(*KNOWN, "e")
     phone = {k: MatchedImage(k, f"phone {k}", "phone", 800, 600) for k in (6, 7)}
-    matches = replace(
-        matches, images=dict(matches.images) | phone, keypoints=dict.fromkeys(range(1, 8), np.zeros((0, 2)))
-    )
+    keypoints = dict.fromkeys(range(1, 8), np.zeros((0, 2)))
+    matches = replace(matches, images=dict(matches.images) | phone, keypoints=keypoints)
     asked = []
 
     def find(some, views, run):
         asked.append({image.group for image in some.images.values()})
-        camera = CalibratedCamera("phone", tuple(some.images), Calibration(np.eye(3), 800, 600, "guess", False))
+        camera = CalibratedCamera("phone", tuple(some.images), Calibration(np.eye(3), 800, 600, "some", told))
         return Intrinsics({"phone": camera.found}), [camera]
 
     monkeypatch.setattr(module, "find_intrinsics", find)
     found, cameras = find_or_keep_intrinsics(matches, ViewGraph({}, {}), run)
 
+    if not told:
+        assert asked == [{"phone"}, {"one", "phone"}] and run.figures == {}
+        return
     assert asked == [{"phone"}] and list(found.cameras) == ["one", "phone"]
     assert found.camera_of == dict.fromkeys([*KNOWN, "e"], "one") | {"phone 6": "phone", "phone 7": "phone"}
     assert run.figures == {"kept_cameras": ["one"]}
