@@ -20,7 +20,7 @@ from sfm_app.hashing import digest_files
 from sfm_app.numerical import Json, json_text
 from sfm_app.reconstruction import MappedScene, Outcome, reconstruct, retry_lost_photos
 from sfm_app.reconstruction.align_upright import orient_or_keep, submit_cue_extraction
-from sfm_app.reconstruction.growth.known_model import map_new_photos
+from sfm_app.reconstruction.growth.known_model import GROWN, map_new_photos
 from sfm_app.reconstruction.look_alikes import jumps, look_alike_entries
 from sfm_app.reconstruction.unregistered import photo_names, unregistered_reasons
 from sfm_app.reconstruction.videos.rolling_shutter import follow_shutter
@@ -95,7 +95,8 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     wanted, database = run.settings.scene.camera_model, found.run.workspace.database
     laid_down = [camera_rules(attempt.model, names, intrinsics, wanted) for attempt in outcome.models]
     adjusted = [
-        adjust_or_keep(attempt.model, database, rules) for attempt, rules in zip(outcome.models, laid_down, strict=True)
+        adjust_or_keep(attempt.model, database, rules, settled=attempt.mapper == GROWN)
+        for attempt, rules in zip(outcome.models, laid_down, strict=True)
     ]
     followed = [
         follow_shutter(one, matches, database, run.progress, rules)

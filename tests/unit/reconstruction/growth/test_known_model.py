@@ -1,4 +1,4 @@
-"""New photos in an earlier model; the mapper that places them is COLMAP's, the one that maps all again is a stand-in."""
+"""New photos in an earlier model: COLMAP's mapper places them, and a stand-in maps all again."""
 
 from dataclasses import replace
 from types import SimpleNamespace
