@@ -38,6 +38,9 @@ def match_probable_pairs(method: FeatureMethod, load: Callable[[], MatchGraph], 
     before = load()
     known = run.earlier.known if run.earlier is not None else frozenset[str]()
     news = {photo for photo, image in before.images.items() if image.name not in known}
+    if not news:  # photos were only taken away
+        run.record(matched_pairs=0, rounds=[0, 0])
+        return {}
     first = first_pairs(before.images, lambda photo: _descriptors(method, before.images[photo], run), run, news)
     first = pairs_with_news(first, before.images, known)
     in_force = match_pairs(method, run, first)
