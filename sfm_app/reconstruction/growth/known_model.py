@@ -101,16 +101,17 @@ def _grow(inputs: _Inputs, earlier: Earlier) -> tuple[Outcome | None, str]:
     graph = _pose_graph(inputs, known)
     _write_graph(graph, inputs)
     matches, views = drop_look_alikes(matches, views, graph)
-    group = Group(graph.connected_photos(placed[0]), matches, views, graph, inputs.intrinsics)
+    around = max(graph.groups, key=lambda photos: len(set(photos).intersection(placed)), default=())
+    group = Group(around, matches, views, graph, inputs.intrinsics)
     before = support(explained_pairs(start, matches, views, epipolar.max_error_px))
     model = _place(start, group, run)
     how = f"{len(placed)} photos were known"
     found = judge_model(matches, views, (GROWN, how), model, run)
     if not isinstance(found, Attempt):
         return None, f"the earlier model takes no new photos ({found.note})"
-    taken = {*posed_photo_ids(found.model), *group.photos}
-    others = _map_others(graph, taken, replace(inputs, matches=matches, views=views))
-    reason = f"{how}, and {found.photos - len(placed)} of {len(group.photos) - len(placed)} others found their place"
+    now, left = set(posed_photo_ids(found.model)), set(around).difference(placed)
+    others = _map_others(graph, {*now, *around}, replace(inputs, matches=matches, views=views))
+    reason = f"{how}, and {len(left & now)} of {len(left)} others found their place"
     outcome = Outcome((found, *others), graph, inputs.intrinsics, (found.note,), reason)
     return outcome, _doubt(found, placed, before, inputs.intrinsics, matches, views)
 

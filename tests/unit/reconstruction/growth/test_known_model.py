@@ -68,6 +68,21 @@ def test_photos_that_left_leave_the_model(grow, synthetic):
     assert len(posed_photo_ids(found.outcome.models[0].model)) == 6  # the sixth was replaced, and is placed anew
 
 
+def test_a_known_photo_whose_pairs_were_dropped_keeps_no_other_from_its_place(grow, synthetic, monkeypatch):
+    build = build_pose_graph
+
+    def without_the_first(*inputs):
+        graph = build(*inputs)
+        poses = {pair: pose for pair, pose in graph.poses.items() if 1 not in pair}
+        return replace(graph, poses=poses, groups=((2, 3, 4, 5, 6),))
+
+    monkeypatch.setattr(module, "build_pose_graph", without_the_first)
+    found, _ = grow(submodel(synthetic.model, [1, 2, 3, 4]), (1, 2, 3, 4), whole=submodel(synthetic.model, [1, 2]))
+
+    assert {5, 6} < set(posed_photo_ids(found.outcome.models[0].model))
+    assert found.outcome.reason == "4 photos were known, and 2 of 2 others found their place"
+
+
 def test_a_wrong_earlier_model_is_mapped_again(grow, synthetic):
     wrong = submodel(synthetic.model, [1, 2, 3, 4])
     for photo, other in ((1, 2), (3, 4)):
