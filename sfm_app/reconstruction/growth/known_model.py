@@ -102,6 +102,9 @@ def _grow(inputs: _Inputs, earlier: Earlier) -> tuple[Outcome | None, str]:
     _write_graph(graph, inputs)
     matches, views = drop_look_alikes(matches, views, graph)
     around = max(graph.groups, key=lambda photos: len(set(photos).intersection(placed)), default=())
+    if lost := set(placed).difference(around):  # COLMAP does not take photos of which the database has no pair
+        placed = [photo for photo in placed if photo not in lost]
+        start = submodel(start, placed)
     group = Group(around, matches, views, graph, inputs.intrinsics)
     before = support(explained_pairs(start, matches, views, epipolar.max_error_px))
     model = _place(start, group, run)
