@@ -33,6 +33,7 @@ MATCH_GRAPH: Stage[MatchGraph] = Stage(
     make=lambda given, run: match_graph.make(given[PHOTOS], run),
     load=lambda given, run: match_graph.load(given[PHOTOS], run),
     digest=match_graph.digest,
+    grows=True,
 )
 VIEW_GRAPH: Stage[ViewGraph] = Stage(
     name="view_graph",
@@ -42,6 +43,7 @@ VIEW_GRAPH: Stage[ViewGraph] = Stage(
     make=lambda given, run: view_graph.make(given[MATCH_GRAPH], run),
     load=lambda _, run: view_graph.load(run),
     digest=view_graph.digest,
+    grows=True,
 )
 INTRINSICS: Stage[Intrinsics] = Stage(
     name="intrinsics",
@@ -51,6 +53,7 @@ INTRINSICS: Stage[Intrinsics] = Stage(
     make=lambda given, run: intrinsics.make(given[MATCH_GRAPH], given[VIEW_GRAPH], run),
     load=lambda _, run: intrinsics.load(run),
     digest=intrinsics.digest,
+    grows=True,
 )
 SCENE: Stage[Scene] = Stage(
     name="scene",
@@ -60,6 +63,7 @@ SCENE: Stage[Scene] = Stage(
     make=lambda given, run: scene.make(given[MATCH_GRAPH], given[VIEW_GRAPH], given[INTRINSICS], run),
     load=lambda _, run: scene.load(run),
     digest=scene.digest,
+    grows=True,
 )
 DEPTH_MAPS: Stage[Path] = Stage(
     name="depth_maps",
@@ -108,11 +112,8 @@ def run_stages(
     """Turn a folder of photos, or a video, into products.
 
     Args:
-        photo_dir: folder or video.
-        run: the run.
-        first: stage from which on everything is redone; empty for none.
-        last: stage to stop after.
-        wanted: stages whose products are loaded before returning.
+        photo_dir, run, wanted: folder or video; the run; stages whose products are loaded before returning.
+        first, last: stage from which on everything is redone, empty for none; stage to stop after.
     """
     options, place = run.settings.photos, run.workspace
     place.check_no_overlap(photo_dir)
@@ -140,9 +141,8 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
     place.manifest.check_format()
     needed, what = (SCENE, "points") if points else (TEXTURE, "model")
     if place.manifest.record(needed.name) is None:
-        hint = resume_hint(run)
-        if place.manifest.record(SCENE.name):
-            hint += "; `--points` exports the points and cameras"
+        more = "; `--points` exports the points and cameras" if place.manifest.record(SCENE.name) else ""
+        hint = resume_hint(run) + more
         raise InputError(f"{place.root} holds no {what} yet: stage `{needed.name}` is missing", hint=hint)
     if not points:
         return Products(run)[TEXTURE]

@@ -13,6 +13,7 @@ MAPPERS = {
     "global": "all at once",
     "colmap": "as COLMAP does by itself",
     "parts": "in parts that were joined",
+    "grown": "by placing new photos in the model that was there",
 }
 CONTRADICTED_WARNING_SHARE = 0.1
 """Share of contradicted matches above which the text warns."""

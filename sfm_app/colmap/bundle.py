@@ -22,7 +22,7 @@ from sfm_app.colmap.bundles.bundle_arrays import (
     write_camera,
 )
 from sfm_app.colmap.bundles.bundle_rounds import Rounds, adjust_in_rounds, solve
-from sfm_app.colmap.bundles.lens_choice import LensRecord, best_families, record_lenses
+from sfm_app.colmap.bundles.lens_choice import Families, LensRecord, best_families, record_lenses
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import finite_mask
 from sfm_app.colmap.types import all_cameras, all_points
@@ -54,7 +54,9 @@ class Adjustment:
     """What the photos say of the cameras that the user gave, by camera id; lacks those that they do not determine."""
 
 
-def adjust(model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RULES) -> Adjustment:
+def adjust(
+    model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RULES, *, settled: bool = False
+) -> Adjustment:
     """Refine cameras, poses, points and tracks in turn; only camera parameters that the photos determine are freed.
 
     In each round, poses and points are eliminated, and the likelihood of the cameras is weighed against their priors.
@@ -65,6 +67,7 @@ def adjust(model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RUL
         model: result of mapping; not changed.
         database: has all keypoints and matches.
         rules: what the user laid down about cameras, by id.
+        settled: whether an adjustment of most of these photos has chosen between fisheye and perspective lenses.
 
     Raises:
         NumericalError: the adjustment diverges; the given model is unchanged.
@@ -78,7 +81,7 @@ def adjust(model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RUL
     graph = find_correspondences(model, database)
     rounds = adjust_in_rounds(model, graph, rules)
     open_points = rounds.open_points
-    families = best_families(model, rounds, rules)
+    families = Families(model) if settled else best_families(model, rounds, rules)
     if families.model is not model:
         model = families.model
         rounds = adjust_in_rounds(model, graph, rules)
@@ -89,18 +92,20 @@ def adjust(model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RUL
     return Adjustment(model, *_summary(rounds), held=held, open_points=open_points, lenses=lenses, estimates=estimates)
 
 
-def adjust_or_keep(model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RULES) -> Adjustment:
+def adjust_or_keep(
+    model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RULES, *, settled: bool = False
+) -> Adjustment:
     """Adjust a model; where that fails numerically, return the given model with the reason.
 
     Args:
-        model, database, rules: as in `adjust`.
+        model, database, rules, settled: as in `adjust`.
 
     Raises:
         BackendError: COLMAP failed.
     """
     try:
         with translate_errors("adjusting the bundle"):
-            return adjust(model, database, rules)
+            return adjust(model, database, rules, settled=settled)
     except FAILURES as err:
         logger.info("the last adjustment failed", exc_info=err)
         nothing: dict[int, dict[str, float]] = {camera_id: {} for camera_id in photos_per_camera(model)}

@@ -1,12 +1,13 @@
 """The loop that runs stages: it skips what is up to date, redoes what is damaged and records everything."""
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import dropwhile
 
 from sfm_app.colmap.backend import check_written
+from sfm_app.engine.growth import find_earlier, forget_earlier, set_aside
 from sfm_app.engine.run_log import log_to_file
 from sfm_app.engine.stage import Product, Products, Stage
 from sfm_app.engine.staleness import (
@@ -18,9 +19,11 @@ from sfm_app.engine.staleness import (
 )
 from sfm_app.engine.usage import measure_usage
 from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError
+from sfm_app.hashing import fingerprint
 from sfm_app.photos import Source
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import choose_plan
+from sfm_app.runtime.earlier import Earlier
 from sfm_app.runtime.manifest import StageRecord
 from sfm_app.types import PhotoSet
 
@@ -104,6 +107,8 @@ class _Execution:
     fingerprints: dict[str, str] = field(default_factory=dict)
     """By stage: hash of everything that its result depends on."""
     products: Products = field(init=False)
+    earlier: Earlier | None = None
+    """What stages may go on from."""
 
     def __post_init__(self) -> None:
         self.products = Products(self.run, self.source)
@@ -119,6 +124,7 @@ class _Execution:
         for stage in later:
             reasons[stage.name] = self.stage_rerun_reason(stage, [inputs[taken.name] for taken in stage.takes])
             inputs[stage.name] = self.fingerprints[stage.name]
+        self.earlier = self.find_earlier(reasons)
         redone = photos.name if self.first == photos.name else ""
         ahead = list(dropwhile(lambda name: not redone and reasons[name] is None, reasons))
         with _limit_workers(self.products[photos], ahead, self.run) as run:
@@ -126,10 +132,25 @@ class _Execution:
                 again = reasons[stage.name]
                 self.run_stage(stage, f"after {redone}" if redone and again in (None, PHOTOS_CHANGED) else again, run)
                 redone = redone if again is None else stage.name
+                forget_earlier(run, if_finished=True)
         for stage in wanted:
             if stage in stages:
                 self.products[stage]
         return self.products
+
+    def find_earlier(self, reasons: Mapping[str, str | None]) -> Earlier | None:
+        """Return what stages may go on from; where only photos came or went, the files of the finished ones."""
+        stages, photos = self.pipeline.later_stages, self.source.photo_hashes(self.products[self.pipeline.photos])
+        if reasons.get(stages[0].name) == PHOTOS_CHANGED and self.first not in (
+            self.pipeline.photos.name,
+            stages[0].name,
+        ):
+            set_aside(stages, self.run)
+        earlier = find_earlier(stages, photos, self.first, self.run)
+        if earlier is not None and any(reasons.get(name) is not None for name in earlier.stages):
+            self.run.progress.say(earlier.text)
+            logger.info("%s: stages %s go on from an earlier run", earlier.text, ", ".join(earlier.stages))
+        return earlier
 
     def stage_rerun_reason(self, stage: Stage[object], inputs: Sequence[str]) -> str | None:
         """Return why a stage has to run, None if it is up to date; keep the fingerprint of what it depends on."""
@@ -145,18 +166,27 @@ class _Execution:
         self.pipeline.forget(stage.name, run)
         run.progress.stage(stage.name, f"again: {again}" if again else "")
         logger.info("%s begins%s", stage.name, f" again: {again}" if again else "")
-        run = run.with_fingerprint(self.fingerprints[stage.name])
+        run = self.stage_context(stage, run)
         with measure_usage() as used:
             product = self.make_product(stage, run)
+        self.products.keep(stage, product)
         place, seconds = run.workspace, round(used.seconds, 2)
+        first = stage is self.pipeline.later_stages[0]
+        photos = self.source.photo_hashes(self.products[self.pipeline.photos]) if first else {}
         record = StageRecord(
-            run.fingerprint, seconds, run.statistics, place.manifest.sizes(stage.files), used.peak_mb,
-            settings_and_versions(stage, run), stage.digest(place), round(used.cpu_seconds, 2),
+            self.fingerprints[stage.name], seconds, run.statistics, place.manifest.sizes(stage.files), used.peak_mb,
+            settings_and_versions(stage, run), stage.digest(place), round(used.cpu_seconds, 2), photos,
         )  # fmt: skip
         place.manifest.finish(stage.name, record, manifest_head(run))
         logger.info("%s took %.2f s, %.2f s of CPU and %d MB", stage.name, seconds, used.cpu_seconds, used.peak_mb)
-        self.products.keep(stage, product)
         run.progress.finish_stage(seconds, len(self.products[self.pipeline.photos].photos))
+
+    def stage_context(self, stage: Stage[object], run: RunContext) -> RunContext:
+        """Return the run for a stage: what it may go on from, and the fingerprint by which it resumes."""
+        inputs, earlier = self.fingerprints[stage.name], self.earlier
+        if earlier is None or stage.name not in earlier.stages:
+            return run.with_fingerprint(inputs)
+        return replace(run.with_fingerprint(fingerprint(inputs, earlier.fingerprint)), earlier=earlier)
 
     def make_product(self, stage: Stage[Product], run: RunContext) -> Product:
         """Return the product of a stage, if its photos and the output folder stayed the same meanwhile."""

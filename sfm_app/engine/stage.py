@@ -30,6 +30,8 @@ class Stage(Generic[Product_co]):
     """Reads the product that `make` has written."""
     digest: Callable[[Workspace], str]
     """Hashes what `load` reads; checked before anything is read, because COLMAP hangs or ends on damaged files."""
+    grows: bool = False
+    """Whether `make` can go on from what it made of other photos, see `runtime.earlier`."""
 
 
 class Products:

@@ -19,6 +19,9 @@ INNER, OUTER, ANGLES = 0.3, 0.8, 20
 """Range of angles that are compared, as shares of that of the corner, and their number. Nearer to the axis a focal and
 a distortion compensate each other, and the corners hold few matches. Chosen by hand; not measured on their own."""
 
+CENTERS = ("optical center, across", "optical center, down")
+"""What a contradiction of the optical center is about."""
+
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
@@ -104,7 +107,7 @@ def _center_contradictions(given: Calibration, found: Calibration) -> list[Contr
     if "center" in found.held:
         return []
     least, answers = LEAST_SHARE * max(found.width, found.height), []
-    for name, axis, what in (("cx", 0, "optical center, across"), ("cy", 1, "optical center, down")):
+    for name, axis, what in (("cx", 0, CENTERS[0]), ("cy", 1, CENTERS[1])):
         values = float(given.K[axis, 2]), float(found.K[axis, 2])
         deviation = float(np.hypot(given.spread.get(name, 0.0), found.spread.get(name, 0.0)))
         if name in found.spread and abs(values[0] - values[1]) > max(least, SIGMAS * deviation):

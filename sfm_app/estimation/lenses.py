@@ -1,7 +1,8 @@
 """Wide lenses of camera groups, given or from raw matches: before them, no fundamental matrix fits."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +30,13 @@ MAX_DEVIATION = 0.01
 hand; not measured on its own."""
 TERMS, ANGLES = 4, 200
 """Terms of COLMAP's OPENCV_FISHEYE, and angles at which they are fitted. Counted; chosen by hand."""
+NONE_DECIDED: Mapping[str, Calibration | None] = MappingProxyType({})
+"""No lens is known from an earlier run."""
 
 
-def find_lenses(matches: MatchGraph, run: RunContext) -> dict[str, Calibration]:
+def find_lenses(
+    matches: MatchGraph, run: RunContext, decided: Mapping[str, Calibration | None] = NONE_DECIDED
+) -> dict[str, Calibration]:
     """Find the cameras whose lens no perspective camera describes, by camera group.
 
     Those that the user gave are taken, and checked against what the matches say.
@@ -39,6 +44,7 @@ def find_lenses(matches: MatchGraph, run: RunContext) -> dict[str, Calibration]:
     Args:
         matches: keypoints and raw matches.
         run: the run.
+        decided: wide lenses that an earlier run found, by camera group; None where it found that there is none.
 
     Raises:
         InputError: the calibration file fits no photo.
@@ -60,7 +66,7 @@ def find_lenses(matches: MatchGraph, run: RunContext) -> dict[str, Calibration]:
             checked[group] = known, _seen_lens(known, images, matches, run)
             lens = known if known.projection == FISHEYE else None
         else:
-            lens = _find_lens(images, matches, run)
+            lens = decided[group] if group in decided else _find_lens(images, matches, run)
         if lens is not None:
             found[group] = lens
             run.progress.say(f"the photos {group} are taken with a wide lens: {describe_lens(lens)}")

@@ -51,13 +51,16 @@ FEWEST_SHARED = 30
 """Least number of keypoints of other photos that match in both photos of a pair of the second round."""
 
 
-def first_pairs(images: Mapping[int, MatchedImage], read: ReadDescriptors, run: RunContext) -> list[PairId]:
+def first_pairs(
+    images: Mapping[int, MatchedImage], read: ReadDescriptors, run: RunContext, choosers: Collection[int] | None = None
+) -> list[PairId]:
     """Choose pairs by what the photos show, and by name, time and GPS.
 
     Args:
         images: all photos by id.
         read: called in several threads.
         run: the run.
+        choosers: photos that need partners; None for all.
     """
     options = run.settings.matching
     photos, count = sorted(images), options.neighbors
@@ -65,10 +68,12 @@ def first_pairs(images: Mapping[int, MatchedImage], read: ReadDescriptors, run: 
     if options.pairs == "sequence":
         count, steps = max(1, round((1 - SEQUENCE_SHARE) * count)), sequence_steps(count)
     chosen = pairs_in_order(list(images.values()), steps) | pairs_nearby(list(images.values()), NEAREST_BY_GPS)
-    return sorted(chosen | _similar_pairs(photos, read, count, run))
+    return sorted(chosen | _similar_pairs(photos, read, count, run, choosers))
 
 
-def _similar_pairs(photos: Sequence[int], read: ReadDescriptors, count: int, run: RunContext) -> set[PairId]:
+def _similar_pairs(
+    photos: Sequence[int], read: ReadDescriptors, count: int, run: RunContext, choosers: Collection[int] | None
+) -> set[PairId]:
     """Return pairs of photos that show the same, some for each photo."""
     largest = run.map(read, photos, "largest features")
     pooled = pool_descriptors(largest, POOLED)
@@ -79,11 +84,11 @@ def _similar_pairs(photos: Sequence[int], read: ReadDescriptors, count: int, run
         vocabulary = learn_vocabulary(pooled, size, run.seed)
     words = run.map(vocabulary.quantize, largest, "words of photos")
     ranked = rank_similar(words, len(vocabulary), RANKED * count)
-    looks = _candidates([[photos[k] for k in row] for row in ranked], photos, count)
+    looks = _candidates([[photos[k] for k in row] for row in ranked], photos, count, choosers)
     small = {photo: one[:PREVIEW_FEATURES] for photo, one in zip(photos, largest, strict=True)}
     scores = _merge(run.map(partial(_preview, small), list(looks.items()), "previews"))
-    sure = choose_by_rank(scores, 1, max(1, round(SURE_SHARE * count)))
-    return sure | choose_by_rank(scores, round(PREVIEW_SHARE * PREVIEW_FEATURES), count)
+    sure = choose_by_rank(scores, 1, max(1, round(SURE_SHARE * count)), choosers)
+    return sure | choose_by_rank(scores, round(PREVIEW_SHARE * PREVIEW_FEATURES), count, choosers)
 
 
 def sequence_steps(count: int) -> tuple[int, ...]:
@@ -101,6 +106,7 @@ def second_pairs(
     matches: Mapping[PairId, NDArray[np.uint32]],
     asked: Collection[PairId],
     options: MatchSettings,
+    choosers: Collection[int] | None = None,
 ) -> list[PairId]:
     """Choose pairs whose photos match the same keypoints of others.
 
@@ -109,17 +115,21 @@ def second_pairs(
         matches: of the pairs so far.
         asked: pairs that were matched already, with or without success.
         options: settings of matching.
+        choosers: photos that need partners; None for all.
     """
     shared = count_shared_keypoints(keypoints, matches)
     left = {pair: count for pair, count in shared.items() if pair not in asked}
-    return sorted(choose_by_rank(left, FEWEST_SHARED, max(1, round(FRIENDS_SHARE * options.neighbors))))
+    return sorted(choose_by_rank(left, FEWEST_SHARED, max(1, round(FRIENDS_SHARE * options.neighbors)), choosers))
 
 
-def _candidates(ranked: Sequence[Sequence[int]], photos: Sequence[int], count: int) -> dict[int, list[int]]:
+def _candidates(
+    ranked: Sequence[Sequence[int]], photos: Sequence[int], count: int, choosers: Collection[int] | None
+) -> dict[int, list[int]]:
     """Return by photo the later photos with which it is looked at more closely."""
     looks = (
         (min(photo, other), max(photo, other))
         for photo, others in zip(photos, ranked, strict=True)
+        if choosers is None or photo in choosers
         for other in spread(others, PREVIEWED * count)
     )
     found: dict[int, list[int]] = {}

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from stat import S_ISREG
+from typing import Any
 
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.hashing import digest_file, fingerprint
@@ -11,7 +12,7 @@ from sfm_app.photos.files import list_files, resolve_file
 from sfm_app.photos.masks import list_masks
 from sfm_app.photos.video.video_formats import is_video, read_head
 from sfm_app.settings import PhotoSettings, Settings
-from sfm_app.types import PhotoSet
+from sfm_app.types import Photo, PhotoSet
 
 Stamp = tuple[int, int]
 """Size in bytes, and time of the last change in nanoseconds."""
@@ -53,12 +54,17 @@ class Source:
 
         Nor do camera groups: features and matches do not depend on which camera took a photo.
         """
-        used = [
-            {**asdict(photo), "group": "", "notes": (), "bytes": self.files.get(photo.path, self.files.get(""))}
-            | {"mask bytes": self.masks.get(photo.mask)}
-            for photo in photos.photos
-        ]
+        used = [self._content(photo) | {"group": ""} for photo in photos.photos]
         return fingerprint(used, photos.masks is not None)
+
+    def photo_hashes(self, photos: PhotoSet) -> dict[str, str]:
+        """Return a hash of each used photo by name: of its bytes, its mask, its size, and its camera group."""
+        return {photo.name: fingerprint(self._content(photo), photos.masks is not None) for photo in photos.photos}
+
+    def _content(self, photo: Photo) -> dict[str, Any]:
+        """Return what results depend on of a photo."""
+        read = {"bytes": self.files.get(photo.path, self.files.get("")), "mask bytes": self.masks.get(photo.mask)}
+        return asdict(photo) | {"notes": ()} | read
 
     def check(self, photos: PhotoSet) -> None:
         """Check that the video, these photos and their masks have not changed since the run began.

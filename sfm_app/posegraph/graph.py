@@ -4,6 +4,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from sfm_app.posegraph.guided import guided_pose
 from sfm_app.posegraph.look_alikes import find_look_alikes
 from sfm_app.posegraph.pair_pose import Pair, estimate_pose
 from sfm_app.posegraph.rotations import average_rotations, check_loops
-from sfm_app.types import EpipolarFit, Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
+from sfm_app.types import EpipolarFit, Intrinsics, LookAlikes, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
 
 logger = logging.getLogger("sfm_app")
 
@@ -44,6 +45,8 @@ CONTRADICTS, BEHIND, TOO_FEW = "contradicts other pairs", "points behind a camer
 NOT_COMPUTABLE = "its pose cannot be computed"
 UNCONFIRMED = "few matches, and no other pair bears it out"
 LOOKS_ALIKE = "equal things in different places"
+NO_POSES: Mapping[PairId, RelativePose] = MappingProxyType({})
+"""No relative pose is known before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +62,9 @@ class PoseGraphOptions:
 
 
 def build_pose_graph(
-    matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, options: PoseGraphOptions, run_map: ParallelMap
-) -> PoseGraph:
+    matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, options: PoseGraphOptions, run_map: ParallelMap,
+    known: Mapping[PairId, RelativePose] = NO_POSES,
+) -> PoseGraph:  # fmt: skip
     """Build the graph of relative poses: without pairs that contradict others, with rejected pairs that others recover.
 
     Args:
@@ -69,6 +73,7 @@ def build_pose_graph(
         intrinsics: cameras.
         options: thresholds and seed.
         run_map: computes pairs in parallel.
+        known: relative poses of a model, which are not estimated again.
     """
 
     def make_pair(pair: PairId) -> Pair:
@@ -82,8 +87,10 @@ def build_pose_graph(
             logger.info("pair %s has no pose", item[0], exc_info=err)
             return NOT_COMPUTABLE
 
-    found = dict(zip(views.fits, run_map(estimate_from_fit, list(views.fits.items()), "relative poses"), strict=True))
+    fits = {pair: fit for pair, fit in views.fits.items() if pair not in known}
+    found = dict(zip(fits, run_map(estimate_from_fit, list(fits.items()), "relative poses"), strict=True))
     poses, dropped = _split_plausible(found, options.min_inliers)
+    poses |= known
     cameras = {photo: intrinsics.camera(image) for photo, image in matches.images.items()}
     apart = find_look_alikes(matches, poses, cameras)
     for pair in [pair for join in apart.joins for pair in join.pairs]:
@@ -103,7 +110,7 @@ def build_pose_graph(
         except FAILURES:  # the reason that it has no pose is already recorded
             return None
 
-    left = [pair for pair in _pairs_without_pose(matches.matches, poses) if dropped.get(pair) != LOOKS_ALIKE]
+    left = [pair for pair in _pairs_without_pose(matches.matches, poses, known) if dropped.get(pair) != LOOKS_ALIKE]
     for pair, pose in zip(left, run_map(estimate_guided, left, "relative poses by known rotations"), strict=True):
         if pose is not None and not apart.is_look_alike(pair, matches.matches[pair][pose.inliers]):
             poses[pair] = pose
@@ -112,9 +119,12 @@ def build_pose_graph(
     for pair in _unconfirmed_pairs(poses, WEAK_FACTOR * options.min_inliers):
         dropped[pair] = UNCONFIRMED
         del poses[pair]
-    stayed = (replace(join, pairs=tuple(pair for pair in join.pairs if pair in poses)) for join in apart.doubtful)
-    doubtful = tuple(join for join in stayed if join.pairs)
-    return PoseGraph(poses, dropped, _groups(poses), apart.joins, doubtful)
+    return PoseGraph(poses, dropped, _groups(poses), apart.joins, _joins_left(apart.doubtful, poses))
+
+
+def _joins_left(joins: Iterable[LookAlikes], poses: Collection[PairId]) -> tuple[LookAlikes, ...]:
+    stayed = (replace(join, pairs=tuple(pair for pair in join.pairs if pair in poses)) for join in joins)
+    return tuple(join for join in stayed if join.pairs)
 
 
 def with_model(graph: PoseGraph, photos: Collection[int], poses: Mapping[PairId, RelativePose]) -> PoseGraph:
@@ -133,8 +143,12 @@ def with_model(graph: PoseGraph, photos: Collection[int], poses: Mapping[PairId,
     return replace(graph, poses=entered, dropped=left, groups=_groups(entered))
 
 
-def _pairs_without_pose(pairs: Iterable[PairId], poses: Mapping[PairId, RelativePose]) -> list[PairId]:
-    """Return the pairs without a pose whose photos are connected by pairs with one."""
+def _pairs_without_pose(
+    pairs: Iterable[PairId], poses: Mapping[PairId, RelativePose], known: Collection[PairId]
+) -> list[PairId]:
+    """Return the pairs without a pose whose photos are connected by pairs with one, and not both in known pairs."""
+    settled = {photo for pair in known for photo in pair}
+    pairs = [pair for pair in pairs if not settled.issuperset(pair)]
     group = {photo: number for number, photos in enumerate(_groups(poses)) for photo in photos}
     return [pair for pair in pairs if pair not in poses and group.get(pair[0], -1) == group.get(pair[1], -2)]
 

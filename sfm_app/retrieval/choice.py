@@ -5,7 +5,7 @@ show the same place, are what holds a model together.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from sfm_app.settings import MatchSettings
 from sfm_app.types import PairId
@@ -52,13 +52,16 @@ def spread(ranked: Sequence[int], count: int) -> list[int]:
     return [*ranked[:first], *(rest[(2 * k + 1) * len(rest) // (2 * wanted)] for k in range(wanted))]
 
 
-def choose_by_rank(scores: Mapping[PairId, int], least: int, count: int) -> set[PairId]:
+def choose_by_rank(
+    scores: Mapping[PairId, int], least: int, count: int, choosers: Collection[int] | None = None
+) -> set[PairId]:
     """Return pairs so that each photo has some with its best and its fair partners.
 
     Args:
         scores: of candidate pairs.
         least: pairs with a lower score are left out.
         count: partners for each photo; it may get more that chose it.
+        choosers: photos that need partners; None for all.
     """
     partners: dict[int, list[tuple[int, int]]] = {}
     for (a, b), score in scores.items():
@@ -67,6 +70,8 @@ def choose_by_rank(scores: Mapping[PairId, int], least: int, count: int) -> set[
             partners.setdefault(b, []).append((-score, a))
     found = set()
     for photo, ranked in partners.items():
+        if choosers is not None and photo not in choosers:
+            continue
         chosen = spread([other for _, other in sorted(ranked)], count)
         found |= {(min(photo, other), max(photo, other)) for other in chosen}
     return found

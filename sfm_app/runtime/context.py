@@ -11,6 +11,7 @@ from sfm_app.atomic_io import save_files
 from sfm_app.plugins import Plugins
 from sfm_app.progress import Progress, SilentProgress, track
 from sfm_app.runtime.cost_estimate import SHARE_OF_MACHINE, machine_memory_mb
+from sfm_app.runtime.earlier import Earlier
 from sfm_app.runtime.parallel import make_executor, ordered_map
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
@@ -40,6 +41,8 @@ class RunContext:
     """Hash of everything that the stage's result depends on."""
     given: GivenCameras = field(default_factory=GivenCameras)
     """Cameras that the user knows."""
+    earlier: Earlier | None = None
+    """What the stage may go on from: files of a run with other photos; None where everything is done afresh."""
     statistics: dict[str, Any] = field(default_factory=dict)
     """What the stage has counted so far, for the manifest; no part of a product is read from here."""
 

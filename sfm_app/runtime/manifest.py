@@ -37,6 +37,9 @@ class StageRecord:
     """Hash of what later runs read of it, so that damage is found before it is read."""
     cpu_seconds: float | None = None
     """Of the program and its processes, on all cores; None if not measured."""
+    photos: Mapping[str, str] = field(default_factory=dict)
+    """Hash of each photo by name, in the record of the first stage after the photos: a later run tells by it which
+    photos came and went."""
 
 
 class Manifest:
@@ -85,7 +88,9 @@ class Manifest:
         """Remove stages from the manifest before their files are touched, so that it never lists what is not there."""
         manifest = self.read()
         known = manifest.get("stages", {})
-        if any(known.pop(stage, None) for stage in stages):
+        if listed := [stage for stage in stages if stage in known]:
+            for stage in listed:
+                del known[stage]
             self.write(manifest)
 
     def finish(self, stage: str, record: StageRecord, head: Mapping[str, Any]) -> None:

@@ -22,7 +22,8 @@ OUTPUT_NAMES = (*FOLDERS, DATABASE, CALIBRATION, SCENE)
 """Names of files and folders that a run removes before it writes them."""
 LOCK, HOLDER = ".lock", ".held-by.txt"
 LOG, PARTS, FEATURES, MAPPING = "log.txt", "view_graph_parts", "feature_parts", ".mapping"
-LINK_CHECKED = (*OUTPUT_NAMES, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING)
+EARLIER = ".earlier"
+LINK_CHECKED = (*OUTPUT_NAMES, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING, EARLIER)
 """Names that a run writes to without replacing them: a link there would lead it out of the folder."""
 PHOTO_SET, VIEW_GRAPH = "photos.json", "view_graph.npz"
 
@@ -118,6 +119,11 @@ class Workspace:
     def view_graph_parts(self) -> Path:
         """Fundamental matrices while they are estimated."""
         return self.root / PARTS
+
+    @property
+    def earlier(self) -> "Workspace":
+        """Files of an earlier run with other photos, while this run goes on from them."""
+        return Workspace(self.root / EARLIER)
 
     @property
     def log(self) -> Path:

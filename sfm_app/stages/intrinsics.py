@@ -3,7 +3,7 @@
 import json
 
 from sfm_app.atomic_io import replace_atomically
-from sfm_app.estimation.calibrating import find_intrinsics
+from sfm_app.estimation.growth.known_cameras import find_or_keep_intrinsics
 from sfm_app.hashing import digest_files
 from sfm_app.numerical import json_text
 from sfm_app.runtime.context import RunContext
@@ -19,7 +19,7 @@ def make(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
         views: fundamental matrices.
         run: the run.
     """
-    intrinsics, cameras = find_intrinsics(matches, views, run)
+    intrinsics, cameras = find_or_keep_intrinsics(matches, views, run)
     run.record(
         cameras={name: _summary(camera) for name, camera in intrinsics.cameras.items()},
         photos={camera.name: len(camera.photos) for camera in cameras},

@@ -1,8 +1,11 @@
 """match_graph: PhotoSet -> MatchGraph."""
 
+from dataclasses import replace
+
 from sfm_app.atomic_io import is_made_from
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import create_database, digest_matches, is_sound, read_match_graph, remove_database
+from sfm_app.colmap.growth.grown_database import forget_changed_matches, grow_database
 from sfm_app.estimation.diagnosis import NOTHING_MATCHED, diagnose_scene
 from sfm_app.estimation.match_rounds import match_probable_pairs
 from sfm_app.estimation.matching import find_all_features, forget_features, match_pairs
@@ -15,7 +18,8 @@ from sfm_app.types import MatchGraph, PhotoSet
 def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
     """Find features and match pairs of photos, without geometric verification.
 
-    Features and matches that a killed run has found in the same photos are reused.
+    Features and matches that a killed run has found in the same photos are reused, and those of photos that an earlier
+    run has seen.
 
     Args:
         photos: usable photos, laid out in the workspace.
@@ -30,10 +34,18 @@ def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
         marker.unlink(missing_ok=True)
         remove_database(place.database)
         with translate_errors("entering photos"):
-            create_database(place.database, photos)
+            if run.earlier is None:
+                create_database(place.database, photos)
+            else:
+                grow_database(place.database, run.earlier.place.database, photos, run.earlier.known)
         marker.write_text(run.fingerprint, encoding="utf-8")
     method = run.plugins.feature_method(options.features)
     in_force = find_all_features(method, run)
+    if run.earlier is not None:
+        changed = forget_changed_matches(place.database, run.earlier.place.database)
+        earlier = run.earlier.with_replaced(changed)
+        run = replace(run, earlier=earlier)
+        run.record(known_photos=len(earlier.known), new_photos=len(earlier.new), gone_photos=len(earlier.gone))
     if wants_all_pairs(len(photos.photos), options):
         in_force |= match_pairs(method, run)
     else:

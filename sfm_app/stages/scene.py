@@ -20,6 +20,7 @@ from sfm_app.hashing import digest_files
 from sfm_app.numerical import Json, json_text
 from sfm_app.reconstruction import MappedScene, Outcome, reconstruct, retry_lost_photos
 from sfm_app.reconstruction.align_upright import orient_or_keep, submit_cue_extraction
+from sfm_app.reconstruction.growth.known_model import GROWN, map_new_photos
 from sfm_app.reconstruction.look_alikes import jumps, look_alike_entries
 from sfm_app.reconstruction.unregistered import photo_names, unregistered_reasons
 from sfm_app.reconstruction.videos.rolling_shutter import follow_shutter
@@ -35,6 +36,8 @@ POINTS = "points"
 def make(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Scene:
     """Map the photos and adjust everything; later stages use the largest model, the others are kept beside it.
 
+    Where an earlier run has a model of most photos, the new ones are placed in that.
+
     Args:
         matches: keypoints and raw matches.
         views: fundamental matrices.
@@ -45,7 +48,10 @@ def make(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: Run
         ReconstructionError: no pair of photos grows into a model; the message says why.
     """
     aside = mapping_run(run)
-    first = MappedScene(reconstruct(matches, views, intrinsics, aside), matches, views, intrinsics, aside)
+    if run.earlier is not None:
+        first = map_new_photos(matches, views, intrinsics, aside, run.earlier)
+    else:
+        first = MappedScene(reconstruct(matches, views, intrinsics, aside), matches, views, intrinsics, aside)
     try:
         scene = _finish_scene(retry_lost_photos(first), run)
     except ReconstructionError:  # after any other end, such as Ctrl-C or a full disk, the same command resumes there
@@ -89,7 +95,8 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     wanted, database = run.settings.scene.camera_model, found.run.workspace.database
     laid_down = [camera_rules(attempt.model, names, intrinsics, wanted) for attempt in outcome.models]
     adjusted = [
-        adjust_or_keep(attempt.model, database, rules) for attempt, rules in zip(outcome.models, laid_down, strict=True)
+        adjust_or_keep(attempt.model, database, rules, settled=attempt.mapper == GROWN)
+        for attempt, rules in zip(outcome.models, laid_down, strict=True)
     ]
     followed = [
         follow_shutter(one, matches, database, run.progress, rules)

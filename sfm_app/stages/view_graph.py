@@ -1,12 +1,15 @@
 """view_graph: MatchGraph -> ViewGraph."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 
 from sfm_app.atomic_io import replace_atomically
 from sfm_app.estimation.diagnosis import diagnose_scene
 from sfm_app.estimation.fitting import fit_pairs, to_view_graph
+from sfm_app.estimation.growth.known_fits import known_fits, known_lenses
+from sfm_app.estimation.growth.same_matches import find_same_matches
 from sfm_app.estimation.lenses import find_lenses
 from sfm_app.hashing import digest_files, load_arrays
 from sfm_app.runtime.context import GIVEN_CAMERAS, RunContext
@@ -20,6 +23,8 @@ LENS_SETTINGS = ("calibration.lens", "calibration.keep", "scene.camera_model", "
 def make(matches: MatchGraph, run: RunContext) -> ViewGraph:
     """Find wide lenses, fit every pair on its own, and count why pairs were rejected.
 
+    Of photos that an earlier run has seen, its fits and lenses stay.
+
     Args:
         matches: keypoints and raw matches.
         run: the run.
@@ -27,8 +32,15 @@ def make(matches: MatchGraph, run: RunContext) -> ViewGraph:
     Raises:
         ReconstructionError: no pair has a usable epipolar geometry.
     """
-    lenses = find_lenses(matches, run)
-    found = fit_pairs(matches, list(matches.matches), run, lenses)
+    before = None if run.earlier is None else load(replace(run, workspace=run.earlier.place))
+    if run.earlier is None or before is None:
+        lenses, known = find_lenses(matches, run), {}
+    else:
+        lenses = find_lenses(matches, run, known_lenses(matches, before, run.earlier))
+        known = known_fits(matches, before, find_same_matches(matches, run.earlier).pairs, lenses)
+        run.record(known_pairs=len(known))
+    fitted = fit_pairs(matches, [pair for pair in matches.matches if pair not in known], run, lenses)
+    found = {pair: known[pair] if pair in known else fitted[pair] for pair in matches.matches}
     graph = to_view_graph(found, lenses)
     run.record(
         kept=len(graph.fits),

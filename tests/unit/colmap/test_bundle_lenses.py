@@ -111,6 +111,18 @@ def test_the_model_of_every_camera_is_named_with_its_rivals(mixed):
 
 
 @pytest.mark.slow
+def test_other_families_are_not_tried_where_that_is_settled(mixed, monkeypatch):
+    monkeypatch.setattr("sfm_app.colmap.bundle.best_families", None)
+
+    found = adjust(*mixed, settled=True)
+
+    assert [found.model.cameras[key].model.name for key in (1, 2)] == ["OPENCV", "OPENCV_FISHEYE"]
+    assert found.lenses[1].chosen.model == "SIMPLE_PINHOLE"
+    with pytest.raises(TypeError):
+        adjust(*mixed)
+
+
+@pytest.mark.slow
 def test_panoramas_alone_are_adjusted_and_keep_their_camera(synthetic):
     model, database = synthetic(photos=6)
     rng = np.random.default_rng(1)

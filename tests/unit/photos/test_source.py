@@ -63,3 +63,29 @@ def test_a_video_has_no_list_of_photos(folder, tmp_path):
     replace(photos, video=True).check_settings(Settings())
     with pytest.raises(ConfigError, match="--images"):
         replace(photos, video=True).check_settings(listed)
+
+
+def test_a_photo_is_the_same_if_bytes_size_group_and_mask_are(folder, tmp_path):
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / "a.png").write_text("mask")
+    (tmp_path / "masks" / "b.png").write_text("mask of b")
+    source = source_of(folder, tmp_path / "out", masks=str(tmp_path / "masks"))
+    used = Photo("a.jpg", 60, 40, "one camera", mask="a.png")
+
+    def hash_of(photo, source=source, masks=None):
+        return source.photo_hashes(PhotoSet(folder, (photo,), (), masks))[photo.name]
+
+    before = hash_of(used)
+    assert hash_of(replace(used, notes=("read without color",))) == before
+    changes = {
+        "width": 61,
+        "group": "another",
+        "mask": "b.png",
+        "turn_deg": 90,
+        "name": "_a.jpg",
+        "shown": (1, 1, 9, 9),
+    }
+    assert len({hash_of(replace(used, **{key: value})) for key, value in changes.items()} - {before}) == len(changes)
+    assert hash_of(used, masks=tmp_path / "masks") != before
+    (folder / "a.jpg").write_text("a better photo of the same name")
+    assert hash_of(used, source_of(folder, tmp_path / "out", masks=str(tmp_path / "masks"))) != before

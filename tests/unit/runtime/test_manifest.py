@@ -51,11 +51,11 @@ def test_a_broken_manifest_counts_as_none(manifest, text):
 
 def test_forgotten_stages_leave_the_others(manifest):
     (manifest.root / "a.txt").write_text("1234")
-    for name in ("photos", "scene"):
+    for name in ("photos", "intrinsics", "scene"):
         finish(manifest, name)
-    manifest.forget(("scene", "mesh"))
+    manifest.forget(("intrinsics", "scene", "mesh"))
 
-    assert manifest.record("scene") is None
+    assert manifest.record("scene") is None and manifest.record("intrinsics") is None
     assert manifest.record("photos") is not None
     assert json.loads((manifest.root / "manifest.json").read_text())["program"] == "test"
 

@@ -1,0 +1,1 @@
+"""Databases and models of an earlier run, changed to the photos of this one."""

@@ -1,0 +1,1 @@
+"""New photos in a model that is there."""
