@@ -80,6 +80,9 @@ class Estimator:
     fit: FitFundamental
     summary: str = ""
 
+    def __reduce__(self) -> tuple[Callable[[str], "Estimator"], tuple[str]]:
+        return _estimator_here, (self.name,)
+
 
 @dataclass(frozen=True, slots=True)
 class Calibrator:
@@ -159,6 +162,9 @@ class FeatureMethod:
                 f"the features '{self.name}' have to come with `find` and `match`, or with options of SIFT alone",
                 hint="docs/plugins.md shows how",
             )
+
+    def __reduce__(self) -> tuple[Callable[[str], "FeatureMethod"], tuple[str]]:
+        return _feature_method_here, (self.name,)
 
 
 class Hooks:
@@ -316,6 +322,27 @@ def _load(modules: Sequence[ModuleType | object], installed: bool) -> Plugins:
         depth_methods=_index_by_name(manager.hook.sfm_depth_methods()),
         features=_index_by_name(manager.hook.sfm_features()),
     )
+
+
+def _estimator_here(name: str) -> Estimator:
+    """Return the estimator of that name in another process: plug-ins travel by name."""
+    return _parts_here(name, built_ins().estimators).estimator(name)
+
+
+def _feature_method_here(name: str) -> FeatureMethod:
+    """Return the way to find features of that name in another process."""
+    return _parts_here(name, built_ins().features).feature_method(name)
+
+
+def _parts_here(name: str, built_in: Mapping[str, object]) -> Plugins:
+    """Return the built-ins where they have a part of that name, so that no plug-in is loaded for it."""
+    return built_ins() if name in built_in else installed_plugins()
+
+
+@cache
+def built_ins() -> Plugins:
+    """Return what ships with the program."""
+    return _load((), installed=False)
 
 
 class _NamedPart(Protocol):

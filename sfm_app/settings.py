@@ -180,6 +180,20 @@ class TextureSettings(Section):
     )
 
 
+class ClusterSettings(Section):
+    """Dask's workers, on this machine or on others; results do not depend on them."""
+
+    address: str = Field(
+        "",
+        pattern=r"^(|local:[1-9]\d{0,2}|(tcp://|tls://)?[^\s/]+:\d{1,5})$",
+        description="scheduler HOST:PORT of a Dask cluster, or local:N for N processes of this machine; none where "
+        "empty",
+    )
+    wait_s: float = Field(
+        60.0, gt=0, le=86400, description="seconds to wait for the scheduler, and for workers where it has none"
+    )
+
+
 class Settings(Section):
     """All settings of a run."""
 
@@ -198,6 +212,7 @@ class Settings(Section):
     depth: DepthSettings = DepthSettings()
     mesh: MeshSettings = MeshSettings()
     texture: TextureSettings = TextureSettings()
+    cluster: ClusterSettings = ClusterSettings()
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], where: str = "settings") -> "Settings":

@@ -60,7 +60,7 @@ class RunContext:
     @contextmanager
     def with_workers(self, workers: int) -> Iterator["RunContext"]:
         """Provide the same run with another number of workers, which stop when the block ends."""
-        with make_executor(workers) as executor:
+        with make_executor(workers, like=self.executor) as executor:
             yield replace(self, workers=workers, executor=executor)
 
     @property

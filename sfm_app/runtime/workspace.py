@@ -21,8 +21,8 @@ FOLDERS = ("photos", "frames", "masks", "sparse", "other_models", "dense", "surf
 OUTPUT_NAMES = (*FOLDERS, DATABASE, CALIBRATION, SCENE)
 """Names of files and folders that a run removes before it writes them."""
 LOCK, HOLDER = ".lock", ".held-by.txt"
-LOG, PARTS, FEATURES, MAPPING = "log.txt", "view_graph_parts", "feature_parts", ".mapping"
-LINK_CHECKED = (*OUTPUT_NAMES, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING)
+LOG, PARTS, FEATURES, MAPPING, PARCELS = "log.txt", "view_graph_parts", "feature_parts", ".mapping", ".cluster"
+LINK_CHECKED = (*OUTPUT_NAMES, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING, PARCELS)
 """Names that a run writes to without replacing them: a link there would lead it out of the folder."""
 PHOTO_SET, VIEW_GRAPH = "photos.json", "view_graph.npz"
 
@@ -118,6 +118,11 @@ class Workspace:
     def view_graph_parts(self) -> Path:
         """Fundamental matrices while they are estimated."""
         return self.root / PARTS
+
+    @property
+    def parcels(self) -> Path:
+        """Large values on their way between the machines of a cluster."""
+        return self.root / PARCELS
 
     @property
     def log(self) -> Path:
