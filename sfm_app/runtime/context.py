@@ -11,7 +11,7 @@ from sfm_app.atomic_io import save_files
 from sfm_app.plugins import Plugins
 from sfm_app.progress import Progress, SilentProgress, track
 from sfm_app.runtime.cost_estimate import SHARE_OF_MACHINE, machine_memory_mb
-from sfm_app.runtime.parallel import make_executor, ordered_map
+from sfm_app.runtime.parallel import make_executor, ordered_map, threads_elsewhere
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.types import GivenCameras, Model
@@ -51,6 +51,11 @@ class RunContext:
     def seed(self) -> int:
         """The run's seed; parts derive theirs from it and from their own ids."""
         return self.settings.seed
+
+    @property
+    def spread(self) -> int:
+        """How many tasks a cluster does at once; 0 where they stay in this process."""
+        return threads_elsewhere(self.executor)
 
     @property
     def memory_mb(self) -> float:

@@ -21,8 +21,9 @@ FOLDERS = ("photos", "frames", "masks", "sparse", "other_models", "dense", "surf
 OUTPUT_NAMES = (*FOLDERS, DATABASE, CALIBRATION, SCENE)
 """Names of files and folders that a run removes before it writes them."""
 LOCK, HOLDER = ".lock", ".held-by.txt"
-LOG, PARTS, FEATURES, MAPPING, PARCELS = "log.txt", "view_graph_parts", "feature_parts", ".mapping", ".cluster"
-LINK_CHECKED = (*OUTPUT_NAMES, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING, PARCELS)
+LOG, PARTS, FEATURES, MAPPING = "log.txt", "view_graph_parts", "feature_parts", ".mapping"
+PARCELS, SIFT_ROWS = ".cluster", ".sift_rows"
+LINK_CHECKED = (*OUTPUT_NAMES, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING, PARCELS, SIFT_ROWS)
 """Names that a run writes to without replacing them: a link there would lead it out of the folder."""
 PHOTO_SET, VIEW_GRAPH = "photos.json", "view_graph.npz"
 
@@ -123,6 +124,11 @@ class Workspace:
     def parcels(self) -> Path:
         """Large values on their way between the machines of a cluster."""
         return self.root / PARCELS
+
+    @property
+    def sift_rows(self) -> Path:
+        """What the workers of a cluster read while they find and match features, and what they have found."""
+        return self.root / SIFT_ROWS
 
     @property
     def log(self) -> Path:

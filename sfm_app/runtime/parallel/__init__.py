@@ -5,7 +5,15 @@ from sfm_app.runtime.parallel.execution import (
     make_executor,
     open_executor,
     ordered_map,
+    threads_elsewhere,
     worker_count,
 )
 
-__all__ = ["cpu_seconds_elsewhere", "make_executor", "open_executor", "ordered_map", "worker_count"]
+__all__ = [
+    "cpu_seconds_elsewhere",
+    "make_executor",
+    "open_executor",
+    "ordered_map",
+    "threads_elsewhere",
+    "worker_count",
+]

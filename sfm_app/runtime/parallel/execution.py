@@ -99,6 +99,11 @@ def ordered_map(
             future.cancel()
 
 
+def threads_elsewhere(executor: Executor) -> int:
+    """Return how many tasks other processes do at once for an executor; 0 where it has none."""
+    return executor.cluster.threads() if isinstance(executor, ClusterExecutor) else 0
+
+
 def cpu_seconds_elsewhere(executor: Executor) -> float:
     """Return the CPU seconds of all tasks so far that other processes have done for an executor."""
     return executor.cluster.cpu_seconds if isinstance(executor, ClusterExecutor) else 0.0

@@ -3,13 +3,12 @@
 import io
 import pickle
 import secrets
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from sfm_app.atomic_io import replace_atomically
 from sfm_app.tasks import Shared
@@ -18,7 +17,8 @@ SMALL_BYTES = 500_000
 """Larger values travel as files. Chosen by hand: the scheduler passes on what is smaller."""
 KEPT = 2
 """Shared values that a worker keeps in memory: those of this step, and of one beside it. Chosen by hand."""
-_LOADING = threading.Lock()
+SHARED, PATH = "shared", "path"
+"""What is not pickled itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class Packer:
         if known is None:
             path = self.folder / f"shared-{secrets.token_hex(8)}.pickle"
             with replace_atomically(path) as beside, beside.open("wb") as file:
-                pickle.dump(value.value, file, protocol=pickle.HIGHEST_PROTOCOL)
+                _Pickler(file, self).dump(value.value)
             known = self._shared[id(value)] = value, path  # the value is held, so that its id stays its own
         return str(known[1])
 
@@ -105,21 +105,25 @@ def unpack(parcel: Parcel, *, remove: bool = False) -> Any:
 
 
 class _Pickler(pickle.Pickler):
-    def __init__(self, file: io.BytesIO, packer: Packer) -> None:
+    """Leaves shared values out, and makes paths absolute: workers have another current folder."""
+
+    def __init__(self, file: IO[bytes], packer: Packer) -> None:
         super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
         self._packer = packer
 
-    def persistent_id(self, value: object) -> str | None:
-        return self._packer.share(value) if isinstance(value, Shared) else None
+    def persistent_id(self, value: object) -> tuple[str, str] | None:
+        if isinstance(value, Shared):
+            return SHARED, self._packer.share(value)
+        return (PATH, str(value.absolute())) if isinstance(value, Path) else None
 
 
 class _Unpickler(pickle.Unpickler):
-    def persistent_load(self, path: str) -> Shared[Any]:
-        with _LOADING:
-            return _read_shared(path)
+    def persistent_load(self, named: tuple[str, str]) -> Shared[Any] | Path:
+        kind, path = named
+        return _read_shared(path) if kind == SHARED else Path(path)
 
 
 @lru_cache(maxsize=KEPT)
 def _read_shared(path: str) -> Shared[Any]:
     with Path(path).open("rb") as file:
-        return Shared(pickle.load(file))  # noqa: S301 - written by the process that the user started
+        return Shared(_Unpickler(file).load())
