@@ -29,6 +29,7 @@ from sfm_app.runtime.parallel import ordered_map
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import MeshSettings
 from sfm_app.stereo import View, region
+from sfm_app.tasks import Shared, Task
 from sfm_app.types import Surface
 
 SURFACE = "surface.npz"
@@ -134,19 +135,23 @@ def color_and_confirm(surface: Surface, dense_dir: Path, views: list[View], run:
         run: the run.
     """
     normals = vertex_normals(surface.vertices, surface.faces)
-    tolerance = run.settings.depth.consistency
-
-    def judge_view(view: View) -> tuple[NDArray[np.uint8], Paint]:
-        eye = DepthView(view.K, view.R, view.t, read_depth(dense_dir, view, "geometric"), view.sample_px)
-        verdict = judge(surface.vertices, normals, eye, tolerance)
-        return verdict, sample_colors(surface.vertices, normals, verdict, eye, read_color(dense_dir, view))
-
+    judge_view = Task(_judge_view, Shared((surface.vertices, normals)), dense_dir, run.settings.depth.consistency)
     support, paint = Support.zeros(len(normals)), Paint.zeros(len(normals))
     found = ordered_map(run.executor, judge_view, views, ahead=run.workers)
     for verdict, colors in track(run.progress, found, "confirming the surface", len(views)):
         support.add(verdict)
         paint.add(colors)
     return Surface(surface.vertices, surface.faces, paint.mean_colors(surface.colors)), support
+
+
+def _judge_view(
+    raw: Shared[tuple[NDArray[np.float64], NDArray[np.float64]]], dense_dir: Path, tolerance: float, view: View
+) -> tuple[NDArray[np.uint8], Paint]:
+    """Return what a photo says of each vertex, and the colors that it gives them."""
+    vertices, normals = raw.value
+    eye = DepthView(view.K, view.R, view.t, read_depth(dense_dir, view, "geometric"), view.sample_px)
+    verdict = judge(vertices, normals, eye, tolerance)
+    return verdict, sample_colors(vertices, normals, verdict, eye, read_color(dense_dir, view))
 
 
 def simplify_mesh(surface: Surface, options: MeshSettings, scratch: Path) -> Surface:

@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import re
 import secrets
 import subprocess
 import sys
@@ -15,19 +14,22 @@ from typing import Any
 from sfm_app.errors import ClusterError, ConfigError
 from sfm_app.runtime.parallel.remote_call import Call, Probe, Reply, answer, find_misfit
 from sfm_app.runtime.parallel.worker_versions import PROCESSOR, differences, worker_versions
-from sfm_app.settings import ClusterSettings
+from sfm_app.settings import LOCAL_ADDRESS, ClusterSettings
 
 logger = logging.getLogger("sfm_app")
 
-LOCAL = re.compile(r"local:(\d{1,4})")
 GOES_ON = "start it again, and the same command goes on where this one stopped; or leave --cluster out"
+LOOK_S = 2.0
+"""Time between two looks at which workers there are, in seconds. Chosen by hand."""
+CONNECTING_S = 10.0
+"""Most seconds that a scheduler, or a worker, may take to answer a connection. Chosen by hand."""
 CLOSING_S = 5.0
 """Most seconds that it takes to say good-bye to a scheduler. Chosen by hand."""
 
 
 def local_workers(address: str) -> int:
     """Return how many processes of this machine an address such as `local:2` asks for; 0 for any other."""
-    found = LOCAL.fullmatch(address)
+    found = LOCAL_ADDRESS.fullmatch(address)
     return int(found[1]) if found else 0
 
 
@@ -46,6 +48,7 @@ class Cluster:
         self.cpu_seconds = 0.0
         self._probe: Probe | None = None
         self._empty_since: float | None = None
+        self._threads, self._looked_at = -1, float("-inf")
 
     @property
     def address(self) -> str:
@@ -53,9 +56,24 @@ class Cluster:
         return str(self.settings.address)
 
     def threads(self) -> int:
-        """Return how many tasks can run at once; at least 1."""
-        workers = self.client.scheduler_info(n_workers=-1)["workers"].values()
-        return max(1, sum(int(worker["nthreads"]) for worker in workers))
+        """Return how many tasks can run at once; at least 1.
+
+        Raises:
+            ClusterError: the scheduler is gone.
+        """
+        return max(1, self._count_threads())
+
+    def _count_threads(self) -> int:
+        """Return the threads of all workers as of a moment ago; each question takes the scheduler some time."""
+        if self.client.status != "running":
+            raise self.lost()
+        now = time.monotonic()
+        if now - self._looked_at > LOOK_S:
+            self._threads = int(self.client.scheduler_info(n_workers=0).get("total_threads", -1))
+            self._looked_at = now
+        if self._threads < 0:  # the connection broke meanwhile
+            raise self.lost()
+        return self._threads
 
     def probe(self) -> Probe:
         """Return what a worker has to have, after checking that all those that are there have it.
@@ -163,9 +181,7 @@ class Cluster:
         return ClusterError(f"the scheduler of the cluster ({self.address}) is gone", hint=GOES_ON)
 
     def _check_alive(self) -> None:
-        if self.client.status != "running":
-            raise self.lost()
-        if self.client.scheduler_info(n_workers=-1)["workers"]:
+        if self._count_threads():
             self._empty_since = None
             return
         now = time.monotonic()
@@ -197,7 +213,10 @@ def connect(settings: ClusterSettings, folder: Path) -> Iterator[Cluster]:
             "a cluster needs Dask, which is not installed", hint="pip install 'sfm-app[cluster]'"
         ) from None
     _quiet()
+    import dask
+
     with contextlib.ExitStack() as stack:
+        stack.enter_context(dask.config.set({"distributed.comm.timeouts.connect": f"{CONNECTING_S:.0f}s"}))
         address = stack.enter_context(_local_scheduler(settings.wait_s)) if count else settings.address
         try:
             client = distributed.Client(address, timeout=settings.wait_s, set_as_default=False)
@@ -264,5 +283,6 @@ def _close(client: Any) -> None:
 
 def _quiet() -> None:
     """Keep Dask's own messages off the terminal: what matters is said in one line by this program."""
-    for name in ("distributed", "tornado", "asyncio"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
+    known = [name for name in logging.root.manager.loggerDict if name.startswith("distributed.")]
+    for name in ("distributed", "tornado", "asyncio", *known):
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
