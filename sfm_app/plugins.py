@@ -80,8 +80,8 @@ class Estimator:
     fit: FitFundamental
     summary: str = ""
 
-    def __reduce__(self) -> tuple[Callable[[str], "Estimator"], tuple[str]]:
-        return _estimator_here, (self.name,)
+    def __reduce__(self) -> tuple[Callable[[str, str], "Estimator"], tuple[str, str]]:
+        return _part_here, ("estimators", self.name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,8 +163,8 @@ class FeatureMethod:
                 hint="docs/plugins.md shows how",
             )
 
-    def __reduce__(self) -> tuple[Callable[[str], "FeatureMethod"], tuple[str]]:
-        return _feature_method_here, (self.name,)
+    def __reduce__(self) -> tuple[Callable[[str, str], "FeatureMethod"], tuple[str, str]]:
+        return _part_here, ("features", self.name)
 
 
 class Hooks:
@@ -324,25 +324,11 @@ def _load(modules: Sequence[ModuleType | object], installed: bool) -> Plugins:
     )
 
 
-def _estimator_here(name: str) -> Estimator:
-    """Return the estimator of that name in another process: plug-ins travel by name."""
-    return _parts_here(name, built_ins().estimators).estimator(name)
-
-
-def _feature_method_here(name: str) -> FeatureMethod:
-    """Return the way to find features of that name in another process."""
-    return _parts_here(name, built_ins().features).feature_method(name)
-
-
-def _parts_here(name: str, built_in: Mapping[str, object]) -> Plugins:
-    """Return the built-ins where they have a part of that name, so that no plug-in is loaded for it."""
-    return built_ins() if name in built_in else installed_plugins()
-
-
 @cache
-def built_ins() -> Plugins:
-    """Return what ships with the program."""
-    return _load((), installed=False)
+def _part_here(kind: str, name: str) -> Any:
+    """Return a part by its name in another process; no plug-in is loaded for what ships with the program."""
+    built_in = getattr(_load((), installed=False), kind)
+    return built_in[name] if name in built_in else _look_up(getattr(installed_plugins(), kind), name, kind)
 
 
 class _NamedPart(Protocol):

@@ -79,7 +79,7 @@ def match_in_chunks(sift: Mapping[str, SiftOption], pairs: Sequence[PairId] | No
 
 
 def chunks(items: Sequence[Item], most: int, workers: int) -> list[Sequence[Item]]:
-    """Cut items into chunks that keep all workers busy.
+    """Return items in chunks that keep all workers busy.
 
     Args:
         items: to cut.

@@ -66,13 +66,13 @@ class Cluster:
     def _count_threads(self) -> int:
         """Return the threads of all workers as of a moment ago; each question takes the scheduler some time."""
         if self.client.status != "running":
-            raise self.lost()
+            raise self.make_loss_error()
         now = time.monotonic()
         if now - self._looked_at > LOOK_S:
             self._threads = int(self.client.scheduler_info(n_workers=0).get("total_threads", -1))
             self._looked_at = now
         if self._threads < 0:  # the connection broke meanwhile
-            raise self.lost()
+            raise self.make_loss_error()
         return self._threads
 
     def probe(self) -> Probe:
@@ -134,7 +134,7 @@ class Cluster:
         try:
             return self.client.submit(answer, call, key=key, pure=False)
         except Exception as err:  # the client is closed, or its connection broke
-            raise self.lost() from err
+            raise self.make_loss_error() from err
 
     def wait(self, future: Any, what: str) -> Reply | None:
         """Return the reply of a call, None where it has ended every worker that it met.
@@ -158,7 +158,7 @@ class Cluster:
                 self._check_alive()
                 continue
             except (CancelledError, CommClosedError) as err:
-                raise self.lost() from err
+                raise self.make_loss_error() from err
             except KilledWorker:
                 return None
             except Exception as err:  # the worker could not even begin
@@ -168,7 +168,7 @@ class Cluster:
             return reply  # type: ignore[no-any-return]
 
     def leave_out(self, address: str) -> None:
-        """Let a worker that cannot be used go.
+        """Remove a worker that cannot be used.
 
         Args:
             address: of the worker.
@@ -176,7 +176,7 @@ class Cluster:
         with contextlib.suppress(Exception):  # it may be gone already
             self.client.retire_workers([address], close_workers=True)
 
-    def lost(self) -> ClusterError:
+    def make_loss_error(self) -> ClusterError:
         """Return the error that says that the scheduler is gone."""
         return ClusterError(f"the scheduler of the cluster ({self.address}) is gone", hint=GOES_ON)
 
@@ -276,7 +276,7 @@ def _start_workers(address: str, count: int) -> Iterator[None]:
 
 
 def _close(client: Any) -> None:
-    """Close a client, also one whose scheduler is gone."""
+    """End a client, also one whose scheduler is gone."""
     with contextlib.suppress(Exception):
         client.close(timeout=CLOSING_S)
 

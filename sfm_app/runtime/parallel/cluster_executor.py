@@ -64,7 +64,7 @@ class ClusterExecutor(ThreadPoolExecutor):
         with packing(self.cluster.folder) as packer:
             yield from _Spreading(self, task, packer).results(iter(items))
 
-    def most_in_flight(self) -> int:
+    def count_in_flight(self) -> int:
         """Return how many calls may be on their way; on this machine, the memory is what was planned for."""
         threads = self.cluster.threads()
         narrow = self.cluster.limit > self.workers
@@ -87,7 +87,7 @@ class _Spreading:
         flights: deque[_Flight] = deque()
         try:
             while True:
-                while len(flights) < self.executor.most_in_flight():
+                while len(flights) < self.executor.count_in_flight():
                     batch = list(islice(items, self._size))
                     if not batch:
                         break

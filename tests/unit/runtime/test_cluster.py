@@ -145,7 +145,7 @@ def test_a_task_that_ends_every_worker_is_named(two, tasks):
 @pytest.mark.slow
 def test_a_narrower_executor_has_the_same_cluster(two, tasks):
     with make_executor(1, like=two) as narrow:
-        assert narrow.most_in_flight() == 1
+        assert narrow.count_in_flight() == 1
         assert [value for value, _ in ordered_map(narrow, Task(tasks.double), range(5), ahead=2)] == [0, 2, 4, 6, 8]
 
 
