@@ -74,6 +74,24 @@ def test_workers_end_with_a_run_that_is_killed(undisturbed, tmp_path):
     assert alive == []
 
 
+def test_an_interrupted_run_ends_its_workers_and_goes_on(undisturbed, refused, tmp_path):
+    out = tmp_path / "out"
+    with start(undisturbed, out, "local:2") as run:
+        wait_for(run, out, "depth_maps begins")
+        time.sleep(1.0)
+        below = psutil.Process(run.pid).children(recursive=True)
+        run.send_signal(signal.SIGINT)
+        _, said = run.communicate(timeout=LONG_S)
+    refused(subprocess.CompletedProcess((), run.returncode, "", said), 130)
+    _, alive = psutil.wait_procs(below, timeout=10)
+    assert alive == []
+    assert left_over(out) == []
+    again = undisturbed.run(out)
+
+    assert again.returncode == 0, again.stderr
+    assert undisturbed.result(out) == undisturbed.result(undisturbed.out)
+
+
 @pytest.fixture
 def scheduler(tmp_path):
     """A scheduler and two workers in processes of their own, and the scheduler's address."""

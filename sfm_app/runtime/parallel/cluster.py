@@ -242,8 +242,8 @@ def _local_scheduler(wait_s: float) -> Iterator[str]:
 
     try:
         scheduler = LocalCluster(
-            n_workers=0, processes=False, dashboard_address=None, host="127.0.0.1", protocol="tcp",
-            silence_logs=logging.CRITICAL,
+            n_workers=0, processes=False, dashboard_address="127.0.0.1:0", host="127.0.0.1", protocol="tcp",
+            silence_logs=logging.CRITICAL, scheduler_kwargs={"dashboard": False},
         )  # fmt: skip
     except (OSError, RuntimeError) as err:
         raise ClusterError(f"no cluster starts on this machine: {err}", hint="leave --cluster out") from err
@@ -276,7 +276,7 @@ def _start_workers(address: str, count: int) -> Iterator[None]:
 
 
 def _close(client: Any) -> None:
-    """End a client, also one whose scheduler is gone."""
+    """Leave a scheduler, also one that is gone."""
     with contextlib.suppress(Exception):
         client.close(timeout=CLOSING_S)
 
