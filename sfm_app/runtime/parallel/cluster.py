@@ -111,18 +111,24 @@ class Cluster:
             )
 
     def ask_all(self, question: Any, *about: Any) -> dict[str, Any]:
-        """Return the answer of each worker, by its address.
+        """Return the answer of each worker by its address, without those that cannot be reached at the moment.
 
         Raises:
-            ClusterError: they do not answer, or they do not have the program.
+            ClusterError: none answers, or one does not have the program.
         """
         try:
-            return dict(self.client.run(question, *about, on_error="raise"))
-        except Exception as err:  # whatever a worker raises that does not even have the program
-            text = str(err).splitlines()[0] if str(err) else type(err).__name__
-            raise ClusterError(
-                f"the workers of {self.address} cannot run the program: {text}", hint="see docs/cluster.md"
-            ) from err
+            found = dict(self.client.run(question, *about, on_error="return"))
+        except Exception as err:  # of whatever kind: the scheduler itself could not ask
+            raise self.make_loss_error() from err
+        for worker, said in list(found.items()):
+            if isinstance(said, OSError):  # its connection broke: it has left, or it will be back and be asked again
+                logger.info("the worker %s does not answer: %s", worker, said)
+                del found[worker]
+            elif isinstance(said, Exception):
+                self._refuse({worker: f"it cannot run the program: {said}"})
+        if not found:
+            raise ClusterError(f"no worker of {self.address} answers", hint=GOES_ON)
+        return found
 
     def submit(self, call: Call, key: str) -> Any:
         """Send a call to some worker, and return Dask's future of its reply.

@@ -271,3 +271,14 @@ def test_items_are_named_shortly():
         name = "a.jpg"
 
     assert [describe_item(item) for item in (Photo(), (1, 2), "b", 1.5)] == ["a.jpg", "(1, 2)", "b", "float"]
+
+
+def test_a_worker_that_cannot_be_reached_is_left_out_and_one_without_the_program_is_not(tmp_path):
+    settings = ClusterSettings(address="host:8786")
+    both = FakeClient()
+    both.run = lambda *_, **__: {"a:1": worker_versions(), "b:2": OSError("timed out")}
+    assert list(Cluster(both, tmp_path, settings).ask_all(worker_versions)) == ["a:1"]
+    with pytest.raises(ClusterError, match="no worker of host:8786 answers"):
+        Cluster(FakeClient(OSError("timed out")), tmp_path, settings).ask_all(worker_versions)
+    with pytest.raises(ClusterError, match=r"10\.0\.0\.7:4000 cannot be used: it cannot run the program: No module"):
+        Cluster(FakeClient(ModuleNotFoundError("No module")), tmp_path, settings).ask_all(worker_versions)
