@@ -18,8 +18,10 @@ def main(scheduler: str, count: str, scratch: str) -> None:
         count: number of workers.
         scratch: folder for what Dask itself writes.
     """
+    import dask
     from distributed.cli.dask_worker import main as run_workers
 
+    dask.config.set({"distributed.worker.profile.enabled": False})  # it looks at all threads a hundred times a second
     threading.Thread(target=_end_with_parent, daemon=True).start()
     options = {
         "nworkers": count, "nthreads": "1", "memory-limit": "0", "local-directory": scratch, "no-dashboard": "",
