@@ -17,7 +17,7 @@ from sfm_app.plugins import load_plugins
 from sfm_app.progress import Progress, SilentProgress
 from sfm_app.ransac import check_points
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.parallel import make_executor, worker_count
+from sfm_app.runtime.parallel import open_executor
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.selfcal.wide_angle.lens_search import LensEstimate, find_lens
 from sfm_app.settings import Settings
@@ -240,6 +240,6 @@ def open_run(out: Path, settings: Settings, progress: Progress | None) -> Iterat
     plugins.estimator(settings.epipolar.estimator)  # unknown names are refused before any work is done
     plugins.calibrator(settings.calibration.calibrator)
     plugins.feature_method(settings.matching.features)
-    workers = worker_count(settings.workers)
-    with make_executor(workers) as executor:
-        yield RunContext(settings, Workspace(out), plugins, executor, workers, progress or SilentProgress())
+    place, shown = Workspace(out), progress or SilentProgress()
+    with open_executor(settings, place.parcels, shown) as (executor, workers):
+        yield RunContext(settings, place, plugins, executor, workers, shown)

@@ -1,7 +1,7 @@
 """Atomic writes of files, and markers of folders that the run after a killed one can go on filling."""
 
 import contextlib
-import os
+import secrets
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,7 +14,7 @@ UNFINISHED = "unfinished.txt"
 def replace_atomically(target: Path) -> Iterator[Path]:
     """Provide a path beside `target`, which replaces it when the block ends without an error."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    beside = target.with_name(f".{target.stem}.{os.getpid()}{target.suffix}")
+    beside = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")  # machines share process ids
     try:
         yield beside
         beside.replace(target)

@@ -9,7 +9,8 @@
     ├── ReconstructionError     the photos do not support a reconstruction       exit 4
     ├── BackendError            COLMAP failed; its own error is the cause        exit 5
     ├── PluginError             a plug-in is broken or clashes with another      exit 6
-    └── NumericalError          our own computation failed: singular matrix, NaN exit 7
+    ├── NumericalError          our own computation failed: singular matrix, NaN exit 7
+    └── ClusterError            the cluster is gone, or cannot be used           exit 8
 """
 
 from typing import ClassVar
@@ -84,3 +85,9 @@ class NumericalError(SfmError):
     """Our own computation failed, as on a singular matrix or a NaN."""
 
     exit_code = 7
+
+
+class ClusterError(SfmError):
+    """The Dask cluster is gone, does not answer, or has workers that cannot be used."""
+
+    exit_code = 8

@@ -80,6 +80,9 @@ class Estimator:
     fit: FitFundamental
     summary: str = ""
 
+    def __reduce__(self) -> tuple[Callable[[str, str], "Estimator"], tuple[str, str]]:
+        return _part_here, ("estimators", self.name)
+
 
 @dataclass(frozen=True, slots=True)
 class Calibrator:
@@ -159,6 +162,9 @@ class FeatureMethod:
                 f"the features '{self.name}' have to come with `find` and `match`, or with options of SIFT alone",
                 hint="docs/plugins.md shows how",
             )
+
+    def __reduce__(self) -> tuple[Callable[[str, str], "FeatureMethod"], tuple[str, str]]:
+        return _part_here, ("features", self.name)
 
 
 class Hooks:
@@ -316,6 +322,13 @@ def _load(modules: Sequence[ModuleType | object], installed: bool) -> Plugins:
         depth_methods=_index_by_name(manager.hook.sfm_depth_methods()),
         features=_index_by_name(manager.hook.sfm_features()),
     )
+
+
+@cache
+def _part_here(kind: str, name: str) -> Any:
+    """Return a part by its name in another process; no plug-in is loaded for what ships with the program."""
+    built_in = getattr(_load((), installed=False), kind)
+    return built_in[name] if name in built_in else _look_up(getattr(installed_plugins(), kind), name, kind)
 
 
 class _NamedPart(Protocol):

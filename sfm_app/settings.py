@@ -5,12 +5,13 @@ The sources of a setting, in rising priority: its default, the quality preset, t
 
 import difflib
 import json
+import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from sfm_app.errors import ConfigError
 
@@ -25,6 +26,12 @@ CameraModelName = Literal[
     "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "EQUIRECTANGULAR",
 ]  # fmt: skip
 ConstraintForm = Literal["huang-faugeras", "frobenius", "trivedi", "polynomial"]
+
+
+LOCAL_ADDRESS = re.compile(r"local:([1-9]\d{0,2})")
+"""So many processes of this machine as a cluster."""
+SCHEDULER_ADDRESS = re.compile(r"(?:[a-z]+://)?(?:[\w.-]+|\[[\da-fA-F:.]+\]):\d{1,5}")
+"""Host, IPv4 or IPv6 address, and port, with Dask's name of a protocol or without."""
 
 
 class Section(BaseModel):
@@ -197,6 +204,28 @@ class TextureSettings(Section):
     )
 
 
+class ClusterSettings(Section):
+    """Dask's workers, on this machine or on others; results do not depend on them."""
+
+    address: str = Field(
+        "",
+        description="scheduler HOST:PORT of a Dask cluster, or local:N for N processes of this machine; none where "
+        "empty",
+    )
+    wait_s: float = Field(
+        60.0, gt=0, le=86400, description="seconds to wait for the scheduler, and for workers where it has none"
+    )
+
+    @field_validator("address")
+    @classmethod
+    def check_address(cls, address: str) -> str:
+        """Return an address after checking its form; ValueError where it has none."""
+        form = LOCAL_ADDRESS if address.startswith("local:") else SCHEDULER_ADDRESS
+        if address and not form.fullmatch(address):
+            raise ValueError("should be HOST:PORT or local:N")
+        return address
+
+
 class Settings(Section):
     """All settings of a run."""
 
@@ -215,6 +244,7 @@ class Settings(Section):
     depth: DepthSettings = DepthSettings()
     mesh: MeshSettings = MeshSettings()
     texture: TextureSettings = TextureSettings()
+    cluster: ClusterSettings = ClusterSettings()
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], where: str = "settings") -> "Settings":

@@ -39,6 +39,7 @@ class SettingFlag:
 SETTING_FLAGS = (
     SettingFlag("--seed", "seed"),
     SettingFlag("--workers", "workers"),
+    SettingFlag("--cluster", "cluster.address", metavar="HOST:PORT|local:N"),
     SettingFlag("--max-memory", "max_memory_gb", metavar="GB"),
     SettingFlag("--quality", "quality", choice=True),
     SettingFlag("--images", "photos.images"),

@@ -1,5 +1,6 @@
 """COLMAP's dense workspace: undistorted photos, depth and normal maps."""
 
+import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -268,7 +269,7 @@ def _map_path(dense_dir: Path, folder: str, view: View, kind: Kind = "geometric"
 def _atomic_path(target: Path) -> Iterator[Path]:
     """Provide a temporary path beside `target`, and rename it to `target` once everything is written."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    beside = target.with_name(f".{target.name}")
+    beside = target.with_name(f".{secrets.token_hex(4)}.{target.name}")  # two machines may write the same map
     yield beside
     check_written(beside)
     beside.replace(target)

@@ -37,7 +37,31 @@ def find_and_match(
     Raises:
         BackendError: COLMAP failed.
     """
-    task: FeatureTask = {
+    task = feature_task(
+        (database, photo_dir, mask_dir), names, options, workers, sift, None if pairs is None else list(pairs)
+    )
+    with start_worker("sfm_app.colmap.processes.feature_process", task) as process:
+        found = relay(process, progress)
+        process.check("matching photos" if found else "finding features")
+    return found
+
+
+def feature_task(
+    paths: tuple[Path, Path, Path | None],
+    names: Sequence[str],
+    options: MatchSettings,
+    workers: int,
+    sift: Mapping[str, SiftOption],
+    pairs: Sequence[PairId] | None,
+) -> FeatureTask:
+    """Return the task of a process that finds and matches features.
+
+    Args:
+        paths: database, photos, masks.
+        names, options, workers, sift, pairs: as in `find_and_match`.
+    """
+    database, photo_dir, mask_dir = paths
+    return {
         "database": str(database),
         "photos": str(photo_dir),
         "masks": str(mask_dir) if mask_dir else None,
@@ -47,7 +71,3 @@ def find_and_match(
         "sift": dict(sift),
         "pairs": None if pairs is None else [list(pair) for pair in pairs],
     }
-    with start_worker("sfm_app.colmap.processes.feature_process", task) as process:
-        found = relay(process, progress)
-        process.check("matching photos" if found else "finding features")
-    return found

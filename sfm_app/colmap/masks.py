@@ -1,6 +1,5 @@
 """Masks in COLMAP's dense workspace: undistorted, at the size of the photos there."""
 
-from collections.abc import Callable
 from math import ceil
 from pathlib import Path
 
@@ -22,23 +21,29 @@ BoolImage = NDArray[np.bool_]
 """(H, W)."""
 
 
-def mask_undistorter(model_dir: Path, mask_dir: Path, dense_dir: Path) -> Callable[[View], None]:
-    """Return a function that writes the mask of an undistorted photo.
+class MaskUndistorter:
+    """Writes masks of undistorted photos; on its way to another process, it is the paths of its inputs.
 
     Args:
         model_dir: model with the cameras of the photos.
         mask_dir: masks of the original photos.
         dense_dir: workspace with the undistorted photos.
     """
-    with translate_errors("reading the model"):
-        model = pycolmap.Reconstruction(model_dir)
-        cameras = {image.name: model.cameras[image.camera_id] for image in all_images(model)}
 
-    def undistort(view: View) -> None:
-        used = _undistort_mask(read_mask(mask_dir, view.name), cameras[view.name], view)
+    def __init__(self, model_dir: Path, mask_dir: Path, dense_dir: Path) -> None:
+        self._inputs = model_dir, mask_dir, dense_dir
+        with translate_errors("reading the model"):
+            model = pycolmap.Reconstruction(model_dir)
+            self._cameras = {image.name: model.cameras[image.camera_id] for image in all_images(model)}
+
+    def __reduce__(self) -> tuple[type["MaskUndistorter"], tuple[Path, Path, Path]]:
+        return MaskUndistorter, self._inputs
+
+    def __call__(self, view: View) -> None:
+        """Write the mask of an undistorted photo."""
+        _, mask_dir, dense_dir = self._inputs
+        used = _undistort_mask(read_mask(mask_dir, view.name), self._cameras[view.name], view)
         save_mask(dense_dir / MASKS, view.name, used)
-
-    return undistort
 
 
 def has_masks(dense_dir: Path) -> bool:

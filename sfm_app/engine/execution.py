@@ -4,6 +4,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import dropwhile
 
 from sfm_app.colmap.backend import check_written
@@ -25,6 +26,7 @@ from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import choose_plan
 from sfm_app.runtime.earlier import Earlier
 from sfm_app.runtime.manifest import StageRecord
+from sfm_app.runtime.parallel import cpu_seconds_elsewhere
 from sfm_app.types import PhotoSet
 
 logger = logging.getLogger("sfm_app")
@@ -167,7 +169,7 @@ class _Execution:
         run.progress.stage(stage.name, f"again: {again}" if again else "")
         logger.info("%s begins%s", stage.name, f" again: {again}" if again else "")
         run = self.stage_context(stage, run)
-        with measure_usage() as used:
+        with measure_usage(partial(cpu_seconds_elsewhere, run.executor)) as used:
             product = self.make_product(stage, run)
         self.products.keep(stage, product)
         place, seconds = run.workspace, round(used.seconds, 2)

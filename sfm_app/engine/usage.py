@@ -3,7 +3,7 @@
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -20,16 +20,20 @@ class Usage:
 
     seconds: float = 0.0
     cpu_seconds: float = 0.0
-    """Of this process and of those that it has waited for."""
+    """Of this process, of those that it has waited for, and of the workers of a cluster."""
     peak_mb: int = 0
     """Most resident memory at any look; pages that processes share count for each of them."""
 
 
 @contextmanager
-def measure_usage() -> Iterator[Usage]:
-    """Measure the work within the block."""
+def measure_usage(elsewhere: Callable[[], float] = float) -> Iterator[Usage]:
+    """Measure the work within the block.
+
+    Args:
+        elsewhere: returns the CPU seconds so far of processes that work for this one without being waited for.
+    """
     used, ended = Usage(), threading.Event()
-    start, cpu_start = time.perf_counter(), _cpu_seconds()
+    start, cpu_start = time.perf_counter(), _cpu_seconds() + elsewhere()
 
     def watch() -> None:
         while True:
@@ -45,7 +49,7 @@ def measure_usage() -> Iterator[Usage]:
         ended.set()
         watcher.join()
         used.peak_mb = max(used.peak_mb, _resident_mb())
-        used.seconds, used.cpu_seconds = time.perf_counter() - start, _cpu_seconds() - cpu_start
+        used.seconds, used.cpu_seconds = time.perf_counter() - start, _cpu_seconds() + elsewhere() - cpu_start
 
 
 def _cpu_seconds() -> float:

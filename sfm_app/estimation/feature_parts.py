@@ -5,6 +5,7 @@ points.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -23,6 +24,7 @@ from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.settings import MatchSettings
+from sfm_app.tasks import Task
 from sfm_app.types import Features
 
 
@@ -38,33 +40,59 @@ def find_features(method: FeatureMethod, names: Mapping[int, str], run: RunConte
         PluginError: the method raises, or returns invalid results.
     """
     panoramas = panorama_names(run.workspace.database)
-
-    def find(photo: int) -> tuple[int, NDArray[np.float32]]:
-        name = names[photo]
-        features, to_photo, size = _find_in_photo(method, name, run, panorama=name in panoramas)
-        keypoints = features.keypoints * to_photo
-        if run.mask_dir is not None:
-            used = read_mask(run.mask_dir, name)
-            column, row = np.clip(keypoints.astype(np.int64), 0, np.array(size) - 1).T
-            seen = used[row, column]
-            features, keypoints = features.select(seen), keypoints[seen]
-        rows = np.arange(min(len(keypoints), run.settings.matching.max_features))
-        _save(features.select(rows), part_path(photo, run))
-        return photo, keypoints[rows].astype(np.float32)
-
-    left = [photo for photo in names if not part_path(photo, run).exists()]
+    place = run.workspace
+    folders = _Folders(place.photos, run.mask_dir, place.feature_parts)
+    find = Task(_find_and_save, method, run.settings.matching, folders)
+    left = [
+        _Wanted(photo, name, name in panoramas)
+        for photo, name in names.items()
+        if not part_path(photo, place.feature_parts).exists()
+    ]
     found = track(run.progress, ordered_map(run.executor, find, left, run.workers), "features", len(left))
     for photo, keypoints in found:
         with translate_errors("writing keypoints"):
             write_keypoints(run.workspace.database, photo, keypoints)
 
 
+@dataclass(frozen=True, slots=True)
+class _Folders:
+    """Where photos, masks and features are."""
+
+    photos: Path
+    masks: Path | None
+    parts: Path
+
+
+@dataclass(frozen=True, slots=True)
+class _Wanted:
+    """A photo whose features are wanted."""
+
+    id: int
+    name: str
+    panorama: bool
+
+
+def _find_and_save(
+    method: FeatureMethod, options: MatchSettings, folders: _Folders, photo: _Wanted
+) -> tuple[int, NDArray[np.float32]]:
+    """Write the features of one photo to its part, and return its id and its keypoints."""
+    pixels = read_pixels(folders.photos / photo.name)
+    features, to_photo, size = _find_in_photo(method, photo.name, pixels, options, panorama=photo.panorama)
+    keypoints = features.keypoints * to_photo
+    if folders.masks is not None:
+        used = read_mask(folders.masks, photo.name)
+        column, row = np.clip(keypoints.astype(np.int64), 0, np.array(size) - 1).T
+        seen = used[row, column]
+        features, keypoints = features.select(seen), keypoints[seen]
+    rows = np.arange(min(len(keypoints), options.max_features))
+    _save(features.select(rows), part_path(photo.id, folders.parts))
+    return photo.id, keypoints[rows].astype(np.float32)
+
+
 def _find_in_photo(
-    method: FeatureMethod, name: str, run: RunContext, *, panorama: bool
+    method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings, *, panorama: bool
 ) -> tuple[Features, NDArray[np.float64], tuple[int, int]]:
     """Return the features of one photo, the scale (x, y) that takes them to its pixels, and its size."""
-    options = run.settings.matching
-    pixels = read_pixels(run.workspace.photos / name)
     height, width = pixels.shape[:2]
     if panorama:
         return _find_in_views(method, name, pixels, options), np.ones(2), (width, height)
@@ -139,14 +167,14 @@ def method_error(method: FeatureMethod, what: str) -> PluginError:
     return PluginError(f"the features '{method.name}' {what}", hint="choose others with --features")
 
 
-def part_path(photo: int, run: RunContext) -> Path:
+def part_path(photo: int, folder: Path) -> Path:
     """Return the file that keeps the features of a photo until all are matched.
 
     Args:
         photo: id.
-        run: the run.
+        folder: of the parts.
     """
-    return run.workspace.feature_parts / f"{photo:06d}.npz"
+    return folder / f"{photo:06d}.npz"
 
 
 def _save(features: Features, path: Path) -> None:
@@ -155,14 +183,14 @@ def _save(features: Features, path: Path) -> None:
         np.savez(beside, allow_pickle=False, size=np.array(features.size), keypoints=features.keypoints, **values)
 
 
-def load_features(photo: int, run: RunContext) -> Features:
+def load_features(photo: int, folder: Path) -> Features:
     """Read the features of a photo from its part.
 
     Args:
         photo: id.
-        run: the run.
+        folder: of the parts.
     """
-    arrays = load_arrays(part_path(photo, run))
+    arrays = load_arrays(part_path(photo, folder))
     values = {name.removeprefix("value_"): value for name, value in arrays.items() if name.startswith("value_")}
     width, height = arrays["size"]
     return Features((int(width), int(height)), arrays["keypoints"], values)

@@ -1,7 +1,8 @@
 """Fundamental matrices of pairs of photos, by the chosen estimator; fits of a killed run are reused."""
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
@@ -13,13 +14,15 @@ from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.geometry.lenses.bearings import bearings
 from sfm_app.hashing import load_arrays
 from sfm_app.numerical import FAILURES
+from sfm_app.plugins import Estimator
 from sfm_app.progress import track
 from sfm_app.ransac import FitFundamentalLike
-from sfm_app.ransac.degeneracy.watermark import find_stationary, fit_moving, is_widespread
+from sfm_app.ransac.degeneracy.watermark import find_stationary, fit_moving, is_widespread, one_per_cell
 from sfm_app.ransac.lev_ransac_rays import fit_lev_ransac_rays
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.settings import EpipolarSettings, Settings
+from sfm_app.tasks import Task
 from sfm_app.types import Calibration, EpipolarFit, MatchedImage, MatchGraph, PairId, Rejected, ViewGraph
 
 logger = logging.getLogger("sfm_app")
@@ -48,29 +51,56 @@ def fit_pairs(
         run: the run.
         lenses: cameras with a wide lens, by camera group; their pairs are fitted by bearing vectors.
     """
-    options = run.settings.epipolar
-    estimator = run.plugins.estimator(options.estimator)
+    estimator = run.plugins.estimator(run.settings.epipolar.estimator)
+    fit_pair = Task(_fit_pair, estimator, run.settings, dict(lenses))
+    return _fit_all(fit_pair, lambda left: _matched_pairs(matches, left), pairs, run)
 
-    def fit_pair(pair: PairId) -> PairFit:
-        try:
-            return fit_or_raise(pair)
-        except FAILURES as err:
-            logger.info("pair %s could not be fitted", pair, exc_info=err)
-            return Rejected("the computation failed"), 0
 
-    def fit_or_raise(pair: PairId) -> PairFit:
-        seed = int(np.random.SeedSequence([run.seed, *pair]).generate_state(1)[0])
-        points, still = matches.points(pair), _stationary_matches(matches, pair, run.settings)
-        by_rays = ray_estimator([matches.images[photo] for photo in pair], lenses)
-        fit = by_rays or estimator.fit
-        if not still.any():
-            return fit(*points, options, seed), 0
-        image = matches.images[pair[0]]
-        wide = is_widespread(points[0][still], matches.keypoints[image.id], (image.width, image.height))
-        wide = wide and by_rays is None  # its test needs an F of pixels
-        return fit_moving(fit, points, still, wide, options, seed), int(np.count_nonzero(still))
+@dataclass(frozen=True, slots=True, eq=False)
+class MatchedPair:
+    """All that the fit of a pair needs of the match graph."""
 
-    return _fit_all(fit_pair, pairs, run)
+    pair: PairId
+    images: tuple[MatchedImage, MatchedImage]
+    points: tuple[FloatArray, FloatArray]
+    """x1, x2, each (M, 2) pixels."""
+    spread: FloatArray
+    """(C, 2) one keypoint of the first photo for each of its cells that has any."""
+
+
+def _matched_pairs(matches: MatchGraph, pairs: Iterable[PairId]) -> Iterator[MatchedPair]:
+    """Yield what the fits of these pairs need."""
+    spreads: dict[int, FloatArray] = {}
+    for pair in pairs:
+        first, second = (matches.images[photo] for photo in pair)
+        if first.id not in spreads:
+            spreads[first.id] = one_per_cell(matches.keypoints[first.id], (first.width, first.height))
+        yield MatchedPair(pair, (first, second), matches.points(pair), spreads[first.id])
+
+
+def _fit_pair(
+    estimator: Estimator, settings: Settings, lenses: Mapping[str, Calibration], matched: MatchedPair
+) -> PairFit:
+    try:
+        return _fit_or_raise(estimator, settings, lenses, matched)
+    except FAILURES as err:
+        logger.info("pair %s could not be fitted", matched.pair, exc_info=err)
+        return Rejected("the computation failed"), 0
+
+
+def _fit_or_raise(
+    estimator: Estimator, settings: Settings, lenses: Mapping[str, Calibration], matched: MatchedPair
+) -> PairFit:
+    seed = int(np.random.SeedSequence([settings.seed, *matched.pair]).generate_state(1)[0])
+    points, still = matched.points, _stationary_matches(matched, settings)
+    by_rays = ray_estimator(matched.images, lenses)
+    fit = by_rays or estimator.fit
+    if not still.any():
+        return fit(*points, settings.epipolar, seed), 0
+    image = matched.images[0]
+    wide = is_widespread(points[0][still], matched.spread, (image.width, image.height))
+    wide = wide and by_rays is None  # its test needs an F of pixels
+    return fit_moving(fit, points, still, wide, settings.epipolar, seed), int(np.count_nonzero(still))
 
 
 def ray_estimator(images: Sequence[MatchedImage], lenses: Mapping[str, Calibration]) -> FitFundamentalLike | None:
@@ -111,7 +141,12 @@ def to_view_graph(
     )
 
 
-def _fit_all(fit_pair: Callable[[PairId], PairFit], pairs: Sequence[PairId], run: RunContext) -> dict[PairId, PairFit]:
+def _fit_all(
+    fit_pair: Callable[[MatchedPair], PairFit],
+    load: Callable[[Iterable[PairId]], Iterator[MatchedPair]],
+    pairs: Sequence[PairId],
+    run: RunContext,
+) -> dict[PairId, PairFit]:
     """Return the result of `fit_pair` for every pair, in order; each part is written to a file once it is complete."""
     folder = run.workspace.view_graph_parts
     if not resume_or_clear(folder, run.fingerprint):
@@ -119,7 +154,7 @@ def _fit_all(fit_pair: Callable[[PairId], PairFit], pairs: Sequence[PairId], run
     parts = {folder / f"{first:06d}.npz": pairs[first : first + PART] for first in range(0, len(pairs), PART)}
     known = {path: read_part(path, part) for path, part in parts.items()}
     left = [pair for path, part in parts.items() if known[path] is None for pair in part]
-    fitted = ordered_map(run.executor, fit_pair, left, ahead=2 * run.workers)
+    fitted = ordered_map(run.executor, fit_pair, load(left), ahead=2 * run.workers)
     results = track(run.progress, fitted, "epipolar geometry", len(left))
     found: dict[PairId, PairFit] = {}
     for path, part in parts.items():
@@ -160,10 +195,10 @@ def read_part(path: Path, pairs: Sequence[PairId]) -> dict[PairId, PairFit] | No
         return None
 
 
-def _stationary_matches(matches: MatchGraph, pair: PairId, settings: Settings) -> BoolArray:
+def _stationary_matches(matched: MatchedPair, settings: Settings) -> BoolArray:
     """Return a mask of the matches of a pair that are stationary in the picture; none if the photos differ in size."""
-    first, second = (matches.images[key] for key in pair)
+    first, second = matched.images
     if (first.width, first.height) != (second.width, second.height):
-        return np.zeros(len(matches.matches[pair]), bool)
+        return np.zeros(len(matched.points[0]), bool)
     shrunk = max(first.width, first.height) / settings.matching.max_image_size_px
-    return find_stationary(*matches.points(pair), unit_px=max(1.0, shrunk))
+    return find_stationary(*matched.points, unit_px=max(1.0, shrunk))

@@ -5,7 +5,8 @@ COLMAP's SIFT fills the database by itself. Any other method is two functions; `
 
 import shutil
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,14 @@ from sfm_app.colmap.database import photo_names, unmatched_pairs, write_matches
 from sfm_app.colmap.features import find_and_match
 from sfm_app.errors import PluginError
 from sfm_app.estimation.feature_parts import find_features, load_features, method_error
+from sfm_app.estimation.on_cluster.sift_chunks import find_in_chunks, match_in_chunks
 from sfm_app.numerical import Json
 from sfm_app.plugins import FeatureMethod
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.settings import MatchSettings
+from sfm_app.tasks import Shared, Task
 from sfm_app.types import Features, PairId
 
 PHOTOS_IN_MEMORY = 32
@@ -67,6 +70,8 @@ def find_all_features(method: FeatureMethod, run: RunContext, pairs: Sequence[Pa
     names = photo_names(place.database)
     if pairs:
         names = {photo: names[photo] for photo in sorted({photo for pair in pairs for photo in pair})}
+    if method.sift is not None and run.spread:
+        return find_in_chunks(method.sift, list(names.values()), run)
     if method.sift is not None:
         return find_and_match(
             place.database, place.photos, list(names.values()), options, run.workers, run.progress, run.mask_dir,
@@ -96,6 +101,8 @@ def match_pairs(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] 
     place, options = run.workspace, run.settings.matching
     if pairs is not None and not pairs:
         return {}
+    if method.sift is not None and run.spread:
+        return match_in_chunks(method.sift, pairs, run)
     if method.sift is not None:
         return find_and_match(
             place.database, place.photos, [], options, run.workers, run.progress, sift=method.sift, pairs=pairs
@@ -122,16 +129,36 @@ def all_pairs(photos: Sequence[int] | Mapping[int, str]) -> list[PairId]:
 def _match(method: FeatureMethod, pairs: Sequence[PairId], run: RunContext) -> None:
     """Write the matches of every pair into the database, also where there are none."""
     options, database = run.settings.matching, run.workspace.database
-    read = lru_cache(max(PHOTOS_IN_MEMORY, 2 * run.workers))(lambda photo: load_features(photo, run))
-
-    def match(pair: PairId) -> tuple[PairId, NDArray[np.uint32]]:
-        return pair, _match_pair(method, (read(pair[0]), read(pair[1])), options)
-
+    reader = FeatureReader(run.workspace.feature_parts, max(PHOTOS_IN_MEMORY, 2 * run.workers))
+    match = Task(_read_and_match, method, options, Shared(reader))
     left = unmatched_pairs(database, pairs)
     found = track(run.progress, ordered_map(run.executor, match, left, 2 * run.workers), "matching", len(left))
     for pair, rows in found:
         with translate_errors("writing matches"):
             write_matches(database, pair, rows)
+
+
+class FeatureReader:
+    """Reads the features of photos, and keeps those of some; in another process, it begins with none.
+
+    Args:
+        folder: of the parts of features.
+        kept: photos whose features stay in memory.
+    """
+
+    def __init__(self, folder: Path, kept: int) -> None:
+        self._made_of = folder, kept
+        self.read = lru_cache(kept)(partial(load_features, folder=folder))
+
+    def __reduce__(self) -> tuple[type["FeatureReader"], tuple[Path, int]]:
+        return FeatureReader, self._made_of
+
+
+def _read_and_match(
+    method: FeatureMethod, options: MatchSettings, features: Shared[FeatureReader], pair: PairId
+) -> tuple[PairId, NDArray[np.uint32]]:
+    first, second = (features.value.read(photo) for photo in pair)
+    return pair, _match_pair(method, (first, second), options)
 
 
 def _match_pair(method: FeatureMethod, pair: tuple[Features, Features], options: MatchSettings) -> NDArray[np.uint32]:

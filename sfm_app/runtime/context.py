@@ -12,7 +12,7 @@ from sfm_app.plugins import Plugins
 from sfm_app.progress import Progress, SilentProgress, track
 from sfm_app.runtime.cost_estimate import SHARE_OF_MACHINE, machine_memory_mb
 from sfm_app.runtime.earlier import Earlier
-from sfm_app.runtime.parallel import make_executor, ordered_map
+from sfm_app.runtime.parallel import make_executor, ordered_map, threads_elsewhere
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.types import GivenCameras, Model
@@ -56,6 +56,11 @@ class RunContext:
         return self.settings.seed
 
     @property
+    def spread(self) -> int:
+        """How many tasks a cluster does at once; 0 where they stay in this process."""
+        return threads_elsewhere(self.executor)
+
+    @property
     def memory_mb(self) -> float:
         """Most memory in MB that the run may use."""
         return 1000 * self.settings.max_memory_gb or SHARE_OF_MACHINE * machine_memory_mb()
@@ -63,7 +68,7 @@ class RunContext:
     @contextmanager
     def with_workers(self, workers: int) -> Iterator["RunContext"]:
         """Provide the same run with another number of workers, which stop when the block ends."""
-        with make_executor(workers) as executor:
+        with make_executor(workers, like=self.executor) as executor:
             yield replace(self, workers=workers, executor=executor)
 
     @property

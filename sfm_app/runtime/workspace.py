@@ -22,8 +22,8 @@ OUTPUT_NAMES = (*FOLDERS, DATABASE, CALIBRATION, SCENE)
 """Names of files and folders that a run removes before it writes them."""
 LOCK, HOLDER = ".lock", ".held-by.txt"
 LOG, PARTS, FEATURES, MAPPING = "log.txt", "view_graph_parts", "feature_parts", ".mapping"
-EARLIER = ".earlier"
-LINK_CHECKED = (*OUTPUT_NAMES, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING, EARLIER)
+EARLIER, PARCELS, SIFT_ROWS = ".earlier", ".cluster", ".sift_rows"
+LINK_CHECKED = (*OUTPUT_NAMES, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING, EARLIER, PARCELS, SIFT_ROWS)
 """Names that a run writes to without replacing them: a link there would lead it out of the folder."""
 PHOTO_SET, VIEW_GRAPH = "photos.json", "view_graph.npz"
 
@@ -124,6 +124,16 @@ class Workspace:
     def earlier(self) -> "Workspace":
         """Files of an earlier run with other photos, while this run goes on from them."""
         return Workspace(self.root / EARLIER)
+
+    @property
+    def parcels(self) -> Path:
+        """Large values on their way between the machines of a cluster."""
+        return self.root / PARCELS
+
+    @property
+    def sift_rows(self) -> Path:
+        """What the workers of a cluster read while they find and match features, and what they have found."""
+        return self.root / SIFT_ROWS
 
     @property
     def log(self) -> Path:

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from hashlib import blake2b
 from pathlib import Path
 
@@ -21,13 +20,14 @@ from sfm_app.colmap.dense import (
     undistort,
     write_fusion_views,
 )
-from sfm_app.colmap.masks import has_masks, mask_undistorter
+from sfm_app.colmap.masks import MaskUndistorter, has_masks
 from sfm_app.colmap.wide_views import WideLens, split_wide_photos, write_model, write_views
 from sfm_app.errors import ReconstructionError
 from sfm_app.hashing import fingerprint
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.stereo import DepthTask, View, rank_neighbors
+from sfm_app.tasks import Shared, Task
 from sfm_app.types import Rejected, Scene
 
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
@@ -60,7 +60,7 @@ def make(scene: Scene, run: RunContext) -> Path:
     with single_threaded_opencv():
         found = method.make(DepthTask(dense_dir, views, ranked, options, DenseStore(dense_dir), run.map))
     if has_masks(dense_dir):
-        run.map(partial(mask_depths, dense_dir), views, "masking depth maps")
+        run.map(Task(mask_depths, dense_dir), views, "masking depth maps")
     record(dense_dir, views, found, run)
     drop_estimates(dense_dir, views)
     write_fusion_views(dense_dir, views)
@@ -95,8 +95,8 @@ def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None
         if lenses is None:
             undistort(scene.model_dir, run.workspace.photos, dense_dir, largest, run.workers, run.progress)
             if run.mask_dir is not None:
-                undistort_mask = mask_undistorter(scene.model_dir, run.mask_dir, dense_dir)
-                run.map(undistort_mask, read_views(dense_dir), "undistorting masks")
+                undistort_mask = MaskUndistorter(scene.model_dir, run.mask_dir, dense_dir)
+                run.map(Task(undistort_mask), read_views(dense_dir), "undistorting masks")
         else:
             look_into_photos(scene, lenses, dense_dir, run)
         mark_unfinished(dense_dir, made_from)
@@ -111,13 +111,17 @@ def look_into_photos(scene: Scene, lenses: Mapping[int, WideLens], dense_dir: Pa
         dense_dir: dense workspace to fill.
         run: the run.
     """
-
-    def look_into(photo: tuple[str, int]) -> None:
-        name, camera_id = photo
-        write_views(name, lenses[camera_id], run.workspace.photos, run.mask_dir, dense_dir)
-
+    look_into = Task(_look_into, Shared(lenses), run.workspace.photos, run.mask_dir, dense_dir)
     run.map(look_into, write_model(scene.model_dir, lenses, dense_dir), "looking into wide photos")
     run.record(views_per_photo=max(len(lens.views) for lens in lenses.values()))
+
+
+def _look_into(
+    lenses: Shared[Mapping[int, WideLens]], photo_dir: Path, mask_dir: Path | None, dense_dir: Path,
+    photo: tuple[str, int],
+) -> None:  # fmt: skip
+    name, camera_id = photo
+    write_views(name, lenses.value[camera_id], photo_dir, mask_dir, dense_dir)
 
 
 def record(dense_dir: Path, views: Sequence[View], found: Sequence[Rejected | None], run: RunContext) -> None:

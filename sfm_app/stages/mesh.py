@@ -17,9 +17,10 @@ from sfm_app.runtime.cost_estimate import block_count
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.stages.blocks.fusion import fuse_maps
-from sfm_app.stages.blocks.judging import SurfaceJudge, simplify_mesh
+from sfm_app.stages.blocks.judging import SurfaceJudge, judge_view, simplify_mesh
 from sfm_app.stages.blocks.surface import mesh_in_blocks
 from sfm_app.stereo import View
+from sfm_app.tasks import Shared, Task
 from sfm_app.types import Surface
 
 SURFACE = "surface.npz"
@@ -73,7 +74,7 @@ def _mesh_at_once(dense_dir: Path, views: list[View], points: NDArray[np.void], 
     with run.step("finding the surface"):
         raw = _check_nonempty(poisson_surface(place, depth), "the fused points span no surface")
     judges = SurfaceJudge.prepare(raw, dense_dir, run.settings.depth.consistency)
-    found = ordered_map(run.executor, judges.judge, views, ahead=run.workers)
+    found = ordered_map(run.executor, Task(judge_view, Shared(judges)), views, ahead=run.workers)
     colored, support = judges.sum_up(track(run.progress, found, "confirming the surface", len(views)))
     least = _min_confirmed(views, run)
     trimmed = trim(colored, support, options.max_gap_triangles, least) if options.trim else colored

@@ -6,7 +6,6 @@ import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +36,7 @@ from sfm_app.runtime.cost_estimate import largest_photo_megapixels
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import PhotoSettings
 from sfm_app.stages.video_frames import video_frames
+from sfm_app.tasks import Task
 from sfm_app.types import GpsPosition, Photo, PhotoSet, UnusablePhoto
 
 
@@ -77,7 +77,7 @@ def _read_photos(
 ) -> PhotoSet:
     """Read these files of a folder and lay the usable photos out for COLMAP; errors as in `make`."""
     options = limit_to_memory(run)
-    found = run.map(partial(read_photo, folder, options=options), names, "photos")
+    found = run.map(Task(read_photo, folder, options=options), names, "photos")
     glances = [photo for photo in found if isinstance(photo, PhotoStats)]
     unusable = [photo for photo in found if isinstance(photo, UnusablePhoto)]
     glances, blackened = attach_masks(glances, folder, source, run)
@@ -93,7 +93,7 @@ def _read_photos(
     photo_set = PhotoSet(folder, named, tuple(unusable), source.mask_dir)
     for place in (run.workspace.photos, run.workspace.masks):
         shutil.rmtree(place, ignore_errors=True)
-    run.map(partial(lay_out_photo, folder=folder, target=run.workspace.photos), photo_set.photos, "laying photos out")
+    run.map(Task(lay_out_photo, folder=folder, target=run.workspace.photos), photo_set.photos, "laying photos out")
     if photo_set.masks is not None:
         _lay_out_masks(photo_set, photo_set.masks, list(source.masks), run)
     _save_photo_set(photo_set, run)
@@ -142,7 +142,7 @@ def attach_masks(
     masks = source.mask_dir
     if masks is None:
         return glances, []
-    found = run.map(lambda glance: find_mask(glance.photo, folder, masks), glances, "masks")
+    found = run.map(Task(_find_mask, folder, masks), [glance.photo for glance in glances], "masks")
     if glances and all(isinstance(photo, Photo) and not photo.mask for photo in found):
         raise InputError(f"none of the {len(source.masks)} files in {masks} is the mask of a photo", hint=MASK_HINT)
     kept = [
@@ -151,9 +151,13 @@ def attach_masks(
     return kept, [photo for photo in found if isinstance(photo, UnusablePhoto)]
 
 
+def _find_mask(folder: Path, masks: Path, photo: Photo) -> Photo | UnusablePhoto:
+    return find_mask(photo, folder, masks)
+
+
 def _lay_out_masks(photo_set: PhotoSet, masks: Path, names: Sequence[str], run: RunContext) -> None:
     """Put a mask of every photo into the workspace, and count them."""
-    lay_out = partial(lay_out_mask, folder=photo_set.folder, masks=masks, target=run.workspace.masks)
+    lay_out = Task(lay_out_mask, folder=photo_set.folder, masks=masks, target=run.workspace.masks)
     run.map(lay_out, photo_set.photos, "laying masks out")
     unused = unused_masks(list(names), photo_set.photos)
     run.record(masks={"photos": sum(bool(photo.mask) for photo in photo_set.photos), "unused": unused})

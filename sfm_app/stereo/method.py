@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -13,6 +12,7 @@ from sfm_app.numerical import FAILURES, error_reason
 from sfm_app.settings import DepthSettings
 from sfm_app.stereo.depth import DepthEstimate, DepthMap, confirm_depths, match_depths
 from sfm_app.stereo.view import GrayImage, View
+from sfm_app.tasks import Shared, Task
 from sfm_app.types import Rejected
 
 Kind = Literal["photometric", "geometric"]
@@ -75,6 +75,16 @@ class DepthTask:
     map: ParallelMap
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Inputs:
+    """What a worker needs of a `DepthTask`."""
+
+    views: Sequence[View]
+    ranked: Sequence[Sequence[int]]
+    options: DepthSettings
+    store: DepthStore
+
+
 def make_depth_maps_on_cpu(task: DepthTask) -> list[Rejected | None]:
     """Match every photo with its neighbors, then keep what the depth maps of other photos confirm.
 
@@ -82,14 +92,16 @@ def make_depth_maps_on_cpu(task: DepthTask) -> list[Rejected | None]:
         For every view the reason why it has no maps, or None.
     """
     everything = range(len(task.views))
-    matched = task.map(partial(_match, task=task), everything, "matching depths")
+    inputs = Shared(_Inputs(task.views, task.ranked, task.options, task.store))
+    matched = task.map(Task(_match, inputs), everything, "matching depths")
     usable = np.array([found is None for found in matched])
-    confirm = partial(_confirm, task=task, usable=usable)
+    confirm = Task(_confirm, inputs, usable)
     confirmed = iter(task.map(confirm, [index for index in everything if usable[index]], "confirming depths"))
     return [next(confirmed) if found is None else found for found in matched]
 
 
-def _match(index: int, task: DepthTask) -> Rejected | None:
+def _match(inputs: Shared[_Inputs], index: int) -> Rejected | None:
+    task = inputs.value
     view = task.views[index]
     if task.store.has(view, "photometric"):
         return None
@@ -104,7 +116,8 @@ def _match(index: int, task: DepthTask) -> Rejected | None:
     return None
 
 
-def _confirm(index: int, task: DepthTask, usable: NDArray[np.bool_]) -> Rejected | None:
+def _confirm(inputs: Shared[_Inputs], usable: NDArray[np.bool_], index: int) -> Rejected | None:
+    task = inputs.value
     view = task.views[index]
     if task.store.has(view, "geometric"):
         return None

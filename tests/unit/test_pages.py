@@ -15,7 +15,7 @@ from sfm_app.settings import QUALITY_PRESETS, Settings
 
 ROOT = Path(__file__).parents[2]
 LIBRARIES = [path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "docs" / "libraries").glob("*.md"))]
-PAGES = ["README.md", "docs/algorithms.md", "docs/architecture.md", "docs/plugins.md", *LIBRARIES]
+PAGES = ["README.md", "docs/algorithms.md", "docs/architecture.md", "docs/cluster.md", "docs/plugins.md", *LIBRARIES]
 NOT_OURS = {"--left-out", "--sets", "--without"}
 """Flags of benchmarks."""
 

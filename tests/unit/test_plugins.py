@@ -1,5 +1,7 @@
+import pickle
 import sys
 import types
+from dataclasses import replace
 from importlib import metadata
 
 import pytest
@@ -94,3 +96,17 @@ def test_a_plugin_that_does_not_import_is_named_every_time(installed, monkeypatc
     for _ in range(2):
         with pytest.raises(PluginError, match="test_plugins_never"):
             load_plugins()
+
+
+def test_methods_travel_by_name():
+    known = load_plugins(installed=False)
+    for method in (*known.estimators.values(), *known.features.values()):
+        bytes_ = pickle.dumps(method)
+        assert len(bytes_) < 200
+        assert pickle.loads(bytes_) == method  # noqa: S301 - our own bytes
+
+
+def test_a_method_that_another_machine_does_not_have_is_named():
+    unknown = replace(load_plugins(installed=False).estimator("lev-ransac"), name="only-here")
+    with pytest.raises(ConfigError, match="'only-here'"):
+        pickle.loads(pickle.dumps(unknown))  # noqa: S301

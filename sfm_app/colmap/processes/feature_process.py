@@ -12,6 +12,7 @@ from sfm_app.colmap.database import open_database, panorama_names
 from sfm_app.colmap.processes.panorama_features import extract_panoramas
 from sfm_app.colmap.processes.worker_process import FeatureTask, ProgressReporter, SiftOption, report, serve
 from sfm_app.numerical import Json
+from sfm_app.progress import Progress
 from sfm_app.settings import MatchSettings
 
 PLAIN = re.compile(r"[!-~]+")
@@ -20,6 +21,17 @@ PLAIN = re.compile(r"[!-~]+")
 
 def work(task: FeatureTask) -> None:
     """Find features of photos, match pairs of photos, and report the effective options."""
+    do_task(task, ProgressReporter(), report)
+
+
+def do_task(task: FeatureTask, progress: Progress, tell: Callable[..., None]) -> None:
+    """Find features of photos, and match pairs of photos.
+
+    Args:
+        task: what to do.
+        progress: shows a bar.
+        tell: called with the options in force, as `extraction` or `matching`.
+    """
     database, photo_dir, names = Path(task["database"]), Path(task["photos"]), task["names"]
     options = MatchSettings.model_validate(task["options"])
     masks = Path(task["masks"]) if task["masks"] else None
@@ -29,14 +41,16 @@ def work(task: FeatureTask) -> None:
     if names:
         extraction = extraction_options(options, task["sift"], task["workers"])
         panoramas = panorama_names(database)
-        extract_panoramas(database, photo_dir, [name for name in names if name in panoramas], masks, extraction)
+        extract_panoramas(
+            database, photo_dir, [name for name in names if name in panoramas], masks, extraction, progress
+        )
         plain = [name for name in names if name not in panoramas]
         if plain:
-            extract(database, photo_dir, plain, reader, extraction)
-        report(extraction=json_options(extraction.todict()))
+            extract(database, photo_dir, plain, reader, extraction, progress)
+        tell(extraction=json_options(extraction.todict()))
     pairs = None if task["pairs"] is None else [(int(a), int(b)) for a, b in task["pairs"]]
     if pairs != []:
-        report(matching=match(database, options, task["workers"], pairs))
+        tell(matching=match(database, options, task["workers"], pairs, progress))
 
 
 def extraction_options(
@@ -65,6 +79,7 @@ def extract(
     names: Sequence[str],
     reader: pycolmap.ImageReaderOptions,
     extraction: pycolmap.FeatureExtractionOptions,
+    progress: Progress,
 ) -> None:
     """Find SIFT features of all photos.
 
@@ -74,6 +89,7 @@ def extract(
         names: names of the photos.
         reader: COLMAP's options for reading photos and masks.
         extraction: see `extraction_options`.
+        progress: shows a bar.
     """
     wanted = set(names)
     with open_database(database) as before:
@@ -88,11 +104,15 @@ def extract(
     def count_finished(reader: pycolmap.Database) -> int:
         return sum(reader.exists_keypoints(image_id) for image_id in ids)
 
-    _run_with_progress(call, database, count_finished, "features", len(names))
+    _run_with_progress(call, database, count_finished, ("features", len(names)), progress)
 
 
 def match(
-    database: Path, options: MatchSettings, workers: int, pairs: Sequence[tuple[int, int]] | None
+    database: Path,
+    options: MatchSettings,
+    workers: int,
+    pairs: Sequence[tuple[int, int]] | None,
+    progress: Progress,
 ) -> dict[str, Json]:
     """Match pairs of photos, and return the effective options.
 
@@ -101,6 +121,7 @@ def match(
         options: largest ratio of descriptor distances.
         workers: threads.
         pairs: ids of the photos of each pair; None for every photo with every other.
+        progress: shows a bar.
     """
     matching = pycolmap.FeatureMatchingOptions()
     matching.skip_geometric_verification = True
@@ -108,7 +129,7 @@ def match(
     matching.use_gpu = False
     matching.sift.max_ratio = options.max_ratio
     if pairs is not None:
-        _match_pairs(database, matching, pairs)
+        _match_pairs(database, matching, pairs, progress)
         return json_options(matching.todict())
 
     def call(token: pycolmap.CancellationToken) -> None:
@@ -121,11 +142,16 @@ def match(
 
     with open_database(database) as reader:
         photos = reader.num_images()
-    _run_with_progress(call, database, count_finished, "matching", math.comb(photos, 2))
+    _run_with_progress(call, database, count_finished, ("matching", math.comb(photos, 2)), progress)
     return json_options(matching.todict())
 
 
-def _match_pairs(database: Path, matching: pycolmap.FeatureMatchingOptions, pairs: Sequence[tuple[int, int]]) -> None:
+def _match_pairs(
+    database: Path,
+    matching: pycolmap.FeatureMatchingOptions,
+    pairs: Sequence[tuple[int, int]],
+    progress: Progress,
+) -> None:
     """Match pairs of photos.
 
     COLMAP's lists end names at blanks. Where a name has any, a copy of the database is matched in which photos are
@@ -135,12 +161,17 @@ def _match_pairs(database: Path, matching: pycolmap.FeatureMatchingOptions, pair
         names = {image.image_id: image.name for image in reader.read_all_images()}
     if all(PLAIN.fullmatch(name) for name in names.values()):
         with tempfile.TemporaryDirectory(dir=database.parent, prefix=".matching") as folder:
-            _match_listed(database, matching, [(names[a], names[b]) for a, b in pairs], Path(folder))
+            _match_listed(database, matching, [(names[a], names[b]) for a, b in pairs], Path(folder), progress)
         return
-    _match_in_copy(database, matching, pairs)
+    _match_in_copy(database, matching, pairs, progress)
 
 
-def _match_in_copy(database: Path, matching: pycolmap.FeatureMatchingOptions, pairs: Sequence[tuple[int, int]]) -> None:
+def _match_in_copy(
+    database: Path,
+    matching: pycolmap.FeatureMatchingOptions,
+    pairs: Sequence[tuple[int, int]],
+    progress: Progress,
+) -> None:
     with tempfile.TemporaryDirectory(dir=database.parent, prefix=".matching") as folder:
         copy = Path(folder) / database.name
         shutil.copyfile(database, copy)
@@ -150,7 +181,7 @@ def _match_in_copy(database: Path, matching: pycolmap.FeatureMatchingOptions, pa
             for image in renamed.read_all_images():
                 image.name = str(image.image_id)
                 renamed.update_image(image)
-        _match_listed(copy, matching, [(str(a), str(b)) for a, b in pairs], Path(folder))
+        _match_listed(copy, matching, [(str(a), str(b)) for a, b in pairs], Path(folder), progress)
         with open_database(copy) as found:
             rows = {pair: found.read_matches(*pair) for pair in pairs}
     with open_database(database) as target:
@@ -159,7 +190,11 @@ def _match_in_copy(database: Path, matching: pycolmap.FeatureMatchingOptions, pa
 
 
 def _match_listed(
-    database: Path, matching: pycolmap.FeatureMatchingOptions, pairs: Sequence[tuple[str, str]], folder: Path
+    database: Path,
+    matching: pycolmap.FeatureMatchingOptions,
+    pairs: Sequence[tuple[str, str]],
+    folder: Path,
+    progress: Progress,
 ) -> None:
     """Match pairs of photos by name; the folder gets a list of them."""
     pairing = pycolmap.ImportedPairingOptions()
@@ -177,15 +212,15 @@ def _match_listed(
     def count_finished(reader: pycolmap.Database) -> int:
         return int(reader.num_matched_image_pairs()) - before
 
-    _run_with_progress(call, database, count_finished, "matching", len(pairs))
+    _run_with_progress(call, database, count_finished, ("matching", len(pairs)), progress)
 
 
 def _run_with_progress(
     call: Callable[[pycolmap.CancellationToken], None],
     database: Path,
     done: Callable[[pycolmap.Database], int],
-    label: str,
-    total: int,
+    what: tuple[str, int],
+    progress: Progress,
 ) -> None:
     """Run a COLMAP call, and show its progress as read from the database.
 
@@ -193,7 +228,7 @@ def _run_with_progress(
     the locks of the first whenever it closes the file, and COLMAP would abort.
     """
     with open_database(database) as reader:
-        run_with_progress(call, lambda: done(reader), label, total, ProgressReporter())
+        run_with_progress(call, lambda: done(reader), *what, progress)
 
 
 if __name__ == "__main__":

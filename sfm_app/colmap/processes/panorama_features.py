@@ -10,11 +10,10 @@ from PIL import Image
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.processes.worker_process import ProgressReporter
 from sfm_app.photos.decode import read_picture, upright_image
 from sfm_app.photos.masks import read_mask
 from sfm_app.photos.panoramas.feature_views import PanoramaViews
-from sfm_app.progress import track
+from sfm_app.progress import Progress, track
 
 
 def extract_panoramas(
@@ -23,6 +22,7 @@ def extract_panoramas(
     names: Sequence[str],
     mask_dir: Path | None,
     extraction: pycolmap.FeatureExtractionOptions,
+    progress: Progress,
 ) -> None:
     """Find SIFT features of panoramas that have none yet. Ours.
 
@@ -34,11 +34,12 @@ def extract_panoramas(
         names: names of the panoramas.
         mask_dir: has a mask of every photo; None without masks.
         extraction: COLMAP's options; the largest size is that of one view.
+        progress: shows a bar.
     """
     with open_database(database) as reader:
         images = {image.name: image.image_id for image in reader.read_all_images()}
         left = [name for name in names if not reader.exists_keypoints(images[name])]
-    for name in track(ProgressReporter(), left, "panoramas", len(left)) if left else ():
+    for name in track(progress, left, "panoramas", len(left)) if left else ():
         keypoints, descriptors = _find_in_panorama(photo_dir / name, extraction)
         if mask_dir is not None:
             used = read_mask(mask_dir, name)

@@ -109,6 +109,21 @@ def fit_moving(
     return EpipolarFit(found.F, inliers, priors, found.trials, found.rms_px, found.degeneracy)
 
 
+def one_per_cell(points: FloatArray, size: tuple[int, int]) -> FloatArray:
+    """Return (C, 2) one point of each cell of a photo that has any; `is_widespread` needs no more of all keypoints.
+
+    Args:
+        points: (N, 2) pixels.
+        size: (width, height) of the photo in pixels.
+    """
+    return points[np.unique(_cells(points, size), return_index=True)[1]]
+
+
 def _occupied_cells(points: FloatArray, size: tuple[int, int]) -> NDArray[np.int64]:
+    return np.unique(_cells(points, size))
+
+
+def _cells(points: FloatArray, size: tuple[int, int]) -> NDArray[np.int64]:
+    """Return (N,) the number of the cell of each point."""
     columns, rows = (points / size * CELLS).astype(np.int64).clip(0, CELLS - 1).T
-    return np.unique(CELLS * rows + columns)
+    return np.asarray(CELLS * rows + columns)

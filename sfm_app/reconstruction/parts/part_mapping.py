@@ -14,6 +14,7 @@ from sfm_app.reconstruction.mapping_runs import Group
 from sfm_app.reconstruction.parts.cut import Part
 from sfm_app.reconstruction.parts.part_files import INPUTS, RESULT, pairs_of_parts, part_of_group, write_inputs
 from sfm_app.runtime.context import RunContext
+from sfm_app.tasks import Task
 from sfm_app.types import PoseGraph
 
 logger = logging.getLogger("sfm_app")
@@ -61,7 +62,7 @@ def map_parts(group: Group, parts: Sequence[Part], mapped: PoseGraph, run: RunCo
     members = (part_of_group(group, part.photos, pairs) for part, pairs in zip(parts, within, strict=True))
     tasks = [_prepare_part(one, mapped, place, run) for one in members]
     try:
-        return run.map(map_part, tasks, f"mapping {len(parts)} parts")
+        return run.map(Task(map_part), tasks, f"mapping {len(parts)} parts")
     except BaseException:  # also Ctrl-C: the processes end when they see the file
         (place / STOP).touch()
         raise

@@ -8,7 +8,6 @@ import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from sfm_app.meshing.blocks.partition import split_points
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import FUSED_AT_ONCE_MP, cache_gb
 from sfm_app.stereo import DepthMap, View, region
+from sfm_app.tasks import Task
 
 FloatArray = NDArray[np.float64]
 
@@ -79,7 +79,7 @@ def fuse_maps(dense_dir: Path, views: Sequence[View], min_views: int, target: Pa
         mark_unfinished(folder, made_from)
     tasks = plan_fusion(dense_dir, views, min_views, folder, run)
     run.record(fusion_blocks=len(tasks))
-    run.map(fuse_block, tasks, "fusing depth maps in blocks")
+    run.map(Task(fuse_block), tasks, "fusing depth maps in blocks")
     with replace_atomically(target) as path:
         join_points([task.path for task in tasks if task.path.stat().st_size], path)
     shutil.rmtree(folder)
@@ -99,7 +99,7 @@ def plan_fusion(
     """
     pixels, whole = sum(view.width * view.height for view in views), region(views)
     bare = [replace(view, point_ids=np.empty(0, np.int64), points=np.empty((0, 3))) for view in views]
-    samples = run.map(partial(sample_points, dense_dir), bare, "measuring depths")
+    samples = run.map(Task(sample_points, dense_dir), bare, "measuring depths")
     inside = [part[((part >= whole[0]) & (part <= whole[1])).all(axis=1)] for part in samples]
     partition = split_points(np.concatenate(inside), -(-pixels // MOST_PIXELS))
     memory_gb = cache_gb(run.memory_mb) / run.workers

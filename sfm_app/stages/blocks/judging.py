@@ -14,6 +14,7 @@ from sfm_app.geometry.triangles import median_edge_length, vertex_normals
 from sfm_app.meshing import NO_EVIDENCE, DepthView, Paint, Support, judge, sample_colors
 from sfm_app.settings import MeshSettings
 from sfm_app.stereo import View
+from sfm_app.tasks import Shared
 from sfm_app.types import Surface
 
 Judgment = tuple[NDArray[np.int64], NDArray[np.uint8], Paint]
@@ -68,6 +69,16 @@ class SurfaceJudge:
             paint.add(at, colors)
         surface = self.surface
         return Surface(surface.vertices, surface.faces, paint.mean_colors(surface.colors)), support
+
+
+def judge_view(judges: Shared[SurfaceJudge], view: View) -> Judgment:
+    """Let one photo judge the vertices that it has in view, on any machine.
+
+    Args:
+        judges: prepared for the surface.
+        view: the photo.
+    """
+    return judges.value.judge(view)
 
 
 def simplify_mesh(surface: Surface, options: MeshSettings, scratch: Path) -> Surface:

@@ -7,7 +7,6 @@ blocks that are missing.
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +36,7 @@ from sfm_app.runtime.cost_estimate import block_count, block_workers
 from sfm_app.settings import MeshSettings
 from sfm_app.stages.blocks.judging import SurfaceJudge, simplify_mesh
 from sfm_app.stereo import View
+from sfm_app.tasks import Task
 from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
@@ -110,7 +110,7 @@ def mesh_in_blocks(
     cell = choose_cell(points, partition, bounds, options.poisson_depth)
     bounds = _with_halo(bounds, cell)
     cubes = [cube_around(low, high, cell) for low, high in bounds]
-    farthest = run.map(partial(farthest_depth, dense_dir), views, "measuring depths")
+    farthest = run.map(Task(farthest_depth, dense_dir), views, "measuring depths")
     seers = _photos_in_reach(views, farthest, bounds)
     tasks = [
         BlockTask(folder, place / FUSED, dense_dir, seers[k], k, bounds[k], cell, cubes[k], options,
@@ -118,7 +118,7 @@ def mesh_in_blocks(
         for k in range(len(cubes))
     ]  # fmt: skip
     with run.with_workers(block_workers(run.workers, run.memory_mb, options)) as few:
-        raw = few.map(mesh_block, tasks, "finding the surface in blocks")
+        raw = few.map(Task(mesh_block), tasks, "finding the surface in blocks")
     with run.step("joining the blocks"):
         joined, lost = join_blocks(partition.root, tasks, cell)
         joined = drop_islands(joined, options.min_island / len(tasks))  # a share of the triangles of a block

@@ -13,7 +13,8 @@ from sfm_app.settings import QUALITY_PRESETS, Settings
 
 RUN = main.commands["run"]
 PARAMETERS = {parameter.name: parameter for parameter in RUN.params}
-GIVEN = {"seed": 3, "workers": 2, "max_memory": 4.0, "quality": "draft", "images": "list.txt", "masks": "masks",
+GIVEN = {"seed": 3, "workers": 2, "cluster": "local:2",
+         "max_memory": 4.0, "quality": "draft", "images": "list.txt", "masks": "masks",
          "cameras": "single", "max_frames": 50, "keep_low_quality": True, "features": "sift-dsp", "pairs": "all",
          "estimator": "msac", "calibrator": "kruppa", "calibration": "cameras.txt", "keep_calibration": True,
          "camera_model": "RADIAL", "mapper": "global", "faces": 1000, "unseen_faces": "cut"}  # fmt: skip

@@ -18,7 +18,7 @@ from sfm_app.colmap.dense import (
     write_maps,
 )
 from sfm_app.colmap.features import find_and_match
-from sfm_app.colmap.masks import REACH_PX, mask_undistorter, used_pixels
+from sfm_app.colmap.masks import REACH_PX, MaskUndistorter, used_pixels
 from sfm_app.colmap.surface import FUSED, fuse, read_fused
 from sfm_app.photos import save_mask
 from sfm_app.progress import SilentProgress
@@ -64,7 +64,7 @@ def dense(place, tmp_path):
     undistort(root / "sparse", root / "photos", tmp_path, 120, 1, SilentProgress())
     views = read_views(tmp_path)
     for view in views:
-        mask_undistorter(root / "sparse", root / "masks", tmp_path)(view)
+        MaskUndistorter(root / "sparse", root / "masks", tmp_path)(view)
     return tmp_path, {view.name: view for view in views}
 
 

@@ -1,7 +1,14 @@
 import numpy as np
 import pytest
 
-from sfm_app.ransac.degeneracy.watermark import ONLY_A_LOGO, SAME_PHOTO, find_stationary, fit_moving, is_widespread
+from sfm_app.ransac.degeneracy.watermark import (
+    ONLY_A_LOGO,
+    SAME_PHOTO,
+    find_stationary,
+    fit_moving,
+    is_widespread,
+    one_per_cell,
+)
 from sfm_app.ransac.lev_ransac import fit_lev_ransac
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.cameras import axis_rotation
@@ -149,3 +156,13 @@ def test_what_covers_a_photo_is_counted_where_it_shows_something():
     assert is_widespread(thing[:200], thing, SIZE)
     assert not is_widespread(thing, rng.uniform([0, 0], SIZE, (2000, 2)), SIZE)
     assert not is_widespread(np.zeros((0, 2)), thing, SIZE)
+
+
+def test_one_keypoint_of_each_cell_says_the_same_of_what_is_widespread():
+    rng = np.random.default_rng(5)
+    for share in (0.1, 0.3, 0.5, 0.7, 1.0):
+        keypoints = rng.uniform([0, 0], np.array(SIZE) * 0.8, (3000, 2))
+        points = keypoints[(keypoints < np.array(SIZE) * share).all(axis=1)]
+        few = one_per_cell(keypoints, SIZE)
+        assert 30 < len(few) <= 64
+        assert is_widespread(points, few, SIZE) == is_widespread(points, keypoints, SIZE)

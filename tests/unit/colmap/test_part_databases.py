@@ -1,0 +1,92 @@
+"""SIFT on a few photos or pairs at a time gives the rows of COLMAP's work on all of them."""
+
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sfm_app.colmap.database import create_database, digest_matches, open_database, unmatched_pairs
+from sfm_app.colmap.features import find_and_match
+from sfm_app.colmap.part_databases import (
+    BLOCK,
+    FEATURES,
+    MATCHES,
+    SiftInputs,
+    enter_rows,
+    exhaustive_pairs,
+    find_in_chunk,
+    match_chunk,
+    photos_without_features,
+    write_snapshot,
+)
+from sfm_app.estimation.on_cluster.sift_chunks import chunks
+from sfm_app.progress import SilentProgress
+from sfm_app.settings import MatchSettings
+from sfm_app.types import Photo, PhotoSet
+
+OPTIONS = MatchSettings(max_features=200)
+COUNT = BLOCK + 3
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A database of small photos that overlap, with features and matches by COLMAP's own exhaustive matching."""
+    place = tmp_path_factory.mktemp("sift")
+    (place / "photos").mkdir()
+    rng = np.random.default_rng(0)
+    wall = Image.fromarray(rng.integers(0, 255, (20, 40, 3), np.uint8)).resize((320, 160), Image.Resampling.BICUBIC)
+    photos = []
+    for number in range(COUNT):
+        photos.append(Photo(f"{number:02d}.png", 96, 96, "g"))
+        left, top = int(rng.integers(0, 224)), int(rng.integers(0, 64))
+        wall.crop((left, top, left + 96, top + 96)).save(place / "photos" / photos[-1].name)
+    create_database(place / "empty.db", PhotoSet(place / "photos", tuple(photos), (), None))
+    shutil.copyfile(place / "empty.db", place / "whole.db")
+    find_and_match(place / "whole.db", place / "photos", [photo.name for photo in photos], OPTIONS, 2, SilentProgress())
+    return place
+
+
+def inputs_of(place, database, folder):
+    folder.mkdir()
+    inputs = SiftInputs(folder / "photos.db", folder / "features.db", place / "photos", None, OPTIONS, {}, folder)
+    write_snapshot(database, inputs.snapshot, (*FEATURES, *MATCHES))
+    write_snapshot(database, inputs.features, MATCHES)
+    return inputs
+
+
+@pytest.mark.slow
+def test_chunks_give_what_colmap_gives_for_all_at_once(made, tmp_path):
+    database = tmp_path / "parts.db"
+    shutil.copyfile(made / "empty.db", database)
+    names = photos_without_features(database)
+    assert sorted(names) == list(range(1, COUNT + 1))
+
+    inputs = inputs_of(made, database, tmp_path / "features")
+    for chunk in reversed(chunks(list(names.values()), 20, 1)):
+        found = find_in_chunk(inputs, chunk)
+        enter_rows(database, found.path, FEATURES)
+        assert found.count == len(chunk)
+        assert not found.path.exists()
+    assert photos_without_features(database) == {}
+
+    inputs, pairs = inputs_of(made, database, tmp_path / "matches"), exhaustive_pairs(sorted(names))
+    assert any(a > b for a, b in pairs)
+    for chunk in chunks(pairs, 700, 1):
+        enter_rows(database, match_chunk(inputs, chunk).path, MATCHES)
+    assert unmatched_pairs(database, [(min(pair), max(pair)) for pair in pairs]) == []
+    with open_database(database) as reader:
+        assert reader.num_matches() > 1000
+    assert digest_matches(database) == digest_matches(made / "whole.db")
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, BLOCK, 2 * BLOCK + 7])
+def test_every_pair_is_listed_once(count):
+    pairs = exhaustive_pairs(range(1, count + 1))
+    assert len({(min(pair), max(pair)) for pair in pairs}) == len(pairs) == count * (count - 1) // 2
+
+
+def test_chunks_keep_all_workers_busy():
+    assert [len(part) for part in chunks(range(11), 8, 2)] == [3, 3, 3, 2]
+    assert [len(part) for part in chunks(range(100), 8, 2)] == [8] * 12 + [4]
+    assert chunks([], 8, 2) == []
