@@ -34,14 +34,7 @@ def measure_usage(elsewhere: Callable[[], float] = float) -> Iterator[Usage]:
     """
     used, ended = Usage(), threading.Event()
     start, cpu_start = time.perf_counter(), _cpu_seconds() + elsewhere()
-
-    def watch() -> None:
-        while True:
-            used.peak_mb = max(used.peak_mb, _resident_mb())
-            if ended.wait(EVERY_S):
-                return
-
-    watcher = threading.Thread(target=watch, name="memory", daemon=True)
+    watcher = threading.Thread(target=_watch_memory, args=(used, ended), name="memory", daemon=True)
     watcher.start()
     try:
         yield used
@@ -50,6 +43,13 @@ def measure_usage(elsewhere: Callable[[], float] = float) -> Iterator[Usage]:
         watcher.join()
         used.peak_mb = max(used.peak_mb, _resident_mb())
         used.seconds, used.cpu_seconds = time.perf_counter() - start, _cpu_seconds() + elsewhere() - cpu_start
+
+
+def _watch_memory(used: Usage, ended: threading.Event) -> None:
+    while True:
+        used.peak_mb = max(used.peak_mb, _resident_mb())
+        if ended.wait(EVERY_S):
+            return
 
 
 def _cpu_seconds() -> float:

@@ -39,8 +39,7 @@ def find_features(method: FeatureMethod, names: Mapping[int, str], run: RunConte
     Raises:
         PluginError: the method raises, or returns invalid results.
     """
-    panoramas = panorama_names(run.workspace.database)
-    place = run.workspace
+    place, panoramas = run.workspace, panorama_names(run.workspace.database)
     folders = _Folders(place.photos, run.mask_dir, place.feature_parts)
     find = Task(_find_and_save, method, run.settings.matching, folders)
     left = [

@@ -119,10 +119,9 @@ def cut_at_plane(surface: Surface, axis: int, at: float, *, keep_below: bool) ->
     inside = (at - surface.vertices[:, axis]) * (1.0 if keep_below else -1.0)
     part = cut(surface, inside)
     if not len(part.faces):
-        none = np.empty(0, np.int64)
-        return part, Border(none, none, none.reshape(0, 2))
-    vertices = part.vertices.copy()
-    on_plane = np.abs(vertices[:, axis] - at) <= 1e-9 * max(1.0, abs(at), float(np.abs(vertices[:, axis]).max()))
+        return part, Border(*(np.empty(shape, np.int64) for shape in (0, 0, (0, 2))))
+    vertices, heights = part.vertices.copy(), part.vertices[:, axis]
+    on_plane = np.abs(heights - at) <= 1e-9 * max(1.0, abs(at), float(np.abs(heights).max()))
     vertices[on_plane, axis] = at
     _, edge_of = unique_edges(part.faces)
     alone = np.bincount(edge_of.ravel())[edge_of] == 1

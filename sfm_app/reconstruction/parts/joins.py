@@ -132,15 +132,21 @@ class _SharedPhotos:
         far_a, far_b = (
             np.linalg.norm(X - centers[self.photo], axis=1) for X, centers in ((self.Xa, self.ca), (self.Xb, self.cb))
         )
-        count = len(photos)
-        self.distance, self.scale = np.full(count, np.nan), np.full(count, np.nan)
-        for number in range(count):
-            seen = self.photo == number
-            if np.count_nonzero(seen) >= LEAST_OF_PHOTO:
-                self.distance[number] = np.median(far_a[seen])
-                self.scale[number] = np.median(far_a[seen] / np.maximum(far_b[seen], 1e-300))
+        self.distance = self._medians(far_a)
+        """(N,) median distance from each photo to its points, in the first model."""
+        self.scale = self._medians(far_a / np.maximum(far_b, 1e-300))
+        """(N,) scale of the first model over that of the second, as each photo has it; NaN for photos of few points."""
         usual = np.nanmedian(self.distance) if np.isfinite(self.distance).any() else 1.0
         self.distance = np.where(np.isfinite(self.distance), self.distance, usual)
+
+    def _medians(self, values: FloatArray) -> FloatArray:
+        """Return (N,) medians by photo of one value for each observation; NaN for photos with few of them."""
+        found = np.full(len(self.ca), np.nan)
+        for number in range(len(found)):
+            seen = self.photo == number
+            if np.count_nonzero(seen) >= LEAST_OF_PHOTO:
+                found[number] = np.median(values[seen])
+        return found
 
     def best_hypothesis(self) -> tuple[NDArray[np.bool_], Similarity]:
         """Return which photos agree with the similarity of that photo with which most agree, and this similarity."""
