@@ -1,12 +1,13 @@
 """Map one part of a group, as a separate process; see `part_mapping.map_part`."""
 
 import json
+import tempfile
 from os.path import relpath
 from pathlib import Path
 
 from sfm_app.atomic_io import replace_atomically
 from sfm_app.colmap.backend import check_written, translate_errors
-from sfm_app.colmap.database import remove_database, write_calibrations, write_match_graph, write_pose_graph
+from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
 from sfm_app.colmap.model import posed_photo_ids, submodel
 from sfm_app.colmap.processes.worker_process import MappingTask, serve
 from sfm_app.plugins import load_plugins
@@ -26,14 +27,16 @@ def work(task: MappingTask) -> None:
     """Map the part in the folder of the task, and write its models and what was tried beside its inputs."""
     folder, photos = Path(task["scratch"]), Path(task["photos"])
     part, mapped, settings = read_inputs(folder / INPUTS)
-    place = SubWorkspace(Workspace(photos.parent), relpath(folder, photos.parent))
-    _write_database(place, part, mapped)
-    with make_executor(1) as executor:
+    # a worker that was cut off from a cluster may still be at the same part
+    with tempfile.TemporaryDirectory(dir=folder, prefix="mapping-") as own, make_executor(1) as executor:
+        place = SubWorkspace(Workspace(photos.parent), relpath(own, photos.parent))
+        _write_database(place, part, mapped)
         run = RunContext(settings, place, load_plugins(installed=False), executor, workers=1)
         found = map_group(part, run)
+    if (folder / RESULT).exists():
+        return
     best = best_attempt(found)
     names = [] if best is None else _write_models(best, folder)
-    remove_database(place.database)
     known = {"models": names, "mapper": "" if best is None else best.mapper, "tried": [one.note for one in found]}
     with replace_atomically(folder / RESULT) as path:
         path.write_text(json.dumps(known), encoding="utf-8")

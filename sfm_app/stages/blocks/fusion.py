@@ -6,6 +6,7 @@ and a little beyond, so that all blocks together are little more work than the w
 
 import os
 import shutil
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -121,8 +122,8 @@ def fuse_block(task: FusionTask) -> None:
     """Write the points of a block, unless a killed run has; an empty file where there are none."""
     if task.path.exists():
         return
-    scratch = task.folder / str(task.number)
-    shutil.rmtree(scratch, ignore_errors=True)
+    # a worker that was cut off from a cluster may still be at the same block
+    scratch = Path(tempfile.mkdtemp(dir=task.folder, prefix=f"{task.number}-"))
     link_tree(task.dense_dir / "sparse", scratch / "sparse")
     (scratch / "images").mkdir()
     (scratch / "stereo").mkdir()

@@ -5,6 +5,7 @@ blocks that are missing.
 """
 
 import shutil
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -137,8 +138,8 @@ def mesh_block(task: BlockTask) -> int:
     """Write the surface of a block and its halo, unless a killed run has; return the triangles that Poisson found."""
     if task.path.exists():
         return int(load_arrays(task.path)["raw"])
-    scratch = task.folder / str(task.number)
-    scratch.mkdir(exist_ok=True)
+    # a worker that was cut off from a cluster may still be at the same block
+    scratch = Path(tempfile.mkdtemp(dir=task.folder, prefix=f"{task.number}-"))
     _write_block_points(task, scratch / FUSED)
     raw = poisson_surface(scratch, task.cube.depth)
     inside = ((raw.vertices >= task.bounds[0]) & (raw.vertices <= task.bounds[1])).all(axis=1)
