@@ -22,6 +22,8 @@ CODE_OR_NETWORK = {
     "pickle", "cPickle", "dill", "joblib", "marshal", "shelve", "code", "runpy",
     "socket", "ssl", "http", "urllib", "ftplib", "smtplib", "requests", "httpx", "aiohttp",
 }  # fmt: skip
+UNPICKLES_WHAT_IT_SENT = Path(sfm_app.__file__).parent / "runtime/parallel/parcels.py"
+"""Checks hashes that come with the messages of a cluster; tests/unit/runtime/test_parcels.py."""
 RUNS_TEXT = {"eval", "exec", "compile", "__import__", "breakpoint", "os.system", "os.popen", "os.startfile"}
 
 
@@ -48,7 +50,8 @@ def _doubts_of_call(name, options):
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.name)
 def test_no_module_runs_what_it_reads(path):
-    assert list(doubts(path.read_text(encoding="utf-8"))) == []
+    known = ["imports pickle"] if path == UNPICKLES_WHAT_IT_SENT else []
+    assert list(doubts(path.read_text(encoding="utf-8"))) == known
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,13 @@
 """What a worker of the cluster does: checks that it fits, applies a task to some items, and reports."""
 
 import os
-import pickle
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from sfm_app.errors import BackendError
-from sfm_app.runtime.parallel.parcels import Packer, Parcel, unpack
+from sfm_app.runtime.parallel.parcels import Packer, Parcel, survives_travel, unpack
 from sfm_app.runtime.parallel.worker_versions import differences, worker_versions
 
 OF_THE_MACHINE = (OSError, MemoryError, BackendError)
@@ -100,10 +99,7 @@ def find_misfit(probe: Probe) -> str:
 
 def picklable(err: Exception) -> Exception:
     """Return an error as it can travel: itself, or its text where it cannot be pickled."""
-    try:
-        return err if type(pickle.loads(pickle.dumps(err))) is type(err) else RuntimeError(repr(err))  # noqa: S301
-    except Exception:  # a plug-in's error may be of any kind
-        return RuntimeError(f"{type(err).__name__}: {err}")
+    return err if survives_travel(err) else RuntimeError(f"{type(err).__name__}: {err}")
 
 
 def _use_one_thread() -> None:

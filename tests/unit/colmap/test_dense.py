@@ -18,7 +18,7 @@ from sfm_app.colmap.dense import (
     write_fusion_views,
     write_maps,
 )
-from sfm_app.colmap.surface import FUSED, fuse, poisson_surface, read_fused, simplify
+from sfm_app.colmap.surface import FUSED, fuse, open_points, poisson_surface, positions, simplify
 from sfm_app.errors import BackendError
 from sfm_app.progress import SilentProgress
 from sfm_app.stereo import DepthEstimate, DepthMap
@@ -84,7 +84,8 @@ def test_fused_points_lie_on_the_plane_and_face_the_cameras(workspace):
     dense, _ = workspace
 
     fuse(dense, 3, BOX, dense / FUSED)
-    points, normals = read_fused(dense)
+    records = open_points(dense / FUSED)
+    points, normals = positions(records), np.stack([records[c] for c in ("nx", "ny", "nz")], axis=1)
 
     assert 1000 < len(points) < 120 * 90
     assert abs(np.median(points @ NORMAL) - DISTANCE) < 4e-4  # depths taken half a pixel aside would make it 2e-3
@@ -141,7 +142,7 @@ def test_the_box_cuts_the_points(workspace):
     dense, _ = workspace
 
     fuse(dense, 2, np.array([[0.0, -50, -50], [50, 50, 50]]), dense / FUSED)
-    assert read_fused(dense)[0][:, 0].min() >= 0
+    assert positions(open_points(dense / FUSED))[:, 0].min() >= 0
 
 
 def test_the_surface_has_the_shape_and_the_colors_of_the_points(workspace):

@@ -19,7 +19,7 @@ from sfm_app.colmap.dense import (
 )
 from sfm_app.colmap.features import find_and_match
 from sfm_app.colmap.masks import REACH_PX, MaskUndistorter, used_pixels
-from sfm_app.colmap.surface import FUSED, fuse, read_fused
+from sfm_app.colmap.surface import FUSED, fuse, open_points, positions
 from sfm_app.photos import save_mask
 from sfm_app.progress import SilentProgress
 from sfm_app.settings import MatchSettings
@@ -149,7 +149,7 @@ def test_nothing_is_fused_from_what_is_masked(dense):
 
     write_fusion_views(folder, [view])
     fuse(folder, 1, np.array([[-50.0] * 3, [50.0] * 3]), folder / FUSED)
-    points, _ = read_fused(folder)
+    points = positions(open_points(folder / FUSED))
 
     at = (points @ view.R.T + view.t) @ view.K.T
     col, row = np.rint(at[:, :2] / at[:, 2:]).astype(int).T
