@@ -13,6 +13,7 @@ from sfm_app.bundle_adjustment.normal_equations import Bundle, cost, reduce
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundles.bundle_arrays import NO_RULES, Rules, read_bundle, write_camera
 from sfm_app.colmap.bundles.bundle_rounds import LOSS_SCALE_PX, MIN_PHOTOS, Rounds, adjust_in_rounds, lens_priors
+from sfm_app.colmap.model import posed_images, submodel
 from sfm_app.geometry.lenses.projections import CX, CY, FISHEYE, FX, FY, PERSPECTIVE
 from sfm_app.numerical import FAILURES, Json, error_reason
 
@@ -21,6 +22,9 @@ logger = logging.getLogger("sfm_app")
 OUTERMOST = 0.999
 """Share of the observations that reach the radius up to which a lens is made like another: the rest may be wrong.
 Chosen by hand; not measured on its own."""
+MOST_COMPARED = 250
+"""Photos of a camera on which its families are compared, at even steps among all: each of them is adjusted several
+times. Chosen by hand."""
 RUNNERS_UP = 3
 """Number of rivals of the same family in the manifest. Chosen by hand."""
 
@@ -77,7 +81,9 @@ def best_families(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules =
         other = convert_lens(params, family, reach) if asks else None
         if other is None:
             continue
-        trial, same = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
+        photos = _spread_photos(model, camera_id)
+        part = model if photos is None else submodel(model, photos)
+        trial, same = pycolmap.Reconstruction(part), pycolmap.Reconstruction(part)
         write_camera(trial.cameras[camera_id], other, FISHEYE if family == PERSPECTIVE else PERSPECTIVE)
         try:
             adjust_in_rounds(same, None, rules)
@@ -85,15 +91,32 @@ def best_families(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules =
         except FAILURES as err:
             logger.info("camera %d is not tried as another: %s", camera_id, error_reason(err))
             continue
-        (kept, choice), (gained, rival) = _compare(same, trial, row, rules)
+        (kept, choice), (gained, rival) = _compare(same, trial, camera_id, rules)
         if gained > kept:
-            model, choice, rival = trial, rival, choice
+            model = trial if part is model else _with_camera(model, trial.cameras[camera_id])
+            choice, rival = rival, choice
         rivals[camera_id] = replace(rival, log_evidence=abs(gained - kept))
     return Families(model, rivals)
 
 
+def _spread_photos(model: pycolmap.Reconstruction, camera_id: int) -> list[int] | None:
+    """Return photos of a camera at even steps among all of them; None where all photos of the model are few."""
+    if model.num_reg_images() <= MOST_COMPARED:
+        return None
+    own = sorted(image.image_id for image in posed_images(model) if image.camera_id == camera_id)
+    return own[:: -(-len(own) // MOST_COMPARED)]
+
+
+def _with_camera(model: pycolmap.Reconstruction, camera: pycolmap.Camera) -> pycolmap.Reconstruction:
+    """Return a copy of a model with the lens of another model's camera."""
+    copy = pycolmap.Reconstruction(model)
+    own = copy.cameras[camera.camera_id]
+    own.model, own.params = camera.model, camera.params.tolist()
+    return copy
+
+
 def _compare(
-    first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, row: int, rules: Rules
+    first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, camera_id: int, rules: Rules
 ) -> tuple[tuple[float, LensChoice], ...]:
     """Return the evidence and the best model of a camera in two models with the same tracks."""
     read = [(model, *read_bundle(model, rules)) for model in (first, second)]
@@ -102,7 +125,8 @@ def _compare(
     found = []
     for (model, ids, bundle), system in zip(read, reduced, strict=True):
         priors = lens_priors(model, ids, bundle, rules)
-        best = estimate_lenses(bundle.params, replace(system, noise_px=noise_px), priors).ranking[row][0]
+        ranking = estimate_lenses(bundle.params, replace(system, noise_px=noise_px), priors).ranking
+        best = ranking[ids.index(camera_id)][0]
         found.append((family_evidence(cost(bundle, LOSS_SCALE_PX), noise_px, best), best))
     return tuple(found)
 

@@ -153,3 +153,24 @@ def test_colmap_moves_poses_and_points_of_a_model_of_three_families(mixed):
 
     model.update_point_3d_errors()
     assert 0.2 < model.compute_mean_reprojection_error() < 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("most", [250, 8])
+def test_a_narrow_lens_taken_for_a_fisheye_becomes_perspective(mapped, monkeypatch, most):
+    monkeypatch.setattr("sfm_app.colmap.bundles.lens_choice.MOST_COMPARED", most)
+    model, database = mapped(
+        [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=16, start=(893.0, 500.0, 400.0, 0.0)
+    )
+    before = model.num_reg_images()
+    camera = model.cameras[1]
+    camera.model = pycolmap.CameraModelId.OPENCV_FISHEYE
+    camera.params = [900.0, 900.0, 500.0, 400.0, 0.33, 0.1, 0.0, 0.0]
+
+    found = adjust(model, database)
+
+    assert 8 < found.model.num_reg_images() == before
+    assert found.model.cameras[1].model.name == "OPENCV"
+    assert found.model.cameras[1].params[:2] == pytest.approx([900.0, 900.0], rel=0.005)
+    assert 0.25 < found.model.compute_mean_reprojection_error() < 0.6
+    assert any("FISHEYE" in one.model for one in found.lenses[1].rivals)
