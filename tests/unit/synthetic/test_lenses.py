@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from sfm_app.errors import ConfigError
@@ -42,6 +42,8 @@ def test_the_radius_is_that_of_the_projection(projection, radius):
 def test_a_ray_comes_back_through_the_lens(projection, k1, k2, p, theta, azimuth):
     lens = Lens(projection, (k1, k2), (p, -p / 2))
     ray = rays_at([theta], azimuth)
+    radii = np.hypot(*Lens(projection, (k1, k2)).project(rays_at(np.linspace(0.0, theta + 0.05, 200))).T)
+    assume((np.diff(radii) > 1e-6).all() or theta < 0.01)  # beyond its fold a lens has no inverse
     back = lens.rays(lens.project(ray))[0]
     np.testing.assert_allclose(back / np.linalg.norm(back), ray[0], atol=1e-10)
 
