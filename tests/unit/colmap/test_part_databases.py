@@ -43,7 +43,7 @@ def made(tmp_path_factory):
         wall.crop((left, top, left + 96, top + 96)).save(place / "photos" / photos[-1].name)
     create_database(place / "empty.db", PhotoSet(place / "photos", tuple(photos), (), None))
     shutil.copyfile(place / "empty.db", place / "whole.db")
-    find_and_match(place / "whole.db", place / "photos", [photo.name for photo in photos], OPTIONS, 2, SilentProgress())
+    find_and_match(place / "whole.db", place / "photos", [photo.name for photo in photos], OPTIONS, 1, SilentProgress())
     return place
 
 
