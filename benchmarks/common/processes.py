@@ -1,5 +1,6 @@
 """Start and stop the processes that are measured."""
 
+import json
 import os
 import signal
 import subprocess
@@ -7,6 +8,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[2]
 """Root folder of the project."""
@@ -21,6 +23,14 @@ def environment() -> dict[str, str]:
     """Return the environment in which a process finds this project wherever it is started."""
     before = os.environ.get("PYTHONPATH")
     return {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *([before] if before else [])])}
+
+
+def row_of_module(module: str, *arguments: str) -> dict[str, Any]:
+    """Return the row that a module prints as its last line, in a process of its own, so that memory is its own."""
+    command = module_command(module, *arguments)
+    said = subprocess.run(command, env=environment(), check=True, capture_output=True, text=True).stdout
+    found: dict[str, Any] = json.loads(said.splitlines()[-1])
+    return found
 
 
 def run_command(command: Sequence[str], limit_s: float | None = None) -> tuple[int | None, str]:

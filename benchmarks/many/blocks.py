@@ -9,7 +9,6 @@ The first photos of a walk through the rendered town, with their true poses, so 
 import argparse
 import json
 import pickle
-import subprocess
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 
 from benchmarks.common.command_line import new_parser
 from benchmarks.common.photo_sets import link_or_copy
-from benchmarks.common.processes import environment, module_command
+from benchmarks.common.processes import row_of_module
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.many.true_town import true_scene
 from sfm_app.engine.usage import measure_usage
@@ -125,14 +124,6 @@ def bend_deg(surface: Surface, edge_of: NDArray[np.int64], uses: NDArray[np.int6
     return found
 
 
-def measure_apart(out: Path, block_points: int) -> Row:
-    """Measure in a process of its own."""
-    command = module_command("benchmarks.many.blocks", "--one", str(out), "--block-points", str(block_points))
-    said = subprocess.run(command, env=environment(), check=True, capture_output=True, text=True).stdout
-    found: Row = json.loads(said.splitlines()[-1])
-    return found
-
-
 def page(rows: Sequence[Row]) -> str:
     """Return the page with a row for each number of photos."""
     return f"# Dense stages of many photos\n\n{ABOUT}\n\n{table(rows, COLUMNS)}"
@@ -162,7 +153,9 @@ def main() -> None:
         cache = (args.cache or Path(scratch)).resolve()
         for count in args.counts:
             out = prepare(count, args.walk or max(args.counts), args.megapixels, cache)
-            rows.append(measure_apart(out, args.block_points))
+            rows.append(
+                row_of_module("benchmarks.many.blocks", "--one", str(out), "--block-points", str(args.block_points))
+            )
             print(table(rows[-1:], COLUMNS), flush=True)
     options = {"megapixels": args.megapixels, "block_points": args.block_points, "walk": args.walk}
     write(args.results, "many-blocks", document("many", ABOUT, options, {"counts": args.counts}, rows), page(rows))

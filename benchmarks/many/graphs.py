@@ -9,7 +9,6 @@ its own, so that memory is its own.
 
 import argparse
 import json
-import subprocess
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.common.command_line import new_parser
 from benchmarks.common.memory import peak_mb
-from benchmarks.common.processes import environment, module_command
+from benchmarks.common.processes import row_of_module
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from sfm_app.estimation.calibrating import photo_pairs, sample_pairs
 from sfm_app.plugins import load_plugins
@@ -117,14 +116,6 @@ def rotation_errors_deg(town: TownGraph, graph: PoseGraph) -> np.ndarray[Any, np
     return np.asarray(np.degrees(Rotation.from_matrix(left @ middle.T).magnitude()), np.float64)
 
 
-def measure_apart(photos: int, seed: int) -> Row:
-    """Measure in a process of its own."""
-    command = module_command("benchmarks.many.graphs", "--one", str(photos), "--seed", str(seed))
-    said = subprocess.run(command, env=environment(), check=True, capture_output=True, text=True).stdout
-    found: Row = json.loads(said.splitlines()[-1])
-    return found
-
-
 def page(rows: Sequence[Row]) -> str:
     """Return the page with a row for each number of photos."""
     return f"# View graphs of thousands of photos\n\n{ABOUT}\n\n{table(rows, COLUMNS)}"
@@ -148,7 +139,7 @@ def main() -> None:
         return
     rows = []
     for count in args.counts:
-        rows.append(measure_apart(count, args.seed))
+        rows.append(row_of_module("benchmarks.many.graphs", "--one", str(count), "--seed", str(args.seed)))
         print(table(rows[-1:], COLUMNS))
     write(args.results, "many-graphs", document("many", ABOUT, {"seed": args.seed}, {}, rows), page(rows))
 

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.common.command_line import new_parser
 from benchmarks.common.metrics import load_truth
 from benchmarks.common.photo_sets import link_or_copy
-from benchmarks.common.processes import environment, module_command
+from benchmarks.common.processes import environment, module_command, row_of_module
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.many.graphs import calibrate_town
 from sfm_app.colmap.bundle import adjust_or_keep
@@ -220,12 +220,11 @@ def main() -> None:
     rows: list[Row] = []
     for method, part in (("whole", WHOLE), ("parts", args.part)):
         if args.photos:
-            command = module_command(
+            town = row_of_module(
                 "benchmarks.many.parts", "--cache", str(args.cache), "--photos", str(args.photos),
                 "--seed", str(args.seed), "--one", str(part),
             )  # fmt: skip
-            said = subprocess.run(command, env=environment(), check=True, capture_output=True, text=True).stdout
-            rows.append({"method": method, **json.loads(said.splitlines()[-1])})
+            rows.append({"method": method, **town})
         if args.data:
             rows.append({"method": method, **measure_kitchen(args.data, args.every, part, args.cache)})
         print(table(rows, COLUMNS))

@@ -1,4 +1,4 @@
-"""Models as arrays, so that many of them can be joined into one; and that one as COLMAP's model."""
+"""One model of several: of two by a similarity, or of many as arrays."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import pycolmap, translate_errors
 from sfm_app.colmap.bundle import drop_infinite_points, find_correspondences
 from sfm_app.colmap.bundles.bundle_rounds import improve_tracks, solve
-from sfm_app.colmap.database import open_database
-from sfm_app.colmap.model import bearing_vectors, posed_images
+from sfm_app.colmap.model import bearing_vectors, move, pose_photo, posed_images, unposed_model
 from sfm_app.colmap.types import all_points
+from sfm_app.geometry.similarity import Similarity
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
@@ -81,18 +81,10 @@ def write_placed(database: Path, placed: PlacedPhotos) -> pycolmap.Reconstructio
         placed: each keypoint is in one point at most. Of the cameras of photos that share one in the database,
             the one with the median focal is taken.
     """
-    options = pycolmap.DatabaseCacheOptions()
-    options.load_all_images = True  # also those that no pair in the database connects
-    with open_database(database) as db:
-        cache = pycolmap.DatabaseCache.create(db, options)
-    model = pycolmap.Reconstruction()
-    model.load(cache)
+    model = unposed_model(database)
     _write_cameras(model, placed)
     for photo, R, center in zip(placed.photos.tolist(), placed.R, placed.centers, strict=True):
-        image = model.images[photo]
-        frame = model.frames[image.frame_id]
-        frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ center))
-        model.register_frame(frame.frame_id)
+        pose_photo(model, photo, pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ center))
     starts = np.searchsorted(placed.point, np.arange(len(placed.X) + 1)).tolist()
     photos, keypoints = placed.photo.tolist(), placed.keypoint.tolist()
     for row, xyz in enumerate(placed.X):
@@ -113,6 +105,32 @@ def _write_cameras(model: pycolmap.Reconstruction, placed: PlacedPhotos) -> None
     for camera_id, ranked in found.items():
         camera, known = model.cameras[camera_id], placed.cameras[sorted(ranked)[len(ranked) // 2][1]]
         camera.model, camera.params = known.model, known.params.tolist()
+
+
+def merge_models(
+    database: Path, first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, similarity: Similarity
+) -> pycolmap.Reconstruction:
+    """Return one model with the photos and points of two models that share no photo.
+
+    Args:
+        database: holds photos, keypoints and two-view geometries.
+        first: gives the frame, and the parameters of cameras that are in both models; not changed.
+        second: not changed.
+        similarity: from the frame of the second model into that of the first.
+    """
+    other = pycolmap.Reconstruction(second)
+    move(other, similarity)
+    model = unposed_model(database)
+    for one in (other, pycolmap.Reconstruction(first)):
+        for image in posed_images(one):
+            camera = model.cameras[image.camera_id]
+            known = one.cameras[image.camera_id]
+            camera.model, camera.params = known.model, known.params.tolist()
+            pose_photo(model, image.image_id, image.cam_from_world())
+        for key in sorted(one.points3D):
+            model.add_point3D(one.points3D[key].xyz, one.points3D[key].track, one.points3D[key].color)
+    model.tear_down()
+    return model
 
 
 def settle(model: pycolmap.Reconstruction, database: Path, refined: Sequence[int]) -> None:

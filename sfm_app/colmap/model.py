@@ -1,4 +1,4 @@
-"""COLMAP's sparse model: build it from our two-view seed, divide, merge and transform it, and read it."""
+"""COLMAP's sparse model: build it from our two-view seed, divide and transform it, and read it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -33,6 +33,35 @@ def finite_mask(xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray((np.abs(xyz) < MAX_COORDINATE).all(axis=-1))
 
 
+def unposed_model(database: Path, *, unconnected: bool = True) -> pycolmap.Reconstruction:
+    """Return a reconstruction of the photos, keypoints and cameras of a database, without poses and points.
+
+    Args:
+        database: holds photos, keypoints and two-view geometries.
+        unconnected: whether photos are in it that no pair in the database connects.
+    """
+    options = pycolmap.DatabaseCacheOptions()
+    options.load_all_images = unconnected
+    with open_database(database) as db:
+        cache = pycolmap.DatabaseCache.create(db, options)
+    model = pycolmap.Reconstruction()
+    model.load(cache)
+    return model
+
+
+def pose_photo(model: pycolmap.Reconstruction, photo: int, cam_from_world: pycolmap.Rigid3d) -> None:
+    """Give a photo of a model its pose, in place.
+
+    Args:
+        model: COLMAP's reconstruction.
+        photo: id.
+        cam_from_world: the pose.
+    """
+    image = model.images[photo]
+    model.frames[image.frame_id].set_cam_from_world(image.camera_id, cam_from_world)
+    model.register_frame(image.frame_id)
+
+
 def model_from_seed(
     database: Path, pair: PairId, matches: NDArray[np.uint32], seed: TwoViewSeed
 ) -> pycolmap.Reconstruction:
@@ -44,15 +73,9 @@ def model_from_seed(
         matches: (N, 2) keypoint indices, one row per point of the seed.
         seed: pose and points; only its usable points are added.
     """
-    with open_database(database) as db:
-        cache = pycolmap.DatabaseCache.create(db, pycolmap.DatabaseCacheOptions())
-    model = pycolmap.Reconstruction()
-    model.load(cache)
-    for image_id, R, t in ((pair[0], np.eye(3), np.zeros(3)), (pair[1], seed.R, seed.t)):
-        image = model.images[image_id]
-        frame = model.frames[image.frame_id]
-        frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pycolmap.Rotation3d(R), t))
-        model.register_frame(frame.frame_id)
+    model = unposed_model(database, unconnected=False)
+    for photo, R, t in ((pair[0], np.eye(3), np.zeros(3)), (pair[1], seed.R, seed.t)):
+        pose_photo(model, photo, pycolmap.Rigid3d(pycolmap.Rotation3d(R), t))
     for index in np.flatnonzero(seed.usable):
         track = pycolmap.Track()
         track.add_element(pair[0], int(matches[index, 0]))
@@ -161,39 +184,6 @@ def submodel(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.
             part.deregister_frame(image.frame_id)
     part.tear_down()  # with frames that have no pose, no covariance can be estimated
     return part
-
-
-def merge_models(
-    database: Path, first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, similarity: Similarity
-) -> pycolmap.Reconstruction:
-    """Return one model with the photos and points of two models that share no photo.
-
-    Args:
-        database: holds photos, keypoints and two-view geometries.
-        first: gives the frame, and the parameters of cameras that are in both models; not changed.
-        second: not changed.
-        similarity: from the frame of the second model into that of the first.
-    """
-    other = pycolmap.Reconstruction(second)
-    move(other, similarity)
-    options = pycolmap.DatabaseCacheOptions()
-    options.load_all_images = True  # also those that no pair in the database connects
-    with open_database(database) as db:
-        cache = pycolmap.DatabaseCache.create(db, options)
-    model = pycolmap.Reconstruction()
-    model.load(cache)
-    for one in (other, pycolmap.Reconstruction(first)):
-        for image in posed_images(one):
-            camera = model.cameras[image.camera_id]
-            known = one.cameras[image.camera_id]
-            camera.model, camera.params = known.model, known.params.tolist()
-            frame = model.frames[model.images[image.image_id].frame_id]
-            frame.set_cam_from_world(image.camera_id, image.cam_from_world())
-            model.register_frame(frame.frame_id)
-        for key in sorted(one.points3D):
-            model.add_point3D(one.points3D[key].xyz, one.points3D[key].track, one.points3D[key].color)
-    model.tear_down()
-    return model
 
 
 def points_by_keypoint(model: pycolmap.Reconstruction) -> dict[tuple[int, int], tuple[int, NDArray[np.float64]]]:

@@ -4,8 +4,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.database import open_database
-from sfm_app.colmap.model import posed_images
+from sfm_app.colmap.model import pose_photo, posed_images, unposed_model
 from sfm_app.colmap.types import all_points
 
 
@@ -24,20 +23,13 @@ def model_in_database(
         keypoints: number of keypoints of each photo in the database.
     """
     before = pycolmap.Reconstruction(earlier)
-    options = pycolmap.DatabaseCacheOptions()
-    options.load_all_images = True  # also those that no pair in the database connects
-    with open_database(database) as db:
-        cache = pycolmap.DatabaseCache.create(db, options)
-    model = pycolmap.Reconstruction()
-    model.load(cache)
+    model = unposed_model(database)
     placed = [image for image in posed_images(before) if image.image_id in photos]
     for image in placed:
         camera, known = model.cameras[model.images[image.image_id].camera_id], before.cameras[image.camera_id]
         camera.model, camera.params = known.model, known.params.tolist()
     for image in placed:
-        own = model.images[image.image_id]
-        model.frames[own.frame_id].set_cam_from_world(own.camera_id, image.cam_from_world())
-        model.register_frame(own.frame_id)
+        pose_photo(model, image.image_id, image.cam_from_world())
     there = {image.image_id for image in placed}
     for _, point in sorted(all_points(before), key=lambda item: item[0]):
         track = pycolmap.Track()
