@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import read_features, write_match_graph
 from sfm_app.colmap.model import posed_photo_ids
-from sfm_app.errors import SfmError
+from sfm_app.errors import ClusterError, SfmError
 from sfm_app.estimation.calibrating import find_intrinsics
 from sfm_app.estimation.fitting import fit_pairs, to_view_graph
 from sfm_app.estimation.matching import fill_database
@@ -64,6 +64,8 @@ def retry_lost_photos(first: MappedScene) -> MappedScene:
     report: dict[str, Json] = {"photos": photo_names(lost, first.matches), "pairs": len(pairs)}
     try:
         second = _retry_pairs(first, pairs, report)
+    except ClusterError:  # the same command would give another scene on a cluster that stays
+        raise
     except SfmError as err:  # the first result is not lost with it
         report["failed"], second = str(err), None
     placed = [_placed_count(one.outcome) for one in (first, second) if one is not None]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sfm_app.colmap.backend import run_in_daemon_thread, translate_errors
 from sfm_app.colmap.joined_model import read_placed, settle, write_placed
-from sfm_app.errors import SfmError
+from sfm_app.errors import BackendError
 from sfm_app.numerical import FAILURES, Json, error_reason
 from sfm_app.reconstruction.mapping_runs import (
     Attempt,
@@ -86,9 +86,7 @@ def map_in_parts(group: Group, mapped: PoseGraph, run: RunContext) -> list[Mappi
         results = map_parts(group, parts, mapped, run)
         joined = join_parts(group, parts, results, run)
         found = _merge(group, joined, run)
-    except (SfmError, *FAILURES) as err:
-        if isinstance(err, OSError):
-            raise
+    except (BackendError, *FAILURES) as err:  # the whole may still be mapped
         logger.info("parts were not joined", exc_info=err)
         return [NoModel(MAPPER, f"in {len(parts)} parts: failed, {error_reason(err)}")]
     best = best_attempt(found)

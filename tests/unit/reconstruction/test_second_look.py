@@ -8,7 +8,7 @@ import pytest
 from sfm_app.api import open_run
 from sfm_app.colmap.database import write_keypoints, write_matches
 from sfm_app.colmap.model import posed_photo_ids
-from sfm_app.errors import BackendError
+from sfm_app.errors import BackendError, ClusterError
 from sfm_app.reconstruction import second_look as module
 from sfm_app.reconstruction.mapping_passes import Outcome
 from sfm_app.reconstruction.mapping_runs import Attempt
@@ -109,6 +109,13 @@ def test_a_second_look_that_fails_costs_nothing(first, finer):
 
     assert retry_lost_photos(first) is first
     assert first.run.statistics["second_look"]["failed"] == "the disk is full"
+
+
+def test_a_second_look_whose_cluster_is_gone_is_not_skipped(first, finer):
+    finer(failing=ClusterError("the scheduler is gone"))
+
+    with pytest.raises(ClusterError, match="scheduler"):
+        retry_lost_photos(first)
 
 
 def test_nobody_looks_twice_where_all_photos_have_a_place(first, finer, synthetic):

@@ -7,6 +7,7 @@ import pytest
 
 from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
 from sfm_app.colmap.model import poses_and_points
+from sfm_app.errors import BackendError, ClusterError
 from sfm_app.geometry.similarity import umeyama
 from sfm_app.plugins import load_plugins
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
@@ -112,6 +113,20 @@ def test_where_no_part_is_mapped_the_reason_is_told(group, start, monkeypatch):
 
     assert isinstance(found, NoModel) and found.note == "in 9 parts: none was mapped; failed: no memory"
     assert not is_convincing([found], PHOTOS)
+
+
+@pytest.mark.parametrize(("error", "passes"), [(ClusterError("gone"), True), (BackendError("failed"), False)])
+def test_a_cluster_that_is_gone_ends_the_run_and_other_failures_leave_the_whole(start, monkeypatch, error, passes):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(parts_run, "map_parts", fail)
+    if passes:
+        with pytest.raises(ClusterError, match="gone"):
+            start()
+    else:
+        ((found,), _) = start()
+        assert isinstance(found, NoModel) and "failed" in found.note
 
 
 def test_the_size_of_parts_is_that_of_the_settings_or_usual_for_large_groups():
