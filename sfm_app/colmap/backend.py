@@ -192,6 +192,7 @@ def run_with_progress(
     progress.start(label, total)
     try:
         run_interruptible(call, poll)
+        poll()
     finally:
         progress.finish()
 

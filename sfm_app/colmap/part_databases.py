@@ -9,23 +9,27 @@ import secrets
 import shutil
 import sqlite3
 import tempfile
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 from sfm_app.atomic_io import replace_atomically
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.features import feature_task
 from sfm_app.colmap.processes.feature_process import do_task
-from sfm_app.colmap.processes.worker_process import SiftOption
+from sfm_app.colmap.processes.worker_process import MatchTask, ProcessGroup, SiftOption
 from sfm_app.numerical import Json
-from sfm_app.progress import SilentProgress
+from sfm_app.progress import Progress, SilentProgress
 from sfm_app.settings import MatchSettings
 from sfm_app.types import PairId
 
 FEATURES, MATCHES = ("keypoints", "descriptors"), ("matches", "two_view_geometries")
 """COLMAP's tables of what it finds in photos, and in pairs."""
+_MATCHING = threading.Lock()
+"""COLMAP loses matches now and then where threads of one process match side by side."""
 BLOCK = 50
 """Photos of a block in COLMAP's exhaustive matching, by its default."""
 
@@ -44,6 +48,8 @@ class SiftInputs:
     sift: Mapping[str, SiftOption]
     folder: Path
     """Where new rows are left, in the output folder."""
+    scratch: Path | None = None
+    """Folder for temporary databases, on a disk of this machine; None for the usual one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,26 +92,48 @@ def find_in_chunk(inputs: SiftInputs, names: Sequence[str]) -> Part:
     Raises:
         BackendError: COLMAP failed.
     """
-    with _scratch_copy(inputs.snapshot) as database:
-        in_force = _find_and_match(database, inputs, names, ())
+    with _scratch_copy(inputs) as database:
+        in_force = _find_and_match(database, inputs, names, (), SilentProgress())
         return Part(_leave_rows(database, FEATURES, inputs.folder), len(names), in_force)
 
 
-def match_chunk(inputs: SiftInputs, pairs: Sequence[PairId]) -> Part:
+def match_chunk(inputs: SiftInputs, pairs: Sequence[PairId], progress: Progress | None = None) -> Part:
     """Match some pairs, and leave their rows in a file.
 
     Args:
         inputs: of all chunks.
         pairs: ids of photos; the order within a pair is that in which COLMAP matches them.
+        progress: counts pairs.
 
     Raises:
         BackendError: COLMAP failed.
     """
     photos = sorted({photo for pair in pairs for photo in pair})
-    with _scratch_copy(inputs.snapshot) as database:
+    with _MATCHING, _scratch_copy(inputs) as database:
         _copy_rows(database, inputs.features, FEATURES, photos)
-        in_force = _find_and_match(database, inputs, (), pairs)
+        in_force = _find_and_match(database, inputs, (), pairs, progress or SilentProgress())
         return Part(_leave_rows(database, MATCHES, inputs.folder), len(pairs), in_force)
+
+
+def match_chunk_apart(inputs: SiftInputs, group: ProcessGroup, progress: Progress, pairs: Sequence[PairId]) -> Part:
+    """Match some pairs in a process of its own.
+
+    Args:
+        inputs: of all chunks.
+        group: of the processes that match.
+        progress: counts pairs.
+        pairs: as in `match_chunk`.
+
+    Raises:
+        BackendError: COLMAP failed, or the group has ended.
+    """
+    task: MatchTask = {
+        "snapshot": str(inputs.snapshot), "features": str(inputs.features), "photos": str(inputs.photos),
+        "options": inputs.options.model_dump(), "sift": dict(inputs.sift), "folder": str(inputs.folder),
+        "pairs": [list(pair) for pair in pairs],
+    }  # fmt: skip
+    said = group.run("sfm_app.colmap.processes.match_process", task, "matching photos", progress)
+    return Part(Path(str(said["path"])), len(pairs), cast(Mapping[str, Json], said["in_force"]))
 
 
 def enter_rows(database: Path, part: Path, tables: Sequence[str]) -> None:
@@ -135,6 +163,12 @@ def photos_without_features(database: Path) -> dict[int, str]:
         }
 
 
+def count_features(database: Path) -> list[int]:
+    """Return the number of keypoints of each photo."""
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        return [int(rows) for (rows,) in connection.execute("SELECT rows FROM keypoints ORDER BY image_id")]
+
+
 def exhaustive_pairs(photos: Sequence[int]) -> list[PairId]:
     """Return all pairs of photos as COLMAP's exhaustive matching takes them; in some, the larger id comes first.
 
@@ -150,21 +184,21 @@ def exhaustive_pairs(photos: Sequence[int]) -> list[PairId]:
 
 
 def _find_and_match(
-    database: Path, inputs: SiftInputs, names: Sequence[str], pairs: Sequence[PairId]
+    database: Path, inputs: SiftInputs, names: Sequence[str], pairs: Sequence[PairId], progress: Progress
 ) -> dict[str, Json]:
     """Let COLMAP work in this process, which nothing else depends on, and return its options."""
     in_force: dict[str, Json] = {}
     task = feature_task((database, inputs.photos, inputs.masks), names, inputs.options, 1, inputs.sift, pairs)
     with translate_errors("matching photos" if pairs else "finding features"):
-        do_task(task, SilentProgress(), in_force.update)
+        do_task(task, progress, in_force.update)
     return in_force
 
 
 @contextlib.contextmanager
-def _scratch_copy(snapshot: Path) -> Iterator[Path]:
-    """Provide a copy of a database on a disk of this machine."""
-    with tempfile.TemporaryDirectory(prefix="sfm-app-sift-") as scratch:
-        yield Path(shutil.copyfile(snapshot, Path(scratch) / snapshot.name))
+def _scratch_copy(inputs: SiftInputs) -> Iterator[Path]:
+    """Provide a copy of the snapshot on a disk of this machine."""
+    with tempfile.TemporaryDirectory(prefix="sfm-app-sift-", dir=inputs.scratch) as scratch:
+        yield Path(shutil.copyfile(inputs.snapshot, Path(scratch) / inputs.snapshot.name))
 
 
 def _leave_rows(database: Path, tables: Sequence[str], folder: Path) -> Path:

@@ -59,10 +59,12 @@ def _cpu_seconds() -> float:
 def _resident_mb() -> int:
     """Return the memory of this process and of its children in MB."""
     me = psutil.Process()
-    total = 0
-    for process in (me, *me.children(recursive=True)):
+    command, total = me.cmdline(), int(me.memory_info().rss)
+    for process in me.children(recursive=True):
         try:
-            total += process.memory_info().rss
+            # until a child runs a program of its own, its memory is ours
+            if process.cmdline() not in ([], command):
+                total += process.memory_info().rss
         except psutil.Error:  # it has ended meanwhile
             continue
     return round(total / MEGA)

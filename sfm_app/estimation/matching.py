@@ -17,7 +17,7 @@ from sfm_app.colmap.database import photo_names, unmatched_pairs, write_matches
 from sfm_app.colmap.features import find_and_match
 from sfm_app.errors import PluginError
 from sfm_app.estimation.feature_parts import find_features, load_features, method_error
-from sfm_app.estimation.on_cluster.sift_chunks import find_in_chunks, match_in_chunks
+from sfm_app.estimation.in_chunks.sift_chunks import find_in_chunks, match_in_chunks
 from sfm_app.numerical import Json
 from sfm_app.plugins import FeatureMethod
 from sfm_app.progress import track
@@ -101,12 +101,10 @@ def match_pairs(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] 
     place, options = run.workspace, run.settings.matching
     if pairs is not None and not pairs:
         return {}
-    if method.sift is not None and run.spread:
+    if method.sift is not None and (run.spread or run.workers > 1):
         return match_in_chunks(method.sift, pairs, run)
     if method.sift is not None:
-        return find_and_match(
-            place.database, place.photos, [], options, run.workers, run.progress, sift=method.sift, pairs=pairs
-        )
+        return find_and_match(place.database, place.photos, [], options, 1, run.progress, sift=method.sift, pairs=pairs)
     _match(method, all_pairs(photo_names(place.database)) if pairs is None else pairs, run)
     return {}
 

@@ -44,6 +44,19 @@ class FeatureTask(TypedDict):
     pairs: list[list[int]] | None
 
 
+class MatchTask(TypedDict):
+    """Task of `match_process`, with the arguments of `part_databases.match_chunk`."""
+
+    snapshot: str
+    features: str
+    photos: str
+    options: dict[str, Any]
+    """Dump of `MatchSettings`."""
+    sift: dict[str, SiftOption]
+    folder: str
+    pairs: list[list[int]]
+
+
 class MappingTask(TypedDict):
     """Task of `baseline_mapping`, with the arguments of `mapping.map_with_colmap_defaults`."""
 
@@ -162,6 +175,42 @@ def start_worker(module: str, task: Mapping[str, object]) -> Iterator[WorkerProc
         finally:
             if process.poll() is None:
                 process.kill()
+
+
+class ProcessGroup:
+    """Worker processes of several threads, which end together."""
+
+    def __init__(self) -> None:
+        self._running, self._lock, self._has_ended = set[WorkerProcess](), threading.Lock(), False
+
+    def run(self, module: str, task: Mapping[str, object], doing: str, progress: Progress) -> dict[str, Json]:
+        """Run a worker process to its end or that of the group, as `run_worker` does.
+
+        Args:
+            module, task, doing, progress: as in `run_worker`.
+
+        Raises:
+            BackendError: COLMAP failed, or the group has ended.
+        """
+        with start_worker(module, task) as process:
+            with self._lock:
+                self._running.add(process)
+                if self._has_ended:
+                    process.process.kill()
+            try:
+                found = relay(process, progress)
+                process.check(doing)
+            finally:
+                with self._lock:
+                    self._running.discard(process)
+        return found
+
+    def stop(self) -> None:
+        """Stop all processes, and those that are started from now on."""
+        with self._lock:
+            self._has_ended = True
+            for process in self._running:
+                process.process.kill()
 
 
 def run_worker(

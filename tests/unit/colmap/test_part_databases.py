@@ -1,6 +1,8 @@
 """SIFT on a few photos or pairs at a time gives the rows of COLMAP's work on all of them."""
 
 import shutil
+import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -17,13 +19,25 @@ from sfm_app.colmap.part_databases import (
     exhaustive_pairs,
     find_in_chunk,
     match_chunk,
+    match_chunk_apart,
     photos_without_features,
     write_snapshot,
 )
-from sfm_app.estimation.on_cluster.sift_chunks import chunks
+from sfm_app.colmap.processes.worker_process import ProcessGroup
+from sfm_app.errors import BackendError
+from sfm_app.estimation.in_chunks.sift_chunks import chunks
 from sfm_app.progress import SilentProgress
 from sfm_app.settings import MatchSettings
 from sfm_app.types import Photo, PhotoSet
+
+
+class Counted(SilentProgress):
+    def __init__(self):
+        self.steps = 0
+
+    def advance(self, steps=1):
+        self.steps += steps
+
 
 OPTIONS = MatchSettings(max_features=200)
 COUNT = BLOCK + 3
@@ -80,6 +94,35 @@ def test_chunks_give_what_colmap_gives_for_all_at_once(made, tmp_path):
     assert digest_matches(database) == digest_matches(made / "whole.db")
 
 
+def test_a_process_of_its_own_matches_the_same(made, tmp_path):
+    inputs, pairs = inputs_of(made, made / "whole.db", tmp_path / "matches"), [(1, 2), (4, 1), (3, 5)]
+    counted = Counted()
+
+    here, apart = match_chunk(inputs, pairs), match_chunk_apart(inputs, ProcessGroup(), counted, pairs)
+
+    assert here.count == apart.count == 3
+    assert here.in_force == apart.in_force
+    assert rows_of(here.path) == rows_of(apart.path)
+    assert len(rows_of(apart.path)) == 3
+    assert counted.steps == 3
+
+
+def test_a_process_that_is_stopped_leaves_nothing(made, tmp_path):
+    inputs, group = inputs_of(made, made / "whole.db", tmp_path / "matches"), ProcessGroup()
+    before = sorted(path.name for path in inputs.folder.iterdir())
+    group.stop()
+
+    with pytest.raises(BackendError, match="ended"):
+        match_chunk_apart(inputs, group, SilentProgress(), [(1, 2)])
+
+    assert sorted(path.name for path in inputs.folder.iterdir()) == before
+
+
+def rows_of(part):
+    with closing(sqlite3.connect(part)) as connection:
+        return connection.execute("SELECT pair_id, rows, cols, data FROM matches ORDER BY pair_id").fetchall()
+
+
 @pytest.mark.parametrize("count", [0, 1, 5, BLOCK, 2 * BLOCK + 7])
 def test_every_pair_is_listed_once(count):
     pairs = exhaustive_pairs(range(1, count + 1))
@@ -87,6 +130,7 @@ def test_every_pair_is_listed_once(count):
 
 
 def test_chunks_keep_all_workers_busy():
-    assert [len(part) for part in chunks(range(11), 8, 2)] == [3, 3, 3, 2]
+    assert [len(part) for part in chunks(range(11), 8, 2)] == [6, 5]
     assert [len(part) for part in chunks(range(100), 8, 2)] == [8] * 12 + [4]
+    assert [len(part) for part in chunks(range(90), 40, 2)] == [23, 23, 23, 21]
     assert chunks([], 8, 2) == []

@@ -1,10 +1,11 @@
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
 
-from sfm_app.engine.usage import measure_usage
+from sfm_app.engine.usage import _resident_mb, measure_usage
 
 HOLD = "held = b'x' * 200_000_000; import time; time.sleep(1.2)"
 
@@ -17,6 +18,18 @@ def test_memory_of_other_processes_counts():
 
     assert alone.peak_mb > 10
     assert 200 <= used.peak_mb - alone.peak_mb < 350
+
+
+def test_memory_of_this_process_counts_once_while_it_starts_others():
+    held = b"x" * 500_000_000  # a child that has not yet begun its program shares it
+    before, seen = _resident_mb(), []
+    others = threading.Thread(target=lambda: [subprocess.run(["true"], check=True) for _ in range(200)])
+    others.start()
+    while others.is_alive():
+        seen.append(_resident_mb())
+
+    assert len(held) / 1e6 <= min(seen)
+    assert max(seen) < before + 200
 
 
 def test_cpu_seconds_are_those_of_work_and_not_of_waiting():

@@ -1,8 +1,15 @@
-"""COLMAP's SIFT on a cluster: workers find and match in chunks, this process enters their rows in a fixed order."""
+"""COLMAP's SIFT in chunks, on a cluster or in processes of this machine; this process enters their rows in order.
 
+COLMAP's matcher loses matches now and then where several threads of a process match: of 1540 pairs of small photos, one
+or two pairs differ in half of the runs. So each process has one thread.
+"""
+
+import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from threading import Lock
 from typing import TypeVar
 
 from sfm_app.colmap.database import photo_names, unmatched_pairs
@@ -11,25 +18,30 @@ from sfm_app.colmap.part_databases import (
     MATCHES,
     Part,
     SiftInputs,
+    count_features,
     enter_rows,
     exhaustive_pairs,
     find_in_chunk,
     match_chunk,
+    match_chunk_apart,
     photos_without_features,
     write_snapshot,
 )
-from sfm_app.colmap.processes.worker_process import SiftOption
+from sfm_app.colmap.processes.worker_process import ProcessGroup, SiftOption
 from sfm_app.numerical import Json
+from sfm_app.progress import Progress, SilentProgress
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.tasks import Task
 from sfm_app.types import PairId
 
-MOST_PHOTOS, MOST_PAIRS, SIDE = 8, 64, 8
-"""Photos, and pairs, that a worker takes at once, and photos on each side of a square of pairs, whose features are read
-together: a process of COLMAP's takes a second to start. Chosen by hand."""
-ROUNDS = 2
-"""Least number of chunks for each worker, so that none waits long for the last one. Chosen by hand."""
+MOST_PHOTOS = 8
+"""Photos whose features a worker finds at once: a process of COLMAP's takes a second to start. Chosen by hand."""
+CHUNK_S, FEATURE_S = 30.0, 1.1e-5
+"""Seconds that a chunk of pairs should take, and those of a pair for each feature of its photos. An index of a photo's
+descriptors costs as much as 1.5 pairs, and each chunk makes its own. Measured on castle-P19 and kitchen1000."""
+LEAST_PAIRS, MOST_PAIRS = 64, 4096
+"""Pairs of a chunk. Chosen by hand."""
 
 Item = TypeVar("Item")
 
@@ -51,11 +63,12 @@ def find_in_chunks(sift: Mapping[str, SiftOption], names: Sequence[str], run: Ru
     """
     wanted = set(names)
     left = [name for name in photos_without_features(run.workspace.database).values() if name in wanted]
-    return _do_in_chunks(find_in_chunk, chunks(left, MOST_PHOTOS, run.spread), sift, run)
+    parts = chunks(left, MOST_PHOTOS, run.spread)
+    return _do_in_chunks(partial(Task, find_in_chunk), parts, FEATURES, sift, run)
 
 
 def match_in_chunks(sift: Mapping[str, SiftOption], pairs: Sequence[PairId] | None, run: RunContext) -> dict[str, Json]:
-    """Match pairs of photos on a cluster; pairs that are in the database stay.
+    """Match pairs of photos on a cluster, or in processes of this machine; pairs that are in the database stay.
 
     Args:
         sift: as in `find_in_chunks`.
@@ -73,33 +86,61 @@ def match_in_chunks(sift: Mapping[str, SiftOption], pairs: Sequence[PairId] | No
     asked = exhaustive_pairs(sorted(photo_names(database))) if pairs is None else list(pairs)
     left = set(unmatched_pairs(database, [(min(pair), max(pair)) for pair in asked]))
     todo = [pair for pair in asked if (min(pair), max(pair)) in left]
-    rank = {photo: place for place, photo in enumerate(sorted({photo for pair in todo for photo in pair}))}
-    todo.sort(key=lambda pair: (*sorted(rank[photo] // SIDE for photo in pair), *sorted(pair)))
-    return _do_in_chunks(match_chunk, chunks(todo, MOST_PAIRS, run.spread), sift, run)
+    parts = _chunks_of_pairs(todo, count_features(database), run.spread or run.workers)
+    if run.spread:
+        return _do_in_chunks(partial(Task, match_chunk), parts, MATCHES, sift, run)
+    group, counter = ProcessGroup(), _PairCounter(run.progress)
+    try:
+        return _do_in_chunks(
+            lambda inputs: partial(match_chunk_apart, inputs, group, counter), parts, MATCHES, sift, run
+        )
+    finally:
+        group.stop()
+
+
+class _PairCounter(SilentProgress):
+    """Counts the pairs of several processes on one bar."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress, self._lock = progress, Lock()
+
+    def advance(self, steps: int = 1) -> None:
+        with self._lock:
+            self._progress.advance(steps)
+
+
+def _chunks_of_pairs(pairs: Sequence[PairId], features: Sequence[int], workers: int) -> list[Sequence[PairId]]:
+    """Return pairs in chunks of few photos each."""
+    pair_s = FEATURE_S * max(sum(features) / max(len(features), 1), 1.0)
+    most = min(max(int(CHUNK_S / pair_s), LEAST_PAIRS), MOST_PAIRS)
+    rank = {photo: place for place, photo in enumerate(sorted({photo for pair in pairs for photo in pair}))}
+    side = math.isqrt(most)
+    in_squares = sorted(pairs, key=lambda pair: (*sorted(rank[photo] // side for photo in pair), *sorted(pair)))
+    return chunks(in_squares, most, workers)
 
 
 def chunks(items: Sequence[Item], most: int, workers: int) -> list[Sequence[Item]]:
-    """Return items in chunks that keep all workers busy.
+    """Return items in chunks of about the same size, as many for each worker.
 
     Args:
         items: to cut.
         most: items of a chunk.
         workers: that share the chunks.
     """
-    size = max(1, min(most, -(-len(items) // (ROUNDS * max(1, workers)))))
+    rounds = -(-len(items) // (most * max(1, workers)))
+    size = max(1, -(-len(items) // max(1, rounds * workers)))
     return [items[first : first + size] for first in range(0, len(items), size)]
 
 
 def _do_in_chunks(
-    work: Callable[[SiftInputs, Sequence[Item]], Part],
+    prepare: Callable[[SiftInputs], Callable[[Sequence[Item]], Part]],
     parts: Sequence[Sequence[Item]],
+    tables: tuple[str, str],
     sift: Mapping[str, SiftOption],
     run: RunContext,
 ) -> dict[str, Json]:
     """Let workers do chunks, and enter their rows in order."""
-    place, tables, label = run.workspace, FEATURES, "features"
-    if work is match_chunk:
-        tables, label = MATCHES, "matching"
+    place, label = run.workspace, "matching" if tables is MATCHES else "features"
     folder, in_force = place.sift_rows, dict[str, Json]()
     shutil.rmtree(folder, ignore_errors=True)
     if not parts:
@@ -107,10 +148,11 @@ def _do_in_chunks(
     inputs = _write_inputs(folder, sift, run, with_features=tables is MATCHES)
     run.progress.start(label, sum(len(part) for part in parts))
     try:
-        for found in ordered_map(run.executor, Task(work, inputs), parts, ahead=run.workers):
+        for found in ordered_map(run.executor, prepare(inputs), parts, ahead=run.workers):
             enter_rows(place.database, found.path, tables)
             in_force |= found.in_force
-            run.progress.advance(found.count)
+            if tables is FEATURES or run.spread:
+                run.progress.advance(found.count)
     finally:
         run.progress.finish()
         shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,1 @@
+"""Work of this package that is cut up for several processes."""
