@@ -1,8 +1,7 @@
-"""Parts of the Schur complement: points whitened by their observations, sparse derivatives, and the gauge."""
+"""Parts of the Schur complement: points whitened by their observations, and the gauge."""
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 FloatArray = NDArray[np.float64]
 
@@ -47,13 +46,6 @@ def whiten_points(by_point: FloatArray, point: NDArray[np.int64], points: int) -
     return W, rank
 
 
-def block_diagonal(blocks: FloatArray) -> sparse.csr_array:
-    """Return the block-diagonal matrix (3P, 3P) of blocks (P, 3, 3)."""
-    P = len(blocks)
-    columns = np.repeat(3 * np.arange(P)[:, None] + np.arange(3), 3, axis=0)
-    return sparse.csr_array((blocks.ravel(), columns.ravel(), 3 * np.arange(3 * P + 1)), shape=(3 * P, 3 * P))
-
-
 def free_pose_columns(R: FloatArray, t: FloatArray) -> NDArray[np.int64]:
     """Return the free pose columns when the gauge is fixed: the first photo, and one coordinate of the farthest one.
 
@@ -65,16 +57,3 @@ def free_pose_columns(R: FloatArray, t: FloatArray) -> NDArray[np.int64]:
     relative = R[far] @ (centers[0] - centers[far])
     held = {POSE * far + 3 + int(np.argmax(np.abs(relative)))} | set(range(POSE))
     return np.array([k for k in range(POSE * len(R)) if k not in held], np.int64)
-
-
-def to_sparse(blocks: FloatArray, columns: NDArray[np.int64], width: int) -> sparse.csr_array:
-    """Return the sparse matrix (2N, width) of blocks in two rows and k columns each.
-
-    Args:
-        blocks: (N, 2, k).
-        columns: (N, k) places of their columns.
-        width: of the matrix.
-    """
-    N, _, k = blocks.shape
-    places = np.repeat(columns, 2, axis=0).ravel()
-    return sparse.csr_array((blocks.ravel(), places, k * np.arange(2 * N + 1)), shape=(2 * N, width))

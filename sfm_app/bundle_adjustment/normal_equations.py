@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
-from sfm_app.bundle_adjustment.elimination import POSE, block_diagonal, free_pose_columns, to_sparse, whiten_points
+from sfm_app.bundle_adjustment.elimination import POSE, free_pose_columns, whiten_points
+from sfm_app.bundle_adjustment.schur import Linearized, eliminate_points
 from sfm_app.geometry.lenses.projections import CAMERA, PANORAMA, project_points, wrap_residuals
 from sfm_app.geometry.spd_solve import project_to_psd, solve_positive, solve_sparse_positive
 
@@ -67,8 +68,10 @@ class ReducedSystem:
     """(6I, 12C) decrease of that change per change of the cameras."""
     point_step: FloatArray
     """(3P,) best change of the points with fixed poses and cameras."""
-    point_response: sparse.csr_array
-    """(3P, 6I + 12C) decrease of that change per change of poses and cameras."""
+    seen: Linearized
+    """All observations."""
+    whiten: FloatArray
+    """(P, 3, 3) from `whiten_points`."""
     lost: int
     """Number of observations that are not used: behind their camera, or not finite."""
     scores: FloatArray
@@ -80,8 +83,8 @@ class ReducedSystem:
     def back_substitute(self, cameras: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the best changes of poses (I, 6) and points (P, 3) for a given change of the cameras (C, 12)."""
         poses = self.pose_step - np.einsum("ij,j->i", self.pose_response, cameras.ravel())
-        points = self.point_step - self.point_response @ np.concatenate([poses, cameras.ravel()])
-        return poses.reshape(-1, POSE), points.reshape(-1, 3)
+        follow = _unwhiten(self.whiten, self.seen.sum_by_point(self.seen.move(poses, cameras.ravel())))
+        return poses.reshape(-1, POSE), self.point_step.reshape(-1, 3) - follow
 
 
 def project(bundle: Bundle) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -118,70 +121,46 @@ def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
         bundle: the model; the result is accurate where poses and points minimize the cost.
         scale_px: s of the loss s^2 (sqrt(1 + |r|^2 / s^2) - 1), which is COLMAP's SOFT_L1.
     """
-    r, by_view, by_point, seen = _linearize(bundle, scale_px)
+    r, by_view, by_point, used = _linearize(bundle, scale_px)
     whiten, rank = whiten_points(by_point, bundle.point, len(bundle.X))
     by_point = np.einsum("nki,nji->nkj", by_point, whiten[bundle.point])
+    counts = len(bundle.R), len(bundle.params), len(bundle.X)
+    seen = Linearized(bundle.photo, bundle.camera[bundle.photo], bundle.point, r, by_view, by_point, counts)
     poses, cameras = POSE * len(bundle.R), CAMERA * len(bundle.params)
-    columns = np.hstack(
-        [
-            POSE * bundle.photo[:, None] + np.arange(POSE),
-            poses + CAMERA * bundle.camera[bundle.photo][:, None] + np.arange(CAMERA),
-        ]
-    )
-    J = to_sparse(by_view, columns, poses + cameras)
-    Jp = to_sparse(by_point, 3 * bundle.point[:, None] + np.arange(3), 3 * len(bundle.X))
-    A = (Jp.T @ J).tocsr()
-    S = sparse.csr_array(J.T @ J - A.T @ A + DAMPING * sparse.eye_array(poses + cameras))
-    flat = r.ravel()
-    along = Jp.T @ flat
-    gradient = J.T @ flat - A.T @ along
+    S, by_camera = eliminate_points(seen, DAMPING)
+    rest = seen.drop_points(r)
+    gradient = seen.sum_by_view(rest)
     free = free_pose_columns(bundle.R, bundle.t)
-    by_camera = S[poses:].toarray()
     right = np.column_stack([by_camera[:, free].T, gradient[free]])
     give = solve_sparse_positive(sparse.csr_array(S[free][:, free]), right)
     across = np.einsum("ij,jk->ik", by_camera[:, free], give)
     H, g = by_camera[:, poses:] - across[:, :-1], gradient[poses:] - across[:, -1]
-    H = project_to_psd(0.5 * (H + H.T), np.asarray(J[:, poses:].power(2).sum(axis=0), np.float64))
+    H = project_to_psd(0.5 * (H + H.T), seen.camera_squares())
     step = solve_positive(H, g[:, None])[:, 0]
-    explained = np.sum(along**2) + np.sum(gradient[free] * give[:, -1]) + np.sum(g * step)
-    left = max(float(np.sum(flat**2) - explained), 0.0) + USUAL_COUNT * USUAL_NOISE_PX**2
-    spare = max(2 * int(np.count_nonzero(seen)) - int(np.sum(rank)) - len(free) - cameras, 0) + USUAL_COUNT
+    explained = np.sum(gradient[free] * give[:, -1]) + np.sum(g * step)
+    left = max(float(np.sum(rest**2) - explained), 0.0) + USUAL_COUNT * USUAL_NOISE_PX**2
+    spare = max(2 * int(np.count_nonzero(used)) - int(np.sum(rank)) - len(free) - cameras, 0) + USUAL_COUNT
     pose_step, pose_give = np.zeros(poses), np.zeros((poses, cameras))
     pose_step[free], pose_give[free] = give[:, -1], give[:, :-1]
-    left_over = flat - J[:, :poses] @ pose_step - Jp @ (along - A[:, :poses] @ pose_step)
-    unwhiten = block_diagonal(whiten.transpose(0, 2, 1))
+    left_over = rest - seen.drop_points(seen.move(pose_step, np.zeros(cameras)))
     return ReducedSystem(
         H=H,
         g=g,
         noise_px=float(np.sqrt(left / spare)),
         pose_step=pose_step,
         pose_response=pose_give,
-        point_step=unwhiten @ along,
-        point_response=unwhiten @ A,
-        lost=len(seen) - int(np.count_nonzero(seen)),
-        scores=_scores((J, Jp, A), pose_give, left_over, np.repeat(bundle.photo, 2), len(bundle.R)),
+        point_step=_unwhiten(whiten, seen.sum_by_point(r)).ravel(),
+        seen=seen,
+        whiten=whiten,
+        lost=len(used) - int(np.count_nonzero(used)),
+        scores=seen.score(pose_give, left_over),
         open_points=int(np.count_nonzero(rank < 3)),
     )
 
 
-def _scores(
-    system: tuple[sparse.csr_array, sparse.csr_array, sparse.csr_array],
-    pose_give: FloatArray, left_over: FloatArray, photo: NDArray[np.int64], photos: int,
-) -> FloatArray:  # fmt: skip
-    """Return the scores (I, 12C), from derivatives by views and points, and residuals (2N,) after poses and points.
-
-    The cameras are processed one by one, so that many of them take no more memory than one.
-    """
-    J, Jp, A = system
-    cameras = pose_give.shape[1]
-    found = np.empty((photos, cameras))
-    for first in range(0, cameras, CAMERA):
-        block = slice(first, first + CAMERA)
-        follow = np.vstack([-pose_give[:, block], np.eye(cameras)[:, block]])
-        by_camera = J @ follow - Jp @ (A @ follow)
-        for column in range(CAMERA):
-            found[:, first + column] = np.bincount(photo, by_camera[:, column] * left_over, photos)
-    return found
+def _unwhiten(whiten: FloatArray, points: FloatArray) -> FloatArray:
+    """Return (P, 3) shifts of points from those of the whitened ones."""
+    return np.asarray(np.einsum("pji,pj->pi", whiten, points), np.float64)
 
 
 def apply_step(bundle: Bundle, params: FloatArray, poses: FloatArray, points: FloatArray) -> Bundle:

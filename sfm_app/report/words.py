@@ -11,6 +11,8 @@ HELD = {
     "k1": "a lens that bends no lines",
 }
 """The usual value, by the parameter that the photos do not determine."""
+WIDE_DEG = 90.0
+"""Field of view from which people call a lens a fisheye. Chosen by hand."""
 SURE = 2.0
 """Distortion in deviations from which on its direction is said: 19 in 20. By convention."""
 
@@ -21,7 +23,8 @@ def field_text(camera: Calibration) -> str:
         return "panoramas of a whole turn"
     across, down = field_of_view_deg(camera)
     seen = f"sees {across:.0f} degrees from left to right, {down:.0f} from top to bottom"
-    return f"a fisheye that {seen}" if camera.projection == FISHEYE else seen
+    # through a narrow field both families are the same lens, in other numbers
+    return f"a fisheye that {seen}" if camera.projection == FISHEYE and across >= WIDE_DEG else seen
 
 
 def verdict(camera: Calibration) -> str:

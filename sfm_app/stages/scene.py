@@ -94,10 +94,11 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     names = {image.name: outcome.intrinsics.camera_name(image) for image in matches.images.values()}
     wanted, database = run.settings.scene.camera_model, found.run.workspace.database
     laid_down = [camera_rules(attempt.model, names, intrinsics, wanted) for attempt in outcome.models]
-    adjusted = [
-        adjust_or_keep(attempt.model, database, rules, settled=attempt.mapper == GROWN)
-        for attempt, rules in zip(outcome.models, laid_down, strict=True)
-    ]
+    with run.step("adjusting all cameras"):
+        adjusted = [
+            adjust_or_keep(attempt.model, database, rules, settled=attempt.mapper == GROWN)
+            for attempt, rules in zip(outcome.models, laid_down, strict=True)
+        ]
     followed = [
         follow_shutter(one, matches, database, run.progress, rules)
         for one, rules in zip(adjusted, laid_down, strict=True)

@@ -28,11 +28,13 @@ def test_the_focal_says_how_sure_it_is_and_how_wide_it_sees():
 
 def test_wide_lenses_say_what_they_see():
     wide = camera(fx=400.0, fy=400.0, projection="fisheye", fisheye=(0.0, 0.0, 0.0, 0.0))
+    narrow = camera(fx=900.0, fy=900.0, projection="fisheye", fisheye=(0.0, 0.0, 0.0, 0.0))
     panorama = camera(projection="equirectangular")
 
     assert focal_text(wide) == (
         "Focal length 400 px: a fisheye that sees 143 degrees from left to right, 115 from top to bottom."
     )
+    assert field_text(narrow) == "sees 64 degrees from left to right, 51 from top to bottom"
     assert focal_text(panorama) == "Panoramas of a whole turn, 1000 x 800 px." and center_text(panorama) == ""
     assert verdict(camera(method="given")).startswith("Given: ")
 
