@@ -15,6 +15,7 @@ from scipy.sparse.linalg import cg
 from scipy.spatial.transform import Rotation
 
 from sfm_app.jit import kernel
+from sfm_app.posegraph.folds import find_turns
 from sfm_app.posegraph.groups import DisjointGroups
 from sfm_app.types import PairId
 
@@ -34,6 +35,8 @@ LEAST_ANGLE, LEAST_STEP = 1e-3, 1e-7
 """In radians: smaller angles get no more weight; smaller steps end the search. Chosen by hand; halved and doubled by
 `benchmarks.sensitivity`."""
 
+MOST_TURNS = 20
+"""Most parts of a graph that turn. Chosen by hand."""
 LOOP_BLOCK = 100_000
 """Loops that are checked at once, to bound the memory. Chosen by hand."""
 DENSE_PHOTOS = 400
@@ -63,19 +66,48 @@ def average_rotations(
     turns, strengths = np.array(list(relative.values())), np.array([weights[pair] for pair in relative])
     support = strengths * loop_support(edges, turns, strengths)
     rotations = _propagate_along_tree(len(photos), edges, turns, support)
-    for done in range(SUM_ROUNDS + SQUARE_ROUNDS):
+    rotations = _descend(rotations, edges, turns, strengths, SUM_ROUNDS)
+    rotations = _undo_folds(rotations, edges, turns, strengths)
+    angles = np.degrees(np.linalg.norm(_residuals(rotations, edges, turns), axis=1))
+    return dict(zip(photos, rotations, strict=True)), dict(zip(relative, angles.tolist(), strict=True))
+
+
+def _descend(
+    rotations: FloatArray, edges: IndexArray, turns: FloatArray, strengths: FloatArray, sum_rounds: int
+) -> FloatArray:
+    """Return the rotations (I, 3, 3) that minimize the angles of pairs near given ones."""
+    for done in range(sum_rounds + SQUARE_ROUNDS):
         left = _residuals(rotations, edges, turns)
         angles = np.linalg.norm(left, axis=1)
-        if done < SUM_ROUNDS:
+        if done < sum_rounds:
             factors = strengths / np.maximum(angles, LEAST_ANGLE)
         else:
             factors = strengths / (1.0 + (angles / np.radians(SCALE_DEG)) ** 2) ** 2
-        steps = _solve_steps(len(photos), edges, left, factors)
+        steps = _solve_steps(len(rotations), edges, left, factors)
         rotations = rotations @ Rotation.from_rotvec(steps).as_matrix()
-        if done > SUM_ROUNDS and np.abs(steps).max() < LEAST_STEP:
+        if done > sum_rounds and np.abs(steps).max() < LEAST_STEP:
             break
-    angles = np.degrees(np.linalg.norm(_residuals(rotations, edges, turns), axis=1))
-    return dict(zip(photos, rotations, strict=True)), dict(zip(relative, angles.tolist(), strict=True))
+    return rotations
+
+
+def _undo_folds(rotations: FloatArray, edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> FloatArray:
+    """Return the rotations after parts of the graph have turned to where most pairs want them."""
+    for _ in range(MOST_TURNS):
+        left, best = _residuals(rotations, edges, turns), _robust_cost(rotations, edges, turns, strengths)
+        for turn in find_turns(len(rotations), edges, left, strengths):
+            turned = np.where(turn.photos[:, None, None], rotations @ turn.by, rotations)
+            if _robust_cost(turned, edges, turns, strengths) < best:
+                rotations = _descend(turned, edges, turns, strengths, 0)
+                break
+        else:
+            break
+    return rotations
+
+
+def _robust_cost(rotations: FloatArray, edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> float:
+    """Return the sum of squares that the last rounds minimize."""
+    squares = (np.linalg.norm(_residuals(rotations, edges, turns), axis=1) / np.radians(SCALE_DEG)) ** 2
+    return float(np.sum(strengths * squares / (1.0 + squares)))
 
 
 def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> FloatArray:

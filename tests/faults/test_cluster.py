@@ -22,6 +22,7 @@ needs_time = pytest.mark.skipif("SFM_APP_FAULTS" not in os.environ, reason="`mak
 
 
 def start(folder, out, address):
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # shells let what they start with & ignore it
     command = [sys.executable, "-m", "sfm_app", "run", str(folder.photos), "-o", str(out), *QUICK]
     return subprocess.Popen([*command, "--cluster", address], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
