@@ -125,7 +125,7 @@ def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
     whiten, rank = whiten_points(by_point, bundle.point, len(bundle.X))
     by_point = np.einsum("nki,nji->nkj", by_point, whiten[bundle.point])
     counts = len(bundle.R), len(bundle.params), len(bundle.X)
-    seen = Linearized(bundle.photo, bundle.camera[bundle.photo], bundle.point, r, by_view, by_point, counts)
+    seen = Linearized(bundle.photo, bundle.camera[bundle.photo], bundle.point, by_view, by_point, counts)
     poses, cameras = POSE * len(bundle.R), CAMERA * len(bundle.params)
     S, by_camera = eliminate_points(seen, DAMPING)
     rest = seen.drop_points(r)

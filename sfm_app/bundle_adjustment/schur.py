@@ -21,7 +21,7 @@ IndexArray = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linearized:
-    """Weighted residuals of all observations, and their derivatives; those of a point by it are orthonormal."""
+    """Weighted derivatives of all observations; those of a point by it are orthonormal."""
 
     photo: IndexArray
     """(N,) row of the photo of each observation."""
@@ -29,8 +29,6 @@ class Linearized:
     """(N,) row of its camera."""
     point: IndexArray
     """(N,) row of its point."""
-    r: FloatArray
-    """(N, 2) residuals."""
     by_view: FloatArray
     """(N, 2, 18) derivatives by pose and camera."""
     by_point: FloatArray

@@ -1,6 +1,7 @@
 """What a person sees of a run that goes on, on stderr."""
 
 import time
+from threading import Timer
 
 from rich.console import Console
 from rich.markup import escape
@@ -36,6 +37,7 @@ class Terminal:
         )  # fmt: skip
         self.task: TaskID | None = None
         self.said_s = 0.0
+        self.reminder: Timer | None = None
 
     def stage(self, name: str, note: str = "") -> None:
         """Print the title of a stage.
@@ -71,19 +73,26 @@ class Terminal:
         """
         self.task, self.said_s = self.bars.add_task(escape(label), total=total), time.monotonic()
         self.bars.start()
+        if total == 1 and not self.console.is_terminal:  # it will not advance before its end
+            self.reminder = Timer(LINE_EVERY_S, self.console.print, [f"    [dim]{escape(label)}[/dim]"])
+            self.reminder.daemon = True
+            self.reminder.start()
 
     def advance(self, steps: int = 1) -> None:
         """Move the bar forward by some steps; without a terminal, print a line from time to time."""
         if self.task is None:
             return
         self.bars.advance(self.task, steps)
-        if not self.console.is_terminal and time.monotonic() - self.said_s >= LINE_EVERY_S:
+        if self.reminder is None and not self.console.is_terminal and time.monotonic() - self.said_s >= LINE_EVERY_S:
             self.said_s = time.monotonic()
             now = next(task for task in self.bars.tasks if task.id == self.task)
             self.console.print(f"    [dim]{now.description} {progress_text(now)}[/dim]")
 
     def finish(self) -> None:
         """Remove the bar."""
+        if self.reminder is not None:
+            self.reminder.cancel()
+            self.reminder = None
         if self.task is not None:
             self.bars.stop()
             self.bars.remove_task(self.task)

@@ -58,6 +58,7 @@ class Part:
 
     path: Path
     count: int
+    """Photos or pairs of which no progress has been shown."""
     in_force: Mapping[str, Json]
     """COLMAP's options."""
 
@@ -133,7 +134,7 @@ def match_chunk_apart(inputs: SiftInputs, group: ProcessGroup, progress: Progres
         "pairs": [list(pair) for pair in pairs],
     }  # fmt: skip
     said = group.run("sfm_app.colmap.processes.match_process", task, "matching photos", progress)
-    return Part(Path(str(said["path"])), len(pairs), cast(Mapping[str, Json], said["in_force"]))
+    return Part(Path(str(said["path"])), 0, cast(Mapping[str, Json], said["in_force"]))
 
 
 def enter_rows(database: Path, part: Path, tables: Sequence[str]) -> None:

@@ -93,10 +93,10 @@ def _descend(
 def _undo_folds(rotations: FloatArray, edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> FloatArray:
     """Return the rotations after parts of the graph have turned to where most pairs want them."""
     for _ in range(MOST_TURNS):
-        left, best = _residuals(rotations, edges, turns), _robust_cost(rotations, edges, turns, strengths)
+        left = _residuals(rotations, edges, turns)
         for turn in find_turns(len(rotations), edges, left, strengths):
             turned = np.where(turn.photos[:, None, None], rotations @ turn.by, rotations)
-            if _robust_cost(turned, edges, turns, strengths) < best:
+            if _robust_cost(_residuals(turned, edges, turns), strengths) < _robust_cost(left, strengths):
                 rotations = _descend(turned, edges, turns, strengths, 0)
                 break
         else:
@@ -104,9 +104,9 @@ def _undo_folds(rotations: FloatArray, edges: IndexArray, turns: FloatArray, str
     return rotations
 
 
-def _robust_cost(rotations: FloatArray, edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> float:
+def _robust_cost(left: FloatArray, strengths: FloatArray) -> float:
     """Return the sum of squares that the last rounds minimize."""
-    squares = (np.linalg.norm(_residuals(rotations, edges, turns), axis=1) / np.radians(SCALE_DEG)) ** 2
+    squares = (np.linalg.norm(left, axis=1) / np.radians(SCALE_DEG)) ** 2
     return float(np.sum(strengths * squares / (1.0 + squares)))
 
 

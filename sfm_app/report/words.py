@@ -24,7 +24,7 @@ def field_text(camera: Calibration) -> str:
     across, down = field_of_view_deg(camera)
     seen = f"sees {across:.0f} degrees from left to right, {down:.0f} from top to bottom"
     # through a narrow field both families are the same lens, in other numbers
-    return f"a fisheye that {seen}" if camera.projection == FISHEYE and across >= WIDE_DEG else seen
+    return f"a fisheye that {seen}" if camera.projection == FISHEYE and max(across, down) >= WIDE_DEG else seen
 
 
 def verdict(camera: Calibration) -> str:

@@ -151,8 +151,7 @@ def _do_in_chunks(
         for found in ordered_map(run.executor, prepare(inputs), parts, ahead=run.workers):
             enter_rows(place.database, found.path, tables)
             in_force |= found.in_force
-            if tables is FEATURES or run.spread:
-                run.progress.advance(found.count)
+            run.progress.advance(found.count)
     finally:
         run.progress.finish()
         shutil.rmtree(folder, ignore_errors=True)

@@ -19,8 +19,8 @@ def bundle():
         rows = np.flatnonzero(point == p)
         columns = min(3, 2 * len(rows))
         by_point[rows, :, :columns] = np.linalg.qr(rng.normal(size=(2 * len(rows), columns)))[0].reshape(-1, 2, columns)
-    r, by_view = rng.normal(size=(SEEN, 2)), rng.normal(size=(SEEN, 2, 18))
-    return Linearized(photo, photo % CAMERAS, point, r, by_view, by_point, (PHOTOS, CAMERAS, POINTS))
+    by_view = rng.normal(size=(SEEN, 2, 18))
+    return Linearized(photo, photo % CAMERAS, point, by_view, by_point, (PHOTOS, CAMERAS, POINTS))
 
 
 def dense(bundle):
@@ -71,7 +71,7 @@ def test_scores_are_the_shares_of_the_photos_in_what_is_left(bundle):
 
 def test_a_bundle_of_nothing_leaves_the_damping():
     none = np.empty(0, np.int64)
-    empty = Linearized(none, none, none, np.zeros((0, 2)), np.zeros((0, 2, 18)), np.zeros((0, 2, 3)), (2, 1, 0))
+    empty = Linearized(none, none, none, np.zeros((0, 2, 18)), np.zeros((0, 2, 3)), (2, 1, 0))
 
     S, rows = eliminate_points(empty, DAMPING)
 

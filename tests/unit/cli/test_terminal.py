@@ -1,4 +1,5 @@
 import io
+import time
 
 import pytest
 from rich.console import Console
@@ -64,3 +65,16 @@ def test_the_end_of_a_stage_tells_its_speed_where_it_took_long(shown):
 
 def test_slow_work_has_two_digits():
     assert [per_minute(1.0), per_minute(0.05), per_minute(0.17)] == ["60", "3.0", "10"]
+
+
+def test_work_that_cannot_be_measured_is_named_once_it_takes_long(shown, monkeypatch):
+    display, paper = shown
+    monkeypatch.setattr(terminal, "LINE_EVERY_S", 0.1)
+    for label, seconds in (("adjusting", 0.5), ("joining", 0.0)):
+        display.start(label, 1)
+        time.sleep(seconds)
+        display.advance()
+        display.finish()
+    time.sleep(0.3)
+
+    assert paper.getvalue().split() == ["adjusting"]
