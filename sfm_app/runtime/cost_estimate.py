@@ -59,7 +59,7 @@ class Plan:
         workers = f"{self.workers} worker{'s' if self.workers > 1 else ''}"
         hard = "; hard photos take longer" if "scene" in names else ""
         cost = f"about {how_long} and up to {gigabytes:.1f} GB with {workers}{hard}"
-        return f"{self.photos} photos, {self.pairs} pairs: {cost}"
+        return f"{self.photos} photos, {self.pairs} pair{'' if self.pairs == 1 else 's'}: {cost}"
 
 
 def largest_photo_megapixels(limit_mb: float) -> float:

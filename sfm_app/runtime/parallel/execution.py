@@ -56,6 +56,9 @@ def open_executor(settings: Settings, folder: Path, progress: Progress) -> Itera
             yield threads, workers
         return
     workers = local_workers(settings.cluster.address) or worker_count(settings.workers)
+    if not local_workers(settings.cluster.address):
+        waits = f"it may take {settings.cluster.wait_s:.0f} seconds to answer"
+        progress.say(f"looking for the cluster {settings.cluster.address}; {waits}")
     with connect(settings.cluster, folder) as cluster:
         others = cluster.check_versions()
         progress.say(f"{cluster.threads()} workers of the cluster {cluster.address}")
