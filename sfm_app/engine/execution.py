@@ -150,7 +150,7 @@ class _Execution:
             set_aside(stages, self.run)
         earlier = find_earlier(stages, photos, self.first, self.run)
         if earlier is not None and any(reasons.get(name) is not None for name in earlier.stages):
-            self.run.progress.say(earlier.text)
+            self.run.progress.say(f"{earlier.text}; from the start, all of them would cost this:")
             logger.info("%s: stages %s go on from an earlier run", earlier.text, ", ".join(earlier.stages))
         return earlier
 

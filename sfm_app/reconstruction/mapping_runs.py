@@ -178,6 +178,8 @@ def choice_reason(best: Attempt, found: Sequence[MappingResult], photos: int) ->
     if _is_flawless(best, photos):
         return f"it places all {photos} photos and next to nothing contradicts it"
     others = [attempt for attempt in found if isinstance(attempt, Attempt) and attempt is not best]
+    if len(found) == 1:
+        return "it explains enough to need no other way"
     if not others:
         return "nothing else gave a model"
     rival = max(others, key=lambda attempt: attempt.support)

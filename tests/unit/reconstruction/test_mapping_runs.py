@@ -141,6 +141,7 @@ def test_why_a_model_was_taken_is_said():
 
     assert choice_reason(best, [best, nothing], 10) == "it places all 10 photos and next to nothing contradicts it"
     assert choice_reason(contradicted, [contradicted, nothing], 10) == "nothing else gave a model"
+    assert choice_reason(contradicted, [contradicted], 10) == "it explains enough to need no other way"
     assert (
         choice_reason(best, [rival, best], 11) == "it explains 2000 matches with 10 photos, the next best 1800 with 9"
     )
