@@ -8,20 +8,24 @@ cal = sfm_app.calibrate_fundamentals(Fs, (width, height))
 lens = sfm_app.estimate_lens(matches, (width, height))
 """
 
+from importlib import import_module
 from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
 
-from sfm_app.api import (
-    Run,
-    calibrate_fundamentals,
-    calibrate_photos,
-    estimate_fundamental,
-    estimate_lens,
-    export_model,
-    reconstruct,
-)
 from sfm_app.errors import BackendError, ConfigError, InputError, PluginError, ReconstructionError, SfmError
-from sfm_app.settings import Settings
 from sfm_app.types import Calibration, EpipolarFit, Intrinsics, Rejected
+
+if TYPE_CHECKING:
+    from sfm_app.api import (
+        Run,
+        calibrate_fundamentals,
+        calibrate_photos,
+        estimate_fundamental,
+        estimate_lens,
+        export_model,
+        reconstruct,
+    )
+    from sfm_app.settings import Settings
 
 __version__ = version("sfm-app")
 
@@ -46,3 +50,16 @@ __all__ = [
     "export_model",
     "reconstruct",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Return a public function, loaded when it is first asked for: COLMAP's processes save the second that it takes."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = import_module("sfm_app.settings" if name == "Settings" else "sfm_app.api")
+    return getattr(module, name)
+
+
+def __dir__() -> list[str]:
+    """List the public names, loaded or not."""
+    return __all__

@@ -4,13 +4,15 @@
     python -m benchmarks.many.pairs DATA --cache CACHE --sets temple16 --rendered 0
 
 Sets of DATA, and evenly spaced photos of the rendered statue at 12 megapixels. Small sets are told to take few partners
-a photo: with the default of 30, retrieval would take all pairs of them. One unmeasured run compiles the kernels.
+a photo: with the default of 30, retrieval would take all pairs of them. One unmeasured run of a few photos compiles the
+kernels.
 """
 
 import argparse
 import json
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,7 @@ from benchmarks.cameras.methods import Method, run
 from benchmarks.cameras.score import TruePhoto, accuracy, read_models, true_photos
 from benchmarks.cameras.worker import OURS
 from benchmarks.common.command_line import new_parser
-from benchmarks.common.photo_sets import PhotoSet, photo_set, steps
+from benchmarks.common.photo_sets import PhotoSet, link_or_copy, photo_set, steps
 from benchmarks.common.results import RESULTS, Row, document, finite_or_none, table, write
 from benchmarks.corpus.score import OFFSETS, offset_figures
 from benchmarks.hundred.command import PHOTOS, SMALL, photo_folder
@@ -35,6 +37,8 @@ ABOUT = (
 SETS = ("fountain-P11", "Herz-Jesus-P8", "castle-P19", "temple16", "kitchen1000 every:5")
 PARTNER_SHARE, LEAST_PARTNERS = 1 / 3, 4
 """Partners of each photo as a share of the photos, in sets that are smaller than the default number of partners."""
+FEW_PHOTOS = 10
+"""Photos of the first set that compile the kernels."""
 ALL, RETRIEVAL = "all", "retrieval"
 COLUMNS = ("photos", "pairs", "matched", "of pairs", "placed", "AUC@1", "AUC@5", "median center cm", "CPU s",
            "CPU / all", "failed")  # fmt: skip
@@ -65,6 +69,15 @@ def photo_sets(args: argparse.Namespace) -> Iterator[tuple[PhotoSet, dict[str, T
         yield real_set(title, args.data, args.cache)
     if args.rendered:
         yield rendered_set(args.rendered, args.cache)
+
+
+def first_photos(photos: PhotoSet, cache: Path) -> PhotoSet:
+    """Return a few photos of a set that lie beside each other."""
+    folder = cache / "pairs" / "few"
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in sorted(photos.folder.iterdir())[:FEW_PHOTOS]:
+        link_or_copy(path, folder)
+    return replace(photos, folder=folder)
 
 
 def measure(photos: PhotoSet, truth: Mapping[str, TruePhoto], choice: str, cache: Path) -> Row:
@@ -126,7 +139,7 @@ def main() -> None:
     args = parser().parse_args()
     rows: list[Row] = []
     sets = list(photo_sets(args))
-    warm_up([photos for photos, _ in sets], [Method(OURS)], args.cache / "pairs" / "warm-up")
+    warm_up([first_photos(sets[0][0], args.cache)], [Method(OURS)], args.cache / "pairs" / "warm-up")
     for photos, truth in sets:
         for row in compare(photos, truth, args.cache):
             rows.append({key: finite_or_none(value) for key, value in row.items()})

@@ -46,6 +46,8 @@ PHOTOS, STEP_M, PART, WHOLE = 300, 0.75, 80, 100_000
 """Photos of the walk, meters between them, photos of a part, and a part that is larger than any set."""
 ROBUST_M = 0.02
 """Scale of the robust fit of the two cameras of a rig, in radians and meters."""
+FOLDED_M = 2.0
+"""A photo farther off than this, a sixth of the width of a street, stands in a wrong place. Chosen by hand."""
 ABOUT = (
     "Mapping of the same match graph as a whole and in parts, up to the last adjustment. CPU: seconds of all processes "
     "from relative poses on. Centers: distances in meters after the best similarity (kitchen1000: and the offset "
@@ -166,6 +168,7 @@ def pose_errors(found: Mapping[str, Pose], truth: Mapping[str, Pose], *, rig: bo
         "center m": float(np.median(off)),
         "90 %": float(np.percentile(off, 90)),
         "worst": float(off.max()),
+        "folded": int((off > FOLDED_M).sum()),
         "rotation deg": float(np.degrees(np.median(np.linalg.norm(rest[0], axis=1)))),
     }
 

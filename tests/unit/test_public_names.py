@@ -35,9 +35,26 @@ def test_a_method_that_does_not_exist_is_refused_before_any_work(tmp_path):
 def test_the_import_leaves_out_what_an_estimator_does_not_need():
     heavy = {"cv2", "open3d", "pycolmap", "trimesh", "matplotlib", "PIL", "rich"}
     heavy |= {"scipy.optimize", "scipy.sparse", "scipy.spatial"}
-    lists = "import sys, sfm_app; print(*sys.modules)"
+    lists = "import sys, sfm_app; sfm_app.estimate_fundamental; print(*sys.modules)"
 
     done = subprocess.run([sys.executable, "-c", lists], capture_output=True, text=True, check=True)
 
     assert "sfm_app.ransac.estimate" in done.stdout.split()
     assert heavy.isdisjoint(done.stdout.split())
+
+
+@pytest.mark.slow
+def test_the_processes_of_colmap_do_not_load_the_estimators():
+    heavy = {"numba", "sfm_app.api", "sfm_app.plugins", "sfm_app.ransac"}
+    lists = "import sys, sfm_app.colmap.processes.match_process; print(*sys.modules)"
+
+    done = subprocess.run([sys.executable, "-c", lists], capture_output=True, text=True, check=True)
+
+    assert "pycolmap" in done.stdout.split()
+    assert heavy.isdisjoint(done.stdout.split())
+
+
+def test_the_package_lists_what_it_loads_later():
+    assert set(dir(sfm_app)) == set(sfm_app.__all__)
+    assert all(hasattr(sfm_app, name) for name in sfm_app.__all__)
+    assert not hasattr(sfm_app, "no_such_name")
