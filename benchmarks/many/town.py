@@ -27,12 +27,12 @@ from sfm_app.synthetic.town.photos import TownPhotos, town_of, town_views
 ABOUT = (
     "`sfm-app run` on the first photos of a walk through a rendered town, as a user types it, with two workers. "
     "Centers: distances in meters after the best similarity, median, 90 % and worst; folded: photos that are more than "
-    f"{FOLDED_M:g} m off. A column of a stage: CPU seconds of all processes per photo. MB: most memory of any stage "
+    f"{FOLDED_M:g} m off. CPU of a stage: seconds of all processes per photo. MB: most memory of any stage "
     "with its processes."
 )
 STAGES = ("photos", "match_graph", "view_graph", "intrinsics", "scene", "depth_maps", "mesh", "texture")
 COLUMNS = ("photos", "of pairs", "placed", "models", "parts", "focal %", "center m", "90 %", "worst", "folded",
-           *STAGES, "CPU per photo", "minutes", "MB", "failed")  # fmt: skip
+           *(f"CPU {name}" for name in STAGES), "CPU per photo", "minutes", "MB", "failed")  # fmt: skip
 
 
 def render(views: Views, options: TownPhotos, folder: Path) -> None:
@@ -92,7 +92,7 @@ def scene_figures(stages: dict[str, Any], out: Path, camera: Camera, views: View
 def cost_figures(stages: dict[str, Any], count: int) -> Row:
     """Return CPU seconds per photo of every stage, and minutes and memory of all."""
     spent = {name: stage["cpu_seconds"] / count for name, stage in stages.items()}
-    return spent | {
+    return {f"CPU {name}": seconds for name, seconds in spent.items()} | {
         "CPU per photo": sum(spent.values()),
         "minutes": sum(stage["seconds"] for stage in stages.values()) / 60.0,
         "MB": max(stage["peak_mb"] for stage in stages.values()),

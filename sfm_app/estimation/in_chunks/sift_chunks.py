@@ -4,7 +4,6 @@ COLMAP's matcher loses matches now and then where several threads of a process m
 or two pairs differ in half of the runs. So each process has one thread.
 """
 
-import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -28,6 +27,7 @@ from sfm_app.colmap.part_databases import (
     write_snapshot,
 )
 from sfm_app.colmap.processes.worker_process import ProcessGroup, SiftOption
+from sfm_app.estimation.in_chunks.pair_chunks import cut_pairs
 from sfm_app.numerical import Json
 from sfm_app.progress import Progress, SilentProgress
 from sfm_app.runtime.context import RunContext
@@ -109,14 +109,10 @@ class _PairCounter(SilentProgress):
             self._progress.advance(steps)
 
 
-def _chunks_of_pairs(pairs: Sequence[PairId], features: Sequence[int], workers: int) -> list[Sequence[PairId]]:
+def _chunks_of_pairs(pairs: Sequence[PairId], features: Sequence[int], workers: int) -> list[list[PairId]]:
     """Return pairs in chunks of few photos each."""
     pair_s = FEATURE_S * max(sum(features) / max(len(features), 1), 1.0)
-    most = min(max(int(CHUNK_S / pair_s), LEAST_PAIRS), MOST_PAIRS)
-    rank = {photo: place for place, photo in enumerate(sorted({photo for pair in pairs for photo in pair}))}
-    side = math.isqrt(most)
-    in_squares = sorted(pairs, key=lambda pair: (*sorted(rank[photo] // side for photo in pair), *sorted(pair)))
-    return chunks(in_squares, most, workers)
+    return cut_pairs(pairs, chunk_size(len(pairs), min(max(int(CHUNK_S / pair_s), LEAST_PAIRS), MOST_PAIRS), workers))
 
 
 def chunks(items: Sequence[Item], most: int, workers: int) -> list[Sequence[Item]]:
@@ -127,9 +123,20 @@ def chunks(items: Sequence[Item], most: int, workers: int) -> list[Sequence[Item
         most: items of a chunk.
         workers: that share the chunks.
     """
-    rounds = -(-len(items) // (most * max(1, workers)))
-    size = max(1, -(-len(items) // max(1, rounds * workers)))
+    size = chunk_size(len(items), most, workers)
     return [items[first : first + size] for first in range(0, len(items), size)]
+
+
+def chunk_size(count: int, most: int, workers: int) -> int:
+    """Return the items of each chunk, so that workers get as many chunks.
+
+    Args:
+        count: items to cut.
+        most: items of a chunk.
+        workers: that share the chunks.
+    """
+    rounds = -(-count // (most * max(1, workers)))
+    return max(1, -(-count // max(1, rounds * workers)))
 
 
 def _do_in_chunks(
