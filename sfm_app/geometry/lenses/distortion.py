@@ -13,11 +13,11 @@ from sfm_app.types.calibration import FISHEYE
 FloatArray = NDArray[np.float64]
 
 NEWTON_STEPS, LEAST_SLOPE = 30, 0.05
-"""Steps of Newton's method for the radius, and the least slope of the distorted radius: below it the lens is near its
+"""Most steps of Newton's method for the radius, and the least slope of the distorted radius: below it the lens is near its
 fold. Chosen by hand; not measured on their own."""
 SHIFT_STEPS, PRECISION = 50, 1e-13
-"""Most steps by which the terms that are not radial are taken out, and the change below which they end, in focal
-lengths. Counted: each step multiplies the error by about twice the radius times p1, which is 0.01 at most."""
+"""Most steps by which the terms that are not radial are taken out, and the change below which these and Newton's steps
+end, in focal lengths. Counted: each step multiplies the error by about twice the radius times p1, 0.01 at most."""
 LARGEST_RADIUS, RADII = 12.0, 2048
 """Radius up to which a fold is sought, in focal lengths, and number of radii: 85 degrees of a perspective lens, and
 more than any fisheye. Chosen by hand; not measured on their own."""
@@ -60,6 +60,8 @@ def undistort(points: FloatArray, terms: FloatArray, projection: str) -> FloatAr
     """
     fold = fold_radius(terms, projection)
     w = _undistort_radius(points, terms, projection, fold)
+    if not terms[[2, 3, 6, 7]].any():
+        return w
     for _ in range(SHIFT_STEPS):
         before, w = w, _undistort_radius(points - _shift(w, terms, projection), terms, projection, fold)
         if np.max(np.abs(w - before), initial=0.0) < PRECISION:
@@ -78,7 +80,9 @@ def _undistort_radius(points: FloatArray, terms: FloatArray, projection: str, fo
         low, high = np.where(error < 0.0, r, low), np.where(error > 0.0, r, high)
         ahead = (r + step) * radial_factor(r + step, terms, projection) - distorted
         tried = r - error / np.maximum((ahead - error) / step, LEAST_SLOPE)
-        r = np.where((tried >= low) & (tried <= high), tried, 0.5 * (low + high))
+        before, r = r, np.where((tried >= low) & (tried <= high), tried, 0.5 * (low + high))
+        if np.max(np.abs(r - before), initial=0.0) < PRECISION:
+            break
     return np.asarray(points * np.divide(r, distorted, out=np.ones_like(r), where=distorted > 0.0)[:, None])
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sfm_app.geometry.lenses import distortion
 from sfm_app.geometry.lenses.distortion import fold_radius, radial_factor, undistort
 from sfm_app.geometry.lenses.projections import project_points
 
@@ -31,3 +32,15 @@ def test_points_beyond_the_fold_lie_on_it():
     w = undistort(np.array([[0.5, 0.0], [5.0, 0.0]]), terms, "perspective")
     assert w[1, 0] == pytest.approx(fold, rel=1e-6)
     assert w[0, 0] * float(radial_factor(w[:1, 0], terms, "perspective")[0]) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("projection", FAMILIES)
+@pytest.mark.parametrize("shifted", [False, True])
+def test_steps_end_where_more_of_them_change_nothing(projection, shifted, monkeypatch):
+    terms = TERMS * ([1.0] * 8 if shifted else [1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
+    points = np.random.default_rng(1).uniform(-1.5, 1.5, (500, 2))
+    monkeypatch.setattr(distortion, "PRECISION", 0.0)
+    exact = undistort(points, terms, projection)
+    monkeypatch.undo()
+
+    assert np.abs(undistort(points, terms, projection) - exact).max() <= 1e-14
