@@ -13,8 +13,8 @@ from sfm_app.types.calibration import FISHEYE
 FloatArray = NDArray[np.float64]
 
 NEWTON_STEPS, LEAST_SLOPE = 30, 0.05
-"""Most steps of Newton's method for the radius, and the least slope of the distorted radius: below it the lens is near its
-fold. Chosen by hand; not measured on their own."""
+"""Most steps of Newton's method for the radius, and the least slope of the distorted radius: below it the lens is near
+its fold. Chosen by hand; not measured on their own."""
 SHIFT_STEPS, PRECISION = 50, 1e-13
 """Most steps by which the terms that are not radial are taken out, and the change below which these and Newton's steps
 end, in focal lengths. Counted: each step multiplies the error by about twice the radius times p1, 0.01 at most."""
