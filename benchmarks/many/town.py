@@ -20,6 +20,8 @@ from benchmarks.many.blocks import WORKERS, camera_size
 from benchmarks.many.parts import FOLDED_M, pose_errors
 from sfm_app.colmap.model import poses_and_points
 from sfm_app.colmap.types import Reconstruction
+from sfm_app.pipeline import NAMES
+from sfm_app.settings import QUALITY_PRESETS
 from sfm_app.synthetic.cameras import Camera, Views, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, add_missing_photos
 from sfm_app.synthetic.town.photos import TownPhotos, town_of, town_views
@@ -30,7 +32,7 @@ ABOUT = (
     f"{FOLDED_M:g} m off. CPU of a stage: seconds of all processes per photo. MB: most memory of any stage "
     "with its processes."
 )
-STAGES = ("photos", "match_graph", "view_graph", "intrinsics", "scene", "depth_maps", "mesh", "texture")
+STAGES = NAMES[: NAMES.index("texture") + 1]
 COLUMNS = ("photos", "of pairs", "placed", "models", "parts", "focal %", "center m", "90 %", "worst", "folded",
            *(f"CPU {name}" for name in STAGES), "CPU per photo", "minutes", "MB", "failed")  # fmt: skip
 
@@ -77,14 +79,14 @@ def scene_figures(stages: dict[str, Any], out: Path, camera: Camera, views: View
     found = {model.images[key].name: pose for key, pose in poses_and_points(model)[0].items()}
     errors = pose_errors(found, views.cam_from_world, rig=False)
     pairs = len(names) * (len(names) - 1) / 2
-    (known,) = stages["intrinsics"]["counts"]["cameras"].values()
+    cameras = stages["intrinsics"]["counts"]["cameras"].values()
     parts = [len(group["parts"]) for group in scene.get("parts", [])]
     return {
         "of pairs": stages["match_graph"]["counts"].get("matched_pairs", pairs) / pairs,
         "placed": scene["registered"],
         "models": 1 + len(scene["other_models"]),
         "parts": sum(parts),
-        "focal %": 100.0 * abs(known["fx"] / camera.K[0, 0] - 1.0),
+        "focal %": max(100.0 * abs(one["fx"] / camera.K[0, 0] - 1.0) for one in cameras),
         **errors,
     }
 
@@ -107,8 +109,8 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--step", type=float, default=TownPhotos().step_m, help="meters between two photos")
     parser.add_argument("--seed", type=int, default=0, help="of the town and the walk")
     parser.add_argument("--megapixels", type=float, default=3.0)
-    parser.add_argument("--quality", default="draft")
-    parser.add_argument("--until", default="texture")
+    parser.add_argument("--quality", default="draft", choices=tuple(QUALITY_PRESETS))
+    parser.add_argument("--until", default="texture", choices=STAGES[STAGES.index("scene") :])
     parser.add_argument("--max-memory", type=float, default=12, help="GB")
     parser.add_argument("--cache", type=Path, required=True, help="keeps the rendered photos and the runs")
     parser.add_argument("--results", type=Path, default=RESULTS)

@@ -157,7 +157,10 @@ def _estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors, fr
     moved, held = _apply_step(params, step.reshape(params.shape), priors.sides)
     moved[absent] = priors.usual[absent]
     moved[priors.fixed], held[priors.fixed], deviations[priors.fixed] = params[priors.fixed], False, 0.0
-    deviations[held] = np.maximum(deviations[held], _prior_deviations(params, priors)[held])
+    prior, stays = _prior_deviations(params, priors), priors.parameter_mask(priors.asked) & ~changing
+    deviations[held] = np.maximum(deviations[held], prior[held])
+    # photos make nothing less certain than it was: more than that is rounding, where nearly all of H cancels
+    deviations[stays] = np.minimum(deviations, np.hypot(prior, away))[stays]
     determined[held] = False
     return LensEstimate(
         np.where(held[:, None], params, moved), deviations, free & determined, determined,

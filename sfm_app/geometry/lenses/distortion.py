@@ -60,7 +60,7 @@ def undistort(points: FloatArray, terms: FloatArray, projection: str) -> FloatAr
     """
     fold = fold_radius(terms, projection)
     w = _undistort_radius(points, terms, projection, fold)
-    if not terms[[2, 3, 6, 7]].any():
+    if not _shift(w, terms, projection).any():
         return w
     for _ in range(SHIFT_STEPS):
         before, w = w, _undistort_radius(points - _shift(w, terms, projection), terms, projection, fold)
