@@ -38,15 +38,22 @@ class Partition:
     boxes: FloatArray
     """(B, 2, 3) lowest and highest coordinates of each block; infinite at the outside."""
 
-    def contains(self, number: int, points: FloatArray) -> NDArray[np.bool_]:
-        """Return (N,) whether points lie in a block.
+    def find_blocks(self, points: FloatArray) -> NDArray[np.intp]:
+        """Return (N,) the number of the block in which each point lies.
 
         Args:
-            number: of the block.
             points: (N, 3).
         """
-        low, high = self.boxes[number]
-        return np.asarray(((points >= low) & (points < high)).all(axis=1))
+        found = np.empty(len(points), np.intp)
+        waiting: list[tuple[Split | int, NDArray[np.intp]]] = [(self.root, np.arange(len(points)))]
+        while waiting:
+            node, inside = waiting.pop()
+            if isinstance(node, Split):
+                low = points[inside, node.axis] < node.at
+                waiting += [(node.low, inside[low]), (node.high, inside[~low])]
+            else:
+                found[inside] = node
+        return found
 
     def planes(self) -> list[tuple[int, float]]:
         """Return axis and coordinate of all planes between blocks, those of the first cuts first."""

@@ -103,13 +103,14 @@ def plan_fusion(
     samples = run.map(Task(sample_points, dense_dir), bare, "measuring depths")
     inside = [part[((part >= whole[0]) & (part <= whole[1])).all(axis=1)] for part in samples]
     partition = split_points(np.concatenate(inside), -(-pixels // MOST_PIXELS))
+    seen = [set(partition.find_blocks(part).tolist()) for part in inside]
     memory_gb = cache_gb(run.memory_mb) / run.workers
     return [
         FusionTask(
             dense_dir,
             folder,
             number,
-            [view for view, part in zip(bare, inside, strict=True) if partition.contains(number, part).any()],
+            [view for view, blocks in zip(bare, seen, strict=True) if number in blocks],
             np.stack([np.maximum(box[0], whole[0]), np.minimum(box[1], whole[1])]),
             min_views,
             memory_gb,

@@ -1,7 +1,7 @@
 """The surface in blocks: each is a task of its own, and they are joined along their faces.
 
-A block reads the fused points and the depth maps, and writes its surface into a file; a killed run resumes at the
-blocks that are missing.
+A block reads the fused points in and around it and the depth maps, and writes its surface into a file; a killed run
+resumes at the blocks that are missing.
 """
 
 import shutil
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.colmap.dense import read_depth
-from sfm_app.colmap.surface import FUSED, open_points, poisson_surface, positions, write_points
+from sfm_app.colmap.surface import FUSED, poisson_surface, positions, write_points
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.culling import Clusters, border_angle
 from sfm_app.geometry.triangles import select_faces
@@ -23,7 +23,6 @@ from sfm_app.hashing import fingerprint, load_arrays
 from sfm_app.meshing import drop_islands, make_manifold, trim
 from sfm_app.meshing.blocks.partition import (
     Cube,
-    Partition,
     Split,
     cell_sizes,
     cube_around,
@@ -36,6 +35,7 @@ from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_count, block_workers
 from sfm_app.settings import MeshSettings
 from sfm_app.stages.blocks.judging import SurfaceJudge, simplify_mesh
+from sfm_app.stages.blocks.points import BlockPoints, sort_points
 from sfm_app.stereo import View
 from sfm_app.tasks import Task
 from sfm_app.types import Surface
@@ -53,8 +53,8 @@ AT_PLANE = 2.0
 """Cells from a plane within which small holes are cracks from joining. Chosen by hand."""
 MOST_LEVELS = 20
 """Of the grid over all points; blocks with more than `poisson_depth` levels get coarser cells. Chosen by hand."""
-CHUNK = 4_000_000
-"""Points that are read at once."""
+SAMPLE = 4_000_000
+"""Points, at most twice as many, by which the blocks are laid out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,8 +63,8 @@ class BlockTask:
 
     folder: Path
     """Where its files go."""
-    fused: Path
-    """The points of all blocks."""
+    points: BlockPoints
+    """Those of all blocks."""
     dense_dir: Path
     views: Sequence[View]
     """The photos that may see it."""
@@ -106,15 +106,16 @@ def mesh_in_blocks(
     made_from = fingerprint(run.fingerprint, len(points), options.model_dump())
     if not resume_or_clear(folder, made_from):
         mark_unfinished(folder, made_from)
-    partition = split_points(_sample(points), block_count(len(points), options))
-    bounds = _bounds(points, partition)
-    cell = choose_cell(points, partition, bounds, options.poisson_depth)
-    bounds = _with_halo(bounds, cell)
+    with run.step("sorting the points"):
+        partition = split_points(_sample(points), block_count(len(points), options))
+        own = sort_points(points, partition, folder)
+        cell = choose_cell(own, options.poisson_depth)
+    bounds = _with_halo(own.bounds, cell)
     cubes = [cube_around(low, high, cell) for low, high in bounds]
     farthest = run.map(Task(farthest_depth, dense_dir), views, "measuring depths")
     seers = _photos_in_reach(views, farthest, bounds)
     tasks = [
-        BlockTask(folder, place / FUSED, dense_dir, seers[k], k, bounds[k], cell, cubes[k], options,
+        BlockTask(folder, own, dense_dir, seers[k], k, bounds[k], cell, cubes[k], options,
                   run.settings.depth.consistency, least)
         for k in range(len(cubes))
     ]  # fmt: skip
@@ -158,17 +159,11 @@ def mesh_block(task: BlockTask) -> int:
 
 def _write_block_points(task: BlockTask, path: Path) -> None:
     """Write the points of a block and its halo, and two more that make Poisson's cube the one on the common grid."""
-    points = open_points(task.fused)
-    anchors = np.zeros(2, points.dtype)
+    anchors = np.zeros(2, task.points.fields)
     for axis, name in enumerate("xyz"):
         anchors[name] = task.cube.anchors[:, axis]
         anchors[f"n{name}"] = 3.0**-0.5
-    parts = [anchors]
-    for start in range(0, len(points), CHUNK):
-        chunk = np.asarray(points[start : start + CHUNK])
-        where = positions(chunk)
-        parts.append(chunk[((where >= task.bounds[0]) & (where <= task.bounds[1])).all(axis=1)])
-    write_points(np.concatenate(parts), path)
+    write_points(np.concatenate([anchors, task.points.read_box(task.bounds)]), path)
 
 
 def join_blocks(node: Split | int, tasks: Sequence[BlockTask], cell: float) -> tuple[Surface, int]:
@@ -187,29 +182,22 @@ def join_blocks(node: Split | int, tasks: Sequence[BlockTask], cell: float) -> t
     return joined, here + lost + also
 
 
-def choose_cell(points: NDArray[np.void], partition: Partition, bounds: FloatArray, most: int) -> float:
+def choose_cell(points: BlockPoints, most: int) -> float:
     """Return the side of the finest cells: as `octree_depth` has it, but with an octree for each block.
 
     Args:
-        points: (N,) records of the fused points.
-        partition: the blocks.
-        bounds: (B, 2, 3) of the points of each block.
+        points: of all blocks.
         most: greatest depth of a block's octree.
     """
+    bounds = points.bounds
+    count = sum(len(points.read(number)) for number in range(len(bounds)))
     extent = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
     cell = extent
     for cell in cell_sizes(extent, MOST_LEVELS):
         if max(cube_around(low, high, cell).depth for low, high in _with_halo(bounds, cell)) > most:
             continue
-        occupied = 0
-        for number in range(len(bounds)):
-            parts = [
-                own[partition.contains(number, own)]
-                for start in range(0, len(points), CHUNK)
-                for own in [positions(points[start : start + CHUNK])]
-            ]
-            occupied += occupied_cells(np.concatenate(parts), cell)
-        if len(points) >= MIN_POINTS * occupied:
+        occupied = sum(occupied_cells(positions(points.read(number)), cell) for number in range(len(bounds)))
+        if count >= MIN_POINTS * occupied:
             break
     return cell
 
@@ -225,19 +213,7 @@ def farthest_depth(dense_dir: Path, view: View) -> float:
 
 
 def _sample(points: NDArray[np.void]) -> FloatArray:
-    return positions(points[:: max(1, len(points) // CHUNK)])
-
-
-def _bounds(points: NDArray[np.void], partition: Partition) -> FloatArray:
-    """Return (B, 2, 3) lowest and highest coordinates of the points of each block."""
-    found = np.stack([np.full((len(partition.boxes), 3), np.inf), np.full((len(partition.boxes), 3), -np.inf)], axis=1)
-    for start in range(0, len(points), CHUNK):
-        chunk = positions(points[start : start + CHUNK])
-        for number in range(len(found)):
-            own = chunk[partition.contains(number, chunk)]
-            found[number, 0] = np.minimum(found[number, 0], own.min(axis=0, initial=np.inf))
-            found[number, 1] = np.maximum(found[number, 1], own.max(axis=0, initial=-np.inf))
-    return found
+    return positions(points[:: max(1, len(points) // SAMPLE)])
 
 
 def _with_halo(bounds: FloatArray, cell: float) -> FloatArray:
