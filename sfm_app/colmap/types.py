@@ -6,6 +6,7 @@ from typing import Protocol
 from sfm_app.colmap.backend import pycolmap
 
 Reconstruction = pycolmap.Reconstruction
+Camera = pycolmap.Camera
 CancellationToken = pycolmap.CancellationToken
 
 

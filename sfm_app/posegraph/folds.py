@@ -59,7 +59,7 @@ def find_turns(count: int, edges: IndexArray, left: FloatArray, strengths: Float
         if np.count_nonzero(group) < LEAST_PAIRS:
             continue
         ends = np.where((reverse & ~alike)[:, None], edges[:, ::-1], edges)[group]
-        side, given = _find_cut(count, edges[held], strengths[held], ends)
+        side, given = find_cut(count, edges[held], strengths[held], (np.unique(ends[:, 0]), np.unique(ends[:, 1])))
         gain = float(strengths[group].sum()) - given
         if gain > 0.0:
             yield Turn(~side, turns[seed].as_matrix(), gain)
@@ -76,20 +76,21 @@ def _find_linked(count: int, edges: IndexArray, chosen: Mask, seed: int) -> Mask
     return np.asarray(chosen & (part[edges[:, 0]] == part[edges[seed, 0]]), np.bool_)
 
 
-def _find_cut(count: int, edges: IndexArray, strengths: FloatArray, ends: IndexArray) -> tuple[Mask, float]:
+def find_cut(
+    count: int, edges: IndexArray, strengths: FloatArray, ends: tuple[IndexArray, IndexArray]
+) -> tuple[Mask, float]:
     """Return which photos stay on the side of the first ends, and the weight of the pairs across; inf without a cut.
 
     Args:
         count: photos.
         edges: (E, 2) of the pairs that hold.
         strengths: (E,) their weights.
-        ends: (K, 2) photos that must be on different sides.
+        ends: (K,) photos that must be on the one side, and (L,) on the other.
     """
-    first, second = np.unique(ends[:, 0]), np.unique(ends[:, 1])
-    if np.intersect1d(first, second).size or not len(edges):
+    if np.intersect1d(*ends).size or not len(edges):
         return np.zeros(count, np.bool_), float("inf")
     unit = max(float(strengths.max()) / UNIT, 1e-300)
-    capacity = _make_network(count, edges, np.maximum(1, np.round(strengths / unit)).astype(np.int64), (first, second))
+    capacity = _make_network(count, edges, np.maximum(1, np.round(strengths / unit)).astype(np.int64), ends)
     found = maximum_flow(capacity, count, count + 1)
     residual = sparse.csr_array((capacity - found.flow) > 0)
     reached = np.zeros(count + 2, np.bool_)

@@ -9,6 +9,7 @@ from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.model import posed_images
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.numerical import Json
+from sfm_app.posegraph.graph import LOOKS_ALIKE
 from sfm_app.reconstruction.unregistered import photo_names
 from sfm_app.types import LookAlikes, MatchGraph, PairId, PoseGraph, ViewGraph
 
@@ -46,6 +47,23 @@ def with_earlier_look_alikes(graph: PoseGraph, earlier: PoseGraph) -> PoseGraph:
     """
     dropped = {pair: earlier.dropped[pair] for join in earlier.look_alikes for pair in join.pairs}
     return replace(graph, dropped=dropped | dict(graph.dropped), look_alikes=earlier.look_alikes + graph.look_alikes)
+
+
+def with_false_joins(graph: PoseGraph, joins: Sequence[LookAlikes]) -> PoseGraph:
+    """Return a pose graph without the pairs of look-alikes that a model showed.
+
+    Args:
+        graph: pose graph of the pass that made the model.
+        joins: pairs that hold one place on top of another.
+    """
+    gone = {pair for join in joins for pair in join.pairs}
+    kept = {pair: pose for pair, pose in graph.poses.items() if pair not in gone}
+    return replace(
+        graph,
+        poses=kept,
+        dropped=dict(graph.dropped) | dict.fromkeys(sorted(gone), LOOKS_ALIKE),
+        look_alikes=(*graph.look_alikes, *joins),
+    )
 
 
 def look_alike_entries(joins: Sequence[LookAlikes], matches: MatchGraph) -> list[dict[str, Json]]:

@@ -17,7 +17,7 @@ from sfm_app.reconstruction.camera_per_photo import (
     with_camera_per_photo,
     with_two_cameras,
 )
-from sfm_app.reconstruction.look_alikes import drop_look_alikes, with_earlier_look_alikes
+from sfm_app.reconstruction.look_alikes import drop_look_alikes, with_earlier_look_alikes, with_false_joins
 from sfm_app.reconstruction.mapping_runs import (
     Attempt,
     Group,
@@ -30,6 +30,7 @@ from sfm_app.reconstruction.mapping_runs import (
 )
 from sfm_app.reconstruction.model_merge import join_models
 from sfm_app.reconstruction.model_split import sound_parts
+from sfm_app.reconstruction.overlaid.false_joins import judge_places
 from sfm_app.reconstruction.parts import is_convincing, map_in_parts, part_size
 from sfm_app.reconstruction.support import model_poses
 from sfm_app.reconstruction.unregistered import are_worth_another_try, photo_names
@@ -41,6 +42,8 @@ MIN_PHOTOS = 3
 MOST_PASSES = 4
 """Largest number of passes over all pairs. On dinoSparseRing with learned features the second finds a focal of 3272
 (true 3318), and the third places all photos with it."""
+MOST_FALSE_JOINS = 3
+"""Passes over all pairs without more look-alikes. Chosen by hand."""
 OTHER_FOCALS = (0.6, 2.4, 4.8)
 """Guesses of the focal besides the usual one, in longer sides: steps of a factor of two over the range of cameras."""
 FOCAL_TOLERANCE = 0.01
@@ -95,7 +98,7 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
     """
     with translate_errors("entering photos"):
         write_match_graph(run.workspace.database, matches)
-    best = _run_pass(matches, views, intrinsics, run)
+    best = _drop_false_joins(_run_pass(matches, views, intrinsics, run), matches, views, run)
     matches, views = drop_look_alikes(matches, views, best.graph)
     best = try_rival(best, matches, views, intrinsics, run)
     best = _try_other_focals(best, matches, views, intrinsics, run)
@@ -114,6 +117,26 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
         )
         matches, views = drop_look_alikes(matches, views, best.graph)
     return _with_joined_models(best, matches, views, run)
+
+
+def _drop_false_joins(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: RunContext) -> Outcome:
+    """Map again without pairs that hold one place on top of another, and return the outcome with fewer strangers."""
+    joins, strangers = judge_places(outcome.models)
+    for _ in range(MOST_FALSE_JOINS if joins else 0):
+        run.progress.say("the model has two places in one: mapping again without the look-alikes that join them")
+        marked = with_false_joins(outcome.graph, joins)
+        again = _run_pass(*drop_look_alikes(matches, views, marked), outcome.intrinsics, run)
+        joins_left, strangers_left = judge_places(again.models)
+        tried = (*outcome.tried, *again.tried)
+        if not again.models or 2 * strangers_left > strangers:
+            _write_graph(outcome.graph, outcome.intrinsics, matches, run)
+            outcome = replace(outcome, tried=tried)
+            break
+        outcome = replace(again, graph=with_earlier_look_alikes(again.graph, marked), tried=tried)
+        joins, strangers = joins_left, strangers_left
+        if not joins:
+            break
+    return replace(outcome, graph=replace(outcome.graph, doubtful=(*outcome.graph.doubtful, *joins)))
 
 
 def try_rival(

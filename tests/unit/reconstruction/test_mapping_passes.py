@@ -10,13 +10,14 @@ from sfm_app.colmap.bundle import adjust
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.errors import BackendError
+from sfm_app.posegraph.graph import LOOKS_ALIKE
 from sfm_app.reconstruction import baseline
 from sfm_app.reconstruction import mapping_passes as module
 from sfm_app.reconstruction.baseline import guessed_intrinsics
 from sfm_app.reconstruction.mapping_passes import learned_intrinsics, reconstruct, split_attempt
 from sfm_app.reconstruction.mapping_runs import Attempt, NoModel
 from sfm_app.reconstruction.support import PairSupport, explained_pairs
-from sfm_app.types import PoseGraph
+from sfm_app.types import LookAlikes, PoseGraph
 
 pytestmark = pytest.mark.slow
 
@@ -70,6 +71,55 @@ def focals_in(path):
 def geometries_in(path):
     with contextlib.closing(sqlite3.connect(path)) as database:
         return database.execute("SELECT * FROM two_view_geometries ORDER BY pair_id").fetchall()
+
+
+def judgments(monkeypatch, *found):
+    """Lets the places of models be judged so, one after the other."""
+    left = list(found)
+    monkeypatch.setattr(module, "judge_places", lambda _: left.pop(0))
+    return left
+
+
+def test_photos_are_mapped_again_without_a_false_join(synthetic, run, cameras, mapped, monkeypatch):
+    true = with_camera(synthetic.copy(), TRUE)
+    seen = mapped(with_camera(synthetic.copy(), TRUE), true)
+    join = LookAlikes(((1, 4), (2, 4)), 0.9)
+    left = judgments(monkeypatch, ([join], 20), ([], 0))
+
+    found = outcome(synthetic, cameras(), run())
+
+    assert len(seen) == 2 and left == []
+    assert found.models[0].model is true and found.passes == 1
+    assert found.graph.look_alikes == (join,) and not found.graph.poses.keys() & set(join.pairs)
+    assert {found.graph.dropped[pair] for pair in join.pairs} == {LOOKS_ALIKE}
+    assert len(geometries_in(run().workspace.database)) == 13
+
+
+def test_a_false_join_whose_removal_changes_nothing_is_only_named(synthetic, run, cameras, mapped, monkeypatch):
+    first = with_camera(synthetic.copy(), TRUE)
+    mapped(first, without(with_camera(synthetic.copy(), TRUE), [6]))
+    join = LookAlikes(((1, 4), (2, 4)), 0.9)
+    judgments(monkeypatch, ([join], 20), ([join], 15))
+
+    found = outcome(synthetic, cameras(), run())
+
+    assert found.models[0].model is first
+    assert found.graph.look_alikes == () and found.graph.doubtful == (join,)
+    assert found.tried == ("6 photos", "5 photos")
+    assert len(geometries_in(run().workspace.database)) == 15
+
+
+def test_false_joins_are_looked_for_a_few_times_only(synthetic, run, cameras, mapped, monkeypatch):
+    models = [with_camera(synthetic.copy(), TRUE) for _ in range(4)]
+    mapped(*models)
+    joins = [LookAlikes((pair,), 0.9) for pair in ((1, 4), (2, 5), (3, 6), (1, 5))]
+    judgments(monkeypatch, *(([join], count) for join, count in zip(joins, (80, 40, 20, 10), strict=True)))
+
+    found = outcome(synthetic, cameras(), run())
+
+    assert found.models[0].model is models[3]
+    assert set(found.graph.look_alikes) == set(joins[:3])
+    assert found.graph.doubtful == (joins[3],)
 
 
 def test_a_camera_that_was_known_and_stayed_is_not_looked_at_twice(synthetic, run, cameras, mapped):
