@@ -19,6 +19,7 @@ from sfm_app.reconstruction.camera_per_photo import (
 )
 from sfm_app.reconstruction.look_alikes import drop_look_alikes, with_earlier_look_alikes, with_false_joins
 from sfm_app.reconstruction.mapping_runs import (
+    ENOUGH_SHARE,
     Attempt,
     Group,
     MappingResult,
@@ -120,7 +121,10 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
 
 
 def _drop_false_joins(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: RunContext) -> Outcome:
-    """Map again without pairs that hold one place on top of another, and return the outcome with fewer strangers."""
+    """Map again without pairs that hold one place on top of another, and return the outcome with fewer strangers.
+
+    Where other pairs do not hold the photos together instead, as by day and by night, the joins stay, and are doubtful.
+    """
     joins, strangers = judge_places(outcome.models)
     for _ in range(MOST_FALSE_JOINS if joins else 0):
         run.progress.say("the model has two places in one: mapping again without the look-alikes that join them")
@@ -128,7 +132,8 @@ def _drop_false_joins(outcome: Outcome, matches: MatchGraph, views: ViewGraph, r
         again = _run_pass(*drop_look_alikes(matches, views, marked), outcome.intrinsics, run)
         joins_left, strangers_left = judge_places(again.models)
         tried = (*outcome.tried, *again.tried)
-        if not again.models or 2 * strangers_left > strangers:
+        kept = again.main is not None and again.main.photos >= ENOUGH_SHARE * outcome.models[0].photos
+        if not kept or 2 * strangers_left > strangers:
             _write_graph(outcome.graph, outcome.intrinsics, matches, run)
             outcome = replace(outcome, tried=tried)
             break
