@@ -52,13 +52,21 @@ def compute_visibility(matches: MatchGraph, poses: Mapping[PairId, RelativePose]
     for pair, found in rows.items():
         for photo, column in zip(pair, found.T, strict=True):
             seen[photo][np.unique(column)] += 1
-    return Visibility(rows, seen, {photo: _keypoint_cells(matches, photo) for photo in photos})
+    images = matches.images
+    cells = {
+        photo: cell_numbers(matches.keypoints[photo], images[photo].width, images[photo].height) for photo in photos
+    }
+    return Visibility(rows, seen, cells)
 
 
-def _keypoint_cells(matches: MatchGraph, photo: int) -> IndexArray:
-    """Return the numbers (K,) of the cells in which the keypoints of a photo lie."""
-    image = matches.images[photo]
-    columns, lines = (matches.keypoints[photo] // (max(image.width, image.height) / CELLS)).astype(np.int64).T
+def cell_numbers(x: NDArray[np.float64], width: int, height: int) -> IndexArray:
+    """Return the numbers (N,) of the cells of a photo in which pixels lie, less than (`CELLS` + 1) squared.
+
+    Args:
+        x: (N, 2) pixels inside the photo.
+        width, height: of the photo.
+    """
+    columns, lines = (x // (max(width, height) / CELLS)).astype(np.int64).T
     return np.asarray(lines * (CELLS + 1) + columns, np.int64)
 
 

@@ -142,10 +142,30 @@ class Depths:
             x = project(there, camera)
             smaller = depths_along(there, camera) / z * here.K[0, 0] / camera.K[0, 0]
             cosines = (turned * there).sum(1) / np.linalg.norm(turned, axis=1) / np.linalg.norm(there, axis=1)
-        size = np.array([image.width, image.height], np.float64)
-        inside = ((x > BORDER * size) & (x < (1.0 - BORDER) * size)).all(axis=1)  # NaN where it cannot be seen
-        alike = (smaller < MOST_SCALE) & (smaller > 1.0 / MOST_SCALE) & (cosines > np.cos(np.radians(MOST_DEG)))
-        return np.asarray(points[inside & alike], np.int64)
+        expected = is_well_inside(x, image.width, image.height) & is_matched_again(smaller, cosines)
+        return np.asarray(points[expected], np.int64)
+
+
+def is_well_inside(x: FloatArray, width: int, height: int) -> NDArray[np.bool_]:
+    """Return (N,) whether pixels lie in a photo, and not at its border.
+
+    Args:
+        x: (N, 2) pixels; NaN where a point cannot be seen.
+        width, height: of the photo.
+    """
+    size = np.array([width, height], np.float64)
+    return np.asarray(((x > BORDER * size) & (x < (1.0 - BORDER) * size)).all(axis=1))
+
+
+def is_matched_again(smaller: FloatArray, cosines: FloatArray) -> NDArray[np.bool_]:
+    """Return (N,) whether points look so much alike in two photos that matching finds them.
+
+    Args:
+        smaller: (N,) their size in the first photo over that in the second.
+        cosines: (N,) of the angles between their two viewing rays.
+    """
+    alike = (smaller < MOST_SCALE) & (smaller > 1.0 / MOST_SCALE) & (cosines > np.cos(np.radians(MOST_DEG)))
+    return np.asarray(alike, np.bool_)
 
 
 def count_missing_cells(photo: int, joined: Iterable[int], trusted: Iterable[int], places: Depths) -> tuple[int, int]:

@@ -126,7 +126,9 @@ def _drop_false_joins(outcome: Outcome, matches: MatchGraph, views: ViewGraph, r
     Where other pairs do not hold the photos together instead, as by day and by night, the joins stay, and are doubtful.
     """
     joins, strangers = judge_places(outcome.models)
-    for _ in range(MOST_FALSE_JOINS if joins else 0):
+    for _ in range(MOST_FALSE_JOINS):
+        if not joins:
+            return outcome
         run.progress.say("the model has two places in one: mapping again without the look-alikes that join them")
         marked = with_false_joins(outcome.graph, joins)
         again = _run_pass(*drop_look_alikes(matches, views, marked), outcome.intrinsics, run)
@@ -139,8 +141,6 @@ def _drop_false_joins(outcome: Outcome, matches: MatchGraph, views: ViewGraph, r
             break
         outcome = replace(again, graph=with_earlier_look_alikes(again.graph, marked), tried=tried)
         joins, strangers = joins_left, strangers_left
-        if not joins:
-            break
     return replace(outcome, graph=replace(outcome.graph, doubtful=(*outcome.graph.doubtful, *joins)))
 
 

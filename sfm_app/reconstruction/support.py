@@ -4,7 +4,7 @@ For every pair of posed photos, the raw matches are counted that lie on the epip
 both cameras. Points, tracks and reprojection errors depend on the mapper; this count does not.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -104,5 +104,14 @@ def _placed_pairs(model: Reconstruction, matches: MatchGraph) -> Iterator[tuple[
 
 def support(explained: Mapping[PairId, PairSupport]) -> float:
     """Return the score of a model: its explained matches, of which each further one of a pair counts less."""
-    counts = np.array([pair.matches for pair in explained.values()], np.float64)
-    return float(np.sum(counts / (1.0 + counts / SATURATION)))
+    return float(np.sum(saturate([pair.matches for pair in explained.values()])))
+
+
+def saturate(matches: Sequence[int]) -> FloatArray:
+    """Return what the matches of pairs count in a score, (N,): each further match of a pair counts less.
+
+    Args:
+        matches: of each pair.
+    """
+    counts = np.array(matches, np.float64)
+    return np.asarray(counts / (1.0 + counts / SATURATION))

@@ -16,8 +16,9 @@ from sfm_app.numerical import FAILURES
 from sfm_app.posegraph.folds import find_cut
 from sfm_app.posegraph.look_alikes import group_doubted_pairs
 from sfm_app.reconstruction.mapping_runs import Attempt
+from sfm_app.reconstruction.model_split import LEAST_MATCHES
 from sfm_app.reconstruction.overlaid.meetings import Meeting, find_meetings
-from sfm_app.reconstruction.support import SATURATION, PairSupport
+from sfm_app.reconstruction.support import PairSupport, saturate
 from sfm_app.types import LookAlikes, PairId
 
 logger = logging.getLogger("sfm_app")
@@ -33,8 +34,6 @@ LEAST_STRANGERS, LEAST_PHOTOS = 10, 3
 LEAST_MISSING = 0.5
 """Least share of the cells that photos on either side of a false join should share, but do not. Chosen by hand: 0.88
 for a house in two streets of a rendered town. Of 14 right models, no meeting of two photos misses more than 0.75."""
-LEAST_MATCHES = 16
-"""Smallest number of matches with which a pair can hold two places together, as in `model_split`."""
 
 
 def judge_places(models: Iterable[Attempt]) -> tuple[list[LookAlikes], int]:
@@ -77,8 +76,9 @@ def find_false_joins(meetings: Mapping[PairId, Meeting], explained: Mapping[Pair
         meetings, explained: as in `find_strangers`.
     """
     strangers, found = find_strangers(meetings, explained), list[LookAlikes]()
-    strengths = {pair: one.matches / (1.0 + one.matches / SATURATION) for pair, one in explained.items() if _holds(one)}
-    photos, left = sorted(set(chain(*strengths, *strangers))), dict(strangers)
+    holding = {pair: one.matches for pair, one in explained.items() if _holds(one)}
+    strengths = dict(zip(holding, saturate(list(holding.values())).tolist(), strict=True))
+    photos, left = sorted(set(chain(*holding, *meetings))), dict(strangers)
     while len(left) >= LEAST_STRANGERS:
         sides = _take_sides(left, meetings)
         apart = {pair for pair, one in meetings.items() if sides[pair[0]] != sides[pair[1]] and _pull(one) < 0}

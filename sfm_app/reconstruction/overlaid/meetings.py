@@ -5,7 +5,7 @@ not found: photos of both streets stand at the same place, look the same way, an
 Heinly et al. 2014 look for such missing matches between pairs of photos).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,30 +13,25 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from sfm_app.colmap.backend import translate_errors
-from sfm_app.colmap.model import posed_images
+from sfm_app.colmap.model import focal_px, posed_images
 from sfm_app.colmap.types import Camera, Reconstruction, all_points
+from sfm_app.posegraph.coverage import CELLS, cell_numbers
+from sfm_app.posegraph.look_alikes import LEAST_CELLS
+from sfm_app.posegraph.missing import MIN_CELL_POINTS, is_matched_again, is_well_inside
 from sfm_app.types import PairId
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-CELLS = 12
-"""Cells along the longer side of a photo, as in the look for look-alikes before mapping."""
 CANDIDATES = 40
 """Photos nearby with which a photo may meet. Chosen by hand."""
-MOST_DEG, MOST_SCALE = 20.0, 1.5
-"""Largest change of viewing angle, and of distance, at which a point is matched again, as in `posegraph.missing`."""
 MOST_TURN_DEG = 45.0
 """Largest angle between the mean viewing rays of photos that are compared. Chosen by hand."""
-BORDER = 0.05
-"""Share of width and height: points that project this near the border may be outside, as in `posegraph.missing`."""
 LEAST_PHOTOS = 3
 """Photos that have to see a point before another one is expected to: two may agree by chance."""
-MIN_CELL_POINTS = 2
-"""A cell with fewer expected points expects nothing, as in `posegraph.missing`."""
-LEAST_CELLS = 15
-"""Least number of expected cells for a photo to meet another one, as for look-alikes before mapping."""
+LEAST_DISTANCE = 1e-12
+"""Distances are at least this, so that they divide."""
 BEHIND = 1.1
 """Points farther away than what a photo sees in a cell, by this factor, may be hidden. Chosen by hand."""
 
@@ -56,23 +51,20 @@ class Sight:
     """A posed photo and the points that it sees."""
 
     camera: Camera
+    focal_px: float
     pose: FloatArray
     """(3, 4) camera from world."""
     center: FloatArray
     rows: IndexArray
     """(N,) numbers of its points, ascending."""
-    rays: FloatArray
-    """(N, 3) from its center to them."""
-    distances: FloatArray
-    """(N,)"""
     reach: FloatArray
     """By cell, how far away what it sees there is; -1 where it sees nothing."""
-
-    @property
-    def direction(self) -> FloatArray:
-        """Mean viewing ray, (3,) of length 1."""
-        mean = (self.rays / self.distances[:, None]).mean(axis=0)
-        return np.asarray(mean / max(float(np.linalg.norm(mean)), 1e-12))
+    firm: IndexArray
+    """(M,) numbers of the points that others see, too."""
+    rays: FloatArray
+    """(M, 3) from its center to them, of length 1."""
+    distances: FloatArray
+    """(M,) from its center to them."""
 
 
 def find_meetings(model: Reconstruction) -> dict[PairId, Meeting]:
@@ -83,82 +75,77 @@ def find_meetings(model: Reconstruction) -> dict[PairId, Meeting]:
     """
     with translate_errors("reading points"):
         points, sights = _read_sights(model)
-    if not sights:
-        return {}
-    often = np.bincount(np.concatenate([sight.rows for sight in sights.values()]), minlength=len(points))
-    found: dict[PairId, list[int]] = {}
-    for photo, other in _neighbors(sights):
-        here = sights[photo]
-        expected, shared = _compare(here, sights[other], often[here.rows] >= LEAST_PHOTOS, points)
-        if expected >= LEAST_CELLS:
-            sums = found.setdefault((min(photo, other), max(photo, other)), [0, 0])
-            sums[0] += expected
-            sums[1] += shared
+        found: dict[PairId, list[int]] = {}
+        for photo, other in _neighbors(sights):
+            expected, shared = _compare(sights[photo], sights[other], points)
+            if expected >= LEAST_CELLS:
+                sums = found.setdefault((min(photo, other), max(photo, other)), [0, 0])
+                sums[0] += expected
+                sums[1] += shared
     return {pair: Meeting(*sums) for pair, sums in sorted(found.items())}
 
 
 def _read_sights(model: Reconstruction) -> tuple[FloatArray, dict[int, Sight]]:
-    """Return the points (P, 3) of a model, and its posed photos that see any by id."""
-    numbered = {key: number for number, (key, _) in enumerate(sorted(all_points(model), key=lambda item: item[0]))}
-    points = np.array([model.points3D[key].xyz for key in numbered], np.float64).reshape(-1, 3)
-    found = {}
+    """Return the points (P, 3) of a model, and by id its posed photos that see points which others see, too."""
+    stored = sorted(all_points(model), key=lambda item: item[0])
+    points = np.array([point.xyz for _, point in stored], np.float64).reshape(-1, 3)
+    often = np.array([point.track.length() >= LEAST_PHOTOS for _, point in stored], np.bool_)
+    keys, found = np.array([key for key, _ in stored], np.int64), {}
     for image in posed_images(model):
-        seen = [(numbered[point.point3D_id], point.xy) for point in image.points2D if point.has_point3D()]
-        if seen:
-            rows = np.array([number for number, _ in seen], np.int64)
-            rows, first = np.unique(rows, return_index=True)
-            x = np.array([xy for _, xy in seen], np.float64)[first]
-            camera = model.cameras[image.camera_id]
-            found[image.image_id] = _sight(camera, np.asarray(image.cam_from_world().matrix()), rows, points[rows], x)
+        seen = image.get_observation_points2D()
+        rows, first = np.unique(np.searchsorted(keys, [one.point3D_id for one in seen]), return_index=True)
+        if often[rows].any():
+            x = np.array([one.xy for one in seen], np.float64)[first]
+            found[image.image_id] = _look(model, image.image_id, (rows, x), points, often[rows])
     return points, found
 
 
-def _sight(camera: Camera, pose: FloatArray, rows: IndexArray, points: FloatArray, x: FloatArray) -> Sight:
-    center = -pose[:, :3].T @ pose[:, 3]
-    rays = points - center
-    distances = np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
-    cells = _cells(x, camera)
+def _look(
+    model: Reconstruction, photo: int, seen: tuple[IndexArray, FloatArray], points: FloatArray, often: Mask
+) -> Sight:
+    """Return what a photo sees: rows of points (N,) at pixels (N, 2), of which others often see some, too."""
+    image = model.images[photo]
+    camera, (rows, x) = model.cameras[image.camera_id], seen
+    center = np.asarray(image.projection_center(), np.float64)
+    rays = points[rows] - center
+    distances = np.maximum(np.linalg.norm(rays, axis=1), LEAST_DISTANCE)
+    cells = cell_numbers(x, camera.width, camera.height)
     reach = np.full((CELLS + 1) ** 2, -1.0)
     for cell in np.unique(cells):
         reach[cell] = np.median(distances[cells == cell])
-    return Sight(camera, pose, center, rows, rays, distances, reach)
+    return Sight(
+        camera, focal_px(model, photo), np.asarray(image.cam_from_world().matrix()), center, rows, reach,
+        rows[often], (rays / distances[:, None])[often], distances[often],
+    )  # fmt: skip
 
 
-def _cells(x: FloatArray, camera: Camera) -> IndexArray:
-    """Return the numbers (N,) of the cells in which pixels (N, 2) of a photo lie."""
-    columns, lines = np.clip(x * (CELLS / max(camera.width, camera.height)), 0, CELLS).astype(np.int64).T
-    return np.asarray(lines * (CELLS + 1) + columns, np.int64)
-
-
-def _neighbors(sights: dict[int, Sight]) -> Iterator[PairId]:
+def _neighbors(sights: Mapping[int, Sight]) -> Iterator[PairId]:
     """Yield photos with others nearby that look the same way; some of these where there are many."""
-    photos = list(sights)
-    tree = KDTree(np.array([sight.center for sight in sights.values()]))
-    directions = np.array([sight.direction for sight in sights.values()])
-    for number, (photo, sight) in enumerate(sights.items()):
+    if not sights:
+        return
+    photos, seers = list(sights), list(sights.values())
+    tree = KDTree(np.array([sight.center for sight in seers]))
+    directions = np.array([sight.rays.mean(axis=0) for sight in seers])
+    directions /= np.maximum(np.linalg.norm(directions, axis=1), LEAST_DISTANCE)[:, None]
+    for number, sight in enumerate(seers):
         near = np.array(sorted(tree.query_ball_point(sight.center, float(np.median(sight.distances)))), np.int64)
-        alike = directions[near] @ directions[number] > np.cos(np.radians(MOST_TURN_DEG))
-        near = near[alike & (near != number)]
+        near = near[(directions[near] @ directions[number] > np.cos(np.radians(MOST_TURN_DEG))) & (near != number)]
         chosen = near[np.unique(np.linspace(0, len(near) - 1, min(CANDIDATES, len(near))).astype(np.int64))]
-        yield from ((photo, photos[other]) for other in chosen)
+        yield from ((photos[number], photos[other]) for other in chosen)
 
 
-def _compare(here: Sight, there: Sight, often: Mask, points: FloatArray) -> tuple[int, int]:
+def _compare(here: Sight, there: Sight, points: FloatArray) -> tuple[int, int]:
     """Count the cells of a photo in which it should see points of another one, and those in which it does."""
-    rows, rays, distances = here.rows[often], here.rays[often], here.distances[often]
+    away = points[here.firm] - there.center
+    lengths = np.maximum(np.linalg.norm(away, axis=1), LEAST_DISTANCE)
+    smaller = lengths / here.distances * here.focal_px / there.focal_px
+    again = is_matched_again(smaller, (here.rays * away).sum(axis=1) / lengths)
+    rows, lengths = here.firm[again], lengths[again]
     inside = points[rows] @ there.pose[:, :3].T + there.pose[:, 3]
-    away = points[rows] - there.center
-    lengths = np.maximum(np.linalg.norm(away, axis=1), 1e-12)
-    smaller, cosines = lengths / distances, (rays * away).sum(axis=1) / (distances * lengths)
-    alike = (smaller < MOST_SCALE) & (smaller > 1.0 / MOST_SCALE) & (cosines > np.cos(np.radians(MOST_DEG)))
-    if not alike.any():
-        return 0, 0
-    x = np.asarray(there.camera.img_from_cam(inside[alike]), np.float64).reshape(-1, 2)
-    size = np.array([there.camera.width, there.camera.height], np.float64)
-    with np.errstate(invalid="ignore"):
-        shown = ((x > BORDER * size) & (x < (1.0 - BORDER) * size)).all(axis=1)  # NaN where it cannot be seen
-    rows, lengths, cells = rows[alike][shown], lengths[alike][shown], _cells(x[shown], there.camera)
-    open_ = lengths < BEHIND * there.reach[cells]
+    x = np.asarray(there.camera.img_from_cam(inside), np.float64).reshape(-1, 2)
+    shown = is_well_inside(x, there.camera.width, there.camera.height)
+    rows, cells = rows[shown], cell_numbers(x[shown], there.camera.width, there.camera.height)
+    open_ = lengths[shown] < BEHIND * there.reach[cells]
     rows, cells = rows[open_], cells[open_]
     expected, counts = np.unique(cells, return_counts=True)
     expected = expected[counts >= MIN_CELL_POINTS]

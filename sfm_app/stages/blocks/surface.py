@@ -190,13 +190,15 @@ def choose_cell(points: BlockPoints, most: int) -> float:
         most: greatest depth of a block's octree.
     """
     bounds = points.bounds
-    count = sum(len(points.read(number)) for number in range(len(bounds)))
     extent = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
     cell = extent
     for cell in cell_sizes(extent, MOST_LEVELS):
         if max(cube_around(low, high, cell).depth for low, high in _with_halo(bounds, cell)) > most:
             continue
-        occupied = sum(occupied_cells(positions(points.read(number)), cell) for number in range(len(bounds)))
+        count = occupied = 0
+        for number in range(len(bounds)):
+            own = positions(points.read(number))
+            count, occupied = count + len(own), occupied + occupied_cells(own, cell)
         if count >= MIN_POINTS * occupied:
             break
     return cell

@@ -14,10 +14,6 @@ class Walls:
 
     def __init__(self):
         self.model = pycolmap.Reconstruction()
-        self.model.add_camera_with_trivial_rig(
-            pycolmap.Camera(model="SIMPLE_PINHOLE", width=WIDTH, height=HEIGHT,
-                            params=[FOCAL, WIDTH / 2, HEIGHT / 2], camera_id=1)
-        )  # fmt: skip
         self.tracks = {}
         self.points = np.empty((0, 3))
 
@@ -28,13 +24,18 @@ class Walls:
         self.points = np.vstack([self.points, np.column_stack([x, y, np.full(count, away)])])
         return np.arange(len(self.points) - count, len(self.points))
 
-    def add_walk(self, photos, places, known, shift=0.0):
+    def add_walk(self, photos, places, known, shift=0.0, zoom=1.0):
         """Add photos with these ids at these places, which see the points that are known to them."""
+        camera, focal = min(photos), zoom * FOCAL
+        self.model.add_camera_with_trivial_rig(
+            pycolmap.Camera(model="SIMPLE_PINHOLE", width=WIDTH, height=HEIGHT,
+                            params=[focal, WIDTH / 2, HEIGHT / 2], camera_id=camera)
+        )  # fmt: skip
         for photo, place in zip(photos, places, strict=True):
             seen = self.points[known] - [place, shift, 0.0]
-            x = FOCAL * seen[:, :2] / seen[:, 2:] + [WIDTH / 2, HEIGHT / 2]
+            x = focal * seen[:, :2] / seen[:, 2:] + [WIDTH / 2, HEIGHT / 2]
             inside = ((x > 0) & (x < [WIDTH, HEIGHT])).all(axis=1)
-            image = pycolmap.Image(image_id=photo, name=f"{photo:03d}.jpg", camera_id=1)
+            image = pycolmap.Image(image_id=photo, name=f"{photo:03d}.jpg", camera_id=camera)
             image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in x[inside]])
             self.model.add_image_with_trivial_frame(
                 image, pycolmap.Rigid3d(pycolmap.Rotation3d(np.eye(3)), -np.array([place, shift, 0.0]))

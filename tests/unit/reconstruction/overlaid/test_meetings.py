@@ -6,6 +6,8 @@ import pytest
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.reconstruction.overlaid.meetings import find_meetings
 
+AWAY = 5.0
+
 pytestmark = pytest.mark.slow
 
 
@@ -31,16 +33,22 @@ def test_photos_of_two_walls_in_one_place_share_nothing(walls):
     assert all(meeting.shared == 0 < meeting.expected for meeting in across)
 
 
-@pytest.mark.parametrize(("far", "meet"), [(AWAY_FAR := 4.0, False), (1.0, True)])
-def test_a_photo_expects_nothing_behind_what_it_sees(walls, far, meet):
-    walls.add_walk(range(1, 7), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=1, away=5.0))
-    walls.add_walk(range(11, 17), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=2, away=5.0 + far))
+@pytest.mark.parametrize(("behind", "sides"), [(0.3, 2), (1.5, 1)])
+def test_a_photo_expects_nothing_behind_what_it_sees(walls, behind, sides):
+    """Those who see the far wall should see the near one, too, and not the other way round."""
+    walls.add_walk(range(1, 7), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=1))
+    walls.add_walk(range(11, 17), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=2, away=AWAY + behind))
 
     found = find_meetings(walls.finish()[0])
 
-    near_sees = [pair for pair in found if (pair[0] < 10) != (pair[1] < 10)]
-    assert bool(near_sees)  # the far ones look past the near wall, which they should see
-    assert all(found[pair].expected <= 12 * 9 for pair in near_sees) or meet
+    assert (sides - 1) * 12 * 9 < found[3, 13].expected <= sides * 12 * 9
+
+
+def test_a_photo_with_another_focal_length_need_not_match(walls):
+    walls.add_walk(range(1, 7), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=1))
+    walls.add_walk(range(11, 17), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=2), zoom=1.6)
+
+    assert all((a < 10) == (b < 10) for a, b in find_meetings(walls.finish()[0]))
 
 
 def test_points_of_two_photos_prove_nothing(walls):
@@ -50,7 +58,7 @@ def test_points_of_two_photos_prove_nothing(walls):
     assert find_meetings(walls.finish()[0]) == {}
 
 
-def test_photos_that_look_the_other_way_do_not_meet(walls):
+def test_photos_far_apart_do_not_meet(walls):
     walls.add_walk(range(1, 7), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=1))
     walls.add_walk(range(11, 17), np.linspace(30, 33, 6), walls.add_points(27, 36, seed=2))
 
