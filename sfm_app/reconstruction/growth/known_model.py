@@ -31,6 +31,7 @@ from sfm_app.reconstruction.mapping_runs import (
     map_group,
     pairs_to_map,
 )
+from sfm_app.reconstruction.overlaid.false_joins import judge_places
 from sfm_app.reconstruction.second_look import MappedScene
 from sfm_app.reconstruction.support import explained_pairs, model_poses, support
 from sfm_app.runtime.context import RunContext
@@ -46,6 +47,8 @@ LEAST_SUPPORT = 0.99
 `mapping_runs.EQUAL_TOLERANCE`."""
 GROWN = "grown"
 """Name of this way to a model, in the manifest."""
+TWO_PLACES = "the model has two places in one"
+"""The doubt of a grown model whose pairs of look-alikes lie on top of each other."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +82,8 @@ def map_new_photos(
     cameras = find_intrinsics(matches, views, replace(run, statistics={}))[0]
     whole = reconstruct(matches, views, cameras, run)
     both = [outcome.models[0] for outcome in (grown, whole) if outcome is not None and outcome.models]
-    if grown is None or best_attempt(both) is not grown.models[0]:
+    is_folded = doubt == TWO_PLACES and bool(whole.models)  # look-alikes explain more, and are wrong
+    if grown is None or is_folded or best_attempt(both) is not grown.models[0]:
         return MappedScene(whole, matches, views, cameras, run)
     _write_graph(grown.graph, inputs)
     return MappedScene(replace(grown, tried=(*whole.tried, *grown.tried)), matches, views, intrinsics, run)
@@ -139,6 +143,8 @@ def _doubt(
     after = support({pair: one for pair, one in found.explained.items() if inside.issuperset(pair)})
     if after < LEAST_SUPPORT * before:
         return "the model explains less of the known photos than before"
+    if judge_places([found])[0]:
+        return TWO_PLACES
     return rival_reason(found, intrinsics, matches, views)
 
 

@@ -14,7 +14,7 @@ from sfm_app.reconstruction.growth.known_model import map_new_photos
 from sfm_app.reconstruction.mapping_passes import Outcome
 from sfm_app.reconstruction.mapping_runs import Attempt
 from sfm_app.reconstruction.support import explained_pairs, model_poses
-from sfm_app.types import PoseGraph, RelativePose
+from sfm_app.types import LookAlikes, PoseGraph, RelativePose
 
 pytestmark = pytest.mark.slow
 
@@ -37,6 +37,8 @@ def grow(synthetic, cameras, run, tmp_path, monkeypatch):
         monkeypatch.setattr(module, "find_intrinsics", lambda *_: (found, ()))
 
         def reconstruct(matches, views, intrinsics, _):
+            if not whole:
+                return Outcome((), PoseGraph({}, {}, ()), intrinsics, ("nothing",))
             explained = explained_pairs(whole, matches, views, 1.5)
             attempt = Attempt("incremental", whole, explained, "all again")
             return Outcome((attempt,), PoseGraph({}, {}, ()), intrinsics, ("all again",))
@@ -113,6 +115,20 @@ def test_the_grown_model_stays_where_all_again_explains_less(grow, synthetic, mo
     assert figures["mapped_again_because"] == "a doubt"
     assert found.outcome.models[0].mapper == "grown" and found.outcome.models[0].photos == 6
     assert found.outcome.tried[0] == "all again"
+
+
+@pytest.mark.parametrize(("left", "mapper"), [((1, 2, 3), "incremental"), ((), "grown")])
+def test_a_grown_model_with_two_places_in_one_stays_only_where_nothing_else_is_found(
+    grow, synthetic, monkeypatch, left, mapper
+):
+    monkeypatch.setattr(module, "judge_places", lambda _: ([LookAlikes(((1, 6),), 0.9)], 12))
+
+    found, figures = grow(
+        submodel(synthetic.model, [1, 2, 3, 4]), (1, 2, 3, 4), whole=left and submodel(synthetic.model, left)
+    )
+
+    assert figures["mapped_again_because"] == "the model has two places in one"
+    assert found.outcome.models[0].mapper == mapper
 
 
 def test_known_pairs_are_not_estimated_again(synthetic, cameras):
