@@ -31,20 +31,18 @@ from sfm_app.reconstruction.mapping_runs import (
 )
 from sfm_app.reconstruction.model_merge import join_models
 from sfm_app.reconstruction.model_split import sound_parts
-from sfm_app.reconstruction.overlaid.false_joins import judge_places
-from sfm_app.reconstruction.parts import is_convincing, map_in_parts, part_size
+from sfm_app.reconstruction.overlaid.false_joins import MOST_FALSE_JOINS, judge_places
+from sfm_app.reconstruction.parts import hide_false_joins, is_convincing, map_in_parts, part_size
 from sfm_app.reconstruction.support import model_poses
 from sfm_app.reconstruction.unregistered import are_worth_another_try, photo_names
 from sfm_app.runtime.context import RunContext
-from sfm_app.types import Calibration, Intrinsics, MatchGraph, PoseGraph, ViewGraph
+from sfm_app.types import Calibration, Intrinsics, LookAlikes, MatchGraph, PoseGraph, ViewGraph
 
 MIN_PHOTOS = 3
 """Smallest number of photos from which a camera is learned, and in a group that is mapped besides the main one."""
 MOST_PASSES = 4
 """Largest number of passes over all pairs. On dinoSparseRing with learned features the second finds a focal of 3272
 (true 3318), and the third places all photos with it."""
-MOST_FALSE_JOINS = 3
-"""Passes over all pairs without more look-alikes. Chosen by hand."""
 OTHER_FOCALS = (0.6, 2.4, 4.8)
 """Guesses of the focal besides the usual one, in longer sides: steps of a factor of two over the range of cameras."""
 FOCAL_TOLERANCE = 0.01
@@ -299,7 +297,8 @@ def _run_pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run
     for number, photos in enumerate(graph.groups):
         if number and len(photos) < MIN_PHOTOS:
             continue
-        found = _map_by_size(Group(photos, matches, views, graph, intrinsics), run)
+        found, joins = _map_by_size(Group(photos, matches, views, graph, intrinsics), run)
+        graph = with_false_joins(graph, joins)
         tried += [attempt.note for attempt in found]
         best = best_attempt(found)
         if best is not None:
@@ -314,12 +313,17 @@ def _run_pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run
     return Outcome(tuple(models), graph, intrinsics, tuple(tried), reason, tuple(cuts))
 
 
-def _map_by_size(group: Group, run: RunContext) -> list[MappingResult]:
-    """Map a large group in parts, and a small one, or one that parts do not explain, as a whole."""
+def _map_by_size(group: Group, run: RunContext) -> tuple[list[MappingResult], tuple[LookAlikes, ...]]:
+    """Map a large group in parts, and a small one, or one that parts do not explain, as a whole.
+
+    Parts may show false joins.
+    """
     if not part_size(len(group.photos), run.settings.scene):
-        return map_group(group, run)
-    found = map_in_parts(group, pairs_to_map(group.graph), run)
-    return found if is_convincing(found, len(group.photos)) else [*found, *map_group(group, run)]
+        return map_group(group, run), ()
+    found, joins = map_in_parts(group, pairs_to_map(group.graph), run)
+    if is_convincing(found, len(group.photos)):
+        return found, joins
+    return [*found, *map_group(hide_false_joins(group, joins), run)], joins
 
 
 def split_attempt(attempt: Attempt) -> list[Attempt]:

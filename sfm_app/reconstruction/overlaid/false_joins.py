@@ -31,6 +31,8 @@ PULLING_SHARE = 0.7
 place share more in 9 of 10 pairs of a video and in nearly all others, those of a house in two streets 0 to 0.65."""
 LEAST_STRANGERS, LEAST_PHOTOS = 10, 3
 """Pairs of strangers, and photos on either side, that prove a wrong join. Chosen by hand."""
+MOST_FALSE_JOINS = 3
+"""Times that photos are mapped again without more look-alikes. Chosen by hand."""
 LEAST_MISSING = 0.5
 """Least share of the cells that photos on either side of a false join should share, but do not. Chosen by hand: 0.88
 for a house in two streets of a rendered town. Of 17 right models, no meeting of two photos misses more than 0.75."""

@@ -16,6 +16,7 @@ from sfm_app.reconstruction.mapping_runs import Group
 from sfm_app.settings import Settings
 from sfm_app.types import (
     Intrinsics,
+    LookAlikes,
     MatchedImage,
     MatchGraph,
     PairId,
@@ -111,6 +112,20 @@ def read_inputs(path: Path) -> tuple[Group, frozenset[PairId], Settings]:
     )
     mapped = frozenset((int(a), int(b)) for a, b in arrays["mapped"])
     return part, mapped, Settings.from_mapping(known["settings"])
+
+
+PlainJoin = tuple[list[list[int]], float]
+"""Pairs of a false join, and the share that is missing across it, as JSON has them."""
+
+
+def joins_to_plain(joins: Sequence[LookAlikes]) -> list[PlainJoin]:
+    """Return false joins as plain values for JSON."""
+    return [([list(pair) for pair in join.pairs], join.missing) for join in joins]
+
+
+def joins_from_plain(values: Sequence[PlainJoin]) -> tuple[LookAlikes, ...]:
+    """Rebuild from `joins_to_plain`."""
+    return tuple(LookAlikes(tuple((a, b) for a, b in pairs), missing) for pairs, missing in values)
 
 
 def _match_arrays(matches: MatchGraph) -> Arrays:

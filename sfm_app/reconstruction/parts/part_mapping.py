@@ -12,10 +12,17 @@ from sfm_app.errors import BackendError
 from sfm_app.hashing import digest_file
 from sfm_app.reconstruction.mapping_runs import Group
 from sfm_app.reconstruction.parts.cut import Part
-from sfm_app.reconstruction.parts.part_files import INPUTS, RESULT, pairs_of_parts, part_of_group, write_inputs
+from sfm_app.reconstruction.parts.part_files import (
+    INPUTS,
+    RESULT,
+    joins_from_plain,
+    pairs_of_parts,
+    part_of_group,
+    write_inputs,
+)
 from sfm_app.runtime.context import RunContext
 from sfm_app.tasks import Task
-from sfm_app.types import PoseGraph
+from sfm_app.types import LookAlikes, PoseGraph
 
 logger = logging.getLogger("sfm_app")
 
@@ -43,6 +50,8 @@ class PartResult:
     mapper: str
     tried: tuple[str, ...]
     """Notes on all attempts, for people; the reason of a failure."""
+    false_joins: tuple[LookAlikes, ...] = ()
+    """Pairs that held one place of the part on top of another; its models are without them."""
 
 
 def map_parts(group: Group, parts: Sequence[Part], mapped: PoseGraph, run: RunContext) -> list[PartResult]:
@@ -97,7 +106,12 @@ def map_part(task: PartTask) -> PartResult:
             logger.info("a part was not mapped", exc_info=err)
             return PartResult((), "", (f"failed: {err}",))
     known = json.loads((folder / RESULT).read_text(encoding="utf-8"))
-    return PartResult(tuple(str(folder / name) for name in known["models"]), known["mapper"], tuple(known["tried"]))
+    return PartResult(
+        tuple(str(folder / name) for name in known["models"]),
+        known["mapper"],
+        tuple(known["tried"]),
+        joins_from_plain(known["false_joins"]),
+    )
 
 
 def remove_parts(run: RunContext) -> None:

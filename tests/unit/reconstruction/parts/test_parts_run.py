@@ -21,7 +21,7 @@ from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import SceneSettings, Settings
 from sfm_app.synthetic.town_graph import TownOptions, make_town_graph
-from sfm_app.types import Calibration, Intrinsics
+from sfm_app.types import Calibration, Intrinsics, LookAlikes
 
 PHOTOS, PART = 90, 30
 
@@ -46,7 +46,7 @@ def group(town):
 def start(group, tmp_path):
     """Maps the group in parts with some workers, in a folder of its own."""
 
-    def run_with(workers=2):
+    def run_with(workers=2, *, whole=False):
         place = Workspace(tmp_path / f"of-{workers}")
         place.photos.mkdir(parents=True)
         write_match_graph(place.database, group.matches)
@@ -55,7 +55,8 @@ def start(group, tmp_path):
         settings = Settings.from_mapping({"scene": {"part_photos": PART}})
         with make_executor(workers) as executor:
             run = RunContext(settings, place, load_plugins(installed=False), executor, workers)
-            return map_in_parts(group, group.graph, run), run
+            found = map_in_parts(group, group.graph, run)
+            return found if whole else (found[0], run)
 
     return run_with
 
@@ -168,13 +169,28 @@ def test_the_whole_is_mapped_where_parts_do_not_explain_it(group, start, monkeyp
         return whole
 
     monkeypatch.setattr(mapping_passes, "map_group", map_whole)
-    monkeypatch.setattr(mapping_passes, "map_in_parts", lambda *_: [of_parts])
+    monkeypatch.setattr(mapping_passes, "map_in_parts", lambda *_: ([of_parts], ()))
     monkeypatch.setattr(mapping_passes, "part_size", lambda *_: 100)
 
-    found = mapping_passes._map_by_size(replace(group, photos=tuple(range(200))), _run())
+    found, joins = mapping_passes._map_by_size(replace(group, photos=tuple(range(200))), _run())
 
-    assert best_attempt(found).mapper == taken
+    assert best_attempt(found).mapper == taken and joins == ()
     assert len(whole) == (taken == "whole")
+
+
+def test_pairs_of_a_false_join_are_hidden_from_what_follows(group, start, monkeypatch):
+    join = LookAlikes(tuple(group.graph.poses)[:2], 0.9)
+    failed = PartResult((), "", ("failed",), (join,))
+    judged = []
+    monkeypatch.setattr(parts_run, "map_parts", lambda *_: [failed, failed])
+    monkeypatch.setattr(parts_run, "cut_group", lambda *_: [parts_run.Part((k,), (k,)) for k in (1, 2)])
+    join_parts = parts_run.join_parts
+    monkeypatch.setattr(parts_run, "join_parts", lambda one, *rest: judged.append(one) or join_parts(one, *rest))
+
+    _, joins = start(whole=True)
+
+    assert joins == (join,)
+    assert not set(join.pairs) & (judged[0].matches.matches.keys() | judged[0].graph.poses.keys())
 
 
 def _run():
