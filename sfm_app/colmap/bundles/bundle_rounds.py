@@ -6,11 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_app.bundle_adjustment.camera_rules import NO_RULE, CameraRule, choices_of_model
+from sfm_app.bundle_adjustment.elimination_width import elimination_width
 from sfm_app.bundle_adjustment.lens_evidence import LensEstimate, estimate_lenses
 from sfm_app.bundle_adjustment.lens_parts import COUNT, PARTS, LensPriors, consistent_choices
 from sfm_app.bundle_adjustment.normal_equations import Bundle, best_step, reduce
 from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread
 from sfm_app.colmap.bundles.bundle_arrays import NO_RULES, Rules, photos_per_camera, read_bundle, write_bundle
+from sfm_app.colmap.types import all_points
 from sfm_app.errors import NumericalError
 from sfm_app.geometry.lenses.projections import FX, FY, PANORAMA
 
@@ -36,9 +38,10 @@ LONG_STEP = 1.0
 """Step of the cameras, in standard deviations, above which the linear step of poses and points is too inaccurate and
 COLMAP's solver refines them."""
 
-MOST_SOLVED_DIRECTLY = 250
-"""Photos above which COLMAP's solver takes conjugate gradients: a factorization grows with the cube of the photos where
-all see the same. On every 5th photo of kitchen1000 (200) they take half as long to the same cost."""
+MOST_TIED = 250
+"""Photos that a photo is tied to (`elimination_width`) above which COLMAP's solver takes conjugate gradients. Where all
+see the same, a factorization grows with the cube of the photos: on every 5th photo of kitchen1000 (200) they take half
+as long to the same cost. Along streets they take five times as long as a factorization (250 photos of a town)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +105,7 @@ def solve(model: pycolmap.Reconstruction, refined: Collection[int] = ()) -> None
     options.ceres.solver_options.max_num_iterations = 50
     options.ceres.solver_options.function_tolerance = 1e-5
     options.ceres.solver_options.num_threads = 1
-    options.ceres.max_num_images_direct_sparse_cpu_solver = MOST_SOLVED_DIRECTLY
+    options.ceres.max_num_images_direct_sparse_cpu_solver = _most_factored(model)
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
         config.add_image(image_id)
@@ -111,6 +114,17 @@ def solve(model: pycolmap.Reconstruction, refined: Collection[int] = ()) -> None
         config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     run_in_daemon_thread(pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve)
+
+
+def _most_factored(model: pycolmap.Reconstruction) -> int:
+    """Return up to how many photos COLMAP's solver is to factor the normal equations: all photos, or `MOST_TIED`."""
+    photos = sorted(model.reg_image_ids())
+    if len(photos) <= MOST_TIED:
+        return MOST_TIED
+    rows = {photo: row for row, photo in enumerate(photos)}
+    seen = [(rows[one.image_id], k) for k, (_, point) in enumerate(all_points(model)) for one in point.track.elements]
+    photo, point = np.array(seen, np.int64).reshape(-1, 2).T
+    return len(photos) if elimination_width(photo, point) <= MOST_TIED else MOST_TIED
 
 
 def improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph) -> int:
