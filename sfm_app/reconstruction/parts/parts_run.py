@@ -158,7 +158,9 @@ def join_parts(group: Group, parts: Sequence[Part], results: Sequence[PartResult
         for number, (part, result) in enumerate(zip(parts, results, strict=True))
         for folder in result.models
     ]
-    across = AcrossJoins(group.matches, group.views, run.settings.epipolar.max_error_px)
+    # pairs that the pose graph has dropped, as those of look-alikes, are evidence neither for a join nor against it
+    sound = {pair: fit for pair, fit in group.views.fits.items() if pair in group.graph.poses}
+    across = AcrossJoins(group.matches, replace(group.views, fits=sound), run.settings.epipolar.max_error_px)
     kept: list[Join] = []
     refused: list[Join] = []
     for first, second in combinations(range(len(fragments)), 2):

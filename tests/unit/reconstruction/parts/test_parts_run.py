@@ -21,7 +21,7 @@ from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import SceneSettings, Settings
 from sfm_app.synthetic.town_graph import TownOptions, make_town_graph
-from sfm_app.types import Calibration, Intrinsics, LookAlikes
+from sfm_app.types import Calibration, EpipolarFit, Intrinsics, LookAlikes
 
 PHOTOS, PART = 90, 30
 
@@ -46,7 +46,7 @@ def group(town):
 def start(group, tmp_path):
     """Maps the group in parts with some workers, in a folder of its own."""
 
-    def run_with(workers=2, *, whole=False):
+    def run_with(workers=2, *, whole=False, group=group):
         place = Workspace(tmp_path / f"of-{workers}")
         place.photos.mkdir(parents=True)
         write_match_graph(place.database, group.matches)
@@ -103,6 +103,25 @@ def test_a_part_that_fails_is_left_to_the_others(start, monkeypatch):
     joined, completed = found
     assert joined.photos < completed.photos
     assert best_attempt(found) is completed and completed.photos >= PHOTOS - 4
+
+
+@pytest.mark.slow
+def test_pairs_that_the_pose_graph_has_dropped_do_not_refuse_a_join(group, start):
+    rng = np.random.default_rng(2)
+    rows, fits = dict(group.matches.matches), dict(group.views.fits)
+    for a, b in rng.permutation([(a, b) for a in range(1, 30) for b in range(60, PHOTOS) if (a, b) not in rows])[:200]:
+        count = min(300, *(len(group.matches.keypoints[photo]) for photo in (a, b)))
+        pair = int(a), int(b)
+        rows[pair] = np.column_stack([np.arange(count)] * 2).astype(np.uint32)
+        fits[pair] = EpipolarFit(rng.normal(size=(3, 3)), np.ones(count, bool), np.ones(count), 9, 0.1)
+
+    found, run = start(
+        group=replace(group, matches=replace(group.matches, matches=rows), views=replace(group.views, fits=fits))
+    )
+
+    (figures,) = run.statistics["parts"]
+    assert figures["dropped_joins"] == [] and len(figures["joins"]) >= len(figures["parts"]) - 1
+    assert best_attempt(found).photos >= PHOTOS - 2
 
 
 def test_where_no_part_is_mapped_the_reason_is_told(group, start, monkeypatch):
