@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfm_app.atomic_io import save_files
-from sfm_app.errors import ConfigError, InputError
+from sfm_app.errors import ConfigError, InputError, SfmError
 from sfm_app.plugins import load_plugins
 from sfm_app.progress import Progress, SilentProgress
 from sfm_app.ransac import check_points
@@ -39,6 +39,8 @@ class Run:
     """COLMAP's sparse model."""
     mesh_path: Path | None
     """model.glb; model.ply lies beside it."""
+    report_path: Path | None
+    """report.html; None where `report` is off in the settings."""
     manifest: dict[str, Any]
     """manifest.json, with the stages up to the one where the run stopped."""
 
@@ -63,11 +65,18 @@ def reconstruct(
         SfmError: see `sfm_app.errors`; its message and hint say what went wrong and what to do.
     """
     from sfm_app import pipeline  # loads COLMAP, which an estimator alone does not need
+    from sfm_app.report.page import finish_report
 
     with open_run(Path(out), settings or Settings(), progress) as run:
         run.plugins.depth_method(run.settings.depth.method)  # fail now, not halfway through the work
         wanted = (pipeline.INTRINSICS, pipeline.SCENE, pipeline.FILES)
-        products = pipeline.run_stages(Path(photos), run, first, last, wanted)
+        try:
+            products = pipeline.run_stages(Path(photos), run, first, last, wanted)
+        except SfmError as err:
+            if written := finish_report(run, err):
+                run.progress.say(f"what was found until then: {written}")
+            raise
+        report = finish_report(run)
         manifest = run.workspace.manifest.read()
         done = pipeline.PIPELINE.stages_until(last)
         scene = products[pipeline.SCENE] if pipeline.SCENE in done else None
@@ -77,8 +86,24 @@ def reconstruct(
             scene=scene,
             model_dir=scene.model_dir if scene else None,
             mesh_path=products[pipeline.FILES][-1] if pipeline.FILES in done else None,
+            report_path=report,
             manifest={**manifest, "stages": {stage.name: manifest["stages"][stage.name] for stage in done}},
         )
+
+
+def write_report(out: PathLike) -> Path:
+    """Write OUT/report.html again, from what a run has left; nothing is computed again.
+
+    Args:
+        out: output folder of the run.
+
+    Raises:
+        InputError: it holds no run.
+    """
+    from sfm_app.report import page  # loads COLMAP
+
+    with open_run(Path(out), Settings(), None) as run:
+        return page.write_report(run)
 
 
 def export_model(

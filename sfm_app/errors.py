@@ -13,6 +13,7 @@
     └── ClusterError            the cluster is gone, or cannot be used           exit 8
 """
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 
@@ -22,15 +23,17 @@ class SfmError(Exception):
     Args:
         message: one line.
         hint: what to do, one line; may be empty.
+        photos: the photos concerned, each with its reason.
     """
 
     exit_code: ClassVar[int] = 1
 
-    def __init__(self, message: str, hint: str = "") -> None:
+    def __init__(self, message: str, hint: str = "", photos: Mapping[str, str] | None = None) -> None:
         # Both go to the base class, so that the error survives pickling between worker processes.
         super().__init__(message, hint)
         self.message = message
         self.hint = hint
+        self.photos = dict(photos or {})
 
     def __str__(self) -> str:
         return self.message

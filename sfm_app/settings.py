@@ -236,6 +236,7 @@ class Settings(Section):
         0.0, ge=0, le=4096, description="most memory that is used, in GB; 0: four fifths of what the machine has"
     )
     plugins: bool = Field(True, description="load installed plug-ins; false: only the program's own methods")
+    report: bool = Field(True, description="write OUT/report.html at the end of every run; false: do not")
     photos: PhotoSettings = PhotoSettings()
     matching: MatchSettings = MatchSettings()
     epipolar: EpipolarSettings = EpipolarSettings()

@@ -10,8 +10,7 @@ from typing import Any
 import click
 
 from sfm_app import __version__
-from sfm_app.api import calibrate_photos, export_model, reconstruct
-from sfm_app.cli.camera_text import intrinsics_lines, intrinsics_summary
+from sfm_app.api import calibrate_photos, export_model, reconstruct, write_report
 from sfm_app.cli.display import (
     file_lines,
     print_json,
@@ -29,6 +28,7 @@ from sfm_app.demo import demo_lines, run_demo
 from sfm_app.errors import ConfigError, SfmError
 from sfm_app.pipeline import NAMES
 from sfm_app.plugins import load_plugins
+from sfm_app.report.camera_text import intrinsics_lines, intrinsics_summary
 
 INTERRUPTED = 130
 FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
@@ -142,6 +142,13 @@ def export(out: Path, file_format: str, target: Path | None, points: bool, as_js
         raise ConfigError("no format is given", hint=f"--format {'|'.join(load_plugins().exporters)}, or -o model.obj")
     files = export_model(out, file_format, target, points=points)
     print_json([str(path) for path in files]) if as_json else print_lines(file_lines(files))
+
+
+@main.command()
+@click.argument("out", type=click.Path(path_type=Path))
+def report(out: Path) -> None:
+    """Write OUT/report.html again: what the run in OUT has found, as one page that opens without a network."""
+    print_lines(file_lines([write_report(out)]))
 
 
 @main.command()

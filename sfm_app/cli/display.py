@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from sfm_app.api import Run
-from sfm_app.cli.camera_text import contradiction_lines, intrinsics_lines, intrinsics_summary
-from sfm_app.cli.scene_text import scene_lines, scene_summary
 from sfm_app.numerical import json_text
+from sfm_app.report.camera_text import contradiction_lines, intrinsics_lines, intrinsics_summary
+from sfm_app.report.scene_text import scene_lines, scene_summary
 
 MEGABYTE, KILOBYTE = 1e6, 1e3
 NAMES_SHOWN = 5
@@ -44,6 +44,7 @@ def run_summary(run: Run) -> dict[str, Any]:
         "pairs": {key: counts.get("view_graph", {}).get(key) for key in ("kept", "rejected")},
         **({"given_cameras": given} if given else {}),
         "calibration": intrinsics_summary(run.calibration) if run.calibration else None,
+        "report": str(run.report_path) if run.report_path else None,
         "seconds": {name: stage["seconds"] for name, stage in stages.items()},
     }
     if run.scene:
@@ -80,6 +81,8 @@ def run_lines(run: Run) -> list[str]:
     if run.mesh_path:
         lines.append(f"mesh        {summary['mesh']['triangles']} triangles{texture_text(summary['mesh'])}")
         lines += [f"            {line}" for line in file_lines(written_files(run, "files"))]
+    if run.report_path:
+        lines.append(f"report      {file_lines([run.report_path])[0]}")
     seconds = summary["seconds"]
     lines.append(
         "seconds     "

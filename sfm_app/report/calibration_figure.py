@@ -5,9 +5,12 @@ panoramas, are the panels of `lens_panels`.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
 
 from sfm_app.errors import ConfigError
 from sfm_app.estimation.calibrating import camera_pairs
@@ -23,6 +26,8 @@ if TYPE_CHECKING:
 SUFFIXES = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 """Formats, and what is left out of the file so that the same figure gives the same bytes."""
 MOST_CAMERAS = 4
+MOST_PAIRS = 300
+"""Pairs of a camera that are drawn, those of most weight: more lines hide each other, and take a minute."""
 WIDTH_IN, TEXT_IN, PLANES_IN, LENS_IN = 12.5, 1.0, 4.6, 4.6
 """Size of the figure, and heights of the text, the planes and the panels of a camera, in inches."""
 
@@ -96,8 +101,26 @@ def calibration_text(camera: Calibration) -> str:
     return "\n".join(fill(text, 150) for text in texts if text).replace("+-", "±")
 
 
+def weightiest(pairs: CameraPairs, most: int) -> CameraPairs:
+    """Return the pairs of most weight, in their order.
+
+    Args:
+        pairs: of one camera.
+        most: of them that are kept.
+    """
+    kept = np.sort(np.argsort(-pairs.weights, kind="stable")[:most])
+    return replace(
+        pairs,
+        Fs=pairs.Fs[kept],
+        weights=pairs.weights[kept],
+        photos=tuple(pairs.photos[k] for k in kept) if pairs.photos else (),
+        inliers=tuple(pairs.inliers[k] for k in kept) if pairs.inliers else (),
+    )
+
+
 def _draw_camera(part: "SubFigure", panel: Panel) -> None:
     """Draw all rows of one camera."""
+    panel = panel._replace(pairs=weightiest(panel.pairs, MOST_PAIRS))
     rows = part.subfigures(len(panel.heights_in), 1, squeeze=False, height_ratios=panel.heights_in)[:, 0]
     if panel.is_perspective:
         draw_vote_planes(rows[0], panel.camera, panel.pairs)

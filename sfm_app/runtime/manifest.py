@@ -16,6 +16,8 @@ FORMAT = 2
 """Version of the stages' files; raised when other versions of the program can no longer read them."""
 CHECKSUM = "check"
 """Key in a record: hash of the rest. A record that was edited or cut off is ignored."""
+PROBLEM = "problem"
+"""Key of what ended the last run."""
 MOST_BYTES = 64_000_000
 
 
@@ -104,6 +106,17 @@ class Manifest:
         entry = json.loads(json_text(asdict(record)))
         stages = self.read().get("stages", {}) | {stage: {**entry, CHECKSUM: fingerprint(entry)}}
         self.write({"format": FORMAT, **head, "stages": stages})
+
+    def note_problem(self, problem: Mapping[str, Any]) -> None:
+        """Note what ended a run, until a stage is finished again; an empty problem removes the note.
+
+        Args:
+            problem: plain values.
+        """
+        manifest = self.read()
+        if problem != manifest.get(PROBLEM, {}):
+            left = {key: value for key, value in manifest.items() if key != PROBLEM}
+            self.write(left | ({PROBLEM: problem} if problem else {}))
 
     def write(self, manifest: Mapping[str, Any]) -> None:
         """Replace the manifest as a whole."""

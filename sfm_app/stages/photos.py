@@ -67,6 +67,17 @@ def load(source: Source, run: RunContext) -> PhotoSet:
     return _read_photo_set(run.workspace.frames if source.video else source.path, source.mask_dir, run)
 
 
+def read_photo_list(place: Workspace) -> PhotoSet:
+    """Read photos.json back as it is, for a reader that needs none of the laid-out photos.
+
+    Args:
+        place: the output folder.
+    """
+    values = json.loads(place.photo_set.read_text(encoding="utf-8"))
+    photos = tuple(_photo_from_dict(entry) for entry in values["photos"])
+    return PhotoSet(place.photos, photos, tuple(UnusablePhoto(**photo) for photo in values["unusable"]))
+
+
 def digest(place: Workspace) -> str:
     """Return a hash of photos.json, which holds hashes of the copies."""
     return digest_files(place.root, place.photo_set.name)
@@ -87,6 +98,7 @@ def _read_photos(
         raise InputError(
             _too_few_message(folder, len(photos), unusable),
             hint="at least two photos of a place are needed; 10 to 50 work best",
+            photos={photo.name: photo.reason for photo in unusable},
         )
     timed = [replace(photo, time_s=times_s.get(photo.path)) for photo in photos]
     named = tuple(split_by_given_camera(list(assign_names(group_by_camera(timed, options.cameras))), run.given))

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sfm_app.cli.scene_text import scene_lines
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundles import bundle_rounds
 from sfm_app.colmap.database import open_database
@@ -19,6 +18,7 @@ from sfm_app.plugins import load_plugins
 from sfm_app.reconstruction import Outcome
 from sfm_app.reconstruction.mapping_runs import Attempt
 from sfm_app.reconstruction.support import PairSupport
+from sfm_app.report.scene_text import scene_lines
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import MAPPING, Workspace
 from sfm_app.settings import Settings

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from sfm_app.cli.camera_text import contradiction_lines, refined_text
+from sfm_app.report.camera_text import contradiction_lines, refined_text
 from sfm_app.types import Scene
 
 NAMES_SHOWN = 4

@@ -6,7 +6,7 @@ from typing import Any
 
 from sfm_app.geometry.lenses.camera_models import calibration_from_model
 from sfm_app.geometry.lenses.lens_curve import field_of_view_deg
-from sfm_app.report import field_text, held_text, lens_text
+from sfm_app.report.words import field_text, held_text, lens_text
 from sfm_app.types import Calibration, CameraModel, Intrinsics
 from sfm_app.types.calibration import EQUIRECTANGULAR, FISHEYE, GIVEN, KEPT
 

@@ -1,0 +1,90 @@
+"""What an output folder holds, read for the page; a stage that has not run, or whose files are damaged, is left out."""
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeVar
+
+from sfm_app.errors import SfmError
+from sfm_app.numerical import FAILURES
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.manifest import PROBLEM
+from sfm_app.stages import intrinsics, match_graph, photos, scene, view_graph
+from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
+
+logger = logging.getLogger("sfm_app")
+
+UNREADABLE = (*FAILURES, SfmError, OSError, KeyError, TypeError)
+"""What reading damaged files raises."""
+Product = TypeVar("Product")
+
+
+class Problem(NamedTuple):
+    """What ended a run."""
+
+    message: str
+    hint: str
+    photos: Mapping[str, str]
+    """The photos concerned, each with its reason."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunContents:
+    """Products of the finished stages of a run."""
+
+    run: RunContext
+    manifest: Mapping[str, Any]
+    photos: PhotoSet | None = None
+    matches: MatchGraph | None = None
+    views: ViewGraph | None = None
+    intrinsics: Intrinsics | None = None
+    scene: Scene | None = None
+
+    @property
+    def problem(self) -> "Problem | None":
+        """What ended the last run; None where it went to its end."""
+        noted = self.manifest.get(PROBLEM)
+        if not noted:
+            return None
+        return Problem(noted.get("message", ""), noted.get("hint", ""), noted.get("photos", {}))
+
+    @property
+    def stages(self) -> Mapping[str, Any]:
+        """Records of the finished stages, by name."""
+        found: Mapping[str, Any] = self.manifest.get("stages", {})
+        return found
+
+    def counts(self, stage: str) -> Mapping[str, Any]:
+        """Return the figures of a stage; empty where it has not run."""
+        found: Mapping[str, Any] = self.stages.get(stage, {}).get("counts", {})
+        return found
+
+
+def read_contents(run: RunContext) -> RunContents:
+    """Read what the finished stages of a run have left.
+
+    Args:
+        run: with its output folder.
+    """
+    manifest = run.workspace.manifest.read()
+    done = manifest.get("stages", {})
+
+    def read(stage: str, load: Callable[[], Product]) -> Product | None:
+        if stage not in done:
+            return None
+        try:
+            return load()
+        except UNREADABLE as err:  # the page shows what is left
+            logger.info("the report leaves out stage %s", stage, exc_info=err)
+            return None
+
+    listed = read("photos", lambda: photos.read_photo_list(run.workspace))
+    return RunContents(
+        run,
+        manifest,
+        listed,
+        read("match_graph", lambda: match_graph.load(listed, run)) if listed is not None else None,
+        read("view_graph", lambda: view_graph.load(run)),
+        read("intrinsics", lambda: intrinsics.load(run)),
+        read("scene", lambda: scene.load(run)),
+    )

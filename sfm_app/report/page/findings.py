@@ -1,0 +1,215 @@
+"""What a run has found, as the tables of the page: at a glance, warnings, cameras, dropped pairs, stages."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sfm_app.report.camera_text import contradiction_lines, intrinsics_lines
+from sfm_app.report.page.contents import RunContents
+from sfm_app.report.scene_text import scene_lines
+from sfm_app.settings import Settings
+
+WARNING = "beware: "
+"""How the texts of a run begin what one should look at."""
+UNKNOWN_CAMERA = "these photos do not determine it"
+"""How the texts of a camera begin why it is a guess."""
+PARAMETERS = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
+"""Places of the parameters in K."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """One of the figures at a glance."""
+
+    name: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraTable:
+    """One camera, as pairs of photos gave it and after the last adjustment."""
+
+    name: str
+    size: str
+    model: str
+    rows: Sequence[tuple[str, str, str]]
+    """Parameter, value from pairs, value after adjustment."""
+    texts: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class StageRow:
+    """What a stage has cost."""
+
+    name: str
+    seconds: float
+    cpu_seconds: float
+    peak_mb: float
+    share: float
+    """Of the seconds of the run."""
+
+
+def glance(contents: RunContents) -> list[Fact]:
+    """Return what was found, at a glance.
+
+    Args:
+        contents: of the run.
+    """
+    return [fact for fact in _facts(contents) if fact.value]
+
+
+def _facts(contents: RunContents) -> Iterator[Fact]:
+    scene, intrinsics = contents.scene, contents.intrinsics
+    photos, pairs = contents.counts("photos"), contents.counts("view_graph")
+    if scene is not None:
+        count = len(scene.registered) + len(scene.unregistered)
+        yield Fact("photos placed", f"{len(scene.registered)} of {count}")
+    elif photos:
+        yield Fact("usable photos", str(photos.get("usable", "")))
+    if scene is not None and scene.cameras:
+        camera = next(iter(scene.cameras.values()))
+        deviation = camera.deviations.get("fx")
+        more = f"± {deviation:.1f} px" if deviation is not None else ""
+        yield Fact("focal length", f"{camera.K[0, 0]:.0f} px", more)
+    elif intrinsics is not None and intrinsics.cameras:
+        known = intrinsics.main
+        yield Fact("focal length", f"{known.focal_px:.0f} px", "" if known.identifiable else "a guess")
+    if pairs:
+        yield Fact("pairs of photos", str(pairs.get("kept", "")), "that show the same place")
+    if scene is not None:
+        yield Fact("points", f"{scene.points:,}", f"seen {scene.observations:,} times")
+        yield Fact("reprojection error", f"{scene.mean_reprojection_px:.2f} px", "mean")
+    triangles = contents.counts("mesh").get("triangles")
+    if triangles:
+        yield Fact("triangles", f"{triangles:,}")
+    unit = contents.counts("scene").get("orientation", {}).get("unit")
+    if unit:
+        yield Fact(
+            "unit", "meters" if unit == "meter" else "its own", "by GPS" if unit == "meter" else "no scale known"
+        )
+    if contents.stages:
+        yield Fact("time", duration_text(sum(stage["seconds"] for stage in contents.stages.values())))
+
+
+def duration_text(seconds: float) -> str:
+    """Return seconds in words."""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+
+def remarks(contents: RunContents) -> tuple[list[str], list[str]]:
+    """Return the warnings of a run, each with what to do, and its other remarks.
+
+    Args:
+        contents: of the run.
+    """
+    lines = list(intrinsics_lines(contents.intrinsics)) if contents.intrinsics is not None else []
+    for stage in ("view_graph", "intrinsics"):
+        lines += contradiction_lines(contents.counts(stage))
+    if contents.scene is not None:
+        lines += scene_lines(contents.scene, contents.counts("scene"))
+    texts = [" ".join(line.split()) for line in lines]
+    warnings = [text.removeprefix(WARNING) for text in texts if text.startswith(WARNING)]
+    warnings += [text for text in texts if text.startswith(UNKNOWN_CAMERA)]
+    others = [text for text in texts if not text.startswith(WARNING) and text not in warnings]
+    return warnings, others
+
+
+def camera_tables(contents: RunContents) -> list[CameraTable]:
+    """Return all cameras with their deviations.
+
+    Args:
+        contents: of the run.
+    """
+    found, scene = contents.intrinsics, contents.scene
+    if found is None:
+        return []
+    tables = []
+    for name, camera in found.cameras.items():
+        after = scene.cameras.get(name) if scene is not None else None
+        rows = [
+            (
+                parameter,
+                value_text(camera.K[at], camera.spread.get(parameter)),
+                value_text(after.K[at], after.deviations.get(parameter)) if after is not None else "",
+            )
+            for parameter, at in PARAMETERS.items()
+        ]
+        rows += _lens_rows(after) if after is not None else []
+        lens = contents.counts("scene").get("lenses", {}).get(name, {}).get("model", "") if after is not None else ""
+        alone = intrinsics_lines(type(found)({name: camera}, found.camera_of, found.photos))
+        texts = [" ".join(line.split()) for line in alone[1:]]
+        tables.append(CameraTable(name, f"{camera.width} × {camera.height}", lens, rows, texts))
+    return tables
+
+
+def _lens_rows(after: Any) -> list[tuple[str, str, str]]:
+    """Return the terms of the lens that have a deviation."""
+    names = [name for name in after.deviations if name not in PARAMETERS]
+    first = len(after.params) - len(names)
+    return [
+        (name, "", value_text(after.params[first + k], after.deviations[name], 4))
+        for k, name in enumerate(names)
+        if first >= 0 and after.params[first + k]
+    ]
+
+
+def value_text(value: float, deviation: float | None, digits: int = 1) -> str:
+    """Return a value with its standard deviation, if known.
+
+    Args:
+        value, deviation: to be written.
+        digits: after the point.
+    """
+    more = "" if deviation is None else f" ± {deviation:.{digits}f}"
+    return f"{value:.{digits}f}{more}"
+
+
+def dropped_pairs(contents: RunContents) -> list[tuple[str, int]]:
+    """Return why pairs of photos were dropped, and how many, those of the F first.
+
+    Args:
+        contents: of the run.
+    """
+    rejected = contents.counts("view_graph").get("rejected", {})
+    later = contents.counts("scene").get("pairs_dropped", {})
+    return [*rejected.items(), *later.items()]
+
+
+def stage_rows(contents: RunContents) -> list[StageRow]:
+    """Return what each stage has cost.
+
+    Args:
+        contents: of the run.
+    """
+    whole = sum(stage["seconds"] for stage in contents.stages.values()) or 1.0
+    return [
+        StageRow(
+            name, stage["seconds"], stage.get("cpu_seconds", 0.0), stage.get("peak_mb", 0.0), stage["seconds"] / whole
+        )
+        for name, stage in contents.stages.items()
+    ]
+
+
+def changed_settings(contents: RunContents) -> list[tuple[str, str, str]]:
+    """Return the settings that are not at their defaults: name, value, default.
+
+    Args:
+        contents: of the run.
+    """
+    given = contents.manifest.get("settings", {})
+    usual = Settings().model_dump()
+    return sorted(_differences(given, usual))
+
+
+def _differences(
+    given: Mapping[str, Any], usual: Mapping[str, Any], prefix: str = ""
+) -> Iterator[tuple[str, str, str]]:
+    for name, value in given.items():
+        default = usual.get(name)
+        if isinstance(value, Mapping) and isinstance(default, Mapping):
+            yield from _differences(value, default, f"{prefix}{name}.")
+        elif value != default:
+            yield f"{prefix}{name}", str(value), str(default)

@@ -1,0 +1,167 @@
+"""Write the page: the template filled with what was found, style and scripts put in, nothing to be loaded."""
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from markupsafe import Markup
+
+from sfm_app.atomic_io import replace_atomically
+from sfm_app.colmap.figures.observations import ModelFigures, model_figures
+from sfm_app.errors import InputError, SfmError
+from sfm_app.numerical import json_text
+from sfm_app.report.page import findings
+from sfm_app.report.page.contents import UNREADABLE, RunContents, read_contents
+from sfm_app.report.page.page_figures import page_figures
+from sfm_app.report.page.photo_rows import LEFT_OUT, PLACED, PhotoRow, photo_rows
+from sfm_app.report.page.scene_view import scene_view
+from sfm_app.report.page.three_script import three_script
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.workspace import LOCK, Workspace
+
+logger = logging.getLogger("sfm_app")
+
+REPORT = "report.html"
+ASSETS = Path(__file__).parent / "assets"
+
+
+def finish_report(run: RunContext, problem: SfmError | None = None) -> Path | None:
+    """Note how a run ended, and write its report; no failure in it ends the run.
+
+    Args:
+        run: with its output folder.
+        problem: that ended the run; None where it went to its end.
+
+    Returns:
+        The report; None where there is none: no run has begun in the folder, or another one is at work in it.
+    """
+    place = run.workspace
+    if not (place.root / LOCK).exists():
+        return None
+    try:
+        with place.hold_lock():
+            noted = (
+                {} if problem is None else {"message": problem.message, "hint": problem.hint, "photos": problem.photos}
+            )
+            place.manifest.note_problem(noted)
+            if not run.settings.report:
+                return None
+            return place.root / REPORT if problem is None and _is_up_to_date(place) else write_report(run)
+    except Exception as err:  # a run does not fail for its report
+        logger.info("no report", exc_info=err)
+        run.progress.say(f"there is no report of this run: {err}")
+        return None
+
+
+def write_report(run: RunContext) -> Path:
+    """Write OUT/report.html from what the finished stages of a run have left, and return its path.
+
+    Args:
+        run: with its output folder.
+
+    Raises:
+        InputError: the folder holds no run.
+    """
+    contents = read_contents(run)
+    if not contents.manifest:
+        raise InputError(
+            f"{run.workspace.root} holds no run", hint="name the folder that `sfm-app run PHOTOS -o OUT` wrote"
+        )
+    path = run.workspace.root / REPORT
+    with replace_atomically(path) as beside:
+        beside.write_text(render_page(contents), encoding="utf-8")
+    return path
+
+
+def _is_up_to_date(place: Workspace) -> bool:
+    """Return whether the report was written after the last change of the manifest."""
+    report, manifest = place.root / REPORT, place.manifest.path
+    return report.exists() and manifest.exists() and report.stat().st_mtime_ns >= manifest.stat().st_mtime_ns
+
+
+def _as_plain(problem: SfmError) -> dict[str, Any]:
+    return {"message": problem.message, "hint": problem.hint, "photos": problem.photos}
+
+
+def render_page(contents: RunContents) -> str:
+    """Return the page as HTML.
+
+    Args:
+        contents: of the run.
+    """
+    figures = _model_figures(contents)
+    rows = photo_rows(contents, figures)
+    names = sorted(photo.name for photo in contents.photos.photos) if contents.photos else []
+    view = scene_view(contents, names)
+    warnings, others = findings.remarks(contents)
+    return _environment().get_template("page.html.jinja").render(
+        title=contents.run.workspace.root.resolve().name,
+        headline=headline(contents, rows),
+        problem=contents.problem,
+        facts=findings.glance(contents),
+        warnings=warnings,
+        remarks=others,
+        cameras=findings.camera_tables(contents),
+        dropped=findings.dropped_pairs(contents),
+        rows=rows,
+        stages=findings.stage_rows(contents),
+        changed=findings.changed_settings(contents),
+        settings=json.dumps(contents.manifest.get("settings", {}), indent=1),
+        versions=contents.manifest.get("versions", {}),
+        figures=page_figures(contents, figures),
+        view=view is not None and bool(three_script()),
+        data=script_data({"view": view, "photos": [_photo_data(row) for row in rows]}),
+        three=Markup(three_script()),  # noqa: S704 - a script of an installed package, without user text
+    )  # fmt: skip
+
+
+def headline(contents: RunContents, rows: Sequence[PhotoRow]) -> str:
+    """Return what came of the run, in one sentence.
+
+    Args:
+        contents: of the run.
+        rows: of all photos.
+    """
+    if contents.problem is not None:
+        return "There is no model." if contents.scene is None else "The run ended early."
+    placed, count = sum(row.state == PLACED for row in rows), sum(row.state != LEFT_OUT for row in rows)
+    if contents.scene is None:
+        return f"{count} usable photos, not mapped yet."
+    what = "A textured model" if "files" in contents.stages else "Cameras and points"
+    return f"{what} from {f'all {count}' if placed == count else f'{placed} of {count}'} photos."
+
+
+def _model_figures(contents: RunContents) -> ModelFigures | None:
+    if contents.scene is None:
+        return None
+    try:
+        return model_figures(contents.scene.model_dir)
+    except UNREADABLE as err:
+        logger.info("the report has no figures of the model", exc_info=err)
+        return None
+
+
+def _photo_data(row: PhotoRow) -> dict[str, Any]:
+    return {key: value for key, value in asdict(row).items() if key != "picture" and value is not None}
+
+
+def script_data(value: Any) -> Markup:
+    """Return plain values as JSON that no text in them can end: `<` is escaped."""
+    text = json_text(value).replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+    return Markup(text)  # noqa: S704 - escaped in the line above
+
+
+@cache
+def _environment() -> jinja2.Environment:
+    """Return the templates, which escape every text that is put into them."""
+    found = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(ASSETS), autoescape=True, undefined=jinja2.StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    found.globals["asset"] = lambda name: Markup((ASSETS / name).read_text(encoding="utf-8"))  # noqa: S704 - our files
+    return found

@@ -1,0 +1,82 @@
+"""Parts of report.html that need no run."""
+
+import json
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sfm_app.report.page.findings import changed_settings, duration_text, glance, value_text
+from sfm_app.report.page.photo_rows import ALL_PIXELS, LARGEST_PX, SMALLEST_PX, picture_side
+from sfm_app.report.page.scene_view import LIGHT_PAGE_PX, lighten
+from sfm_app.report.page.three_script import three_script
+from sfm_app.report.page.writing import script_data
+from sfm_app.settings import Settings
+
+
+def test_three_js_comes_from_an_installed_package_and_ends_before_the_page_that_it_was_in():
+    script = three_script()
+
+    assert 500_000 < len(script) < 2_000_000
+    assert "WebGLRenderer" in script and "GLTFLoader" in script
+    assert "B64GLTF" not in script and "</script" not in script.lower()
+
+
+@pytest.mark.parametrize(
+    "text", ["</script><script>alert(1)</script>", "<!--", "a\u2028b", "<img src=x onerror=alert(1)>"]
+)
+def test_no_text_ends_the_data_of_the_script(text):
+    found = str(script_data({"name": text}))
+
+    assert "<" not in found and "\u2028" not in found
+    assert json.loads(found) == {"name": text}
+
+
+@pytest.mark.parametrize("count", [1, 20, 200, 5000])
+def test_pictures_of_any_number_of_photos_stay_small(count):
+    side = picture_side(count)
+
+    assert SMALLEST_PX <= side <= LARGEST_PX
+    assert count * side * side * 3 / 4 < max(1.4 * ALL_PIXELS, count * SMALLEST_PX**2)
+
+
+def test_few_photos_have_larger_pictures_than_many():
+    assert picture_side(5) > picture_side(50) > picture_side(250)
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (119, "119 s"), (150, "2 min"), (7300, "2.0 h")])
+def test_durations_are_said_in_a_fitting_unit(seconds, text):
+    assert duration_text(seconds) == text
+
+
+def test_a_value_has_its_deviation_only_where_it_is_known():
+    assert value_text(1379.16, 1.05) == "1379.2 ± 1.1"
+    assert value_text(-0.00076, None, 4) == "-0.0008"
+
+
+def test_settings_that_were_changed_are_listed_with_their_defaults():
+    given = Settings.from_mapping({"seed": 3, "mesh": {"faces": 1000}}).model_dump()
+    contents = SimpleNamespace(manifest={"settings": given})
+
+    assert changed_settings(contents) == [("mesh.faces", "1000", str(Settings().mesh.faces)), ("seed", "3", "0")]
+
+
+def test_nothing_is_claimed_of_a_run_without_a_stage():
+    contents = SimpleNamespace(scene=None, intrinsics=None, stages={}, counts=lambda _: {})
+
+    assert glance(contents) == []
+
+
+def test_a_large_texture_is_shrunk_and_keeps_its_colors(textured_ball):
+    large = np.full((3 * LIGHT_PAGE_PX, 2 * LIGHT_PAGE_PX, 3), (10, 120, 240), np.uint8)
+    small = large[:64, :96]
+
+    first, second = lighten(
+        replace(textured_ball, texture=replace(textured_ball.texture, pages=(large, small)))
+    ).texture.pages
+
+    assert max(first.shape[:2]) == LIGHT_PAGE_PX and math.isclose(first.shape[0] / first.shape[1], 1.5, rel_tol=0.01)
+    assert (first == (10, 120, 240)).all()
+    assert second is small
