@@ -3,6 +3,7 @@
 run = sfm_app.reconstruct("photos/", "out/")
 cal = sfm_app.calibrate_photos("photos/")
 sfm_app.export_model("out/", "obj")
+sfm_app.write_report("out/")
 fit = sfm_app.estimate_fundamental(x1, x2)
 cal = sfm_app.calibrate_fundamentals(Fs, (width, height))
 lens = sfm_app.estimate_lens(matches, (width, height))
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
         estimate_lens,
         export_model,
         reconstruct,
+        write_report,
     )
     from sfm_app.settings import Settings
 
@@ -49,6 +51,7 @@ __all__ = [
     "estimate_lens",
     "export_model",
     "reconstruct",
+    "write_report",
 ]
 
 

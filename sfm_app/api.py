@@ -39,10 +39,10 @@ class Run:
     """COLMAP's sparse model."""
     mesh_path: Path | None
     """model.glb; model.ply lies beside it."""
-    report_path: Path | None
-    """report.html; None where `report` is off in the settings."""
     manifest: dict[str, Any]
     """manifest.json, with the stages up to the one where the run stopped."""
+    report_path: Path | None = None
+    """report.html; None where `report` is off in the settings."""
 
 
 def reconstruct(
@@ -86,8 +86,8 @@ def reconstruct(
             scene=scene,
             model_dir=scene.model_dir if scene else None,
             mesh_path=products[pipeline.FILES][-1] if pipeline.FILES in done else None,
-            report_path=report,
             manifest={**manifest, "stages": {stage.name: manifest["stages"][stage.name] for stage in done}},
+            report_path=report,
         )
 
 
