@@ -91,19 +91,20 @@ def reconstruct(
         )
 
 
-def write_report(out: PathLike) -> Path:
+def write_report(out: PathLike, compare: PathLike | None = None) -> Path:
     """Write OUT/report.html again, from what a run has left; nothing is computed again.
 
     Args:
         out: output folder of the run.
+        compare: that of another run, to be set beside it; None for none.
 
     Raises:
-        InputError: it holds no run.
+        InputError: a folder holds no run.
     """
     from sfm_app.report import page  # loads COLMAP
 
     with open_run(Path(out), Settings(), None) as run:
-        return page.write_report(run)
+        return page.write_report(run, replace(run, workspace=Workspace(Path(compare))) if compare is not None else None)
 
 
 def export_model(

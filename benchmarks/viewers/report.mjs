@@ -2,10 +2,12 @@
 // Prints JSON: what the console said, requests, whether the 3D view draws, and what a click on a camera does.
 import chromium from '@sparticuz/chromium';
 import fs from 'node:fs';
+import { createRequire } from 'node:module';
 import path from 'node:path';
 import { pathToFileURL } from 'node:url';
 import puppeteer from 'puppeteer-core';
 
+const AXE = fs.readFileSync(createRequire(import.meta.url).resolve('axe-core/axe.min.js'), 'utf8');
 const SOFTWARE = ['--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader'];
 const WIDTHS = { wide: { width: 1440, height: 900 }, narrow: { width: 390, height: 844, isMobile: true, hasTouch: true } };
 const [file, pictures] = process.argv.slice(2).map((one) => path.resolve(one));
@@ -47,6 +49,11 @@ async function visit(browser, name, size) {
     await page.screenshot({ path: path.join(pictures, `report-${name}-flown.png`) });
   }
   await page.screenshot({ path: path.join(pictures, `report-${name}-whole.png`), fullPage: true });
+  await page.evaluate(AXE);
+  found.axe = await page.evaluate(async () => {
+    const { violations } = await window.axe.run(document);
+    return violations.map(({ id, nodes }) => `${id}: ${nodes.map((node) => node.target.join(' ')).slice(0, 3).join(', ')}`);
+  });
   found.overflow = await page.evaluate(() => document.documentElement.scrollWidth - document.documentElement.clientWidth);
   await page.close();
   return { ...found, said: said.filter((text) => !/GPU stall/.test(text)), requests: asked.filter((url) => !url.endsWith(path.basename(file))) };

@@ -146,9 +146,10 @@ def export(out: Path, file_format: str, target: Path | None, points: bool, as_js
 
 @main.command()
 @click.argument("out", type=click.Path(path_type=Path))
-def report(out: Path) -> None:
+@click.option("--compare", type=click.Path(path_type=Path), help="Output folder of another run, to be set beside it.")
+def report(out: Path, compare: Path | None) -> None:
     """Write OUT/report.html again: what the run in OUT has found, as one page that opens without a network."""
-    print_lines(file_lines([write_report(out)]))
+    print_lines(file_lines([write_report(out, compare)]))
 
 
 @main.command()

@@ -161,10 +161,26 @@ def test_no_report_is_written_where_none_is_wanted(rendered, tmp_path):
     assert done.report_path is None and not (tmp_path / "out" / REPORT).exists()
 
 
-def test_a_folder_that_holds_no_run_is_refused(tmp_path):
-    said = CliRunner().invoke(main, ["report", str(tmp_path)])
+def test_two_runs_are_set_side_by_side(mapped, tmp_path):
+    other = sfm_app.reconstruct(
+        mapped.out.parent / "photos",
+        tmp_path / "other",
+        Settings.from_mapping({"seed": 7, "quality": "draft"}),
+        last="photos",
+    )
 
-    assert said.exit_code == 3 and "holds no run" in said.output
+    said = CliRunner().invoke(main, ["report", str(mapped.out), "--compare", str(other.out)])
+
+    _, page = read(mapped.out)
+    assert said.exit_code == 0 and "Beside other" in page.text
+    assert "setting seed 0 7" in page.text and "photos placed 7 of 7" in page.text
+
+
+def test_a_folder_that_holds_no_run_is_refused(mapped, tmp_path):
+    for arguments in ([str(tmp_path)], [str(mapped.out), "--compare", str(tmp_path)]):
+        said = CliRunner().invoke(main, ["report", *arguments])
+
+        assert said.exit_code == 3 and "holds no run" in said.output
 
 
 def test_a_report_that_cannot_be_made_does_not_end_the_run(rendered, tmp_path, monkeypatch):

@@ -178,6 +178,34 @@ def dropped_pairs(contents: RunContents) -> list[tuple[str, int]]:
     return [*rejected.items(), *later.items()]
 
 
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Two runs side by side."""
+
+    other: str
+    """Name of the other run."""
+    rows: Sequence[tuple[str, str, str]]
+    """What, in this run, in the other one."""
+
+
+def compare(contents: RunContents, other: RunContents) -> Comparison:
+    """Return what two runs have found, the settings in which they differ, and what their stages have cost.
+
+    Args:
+        contents: of this run.
+        other: of the other one.
+    """
+    facts = [{fact.name: f"{fact.value} {fact.note}".strip() for fact in glance(one)} for one in (contents, other)]
+    costs = [
+        {f"{row.name}, CPU seconds": f"{row.cpu_seconds:.1f}" for row in stage_rows(one)} for one in (contents, other)
+    ]
+    here, there = facts[0] | costs[0], facts[1] | costs[1]
+    rows = [(name, here.get(name, ""), there.get(name, "")) for name in {**here, **there}]
+    settings = [one.manifest.get("settings", {}) for one in (contents, other)]
+    rows += [(f"setting {name}", mine, theirs) for name, mine, theirs in sorted(_differences(*settings))]
+    return Comparison(other.run.workspace.root.resolve().name, rows)
+
+
 def stage_rows(contents: RunContents) -> list[StageRow]:
     """Return what each stage has cost.
 

@@ -58,23 +58,20 @@ def finish_report(run: RunContext, problem: SfmError | None = None) -> Path | No
         return None
 
 
-def write_report(run: RunContext) -> Path:
+def write_report(run: RunContext, beside_run: RunContext | None = None) -> Path:
     """Write OUT/report.html from what the finished stages of a run have left, and return its path.
 
     Args:
         run: with its output folder.
+        beside_run: another run to compare it with; None for none.
 
     Raises:
-        InputError: the folder holds no run.
+        InputError: a folder holds no run.
     """
-    contents = read_contents(run)
-    if not contents.manifest:
-        raise InputError(
-            f"{run.workspace.root} holds no run", hint="name the folder that `sfm-app run PHOTOS -o OUT` wrote"
-        )
+    contents, other = _read_run(run), _read_run(beside_run) if beside_run is not None else None
     path = run.workspace.root / REPORT
     with replace_atomically(path) as beside:
-        beside.write_text(render_page(contents), encoding="utf-8")
+        beside.write_text(render_page(contents, other), encoding="utf-8")
     return path
 
 
@@ -88,11 +85,22 @@ def _as_plain(problem: SfmError) -> dict[str, Any]:
     return {"message": problem.message, "hint": problem.hint, "photos": problem.photos}
 
 
-def render_page(contents: RunContents) -> str:
+def _read_run(run: RunContext) -> RunContents:
+    """Return what a run has left; InputError where the folder holds none."""
+    contents = read_contents(run)
+    if not contents.manifest:
+        raise InputError(
+            f"{run.workspace.root} holds no run", hint="name the folder that `sfm-app run PHOTOS -o OUT` wrote"
+        )
+    return contents
+
+
+def render_page(contents: RunContents, other: RunContents | None = None) -> str:
     """Return the page as HTML.
 
     Args:
         contents: of the run.
+        other: what another run has left, to compare it with.
     """
     figures = _model_figures(contents)
     rows = photo_rows(contents, figures)
@@ -104,6 +112,7 @@ def render_page(contents: RunContents) -> str:
         headline=headline(contents, rows),
         problem=contents.problem,
         facts=findings.glance(contents),
+        compared=findings.compare(contents, other) if other is not None else None,
         warnings=warnings,
         remarks=others,
         cameras=findings.camera_tables(contents),
