@@ -20,8 +20,8 @@ from sfm_app.api import write_report
 ABOUT = (
     "report.html opened from the disk with the network off. seconds: to write it. colors, covered: of the 3D view, how "
     "many colors it has, and the share of its pixels that are not background. chosen: the photo after a click on its "
-    "row; moved: whether the view changed. said: what the console says. requests: that left the page. beyond: pixels by "
-    "which the page is wider than the screen. axe: rules of accessibility that axe-core finds broken."
+    "row; moved: whether the view changed. said: what the console says. requests: that left the page. beyond: pixels "
+    "by which the page is wider than the screen. axe: rules of accessibility that axe-core finds broken."
 )
 COLUMNS = (
     "run", "width", "MB", "seconds", "colors", "covered", "chosen", "moved", "said", "requests", "beyond", "axe",
