@@ -25,7 +25,7 @@ const drawn = () => {
     const color = (data[k] << 16) | (data[k + 1] << 8) | data[k + 2];
     colors.set(color, (colors.get(color) ?? 0) + 1);
   }
-  return { colors: colors.size, covered: 1 - Math.max(...colors.values()) / (data.length / 4), model: canvas.dataset.model ?? '' };
+  return { colors: colors.size, covered: 1 - [...colors.values()].reduce((a, b) => Math.max(a, b), 0) / (data.length / 4), model: canvas.dataset.model ?? '' };
 };
 
 async function visit(browser, name, size) {

@@ -56,7 +56,7 @@
 
   function showAll() {
     flying = null; held = false;
-    Object.assign(orbit, { turn: startTurn(), tilt: 0.35, distance: 1.5 * size });
+    Object.assign(orbit, { turn: startTurn(), tilt: 0.35, distance: 1.15 * size });
     orbit.target.copy(home);
     eye.fov = 50;
     eye.updateProjectionMatrix();
