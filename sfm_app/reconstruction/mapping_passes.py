@@ -32,7 +32,7 @@ from sfm_app.reconstruction.mapping_runs import (
 from sfm_app.reconstruction.model_merge import join_models
 from sfm_app.reconstruction.model_split import sound_parts
 from sfm_app.reconstruction.overlaid.false_joins import MOST_FALSE_JOINS, judge_places
-from sfm_app.reconstruction.parts import hide_false_joins, is_convincing, map_in_parts, part_size
+from sfm_app.reconstruction.parts import is_convincing, map_in_parts, part_size
 from sfm_app.reconstruction.support import model_poses
 from sfm_app.reconstruction.unregistered import are_worth_another_try, photo_names
 from sfm_app.runtime.context import RunContext
@@ -284,7 +284,10 @@ def _has_changed(before: Calibration, after: Calibration) -> bool:
     return not before.is_estimated or abs(float(np.log(after.focal_px / before.focal_px))) > FOCAL_TOLERANCE
 
 
-def _run_pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Outcome:
+def _run_pass(
+    matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext, chances: int = MOST_FALSE_JOINS
+) -> Outcome:
+    """Map all groups from new relative poses, again up to `chances` times where parts have two places in one."""
     epipolar = run.settings.epipolar
     options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, run.seed)
     graph = build_pose_graph(matches, views, intrinsics, options, run.map)
@@ -297,8 +300,9 @@ def _run_pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run
     for number, photos in enumerate(graph.groups):
         if number and len(photos) < MIN_PHOTOS:
             continue
-        found, joins = _map_by_size(Group(photos, matches, views, graph, intrinsics), run)
-        graph = with_false_joins(graph, joins)
+        found, joins = _map_by_size(Group(photos, matches, views, graph, intrinsics), run, asked=chances > 0)
+        if joins:
+            return _run_pass_without(joins, graph, intrinsics, (matches, views), run, chances - 1)
         tried += [attempt.note for attempt in found]
         best = best_attempt(found)
         if best is not None:
@@ -313,17 +317,39 @@ def _run_pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run
     return Outcome(tuple(models), graph, intrinsics, tuple(tried), reason, tuple(cuts))
 
 
-def _map_by_size(group: Group, run: RunContext) -> tuple[list[MappingResult], tuple[LookAlikes, ...]]:
+def _run_pass_without(
+    joins: Sequence[LookAlikes],
+    graph: PoseGraph,
+    intrinsics: Intrinsics,
+    pairs: tuple[MatchGraph, ViewGraph],
+    run: RunContext,
+    chances: int,
+) -> Outcome:
+    """Run a pass without the false joins that parts have shown, before any is joined to others.
+
+    The true pairs of the same corner had contradicted them, and come back with new relative poses. Where they do not
+    hold most photos together, the joins stay, and are doubtful.
+    """
+    run.progress.say("parts have two places in one: mapping again without the look-alikes that join them")
+    marked = with_false_joins(graph, joins)
+    again = _run_pass(*drop_look_alikes(*pairs, marked), intrinsics, run, chances)
+    if again.main is not None and again.main.photos >= ENOUGH_SHARE * len(graph.groups[0]):
+        return replace(again, graph=with_earlier_look_alikes(again.graph, marked))
+    first = _run_pass(*pairs, intrinsics, run, 0)
+    return replace(first, graph=replace(first.graph, doubtful=(*first.graph.doubtful, *joins)))
+
+
+def _map_by_size(group: Group, run: RunContext, *, asked: bool) -> tuple[list[MappingResult], tuple[LookAlikes, ...]]:
     """Map a large group in parts, and a small one, or one that parts do not explain, as a whole.
 
-    Parts may show false joins.
+    Parts that are asked may show false joins instead.
     """
     if not part_size(len(group.photos), run.settings.scene):
         return map_group(group, run), ()
-    found, joins = map_in_parts(group, pairs_to_map(group.graph), run)
-    if is_convincing(found, len(group.photos)):
+    found, joins = map_in_parts(group, pairs_to_map(group.graph), run, asked=asked)
+    if joins or is_convincing(found, len(group.photos)):
         return found, joins
-    return [*found, *map_group(hide_false_joins(group, joins), run)], joins
+    return [*found, *map_group(group, run)], ()
 
 
 def split_attempt(attempt: Attempt) -> list[Attempt]:

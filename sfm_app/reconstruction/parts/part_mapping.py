@@ -51,7 +51,7 @@ class PartResult:
     tried: tuple[str, ...]
     """Notes on all attempts, for people; the reason of a failure."""
     false_joins: tuple[LookAlikes, ...] = ()
-    """Pairs that held one place of the part on top of another; its models are without them."""
+    """Pairs that hold one place of the part on top of another."""
 
 
 def map_parts(group: Group, parts: Sequence[Part], mapped: PoseGraph, run: RunContext) -> list[PartResult]:

@@ -2,7 +2,6 @@
 
 import json
 import tempfile
-from collections.abc import Sequence
 from os.path import relpath
 from pathlib import Path
 
@@ -12,14 +11,17 @@ from sfm_app.colmap.database import write_calibrations, write_match_graph, write
 from sfm_app.colmap.model import posed_photo_ids, submodel
 from sfm_app.colmap.processes.worker_process import MappingTask, serve
 from sfm_app.plugins import load_plugins
-from sfm_app.reconstruction.mapping_runs import Attempt, Group
+from sfm_app.reconstruction.mapping_runs import Attempt, Group, best_attempt, map_group
 from sfm_app.reconstruction.model_split import sound_parts
+from sfm_app.reconstruction.overlaid.false_joins import judge_places
 from sfm_app.reconstruction.parts.part_files import INPUTS, RESULT, joins_to_plain, read_inputs
-from sfm_app.reconstruction.parts.unfolding import LEAST_PHOTOS, map_unfolded
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import SubWorkspace, Workspace
 from sfm_app.types import PairId
+
+LEAST_PHOTOS = 3
+"""Smallest model that is worth joining: of two photos, nothing tells the scale."""
 
 
 def work(task: MappingTask) -> None:
@@ -31,47 +33,42 @@ def work(task: MappingTask) -> None:
         place = SubWorkspace(Workspace(photos.parent), relpath(own, photos.parent))
         _write_database(place, part, mapped)
         run = RunContext(settings, place, load_plugins(installed=False), executor, workers=1)
-        found = map_unfolded(part, lambda rival: _follow_pairs(place, rival, mapped), run)
+        found = map_group(part, run)
     if (folder / RESULT).exists():
         return
+    best = best_attempt(found)
     known = {
-        "models": _write_models(found.models, folder),
-        "mapper": found.models[0].mapper if found.models else "",
-        "tried": list(found.tried),
-        "false_joins": joins_to_plain(found.false_joins),
+        "models": [] if best is None else _write_models(best, folder),
+        "mapper": "" if best is None else best.mapper,
+        "tried": [one.note for one in found],
+        "false_joins": [] if best is None else joins_to_plain(judge_places([best])[0]),
     }
     with replace_atomically(folder / RESULT) as path:
         path.write_text(json.dumps(known), encoding="utf-8")
 
 
 def _write_database(place: Workspace, part: Group, mapped: frozenset[PairId]) -> None:
+    graph = part.graph
+    followed = type(graph)({pair: pose for pair, pose in graph.poses.items() if pair in mapped}, {}, graph.groups)
     with translate_errors("entering the photos of a part"):
         write_match_graph(place.database, part.matches)
         write_calibrations(place.database, part.matches, part.intrinsics)
-    _follow_pairs(place, part, mapped)
-
-
-def _follow_pairs(place: Workspace, part: Group, mapped: frozenset[PairId]) -> None:
-    """Let mappers follow the pairs of a part that are to be mapped."""
-    graph = part.graph
-    followed = type(graph)({pair: pose for pair, pose in graph.poses.items() if pair in mapped}, {}, graph.groups)
-    with translate_errors("entering the pairs of a part"):
         write_pose_graph(place.database, part.matches, followed)
 
 
-def _write_models(models: Sequence[Attempt], folder: Path) -> list[str]:
-    """Write the pieces of models that their own matches do not contradict, and return the names of their folders."""
-    names = list[str]()
-    for one in models:
-        for photos in sound_parts(one.explained, posed_photo_ids(one.model)):
-            if len(photos) < LEAST_PHOTOS:
-                continue
-            names.append(f"model-{len(names)}")
-            target = folder / names[-1]
-            target.mkdir(exist_ok=True)
-            with translate_errors("writing the model of a part"):
-                submodel(one.model, photos).write(target)
-                check_written(*target.iterdir())
+def _write_models(best: Attempt, folder: Path) -> list[str]:
+    """Write the pieces of a model that its own matches do not contradict, and return the names of their folders."""
+    pieces = [
+        photos for photos in sound_parts(best.explained, posed_photo_ids(best.model)) if len(photos) >= LEAST_PHOTOS
+    ]
+    names = []
+    for number, photos in enumerate(pieces):
+        names.append(f"model-{number}")
+        target = folder / names[-1]
+        target.mkdir(exist_ok=True)
+        with translate_errors("writing the model of a part"):
+            submodel(best.model, photos).write(target)
+            check_written(*target.iterdir())
     return names
 
 

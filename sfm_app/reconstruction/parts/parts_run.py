@@ -7,7 +7,6 @@ from itertools import combinations
 from pathlib import Path
 
 from sfm_app.colmap.backend import run_in_daemon_thread, translate_errors
-from sfm_app.colmap.database import write_pose_graph
 from sfm_app.colmap.joined_model import read_placed, settle, write_placed
 from sfm_app.errors import BackendError
 from sfm_app.numerical import FAILURES, Json, error_reason
@@ -20,14 +19,12 @@ from sfm_app.reconstruction.mapping_runs import (
     complete_attempt,
     is_well_known,
     judge_model,
-    pairs_to_map,
 )
 from sfm_app.reconstruction.parts.cut import Part, cut_group
 from sfm_app.reconstruction.parts.frames import Alignment, JoinError, align_fragments, loop_errors
 from sfm_app.reconstruction.parts.joins import AcrossJoins, Fragment, Join, find_join
 from sfm_app.reconstruction.parts.merge import merge_fragments
 from sfm_app.reconstruction.parts.part_mapping import PartResult, map_parts, remove_parts
-from sfm_app.reconstruction.parts.unfolding import hide_false_joins
 from sfm_app.reconstruction.unregistered import are_worth_another_try, photo_names
 from sfm_app.runtime.context import RunContext
 from sfm_app.settings import SceneSettings
@@ -73,42 +70,39 @@ def part_size(photos: int, options: SceneSettings) -> int:
 
 
 def map_in_parts(
-    group: Group, mapped: PoseGraph, run: RunContext
+    group: Group, mapped: PoseGraph, run: RunContext, *, asked: bool = True
 ) -> tuple[list[MappingResult], tuple[LookAlikes, ...]]:
-    """Return the results of mapping a group in parts, and the false joins that these showed.
+    """Return the results of mapping a group in parts; or else the false joins within parts, which are then not joined.
 
-    A group of one part gives none. Where there are false joins, the run's database no longer has their pairs.
+    A group of one part gives neither.
 
     Args:
         group: a connected group of photos, with their matches and poses.
         mapped: the pose graph with the pairs that mapping follows; it is in the run's database.
         run: the run.
+        asked: whether parts are asked for false joins.
     """
     parts = cut_group(group.graph, group.photos, part_size(len(group.photos), run.settings.scene))
     if len(parts) < 2:
         return [], ()
     photos = len(group.photos)
     run.progress.say(f"{photos} photos are mapped in {len(parts)} parts of {_range([len(p.photos) for p in parts])}")
-    joins: tuple[LookAlikes, ...] = ()
     try:
         results = map_parts(group, parts, mapped, run)
         joins = merge_false_joins([join for result in results for join in result.false_joins])
-        if joins:
-            run.progress.say("parts had two places in one: they were mapped without the look-alikes that join them")
-            group = hide_false_joins(group, joins)
-            with translate_errors("writing relative poses"):
-                write_pose_graph(run.workspace.database, group.matches, pairs_to_map(group.graph))
+        if joins and asked:
+            return [], joins
         joined = join_parts(group, parts, results, run)
         found = _merge(group, joined, run)
     except (BackendError, *FAILURES) as err:  # the whole may still be mapped
         logger.info("parts were not joined", exc_info=err)
-        return [NoModel(MAPPER, f"in {len(parts)} parts: failed, {error_reason(err)}")], joins
+        return [NoModel(MAPPER, f"in {len(parts)} parts: failed, {error_reason(err)}")], ()
     best = best_attempt(found)
     if best is not None and best.photos < photos:
         found += [replace(one, mapper=MAPPER) for one in complete_attempt(group, best, run)]
     run.record(parts=[*run.statistics.get("parts", []), part_figures(group, joined, found)])
     remove_parts(run)
-    return found, joins
+    return found, ()
 
 
 def merge_false_joins(joins: Sequence[LookAlikes]) -> tuple[LookAlikes, ...]:

@@ -125,6 +125,67 @@ def test_false_joins_are_looked_for_a_few_times_only(synthetic, run, cameras, ma
     assert found.graph.doubtful == (joins[3],)
 
 
+@pytest.fixture
+def in_parts(monkeypatch, synthetic):
+    """Maps in parts: those that are asked show these false joins, pass by pass, and then none; models are as given."""
+
+    def make(joins, *models):
+        seen, left, ready = [], list(joins), list(models)
+
+        def attempts(group, followed, run, *, asked):
+            seen.append((set(group.graph.poses), set(followed.poses), asked))
+            if asked and left:
+                return [], left.pop(0)
+            explained = explained_pairs(model := ready.pop(0), synthetic.matches, synthetic.views, 1.5)
+            return [Attempt("parts", model, explained, f"{model.num_reg_images()} photos")], ()
+
+        monkeypatch.setattr(module, "part_size", lambda *_: 3)
+        monkeypatch.setattr(module, "map_in_parts", attempts)
+        monkeypatch.setattr(module, "map_group", lambda *_: [NoModel("incremental", "nothing")])
+        monkeypatch.setattr(module, "judge_places", lambda _: ([], 0))
+        return seen
+
+    return make
+
+
+def test_parts_with_two_places_in_one_are_mapped_again_before_any_is_joined(synthetic, run, cameras, in_parts):
+    joins = [(LookAlikes(((1, 4), (2, 4)), 0.9),), (LookAlikes(((3, 6),), 0.8),)]
+    model = with_camera(synthetic.copy(), TRUE)
+    seen = in_parts(joins, model)
+
+    found = outcome(synthetic, cameras(), run())
+
+    gone = [set(), {(1, 4), (2, 4)}, {(1, 4), (2, 4), (3, 6)}]
+    assert [len(poses) for poses, *_ in seen] == [15, 13, 12]
+    assert all(not poses & dropped for (poses, *_), dropped in zip(seen, gone, strict=True))
+    assert found.models[0].model is model and len(found.tried) == 1
+    assert {pair for join in found.graph.look_alikes for pair in join.pairs} == gone[-1]
+    assert len(geometries_in(run().workspace.database)) == 12
+
+
+def test_false_joins_of_parts_stay_where_nothing_else_holds_the_photos_together(synthetic, run, cameras, in_parts):
+    join = LookAlikes(((1, 4), (2, 4)), 0.9)
+    first = with_camera(synthetic.copy(), TRUE)
+    seen = in_parts([(join,)], without(with_camera(synthetic.copy(), TRUE), [6]), first)
+
+    found = outcome(synthetic, cameras(), run())
+
+    assert [(len(poses), asked) for poses, _, asked in seen] == [(15, True), (13, True), (15, False)]
+    assert found.models[0].model is first
+    assert found.graph.look_alikes == () and found.graph.doubtful == (join,)
+    assert len(geometries_in(run().workspace.database)) == 15
+
+
+def test_parts_are_asked_a_few_times_only(synthetic, run, cameras, in_parts):
+    joins = [(LookAlikes((pair,), 0.9),) for pair in ((1, 4), (2, 5), (3, 6), (1, 5))]
+    seen = in_parts(joins, with_camera(synthetic.copy(), TRUE))
+
+    found = outcome(synthetic, cameras(), run())
+
+    assert [asked for *_, asked in seen] == [True, True, True, False]
+    assert found.graph.look_alikes == tuple(join for (join,) in joins[:3])
+
+
 def test_a_camera_that_was_known_and_stayed_is_not_looked_at_twice(synthetic, run, cameras, mapped):
     seen = mapped(with_camera(synthetic.copy(), [FOCAL * 1.009, 512.0, 384.0, 0.01]))
 

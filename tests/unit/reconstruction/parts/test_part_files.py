@@ -1,11 +1,20 @@
 """Inputs of parts as files: what is read back is what was written, and the same inputs are the same bytes."""
 
+import json
+
 import numpy as np
 
 from sfm_app.reconstruction.mapping_runs import Group
-from sfm_app.reconstruction.parts.part_files import pairs_of_parts, part_of_group, read_inputs, write_inputs
+from sfm_app.reconstruction.parts.part_files import (
+    joins_from_plain,
+    joins_to_plain,
+    pairs_of_parts,
+    part_of_group,
+    read_inputs,
+    write_inputs,
+)
 from sfm_app.settings import Settings
-from sfm_app.types import Calibration, Intrinsics, PoseGraph, RelativePose
+from sfm_app.types import Calibration, Intrinsics, LookAlikes, PoseGraph, RelativePose
 from tests.unit.reconstruction.parts.conftest import K
 
 
@@ -60,3 +69,9 @@ def test_inputs_are_read_back_as_they_were(street, tmp_path):
         assert np.array_equal(read.inliers, pose.inliers)
         assert (read.angle_deg, read.in_front, read.kind, read.guided) == (3.25, 0.9, "planar", sum(pair) % 2 == 0)
     assert found.intrinsics.to_dict() == part.intrinsics.to_dict()
+
+
+def test_false_joins_travel_as_plain_values():
+    joins = (LookAlikes(((1, 2), (3, 4)), 0.875), LookAlikes(((5, 6),), 0.5))
+
+    assert joins_from_plain(json.loads(json.dumps(joins_to_plain(joins)))) == joins

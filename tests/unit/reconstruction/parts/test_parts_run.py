@@ -46,7 +46,7 @@ def group(town):
 def start(group, tmp_path):
     """Maps the group in parts with some workers, in a folder of its own."""
 
-    def run_with(workers=2, *, whole=False, group=group):
+    def run_with(workers=2, *, whole=False, group=group, asked=True):
         place = Workspace(tmp_path / f"of-{workers}")
         place.photos.mkdir(parents=True)
         write_match_graph(place.database, group.matches)
@@ -55,7 +55,7 @@ def start(group, tmp_path):
         settings = Settings.from_mapping({"scene": {"part_photos": PART}})
         with make_executor(workers) as executor:
             run = RunContext(settings, place, load_plugins(installed=False), executor, workers)
-            found = map_in_parts(group, group.graph, run)
+            found = map_in_parts(group, group.graph, run, asked=asked)
             return found if whole else (found[0], run)
 
     return run_with
@@ -188,28 +188,38 @@ def test_the_whole_is_mapped_where_parts_do_not_explain_it(group, start, monkeyp
         return whole
 
     monkeypatch.setattr(mapping_passes, "map_group", map_whole)
-    monkeypatch.setattr(mapping_passes, "map_in_parts", lambda *_: ([of_parts], ()))
+    monkeypatch.setattr(mapping_passes, "map_in_parts", lambda *_, **__: ([of_parts], ()))
     monkeypatch.setattr(mapping_passes, "part_size", lambda *_: 100)
 
-    found, joins = mapping_passes._map_by_size(replace(group, photos=tuple(range(200))), _run())
+    found, joins = mapping_passes._map_by_size(replace(group, photos=tuple(range(200))), _run(), asked=True)
 
     assert best_attempt(found).mapper == taken and joins == ()
     assert len(whole) == (taken == "whole")
 
 
-def test_pairs_of_a_false_join_are_hidden_from_what_follows(group, start, monkeypatch):
-    join = LookAlikes(tuple(group.graph.poses)[:2], 0.9)
-    failed = PartResult((), "", ("failed",), (join,))
-    judged = []
-    monkeypatch.setattr(parts_run, "map_parts", lambda *_: [failed, failed])
-    monkeypatch.setattr(parts_run, "cut_group", lambda *_: [parts_run.Part((k,), (k,)) for k in (1, 2)])
-    join_parts = parts_run.join_parts
-    monkeypatch.setattr(parts_run, "join_parts", lambda one, *rest: judged.append(one) or join_parts(one, *rest))
+def test_parts_with_false_joins_are_not_joined_unless_nobody_asks(start, monkeypatch):
+    join, more = LookAlikes(((1, 2), (3, 4)), 0.9), LookAlikes(((3, 4), (5, 6)), 0.7)
+    results = [PartResult((), "", ("failed",), (one,)) for one in (join, more, join)]
+    monkeypatch.setattr(parts_run, "map_parts", lambda *_: results)
+    monkeypatch.setattr(parts_run, "cut_group", lambda *_: [parts_run.Part((k,), (k,)) for k in (1, 2, 3)])
 
-    _, joins = start(whole=True)
+    assert start(1, whole=True) == ([], (join, LookAlikes(((5, 6),), 0.7)))
+    found, joins = start(2, whole=True, asked=False)
+    assert joins == () and [one.note for one in found] == ["in 3 parts: none was mapped; failed"]
 
-    assert joins == (join,)
-    assert not set(join.pairs) & (judged[0].matches.matches.keys() | judged[0].graph.poses.keys())
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_false_joins_of_parts_go_up_and_nothing_else_is_mapped(group, monkeypatch, asked):
+    join = LookAlikes(((1, 2),), 0.9)
+    monkeypatch.setattr(mapping_passes, "map_group", lambda *_: pytest.fail("the whole was mapped"))
+    monkeypatch.setattr(
+        mapping_passes, "map_in_parts", lambda *_, asked: ([], (join,)) if asked else ([attempt(200)], ())
+    )
+    monkeypatch.setattr(mapping_passes, "part_size", lambda *_: 100)
+
+    found, joins = mapping_passes._map_by_size(replace(group, photos=tuple(range(200))), _run(), asked=asked)
+
+    assert joins == ((join,) if asked else ()) and len(found) == (0 if asked else 1)
 
 
 def _run():
