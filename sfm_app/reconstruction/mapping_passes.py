@@ -7,7 +7,7 @@ import numpy as np
 
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
-from sfm_app.colmap.model import cameras_by_photo, posed_photo_ids, submodel
+from sfm_app.colmap.model import cameras_by_photo, posed_photo_ids
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
 from sfm_app.reconstruction.baseline import guessed_intrinsics, has_many_unplaced, map_baseline, rival_reason
 from sfm_app.reconstruction.camera_per_photo import (
@@ -20,6 +20,7 @@ from sfm_app.reconstruction.camera_per_photo import (
 from sfm_app.reconstruction.look_alikes import drop_look_alikes, with_earlier_look_alikes, with_false_joins
 from sfm_app.reconstruction.mapping_runs import (
     ENOUGH_SHARE,
+    MIN_PHOTOS,
     Attempt,
     Group,
     MappingResult,
@@ -30,7 +31,7 @@ from sfm_app.reconstruction.mapping_runs import (
     pairs_to_map,
 )
 from sfm_app.reconstruction.model_merge import join_models
-from sfm_app.reconstruction.model_split import sound_parts
+from sfm_app.reconstruction.model_split import split_attempt
 from sfm_app.reconstruction.overlaid.false_joins import MOST_FALSE_JOINS, judge_places
 from sfm_app.reconstruction.parts import is_convincing, map_in_parts, part_size
 from sfm_app.reconstruction.support import model_poses
@@ -38,8 +39,6 @@ from sfm_app.reconstruction.unregistered import are_worth_another_try, photo_nam
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, LookAlikes, MatchGraph, PoseGraph, ViewGraph
 
-MIN_PHOTOS = 3
-"""Smallest number of photos from which a camera is learned, and in a group that is mapped besides the main one."""
 MOST_PASSES = 4
 """Largest number of passes over all pairs. On dinoSparseRing with learned features the second finds a focal of 3272
 (true 3318), and the third places all photos with it."""
@@ -318,13 +317,9 @@ def _run_pass(
 
 
 def _run_pass_without(
-    joins: Sequence[LookAlikes],
-    graph: PoseGraph,
-    intrinsics: Intrinsics,
-    pairs: tuple[MatchGraph, ViewGraph],
-    run: RunContext,
-    chances: int,
-) -> Outcome:
+    joins: Sequence[LookAlikes], graph: PoseGraph, intrinsics: Intrinsics, pairs: tuple[MatchGraph, ViewGraph],
+    run: RunContext, chances: int,
+) -> Outcome:  # fmt: skip
     """Run a pass without the false joins that parts have shown, before any is joined to others.
 
     The true pairs of the same corner had contradicted them, and come back with new relative poses. Where they do not
@@ -350,25 +345,6 @@ def _map_by_size(group: Group, run: RunContext, *, asked: bool) -> tuple[list[Ma
     if joins or is_convincing(found, len(group.photos)):
         return found, joins
     return [*found, *map_group(group, run)], ()
-
-
-def split_attempt(attempt: Attempt) -> list[Attempt]:
-    """Divide a model where more matches contradict than support its joins; return it unchanged if it has one part.
-
-    Single photos are left out, and so are small parts beside the largest one.
-    """
-    parts = sound_parts(attempt.explained, posed_photo_ids(attempt.model))
-    if len(parts) == 1:
-        return [attempt]
-    kept = [part for number, part in enumerate(parts) if len(part) >= (2 if number == 0 else MIN_PHOTOS)]
-    with translate_errors("dividing a model"):
-        return [_part(attempt, part) for part in kept]
-
-
-def _part(attempt: Attempt, photos: Sequence[int]) -> Attempt:
-    members = set(photos)
-    explained = {pair: found for pair, found in attempt.explained.items() if members.issuperset(pair)}
-    return replace(attempt, model=submodel(attempt.model, photos), explained=explained)
 
 
 def _update_graph(models: Sequence[Attempt], graph: PoseGraph, matches: MatchGraph, run: RunContext) -> PoseGraph:

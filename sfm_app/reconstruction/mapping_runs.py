@@ -30,6 +30,8 @@ ENOUGH_SHARE = 0.9
 """A model with this share of the photos of its group ends the search for a better seed."""
 CONFIRMED_SHARE = 0.5
 """This share is enough when two seeds agree on how many photos can be placed."""
+MIN_PHOTOS = 3
+"""Smallest number of photos from which a camera is learned, and in a group that is mapped besides the main one."""
 MIN_GLOBAL_PHOTOS = 3
 """Smallest number of photos for the global mapper: the positions of two photos do not determine a scale."""
 EQUAL_TOLERANCE = 0.01

@@ -5,9 +5,13 @@ unexplained: those of pairs that see the true layout.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
+from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.model import posed_photo_ids, submodel
 from sfm_app.posegraph.groups import DisjointGroups
+from sfm_app.reconstruction.mapping_runs import MIN_PHOTOS, Attempt
 from sfm_app.reconstruction.support import PairSupport
 from sfm_app.types import PairId
 
@@ -57,3 +61,22 @@ def _merge_joins(between: defaultdict[int, Counter[int]], kept: int, gone: int) 
             between[kept][other] += value
             between[other][kept] += value
         del between[other][gone]
+
+
+def split_attempt(attempt: Attempt) -> list[Attempt]:
+    """Divide a model where more matches contradict than support its joins; return it unchanged if it has one part.
+
+    Single photos are left out, and so are small parts beside the largest one.
+    """
+    parts = sound_parts(attempt.explained, posed_photo_ids(attempt.model))
+    if len(parts) == 1:
+        return [attempt]
+    kept = [part for number, part in enumerate(parts) if len(part) >= (2 if number == 0 else MIN_PHOTOS)]
+    with translate_errors("dividing a model"):
+        return [_part(attempt, part) for part in kept]
+
+
+def _part(attempt: Attempt, photos: Sequence[int]) -> Attempt:
+    members = set(photos)
+    explained = {pair: found for pair, found in attempt.explained.items() if members.issuperset(pair)}
+    return replace(attempt, model=submodel(attempt.model, photos), explained=explained)

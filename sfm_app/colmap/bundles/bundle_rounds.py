@@ -105,7 +105,7 @@ def solve(model: pycolmap.Reconstruction, refined: Collection[int] = ()) -> None
     options.ceres.solver_options.max_num_iterations = 50
     options.ceres.solver_options.function_tolerance = 1e-5
     options.ceres.solver_options.num_threads = 1
-    options.ceres.max_num_images_direct_sparse_cpu_solver = _most_factored(model)
+    options.ceres.max_num_images_direct_sparse_cpu_solver = _choose_most_factored(model)
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
         config.add_image(image_id)
@@ -116,7 +116,7 @@ def solve(model: pycolmap.Reconstruction, refined: Collection[int] = ()) -> None
     run_in_daemon_thread(pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve)
 
 
-def _most_factored(model: pycolmap.Reconstruction) -> int:
+def _choose_most_factored(model: pycolmap.Reconstruction) -> int:
     """Return up to how many photos COLMAP's solver is to factor the normal equations: all photos, or `MOST_TIED`."""
     photos = sorted(model.reg_image_ids())
     if len(photos) <= MOST_TIED:

@@ -20,9 +20,10 @@ from sfm_app.estimation.growth.same_matches import find_same_matches
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.reconstruction.baseline import rival_reason
 from sfm_app.reconstruction.look_alikes import drop_look_alikes
-from sfm_app.reconstruction.mapping_passes import MIN_PHOTOS, Outcome, reconstruct, split_attempt
+from sfm_app.reconstruction.mapping_passes import Outcome, reconstruct
 from sfm_app.reconstruction.mapping_runs import (
     INCREMENTAL_FOLDER,
+    MIN_PHOTOS,
     Attempt,
     Group,
     best_attempt,
@@ -31,6 +32,7 @@ from sfm_app.reconstruction.mapping_runs import (
     map_group,
     pairs_to_map,
 )
+from sfm_app.reconstruction.model_split import split_attempt
 from sfm_app.reconstruction.overlaid.false_joins import judge_places
 from sfm_app.reconstruction.second_look import MappedScene
 from sfm_app.reconstruction.support import explained_pairs, model_poses, support

@@ -14,8 +14,9 @@ from sfm_app.posegraph.graph import LOOKS_ALIKE
 from sfm_app.reconstruction import baseline
 from sfm_app.reconstruction import mapping_passes as module
 from sfm_app.reconstruction.baseline import guessed_intrinsics
-from sfm_app.reconstruction.mapping_passes import learned_intrinsics, reconstruct, split_attempt
+from sfm_app.reconstruction.mapping_passes import learned_intrinsics, reconstruct
 from sfm_app.reconstruction.mapping_runs import Attempt, NoModel
+from sfm_app.reconstruction.model_split import split_attempt
 from sfm_app.reconstruction.support import PairSupport, explained_pairs
 from sfm_app.types import LookAlikes, PoseGraph
 
