@@ -72,9 +72,14 @@ def read_photo_list(place: Workspace) -> PhotoSet:
 
     Args:
         place: the output folder.
+
+    Raises:
+        ValueError: it names a photo outside of the folder.
     """
     values = json.loads(place.photo_set.read_text(encoding="utf-8"))
     photos = tuple(_photo_from_dict(entry) for entry in values["photos"])
+    if not all(is_below(photo.name) for photo in photos):
+        raise ValueError(f"{place.photo_set} names photos outside of their folder")
     return PhotoSet(place.photos, photos, tuple(UnusablePhoto(**photo) for photo in values["unusable"]))
 
 
@@ -211,11 +216,9 @@ def _copy_digest(photo: Photo, run: RunContext) -> str | None:
 
 def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoSet:
     """Read photos.json back, and lay out what is missing."""
+    found = replace(read_photo_list(run.workspace), folder=folder, masks=masks)
     values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
-    photos = tuple(_photo_from_dict(entry) for entry in values["photos"])
-    if not all(is_below(photo.name) for photo in photos):
-        raise ValueError(f"{run.workspace.photo_set} names photos outside of their folder")
-    for photo in photos:
+    for photo in found.photos:
         place, copy = run.workspace.photos / photo.name, values["copies"].get(photo.name)
         if copy != _copy_digest(photo, run) or not (copy or place.resolve() == resolve_file(folder, photo.path)):
             if folder == run.workspace.frames and not (folder / photo.path).exists():
@@ -223,7 +226,7 @@ def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoS
             lay_out_photo(photo, folder=folder, target=run.workspace.photos)
         if masks is not None and not mask_path(run.workspace.masks, photo.name).exists():
             lay_out_mask(photo, folder, masks, run.workspace.masks)
-    return PhotoSet(folder, photos, tuple(UnusablePhoto(**photo) for photo in values["unusable"]), masks)
+    return found
 
 
 def _photo_to_dict(photo: Photo) -> dict[str, Any]:

@@ -124,6 +124,20 @@ def test_a_run_that_changes_nothing_leaves_it_alone_and_the_command_makes_it_aga
     assert (mapped.out / REPORT).stat().st_mtime_ns > before
 
 
+def test_a_damaged_model_is_left_out_and_not_given_to_colmap(mapped, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    shutil.copytree(mapped.out, out, symlinks=True)
+    with (out / "sparse" / "points3D.bin").open("r+b") as file:
+        file.write(b"\xff" * 64)
+    monkeypatch.setattr("sfm_app.stages.scene.load", lambda _: pytest.fail("COLMAP would hang"))
+
+    sfm_app.write_report(out)
+
+    text, page = read(out)
+    assert data_of(text)["view"] is None and [row["state"] for row in data_of(text)["photos"][:7]] == ["usable"] * 7
+    assert "Which photos hang together" in page.text
+
+
 def test_a_folder_without_photos_says_why_and_names_the_files(rendered, tmp_path):
     photos, out = tmp_path / "photos", tmp_path / "out"
     photos.mkdir()

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any, NamedTuple, TypeVar
 
 from sfm_app.errors import SfmError
@@ -69,22 +70,26 @@ def read_contents(run: RunContext) -> RunContents:
     manifest = run.workspace.manifest.read()
     done = manifest.get("stages", {})
 
-    def read(stage: str, load: Callable[[], Product]) -> Product | None:
+    def read(module: ModuleType, load: Callable[[], Product]) -> Product | None:
+        stage = module.__name__.rpartition(".")[2]
         if stage not in done:
             return None
         try:
+            # compared before anything is read, because COLMAP never ends on some damaged models
+            if done[stage]["digest"] != module.digest(run.workspace):
+                raise ValueError(f"the files of stage {stage} have changed")
             return load()
         except UNREADABLE as err:  # the page shows what is left
             logger.info("the report leaves out stage %s", stage, exc_info=err)
             return None
 
-    listed = read("photos", lambda: photos.read_photo_list(run.workspace))
+    listed = read(photos, lambda: photos.read_photo_list(run.workspace))
     return RunContents(
         run,
         manifest,
         listed,
-        read("match_graph", lambda: match_graph.load(listed, run)) if listed is not None else None,
-        read("view_graph", lambda: view_graph.load(run)),
-        read("intrinsics", lambda: intrinsics.load(run)),
-        read("scene", lambda: scene.load(run)),
+        read(match_graph, lambda: match_graph.load(listed, run)) if listed is not None else None,
+        read(view_graph, lambda: view_graph.load(run)),
+        read(intrinsics, lambda: intrinsics.load(run)),
+        read(scene, lambda: scene.load(run)),
     )

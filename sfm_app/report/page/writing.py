@@ -45,13 +45,13 @@ def finish_report(run: RunContext, problem: SfmError | None = None) -> Path | No
         return None
     try:
         with place.hold_lock():
-            noted = (
-                {} if problem is None else {"message": problem.message, "hint": problem.hint, "photos": problem.photos}
-            )
-            place.manifest.note_problem(noted)
+            place.manifest.note_problem({} if problem is None else _as_plain(problem))
             if not run.settings.report:
                 return None
-            return place.root / REPORT if problem is None and _is_up_to_date(place) else write_report(run)
+            if problem is None and _is_up_to_date(place):
+                return place.root / REPORT
+            run.progress.say(f"writing {REPORT}")
+            return write_report(run)
     except Exception as err:  # a run does not fail for its report
         logger.info("no report", exc_info=err)
         run.progress.say(f"there is no report of this run: {err}")
