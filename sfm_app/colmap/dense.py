@@ -107,7 +107,17 @@ def map_file(dense_dir: Path, view: View) -> Path:
         dense_dir: folder with undistorted photos and their maps.
         view: an undistorted photo.
     """
-    return _map_path(dense_dir, "depth_maps", view, "geometric")
+    return _map_path(dense_dir, DEPTHS, view, "geometric")
+
+
+def normals_file(dense_dir: Path, view: View) -> Path:
+    """Return the path of the normals of a view, whether or not it exists.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        view: an undistorted photo.
+    """
+    return _map_path(dense_dir, NORMALS, view, "geometric")
 
 
 class DenseStore:
@@ -200,7 +210,18 @@ def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
         _atomic_path(_map_path(dense_dir, NORMALS, view)) as path,
     ):
         pycolmap.NormalMap.from_array(planes).write(path)
-    _write_depth_format(dense_dir, DEPTHS, view, maps.depth, "geometric")
+    write_depth(dense_dir, view, maps.depth)
+
+
+def write_depth(dense_dir: Path, view: View, depth: NDArray[np.float32]) -> None:
+    """Write the confirmed depths of a view.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        view: an undistorted photo.
+        depth: (H, W), 0 where unknown.
+    """
+    _write_depth_format(dense_dir, DEPTHS, view, depth, "geometric")
 
 
 def mask_depths(dense_dir: Path, view: View) -> None:
@@ -213,7 +234,7 @@ def mask_depths(dense_dir: Path, view: View) -> None:
     used, file = used_pixels(dense_dir, view), map_file(dense_dir, view)
     if used is not None and file.exists():
         depth = read_depth(dense_dir, view, "geometric")
-        _write_depth_format(dense_dir, DEPTHS, view, np.where(used, depth, np.float32(MASKED)), "geometric")
+        write_depth(dense_dir, view, np.where(used, depth, np.float32(MASKED)))
 
 
 def drop_estimates(dense_dir: Path, views: Sequence[View]) -> None:

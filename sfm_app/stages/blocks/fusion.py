@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_clear
-from sfm_app.colmap.dense import map_file, read_depth, read_normals, write_fusion_views, write_maps
+from sfm_app.colmap.dense import map_file, normals_file, read_depth, write_depth, write_fusion_views
 from sfm_app.colmap.surface import fuse, join_points
 from sfm_app.hashing import fingerprint
 from sfm_app.meshing.blocks.partition import split_points
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import FUSED_AT_ONCE_MP, cache_gb
-from sfm_app.stereo import DepthMap, View, region
+from sfm_app.stereo import View, region
 from sfm_app.tasks import Task
 
 FloatArray = NDArray[np.float64]
@@ -129,12 +129,11 @@ def fuse_block(task: FusionTask) -> None:
     (scratch / "images").mkdir()
     (scratch / "stereo").mkdir()
     for view in task.views:
-        photo = scratch / "images" / view.name
-        photo.parent.mkdir(parents=True, exist_ok=True)
-        link_file(task.dense_dir / "images" / view.name, photo)
+        for kept in (Path("images") / view.name, normals_file(Path(), view)):
+            (scratch / kept).parent.mkdir(parents=True, exist_ok=True)
+            link_file(task.dense_dir / kept, scratch / kept)
         depth = read_depth(task.dense_dir, view, "geometric")
-        depth = np.where(is_near(view, depth, task.box), depth, np.float32(0))
-        write_maps(scratch, view, DepthMap(depth, read_normals(task.dense_dir, view)))
+        write_depth(scratch, view, np.where(is_near(view, depth, task.box), depth, np.float32(0)))
     write_fusion_views(scratch, task.views)
     with replace_atomically(task.path) as path:
         if task.views:
@@ -164,16 +163,23 @@ def is_near(view: View, depth: NDArray[np.float32], box: FloatArray) -> NDArray[
         depth: (H, W).
         box: (2, 3) lowest and highest coordinates.
     """
-    points, beyond = world_points(view, depth), BEYOND * depth[..., None]
-    return np.asarray(((points >= box[0] - beyond) & (points <= box[1] + beyond)).all(axis=2))
+    along = view.R.T @ np.linalg.inv(view.K)
+    rows, columns = depth.shape
+    x, y = np.arange(columns) + view.sample_px, np.arange(rows)[:, None] + view.sample_px
+    near, beyond = np.ones(depth.shape, np.bool_), np.float32(BEYOND) * depth
+    for axis, center in enumerate(view.center):
+        ray = (along[axis, 0] * x + along[axis, 2] + along[axis, 1] * y).astype(np.float32)
+        place = ray * depth + np.float32(center)
+        near &= (place >= np.float32(box[0, axis]) - beyond) & (place <= np.float32(box[1, axis]) + beyond)
+    return near
 
 
-def world_points(view: View, depth: NDArray[np.float32], step: int = 1) -> FloatArray:
+def world_points(view: View, depth: NDArray[np.float32], step: int) -> FloatArray:
     """Return the points (H, W, 3) of the depths (H, W) of a photo.
 
     Args:
         view: the photo.
-        depth: of every row and column, or every so many.
+        depth: of every so many rows and columns.
         step: rows and columns from one depth to the next.
     """
     rows, columns = depth.shape
