@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import dropwhile
 
 from sfm_app.colmap.backend import check_written
 from sfm_app.engine.growth import find_earlier, forget_earlier, set_aside
@@ -87,14 +86,15 @@ class Pipeline:
             return _Execution(self, source, run, first).execute(stages, wanted)
 
     def forget(self, name: str, run: RunContext) -> None:
-        """Remove a stage and all later ones from the manifest; the photos stage alone, as no other needs its files.
+        """Remove a stage and those that depend on it from the manifest; the photos stage alone: none needs its files.
 
         Args:
             name: of the stage.
             run: the run.
         """
         alone = name == self.photos.name
-        run.workspace.manifest.forget((name,) if alone else self.names[self.names.index(name) :])
+        dependent = () if alone else (stage.name for stage in self.stages if name in stage.depends_on)
+        run.workspace.manifest.forget((name, *dependent))
 
 
 @dataclass(slots=True, eq=False)
@@ -127,13 +127,11 @@ class _Execution:
             reasons[stage.name] = self.stage_rerun_reason(stage, [inputs[taken.name] for taken in stage.takes])
             inputs[stage.name] = self.fingerprints[stage.name]
         self.earlier = self.find_earlier(reasons)
-        redone = photos.name if self.first == photos.name else ""
-        ahead = list(dropwhile(lambda name: not redone and reasons[name] is None, reasons))
+        reasons = spread_reasons(later, reasons, (photos.name,) if self.first == photos.name else ())
+        ahead = [name for name, again in reasons.items() if again is not None]
         with _limit_workers(self.products[photos], ahead, self.run) as run:
             for stage in later:
-                again = reasons[stage.name]
-                self.run_stage(stage, f"after {redone}" if redone and again in (None, PHOTOS_CHANGED) else again, run)
-                redone = redone if again is None else stage.name
+                self.run_stage(stage, reasons[stage.name], run)
                 forget_earlier(run, if_finished=True)
         for stage in wanted:
             if stage in stages:
@@ -202,6 +200,24 @@ class _Execution:
             check_undisturbed(self.source, None if stage is photos else self.products[photos], run, by=err)
             raise
         return product
+
+
+def spread_reasons(
+    stages: Sequence[Stage[object]], reasons: Mapping[str, str | None], redone: Sequence[str] = ()
+) -> dict[str, str | None]:
+    """Return why each stage runs again, where what it depends on does, too.
+
+    Args:
+        stages: in order.
+        reasons: of each stage by itself; None for those that are up to date.
+        redone: stages before them that run again.
+    """
+    found: dict[str, str | None] = {}
+    for stage in stages:
+        again, before = reasons[stage.name], [*redone, *(name for name, why in found.items() if why is not None)]
+        causes = [name for name in before if name in stage.depends_on]
+        found[stage.name] = f"after {causes[-1]}" if causes and again in (None, PHOTOS_CHANGED) else again
+    return found
 
 
 @contextmanager

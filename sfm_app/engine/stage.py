@@ -33,6 +33,11 @@ class Stage(Generic[Product_co]):
     grows: bool = False
     """Whether `make` can go on from what it made of other photos, see `runtime.earlier`."""
 
+    @property
+    def depends_on(self) -> frozenset[str]:
+        """Names of all stages whose products its result depends on, directly or not."""
+        return frozenset(name for stage in self.takes for name in (stage.name, *stage.depends_on))
+
 
 class Products:
     """Products by stage; those of skipped stages are loaded on first use.

@@ -9,7 +9,7 @@ from typing import Any
 from sfm_app.colmap.backend import versions as colmap_versions
 from sfm_app.engine.stage import Stage
 from sfm_app.hashing import fingerprint
-from sfm_app.runtime.context import GIVEN_CAMERAS, RunContext
+from sfm_app.runtime.context import CONTROL_POINTS, GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.manifest import PROGRAM
 
 PHOTOS_CHANGED = "the photos have changed"
@@ -35,7 +35,8 @@ def settings_and_versions(stage: Stage[object], run: RunContext) -> dict[str, An
         stage: names the settings it depends on.
         run: has the settings.
     """
-    values = run.settings.model_dump() | {GIVEN_CAMERAS: run.given.digest}
+    files = {GIVEN_CAMERAS: run.given.digest, CONTROL_POINTS: run.control_points.digest}
+    values = run.settings.model_dump() | files
     return {"settings": {key: nested_value(values, key) for key in stage.settings}, "versions": versions()}
 
 
