@@ -19,6 +19,7 @@ from sfm_app.ransac import check_points
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import open_executor
 from sfm_app.runtime.workspace import Workspace
+from sfm_app.scale.measuring import Distance
 from sfm_app.selfcal.wide_angle.lens_search import LensEstimate, find_lens
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Intrinsics, Rejected, Scene
@@ -144,6 +145,27 @@ def export_model(
         return save_files(named_so, place.parent)
     except OSError as err:
         raise InputError(f"cannot write {place}: {err.strerror}", hint="name another file with -o") from err
+
+
+def measure_distance(out: PathLike, a: ArrayLike, b: ArrayLike) -> Distance:
+    """Return the distance between two places of a finished run, with its standard deviation.
+
+    Args:
+        out: output folder of the run.
+        a: (3,) x, y, z in the frame of its exported files, such as OUT/model.glb.
+        b: the other place.
+
+    Raises:
+        ValueError: a place is not three finite numbers, or both are the same.
+        InputError: the run has no camera poses yet.
+    """
+    from sfm_app.pipeline import stored_distance  # loads COLMAP
+
+    ends = np.array([a, b], np.float64)
+    if ends.shape != (2, 3) or not np.isfinite(ends).all():
+        raise ValueError("each place is three finite numbers")
+    with open_run(Path(out), Settings(), None) as run:
+        return stored_distance(run, ends)
 
 
 def calibrate_photos(

@@ -5,15 +5,21 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sfm_app.camera_files import read_given_cameras
 from sfm_app.colmap.model import sparse_model
 from sfm_app.engine.execution import Pipeline
 from sfm_app.engine.stage import Products, Stage, check_undamaged, resume_hint
 from sfm_app.errors import InputError
 from sfm_app.photos import read_source
-from sfm_app.runtime.context import GIVEN_CAMERAS, RunContext
+from sfm_app.runtime.context import CONTROL_POINTS, GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.parallel import ordered_map
-from sfm_app.stages import depth_maps, export, intrinsics, match_graph, mesh, photos, scene, texture, view_graph
+from sfm_app.scale import MetricFrame, move_model, read_control_points
+from sfm_app.scale.measuring import Distance, measure_distance
+from sfm_app.scale.photo_rays import PosedPhotos
+from sfm_app.stages import depth_maps, export, intrinsics, match_graph, mesh, photos, scale, scene, texture, view_graph
 from sfm_app.types import Intrinsics, MatchGraph, Model, PhotoSet, Scene, Surface, ViewGraph
 
 PHOTOS: Stage[PhotoSet] = Stage(
@@ -65,6 +71,15 @@ SCENE: Stage[Scene] = Stage(
     digest=scene.digest,
     grows=True,
 )
+SCALE: Stage[MetricFrame] = Stage(
+    name="scale",
+    takes=(PHOTOS, SCENE),
+    settings=("scale", CONTROL_POINTS),
+    files=("scale.json",),
+    make=lambda given, run: scale.make(given[PHOTOS], given[SCENE], run),
+    load=lambda _, run: scale.load(run),
+    digest=scale.digest,
+)
 DEPTH_MAPS: Stage[Path] = Stage(
     name="depth_maps",
     takes=(SCENE,),
@@ -94,15 +109,15 @@ TEXTURE: Stage[Model] = Stage(
 )
 FILES: Stage[tuple[Path, ...]] = Stage(
     name="files",
-    takes=(TEXTURE,),
+    takes=(SCALE, TEXTURE),
     settings=(),
     files=("model.ply", "model.glb"),
-    make=lambda given, run: export.make(given[TEXTURE], run),
+    make=lambda given, run: export.make(given[TEXTURE], given[SCALE], run),
     load=lambda _, run: export.load(run),
     digest=export.digest,
 )
 
-PIPELINE = Pipeline(PHOTOS, (MATCH_GRAPH, VIEW_GRAPH, INTRINSICS, SCENE, DEPTH_MAPS, MESH, TEXTURE, FILES))
+PIPELINE = Pipeline(PHOTOS, (MATCH_GRAPH, VIEW_GRAPH, INTRINSICS, SCENE, SCALE, DEPTH_MAPS, MESH, TEXTURE, FILES))
 STAGES, NAMES = PIPELINE.stages, PIPELINE.names
 
 
@@ -121,6 +136,8 @@ def run_stages(
         place.check_no_overlap(Path(options.masks), "masks")
     if run.settings.calibration.file:
         run = replace(run, given=read_given_cameras(Path(run.settings.calibration.file)))
+    if run.settings.scale.control_points:
+        run = replace(run, control_points=read_control_points(Path(run.settings.scale.control_points)))
     source = read_source(photo_dir, place.root, options, partial(ordered_map, run.executor, ahead=4 * run.workers))
     source.check_settings(run.settings)
     return PIPELINE.run(source, run, first, last, wanted)
@@ -135,16 +152,60 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
     Raises:
         InputError: a stage has not run yet (the message names it), or its files are missing or damaged.
     """
-    place = run.workspace
-    if not place.manifest.read().get("stages"):
-        raise InputError(f"{place.root} holds no run", hint="name the folder that `sfm-app run PHOTOS -o OUT` wrote")
-    place.manifest.check_format()
-    needed, what = (SCENE, "points") if points else (TEXTURE, "model")
-    if place.manifest.record(needed.name) is None:
-        more = "; `--points` exports the points and cameras" if place.manifest.record(SCENE.name) else ""
-        hint = resume_hint(run) + more
-        raise InputError(f"{place.root} holds no {what} yet: stage `{needed.name}` is missing", hint=hint)
+    _check_finished(SCENE if points else TEXTURE, "points" if points else "model", run)
+    frame, place = stored_frame(run), run.workspace
     if not points:
-        return Products(run)[TEXTURE]
+        return move_model(Products(run)[TEXTURE], frame.from_model)
     with check_undamaged(SCENE, run):
-        return sparse_model(place.sparse)
+        return move_model(sparse_model(place.sparse), frame.from_model)
+
+
+def stored_distance(run: RunContext, ends: NDArray[np.float64]) -> Distance:
+    """Return the distance between two places in the frame of exported files.
+
+    Args:
+        run: the finished run.
+        ends: (2, 3) the places.
+
+    Raises:
+        ValueError: both are the same.
+        InputError: the run has no poses yet, or its files are damaged.
+    """
+    _check_finished(SCENE, "camera poses", run)
+    frame = stored_frame(run)
+    a, b = frame.from_model.inverse()(ends)
+    with check_undamaged(SCENE, run):
+        model = PosedPhotos(run.workspace.sparse).sightlines()
+    return measure_distance(a, b, model, frame.from_model.scale, frame.deviation)
+
+
+def _check_finished(needed: Stage[object], what: str, run: RunContext) -> None:
+    """Check that a run has finished a stage.
+
+    Args:
+        needed: the stage.
+        what: it gives, for the message.
+        run: the run.
+
+    Raises:
+        InputError: it has not; the message names the stage.
+    """
+    manifest = run.workspace.manifest
+    if not manifest.read().get("stages"):
+        hint = "name the folder that `sfm-app run PHOTOS -o OUT` wrote"
+        raise InputError(f"{run.workspace.root} holds no run", hint=hint)
+    manifest.check_format()
+    if manifest.record(needed.name) is None:
+        more = "; `--points` exports the points and cameras" if manifest.record(SCENE.name) else ""
+        missing = f"{run.workspace.root} holds no {what} yet: stage `{needed.name}` is missing"
+        raise InputError(missing, hint=resume_hint(run) + more)
+
+
+def stored_frame(run: RunContext) -> MetricFrame:
+    """Return the frame of exported files; that of the model where nothing is known of its size.
+
+    Args:
+        run: the finished run.
+    """
+    known = run.workspace.manifest.record(SCALE.name) is not None
+    return Products(run)[SCALE] if known else MetricFrame()

@@ -14,6 +14,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from sfm_app.errors import ConfigError
+from sfm_app.lengths import parse_length, parse_point
 
 MOST_TOML_BYTES = 20_000
 """Most bytes of a settings file. One with every setting has a fifth; a megabyte of dots takes minutes to parse."""
@@ -24,6 +25,10 @@ Quality = Literal["draft", "normal", "high"]
 CameraModelName = Literal[
     "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_FISHEYE",
     "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "EQUIRECTANGULAR",
+]  # fmt: skip
+MarkerFamily = Literal[
+    "auto", "apriltag-36h11", "apriltag-25h9", "apriltag-16h5", "aruco-4x4", "aruco-4x4-1000", "aruco-5x5",
+    "aruco-5x5-1000", "aruco-6x6", "aruco-6x6-1000", "aruco-7x7", "aruco-7x7-1000", "aruco-original", "aruco-mip-36h12",
 ]  # fmt: skip
 ConstraintForm = Literal["huang-faugeras", "frobenius", "trivedi", "polynomial"]
 
@@ -152,6 +157,41 @@ class SceneSettings(Section):
     )
 
 
+class ScaleSettings(Section):
+    """Real size: what is known of lengths and places in the scene. Poses and depth do not depend on it."""
+
+    distances: tuple[tuple[str, str, str], ...] = Field(
+        (),
+        description='known distances, each ["x,y,z", "x,y,z", "1.25m"]: two points in the unit of OUT/sparse, and how '
+        "far apart they are",
+    )
+    markers: str = Field(
+        "", description="side of the dark square of printed ArUco or AprilTag markers, such as 50mm; none where empty"
+    )
+    marker_family: MarkerFamily = Field("auto", description="family of these markers; auto: the common ones")
+    control_points: str = Field(
+        "", description="file with ground control points, as OpenDroneMap's gcp_list.txt; none where empty"
+    )
+
+    @field_validator("markers")
+    @classmethod
+    def check_side(cls, side: str) -> str:
+        """Return a length after checking its form; ValueError where it is none."""
+        if side:
+            parse_length(side)
+        return side
+
+    @field_validator("distances")
+    @classmethod
+    def check_distances(cls, distances: tuple[tuple[str, str, str], ...]) -> tuple[tuple[str, str, str], ...]:
+        """Return distances after checking their form; ValueError where a point or a length is none."""
+        for first, second, length in distances:
+            if parse_point(first) == parse_point(second):
+                raise ValueError("a distance needs two points")
+            parse_length(length)
+        return distances
+
+
 class DepthSettings(Section):
     """Depth maps."""
 
@@ -242,6 +282,7 @@ class Settings(Section):
     epipolar: EpipolarSettings = EpipolarSettings()
     calibration: CalibrationSettings = CalibrationSettings()
     scene: SceneSettings = SceneSettings()
+    scale: ScaleSettings = ScaleSettings()
     depth: DepthSettings = DepthSettings()
     mesh: MeshSettings = MeshSettings()
     texture: TextureSettings = TextureSettings()

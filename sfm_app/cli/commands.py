@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from sfm_app import __version__
-from sfm_app.api import calibrate_photos, export_model, reconstruct, write_report
+from sfm_app.api import calibrate_photos, export_model, measure_distance, reconstruct, write_report
 from sfm_app.cli.display import (
     file_lines,
     print_json,
@@ -26,9 +26,13 @@ from sfm_app.cli.terminal import Terminal
 from sfm_app.colmap.backend import has_running_call
 from sfm_app.demo import demo_lines, run_demo
 from sfm_app.errors import ConfigError, SfmError
+from sfm_app.lengths import parse_length, parse_point
 from sfm_app.pipeline import NAMES
 from sfm_app.plugins import load_plugins
 from sfm_app.report.camera_text import intrinsics_lines, intrinsics_summary
+from sfm_app.report.scale_text import distance_text
+from sfm_app.scale.marker_page import PAGES_MM, write_marker_page
+from sfm_app.scale.markers import FAMILIES
 
 INTERRUPTED = 130
 FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
@@ -142,6 +146,50 @@ def export(out: Path, file_format: str, target: Path | None, points: bool, as_js
         raise ConfigError("no format is given", hint=f"--format {'|'.join(load_plugins().exporters)}, or -o model.obj")
     files = export_model(out, file_format, target, points=points)
     print_json([str(path) for path in files]) if as_json else print_lines(file_lines(files))
+
+
+@main.command(context_settings={"ignore_unknown_options": True})  # coordinates may begin with a minus
+@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("a")
+@click.argument("b")
+@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+def measure(out: Path, a: str, b: str, as_json: bool) -> None:
+    """Print the distance between the places A and B, each x,y,z as in OUT/model.glb, with its standard deviation."""
+    try:
+        found = measure_distance(out, parse_point(a), parse_point(b))
+    except ValueError as err:
+        raise ConfigError(str(err), hint="sfm-app measure OUT 0.1,0.2,0.3 1,0,-0.5") from None
+    print_json(found.to_dict()) if as_json else print_lines([distance_text(found)])
+
+
+@main.command()
+@click.argument("side")
+@click.option(
+    "-o",
+    "--output",
+    "target",
+    type=click.Path(path_type=Path),
+    default=Path("markers.pdf"),
+    show_default=True,
+    help="PDF or SVG file to write.",
+)
+@click.option(
+    "--family", type=click.Choice(tuple(FAMILIES)), default="apriltag-36h11", show_default=True, help="Kind of markers."
+)
+@click.option("--first", type=click.IntRange(0, 10_000), default=0, show_default=True, help="Number of the first one.")
+@click.option("--paper", type=click.Choice(tuple(PAGES_MM)), default="a4", show_default=True, help="Size of the page.")
+def markers(side: str, target: Path, family: str, first: int, paper: str) -> None:
+    """Make a page of markers of side SIDE, such as 50mm, to print and lay beside what is photographed.
+
+    `sfm-app run PHOTOS --markers 50mm` then gives the model its real size.
+    """
+    try:
+        count = write_marker_page(target, parse_length(side), family, first, paper)
+    except ValueError as err:
+        raise ConfigError(str(err), hint="sfm-app markers 50mm -o markers.pdf") from None
+    print_lines(
+        [*file_lines([target]), f"{count} markers; measure one after printing: sfm-app run PHOTOS --markers {side}"]
+    )
 
 
 @main.command()

@@ -8,6 +8,7 @@ from typing import Any
 from sfm_app.api import Run
 from sfm_app.numerical import json_text
 from sfm_app.report.camera_text import contradiction_lines, intrinsics_lines, intrinsics_summary
+from sfm_app.report.scale_text import scale_lines
 from sfm_app.report.scene_text import scene_lines, scene_summary
 
 MEGABYTE, KILOBYTE = 1e6, 1e3
@@ -50,6 +51,8 @@ def run_summary(run: Run) -> dict[str, Any]:
     if run.scene:
         points = [str(path) for path in written_files(run, "scene")]
         summary["scene"] = {**scene_summary(run.scene, counts.get("scene", {})), "files": points}
+    if "scale" in counts:
+        summary["scale"] = counts["scale"]
     if run.mesh_path:
         files = [str(path) for path in written_files(run, "files")]
         about = {key: counts["files"][key] for key in ("pages_px", "jpeg_quality") if key in counts["files"]}
@@ -78,6 +81,8 @@ def run_lines(run: Run) -> list[str]:
     if run.scene:
         lines += scene_lines(run.scene, stages.get("scene", {}).get("counts", {}))
         lines += [f"            points and cameras: {line}" for line in file_lines(written_files(run, "scene"))]
+    if "scale" in summary:
+        lines += scale_lines(summary["scale"])
     if run.mesh_path:
         lines.append(f"mesh        {summary['mesh']['triangles']} triangles{texture_text(summary['mesh'])}")
         lines += [f"            {line}" for line in file_lines(written_files(run, "files"))]

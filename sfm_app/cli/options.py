@@ -40,7 +40,7 @@ def settings_from_flags(flags: Mapping[str, Any]) -> Settings:
     show_log(flags["verbose"])
     overrides: dict[str, Any] = {"plugins": False} if flags["no_plugins"] else {}
     for flag in SETTING_FLAGS:
-        if (value := flags[flag.parameter]) is not None:
+        if (value := flags[flag.parameter]) not in (None, ()):
             overrides = merge_nested(overrides, flag.to_mapping(value))
     for assignment in flags["assignments"]:
         overrides = merge_nested(overrides, parse_assignment(assignment))

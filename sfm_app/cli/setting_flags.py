@@ -24,6 +24,8 @@ class SettingFlag:
     metavar: str | None = None
     choice: bool = False
     """Whether click checks the value; otherwise `Settings` does, and its error names the table."""
+    parts: int = 1
+    """Words that it takes; where these are several, it may be given several times."""
 
     @property
     def parameter(self) -> str:
@@ -55,16 +57,21 @@ SETTING_FLAGS = (
     SettingFlag("--keep-calibration", "calibration.keep"),
     SettingFlag("--camera-model", "scene.camera_model", metavar="MODEL"),
     SettingFlag("--mapper", "scene.mapper"),
+    SettingFlag("--scale", "scale.distances", metavar="A B LENGTH", parts=3),
+    SettingFlag("--markers", "scale.markers", metavar="LENGTH"),
+    SettingFlag("--gcp", "scale.control_points", metavar="FILE"),
     SettingFlag("--faces", "mesh.faces"),
     SettingFlag("--unseen-faces", "texture.unseen_faces", choice=True),
 )
 
 
 def setting_option(flag: SettingFlag) -> Callable[[Command], Command]:
-    """Return the click option of a setting; its value is None where it is not given."""
+    """Return the click option of a setting; its value is None, or empty for several words, where it is not given."""
     kind, text = setting_field(flag.setting).annotation, help_text(flag.setting)
     if kind is bool:
         return click.option(flag.flag, is_flag=True, default=None, help=text)
+    if flag.parts > 1:
+        return click.option(flag.flag, type=str, nargs=flag.parts, multiple=True, metavar=flag.metavar, help=text)
     if flag.choice:
         return click.option(flag.flag, type=click.Choice(get_args(kind)), help=text)
     return click.option(flag.flag, type=kind if kind in (int, float) else str, metavar=flag.metavar, help=text)
@@ -86,7 +93,7 @@ def default_text(setting: str) -> str:
     if setting != "quality" and len(set(values.values())) > 1:
         return "default: " + ", ".join(f"{value} for {quality}" for quality, value in values.items())
     value = setting_value(Settings(), setting)
-    return "" if value == "" or isinstance(value, bool) else f"default: {value}"
+    return "" if value in ("", ()) or isinstance(value, bool) else f"default: {value}"
 
 
 def range_text(setting: str) -> str:

@@ -15,6 +15,7 @@ STAGE_TITLES = {
     "view_graph": "fundamental matrices",
     "intrinsics": "camera matrix",
     "scene": "camera poses and points",
+    "scale": "real size",
     "depth_maps": "depth maps",
     "mesh": "surface",
     "texture": "texture",

@@ -222,6 +222,17 @@ def _orientation_entry(upright: UpEstimate, front: str) -> dict[str, Json]:
     }
 
 
+def gps_deviation(orientation: Mapping[str, Json]) -> float | None:
+    """Return the relative standard deviation of the meter by GPS; None where the unit is arbitrary.
+
+    Args:
+        orientation: entry for the manifest, of `orient_or_keep`.
+    """
+    found = orientation.get("georeference")
+    percent = found.get("scale_deviation_percent") if isinstance(found, Mapping) else None
+    return float(percent) / 100.0 if isinstance(percent, int | float) else None
+
+
 def _georeference_entry(viewer: Similarity, gps: Georeference | NoGeoreference) -> dict[str, Json]:
     """Return the unit and georeference of the model that `viewer` has moved, for the manifest."""
     if isinstance(gps, NoGeoreference):

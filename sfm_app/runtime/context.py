@@ -15,7 +15,7 @@ from sfm_app.runtime.earlier import Earlier
 from sfm_app.runtime.parallel import make_executor, ordered_map, threads_elsewhere
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
-from sfm_app.types import GivenCameras, Model
+from sfm_app.types import ControlPoints, GivenCameras, Model
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -23,8 +23,9 @@ Result = TypeVar("Result")
 STANDARD_FORMATS = ("ply", "glb")
 """Formats in which every run writes its models; `sfm-app export` writes others."""
 
-GIVEN_CAMERAS = "given_cameras"
-"""Name by which a stage says, among its settings, that it depends on what the calibration file holds."""
+GIVEN_CAMERAS, CONTROL_POINTS = "given_cameras", "control_points"
+"""Names by which a stage says, among its settings, that it depends on what the calibration file, or the file of ground
+control points, holds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +42,8 @@ class RunContext:
     """Hash of everything that the stage's result depends on."""
     given: GivenCameras = field(default_factory=GivenCameras)
     """Cameras that the user knows."""
+    control_points: ControlPoints = field(default_factory=ControlPoints)
+    """Ground control points that the user knows."""
     earlier: Earlier | None = None
     """What the stage may go on from: files of a run with other photos; None where everything is done afresh."""
     statistics: dict[str, Any] = field(default_factory=dict)

@@ -130,6 +130,8 @@ def make_plan(photos: Iterable[Photo], settings: Settings, workers: int, limit_m
             "view_graph": 0.04 * pairs * features / 8192,
             "intrinsics": 0.03 * pairs,
             "scene": 2.0 * count,
+            "scale": 1.0
+            + (0.2 * sum(width * height for width, height in sizes) / MEGA if settings.scale.markers else 0.0),
             "depth_maps": 3.0 * sum(mapped) * settings.depth.neighbors,
             "mesh": 15 + (2.0 if dense <= FUSED_AT_ONCE_MP else 2.7) * dense,
             "texture": 0.1 * sum(width * height for width, height in sizes) / MEGA,
@@ -140,6 +142,7 @@ def make_plan(photos: Iterable[Photo], settings: Settings, workers: int, limit_m
             "view_graph": 450 + 0.05 * pairs + 1.0 * count,
             "intrinsics": 500 + 0.06 * pairs,
             "scene": 700 + 15.5 * count * features / 8192,
+            "scale": 600 + workers * 8 * largest + 5.0 * count,
             "depth_maps": 750 + workers * 150 * max(mapped, default=0) + 5.0 * count,
             "mesh": 950 + max(min(1000 * cache_gb(limit_mb), fused_mb), block_mb),
             "texture": 1000 + (8 + 3 * (blocks - 1)) * pages + workers * 8 * largest + 3.0 * count,

@@ -16,9 +16,9 @@ from sfm_app.atomic_io import UNFINISHED
 from sfm_app.errors import InputError
 from sfm_app.runtime.manifest import MANIFEST, Manifest
 
-DATABASE, CALIBRATION, SCENE = "database.db", "calibration.json", "scene.json"
+DATABASE, CALIBRATION, SCENE, SCALE = "database.db", "calibration.json", "scene.json", "scale.json"
 FOLDERS = ("photos", "frames", "masks", "sparse", "other_models", "dense", "surface", "texture")
-OUTPUT_NAMES = (*FOLDERS, DATABASE, CALIBRATION, SCENE)
+OUTPUT_NAMES = (*FOLDERS, DATABASE, CALIBRATION, SCENE, SCALE)
 """Names of files and folders that a run removes before it writes them."""
 LOCK, HOLDER = ".lock", ".held-by.txt"
 LOG, PARTS, FEATURES, MAPPING = "log.txt", "view_graph_parts", "feature_parts", ".mapping"
@@ -79,6 +79,11 @@ class Workspace:
     def scene(self) -> Path:
         """What is known about the scene besides COLMAP's model: refined cameras, and why photos are not placed."""
         return self.root / SCENE
+
+    @property
+    def scale(self) -> Path:
+        """The frame of exported files: how large the scene is, and where."""
+        return self.root / SCALE
 
     @property
     def sparse(self) -> Path:

@@ -6,19 +6,21 @@ from sfm_app.formats.pages import JPEG_QUALITY
 from sfm_app.hashing import digest_files
 from sfm_app.runtime.context import STANDARD_FORMATS, RunContext
 from sfm_app.runtime.workspace import Workspace
+from sfm_app.scale import MetricFrame, move_model
 from sfm_app.types import Model
 
 NAME = "model"
 
 
-def make(model: Model, run: RunContext) -> tuple[Path, ...]:
+def make(model: Model, frame: MetricFrame, run: RunContext) -> tuple[Path, ...]:
     """Write the finished model in every standard format; the last one is the one to open.
 
     Args:
         model: the textured surface.
+        frame: in which it is written.
         run: the run.
     """
-    paths = run.write_model(model, NAME)
+    paths = run.write_model(move_model(model, frame.from_model), NAME)
     if model.texture is not None:
         sizes = [[page.shape[1], page.shape[0]] for page in model.texture.pages]
         run.record(pages_px=sizes, jpeg_quality=JPEG_QUALITY)

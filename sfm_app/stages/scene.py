@@ -19,7 +19,7 @@ from sfm_app.estimation.exif_check import report_claims
 from sfm_app.hashing import digest_files
 from sfm_app.numerical import Json, json_text
 from sfm_app.reconstruction import MappedScene, Outcome, reconstruct, retry_lost_photos
-from sfm_app.reconstruction.align_upright import orient_or_keep, submit_cue_extraction
+from sfm_app.reconstruction.align_upright import gps_deviation, orient_or_keep, submit_cue_extraction
 from sfm_app.reconstruction.growth.known_model import GROWN, map_new_photos
 from sfm_app.reconstruction.look_alikes import jumps, look_alike_entries
 from sfm_app.reconstruction.unregistered import photo_names, unregistered_reasons
@@ -66,7 +66,8 @@ def load(run: RunContext) -> Scene:
     place = run.workspace
     known = json.loads(place.scene.read_text(encoding="utf-8"))
     with translate_errors("reading the sparse model"):
-        return read_scene(place.sparse, known["camera_of"], known["unregistered"], known["cameras"])
+        scene = read_scene(place.sparse, known["camera_of"], known["unregistered"], known["cameras"])
+    return replace(scene, gps_deviation=known.get("gps_deviation"))
 
 
 def digest(place: Workspace) -> str:
@@ -115,6 +116,7 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     members = [posed_photo_ids(model) for model in models]
     reasons = unregistered_reasons(set(members[0]), members[1:], matches, views, outcome.graph)
     scene = read_scene(run.workspace.sparse, names, reasons, refined_cameras(adjusted[0], names))
+    scene = replace(scene, gps_deviation=gps_deviation(orientations[0]))
     write_scene(scene, run)
     if readout is not None:
         run.record(shutter=readout.to_dict())
@@ -265,6 +267,7 @@ def write_scene(scene: Scene, run: RunContext) -> None:
         "cameras": {name: camera.to_dict() for name, camera in scene.cameras.items()},
         "camera_of": dict(scene.camera_of),
         "unregistered": dict(scene.unregistered),
+        "gps_deviation": scene.gps_deviation,
     }
     with replace_atomically(run.workspace.scene) as path:
         path.write_text(json_text(known), encoding="utf-8")

@@ -10,6 +10,7 @@ Conventions:
 
 from sfm_app.types.calibration import Calibration, Intrinsics
 from sfm_app.types.camera_pairs import CameraPairs, PhotoPairs
+from sfm_app.types.control_points import ControlPoint, ControlPoints
 from sfm_app.types.epipolar import EpipolarFit, Rejected, ViewGraph
 from sfm_app.types.features import Features
 from sfm_app.types.given_cameras import GivenCameras
@@ -24,6 +25,8 @@ __all__ = [
     "Calibration",
     "CameraModel",
     "CameraPairs",
+    "ControlPoint",
+    "ControlPoints",
     "EpipolarFit",
     "Features",
     "Frame",

@@ -47,6 +47,8 @@ class Scene:
     mean_reprojection_px: float
     camera_of: Mapping[str, str] = field(default_factory=dict)
     """Name of the camera by photo that has a pose."""
+    gps_deviation: float | None = None
+    """Relative standard deviation of the unit where GPS makes it the meter; None: the unit is arbitrary."""
 
     @property
     def registered(self) -> tuple[str, ...]:

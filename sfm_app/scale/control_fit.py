@@ -1,0 +1,156 @@
+"""Place and size of a model from ground control points, without those that contradict the others."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import comb
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.similarity import Similarity, robust_similarity, umeyama
+from sfm_app.orientation.georeference import enu_m, position_from_enu
+from sfm_app.scale.sighted_points import SightedPoint
+from sfm_app.types import ControlPoint, ControlPoints, GpsPosition
+
+FloatArray = NDArray[np.float64]
+
+LEAST_POINTS = 3
+CHECKED_POINTS = 5
+"""Points from which on a wrong one can be told: four others determine the seven numbers with five left over."""
+SIGNIFICANCE = 0.002
+"""Probability of a false alarm at each step. Chosen by hand; `tests/unit/scale/test_control_fit.py` counts those, and
+the wrong points that are found."""
+UNKNOWNS = 7
+"""Of a similarity."""
+LEAST_SIGMA_M = 1e-4
+"""Least standard deviation of a control point, in meters: nobody measures better."""
+EAST_UP_SOUTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""From east, north, up to x, y, z of exported files, with y up."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ControlFit:
+    """A model placed on ground control points."""
+
+    from_model: Similarity
+    """To x east, y up and z south of the offset, in meters."""
+    crs: str
+    offset: tuple[float, float, float]
+    """East, north and up of (0, 0, 0)."""
+    deviation: float
+    """Relative standard deviation of the scale."""
+    rms_m: float
+    """Root mean square distance of the used points."""
+    used: tuple[str, ...]
+    wrong: Mapping[str, float]
+    """Distance in meters by which each left-out point misses the fit."""
+
+
+def fit_control_points(given: ControlPoints, located: Mapping[str, SightedPoint]) -> ControlFit | str:
+    """Fit the similarity that takes the model to its ground control points, or say why there is none.
+
+    Args:
+        given: the user's points.
+        located: places in the model, by name of the point.
+    """
+    points = [point for point in given.points if point.name in located]
+    if len(points) < LEAST_POINTS:
+        return f"{len(points)} of {len(given.points)} ground control points have a place in the model, 3 are needed"
+    targets, crs, offset = _target_positions(points, given)
+    places = np.array([located[point.name].place for point in points])
+    try:
+        used = agreeing_points(places, targets)
+    except ValueError:
+        return "the ground control points lie on a line: they do not determine which way is up"
+    fit = umeyama(places[used], targets[used])
+    off = np.linalg.norm(fit(places) - targets, axis=1)
+    rms = float(np.sqrt(np.mean(off[used] ** 2)))
+    marked = [np.trace(located[point.name].covariance) / 3 for point, kept in zip(points, used, strict=True) if kept]
+    sigma = max(_sigma(off[used]), fit.scale * float(np.sqrt(np.mean(marked))), LEAST_SIGMA_M)
+    spread = float(np.sqrt((np.square(places[used] - places[used].mean(axis=0))).sum()))
+    names = [point.name for point in points]
+    return ControlFit(
+        fit,
+        crs,
+        offset,
+        sigma / (fit.scale * spread),
+        rms,
+        tuple(name for name, kept in zip(names, used, strict=True) if kept),
+        {name: float(miss) for name, kept, miss in zip(names, used, off, strict=True) if not kept},
+    )
+
+
+def agreeing_points(places: FloatArray, targets: FloatArray) -> NDArray[np.bool_]:
+    """Return which points agree on one similarity; all of them where fewer than `CHECKED_POINTS` are given.
+
+    A forward search (Atkinson and Riani 2000) begins with the four that agree best and adds the nearest one by one. A
+    point is left out where the fit without it, or without it and those added later, is better than chance allows: by
+    the F-test, with as many trials as there are ways to choose those left out.
+
+    Args:
+        places: (N, 3) in the model.
+        targets: (N, 3) where they should be, in meters.
+
+    Raises:
+        ValueError: all lie on a line.
+    """
+    first = robust_similarity(places, targets)
+    if len(places) < CHECKED_POINTS:
+        return np.ones(len(places), bool)
+    members = np.argsort(np.linalg.norm(first(places) - targets, axis=1), kind="stable")[:4]
+    searched = [members]
+    squares = [_squared_error(places[members], targets[members])]
+    while len(members) < len(places):
+        off = np.linalg.norm(umeyama(places[members], targets[members])(places) - targets, axis=1)
+        members = np.argsort(off, kind="stable")[: len(members) + 1]
+        searched.append(members)
+        squares.append(_squared_error(places[members], targets[members]))
+    last = len(searched) - 1
+    while any(_chance(squares, fewer, last) < SIGNIFICANCE for fewer in range(last)):
+        last -= 1
+    used = np.zeros(len(places), bool)
+    used[searched[last]] = True
+    return used
+
+
+def _chance(squares: Sequence[float], fewer: int, more: int) -> float:
+    """Return the probability that good points alone make the fit so much worse, from four points plus either count."""
+    from scipy.stats import f  # takes half a second to load
+
+    extra, freedom = more - fewer, 3 * (fewer + 4) - UNKNOWNS
+    ratio = (squares[more] - squares[fewer]) / (3 * extra) / (squares[fewer] / freedom)
+    return float(comb(more + 4, extra) * f.sf(ratio, 3 * extra, freedom))
+
+
+def _squared_error(places: FloatArray, targets: FloatArray) -> float:
+    """Return the squared distances of points to their fit, as large as the least deviation at least."""
+    off = umeyama(places, targets)(places) - targets
+    return max(float((off**2).sum()), LEAST_SIGMA_M**2 * (3 * len(places) - UNKNOWNS))
+
+
+def _sigma(off: FloatArray) -> float:
+    """Return the standard deviation of each coordinate of points from their distances to the fit."""
+    from scipy.stats import norm, t  # takes half a second to load
+
+    freedom = max(3 * len(off) - UNKNOWNS, 1)
+    # a deviation from few numbers may be too small: three of it are to cover as much as of a normal distribution
+    few = t.ppf(norm.cdf(3.0), freedom) / 3.0
+    return float(few * np.sqrt((off**2).sum() / freedom))
+
+
+def _target_positions(
+    points: Sequence[ControlPoint], given: ControlPoints
+) -> tuple[FloatArray, str, tuple[float, float, float]]:
+    """Return the positions (N, 3) in the frame of exported files, their coordinate system, and the frame's origin."""
+    positions = np.array([point.position for point in points])
+    if not given.geographic:
+        offset = np.round(positions.mean(axis=0))
+        east, north, up = map(float, offset)
+        return (positions - offset) @ EAST_UP_SOUTH.T, given.crs, (east, north, up)
+    known = [GpsPosition(latitude, longitude, height) for longitude, latitude, height in positions.tolist()]
+    middle = GpsPosition(*(float(value) for value in np.median(positions, axis=0)[[1, 0, 2]]))
+    origin = position_from_enu(np.zeros(3), middle)
+    where = (
+        f"meters east, north and up of {origin.latitude_deg:.8f}, {origin.longitude_deg:.8f}, {origin.altitude_m:.3f}"
+    )
+    return enu_m(known, origin) @ EAST_UP_SOUTH.T, where, (0.0, 0.0, 0.0)

@@ -1,0 +1,98 @@
+"""What tells how large a model is, how far it can be trusted, and whether its parts agree."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm_app.lengths import format_length
+
+CONTRADICTION = 4.0
+"""Standard deviations by which two that agree may differ. Chosen by hand: one pair of 16 000 differs by more."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleEvidence:
+    """One thing of known size in a model."""
+
+    name: str
+    """For people, such as "marker aruco-4x4 3"."""
+    scale: float
+    """Meters per unit of the model, > 0."""
+    deviation: float
+    """Its standard deviation, relative, > 0."""
+    photos: int = 0
+    """That show it."""
+
+
+@dataclass(frozen=True, slots=True)
+class AgreedScale:
+    """The scale that most of the evidence supports."""
+
+    scale: float
+    deviation: float
+    """Relative standard deviation; covers the contradiction where two pieces of evidence are left that differ."""
+    used: tuple[ScaleEvidence, ...]
+    contradictions: tuple[str, ...]
+
+
+def agree(evidence: Sequence[ScaleEvidence], shape: float = 0.0) -> AgreedScale:
+    """Weigh evidence of a scale, without what contradicts the rest.
+
+    What is farthest from the weighted mean of the others is left out as long as it differs by more than
+    `CONTRADICTION` of its standard deviations and two others remain. Two alone that differ are both named, the more
+    exact one is taken, and the deviation covers half of the difference.
+
+    Args:
+        evidence: at least one.
+        shape: relative deviation of the model's own shape: by it, two places may differ, and more evidence does not
+            make it smaller.
+    """
+    used, named = list(evidence), []
+    while len(used) > 2:
+        off = [_difference(one, _mean([other for other in used if other is not one]), shape) for one in used]
+        worst = int(np.argmax(off))
+        if off[worst] <= CONTRADICTION:
+            break
+        left_out = used.pop(worst)
+        named.append(_contradiction(left_out, _mean(used), f"the {len(used)} others"))
+    mean = _mean(used)
+    if len(used) == 2 and _difference(used[0], used[1], shape) > CONTRADICTION:
+        best, other = sorted(used, key=lambda one: one.deviation)
+        named.append(_contradiction(other, best, best.name))
+        half = abs(np.log(other.scale / best.scale)) / 2
+        mean, used = replace(best, deviation=max(best.deviation, float(half))), [best]
+    return AgreedScale(mean.scale, float(np.hypot(mean.deviation, shape)), tuple(used), tuple(named))
+
+
+def _mean(evidence: Sequence[ScaleEvidence]) -> ScaleEvidence:
+    """Return the weighted mean of logarithms, with a deviation that covers the scatter."""
+    logs = np.log([one.scale for one in evidence])
+    weights = 1.0 / np.square([one.deviation for one in evidence])
+    mean = float(weights @ logs / weights.sum())
+    freedom = max(len(logs) - 1, 1)
+    inflation = max(1.0, float(np.sqrt(weights @ (logs - mean) ** 2 / freedom)))
+    return ScaleEvidence("", float(np.exp(mean)), inflation / float(np.sqrt(weights.sum())))
+
+
+def _difference(one: ScaleEvidence, other: ScaleEvidence, shape: float) -> float:
+    """Return how many standard deviations two scales differ by."""
+    expected = np.linalg.norm([one.deviation, other.deviation, shape])
+    return abs(float(np.log(one.scale / other.scale))) / float(expected)
+
+
+def _contradiction(one: ScaleEvidence, against: ScaleEvidence, name: str) -> str:
+    share = 100.0 * (one.scale / against.scale - 1.0)
+    return (
+        f"{one.name} contradicts {name}: by it, the model is {abs(share):.2g} % {'larger' if share > 0 else 'smaller'}"
+    )
+
+
+def deviation_text(scale: float, deviation: float) -> str:
+    """Return a scale and its deviation for people.
+
+    Args:
+        scale: meters per unit of the model.
+        deviation: relative.
+    """
+    return f"a unit of the model is {format_length(scale)} +- {100 * deviation:.2g} %"

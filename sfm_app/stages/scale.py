@@ -1,0 +1,157 @@
+"""scale: PhotoSet and Scene -> MetricFrame, the frame of everything that is exported."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_app.atomic_io import replace_atomically
+from sfm_app.colmap.model import sparse_model
+from sfm_app.geometry.similarity import Similarity
+from sfm_app.hashing import digest_files
+from sfm_app.numerical import json_text
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.workspace import Workspace
+from sfm_app.scale.control_fit import ControlFit, fit_control_points
+from sfm_app.scale.evidence import ScaleEvidence, agree
+from sfm_app.scale.known_lengths import control_places, distance_evidence, marker_evidence
+from sfm_app.scale.metric_frame import MetricFrame, move_model
+from sfm_app.scale.photo_rays import PosedPhotos
+from sfm_app.stages.scene import POINTS
+from sfm_app.types import PhotoSet, Scene
+
+
+def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
+    """Find how large the scene is, and where, from all that is known of it; points and cameras are written again so.
+
+    Nothing that is missing or contradictory ends the run: it is recorded, and the unit stays what it was.
+
+    Args:
+        photos: in which marks and markers are.
+        scene: their poses.
+        run: the run, with what the user knows.
+    """
+    before = _earlier_frame(run.workspace)
+    frame = find_frame(photos, scene, run)
+    with replace_atomically(run.workspace.scale) as path:
+        path.write_text(json_text(frame.to_dict()), encoding="utf-8")
+    if frame.changes or before.changes:
+        run.write_model(move_model(sparse_model(run.workspace.sparse), frame.from_model), POINTS)
+    return frame
+
+
+def load(run: RunContext) -> MetricFrame:
+    """Read scale.json back."""
+    return read_frame(run.workspace)
+
+
+def digest(place: Workspace) -> str:
+    """Return a hash of scale.json."""
+    return digest_files(place.root, place.scale.name)
+
+
+def read_frame(place: Workspace) -> MetricFrame:
+    """Read scale.json of an output folder."""
+    return MetricFrame.from_dict(json.loads(place.scale.read_text(encoding="utf-8")))
+
+
+def find_frame(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
+    """Return the frame that the evidence supports, and record the evidence.
+
+    Args:
+        photos, scene, run: as in `make`.
+    """
+    options, evidence, problems = run.settings.scale, list[ScaleEvidence](), list[str]()
+    if scene.gps_deviation is not None:
+        evidence.append(ScaleEvidence("GPS of the photos", 1.0, max(scene.gps_deviation, 1e-4), len(scene.registered)))
+    control: ControlFit | None = None
+    if options.distances or options.markers or run.control_points:
+        posed = PosedPhotos(scene.model_dir)
+        if options.distances:
+            evidence += distance_evidence(options.distances, posed.sightlines())
+        if options.markers:
+            evidence += marker_evidence(posed, run, problems)
+        if run.control_points:
+            control = _control_evidence(photos, posed, run, evidence, problems)
+    frame = _agreed_frame(evidence, control, shape_deviation(scene))
+    run.record(
+        unit="meter" if frame.is_metric else "arbitrary",
+        scale=frame.from_model.scale,
+        deviation_percent=None if frame.deviation is None else round(100 * frame.deviation, 4),
+        source=frame.source,
+        evidence=[
+            {
+                "name": one.name,
+                "scale": one.scale,
+                "deviation_percent": round(100 * one.deviation, 4),
+                "photos": one.photos,
+            }
+            for one in evidence
+        ],
+        contradictions=list(frame.contradictions),
+        problems=problems,
+    )
+    return frame
+
+
+def _control_evidence(
+    photos: PhotoSet, posed: PosedPhotos, run: RunContext, evidence: list[ScaleEvidence], problems: list[str]
+) -> ControlFit | None:
+    """Return the fit to ground control points, and add what it tells to the evidence and the problems."""
+    located = control_places(photos, posed, run.control_points, problems)
+    found = fit_control_points(run.control_points, located)
+    if isinstance(found, str):
+        problems.append(found)
+        return None
+    for name, miss in found.wrong.items():
+        problems.append(f"ground control point '{name}' contradicts the others: it is {miss:.3g} m off, and left out")
+    name = f"{len(found.used)} ground control points"
+    evidence.append(ScaleEvidence(name, found.from_model.scale, found.deviation, 0))
+    run.record(control_points={"used": list(found.used), "wrong": dict(found.wrong), "rms_m": found.rms_m})
+    return found
+
+
+def shape_deviation(scene: Scene) -> float:
+    """Return the relative standard deviation of the proportions of a scene, by which places in it differ in scale.
+
+    A focal length that is off by a share bends depths against widths by about as much.
+
+    Args:
+        scene: with the deviations of its cameras.
+    """
+    known = (one.deviations.get("fx", 0.0) / one.K[0, 0] for one in scene.cameras.values())
+    return float(max((share for share in known if np.isfinite(share)), default=0.0))
+
+
+def _agreed_frame(evidence: Sequence[ScaleEvidence], control: ControlFit | None, shape: float) -> MetricFrame:
+    """Return the frame by the agreed scale; ground control points also give its place and directions."""
+    if not evidence:
+        return MetricFrame()
+    agreed = agree(evidence, shape)
+    source = ", ".join(one.name for one in agreed.used)
+    frame = MetricFrame(
+        Similarity(agreed.scale, np.eye(3), np.zeros(3)),
+        agreed.deviation,
+        source,
+        tuple(evidence),
+        agreed.contradictions,
+    )
+    if control is None:
+        return frame if agreed.scale != 1.0 else replace(frame, from_model=MetricFrame().from_model)
+    apart = abs(float(np.log(agreed.scale / control.from_model.scale)))
+    return replace(
+        frame,
+        from_model=control.from_model,
+        deviation=max(float(np.hypot(control.deviation, shape)), apart),
+        crs=control.crs,
+        offset=control.offset,
+    )
+
+
+def _earlier_frame(place: Workspace) -> MetricFrame:
+    """Return the frame in which points and cameras were written last."""
+    try:
+        return read_frame(place)
+    except (OSError, ValueError, KeyError, TypeError):  # none yet, or damaged
+        return MetricFrame()

@@ -1,0 +1,178 @@
+"""Real size by markers, distances and ground control points, from photos to exported files."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pycolmap
+import pytest
+import trimesh
+from scipy.spatial import KDTree
+
+import sfm_app
+from sfm_app.geometry.similarity import Similarity, umeyama
+from sfm_app.scale.markers import draw_pattern
+from sfm_app.settings import Settings
+from sfm_app.stages import scene as scene_stage
+from sfm_app.synthetic.cameras import ArcOptions, arc, camera_center, make_camera
+from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
+from sfm_app.synthetic.scenes.marker_sheet import marker_sheet
+from sfm_app.synthetic.scenes.scene_catalog import build_scene
+
+pytestmark = pytest.mark.slow
+
+SIDE_M = 0.4
+UTM = np.array([500_000.0, 4_649_000.0, 320.0])
+GROUND = np.array(
+    [[-1.2, 0.0, 0.6], [1.1, 1.4, -0.3], [0.1, 1.36, 0.1], [-0.4, 2.4, -2.6], [0.9, 0.35, 1.2], [1.6, 2.0, -2.6]]
+)
+"""Places that are marked in photos; they need not be on a surface."""
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    """A run up to the size, of photos that show two markers."""
+    place = tmp_path_factory.mktemp("size")
+    scene = build_scene()
+    markers = [
+        *marker_sheet(draw_pattern("apriltag-36h11", 0), SIDE_M, (-0.85, 0.75, 0.75), 15, 75),
+        *marker_sheet(draw_pattern("apriltag-36h11", 1), SIDE_M, (0.85, 0.72, 0.8), -20, 70),
+    ]
+    views = arc(make_camera(480, 320), ArcOptions(photos=7, sweep_deg=50.0))
+    fine = PhotoOptions(supersampling=5)  # edges along the pixels lie between the rays
+    truth = write_photo_folder(place / "photos", replace(scene, bodies=(*scene.bodies, *markers)), views, fine)
+    run = sfm_app.reconstruct(place / "photos", place / "out", settings_with(markers=f"{SIDE_M}m"), last="scale")
+    return SimpleNamespace(place=place, photos=place / "photos", out=place / "out", truth=truth, run=run)
+
+
+def settings_with(**scale):
+    return Settings.from_mapping({"quality": "draft", "scale": scale})
+
+
+def again(measured, last="scale", **scale):
+    return sfm_app.reconstruct(measured.photos, measured.out, settings_with(**scale), last=last)
+
+
+def read_scale(out):
+    return json.loads((out / "scale.json").read_text())
+
+
+def true_similarity(measured):
+    """From OUT/sparse to the world."""
+    scene = measured.run.scene
+    names = sorted(scene.registered)
+    found, true = (
+        np.array([camera_center(poses[name]) for name in names])
+        for poses in (scene.cam_from_world, measured.truth.cam_from_world)
+    )
+    return umeyama(found, true)
+
+
+def to_utm(place):
+    return UTM + np.array([place[0], -place[2], place[1]])
+
+
+def assert_scale(found, true, within):
+    error = abs(np.log(found["scale"] / true))
+    assert error < within
+    assert error < 3 * found["deviation"]
+    assert found["deviation"] < 5 * within
+
+
+def marks_file(measured, path, places, wrong=None):
+    """Write ground control points as they are seen, with the errors of a hand that marks them."""
+    rng, K, lines = np.random.default_rng(5), measured.truth.K, ["EPSG:32632"]
+    for number, place in enumerate(places):
+        east, north, up = to_utm(place) + (wrong or {}).get(number, np.zeros(3))
+        for name, pose in sorted(measured.truth.cam_from_world.items()):
+            seen = K @ (pose[:, :3] @ place + pose[:, 3])
+            x, y = seen[:2] / seen[2] + 0.2 * rng.normal(size=2)
+            if 0 < x < measured.truth.camera.width and 0 < y < measured.truth.camera.height:
+                lines.append(f"{east:.4f} {north:.4f} {up:.4f} {x:.2f} {y:.2f} {name} p{number}")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def test_two_markers_give_the_size(measured):
+    found = read_scale(measured.out)
+    assert found["unit"] == "meter"
+    assert len(found["evidence"]) == 2
+    assert_scale(found, true_similarity(measured).scale, within=0.002)
+
+
+def test_points_are_written_in_meters_and_the_model_on_disk_is_kept(measured):
+    again(measured, markers=f"{SIDE_M}m")
+    scale = read_scale(measured.out)["scale"]
+    written = trimesh.load(measured.out / "points.ply").vertices
+    own = np.array([point.xyz for point in pycolmap.Reconstruction(measured.out / "sparse").points3D.values()])
+    at_a_point = KDTree(scale * own).query(written)[0] < 1e-5
+    assert 0.7 < at_a_point.mean() < 1.0  # the others are corners of the drawn cameras
+
+    (again_written,) = sfm_app.export_model(measured.out, target=measured.place / "again.ply", points=True)
+    assert np.allclose(np.sort(trimesh.load(again_written).vertices, axis=0), np.sort(written, axis=0), atol=1e-5)
+
+
+def test_a_distance_is_measured_in_meters(measured):
+    again(measured, markers=f"{SIDE_M}m")
+    to_world = true_similarity(measured)
+    scale = read_scale(measured.out)["scale"]
+    a, b = (scale * to_world.inverse()(np.array(place)) for place in ((-0.7, 0.9, 0.7), (0.8, 0.6, 0.9)))
+    found = sfm_app.measure_distance(measured.out, a, b)
+
+    assert found.metric
+    assert found.value == pytest.approx(np.linalg.norm([1.5, -0.3, 0.2]), rel=0.002)
+    assert 0.0005 < found.deviation < 0.05
+
+
+def test_only_what_depends_on_the_size_is_done_again(measured, monkeypatch):
+    before = (measured.out / "manifest.json").read_text()
+    monkeypatch.setattr(scene_stage, "make", None)  # nothing is mapped again
+    again(measured, distances=[["0,0,0", "1,0,0", "2m"]])
+
+    earlier, later = (json.loads(text)["stages"] for text in (before, (measured.out / "manifest.json").read_text()))
+    assert {name for name in later if later[name] != earlier[name]} == {"scale"}
+    assert read_scale(measured.out)["scale"] == pytest.approx(2.0)
+
+
+def test_a_distance_that_contradicts_the_markers_is_named(measured):
+    true = true_similarity(measured).scale
+    again(measured, markers=f"{SIDE_M}m", distances=[["0,0,0", "0.2,0,0", f"{0.2 * true * 1.1}m"]])
+    found = read_scale(measured.out)
+
+    assert len(found["contradictions"]) == 1
+    assert "the distance of" in found["contradictions"][0]
+    assert "10 % larger" in found["contradictions"][0] or "9.9 % larger" in found["contradictions"][0]
+    assert found["scale"] == pytest.approx(true, rel=0.002)
+
+
+def test_control_points_give_size_and_place(measured, tmp_path):
+    run = again(measured, control_points=str(marks_file(measured, tmp_path / "gcp_list.txt", GROUND[:5])))
+    found = read_scale(measured.out)
+    assert_scale(found, true_similarity(measured).scale, within=0.005)
+
+    assert found["crs"] == "EPSG:32632"
+    frame = Similarity(found["scale"], np.array(found["R"]), np.array(found["t"]))
+    for name, pose in run.scene.cam_from_world.items():
+        x, y, z = frame(camera_center(pose))
+        east_north_up = np.array([x, -z, y]) + found["offset"]
+        assert np.linalg.norm(east_north_up - to_utm(camera_center(measured.truth.cam_from_world[name]))) < 0.01
+
+
+def test_a_wrong_control_point_is_named_and_left_out(measured, tmp_path):
+    path = marks_file(measured, tmp_path / "gcp_list.txt", GROUND, wrong={1: (0.1, -0.05, 0.2)})
+    run = again(measured, control_points=str(path))
+    counts = run.manifest["stages"]["scale"]["counts"]
+
+    assert set(counts["control_points"]["wrong"]) == {"p1"}
+    assert counts["control_points"]["wrong"]["p1"] == pytest.approx(0.23, abs=0.03)
+    assert any("'p1' contradicts the others" in text for text in counts["problems"])
+    assert_scale(read_scale(measured.out), true_similarity(measured).scale, within=0.005)
+
+
+def test_markers_that_are_not_there_leave_the_unit_as_it_was(measured):
+    run = again(measured, markers="50mm", marker_family="aruco-7x7")
+    assert read_scale(measured.out)["unit"] == "arbitrary"
+    assert run.manifest["stages"]["scale"]["counts"]["problems"] == [
+        "no photo shows a marker; print a page of them with `sfm-app markers`"
+    ]

@@ -1,0 +1,98 @@
+"""Ground control points: the right place and size, a deviation that covers the error, and wrong ones named."""
+
+import numpy as np
+import pytest
+
+from sfm_app.geometry.similarity import Similarity
+from sfm_app.scale.control_fit import ControlFit, agreeing_points, fit_control_points
+from sfm_app.scale.sighted_points import SightedPoint
+from sfm_app.synthetic.cameras import axis_rotation
+from sfm_app.types import ControlPoint, ControlPoints
+
+TRUE = Similarity(12.0, axis_rotation(np.array([2.0, 6.0, 3.0]) / 7.0, 70.0), np.array([3.0, -1.0, 8.0]))
+"""From the model to x east, y up, z south, less the offset."""
+UTM = np.array([500_000.0, 4_649_000.0, 320.0])
+
+
+def survey(rng, count, noise_m=0.01, wrong=(), miss_m=1.0):
+    """Control points in UTM coordinates, and their places in the model."""
+    places = rng.uniform(-1, 1, size=(count, 3)) * [1.0, 0.3, 1.0]
+    targets = TRUE(places) + noise_m * rng.normal(size=(count, 3))
+    for k in wrong:
+        step = rng.normal(size=3)
+        targets[k] += miss_m * step / np.linalg.norm(step)
+    enu = np.column_stack([targets[:, 0], -targets[:, 2], targets[:, 1]]) + UTM
+    points = tuple(ControlPoint(f"p{k}", tuple(row), {}) for k, row in enumerate(enu.tolist()))
+    located = {f"p{k}": SightedPoint(place, np.eye(3) * 1e-8, 0.3, (), ()) for k, place in enumerate(places)}
+    return ControlPoints(points, "EPSG:32632"), located, places
+
+
+def test_five_points_give_the_place_and_the_size():
+    given, located, places = survey(np.random.default_rng(0), 5, noise_m=0.0)
+    found = fit_control_points(given, located)
+
+    assert isinstance(found, ControlFit)
+    assert found.from_model.scale == pytest.approx(TRUE.scale, rel=1e-9)
+    moved = found.from_model(places)
+    east_north_up = np.column_stack([moved[:, 0], -moved[:, 2], moved[:, 1]]) + found.offset
+    assert np.allclose(east_north_up, [point.position for point in given.points], atol=1e-6)
+    assert found.offset == tuple(np.round(found.offset))  # whole meters
+    assert found.crs == "EPSG:32632"
+
+
+@pytest.mark.parametrize("count", [4, 5, 12])
+def test_the_deviation_of_the_scale_covers_its_error(count):
+    rng, normalized = np.random.default_rng(1), []
+    for _ in range(150):
+        given, located, _ = survey(rng, count)
+        found = fit_control_points(given, located)
+        normalized.append(np.log(found.from_model.scale / TRUE.scale) / found.deviation)
+    assert 0.4 < np.std(normalized) < 1.3
+    assert np.mean(np.abs(normalized) > 3) <= 0.02
+
+
+@pytest.mark.parametrize(("count", "wrong"), [(5, (2,)), (6, (0,)), (8, (1, 5)), (12, (0, 3, 7))])
+def test_wrong_points_are_named(count, wrong):
+    rng, named, falsely = np.random.default_rng(2), 0, 0
+    for _ in range(100):
+        found = fit_control_points(*survey(rng, count, wrong=wrong, miss_m=0.5)[:2])
+        named += set(found.wrong) >= {f"p{k}" for k in wrong}
+        falsely += not set(found.wrong) <= {f"p{k}" for k in wrong}
+    assert named >= 95
+    assert falsely <= 3
+
+
+@pytest.mark.parametrize("count", [5, 6, 8, 15])
+def test_good_points_are_kept(count):
+    rng = np.random.default_rng(3)
+    kept = [agreeing_points(places, TRUE(places) + 0.01 * rng.normal(size=places.shape)).all()
+            for places in (rng.uniform(-1, 1, size=(count, 3)) for _ in range(200))]  # fmt: skip
+    assert np.mean(kept) >= 0.98
+
+
+def test_too_few_points_and_points_on_a_line_give_a_reason():
+    rng = np.random.default_rng(4)
+    given, located, _ = survey(rng, 5)
+    assert "3 are needed" in fit_control_points(given, dict(list(located.items())[:2]))
+
+    on_line = {name: SightedPoint(k * np.ones(3), np.eye(3) * 1e-8, 0.3, (), ()) for k, name in enumerate(located)}
+    assert "on a line" in fit_control_points(given, on_line)
+
+
+def test_longitude_and_latitude_become_meters():
+    given = ControlPoints(
+        (
+            ControlPoint("a", (8.0, 47.0, 400.0), {}),
+            ControlPoint("b", (8.001, 47.0, 400.0), {}),
+            ControlPoint("c", (8.0, 47.001, 400.0), {}),
+        ),
+        "EPSG:4326",
+        geographic=True,
+    )
+    places = {"a": (0, 0, 0), "b": (0.76057, 0, 0), "c": (0, 0, -1.11177)}
+    located = {name: SightedPoint(np.array(at, float), np.eye(3) * 1e-9, 0.3, (), ()) for name, at in places.items()}
+    found = fit_control_points(given, located)
+
+    assert found.from_model.scale == pytest.approx(100.0, rel=2e-3)
+    assert np.allclose(found.from_model.R, np.eye(3), atol=2e-3)
+    assert "47.0" in found.crs
