@@ -3,6 +3,7 @@
 run = sfm_app.reconstruct("photos/", "out/")
 cal = sfm_app.calibrate_photos("photos/")
 sfm_app.export_model("out/", "obj")
+sfm_app.export_scene("out/", "colmap")
 sfm_app.write_report("out/")
 fit = sfm_app.estimate_fundamental(x1, x2)
 cal = sfm_app.calibrate_fundamentals(Fs, (width, height))
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
         estimate_fundamental,
         estimate_lens,
         export_model,
+        export_scene,
         reconstruct,
         write_report,
     )
@@ -50,6 +52,7 @@ __all__ = [
     "estimate_fundamental",
     "estimate_lens",
     "export_model",
+    "export_scene",
     "reconstruct",
     "write_report",
 ]

@@ -6,10 +6,8 @@ from functools import partial
 from pathlib import Path
 
 from sfm_app.camera_files import read_given_cameras
-from sfm_app.colmap.model import sparse_model
 from sfm_app.engine.execution import Pipeline
-from sfm_app.engine.stage import Products, Stage, check_undamaged, resume_hint
-from sfm_app.errors import InputError
+from sfm_app.engine.stage import Products, Stage
 from sfm_app.photos import read_source
 from sfm_app.runtime.context import GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.parallel import ordered_map
@@ -124,27 +122,3 @@ def run_stages(
     source = read_source(photo_dir, place.root, options, partial(ordered_map, run.executor, ahead=4 * run.workers))
     source.check_settings(run.settings)
     return PIPELINE.run(source, run, first, last, wanted)
-
-
-def stored_model(run: RunContext, *, points: bool = False) -> Model:
-    """Read the finished model, or the points and cameras, of a run; nothing is computed.
-
-    Args:
-        run, points: the finished run; whether to read the points and cameras instead of the textured surface.
-
-    Raises:
-        InputError: a stage has not run yet (the message names it), or its files are missing or damaged.
-    """
-    place = run.workspace
-    if not place.manifest.read().get("stages"):
-        raise InputError(f"{place.root} holds no run", hint="name the folder that `sfm-app run PHOTOS -o OUT` wrote")
-    place.manifest.check_format()
-    needed, what = (SCENE, "points") if points else (TEXTURE, "model")
-    if place.manifest.record(needed.name) is None:
-        more = "; `--points` exports the points and cameras" if place.manifest.record(SCENE.name) else ""
-        hint = resume_hint(run) + more
-        raise InputError(f"{place.root} holds no {what} yet: stage `{needed.name}` is missing", hint=hint)
-    if not points:
-        return Products(run)[TEXTURE]
-    with check_undamaged(SCENE, run):
-        return sparse_model(place.sparse)
