@@ -3,6 +3,7 @@
 run = sfm_app.reconstruct("photos/", "out/")
 cal = sfm_app.calibrate_photos("photos/")
 sfm_app.export_model("out/", "obj")
+sfm_app.export_scene("out/", "colmap")
 sfm_app.write_report("out/")
 sfm_app.measure_distance("out/", (0, 0, 0), (1, 0, 0))
 fit = sfm_app.estimate_fundamental(x1, x2)
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
         estimate_fundamental,
         estimate_lens,
         export_model,
+        export_scene,
         measure_distance,
         reconstruct,
         write_report,
@@ -52,6 +54,7 @@ __all__ = [
     "estimate_fundamental",
     "estimate_lens",
     "export_model",
+    "export_scene",
     "measure_distance",
     "reconstruct",
     "write_report",

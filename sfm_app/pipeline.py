@@ -5,20 +5,13 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sfm_app.camera_files import read_given_cameras
-from sfm_app.colmap.model import sparse_model
 from sfm_app.engine.execution import Pipeline
-from sfm_app.engine.stage import Products, Stage, check_undamaged, resume_hint
-from sfm_app.errors import InputError
+from sfm_app.engine.stage import Stage
 from sfm_app.photos import read_source
 from sfm_app.runtime.context import CONTROL_POINTS, GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.parallel import ordered_map
-from sfm_app.scale import MetricFrame, move_model, read_control_points
-from sfm_app.scale.measuring import Distance, measure_distance
-from sfm_app.scale.photo_rays import PosedPhotos
+from sfm_app.scale import MetricFrame, read_control_points
 from sfm_app.stages import depth_maps, export, intrinsics, match_graph, mesh, photos, scale, scene, texture, view_graph
 from sfm_app.types import Intrinsics, MatchGraph, Model, PhotoSet, Scene, Surface, ViewGraph
 
@@ -141,71 +134,3 @@ def run_stages(
     source = read_source(photo_dir, place.root, options, partial(ordered_map, run.executor, ahead=4 * run.workers))
     source.check_settings(run.settings)
     return PIPELINE.run(source, run, first, last, wanted)
-
-
-def stored_model(run: RunContext, *, points: bool = False) -> Model:
-    """Read the finished model, or the points and cameras, of a run; nothing is computed.
-
-    Args:
-        run, points: the finished run; whether to read the points and cameras instead of the textured surface.
-
-    Raises:
-        InputError: a stage has not run yet (the message names it), or its files are missing or damaged.
-    """
-    _check_finished(SCENE if points else TEXTURE, "points" if points else "model", run)
-    frame, place = stored_frame(run), run.workspace
-    if not points:
-        return move_model(Products(run)[TEXTURE], frame.from_model)
-    with check_undamaged(SCENE, run):
-        return move_model(sparse_model(place.sparse), frame.from_model)
-
-
-def stored_distance(run: RunContext, ends: NDArray[np.float64]) -> Distance:
-    """Return the distance between two places in the frame of exported files.
-
-    Args:
-        run: the finished run.
-        ends: (2, 3) the places.
-
-    Raises:
-        ValueError: both are the same.
-        InputError: the run has no poses yet, or its files are damaged.
-    """
-    _check_finished(SCENE, "camera poses", run)
-    frame = stored_frame(run)
-    a, b = frame.from_model.inverse()(ends)
-    with check_undamaged(SCENE, run):
-        model = PosedPhotos(run.workspace.sparse).sightlines()
-    return measure_distance(a, b, model, frame.from_model.scale, frame.deviation)
-
-
-def _check_finished(needed: Stage[object], what: str, run: RunContext) -> None:
-    """Check that a run has finished a stage.
-
-    Args:
-        needed: the stage.
-        what: it gives, for the message.
-        run: the run.
-
-    Raises:
-        InputError: it has not; the message names the stage.
-    """
-    manifest = run.workspace.manifest
-    if not manifest.read().get("stages"):
-        hint = "name the folder that `sfm-app run PHOTOS -o OUT` wrote"
-        raise InputError(f"{run.workspace.root} holds no run", hint=hint)
-    manifest.check_format()
-    if manifest.record(needed.name) is None:
-        more = "; `--points` exports the points and cameras" if manifest.record(SCENE.name) else ""
-        missing = f"{run.workspace.root} holds no {what} yet: stage `{needed.name}` is missing"
-        raise InputError(missing, hint=resume_hint(run) + more)
-
-
-def stored_frame(run: RunContext) -> MetricFrame:
-    """Return the frame of exported files; that of the model where nothing is known of its size.
-
-    Args:
-        run: the finished run.
-    """
-    known = run.workspace.manifest.record(SCALE.name) is not None
-    return Products(run)[SCALE] if known else MetricFrame()

@@ -15,11 +15,12 @@ import pluggy
 from numpy.typing import NDArray
 
 from sfm_app.errors import ConfigError, PluginError
-from sfm_app.formats import EXPORTERS
+from sfm_app.formats import EXPORTERS, SCENE_EXPORTERS
+from sfm_app.formats.exporters import INSTALL_HINT, Exporter, SceneExporter
 from sfm_app.ransac import ESTIMATORS
 from sfm_app.selfcal import CALIBRATORS, SEVERAL_CAMERAS
 from sfm_app.settings import CalibrationSettings, EpipolarSettings, MatchSettings
-from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Features, Model, Rejected
+from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Features, Rejected
 
 if TYPE_CHECKING:  # OpenCV, which stereo needs, takes longer to load than an estimator to run
     from sfm_app.stereo import DepthTask
@@ -95,26 +96,6 @@ class Calibrator:
     """Whether the program's own method then splits groups that disagree, and uses pairs between cameras."""
 
 
-class WriteModel(Protocol):
-    """Makes model files by name: first the one to open (`name` with the format as suffix), then those it refers to.
-
-    Takes a surface with a texture (pages of pictures), a surface with a color per vertex, or points and cameras; the
-    same model gives the same bytes. ReconstructionError where the model is empty.
-    """
-
-    def __call__(self, model: Model, name: str, /) -> Mapping[str, bytes]: ...
-
-
-@dataclass(frozen=True, slots=True)
-class Exporter:
-    """A file format for models."""
-
-    name: str
-    """Name of the format: the suffix, without dot, of the file to open."""
-    write: WriteModel
-    summary: str = ""
-
-
 class MakeDepthMaps(Protocol):
     """Writes geometric depth and normal maps to the workspace; returns for every view why it has none, or None."""
 
@@ -187,6 +168,10 @@ class Hooks:
         """Return file formats for models."""
 
     @hookspec
+    def sfm_scene_exporters(self) -> Iterable[SceneExporter]:  # type: ignore[empty-body]
+        """Return formats for cameras, poses, points and photos."""
+
+    @hookspec
     def sfm_depth_methods(self) -> Iterable[DepthMethod]:  # type: ignore[empty-body]
         """Return ways to make depth maps."""
 
@@ -218,7 +203,12 @@ class BuiltIns:
     @hookimpl
     def sfm_exporters(self) -> Iterable[Exporter]:
         """Return the file formats for models."""
-        return [Exporter(name, write, summary) for name, (write, summary) in EXPORTERS.items()]
+        return EXPORTERS.values()
+
+    @hookimpl
+    def sfm_scene_exporters(self) -> Iterable[SceneExporter]:
+        """Return the formats for cameras, poses, points and photos."""
+        return SCENE_EXPORTERS.values()
 
     @hookimpl
     def sfm_depth_methods(self) -> Iterable[DepthMethod]:
@@ -233,6 +223,7 @@ class Plugins:
     estimators: Mapping[str, Estimator]
     calibrators: Mapping[str, Calibrator]
     exporters: Mapping[str, Exporter]
+    scene_exporters: Mapping[str, SceneExporter]
     depth_methods: Mapping[str, DepthMethod]
     features: Mapping[str, FeatureMethod]
 
@@ -245,8 +236,12 @@ class Plugins:
         return _look_up(self.calibrators, name, "calibrator")
 
     def exporter(self, name: str) -> Exporter:
-        """Return the file format of that name; ConfigError names the known ones."""
-        return _look_up(self.exporters, name, "file format")
+        """Return the file format for models of that name; ConfigError where there is none, or it cannot run here."""
+        return _check_available(_look_up(self.exporters, name, "file format"))
+
+    def scene_exporter(self, name: str) -> SceneExporter:
+        """Return the format for scenes of that name; ConfigError as in `exporter`."""
+        return _check_available(_look_up(self.scene_exporters, name, "format for scenes"))
 
     def feature_method(self, name: str) -> FeatureMethod:
         """Return the way to find features of that name; ConfigError where there is none, or it cannot run here."""
@@ -315,10 +310,12 @@ def _load(modules: Sequence[ModuleType | object], installed: bool) -> Plugins:
         raise PluginError(
             f"a plug-in does not load: {err}", hint="update or uninstall it; hooks: sfm_app.plugins.Hooks"
         ) from err
+    exporters = _index_by_name(manager.hook.sfm_exporters())
     return Plugins(
         estimators=_index_by_name(manager.hook.sfm_estimators()),
         calibrators=_index_by_name(manager.hook.sfm_calibrators()),
-        exporters=_index_by_name(manager.hook.sfm_exporters()),
+        exporters=exporters,
+        scene_exporters=_index_by_name(manager.hook.sfm_scene_exporters(), exporters),
         depth_methods=_index_by_name(manager.hook.sfm_depth_methods()),
         features=_index_by_name(manager.hook.sfm_features()),
     )
@@ -339,14 +336,23 @@ class _NamedPart(Protocol):
 Part = TypeVar("Part", bound=_NamedPart)
 
 
-def _index_by_name(results: Iterable[Iterable[Part]]) -> Mapping[str, Part]:
+def _index_by_name(results: Iterable[Iterable[Part]], taken: Iterable[str] = ()) -> Mapping[str, Part]:
     # pluggy calls the last registered first; reversed, the built-ins lead every listing
     found: dict[str, Part] = {}
     for part in (part for parts in reversed(list(results)) for part in parts):
-        if part.name in found:
+        if part.name in found or part.name in taken:
             raise PluginError(f"two plug-ins offer '{part.name}'", hint="uninstall one of them")
         found[part.name] = part
     return MappingProxyType(found)
+
+
+Format = TypeVar("Format", Exporter, SceneExporter)
+
+
+def _check_available(part: Format) -> Format:
+    if reason := part.unavailable():
+        raise ConfigError(f"the file format '{part.name}' cannot be written here: {reason}", hint=INSTALL_HINT)
+    return part
 
 
 def _look_up(parts: Mapping[str, Part], name: str, kind: str) -> Part:

@@ -100,7 +100,7 @@ def main() -> int:
 
 def gather(runs: Sequence[Path], place: Path) -> list[Subject]:
     """Copy the GLBs of all runs and the sample into one folder under distinct names."""
-    files = {**EXPORTERS["glb"][0](sample_model(), SAMPLE), **EXPORTERS["ply"][0](sample_model(), SAMPLE)}
+    files = {**EXPORTERS["glb"].write(sample_model(), SAMPLE), **EXPORTERS["ply"].write(sample_model(), SAMPLE)}
     for name, data in files.items():
         (place / name).write_bytes(data)
     found = [Subject(SAMPLE, place / f"{SAMPLE}.glb", place / f"{SAMPLE}.ply")]

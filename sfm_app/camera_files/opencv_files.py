@@ -73,6 +73,8 @@ def _node_value(node: Any) -> Any:
         return node.string()
     if node.isSeq():
         return [_node_value(node.at(k)) for k in range(node.size())]
+    if node.isMap() and "data" not in node.keys():  # noqa: SIM118 -- no mapping
+        return {name: _node_value(node.getNode(name)) for name in node.keys()}  # noqa: SIM118
     return node.mat()
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from sfm_app import __version__
-from sfm_app.api import calibrate_photos, export_model, measure_distance, reconstruct, write_report
+from sfm_app.api import calibrate_photos, export_model, export_scene, measure_distance, reconstruct, write_report
 from sfm_app.cli.display import (
     file_lines,
     print_json,
@@ -21,6 +21,7 @@ from sfm_app.cli.display import (
     to_printable,
 )
 from sfm_app.cli.doctor import examine
+from sfm_app.cli.formats import ExportCommand, choose_format
 from sfm_app.cli.options import output_options, settings_from_flags, settings_options
 from sfm_app.cli.terminal import Terminal
 from sfm_app.colmap.backend import has_running_call
@@ -84,7 +85,8 @@ def fail(message: str, hint: str, code: int) -> None:
         hint: what to do about it; may be empty.
         code: exit code, > 0.
     """
-    click.echo(f"error: {to_printable(message)}" + (f"\nhint: {to_printable(hint)}" if hint else ""), err=True)
+    advice = "\n".join(map(to_printable, hint.split("\n")))
+    click.echo(f"error: {to_printable(message)}" + (f"\nhint: {advice}" if hint else ""), err=True)
     sys.exit(code)
 
 
@@ -132,20 +134,28 @@ def calibrate(photos: Path, out: Path | None, figure: Path | None, **flags: Any)
     print_json(intrinsics_summary(found)) if flags["as_json"] else print_lines(intrinsics_lines(found))
 
 
-@main.command()
+@main.command(cls=ExportCommand)
 @click.argument("out", type=click.Path(path_type=Path))
-@click.option("--format", "file_format", default="", help="ply, glb, obj, ...  [default: the suffix of FILE]")
+@click.option("--format", "file_format", default="", help="One of the formats below.  [default: the suffix of TARGET]")
 @click.option(
-    "-o", "--output", "target", type=click.Path(path_type=Path), help="File to write.  [default: OUT/model.FORMAT]"
+    "-o",
+    "--output",
+    "target",
+    type=click.Path(path_type=Path),
+    help="File or folder to write.  [default: OUT/model.FORMAT, OUT/cameras.json, OUT/export/FORMAT, ...]",
 )
 @click.option("--points", is_flag=True, help="Export the sparse points and the cameras instead of the model.")
-@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-def export(out: Path, file_format: str, target: Path | None, points: bool, as_json: bool) -> None:
-    """Write the model of the run in OUT in another format, without recomputing anything."""
-    if not file_format and not (target and target.suffix):
-        raise ConfigError("no format is given", hint=f"--format {'|'.join(load_plugins().exporters)}, or -o model.obj")
-    files = export_model(out, file_format, target, points=points)
-    print_json([str(path) for path in files]) if as_json else print_lines(file_lines(files))
+@output_options
+def export(out: Path, file_format: str, target: Path | None, points: bool, quiet: bool, as_json: bool) -> None:
+    """Write what the run in OUT has found for another program, without recomputing anything."""
+    name = choose_format(file_format, target)
+    if name in load_plugins().scene_exporters:
+        if points:
+            raise ConfigError(f"--points does not go with the format '{name}'", hint="leave it out")
+        paths = [export_scene(out, name, target, progress=Terminal(quiet=quiet or as_json))]
+    else:
+        paths = list(export_model(out, name, target, points=points))
+    print_json([str(path) for path in paths]) if as_json else print_lines(file_lines(paths))
 
 
 @main.command(context_settings={"ignore_unknown_options": True})  # coordinates may begin with a minus
@@ -236,6 +246,7 @@ def plugins() -> None:
         ("estimators", found.estimators),
         ("calibrators", found.calibrators),
         ("exporters", found.exporters),
+        ("scene exporters", found.scene_exporters),
         ("depth methods", found.depth_methods),
     ):
         print_lines([f"{title}:", *(f"  {line}" for line in table({p.name: p.summary for p in parts.values()}))])

@@ -147,8 +147,15 @@ def written_files(run: Run, stage: str) -> list[Path]:
 
 
 def file_lines(paths: Sequence[Path]) -> list[str]:
-    """Return one line per file, with its size."""
-    return [f"{path}  {size_text(path.stat().st_size)}" for path in paths]
+    """Return one line per file or folder, with its size."""
+    return [f"{path}  {_size_on_disk(path)}" for path in paths]
+
+
+def _size_on_disk(path: Path) -> str:
+    if not path.is_dir():
+        return size_text(path.stat().st_size)
+    sizes = [file.stat().st_size for file in path.rglob("*") if file.is_file()]
+    return f"{len(sizes)} files, {size_text(sum(sizes))}"
 
 
 def size_text(size: int) -> str:

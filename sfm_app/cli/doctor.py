@@ -66,7 +66,7 @@ def _plugins() -> str:
             ("feature methods", found.features),
             ("estimators", found.estimators),
             ("calibrators", found.calibrators),
-            ("formats", found.exporters),
+            ("formats", {**found.exporters, **found.scene_exporters}),
             ("depth methods", found.depth_methods),
         )
     )

@@ -45,6 +45,7 @@ def undistort(
         "photos": str(photo_dir),
         "max_side_px": max_side_px,
         "workers": workers,
+        "output": "COLMAP",
     }
     run_worker("sfm_app.colmap.processes.undistort_process", task, "undistorting photos", progress)
 

@@ -20,8 +20,6 @@ from sfm_app.types import CameraModel, Frustum, Model, PairId, Scene, Surface
 
 MIN_CONFIRMED_POINTS = 100
 """Points seen by three or more photos from which on their bounding box limits the scene."""
-
-
 STEP_PX = 1e-3
 """Step of the derivatives of bearing vectors: curvature and rounding in double precision cost about 1e-9 of them."""
 MAX_COORDINATE = 1e100
@@ -240,14 +238,30 @@ def seen_points(model: pycolmap.Reconstruction, most: int) -> SeenPoints:
     )
 
 
+def read_model(model_dir: Path, frame: Similarity | None = None) -> pycolmap.Reconstruction:
+    """Read a model on disk.
+
+    Args:
+        model_dir: COLMAP's model.
+        frame: from its frame into the one that is wanted; None for its own.
+    """
+    with translate_errors("reading the sparse model"):
+        model = pycolmap.Reconstruction(model_dir)
+        if frame is not None:
+            move(model, frame)
+    return model
+
+
 def sparse_model(model_dir: Path) -> Model:
     """Return the colored points of a model on disk, and its posed photos as frusta, in order of ids.
 
     No third photo confirms points that only two photos see. Wrong ones among them lie far away and would shrink the
     scene to a dot in a viewer, so points outside the bounding box of the confirmed points are left out.
+
+    Raises:
+        BackendError: it cannot be read.
     """
-    with translate_errors("reading the sparse model"):
-        model = pycolmap.Reconstruction(model_dir)
+    model = read_model(model_dir)
     found = [model.points3D[key] for key in sorted(model.points3D) if finite_mask(model.points3D[key].xyz)]
     places = np.array([point.xyz for point in found], np.float64).reshape(-1, 3)
     colors = np.array([point.color for point in found], np.uint8).reshape(-1, 3)

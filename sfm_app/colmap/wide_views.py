@@ -1,6 +1,6 @@
 """Photos of wide lenses in COLMAP's dense workspace: as several perspective views where one would lose too much."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,12 +66,26 @@ def split_wide_photos(model_dir: Path, max_side_px: int) -> dict[int, WideLens] 
     """
     with translate_errors("reading the model"):
         model = pycolmap.Reconstruction(model_dir)
-        used = sorted({image.camera_id for image in all_images(model) if image.has_pose})
-        cameras = {camera_id: model.cameras[camera_id] for camera_id in used}
-        single = {camera_id: _one_view(camera, max_side_px) for camera_id, camera in cameras.items()}
-        if all(view is not None for view in single.values()):
+        if all(view is not None for view in _single_views(model, max_side_px).values()):
             return None
-        return {camera_id: _make_lens(camera, single[camera_id], max_side_px) for camera_id, camera in cameras.items()}
+        return perspective_lenses(model, max_side_px)
+
+
+def perspective_lenses(model: pycolmap.Reconstruction, max_side_px: int) -> dict[int, WideLens]:
+    """Return the perspective views of every camera that has posed photos, one where that is enough, by its id.
+
+    Args:
+        model: COLMAP's reconstruction.
+        max_side_px: longest side of a view.
+    """
+    single = _single_views(model, max_side_px)
+    return {key: _make_lens(model.cameras[key], view, max_side_px) for key, view in single.items()}
+
+
+def _single_views(model: pycolmap.Reconstruction, max_side_px: int) -> dict[int, PerspectiveView | None]:
+    """Return the undistorted photo of every camera in use, by its id; None where one loses too much."""
+    used = sorted({image.camera_id for image in all_images(model) if image.has_pose})
+    return {camera_id: _one_view(model.cameras[camera_id], max_side_px) for camera_id in used}
 
 
 def view_name(photo: str, number: int) -> str:
@@ -95,7 +109,7 @@ def write_model(model_dir: Path, lenses: Mapping[int, WideLens], dense_dir: Path
     with translate_errors("writing the model of perspective views"):
         model, found = pycolmap.Reconstruction(model_dir), pycolmap.Reconstruction()
         images = sorted((image for image in all_images(model) if image.has_pose), key=lambda image: image.name)
-        ids = _add_cameras(found, lenses)
+        ids = add_view_cameras(found, lenses)
         tracks = {point: pycolmap.Track() for point in sorted(model.points3D)}
         for image in images:
             for number, view in enumerate(lenses[image.camera_id].views):
@@ -122,22 +136,45 @@ def write_views(name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | Non
         BackendError: the photo cannot be read, or the views cannot be written.
     """
     with translate_errors(f"looking into {name}"):
-        photo = np.asarray(cv2.imdecode(np.fromfile(photo_dir / name, np.uint8), cv2.IMREAD_COLOR), np.uint8)
-        used = None if mask_dir is None else read_mask(mask_dir, name)
-        for number, view in enumerate(lens.views):
-            at = view.locate(lens.locate)
-            shown = at[..., 0] >= 0.0
-            small = shrink(photo, view.K[0, 0] / lens.params[FX])
-            target = dense_dir / "images" / view_name(name, number)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            pixels = resample(small, at, lens.size, wraps=lens.family == PANORAMA)
-            with replace_atomically(target) as path:
-                path.write_bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes())
-            if used is not None:
-                row, column = (np.minimum(at[..., axis].astype(np.int64), lens.size[axis] - 1) for axis in (1, 0))
-                shown &= used[row, column]
+        for number, (pixels, shown) in enumerate(render_views(name, lens, photo_dir, mask_dir)):
+            save_picture(dense_dir / "images" / view_name(name, number), pixels)
             if not shown.all():
                 save_mask(dense_dir / MASKS, view_name(name, number), shrink_mask(shown))
+
+
+def render_views(
+    name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | None, maps: Sequence[NDArray[np.float32]] = ()
+) -> Iterator[tuple[NDArray[np.uint8], BoolArray]]:
+    """Yield each view of a photo, (H, W, 3) BGR, and (H, W) which of its pixels the photo shows and nothing masks.
+
+    Args:
+        name: of the photo.
+        lens: of the photo.
+        photo_dir: the photos.
+        mask_dir: their masks; None without masks.
+        maps: (H, W, 2) pixels of the photo that each view shows, -1 where it shows none; empty if not known.
+    """
+    photo = np.asarray(cv2.imdecode(np.fromfile(photo_dir / name, np.uint8), cv2.IMREAD_COLOR), np.uint8)
+    used = None if mask_dir is None else read_mask(mask_dir, name)
+    for number, view in enumerate(lens.views):
+        at = maps[number] if maps else view.locate(lens.locate)
+        shown = at[..., 0] >= 0.0
+        small = shrink(photo, view.K[0, 0] / lens.params[FX])
+        if used is not None:
+            row, column = (np.minimum(at[..., axis].astype(np.int64), lens.size[axis] - 1) for axis in (1, 0))
+            shown &= used[row, column]
+        yield resample(small, at, lens.size, wraps=lens.family == PANORAMA), shown
+
+
+def save_picture(target: Path, pixels: NDArray[np.uint8]) -> None:
+    """Write a picture as JPEG, as a whole or not at all.
+
+    Args:
+        target: file; its folder is created.
+        pixels: (H, W, 3) BGR.
+    """
+    with replace_atomically(target) as path:
+        path.write_bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes())
 
 
 def _one_view(camera: pycolmap.Camera, max_side_px: int) -> PerspectiveView | None:
@@ -178,8 +215,13 @@ def _shown_rays(camera: pycolmap.Camera) -> FloatArray:
     return np.asarray(rays[sound], np.float64)
 
 
-def _add_cameras(found: pycolmap.Reconstruction, lenses: Mapping[int, WideLens]) -> dict[tuple[int, int], int]:
-    """Add a camera for every view, and return its id by the camera of the photo and the number of the view."""
+def add_view_cameras(found: pycolmap.Reconstruction, lenses: Mapping[int, WideLens]) -> dict[tuple[int, int], int]:
+    """Add a camera for every view, and return its id by the camera of the photo and the number of the view.
+
+    Args:
+        found: model of the views, changed in place.
+        lenses: views by id of the camera.
+    """
     ids = dict[tuple[int, int], int]()
     for camera_id, lens in sorted(lenses.items()):
         for number, view in enumerate(lens.views):

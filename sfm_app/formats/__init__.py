@@ -1,17 +1,49 @@
-"""Model files: every writer takes a `Model` and a name, and returns the bytes of its files by file name."""
+"""File formats: models as bytes by file name, and whole scenes as files or folders; all are offered like plug-ins."""
 
-from collections.abc import Callable, Mapping
+from functools import partial
 
+from sfm_app.formats.draco import write_draco
+from sfm_app.formats.exporters import CLOUD, Exporter, SceneExporter, missing_package
 from sfm_app.formats.glb import write_glb
 from sfm_app.formats.obj import write_obj
 from sfm_app.formats.ply import write_ply
-from sfm_app.types import Model
+from sfm_app.formats.scenes.cameras import write_cameras
+from sfm_app.formats.scenes.clouds import write_cloud_ply, write_laz
+from sfm_app.formats.scenes.colmap_folder import write_bundler, write_colmap, write_colmap_text, write_splat
+from sfm_app.formats.scenes.nerfstudio import write_nerfstudio
+from sfm_app.formats.scenes.opencv import write_opencv
+from sfm_app.formats.usd import write_usd, write_usdz
 
-EXPORTERS: dict[str, tuple[Callable[[Model, str], Mapping[str, bytes]], str]] = {
-    "ply": (write_ply, "binary PLY, colors and normals per vertex; MeshLab, CloudCompare, Blender"),
-    "glb": (write_glb, "binary glTF 2.0, textured, all in one file; web viewers, game engines, Blender"),
-    "obj": (write_obj, "Wavefront OBJ with MTL and JPEG pages, textured; everything else"),
-}
-"""Writer and summary by format name, which is the suffix of the file to open."""
+_no_usd = partial(missing_package, "usd-core", "pxr")
+_no_draco = partial(missing_package, "DracoPy", "DracoPy")
+_no_laz = partial(missing_package, "laspy[lazrs]", "lazrs")
 
-__all__ = ["EXPORTERS"]
+_MODELS = (
+    Exporter("ply", write_ply, "binary PLY, colors and normals per vertex; MeshLab, CloudCompare, Blender"),
+    Exporter("glb", write_glb, "binary glTF 2.0, textured, all in one file; web viewers, game engines, Blender"),
+    Exporter("obj", write_obj, "Wavefront OBJ with MTL and JPEG pages, textured; everything else"),
+    Exporter("draco", write_draco, "GLB compressed by Draco, a quarter of the size; web viewers", "glb", _no_draco),
+    Exporter("usdz", write_usdz, "USD and its texture in one file; Apple's Quick Look, Blender", unavailable=_no_usd),
+    Exporter("usd", write_usd, "binary USD with JPEG pages; Blender, Houdini, Omniverse", unavailable=_no_usd),
+)
+_SCENES = (
+    SceneExporter("colmap", write_colmap, "folder images/, sparse/0: undistorted photos, COLMAP's binary model"),
+    SceneExporter("colmap-text", write_colmap_text, "the same with COLMAP's model as text"),
+    SceneExporter("splat", write_splat, "as colmap, optical centers in the middle, which some splat trainers expect"),
+    SceneExporter("nerfstudio", write_nerfstudio, "folder with transforms.json, images/ and the points; nerfstudio"),
+    SceneExporter(
+        "bundler", write_bundler, "folder with bundle.out, list.txt and photos as in splat, by COLMAP's writer"
+    ),
+    SceneExporter(
+        "cameras", write_cameras, "JSON: K, lens and standard deviations, pose of each photo", "cameras.json"
+    ),
+    SceneExporter("opencv", write_opencv, "folder with a YAML file per camera, with its photos' poses, for OpenCV"),
+    SceneExporter("cloud-ply", write_cloud_ply, "the dense cloud as PLY; CloudCompare, MeshLab", "cloud.ply", CLOUD),
+    SceneExporter("laz", write_laz, "the dense cloud as compressed LAS; PDAL, QGIS", "cloud.laz", CLOUD, _no_laz),
+)
+EXPORTERS = {exporter.name: exporter for exporter in _MODELS}
+"""Formats for models by name."""
+SCENE_EXPORTERS = {exporter.name: exporter for exporter in _SCENES}
+"""Formats for scenes by name."""
+
+__all__ = ["EXPORTERS", "SCENE_EXPORTERS"]

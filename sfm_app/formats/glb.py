@@ -63,20 +63,31 @@ def add_textured_primitives(glb: Glb, model: Model, texture: Texture) -> list[di
         texture: of the model.
     """
     surface, normals = model.surface, unit_normals(model.surface)
-    sampler = glb.add("samplers", {"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED})
     primitives = []
     for page in pages_in_use(texture.page):
         here = texture.page == page
         old, uv, faces = split_corners(surface.faces[here], texture.uv[here])
-        image = glb.add(
-            "images",
-            {"name": f"page {page}", "mimeType": "image/jpeg", "bufferView": glb.add_view(jpeg(texture.pages[page]))},
-        )
-        picture = glb.add("textures", {"sampler": sampler, "source": image})
-        material = add_unlit_material(glb, f"page {page}", baseColorTexture={"index": picture})
+        material = add_page_material(glb, texture.pages[page], page)
         attributes = add_geometry(glb, surface.vertices[old], normals[old]) | {"TEXCOORD_0": glb.add_vertices(uv)}
         primitives.append({"attributes": attributes, "indices": glb.add_indices(faces, len(old)), "material": material})
     return primitives
+
+
+def add_page_material(glb: Glb, picture: NDArray[np.uint8], page: int) -> int:
+    """Add a page of texture and its material, and return the material's number.
+
+    Args:
+        glb: the file; its first page adds the sampler that all share.
+        picture: (H, W, 3) RGB.
+        page: its number.
+    """
+    if not glb.tree.get("samplers"):
+        glb.add("samplers", {"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED})
+    image = glb.add(
+        "images", {"name": f"page {page}", "mimeType": "image/jpeg", "bufferView": glb.add_view(jpeg(picture))}
+    )
+    number = glb.add("textures", {"sampler": 0, "source": image})
+    return add_unlit_material(glb, f"page {page}", baseColorTexture={"index": number})
 
 
 def add_colored_primitive(glb: Glb, model: Model) -> dict[str, Any]:

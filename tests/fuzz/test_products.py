@@ -11,8 +11,9 @@ import pytest
 from sfm_app.engine.stage import Products
 from sfm_app.engine.staleness import rerun_reason
 from sfm_app.errors import SfmError
+from sfm_app.exports.stored import stored_model
 from sfm_app.photos import read_source
-from sfm_app.pipeline import NAMES, STAGES, stored_model
+from sfm_app.pipeline import NAMES, STAGES
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.manifest import StageRecord

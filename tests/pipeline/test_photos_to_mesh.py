@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 
+import laspy
 import numpy as np
 import pytest
 import trimesh
@@ -16,7 +17,9 @@ from click.testing import CliRunner
 
 import sfm_app
 from sfm_app.cli import main
+from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.dense import DenseStore
+from sfm_app.formats import EXPORTERS, SCENE_EXPORTERS
 from sfm_app.pipeline import NAMES
 from sfm_app.runtime.workspace import LOCK, Workspace
 from sfm_app.settings import Settings
@@ -95,6 +98,31 @@ def test_the_texture_covers_the_mesh(finished):
     assert len(counts["pages"]) == 1
     assert counts["rejected"] == {}
     np.testing.assert_allclose(list(counts["gains"].values()), 1.0, atol=0.05)  # rendered with one exposure
+
+
+@pytest.mark.parametrize("name", [*EXPORTERS, *SCENE_EXPORTERS])
+def test_every_format_is_written(finished, tmp_path, name):
+    run, _ = finished
+
+    if name in EXPORTERS:
+        first = sfm_app.export_model(run.out, name, tmp_path / "made")[0]
+        assert 20_000 < first.stat().st_size < 20_000_000
+        return
+    place = sfm_app.export_scene(run.out, name, tmp_path / "made")
+    if name in ("colmap", "colmap-text", "splat"):
+        model, own = (pycolmap.Reconstruction(path) for path in (place / "sparse" / "0", run.model_dir))
+        assert len(list((place / "images").iterdir())) == len(run.scene.registered)
+        assert not (place / "masks").exists()
+        assert 0.99 < model.num_points3D() / own.num_points3D() <= 1.0
+        assert all((model.points3D[key].xyz == own.points3D[key].xyz).all() for key in model.points3D)
+        errors = [found.compute_mean_reprojection_error() for found in (model, own)]
+        assert errors[0] == pytest.approx(errors[1], rel=0.02)  # keypoints stay where they were found
+    elif name in ("cloud-ply", "laz"):
+        counts = run.manifest["stages"]["mesh"]["counts"]
+        cloud = trimesh.load(place).vertices if name == "cloud-ply" else laspy.read(place).xyz
+        assert len(cloud) == counts["fused_points"]
+    else:
+        assert place.exists()
 
 
 def test_a_second_run_does_nothing(finished, rendered):

@@ -42,8 +42,9 @@ def call(*arguments):
 def test_the_file_is_what_the_run_would_have_written(textured_ball, finished, name):
     paths = sfm_app.export_model(finished, name)
 
-    assert paths[0] == finished / f"model.{name}"
-    assert {path.name: path.read_bytes() for path in paths} == EXPORTERS[name][0](textured_ball, "model")
+    stem = "model-draco" if name == "draco" else "model"
+    assert paths[0] == finished / f"{stem}.{EXPORTERS[name].ending}"
+    assert {path.name: path.read_bytes() for path in paths} == EXPORTERS[name].write(textured_ball, stem)
 
 
 @pytest.mark.parametrize(
@@ -137,7 +138,7 @@ def test_a_model_without_a_texture_has_the_colors_of_its_vertices(ball, finished
 
     (path,) = sfm_app.export_model(finished, "glb")
 
-    assert path.read_bytes() == EXPORTERS["glb"][0](ball, "model")["model.glb"]
+    assert path.read_bytes() == EXPORTERS["glb"].write(ball, "model")["model.glb"]
 
 
 def test_sizes_are_told_to_people_and_paths_to_scripts(finished):

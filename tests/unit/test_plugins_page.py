@@ -14,6 +14,7 @@ import pytest
 
 import sfm_app
 from sfm_app import plugins
+from sfm_app.formats import exporters
 from sfm_app.plugins import installed_plugins, load_plugins
 from sfm_app.settings import EpipolarSettings, MatchSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
@@ -105,8 +106,8 @@ def printed(node):
 
 def hooks():
     """Every hook of plugins.py, what it returns, and how that is called."""
-    tree = ast.parse(Path(plugins.__file__).read_text(encoding="utf-8"))
-    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    trees = [ast.parse(Path(module.__file__).read_text(encoding="utf-8")) for module in (plugins, exporters)]
+    classes = {node.name: node for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)}
     for hook in (node for node in classes["Hooks"].body if isinstance(node, ast.FunctionDef)):
         part = hook.returns.slice.id
         yield f"{hook.name}() -> {printed(hook.returns)}"

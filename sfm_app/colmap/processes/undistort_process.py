@@ -6,6 +6,8 @@ from sfm_app.colmap.backend import check_written, pycolmap, run_with_progress
 from sfm_app.colmap.processes.worker_process import ProgressReporter, UndistortTask, serve
 
 JPEG_QUALITY = 98
+FOLDERS = {"COLMAP": "images", "PMVS": "pmvs/visualize"}
+"""Where the undistorted photos lie, by layout."""
 
 
 def work(task: UndistortTask) -> None:
@@ -13,12 +15,12 @@ def work(task: UndistortTask) -> None:
     dense_dir, model_dir = Path(task["dense"]), Path(task["model"])
     options = pycolmap.UndistortCameraOptions()
     options.max_image_size = task["max_side_px"]
-    photos = dense_dir / "images"
+    photos = dense_dir / FOLDERS[task["output"]]
 
     def call(token: pycolmap.CancellationToken) -> None:
         pycolmap.undistort_images(
             dense_dir, model_dir, Path(task["photos"]), undistort_options=options, jpeg_quality=JPEG_QUALITY,
-            num_threads=task["workers"], cancellation_token=token,
+            num_threads=task["workers"], cancellation_token=token, output_type=task["output"],
         )  # fmt: skip
 
     def count_finished() -> int:

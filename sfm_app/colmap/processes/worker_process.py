@@ -79,6 +79,8 @@ class UndistortTask(TypedDict):
     photos: str
     max_side_px: int
     workers: int
+    output: Literal["COLMAP", "PMVS"]
+    """Layout of the workspace by COLMAP's name."""
 
 
 class FuseTask(TypedDict):

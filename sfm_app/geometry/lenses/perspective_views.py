@@ -22,6 +22,10 @@ OVERLAP_DEG = 4.0
 whole in one of the views. Chosen by hand; not measured on its own."""
 STRIP_PX = 256
 """Rows that are projected at once, so that memory stays small. Chosen by hand; the result does not depend on it."""
+ROUNDING_PX = 1e-6
+"""Part of a pixel by which rounding may shrink a view. By definition."""
+HALVINGS = 50
+"""Steps of the search for the largest view inside another one: as many as numbers in double precision have bits."""
 WHOLE_TURN_DEG = 300.0
 """A photo that shows more than this is a panorama: its views look through the faces of a cube. Chosen by hand; no lens
 lies between a fisheye and a panorama."""
@@ -74,6 +78,33 @@ def cover_rays(rays: FloatArray, focal_px: float, most_px: int) -> list[Perspect
     nearest = np.argmax(rays @ axes[:, 2].T, axis=1)
     views = [_fit_view(axis, rays[nearest == k], focal_px, most_px) for k, axis in enumerate(axes)]
     return [view for view in views if view is not None]
+
+
+def center_view(view: PerspectiveView) -> PerspectiveView:
+    """Return the view turned to the middle of what it shows, with square pixels and the optical center in the middle.
+
+    It is the largest view of the same aspect that shows nothing else. At its middle, things are as large as before.
+    """
+    middle = np.linalg.solve(view.K, [view.width / 2, view.height / 2, 1.0])
+    away = float(np.linalg.norm(middle))
+    x, y, z = middle / away
+    both = -x * y / (1.0 + z)
+    turn = np.array([[1.0 - x * x / (1.0 + z), both, -x], [both, 1.0 - y * y / (1.0 + z), -y], [x, y, z]])
+    focal = float(np.sqrt(view.K[0, 0] * view.K[1, 1])) * away
+    size = np.array([view.width / view.K[0, 0], view.height / view.K[1, 1]]) * focal
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * size / (2.0 * focal)
+
+    def fits(share: float) -> bool:
+        seen = np.column_stack([share * corners, np.ones(4)]) @ turn @ view.K.T
+        pixels = seen[:, :2] / seen[:, 2:]
+        return bool((seen[:, 2] > 0.0).all() and (pixels >= 0.0).all() and (pixels <= [view.width, view.height]).all())
+
+    low, high = 0.0, 2.0
+    for _ in range(HALVINGS):
+        low, high = ((low + high) / 2, high) if fits((low + high) / 2) else (low, (low + high) / 2)
+    # a view that is centered already fits but for rounding
+    width, height = (max(1, int(side + ROUNDING_PX)) for side in low * size)
+    return PerspectiveView(turn @ view.R, camera_matrix(focal, focal, width / 2, height / 2), width, height)
 
 
 def _axes(rays: FloatArray) -> FloatArray:

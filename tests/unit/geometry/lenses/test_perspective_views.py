@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.lenses.perspective_views import MOST_FIELD_DEG, OVERLAP_DEG, cover_rays
+from sfm_app.geometry.camera import camera_matrix
+from sfm_app.geometry.lenses.perspective_views import (
+    MOST_FIELD_DEG,
+    OVERLAP_DEG,
+    PerspectiveView,
+    center_view,
+    cover_rays,
+)
 
 
 def cone(across_deg, down_deg, count=161):
@@ -79,3 +86,32 @@ def test_views_next_to_each_other_overlap():
     assert shown(left, middle).all() and shown(right, middle).all()
     aside = np.array([[np.sin(np.radians(20.0)), 0.0, np.cos(np.radians(20.0))]])
     assert shown(left, aside).tolist() == [False] and shown(right, aside).tolist() == [True]
+
+
+@pytest.mark.parametrize("center", [(500.0, 400.0), (540.0, 380.0), (700.0, 250.0), (100.0, 700.0)])
+def test_a_centered_view_shows_nothing_else_and_as_much_as_it_can(center):
+    tilt = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    view = PerspectiveView(tilt * np.linalg.det(tilt), camera_matrix(900.0, 880.0, *center), 1000, 800)
+
+    found = center_view(view)
+
+    fx, fy, cx, cy = found.K[0, 0], found.K[1, 1], found.K[0, 2], found.K[1, 2]
+    assert (fx, cx, cy) == (fy, found.width / 2, found.height / 2)
+    np.testing.assert_allclose(found.R @ found.R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(found.R) == pytest.approx(1.0)
+    inside = shown(view, found.rays().reshape(-1, 3), margin_px=1e-6)
+    assert inside.all()
+    larger = PerspectiveView(found.R, camera_matrix(fx, fx, cx + 2, cy + 2), found.width + 4, found.height + 4)
+    assert not shown(view, larger.rays().reshape(-1, 3)).all()
+    middle = np.array([500.0, 400.0, 1.0]) @ np.linalg.inv(view.K).T @ view.R
+    np.testing.assert_allclose(found.R @ middle / np.linalg.norm(middle), (0, 0, 1), atol=1e-12)
+
+
+def test_a_view_that_is_centered_stays_as_it_is():
+    view = PerspectiveView(np.eye(3), camera_matrix(900.0, 900.0, 500.0, 400.0), 1000, 800)
+
+    found = center_view(view)
+
+    assert (found.width, found.height) == (1000, 800)
+    np.testing.assert_allclose(found.K, view.K)
+    np.testing.assert_allclose(found.R, view.R, atol=1e-15)

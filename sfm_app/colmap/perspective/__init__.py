@@ -1,0 +1,1 @@
+"""A finished model as pinhole cameras at full size, for other programs."""

@@ -1,0 +1,1 @@
+"""Formats for whole scenes: cameras, poses, points and photos for other programs."""

@@ -1,0 +1,263 @@
+"""USD, which Pixar's tools, Blender, Houdini and Apple's Quick Look open, alone or packed as USDZ; needs usd-core.
+
+A stage stands upright (y up) and counts in meters. The texture is the diffuse color of a rough surface, since USD has
+no unlit material that all viewers know.
+"""
+
+import io
+import re
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.formats.checks import check, unit_normals
+from sfm_app.formats.frusta import center, frustum_depth
+from sfm_app.formats.glb import FLIP, linear_colors
+from sfm_app.formats.pages import jpeg, pages_in_use
+from sfm_app.types import Frustum, Model, Surface, Texture
+
+if TYPE_CHECKING:
+    from pxr import Usd, UsdGeom
+
+ROOT = "/model"
+FILM_MM = 36.0
+"""Width of the film in millimeters, as which USD states a field of view: that of 35 mm film. By definition."""
+ALIGNED = 64
+"""Every file in a USDZ starts at a multiple of so many bytes (USDZ specification)."""
+PADDING_ID = 0x1986
+"""Number of the ZIP field that pads up to it; USD's own packer uses it. By definition."""
+POINT_SHARE = 2e-3
+"""Width of a drawn point over the depth of a drawn camera. Chosen by hand."""
+EARLIEST = (1980, 1, 1, 0, 0, 0)
+"""Time of all files in a USDZ: the first that ZIP can say, so that the same model gives the same bytes."""
+
+
+def write_usd(model: Model, name: str) -> Mapping[str, bytes]:
+    """Write triangles with a texture or a color per vertex, or points; and the cameras, if any.
+
+    Args:
+        model: what to write.
+        name: of the files, without suffix.
+
+    Returns:
+        The stage in USD's binary form, and a JPEG per page of texture.
+
+    Raises:
+        ReconstructionError: the model is empty or not finite.
+    """
+    check(model)
+    pages = page_files(model, name)
+    pictures = {file: jpeg(model.texture.pages[page]) for page, file in pages.items() if model.texture is not None}
+    return {f"{name}.usd": stage_bytes(model, pages), **pictures}
+
+
+def write_usdz(model: Model, name: str) -> Mapping[str, bytes]:
+    """Write what `write_usd` does into one uncompressed package.
+
+    Args:
+        model: what to write.
+        name: of the file, without suffix.
+
+    Returns:
+        One file.
+
+    Raises:
+        ReconstructionError: the model is empty or not finite.
+    """
+    check(model)
+    stage, *pages = write_usd(model, "model").items()
+    return {f"{name}.usdz": pack({"model.usdc": stage[1], **dict(pages)})}
+
+
+def page_files(model: Model, name: str) -> dict[int, str]:
+    """Return the files of the pages of texture by their numbers; empty without a texture.
+
+    Args:
+        model: the model.
+        name: of the file, without suffix.
+    """
+    if model.texture is None or not len(model.surface.faces):
+        return {}
+    beside = re.sub(r"\s", "_", name)
+    return {page: f"{beside}_{page}.jpg" for page in pages_in_use(model.texture.page)}
+
+
+def pack(files: Mapping[str, bytes]) -> bytes:
+    """Return a USDZ package: a ZIP file without compression, in which every file starts at a multiple of 64 bytes.
+
+    Args:
+        files: contents by file name; the first is the stage to open.
+    """
+    found = io.BytesIO()
+    with zipfile.ZipFile(found, "w", zipfile.ZIP_STORED) as package:
+        for name, data in files.items():
+            start = found.tell() + 30 + len(name.encode()) + 4  # after the entry's header and that of the padding
+            gap = -start % ALIGNED
+            entry = zipfile.ZipInfo(name, EARLIEST)
+            entry.extra = PADDING_ID.to_bytes(2, "little") + gap.to_bytes(2, "little") + bytes(gap)
+            package.writestr(entry, data)
+    return found.getvalue()
+
+
+def stage_bytes(model: Model, pages: Mapping[int, str]) -> bytes:
+    """Return a stage in USD's binary form.
+
+    Args:
+        model: what it shows.
+        pages: files of the pages of texture by their numbers.
+    """
+    from pxr import Usd, UsdGeom
+
+    with tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch:
+        path = Path(scratch) / "model.usdc"
+        stage = Usd.Stage.CreateNew(str(path))
+        stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, ROOT).GetPrim())
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        if len(model.surface.faces):
+            mesh = add_mesh(stage, model.surface)
+            if pages and model.texture is not None:
+                add_texture(stage, mesh, model.texture, pages)
+        else:
+            add_points(stage, model)
+        add_cameras(stage, model)
+        stage.GetRootLayer().Save()
+        return path.read_bytes()
+
+
+def add_mesh(stage: "Usd.Stage", surface: Surface) -> "UsdGeom.Mesh":
+    """Add triangles with normals and a color per vertex.
+
+    Args:
+        stage: changed in place.
+        surface: the triangles.
+    """
+    from pxr import UsdGeom, Vt
+
+    mesh = UsdGeom.Mesh.Define(stage, f"{ROOT}/surface")
+    mesh.CreatePointsAttr(_vectors(surface.vertices))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(surface.faces), 3, np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(surface.faces.astype(np.int32).ravel()))
+    mesh.CreateNormalsAttr(_vectors(unit_normals(surface)))
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreateDoubleSidedAttr(True)
+    mesh.CreateExtentAttr(_vectors(np.stack([surface.vertices.min(axis=0), surface.vertices.max(axis=0)])))
+    mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(_vectors(linear_colors(surface.colors)))
+    return mesh
+
+
+def add_texture(stage: "Usd.Stage", mesh: "UsdGeom.Mesh", texture: Texture, pages: Mapping[int, str]) -> None:
+    """Add texture coordinates, and a material for the triangles of each page.
+
+    Args:
+        stage, mesh: changed in place.
+        texture: of the mesh.
+        pages: files by number of the page.
+    """
+    from pxr import Sdf, UsdGeom, UsdShade, Vt
+
+    places = texture.uv.reshape(-1, 2).astype(np.float32) * (1.0, -1.0) + (0.0, 1.0)  # 0 is at the bottom in USD
+    kind, name = Sdf.ValueTypeNames.TexCoord2fArray, "st"
+    coordinates = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(name, kind, UsdGeom.Tokens.faceVarying)
+    coordinates.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(places, np.float32)))
+    for page, file in pages.items():
+        material = _page_material(stage, f"{ROOT}/materials/page_{page}", file)
+        faces = Vt.IntArray.FromNumpy(np.flatnonzero(texture.page == page).astype(np.int32))
+        part = UsdGeom.Subset.CreateGeomSubset(mesh, f"page_{page}", UsdGeom.Tokens.face, faces, "materialBind")
+        UsdShade.MaterialBindingAPI.Apply(part.GetPrim()).Bind(material)
+    UsdGeom.Subset.SetFamilyType(mesh, "materialBind", UsdGeom.Tokens.partition)
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim())
+
+
+def _page_material(stage: "Usd.Stage", path: str, file: str) -> "UsdShade.Material":  # type: ignore[name-defined]  # noqa: F821
+    """Add a rough material with a picture as its color."""
+    from pxr import Sdf, UsdShade
+
+    types = Sdf.ValueTypeNames
+    material = UsdShade.Material.Define(stage, path)
+    surface, picture, reader = (
+        UsdShade.Shader.Define(stage, f"{path}/{part}") for part in ("surface", "picture", "coordinates")
+    )
+    reader.CreateIdAttr("UsdPrimvarReader_float2")
+    reader.CreateInput("varname", types.String).Set("st")
+    picture.CreateIdAttr("UsdUVTexture")
+    picture.CreateInput("file", types.Asset).Set(Sdf.AssetPath(f"./{file}"))
+    picture.CreateInput("sourceColorSpace", types.Token).Set("sRGB")
+    for wrap in ("wrapS", "wrapT"):
+        picture.CreateInput(wrap, types.Token).Set("clamp")
+    places = reader.CreateOutput("result", types.Float2)
+    picture.CreateInput("st", types.Float2).ConnectToSource(places)
+    surface.CreateIdAttr("UsdPreviewSurface")
+    surface.CreateInput("roughness", types.Float).Set(1.0)
+    surface.CreateInput("metallic", types.Float).Set(0.0)
+    color = picture.CreateOutput("rgb", types.Float3)
+    surface.CreateInput("diffuseColor", types.Color3f).ConnectToSource(color)
+    material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
+    return material
+
+
+def add_points(stage: "Usd.Stage", model: Model) -> None:
+    """Add colored points.
+
+    Args:
+        stage: changed in place.
+        model: points and cameras.
+    """
+    from pxr import UsdGeom, Vt
+
+    surface = model.surface
+    points = UsdGeom.Points.Define(stage, f"{ROOT}/points")
+    points.CreatePointsAttr(_vectors(surface.vertices))
+    centers = np.array([center(camera) for camera in model.cameras] or [np.zeros(3)])
+    points.CreateWidthsAttr(Vt.FloatArray([POINT_SHARE * frustum_depth(centers, surface.vertices)]))
+    points.SetWidthsInterpolation(UsdGeom.Tokens.constant)
+    points.CreateExtentAttr(_vectors(np.stack([surface.vertices.min(axis=0), surface.vertices.max(axis=0)])))
+    points.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(_vectors(linear_colors(surface.colors)))
+
+
+def add_cameras(stage: "Usd.Stage", model: Model) -> None:
+    """Add a camera for every photo, with its optical center where it is.
+
+    Args:
+        stage: changed in place.
+        model: with its cameras, perhaps none.
+    """
+    from pxr import Gf, UsdGeom
+
+    for number, camera in enumerate(model.cameras):
+        film = film_of(camera)
+        found = UsdGeom.Camera.Define(stage, f"{ROOT}/cameras/photo_{number + 1}")
+        found.GetPrim().SetCustomDataByKey("photo", camera.name)
+        found.CreateProjectionAttr(UsdGeom.Tokens.perspective)
+        found.CreateFocalLengthAttr(film["focal"])
+        found.CreateHorizontalApertureAttr(film["width"])
+        found.CreateVerticalApertureAttr(film["height"])
+        found.CreateHorizontalApertureOffsetAttr(film["right"])
+        found.CreateVerticalApertureOffsetAttr(film["up"])
+        matrix = np.eye(4)  # of rows, as USD multiplies
+        matrix[:3, :3], matrix[3, :3] = FLIP @ camera.cam_from_world[:, :3], center(camera)
+        UsdGeom.Xformable(found).AddTransformOp().Set(Gf.Matrix4d(matrix.tolist()))
+
+
+def film_of(camera: Frustum) -> dict[str, float]:
+    """Return the film of a camera in millimeters: focal, width, height, and how far its middle is right and up.
+
+    Args:
+        camera: without distortion.
+    """
+    fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
+    focal = FILM_MM * fx / camera.width
+    right, up = focal * (camera.width / 2 - cx) / fx, focal * (cy - camera.height / 2) / fy
+    return {"focal": focal, "width": FILM_MM, "height": focal * camera.height / fy, "right": right, "up": up}
+
+
+def _vectors(values: NDArray[np.generic]) -> "Vt.Vec3fArray":  # type: ignore[name-defined]  # noqa: F821
+    from pxr import Vt
+
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
