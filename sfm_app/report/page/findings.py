@@ -6,6 +6,7 @@ from typing import Any
 
 from sfm_app.report.camera_text import contradiction_lines, intrinsics_lines
 from sfm_app.report.page.contents import RunContents
+from sfm_app.report.page.correlations import CorrelationTable, correlation_table
 from sfm_app.report.scene_text import scene_lines
 from sfm_app.settings import Settings
 
@@ -36,6 +37,8 @@ class CameraTable:
     rows: Sequence[tuple[str, str, str]]
     """Parameter, value from pairs, value after adjustment."""
     texts: Sequence[str]
+    correlations: CorrelationTable | None = None
+    """None where they are not known, or only one parameter is determined."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +144,8 @@ def camera_tables(contents: RunContents) -> list[CameraTable]:
         lens = contents.counts("scene").get("lenses", {}).get(name, {}).get("model", "") if after is not None else ""
         alone = intrinsics_lines(type(found)({name: camera}, found.camera_of, found.photos))
         texts = [" ".join(line.split()) for line in alone[1:]]
-        tables.append(CameraTable(name, f"{camera.width} × {camera.height}", lens, rows, texts))
+        size = f"{camera.width} × {camera.height}"
+        tables.append(CameraTable(name, size, lens, rows, texts, correlation_table(camera, after)))
     return tables
 
 

@@ -17,6 +17,7 @@ from sfm_app.errors import InputError, SfmError
 from sfm_app.numerical import json_text
 from sfm_app.report.page import findings
 from sfm_app.report.page.contents import UNREADABLE, RunContents, read_contents
+from sfm_app.report.page.correlations import correlation_text
 from sfm_app.report.page.page_figures import page_figures
 from sfm_app.report.page.photo_rows import LEFT_OUT, PLACED, PhotoRow, photo_rows
 from sfm_app.report.page.scene_view import scene_view
@@ -172,5 +173,6 @@ def _environment() -> jinja2.Environment:
         loader=jinja2.FileSystemLoader(ASSETS), autoescape=True, undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
+    found.globals["correlation_text"] = correlation_text
     found.globals["asset"] = lambda name: Markup((ASSETS / name).read_text(encoding="utf-8"))  # noqa: S704 - our files
     return found
