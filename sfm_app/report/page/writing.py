@@ -18,6 +18,7 @@ from sfm_app.numerical import json_text
 from sfm_app.report.page import findings
 from sfm_app.report.page.contents import UNREADABLE, RunContents, read_contents
 from sfm_app.report.page.correlations import correlation_text
+from sfm_app.report.page.depth_pictures import depth_pictures
 from sfm_app.report.page.page_figures import page_figures
 from sfm_app.report.page.photo_rows import LEFT_OUT, PLACED, PhotoRow, photo_rows
 from sfm_app.report.page.scene_view import scene_view
@@ -124,6 +125,7 @@ def render_page(contents: RunContents, other: RunContents | None = None) -> str:
         settings=json.dumps(contents.manifest.get("settings", {}), indent=1),
         versions=contents.manifest.get("versions", {}),
         figures=page_figures(contents, figures),
+        depths=depth_pictures(contents),
         view=view is not None and bool(three_script()),
         data=script_data({"view": view, "photos": [_photo_data(row) for row in rows]}),
         three=Markup(three_script()),  # noqa: S704 - a script of an installed package, without user text
