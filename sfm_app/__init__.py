@@ -4,6 +4,7 @@ run = sfm_app.reconstruct("photos/", "out/")
 cal = sfm_app.calibrate_photos("photos/")
 sfm_app.export_model("out/", "obj")
 sfm_app.write_report("out/")
+sfm_app.view_run("out/")
 fit = sfm_app.estimate_fundamental(x1, x2)
 cal = sfm_app.calibrate_fundamentals(Fs, (width, height))
 lens = sfm_app.estimate_lens(matches, (width, height))
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
         estimate_lens,
         export_model,
         reconstruct,
+        view_run,
         write_report,
     )
     from sfm_app.settings import Settings
@@ -51,6 +53,7 @@ __all__ = [
     "estimate_lens",
     "export_model",
     "reconstruct",
+    "view_run",
     "write_report",
 ]
 

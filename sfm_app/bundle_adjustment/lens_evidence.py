@@ -80,7 +80,7 @@ class LensEstimate:
     deviations: FloatArray
     """(C, 12) their standard deviations."""
     mean_squares: FloatArray
-    """(C, 12, 12) mean squares about `params`, over all choices of freed parts: how parameters are off together. 0 where
+    """(C, 12, 12) mean squares about `params`, over all choices of freed parts: how they are off together. 0 where
     the camera is fixed, or diverged."""
     free: BoolArray
     """(C, 7) the parts that have the wide prior, in the order of PARTS."""

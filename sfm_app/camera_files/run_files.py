@@ -50,8 +50,8 @@ def run_camera(values: Mapping[str, Any]) -> Calibration | None:
     if "params" in values:
         size = int(values["width"]), int(values["height"])
         found = calibration_from_model(str(values["model"]), values["params"], size)
-        known = {"spread": "deviations", "correlations": "correlations"}
-        return replace(found, **{name: finite_entries(values.get(key, {})) for name, key in known.items()})
+        spread, correlations = (finite_entries(values.get(name, {})) for name in ("deviations", "correlations"))
+        return replace(found, spread=spread, correlations=correlations)
     if not values["identifiable"]:
         return None
     known = {name: value for name, value in values.items() if name in FIELDS}

@@ -75,7 +75,8 @@ def frustum_depth(centers: FloatArray, points: FloatArray) -> float:
 
     size = max(scene_size(centers), scene_size(points)) or 1.0
     # two neighbors are asked for, since the nearest one is the camera itself
-    step = float(np.median(cKDTree(centers).query(centers, 2)[0][:, 1])) if len(centers) > 1 else np.inf
+    away = np.asarray(cKDTree(centers).query(centers, 2)[0]) if len(centers) > 1 else np.full((1, 2), np.inf)
+    step = float(np.median(away[:, 1]))
     least = min(LEAST_SHARE, 1.0 / (3.0 * max(len(centers), 1)))
     return float(np.clip(step / 3, least * size, MOST_SHARE * size))
 

@@ -39,6 +39,8 @@ class DepthPicture:
     """What one sees; also what is read out instead of it."""
     address: str
     """JPEG as a data address: the photo at the left, depths at the right."""
+    size: tuple[int, int]
+    """Its width and height in pixels, so that nothing on the page moves while it loads."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +92,8 @@ def _draw(dense: Path, name: str, share: float) -> DepthPicture | None:
         logger.info("no picture of the depths of %s", name, exc_info=err)
         return None
     text = f"{100 * share:.0f} % of it has a depth, from {near:.3g} (yellow) to {far:.3g} (violet)"
-    return DepthPicture(name, text, "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii"))
+    address = "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+    return DepthPicture(name, text, address, (2 * size[0], size[1]))
 
 
 def depth_colors(depth: FloatArray) -> tuple[ByteArray, tuple[float, float]]:

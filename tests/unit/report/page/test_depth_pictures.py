@@ -38,7 +38,7 @@ def test_a_photo_stands_beside_its_depths_and_small(dense):
     assert picture.text == "83 % of it has a depth, from 2 (yellow) to 8 (violet)"
     data = np.frombuffer(base64.b64decode(picture.address.partition(",")[2]), np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB).astype(int)
-    assert image.shape == (24, 960, 3)
+    assert image.shape == (24, 960, 3) and picture.size == (960, 24)
     assert np.abs(image[12, 200] - 128).max() < 6
     near, far, nothing = (image[12, 480 + x] for x in (100, 320, 460))
     assert near[0] > 200 and near[1] > 200 and near[2] < 90
