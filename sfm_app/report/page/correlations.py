@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
+from sfm_app.geometry.lenses.camera_models import PARAMETERS
 from sfm_app.types import Calibration, CameraModel
 from sfm_app.types.correlations import correlation_key
 
@@ -11,14 +12,12 @@ STRONG = 0.5
 """Correlation from which on two parameters are said to depend on each other. Chosen by hand: a quarter of the variance
 of the one is then that of the other."""
 MOST_SENTENCES = 3
-BELONGS_TO = {"fy": "aspect", "cx": "center", "cy": "center", "sx1": "thin prism", "sy1": "thin prism"}
-"""The part of the camera that a parameter belongs to, where it is called otherwise; `determined` names the parts."""
 PAIR_PARAMETERS = ("fx", "fy", "cx", "cy", "k1")
 
 
 @dataclass(frozen=True, slots=True)
 class CorrelationTable:
-    """Correlations between the parameters of a camera that its photos determine."""
+    """Correlations between the parameters of a camera."""
 
     source: str
     """What they are from."""
@@ -33,29 +32,27 @@ class CorrelationTable:
 def correlation_table(before: Calibration, after: CameraModel | None) -> CorrelationTable | None:
     """Return the correlations after the last adjustment, else those from pairs; None where none are known.
 
-    Parameters that the photos do not determine are left out: they keep their usual values.
+    Terms of the lens that are 0 are left out, and the second focal of square pixels. A center that the photos do not
+    determine is not: where it is off, the focal is off with it.
 
     Args:
         before: the camera from pairs of photos.
         after: the last adjustment; None where there was none.
     """
     if after is not None and after.correlations:
-        parts = after.determined
-        names = [name for name in after.deviations if name == "fx" or _is_in(name, parts)]
+        values = dict(zip(PARAMETERS.get(after.model, ()), after.params, strict=False))
+        left_out = () if "aspect" in after.determined else ("fy",)
+        names = [name for name in after.deviations if values.get(name) and name not in left_out]
         return _table("after the last adjustment", names, after.correlations)
     if before.identifiable and before.correlations:
-        names = [name for name in PAIR_PARAMETERS if BELONGS_TO.get(name, name) not in before.held]
+        left_out = ("fy",) if "aspect" in before.held else ()
+        names = [name for name in PAIR_PARAMETERS if name not in (*left_out, *before.held)]
         return _table("from pairs of photos", names, before.correlations)
     return None
 
 
-def _is_in(name: str, parts: Sequence[str]) -> bool:
-    """Return whether a parameter belongs to one of the parts of a camera, which name theirs, as "p1 p2" does."""
-    return any(BELONGS_TO.get(name, name) in (part, *part.split()) for part in parts)
-
-
 def _table(source: str, names: Sequence[str], values: Mapping[str, float]) -> CorrelationTable | None:
-    """Return the table of some parameters; None where fewer than two are determined."""
+    """Return the table of some parameters; None where there are fewer than two."""
     if len(names) < 2:
         return None
     called = ["focal" if name == "fx" and "fy" not in names else name for name in names]

@@ -4,16 +4,22 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sfm_app.report.camera_text import contradiction_lines, intrinsics_lines
+from sfm_app.report.camera_text import SOURCES, contradiction_lines, intrinsics_lines
 from sfm_app.report.page.contents import RunContents
 from sfm_app.report.page.correlations import CorrelationTable, correlation_table
 from sfm_app.report.scene_text import scene_lines
 from sfm_app.settings import Settings
+from sfm_app.types import Calibration, CameraModel
 
 WARNING = "beware: "
 """How the texts of a run begin what one should look at."""
 UNKNOWN_CAMERA = "these photos do not determine it"
 """How the texts of a camera begin why it is a guess."""
+DETERMINE_IT = (
+    "add photos from nearer, farther and other heights, some with the camera turned on its side, or give the camera, if "
+    "you know it, with --calibration FILE"
+)
+"""What to do where pairs of photos do not determine a camera."""
 PARAMETERS = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 """Places of the parameters in K."""
 
@@ -115,9 +121,33 @@ def remarks(contents: RunContents) -> tuple[list[str], list[str]]:
         lines += scene_lines(contents.scene, contents.counts("scene"))
     texts = [" ".join(line.split()) for line in lines]
     warnings = [text.removeprefix(WARNING) for text in texts if text.startswith(WARNING)]
-    warnings += [text for text in texts if text.startswith(UNKNOWN_CAMERA)]
-    others = [text for text in texts if not text.startswith(WARNING) and text not in warnings]
-    return warnings, others
+    others = [text for text in texts if not text.startswith((WARNING, UNKNOWN_CAMERA))]
+    return warnings + unknown_cameras(contents), others
+
+
+def unknown_cameras(contents: RunContents) -> list[str]:
+    """Return, of each camera that its pairs of photos do not determine, why, what came of it, and what to do.
+
+    Args:
+        contents: of the run.
+    """
+    cameras = contents.intrinsics.cameras if contents.intrinsics is not None else {}
+    after = contents.scene.cameras if contents.scene is not None else {}
+    return [
+        _unknown_text(f" {name}" if len(cameras) > 1 else "", camera, after.get(name))
+        for name, camera in cameras.items()
+        if not camera.identifiable
+    ]
+
+
+def _unknown_text(name: str, camera: Calibration, after: CameraModel | None) -> str:
+    source = SOURCES.get(camera.method, camera.method)
+    text = f"Pairs of photos do not determine the camera{name}: {camera.reason}. "
+    text += f"A focal of {camera.focal_px:.0f} px is {source}"
+    if after is not None and "fx" in after.deviations:
+        focal = value_text(after.K[0, 0], after.deviations["fx"])
+        text += f"; the last adjustment, of all photos together, came to {focal} px"
+    return f"{text}. What to do: {DETERMINE_IT}."
 
 
 def camera_tables(contents: RunContents) -> list[CameraTable]:

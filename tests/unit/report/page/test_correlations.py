@@ -12,10 +12,10 @@ PAIRS = Calibration(
 )  # fmt: skip
 
 
-def adjusted(determined, **correlations):
+def adjusted(determined, params, **correlations):
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
     values = {key.replace("_", " "): value for key, value in correlations.items()}
-    return CameraModel("OPENCV", (0.0,) * 8, np.eye(3), 640, 480, dict.fromkeys(names, 1.0), determined, values)
+    return CameraModel("OPENCV", params, np.eye(3), 640, 480, dict.fromkeys(names, 1.0), determined, values)
 
 
 def test_parameters_that_move_together_are_named_the_strongest_first():
@@ -30,17 +30,18 @@ def test_parameters_that_move_together_are_named_the_strongest_first():
     ]
 
 
-def test_the_last_adjustment_counts_and_only_what_it_determines():
-    found = correlation_table(PAIRS, adjusted(("aspect", "k1", "p1 p2"), fx_fy=0.4, fx_k1=-0.3, k1_p1=0.2, fx_k2=0.9))
+def test_the_last_adjustment_counts_and_terms_that_are_zero_do_not():
+    params = (900.0, 800.0, 320.0, 240.0, -0.1, 0.0, 1e-4, -1e-4)
+    found = correlation_table(PAIRS, adjusted(("aspect", "k1"), params, fx_fy=0.4, fx_k1=-0.3, k1_p1=0.2, fx_k2=0.9))
 
     assert found.source == "after the last adjustment"
-    assert list(found.names) == ["fx", "fy", "k1", "p1", "p2"]
+    assert list(found.names) == ["fx", "fy", "cx", "cy", "k1", "p1", "p2"]
     assert list(found.texts) == ["none hides in another: the strongest is fx with fy, 0.40"]
 
 
 def test_a_long_list_is_cut_and_counted():
     strong = {f"{a}_{b}": 0.7 for a, b in (("fx", "fy"), ("fx", "cx"), ("fx", "cy"), ("fy", "cx"), ("cx", "cy"))}
-    found = correlation_table(PAIRS, adjusted(("aspect", "center"), **strong))
+    found = correlation_table(PAIRS, adjusted(("aspect",), (900.0, 900.0, 320.0, 240.0, 0, 0, 0, 0), **strong))
 
     assert len(found.texts) == 4 and found.texts[-1] == "and 2 more pairs of parameters"
 
@@ -49,7 +50,7 @@ def test_nothing_is_said_where_nothing_is_known():
     guess = Calibration(np.eye(3), 640, 480, "guess", False, correlations=PAIRS.correlations)
 
     assert correlation_table(guess, None) is None
-    assert correlation_table(guess, adjusted((), fx_k1=0.9)) is None
+    assert correlation_table(guess, adjusted((), (0.0,) * 8, fx_k1=0.9)) is None
 
 
 def test_a_correlation_has_two_digits_and_no_negative_zero():
