@@ -16,8 +16,8 @@ WARNING = "beware: "
 UNKNOWN_CAMERA = "these photos do not determine it"
 """How the texts of a camera begin why it is a guess."""
 DETERMINE_IT = (
-    "add photos from nearer, farther and other heights, some with the camera turned on its side, or give the camera, if "
-    "you know it, with --calibration FILE"
+    "add photos from nearer, farther and other heights, some with the camera turned on its side, or give the camera, "
+    "if you know it, with --calibration FILE"
 )
 """What to do where pairs of photos do not determine a camera."""
 PARAMETERS = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
@@ -119,10 +119,15 @@ def remarks(contents: RunContents) -> tuple[list[str], list[str]]:
         lines += contradiction_lines(contents.counts(stage))
     if contents.scene is not None:
         lines += scene_lines(contents.scene, contents.counts("scene"))
-    texts = [" ".join(line.split()) for line in lines]
+    texts = [plain_text(line) for line in lines]
     warnings = [text.removeprefix(WARNING) for text in texts if text.startswith(WARNING)]
     others = [text for text in texts if not text.startswith((WARNING, UNKNOWN_CAMERA))]
     return warnings + unknown_cameras(contents), others
+
+
+def plain_text(line: str) -> str:
+    """Return a line of the terminal without its indentation, and with a true sign of deviations."""
+    return " ".join(line.split()).replace("+-", "±")
 
 
 def unknown_cameras(contents: RunContents) -> list[str]:
@@ -173,7 +178,7 @@ def camera_tables(contents: RunContents) -> list[CameraTable]:
         rows += _lens_rows(after) if after is not None else []
         lens = contents.counts("scene").get("lenses", {}).get(name, {}).get("model", "") if after is not None else ""
         alone = intrinsics_lines(type(found)({name: camera}, found.camera_of, found.photos))
-        texts = [" ".join(line.split()) for line in alone[1:]]
+        texts = [plain_text(line) for line in alone[1:]]
         size = f"{camera.width} × {camera.height}"
         tables.append(CameraTable(name, size, lens, rows, texts, correlation_table(camera, after)))
     return tables

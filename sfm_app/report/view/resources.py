@@ -112,12 +112,13 @@ class RunResources:
         if self.points is None or self.levels is None:
             return None
         models = ["model.glb"] if model_file(self.contents) is not None else []
-        return {
+        large: dict[str, Json] = {
             "models": ["light.glb", *models] if self._is_large() else models,
             "levels": self.levels.counts,
             "photos": "photos",
             "out": shlex.quote(str(self.contents.run.workspace.root)),
-        } | view_frame(self.contents, self.points, self.names)
+        }
+        return large | view_frame(self.contents, self.points, self.names)
 
 
 def read_resources(run: RunContext) -> RunResources:

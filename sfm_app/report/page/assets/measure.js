@@ -32,6 +32,12 @@
     show();
   }
 
+  // a line does not end within an option
+  function write(id, command) {
+    const parts = command.split(/(--\w*)/).map((part, k) => (k % 2 ? Object.assign(document.createElement("span"), { textContent: part }) : part));
+    byId(id).replaceChildren(...parts);
+  }
+
   function show() {
     const [a, b] = marks;
     byId("measured-a").textContent = a ? coordinates(a) : "–";
@@ -43,9 +49,9 @@
       : `Mark ${a ? "B" : "A"}: click or tap on the model. By keyboard: turn the view until the cross is there, and press Enter.`;
     if (b) {
       const places = `"${coordinates(a)}" "${coordinates(b)}"`, out = view.out || "OUT";
-      byId("command-scale").textContent = `sfm-app run PHOTOS -o ${out} --scale ${places} 1.25m`;
+      write("command-scale", `sfm-app run PHOTOS -o ${out} --scale ${places} 1.25m`);
       // after "--", a negative coordinate is no option
-      byId("command-measure").textContent = `sfm-app measure ${out} ${places.includes('"-') ? "-- " : ""}${places}`;
+      write("command-measure", `sfm-app measure ${out} ${places.includes('"-') ? "-- " : ""}${places}`);
     }
     canvas.dataset.marks = String(marks.length);
     viewer.redraw();

@@ -319,6 +319,7 @@
   const ray = new THREE.Raycaster(), NEAR_PX = 8;
   function pick(x, y) {
     const { clientWidth: width, clientHeight: height } = canvas;
+    eye.updateMatrixWorld(); // it may have moved since the last frame
     ray.setFromCamera({ x: (2 * x) / width - 1, y: 1 - (2 * y) / height }, eye);
     const hit = model?.visible ? ray.intersectObject(model, true)[0] : undefined;
     if (hit) return hit.point;
