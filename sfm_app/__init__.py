@@ -6,6 +6,7 @@ sfm_app.export_model("out/", "obj")
 sfm_app.export_scene("out/", "colmap")
 sfm_app.write_report("out/")
 sfm_app.measure_distance("out/", (0, 0, 0), (1, 0, 0))
+sfm_app.view_run("out/")
 fit = sfm_app.estimate_fundamental(x1, x2)
 cal = sfm_app.calibrate_fundamentals(Fs, (width, height))
 lens = sfm_app.estimate_lens(matches, (width, height))
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
         export_scene,
         measure_distance,
         reconstruct,
+        view_run,
         write_report,
     )
     from sfm_app.settings import Settings
@@ -57,6 +59,7 @@ __all__ = [
     "export_scene",
     "measure_distance",
     "reconstruct",
+    "view_run",
     "write_report",
 ]
 

@@ -2,7 +2,7 @@
 
 import os
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -107,6 +107,27 @@ def write_report(out: PathLike, compare: PathLike | None = None) -> Path:
 
     with open_run(Path(out), Settings(), None) as run:
         return page.write_report(run, replace(run, workspace=Workspace(Path(compare))) if compare is not None else None)
+
+
+def view_run(
+    out: PathLike, *, port: int = 0, started: Callable[[str], None] | None = None, progress: Progress | None = None
+) -> None:
+    """Serve the report of a run to the browsers of this machine until Ctrl-C, with its model at full size.
+
+    Args:
+        out: output folder of the run, which may have stopped at any stage.
+        port: to listen on; 0 for any that is free.
+        started: called with the address of the page once it can be opened.
+        progress: display of progress; silent by default.
+
+    Raises:
+        InputError: the folder holds no run.
+        ConfigError: the port is taken.
+    """
+    from sfm_app.report.view import serve_run  # loads COLMAP
+
+    with open_run(Path(out), Settings(), progress) as run:
+        serve_run(run, port, started or run.progress.say)
 
 
 def export_model(

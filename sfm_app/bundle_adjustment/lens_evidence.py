@@ -79,6 +79,9 @@ class LensEstimate:
     """(C, 12) as in `Bundle`."""
     deviations: FloatArray
     """(C, 12) their standard deviations."""
+    mean_squares: FloatArray
+    """(C, 12, 12) mean squares about `params`, over all choices of freed parts: how they are off together. 0 where
+    the camera is fixed, or diverged."""
     free: BoolArray
     """(C, 7) the parts that have the wide prior, in the order of PARTS."""
     determined: BoolArray
@@ -150,7 +153,8 @@ def _estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors, fr
     about = _mean_squares(step, (mean, covariance), precision, away, priors)
     photos = evidence_weight(reduced.noise_px) * (reduced.scores @ T)
     by_photo = _multiply(photos, covariance) @ T.T
-    variances = np.maximum(np.einsum("ii->i", (T @ about) @ T.T), np.sum(by_photo**2, axis=0))
+    mean_squares = np.asarray((T @ about) @ T.T, np.float64)
+    variances = np.maximum(np.einsum("ii->i", mean_squares), np.sum(by_photo**2, axis=0))
     deviations = np.sqrt(variances).reshape(params.shape) * np.where(priors.asked.all(axis=1), 1.0, FEW)[:, None]
     largest = np.abs(step) / np.sqrt(np.diag(own), out=np.ones_like(step), where=(changing & ~absent).ravel())
     largest = np.where(absent.ravel(), 0.0, largest)
@@ -162,8 +166,9 @@ def _estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors, fr
     # photos make nothing less certain than it was: more than that is rounding, where nearly all of H cancels
     deviations[stays] = np.minimum(deviations, np.hypot(prior, away))[stays]
     determined[held] = False
+    own_squares = _camera_blocks(mean_squares) * (~held & ~priors.fixed)[:, None, None]
     return LensEstimate(
-        np.where(held[:, None], params, moved), deviations, free & determined, determined,
+        np.where(held[:, None], params, moved), deviations, own_squares, free & determined, determined,
         float(np.max(largest.reshape(params.shape)[~held & ~priors.fixed], initial=0.0)), held, (), held,
     )  # fmt: skip
 
@@ -241,6 +246,13 @@ def _mean_squares(
         choices = priors.choice_priors(consistent_choices(int(priors.family[camera])), camera, away[camera])
         found[block] = posteriors(*said, choices).mean_squares(step[own])
     return found
+
+
+def _camera_blocks(squares: FloatArray) -> FloatArray:
+    """Return (C, 12, 12), the blocks of single cameras of a matrix (12C, 12C)."""
+    count = len(squares) // CAMERA
+    blocks = np.einsum("iaib->iab", squares.reshape(count, CAMERA, count, CAMERA))
+    return np.array(blocks, np.float64)
 
 
 def _logarithm_jacobian(params: FloatArray) -> sparse.csr_array:

@@ -50,7 +50,8 @@ def run_camera(values: Mapping[str, Any]) -> Calibration | None:
     if "params" in values:
         size = int(values["width"]), int(values["height"])
         found = calibration_from_model(str(values["model"]), values["params"], size)
-        return replace(found, spread=finite_entries(values.get("deviations", {})))
+        spread, correlations = (finite_entries(values.get(name, {})) for name in ("deviations", "correlations"))
+        return replace(found, spread=spread, correlations=correlations)
     if not values["identifiable"]:
         return None
     known = {name: value for name, value in values.items() if name in FIELDS}

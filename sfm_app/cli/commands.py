@@ -10,7 +10,16 @@ from typing import Any
 import click
 
 from sfm_app import __version__
-from sfm_app.api import calibrate_photos, export_model, export_scene, measure_distance, reconstruct, write_report
+from sfm_app.api import (
+    calibrate_photos,
+    export_model,
+    export_scene,
+    measure_distance,
+    reconstruct,
+    view_run,
+    write_report,
+)
+from sfm_app.cli.browser import open_browser
 from sfm_app.cli.display import (
     file_lines,
     print_json,
@@ -208,6 +217,22 @@ def markers(side: str, target: Path, family: str, first: int, paper: str) -> Non
 def report(out: Path, compare: Path | None) -> None:
     """Write OUT/report.html again: what the run in OUT has found, as one page that opens without a network."""
     print_lines(file_lines([write_report(out, compare)]))
+
+
+@main.command()
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port to listen on.  [default: a free one]")
+@click.option("--no-browser", is_flag=True, help="Only print the address.")
+def view(out: Path, port: int, no_browser: bool) -> None:
+    """Show the run in OUT in the browser, with the model at full size, to this machine only; Ctrl-C ends it."""
+
+    def announce(address: str) -> None:
+        print_lines([f"{address} shows {out}; Ctrl-C ends it"])
+        sys.stdout.flush()  # whoever reads it through a pipe waits for it
+        if not no_browser:
+            open_browser(address)
+
+    view_run(out, port=port, started=announce, progress=Terminal(quiet=False))
 
 
 @main.command()

@@ -29,6 +29,7 @@ from sfm_app.colmap.types import all_cameras, all_points
 from sfm_app.geometry.lenses.projections import FX, FY, PANORAMA
 from sfm_app.numerical import FAILURES, error_reason, finite_entries
 from sfm_app.types import Calibration
+from sfm_app.types.correlations import named_correlations
 
 logger = logging.getLogger("sfm_app")
 
@@ -42,6 +43,8 @@ class Adjustment:
     """Standard deviations by camera id, as in `CameraModel`."""
     determined: dict[int, tuple[str, ...]]
     """Parameters that the photos determine, by camera id, as in `CameraModel`."""
+    correlations: dict[int, dict[str, float]] = field(default_factory=dict)
+    """Correlations of parameters by camera id, as in `CameraModel`; lacks cameras without any."""
     failure: str = ""
     """Why the adjustment failed, empty where it did not; the model is then the given one, without deviations."""
     held: tuple[int, ...] = ()
@@ -89,7 +92,10 @@ def adjust(
     held = tuple(camera_id for camera_id, away in zip(rounds.ids, rounds.found.held, strict=True) if away)
     lenses = record_lenses(model, rounds, families.rivals)
     estimates = given_estimates(model, rounds, rules)
-    return Adjustment(model, *_summary(rounds), held=held, open_points=open_points, lenses=lenses, estimates=estimates)
+    return Adjustment(
+        model, *_summary(rounds), _correlations(rounds), held=held, open_points=open_points, lenses=lenses,
+        estimates=estimates,
+    )  # fmt: skip
 
 
 def adjust_or_keep(
@@ -137,15 +143,30 @@ def _summary(rounds: Rounds) -> tuple[dict[int, dict[str, float]], dict[int, tup
     deviations: dict[int, dict[str, float]] = {}
     determined: dict[int, tuple[str, ...]] = {}
     for row, camera_id in enumerate(rounds.ids):
-        family = int(rounds.bundle.family[row])
-        determined[camera_id] = part_names(family, rounds.found.determined[row])
-        deviations[camera_id] = {}
-        is_fixed = rounds.bundle.fixed is not None and bool(rounds.bundle.fixed[row])
-        if family in FILE_MODELS and not is_fixed:
-            keys = FILE_MODELS[family][file_model(rounds.found.params[row], family)]
-            values = rounds.found.deviations[row]
-            deviations[camera_id] = finite_entries({key: float(values[PLACES[key][0]]) for key in keys})
+        determined[camera_id] = part_names(int(rounds.bundle.family[row]), rounds.found.determined[row])
+        values = rounds.found.deviations[row]
+        entries = {key: float(values[PLACES[key][0]]) for key in _adjusted_names(rounds, row)}
+        deviations[camera_id] = finite_entries(entries)
     return deviations, determined
+
+
+def _correlations(rounds: Rounds) -> dict[int, dict[str, float]]:
+    """Return the correlations of `Adjustment`."""
+    found = {}
+    for row, camera_id in enumerate(rounds.ids):
+        names = _adjusted_names(rounds, row)
+        places = [PLACES[name][0] for name in names]
+        found[camera_id] = named_correlations(names, rounds.found.mean_squares[row][np.ix_(places, places)])
+    return found
+
+
+def _adjusted_names(rounds: Rounds, row: int) -> tuple[str, ...]:
+    """Return COLMAP's names of the parameters of a camera that were adjusted; none of a panorama or a fixed camera."""
+    family = int(rounds.bundle.family[row])
+    is_fixed = rounds.bundle.fixed is not None and bool(rounds.bundle.fixed[row])
+    if family not in FILE_MODELS or is_fixed:
+        return ()
+    return tuple(FILE_MODELS[family][file_model(rounds.found.params[row], family)])
 
 
 def apply_rules(model: pycolmap.Reconstruction, rules: Rules) -> None:

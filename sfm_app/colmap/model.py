@@ -331,6 +331,7 @@ class RefinedCamera(TypedDict, total=False):
 
     deviations: Mapping[str, float | None]
     determined: Sequence[str]
+    correlations: Mapping[str, float | None]
 
 
 def read_scene(
@@ -341,7 +342,7 @@ def read_scene(
     Args:
         model_dir: COLMAP's model.
         names, unregistered: the name of its camera, by photo; the reason why it has no pose, by photo.
-        refined: deviations and determined parameters, by camera; may lack cameras.
+        refined: deviations, determined parameters and correlations, by camera; may lack cameras.
     """
     model = pycolmap.Reconstruction(model_dir)
     posed = posed_images(model)
@@ -362,4 +363,5 @@ def _camera(camera: pycolmap.Camera, refined: RefinedCamera) -> CameraModel:
     K = scale_matrix(camera)
     params = tuple(float(value) for value in camera.params)
     deviations, determined = finite_entries(refined.get("deviations", {})), tuple(refined.get("determined", ()))
-    return CameraModel(camera.model.name, params, K, camera.width, camera.height, deviations, determined)
+    correlations = finite_entries(refined.get("correlations", {}))
+    return CameraModel(camera.model.name, params, K, camera.width, camera.height, deviations, determined, correlations)

@@ -18,7 +18,8 @@ DOTS = 12
 """Dots per edge, for formats without lines."""
 
 LEAST_SHARE, MOST_SHARE = 0.01, 0.1
-"""Smallest and largest depth of a frustum, relative to the scene: visible, but without hiding the scene."""
+"""Smallest and largest depth of a frustum, relative to the scene: visible, but without hiding the scene. Of many
+cameras, the smallest is a third of their distance if they stood in one line: a hundredth of a town hides the next."""
 
 
 def camera_lines(model: Model) -> tuple[FloatArray, IndexArray]:
@@ -70,11 +71,14 @@ def frustum_depth(centers: FloatArray, points: FloatArray) -> float:
         centers: (C, 3) of the cameras.
         points: (N, 3) of the scene.
     """
+    from scipy.spatial import cKDTree
+
     size = max(scene_size(centers), scene_size(points)) or 1.0
-    apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
-    np.fill_diagonal(apart, np.inf)
-    step = float(np.median(apart.min(axis=1))) if len(centers) > 1 else np.inf
-    return float(np.clip(step / 3, LEAST_SHARE * size, MOST_SHARE * size))
+    # two neighbors are asked for, since the nearest one is the camera itself
+    away = np.asarray(cKDTree(centers).query(centers, 2)[0]) if len(centers) > 1 else np.full((1, 2), np.inf)
+    step = float(np.median(away[:, 1]))
+    least = min(LEAST_SHARE, 1.0 / (3.0 * max(len(centers), 1)))
+    return float(np.clip(step / 3, least * size, MOST_SHARE * size))
 
 
 def scene_size(points: FloatArray) -> float:

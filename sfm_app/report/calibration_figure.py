@@ -89,7 +89,8 @@ def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
         parts = figure.subfigures(len(shown), 1, squeeze=False, height_ratios=heights)[:, 0]
         for part, panel in zip(parts, shown, strict=True):
             many = f"Camera {panel.name}, one of {len(panels)}.\n" if len(panels) > 1 else ""
-            part.suptitle(many + calibration_text(panel.camera), fontsize=10.5, x=0.02, ha="left")
+            texts = filter(None, (calibration_text(panel.camera), pairs_text(len(panel.pairs.Fs))))
+            part.suptitle(many + "\n".join(texts), fontsize=10.5, x=0.02, ha="left")
             _draw_camera(part, panel)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=130, metadata=SUFFIXES[path.suffix.lower()])
@@ -99,6 +100,11 @@ def calibration_text(camera: Calibration) -> str:
     """Return a calibration in words, one line per property."""
     texts = (verdict(camera), focal_text(camera), center_text(camera), lens_text(camera), held_text(camera))
     return "\n".join(fill(text, 150) for text in texts if text).replace("+-", "±")
+
+
+def pairs_text(count: int) -> str:
+    """Return how many pairs of a camera are drawn, of how many; empty where all are."""
+    return f"Drawn are the {MOST_PAIRS} pairs of most weight, of {count}." if count > MOST_PAIRS else ""
 
 
 def weightiest(pairs: CameraPairs, most: int) -> CameraPairs:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sfm_app.selfcal.adjustment.calibrate_pairs import Fit, extend_to_all_pairs, fit_cameras, undistorted_fundamentals
 from sfm_app.selfcal.adjustment.camera_priors import LENS, USUAL_FOCAL, CameraPriors
 from sfm_app.selfcal.adjustment.structureless_ba import Matches
-from sfm_app.selfcal.adjustment.uncertainty import covariance, key_pairs, spread_from_covariance
+from sfm_app.selfcal.adjustment.uncertainty import camera_uncertainty, covariance, key_pairs
 from sfm_app.selfcal.consensus import consensus_peak
 from sfm_app.selfcal.consensus.consensus import Consensus
 from sfm_app.selfcal.consensus.peak_evidence import effective_count, spread_px
@@ -136,7 +136,7 @@ def _calibrate_from_matches(
     photos = tuple(pairs.photos[k] for k in usable.kept[adjusted.used_pairs]) if pairs.photos else ()
     found = replace(
         found,
-        spread=spread_from_covariance(theta, cov, side),
+        **camera_uncertainty(theta, cov, side)._asdict(),
         evidence=evidence,
         held=fit.held_names(0),
         key_pairs=key_pairs(fit, photos),

@@ -243,7 +243,7 @@ def write_model(model: Reconstruction, target: Path) -> None:
 
 
 def refined_cameras(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, RefinedCamera]:
-    """Return deviations and determined parameters of the refined cameras, by name of the camera.
+    """Return deviations, determined parameters and correlations of the refined cameras, by name of the camera.
 
     Args:
         adjusted: the model with the deviations of its cameras.
@@ -251,7 +251,11 @@ def refined_cameras(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str,
     """
     cameras = {names[image.name]: image.camera_id for image in posed_images(adjusted.model)}
     return {
-        name: {"deviations": adjusted.deviations[camera_id], "determined": adjusted.determined[camera_id]}
+        name: {
+            "deviations": adjusted.deviations[camera_id],
+            "determined": adjusted.determined[camera_id],
+            "correlations": adjusted.correlations.get(camera_id, {}),
+        }
         for name, camera_id in cameras.items()
     }
 

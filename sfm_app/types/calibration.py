@@ -46,6 +46,8 @@ class Calibration:
     more terms than `radial` or `fisheye`; these two then hold its radial terms as far as they go. Empty otherwise."""
     spread: Mapping[str, float] = field(default_factory=dict)
     """Standard deviations where the calibrator estimates them: "fx", "fy", "cx", "cy" in pixels, "k1"."""
+    correlations: Mapping[str, float] = field(default_factory=dict)
+    """Correlations of the parameters in `spread`, from -1 to 1, by two names with a space between: "fx k1"."""
     held: tuple[str, ...] = ()
     """Parameters at their usual values because the photos do not determine them: "center", "aspect", "k1"."""
     key_pairs: tuple[PairId, ...] = ()
@@ -82,6 +84,7 @@ class Calibration:
         """Return plain values for JSON."""
         plain = {field.name: getattr(self, field.name) for field in fields(self)}
         tables = {"K": self.K.tolist(), "spread": dict(self.spread), "evidence": dict(self.evidence)}
+        tables["correlations"] = dict(self.correlations)
         lists = {"held": list(self.held), "fisheye": list(self.fisheye), "distortion": list(self.distortion)}
         if not self.distortion:
             del plain["distortion"], lists["distortion"]
@@ -92,6 +95,7 @@ class Calibration:
         """Rebuild from `to_dict`."""
         pairs = tuple((int(first), int(second)) for first, second in values["key_pairs"])
         tables = {name: finite_entries(values[name]) for name in ("spread", "evidence")}
+        tables["correlations"] = finite_entries(values.get("correlations", {}))  # older files have none
         plain = {"K": np.array(values["K"], np.float64), "held": tuple(values["held"]), "key_pairs": pairs}
         terms = {name: tuple(values.get(name, ())) for name in ("fisheye", "distortion")}
         return cls(**{**values, **tables, **plain, **terms})

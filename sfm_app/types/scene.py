@@ -24,6 +24,8 @@ class CameraModel:
     """Standard deviations: "fx", "fy", "cx", "cy" in pixels, and the others by COLMAP's names; none of a panorama."""
     determined: tuple[str, ...] = ()
     """What the photos determine besides the focal: "center", "aspect", "k1", ...; the others kept their values."""
+    correlations: Mapping[str, float] = field(default_factory=dict)
+    """Correlations of the parameters in `deviations`, from -1 to 1, by two names with a space between: "fx k1"."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""

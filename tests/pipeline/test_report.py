@@ -9,9 +9,11 @@ import pytest
 from click.testing import CliRunner
 
 import sfm_app
+from sfm_app.api import open_run
 from sfm_app.cli import main
 from sfm_app.errors import InputError
 from sfm_app.report.page import REPORT
+from sfm_app.report.view.resources import read_resources
 from sfm_app.settings import Settings
 
 DRAFT = Settings.from_mapping({"quality": "draft"})
@@ -111,6 +113,34 @@ def test_the_page_says_what_was_found(mapped):
         f"{focal:.0f} px" in page.text and "Seen from above" in page.text and "Which photos hang together" in page.text
     )
     assert mapped.report_path == mapped.out / REPORT
+
+
+def test_parameters_that_move_together_are_told_and_kept(mapped):
+    _, page = read(mapped.out)
+    camera = next(iter(mapped.scene.cameras.values()))
+    kept = json.loads((mapped.out / "scene.json").read_text())["cameras"]
+
+    assert "Which parameters move together, after the last adjustment" in page.text
+    assert set(camera.correlations) >= {"fx fy", "fx cx", "cx cy"}
+    assert all(-1.0 <= value <= 1.0 for value in camera.correlations.values())
+    assert [one["correlations"] for one in kept.values()] == [dict(camera.correlations)]
+
+
+def test_the_view_loads_what_the_report_has_in_it(mapped):
+    with open_run(mapped.out, Settings(), None) as run:
+        found = read_resources(run)
+        text = found.page.decode()
+        view = data_of(text)["view"]
+
+        # without single points far away, which no file of points has
+        assert 0.95 * mapped.scene.points < sum(view["levels"]) <= mapped.scene.points and view["models"] == []
+        assert "data:image/jpeg;base64," not in text and "connect-src 'self'" in text
+        pictures = [
+            one["src"] for tag, one in Page(text).elements if tag == "img" and "pictures/" in one.get("src", "")
+        ]
+        assert len(pictures) == 7 and all(found.find(f"/{address}").content[:2] == b"\xff\xd8" for address in pictures)
+        assert found.find(f"/photos/{view['cameras'][0]['row']}").content[:2] == b"\xff\xd8"
+        assert "<img src=x" not in text
 
 
 def test_a_run_that_changes_nothing_leaves_it_alone_and_the_command_makes_it_again(mapped):

@@ -7,7 +7,7 @@ from pathlib import Path
 import sfm_app
 
 PACKAGE = Path(sfm_app.__file__).parent
-COMMANDS = ("cli/commands.py:run", "cli/commands.py:calibrate", "cli/commands.py:export", "cli/commands.py:report")
+COMMANDS = tuple(f"cli/commands.py:{name}" for name in ("run", "calibrate", "export", "report", "view"))
 """Their docstrings are what `--help` prints; click says what the options are."""
 
 

@@ -4,15 +4,22 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sfm_app.report.camera_text import contradiction_lines, intrinsics_lines
+from sfm_app.report.camera_text import SOURCES, contradiction_lines, intrinsics_lines
 from sfm_app.report.page.contents import RunContents
+from sfm_app.report.page.correlations import CorrelationTable, correlation_table
 from sfm_app.report.scene_text import scene_lines
 from sfm_app.settings import Settings
+from sfm_app.types import Calibration, CameraModel
 
 WARNING = "beware: "
 """How the texts of a run begin what one should look at."""
 UNKNOWN_CAMERA = "these photos do not determine it"
 """How the texts of a camera begin why it is a guess."""
+DETERMINE_IT = (
+    "add photos from nearer, farther and other heights, some with the camera turned on its side, or give the camera, "
+    "if you know it, with --calibration FILE"
+)
+"""What to do where pairs of photos do not determine a camera."""
 PARAMETERS = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 """Places of the parameters in K."""
 
@@ -36,6 +43,8 @@ class CameraTable:
     rows: Sequence[tuple[str, str, str]]
     """Parameter, value from pairs, value after adjustment."""
     texts: Sequence[str]
+    correlations: CorrelationTable | None = None
+    """None where they are not known, or only one parameter is determined."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,11 +119,40 @@ def remarks(contents: RunContents) -> tuple[list[str], list[str]]:
         lines += contradiction_lines(contents.counts(stage))
     if contents.scene is not None:
         lines += scene_lines(contents.scene, contents.counts("scene"))
-    texts = [" ".join(line.split()) for line in lines]
+    texts = [plain_text(line) for line in lines]
     warnings = [text.removeprefix(WARNING) for text in texts if text.startswith(WARNING)]
-    warnings += [text for text in texts if text.startswith(UNKNOWN_CAMERA)]
-    others = [text for text in texts if not text.startswith(WARNING) and text not in warnings]
-    return warnings, others
+    others = [text for text in texts if not text.startswith((WARNING, UNKNOWN_CAMERA))]
+    return warnings + unknown_cameras(contents), others
+
+
+def plain_text(line: str) -> str:
+    """Return a line of the terminal without its indentation, and with a true sign of deviations."""
+    return " ".join(line.split()).replace("+-", "±")
+
+
+def unknown_cameras(contents: RunContents) -> list[str]:
+    """Return, of each camera that its pairs of photos do not determine, why, what came of it, and what to do.
+
+    Args:
+        contents: of the run.
+    """
+    cameras = contents.intrinsics.cameras if contents.intrinsics is not None else {}
+    after = contents.scene.cameras if contents.scene is not None else {}
+    return [
+        _unknown_text(f" {name}" if len(cameras) > 1 else "", camera, after.get(name))
+        for name, camera in cameras.items()
+        if not camera.identifiable
+    ]
+
+
+def _unknown_text(name: str, camera: Calibration, after: CameraModel | None) -> str:
+    source = SOURCES.get(camera.method, camera.method)
+    text = f"Pairs of photos do not determine the camera{name}: {camera.reason}. "
+    text += f"A focal of {camera.focal_px:.0f} px is {source}"
+    if after is not None and "fx" in after.deviations:
+        focal = value_text(after.K[0, 0], after.deviations["fx"])
+        text += f"; the last adjustment, of all photos together, came to {focal} px"
+    return f"{text}. What to do: {DETERMINE_IT}."
 
 
 def camera_tables(contents: RunContents) -> list[CameraTable]:
@@ -140,8 +178,9 @@ def camera_tables(contents: RunContents) -> list[CameraTable]:
         rows += _lens_rows(after) if after is not None else []
         lens = contents.counts("scene").get("lenses", {}).get(name, {}).get("model", "") if after is not None else ""
         alone = intrinsics_lines(type(found)({name: camera}, found.camera_of, found.photos))
-        texts = [" ".join(line.split()) for line in alone[1:]]
-        tables.append(CameraTable(name, f"{camera.width} × {camera.height}", lens, rows, texts))
+        texts = [plain_text(line) for line in alone[1:]]
+        size = f"{camera.width} × {camera.height}"
+        tables.append(CameraTable(name, size, lens, rows, texts, correlation_table(camera, after)))
     return tables
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.figures.observations import ModelFigures
-from sfm_app.report.calibration_figure import draw_intrinsics
+from sfm_app.report.calibration_figure import MOST_PAIRS, draw_intrinsics
 from sfm_app.report.page.contents import UNREADABLE, RunContents
 
 if TYPE_CHECKING:
@@ -81,6 +81,9 @@ def _draw_cameras(contents: RunContents) -> PageFigure | None:
         "the zero curves of the best pairs; many pairs agree where it is bright. Below: the lens beside an ideal one, "
         "and the residuals over the photo."
     )
+    count = len(views.fits)
+    if count > MOST_PAIRS:
+        text += f" Of {count} pairs, at most {MOST_PAIRS} of each camera are drawn, those of most weight."
     return PageFigure("Votes, curves and lens", text, _address(data))
 
 

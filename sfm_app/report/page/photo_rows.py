@@ -5,7 +5,7 @@ import io
 import logging
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,21 +41,21 @@ class PhotoRow:
     depth: float | None = None
     """Share of the photo with a depth."""
     picture: str = ""
-    """JPEG as a data address; empty where there is none."""
+    """Address of a small picture; empty where there is none."""
 
 
-def photo_rows(contents: RunContents, figures: ModelFigures | None) -> list[PhotoRow]:
+def photo_rows(contents: RunContents, figures: ModelFigures | None, pictures: Mapping[str, str]) -> list[PhotoRow]:
     """Return the rows of all photos, in order of their names, those that were left out last.
 
     Args:
         contents: of the run.
         figures: of its model; None where there is none.
+        pictures: addresses of small pictures, by name of the photo; may lack some.
     """
     if contents.photos is None:
         return []
     photos = contents.photos.photos
     pairs, inliers = _count_pairs(contents)
-    pictures = _pictures(photos, contents)
     depths = contents.counts("depth_maps").get("coverage", {})
     rows = []
     for photo in sorted(photos, key=lambda one: one.name):
@@ -102,12 +102,21 @@ def _count_pairs(contents: RunContents) -> tuple[Counter[str], Counter[str]]:
     return pairs, inliers
 
 
-def _pictures(photos: Sequence[Photo], contents: RunContents) -> Mapping[str, str]:
-    """Return small pictures of photos as data addresses, by name."""
-    side = picture_side(len(photos))
-    folder = contents.run.workspace.photos
-    found = contents.run.map(lambda photo: _picture(folder / photo.name, side), photos, "pictures of the report")
-    return dict(zip((photo.name for photo in photos), found, strict=True))
+def photo_names(contents: RunContents) -> list[str]:
+    """Return the names of the usable photos in order of the page's rows."""
+    return sorted(photo.name for photo in contents.photos.photos) if contents.photos is not None else []
+
+
+def embedded_pictures(contents: RunContents) -> Mapping[str, str]:
+    """Return small pictures of all photos as data addresses, by name.
+
+    Args:
+        contents: of the run.
+    """
+    names, folder = photo_names(contents), contents.run.workspace.photos
+    side = picture_side(max(len(names), 1))
+    found = contents.run.map(lambda name: _address(picture(folder / name, side)), names, "pictures of the report")
+    return dict(zip(names, found, strict=True))
 
 
 def picture_side(count: int) -> int:
@@ -119,8 +128,13 @@ def picture_side(count: int) -> int:
     return int(min(max(math.sqrt(ALL_PIXELS / max(count, 1) * 4 / 3), SMALLEST_PX), LARGEST_PX))
 
 
-def _picture(path: Path, side: int) -> str:
-    """Return a small picture of a photo as a data address; empty where it can no longer be read."""
+def picture(path: Path, side: int) -> bytes:
+    """Return a picture of a photo as JPEG; empty where the photo can no longer be read.
+
+    Args:
+        path: of the photo.
+        side: most pixels of its longer side.
+    """
     try:
         with Image.open(path) as image:
             image.draft("RGB", (side, side))
@@ -130,5 +144,9 @@ def _picture(path: Path, side: int) -> str:
             small.save(file, "JPEG", quality=QUALITY)
     except (OSError, ValueError, Image.DecompressionBombError) as err:  # the photo may be gone
         logger.info("no picture of %s", path.name, exc_info=err)
-        return ""
-    return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode("ascii")
+        return b""
+    return file.getvalue()
+
+
+def _address(jpeg: bytes) -> str:
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii") if jpeg else ""

@@ -4,6 +4,7 @@ import base64
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -27,45 +28,85 @@ LIGHT_PAGE_PX = 2048
 MOST_POINTS = 60_000
 
 
-def scene_view(contents: RunContents, photos: Sequence[str]) -> Mapping[str, Json] | None:
-    """Return what the 3D view needs, as plain values; None where no photo has a place.
+def embedded_view(contents: RunContents, photos: Sequence[str]) -> Mapping[str, Json] | None:
+    """Return what the 3D view needs, with model and points in it, as plain values; None where no photo has a place.
 
     Args:
         contents: of the run.
         photos: names of the photos in order of the page's rows.
     """
+    points = view_points(contents)
+    if points is None:
+        return None
+    places, colors = _sample(points)
+    return {
+        "glb": _base64(_model_bytes(contents)),
+        "places": _base64(places.astype("<f4").tobytes()),
+        "colors": _base64(colors.tobytes()),
+    } | view_frame(contents, points, photos)
+
+
+def view_points(contents: RunContents) -> Model | None:
+    """Return the points and the cameras of the scene; None where there are none.
+
+    Args:
+        contents: of the run.
+    """
     if contents.scene is None:
         return None
     try:
-        points = sparse_model(contents.scene.model_dir)
+        return sparse_model(contents.scene.model_dir)
     except UNREADABLE as err:
         logger.info("the report has no 3D view", exc_info=err)
         return None
+
+
+def view_frame(contents: RunContents, points: Model, photos: Sequence[str]) -> dict[str, Json]:
+    """Return what the 3D view needs besides model and points: the cameras, and where and how large the scene is.
+
+    Args:
+        contents: of the run.
+        points: the points and the cameras.
+        photos: names of the photos in order of the page's rows.
+    """
     rows = {name: number for number, name in enumerate(photos)}
-    glb = _model_bytes(contents)
-    places, colors = _sample(points)
     middle, size = _bounds(points)
-    depth = frustum_depth(np.array([center(camera) for camera in points.cameras]), points.surface.vertices)
+    unit = contents.counts("scene").get("orientation", {}).get("unit")
     return {
-        "glb": _base64(glb),
-        "places": _base64(places.astype("<f4").tobytes()),
-        "colors": _base64(colors.tobytes()),
         "cameras": [_camera(camera, rows.get(camera.name)) for camera in points.cameras],
         "middle": middle,
         "size": size,
-        "depth": depth,
+        "depth": frustum_depth(np.array([center(camera) for camera in points.cameras]), points.surface.vertices),
+        "unit": "m" if unit == "meter" else "",
     }
+
+
+def model_file(contents: RunContents) -> Path | None:
+    """Return the file of the finished model; None where there is none.
+
+    Args:
+        contents: of the run.
+    """
+    path = contents.run.workspace.root / "model.glb"
+    return path if "files" in contents.stages and path.exists() else None
+
+
+def light_model(contents: RunContents) -> bytes:
+    """Return the finished model as GLB with smaller pages of texture.
+
+    Args:
+        contents: of a run with a texture.
+    """
+    return write_glb(lighten(texture.load(contents.run)), "model")["model.glb"]
 
 
 def _model_bytes(contents: RunContents) -> bytes:
     """Return the finished model as GLB, a lighter one where it is large; empty where there is none."""
-    path = contents.run.workspace.root / "model.glb"
+    path = model_file(contents)
+    if path is None:
+        return b""
     try:
-        if "files" not in contents.stages or not path.exists():
-            return b""
-        if path.stat().st_size <= MOST_GLB_BYTES:
-            return path.read_bytes()
-        return write_glb(lighten(texture.load(contents.run)), "model")["model.glb"]
+        return path.read_bytes() if path.stat().st_size <= MOST_GLB_BYTES else light_model(contents)
     except UNREADABLE as err:
         logger.info("the report shows no surface", exc_info=err)
         return b""

@@ -2,8 +2,8 @@
 
 import json
 import logging
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,14 @@ from markupsafe import Markup
 from sfm_app.atomic_io import replace_atomically
 from sfm_app.colmap.figures.observations import ModelFigures, model_figures
 from sfm_app.errors import InputError, SfmError
-from sfm_app.numerical import json_text
+from sfm_app.numerical import Json, json_text
 from sfm_app.report.page import findings
 from sfm_app.report.page.contents import UNREADABLE, RunContents, read_contents
+from sfm_app.report.page.correlations import correlation_text
+from sfm_app.report.page.depth_pictures import depth_pictures
 from sfm_app.report.page.page_figures import page_figures
-from sfm_app.report.page.photo_rows import LEFT_OUT, PLACED, PhotoRow, photo_rows
-from sfm_app.report.page.scene_view import scene_view
+from sfm_app.report.page.photo_rows import LEFT_OUT, PLACED, PhotoRow, embedded_pictures, photo_names, photo_rows
+from sfm_app.report.page.scene_view import embedded_view
 from sfm_app.report.page.three_script import three_script
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import LOCK, Workspace
@@ -68,10 +70,10 @@ def write_report(run: RunContext, beside_run: RunContext | None = None) -> Path:
     Raises:
         InputError: a folder holds no run.
     """
-    contents, other = _read_run(run), _read_run(beside_run) if beside_run is not None else None
+    contents, other = read_run(run), read_run(beside_run) if beside_run is not None else None
     path = run.workspace.root / REPORT
     with replace_atomically(path) as beside:
-        beside.write_text(render_page(contents, other), encoding="utf-8")
+        beside.write_text(render_page(contents, embed_parts(contents), other), encoding="utf-8")
     return path
 
 
@@ -85,8 +87,36 @@ def _as_plain(problem: SfmError) -> dict[str, Any]:
     return {"message": problem.message, "hint": problem.hint, "photos": problem.photos}
 
 
-def _read_run(run: RunContext) -> RunContents:
-    """Return what a run has left; InputError where the folder holds none."""
+@dataclass(frozen=True, slots=True)
+class LargeParts:
+    """The parts of the page that are too large for one file where the model is large."""
+
+    pictures: Mapping[str, str]
+    """Addresses of small pictures, by name of the photo; may lack some."""
+    view: Mapping[str, Json] | None
+    """What the 3D view needs; None where no photo has a place."""
+    is_served: bool
+    """Whether they are loaded from where the page is from; else they are in the page, and it may load nothing."""
+
+
+def embed_parts(contents: RunContents) -> LargeParts:
+    """Return the large parts as data in the page.
+
+    Args:
+        contents: of the run.
+    """
+    return LargeParts(embedded_pictures(contents), embedded_view(contents, photo_names(contents)), is_served=False)
+
+
+def read_run(run: RunContext) -> RunContents:
+    """Return what a run has left.
+
+    Args:
+        run: with its output folder.
+
+    Raises:
+        InputError: the folder holds no run.
+    """
     contents = read_contents(run)
     if not contents.manifest:
         raise InputError(
@@ -95,17 +125,17 @@ def _read_run(run: RunContext) -> RunContents:
     return contents
 
 
-def render_page(contents: RunContents, other: RunContents | None = None) -> str:
+def render_page(contents: RunContents, parts: LargeParts, other: RunContents | None = None) -> str:
     """Return the page as HTML.
 
     Args:
         contents: of the run.
+        parts: pictures and view of this run.
         other: what another run has left, to compare it with.
     """
     figures = _model_figures(contents)
-    rows = photo_rows(contents, figures)
-    names = sorted(photo.name for photo in contents.photos.photos) if contents.photos else []
-    view = scene_view(contents, names)
+    rows = photo_rows(contents, figures, parts.pictures)
+    view = parts.view
     warnings, others = findings.remarks(contents)
     return _environment().get_template("page.html.jinja").render(
         title=contents.run.workspace.root.resolve().name,
@@ -123,7 +153,9 @@ def render_page(contents: RunContents, other: RunContents | None = None) -> str:
         settings=json.dumps(contents.manifest.get("settings", {}), indent=1),
         versions=contents.manifest.get("versions", {}),
         figures=page_figures(contents, figures),
+        depths=depth_pictures(contents),
         view=view is not None and bool(three_script()),
+        served=parts.is_served,
         data=script_data({"view": view, "photos": [_photo_data(row) for row in rows]}),
         three=Markup(three_script()),  # noqa: S704 - a script of an installed package, without user text
     )  # fmt: skip
@@ -172,5 +204,6 @@ def _environment() -> jinja2.Environment:
         loader=jinja2.FileSystemLoader(ASSETS), autoescape=True, undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
+    found.globals["correlation_text"] = correlation_text
     found.globals["asset"] = lambda name: Markup((ASSETS / name).read_text(encoding="utf-8"))  # noqa: S704 - our files
     return found

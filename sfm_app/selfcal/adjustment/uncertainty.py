@@ -3,6 +3,8 @@
 Ours; leaving out photos is the jackknife (Efron 1982). Key pairs are what chapter 6 of the thesis asks for.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,9 +14,11 @@ from sfm_app.selfcal.adjustment.structureless_ba import OWN_CAMERA_SIGMAS
 from sfm_app.selfcal.adjustment.two_view_cost import CAMERA
 from sfm_app.selfcal.lens import CENTER_U, CENTER_V, KAPPA, LOG_ASPECT, LOG_FOCAL
 from sfm_app.types import PairId
+from sfm_app.types.correlations import named_correlations
 
 FloatArray = NDArray[np.float64]
 
+NAMES = ("fx", "fy", "cx", "cy", "k1")
 MODEL_ERROR = np.array([1e-3, 1e-3, 1e-3, 1e-3, 3e-3])
 """Standard deviations of errors that no lens model covers: of log f, u and v in longer sides, log a, and k1.
 docs/algorithms.md, Self-calibration, 4. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
@@ -42,8 +46,15 @@ def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> Float
     return np.asarray(found + np.diag(floor.ravel() ** 2), np.float64)
 
 
-def spread_from_covariance(theta: FloatArray, cov: FloatArray, unit_px: float) -> dict[str, float]:
-    """Return the standard deviations of fx, fy, cx, cy in pixels and of k1.
+class Uncertainty(NamedTuple):
+    """How far the parameters of a camera may be off, and which of them are off together; as in `Calibration`."""
+
+    spread: dict[str, float]
+    correlations: dict[str, float]
+
+
+def camera_uncertainty(theta: FloatArray, cov: FloatArray, unit_px: float) -> Uncertainty:
+    """Return the standard deviations of fx, fy, cx, cy in pixels and of k1, and their correlations.
 
     Args:
         theta: (5,) parameters of the camera.
@@ -58,8 +69,9 @@ def spread_from_covariance(theta: FloatArray, cov: FloatArray, unit_px: float) -
     slopes[1, [LOG_FOCAL, LOG_ASPECT]] = focal * half, 0.5 * focal * half
     slopes[2, CENTER_U] = slopes[3, CENTER_V] = unit_px
     slopes[4, [LOG_FOCAL, KAPPA]] = 2.0 * theta[KAPPA] * squared, squared
-    deviations = np.sqrt(np.maximum(np.diag(slopes @ cov @ slopes.T), 0.0))
-    return dict(zip(("fx", "fy", "cx", "cy", "k1"), deviations.tolist(), strict=True))
+    found = slopes @ cov @ slopes.T
+    deviations = np.sqrt(np.maximum(np.diag(found), 0.0))
+    return Uncertainty(dict(zip(NAMES, deviations.tolist(), strict=True)), named_correlations(NAMES, found))
 
 
 def key_pairs(fit: Fit, photos: tuple[PairId, ...]) -> tuple[PairId, ...]:

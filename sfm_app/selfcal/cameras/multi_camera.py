@@ -20,7 +20,7 @@ from sfm_app.selfcal.adjustment.camera_priors import FOCAL_SPREAD, HINT_SPREAD, 
 from sfm_app.selfcal.adjustment.structureless_ba import Matches
 from sfm_app.selfcal.adjustment.tied_priors import TiedPriors
 from sfm_app.selfcal.adjustment.two_view_cost import CAMERA
-from sfm_app.selfcal.adjustment.uncertainty import covariance, key_pairs, spread_from_covariance
+from sfm_app.selfcal.adjustment.uncertainty import camera_uncertainty, covariance, key_pairs
 from sfm_app.selfcal.cameras.max_sum import best_places
 from sfm_app.selfcal.consensus import consensus_peak
 from sfm_app.selfcal.consensus.peak_evidence import MIN_LEAD, RIVAL_RATIO
@@ -256,9 +256,8 @@ def _judge_camera(
     if reason:
         return guess_calibration(camera.size, reason, evidence)
     found = calibration_from_parameters(theta, camera.size, method, unit)
-    found = replace(
-        found, spread=spread_from_covariance(theta, block, unit), evidence=evidence, held=fit.held_names(index)
-    )
+    uncertainty = camera_uncertainty(theta, block, unit)
+    found = replace(found, **uncertainty._asdict(), evidence=evidence, held=fit.held_names(index))
     return downgrade_to_estimate(found, vague)
 
 

@@ -307,7 +307,8 @@ def _fall_back_to_guess(camera: CalibratedCamera, pairs: PhotoPairs) -> Calibrat
     size = pairs.sizes[camera.photos[0]]
     if not np.isfinite(claim):
         return found if camera.family >= 0 else guess_calibration(size, found.reason, found.evidence)
-    return replace(found, K=guessed_camera_matrix(size, claim), method="exif", radial=0.0, spread={}, held=())
+    K = guessed_camera_matrix(size, claim)
+    return replace(found, K=K, method="exif", radial=0.0, spread={}, correlations={}, held=())
 
 
 def _claimed_focal(camera: CalibratedCamera, pairs: PhotoPairs) -> float:

@@ -114,6 +114,18 @@ def test_stated_deviations_are_those_of_independent_noise_times_the_misfit():
     assert np.all((stated > 1.5 * scatter) & (stated < 8 * scatter))
 
 
+def test_parameters_are_off_together_as_their_mean_squares_say():
+    true, places = [900.0, 900.0, 500.0, 400.0, -0.2, 0.2, 0.0, 0.0], [0, 4, 5]
+    found = [answer(seen(true, seed=seed, photos=5, points=200)) for seed in range(20)]
+
+    drawn = np.corrcoef(np.array([one.params[0, places] for one in found]).T)
+    squares = np.mean([one.mean_squares[0] for one in found], axis=0)[np.ix_(places, places)]
+    stated = squares / np.sqrt(np.outer(np.diag(squares), np.diag(squares)))
+
+    assert -1.0 < stated[1, 2] < -0.7 and -1.0 < drawn[1, 2] < -0.7  # what k1 bends, k2 bends back
+    assert np.abs(stated - drawn)[0].max() < 0.5
+
+
 def test_what_is_not_determined_stays_where_it_is_and_may_be_off():
     true = [30000.0, 30000.0, 506.0, 395.0, 0.0, 0.0, 0.0, 0.0]
     bundle = starting_at(seen(true, noise_px=1.0), [30000.0, 30000.0, 498.0, 401.0, 0.0, 0.0, 0.0, 0.0])

@@ -50,6 +50,14 @@ def test_frusta_are_seen_and_do_not_hide_the_scene(step, depth):
     assert frustum_depth(centers, points) == pytest.approx(depth, rel=0.05)
 
 
+def test_cameras_along_the_streets_of_a_town_do_not_hide_each_other():
+    walk = 0.6 * np.column_stack([np.arange(1000), np.zeros((1000, 2))])
+    still = np.zeros((1000, 3))
+
+    assert frustum_depth(walk, 0.2 * walk) == pytest.approx(0.2)
+    assert 0.0 < frustum_depth(still, walk) == pytest.approx(0.9 * 600 / 3000, rel=0.01)
+
+
 def test_without_cameras_there_is_nothing(ball):
     assert [len(part) for part in (*camera_lines(ball), *camera_dots(ball))] == [0, 0, 0, 0]
 

@@ -281,11 +281,12 @@ def test_what_is_known_of_refined_cameras_goes_by_their_names():
         model=SimpleNamespace(images=images),
         deviations={7: {"fx": 1.0}, 8: {"fx": 2.0}},
         determined={7: ("k1",), 8: ()},
+        correlations={7: {"fx k1": 0.5}},
     )
 
     found = scene.refined_cameras(adjusted, {"1.jpg": "a", "2.jpg": "a", "3.jpg": "b", "4.jpg": "c"})
 
     assert found == {
-        "a": {"deviations": {"fx": 1.0}, "determined": ("k1",)},
-        "b": {"deviations": {"fx": 2.0}, "determined": ()},
+        "a": {"deviations": {"fx": 1.0}, "determined": ("k1",), "correlations": {"fx k1": 0.5}},
+        "b": {"deviations": {"fx": 2.0}, "determined": (), "correlations": {}},
     }

@@ -7,7 +7,8 @@ from sfm_app.types import Calibration, Intrinsics
 
 FOUND = Calibration(
     np.array([[900.5, 0, 501.25], [0, 901.5, 373.0], [0, 0, 1]]), 1000, 750, "zero-curves", True, radial=-0.0625,
-    spread={"fx": 3.5, "k1": 0.01}, held=("aspect",), key_pairs=((1, 4), (2, 7)), evidence={"pairs": 12.0},
+    spread={"fx": 3.5, "k1": 0.01}, correlations={"fx k1": -0.75}, held=("aspect",),
+    key_pairs=((1, 4), (2, 7)), evidence={"pairs": 12.0},
 )  # fmt: skip
 UNKNOWN = Calibration(np.diag([1200.0, 1200.0, 1.0]), 1000, 750, "exif", False, "an orbit")
 
@@ -19,6 +20,13 @@ def test_every_field_of_a_calibration_survives():
         for name in one.__slots__:
             assert name == "K" or getattr(back, name) == getattr(one, name)
             assert type(getattr(back, name)) is type(getattr(one, name))
+
+
+def test_files_from_before_there_were_correlations_are_read():
+    older = FOUND.to_dict()
+    del older["correlations"]
+
+    assert Calibration.from_dict(older).correlations == {}
 
 
 def test_distortion_is_written_only_where_there_is_any():

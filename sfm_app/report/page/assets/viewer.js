@@ -1,5 +1,5 @@
 "use strict";
-// The 3D view: an orbit around a point, with up kept upright; cameras that can be chosen.
+// The 3D view: an orbit around a point, with up kept upright; cameras that can be chosen. Other scripts add to `sfmViewer`.
 (() => {
   const { view, photos } = JSON.parse(document.getElementById("data").textContent);
   const canvas = document.getElementById("view");
@@ -70,17 +70,52 @@
     return sum.lengthSq() > 0.01 * view.cameras.length ** 2 ? Math.atan2(sum.x, sum.z) : 0.6;
   }
 
-  // points
-  const places = new Float32Array(bytes(view.places).buffer), colors = bytes(view.colors);
-  const cloud = new THREE.BufferGeometry();
-  cloud.setAttribute("position", new THREE.BufferAttribute(places, 3));
-  const linear = new Float32Array(colors.length), color = new THREE.Color();
-  for (let k = 0; k < colors.length; k += 3) {
-    color.setRGB(colors[k] / 255, colors[k + 1] / 255, colors[k + 2] / 255).convertSRGBToLinear().toArray(linear, k);
+  // points: in the page, or in levels from coarse to fine that are loaded when they are shown
+  const points = new THREE.Group(), dots = new THREE.PointsMaterial({ vertexColors: true, size: 2.5, sizeAttenuation: false });
+  const toLinear = Float32Array.from({ length: 256 }, (_, k) => new THREE.Color(k / 255, 0, 0).convertSRGBToLinear().r);
+  function addPoints(places, colors) {
+    const cloud = new THREE.BufferGeometry();
+    cloud.setAttribute("position", new THREE.BufferAttribute(places, 3));
+    const linear = new Float32Array(colors.length);
+    for (let k = 0; k < colors.length; k += 1) linear[k] = toLinear[colors[k]];
+    cloud.setAttribute("color", new THREE.BufferAttribute(linear, 3));
+    points.add(new THREE.Points(cloud, dots));
+    dirty = true;
   }
-  cloud.setAttribute("color", new THREE.BufferAttribute(linear, 3));
-  const points = new THREE.Points(cloud, new THREE.PointsMaterial({ vertexColors: true, size: 2.5, sizeAttenuation: false }));
   scene.add(points);
+  let nextLevel = 0, loadingPoints = false;
+  async function loadPoints() {
+    if (!view.levels || loadingPoints) return;
+    loadingPoints = true;
+    while (points.visible && nextLevel < view.levels.length) {
+      const count = view.levels[nextLevel], data = await load(`points/${nextLevel}`, `points, level ${nextLevel + 1} of ${view.levels.length}`);
+      if (!data) break;
+      addPoints(new Float32Array(data, 0, 3 * count), new Uint8Array(data, 12 * count));
+      nextLevel += 1;
+    }
+    loadingPoints = false;
+    canvas.dataset.levels = String(nextLevel);
+  }
+
+  // a file from where the page is from; undefined where it cannot be had
+  const status = byId("loading");
+  async function load(address, what) {
+    try {
+      const answer = await fetch(address);
+      if (!answer.ok) throw new Error(`${answer.status}`);
+      const whole = Number(answer.headers.get("Content-Length")), reader = answer.body.getReader(), data = new Uint8Array(whole);
+      for (let at = 0, part; !(part = await reader.read()).done; at += part.value.length) {
+        data.set(part.value, at);
+        status.textContent = whole > 2e6 ? `loading the ${what}: ${Math.round((100 * at) / whole)} % of ${(whole / 1e6).toFixed(0)} MB` : "";
+      }
+      status.textContent = "";
+      return data.buffer;
+    } catch {
+      status.setAttribute("role", "alert");
+      status.textContent = `The ${what} could not be loaded. Is sfm-app view still running?`;
+      return undefined;
+    }
+  }
 
   // cameras
   const frusta = new THREE.Group(), centers = [];
@@ -103,7 +138,7 @@
   // model
   let model = null;
   const tick = (id, on) => byId(id).addEventListener("change", (event) => { on(event.target.checked); dirty = true; });
-  tick("show-points", (on) => { points.visible = on; });
+  tick("show-points", (on) => { points.visible = on; loadPoints(); });
   tick("show-cameras", (on) => { frusta.visible = on; });
   tick("show-model", (on) => { if (model) model.visible = on; });
   function withoutModel() {
@@ -112,19 +147,52 @@
     byId("show-model").checked = false;
     dirty = true;
   }
-  points.visible = !view.glb;
-  if (view.glb) {
-    new THREE.GLTFLoader().parse(bytes(view.glb).buffer, "", (found) => {
-      model = found.scene;
+  function showModel(data) {
+    return new Promise((ready, failed) => new THREE.GLTFLoader().parse(data, "", (found) => {
       const lines = [];
-      model.traverse((node) => { if (node.isLine || node.isLineSegments) lines.push(node); });
+      found.scene.traverse((node) => { if (node.isLine || node.isLineSegments) lines.push(node); });
       for (const node of lines) node.parent.remove(node); // the file's own cameras: these here can be chosen
+      if (model) discard(model);
+      model = found.scene;
+      model.visible = byId("show-model").checked;
       scene.add(model);
       dirty = true;
-      canvas.dataset.model = "shown";
-    }, withoutModel);
+      ready();
+    }, failed));
+  }
+  function discard(old) {
+    scene.remove(old);
+    old.traverse((node) => {
+      node.geometry?.dispose();
+      node.material?.map?.dispose();
+      node.material?.dispose();
+    });
+  }
+  // points are seen at once; then the light model, where there is one; then the full one takes its place
+  async function loadModels() {
+    loadPoints();
+    for (const [number, address] of view.models.entries()) {
+      const what = number + 1 < view.models.length ? "light model" : "full model";
+      const data = await load(address, what);
+      try {
+        if (!data) continue;
+        await showModel(data);
+        canvas.dataset.model = number + 1 < view.models.length ? "light" : "shown";
+        if (number === 0) points.visible = byId("show-points").checked;
+      } catch {
+        status.textContent = `The ${what} cannot be shown here.`;
+      }
+    }
+    if (!model) withoutModel();
+    loadPoints();
+  }
+  if (view.levels) {
+    loadModels();
   } else {
-    withoutModel();
+    points.visible = !view.glb;
+    addPoints(new Float32Array(bytes(view.places).buffer), bytes(view.colors));
+    if (view.glb) showModel(bytes(view.glb).buffer).then(() => { canvas.dataset.model = "shown"; }, withoutModel);
+    else withoutModel();
   }
 
   // choosing a camera
@@ -134,6 +202,7 @@
     const row = document.querySelector(`tr[data-row="${one.row}"] img`);
     byId("chosen").hidden = false;
     byId("chosen-picture").src = row ? row.src : "";
+    byId("chosen-picture").dataset.large = view.photos && row ? `${view.photos}/${one.row}` : "";
     byId("chosen-picture").alt = `The photo ${one.name}`;
     const more = photo && photo.points !== undefined ? `${photo.points} points, ${(photo.residual_px ?? 0).toFixed(2)} px` : "";
     byId("chosen-text").textContent = [one.name, more].filter(Boolean).join(" · ");
@@ -197,6 +266,7 @@
     const last = fingers.get(event.pointerId);
     fingers.delete(event.pointerId);
     if (last && moved < 5 && event.type === "pointerup" && fingers.size === 0) {
+      if (viewer.onTap?.(event.offsetX, event.offsetY)) return;
       const number = nearestCamera(event.offsetX, event.offsetY);
       if (number >= 0) choose(number, true);
     }
@@ -210,8 +280,11 @@
     zoom(Math.exp(Math.sign(event.deltaY) * 0.1));
   }, { passive: false });
   canvas.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.altKey || event.metaKey) return;
+    const shift = event.shiftKey;
     const keys = {
-      ArrowLeft: () => turn(-0.1, 0), ArrowRight: () => turn(0.1, 0), ArrowUp: () => turn(0, 0.08), ArrowDown: () => turn(0, -0.08),
+      ArrowLeft: () => (shift ? pan(30, 0) : turn(-0.1, 0)), ArrowRight: () => (shift ? pan(-30, 0) : turn(0.1, 0)),
+      ArrowUp: () => (shift ? pan(0, 30) : turn(0, 0.08)), ArrowDown: () => (shift ? pan(0, -30) : turn(0, -0.08)),
       "+": () => zoom(0.85), "=": () => zoom(0.85), "-": () => zoom(1.18), 0: showAll,
     };
     if (!(event.key in keys)) return;
@@ -242,6 +315,36 @@
     canvas.focus();
   });
 
+  // what is seen at a place of the canvas: the surface, else the nearest of the points around it
+  const ray = new THREE.Raycaster(), NEAR_PX = 8;
+  function pick(x, y) {
+    const { clientWidth: width, clientHeight: height } = canvas;
+    eye.updateMatrixWorld(); // it may have moved since the last frame
+    ray.setFromCamera({ x: (2 * x) / width - 1, y: 1 - (2 * y) / height }, eye);
+    const hit = model?.visible ? ray.intersectObject(model, true)[0] : undefined;
+    if (hit) return hit.point;
+    if (!points.visible) return null;
+    const at = new THREE.Vector3(), toScreen = new THREE.Matrix4().multiplyMatrices(eye.projectionMatrix, eye.matrixWorldInverse);
+    let least = Infinity, best = null;
+    for (const cloud of points.children) {
+      const all = cloud.geometry.getAttribute("position");
+      for (let k = 0; k < all.count; k += 1) {
+        at.fromBufferAttribute(all, k).applyMatrix4(toScreen);
+        const off = Math.hypot(((at.x + 1) / 2) * width - x, ((1 - at.y) / 2) * height - y);
+        if (Math.abs(at.z) < 1 && off < NEAR_PX && at.z < least) { least = at.z; best = new THREE.Vector3().fromBufferAttribute(all, k); }
+      }
+    }
+    return best;
+  }
+
+  // where a point of the scene is on the canvas, in pixels; null behind the eye
+  function project(point) {
+    const at = point.clone().project(eye);
+    return at.z > 1 ? null : [((at.x + 1) / 2) * canvas.clientWidth, ((1 - at.y) / 2) * canvas.clientHeight];
+  }
+  const viewer = { view, canvas, pick, project, redraw: () => { dirty = true; }, onTap: null, onDraw: null };
+  window.sfmViewer = viewer;
+
   // rows of the table fly to their camera
   const numberOfRow = new Map(view.cameras.map((one, number) => [one.row, number]));
   for (const row of document.querySelectorAll("#photo-table tbody tr")) {
@@ -258,6 +361,7 @@
 
   function fit() {
     const width = canvas.clientWidth, height = canvas.clientHeight;
+    if (!width || !height) return; // not shown now
     renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     renderer.setSize(width, height, false);
     eye.aspect = width / height;
@@ -280,6 +384,7 @@
     if (!dirty) return;
     dirty = false;
     renderer.render(scene, eye);
+    viewer.onDraw?.();
   }
   fit();
   showAll();

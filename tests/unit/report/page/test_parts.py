@@ -8,12 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sfm_app.report.page.findings import changed_settings, duration_text, glance, value_text
+from sfm_app.report.page.findings import changed_settings, duration_text, glance, unknown_cameras, value_text
 from sfm_app.report.page.photo_rows import ALL_PIXELS, LARGEST_PX, SMALLEST_PX, picture_side
 from sfm_app.report.page.scene_view import LIGHT_PAGE_PX, lighten
 from sfm_app.report.page.three_script import three_script
 from sfm_app.report.page.writing import script_data
 from sfm_app.settings import Settings
+from sfm_app.types import Calibration, CameraModel
 
 
 def test_three_js_comes_from_an_installed_package_and_ends_before_the_page_that_it_was_in():
@@ -67,6 +68,24 @@ def test_nothing_is_claimed_of_a_run_without_a_stage():
     contents = SimpleNamespace(scene=None, intrinsics=None, stages={}, counts=lambda _: {})
 
     assert glance(contents) == []
+
+
+@pytest.mark.parametrize("after", [None, 675.12])
+def test_a_camera_that_pairs_do_not_determine_comes_with_what_to_do(after):
+    K = np.diag([768.0, 768.0, 1.0])
+    camera = Calibration(K, 640, 480, "guess", identifiable=False, reason="an orbit")
+    known = replace(camera, identifiable=True, method="zero-curves")
+    adjusted = None
+    if after is not None:
+        K = np.diag([after, after, 1.0])
+        adjusted = SimpleNamespace(cameras={"b": CameraModel("PINHOLE", (), K, 640, 480, {"fx": 2.47})})
+    contents = SimpleNamespace(intrinsics=SimpleNamespace(cameras={"a": known, "b": camera}), scene=adjusted)
+
+    [said] = unknown_cameras(contents)
+
+    assert said.startswith("Pairs of photos do not determine the camera b: an orbit. A focal of 768 px is a guess")
+    assert ("came to 675.1 ± 2.5 px" in said) == (after is not None)
+    assert "What to do: add photos" in said
 
 
 def test_a_large_texture_is_shrunk_and_keeps_its_colors(textured_ball):

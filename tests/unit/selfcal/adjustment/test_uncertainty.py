@@ -6,7 +6,7 @@ import pytest
 from sfm_app.selfcal.adjustment.calibrate_pairs import fit_cameras, jackknife_deviations
 from sfm_app.selfcal.adjustment.camera_priors import CameraPriors
 from sfm_app.selfcal.adjustment.structureless_ba import Matches
-from sfm_app.selfcal.adjustment.uncertainty import covariance, key_pairs, spread_from_covariance
+from sfm_app.selfcal.adjustment.uncertainty import camera_uncertainty, covariance, key_pairs
 from sfm_app.selfcal.results import calibration_from_parameters, parameters_from_calibration
 
 pytestmark = pytest.mark.slow
@@ -29,7 +29,7 @@ def test_standard_deviations_are_those_of_repeated_photos(shots):
         made = shots(5, 40 + seed, k1=-0.1, center=(0.56, 0.46), points=90, noise_px=1.0)
         fit = fitted(made.pairs)
         theta = fit.state.thetas[0]
-        said = spread_from_covariance(theta, covariance(fit, np.ones(1)), SIDE)
+        said = camera_uncertainty(theta, covariance(fit, np.ones(1)), SIDE).spread
         found = calibration_from_parameters(theta, (1000, 750), "mine")
         errors = [*(found.K - made.Ks[0])[[0, 1, 0, 1], [0, 1, 2, 2]], found.radial + 0.1]
         scores.append(np.array(errors) / [said[name] for name in ("fx", "fy", "cx", "cy", "k1")])
@@ -41,12 +41,15 @@ def test_standard_deviations_are_those_of_repeated_photos(shots):
 def test_spread_is_the_first_order_of_the_answer():
     theta = np.array([0.2, 0.03, -0.02, 0.1, -0.05])
     root = np.random.default_rng(0).normal(size=(5, 5)) * 1e-4
-    said = spread_from_covariance(theta, root @ root.T, SIDE)
+    said, correlations = camera_uncertainty(theta, root @ root.T, SIDE)
     drawn = theta + np.random.default_rng(1).normal(size=(4000, 5)) @ root.T
     answers = [calibration_from_parameters(one, (1000, 750), "mine") for one in drawn]
     values = np.array([[*a.K[[0, 1, 0, 1], [0, 1, 2, 2]], a.radial] for a in answers])
     assert list(said) == ["fx", "fy", "cx", "cy", "k1"]
     np.testing.assert_allclose(list(said.values()), values.std(axis=0), rtol=0.04)
+    drawn_so = np.corrcoef(values.T)[np.triu_indices(5, 1)]
+    assert list(correlations)[:2] == ["fx fy", "fx cx"] and np.ptp(drawn_so) > 0.5
+    np.testing.assert_allclose(list(correlations.values()), drawn_so, atol=0.05)
 
 
 def test_parameters_survive_the_answer():
