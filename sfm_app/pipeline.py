@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sfm_app.camera_files import read_given_cameras
 from sfm_app.engine.execution import Pipeline
-from sfm_app.engine.stage import Stage
+from sfm_app.engine.stage import Products, Stage
 from sfm_app.photos import read_source
 from sfm_app.runtime.context import CONTROL_POINTS, GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.parallel import ordered_map

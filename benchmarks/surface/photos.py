@@ -12,7 +12,7 @@ from PIL import Image
 
 from benchmarks.common.results import Row
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.model import submodel
+from sfm_app.colmap.models.model import submodel
 from sfm_app.synthetic.pictures import Picture, PreparedModel, render_rays
 
 Pixels = NDArray[np.uint8]

@@ -24,7 +24,7 @@ from sfm_app.bundle_adjustment.readout import ReadoutEstimate
 from sfm_app.colmap.backend import pycolmap, show_log
 from sfm_app.colmap.bundle import Adjustment, adjust
 from sfm_app.colmap.bundles.rolling_shutter import measure_readout, read_keypoints, straighten_model
-from sfm_app.colmap.model import posed_images
+from sfm_app.colmap.models.model import posed_images
 from sfm_app.progress import SilentProgress
 from sfm_app.reconstruction.videos.rolling_shutter import ROUNDS, Readout, follow_shutter
 from sfm_app.synthetic.trajectory import WalkOptions

@@ -1,4 +1,4 @@
-"""Flags that are settings: type, help, range and default come from the field in `settings.py`."""
+"""Flags that are settings: type, help, range and default come from the field in `settings/`."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

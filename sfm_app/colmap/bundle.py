@@ -24,7 +24,7 @@ from sfm_app.colmap.bundles.bundle_arrays import (
 from sfm_app.colmap.bundles.bundle_rounds import Rounds, adjust_in_rounds, solve
 from sfm_app.colmap.bundles.lens_choice import Families, LensRecord, best_families, record_lenses
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.model import finite_mask
+from sfm_app.colmap.models.model import finite_mask
 from sfm_app.colmap.types import all_cameras, all_points
 from sfm_app.geometry.lenses.projections import FX, FY, PANORAMA
 from sfm_app.numerical import FAILURES, error_reason, finite_entries

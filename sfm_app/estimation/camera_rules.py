@@ -6,7 +6,7 @@ import numpy as np
 
 from sfm_app.bundle_adjustment.camera_rules import CameraRule
 from sfm_app.colmap.bundle import Adjustment
-from sfm_app.colmap.model import posed_images
+from sfm_app.colmap.models.model import posed_images
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.estimation.exif_check import FocalClaim, focal_claim
 from sfm_app.types import Calibration, Intrinsics, MatchedImage, MatchGraph, Scene

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.model import posed_images, read_model, sparse_model
+from sfm_app.colmap.models.model import posed_images
+from sfm_app.colmap.models.stored_model import read_model, sparse_model
 from sfm_app.colmap.surface import FUSED, open_points, positions
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.engine.stage import Products, Stage, check_undamaged, resume_hint

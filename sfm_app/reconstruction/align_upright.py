@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import translate_errors
-from sfm_app.colmap.model import (
+from sfm_app.colmap.models.model import (
     finite_mask,
     focal_px,
     move,

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm_app.colmap.model import cameras_by_photo, posed_photo_ids
+from sfm_app.colmap.models.model import cameras_by_photo, posed_photo_ids
 from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.reconstruction.baseline import connected_photos, has_many_unplaced
 from sfm_app.reconstruction.mapping_runs import EQUAL_TOLERANCE, MAX_CONTRADICTED_SHARE, Attempt

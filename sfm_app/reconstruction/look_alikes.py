@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_app.colmap.backend import translate_errors
-from sfm_app.colmap.model import posed_images
+from sfm_app.colmap.models.model import posed_images
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.numerical import Json
 from sfm_app.posegraph.graph import LOOKS_ALIKE

@@ -7,7 +7,7 @@ import numpy as np
 
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
-from sfm_app.colmap.model import cameras_by_photo, posed_photo_ids
+from sfm_app.colmap.models.model import cameras_by_photo, posed_photo_ids
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
 from sfm_app.reconstruction.baseline import guessed_intrinsics, has_many_unplaced, map_baseline, rival_reason
 from sfm_app.reconstruction.camera_per_photo import (

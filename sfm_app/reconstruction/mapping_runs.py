@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm_app.colmap.backend import run_interruptible, translate_errors
 from sfm_app.colmap.mapping import copy_database, map_globally, map_incrementally
-from sfm_app.colmap.model import model_from_seed
+from sfm_app.colmap.models.model import model_from_seed
 from sfm_app.colmap.types import Cancellation, CancellationToken, Reconstruction
 from sfm_app.errors import BackendError
 from sfm_app.numerical import FAILURES, error_reason

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.bundle import adjust_or_keep
-from sfm_app.colmap.joined_model import merge_models
-from sfm_app.colmap.model import points_by_keypoint, posed_photo_ids
+from sfm_app.colmap.models.joined_model import merge_models
+from sfm_app.colmap.models.model import points_by_keypoint, posed_photo_ids
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.geometry.similarity import robust_similarity
 from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, judge_model

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from sfm_app.colmap.backend import translate_errors
-from sfm_app.colmap.model import posed_photo_ids, submodel
+from sfm_app.colmap.models.model import posed_photo_ids, submodel
 from sfm_app.posegraph.groups import DisjointGroups
 from sfm_app.reconstruction.mapping_runs import MIN_PHOTOS, Attempt
 from sfm_app.reconstruction.support import PairSupport

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import read_features, write_match_graph
-from sfm_app.colmap.model import posed_photo_ids
+from sfm_app.colmap.models.model import posed_photo_ids
 from sfm_app.errors import ClusterError, SfmError
 from sfm_app.estimation.calibrating import find_intrinsics
 from sfm_app.estimation.fitting import fit_pairs, to_view_graph

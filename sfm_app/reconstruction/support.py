@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.model import placed_views
+from sfm_app.colmap.models.model import placed_views
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.posegraph.pair_pose import is_in_front, ray_angles_deg
 from sfm_app.posegraph.refine import pose_distances

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import csr_array, triu
 
 from sfm_app.colmap.backend import translate_errors
-from sfm_app.colmap.model import posed_images
+from sfm_app.colmap.models.model import posed_images
 from sfm_app.colmap.types import Reconstruction, all_points
 
 MIN_SHARED_POINTS = 5

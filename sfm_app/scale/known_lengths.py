@@ -10,7 +10,7 @@ from sfm_app.scale.evidence import ScaleEvidence
 from sfm_app.scale.marker_scale import marker_scales
 from sfm_app.scale.markers import find_markers_in_file
 from sfm_app.scale.measuring import Sightlines, measure_distance
-from sfm_app.scale.photo_rays import PosedPhotos, laid_out_pixels, named_photos
+from sfm_app.scale.photo_rays import PosedPhotos, named_photos, unrotate_pixels
 from sfm_app.scale.sighted_points import Sight, SightedPoint, locate_point
 from sfm_app.tasks import Task
 from sfm_app.types import ControlPoints, Photo, PhotoSet
@@ -100,7 +100,7 @@ def _mark_sights(
         photo = names.get(name)
         if photo is None or photo.name not in posed:
             continue
-        pixel = laid_out_pixels(photo, np.array([mark]))
+        pixel = unrotate_pixels(photo, np.array([mark]))
         if not (0 <= pixel[0, 0] <= photo.width and 0 <= pixel[0, 1] <= photo.height):
             problems.append(f"ground control point '{point}': its mark in {name} lies outside of the photo")
             continue

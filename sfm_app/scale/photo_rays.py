@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import translate_errors
-from sfm_app.colmap.model import focal_px, posed_images, seen_points, viewing_rays
+from sfm_app.colmap.models.model import focal_px, posed_images, seen_points, viewing_rays
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.scale.measuring import Sightlines
 from sfm_app.scale.sighted_points import Sight
@@ -73,7 +73,7 @@ class PosedPhotos:
         return Sightlines(centers, focals, found.points, tuple(np.split(cameras[order], ends)), residual)
 
 
-def laid_out_pixels(photo: Photo, upright: FloatArray) -> FloatArray:
+def unrotate_pixels(photo: Photo, upright: FloatArray) -> FloatArray:
     """Return pixels of the upright photo as pixels of the photo as it is laid out, in the sensor's orientation.
 
     Args:

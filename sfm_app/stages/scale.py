@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_app.atomic_io import replace_atomically
-from sfm_app.colmap.model import sparse_model
+from sfm_app.colmap.models.stored_model import sparse_model
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.hashing import digest_files
 from sfm_app.numerical import json_text

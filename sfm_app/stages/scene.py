@@ -9,7 +9,8 @@ from pathlib import Path
 from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.colmap.backend import check_written, translate_errors
 from sfm_app.colmap.bundle import Adjustment, adjust_or_keep
-from sfm_app.colmap.model import RefinedCamera, color_points, posed_images, posed_photo_ids, read_scene, sparse_model
+from sfm_app.colmap.models.model import color_points, posed_images, posed_photo_ids
+from sfm_app.colmap.models.stored_model import RefinedCamera, read_scene, sparse_model
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import ReconstructionError
 from sfm_app.estimation.camera_check import report_checks

@@ -13,6 +13,7 @@ from sfm_app.formats import EXPORTERS
 from sfm_app.pipeline import NAMES, STAGES
 from sfm_app.runtime.manifest import StageRecord
 from sfm_app.runtime.workspace import Workspace
+from sfm_app.scale import MetricFrame
 
 LAST = STAGES[-1].takes[-1]
 """The stage whose product the files of the model hold."""
@@ -29,6 +30,7 @@ def finished(textured_ball, tmp_path):
         vertices=surface.vertices, faces=surface.faces, colors=surface.colors,
         uv=texture.uv, page=texture.page, page0=texture.pages[0], page1=texture.pages[1],
     )  # fmt: skip
+    place.scale.write_text(json.dumps(MetricFrame().to_dict()))
     for stage in NAMES[:-1]:
         place.manifest.finish(stage, StageRecord("", 0.0, digest=LAST.digest(place)), {})
     return place.root

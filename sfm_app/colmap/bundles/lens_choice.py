@@ -13,7 +13,7 @@ from sfm_app.bundle_adjustment.normal_equations import Bundle, cost, reduce
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundles.bundle_arrays import NO_RULES, Rules, read_bundle, write_camera
 from sfm_app.colmap.bundles.bundle_rounds import LOSS_SCALE_PX, MIN_PHOTOS, Rounds, adjust_in_rounds, lens_priors
-from sfm_app.colmap.model import posed_images, submodel
+from sfm_app.colmap.models.model import posed_images, submodel
 from sfm_app.geometry.lenses.projections import CX, CY, FISHEYE, FX, FY, PERSPECTIVE
 from sfm_app.numerical import FAILURES, Json, error_reason
 

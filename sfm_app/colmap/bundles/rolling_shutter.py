@@ -16,7 +16,7 @@ from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundle import Adjustment
 from sfm_app.colmap.bundles.bundle_arrays import read_bundle, write_bundle
 from sfm_app.colmap.bundles.bundle_rounds import LOSS_SCALE_PX, lens_priors
-from sfm_app.colmap.model import posed_images, viewing_rays
+from sfm_app.colmap.models.model import posed_images, viewing_rays
 from sfm_app.geometry.lenses.projections import project_points
 
 FloatArray = NDArray[np.float64]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import pycolmap, translate_errors
-from sfm_app.colmap.model import finite_mask, posed_images
+from sfm_app.colmap.models.model import finite_mask, posed_images
 
 CELLS = 8
 """Cells along each side of a photo whose share with points is its coverage. Chosen by hand."""

@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.model import pose_photo, posed_images, unposed_model
+from sfm_app.colmap.models.model import pose_photo, posed_images, unposed_model
 from sfm_app.colmap.types import all_points
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import check_written, pycolmap, translate_errors
-from sfm_app.colmap.model import finite_mask, posed_images
+from sfm_app.colmap.models.model import finite_mask, posed_images
 from sfm_app.colmap.wide_views import WideLens, add_view_cameras, perspective_lenses
 from sfm_app.geometry.lenses.perspective_views import PerspectiveView, center_view
 from sfm_app.types.exported import PerspectivePhoto, PointCloud

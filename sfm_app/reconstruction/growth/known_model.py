@@ -12,7 +12,7 @@ from sfm_app.colmap.backend import run_interruptible, translate_errors
 from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
 from sfm_app.colmap.growth.grown_model import model_in_database
 from sfm_app.colmap.mapping import map_incrementally
-from sfm_app.colmap.model import posed_photo_ids, submodel
+from sfm_app.colmap.models.model import posed_photo_ids, submodel
 from sfm_app.colmap.types import CancellationToken, Reconstruction
 from sfm_app.errors import BackendError
 from sfm_app.estimation.calibrating import find_intrinsics

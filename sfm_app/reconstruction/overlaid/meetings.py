@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from sfm_app.colmap.backend import translate_errors
-from sfm_app.colmap.model import focal_px, posed_images
+from sfm_app.colmap.models.model import focal_px, posed_images
 from sfm_app.colmap.types import Camera, Reconstruction, all_points
 from sfm_app.posegraph.coverage import CELLS, cell_numbers
 from sfm_app.posegraph.look_alikes import LEAST_CELLS

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.joined_model import PlacedPhotos
+from sfm_app.colmap.models.joined_model import PlacedPhotos
 from sfm_app.geometry.similarity import Similarity, robust_similarity
 from sfm_app.posegraph.pair_pose import is_in_front
 from sfm_app.posegraph.refine import pose_distances

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sfm_app.colmap.joined_model import PlacedPhotos
+from sfm_app.colmap.models.joined_model import PlacedPhotos
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.reconstruction.parts.joins import Fragment
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from sfm_app.atomic_io import replace_atomically
 from sfm_app.colmap.backend import check_written, translate_errors
 from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
-from sfm_app.colmap.model import posed_photo_ids, submodel
+from sfm_app.colmap.models.model import posed_photo_ids, submodel
 from sfm_app.colmap.processes.worker_process import MappingTask, serve
 from sfm_app.plugins import load_plugins
 from sfm_app.reconstruction.mapping_runs import Attempt, Group, best_attempt, map_group

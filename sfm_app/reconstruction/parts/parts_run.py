@@ -7,7 +7,7 @@ from itertools import combinations
 from pathlib import Path
 
 from sfm_app.colmap.backend import run_in_daemon_thread, translate_errors
-from sfm_app.colmap.joined_model import read_placed, settle, write_placed
+from sfm_app.colmap.models.joined_model import read_placed, settle, write_placed
 from sfm_app.errors import BackendError
 from sfm_app.numerical import FAILURES, Json, error_reason
 from sfm_app.reconstruction.mapping_runs import (

@@ -10,7 +10,7 @@ from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.bundle import Adjustment, adjust_or_keep
 from sfm_app.colmap.bundles.bundle_arrays import NO_RULES, Rules
 from sfm_app.colmap.bundles.rolling_shutter import measure_readout, read_keypoints, straighten_model
-from sfm_app.colmap.model import posed_photo_ids
+from sfm_app.colmap.models.model import posed_photo_ids
 from sfm_app.numerical import FAILURES, Json
 from sfm_app.progress import Progress
 from sfm_app.reconstruction.videos.frame_times import FrameTimes, frame_times

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.model import sparse_model
+from sfm_app.colmap.models.stored_model import sparse_model
 from sfm_app.formats.frusta import center, frustum_depth, scene_size
 from sfm_app.formats.glb import FLIP, write_glb
 from sfm_app.numerical import Json

@@ -70,7 +70,7 @@ def test_whoever_imports_a_constant_sees_it_scaled():
 
 def test_a_module_that_is_imported_already_is_refused():
     with pytest.raises(RuntimeError, match="imported already"):
-        install(Constant("sfm_app/settings.py", "ANY"), 2.0)
+        install(Constant("sfm_app/settings/tables.py", "ANY"), 2.0)
 
 
 def test_rows_show_differences_and_failures():

@@ -11,9 +11,10 @@ from sfm_app.colmap.surface import write_points
 from sfm_app.formats.ply import COLOR, NORMAL, PLACE
 from sfm_app.numerical import json_text
 from sfm_app.photos import save_mask
-from sfm_app.pipeline import MESH, NAMES, SCENE
+from sfm_app.pipeline import MESH, NAMES, SCALE, SCENE
 from sfm_app.runtime.manifest import StageRecord
 from sfm_app.runtime.workspace import Workspace
+from sfm_app.scale import MetricFrame
 
 SIZE = 240, 160
 CAMERAS = {
@@ -111,8 +112,9 @@ def make_run(tmp_path):
         np.savez(
             place.surface / "surface.npz", vertices=np.eye(3), faces=np.array([[0, 1, 2]]), colors=np.zeros((3, 3))
         )
+        place.scale.write_text(json_text(MetricFrame().to_dict()), encoding="utf-8")
         for name in NAMES[: NAMES.index(until) + 1]:
-            stage = {"scene": SCENE, "mesh": MESH}.get(name)
+            stage = {"scene": SCENE, "scale": SCALE, "mesh": MESH}.get(name)
             place.manifest.finish(name, StageRecord("", 0.0, digest=stage.digest(place) if stage else ""), {})
         return SimpleNamespace(model=model, place=place, out=place.root, cloud=cloud)
 

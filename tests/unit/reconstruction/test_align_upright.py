@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.model import poses_and_points
+from sfm_app.colmap.models.model import poses_and_points
 from sfm_app.orientation.georeference import enu_m, position_from_enu
 from sfm_app.orientation.gravity import up_direction
 from sfm_app.reconstruction import align_upright

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.model import MappedCamera
+from sfm_app.colmap.models.model import MappedCamera
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.reconstruction import camera_per_photo
 from sfm_app.reconstruction import mapping_passes as module

@@ -8,7 +8,7 @@ import pytest
 
 from sfm_app.colmap.bundle import adjust
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.model import posed_photo_ids
+from sfm_app.colmap.models.model import posed_photo_ids
 from sfm_app.errors import BackendError
 from sfm_app.posegraph.graph import LOOKS_ALIKE
 from sfm_app.reconstruction import baseline

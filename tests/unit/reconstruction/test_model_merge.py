@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.colmap.model import move, posed_photo_ids, poses_and_points, submodel
+from sfm_app.colmap.models.model import move, posed_photo_ids, poses_and_points, submodel
 from sfm_app.geometry.similarity import Similarity, umeyama
 from sfm_app.reconstruction import mapping_passes
 from sfm_app.reconstruction.mapping_passes import reconstruct

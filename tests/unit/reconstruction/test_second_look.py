@@ -7,7 +7,7 @@ import pytest
 
 from sfm_app.api import open_run
 from sfm_app.colmap.database import write_keypoints, write_matches
-from sfm_app.colmap.model import posed_photo_ids
+from sfm_app.colmap.models.model import posed_photo_ids
 from sfm_app.errors import BackendError, ClusterError
 from sfm_app.reconstruction import second_look as module
 from sfm_app.reconstruction.mapping_passes import Outcome

@@ -9,7 +9,7 @@ from PIL import Image
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.scale import MetricFrame, move_model
 from sfm_app.scale.evidence import ScaleEvidence
-from sfm_app.scale.photo_rays import laid_out_pixels
+from sfm_app.scale.photo_rays import unrotate_pixels
 from sfm_app.synthetic.cameras import axis_rotation
 from sfm_app.types import Photo
 
@@ -57,4 +57,4 @@ def test_pixels_of_the_upright_photo_are_found_as_it_is_laid_out(turn):
     row, column = np.argwhere(upright)[0]
     photo = Photo("a.jpg", 60, 40, "one camera", turn_deg=turn)
 
-    assert laid_out_pixels(photo, np.array([[column + 0.5, row + 0.5]])).tolist() == [[47.5, 11.5]]
+    assert unrotate_pixels(photo, np.array([[column + 0.5, row + 0.5]])).tolist() == [[47.5, 11.5]]

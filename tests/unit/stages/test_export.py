@@ -7,6 +7,7 @@ from sfm_app.formats.pages import JPEG_QUALITY
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
+from sfm_app.scale import MetricFrame
 from sfm_app.settings import Settings
 from sfm_app.stages import export
 
@@ -17,7 +18,7 @@ def run(tmp_path):
 
 
 def test_the_manifest_says_how_large_the_files_are_and_how_good_the_pictures(textured_ball, run):
-    paths = export.make(textured_ball, run)
+    paths = export.make(textured_ball, MetricFrame(), run)
 
     assert paths == export.load(run)
     assert [path.name for path in paths] == ["model.ply", "model.glb"]
@@ -31,6 +32,6 @@ def test_the_manifest_says_how_large_the_files_are_and_how_good_the_pictures(tex
 
 
 def test_without_a_texture_it_says_nothing_about_pictures(ball, run):
-    export.make(ball, run)
+    export.make(ball, MetricFrame(), run)
 
     assert list(run.statistics) == ["bytes"]

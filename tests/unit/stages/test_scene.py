@@ -11,7 +11,7 @@ import pytest
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundles import bundle_rounds
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.model import posed_photo_ids, submodel
+from sfm_app.colmap.models.model import posed_photo_ids, submodel
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.plugins import load_plugins

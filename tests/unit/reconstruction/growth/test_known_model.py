@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.database import write_match_graph
-from sfm_app.colmap.model import posed_photo_ids, submodel
+from sfm_app.colmap.models.model import posed_photo_ids, submodel
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.reconstruction.growth import known_model as module
 from sfm_app.reconstruction.growth.known_model import map_new_photos

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.joined_model import PlacedPhotos
+from sfm_app.colmap.models.joined_model import PlacedPhotos
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import fundamental_from_pose
 from sfm_app.geometry.similarity import Similarity

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.colmap.joined_model import PlacedPhotos
+from sfm_app.colmap.models.joined_model import PlacedPhotos
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.reconstruction.parts.frames import align_fragments, loop_errors
 from sfm_app.reconstruction.parts.joins import Fragment, Join

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
-from sfm_app.colmap.model import poses_and_points
+from sfm_app.colmap.models.model import poses_and_points
 from sfm_app.errors import BackendError, ClusterError
 from sfm_app.geometry.similarity import umeyama
 from sfm_app.plugins import load_plugins

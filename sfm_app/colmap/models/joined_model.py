@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import pycolmap, translate_errors
 from sfm_app.colmap.bundle import drop_infinite_points, find_correspondences
 from sfm_app.colmap.bundles.bundle_rounds import improve_tracks, solve
-from sfm_app.colmap.model import bearing_vectors, move, pose_photo, posed_images, unposed_model
+from sfm_app.colmap.models.model import bearing_vectors, move, pose_photo, posed_images, unposed_model
 from sfm_app.colmap.types import all_points
 from sfm_app.geometry.similarity import Similarity
 

@@ -1,0 +1,1 @@
+"""COLMAP's sparse models: built, divided, joined, and read from the disk."""
