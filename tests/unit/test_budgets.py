@@ -7,7 +7,9 @@ from pathlib import Path
 import sfm_app
 
 PACKAGE = Path(sfm_app.__file__).parent
-COMMANDS = tuple(f"cli/commands.py:{name}" for name in ("run", "calibrate", "export", "report", "view"))
+COMMANDS = tuple(
+    f"cli/commands.py:{name}" for name in ("run", "calibrate", "export", "markers", "measure", "report", "view")
+)
 """Their docstrings are what `--help` prints; click says what the options are."""
 
 
