@@ -32,6 +32,7 @@ from sfm_app.cli.display import (
 from sfm_app.cli.doctor import examine
 from sfm_app.cli.formats import ExportCommand, choose_format
 from sfm_app.cli.options import output_options, settings_from_flags, settings_options
+from sfm_app.cli.outcome import outcome_lines
 from sfm_app.cli.terminal import Terminal
 from sfm_app.colmap.backend import has_running_call
 from sfm_app.demo import demo_lines, run_demo
@@ -123,7 +124,10 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: A
     settings = settings_from_flags(flags)
     out = out or photos.resolve().with_name(f"{photos.resolve().name}-model")
     done = reconstruct(photos, out, settings, first=first or "", last=last, progress=Terminal(quiet=flags["quiet"]))
-    print_json(run_summary(done)) if flags["as_json"] else print_lines(run_lines(done))
+    if flags["as_json"]:
+        print_json(run_summary(done))
+    else:
+        print_lines(run_lines(done) if flags["verbose"] else outcome_lines(done))
 
 
 @main.command()

@@ -67,7 +67,7 @@ def run_lines(run: Run) -> list[str]:
     lines.append(f"photos      {summary['photos']['usable']} usable")
     lines += [f"            {line}" for line in photo_lines(summary["photos"])]
     if summary["masks"] is not None:
-        lines += _mask_lines(summary["masks"], summary["photos"]["usable"])
+        lines += mask_lines(summary["masks"], summary["photos"]["usable"])
     if summary["pairs"]["kept"] is not None:
         rejected = ", ".join(f"{count} {reason}" for reason, count in summary["pairs"]["rejected"].items())
         lines.append(
@@ -116,8 +116,13 @@ def photo_lines(photos: Mapping[str, Any]) -> Iterator[str]:
         yield f"left out: {abbreviate_names(names)}: {reason}"
 
 
-def _mask_lines(masks: Mapping[str, Any], photos: int) -> Iterator[str]:
-    """Yield how many photos have a mask, and which mask files belong to no photo."""
+def mask_lines(masks: Mapping[str, Any], photos: int) -> Iterator[str]:
+    """Yield how many photos have a mask, and which mask files belong to no photo.
+
+    Args:
+        masks: their figures in the manifest.
+        photos: how many are used.
+    """
     yield f"masks       {masks['photos']} of {photos} photos"
     if masks["unused"]:
         yield f"            without a photo that is used: {abbreviate_names(masks['unused'])}"

@@ -24,7 +24,12 @@ def settings_options(command: Command) -> Command:
         *(setting_option(flag) for flag in SETTING_FLAGS),
         click.option("--no-plugins", is_flag=True, help=f"Do not {without}."),
         click.option("--set", "assignments", multiple=True, metavar="TABLE.KEY=VALUE", help="Any other setting."),
-        click.option("-v", "--verbose", count=True, help="Show COLMAP's warnings; -vv shows all of its log."),
+        click.option(
+            "-v",
+            "--verbose",
+            count=True,
+            help="Print all that was found, and COLMAP's warnings; -vv shows all of its log.",
+        ),
     )
     return reduce(lambda wrapped, option: option(wrapped), reversed(options), command)
 

@@ -17,6 +17,10 @@ SURE = 2.0
 """Distortion in deviations from which on its direction is said: 19 in 20. By convention."""
 
 
+WARNING = "beware: "
+"""How the texts of a run begin what one should look at."""
+
+
 def field_text(camera: Calibration) -> str:
     """Return what the camera sees, through its lens."""
     if camera.projection == EQUIRECTANGULAR:
@@ -83,3 +87,10 @@ def held_text(camera: Calibration) -> str:
 def _deviation(camera: Calibration, name: str) -> str:
     value = camera.spread.get(name, 0.0)
     return f" +- {value:.0f}" if value >= 1.5 else f" +- {value:.1f}" if value > 0 else ""
+
+
+def duration_text(seconds: float) -> str:
+    """Return seconds in words."""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

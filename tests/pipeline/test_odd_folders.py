@@ -144,7 +144,7 @@ def test_two_groups_of_photos_give_the_larger_one(courtyard, heap, folder, tmp_p
     assert (scene["registered"], scene["of"]) == (6, 10)
     assert sorted(scene["unregistered"]) == [f"heap_view_{k:02d}.jpg" for k in range(4)]
     assert (out / "sparse").is_dir()
-    told = call("run", folder, "-o", out, "--until", "scene").stdout
+    told = call("run", folder, "-o", out, "--until", "scene", "-v").stdout
     assert all(f"heap_view_{k:02d}.jpg" in told for k in range(4))
 
 

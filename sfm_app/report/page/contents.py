@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any, NamedTuple, TypeVar
 
@@ -10,7 +10,8 @@ from sfm_app.errors import SfmError
 from sfm_app.numerical import FAILURES
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.manifest import PROBLEM
-from sfm_app.stages import intrinsics, match_graph, photos, scene, view_graph
+from sfm_app.scale import MetricFrame
+from sfm_app.stages import intrinsics, match_graph, photos, scale, scene, view_graph
 from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
 
 logger = logging.getLogger("sfm_app")
@@ -40,6 +41,8 @@ class RunContents:
     views: ViewGraph | None = None
     intrinsics: Intrinsics | None = None
     scene: Scene | None = None
+    frame: MetricFrame = field(default_factory=MetricFrame)
+    """That of exported files; that of the scene where nothing is known of its size."""
 
     @property
     def problem(self) -> "Problem | None":
@@ -48,6 +51,12 @@ class RunContents:
         if not noted:
             return None
         return Problem(noted.get("message", ""), noted.get("hint", ""), noted.get("photos", {}))
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether the unit of exported files is the meter."""
+        by_gps = self.counts("scene").get("orientation", {}).get("unit") == "meter"
+        return self.frame.is_metric or ("scale" not in self.stages and by_gps)
 
     @property
     def stages(self) -> Mapping[str, Any]:
@@ -92,4 +101,5 @@ def read_contents(run: RunContext) -> RunContents:
         read(view_graph, lambda: view_graph.load(run)),
         read(intrinsics, lambda: intrinsics.load(run)),
         read(scene, lambda: scene.load(run)),
+        read(scale, lambda: scale.load(run)) or MetricFrame(),
     )

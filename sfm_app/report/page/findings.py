@@ -7,12 +7,12 @@ from typing import Any
 from sfm_app.report.camera_text import SOURCES, contradiction_lines, intrinsics_lines
 from sfm_app.report.page.contents import RunContents
 from sfm_app.report.page.correlations import CorrelationTable, correlation_table
+from sfm_app.report.scale_text import scale_lines
 from sfm_app.report.scene_text import scene_lines
+from sfm_app.report.words import WARNING, duration_text
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, CameraModel
 
-WARNING = "beware: "
-"""How the texts of a run begin what one should look at."""
 UNKNOWN_CAMERA = "these photos do not determine it"
 """How the texts of a camera begin why it is a guess."""
 DETERMINE_IT = (
@@ -92,20 +92,19 @@ def _facts(contents: RunContents) -> Iterator[Fact]:
     triangles = contents.counts("mesh").get("triangles")
     if triangles:
         yield Fact("triangles", f"{triangles:,}")
-    unit = contents.counts("scene").get("orientation", {}).get("unit")
-    if unit:
-        yield Fact(
-            "unit", "meters" if unit == "meter" else "its own", "by GPS" if unit == "meter" else "no scale known"
-        )
+    if scene is not None:
+        yield _unit_fact(contents)
     if contents.stages:
         yield Fact("time", duration_text(sum(stage["seconds"] for stage in contents.stages.values())))
 
 
-def duration_text(seconds: float) -> str:
-    """Return seconds in words."""
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+def _unit_fact(contents: RunContents) -> Fact:
+    """Return the unit of the model, and how well it is known."""
+    if not contents.is_metric:
+        return Fact("unit", "its own", "no scale known")
+    frame = contents.frame
+    by = f"by {frame.source.partition(', ')[0]}" if frame.source else "by GPS"
+    return Fact("unit", "meters", by if frame.deviation is None else f"± {100 * frame.deviation:.2g} %, {by}")
 
 
 def remarks(contents: RunContents) -> tuple[list[str], list[str]]:
@@ -119,6 +118,8 @@ def remarks(contents: RunContents) -> tuple[list[str], list[str]]:
         lines += contradiction_lines(contents.counts(stage))
     if contents.scene is not None:
         lines += scene_lines(contents.scene, contents.counts("scene"))
+    if "scale" in contents.stages:
+        lines += scale_lines(contents.counts("scale"))
     texts = [plain_text(line) for line in lines]
     warnings = [text.removeprefix(WARNING) for text in texts if text.startswith(WARNING)]
     others = [text for text in texts if not text.startswith((WARNING, UNKNOWN_CAMERA))]

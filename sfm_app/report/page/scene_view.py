@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from sfm_app.colmap.models.stored_model import sparse_model
 from sfm_app.formats.frusta import center, frustum_depth, scene_size
 from sfm_app.formats.glb import FLIP, write_glb
+from sfm_app.geometry.similarity import Similarity
 from sfm_app.numerical import Json
 from sfm_app.report.page.contents import UNREADABLE, RunContents
+from sfm_app.scale import move_model
 from sfm_app.stages import texture
 from sfm_app.types import Frustum, Model
 
@@ -47,7 +49,7 @@ def embedded_view(contents: RunContents, photos: Sequence[str]) -> Mapping[str, 
 
 
 def view_points(contents: RunContents) -> Model | None:
-    """Return the points and the cameras of the scene; None where there are none.
+    """Return the points and the cameras of the scene, in the frame of exported files; None where there are none.
 
     Args:
         contents: of the run.
@@ -55,7 +57,7 @@ def view_points(contents: RunContents) -> Model | None:
     if contents.scene is None:
         return None
     try:
-        return sparse_model(contents.scene.model_dir)
+        return move_model(sparse_model(contents.scene.model_dir), contents.frame.from_model)
     except UNREADABLE as err:
         logger.info("the report has no 3D view", exc_info=err)
         return None
@@ -71,13 +73,13 @@ def view_frame(contents: RunContents, points: Model, photos: Sequence[str]) -> d
     """
     rows = {name: number for number, name in enumerate(photos)}
     middle, size = _bounds(points)
-    unit = contents.counts("scene").get("orientation", {}).get("unit")
     return {
         "cameras": [_camera(camera, rows.get(camera.name)) for camera in points.cameras],
         "middle": middle,
         "size": size,
         "depth": frustum_depth(np.array([center(camera) for camera in points.cameras]), points.surface.vertices),
-        "unit": "m" if unit == "meter" else "",
+        "unit": "m" if contents.is_metric else "",
+        "fromModel": _plain_similarity(contents.frame.from_model),
     }
 
 
@@ -97,7 +99,8 @@ def light_model(contents: RunContents) -> bytes:
     Args:
         contents: of a run with a texture.
     """
-    return write_glb(lighten(texture.load(contents.run)), "model")["model.glb"]
+    model = move_model(texture.load(contents.run), contents.frame.from_model)
+    return write_glb(lighten(model), "model")["model.glb"]
 
 
 def _model_bytes(contents: RunContents) -> bytes:
@@ -161,6 +164,11 @@ def _camera(camera: Frustum, row: int | None) -> dict[str, Any]:
         "across": float(camera.width / (2 * camera.K[0, 0])),
         "down": float(camera.height / (2 * camera.K[1, 1])),
     }
+
+
+def _plain_similarity(similarity: Similarity) -> dict[str, Json]:
+    """Return scale, rotation by rows and translation: `--scale` takes points in the frame before it."""
+    return {"scale": similarity.scale, "R": similarity.R.ravel().tolist(), "t": similarity.t.tolist()}
 
 
 def _base64(data: bytes) -> str:

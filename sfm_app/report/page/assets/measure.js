@@ -10,6 +10,12 @@
 
   const number = (value) => String(Number(value.toPrecision(6)) || 0);
   const coordinates = (point) => point.toArray().map(number).join(",");
+  // --scale takes places in the frame of the model on disk: before the size was known, or with another one
+  const { scale, R, t } = view.fromModel;
+  function inModel(point) {
+    const at = point.toArray().map((value, k) => (value - t[k]) / scale);
+    return [0, 1, 2].map((k) => number(R[k] * at[0] + R[3 + k] * at[1] + R[6 + k] * at[2])).join(",");
+  }
   const length = (value) => (view.unit ? `${Number(value.toPrecision(4))} ${view.unit}` : `${Number(value.toPrecision(4))} units of the model`);
 
   function turnOn(wanted) {
@@ -49,7 +55,7 @@
       : `Mark ${a ? "B" : "A"}: click or tap on the model. By keyboard: turn the view until the cross is there, and press Enter.`;
     if (b) {
       const places = `"${coordinates(a)}" "${coordinates(b)}"`, out = view.out || "OUT";
-      write("command-scale", `sfm-app run PHOTOS -o ${out} --scale ${places} 1.25m`);
+      write("command-scale", `sfm-app run PHOTOS -o ${out} --scale "${inModel(a)}" "${inModel(b)}" 1.25m`);
       // after "--", a negative coordinate is no option
       write("command-measure", `sfm-app measure ${out} ${places.includes('"-') ? "-- " : ""}${places}`);
     }
