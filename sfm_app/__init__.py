@@ -1,6 +1,8 @@
 """Reconstruct a 3D model from a folder of uncalibrated photos.
 
-run = sfm_app.reconstruct("photos/", "out/")
+run = sfm_app.reconstruct("photos/", "out/", progress=print)
+run = sfm_app.read_run("out/")
+points, poses = run.scene.arrays.points, run.scene.arrays.cam_from_world
 cal = sfm_app.calibrate_photos("photos/")
 sfm_app.export_model("out/", "obj")
 sfm_app.export_scene("out/", "colmap")
@@ -17,7 +19,8 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from sfm_app.errors import BackendError, ConfigError, InputError, PluginError, ReconstructionError, SfmError
-from sfm_app.types import Calibration, EpipolarFit, Intrinsics, Rejected
+from sfm_app.progress import Step
+from sfm_app.types import Calibration, EpipolarFit, Intrinsics, Rejected, SceneArrays
 
 if TYPE_CHECKING:
     from sfm_app.api import (
@@ -29,6 +32,7 @@ if TYPE_CHECKING:
         export_model,
         export_scene,
         measure_distance,
+        read_run,
         reconstruct,
         view_run,
         write_report,
@@ -48,8 +52,10 @@ __all__ = [
     "ReconstructionError",
     "Rejected",
     "Run",
+    "SceneArrays",
     "Settings",
     "SfmError",
+    "Step",
     "__version__",
     "calibrate_fundamentals",
     "calibrate_photos",
@@ -58,6 +64,7 @@ __all__ = [
     "export_model",
     "export_scene",
     "measure_distance",
+    "read_run",
     "reconstruct",
     "view_run",
     "write_report",

@@ -1,7 +1,7 @@
 """The interface through which long work reports its progress, whatever displays it."""
 
-from collections.abc import Iterable, Iterator
-from typing import Protocol, TypeVar
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple, Protocol, TypeVar
 
 Item = TypeVar("Item")
 
@@ -75,6 +75,73 @@ class SilentProgress:
 
     def finish(self) -> None:
         """Show nothing."""
+
+
+class Step(NamedTuple):
+    """How far a run has come, for a callback."""
+
+    stage: str
+    """Name of the current stage, as in the manifest; empty before the first."""
+    label: str
+    """What is done, or a message, for people."""
+    done: int
+    """Steps of the current work that are done."""
+    total: int
+    """Steps of the current work; 0 where it has none: a stage that begins, a message."""
+
+
+Callback = Callable[[Step], None]
+
+
+class CallbackProgress(SilentProgress):
+    """A display that calls a function with every step; an exception from it ends the run, which can be resumed.
+
+    Args:
+        callback: called in the thread that started the run.
+    """
+
+    def __init__(self, callback: Callback) -> None:
+        self.callback = callback
+        self.now = Step("", "", 0, 0)
+
+    def stage(self, name: str, note: str = "") -> None:
+        """Tell of a stage.
+
+        Args:
+            name, note: as in `Progress`.
+        """
+        self._tell(Step(name, note, 0, 0))
+
+    def say(self, text: str) -> None:
+        """Tell of a message."""
+        self.callback(Step(self.now.stage, text, 0, 0))
+
+    def start(self, label: str, total: int) -> None:
+        """Tell of work that begins.
+
+        Args:
+            label, total: as in `Progress`.
+        """
+        self._tell(Step(self.now.stage, label, 0, total))
+
+    def advance(self, steps: int = 1) -> None:
+        """Tell of steps that are done."""
+        self._tell(self.now._replace(done=self.now.done + steps))
+
+    def _tell(self, step: Step) -> None:
+        self.now = step
+        self.callback(step)
+
+
+def as_progress(shown: Progress | Callback | None) -> Progress:
+    """Return the display of progress that a caller means.
+
+    Args:
+        shown: a display, a function that is called with every step, or None for silence.
+    """
+    if shown is None:
+        return SilentProgress()
+    return CallbackProgress(shown) if callable(shown) else shown
 
 
 def track(progress: Progress, items: Iterable[Item], label: str, total: int) -> Iterator[Item]:

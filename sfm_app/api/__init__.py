@@ -2,11 +2,13 @@
 
 from sfm_app.api.estimators import calibrate_fundamentals, estimate_fundamental, estimate_lens
 from sfm_app.api.finished_runs import export_model, export_scene, measure_distance, view_run, write_report
-from sfm_app.api.runs import PathLike, Run, calibrate_photos, open_run, reconstruct
+from sfm_app.api.run import PathLike, Run, RunScene, open_run
+from sfm_app.api.runs import calibrate_photos, read_run, reconstruct
 
 __all__ = [
     "PathLike",
     "Run",
+    "RunScene",
     "calibrate_fundamentals",
     "calibrate_photos",
     "estimate_fundamental",
@@ -15,6 +17,7 @@ __all__ = [
     "export_scene",
     "measure_distance",
     "open_run",
+    "read_run",
     "reconstruct",
     "view_run",
     "write_report",

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sfm_app.api.runs import PathLike, open_run
+from sfm_app.api.run import PathLike, open_run
 from sfm_app.atomic_io import replace_atomically, save_files
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.formats.exporters import CLOUD
 from sfm_app.plugins import load_plugins
-from sfm_app.progress import Progress
+from sfm_app.progress import Callback, Progress
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.scale.measuring import Distance
 from sfm_app.settings import Settings
@@ -36,7 +36,11 @@ def write_report(out: PathLike, compare: PathLike | None = None) -> Path:
 
 
 def view_run(
-    out: PathLike, *, port: int = 0, started: Callable[[str], None] | None = None, progress: Progress | None = None
+    out: PathLike,
+    *,
+    port: int = 0,
+    started: Callable[[str], None] | None = None,
+    progress: Progress | Callback | None = None,
 ) -> None:
     """Serve the report of a run to the browsers of this machine until Ctrl-C, with its model at full size.
 
@@ -44,7 +48,7 @@ def view_run(
         out: output folder of the run, which may have stopped at any stage.
         port: to listen on; 0 for any that is free.
         started: called with the address of the page once it can be opened.
-        progress: display of progress; silent by default.
+        progress: display of progress, or a function that is called with every `Step`; silent by default.
 
     Raises:
         InputError: the folder holds no run.
@@ -94,7 +98,7 @@ def export_model(
 
 
 def export_scene(
-    out: PathLike, file_format: str, target: PathLike | None = None, *, progress: Progress | None = None
+    out: PathLike, file_format: str, target: PathLike | None = None, *, progress: Progress | Callback | None = None
 ) -> Path:
     """Write cameras, poses, points and photos of a finished run for another program; no mesh is needed.
 
@@ -103,7 +107,7 @@ def export_scene(
         file_format: "colmap", "splat", "nerfstudio", "cameras", or another that `sfm-app plugins` lists.
         target: file or folder to write; None for OUT/cameras.json, OUT/cloud.laz, OUT/export/colmap, ... A folder that
             an earlier export has written is replaced.
-        progress: display of progress; silent by default.
+        progress: display of progress, or a function that is called with every `Step`; silent by default.
 
     Returns:
         The file or the folder.

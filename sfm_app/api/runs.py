@@ -1,65 +1,23 @@
-"""Whole runs: from photos to a mesh, or to a camera."""
+"""Whole runs: from photos to a mesh, or to a camera, and finished ones read again."""
 
-import os
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from sfm_app.errors import SfmError
-from sfm_app.plugins import load_plugins
-from sfm_app.progress import Progress, SilentProgress
-from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.parallel import open_executor
-from sfm_app.runtime.workspace import Workspace
+from sfm_app.api.run import PathLike, Run, RunScene, open_run
+from sfm_app.errors import InputError, SfmError
+from sfm_app.progress import Callback, Progress
 from sfm_app.settings import Settings
-from sfm_app.types import Intrinsics, Scene
+from sfm_app.types import Intrinsics
 
-PathLike = str | os.PathLike[str]
-
-
-@dataclass(frozen=True, slots=True)
-class Run:
-    """The results of a finished run."""
-
-    out: Path
-    calibration: Intrinsics | None
-    """K per camera group as found before bundle adjustment; None when the run stopped earlier."""
-    scene: Scene | None
-    """The sparse reconstruction with the refined cameras; None when the run stopped earlier."""
-    model_dir: Path | None
-    """COLMAP's sparse model."""
-    mesh_path: Path | None
-    """model.glb; model.ply lies beside it."""
-    manifest: dict[str, Any]
-    """manifest.json, with the stages up to the one where the run stopped."""
-    report_path: Path | None = None
-    """report.html; None where `report` is off in the settings."""
-
-
-@contextmanager
-def open_run(out: Path, settings: Settings, progress: Progress | None) -> Iterator[RunContext]:
-    """Provide a run with its workers, which stop when the block ends.
-
-    Args:
-        out: output folder.
-        settings: of the run.
-        progress: display of progress; None for silence.
-    """
-    plugins = load_plugins(installed=settings.plugins)
-    plugins.estimator(settings.epipolar.estimator)  # unknown names are refused before any work is done
-    plugins.calibrator(settings.calibration.calibrator)
-    plugins.feature_method(settings.matching.features)
-    place, shown = Workspace(out), progress or SilentProgress()
-    with open_executor(settings, place.parcels, shown) as (executor, workers):
-        yield RunContext(settings, place, plugins, executor, workers, shown)
+if TYPE_CHECKING:
+    from sfm_app.engine.stage import Products
+    from sfm_app.runtime.context import RunContext
 
 
 def reconstruct(
     photos: PathLike, out: PathLike, settings: Settings | None = None, *,
-    first: str = "", last: str = "files", progress: Progress | None = None,
+    first: str = "", last: str = "files", progress: Progress | Callback | None = None,
 ) -> Run:  # fmt: skip
     """Turn a folder of photos, or a video, into a mesh: OUT/model.ply and OUT/model.glb.
 
@@ -71,7 +29,7 @@ def reconstruct(
         settings: None for the defaults.
         first: redo everything from this stage on.
         last: stop after this stage.
-        progress: display of progress; silent by default.
+        progress: display of progress, or a function that is called with every `Step`; silent by default.
 
     Raises:
         SfmError: see `sfm_app.errors`; its message and hint say what went wrong and what to do.
@@ -88,24 +46,60 @@ def reconstruct(
             if written := finish_report(run, err):
                 run.progress.say(f"what was found until then: {written}")
             raise
-        report = finish_report(run)
-        manifest = run.workspace.manifest.read()
-        done = pipeline.PIPELINE.stages_until(last)
-        scene = products[pipeline.SCENE] if pipeline.SCENE in done else None
-        return Run(
-            out=run.workspace.root,
-            calibration=products[pipeline.INTRINSICS] if pipeline.INTRINSICS in done else None,
-            scene=scene,
-            model_dir=scene.model_dir if scene else None,
-            mesh_path=products[pipeline.FILES][-1] if pipeline.FILES in done else None,
-            manifest={**manifest, "stages": {stage.name: manifest["stages"][stage.name] for stage in done}},
-            report_path=report,
-        )
+        return _as_run(run, products, last, finish_report(run))
+
+
+def read_run(out: PathLike) -> Run:
+    """Read a finished run again, up to where it has come; nothing is computed.
+
+    Args:
+        out: its output folder.
+
+    Raises:
+        InputError: it holds no run, or its files are damaged.
+    """
+    from sfm_app import pipeline  # loads COLMAP
+    from sfm_app.engine.stage import Products
+    from sfm_app.report.page import REPORT
+
+    with open_run(Path(out), Settings(), None) as run:
+        run.workspace.manifest.check_format()
+        done = [name for name in pipeline.NAMES if run.workspace.manifest.record(name) is not None]
+        if not done:
+            raise InputError(f"{out} holds no run", hint="name the folder that `sfm-app run PHOTOS -o OUT` wrote")
+        report = run.workspace.root / REPORT
+        return _as_run(run, Products(run), done[-1], report if report.exists() else None)
+
+
+def _as_run(run: "RunContext", products: "Products", last: str, report: Path | None) -> Run:
+    """Return the products of a run up to a stage.
+
+    Args:
+        run: with its output folder.
+        products: of its stages.
+        last: name of the stage where it stopped.
+        report: its report; None where there is none.
+    """
+    from sfm_app import pipeline
+
+    manifest: dict[str, Any] = run.workspace.manifest.read()
+    # a run of an earlier version may lack a stage
+    done = [stage for stage in pipeline.PIPELINE.stages_until(last) if stage.name in manifest["stages"]]
+    scene = RunScene.of(products[pipeline.SCENE], run.workspace.root) if pipeline.SCENE in done else None
+    return Run(
+        out=run.workspace.root,
+        calibration=products[pipeline.INTRINSICS] if pipeline.INTRINSICS in done else None,
+        scene=scene,
+        model_dir=scene.model_dir if scene else None,
+        mesh_path=products[pipeline.FILES][-1] if pipeline.FILES in done else None,
+        manifest={**manifest, "stages": {stage.name: manifest["stages"][stage.name] for stage in done}},
+        report_path=report,
+    )
 
 
 def calibrate_photos(
     photos: PathLike, settings: Settings | None = None, *,
-    out: PathLike | None = None, figure: PathLike | None = None, progress: Progress | None = None,
+    out: PathLike | None = None, figure: PathLike | None = None, progress: Progress | Callback | None = None,
 ) -> Intrinsics:  # fmt: skip
     """Find the camera matrix of a folder of photos, or of a video, without reconstructing the scene.
 
@@ -114,7 +108,7 @@ def calibrate_photos(
         settings: None for the defaults.
         out: folder that keeps features and matches for a later run; None for a temporary one.
         figure: PNG, SVG or PDF file to draw the pairs' votes, the lens and the residuals into; None for no figure.
-        progress: display of progress; silent by default.
+        progress: display of progress, or a function that is called with every `Step`; silent by default.
 
     Raises:
         SfmError: see `sfm_app.errors`.

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.colmap.models.arrays import model_arrays
 from sfm_app.colmap.models.model import posed_images
 from sfm_app.colmap.models.stored_model import read_model, sparse_model
 from sfm_app.colmap.surface import FUSED, open_points, positions
@@ -19,10 +20,10 @@ from sfm_app.errors import InputError
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.pipeline import MESH, SCALE, SCENE, TEXTURE
 from sfm_app.runtime.context import RunContext
-from sfm_app.scale import MetricFrame, move_model
+from sfm_app.scale import GPS, MetricFrame, move_model
 from sfm_app.scale.measuring import Distance, measure_distance
 from sfm_app.scale.photo_rays import PosedPhotos
-from sfm_app.types import Model, Scene
+from sfm_app.types import Model, Scene, SceneArrays
 from sfm_app.types.exported import PointCloud
 
 COLORS, NORMALS = ("red", "green", "blue"), ("nx", "ny", "nz")
@@ -35,8 +36,11 @@ def stored_frame(run: RunContext) -> MetricFrame:
     Args:
         run: the finished run.
     """
-    known = run.workspace.manifest.record(SCALE.name) is not None
-    return Products(run)[SCALE] if known else MetricFrame()
+    if run.workspace.manifest.record(SCALE.name) is not None:
+        return Products(run)[SCALE]
+    known = run.workspace.manifest.record(SCENE.name) is not None
+    deviation = Products(run)[SCENE].gps_deviation if known else None
+    return MetricFrame() if deviation is None else MetricFrame(deviation=deviation, source=GPS)
 
 
 def export_frame(run: RunContext) -> Similarity | None:
@@ -101,6 +105,19 @@ def stored_scene(run: RunContext) -> tuple[Scene, Reconstruction]:
     model = read_model(scene.model_dir, export_frame(run))
     poses = {image.name: np.asarray(image.cam_from_world().matrix(), np.float64) for image in posed_images(model)}
     return replace(scene, cam_from_world=poses), model
+
+
+def stored_arrays(run: RunContext) -> SceneArrays:
+    """Read poses, cameras, points and tracks as plain arrays, in the frame of exports.
+
+    Args:
+        run: the finished run.
+
+    Raises:
+        InputError: the scene has not been made yet, or its files are missing or damaged.
+    """
+    _, model = stored_scene(run)
+    return model_arrays(model, metric=stored_frame(run).is_metric)
 
 
 def stored_distance(run: RunContext, ends: NDArray[np.float64]) -> Distance:

@@ -7,6 +7,7 @@ import numpy as np
 
 from sfm_app.lengths import format_length
 
+GPS = "GPS of the photos"
 CONTRADICTION = 4.0
 """Standard deviations by which two that agree may differ. Chosen by hand: one pair of 16 000 differs by more."""
 

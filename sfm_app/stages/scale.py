@@ -14,7 +14,7 @@ from sfm_app.numerical import json_text
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.scale.control_fit import ControlFit, fit_control_points
-from sfm_app.scale.evidence import ScaleEvidence, agree
+from sfm_app.scale.evidence import GPS, ScaleEvidence, agree
 from sfm_app.scale.known_lengths import control_places, distance_evidence, marker_evidence
 from sfm_app.scale.metric_frame import MetricFrame, move_model
 from sfm_app.scale.photo_rays import PosedPhotos
@@ -64,7 +64,7 @@ def find_frame(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
     """
     options, evidence, problems = run.settings.scale, list[ScaleEvidence](), list[str]()
     if scene.gps_deviation is not None:
-        evidence.append(ScaleEvidence("GPS of the photos", 1.0, max(scene.gps_deviation, 1e-4), len(scene.registered)))
+        evidence.append(ScaleEvidence(GPS, 1.0, max(scene.gps_deviation, 1e-4), len(scene.registered)))
     control: ControlFit | None = None
     if options.distances or options.markers or run.control_points:
         posed = PosedPhotos(scene.model_dir)

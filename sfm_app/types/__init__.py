@@ -19,6 +19,7 @@ from sfm_app.types.model import Frustum, Model, Texture
 from sfm_app.types.photos import Frame, GpsPosition, Photo, PhotoSet, UnusablePhoto
 from sfm_app.types.pose_graph import LookAlikes, PoseGraph, RelativePose
 from sfm_app.types.scene import CameraModel, Scene
+from sfm_app.types.scene_arrays import SceneArrays
 from sfm_app.types.surface import Surface
 
 __all__ = [
@@ -46,6 +47,7 @@ __all__ = [
     "Rejected",
     "RelativePose",
     "Scene",
+    "SceneArrays",
     "Surface",
     "Texture",
     "UnusablePhoto",

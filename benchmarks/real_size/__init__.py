@@ -1,0 +1,1 @@
+"""Real size by markers, known distances and ground control points, on rendered scenes."""

@@ -1,0 +1,5 @@
+"""Run `python -m benchmarks.real_size`."""
+
+from benchmarks.real_size.command import main
+
+main()

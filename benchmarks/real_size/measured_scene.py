@@ -1,0 +1,125 @@
+"""A scene with two printed markers in it, and ground control points as somebody marks them."""
+
+from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.scale.markers import draw_pattern
+from sfm_app.synthetic.cameras import Views, camera_center
+from sfm_app.synthetic.scenes.bodies import SyntheticScene
+from sfm_app.synthetic.scenes.marker_sheet import marker_sheet
+
+FloatArray = NDArray[np.float64]
+
+FAMILY = "apriltag-36h11"
+UTM = np.array([500_000.0, 4_649_000.0, 320.0])
+"""East, north and up of the scene's origin."""
+MARK_PX = 0.5
+"""Standard deviation of a mark in a photo."""
+SURVEY_M = 0.002
+"""Standard deviation of the coordinates of a point, in scene units."""
+WRONG_M = 0.05
+"""By how much a wrong point is off, as a share of the distance to the scene."""
+
+
+def add_markers(scene: SyntheticScene, views: Views, side: float) -> SyntheticScene:
+    """Return a scene with two markers that stand between the cameras and what they look at, and face them.
+
+    Args:
+        scene: what is photographed.
+        views: of the photos.
+        side: of a marker, in scene units.
+    """
+    middle, aim = middle_and_aim(views)
+    along = aim - middle
+    right = np.cross(along, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    turn = float(np.degrees(np.arctan2(-along[0], -along[2])))
+    bodies = list(scene.bodies)
+    for number, aside in enumerate((-0.16, 0.16)):
+        at = middle + 0.8 * along + aside * np.linalg.norm(along) * right
+        x, y, z = map(float, at)
+        bodies += marker_sheet(draw_pattern(FAMILY, number), side, (x, y, z), turn - 60 * aside, 82.0)
+    return replace(scene, bodies=tuple(bodies))
+
+
+def middle_and_aim(views: Views) -> tuple[FloatArray, FloatArray]:
+    """Return the mean of the cameras' centers, and the point that their axes pass nearest to.
+
+    Args:
+        views: of the photos.
+    """
+    poses = list(views.cam_from_world.values())
+    centers, axes = np.array([camera_center(pose) for pose in poses]), np.array([pose[2, :3] for pose in poses])
+    across = np.eye(3) - np.einsum("ni,nj->nij", axes, axes)
+    aim = np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, centers))
+    return centers.mean(axis=0), aim
+
+
+def write_control_points(
+    path: Path, vertices: FloatArray, views: Views, count: int, wrong: Collection[int], rng: np.random.Generator
+) -> None:
+    """Write a file of ground control points with marks in the photos, as a hand makes them.
+
+    Args:
+        path: of the file.
+        vertices: (V, 3) of the scene, from which points are taken.
+        views: of the photos.
+        count: how many points.
+        wrong: which of them are off.
+        rng: draws the points and the errors.
+    """
+    seen = {name: project(vertices, views, name) for name in views.cam_from_world}
+    inside = np.sum([np.isfinite(x).all(axis=1) for x in seen.values()], axis=0)
+    likely = np.flatnonzero(inside >= 0.7 * len(seen))
+    chosen = spread_out(vertices, likely, count, rng)
+    middle, aim = middle_and_aim(views)
+    lines = ["EPSG:32632"]
+    for number, vertex in enumerate(chosen):
+        at = vertices[vertex] + SURVEY_M * rng.normal(size=3)
+        if number in wrong:
+            step = rng.normal(size=3)
+            at = at + WRONG_M * np.linalg.norm(aim - middle) * step / np.linalg.norm(step)
+        east, north, up = UTM + np.array([at[0], -at[2], at[1]])
+        for name, x in seen.items():
+            if np.isfinite(x[vertex]).all():
+                u, v = x[vertex] + MARK_PX * rng.normal(size=2)
+                lines.append(f"{east:.4f} {north:.4f} {up:.4f} {u:.2f} {v:.2f} {name} p{number}")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def project(points: FloatArray, views: Views, name: str) -> FloatArray:
+    """Return (N, 2) where a photo shows points (N, 3), as if nothing stood in the way; NaN outside of it.
+
+    Args:
+        points: in the scene.
+        views: of the photos, without distortion.
+        name: of the photo.
+    """
+    camera, pose = views.cameras[name], views.cam_from_world[name]
+    seen = (points @ pose[:, :3].T + pose[:, 3]) @ camera.K.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = seen[:, :2] / seen[:, 2:]
+    outside = (seen[:, 2] <= 0) | (x < 0).any(axis=1) | (x > [camera.width, camera.height]).any(axis=1)
+    x[outside] = np.nan
+    return x
+
+
+def spread_out(points: FloatArray, among: NDArray[np.intp], count: int, rng: np.random.Generator) -> list[int]:
+    """Return indices of points far from each other: each next one is the farthest of a sample from those before it.
+
+    Args:
+        points: (N, 3).
+        among: indices of those that may be chosen.
+        count: how many.
+        rng: draws the sample.
+    """
+    sample = rng.choice(among, min(200, len(among)), replace=False)
+    chosen = [int(sample[0])]
+    while len(chosen) < count:
+        away = np.linalg.norm(points[sample][:, None] - points[chosen][None], axis=2).min(axis=1)
+        chosen.append(int(sample[np.argmax(away)]))
+    return chosen
