@@ -105,7 +105,7 @@ class CallbackProgress(SilentProgress):
         self.now = Step("", "", 0, 0)
 
     def stage(self, name: str, note: str = "") -> None:
-        """Tell of a stage.
+        """Announce a stage.
 
         Args:
             name, note: as in `Progress`.
@@ -113,11 +113,11 @@ class CallbackProgress(SilentProgress):
         self._tell(Step(name, note, 0, 0))
 
     def say(self, text: str) -> None:
-        """Tell of a message."""
+        """Announce a message."""
         self.callback(Step(self.now.stage, text, 0, 0))
 
     def start(self, label: str, total: int) -> None:
-        """Tell of work that begins.
+        """Announce work that begins.
 
         Args:
             label, total: as in `Progress`.
@@ -125,7 +125,7 @@ class CallbackProgress(SilentProgress):
         self._tell(Step(self.now.stage, label, 0, total))
 
     def advance(self, steps: int = 1) -> None:
-        """Tell of steps that are done."""
+        """Count steps that are done."""
         self._tell(self.now._replace(done=self.now.done + steps))
 
     def _tell(self, step: Step) -> None:

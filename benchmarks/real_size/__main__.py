@@ -2,4 +2,5 @@
 
 from benchmarks.real_size.command import main
 
-main()
+if __name__ == "__main__":
+    main()

@@ -59,7 +59,7 @@ def measure(scene: str, seed: int, args: argparse.Namespace) -> Iterator[Row]:
         return
     truth = true_similarity(place, views)
     yield row_of("2 markers", scene, seed, place, views, truth)
-    ends = truth.inverse()(np.array([aim, aim + [DISTANCE, 0.0, 0.0]]))
+    ends = truth.inverse()(np.array([aim, aim + np.array([DISTANCE, 0.0, 0.0])]))
     a, b = (",".join(f"{value:.9f}" for value in end) for end in ends)
     run_program(place, args.quality, "--scale", a, b, f"{DISTANCE}m")
     yield row_of("a distance", scene, seed, place, views, truth)

@@ -35,7 +35,7 @@ class RunScene(Scene):
             return stored_arrays(run)
 
     @classmethod
-    def of(cls, scene: Scene, out: Path) -> "RunScene":
+    def from_scene(cls, scene: Scene, out: Path) -> "RunScene":
         """Return a scene with the folder that its arrays are read from.
 
         Args:

@@ -85,7 +85,7 @@ def _as_run(run: "RunContext", products: "Products", last: str, report: Path | N
     manifest: dict[str, Any] = run.workspace.manifest.read()
     # a run of an earlier version may lack a stage
     done = [stage for stage in pipeline.PIPELINE.stages_until(last) if stage.name in manifest["stages"]]
-    scene = RunScene.of(products[pipeline.SCENE], run.workspace.root) if pipeline.SCENE in done else None
+    scene = RunScene.from_scene(products[pipeline.SCENE], run.workspace.root) if pipeline.SCENE in done else None
     return Run(
         out=run.workspace.root,
         calibration=products[pipeline.INTRINSICS] if pipeline.INTRINSICS in done else None,

@@ -120,7 +120,9 @@ def pairs_to_map(graph: PoseGraph) -> PoseGraph:
     return replace(graph, poses={pair: pose for pair, pose in graph.poses.items() if pair in chosen})
 
 
-def map_group(group: Group, run: RunContext) -> list[MappingResult]:
+def map_group(
+    group: Group, run: RunContext, is_settled: Callable[[Attempt], bool] = lambda _: False
+) -> list[MappingResult]:
     """Return the results of the mappers on a group.
 
     The incremental mapper from the best seed and the global mapper run side by side. Where neither places most photos,
@@ -130,6 +132,7 @@ def map_group(group: Group, run: RunContext) -> list[MappingResult]:
     Args:
         group: a connected group of photos, with their matches and poses.
         run: the run.
+        is_settled: whether an incremental model says enough, although it is incomplete or contradicted.
     """
     options = run.settings.scene
     at_once = options.mapper != "incremental" and len(group.photos) >= MIN_GLOBAL_PHOTOS
@@ -138,7 +141,7 @@ def map_group(group: Group, run: RunContext) -> list[MappingResult]:
     if at_once:
         copy_database(run.workspace.database, run.workspace.root / GLOBAL_FOLDER)
     with _attempt_runner(group, run) as made:
-        found = made(lambda token: _run_first_round(group, seeds[:1], at_once, run, token))
+        found = made(lambda token: _run_first_round(group, seeds[:1], at_once, run, is_settled, token))
         for seed in seeds[1:]:
             if _can_stop(found, len(group.photos)):
                 break
@@ -214,13 +217,16 @@ def _attempt_runner(group: Group, run: RunContext) -> Iterator[Callable[[Maker],
 
 
 def _run_first_round(
-    group: Group, seeds: Sequence[Candidate], at_once: bool, run: RunContext, token: CancellationToken
-) -> list[MappingResult]:
+    group: Group, seeds: Sequence[Candidate], at_once: bool, run: RunContext, is_settled: Callable[[Attempt], bool],
+    token: CancellationToken,
+) -> list[MappingResult]:  # fmt: skip
     stop = StopSignal(token)
 
     def map_from_seed(seed: Candidate) -> MappingResult:
         (attempt,) = _attempt_from_seed(group, seed, run, token)
-        stop.needless = isinstance(attempt, Attempt) and _is_flawless(attempt, len(group.photos))
+        stop.needless = isinstance(attempt, Attempt) and (
+            _is_flawless(attempt, len(group.photos)) or is_settled(attempt)
+        )
         return attempt
 
     with ThreadPoolExecutor(min(run.workers, 2), thread_name_prefix="mapper") as pool:

@@ -12,6 +12,7 @@ from sfm_app.types.calibration import Calibration, Intrinsics
 from sfm_app.types.camera_pairs import CameraPairs, PhotoPairs
 from sfm_app.types.control_points import ControlPoint, ControlPoints
 from sfm_app.types.epipolar import EpipolarFit, Rejected, ViewGraph
+from sfm_app.types.exported import SceneArrays
 from sfm_app.types.features import Features
 from sfm_app.types.given_cameras import GivenCameras
 from sfm_app.types.matches import MatchedImage, MatchGraph, PairId
@@ -19,7 +20,6 @@ from sfm_app.types.model import Frustum, Model, Texture
 from sfm_app.types.photos import Frame, GpsPosition, Photo, PhotoSet, UnusablePhoto
 from sfm_app.types.pose_graph import LookAlikes, PoseGraph, RelativePose
 from sfm_app.types.scene import CameraModel, Scene
-from sfm_app.types.scene_arrays import SceneArrays
 from sfm_app.types.surface import Surface
 
 __all__ = [

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -74,31 +74,44 @@ def part_of_group(group: Group, photos: Sequence[int], pairs: Sequence[PairId]) 
     )
 
 
-def write_inputs(path: Path, part: Group, mapped: Sequence[PairId], settings: Settings) -> None:
+@dataclass(frozen=True, slots=True, eq=False)
+class PartInputs:
+    """What a part is mapped from."""
+
+    part: Group
+    """Photos, matches, geometry, relative poses and cameras."""
+    mapped: frozenset[PairId]
+    """Pairs of the pose graph that mapping follows."""
+    settings: Settings
+    asked: bool
+    """Whether everything is mapped anew where a false join is found, so that no other mapper is needed then."""
+
+
+def write_inputs(path: Path, inputs: PartInputs) -> None:
     """Write the inputs of a part, as a whole.
 
     Args:
         path: file to write.
-        part: photos, matches, geometry, relative poses and cameras.
-        mapped: pairs of the pose graph that mapping follows.
-        settings: of the run.
+        inputs: of the part.
     """
+    part = inputs.part
     known = {
         "photos": list(part.photos),
         # frames and times of photos do not matter to mapping
         "images": [asdict(replace(image, gps=None, shown=None)) for image in part.matches.images.values()],
         "intrinsics": part.intrinsics.to_dict(),
-        "settings": settings.model_dump(mode="json"),
+        "settings": inputs.settings.model_dump(mode="json"),
+        "asked": inputs.asked,
     }
     arrays = _match_arrays(part.matches) | _pose_arrays(part.graph)
     arrays |= {f"view_{name}": array for name, array in part.views.to_arrays().items()}
-    arrays |= {"mapped": np.array(sorted(mapped), np.int64).reshape(-1, 2), "known": np.array(json_text(known))}
+    arrays |= {"mapped": np.array(sorted(inputs.mapped), np.int64).reshape(-1, 2), "known": np.array(json_text(known))}
     with replace_atomically(path) as beside, beside.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
 
 
-def read_inputs(path: Path) -> tuple[Group, frozenset[PairId], Settings]:
-    """Read back what `write_inputs` wrote: the part, the pairs that mapping follows, the settings."""
+def read_inputs(path: Path) -> PartInputs:
+    """Read back what `write_inputs` wrote."""
     arrays = load_arrays(path)
     known = json.loads(str(arrays["known"]))
     images = {image["id"]: MatchedImage(**image) for image in known["images"]}
@@ -111,7 +124,7 @@ def read_inputs(path: Path) -> tuple[Group, frozenset[PairId], Settings]:
         Intrinsics.from_dict(known["intrinsics"]),
     )
     mapped = frozenset((int(a), int(b)) for a, b in arrays["mapped"])
-    return part, mapped, Settings.from_mapping(known["settings"])
+    return PartInputs(part, mapped, Settings.from_mapping(known["settings"]), known["asked"])
 
 
 PlainJoin = tuple[list[list[int]], float]

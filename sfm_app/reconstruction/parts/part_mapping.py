@@ -15,6 +15,7 @@ from sfm_app.reconstruction.parts.cut import Part
 from sfm_app.reconstruction.parts.part_files import (
     INPUTS,
     RESULT,
+    PartInputs,
     joins_from_plain,
     pairs_of_parts,
     part_of_group,
@@ -54,7 +55,9 @@ class PartResult:
     """Pairs that hold one place of the part on top of another."""
 
 
-def map_parts(group: Group, parts: Sequence[Part], mapped: PoseGraph, run: RunContext) -> list[PartResult]:
+def map_parts(
+    group: Group, parts: Sequence[Part], mapped: PoseGraph, run: RunContext, *, asked: bool
+) -> list[PartResult]:
     """Map parts, as many at once as there are workers; one that fails is a result without models.
 
     Parts that a killed run has finished are not mapped again.
@@ -64,12 +67,13 @@ def map_parts(group: Group, parts: Sequence[Part], mapped: PoseGraph, run: RunCo
         parts: of its photos.
         mapped: the pose graph with the pairs that mapping follows.
         run: the run.
+        asked: whether false joins within parts end the pass.
     """
     place = run.workspace.root / FOLDER
     (place / STOP).unlink(missing_ok=True)
     within = pairs_of_parts(group.matches.matches, [part.photos for part in parts])
     members = (part_of_group(group, part.photos, pairs) for part, pairs in zip(parts, within, strict=True))
-    tasks = [_prepare_part(one, mapped, place, run) for one in members]
+    tasks = [_prepare_part(one, mapped, place, run, asked=asked) for one in members]
     try:
         return run.map(Task(map_part), tasks, f"mapping {len(parts)} parts")
     except BaseException:  # also Ctrl-C: the processes end when they see the file
@@ -77,10 +81,11 @@ def map_parts(group: Group, parts: Sequence[Part], mapped: PoseGraph, run: RunCo
         raise
 
 
-def _prepare_part(members: Group, mapped: PoseGraph, place: Path, run: RunContext) -> PartTask:
+def _prepare_part(members: Group, mapped: PoseGraph, place: Path, run: RunContext, *, asked: bool) -> PartTask:
     """Write the inputs of a part, in a folder that is called after what they are."""
     beside = place / INPUTS
-    write_inputs(beside, members, [pair for pair in members.graph.poses if pair in mapped.poses], run.settings)
+    followed = frozenset(pair for pair in members.graph.poses if pair in mapped.poses)
+    write_inputs(beside, PartInputs(members, followed, run.settings, asked))
     folder = place / digest_file(beside)[:16]
     folder.mkdir(exist_ok=True)
     beside.replace(folder / INPUTS)

@@ -2,6 +2,7 @@
 
 import json
 import tempfile
+from functools import cache
 from os.path import relpath
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from sfm_app.colmap.database import write_calibrations, write_match_graph, write
 from sfm_app.colmap.models.model import posed_photo_ids, submodel
 from sfm_app.colmap.processes.worker_process import MappingTask, serve
 from sfm_app.plugins import load_plugins
-from sfm_app.reconstruction.mapping_runs import Attempt, Group, best_attempt, map_group
+from sfm_app.reconstruction.mapping_runs import ENOUGH_SHARE, Attempt, Group, best_attempt, map_group
 from sfm_app.reconstruction.model_split import sound_parts
 from sfm_app.reconstruction.overlaid.false_joins import judge_places
 from sfm_app.reconstruction.parts.part_files import INPUTS, RESULT, joins_to_plain, read_inputs
@@ -27,13 +28,15 @@ LEAST_PHOTOS = 3
 def work(task: MappingTask) -> None:
     """Map the part in the folder of the task, and write its models and what was tried beside its inputs."""
     folder, photos = Path(task["scratch"]), Path(task["photos"])
-    part, mapped, settings = read_inputs(folder / INPUTS)
+    given = read_inputs(folder / INPUTS)
+    judge = cache(lambda attempt: judge_places([attempt])[0])
+    enough = ENOUGH_SHARE * len(given.part.photos)
     # a worker that was cut off from a cluster may still be at the same part
     with tempfile.TemporaryDirectory(dir=folder, prefix="mapping-") as own, make_executor(1) as executor:
         place = SubWorkspace(Workspace(photos.parent), relpath(own, photos.parent))
-        _write_database(place, part, mapped)
-        run = RunContext(settings, place, load_plugins(installed=False), executor, workers=1)
-        found = map_group(part, run)
+        _write_database(place, given.part, given.mapped)
+        run = RunContext(given.settings, place, load_plugins(installed=False), executor, workers=1)
+        found = map_group(given.part, run, lambda one: given.asked and one.photos >= enough and bool(judge(one)))
     if (folder / RESULT).exists():
         return
     best = best_attempt(found)
@@ -41,7 +44,7 @@ def work(task: MappingTask) -> None:
         "models": [] if best is None else _write_models(best, folder),
         "mapper": "" if best is None else best.mapper,
         "tried": [one.note for one in found],
-        "false_joins": [] if best is None else joins_to_plain(judge_places([best])[0]),
+        "false_joins": [] if best is None else joins_to_plain(judge(best)),
     }
     with replace_atomically(folder / RESULT) as path:
         path.write_text(json.dumps(known), encoding="utf-8")

@@ -88,7 +88,7 @@ def map_in_parts(
     photos = len(group.photos)
     run.progress.say(f"{photos} photos are mapped in {len(parts)} parts of {_range([len(p.photos) for p in parts])}")
     try:
-        results = map_parts(group, parts, mapped, run)
+        results = map_parts(group, parts, mapped, run, asked=asked)
         joins = merge_false_joins([join for result in results for join in result.false_joins])
         if joins and asked:
             return [], joins

@@ -61,7 +61,9 @@ def try_out(run, cameras, monkeypatch):
     waits until the other one is done.
     """
 
-    def make(grown, at_once=None, late="", count=COUNT, points=500, contradicted=0, completed=0, **scene):
+    def make(
+        grown, at_once=None, late="", count=COUNT, points=500, contradicted=0, completed=0, settled=False, **scene
+    ):
         images = {key: MatchedImage(key, f"{key}.jpg", "one", 1024, 768) for key in range(1, count + 1)}
         rng = np.random.default_rng(0)
         keypoints = {key: rng.uniform((0, 0), (1024, 768), (400, 2)) for key in images}
@@ -101,7 +103,7 @@ def try_out(run, cameras, monkeypatch):
         monkeypatch.setattr(module, "copy_database", lambda *_: None)
         explained = {(0, 1): PairSupport(100, 100, contradicted)}
         monkeypatch.setattr(module, "explained_pairs", lambda *_: explained)
-        return map_group(group, run(**scene)), calls
+        return map_group(group, run(**scene), lambda _: settled), calls
 
     return make
 
@@ -133,6 +135,13 @@ def test_a_flawless_model_makes_the_other_one_needless_whether_or_not_it_is_ther
 def test_a_model_of_all_photos_that_matches_contradict_is_not_flawless(try_out):
     assert summary(try_out([10], at_once=10, contradicted=2)[0]) == [("incremental", 10), ("global", 10)]
     assert summary(try_out([10], at_once=10, contradicted=1)[0]) == [("incremental", 10), ("global", 0)]
+
+
+def test_a_contradicted_model_that_says_enough_makes_the_other_one_needless(try_out):
+    found, _ = try_out([10], at_once=10, contradicted=2, settled=True)
+
+    assert summary(found) == [("incremental", 10), ("global", 0)]
+    assert found[1].note == "all at once: not needed"
 
 
 def test_why_a_model_was_taken_is_said():

@@ -6,6 +6,7 @@ import numpy as np
 
 from sfm_app.reconstruction.mapping_runs import Group
 from sfm_app.reconstruction.parts.part_files import (
+    PartInputs,
     joins_from_plain,
     joins_to_plain,
     pairs_of_parts,
@@ -52,12 +53,13 @@ def test_inputs_are_read_back_as_they_were(street, tmp_path):
     part = part_of_group(group, range(21, 41), pairs)
     settings = Settings.from_mapping({"seed": 7, "scene": {"part_photos": 33}})
 
-    write_inputs(tmp_path / "a.npz", part, [(21, 22), (21, 23)], settings)
-    write_inputs(tmp_path / "b.npz", part, [(21, 23), (21, 22)], settings)
-    found, mapped, again = read_inputs(tmp_path / "a.npz")
+    write_inputs(tmp_path / "a.npz", PartInputs(part, frozenset([(21, 22), (21, 23)]), settings, asked=True))
+    write_inputs(tmp_path / "b.npz", PartInputs(part, frozenset([(21, 23), (21, 22)]), settings, asked=True))
+    again = read_inputs(tmp_path / "a.npz")
+    found = again.part
 
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    assert mapped == {(21, 22), (21, 23)} and again == settings
+    assert again.mapped == {(21, 22), (21, 23)} and again.settings == settings and again.asked
     assert found.photos == part.photos and found.matches.images == part.matches.images
     assert list(found.matches.matches) == list(part.matches.matches)
     assert all(np.array_equal(found.matches.matches[pair], rows) for pair, rows in part.matches.matches.items())

@@ -126,7 +126,7 @@ def test_pairs_that_the_pose_graph_has_dropped_do_not_refuse_a_join(group, start
 
 def test_where_no_part_is_mapped_the_reason_is_told(group, start, monkeypatch):
     failed = PartResult((), "", ("failed: no memory",))
-    monkeypatch.setattr(parts_run, "map_parts", lambda *_: [failed] * 9)
+    monkeypatch.setattr(parts_run, "map_parts", lambda *_, **__: [failed] * 9)
     monkeypatch.setattr(parts_run, "cut_group", lambda *_: [parts_run.Part((k,), (k,)) for k in range(1, 10)])
 
     (found,) = start()[0]
@@ -137,7 +137,7 @@ def test_where_no_part_is_mapped_the_reason_is_told(group, start, monkeypatch):
 
 @pytest.mark.parametrize(("error", "passes"), [(ClusterError("gone"), True), (BackendError("failed"), False)])
 def test_a_cluster_that_is_gone_ends_the_run_and_other_failures_leave_the_whole(start, monkeypatch, error, passes):
-    def fail(*_):
+    def fail(*_, **__):
         raise error
 
     monkeypatch.setattr(parts_run, "map_parts", fail)
@@ -200,7 +200,7 @@ def test_the_whole_is_mapped_where_parts_do_not_explain_it(group, start, monkeyp
 def test_parts_with_false_joins_are_not_joined_unless_nobody_asks(start, monkeypatch):
     join, more = LookAlikes(((1, 2), (3, 4)), 0.9), LookAlikes(((3, 4), (5, 6)), 0.7)
     results = [PartResult((), "", ("failed",), (one,)) for one in (join, more, join)]
-    monkeypatch.setattr(parts_run, "map_parts", lambda *_: results)
+    monkeypatch.setattr(parts_run, "map_parts", lambda *_, **__: results)
     monkeypatch.setattr(parts_run, "cut_group", lambda *_: [parts_run.Part((k,), (k,)) for k in (1, 2, 3)])
 
     assert start(1, whole=True) == ([], (join, LookAlikes(((5, 6),), 0.7)))
