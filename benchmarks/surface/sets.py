@@ -6,7 +6,7 @@ from pathlib import Path
 
 from benchmarks.common.photo_sets import FORMATS, link_or_copy
 from sfm_app.api import open_run
-from sfm_app.pipeline import NAMES, SCENE, TEXTURE, run_stages
+from sfm_app.pipeline import DEPTH_MAPS, NAMES, TEXTURE, run_stages
 from sfm_app.settings import Settings
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder
 from sfm_app.synthetic.scenes.scene_catalog import WALKS, build_scene, scene_views
@@ -69,7 +69,7 @@ def finished_model(photos: Path, out: Path, settings: Settings) -> Model:
 
 def dense_stages() -> Sequence[str]:
     """List the stages after the cameras, in order."""
-    return NAMES[NAMES.index(SCENE.name) + 1 :]
+    return NAMES[NAMES.index(DEPTH_MAPS.name) :]
 
 
 def _load_or_render(name: str, seed: int, folder: Path) -> Truth:

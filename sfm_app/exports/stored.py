@@ -82,13 +82,12 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
     Raises:
         InputError: a stage has not run yet, or its files are missing or damaged.
     """
-    frame = stored_frame(run).from_model
     if not points:
         check_finished(run, [TEXTURE], "model", "`--points` exports the points and cameras")
-        return move_model(Products(run)[TEXTURE], frame)
+        return move_model(Products(run)[TEXTURE], stored_frame(run).from_model)
     check_finished(run, [SCENE], "points")
     with check_undamaged(SCENE, run):
-        return move_model(sparse_model(run.workspace.sparse), frame)
+        return move_model(sparse_model(run.workspace.sparse), stored_frame(run).from_model)
 
 
 def stored_scene(run: RunContext) -> tuple[Scene, Reconstruction]:

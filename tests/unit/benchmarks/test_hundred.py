@@ -80,6 +80,6 @@ def test_the_page_has_stages_in_rows_and_numbers_of_photos_in_columns():
     assert "49 of 50, 99 of 100" in lines[2]
     columns = " | ".join(f"{figure}, {count} photos" for figure in ("CPU", "s", "MB") for count in (50, 100))
     assert f"| stage | {columns} |" in lines
-    assert "| mesh | 100 | 200 | 50 | 100 | 506 | 1006 |" in lines
+    assert "| mesh | 100 | 200 | 50 | 100 | 507 | 1007 |" in lines
     n = len(NAMES)
-    assert f"| together | {n * 100} | {n * 200} | {n * 50} | {n * 100} | 508 | 1008 |" in lines
+    assert f"| together | {n * 100} | {n * 200} | {n * 50} | {n * 100} | 509 | 1009 |" in lines
