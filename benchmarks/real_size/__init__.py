@@ -1,1 +1,1 @@
-"""Real size by markers, known distances and ground control points, on rendered scenes."""
+"""Real size by markers and ground control points, on rendered scenes."""

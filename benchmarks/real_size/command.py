@@ -1,4 +1,4 @@
-"""How exact the size and the place of a model are that markers, a distance, and ground control points give.
+"""How exact the size and the place of a model are that markers and ground control points give.
 
     python -m benchmarks.real_size --cache CACHE
     python -m benchmarks.real_size --cache CACHE --scenes statue --seeds 3
@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.common.command_line import new_parser
 from benchmarks.common.processes import module_command, run_command
 from benchmarks.common.results import RESULTS, Row, document, table, write
-from benchmarks.real_size.measured_scene import UTM, add_markers, middle_and_aim, write_control_points
+from benchmarks.real_size.measured_scene import UTM, add_markers, center_and_aim, write_control_points
 from sfm_app.colmap.models.model import poses_and_points
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.geometry.similarity import Similarity, umeyama
@@ -35,7 +35,6 @@ COLUMNS = ("scene", "seed", "by", "error %", "deviation %", "in deviations", "ce
 SCENES = ("courtyard", "statue", "facade", "corner")
 SIDE = 1 / 15
 """Side of a marker as a share of the distance to the scene."""
-DISTANCE = 2.0
 
 
 def measure(scene: str, seed: int, args: argparse.Namespace) -> Iterator[Row]:
@@ -46,28 +45,25 @@ def measure(scene: str, seed: int, args: argparse.Namespace) -> Iterator[Row]:
         seed: of the poses and the errors.
         args: cache, quality.
     """
-    views = scene_views(scene, seed)
-    middle, aim = middle_and_aim(views)
-    side = round(float(SIDE * np.linalg.norm(aim - middle)), 3)
+    views, plain = scene_views(scene, seed), build_scene(scene)
+    center, aim = center_and_aim(plain.vertices, views)
+    side = round(float(SIDE * np.linalg.norm(aim - center)), 3)
     place = args.cache / f"{scene}-{seed}"
-    measured = add_markers(build_scene(scene), views, side)
+    measured = add_markers(plain, views, side)
     # edges along the pixels lie between few rays
     add_missing_photos(place / "photos", measured, views, PhotoOptions(supersampling=4, seed=seed), processes=2)
-    vertices = measured.vertices
+    vertices = plain.vertices
     if problem := run_program(place, args.quality, "--markers", f"{side}m"):
         yield {"method": "sfm-app", "scene": scene, "seed": seed, "by": "markers", "failed": problem}
         return
     truth = true_similarity(place, views)
-    yield row_of("2 markers", scene, seed, place, views, truth)
-    ends = truth.inverse()(np.array([aim, aim + np.array([DISTANCE, 0.0, 0.0])]))
-    a, b = (",".join(f"{value:.9f}" for value in end) for end in ends)
-    run_program(place, args.quality, "--scale", a, b, f"{DISTANCE}m")
-    yield row_of("a distance", scene, seed, place, views, truth)
+    distance = float(np.linalg.norm(aim - center))
+    yield row_of("2 markers", scene, seed, place, views, truth, distance)
     for count, wrong in ((5, ()), (6, (1,)), (10, (2, 5))):
         rng = np.random.default_rng([seed, count])
         write_control_points(place / "gcp_list.txt", vertices, views, count, wrong, rng)
         run_program(place, args.quality, "--gcp", str(place / "gcp_list.txt"))
-        yield row_of(f"{count} points", scene, seed, place, views, truth) | {"wrong": len(wrong)}
+        yield row_of(f"{count} points", scene, seed, place, views, truth, distance) | {"wrong": len(wrong)}
 
 
 def run_program(place: Path, quality: str, *options: str) -> str:
@@ -108,7 +104,7 @@ def found_centers(place: Path) -> Mapping[str, Any]:
     return {model.images[key].name: camera_center(pose) for key, pose in poses_and_points(model)[0].items()}
 
 
-def row_of(by: str, scene: str, seed: int, place: Path, views: Views, truth: Similarity) -> Row:
+def row_of(by: str, scene: str, seed: int, place: Path, views: Views, truth: Similarity, distance: float) -> Row:
     """Return how exact scale.json is.
 
     Args:
@@ -117,6 +113,7 @@ def row_of(by: str, scene: str, seed: int, place: Path, views: Views, truth: Sim
         place: of the run.
         views: the true poses.
         truth: from OUT/sparse to the scene.
+        distance: to the scene.
     """
     found = json.loads((place / "out" / "scale.json").read_text(encoding="utf-8"))
     counts = json.loads((place / "out" / "manifest.json").read_text(encoding="utf-8"))["stages"]["scale"]["counts"]
@@ -131,13 +128,12 @@ def row_of(by: str, scene: str, seed: int, place: Path, views: Views, truth: Sim
     }
     if found["crs"]:
         frame = Similarity(found["scale"], np.array(found["R"]), np.array(found["t"]))
-        middle, aim = middle_and_aim(views)
         off = []
         for name, center in found_centers(place).items():
             x, y, z = frame(center)
             east, north, up = np.array([x, -z, y]) + found["offset"] - UTM
             off.append(np.linalg.norm(np.array([east, up, -north]) - camera_center(views.cam_from_world[name])))
-        row["center"] = 1000 * float(np.median(off)) / float(np.linalg.norm(aim - middle))
+        row["center"] = 1000 * float(np.median(off)) / distance
         row["named"] = len(counts["control_points"]["wrong"])
     return row
 

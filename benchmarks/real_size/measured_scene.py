@@ -26,37 +26,39 @@ WRONG_M = 0.05
 
 
 def add_markers(scene: SyntheticScene, views: Views, side: float) -> SyntheticScene:
-    """Return a scene with two markers that stand between the cameras and what they look at, and face them.
+    """Return a scene with two markers that stand before what the middle photo shows, and face it.
 
     Args:
         scene: what is photographed.
         views: of the photos.
         side: of a marker, in scene units.
     """
-    middle, aim = middle_and_aim(views)
-    along = aim - middle
+    center, aim = center_and_aim(scene.vertices, views)
+    along = aim - center
     right = np.cross(along, [0.0, 1.0, 0.0])
     right /= np.linalg.norm(right)
     turn = float(np.degrees(np.arctan2(-along[0], -along[2])))
     bodies = list(scene.bodies)
     for number, aside in enumerate((-0.16, 0.16)):
-        at = middle + 0.8 * along + aside * np.linalg.norm(along) * right
+        at = center + 0.75 * along + aside * np.linalg.norm(along) * right
         x, y, z = map(float, at)
         bodies += marker_sheet(draw_pattern(FAMILY, number), side, (x, y, z), turn - 60 * aside, 82.0)
     return replace(scene, bodies=tuple(bodies))
 
 
-def middle_and_aim(views: Views) -> tuple[FloatArray, FloatArray]:
-    """Return the mean of the cameras' centers, and the point that their axes pass nearest to.
+def center_and_aim(vertices: FloatArray, views: Views) -> tuple[FloatArray, FloatArray]:
+    """Return where the middle photo was taken from, and the place on its axis at the depth of what it shows.
 
     Args:
+        vertices: (V, 3) of the scene.
         views: of the photos.
     """
-    poses = list(views.cam_from_world.values())
-    centers, axes = np.array([camera_center(pose) for pose in poses]), np.array([pose[2, :3] for pose in poses])
-    across = np.eye(3) - np.einsum("ni,nj->nij", axes, axes)
-    aim = np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, centers))
-    return centers.mean(axis=0), aim
+    name = sorted(views.cam_from_world)[len(views.cam_from_world) // 2]
+    pose = views.cam_from_world[name]
+    shown = np.isfinite(project(vertices, views, name)).all(axis=1)
+    depth = float(np.median(vertices[shown] @ pose[2, :3] + pose[2, 3]))
+    center = camera_center(pose)
+    return center, center + depth * pose[2, :3]
 
 
 def write_control_points(
@@ -76,13 +78,13 @@ def write_control_points(
     inside = np.sum([np.isfinite(x).all(axis=1) for x in seen.values()], axis=0)
     likely = np.flatnonzero(inside >= 0.7 * len(seen))
     chosen = spread_out(vertices, likely, count, rng)
-    middle, aim = middle_and_aim(views)
+    center, aim = center_and_aim(vertices, views)
     lines = ["EPSG:32632"]
     for number, vertex in enumerate(chosen):
         at = vertices[vertex] + SURVEY_M * rng.normal(size=3)
         if number in wrong:
             step = rng.normal(size=3)
-            at = at + WRONG_M * np.linalg.norm(aim - middle) * step / np.linalg.norm(step)
+            at = at + WRONG_M * np.linalg.norm(aim - center) * step / np.linalg.norm(step)
         east, north, up = UTM + np.array([at[0], -at[2], at[1]])
         for name, x in seen.items():
             if np.isfinite(x[vertex]).all():

@@ -23,7 +23,7 @@ FAMILIES = MappingProxyType({
     "aruco-mip-36h12": "DICT_ARUCO_MIP_36h12",
 })  # fmt: skip
 """OpenCV's dictionaries, by our names."""
-TRIED = ("apriltag-36h11", "aruco-6x6", "aruco-5x5", "aruco-4x4", "aruco-7x7", "aruco-original")
+TRIED = ("apriltag-36h11", "aruco-6x6", "aruco-5x5", "aruco-4x4", "aruco-7x7")
 """Families that `auto` looks for. Families of few bits and many markers are left out: they are found in brickwork."""
 
 
