@@ -24,7 +24,8 @@ FAMILIES = MappingProxyType({
 })  # fmt: skip
 """OpenCV's dictionaries, by our names."""
 TRIED = ("apriltag-36h11", "aruco-6x6", "aruco-5x5", "aruco-4x4", "aruco-7x7")
-"""Families that `auto` looks for. Families of few bits and many markers are left out: they are found in brickwork."""
+"""Families that `auto` looks for. Families of few bits and many markers are left out: they are found in brickwork,
+and aruco-original in windows."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
