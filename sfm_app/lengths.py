@@ -15,7 +15,7 @@ def parse_length(text: str) -> float:
     """Read a length such as 1.25m, 50 mm or 3ft.
 
     Args:
-        text: a positive number and its unit; meters without one.
+        text: a positive number and its unit. A bare number is refused: 50 may be meant as millimeters.
 
     Returns:
         meters.
@@ -24,11 +24,12 @@ def parse_length(text: str) -> float:
         ValueError: it is no length, not positive, or of an unknown unit.
     """
     found = LENGTH.fullmatch(text)
-    unit = (found.group(2) or "m") if found else ""
-    if found is None or unit.lower() not in METERS:
-        raise ValueError(f"'{text}' is no length; write 1.25m, 50mm or 3ft")
+    unit = found.group(2).lower() if found else ""
+    if found is None or unit not in METERS:
+        reason = f"'{text}' is no length" if unit or not found else f"'{text}' is no length without a unit"
+        raise ValueError(f"{reason}; write 1.25m, 50mm or 3ft")
     try:
-        length = float(found.group(1)) * METERS[unit.lower()]
+        length = float(found.group(1)) * METERS[unit]
     except ValueError:
         raise ValueError(f"'{text}' is no length; write 1.25m, 50mm or 3ft") from None
     if not (0 < length < math.inf):

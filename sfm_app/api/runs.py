@@ -59,14 +59,14 @@ def read_run(out: PathLike) -> Run:
         InputError: it holds no run, or its files are damaged.
     """
     from sfm_app import pipeline  # loads COLMAP
-    from sfm_app.engine.stage import Products
+    from sfm_app.engine.stage import Products, resume_hint
     from sfm_app.report.page import REPORT
 
     with open_run(Path(out), Settings(), None) as run:
-        run.workspace.manifest.check_format()
+        run.workspace.manifest.check_begun()
         done = [name for name in pipeline.NAMES if run.workspace.manifest.record(name) is not None]
         if not done:
-            raise InputError(f"{out} holds no run", hint="name the folder that `sfm-app run PHOTOS -o OUT` wrote")
+            raise InputError(f"no stage of the run in {out} is finished", hint=resume_hint(run))
         report = run.workspace.root / REPORT
         return _as_run(run, Products(run), done[-1], report if report.exists() else None)
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from sfm_app.api import Run
+from sfm_app.name_lists import list_names
 from sfm_app.numerical import json_text
 from sfm_app.report.camera_text import contradiction_lines, intrinsics_lines, intrinsics_summary
 from sfm_app.report.scale_text import scale_lines
@@ -130,8 +131,7 @@ def mask_lines(masks: Mapping[str, Any], photos: int) -> Iterator[str]:
 
 def abbreviate_names(names: Sequence[str]) -> str:
     """Return the first few names, and how many more there are."""
-    more = f" and {len(names) - NAMES_SHOWN} more (all of them in manifest.json)" if len(names) > NAMES_SHOWN else ""
-    return f"{', '.join(names[:NAMES_SHOWN])}{more}"
+    return list_names(names, NAMES_SHOWN) + (" (all of them in manifest.json)" if len(names) > NAMES_SHOWN else "")
 
 
 def texture_text(mesh: Mapping[str, Any]) -> str:

@@ -65,7 +65,7 @@ def _quality_lines(run: Run) -> Iterator[str]:
     """Yield how exact the model and its camera are, and its unit."""
     if run.scene is not None:
         error = run.scene.mean_reprojection_px
-        yield f"how exact   photos show its points to {error:.2g} px; report.html has the rest"
+        yield f"how exact   photos show its points to {error:.2g} px"
     yield from _camera_lines(run)
     if counts := run.manifest.get("stages", {}).get("scale", {}).get("counts"):
         yield next(iter(scale_lines(counts)))
@@ -107,7 +107,7 @@ def _first_few(label: str, texts: list[str], what: str) -> Iterator[str]:
     for number, text in enumerate(texts[:SHOWN]):
         yield f"{'' if number else label:12}{shorten(text, WIDTH, placeholder=' ...')}"
     if len(texts) > SHOWN:
-        yield f"{'':12}and {len(texts) - SHOWN} more {what}, see the report"
+        yield f"{'':12}and {len(texts) - SHOWN} more {what}; -v prints them"
 
 
 def _place_lines(run: Run) -> Iterator[str]:

@@ -9,6 +9,7 @@ from typing import Any
 from sfm_app.colmap.backend import versions as colmap_versions
 from sfm_app.engine.stage import Stage
 from sfm_app.hashing import fingerprint
+from sfm_app.name_lists import list_names
 from sfm_app.runtime.context import CONTROL_POINTS, GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.manifest import PROGRAM
 
@@ -56,8 +57,7 @@ def rerun_reason(stage: Stage[object], inputs: str, run: RunContext) -> str | No
     if record.fingerprint == inputs:
         return None
     found = list(_changes(record.made_with, json.loads(json.dumps(settings_and_versions(stage, run)))))
-    more = f" and {len(found) - CHANGES_SHOWN} more" if len(found) > CHANGES_SHOWN else ""
-    return f"{', '.join(found[:CHANGES_SHOWN])}{more}" if found else PHOTOS_CHANGED
+    return list_names(found, CHANGES_SHOWN) if found else PHOTOS_CHANGED
 
 
 def _changes(before: Any, now: Mapping[str, Any], name: str = "") -> Iterator[str]:

@@ -21,6 +21,7 @@ from sfm_app.colmap.wide_views import WideLens, render_views, save_picture
 from sfm_app.errors import InputError
 from sfm_app.exports.stored import stored_cloud, stored_scene
 from sfm_app.formats.scenes.names import plain_names
+from sfm_app.name_lists import list_names
 from sfm_app.photos import mask_path, save_mask
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Scene
@@ -129,9 +130,8 @@ class StoredPhotos:
         place = self._run.workspace.photos
         gone = [name for name in self._camera_of if not (place / name).exists()]
         if gone:
-            more = f" and {len(gone) - 1} more" if len(gone) > 1 else ""
             hint = f"{place} links to the photos of the run: put them back to where they were"
-            raise InputError(f"the photo {gone[0]}{more} is gone", hint=hint)
+            raise InputError(f"the photo {list_names(gone, 1)} is gone", hint=hint)
         write = partial(self._write_photo, folder)
         by_camera = sorted(self._camera_of, key=lambda name: (self._camera_of[name], name))
         with self._run.with_workers(self._run.workers) as run:  # none of them writes on after an interrupt

@@ -62,9 +62,7 @@ def check_finished(run: RunContext, stages: Sequence[Stage[object]], what: str, 
         InputError: there is no run, or a stage is missing (the message names it).
     """
     place = run.workspace
-    if not place.manifest.read().get("stages"):
-        raise InputError(f"{place.root} holds no run", hint="name the folder that `sfm-app run PHOTOS -o OUT` wrote")
-    place.manifest.check_format()
+    place.manifest.check_begun()
     for stage in stages:
         if place.manifest.record(stage.name) is None:
             more = f"; {otherwise}" if otherwise and place.manifest.record(SCENE.name) else ""

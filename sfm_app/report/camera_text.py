@@ -6,6 +6,7 @@ from typing import Any
 
 from sfm_app.geometry.lenses.camera_models import calibration_from_model
 from sfm_app.geometry.lenses.lens_curve import field_of_view_deg
+from sfm_app.name_lists import list_names
 from sfm_app.report.words import field_text, held_text, lens_text
 from sfm_app.types import Calibration, CameraModel, Intrinsics
 from sfm_app.types.calibration import EQUIRECTANGULAR, FISHEYE, GIVEN, KEPT
@@ -40,8 +41,7 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
         lines.append(f"camera      {f'{name}: ' if many else ''}{_camera_text(camera)}")
         mine = [photo for photo, of in intrinsics.camera_of.items() if of == name]
         if many and mine:
-            more = f" and {len(mine) - PHOTOS_SHOWN} more" if len(mine) > PHOTOS_SHOWN else ""
-            lines.append(f"            took {', '.join(mine[:PHOTOS_SHOWN])}{more}")
+            lines.append(f"            took {list_names(mine, PHOTOS_SHOWN)}")
         if not camera.identifiable:
             source = SOURCES.get(camera.method, camera.method)
             lines.append(f"            these photos do not determine it ({camera.reason}): {source}")

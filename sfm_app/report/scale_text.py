@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from sfm_app.lengths import format_length
+from sfm_app.name_lists import list_names
 from sfm_app.scale.measuring import Distance
 
 SHOWN = 3
@@ -18,8 +19,7 @@ def scale_lines(counts: Mapping[str, Any]) -> Iterator[str]:
     """
     if counts["unit"] == "meter":
         names = counts["source"].split(", ")
-        more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-        yield f"size        in meters, +- {counts['deviation_percent']:.2g} %, by {', '.join(names[:SHOWN])}{more}"
+        yield f"size        in meters, +- {counts['deviation_percent']:.2g} %, by {list_names(names, SHOWN)}"
     else:
         yield "size        not known: --markers, --scale or --gcp turn the model's unit into meters"
     for text in (*counts["contradictions"], *counts["problems"]):

@@ -1,8 +1,9 @@
 """Summaries of a run's scene: lines of text, and plain values for --json."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
+from sfm_app.name_lists import list_names
 from sfm_app.report.camera_text import contradiction_lines, refined_text
 from sfm_app.types import Scene
 
@@ -92,7 +93,7 @@ def _remark_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iter
         yield f"split, because more matches contradict the connection than support it: {photos}"
     yield from _doubt_lines(summary)
     for number, names in enumerate(summary.get("other_models", ()), start=1):
-        yield f"another model of {len(names)} photos in other_models/{number}: {_name_list(names)}"
+        yield f"another model of {len(names)} photos in other_models/{number}: {list_names(names, NAMES_SHOWN)}"
     explained, against = counts.get("explained_matches", 0), counts.get("contradicted_matches", 0)
     if against > CONTRADICTED_WARNING_SHARE * (explained + against):
         yield (
@@ -148,29 +149,24 @@ def _adjustment_warnings(adjustment: Mapping[str, Any]) -> Iterator[str]:
 def _doubt_lines(summary: Mapping[str, Any]) -> Iterator[str]:
     """Yield warnings about look-alikes, possible folds, and parts whose scale is weakly determined."""
     for join in summary.get("look_alikes", ()):
-        here, there = (_name_list(names) for names in join["between"])
+        here, there = (list_names(names, NAMES_SHOWN) for names in join["between"])
         yield (
             f"look-alikes separated, {join['pairs']} pairs of photos: {here} | {there} "
             f"({100 * join['missing']:.0f} % of what they would share in one place is missing)"
         )
     for join in summary.get("perhaps_look_alikes", ()):
-        here, there = (_name_list(names) for names in join["between"])
+        here, there = (list_names(names, NAMES_SHOWN) for names in join["between"])
         yield (
             f"beware: a loop, or look-alikes: {join['pairs']} pairs take {here} and {there} for one place, "
             "but the photos between them do not confirm it"
         )
     for names in summary.get("weakly_joined", ()):
         yield (
-            f"beware: hardly any point determines how far {_name_list(names)} {'are' if len(names) > 1 else 'is'} from "
-            "the rest; photos between them help"
+            f"beware: hardly any point determines how far {list_names(names, NAMES_SHOWN)} "
+            f"{'are' if len(names) > 1 else 'is'} from the rest; photos between them help"
         )
     for before, after in summary.get("jumps", ()):
         yield f"beware: a jump from {before} to {after}, which are consecutive: in a video, a sign of look-alikes"
-
-
-def _name_list(names: Sequence[str]) -> str:
-    more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
-    return f"{', '.join(names[:NAMES_SHOWN])}{more}"
 
 
 def _orientation_warnings(orientation: Mapping[str, Any]) -> Iterator[str]:

@@ -74,6 +74,16 @@ class Manifest:
                 hint="name another output folder with -o, or remove this one",
             )
 
+    def check_begun(self) -> None:
+        """Check that a run has left something that this program can read.
+
+        Raises:
+            InputError: there is no run, or another version of the program made it.
+        """
+        if not self.read():
+            raise InputError(f"{self.root} holds no run", hint="name the folder that `sfm-app run PHOTOS -o OUT` wrote")
+        self.check_format()
+
     def record(self, stage: str) -> StageRecord | None:
         """Return the record of a finished stage; None where there is none, or it was altered."""
         entry = self.read().get("stages", {}).get(stage)

@@ -45,7 +45,8 @@ def read_control_points(path: Path) -> ControlPoints:
         if not points:
             raise ValueError("it holds no point")
     except OSError as err:
-        raise InputError(f"cannot read the ground control points {path}: {err.strerror}", hint=FORM) from err
+        hint = f"name the file: {FORM}"
+        raise InputError(f"cannot read the ground control points {path}: {err.strerror}", hint=hint) from err
     except ValueError as err:
         raise InputError(f"{path} holds no ground control points: {err}", hint=FORM) from err
     known = [[one.name, one.position, one.marks] for one in points]

@@ -5,12 +5,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sfm_app.lengths import format_length, parse_length, parse_point
+from sfm_app.name_lists import list_names
 from sfm_app.runtime.context import RunContext
 from sfm_app.scale.evidence import ScaleEvidence
 from sfm_app.scale.marker_scale import marker_scales
 from sfm_app.scale.markers import find_markers_in_file
 from sfm_app.scale.measuring import Sightlines, measure_distance
-from sfm_app.scale.photo_rays import PosedPhotos, named_photos, unrotate_pixels
+from sfm_app.scale.photo_rays import PosedPhotos, layout_scale, named_photos, unrotate_pixels
 from sfm_app.scale.sighted_points import Sight, SightedPoint, locate_point
 from sfm_app.tasks import Task
 from sfm_app.types import ControlPoints, Photo, PhotoSet
@@ -71,10 +72,11 @@ def control_places(
     names, found = named_photos(photos.photos), dict[str, SightedPoint]()
     unknown = sorted({photo for point in given.points for photo in point.marks if photo not in names})
     if unknown:
-        more = f" and {len(unknown) - NAMES_SHOWN} more" if len(unknown) > NAMES_SHOWN else ""
-        problems.append(f"no photo in use is called {', '.join(unknown[:NAMES_SHOWN])}{more}")
+        problems.append(f"no photo in use is called {list_names(unknown, NAMES_SHOWN)}")
+    marked = {photo for point in given.points for photo in point.marks if photo in names}
+    scales = {name: layout_scale(names[name], photos.folder) for name in sorted(marked)}
     for point in given.points:
-        sights = _mark_sights(point.name, point.marks, names, posed, problems)
+        sights = _mark_sights(point.name, point.marks, names, scales, posed, problems)
         placed = locate_point(sights)
         if isinstance(placed, str):
             problems.append(f"ground control point '{point.name}' is not used: {placed}")
@@ -91,6 +93,7 @@ def _mark_sights(
     point: str,
     marks: Mapping[str, tuple[float, float]],
     names: Mapping[str, Photo],
+    scales: Mapping[str, float],
     posed: PosedPhotos,
     problems: list[str],
 ) -> list[Sight]:
@@ -100,7 +103,7 @@ def _mark_sights(
         photo = names.get(name)
         if photo is None or photo.name not in posed:
             continue
-        pixel = unrotate_pixels(photo, np.array([mark]))
+        pixel = unrotate_pixels(photo, scales[name] * np.array([mark]))
         if not (0 <= pixel[0, 0] <= photo.width and 0 <= pixel[0, 1] <= photo.height):
             problems.append(f"ground control point '{point}': its mark in {name} lies outside of the photo")
             continue

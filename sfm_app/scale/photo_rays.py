@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.models.model import focal_px, posed_images, seen_points, viewing_rays
@@ -73,12 +74,28 @@ class PosedPhotos:
         return Sightlines(centers, focals, found.points, tuple(np.split(cameras[order], ends)), residual)
 
 
+def layout_scale(photo: Photo, folder: Path) -> float:
+    """Return how much smaller a photo is laid out than its file: 1 where it has its full size, or the file is gone.
+
+    Args:
+        photo: as it is laid out.
+        folder: of the files.
+    """
+    if not photo.needs_copy:
+        return 1.0
+    try:
+        with Image.open(folder / photo.path) as image:
+            return max(photo.width, photo.height) / max(image.size)
+    except OSError:
+        return 1.0
+
+
 def unrotate_pixels(photo: Photo, upright: FloatArray) -> FloatArray:
     """Return pixels of the upright photo as pixels of the photo as it is laid out, in the sensor's orientation.
 
     Args:
         photo: its size and by how much it is turned.
-        upright: (N, 2) x and y in the upright photo.
+        upright: (N, 2) x and y in the upright photo, at its laid-out size.
     """
     x, y = upright[:, 0], upright[:, 1]
     if photo.turn_deg == 90:

@@ -124,7 +124,7 @@ def _problem(error: dict[str, Any]) -> tuple[str, str]:
     *table, key = [str(part) for part in error["loc"]] or ["settings"]
     name = ".".join((*table, key))
     if error["type"] != "extra_forbidden":
-        return f"'{name}': {error['msg'].lower()}, got {_abbreviate(error['input'])}", ""
+        return f"'{name}': {error['msg'].lower().removeprefix('value error, ')}, got {_abbreviate(error['input'])}", ""
     section: Any = Settings
     for part in table:
         section = section.model_fields[part].annotation

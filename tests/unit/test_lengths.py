@@ -9,13 +9,13 @@ from sfm_app.lengths import format_length, parse_length, parse_point
 
 @pytest.mark.parametrize(
     ("text", "meters"),
-    [("1.25m", 1.25), ("50 mm", 0.05), ("50mm", 0.05), ("3ft", 0.9144), ('2"', 0.0508), ("1.2e1 CM", 0.12), ("7", 7.0)],
+    [("1.25m", 1.25), ("50 mm", 0.05), ("50mm", 0.05), ("3ft", 0.9144), ('2"', 0.0508), ("1.2e1 CM", 0.12)],
 )
 def test_lengths_are_read(text, meters):
     assert parse_length(text) == pytest.approx(meters, rel=1e-12)
 
 
-@pytest.mark.parametrize("text", ["", "m", "1.2.3m", "-1m", "0", "nan", "inf", "1 parsec", "1m 20", "1e400"])
+@pytest.mark.parametrize("text", ["", "m", "50", "1.2.3m", "-1m", "0", "nan", "inf", "1 parsec", "1m 20", "1e400"])
 def test_what_is_no_length_says_what_one_looks_like(text):
     with pytest.raises(ValueError, match="is no length"):
         parse_length(text)

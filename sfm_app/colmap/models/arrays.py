@@ -26,7 +26,8 @@ def model_arrays(model: pycolmap.Reconstruction, *, metric: bool) -> SceneArrays
         if member.image_id in rows
     ]
     point, photo, keypoint = np.array(seen, np.int64).reshape(-1, 3).T
-    pixels = np.array([keypoints[k][index] for k, index in zip(photo, keypoint, strict=True)], np.float64)
+    starts = np.cumsum([0, *map(len, keypoints)])
+    pixels = np.concatenate([*keypoints, np.zeros((0, 2))])[starts[photo] + keypoint]
     poses = [image.cam_from_world().matrix() for image in images]
     return SceneArrays(
         photos=tuple(image.name for image in images),
@@ -38,6 +39,6 @@ def model_arrays(model: pycolmap.Reconstruction, *, metric: bool) -> SceneArrays
         errors_px=np.array([point.error for point in found], np.float64),
         track_points=point,
         track_photos=photo,
-        track_pixels=pixels.reshape(-1, 2),
+        track_pixels=pixels,
         metric=metric,
     )

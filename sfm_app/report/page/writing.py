@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from sfm_app.atomic_io import replace_atomically
 from sfm_app.colmap.figures.observations import ModelFigures, model_figures
-from sfm_app.errors import InputError, SfmError
+from sfm_app.errors import SfmError
 from sfm_app.numerical import Json, json_text
 from sfm_app.report.page import findings
 from sfm_app.report.page.contents import UNREADABLE, RunContents, read_contents
@@ -117,12 +117,8 @@ def read_run(run: RunContext) -> RunContents:
     Raises:
         InputError: the folder holds no run.
     """
-    contents = read_contents(run)
-    if not contents.manifest:
-        raise InputError(
-            f"{run.workspace.root} holds no run", hint="name the folder that `sfm-app run PHOTOS -o OUT` wrote"
-        )
-    return contents
+    run.workspace.manifest.check_begun()
+    return read_contents(run)
 
 
 def render_page(contents: RunContents, parts: LargeParts, other: RunContents | None = None) -> str:

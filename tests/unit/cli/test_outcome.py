@@ -61,7 +61,7 @@ def test_of_many_only_the_first_few_are_named(finished):
     lines = outcome_lines(replace(finished, scene=scene))
 
     assert sum("not placed" in line for line in lines) == 2
-    assert any(line.strip() == "and 38 more photos, see the report" for line in lines)
+    assert any(line.strip() == "and 38 more photos; -v prints them" for line in lines)
     assert len(lines) < 20
 
 

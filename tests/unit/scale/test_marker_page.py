@@ -1,6 +1,7 @@
 """Pages of markers: they are found in the drawing, at their size."""
 
 import re
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.scale.marker_page import PAGES_MM, marker_places, write_marker_page
-from sfm_app.scale.markers import draw_pattern, find_markers
+from sfm_app.scale.markers import AUTO, FAMILIES, TRIED, draw_pattern, find_markers
+from sfm_app.settings import ScaleSettings
 
 PX_PER_MM = 4.0
 
@@ -73,6 +75,11 @@ def test_markers_do_not_touch_each_other_or_the_margin(paper, side):
 def test_what_does_not_fit_is_said(tmp_path, change, says):
     with pytest.raises(ConfigError, match=says):
         write_marker_page(tmp_path / "page.pdf", **({"side_m": 0.05} | change))
+
+
+def test_the_families_of_the_settings_are_those_that_are_known():
+    assert set(get_args(ScaleSettings.model_fields["marker_family"].annotation)) == {AUTO, *FAMILIES}
+    assert set(TRIED) < set(FAMILIES)
 
 
 def test_other_files_and_folders_are_refused(tmp_path):

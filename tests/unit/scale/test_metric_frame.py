@@ -1,6 +1,7 @@
 """The frame of exported files: what is moved into it stays the same scene."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from PIL import Image
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.scale import MetricFrame, move_model
 from sfm_app.scale.evidence import ScaleEvidence
-from sfm_app.scale.photo_rays import unrotate_pixels
+from sfm_app.scale.photo_rays import layout_scale, unrotate_pixels
 from sfm_app.synthetic.cameras import axis_rotation
 from sfm_app.types import Photo
 
@@ -47,6 +48,14 @@ def test_moved_cameras_see_moved_points_where_they_saw_them(textured_ball):
         )
         assert np.allclose(new, 3.5 * old, atol=1e-9)
     assert np.array_equal(moved.surface.faces, textured_ball.surface.faces)
+
+
+def test_marks_are_of_the_file_at_its_full_size(tmp_path):
+    Image.new("RGB", (120, 80)).save(tmp_path / "a.jpg")
+    small = Photo("a.jpg", 60, 40, "one camera", needs_copy=True)
+    assert layout_scale(small, tmp_path) == 0.5
+    assert layout_scale(replace(small, needs_copy=False), tmp_path) == 1.0
+    assert layout_scale(replace(small, name="gone.jpg"), tmp_path) == 1.0
 
 
 @pytest.mark.parametrize("turn", [0, 90, 180, 270])
