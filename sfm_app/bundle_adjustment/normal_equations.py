@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_app.bundle_adjustment.elimination import POSE, free_pose_columns, whiten_points
 from sfm_app.bundle_adjustment.schur import Linearized, eliminate_points
-from sfm_app.geometry.lenses.projections import CAMERA, PANORAMA, project_points, wrap_residuals
+from sfm_app.geometry.lenses.projections import CAMERA, PANORAMA, image_points, project_points, wrap_residuals
 from sfm_app.geometry.spd_solve import project_to_psd, solve_positive, solve_sparse_positive
 
 FloatArray = NDArray[np.float64]
@@ -101,12 +101,19 @@ def project(bundle: Bundle) -> tuple[FloatArray, FloatArray, FloatArray, FloatAr
     return found.x, found.by_camera, by_pose, np.einsum("nij,njk->nik", found.by_point, R)
 
 
+def predict(bundle: Bundle) -> FloatArray:
+    """Return the predictions of `project` (N, 2), without derivatives."""
+    rows = bundle.camera[bundle.photo]
+    turned = np.einsum("nij,nj->ni", bundle.R[bundle.photo], bundle.X[bundle.point])
+    return image_points(turned + bundle.t[bundle.photo], bundle.params[rows], bundle.family[rows])
+
+
 def residuals(bundle: Bundle, predicted: FloatArray) -> FloatArray:
     """Return (N, 2) observed less predicted positions, in pixels; in panoramas the short way round.
 
     Args:
         bundle: the model.
-        predicted: (N, 2) from `project`.
+        predicted: (N, 2) from `project` or `predict`.
     """
     rows = bundle.camera[bundle.photo]
     return wrap_residuals(bundle.x - predicted, bundle.params[rows], bundle.family[rows])
@@ -205,7 +212,7 @@ def cost(bundle: Bundle, scale_px: float) -> float:
         scale_px: s of the loss, in pixels, > 0.
     """
     with np.errstate(all="ignore"):
-        r = residuals(bundle, project(bundle)[0])
+        r = residuals(bundle, predict(bundle))
     return loss(r, usable_mask(bundle, r), scale_px)
 
 
@@ -242,7 +249,7 @@ def usable_mask(bundle: Bundle, r: FloatArray, depth: FloatArray | None = None) 
 def lost_points(bundle: Bundle) -> NDArray[np.bool_]:
     """Return (P,) which points have a lost observation."""
     with np.errstate(all="ignore"):
-        r = residuals(bundle, project(bundle)[0])
+        r = residuals(bundle, predict(bundle))
     return np.bincount(bundle.point[~usable_mask(bundle, r)], minlength=len(bundle.X)) > 0
 
 

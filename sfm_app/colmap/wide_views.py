@@ -15,7 +15,7 @@ from sfm_app.colmap.masks import MASKS, shrink_mask
 from sfm_app.colmap.processes.undistort_process import JPEG_QUALITY
 from sfm_app.colmap.types import all_images
 from sfm_app.geometry.lenses.perspective_views import PerspectiveView, cover_rays
-from sfm_app.geometry.lenses.projections import FISHEYE, FX, PANORAMA, SEEN_ANGLE, project_points
+from sfm_app.geometry.lenses.projections import FISHEYE, FX, PANORAMA, SEEN_ANGLE, image_points
 from sfm_app.photos import read_mask, save_mask
 from sfm_app.photos.resample import resample, shrink
 
@@ -51,7 +51,7 @@ class WideLens:
             rays: (N, 3) in the camera's frame.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
-            x = project_points(rays, np.tile(self.params, (len(rays), 1)), np.full(len(rays), self.family)).x
+            x = image_points(rays, np.tile(self.params, (len(rays), 1)), np.full(len(rays), self.family))
             shown = rays[:, 2] >= self.least_cosine * np.linalg.norm(rays, axis=1)
             shown &= np.all((x >= 0.0) & (x <= self.size), axis=1)
         return np.where(shown[:, None], x, -1.0)
@@ -206,7 +206,7 @@ def _shown_rays(camera: pycolmap.Camera) -> FloatArray:
     pixels = np.column_stack([x.ravel(), y.ravel()])
     rays, family = np.array(camera.cam_ray_from_img(pixels), np.float64), camera_family(camera)
     with np.errstate(divide="ignore", invalid="ignore"):
-        again = project_points(rays, np.tile(read_camera(camera), (len(rays), 1)), np.full(len(rays), family)).x
+        again = image_points(rays, np.tile(read_camera(camera), (len(rays), 1)), np.full(len(rays), family))
         # the seam of a panorama is at both of its borders
         sound = (family == PANORAMA) | (np.linalg.norm(again - pixels, axis=1) < AGREE_PX)
         sound &= np.isfinite(rays).all(axis=1)

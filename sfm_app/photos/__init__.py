@@ -2,7 +2,6 @@
 
 from sfm_app.photos.camera_groups import group_by_camera, split_by_given_camera
 from sfm_app.photos.decode import UnreadableError, read_picture, upright_image
-from sfm_app.photos.duplicates import drop_duplicates
 from sfm_app.photos.files import list_files, resolve_file
 from sfm_app.photos.masks import (
     MASK_HINT,
@@ -16,10 +15,12 @@ from sfm_app.photos.masks import (
     unused_masks,
 )
 from sfm_app.photos.probe import read_photo
-from sfm_app.photos.quality_filter import drop_unusable
+from sfm_app.photos.selection.duplicates import drop_duplicates
+from sfm_app.photos.selection.quality_filter import drop_unusable
+from sfm_app.photos.selection.stats_file import read_stats, write_stats
+from sfm_app.photos.selection.thumbnail_stats import PhotoStats
 from sfm_app.photos.source import Source, read_source
 from sfm_app.photos.staging import assign_names, lay_out
-from sfm_app.photos.thumbnail_stats import PhotoStats
 from sfm_app.photos.video.feature_tracking import CornerTracker, TrackedFrame
 from sfm_app.photos.video.keyframe_selection import select_keyframes
 from sfm_app.photos.video.video_formats import is_video, read_head
@@ -50,10 +51,12 @@ __all__ = [
     "read_photo",
     "read_picture",
     "read_source",
+    "read_stats",
     "resolve_file",
     "save_mask",
     "select_keyframes",
     "split_by_given_camera",
     "unused_masks",
     "upright_image",
+    "write_stats",
 ]

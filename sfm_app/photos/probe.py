@@ -19,7 +19,7 @@ from sfm_app.photos.exif import camera_name, focal_px, gps_position, orientation
 from sfm_app.photos.files import resolve_file
 from sfm_app.photos.letterbox import shown_part
 from sfm_app.photos.panoramas.recognition import is_panorama
-from sfm_app.photos.thumbnail_stats import PhotoStats, measure_photo
+from sfm_app.photos.selection.thumbnail_stats import PhotoStats, measure_photo
 from sfm_app.settings import PhotoSettings
 from sfm_app.types import Frame, Photo, UnusablePhoto
 from sfm_app.types.calibration import EQUIRECTANGULAR, PERSPECTIVE

@@ -16,6 +16,8 @@ from sfm_app.types import Photo, PhotoSet
 
 Stamp = tuple[int, int]
 """Size in bytes, and time of the last change in nanoseconds."""
+UNREADABLE = "unreadable"
+"""Stands for the hash of a file that cannot be read."""
 ParallelMap = Callable[[Callable[[str], str], Sequence[str]], Iterable[str]]
 """Calls a function for every item, possibly in parallel, and returns the results in order."""
 
@@ -66,6 +68,10 @@ class Source:
         read = {"bytes": self.files.get(photo.path, self.files.get("")), "mask bytes": self.masks.get(photo.mask)}
         return asdict(photo) | {"notes": ()} | read
 
+    def digests(self) -> dict[str, str]:
+        """Return the hashes of the files that can be read, by path in the folder; none for a video."""
+        return {name: digest for name, digest in self.files.items() if name and digest != UNREADABLE}
+
     def check(self, photos: PhotoSet) -> None:
         """Check that the video, these photos and their masks have not changed since the run began.
 
@@ -105,11 +111,11 @@ def read_source(path: Path, out: Path, options: PhotoSettings, spread: ParallelM
 
 
 def digest(file: Path) -> str:
-    """Return the hash of the bytes of a file; "unreadable" if it cannot be read."""
+    """Return the hash of the bytes of a file; UNREADABLE if it cannot be read."""
     try:
         return digest_file(file)
     except OSError:
-        return "unreadable"
+        return UNREADABLE
 
 
 def _stamp(path: Path) -> Stamp | None:

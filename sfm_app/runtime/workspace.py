@@ -25,7 +25,7 @@ LOG, PARTS, FEATURES, MAPPING = "log.txt", "view_graph_parts", "feature_parts", 
 EARLIER, PARCELS, SIFT_ROWS = ".earlier", ".cluster", ".sift_rows"
 LINK_CHECKED = (*OUTPUT_NAMES, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING, EARLIER, PARCELS, SIFT_ROWS)
 """Names that a run writes to without replacing them: a link there would lead it out of the folder."""
-PHOTO_SET, VIEW_GRAPH = "photos.json", "view_graph.npz"
+PHOTO_SET, PHOTO_STATS, VIEW_GRAPH = "photos.json", ".photo_stats.npz", "view_graph.npz"
 
 
 class Workspace:
@@ -64,6 +64,11 @@ class Workspace:
     def photo_set(self) -> Path:
         """What is known about the photos."""
         return self.root / PHOTO_SET
+
+    @property
+    def photo_stats(self) -> Path:
+        """What was measured on every photo: a run that knows a file by its bytes does not decode it again."""
+        return self.root / PHOTO_STATS
 
     @property
     def view_graph(self) -> Path:

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 from sfm_app.atomic_io import replace_atomically
 from sfm_app.errors import InputError
@@ -27,9 +26,11 @@ from sfm_app.photos import (
     list_files,
     mask_path,
     read_photo,
+    read_stats,
     resolve_file,
     split_by_given_camera,
     unused_masks,
+    write_stats,
 )
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import largest_photo_megapixels
@@ -37,7 +38,7 @@ from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import PhotoSettings
 from sfm_app.stages.video_frames import video_frames
 from sfm_app.tasks import Task
-from sfm_app.types import GpsPosition, Photo, PhotoSet, UnusablePhoto
+from sfm_app.types import Photo, PhotoSet, UnusablePhoto
 
 
 def make(source: Source, run: RunContext) -> PhotoSet:
@@ -77,7 +78,7 @@ def read_photo_list(place: Workspace) -> PhotoSet:
         ValueError: it names a photo outside of the folder.
     """
     values = json.loads(place.photo_set.read_text(encoding="utf-8"))
-    photos = tuple(_photo_from_dict(entry) for entry in values["photos"])
+    photos = tuple(Photo.from_dict(entry) for entry in values["photos"])
     if not all(is_below(photo.name) for photo in photos):
         raise ValueError(f"{place.photo_set} names photos outside of their folder")
     return PhotoSet(place.photos, photos, tuple(UnusablePhoto(**photo) for photo in values["unusable"]))
@@ -93,7 +94,7 @@ def _read_photos(
 ) -> PhotoSet:
     """Read these files of a folder and lay the usable photos out for COLMAP; errors as in `make`."""
     options = limit_to_memory(run)
-    found = run.map(Task(read_photo, folder, options=options), names, "photos")
+    found = read_all(source, folder, names, options, run)
     glances = [photo for photo in found if isinstance(photo, PhotoStats)]
     unusable = [photo for photo in found if isinstance(photo, UnusablePhoto)]
     glances, blackened = attach_masks(glances, folder, source, run)
@@ -118,6 +119,27 @@ def _read_photos(
     run.record(notes={photo.path: list(photo.notes) for photo in photos if photo.notes})
     run.record(gps=sum(photo.gps is not None for photo in photos))
     return photo_set
+
+
+def read_all(
+    source: Source, folder: Path, names: Sequence[str], options: PhotoSettings, run: RunContext
+) -> list[PhotoStats | UnusablePhoto]:
+    """Return what the files of a folder hold; those that an earlier run has read are not decoded again.
+
+    Args:
+        source: has the hashes of the files.
+        folder, names: the files.
+        options: smallest and largest size.
+        run: the run.
+    """
+    digests, store = source.digests(), run.workspace.photo_stats
+    known: dict[str, PhotoStats | UnusablePhoto] = {**read_stats(store, digests, options)}
+    left = [name for name in names if name not in known]
+    found = known | dict(zip(left, run.map(Task(read_photo, folder, options=options), left, "photos"), strict=True))
+    usable = {name: one for name in names if isinstance(one := found[name], PhotoStats)}
+    if left and usable.keys() & digests.keys():
+        write_stats(store, usable, digests, options)
+    return [found[name] for name in names]
 
 
 def limit_to_memory(run: RunContext) -> PhotoSettings:
@@ -201,7 +223,7 @@ def lay_out_photo(photo: Photo, *, folder: Path, target: Path) -> None:
 
 def _save_photo_set(photos: PhotoSet, run: RunContext) -> None:
     """Write photos.json, with hashes of the copies."""
-    entries = [_photo_to_dict(photo) for photo in photos.photos]
+    entries = [photo.to_dict() for photo in photos.photos]
     known = {"photos": entries, "unusable": [asdict(photo) for photo in photos.unusable]}
     copies = {photo.name: _copy_digest(photo, run) for photo in photos.photos}
     with replace_atomically(run.workspace.photo_set) as path:
@@ -227,16 +249,6 @@ def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoS
         if masks is not None and not mask_path(run.workspace.masks, photo.name).exists():
             lay_out_mask(photo, folder, masks, run.workspace.masks)
     return found
-
-
-def _photo_to_dict(photo: Photo) -> dict[str, Any]:
-    return {key: value for key, value in asdict(photo).items() if key != "time_s" or value is not None}
-
-
-def _photo_from_dict(entry: Mapping[str, Any]) -> Photo:
-    gps, shown = entry.get("gps"), entry.get("shown")
-    known = {"gps": GpsPosition(**gps) if gps else None, "shown": tuple(shown) if shown else None}
-    return Photo(**{**entry, **known, "notes": tuple(entry.get("notes", ()))})
 
 
 def _too_few_message(folder: Path, usable: int, unusable: list[UnusablePhoto]) -> str:

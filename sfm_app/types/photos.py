@@ -1,7 +1,9 @@
 """Photos of a folder, usable or not."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 Frame = tuple[int, int, int, int]
 """Left, top, width and height of a part of a photo, in pixels."""
@@ -58,6 +60,17 @@ class Photo:
     def path(self) -> str:
         """Path inside the folder."""
         return self.original or self.name
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the photo as JSON values."""
+        return {key: value for key, value in asdict(self).items() if key != "time_s" or value is not None}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "Photo":
+        """Return the photo from the values of `to_dict`."""
+        gps, shown = values.get("gps"), values.get("shown")
+        known = {"gps": GpsPosition(**gps) if gps else None, "shown": tuple(shown) if shown else None}
+        return cls(**{**values, **known, "notes": tuple(values.get("notes", ()))})
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from sfm_app.colmap.bundle import Adjustment
 from sfm_app.colmap.bundles.bundle_arrays import read_bundle, write_bundle
 from sfm_app.colmap.bundles.bundle_rounds import LOSS_SCALE_PX, lens_priors
 from sfm_app.colmap.models.model import posed_images, viewing_rays
-from sfm_app.geometry.lenses.projections import project_points
+from sfm_app.geometry.lenses.projections import image_points
 
 FloatArray = NDArray[np.float64]
 Keypoints = Mapping[int, FloatArray]
@@ -121,7 +121,7 @@ def _compensate(
     place = int(bundle.camera[row])
     params, family = np.tile(bundle.params[place], (len(x), 1)), np.full(len(x), bundle.family[place])
     with np.errstate(all="ignore"):
-        moved = project_points(middle, params, family).x
+        moved = image_points(middle, params, family)
     shown = np.isfinite(moved).all(axis=1, keepdims=True)
     return np.where(shown, moved, x)
 

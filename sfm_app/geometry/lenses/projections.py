@@ -65,6 +65,22 @@ def project_points(points: FloatArray, params: FloatArray, family: IntArray) -> 
     return found
 
 
+def image_points(points: FloatArray, params: FloatArray, family: IntArray) -> FloatArray:
+    """Return (N, 2) pixels of points, without derivatives, as `project_points` does.
+
+    Args:
+        points, params, family: as in `project_points`.
+    """
+    kinds = np.unique(family)
+    if len(kinds) == 1:
+        return _POSITIONS[kinds[0]](points, params)
+    x = np.zeros((len(points), 2))
+    for kind in kinds:
+        rows = np.flatnonzero(family == kind)
+        x[rows] = _POSITIONS[kind](points[rows], params[rows])
+    return x
+
+
 def wrap_residuals(r: FloatArray, params: FloatArray, family: IntArray) -> FloatArray:
     """Return residuals (N, 2) with those of panoramas taken the short way round.
 
@@ -125,6 +141,38 @@ def shown_angle(params: FloatArray, family: int, reach: float) -> float:
     return float(angle[min(folds[0] if len(folds) else last, ends[0] if len(ends) else last)])
 
 
+def _place_perspective(points: FloatArray, params: FloatArray) -> FloatArray:
+    X, Y, Z = points.T
+    u, v = X / Z, Y / Z
+    return _pixels(*_bend(u, v, _radial_factor(u * u + v * v, params, PERSPECTIVE)[0], params), params)
+
+
+def _place_fisheye(points: FloatArray, params: FloatArray) -> FloatArray:
+    X, Y, Z = points.T
+    side = np.hypot(X, Y)
+    theta = np.arctan2(side, Z)
+    gain = _axial_gain(side, theta, Z)
+    t2 = theta * theta
+    x = _pixels(*_bend(gain * X, gain * Y, _radial_factor(t2, params, FISHEYE)[0], params), params)
+    prism = params[:, [SX, SY]]
+    return x + params[:, [FX, FY]] * prism * t2[:, None] if prism.any() else x
+
+
+def _place_panorama(points: FloatArray, params: FloatArray) -> FloatArray:
+    X, Y, Z = points.T
+    fx, fy, cx, cy = params[:, : CY + 1].T
+    return np.stack([fx * np.arctan2(X, Z) + cx, fy * np.arctan2(Y, np.hypot(X, Z)) + cy], -1)
+
+
+_POSITIONS = {PERSPECTIVE: _place_perspective, FISHEYE: _place_fisheye, PANORAMA: _place_panorama}
+
+
+def _axial_gain(side: FloatArray, theta: FloatArray, Z: FloatArray) -> FloatArray:
+    """Return the angle over the distance to the optical axis, of points (N,)."""
+    near = (side < NEAR_AXIS * np.abs(Z)) & (Z > 0.0)
+    return np.where(near, 1.0 / Z, theta / np.where(near, 1.0, side))
+
+
 def _project_perspective(points: FloatArray, params: FloatArray) -> Projected:
     X, Y, Z = points.T
     u, v = X / Z, Y / Z
@@ -142,9 +190,8 @@ def _project_fisheye(points: FloatArray, params: FloatArray) -> Projected:
     side, square = np.hypot(X, Y), np.einsum("ni,ni->n", points, points)
     theta = np.arctan2(side, Z)
     near = (side < NEAR_AXIS * np.abs(Z)) & (Z > 0.0)
-    wide = np.where(near, 1.0, side)
-    gain = np.where(near, 1.0 / Z, theta / wide)
-    bend = np.where(near, -2.0 / (3.0 * Z**3), (Z / square - gain) / wide**2)
+    gain = _axial_gain(side, theta, Z)
+    bend = np.where(near, -2.0 / (3.0 * Z**3), (Z / square - gain) / np.where(near, 1.0, side) ** 2)
     u, v = gain * X, gain * Y
     uv_by_x = np.stack(
         [
@@ -170,11 +217,11 @@ def _project_fisheye(points: FloatArray, params: FloatArray) -> Projected:
 
 def _project_panorama(points: FloatArray, params: FloatArray) -> Projected:
     X, Y, Z = points.T
-    fx, fy, cx, cy = params[:, : CY + 1].T
+    fx, fy = params[:, : FY + 1].T
     level, square = np.hypot(X, Z), np.einsum("ni,ni->n", points, points)
-    x = np.stack([fx * np.arctan2(X, Z) + cx, fy * np.arctan2(Y, level) + cy], -1)
     across = np.stack([fx * Z / level**2, np.zeros_like(X), -fx * X / level**2], -1)
     upright = np.stack([-X * Y / level, level, -Y * Z / level], -1) * (fy / square)[:, None]
+    x = _place_panorama(points, params)
     return Projected(x, np.zeros((len(x), 2, CAMERA)), np.stack([across, upright], 1))
 
 
@@ -193,6 +240,18 @@ def _radial_factor(r2: FloatArray, params: FloatArray, family: int) -> tuple[Flo
     return factor, (climb - factor * fall) / below, below
 
 
+def _bend(u: FloatArray, v: FloatArray, factor: FloatArray, params: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return points (N,), (N,) of the plane behind the distortion, in focal lengths; `factor` is that of the radius."""
+    p1, p2 = params[:, [P1, P2]].T
+    r2, uv = u * u + v * v, 2.0 * u * v
+    return u * factor + p1 * uv + p2 * (r2 + 2.0 * u * u), v * factor + p2 * uv + p1 * (r2 + 2.0 * v * v)
+
+
+def _pixels(ud: FloatArray, vd: FloatArray, params: FloatArray) -> FloatArray:
+    fx, fy, cx, cy = params[:, : CY + 1].T
+    return np.stack([fx * ud + cx, fy * vd + cy], -1)
+
+
 def _distort(
     u: FloatArray, v: FloatArray, radial: tuple[FloatArray, FloatArray], params: FloatArray,
     terms: tuple[list[FloatArray], tuple[int, ...]], uv_by_x: FloatArray,
@@ -206,12 +265,12 @@ def _distort(
         terms: derivatives of the factor by some radial parameters, and the indices of these.
         uv_by_x: (N, 2, 3) derivatives of u and v by the point.
     """
-    fx, fy, cx, cy = params[:, : CY + 1].T
+    fx, fy = params[:, : FY + 1].T
     p1, p2 = params[:, [P1, P2]].T
     factor, slope = radial
     r2, uv = u * u + v * v, 2.0 * u * v
     across, upright = r2 + 2.0 * u * u, r2 + 2.0 * v * v
-    ud, vd = u * factor + p1 * uv + p2 * across, v * factor + p2 * uv + p1 * upright
+    ud, vd = _bend(u, v, factor, params)
     by_camera = np.zeros((len(u), 2, CAMERA))
     by_camera[:, 0, FX], by_camera[:, 1, FY] = ud, vd
     by_camera[:, 0, CX] = by_camera[:, 1, CY] = 1.0
@@ -223,5 +282,4 @@ def _distort(
     uu = factor + 2.0 * u * u * slope + 2.0 * p1 * v + 6.0 * p2 * u
     vv = factor + 2.0 * v * v * slope + 2.0 * p2 * u + 6.0 * p1 * v
     by_uv = np.stack([np.stack([fx * uu, fx * cross], -1), np.stack([fy * cross, fy * vv], -1)], 1)
-    x = np.stack([fx * ud + cx, fy * vd + cy], -1)
-    return Projected(x, by_camera, np.einsum("nij,njk->nik", by_uv, uv_by_x))
+    return Projected(_pixels(ud, vd, params), by_camera, np.einsum("nij,njk->nik", by_uv, uv_by_x))

@@ -7,7 +7,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from sfm_app.errors import InputError
-from sfm_app.photos import read_source
+from sfm_app.photos import read_photo, read_source
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
@@ -236,6 +236,22 @@ def test_the_output_folder_inside_the_photos_is_not_read(folder, tmp_path):
         found = make(folder, RunContext(Settings(), workspace, load_plugins(installed=False), executor, 1))
 
     assert [photo.name for photo in found.photos] == ["a.jpg", "b.png"]
+
+
+def test_photos_that_came_later_are_read_and_known_ones_are_not_decoded_again(folder, run, monkeypatch):
+    make(folder, run)
+    Image.fromarray(pixels(3)).save(folder / "c.jpg")
+    Image.fromarray(pixels(4)).save(folder / "b.png")
+    read = []
+    monkeypatch.setattr(
+        photos, "read_photo", lambda place, name, options: read.append(name) or read_photo(place, name, options=options)
+    )
+
+    found = make(folder, run)
+
+    assert sorted(read) == ["b.png", "c.jpg"]
+    run.workspace.photo_stats.unlink()
+    assert make(folder, run) == found
 
 
 @pytest.mark.parametrize(

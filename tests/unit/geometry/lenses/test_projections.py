@@ -14,6 +14,7 @@ from sfm_app.geometry.lenses.projections import (
     PANORAMA,
     PERSPECTIVE,
     angle_limit,
+    image_points,
     project_points,
     radius_at,
 )
@@ -53,6 +54,18 @@ def test_points_come_to_lie_where_colmap_puts_them(family):
     found = projected(points, CAMERAS[family], family).x
 
     assert found == pytest.approx(np.asarray(camera.img_from_cam(points)), abs=1e-6)
+
+
+def test_positions_without_derivatives_are_the_same_for_cameras_of_all_families():
+    points = np.vstack([points_of(family) for family in CAMERAS])
+    family = np.repeat(list(CAMERAS), 60)
+    params = np.array([CAMERAS[kind] for kind in family])
+
+    assert np.array_equal(image_points(points, params, family), project_points(points, params, family).x)
+    for kind in CAMERAS:
+        rows = family == kind
+        alone = image_points(points[rows], params[rows], family[rows])
+        assert np.array_equal(alone, project_points(points[rows], params[rows], family[rows]).x)
 
 
 @pytest.mark.parametrize("family", CAMERAS)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sfm_app.photos.thumbnail_stats import PhotoStats
+from sfm_app.photos.selection.thumbnail_stats import PhotoStats
 from sfm_app.types import Photo, UnusablePhoto
 
 BLURRED, BLURRED_MORE = 0.85, 0.15

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.photos.thumbnail_stats import SIDE_PX, PhotoStats
+from sfm_app.photos.selection.thumbnail_stats import SIDE_PX, PhotoStats
 from sfm_app.types import Photo, UnusablePhoto
 
 MAX_DIFFERENCE = 0.015

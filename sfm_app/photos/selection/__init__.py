@@ -1,0 +1,1 @@
+"""Which photos are worth using: measured, compared, and left out."""
