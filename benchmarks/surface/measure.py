@@ -7,6 +7,7 @@ from statistics import fmean
 from typing import Any
 
 from benchmarks.common.results import Row
+from benchmarks.surface.detail import detail_scores
 from benchmarks.surface.photos import (
     Likeness,
     leave_out,
@@ -24,6 +25,7 @@ from benchmarks.surface.worker import StageCost, run_stages
 from sfm_app.settings import Settings
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.synthetic.pictures import PreparedModel, prepare_model
+from sfm_app.synthetic.scenes.bodies import SyntheticScene
 from sfm_app.types import Surface
 
 FILES = ("glb", "ply", "obj")
@@ -48,12 +50,13 @@ def file_sizes(out: Path) -> Row:
     return {f"kB {suffix}": path.stat().st_size // 1000 for suffix, path in found.items() if path.exists()}
 
 
-def compare_with_truth(surface: Surface, out: Path, truth: Truth) -> Row:
-    """Score our surface, and the best one from the sparse points, against the truth."""
+def compare_with_truth(surface: Surface, out: Path, truth: Truth, scene: SyntheticScene) -> Row:
+    """Score our surface, and the best one from the sparse points, against the truth of a scene."""
     centers = {name: image.projection_center() for name, image in placed_photos(out).items()}
     seen = seen_places(truth)
     row = truth_scores(surface, centers, truth, seen)
     row["completeness of 3 photos %"] = truth_scores(surface, centers, truth, seen_places(truth, 3))["completeness %"]
+    row |= detail_scores(surface, centers, truth, scene)
     rivals = [
         truth_scores(found, centers, truth, seen) | {"trim": trim}
         for trim, found in sparse_surfaces(out / "sparse")

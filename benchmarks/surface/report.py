@@ -15,6 +15,10 @@ PHOTOS = (
     "coverage of not black %",
     "PSNR dB", "worst PSNR dB", "left out", "left out: PSNR dB", "left out: PSNR lower by dB",
 )  # fmt: skip
+DETAIL = (
+    "photos", *(f"{name} {limit:g} %" for limit in (0.05, 0.1, 0.2, 0.4) for name in ("accuracy", "completeness", "F")),
+    "flakes %", "edges: median %", "edges: mean %", "edges within 0.1 %", "thin things %", "ground at a low angle %",
+)  # fmt: skip
 COST = ("photos", "placed", "seconds together", "seconds per photo")
 
 
@@ -27,6 +31,7 @@ def page(about: str, rows: Sequence[Row], parts: Sequence[Row], files_of: Mappin
         f"# Surfaces\n\n{about}\n",
         f"## Asked and measured\n\n{table(bar_rows(rows))}" if bar_rows(rows) else "",
         _section("Rendered scenes, against the true surface", [row for row in rows if "accuracy %" in row], TRUTH),
+        _section("Rendered scenes, in detail", [row for row in rows if "flakes %" in row], DETAIL),
         _section("Real photos, against the model rendered into their cameras", _photo_rows(rows), PHOTOS),
         _section("Seconds, memory, files", rows, (*COST, *stages, *files)),
         _section("The same set with fewer and more photos", parts, (*COST, *stages)),

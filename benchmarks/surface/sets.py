@@ -9,10 +9,13 @@ from sfm_app.api import open_run
 from sfm_app.pipeline import DEPTH_MAPS, NAMES, TEXTURE, run_stages
 from sfm_app.settings import Settings
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder
+from sfm_app.synthetic.scenes.bodies import SyntheticScene
 from sfm_app.synthetic.scenes.scene_catalog import WALKS, build_scene, scene_views
 from sfm_app.types.model import Model
 
 RENDERED = ("statue", "facade", "corner")
+DETAILED = ("ornament", "railing", "garden")
+"""Rendered scenes with fine detail; their photos are noisier, and exposed differently."""
 REAL = ("fountain-P11", "Herz-Jesus-P8", "castle-P19", "temple16", "kermit11")
 
 
@@ -24,6 +27,8 @@ class SurfaceSet:
     photos: Path
     truth: Truth | None
     """Truth of rendered photos; None for real ones."""
+    scene: SyntheticScene | None = None
+    """What rendered photos show."""
 
     @property
     def count(self) -> int:
@@ -45,7 +50,7 @@ def surface_set(name: str, data: Path | None, cache: Path) -> SurfaceSet:
     scene, _, seed = name.partition("@")
     if scene in WALKS:
         folder = cache / "rendered" / name
-        return SurfaceSet(name, folder / "photos", _load_or_render(scene, int(seed or 0), folder))
+        return SurfaceSet(name, folder / "photos", _load_or_render(scene, int(seed or 0), folder), build_scene(scene))
     if data is None or not (data / name / "images").is_dir():
         raise ValueError(f"'{name}' is neither a rendered scene ({', '.join(WALKS)}) nor a folder of DATA")
     return SurfaceSet(name, data / name / "images", None)
@@ -74,6 +79,7 @@ def dense_stages() -> Sequence[str]:
 
 def _load_or_render(name: str, seed: int, folder: Path) -> Truth:
     if not (folder / "truth.json").exists():  # written last
-        options = PhotoOptions(seed=seed)
+        rough = PhotoOptions(noise=2.5, blur_px=0.6, quality=88, exposure_ev=0.25, seed=seed)
+        options = rough if name in DETAILED else PhotoOptions(seed=seed)
         save_truth(write_photo_folder(folder / "photos", build_scene(name), scene_views(name, seed), options), folder)
     return load_truth(folder)

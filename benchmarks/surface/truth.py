@@ -1,6 +1,7 @@
 """Compare a surface with the true one: accuracy, and completeness over the places that the photos see."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +47,18 @@ def truth_scores(surface: Surface, centers: Mapping[str, FloatArray], truth: Tru
     return {name: round(100.0 * value, 3) for name, value in zip(names, values, strict=True)}
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Sights:
+    """Places, and how photos see them."""
+
+    places: FloatArray
+    """(N, 3)."""
+    count: NDArray[np.int64]
+    """(N,) photos that see each: in frame, in front, not hidden, and not at a grazing angle."""
+    steepest_deg: FloatArray
+    """(N,) largest angle between the horizontal plane and the ray of such a photo; 0 where none sees the place."""
+
+
 def seen_places(truth: Truth, photos: int = SEEN_BY, samples: int = 3 * SAMPLES) -> FloatArray:
     """Sample places of the true surface, evenly over its area, that enough photos see: in frame, in front, not hidden.
 
@@ -54,10 +67,22 @@ def seen_places(truth: Truth, photos: int = SEEN_BY, samples: int = 3 * SAMPLES)
         photos: least number of photos.
         samples: number of samples over the whole surface, unseen parts included.
     """
+    found = sights_of(truth, *sample_with_normals(truth, samples))
+    return found.places[found.count >= photos]
+
+
+def sights_of(truth: Truth, places: FloatArray, normals: FloatArray | None, slack: FloatArray | None = None) -> Sights:
+    """Return how photos see places.
+
+    Args:
+        truth: truth of the rendered photos.
+        places: (N, 3).
+        normals: (N, 3) unit normals of the surface there; None where a place is seen from all sides.
+        slack: (N,) how far behind the first surface on a ray a place still counts as seen; a small one if None.
+    """
     caster = ray_caster(truth.vertices, truth.faces)
-    places, normals = _sample_with_normals(truth, samples)
-    slack = HIDDEN * scene_size(truth)
-    counted = np.zeros(len(places), np.int64)
+    slack = np.full(len(places), HIDDEN * scene_size(truth)) if slack is None else slack
+    counted, steepest = np.zeros(len(places), np.int64), np.zeros(len(places))
     for name, pose in truth.cam_from_world.items():
         center, camera = camera_center(pose), truth.cameras[name]
         x = places @ pose[:, :3].T + pose[:, 3]
@@ -67,16 +92,25 @@ def seen_places(truth: Truth, photos: int = SEEN_BY, samples: int = 3 * SAMPLES)
         within = (x[:, 2] > 0) & ((pixel >= 0) & (pixel <= [camera.width, camera.height])).all(axis=1)
         ways = places - center
         distance = np.linalg.norm(ways, axis=1)
-        facing = -(ways * normals).sum(axis=1) > np.cos(np.radians(GRAZING_DEG)) * distance
-        asked = np.flatnonzero(within & facing)
+        if normals is not None:
+            within &= -(ways * normals).sum(axis=1) > np.cos(np.radians(GRAZING_DEG)) * distance
+        asked = np.flatnonzero(within)
         # the ray directions have the length of the distance, so t_hit is in units of it
         first = cast_rays(caster, center, ways[asked])["t_hit"].astype(np.float64) * distance[asked]
-        counted[asked[first >= distance[asked] - slack]] += 1
-    return places[counted >= photos]
+        shown = asked[first >= distance[asked] - slack[asked]]
+        counted[shown] += 1
+        angle = np.degrees(np.arcsin(np.clip(-ways[shown, 1] / distance[shown], -1.0, 1.0)))
+        steepest[shown] = np.maximum(steepest[shown], angle)
+    return Sights(places, counted, steepest)
 
 
-def _sample_with_normals(truth: Truth, samples: int) -> tuple[FloatArray, FloatArray]:
-    """Sample points on the surface, with the normals of their triangles."""
+def sample_with_normals(truth: Truth, samples: int) -> tuple[FloatArray, FloatArray]:
+    """Sample points on the true surface, evenly over its area, with the normals of their triangles.
+
+    Args:
+        truth: truth of the rendered photos.
+        samples: number of points.
+    """
     places, face = sample_triangles(truth.vertices, truth.faces, samples)
     corners = truth.vertices[truth.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -41,6 +41,8 @@ class PhotoOptions:
     """Standard deviation of the sensor noise, in gray levels of 255, >= 0."""
     quality: int = 92
     """JPEG quality, 1..95."""
+    exposure_ev: float = 0.0
+    """Standard deviation of the exposure from photo to photo, in stops, 0..3."""
     seed: int = 0
     """Same seed, same noise."""
 
@@ -50,6 +52,7 @@ class PhotoOptions:
             "blur_px": 0 <= self.blur_px <= 100,
             "noise": 0 <= self.noise <= 100,
             "quality": 1 <= self.quality <= 95,
+            "exposure_ev": 0 <= self.exposure_ev <= 3,
             "seed": self.seed >= 0,
         }
         wrong = [name for name, holds in checks.items() if not holds]
@@ -204,13 +207,15 @@ def _write_in_process(number: int) -> None:
 
 
 def develop(image: FloatArray, options: PhotoOptions, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Blur the image, then apply gamma and sensor noise, from linear RGB to 8 bits.
+    """Blur and expose the image, then apply gamma and sensor noise, from linear RGB to 8 bits.
 
     Args:
         image: (H, W, 3) linear RGB, about 0..1.
-        options: blur and noise.
-        rng: random generator of the noise.
+        options: blur, exposure and noise.
+        rng: random generator of exposure and noise.
     """
+    if options.exposure_ev > 0:
+        image = image * 2.0 ** rng.normal(scale=options.exposure_ev)
     if options.blur_px > 0:
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), options.blur_px), dtype=np.float64)
     levels = 255.0 * np.clip(image, 0.0, 1.0) ** (1.0 / GAMMA)

@@ -35,6 +35,9 @@ class SyntheticScene:
     bounced: float = 0.0
     """Share of the sky's light that reaches what sees no sky, such as panes in deep windows; 0..1."""
 
+    thin: tuple[FloatArray, ...] = ()
+    """Lines (N, 4) of thin things: points on their axes, and the radius there."""
+
     @property
     def vertices(self) -> FloatArray:
         """(V, 3) vertices of all bodies."""

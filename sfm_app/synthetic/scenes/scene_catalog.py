@@ -6,6 +6,9 @@ from typing import TypeVar
 
 from sfm_app.errors import ConfigError
 from sfm_app.synthetic.cameras import Views, arc, make_camera
+from sfm_app.synthetic.fine.garden import garden, garden_views
+from sfm_app.synthetic.fine.ornament import ornament, ornament_views
+from sfm_app.synthetic.fine.railing import railing, railing_views
 from sfm_app.synthetic.scenes.bodies import SyntheticScene
 from sfm_app.synthetic.scenes.corner import corner, corner_views
 from sfm_app.synthetic.scenes.courtyard import courtyard
@@ -17,7 +20,7 @@ from sfm_app.synthetic.town.photos import TownPhotos, town_views
 
 SCENES: Mapping[str, Callable[[], SyntheticScene]] = MappingProxyType({
     "courtyard": courtyard, "poster": poster, "heap": heap, "statue": statue, "facade": facade, "corner": corner,
-    "town": town,
+    "town": town, "ornament": ornament, "railing": railing, "garden": garden,
 })  # fmt: skip
 WALKS: Mapping[str, Callable[[int], Views]] = MappingProxyType({
     "courtyard": lambda seed: arc(make_camera(960, 640), seed=seed),
@@ -27,6 +30,9 @@ WALKS: Mapping[str, Callable[[int], Views]] = MappingProxyType({
     "town": lambda seed: town_views(
         make_camera(1200, 900, focal_widths=0.8), TownPhotos(photos=40, step_m=1.5, seed=seed)
     ),
+    "ornament": lambda seed: ornament_views(make_camera(1800, 1350, focal_widths=1.0), seed),
+    "railing": lambda seed: railing_views(make_camera(1800, 1350, focal_widths=0.95), seed),
+    "garden": lambda seed: garden_views(make_camera(1800, 1200, focal_widths=1.0), seed),
 })  # fmt: skip
 """By scene: a walk with a suitable camera; the seed varies the poses."""
 

@@ -143,6 +143,14 @@ def test_blur_spreads_an_edge_as_far_as_asked():
     assert spread[0] == 0.0 and 0.4 < spread[1] < 0.6 and 1.8 < spread[2] < 2.2
 
 
+def test_exposures_differ_by_as_much_as_asked():
+    gray = np.full((20, 20, 3), 0.1)
+    options = PhotoOptions(noise=0.0, blur_px=0.0, exposure_ev=0.5)
+    levels = [develop(gray, options, np.random.default_rng(k)).mean() for k in range(200)]
+    stops = np.log2((np.array(levels) / 255.0) ** 2.2 / 0.1)
+    assert abs(stops.mean()) < 0.1 and stops.std() == pytest.approx(0.5, rel=0.15)
+
+
 def test_wrong_options_are_named():
     with pytest.raises(ConfigError, match="supersampling, quality"):
         PhotoOptions(supersampling=0, quality=100)

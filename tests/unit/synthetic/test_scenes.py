@@ -126,7 +126,7 @@ def test_a_walk_past_a_wall_turns_its_head():
 
 
 def test_walks_are_of_known_scenes():
-    assert set(WALKS) == {"courtyard", "statue", "facade", "corner", "town"}
+    assert set(WALKS) == {"courtyard", "statue", "facade", "corner", "town", "ornament", "railing", "garden"}
     with pytest.raises(ConfigError, match="poster") as caught:
         scene_views("poster")
     assert "statue" in caught.value.hint
