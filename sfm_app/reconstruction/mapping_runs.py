@@ -42,6 +42,9 @@ MAX_FOCAL_DEVIATION = 0.01
 """Relative standard deviation of a focal up to which mapping holds it fixed."""
 MOST_FULLY_MAPPED, MAPPED_PARTNERS = 250, 16
 """Photos up to which mapping uses all pairs, and partners of each photo above. Chosen by hand."""
+MOST_DROPPED = 0.05
+"""Share of the pairs of a group that the pose graph may have dropped where the incremental mapper is given time to do
+without the other one. It decides when that begins, and nothing else. Chosen by hand."""
 INCREMENTAL_FOLDER, GLOBAL_FOLDER = "incremental", "global"
 
 
@@ -125,9 +128,10 @@ def map_group(
 ) -> list[MappingResult]:
     """Return the results of the mappers on a group.
 
-    The incremental mapper from the best seed and the global mapper run side by side. Where neither places most photos,
-    the next seeds are tried. The results do not depend on which mapper ends first: a complete, uncontradicted
-    incremental model discards the global one, whether or not that is finished.
+    The incremental mapper from the best seed and the global mapper run side by side, or one after the other where the
+    first will probably do. Where neither places most photos, the next seeds are tried. The results do not depend on
+    which mapper ends first: a complete, uncontradicted incremental model discards the global one, whether or not that
+    is finished.
 
     Args:
         group: a connected group of photos, with their matches and poses.
@@ -229,13 +233,23 @@ def _run_first_round(
         )
         return attempt
 
-    with ThreadPoolExecutor(min(run.workers, 2), thread_name_prefix="mapper") as pool:
+    at_a_time = 1 if seeds and _is_easy(group) else min(run.workers, 2)
+    with ThreadPoolExecutor(at_a_time, thread_name_prefix="mapper") as pool:
         grown = [pool.submit(map_from_seed, seed) for seed in seeds]
         placed = [pool.submit(_attempt_globally, group, run, stop)] if at_once else []
         found = [future.result() for future in (*grown, *placed)]
     if stop.needless:
         found[1:] = [NoModel("global", "all at once: not needed") for _ in placed]
     return found
+
+
+def _is_easy(group: Group) -> bool:
+    """Return whether cameras are well known, and hardly any pair contradicts the others."""
+    inside = set(group.photos)
+    kept = sum(inside.issuperset(pair) for pair in group.graph.poses)
+    dropped = sum(inside.issuperset(pair) for pair in group.graph.dropped)
+    known = all(is_well_known(group.intrinsics.camera(group.matches.images[photo])) for photo in group.photos)
+    return known and dropped <= MOST_DROPPED * (kept + dropped)
 
 
 def _can_stop(found: Sequence[MappingResult], photos: int) -> bool:

@@ -71,8 +71,11 @@ def flat_share(picture: Image.Image) -> float:
     """Return the share of small squares of the picture that have one color."""
     gray = np.asarray(picture)
     height, width = (side // BLOCK_PX * BLOCK_PX for side in gray.shape)
-    squares = gray[:height, :width].reshape(height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX)
-    return float(np.mean(np.ptp(squares, axis=(1, 3)) == 0)) if squares.size else 0.0
+    if not height or not width:
+        return 0.0
+    rows = gray[:height, :width].reshape(height // BLOCK_PX, BLOCK_PX, width)  # whole rows first: many times as fast
+    low, high = (ends.reshape(len(rows), -1, BLOCK_PX) for ends in (rows.min(axis=1), rows.max(axis=1)))
+    return float(np.mean(low.min(axis=2) == high.max(axis=2)))
 
 
 def _edge_slope(image: NDArray[np.float32], axis: int) -> float:

@@ -1,4 +1,5 @@
 import threading
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -122,6 +123,30 @@ def test_both_mappers_are_tried_and_one_good_model_is_enough(try_out):
     assert summary(found) == [("incremental", 9), ("global", 3)]
     assert [attempt.note for attempt in found] == ["from 1.jpg + 2.jpg: 9 photos", "all at once: 3 photos"]
     assert found[0].support == 50 and found[0].model.num_reg_images() == 9
+
+
+def test_where_it_is_easy_the_other_mapper_begins_only_if_it_is_needed(try_out, monkeypatch):
+    monkeypatch.setattr(module, "_is_easy", lambda _: True)
+
+    found, calls = try_out([10], at_once=10)
+    assert summary(found) == [("incremental", 10), ("global", 0)] and calls == ["incremental"]
+    found, calls = try_out([9], at_once=10)
+    assert summary(found) == [("incremental", 9), ("global", 10)] and calls == ["incremental", "global"]
+
+
+@pytest.mark.parametrize(
+    ("deviation", "dropped", "easy"), [(1.0, 0, True), (1.0, 5, True), (1.0, 6, False), (50.0, 0, False)]
+)
+def test_it_is_easy_with_known_cameras_and_few_contradictions(cameras, deviation, dropped, easy):
+    images = {key: MatchedImage(key, f"{key}.jpg", "one", 1024, 768) for key in range(1, 102)}
+    pose = RelativePose(np.eye(3), np.eye(3)[0], np.ones(40, np.bool_), 20.0, 1.0)
+    pairs = [(key, key + 1) for key in range(1, 101)]
+    graph = PoseGraph(dict.fromkeys(pairs[dropped:], pose), dict.fromkeys(pairs[:dropped], ""), ())
+    known = cameras()
+    sure = {name: replace(one, spread={"fx": deviation}) for name, one in known.cameras.items()}
+    group = Group(tuple(images), MatchGraph(images, {}, {}), ViewGraph({}, {}), graph, replace(known, cameras=sure))
+
+    assert module._is_easy(group) is easy
 
 
 @pytest.mark.parametrize("late", ["global", "incremental"])
