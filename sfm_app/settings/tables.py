@@ -206,6 +206,9 @@ class MeshSettings(Section):
     max_error_edges: float = Field(
         0.15, ge=0, le=10, description="most that simplification may move the surface, in edges of Poisson's triangles"
     )
+    refine: bool = Field(
+        False, description="move the surface to where photos agree best: sharper detail and edges, for several minutes"
+    )
     faces: int = Field(
         200_000, ge=100, le=50_000_000, description="most triangles of the finished mesh, or of each of its blocks"
     )

@@ -18,6 +18,7 @@ from sfm_app.runtime.parallel import ordered_map
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.stages.blocks.fusion import fuse_maps
 from sfm_app.stages.blocks.judging import SurfaceJudge, judge_view, simplify_mesh
+from sfm_app.stages.blocks.refining import refine_surface
 from sfm_app.stages.blocks.surface import mesh_in_blocks
 from sfm_app.stereo import View
 from sfm_app.tasks import Shared, Task
@@ -80,8 +81,22 @@ def _mesh_at_once(dense_dir: Path, views: list[View], points: NDArray[np.void], 
     trimmed = trim(colored, support, options.max_gap_triangles, least) if options.trim else colored
     detailed = _check_nonempty(drop_islands(trimmed, options.min_island), "the photos confirm no part of the surface")
     run.record(poisson_depth=depth, raw_triangles=len(raw.faces), detailed_triangles=len(detailed.faces))
+    if options.refine:
+        detailed = _refine(detailed, dense_dir, views, run)
     with run.step("simplifying"):
         return _check_nonempty(make_manifold(simplify_mesh(detailed, options, place)), "the surface has no extent")
+
+
+def _refine(surface: Surface, dense_dir: Path, views: list[View], run: RunContext) -> Surface:
+    """Return the surface with the detail of the photos."""
+    with run.step("refining the surface"):
+        found = refine_surface(
+            surface, dense_dir, views, run.settings.mesh,
+            lambda ask, photos: ordered_map(run.executor, ask, photos, ahead=2 * run.workers),
+        )  # fmt: skip
+    run.record(refined_triangles=len(found.surface.faces))
+    run.record(photo_correlations=[round(one, 4) for one in found.correlations])
+    return found.surface
 
 
 def _check_nonempty(surface: Surface, otherwise: str) -> Surface:

@@ -36,6 +36,7 @@ from sfm_app.runtime.cost_estimate import block_count, block_workers
 from sfm_app.settings import MeshSettings
 from sfm_app.stages.blocks.judging import SurfaceJudge, simplify_mesh
 from sfm_app.stages.blocks.points import BlockPoints, sort_points
+from sfm_app.stages.blocks.refining import refine_surface
 from sfm_app.stereo import View
 from sfm_app.tasks import Task
 from sfm_app.types import Surface
@@ -149,6 +150,8 @@ def mesh_block(task: BlockTask) -> int:
     found, support = judge.sum_up(map(judge.judge, task.views))
     if task.options.trim and len(found.faces):
         found = trim(found, support, task.options.max_gap_triangles, task.least)
+    if len(found.faces) and task.options.refine:
+        found = refine_surface(found, task.dense_dir, task.views, task.options).surface
     if len(found.faces):
         found = make_manifold(simplify_mesh(found, task.options, scratch))
     with replace_atomically(task.path) as path:

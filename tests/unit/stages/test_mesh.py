@@ -182,6 +182,21 @@ def test_a_ball_in_blocks_is_the_ball(dense, ball, tmp_path):
     np.testing.assert_array_equal(again.vertices, found.vertices)
 
 
+@pytest.mark.parametrize("block_points", [4_000_000, 8000])
+def test_refined_with_photos_that_show_nothing_a_ball_stays_a_ball(dense, tmp_path, block_points):
+    for name in ("dense", "surface"):
+        shutil.copytree(dense.parent / name, tmp_path / name)
+
+    found, counts = made(tmp_path / "dense", refine=True, block_points=block_points)
+    again, _ = made(tmp_path / "dense", workers=1, refine=True, block_points=block_points)
+
+    edges, edge_of = unique_edges(found.faces)
+    assert np.array_equal(np.bincount(edge_of.ravel()), np.full(len(edges), 2))
+    assert np.percentile(np.abs(np.linalg.norm(found.vertices, axis=1) - 1), 95) < 0.015
+    assert ("blocks" in counts) == (block_points == 8000) == ("refined_triangles" not in counts)
+    np.testing.assert_array_equal(again.vertices, found.vertices)
+
+
 def test_a_run_that_was_killed_makes_the_missing_blocks_only(dense, ball, tmp_path, monkeypatch):
     for name in ("dense", "surface"):
         shutil.copytree(dense.parent / name, tmp_path / name)

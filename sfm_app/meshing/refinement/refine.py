@@ -1,0 +1,125 @@
+"""The refinement of a surface: from coarse photos to fine ones, in a few Gauss-Newton steps each."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.triangles import vertex_normals
+from sfm_app.meshing.refinement.agreement import Pull, compare
+from sfm_app.meshing.refinement.fairness import Neighbors, find_displacements
+from sfm_app.meshing.refinement.photo_levels import RefinePhoto
+from sfm_app.meshing.refinement.rasterize import rasterize
+from sfm_app.meshing.refinement.subdivide import split_long_edges
+from sfm_app.types import Surface
+
+FloatArray = NDArray[np.float64]
+Item = TypeVar("Item")
+Spread = Callable[[Callable[[int], "Pull"], Sequence[int]], Iterable["Pull"]]
+"""Calls a function for every number, possibly in parallel, and returns the results in order."""
+
+LEVELS = ((0.5, 3), (1.0, 3))
+"""Shares of the resolution of the photos, and iterations at each. Chosen on `ornament`."""
+EDGE_PX = 3.0
+"""Longest edge in the photo that shows it best, in pixels: detail takes two pixels. Chosen on `ornament`."""
+ROUNDS = 3
+"""Most times that edges are divided before a level."""
+MOST_PX = 1.0
+"""Longest step of a vertex, in pixels of the photo that shows it best: photos are smooth over about that. By
+definition of the blur."""
+MOST_EDGES = 0.5
+"""Longest step of a vertex in edges, so that triangles do not turn over. By definition."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refinement:
+    """A refined surface."""
+
+    surface: Surface
+    correlations: tuple[float, ...]
+    """Mean correlation of photos through the surface, before each iteration."""
+
+
+def refine(
+    surface: Surface, photos: Sequence[RefinePhoto], partners: Sequence[Sequence[int]], most: int, spread: Spread = map
+) -> Refinement:
+    """Move the vertices of a surface along their normals to where photos agree best; divide what is too coarse.
+
+    Args:
+        surface: triangles, counterclockwise seen from outside, about right to some pixels.
+        photos: posed photos without distortion.
+        partners: for each photo, numbers of others that it is compared with.
+        most: triangles; edges are no longer divided beyond.
+        spread: applies a function to photos, possibly in parallel.
+    """
+    found = list[float]()
+    for share, iterations in LEVELS:
+        surface = _divide(surface, photos, share, most)
+        around = Neighbors.from_faces(surface.faces, len(surface.vertices))
+        reach = MOST_PX * finest_pixels(surface.vertices, photos, share)
+        for _ in range(iterations):
+            surface, correlation = _improve(surface, around, reach, (photos, partners, share), spread)
+            found.append(correlation)
+    return Refinement(surface, tuple(found))
+
+
+def finest_pixels(vertices: FloatArray, photos: Sequence[RefinePhoto], share: float) -> FloatArray:
+    """Return (V,) the size of a pixel at each vertex, in the photo that has it in view and shows it largest.
+
+    Infinite where no photo has it in view; what hides it does not matter.
+
+    Args:
+        vertices: (V, 3).
+        photos: posed photos.
+        share: of their resolution.
+    """
+    found = np.full(len(vertices), np.inf)
+    for photo in photos:
+        (height, width), P = photo.size_at(share), photo.projection(share)
+        x, y, z = (vertices @ P[:, :3].T + P[:, 3]).T
+        shown = (z > 0) & (x > 0) & (y > 0) & (x < width * z) & (y < height * z)
+        size = z / (photo.focal_px * width / photo.gray.shape[1])
+        found[shown] = np.minimum(found[shown], size[shown])
+    return found
+
+
+def _divide(surface: Surface, photos: Sequence[RefinePhoto], share: float, most: int) -> Surface:
+    """Return the surface with triangles as small as a level of the photos asks for, as far as `most` allows."""
+    for _ in range(ROUNDS):
+        finer = split_long_edges(surface, EDGE_PX * finest_pixels(surface.vertices, photos, share))
+        if len(finer.faces) == len(surface.faces) or len(finer.faces) > most:
+            break
+        surface = finer
+    return surface
+
+
+def _improve(
+    surface: Surface, around: Neighbors, reach: FloatArray,
+    seen: tuple[Sequence[RefinePhoto], Sequence[Sequence[int]], float], spread: Spread,
+) -> tuple[Surface, float]:  # fmt: skip
+    """Return the surface after one step, and the correlation of photos before it."""
+    photos, partners, share = seen
+    vertices, faces = surface.vertices, surface.faces
+    normals = vertex_normals(vertices, faces)
+
+    def depths(k: int) -> NDArray[np.float32]:
+        return rasterize(vertices, faces, photos[k].projection(share), photos[k].size_at(share)).depth
+
+    def ask(k: int) -> Pull:
+        pull, level = Pull.zeros(len(vertices)), photos[k].level(share)
+        raster = rasterize(vertices, faces, level.projection, level.gray.shape)
+        for other in partners[k]:
+            compare((vertices, normals, faces), (level, raster), (photos[other].level(share), maps[other]), pull)
+        return pull
+
+    maps = list(map(depths, range(len(photos))))
+    whole = Pull.zeros(len(vertices))
+    for pull in spread(ask, range(len(photos))):
+        whole.add(pull)
+    size = np.maximum(around.edge_lengths(vertices), np.finfo(np.float64).tiny ** 0.25)
+    steps = find_displacements(vertices, normals, around, (whole.g, whole.h), size)
+    limit = np.minimum(np.where(np.isfinite(reach), reach, 0.0), MOST_EDGES * size)
+    moved = vertices + np.clip(steps, -limit, limit)[:, None] * normals
+    return replace(surface, vertices=moved), whole.correlation / max(whole.pixels, 1.0)

@@ -1,0 +1,55 @@
+import numpy as np
+import pytest
+
+from sfm_app.meshing.refinement.rasterize import NOTHING, rasterize
+
+P = np.array([[100.0, 0.0, 32.0, 0.0], [0.0, 100.0, 24.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
+"""A camera at the origin that looks along z, y down."""
+SIZE = (48, 64)
+TILTED = np.array([[-0.2, -0.2, 1.0], [0.0, 0.2, 1.2], [0.3, -0.1, 1.5]])
+FRONT, BACK = np.array([[0, 1, 2]]), np.array([[0, 2, 1]])
+
+
+def facing(vertices, faces):
+    """Whether the first triangle turns its front to the camera."""
+    a, b, c = vertices[faces[0]]
+    return np.cross(b - a, c - a) @ a < 0
+
+
+def test_pixels_inside_a_triangle_get_its_depth_and_place():
+    faces = FRONT if facing(TILTED, FRONT) else BACK
+    found = rasterize(TILTED, faces, P, SIZE)
+
+    i, j = np.nonzero(found.face == 0)
+    assert 200 < len(i) < 900
+    b, c = found.weights[i, j].T.astype(float)
+    corners = TILTED[faces[0]]
+    place = (1 - b - c)[:, None] * corners[0] + b[:, None] * corners[1] + c[:, None] * corners[2]
+    assert place[:, 2] == pytest.approx(found.depth[i, j], rel=1e-5)
+    seen = place @ P[:, :3].T
+    assert seen[:, :2] / seen[:, 2:] == pytest.approx(np.column_stack([j, i]) + 0.5, abs=1e-3)
+    assert np.isinf(found.depth[found.face == NOTHING]).all()
+
+
+def test_the_back_of_a_triangle_hides_and_is_not_shown():
+    faces = BACK if facing(TILTED, FRONT) else FRONT
+    behind = 2.0 * TILTED
+    found = rasterize(np.concatenate([TILTED, behind]), np.concatenate([faces, 3 + faces[:, ::-1]]), P, SIZE)
+
+    assert (found.face == NOTHING).all()
+    assert found.depth[np.isfinite(found.depth)].max() < 1.6
+
+
+def test_the_nearest_triangle_is_shown():
+    faces = FRONT if facing(TILTED, FRONT) else BACK
+    both = np.concatenate([1.3 * TILTED, TILTED])
+    found = rasterize(both, np.concatenate([faces, 3 + faces]), P, SIZE)
+
+    assert (found.face[found.face != NOTHING] == 1).all()
+
+
+@pytest.mark.parametrize("off", [(0.0, 0.0, -3.0), (50.0, 0.0, 0.0), (0.0, 0.0, -1.2)])
+def test_what_is_behind_or_beside_the_photo_is_not_drawn(off):
+    found = rasterize(TILTED + off, FRONT, P, SIZE)
+
+    assert (found.face == NOTHING).all()
