@@ -1,6 +1,8 @@
 """mesh: dense workspace -> Surface."""
 
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,11 +91,12 @@ def _mesh_at_once(dense_dir: Path, views: list[View], points: NDArray[np.void], 
 
 def _refine(surface: Surface, dense_dir: Path, views: list[View], run: RunContext) -> Surface:
     """Return the surface with the detail of the photos."""
-    with run.step("refining the surface"):
-        found = refine_surface(
-            surface, dense_dir, views, run.settings.mesh,
-            lambda ask, photos: ordered_map(run.executor, ask, photos, ahead=2 * run.workers),
-        )  # fmt: skip
+
+    def spread(ask: Callable[[int], Any], photos: Sequence[int]) -> Iterator[Any]:
+        found = ordered_map(run.executor, ask, photos, ahead=2 * run.workers)
+        return track(run.progress, found, "refining the surface", len(photos))
+
+    found = refine_surface(surface, dense_dir, views, run.settings.mesh, spread)
     run.record(refined_triangles=len(found.surface.faces))
     run.record(photo_correlations=[round(one, 4) for one in found.correlations])
     return found.surface

@@ -83,7 +83,7 @@ def compare(
     shape = level.gray.shape
     seen, slope, mask = (np.zeros(shape, np.float32) for _ in range(3))
     _look_through(
-        (vertices, normals, faces), (raster.depth, raster.face, raster.weights), (level.center, other.center),
+        (vertices, normals, faces), (raster.face, raster.weights), (level.center, other.center),
         other.projection, (other.gray, other.by_x, other.by_y, other_depth), (seen, slope, mask),
     )  # fmt: skip
     difference, gain, correlation, full = _difference(level.gray, seen, mask)
@@ -125,15 +125,15 @@ def _look_through(
     Arguments as in `compare`; found: gray levels, changes and 0 or 1, (H, W) each.
     """
     vertices, normals, faces = surface
-    depth, face, weights = raster
+    face, weights = raster
     here, there = centers
     P = projection
     gray, by_x, by_y, other_depth = other
     seen, slope, mask = found
     height, width = gray.shape
     place, normal = np.empty(3), np.empty(3)
-    for i in range(depth.shape[0]):
-        for j in range(depth.shape[1]):
+    for i in range(face.shape[0]):
+        for j in range(face.shape[1]):
             f = face[i, j]
             if f < 0:
                 continue

@@ -26,6 +26,8 @@ class RefinePhoto:
     """(3,) translation of cam_from_world."""
     gray: NDArray[np.uint8]
     """(H, W)."""
+    masked: NDArray[np.bool_] | None = None
+    """(H, W) what a mask leaves out; None without a mask."""
 
     @property
     def center(self) -> FloatArray:
@@ -47,6 +49,13 @@ class RefinePhoto:
         (height, width), full = self.size_at(share), self.gray.shape
         scale = np.diag([width / full[1], height / full[0], 1.0])
         return np.asarray(scale @ self.K @ np.column_stack([self.R, self.t]))
+
+    def mask_at(self, share: float) -> NDArray[np.bool_] | None:
+        """Return the mask at a share of the full resolution: pixels of which any part is left out."""
+        if self.masked is None:
+            return None
+        size = self.size_at(share)[::-1]
+        return np.asarray(cv2.resize(self.masked.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0)
 
     def level(self, share: float) -> "PhotoLevel":
         """Return the photo at a share of its resolution, smoothed, with its gradients."""

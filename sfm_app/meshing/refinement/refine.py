@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +11,12 @@ from sfm_app.geometry.triangles import vertex_normals
 from sfm_app.meshing.refinement.agreement import Pull, compare
 from sfm_app.meshing.refinement.fairness import Neighbors, find_displacements
 from sfm_app.meshing.refinement.photo_levels import RefinePhoto
-from sfm_app.meshing.refinement.rasterize import rasterize
+from sfm_app.meshing.refinement.rasterize import NOTHING, Raster, rasterize
 from sfm_app.meshing.refinement.subdivide import split_long_edges
 from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
-Item = TypeVar("Item")
-Spread = Callable[[Callable[[int], "Pull"], Sequence[int]], Iterable["Pull"]]
+Spread = Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]]
 """Calls a function for every number, possibly in parallel, and returns the results in order."""
 
 LEVELS = ((0.5, 3), (1.0, 3))
@@ -105,16 +104,15 @@ def _improve(
     normals = vertex_normals(vertices, faces)
 
     def depths(k: int) -> NDArray[np.float32]:
-        return rasterize(vertices, faces, photos[k].projection(share), photos[k].size_at(share)).depth
+        return _draw(surface, photos[k], share).depth
 
     def ask(k: int) -> Pull:
-        pull, level = Pull.zeros(len(vertices)), photos[k].level(share)
-        raster = rasterize(vertices, faces, level.projection, level.gray.shape)
+        pull, level, raster = Pull.zeros(len(vertices)), photos[k].level(share), _draw(surface, photos[k], share)
         for other in partners[k]:
             compare((vertices, normals, faces), (level, raster), (photos[other].level(share), maps[other]), pull)
         return pull
 
-    maps = list(map(depths, range(len(photos))))
+    maps = list(spread(depths, range(len(photos))))
     whole = Pull.zeros(len(vertices))
     for pull in spread(ask, range(len(photos))):
         whole.add(pull)
@@ -123,3 +121,12 @@ def _improve(
     limit = np.minimum(np.where(np.isfinite(reach), reach, 0.0), MOST_EDGES * size)
     moved = vertices + np.clip(steps, -limit, limit)[:, None] * normals
     return replace(surface, vertices=moved), whole.correlation / max(whole.pixels, 1.0)
+
+
+def _draw(surface: Surface, photo: RefinePhoto, share: float) -> Raster:
+    """Return the surface as a photo sees it; nothing where the photo is masked."""
+    found = rasterize(surface.vertices, surface.faces, photo.projection(share), photo.size_at(share))
+    masked = photo.mask_at(share)
+    if masked is not None:
+        found.depth[masked], found.face[masked] = np.inf, NOTHING
+    return found

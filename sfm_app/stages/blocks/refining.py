@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from sfm_app.colmap.dense import read_gray
+from sfm_app.colmap.dense import read_depth, read_gray
 from sfm_app.meshing.refinement import Refinement, RefinePhoto, Spread, refine
 from sfm_app.settings import MeshSettings
 from sfm_app.stereo import View, rank_neighbors
@@ -22,10 +22,13 @@ def refine_surface(
 
     Args:
         surface: what the depth maps give.
-        dense_dir: folder with the undistorted photos.
+        dense_dir: folder with the undistorted photos and their maps, which are negative where masked.
         views: the photos that may see it.
         options: how many triangles the mesh may have in the end.
         spread: applies a function to the numbers of photos, possibly in parallel.
     """
-    photos = [RefinePhoto(view.K, view.R, view.t, read_gray(dense_dir, view)) for view in views]
+    photos = [
+        RefinePhoto(view.K, view.R, view.t, read_gray(dense_dir, view), read_depth(dense_dir, view, "geometric") < 0)
+        for view in views
+    ]
     return refine(surface, photos, rank_neighbors(views, PARTNERS), FINER * options.faces, spread)

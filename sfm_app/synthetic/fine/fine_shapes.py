@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.synthetic.scenes.shapes import Shape
+from sfm_app.synthetic.scenes.shapes import Shape, grid
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
@@ -24,13 +24,14 @@ def relief(height: Height, width: float, high: float, spacing: float) -> Shape:
         spacing: approximate side of a square of its grid.
     """
     columns, rows = (1 + max(1, round(size / spacing)) for size in (width, high))
-    x, y = np.meshgrid(np.linspace(-width / 2, width / 2, columns), np.linspace(0.0, high, rows), indexing="ij")
+    plane, faces = grid(np.linspace(-width / 2, width / 2, columns), np.linspace(0.0, high, rows))
+    x, y = plane.T.reshape(2, columns, rows)
     z = height(x, y)
     up_x, up_y = np.gradient(z, width / (columns - 1), high / (rows - 1))
     normals = np.stack([-up_x, -up_y, np.ones_like(z)], -1).reshape(-1, 3)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     vertices = np.stack([x, y, z], -1).reshape(-1, 3)
-    return Shape(vertices, _grid_faces(columns, rows), normals, vertices)
+    return Shape(vertices, faces, normals, vertices)
 
 
 def tube(line: FloatArray, segments: int = 10) -> Shape:
@@ -68,12 +69,6 @@ def _tube_faces(rings: int, segments: int, first_end: int) -> IndexArray:
     low = np.stack([np.full(segments, first_end), there, here], -1)
     high = np.stack([np.full(segments, first_end + 1), last + here, last + there], -1)
     return np.concatenate([sides, low, high])
-
-
-def _grid_faces(columns: int, rows: int) -> IndexArray:
-    corner = (np.arange(columns - 1)[:, None] * rows + np.arange(rows - 1)).ravel()
-    right, up = corner + rows, corner + 1
-    return np.concatenate([np.stack([corner, right, right + 1], -1), np.stack([corner, right + 1, up], -1)])
 
 
 def ridge(distance: FloatArray, width: float) -> FloatArray:

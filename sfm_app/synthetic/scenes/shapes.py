@@ -66,8 +66,8 @@ def box(width: float, height: float, depth: float, spacing: float = 0.15) -> Sha
     for axis in range(3):
         # u x v = axis keeps the triangles counterclockwise
         u, v = (axis + 1) % 3, (axis + 2) % 3
-        grid = [np.linspace(-0.5, 0.5, 1 + max(1, round(size[k] / spacing))) * size[k] for k in (u, v)]
-        side, faces = _grid(*grid)
+        steps = [np.linspace(-0.5, 0.5, 1 + max(1, round(size[k] / spacing))) * size[k] for k in (u, v)]
+        side, faces = grid(*steps)
         for sign in (1.0, -1.0):
             vertices = np.empty((len(side), 3))
             vertices[:, axis] = 0.5 * sign * size[axis]
@@ -259,9 +259,9 @@ def ground(x: tuple[float, float], z: tuple[float, float], unevenness: float, sp
         spacing: approximate side of a square.
     """
     xs, zs = (np.linspace(a, b, 1 + max(1, round((b - a) / spacing))) for a, b in (x, z))
-    grid, faces = _grid(zs, xs)
-    height = np.sin(1.3 * grid[:, 1] + 0.7) * np.sin(1.7 * grid[:, 0] + 2.1) + 0.5 * np.sin(3.1 * grid.sum(axis=1))
-    return _build_shape([(np.column_stack([grid[:, 1], unevenness * height, grid[:, 0]]), faces)])
+    floor, faces = grid(zs, xs)
+    height = np.sin(1.3 * floor[:, 1] + 0.7) * np.sin(1.7 * floor[:, 0] + 2.1) + 0.5 * np.sin(3.1 * floor.sum(axis=1))
+    return _build_shape([(np.column_stack([floor[:, 1], unevenness * height, floor[:, 0]]), faces)])
 
 
 def _revolve_profile(
@@ -312,7 +312,13 @@ def _outer_radius(
     return np.where(found.any(axis=1), inner[:, 0], 0.0)
 
 
-def _grid(a: FloatArray, b: FloatArray) -> tuple[FloatArray, IndexArray]:
+def grid(a: FloatArray, b: FloatArray) -> tuple[FloatArray, IndexArray]:
+    """Return the points (N, 2) of a grid, and two triangles (T, 3) for each of its squares.
+
+    Args:
+        a: steps along the first axis.
+        b: steps along the second.
+    """
     points = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
     corner = (np.arange(len(a) - 1)[:, None] * len(b) + np.arange(len(b) - 1)).ravel()
     right, up = corner + len(b), corner + 1

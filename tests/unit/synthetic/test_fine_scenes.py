@@ -9,15 +9,11 @@ from sfm_app.synthetic.fine.ornament import HIGH, WIDTH, carving
 from sfm_app.synthetic.fine.railing import straight, tree
 from sfm_app.synthetic.render import cast_rays, ray_caster
 from sfm_app.synthetic.scenes.scene_catalog import build_scene, scene_views
+from tests.unit.synthetic.test_shapes import signed_volume
 
 pytestmark = pytest.mark.slow
 SIZE = 4.0
 """Approximate size of these scenes."""
-
-
-def signed_volume(shape):
-    a, b, c = (shape.vertices[shape.faces[:, k]] for k in range(3))
-    return float(np.sum(a * np.cross(b, c)) / 6)
 
 
 @pytest.mark.parametrize("end", [(0.0, 2.0, 0.0), (1.0, 1.0, -1.0)])

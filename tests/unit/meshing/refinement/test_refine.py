@@ -74,6 +74,21 @@ def test_exposure_does_not_matter(relief):
     assert inner_errors(found.surface, bumps).std() < 0.3 * inner_errors(grid(flat), bumps).std()
 
 
+def test_what_is_masked_says_nothing(relief):
+    scene = relief(bumps)
+    masked = np.zeros((SIDE, SIDE), np.bool_)
+    masked[:, : SIDE // 2] = True
+    spoilt = [
+        replace(photo, gray=np.where(masked, photo.gray[::-1], photo.gray), masked=masked) for photo in scene.photos
+    ]
+    found = refine(grid(flat), spoilt, scene.partners, 100_000).surface
+
+    x, y, z = found.vertices.T
+    left, right = (x < -0.15) & (np.abs(y) < 0.2), (x > 0.15) & (x < 0.25) & (np.abs(y) < 0.2)
+    assert np.abs(z[left]).max() < 0.3 * PIXEL, "nothing pulls there"
+    assert (z - bumps(x, y))[right].std() < 0.4 * bumps(x, y)[right].std()
+
+
 def test_photos_without_texture_change_nothing_but_roughness(relief):
     scene = relief(flat)
     rng = np.random.default_rng(0)
