@@ -84,10 +84,10 @@ DEPTH_MAPS: Stage[Path] = Stage(
 )
 MESH: Stage[Surface] = Stage(
     name="mesh",
-    takes=(DEPTH_MAPS,),
+    takes=(SCENE, DEPTH_MAPS),
     settings=("mesh",),
     files=("surface/surface.npz",),
-    make=lambda given, run: mesh.make(given[DEPTH_MAPS], run),
+    make=lambda given, run: mesh.make(given[SCENE], given[DEPTH_MAPS], run),
     load=lambda _, run: mesh.load(run),
     digest=mesh.digest,
 )

@@ -85,7 +85,7 @@ def measure(out: Path, block_points: int) -> Row:
                 if name == "depth_maps":
                     dense = depth_maps.make(scene, stage)
                 elif name == "mesh":
-                    surface = mesh.make(dense, stage)
+                    surface = mesh.make(scene, dense, stage)
                 else:
                     texture.make(scene, surface, stage)
             row |= {f"CPU {name}": used.cpu_seconds / row["photos"], f"MB {name}": used.peak_mb}

@@ -30,6 +30,11 @@ POINTS_PER_MP = 70_000
 BLOCK_MB_PER_POINT = 1200 / MEGA
 """Memory of Poisson's reconstruction and of the surface that it gives, for each point of a block: COLMAP's process had
 950 bytes for each of 1.3 million points of a town."""
+REFINE_SECONDS_PER_MP, REFINE_MB, REFINE_MB_PER_MP = 1.0, 200.0, 25.0
+"""Core seconds of the surface's refinement for each megapixel of photos, its memory, and that for each megapixel of the
+photos that it holds at once, divided triangles included; on fountain-P11 and `ornament`."""
+REFINED_AT_ONCE_MP = 100.0
+"""Megapixels of photos that the refinement holds at once, as `meshing.refinement.sights` has it."""
 SERIAL_STAGES = ("scene", "mesh")
 """Stages in which more workers are of little use."""
 
@@ -99,7 +104,8 @@ def block_workers(workers: int, limit_mb: float, options: MeshSettings) -> int:
         limit_mb: most memory.
         options: most points of a surface that is made at once.
     """
-    fit = (limit_mb - 1000) / (BLOCK_MB_PER_POINT * options.block_points / 2)
+    refined_mb = _refine_mb(REFINED_AT_ONCE_MP) if options.max_image_size_px else 0.0
+    fit = (limit_mb - 1000) / max(BLOCK_MB_PER_POINT * options.block_points / 2, refined_mb)
     return max(1, int(min(workers, fit)))
 
 
@@ -118,11 +124,15 @@ def make_plan(photos: Iterable[Photo], settings: Settings, workers: int, limit_m
     searched = [_megapixels(size, settings.matching.max_image_size_px) for size in sizes]
     mapped = [_megapixels(size, settings.depth.max_image_size_px) for size in sizes]
     features = sum(min(settings.matching.max_features, FEATURES_PER_MP * one) for one in searched) / max(count, 1)
+    refined = [_megapixels(size, settings.mesh.max_image_size_px) for size in sizes]
     pages = settings.texture.max_pages * settings.texture.max_atlas_px**2 / MEGA
     dense, points = sum(mapped), POINTS_PER_MP * sum(mapped)
     blocks = block_count(points, settings.mesh)
     together = block_workers(workers, limit_mb, settings.mesh) if blocks > 1 else 1
-    block_mb = BLOCK_MB_PER_POINT * points / blocks * min(together, blocks)
+    block_mb = BLOCK_MB_PER_POINT * points / blocks
+    if settings.mesh.max_image_size_px:
+        block_mb = max(block_mb, _refine_mb(sum(refined) / blocks))
+    block_mb *= min(together, blocks)
     fused_mb = FUSED_MB_PER_MP * (dense if dense <= FUSED_AT_ONCE_MP else min(dense, workers * FUSED_AT_ONCE_MP))
     return Plan(
         count,
@@ -136,7 +146,9 @@ def make_plan(photos: Iterable[Photo], settings: Settings, workers: int, limit_m
             "scale": 1.0
             + (0.2 * sum(width * height for width, height in sizes) / MEGA if settings.scale.markers else 0.0),
             "depth_maps": 3.0 * sum(mapped) * settings.depth.neighbors,
-            "mesh": 15 + (2.0 if dense <= FUSED_AT_ONCE_MP else 2.7) * dense,
+            "mesh": 15
+            + (2.0 if dense <= FUSED_AT_ONCE_MP else 2.7) * dense
+            + REFINE_SECONDS_PER_MP * sum(refined) / workers,
             "texture": 0.1 * sum(width * height for width, height in sizes) / MEGA,
             "files": 1.0,
         },
@@ -180,6 +192,11 @@ def machine_memory_mb() -> float:
         if said:
             found.append(int(said[1]) * unit)
     return min(found)
+
+
+def _refine_mb(megapixels: float) -> float:
+    """Return the memory in MB of the surface's refinement with photos of so many megapixels."""
+    return REFINE_MB + megapixels + REFINE_MB_PER_MP * min(megapixels, REFINED_AT_ONCE_MP)
 
 
 def _megapixels(size: tuple[int, int], longest: int) -> float:

@@ -93,14 +93,14 @@ QUALITY_PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         "matching": {"max_image_size_px": 1000, "max_features": 4096},
         "depth": {"max_image_size_px": 640, "neighbors": 3},
-        "mesh": {"poisson_depth": 10, "faces": 50_000},
+        "mesh": {"poisson_depth": 10, "faces": 50_000, "max_image_size_px": 0},
         "texture": {"max_atlas_px": 2048, "max_pages": 1},
     },
     "normal": {},
     "high": {
         "matching": {"max_image_size_px": 3200, "max_features": 16384},
         "depth": {"max_image_size_px": 2000, "neighbors": 6},
-        "mesh": {"poisson_depth": 13, "faces": 1_000_000},
+        "mesh": {"poisson_depth": 13, "faces": 1_000_000, "max_image_size_px": 3200},
         "texture": {"max_atlas_px": 8192},
     },
 }

@@ -206,8 +206,12 @@ class MeshSettings(Section):
     max_error_edges: float = Field(
         0.15, ge=0, le=10, description="most that simplification may move the surface, in edges of Poisson's triangles"
     )
-    refine: bool = Field(
-        False, description="move the surface to where photos agree best: sharper detail and edges, for several minutes"
+    max_image_size_px: int = Field(
+        1600,
+        ge=0,
+        le=16384,
+        description="longer side of the photos by which the surface is refined, in pixels: it moves to where they "
+        "agree best; 0: it stays as the depth maps have it",
     )
     faces: int = Field(
         200_000, ge=100, le=50_000_000, description="most triangles of the finished mesh, or of each of its blocks"

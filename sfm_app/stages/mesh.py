@@ -1,4 +1,4 @@
-"""mesh: dense workspace -> Surface."""
+"""mesh: Scene, dense workspace -> Surface."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -20,11 +20,11 @@ from sfm_app.runtime.parallel import ordered_map
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.stages.blocks.fusion import fuse_maps
 from sfm_app.stages.blocks.judging import SurfaceJudge, judge_view, simplify_mesh
-from sfm_app.stages.blocks.refining import refine_surface
+from sfm_app.stages.blocks.refining import Originals, rank_partners, refine_surface
 from sfm_app.stages.blocks.surface import mesh_in_blocks
 from sfm_app.stereo import View
 from sfm_app.tasks import Shared, Task
-from sfm_app.types import Surface
+from sfm_app.types import Scene, Surface
 
 SURFACE = "surface.npz"
 FUSED_DIGEST = "fused.txt"
@@ -38,10 +38,11 @@ CONFIRMED_SHARE = 2 / 3
 """A part stays when this share of the photos that a fused point needs confirms its average vertex."""
 
 
-def make(dense_dir: Path, run: RunContext) -> Surface:
-    """Span a surface over the fused points, keep what the photos confirm, and simplify it.
+def make(scene: Scene, dense_dir: Path, run: RunContext) -> Surface:
+    """Span a surface over the fused points, keep what the photos confirm, refine it by them, and simplify it.
 
     Args:
+        scene: cameras and poses.
         dense_dir: dense workspace with depth maps.
         run: the run.
 
@@ -53,26 +54,29 @@ def make(dense_dir: Path, run: RunContext) -> Surface:
     place.mkdir(exist_ok=True)
     views = [view for view in read_views(dense_dir) if map_file(dense_dir, view).exists()]
     points = _fused_points(dense_dir, views, run)
+    originals = Originals(scene.model_dir, run.workspace.photos, run.mask_dir)
     if block_count(len(points), options) > 1:
-        surface = mesh_in_blocks(dense_dir, views, points, _min_confirmed(views, run), run)
+        surface = mesh_in_blocks((dense_dir, originals), views, points, _min_confirmed(views, run), run)
     else:
-        surface = _mesh_at_once(dense_dir, views, points, run)
+        surface = _mesh_at_once((dense_dir, originals), views, points, run)
     run.record(vertices=len(surface.vertices), triangles=len(surface.faces))
     with replace_atomically(place / SURFACE) as path:
         np.savez(path, vertices=surface.vertices, faces=surface.faces, colors=surface.colors)
     return surface
 
 
-def _mesh_at_once(dense_dir: Path, views: list[View], points: NDArray[np.void], run: RunContext) -> Surface:
+def _mesh_at_once(
+    source: tuple[Path, Originals], views: list[View], points: NDArray[np.void], run: RunContext
+) -> Surface:
     """Return the surface of all points.
 
     Args:
-        dense_dir: dense workspace with depth maps.
+        source: dense workspace with depth maps, and the photos.
         views: photos with a depth map.
         points: (N,) records of the fused points.
         run: the run.
     """
-    place, options = run.workspace.surface, run.settings.mesh
+    (dense_dir, originals), place, options = source, run.workspace.surface, run.settings.mesh
     depth = octree_depth(positions(points), options.poisson_depth)
     with run.step("finding the surface"):
         raw = _check_nonempty(poisson_surface(place, depth), "the fused points span no surface")
@@ -83,21 +87,21 @@ def _mesh_at_once(dense_dir: Path, views: list[View], points: NDArray[np.void], 
     trimmed = trim(colored, support, options.max_gap_triangles, least) if options.trim else colored
     detailed = _check_nonempty(drop_islands(trimmed, options.min_island), "the photos confirm no part of the surface")
     run.record(poisson_depth=depth, raw_triangles=len(raw.faces), detailed_triangles=len(detailed.faces))
-    if options.refine:
-        detailed = _refine(detailed, dense_dir, views, run)
+    if options.max_image_size_px:
+        detailed = _refine(detailed, originals, views, run)
     with run.step("simplifying"):
         return _check_nonempty(make_manifold(simplify_mesh(detailed, options, place)), "the surface has no extent")
 
 
-def _refine(surface: Surface, dense_dir: Path, views: list[View], run: RunContext) -> Surface:
+def _refine(surface: Surface, originals: Originals, views: list[View], run: RunContext) -> Surface:
     """Return the surface with the detail of the photos."""
 
     def spread(ask: Callable[[int], Any], photos: Sequence[int]) -> Iterator[Any]:
         found = ordered_map(run.executor, ask, photos, ahead=2 * run.workers)
         return track(run.progress, found, "refining the surface", len(photos))
 
-    found = refine_surface(surface, dense_dir, views, run.settings.mesh, spread)
-    run.record(refined_triangles=len(found.surface.faces))
+    found = refine_surface(surface, originals, views, rank_partners(views), run.settings.mesh, spread)
+    run.record(refined_triangles=len(found.surface.faces), refinement_failed=found.failed)
     run.record(photo_correlations=[round(one, 4) for one in found.correlations])
     return found.surface
 

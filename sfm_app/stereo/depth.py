@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sfm_app.stereo.consistency import count_confirming_maps, filter_speckles, merge_hypotheses
 from sfm_app.stereo.edge_fattening import remove_spill, rim_mask
+from sfm_app.stereo.enclosure import enclosed_pixels
 from sfm_app.stereo.matching import depths_from_disparities, disparities
 from sfm_app.stereo.normals import fit_planes, plane_normals
 from sfm_app.stereo.patch_match import NO_MATCH, PlaneArray, improve_planes
@@ -123,7 +124,7 @@ def confirm_depths(
     """Keep depths that enough other maps confirm; remove spill and specks, fill plain walls, add normals.
 
     The required number is `min_agreeing`; one more at low correlation and next to broad gaps; three more at very low
-    correlation. Depths in skies are always dropped.
+    correlation, which must lie between surer ones, too. Depths in skies are always dropped.
 
     Args:
         view: the photo.
@@ -141,6 +142,8 @@ def confirm_depths(
     enough = np.where(confidence < UNSURE_CORRELATION, more, least)
     enough[confidence < WEAK_CORRELATION] = min_agreeing + WEAK_EXTRA_MAPS
     sound = (estimate.depth > 0) & (agreeing >= enough)
+    # without texture, semi-global matching carries depths on beyond the outline of a thing, in all photos alike
+    sound &= (confidence >= WEAK_CORRELATION) | enclosed_pixels(sound & (confidence >= WEAK_CORRELATION))
     confirmed = np.where(sound & ~surfaceless_areas(confidence, sound), estimate.depth, np.float32(0))
     doubtful = rim_mask(confirmed > 0) & (agreeing < more)
     confirmed = filter_speckles(remove_spill(np.where(doubtful, np.float32(0), confirmed), image), tolerance)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.stereo.enclosure import enclosed_pixels
 from sfm_app.stereo.view import DepthArray, FloatArray, GrayImage
 
 BLUR_PX = 1.5
@@ -29,7 +30,7 @@ MAX_BEND = 0.3
 
 
 def fill_planar_areas(depth: DepthArray, image: GrayImage, tolerance: float) -> DepthArray:
-    """Replace depths in areas of uniform color by planes, within the convex hull of the known depths.
+    """Replace depths in areas of uniform color by planes, within the convex hull of the known depths and between them.
 
     Args:
         depth: (H, W) depths that other photos confirm, 0 where unknown.
@@ -70,10 +71,11 @@ def _fill_area(depth: DepthArray, area: NDArray[np.bool_], tolerance: float) -> 
     bend = _bend(row[on_plane], col[on_plane], residual[on_plane], depth.shape)
     if np.mean(on_plane) < MIN_ON_PLANE or bend > MAX_BEND * tolerance:
         return
-    within = np.zeros(depth.shape, np.uint8)
+    certain, within = np.zeros(depth.shape, np.bool_), np.zeros(depth.shape, np.uint8)
+    certain[row[on_plane], col[on_plane]] = True
     hull = cv2.convexHull(np.column_stack([col, row])[on_plane].astype(np.int32))
     cv2.fillConvexPoly(within, hull, 1)
-    row, col = np.nonzero(area & (within > 0))
+    row, col = np.nonzero(area & (within > 0) & enclosed_pixels(certain))
     depth[row, col] = 1.0 / (plane[0] + plane[1] * col + plane[2] * row)
 
 

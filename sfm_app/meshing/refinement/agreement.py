@@ -1,4 +1,4 @@
-"""How two photos agree on a surface, and which way each vertex would have to move.
+"""How photos agree on a surface, and which way each vertex would have to move.
 
 A photo is seen through the surface from another one. Where both differ after local brightness and contrast have been
 made equal, the surface is too near or too far: the difference divided by its derivative along the viewing ray is the
@@ -6,10 +6,10 @@ distance (Vu, Labatut, Pons, Keriven: High accuracy and visibility-consistent de
 gradient descent; here in Gauss-Newton steps, which need a tenth of the iterations).
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,8 +20,9 @@ from sfm_app.meshing.refinement.rasterize import Raster
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
-WINDOW_PX = 7
-"""Side of the window in which brightness and contrast are made equal. Chosen on `ornament`."""
+REACH = 3
+"""Pixels from the middle of a window to its border; brightness and contrast are made equal in windows. Chosen on
+`ornament`."""
 NOISE_GRAY = 3.0
 """Standard deviation of gray levels that the surface does not explain. Chosen by hand."""
 OUTLIER = 3.0
@@ -35,6 +36,8 @@ HIDDEN = 0.003
 hand."""
 LEAST_SEEN = 0.6
 """Least share of a window that both photos see. Chosen by hand."""
+SUMS = 7
+"""Sums over a window: pixels, both gray levels, their squares and product, and the slope."""
 
 
 @dataclass(slots=True, eq=False)
@@ -63,152 +66,212 @@ class Pull:
         self.pixels += other.pixels
 
 
-def compare(
-    surface: tuple[FloatArray, FloatArray, IndexArray],
-    here: tuple[PhotoLevel, Raster],
-    there: tuple[PhotoLevel, Gray],
-    pull: Pull,
-) -> None:
-    """Add what a pair of photos says about the displacement of the vertices.
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """A photo, and the surface in it."""
+
+    level: PhotoLevel
+    raster: Raster
+
+
+def compare(vertices: FloatArray, faces: IndexArray, normals: Gray, here: Sight, others: Iterable[Sight]) -> Pull:
+    """Return what a photo and others say about the displacement of the vertices.
 
     Args:
-        surface: vertices (V, 3), normals (V, 3), and faces (T, 3).
-        here: a photo, and the surface in it.
-        there: the other photo, and the depths (H, W) of the surface in it.
-        pull: changed.
+        vertices: (V, 3).
+        faces: (T, 3).
+        normals: (T, 3) of the triangles, unit.
+        here: the photo.
+        others: those that it is compared with.
     """
-    vertices, normals, faces = surface
-    level, raster = here
-    other, other_depth = there
-    shape = level.gray.shape
-    seen, slope, mask = (np.zeros(shape, np.float32) for _ in range(3))
-    _look_through(
-        (vertices, normals, faces), (raster.face, raster.weights), (level.center, other.center),
-        other.projection, (other.gray, other.by_x, other.by_y, other_depth), (seen, slope, mask),
-    )  # fmt: skip
-    difference, gain, correlation, full = _difference(level.gray, seen, mask)
-    related = np.clip((correlation - UNRELATED) / (RELATED - UNRELATED), 0.0, 1.0)
-    weight = mask * full * related / (1.0 + (difference / (OUTLIER * NOISE_GRAY)) ** 2) / (2.0 * NOISE_GRAY**2)
-    _sum_up(raster.face, raster.weights, faces, difference, gain * slope, weight.astype(np.float32), pull.g, pull.h)
-    pull.correlation += float((correlation * mask).sum(dtype=np.float64))
-    pull.pixels += float(mask.sum(dtype=np.float64))
-
-
-def _difference(gray: Gray, seen: Gray, mask: Gray) -> tuple[Gray, Gray, Gray, NDArray[np.bool_]]:
-    """Return how photos differ where their windows have equal mean and contrast, and the gain that makes them equal.
-
-    Also their correlation, and where a window is seen well enough; all (H, W).
-    """
-    side = (WINDOW_PX, WINDOW_PX)
-    share = cv2.blur(mask, side)
-    count = np.maximum(share, 1e-6)
-    mean, other_mean = cv2.blur(gray * mask, side) / count, cv2.blur(seen * mask, side) / count
-    noise = NOISE_GRAY**2
-    variance = np.maximum(cv2.blur(gray * gray * mask, side) / count - mean * mean, 0.0) + noise
-    other_variance = np.maximum(cv2.blur(seen * seen * mask, side) / count - other_mean * other_mean, 0.0) + noise
-    common = cv2.blur(gray * seen * mask, side) / count - mean * other_mean
-    gain = np.sqrt(variance / other_variance)
-    difference = (gray - mean) - gain * (seen - other_mean)
-    correlation = common / np.sqrt(variance * other_variance)
-    return (
-        np.asarray(difference, np.float32), np.asarray(gain, np.float32), np.asarray(correlation, np.float32),
-        share > LEAST_SEEN,
-    )  # fmt: skip
+    found, level, raster = Pull.zeros(len(vertices)), here.level, here.raster
+    shape = raster.depth.shape
+    g, h = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    views = np.empty((*shape, 3), np.float32)
+    sums = np.empty((SUMS, shape[1]))
+    for other in others:
+        H, p = other.level.projection[:, :3] @ level.rays, other.level.projection @ np.append(level.center, 1.0)
+        _look_through(
+            (raster.depth, raster.face, normals), (H, p), (level.rays, level.center, other.level.center),
+            (other.level.image, other.raster.depth), views,
+        )  # fmt: skip
+        correlation, pixels = _weigh(level.image, views, sums, g, h)
+        found.correlation += correlation
+        found.pixels += pixels
+    _sum_up((vertices, faces), (raster.face, raster.depth), (level.rays, level.center), (g, h), (found.g, found.h))
+    return found
 
 
 @kernel
-def _look_through(
-    surface: Any, raster: Any, centers: Any, projection: FloatArray, other: Any, found: Any,
-) -> None:  # fmt: skip
-    """Fill in what the other photo shows at each pixel, its change per displacement of the surface, and where it sees.
+def _look_through(surface: Any, homography: Any, eyes: Any, other: Any, views: Gray) -> None:
+    """Fill in what the other photo shows at each pixel, its change per displacement of the surface, and 1 or 0: seen.
 
-    Arguments as in `compare`; found: gray levels, changes and 0 or 1, (H, W) each.
+    Arguments: the surface in the photo; what takes its pixels at depth z to those of the other one, z H x + p; rays of
+    the photo and both centers; the other photo, and the depths of the surface in it; (H, W, 3) for what is found.
     """
-    vertices, normals, faces = surface
-    face, weights = raster
-    here, there = centers
-    P = projection
-    gray, by_x, by_y, other_depth = other
-    seen, slope, mask = found
-    height, width = gray.shape
-    place, normal = np.empty(3), np.empty(3)
-    for i in range(face.shape[0]):
-        for j in range(face.shape[1]):
+    depth, face, normals = surface
+    H, p = homography
+    M, here, there = eyes
+    image, other_depth = other
+    height, width = other_depth.shape
+    for i in range(depth.shape[0]):
+        y = i + 0.5
+        for j in range(depth.shape[1]):
+            views[i, j, 0], views[i, j, 1], views[i, j, 2] = 0.0, 0.0, 0.0
             f = face[i, j]
             if f < 0:
                 continue
-            b, c = weights[i, j, 0], weights[i, j, 1]
-            a = 1.0 - b - c
-            for k in range(3):
-                place[k] = a * vertices[faces[f, 0], k] + b * vertices[faces[f, 1], k] + c * vertices[faces[f, 2], k]
-                normal[k] = a * normals[faces[f, 0], k] + b * normals[faces[f, 1], k] + c * normals[faces[f, 2], k]
-            w = P[2, 0] * place[0] + P[2, 1] * place[1] + P[2, 2] * place[2] + P[2, 3]
+            x, z = j + 0.5, float(depth[i, j])
+            hz = H[2, 0] * x + H[2, 1] * y + H[2, 2]
+            w = z * hz + p[2]
             if w <= 0.0:
                 continue
-            u = (P[0, 0] * place[0] + P[0, 1] * place[1] + P[0, 2] * place[2] + P[0, 3]) / w
-            v = (P[1, 0] * place[0] + P[1, 1] * place[1] + P[1, 2] * place[2] + P[1, 3]) / w
-            col, row = int(np.floor(u - 0.5)), int(np.floor(v - 0.5))
-            if col < 0 or row < 0 or col >= width - 1 or row >= height - 1:
+            hx, hy = H[0, 0] * x + H[0, 1] * y + H[0, 2], H[1, 0] * x + H[1, 1] * y + H[1, 2]
+            u, v = (z * hx + p[0]) / w, (z * hy + p[1]) / w
+            if not (0.5 <= u < width - 0.5 and 0.5 <= v < height - 0.5):
                 continue
+            col, row = min(int(u - 0.5), width - 2), min(int(v - 0.5), height - 2)
             near = 0
             for m in range(row, row + 2):
                 for n in range(col, col + 2):
                     near += abs(other_depth[m, n] - w) <= HIDDEN * w
             if near < 2:
                 continue
-            facing, ray = _cosine(normal, place, here)
-            if facing < LEAST_FACING or _cosine(normal, place, there)[0] < LEAST_FACING:
+            rx, ry = M[0, 0] * x + M[0, 1] * y + M[0, 2], M[1, 0] * x + M[1, 1] * y + M[1, 2]
+            rz = M[2, 0] * x + M[2, 1] * y + M[2, 2]
+            nx, ny, nz = normals[f, 0], normals[f, 1], normals[f, 2]
+            along = nx * rx + ny * ry + nz * rz
+            ox, oy, oz = here[0] + z * rx - there[0], here[1] + z * ry - there[1], here[2] + z * rz - there[2]
+            across = nx * ox + ny * oy + nz * oz
+            if along > -LEAST_FACING * np.sqrt(rx * rx + ry * ry + rz * rz):
                 continue
-            x, y = u - 0.5 - col, v - 0.5 - row
-            seen[i, j] = _interpolate(gray, row, col, x, y)
-            # along the ray, the surface moves by 1 / facing per displacement, towards the photo
-            scale = 1.0 / (ray * facing)
-            step_x, step_y, step_z = (
-                scale * (here[0] - place[0]),
-                scale * (here[1] - place[1]),
-                scale * (here[2] - place[2]),
+            if across > -LEAST_FACING * np.sqrt(ox * ox + oy * oy + oz * oz):
+                continue
+            # the displacement changes the depth by 1 / (normal ray)
+            du, dv = (hx - u * hz) / (w * along), (hy - v * hz) / (w * along)
+            a, b = np.float32(u - 0.5 - col), np.float32(v - 0.5 - row)
+            for c in range(3):
+                upper = image[row, col, c] + a * (image[row, col + 1, c] - image[row, col, c])
+                lower = image[row + 1, col, c] + a * (image[row + 1, col + 1, c] - image[row + 1, col, c])
+                value = upper + b * (lower - upper)
+                if c == 0:
+                    views[i, j, 0] = value
+                else:
+                    views[i, j, 1] += value * (du if c == 1 else dv)
+            views[i, j, 2] = 1.0
+
+
+@kernel
+def _weigh(image: Gray, views: Gray, sums: FloatArray, g: Gray, h: Gray) -> tuple[float, float]:
+    """Add what each pixel says about the displacement; return the sum of correlations, and the number of pixels.
+
+    Windows have the same mean and contrast in both photos. `sums` (SUMS, W) is overwritten: sums over the rows of a
+    window.
+    """
+    height, width = views.shape[0], views.shape[1]
+    sums[:] = 0.0
+    total, count = 0.0, 0.0
+    noise = NOISE_GRAY * NOISE_GRAY
+    least = LEAST_SEEN * (2 * REACH + 1) ** 2
+    for i in range(-REACH, height):
+        if i + REACH < height:
+            _add_row(image, views, i + REACH, 1.0, sums)
+        if i > REACH:
+            _add_row(image, views, i - REACH - 1, -1.0, sums)
+        if i < 0:
+            continue
+        n, a, b, aa, bb, ab, s = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(-REACH, width):
+            if j + REACH < width:
+                k = j + REACH
+                n, a, b, aa = n + sums[0, k], a + sums[1, k], b + sums[2, k], aa + sums[3, k]
+                bb, ab, s = bb + sums[4, k], ab + sums[5, k], s + sums[6, k]
+            if j > REACH:
+                k = j - REACH - 1
+                n, a, b, aa = n - sums[0, k], a - sums[1, k], b - sums[2, k], aa - sums[3, k]
+                bb, ab, s = bb - sums[4, k], ab - sums[5, k], s - sums[6, k]
+            if j < 0 or views[i, j, 2] == 0.0:
+                continue
+            one = 1.0 / n
+            mean, other = a * one, b * one
+            variance, other_variance = (
+                max(aa * one - mean * mean, 0.0) + noise,
+                max(bb * one - other * other, 0.0) + noise,
             )
-            dw = P[2, 0] * step_x + P[2, 1] * step_y + P[2, 2] * step_z
-            du = (P[0, 0] * step_x + P[0, 1] * step_y + P[0, 2] * step_z - u * dw) / w
-            dv = (P[1, 0] * step_x + P[1, 1] * step_y + P[1, 2] * step_z - v * dw) / w
-            slope[i, j] = _interpolate(by_x, row, col, x, y) * du + _interpolate(by_y, row, col, x, y) * dv
-            mask[i, j] = 1.0
-
-
-@kernel
-def _cosine(normal: FloatArray, place: FloatArray, center: FloatArray) -> tuple[float, float]:
-    """Return the cosine between a normal and the way to a photo, and the length of that way."""
-    dot, square, length = 0.0, 0.0, 0.0
-    for k in range(3):
-        way = center[k] - place[k]
-        dot += normal[k] * way
-        square += normal[k] * normal[k]
-        length += way * way
-    length = np.sqrt(length)
-    return dot / max(np.sqrt(square) * length, 1e-300), length
-
-
-@kernel
-def _interpolate(image: Gray, row: int, col: int, x: float, y: float) -> float:
-    """Return the bilinear value at (x, y) in [0, 1) from a pixel."""
-    upper = image[row, col] + x * (image[row, col + 1] - image[row, col])
-    lower = image[row + 1, col] + x * (image[row + 1, col + 1] - image[row + 1, col])
-    return float(upper + y * (lower - upper))
-
-
-@kernel
-def _sum_up(
-    face: NDArray[np.int32], weights: Gray, faces: IndexArray, difference: Gray, slope: Gray, weight: Gray,
-    g: FloatArray, h: FloatArray,
-) -> None:  # fmt: skip
-    for i in range(face.shape[0]):
-        for j in range(face.shape[1]):
-            if weight[i, j] <= 0.0:
+            gain = np.sqrt(variance / other_variance)
+            correlation = (ab * one - mean * other) / (gain * other_variance)
+            total += correlation
+            count += 1.0
+            related = min((correlation - UNRELATED) / (RELATED - UNRELATED), 1.0)
+            if n < least or related <= 0.0:
                 continue
-            f, second, third = face[i, j], weights[i, j, 0], weights[i, j, 1]
-            pull = weight[i, j] * slope[i, j] * difference[i, j]
-            stiff = weight[i, j] * slope[i, j] * slope[i, j]
-            for k in range(3):
-                share = second if k == 1 else third if k == 2 else 1.0 - second - third
-                g[faces[f, k]] += share * pull
-                h[faces[f, k]] += share * stiff
+            off = (image[i, j, 0] - mean) - gain * (views[i, j, 0] - other)
+            slope = gain * (views[i, j, 1] - s * one)
+            far = off / (OUTLIER * NOISE_GRAY)
+            weight = related / ((1.0 + far * far) * (2.0 * noise))
+            g[i, j] += weight * slope * off
+            h[i, j] += weight * slope * slope
+    return total, count
+
+
+@kernel
+def _add_row(image: Gray, views: Gray, i: int, sign: float, sums: FloatArray) -> None:
+    """Add a row to the sums over rows, or take it away."""
+    for j in range(views.shape[1]):
+        if views[i, j, 2] > 0.0:
+            a, b = float(image[i, j, 0]), float(views[i, j, 0])
+            sums[0, j] += sign
+            sums[1, j] += sign * a
+            sums[2, j] += sign * b
+            sums[3, j] += sign * (a * a)
+            sums[4, j] += sign * (b * b)
+            sums[5, j] += sign * (a * b)
+            sums[6, j] += sign * views[i, j, 1]
+
+
+@kernel
+def _sum_up(mesh: Any, raster: Any, eye: Any, said: Any, found: Any) -> None:
+    """Add what each pixel says to the corners of its triangle, by its place on it."""
+    vertices, faces = mesh
+    face, depth = raster
+    M, center = eye
+    g, h = said
+    whole_g, whole_h = found
+    for i in range(face.shape[0]):
+        y = i + 0.5
+        for j in range(face.shape[1]):
+            if h[i, j] <= 0.0:
+                continue
+            x, z = j + 0.5, float(depth[i, j])
+            a, b, c = faces[face[i, j], 0], faces[face[i, j], 1], faces[face[i, j], 2]
+            second, third = _weights(
+                vertices[a], vertices[b], vertices[c],
+                (
+                    center[0] + z * (M[0, 0] * x + M[0, 1] * y + M[0, 2]),
+                    center[1] + z * (M[1, 0] * x + M[1, 1] * y + M[1, 2]),
+                    center[2] + z * (M[2, 0] * x + M[2, 1] * y + M[2, 2]),
+                ),
+            )  # fmt: skip
+            first = 1.0 - second - third
+            whole_g[a] += first * g[i, j]
+            whole_g[b] += second * g[i, j]
+            whole_g[c] += third * g[i, j]
+            whole_h[a] += first * h[i, j]
+            whole_h[b] += second * h[i, j]
+            whole_h[c] += third * h[i, j]
+
+
+@kernel
+def _weights(a: FloatArray, b: FloatArray, c: FloatArray, place: tuple[float, float, float]) -> tuple[float, float]:
+    """Return the weights of the second and the third corner of a triangle at a place on it, within [0, 1]."""
+    bb, cc, bc, bp, cp = 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(3):
+        to_b, to_c, to_p = b[k] - a[k], c[k] - a[k], place[k] - a[k]
+        bb += to_b * to_b
+        cc += to_c * to_c
+        bc += to_b * to_c
+        bp += to_b * to_p
+        cp += to_c * to_p
+    area = max(bb * cc - bc * bc, 1e-300)
+    second = min(max((cc * bp - bc * cp) / area, 0.0), 1.0)
+    return second, min(max((bb * cp - bc * bp) / area, 0.0), 1.0 - second)

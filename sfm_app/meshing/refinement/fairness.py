@@ -14,8 +14,9 @@ IndexArray = NDArray[np.int64]
 BEND, CREASE = 0.1, 0.25
 """Usual distance of a vertex from the mean of its neighbors, and distance from which the surface counts as creased, in
 edges. Chosen on `ornament`."""
-HOLD = 1e-3
-"""Weight that holds a vertex where neither photos nor neighbors say anything, per squared edge. Chosen by hand."""
+HOLD, UNSEEN = 1e-3, 10.0
+"""Weights that hold a vertex where it is, per squared edge: usual ones, and those that photos say nothing about. Chosen
+by hand."""
 STEPS, ACCURACY = 60, 1e-2
 """Most steps of conjugate gradients, and the share of the first residual at which they end: the next iteration of the
 refinement goes on from there. Chosen by hand."""
@@ -74,7 +75,16 @@ def find_displacements(
     _bends(around.starts, around.others, around.inner, vertices, normals, bend)
     weight = around.inner / (BEND * size) ** 2 / (1.0 + (bend / (CREASE * size)) ** 2)
     found = np.zeros(len(vertices))
-    _solve(around.starts, around.others, h + HOLD / size**2, weight, g, bend, (STEPS, ACCURACY), found)
+    _solve(
+        around.starts,
+        around.others,
+        h + np.where(h > 0.0, HOLD, UNSEEN) / size**2,
+        weight,
+        g,
+        bend,
+        (STEPS, ACCURACY),
+        found,
+    )
     return found
 
 

@@ -65,9 +65,9 @@ class RefinePhoto:
             small = np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
         gray = np.asarray(cv2.GaussianBlur(small.astype(np.float32), (0, 0), BLUR_PX), np.float32)
         by_x, by_y = (cv2.Sobel(gray, cv2.CV_32F, *axis, ksize=3, scale=1.0 / 8.0) for axis in ((1, 0), (0, 1)))
-        return PhotoLevel(
-            self.projection(share), self.center, gray, np.asarray(by_x, np.float32), np.asarray(by_y, np.float32)
-        )
+        projection = self.projection(share)
+        rays = np.asarray(np.linalg.inv(projection[:, :3]), np.float64)
+        return PhotoLevel(projection, self.center, rays, np.stack([gray, by_x, by_y], axis=-1, dtype=np.float32))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,9 +78,7 @@ class PhotoLevel:
     """(3, 4) K [R | t]."""
     center: FloatArray
     """(3,) in the world."""
-    gray: Gray
-    """(H, W) gray levels."""
-    by_x: Gray
-    """(H, W) their derivative, per pixel."""
-    by_y: Gray
-    """(H, W) likewise."""
+    rays: FloatArray
+    """(3, 3) from pixels (x, y, 1) to rays in the world, at depth 1."""
+    image: Gray
+    """(H, W, 3) gray levels, and their derivatives by x and by y, per pixel."""

@@ -1,4 +1,4 @@
-"""Draw a surface into a photo: which triangle each pixel shows, where on it, and how far away."""
+"""Draw a surface into a photo: which triangle each pixel shows, and how far away."""
 
 from dataclasses import dataclass
 
@@ -23,8 +23,6 @@ class Raster:
     """(H, W) along the optical axis; infinite where nothing is."""
     face: NDArray[np.int32]
     """(H, W) triangle; NOTHING where none is, or where its back is seen."""
-    weights: NDArray[np.float32]
-    """(H, W, 2) of the second and the third corner, at the place on the triangle; the three sum to 1."""
 
 
 def rasterize(vertices: FloatArray, faces: IndexArray, projection: FloatArray, size: tuple[int, int]) -> Raster:
@@ -36,46 +34,54 @@ def rasterize(vertices: FloatArray, faces: IndexArray, projection: FloatArray, s
         projection: (3, 4) K [R | t].
         size: height and width in pixels.
     """
-    depth = np.full(size, np.inf, np.float32)
-    face, weights = np.full(size, NOTHING, np.int32), np.zeros((*size, 2), np.float32)
-    seen = vertices @ projection[:, :3].T + projection[:, 3]
-    ahead = np.where(seen[:, 2] > NEAREST, seen[:, 2], 1.0)
-    seen[:, :2] /= ahead[:, None]
-    _draw(seen, faces, depth, face, weights)
-    return Raster(depth, face, weights)
+    nearness, face = np.zeros(size, np.float32), np.full(size, NOTHING, np.int32)
+    seen = np.empty((len(vertices), 3))
+    _project(vertices, projection, seen)
+    _draw(seen, faces, nearness, face)
+    with np.errstate(divide="ignore"):
+        return Raster(np.float32(1.0) / nearness, face)
 
 
 @kernel
-def _draw(
-    seen: FloatArray,
-    faces: IndexArray,
-    depth: NDArray[np.float32],
-    face: NDArray[np.int32],
-    weights: NDArray[np.float32],
-) -> None:
-    height, width = depth.shape
+def _project(vertices: FloatArray, P: FloatArray, seen: FloatArray) -> None:
+    """Fill in the pixels of vertices, and 1 / depth, or -1 for those that are not in front of the photo."""
+    for k in range(len(vertices)):
+        x, y, z = vertices[k, 0], vertices[k, 1], vertices[k, 2]
+        w = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
+        near = 1.0 / w if w > NEAREST else -1.0
+        seen[k, 0] = near * (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3])
+        seen[k, 1] = near * (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3])
+        seen[k, 2] = near
+
+
+@kernel
+def _draw(seen: FloatArray, faces: IndexArray, nearness: NDArray[np.float32], face: NDArray[np.int32]) -> None:
+    """Fill in 1 / depth, which is linear in the photo, and the triangles; `seen` has pixels and 1 / depth."""
+    height, width = face.shape
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        if min(seen[a, 2], seen[b, 2], seen[c, 2]) <= NEAREST:
-            continue
         ax, ay, bx, by, cx, cy = seen[a, 0], seen[a, 1], seen[b, 0], seen[b, 1], seen[c, 0], seen[c, 1]
-        left, right = np.ceil(min(ax, bx, cx) - 0.5), np.floor(max(ax, bx, cx) - 0.5)
-        top, bottom = np.ceil(min(ay, by, cy) - 0.5), np.floor(max(ay, by, cy) - 0.5)
-        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        if area == 0.0 or right < 0 or bottom < 0 or left >= width or top >= height:
+        low, high = min(ay, by, cy), max(ay, by, cy)
+        if high < 0.5 or low > height - 0.5 or min(seen[a, 2], seen[b, 2], seen[c, 2]) < 0.0:
             continue
-        near_a, near_b, near_c = 1.0 / seen[a, 2], 1.0 / seen[b, 2], 1.0 / seen[c, 2]
-        for i in range(max(int(top), 0), min(int(bottom), height - 1) + 1):
-            for j in range(max(int(left), 0), min(int(right), width - 1) + 1):
-                x, y = j + 0.5, i + 0.5
-                second = ((x - ax) * (cy - ay) - (y - ay) * (cx - ax)) / area
-                third = ((bx - ax) * (y - ay) - (by - ay) * (x - ax)) / area
-                first = 1.0 - second - third
-                if first < 0.0 or second < 0.0 or third < 0.0:
+        left, right = min(ax, bx, cx), max(ax, bx, cx)
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if right < 0.5 or left > width - 0.5 or area == 0.0:
+            continue
+        first_column, last_column = max(int(left + 0.5), 0), min(int(right + 0.5), width)
+        near, over = seen[a, 2], 1.0 / area
+        # changes of both weights per pixel, and of nearness with them
+        bdx, bdy, cdx, cdy = (cy - ay) * over, (ax - cx) * over, (ay - by) * over, (bx - ax) * over
+        to_b, to_c = seen[b, 2] - near, seen[c, 2] - near
+        shown = f if area < 0.0 else NOTHING  # rows run down: what is counterclockwise has a negative area here
+        for i in range(max(int(low + 0.5), 0), min(int(high + 0.5), height)):
+            y = i + 0.5 - ay
+            for j in range(first_column, last_column):
+                x = j + 0.5 - ax
+                second, third = x * bdx + y * bdy, x * cdx + y * cdy
+                if second < 0.0 or third < 0.0 or second + third > 1.0:
                     continue
-                z = 1.0 / (first * near_a + second * near_b + third * near_c)
-                if z < depth[i, j]:
-                    depth[i, j] = z
-                    # rows run down, so what is counterclockwise in the world has a negative area here
-                    face[i, j] = f if area < 0.0 else NOTHING
-                    weights[i, j, 0], weights[i, j, 1] = second * near_b * z, third * near_c * z
+                here = np.float32(near + second * to_b + third * to_c)
+                if here > nearness[i, j]:
+                    nearness[i, j] = here
+                    face[i, j] = shown

@@ -8,21 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.triangles import vertex_normals
-from sfm_app.meshing.refinement.agreement import Pull, compare
+from sfm_app.meshing.refinement.agreement import Pull, Sight, compare
 from sfm_app.meshing.refinement.fairness import Neighbors, find_displacements
 from sfm_app.meshing.refinement.photo_levels import RefinePhoto
-from sfm_app.meshing.refinement.rasterize import NOTHING, Raster, rasterize
-from sfm_app.meshing.refinement.subdivide import split_long_edges
+from sfm_app.meshing.refinement.rasterize import NOTHING, rasterize
+from sfm_app.meshing.refinement.sights import Sights
+from sfm_app.meshing.refinement.subdivide import sort_in_space, split_long_edges
 from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
 Spread = Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]]
 """Calls a function for every number, possibly in parallel, and returns the results in order."""
 
-LEVELS = ((0.5, 3), (1.0, 3))
-"""Shares of the resolution of the photos, and iterations at each. Chosen on `ornament`."""
-EDGE_PX = 3.0
-"""Longest edge in the photo that shows it best, in pixels: detail takes two pixels. Chosen on `ornament`."""
+LEVELS = ((0.5, 3, 6.0), (1.0, 2, 8.0))
+"""Shares of the resolution of the photos, iterations at each, and longest edges in the photo that shows them best, in
+pixels. Chosen on `ornament`: half as long edges cost twice as much and find nothing more."""
 ROUNDS = 3
 """Most times that edges are divided before a level."""
 MOST_PX = 1.0
@@ -39,6 +39,8 @@ class Refinement:
     surface: Surface
     correlations: tuple[float, ...]
     """Mean correlation of photos through the surface, before each iteration."""
+    failed: str = ""
+    """Why the surface is as it was; empty where it is refined."""
 
 
 def refine(
@@ -54,8 +56,8 @@ def refine(
         spread: applies a function to photos, possibly in parallel.
     """
     found = list[float]()
-    for share, iterations in LEVELS:
-        surface = _divide(surface, photos, share, most)
+    for share, iterations, edge_px in LEVELS:
+        surface = _divide(surface, photos, (share, edge_px), most)
         around = Neighbors.from_faces(surface.faces, len(surface.vertices))
         reach = MOST_PX * finest_pixels(surface.vertices, photos, share)
         for _ in range(iterations):
@@ -84,14 +86,15 @@ def finest_pixels(vertices: FloatArray, photos: Sequence[RefinePhoto], share: fl
     return found
 
 
-def _divide(surface: Surface, photos: Sequence[RefinePhoto], share: float, most: int) -> Surface:
+def _divide(surface: Surface, photos: Sequence[RefinePhoto], level: tuple[float, float], most: int) -> Surface:
     """Return the surface with triangles as small as a level of the photos asks for, as far as `most` allows."""
+    share, edge_px = level
     for _ in range(ROUNDS):
-        finer = split_long_edges(surface, EDGE_PX * finest_pixels(surface.vertices, photos, share))
+        finer = split_long_edges(surface, edge_px * finest_pixels(surface.vertices, photos, share))
         if len(finer.faces) == len(surface.faces) or len(finer.faces) > most:
             break
         surface = finer
-    return surface
+    return sort_in_space(surface)
 
 
 def _improve(
@@ -102,17 +105,12 @@ def _improve(
     photos, partners, share = seen
     vertices, faces = surface.vertices, surface.faces
     normals = vertex_normals(vertices, faces)
-
-    def depths(k: int) -> NDArray[np.float32]:
-        return _draw(surface, photos[k], share).depth
+    facing = _unit(normals[faces].mean(axis=1)).astype(np.float32)
+    sights = Sights(lambda k: look(surface, photos[k], share))
 
     def ask(k: int) -> Pull:
-        pull, level, raster = Pull.zeros(len(vertices)), photos[k].level(share), _draw(surface, photos[k], share)
-        for other in partners[k]:
-            compare((vertices, normals, faces), (level, raster), (photos[other].level(share), maps[other]), pull)
-        return pull
+        return compare(vertices, faces, facing, sights[k], [sights[other] for other in partners[k]])
 
-    maps = list(spread(depths, range(len(photos))))
     whole = Pull.zeros(len(vertices))
     for pull in spread(ask, range(len(photos))):
         whole.add(pull)
@@ -123,10 +121,21 @@ def _improve(
     return replace(surface, vertices=moved), whole.correlation / max(whole.pixels, 1.0)
 
 
-def _draw(surface: Surface, photo: RefinePhoto, share: float) -> Raster:
-    """Return the surface as a photo sees it; nothing where the photo is masked."""
+def look(surface: Surface, photo: RefinePhoto, share: float) -> Sight:
+    """Return a photo, and the surface in it; nothing where the photo is masked.
+
+    Args:
+        surface: triangles.
+        photo: the photo.
+        share: of its resolution.
+    """
     found = rasterize(surface.vertices, surface.faces, photo.projection(share), photo.size_at(share))
     masked = photo.mask_at(share)
     if masked is not None:
         found.depth[masked], found.face[masked] = np.inf, NOTHING
-    return found
+    return Sight(photo.level(share), found)
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.maximum(length, np.finfo(np.float64).tiny))

@@ -36,7 +36,7 @@ from sfm_app.runtime.cost_estimate import block_count, block_workers
 from sfm_app.settings import MeshSettings
 from sfm_app.stages.blocks.judging import SurfaceJudge, simplify_mesh
 from sfm_app.stages.blocks.points import BlockPoints, sort_points
-from sfm_app.stages.blocks.refining import refine_surface
+from sfm_app.stages.blocks.refining import Originals, Partners, rank_partners, refine_surface
 from sfm_app.stereo import View
 from sfm_app.tasks import Task
 from sfm_app.types import Surface
@@ -67,8 +67,11 @@ class BlockTask:
     points: BlockPoints
     """Those of all blocks."""
     dense_dir: Path
+    originals: Originals
     views: Sequence[View]
     """The photos that may see it."""
+    partners: Partners
+    """With which of the others each one is compared."""
     number: int
     bounds: FloatArray
     """(2, 3) of its points and halo."""
@@ -88,12 +91,12 @@ class BlockTask:
 
 
 def mesh_in_blocks(
-    dense_dir: Path, views: Sequence[View], points: NDArray[np.void], least: float, run: RunContext
+    source: tuple[Path, Originals], views: Sequence[View], points: NDArray[np.void], least: float, run: RunContext
 ) -> Surface:
     """Return the surface of all points, made block by block.
 
     Args:
-        dense_dir: dense workspace with depth maps.
+        source: dense workspace with depth maps, and the photos.
         views: photos with a depth map.
         points: (N,) records of the fused points.
         least: photos that have to confirm the average vertex of a part.
@@ -102,7 +105,7 @@ def mesh_in_blocks(
     Raises:
         ReconstructionError: there is no surface.
     """
-    place, options = run.workspace.surface, run.settings.mesh
+    (dense_dir, originals), place, options = source, run.workspace.surface, run.settings.mesh
     folder = place / BLOCKS
     made_from = fingerprint(run.fingerprint, len(points), options.model_dump())
     if not resume_or_clear(folder, made_from):
@@ -114,11 +117,12 @@ def mesh_in_blocks(
     bounds = _with_halo(own.bounds, cell)
     cubes = [cube_around(low, high, cell) for low, high in bounds]
     farthest = run.map(Task(farthest_depth, dense_dir), views, "measuring depths")
+    partners = rank_partners(views)
     seers = _photos_in_reach(views, farthest, bounds)
     tasks = [
-        BlockTask(folder, own, dense_dir, seers[k], k, bounds[k], cell, cubes[k], options,
-                  run.settings.depth.consistency, least)
-        for k in range(len(cubes))
+        BlockTask(folder, own, dense_dir, originals, seen, {view.name: partners[view.name] for view in seen},
+                  k, bounds[k], cell, cubes[k], options, run.settings.depth.consistency, least)
+        for k, seen in enumerate(seers)
     ]  # fmt: skip
     with run.with_workers(block_workers(run.workers, run.memory_mb, options)) as few:
         raw = few.map(Task(mesh_block), tasks, "finding the surface in blocks")
@@ -150,8 +154,8 @@ def mesh_block(task: BlockTask) -> int:
     found, support = judge.sum_up(map(judge.judge, task.views))
     if task.options.trim and len(found.faces):
         found = trim(found, support, task.options.max_gap_triangles, task.least)
-    if len(found.faces) and task.options.refine:
-        found = refine_surface(found, task.dense_dir, task.views, task.options).surface
+    if len(found.faces) and task.options.max_image_size_px:
+        found = refine_surface(found, task.originals, task.views, task.partners, task.options).surface
     if len(found.faces):
         found = make_manifold(simplify_mesh(found, task.options, scratch))
     with replace_atomically(task.path) as path:

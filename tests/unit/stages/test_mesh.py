@@ -1,6 +1,7 @@
 """From true depth maps of a ball seen all round to its closed surface."""
 
 import shutil
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -84,8 +85,10 @@ def run_in(dense, workers=2, **options):
 
 
 def made(dense, **options):
-    run = run_in(dense, **options)
-    return mesh.make(dense, run), run.statistics
+    run = run_in(dense, **{"max_image_size_px": 0} | options)
+    if not run.workspace.photos.exists():  # without distortion: those of the workspace are the originals
+        run.workspace.photos.symlink_to(dense / "images")
+    return mesh.make(SimpleNamespace(model_dir=dense / "sparse"), dense, run), run.statistics
 
 
 @pytest.fixture(scope="module")
@@ -182,19 +185,49 @@ def test_a_ball_in_blocks_is_the_ball(dense, ball, tmp_path):
     np.testing.assert_array_equal(again.vertices, found.vertices)
 
 
+def copied(dense, target):
+    for name in ("dense", "surface"):
+        shutil.copytree(dense.parent / name, target / name)
+    return target / "dense"
+
+
 @pytest.mark.parametrize("block_points", [4_000_000, 8000])
 def test_refined_with_photos_that_show_nothing_a_ball_stays_a_ball(dense, tmp_path, block_points):
-    for name in ("dense", "surface"):
-        shutil.copytree(dense.parent / name, tmp_path / name)
+    place = copied(dense, tmp_path)
 
-    found, counts = made(tmp_path / "dense", refine=True, block_points=block_points)
-    again, _ = made(tmp_path / "dense", workers=1, refine=True, block_points=block_points)
+    found, counts = made(place, max_image_size_px=1600, block_points=block_points)
+    again, _ = made(place, workers=1, max_image_size_px=1600, block_points=block_points)
 
     edges, edge_of = unique_edges(found.faces)
     assert np.array_equal(np.bincount(edge_of.ravel()), np.full(len(edges), 2))
     assert np.percentile(np.abs(np.linalg.norm(found.vertices, axis=1) - 1), 95) < 0.015
     assert ("blocks" in counts) == (block_points == 8000) == ("refined_triangles" not in counts)
     np.testing.assert_array_equal(again.vertices, found.vertices)
+
+
+def marbled(view, radius):
+    """What a camera sees of a ball whose color varies smoothly in space."""
+    y, x = np.mgrid[: view.height, : view.width] + 0.5
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(view.K).T @ view.R
+    a, b = np.sum(rays**2, axis=-1), rays @ view.center
+    root = b**2 - a * (view.center @ view.center - radius**2)
+    places = view.center + rays * ((-b - np.sqrt(np.maximum(root, 0))) / a)[..., None]
+    value = np.zeros_like(a)
+    for way in np.random.default_rng(3).normal(size=(12, 3)):
+        value += np.cos(14.0 * places @ way)
+    return np.where(root > 0, np.clip(128 + 20 * value, 0, 255), 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("block_points", [4_000_000, 8000])
+def test_a_ball_that_is_too_small_grows_to_what_the_photos_show(dense, ball, tmp_path, block_points):
+    place, radius = copied(dense, tmp_path), 1.008
+    for view in read_views(place):
+        cv2.imwrite(str(place / "images" / view.name), marbled(view, radius))
+
+    found, _ = made(place, max_image_size_px=1600, block_points=block_points)
+
+    assert np.median(np.linalg.norm(ball[0].vertices, axis=1)) == pytest.approx(1.0, abs=0.002)
+    assert np.median(np.linalg.norm(found.vertices, axis=1)) == pytest.approx(radius, abs=0.004)
 
 
 def test_a_run_that_was_killed_makes_the_missing_blocks_only(dense, ball, tmp_path, monkeypatch):
