@@ -92,7 +92,7 @@ def compare(vertices: FloatArray, faces: IndexArray, normals: Gray, here: Sight,
     for other in others:
         H, p = other.level.projection[:, :3] @ level.rays, other.level.projection @ np.append(level.center, 1.0)
         _look_through(
-            (raster.depth, raster.face, normals), (H, p), (level.rays, level.center, other.level.center),
+            (raster.depth, raster.face, normals), (H, p), (level.rays, level.center - other.level.center),
             (other.level.image, other.raster.depth), views,
         )  # fmt: skip
         correlation, pixels = _weigh(level.image, views, sums, g, h)
@@ -107,11 +107,12 @@ def _look_through(surface: Any, homography: Any, eyes: Any, other: Any, views: G
     """Fill in what the other photo shows at each pixel, its change per displacement of the surface, and 1 or 0: seen.
 
     Arguments: the surface in the photo; what takes its pixels at depth z to those of the other one, z H x + p; rays of
-    the photo and both centers; the other photo, and the depths of the surface in it; (H, W, 3) for what is found.
+    the photo and the way to its center from the other one; the other photo, and the depths of the surface in it;
+    (H, W, 3) for what is found.
     """
     depth, face, normals = surface
     H, p = homography
-    M, here, there = eyes
+    M, apart = eyes
     image, other_depth = other
     height, width = other_depth.shape
     for i in range(depth.shape[0]):
@@ -127,28 +128,30 @@ def _look_through(surface: Any, homography: Any, eyes: Any, other: Any, views: G
             if w <= 0.0:
                 continue
             hx, hy = H[0, 0] * x + H[0, 1] * y + H[0, 2], H[1, 0] * x + H[1, 1] * y + H[1, 2]
-            u, v = (z * hx + p[0]) / w, (z * hy + p[1]) / w
+            over = 1.0 / w
+            u, v = (z * hx + p[0]) * over, (z * hy + p[1]) * over
             if not (0.5 <= u < width - 0.5 and 0.5 <= v < height - 0.5):
                 continue
             col, row = min(int(u - 0.5), width - 2), min(int(v - 0.5), height - 2)
-            near = 0
-            for m in range(row, row + 2):
-                for n in range(col, col + 2):
-                    near += abs(other_depth[m, n] - w) <= HIDDEN * w
+            limit = HIDDEN * w
+            near = int(abs(other_depth[row, col] - w) <= limit) + int(abs(other_depth[row, col + 1] - w) <= limit)
+            near += int(abs(other_depth[row + 1, col] - w) <= limit)
+            near += int(abs(other_depth[row + 1, col + 1] - w) <= limit)
             if near < 2:
                 continue
             rx, ry = M[0, 0] * x + M[0, 1] * y + M[0, 2], M[1, 0] * x + M[1, 1] * y + M[1, 2]
             rz = M[2, 0] * x + M[2, 1] * y + M[2, 2]
             nx, ny, nz = normals[f, 0], normals[f, 1], normals[f, 2]
             along = nx * rx + ny * ry + nz * rz
-            ox, oy, oz = here[0] + z * rx - there[0], here[1] + z * ry - there[1], here[2] + z * rz - there[2]
-            across = nx * ox + ny * oy + nz * oz
-            if along > -LEAST_FACING * np.sqrt(rx * rx + ry * ry + rz * rz):
+            if along >= 0.0 or along * along < LEAST_FACING * LEAST_FACING * (rx * rx + ry * ry + rz * rz):
                 continue
-            if across > -LEAST_FACING * np.sqrt(ox * ox + oy * oy + oz * oz):
+            ox, oy, oz = z * rx + apart[0], z * ry + apart[1], z * rz + apart[2]
+            across = nx * ox + ny * oy + nz * oz
+            if across >= 0.0 or across * across < LEAST_FACING * LEAST_FACING * (ox * ox + oy * oy + oz * oz):
                 continue
             # the displacement changes the depth by 1 / (normal ray)
-            du, dv = (hx - u * hz) / (w * along), (hy - v * hz) / (w * along)
+            change = over / along
+            du, dv = (hx - u * hz) * change, (hy - v * hz) * change
             a, b = np.float32(u - 0.5 - col), np.float32(v - 0.5 - row)
             for c in range(3):
                 upper = image[row, col, c] + a * (image[row, col + 1, c] - image[row, col, c])
