@@ -1,6 +1,6 @@
 """What the surface at once and the surface in blocks have in common: the photos' judgment, and simplification."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,11 +11,14 @@ from sfm_app.colmap.dense import read_color, read_depth
 from sfm_app.colmap.surface import simplify
 from sfm_app.geometry.culling import Clusters, cluster
 from sfm_app.geometry.triangles import median_edge_length, vertex_normals
-from sfm_app.meshing import NO_EVIDENCE, DepthView, Paint, Support, judge, sample_colors
+from sfm_app.meshing import CONFIRMED, NO_EVIDENCE, DepthView, Paint, Support, judge, sample_colors
 from sfm_app.settings import MeshSettings
 from sfm_app.stereo import View
 from sfm_app.tasks import Shared
 from sfm_app.types import Surface
+
+LEAST_CONFIRMED = 200
+"""Vertices of a block that a photo has to confirm for taking part in its refinement. Chosen by hand."""
 
 Judgment = tuple[NDArray[np.int64], NDArray[np.uint8], Paint]
 """Of one photo: the vertices (N,) it says something about, what it says of each (N,), and its colors there."""
@@ -69,6 +72,24 @@ class SurfaceJudge:
             paint.add(at, colors)
         surface = self.surface
         return Surface(surface.vertices, surface.faces, paint.mean_colors(surface.colors)), support
+
+
+def judge_by_all(judge: SurfaceJudge, views: Sequence[View]) -> tuple[Surface, Support, list[View]]:
+    """Return what `sum_up` does, and the photos that confirm enough of the surface to refine it.
+
+    Args:
+        judge: prepared for the surface.
+        views: the photos.
+    """
+    seers = list[View]()
+
+    def ask(view: View) -> Judgment:
+        said = judge.judge(view)
+        if np.count_nonzero(said[1] == CONFIRMED) >= LEAST_CONFIRMED:
+            seers.append(view)
+        return said
+
+    return *judge.sum_up(map(ask, views)), seers
 
 
 def judge_view(judges: Shared[SurfaceJudge], view: View) -> Judgment:

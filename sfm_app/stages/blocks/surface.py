@@ -34,7 +34,7 @@ from sfm_app.meshing.components import MIN_POINTS
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_count, block_workers
 from sfm_app.settings import MeshSettings
-from sfm_app.stages.blocks.judging import SurfaceJudge, simplify_mesh
+from sfm_app.stages.blocks.judging import SurfaceJudge, judge_by_all, simplify_mesh
 from sfm_app.stages.blocks.points import BlockPoints, sort_points
 from sfm_app.stages.blocks.refining import Originals, Partners, rank_partners, refine_surface
 from sfm_app.stereo import View
@@ -151,11 +151,11 @@ def mesh_block(task: BlockTask) -> int:
     inside = ((raw.vertices >= task.bounds[0]) & (raw.vertices <= task.bounds[1])).all(axis=1)
     near = select_faces(raw, inside[raw.faces].all(axis=1))
     judge = SurfaceJudge.prepare(near, task.dense_dir, task.tolerance)
-    found, support = judge.sum_up(map(judge.judge, task.views))
+    found, support, seers = judge_by_all(judge, task.views)
     if task.options.trim and len(found.faces):
         found = trim(found, support, task.options.max_gap_triangles, task.least)
     if len(found.faces) and task.options.max_image_size_px:
-        found = refine_surface(found, task.originals, task.views, task.partners, task.options).surface
+        found = refine_surface(found, task.originals, seers, task.partners, task.options).surface
     if len(found.faces):
         found = make_manifold(simplify_mesh(found, task.options, scratch))
     with replace_atomically(task.path) as path:
