@@ -15,7 +15,7 @@ from sfm_app.stereo.normals import fit_planes, plane_normals
 from sfm_app.stereo.patch_match import NO_MATCH, PlaneArray, improve_planes
 from sfm_app.stereo.planar_fill import fill_planar_areas
 from sfm_app.stereo.rectify import rectify
-from sfm_app.stereo.textureless import surfaceless_areas
+from sfm_app.stereo.textureless import plain_walls, surfaceless_areas
 from sfm_app.stereo.view import DepthArray, GrayImage, View
 from sfm_app.types import Rejected
 
@@ -124,7 +124,8 @@ def confirm_depths(
     """Keep depths that enough other maps confirm; remove spill and specks, fill plain walls, add normals.
 
     The required number is `min_agreeing`; one more at low correlation and next to broad gaps; three more at very low
-    correlation, which must lie between surer ones, too. Depths in skies are always dropped.
+    correlation. There, a depth must belong to a plain wall or lie between surer ones, too. Depths in skies are always
+    dropped.
 
     Args:
         view: the photo.
@@ -143,11 +144,13 @@ def confirm_depths(
     enough[confidence < WEAK_CORRELATION] = min_agreeing + WEAK_EXTRA_MAPS
     sound = (estimate.depth > 0) & (agreeing >= enough)
     # without texture, semi-global matching carries depths on beyond the outline of a thing, in all photos alike
-    sound &= (confidence >= WEAK_CORRELATION) | enclosed_pixels(sound & (confidence >= WEAK_CORRELATION))
+    weak = confidence < WEAK_CORRELATION
+    walls = plain_walls(weak, sound)
+    sound &= ~weak | walls | enclosed_pixels(sound & ~weak)
     confirmed = np.where(sound & ~surfaceless_areas(confidence, sound), estimate.depth, np.float32(0))
     doubtful = rim_mask(confirmed > 0) & (agreeing < more)
     confirmed = filter_speckles(remove_spill(np.where(doubtful, np.float32(0), confirmed), image), tolerance)
-    planes = fit_planes(fill_planar_areas(confirmed, image, tolerance))
+    planes = fit_planes(fill_planar_areas(confirmed, image, tolerance, walls))
     if not planes.any():
         return Rejected("no depth is confirmed by other photos")
     depth = np.divide(1, planes[..., 0], out=np.zeros_like(confirmed), where=planes[..., 0] > 0)

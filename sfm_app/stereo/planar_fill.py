@@ -29,13 +29,18 @@ MAX_BEND = 0.3
 """Largest root mean square of the cells' mean residuals, in tolerances."""
 
 
-def fill_planar_areas(depth: DepthArray, image: GrayImage, tolerance: float) -> DepthArray:
-    """Replace depths in areas of uniform color by planes, within the convex hull of the known depths and between them.
+def fill_planar_areas(
+    depth: DepthArray, image: GrayImage, tolerance: float, walls: NDArray[np.bool_] | None = None
+) -> DepthArray:
+    """Replace depths in areas of uniform color by planes, within the convex hull of the known depths.
+
+    Outside walls, only between known depths: what has the color of a wall may be the sky beside it.
 
     Args:
         depth: (H, W) depths that other photos confirm, 0 where unknown.
         image: (H, W) the photo.
         tolerance: largest relative difference of depths that agree.
+        walls: (H, W) what is known to be a wall; None for nothing.
 
     Returns:
         (H, W) depth, unchanged in other areas.
@@ -47,7 +52,7 @@ def fill_planar_areas(depth: DepthArray, image: GrayImage, tolerance: float) -> 
         if area < MIN_AREA * image.size:
             continue
         box = np.s_[top : top + height, left : left + width]
-        _fill_area(bridged[box], labels[box] == label, tolerance)
+        _fill_area(bridged[box], labels[box] == label, tolerance, None if walls is None else walls[box])
     return bridged
 
 
@@ -57,7 +62,7 @@ def _uniform_mask(image: GrayImage) -> NDArray[np.bool_]:
     return np.asarray(slope < MAX_SLOPE)
 
 
-def _fill_area(depth: DepthArray, area: NDArray[np.bool_], tolerance: float) -> None:
+def _fill_area(depth: DepthArray, area: NDArray[np.bool_], tolerance: float, walls: NDArray[np.bool_] | None) -> None:
     """Replace the depths of an area, in its bounding box, if they lie on a plane."""
     known = area & (depth > 0)
     if np.count_nonzero(known) < max(MIN_KNOWN * np.count_nonzero(area), CELL_PIXELS):
@@ -75,7 +80,8 @@ def _fill_area(depth: DepthArray, area: NDArray[np.bool_], tolerance: float) -> 
     certain[row[on_plane], col[on_plane]] = True
     hull = cv2.convexHull(np.column_stack([col, row])[on_plane].astype(np.int32))
     cv2.fillConvexPoly(within, hull, 1)
-    row, col = np.nonzero(area & (within > 0) & enclosed_pixels(certain))
+    fillable = enclosed_pixels(certain) if walls is None else walls | enclosed_pixels(certain)
+    row, col = np.nonzero(area & (within > 0) & fillable)
     depth[row, col] = 1.0 / (plane[0] + plane[1] * col + plane[2] * row)
 
 

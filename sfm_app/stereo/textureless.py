@@ -15,6 +15,31 @@ SPECK_PX = 5
 MIN_SHARE = 0.03
 """Other photos confirm a twelfth or more of a wall, but at most a hundredth of a sky."""
 
+FAR_SHARE = 0.02
+"""Distance from the nearest sure depth, in longer sides of the photo, over which semi-global matching carries depths
+on. Chosen on `garden` and `ornament`, where it is a hundredth, with `corner` left out."""
+LEAST_FAR_PX = 100
+"""Fewest pixels farther away that tell a wall from a sky. Chosen by hand."""
+
+
+def plain_walls(weak: NDArray[np.bool_], confirmed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mark areas of weak texture, (H, W), that other photos confirm far from all sure depths, too.
+
+    Args:
+        weak: (H, W) where there is hardly any texture.
+        confirmed: (H, W) whether enough other photos confirm the depth.
+    """
+    smooth = cv2.medianBlur(weak.view(np.uint8), SPECK_PX)
+    count, areas = cv2.connectedComponents(smooth, connectivity=4)
+    sure = confirmed & ~weak
+    away = cv2.distanceTransform(1 - sure.view(np.uint8), cv2.DIST_L2, 3)
+    far = away > FAR_SHARE * max(weak.shape)
+    size = np.bincount(areas[far], minlength=count)
+    share = np.bincount(areas[far], confirmed[far], count) / np.maximum(size, 1)
+    wall = (size >= LEAST_FAR_PX) & (share >= MIN_SHARE)
+    wall[0] = False  # label 0: everything that has texture
+    return np.asarray(wall)[areas]
+
 
 def surfaceless_areas(confidence: NDArray[np.float32], confirmed: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mark blank areas of which almost nothing is confirmed, (H, W).
