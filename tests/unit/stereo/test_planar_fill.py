@@ -69,3 +69,16 @@ def test_a_few_specks_make_no_wall():
     depth = patches(WALL, 0.04, 0.0)
 
     np.testing.assert_array_equal(fill_planar_areas(depth, paint(WIDTH), 0.01), depth)
+
+
+def test_a_sky_beside_a_wall_of_its_color_is_not_filled_unless_it_is_known_to_be_a_wall():
+    depth = patches(WALL, 0.5, 0.003)
+    depth[:120, 200:] = 0  # what runs out of the photo above the wall, and to its right
+    beyond = (COL > 215) & (ROW < 105) & (COL < 320 - 20) & (ROW > 20)
+
+    plain = fill_planar_areas(depth, paint(WIDTH), 0.01)
+    wall = fill_planar_areas(depth, paint(WIDTH), 0.01, walls=np.ones((HEIGHT, WIDTH), bool))
+
+    assert np.mean(plain[beyond] > 0) < 0.02
+    assert np.mean(plain[(ROW > 130) & (ROW < 220) & (COL > 20) & (COL < 300)] > 0) > 0.95
+    assert np.mean(wall[beyond] > 0) > 0.2, "within the hull"

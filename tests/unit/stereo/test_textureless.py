@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.stereo.textureless import surfaceless_areas
+from sfm_app.stereo.textureless import FAR_SHARE, plain_walls, surfaceless_areas
 
 SHAPE = (120, 160)
 
@@ -60,3 +60,29 @@ def test_weak_likeness_is_not_blank():
     weak = np.full(SHAPE, 0.15, np.float32)
 
     assert not surfaceless_areas(weak, np.zeros(SHAPE, bool)).any()
+
+
+def test_a_wall_is_confirmed_in_places_far_from_outlines():
+    weak = blank_half() < 0.3
+    confirmed = confirmed_rim(2)
+    confirmed[10:20, 30:90] = True
+
+    found = plain_walls(weak, confirmed)
+
+    assert found[:58].mean() > 0.98 and not found[62:].any()
+
+
+@pytest.mark.parametrize("rows", [0, 3])
+def test_depths_that_are_carried_on_over_an_outline_make_no_wall(rows):
+    assert rows <= FAR_SHARE * max(SHAPE)
+    confirmed = confirmed_rim(rows)
+    confirmed[5:7, 20:40] = True  # by chance: less than a hundredth
+
+    assert not plain_walls(blank_half() < 0.3, confirmed).any()
+
+
+def test_a_narrow_strip_tells_nothing():
+    weak = np.zeros(SHAPE, bool)
+    weak[:, 50:55] = True
+
+    assert not plain_walls(weak, np.ones(SHAPE, bool)).any()
