@@ -98,6 +98,12 @@ def view_name(photo: str, number: int) -> str:
     return f"{photo}.{number + 1}.jpg"
 
 
+def parse_view_name(name: str) -> tuple[str, int]:
+    """Return the photo and the number of a view; the reverse of `view_name`."""
+    photo, number, _ = name.rsplit(".", 2)
+    return photo, int(number) - 1
+
+
 def write_model(model_dir: Path, lenses: Mapping[int, WideLens], dense_dir: Path) -> list[tuple[str, int]]:
     """Write the model of all views into a dense workspace, and return the name and the camera's id of each photo.
 

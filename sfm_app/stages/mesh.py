@@ -13,6 +13,7 @@ from sfm_app.colmap.surface import FUSED, open_points, poisson_surface, position
 from sfm_app.errors import ReconstructionError
 from sfm_app.hashing import digest_files, load_arrays
 from sfm_app.meshing import drop_islands, make_manifold, octree_depth, trim
+from sfm_app.meshing.refinement import STEPS
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_count
@@ -97,11 +98,19 @@ def _refine(surface: Surface, originals: Originals, views: list[View], run: RunC
     """Return the surface with the detail of the photos."""
 
     def spread(ask: Callable[[int], Any], photos: Sequence[int]) -> Iterator[Any]:
-        found = ordered_map(run.executor, ask, photos, ahead=2 * run.workers)
-        return track(run.progress, found, "refining the surface", len(photos))
+        for found in ordered_map(run.executor, ask, photos, ahead=2 * run.workers):
+            run.progress.advance()
+            yield found
 
-    found = refine_surface(surface, originals, views, rank_partners(views), run.settings.mesh, spread)
-    run.record(refined_triangles=len(found.surface.faces), refinement_failed=found.failed)
+    run.progress.start("refining the surface", (1 + STEPS) * len(views))  # each is read, too
+    try:
+        found = refine_surface(surface, originals, views, rank_partners(views), run.settings.mesh, spread)
+    finally:
+        run.progress.finish()
+    if found.failed:
+        run.record(refinement_failed=found.failed)
+        run.progress.say(f"the surface stays as the depth maps have it: {found.failed}")
+    run.record(refined_triangles=len(found.surface.faces))
     run.record(photo_correlations=[round(one, 4) for one in found.correlations])
     return found.surface
 

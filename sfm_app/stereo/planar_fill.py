@@ -29,9 +29,7 @@ MAX_BEND = 0.3
 """Largest root mean square of the cells' mean residuals, in tolerances."""
 
 
-def fill_planar_areas(
-    depth: DepthArray, image: GrayImage, tolerance: float, walls: NDArray[np.bool_] | None = None
-) -> DepthArray:
+def fill_planar_areas(depth: DepthArray, image: GrayImage, tolerance: float, walls: NDArray[np.bool_]) -> DepthArray:
     """Replace depths in areas of uniform color by planes, within the convex hull of the known depths.
 
     Outside walls, only between known depths: what has the color of a wall may be the sky beside it.
@@ -40,7 +38,7 @@ def fill_planar_areas(
         depth: (H, W) depths that other photos confirm, 0 where unknown.
         image: (H, W) the photo.
         tolerance: largest relative difference of depths that agree.
-        walls: (H, W) what is known to be a wall; None for nothing.
+        walls: (H, W) what is known to be a wall.
 
     Returns:
         (H, W) depth, unchanged in other areas.
@@ -52,7 +50,7 @@ def fill_planar_areas(
         if area < MIN_AREA * image.size:
             continue
         box = np.s_[top : top + height, left : left + width]
-        _fill_area(bridged[box], labels[box] == label, tolerance, None if walls is None else walls[box])
+        _fill_area(bridged[box], labels[box] == label, tolerance, walls[box])
     return bridged
 
 
@@ -62,7 +60,7 @@ def _uniform_mask(image: GrayImage) -> NDArray[np.bool_]:
     return np.asarray(slope < MAX_SLOPE)
 
 
-def _fill_area(depth: DepthArray, area: NDArray[np.bool_], tolerance: float, walls: NDArray[np.bool_] | None) -> None:
+def _fill_area(depth: DepthArray, area: NDArray[np.bool_], tolerance: float, walls: NDArray[np.bool_]) -> None:
     """Replace the depths of an area, in its bounding box, if they lie on a plane."""
     known = area & (depth > 0)
     if np.count_nonzero(known) < max(MIN_KNOWN * np.count_nonzero(area), CELL_PIXELS):
@@ -80,8 +78,7 @@ def _fill_area(depth: DepthArray, area: NDArray[np.bool_], tolerance: float, wal
     certain[row[on_plane], col[on_plane]] = True
     hull = cv2.convexHull(np.column_stack([col, row])[on_plane].astype(np.int32))
     cv2.fillConvexPoly(within, hull, 1)
-    fillable = enclosed_pixels(certain) if walls is None else walls | enclosed_pixels(certain)
-    row, col = np.nonzero(area & (within > 0) & fillable)
+    row, col = np.nonzero(area & (within > 0) & (walls | enclosed_pixels(certain)))
     depth[row, col] = 1.0 / (plane[0] + plane[1] * col + plane[2] * row)
 
 

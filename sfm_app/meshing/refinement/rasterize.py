@@ -35,11 +35,21 @@ def rasterize(vertices: FloatArray, faces: IndexArray, projection: FloatArray, s
         size: height and width in pixels.
     """
     nearness, face = np.zeros(size, np.float32), np.full(size, NOTHING, np.int32)
-    seen = np.empty((len(vertices), 3))
-    _project(vertices, projection, seen)
-    _draw(seen, faces, nearness, face)
+    _draw(project_vertices(vertices, projection), faces, nearness, face)
     with np.errstate(divide="ignore"):
         return Raster(np.float32(1.0) / nearness, face)
+
+
+def project_vertices(vertices: FloatArray, projection: FloatArray) -> FloatArray:
+    """Return the pixels x, y of vertices and 1 / depth (V, 3); -1 for the last where one is not in front of the photo.
+
+    Args:
+        vertices: (V, 3).
+        projection: (3, 4) K [R | t].
+    """
+    seen = np.empty((len(vertices), 3))
+    _project(vertices, projection, seen)
+    return seen
 
 
 @kernel

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.triangles import vertex_normals
+from sfm_app.geometry.unit_vectors import normalize
 from sfm_app.meshing.refinement.agreement import Pull, Sight, compare
 from sfm_app.meshing.refinement.fairness import Neighbors, find_displacements
 from sfm_app.meshing.refinement.photo_levels import RefinePhoto
-from sfm_app.meshing.refinement.rasterize import NOTHING, rasterize
+from sfm_app.meshing.refinement.rasterize import NOTHING, project_vertices, rasterize
 from sfm_app.meshing.refinement.sights import Sights
 from sfm_app.meshing.refinement.subdivide import sort_in_space, split_long_edges
 from sfm_app.types import Surface
@@ -23,6 +24,8 @@ Spread = Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]]
 LEVELS = ((0.5, 2), (1.0, 3))
 """Shares of the resolution of the photos, and iterations at each. Chosen on `ornament`, where three and two find less
 of the edges; on `garden`, which was left out, too."""
+STEPS = sum(iterations for _, iterations in LEVELS)
+"""Times that every photo is asked."""
 EDGE_PX = 8.0
 """Longest edge in the photo that shows it best, in pixels. Chosen on `ornament`: half as long ones cost twice as much
 and find nothing more."""
@@ -82,9 +85,9 @@ def finest_pixels(vertices: FloatArray, photos: Sequence[RefinePhoto], share: fl
     found = np.full(len(vertices), np.inf)
     for photo in photos:
         (height, width), P = photo.size_at(share), photo.projection(share)
-        x, y, z = (vertices @ P[:, :3].T + P[:, 3]).T
-        shown = (z > 0) & (x > 0) & (y > 0) & (x < width * z) & (y < height * z)
-        size = z / (photo.focal_px * width / photo.gray.shape[1])
+        x, y, near = project_vertices(vertices, P).T
+        shown = (near > 0) & (x > 0) & (y > 0) & (x < width) & (y < height)
+        size = 1.0 / (near * photo.focal_px * width / photo.gray.shape[1])
         found[shown] = np.minimum(found[shown], size[shown])
     return found
 
@@ -107,7 +110,7 @@ def _improve(
     photos, partners, share = seen
     vertices, faces = surface.vertices, surface.faces
     normals = vertex_normals(vertices, faces)
-    facing = _unit(normals[faces].mean(axis=1)).astype(np.float32)
+    facing = normalize(normals[faces].mean(axis=1)).astype(np.float32)
     sights = Sights(lambda k: look(surface, photos[k], share))
 
     def ask(k: int) -> Pull:
@@ -136,8 +139,3 @@ def look(surface: Surface, photo: RefinePhoto, share: float) -> Sight:
     if masked is not None:
         found.depth[masked], found.face[masked] = np.inf, NOTHING
     return Sight(photo.level(share), found)
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.asarray(vectors / np.maximum(length, np.finfo(np.float64).tiny))

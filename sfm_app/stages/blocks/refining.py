@@ -38,15 +38,13 @@ class Originals:
             max_side_px: longest side in pixels.
             spread: applies a function to photos, possibly in parallel.
         """
-        larger, known = LargerViews(self.model_dir, self.photo_dir, self.mask_dir, max_side_px), {}
-        poses = {view.name: view for view in views}
-        photos = larger.photos(list(poses))
+        larger = LargerViews(self.model_dir, self.photo_dir, self.mask_dir, views, max_side_px)
+        photos, poses, known = larger.photos, {view.name: view for view in views}, dict[str, RefinePhoto]()
 
         def look(number: int) -> list[tuple[str, RefinePhoto]]:
             return [
                 (name, RefinePhoto(K, poses[name].R, poses[name].t, gray, None if shown.all() else ~shown))
                 for name, K, gray, shown in larger.render(photos[number])
-                if name in poses
             ]
 
         for found in spread(look, range(len(photos))):

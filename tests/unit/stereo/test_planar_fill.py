@@ -11,6 +11,9 @@ WALL = 1 / (0.2 + 2e-4 * COL - 1e-4 * ROW)
 """Depth of a slanted wall."""
 
 
+NO_WALL = np.zeros((HEIGHT, WIDTH), bool)
+
+
 def paint(texture_from_col: int) -> np.ndarray:
     """A wall of one color, with a pattern beside it."""
     rng = np.random.default_rng(1)
@@ -30,7 +33,7 @@ def patches(truth: np.ndarray, share: float, noise: float, seed: int = 2) -> np.
 def test_a_plain_wall_is_found_between_what_is_known_of_it(share):
     depth = patches(WALL, share, noise=0.003)
 
-    found = fill_planar_areas(depth, paint(240), 0.01)
+    found = fill_planar_areas(depth, paint(240), 0.01, NO_WALL)
 
     wall = (COL > 20) & (COL < 220) & (ROW > 20) & (ROW < 220)
     assert np.mean(depth[wall] > 0) < share + 0.1
@@ -44,7 +47,7 @@ def test_a_plain_wall_is_found_between_what_is_known_of_it(share):
 def test_nothing_is_carried_beyond_what_is_known():
     depth = np.where(ROW > 120, patches(WALL, 0.5, 0.003), 0).astype(np.float32)
 
-    found = fill_planar_areas(depth, paint(WIDTH), 0.01)
+    found = fill_planar_areas(depth, paint(WIDTH), 0.01, NO_WALL)
 
     assert np.mean(found[130:230] > 0) > 0.9
     assert not found[:118].any()
@@ -62,13 +65,13 @@ def test_nothing_is_carried_beyond_what_is_known():
 def test_what_is_no_plane_stays_as_it_is(truth):
     depth = patches(truth, 0.4, 0.001)
 
-    np.testing.assert_array_equal(fill_planar_areas(depth, paint(WIDTH), 0.01), depth)
+    np.testing.assert_array_equal(fill_planar_areas(depth, paint(WIDTH), 0.01, NO_WALL), depth)
 
 
 def test_a_few_specks_make_no_wall():
     depth = patches(WALL, 0.04, 0.0)
 
-    np.testing.assert_array_equal(fill_planar_areas(depth, paint(WIDTH), 0.01), depth)
+    np.testing.assert_array_equal(fill_planar_areas(depth, paint(WIDTH), 0.01, NO_WALL), depth)
 
 
 def test_a_sky_beside_a_wall_of_its_color_is_not_filled_unless_it_is_known_to_be_a_wall():
@@ -76,8 +79,8 @@ def test_a_sky_beside_a_wall_of_its_color_is_not_filled_unless_it_is_known_to_be
     depth[:120, 200:] = 0  # what runs out of the photo above the wall, and to its right
     beyond = (COL > 215) & (ROW < 105) & (COL < 320 - 20) & (ROW > 20)
 
-    plain = fill_planar_areas(depth, paint(WIDTH), 0.01)
-    wall = fill_planar_areas(depth, paint(WIDTH), 0.01, walls=np.ones((HEIGHT, WIDTH), bool))
+    plain = fill_planar_areas(depth, paint(WIDTH), 0.01, NO_WALL)
+    wall = fill_planar_areas(depth, paint(WIDTH), 0.01, np.ones((HEIGHT, WIDTH), bool))
 
     assert np.mean(plain[beyond] > 0) < 0.02
     assert np.mean(plain[(ROW > 130) & (ROW < 220) & (COL > 20) & (COL < 300)] > 0) > 0.95
