@@ -19,7 +19,7 @@ from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import mesh
-from sfm_app.stages.blocks import fusion
+from sfm_app.stages.blocks import fusion, refining
 from sfm_app.stages.blocks import surface as blocks
 from sfm_app.stereo import DepthMap
 from sfm_app.synthetic.cameras import look_at
@@ -203,6 +203,18 @@ def test_refined_with_photos_that_show_nothing_a_ball_stays_a_ball(dense, tmp_pa
     assert np.percentile(np.abs(np.linalg.norm(found.vertices, axis=1) - 1), 95) < 0.015
     assert ("blocks" in counts) == (block_points == 8000) == ("refined_triangles" not in counts)
     np.testing.assert_array_equal(again.vertices, found.vertices)
+
+
+def test_a_refinement_that_fails_leaves_the_surface(dense, ball, tmp_path, monkeypatch):
+    def fail(*_):
+        raise ValueError("a singular matrix")
+
+    monkeypatch.setattr(refining, "refine", fail)
+
+    found, counts = made(copied(dense, tmp_path), max_image_size_px=1600)
+
+    assert counts["refinement_failed"] == "the computation failed: a singular matrix"
+    np.testing.assert_array_equal(found.vertices, ball[0].vertices)
 
 
 def marbled(view, radius):
