@@ -4,12 +4,21 @@ Kernels release the GIL, so pairs run in parallel threads, and their machine cod
 only the first run on a machine compiles.
 """
 
+import time
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+ASKED_FOR: dict[tuple[str, tuple[Any, ...]], None] = {}
+"""Full names of the kernels that this process has looked for, with the types of their arguments, in order."""
+POLL_S = 0.05
+"""Seconds between two looks for a kernel that another process compiles. Chosen by hand."""
+
+IsAwaited = Callable[[str, Any], bool]
+"""Says of the name of a kernel and the types of its arguments whether another process is about to compile it."""
 
 
 def kernel(function: Function) -> Function:
@@ -25,13 +34,28 @@ def summing_kernel(function: Function) -> Function:
     return _compile(function, fastmath={"reassoc", "nsz"})
 
 
+def wait_where(is_awaited: IsAwaited | None) -> None:
+    """Let kernels be waited for where another process is about to compile them.
+
+    Args:
+        is_awaited: asked again and again while a kernel is not in the cache; None for not waiting any more.
+    """
+    _Waiting.is_awaited = is_awaited
+
+
+class _Waiting:
+    is_awaited: IsAwaited | None = None
+
+
 def _compile(function: Function, *, fastmath: bool | set[str]) -> Function:
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": fastmath, "no_cfunc_wrapper": True}
     try:
         compiled: Function = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder for the cache is writable: compile in every process
         return cast(Function, numba.njit(**options)(function))
+    name = f"{function.__module__}.{function.__qualname__}"
     _forget_unreadable_cache(compiled)
+    _wait_for_others(name, compiled)
     return compiled
 
 
@@ -47,3 +71,18 @@ def _forget_unreadable_cache(compiled: Any) -> None:
             return {}
 
     cache_file._load_index = load_or_forget
+
+
+def _wait_for_others(name: str, compiled: Any) -> None:
+    """Let a kernel be read from the cache as soon as another process has compiled it."""
+    load = compiled._cache.load_overload
+
+    def load_or_wait(signature: Any, target: Any) -> Any:
+        ASKED_FOR[name, tuple(signature)] = None
+        found = load(signature, target)
+        while found is None and (ask := _Waiting.is_awaited) is not None and ask(name, signature):
+            time.sleep(POLL_S)
+            found = load(signature, target)
+        return found
+
+    compiled._cache.load_overload = load_or_wait

@@ -9,6 +9,7 @@ from sfm_app.camera_files import read_given_cameras
 from sfm_app.engine.execution import Pipeline
 from sfm_app.engine.stage import Products, Stage
 from sfm_app.photos import read_source
+from sfm_app.runtime.compiling import PARTS, compiling_ahead
 from sfm_app.runtime.context import CONTROL_POINTS, GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.scale import MetricFrame, read_control_points
@@ -133,4 +134,12 @@ def run_stages(
         run = replace(run, control_points=read_control_points(Path(run.settings.scale.control_points)))
     source = read_source(photo_dir, place.root, options, partial(ordered_map, run.executor, ahead=4 * run.workers))
     source.check_settings(run.settings)
-    return PIPELINE.run(source, run, first, last, wanted)
+    with compiling_ahead(_parts_to_compile(last, run), run.progress):
+        return PIPELINE.run(source, run, first, last, wanted)
+
+
+def _parts_to_compile(last: str, run: RunContext) -> Sequence[str]:
+    """Return the parts of the list of kernels that a run needs; none where its cameras are known already."""
+    if last == PHOTOS.name or run.workspace.manifest.record(VIEW_GRAPH.name) is not None:
+        return ()
+    return PARTS if not last or last in NAMES[NAMES.index(DEPTH_MAPS.name) :] else PARTS[:1]

@@ -38,13 +38,26 @@ def plane_normals(planes: PlaneArray, view: View) -> NDArray[np.float32]:
         planes: (H, W, 3) inverse depth and its slopes per pixel, from `fit_planes`.
         view: the photo.
     """
-    q, qu, qv = (planes[..., k].astype(np.float64) for k in range(3))
-    row, col = np.indices(q.shape) + view.sample_px
-    # n'K^-1 (u, v, 1) = q + qu (u - u0) + qv (v - v0) for all u, v
-    normals = np.stack([qu, qv, q - qu * col - qv * row], axis=-1) @ view.K
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    unit: NDArray[np.float64] = np.divide(-normals, length, out=np.zeros_like(normals), where=(q > 0)[..., None])
-    return np.asarray(unit, np.float32)
+    normals = np.zeros_like(planes)
+    _find_normals(planes, view.K, view.sample_px, normals)
+    return normals
+
+
+@kernel
+def _find_normals(planes: PlaneArray, K: FloatArray, sample: float, normals: NDArray[np.float32]) -> None:
+    for row in range(planes.shape[0]):
+        for col in range(planes.shape[1]):
+            a, b = float(planes[row, col, 1]), float(planes[row, col, 2])
+            q = float(planes[row, col, 0])
+            if q <= 0:
+                continue
+            # n'K^-1 (u, v, 1) = q + a (u - u0) + b (v - v0) for all u, v
+            c = q - a * (col + sample) - b * (row + sample)
+            x = a * K[0, 0] + b * K[1, 0] + c * K[2, 0]
+            y = a * K[0, 1] + b * K[1, 1] + c * K[2, 1]
+            z = a * K[0, 2] + b * K[1, 2] + c * K[2, 2]
+            length = np.sqrt(x * x + y * y + z * z)
+            normals[row, col, 0], normals[row, col, 1], normals[row, col, 2] = -x / length, -y / length, -z / length
 
 
 @kernel

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.jit import kernel
+from sfm_app.jit import kernel, summing_kernel
 from sfm_app.stereo.view import FloatArray, GrayImage, View
 
 PlaneArray = NDArray[np.float32]
@@ -22,6 +22,9 @@ STRIDE_PX = 2
 """The window has (2 REACH + 1)^2 pixels with this spacing."""
 SIDE = 2 * REACH + 1
 BORDER = REACH * STRIDE_PX
+STEPS = np.arange(-REACH, REACH + 1, dtype=np.float32) * STRIDE_PX
+ACROSS, DOWN = np.tile(STEPS, SIDE), np.repeat(STEPS, SIDE)
+"""Of each pixel of the window from its middle, row by row."""
 SIGMA_PX = 4.0
 FALLOFF_GRAY = 12.0
 """Difference in gray from the center pixel at which the weight is 1/e: the pixel may be of another object."""
@@ -29,6 +32,7 @@ NOISE_GRAY = 2.0
 """Standard deviation of gray levels without texture."""
 NO_MATCH = 2.0
 """The cost where no neighbor sees the pixel; no correlation costs more."""
+LOW = np.uint32(0xFF)
 MIN_GAIN = 0.01
 """Smallest decrease of the cost that replaces a plane; without it, noise would make flat areas rough."""
 STEP_PX = 0.3
@@ -62,21 +66,27 @@ def improve_planes(
         (H, W) cost in [0, 2]; 2 where unknown.
     """
     height, width = (max(photo.shape[side] for _, photo in others) for side in (0, 1))
-    stack = np.zeros((len(others), height, width), np.float32)
+    stack = np.zeros((len(others), height, width), np.uint32)
     projections, sizes = np.empty((len(others), 3, 4)), np.empty((len(others), 2), np.int64)
     K_inv = np.linalg.inv(view.K)
     for k, (other, photo) in enumerate(others):
-        stack[k, : photo.shape[0], : photo.shape[1]] = photo
+        stack[k, : photo.shape[0] - 1, : photo.shape[1] - 1] = pack_squares(photo)
         sizes[k] = photo.shape
         relative = other.R @ view.R.T
         projections[k] = other.K @ np.column_stack([relative @ K_inv, other.t - relative @ view.t])
-    steps = np.arange(-REACH, REACH + 1) * STRIDE_PX
-    near = np.exp(-0.5 * (steps[:, None] ** 2 + steps**2) / SIGMA_PX**2)
+    near = np.exp(-0.5 * (STEPS[:, None] ** 2 + STEPS**2) / SIGMA_PX**2)
     alike = np.exp(-np.arange(256) / FALLOFF_GRAY)
     cost = np.full(image.shape, NO_MATCH, np.float32)
     for sweep in range(sweeps):
         _sweep(sweep, image, (near, alike), (stack.ravel(), width, sizes, projections), planes, cost)
     return cost
+
+
+def pack_squares(image: GrayImage) -> NDArray[np.uint32]:
+    """Return (H - 1, W - 1) numbers of four bytes: a pixel, the one to its right, and the two below them."""
+    wide = image.astype(np.uint32)
+    packed = wide[:-1, :-1] | wide[:-1, 1:] << 8 | wide[1:, :-1] << 16 | wide[1:, 1:] << 24
+    return np.asarray(packed, np.uint32)
 
 
 @kernel
@@ -219,32 +229,27 @@ def _cost(row: int, col: int, plane: FloatArray, window: Any, others: Any, costs
     return total / used
 
 
-@kernel
-def _correlation(stack: NDArray[np.float32], start: int, stride: int, affine: Any, window: Any) -> float:
+@summing_kernel
+def _correlation(stack: NDArray[np.uint32], start: int, stride: int, affine: Any, window: Any) -> float:
     """Return the weighted normalized cross-correlation of a window and its image; both variances include noise."""
     weights, grays, mean, variance = window
     u, v = np.float32(affine[0]), np.float32(affine[1])
     uu, uv, vu, vv = np.float32(affine[2]), np.float32(affine[3]), np.float32(affine[4]), np.float32(affine[5])
-    one, square, mixed = np.float32(0), np.float32(0), np.float32(0)
-    k = 0
-    for i in range(SIDE):
-        b = np.float32((i - REACH) * STRIDE_PX)
-        for j in range(SIDE):
-            a = np.float32((j - REACH) * STRIDE_PX)
-            x, y = u + a * uu + b * uv, v + a * vu + b * vv
-            column, line = np.int32(x), np.int32(y)
-            fx, fy = x - np.float32(column), y - np.float32(line)
-            # unsigned indices need no test for negative values, which takes a third of the time
-            above = np.uint64(start + line * stride + column)
-            below = above + np.uint64(stride)
-            upper = stack[above] + fx * (stack[above + np.uint64(1)] - stack[above])
-            lower = stack[below] + fx * (stack[below + np.uint64(1)] - stack[below])
-            gray = upper + fy * (lower - upper)
-            weighted = weights[k] * gray
-            one += weighted
-            square += weighted * gray
-            mixed += weighted * grays[k]
-            k += 1
+    one, square, mixed, middle = np.float32(0), np.float32(0), np.float32(0), np.float32(mean)
+    for k in range(SIDE * SIDE):
+        x, y = u + ACROSS[k] * uu + DOWN[k] * uv, v + ACROSS[k] * vu + DOWN[k] * vv
+        column, line = np.int32(x), np.int32(y)
+        fx, fy = x - np.float32(column), y - np.float32(line)
+        # unsigned indices need no test for negative values
+        four = stack[np.uint64(start + line * stride + column)]
+        a, b = np.float32(four & LOW), np.float32((four >> np.uint32(8)) & LOW)
+        c, d = np.float32((four >> np.uint32(16)) & LOW), np.float32(four >> np.uint32(24))
+        upper, lower = a + fx * (b - a), c + fx * (d - c)
+        gray = upper + fy * (lower - upper) - middle  # small numbers keep their digits
+        weighted = weights[k] * gray
+        one += weighted
+        square += weighted * gray
+        mixed += weighted * grays[k]
     noise = NOISE_GRAY * NOISE_GRAY
     spread = (variance + noise) * (max(0.0, float(square - one * one)) + noise)
     return float((mixed - one * mean) / np.sqrt(spread))
