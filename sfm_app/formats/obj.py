@@ -6,9 +6,10 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.formats.checks import check, unit_normals
+from sfm_app.formats.checks import check
 from sfm_app.formats.frusta import append_cameras, scene_size
 from sfm_app.formats.pages import jpeg, pages_in_use
+from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Model, Texture
 
 DIGITS = 6

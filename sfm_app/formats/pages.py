@@ -1,4 +1,4 @@
-"""Texture pages as JPEG, and the vertices of their triangles."""
+"""Texture pages and normal maps as files, and the vertices of their triangles."""
 
 import io
 
@@ -9,6 +9,8 @@ IndexArray = NDArray[np.int64]
 
 JPEG_QUALITY = 90
 """Quality of texture pages on libjpeg's scale: lower values show blocks, higher ones make much larger files."""
+
+NORMAL_QUALITY, NORMAL_SUFFIX, NORMAL_TYPE = 92, "jpg", "image/jpeg"
 
 
 def jpeg(page: NDArray[np.uint8]) -> bytes:
@@ -24,19 +26,28 @@ def jpeg(page: NDArray[np.uint8]) -> bytes:
     return file.getvalue()
 
 
+def normal_picture(page: NDArray[np.uint8]) -> bytes:
+    """Return a normal map (H, W, 3) as a file, of the kind that `NORMAL_SUFFIX` names."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(page).save(file, "JPEG", quality=NORMAL_QUALITY, subsampling="4:4:4", optimize=True)
+    return file.getvalue()
+
+
 def split_corners(faces: IndexArray, uv: NDArray[np.float32]) -> tuple[IndexArray, NDArray[np.float32], IndexArray]:
     """Divide vertices on chart borders, so that each vertex has one texture coordinate.
 
     Args:
         faces: (T, 3) vertex indices.
-        uv: (T, 3, 2) texture coordinates of their corners.
+        uv: (T, 3, C) texture coordinates of their corners, and whatever else may differ there.
 
     Returns:
         For each of N new vertices, in the order of the old ones: the old vertex (N,) and the texture coordinates
-        (N, 2); and the faces (T, 3) of new vertices.
+        (N, C); and the faces (T, 3) of new vertices.
     """
-    at, place = faces.ravel(), np.ascontiguousarray(uv, np.float32).reshape(-1, 2)
-    order = np.lexsort((place[:, 1], place[:, 0], at))
+    at, place = faces.ravel(), np.ascontiguousarray(uv, np.float32).reshape(faces.size, -1)
+    order = np.lexsort((*place.T[::-1], at))
     first = np.ones(len(order), bool)
     first[1:] = (np.diff(at[order]) != 0) | (np.diff(place[order], axis=0) != 0).any(axis=1)
     new = np.empty(len(order), np.int64)
