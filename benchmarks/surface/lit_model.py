@@ -13,7 +13,7 @@ from PIL import Image
 
 FloatArray = NDArray[np.float64]
 
-KINDS = {5123: np.dtype("<u2"), 5125: np.dtype("<u4"), 5126: np.dtype("<f4")}
+KINDS: dict[int, np.dtype[Any]] = {5123: np.dtype("<u2"), 5125: np.dtype("<u4"), 5126: np.dtype("<f4")}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 TRIANGLES = 4
 """glTF's mode of a primitive that has none."""
@@ -118,7 +118,7 @@ def angles_deg(a: FloatArray, b: FloatArray) -> FloatArray:
 def _array(tree: dict[str, Any], buffer: bytes, number: int) -> NDArray[Any]:
     entry = tree["accessors"][number]
     view, kind, width = tree["bufferViews"][entry["bufferView"]], KINDS[entry["componentType"]], WIDTHS[entry["type"]]
-    values = np.frombuffer(buffer, kind, entry["count"] * width, view["byteOffset"])
+    values: NDArray[Any] = np.frombuffer(buffer, kind, entry["count"] * width, view["byteOffset"])
     return values.reshape(-1, width) if width > 1 else values
 
 

@@ -20,7 +20,7 @@ from sfm_app.formats.checks import check
 from sfm_app.formats.frusta import CAMERA_COLOR, camera_lines, center, frustum_depth
 from sfm_app.formats.gltf import Glb
 from sfm_app.formats.pages import NORMAL_TYPE, jpeg, normal_picture, pages_in_use, split_corners
-from sfm_app.geometry.tangents import corner_tangents
+from sfm_app.geometry.relief.tangents import corner_tangents
 from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Frustum, Model, Texture
 

@@ -93,7 +93,7 @@ def _mesh_at_once(
     if options.max_image_size_px:
         detailed = _refine(detailed, originals, views, run)
     if run.settings.texture.normal_map:
-        save_fine([FineShape.of(detailed)], run.workspace.fine_surface)
+        save_fine([FineShape.from_surface(detailed)], run.workspace.fine_surface)
     with run.step("simplifying"):
         return _check_nonempty(make_manifold(simplify_mesh(detailed, options, place)), "the surface has no extent")
 

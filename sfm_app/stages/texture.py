@@ -49,13 +49,18 @@ def make(scene: Scene, surface: Surface, run: RunContext) -> Model:
     store = FileStore(run.workspace.photos, parts, run.mask_dir)
     model, figures = texture_surface(surface, views, store, hidden, run.settings.texture, run.map)
     run.record(**figures)
-    if run.settings.texture.normal_map:
-        fine = load_arrays(run.workspace.fine_surface)
-        model, share = bake_normals(model, NearestNormals(fine["vertices"], fine["faces"]).find, run.map)
-        run.record(normal_map_share=round(share, 4))
+    model = _add_normal_map(model, run) if run.settings.texture.normal_map else model
     save_texture(model, run)
     shutil.rmtree(parts)
     return model
+
+
+def _add_normal_map(model: Model, run: RunContext) -> Model:
+    """Return the model with the detail of the fine surface, as the mesh stage has kept it."""
+    fine = load_arrays(run.workspace.fine_surface)
+    found, share = bake_normals(model, NearestNormals(fine["vertices"], fine["faces"]).find, run.map)
+    run.record(normal_map_share=round(share, 4))
+    return found
 
 
 class FileStore:

@@ -19,7 +19,7 @@ class Texture:
     pages: tuple[NDArray[np.uint8], ...]
     """(H, W, 3) RGB each."""
     normal_maps: tuple[NDArray[np.uint8], ...] = ()
-    """One (h, w, 3) per page, of its proportions: normals in the frames of `geometry.tangents`, stored as glTF does:
+    """One (h, w, 3) per page, of its proportions: normals in the frames of `geometry.relief`, stored as glTF does:
     0.5 + 0.5 n, linear, +y up; none where the surface has all its detail itself."""
 
 

@@ -22,7 +22,7 @@ class FineShape:
     """(T, 3) vertex indices, counter-clockwise seen from outside."""
 
     @classmethod
-    def of(cls, surface: Surface) -> "FineShape":
+    def from_surface(cls, surface: Surface) -> "FineShape":
         """Return the shape of a surface."""
         return cls(surface.vertices.astype(np.float32), surface.faces.astype(np.int32))
 

@@ -147,7 +147,7 @@ def mesh_in_blocks(
     run.record(blocks=len(tasks), planes=[list(plane) for plane in partition.planes()])
     run.record(cell=cell, raw_triangles=sum(raw), open_border_edges=lost)
     if run.settings.texture.normal_map:
-        save_fine(_own_parts(tasks, partition), run.workspace.fine_surface)
+        save_fine(_parts_without_halo(tasks, partition), run.workspace.fine_surface)
     shutil.rmtree(folder)
     return surface
 
@@ -168,17 +168,21 @@ def mesh_block(task: BlockTask) -> int:
         found = trim(found, support, task.options.max_gap_triangles, task.least)
     if len(found.faces) and task.options.max_image_size_px:
         found = refine_surface(found, task.originals, seers, task.partners, task.options).surface
-    if task.keeps_fine:
-        save_fine([FineShape.of(found)], task.fine_path)
-    if len(found.faces):
-        found = make_manifold(simplify_mesh(found, task.options, scratch))
+    found = _simplify_block(found, task, scratch)
     with replace_atomically(task.path) as path:
         np.savez(path, vertices=found.vertices, faces=found.faces, colors=found.colors, raw=len(raw.faces))
     shutil.rmtree(scratch)
     return len(raw.faces)
 
 
-def _own_parts(tasks: Sequence[BlockTask], partition: Partition) -> Iterator[FineShape]:
+def _simplify_block(found: Surface, task: BlockTask, scratch: Path) -> Surface:
+    """Return the surface of a block with few triangles, and keep it as it is where a normal map is made of it."""
+    if task.keeps_fine:
+        save_fine([FineShape.from_surface(found)], task.fine_path)
+    return make_manifold(simplify_mesh(found, task.options, scratch)) if len(found.faces) else found
+
+
+def _parts_without_halo(tasks: Sequence[BlockTask], partition: Partition) -> Iterator[FineShape]:
     """Yield the fine surface of each block without its halo, which the neighbors have, too, and better."""
     for task in tasks:
         fine = FineShape.load(task.fine_path)

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.tangents import corner_tangents
+from sfm_app.geometry.relief.tangents import corner_tangents
 from sfm_app.geometry.triangles import unit_normals
 from sfm_app.texture.facets import IntArray
 from sfm_app.texture.normal_map.texels import encode, texel_frames
@@ -39,18 +39,12 @@ def bake_normals(model: Model, find: FindNormals, spread: ParallelMap) -> tuple[
     texture = model.texture
     if texture is None:
         return model, 0.0
-    frames = corner_frames(model.surface, texture)
-    points, maps, own, whole = model.surface.vertices[model.surface.faces], list[NDArray[np.uint8]](), 0, 0
-    sizes = np.array([page.shape[1::-1] for page in texture.pages])
-    flat = are_squares(texture.uv * sizes[texture.page][:, None, :])
-    for number, (width, height) in enumerate(-(-sizes // SHRINK)):
-        triangles = np.flatnonzero((texture.page == number) & ~flat)
-        corners = texture.uv.astype(np.float64) * (width, height)
-        owner = owners((int(width), int(height)), triangles, corners)
+    points, frames = model.surface.vertices[model.surface.faces], corner_frames(model.surface, texture)
+    maps, own, whole = list[NDArray[np.uint8]](), 0, 0
+    for number in range(len(texture.pages)):
+        corners, owner = _page_owners(texture, number)
         work = partial(_bake_rows, owner=owner, corners=corners, points=points, frames=frames, find=find)
-        rows = max(1, BAND // int(width))
-        bands = [slice(top, top + rows) for top in range(0, int(height), rows)]
-        found = spread(work, bands, f"baking normals, page {number + 1} of {len(sizes)}")
+        found = spread(work, _bands(owner), f"baking normals, page {number + 1} of {len(texture.pages)}")
         maps.append(np.concatenate([texels for texels, _ in found]))
         own, whole = own + sum(count for _, count in found), whole + int(np.count_nonzero(owner >= 0))
     return replace(model, texture=replace(texture, normal_maps=tuple(maps))), own / max(whole, 1)
@@ -67,6 +61,21 @@ def corner_frames(surface: Surface, texture: Texture) -> FloatArray:
     tangents = corner_tangents(surface.vertices, normals, surface.faces, texture.uv, texture.page).astype(np.float64)
     along, up = tangents[..., :3], normals[surface.faces]
     return np.stack([along, tangents[..., 3:] * np.cross(up, along), up], axis=2)
+
+
+def _page_owners(texture: Texture, number: int) -> tuple[FloatArray, IntArray]:
+    """Return (T, 3, 2) corners in texels of a normal map, and (H, W) the triangle of each texel, -1 for none."""
+    height, width = texture.pages[number].shape[:2]
+    own = np.flatnonzero(texture.page == number)
+    drawn = own[~are_squares(texture.uv[own].astype(np.float64) * (width, height))]
+    size = -(-width // SHRINK), -(-height // SHRINK)
+    corners = texture.uv.astype(np.float64) * size
+    return corners, owners(size, drawn, corners)
+
+
+def _bands(owner: IntArray) -> list[slice]:
+    rows = max(1, BAND // owner.shape[1])
+    return [slice(top, top + rows) for top in range(0, len(owner), rows)]
 
 
 def _bake_rows(

@@ -25,42 +25,51 @@ def texel_frames(
     Args:
         owner: (h, W) triangle of each texel in some rows of a page, -1 for none.
         top: the first of these rows.
-        corners: (T, 3, 2) texels.
-        points: (T, 3, 3) corners in the scene.
-        frames: (T, 3, 3, 3) tangent, bitangent and normal at each corner.
+        corners, points: (T, 3, 2) texels, and (T, 3, 3) where they are in the scene.
+        frames: (T, 3, 3, 3) from `corner_frames`.
     """
-    count = np.count_nonzero(owner != NONE)
+    count, n, part = np.count_nonzero(owner != NONE), 0, np.empty(3)
     where, found = np.empty((count, 3), np.float32), np.empty((count, 3, 3))
-    n, part = 0, np.empty(3)
     for y in range(owner.shape[0]):
         for x in range(owner.shape[1]):
             f = owner[y, x]
             if f == NONE:
                 continue
-            ax, ay = corners[f, 0, 0], corners[f, 0, 1]
-            bx, by, cx, cy = corners[f, 1, 0] - ax, corners[f, 1, 1] - ay, corners[f, 2, 0] - ax, corners[f, 2, 1] - ay
-            turn, dx, dy = bx * cy - by * cx, x + 0.5 - ax, top + y + 0.5 - ay
-            part[1] = (dx * cy - dy * cx) / turn if turn != 0.0 else 0.0
-            part[2] = (bx * dy - by * dx) / turn if turn != 0.0 else 0.0
-            # margins of thin triangles must not be extrapolated far
-            part[1], part[2] = min(max(part[1], -1.0), 2.0), min(max(part[2], -1.0), 2.0)
-            part[0] = 1.0 - part[1] - part[2]
+            _set_shares(corners[f], x + 0.5, top + y + 0.5, part)
             for axis in range(3):
-                where[n, axis] = _mix(part, points[f, 0, axis], points[f, 1, axis], points[f, 2, axis])
-            for row in range(3):
-                length = 0.0
-                for axis in range(3):
-                    one = _mix(part, frames[f, 0, row, axis], frames[f, 1, row, axis], frames[f, 2, row, axis])
-                    found[n, row, axis] = one
-                    length += one * one
-                found[n, row] /= np.sqrt(length) if length > 0.0 else 1.0
+                where[n, axis] = _mix(part, points[f, :, axis])
+            _set_frame(part, frames[f], found[n])
             n += 1
     return where, found
 
 
 @kernel
-def _mix(part: FloatArray, a: float, b: float, c: float) -> float:
-    return part[0] * a + part[1] * b + part[2] * c
+def _set_frame(part: FloatArray, frames: FloatArray, found: FloatArray) -> None:
+    """Set the interpolated frame (3, 3), each of its vectors of length 1."""
+    for row in range(3):
+        length = 0.0
+        for axis in range(3):
+            found[row, axis] = _mix(part, frames[:, row, axis])
+            length += found[row, axis] ** 2
+        found[row] /= np.sqrt(length) if length > 0.0 else 1.0
+
+
+@kernel
+def _set_shares(corner: FloatArray, x: float, y: float, part: FloatArray) -> None:
+    """Set the barycentric coordinates of a texel, which may lie in the margin of its triangle."""
+    ax, ay = corner[0, 0], corner[0, 1]
+    bx, by, cx, cy = corner[1, 0] - ax, corner[1, 1] - ay, corner[2, 0] - ax, corner[2, 1] - ay
+    turn, dx, dy = bx * cy - by * cx, x - ax, y - ay
+    part[1] = (dx * cy - dy * cx) / turn if turn != 0.0 else 0.0
+    part[2] = (bx * dy - by * dx) / turn if turn != 0.0 else 0.0
+    # margins of thin triangles must not be extrapolated far
+    part[1], part[2] = min(max(part[1], -1.0), 2.0), min(max(part[2], -1.0), 2.0)
+    part[0] = 1.0 - part[1] - part[2]
+
+
+@kernel
+def _mix(part: FloatArray, values: FloatArray) -> float:
+    return float(part[0] * values[0] + part[1] * values[1] + part[2] * values[2])
 
 
 @kernel
@@ -103,7 +112,7 @@ def _solve(frame: FloatArray, normal: NDArray[np.float32], one: FloatArray) -> b
 
 
 @kernel
-def _span(a: FloatArray, b: FloatArray, c: FloatArray) -> float:
+def _span(a: NDArray[np.floating], b: NDArray[np.floating], c: NDArray[np.floating]) -> float:
     """Return the volume that three vectors span, positive where they are right-handed."""
     x, y, z = b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]
     return float(a[0] * x + a[1] * y + a[2] * z)

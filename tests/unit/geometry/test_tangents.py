@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.tangents import corner_angles, corner_tangents
+from sfm_app.geometry.relief.tangents import corner_angles, corner_tangents
 from sfm_app.geometry.triangles import vertex_normals
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -35,7 +35,7 @@ def test_a_mirrored_picture_has_its_right_on_the_left_and_still_its_up_on_top():
 
 
 def test_corners_share_a_tangent_where_they_share_vertex_place_and_page():
-    bent = SQUARE + [[0, 0, 0], [0, 0, 0.3], [0, 0, 0], [0, 0, -0.2]]
+    bent = np.column_stack([SQUARE[:, :2], [0, 0.3, 0, -0.2]])
     uv = pictured(SQUARE) * [1, 0.7] + np.array([[[0, 0]] * 3, [[0.1, 0], [0, 0.05], [0, 0]]])
     joined, parted = tangents(pictured(SQUARE), bent), tangents(uv, bent)
     on_pages = tangents(pictured(SQUARE), bent, np.array([0, 1], np.int32))

@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.unit_vectors import normalize
+
 FloatArray = NDArray[np.float64]
 
 DEGENERATE = 1e-6
@@ -18,25 +20,20 @@ def corner_tangents(
 ) -> NDArray[np.float32]:
     """Return tangents (T, 3, 4) of the corners of triangles: a unit vector, and the handedness, 1 or -1.
 
-    The tangent points to where the texture goes right. The bitangent, handedness times the cross product of normal and
-    tangent, points to where it goes up. A tangent is the mean over the triangles that share a vertex, its place on the
+    The tangent points right in the texture; the bitangent, handedness times the cross product of normal and tangent,
+    points up. A tangent is the mean over the triangles that share a vertex, its place on the
     page and the handedness, weighted by their angles there, and is at a right angle to the normal.
 
     Args:
-        vertices: (V, 3).
-        normals: (V, 3) unit vectors.
+        vertices, normals: (V, 3), the latter unit vectors.
         faces: (T, 3) vertex indices.
-        uv: (T, 3, 2) places of the corners on their page, from its top left.
-        page: (T,) page of each triangle.
+        uv, page: (T, 3, 2) places of the corners on their page, from its top left, and (T,) the page.
     """
-    corners, places = vertices[faces], uv.astype(np.float64)
-    along, handed = _face_tangents(corners, places)
+    corners = vertices[faces]
+    along, handed = _face_tangents(corners, uv.astype(np.float64))
     weighted = corner_angles(corners)[:, :, None] * along[:, None, :]
-    group = _shared_corners(faces, uv, page, handed)
-    size = int(group.max(initial=-1)) + 1
-    total = np.stack([np.bincount(group, weighted[..., axis].ravel(), size) for axis in range(3)], axis=1)
-    there = normals[faces].reshape(-1, 3)
-    found = _across(total[group], there).reshape(-1, 3, 3)
+    total = _group_sums(weighted.reshape(-1, 3), _shared_corners(faces, uv, page, handed))
+    found = _straighten(total, normals[faces].reshape(-1, 3)).reshape(-1, 3, 3)
     return np.concatenate([found, np.repeat(handed, 3).reshape(-1, 3, 1)], axis=2).astype(np.float32)
 
 
@@ -46,9 +43,16 @@ def corner_angles(corners: FloatArray) -> FloatArray:
     Args:
         corners: (T, 3, 3) their corners.
     """
-    ahead = _unit(np.roll(corners, -1, axis=1) - corners)
+    ahead = normalize(np.roll(corners, -1, axis=1) - corners)
     cosine = -(ahead * np.roll(ahead, 1, axis=1)).sum(axis=2)
     return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def _group_sums(values: FloatArray, group: NDArray[np.int64]) -> FloatArray:
+    """Return for each of N rows (N, 3) the sum over its group (N,)."""
+    size = int(group.max(initial=-1)) + 1
+    total = np.stack([np.bincount(group, column, size) for column in values.T], axis=1)
+    return np.asarray(total[group], np.float64)
 
 
 def _face_tangents(corners: FloatArray, places: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -58,7 +62,7 @@ def _face_tangents(corners: FloatArray, places: FloatArray) -> tuple[FloatArray,
     turn = ub * vc - uc * vb
     # v grows downward: triangles that are counter-clockwise from outside turn to the negative where nothing is mirrored
     handed = np.where(turn > 0, -1.0, 1.0)
-    return _unit(np.sign(turn)[:, None] * (vc[:, None] * b - vb[:, None] * c)), handed
+    return normalize(np.sign(turn)[:, None] * (vc[:, None] * b - vb[:, None] * c)), handed
 
 
 def _shared_corners(
@@ -76,7 +80,7 @@ def _shared_corners(
     return found
 
 
-def _across(tangents: FloatArray, normals: FloatArray) -> FloatArray:
+def _straighten(tangents: FloatArray, normals: FloatArray) -> FloatArray:
     """Return unit vectors (N, 3) at right angles to normals, as close to tangents as can be; any where those have none.
 
     Args:
@@ -88,10 +92,4 @@ def _across(tangents: FloatArray, normals: FloatArray) -> FloatArray:
     lost = length <= DEGENERATE * np.linalg.norm(tangents, axis=1)
     away = np.eye(3)[np.abs(normals[lost]).argmin(axis=1)]
     straight[lost] = away - (away * normals[lost]).sum(axis=1, keepdims=True) * normals[lost]
-    return _unit(straight)
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    """Return vectors of length 1 along the last axis; 0 where they have none."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0))
+    return normalize(straight)
