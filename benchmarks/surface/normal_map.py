@@ -44,7 +44,9 @@ SAME_PLACE = 0.01
 """Relative difference in depth within which a pixel shows the same place of both surfaces: that of depth maps."""
 LAMP = normalize([-1.0, -0.35, -0.45])
 """Direction to the lamp of the pictures, in the camera's frame: from the left, at a low angle."""
-AMBIENT, WHITE = 0.12, 235.0
+AMBIENT, WHITE, NOTHING = 0.12, 235.0, 255.0
+CROP = 0.3
+"""Share of a photo that pictures leave out on each side. Chosen by hand."""
 BARS: Mapping[str, Bar] = {"fountain-P11": upper_bound("mean deg", 8.0)}
 ABOUT = (
     "Runs with at most 50 000 triangles and a normal map; model.glb is read back. In the cameras of the photos, at "
@@ -118,11 +120,10 @@ def _select(hits: Mapping[str, NDArray[Any]], keep: NDArray[np.bool_]) -> dict[s
     return {name: values[keep] for name, values in hits.items()}
 
 
-def rays_of_photo(out: Path, name: str, step: int) -> tuple[FloatArray, FloatArray]:
-    """Return center (3,) and rays (h, w, 3) of a photo in the frame of the export, at every `step`-th pixel."""
+def rays_of_photo(out: Path, name: str) -> tuple[FloatArray, FloatArray]:
+    """Return center (3,) and rays (H, W, 3) of a photo in the frame of the export."""
     photo, frame = placed_photo(out, name), read_frame(Workspace(out)).from_model
-    rays = photo.rays[step // 2 :: step, step // 2 :: step]
-    return frame(photo.center[None])[0], rays @ frame.R.T
+    return frame(photo.center[None])[0], photo.rays @ frame.R.T
 
 
 def compare(pair: Pair, out: Path, names: Sequence[str]) -> Row:
@@ -130,8 +131,9 @@ def compare(pair: Pair, out: Path, names: Sequence[str]) -> Row:
     angles: dict[str, list[FloatArray]] = {"": [], "bare ": [], "MikkTSpace ": []}
     shown = elsewhere = 0
     for name in names:
-        center, rays = rays_of_photo(out, name, STEP)
-        light, fine = (cast_rays(scene, center, rays.reshape(-1, 3)) for scene in (pair.light, pair.fine))
+        center, rays = rays_of_photo(out, name)
+        some = rays[STEP // 2 :: STEP, STEP // 2 :: STEP].reshape(-1, 3)
+        light, fine = (cast_rays(scene, center, some) for scene in (pair.light, pair.fine))
         both = np.isfinite(light["t_hit"]) & np.isfinite(fine["t_hit"])
         light, fine = _select(light, both), _select(fine, both)
         same = np.abs(light["t_hit"] / fine["t_hit"] - 1.0) <= SAME_PLACE
@@ -152,8 +154,10 @@ def compare(pair: Pair, out: Path, names: Sequence[str]) -> Row:
 
 
 def shaded_page(pair: Pair, out: Path, name: str) -> NDArray[np.uint8]:
-    """Return pictures side by side under a low lamp: the bare light model, the one with its map, the fine surface."""
-    center, rays = rays_of_photo(out, name, 1)
+    """Return pictures one below the other under a low lamp: the bare light model, with its map, the fine surface."""
+    center, rays = rays_of_photo(out, name)
+    height, width = (int(CROP * size) for size in rays.shape[:2])
+    rays = rays[height : rays.shape[0] - height, width : rays.shape[1] - width]
     image = placed_photos(out)[name]
     frame = read_frame(Workspace(out)).from_model
     lamp = LAMP @ image.cam_from_world().matrix()[:, :3] @ frame.R.T
@@ -165,11 +169,11 @@ def shaded_page(pair: Pair, out: Path, name: str) -> NDArray[np.uint8]:
         (fine, pair.true_normals),
     ):
         there = np.isfinite(hits["t_hit"])
-        shade = np.full(len(there), WHITE + 20.0)
+        shade = np.full(len(there), NOTHING)
         facing = np.maximum(find(_select(hits, there)) @ lamp, 0.0)
         shade[there] = WHITE * (AMBIENT + (1.0 - AMBIENT) * facing)
         pictures.append(shade.reshape(rays.shape[:2]))
-    return np.repeat(np.concatenate(pictures, axis=1).astype(np.uint8)[..., None], 3, axis=2)
+    return np.repeat(np.concatenate(pictures).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def measure(name: str, cache: Path, args: argparse.Namespace) -> Row:

@@ -8,7 +8,8 @@ from sfm_app.meshing.open3d import load_open3d
 
 REACH_EDGES = 4.0
 """Distance from the fine surface, in median edges of it, beyond which it says nothing about a point. Chosen on
-fountain-P11 with 50 000 triangles (benchmarks/surface/normal_map.py)."""
+fountain-P11 with 50 000 triangles (benchmarks/surface/normal_map.py): 1 leaves out 0.4 % of the texels, 16 none that 4
+leaves out; the angles are the same."""
 
 
 class NearestNormals:
