@@ -21,19 +21,22 @@ def jpeg(page: NDArray[np.uint8]) -> bytes:
     JPEG's usual chroma subsampling smears colors across the borders of charts: on the page of a brick wall it costs
     3 dB. At equal file size, full resolution with lower quality is 1.5 dB closer to the page.
     """
-    from PIL import Image
-
-    file = io.BytesIO()
-    Image.fromarray(page).save(file, "JPEG", quality=JPEG_QUALITY, subsampling="4:4:4", optimize=True)
-    return file.getvalue()
+    try:
+        return _encode(page, JPEG_QUALITY, optimize=True)
+    except OSError:  # Pillow reserves a byte for each pixel; pages that are mostly noise take more
+        return _encode(page, JPEG_QUALITY, optimize=False)
 
 
 def normal_picture(page: NDArray[np.uint8]) -> bytes:
     """Return a normal map (H, W, 3) as a file, of the kind that `NORMAL_SUFFIX` names."""
+    return _encode(page, NORMAL_QUALITY, optimize=False)
+
+
+def _encode(page: NDArray[np.uint8], quality: int, *, optimize: bool) -> bytes:
     from PIL import Image
 
     file = io.BytesIO()
-    Image.fromarray(page).save(file, "JPEG", quality=NORMAL_QUALITY, subsampling="4:4:4")
+    Image.fromarray(page).save(file, "JPEG", quality=quality, subsampling="4:4:4", optimize=optimize)
     return file.getvalue()
 
 

@@ -270,3 +270,12 @@ def test_colors_of_neighboring_charts_stay_apart():
     back = np.asarray(Image.open(io.BytesIO(jpeg(page)))).astype(float)
 
     assert 0 < np.abs(back - page).mean() < 6
+
+
+def test_a_page_of_noise_is_written_too():
+    page = np.random.default_rng(0).integers(0, 255, (200, 300, 3), np.uint8)
+
+    data = jpeg(page)
+
+    assert len(data) > page.shape[0] * page.shape[1]  # more than Pillow expects
+    assert np.abs(np.asarray(Image.open(io.BytesIO(data))).astype(int) - page).mean() < 10
