@@ -21,8 +21,8 @@ def corner_tangents(
     """Return tangents (T, 3, 4) of the corners of triangles: a unit vector, and the handedness, 1 or -1.
 
     The tangent points right in the texture; the bitangent, handedness times the cross product of normal and tangent,
-    points up. A tangent is the mean over the triangles that share a vertex, its place on the
-    page and the handedness, weighted by their angles there, and is at a right angle to the normal.
+    points up. A tangent is the mean over the triangles that share a vertex, its place on the page and the handedness,
+    weighted by their angles there, at a right angle to the normal.
 
     Args:
         vertices, normals: (V, 3), the latter unit vectors.
