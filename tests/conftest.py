@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,17 @@ def textured_ball(ball) -> Model:
     uv = (0.5 + 0.45 * corners[:, :, [0, 2]]).astype(np.float32)
     pages = np.full((64, 64, 3), (200, 40, 30), np.uint8), np.full((32, 96, 3), (30, 60, 200), np.uint8)
     return Model(ball.surface, Texture(uv, page, pages))
+
+
+@pytest.fixture(scope="session")
+def lit_ball(textured_ball) -> Model:
+    """Give the textured ball a smooth normal map on each page, of half its size."""
+    maps = []
+    for page in textured_ball.texture.pages:
+        y, x = np.mgrid[: page.shape[0] // 2, : page.shape[1] // 2] / 8.0
+        normals = np.stack([0.3 * np.sin(x), 0.3 * np.cos(y), np.ones_like(x)], axis=2)
+        maps.append(np.round(127.5 + 127.5 * normals / np.linalg.norm(normals, axis=2, keepdims=True)).astype(np.uint8))
+    return replace(textured_ball, texture=replace(textured_ball.texture, normal_maps=tuple(maps)))
 
 
 @pytest.fixture(scope="session")

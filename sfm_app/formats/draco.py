@@ -5,15 +5,17 @@ cameras are written as they are: the extension is for triangles only.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.formats.checks import check, unit_normals
+from sfm_app.formats.checks import check
 from sfm_app.formats.glb import UNLIT, add_page_material, add_unlit_material, linear_colors, write_glb
 from sfm_app.formats.gltf import Glb
 from sfm_app.formats.pages import pages_in_use, split_corners
+from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Model, Texture
 
 DRACO = "KHR_draco_mesh_compression"
@@ -57,12 +59,13 @@ def write_draco(model: Model, name: str) -> Mapping[str, bytes]:
 
 def _textured_primitives(glb: Glb, model: Model, texture: Texture) -> list[dict[str, Any]]:
     surface, normals, primitives = model.surface, unit_normals(model.surface), []
+    texture = replace(texture, normal_maps=())
     for page in pages_in_use(texture.page):
         here = texture.page == page
         old, uv, faces = split_corners(surface.faces[here], texture.uv[here])
         arrays = {"normals": normals[old], "tex_coord": uv.astype(np.float64)}
         primitive = _compressed_primitive(glb, surface.vertices[old], faces, arrays)
-        primitives.append(primitive | {"material": add_page_material(glb, texture.pages[page], page)})
+        primitives.append(primitive | {"material": add_page_material(glb, texture, page)})
     return primitives
 
 

@@ -17,8 +17,8 @@ SCENE, CLOUD = "scene", "cloud"
 class WriteModel(Protocol):
     """Makes model files by name: first the one to open (`name` with the format's suffix), then those it refers to.
 
-    Takes a surface with a texture (pages of pictures), a surface with a color per vertex, or points and cameras; the
-    same model gives the same bytes. ReconstructionError where the model is empty.
+    Takes a surface with a texture (pages of pictures, perhaps with normal maps), a surface with a color per vertex, or
+    points and cameras; the same model gives the same bytes. ReconstructionError where the model is empty.
     """
 
     def __call__(self, model: Model, name: str, /) -> Mapping[str, bytes]: ...

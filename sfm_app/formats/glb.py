@@ -5,6 +5,9 @@ other paler. So the material is KHR_materials_unlit: three.js, Babylon.js, model
 original colors. Viewers without the extension show a rough, matte surface, lit by means of the normals, which also
 allow relighting. The extension is not listed as required, so no viewer has to refuse the file. Without a material,
 viewers would use glTF's default, which is metallic and looks black.
+
+Unlit materials ignore normal maps, so a model with one is lit: rough, without metal, with the frame of the map at each
+vertex.
 """
 
 from collections.abc import Mapping
@@ -13,10 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.formats.checks import check, unit_normals
+from sfm_app.formats.checks import check
 from sfm_app.formats.frusta import CAMERA_COLOR, camera_lines, center, frustum_depth
 from sfm_app.formats.gltf import Glb
-from sfm_app.formats.pages import jpeg, pages_in_use, split_corners
+from sfm_app.formats.pages import NORMAL_TYPE, jpeg, normal_picture, pages_in_use, split_corners
+from sfm_app.geometry.relief.tangents import corner_tangents
+from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Frustum, Model, Texture
 
 UNLIT = "KHR_materials_unlit"
@@ -41,7 +46,9 @@ def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
         ReconstructionError: the model is empty or not finite.
     """
     check(model)
-    glb = Glb(extensionsUsed=[UNLIT], scene=0)
+    is_textured = model.texture is not None and len(model.surface.faces)
+    is_lit = is_textured and model.texture.normal_maps  # type: ignore[union-attr]
+    glb = Glb(**({} if is_lit and not model.cameras else {"extensionsUsed": [UNLIT]}), scene=0)
     if model.texture is not None and len(model.surface.faces):
         primitives = add_textured_primitives(glb, model, model.texture)
     else:
@@ -63,31 +70,44 @@ def add_textured_primitives(glb: Glb, model: Model, texture: Texture) -> list[di
         texture: of the model.
     """
     surface, normals = model.surface, unit_normals(model.surface)
-    primitives = []
+    at_corners, primitives = texture.uv, []
+    if texture.normal_maps:
+        tangents = corner_tangents(surface.vertices, normals, surface.faces, texture.uv, texture.page)
+        at_corners = np.concatenate([texture.uv, tangents], axis=2)
     for page in pages_in_use(texture.page):
         here = texture.page == page
-        old, uv, faces = split_corners(surface.faces[here], texture.uv[here])
-        material = add_page_material(glb, texture.pages[page], page)
-        attributes = add_geometry(glb, surface.vertices[old], normals[old]) | {"TEXCOORD_0": glb.add_vertices(uv)}
+        old, values, faces = split_corners(surface.faces[here], at_corners[here])
+        material = add_page_material(glb, texture, page)
+        attributes = add_geometry(glb, surface.vertices[old], normals[old])
+        attributes["TEXCOORD_0"] = glb.add_vertices(values[:, :2])
+        if texture.normal_maps:
+            attributes["TANGENT"] = glb.add_vertices(values[:, 2:])
         primitives.append({"attributes": attributes, "indices": glb.add_indices(faces, len(old)), "material": material})
     return primitives
 
 
-def add_page_material(glb: Glb, picture: NDArray[np.uint8], page: int) -> int:
-    """Add a page of texture and its material, and return the material's number.
+def add_page_material(glb: Glb, texture: Texture, page: int) -> int:
+    """Add a page of texture, its normal map if it has one, and its material, and return the material's number.
 
     Args:
         glb: the file; its first page adds the sampler that all share.
-        picture: (H, W, 3) RGB.
+        texture: has the page.
         page: its number.
     """
     if not glb.tree.get("samplers"):
         glb.add("samplers", {"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED})
-    image = glb.add(
-        "images", {"name": f"page {page}", "mimeType": "image/jpeg", "bufferView": glb.add_view(jpeg(picture))}
-    )
-    number = glb.add("textures", {"sampler": 0, "source": image})
-    return add_unlit_material(glb, f"page {page}", baseColorTexture={"index": number})
+    name = f"page {page}"
+    color = {"index": _add_picture(glb, name, "image/jpeg", jpeg(texture.pages[page]))}
+    if not texture.normal_maps:
+        return add_unlit_material(glb, name, baseColorTexture=color)
+    relief = _add_picture(glb, f"normals {page}", NORMAL_TYPE, normal_picture(texture.normal_maps[page]))
+    return glb.add("materials", _matte_material(name, baseColorTexture=color) | {"normalTexture": {"index": relief}})
+
+
+def _add_picture(glb: Glb, name: str, kind: str, data: bytes) -> int:
+    """Add an image and its texture, and return the number of the texture."""
+    image = glb.add("images", {"name": name, "mimeType": kind, "bufferView": glb.add_view(data)})
+    return glb.add("textures", {"sampler": 0, "source": image})
 
 
 def add_colored_primitive(glb: Glb, model: Model) -> dict[str, Any]:
@@ -130,15 +150,12 @@ def add_unlit_material(glb: Glb, name: str, **base: Any) -> int:
         name: of the material.
         **base: color or texture, as in glTF's pbrMetallicRoughness.
     """
-    return glb.add(
-        "materials",
-        {
-            "name": name,
-            "doubleSided": True,
-            "pbrMetallicRoughness": {**base, "metallicFactor": 0.0, "roughnessFactor": 1.0},
-            "extensions": {UNLIT: {}},
-        },
-    )
+    return glb.add("materials", _matte_material(name, **base) | {"extensions": {UNLIT: {}}})
+
+
+def _matte_material(name: str, **base: Any) -> dict[str, Any]:
+    rough = {**base, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    return {"name": name, "doubleSided": True, "pbrMetallicRoughness": rough}
 
 
 def linear_colors(colors: NDArray[np.uint8]) -> NDArray[np.float32]:

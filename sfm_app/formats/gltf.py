@@ -11,7 +11,7 @@ MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 VERTICES, INDICES = 34962, 34963
 """Types of buffer views, by their OpenGL constants."""
 COMPONENTS = {np.dtype(np.uint16): 5123, np.dtype(np.uint32): 5125, np.dtype(np.float32): 5126}
-SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
+SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 RESTART = 0xFFFF
 """The largest 16-bit number cannot be an index: OpenGL reserves it as the primitive-restart index."""
 
@@ -47,7 +47,7 @@ class Glb:
         """Add a vertex attribute and return the accessor's number.
 
         Args:
-            values: (N, 2) or (N, 3), one row per vertex.
+            values: (N, 2), (N, 3) or (N, 4), one row per vertex.
             bounds: whether to include the lowest and highest values, which glTF requires for positions.
         """
         entry = self._accessor(values, VERTICES)

@@ -6,9 +6,10 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.formats.checks import check, unit_normals
+from sfm_app.formats.checks import check
 from sfm_app.formats.frusta import append_cameras, scene_size
-from sfm_app.formats.pages import jpeg, pages_in_use
+from sfm_app.formats.pages import NORMAL_SUFFIX, jpeg, normal_picture, pages_in_use
+from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Model, Texture
 
 DIGITS = 6
@@ -20,8 +21,8 @@ KEY_BASE = 10 ** (DIGITS + 1)
 CHUNK = 50_000
 """Rows formatted at once; Python numbers take several times the memory of their text."""
 
-MATERIAL = "newmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 0\n"
-"""`illum 0` shows the colors unlit: photos already contain the lighting."""
+MATERIAL = "newmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum {light}\n"
+"""`illum 0` shows the colors unlit: photos already contain the lighting; 1, with normal maps, lights them."""
 
 
 def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
@@ -32,7 +33,7 @@ def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
         name: of the files, without suffix.
 
     Returns:
-        The OBJ; if the model has a texture, also the MTL and a JPEG per page.
+        The OBJ; if the model has a texture, also the MTL, a JPEG per page, and its normal map, if any.
 
     Raises:
         ReconstructionError: the model is empty or not finite.
@@ -50,10 +51,18 @@ def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
         used = pages_in_use(texture.page)
         pages = {page: f"{beside}_{page}.jpg" for page in used}
         text += [f"mtllib {beside}.mtl\n", *_textured_lines(model, texture, used)]
-        materials = (MATERIAL.format(name=f"page_{page}") + f"map_Kd {file}\n" for page, file in pages.items())
+        maps = {page: f"{beside}_{page}_normals.{NORMAL_SUFFIX}" for page in used if texture.normal_maps}
+        materials = (_material(page, file, maps.get(page, "")) for page, file in pages.items())
         files[f"{beside}.mtl"] = "\n".join(materials).encode()
         files |= {file: jpeg(texture.pages[page]) for page, file in pages.items()}
+        files |= {file: normal_picture(texture.normal_maps[page]) for page, file in maps.items()}
     return {f"{name}.obj": "".join(text).encode(), **files}
+
+
+def _material(page: int, picture: str, normal_map: str) -> str:
+    """Return the material of a page; `norm` is the name that readers have for normal maps (others are heights)."""
+    text = MATERIAL.format(name=f"page_{page}", light=1 if normal_map else 0) + f"map_Kd {picture}\n"
+    return text + (f"norm {normal_map}\n" if normal_map else "")
 
 
 def _vertex_lines(model: Model, *, with_colors: bool) -> Iterator[str]:

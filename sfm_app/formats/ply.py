@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.formats.checks import check, unit_normals
+from sfm_app.formats.checks import check
 from sfm_app.formats.frusta import camera_dots
+from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Model
 
 PLY_NAMES = {"f": "float", "u": "uchar"}

@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.formats.checks import check, unit_normals
+from sfm_app.formats.checks import check
 from sfm_app.formats.frusta import center, frustum_depth
 from sfm_app.formats.glb import FLIP, linear_colors
-from sfm_app.formats.pages import jpeg, pages_in_use
+from sfm_app.formats.pages import NORMAL_SUFFIX, jpeg, normal_picture, pages_in_use
+from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Frustum, Model, Surface, Texture
 
 if TYPE_CHECKING:
@@ -45,15 +46,14 @@ def write_usd(model: Model, name: str) -> Mapping[str, bytes]:
         name: of the files, without suffix.
 
     Returns:
-        The stage in USD's binary form, and a JPEG per page of texture.
+        The stage in USD's binary form, a JPEG per page of texture, and its normal map, if any.
 
     Raises:
         ReconstructionError: the model is empty or not finite.
     """
     check(model)
     pages = page_files(model, name)
-    pictures = {file: jpeg(model.texture.pages[page]) for page, file in pages.items() if model.texture is not None}
-    return {f"{name}.usd": stage_bytes(model, pages), **pictures}
+    return {f"{name}.usd": stage_bytes(model, pages), **_pictures(model, pages)}
 
 
 def write_usdz(model: Model, name: str) -> Mapping[str, bytes]:
@@ -85,6 +85,19 @@ def page_files(model: Model, name: str) -> dict[int, str]:
         return {}
     beside = re.sub(r"\s", "_", name)
     return {page: f"{beside}_{page}.jpg" for page in pages_in_use(model.texture.page)}
+
+
+def normal_file(picture: str) -> str:
+    """Return the file of the normal map that belongs to a page of texture."""
+    return f"{Path(picture).stem}_normals.{NORMAL_SUFFIX}"
+
+
+def _pictures(model: Model, pages: Mapping[int, str]) -> dict[str, bytes]:
+    if model.texture is None:
+        return {}
+    found = {file: jpeg(model.texture.pages[page]) for page, file in pages.items()}
+    maps = model.texture.normal_maps
+    return found | {normal_file(file): normal_picture(maps[page]) for page, file in pages.items() if maps}
 
 
 def pack(files: Mapping[str, bytes]) -> bytes:
@@ -168,6 +181,8 @@ def add_texture(stage: "Usd.Stage", mesh: "UsdGeom.Mesh", texture: Texture, page
     coordinates.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(places, np.float32)))
     for page, file in pages.items():
         material = _page_material(stage, f"{ROOT}/materials/page_{page}", file)
+        if texture.normal_maps:
+            _add_normal_map(material, normal_file(file))
         faces = Vt.IntArray.FromNumpy(np.flatnonzero(texture.page == page).astype(np.int32))
         part = UsdGeom.Subset.CreateGeomSubset(mesh, f"page_{page}", UsdGeom.Tokens.face, faces, "materialBind")
         UsdShade.MaterialBindingAPI.Apply(part.GetPrim()).Bind(material)
@@ -200,6 +215,24 @@ def _page_material(stage: "Usd.Stage", path: str, file: str) -> "UsdShade.Materi
     surface.CreateInput("diffuseColor", types.Color3f).ConnectToSource(color)
     material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
     return material
+
+
+def _add_normal_map(material: "UsdShade.Material", file: str) -> None:  # type: ignore[name-defined]  # noqa: F821
+    """Add a normal map to a material from `_page_material`; its texels count from 0 to 1, normals from -1 to 1."""
+    from pxr import Gf, Sdf, UsdShade
+
+    types, stage, path = Sdf.ValueTypeNames, material.GetPrim().GetStage(), material.GetPath()
+    reader, surface = (UsdShade.Shader.Get(stage, path.AppendChild(part)) for part in ("coordinates", "surface"))
+    picture = UsdShade.Shader.Define(stage, path.AppendChild("normals"))
+    picture.CreateIdAttr("UsdUVTexture")
+    picture.CreateInput("file", types.Asset).Set(Sdf.AssetPath(f"./{file}"))
+    picture.CreateInput("sourceColorSpace", types.Token).Set("raw")
+    picture.CreateInput("scale", types.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
+    picture.CreateInput("bias", types.Float4).Set(Gf.Vec4f(-1, -1, -1, 0))
+    for wrap in ("wrapS", "wrapT"):
+        picture.CreateInput(wrap, types.Token).Set("clamp")
+    picture.CreateInput("st", types.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
+    surface.CreateInput("normal", types.Normal3f).ConnectToSource(picture.CreateOutput("rgb", types.Float3))
 
 
 def add_points(stage: "Usd.Stage", model: Model) -> None:

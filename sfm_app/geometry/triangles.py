@@ -24,6 +24,16 @@ def vertex_normals(vertices: FloatArray, faces: IndexArray) -> FloatArray:
     return np.asarray(np.divide(total, length, out=np.zeros_like(total), where=length > 0))
 
 
+def unit_normals(surface: Surface) -> FloatArray:
+    """Return (V, 3) unit normals; (0, 1, 0) where triangles without area do not define one.
+
+    glTF requires unit normals.
+    """
+    normals = vertex_normals(surface.vertices, surface.faces)
+    normals[np.linalg.norm(normals, axis=1) < 0.5] = (0.0, 1.0, 0.0)
+    return normals
+
+
 def unique_edges(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
     """Return every edge once, (E, 2) with the lower vertex first, and (T, 3) their numbers per triangle: ab, bc, ca."""
     ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)

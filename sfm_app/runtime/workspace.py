@@ -25,6 +25,7 @@ LOG, PARTS, FEATURES, MAPPING = "log.txt", "view_graph_parts", "feature_parts", 
 EARLIER, PARCELS, SIFT_ROWS = ".earlier", ".cluster", ".sift_rows"
 LINK_CHECKED = (*OUTPUT_NAMES, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING, EARLIER, PARCELS, SIFT_ROWS)
 """Names that a run writes to without replacing them: a link there would lead it out of the folder."""
+FINE = "fine.npz"
 PHOTO_SET, PHOTO_STATS, VIEW_GRAPH = "photos.json", ".photo_stats.npz", "view_graph.npz"
 
 
@@ -109,6 +110,11 @@ class Workspace:
     def surface(self) -> Path:
         """Fused points, and the surface through them."""
         return self.root / "surface"
+
+    @property
+    def fine_surface(self) -> Path:
+        """The surface before it was simplified, where a normal map is made of it."""
+        return self.surface / FINE
 
     @property
     def texture(self) -> Path:

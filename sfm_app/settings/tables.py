@@ -234,6 +234,11 @@ class TextureSettings(Section):
     unseen_faces: Literal["color", "cut"] = Field(
         "color", description="triangles that no photo sees: color: painted like what is around them; cut: left out"
     )
+    normal_map: bool = Field(
+        False,
+        description="keep the detail that simplification takes away as a normal map, which shows under light; false: "
+        "none, shown unlit",
+    )
 
 
 class ClusterSettings(Section):

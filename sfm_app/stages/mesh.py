@@ -19,6 +19,7 @@ from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_count
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.runtime.workspace import Workspace
+from sfm_app.stages.blocks.fine import FineShape, save_fine
 from sfm_app.stages.blocks.fusion import fuse_maps
 from sfm_app.stages.blocks.judging import SurfaceJudge, judge_view, simplify_mesh
 from sfm_app.stages.blocks.refining import Originals, rank_partners, refine_surface
@@ -53,6 +54,7 @@ def make(scene: Scene, dense_dir: Path, run: RunContext) -> Surface:
     """
     place, options = run.workspace.surface, run.settings.mesh
     place.mkdir(exist_ok=True)
+    run.workspace.fine_surface.unlink(missing_ok=True)
     views = [view for view in read_views(dense_dir) if map_file(dense_dir, view).exists()]
     points = _fused_points(dense_dir, views, run)
     originals = Originals(scene.model_dir, run.workspace.photos, run.mask_dir)
@@ -90,6 +92,8 @@ def _mesh_at_once(
     run.record(poisson_depth=depth, raw_triangles=len(raw.faces), detailed_triangles=len(detailed.faces))
     if options.max_image_size_px:
         detailed = _refine(detailed, originals, views, run)
+    if run.settings.texture.normal_map:
+        save_fine([FineShape.from_surface(detailed)], run.workspace.fine_surface)
     with run.step("simplifying"):
         return _check_nonempty(make_manifold(simplify_mesh(detailed, options, place)), "the surface has no extent")
 
@@ -133,8 +137,9 @@ def load(run: RunContext) -> Surface:
 
 
 def digest(place: Workspace) -> str:
-    """Return a hash of the surface."""
-    return digest_files(place.surface, SURFACE)
+    """Return a hash of the surface, and of the fine one where it is kept."""
+    fine = place.fine_surface
+    return digest_files(place.surface, SURFACE, *([fine.name] if fine.exists() else []))
 
 
 def _fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray[np.void]:

@@ -12,17 +12,20 @@ from PIL import Image
 
 from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.hashing import digest_files, fingerprint, load_arrays
+from sfm_app.meshing.nearest import NearestNormals
 from sfm_app.meshing.occlusion import Occluders
 from sfm_app.photos import fill_masked, read_mask
 from sfm_app.photos.panoramas.painted_parts import mask_part, panorama_parts, show_part
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
-from sfm_app.texture import PhotoView, part_view, photo_view, texture_surface
+from sfm_app.texture import PhotoView, bake_normals, part_view, photo_view, texture_surface
 from sfm_app.types import Model, Scene, Surface, Texture
 
 TEXTURE = "texture.npz"
 PANORAMA = "EQUIRECTANGULAR"
 """COLMAP's name of the camera model of panoramas."""
+NORMALS = "normals"
+"""Name of a normal map in the file, before its page."""
 PARTS = "parts"
 """Folder beside it while the texture is made: the finished work on each photo."""
 
@@ -46,9 +49,18 @@ def make(scene: Scene, surface: Surface, run: RunContext) -> Model:
     store = FileStore(run.workspace.photos, parts, run.mask_dir)
     model, figures = texture_surface(surface, views, store, hidden, run.settings.texture, run.map)
     run.record(**figures)
+    model = _add_normal_map(model, run) if run.settings.texture.normal_map else model
     save_texture(model, run)
     shutil.rmtree(parts)
     return model
+
+
+def _add_normal_map(model: Model, run: RunContext) -> Model:
+    """Return the model with the detail of the fine surface, as the mesh stage has kept it."""
+    fine = load_arrays(run.workspace.fine_surface)
+    found, share = bake_normals(model, NearestNormals(fine["vertices"], fine["faces"]).find, run.map)
+    run.record(normal_map_share=round(share, 4))
+    return found
 
 
 class FileStore:
@@ -142,6 +154,7 @@ def save_texture(model: Model, run: RunContext) -> None:
     if texture is not None:
         stored |= {"uv": texture.uv, "page": texture.page}
         stored |= {f"page{number}": page for number, page in enumerate(texture.pages)}
+        stored |= {f"{NORMALS}{number}": page for number, page in enumerate(texture.normal_maps)}
     with replace_atomically(run.workspace.texture / TEXTURE) as path:
         np.savez(path, **stored)
 
@@ -162,5 +175,8 @@ def read_texture(place: Workspace) -> Model:
     surface = Surface(stored["vertices"], stored["faces"], stored["colors"])
     if "uv" not in stored:
         return Model(surface)
-    pages = tuple(stored[f"page{number}"] for number in range(sum(name[4:].isdigit() for name in stored)))
-    return Model(surface, Texture(stored["uv"], stored["page"], pages))
+    pages, normals = (
+        tuple(stored[f"{kind}{number}"] for number in range(sum(f"{kind}{k}" in stored for k in range(len(stored)))))
+        for kind in ("page", NORMALS)
+    )
+    return Model(surface, Texture(stored["uv"], stored["page"], pages, normals))

@@ -2,8 +2,18 @@
 
 from sfm_app.texture.appearance.view_scoring import OcclusionTest
 from sfm_app.texture.assemble import texture_surface
+from sfm_app.texture.normal_map.bake import bake_normals
 from sfm_app.texture.page_painting import ParallelMap
 from sfm_app.texture.store import Store
 from sfm_app.texture.views import PhotoView, part_view, photo_view
 
-__all__ = ["OcclusionTest", "ParallelMap", "PhotoView", "Store", "part_view", "photo_view", "texture_surface"]
+__all__ = [
+    "OcclusionTest",
+    "ParallelMap",
+    "PhotoView",
+    "Store",
+    "bake_normals",
+    "part_view",
+    "photo_view",
+    "texture_surface",
+]

@@ -21,7 +21,7 @@ from sfm_app.texture.page_painting import CheckedViews, ParallelMap, TexturePlan
 from sfm_app.texture.painting import fill_background
 from sfm_app.texture.seam_leveling import level_seams
 from sfm_app.texture.store import Store
-from sfm_app.texture.unseen_faces import square_texels, vertex_colors
+from sfm_app.texture.unseen_faces import SQUARE_CORNERS, square_texels, vertex_colors
 from sfm_app.texture.view_selection import choose_photos
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import Model, Rejected, Surface, Texture
@@ -149,7 +149,7 @@ def _finish(plan: TexturePlan, finished: Sequence[tuple[NDArray[np.uint8], NDArr
                 here = number == k
                 page[y[here] + dy, x[here] + dx] = texels[here, dy, dx]
                 painted[k][y[here] + dy, x[here] + dx] = True
-    corners[~drawn] = np.stack([x, y], axis=1)[:, None, :] + np.array([[0.5, 0.5], [1.5, 0.5], [0.5, 1.5]])
+    corners[~drawn] = np.stack([x, y], axis=1)[:, None, :] + SQUARE_CORNERS
     sizes = np.array(plan.layout.sizes, np.float64)
     uv = (corners / sizes[plan.page][:, None, :]).astype(np.float32)
     surface = Surface(plan.mesh.vertices, plan.mesh.faces, np.round(colors).astype(np.uint8))

@@ -42,11 +42,22 @@ def canvas(size: tuple[int, int], triangles: NDArray[np.int64], corners: FloatAr
         triangles: (N,) indices of the page's triangles.
         corners: (T, 3, 2) texels.
     """
+    return Canvas(owners(size, triangles, corners), np.zeros((size[1], size[0], 3), np.int32))
+
+
+def owners(size: tuple[int, int], triangles: NDArray[np.int64], corners: FloatArray) -> IntArray:
+    """Return (H, W) the triangle that each texel belongs to, -1 for none.
+
+    Args:
+        size: (width, height) of the page.
+        triangles: (N,) indices of the page's triangles.
+        corners: (T, 3, 2) texels.
+    """
     owner = np.full((size[1], size[0]), NONE, np.int32)
     _claim_texels(triangles, corners, 0.0, owner)
     for margin in range(1, MARGIN + 1):
         _claim_texels(triangles, corners, margin - 0.5, owner)
-    return Canvas(owner, np.zeros((size[1], size[0], 3), np.int32))
+    return owner
 
 
 @kernel

@@ -12,6 +12,10 @@ CELL = 2
 """Side of the square of an unseen triangle, in texels; bilinear interpolation inside it is exact."""
 BLOCK = 64
 """Largest number of squares along a side of a block."""
+SQUARE_CORNERS = np.array([[0.5, 0.5], [1.5, 0.5], [0.5, 1.5]])
+"""Corners of a triangle in its square, on the centers of texels."""
+ROUNDING = 5e-3
+"""Texels that a corner may be off: single precision on the largest page gives a thousandth. Chosen by hand."""
 PRIOR_WEIGHT = 1e-4
 """Weight of the previous color of an unseen vertex, relative to 1 per neighbor, for parts that no photo sees."""
 
@@ -75,6 +79,16 @@ def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int)
         row, column = np.divmod(np.arange(count), width // CELL)
         found.append(np.column_stack([np.full(count, page), left + CELL * column, top + CELL * row]))
     return np.concatenate(found).astype(np.int64) if found else np.empty((0, 3), np.int64)
+
+
+def are_squares(corners: FloatArray) -> NDArray[np.bool_]:
+    """Return (T,) which triangles are those of squares, by their corners.
+
+    Args:
+        corners: (T, 3, 2) texels, off by single precision.
+    """
+    first = np.floor(corners[:, :1])
+    return np.asarray((np.abs(corners - first - SQUARE_CORNERS) < ROUNDING).all(axis=(1, 2)))
 
 
 def square_texels(corner_colors: FloatArray) -> NDArray[np.uint8]:

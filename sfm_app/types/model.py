@@ -18,6 +18,9 @@ class Texture:
     """(T,) page of each triangle."""
     pages: tuple[NDArray[np.uint8], ...]
     """(H, W, 3) RGB each."""
+    normal_maps: tuple[NDArray[np.uint8], ...] = ()
+    """One (h, w, 3) per page, of its proportions: normals in the frames of `geometry.relief`, stored as glTF does:
+    0.5 + 0.5 n, linear, +y up; none where the surface has all its detail itself."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,8 +22,8 @@ from sfm_app.colmap.dense import DenseStore
 from sfm_app.formats import EXPORTERS, SCENE_EXPORTERS
 from sfm_app.pipeline import NAMES
 from sfm_app.runtime.workspace import LOCK, Workspace
-from sfm_app.settings import Settings
-from sfm_app.stages.texture import PARTS, FileStore
+from sfm_app.settings import Settings, merge_nested
+from sfm_app.stages.texture import PARTS, FileStore, read_texture
 from sfm_app.synthetic.cameras import camera_center
 from sfm_app.synthetic.compare import center_error_percent, focal_error_percent, surface_error
 from sfm_app.texture import atlas
@@ -64,6 +64,25 @@ def test_mesh_lies_on_the_true_surface(finished):
 
     assert len(mesh.faces) > 5000
     assert error < 0.01
+
+
+def test_a_normal_map_is_made_from_the_mesh_on_and_leaves_nothing_behind(finished, rendered, tmp_path):
+    out, place = tmp_path / "out", Workspace(tmp_path / "out")
+    shutil.copytree(finished[0].out, out, symlinks=True)
+    plain, before = (out / "model.glb").read_bytes(), place.manifest.read()["stages"]
+    lit = Settings.from_mapping(merge_nested(DRAFT.model_dump(), {"texture": {"normal_map": True}}))
+
+    run = sfm_app.reconstruct(rendered[0], out, lit)
+    mapped, after = run.mesh_path.read_bytes(), place.manifest.read()["stages"]
+
+    assert {name for name in NAMES if after[name] != before[name]} == {"mesh", "texture", "files"}
+    assert b'"TANGENT"' in mapped and b'"normalTexture"' in mapped and b"KHR_materials_unlit" not in mapped
+    assert after["texture"]["counts"]["normal_map_share"] > 0.9
+    (relief,) = read_texture(place).texture.normal_maps
+    assert np.abs(relief.reshape(-1, 3).mean(axis=0) - [128, 128, 255]).max() < 12
+    assert (relief != [128, 128, 255]).any(axis=2).mean() > 0.3
+    assert sfm_app.reconstruct(rendered[0], out, DRAFT).mesh_path.read_bytes() == plain
+    assert not place.fine_surface.exists()
 
 
 def test_glb_loads_upright_and_textured(finished):

@@ -26,7 +26,7 @@ logger = logging.getLogger("sfm_app")
 MOST_GLB_BYTES = 16_000_000
 """Largest model that the page carries as it is. Chosen by hand: a page of 40 MB still opens on a telephone."""
 LIGHT_PAGE_PX = 2048
-"""Longer side of a page of texture in the lighter model."""
+"""Longer side of a page of texture in the lighter model; normal maps have half of it."""
 MOST_POINTS = 60_000
 
 
@@ -123,13 +123,14 @@ def lighten(model: Model) -> Model:
     """
     if model.texture is None:
         return model
-    pages = tuple(_shrink(page) for page in model.texture.pages)
-    return replace(model, texture=replace(model.texture, pages=pages))
+    pages = tuple(_shrink(page, LIGHT_PAGE_PX) for page in model.texture.pages)
+    maps = tuple(_shrink(one, LIGHT_PAGE_PX // 2) for one in model.texture.normal_maps)
+    return replace(model, texture=replace(model.texture, pages=pages, normal_maps=maps))
 
 
-def _shrink(page: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _shrink(page: NDArray[np.uint8], most: int) -> NDArray[np.uint8]:
     height, width = page.shape[:2]
-    scale = LIGHT_PAGE_PX / max(height, width)
+    scale = most / max(height, width)
     if scale >= 1.0:
         return page
     size = max(1, round(width * scale)), max(1, round(height * scale))

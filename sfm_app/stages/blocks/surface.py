@@ -6,7 +6,7 @@ resumes at the blocks that are missing.
 
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from sfm_app.hashing import fingerprint, load_arrays
 from sfm_app.meshing import drop_islands, make_manifold, trim
 from sfm_app.meshing.blocks.partition import (
     Cube,
+    Partition,
     Split,
     cell_sizes,
     cube_around,
@@ -34,6 +35,7 @@ from sfm_app.meshing.components import MIN_POINTS
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_count, block_workers
 from sfm_app.settings import MeshSettings
+from sfm_app.stages.blocks.fine import FineShape, save_fine
 from sfm_app.stages.blocks.judging import SurfaceJudge, judge_by_all, simplify_mesh
 from sfm_app.stages.blocks.points import BlockPoints, sort_points
 from sfm_app.stages.blocks.refining import Originals, Partners, rank_partners, refine_surface
@@ -83,11 +85,18 @@ class BlockTask:
     """Relative difference in depth within which a photo confirms a vertex."""
     least: float
     """Photos that have to confirm the average vertex of a part."""
+    keeps_fine: bool
+    """Whether its surface is also kept as it is before it is simplified."""
 
     @property
     def path(self) -> Path:
         """The surface of the block."""
         return self.folder / f"{self.number}.npz"
+
+    @property
+    def fine_path(self) -> Path:
+        """The surface of the block before it is simplified."""
+        return self.folder / f"{self.number}-fine.npz"
 
 
 def mesh_in_blocks(
@@ -121,7 +130,8 @@ def mesh_in_blocks(
     seers = _photos_in_reach(views, farthest, bounds)
     tasks = [
         BlockTask(folder, own, dense_dir, originals, seen, {view.name: partners[view.name] for view in seen},
-                  k, bounds[k], cell, cubes[k], options, run.settings.depth.consistency, least)
+                  k, bounds[k], cell, cubes[k], options, run.settings.depth.consistency, least,
+                  run.settings.texture.normal_map)
         for k, seen in enumerate(seers)
     ]  # fmt: skip
     with run.with_workers(block_workers(run.workers, run.memory_mb, options)) as few:
@@ -136,6 +146,8 @@ def mesh_in_blocks(
         )
     run.record(blocks=len(tasks), planes=[list(plane) for plane in partition.planes()])
     run.record(cell=cell, raw_triangles=sum(raw), open_border_edges=lost)
+    if run.settings.texture.normal_map:
+        save_fine(_parts_without_halo(tasks, partition), run.workspace.fine_surface)
     shutil.rmtree(folder)
     return surface
 
@@ -156,12 +168,25 @@ def mesh_block(task: BlockTask) -> int:
         found = trim(found, support, task.options.max_gap_triangles, task.least)
     if len(found.faces) and task.options.max_image_size_px:
         found = refine_surface(found, task.originals, seers, task.partners, task.options).surface
-    if len(found.faces):
-        found = make_manifold(simplify_mesh(found, task.options, scratch))
+    found = _simplify_block(found, task, scratch)
     with replace_atomically(task.path) as path:
         np.savez(path, vertices=found.vertices, faces=found.faces, colors=found.colors, raw=len(raw.faces))
     shutil.rmtree(scratch)
     return len(raw.faces)
+
+
+def _simplify_block(found: Surface, task: BlockTask, scratch: Path) -> Surface:
+    """Return the surface of a block with few triangles, and keep it as it is where a normal map is made of it."""
+    if task.keeps_fine:
+        save_fine([FineShape.from_surface(found)], task.fine_path)
+    return make_manifold(simplify_mesh(found, task.options, scratch)) if len(found.faces) else found
+
+
+def _parts_without_halo(tasks: Sequence[BlockTask], partition: Partition) -> Iterator[FineShape]:
+    """Yield the fine surface of each block without its halo, which the neighbors have, too, and better."""
+    for task in tasks:
+        fine = FineShape.load(task.fine_path)
+        yield fine.select(partition.find_blocks(fine.vertices[fine.faces].mean(axis=1)) == task.number)
 
 
 def _write_block_points(task: BlockTask, path: Path) -> None:

@@ -16,7 +16,7 @@ from sfm_app.meshing.open3d import load_open3d
 from sfm_app.types import Model, Surface
 
 COMPONENTS = {5123: np.uint16, 5125: np.uint32, 5126: np.float32}
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
 def glb_of(model):
@@ -47,7 +47,7 @@ def array(tree, buffer, number):
     return values.reshape(-1, width) if width > 1 else values
 
 
-@pytest.fixture(params=["ball", "textured_ball", "cloud"])
+@pytest.fixture(params=["ball", "textured_ball", "lit_ball", "cloud"])
 def model(request):
     return request.getfixturevalue(request.param)
 
@@ -86,8 +86,9 @@ def test_numbers_are_what_the_tree_says_of_them(model):
             assert tree["bufferViews"][tree["accessors"][primitive["indices"]]["bufferView"]]["target"] == 34963
 
 
-def test_every_material_shows_colors_as_they_are_from_both_sides(model):
-    tree, _ = taken_apart(glb_of(model))
+@pytest.mark.parametrize("name", ["ball", "textured_ball", "cloud"])
+def test_every_material_shows_colors_as_they_are_from_both_sides(name, request):
+    tree, _ = taken_apart(glb_of(request.getfixturevalue(name)))
 
     assert tree["asset"] == {"version": "2.0", "generator": "sfm_app"}
     assert tree["extensionsUsed"] == ["KHR_materials_unlit"]
@@ -113,6 +114,36 @@ def test_each_page_is_a_jpeg_and_a_primitive_of_its_own(textured_ball):
         assert set(view) == {"buffer", "byteOffset", "byteLength"}
         np.testing.assert_allclose(np.asarray(picture), page, atol=4)
         assert set(primitive["attributes"]) == {"POSITION", "NORMAL", "TEXCOORD_0"}
+
+
+def test_a_normal_map_makes_a_material_lit_and_comes_with_its_frames(lit_ball):
+    surface, texture = lit_ball.surface, lit_ball.texture
+    tree, buffer = taken_apart(glb_of(lit_ball))
+
+    assert not {"extensionsUsed", "extensionsRequired"} & set(tree)
+    for primitive, relief in zip(tree["meshes"][0]["primitives"], texture.normal_maps, strict=True):
+        material = tree["materials"][primitive["material"]]
+        rough = material["pbrMetallicRoughness"]
+        assert (rough["metallicFactor"], rough["roughnessFactor"], material["doubleSided"]) == (0.0, 1.0, True)
+        assert "extensions" not in material
+        image = tree["images"][tree["textures"][material["normalTexture"]["index"]]["source"]]
+        view = tree["bufferViews"][image["bufferView"]]
+        picture = Image.open(io.BytesIO(buffer[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]))
+        assert image["mimeType"] == f"image/{picture.format.lower()}"
+        np.testing.assert_allclose(np.asarray(picture), relief, atol=4)
+        normals, tangents = (array(tree, buffer, primitive["attributes"][name]) for name in ("NORMAL", "TANGENT"))
+        np.testing.assert_allclose(np.linalg.norm(tangents[:, :3], axis=1), 1, atol=1e-6)
+        np.testing.assert_allclose(np.sum(tangents[:, :3] * normals, axis=1), 0, atol=1e-6)
+        assert set(tangents[:, 3]) <= {-1.0, 1.0}
+    corners = sum(len(array(tree, buffer, one["indices"])) for one in tree["meshes"][0]["primitives"])
+    assert corners == surface.faces.size
+
+
+def test_cameras_beside_a_lit_model_stay_unlit(lit_ball, cloud):
+    tree, _ = taken_apart(glb_of(replace(lit_ball, cameras=cloud.cameras)))
+
+    assert tree["extensionsUsed"] == ["KHR_materials_unlit"]
+    assert ["extensions" in one for one in tree["materials"]] == [False, False, True]
 
 
 def test_corners_keep_their_place_in_the_texture(textured_ball):
@@ -239,3 +270,12 @@ def test_colors_of_neighboring_charts_stay_apart():
     back = np.asarray(Image.open(io.BytesIO(jpeg(page)))).astype(float)
 
     assert 0 < np.abs(back - page).mean() < 6
+
+
+def test_a_page_of_noise_is_written_too():
+    page = np.random.default_rng(0).integers(0, 255, (200, 300, 3), np.uint8)
+
+    data = jpeg(page)
+
+    assert len(data) > page.shape[0] * page.shape[1]  # more than Pillow expects
+    assert np.abs(np.asarray(Image.open(io.BytesIO(data))).astype(int) - page).mean() < 10

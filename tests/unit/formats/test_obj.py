@@ -42,6 +42,20 @@ def test_the_materials_name_the_pages_beside_them(textured_ball):
         np.testing.assert_allclose(np.asarray(Image.open(io.BytesIO(files[f"my_model_{number}.jpg"]))), page, atol=4)
 
 
+def test_normal_maps_are_beside_the_pages_and_the_model_is_lit(lit_ball):
+    files = write_obj(lit_ball, "ball")
+
+    assert list(files) == [
+        "ball.obj", "ball.mtl", "ball_0.jpg", "ball_1.jpg", "ball_0_normals.jpg", "ball_1_normals.jpg",
+    ]  # fmt: skip
+    text = files["ball.mtl"].decode()
+    assert text.count("illum 1\n") == 2 and "illum 0" not in text
+    for number, relief in enumerate(lit_ball.texture.normal_maps):
+        assert f"norm ball_{number}_normals.jpg\n" in text
+        picture = Image.open(io.BytesIO(files[f"ball_{number}_normals.jpg"]))
+        np.testing.assert_allclose(np.asarray(picture), relief, atol=4)
+
+
 def test_without_a_texture_vertices_carry_the_colors(ball):
     files = write_obj(ball, "model")
 

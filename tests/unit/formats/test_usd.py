@@ -64,6 +64,22 @@ def test_every_triangle_has_the_picture_and_the_place_of_its_texture(textured_ba
     np.testing.assert_allclose(places, textured_ball.texture.uv * (1, -1) + (0, 1), atol=1e-6)
 
 
+@pytest.mark.parametrize("write", [write_usd, write_usdz])
+def test_a_normal_map_is_read_raw_and_counts_from_minus_1_to_1(lit_ball, write, tmp_path):
+    stage = open_stage(write(lit_ball, "ball"), tmp_path)
+
+    for number, relief in enumerate(lit_ball.texture.normal_maps):
+        shader = UsdShade.Material(stage.GetPrimAtPath(f"/model/materials/page_{number}")).ComputeSurfaceSource()[0]
+        picture = UsdShade.Shader(shader.GetInput("normal").GetConnectedSource()[0].GetPrim())
+        asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(picture.GetInput("file").Get().resolvedPath))
+        pixels = np.asarray(Image.open(io.BytesIO(bytes(asset.GetBuffer()))))
+        np.testing.assert_allclose(pixels, relief, atol=4)
+        assert picture.GetInput("sourceColorSpace").Get() == "raw"
+        assert picture.GetInput("scale").Get() == Gf.Vec4f(2, 2, 2, 1)
+        assert picture.GetInput("bias").Get() == Gf.Vec4f(-1, -1, -1, 0)
+        assert picture.GetInput("st").HasConnectedSource()
+
+
 def test_files_in_a_package_are_plain_and_aligned(textured_ball):
     data = write_usdz(textured_ball, "ball")["ball.usdz"]
 

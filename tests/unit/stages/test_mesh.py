@@ -12,7 +12,7 @@ from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.dense import map_file, read_views, write_fusion_views, write_maps
 from sfm_app.colmap.surface import open_points, positions
 from sfm_app.errors import ReconstructionError
-from sfm_app.geometry.triangles import unique_edges, vertex_normals
+from sfm_app.geometry.triangles import areas, unique_edges, vertex_normals
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
@@ -283,3 +283,37 @@ def test_fused_in_blocks_the_points_are_the_same_but_for_their_rims(dense, ball,
     assert np.mean(cKDTree(whole).query(parts)[0] < 1e-6) > 0.8
     assert np.percentile(cKDTree(parts).query(whole)[0], 99) < 0.02
     assert not (tmp_path / "surface" / fusion.FUSING).exists()
+
+
+def make_with_map(dense, workers=2, *, normal_map=True, **options):
+    tables = {"mesh": {"max_image_size_px": 0} | options, "texture": {"normal_map": normal_map}}
+    run = RunContext(
+        Settings.from_mapping(tables), Workspace(dense.parent), load_plugins(), make_executor(workers), workers
+    )
+    mesh.make(SimpleNamespace(model_dir=dense / "sparse"), dense, run)
+    return run.workspace
+
+
+@pytest.mark.parametrize("block_points", [4_000_000, 8000])
+def test_the_fine_surface_is_kept_for_a_normal_map_and_changes_nothing_else(dense, ball, tmp_path, block_points):
+    place, options = copied(dense, tmp_path), {"faces": 500, "block_points": block_points}
+    light = (make_with_map(place, normal_map=False, **options).surface / mesh.SURFACE).read_bytes()
+    assert not Workspace(tmp_path).fine_surface.exists()
+
+    kept = make_with_map(place, **options)
+    fine = kept.fine_surface.read_bytes()
+
+    assert (kept.surface / mesh.SURFACE).read_bytes() == light
+    stored = np.load(kept.fine_surface)
+    vertices, faces = stored["vertices"].astype(float), stored["faces"].astype(int)
+    assert np.percentile(np.abs(np.linalg.norm(vertices, axis=1) - 1), 95) < 0.01
+    assert len(faces) > 10 * 500 and set(faces.ravel()) == set(range(len(vertices)))
+    assert areas(vertices, faces).sum() == pytest.approx(4 * np.pi, rel=0.02)  # blocks neither overlap nor gape
+    corners = vertices[faces]
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert np.mean(np.sum(outward * corners.mean(axis=1), axis=1) > 0) > 0.999
+    assert make_with_map(place, workers=1, **options).fine_surface.read_bytes() == fine
+
+    whole = mesh.digest(kept)
+    kept.fine_surface.write_bytes(fine[:-1])
+    assert mesh.digest(kept) != whole

@@ -36,6 +36,19 @@ def test_a_model_comes_back_with_all_its_pages(tmp_path):
         np.testing.assert_array_equal(ours, theirs)
 
 
+def test_normal_maps_come_back_with_their_pages(tmp_path):
+    rng = np.random.default_rng(1)
+    pages, maps = (tuple(rng.integers(0, 255, (side, side, 3), np.uint8) for _ in range(11)) for side in (6, 3))
+    texture = Texture(rng.random((1, 3, 2)).astype(np.float32), np.array([10], np.int32), pages)
+
+    assert stored(Model(SURFACE, texture), tmp_path).texture.normal_maps == ()
+    found = stored(Model(SURFACE, replace(texture, normal_maps=maps)), tmp_path).texture
+
+    assert len(found.pages) == len(found.normal_maps) == 11
+    for ours, theirs in zip((*found.pages, *found.normal_maps), (*pages, *maps), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
 def test_a_model_without_a_texture_comes_back(tmp_path):
     assert stored(Model(SURFACE), tmp_path).texture is None
 

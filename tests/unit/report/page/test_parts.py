@@ -99,3 +99,13 @@ def test_a_large_texture_is_shrunk_and_keeps_its_colors(textured_ball):
     assert max(first.shape[:2]) == LIGHT_PAGE_PX and math.isclose(first.shape[0] / first.shape[1], 1.5, rel_tol=0.01)
     assert (first == (10, 120, 240)).all()
     assert second is small
+
+
+def test_normal_maps_are_shrunk_with_their_pages(lit_ball):
+    large = np.full((LIGHT_PAGE_PX, 2 * LIGHT_PAGE_PX, 3), (128, 128, 255), np.uint8)
+    small = lit_ball.texture.normal_maps[1]
+
+    maps = lighten(replace(lit_ball, texture=replace(lit_ball.texture, normal_maps=(large, small)))).texture.normal_maps
+
+    assert maps[0].shape == (LIGHT_PAGE_PX // 4, LIGHT_PAGE_PX // 2, 3) and (maps[0] == (128, 128, 255)).all()
+    assert maps[1] is small

@@ -1,0 +1,1 @@
+"""Relief that is stored in a texture."""

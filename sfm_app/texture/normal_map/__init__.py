@@ -1,0 +1,1 @@
+"""The normal map: what a fine surface adds to the triangles of a light one."""
