@@ -15,7 +15,7 @@ from benchmarks.surface.scan import Scan, align
 from benchmarks.surface.truth import sights_of
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.meshing.open3d import load_open3d
-from sfm_app.synthetic.cameras import Camera
+from sfm_app.synthetic.cameras import Camera, camera_center
 from sfm_app.synthetic.compare import sample_surface, surface_distances
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.types import Surface
@@ -74,7 +74,6 @@ def kinect_scores(surface: Surface, poses: Mapping[str, Pose], truth: KinectTrut
         "median center cm": _cm(np.median(offset.center)),
         "90 % center cm": _cm(np.percentile(offset.center, 90)),
         "cameras apart cm": _cm(offset.shift),
-        "cameras apart deg": round(offset.turn_deg, 2),
         "scan: rough cm": _cm(np.nanmedian(truth.scan.roughness)),
     }
     samples = sample_surface(surface.vertices, surface.faces, count)
@@ -87,7 +86,23 @@ def kinect_scores(surface: Surface, poses: Mapping[str, Pose], truth: KinectTrut
     figures = _figures(surface, samples, onto.compose(offset.world), truth, sorted(poses))
     row["ICP: moved by cm"] = _cm(np.median(np.linalg.norm(onto(moved) - moved, axis=1)))
     row["ICP: scaled by %"] = round(100.0 * (onto.scale - 1.0), 2)
+    apart = camera_offset(poses, truth.poses, onto.compose(offset.world))
+    row["ICP: cameras apart cm"] = _cm(np.linalg.norm(apart))
     return row | {f"ICP: {name}": value for name, value in figures.items()}
+
+
+def camera_offset(found: Mapping[str, Pose], truth: Mapping[str, Pose], world: Similarity) -> FloatArray:
+    """Return the median place (3,) of our camera in the frame of the depth camera, under a given alignment.
+
+    Args:
+        found: (3, 4) cam_from_world in the frame of the reconstruction, by photo name without suffix.
+        truth: of the depth camera.
+        world: from the frame of the reconstruction to that of the truth.
+    """
+    names = sorted(set(found) & set(truth))
+    centers = world(np.array([camera_center(found[name]) for name in names]))
+    places = [truth[name][:, :3] @ center + truth[name][:, 3] for name, center in zip(names, centers, strict=True)]
+    return np.asarray(np.median(places, axis=0))
 
 
 def within_reach(places: FloatArray, surface: Surface, truth: KinectTruth, names: list[str]) -> NDArray[np.bool_]:

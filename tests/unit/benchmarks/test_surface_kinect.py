@@ -5,7 +5,16 @@ import pytest
 from PIL import Image
 
 from benchmarks.surface.bars import BARS, bar_rows
-from benchmarks.surface.kinect import FOCAL_PX, HEIGHT, WIDTH, KinectTruth, kinect_scores, load_kinect, within_reach
+from benchmarks.surface.kinect import (
+    FOCAL_PX,
+    HEIGHT,
+    WIDTH,
+    KinectTruth,
+    camera_offset,
+    kinect_scores,
+    load_kinect,
+    within_reach,
+)
 from benchmarks.surface.report import page
 from benchmarks.surface.scan import PATCH, Scan, align
 from benchmarks.surface.sets import SCANNED, surface_set
@@ -147,7 +156,7 @@ def test_the_walls_themselves_are_accurate_and_complete(truth):
     found = scores(truth, *joined([walls[name] for name in walls if name != "ceiling"]))
     assert found["accuracy 3 cm %"] > 99 and found["completeness 5 cm %"] == 100 and found["median cm"] < 0.3
     assert found["median center cm"] < 0.01 and found["cameras apart cm"] == pytest.approx(3.16, abs=0.05)
-    assert found["cameras apart deg"] == pytest.approx(2.5, abs=0.02)
+    assert found["ICP: cameras apart cm"] == pytest.approx(3.16, abs=0.25)
     assert found["ICP: moved by cm"] < 0.2 and abs(found["ICP: scaled by %"]) < 0.1
 
 
@@ -204,6 +213,13 @@ def test_reach_is_the_picture_the_range_and_what_nothing_hides():
     assert within_reach(places, sheet, truth, ["a", "unknown"]).tolist() == [
         False, True, True, True, False, False, True, False, True, False,
     ]  # fmt: skip
+
+
+def test_the_offset_of_the_cameras_is_their_median_place():
+    depth, ours = rig()
+    assert camera_offset(ours, depth, WORLD.inverse()) == pytest.approx([0.03, 0.0, 0.01], abs=1e-6)
+    ours["00"] = ours["00"] + np.column_stack([np.zeros((3, 3)), np.ones(3)])
+    assert camera_offset(ours, depth, WORLD.inverse()) == pytest.approx([0.03, 0.0, 0.01], abs=1e-6), "one is off"
 
 
 def test_icp_wants_something_near():
