@@ -3,9 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from benchmarks.cameras.score import true_photos
 from benchmarks.common.metrics import Pose
@@ -45,6 +47,19 @@ class KinectTruth:
     """(3, 4) cam_from_world of the depth camera, by photo name without suffix."""
 
 
+class CameraDifferences(NamedTuple):
+    """How the depth camera's poses differ from ours."""
+
+    offset: FloatArray
+    """(3,) median place of our camera in the frame of the depth camera, in meters."""
+    turn_deg: FloatArray
+    """(N,) by photo: rotation against the depth camera, without the mean."""
+    pivot_m: float
+    """Depth of the point ahead that cameras are turned about which are turned wrongly."""
+    explained: float
+    """Share of the squared sideways differences of the places that turning about that point explains, up to 1."""
+
+
 def load_kinect(folder: Path) -> KinectTruth:
     """Read surface.ply and cameras.json.
 
@@ -74,6 +89,7 @@ def kinect_scores(surface: Surface, poses: Mapping[str, Pose], truth: KinectTrut
         "median center cm": _cm(np.median(offset.center)),
         "90 % center cm": _cm(np.percentile(offset.center, 90)),
         "cameras apart cm": _cm(offset.shift),
+        "cameras turned deg": round(float(np.median(offset.rotation_deg)), 2),
         "scan: rough cm": _cm(np.nanmedian(truth.scan.roughness)),
     }
     samples = sample_surface(surface.vertices, surface.faces, count)
@@ -86,13 +102,18 @@ def kinect_scores(surface: Surface, poses: Mapping[str, Pose], truth: KinectTrut
     figures = _figures(surface, samples, onto.compose(offset.world), truth, sorted(poses))
     row["ICP: moved by cm"] = _cm(np.median(np.linalg.norm(onto(moved) - moved, axis=1)))
     row["ICP: scaled by %"] = round(100.0 * (onto.scale - 1.0), 2)
-    apart = camera_offset(poses, truth.poses, onto.compose(offset.world))
-    row["ICP: cameras apart cm"] = _cm(np.linalg.norm(apart))
+    differences = compare_cameras(poses, truth.poses, onto.compose(offset.world))
+    row |= {
+        "ICP: cameras apart cm": _cm(np.linalg.norm(differences.offset)),
+        "ICP: cameras turned deg": round(float(np.median(differences.turn_deg)), 2),
+        "ICP: turned about m": round(differences.pivot_m, 2),
+        "ICP: which explains %": round(100.0 * differences.explained, 1),
+    }
     return row | {f"ICP: {name}": value for name, value in figures.items()}
 
 
-def camera_offset(found: Mapping[str, Pose], truth: Mapping[str, Pose], world: Similarity) -> FloatArray:
-    """Return the median place (3,) of our camera in the frame of the depth camera, under a given alignment.
+def compare_cameras(found: Mapping[str, Pose], truth: Mapping[str, Pose], world: Similarity) -> CameraDifferences:
+    """Compare our cameras with the depth camera under a given alignment.
 
     Args:
         found: (3, 4) cam_from_world in the frame of the reconstruction, by photo name without suffix.
@@ -101,8 +122,15 @@ def camera_offset(found: Mapping[str, Pose], truth: Mapping[str, Pose], world: S
     """
     names = sorted(set(found) & set(truth))
     centers = world(np.array([camera_center(found[name]) for name in names]))
-    places = [truth[name][:, :3] @ center + truth[name][:, 3] for name, center in zip(names, centers, strict=True)]
-    return np.asarray(np.median(places, axis=0))
+    places = np.array([truth[n][:, :3] @ center + truth[n][:, 3] for n, center in zip(names, centers, strict=True)])
+    turns = Rotation.from_matrix(np.array([truth[n][:, :3] @ world.R @ found[n][:, :3].T for n in names]))
+    turn = (turns.mean().inv() * turns).as_rotvec()
+    offset = np.median(places, axis=0)
+    # a camera that turns by a small angle about a point ahead at depth d moves sideways by d times that
+    sideways, ways = np.cross(turn, [0.0, 0.0, 1.0])[:, :2], (places - offset)[:, :2]
+    depth = float((sideways * ways).sum() / max((sideways**2).sum(), 1e-12))
+    rest = float(((ways - depth * sideways) ** 2).sum() / max((ways**2).sum(), 1e-12))
+    return CameraDifferences(offset, np.degrees(np.linalg.norm(turn, axis=1)), -depth, 1.0 - rest)
 
 
 def within_reach(places: FloatArray, surface: Surface, truth: KinectTruth, names: list[str]) -> NDArray[np.bool_]:

@@ -22,7 +22,8 @@ DETAIL = (
 KINECT = (
     "photos", "moved by", "accuracy 3 cm %", "3 cm of a point %", "completeness 5 cm %", "median cm",
     "over 10 cm off %", "in reach %", "in reach: accuracy 3 cm %", "in reach: median cm", "moved by cm", "scaled by %",
-    "cameras apart cm", "median center cm", "90 % center cm", "scan: rough cm",
+    "median center cm", "90 % center cm", "cameras apart cm", "cameras turned deg", "turned about m",
+    "which explains %", "scan: rough cm",
 )  # fmt: skip
 ICP = "ICP: "
 """Begins the names of figures after the second alignment."""

@@ -10,7 +10,7 @@ from benchmarks.surface.kinect import (
     HEIGHT,
     WIDTH,
     KinectTruth,
-    camera_offset,
+    compare_cameras,
     kinect_scores,
     load_kinect,
     within_reach,
@@ -215,11 +215,25 @@ def test_reach_is_the_picture_the_range_and_what_nothing_hides():
     ]  # fmt: skip
 
 
-def test_the_offset_of_the_cameras_is_their_median_place():
-    depth, ours = rig()
-    assert camera_offset(ours, depth, WORLD.inverse()) == pytest.approx([0.03, 0.0, 0.01], abs=1e-6)
-    ours["00"] = ours["00"] + np.column_stack([np.zeros((3, 3)), np.ones(3)])
-    assert camera_offset(ours, depth, WORLD.inverse()) == pytest.approx([0.03, 0.0, 0.01], abs=1e-6), "one is off"
+@pytest.mark.parametrize("pivot", [0.8, 2.0])
+def test_cameras_that_are_turned_about_what_they_see_are_told(pivot):
+    depth, ours = rig(40)
+    same = compare_cameras(ours, depth, WORLD.inverse())
+    assert same.offset == pytest.approx([0.03, 0.0, 0.01], abs=1e-6) and same.turn_deg.max() < 1e-4
+    rng = np.random.default_rng(5)
+    turned = {}
+    for name, P in depth.items():
+        R = axis_rotation(np.array([1.0, 0.0, 0.0]), rng.normal()) @ axis_rotation(
+            np.array([0.0, 1.0, 0.0]), rng.normal()
+        )
+        # the point ahead stays where it is in the picture
+        t = R @ (P[:, 3] - [0.0, 0.0, pivot]) + [0.0, 0.0, pivot]
+        turned[name] = np.column_stack([R @ P[:, :3], t + 0.001 * rng.normal(size=3)])
+    found = compare_cameras(ours, turned, WORLD.inverse())
+    assert found.pivot_m == pytest.approx(pivot, abs=0.05) and 0.97 < found.explained < 1.0
+    assert 0.8 < np.median(found.turn_deg) < 1.7
+    shifted = {n: P + np.column_stack([np.zeros((3, 3)), 0.03 * rng.normal(size=3)]) for n, P in depth.items()}
+    assert abs(compare_cameras(ours, shifted, WORLD.inverse()).explained) < 0.2, "a shift is no turn"
 
 
 def test_icp_wants_something_near():
