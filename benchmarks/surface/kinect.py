@@ -28,7 +28,7 @@ ACCURATE_M, COMPLETE_M, FAR_M = 0.03, 0.05, 0.1
 DEPTHS_M = (0.4, 3.5)
 """Depths that a Kinect measures and that the scan was made from, in meters."""
 SAMPLES = 100_000
-"""Number of points that a surface is sampled at, evenly over its area; 60 000 of them determine shares to 0.2 %."""
+"""Number of points that a surface is sampled at, evenly over its area; they determine shares to 0.2 %."""
 FOCAL_PX, WIDTH, HEIGHT = 585.0, 640, 480
 """The depth camera of a Kinect. Longer than the 525 of its color camera, which cameras.json states: nearly all points
 of the scan of kitchen1000 lie in three frames of a camera of 585 pixels, as many as a point takes, but of no longer."""
