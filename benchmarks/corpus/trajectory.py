@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
 from benchmarks.common.metrics import Pose
-from sfm_app.geometry.similarity import umeyama
+from sfm_app.geometry.similarity import Similarity, umeyama
 
 LONG_STEPS = 5.0
 """A step of more than this many median steps is a jump."""
@@ -56,6 +56,8 @@ class Offset(NamedTuple):
     """Distance between the two cameras, in units of the truth."""
     turn_deg: float
     """Angle between the two cameras."""
+    world: Similarity
+    """From the model to the world of the truth."""
 
 
 def offset_errors(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> Offset | None:
@@ -88,6 +90,7 @@ def offset_errors(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> Offse
         np.degrees(rotation),
         float(np.linalg.norm(fit.x[10:13])),
         float(np.degrees(np.linalg.norm(fit.x[:3]))),
+        Similarity(float(np.exp(fit.x[6])), Rotation.from_rotvec(fit.x[3:6]).as_matrix(), fit.x[7:10]),
     )
 
 

@@ -6,8 +6,11 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import numpy as np
+
 from benchmarks.common.results import Row
 from benchmarks.surface.detail import detail_scores
+from benchmarks.surface.kinect import KinectTruth, kinect_scores
 from benchmarks.surface.photos import (
     Likeness,
     leave_out,
@@ -64,6 +67,12 @@ def compare_with_truth(surface: Surface, out: Path, truth: Truth, scene: Synthet
     ]
     best = max(rivals, key=lambda rival: rival["F %"], default={})
     return row | {f"sparse: {name}": value for name, value in best.items()}
+
+
+def compare_with_kinect(surface: Surface, out: Path, truth: KinectTruth) -> Row:
+    """Score our surface against what a depth camera saw."""
+    poses = {Path(name).stem: np.asarray(image.cam_from_world().matrix()) for name, image in placed_photos(out).items()}
+    return kinect_scores(surface, poses, truth)
 
 
 def compare_with_photos(model: PreparedModel, out: Path, names: Sequence[str]) -> Row:

@@ -1,10 +1,11 @@
 """Photo sets for surfaces: rendered ones with their truth, real ones, and parts of them; also the finished model."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.common.photo_sets import FORMATS, link_or_copy
+from benchmarks.common.photo_sets import FORMATS, link_or_copy, photo_set
+from benchmarks.surface.kinect import KinectTruth, load_kinect
 from sfm_app.api import open_run
 from sfm_app.pipeline import DEPTH_MAPS, NAMES, TEXTURE, run_stages
 from sfm_app.settings import Settings
@@ -17,6 +18,8 @@ RENDERED = ("statue", "facade", "corner")
 DETAILED = ("ornament", "railing", "garden")
 """Rendered scenes with fine detail; their photos are noisier, and exposed differently."""
 REAL = ("fountain-P11", "Herz-Jesus-P8", "castle-P19", "temple16", "kermit11")
+SCANNED: Mapping[str, str] = {"kitchen1000": "every:5"}
+"""Real sets with the surface that a depth camera saw, and which photos of them are used."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,6 +32,8 @@ class SurfaceSet:
     """Truth of rendered photos; None for real ones."""
     scene: SyntheticScene | None = None
     """What rendered photos show."""
+    kinect: KinectTruth | None = None
+    """What a depth camera saw beside real photos."""
 
     @property
     def count(self) -> int:
@@ -40,9 +45,10 @@ def surface_set(name: str, data: Path | None, cache: Path) -> SurfaceSet:
     """Return one of the program's own scenes, rendered once into the cache, or DATA/NAME/images.
 
     Args:
-        name: a scene, SCENE@SEED for another walk and other noise, or a folder of DATA.
+        name: a scene, SCENE@SEED for another walk and other noise, or a folder of DATA; "FOLDER every:N" for every Nth
+            photo of a set that a depth camera saw, too.
         data: folder of the photo sets.
-        cache: folder for rendered photos.
+        cache: folder for rendered and chosen photos.
 
     Raises:
         ValueError: neither exists.
@@ -51,6 +57,10 @@ def surface_set(name: str, data: Path | None, cache: Path) -> SurfaceSet:
     if scene in WALKS:
         folder = cache / "rendered" / name
         return SurfaceSet(name, folder / "photos", _load_or_render(scene, int(seed or 0), folder), build_scene(scene))
+    folder_name, _, change = name.partition(" ")
+    if data is not None and folder_name in SCANNED and (data / folder_name / "images").is_dir():
+        photos = photo_set(data, folder_name, change or SCANNED[folder_name], cache).folder
+        return SurfaceSet(name, photos, None, kinect=load_kinect(data / folder_name))
     if data is None or not (data / name / "images").is_dir():
         raise ValueError(f"'{name}' is neither a rendered scene ({', '.join(WALKS)}) nor a folder of DATA")
     return SurfaceSet(name, data / name / "images", None)

@@ -71,7 +71,13 @@ def seen_places(truth: Truth, photos: int = SEEN_BY, samples: int = 3 * SAMPLES)
     return found.places[found.count >= photos]
 
 
-def sights_of(truth: Truth, places: FloatArray, normals: FloatArray | None, slack: FloatArray | None = None) -> Sights:
+def sights_of(
+    truth: Truth,
+    places: FloatArray,
+    normals: FloatArray | None,
+    slack: FloatArray | None = None,
+    depths: tuple[float, float] = (0.0, np.inf),
+) -> Sights:
     """Return how photos see places.
 
     Args:
@@ -79,6 +85,7 @@ def sights_of(truth: Truth, places: FloatArray, normals: FloatArray | None, slac
         places: (N, 3).
         normals: (N, 3) unit normals of the surface there; None where a place is seen from all sides.
         slack: (N,) how far behind the first surface on a ray a place still counts as seen; a small one if None.
+        depths: range of the depth in which places count as seen.
     """
     caster = ray_caster(truth.vertices, truth.faces)
     slack = np.full(len(places), HIDDEN * scene_size(truth)) if slack is None else slack
@@ -89,7 +96,8 @@ def sights_of(truth: Truth, places: FloatArray, normals: FloatArray | None, slac
         plane = x[:, :2] / np.maximum(x[:, 2:], 1e-9)
         plane = plane * (1.0 + camera.radial * (plane**2).sum(axis=1, keepdims=True))
         pixel = plane * np.diag(camera.K)[:2] + camera.K[:2, 2]
-        within = (x[:, 2] > 0) & ((pixel >= 0) & (pixel <= [camera.width, camera.height])).all(axis=1)
+        within = (x[:, 2] > depths[0]) & (x[:, 2] <= depths[1])
+        within &= ((pixel >= 0) & (pixel <= [camera.width, camera.height])).all(axis=1)
         ways = places - center
         distance = np.linalg.norm(ways, axis=1)
         if normals is not None:

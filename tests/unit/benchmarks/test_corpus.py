@@ -60,6 +60,8 @@ def test_an_offset_camera_is_fitted_and_what_is_off_remains():
     assert found.center.max() < 1e-3 and found.rotation_deg.max() < 0.05
     assert found.shift == pytest.approx(np.linalg.norm(shift), abs=1e-3)
     assert found.turn_deg == pytest.approx(2.5, abs=0.05)
+    assert found.world.scale == pytest.approx(1.7, abs=1e-3)
+    assert np.allclose(found.world.R, world, atol=1e-3) and np.allclose(found.world.t, [3.0, -1.0, 0.5], atol=3e-3)
 
     moved = {name: P + np.column_stack([np.zeros((3, 3)), [0.05 * (k == 4), 0, 0]]) for k, (name, P) in enumerate(
         beside.items())}  # fmt: skip

@@ -11,7 +11,7 @@ from benchmarks.surface.measure import cost
 from benchmarks.surface.photos import Likeness, likeness, photo_scores, psnr_db, subsample
 from benchmarks.surface.pictures import BYTES, WIDTHS_PX, save_page
 from benchmarks.surface.report import page
-from benchmarks.surface.sets import REAL, RENDERED, SurfaceSet, first_photos, surface_set
+from benchmarks.surface.sets import REAL, RENDERED, SCANNED, SurfaceSet, first_photos, surface_set
 from benchmarks.surface.sparse_poisson import points_ply
 from benchmarks.surface.truth import seen_places, truth_scores
 from benchmarks.surface.worker import StageCost
@@ -160,7 +160,7 @@ def test_cost_is_that_of_all_stages_but_the_files():
 
 
 def test_every_set_has_its_bars_and_they_are_judged_both_ways():
-    assert set(BARS) == set(RENDERED) | set(REAL) and set(RENDERED) <= set(WALKS)
+    assert set(BARS) == {*RENDERED, *REAL, *SCANNED} and set(RENDERED) <= set(WALKS)
     assert BARS["statue"] == (lower_bound("accuracy %", 90.0), lower_bound("completeness %", 85.0))
     assert upper_bound("seconds together", 90.0) in BARS["fountain-P11"]
     assert lower_bound("worst coverage %", 75.0) in BARS["Herz-Jesus-P8"]
