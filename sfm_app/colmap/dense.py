@@ -15,6 +15,7 @@ from sfm_app.colmap.processes.worker_process import UndistortTask, run_worker
 from sfm_app.colmap.types import all_images
 from sfm_app.hashing import digest_files, is_below
 from sfm_app.progress import Progress
+from sfm_app.settings.tables import MOST_LEVELS
 from sfm_app.stereo import DepthEstimate, DepthMap, Kind, View
 
 DEPTHS, NORMALS, CONFIDENCES = "depth_maps", "normal_maps", "confidence_maps"
@@ -128,8 +129,9 @@ class DenseStore:
         self.dense_dir = dense_dir
 
     def photo(self, view: View) -> NDArray[np.uint8]:
-        """Return the undistorted photo, (H, W)."""
-        return read_gray(self.dense_dir, view)
+        """Return the undistorted photo, (H, W), at the size of the view."""
+        photo = read_gray(self.dense_dir, view)
+        return _resize(photo, view) if view.level else photo
 
     def has(self, view: View, kind: Kind) -> bool:
         """Return whether a depth map exists.
@@ -155,6 +157,8 @@ class DenseStore:
         """
         used = used_pixels(self.dense_dir, view)
         if used is not None:
+            if view.level:  # a pixel counts if all under it do
+                used = _resize(used.view(np.uint8) * np.uint8(255), view) == 255
             # full confidence, so that masked pixels do not become part of a blank area beside them
             estimate = DepthEstimate(estimate.depth * used, np.where(used, estimate.confidence, np.float32(1)))
         _write_depth_format(self.dense_dir, CONFIDENCES, view, estimate.confidence, "photometric")
@@ -246,8 +250,9 @@ def drop_estimates(dense_dir: Path, views: Sequence[View]) -> None:
         views: all undistorted photos.
     """
     for view in views:
-        for folder in (DEPTHS, NORMALS, CONFIDENCES):
-            _map_path(dense_dir, folder, view, "photometric").unlink(missing_ok=True)
+        for at_level in (view, *(view.halve(level) for level in range(1, MOST_LEVELS))):
+            for folder in (DEPTHS, NORMALS, CONFIDENCES):
+                _map_path(dense_dir, folder, at_level, "photometric").unlink(missing_ok=True)
 
 
 def write_fusion_views(dense_dir: Path, views: Sequence[View]) -> None:
@@ -284,7 +289,12 @@ def _write_depth_format(dense_dir: Path, folder: str, view: View, values: NDArra
 
 
 def _map_path(dense_dir: Path, folder: str, view: View, kind: Kind = "geometric") -> Path:
-    return dense_dir / "stereo" / folder / f"{view.name}.{kind}.bin"
+    return dense_dir / "stereo" / folder / f"{view.name}.{kind}{view.level or ''}.bin"
+
+
+def _resize(picture: NDArray[np.uint8], view: View) -> NDArray[np.uint8]:
+    """Return a picture (H, W) at the size of a smaller view, by averaging."""
+    return np.asarray(cv2.resize(picture, (view.width, view.height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 @contextmanager

@@ -46,11 +46,11 @@ def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
         ReconstructionError: the model is empty or not finite.
     """
     check(model)
-    is_textured = model.texture is not None and len(model.surface.faces)
-    is_lit = is_textured and model.texture.normal_maps  # type: ignore[union-attr]
+    texture = model.texture if len(model.surface.faces) else None
+    is_lit = texture is not None and bool(texture.normal_maps)
     glb = Glb(**({} if is_lit and not model.cameras else {"extensionsUsed": [UNLIT]}), scene=0)
-    if model.texture is not None and len(model.surface.faces):
-        primitives = add_textured_primitives(glb, model, model.texture)
+    if texture is not None:
+        primitives = add_textured_primitives(glb, model, texture)
     else:
         primitives = [add_colored_primitive(glb, model)]
     mesh = glb.add("meshes", {"name": name, "primitives": primitives})

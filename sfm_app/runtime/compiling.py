@@ -188,7 +188,7 @@ def make_type(kind: Kind) -> Any:
 
 
 def _end_with_parent() -> None:
-    """End this process when the one that started it has ended, however that was."""
+    """Stop this process when the one that started it has ended, however that was."""
 
     def watch() -> None:
         sys.stdin.read()

@@ -16,6 +16,8 @@ MarkerFamily = Literal[
     "aruco-5x5-1000", "aruco-6x6", "aruco-6x6-1000", "aruco-7x7", "aruco-7x7-1000", "aruco-original", "aruco-mip-36h12",
 ]  # fmt: skip
 ConstraintForm = Literal["huang-faugeras", "frobenius", "trivedi", "polynomial"]
+MOST_LEVELS = 4
+"""Sizes at which depth maps can be made. Chosen by hand: an eighth of a photo shows next to nothing."""
 
 
 LOCAL_ADDRESS = re.compile(r"local:([1-9]\d{0,2})")
@@ -185,6 +187,13 @@ class DepthSettings(Section):
         description="name of the method (see `sfm-app plugins`); auto: on the GPU where one can be used, else cpu",
     )
     max_image_size_px: int = Field(1000, ge=64, le=16384, description="longer side of the depth maps, in pixels")
+    levels: int = Field(
+        1,
+        ge=1,
+        le=MOST_LEVELS,
+        description="sizes at which depth maps are made, each half of the one before; 2 finds more of plain walls and "
+        "furniture indoors, but also rims of the sky",
+    )
     neighbors: int = Field(4, ge=1, le=20, description="photos that each photo is matched with")
     consistency: float = Field(
         0.01, gt=0, le=1, description="largest relative depth difference between photos that agree"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sfm_app.numerical import FAILURES, error_reason
 from sfm_app.settings import DepthSettings
 from sfm_app.stereo.depth import DepthEstimate, DepthMap, confirm_depths, match_depths
+from sfm_app.stereo.levels import fill_from_coarse, halve_views
 from sfm_app.stereo.view import GrayImage, View
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Rejected
@@ -23,7 +24,7 @@ class DepthStore(Protocol):
     """Reads photos and keeps maps; a map appears complete or not at all."""
 
     def photo(self, view: View, /) -> GrayImage:
-        """Return the photo without distortion, (H, W)."""
+        """Return the photo without distortion, (H, W), at the size of the view."""
 
     def has(self, view: View, kind: Kind, /) -> bool:
         """Return whether a map is there.
@@ -79,20 +80,27 @@ class DepthTask:
 class _Inputs:
     """What a worker needs of a `DepthTask`."""
 
-    views: Sequence[View]
+    levels: Sequence[Sequence[View]]
+    """The views at full size, at half the size, and so on."""
     ranked: Sequence[Sequence[int]]
     options: DepthSettings
     store: DepthStore
+
+    def tolerance(self, level: int) -> float:
+        """Return the relative difference of depths that agree, which is as coarse as the photos."""
+        return self.options.consistency * 2.0**level
 
 
 def make_depth_maps_on_cpu(task: DepthTask) -> list[Rejected | None]:
     """Match every photo with its neighbors, then keep what the depth maps of other photos confirm.
 
+    Both are done at every level; where the finer ones have no depth, the coarser ones fill it in.
+
     Returns:
         For every view the reason why it has no maps, or None.
     """
     everything = range(len(task.views))
-    inputs = Shared(_Inputs(task.views, task.ranked, task.options, task.store))
+    inputs = Shared(_Inputs(halve_views(task.views, task.options.levels), task.ranked, task.options, task.store))
     matched = task.map(Task(_match, inputs), everything, "matching depths")
     usable = np.array([found is None for found in matched])
     confirm = Task(_confirm, inputs, usable)
@@ -101,13 +109,23 @@ def make_depth_maps_on_cpu(task: DepthTask) -> list[Rejected | None]:
 
 
 def _match(inputs: Shared[_Inputs], index: int) -> Rejected | None:
+    """Match a photo at every level; a coarser level may fail."""
     task = inputs.value
-    view = task.views[index]
+    found = _match_level(task, 0, index)
+    for level in range(1, len(task.levels)):
+        if found is None:
+            _match_level(task, level, index)
+    return found
+
+
+def _match_level(task: _Inputs, level: int, index: int) -> Rejected | None:
+    views, options = task.levels[level], task.options
+    view = views[index]
     if task.store.has(view, "photometric"):
         return None
-    candidates = [task.views[other] for other in task.ranked[index]]
+    candidates = [views[other] for other in task.ranked[index]]
     try:
-        found = match_depths(view, candidates, task.store.photo, task.options.neighbors, task.options.consistency)
+        found = match_depths(view, candidates, task.store.photo, options.neighbors, task.tolerance(level))
     except FAILURES as err:
         return Rejected(f"the computation failed: {error_reason(err)}")
     if isinstance(found, Rejected):
@@ -117,22 +135,34 @@ def _match(inputs: Shared[_Inputs], index: int) -> Rejected | None:
 
 
 def _confirm(inputs: Shared[_Inputs], usable: NDArray[np.bool_], index: int) -> Rejected | None:
+    """Keep the depths of a photo that others confirm, and fill in those of coarser levels."""
     task = inputs.value
-    view = task.views[index]
+    view = task.levels[0][index]
     if task.store.has(view, "geometric"):
         return None
-    others = [
-        (task.views[other], task.store.read_estimate(task.views[other]).depth)
-        for other in task.ranked[index]
-        if usable[other]
-    ]
-    estimate, options = task.store.read_estimate(view), task.options
-    photo = task.store.photo(view)
-    try:
-        found = confirm_depths(view, photo, estimate, others, options.min_agreeing, options.consistency)
-    except FAILURES as err:
-        return Rejected(f"the computation failed: {error_reason(err)}")
+    found = _confirm_level(task, 0, usable, index)
     if isinstance(found, Rejected):
         return found
+    for level in range(1, len(task.levels)):
+        coarse = _confirm_level(task, level, usable, index)
+        if not isinstance(coarse, Rejected):
+            found = fill_from_coarse(found, view, coarse, task.levels[level][index])
     task.store.write_maps(view, found)
     return None
+
+
+def _confirm_level(task: _Inputs, level: int, usable: NDArray[np.bool_], index: int) -> DepthMap | Rejected:
+    views, store = task.levels[level], task.store
+    view = views[index]
+    if not store.has(view, "photometric"):
+        return Rejected("no depth map of this size")
+    others = [
+        (views[other], store.read_estimate(views[other]).depth)
+        for other in task.ranked[index]
+        if usable[other] and store.has(views[other], "photometric")
+    ]
+    estimate, photo = store.read_estimate(view), store.photo(view)
+    try:
+        return confirm_depths(view, photo, estimate, others, task.options.min_agreeing, task.tolerance(level))
+    except FAILURES as err:
+        return Rejected(f"the computation failed: {error_reason(err)}")

@@ -1,7 +1,7 @@
 """Camera, pose and sparse points of a photo."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,8 @@ class View:
     """(M, 3) those points in the world."""
     sample_px: float = 0.5
     """Position of a depth inside its pixel, in x and y: 0.5 is the pixel's center, 0 its top-left corner."""
+    level: int = 0
+    """How many times the photo was halved."""
 
     @property
     def center(self) -> FloatArray:
@@ -55,6 +57,16 @@ class View:
     def projection(self) -> FloatArray:
         """(3, 4) projection matrix K [R | t]."""
         return self.K @ np.column_stack([self.R, self.t])
+
+    def halve(self, level: int) -> "View":
+        """Return the view of the photo at half the size, and half of that, and so on; depths are at pixel centers.
+
+        Args:
+            level: how many times, >= 1.
+        """
+        width, height = (max(1, side >> level) for side in (self.width, self.height))
+        scale = np.diag([width / self.width, height / self.height, 1.0])
+        return replace(self, K=scale @ self.K, width=width, height=height, sample_px=0.5, level=level)
 
 
 def region(views: Sequence[View], margin: float = 0.2) -> FloatArray:

@@ -117,9 +117,18 @@ def test_estimates_come_and_go(workspace):
 
     np.testing.assert_array_equal(found.depth, depth)
     np.testing.assert_array_equal(found.confidence, depth / 4)
+    small = views[0].halve(1)
+    assert store.photo(small).shape == (small.height, small.width) == (45, 60)
+    assert abs(store.photo(small).mean() - store.photo(views[0]).mean()) < 1
+    assert not store.has(small, "photometric")
+    store.write_estimate(small, DepthEstimate(depth[:45, :60], depth[:45, :60]))
+    assert store.read_estimate(small).depth.shape == (45, 60)
+    np.testing.assert_array_equal(store.read_estimate(views[0]).depth, depth)
+
     drop_estimates(dense, views)
+
     assert not store.has(views[0], "photometric")
-    assert not list(dense.rglob("*.photometric.bin"))
+    assert not list(dense.rglob("*.photometric*"))
     assert store.has(views[0], "geometric")
 
 

@@ -133,6 +133,11 @@ def test_estimates_have_no_depth_where_the_photo_is_masked(dense):
 
     np.testing.assert_array_equal(found.depth, np.where(used, 3, 0))
     np.testing.assert_allclose(found.confidence, np.where(used, 0.05, 1))
+    small = view.halve(1)
+    DenseStore(folder).write_estimate(small, DepthEstimate(depth[::2, ::2], np.full_like(depth[::2, ::2], 0.05)))
+    all_used = used[: small.height * 2, : small.width * 2].reshape(small.height, 2, small.width, 2).all(axis=(1, 3))
+    found = DenseStore(folder).read_estimate(small)
+    np.testing.assert_array_equal(found.depth, np.where(all_used, 3, 0))
 
 
 def test_nothing_is_fused_from_what_is_masked(dense):

@@ -26,16 +26,16 @@ class Memory:
         return self.plane.photo(view)
 
     def has(self, view, kind):
-        return view.name in (self.maps if kind == "geometric" else self.estimates)
+        return view.name in self.maps if kind == "geometric" else (view.name, view.level) in self.estimates
 
     def read_estimate(self, view):
-        return self.estimates[view.name]
+        return self.estimates[view.name, view.level]
 
     def write_estimate(self, view, estimate):
         if len(self.written) == self.full:
             raise KeyboardInterrupt
         self.written.append(view.name)
-        self.estimates[view.name] = estimate
+        self.estimates[view.name, view.level] = estimate
 
     def write_maps(self, view, maps):
         self.written.append(view.name)
@@ -52,7 +52,7 @@ def task_for(views, store):
     def one_by_one(function, items, _):
         return [function(item) for item in items]
 
-    return DepthTask(None, views, rank_neighbors(views, 4), DepthSettings(neighbors=2), store, one_by_one)
+    return DepthTask(None, views, rank_neighbors(views, 4), DepthSettings(neighbors=2, levels=1), store, one_by_one)
 
 
 def test_a_killed_run_goes_on_with_the_photo_it_stopped_at(plane, views):
@@ -80,7 +80,8 @@ def test_a_photo_that_nothing_confirms_has_a_reason_and_no_map(plane, views, mak
     found = make_depth_maps_on_cpu(task_for([*views, stranger], store))
 
     assert found == [None, None, None, Rejected("no photo shares enough points")]
-    assert "stranger.jpg" not in store.estimates | store.maps
+    assert ("stranger.jpg", 0) not in store.estimates
+    assert "stranger.jpg" not in store.maps
     assert all(0 < np.mean(maps.depth > 0) <= 1 for maps in store.maps.values())
 
 

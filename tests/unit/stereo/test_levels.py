@@ -1,0 +1,102 @@
+"""Coarser depth maps fill what finer ones leave open."""
+
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm_app.settings import DepthSettings
+from sfm_app.stereo import DepthMap, DepthTask, make_depth_maps_on_cpu, rank_neighbors
+from sfm_app.stereo.levels import fill_from_coarse, halve_views
+from sfm_app.stereo.normals import fit_planes, plane_normals
+
+CENTERS = [(-0.5, 0, 0), (0, 0, 0), (0.5, 0.1, 0), (0.1, 0.5, 0.05), (-0.2, -0.4, 0)]
+
+
+@pytest.mark.parametrize("size", [(240, 180), (241, 179)])
+def test_a_halved_view_sees_the_same_at_half_the_place(make_view, size):
+    view = make_view((0.1, 0.2, 0), size=size, sample_px=0.0)
+
+    small = view.halve(1)
+
+    assert (small.width, small.height) == (120, size[1] // 2)
+    assert (small.level, small.sample_px) == (1, 0.5)
+    full, half = (at[:, :2] / at[:, 2:] for at in ((view.points @ v.R.T + v.t) @ v.K.T for v in (view, small)))
+    np.testing.assert_allclose(half / [small.width, small.height], full / size, rtol=1e-12)
+    assert [level[0].width for level in halve_views([view], 3)] == [size[0], 120, 60]
+
+
+def maps_of(plane, view):
+    depth = plane.depth(view)
+    return DepthMap(depth, plane_normals(fit_planes(depth), view))
+
+
+@pytest.mark.parametrize("sample_px", [0.0, 0.5])
+def test_holes_get_the_depth_of_the_plane_and_nothing_else_changes(plane, make_view, sample_px):
+    view = make_view((0.1, 0.2, 0), sample_px=sample_px)
+    small, whole = view.halve(1), maps_of(plane, view)
+    coarse = maps_of(plane, small)
+    coarse.depth[:, :20] = 0  # unknown there, too
+    hole = np.zeros(whole.depth.shape, bool)
+    hole[60:120, 10:150] = True
+    fine = DepthMap(np.where(hole, np.float32(0), whole.depth), np.where(hole[..., None], np.float32(0), whole.normals))
+
+    found = fill_from_coarse(fine, view, coarse, small)
+
+    np.testing.assert_array_equal(found.depth[~hole], whole.depth[~hole])
+    filled = hole & (found.depth > 0)
+    assert not found.depth[hole & (np.arange(240) < 39)].any()
+    assert filled.sum() == (hole & (np.arange(240) >= 40)).sum()
+    error = np.abs(found.depth / whole.depth - 1)[filled]
+    assert 0 < error.max() < 2e-4  # the nearest depth without its slope would be 1e-3 off
+    assert (np.einsum("nk,nk->n", found.normals[filled], whole.normals[filled]) > 0.999).all()
+
+
+@dataclass
+class Memory:
+    """A store of noisy photos that show hardly anything."""
+
+    plane: object
+    estimates: dict = field(default_factory=dict)
+    maps: dict = field(default_factory=dict)
+
+    def photo(self, view):
+        full = replace(view, K=np.diag([2.0**view.level, 2.0**view.level, 1]) @ view.K, level=0,
+                       width=view.width << view.level, height=view.height << view.level)  # fmt: skip
+        rng = np.random.default_rng([ord(c) for c in view.name])
+        shown = (
+            128 + 0.04 * (self.plane.photo(full).astype(float) - 128) + rng.normal(0, 2.0, (full.height, full.width))
+        )
+        return cv2.resize(np.round(shown).astype(np.uint8), (view.width, view.height), interpolation=cv2.INTER_AREA)
+
+    def has(self, view, kind):
+        return (view.name, view.level) in (self.maps if kind == "geometric" else self.estimates)
+
+    def read_estimate(self, view):
+        return self.estimates[view.name, view.level]
+
+    def write_estimate(self, view, estimate):
+        self.estimates[view.name, view.level] = estimate
+
+    def write_maps(self, view, maps):
+        self.maps[view.name, view.level] = maps
+
+
+@pytest.mark.slow
+def test_what_noise_hides_is_found_in_smaller_photos(plane, make_view):
+    views = [make_view(center, name=f"{k}.jpg") for k, center in enumerate(CENTERS)]
+    known = []
+    for levels in (1, 2):
+        store = Memory(plane)
+        options = DepthSettings(neighbors=4, levels=levels)
+        one_by_one = lambda function, items, _: [function(item) for item in items]  # noqa: E731
+        make_depth_maps_on_cpu(DepthTask(None, views, rank_neighbors(views, 4), options, store, one_by_one))
+        depth = [store.maps[view.name, 0].depth if (view.name, 0) in store.maps else None for view in views]
+        known.append(np.mean([0.0 if map_ is None else np.mean(map_ > 0) for map_ in depth]))
+        errors = [np.abs(m / plane.depth(v) - 1)[m > 0] for m, v in zip(depth, views, strict=True) if m is not None]
+
+    assert known[0] < 0.1
+    assert 0.3 < known[1] < 0.8
+    assert 1e-4 < np.median(np.concatenate(errors)) < 0.01
+    assert np.percentile(np.concatenate(errors), 95) < 0.02
