@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common.results import Row
+from benchmarks.surface.depth_camera.kinect import KinectTruth, kinect_scores
 from benchmarks.surface.detail import detail_scores
-from benchmarks.surface.kinect import KinectTruth, kinect_scores
 from benchmarks.surface.photos import (
     Likeness,
     leave_out,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.common.photo_sets import FORMATS, link_or_copy, photo_set
-from benchmarks.surface.kinect import KinectTruth, load_kinect
+from benchmarks.surface.depth_camera.kinect import KinectTruth, load_kinect
 from sfm_app.api import open_run
 from sfm_app.pipeline import DEPTH_MAPS, NAMES, TEXTURE, run_stages
 from sfm_app.settings import Settings

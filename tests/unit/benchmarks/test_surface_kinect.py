@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from benchmarks.surface.bars import BARS, bar_rows
-from benchmarks.surface.kinect import (
+from benchmarks.surface.depth_camera.kinect import (
     FOCAL_PX,
     HEIGHT,
     WIDTH,
@@ -15,8 +15,8 @@ from benchmarks.surface.kinect import (
     load_kinect,
     within_reach,
 )
+from benchmarks.surface.depth_camera.scan import PATCH, Scan, align
 from benchmarks.surface.report import page
-from benchmarks.surface.scan import PATCH, Scan, align
 from benchmarks.surface.sets import SCANNED, surface_set
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.synthetic.cameras import Camera, axis_rotation, camera_center, look_at

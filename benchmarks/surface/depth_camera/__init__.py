@@ -1,0 +1,1 @@
+"""Surfaces compared with the scan of a depth camera."""
