@@ -18,9 +18,9 @@ from benchmarks.cameras.bars import BARS
 from benchmarks.cameras.measure import OWN_CAMERA_SETS, measure, warm_up
 from benchmarks.cameras.methods import STOCK, Method, methods, rotate_methods
 from benchmarks.cameras.report import draw, medians, page
-from benchmarks.common.command_line import add_pictures, is_wanted, new_parser, overrides
+from benchmarks.common.command_line import add_pictures, add_results, is_wanted, new_parser, overrides
 from benchmarks.common.photo_sets import PhotoSet, photo_set
-from benchmarks.common.results import RESULTS, Row, document, write
+from benchmarks.common.results import Row, document, write
 
 EXTRA_SETTINGS: tuple[str, ...] = ()
 """Settings for one more run of the program each, unless --also names others."""
@@ -76,8 +76,7 @@ def parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--repeat", type=int, default=1, metavar="N", help="runs of every method")
     parser.add_argument("--twice", action="store_true", help="run ours at least twice and compare the bytes")
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--name", default="cameras", help="name of the result files")
+    add_results(parser, "cameras")
     add_pictures(parser, "result files")
     return parser
 

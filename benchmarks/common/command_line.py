@@ -52,8 +52,31 @@ def add_seeds(parser: argparse.ArgumentParser, seeds: int, name: str) -> None:
     """
     parser.add_argument("--seeds", type=int, default=seeds)
     parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--name", default=name, help="name of the result files")
+    add_results(parser, name)
+
+
+def add_results(parser: argparse.ArgumentParser, name: str) -> None:
+    """Add the options that say where results go.
+
+    Args:
+        parser: where they are added.
+        name: of the result files by default.
+    """
     parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--name", default=name, help="name of the result files")
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """Add the option for settings of the program; `merge_assignments` reads what it gives."""
+    parser.add_argument("--set", dest="assignments", nargs="*", default=[], metavar="TABLE.KEY=VALUE")
+
+
+def merge_assignments(texts: Sequence[str]) -> dict[str, Any]:
+    """Return the settings that texts like TABLE.KEY=VALUE name, nested."""
+    settings: dict[str, Any] = {}
+    for text in texts:
+        settings = merge_nested(settings, parse_assignment(text))
+    return settings
 
 
 def add_pictures(parser: argparse.ArgumentParser, named_by: str) -> None:
@@ -69,13 +92,7 @@ def is_wanted(pictures: Sequence[str] | None, name: str) -> bool:
 
 def overrides(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Read the settings of `--also`, keyed by the text that was typed; a text may hold several, separated by spaces."""
-    found = {}
-    for text in texts:
-        settings: dict[str, Any] = {}
-        for assignment in text.split():
-            settings = merge_nested(settings, parse_assignment(assignment))
-        found[text] = settings
-    return found
+    return {text: merge_assignments(text.split()) for text in texts}
 
 
 def ensure_single_thread() -> None:

@@ -29,11 +29,16 @@ BARS: Mapping[str, tuple[Bar, ...]] = (
 """By photo set: shares of the surface for rendered and scanned scenes, coverage and PSNR of the photos for others."""
 
 
-def bar_rows(rows: Sequence[Row]) -> list[Row]:
-    """Return one row per bar: the bar, the measured value, and whether it is met."""
+def bar_rows(rows: Sequence[Row], bars: Mapping[str, tuple[Bar, ...]] = BARS) -> list[Row]:
+    """Return one row per bar: the bar, the measured value, and whether it is met.
+
+    Args:
+        rows: figures of photo sets.
+        bars: by photo set.
+    """
     found = []
     for row in rows:
-        for bar in BARS.get(row["photos"], ()):
+        for bar in bars.get(row["photos"], ()):
             value = row.get(bar.column)
             reached = value is not None and (value <= bar.bound if bar.at_most else value >= bar.bound)
             found.append({

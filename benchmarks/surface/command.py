@@ -16,8 +16,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common.command_line import add_pictures, is_wanted, new_parser
-from benchmarks.common.results import RESULTS, Row, document, write
+from benchmarks.common.command_line import (
+    add_pictures,
+    add_results,
+    add_settings,
+    is_wanted,
+    merge_assignments,
+    new_parser,
+)
+from benchmarks.common.results import Row, document, write
 from benchmarks.surface.measure import (
     compare_with_kinect,
     compare_with_photos,
@@ -40,8 +47,7 @@ from benchmarks.surface.sets import (
     surface_set,
 )
 from benchmarks.surface.worker import run_stages
-from sfm_app.cli.options import parse_assignment
-from sfm_app.settings import Settings, merge_nested
+from sfm_app.settings import Settings
 from sfm_app.synthetic.pictures import prepare_model
 
 ABOUT = (
@@ -125,9 +131,8 @@ def parser() -> argparse.ArgumentParser:
         "--parts", nargs="+", default=[], metavar=("SET", "COUNT"), help="cost of the first COUNT photos"
     )
     parser.add_argument("--keep", action="store_true", help="reuse stages that are up to date")
-    parser.add_argument("--set", dest="assignments", nargs="*", default=[], metavar="TABLE.KEY=VALUE")
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--name", default="surface", help="name of the result files")
+    add_settings(parser)
+    add_results(parser, "surface")
     add_pictures(parser, "sets")
     return parser
 
@@ -137,9 +142,7 @@ def parse_arguments() -> argparse.Namespace:
     args = parser().parse_args()
     if args.sets is None:
         args.sets = [*RENDERED, *((*REAL, *SCANNED) if args.data else ())]
-    args.settings = {}
-    for assignment in args.assignments:
-        args.settings = merge_nested(args.settings, parse_assignment(assignment))
+    args.settings = merge_assignments(args.assignments)
     return args
 
 

@@ -17,15 +17,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cameras.bars import Bar, upper_bound
-from benchmarks.common.command_line import add_pictures, is_wanted, new_parser
-from benchmarks.common.results import RESULTS, Row, document, table, write
+from benchmarks.common.command_line import (
+    add_pictures,
+    add_results,
+    add_settings,
+    is_wanted,
+    merge_assignments,
+    new_parser,
+)
+from benchmarks.common.results import Row, document, table, write
+from benchmarks.surface.bars import bar_rows
 from benchmarks.surface.lit_model import LitPart, angles_deg, read_lit
 from benchmarks.surface.measure import cost
 from benchmarks.surface.photos import placed_photo, placed_photos
 from benchmarks.surface.pictures import save_page
 from benchmarks.surface.sets import dense_stages, surface_set
 from benchmarks.surface.worker import run_stages
-from sfm_app.cli.options import parse_assignment
 from sfm_app.geometry.triangles import vertex_normals
 from sfm_app.geometry.unit_vectors import normalize
 from sfm_app.hashing import load_arrays
@@ -47,7 +54,7 @@ LAMP = normalize([-1.0, -0.35, -0.45])
 AMBIENT, WHITE, NOTHING = 0.12, 235.0, 255.0
 CROP = 0.3
 """Share of a photo that pictures leave out on each side. Chosen by hand."""
-BARS: Mapping[str, Bar] = {"fountain-P11": upper_bound("mean deg", 8.0)}
+BARS: Mapping[str, tuple[Bar, ...]] = {"fountain-P11": (upper_bound("mean deg", 8.0),)}
 ABOUT = (
     "Runs with at most 50 000 triangles and a normal map; model.glb is read back. In the cameras of the photos, at "
     "every third pixel in both directions, the normal that three.js shades the light model with is compared with the "
@@ -197,15 +204,7 @@ def measure(name: str, cache: Path, args: argparse.Namespace) -> Row:
 
 def page(rows: Sequence[Row], drawn: Mapping[str, str]) -> str:
     """Return the page: bars first, then all figures, then the pictures."""
-    asked = []
-    for row in rows:
-        bar = BARS.get(row["photos"])
-        if bar is not None and not row["failed"]:
-            value = row[bar.column]
-            met = "yes" if value <= bar.bound else "**no**"
-            asked.append(
-                {"photos": row["photos"], "asked": f"{bar.column} at most {bar.bound:g}", "measured": value, "met": met}
-            )
+    asked = bar_rows(rows, BARS)
     parts = [f"# Light models with normal maps\n\n{ABOUT}\n"]
     parts += [f"## Asked and measured\n\n{table(asked)}"] if asked else []
     parts.append(f"## Figures\n\n{table(rows, [name for name in COLUMNS if any(name in row for row in rows)])}")
@@ -222,9 +221,8 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("data", type=Path, nargs="?", help="folder with NAME/images; rendered scenes need none")
     parser.add_argument("--cache", type=Path, help="keeps rendered photos and the runs, which are used again")
     parser.add_argument("--sets", nargs="+", default=["fountain-P11"], help="rendered scenes and names in DATA")
-    parser.add_argument("--set", dest="assignments", nargs="*", default=[], metavar="TABLE.KEY=VALUE")
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--name", default="surface-normal-map", help="name of the result files")
+    add_settings(parser)
+    add_results(parser, "surface-normal-map")
     add_pictures(parser, "sets")
     return parser
 
@@ -232,9 +230,7 @@ def parser() -> argparse.ArgumentParser:
 def main() -> None:
     """Measure all sets, and write the results."""
     args = parser().parse_args()
-    args.settings = {}
-    for assignment in args.assignments:
-        args.settings = merge_nested(args.settings, parse_assignment(assignment))
+    args.settings = merge_assignments(args.assignments)
     rows = []
     with tempfile.TemporaryDirectory(prefix="normal-map-") as scratch:
         cache = (args.cache or Path(scratch)).resolve()

@@ -72,5 +72,15 @@ def select_faces(surface: Surface, keep: NDArray[np.bool_]) -> Surface:
         surface: T triangles and their vertices.
         keep: (T,) True for the triangles to keep.
     """
-    used, faces = np.unique(surface.faces[keep], return_inverse=True)
-    return Surface(surface.vertices[used], faces.reshape(-1, 3).astype(np.int64), surface.colors[used])
+    used, faces = number_vertices(surface.faces[keep])
+    return Surface(surface.vertices[used], faces.astype(np.int64), surface.colors[used])
+
+
+def number_vertices(faces: NDArray[np.integer]) -> tuple[IndexArray, IndexArray]:
+    """Return the vertices (N,) that triangles use, in order, and the triangles (T, 3) with indices among these.
+
+    Args:
+        faces: (T, 3) vertex indices.
+    """
+    used, at = np.unique(faces, return_inverse=True)
+    return used, at.reshape(-1, 3)

@@ -5,7 +5,6 @@ there waits for it instead of compiling it a second time; kernels or types that 
 """
 
 import contextlib
-import importlib
 import json
 import os
 import re
@@ -16,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from hashlib import blake2b
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, TypeAlias
 
 import numba
@@ -52,7 +52,7 @@ def compiling_ahead(parts: Sequence[str], progress: Progress) -> Iterator[None]:
     if not missing:
         yield
         return
-    progress.say("first run on this machine: numeric kernels are compiled in the background, once")
+    progress.say("first run on this machine: the program compiles parts of itself in the background, once")
     running = {part: _start(part) for part in missing}
     wanted = {part: listed_signatures(part) for part in missing}
 
@@ -92,7 +92,7 @@ def compile_part(part: str) -> list[str]:
         for name, signatures in read_list()[part].items():
             for kinds in signatures:
                 try:
-                    _find_kernel(name).compile(tuple(make_type(kind) for kind in kinds))
+                    resolve_name(name).compile(tuple(make_type(kind) for kind in kinds))
                 except Exception as err:  # the run compiles it, or says what is wrong
                     failed.append(f"{name}: {err}")
         for old in stamp.parent.glob(f"compiled-{part}-*"):
@@ -126,7 +126,7 @@ def stamp_file(part: str) -> Path | None:
         part: of `PARTS`.
     """
     names = list(read_list()[part])
-    place = getattr(getattr(_find_kernel(names[0]), "_cache", None), "cache_path", None)
+    place = getattr(getattr(resolve_name(names[0]), "_cache", None), "cache_path", None)
     if place is None:
         return None
     whole = blake2b(digest_size=8)
@@ -135,11 +135,6 @@ def stamp_file(part: str) -> Path | None:
     versions = (numba.__version__, sys.version, get_host_cpu_name())
     whole.update(repr((versions, LIST.read_bytes(), states)).encode())
     return Path(place) / f"compiled-{part}-{whole.hexdigest()}"
-
-
-def _find_kernel(name: str) -> Any:
-    module, _, function = name.rpartition(".")
-    return getattr(importlib.import_module(module), function)
 
 
 def used_kernels() -> dict[str, dict[str, list[list[Kind]]]]:
@@ -178,7 +173,7 @@ def make_type(kind: Kind) -> Any:
     """
     if isinstance(kind, Mapping):
         ((name, parts),) = kind.items()
-        return types.BaseTuple.from_types([make_type(part) for part in parts], _find_kernel(name))
+        return types.BaseTuple.from_types([make_type(part) for part in parts], resolve_name(name))
     if not isinstance(kind, str):
         return types.BaseTuple.from_types([make_type(part) for part in kind])
     if found := ARRAY.fullmatch(kind):

@@ -41,6 +41,11 @@ class DepthMap:
     normals: NDArray[np.float32]
     """(H, W, 3) unit, camera frame, towards the camera; 0 where the depth is 0."""
 
+    @classmethod
+    def unknown(cls, view: View) -> "DepthMap":
+        """Return a map of a photo without any depth."""
+        return cls(np.zeros((view.height, view.width), np.float32), np.zeros((view.height, view.width, 3), np.float32))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthEstimate:

@@ -109,13 +109,9 @@ def make_depth_maps_on_cpu(task: DepthTask) -> list[Rejected | None]:
 
 
 def _match(inputs: Shared[_Inputs], index: int) -> Rejected | None:
-    """Match a photo at every level; a coarser level may fail."""
-    task = inputs.value
-    found = _match_level(task, 0, index)
-    for level in range(1, len(task.levels)):
-        if found is None:
-            _match_level(task, level, index)
-    return found
+    """Match a photo at every level; one is enough."""
+    found = [_match_level(inputs.value, level, index) for level in range(len(inputs.value.levels))]
+    return None if None in found else found[0]
 
 
 def _match_level(task: _Inputs, level: int, index: int) -> Rejected | None:
@@ -141,12 +137,13 @@ def _confirm(inputs: Shared[_Inputs], usable: NDArray[np.bool_], index: int) -> 
     if task.store.has(view, "geometric"):
         return None
     found = _confirm_level(task, 0, usable, index)
-    if isinstance(found, Rejected):
-        return found
     for level in range(1, len(task.levels)):
         coarse = _confirm_level(task, level, usable, index)
         if not isinstance(coarse, Rejected):
-            found = fill_from_coarse(found, view, coarse, task.levels[level][index])
+            fine = DepthMap.unknown(view) if isinstance(found, Rejected) else found
+            found = fill_from_coarse(fine, view, coarse, task.levels[level][index])
+    if isinstance(found, Rejected):
+        return found
     task.store.write_maps(view, found)
     return None
 

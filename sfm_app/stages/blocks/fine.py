@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.atomic_io import replace_atomically
+from sfm_app.geometry.triangles import number_vertices
 from sfm_app.hashing import load_arrays
 from sfm_app.types import Surface
 
@@ -34,8 +35,8 @@ class FineShape:
 
     def select(self, keep: NDArray[np.bool_]) -> "FineShape":
         """Return the marked triangles (T,) with the vertices that they use."""
-        used, faces = np.unique(self.faces[keep], return_inverse=True)
-        return FineShape(self.vertices[used], faces.reshape(-1, 3).astype(np.int32))
+        used, faces = number_vertices(self.faces[keep])
+        return FineShape(self.vertices[used], faces.astype(np.int32))
 
 
 def save_fine(parts: Iterable[FineShape], path: Path) -> None:

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from sfm_app.settings import DepthSettings
-from sfm_app.stereo import DepthMap, DepthTask, make_depth_maps_on_cpu, rank_neighbors
+from sfm_app.stereo import DepthMap, DepthTask, make_depth_maps_on_cpu, method, rank_neighbors
 from sfm_app.stereo.levels import fill_from_coarse, halve_views
 from sfm_app.stereo.normals import fit_planes, plane_normals
+from sfm_app.types import Rejected
 
 CENTERS = [(-0.5, 0, 0), (0, 0, 0), (0.5, 0.1, 0), (0.1, 0.5, 0.05), (-0.2, -0.4, 0)]
 
@@ -58,6 +59,7 @@ class Memory:
     """A store of noisy photos that show hardly anything."""
 
     plane: object
+    contrast: float = 0.04
     estimates: dict = field(default_factory=dict)
     maps: dict = field(default_factory=dict)
 
@@ -66,7 +68,9 @@ class Memory:
                        width=view.width << view.level, height=view.height << view.level)  # fmt: skip
         rng = np.random.default_rng([ord(c) for c in view.name])
         shown = (
-            128 + 0.04 * (self.plane.photo(full).astype(float) - 128) + rng.normal(0, 2.0, (full.height, full.width))
+            128
+            + self.contrast * (self.plane.photo(full).astype(float) - 128)
+            + rng.normal(0, 2.0, (full.height, full.width))
         )
         return cv2.resize(np.round(shown).astype(np.uint8), (view.width, view.height), interpolation=cv2.INTER_AREA)
 
@@ -83,15 +87,21 @@ class Memory:
         self.maps[view.name, view.level] = maps
 
 
+def task_of(views, store, levels):
+    def one_by_one(function, items, _):
+        return [function(item) for item in items]
+
+    options = DepthSettings(neighbors=4, levels=levels)
+    return DepthTask(None, views, rank_neighbors(views, 4), options, store, one_by_one)
+
+
 @pytest.mark.slow
 def test_what_noise_hides_is_found_in_smaller_photos(plane, make_view):
     views = [make_view(center, name=f"{k}.jpg") for k, center in enumerate(CENTERS)]
     known = []
     for levels in (1, 2):
         store = Memory(plane)
-        options = DepthSettings(neighbors=4, levels=levels)
-        one_by_one = lambda function, items, _: [function(item) for item in items]  # noqa: E731
-        make_depth_maps_on_cpu(DepthTask(None, views, rank_neighbors(views, 4), options, store, one_by_one))
+        make_depth_maps_on_cpu(task_of(views, store, levels))
         depth = [store.maps[view.name, 0].depth if (view.name, 0) in store.maps else None for view in views]
         known.append(np.mean([0.0 if map_ is None else np.mean(map_ > 0) for map_ in depth]))
         errors = [np.abs(m / plane.depth(v) - 1)[m > 0] for m, v in zip(depth, views, strict=True) if m is not None]
@@ -100,3 +110,23 @@ def test_what_noise_hides_is_found_in_smaller_photos(plane, make_view):
     assert 0.3 < known[1] < 0.8
     assert 1e-4 < np.median(np.concatenate(errors)) < 0.01
     assert np.percentile(np.concatenate(errors), 95) < 0.02
+
+
+@pytest.mark.slow
+def test_a_photo_that_nothing_confirms_at_full_size_has_the_depths_of_the_smaller_one(plane, make_view, monkeypatch):
+    views, whole = [make_view(center, name=f"{k}.jpg") for k, center in enumerate(CENTERS)], method.confirm_depths
+    reason = Rejected("no depth is confirmed by other photos")
+
+    def confirm(view, *rest):
+        return reason if view.level == 0 and view.name == "1.jpg" else whole(view, *rest)
+
+    monkeypatch.setattr(method, "confirm_depths", confirm)
+    for levels, expected in ((1, reason), (2, None)):
+        store = Memory(plane, contrast=1.0)
+        found = make_depth_maps_on_cpu(task_of(views, store, levels))
+
+        assert found[1] == expected
+        assert found[0] is None
+    depth = store.maps["1.jpg", 0].depth
+    assert 0.4 < np.mean(depth > 0) <= 1
+    assert 1e-4 < np.median(np.abs(depth / plane.depth(views[1]) - 1)[depth > 0]) < 0.01
