@@ -38,7 +38,8 @@ def wait_where(is_awaited: IsAwaited | None) -> None:
     """Let kernels be waited for where another process is about to compile them.
 
     Args:
-        is_awaited: asked again and again while a kernel is not in the cache; None for not waiting any more.
+        is_awaited: asked again and again while a kernel is not in the cache, and may raise; None for not waiting any
+            more.
     """
     _Waiting.is_awaited = is_awaited
 
@@ -79,8 +80,8 @@ def _wait_for_others(name: str, compiled: Any) -> None:
 
     def load_or_wait(signature: Any, target: Any) -> Any:
         ASKED_FOR[name, tuple(signature)] = None
-        found = load(signature, target)
-        while found is None and (ask := _Waiting.is_awaited) is not None and ask(name, signature):
+        found, ask = load(signature, target), _Waiting.is_awaited
+        while found is None and ask is not None and ask(name, signature):
             time.sleep(POLL_S)
             found = load(signature, target)
         return found

@@ -9,7 +9,6 @@ from sfm_app.camera_files import read_given_cameras
 from sfm_app.engine.execution import Pipeline
 from sfm_app.engine.stage import Products, Stage
 from sfm_app.photos import read_source
-from sfm_app.runtime.compiling import PARTS, compiling_ahead
 from sfm_app.runtime.context import CONTROL_POINTS, GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.scale import MetricFrame, read_control_points
@@ -43,6 +42,7 @@ VIEW_GRAPH: Stage[ViewGraph] = Stage(
     make=lambda given, run: view_graph.make(given[MATCH_GRAPH], run),
     load=lambda _, run: view_graph.load(run),
     digest=view_graph.digest,
+    kernels="cameras",
     grows=True,
 )
 INTRINSICS: Stage[Intrinsics] = Stage(
@@ -53,6 +53,7 @@ INTRINSICS: Stage[Intrinsics] = Stage(
     make=lambda given, run: intrinsics.make(given[MATCH_GRAPH], given[VIEW_GRAPH], run),
     load=lambda _, run: intrinsics.load(run),
     digest=intrinsics.digest,
+    kernels="cameras",
     grows=True,
 )
 SCENE: Stage[Scene] = Stage(
@@ -63,6 +64,7 @@ SCENE: Stage[Scene] = Stage(
     make=lambda given, run: scene.make(given[MATCH_GRAPH], given[VIEW_GRAPH], given[INTRINSICS], run),
     load=lambda _, run: scene.load(run),
     digest=scene.digest,
+    kernels="cameras",
     grows=True,
 )
 SCALE: Stage[MetricFrame] = Stage(
@@ -82,6 +84,7 @@ DEPTH_MAPS: Stage[Path] = Stage(
     make=lambda given, run: depth_maps.make(given[SCENE], run),
     load=lambda _, run: depth_maps.load(run),
     digest=depth_maps.digest,
+    kernels="surface",
 )
 MESH: Stage[Surface] = Stage(
     name="mesh",
@@ -91,6 +94,7 @@ MESH: Stage[Surface] = Stage(
     make=lambda given, run: mesh.make(given[SCENE], given[DEPTH_MAPS], run),
     load=lambda _, run: mesh.load(run),
     digest=mesh.digest,
+    kernels="surface",
 )
 TEXTURE: Stage[Model] = Stage(
     name="texture",
@@ -100,6 +104,7 @@ TEXTURE: Stage[Model] = Stage(
     make=lambda given, run: texture.make(given[SCENE], given[MESH], run),
     load=lambda _, run: texture.load(run),
     digest=texture.digest,
+    kernels="surface",
 )
 FILES: Stage[tuple[Path, ...]] = Stage(
     name="files",
@@ -134,12 +139,4 @@ def run_stages(
         run = replace(run, control_points=read_control_points(Path(run.settings.scale.control_points)))
     source = read_source(photo_dir, place.root, options, partial(ordered_map, run.executor, ahead=4 * run.workers))
     source.check_settings(run.settings)
-    with compiling_ahead(_parts_to_compile(last, run), run.progress):
-        return PIPELINE.run(source, run, first, last, wanted)
-
-
-def _parts_to_compile(last: str, run: RunContext) -> Sequence[str]:
-    """Return the parts of the list of kernels that a run needs; none where its cameras are known already."""
-    if last == PHOTOS.name or run.workspace.manifest.record(VIEW_GRAPH.name) is not None:
-        return ()
-    return PARTS if not last or last in NAMES[NAMES.index(DEPTH_MAPS.name) :] else PARTS[:1]
+    return PIPELINE.run(source, run, first, last, wanted)

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -21,6 +21,7 @@ from sfm_app.engine.usage import measure_usage
 from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError
 from sfm_app.hashing import fingerprint
 from sfm_app.photos import Source
+from sfm_app.runtime.compiling import PARTS, compiling_ahead
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import choose_plan
 from sfm_app.runtime.earlier import Earlier
@@ -129,7 +130,13 @@ class _Execution:
         self.earlier = self.find_earlier(reasons)
         reasons = spread_reasons(later, reasons, (photos.name,) if self.first == photos.name else ())
         ahead = [name for name, again in reasons.items() if again is not None]
-        with _limit_workers(self.products[photos], ahead, self.run) as run:
+        kernels = [part for part in PARTS if any(stage.kernels == part for stage in later if stage.name in ahead)]
+        with (
+            compiling_ahead(kernels, self.run.progress) as has_ended,
+            _limit_workers(self.products[photos], ahead, self.run) as run,
+            ExitStack() as first,
+        ):
+            first.callback(has_ended.set)  # else workers that wait for kernels hold up an interrupted run
             for stage in later:
                 self.run_stage(stage, reasons[stage.name], run)
                 forget_earlier(run, if_finished=True)

@@ -41,28 +41,33 @@ class by name for a named one."""
 
 
 @contextlib.contextmanager
-def compiling_ahead(parts: Sequence[str], progress: Progress) -> Iterator[None]:
+def compiling_ahead(parts: Sequence[str], progress: Progress) -> Iterator[threading.Event]:
     """Compile kernels in the background for the duration of the block, unless the machine has them already.
+
+    The block gets an event. Once it is set, whoever needs a kernel that is not there has an InterruptedError instead.
 
     Args:
         parts: of `PARTS`.
         progress: is told about it.
     """
+    has_ended = threading.Event()
     missing = [part for part in parts if (stamp := stamp_file(part)) and not stamp.exists()]
     if not missing:
-        yield
+        yield has_ended
         return
-    progress.say("first run on this machine: the program compiles parts of itself in the background, once")
+    progress.say("first run on this machine: parts of the program are compiled, once; stages that need them wait")
     running = {part: _start(part) for part in missing}
     wanted = {part: listed_signatures(part) for part in missing}
 
     def is_awaited(name: str, signature: Any) -> bool:
+        if has_ended.is_set():
+            raise InterruptedError("the run has ended")
         asked = name, json.dumps([describe(kind) for kind in signature])
         return any(asked in wanted[part] and process.poll() is None for part, process in running.items())
 
     wait_where(is_awaited)
     try:
-        yield
+        yield has_ended
     finally:
         wait_where(None)
         for process in running.values():

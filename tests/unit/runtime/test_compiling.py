@@ -157,6 +157,31 @@ time.sleep(60)
     assert jit._Waiting.is_awaited is None
 
 
+def test_whoever_needs_a_kernel_of_a_run_that_has_ended_ends_with_it(listed, monkeypatch):
+    idle = "import time; time.sleep(60)"
+    monkeypatch.setattr(compiling, "_start", lambda _: subprocess.Popen([sys.executable, "-c", idle]))
+    failed = []
+
+    def call():
+        try:
+            few_kernels.twice(np.ones(2))
+        except InterruptedError as err:
+            failed.append(str(err))
+
+    with compiling_ahead(["cameras"], Listener()) as has_ended:
+        import few_kernels
+
+        waiting = threading.Thread(target=call)
+        waiting.start()
+        waiting.join(0.5)
+        assert waiting.is_alive()
+        has_ended.set()
+        waiting.join(5)
+        call()
+        assert failed == ["the run has ended", "the run has ended"]
+    assert few_kernels.twice(np.ones(2)).tolist() == [2.0, 2.0]
+
+
 def test_no_process_is_left_behind(listed):
     code = """
 import os, sys
