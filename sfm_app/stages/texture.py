@@ -175,11 +175,11 @@ def read_texture(place: Workspace) -> Model:
     surface = Surface(stored["vertices"], stored["faces"], stored["colors"])
     if "uv" not in stored:
         return Model(surface)
-    pages, normals = _numbered(stored, "page"), _numbered(stored, NORMALS)
+    pages, normals = _list_numbered(stored, "page"), _list_numbered(stored, NORMALS)
     return Model(surface, Texture(stored["uv"], stored["page"], pages, normals))
 
 
-def _numbered(stored: Mapping[str, NDArray[Any]], kind: str) -> tuple[NDArray[Any], ...]:
+def _list_numbered(stored: Mapping[str, NDArray[Any]], kind: str) -> tuple[NDArray[Any], ...]:
     """Return the arrays whose names are a kind and a number, from 0 on."""
     found = list[NDArray[Any]]()
     while (array := stored.get(f"{kind}{len(found)}")) is not None:

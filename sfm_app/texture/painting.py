@@ -128,28 +128,39 @@ def paint(
         ax, ay = corners[f, 0, 0], corners[f, 0, 1]
         bx, by = corners[f, 1, 0] - ax, corners[f, 1, 1] - ay
         cx, cy = corners[f, 2, 0] - ax, corners[f, 2, 1] - ay
-        turn = bx * cy - by * cx
-        _set_insets(corners[f], rims[n], abs(turn), least)
+        _set_insets(corners[f], rims[n], abs(bx * cy - by * cx), least)
         x0, x1 = int(min(0.0, bx, cx) + ax - MARGIN - 1), int(max(0.0, bx, cx) + ax + MARGIN + 1)
         y0, y1 = int(min(0.0, by, cy) + ay - MARGIN - 1), int(max(0.0, by, cy) + ay + MARGIN + 1)
         for y in range(max(y0, 0), min(y1, height - 1) + 1):
             for x in range(max(x0, 0), min(x1, width - 1) + 1):
                 if owner[y, x] != f:
                     continue
-                dx, dy = x + 0.5 - ax, y + 0.5 - ay
-                if turn != 0.0:
-                    part[1], part[2] = (dx * cy - dy * cx) / turn, (bx * dy - by * dx) / turn
-                else:
-                    part[1] = part[2] = 0.0
-                # margins of thin triangles must not be extrapolated far
-                part[1], part[2] = min(max(part[1], -1.0), 2.0), min(max(part[2], -1.0), 2.0)
-                part[0] = 1.0 - part[1] - part[2]
+                set_shares(corners[f], x + 0.5, y + 0.5, part)
                 _clamp_coordinates(part, least)
                 px = part[0] * points[n, 0, 0] + part[1] * points[n, 1, 0] + part[2] * points[n, 2, 0]
                 py = part[0] * points[n, 0, 1] + part[1] * points[n, 1, 1] + part[2] * points[n, 2, 1]
                 pz = part[0] * points[n, 0, 2] + part[1] * points[n, 1, 2] + part[2] * points[n, 2, 2]
                 u, v, _ = project(camera, px, py, pz)
                 _add(photo, brightness, (u, v), part, shares[n], total[y, x])
+
+
+@kernel
+def set_shares(corner: FloatArray, x: float, y: float, part: FloatArray) -> None:
+    """Set the barycentric coordinates of a texel, which may lie in the margin of its triangle.
+
+    Args:
+        corner: (3, 2) corners of the triangle in texels.
+        x, y: center of the texel.
+        part: (3,) is set.
+    """
+    ax, ay = corner[0, 0], corner[0, 1]
+    bx, by, cx, cy = corner[1, 0] - ax, corner[1, 1] - ay, corner[2, 0] - ax, corner[2, 1] - ay
+    turn, dx, dy = bx * cy - by * cx, x - ax, y - ay
+    part[1] = (dx * cy - dy * cx) / turn if turn != 0.0 else 0.0
+    part[2] = (bx * dy - by * dx) / turn if turn != 0.0 else 0.0
+    # margins of thin triangles must not be extrapolated far
+    part[1], part[2] = min(max(part[1], -1.0), 2.0), min(max(part[2], -1.0), 2.0)
+    part[0] = 1.0 - part[1] - part[2]
 
 
 @kernel

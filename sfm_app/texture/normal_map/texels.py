@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.texture.facets import NONE, IntArray
+from sfm_app.texture.painting import set_shares
 
 FloatArray = NDArray[np.float64]
 
@@ -35,7 +36,7 @@ def texel_frames(
             f = owner[y, x]
             if f == NONE:
                 continue
-            _set_shares(corners[f], x + 0.5, top + y + 0.5, part)
+            set_shares(corners[f], x + 0.5, top + y + 0.5, part)
             for axis in range(3):
                 where[n, axis] = _mix(part, points[f, :, axis])
             _set_frame(part, frames[f], found[n])
@@ -52,19 +53,6 @@ def _set_frame(part: FloatArray, frames: FloatArray, found: FloatArray) -> None:
             found[row, axis] = _mix(part, frames[:, row, axis])
             length += found[row, axis] ** 2
         found[row] /= np.sqrt(length) if length > 0.0 else 1.0
-
-
-@kernel
-def _set_shares(corner: FloatArray, x: float, y: float, part: FloatArray) -> None:
-    """Set the barycentric coordinates of a texel, which may lie in the margin of its triangle."""
-    ax, ay = corner[0, 0], corner[0, 1]
-    bx, by, cx, cy = corner[1, 0] - ax, corner[1, 1] - ay, corner[2, 0] - ax, corner[2, 1] - ay
-    turn, dx, dy = bx * cy - by * cx, x - ax, y - ay
-    part[1] = (dx * cy - dy * cx) / turn if turn != 0.0 else 0.0
-    part[2] = (bx * dy - by * dx) / turn if turn != 0.0 else 0.0
-    # margins of thin triangles must not be extrapolated far
-    part[1], part[2] = min(max(part[1], -1.0), 2.0), min(max(part[2], -1.0), 2.0)
-    part[0] = 1.0 - part[1] - part[2]
 
 
 @kernel
