@@ -199,6 +199,9 @@ class DepthSettings(Section):
         0.01, gt=0, le=1, description="largest relative depth difference between photos that agree"
     )
     min_agreeing: int = Field(1, ge=1, le=20, description="other photos that have to agree with a depth")
+    drop_sky: bool = Field(
+        True, description="remove depths in bright, even areas that other photos show to be infinitely far; false: keep"
+    )
 
 
 class MeshSettings(Section):

@@ -8,30 +8,37 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from sfm_app.atomic_io import mark_finished, mark_unfinished, resume_or_clear
+from sfm_app.atomic_io import mark_finished, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.colmap.dense import (
     DenseStore,
     digest_maps,
     drop_estimates,
+    map_file,
     mask_depths,
     read_depth,
+    read_gray,
     read_views,
     undistort,
+    write_depth,
     write_fusion_views,
 )
 from sfm_app.colmap.masks import MaskUndistorter, has_masks
 from sfm_app.colmap.wide_views import WideLens, split_wide_photos, write_model, write_views
 from sfm_app.errors import ReconstructionError
-from sfm_app.hashing import fingerprint
+from sfm_app.hashing import fingerprint, load_arrays
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.stereo import DepthTask, View, rank_neighbors
+from sfm_app.stereo.sky import PhotoAreas, Votes, blank_areas, count_votes, find_skies, sky_pixels
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Rejected, Scene
 
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
 
+SKIES = "skies.npz"
+"""File with the cells of each photo that show sky."""
 CONFIRMING_FACTOR = 2
 """A depth map is checked against this many times as many photos as it was made from."""
 
@@ -59,6 +66,8 @@ def make(scene: Scene, run: RunContext) -> Path:
     ranked = rank_neighbors(views, CONFIRMING_FACTOR * options.neighbors)
     with single_threaded_opencv():
         found = method.make(DepthTask(dense_dir, views, ranked, options, DenseStore(dense_dir), run.map))
+    if options.drop_sky:
+        drop_skies(dense_dir, [view for view in views if map_file(dense_dir, view).exists()], run)
     if has_masks(dense_dir):
         run.map(Task(mask_depths, dense_dir), views, "masking depth maps")
     record(dense_dir, views, found, run)
@@ -122,6 +131,53 @@ def _look_into(
 ) -> None:  # fmt: skip
     name, camera_id = photo
     write_views(name, lenses.value[camera_id], photo_dir, mask_dir, dense_dir)
+
+
+def drop_skies(dense_dir: Path, views: Sequence[View], run: RunContext) -> None:
+    """Remove the depths of what is infinitely far: semi-global matching carries depths on along its rims.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        views: those that have a map.
+        run: the run.
+    """
+    kept = dense_dir / SKIES
+    if not kept.exists():  # a killed run has removed depths by it, and would find other skies now
+        areas = run.map(Task(find_blank_areas, dense_dir), views, "looking for the sky")
+        votes = run.map(Task(_count_votes, Shared(areas), views), range(len(views)), "comparing skies")
+        with replace_atomically(kept) as path:
+            np.savez(
+                path,
+                allow_pickle=False,
+                **{str(number): cells for number, cells in enumerate(find_skies(areas, votes))},
+            )
+    skies = load_arrays(kept)
+    shares = run.map(Task(_drop_sky, dense_dir, Shared(skies)), list(enumerate(views)), "dropping the sky")
+    run.record(sky=round(float(np.mean(shares)), 3) if shares else 0.0)
+
+
+def find_blank_areas(dense_dir: Path, view: View) -> PhotoAreas:
+    """Return the blank areas of a photo.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        view: a photo with a map.
+    """
+    return blank_areas(read_gray(dense_dir, view), read_depth(dense_dir, view, "geometric"))
+
+
+def _count_votes(areas: Shared[Sequence[PhotoAreas]], views: Sequence[View], index: int) -> Votes:
+    return count_votes(areas.value, views, index)
+
+
+def _drop_sky(dense_dir: Path, skies: Shared[Mapping[str, NDArray[np.bool_]]], photo: tuple[int, View]) -> float:
+    """Remove the depths of the sky of one photo, and return its share of the photo."""
+    number, view = photo
+    sky = sky_pixels(read_gray(dense_dir, view), skies.value[str(number)])
+    if sky.any():
+        depth = read_depth(dense_dir, view, "geometric")
+        write_depth(dense_dir, view, np.where(sky & (depth > 0), np.float32(0), depth))
+    return float(sky.mean())
 
 
 def record(dense_dir: Path, views: Sequence[View], found: Sequence[Rejected | None], run: RunContext) -> None:

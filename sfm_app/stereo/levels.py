@@ -8,6 +8,7 @@ stereo. CVPR 2019).
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfm_app.stereo.depth import DepthMap
 from sfm_app.stereo.view import View
@@ -26,7 +27,7 @@ def halve_views(views: Sequence[View], levels: int) -> list[list[View]]:
     return [list(views), *([view.halve(level) for view in views] for level in range(1, levels))]
 
 
-def fill_from_coarse(fine: DepthMap, view: View, coarse: DepthMap, small: View) -> DepthMap:
+def fill_from_coarse(fine: DepthMap, view: View, coarse: DepthMap, small: View, closed: NDArray[np.bool_]) -> DepthMap:
     """Return a depth map with the depths of a coarser one, along its planes, where it has none.
 
     Args:
@@ -34,8 +35,9 @@ def fill_from_coarse(fine: DepthMap, view: View, coarse: DepthMap, small: View) 
         view: the photo.
         coarse: of the smaller photo.
         small: the smaller photo.
+        closed: (H, W) where nothing is filled in.
     """
-    row, col = np.nonzero(fine.depth == 0)
+    row, col = np.nonzero((fine.depth == 0) & ~closed)
     x = (col + view.sample_px) * (small.width / view.width)
     y = (row + view.sample_px) * (small.height / view.height)
     i, j = y.astype(np.int64).clip(0, small.height - 1), x.astype(np.int64).clip(0, small.width - 1)
