@@ -1,4 +1,4 @@
-"""Blank areas of a photo, each of which may be sky: bright, even, without depths."""
+"""Blank areas of a photo, each of which may be sky: even, without depths, and brighter than most surfaces."""
 
 from dataclasses import dataclass
 
@@ -17,9 +17,9 @@ MOST_VARIATION = 6.0
 noise and compression included; the ground of castle-P19 has 3, plain walls 1 to 2. Chosen by hand."""
 OPEN_SHARE, KNOWN_SHARE = 0.2, 0.5
 """Share of the pixels of a cell with a depth: it is open below the first, known from the second. Chosen by hand."""
-BRIGHT_RANK = 0.6
-"""Share of the photo that is darker than a sky, on average. Chosen on castle-P19, where the sky has 0.89 and more and
-the ground 0.4; `railing`, `garden` and `statue` have 0.64 and more."""
+BRIGHT_RANK = 0.75
+"""Share of the surfaces in a photo that are darker than a sky. Chosen on castle-P19 and `garden`, where skies have 1.0 and
+0.81 and more, and most of castle-P19's ground and kitchen1000's furniture 0.0 to 0.4."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,21 +55,33 @@ def blank_areas(photo: GrayImage, depth: DepthArray) -> PhotoAreas:
     variation = np.sqrt(np.maximum(cv2.blur(gray * gray, (WINDOW_PX, WINDOW_PX)) - mean * mean, 0))
     cells, known = to_cells(gray), to_cells((depth > 0).astype(np.float32))
     blank = (known < OPEN_SHARE) & (to_cells(variation) <= MOST_VARIATION)
-    labels = _keep_bright(cv2.connectedComponents(blank.view(np.uint8), connectivity=4)[1], cells)
+    labels = cv2.connectedComponents(blank.view(np.uint8), connectivity=4)[1]
+    surfaces = known >= KNOWN_SHARE
+    labels = _keep_bright(labels, cells, np.sort(cells[surfaces]))
     size = np.bincount(labels.ravel())
     at_border = np.zeros(len(size), bool)
     at_border[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = True
     at_border[0] = False
-    mean_gray = np.bincount(labels.ravel(), cells.ravel()) / np.maximum(size, 1)
-    return PhotoAreas(labels.astype(np.uint16), known >= KNOWN_SHARE, size, mean_gray, at_border)
+    return PhotoAreas(labels.astype(np.uint16), surfaces, size, _mean_gray(labels, cells), at_border)
 
 
-def _keep_bright(labels: NDArray[np.int32], gray: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return labels of the areas that are brighter than most of the photo, numbered from 1; 0 elsewhere."""
-    rank = np.searchsorted(np.sort(gray, axis=None), gray) / gray.size
-    bright = np.bincount(labels.ravel(), rank.ravel()) >= BRIGHT_RANK * np.bincount(labels.ravel())
+def _keep_bright(
+    labels: NDArray[np.int32], gray: NDArray[np.float32], surfaces: NDArray[np.float32]
+) -> NDArray[np.int64]:
+    """Return the areas that are brighter than most surfaces, numbered from 1; 0 elsewhere.
+
+    Args:
+        labels: (h, w) of all areas.
+        gray: (h, w) mean gray levels.
+        surfaces: (S,) gray levels of what has a depth, ascending.
+    """
+    bright = np.searchsorted(surfaces, _mean_gray(labels, gray)) >= max(1.0, BRIGHT_RANK * len(surfaces))
     bright[0] = False
     return np.asarray((np.cumsum(bright) * bright)[labels])
+
+
+def _mean_gray(labels: NDArray[np.signedinteger], gray: NDArray[np.float32]) -> NDArray[np.float64]:
+    return np.asarray(np.bincount(labels.ravel(), gray.ravel()) / np.maximum(np.bincount(labels.ravel()), 1))
 
 
 def to_cells(values: NDArray[np.float32]) -> NDArray[np.float32]:

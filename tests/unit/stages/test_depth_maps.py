@@ -95,8 +95,52 @@ def test_the_manifest_says_what_was_done(scene):
 
     assert counts == {
         "method": "ours", "method_reason": "installed and able to run here", "depth_maps": 2,
-        "rejected": {"too dark": 1}, "coverage": {"1.png": 0.5, "3.png": 0.5},
+        "rejected": {"too dark": 1}, "coverage": {"1.png": 0.5, "3.png": 0.5}, "sky": 0.0,
     }  # fmt: skip
+
+
+@pytest.fixture
+def upside_down(scene):
+    """Photos of a textured wall above a bright sky; the depths of `Method` reach four rows into it."""
+    for path in scene.photo_dir.iterdir():
+        photo = np.random.default_rng(3).integers(0, 160, (60, 80, 3), np.uint8)
+        photo[26:] = 230
+        cv2.imwrite(str(path), photo)
+    return scene
+
+
+def test_depths_in_the_sky_are_removed(upside_down):
+    counts = run_stage(upside_down, Method())
+
+    depth = read_depth(upside_down.dense_dir, read_views(upside_down.dense_dir)[0], "geometric")
+    assert counts["sky"] == pytest.approx(32 / 60, abs=0.03)  # the area begins below the depths, and reaches two rows up
+    assert (depth[:26] == 3).all()
+    assert not depth[28:, :78].any()  # COLMAP leaves the last column black
+
+
+def test_depths_in_the_sky_stay_where_that_is_asked_for(upside_down):
+    counts = run_stage(upside_down, Method(), drop_sky=False)
+
+    depth = read_depth(upside_down.dense_dir, read_views(upside_down.dense_dir)[0], "geometric")
+    assert "sky" not in counts
+    assert (depth[:30] == 3).all()
+
+
+def test_a_run_that_is_killed_while_it_removes_the_sky_finds_the_same_sky(upside_down, monkeypatch):
+    whole = run_stage(upside_down, Method())
+    dropped = [read_depth(upside_down.dense_dir, view, "geometric") for view in read_views(upside_down.dense_dir)]
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(depth_maps, "record", stop)
+        with pytest.raises(KeyboardInterrupt):
+            run_stage(upside_down, Method(), "again")
+
+    assert run_stage(upside_down, Method(), "again") == whole
+    for view, before in zip(read_views(upside_down.dense_dir), dropped, strict=True):
+        np.testing.assert_array_equal(read_depth(upside_down.dense_dir, view, "geometric"), before)
 
 
 def test_a_killed_run_keeps_what_it_made(scene):

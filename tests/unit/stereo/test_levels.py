@@ -43,7 +43,7 @@ def test_holes_get_the_depth_of_the_plane_and_nothing_else_changes(plane, make_v
     hole[60:120, 10:150] = True
     fine = DepthMap(np.where(hole, np.float32(0), whole.depth), np.where(hole[..., None], np.float32(0), whole.normals))
 
-    found = fill_from_coarse(fine, view, coarse, small)
+    found = fill_from_coarse(fine, view, coarse, small, np.zeros(hole.shape, bool))
 
     np.testing.assert_array_equal(found.depth[~hole], whole.depth[~hole])
     filled = hole & (found.depth > 0)
