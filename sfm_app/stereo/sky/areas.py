@@ -18,8 +18,8 @@ noise and compression included; the ground of castle-P19 has 3, plain walls 1 to
 OPEN_SHARE, KNOWN_SHARE = 0.2, 0.5
 """Share of the pixels of a cell with a depth: it is open below the first, known from the second. Chosen by hand."""
 BRIGHT_RANK = 0.75
-"""Share of the surfaces in a photo that are darker than a sky. Chosen on castle-P19 and `garden`, where skies have 1.0 and
-0.81 and more, and most of castle-P19's ground and kitchen1000's furniture 0.0 to 0.4."""
+"""Share of the surfaces in a photo that are darker than a sky. Chosen on castle-P19 and `garden`, where skies have 1.0
+and 0.81 and more, and most of castle-P19's ground and kitchen1000's furniture 0.0 to 0.4."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
