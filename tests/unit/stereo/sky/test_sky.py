@@ -76,7 +76,7 @@ def test_depths_that_matching_carried_into_the_sky_are_in_it():
     ]
 
     for rim, found in zip(rims, skies_of(spoiled), strict=True):
-        assert found[rim].mean() > 0.95
+        assert found[rim].mean() > 0.8  # all but the pixel beside the outline
 
 
 def test_a_plain_wall_is_no_sky():
