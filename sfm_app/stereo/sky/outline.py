@@ -12,6 +12,9 @@ depths on. Chosen on `garden` and `ornament`."""
 TOLERANCE = 4.0
 """Largest difference in gray levels from the sky around, after noise is smoothed. Chosen on `railing`, where 4 marks
 88 % of the sky and 0.04 % of what is not, and 5 gains a hundredth."""
+NARROW_PX, RIM_PX = 9, 2
+"""Width below which a thing before the sky is narrow, and the rim of depths that it keeps on each side: two pixels of
+depths are too few for a surface. Chosen on `railing`."""
 LEAST_WEIGHT = 1e-4
 """Of the sky around that is averaged. By definition: rounding."""
 
@@ -26,11 +29,19 @@ def sky_pixels(photo: GrayImage, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     if not cells.any():
         return np.zeros(photo.shape, bool)
     shape, reach = photo.shape[::-1], REACH * max(cells.shape)
-    sky, side = cells.astype(np.float32), 2 * round(reach) + 1
+    seen, side = cells.astype(np.float32), 2 * round(reach) + 1
     gray = cv2.resize(photo, cells.shape[::-1], interpolation=cv2.INTER_AREA)
-    weight = cv2.GaussianBlur(sky, (0, 0), reach)
-    around = cv2.GaussianBlur(sky * gray, (0, 0), reach) / np.maximum(weight, LEAST_WEIGHT)
-    near = cv2.resize(cv2.dilate(sky, np.ones((side, side), np.uint8)), shape, interpolation=cv2.INTER_NEAREST) > 0
+    weight = cv2.GaussianBlur(seen, (0, 0), reach)
+    around = cv2.GaussianBlur(seen * gray, (0, 0), reach) / np.maximum(weight, LEAST_WEIGHT)
+    near = cv2.resize(cv2.dilate(seen, np.ones((side, side), np.uint8)), shape, interpolation=cv2.INTER_NEAREST) > 0
     smooth = cv2.GaussianBlur(photo.astype(np.float32), (3, 3), 0)  # a median would swallow wires
-    differs = np.abs(smooth - cv2.resize(around, shape))
-    return np.asarray(near & (differs <= TOLERANCE))
+    sky = near & (np.abs(smooth - cv2.resize(around, shape)) <= TOLERANCE)
+    return np.asarray(sky & ~_beside_narrow(sky))
+
+
+def _beside_narrow(sky: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mark pixels beside things before the sky that are narrow, such as branches: they keep a rim."""
+    things = (~sky).view(np.uint8)
+    broad = cv2.morphologyEx(things, cv2.MORPH_OPEN, np.ones((NARROW_PX, NARROW_PX), np.uint8))
+    side = 2 * RIM_PX + 1
+    return np.asarray(cv2.dilate(things & ~broad, np.ones((side, side), np.uint8)) > 0)
