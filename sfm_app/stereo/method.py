@@ -12,7 +12,7 @@ from sfm_app.numerical import FAILURES, error_reason
 from sfm_app.settings import DepthSettings
 from sfm_app.stereo.depth import DepthEstimate, DepthMap, confirm_depths, match_depths
 from sfm_app.stereo.levels import fill_from_coarse, halve_views
-from sfm_app.stereo.sky import blank_areas, sky_pixels
+from sfm_app.stereo.sky import blank_areas, near_pixels
 from sfm_app.stereo.view import GrayImage, View
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Rejected
@@ -142,10 +142,11 @@ def _confirm(inputs: Shared[_Inputs], usable: NDArray[np.bool_], index: int) -> 
         coarse = _confirm_level(task, level, usable, index)
         if not isinstance(coarse, Rejected):
             fine = DepthMap.unknown(view) if isinstance(found, Rejected) else found
-            photo = task.store.photo(view)
-            # what may be a sky looks like a plain wall at half the size, too
-            closed = sky_pixels(photo, blank_areas(photo, fine.depth).blank)
-            found = fill_from_coarse(fine, view, coarse, task.levels[level][index], closed)
+            # at half the size, what may be a sky looks like a plain wall
+            blank = blank_areas(task.store.photo(view), fine.depth).blank
+            found = fill_from_coarse(
+                fine, view, coarse, task.levels[level][index], near_pixels(blank, fine.depth.shape)
+            )
     if isinstance(found, Rejected):
         return found
     task.store.write_maps(view, found)

@@ -28,15 +28,25 @@ def sky_pixels(photo: GrayImage, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """
     if not cells.any():
         return np.zeros(photo.shape, bool)
-    shape, reach = photo.shape[::-1], REACH * max(cells.shape)
-    seen, side = cells.astype(np.float32), 2 * round(reach) + 1
+    shape, seen, reach = photo.shape[::-1], cells.astype(np.float32), REACH * max(cells.shape)
     gray = cv2.resize(photo, cells.shape[::-1], interpolation=cv2.INTER_AREA)
     weight = cv2.GaussianBlur(seen, (0, 0), reach)
     around = cv2.GaussianBlur(seen * gray, (0, 0), reach) / np.maximum(weight, LEAST_WEIGHT)
-    near = cv2.resize(cv2.dilate(seen, np.ones((side, side), np.uint8)), shape, interpolation=cv2.INTER_NEAREST) > 0
     smooth = cv2.GaussianBlur(photo.astype(np.float32), (3, 3), 0)  # a median would swallow wires
-    sky = near & (np.abs(smooth - cv2.resize(around, shape)) <= TOLERANCE)
+    sky = near_pixels(cells, photo.shape) & (np.abs(smooth - cv2.resize(around, shape)) <= TOLERANCE)
     return np.asarray(sky & ~_beside_narrow(sky))
+
+
+def near_pixels(cells: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Mark the pixels (H, W) in cells and within reach of them.
+
+    Args:
+        cells: (h, w).
+        shape: (H, W).
+    """
+    side = 2 * round(REACH * max(cells.shape)) + 1
+    near = cv2.dilate(cells.view(np.uint8), np.ones((side, side), np.uint8))
+    return np.asarray(cv2.resize(near, shape[::-1], interpolation=cv2.INTER_NEAREST) > 0)
 
 
 def _beside_narrow(sky: NDArray[np.bool_]) -> NDArray[np.bool_]:
