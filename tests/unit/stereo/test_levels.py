@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sfm_app.settings import DepthSettings
-from sfm_app.stereo import DepthMap, DepthTask, make_depth_maps_on_cpu, method, rank_neighbors
+from sfm_app.stereo import DepthEstimate, DepthMap, DepthTask, make_depth_maps_on_cpu, method, rank_neighbors
 from sfm_app.stereo.levels import fill_from_coarse, halve_views
 from sfm_app.stereo.normals import fit_planes, plane_normals
 from sfm_app.types import Rejected
@@ -29,7 +29,10 @@ def test_a_halved_view_sees_the_same_at_half_the_place(make_view, size):
 
 
 def maps_of(plane, view):
-    depth = plane.depth(view)
+    return maps_of_depth(plane.depth(view), view)
+
+
+def maps_of_depth(depth, view):
     return DepthMap(depth, plane_normals(fit_planes(depth), view))
 
 
@@ -130,3 +133,30 @@ def test_a_photo_that_nothing_confirms_at_full_size_has_the_depths_of_the_smalle
     depth = store.maps["1.jpg", 0].depth
     assert 0.4 < np.mean(depth > 0) <= 1
     assert 1e-4 < np.median(np.abs(depth / plane.depth(views[1]) - 1)[depth > 0]) < 0.01
+
+
+class Banded(Memory):
+    """Photos with a bright and a dark band that show nothing else."""
+
+    def photo(self, view):
+        shown = self.plane.photo(view).clip(80, 160)
+        shown[:, : view.width // 4], shown[:, -view.width // 4 :] = 240, 50
+        return shown
+
+
+def test_what_may_be_a_sky_is_not_filled(plane, make_view, monkeypatch):
+    views = [make_view(center, name=f"{k}.jpg") for k, center in enumerate(CENTERS)]
+
+    def confirm(view, *_):
+        whole, known = plane.depth(view), np.ones((view.height, view.width), bool)
+        known[:, : view.width // 4] = known[:, -view.width // 4 :] = view.level > 0
+        return maps_of_depth(np.where(known, whole, np.float32(0)), view)
+
+    monkeypatch.setattr(method, "match_depths", lambda view, *_: DepthEstimate(plane.depth(view), plane.depth(view)))
+    monkeypatch.setattr(method, "confirm_depths", confirm)
+    store = Banded(plane)
+    make_depth_maps_on_cpu(task_of(views, store, 2))
+
+    found = store.maps["1.jpg", 0].depth > 0
+    assert not found[:, :60].any()
+    assert found[:, 64:].all()
