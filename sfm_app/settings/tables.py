@@ -16,8 +16,9 @@ MarkerFamily = Literal[
     "aruco-5x5-1000", "aruco-6x6", "aruco-6x6-1000", "aruco-7x7", "aruco-7x7-1000", "aruco-original", "aruco-mip-36h12",
 ]  # fmt: skip
 ConstraintForm = Literal["huang-faugeras", "frobenius", "trivedi", "polynomial"]
-MOST_LEVELS = 4
-"""Sizes at which depth maps can be made. Chosen by hand: an eighth of a photo shows next to nothing."""
+AS_NEEDED, MOST_LEVELS = 0, 4
+"""Sizes at which depth maps are made: 0 for as many as the photos need, and the most. Chosen by hand: an eighth of a
+photo shows next to nothing."""
 
 
 LOCAL_ADDRESS = re.compile(r"local:([1-9]\d{0,2})")
@@ -188,11 +189,11 @@ class DepthSettings(Section):
     )
     max_image_size_px: int = Field(1000, ge=64, le=16384, description="longer side of the depth maps, in pixels")
     levels: int = Field(
-        1,
-        ge=1,
+        AS_NEEDED,
+        ge=AS_NEEDED,
         le=MOST_LEVELS,
-        description="sizes at which depth maps are made, each half of the one before; 2 finds more of plain walls and "
-        "furniture indoors, but also rims of the sky",
+        description="sizes at which depth maps are made, each half of the one before: smaller ones find more of plain "
+        "walls, furniture and floors; 0: a second one where the first leaves much open",
     )
     neighbors: int = Field(4, ge=1, le=20, description="photos that each photo is matched with")
     consistency: float = Field(

@@ -1,22 +1,24 @@
 """The interface of depth-map methods, and the method that runs on every machine."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.numerical import FAILURES, error_reason
 from sfm_app.settings import DepthSettings
+from sfm_app.settings.tables import AS_NEEDED
 from sfm_app.stereo.depth import DepthEstimate, DepthMap, confirm_depths, match_depths
-from sfm_app.stereo.levels import fill_from_coarse, halve_views
+from sfm_app.stereo.levels import MOST_OPEN, fill_from_coarse, halve_views, open_share
 from sfm_app.stereo.sky import blank_areas, near_pixels
 from sfm_app.stereo.view import GrayImage, View
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Rejected
 
+Result = TypeVar("Result")
 Kind = Literal["photometric", "geometric"]
 """COLMAP's names for a depth map before and after the check against the other photos."""
 
@@ -58,9 +60,7 @@ class DepthStore(Protocol):
 class ParallelMap(Protocol):
     """Applies a function to items in parallel and returns the results in order; a label names the progress."""
 
-    def __call__(
-        self, function: Callable[[int], Rejected | None], items: Sequence[int], label: str, /
-    ) -> list[Rejected | None]: ...
+    def __call__(self, function: Callable[[int], Result], items: Sequence[int], label: str, /) -> list[Result]: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,27 +95,42 @@ class _Inputs:
 def make_depth_maps_on_cpu(task: DepthTask) -> list[Rejected | None]:
     """Match every photo with its neighbors, then keep what the depth maps of other photos confirm.
 
-    Both are done at every level; where the finer ones have no depth, the coarser ones fill it in.
+    Both are done at every level; where the finer ones have no depth, the coarser ones fill it in. Where the settings
+    leave it open, there is a coarser level if much of the photos needs it.
 
     Returns:
         For every view the reason why it has no maps, or None.
     """
-    everything = range(len(task.views))
-    inputs = Shared(_Inputs(halve_views(task.views, task.options.levels), task.ranked, task.options, task.store))
-    matched = task.map(Task(_match, inputs), everything, "matching depths")
+    everything, options = range(len(task.views)), task.options
+    inputs = _Inputs(halve_views(task.views, max(options.levels, 1)), task.ranked, options, task.store)
+    matched = task.map(Task(_match, Shared(inputs), 0), everything, "matching depths")
+    if options.levels == AS_NEEDED and _needs_coarser(task, inputs):
+        inputs = replace(inputs, levels=halve_views(task.views, 2))
+    shared = Shared(inputs)
+    for level in range(1, len(inputs.levels)):
+        again = task.map(Task(_match, shared, level), everything, "matching depths in smaller photos")
+        matched = [one and other for one, other in zip(matched, again, strict=True)]
     usable = np.array([found is None for found in matched])
-    confirm = Task(_confirm, inputs, usable)
+    confirm = Task(_confirm, shared, usable)
     confirmed = iter(task.map(confirm, [index for index in everything if usable[index]], "confirming depths"))
     return [next(confirmed) if found is None else found for found in matched]
 
 
-def _match(inputs: Shared[_Inputs], index: int) -> Rejected | None:
-    """Match a photo at every level; one is enough."""
-    found = [_match_level(inputs.value, level, index) for level in range(len(inputs.value.levels))]
-    return None if None in found else found[0]
+def _needs_coarser(task: DepthTask, inputs: _Inputs) -> bool:
+    """Return whether much of the photos may have depths that full size does not show."""
+    shares = task.map(Task(_open_share, Shared(inputs)), range(len(task.views)), "looking for what is left open")
+    known = [share for share in shares if share is not None]
+    return bool(known) and float(np.mean(known)) >= MOST_OPEN
 
 
-def _match_level(task: _Inputs, level: int, index: int) -> Rejected | None:
+def _open_share(inputs: Shared[_Inputs], index: int) -> float | None:
+    view, store = inputs.value.levels[0][index], inputs.value.store
+    return open_share(store.photo(view), store.read_estimate(view)) if store.has(view, "photometric") else None
+
+
+def _match(inputs: Shared[_Inputs], level: int, index: int) -> Rejected | None:
+    """Match a photo with its neighbors at one level."""
+    task = inputs.value
     views, options = task.levels[level], task.options
     view = views[index]
     if task.store.has(view, "photometric"):

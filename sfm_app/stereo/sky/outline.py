@@ -34,7 +34,7 @@ def sky_pixels(photo: GrayImage, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     around = cv2.GaussianBlur(seen * gray, (0, 0), reach) / np.maximum(weight, LEAST_WEIGHT)
     smooth = cv2.GaussianBlur(photo.astype(np.float32), (3, 3), 0)  # a median would swallow wires
     sky = near_pixels(cells, photo.shape) & (np.abs(smooth - cv2.resize(around, shape)) <= TOLERANCE)
-    return np.asarray(sky & ~_beside_narrow(sky))
+    return np.asarray(sky & ~_find_narrow_rims(sky))
 
 
 def near_pixels(cells: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -49,7 +49,7 @@ def near_pixels(cells: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.
     return np.asarray(cv2.resize(near, shape[::-1], interpolation=cv2.INTER_NEAREST) > 0)
 
 
-def _beside_narrow(sky: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _find_narrow_rims(sky: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mark pixels beside things before the sky that are narrow, such as branches: they keep a rim."""
     things = (~sky).view(np.uint8)
     broad = cv2.morphologyEx(things, cv2.MORPH_OPEN, np.ones((NARROW_PX, NARROW_PX), np.uint8))

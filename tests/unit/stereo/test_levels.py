@@ -8,7 +8,7 @@ import pytest
 
 from sfm_app.settings import DepthSettings
 from sfm_app.stereo import DepthEstimate, DepthMap, DepthTask, make_depth_maps_on_cpu, method, rank_neighbors
-from sfm_app.stereo.levels import fill_from_coarse, halve_views
+from sfm_app.stereo.levels import fill_from_coarse, halve_views, open_share
 from sfm_app.stereo.normals import fit_planes, plane_normals
 from sfm_app.types import Rejected
 
@@ -160,3 +160,26 @@ def test_what_may_be_a_sky_is_not_filled(plane, make_view, monkeypatch):
     found = store.maps["1.jpg", 0].depth > 0
     assert not found[:, :60].any()
     assert found[:, 64:].all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("contrast", "second"), [(0.04, True), (1.0, False)])
+def test_a_second_level_comes_where_the_first_leaves_much_open(plane, make_view, contrast, second):
+    views = [make_view(center, name=f"{k}.jpg") for k, center in enumerate(CENTERS)]
+    store = Memory(plane, contrast=contrast)
+
+    make_depth_maps_on_cpu(task_of(views, store, levels=0))
+
+    assert {level for _, level in store.estimates} == ({0, 1} if second else {0})
+    assert {level for _, level in store.maps} == {0}
+
+
+def test_what_is_black_or_may_be_sky_is_not_open(plane, make_view):
+    view = make_view((0, 0, 0))
+    photo, depth = Banded(plane).photo(view), plane.depth(view)
+    known = np.ones(photo.shape, bool)
+    known[:, :60] = known[:, 180:] = False
+    estimate = DepthEstimate(np.where(known, depth, np.float32(0)), known.astype(np.float32))
+
+    assert open_share(photo, estimate) == pytest.approx(0.25, abs=0.02)  # the dark band, not the bright one
+    assert open_share(np.where(photo == 50, 10, photo).astype(np.uint8), estimate) < 0.02
