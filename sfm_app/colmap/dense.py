@@ -175,7 +175,7 @@ class DenseStore:
 
 
 def read_depth(dense_dir: Path, view: View, kind: Kind) -> NDArray[np.float32]:
-    """Read a depth map, (H, W), 0 where unknown, MASKED where the photo is masked.
+    """Read a depth map, (H, W): 0 where unknown, MASKED where the photo is masked, SKY where it shows the sky.
 
     Args:
         dense_dir: folder with undistorted photos and their maps.

@@ -15,6 +15,8 @@ DepthArray = NDArray[np.float32]
 NO_EVIDENCE, CONFIRMED, SEEN_THROUGH, EMPTY = 0, 1, 2, 3
 MIN_COSINE = 0.1
 """Least cosine between a surface's normal and the ray to the photo that confirms it."""
+SKY = -2.0
+"""Depth of a pixel that shows the sky; COLMAP's fusion reads it as no depth."""
 THROUGH = 3.0
 """A photo sees through a point if its depths lie at least this many tolerances behind the point."""
 
@@ -30,7 +32,7 @@ class DepthView:
     t: FloatArray
     """(3,) translation of cam_from_world."""
     depth: DepthArray
-    """0 where unknown, negative where the photo is masked and gives no evidence."""
+    """0 where unknown, SKY where the photo shows the sky; negative, too, where it is masked and gives no evidence."""
     sample_px: float
     """Position inside the pixel at which a depth is sampled, in x and y; 0.5 is the pixel's center."""
 
@@ -64,8 +66,8 @@ def judge(points: FloatArray, normals: FloatArray, eye: DepthView, tolerance: fl
     """Judge points on a surface: CONFIRMED, SEEN_THROUGH, EMPTY or SILENT.
 
     A point is CONFIRMED if it faces the photo and the surrounding depths agree with its own within the relative
-    tolerance. It is SEEN_THROUGH if all four surrounding depths lie well behind it. It is EMPTY if it faces the photo
-    and no depth around it is known. Hidden points and points in masked areas are SILENT.
+    tolerance. It is SEEN_THROUGH if its pixel shows the sky, or if all four surrounding depths lie well behind it. It
+    is EMPTY if it faces the photo and no depth around it is known. Hidden points and points in masked areas are SILENT.
 
     Args:
         points: (N, 3) in the world.
@@ -99,6 +101,9 @@ def _judge(
         v = (P[1, 0] * X + P[1, 1] * Y + P[1, 2] * Z + P[1, 3]) / z - sample_px
         col, row = int(np.floor(u)), int(np.floor(v))
         if not (0 <= col < width - 1 and 0 <= row < height - 1):
+            continue
+        if depth[int(np.floor(v + 0.5)), int(np.floor(u + 0.5))] == SKY:
+            verdict[k] = SEEN_THROUGH
             continue
         low, high, known, masked, near = np.inf, 0.0, 0, 0, False
         for i in range(row, row + 2):

@@ -28,6 +28,7 @@ from sfm_app.colmap.masks import MaskUndistorter, has_masks
 from sfm_app.colmap.wide_views import WideLens, split_wide_photos, write_model, write_views
 from sfm_app.errors import ReconstructionError
 from sfm_app.hashing import fingerprint, load_arrays
+from sfm_app.meshing.visibility import SKY
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.stereo import DepthTask, View, rank_neighbors
@@ -176,7 +177,7 @@ def _drop_sky(dense_dir: Path, skies: Shared[Mapping[str, NDArray[np.bool_]]], p
     sky = sky_pixels(read_gray(dense_dir, view), skies.value[str(number)])
     if sky.any():
         depth = read_depth(dense_dir, view, "geometric")
-        write_depth(dense_dir, view, np.where(sky & (depth > 0), np.float32(0), depth))
+        write_depth(dense_dir, view, np.where(sky, np.float32(SKY), depth))
     return float(sky.mean())
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_app.meshing import CONFIRMED, EMPTY, NO_EVIDENCE, SEEN_THROUGH, DepthView, Paint, judge, sample_colors
+from sfm_app.meshing.visibility import SKY
 
 FACING = np.array([[0.0, 0.0, -1.0]])
 
@@ -50,6 +51,17 @@ def test_what_is_masked_says_nothing(eye):
     verdict = judge(points, FACING.repeat(4, axis=0), eye, 0.01)
 
     assert verdict.tolist() == [NO_EVIDENCE, EMPTY, CONFIRMED, NO_EVIDENCE]
+
+
+def test_what_stands_before_the_sky_is_seen_through_from_both_sides(eye):
+    """The depth of the pixel beside it confirms nothing."""
+    eye.depth[:20, 60:] = SKY
+    points = np.array([[3, -1.5, 10.0], [0.6, -0.3, 2.0], [2.01, -1.5, 10.0], [1.99, -1.5, 10.0]])
+
+    for facing, beside in ((FACING, CONFIRMED), (-FACING, NO_EVIDENCE)):
+        verdict = judge(points, facing.repeat(4, axis=0), eye, 0.01)
+
+        assert verdict.tolist() == [SEEN_THROUGH, SEEN_THROUGH, SEEN_THROUGH, beside]
 
 
 def test_colors_are_those_of_the_pixels_and_the_closer_photo_weighs_more(eye):
