@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.triangles import areas, select_faces, unique_edges
+from sfm_app.geometry.triangles import areas, bucket_order, select_faces, unique_edges
 from sfm_app.types import Surface
 
 MIN_HEIGHT = 1e-7
@@ -34,9 +34,11 @@ def _proper_faces(surface: Surface) -> NDArray[np.bool_]:
     area = areas(surface.vertices, surface.faces)
     finite = np.isfinite(area)
     size = np.ptp(surface.vertices[np.isfinite(surface.vertices).all(axis=1)], axis=0).max(initial=0.0)
-    _, first = np.unique(np.sort(surface.faces, axis=1), axis=0, return_index=True)
-    proper = np.zeros(len(surface.faces), bool)
-    proper[first] = True
+    ranked, order = np.sort(surface.faces, axis=1), np.arange(len(surface.faces))
+    for corner in (2, 1, 0):
+        order = order[bucket_order(ranked[order, corner], len(surface.vertices))]
+    proper = np.ones(len(surface.faces), bool)
+    proper[order[1:]] = (ranked[order[1:]] != ranked[order[:-1]]).any(axis=1)
     return np.asarray(proper & finite & (2.0 * area > MIN_HEIGHT * size * sides))
 
 
@@ -62,9 +64,9 @@ def split_fans(surface: Surface) -> Surface:
     from scipy.sparse.csgraph import connected_components
 
     count = len(surface.faces)
-    _, edge_of = unique_edges(surface.faces)
+    edges, edge_of = unique_edges(surface.faces)
     # corners of two triangles belong together where the triangles share an edge that ends there
-    order = np.argsort(edge_of, axis=None, kind="stable")
+    order = bucket_order(edge_of.ravel(), len(edges))
     same = np.flatnonzero(np.diff(edge_of.ravel()[order]) == 0)
     face_a, side_a = np.divmod(order[same], 3)
     face_b, side_b = np.divmod(order[same + 1], 3)
@@ -74,11 +76,11 @@ def split_fans(surface: Surface) -> Surface:
     ]
     rows, cols = np.concatenate(joined, axis=1)
     graph = coo_array((np.ones(len(rows), bool), (rows, cols)), (3 * count, 3 * count))
-    _, fan = connected_components(graph, directed=False)
-    _, first, faces = np.unique(fan, return_index=True, return_inverse=True)
-    vertex = surface.faces.ravel()[first]
-    order = np.argsort(vertex, kind="stable")
+    fans, fan = connected_components(graph, directed=False)
+    vertex = np.empty(fans, np.int64)
+    vertex[fan] = surface.faces.ravel()
+    order = bucket_order(vertex, len(surface.vertices))
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))
     vertex = vertex[order]
-    return Surface(surface.vertices[vertex], rank[faces].reshape(-1, 3), surface.colors[vertex])
+    return Surface(surface.vertices[vertex], rank[fan].reshape(-1, 3), surface.colors[vertex])

@@ -30,8 +30,8 @@ PACKAGE = Path(__file__).parents[1]
 LIST = Path(__file__).with_name("kernels.json")
 PARTS = ("cameras", "surface")
 """Of the list, each for one process: kernels of the stages up to the scene, and of those after it."""
-SURFACE_ROOMS = ("stereo", "meshing", "texture")
-"""Packages whose kernels belong to the second part."""
+SURFACE_ROOMS = ("stereo.", "meshing.", "texture.", "geometry.triangles.")
+"""Packages and modules whose kernels belong to the second part."""
 LATER = 10
 """Added to the niceness of the second process: its kernels are needed last. Chosen by hand."""
 ARRAY = re.compile(r"(\w+)\[(\d+)([CFA])(!?)\]")
@@ -149,7 +149,7 @@ def used_kernels() -> dict[str, dict[str, list[list[Kind]]]]:
     """
     found: dict[str, dict[str, list[list[Kind]]]] = {part: {} for part in PARTS}
     for name, signature in ASKED_FOR:
-        part = PARTS[name.split(".")[1] in SURFACE_ROOMS]
+        part = PARTS[name.removeprefix("sfm_app.").startswith(SURFACE_ROOMS)]
         found[part].setdefault(name, []).append([describe(kind) for kind in signature])
     return found
 

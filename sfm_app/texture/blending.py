@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.texture.appearance.sightings import Sightings
-from sfm_app.texture.facets import NONE, Facets, IntArray
+from sfm_app.texture.facets import NONE, Facets, IntArray, distinct
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
@@ -77,9 +77,9 @@ def _photo_weights(
         mesh: the surface.
         degree: (V,) number of edges at each vertex.
     """
-    at = np.unique(mesh.faces[own])
+    at = distinct(mesh.faces[own].ravel(), len(mesh.vertices))
     for _ in range(RINGS):
-        at = np.unique(mesh.faces[mesh.faces_at(at)])
+        at = distinct(mesh.faces[mesh.faces_at(at)].ravel(), len(mesh.vertices))
     near = mesh.faces_at(at)
     allowed = np.isin(near, seen.usable_faces(photo), assume_unique=True) | np.isin(chosen[near], (photo, NONE))
     corners = np.searchsorted(at, mesh.faces[near][~allowed].ravel()).clip(max=max(len(at) - 1, 0))

@@ -6,12 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.culling import Clusters, cluster
+from sfm_app.geometry.triangles import bucket_order, unique_edges
 from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
 NONE = -1
+SPARSE = 64
+"""One of so many or fewer: sorting them is faster than marking them among all. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +52,8 @@ class Facets:
 
     def faces_at(self, vertices: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return (M,) the triangles at some vertices (N,), each once, ascending."""
-        return np.unique(self.fans[ranges(self.fan_starts[vertices], self.fan_starts[vertices + 1])])
+        found = self.fans[ranges(self.fan_starts[vertices], self.fan_starts[vertices + 1])]
+        return distinct(found, len(self.faces))
 
     def edges_among(self, vertices: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return (M,) the edges between vertices (N,) of a set, ascending; the vertices ascend."""
@@ -62,22 +66,33 @@ class Facets:
 
 def facets(surface: Surface) -> Facets:
     """Build the tables of neighbors and edges."""
-    starts, ends = surface.faces.ravel(), np.roll(surface.faces, -1, axis=1).ravel()
-    key = np.minimum(starts, ends) * np.int64(len(surface.vertices)) + np.maximum(starts, ends)
-    order = np.argsort(key, kind="stable")
-    ranked = key[order]
-    first = np.flatnonzero(np.concatenate([[True], ranked[1:] != ranked[:-1]])) if len(ranked) else np.empty(0, int)
-    shared = np.diff(np.append(first, len(ranked)))
-    neighbors = np.full(len(key), NONE, np.int32)
-    one, other = order[first[shared == 2]], order[first[shared == 2] + 1]
-    neighbors[one], neighbors[other] = other // 3, one // 3
-    edges = np.column_stack(np.divmod(ranked[first], np.int64(max(len(surface.vertices), 1))))
+    edges, edge_of = unique_edges(surface.faces)
+    sides, edge_of = np.arange(edge_of.size), edge_of.ravel()
+    # the two sides of an edge add up to the sum of their numbers
+    both = np.bincount(edge_of, sides, len(edges))[edge_of].astype(np.int64)
+    inner = np.bincount(edge_of, minlength=len(edges))[edge_of] == 2
+    neighbors = np.where(inner, (both - sides) // 3, NONE).astype(np.int32)
     lengths = np.linalg.norm(surface.vertices[edges[:, 0]] - surface.vertices[edges[:, 1]], axis=1)
     spacing = float(np.median(lengths)) if len(lengths) else 0.0
-    fans = np.argsort(starts, kind="stable") // 3
-    fan_starts = np.concatenate([[0], np.cumsum(np.bincount(starts, minlength=len(surface.vertices)))])
+    corners, count = surface.faces.ravel(), len(surface.vertices)
+    fans = bucket_order(corners, count) // 3
+    fan_starts = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=count))])
     near = cluster(surface.vertices[surface.faces])
     return Facets(surface, neighbors.reshape(-1, 3), edges, spacing, near, fan_starts.astype(np.int64), fans)
+
+
+def distinct(numbers: NDArray[np.int64], size: int) -> NDArray[np.int64]:
+    """Return (M,) the different ones of some numbers, ascending.
+
+    Args:
+        numbers: (N,) in [0, size).
+        size: number of those that may be there.
+    """
+    if SPARSE * len(numbers) < size:
+        return np.unique(numbers)
+    is_there = np.zeros(size, np.bool_)
+    is_there[numbers] = True
+    return np.flatnonzero(is_there)
 
 
 def ranges(starts: NDArray[np.int64], ends: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.triangles import unique_edges
+from sfm_app.geometry.triangles import bucket_order, unique_edges
 from sfm_app.jit import kernel
 
 FloatArray = NDArray[np.float64]
@@ -42,12 +42,11 @@ class Neighbors:
             count: number of vertices.
         """
         edges, edge_of = unique_edges(faces)
-        both = np.concatenate([edges, edges[:, ::-1]])
-        order = np.lexsort((both[:, 1], both[:, 0]))
-        starts = np.concatenate([[0], np.cumsum(np.bincount(both[:, 0], minlength=count))])
+        own, other = edges.T[::-1].ravel(), edges.T.ravel()  # lower neighbors first: they ascend at each vertex
+        starts = np.concatenate([[0], np.cumsum(np.bincount(own, minlength=count))])
         inner = np.ones(count, np.bool_)
         inner[edges[np.bincount(edge_of.ravel(), minlength=len(edges)) != 2].ravel()] = False
-        return cls(starts, both[order, 1], inner)
+        return cls(starts, other[bucket_order(own, count)], inner)
 
     def edge_lengths(self, vertices: FloatArray) -> FloatArray:
         """Return (V,) the mean length of the edges at each vertex (V, 3); 0 without any."""

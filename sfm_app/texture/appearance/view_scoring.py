@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.triangles import number_vertices
 from sfm_app.jit import kernel
 from sfm_app.texture.facets import Facets, IntArray
 from sfm_app.texture.views import POSE, PhotoView, project, sample
@@ -77,9 +78,9 @@ def _lower_rims(face: NDArray[np.int64], worth: NDArray[np.float32], mesh: Facet
     inner = np.arange(len(face))
     for _ in range(RIM_RINGS):
         corners = mesh.faces[face[inner]]
-        vertices, at = np.unique(corners, return_inverse=True)
+        vertices, at = number_vertices(corners)
         whole = np.bincount(at.ravel(), minlength=len(vertices)) == mesh.valence[vertices]
-        inside = whole[at.reshape(-1, 3)].all(axis=1)
+        inside = whole[at].all(axis=1)
         beyond = np.ones(len(face), np.bool_)
         beyond[inner[inside]] = False
         worth[beyond] *= RIM_WORTH
@@ -91,8 +92,8 @@ def _occluded_mask(
 ) -> NDArray[np.bool_]:
     """Mark triangles that are hidden at the center or at two corners, (N,)."""
     corners = mesh.faces[candidates]
-    points, at = np.unique(corners, return_inverse=True)
-    blocked = hidden(mesh.vertices[points])[at.reshape(-1, 3)].sum(axis=1, dtype=np.int8) > 1
+    points, at = number_vertices(corners)
+    blocked = hidden(mesh.vertices[points])[at].sum(axis=1, dtype=np.int8) > 1
     open_ones = np.flatnonzero(~blocked)
     blocked[open_ones] = hidden(mesh.vertices[corners[open_ones]].mean(axis=1))
     return np.asarray(blocked, np.bool_)
