@@ -1,6 +1,7 @@
 """Whole runs: from photos to a mesh, or to a camera, and finished ones read again."""
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,18 +36,19 @@ def reconstruct(
         SfmError: see `sfm_app.errors`; its message and hint say what went wrong and what to do.
     """
     from sfm_app import pipeline  # loads COLMAP, which an estimator alone does not need
-    from sfm_app.report.page import finish_report
+    from sfm_app.report.page import EarlyFigures, finish_report
 
     with open_run(Path(out), settings or Settings(), progress) as run:
         run.plugins.depth_method(run.settings.depth.method)  # fail now, not halfway through the work
         wanted = (pipeline.INTRINSICS, pipeline.SCENE, pipeline.FILES)
+        early = EarlyFigures(run)
         try:
-            products = pipeline.run_stages(Path(photos), run, first, last, wanted)
+            products = pipeline.run_stages(Path(photos), replace(run, begins=early.begin), first, last, wanted)
         except SfmError as err:
-            if written := finish_report(run, err):
+            if written := finish_report(run, err, early):
                 run.progress.say(f"what was found until then: {written}")
             raise
-        return _as_run(run, products, last, finish_report(run))
+        return _as_run(run, products, last, finish_report(run, early=early))
 
 
 def read_run(out: PathLike) -> Run:

@@ -174,6 +174,7 @@ class _Execution:
         run.progress.stage(stage.name, f"again: {again}" if again else "")
         logger.info("%s begins%s", stage.name, f" again: {again}" if again else "")
         run = self.stage_context(stage, run)
+        run.begins(stage.name)
         with measure_usage(partial(cpu_seconds_elsewhere, run.executor)) as used:
             product = self.make_product(stage, run)
         self.products.keep(stage, product)
