@@ -27,12 +27,13 @@ def octree_depth(points: NDArray[np.float64], most: int) -> int:
     extent = MARGIN * np.ptp(points, axis=0).max(initial=0.0) if len(points) else 0.0
     if extent == 0.0:
         return 1
-    low = points.min(axis=0)
+    cells = np.floor((points - points.min(axis=0)) * (2**most / extent)).astype(np.int64)
     for depth in range(most, 1, -1):
-        cells = np.floor((points - low) * (2**depth / extent)).astype(np.int64)
-        occupied = len(np.unique((cells[:, 0] << 2 * depth) + (cells[:, 1] << depth) + cells[:, 2]))
+        keys = np.sort((cells[:, 0] << 2 * depth) + (cells[:, 1] << depth) + cells[:, 2])
+        occupied = 1 + np.count_nonzero(keys[1:] != keys[:-1])
         if len(points) >= MIN_POINTS * occupied:
             return depth
+        cells >>= 1
     return 1
 
 
