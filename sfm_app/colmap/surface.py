@@ -105,7 +105,9 @@ def positions(records: NDArray[np.void]) -> NDArray[np.float64]:
 
 
 def poisson_surface(folder: Path, depth: int) -> Surface:
-    """Return Poisson's closed surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points, with their colors.
+    """Return Poisson's closed surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points.
+
+    It has no colors of its own: all vertices have the same.
 
     Args:
         folder: folder with the fused points.

@@ -1,4 +1,7 @@
-"""Colors of a surface's vertices, from the photos that see them."""
+"""Colors of a surface's vertices, from the photos that see them.
+
+SciPy is imported where it is used: a program that only estimates fundamental matrices starts without it.
+"""
 
 from dataclasses import dataclass
 
@@ -36,10 +39,19 @@ class Paint:
         self.total[at] += other.total
         self.weight[at] += other.weight
 
-    def mean_colors(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return (V, 3) mean colors of the photos; vertices that no photo shows keep their color from `colors`."""
+    def mean_colors(self, points: FloatArray) -> NDArray[np.uint8]:
+        """Return (V, 3) mean colors of the photos; vertices that no photo shows have that of the nearest one shown.
+
+        Args:
+            points: (V, 3) vertices.
+        """
+        from scipy.spatial import cKDTree
+
         mean = self.total / np.maximum(self.weight, np.finfo(np.float32).tiny)[:, None]
-        return np.where(self.weight[:, None] > 0, np.rint(mean), colors).astype(np.uint8)
+        colors, shown = np.rint(mean).astype(np.uint8), self.weight > 0
+        if shown.any() and not shown.all():
+            colors[~shown] = colors[shown][cKDTree(points[shown]).query(points[~shown])[1]]
+        return colors
 
 
 def sample_colors(

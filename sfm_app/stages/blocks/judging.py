@@ -71,7 +71,7 @@ class SurfaceJudge:
             support.add(at, verdict)
             paint.add(at, colors)
         surface = self.surface
-        return Surface(surface.vertices, surface.faces, paint.mean_colors(surface.colors)), support
+        return Surface(surface.vertices, surface.faces, paint.mean_colors(surface.vertices)), support
 
 
 def judge_by_all(judge: SurfaceJudge, views: Sequence[View]) -> tuple[Surface, Support, list[View]]:
