@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.jit import kernel
 from sfm_app.texture.appearance.sightings import Sightings
 from sfm_app.texture.blending import Blend
 from sfm_app.texture.facets import NONE, Facets
@@ -44,42 +45,70 @@ def level_seams(blend: Blend, seen: Sightings, gains: FloatArray, mesh: Facets) 
 def solve_ties(
     one: NDArray[np.int64], other: NDArray[np.int64], weights: FloatArray, hold: float | FloatArray, right: FloatArray
 ) -> FloatArray:
-    """Return (N, C) x that solves (graph Laplacian + hold) x = right, by conjugate gradients.
+    """Return (N, 3) x that solves (graph Laplacian + hold) x = right, by conjugate gradients.
 
     Args:
         one: (E,) node at one end of each edge of the graph.
         other: (E,) node at the other end.
         weights: (E,) of the edges.
         hold: added to the diagonal, > 0 somewhere in each connected part; a number or (N,).
-        right: (N, C) right-hand sides.
+        right: (N, 3) right-hand sides.
     """
-    from scipy.sparse import coo_matrix, diags
+    from scipy.sparse import coo_matrix
 
     size = len(right)
     diagonal = np.bincount(one, weights, size) + np.bincount(other, weights, size) + hold
     rows, columns = np.concatenate([one, other]), np.concatenate([other, one])
-    ties = coo_matrix((-np.concatenate([weights, weights]), (rows, columns)), shape=(size, size)).tocsr()
-    matrix = (ties + diags(diagonal)).tocsr()
-    x = np.zeros_like(right)
-    residual = right.copy()
-    scaled = residual / diagonal[:, None]
-    way, energy = scaled.copy(), np.einsum("nc,nc->c", residual, scaled)
-    enough = RESIDUAL_TOLERANCE**2 * energy
-    for _ in range(STEPS):
-        if np.all(energy <= enough):
-            break
-        moved = matrix @ way
-        step = _ratio(energy, np.einsum("nc,nc->c", way, moved))
-        x += step * way
-        residual -= step * moved
-        scaled = residual / diagonal[:, None]
-        before, energy = energy, np.einsum("nc,nc->c", residual, scaled)
-        way = scaled + _ratio(energy, before) * way
+    ties = coo_matrix((np.concatenate([weights, weights]), (rows, columns)), shape=(size, size)).tocsr()
+    x = np.zeros((size, 3))
+    _solve(ties.indptr, ties.indices, ties.data, np.asarray(diagonal), np.ascontiguousarray(right), x)
     return x
 
 
-def _ratio(above: FloatArray, below: FloatArray) -> FloatArray:
-    return np.divide(above, below, out=np.zeros_like(above), where=below > 0)
+@kernel
+def _solve(
+    starts: NDArray[np.int32], others: NDArray[np.int32], weights: FloatArray, diagonal: FloatArray, right: FloatArray,
+    x: FloatArray,
+) -> None:  # fmt: skip
+    """Solve (diagonal - weights) x = right by conjugate gradients from x = 0, scaled by the diagonal."""
+    size, channels = len(right), 3
+    residual, way, moved = right.copy(), np.empty_like(right), np.empty_like(right)
+    energy, enough, step = np.zeros(channels), np.zeros(channels), np.zeros(channels)
+    for n in range(size):
+        for c in range(channels):
+            way[n, c] = residual[n, c] / diagonal[n]
+            energy[c] += residual[n, c] * way[n, c]
+    enough[:] = RESIDUAL_TOLERANCE * RESIDUAL_TOLERANCE * energy
+    for _ in range(STEPS):
+        if np.all(energy <= enough):
+            break
+        along = np.zeros(channels)
+        for n in range(size):
+            red, green, blue = diagonal[n] * way[n, 0], diagonal[n] * way[n, 1], diagonal[n] * way[n, 2]
+            for k in range(starts[n], starts[n + 1]):
+                weight, other = weights[k], others[k]
+                red -= weight * way[other, 0]
+                green -= weight * way[other, 1]
+                blue -= weight * way[other, 2]
+            moved[n, 0], moved[n, 1], moved[n, 2] = red, green, blue
+            along[0] += way[n, 0] * red
+            along[1] += way[n, 1] * green
+            along[2] += way[n, 2] * blue
+        before = energy.copy()
+        for c in range(channels):
+            step[c] = energy[c] / along[c] if along[c] > 0.0 else 0.0
+            energy[c] = 0.0
+        for n in range(size):
+            for c in range(channels):
+                x[n, c] += step[c] * way[n, c]
+                residual[n, c] -= step[c] * moved[n, c]
+                moved[n, c] = residual[n, c] / diagonal[n]
+                energy[c] += residual[n, c] * moved[n, c]
+        for c in range(channels):
+            step[c] = energy[c] / before[c] if before[c] > 0.0 else 0.0
+        for n in range(size):
+            for c in range(channels):
+                way[n, c] = moved[n, c] + step[c] * way[n, c]
 
 
 def _gaps(
