@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.triangles import vertex_normals
 from sfm_app.geometry.unit_vectors import normalize
+from sfm_app.jit import kernel
 from sfm_app.meshing.refinement.agreement import Pull, Sight, compare
 from sfm_app.meshing.refinement.fairness import Neighbors, find_displacements
 from sfm_app.meshing.refinement.photo_levels import RefinePhoto
@@ -84,12 +85,19 @@ def finest_pixels(vertices: FloatArray, photos: Sequence[RefinePhoto], share: fl
     """
     found = np.full(len(vertices), np.inf)
     for photo in photos:
-        (height, width), P = photo.size_at(share), photo.projection(share)
-        x, y, near = project_vertices(vertices, P).T
-        shown = (near > 0) & (x > 0) & (y > 0) & (x < width) & (y < height)
-        size = 1.0 / (near * photo.focal_px * width / photo.gray.shape[1])
-        found[shown] = np.minimum(found[shown], size[shown])
+        seen = project_vertices(vertices, photo.projection(share))
+        _keep_finest(seen, photo.size_at(share), photo.focal_px, photo.gray.shape[1], found)
     return found
+
+
+@kernel
+def _keep_finest(seen: FloatArray, shape: tuple[int, int], focal_px: float, full_width: int, found: FloatArray) -> None:
+    """Lower the size of a pixel at each vertex to that in a photo; `seen` has its place there and 1 / depth."""
+    height, width = shape
+    for v in range(len(found)):
+        x, y, near = seen[v, 0], seen[v, 1], seen[v, 2]
+        if near > 0.0 and 0.0 < x < width and 0.0 < y < height:
+            found[v] = min(found[v], 1.0 / (near * focal_px * width / full_width))
 
 
 def _divide(surface: Surface, photos: Sequence[RefinePhoto], share: float, most: int) -> Surface:

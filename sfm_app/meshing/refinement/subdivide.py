@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.culling import morton_order
 from sfm_app.geometry.triangles import unique_edges
+from sfm_app.jit import kernel
 from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
@@ -19,17 +20,28 @@ def split_long_edges(surface: Surface, longest: FloatArray) -> Surface:
         longest: (V,) longest edge at each vertex; the smaller one of both ends decides.
     """
     edges, edge_of = unique_edges(surface.faces)
-    ends = surface.vertices[edges]
-    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-    split = length > longest[edges].min(axis=1)
     middle = np.full(len(edges), -1)
-    middle[split] = len(surface.vertices) + np.arange(np.count_nonzero(split))
-    colors = surface.colors[edges[split]].astype(np.uint16).sum(axis=1) // 2
+    count = _number_long(edges, surface.vertices, longest, middle)
+    one, other = edges[middle >= 0].T
+    colors = (surface.colors[one].astype(np.uint16) + surface.colors[other]) // 2
     return Surface(
-        np.concatenate([surface.vertices, ends[split].mean(axis=1)]),
-        _divide(surface.faces, middle[edge_of]),
+        np.concatenate([surface.vertices, (surface.vertices[one] + surface.vertices[other]) / 2.0]),
+        _divide(surface.faces, middle[edge_of]) if count else surface.faces,
         np.concatenate([surface.colors, colors.astype(np.uint8)]),
     )
+
+
+@kernel
+def _number_long(edges: IndexArray, vertices: FloatArray, longest: FloatArray, middle: IndexArray) -> int:
+    """Fill in the numbers of the new vertices in the middle of edges that are too long; return how many there are."""
+    count = 0
+    for k in range(len(edges)):
+        a, b = edges[k, 0], edges[k, 1]
+        x, y, z = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+        if np.sqrt(x * x + y * y + z * z) > min(longest[a], longest[b]):
+            middle[k] = len(vertices) + count
+            count += 1
+    return count
 
 
 def sort_in_space(surface: Surface) -> Surface:
@@ -44,7 +56,7 @@ def sort_in_space(surface: Surface) -> Surface:
 
 def _divide(faces: IndexArray, middle: IndexArray) -> IndexArray:
     """Return the parts of triangles; `middle` (T, 3) has the new vertices on the edges ab, bc, ca, -1 for none."""
-    count = (middle >= 0).sum(axis=1)
+    count = np.sum([side >= 0 for side in middle.T], axis=0)
     parts = [faces[count == 0]]
     for corner in range(3):
         a, b, c = corner, (corner + 1) % 3, (corner + 2) % 3
