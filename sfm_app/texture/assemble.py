@@ -15,8 +15,9 @@ from sfm_app.texture.appearance.sightings import Sightings, list_sightings
 from sfm_app.texture.appearance.view_scoring import FaceView, OcclusionTest, score_faces, sharpness_factors
 from sfm_app.texture.blending import Blend, blend_weights
 from sfm_app.texture.blocks import block_of_faces, lay_out
-from sfm_app.texture.charts import absorb_small_charts, make_charts
+from sfm_app.texture.charts import Charts, absorb_small_charts, make_charts
 from sfm_app.texture.facets import NONE, Facets, IntArray, facets
+from sfm_app.texture.packing import Layout
 from sfm_app.texture.page_painting import CheckedViews, ParallelMap, TexturePlan, paint_blocks
 from sfm_app.texture.painting import fill_background
 from sfm_app.texture.seam_leveling import level_seams
@@ -27,6 +28,7 @@ from sfm_app.texture.views import PhotoView
 from sfm_app.types import Model, Rejected, Surface, Texture
 
 FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
 
 
 def texture_surface(
@@ -58,7 +60,7 @@ def texture_surface(
     if options.unseen_faces == "cut" and not unseen.all():
         mesh = facets(select_faces(surface, ~unseen))
         seen, chosen = replace(seen, all=seen.all.select_triangles(~unseen)), chosen[~unseen]
-    plan = _plan(mesh, seen, chosen, views, options)
+    plan = _plan(mesh, seen, chosen, (views, options), spread)
     rejected = [look if isinstance(look, Rejected) else None for look in looks]
     painted = paint_blocks(plan, views, store, spread, [reason is None for reason in rejected])
     return _finish(plan, painted), _figures(plan, views, rejected, int(unseen.sum()))
@@ -102,17 +104,25 @@ def _check_views(looks: Sequence[FaceView | Rejected], mesh: Facets) -> CheckedV
 
 
 def _plan(
-    mesh: Facets, seen: CheckedViews, chosen: IntArray, views: Sequence[PhotoView], options: TextureSettings
-) -> TexturePlan:
+    mesh: Facets, seen: CheckedViews, chosen: IntArray, given: tuple[Sequence[PhotoView], TextureSettings],
+    spread: ParallelMap,
+) -> TexturePlan:  # fmt: skip
+    views, options = given
     block_of = block_of_faces(mesh)
-    charts = make_charts(chosen, np.array([view.row for view in views]), mesh, options.max_atlas_px / 2, block_of)
-    layout, cells, block_of_page = lay_out(charts, block_of, mesh, options)
+
+    def place() -> tuple[Charts, tuple[Layout, IndexArray, IntArray]]:
+        charts = make_charts(chosen, np.array([view.row for view in views]), mesh, options.max_atlas_px / 2, block_of)
+        return charts, lay_out(charts, block_of, mesh, options)
+
+    def mix() -> Blend:
+        return level_seams(blend_weights(chosen, seen.all, mesh), seen.all, seen.gains, mesh)
+
+    (charts, (layout, cells, block_of_page)), blend = spread(lambda job: job(), (place, mix), "planning the texture")
     corners, page = charts.corners * layout.scale, np.zeros(len(chosen), np.int32)
     drawn = chosen != NONE
     corners[drawn] += layout.shift[charts.chart_of_face[drawn]][:, None, :]
     page[drawn] = layout.page[charts.chart_of_face[drawn]]
     page[~drawn] = cells[:, 0]
-    blend = level_seams(blend_weights(chosen, seen.all, mesh), seen.all, seen.gains, mesh)
     allowed = _allowed_weight(blend, seen.all, chosen, mesh)
     return TexturePlan(mesh, seen, chosen, charts, layout, corners, page, block_of_page, cells, blend, allowed)
 

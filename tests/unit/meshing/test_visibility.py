@@ -75,7 +75,7 @@ def test_colors_are_those_of_the_pixels_and_the_closer_photo_weighs_more(eye):
     white = np.full((120, 160, 3), 255, np.uint8)
     closer = sample_colors(points, normals, judge(points, normals, near, 0.01), near, white)
 
-    np.testing.assert_allclose(paint.mean_colors(points)[:, 0], [79, 89, 89], atol=1)  # the second one is nearer to the third
+    np.testing.assert_allclose(paint.mean_colors(points)[:, 0], [79, 89, 89], atol=1)
     np.testing.assert_allclose(closer.weight[:2], 4 * paint.weight[:2])
     large = sample_colors(
         points, normals, judge(points, normals, eye, 0.01), eye, image.repeat(2, axis=0).repeat(2, axis=1)
