@@ -82,7 +82,7 @@ def paint_blocks(
         if kept is not None:
             found += [(kept[f"page{number}"], kept[f"mask{number}"]) for number in numbers]
             continue
-        pages = Pages([_new_canvas(number, plan) for number in numbers], len(views), store, block)
+        pages = Pages([_new_canvas(number, plan, spread) for number in numbers], len(views), store, block)
         work = partial(_paint_photo, plan=plan, numbers=numbers, views=views, store=store, pages=pages)
         spread(work, photos, "painting" if blocks == 1 else f"painting block {block + 1} of {blocks}")
         done = [finish_page(page) for page in pages.canvases]
@@ -94,9 +94,10 @@ def paint_blocks(
     return found
 
 
-def _new_canvas(number: int, plan: TexturePlan) -> Any:
+def _new_canvas(number: int, plan: TexturePlan, spread: ParallelMap) -> Any:
     own = np.flatnonzero((plan.page == number) & (plan.chosen != NONE))
-    return canvas(plan.layout.sizes[number], own, plan.corners)
+    size = plan.layout.sizes[number]
+    return canvas(size, own, plan.corners, lambda claim, bands: spread(claim, bands, "dividing a page"))
 
 
 def _blocks_of_photos(plan: TexturePlan) -> list[set[int]]:

@@ -5,7 +5,9 @@ photo adds its share to the texels of the triangles that it contributes to. The 
 projected through pose and lens, and the photo is sampled there, so photos are resampled only once.
 """
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,11 @@ from sfm_app.texture.packing import MARGIN
 from sfm_app.texture.views import project, sample
 
 FloatArray = NDArray[np.float64]
+Spread = Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]]
+"""Calls a function for every number, possibly in parallel, and returns the results in order."""
 
+BAND = 512
+"""Rows of a page whose texels get owners at once. Chosen by hand: a few for each of two workers."""
 LEVELS_PER_GRAY = 256
 INSET_PX, MOST_INSET = 1.5, 0.3
 """At an edge where the visible surface ends, pixels mix with the background. Texels closer to it than this distance in
@@ -34,46 +40,54 @@ class Canvas:
     """(H, W, 3) weighted sum over photos, in 1 / FINE gray levels; sums of integers do not depend on the order."""
 
 
-def canvas(size: tuple[int, int], triangles: NDArray[np.int64], corners: FloatArray) -> Canvas:
+def canvas(size: tuple[int, int], triangles: NDArray[np.int64], corners: FloatArray, spread: Spread = map) -> Canvas:
     """Make an empty page whose texels have owners.
 
     Args:
         size: (width, height) of the page.
         triangles: (N,) indices of the page's triangles.
         corners: (T, 3, 2) texels.
+        spread: applies a function to parts of the page, possibly in parallel.
     """
-    return Canvas(owners(size, triangles, corners), np.zeros((size[1], size[0], 3), np.int32))
+    return Canvas(owners(size, triangles, corners, spread), np.zeros((size[1], size[0], 3), np.int32))
 
 
-def owners(size: tuple[int, int], triangles: NDArray[np.int64], corners: FloatArray) -> IntArray:
+def owners(size: tuple[int, int], triangles: NDArray[np.int64], corners: FloatArray, spread: Spread = map) -> IntArray:
     """Return (H, W) the triangle that each texel belongs to, -1 for none.
 
     Args:
         size: (width, height) of the page.
         triangles: (N,) indices of the page's triangles.
         corners: (T, 3, 2) texels.
+        spread: applies a function to parts of the page, possibly in parallel.
     """
     owner = np.full((size[1], size[0]), NONE, np.int32)
-    _claim_texels(triangles, corners, 0.0, owner)
-    for margin in range(1, MARGIN + 1):
-        _claim_texels(triangles, corners, margin - 0.5, owner)
+
+    def claim(top: int) -> None:
+        band = owner[top : top + BAND]  # who owns a texel does not depend on the others
+        _claim_texels(triangles, corners, top, 0.0, band)
+        for margin in range(1, MARGIN + 1):
+            _claim_texels(triangles, corners, top, margin - 0.5, band)
+
+    for _ in spread(claim, range(0, size[1], BAND)):
+        pass
     return owner
 
 
 @kernel
-def _claim_texels(triangles: NDArray[np.int64], corners: FloatArray, reach: float, owner: IntArray) -> None:
-    """Claim free texels within `reach` of each triangle."""
+def _claim_texels(triangles: NDArray[np.int64], corners: FloatArray, top: int, reach: float, owner: IntArray) -> None:
+    """Claim free texels within `reach` of each triangle, in a band of a page; `top` is its first row."""
     height, width = owner.shape
     for f in triangles:
         ax, ay = corners[f, 0, 0], corners[f, 0, 1]
         bx, by = corners[f, 1, 0], corners[f, 1, 1]
         cx, cy = corners[f, 2, 0], corners[f, 2, 1]
+        y0, y1 = max(int(min(ay, by, cy) - reach - 0.5), top), min(int(max(ay, by, cy) + reach + 0.5), top + height - 1)
         x0, x1 = max(int(min(ax, bx, cx) - reach - 0.5), 0), min(int(max(ax, bx, cx) + reach + 0.5), width - 1)
-        y0, y1 = max(int(min(ay, by, cy) - reach - 0.5), 0), min(int(max(ay, by, cy) + reach + 0.5), height - 1)
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
-                if owner[y, x] == NONE and _distance(corners[f], x + 0.5, y + 0.5) <= reach:
-                    owner[y, x] = f
+                if owner[y - top, x] == NONE and _distance(corners[f], x + 0.5, y + 0.5) <= reach:
+                    owner[y - top, x] = f
 
 
 @kernel

@@ -41,11 +41,13 @@ def choose_photos(seen: Sightings, mesh: Facets) -> IntArray:
     cost = (PRICE_OF_DETAIL * _relative_size(mesh)[:, None] * np.minimum(lost, MAX_LOSS)).astype(np.float32)
     price = _edge_prices(mesh)
     back = _reverse_edge_indices(mesh.neighbors)
+    same = np.full((triangles, 3, kept), NONE, np.int8)
+    _match_labels(labels, mesh.neighbors, same)
     chosen = np.full(triangles, NONE, np.int32)
     messages = np.zeros((triangles, 3, kept), np.float32)
     for _ in range(ROUNDS):
         for forward in (True, False):
-            _pass_messages(labels, cost, mesh.neighbors, back, price, messages, forward)
+            _pass_messages(labels, cost, (mesh.neighbors, back, same), price, messages, forward)
     _decode(labels, cost, mesh.neighbors, price, messages, chosen)
     for _ in range(ROUNDS):
         if not _improve(labels, cost, mesh.neighbors, price, chosen):
@@ -93,18 +95,36 @@ def _keep_best(
 
 
 @kernel
+def _match_labels(labels: IntArray, neighbors: IntArray, same: NDArray[np.int8]) -> None:
+    """Fill in same[f, k, n], the column of the n-th label of neighbor k among the labels of f; -1 for none."""
+    triangles, kept = labels.shape
+    for f in range(triangles):
+        for k in range(3):
+            g = neighbors[f, k]
+            if g == NONE:
+                continue
+            for n in range(kept):
+                for m in range(kept):
+                    if labels[g, n] != NONE and labels[f, m] == labels[g, n]:
+                        same[f, k, n] = m
+
+
+@kernel
 def _pass_messages(
     labels: IntArray,
     cost: NDArray[np.float32],
-    neighbors: IntArray,
-    back: IntArray,
+    beside: tuple[IntArray, IntArray, NDArray[np.int8]],
     price: NDArray[np.float32],
     messages: NDArray[np.float32],
     forward: bool,
 ) -> None:
-    """Pass messages once; messages[f, k] is the message from neighbor k of f about the labels of f."""
+    """Pass messages once; messages[f, k] is the message from neighbor k of f about the labels of f.
+
+    `beside` has the neighbors, the column of each triangle in its neighbor's row, and the labels that both have.
+    """
+    neighbors, back, same = beside
     triangles, kept = labels.shape
-    belief = np.empty(kept)
+    belief, kept_back = np.empty(kept), np.empty(kept)
     for step in range(triangles):
         f = step if forward else triangles - 1 - step
         before = after = 0
@@ -120,14 +140,14 @@ def _pass_messages(
                 continue
             least = np.inf
             for m in range(kept):
+                kept_back[m] = share * belief[m] - messages[f, k, m]
                 if labels[f, m] != NONE:
-                    least = min(least, share * belief[m] - messages[f, k, m])
+                    least = min(least, kept_back[m])
             lowest = np.inf
             for n in range(kept):
-                value = least + price[f, k]
-                for m in range(kept):
-                    if labels[f, m] == labels[g, n]:
-                        value = min(value, share * belief[m] - messages[f, k, m])
+                value, m = least + price[f, k], same[f, k, n]
+                if m != NONE:
+                    value = min(value, kept_back[m])
                 messages[g, back[f, k], n] = value
                 lowest = min(lowest, value)
             for n in range(kept):
