@@ -5,6 +5,7 @@ import pytest
 
 from sfm_app.geometry.triangles import select_faces
 from sfm_app.meshing import drop_islands, octree_depth
+from sfm_app.meshing.components import MARGIN, MIN_POINTS
 
 
 @pytest.mark.parametrize(("share", "left"), [(0.0, 2), (0.05, 2), (0.15, 1)])
@@ -36,6 +37,19 @@ def test_octree_cells_hold_a_point_or_so(sheet):
     assert octree_depth(points * 100 + 7, 12) == octree_depth(points, 12)
     assert octree_depth(np.repeat(points, 4, axis=0), 12) >= octree_depth(points, 12)
     assert octree_depth(points, 5) == 5
+
+
+@pytest.mark.parametrize("most", [3, 6, 9])
+def test_the_octree_is_the_deepest_whose_occupied_cells_hold_enough(most):
+    points = np.random.default_rng(most).uniform(-2, 3, (400, 3)) ** 3
+    extent = MARGIN * np.ptp(points, axis=0).max()
+
+    def occupied(depth):
+        cells = np.floor((points - points.min(axis=0)) * (2**depth / extent))
+        return len(np.unique(cells, axis=0))
+
+    fits = [depth for depth in range(2, most + 1) if len(points) >= MIN_POINTS * occupied(depth)]
+    assert octree_depth(points, most) == max(fits)
 
 
 @pytest.mark.parametrize("points", [np.empty((0, 3)), np.ones((1, 3)), np.ones((50, 3))])

@@ -85,3 +85,7 @@ def test_colors_are_those_of_the_pixels_and_the_closer_photo_weighs_more(eye):
     both.add(np.arange(3), paint)
     both.add(np.arange(3), closer)
     np.testing.assert_allclose(both.mean_colors(points)[0, 0], (79 + 4 * 255) / 5, atol=1)
+
+
+def test_a_surface_that_no_photo_confirms_is_black():
+    assert Paint.zeros(2).mean_colors(np.eye(3)[:2]).tolist() == [[0, 0, 0], [0, 0, 0]]
