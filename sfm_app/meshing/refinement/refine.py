@@ -92,7 +92,7 @@ def finest_pixels(vertices: FloatArray, photos: Sequence[RefinePhoto], share: fl
 
 @kernel
 def _keep_finest(seen: FloatArray, shape: tuple[int, int], focal_px: float, full_width: int, found: FloatArray) -> None:
-    """Keep the smaller size of a pixel at each vertex, that of a photo or the known one; `seen` has its place there and 1 / depth."""
+    """Keep the smaller size of a pixel at each vertex, the known one or that of a photo with x, y, 1 / depth `seen`."""
     height, width = shape
     for v in range(len(found)):
         x, y, near = seen[v, 0], seen[v, 1], seen[v, 2]
