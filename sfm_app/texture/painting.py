@@ -225,9 +225,19 @@ def _clamp_coordinates(part: FloatArray, least: FloatArray) -> None:
 
 def finish_page(page: Canvas) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Return the page as 8-bit RGB, black at texels without an owner, and (H, W) whether a texel has one."""
-    levels = page.total + LEVELS_PER_GRAY // 2
-    levels //= LEVELS_PER_GRAY  # in place, because the sums of a page may take two hundred megabytes
-    return np.clip(levels, 0, 255, out=levels).astype(np.uint8), page.owner != NONE
+    rounded = np.empty(page.total.shape, np.uint8)
+    _round_levels(page.total, rounded)
+    return rounded, page.owner != NONE
+
+
+@kernel
+def _round_levels(total: IntArray, rounded: NDArray[np.uint8]) -> None:
+    """Fill in the gray levels of weighted sums."""
+    for y in range(total.shape[0]):
+        for x in range(total.shape[1]):
+            for channel in range(3):
+                level = (total[y, x, channel] + LEVELS_PER_GRAY // 2) // LEVELS_PER_GRAY
+                rounded[y, x, channel] = min(max(level, 0), 255)
 
 
 def fill_background(page: NDArray[np.uint8], painted: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -241,14 +251,40 @@ def fill_background(page: NDArray[np.uint8], painted: NDArray[np.bool_]) -> NDAr
     """
     if painted.all() or min(page.shape[:2]) < 2:
         return page
-    height, width = page.shape[0] // 2, page.shape[1] // 2
-    sums, counts = np.zeros((height, width, 3), np.uint16), np.zeros((height, width), np.uint8)
-    for dy in (0, 1):
-        for dx in (0, 1):
-            part = np.s_[dy : 2 * height : 2, dx : 2 * width : 2]
-            sums += np.where(painted[part][..., None], page[part], 0)
-            counts += painted[part]
-    means = (sums // np.maximum(counts, 1)[..., None]).astype(np.uint8)
-    coarse = fill_background(means, counts > 0)
-    rows, columns = (np.minimum(np.arange(n) // 2, m - 1) for n, m in zip(page.shape[:2], (height, width), strict=True))
-    return np.where(painted[..., None], page, coarse[rows][:, columns])
+    shape = page.shape[0] // 2, page.shape[1] // 2
+    means, known = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.bool_)
+    _average_blocks(page, painted, means, known)
+    filled = page.copy()
+    _fill_gaps(fill_background(means, known), painted, filled)
+    return filled
+
+
+@kernel
+def _average_blocks(
+    page: NDArray[np.uint8], painted: NDArray[np.bool_], means: NDArray[np.uint8], known: NDArray[np.bool_]
+) -> None:
+    """Fill in the mean painted color of each block of 2 x 2 texels, and whether it has one."""
+    for y in range(known.shape[0]):
+        for x in range(known.shape[1]):
+            count = 0
+            for k in range(4):
+                count += painted[2 * y + k // 2, 2 * x + k % 2]
+            known[y, x] = count > 0
+            for channel in range(3):
+                total = 0
+                for k in range(4):
+                    if painted[2 * y + k // 2, 2 * x + k % 2]:
+                        total += page[2 * y + k // 2, 2 * x + k % 2, channel]
+                means[y, x, channel] = total // max(count, 1)
+
+
+@kernel
+def _fill_gaps(coarse: NDArray[np.uint8], painted: NDArray[np.bool_], page: NDArray[np.uint8]) -> None:
+    """Give texels without an owner the color of their block."""
+    for y in range(page.shape[0]):
+        for x in range(page.shape[1]):
+            if not painted[y, x]:
+                for channel in range(3):
+                    page[y, x, channel] = coarse[
+                        min(y // 2, coarse.shape[0] - 1), min(x // 2, coarse.shape[1] - 1), channel
+                    ]
