@@ -15,6 +15,8 @@ from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
+Edges = tuple[IndexArray, IndexArray]
+"""What `unique_edges` returns."""
 
 SMOOTHING = 20
 """Iterations of averaging over neighbors that smooth the border."""
@@ -74,13 +76,16 @@ def trim(surface: Surface, support: Support, max_gap_triangles: float, least: fl
         max_gap_triangles: as for `bridge_gaps`.
         least: as for `drop_doubtful_parts`.
     """
-    sign = np.where(support.is_supported, 1.0, -1.0)
-    smooth = smooth_support(surface, bridge_gaps(surface, sign, support.is_free, max_gap_triangles), SMOOTHING)
-    whole = bridge_gaps(surface, smooth, support.is_free, max_gap_triangles)
-    return cut(surface, drop_doubtful_parts(surface, whole, support.confirmed, least))
+    sign, edges = np.where(support.is_supported, 1.0, -1.0), unique_edges(surface.faces)
+    bridged = bridge_gaps(surface, sign, support.is_free, max_gap_triangles, edges)
+    smooth = smooth_support(surface, bridged, SMOOTHING, edges)
+    whole = bridge_gaps(surface, smooth, support.is_free, max_gap_triangles, edges)
+    return cut(surface, drop_doubtful_parts(surface, whole, support.confirmed, least, edges), edges)
 
 
-def bridge_gaps(surface: Surface, support: FloatArray, free: NDArray[np.bool_], max_width: float) -> FloatArray:
+def bridge_gaps(
+    surface: Surface, support: FloatArray, free: NDArray[np.bool_], max_width: float, known: Edges | None = None
+) -> FloatArray:
     """Add support to unsupported patches that are small and hardly seen through.
 
     Args:
@@ -88,6 +93,7 @@ def bridge_gaps(surface: Surface, support: FloatArray, free: NDArray[np.bool_], 
         support: (V,) positive where photos confirm the surface, negative where none does.
         free: (V,) where photos see through the surface.
         max_width: largest width of a bridged patch, in edge lengths of its rim; its length is not limited.
+        known: edges of the surface; None for finding them.
 
     Returns:
         (V,) support, 1 on bridged patches.
@@ -97,7 +103,7 @@ def bridge_gaps(surface: Surface, support: FloatArray, free: NDArray[np.bool_], 
     inside = support > 0
     if not inside.any() or inside.all():
         return support
-    edges, _ = unique_edges(surface.faces)
+    edges, _ = known or unique_edges(surface.faces)
     length = np.linalg.norm(surface.vertices[edges[:, 0]] - surface.vertices[edges[:, 1]], axis=1)
     ends_inside = inside[edges].sum(axis=1)
     outer = edges[ends_inside == 0]
@@ -115,7 +121,7 @@ def bridge_gaps(surface: Surface, support: FloatArray, free: NDArray[np.bool_], 
 
 
 def drop_doubtful_parts(
-    surface: Surface, support: FloatArray, confirmed: NDArray[np.int32], least: float
+    surface: Surface, support: FloatArray, confirmed: NDArray[np.int32], least: float, known: Edges | None = None
 ) -> FloatArray:
     """Remove the support of connected parts that too few photos confirm on average.
 
@@ -126,25 +132,27 @@ def drop_doubtful_parts(
         support: (V,) positive where photos confirm the surface.
         confirmed: (V,) photos that confirm each vertex.
         least: smallest mean number of photos, >= 0.
+        known: edges of the surface; None for finding them.
     """
     from scipy.sparse.csgraph import connected_components
 
-    edges, _ = unique_edges(surface.faces)
+    edges, _ = known or unique_edges(surface.faces)
     inside = support > 0
     count, part = connected_components(_graph(edges[inside[edges].all(axis=1)], len(support)), directed=False)
     mean = np.bincount(part, confirmed, count) / np.bincount(part, minlength=count)
     return np.where(inside & (mean[part] < least), -1.0, support)
 
 
-def smooth_support(surface: Surface, support: FloatArray, steps: int) -> FloatArray:
+def smooth_support(surface: Surface, support: FloatArray, steps: int, known: Edges | None = None) -> FloatArray:
     """Average the support over each vertex and its neighbors, (V,), to smooth the border.
 
     Args:
         surface: its edges are used.
         support: (V,) positive where photos confirm the surface.
         steps: iterations, >= 0.
+        known: edges of the surface; None for finding them.
     """
-    edges, _ = unique_edges(surface.faces)
+    edges, _ = known or unique_edges(surface.faces)
     graph = _graph(edges, len(support))
     neighbors = np.maximum(np.bincount(edges.ravel(), minlength=len(support)), 1)
     for _ in range(steps):
@@ -160,7 +168,7 @@ def _graph(edges: IndexArray, size: int, weights: FloatArray | None = None) -> A
     ).tocsr()
 
 
-def cut(surface: Surface, support: FloatArray) -> Surface:
+def cut(surface: Surface, support: FloatArray, known: Edges | None = None) -> Surface:
     """Return the part of a surface where the support, linear along the edges, is positive.
 
     Triangles on the border are split.
@@ -168,8 +176,9 @@ def cut(surface: Surface, support: FloatArray) -> Surface:
     Args:
         surface: any.
         support: (V,).
+        known: edges of the surface; None for finding them.
     """
-    edges, edge_of = unique_edges(surface.faces)
+    edges, edge_of = known or unique_edges(surface.faces)
     support = np.where(support == 0, -1e-9, support)
     a, b = support[edges].T
     crossed = (a > 0) != (b > 0)
