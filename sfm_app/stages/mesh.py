@@ -13,7 +13,6 @@ from sfm_app.colmap.surface import FUSED, open_points, poisson_surface, position
 from sfm_app.errors import ReconstructionError
 from sfm_app.hashing import digest_files, load_arrays
 from sfm_app.meshing import drop_islands, make_manifold, octree_depth, trim
-from sfm_app.meshing.open3d import load_open3d
 from sfm_app.meshing.refinement import STEPS
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
@@ -96,7 +95,6 @@ def _mesh_at_once(
     if run.settings.texture.normal_map:
         save_fine([FineShape.from_surface(detailed)], run.workspace.fine_surface)
     with run.step("simplifying"):
-        run.executor.submit(load_open3d)  # the texture needs it, and the helper process leaves a core idle
         return _check_nonempty(make_manifold(simplify_mesh(detailed, options, place)), "the surface has no extent")
 
 
