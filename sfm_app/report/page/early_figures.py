@@ -14,6 +14,9 @@ logger = logging.getLogger("sfm_app")
 
 IDLE = "mesh"
 """Stage that leaves cores idle, after all those that are drawn."""
+MOST_PHOTOS = 100
+"""Of a run whose figures are drawn early: the surface of more needs the memory. Chosen on castle-P19, where they take
+280 MB."""
 SHOWN = ("photos", "match_graph", "view_graph", "intrinsics", "scene")
 """Stages that are drawn."""
 
@@ -45,15 +48,19 @@ class EarlyFigures:
 
     def __init__(self, run: RunContext) -> None:
         self._run = run
-        self._drawn: Future[DrawnFigures] | None = None
+        self._drawn: Future[DrawnFigures | None] | None = None
 
     def begin(self, stage: str) -> None:
         """Begin to draw, if the stage that begins leaves cores idle."""
         if stage != IDLE or not self._run.settings.report or self._drawn is not None:
             return
         thread = ThreadPoolExecutor(1, thread_name_prefix="figures")
-        self._drawn = thread.submit(lambda: DrawnFigures.draw(read_contents(self._run)))
+        self._drawn = thread.submit(self._draw)
         thread.shutdown(wait=False)
+
+    def _draw(self) -> DrawnFigures | None:
+        photos = self._run.workspace.manifest.read()["stages"]["photos"]["counts"]["usable"]
+        return DrawnFigures.draw(read_contents(self._run)) if photos <= MOST_PHOTOS else None
 
     def take(self, contents: RunContents) -> DrawnFigures | None:
         """Return the figures, if they were drawn and show what a run has left.
@@ -64,7 +71,7 @@ class EarlyFigures:
         if self._drawn is None or self._drawn.exception() is not None:
             return None
         found = self._drawn.result()
-        return found if found.shown == _digests(contents) else None
+        return found if found is not None and found.shown == _digests(contents) else None
 
 
 def _digests(contents: RunContents) -> tuple[str | None, ...]:

@@ -24,8 +24,10 @@ def drawings(monkeypatch):
     return seen
 
 
-def make_run(*, report=True):
-    return SimpleNamespace(settings=SimpleNamespace(report=report))
+def make_run(*, report=True, photos=3):
+    manifest = {"stages": {"photos": {"counts": {"usable": photos}}}}
+    workspace = SimpleNamespace(manifest=SimpleNamespace(read=lambda: manifest))
+    return SimpleNamespace(settings=SimpleNamespace(report=report), workspace=workspace)
 
 
 def test_figures_are_drawn_once_when_the_surface_begins_and_taken_for_the_same_stages(drawings):
@@ -51,7 +53,9 @@ def test_figures_of_stages_that_were_done_again_are_not_taken(drawings, changed)
 
 def test_nothing_is_taken_where_nothing_was_drawn(drawings, monkeypatch):
     without, idle, failed = EarlyFigures(make_run(report=False)), EarlyFigures(make_run()), EarlyFigures(make_run())
+    many = EarlyFigures(make_run(photos=101))
     without.begin("mesh")
+    many.begin("mesh")
     idle.begin("texture")
 
     def fail(run):
@@ -61,5 +65,5 @@ def test_nothing_is_taken_where_nothing_was_drawn(drawings, monkeypatch):
     failed.begin("mesh")
 
     contents = SimpleNamespace(stages=STAGES)
-    assert [early.take(contents) for early in (without, idle, failed)] == [None, None, None]
+    assert [early.take(contents) for early in (without, idle, many, failed)] == [None] * 4
     assert not drawings
