@@ -31,8 +31,8 @@ BLOCK_MB_PER_POINT = 1200 / MEGA
 """Memory of Poisson's reconstruction and of the surface that it gives, for each point of a block: COLMAP's process had
 950 bytes for each of 1.3 million points of a town."""
 DEPTH_SECONDS_PER_MP = 1.3
-"""Core seconds of the depth maps for each of their megapixels and each neighbor: 1.1 on fountain-P11 and castle-P19 with
-one level, a second one takes a quarter of the first."""
+"""Core seconds of the depth maps for each of their megapixels and each neighbor: 1.1 on fountain-P11 and castle-P19
+with one level; a second one takes a quarter of the first."""
 REFINE_SECONDS_PER_MP, REFINE_MB, REFINE_MB_PER_MP = 1.0, 200.0, 25.0
 """Core seconds of the surface's refinement for each megapixel of photos, its memory, and that for each megapixel of the
 photos that it holds at once, divided triangles included; on fountain-P11 and `ornament`."""
