@@ -99,7 +99,7 @@ QUALITY_PRESETS: dict[str, dict[str, Any]] = {
     "normal": {},
     "high": {
         "matching": {"max_image_size_px": 3200, "max_features": 16384},
-        "depth": {"max_image_size_px": 2000, "neighbors": 6},
+        "depth": {"max_image_size_px": 1400, "neighbors": 5},
         "mesh": {"poisson_depth": 13, "faces": 1_000_000, "max_image_size_px": 3200},
         "texture": {"max_atlas_px": 8192},
     },
