@@ -36,6 +36,9 @@ HINT = "take more photos, a step apart, with more overlap; OUT/points.ply and OU
 MIN_POINTS = 100
 """Fewer fused points carry no surface."""
 
+MOST_CELLS_PER_FACE = 1.6
+"""Occupied cells of Poisson's octree for each triangle of the finished mesh, where it is not refined: four triangles
+are simplified to one. Chosen at `draft` on fountain-P11."""
 CONFIRMED_SHARE = 2 / 3
 """A part stays when this share of the photos that a fused point needs confirms its average vertex."""
 
@@ -80,7 +83,9 @@ def _mesh_at_once(
         run: the run.
     """
     (dense_dir, originals), place, options = source, run.workspace.surface, run.settings.mesh
-    depth = octree_depth(positions(points), options.poisson_depth)
+    # a surface that is not refined loses most of its triangles at once
+    most_cells = np.inf if options.max_image_size_px else MOST_CELLS_PER_FACE * options.faces
+    depth = octree_depth(positions(points), options.poisson_depth, most_cells)
     with run.step("finding the surface"):
         raw = _check_nonempty(poisson_surface(place, depth), "the fused points span no surface")
     judges = SurfaceJudge.prepare(raw, dense_dir, run.settings.depth.consistency)

@@ -50,6 +50,9 @@ def test_the_octree_is_the_deepest_whose_occupied_cells_hold_enough(most):
 
     fits = [depth for depth in range(2, most + 1) if len(points) >= MIN_POINTS * occupied(depth)]
     assert octree_depth(points, most) == max(fits)
+    cells = occupied(max(fits))
+    assert octree_depth(points, most, cells) == max(fits)
+    assert octree_depth(points, most, cells - 1) == max(fits) - 1
 
 
 @pytest.mark.parametrize("points", [np.empty((0, 3)), np.ones((1, 3)), np.ones((50, 3))])
