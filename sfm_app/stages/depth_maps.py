@@ -145,7 +145,7 @@ def drop_skies(dense_dir: Path, views: Sequence[View], run: RunContext) -> None:
     kept = dense_dir / SKIES
     if not kept.exists():  # a killed run has removed depths by it, and would find other skies now
         areas = run.map(Task(find_blank_areas, dense_dir), views, "looking for the sky")
-        votes = run.map(Task(_count_votes, Shared(areas), views), range(len(views)), "comparing skies")
+        votes = run.map(Task(_count_votes, Shared((areas, views))), range(len(views)), "comparing skies")
         with replace_atomically(kept) as path:
             np.savez(
                 path,
@@ -167,8 +167,8 @@ def find_blank_areas(dense_dir: Path, view: View) -> PhotoAreas:
     return blank_areas(read_gray(dense_dir, view), read_depth(dense_dir, view, "geometric"))
 
 
-def _count_votes(areas: Shared[Sequence[PhotoAreas]], views: Sequence[View], index: int) -> Votes:
-    return count_votes(areas.value, views, index)
+def _count_votes(photos: Shared[tuple[Sequence[PhotoAreas], Sequence[View]]], index: int) -> Votes:
+    return count_votes(*photos.value, index)
 
 
 def _drop_sky(dense_dir: Path, skies: Shared[Mapping[str, NDArray[np.bool_]]], photo: tuple[int, View]) -> float:

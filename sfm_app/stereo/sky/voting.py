@@ -26,7 +26,8 @@ LEAST_SEEN = 0.3
 LEAST_SHARE = 0.003
 """Of the photo, of an area at its border by which skies are told. Chosen by hand."""
 SAME_PLACE = 1e-6
-"""Photos nearer than this share of the largest distance are parts of one wide photo. By definition: rounding."""
+"""Photos nearer than this share of the largest distance are parts of one wide photo; what has a smaller share of the
+largest depth lies beside a photo or behind it. By definition: rounding."""
 DARKER = 10.0
 """Gray levels by which other parts of the sky, beyond branches, may be darker. Chosen on `railing`."""
 
@@ -90,7 +91,7 @@ def _look_along(
 ) -> tuple[NDArray[np.bool_], tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Return which directions (3, N) a photo sees, and in which row and column of its cells."""
     u, v, depth = view.K @ view.R @ rays
-    ahead = depth > 0
+    ahead = depth > SAME_PLACE * np.abs(depth).max(initial=0.0)
     at = np.stack([v, u]) / np.where(ahead, depth, 1.0)
     row, column = np.floor(at * (np.array(shape) / [view.height, view.width])[:, None]).astype(np.int64)
     seen = ahead & (row >= 0) & (column >= 0) & (row < shape[0]) & (column < shape[1])
