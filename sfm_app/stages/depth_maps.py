@@ -153,8 +153,9 @@ def drop_skies(dense_dir: Path, views: Sequence[View], run: RunContext) -> None:
                 **{str(number): cells for number, cells in enumerate(find_skies(areas, votes))},
             )
     skies = load_arrays(kept)
-    shares = run.map(Task(_drop_sky, dense_dir, Shared(skies)), list(enumerate(views)), "dropping the sky")
-    run.record(sky=round(float(np.mean(shares)), 3) if shares else 0.0)
+    under_sky = [(number, view) for number, view in enumerate(views) if skies[str(number)].any()]
+    shares = run.map(Task(_drop_sky, dense_dir, Shared(skies)), under_sky, "dropping the sky") if under_sky else []
+    run.record(sky=round(sum(shares) / max(len(views), 1), 3))
 
 
 def find_blank_areas(dense_dir: Path, view: View) -> PhotoAreas:
@@ -175,9 +176,8 @@ def _drop_sky(dense_dir: Path, skies: Shared[Mapping[str, NDArray[np.bool_]]], p
     """Remove the depths of the sky of one photo, and return its share of the photo."""
     number, view = photo
     sky = sky_pixels(read_gray(dense_dir, view), skies.value[str(number)])
-    if sky.any():
-        depth = read_depth(dense_dir, view, "geometric")
-        write_depth(dense_dir, view, np.where(sky, np.float32(SKY), depth))
+    depth = read_depth(dense_dir, view, "geometric")
+    write_depth(dense_dir, view, np.where(sky, np.float32(SKY), depth))
     return float(sky.mean())
 
 

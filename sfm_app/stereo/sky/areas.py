@@ -53,8 +53,8 @@ def blank_areas(photo: GrayImage, depth: DepthArray) -> PhotoAreas:
     gray = photo.astype(np.float32)
     mean = cv2.blur(gray, (WINDOW_PX, WINDOW_PX))
     variation = np.sqrt(np.maximum(cv2.blur(gray * gray, (WINDOW_PX, WINDOW_PX)) - mean * mean, 0))
-    cells, known = to_cells(gray), to_cells((depth > 0).astype(np.float32))
-    blank = (known < OPEN_SHARE) & (to_cells(variation) <= MOST_VARIATION)
+    cells, known = _to_cells(gray), _to_cells((depth > 0).astype(np.float32))
+    blank = (known < OPEN_SHARE) & (_to_cells(variation) <= MOST_VARIATION)
     labels = cv2.connectedComponents(blank.view(np.uint8), connectivity=4)[1]
     surfaces = known >= KNOWN_SHARE
     labels = _keep_bright(labels, cells, np.sort(cells[surfaces]))
@@ -84,12 +84,8 @@ def _mean_gray(labels: NDArray[np.signedinteger], gray: NDArray[np.float32]) -> 
     return np.asarray(np.bincount(labels.ravel(), gray.ravel()) / np.maximum(np.bincount(labels.ravel()), 1))
 
 
-def to_cells(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return (h, w) the means over cells of values (H, W).
-
-    Args:
-        values: of all pixels.
-    """
+def _to_cells(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return (h, w) the means over cells of values (H, W)."""
     height, width = values.shape
     scale = min(1.0, LONGER_SIDE / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
