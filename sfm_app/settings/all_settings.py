@@ -91,14 +91,14 @@ class Settings(Section):
 
 QUALITY_PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
-        "matching": {"max_image_size_px": 1000, "max_features": 4096},
+        "matching": {"max_features": 4096, "enlarge_below": 2000},
         "depth": {"max_image_size_px": 640, "neighbors": 3},
         "mesh": {"poisson_depth": 10, "faces": 50_000, "max_image_size_px": 0},
         "texture": {"max_atlas_px": 2048, "max_pages": 1},
     },
     "normal": {},
     "high": {
-        "matching": {"max_image_size_px": 3200, "max_features": 16384},
+        "matching": {"max_image_size_px": 3200, "max_features": 16384, "enlarge_below": 8000},
         "depth": {"max_image_size_px": 1400, "neighbors": 5},
         "mesh": {"poisson_depth": 13, "faces": 1_000_000, "max_image_size_px": 3200},
         "texture": {"max_atlas_px": 8192},

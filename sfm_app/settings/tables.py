@@ -59,6 +59,13 @@ class MatchSettings(Section):
         1600, ge=128, le=16384, description="longer side at which features are found, in pixels"
     )
     max_features: int = Field(8192, ge=100, le=100000, description="most features per photo")
+    enlarge_below: int = Field(
+        4000,
+        ge=0,
+        le=100000,
+        description="photos with fewer features are searched again at twice their size, which takes four times as "
+        "long; for SIFT",
+    )
     max_ratio: float = Field(
         0.8, gt=0, le=1, description="largest nearest over second nearest descriptor distance, for SIFT; 1: no limit"
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from sfm_app.colmap.backend import json_options, pycolmap, run_with_progress
 from sfm_app.colmap.database import open_database, panorama_names
+from sfm_app.colmap.processes.enlarged_features import find_as_needed
 from sfm_app.colmap.processes.panorama_features import extract_panoramas
 from sfm_app.colmap.processes.worker_process import FeatureTask, ProgressReporter, SiftOption, report, serve
 from sfm_app.numerical import Json
@@ -45,8 +46,15 @@ def do_task(task: FeatureTask, progress: Progress, tell: Callable[..., None]) ->
             database, photo_dir, [name for name in names if name in panoramas], masks, extraction, progress
         )
         plain = [name for name in names if name not in panoramas]
-        if plain:
+        if plain and task["sift"]:
             extract(database, photo_dir, plain, reader, extraction, progress)
+        elif plain:
+            how = reader, extraction, options.enlarge_below
+
+            def call(token: pycolmap.CancellationToken) -> None:
+                find_as_needed(database, photo_dir, plain, how, token)
+
+            _run_with_progress(call, database, *_counter(database, plain), progress)
         tell(extraction=json_options(extraction.todict()))
     pairs = None if task["pairs"] is None else [(int(a), int(b)) for a, b in task["pairs"]]
     if pairs != []:
@@ -91,9 +99,6 @@ def extract(
         extraction: see `extraction_options`.
         progress: shows a bar.
     """
-    wanted = set(names)
-    with open_database(database) as before:
-        ids = [image.image_id for image in before.read_all_images() if image.name in wanted]
 
     def call(token: pycolmap.CancellationToken) -> None:
         pycolmap.extract_features(
@@ -101,10 +106,15 @@ def extract(
             device=pycolmap.Device.cpu, cancellation_token=token,
         )  # fmt: skip
 
-    def count_finished(reader: pycolmap.Database) -> int:
-        return sum(reader.exists_keypoints(image_id) for image_id in ids)
+    _run_with_progress(call, database, *_counter(database, names), progress)
 
-    _run_with_progress(call, database, count_finished, ("features", len(names)), progress)
+
+def _counter(database: Path, names: Sequence[str]) -> tuple[Callable[[pycolmap.Database], int], tuple[str, int]]:
+    """Return what counts the photos that have keypoints, and what a bar shows."""
+    wanted = set(names)
+    with open_database(database) as before:
+        ids = [image.image_id for image in before.read_all_images() if image.name in wanted]
+    return lambda reader: sum(reader.exists_keypoints(photo) for photo in ids), ("features", len(ids))
 
 
 def match(
