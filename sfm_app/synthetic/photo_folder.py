@@ -251,7 +251,7 @@ def save_truth(truth: Truth, folder: Path) -> None:
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / TRUTH_FILE).write_text(json.dumps(text, indent=1), encoding="utf-8")
+        (folder / TRUTH_FILE).write_text(json.dumps(text, indent=1), encoding="utf-8", newline="\n")
         (folder / SURFACE_FILE).write_bytes(_to_ply(truth.vertices, truth.faces))
     except OSError as err:
         raise InputError(f"cannot write the truth to {folder}: {err}", hint="choose another folder") from err
