@@ -20,19 +20,20 @@ JPEG_QUALITY = 95
 
 
 def assign_names(photos: Iterable[Photo]) -> Iterator[Photo]:
-    """Yield photos with unique names that COLMAP can write into databases and line-based lists.
+    """Yield photos with names that COLMAP can write into databases and line-based lists.
 
-    A name is printable and has an extension that COLMAP knows; a name that already fits is kept.
+    A name is printable and has an extension that COLMAP knows; a name that already fits is kept. Names differ by more
+    than capitals, which many file systems do not tell apart.
     """
     photos = list(photos)
-    taken = {photo.path for photo in photos}
+    given, taken = {photo.path.casefold() for photo in photos}, set[str]()
     for photo in photos:
         name = "".join(c if c.isprintable() else "_" for c in photo.path)
         if PurePosixPath(name).suffix.lower() not in READ_BY_COLMAP:
             name += ".jpg" if photo.lossy else ".png"
-        while name != photo.path and name in taken:
+        while name.casefold() in taken or (name != photo.path and name.casefold() in given):
             name = str(PurePosixPath(name).with_name(f"_{PurePosixPath(name).name}"))
-        taken.add(name)
+        taken.add(name.casefold())
         yield replace(photo, name=name, original=photo.path)
 
 
