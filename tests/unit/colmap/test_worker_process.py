@@ -11,6 +11,7 @@ import pytest
 
 from sfm_app.colmap.processes.worker_process import relay, start_worker
 from sfm_app.errors import BackendError
+from sfm_app.operating_system import Ability
 
 pytestmark = pytest.mark.slow
 
@@ -106,7 +107,9 @@ def test_a_process_is_ended_with_the_block(child):
     assert process.process.returncode == -signal.SIGKILL
 
 
-def test_a_process_ends_when_the_one_that_started_it_is_killed(child):
+@pytest.mark.parametrize("taken", [(), (Ability.CLOSED_INPUT,)], ids=["input", "number"])
+def test_a_process_ends_when_the_one_that_started_it_is_killed(child, without, taken):
+    without(*taken)
     parent = (
         "import sys; from sfm_app.colmap.processes.worker_process import start_worker\n"
         "with start_worker(sys.argv[1], {}) as process:\n"
