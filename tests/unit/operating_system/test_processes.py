@@ -15,6 +15,7 @@ from sfm_app.operating_system import (
     end_own_group,
     group_options,
     has_run_out,
+    lacks,
     processes,
 )
 
@@ -89,7 +90,7 @@ def test_a_process_without_a_group_ends_itself_last(without, monkeypatch):
 
 
 def test_ctrl_c_does_not_reach_a_group(without, monkeypatch):
-    assert os.name == "nt" or group_options() == {"start_new_session": True}
+    assert lacks(Ability.GROUPS) or group_options() == {"start_new_session": True}
     without(Ability.GROUPS)
     monkeypatch.setattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0x200, raising=False)
 
