@@ -12,6 +12,8 @@ from sfm_app.operating_system.abilities import Ability, lacks
 
 WAITS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Seconds between attempts at a file that another program looks at. Chosen by hand: virus scanners take less."""
+PIECE_BYTES = 1_000_000
+"""Bytes that are copied at once. Chosen by hand."""
 
 
 def link_or_copy(place: Path, target: Path | str, source: Path) -> None:
@@ -25,13 +27,19 @@ def link_or_copy(place: Path, target: Path | str, source: Path) -> None:
         source: the file.
 
     Raises:
-        OSError: neither can be written.
+        OSError: neither can be written, or something is there.
     """
     if not lacks(Ability.LINKS):
-        with contextlib.suppress(OSError):  # Windows without the right to link, some network drives
+        try:
             place.symlink_to(target)
+        except FileExistsError:  # a copy would go through a link that is there, into what it leads to
+            raise
+        except OSError:  # Windows without the right to link, some network drives
+            pass
+        else:
             return
-    shutil.copyfile(source, place)
+    with source.open("rb") as read, place.open("xb") as written:
+        shutil.copyfileobj(read, written, PIECE_BYTES)
 
 
 def share_bytes(source: Path, target: Path) -> None:

@@ -23,6 +23,8 @@ from sfm_app.synthetic.scenes.bodies import SyntheticScene
 
 FloatArray = NDArray[np.float64]
 TRUTH_FILE, SURFACE_FILE = "truth.json", "surface.ply"
+MOST_PROCESSES = 61
+"""Windows waits for no more at a time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,7 +165,7 @@ def add_missing_photos(
         elif missing:
             # a fork would copy the locks of Open3D's threads, but not the threads
             with ProcessPoolExecutor(
-                min(processes, len(missing)), get_context("spawn"), _start_process, arguments
+                min(processes, len(missing), MOST_PROCESSES), get_context("spawn"), _start_process, arguments
             ) as pool:
                 done = pool.map(_write_in_process, missing)
                 for _ in track(shown, done, "rendering photos", len(missing)):

@@ -38,6 +38,17 @@ def test_without_links_the_bytes_are_copied_and_the_photo_is_safe(photo, tmp_pat
     assert photo.read_bytes() == b"light"
 
 
+@pytest.mark.parametrize("taken", [(), (Ability.LINKS,)])
+def test_what_is_there_is_not_written_through(photo, tmp_path, without, taken):
+    without(*taken)
+    (tmp_path / "other.jpg").write_bytes(b"another")
+    (tmp_path / "place").symlink_to("other.jpg")
+
+    with pytest.raises(FileExistsError):
+        link_or_copy(tmp_path / "place", photo, photo)
+    assert (tmp_path / "other.jpg").read_bytes() == b"another"
+
+
 @pytest.mark.parametrize(("taken", "names"), [((), 1 if lacks(Ability.HARD_LINKS) else 2), ((Ability.HARD_LINKS,), 1)])
 def test_bytes_are_shared_where_they_can_be(photo, tmp_path, without, taken, names):
     without(*taken)
