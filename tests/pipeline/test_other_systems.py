@@ -72,6 +72,19 @@ def test_nothing_that_is_open_is_removed_replaced_or_moved(runs):
     assert not runs[3].exists(), runs[3].read_text(encoding="utf-8")
 
 
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="only Linux tells which files are open")
+@pytest.mark.parametrize("name", ["usdz", "colmap", "bundler", "draco", "laz"])
+def test_exports_remove_nothing_that_is_open(runs, tmp_path, name):
+    target, notes = tmp_path / ("export" if name in ("colmap", "bundler") else f"x.{name}"), tmp_path / "notes.txt"
+    paths = os.pathsep.join([str(RULES), os.environ.get("PYTHONPATH", "")])
+    rules = {"RULES_OUT": str(tmp_path.resolve()), "RULES_NOTES": str(notes), "TMPDIR": str(tmp_path)}
+    command = [sys.executable, "-m", "sfm_app", "export", runs[0], "--format", name, "-o", target]
+    for _ in range(2):  # the second replaces the first
+        subprocess.run(command, env={**os.environ, **rules, "PYTHONPATH": paths}, capture_output=True, check=True)
+
+    assert target.exists() and not notes.exists(), notes.read_text(encoding="utf-8")
+
+
 def test_no_text_is_read_or_written_as_this_machine_is_set(runs):
     warned = re.findall(r"^.*sfm_app.*EncodingWarning.*$", runs[2].stderr, re.MULTILINE)
     assert warned == []
