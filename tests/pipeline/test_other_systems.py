@@ -73,9 +73,12 @@ def test_nothing_that_is_open_is_removed_replaced_or_moved(runs):
 
 
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="only Linux tells which files are open")
-@pytest.mark.parametrize("name", ["usdz", "colmap", "bundler", "draco", "laz"])
-def test_exports_remove_nothing_that_is_open(runs, tmp_path, name):
-    target, notes = tmp_path / ("export" if name in ("colmap", "bundler") else f"x.{name}"), tmp_path / "notes.txt"
+@pytest.mark.parametrize(
+    ("name", "to"),
+    [("usdz", "x.usdz"), ("colmap", "folder"), ("bundler", "folder"), ("draco", "x.glb"), ("laz", "x.laz")],
+)
+def test_exports_remove_nothing_that_is_open(runs, tmp_path, name, to):
+    target, notes = tmp_path / to, tmp_path / "notes.txt"
     paths = os.pathsep.join([str(RULES), os.environ.get("PYTHONPATH", "")])
     rules = {"RULES_OUT": str(tmp_path.resolve()), "RULES_NOTES": str(notes), "TMPDIR": str(tmp_path)}
     command = [sys.executable, "-m", "sfm_app", "export", runs[0], "--format", name, "-o", target]
