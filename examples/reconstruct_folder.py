@@ -5,7 +5,14 @@ import sys
 
 import sfm_app
 
-settings = sfm_app.Settings.from_mapping({"quality": "draft"})
-run = sfm_app.reconstruct(sys.argv[1], sys.argv[2], settings)
-print(f"{len(run.scene.registered)} photos placed, K before bundle adjustment:\n{run.calibration.K.round(1)}")
-print(f"mesh: {run.mesh_path}")
+
+def main() -> None:
+    """Reconstruct the photos, and print what was found."""
+    settings = sfm_app.Settings.from_mapping({"quality": "draft"})
+    run = sfm_app.reconstruct(sys.argv[1], sys.argv[2], settings)
+    print(f"{len(run.scene.registered)} photos placed, K before bundle adjustment:\n{run.calibration.K.round(1)}")
+    print(f"mesh: {run.mesh_path}")
+
+
+if __name__ == "__main__":  # where processes are spawned, each of them imports the script
+    main()

@@ -6,6 +6,8 @@ import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from sfm_app.operating_system import replace_file
+
 UNFINISHED = "unfinished.txt"
 """Marker in a folder that a stage is filling: the fingerprint of the inputs, by which a killed run can resume."""
 
@@ -17,7 +19,7 @@ def replace_atomically(target: Path) -> Iterator[Path]:
     beside = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")  # machines share process ids
     try:
         yield beside
-        beside.replace(target)
+        replace_file(beside, target)
     finally:
         beside.unlink(missing_ok=True)
 
@@ -56,7 +58,7 @@ def mark_unfinished(folder: Path, made_from: str) -> None:
         made_from: fingerprint of the inputs.
     """
     with replace_atomically(folder / UNFINISHED) as path:
-        path.write_text(made_from, encoding="utf-8")
+        path.write_text(made_from, encoding="utf-8", newline="\n")
 
 
 def mark_finished(folder: Path) -> None:

@@ -10,6 +10,8 @@ from zipfile import ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.operating_system import is_link
+
 MOST_BYTES, MOST_INFLATED = 1_000_000_000, 200
 """A file is refused if its arrays exceed both: this many bytes, and this many times the size of the file. Our own
 exceed one at most; deflate reaches 1000 times with zeros."""
@@ -64,13 +66,13 @@ def fingerprint(*parts: Any) -> str:
 
 def is_below(name: str) -> bool:
     """Return whether a name stays below the folder that it is joined to, judging by the name alone."""
-    path = PurePath(name)
-    return bool(path.parts) and not path.is_absolute() and ".." not in path.parts and "\0" not in name
+    path = PurePath(name)  # a drive of Windows leads elsewhere without being absolute
+    return bool(path.parts) and not path.anchor and ".." not in path.parts and "\0" not in name
 
 
 def _files(path: Path) -> Iterator[Path]:
     if not path.is_dir():
         yield path
         return
-    below = (place for place in path.rglob("*") if place.is_file() and not place.is_symlink())
+    below = (place for place in path.rglob("*") if place.is_file() and not is_link(place))
     yield from sorted(place for place in below if not place.name.startswith("."))

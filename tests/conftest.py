@@ -11,6 +11,7 @@ import trimesh
 from hypothesis import settings
 from PIL import Image
 
+from sfm_app.operating_system import VARIABLE, abilities
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera, orbit
 from sfm_app.synthetic.photo_folder import load_truth, save_truth, write_photo_folder
 from sfm_app.synthetic.scenes.scene_catalog import build_scene
@@ -100,3 +101,14 @@ def as_ordinary_user(tmp_path_factory):
     if run("-c", f"open({str(closed)!r})").returncode == 0:
         pytest.skip("file modes restrict nobody here")
     return run
+
+
+@pytest.fixture
+def without(monkeypatch):
+    """Return a function that takes abilities of the system away, here and in the processes that are started."""
+
+    def take(*names):
+        monkeypatch.setattr(abilities, "HERE", abilities.HERE - {abilities.Ability(name) for name in names})
+        monkeypatch.setenv(VARIABLE, ",".join(names))
+
+    return take

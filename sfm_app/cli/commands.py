@@ -5,6 +5,7 @@ import gc
 import os
 import sys
 import warnings
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,8 @@ class Commands(click.Group):
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
         """Run the command line; end the process at once where a call of COLMAP still runs."""
+        if isinstance(sys.stdout, TextIOWrapper):  # in a file, Windows has no letters but those of its own language
+            sys.stdout.reconfigure(errors="backslashreplace")
         gc.freeze()  # what is imported lives to the end: looking through it again takes a third of a second at exit
         try:
             return super().main(*args, **kwargs)

@@ -8,10 +8,11 @@ from sfm_app.colmap.backend import has_cuda
 from sfm_app.engine.staleness import versions
 from sfm_app.errors import SfmError
 from sfm_app.meshing.open3d import load_open3d
+from sfm_app.operating_system import free_memory_mb, missing_abilities
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.parallel import worker_count
 
-GIGABYTE = 2**30
+GIGABYTE, MB_PER_GB = 2**30, 2**30 / 1e6
 ENOUGH_DISK = 2 * GIGABYTE
 
 
@@ -21,23 +22,16 @@ def examine() -> dict[str, str]:
     return {
         "python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",
         "cores": str(worker_count(0)),
-        "memory": _memory(),
+        "memory": f"{free_memory_mb() / MB_PER_GB:.0f} GB free",
         "free disk here": f"{disk / GIGABYTE:.0f} GB"
         + ("" if disk > ENOUGH_DISK else ": little; dense stereo needs about 2 GB"),
+        "done without": ", ".join(missing_abilities()) or "nothing",
         **versions(),
         "COLMAP with CUDA": "yes" if has_cuda() else "no",
         "depth maps": _depth_maps(),
         "ray casting (Open3D)": _open3d(),
         "plug-ins": _plugins(),
     }
-
-
-def _memory() -> str:
-    try:
-        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines())
-        return f"{int(lines['MemAvailable'].split()[0]) / 2**20:.0f} GB free"
-    except (OSError, KeyError, ValueError):
-        return "unknown on this system"
 
 
 def _depth_maps() -> str:

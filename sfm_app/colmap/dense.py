@@ -14,6 +14,7 @@ from sfm_app.colmap.masks import used_pixels
 from sfm_app.colmap.processes.worker_process import UndistortTask, run_worker
 from sfm_app.colmap.types import all_images
 from sfm_app.hashing import digest_files, is_below
+from sfm_app.operating_system import replace_file
 from sfm_app.progress import Progress
 from sfm_app.settings.tables import MOST_LEVELS
 from sfm_app.stereo import DepthEstimate, DepthMap, Kind, View
@@ -263,7 +264,7 @@ def write_fusion_views(dense_dir: Path, views: Sequence[View]) -> None:
         views: all undistorted photos.
     """
     config = "".join(f"{view.name}\n" for view in views if map_file(dense_dir, view).exists())
-    (dense_dir / "stereo" / "fusion.cfg").write_text(config, encoding="utf-8")
+    (dense_dir / "stereo" / "fusion.cfg").write_text(config, encoding="utf-8", newline="\n")
 
 
 def digest_maps(dense_dir: Path) -> str:
@@ -304,4 +305,4 @@ def _atomic_path(target: Path) -> Iterator[Path]:
     beside = target.with_name(f".{secrets.token_hex(4)}.{target.name}")  # two machines may write the same map
     yield beside
     check_written(beside)
-    beside.replace(target)
+    replace_file(beside, target)

@@ -15,6 +15,7 @@ from itertools import takewhile
 from sfm_app.engine.stage import Stage
 from sfm_app.engine.staleness import settings_and_versions
 from sfm_app.hashing import fingerprint
+from sfm_app.operating_system import move
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.earlier import Earlier, split_names
 from sfm_app.runtime.manifest import StageRecord
@@ -93,7 +94,7 @@ def _move_files(stages: Sequence[Stage[object]], run: RunContext) -> None:
             for name in stage.files:
                 if not (place.root / name).exists():
                     with suppress(FileNotFoundError):
-                        (here.root / name).rename(place.root / name)
+                        move(here.root / name, place.root / name)
 
 
 def _is_usable(stage: Stage[object], run: RunContext) -> bool:

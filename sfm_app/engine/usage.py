@@ -1,6 +1,5 @@
 """Seconds, CPU seconds and memory of a stage, with the processes that it starts."""
 
-import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -8,6 +7,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import psutil
+
+from sfm_app.operating_system import ChildTimes, cpu_seconds
 
 EVERY_S = 0.5
 """Time between two looks at the memory, in seconds. Chosen by hand: a look takes some milliseconds."""
@@ -32,35 +33,33 @@ def measure_usage(elsewhere: Callable[[], float] = float) -> Iterator[Usage]:
     Args:
         elsewhere: returns the CPU seconds so far of processes that work for this one without being waited for.
     """
-    used, ended = Usage(), threading.Event()
-    start, cpu_start = time.perf_counter(), _cpu_seconds() + elsewhere()
-    watcher = threading.Thread(target=_watch_memory, args=(used, ended), name="memory", daemon=True)
+    used, ended, children = Usage(), threading.Event(), ChildTimes()
+    start, cpu_start = time.perf_counter(), cpu_seconds() + elsewhere()
+    watcher = threading.Thread(target=_watch_memory, args=(used, children, ended), name="memory", daemon=True)
     watcher.start()
     try:
         yield used
     finally:
         ended.set()
         watcher.join()
-        used.peak_mb = max(used.peak_mb, _resident_mb())
-        used.seconds, used.cpu_seconds = time.perf_counter() - start, _cpu_seconds() + elsewhere() - cpu_start
+        used.peak_mb = max(used.peak_mb, _resident_mb(children))
+        used.seconds = time.perf_counter() - start
+        used.cpu_seconds = cpu_seconds() + children.seconds() + elsewhere() - cpu_start
 
 
-def _watch_memory(used: Usage, ended: threading.Event) -> None:
+def _watch_memory(used: Usage, children: ChildTimes, ended: threading.Event) -> None:
     while True:
-        used.peak_mb = max(used.peak_mb, _resident_mb())
+        used.peak_mb = max(used.peak_mb, _resident_mb(children))
         if ended.wait(EVERY_S):
             return
 
 
-def _cpu_seconds() -> float:
-    return sum(os.times()[:4])
-
-
-def _resident_mb() -> int:
-    """Return the memory of this process and of its children in MB."""
+def _resident_mb(times: ChildTimes) -> int:
+    """Return the memory of this process and of its children in MB, and note the time of the latter."""
     me = psutil.Process()
-    command, total = me.cmdline(), int(me.memory_info().rss)
-    for process in me.children(recursive=True):
+    command, total, children = me.cmdline(), int(me.memory_info().rss), me.children(recursive=True)
+    times.look(children)
+    for process in children:
         try:
             # until a child runs a program of its own, its memory is ours
             if process.cmdline() not in ([], command):

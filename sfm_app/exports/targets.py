@@ -9,6 +9,7 @@ from pathlib import Path
 from sfm_app.atomic_io import replace_atomically
 from sfm_app.errors import InputError
 from sfm_app.numerical import json_text
+from sfm_app.operating_system import is_link, move
 
 RECORD = "export.json"
 """In a folder that an export has written: its format, its files, and which photo each picture shows."""
@@ -34,16 +35,16 @@ def fill_folder(target: Path, about: Callable[[], Mapping[str, object]]) -> Iter
     try:
         yield beside
         with replace_atomically(beside / RECORD) as path:
-            path.write_text(json_text({**about(), "files": _list_files(beside)}), encoding="utf-8")
+            path.write_text(json_text({**about(), "files": _list_files(beside)}), encoding="utf-8", newline="\n")
         check_replaceable(target)  # it may have been filled meanwhile
         if target.exists():
             old = target.with_name(f".{target.name}.old")
             shutil.rmtree(old, ignore_errors=True)
-            target.rename(old)
-            beside.rename(target)
+            move(target, old)
+            move(beside, target)
             shutil.rmtree(old, ignore_errors=True)
         else:
-            beside.rename(target)
+            move(beside, target)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
 
@@ -57,7 +58,7 @@ def check_replaceable(target: Path) -> None:
     Raises:
         InputError: it is no folder, or it holds files that no export has written.
     """
-    if target.is_symlink() or (target.exists() and not target.is_dir()):
+    if is_link(target) or (target.exists() and not target.is_dir()):
         raise InputError(f"{target} is no folder", hint=ELSEWHERE)
     if not target.exists():
         return

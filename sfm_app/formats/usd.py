@@ -124,23 +124,28 @@ def stage_bytes(model: Model, pages: Mapping[int, str]) -> bytes:
         model: what it shows.
         pages: files of the pages of texture by their numbers.
     """
-    from pxr import Usd, UsdGeom
-
     with tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch:
         path = Path(scratch) / "model.usdc"
-        stage = Usd.Stage.CreateNew(str(path))
-        stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, ROOT).GetPrim())
-        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-        if len(model.surface.faces):
-            mesh = add_mesh(stage, model.surface)
-            if pages and model.texture is not None:
-                add_texture(stage, mesh, model.texture, pages)
-        else:
-            add_points(stage, model)
-        add_cameras(stage, model)
-        stage.GetRootLayer().Save()
+        _write_stage(path, model, pages)
         return path.read_bytes()
+
+
+def _write_stage(path: Path, model: Model, pages: Mapping[int, str]) -> None:
+    """Write a stage. Nothing keeps it beyond this function, so that the file is closed and can be removed."""
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.CreateNew(str(path))
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, ROOT).GetPrim())
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    if len(model.surface.faces):
+        mesh = add_mesh(stage, model.surface)
+        if pages and model.texture is not None:
+            add_texture(stage, mesh, model.texture, pages)
+    else:
+        add_points(stage, model)
+    add_cameras(stage, model)
+    stage.GetRootLayer().Save()
 
 
 def add_mesh(stage: "Usd.Stage", surface: Surface) -> "UsdGeom.Mesh":

@@ -1,11 +1,10 @@
 """Import of Open3D, which is slow, logs much, and needs a library that minimal Linux systems lack."""
 
-import ctypes
 import functools
 import importlib
 from typing import Any
 
-import libusb_package
+from sfm_app.operating_system import load_for_others
 
 
 @functools.cache
@@ -14,10 +13,7 @@ def load_open3d() -> Any:
 
     Call it inside the functions that need Open3D: the import takes more than a second.
     """
-    # Open3D links to libusb-1.0.so.0; a library of that name that is already loaded is used.
-    library = libusb_package.get_library_path()
-    if library is not None:
-        ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
+    load_for_others("libusb_package")  # Open3D links to libusb-1.0.so.0; one that is already loaded is used
     open3d = importlib.import_module("open3d")
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     return open3d

@@ -20,7 +20,7 @@ from sfm_app.photos.selection.quality_filter import drop_unusable
 from sfm_app.photos.selection.stats_file import read_stats, write_stats
 from sfm_app.photos.selection.thumbnail_stats import PhotoStats
 from sfm_app.photos.source import Source, read_source
-from sfm_app.photos.staging import assign_names, lay_out
+from sfm_app.photos.staging import assign_names, is_laid_out, lay_out
 from sfm_app.photos.video.feature_tracking import CornerTracker, TrackedFrame
 from sfm_app.photos.video.keyframe_selection import select_keyframes
 from sfm_app.photos.video.video_formats import is_video, read_head
@@ -39,6 +39,7 @@ __all__ = [
     "fill_masked",
     "find_mask",
     "group_by_camera",
+    "is_laid_out",
     "is_video",
     "lay_out",
     "lay_out_mask",

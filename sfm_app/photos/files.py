@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from sfm_app.errors import InputError
+from sfm_app.operating_system import is_link
 from sfm_app.photos.video.video_formats import ENDINGS
 
 HINT = "name the folder that holds the photos"
@@ -65,11 +66,11 @@ def resolve_file(folder: Path, name: str) -> Path | str:
     except (OSError, ValueError) as err:  # lists may hold invalid names; folders may be inaccessible
         return f"not readable: {getattr(err, 'strerror', 'no name').lower()}"
     if not real.is_relative_to(root):
-        return "a link out of the folder" if place.is_symlink() else "outside the folder"
+        return "a link out of the folder" if is_link(place) else "outside the folder"
     if not there:
-        return "a link that leads nowhere" if place.is_symlink() else "not there"
+        return "a link that leads nowhere" if is_link(place) else "not there"
     if real.is_dir():
-        return "a link to a folder" if place.is_symlink() else "a folder"
+        return "a link to a folder" if is_link(place) else "a folder"
     return real if real.is_file() else "not a file"  # reading a pipe would never end
 
 
@@ -85,6 +86,6 @@ def _read_list(file: Path) -> list[str]:
 def _walk(folder: Path, left_out: set[Path]) -> Iterator[Path]:
     for place, folders, files in os.walk(folder):
         here = Path(place)
-        closed = [name for name in folders if name.startswith(".") or (here / name).is_symlink()]
+        closed = [name for name in folders if name.startswith(".") or is_link(here / name)]
         folders[:] = [name for name in folders if name not in closed and (here / name).resolve() not in left_out]
         yield from (here / name for name in (*files, *closed))

@@ -10,8 +10,8 @@ from typing import Any
 
 import PIL
 
-LIBRARY_DIRS = (Path(PIL.__file__).parents[1] / "pillow.libs", Path(PIL.__file__).parent / ".dylibs")
-"""Where Pillow's wheels keep their own libtiff on Linux and macOS."""
+from sfm_app.operating_system import find_in_wheel
+
 HANDLER = ctypes.CFUNCTYPE(None, ctypes.c_char_p, ctypes.c_char_p, ctypes.c_void_p)
 """Type of libtiff's error callback: module, format and arguments of a message."""
 
@@ -22,7 +22,8 @@ _thread_errors = threading.local()
 def libtiff_errors() -> Iterator[list[str]]:
     """Provide a list that collects libtiff's errors while this thread decodes.
 
-    It stays empty if Pillow has no libtiff of its own.
+    It stays empty if Pillow's libtiff is no library of its own, as on Windows: what Pillow itself notices is still an
+    error, but damage after which libtiff goes on decoding is not noticed.
     """
     _install_handler()
     _thread_errors.errors = []
@@ -42,7 +43,7 @@ ERROR_CALLBACK = HANDLER(_record_error)
 
 @cache
 def _install_handler() -> None:
-    for library in (file for place in LIBRARY_DIRS for file in place.glob("libtiff*")):
-        set_handler = ctypes.CDLL(str(library)).TIFFSetErrorHandler
+    for library in find_in_wheel(Path(PIL.__file__).parent, "pillow", "libtiff"):
+        set_handler = library.TIFFSetErrorHandler
         set_handler.argtypes, set_handler.restype = [HANDLER], ctypes.c_void_p
         set_handler(ERROR_CALLBACK)

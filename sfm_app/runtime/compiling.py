@@ -24,6 +24,7 @@ from llvmlite.binding import get_host_cpu_name
 from numba import types
 
 from sfm_app.jit import ASKED_FOR, wait_where
+from sfm_app.operating_system import watch_parent, yield_to_others
 from sfm_app.progress import Progress
 
 PACKAGE = Path(__file__).parents[1]
@@ -76,7 +77,7 @@ def compiling_ahead(parts: Sequence[str], progress: Progress) -> Iterator[thread
 
 
 def _start(part: str) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, "-P", "-m", "sfm_app.runtime.compiling", part]
+    command = [sys.executable, "-P", "-m", "sfm_app.runtime.compiling", part, str(os.getpid())]
     quiet = subprocess.DEVNULL
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet)  # noqa: S603 - our module
 
@@ -187,18 +188,8 @@ def make_type(kind: Kind) -> Any:
     return types.boolean if kind == "bool" else getattr(types, kind)
 
 
-def _end_with_parent() -> None:
-    """Stop this process when the one that started it has ended, however that was."""
-
-    def watch() -> None:
-        sys.stdin.read()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
 if __name__ == "__main__":
-    _end_with_parent()
-    if sys.argv[1] == PARTS[1] and hasattr(os, "nice"):
-        os.nice(LATER)
+    watch_parent(int(sys.argv[2]), lambda: os._exit(1))
+    if sys.argv[1] == PARTS[1]:
+        yield_to_others(LATER)
     sys.exit(1 if compile_part(sys.argv[1]) else 0)

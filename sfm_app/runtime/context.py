@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from sfm_app.atomic_io import save_files
+from sfm_app.operating_system import machine_memory_mb
 from sfm_app.plugins import Plugins
 from sfm_app.progress import Progress, SilentProgress, track
-from sfm_app.runtime.cost_estimate import SHARE_OF_MACHINE, machine_memory_mb
+from sfm_app.runtime.cost_estimate import SHARE_OF_MACHINE
 from sfm_app.runtime.earlier import Earlier
 from sfm_app.runtime.parallel import make_executor, ordered_map, threads_elsewhere
 from sfm_app.runtime.workspace import Workspace

@@ -5,10 +5,8 @@ machines differ by a factor of two, and so do other scenes.
 """
 
 import math
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 from sfm_app.retrieval.choice import expected_pairs
 from sfm_app.settings import MeshSettings, Settings
@@ -182,19 +180,6 @@ def choose_plan(
     chosen, names = list(photos), list(stages)
     plans = (make_plan(chosen, settings, number, limit_mb) for number in range(workers, 0, -1))
     return next((plan for plan in plans if plan.peak_mb(names) <= limit_mb), make_plan(chosen, settings, 1, limit_mb))
-
-
-def machine_memory_mb() -> float:
-    """Return the memory of this machine or container in MB; infinite where the system does not say."""
-    found = [math.inf]
-    for path, unit in (("/proc/meminfo", 1 / 1000), ("/sys/fs/cgroup/memory.max", 1 / MEGA)):
-        try:
-            said = re.search(r"(?:MemTotal:\s+)?(\d+)", Path(path).read_text(encoding="utf-8"))
-        except OSError:
-            continue
-        if said:
-            found.append(int(said[1]) * unit)
-    return min(found)
 
 
 def _refine_mb(megapixels: float) -> float:

@@ -131,7 +131,7 @@ class Manifest:
     def write(self, manifest: Mapping[str, Any]) -> None:
         """Replace the manifest as a whole."""
         with replace_atomically(self.path) as path:
-            path.write_text(json_text(manifest), encoding="utf-8")
+            path.write_text(json_text(manifest), encoding="utf-8", newline="\n")
 
     def sizes(self, files: tuple[str, ...]) -> dict[str, int]:
         """Return the sizes of a stage's files, as its record holds them."""

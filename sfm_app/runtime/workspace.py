@@ -10,10 +10,11 @@ from datetime import datetime
 from itertools import chain
 from pathlib import Path
 
-from filelock import FileLock, Timeout
+from filelock import BaseFileLock, FileLock, Timeout
 
 from sfm_app.atomic_io import UNFINISHED
 from sfm_app.errors import InputError
+from sfm_app.operating_system import is_link
 from sfm_app.runtime.manifest import MANIFEST, Manifest
 
 DATABASE, CALIBRATION, SCENE, SCALE = "database.db", "calibration.json", "scene.json", "scale.json"
@@ -189,10 +190,10 @@ class Workspace:
     def _links(self) -> Iterator[Path]:
         """Yield links that no run has made; links to photos are left out, since laying out replaces them."""
         for path in (self.root / name for name in LINK_CHECKED):
-            if path.is_symlink():
+            if is_link(path):
                 yield path
             elif path.name != self.photos.name:
-                yield from (below for below in path.rglob("*") if below.is_symlink())
+                yield from (below for below in path.rglob("*") if is_link(below))
 
     def check_no_overlap(self, photos: Path, what: str = "photos") -> None:
         """Check that a run would not write over its photos, or its masks.
@@ -233,12 +234,23 @@ class Workspace:
             ) from None
         try:
             started = datetime.now().astimezone().isoformat(" ", "seconds")
-            holder.write_text(f"process {os.getpid()} on {platform.node()} since {started}\n", encoding="utf-8")
+            holder.write_text(
+                f"process {os.getpid()} on {platform.node()} since {started}\n", encoding="utf-8", newline="\n"
+            )
             yield
         finally:
             with contextlib.suppress(OSError):  # the folder may be gone or read-only: the run reports that itself
                 holder.unlink(missing_ok=True)
-            lock.release()
+            self._release(lock)
+
+    def _release(self, lock: BaseFileLock) -> None:
+        """Release the lock, but keep its file, which Windows removes: by it, the next run knows that one was here."""
+        file = self.root / LOCK
+        was_there = file.exists()
+        lock.release()
+        if was_there and not file.exists():
+            with contextlib.suppress(OSError):
+                file.touch()
 
     def check_exists(self) -> None:
         """Check that the folder still exists during a run, and is writable.

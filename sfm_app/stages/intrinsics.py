@@ -26,7 +26,7 @@ def make(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
         identifiable=sum(camera.found.identifiable for camera in cameras),
     )
     with replace_atomically(run.workspace.calibration) as path:
-        path.write_text(json_text(intrinsics.to_dict()), encoding="utf-8")
+        path.write_text(json_text(intrinsics.to_dict()), encoding="utf-8", newline="\n")
     return intrinsics
 
 

@@ -38,7 +38,7 @@ def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
                 create_database(place.database, photos)
             else:
                 grow_database(place.database, run.earlier.place.database, photos, run.earlier.known)
-        marker.write_text(run.fingerprint, encoding="utf-8")
+        marker.write_text(run.fingerprint, encoding="utf-8", newline="\n")
     method = run.plugins.feature_method(options.features)
     in_force = find_all_features(method, run)
     if run.earlier is not None:

@@ -159,7 +159,7 @@ def _fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArra
     sound = target.exists() and is_made_from(whole, digest_files(place, FUSED))
     if not sound or target.stat().st_mtime_ns <= youngest:
         fuse_maps(dense_dir, views, _min_views(views, run), target, run)
-        whole.write_text(digest_files(place, FUSED), encoding="utf-8")
+        whole.write_text(digest_files(place, FUSED), encoding="utf-8", newline="\n")
     points = open_points(target)
     run.record(fused_points=len(points))
     if len(points) < MIN_POINTS:

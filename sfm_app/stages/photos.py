@@ -11,6 +11,7 @@ from pathlib import Path
 from sfm_app.atomic_io import replace_atomically
 from sfm_app.errors import InputError
 from sfm_app.hashing import digest_files, is_below
+from sfm_app.operating_system import is_link
 from sfm_app.photos import (
     MASK_HINT,
     PhotoStats,
@@ -21,13 +22,13 @@ from sfm_app.photos import (
     drop_unusable,
     find_mask,
     group_by_camera,
+    is_laid_out,
     lay_out,
     lay_out_mask,
     list_files,
     mask_path,
     read_photo,
     read_stats,
-    resolve_file,
     split_by_given_camera,
     unused_masks,
     write_stats,
@@ -227,13 +228,14 @@ def _save_photo_set(photos: PhotoSet, run: RunContext) -> None:
     known = {"photos": entries, "unusable": [asdict(photo) for photo in photos.unusable]}
     copies = {photo.name: _copy_digest(photo, run) for photo in photos.photos}
     with replace_atomically(run.workspace.photo_set) as path:
-        path.write_text(json.dumps({**known, "copies": copies}, indent=1) + "\n", encoding="utf-8")
+        path.write_text(json.dumps({**known, "copies": copies}, indent=1) + "\n", encoding="utf-8", newline="\n")
 
 
 def _copy_digest(photo: Photo, run: RunContext) -> str | None:
-    """Return a hash of the bytes of a copy; None where there is a link to the photo, or nothing."""
+    """Return a hash of the bytes of an 8-bit copy; None where the photo itself is laid out, or nothing."""
     place = run.workspace.photos / photo.name
-    return digest_files(run.workspace.photos, photo.name) if place.is_file() and not place.is_symlink() else None
+    is_copy = photo.needs_copy and place.is_file() and not is_link(place)
+    return digest_files(run.workspace.photos, photo.name) if is_copy else None
 
 
 def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoSet:
@@ -241,8 +243,8 @@ def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoS
     found = replace(read_photo_list(run.workspace), folder=folder, masks=masks)
     values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
     for photo in found.photos:
-        place, copy = run.workspace.photos / photo.name, values["copies"].get(photo.name)
-        if copy != _copy_digest(photo, run) or not (copy or place.resolve() == resolve_file(folder, photo.path)):
+        copy = values["copies"].get(photo.name)
+        if copy != _copy_digest(photo, run) or not (copy or is_laid_out(photo, folder, run.workspace.photos)):
             if folder == run.workspace.frames and not (folder / photo.path).exists():
                 raise FileNotFoundError(errno.ENOENT, "no such frame", str(folder / photo.path))
             lay_out_photo(photo, folder=folder, target=run.workspace.photos)

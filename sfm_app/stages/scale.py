@@ -35,7 +35,7 @@ def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
     before = _earlier_frame(run.workspace)
     frame = find_frame(photos, scene, run)
     with replace_atomically(run.workspace.scale) as path:
-        path.write_text(json_text(frame.to_dict()), encoding="utf-8")
+        path.write_text(json_text(frame.to_dict()), encoding="utf-8", newline="\n")
     if frame.changes or before.changes:
         run.write_model(move_model(sparse_model(run.workspace.sparse), frame.from_model), POINTS)
     return frame

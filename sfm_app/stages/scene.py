@@ -19,6 +19,7 @@ from sfm_app.estimation.diagnosis import diagnose_depth, diagnose_scene
 from sfm_app.estimation.exif_check import report_claims
 from sfm_app.hashing import digest_files
 from sfm_app.numerical import Json, json_text
+from sfm_app.operating_system import move
 from sfm_app.reconstruction import MappedScene, Outcome, reconstruct, retry_lost_photos
 from sfm_app.reconstruction.align_upright import gps_deviation, orient_or_keep, submit_cue_extraction
 from sfm_app.reconstruction.growth.known_model import GROWN, map_new_photos
@@ -240,7 +241,7 @@ def write_model(model: Reconstruction, target: Path) -> None:
         model.write(beside)
         check_written(*beside.iterdir())
     shutil.rmtree(target, ignore_errors=True)
-    beside.rename(target)
+    move(beside, target)
 
 
 def refined_cameras(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, RefinedCamera]:
@@ -275,4 +276,4 @@ def write_scene(scene: Scene, run: RunContext) -> None:
         "gps_deviation": scene.gps_deviation,
     }
     with replace_atomically(run.workspace.scene) as path:
-        path.write_text(json_text(known), encoding="utf-8")
+        path.write_text(json_text(known), encoding="utf-8", newline="\n")

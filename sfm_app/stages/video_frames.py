@@ -62,7 +62,7 @@ def video_frames(source: Path, run: RunContext) -> Iterator[VideoFrames]:
         chosen = choose_frames(source, run)
         shutil.rmtree(run.workspace.frames, ignore_errors=True)
         with replace_atomically(run.workspace.frames_marker) as path:
-            path.write_text(json.dumps(asdict(chosen)), encoding="utf-8")
+            path.write_text(json.dumps(asdict(chosen)), encoding="utf-8", newline="\n")
     _write_frames(source, chosen.frames, run)
     run.record(video=chosen.counts)
     names = (frame_name(source, frame) for frame in chosen.frames)

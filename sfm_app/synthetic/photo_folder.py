@@ -23,6 +23,8 @@ from sfm_app.synthetic.scenes.bodies import SyntheticScene
 
 FloatArray = NDArray[np.float64]
 TRUTH_FILE, SURFACE_FILE = "truth.json", "surface.ply"
+MOST_PROCESSES = 61
+"""Windows waits for no more at a time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,7 +165,7 @@ def add_missing_photos(
         elif missing:
             # a fork would copy the locks of Open3D's threads, but not the threads
             with ProcessPoolExecutor(
-                min(processes, len(missing)), get_context("spawn"), _start_process, arguments
+                min(processes, len(missing), MOST_PROCESSES), get_context("spawn"), _start_process, arguments
             ) as pool:
                 done = pool.map(_write_in_process, missing)
                 for _ in track(shown, done, "rendering photos", len(missing)):
@@ -251,7 +253,7 @@ def save_truth(truth: Truth, folder: Path) -> None:
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / TRUTH_FILE).write_text(json.dumps(text, indent=1), encoding="utf-8")
+        (folder / TRUTH_FILE).write_text(json.dumps(text, indent=1), encoding="utf-8", newline="\n")
         (folder / SURFACE_FILE).write_bytes(_to_ply(truth.vertices, truth.faces))
     except OSError as err:
         raise InputError(f"cannot write the truth to {folder}: {err}", hint="choose another folder") from err

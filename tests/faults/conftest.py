@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -49,6 +50,8 @@ class Folder:
 
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory, as_ordinary_user):
+    if sys.platform == "win32":
+        pytest.skip("Windows has neither SIGKILL nor limits of processes")
     place = tmp_path_factory.mktemp("faults")
     views = arc(make_camera(480, 360), ArcOptions(photos=5, sweep_deg=40.0))
     write_photo_folder(place / "photos", build_scene(), views, PhotoOptions(supersampling=1))

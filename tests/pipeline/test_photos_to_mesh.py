@@ -291,6 +291,7 @@ def heed_interrupts():
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are another thing there")
 def test_an_interrupted_run_says_so_and_goes_on(rendered, tmp_path):
     command = [sys.executable, "-m", "sfm_app", "run", str(rendered[0]), "-o", str(tmp_path / "out"), "-q"]
     command += ["--quality", "draft"]

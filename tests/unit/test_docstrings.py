@@ -9,13 +9,13 @@ import sfm_app
 
 PACKAGE = Path(sfm_app.__file__).parent
 VERBS = """
-    Add Adjust Announce Apply Average Begin Blur Bring Build Change Check Choose Claim Collapse Collect Compile
-    Compute Continue Copy Count Decode Decompose Describe Divide Do Draw Drop Eliminate Enter Estimate Even Expect
-    Fill Find Finish Fit Fuse Give Go Group Hold Import Improve Invert Join Judge Keep Lay Learn Leave Let Lift Link
-    List Look Make Map Mark Match Measure Minimize Mix Move Note Open Paint Pass Photograph Pickle Place Prepare Print
-    Project Provide Put Raise Rank Read Rebuild Reconstruct Refine Refit Refuse Register Remove Render Replace Return
-    Round Run Sample Say Score Send Serve Set Show Simplify Solve Sort Span Spread Start Stop Sum Swap Take Tilt Turn
-    Undistort Update Use Verify Wait Walk Warp Weigh Widen Write Yield
+    Add Adjust Announce Apply Average Begin Blur Bring Build Call Change Check Choose Claim Collapse Collect Compile
+    Compute Continue Copy Count Decode Decompose Describe Divide Do Draw Drop Eliminate End Enter Estimate Even Expect
+    Fill Find Finish Fit Fuse Give Go Group Hold Import Improve Invert Join Judge Keep Kill Lay Learn Leave Let Lift
+    Link List Load Look Make Map Mark Match Measure Minimize Mix Move Note Open Paint Pass Photograph Pickle Place
+    Prepare Print Project Provide Put Raise Rank Read Rebuild Reconstruct Refine Refit Refuse Register Release Remove
+    Render Replace Return Round Run Sample Say Score Send Serve Set Show Simplify Solve Sort Span Spread Start Stop
+    Sum Swap Take Tilt Turn Undistort Update Use Verify Wait Walk Warp Weigh Widen Write Yield
 """.split()  # noqa: SIM905 -- a list of a hundred lines reads worse
 """A new verb is entered here; a noun, a participle or a fragment is not."""
 

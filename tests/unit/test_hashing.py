@@ -1,8 +1,10 @@
 import zipfile
+from pathlib import PureWindowsPath
 
 import numpy as np
 import pytest
 
+from sfm_app import hashing
 from sfm_app.hashing import MOST_BYTES, digest_files, fingerprint, is_below, load_arrays
 
 
@@ -81,3 +83,13 @@ def test_names_that_stay_below(name, below):
 def test_fingerprints_ignore_order_of_keys_only():
     assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1})
     assert fingerprint([1, 2]) != fingerprint([2, 1])
+
+
+@pytest.mark.parametrize(
+    ("name", "below"),
+    [("in\\x.jpg", True), ("C:x.jpg", False), ("\\x.jpg", False), ("C:\\x.jpg", False), ("..\\x", False)],
+)
+def test_drives_and_roots_of_windows_lead_out_of_the_folder(monkeypatch, name, below):
+    monkeypatch.setattr(hashing, "PurePath", PureWindowsPath)
+
+    assert is_below(name) == below

@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 from sfm_app.colmap.processes.worker_process import UndistortTask, run_worker
+from sfm_app.operating_system import replace_file
 from sfm_app.progress import Progress
 
 BUNDLE = "pmvs/bundle.rd.out"
@@ -36,6 +37,6 @@ def write_bundle(model_dir: Path, photo_dir: Path, file: Path, workers: int, pro
             "output": "PMVS",
         }
         run_worker("sfm_app.colmap.processes.undistort_process", task, "writing Bundler's file", progress)
-        (scratch / BUNDLE).replace(file)
+        replace_file(scratch / BUNDLE, file)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)

@@ -209,7 +209,7 @@ def _match_listed(
     """Match pairs of photos by name; the folder gets a list of them."""
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = folder / "pairs.txt"
-    pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="ascii")
+    pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="ascii", newline="\n")
     with open_database(database) as reader:
         before = int(reader.num_matched_image_pairs())
 

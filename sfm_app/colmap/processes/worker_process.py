@@ -7,7 +7,6 @@ error like any other. The process ends with its parent, however that ends, so th
 import contextlib
 import json
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -18,6 +17,7 @@ from typing import IO, Any, Literal, TypeAlias, TypedDict, TypeVar
 from sfm_app.colmap.backend import log_level, show_log
 from sfm_app.errors import BackendError
 from sfm_app.numerical import Json
+from sfm_app.operating_system import crash_name, has_run_out, ignore_interrupts, watch_parent
 from sfm_app.progress import Progress, SilentProgress
 
 ENDED_EARLY = 1
@@ -140,7 +140,7 @@ class WorkerProcess:
         code = self.process.wait()
         if not code:
             return
-        if code == -signal.SIGKILL:
+        if has_run_out(code):
             raise BackendError(
                 f"COLMAP was ended from outside while {doing}: perhaps the memory was full",
                 hint="run again with --workers 1, or with --quality draft",
@@ -148,8 +148,8 @@ class WorkerProcess:
         self._said.seek(0)
         lines = self._said.read().decode(errors="replace").split("\n")
         last = next((line.strip() for line in reversed(lines) if line.strip()), f"it ended with {code}")
-        # after a crash, the last line of the output is a stack address
-        why = last if code > 0 else f"it crashed ({signal.Signals(-code).name})"
+        crash = crash_name(code)  # after a crash, the last line of the output is a stack address
+        why = f"it crashed ({crash})" if crash else last
         raise BackendError(f"COLMAP failed while {doing}: {why}", hint="run again with -v to see what COLMAP says")
 
 
@@ -167,12 +167,12 @@ def start_worker(module: str, task: Mapping[str, object]) -> Iterator[WorkerProc
     with (
         tempfile.TemporaryFile() as said,
         subprocess.Popen(  # noqa: S603 - our module
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=None if loud else said, text=True
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=None if loud else said, encoding="utf-8"
         ) as process,
     ):
         try:
-            with contextlib.suppress(BrokenPipeError):  # the process has failed already; `check` reports why
-                print(json.dumps({"log_level": loud, **task}), file=process.stdin, flush=True)
+            with contextlib.suppress(OSError):  # the process has failed already; `check` reports why
+                print(json.dumps({"log_level": loud, "parent": os.getpid(), **task}), file=process.stdin, flush=True)
             yield WorkerProcess(process, said)
         finally:
             if process.poll() is None:
@@ -237,7 +237,7 @@ def run_worker(
 
 def serve(work: Callable[[Task], None]) -> None:
     """Do the task in the worker process, and end when its parent does."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    ignore_interrupts()
     os.dup2(sys.stdout.fileno(), REPORT_FD)
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # output of libraries must not mix with the reports
     line = sys.stdin.readline()
@@ -245,13 +245,7 @@ def serve(work: Callable[[Task], None]) -> None:
         return
     task = json.loads(line)
     show_log(task["log_level"])
-
-    def watch() -> None:
-        while os.read(sys.stdin.fileno(), 1):
-            pass
-        os._exit(ENDED_EARLY)
-
-    threading.Thread(target=watch, daemon=True).start()
+    watch_parent(task["parent"], lambda: os._exit(ENDED_EARLY))
     work(task)
 
 

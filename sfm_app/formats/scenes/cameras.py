@@ -43,7 +43,7 @@ def write_cameras(scene: FinishedScene, target: Path) -> None:
         "photos": photos,
         "unregistered": dict(found.unregistered),
     }
-    target.write_text(json_text(content), encoding="utf-8")
+    target.write_text(json_text(content), encoding="utf-8", newline="\n")
 
 
 def camera_entry(camera: CameraModel) -> dict[str, Any]:

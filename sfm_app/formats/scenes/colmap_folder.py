@@ -53,7 +53,7 @@ def write_bundler(scene: FinishedScene, target: Path) -> None:
     found.write_photos(target)
     found.write_bundle(target / "bundle.out")
     lines = "".join(f"images/{photo.image}\n" for photo in found.photos)
-    (target / "list.txt").write_text(lines, encoding="ascii")
+    (target / "list.txt").write_text(lines, encoding="ascii", newline="\n")
 
 
 def _write_folder(scene: FinishedScene, target: Path, *, text: bool = False, centered: bool = False) -> None:

@@ -28,7 +28,7 @@ def write_nerfstudio(scene: FinishedScene, target: Path) -> None:
     found = scene.perspective()
     found.write_photos(target)
     (target / POINTS).write_bytes(cloud_ply(scene.points()))
-    (target / TRANSFORMS).write_text(json_text(transforms(found.photos)), encoding="utf-8")
+    (target / TRANSFORMS).write_text(json_text(transforms(found.photos)), encoding="utf-8", newline="\n")
 
 
 def transforms(photos: tuple[PerspectivePhoto, ...]) -> dict[str, Any]:

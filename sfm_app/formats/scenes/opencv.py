@@ -42,7 +42,7 @@ def write_opencv(scene: FinishedScene, target: Path) -> None:
             reasons[name] = str(err)
             continue
         with replace_atomically(target / f"{files[name]}.yaml") as path:
-            path.write_text(camera_yaml(name, camera, (model, terms), found), encoding="utf-8")
+            path.write_text(camera_yaml(name, camera, (model, terms), found), encoding="utf-8", newline="\n")
     lines = [f"camera {name} is left out: {reason}" for name, reason in reasons.items()]
     if len(reasons) == len(found.cameras):
         hint = "--format cameras writes cameras of every kind, --format colmap perspective views of the photos"

@@ -10,6 +10,7 @@ from pathlib import Path
 from sfm_app.colmap.processes.worker_process import MappingTask, start_worker
 from sfm_app.errors import BackendError
 from sfm_app.hashing import digest_file
+from sfm_app.operating_system import replace_file
 from sfm_app.reconstruction.mapping_runs import Group
 from sfm_app.reconstruction.parts.cut import Part
 from sfm_app.reconstruction.parts.part_files import (
@@ -88,7 +89,7 @@ def _prepare_part(members: Group, mapped: PoseGraph, place: Path, run: RunContex
     write_inputs(beside, PartInputs(members, followed, run.settings, asked))
     folder = place / digest_file(beside)[:16]
     folder.mkdir(exist_ok=True)
-    beside.replace(folder / INPUTS)
+    replace_file(beside, folder / INPUTS)
     return PartTask(str(folder), str(run.workspace.photos))
 
 

@@ -47,7 +47,7 @@ def work(task: MappingTask) -> None:
         "false_joins": [] if best is None else joins_to_plain(judge(best)),
     }
     with replace_atomically(folder / RESULT) as path:
-        path.write_text(json.dumps(known), encoding="utf-8")
+        path.write_text(json.dumps(known), encoding="utf-8", newline="\n")
 
 
 def _write_database(place: Workspace, part: Group, mapped: frozenset[PairId]) -> None:

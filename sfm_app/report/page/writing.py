@@ -75,7 +75,7 @@ def write_report(run: RunContext, beside_run: RunContext | None = None, early: E
     path = run.workspace.root / REPORT
     drawn = early.take(contents) if early is not None else None
     with replace_atomically(path) as beside:
-        beside.write_text(render_page(contents, embed_parts(contents), other, drawn), encoding="utf-8")
+        beside.write_text(render_page(contents, embed_parts(contents), other, drawn), encoding="utf-8", newline="\n")
     return path
 
 

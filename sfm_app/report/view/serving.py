@@ -16,6 +16,7 @@ from socketserver import ThreadingTCPServer
 from typing import Any
 
 from sfm_app.errors import ConfigError
+from sfm_app.operating_system import Ability, lacks
 from sfm_app.report.view.resources import Resource, RunResources, read_resources
 from sfm_app.runtime.context import RunContext
 
@@ -37,7 +38,7 @@ class ViewServer(ThreadingTCPServer):
     """Serves the page of one run. It is no HTTPServer, which asks the network for the name of this machine."""
 
     daemon_threads = True
-    allow_reuse_address = os.name == "posix"  # elsewhere it lets two servers share a port
+    allow_reuse_address = not lacks(Ability.REUSED_PORTS)
 
     def __init__(self, resources: RunResources, port: int) -> None:
         self.resources = resources

@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import os
 import secrets
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from sfm_app.errors import ClusterError, ConfigError
+from sfm_app.operating_system import end_group, group_options
 from sfm_app.runtime.parallel.remote_call import Call, Probe, Reply, answer, find_misfit
 from sfm_app.runtime.parallel.worker_versions import PROCESSOR, differences, worker_versions
 from sfm_app.settings import LOCAL_ADDRESS, ClusterSettings
@@ -84,7 +86,7 @@ class Cluster:
         if self._probe is None:
             self.folder.mkdir(parents=True, exist_ok=True)
             name = f"probe-{secrets.token_hex(8)}.txt"
-            (self.folder / name).write_text(name, encoding="utf-8")
+            (self.folder / name).write_text(name, encoding="utf-8", newline="\n")
             probe = Probe(tuple(worker_versions().items()), str(self.folder.resolve()), name)
             found = self.ask_all(find_misfit, probe)
             self._refuse({worker: why for worker, why in found.items() if why})
@@ -266,19 +268,16 @@ def _start_workers(address: str, count: int) -> Iterator[None]:
     with tempfile.TemporaryDirectory(prefix="sfm-app-workers-", ignore_cleanup_errors=True) as scratch:
         command: Sequence[str] = (
             sys.executable, "-P", "-m", "sfm_app.runtime.parallel.local_workers", address, str(count), scratch,
+            str(os.getpid()),
         )  # fmt: skip
         with subprocess.Popen(  # noqa: S603 - our module
             command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            start_new_session=True,
+            **group_options(),
         ) as process:  # fmt: skip
             try:
                 yield
             finally:
-                if process.stdin is not None:
-                    process.stdin.close()  # the process group ends itself
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(CLOSING_S)
-                process.kill()
+                end_group(process, CLOSING_S)
 
 
 def _close(client: Any) -> None:

@@ -1,6 +1,5 @@
 """One concurrent.futures.Executor for all work, and its results in the order of the items."""
 
-import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -8,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
+from sfm_app.operating_system import usable_cores
 from sfm_app.progress import Progress
 from sfm_app.runtime.parallel.cluster import connect, local_workers
 from sfm_app.runtime.parallel.cluster_executor import ClusterExecutor
@@ -20,9 +20,7 @@ Result = TypeVar("Result")
 
 def worker_count(wanted: int) -> int:
     """Return the number of workers; 0 stands for one per core that this process may use."""
-    if wanted > 0:
-        return wanted
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return wanted if wanted > 0 else usable_cores()
 
 
 def make_executor(workers: int, like: Executor | None = None) -> Executor:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sfm_app.errors import BackendError
+from sfm_app.operating_system import cpu_seconds
 from sfm_app.runtime.parallel.parcels import Packer, Parcel, survives_travel, unpack
 from sfm_app.runtime.parallel.worker_versions import differences, worker_versions
 
@@ -61,7 +62,7 @@ def answer(call: Call) -> Reply:
         from distributed import get_worker
 
         return Reply(unfit=reason, worker=str(get_worker().address))
-    start, spent = time.perf_counter(), sum(os.times()[:4])
+    start, spent = time.perf_counter(), cpu_seconds()
     _use_one_thread()
     results: list[Any] = []
     error: Exception | None = None
@@ -74,7 +75,7 @@ def answer(call: Call) -> Reply:
         error = picklable(err)
         is_of_machine = isinstance(err, OF_THE_MACHINE)
     packed = Packer(Path(call.probe.folder)).pack(results)
-    took, used = time.perf_counter() - start, sum(os.times()[:4]) - spent
+    took, used = time.perf_counter() - start, cpu_seconds() - spent
     return Reply(packed, error, is_of_machine=is_of_machine, seconds=took, cpu_seconds=used)
 
 

@@ -4,7 +4,6 @@ A block is a box. It gets a workspace of its own with the photos that have depth
 and a little beyond, so that all blocks together are little more work than the whole.
 """
 
-import os
 import shutil
 import tempfile
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from sfm_app.colmap.dense import map_file, normals_file, read_depth, write_depth
 from sfm_app.colmap.surface import fuse, join_points
 from sfm_app.hashing import fingerprint
 from sfm_app.meshing.blocks.partition import split_points
+from sfm_app.operating_system import share_bytes
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import FUSED_AT_ONCE_MP, cache_gb
 from sfm_app.stereo import View, region
@@ -131,7 +131,7 @@ def fuse_block(task: FusionTask) -> None:
     for view in task.views:
         for kept in (Path("images") / view.name, normals_file(Path(), view)):
             (scratch / kept).parent.mkdir(parents=True, exist_ok=True)
-            link_file(task.dense_dir / kept, scratch / kept)
+            share_bytes(task.dense_dir / kept, scratch / kept)
         depth = read_depth(task.dense_dir, view, "geometric")
         write_depth(scratch, view, np.where(is_near(view, depth, task.box), depth, np.float32(0)))
     write_fusion_views(scratch, task.views)
@@ -198,20 +198,7 @@ def link_tree(source: Path, target: Path) -> None:
     target.mkdir(parents=True)
     for path in sorted(source.iterdir()):
         if path.is_file():
-            link_file(path, target / path.name)
-
-
-def link_file(source: Path, target: Path) -> None:
-    """Make a file with the bytes of another, which they share where the system can.
-
-    Args:
-        source: the other file.
-        target: in a folder that is there.
-    """
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)
+            share_bytes(path, target / path.name)
 
 
 def _stamp(dense_dir: Path, view: View) -> int:

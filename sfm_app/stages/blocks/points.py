@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sfm_app.colmap.surface import positions
 from sfm_app.meshing.blocks.partition import Partition
+from sfm_app.operating_system import move
 
 FloatArray = NDArray[np.float64]
 
@@ -69,7 +70,7 @@ def sort_points(points: NDArray[np.void], partition: Partition, folder: Path) ->
         for start in range(0, len(points), CHUNK):
             chunk = np.asarray(points[start : start + CHUNK])
             _add(chunk, partition.find_blocks(positions(chunk)), unfinished, count)
-        unfinished.rename(place)
+        move(unfinished, place)
     found = BlockPoints(place, points.dtype, np.empty((count, 2, 3)))
     for number in range(count):
         where = positions(found.read(number))

@@ -1,4 +1,5 @@
 import json
+import os
 import subprocess
 import sys
 
@@ -155,6 +156,15 @@ def test_plugins_and_doctor_answer():
 
 
 @pytest.mark.slow
+def test_a_terminal_or_file_without_the_letters_of_a_name_gets_their_numbers(tmp_path):
+    command = [sys.executable, "-m", "sfm_app", "markers", "50mm", "-o", str(tmp_path / "\u5199.pdf")]
+    known = {**os.environ, "PYTHONIOENCODING": "cp1252"}
+    done = subprocess.run(command, env=known, capture_output=True, check=False)
+
+    assert done.returncode == 0, done.stderr
+    assert rb"\u5199.pdf" in done.stdout
+
+
 def test_the_module_runs_as_a_program():
     done = subprocess.run([sys.executable, "-m", "sfm_app", "--version"], capture_output=True, text=True, check=True)
 

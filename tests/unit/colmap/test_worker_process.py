@@ -5,14 +5,16 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
+import psutil
 import pytest
 
 from sfm_app.colmap.processes.worker_process import relay, start_worker
 from sfm_app.errors import BackendError
+from sfm_app.operating_system import Ability
 
 pytestmark = pytest.mark.slow
+POSIX = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signals")
 
 CHILD = """
 import os, signal, sys, time
@@ -88,9 +90,13 @@ def test_progress_comes_through(child):
     [
         ("raise ValueError('first line\\nat last')", "COLMAP failed while working: at last"),
         ("sys.stderr.write('x' * 1_000_000); sys.stderr.write('\\nthe end'); sys.exit(3)", "working: the end"),
-        ("os.abort()", r"COLMAP failed while working: it crashed \(SIGABRT\)"),
+        pytest.param("os.abort()", r"COLMAP failed while working: it crashed \(SIGABRT\)", marks=POSIX),
         ("os._exit(7)", "COLMAP failed while working: it ended with 7"),
-        ("os.kill(os.getpid(), signal.SIGKILL)", "ended from outside while working: perhaps the memory was full"),
+        pytest.param(
+            "os.kill(os.getpid(), signal.SIGKILL)",
+            "ended from outside while working: perhaps the memory was full",
+            marks=POSIX,
+        ),
     ],
 )
 def test_a_process_that_fails_is_an_error_with_its_last_line(child, work, message):
@@ -103,10 +109,12 @@ def test_a_process_is_ended_with_the_block(child):
         next(process.messages())
         assert not process.has_ended(0.0)
 
-    assert process.process.returncode == -signal.SIGKILL
+    assert process.process.returncode == (1 if sys.platform == "win32" else -signal.SIGKILL)
 
 
-def test_a_process_ends_when_the_one_that_started_it_is_killed(child):
+@pytest.mark.parametrize("taken", [(), (Ability.CLOSED_INPUT,)], ids=["input", "number"])
+def test_a_process_ends_when_the_one_that_started_it_is_killed(child, without, taken):
+    without(*taken)
     parent = (
         "import sys; from sfm_app.colmap.processes.worker_process import start_worker\n"
         "with start_worker(sys.argv[1], {}) as process:\n"
@@ -125,13 +133,9 @@ def ends(process, seconds):
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         try:
-            os.kill(process, 0)
-            state = Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
-        except ProcessLookupError:
-            return True
-        except OSError:  # no Linux
-            state = ""
-        if state == "Z":
+            if psutil.Process(process).status() == psutil.STATUS_ZOMBIE:
+                return True
+        except psutil.NoSuchProcess:
             return True
         time.sleep(0.05)
     return False

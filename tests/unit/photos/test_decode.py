@@ -1,14 +1,19 @@
 """Formats, pixel depths and damage."""
 
 import zlib
+from pathlib import Path
 
 import numpy as np
+import PIL
 import pytest
 from PIL import Image, features
 
+from sfm_app.operating_system import Ability, find_in_wheel
 from sfm_app.photos import UnreadableError, read_picture, upright_image
 from sfm_app.photos.decode import FORMATS
-from sfm_app.photos.tiff import LIBRARY_DIRS
+from sfm_app.photos.tiff import _install_handler
+
+LIBTIFF = list(find_in_wheel(Path(PIL.__file__).parent, "pillow", "libtiff"))
 
 BARS = np.repeat(np.arange(0, 256, 8, np.uint8)[None], 24, axis=0)
 COLORS = np.stack([BARS, BARS[:, ::-1], 255 - BARS // 2], axis=-1)
@@ -145,7 +150,7 @@ def test_damaged_exif_does_no_harm(tmp_path):
 
 
 @pytest.mark.parametrize("compression", ["group4", "jpeg"])
-@pytest.mark.skipif(not any(place.is_dir() for place in LIBRARY_DIRS), reason="this Pillow has no libtiff of its own")
+@pytest.mark.skipif(not LIBTIFF, reason="this Pillow has no libtiff of its own")
 def test_what_libtiff_prints_makes_a_file_a_damaged_one(tmp_path, capfd, compression):
     noise = np.random.default_rng(0).integers(0, 255, (96, 128), np.uint8)
     image = Image.fromarray(noise).convert("1" if compression == "group4" else "RGB")
@@ -158,3 +163,21 @@ def test_what_libtiff_prints_makes_a_file_a_damaged_one(tmp_path, capfd, compres
         read_picture(tmp_path / "damaged.tif")
     assert read_picture(tmp_path / "whole.tif").image.size == (128, 96)
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("compression", ["raw", "tiff_lzw", "jpeg"])
+def test_without_a_libtiff_that_can_be_asked_a_file_that_breaks_off_is_still_a_damaged_one(
+    tmp_path, without, compression
+):
+    without(Ability.WHEEL_LIBRARIES)
+    _install_handler.cache_clear()
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (96, 128, 3), np.uint8)).save(
+        tmp_path / "whole.tif", compression=compression
+    )
+    data = (tmp_path / "whole.tif").read_bytes()
+    (tmp_path / "cut.tif").write_bytes(data[: len(data) * 2 // 3])
+
+    with pytest.raises(UnreadableError):
+        read_picture(tmp_path / "cut.tif")
+    assert read_picture(tmp_path / "whole.tif").image.size == (128, 96)
+    _install_handler.cache_clear()

@@ -5,7 +5,8 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from sfm_app.photos import UnreadableError, assign_names, group_by_camera, lay_out
+from sfm_app.operating_system import Ability, lacks
+from sfm_app.photos import UnreadableError, assign_names, group_by_camera, is_laid_out, lay_out
 from sfm_app.types import Photo
 
 PIXELS = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
@@ -40,6 +41,13 @@ def test_no_two_photos_get_one_name():
 
     assert len(set(found)) == len(found)
     assert (found[1], found[4]) == ("a.webp.jpg", "x_.jpg")
+
+
+def test_names_differ_by_more_than_capitals():
+    assert named("a.jpg", "A.JPG", "_A.JPG", "b.webp", "B.WEBP.jpg") == [
+        "a.jpg", "__A.JPG", "_A.JPG", "_b.webp.jpg", "B.WEBP.jpg",
+    ]  # fmt: skip
+    assert named("in/a.jpg", "In/a.jpg") == ["in/a.jpg", "In/_a.jpg"]
 
 
 def test_what_it_was_called_is_kept():
@@ -92,6 +100,34 @@ def test_a_turned_photo_is_laid_out_as_the_sensor_lay(tmp_path, turn):
         assert np.array_equal(np.asarray(seen), PIXELS)
 
 
+def test_without_links_a_photo_is_copied_and_a_changed_copy_is_noticed(tmp_path, without):
+    without(Ability.LINKS)
+    photos, target, photo = tmp_path / "photos", tmp_path / "target", Photo("in/x.png", 60, 40, "g")
+    (photos / "in").mkdir(parents=True)
+    Image.fromarray(PIXELS).save(photos / "in/x.png")
+    assert not is_laid_out(photo, photos, target)
+    lay_out(photo, photos, target)
+    place = target / "in/x.png"
+
+    assert not place.is_symlink() and place.read_bytes() == (photos / "in/x.png").read_bytes()
+    assert is_laid_out(photo, photos, target)
+    place.write_bytes(place.read_bytes() + b"!")
+    assert not is_laid_out(photo, photos, target)
+    lay_out(photo, photos, target)
+    assert is_laid_out(photo, photos, target)
+    (photos / "in/x.png").unlink()
+    assert not is_laid_out(photo, photos, target)
+
+
+def test_a_link_to_another_photo_is_not_the_photo(tmp_path):
+    for name in ("x.png", "y.png"):
+        Image.fromarray(PIXELS).save(tmp_path / name)
+    (tmp_path / "target").mkdir()
+    (tmp_path / "target" / "x.png").symlink_to(tmp_path / "y.png")
+
+    assert not is_laid_out(Photo("x.png", 60, 40, "g"), tmp_path, tmp_path / "target")
+
+
 @pytest.mark.parametrize("kind", ["TIFF", "BMP", "WEBP", "PNG"])
 def test_colmap_reads_and_writes_what_is_laid_out(tmp_path, kind):
     (tmp_path / "photos" / "in").mkdir(parents=True)
@@ -105,7 +141,7 @@ def test_colmap_reads_and_writes_what_is_laid_out(tmp_path, kind):
     seen = pycolmap.Bitmap.read(place, as_rgb=True)
     assert np.abs(seen.to_array().astype(int) - PIXELS).mean() < (0.1 if kind != "WEBP" else 60)
     assert seen.write(tmp_path / f"again{place.suffix}")
-    assert place.is_symlink() == (kind == "PNG")
+    assert place.is_symlink() == (kind == "PNG" and not lacks(Ability.LINKS))
 
 
 def test_large_photos_are_scaled_down(tmp_path):

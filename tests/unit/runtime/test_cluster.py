@@ -130,12 +130,14 @@ def test_what_fails_on_a_machine_is_done_here(two, tasks):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
 def test_a_killed_worker_costs_its_own_tasks_only(two, tasks, tmp_path):
     assert list(ordered_map(two, Task(tasks.die_once, str(tmp_path)), range(12), ahead=2)) == list(range(12))
     assert (tmp_path / "died").exists()
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
 def test_a_task_that_ends_every_worker_is_named(two, tasks):
     results = ordered_map(two, Task(tasks.die_always), range(4), ahead=2)
     with pytest.raises(ClusterError, match="die_always of 1 ended every worker"):

@@ -7,7 +7,7 @@ import pytest
 from sfm_app.meshing.refinement.sights import MOST_PX
 from sfm_app.pipeline import NAMES
 from sfm_app.runtime import cost_estimate
-from sfm_app.runtime.cost_estimate import cache_gb, choose_plan, largest_photo_megapixels, machine_memory_mb, make_plan
+from sfm_app.runtime.cost_estimate import cache_gb, choose_plan, largest_photo_megapixels, make_plan
 from sfm_app.settings import Settings
 from sfm_app.types import Photo
 
@@ -86,10 +86,6 @@ def test_two_hundred_photos_of_twelve_megapixels_need_no_more_than_eight_gigabyt
 
     assert plan.peak_mb(STAGES) <= 8000 and plan.workers >= 2
     assert 3000 < make_plan(photos(200), Settings(), 2).memory_mb["mesh"] < 8000
-
-
-def test_the_machine_has_some_memory():
-    assert machine_memory_mb() > 100
 
 
 def test_the_estimate_knows_how_many_photos_the_refinement_holds():

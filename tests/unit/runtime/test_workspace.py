@@ -1,7 +1,9 @@
 import pytest
+from filelock import FileLock
 
 from sfm_app.errors import InputError
-from sfm_app.runtime.workspace import Workspace
+from sfm_app.runtime import workspace
+from sfm_app.runtime.workspace import LOCK, Workspace
 
 
 def test_a_file_in_place_of_the_folder_is_an_input_error(tmp_path):
@@ -45,3 +47,30 @@ def test_a_folder_that_somebody_put_in_the_place_of_the_output_stays_foreign(tmp
 
     with pytest.raises(InputError, match="no run has made it"):
         place.create()
+
+
+def test_a_folder_stays_known_where_the_lock_goes_with_its_file(tmp_path, monkeypatch):
+    class LockOfWindows(FileLock):
+        def release(self, *arguments, **options):
+            held = self.is_locked
+            super().release(*arguments, **options)
+            if held:
+                (tmp_path / "out" / LOCK).unlink()
+
+    monkeypatch.setattr(workspace, "FileLock", LockOfWindows)
+    place = Workspace(tmp_path / "out")
+    place.create()
+    with place.hold_lock():
+        place.photos.mkdir()  # a run that fails before a stage is finished leaves no more
+
+    assert (place.root / LOCK).exists()
+    place.create()
+
+
+def test_a_lock_that_somebody_removed_is_not_brought_back(tmp_path):
+    place = Workspace(tmp_path / "out")
+    place.create()
+    with place.hold_lock():
+        (place.root / LOCK).unlink()
+
+    assert not (place.root / LOCK).exists()

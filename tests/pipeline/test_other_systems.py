@@ -1,0 +1,131 @@
+"""A whole run on a system that lacks every ability: the same bytes, and nothing that Windows would refuse."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sfm_app.operating_system import VARIABLE, Ability, lacks
+
+RULES = Path(__file__).with_name("rules_of_windows")
+QUICK = ("--quality", "draft", "--set", "depth.max_image_size_px=240", "--faces", "3000", "--workers", "2")
+TIMES = {"manifest.json", "log.txt", "report.html", "database.db"}
+"""Files that hold times, or in which SQLite counts its changes."""
+RESERVED = re.compile(r'[<>:"\\|?*\x00-\x1f]|[. ]$|^(?:con|prn|aux|nul|com\d|lpt\d)(?:\.|$)', re.IGNORECASE)
+"""Names that Windows does not have."""
+
+
+def call(photos, out, **environment):
+    command = [sys.executable, "-X", "warn_default_encoding", "-m", "sfm_app", "run", photos, "-o", out, *QUICK]
+    known = {**os.environ, **environment}
+    return subprocess.run(command, env=known, capture_output=True, encoding="utf-8", check=False)
+
+
+@pytest.fixture(scope="module")
+def runs(rendered, tmp_path_factory):
+    """The output folders of a run as ever, and of one without any ability; what the latter said, and what was noted."""
+    place = tmp_path_factory.mktemp("systems").resolve()
+    usual, bare, notes = place / "usual", place / "bare", place / "notes.txt"
+    done = call(rendered[0], usual)
+    assert done.returncode == 0, done.stderr
+    paths = os.pathsep.join([str(RULES), os.environ.get("PYTHONPATH", "")])
+    rules = {"RULES_OUT": str(bare), "RULES_NOTES": str(notes), "PYTHONPATH": paths}
+    done = call(rendered[0], bare, **{VARIABLE: ",".join(Ability)}, **rules)
+    assert done.returncode == 0, done.stderr
+    return usual, bare, done, notes
+
+
+def files(out):
+    """All files by name, with what they hold; links are followed."""
+    names = sorted(path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file())
+    return {name: (out / name).read_bytes() for name in names if name not in TIMES}
+
+
+def test_every_file_has_the_same_bytes(runs):
+    usual, bare = files(runs[0]), files(runs[1])
+
+    assert len(usual) > 40 and {"model.glb", "photos.json", "scene.json"} < usual.keys()
+    assert [name for name in {**usual, **bare} if usual.get(name) != bare.get(name)] == []
+
+
+@pytest.mark.skipif(lacks(Ability.LINKS) or os.name == "nt", reason="this system has no links")
+def test_photos_are_links_and_copies(runs):
+    usual, bare = ([path.is_symlink() for path in sorted((out / "photos").iterdir())] for out in runs[:2])
+    assert all(usual) and len(usual) == 7
+    assert not any(bare) and len(bare) == 7
+
+
+def test_stages_have_the_same_results(runs):
+    usual, bare = (json.loads((out / "manifest.json").read_text(encoding="utf-8"))["stages"] for out in runs[:2])
+    for name, record in usual.items():
+        for key in ("fingerprint", "digest", "files", "made_with"):
+            assert record[key] == bare[name][key], f"{name}: {key}"
+        assert bare[name]["cpu_seconds"] >= 0 and bare[name]["peak_mb"] > 100
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="only Linux tells which files are open")
+def test_nothing_that_is_open_is_removed_replaced_or_moved(runs):
+    assert not runs[3].exists(), runs[3].read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="only Linux tells which files are open")
+@pytest.mark.parametrize(
+    ("name", "to"),
+    [("usdz", "x.usdz"), ("colmap", "folder"), ("bundler", "folder"), ("draco", "x.glb"), ("laz", "x.laz")],
+)
+def test_exports_remove_nothing_that_is_open(runs, tmp_path, name, to):
+    target, notes = tmp_path / to, tmp_path / "notes.txt"
+    paths = os.pathsep.join([str(RULES), os.environ.get("PYTHONPATH", "")])
+    rules = {"RULES_OUT": str(tmp_path.resolve()), "RULES_NOTES": str(notes), "TMPDIR": str(tmp_path)}
+    command = [sys.executable, "-m", "sfm_app", "export", runs[0], "--format", name, "-o", target]
+    for _ in range(2):  # the second replaces the first
+        subprocess.run(command, env={**os.environ, **rules, "PYTHONPATH": paths}, capture_output=True, check=True)
+
+    assert target.exists() and not notes.exists(), notes.read_text(encoding="utf-8")
+
+
+def test_no_text_is_read_or_written_as_this_machine_is_set(runs):
+    warned = re.findall(r"^.*sfm_app.*EncodingWarning.*$", runs[2].stderr, re.MULTILINE)
+    assert warned == []
+
+
+def test_windows_could_have_every_name(runs):
+    names = [path.relative_to(runs[1]).as_posix() for path in runs[1].rglob("*")]
+
+    assert [name for name in names if any(RESERVED.search(part) for part in name.split("/"))] == []
+    assert len({name.casefold() for name in names}) == len(names)
+    assert max(map(len, names)) < 100
+
+
+def test_a_run_goes_on_from_copies(runs, rendered):
+    model = (runs[1] / "model.glb").stat().st_mtime_ns
+    done = call(rendered[0], runs[1], **{VARIABLE: ",".join(Ability)})
+
+    assert done.returncode == 0, done.stderr
+    assert (runs[1] / "model.glb").stat().st_mtime_ns == model
+
+
+@pytest.mark.parametrize(
+    ("name", "bad"), [("a:b.jpg", True), ("aux.txt", True), ("a.", True), ("auxiliary", False), ("a-b_1.jpg", False)]
+)
+def test_the_rule_finds_names(name, bad):
+    assert bool(RESERVED.search(name)) == bad
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="only Linux tells which files are open")
+def test_the_rules_of_windows_are_noticed(tmp_path):
+    code = (
+        "import os\nfrom pathlib import Path\nout = Path(os.environ['RULES_OUT']); inner = out / 'in'; inner.mkdir()\n"
+        "(inner / 'a').write_text('x'); (inner / 'b').write_text('y'); (inner / 'b').unlink()\n"
+        "with (inner / 'a').open():\n  inner.rename(out / 'moved')\n"
+    )
+    notes = tmp_path / "notes.txt"
+    known = {"RULES_OUT": str(tmp_path.resolve()), "RULES_NOTES": str(notes), "PYTHONPATH": str(RULES)}
+    subprocess.run([sys.executable, "-c", code], env={**os.environ, **known}, check=True)
+
+    (line,) = [line for line in notes.read_text(encoding="utf-8").splitlines() if line.startswith(("re", "un"))]
+    assert line.startswith("rename") and "in/a" in line
