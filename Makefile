@@ -7,7 +7,7 @@ JOBS ?= 2
 # not learned: its PyTorch brings gigabytes
 PLUGINS := $(filter-out plugins/learned,$(wildcard plugins/*))
 
-.PHONY: demo test quick learned faults lint format viewers clean
+.PHONY: demo test quick learned faults lint format viewers docs clean
 
 demo: $(INSTALLED)
 	$(BIN)/sfm-app demo -o demo
@@ -49,5 +49,13 @@ viewers: $(INSTALLED)
 	npm --prefix benchmarks/viewers install --no-audit --no-fund --no-package-lock
 	$(BIN)/python -m benchmarks.viewers $(RUNS)
 
+# the site, docs/_build/html/index.html; a warning is an error
+docs: $(VENV)/.docs
+	$(BIN)/python docs/build.py
+
+$(VENV)/.docs: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	touch $@
+
 clean:
-	rm -rf $(VENV) demo .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
+	rm -rf $(VENV) demo docs/_build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
