@@ -18,7 +18,7 @@ def build(target: Path) -> int:
     from sphinx.cmd.build import main
 
     lay_out(target / "pages", GENERATORS)
-    strict = ["--fail-on-warning", "--keep-going", "--quiet", "-j", "auto"]
+    strict = ["--fail-on-warning", "--keep-going", "--quiet", "--write-all", "-j", "auto"]
     folders = [target / "pages", target / "html"]
     return main([*strict, "-c", str(DOCS), "-d", str(target / "doctrees"), "-b", "html", *map(str, folders)])
 

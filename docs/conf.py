@@ -42,5 +42,7 @@ default_role = "code"
 """Of docstrings: what stands between single backquotes."""
 
 nitpicky = True
-nitpick_ignore_regex = [(r"py:.*", r"(numpy|np|pathlib|collections|typing|os|click|pydantic|pluggy|types|functools)\b.*")]
+nitpick_ignore_regex = [
+    (r"py:.*", r"(ArrayLike|NDArray|numpy|np|pathlib|collections|typing|os|click|pydantic|pluggy|types|functools)\b.*")
+]
 suppress_warnings = ["myst.xref_ambiguous"]

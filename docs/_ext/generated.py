@@ -16,7 +16,11 @@ from sfm_app.plugins import load_plugins
 from sfm_app.settings import QUALITY_PRESETS, Section, Settings, merge_nested
 
 PROGRAM = "sfm-app"
-BESIDES_ERRORS = {0: "done", 1: "a bug: please report it with `OUT/log.txt`", 130: "interrupted; the same command resumes"}
+BESIDES_ERRORS = {
+    0: "done",
+    1: "a bug: please report it with `OUT/log.txt`",
+    130: "interrupted; the same command resumes",
+}
 """Exit codes that no error of the program has."""
 UNIONS = (Union, types.UnionType)
 
@@ -91,8 +95,8 @@ def _settings_table(table: str, fields: dict[str, FieldInfo]) -> str:
         limits = range_text(name)
         kind = type_text(field.annotation) + (f", `{limits}`" if limits else "")
         text = _sentence(_escape(field.description or "")) + flags.get(name, "")
-        rows.append((f"[`{key}`](#{anchor}){{#{anchor}}}", text, _default_text(name), kind))
-    return _table(("setting", "what it does", "default", "values"), rows)
+        rows.append((f"[`{key}`](#{anchor}){{#{anchor}}}", text, f"{_default_text(name)}<br>{kind}"))
+    return _table(("setting", "what it does", "default, and what is allowed"), rows)
 
 
 def _sentence(text: str) -> str:

@@ -14,10 +14,10 @@ from sfm_app.geometry.epipolar import fundamental_from_pose, to_homogeneous
 from sfm_app.selfcal.consensus.consensus import Consensus
 from sfm_app.selfcal.inputs import prepare
 from sfm_app.selfcal.thesis.curves import focal_curves
-from sfm_app.synthetic.cameras import Camera, arc, make_camera
+from sfm_app.synthetic.cameras import Camera, arc, camera_center, make_camera, pixel_rays
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
-from sfm_app.synthetic.render import GAMMA, cast_rays, prepare as prepare_scene, render_scene
-from sfm_app.synthetic.cameras import camera_center, pixel_rays
+from sfm_app.synthetic.render import GAMMA, cast_rays, render_scene
+from sfm_app.synthetic.render import prepare as prepare_scene
 from sfm_app.synthetic.scenes.scene_catalog import build_scene
 from sfm_app.types import CameraPairs
 
@@ -65,7 +65,9 @@ def draw_epipolar_lines(two: TwoPhotos) -> None:
     y, _ = two.see(x)
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
     colors = ("#ffd166", "#06d6a0", "#ef476f", "#4cc9f0")
-    for part, photo, title in zip(axes, two.photos, ("photo 1: four places", "photo 2: where each of them must lie"), strict=True):
+    for part, photo, title in zip(
+        axes, two.photos, ("photo 1: four places", "photo 2: where each of them must lie"), strict=True
+    ):
         part.imshow(photo, extent=(0, two.camera.width, two.camera.height, 0))
         part.set(title=title, xticks=[], yticks=[], xlim=(0, two.camera.width), ylim=(two.camera.height, 0))
     for place, partner, (a, b, c), color in zip(x, y, to_homogeneous(x) @ two.F.T, colors, strict=True):
@@ -89,16 +91,27 @@ def draw_matches(two: TwoPhotos) -> None:
     if not fit:
         raise SystemExit(fit.reason)
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.1), layout="constrained")
-    titles = f"{len(x1)} matches, half of them wrong", "how far each is trusted", f"what agrees: {fit.inlier_count} matches"
+    titles = (
+        f"{len(x1)} matches, half of them wrong",
+        "how far each is trusted",
+        f"what agrees: {fit.inlier_count} matches",
+    )
     shades = np.ones(len(x1)), fit.priors, fit.inliers.astype(float)
     for part, title, shade in zip(axes, titles, shades, strict=True):
         part.imshow(two.photos[0], extent=(0, *size[:1], *size[1:], 0), alpha=0.45)
         for (u1, v1), (u2, v2), value in zip(x1, x2, shade, strict=True):
             if value > 0.02:
-                part.plot([u1, u2], [v1, v2], color=LINE if shade is shades[0] else RIGHT, linewidth=0.9, alpha=float(max(value, 0.08)))
+                part.plot(
+                    [u1, u2],
+                    [v1, v2],
+                    color=LINE if shade is shades[0] else RIGHT,
+                    linewidth=0.9,
+                    alpha=float(max(value, 0.08)),
+                )
         part.set(title=title, xticks=[], yticks=[], xlim=(0, size[0]), ylim=(size[1], 0))
     right = np.setdiff1d(np.arange(len(x1)), wrong)
-    print(f"kept: {fit.inliers[right].sum()} of {len(right)} right ones, {fit.inliers[wrong].sum()} of {len(wrong)} wrong ones, {fit.trials} samples")
+    kept = fit.inliers[right].sum(), fit.inliers[wrong].sum()
+    print(f"kept: {kept[0]} of {len(right)} right matches, {kept[1]} of {len(wrong)} wrong ones, {fit.trials} samples")
     save(figure, "matches.jpg")
 
 
@@ -115,7 +128,10 @@ def draw_influence() -> None:
     cook = residuals**2 / (2 * variance) * leverage / (1 - leverage) ** 2
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
     reach = np.array([0.0, 10.5])
-    for keep, color, label in ((np.ones(len(x), bool), WRONG, "line through all points"), (np.arange(len(x)) < len(x) - 1, RIGHT, "line without the last one")):
+    for keep, color, label in (
+        (np.ones(len(x), bool), WRONG, "line through all points"),
+        (np.arange(len(x)) < len(x) - 1, RIGHT, "line without the last one"),
+    ):
         a, b = np.linalg.lstsq(A[keep], y[keep], rcond=None)[0]
         axes[0].plot(reach, a + b * reach, color=color, label=label)
     axes[0].plot(x, y, "o", color="black", markersize=5)
@@ -141,16 +157,24 @@ def draw_zero_curves() -> None:
     center = (tracks.K[0, 0, 2] / width - 0.5, tracks.K[0, 1, 2] / width - 0.5 * height / width)
     fx = np.linspace(0.4, 3.0, 700)
     curves = focal_curves(pairs, fx, center)
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.7), layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(8, 4), layout="constrained")
     curve_parts(axes[0], fx, curves[:1], [False])
     axes[0].set(title="one pair: a curve of possible cameras")
     curve_parts(axes[1], fx, curves, broken)
     axes[1].plot(*true, "o", markersize=14, fillstyle="none", color="black", markeredgewidth=1.5)
     axes[1].set(title="ten pairs: eight meet, two do not")
-    for part in axes[:2]:
-        part.set(xlim=(0.4, 3.0), ylim=(0.4, 3.0), xlabel="focal length across, in photo widths", ylabel="focal length down", aspect="equal")
-    votes(axes[2], pairs, center, true[0])
+    for part in axes:
+        part.set(
+            xlim=(0.4, 3.0),
+            ylim=(0.4, 3.0),
+            xlabel="focal length across, in photo widths",
+            ylabel="focal length down",
+            aspect="equal",
+        )
     save(figure, "zero-curves.png")
+    figure, part = plt.subplots(figsize=(6, 2.8), layout="constrained")
+    votes(part, pairs, center, true[0])
+    save(figure, "votes.png")
 
 
 def curve_parts(part: Any, fx: FloatArray, curves: FloatArray, broken: list[bool]) -> None:
@@ -169,7 +193,13 @@ def votes(part: Any, pairs: Any, center: tuple[float, float], true: float) -> No
     part.plot(focals, counts, color=LINE)
     part.axvline(true, color="black", linestyle=":", label="true focal length")
     part.legend(frameon=False)
-    part.set(title="pairs that agree with a focal length", xlabel="focal length, in photo widths", ylabel="votes", xlim=(0.4, 3.0), ylim=(0, None))
+    part.set(
+        title="pairs that agree with a focal length",
+        xlabel="focal length, in photo widths",
+        ylabel="votes",
+        xlim=(0.4, 3.0),
+        ylim=(0, None),
+    )
 
 
 def save(figure: Any, name: str) -> None:

@@ -35,7 +35,7 @@ def name_of(program):
 
 @pytest.fixture(autouse=True)
 def quiet_colmap(monkeypatch):
-    monkeypatch.setattr(options, "show_log", lambda verbose: None)
+    monkeypatch.setattr(options, "show_log", lambda _: None)
 
 
 @pytest.mark.parametrize(("block", "words"), ALL, ids=[f"{block}-{' '.join(words)[:60]}" for block, words in ALL])
@@ -48,7 +48,7 @@ def test_a_command_can_be_typed(block, words):
         for k in named[-1:]:
             check_ours(rest[k + 1 :])
     elif name == "make":
-        assert {word for word in rest[:1]} <= targets()
+        assert set(rest[:1]) <= targets()
     elif name == "pip":
         check_pip(rest, block.page.parent)
     elif name in ("python", "python3"):

@@ -9,7 +9,11 @@ from sfm_app.runtime.manifest import CHECKSUM, StageRecord
 from tests.docs.pages import ROOT
 
 PAGE = (ROOT / "docs" / "reference" / "output-files.md").read_text(encoding="utf-8")
-NAMED = {name.rstrip("/") for row in re.findall(r"^\| (`[^|]+) \|", PAGE, re.MULTILINE) for name in re.findall(r"`([^`]+)`", row)}
+NAMED = {
+    name.rstrip("/")
+    for row in re.findall(r"^\| (`[^|]+) \|", PAGE, re.MULTILINE)
+    for name in re.findall(r"`([^`]+)`", row)
+}
 
 
 def test_every_entry_of_a_record_is_listed():

@@ -4,7 +4,6 @@ import importlib.util
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import click
 import pytest
@@ -44,7 +43,11 @@ def laid_out(tools, tmp_path_factory):
 
 
 def test_every_public_name_is_on_a_page():
-    shown = set(re.findall(r"auto(?:function|class|exception|data):: (?:sfm_app\.)?([A-Za-z_]+)(?:\(\))?$", REFERENCE, re.MULTILINE))
+    shown = set(
+        re.findall(
+            r"auto(?:function|class|exception|data):: (?:sfm_app\.)?([A-Za-z_]+)(?:\(\))?$", REFERENCE, re.MULTILINE
+        )
+    )
     assert set(sfm_app.__all__) <= shown
 
 
@@ -113,7 +116,9 @@ def test_a_second_time_nothing_is_written(laid_out, tools):
 
 def test_links_are_moved_and_code_is_not(tools):
     page = DOCS / "how-to" / "video.md"
-    text = "[a](../../benchmarks/README.md#rules) `[b](../../x.md)` [c](../../examples) [d](https://github.com/x) [e](#f)"
+    text = (
+        "[a](../../benchmarks/README.md#rules) `[b](../../x.md)` [c](../../examples) [d](https://github.com/x) [e](#f)"
+    )
 
     moved = tools[1].relink(text, page, [ROOT / "benchmarks" / "README.md"], set())
 
@@ -154,7 +159,9 @@ def test_no_page_asks_other_hosts(site):
 @pytest.mark.slow
 def test_the_search_knows_the_pages(site):
     index = (site / "searchindex.js").read_text(encoding="utf-8")
-    assert all(word in index for word in ("how-to/turntable", "reference/estimators", "estimate_fundamental", "turntabl"))
+    assert all(
+        word in index for word in ("how-to/turntable", "reference/estimators", "estimate_fundamental", "turntabl")
+    )
     assert (site / "search.html").exists()
 
 

@@ -1,4 +1,4 @@
-"""Relative links of all pages lead somewhere, and so do their anchors; others are well-formed, to hosts that we know."""
+"""Relative links of all pages lead somewhere, and so do their anchors; others are well-formed, to known hosts."""
 
 import re
 from pathlib import Path

@@ -14,9 +14,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 TEXT = (DOCS / "symbols.md").read_text(encoding="utf-8")
 MAP = (DOCS / "thesis-map.md").read_text(encoding="utf-8")
 COMMAND = "python -m "
-NAMES = sorted(
-    {name for name in re.findall(r"`([^`]+)`", TEXT + MAP) if not name.startswith(COMMAND)} - {"sfm_app"}
-)
+NAMES = sorted({name for name in re.findall(r"`([^`]+)`", TEXT + MAP) if not name.startswith(COMMAND)} - {"sfm_app"})
 LAST_EQUATIONS = {2: 38, 3: 22, 4: 18, 5: 35}
 """The last numbered equation of each chapter of the thesis."""
 SHAPE = re.compile(r"([a-z_0-9.]+(?:\.[A-Za-z_0-9]+)*)(?:\((\w+)\))?")
@@ -113,5 +111,6 @@ def test_every_function_on_the_map_is_a_path():
     names = {name for name in re.findall(r"`([^`]+)`", MAP) if not name.startswith(COMMAND)}
     methods = {name for name in names if "." not in name}
     assert methods == {
-        "sfm_app", "lev-ransac", "lev-ransac-thesis", "multi-start", "perturbation", "zero-curves", "zero-curves-thesis",
+        "sfm_app", "lev-ransac", "lev-ransac-thesis", "multi-start", "perturbation", "zero-curves",
+        "zero-curves-thesis",
     }  # fmt: skip
