@@ -32,7 +32,10 @@ def commands() -> str:
 
 def _all_commands(group: click.Group, path: str) -> Iterator[tuple[str, click.Command]]:
     """Yield all commands of a group and of the groups in it, with what one types to call them."""
-    for name, command in sorted(group.commands.items()):
+    for name in group.list_commands(click.Context(group)):
+        command = group.get_command(click.Context(group), name)
+        if command is None:
+            continue
         if isinstance(command, click.Group):
             yield from _all_commands(command, f"{path} {name}")
         elif not command.hidden:
@@ -48,7 +51,7 @@ def _command_text(command: click.Command, name: str) -> str:
     parts = [f"## {name}", _prose(command.help or ""), f"```\n{usage}\n```"]
     if own:
         parts.append(_table(("option", "what it does"), own))
-    if shared and len(own) < len(_options(command, context)):
+    if set(shared) <= set(_options(command, context)):
         parts.append("Besides, all [options that change settings](#options-that-change-settings).")
     return "\n\n".join(parts)
 
@@ -61,12 +64,13 @@ def setting_options() -> str:
 def _shared_flags() -> list[tuple[str, str]]:
     """Return the options of `sfm-app config`, which has no other."""
     command = main.commands["config"]
-    return [row for row in _options(command, click.Context(command)) if row[0] != "`-h, --help`"]
+    return _options(command, click.Context(command))
 
 
 def _options(command: click.Command, context: click.Context) -> list[tuple[str, str]]:
-    """Return the options of a command, each with its help."""
-    records = (option.get_help_record(context) for option in command.get_params(context))
+    """Return the options of a command, each with its help; what an argument is, the help of the command says."""
+    options = (part for part in command.params if isinstance(part, click.Option))
+    records = (option.get_help_record(context) for option in options)
     return [(f"`{names}`", _escape(text)) for names, text in filter(None, records)]
 
 
