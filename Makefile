@@ -41,7 +41,7 @@ format: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml constraints.txt $(PLUGINS:=/pyproject.toml)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]' $(PLUGINS:%=-e %)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,docs]' $(PLUGINS:%=-e %)
 	touch $@
 
 # RUNS: output folders of finished runs, such as RUNS="demo out"; needs Node
@@ -50,12 +50,8 @@ viewers: $(INSTALLED)
 	$(BIN)/python -m benchmarks.viewers $(RUNS)
 
 # the site, docs/_build/html/index.html; a warning is an error
-docs: $(VENV)/.docs
+docs: $(INSTALLED)
 	$(BIN)/python docs/build.py
-
-$(VENV)/.docs: $(INSTALLED)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
-	touch $@
 
 clean:
 	rm -rf $(VENV) demo docs/_build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

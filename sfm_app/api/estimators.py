@@ -73,8 +73,8 @@ def calibrate_fundamentals(
         >>> from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
         >>> tracks = make_tracks(TrackOptions(), seed=1)
         >>> camera = sfm_app.calibrate_fundamentals(tracks.F, tracks.size)
-        >>> camera.identifiable, round(camera.focal_px / tracks.K[0, 0, 0], 1)
-        (True, 1.0)
+        >>> camera.identifiable, f"{camera.K[0, 0] / tracks.K[0, 0, 0]:.2f} times the true focal length"
+        (True, '1.00 times the true focal length')
     """
     found = [np.asarray(pair, np.float64) for pair in matches]
     pairs = replace(CameraPairs.from_Fs(Fs, size, weights), photos=tuple(photos), inliers=tuple(found))
@@ -103,7 +103,7 @@ def estimate_lens(matches: Sequence[ArrayLike], size: tuple[int, int], seed: int
         >>> import numpy as np, sfm_app
         >>> from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
         >>> tracks = make_tracks(TrackOptions(), seed=1)
-        >>> matches = [np.hstack([pair.x1, pair.x2]) for pair in tracks.pairs.values()]
+        >>> matches = [np.hstack([pair.x1, pair.x2]) for pair in list(tracks.pairs.values())[:3]]
         >>> sfm_app.estimate_lens(matches, tracks.size).is_fisheye
         False
     """

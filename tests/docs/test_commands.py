@@ -8,6 +8,7 @@ import click
 import pytest
 
 from sfm_app.cli import main, options
+from sfm_app.colmap import backend
 from tests.docs.pages import PAGES, ROOT, SHELL, blocks, commands
 
 PROGRAM = "sfm-app"
@@ -35,7 +36,9 @@ def name_of(program):
 
 @pytest.fixture(autouse=True)
 def quiet_colmap(monkeypatch):
-    monkeypatch.setattr(options, "show_log", lambda _: None)
+    """COLMAP's log stays as it is, wherever the options find the function that changes it."""
+    monkeypatch.setattr(backend, "show_log", lambda _: None)
+    monkeypatch.setattr(options, "show_log", lambda _: None, raising=False)
 
 
 @pytest.mark.parametrize(("block", "words"), ALL, ids=[f"{block}-{' '.join(words)[:60]}" for block, words in ALL])

@@ -136,7 +136,7 @@ def test_pictures_are_small_and_used():
 def site(tmp_path_factory):
     """The site, built with warnings as errors."""
     if not HAS_SPHINX:
-        pytest.skip("the extra `docs` is not installed; `make docs` installs it")
+        pytest.skip("the extra `docs` is not installed: pip install -e '.[docs]'")
     target = tmp_path_factory.mktemp("built")
     command = [sys.executable, str(DOCS / "build.py"), str(target)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
