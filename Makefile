@@ -7,7 +7,7 @@ JOBS ?= 2
 # not learned: its PyTorch brings gigabytes
 PLUGINS := $(filter-out plugins/learned,$(wildcard plugins/*))
 
-.PHONY: demo test quick learned faults lint format viewers clean
+.PHONY: demo test quick learned faults lint format viewers docs clean
 
 demo: $(INSTALLED)
 	$(BIN)/sfm-app demo -o demo
@@ -41,7 +41,7 @@ format: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml constraints.txt $(PLUGINS:=/pyproject.toml)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]' $(PLUGINS:%=-e %)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,docs]' $(PLUGINS:%=-e %)
 	touch $@
 
 # RUNS: output folders of finished runs, such as RUNS="demo out"; needs Node
@@ -49,5 +49,9 @@ viewers: $(INSTALLED)
 	npm --prefix benchmarks/viewers install --no-audit --no-fund --no-package-lock
 	$(BIN)/python -m benchmarks.viewers $(RUNS)
 
+# the site, docs/_build/html/index.html; a warning is an error
+docs: $(INSTALLED)
+	$(BIN)/python docs/build.py
+
 clean:
-	rm -rf $(VENV) demo .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
+	rm -rf $(VENV) demo docs/_build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

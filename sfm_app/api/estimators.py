@@ -31,6 +31,16 @@ def estimate_fundamental(
     Raises:
         ValueError: shapes differ or values are not finite.
         ConfigError: no estimator has that name.
+
+    Examples:
+        >>> import sfm_app
+        >>> from sfm_app.synthetic.correspondences import PairOptions, make_pair
+        >>> pair = make_pair(PairOptions(outliers=0.5), seed=1)
+        >>> fit = sfm_app.estimate_fundamental(pair.x1, pair.x2)
+        >>> bool(fit), fit.F.shape, fit.degeneracy
+        (True, (3, 3), '')
+        >>> fit.inliers[pair.is_inlier].mean() > 0.8
+        np.True_
     """
     options = (settings or Settings()).epipolar
     return load_plugins().estimator(method).fit(*check_points(x1, x2), options, seed)
@@ -57,6 +67,14 @@ def calibrate_fundamentals(
     Raises:
         ValueError: shapes are wrong or values are not finite.
         ConfigError: no calibrator has that name.
+
+    Examples:
+        >>> import sfm_app
+        >>> from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
+        >>> tracks = make_tracks(TrackOptions(), seed=1)
+        >>> camera = sfm_app.calibrate_fundamentals(tracks.F, tracks.size)
+        >>> camera.identifiable, f"{camera.K[0, 0] / tracks.K[0, 0, 0]:.2f} times the true focal length"
+        (True, '1.00 times the true focal length')
     """
     found = [np.asarray(pair, np.float64) for pair in matches]
     pairs = replace(CameraPairs.from_Fs(Fs, size, weights), photos=tuple(photos), inliers=tuple(found))
@@ -80,6 +98,14 @@ def estimate_lens(matches: Sequence[ArrayLike], size: tuple[int, int], seed: int
 
     Raises:
         ValueError: shapes are wrong or values are not finite.
+
+    Examples:
+        >>> import numpy as np, sfm_app
+        >>> from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
+        >>> tracks = make_tracks(TrackOptions(), seed=1)
+        >>> matches = [np.hstack([pair.x1, pair.x2]) for pair in list(tracks.pairs.values())[:3]]
+        >>> sfm_app.estimate_lens(matches, tracks.size).is_fisheye
+        False
     """
     found = [np.asarray(pair, np.float64) for pair in matches]
     if any(pair.ndim != 2 or pair.shape[1] != 4 or not np.isfinite(pair).all() for pair in found) or min(size) < 1:

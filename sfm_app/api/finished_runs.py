@@ -28,6 +28,11 @@ def write_report(out: PathLike, compare: PathLike | None = None) -> Path:
 
     Raises:
         InputError: a folder holds no run.
+
+    Examples:
+        >>> import sfm_app
+        >>> sfm_app.write_report("out").name
+        'report.html'
     """
     from sfm_app.report import page  # loads COLMAP
 
@@ -53,6 +58,10 @@ def view_run(
     Raises:
         InputError: the folder holds no run.
         ConfigError: the port is taken.
+
+    Examples:
+        >>> import sfm_app
+        >>> sfm_app.view_run("out")  # doctest: +SKIP
     """
     from sfm_app.report.view import serve_run  # loads COLMAP
 
@@ -73,12 +82,18 @@ def export_model(
         points: export the points and cameras of the sparse reconstruction instead of the model.
 
     Returns:
-        The files: first the one to open, then those that it refers to.
+        The files, the one to open first, then those that it refers to.
 
     Raises:
         ConfigError: no format has that name, a package that it needs is missing, or the suffix of `target` belongs to
             another one.
         InputError: the run has not made the model yet, or the target cannot be written.
+
+    Examples:
+        >>> import sfm_app
+        >>> files = sfm_app.export_model("out", target="files/model.obj")
+        >>> [path.name for path in files[:2]]
+        ['model.obj', 'model.mtl']
     """
     from sfm_app.exports.stored import stored_model  # loads COLMAP
 
@@ -117,6 +132,12 @@ def export_scene(
             another one.
         InputError: the run has not made what the format needs, its photos are gone, or the target cannot be written
             or holds files that no export has written.
+
+    Examples:
+        >>> import sfm_app
+        >>> folder = sfm_app.export_scene("out", "colmap")
+        >>> sorted(path.name for path in folder.iterdir())
+        ['export.json', 'images', 'sparse']
     """
     from sfm_app.exports.finished_scene import StoredScene  # loads COLMAP
     from sfm_app.exports.stored import check_cloud
@@ -171,6 +192,12 @@ def measure_distance(out: PathLike, a: ArrayLike, b: ArrayLike) -> Distance:
     Raises:
         ValueError: a place is not three finite numbers, or both are the same.
         InputError: the run has no camera poses yet.
+
+    Examples:
+        >>> import sfm_app
+        >>> length = sfm_app.measure_distance("out", (0, 0, 0), (1, 0, 0))
+        >>> round(length.value, 3), length.metric
+        (1.0, False)
     """
     from sfm_app.exports.stored import stored_distance  # loads COLMAP
 

@@ -34,6 +34,12 @@ def reconstruct(
 
     Raises:
         SfmError: see `sfm_app.errors`; its message and hint say what went wrong and what to do.
+
+    Examples:
+        >>> import sfm_app
+        >>> run = sfm_app.reconstruct("photos", "out")
+        >>> len(run.scene.registered), run.mesh_path.name
+        (7, 'model.glb')
     """
     from sfm_app import pipeline  # loads COLMAP, which an estimator alone does not need
     from sfm_app.report.page import EarlyFigures, finish_report
@@ -59,6 +65,14 @@ def read_run(out: PathLike) -> Run:
 
     Raises:
         InputError: it holds no run, or its files are damaged.
+
+    Examples:
+        >>> import sfm_app
+        >>> run = sfm_app.read_run("out")
+        >>> run.scene.arrays.cam_from_world.shape
+        (7, 3, 4)
+        >>> f"{run.calibration.K[0, 0] / 504:.2f} times the true focal length"  # these photos are rendered
+        '1.00 times the true focal length'
     """
     from sfm_app import pipeline  # loads COLMAP
     from sfm_app.engine.stage import Products, resume_hint
@@ -114,6 +128,12 @@ def calibrate_photos(
 
     Raises:
         SfmError: see `sfm_app.errors`.
+
+    Examples:
+        >>> import sfm_app
+        >>> found = sfm_app.calibrate_photos("photos", out="out", figure="camera.png")
+        >>> found.identifiable
+        True
     """
     from sfm_app import pipeline  # loads COLMAP
     from sfm_app.report import check_figure, draw_intrinsics

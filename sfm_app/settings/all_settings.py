@@ -61,6 +61,14 @@ class Settings(Section):
 
         Raises:
             ConfigError: a key is unknown, or a value has the wrong type or is out of range; lists the first few.
+
+        Examples:
+            >>> from sfm_app import Settings
+            >>> Settings.from_mapping({"quality": "draft", "depth": {"neighbors": 6}}).depth.neighbors
+            6
+            >>> Settings.from_mapping({"depth": {"neighbours": 6}})
+            Traceback (most recent call last):
+            sfm_app.errors.ConfigError: settings: unknown setting 'depth.neighbours'
         """
         preset = QUALITY_PRESETS.get(str(values.get("quality", "normal")), {})
         try:

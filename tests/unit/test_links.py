@@ -1,12 +1,17 @@
-"""Relative links of all pages lead somewhere, and so do their anchors."""
+"""Relative links of all pages lead somewhere, and so do their anchors; others are well-formed, to known hosts."""
 
 import re
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
-SKIPPED = {".venv", "node_modules", ".git", "build", "dist", "demo"}
+SKIPPED = {".venv", "node_modules", ".git", "build", "dist", "demo", "_build", ".pytest_cache"}
+HOSTS = {
+    "docs.dask.org", "github.com", "jobqueue.dask.org", "keepachangelog.com", "kubernetes.dask.org", "semver.org",
+}  # fmt: skip
+"""Others are entered here by whoever has looked at the page; nothing is asked of them during tests."""
 LINK = re.compile(r"!?\[[^\]]*\]\(([^()\s]+(?:\([^()\s]*\)[^()\s]*)*)(?: \"[^\"]*\")?\)")
 PAGES = [
     path
@@ -37,6 +42,19 @@ def is_dead(page, link):
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_no_link_is_dead(page):
     assert [link for link in links(page) if is_dead(page, link)] == []
+
+
+def external_links(page):
+    """The links of a page to other hosts, code left out."""
+    text = re.sub(r"```.*?```|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    return re.findall(r"\bhttps?:[^\s)>\]]*", text)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_other_hosts_are_known(page):
+    addresses = [urlsplit(link) for link in external_links(page)]
+    assert {address.hostname for address in addresses} <= HOSTS
+    assert {address.scheme for address in addresses} <= {"https"}
 
 
 def test_every_picture_of_the_results_is_on_a_page():

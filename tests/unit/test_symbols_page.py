@@ -1,4 +1,4 @@
-"""docs/symbols.md names nothing that the code has not."""
+"""docs/symbols.md and docs/thesis-map.md name nothing that the code has not, and leave out no equation."""
 
 import ast
 import re
@@ -10,9 +10,13 @@ import pytest
 import sfm_app
 
 PACKAGE = Path(sfm_app.__file__).parent
-PAGE = Path(__file__).parents[2] / "docs" / "symbols.md"
-TEXT = PAGE.read_text(encoding="utf-8")
-NAMES = sorted(set(re.findall(r"`([^`]+)`", TEXT)) - {"sfm_app"})
+DOCS = Path(__file__).parents[2] / "docs"
+TEXT = (DOCS / "symbols.md").read_text(encoding="utf-8")
+MAP = (DOCS / "thesis-map.md").read_text(encoding="utf-8")
+COMMAND = "python -m "
+NAMES = sorted({name for name in re.findall(r"`([^`]+)`", TEXT + MAP) if not name.startswith(COMMAND)} - {"sfm_app"})
+LAST_EQUATIONS = {2: 38, 3: 22, 4: 18, 5: 35}
+"""The last numbered equation of each chapter of the thesis."""
 SHAPE = re.compile(r"([a-z_0-9.]+(?:\.[A-Za-z_0-9]+)*)(?:\((\w+)\))?")
 
 
@@ -87,3 +91,26 @@ def test_every_equation_of_both_chapters_is_on_the_page():
         listed |= {(chapter, int(number)) for chapter, number in re.findall(r"\b([45])\.(\d+)\b", cell)}
     wanted = {("4", k) for k in range(1, 19)} | {("5", k) for k in range(1, 36)}
     assert wanted - listed == set()
+
+
+def test_every_equation_of_four_chapters_is_on_the_map():
+    cells = re.findall(r"^\| ([2-5]\.[^|]*) \|", MAP, re.MULTILINE)
+    listed = []
+    for cell in cells:
+        for first, last in re.findall(r"\d\.(\d+)(?: to \d\.(\d+))?", cell):
+            listed += [(int(cell[0]), number) for number in range(int(first), int(last or first) + 1)]
+    assert sorted(listed) == [(chapter, k) for chapter, last in LAST_EQUATIONS.items() for k in range(1, last + 1)]
+
+
+def test_every_algorithm_is_on_the_map():
+    assert re.findall(r"^\| Algorithm (\d) \|", MAP, re.MULTILINE) == ["1", "2", "3", "4"]
+
+
+def test_every_function_on_the_map_is_a_path():
+    """A bare word would pass for the name of a method."""
+    names = {name for name in re.findall(r"`([^`]+)`", MAP) if not name.startswith(COMMAND)}
+    methods = {name for name in names if "." not in name}
+    assert methods == {
+        "sfm_app", "lev-ransac", "lev-ransac-thesis", "multi-start", "perturbation", "zero-curves",
+        "zero-curves-thesis",
+    }  # fmt: skip
