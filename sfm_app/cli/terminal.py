@@ -40,9 +40,13 @@ class Terminal:
         self.has_bar = is_terminal and not quiet and not self.console.is_dumb_terminal
         self.bars = Bars(
             TextColumn("  {task.description}", table_column=Column(width=LABEL_COLUMNS, no_wrap=True)),
-            BarColumn(bar_width=BAR_COLUMNS), StepsColumn(), PaceColumn(),
-            console=self.console, transient=True, disable=not self.has_bar,
-        )  # fmt: skip
+            BarColumn(bar_width=BAR_COLUMNS),
+            StepsColumn(table_column=Column(no_wrap=True)),
+            PaceColumn(table_column=Column(no_wrap=True)),
+            console=self.console,
+            transient=True,
+            disable=not self.has_bar,
+        )
         self.task: TaskID | None = None
         self.title, self.works = "", False
         """Of the current stage, while it is not printed yet; whether some work of it has started."""
@@ -117,7 +121,7 @@ class Terminal:
             self.bars.advance(self.task, steps)
 
     def finish(self) -> None:
-        """End the work; while its stage goes on, a bar without an end is shown."""
+        """Show a bar without an end again, since the stage goes on."""
         if self.works:
             self.works = False
             self._show_bar("", None)
@@ -139,7 +143,7 @@ class Terminal:
         """Print the title of the stage, if that has not been done; without an end, its seconds may follow."""
         title, self.title = self.title, ""
         if title:
-            self._print(title if end else f"{title:{TITLE_COLUMNS}}", end=end)
+            self._print(title if end else f"{title:{TITLE_COLUMNS}} ", end=end)
             self.is_open = not end
 
     def _end_line(self) -> None:
@@ -198,7 +202,7 @@ def compiles() -> bool:
 def progress_text(task: Task) -> str:
     """Return how far some work is, and how fast it goes."""
     if compiles():
-        return "waits for parts that are being compiled, once on this machine"
+        return "waits for kernels, compiled once on this machine"
     if not task.total or task.total == 1:
         return f"goes on, {task.elapsed or 0.0:.0f} s so far"
     left = left_text(task)

@@ -98,9 +98,9 @@ def demo_lines(result: DemoResult) -> list[str]:
         f"camera      true   {k_text(result.true_K)}",
         f"            found  {k_text(result.refined_K)}",
         f"            focal {focal} % off by pairs of photos, {refined} % by bundle adjustment",
-        f"mesh        of {placed} {result.photos} photos, with {result.triangles:,} triangles: "
-        f"{result.surface_accuracy_percent} % of it lie within 0.5 % of the scene's size of the truth; "
-        f"it covers {result.surface_coverage_percent} % of what the photos see",
+        f"mesh        of {placed} {result.photos} photos, {result.triangles:,} triangles: "
+        f"{result.surface_accuracy_percent} % within 0.5 % of the scene's size "
+        f"of the truth, {result.surface_coverage_percent} % of what the photos see",
         f"took        {duration_text(seconds[0])}, and {duration_text(seconds[1])} to render the photos",
         *(f"{'' if number else 'open':12}{path}" for number, path in enumerate(files)),
     ]

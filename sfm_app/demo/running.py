@@ -64,10 +64,12 @@ def _render_photos(out: Path, scene: str, settings: Settings, progress: Progress
     views, photos = demo.views(), out / "photos"
     there = {path.name for path in photos.glob("*.jpg")}
     progress.stage(f"rendering {len(views.cam_from_world)} photos: {scene}")
-    if (out / TRUTH).exists() and _is_of(known := load_truth(out), views) and there == set(views.cam_from_world):
-        return known
-    if there and not ((out / TRUTH).exists() and _is_of(load_truth(out), views)):
+    known = load_truth(out) if (out / TRUTH).exists() else None
+    is_known = known is not None and _is_of(known, views)
+    if there - set(views.cam_from_world) or (there and not is_known):
         raise InputError(f"{photos} has other photos", hint="name another folder with -o, or remove this one")
+    if known is not None and is_known and there == set(views.cam_from_world):
+        return known
     built = demo.build()
     truth = Truth(dict(views.cameras), dict(views.cam_from_world), built.vertices, built.faces)
     out.mkdir(parents=True, exist_ok=True)

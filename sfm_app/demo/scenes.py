@@ -4,11 +4,8 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-import numpy as np
-
 from sfm_app.demo import COURTYARD
-from sfm_app.geometry.camera import camera_matrix
-from sfm_app.synthetic.cameras import ArcOptions, Camera, Views, arc, make_camera
+from sfm_app.synthetic.cameras import ArcOptions, Views, arc, make_camera, make_wide_camera
 from sfm_app.synthetic.lenses import Lens
 from sfm_app.synthetic.scenes.bodies import SyntheticScene
 from sfm_app.synthetic.scenes.courtyard import courtyard
@@ -19,9 +16,8 @@ from sfm_app.synthetic.town.photos import TownPhotos, town_views
 
 SIZE = (960, 640)
 """Width and height of the photos of most scenes, in pixels: large enough for a good model, small enough to wait for."""
-CIRCLE_SIZE, CIRCLE_CENTER, CIRCLE_RADIUS_PX = (800, 600), (410.0, 296.0), 300.0
-"""Of the photos through the fisheye: size, optical center, and radius of the circle that shows 180 degrees, in pixels.
-As in `benchmarks.lenses.picture`."""
+WIDE_DEG = 150.0
+"""What the fisheye sees from left to right: 180 degrees from corner to corner, as fisheyes that fill the photo do."""
 CLOSE = (2.4, 3.6)
 """Distance of the fisheye from the middle of the court: farther away, it shows little of it. Chosen by hand."""
 
@@ -33,12 +29,6 @@ class DemoScene(NamedTuple):
     views: Callable[[], Views]
 
 
-def circular_fisheye() -> Camera:
-    """Return an equidistant camera whose circle of 180 degrees is as high as the photo."""
-    focal = CIRCLE_RADIUS_PX / (0.5 * np.pi)
-    return Camera(camera_matrix(focal, focal, *CIRCLE_CENTER), *CIRCLE_SIZE, Lens("equidistant"))
-
-
 DEMO_SCENES: Mapping[str, DemoScene] = MappingProxyType({
     COURTYARD: DemoScene(courtyard, lambda: arc(make_camera(*SIZE))),
     "statue": DemoScene(statue, lambda: statue_views(make_camera(640, 960, focal_widths=1.35), photos=18)),
@@ -46,7 +36,7 @@ DEMO_SCENES: Mapping[str, DemoScene] = MappingProxyType({
     "town": DemoScene(
         town, lambda: town_views(make_camera(*SIZE, focal_widths=0.8), TownPhotos(photos=20, step_m=1.2))
     ),
-    "fisheye": DemoScene(courtyard, lambda: arc(circular_fisheye(), ArcOptions(distance=CLOSE))),
+    "fisheye": DemoScene(courtyard, lambda: arc(make_wide_camera(*SIZE, WIDE_DEG, Lens("equidistant")), ArcOptions(distance=CLOSE))),
 })  # fmt: skip
 """By name, as in `demo.SCENES`. Sizes and numbers of photos: chosen so that each takes less than four minutes on two
 cores."""

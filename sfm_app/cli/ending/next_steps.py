@@ -27,9 +27,9 @@ def run_steps(run: Run, photos: Path, out: Path | None, settings: Settings, *, q
         return _steps([(again, "goes on to the model")])
     steps = [(_view(run), "look at it in the browser")]
     if settings.quality != "high":
-        steps.append((f"{again} --quality high", "finer; draft is quicker and smaller"))
+        steps.append((f"{again} --quality high", "finer; draft: quicker"))
     if not settings.scale.markers and not settings.scale.distances and not settings.scale.control_points:
-        steps.append((f"{again} --markers 50mm", "real size, with printed markers beside it"))
+        steps.append((f"{again} --markers 50mm", "real size, by markers"))
     return _steps(steps)
 
 
@@ -47,7 +47,7 @@ def demo_steps(run: Run, scene: str, *, quiet: bool) -> list[str]:
     return _steps([
         (_view(run), "look at it in the browser"),
         (f"sfm-app demo --scene {other}", "another scene"),
-        ("sfm-app run PHOTOS", "photos of your own: a folder, or a video"),
+        ("sfm-app run PHOTOS", "photos of your own"),
     ])  # fmt: skip
 
 

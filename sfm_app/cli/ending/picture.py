@@ -6,12 +6,13 @@ import sys
 
 from sfm_app.api import Run
 from sfm_app.cli.ending.graphics import draw, graphics_of
+from sfm_app.errors import SfmError
 from sfm_app.numerical import FAILURES
 from sfm_app.settings import Settings
 
 logger = logging.getLogger("sfm_app")
 
-ROWS, COLUMNS = 16, 64
+ROWS, COLUMNS = 20, 72
 """Most lines and columns of a picture: the text below stays on the screen with it. Chosen by hand."""
 
 
@@ -29,7 +30,7 @@ def print_picture(run: Run, settings: Settings, *, quiet: bool) -> None:
     room = shutil.get_terminal_size((80, 24))
     try:
         picture = run.picture()
-    except (*FAILURES, OSError, KeyError) as err:  # the result is there without it
+    except (*FAILURES, SfmError, OSError, KeyError) as err:  # the result is there without it
         logger.info("no picture of the model", exc_info=err)
         return
     if picture is not None and picture[..., 3].any():
