@@ -5,7 +5,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from sfm_app.demo import COURTYARD
-from sfm_app.synthetic.cameras import ArcOptions, Views, arc, make_camera, make_wide_camera
+from sfm_app.synthetic.cameras import ArcOptions, Camera, Views, arc, make_camera, make_wide_camera
 from sfm_app.synthetic.lenses import Lens
 from sfm_app.synthetic.scenes.bodies import SyntheticScene
 from sfm_app.synthetic.scenes.courtyard import courtyard
@@ -29,14 +29,17 @@ class DemoScene(NamedTuple):
     views: Callable[[], Views]
 
 
+def fisheye_camera() -> Camera:
+    """Return a camera whose angles to the optical axis grow evenly with the distance from its center."""
+    return make_wide_camera(*SIZE, WIDE_DEG, Lens("equidistant"))
+
+
 DEMO_SCENES: Mapping[str, DemoScene] = MappingProxyType({
     COURTYARD: DemoScene(courtyard, lambda: arc(make_camera(*SIZE))),
-    "statue": DemoScene(statue, lambda: statue_views(make_camera(640, 960, focal_widths=1.35), photos=18)),
+    "statue": DemoScene(statue, lambda: statue_views(make_camera(*SIZE[::-1], focal_widths=1.35), photos=18)),
     "facade": DemoScene(facade, lambda: facade_views(make_camera(*SIZE))),
-    "town": DemoScene(
-        town, lambda: town_views(make_camera(*SIZE, focal_widths=0.8), TownPhotos(photos=20, step_m=1.2))
-    ),
-    "fisheye": DemoScene(courtyard, lambda: arc(make_wide_camera(*SIZE, WIDE_DEG, Lens("equidistant")), ArcOptions(distance=CLOSE))),
+    "town": DemoScene(town, lambda: town_views(make_camera(*SIZE, focal_widths=0.8), TownPhotos(photos=20))),
+    "fisheye": DemoScene(courtyard, lambda: arc(fisheye_camera(), ArcOptions(distance=CLOSE))),
 })  # fmt: skip
 """By name, as in `demo.SCENES`. Sizes and numbers of photos: chosen so that each takes less than four minutes on two
 cores."""

@@ -154,7 +154,7 @@ def test_errors_fit_on_a_terminal(monkeypatch):
     screen = Screen()
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setattr("sfm_app.cli.program.sys.stderr", screen)
-    monkeypatch.setattr(click, "echo", lambda text, err: screen.write(f"{text}\n"))
+    monkeypatch.setattr(click, "echo", lambda text, **_: screen.write(f"{text}\n"))
     with pytest.raises(SystemExit):
         fail(f"\x1b[31m{LONG}", LONG, 3)
 

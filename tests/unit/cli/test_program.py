@@ -31,7 +31,11 @@ def loaded_by(*arguments, **environment):
         f"finally: print([name for name in {HEAVY} if name in sys.modules], file=sys.stderr)"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, env={**os.environ, **environment}
+        [sys.executable, "-c", code, *arguments],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, **environment},
     )
     return done.stderr.strip().splitlines()[-1], done.stdout
 
@@ -143,7 +147,7 @@ def test_names_are_completed(typed, expected):
 )
 @pytest.mark.parametrize("installed", [True, False])
 def test_methods_and_formats_are_completed_those_of_plugins_included(monkeypatch, typed, kinds, installed):
-    monkeypatch.setattr("sfm_app.cli.completions.entry_points", lambda group: ["one"] if installed else [])
+    monkeypatch.setattr("sfm_app.cli.completions.entry_points", lambda **_: ["one"] if installed else [])
     known = load_plugins(installed=installed)
 
     assert offered(*typed) == [name for kind in kinds for name in getattr(known, kind)]
@@ -152,7 +156,7 @@ def test_methods_and_formats_are_completed_those_of_plugins_included(monkeypatch
 
 @pytest.mark.parametrize("kind", BUILT_IN)
 def test_the_names_at_hand_are_those_of_the_methods(monkeypatch, kind):
-    monkeypatch.setattr("sfm_app.cli.completions.entry_points", lambda group: [])
+    monkeypatch.setattr("sfm_app.cli.completions.entry_points", lambda **_: [])
 
     assert names_of(kind) == tuple(getattr(load_plugins(installed=False), kind))
 

@@ -35,7 +35,7 @@ class Screen(io.StringIO):
         ({"TERM": "foot"}, Graphics.SIXEL),
         ({"TERM": "xterm-sixel"}, Graphics.SIXEL),
         (
-            {"TERM": "tmux-256color", "COLORTERM": "truecolor", "KITTY_WINDOW_ID": "1", "TMUX": "/tmp/x"},
+            {"TERM": "tmux-256color", "COLORTERM": "truecolor", "KITTY_WINDOW_ID": "1", "TMUX": "1"},
             Graphics.BLOCKS,
         ),
         ({"TERM": "screen", "KITTY_WINDOW_ID": "1"}, None),
@@ -109,19 +109,19 @@ def decode_sixels(text):
     size, body = re.fullmatch(r'\x1bP0;1;0q"1;1;(\d+;\d+)(.*)\x1b\\\n', text, re.DOTALL).groups()
     width, height = map(int, size.split(";"))
     drawn, palette, color, x, y = np.full((height + 6, width, 3), -1), {}, 0, 0, 0
-    for token in re.findall(r"#\d+;2;\d+;\d+;\d+|#\d+|!\d+[?-~]|[?-~]|\$|-", body):
-        if token[0] == "#":
-            color, *shade = [int(value) for value in token[1:].split(";")]
+    for part in re.findall(r"#\d+;2;\d+;\d+;\d+|#\d+|!\d+[?-~]|[?-~]|\$|-", body):
+        if part[0] == "#":
+            color, *shade = [int(value) for value in part[1:].split(";")]
             if shade:
                 palette[color] = shade[1:]
-        elif token == "$":
+        elif part == "$":
             x = 0
-        elif token == "-":
+        elif part == "-":
             x, y = 0, y + 6
         else:
-            count = int(token[1:-1]) if token[0] == "!" else 1
+            count = int(part[1:-1]) if part[0] == "!" else 1
             for bit in range(6):
-                if (ord(token[-1]) - 63) >> bit & 1:
+                if (ord(part[-1]) - 63) >> bit & 1:
                     drawn[y + bit, x : x + count] = palette[color]
             x += count
     return drawn[:height]
