@@ -21,7 +21,7 @@ seconds between two lines on what it does then. Chosen by hand."""
 LOOK_EVERY_S = 1.0
 """Seconds between two looks for silence."""
 MINUTE_S, FAST = 60.0, 10.0
-LABEL_COLUMNS, BAR_COLUMNS, TITLE_COLUMNS = 26, 16, 38
+LABEL_COLUMNS, BAR_COLUMNS, TITLE_COLUMNS = 32, 16, 38
 """Of a bar's line, which has 80 at most, and of the title of a stage, with its seconds behind it."""
 INDENT = " " * 6
 """Before what belongs to a stage."""
@@ -186,7 +186,8 @@ class PaceColumn(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         """Return the text of a bar."""
-        passed = f"{task.elapsed or 0.0:.0f} s"
+        minutes, seconds = divmod(int(task.elapsed or 0.0), 60)
+        passed = f"{minutes}:{seconds:02}"
         if compiles():
             return Text(f"{passed}, compiling, once")
         left = left_text(task)

@@ -29,6 +29,8 @@ KITTY_PROGRAMS, ITERM_PROGRAMS = ("ghostty", "WezTerm"), ("iTerm.app", "mintty")
 """Values of TERM_PROGRAM, as their manuals have them."""
 SIXEL_TERMS = ("foot", "mlterm", "contour", "yaft")
 """First words of TERM of terminals that know sixels from the start."""
+WINDOWS = "WT_SESSION"
+"""Variable that Windows Terminal sets, which has no TERM."""
 IN_BETWEEN = ("screen", "tmux")
 """First words of TERM inside a multiplexer, which passes no pictures on."""
 
@@ -51,7 +53,7 @@ def graphics_of(stream: TextIO, environment: Mapping[str, str] | None = None) ->
     """
     known = os.environ if environment is None else environment
     term, program = known.get("TERM", ""), known.get("TERM_PROGRAM", "")
-    if not stream.isatty() or term in ("", "dumb"):
+    if not stream.isatty() or term == "dumb" or not (term or WINDOWS in known):
         return None
     if "TMUX" not in known and not term.startswith(IN_BETWEEN):
         if "KITTY_WINDOW_ID" in known or term == "xterm-kitty" or program in KITTY_PROGRAMS:
@@ -60,7 +62,7 @@ def graphics_of(stream: TextIO, environment: Mapping[str, str] | None = None) ->
             return Graphics.ITERM
         if "sixel" in term or term.split("-")[0] in SIXEL_TERMS:
             return Graphics.SIXEL
-    colorful = known.get("COLORTERM") in ("truecolor", "24bit") or term.endswith("-direct")
+    colorful = known.get("COLORTERM") in ("truecolor", "24bit") or term.endswith("-direct") or WINDOWS in known
     return Graphics.BLOCKS if colorful and "NO_COLOR" not in known else None
 
 

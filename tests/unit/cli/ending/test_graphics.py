@@ -32,6 +32,7 @@ class Screen(io.StringIO):
         ({**COLORFUL, "TERM_PROGRAM": "ghostty"}, Graphics.KITTY),
         ({**COLORFUL, "TERM_PROGRAM": "iTerm.app"}, Graphics.ITERM),
         ({**COLORFUL, "LC_TERMINAL": "iTerm2"}, Graphics.ITERM),
+        ({"WT_SESSION": "1"}, Graphics.BLOCKS),
         ({"TERM": "foot"}, Graphics.SIXEL),
         ({"TERM": "xterm-sixel"}, Graphics.SIXEL),
         (
