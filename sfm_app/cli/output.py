@@ -34,7 +34,7 @@ def print_lines(lines: Iterable[str]) -> None:
 
 def print_text(lines: Iterable[str]) -> None:
     """Print lines on stdout, those that are too long on several lines."""
-    print_lines(fold_lines(lines, columns(sys.stdout) or WIDTH))
+    print_lines(fold_lines(map(to_printable, lines), columns(sys.stdout) or WIDTH))
 
 
 def columns(stream: TextIO) -> int | None:

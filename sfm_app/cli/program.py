@@ -103,10 +103,10 @@ def fail(message: str, hint: str, code: int) -> None:
         code: exit code, > 0.
     """
     advice = hint.split("\n") if hint else []
-    lines = [f"error: {message}", *(f"{'' if number else 'hint: '}{line}" for number, line in enumerate(advice))]
-    width = columns(sys.stderr)
+    said = [f"error: {message}", *(f"{'' if number else 'hint: '}{line}" for number, line in enumerate(advice))]
+    lines, width = [to_printable(line) for line in said], columns(sys.stderr)
     for line in fold_lines(lines, width) if width else lines:
-        click.echo(to_printable(line), err=True)
+        click.echo(line, err=True)
     sys.exit(code)
 
 

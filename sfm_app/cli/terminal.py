@@ -12,7 +12,7 @@ from rich.progress import Progress as Bars
 from rich.table import Column
 from rich.text import Text
 
-from sfm_app.cli.output import WIDTH, columns, fold_lines
+from sfm_app.cli.output import WIDTH, columns, fold_lines, to_printable
 from sfm_app.cli.stage_titles import STAGE_TITLES
 
 LONG_STAGE_S, SILENCE_S, LINE_EVERY_S = 10.0, 5.0, 30.0
@@ -102,7 +102,7 @@ class Terminal:
     def say(self, text: str) -> None:
         """Print a text, below the title of the stage that it belongs to."""
         self._print_title()
-        for line in fold_lines([f"{INDENT}{text}"], columns(sys.stderr) or WIDTH):
+        for line in fold_lines([f"{INDENT}{to_printable(text)}"], columns(sys.stderr) or WIDTH):
             self._print(line)
 
     def start(self, label: str, total: int) -> None:
@@ -113,7 +113,7 @@ class Terminal:
             total: steps of the work.
         """
         self.works = True
-        self._show_bar(label, total)
+        self._show_bar(to_printable(label), total)
 
     def advance(self, steps: int = 1) -> None:
         """Move the bar forward by some steps."""
@@ -156,7 +156,7 @@ class Terminal:
             self.is_open = False
         self._end_line()
         self.said_s = time.monotonic()
-        self.console.print(Text.assemble(text, (dim, self.dim)), soft_wrap=True, end=end)
+        self.console.print(Text.assemble(to_printable(text), (dim, self.dim)), soft_wrap=True, end=end)
 
     def _show_bar(self, label: str, total: int | None) -> None:
         """Show the bar with another label; an empty one leaves it as it is."""

@@ -127,6 +127,15 @@ def test_what_is_said_stands_below_the_title_in_80_columns(shown):
     assert "[of 2]" in second
 
 
+def test_names_cannot_move_the_cursor(shown):
+    display, paper = shown
+    display.stage("photos", "again: \x1b[2J")
+    display.say("left out: a\x1b[2Jb\n")
+    display.finish_stage(1.0)
+
+    assert "\x1b" not in paper.getvalue() and "left out: a\\x1b[2Jb\\n" in paper.getvalue()
+
+
 def test_nothing_is_shown_when_quiet(monkeypatch):
     paper = io.StringIO()
     monkeypatch.setattr(terminal.sys, "stderr", paper)
