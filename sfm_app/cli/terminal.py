@@ -53,7 +53,7 @@ class Terminal:
         self.is_open = False
         """Whether the last line is a title that waits for its seconds."""
         self.said_s = time.monotonic()
-        self.ended = threading.Event()
+        self.ended, self.lock = threading.Event(), threading.RLock()
         if not quiet and not self.has_bar:
             threading.Thread(target=self._look_for_silence, daemon=True).start()
 
@@ -67,10 +67,11 @@ class Terminal:
 
     def close(self) -> None:
         """Remove the bar and end the line; nothing is shown any more."""
-        self.ended.set()
-        self._print_title()
-        self._end_line()
-        self._remove_bar()
+        with self.lock:
+            self.ended.set()
+            self._print_title()
+            self._end_line()
+            self._remove_bar()
 
     def stage(self, name: str, note: str = "") -> None:
         """Announce a stage; its title is printed once it ends or takes long, and is above the bar until then.
@@ -79,12 +80,13 @@ class Terminal:
             name: of the stage.
             note: why it is skipped or done again; may be empty.
         """
-        self._print_title()
-        steps = list(STAGE_TITLES)
-        number = f"{steps.index(name) + 1:2}/{len(steps)} " if name in steps else ""
-        self.title = f"{number}{STAGE_TITLES.get(name, name)}{f' ({note})' if note else ''}"
-        self.said_s = time.monotonic()
-        self._show_bar(STAGE_TITLES.get(name, name), None)
+        with self.lock:
+            self._print_title()
+            steps = list(STAGE_TITLES)
+            number = f"{steps.index(name) + 1:2}/{len(steps)} " if name in steps else ""
+            self.title = f"{number}{STAGE_TITLES.get(name, name)}{f' ({note})' if note else ''}"
+            self.said_s = time.monotonic()
+            self._show_bar(STAGE_TITLES.get(name, name), None)
 
     def finish_stage(self, seconds: float, photos: int = 0) -> None:
         """Print how long the stage took, and its speed where that is of interest.
@@ -93,17 +95,19 @@ class Terminal:
             seconds: its duration.
             photos: photos in use.
         """
-        rate = f", {per_minute(photos / seconds)} photos per minute" if photos and seconds >= LONG_STAGE_S else ""
-        self._remove_bar()
-        if self.title:
-            self._print_title(end="")
-        self._print("" if self.is_open else INDENT, f"{seconds:.1f} s{rate}", goes_on=self.is_open)
+        with self.lock:
+            rate = f", {per_minute(photos / seconds)} photos per minute" if photos and seconds >= LONG_STAGE_S else ""
+            self._remove_bar()
+            if self.title:
+                self._print_title(end="")
+            self._print("" if self.is_open else INDENT, f"{seconds:.1f} s{rate}", goes_on=self.is_open)
 
     def say(self, text: str) -> None:
         """Print a text, below the title of the stage that it belongs to."""
-        self._print_title()
-        for line in fold_lines([f"{INDENT}{to_printable(text)}"], columns(sys.stderr) or WIDTH):
-            self._print(line)
+        with self.lock:
+            self._print_title()
+            for line in fold_lines([f"{INDENT}{to_printable(text)}"], columns(sys.stderr) or WIDTH):
+                self._print(line)
 
     def start(self, label: str, total: int) -> None:
         """Show a bar for work that begins.
@@ -112,8 +116,9 @@ class Terminal:
             label: what is done.
             total: steps of the work.
         """
-        self.works = True
-        self._show_bar(to_printable(label), total)
+        with self.lock:
+            self.works = True
+            self._show_bar(to_printable(label), total)
 
     def advance(self, steps: int = 1) -> None:
         """Move the bar forward by some steps."""
@@ -122,22 +127,24 @@ class Terminal:
 
     def finish(self) -> None:
         """Show a bar without an end again, since the stage goes on."""
-        if self.works:
-            self.works = False
-            self._show_bar("", None)
+        with self.lock:
+            if self.works:
+                self.works = False
+                self._show_bar("", None)
 
     def look(self) -> None:
         """Print a line where there has been none for long: the title, or how far the work is."""
         silent_s = time.monotonic() - self.said_s
         if self.title and silent_s >= SILENCE_S:
             self._print_title(end="")
-        elif self.task is not None and silent_s >= LINE_EVERY_S:
+        elif self.bars.tasks and silent_s >= LINE_EVERY_S:
             now = self.bars.tasks[0]
             self._print(INDENT, f"{now.description}: {progress_text(now)}")
 
     def _look_for_silence(self) -> None:
         while not self.ended.wait(LOOK_EVERY_S):
-            self.look()
+            with self.lock:
+                self.look()
 
     def _print_title(self, end: str = "\n") -> None:
         """Print the title of the stage, if that has not been done; without an end, its seconds may follow."""

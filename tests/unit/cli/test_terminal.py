@@ -1,6 +1,7 @@
 """What is seen of a run that goes on: one line per stage, and no long silence."""
 
 import io
+import re
 import sys
 
 import pytest
@@ -168,3 +169,38 @@ def test_bars_fit_into_the_terminal(monkeypatch, columns):
 
 def test_slow_work_has_two_digits():
     assert [per_minute(1.0), per_minute(0.05), per_minute(0.17)] == ["60", "3.0", "10"]
+
+
+def printed(monkeypatch, paper, **environment):
+    """What a short run shows, with these variables."""
+    for name in ("NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE", "TTY_COMPATIBLE"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in {"TERM": "xterm-256color", "COLORTERM": "truecolor", **environment}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(terminal.sys, "stderr", paper)
+    with Terminal(quiet=False) as display:
+        display.stage("photos")
+        display.say("a note")
+        display.start("photos", 3)
+        display.advance()
+        display.look()
+        display.finish_stage(12.0, 10)
+    return paper.getvalue()
+
+
+@pytest.mark.parametrize("forced", [{}, {"FORCE_COLOR": "1"}])
+def test_a_pipe_gets_no_codes(monkeypatch, forced):
+    text = printed(monkeypatch, io.StringIO(), **forced)
+
+    assert "\x1b" not in text and "reading photos" in text and "12.0 s" in text
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_a_terminal_without_colors_gets_none(monkeypatch):
+    styles = r"\x1b\[[0-9;]*m"
+    assert re.search(styles, printed(monkeypatch, Screen()))
+    assert not re.search(styles, printed(monkeypatch, Screen(), NO_COLOR="1"))
+
+
+def test_a_dumb_terminal_gets_lines(monkeypatch):
+    assert "\x1b" not in printed(monkeypatch, Screen(), TERM="dumb")
