@@ -91,21 +91,19 @@ def evaluate(run: Run, scene: Scene, model: Model, truth: Truth, seconds: tuple[
 def demo_lines(result: DemoResult) -> list[str]:
     """Return the result as lines of text."""
     placed = "all" if result.registered == result.photos else f"{result.registered} of"
-    focal, refined = result.focal_error_percent, result.refined_focal_error_percent
     seconds = result.seconds_reconstruction, result.seconds_rendering
-    files = [path for path in result.files if not path.endswith(".ply")]
+    shown = [path for path in result.files if path.endswith((".html", ".glb"))]
     return [
         f"camera      true   {k_text(result.true_K)}",
-        f"            found  {k_text(result.refined_K)}",
-        f"            focal {focal} % off by pairs of photos, {refined} % by bundle adjustment",
+        f"            found  {k_text(result.refined_K)}   {result.refined_focal_error_percent:.2g} % off",
         f"mesh        of {placed} {result.photos} photos, {result.triangles:,} triangles: "
         f"{result.surface_accuracy_percent} % within 0.5 % of the scene's size "
         f"of the truth, {result.surface_coverage_percent} % of what the photos see",
         f"took        {duration_text(seconds[0])}, and {duration_text(seconds[1])} to render the photos",
-        *(f"{'' if number else 'open':12}{path}" for number, path in enumerate(files)),
+        *(f"{'' if number else 'open':12}{path}" for number, path in enumerate(shown)),
     ]
 
 
 def k_text(K: list[list[float]]) -> str:
     """Return a camera matrix in one line."""
-    return f"fx {K[0][0]:8.2f}  fy {K[1][1]:8.2f}  cx {K[0][2]:7.2f}  cy {K[1][2]:7.2f}"
+    return f"fx {K[0][0]:7.2f}  fy {K[1][1]:7.2f}  cx {K[0][2]:7.2f}  cy {K[1][2]:7.2f}"

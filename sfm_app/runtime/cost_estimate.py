@@ -68,9 +68,9 @@ class Plan:
         minutes, gigabytes = self.minutes(names), self.peak_mb(names) / 1000
         how_long = f"about {_round_minutes(minutes)} minutes" if minutes >= 1.5 else "a minute or two"
         workers = f"{self.workers} worker{'s' if self.workers > 1 else ''}"
-        hard = ", more for hard photos" if "scene" in names else ""
+        hard = " or more" if minutes >= 1.5 and "scene" in names else ""  # photos may be hard to place
         size = f"{self.photos} photos, {self.pairs} pair{'' if self.pairs == 1 else 's'}"
-        return f"{size}: {how_long}{hard}; up to {gigabytes:.1f} GB with {workers}"
+        return f"{size}: {how_long}{hard}; {gigabytes:.1f} GB with {workers}"
 
 
 def largest_photo_megapixels(limit_mb: float) -> float:

@@ -25,7 +25,7 @@ def run_steps(run: Run, photos: Path, out: Path | None, settings: Settings, *, q
     again = f"sfm-app run {shlex.quote(str(photos))}" + (f" -o {shlex.quote(str(out))}" if out is not None else "")
     if run.mesh_path is None:
         return _steps([(again, "goes on to the model")])
-    steps = [(_view(run), "look at it in the browser")]
+    steps = [(_view(run), "look at it")]
     if settings.quality != "high":
         steps.append((f"{again} --quality high", "finer; draft: quicker"))
     if not settings.scale.markers and not settings.scale.distances and not settings.scale.control_points:
@@ -45,7 +45,7 @@ def demo_steps(run: Run, scene: str, *, quiet: bool) -> list[str]:
         return []
     other = "statue" if scene != "statue" else "facade"
     return _steps([
-        (_view(run), "look at it in the browser"),
+        (_view(run), "look at it"),
         (f"sfm-app demo --scene {other}", "another scene"),
         ("sfm-app run PHOTOS", "photos of your own"),
     ])  # fmt: skip

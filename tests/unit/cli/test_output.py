@@ -131,7 +131,7 @@ def test_what_came_of_a_demo_fits(capsys, scene):
 
     printed = capsys.readouterr().out
     check_text(printed)
-    assert len(printed.splitlines()) <= 9
+    assert len(printed.splitlines()) <= 7
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])
