@@ -29,7 +29,7 @@ def print_json(value: Any) -> None:
 
 def print_lines(lines: Iterable[str]) -> None:
     """Print lines on stdout as they are, but for characters that cannot be printed."""
-    sys.stdout.write("\n".join(map(to_printable, lines)) + "\n")
+    sys.stdout.write("".join(f"{to_printable(line)}\n" for line in lines))
 
 
 def print_text(lines: Iterable[str]) -> None:

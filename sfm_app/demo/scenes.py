@@ -38,7 +38,7 @@ DEMO_SCENES: Mapping[str, DemoScene] = MappingProxyType({
     COURTYARD: DemoScene(courtyard, lambda: arc(make_camera(*SIZE))),
     "statue": DemoScene(statue, lambda: statue_views(make_camera(*SIZE[::-1], focal_widths=1.35), photos=18)),
     "facade": DemoScene(facade, lambda: facade_views(make_camera(*SIZE))),
-    "town": DemoScene(town, lambda: town_views(make_camera(*SIZE, focal_widths=0.8), TownPhotos(photos=20))),
+    "town": DemoScene(town, lambda: town_views(make_camera(*SIZE, focal_widths=0.8), TownPhotos(photos=16))),
     "fisheye": DemoScene(courtyard, lambda: arc(fisheye_camera(), ArcOptions(distance=CLOSE))),
 })  # fmt: skip
 """By name, as in `demo.SCENES`. Sizes and numbers of photos: chosen so that each takes less than four minutes on two

@@ -75,6 +75,8 @@ def test_the_width_is_that_of_the_terminal_within_bounds(monkeypatch, terminal, 
 def test_what_could_move_the_cursor_is_escaped(capsys):
     print_lines(["a\x1b[2Jb\n", "é"])
     assert capsys.readouterr().out == "a\\x1b[2Jb\\n\né\n"
+    print_lines([])
+    assert capsys.readouterr().out == ""
 
 
 def test_files_stand_with_their_sizes(tmp_path):
