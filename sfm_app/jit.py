@@ -4,9 +4,10 @@ Kernels release the GIL, so pairs run in parallel threads, and their machine cod
 only the first run on a machine compiles.
 """
 
+import threading
 import time
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any, ClassVar, TypeVar, cast
 
 import numba
 
@@ -44,8 +45,15 @@ def wait_where(is_awaited: IsAwaited | None) -> None:
     _Waiting.is_awaited = is_awaited
 
 
+def is_waiting() -> bool:
+    """Return whether a thread of this process waits for a kernel that another process compiles."""
+    return bool(_Waiting.threads)
+
+
 class _Waiting:
     is_awaited: IsAwaited | None = None
+    threads: ClassVar[set[int]] = set()
+    """Those that wait now."""
 
 
 def _compile(function: Function, *, fastmath: bool | set[str]) -> Function:
@@ -81,9 +89,15 @@ def _wait_for_others(name: str, compiled: Any) -> None:
     def load_or_wait(signature: Any, target: Any) -> Any:
         ASKED_FOR[name, tuple(signature)] = None
         found, ask = load(signature, target), _Waiting.is_awaited
-        while found is None and ask is not None and ask(name, signature):
-            time.sleep(POLL_S)
-            found = load(signature, target)
+        if found is not None or ask is None:
+            return found
+        _Waiting.threads.add(threading.get_ident())
+        try:
+            while found is None and ask(name, signature):
+                time.sleep(POLL_S)
+                found = load(signature, target)
+        finally:
+            _Waiting.threads.discard(threading.get_ident())
         return found
 
     compiled._cache.load_overload = load_or_wait

@@ -8,6 +8,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sfm_app.plugins import load_plugins
 from sfm_app.progress import Callback, Progress, as_progress
 from sfm_app.runtime.context import RunContext
@@ -62,6 +65,14 @@ class Run:
     """manifest.json, with the stages up to the one where the run stopped."""
     report_path: Path | None = None
     """report.html; None where `report` is off in the settings."""
+
+    def picture(self) -> NDArray[np.uint8] | None:
+        """Return a picture (H, W, 4) RGBA of the model, or of its points; None where no photo has a place."""
+        from sfm_app.report.notebook import model_cutout
+        from sfm_app.report.page.contents import read_scene
+
+        with open_run(self.out, Settings(), None) as run:
+            return model_cutout(read_scene(run))
 
     def _repr_html_(self) -> str:
         """Return a picture of the model and a table of what was found, for notebooks."""

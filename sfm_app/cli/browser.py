@@ -3,6 +3,7 @@
 import os
 import sys
 import webbrowser
+from pathlib import Path
 
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 
@@ -18,3 +19,17 @@ def open_browser(address: str) -> bool:
         return webbrowser.open(address)
     except (webbrowser.Error, OSError):
         return False
+
+
+def open_report(path: Path | None, wanted: bool | None, *, quiet: bool) -> None:
+    """Open a report in the browser, where one is wanted and there is somebody to look at it.
+
+    Args:
+        path: of the report; None where there is none.
+        wanted: as asked for; None: on a terminal, but not where `CI` is set.
+        quiet: whether nothing but results is wanted.
+    """
+    if wanted is None:
+        wanted = not quiet and sys.stdout.isatty() and not os.environ.get("CI")
+    if wanted and path is not None:
+        open_browser(path.resolve().as_uri())

@@ -1,35 +1,18 @@
 """What a person sees of a finished run, on stdout."""
 
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from sfm_app.api import Run
+from sfm_app.cli.output import file_lines
 from sfm_app.name_lists import list_names
-from sfm_app.numerical import json_text
 from sfm_app.report.camera_text import contradiction_lines, intrinsics_lines, intrinsics_summary
 from sfm_app.report.scale_text import scale_lines
 from sfm_app.report.scene_text import scene_lines, scene_summary
 
-MEGABYTE, KILOBYTE = 1e6, 1e3
 NAMES_SHOWN = 5
 """Most files of one kind that are named; the manifest has all."""
-
-
-def print_json(value: Any) -> None:
-    """Print one JSON document on stdout."""
-    sys.stdout.write(json_text(value))
-
-
-def print_lines(lines: list[str]) -> None:
-    """Print lines on stdout."""
-    sys.stdout.write("\n".join(map(to_printable, lines)) + "\n")
-
-
-def to_printable(text: str) -> str:
-    """Return a text with unprintable characters escaped: a file's name could move the cursor or break the line."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def run_summary(run: Run) -> dict[str, Any]:
@@ -149,28 +132,3 @@ def written_files(run: Run, stage: str) -> list[Path]:
     """
     names = run.manifest.get("stages", {}).get(stage, {}).get("counts", {}).get("bytes", {})
     return [run.out / name for name in reversed(names) if (run.out / name).exists()]
-
-
-def file_lines(paths: Sequence[Path]) -> list[str]:
-    """Return one line per file or folder, with its size."""
-    return [f"{path}  {_size_on_disk(path)}" for path in paths]
-
-
-def _size_on_disk(path: Path) -> str:
-    if not path.is_dir():
-        return size_text(path.stat().st_size)
-    sizes = [file.stat().st_size for file in path.rglob("*") if file.is_file()]
-    return f"{len(sizes)} files, {size_text(sum(sizes))}"
-
-
-def size_text(size: int) -> str:
-    """Return a number of bytes with a suitable unit."""
-    if size < KILOBYTE:
-        return f"{size} bytes"
-    return f"{size / MEGABYTE:.1f} MB" if size >= MEGABYTE else f"{size / KILOBYTE:.0f} kB"
-
-
-def table(rows: Mapping[str, str]) -> list[str]:
-    """Return lines with names and texts in two aligned columns."""
-    width = max(map(len, rows), default=0)
-    return [f"{name:{width}}  {text}" for name, text in rows.items()]

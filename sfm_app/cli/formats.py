@@ -1,12 +1,14 @@
 """The formats of `sfm-app export`: their list, and which one a command line means."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from sfm_app.errors import ConfigError
-from sfm_app.formats.exporters import Exporter, SceneExporter
-from sfm_app.plugins import load_plugins
+
+if TYPE_CHECKING:  # all methods are imported with them
+    from sfm_app.formats.exporters import Exporter, SceneExporter
 
 
 class ExportCommand(click.Command):
@@ -24,10 +26,19 @@ class ExportCommand(click.Command):
         super().format_epilog(ctx, formatter)
 
 
-def known_formats() -> dict[str, Exporter | SceneExporter]:
+def known_formats() -> "dict[str, Exporter | SceneExporter]":
     """Return all formats by name, those for models first."""
+    from sfm_app.plugins import load_plugins
+
     found = load_plugins()
     return {**found.exporters, **found.scene_exporters}
+
+
+def is_of_scenes(name: str) -> bool:
+    """Return whether a format is one for cameras, poses, points and photos instead of models."""
+    from sfm_app.plugins import load_plugins
+
+    return name in load_plugins().scene_exporters
 
 
 def choose_format(name: str, target: Path | None) -> str:

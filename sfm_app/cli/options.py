@@ -9,7 +9,6 @@ from typing import Any
 import click
 
 from sfm_app.cli.setting_flags import SETTING_FLAGS, Command, setting_field, setting_option
-from sfm_app.colmap.backend import show_log
 from sfm_app.errors import ConfigError
 from sfm_app.settings import Settings, merge_nested
 
@@ -40,10 +39,19 @@ def output_options(command: Command) -> Command:
     return click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")(command)
 
 
+def picture_option(command: Command) -> Command:
+    """Add --no-picture."""
+    return click.option("--no-picture", is_flag=True, help="Show no picture of the model at the end.")(command)
+
+
 def settings_from_flags(flags: Mapping[str, Any]) -> Settings:
     """Return settings from the shared options; flags override the file."""
+    from sfm_app.colmap.backend import show_log  # loads COLMAP
+
     show_log(flags["verbose"])
     overrides: dict[str, Any] = {"plugins": False} if flags["no_plugins"] else {}
+    if flags.get("no_picture"):
+        overrides["picture"] = False
     for flag in SETTING_FLAGS:
         if (value := flags[flag.parameter]) not in (None, ()):
             overrides = merge_nested(overrides, flag.to_mapping(value))

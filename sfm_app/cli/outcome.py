@@ -4,7 +4,8 @@ from collections.abc import Iterator
 from textwrap import shorten
 
 from sfm_app.api import Run
-from sfm_app.cli.display import file_lines, mask_lines, photo_lines, run_lines, run_summary, video_lines, written_files
+from sfm_app.cli.display import mask_lines, photo_lines, run_lines, run_summary, video_lines, written_files
+from sfm_app.cli.output import file_lines
 from sfm_app.geometry.lenses.camera_models import calibration_from_model
 from sfm_app.report.camera_text import SOURCES
 from sfm_app.report.scale_text import scale_lines

@@ -7,6 +7,7 @@ from typing import Any, TypeVar, get_args
 import click
 from pydantic.fields import FieldInfo
 
+from sfm_app.cli.completions import Complete, complete_from, complete_names
 from sfm_app.settings import QUALITY_PRESETS, Section, Settings, merge_nested
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -26,6 +27,8 @@ class SettingFlag:
     """Whether click checks the value; otherwise `Settings` does, and its error names the table."""
     parts: int = 1
     """Words that it takes; where these are several, it may be given several times."""
+    names: str = ""
+    """Kind of methods whose names a shell completes, as in `completions`; a choice completes itself."""
 
     @property
     def parameter(self) -> str:
@@ -49,10 +52,10 @@ SETTING_FLAGS = (
     SettingFlag("--cameras", "photos.cameras"),
     SettingFlag("--max-frames", "photos.max_frames"),
     SettingFlag("--keep-low-quality", "photos.keep_low_quality"),
-    SettingFlag("--features", "matching.features"),
+    SettingFlag("--features", "matching.features", names="features"),
     SettingFlag("--pairs", "matching.pairs"),
-    SettingFlag("--estimator", "epipolar.estimator"),
-    SettingFlag("--calibrator", "calibration.calibrator"),
+    SettingFlag("--estimator", "epipolar.estimator", names="estimators"),
+    SettingFlag("--calibrator", "calibration.calibrator", names="calibrators"),
     SettingFlag("--calibration", "calibration.file", metavar="FILE"),
     SettingFlag("--keep-calibration", "calibration.keep"),
     SettingFlag("--camera-model", "scene.camera_model", metavar="MODEL"),
@@ -74,7 +77,21 @@ def setting_option(flag: SettingFlag) -> Callable[[Command], Command]:
         return click.option(flag.flag, type=str, nargs=flag.parts, multiple=True, metavar=flag.metavar, help=text)
     if flag.choice:
         return click.option(flag.flag, type=click.Choice(get_args(kind)), help=text)
-    return click.option(flag.flag, type=kind if kind in (int, float) else str, metavar=flag.metavar, help=text)
+    complete = completion_of(flag, kind)
+    kind = kind if kind in (int, float) else str
+    return click.option(flag.flag, type=kind, metavar=flag.metavar, help=text, shell_complete=complete)
+
+
+def completion_of(flag: SettingFlag, kind: Any) -> Complete | None:
+    """Return what completes the value of a flag in a shell; None where nothing does.
+
+    Args:
+        flag: of the setting.
+        kind: type of the setting; a Literal lists its values.
+    """
+    if flag.names:
+        return complete_names(flag.names)
+    return complete_from(get_args(kind)) if get_args(kind) else None
 
 
 def help_text(setting: str) -> str:

@@ -64,11 +64,11 @@ class Plan:
         """Describe the plan for people."""
         names = list(stages)
         minutes, gigabytes = self.minutes(names), self.peak_mb(names) / 1000
-        how_long = f"{_round_minutes(minutes)} minutes" if minutes >= 1.5 else "a minute or two"
+        how_long = f"about {_round_minutes(minutes)} minutes" if minutes >= 1.5 else "a minute or two"
         workers = f"{self.workers} worker{'s' if self.workers > 1 else ''}"
-        hard = "; hard photos take longer" if "scene" in names else ""
-        cost = f"about {how_long} and up to {gigabytes:.1f} GB with {workers}{hard}"
-        return f"{self.photos} photos, {self.pairs} pair{'' if self.pairs == 1 else 's'}: {cost}"
+        hard = " or more" if minutes >= 1.5 and "scene" in names else ""  # photos may be hard to place
+        size = f"{self.photos} photos, {self.pairs} pair{'' if self.pairs == 1 else 's'}"
+        return f"{size}: {how_long}{hard}; {gigabytes:.1f} GB with {workers}"
 
 
 def largest_photo_megapixels(limit_mb: float) -> float:

@@ -1,6 +1,7 @@
 """Compare a reconstruction with the ground truth of a rendered photo folder."""
 
 from collections.abc import Mapping
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,6 +130,7 @@ def scene_size(truth: Truth) -> float:
     return float(np.linalg.norm(np.ptp(seen_points(truth), axis=0)))
 
 
+@lru_cache(maxsize=1)
 def seen_points(truth: Truth) -> FloatArray:
     """Return (N, 3) points where a regular grid of rays through all photos meets the true surface."""
     caster = ray_caster(truth.vertices, truth.faces)

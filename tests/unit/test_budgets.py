@@ -8,8 +8,12 @@ import sfm_app
 
 PACKAGE = Path(sfm_app.__file__).parent
 COMMANDS = tuple(
-    f"cli/commands.py:{name}" for name in ("run", "calibrate", "export", "markers", "measure", "report", "view")
-)
+    f"cli/commands/{name}"
+    for name in (
+        "making.py:run", "making.py:calibrate", "making.py:demo", "paper.py:markers", "finished.py:export",
+        "finished.py:measure", "finished.py:report", "finished.py:view", "machine.py:completion",
+    )
+)  # fmt: skip
 """Their docstrings are what `--help` prints; click says what the options are."""
 
 

@@ -5,7 +5,7 @@ import numba
 import numpy as np
 import pytest
 
-from sfm_app.jit import kernel, summing_kernel
+from sfm_app.jit import is_waiting, kernel, summing_kernel, wait_where
 
 pytestmark = pytest.mark.slow
 
@@ -69,3 +69,22 @@ def test_a_cache_that_names_a_class_which_is_gone_is_made_anew(tmp_path):
         )
         assert (done.stdout.strip(), done.returncode) == ("42.0", 0), done.stderr
     assert list(tmp_path.rglob("*.nbi"))
+
+
+def test_who_waits_for_another_process_is_told_so():
+    seen = []
+
+    @kernel
+    def thrice(x):
+        return 3 * x
+
+    def is_awaited(name, signature):
+        seen.append((name.rpartition(".")[2], is_waiting()))
+        return len(seen) < 3
+
+    wait_where(is_awaited)
+    try:
+        assert thrice(2.0) == 6.0
+    finally:
+        wait_where(None)
+    assert seen == [("thrice", True)] * 3 and not is_waiting()

@@ -27,7 +27,7 @@ NAMES = {
     *("cpu_count", "process_cpu_count", "sysconf", "statvfs", "uname", "umask", "mkfifo"),
     *("link", "symlink", "symlink_to", "hardlink_to", "readlink", "is_symlink", "is_junction", "rename", "renames"),
     *("chmod", "lchmod", "chown", "getuid", "geteuid", "getgid", "virtual_memory", "RTLD_GLOBAL", "CDLL"),
-    *("set_start_method", "platform", "sigwait", "get_terminal_size"),
+    *("set_start_method", "platform", "sigwait"),
 }
 """Attributes of `os`, `pathlib.Path`, `sys`, `psutil` and `ctypes` that some system lacks, or understands otherwise."""
 OPTIONS = {"start_new_session", "preexec_fn", "process_group", "creationflags", "pass_fds", "universal_newlines"}

@@ -77,29 +77,43 @@ def read_contents(run: RunContext) -> RunContents:
         run: with its output folder.
     """
     manifest = run.workspace.manifest.read()
-    done = manifest.get("stages", {})
-
-    def read(module: ModuleType, load: Callable[[], Product]) -> Product | None:
-        stage = module.__name__.rpartition(".")[2]
-        if stage not in done:
-            return None
-        try:
-            # compared before anything is read, because COLMAP never ends on some damaged models
-            if done[stage]["digest"] != module.digest(run.workspace):
-                raise ValueError(f"the files of stage {stage} have changed")
-            return load()
-        except UNREADABLE as err:  # the page shows what is left
-            logger.info("the report leaves out stage %s", stage, exc_info=err)
-            return None
-
-    listed = read(photos, lambda: photos.read_photo_list(run.workspace))
+    listed = _read(run, manifest, photos, lambda: photos.read_photo_list(run.workspace))
     return RunContents(
         run,
         manifest,
         listed,
-        read(match_graph, lambda: match_graph.load(listed, run)) if listed is not None else None,
-        read(view_graph, lambda: view_graph.load(run)),
-        read(intrinsics, lambda: intrinsics.load(run)),
-        read(scene, lambda: scene.load(run)),
-        read(scale, lambda: scale.load(run)) or MetricFrame(),
+        _read(run, manifest, match_graph, lambda: match_graph.load(listed, run)) if listed is not None else None,
+        _read(run, manifest, view_graph, lambda: view_graph.load(run)),
+        _read(run, manifest, intrinsics, lambda: intrinsics.load(run)),
+        _read(run, manifest, scene, lambda: scene.load(run)),
+        _read(run, manifest, scale, lambda: scale.load(run)) or MetricFrame(),
     )
+
+
+def read_scene(run: RunContext) -> RunContents:
+    """Read only what a picture of the model needs: matches of many photos take long to read.
+
+    Args:
+        run: with its output folder.
+    """
+    manifest = run.workspace.manifest.read()
+    found = _read(run, manifest, scene, lambda: scene.load(run))
+    frame = _read(run, manifest, scale, lambda: scale.load(run)) or MetricFrame()
+    return RunContents(run, manifest, scene=found, frame=frame)
+
+
+def _read(
+    run: RunContext, manifest: Mapping[str, Any], module: ModuleType, load: Callable[[], Product | None]
+) -> Product | None:
+    """Return what a stage has left; None where it has not run, or its files are damaged."""
+    stage, done = module.__name__.rpartition(".")[2], manifest.get("stages", {})
+    if stage not in done:
+        return None
+    try:
+        # compared before anything is read, because COLMAP never ends on some damaged models
+        if done[stage]["digest"] != module.digest(run.workspace):
+            raise ValueError(f"the files of stage {stage} have changed")
+        return load()
+    except UNREADABLE as err:  # the page shows what is left
+        logger.info("the report leaves out stage %s", stage, exc_info=err)
+        return None

@@ -28,6 +28,8 @@ MOST_GLB_BYTES = 16_000_000
 LIGHT_PAGE_PX = 2048
 """Longer side of a page of texture in the lighter model; normal maps have half of it."""
 MOST_POINTS = 60_000
+HEIGHTS = (2.0, 98.0)
+"""Percentiles of the heights of points between which the view looks. Chosen by hand: single wrong points are beyond."""
 
 
 def embedded_view(contents: RunContents, photos: Sequence[str]) -> Mapping[str, Json] | None:
@@ -151,7 +153,9 @@ def _bounds(points: Model) -> tuple[list[float], float]:
         places = np.array([center(camera) for camera in points.cameras]).reshape(-1, 3)
     if not len(places):
         return [0.0, 0.0, 0.0], 1.0
-    return np.median(places, axis=0).tolist(), scene_size(places) or 1.0
+    middle = np.median(places, axis=0)
+    middle[1] = np.percentile(places[:, 1], HEIGHTS).mean()  # most points may be on the ground
+    return middle.tolist(), scene_size(places) or 1.0
 
 
 def _camera(camera: Frustum, row: int | None) -> dict[str, Any]:

@@ -187,7 +187,7 @@ def test_whatever_happens_ends_with_one_line(monkeypatch, folder, error, code, s
     def broken(*_, **__):
         raise error
 
-    monkeypatch.setattr("sfm_app.cli.commands.reconstruct", broken)
+    monkeypatch.setattr("sfm_app.api.reconstruct", broken)
     result = call("run", folder, "-q")
 
     assert result.exit_code == code

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from sfm_app.api import Run
-from sfm_app.cli.display import intrinsics_lines, intrinsics_summary, run_lines, run_summary, size_text
+from sfm_app.cli.display import intrinsics_lines, intrinsics_summary, run_lines, run_summary
+from sfm_app.cli.output import size_text
 from sfm_app.geometry.camera import camera_matrix, panorama_matrix
 from sfm_app.report.camera_text import contradiction_lines, refined_text
 from sfm_app.types import Calibration, CameraModel, Intrinsics, Scene

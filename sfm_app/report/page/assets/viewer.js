@@ -63,11 +63,13 @@
     place();
   }
 
-  // look from where the cameras stood, on average
+  // look from where the cameras stood, on average; where they stood all round, from where the middle one did
   function startTurn() {
     const sum = new THREE.Vector3();
     for (const one of view.cameras) sum.add(new THREE.Vector3(one.matrix[8], 0, one.matrix[10]));
-    return sum.lengthSq() > 0.01 * view.cameras.length ** 2 ? Math.atan2(sum.x, sum.z) : 0.6;
+    if (sum.lengthSq() > 0.01 * view.cameras.length ** 2) return Math.atan2(sum.x, sum.z);
+    const middle = view.cameras[Math.floor(view.cameras.length / 2)];
+    return middle ? Math.atan2(middle.matrix[8], middle.matrix[10]) : 0.6;
   }
 
   // points: in the page, or in levels from coarse to fine that are loaded when they are shown

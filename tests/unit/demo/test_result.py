@@ -1,3 +1,6 @@
+"""A demo says how close it came."""
+
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -6,7 +9,9 @@ import pytest
 from PIL import Image
 
 from sfm_app.api import Run
-from sfm_app.demo import demo_lines, draw, evaluate
+from sfm_app.cli.output import fold_lines
+from sfm_app.demo.result import demo_lines, evaluate
+from sfm_app.demo.running import draw
 from sfm_app.types import CameraModel, Model, Scene, Surface, Texture
 
 pytestmark = pytest.mark.slow
@@ -18,7 +23,8 @@ def scene(rendered) -> Scene:
     truth = rendered[1]
     camera = truth.camera
     K = camera.K * [[1.01, 1, 1], [1, 1.01, 1], [1, 1, 1]]
-    found = CameraModel("PINHOLE", (), K, camera.width, camera.height)
+    params = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    found = CameraModel("PINHOLE", params, K, camera.width, camera.height)
     return Scene(
         Path("sparse"), truth.cam_from_world, {}, {"one": found}, 0, 0, 0.0, dict.fromkeys(truth.cameras, "one")
     )
@@ -45,9 +51,11 @@ def test_what_was_found_is_set_beside_the_truth(rendered, scene, model, tmp_path
     assert result.surface_accuracy_percent == result.surface_coverage_percent == 100.0
     assert result.pages_px == [[30, 20], [16, 16]]
     text = "\n".join(demo_lines(result))
-    assert f"mesh            {len(truth.faces)} triangles; half of it lies within 0.0 %" in text
-    assert "100.0 % within 0.5 %; covers 100.0 %" in text
-    assert "texture         30 x 20 and 16 x 16 px" in text
+    assert f"mesh        of all 7 photos, {len(truth.faces):,} triangles: 100.0 % within 0.5 %" in text
+    assert "of the truth, 100.0 % of what the photos see" in text
+    assert re.search(r"found  fx .* 1 % off\n", text)
+    assert "took        2 s, and 1 s to render the photos" in text
+    assert max(len(line) for line in fold_lines(text.splitlines()) if str(tmp_path) not in line) <= 80
 
 
 def test_a_surface_partly_beside_the_truth_is_less_accurate(rendered, scene, model, tmp_path):
@@ -58,7 +66,7 @@ def test_a_surface_partly_beside_the_truth_is_less_accurate(rendered, scene, mod
 
     # walls slide along themselves, the ground rises
     assert 5.0 < result.surface_accuracy_percent < 90.0
-    assert result.pages_px == [] and not any("texture" in line for line in demo_lines(result))
+    assert result.pages_px == []
 
 
 def test_the_picture_shows_a_photo_and_the_textured_model(rendered, scene, model, tmp_path):
