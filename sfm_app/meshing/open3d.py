@@ -1,23 +1,33 @@
-"""Import of Open3D, which is slow, logs much, and needs a library that minimal Linux systems lack."""
+"""Import of Open3D, which is slow, logs much, and needs libraries that minimal Linux systems lack."""
 
-import ctypes
 import functools
 import importlib
+import importlib.util
+import sys
+from pathlib import Path
 from typing import Any
 
-import libusb_package
+from sfm_app.meshing.stand_ins import add_stand_ins
+
+LINKED = ("libOpen3D.so*", "cpu/pybind*.so")
+"""The files of Open3D's wheel that link to the system's libraries: from 0.20 on, and before."""
 
 
 @functools.cache
 def load_open3d() -> Any:
-    """Import Open3D, with little logging and with the libusb that its wheel expects on the system.
+    """Import Open3D, with little logging and without the screens and cameras that its wheel expects on the system.
 
     Call it inside the functions that need Open3D: the import takes more than a second.
     """
-    # Open3D links to libusb-1.0.so.0; a library of that name that is already loaded is used.
-    library = libusb_package.get_library_path()
-    if library is not None:
-        ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
+    if sys.platform == "linux":
+        for library in _linked_files():
+            add_stand_ins(library)
     open3d = importlib.import_module("open3d")
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     return open3d
+
+
+def _linked_files() -> list[Path]:
+    spec = importlib.util.find_spec("open3d")
+    folder = Path(spec.origin).parent if spec is not None and spec.origin else None
+    return [] if folder is None else [path for pattern in LINKED for path in sorted(folder.glob(pattern))]
