@@ -1,6 +1,6 @@
 """Build the image of docker/Dockerfile without Docker, run the demo in it, and check what comes out.
 
-    python -m benchmarks.anywhere.image --cache CACHE
+    python -m benchmarks.anywhere --cache CACHE
 
 Needs root, debootstrap, unshare and 8 GB. Size, exit code, seconds, lines on the screen, and whose the files are.
 """
@@ -58,7 +58,7 @@ def problems(row: Row, data: Path) -> list[str]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
-    parser = new_parser("anywhere.image", __doc__)
+    parser = new_parser("anywhere", __doc__)
     parser.add_argument("--cache", type=Path, required=True, help="where the roots are made")
     parser.add_argument("--built", action="store_true", help="try the image that an earlier call has built")
     add_results(parser, "anywhere-image")
@@ -71,7 +71,3 @@ def main(arguments: Sequence[str] | None = None) -> None:
     write(args.results, args.name, document(args.name, ABOUT, {}, {}, [row]), page)
     print(table([row], COLUMNS))
     sys.exit(1 if row["problems"] else 0)
-
-
-if __name__ == "__main__":
-    main()
