@@ -45,6 +45,8 @@ def add_stand_ins(library: Path) -> list[str]:
         library: in ELF's format.
     """
     processor, needed, undefined = read_needs(library)
+    if processor not in RETURN_0:
+        return []
     absent = [name for name in needed if name in PREFIXES and not _is_there(name)]
     for name in absent:
         functions = [symbol for symbol in undefined if symbol.startswith(PREFIXES[name])]

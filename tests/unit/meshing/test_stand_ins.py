@@ -65,3 +65,9 @@ def test_rays_are_cast_without_any_library_of_the_system():
 def test_what_is_there_is_not_replaced(monkeypatch):
     monkeypatch.setattr(stand_ins, "_is_there", bool)
     assert stand_ins.add_stand_ins(open3d_library()) == []
+
+
+def test_other_processors_get_none(monkeypatch):
+    monkeypatch.setattr(stand_ins, "RETURN_0", {})
+    monkeypatch.setattr(stand_ins, "_is_there", lambda _: False)
+    assert stand_ins.add_stand_ins(open3d_library()) == []
