@@ -7,7 +7,7 @@ JOBS ?= 2
 # not learned: its PyTorch brings gigabytes
 PLUGINS := $(filter-out plugins/learned,$(wildcard plugins/*))
 
-.PHONY: demo test quick learned faults lint format viewers docs clean
+.PHONY: demo test quick learned faults lint format viewers docs wheels test-pythons clean
 
 demo: $(INSTALLED)
 	$(BIN)/sfm-app demo -o demo
@@ -53,5 +53,16 @@ viewers: $(INSTALLED)
 docs: $(INSTALLED)
 	$(BIN)/python docs/build.py
 
+# the wheel and the sdist in dist/, checked
+wheels: $(INSTALLED)
+	rm -rf dist
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt build twine
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/python -m twine check --strict dist/*
+
+# the wheel on every Python that is there, outside the tree; PYTHONS="..." names them instead of PATH
+test-pythons: wheels
+	$(BIN)/python -m benchmarks.anywhere.pythons dist --pythons $(PYTHONS)
+
 clean:
-	rm -rf $(VENV) demo docs/_build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
+	rm -rf $(VENV) dist demo docs/_build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

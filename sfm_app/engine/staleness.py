@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from sfm_app.colmap.backend import versions as colmap_versions
@@ -91,5 +91,13 @@ def manifest_head(run: RunContext) -> dict[str, Any]:
 @cache
 def versions() -> dict[str, str]:
     """Return the versions of the program and of the libraries that compute the result."""
-    parts = ("sfm-app", "numpy", "numba", "opencv-contrib-python-headless", "open3d")
-    return {name: version(name) for name in parts} | colmap_versions()
+    parts = ("sfm-app", "numpy", "numba", "opencv-contrib-python-headless")
+    return {name: version(name) for name in parts} | {"open3d": _open3d_version()} | colmap_versions()
+
+
+def _open3d_version() -> str:
+    """Return the version of Open3D, whose wheel without CUDA has a name of its own, and which few systems have."""
+    try:
+        return version("open3d-cpu")
+    except PackageNotFoundError:
+        return version("open3d")

@@ -11,7 +11,7 @@ from sfm_app.operating_system.files import (
     replace_file,
     share_bytes,
 )
-from sfm_app.operating_system.libraries import find_in_wheel, load_for_others
+from sfm_app.operating_system.libraries import find_in_wheel
 from sfm_app.operating_system.machine import (
     ChildTimes,
     cpu_seconds,
@@ -29,11 +29,13 @@ from sfm_app.operating_system.processes import (
     ignore_interrupts,
     watch_parent,
 )
+from sfm_app.operating_system.stand_ins import add_stand_ins
 
 __all__ = [
     "VARIABLE",
     "Ability",
     "ChildTimes",
+    "add_stand_ins",
     "cpu_seconds",
     "crash_name",
     "end_group",
@@ -46,7 +48,6 @@ __all__ = [
     "is_link",
     "lacks",
     "link_or_copy",
-    "load_for_others",
     "machine_memory_mb",
     "missing_abilities",
     "move",

@@ -30,14 +30,12 @@ class Ability(StrEnum):
     """The system says how much memory a container may use."""
     REUSED_PORTS = "reusing ports"
     """The port of a program that has just ended can be asked for. On Windows, that lets two programs share one."""
-    GLOBAL_LIBRARIES = "shared libraries"
-    """A library that is loaded serves others that ask for it by name."""
     WHEEL_LIBRARIES = "libraries in wheels"
     """The libraries of a package are files of their own, whose functions can be called."""
 
 
 LINUX = frozenset(Ability)
-MACOS = LINUX - {Ability.CORES, Ability.CONTAINERS, Ability.GLOBAL_LIBRARIES}
+MACOS = LINUX - {Ability.CORES, Ability.CONTAINERS}
 WINDOWS = frozenset({Ability.LINKS, Ability.HARD_LINKS})
 """Links are tried, and copied where they are refused."""
 

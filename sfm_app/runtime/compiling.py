@@ -138,7 +138,7 @@ def stamp_file(part: str) -> Path | None:
     whole = blake2b(digest_size=8)
     files = sorted({PACKAGE.joinpath(*name.split(".")[1:-1]).with_suffix(".py") for name in names})
     states = [(file.name, file.stat().st_mtime_ns, file.stat().st_size) for file in files if file.exists()]
-    versions = (numba.__version__, sys.version, get_host_cpu_name())
+    versions = (numba.__version__, sys.version, numba.config.CPU_NAME or get_host_cpu_name())
     whole.update(repr((versions, LIST.read_bytes(), states)).encode())
     return Path(place) / f"compiled-{part}-{whole.hexdigest()}"
 

@@ -8,8 +8,8 @@ from importlib.metadata import PackageNotFoundError, entry_points, version
 from pathlib import Path
 
 LIBRARIES = (
-    "sfm-app", "numpy", "scipy", "numba", "opencv-contrib-python-headless", "open3d", "pillow", "pycolmap", "dask",
-    "distributed",
+    "sfm-app", "numpy", "scipy", "numba", "opencv-contrib-python-headless", "open3d", "open3d-cpu", "pillow",
+    "pycolmap", "dask", "distributed",
 )  # fmt: skip
 """Packages that compute results, or that the machines talk through."""
 PROCESSOR = "processor"
