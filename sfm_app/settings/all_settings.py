@@ -102,7 +102,7 @@ class Settings(Section):
 
 QUALITY_PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
-        "matching": {"max_features": 4096, "enlarge_below": 2000},
+        "matching": {"max_features": 3072, "enlarge_below": 2000},
         "depth": {"max_image_size_px": 640, "neighbors": 3},
         "mesh": {"poisson_depth": 10, "faces": 50_000, "max_image_size_px": 0},
         "texture": {"max_atlas_px": 2048, "max_pages": 1},

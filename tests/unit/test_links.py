@@ -9,8 +9,8 @@ import pytest
 ROOT = Path(__file__).parents[2]
 SKIPPED = {".venv", "node_modules", ".git", "build", "dist", "demo", "_build", ".pytest_cache"}
 HOSTS = {
-    "docs.astral.sh", "docs.dask.org", "github.com", "jobqueue.dask.org", "keepachangelog.com", "kubernetes.dask.org", "pipx.pypa.io",
-    "semver.org",
+    "docs.astral.sh", "docs.dask.org", "github.com", "jobqueue.dask.org", "keepachangelog.com", "kubernetes.dask.org",
+    "pipx.pypa.io", "semver.org",
 }  # fmt: skip
 """Others are entered here by whoever has looked at the page; nothing is asked of them during tests."""
 LINK = re.compile(r"!?\[[^\]]*\]\(([^()\s]+(?:\([^()\s]*\)[^()\s]*)*)(?: \"[^\"]*\")?\)")

@@ -9,6 +9,9 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import open_database
 
@@ -71,6 +74,15 @@ def _enter_rich(
             of, to = ({image.name: image.image_id for image in one.read_all_images()} for one in (source, target))
             rich = {name for name in names if name in of and source.num_keypoints_for_image(of[name]) >= enough}
             for name in sorted(rich):
-                target.write_keypoints(to[name], source.read_keypoints(of[name]))
-                target.write_descriptors(to[name], source.read_descriptors(of[name]))
+                keypoints, descriptors = source.read_keypoints(of[name]), source.read_descriptors(of[name])
+                kept = _largest(keypoints, own.sift.max_num_features)
+                rows = np.ascontiguousarray(descriptors.data[kept])
+                target.write_keypoints(to[name], keypoints[kept])
+                target.write_descriptors(to[name], pycolmap.FeatureDescriptors(descriptors.type, rows))
     return rich
+
+
+def _largest(keypoints: NDArray[np.float32], most: int) -> NDArray[np.int64]:
+    """Return the numbers of the keypoints (N, 6) with the largest scale, in their order; COLMAP keeps whole levels."""
+    scale = np.hypot(keypoints[:, 2], keypoints[:, 4])
+    return np.sort(np.argsort(-scale, kind="stable")[:most])

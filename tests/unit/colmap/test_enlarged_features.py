@@ -71,3 +71,12 @@ def test_what_a_killed_run_has_found_stays(place, tmp_path):
     assert first.keys() == again.keys() == {RICH, POOR, EMPTY}
     for name, keypoints in first.items():
         np.testing.assert_array_equal(again[name], keypoints)
+
+
+@pytest.mark.slow
+def test_a_photo_has_no_more_features_than_asked_for(place, tmp_path):
+    own = find(place, tmp_path / "own.db", enlarge_below=0)
+    cut = find(place, tmp_path / "cut.db", enlarge_below=0, max_features=100)
+    assert len(own[RICH]) > 150
+    assert len(cut[RICH]) == 100
+    assert {tuple(row) for row in cut[RICH].tolist()} <= {tuple(row) for row in own[RICH].tolist()}
