@@ -58,7 +58,7 @@ def test_no_more_than_three_are_named(run):
     finished(run)
     said = why(set_to(run, quality="high", photos={"cameras": "each"}, seed=1, matching={"max_ratio": 0.7}))
 
-    assert said.count("->") == 3 and said.endswith("and 2 more")
+    assert said.count("->") == 3 and said.endswith("and 3 more")
 
 
 def test_photos_files_and_versions(run, monkeypatch):
