@@ -116,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             rows.append({"method": f"Python {minor}", "result": "not found on this machine"})
             continue
         with tempfile.TemporaryDirectory() as work:
-            rows.append(try_python(minor, found[minor], args.built, Path(work)))
+            rows.append(try_python(minor, found[minor], args.built.resolve(), Path(work)))
     columns = [*dict.fromkeys(name for row in rows for name in row if name != "result"), "result"]
     print(table(rows, columns))
     if args.keep:
