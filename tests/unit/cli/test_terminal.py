@@ -138,16 +138,8 @@ def test_names_cannot_move_the_cursor(shown):
 
 
 def test_nothing_is_shown_when_quiet(monkeypatch):
-    paper = io.StringIO()
-    monkeypatch.setattr(terminal.sys, "stderr", paper)
-    with Terminal(quiet=True) as display:
-        display.stage("photos")
-        display.say("a note")
-        display.start("photos", 2)
-        display.look()
-        display.finish_stage(20.0)
-
-    assert paper.getvalue() == ""
+    assert printed(monkeypatch, io.StringIO(), quiet=True) == ""
+    assert printed(monkeypatch, io.StringIO()) != ""
 
 
 @pytest.mark.parametrize("columns", [80, 60])
@@ -171,14 +163,14 @@ def test_slow_work_has_two_digits():
     assert [per_minute(1.0), per_minute(0.05), per_minute(0.17)] == ["60", "3.0", "10"]
 
 
-def printed(monkeypatch, paper, **environment):
+def printed(monkeypatch, paper, *, quiet=False, **environment):
     """What a short run shows, with these variables."""
     for name in ("NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE", "TTY_COMPATIBLE"):
         monkeypatch.delenv(name, raising=False)
     for name, value in {"TERM": "xterm-256color", "COLORTERM": "truecolor", **environment}.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(terminal.sys, "stderr", paper)
-    with Terminal(quiet=False) as display:
+    with Terminal(quiet=quiet) as display:
         display.stage("photos")
         display.say("a note")
         display.start("photos", 3)
