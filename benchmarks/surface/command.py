@@ -99,7 +99,7 @@ def measure(photos: SurfaceSet, out: Path, args: argparse.Namespace) -> Row:
         row |= compare_with_kinect(model.surface, out, photos.kinect)
     row |= compare_with_photos(prepared, out, names)
     if args.left_out:
-        row |= score_left_out(photos, out, prepared, args.settings, count=args.left_out, geometry_too=args.geometry_too)
+        row |= score_left_out(out, prepared, args.settings, count=args.left_out, geometry_too=args.geometry_too)
     return row
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from benchmarks.common.results import Row
 from benchmarks.surface.depth_camera.kinect import KinectTruth, kinect_scores
 from benchmarks.surface.detail import detail_scores
+from benchmarks.surface.left_out import remake_without
 from benchmarks.surface.photos import (
     Likeness,
-    leave_out,
     likeness,
     photo_scores,
     placed_photo,
@@ -21,11 +21,11 @@ from benchmarks.surface.photos import (
     render_view,
     subsample,
 )  # fmt: skip
-from benchmarks.surface.sets import SurfaceSet, dense_stages, finished_model
+from benchmarks.surface.sets import dense_stages
 from benchmarks.surface.sparse_poisson import sparse_surfaces
 from benchmarks.surface.truth import seen_places, truth_scores
-from benchmarks.surface.worker import StageCost, run_stages
-from sfm_app.settings import Settings
+from benchmarks.surface.worker import StageCost
+from sfm_app.errors import SfmError
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.synthetic.pictures import PreparedModel, prepare_model
 from sfm_app.synthetic.scenes.bodies import SyntheticScene
@@ -90,7 +90,7 @@ def likenesses(model: PreparedModel, out: Path, names: Sequence[str]) -> dict[st
 
 
 def score_left_out(
-    photos: SurfaceSet, out: Path, model: PreparedModel, settings: Mapping[str, Any], *, count: int, geometry_too: bool
+    out: Path, model: PreparedModel, settings: Mapping[str, Any], *, count: int, geometry_too: bool
 ) -> Row:
     """Return PSNR in photos that the texture was made without, and by how much it is lower than with them."""
     names = subsample(list(placed_photos(out)), count)
@@ -98,16 +98,10 @@ def score_left_out(
     values, lower = [], []
     for name in names:
         target = out.with_name(f"{out.name}-left-out")
-        first = leave_out(out, target, name, geometry_too=geometry_too)
-        stages = dense_stages()[:-1]
-        if first not in stages:
-            return {"left out": f"there is no stage {first}"}
-        stages = stages[stages.index(first) :]
-        said = run_stages(photos.photos, target, stages, settings, again=stages)
-        if any(one.failed for one in said.values()):
-            return {"left out": next(one.failed for one in said.values() if one.failed)}
-        without = prepare_model(finished_model(photos.photos, target, Settings.from_mapping(settings)))
-        # the camera is that of the finished run, whose frame the copy shares
+        try:
+            without = prepare_model(remake_without(out, target, name, settings, geometry_too=geometry_too))
+        except SfmError as error:
+            return {"left out": f"without {name}: {error}"}
         psnr = likenesses(without, out, [name])[name].psnr_db
         if math.isfinite(psnr) and math.isfinite(with_it[name].psnr_db):
             values.append(psnr)

@@ -1,6 +1,5 @@
 """Compare a finished model with its photos: how much of them it covers, and how similar it is there."""
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,6 @@ from PIL import Image
 
 from benchmarks.common.results import Row
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.models.model import submodel
 from sfm_app.synthetic.pictures import Picture, PreparedModel, render_rays
 
 Pixels = NDArray[np.uint8]
@@ -112,26 +110,3 @@ def subsample(names: list[str], count: int) -> list[str]:
     if count >= len(names):
         return names
     return [names[round(place)] for place in (np.arange(count) + 0.5) / count * (len(names) - 1)]
-
-
-def leave_out(out: Path, target: Path, name: str, *, geometry_too: bool) -> str:
-    """Copy a finished run without a photo's pose, as if the photo had never been registered.
-
-    Args:
-        out: the finished run.
-        target: folder of the copy; its contents are removed.
-        name: name of the photo.
-        geometry_too: whether depth maps and mesh leave it out as well, or the texture only.
-
-    Returns:
-        The stage from which on the program has to run again.
-    """
-    shutil.rmtree(target, ignore_errors=True)
-    skipped = shutil.ignore_patterns("dense") if geometry_too else None
-    shutil.copytree(out, target, symlinks=True, ignore=skipped)
-    places = [target / "sparse"] + ([] if geometry_too else [target / "dense" / "sparse"])
-    for folder in places:
-        model = pycolmap.Reconstruction(folder)
-        others = [image.image_id for image in model.images.values() if image.has_pose and image.name != name]
-        submodel(model, others).write(folder)
-    return "depth_maps" if geometry_too else "texture"

@@ -1,6 +1,6 @@
 """From a raw surface to a clean mesh: confirmed by photos, with smooth borders, manifold and colored."""
 
-from sfm_app.meshing.components import drop_islands, octree_depth
+from sfm_app.meshing.components import drop_islands
 from sfm_app.meshing.manifold import make_manifold
 from sfm_app.meshing.trimming import Support, bridge_gaps, cut, drop_doubtful_parts, smooth_support, trim
 from sfm_app.meshing.vertex_colors import Paint, sample_colors
@@ -20,7 +20,6 @@ __all__ = [
     "drop_islands",
     "judge",
     "make_manifold",
-    "octree_depth",
     "sample_colors",
     "smooth_support",
     "trim",

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from sfm_app.atomic_io import is_made_from, replace_atomically
 from sfm_app.colmap.dense import map_file, read_views
-from sfm_app.colmap.surface import FUSED, open_points, poisson_surface, positions
+from sfm_app.colmap.surface import FUSED, open_points, positions
 from sfm_app.errors import ReconstructionError
 from sfm_app.hashing import digest_files, load_arrays
-from sfm_app.meshing import drop_islands, make_manifold, octree_depth, trim
+from sfm_app.meshing import drop_islands, make_manifold, trim
+from sfm_app.meshing.octree import MIN_POINTS, cell_sizes, choose_cell, cube_around, occupied_cells
 from sfm_app.meshing.refinement import STEPS
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
@@ -22,6 +23,7 @@ from sfm_app.runtime.workspace import Workspace
 from sfm_app.stages.blocks.fine import FineShape, save_fine
 from sfm_app.stages.blocks.fusion import fuse_maps
 from sfm_app.stages.blocks.judging import SurfaceJudge, judge_view, simplify_mesh
+from sfm_app.stages.blocks.poisson import span_surface, with_halo
 from sfm_app.stages.blocks.refining import Originals, rank_partners, refine_surface
 from sfm_app.stages.blocks.surface import mesh_in_blocks
 from sfm_app.stereo import View
@@ -33,7 +35,7 @@ FUSED_DIGEST = "fused.txt"
 """File with the hash of the fused points, so that a resumed run does not read damaged ones."""
 HINT = "take more photos, a step apart, with more overlap; OUT/points.ply and OUT/points.glb have the sparse points"
 
-MIN_POINTS = 100
+FEWEST_POINTS = 100
 """Fewer fused points carry no surface."""
 
 MOST_CELLS_PER_FACE = 1.6
@@ -82,25 +84,41 @@ def _mesh_at_once(
         points: (N,) records of the fused points.
         run: the run.
     """
-    (dense_dir, originals), place, options = source, run.workspace.surface, run.settings.mesh
-    # a surface that is not refined loses most of its triangles at once
-    most_cells = np.inf if options.max_image_size_px else MOST_CELLS_PER_FACE * options.faces
-    depth = octree_depth(positions(points), options.poisson_depth, most_cells)
-    with run.step("finding the surface"):
-        raw = _check_nonempty(poisson_surface(place, depth), "the fused points span no surface")
+    (dense_dir, originals), options = source, run.settings.mesh
+    raw = _check_nonempty(_span(points, run), "the fused points span no surface")
     judges = SurfaceJudge.prepare(raw, dense_dir, run.settings.depth.consistency)
     found = ordered_map(run.executor, Task(judge_view, Shared(judges)), views, ahead=run.workers)
     colored, support = judges.sum_up(track(run.progress, found, "confirming the surface", len(views)))
     least = _min_confirmed(views, run)
     trimmed = trim(colored, support, options.max_gap_triangles, least) if options.trim else colored
     detailed = _check_nonempty(drop_islands(trimmed, options.min_island), "the photos confirm no part of the surface")
-    run.record(poisson_depth=depth, raw_triangles=len(raw.faces), detailed_triangles=len(detailed.faces))
+    run.record(detailed_triangles=len(detailed.faces))
     if options.max_image_size_px:
         detailed = _refine(detailed, originals, views, run)
     if run.settings.texture.normal_map:
         save_fine([FineShape.from_surface(detailed)], run.workspace.fine_surface)
     with run.step("simplifying"):
-        return _check_nonempty(make_manifold(simplify_mesh(detailed, options, place)), "the surface has no extent")
+        return _check_nonempty(
+            make_manifold(simplify_mesh(detailed, options, run.workspace.surface)), "the surface has no extent"
+        )
+
+
+def _span(points: NDArray[np.void], run: RunContext) -> Surface:
+    """Return Poisson's surface of all points, as fine as there are points, and as triangles are asked for."""
+    options, where = run.settings.mesh, positions(points)
+    bounds = np.stack([where.min(axis=0), where.max(axis=0)])
+    if (extent := float(np.ptp(bounds, axis=0).max())) == 0.0:
+        raise ReconstructionError("the fused points have no extent", hint=HINT)
+    # a surface that is not refined loses most of its triangles at once
+    most_cells = np.inf if options.max_image_size_px else MOST_CELLS_PER_FACE * options.faces
+    held = ((cell, len(where) / occupied_cells(where, cell)) for cell in cell_sizes(extent, options.poisson_depth))
+    with run.step("finding the surface"):
+        cell = choose_cell(held, max(MIN_POINTS, len(where) / most_cells))
+        surface, raw = span_surface(
+            points, with_halo(bounds, cell), cube_around(bounds[0], bounds[1], cell), run.workspace.surface
+        )
+    run.record(cell=cell, raw_triangles=raw)
+    return surface
 
 
 def _refine(surface: Surface, originals: Originals, views: list[View], run: RunContext) -> Surface:
@@ -162,7 +180,7 @@ def _fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArra
         whole.write_text(digest_files(place, FUSED), encoding="utf-8", newline="\n")
     points = open_points(target)
     run.record(fused_points=len(points))
-    if len(points) < MIN_POINTS:
+    if len(points) < FEWEST_POINTS:
         raise ReconstructionError(
             f"the {len(views)} depth maps agree on {len(points) or 'no'} points only: too few for a surface", hint=HINT
         )

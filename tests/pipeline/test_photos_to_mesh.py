@@ -16,6 +16,8 @@ import trimesh
 from click.testing import CliRunner
 
 import sfm_app
+from benchmarks.surface.left_out import remake_without
+from benchmarks.surface.photos import placed_photos
 from sfm_app.cli import main
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.dense import DenseStore
@@ -23,7 +25,8 @@ from sfm_app.formats import EXPORTERS, SCENE_EXPORTERS
 from sfm_app.pipeline import NAMES
 from sfm_app.runtime.workspace import LOCK, Workspace
 from sfm_app.settings import Settings, merge_nested
-from sfm_app.stages.texture import PARTS, FileStore, read_texture
+from sfm_app.stages import texture
+from sfm_app.stages.texture import PARTS, FileStore, photo_views, read_texture
 from sfm_app.synthetic.cameras import camera_center
 from sfm_app.synthetic.compare import center_error_percent, focal_error_percent, surface_error
 from sfm_app.texture import atlas
@@ -83,6 +86,22 @@ def test_a_normal_map_is_made_from_the_mesh_on_and_leaves_nothing_behind(finishe
     assert (relief != [128, 128, 255]).any(axis=2).mean() > 0.3
     assert sfm_app.reconstruct(rendered[0], out, DRAFT).mesh_path.read_bytes() == plain
     assert not place.fine_surface.exists()
+
+
+def test_what_a_photo_shows_is_not_in_the_texture_that_is_made_without_it(finished, tmp_path, monkeypatch):
+    run, _ = finished
+    whole = read_texture(Workspace(run.out))
+    name, used = run.scene.registered[3], []
+    monkeypatch.setattr(texture, "photo_views", lambda scene, ask=photo_views: used.extend(ask(scene)) or ask(scene))
+
+    without = remake_without(run.out, tmp_path / "copy", name, DRAFT.model_dump())
+
+    assert {view.name for view in used} == set(run.scene.registered) - {name}
+    np.testing.assert_array_equal(without.surface.vertices, whole.surface.vertices)
+    assert without.texture.pages[0].shape[1] > 256 and np.isfinite(without.texture.uv).all()
+    before, after = (part.texture.pages[0] for part in (whole, without))
+    assert before.shape != after.shape or (before != after).mean() > 0.02
+    assert set(run.scene.registered) == set(placed_photos(run.out))
 
 
 def test_glb_loads_upright_and_textured(finished):

@@ -1,6 +1,5 @@
 """Blocks of points: boxes with about as many points each, the leaves of a k-d tree (Bentley, CACM 1975)."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,13 +7,6 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-MARGIN = 1.1
-"""Width of Poisson's cube in extents of its points."""
-ALIGNMENT = 16
-"""Cells at whose multiples Poisson's cubes begin, so that the cells of blocks side by side are the same down to a few
-levels. Chosen by hand."""
-DEEPEST = 24
-"""Levels of a grid over all points: 16 million cells along a side. Chosen by hand."""
 SAMPLE = 2_000_000
 """Points by which the blocks are laid out. Chosen by hand."""
 
@@ -103,55 +95,3 @@ def split_points(points: FloatArray, blocks: int) -> Partition:
     whole = np.stack([np.full(3, -np.inf), np.full(3, np.inf)])
     root = grow(sample, whole, blocks)
     return Partition(root, np.stack(boxes))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Cube:
-    """Poisson's cube around the points of a block, on the common grid."""
-
-    depth: int
-    """Of the octree."""
-    anchors: FloatArray
-    """(2, 3) lowest and highest corner of the points that give the octree this cube."""
-
-
-def cube_around(low: FloatArray, high: FloatArray, cell: float) -> Cube:
-    """Return the smallest cube on the common grid that holds the points of a block.
-
-    Args:
-        low: (3,) lowest coordinates of the points.
-        high: (3,) highest coordinates of the points.
-        cell: side of the finest cells.
-    """
-    step = ALIGNMENT * cell
-    depth = 5
-    while True:
-        side = cell * 2.0**depth
-        start = np.floor((0.5 * (low + high) - 0.5 * side) / step + 0.5) * step
-        inner = np.stack([start + 0.5 * (side - side / MARGIN), start + 0.5 * (side + side / MARGIN)])
-        if (inner[0] <= low).all() and (inner[1] >= high).all():
-            return Cube(depth, inner)
-        depth += 1
-
-
-def cell_sizes(extent: float, depth: int) -> Iterator[float]:
-    """Yield sides of cells, the finest first, each twice the one before.
-
-    Args:
-        extent: largest of all points.
-        depth: greatest depth of an octree over them all.
-    """
-    for level in range(min(depth, DEEPEST), 1, -1):
-        yield MARGIN * extent / 2.0**level
-
-
-def occupied_cells(points: FloatArray, cell: float) -> int:
-    """Return how many cells of a grid hold points (N, 3).
-
-    Args:
-        points: (N, 3).
-        cell: side of a cell.
-    """
-    at = np.floor(points / cell).astype(np.int64)
-    at -= at.min(axis=0, initial=0)
-    return len(np.unique((at[:, 0] << 42) + (at[:, 1] << 21) + at[:, 2]))

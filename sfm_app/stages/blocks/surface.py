@@ -15,29 +15,21 @@ from numpy.typing import NDArray
 
 from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.colmap.dense import read_depth
-from sfm_app.colmap.surface import FUSED, poisson_surface, positions, write_points
+from sfm_app.colmap.surface import positions
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.culling import Clusters, border_angle
-from sfm_app.geometry.triangles import select_faces
 from sfm_app.hashing import fingerprint, load_arrays
 from sfm_app.meshing import drop_islands, make_manifold, trim
-from sfm_app.meshing.blocks.partition import (
-    Cube,
-    Partition,
-    Split,
-    cell_sizes,
-    cube_around,
-    occupied_cells,
-    split_points,
-)
+from sfm_app.meshing.blocks.partition import Partition, Split, split_points
 from sfm_app.meshing.blocks.weld import close_cracks, weld
-from sfm_app.meshing.components import MIN_POINTS
+from sfm_app.meshing.octree import MIN_POINTS, Cube, cell_sizes, choose_cell, cube_around, occupied_cells
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_count, block_workers
 from sfm_app.settings import MeshSettings
 from sfm_app.stages.blocks.fine import FineShape, save_fine
 from sfm_app.stages.blocks.judging import SurfaceJudge, judge_by_all, simplify_mesh
 from sfm_app.stages.blocks.points import BlockPoints, sort_points
+from sfm_app.stages.blocks.poisson import span_surface, with_halo
 from sfm_app.stages.blocks.refining import Originals, Partners, rank_partners, refine_surface
 from sfm_app.stereo import View
 from sfm_app.tasks import Task
@@ -47,9 +39,6 @@ FloatArray = NDArray[np.float64]
 
 BLOCKS = "blocks"
 """Folder beside the surface while its blocks are made."""
-HALO = 24
-"""Cells that a block shares with its neighbors. Gaps of twenty triangles are closed in the same way from both sides,
-and Poisson's surface no longer depends on where the points end. Chosen by hand."""
 GIVE_WAY = 8.0
 """Cells over which a block gives way to its neighbor. Chosen by hand."""
 AT_PLANE = 2.0
@@ -122,8 +111,8 @@ def mesh_in_blocks(
     with run.step("sorting the points"):
         partition = split_points(_sample(points), block_count(len(points), options))
         own = sort_points(points, partition, folder)
-        cell = choose_cell(own, options.poisson_depth)
-    bounds = _with_halo(own.bounds, cell)
+        cell = choose_cell(cell_sizes_of_blocks(own, options.poisson_depth), MIN_POINTS)
+    bounds = with_halo(own.bounds, cell)
     cubes = [cube_around(low, high, cell) for low, high in bounds]
     farthest = run.map(Task(farthest_depth, dense_dir), views, "measuring depths")
     partners = rank_partners(views)
@@ -158,10 +147,7 @@ def mesh_block(task: BlockTask) -> int:
         return int(load_arrays(task.path)["raw"])
     # a worker that was cut off from a cluster may still be at the same block
     scratch = Path(tempfile.mkdtemp(dir=task.folder, prefix=f"{task.number}-"))
-    _write_block_points(task, scratch / FUSED)
-    raw = poisson_surface(scratch, task.cube.depth)
-    inside = ((raw.vertices >= task.bounds[0]) & (raw.vertices <= task.bounds[1])).all(axis=1)
-    near = select_faces(raw, inside[raw.faces].all(axis=1))
+    near, raw = span_surface(task.points.read_box(task.bounds), task.bounds, task.cube, scratch)
     judge = SurfaceJudge.prepare(near, task.dense_dir, task.tolerance)
     found, support, seers = judge_by_all(judge, task.views)
     if task.options.trim and len(found.faces):
@@ -170,9 +156,9 @@ def mesh_block(task: BlockTask) -> int:
         found = refine_surface(found, task.originals, seers, task.partners, task.options).surface
     found = _simplify_block(found, task, scratch)
     with replace_atomically(task.path) as path:
-        np.savez(path, vertices=found.vertices, faces=found.faces, colors=found.colors, raw=len(raw.faces))
+        np.savez(path, vertices=found.vertices, faces=found.faces, colors=found.colors, raw=raw)
     shutil.rmtree(scratch)
-    return len(raw.faces)
+    return raw
 
 
 def _simplify_block(found: Surface, task: BlockTask, scratch: Path) -> Surface:
@@ -187,15 +173,6 @@ def _parts_without_halo(tasks: Sequence[BlockTask], partition: Partition) -> Ite
     for task in tasks:
         fine = FineShape.load(task.fine_path)
         yield fine.select(partition.find_blocks(fine.vertices[fine.faces].mean(axis=1)) == task.number)
-
-
-def _write_block_points(task: BlockTask, path: Path) -> None:
-    """Write the points of a block and its halo, and two more that make Poisson's cube the one on the common grid."""
-    anchors = np.zeros(2, task.points.fields)
-    for axis, name in enumerate("xyz"):
-        anchors[name] = task.cube.anchors[:, axis]
-        anchors[f"n{name}"] = 3.0**-0.5
-    write_points(np.concatenate([anchors, task.points.read_box(task.bounds)]), path)
 
 
 def join_blocks(node: Split | int, tasks: Sequence[BlockTask], cell: float) -> tuple[Surface, int]:
@@ -214,8 +191,8 @@ def join_blocks(node: Split | int, tasks: Sequence[BlockTask], cell: float) -> t
     return joined, here + lost + also
 
 
-def choose_cell(points: BlockPoints, most: int) -> float:
-    """Return the side of the finest cells: as `octree_depth` has it, but with an octree for each block.
+def cell_sizes_of_blocks(points: BlockPoints, most: int) -> Iterator[tuple[float, float]]:
+    """Yield sides of cells, the finest first, and the mean number of points in an occupied one.
 
     Args:
         points: of all blocks.
@@ -223,17 +200,12 @@ def choose_cell(points: BlockPoints, most: int) -> float:
     """
     bounds = points.bounds
     extent = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
-    cell = extent
     for cell in cell_sizes(extent, MOST_LEVELS):
-        if max(cube_around(low, high, cell).depth for low, high in _with_halo(bounds, cell)) > most:
+        if max(cube_around(low, high, cell).depth for low, high in with_halo(bounds, cell)) > most:
             continue
-        count = occupied = 0
-        for number in range(len(bounds)):
-            own = positions(points.read(number))
-            count, occupied = count + len(own), occupied + occupied_cells(own, cell)
-        if count >= MIN_POINTS * occupied:
-            break
-    return cell
+        own = (positions(points.read(number)) for number in range(len(bounds)))
+        count, occupied = np.sum([(len(part), occupied_cells(part, cell)) for part in own], axis=0)
+        yield cell, count / occupied
 
 
 def farthest_depth(dense_dir: Path, view: View) -> float:
@@ -248,11 +220,6 @@ def farthest_depth(dense_dir: Path, view: View) -> float:
 
 def _sample(points: NDArray[np.void]) -> FloatArray:
     return positions(points[:: max(1, len(points) // SAMPLE)])
-
-
-def _with_halo(bounds: FloatArray, cell: float) -> FloatArray:
-    """Return (B, 2, 3) bounds that contain the halo of each block."""
-    return bounds + HALO * cell * np.array([-1.0, 1.0])[None, :, None]
 
 
 def _photos_in_reach(views: Sequence[View], farthest: Sequence[float], bounds: FloatArray) -> list[list[View]]:

@@ -141,7 +141,10 @@ def test_what_no_photo_sees_is_cut_off_or_kept_closed(dense, tmp_path):
     closed, _ = made(half, trim=False)
 
     assert -0.75 < cut.vertices[:, 2].min() < 0.2
-    assert closed.vertices[:, 2].min() < -0.75
+    assert closed.vertices[:, 2].min() < cut.vertices[:, 2].min() - 0.1
+    # an edge of a closed surface has a triangle on each side
+    assert len(unique_edges(closed.faces)[0]) == 1.5 * len(closed.faces)
+    assert len(unique_edges(cut.faces)[0]) > 1.5 * len(cut.faces)
 
 
 def test_maps_that_agree_on_nothing_give_an_error_that_says_so(dense, tmp_path):
@@ -307,7 +310,7 @@ def test_the_fine_surface_is_kept_for_a_normal_map_and_changes_nothing_else(dens
     stored = np.load(kept.fine_surface)
     vertices, faces = stored["vertices"].astype(float), stored["faces"].astype(int)
     assert np.percentile(np.abs(np.linalg.norm(vertices, axis=1) - 1), 95) < 0.01
-    assert len(faces) > 10 * 500 and set(faces.ravel()) == set(range(len(vertices)))
+    assert len(faces) > 3 * 500 and set(faces.ravel()) == set(range(len(vertices)))
     assert areas(vertices, faces).sum() == pytest.approx(4 * np.pi, rel=0.02)  # blocks neither overlap nor gape
     corners = vertices[faces]
     outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
