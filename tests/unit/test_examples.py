@@ -12,9 +12,11 @@ import tomllib
 from pathlib import Path
 
 import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
+from sfm_app.camera_files.recognition import read_given_cameras
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
 ROOT = Path(__file__).parents[2]
@@ -22,6 +24,8 @@ EXAMPLES = ROOT / "examples"
 NOTEBOOKS = sorted((EXAMPLES / "notebooks").glob("*.ipynb"))
 RENDERED = {"COUNT": 7, "WIDTH": 480, "RADIAL": 0.0}
 """As the fixture `rendered` has it."""
+PHOTOS = "photos_7_480_0.0"
+"""Their folder."""
 MOST_BYTES = 200_000
 """Of a notebook with its outputs."""
 CONTRACT = "finds_the_truth or cross_process or ten_runs or memory_is_linear or random or is_left_alone"
@@ -92,7 +96,7 @@ def test_batch_goes_on_after_a_failure_and_does_nothing_again(begun_batch):
     folders, out = begun_batch
     before = stages(out / "good")
 
-    done = call("batch_folders.py", folders, out, "--quality", "draft")
+    done = call("batch_folders.py", folders, out, "--quality", "draft", "--set", "report=false")
 
     assert done.returncode == 1, done.stderr
     rows = read_table(out / "table.csv")
@@ -106,7 +110,7 @@ def test_batch_goes_on_after_a_failure_and_does_nothing_again(begun_batch):
     assert float(good["seconds"]) == pytest.approx(sum(stage["seconds"] for stage in after.values()), abs=0.1)
     del before["photos"], after["photos"]  # those of another folder are read, and found to be the same
     assert len(after) > 5 and after == before
-    assert done.stdout.startswith("[1/2] bad: state failed, reason ")
+    assert done.stdout.startswith("[1/2] bad: state failed, reason ") and not (out / "bad" / "report.html").exists()
 
 
 @pytest.mark.slow
@@ -156,33 +160,34 @@ def execute(name, **changed):
 @pytest.fixture
 def work(folder_run, rendered, tmp_path):
     """A folder in which most of a notebook's work is done: photos but one, and the finished run of all."""
-    shutil.copytree(rendered[0], tmp_path / "photos")
-    (tmp_path / "photos" / "view_06.jpg").unlink()
+    shutil.copytree(rendered[0], tmp_path / PHOTOS)
+    (tmp_path / PHOTOS / "view_06.jpg").unlink()
     shutil.copytree(folder_run[0], tmp_path / "out", symlinks=True)
     return tmp_path
 
 
 @pytest.fixture
 def no_screen():
-    pyplot = pytest.importorskip("matplotlib.pyplot")
     matplotlib.use("Agg")
     yield
-    pyplot.close("all")
+    plt.close("all")
 
 
 @pytest.mark.slow
 def test_calibrate_folder(work, rendered, capsys):
     names = execute("calibrate_folder", WORK=str(work), QUALITY="draft", **RENDERED)
 
-    assert (work / "photos" / "view_06.jpg").read_bytes() == (rendered[0] / "view_06.jpg").read_bytes()
+    assert (work / PHOTOS / "view_06.jpg").read_bytes() == (rendered[0] / "view_06.jpg").read_bytes()
     camera, deviation = names["camera"], names["camera"].spread["fx"]
     assert camera.identifiable and 0.1 < deviation < 10
     assert abs(camera.K[0, 0] - 504) < 4 * deviation
     said = capsys.readouterr().out
-    assert "7 files in photos\nthe photos determine K\n" in said
+    assert f"7 files in {PHOTOS}\nthe photos determine K\n" in said
     line = re.search(r"^fx +([\d.]+) +([\d.]+) +504\.000 +(-?[\d.]+)$", said, re.MULTILINE)
     assert float(line[3]) == pytest.approx((float(line[1]) - 504) / float(line[2]), abs=0.06)
-    assert json.loads((work / "calibration.json").read_text())["cameras"]["480x320"]["identifiable"]
+    assert (work / "camera.png").stat().st_size > 50_000
+    (given,) = read_given_cameras(work / "out" / "calibration.json").cameras.values()  # what --calibration takes
+    np.testing.assert_allclose(given.K, camera.K)
 
 
 @pytest.mark.slow
