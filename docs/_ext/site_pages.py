@@ -10,11 +10,15 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 OUTSIDE = (
     "CHANGELOG.md", "CONTRIBUTING.md", "benchmarks/README.md", "benchmarks/results/*.md", "plugins/*/README.md",
+    "examples/README.md", "examples/*/README.md",
 )  # fmt: skip
 """Pages that are not in docs/; they get the same path on the site."""
 FRONT = {"README.md": "index.md"}
 """The README is the front page of the repository; the site has one of its own."""
-NAVIGATION = {"libraries/README.md": "*", "benchmarks/README.md": "results/*", "plugins.md": "plugins/*/README"}
+NAVIGATION = {
+    "libraries/README.md": "*", "benchmarks/README.md": "results/*", "plugins.md": "plugins/*/README",
+    "scripting.md": "examples/README", "examples/README.md": "*/README",
+}  # fmt: skip
 """Pages of the site that stand above others, and which."""
 LINK = re.compile(r"(!?\[(?:[^\[\]]|\[[^\]]*\])*\]\()([^()\s]+)((?: \"[^\"]*\")?\))")
 CODE = re.compile(r"(```.*?```|`[^`\n]*`)", re.DOTALL)

@@ -11,7 +11,7 @@ PAGES = [
     ROOT / "CONTRIBUTING.md",
     *(path for path in sorted((ROOT / "docs").rglob("*.md")) if "_build" not in path.parts),
     *sorted((ROOT / "plugins").glob("*/README.md")),
-    *sorted((ROOT / "examples").glob("*.md")),
+    *sorted((ROOT / "examples").rglob("*.md")),
 ]
 FENCE = re.compile(r"^(<!-- compiled only: [^\n]+ -->\n\n?)?```(\S*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 SHELL = ("sh", "console")

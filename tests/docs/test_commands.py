@@ -15,8 +15,8 @@ PROGRAM = "sfm-app"
 RUNNERS = {"uvx", "uv", "pipx", "docker", "podman"}
 """What follows the program's name in their lines is a command of ours."""
 OTHERS = {
-    ".", "InterfaceCOLMAP", "cd", "colmap", "cp", "curl", "dask", "echo", "eval", "export", "git", "ls", "mkdir", "npm",
-    "ns-train", "pre-commit", "source", "twine",
+    ".", "InterfaceCOLMAP", "cd", "colmap", "cp", "curl", "dask", "echo", "eval", "export", "git", "jupyter",
+    "ls", "mkdir", "npm", "ns-train", "pre-commit", "source", "twine",
 }  # fmt: skip
 """Programs of other people."""
 TRAINERS = {"train.py", "examples/simple_trainer.py"}

@@ -70,7 +70,7 @@ def test_one_version():
     assert headings[0] == version
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))["version"] == version
     minor = int(version.split(".")[1])
-    for path in (ROOT / "plugins").glob("*/pyproject.toml"):
+    for path in (*ROOT.glob("plugins/*/pyproject.toml"), ROOT / "examples" / "plugin_template" / "pyproject.toml"):
         needed = tomllib.loads(path.read_text(encoding="utf-8"))["project"]["dependencies"]
         assert f"sfm-app>=0.{minor},<0.{minor + 1}" in needed
 
