@@ -48,7 +48,7 @@ class RunScene(Scene):
         return cls(**{field.name: getattr(scene, field.name) for field in fields(Scene)}, out=out)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Run:
     """The results of a finished run."""
 
@@ -65,6 +65,11 @@ class Run:
     """manifest.json, with the stages up to the one where the run stopped."""
     report_path: Path | None = None
     """report.html; None where `report` is off in the settings."""
+
+    def __repr__(self) -> str:
+        placed = len(self.scene.registered) if self.scene else 0
+        made = self.mesh_path or self.model_dir
+        return f"Run({str(self.out)!r}: {placed} photos placed, {made.name if made else 'no model'})"
 
     def picture(self) -> NDArray[np.uint8] | None:
         """Return a picture (H, W, 4) RGBA of the model, or of its points; None where no photo has a place."""

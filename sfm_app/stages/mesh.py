@@ -13,7 +13,7 @@ from sfm_app.colmap.surface import FUSED, open_points, positions
 from sfm_app.errors import ReconstructionError
 from sfm_app.hashing import digest_files, load_arrays
 from sfm_app.meshing import drop_islands, make_manifold, trim
-from sfm_app.meshing.octree import MIN_POINTS, cell_sizes, choose_cell, cube_around, occupied_cells
+from sfm_app.meshing.octree import LEAST_POINTS, cell_sizes, choose_cell, cube_around
 from sfm_app.meshing.refinement import STEPS
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
@@ -23,7 +23,7 @@ from sfm_app.runtime.workspace import Workspace
 from sfm_app.stages.blocks.fine import FineShape, save_fine
 from sfm_app.stages.blocks.fusion import fuse_maps
 from sfm_app.stages.blocks.judging import SurfaceJudge, judge_view, simplify_mesh
-from sfm_app.stages.blocks.poisson import span_surface, with_halo
+from sfm_app.stages.blocks.poisson import EVERYWHERE, RecordCells, span_surface, with_halo
 from sfm_app.stages.blocks.refining import Originals, rank_partners, refine_surface
 from sfm_app.stages.blocks.surface import mesh_in_blocks
 from sfm_app.stereo import View
@@ -98,9 +98,8 @@ def _mesh_at_once(
     if run.settings.texture.normal_map:
         save_fine([FineShape.from_surface(detailed)], run.workspace.fine_surface)
     with run.step("simplifying"):
-        return _check_nonempty(
-            make_manifold(simplify_mesh(detailed, options, run.workspace.surface)), "the surface has no extent"
-        )
+        simple = make_manifold(simplify_mesh(detailed, options, run.workspace.surface))
+    return _check_nonempty(simple, "the surface has no extent")
 
 
 def _span(points: NDArray[np.void], run: RunContext) -> Surface:
@@ -111,12 +110,12 @@ def _span(points: NDArray[np.void], run: RunContext) -> Surface:
         raise ReconstructionError("the fused points have no extent", hint=HINT)
     # a surface that is not refined loses most of its triangles at once
     most_cells = np.inf if options.max_image_size_px else MOST_CELLS_PER_FACE * options.faces
-    held = ((cell, len(where) / occupied_cells(where, cell)) for cell in cell_sizes(extent, options.poisson_depth))
+    sizes = list(cell_sizes(extent, options.poisson_depth))
     with run.step("finding the surface"):
-        cell = choose_cell(held, max(MIN_POINTS, len(where) / most_cells))
-        surface, raw = span_surface(
-            points, with_halo(bounds, cell), cube_around(bounds[0], bounds[1], cell), run.workspace.surface
-        )
+        cell = choose_cell(sizes, RecordCells(lambda: [points]), max(LEAST_POINTS, len(where) / most_cells))
+        cube = cube_around(bounds[0], bounds[1], cell)
+        kept = with_halo(bounds, cell) if options.trim else EVERYWHERE
+        surface, raw = span_surface(points, kept, cube, run.workspace.surface)
     run.record(cell=cell, raw_triangles=raw)
     return surface
 

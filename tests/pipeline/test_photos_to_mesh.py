@@ -56,6 +56,7 @@ def test_every_photo_has_a_place(finished):
 
     assert set(run.scene.registered) == set(truth.cam_from_world)
     assert 0.05 < run.scene.mean_reprojection_px < 1.0
+    assert repr(run) == f"Run({str(run.out)!r}: 7 photos placed, model.glb)"
 
 
 def test_mesh_lies_on_the_true_surface(finished):

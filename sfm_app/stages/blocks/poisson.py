@@ -1,14 +1,16 @@
 """Poisson's surface of points, in a cube that two more points enlarge until its cells have the size asked for."""
 
 import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.surface import FUSED, poisson_surface, write_points
+from sfm_app.colmap.surface import FUSED, poisson_surface, positions, write_points
 from sfm_app.geometry.triangles import select_faces
-from sfm_app.meshing.octree import Cube
+from sfm_app.meshing.octree import Cube, count_bent, count_cells
 from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
@@ -16,6 +18,41 @@ FloatArray = NDArray[np.float64]
 HALO = 24
 """Cells around a box to which the surface of its points reaches. Gaps of twenty triangles are closed in the same way
 from both sides of a block, and Poisson's surface no longer depends on where the points end. Chosen by hand."""
+EVERYWHERE = np.array([[-np.inf] * 3, [np.inf] * 3])
+"""Bounds without end."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordCells:
+    """The `PointCells` of the fused points, which may be too many to be held at once."""
+
+    read: Callable[[], Iterable[NDArray[np.void]]]
+    """Gives their records, part by part."""
+
+    def points_per_cell(self, cell: float) -> float:
+        """Return the mean number of points in an occupied cell.
+
+        Args:
+            cell: side of a cell.
+        """
+        counts = [(len(part), count_cells(positions(part), cell)) for part in self.read()]
+        points, occupied = np.sum(counts, axis=0)
+        return float(points / occupied)
+
+    def bent_share(self, cell: float) -> float:
+        """Return the share of cells whose normals differ.
+
+        Args:
+            cell: side of a cell.
+        """
+        counts = [count_bent(positions(part), _normals(part), cell) for part in self.read()]
+        bent, told = np.sum(counts, axis=0)
+        return float(bent / max(told, 1))
+
+
+def _normals(records: NDArray[np.void]) -> FloatArray:
+    """Return the normals (N, 3) of records."""
+    return np.stack([records[f"n{c}"] for c in "xyz"], axis=1).astype(np.float64)
 
 
 def with_halo(bounds: FloatArray, cell: float) -> FloatArray:

@@ -22,14 +22,14 @@ from sfm_app.hashing import fingerprint, load_arrays
 from sfm_app.meshing import drop_islands, make_manifold, trim
 from sfm_app.meshing.blocks.partition import Partition, Split, split_points
 from sfm_app.meshing.blocks.weld import close_cracks, weld
-from sfm_app.meshing.octree import MIN_POINTS, Cube, cell_sizes, choose_cell, cube_around, occupied_cells
+from sfm_app.meshing.octree import DEEPEST, Cube, cell_sizes, choose_cell, cube_around
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_count, block_workers
 from sfm_app.settings import MeshSettings
 from sfm_app.stages.blocks.fine import FineShape, save_fine
 from sfm_app.stages.blocks.judging import SurfaceJudge, judge_by_all, simplify_mesh
 from sfm_app.stages.blocks.points import BlockPoints, sort_points
-from sfm_app.stages.blocks.poisson import span_surface, with_halo
+from sfm_app.stages.blocks.poisson import RecordCells, span_surface, with_halo
 from sfm_app.stages.blocks.refining import Originals, Partners, rank_partners, refine_surface
 from sfm_app.stereo import View
 from sfm_app.tasks import Task
@@ -43,8 +43,6 @@ GIVE_WAY = 8.0
 """Cells over which a block gives way to its neighbor. Chosen by hand."""
 AT_PLANE = 2.0
 """Cells from a plane within which small holes are cracks from joining. Chosen by hand."""
-MOST_LEVELS = 20
-"""Of the grid over all points; blocks with more than `poisson_depth` levels get coarser cells. Chosen by hand."""
 SAMPLE = 4_000_000
 """Points, at most twice as many, by which the blocks are laid out."""
 
@@ -111,7 +109,8 @@ def mesh_in_blocks(
     with run.step("sorting the points"):
         partition = split_points(_sample(points), block_count(len(points), options))
         own = sort_points(points, partition, folder)
-        cell = choose_cell(cell_sizes_of_blocks(own, options.poisson_depth), MIN_POINTS)
+        sizes = sizes_for_blocks(own.bounds, options.poisson_depth)
+        cell = choose_cell(sizes, RecordCells(lambda: map(own.read, range(len(own.bounds)))))
     bounds = with_halo(own.bounds, cell)
     cubes = [cube_around(low, high, cell) for low, high in bounds]
     farthest = run.map(Task(farthest_depth, dense_dir), views, "measuring depths")
@@ -191,21 +190,20 @@ def join_blocks(node: Split | int, tasks: Sequence[BlockTask], cell: float) -> t
     return joined, here + lost + also
 
 
-def cell_sizes_of_blocks(points: BlockPoints, most: int) -> Iterator[tuple[float, float]]:
-    """Yield sides of cells, the finest first, and the mean number of points in an occupied one.
+def sizes_for_blocks(bounds: FloatArray, most: int) -> list[float]:
+    """Return sides of cells for which no octree of a block is too deep, the finest first.
 
     Args:
-        points: of all blocks.
+        bounds: (B, 2, 3) of the points of each block.
         most: greatest depth of a block's octree.
     """
-    bounds = points.bounds
     extent = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
-    for cell in cell_sizes(extent, MOST_LEVELS):
-        if max(cube_around(low, high, cell).depth for low, high in with_halo(bounds, cell)) > most:
-            continue
-        own = (positions(points.read(number)) for number in range(len(bounds)))
-        count, occupied = np.sum([(len(part), occupied_cells(part, cell)) for part in own], axis=0)
-        yield cell, count / occupied
+
+    def deepest(cell: float) -> int:
+        return max(cube_around(low, high, cell).depth for low, high in with_halo(bounds, cell))
+
+    sizes = list(cell_sizes(extent, DEEPEST))
+    return [cell for cell in sizes if deepest(cell) <= most] or sizes[-1:]
 
 
 def farthest_depth(dense_dir: Path, view: View) -> float:

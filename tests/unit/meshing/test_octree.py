@@ -5,56 +5,104 @@ import pytest
 
 from sfm_app.meshing.octree import (
     ALIGNMENT,
-    MARGIN,
-    MIN_POINTS,
+    BENT_SHARE,
+    LEAST_POINTS,
+    MOST_POINTS,
     cell_sizes,
     choose_cell,
+    count_bent,
+    count_cells,
     cube_around,
-    occupied_cells,
+    find_size,
 )
 
 
-def sizes_of(points, most=12):
-    """Yield sides of cells and mean numbers of points in an occupied one."""
-    extent = np.ptp(points, axis=0).max()
-    return ((cell, len(points) / occupied_cells(points, cell)) for cell in cell_sizes(extent, most))
+class Cells:
+    """Oriented points, and what is asked about their cells."""
+
+    def __init__(self, points, normals):
+        self.points, self.normals = points, normals
+        self.sizes = list(cell_sizes(np.ptp(points, axis=0).max(), 12))
+
+    def points_per_cell(self, cell):
+        return len(self.points) / count_cells(self.points, cell)
+
+    def bent_share(self, cell):
+        bent, told = count_bent(self.points, self.normals, cell)
+        return bent / max(told, 1)
 
 
-@pytest.mark.parametrize("least", [1.4, 2.0, 2.7, 5.6])
-@pytest.mark.parametrize("scale", [1.0, 1.3, 7.0])
-def test_cells_of_a_plane_hold_as_many_points_as_asked_for(least, scale):
-    points = np.random.default_rng(4).uniform(0, 1, (40_000, 3)) * [1, scale, 0]
+def plane(count=40_000, width=1.0, bump=0.0, seed=4):
+    """Points on a plane, and a share of them on rods of a hundredth of its size before it."""
+    rng = np.random.default_rng(seed)
+    points, normals = rng.uniform(0, 1, (count, 3)) * [1, width, 0], np.tile([0.0, 0.0, 1.0], (count, 1))
+    rods, angle = rng.random(count) < bump, rng.uniform(0, 2 * np.pi, count)
+    normals[rods] = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)[rods]
+    points[rods, 0] = np.round(points[rods, 0], 1)
+    points[rods] += 0.005 * normals[rods] + [0.0, 0.0, 0.1]
+    return Cells(points, normals)
 
-    cell = choose_cell(sizes_of(points), least)
 
-    assert 0.9 * least < len(points) / occupied_cells(points, cell) < 1.1 * least
+@pytest.mark.parametrize("wanted", [1.4, 2.0, 2.7, 5.6])
+@pytest.mark.parametrize("width", [1.0, 1.3, 7.0])
+def test_cells_of_a_plane_hold_as_many_points_as_wanted(wanted, width):
+    cells = plane(width=width)
+
+    cell = find_size(cells.sizes, cells.points_per_cell, wanted)
+
+    assert 0.9 * wanted < cells.points_per_cell(cell) < 1.1 * wanted
 
 
-def test_cells_grow_with_the_points_by_no_step():
-    """A box that grows by a far point does not halve the cells."""
-    points = np.random.default_rng(5).uniform(0, 1, (30_000, 3)) * [1, 1, 0]
-    sides = [choose_cell(sizes_of(np.vstack([points, [1 + far, 0, 0]])), MIN_POINTS) for far in np.linspace(0, 2, 21)]
+def test_cells_do_not_jump_as_a_far_point_enlarges_the_box():
+    flat = plane(30_000)
+    sides = [
+        choose_cell(cells.sizes, cells)
+        for far in np.linspace(0, 2, 21)
+        for cells in [Cells(np.vstack([flat.points, [1 + far, 0, 0]]), np.vstack([flat.normals, [0, 0, 1]]))]
+    ]
 
     assert max(sides) < 1.1 * min(sides)
 
 
-@pytest.mark.parametrize("most", [3, 6, 9])
-def test_cells_lie_between_two_sizes_of_which_one_holds_enough(most):
-    points = np.random.default_rng(most).uniform(-2, 3, (400, 3)) ** 3
+def test_cells_are_large_on_walls_and_small_where_there_are_rods():
+    shares = [0.0, 0.03, 0.06, 0.1, 0.3, 0.6]
+    held = []
+    for share in shares:
+        cells = plane(bump=share)
+        held.append(cells.points_per_cell(choose_cell(cells.sizes, cells)))
 
-    cell = choose_cell(sizes_of(points, most), MIN_POINTS)
-
-    extent = MARGIN * np.ptp(points, axis=0).max()
-    fits = [
-        depth for depth in range(2, most + 1) if len(points) >= MIN_POINTS * occupied_cells(points, extent / 2**depth)
-    ]
-    assert extent / 2 ** min(max(fits) + 1, most) <= cell <= extent / 2 ** max(fits)
+    assert 0.9 * MOST_POINTS < held[0] < 1.1 * MOST_POINTS
+    assert 0.9 * LEAST_POINTS < held[-1] < 1.1 * LEAST_POINTS
+    assert any(1.1 * LEAST_POINTS < value < 0.9 * MOST_POINTS for value in held)
+    assert (np.diff(held) < 0.1).all()
 
 
-def test_where_no_cells_hold_enough_they_are_the_coarsest():
-    assert choose_cell(iter([(1.0, 1.0), (2.0, 1.1)]), 1.4) == 2.0
-    assert choose_cell(iter([(1.0, 1.5), (2.0, 5.0)]), 1.4) == 1.0
-    assert choose_cell(iter([(1.0, 1.0), (2.0, 4.0)]), 2.0) == pytest.approx(2**0.5)
+def test_between_the_two_about_as_many_cells_are_bent_as_may_be():
+    cells = plane(bump=0.03)
+    cell = choose_cell(cells.sizes, cells)
+
+    assert LEAST_POINTS < cells.points_per_cell(cell) < MOST_POINTS
+    assert 0.5 * BENT_SHARE < cells.bent_share(2 * cell) < 2.0 * BENT_SHARE
+
+
+def test_more_points_are_held_where_fewer_triangles_are_wanted():
+    cells = plane()
+
+    assert 7.2 < cells.points_per_cell(choose_cell(cells.sizes, cells, least=8.0)) < 8.8
+
+
+def test_where_no_size_holds_enough_it_is_the_coarsest():
+    assert find_size([1.0, 2.0], {1.0: 1.0, 2.0: 1.1}.get, 1.4) == 2.0
+    assert find_size([1.0, 2.0], {1.0: 1.5, 2.0: 5.0}.get, 1.4) == 1.0
+    assert find_size([1.0, 2.0], {1.0: 1.0, 2.0: 4.0}.get, 2.0) == pytest.approx(2**0.5)
+
+
+def test_cells_are_counted_once_and_bent_ones_among_those_with_two_points():
+    points = np.array([[0.1, 0.1, 0.1], [0.2, 0.9, 0.3], [-0.1, 0.1, 0.1], [5.5, 0.0, 0.0], [5.6, 0.1, 0.2]])
+    normals = np.array([[0.0, 0, 1], [0, 1, 0], [1, 0, 0], [1, 0, 0], [1, 0, 0]])
+
+    assert count_cells(points, 1.0) == 3
+    assert count_bent(points, normals, 1.0) == (1, 2)
 
 
 def test_cubes_hold_their_points_on_a_common_grid():
@@ -71,9 +119,3 @@ def test_cubes_hold_their_points_on_a_common_grid():
         np.testing.assert_allclose(side, 0.05 * 2**cube.depth)
         np.testing.assert_allclose(start / (ALIGNMENT * 0.05), np.round(start / (ALIGNMENT * 0.05)), atol=1e-6)
         assert side[0] < 4.5 * max(30 * 0.05, (high - low).max() + 2 * ALIGNMENT * 0.05)
-
-
-def test_cells_are_counted_once():
-    points = np.array([[0.1, 0.1, 0.1], [0.2, 0.9, 0.3], [-0.1, 0.1, 0.1], [5.5, 0.0, 0.0]])
-
-    assert occupied_cells(points, 1.0) == 3
