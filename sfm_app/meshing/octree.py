@@ -19,9 +19,9 @@ MOST_POINTS = 3.0
 photos refine them. Chosen on fountain-P11 and Herz-Jesus-P8."""
 BENT_COSINE = 0.9
 """Length of the mean of unit normals below which a cell is bent: they are 26 degrees off it. Chosen by hand."""
-BENT_SHARE = 0.02
-"""Share of bent cells from which on cells are finer. Between fountain-P11 and Herz-Jesus-P8 (0.017 with three points
-in a cell) and `railing` (0.03 with one and a half)."""
+BENT_SHARE = 0.015
+"""Share of bent cells from which on cells are finer. `railing` has 0.03 with one and a half points in a cell,
+fountain-P11 and Herz-Jesus-P8 0.008, and 0.015 with two and a half, where left-out photos fit best."""
 MARGIN = 1.1
 """Width of Poisson's cube in extents of its points."""
 ALIGNMENT = 16
