@@ -14,14 +14,14 @@ FloatArray = NDArray[np.float64]
 LEAST_POINTS = 1.5
 """Smallest mean number of points in an occupied cell: finer cells, most with one point, would only model noise, with
 four times the triangles per level. Chosen on `railing`."""
-MOST_POINTS = 3.0
+MOST_POINTS = 2.5
 """Mean number of points in an occupied cell where surfaces are smooth: finer cells than that show no more, once the
-photos refine them. Chosen on fountain-P11 and Herz-Jesus-P8."""
+photos refine them, and model the noise of lawns. Chosen on fountain-P11, Herz-Jesus-P8 and `garden`."""
 BENT_COSINE = 0.9
 """Length of the mean of unit normals below which a cell is bent: they are 26 degrees off it. Chosen by hand."""
-BENT_SHARE = 0.015
-"""Share of bent cells from which on cells are finer. `railing` has 0.03 with one and a half points in a cell,
-fountain-P11 and Herz-Jesus-P8 0.008, and 0.015 with two and a half, where left-out photos fit best."""
+BENT_SHARE = 0.025
+"""Share of bent cells from which on cells are finer. `railing` has 0.03 with one and a half points in a cell; with two
+and a half, `ornament` 0.045, `garden` 0.02, fountain-P11 and Herz-Jesus-P8 0.015."""
 MARGIN = 1.1
 """Width of Poisson's cube in extents of its points."""
 ALIGNMENT = 16
