@@ -3,10 +3,12 @@
 import errno
 import gc
 import os
+import shlex
 import sys
 import warnings
 from collections.abc import Mapping
 from io import TextIOWrapper
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -73,6 +75,22 @@ class Program(LazyGroup):
                 sys.stderr.flush()
                 os._exit(INTERRUPTED)
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command; whoever names a folder instead is told what to type.
+
+        Args:
+            ctx: of the program.
+            args: what was typed.
+        """
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as err:
+            if Path(args[0]).exists():
+                err.message += f" For a model of it: sfm-app run {shlex.quote(args[0])}"
+            raise
+
     def invoke(self, ctx: click.Context) -> Any:
         """Run one command and turn its errors into one line and an exit code."""
         try:
@@ -81,6 +99,10 @@ class Program(LazyGroup):
             fail(str(err), err.hint, err.exit_code)
         except KeyboardInterrupt:
             fail("interrupted", "the same command continues where this one stopped", INTERRUPTED)
+        except click.UsageError as err:
+            if err.message.startswith("Got unexpected extra argument"):
+                err.message += ' A name with blanks stands in quotes: "My photos"'
+            raise
         except (click.ClickException, click.exceptions.Exit, click.Abort):
             raise
         except OSError as err:  # a full disk, a folder that went away
