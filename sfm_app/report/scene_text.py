@@ -177,8 +177,8 @@ def _orientation_warnings(orientation: Mapping[str, Any]) -> Iterator[str]:
         if odds < UNSURE_ODDS:
             others = " or ".join(str((orientation["photos_turned_deg"] + turn) % 360) for turn in turns)
             yield (
-                f"beware: it may {what} (odds {odds:.1f} to 1 against); if so, "
-                f"--set scene.photo_rotation_deg={others} helps"
+                f"beware: it may {what} (odds {odds:.1f} to 1 against): look at it; if so, "
+                f"run it again with --set scene.photo_rotation_deg={others}"
             )
 
 
