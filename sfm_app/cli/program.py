@@ -101,7 +101,7 @@ class Program(LazyGroup):
             fail("interrupted", "the same command continues where this one stopped", INTERRUPTED)
         except click.UsageError as err:
             if err.message.startswith("Got unexpected extra argument"):
-                err.message += ' A name with blanks stands in quotes: "My photos"'
+                err.message += '. A name with blanks needs quotes: "My photos"'
             raise
         except (click.ClickException, click.exceptions.Exit, click.Abort):
             raise

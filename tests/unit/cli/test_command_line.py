@@ -105,7 +105,7 @@ def test_an_output_folder_that_is_a_file(folder, tmp_path):
     ("typed", "says"),
     [
         (("{folder}",), "sfm-app run {folder}"),
-        (("run", "My", "photos", "-o", "out"), 'A name with blanks stands in quotes: "My photos"'),
+        (("run", "My", "photos", "-o", "out"), '(photos). A name with blanks needs quotes: "My photos"'),
     ],
 )
 def test_what_newcomers_type_first_is_explained(folder, typed, says):
