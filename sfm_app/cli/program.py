@@ -46,6 +46,11 @@ SECTIONS: Mapping[str, Mapping[str, Entry]] = MappingProxyType({
         "completion": Entry(MACHINE, "Print what completes commands in a shell."),
     },
 })  # fmt: skip
+ADVICE: Mapping[str, str] = MappingProxyType({
+    "Got unexpected extra argument": '. A name with blanks needs quotes: "My photos"',
+    "Option '--scale' requires": ' Two places and how far apart they are: "measure" in the report prints them.',
+})  # fmt: skip
+"""What helps newcomers, behind what click says; by how that begins."""
 WELCOME = (
     "sfm-app turns photos about which nothing is known into a 3D model.",
     "",
@@ -88,7 +93,7 @@ class Program(LazyGroup):
             return super().resolve_command(ctx, args)
         except click.UsageError as err:
             if Path(args[0]).exists():
-                err.message += f" For a model of it: sfm-app run {shlex.quote(args[0])}"
+                err.message += f" (For a model of it: sfm-app run {shlex.quote(args[0])})"
             raise
 
     def invoke(self, ctx: click.Context) -> Any:
@@ -100,8 +105,7 @@ class Program(LazyGroup):
         except KeyboardInterrupt:
             fail("interrupted", "the same command continues where this one stopped", INTERRUPTED)
         except click.UsageError as err:
-            if err.message.startswith("Got unexpected extra argument"):
-                err.message += '. A name with blanks needs quotes: "My photos"'
+            err.message += next((advice for begin, advice in ADVICE.items() if err.message.startswith(begin)), "")
             raise
         except (click.ClickException, click.exceptions.Exit, click.Abort):
             raise

@@ -105,6 +105,7 @@ def test_an_output_folder_that_is_a_file(folder, tmp_path):
     ("typed", "says"),
     [
         (("{folder}",), "sfm-app run {folder}"),
+        (("run", "photos", "--scale", "24cm"), 'how far apart they are: "measure" in the report prints them.'),
         (("run", "My", "photos", "-o", "out"), '(photos). A name with blanks needs quotes: "My photos"'),
     ],
 )

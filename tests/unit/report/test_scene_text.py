@@ -31,7 +31,7 @@ def test_people_read_how_many_photos_are_placed_how_and_how_sure_the_camera_is()
     assert "pairs of photos left out because they do not fit the others: 4" in text
     assert "not placed: x.jpg: shares no scene" in text
     assert "fx 900.0 +- 1.2" in text and "fy 901.0  cx" in text
-    assert "upright by vanishing lines, to about 0.3 degrees; in a unit of its own" in text
+    assert "upright by vanishing lines, to about 0.3 degrees\n" in text and "unit of its own" not in text
     assert "beware" not in text and "another model" not in text
     assert summary["mapper"] == "global" and summary["cameras"]["one"]["K"][0][0] == 900.0
 
