@@ -92,9 +92,10 @@ class Program(LazyGroup):
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as err:
-            if Path(args[0]).exists():
-                err.message += f" (For a model of it: sfm-app run {shlex.quote(args[0])})"
-            raise
+            if not Path(args[0]).exists():
+                raise
+            said = f"{err.format_message()} For a model of this folder: sfm-app run {shlex.quote(args[0])}"
+            raise click.UsageError(said, err.ctx) from None
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run one command and turn its errors into one line and an exit code."""
@@ -105,8 +106,10 @@ class Program(LazyGroup):
         except KeyboardInterrupt:
             fail("interrupted", "the same command continues where this one stopped", INTERRUPTED)
         except click.UsageError as err:
-            err.message += next((advice for begin, advice in ADVICE.items() if err.message.startswith(begin)), "")
-            raise
+            advice = next((advice for begin, advice in ADVICE.items() if err.message.startswith(begin)), "")
+            if not advice:
+                raise
+            raise click.UsageError(f"{err.message}{advice}", err.ctx) from None
         except (click.ClickException, click.exceptions.Exit, click.Abort):
             raise
         except OSError as err:  # a full disk, a folder that went away

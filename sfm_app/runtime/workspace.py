@@ -173,9 +173,7 @@ class Workspace:
         if link:
             raise InputError(f"{link} is a link, and no run has made it", hint="name another output folder with -o")
         if self.root.is_file():
-            raise InputError(
-                f"{self.root} is a file", hint="name an output folder with -o: a new one, or that of a run"
-            )
+            raise InputError(f"cannot write to {self.root}: it is a file", hint="name an output folder with -o")
         try:
             self.root.mkdir(parents=True, exist_ok=True)
         except OSError as err:
