@@ -76,8 +76,8 @@ def export_model(
 
     Args:
         out: output folder of the run.
-        file_format: "ply", "glb", "obj", "draco", "usdz", "usd", or another that `sfm-app plugins` lists; empty for
-            the suffix of `target`.
+        file_format: "ply", "glb", "obj", "stl", "draco", "usdz", "usd", or another that `sfm-app plugins` lists; empty
+            for the suffix of `target`.
         target: file to write; None for OUT/model.FORMAT, OUT/points.FORMAT, OUT/model-draco.glb, ...
         points: export the points and cameras of the sparse reconstruction instead of the model.
 

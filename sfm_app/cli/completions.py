@@ -18,7 +18,7 @@ BUILT_IN: Mapping[str, tuple[str, ...]] = MappingProxyType({
     "calibrators": (
         "zero-curves", "zero-curves-thesis", "multi-start", "perturbation", "geometric", "huang-faugeras", "kruppa",
     ),
-    "exporters": ("ply", "glb", "obj", "draco", "usdz", "usd"),
+    "exporters": ("ply", "glb", "obj", "stl", "draco", "usdz", "usd"),
     "scene_exporters": (
         "colmap", "colmap-text", "splat", "nerfstudio", "bundler", "cameras", "opencv", "cloud-ply", "laz",
     ),

@@ -75,6 +75,8 @@ def _quality_lines(run: Run) -> Iterator[str]:
 def _camera_lines(run: Run) -> Iterator[str]:
     """Yield focal length and field of view of each camera, the refined one where there is one."""
     cameras = run.calibration.cameras if run.calibration is not None else {}
+    if run.scene is not None and run.scene.cameras:  # those of photos that are not in the model do not matter
+        cameras = {name: found for name, found in cameras.items() if name in run.scene.cameras}
     for name, found in list(cameras.items())[:SHOWN]:
         after = run.scene.cameras.get(name) if run.scene is not None else None
         now = calibration_from_model(after.model, after.params, (found.width, found.height)) if after else found

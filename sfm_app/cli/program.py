@@ -3,10 +3,12 @@
 import errno
 import gc
 import os
+import shlex
 import sys
 import warnings
 from collections.abc import Mapping
 from io import TextIOWrapper
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -44,6 +46,11 @@ SECTIONS: Mapping[str, Mapping[str, Entry]] = MappingProxyType({
         "completion": Entry(MACHINE, "Print what completes commands in a shell."),
     },
 })  # fmt: skip
+ADVICE: Mapping[str, str] = MappingProxyType({
+    "Got unexpected extra argument": '. A name with blanks needs quotes: "My photos"',
+    "Option '--scale' requires": ' Two places and how far apart they are: "measure" in the report prints them.',
+})  # fmt: skip
+"""What helps newcomers, behind what click says; by how that begins."""
 WELCOME = (
     "sfm-app turns photos about which nothing is known into a 3D model.",
     "",
@@ -73,6 +80,23 @@ class Program(LazyGroup):
                 sys.stderr.flush()
                 os._exit(INTERRUPTED)
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command; whoever names a folder instead is told what to type.
+
+        Args:
+            ctx: of the program.
+            args: what was typed.
+        """
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as err:
+            if not Path(args[0]).exists():
+                raise
+            said = f"{err.format_message()} For a model of this folder: sfm-app run {shlex.quote(args[0])}"
+            raise click.UsageError(said, err.ctx) from None
+
     def invoke(self, ctx: click.Context) -> Any:
         """Run one command and turn its errors into one line and an exit code."""
         try:
@@ -81,6 +105,11 @@ class Program(LazyGroup):
             fail(str(err), err.hint, err.exit_code)
         except KeyboardInterrupt:
             fail("interrupted", "the same command continues where this one stopped", INTERRUPTED)
+        except click.UsageError as err:
+            advice = next((advice for begin, advice in ADVICE.items() if err.message.startswith(begin)), "")
+            if not advice:
+                raise
+            raise click.UsageError(f"{err.message}{advice}", err.ctx) from None
         except (click.ClickException, click.exceptions.Exit, click.Abort):
             raise
         except OSError as err:  # a full disk, a folder that went away

@@ -12,6 +12,7 @@ from sfm_app.formats.scenes.clouds import write_cloud_ply, write_laz
 from sfm_app.formats.scenes.colmap_folder import write_bundler, write_colmap, write_colmap_text, write_splat
 from sfm_app.formats.scenes.nerfstudio import write_nerfstudio
 from sfm_app.formats.scenes.opencv import write_opencv
+from sfm_app.formats.stl import write_stl
 from sfm_app.formats.usd import write_usd, write_usdz
 
 _no_usd = partial(missing_package, "usd-core", "pxr")
@@ -22,6 +23,9 @@ _MODELS = (
     Exporter("ply", write_ply, "binary PLY, colors and normals per vertex; MeshLab, CloudCompare, Blender"),
     Exporter("glb", write_glb, "binary glTF 2.0, textured, all in one file; web viewers, game engines, Blender"),
     Exporter("obj", write_obj, "Wavefront OBJ with MTL and JPEG pages, textured; everything else"),
+    Exporter(
+        "stl", write_stl, "binary STL in millimeters, z up, no colors; programs for 3D printers", holds_points=False
+    ),
     Exporter("draco", write_draco, "GLB compressed by Draco, a quarter of the size; web viewers", "glb", _no_draco),
     Exporter("usdz", write_usdz, "USD and its texture in one file; Apple's Quick Look, Blender", unavailable=_no_usd),
     Exporter("usd", write_usd, "binary USD with JPEG pages; Blender, Houdini, Omniverse", unavailable=_no_usd),

@@ -18,7 +18,8 @@ class WriteModel(Protocol):
     """Makes model files by name: first the one to open (`name` with the format's suffix), then those it refers to.
 
     Takes a surface with a texture (pages of pictures, perhaps with normal maps), a surface with a color per vertex, or
-    points and cameras; the same model gives the same bytes. ReconstructionError where the model is empty.
+    points and cameras; the same model gives the same bytes. ReconstructionError where the model is empty, or has no
+    triangles and the format holds nothing else.
     """
 
     def __call__(self, model: Model, name: str, /) -> Mapping[str, bytes]: ...
@@ -39,6 +40,9 @@ class Exporter:
     """Suffix, without dot, of the file to open; empty where it is the name."""
     unavailable: Callable[[], str] = _no_reason
     """Why it cannot be written on this machine; empty where it can."""
+
+    holds_points: bool = True
+    """Whether it holds points and cameras, too."""
 
     @property
     def ending(self) -> str:

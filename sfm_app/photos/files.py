@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 
 from sfm_app.errors import InputError
@@ -41,7 +42,10 @@ def _bad_path_error(path: Path) -> InputError:
     """Return the error for a path that is neither a folder nor a video."""
     if not path.exists():
         what = "file" if path.suffix.lower() in ENDINGS else "folder"
-        return InputError(f"no such {what}: {path}", hint=f"{HINT}, or a video")
+        beside = path.parent.iterdir() if os.access(path.parent, os.R_OK) and path.parent.is_dir() else ()
+        near = get_close_matches(path.name, sorted(other.name for other in beside), 1)
+        meant = f"\nis it {path.with_name(near[0])}?" if near else ""
+        return InputError(f"no such {what}: {path}", hint=f"{HINT}, or a video{meant}")
     if path.suffix.lower() not in ENDINGS or not path.is_file():
         return InputError(f"not a folder: {path}", hint=f"{HINT}, or a video, not a photo")
     if not os.access(path, os.R_OK):

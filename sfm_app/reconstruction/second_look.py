@@ -60,7 +60,8 @@ def retry_lost_photos(first: MappedScene) -> MappedScene:
         return first
     pairs = candidate_pairs(lost, first.matches)
     seen = sorted({photo for pair in pairs for photo in pair})
-    run.progress.say(f"{len(lost)} photos have no place: finer features are sought in {len(seen)}")
+    without = "1 photo has no place" if len(lost) == 1 else f"{len(lost)} photos have no place"
+    run.progress.say(f"{without}: finer features are sought in {len(seen)}")
     report: dict[str, Json] = {"photos": photo_names(lost, first.matches), "pairs": len(pairs)}
     try:
         second = _retry_pairs(first, pairs, report)

@@ -21,7 +21,7 @@ def scale_lines(counts: Mapping[str, Any]) -> Iterator[str]:
         names = counts["source"].split(", ")
         yield f"size        in meters, +- {counts['deviation_percent']:.2g} %, by {list_names(names, SHOWN)}"
     else:
-        yield "size        not known: --markers, --scale or --gcp turn the model's unit into meters"
+        yield 'size        not known: "measure" in the report, --markers or --gcp give it'
     for text in (*counts["contradictions"], *counts["problems"]):
         yield f"            beware: {text}"
 
@@ -34,7 +34,7 @@ def distance_text(found: Distance) -> str:
     """
     if not found.metric:
         return (
-            f"{found.value:.6g} +- {found.deviation:.2g} in the model's own unit; --markers, --scale or --gcp of "
+            f"{found.value:.6g} +- {found.deviation:.2g} in the model's own unit; --scale, --markers or --gcp of "
             "`sfm-app run` turn it into meters"
         )
     return f"{format_length(found.value)} +- {format_length(found.deviation)}"

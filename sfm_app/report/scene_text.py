@@ -108,7 +108,8 @@ def _remark_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iter
     elif orientation:
         deviation = orientation["up_deviation_deg"]
         sure = f"to about {max(deviation, 0.1):.1f} degrees" if deviation is not None else "with unknown accuracy"
-        yield f"upright by {orientation['up']}, {sure}; in {_unit_text(orientation)}"
+        meters = "; in meters by GPS" if orientation["unit"] == "meter" else ""  # the stage `scale` may know others
+        yield f"upright by {orientation['up']}, {sure}{meters}"
         yield from _orientation_warnings(orientation)
 
 
@@ -177,10 +178,6 @@ def _orientation_warnings(orientation: Mapping[str, Any]) -> Iterator[str]:
         if odds < UNSURE_ODDS:
             others = " or ".join(str((orientation["photos_turned_deg"] + turn) % 360) for turn in turns)
             yield (
-                f"beware: it may {what} (odds {odds:.1f} to 1 against); if so, "
-                f"--set scene.photo_rotation_deg={others} helps"
+                f"beware: it may {what} (odds {odds:.1f} to 1 against): look at it; if so, "
+                f"run it again with --set scene.photo_rotation_deg={others}"
             )
-
-
-def _unit_text(orientation: Mapping[str, Any]) -> str:
-    return "meters by GPS" if orientation["unit"] == "meter" else "a unit of its own"

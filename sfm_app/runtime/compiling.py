@@ -56,7 +56,7 @@ def compiling_ahead(parts: Sequence[str], progress: Progress) -> Iterator[thread
     if not missing:
         yield has_ended
         return
-    progress.say("first run on this machine: compiling kernels, a minute or two more, once")
+    progress.say("first run on this machine: parts of the program are compiled, a minute or two more, once")
     running = {part: _start(part) for part in missing}
     wanted = {part: listed_signatures(part) for part in missing}
 

@@ -81,7 +81,12 @@ class Manifest:
             InputError: there is no run, or another version of the program made it.
         """
         if not self.read():
-            raise InputError(f"{self.root} holds no run", hint="name the folder that `sfm-app run PHOTOS -o OUT` wrote")
+            beside = self.root.resolve()
+            beside = beside.with_name(f"{beside.name}-model")  # where a run without -o writes
+            meant = f"\nis it {beside}?" if (beside / MANIFEST).exists() else ""
+            raise InputError(
+                f"{self.root} holds no run", hint=f"name the folder that `sfm-app run PHOTOS -o OUT` wrote{meant}"
+            )
         self.check_format()
 
     def record(self, stage: str) -> StageRecord | None:

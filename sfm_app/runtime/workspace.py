@@ -172,6 +172,8 @@ class Workspace:
         link = next(self._links(), None)
         if link:
             raise InputError(f"{link} is a link, and no run has made it", hint="name another output folder with -o")
+        if self.root.is_file():
+            raise InputError(f"cannot write to {self.root}: it is a file", hint="name an output folder with -o")
         try:
             self.root.mkdir(parents=True, exist_ok=True)
         except OSError as err:

@@ -158,7 +158,7 @@ class ScaleSettings(Section):
     distances: tuple[tuple[str, str, str], ...] = Field(
         (),
         description='known distances, each ["x,y,z", "x,y,z", "1.25m"]: two points in the unit of OUT/sparse, and how '
-        "far apart they are",
+        "far apart they are; measure in the report prints them",
     )
     markers: str = Field(
         "", description="side of the dark square of printed ArUco or AprilTag markers, such as 50mm; none where empty"

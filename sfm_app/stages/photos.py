@@ -41,6 +41,10 @@ from sfm_app.stages.video_frames import video_frames
 from sfm_app.tasks import Task
 from sfm_app.types import Photo, PhotoSet, UnusablePhoto
 
+MANY_FILES = 5000
+"""From so many on it is said that this may be another folder than meant, such as a home. Chosen by hand: five times the
+largest folder that was run."""
+
 
 def make(source: Source, run: RunContext) -> PhotoSet:
     """Read every file of a folder, or the frames of a video, and lay the usable photos out for COLMAP.
@@ -136,6 +140,8 @@ def read_all(
     digests, store = source.digests(), run.workspace.photo_stats
     known: dict[str, PhotoStats | UnusablePhoto] = {**read_stats(store, digests, options)}
     left = [name for name in names if name not in known]
+    if len(left) > MANY_FILES:
+        run.progress.say(f"{len(left):,} files: if this is not the folder of the photos, stop with Ctrl-C")
     found = known | dict(zip(left, run.map(Task(read_photo, folder, options=options), left, "photos"), strict=True))
     usable = {name: one for name in names if isinstance(one := found[name], PhotoStats)}
     if left and usable.keys() & digests.keys():

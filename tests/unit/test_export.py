@@ -71,8 +71,8 @@ def test_the_target_is_named_as_people_name_files(finished, tmp_path, file_forma
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
-        (("--format", "stl"), 2, "no file format is named 'stl'"),
-        (("-o", "model.stl"), 2, "no file format is named 'stl'"),
+        (("--format", "3mf"), 2, "no file format is named '3mf'"),
+        (("-o", "model.3mf"), 2, "no file format is named '3mf'"),
         (("-o", "model.ply", "--format", "glb"), 2, "model.ply does not end in .glb"),
         ((), 2, "no format is given"),
     ],

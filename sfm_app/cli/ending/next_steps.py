@@ -25,11 +25,10 @@ def run_steps(run: Run, photos: Path, out: Path | None, settings: Settings, *, q
     again = f"sfm-app run {shlex.quote(str(photos))}" + (f" -o {shlex.quote(str(out))}" if out is not None else "")
     if run.mesh_path is None:
         return _steps([(again, "goes on to the model")])
-    steps = [(_view(run), "look at it")]
+    steps = [(_view(run), "look at it, measure it")]
     if settings.quality != "high":
         steps.append((f"{again} --quality high", "finer; draft: quicker"))
-    if not settings.scale.markers and not settings.scale.distances and not settings.scale.control_points:
-        steps.append((f"{again} --markers 50mm", "real size, by markers"))
+    steps.append((f"sfm-app export {shlex.quote(str(run.out))} --format obj", "for other programs"))
     return _steps(steps)
 
 

@@ -73,7 +73,9 @@ def _facts(contents: RunContents) -> Iterator[Fact]:
     photos, pairs = contents.counts("photos"), contents.counts("view_graph")
     if scene is not None:
         count = len(scene.registered) + len(scene.unregistered)
-        yield Fact("photos placed", f"{len(scene.registered)} of {count}")
+        left_out = len(photos.get("unusable", ()))
+        more = f"{left_out} more {'was' if left_out == 1 else 'were'} left out" if left_out else ""
+        yield Fact("photos placed", f"{len(scene.registered)} of {count}", more)
     elif photos:
         yield Fact("usable photos", str(photos.get("usable", "")))
     if scene is not None and scene.cameras:
@@ -134,6 +136,8 @@ def plain_text(line: str) -> str:
 def unknown_cameras(contents: RunContents) -> list[str]:
     """Return, of each camera that its pairs of photos do not determine, why, what came of it, and what to do.
 
+    A camera none of whose photos is in the model changes nothing there: it is passed over.
+
     Args:
         contents: of the run.
     """
@@ -142,7 +146,7 @@ def unknown_cameras(contents: RunContents) -> list[str]:
     return [
         _unknown_text(f" {name}" if len(cameras) > 1 else "", camera, after.get(name))
         for name, camera in cameras.items()
-        if not camera.identifiable
+        if not camera.identifiable and (name in after or not after)
     ]
 
 

@@ -71,6 +71,55 @@ def test_missing_paths_end_with_exit_code_3(tmp_path):
     assert (result.exit_code, "no such folder" in result.stderr) == (3, True)
 
 
+def test_a_name_that_is_nearly_right_is_offered(tmp_path):
+    (tmp_path / "Regal 2019 (für Oma)").mkdir()
+    (tmp_path / "wheels").mkdir()
+
+    nearly, far = (call("run", tmp_path / name, "-o", tmp_path / "out", "-q").stderr for name in ("Regal 2019", "fox"))
+
+    assert nearly.endswith(f"\nis it {tmp_path / 'Regal 2019 (für Oma)'}?\n")
+    assert far.count("\n") == 2 and "is it" not in far
+
+
+def test_a_folder_of_photos_has_no_run_but_the_one_beside_it(folder, tmp_path):
+    before = call("report", folder).stderr
+    (tmp_path / "photos-model").mkdir()
+    (tmp_path / "photos-model" / "manifest.json").write_text("{}")
+
+    assert "holds no run" in before and "is it" not in before
+    assert call("report", folder).stderr.endswith(f"\nis it {folder.resolve()}-model?\n")
+
+
+def test_an_output_folder_that_is_a_file(folder, tmp_path):
+    for name in ("a.jpg", "b.jpg"):
+        photo(folder / name)
+    (tmp_path / "model.glb").write_text("mine")
+
+    result = call("run", folder, "-o", tmp_path / "model.glb", "-q")
+
+    assert (result.exit_code, "model.glb: it is a file" in result.stderr) == (3, True)
+    assert (tmp_path / "model.glb").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("typed", "says"),
+    [
+        (("{folder}",), "sfm-app run {folder}"),
+        (("run", "photos", "--scale", "24cm"), 'how far apart they are: "measure" in the report prints them.'),
+        (("run", "My", "photos", "-o", "out"), '(photos). A name with blanks needs quotes: "My photos"'),
+    ],
+)
+def test_what_newcomers_type_first_is_explained(folder, typed, says):
+    result = call(*(word.format(folder=folder) for word in typed))
+
+    assert result.exit_code == 2
+    assert says.format(folder=folder) in result.stderr
+
+
+def test_a_word_that_is_no_folder_is_no_command_either(tmp_path):
+    assert "sfm-app run" not in call(tmp_path / "nowhere").stderr.split("Error:")[1]
+
+
 def test_an_output_folder_that_cannot_be_made_ends_with_exit_code_3(folder, tmp_path):
     for name in ("a.jpg", "b.jpg"):
         photo(folder / name)

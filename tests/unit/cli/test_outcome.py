@@ -72,6 +72,20 @@ def test_a_camera_that_pairs_do_not_determine_is_called_so(finished, after, says
     assert any(f"pairs of photos do not determine it, {says}: an orbit" in line for line in outcome_lines(run))
 
 
+def test_a_camera_of_no_placed_photo_is_not_told(finished):
+    guess = Calibration(K, 640, 480, "guess", False, "0 usable pairs")
+    text = "\n".join(outcome_lines(replace(finished, calibration=Intrinsics({"two": guess, "one": KNOWN}))))
+
+    assert "camera      focal 501.0" in text and "0 usable pairs" not in text
+
+
+def test_a_size_that_is_not_known_is_asked_for(finished):
+    stages = {**finished.manifest["stages"], "scale": {"counts": {**SIZE, "unit": ""}, "seconds": 1.0}}
+    [size] = [line for line in outcome_lines(replace(finished, manifest={"stages": stages})) if line[:4] == "size"]
+
+    assert '"measure" in the report' in size and len(size) <= 80
+
+
 def test_a_run_that_was_stopped_early_says_how_far_it_came(finished):
     earlier = replace(finished, mesh_path=None)
     assert outcome_lines(earlier)[0] == "Cameras and points of 2 of 4 photos."

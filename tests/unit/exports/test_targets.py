@@ -19,10 +19,10 @@ def call(*arguments):
 
 def test_help_and_unknown_formats_and_plugins_name_all_formats(make_run):
     shown = CliRunner().invoke(main, ["export", "--help"]).stdout
-    refused = call(make_run().out, "--format", "stl")
+    refused = call(make_run().out, "--format", "3mf")
     listed = CliRunner().invoke(main, ["plugins"]).stdout
 
-    assert refused.exit_code == 2 and "no file format is named 'stl'" in refused.stderr
+    assert refused.exit_code == 2 and "no file format is named '3mf'" in refused.stderr
     for name, part in {**EXPORTERS, **SCENE_EXPORTERS}.items():
         assert f"\n  {name} " in shown and part.summary[:20] in shown
         assert f"\n  {name} " in refused.stderr and part.summary in refused.stderr

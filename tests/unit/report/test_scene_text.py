@@ -31,7 +31,7 @@ def test_people_read_how_many_photos_are_placed_how_and_how_sure_the_camera_is()
     assert "pairs of photos left out because they do not fit the others: 4" in text
     assert "not placed: x.jpg: shares no scene" in text
     assert "fx 900.0 +- 1.2" in text and "fy 901.0  cx" in text
-    assert "upright by vanishing lines, to about 0.3 degrees; in a unit of its own" in text
+    assert "upright by vanishing lines, to about 0.3 degrees\n" in text and "unit of its own" not in text
     assert "beware" not in text and "another model" not in text
     assert summary["mapper"] == "global" and summary["cameras"]["one"]["K"][0][0] == 900.0
 
@@ -84,7 +84,7 @@ def test_a_model_that_may_stand_the_wrong_way_up_comes_with_a_remedy():
     unsure = COUNTS["orientation"] | {"up_sign_odds": 2.3, "up_axis_odds": 900.0, "photos_turned_deg": 270}
 
     assert "beware: it may stand upside down (odds 2.3 to 1 against)" in told(orientation=unsure)[0]
-    assert "--set scene.photo_rotation_deg=90 helps" in told(orientation=unsure)[0]
+    assert "run it again with --set scene.photo_rotation_deg=90" in told(orientation=unsure)[0]
     lying = told(orientation=unsure | {"up_sign_odds": 70.0, "up_axis_odds": 1.5, "photos_turned_deg": 0})[0]
     assert "upside down" not in lying and "lie on its side" in lying and "scene.photo_rotation_deg=90 or 270" in lying
     assert "beware" not in told(orientation=unsure | {"up_sign_odds": 70.0})[0]

@@ -275,6 +275,17 @@ def test_too_few_photos(tmp_path, run, names, says):
         make(folder, run)
 
 
+@pytest.mark.parametrize(("limit", "told"), [(1, ["2 files: if this is not the folder"]), (2, [])])
+def test_a_folder_of_very_many_files_may_be_another_than_meant(folder, run, monkeypatch, limit, told):
+    said = []
+    monkeypatch.setattr(photos, "MANY_FILES", limit)
+    monkeypatch.setattr(run.progress, "say", said.append)
+
+    make(folder, run)
+
+    assert [line[: len(told[0])] for line in said] == told if told else said == []
+
+
 def test_a_missing_folder_or_a_file(tmp_path, run):
     with pytest.raises(InputError, match="no such folder"):
         make(tmp_path / "nowhere", run)

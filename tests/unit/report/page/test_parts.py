@@ -88,6 +88,36 @@ def test_a_camera_that_pairs_do_not_determine_comes_with_what_to_do(after):
     assert "What to do: add photos" in said
 
 
+def test_a_camera_of_no_placed_photo_is_passed_over():
+    K = np.diag([768.0, 768.0, 1.0])
+    camera = Calibration(K, 640, 480, "guess", identifiable=False, reason="an orbit")
+    cameras = {"b": CameraModel("PINHOLE", (), K, 640, 480)}
+
+    def said_with(found):
+        scene = SimpleNamespace(cameras=found)
+        return unknown_cameras(
+            SimpleNamespace(intrinsics=SimpleNamespace(cameras={"a": camera, "b": camera}), scene=scene)
+        )
+
+    assert [text.split(":")[0][-1] for text in said_with(cameras)] == ["b"]
+    assert len(said_with({})) == 2
+
+
+@pytest.mark.parametrize(("unusable", "more"), [(0, ""), (1, "1 more was left out"), (2, "2 more were left out")])
+def test_photos_that_were_left_out_are_counted_beside_those_that_are_placed(unusable, more):
+    counts = {"photos": {"unusable": {str(k): "blurred" for k in range(unusable)}}}
+    scene = SimpleNamespace(
+        registered={"a": 0}, unregistered={"b": ""}, cameras={}, points=5, observations=9, mean_reprojection_px=0.5
+    )
+    contents = SimpleNamespace(
+        scene=scene, intrinsics=None, stages={}, counts=lambda stage: counts.get(stage, {}), is_metric=False
+    )
+
+    first = glance(contents)[0]
+
+    assert (first.value, first.note) == ("1 of 2", more)
+
+
 def test_a_large_texture_is_shrunk_and_keeps_its_colors(textured_ball):
     large = np.full((3 * LIGHT_PAGE_PX, 2 * LIGHT_PAGE_PX, 3), (10, 120, 240), np.uint8)
     small = large[:64, :96]
