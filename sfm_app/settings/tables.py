@@ -216,7 +216,7 @@ class MeshSettings(Section):
     """The surface through the depth maps."""
 
     poisson_depth: int = Field(12, ge=5, le=14, description="greatest depth of the Poisson octree")
-    trim: bool = Field(True, description="cut off surface that no photo confirms; false closes all but small holes by a guess")
+    trim: bool = Field(True, description="cut off surface that no photo confirms; false closes large holes by a guess")
     max_gap_triangles: float = Field(
         20.0, ge=0, le=1000, description="gaps in what photos confirm are closed up to this width, in triangles"
     )
