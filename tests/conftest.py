@@ -24,6 +24,15 @@ settings.load_profile("untimed")
 HANGS_S = 1200
 """A run that takes longer hangs: on a busy machine, where kernels are compiled first, one has taken 300 s."""
 
+LONG = ("tests/real/", "tests/pipeline/", "tests/faults/", "tests/docs/", "tests/fuzz/", "tests/contract/")
+"""Folders whose files take longest, in this order: a long file that begins last is waited for by all other workers."""
+
+
+def pytest_collection_modifyitems(config, items):
+    """Let workers begin with the folders whose files take long."""
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: [not item.nodeid.startswith(place) for place in LONG])
+
 
 @pytest.fixture(scope="session")
 def rendered(tmp_path_factory):
