@@ -35,9 +35,8 @@ def test_portrait_and_landscape_are_one_camera(tmp_path, told):
             else:
                 photo.rotate(-turn, expand=True).save(tmp_path / "photos" / name, quality=95)
 
-    run = sfm_app.reconstruct(
-        tmp_path / "photos", tmp_path / "out", Settings.from_mapping({"quality": "draft"}), last="scene"
-    )
+    settings = Settings.from_mapping({"quality": "draft", "report": False})
+    run = sfm_app.reconstruct(tmp_path / "photos", tmp_path / "out", settings, last="scene")
     found = next(iter(run.calibration.cameras.values())).K
 
     assert len(run.calibration.cameras) == 1 and len(run.scene.registered) == 8

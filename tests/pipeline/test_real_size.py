@@ -47,7 +47,7 @@ def measured(tmp_path_factory):
 
 
 def settings_with(**scale):
-    return Settings.from_mapping({"quality": "draft", "scale": scale})
+    return Settings.from_mapping({"quality": "draft", "report": False, "scale": scale})
 
 
 def again(measured, last="scale", **scale):
