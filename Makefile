@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 JOBS ?= 2
+# tests start the program a hundred times: without compiled modules, each would take half a second more
+unexport PYTHONDONTWRITEBYTECODE
 # not learned: its PyTorch brings gigabytes
 PLUGINS := $(filter-out plugins/learned,$(wildcard plugins/*))
 
