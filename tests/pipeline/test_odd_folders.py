@@ -103,7 +103,7 @@ def test_ten_photos_of_a_white_wall(folder, tmp_path, noise, says):
     ends_with(call("calibrate", folder, "-o", out), "hardly any texture")
 
 
-@pytest.mark.parametrize(("photos", "step_deg"), [(2, 12.0), (6, 30.0)])
+@pytest.mark.parametrize(("photos", "step_deg"), [(2, 12.0), (4, 30.0)])
 def test_a_panorama(folder, tmp_path, photos, step_deg):
     write_photo_folder(folder, build_scene(), panorama(CAMERA, photos, step_deg), FAST)
 
@@ -136,18 +136,18 @@ def test_twenty_copies_of_one_photo(courtyard, folder, tmp_path):
 def test_two_groups_of_photos_give_the_larger_one(courtyard, heap, folder, tmp_path):
     for photo in courtyard.iterdir():
         shutil.copy(photo, folder / f"court_{photo.name}")
-    for photo in heap.iterdir():
+    for photo in sorted(heap.iterdir())[:3]:
         shutil.copy(photo, folder / f"heap_{photo.name}")
 
     result, out = run(folder, tmp_path, "--json")
 
     assert result.exit_code == 0, result.stderr
     scene = json.loads(result.stdout)["scene"]
-    assert (scene["registered"], scene["of"]) == (6, 10)
-    assert sorted(scene["unregistered"]) == [f"heap_view_{k:02d}.jpg" for k in range(4)]
+    assert (scene["registered"], scene["of"]) == (6, 9)
+    assert sorted(scene["unregistered"]) == [f"heap_view_{k:02d}.jpg" for k in range(3)]
     assert (out / "sparse").is_dir()
     told = call("run", folder, "-o", out, "--until", "scene", "-v").stdout
-    assert all(f"heap_view_{k:02d}.jpg" in told for k in range(4))
+    assert all(f"heap_view_{k:02d}.jpg" in told for k in range(3))
 
 
 def test_a_time_stamp_does_not_stop_the_camera(courtyard, folder, tmp_path):
