@@ -31,7 +31,7 @@ from sfm_app.synthetic.cameras import camera_center
 from sfm_app.synthetic.compare import center_error_percent, focal_error_percent, surface_error
 from sfm_app.texture import atlas
 
-QUICK = {"quality": "draft", "report": False, "depth": {"max_image_size_px": 480}, "mesh": {"poisson_depth": 8}}
+QUICK = {"quality": "draft", "report": False, "depth": {"max_image_size_px": 360}, "mesh": {"poisson_depth": 8}}
 DRAFT = Settings.from_mapping(QUICK)
 
 
