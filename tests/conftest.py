@@ -24,14 +24,17 @@ settings.load_profile("untimed")
 HANGS_S = 1200
 """A run that takes longer hangs: on a busy machine, where kernels are compiled first, one has taken 300 s."""
 
-LONG = ("tests/real/", "tests/faults/", "tests/pipeline/", "tests/docs/", "tests/fuzz/", "tests/contract/")
-"""Folders whose files take longest, in this order: a long file that begins last is waited for by all other workers."""
+LONG = (
+    "tests/real/", "tests/faults/", "tests/pipeline/", "tests/docs/", "tests/fuzz/", "tests/unit/test_examples.py",
+    "tests/contract/",
+)  # fmt: skip
+"""What takes longest, in this order: a long file that begins last is waited for by all other workers."""
 TOGETHER = ("tests/faults/", "tests/docs/", "tests/fuzz/")
 """Folders that one worker tries, since their files share a run of the whole program."""
 
 
 def pytest_collection_modifyitems(config, items):
-    """Let workers begin with the folders whose files take long."""
+    """Let workers begin with what takes long."""
     if hasattr(config, "workerinput"):
         items.sort(key=lambda item: [not item.nodeid.startswith(place) for place in LONG])
 
