@@ -4,6 +4,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 JOBS ?= 2
+# tests start the program a hundred times: without compiled modules, each would take half a second more
+unexport PYTHONDONTWRITEBYTECODE
+# each worker has one core: threads of BLAS that wait for each other take twice the time
+test quick faults: export OPENBLAS_NUM_THREADS = 1
 # not learned: its PyTorch brings gigabytes
 PLUGINS := $(filter-out plugins/learned,$(wildcard plugins/*))
 

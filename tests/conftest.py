@@ -24,6 +24,35 @@ settings.load_profile("untimed")
 HANGS_S = 1200
 """A run that takes longer hangs: on a busy machine, where kernels are compiled first, one has taken 300 s."""
 
+LONG = (
+    "tests/real/", "tests/faults/", "tests/pipeline/", "tests/docs/", "tests/fuzz/", "tests/unit/test_examples.py",
+    "tests/contract/",
+)  # fmt: skip
+"""What takes longest, in this order: a long file that begins last is waited for by all other workers."""
+TOGETHER = ("tests/faults/", "tests/docs/", "tests/fuzz/")
+"""Folders that one worker tries, since their files share a run of the whole program."""
+
+
+def pytest_collection_modifyitems(config, items):
+    """Let workers begin with what takes long."""
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: [not item.nodeid.startswith(place) for place in LONG])
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Give workers whole files, and some whole folders, in that order; xdist would begin with those of most tests."""
+    if config.getvalue("dist") != "loadfile":
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid):
+            return next((place for place in TOGETHER if nodeid.startswith(place)), super()._split_scope(nodeid))
+
+    config.option.loadscopereorder = False
+    return Scheduling(config, log)
+
 
 @pytest.fixture(scope="session")
 def rendered(tmp_path_factory):

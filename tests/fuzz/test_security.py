@@ -51,9 +51,10 @@ def _doubts_of_call(name, options):
         yield f"{name} with pickles"
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.name)
-def test_no_module_runs_what_it_reads(path):
-    assert list(doubts(path.read_text(encoding="utf-8"))) == KNOWN.get(path, [])
+def test_no_module_runs_what_it_reads():
+    found = {path: list(doubts(path.read_text(encoding="utf-8"))) for path in SOURCES}
+    assert len(found) > 300
+    assert {path: said for path, said in found.items() if said} == KNOWN
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,9 @@ pytestmark = pytest.mark.slow
 
 def run(photos, out, **values):
     settings = {key: values.pop(key) for key in ("scene",) if key in values}
-    return reconstruct(photos, out, Settings.from_mapping({**settings, "calibration": values}), last="scene")
+    return reconstruct(
+        photos, out, Settings.from_mapping({**settings, "calibration": values, "report": False}), last="scene"
+    )
 
 
 def contradicted(done, stage):

@@ -17,7 +17,9 @@ from sfm_app.synthetic.cameras import camera_center
 
 pytestmark = pytest.mark.slow
 
-DRAFT = Settings.from_mapping({"quality": "draft"})
+NO_REPORT = {"quality": "draft", "report": False}
+"""Drawing its figures would take as long as the rest of the scene."""
+DRAFT = Settings.from_mapping(NO_REPORT)
 FIRST = 5
 """Photos of the first run; two more come later."""
 
@@ -95,7 +97,7 @@ def test_the_same_history_gives_the_same_bytes(first, folder, tmp_path):
     add(photos, first, 5, 6)
     results = []
     for place, workers in ((out, 1), (tmp_path / "other", 2)):
-        run = reconstruct(photos, place, Settings.from_mapping({"quality": "draft", "workers": workers}))
+        run = reconstruct(photos, place, Settings.from_mapping(NO_REPORT | {"workers": workers}))
         files = [*sorted((place / "sparse").iterdir()), place / "view_graph.npz", place / "scene.json"]
         results.append(([path.read_bytes() for path in files], run.scene.cam_from_world.keys()))
 
@@ -138,7 +140,7 @@ def test_nothing_is_gone_on_from_with_other_settings(first, folder):
     photos, out = folder
     add(photos, first, 5, 6)
 
-    run = reconstruct(photos, out, Settings.from_mapping({"quality": "draft", "seed": 4}))
+    run = reconstruct(photos, out, Settings.from_mapping(NO_REPORT | {"seed": 4}))
 
     assert "known_photos" in counts(run, "match_graph")  # features do not depend on the seed
     assert "known_pairs" not in counts(run, "view_graph") and "kept_cameras" not in counts(run, "intrinsics")

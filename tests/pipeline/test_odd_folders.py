@@ -16,7 +16,8 @@ from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
 from sfm_app.synthetic.scenes.scene_catalog import build_scene
 
 CAMERA = make_camera(480, 360)
-QUICK = PhotoOptions(supersampling=1)
+QUICK = "--quality", "draft", "--set", "report=false"
+FAST = PhotoOptions(supersampling=1)
 
 
 def run(folder, tmp_path, *flags):
@@ -26,7 +27,7 @@ def run(folder, tmp_path, *flags):
 
 
 def call(*arguments):
-    return CliRunner().invoke(main, [*map(str, arguments), "-q", "--workers", "1", "--quality", "draft"])
+    return CliRunner().invoke(main, [*map(str, arguments), "-q", "--workers", "1", *QUICK])
 
 
 def ends_with(result, *words):
@@ -42,7 +43,7 @@ def ends_with(result, *words):
 def courtyard(tmp_path_factory):
     """Six photos of the courtyard."""
     folder = tmp_path_factory.mktemp("courtyard")
-    write_photo_folder(folder, build_scene(), arc(CAMERA, ArcOptions(photos=6, sweep_deg=50.0)), QUICK)
+    write_photo_folder(folder, build_scene(), arc(CAMERA, ArcOptions(photos=6, sweep_deg=50.0)), FAST)
     return folder
 
 
@@ -50,7 +51,7 @@ def courtyard(tmp_path_factory):
 def heap(tmp_path_factory):
     """Four photos of another place."""
     folder = tmp_path_factory.mktemp("heap")
-    write_photo_folder(folder, build_scene("heap"), arc(CAMERA, ArcOptions(photos=4, sweep_deg=36.0), 2), QUICK)
+    write_photo_folder(folder, build_scene("heap"), arc(CAMERA, ArcOptions(photos=4, sweep_deg=36.0), 2), FAST)
     return folder
 
 
@@ -102,9 +103,9 @@ def test_ten_photos_of_a_white_wall(folder, tmp_path, noise, says):
     ends_with(call("calibrate", folder, "-o", out), "hardly any texture")
 
 
-@pytest.mark.parametrize(("photos", "step_deg"), [(2, 12.0), (6, 30.0)])
+@pytest.mark.parametrize(("photos", "step_deg"), [(2, 12.0), (4, 30.0)])
 def test_a_panorama(folder, tmp_path, photos, step_deg):
-    write_photo_folder(folder, build_scene(), panorama(CAMERA, photos, step_deg), QUICK)
+    write_photo_folder(folder, build_scene(), panorama(CAMERA, photos, step_deg), FAST)
 
     result, out = run(folder, tmp_path)
 
@@ -135,18 +136,18 @@ def test_twenty_copies_of_one_photo(courtyard, folder, tmp_path):
 def test_two_groups_of_photos_give_the_larger_one(courtyard, heap, folder, tmp_path):
     for photo in courtyard.iterdir():
         shutil.copy(photo, folder / f"court_{photo.name}")
-    for photo in heap.iterdir():
+    for photo in sorted(heap.iterdir())[:3]:
         shutil.copy(photo, folder / f"heap_{photo.name}")
 
     result, out = run(folder, tmp_path, "--json")
 
     assert result.exit_code == 0, result.stderr
     scene = json.loads(result.stdout)["scene"]
-    assert (scene["registered"], scene["of"]) == (6, 10)
-    assert sorted(scene["unregistered"]) == [f"heap_view_{k:02d}.jpg" for k in range(4)]
+    assert (scene["registered"], scene["of"]) == (6, 9)
+    assert sorted(scene["unregistered"]) == [f"heap_view_{k:02d}.jpg" for k in range(3)]
     assert (out / "sparse").is_dir()
     told = call("run", folder, "-o", out, "--until", "scene", "-v").stdout
-    assert all(f"heap_view_{k:02d}.jpg" in told for k in range(4))
+    assert all(f"heap_view_{k:02d}.jpg" in told for k in range(3))
 
 
 def test_a_time_stamp_does_not_stop_the_camera(courtyard, folder, tmp_path):
@@ -162,7 +163,7 @@ def test_a_time_stamp_does_not_stop_the_camera(courtyard, folder, tmp_path):
 
 
 def test_two_photos_of_a_plane(folder, tmp_path):
-    write_photo_folder(folder, build_scene("poster"), arc(CAMERA, ArcOptions(photos=2, sweep_deg=30.0)), QUICK)
+    write_photo_folder(folder, build_scene("poster"), arc(CAMERA, ArcOptions(photos=2, sweep_deg=30.0)), FAST)
 
     result, out = run(folder, tmp_path)
 
@@ -172,7 +173,7 @@ def test_two_photos_of_a_plane(folder, tmp_path):
 
 def test_a_plane_seen_from_many_sides_is_reconstructed(folder, tmp_path):
     views = arc(CAMERA, ArcOptions(photos=6, sweep_deg=70.0))
-    truth = write_photo_folder(folder, build_scene("poster"), views, QUICK)
+    truth = write_photo_folder(folder, build_scene("poster"), views, FAST)
 
     result, _ = run(folder, tmp_path, "--json")
 

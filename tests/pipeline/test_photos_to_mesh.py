@@ -31,7 +31,8 @@ from sfm_app.synthetic.cameras import camera_center
 from sfm_app.synthetic.compare import center_error_percent, focal_error_percent, surface_error
 from sfm_app.texture import atlas
 
-DRAFT = Settings.from_mapping({"quality": "draft", "depth": {"max_image_size_px": 480}})
+QUICK = {"quality": "draft", "report": False, "depth": {"max_image_size_px": 360}, "mesh": {"poisson_depth": 8}}
+DRAFT = Settings.from_mapping(QUICK)
 
 
 @pytest.fixture(scope="module")
@@ -189,9 +190,7 @@ def test_a_changed_setting_redoes_only_what_it_touches(finished, rendered, tmp_p
     run, _ = finished
     shutil.copytree(run.out, tmp_path / "out", symlinks=True)
     before = {name: stage["fingerprint"] for name, stage in run.manifest["stages"].items()}
-    changed = Settings.from_mapping(
-        {"quality": "draft", "depth": {"max_image_size_px": 480}, "mesh": {"max_gap_triangles": 10}}
-    )
+    changed = Settings.from_mapping(merge_nested(QUICK, {"mesh": {"max_gap_triangles": 10}}))
 
     after = sfm_app.reconstruct(rendered[0], tmp_path / "out", changed).manifest["stages"]
 
@@ -263,7 +262,7 @@ def test_one_worker_and_two_give_the_same_bytes(rendered, tmp_path):
     outs = []
     for workers in (1, 2):
         out = tmp_path / str(workers)
-        settings = Settings.from_mapping({"quality": "draft", "workers": workers, "seed": 5})
+        settings = Settings.from_mapping({"quality": "draft", "report": False, "workers": workers, "seed": 5})
         sfm_app.reconstruct(rendered[0], out, settings, last="scene")
         outs.append(out)
 
@@ -286,7 +285,7 @@ def test_calibrate_prints_json(rendered):
 def test_the_literal_methods_give_points_that_open(rendered, tmp_path):
     """`--until scene` with the methods as they stand in print."""
     out = tmp_path / "out"
-    literal = ["--estimator", "lev-ransac-thesis", "--calibrator", "zero-curves-thesis"]
+    literal = ["--estimator", "lev-ransac-thesis", "--calibrator", "zero-curves-thesis", "--set", "report=false"]
     flags = ["-o", str(out), "--quality", "draft", *literal, "--until", "scene", "--json", "-q"]
 
     result = CliRunner().invoke(main, ["run", str(rendered[0]), *flags])
@@ -314,7 +313,7 @@ def heed_interrupts():
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are another thing there")
 def test_an_interrupted_run_says_so_and_goes_on(rendered, tmp_path):
     command = [sys.executable, "-m", "sfm_app", "run", str(rendered[0]), "-o", str(tmp_path / "out"), "-q"]
-    command += ["--quality", "draft"]
+    command += ["--quality", "draft", "--set", "report=false"]
     # a run to the end: what is asked of it must not be done before the signal comes, however busy the machine is
     options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True, "preexec_fn": heed_interrupts}
     with subprocess.Popen(command, **options) as process:

@@ -40,14 +40,14 @@ def measured(tmp_path_factory):
         *marker_sheet(draw_pattern("apriltag-36h11", 1), SIDE_M, (0.85, 0.72, 0.8), -20, 70),
     ]
     views = arc(make_camera(480, 320), ArcOptions(photos=7, sweep_deg=50.0))
-    fine = PhotoOptions(supersampling=5)  # edges along the pixels lie between the rays
+    fine = PhotoOptions(supersampling=4)  # edges along the pixels lie between the rays
     truth = write_photo_folder(place / "photos", replace(scene, bodies=(*scene.bodies, *markers)), views, fine)
     run = sfm_app.reconstruct(place / "photos", place / "out", settings_with(markers=f"{SIDE_M}m"), last="scale")
     return SimpleNamespace(place=place, photos=place / "photos", out=place / "out", truth=truth, run=run)
 
 
 def settings_with(**scale):
-    return Settings.from_mapping({"quality": "draft", "scale": scale})
+    return Settings.from_mapping({"quality": "draft", "report": False, "scale": scale})
 
 
 def again(measured, last="scale", **scale):

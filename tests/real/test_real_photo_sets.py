@@ -40,7 +40,8 @@ def test_herz_jesus_is_calibrated_without_exif():
 
 
 def test_temple16_stands_upright_though_all_its_photos_lie_on_their_side(tmp_path):
-    run = sfm_app.reconstruct(photo_set("temple16"), tmp_path / "out", last="scene")
+    no_report = sfm_app.Settings.from_mapping({"report": False})
+    run = sfm_app.reconstruct(photo_set("temple16"), tmp_path / "out", no_report, last="scene")
     orientation = run.manifest["stages"]["scene"]["counts"]["orientation"]
 
     assert orientation["photos_turned_deg"] == 270, "the steps are on the left in most photos"

@@ -22,9 +22,14 @@ def modules():
     return {path.relative_to(PACKAGE).as_posix(): path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py")}
 
 
+@cache
+def trees():
+    return {name: ast.parse(text) for name, text in modules().items()}
+
+
 def functions():
-    for name, text in modules().items():
-        for node in ast.walk(ast.parse(text)):
+    for name, tree in trees().items():
+        for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 yield f"{name}:{node.name}", node
 
@@ -56,14 +61,14 @@ def test_folders_are_small():
 
 
 def test_what_is_public_says_what_it_is():
-    found = [item for name, text in modules().items() for item in public(ast.parse(text).body, name)]
+    found = [item for name, tree in trees().items() for item in public(tree.body, name)]
     assert [name for name, node in found if not ast.get_docstring(node)] == []
 
 
 def test_public_functions_say_what_their_parameters_are():
     silent = []
-    for name, text in modules().items():
-        for place, node in public(ast.parse(text).body, name):
+    for name, tree in trees().items():
+        for place, node in public(tree.body, name):
             if isinstance(node, ast.FunctionDef):
                 given = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
                 count = sum(one.arg not in ("self", "cls") for one in given)

@@ -4,8 +4,6 @@ import re
 from pathlib import Path
 from urllib.parse import urlsplit
 
-import pytest
-
 ROOT = Path(__file__).parents[2]
 SKIPPED = {".venv", "node_modules", ".git", "build", "dist", "demo", "_build", ".pytest_cache"}
 HOSTS = {
@@ -40,9 +38,10 @@ def is_dead(page, link):
     return not target.exists() or bool(anchor and target.suffix == ".md" and anchor not in anchors(target))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_no_link_is_dead(page):
-    assert [link for link in links(page) if is_dead(page, link)] == []
+def test_no_link_is_dead():
+    found = [(page.relative_to(ROOT).as_posix(), link) for page in PAGES for link in links(page)]
+    assert len(found) > 200
+    assert [(page, link) for page, link in found if is_dead(ROOT / page, link)] == []
 
 
 def external_links(page):
@@ -51,11 +50,11 @@ def external_links(page):
     return re.findall(r"\bhttps?:[^\s)>\]]*", text)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_other_hosts_are_known(page):
-    addresses = [urlsplit(link) for link in external_links(page)]
-    assert {address.hostname for address in addresses} <= HOSTS
-    assert {address.scheme for address in addresses} <= {"https"}
+def test_other_hosts_are_known():
+    found = [(page.relative_to(ROOT).as_posix(), link) for page in PAGES for link in external_links(page)]
+    assert len(found) > 5
+    assert [(page, link) for page, link in found if urlsplit(link).hostname not in HOSTS] == []
+    assert [(page, link) for page, link in found if urlsplit(link).scheme != "https"] == []
 
 
 def test_every_picture_of_the_results_is_on_a_page():

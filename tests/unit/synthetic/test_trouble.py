@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -21,11 +22,15 @@ from sfm_app.synthetic.trouble import (
 
 pytestmark = pytest.mark.slow
 
-PLANS = [troubled_folder(seed) for seed in range(120)]
+
+@cache
+def plans():
+    """As they are asked for first: every worker collects this module, and one runs it."""
+    return [troubled_folder(seed) for seed in range(120)]
 
 
 def plan_with(*troubles):
-    return next(plan for plan in PLANS if set(troubles) <= set(plan.troubles))
+    return next(plan for plan in plans() if set(troubles) <= set(plan.troubles))
 
 
 def small(plan, photos=2, width=96):
@@ -52,24 +57,24 @@ def written(plan, folder):
 def test_a_seed_is_a_folder():
     again = troubled_folder(17)
 
-    assert (again.troubles, again.options) == (PLANS[17].troubles, PLANS[17].options)
+    assert (again.troubles, again.options) == (plans()[17].troubles, plans()[17].options)
     for name, pose in again.views.cam_from_world.items():
-        assert np.array_equal(pose, PLANS[17].views.cam_from_world[name])
-        assert np.array_equal(again.views.cameras[name].K, PLANS[17].views.cameras[name].K)
-    assert np.array_equal(again.scene.vertices, PLANS[17].scene.vertices)
+        assert np.array_equal(pose, plans()[17].views.cam_from_world[name])
+        assert np.array_equal(again.views.cameras[name].K, plans()[17].views.cameras[name].K)
+    assert np.array_equal(again.scene.vertices, plans()[17].scene.vertices)
 
 
 def test_every_trouble_comes_up_and_few_at_a_time():
-    met = {kind for plan in PLANS for kind in plan.troubles}
+    met = {kind for plan in plans() for kind in plan.troubles}
 
     assert met == set(KINDS)
-    assert all(len(plan.troubles) <= 6 for plan in PLANS)
-    assert 1 <= sum(not plan.troubles for plan in PLANS) <= 12
-    assert all(PHOTOS[0] <= len(plan.views.cameras) <= PHOTOS[1] for plan in PLANS)
+    assert all(len(plan.troubles) <= 6 for plan in plans())
+    assert 1 <= sum(not plan.troubles for plan in plans()) <= 12
+    assert all(PHOTOS[0] <= len(plan.views.cameras) <= PHOTOS[1] for plan in plans())
 
 
 def test_cameras_are_those_of_the_trouble():
-    for plan in PLANS:
+    for plan in plans():
         focals = {round(camera.K[0, 0], 6) for camera in plan.views.cameras.values()}
         first = plan.views.cameras["view_00.jpg"]
         off = np.abs(first.K[:2, 2] / (first.width, first.height) - 0.5).max()
@@ -166,4 +171,4 @@ def test_the_folder_is_rendered_alike_twice_and_a_thing_stands_on_its_foot(tmp_p
 def test_a_folder_that_cannot_be_written_is_said(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write photos"):
-        write_troubled_folder(tmp_path / "file", small(PLANS[0], photos=1))
+        write_troubled_folder(tmp_path / "file", small(plans()[0], photos=1))
