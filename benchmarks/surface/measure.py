@@ -10,7 +10,6 @@ import numpy as np
 
 from benchmarks.common.results import Row
 from benchmarks.surface.depth_camera.kinect import KinectTruth, kinect_scores
-from benchmarks.surface.detail import detail_scores
 from benchmarks.surface.left_out import remake_without
 from benchmarks.surface.photos import (
     Likeness,
@@ -21,9 +20,10 @@ from benchmarks.surface.photos import (
     render_view,
     subsample,
 )  # fmt: skip
+from benchmarks.surface.rendered.detail import detail_scores
+from benchmarks.surface.rendered.truth import seen_places, truth_scores
 from benchmarks.surface.sets import dense_stages
 from benchmarks.surface.sparse_poisson import sparse_surfaces
-from benchmarks.surface.truth import seen_places, truth_scores
 from benchmarks.surface.worker import StageCost
 from sfm_app.errors import SfmError
 from sfm_app.synthetic.photo_folder import Truth

@@ -22,6 +22,7 @@ from sfm_app.operating_system.machine import (
 )
 from sfm_app.operating_system.processes import (
     crash_name,
+    end_at_exit,
     end_group,
     end_own_group,
     group_options,
@@ -38,6 +39,7 @@ __all__ = [
     "add_stand_ins",
     "cpu_seconds",
     "crash_name",
+    "end_at_exit",
     "end_group",
     "end_own_group",
     "find_in_wheel",

@@ -32,10 +32,12 @@ class Ability(StrEnum):
     """The port of a program that has just ended can be asked for. On Windows, that lets two programs share one."""
     WHEEL_LIBRARIES = "libraries in wheels"
     """The libraries of a package are files of their own, whose functions can be called."""
+    EXIT_HANDLERS = "exit handlers"
+    """The C library can be told what to do first at the end of a process, and passes the exit code on."""
 
 
 LINUX = frozenset(Ability)
-MACOS = LINUX - {Ability.CORES, Ability.CONTAINERS}
+MACOS = LINUX - {Ability.CORES, Ability.CONTAINERS, Ability.EXIT_HANDLERS}
 WINDOWS = frozenset({Ability.LINKS, Ability.HARD_LINKS})
 """Links are tried, and copied where they are refused."""
 

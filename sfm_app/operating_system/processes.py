@@ -1,6 +1,7 @@
 """Processes that end with those that started them, and why a process has ended."""
 
 import contextlib
+import ctypes
 import os
 import signal
 import subprocess
@@ -100,6 +101,19 @@ def _wait_for_end(number: int) -> None:
         process = psutil.Process(number)
         while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
             time.sleep(LOOK_S)
+
+
+def end_at_exit() -> None:
+    """Let this process end at once where a library calls `exit`, without what is registered for its end up to now.
+
+    A library that does so in a thread (libjpeg, where the disk is full) has the data of all others taken away while
+    their threads work on; then they may wait for each other for ever.
+    """
+    if lacks(Ability.EXIT_HANDLERS):
+        return
+    library = ctypes.CDLL(None)
+    if hasattr(library, "on_exit"):  # of glibc, and not of musl
+        library.on_exit(library._exit, None)
 
 
 def ignore_interrupts() -> None:

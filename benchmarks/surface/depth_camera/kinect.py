@@ -14,7 +14,7 @@ from benchmarks.common.metrics import Pose
 from benchmarks.common.results import Row
 from benchmarks.corpus.trajectory import offset_errors
 from benchmarks.surface.depth_camera.scan import Scan, align
-from benchmarks.surface.truth import sights_of
+from benchmarks.surface.rendered.truth import sights_of
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.meshing.open3d import load_open3d
 from sfm_app.synthetic.cameras import Camera, camera_center

@@ -17,7 +17,7 @@ from typing import IO, Any, Literal, TypeAlias, TypedDict, TypeVar
 from sfm_app.colmap.backend import log_level, show_log
 from sfm_app.errors import BackendError
 from sfm_app.numerical import Json
-from sfm_app.operating_system import crash_name, has_run_out, ignore_interrupts, watch_parent
+from sfm_app.operating_system import crash_name, end_at_exit, has_run_out, ignore_interrupts, watch_parent
 from sfm_app.progress import Progress, SilentProgress
 
 ENDED_EARLY = 1
@@ -238,6 +238,7 @@ def run_worker(
 def serve(work: Callable[[Task], None]) -> None:
     """Do the task in the worker process, and end when its parent does."""
     ignore_interrupts()
+    end_at_exit()
     os.dup2(sys.stdout.fileno(), REPORT_FD)
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # output of libraries must not mix with the reports
     line = sys.stdin.readline()

@@ -10,10 +10,10 @@ from benchmarks.surface.bars import BARS, bar_rows
 from benchmarks.surface.measure import cost
 from benchmarks.surface.photos import Likeness, likeness, photo_scores, psnr_db, subsample
 from benchmarks.surface.pictures import BYTES, WIDTHS_PX, save_page
+from benchmarks.surface.rendered.truth import seen_places, truth_scores
 from benchmarks.surface.report import page
 from benchmarks.surface.sets import REAL, RENDERED, SCANNED, SurfaceSet, first_photos, surface_set
 from benchmarks.surface.sparse_poisson import points_ply
-from benchmarks.surface.truth import seen_places, truth_scores
 from benchmarks.surface.worker import StageCost
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.synthetic.cameras import Views, axis_rotation, look_at, make_camera

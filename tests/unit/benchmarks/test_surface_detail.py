@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from benchmarks.surface import detail
-from benchmarks.surface.detail import creases, detail_scores
+from benchmarks.surface.rendered import detail
+from benchmarks.surface.rendered.detail import creases, detail_scores
 from sfm_app.synthetic.cameras import Views, look_at, make_camera
 from sfm_app.synthetic.compare import scene_size
 from sfm_app.synthetic.fine.fine_shapes import tube

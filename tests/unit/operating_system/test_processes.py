@@ -11,6 +11,7 @@ import pytest
 from sfm_app.operating_system import (
     Ability,
     crash_name,
+    end_at_exit,
     end_group,
     end_own_group,
     group_options,
@@ -130,3 +131,30 @@ def ends(process):
             return True
         time.sleep(0.05)
     return False
+
+
+LIBRARY_EXITS = """
+import ctypes, time
+from sfm_app.operating_system import end_at_exit
+library = ctypes.CDLL(None)
+wait = ctypes.CFUNCTYPE(None, ctypes.c_int, ctypes.c_void_p)(lambda code, _: print("cleaning up", flush=True))
+library.on_exit(wait, None)
+{}
+library.exit(7)
+"""
+
+
+@pytest.mark.skipif(lacks(Ability.EXIT_HANDLERS), reason="the C library has no on_exit")
+@pytest.mark.parametrize(("first", "said"), [("", "cleaning up"), ("end_at_exit()", "")])
+def test_a_process_that_a_library_ends_cleans_nothing_up_while_its_threads_work(first, said):
+    done = subprocess.run(
+        [sys.executable, "-c", LIBRARY_EXITS.format(first)], capture_output=True, text=True, check=False
+    )
+
+    assert (done.returncode, done.stdout.strip()) == (7, said)
+
+
+def test_without_exit_handlers_a_process_ends_as_ever(without):
+    without(Ability.EXIT_HANDLERS)
+
+    end_at_exit()

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common.results import Row
-from benchmarks.surface.truth import Sights, sample_with_normals, sights_of
+from benchmarks.surface.rendered.truth import Sights, sample_with_normals, sights_of
 from sfm_app.synthetic.compare import align_centers, sample_surface, scene_size, surface_distances
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.synthetic.scenes.bodies import SyntheticScene

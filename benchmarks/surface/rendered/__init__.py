@@ -1,0 +1,1 @@
+"""A surface beside the true one of a rendered scene."""
