@@ -14,7 +14,13 @@ from benchmarks.common.command_line import add_pictures, add_rendered, add_seeds
 from benchmarks.common.processes import environment, module_command
 
 PACKAGE = Path(benchmarks.__file__).parent
-SHARED = ("benchmarks", "benchmarks.common", "benchmarks.surface.depth_camera", "benchmarks.thesis")
+SHARED = (
+    "benchmarks",
+    "benchmarks.common",
+    "benchmarks.surface.depth_camera",
+    "benchmarks.surface.rendered",
+    "benchmarks.thesis",
+)
 """Packages that are no command."""
 MOST_FILES = 15
 
