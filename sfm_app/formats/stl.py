@@ -10,8 +10,6 @@ from sfm_app.types import Model
 
 MILLIMETERS = 1000.0
 """Of a meter. STL names no unit, and printers take millimeters. By definition."""
-TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-HEADER_BYTES = 80
 
 
 def write_stl(model: Model, name: str) -> Mapping[str, bytes]:
@@ -27,17 +25,12 @@ def write_stl(model: Model, name: str) -> Mapping[str, bytes]:
     Raises:
         ReconstructionError: the model is not finite, or has no triangles.
     """
+    import trimesh  # slow to load, and few need it
+
     check(model)
     surface = model.surface
     if not len(surface.faces):
         raise ReconstructionError("STL holds triangles only", hint="--format ply or glb for points and cameras")
     x, y, z = MILLIMETERS * surface.vertices.T
-    places = np.stack([x, -z, y], axis=1)
-    rows = np.zeros(len(surface.faces), TRIANGLE)
-    a, b, c = np.moveaxis(places[surface.faces], 1, 0)
-    normals = np.cross(b - a, c - a)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    rows["corners"] = places[surface.faces]
-    rows["normal"] = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
-    header = b"made by sfm_app".ljust(HEADER_BYTES) + np.uint32(len(rows)).tobytes()
-    return {f"{name}.stl": header + rows.tobytes()}
+    mesh = trimesh.Trimesh(np.stack([x, -z, y], axis=1), surface.faces, process=False)
+    return {f"{name}.stl": bytes(mesh.export(file_type="stl"))}

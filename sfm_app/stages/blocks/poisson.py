@@ -65,9 +65,7 @@ def with_halo(bounds: FloatArray, cell: float) -> FloatArray:
     return bounds + HALO * cell * np.array([-1.0, 1.0])[:, None]
 
 
-def span_surface(
-    records: NDArray[np.void], bounds: FloatArray, cube: Cube, place: Path, name: str = "poisson"
-) -> tuple[Surface, int]:
+def span_surface(records: NDArray[np.void], bounds: FloatArray, cube: Cube, place: Path) -> tuple[Surface, int]:
     """Return Poisson's surface within bounds, and how many triangles all of it has.
 
     Args:
@@ -75,13 +73,12 @@ def span_surface(
         bounds: (2, 3) lowest and highest coordinates.
         cube: of the octree.
         place: folder for files that do not stay.
-        name: of the folder in it; another worker may be at the same points.
     """
     anchors = np.zeros(2, records.dtype)
     for axis, letter in enumerate("xyz"):
         anchors[letter] = cube.anchors[:, axis]
         anchors[f"n{letter}"] = 3.0**-0.5
-    with tempfile.TemporaryDirectory(dir=place, prefix=f"{name}-") as scratch:
+    with tempfile.TemporaryDirectory(dir=place, prefix="poisson-") as scratch:
         write_points(np.concatenate([anchors, records]), Path(scratch) / FUSED)
         raw = poisson_surface(Path(scratch), cube.depth)
     inside = ((raw.vertices >= bounds[0]) & (raw.vertices <= bounds[1])).all(axis=1)

@@ -154,7 +154,11 @@ def test_a_process_that_a_library_ends_cleans_nothing_up_while_its_threads_work(
     assert (done.returncode, done.stdout.strip()) == (7, said)
 
 
-def test_without_exit_handlers_a_process_ends_as_ever(without):
+def test_without_exit_handlers_the_c_library_is_left_alone(without, monkeypatch):
+    asked = []
+    monkeypatch.setattr(processes.ctypes, "CDLL", asked.append)
     without(Ability.EXIT_HANDLERS)
 
     end_at_exit()
+
+    assert asked == []
