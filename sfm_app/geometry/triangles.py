@@ -149,3 +149,31 @@ def number_vertices(faces: NDArray[np.integer]) -> tuple[IndexArray, IndexArray]
     is_used = np.zeros(int(faces.max(initial=-1)) + 1, np.bool_)
     is_used[faces] = True
     return np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[faces].reshape(-1, 3)
+
+
+def split_fans(surface: Surface) -> Surface:
+    """Give every fan of triangles around a vertex its own copy of the vertex."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(surface.faces)
+    edges, edge_of = unique_edges(surface.faces)
+    # corners of two triangles belong together where the triangles share an edge that ends there
+    order = bucket_order(edge_of.ravel(), len(edges))
+    same = np.flatnonzero(np.diff(edge_of.ravel()[order]) == 0)
+    face_a, side_a = np.divmod(order[same], 3)
+    face_b, side_b = np.divmod(order[same + 1], 3)
+    joined = [
+        (3 * face_a + side_a, 3 * face_b + (side_b + 1) % 3),
+        (3 * face_a + (side_a + 1) % 3, 3 * face_b + side_b),
+    ]
+    rows, cols = np.concatenate(joined, axis=1)
+    graph = coo_array((np.ones(len(rows), bool), (rows, cols)), (3 * count, 3 * count))
+    fans, fan = connected_components(graph, directed=False)
+    vertex = np.empty(fans, np.int64)
+    vertex[fan] = surface.faces.ravel()
+    order = bucket_order(vertex, len(surface.vertices))
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    vertex = vertex[order]
+    return Surface(surface.vertices[vertex], rank[fan].reshape(-1, 3), surface.colors[vertex])

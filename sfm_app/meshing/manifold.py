@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.triangles import areas, bucket_order, select_faces, unique_edges
+from sfm_app.geometry.triangles import areas, bucket_order, select_faces, split_fans, unique_edges
 from sfm_app.types import Surface
 
 MIN_HEIGHT = 1e-7
@@ -56,31 +56,3 @@ def _excess_faces(surface: Surface) -> NDArray[np.bool_]:
         at = edge_of[face, side][order]
         bad[face[order][np.diff(at, prepend=-1) > 0]] = True
     return bad
-
-
-def split_fans(surface: Surface) -> Surface:
-    """Give every fan of triangles around a vertex its own copy of the vertex."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    count = len(surface.faces)
-    edges, edge_of = unique_edges(surface.faces)
-    # corners of two triangles belong together where the triangles share an edge that ends there
-    order = bucket_order(edge_of.ravel(), len(edges))
-    same = np.flatnonzero(np.diff(edge_of.ravel()[order]) == 0)
-    face_a, side_a = np.divmod(order[same], 3)
-    face_b, side_b = np.divmod(order[same + 1], 3)
-    joined = [
-        (3 * face_a + side_a, 3 * face_b + (side_b + 1) % 3),
-        (3 * face_a + (side_a + 1) % 3, 3 * face_b + side_b),
-    ]
-    rows, cols = np.concatenate(joined, axis=1)
-    graph = coo_array((np.ones(len(rows), bool), (rows, cols)), (3 * count, 3 * count))
-    fans, fan = connected_components(graph, directed=False)
-    vertex = np.empty(fans, np.int64)
-    vertex[fan] = surface.faces.ravel()
-    order = bucket_order(vertex, len(surface.vertices))
-    rank = np.empty(len(order), np.int64)
-    rank[order] = np.arange(len(order))
-    vertex = vertex[order]
-    return Surface(surface.vertices[vertex], rank[fan].reshape(-1, 3), surface.colors[vertex])

@@ -254,6 +254,11 @@ class TextureSettings(Section):
     unseen_faces: Literal["color", "cut"] = Field(
         "color", description="triangles that no photo sees: color: painted like what is around them; cut: left out"
     )
+    trim_borders: bool = Field(
+        True,
+        description="cut off borders of the surface about whose color photos disagree: they show what lies behind; "
+        "false: keep them",
+    )
     normal_map: bool = Field(
         False,
         description="keep the detail that simplification takes away as a normal map, which shows under light; false: "

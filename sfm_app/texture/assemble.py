@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.triangles import select_faces
+from sfm_app.geometry.triangles import select_faces, split_fans
 from sfm_app.settings import TextureSettings
+from sfm_app.texture.appearance.border_agreement import doubtful_border
 from sfm_app.texture.appearance.exposure import photo_gains
 from sfm_app.texture.appearance.photo_consistency import outlier_mask
 from sfm_app.texture.appearance.sightings import Sightings, list_sightings
@@ -54,16 +55,19 @@ def texture_surface(
     """
     mesh = facets(surface)
     looks = _score_photos(views, mesh, store, hidden, spread)
-    seen = _check_views(looks, mesh)
+    seen, trimmed = _check_views(looks, mesh), 0
+    if options.trim_borders:
+        border = doubtful_border(seen.all, seen.gains, mesh.neighbors)
+        mesh, seen, trimmed = *_cut_faces(border, mesh, seen), int(border.sum())
     chosen = absorb_small_charts(choose_photos(seen.all, mesh), seen.all, mesh.neighbors)
     unseen = chosen == NONE
     if options.unseen_faces == "cut" and not unseen.all():
-        mesh = facets(select_faces(surface, ~unseen))
-        seen, chosen = replace(seen, all=seen.all.select_triangles(~unseen)), chosen[~unseen]
+        mesh, seen = _cut_faces(unseen, mesh, seen)
+        chosen = chosen[~unseen]
     plan = _plan(mesh, seen, chosen, (views, options), spread)
     rejected = [look if isinstance(look, Rejected) else None for look in looks]
     painted = paint_blocks(plan, views, store, spread, [reason is None for reason in rejected])
-    return _finish(plan, painted), _figures(plan, views, rejected, int(unseen.sum()))
+    return _finish(plan, painted), _figures(plan, views, rejected, (int(unseen.sum()), trimmed))
 
 
 def _score_photos(
@@ -101,6 +105,14 @@ def _check_views(looks: Sequence[FaceView | Rejected], mesh: Facets) -> CheckedV
     gains = photo_gains(seen)
     strange = outlier_mask(seen, gains, mesh.neighbors)
     return CheckedViews(seen.with_worth(np.where(strange, -seen.worth, seen.worth)), gains, int(strange.sum()))
+
+
+def _cut_faces(gone: NDArray[np.bool_], mesh: Facets, seen: CheckedViews) -> tuple[Facets, CheckedViews]:
+    """Return the surface and its views without some triangles (T,), if others are left."""
+    if gone.all() or not gone.any():
+        return mesh, seen
+    kept = facets(split_fans(select_faces(mesh.surface, ~gone)))
+    return kept, replace(seen, all=seen.all.select_triangles(~gone))
 
 
 def _plan(
@@ -168,16 +180,17 @@ def _finish(plan: TexturePlan, finished: Sequence[tuple[NDArray[np.uint8], NDArr
 
 
 def _figures(
-    plan: TexturePlan, views: Sequence[PhotoView], rejected: Sequence[Rejected | None], unseen: int
+    plan: TexturePlan, views: Sequence[PhotoView], rejected: Sequence[Rejected | None], counts: tuple[int, int]
 ) -> dict[str, Any]:
-    """Return the figures for the manifest."""
+    """Return the figures for the manifest; the counts are those of unseen triangles and of trimmed ones."""
     covered = sum(width * height for width, height in plan.layout.sizes)
     return {
         "charts": len(plan.charts.photo),
         "pages": [list(size) for size in plan.layout.sizes],
         "texels": covered,
         "scale": round(plan.layout.scale, 3),
-        "unseen_triangles": unseen,
+        "unseen_triangles": counts[0],
+        "trimmed_triangles": counts[1],
         "strange_views_of_triangles": plan.seen.outliers,
         "gains": {
             view.name: [round(float(gain), 3) for gain in gains]

@@ -56,6 +56,35 @@ def outlier_mask(seen: Sightings, gains: NDArray[np.float64], neighbors: IntArra
 
 
 @kernel
+def measure_deviations(
+    here: NDArray[np.int64],
+    colors: NDArray[np.uint8],
+    photo: IntArray,
+    scale: NDArray[np.float64],
+    level: NDArray[np.float64],
+    far: NDArray[np.float64],
+) -> None:
+    """Write the largest deviations over the channels from the median color of a triangle.
+
+    Args:
+        here: (K,) rows of its views.
+        colors: (N, 3) RGB of all views.
+        photo: (N,) of all views.
+        scale: (P, 3) by which the colors of each photo are multiplied.
+        level: (K or more,) changed.
+        far: (K or more,) the deviations in gray levels.
+    """
+    count = len(here)
+    far[:count] = 0.0
+    for channel in range(3):
+        for k in range(count):
+            level[k] = colors[here[k], channel] * scale[photo[here[k]], channel]
+        middle = median(level, count)
+        for k in range(count):
+            far[k] = max(far[k], abs(colors[here[k], channel] * scale[photo[here[k]], channel] - middle))
+
+
+@kernel
 def _deviations(
     starts: NDArray[np.int64],
     rows: NDArray[np.int64],
@@ -67,18 +96,11 @@ def _deviations(
     """Write the largest deviation from the median color over all channels, divided by the usual deviation."""
     level, far = np.empty(len(scale)), np.empty(len(scale))
     for f in range(len(starts) - 1):
-        count = starts[f + 1] - starts[f]
+        here = rows[starts[f] : starts[f + 1]]
+        count = len(here)
         if count < LEAST_VIEWS:
             continue
-        here = rows[starts[f] : starts[f + 1]]
-        for k in range(count):
-            far[k] = 0.0
-        for channel in range(3):
-            for k in range(count):
-                level[k] = colors[here[k], channel] * scale[photo[here[k]], channel]
-            middle = median(level, count)
-            for k in range(count):
-                far[k] = max(far[k], abs(colors[here[k], channel] * scale[photo[here[k]], channel] - middle))
+        measure_deviations(here, colors, photo, scale, level, far)
         for k in range(count):
             level[k] = far[k]
         usual = LEVELS + median(level, count)

@@ -1,0 +1,122 @@
+"""Borders of a surface where photos disagree about its color: there is no surface, each shows what lies behind.
+
+Depth maps reach over the outlines of things, by the same pixels in every photo, so that they agree with each other. But
+behind the outline each photo shows another part of the background.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.texture.appearance.photo_consistency import LEVELS, measure_deviations
+from sfm_app.texture.appearance.sightings import Sightings
+from sfm_app.texture.facets import NONE, IntArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+DOUBTFUL = 4.0
+"""Disagreement of a doubtful triangle, in medians of all triangles. Chosen with `RINGS` and `SMOOTHING` on fountain-P11
+and Herz-Jesus-P8, by photos that are left out; left out themselves: castle-P19 and the rendered scenes."""
+RINGS = 20
+"""Most rings of triangles that are cut from the border: what photos see of a hedge or of water stays."""
+SMOOTHING = 2
+"""Rounds of averaging the disagreement over neighbors, and of straightening the cut."""
+CRUMBS = 0.001
+"""Parts with a smaller share of all triangles go with the border that held them. Chosen by hand: on both sets, parts
+have at most 39 triangles or at least 992."""
+
+
+def doubtful_border(seen: Sightings, gains: FloatArray, neighbors: IntArray) -> BoolArray:
+    """Mark triangles to cut from the border, (T,): photos disagree about them more than about the surface elsewhere.
+
+    What at least three photos show, and the others do not, is a matter of `outlier_mask`.
+
+    Args:
+        seen: which photos see which triangles, in which colors; not used where the worth is negative.
+        gains: (P, 3) of the photos.
+        neighbors: (T, 3) triangles beside each triangle, -1 for none.
+    """
+    disagreement = np.full(seen.triangles, np.nan)
+    _disagreement(seen.face_starts, seen.face_rows, seen.worth, seen.colors, seen.photo, 1.0 / gains, disagreement)
+    if not np.isfinite(disagreement).any():
+        return np.zeros(seen.triangles, np.bool_)
+    usual = float(np.nanmedian(disagreement))
+    for _ in range(SMOOTHING):
+        disagreement = _average(disagreement, neighbors)
+    doubtful = disagreement > max(DOUBTFUL * usual, LEVELS)
+    cut = _straighten(_reach(doubtful, neighbors), neighbors)
+    return cut | _crumbs(cut, neighbors)
+
+
+@kernel
+def _disagreement(
+    starts: NDArray[np.int64], rows: NDArray[np.int64], worth: NDArray[np.float32], colors: NDArray[np.uint8],
+    photo: IntArray, scale: FloatArray, found: FloatArray,
+) -> None:  # fmt: skip
+    """Write the mean deviation of the views of each triangle from their median color, in gray levels."""
+    level, far, used = np.empty(len(scale)), np.empty(len(scale)), np.empty(len(scale), np.int64)
+    for f in range(len(starts) - 1):
+        count = 0
+        for row in rows[starts[f] : starts[f + 1]]:
+            if worth[row] > 0:
+                used[count] = row
+                count += 1
+        if count < 2:
+            continue
+        measure_deviations(used[:count], colors, photo, scale, level, far)
+        found[f] = 0.0
+        for k in range(count):
+            found[f] += far[k] / count
+
+
+def _average(values: FloatArray, neighbors: IntArray) -> FloatArray:
+    """Return (T,) means over each triangle and its neighbors, of those that have a value."""
+    known = np.isfinite(values)
+    total, count = np.where(known, values, 0.0), known.astype(np.float64)
+    for beside in neighbors.T:
+        there = (beside != NONE) & known[beside]
+        total += np.where(there, values[beside], 0.0)
+        count += there
+    return np.asarray(np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0))
+
+
+def _reach(doubtful: BoolArray, neighbors: IntArray) -> BoolArray:
+    """Return (T,) the doubtful triangles that are connected with the border by others, within some rings."""
+    front = doubtful & (neighbors == NONE).any(axis=1)
+    found = front.copy()
+    for _ in range(RINGS):
+        beside = neighbors[front]
+        near = np.zeros(len(found), np.bool_)
+        near[beside[beside != NONE]] = True
+        front = near & doubtful & ~found
+        found |= front
+    return found
+
+
+def _straighten(cut: BoolArray, neighbors: IntArray) -> BoolArray:
+    """Return (T,) the cut with triangles that would stay as spikes: two of their sides would be open."""
+    cut = cut.copy()
+    for _ in range(SMOOTHING):
+        beside = np.where(neighbors == NONE, False, cut[neighbors])
+        is_open = beside | (neighbors == NONE)
+        cut |= beside.any(axis=1) & (is_open.sum(axis=1) >= 2)
+    return np.asarray(cut, np.bool_)
+
+
+def _crumbs(cut: BoolArray, neighbors: IntArray) -> BoolArray:
+    """Mark (T,) small connected parts that touch the cut."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    if not cut.any():
+        return cut
+    face, side = np.nonzero((neighbors != NONE) & ~cut[:, None])
+    other = neighbors[face, side]
+    stays = ~cut[other]
+    ties = coo_array((np.ones(stays.sum(), np.bool_), (face[stays], other[stays])), (len(cut), len(cut)))
+    _, part = connected_components(ties, directed=False)
+    touches = np.zeros(len(cut), np.bool_)
+    touches[part[face[~stays]]] = True
+    small = np.bincount(part, minlength=len(cut)) < CRUMBS * len(cut)
+    return np.asarray(~cut & (touches & small)[part], np.bool_)
