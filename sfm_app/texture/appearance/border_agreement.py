@@ -15,13 +15,16 @@ from sfm_app.texture.facets import NONE, IntArray
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-DOUBTFUL = 4.0
+DOUBTFUL = 3.5
 """Disagreement of a doubtful triangle, in medians of all triangles. Chosen with `RINGS` and `SMOOTHING` on fountain-P11
 and Herz-Jesus-P8, by photos that are left out; left out themselves: castle-P19 and the rendered scenes."""
 RINGS = 20
 """Most rings of triangles that are cut from the border: what photos see of a hedge or of water stays."""
 SMOOTHING = 2
 """Rounds of averaging the disagreement over neighbors, and of straightening the cut."""
+PASSERS_BY = 1
+"""Most photos that may show something before the surface instead of it; where more are outliers, they have a say.
+Chosen by hand: people move on."""
 CRUMBS = 0.001
 """Parts with a smaller share of all triangles go with the border that held them. Chosen by hand: on both sets, parts
 have at most 39 triangles or at least 992."""
@@ -30,10 +33,8 @@ have at most 39 triangles or at least 992."""
 def doubtful_border(seen: Sightings, gains: FloatArray, neighbors: IntArray) -> BoolArray:
     """Mark triangles to cut from the border, (T,): photos disagree about them more than about the surface elsewhere.
 
-    What at least three photos show, and the others do not, is a matter of `outlier_mask`.
-
     Args:
-        seen: which photos see which triangles, in which colors; not used where the worth is negative.
+        seen: which photos see which triangles, in which colors; the worth of outliers is negative.
         gains: (P, 3) of the photos.
         neighbors: (T, 3) triangles beside each triangle, -1 for none.
     """
@@ -57,9 +58,11 @@ def _disagreement(
     """Write the mean deviation of the views of each triangle from their median color, in gray levels."""
     level, far, used = np.empty(len(scale)), np.empty(len(scale)), np.empty(len(scale), np.int64)
     for f in range(len(starts) - 1):
-        count = 0
+        count = strange = 0
         for row in rows[starts[f] : starts[f + 1]]:
-            if worth[row] > 0:
+            strange += worth[row] < 0
+        for row in rows[starts[f] : starts[f + 1]]:
+            if worth[row] > 0 or strange > PASSERS_BY:
                 used[count] = row
                 count += 1
         if count < 2:
@@ -91,7 +94,7 @@ def _reach(doubtful: BoolArray, neighbors: IntArray) -> BoolArray:
         near[beside[beside != NONE]] = True
         front = near & doubtful & ~found
         found |= front
-    return found
+    return np.asarray(found, np.bool_)
 
 
 def _straighten(cut: BoolArray, neighbors: IntArray) -> BoolArray:
