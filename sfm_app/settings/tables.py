@@ -257,7 +257,7 @@ class TextureSettings(Section):
     trim_borders: bool = Field(
         True,
         description="cut off borders of the surface about whose color photos disagree: they show what lies behind; "
-        "false: keep them",
+        "false, or where `mesh.trim` is false: keep them",
     )
     normal_map: bool = Field(
         False,

@@ -47,7 +47,10 @@ def make(scene: Scene, surface: Surface, run: RunContext) -> Model:
         mark_unfinished(parts, made_from)
     hidden = Occluders(surface.vertices, surface.faces).is_hidden
     store = FileStore(run.workspace.photos, parts, run.mask_dir)
-    model, figures = texture_surface(surface, views, store, hidden, run.settings.texture, run.map)
+    options = run.settings.texture
+    if not run.settings.mesh.trim:  # who wants a closed surface wants no borders
+        options = options.model_copy(update={"trim_borders": False})
+    model, figures = texture_surface(surface, views, store, hidden, options, run.map)
     run.record(**figures)
     model = _add_normal_map(model, run) if run.settings.texture.normal_map else model
     save_texture(model, run)
