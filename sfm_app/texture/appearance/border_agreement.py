@@ -18,7 +18,7 @@ BoolArray = NDArray[np.bool_]
 DOUBTFUL = 5.0
 """Disagreement of a doubtful triangle, in medians of all triangles. Chosen with `RINGS` and `SMOOTHING` on fountain-P11
 and Herz-Jesus-P8, by photos that are left out, and on `railing`, whose rods are thin: 3.5 gains a tenth of a dB on both
-sets, and cuts a quarter of the rods instead of a twentieth. Left out: castle-P19, `ornament`, `garden`."""
+sets, and cuts a sixth of the rods instead of a twentieth. Left out: castle-P19, `ornament`, `garden`."""
 RINGS = 20
 """Most rings of triangles that are cut from the border: what photos see of a hedge or of water stays."""
 SMOOTHING = 2
