@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.texture.appearance.sightings import Sightings
-from sfm_app.texture.facets import NONE, Facets, IntArray
+from sfm_app.texture.facets import NONE, Facets, IntArray, components
 from sfm_app.texture.views import project
 
 FloatArray = NDArray[np.float64]
@@ -114,17 +114,6 @@ def _find_folds(
                         taken[y, x] = True
 
 
-def components(group: NDArray[np.int64], neighbors: IntArray) -> tuple[IntArray, int]:
-    """Find connected triangles of equal group: (T,) component, -1 where the group is -1, and number of components.
-
-    Args:
-        group: (T,) only triangles of equal numbers are connected; -1 for none.
-        neighbors: (T, 3) triangle across each edge, -1 for none.
-    """
-    of = np.full(len(group), NONE, np.int32)
-    return of, _flood(group, neighbors, of)
-
-
 def absorb_small_charts(chosen: IntArray, seen: Sightings, neighbors: IntArray) -> IntArray:
     """Give small charts the photo of a neighboring chart that may be used for all their triangles.
 
@@ -156,28 +145,6 @@ def _project_corners(
             i = faces[f, k]
             u, v, _ = project(cameras[chosen[f]], vertices[i, 0], vertices[i, 1], vertices[i, 2])
             corners[f, k, 0], corners[f, k, 1] = u, v
-
-
-@kernel
-def _flood(group: NDArray[np.int64], neighbors: IntArray, of: IntArray) -> int:
-    stack = np.empty(len(group), np.int64)
-    count = 0
-    for seed in range(len(group)):
-        if group[seed] == NONE or of[seed] != NONE:
-            continue
-        stack[0], top = seed, 1
-        of[seed] = count
-        while top:
-            top -= 1
-            f = stack[top]
-            for k in range(3):
-                g = neighbors[f, k]
-                if g != NONE and of[g] == NONE and group[g] == group[f]:
-                    of[g] = count
-                    stack[top] = g
-                    top += 1
-        count += 1
-    return count
 
 
 @kernel

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.culling import Clusters, cluster
 from sfm_app.geometry.triangles import bucket_order, unique_edges
+from sfm_app.jit import kernel
 from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
@@ -117,3 +118,36 @@ def sum_at_vertices(values: FloatArray, faces: NDArray[np.int64], size: int) -> 
     """
     per_corner = np.broadcast_to(values[:, None] if values.ndim == 1 else values, faces.shape)
     return np.asarray(np.bincount(faces.ravel(), per_corner.ravel(), size), np.float64)
+
+
+def components(group: NDArray[np.int64], neighbors: IntArray) -> tuple[IntArray, int]:
+    """Find connected triangles of equal group: (T,) component, -1 where the group is -1, and number of components.
+
+    Args:
+        group: (T,) only triangles of equal numbers are connected; -1 for none.
+        neighbors: (T, 3) triangle across each edge, -1 for none.
+    """
+    of = np.full(len(group), NONE, np.int32)
+    return of, _flood(group, neighbors, of)
+
+
+@kernel
+def _flood(group: NDArray[np.int64], neighbors: IntArray, of: IntArray) -> int:
+    stack = np.empty(len(group), np.int64)
+    count = 0
+    for seed in range(len(group)):
+        if group[seed] == NONE or of[seed] != NONE:
+            continue
+        stack[0], top = seed, 1
+        of[seed] = count
+        while top:
+            top -= 1
+            f = stack[top]
+            for k in range(3):
+                g = neighbors[f, k]
+                if g != NONE and of[g] == NONE and group[g] == group[f]:
+                    of[g] = count
+                    stack[top] = g
+                    top += 1
+        count += 1
+    return count

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sfm_app.jit import kernel
 from sfm_app.texture.appearance.photo_consistency import LEVELS, measure_deviations
 from sfm_app.texture.appearance.sightings import Sightings
-from sfm_app.texture.facets import NONE, IntArray
+from sfm_app.texture.facets import NONE, IntArray, components
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -101,7 +101,7 @@ def _straighten(cut: BoolArray, neighbors: IntArray) -> BoolArray:
     """Return (T,) the cut with triangles that would stay as spikes: two of their sides would be open."""
     cut = cut.copy()
     for _ in range(SMOOTHING):
-        beside = np.where(neighbors == NONE, False, cut[neighbors])
+        beside = (neighbors != NONE) & cut[neighbors]
         is_open = beside | (neighbors == NONE)
         cut |= beside.any(axis=1) & (is_open.sum(axis=1) >= 2)
     return np.asarray(cut, np.bool_)
@@ -109,17 +109,8 @@ def _straighten(cut: BoolArray, neighbors: IntArray) -> BoolArray:
 
 def _crumbs(cut: BoolArray, neighbors: IntArray) -> BoolArray:
     """Mark (T,) small connected parts that touch the cut."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    if not cut.any():
-        return cut
-    face, side = np.nonzero((neighbors != NONE) & ~cut[:, None])
-    other = neighbors[face, side]
-    stays = ~cut[other]
-    ties = coo_array((np.ones(stays.sum(), np.bool_), (face[stays], other[stays])), (len(cut), len(cut)))
-    _, part = connected_components(ties, directed=False)
-    touches = np.zeros(len(cut), np.bool_)
-    touches[part[face[~stays]]] = True
-    small = np.bincount(part, minlength=len(cut)) < CRUMBS
-    return np.asarray(~cut & (touches & small)[part], np.bool_)
+    part, count = components(np.where(cut, NONE, 0), neighbors)
+    beside_cut = ~cut & ((neighbors != NONE) & cut[neighbors]).any(axis=1)
+    crumb = np.bincount(part[~cut], minlength=count) < CRUMBS
+    crumb &= np.bincount(part[beside_cut], minlength=count) > 0
+    return np.asarray(~cut & crumb[part], np.bool_)

@@ -43,9 +43,20 @@ def test_what_photos_disagree_about_is_cut_where_it_borders():
     assert found.sum() < 1.4 * flake.sum()
 
 
-@pytest.mark.parametrize("by", [0.0, 12.0])
-def test_noise_and_small_differences_cut_nothing(by):
-    assert not cut(CENTER[:, 0] < 4, by).any()
+@pytest.mark.parametrize(("by", "noise"), [(0.0, 1.0), (12.0, 1.0), (24.0, 0.0)])
+def test_noise_and_small_differences_cut_nothing(by, noise):
+    """Photos without noise agree exactly, but ten gray levels are no doubt."""
+    assert not cut(CENTER[:, 0] < 4, by, noise=noise).any()
+
+
+def test_few_spikes_stay():
+    """The widths of the flake differ from row to row; without straightening, 25 triangles stand out."""
+    width = np.random.default_rng(3).integers(1, 8, SIDE)[CENTER[:, 1].astype(int)]
+    found = cut(CENTER[:, 0] < width, 120.0)
+    beside = (MESH.neighbors >= 0) & found[MESH.neighbors]
+    open_sides = (beside | (MESH.neighbors < 0)).sum(axis=1)
+    assert 100 < found.sum() < 1000
+    assert (~found & beside.any(axis=1) & (open_sides >= 2)).sum() < 6
 
 
 def test_what_differs_as_much_everywhere_stays():
@@ -69,6 +80,13 @@ def test_a_passer_by_cuts_nothing():
     assert not doubtful_border(sightings(worth, shown), GAINS, MESH.neighbors).any()
     worth[2, person] = 1.0
     assert doubtful_border(sightings(worth, shown), GAINS, MESH.neighbors)[person].mean() > 0.9
+
+
+def test_two_that_differ_cut():
+    """Where half of the photos show other things, they are not all people."""
+    worth, shown, flake = EVERYWHERE.copy(), colors(), CENTER[:, 0] < 4
+    worth[2:, flake], shown[2, flake], shown[3, flake] = -1.0, 200, 10
+    assert doubtful_border(sightings(worth, shown), GAINS, MESH.neighbors)[flake].mean() > 0.9
 
 
 def test_one_photo_alone_decides_nothing():

@@ -17,8 +17,8 @@ from sfm_app.texture.appearance.median import median
 from sfm_app.texture.appearance.photo_consistency import outlier_mask
 from sfm_app.texture.appearance.view_scoring import sharpness, sharpness_factors
 from sfm_app.texture.blending import blend_weights
-from sfm_app.texture.charts import Charts, absorb_small_charts, components, folds
-from sfm_app.texture.facets import NONE, facets
+from sfm_app.texture.charts import Charts, absorb_small_charts, folds
+from sfm_app.texture.facets import NONE, components, facets
 from sfm_app.texture.packing import MARGIN, pack
 from sfm_app.texture.painting import canvas, fill_background
 from sfm_app.texture.seam_leveling import level_seams, solve_ties
