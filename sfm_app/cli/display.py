@@ -10,6 +10,7 @@ from sfm_app.name_lists import list_names
 from sfm_app.report.camera_text import contradiction_lines, intrinsics_lines, intrinsics_summary
 from sfm_app.report.scale_text import scale_lines
 from sfm_app.report.scene_text import scene_lines, scene_summary
+from sfm_app.runtime.manifest import model_triangles
 
 NAMES_SHOWN = 5
 """Most files of one kind that are named; the manifest has all."""
@@ -40,7 +41,7 @@ def run_summary(run: Run) -> dict[str, Any]:
     if run.mesh_path:
         files = [str(path) for path in written_files(run, "files")]
         about = {key: counts["files"][key] for key in ("pages_px", "jpeg_quality") if key in counts["files"]}
-        summary["mesh"] = {"triangles": counts["mesh"].get("triangles"), **about, "files": files}
+        summary["mesh"] = {"triangles": model_triangles(stages), **about, "files": files}
     return summary
 
 

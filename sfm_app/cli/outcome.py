@@ -10,6 +10,7 @@ from sfm_app.geometry.lenses.camera_models import calibration_from_model
 from sfm_app.report.camera_text import SOURCES
 from sfm_app.report.scale_text import scale_lines
 from sfm_app.report.words import WARNING, duration_text, field_text
+from sfm_app.runtime.manifest import model_triangles
 from sfm_app.types.calibration import EQUIRECTANGULAR
 
 SHOWN = 3
@@ -47,7 +48,7 @@ def headline(run: Run) -> str:
         return f"The camera of {usable} photos" if run.calibration else f"{usable} usable photos"
     placed, count = len(run.scene.registered), len(run.scene.registered) + len(run.scene.unregistered)
     photos = f"all {count} photos" if placed == count else f"{placed} of {count} photos"
-    triangles = run.manifest.get("stages", {}).get("mesh", {}).get("counts", {}).get("triangles")
+    triangles = model_triangles(run.manifest.get("stages", {}))
     if run.mesh_path is None:
         return f"Cameras and points of {photos}"
     return f"A model of {photos}, with {triangles:,} triangles" if triangles else f"A model of {photos}"

@@ -144,6 +144,16 @@ class Manifest:
         return {name: size for name, size in found.items() if size is not None}
 
 
+def model_triangles(stages: Mapping[str, Any]) -> int | None:
+    """Return how many triangles the model has, None where there is none: texturing may cut some of the surface's.
+
+    Args:
+        stages: of a manifest, by name.
+    """
+    counts = [stages.get(stage, {}).get("counts", {}).get("triangles") for stage in ("texture", "mesh")]
+    return next((count for count in counts if count), None)
+
+
 def _size(path: Path) -> int | None:
     if not path.exists():
         return None

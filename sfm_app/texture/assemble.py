@@ -185,6 +185,7 @@ def _figures(
     """Return the figures for the manifest; the counts are those of unseen triangles and of trimmed ones."""
     covered = sum(width * height for width, height in plan.layout.sizes)
     return {
+        "triangles": len(plan.mesh.faces),
         "charts": len(plan.charts.photo),
         "pages": [list(size) for size in plan.layout.sizes],
         "texels": covered,

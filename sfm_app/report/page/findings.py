@@ -10,6 +10,7 @@ from sfm_app.report.page.correlations import CorrelationTable, correlation_table
 from sfm_app.report.scale_text import scale_lines
 from sfm_app.report.scene_text import scene_lines
 from sfm_app.report.words import WARNING, duration_text
+from sfm_app.runtime.manifest import model_triangles
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, CameraModel
 
@@ -91,7 +92,7 @@ def _facts(contents: RunContents) -> Iterator[Fact]:
     if scene is not None:
         yield Fact("points", f"{scene.points:,}", f"seen {scene.observations:,} times")
         yield Fact("reprojection error", f"{scene.mean_reprojection_px:.2f} px", "mean")
-    triangles = contents.counts("mesh").get("triangles")
+    triangles = model_triangles(contents.stages)
     if triangles:
         yield Fact("triangles", f"{triangles:,}")
     if scene is not None:

@@ -3,7 +3,7 @@ import json
 import pytest
 
 from sfm_app.errors import InputError
-from sfm_app.runtime.manifest import Manifest, StageRecord
+from sfm_app.runtime.manifest import Manifest, StageRecord, model_triangles
 
 
 @pytest.fixture
@@ -86,3 +86,11 @@ def test_a_folder_without_a_run_of_ours_has_no_format(manifest):
     manifest.check_format()
     manifest.write({"program": "another", "format": 1, "stages": {"photos": {}}})
     manifest.check_format()
+
+
+def test_a_model_has_the_triangles_that_texturing_has_left():
+    mesh, texture = {"counts": {"triangles": 9}}, {"counts": {"triangles": 7}}
+    assert model_triangles({"mesh": mesh, "texture": texture}) == 7
+    assert model_triangles({"mesh": mesh, "texture": {"counts": {}}}) == 9  # of an earlier version
+    assert model_triangles({"mesh": mesh}) == 9
+    assert model_triangles({}) is None
