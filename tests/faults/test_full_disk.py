@@ -23,7 +23,7 @@ FIRST = {  # last finished stage, and kilobytes that a file may have from then o
     "depth_maps": (60, 1000),
     "texture": (60, 150),
 }
-ALWAYS = {("", 400), ("scene", 30)}
+ALWAYS = {("scene", 30)}
 CASES = [(stage, limit) for stage, limits in FIRST.items() for limit in limits]
 
 

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-ALWAYS = {"matching:10", "before:0.7"}
+ALWAYS = {"matching:10"}
 POINTS = ["features:10", "matching:10", "undistorting:0", *[f"before:{tenth / 10}" for tenth in range(1, 10)]]
 
 needs_time = pytest.mark.skipif("SFM_APP_FAULTS" not in os.environ, reason="`make faults` tries all points")

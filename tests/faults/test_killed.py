@@ -8,7 +8,7 @@ import pytest
 KILLED = -9
 STEPS = 15
 """So many steps lie between the first file that appears and the last."""
-ALWAYS = {"before:4", "after:12", "matching:60"}
+ALWAYS = {"after:12", "matching:60"}
 IN_COLMAP = [f"{what}:{ms}" for what in ("features", "matching", "undistorting") for ms in (0, 60, 400)]
 
 needs_time = pytest.mark.skipif("SFM_APP_FAULTS" not in os.environ, reason="`make faults` tries all points")

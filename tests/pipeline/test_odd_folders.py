@@ -103,9 +103,8 @@ def test_ten_photos_of_a_white_wall(folder, tmp_path, noise, says):
     ends_with(call("calibrate", folder, "-o", out), "hardly any texture")
 
 
-@pytest.mark.parametrize(("photos", "step_deg"), [(2, 12.0), (4, 30.0)])
-def test_a_panorama(folder, tmp_path, photos, step_deg):
-    write_photo_folder(folder, build_scene(), panorama(CAMERA, photos, step_deg), FAST)
+def test_a_panorama(folder, tmp_path):
+    write_photo_folder(folder, build_scene(), panorama(CAMERA, 3, 20.0), FAST)
 
     result, out = run(folder, tmp_path)
 

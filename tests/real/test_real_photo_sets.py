@@ -19,7 +19,8 @@ def photo_set(name):
 
 
 def test_kermit11_runs_to_a_mesh(tmp_path):
-    run = sfm_app.reconstruct(photo_set("kermit11"), tmp_path / "out")
+    draft = sfm_app.Settings.from_mapping({"quality": "draft"})
+    run = sfm_app.reconstruct(photo_set("kermit11"), tmp_path / "out", draft)
 
     assert len(run.scene.registered) == 11
     assert run.scene.points > 500

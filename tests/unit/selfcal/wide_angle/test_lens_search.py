@@ -121,7 +121,7 @@ def test_a_barrel_lens_is_no_fisheye_even_where_a_pair_shows_repeated_things(see
 
 
 def test_the_same_seed_gives_the_same_lens():
-    matches = photos_through(lens_of(120.0, 0.0), photos=4)
+    matches = photos_through(lens_of(120.0, 0.0), photos=3)
     first, second, other = (find_lens(matches, SIZE, seed) for seed in (0, 0, 1))
     assert first == second
     assert other is not None and other.lens.focal == pytest.approx(first.lens.focal, rel=0.02)
