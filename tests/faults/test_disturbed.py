@@ -10,7 +10,7 @@ SAYS = {
     "photo-gone": "is gone since",
     "photo-changed": "has changed since",
 }
-ALWAYS = {("out-gone", 0.5), ("photo-changed", 0.3)}
+ALWAYS = {("out-gone", 0.5), ("out-closed", 0.5), ("photo-gone", 0.3), ("photo-changed", 0.3)}
 CASES = [(what, share) for what in SAYS for share in (0.1, 0.3, 0.5, 0.7, 0.9)]
 
 needs_time = pytest.mark.skipif("SFM_APP_FAULTS" not in os.environ, reason="`make faults` tries all of them")

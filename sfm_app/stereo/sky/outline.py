@@ -37,9 +37,7 @@ def sky_pixels(photo: GrayImage, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     around = cv2.GaussianBlur(seen * gray, (0, 0), reach) / np.maximum(weight, LEAST_WEIGHT)
     smooth = cv2.GaussianBlur(photo.astype(np.float32), (3, 3), 0)  # a median would swallow wires
     sky = near_pixels(cells, photo.shape) & (np.abs(smooth - cv2.resize(around, shape)) <= TOLERANCE)
-    side = 2 * BLUR_PX + 1
-    blurred = cv2.dilate(sky.view(np.uint8), np.ones((side, side), np.uint8)) > 0
-    return np.asarray(blurred & ~_find_narrow_rims(sky))
+    return _widen(sky, BLUR_PX) & ~_find_narrow_rims(sky)
 
 
 def near_pixels(cells: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -58,5 +56,10 @@ def _find_narrow_rims(sky: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mark pixels beside things before the sky that are narrow, such as branches: they keep a rim."""
     things = (~sky).view(np.uint8)
     broad = cv2.morphologyEx(things, cv2.MORPH_OPEN, np.ones((NARROW_PX, NARROW_PX), np.uint8))
-    side = 2 * RIM_PX + 1
-    return np.asarray(cv2.dilate(things & ~broad, np.ones((side, side), np.uint8)) > 0)
+    return _widen((things & ~broad).view(np.bool_), RIM_PX)
+
+
+def _widen(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+    """Return the mask with everything that is at most some pixels beside it."""
+    side = 2 * pixels + 1
+    return np.asarray(cv2.dilate(mask.view(np.uint8), np.ones((side, side), np.uint8)) > 0)

@@ -135,7 +135,7 @@ def test_what_is_not_determined_stays_where_it_is_and_may_be_off():
     assert found.params[0, 2:4].tolist() == [498.0, 401.0]
     assert not found.determined[0, NAMES.index("center")]
     # three photo sets of ten are cropped, by 15 % of the longer side; whether this one is, rounding may say a little
-    # about: on three machines the deviations were between 40 and 150 pixels
+    # about: with eight seeds the deviations were between 40 and 150 pixels
     assert (found.deviations[0, 2:4] > 3.0 * np.abs(found.params[0, 2:4] - true[2:4])).all()
     assert (found.deviations[0, 2:4] < 1.01 * 150).all()
 
