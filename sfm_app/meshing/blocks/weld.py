@@ -92,7 +92,8 @@ def weld(below: Surface, above: Surface, axis: int, at: float, cell: float, halo
 def close_cracks(surface: Surface, at_planes: NDArray[np.bool_]) -> Surface:
     """Return the surface as an oriented manifold, with the short loops of open edges closed that touch a plane.
 
-    Triangles that welding has folded are removed, and the hole that each leaves is closed with larger ones.
+    Triangles that welding has folded are removed, and the hole that each leaves is closed with larger ones. Where one
+    had two corners in one place, as planes that nearly touch leave them, these become one.
 
     Args:
         surface: welded.
@@ -100,11 +101,29 @@ def close_cracks(surface: Surface, at_planes: NDArray[np.bool_]) -> Surface:
     """
     found = make_manifold(Surface(surface.vertices, surface.faces, np.column_stack([surface.colors, at_planes])))
     for _ in range(ROUNDS):
+        found = _join_same_places(found)
         fills = _crack_fills(found.faces, np.flatnonzero(found.colors[:, 3]))
         if not len(fills):
             break
         found = make_manifold(Surface(found.vertices, np.concatenate([found.faces, fills]), found.colors))
     return Surface(found.vertices, found.faces, found.colors[:, :3])
+
+
+def _join_same_places(surface: Surface) -> Surface:
+    """Return the surface with the ends of open edges at planes as one vertex where they lie in one place.
+
+    Args:
+        surface: the fourth of its colors says which vertices are at a plane.
+    """
+    edges, edge_of = unique_edges(surface.faces)
+    ends = np.unique(edges[np.bincount(edge_of.ravel(), minlength=len(edges)) == 1])
+    ends = ends[surface.colors[ends, 3] != 0]
+    _, first, place = np.unique(surface.vertices[ends], axis=0, return_index=True, return_inverse=True)
+    same = np.arange(len(surface.vertices))
+    same[ends] = ends[first[place.ravel()]]
+    if (same == np.arange(len(same))).all():
+        return surface
+    return make_manifold(Surface(surface.vertices, same[surface.faces], surface.colors))
 
 
 def cut_at_plane(surface: Surface, axis: int, at: float, *, keep_below: bool) -> tuple[Surface, Border]:

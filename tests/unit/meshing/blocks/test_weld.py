@@ -60,6 +60,32 @@ def test_a_ball_in_four_blocks_is_closed_and_round(noise):
     assert off.max() < (0.05 + 5 * noise) * CELL
 
 
+def test_a_crack_without_area_is_closed():
+    """Two planes that nearly touch leave two vertices in one place, with flat triangles between them."""
+    whole = ball(1, noise=0.0)
+    around = np.flatnonzero((whole.faces == 0).any(axis=1))
+    fan = {}  # from one neighbor of vertex 0 to the next
+    for face in whole.faces[around]:
+        at = int(np.flatnonzero(face == 0)[0])
+        fan[int(face[(at + 1) % 3])] = int(face[(at + 2) % 3])
+    first = min(fan)
+    second = fan[fan[first]]
+    twin = len(whole.vertices)
+    faces = whole.faces.copy()
+    for face in around:
+        corners = faces[face].tolist()
+        if corners[(corners.index(0) + 1) % 3] in (first, fan[first]):
+            faces[face][corners.index(0)] = twin
+    faces = np.concatenate([faces, [[0, twin, first], [twin, 0, second]]])
+    torn = Surface(np.concatenate([whole.vertices, whole.vertices[:1]]), faces, np.zeros((twin + 1, 3), np.uint8))
+    assert len(open_edges(torn)) == 0 and len(open_edges(make_manifold(torn))) == 4
+
+    found = close_cracks(torn, np.ones(twin + 1, bool))
+
+    assert len(open_edges(found)) == 0
+    assert (len(found.vertices), len(found.faces)) == (len(whole.vertices), len(whole.faces))
+
+
 def test_normals_at_the_planes_are_those_beside_them():
     found = four(lambda seed: ball(seed, 0.02), 0.013, -0.021, CELL, HALO)
     normals = vertex_normals(found.vertices, found.faces)
