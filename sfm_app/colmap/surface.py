@@ -21,7 +21,7 @@ def fuse(
     min_views: int,
     box: NDArray[np.float64],
     target: Path,
-    cache_gb: float = 2.0,
+    cache_gb: float = 0.0,
 ) -> None:
     """Fuse the geometric maps of a dense workspace into the PLY file `target`.
 
@@ -30,7 +30,8 @@ def fuse(
         min_views: smallest number of photos that see a point.
         box: (2, 3) lowest and highest coordinates that are kept.
         target: PLY file, in any folder.
-        cache_gb: memory for depth and normal maps; with less, they are read more often.
+        cache_gb: memory for depth and normal maps; with less, they are read more often. 0: all are held, which takes
+            half the time.
     """
     task: FuseTask = {
         "do": "fuse",
@@ -127,16 +128,18 @@ def poisson_surface(folder: Path, depth: int) -> Surface:
     return surface
 
 
-def simplify(surface: Surface, share: float, max_error: float, scratch: Path) -> Surface:
+def simplify(surface: Surface, most: int, max_error: float, scratch: Path, threads: int = 1) -> Surface:
     """Collapse edges, cheapest first by their quadric error (Garland and Heckbert, SIGGRAPH 1997).
 
     Each vertex has the mean color of the vertices that it replaces.
 
     Args:
         surface: a manifold; its borders are kept.
-        share: share of the triangles at which simplification stops, in (0, 1].
-        max_error: largest root of the summed squared distances of a vertex from the planes it replaces; 0: unlimited.
+        most: triangles that may be left, >= 1.
+        max_error: edges go on being collapsed up to this root of the summed squared distances of a vertex from the
+            planes it replaces; 0: no more than `most` asks for.
         scratch: folder for two temporary files.
+        threads: number of threads; the surface is the same for any.
     """
     given, found = scratch / "fine.ply", scratch / "coarse.ply"
     trimesh.Trimesh(surface.vertices, surface.faces, process=False).export(given)
@@ -144,24 +147,25 @@ def simplify(surface: Surface, share: float, max_error: float, scratch: Path) ->
         "do": "simplify",
         "mesh": str(given),
         "target": str(found),
-        "share": share,
+        "most": most,
         "max_error": max_error,
+        "threads": threads,
     }
     run_worker("sfm_app.colmap.processes.surface_process", task, "simplifying the surface")
     simple = _read(found)
     given.unlink()
     found.unlink()
-    return Surface(simple.vertices, simple.faces, _mean_colors(surface, simple.vertices))
+    return Surface(simple.vertices, simple.faces, _mean_colors(surface, simple.vertices, threads))
 
 
-def _mean_colors(surface: Surface, vertices: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _mean_colors(surface: Surface, vertices: NDArray[np.float64], threads: int) -> NDArray[np.uint8]:
     """Return (V, 3) mean colors of the old vertices whose nearest new vertex (V, 3) is each one.
 
     They are computed here because pycolmap 4.2 reads no colors.
     """
     from scipy.spatial import cKDTree
 
-    _, at = cKDTree(vertices).query(surface.vertices)
+    _, at = cKDTree(vertices).query(surface.vertices, workers=threads)
     count = np.bincount(at, minlength=len(vertices))
     total = np.stack([np.bincount(at, channel, len(vertices)) for channel in surface.colors.T], axis=1)
     mean = np.rint(total / np.maximum(count, 1)[:, None]).astype(np.uint8)

@@ -21,6 +21,8 @@ FEATURES_PER_MP = 4500
 FUSED_AT_ONCE_MP = 75.0
 """Megapixels of depth maps that are fused at once; more are fused in blocks. Chosen on 1000 photos of a town, where 50,
 75 and 150 cost the same CPU seconds, and 6.5, 6.8 and 14 GB with two workers."""
+MAPS_MB_PER_MP = 28
+"""Memory of the maps themselves; on photos of a town."""
 FUSED_MB_PER_MP = 42
 """Memory of COLMAP's fusion for each megapixel of depth maps, points included; on photos of a town."""
 POINTS_PER_MP = 70_000
@@ -79,8 +81,8 @@ def largest_photo_megapixels(limit_mb: float) -> float:
 def cache_gb(limit_mb: float) -> float:
     """Return the size of fusion's cache of depth maps in GB; the points and the surface need memory, too.
 
-    Fusion needs 28 MB per megapixel of depth maps. Where the cache is smaller, it reads all maps again and again:
-    200 photos were not done after half an hour with 2 GB.
+    Where the cache is smaller than the maps, fusion reads all of them again and again: 200 photos were not done after
+    half an hour with 2 GB.
     """
     return min(64.0, max(0.25, (limit_mb - 1500) / 1000))
 

@@ -98,7 +98,7 @@ def _mesh_at_once(
     if run.settings.texture.normal_map:
         save_fine([FineShape.from_surface(detailed)], run.workspace.fine_surface)
     with run.step("simplifying"):
-        simple = make_manifold(simplify_mesh(detailed, options, run.workspace.surface))
+        simple = make_manifold(simplify_mesh(detailed, options, run.workspace.surface, run.workers))
     return _check_nonempty(simple, "the surface has no extent")
 
 

@@ -35,7 +35,8 @@ def fuse(task: FuseTask) -> None:
     options.max_normal_error = MAX_NORMAL_ERROR_DEG
     low, high = np.array(task["box"], np.float32)
     options.bounding_box = (low, high)
-    options.use_cache, options.cache_size = True, task["cache_gb"]  # else all maps of all photos are in memory at once
+    options.use_cache = task["cache_gb"] > 0.0  # else all maps are in memory at once, which takes half the time
+    options.cache_size = task["cache_gb"] or options.cache_size
     options.num_threads = 1
     pycolmap.stereo_fusion(Path(task["target"]), Path(task["dense"]), options=options, output_type="ply")
 
@@ -50,12 +51,24 @@ def mesh_poisson(task: PoissonTask) -> None:
 
 
 def simplify(task: SimplifyTask) -> None:
-    """Simplify a surface to fewer triangles."""
+    """Simplify a surface as far as its error allows, and then to as few triangles as are asked for."""
     options = pycolmap.MeshSimplificationOptions()
-    options.target_face_ratio, options.max_error = task["share"], task["max_error"] ** 2
-    options.boundary_weight = BORDER_WEIGHT
-    options.num_threads = 1
-    pycolmap.simplify_mesh(Path(task["mesh"]), Path(task["target"]), options)
+    options.boundary_weight, options.num_threads = BORDER_WEIGHT, task["threads"]
+    source, target = Path(task["mesh"]), Path(task["target"])
+    faces = count_faces(source)
+    if task["max_error"]:
+        options.target_face_ratio, options.max_error = 1.0 / faces, task["max_error"] ** 2
+        pycolmap.simplify_mesh(source, target, options)
+        source, faces = target, count_faces(target)
+    if source != target or faces > task["most"]:
+        options.target_face_ratio, options.max_error = min(task["most"] / faces, 1.0), 0.0
+        pycolmap.simplify_mesh(source, target, options)
+
+
+def count_faces(mesh: Path) -> int:
+    """Return the number of triangles that the header of a PLY file states."""
+    with mesh.open("rb") as file:
+        return next(int(line.split()[2]) for line in file if line.startswith(b"element face"))
 
 
 if __name__ == "__main__":

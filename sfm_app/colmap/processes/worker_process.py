@@ -109,8 +109,9 @@ class SimplifyTask(TypedDict):
     do: Literal["simplify"]
     mesh: str
     target: str
-    share: float
+    most: int
     max_error: float
+    threads: int
 
 
 class WorkerProcess:

@@ -20,7 +20,7 @@ from sfm_app.hashing import fingerprint
 from sfm_app.meshing.blocks.partition import split_points
 from sfm_app.operating_system import share_bytes
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.cost_estimate import FUSED_AT_ONCE_MP, cache_gb
+from sfm_app.runtime.cost_estimate import FUSED_AT_ONCE_MP, MAPS_MB_PER_MP, cache_gb
 from sfm_app.stereo import View, region
 from sfm_app.tasks import Task
 
@@ -51,7 +51,8 @@ class FusionTask:
     """(2, 3) lowest and highest coordinates of its points."""
     min_views: int
     """Photos that have to see a point."""
-    cache_gb: float
+    memory_gb: float
+    """For maps."""
 
     @property
     def path(self) -> Path:
@@ -72,7 +73,7 @@ def fuse_maps(dense_dir: Path, views: Sequence[View], min_views: int, target: Pa
     pixels = sum(view.width * view.height for view in views)
     if pixels <= MOST_PIXELS:
         with run.step("fusing depth maps"), replace_atomically(target) as path:
-            fuse(dense_dir, min_views, region(views), path, cache_gb(run.memory_mb))
+            fuse(dense_dir, min_views, region(views), path, _cache_gb(views, cache_gb(run.memory_mb)))
         return
     folder = target.parent / FUSING
     made_from = fingerprint(run.fingerprint, [[view.name, _stamp(dense_dir, view)] for view in views], min_views)
@@ -137,10 +138,16 @@ def fuse_block(task: FusionTask) -> None:
     write_fusion_views(scratch, task.views)
     with replace_atomically(task.path) as path:
         if task.views:
-            fuse(scratch, task.min_views, task.box, path, task.cache_gb)
+            fuse(scratch, task.min_views, task.box, path, _cache_gb(task.views, task.memory_gb))
         else:
             path.touch()
     shutil.rmtree(scratch)
+
+
+def _cache_gb(views: Sequence[View], memory_gb: float) -> float:
+    """Return the size of fusion's cache, 0 where memory holds all maps."""
+    needed_mb = MAPS_MB_PER_MP * sum(view.width * view.height for view in views) / 1e6
+    return memory_gb if needed_mb > 1000 * memory_gb else 0.0
 
 
 def sample_points(dense_dir: Path, view: View) -> FloatArray:

@@ -102,18 +102,16 @@ def judge_view(judges: Shared[SurfaceJudge], view: View) -> Judgment:
     return judges.value.judge(view)
 
 
-def simplify_mesh(surface: Surface, options: MeshSettings, scratch: Path) -> Surface:
+def simplify_mesh(surface: Surface, options: MeshSettings, scratch: Path, threads: int = 1) -> Surface:
     """Simplify to as few triangles as the error allows, and no more than asked for.
 
     Args:
         surface: detailed triangles.
         options: largest error, and most triangles.
         scratch: folder for temporary files.
+        threads: number of threads; the surface is the same for any.
     """
-    simple = surface
-    if options.max_error_edges:
-        edge = median_edge_length(surface.vertices, surface.faces)
-        simple = simplify(surface, 1.0 / len(surface.faces), options.max_error_edges * edge, scratch)
-    if len(simple.faces) > options.faces:
-        simple = simplify(simple, options.faces / len(simple.faces), 0.0, scratch)
-    return simple
+    if not options.max_error_edges and len(surface.faces) <= options.faces:
+        return surface
+    edge = median_edge_length(surface.vertices, surface.faces)
+    return simplify(surface, options.faces, options.max_error_edges * edge, scratch, threads)

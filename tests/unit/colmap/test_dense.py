@@ -84,7 +84,9 @@ def test_fused_points_lie_on_the_plane_and_face_the_cameras(workspace):
     dense, _ = workspace
 
     fuse(dense, 3, BOX, dense / FUSED)
+    fuse(dense, 3, BOX, dense / "cached.ply", cache_gb=0.25)
     records = open_points(dense / FUSED)
+    assert (dense / "cached.ply").read_bytes() == (dense / FUSED).read_bytes()
     points, normals = positions(records), np.stack([records[c] for c in ("nx", "ny", "nz")], axis=1)
 
     assert 1000 < len(points) < 120 * 90
@@ -191,7 +193,7 @@ def test_a_surface_does_not_depend_on_those_before_it(workspace):
 def test_simplification_spares_what_is_curved_and_keeps_borders_and_colors(tmp_path):
     fine = wavy(40)
 
-    found = simplify(fine, 0.2, 0.0, tmp_path)
+    found = simplify(fine, len(fine.faces) // 5, 0.0, tmp_path)
 
     assert 0.15 * len(fine.faces) < len(found.faces) <= 0.2 * len(fine.faces)
     middles = found.vertices[found.faces].mean(axis=1)[:, 0]
@@ -207,11 +209,16 @@ def test_simplification_spares_what_is_curved_and_keeps_borders_and_colors(tmp_p
 def test_simplification_by_error_stops_where_it_would_move_the_surface(tmp_path, max_error):
     fine = wavy(40)
 
-    found = simplify(fine, 1e-4, max_error, tmp_path)
+    found = simplify(fine, len(fine.faces), max_error, tmp_path)
+    fewer = simplify(fine, len(found.faces) // 2, max_error, tmp_path)
+    threaded = simplify(fine, len(found.faces) // 2, max_error, tmp_path, threads=2)
 
     closest = trimesh.proximity.closest_point_naive(trimesh.Trimesh(found.vertices, found.faces), fine.vertices)[1]
     assert 0.05 * max_error < closest.max() < 2 * max_error
     assert 20 < len(found.faces) < 0.5 * len(fine.faces)
+    assert 0.7 * len(found.faces) // 2 < len(fewer.faces) <= len(found.faces) // 2
+    np.testing.assert_array_equal(threaded.vertices, fewer.vertices)
+    np.testing.assert_array_equal(threaded.faces, fewer.faces)
 
 
 def test_points_in_one_spot_give_a_surface_without_triangles(tmp_path):
