@@ -147,7 +147,11 @@ class DenseStore:
     def read_estimate(self, view: View) -> DepthEstimate:
         """Read the photometric map of a view."""
         confidence = _read_depth_format(self.dense_dir, CONFIDENCES, view, "photometric")
-        return DepthEstimate(read_depth(self.dense_dir, view, "photometric"), confidence)
+        return DepthEstimate(self.read_depth(view), confidence)
+
+    def read_depth(self, view: View) -> NDArray[np.float32]:
+        """Read the depths of the photometric map of a view."""
+        return read_depth(self.dense_dir, view, "photometric")
 
     def write_estimate(self, view: View, estimate: DepthEstimate) -> None:
         """Write the photometric map of a view, without depth where the photo is masked.

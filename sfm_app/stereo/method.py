@@ -14,7 +14,7 @@ from sfm_app.settings.tables import AS_NEEDED
 from sfm_app.stereo.depth import DepthEstimate, DepthMap, confirm_depths, match_depths
 from sfm_app.stereo.levels import MOST_OPEN, fill_from_coarse, halve_views, open_share
 from sfm_app.stereo.sky import blank_areas, near_pixels
-from sfm_app.stereo.view import GrayImage, View
+from sfm_app.stereo.view import DepthArray, GrayImage, View
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Rejected
 
@@ -39,6 +39,9 @@ class DepthStore(Protocol):
 
     def read_estimate(self, view: View, /) -> DepthEstimate:
         """Return the photometric map."""
+
+    def read_depth(self, view: View, /) -> DepthArray:
+        """Return the depths of the photometric map."""
 
     def write_estimate(self, view: View, estimate: DepthEstimate, /) -> None:
         """Keep the photometric map.
@@ -174,7 +177,7 @@ def _confirm_level(task: _Inputs, level: int, usable: NDArray[np.bool_], index: 
     if not store.has(view, "photometric"):
         return Rejected("no depth map of this size")
     others = [
-        (views[other], store.read_estimate(views[other]).depth)
+        (views[other], store.read_depth(views[other]))
         for other in task.ranked[index]
         if usable[other] and store.has(views[other], "photometric")
     ]

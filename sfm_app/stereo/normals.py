@@ -27,7 +27,9 @@ def fit_planes(depth: DepthArray) -> PlaneArray:
     planes = np.zeros((*depth.shape, 3), np.float32)
     steps = np.arange(-RADIUS_PX, RADIUS_PX + 1)
     profile = np.exp(-0.5 * (steps / SIGMA_PX) ** 2)
-    _fit(depth, np.outer(profile, profile), planes)
+    inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0, dtype=np.float64)
+    window = np.outer(profile, profile)
+    _fit(depth, inverse, (window, MIN_WEIGHT * float(window.sum())), planes)
     return planes
 
 
@@ -61,18 +63,21 @@ def _find_normals(planes: PlaneArray, K: FloatArray, sample: float, normals: NDA
 
 
 @kernel
-def _fit(depth: DepthArray, window: FloatArray, planes: PlaneArray) -> None:
+def _fit(depth: DepthArray, inverse: FloatArray, weights: tuple[FloatArray, float], planes: PlaneArray) -> None:
     for row in range(depth.shape[0]):
         for col in range(depth.shape[1]):
             if depth[row, col] > 0:
-                g0, gu, gv = _slopes(depth, row, col, window)
+                g0, gu, gv = _slopes(depth, inverse, row, col, weights)
                 if g0 > 0:
                     planes[row, col, 0], planes[row, col, 1], planes[row, col, 2] = g0, gu, gv
 
 
 @kernel
-def _slopes(depth: DepthArray, row: int, col: int, window: FloatArray) -> tuple[float, float, float]:
+def _slopes(
+    depth: DepthArray, inverse: FloatArray, row: int, col: int, weights: tuple[FloatArray, float]
+) -> tuple[float, float, float]:
     """Fit the inverse depth g0 + gu du + gv dv, (du, dv) in pixels from (col, row); g0 = 0 where undetermined."""
+    window, least = weights
     height, width = depth.shape
     z = depth[row, col]
     n, su, sv, suu, suv, svv, q, qu, qv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -82,17 +87,17 @@ def _slopes(depth: DepthArray, row: int, col: int, window: FloatArray) -> tuple[
             if other <= 0 or abs(other - z) > MAX_STEP * z:
                 continue
             weight = window[i - row + RADIUS_PX, j - col + RADIUS_PX]
-            du, dv, inverse = float(j - col), float(i - row), weight / other
+            du, dv, share = float(j - col), float(i - row), weight * inverse[i, j]
             n += weight
             su += weight * du
             sv += weight * dv
             suu += weight * du * du
             suv += weight * du * dv
             svv += weight * dv * dv
-            q += inverse
-            qu += du * inverse
-            qv += dv * inverse
-    if n < MIN_WEIGHT * np.sum(window):
+            q += share
+            qu += du * share
+            qv += dv * share
+    if n < least:
         return 0.0, 0.0, 0.0
     suu, suv, svv = suu - su * su / n, suv - su * sv / n, svv - sv * sv / n
     qu, qv = qu - su * q / n, qv - sv * q / n

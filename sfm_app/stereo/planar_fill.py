@@ -85,15 +85,14 @@ def _fill_area(depth: DepthArray, area: NDArray[np.bool_], tolerance: float, wal
 def _consensus_plane(A: FloatArray, inverse: FloatArray, tolerance: float) -> FloatArray:
     """Estimate inverse depth as a linear function of column and row, (3,), by consensus of the pixels."""
     rng = np.random.default_rng(0)
-    some = rng.integers(0, len(A), SAMPLED_PIXELS)
-    best, most = np.array([np.median(inverse), 0.0, 0.0]), 0
-    for triple in rng.integers(0, len(A), (SAMPLES, 3)):
-        if abs(np.linalg.det(A[triple])) < 1.0:  # collinear
-            continue
-        plane = np.linalg.solve(A[triple], inverse[triple])
-        agreeing = int(np.count_nonzero(np.abs(A[some] @ plane / inverse[some] - 1.0) < tolerance))
-        if agreeing > most:
-            best, most = plane, agreeing
+    some, triples = rng.integers(0, len(A), SAMPLED_PIXELS), rng.integers(0, len(A), (SAMPLES, 3))
+    triples = triples[np.abs(np.linalg.det(A[triples])) >= 1.0]  # the others are collinear
+    best = np.array([np.median(inverse), 0.0, 0.0])
+    if len(triples):
+        planes = np.linalg.solve(A[triples], inverse[triples][..., None])[..., 0]
+        agreeing = np.count_nonzero(np.abs(A[some] @ planes.T / inverse[some, None] - 1.0) < tolerance, axis=0)
+        if agreeing.any():
+            best = planes[np.argmax(agreeing)]
     for _ in range(3):
         agrees = np.abs(A @ best / inverse - 1.0) < tolerance
         if np.count_nonzero(agrees) < 3:

@@ -83,6 +83,9 @@ class Memory:
     def read_estimate(self, view):
         return self.estimates[view.name, view.level]
 
+    def read_depth(self, view):
+        return self.estimates[view.name, view.level].depth
+
     def write_estimate(self, view, estimate):
         self.estimates[view.name, view.level] = estimate
 
