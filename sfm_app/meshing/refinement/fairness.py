@@ -116,26 +116,42 @@ def _bends(
 
 
 @kernel
-def _spread(starts: IndexArray, others: IndexArray, weight: FloatArray, d: FloatArray, out: FloatArray) -> None:
-    """Fill in L d: the mean of the neighbors less the vertex, where its weight is not 0."""
+def _apply(
+    starts: IndexArray, others: IndexArray, share: FloatArray, weight: FloatArray, d: FloatArray, scratch: FloatArray,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    """Fill in L' W L d; L d is the mean of the neighbors less the vertex.
+
+    Args:
+        starts, others: the neighbors.
+        share: (V,) one over the number of neighbors.
+        weight: (V,) the diagonal of W; 0 where there are no neighbors.
+        d: (V,).
+        scratch: (V,), overwritten.
+        out: (V,), overwritten.
+    """
     for v in range(len(d)):
         out[v] = 0.0
         if weight[v] > 0.0:
             total = 0.0
             for k in range(starts[v], starts[v + 1]):
                 total += d[others[k]]
-            out[v] = total / (starts[v + 1] - starts[v]) - d[v]
+            out[v] = weight[v] * (total * share[v] - d[v])
+    _gather(starts, others, share, scratch, out)
 
 
 @kernel
-def _gather(starts: IndexArray, others: IndexArray, bends: FloatArray, out: FloatArray) -> None:
-    """Fill in L' bends; those are 0 where the weight is."""
+def _gather(
+    starts: IndexArray, others: IndexArray, share: FloatArray, scratch: FloatArray, bends: FloatArray
+) -> None:
+    """Replace bends by L' bends; those are 0 where the weight is. `scratch` (V,) is overwritten."""
+    for v in range(len(bends)):
+        scratch[v] = bends[v] * share[v]
     for v in range(len(bends)):
         total = -bends[v]
         for k in range(starts[v], starts[v + 1]):
-            n = others[k]
-            total += bends[n] / (starts[n + 1] - starts[n])
-        out[v] = total
+            total += scratch[others[k]]
+        bends[v] = total
 
 
 @kernel
@@ -148,24 +164,26 @@ def _solve(
     It ends after a number of steps, or at a share of the first residual.
     """
     count = len(d)
-    diagonal, r, across = np.empty(count), np.empty(count), np.empty(count)
-    _gather(starts, others, weight * bend, across)
+    share, scratch, diagonal, r = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
     for v in range(count):
-        r[v] = g[v] - across[v]
+        share[v] = 1.0 / max(starts[v + 1] - starts[v], 1)
+        scratch[v] = weight[v] * share[v] * share[v]
+    for v in range(count):
         diagonal[v] = stiff[v] + weight[v]
         for k in range(starts[v], starts[v + 1]):
-            n = others[k]
-            diagonal[v] += weight[n] / (starts[n + 1] - starts[n]) ** 2
-    way, product = r / diagonal, np.empty(count)
+            diagonal[v] += scratch[others[k]]
+    scale, product = 1.0 / diagonal, weight * bend
+    _gather(starts, others, share, scratch, product)
     energy = 0.0
     for v in range(count):
-        energy += r[v] * way[v]
+        r[v] = g[v] - product[v]
+        energy += r[v] * r[v] * scale[v]
+    way = r * scale
     enough = end[1] * end[1] * energy
     for _ in range(end[0]):
         if energy <= enough or energy <= 0.0:
             break
-        _spread(starts, others, weight, way, across)
-        _gather(starts, others, weight * across, product)
+        _apply(starts, others, share, weight, way, scratch, product)
         along = 0.0
         for v in range(count):
             product[v] += stiff[v] * way[v]
@@ -175,6 +193,7 @@ def _solve(
         for v in range(count):
             d[v] += step * way[v]
             r[v] -= step * product[v]
-            energy += r[v] * r[v] / diagonal[v]
+            energy += r[v] * r[v] * scale[v]
+        ratio = energy / before
         for v in range(count):
-            way[v] = r[v] / diagonal[v] + energy / before * way[v]
+            way[v] = r[v] * scale[v] + ratio * way[v]
