@@ -30,9 +30,9 @@ POINTS_PER_MP = 70_000
 BLOCK_MB_PER_POINT = 1200 / MEGA
 """Memory of Poisson's reconstruction and of the surface that it gives, for each point of a block: COLMAP's process had
 950 bytes for each of 1.3 million points of a town."""
-DEPTH_SECONDS_PER_MP = 1.3
-"""Core seconds of the depth maps for each of their megapixels and each neighbor: 1.1 on fountain-P11 and castle-P19
-with one level; a second one takes a quarter of the first."""
+DEPTH_SECONDS_PER_MP = 1.2
+"""Core seconds of the depth maps for each of their megapixels and each neighbor: 1.0 on fountain-P11 with one level,
+1.2 on castle-P19 with two."""
 REFINE_SECONDS_PER_MP, REFINE_MB, REFINE_MB_PER_MP = 1.0, 200.0, 25.0
 """Core seconds of the surface's refinement for each megapixel of photos, its memory, and that for each megapixel of the
 photos that it holds at once, divided triangles included; on fountain-P11 and `ornament`."""
@@ -149,8 +149,8 @@ def make_plan(photos: Iterable[Photo], settings: Settings, workers: int, limit_m
             "scale": 1.0
             + (0.2 * sum(width * height for width, height in sizes) / MEGA if settings.scale.markers else 0.0),
             "depth_maps": DEPTH_SECONDS_PER_MP * sum(mapped) * settings.depth.neighbors,
-            "mesh": 15
-            + (2.0 if dense <= FUSED_AT_ONCE_MP else 2.7) * dense
+            "mesh": 5
+            + (1.6 if dense <= FUSED_AT_ONCE_MP else 2.7) * dense
             + REFINE_SECONDS_PER_MP * sum(refined) / workers,
             "texture": 0.1 * sum(width * height for width, height in sizes) / MEGA,
             "files": 1.0,
