@@ -13,17 +13,20 @@ from sfm_app.report.words import WARNING, duration_text, field_text
 from sfm_app.runtime.manifest import model_triangles
 from sfm_app.types.calibration import EQUIRECTANGULAR
 
+EARLIER = 1.2
+"""Seconds of all stages over those of this command from which on both are printed: stages were up to date."""
 SHOWN = 3
 """Most warnings, and most photos that are not in the model, that are printed; the report has all."""
 WIDTH = 160
 """Most characters of a warning."""
 
 
-def outcome_lines(run: Run) -> list[str]:
+def outcome_lines(run: Run, seconds: float) -> list[str]:
     """Return what came of a run; `run_lines` has everything else.
 
     Args:
         run: up to any stage.
+        seconds: that it took this time.
     """
     lines = [
         f"{headline(run)}.",
@@ -33,8 +36,9 @@ def outcome_lines(run: Run) -> list[str]:
         *_warning_lines(run),
         *_place_lines(run),
     ]
-    seconds = sum(stage["seconds"] for stage in run.manifest.get("stages", {}).values())
-    return [*lines, f"took        {duration_text(seconds)}; -v prints everything that was found"]
+    whole = sum(stage["seconds"] for stage in run.manifest.get("stages", {}).values())
+    earlier = f", {duration_text(whole)} with what was there" if whole > EARLIER * seconds else ""
+    return [*lines, f"took        {duration_text(seconds)}{earlier}; -v prints everything that was found"]
 
 
 def headline(run: Run) -> str:

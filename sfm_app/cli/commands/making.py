@@ -1,6 +1,7 @@
 """Commands that make models, and what is needed for that."""
 
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import click
@@ -44,15 +45,16 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: A
     from sfm_app.cli.outcome import outcome_lines
     from sfm_app.cli.terminal import Terminal
 
-    settings = settings_from_flags(flags)
+    settings, start = settings_from_flags(flags), monotonic()
     place = out or photos.resolve().with_name(f"{photos.resolve().name}-model")
     with Terminal(quiet=flags["quiet"]) as progress:
         done = sfm_app.reconstruct(photos, place, settings, first=first or "", last=last, progress=progress)
     if flags["as_json"]:
         print_json(run_summary(done))
         return
+    took_s = monotonic() - start
     print_picture(done, settings, quiet=flags["quiet"])
-    print_text(run_lines(done) if flags["verbose"] else outcome_lines(done))
+    print_text(run_lines(done) if flags["verbose"] else outcome_lines(done, took_s))
     print_lines(run_steps(done, photos, out, settings, quiet=flags["quiet"]))
 
 

@@ -7,6 +7,7 @@ finest features, which are also the least exact ones: photos that show much do a
 import copy
 import tempfile
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -43,8 +44,9 @@ def find_as_needed(
     with open_database(database) as before:
         ids = {image.name: image.image_id for image in before.read_all_images()}
         left = {name for name in names if not before.exists_keypoints(ids[name])}
-    for first in range(0, len(names), PHOTOS_AT_ONCE):
-        some = names[first : first + PHOTOS_AT_ONCE]
+    # a short rest would leave workers idle
+    bounds = [*range(0, max(len(names) - PHOTOS_AT_ONCE // 2, 1), PHOTOS_AT_ONCE), len(names)]
+    for some in (names[first:last] for first, last in pairwise(bounds)):
         if left.isdisjoint(some):
             continue
         # a run that goes on where a killed one ended looks at the same sample

@@ -141,9 +141,7 @@ def _apply(
 
 
 @kernel
-def _gather(
-    starts: IndexArray, others: IndexArray, share: FloatArray, scratch: FloatArray, bends: FloatArray
-) -> None:
+def _gather(starts: IndexArray, others: IndexArray, share: FloatArray, scratch: FloatArray, bends: FloatArray) -> None:
     """Replace bends by L' bends; those are 0 where the weight is. `scratch` (V,) is overwritten."""
     for v in range(len(bends)):
         scratch[v] = bends[v] * share[v]

@@ -42,7 +42,7 @@ def finished(tmp_path):
 
 
 def test_it_says_what_came_of_it_how_good_it_is_and_where(finished):
-    lines = outcome_lines(finished)
+    lines = outcome_lines(finished, 250.0)
 
     assert lines[0] == "A model of 2 of 4 photos, with 12,345 triangles."
     assert "photos show its points to 0.31 px" in lines[1]
@@ -56,9 +56,13 @@ def test_it_says_what_came_of_it_how_good_it_is_and_where(finished):
     assert lines[11] == "took        4 min; -v prints everything that was found"
 
 
+def test_what_was_there_before_is_not_counted_as_work(finished):
+    assert outcome_lines(finished, 65.0)[-1].startswith("took        65 s, 4 min with what was there; ")
+
+
 def test_of_many_only_the_first_few_are_named(finished):
     scene = replace(finished.scene, unregistered={f"{k:02}.jpg": "no match" for k in range(40)})
-    lines = outcome_lines(replace(finished, scene=scene))
+    lines = outcome_lines(replace(finished, scene=scene), 250.0)
 
     assert sum("not placed" in line for line in lines) == 2
     assert any(line.strip() == "and 38 more photos; -v prints them" for line in lines)
@@ -69,25 +73,27 @@ def test_of_many_only_the_first_few_are_named(finished):
 def test_a_camera_that_pairs_do_not_determine_is_called_so(finished, after, says):
     guess = Calibration(K, 1000, 800, "guess", False, "an orbit")
     run = replace(finished, calibration=Intrinsics({"one": guess}), scene=finished.scene if after else None)
-    assert any(f"pairs of photos do not determine it, {says}: an orbit" in line for line in outcome_lines(run))
+    assert any(f"pairs of photos do not determine it, {says}: an orbit" in line for line in outcome_lines(run, 250.0))
 
 
 def test_a_camera_of_no_placed_photo_is_not_told(finished):
     guess = Calibration(K, 640, 480, "guess", False, "0 usable pairs")
-    text = "\n".join(outcome_lines(replace(finished, calibration=Intrinsics({"two": guess, "one": KNOWN}))))
+    text = "\n".join(outcome_lines(replace(finished, calibration=Intrinsics({"two": guess, "one": KNOWN})), 250.0))
 
     assert "camera      focal 501.0" in text and "0 usable pairs" not in text
 
 
 def test_a_size_that_is_not_known_is_asked_for(finished):
     stages = {**finished.manifest["stages"], "scale": {"counts": {**SIZE, "unit": ""}, "seconds": 1.0}}
-    [size] = [line for line in outcome_lines(replace(finished, manifest={"stages": stages})) if line[:4] == "size"]
+    [size] = [
+        line for line in outcome_lines(replace(finished, manifest={"stages": stages}), 250.0) if line[:4] == "size"
+    ]
 
     assert '"measure" in the report' in size and len(size) <= 80
 
 
 def test_a_run_that_was_stopped_early_says_how_far_it_came(finished):
     earlier = replace(finished, mesh_path=None)
-    assert outcome_lines(earlier)[0] == "Cameras and points of 2 of 4 photos."
-    assert outcome_lines(replace(earlier, scene=None))[0] == "The camera of 4 photos."
-    assert outcome_lines(replace(earlier, scene=None, calibration=None))[0] == "4 usable photos."
+    assert outcome_lines(earlier, 250.0)[0] == "Cameras and points of 2 of 4 photos."
+    assert outcome_lines(replace(earlier, scene=None), 250.0)[0] == "The camera of 4 photos."
+    assert outcome_lines(replace(earlier, scene=None, calibration=None), 250.0)[0] == "4 usable photos."
