@@ -4,21 +4,34 @@ import os
 import sys
 import webbrowser
 from pathlib import Path
+from threading import Thread
 
-DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
+SIGNS = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
+"""Variables of which one is set where there is a screen, or a way to one from elsewhere, as editors set it."""
+OPENING_S = 2.0
+"""Longest time that opening is waited for. Chosen by hand."""
 
 
 def open_browser(address: str) -> bool:
     """Open an address in the user's browser, and return whether there is one.
 
-    On a machine without a screen, a browser of text would take over the terminal: there, none is opened.
+    On a machine without a screen, a browser of text would take over the terminal: there, none is opened, unless one is
+    asked for. Some commands last as long as the browser; they are not waited for.
     """
-    if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in DISPLAYS):
+    if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in SIGNS):
         return False
-    try:
-        return webbrowser.open(address)
-    except (webbrowser.Error, OSError):
-        return False
+    found = [True]
+
+    def call() -> None:
+        try:
+            found[0] = webbrowser.open(address)
+        except (webbrowser.Error, OSError):
+            found[0] = False
+
+    opening = Thread(target=call, daemon=True)
+    opening.start()
+    opening.join(OPENING_S)
+    return found[0]
 
 
 def open_report(path: Path | None, wanted: bool | None, *, quiet: bool) -> None:

@@ -18,6 +18,7 @@ from sfm_app import __version__
 from sfm_app.cli.lazy import Entry, LazyGroup
 from sfm_app.cli.output import columns, fold_lines, print_lines, to_printable
 from sfm_app.errors import SfmError
+from sfm_app.operating_system import heed_requests_to_end
 
 INTERRUPTED = 130
 FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
@@ -71,7 +72,8 @@ class Program(LazyGroup):
         if isinstance(sys.stdout, TextIOWrapper):  # in a file, Windows has no letters but those of its own language
             sys.stdout.reconfigure(errors="backslashreplace")
         try:
-            return super().main(*args, **kwargs)
+            with heed_requests_to_end():
+                return super().main(*args, **kwargs)
         finally:
             gc.freeze()  # what is imported lives to the end: looking through it again takes a third of a second at exit
             colmap = sys.modules.get("sfm_app.colmap.backend")  # None where no command has needed it

@@ -16,6 +16,7 @@ import pycolmap
 
 from sfm_app.errors import BackendError, NumericalError, SfmError
 from sfm_app.numerical import FAILURES, Json, error_reason
+from sfm_app.operating_system import keep_handler
 from sfm_app.progress import Progress
 
 __all__ = [
@@ -41,6 +42,7 @@ MIN_FREE_BYTES = 1_000_000
 """Free bytes that the disk must have: more than any program buffers before it writes."""
 
 zlib.crc32(b"")  # zlib is imported for its side effect
+keep_handler()
 _Level = pycolmap.logging.Level
 pycolmap.logging.minloglevel = _Level.FATAL.value
 

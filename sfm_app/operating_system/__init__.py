@@ -27,7 +27,9 @@ from sfm_app.operating_system.processes import (
     end_own_group,
     group_options,
     has_run_out,
+    heed_requests_to_end,
     ignore_interrupts,
+    keep_handler,
     watch_parent,
 )
 from sfm_app.operating_system.stand_ins import add_stand_ins
@@ -46,8 +48,10 @@ __all__ = [
     "free_memory_mb",
     "group_options",
     "has_run_out",
+    "heed_requests_to_end",
     "ignore_interrupts",
     "is_link",
+    "keep_handler",
     "lacks",
     "link_or_copy",
     "machine_memory_mb",

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import psutil
@@ -119,6 +119,25 @@ def end_at_exit() -> None:
 def ignore_interrupts() -> None:
     """Leave Ctrl-C to the process that has started this one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@contextlib.contextmanager
+def heed_requests_to_end() -> Iterator[None]:
+    """Let a request to end, as `kill` and `docker stop` send it, do what Ctrl-C does; in the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def keep_handler() -> None:
+    """Have a request to end handled as it was before a library took it: COLMAP prints where each thread is."""
+    with contextlib.suppress(ValueError):  # only the main thread can
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
 
 
 def has_run_out(code: int) -> bool:

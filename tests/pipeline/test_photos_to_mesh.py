@@ -313,7 +313,8 @@ def heed_interrupts():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are another thing there")
-def test_an_interrupted_run_says_so_and_goes_on(rendered, tmp_path):
+@pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_says_so_and_goes_on(rendered, tmp_path, asked):
     command = [sys.executable, "-m", "sfm_app", "run", str(rendered[0]), "-o", str(tmp_path / "out"), "-q"]
     command += ["--quality", "draft", "--set", "report=false"]
     # a run to the end: what is asked of it must not be done before the signal comes, however busy the machine is
@@ -321,7 +322,7 @@ def test_an_interrupted_run_says_so_and_goes_on(rendered, tmp_path):
     with subprocess.Popen(command, **options) as process:
         while not (tmp_path / "out" / "database.db").exists() and process.poll() is None:
             time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(asked)
         _, said = process.communicate(timeout=60)
 
     assert (process.returncode, said.splitlines()[:1]) == (130, ["error: interrupted"])

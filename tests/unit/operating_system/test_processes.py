@@ -1,6 +1,7 @@
 """Processes end with those that started them, with and without process groups and a standard input to wait for."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -16,6 +17,7 @@ from sfm_app.operating_system import (
     end_own_group,
     group_options,
     has_run_out,
+    heed_requests_to_end,
     lacks,
     processes,
 )
@@ -162,3 +164,20 @@ def test_without_exit_handlers_the_c_library_is_left_alone(without, monkeypatch)
     end_at_exit()
 
     assert asked == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are another thing there")
+def test_a_request_to_end_prints_no_stack():
+    """COLMAP has a handler of its own, which does."""
+    text = "import os, signal; import sfm_app.colmap.backend; os.kill(os.getpid(), signal.SIGTERM)"
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (-signal.SIGTERM, b"")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are another thing there")
+def test_a_request_to_end_is_as_ctrl_c_within_the_program_only():
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt), heed_requests_to_end():
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.5)
+    assert signal.getsignal(signal.SIGTERM) is before
