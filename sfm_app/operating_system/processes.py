@@ -135,7 +135,7 @@ def heed_requests_to_end() -> Iterator[None]:
 
 
 def keep_handler() -> None:
-    """Have a request to end handled as it was before a library took it: COLMAP prints where each thread is."""
+    """Take requests to end back from a library: COLMAP prints where each thread is."""
     with contextlib.suppress(ValueError):  # only the main thread can
         signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
 

@@ -3,6 +3,7 @@
 import io
 import re
 from dataclasses import replace
+from functools import partial
 
 import click
 import numpy as np
@@ -112,7 +113,7 @@ def finished(tmp_path):
     return Run(tmp_path, known, scene, None, tmp_path / "model.glb", {"stages": stages}, tmp_path / "report.html")
 
 
-@pytest.mark.parametrize("lines_of", [run_lines, outcome_lines])
+@pytest.mark.parametrize("lines_of", [run_lines, partial(outcome_lines, seconds=0.7)], ids=["all", "outcome"])
 @pytest.mark.parametrize("until", ["photos", "camera", "scene", "mesh"])
 def test_what_came_of_a_run_fits(capsys, finished, lines_of, until):
     less = {"mesh": {}, "scene": {"mesh_path": None}, "camera": {"mesh_path": None, "scene": None}}
