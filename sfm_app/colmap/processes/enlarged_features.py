@@ -7,7 +7,6 @@ finest features, which are also the least exact ones: photos that show much do a
 import copy
 import tempfile
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +17,6 @@ from sfm_app.colmap.database import open_database
 
 PHOTOS_AT_ONCE = 16
 """Photos after which features are entered: what a killed run does again. Chosen by hand."""
-SAMPLED = 4
-"""Photos of these that are searched at their own size first: if none shows much, all are enlarged at once. Chosen on
-castle-P19."""
 
 
 def find_as_needed(
@@ -43,19 +39,11 @@ def find_as_needed(
     reader, extraction, _ = how
     with open_database(database) as before:
         ids = {image.name: image.image_id for image in before.read_all_images()}
-        left = {name for name in names if not before.exists_keypoints(ids[name])}
-    # a short rest would leave workers idle
-    bounds = [*range(0, max(len(names) - PHOTOS_AT_ONCE // 2, 1), PHOTOS_AT_ONCE), len(names)]
-    for some in (names[first:last] for first, last in pairwise(bounds)):
-        if left.isdisjoint(some):
-            continue
-        # a run that goes on where a killed one ended looks at the same sample
-        sample = some[:: len(some) // SAMPLED] if len(some) >= 2 * SAMPLED else some
-        rich = _enter_rich(database, photo_dir, sample, how, token)
-        if rich and len(sample) < len(some):
-            rest = [name for name in some if name in left and name not in sample]
-            rich |= _enter_rich(database, photo_dir, rest, how, token)
-        poor = [name for name in some if name in left and name not in rich]
+        left = [name for name in names if not before.exists_keypoints(ids[name])]
+    for first in range(0, len(left), PHOTOS_AT_ONCE):
+        some = left[first : first + PHOTOS_AT_ONCE]
+        rich = _enter_rich(database, photo_dir, some, how, token)
+        poor = [name for name in some if name not in rich]
         if poor and not token.is_cancelled:
             pycolmap.extract_features(
                 database, photo_dir, poor, reader_options=reader, extraction_options=extraction,
@@ -70,7 +58,7 @@ def _enter_rich(
     how: tuple[pycolmap.ImageReaderOptions, pycolmap.FeatureExtractionOptions, int],
     token: pycolmap.CancellationToken,
 ) -> set[str]:
-    """Enter the features of photos that have enough at their own size, unless they have any; return their names."""
+    """Enter the features of photos that have enough at their own size, and return their names."""
     reader, extraction, enough = how
     own = copy.deepcopy(extraction)
     own.sift.first_octave = 0
@@ -85,7 +73,7 @@ def _enter_rich(
         with open_database(found) as source, open_database(database) as target:
             of, to = ({image.name: image.image_id for image in one.read_all_images()} for one in (source, target))
             rich = {name for name in names if name in of and source.num_keypoints_for_image(of[name]) >= enough}
-            for name in sorted(name for name in rich if not target.exists_keypoints(to[name])):
+            for name in sorted(rich):
                 keypoints, descriptors = source.read_keypoints(of[name]), source.read_descriptors(of[name])
                 kept = _largest(keypoints, own.sift.max_num_features)
                 rows = np.ascontiguousarray(descriptors.data[kept])

@@ -80,30 +80,3 @@ def test_a_photo_has_no_more_features_than_asked_for(place, tmp_path):
     assert len(own[RICH]) > 150
     assert len(cut[RICH]) == 100
     assert {tuple(row) for row in cut[RICH].tolist()} <= {tuple(row) for row in own[RICH].tolist()}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("rich_at", "enlarged"), [(0, False), (1, True)])
-def test_where_a_sample_shows_little_all_photos_are_enlarged(tmp_path, rich_at, enlarged):
-    """Of eight photos, every other one is the sample."""
-    names = [f"{number}.png" for number in range(8)]
-    for number, name in enumerate(names):
-        pixels = np.full(SIZE[::-1], 128, np.uint8)
-        rows = slice(None) if number == rich_at else slice(0, 100)
-        pixels[rows, :160] = grain(6, number)[rows, :160]
-        Image.fromarray(pixels).save(tmp_path / name)
-    photos = PhotoSet(tmp_path, tuple(Photo(name, *SIZE, "g") for name in names))
-
-    def find_with(enlarge_below):
-        database = tmp_path / f"{enlarge_below}.db"
-        create_database(database, photos)
-        find_and_match(
-            database, tmp_path, names, MatchSettings(enlarge_below=enlarge_below), 1, SilentProgress(), pairs=()
-        )
-        graph = read_match_graph(database, photos)
-        return [len(graph.keypoints[key]) for key in sorted(graph.keypoints, key=lambda k: graph.images[k].name)]
-
-    own, large = find_with(0), find_with(100_000)
-    between = (own[rich_at] + max(own[:rich_at] + own[rich_at + 1 :])) // 2
-    assert max(own[:rich_at] + own[rich_at + 1 :]) < between < own[rich_at] < large[rich_at]
-    assert find_with(between)[rich_at] == (large if enlarged else own)[rich_at]
