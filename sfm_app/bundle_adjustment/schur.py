@@ -183,7 +183,9 @@ def mirror_blocks(starts: Any, others: Any, blocks: FloatArray) -> None:
         for e in range(starts[i], starts[i + 1]):
             j = others[e]
             if j > i:  # rows ascend, so those of j are met in their order
-                blocks[below[j]] = blocks[e].T
+                for u in range(POSE):  # assigning blocks compiles for a second
+                    for v in range(POSE):
+                        blocks[below[j], u, v] = blocks[e, v, u]
                 below[j] += 1
 
 

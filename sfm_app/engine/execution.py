@@ -130,7 +130,7 @@ class _Execution:
         self.earlier = self.find_earlier(reasons)
         reasons = spread_reasons(later, reasons, (photos.name,) if self.first == photos.name else ())
         ahead = [name for name, again in reasons.items() if again is not None]
-        kernels = [part for part in PARTS if any(stage.kernels == part for stage in later if stage.name in ahead)]
+        kernels = [part for part in PARTS if any(part in stage.kernels for stage in later if stage.name in ahead)]
         with (
             compiling_ahead(kernels, self.run.progress) as has_ended,
             _limit_workers(self.products[photos], ahead, self.run) as run,

@@ -136,7 +136,8 @@ def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArr
         turns: (E, 3, 3) rotation of photo 2 from photo 1.
     """
     order = np.lexsort(edges.T[::-1])
-    loops = order[_find_loops(edges[order])] if len(edges) else np.zeros((0, 3), np.int64)
+    starts = np.searchsorted(edges[order, 0], np.arange(edges.max(initial=0) + 2))
+    loops = order[_find_loops(edges[order], starts)] if len(edges) else np.zeros((0, 3), np.int64)
     agree = np.zeros(len(loops), np.bool_)
     for start in range(0, len(loops), LOOP_BLOCK):
         first, second, across = (turns[column] for column in loops[start : start + LOOP_BLOCK].T)
@@ -146,13 +147,13 @@ def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArr
 
 
 @kernel
-def _find_loops(edges: IndexArray) -> IndexArray:
+def _find_loops(edges: IndexArray, starts: IndexArray) -> IndexArray:
     """Return (L, 3) numbers of the edges a-b, b-c and a-c of every three photos a < b < c that are all connected.
 
     Args:
         edges: (E, 2) sorted, the smaller photo first; E > 0.
+        starts: first edge from each photo, and from one after the last.
     """
-    starts = np.searchsorted(edges[:, 0], np.arange(edges.max() + 2))
     found, count = np.empty((len(edges), 3), np.int64), 0
     for k in range(len(edges)):
         a, b = edges[k]

@@ -5,6 +5,7 @@ there waits for it instead of compiling it a second time; kernels or types that 
 """
 
 import contextlib
+import gc
 import json
 import os
 import re
@@ -29,12 +30,16 @@ from sfm_app.progress import Progress
 
 PACKAGE = Path(__file__).parents[1]
 LIST = Path(__file__).with_name("kernels.json")
-PARTS = ("cameras", "surface")
-"""Of the list, each for one process: kernels of the stages up to the scene, and of those after it."""
-SURFACE_ROOMS = ("stereo.", "meshing.", "texture.", "geometry.triangles.")
-"""Packages and modules whose kernels belong to the second part."""
+PARTS = ("pairs", "cameras", "surface")
+"""Of the list, each for one process: two of about the same length for the stages up to the scene, and one for those
+after it."""
+ROOMS = {
+    "pairs": ("ransac.degeneracy.", "ransac.inner_loop.", "ransac.scoring.", "ransac.solvers.", "ransac.verification."),
+    "surface": ("stereo.", "meshing.", "texture.", "geometry.triangles."),
+}
+"""Packages and modules whose kernels belong to a part; those of all others belong to the cameras."""
 LATER = 10
-"""Added to the niceness of the second process: its kernels are needed last. Chosen by hand."""
+"""Added to the niceness of the process for the surface: its kernels are needed last. Chosen by hand."""
 ARRAY = re.compile(r"(\w+)\[(\d+)([CFA])(!?)\]")
 Kind: TypeAlias = "str | Sequence[Kind] | Mapping[str, Sequence[Kind]]"
 """A type of numba: `float64`, `float64[2C]` for an array (`!`: it cannot be written), a sequence for a tuple, and its
@@ -56,7 +61,7 @@ def compiling_ahead(parts: Sequence[str], progress: Progress) -> Iterator[thread
     if not missing:
         yield has_ended
         return
-    progress.say("first run on this machine: parts of the program are compiled, a minute or two more, once")
+    progress.say("first run on this machine: parts of the program are compiled, half a minute more, once")
     running = {part: _start(part) for part in missing}
     wanted = {part: listed_signatures(part) for part in missing}
 
@@ -150,7 +155,8 @@ def used_kernels() -> dict[str, dict[str, list[list[Kind]]]]:
     """
     found: dict[str, dict[str, list[list[Kind]]]] = {part: {} for part in PARTS}
     for name, signature in ASKED_FOR:
-        part = PARTS[name.removeprefix("sfm_app.").startswith(SURFACE_ROOMS)]
+        room = name.removeprefix("sfm_app.")
+        part = next((part for part, rooms in ROOMS.items() if room.startswith(rooms)), "cameras")
         found[part].setdefault(name, []).append([describe(kind) for kind in signature])
     return found
 
@@ -190,6 +196,7 @@ def make_type(kind: Kind) -> Any:
 
 if __name__ == "__main__":
     watch_parent(int(sys.argv[2]), lambda: os._exit(1))
-    if sys.argv[1] == PARTS[1]:
+    if sys.argv[1] == "surface":
         yield_to_others(LATER)
+    gc.disable()  # a sixth of the time; it ends before what it holds matters
     sys.exit(1 if compile_part(sys.argv[1]) else 0)

@@ -66,7 +66,9 @@ class Plan:
         """Describe the plan for people."""
         names = list(stages)
         minutes, gigabytes = self.minutes(names), self.peak_mb(names) / 1000
-        how_long = f"about {_round_minutes(minutes)} minutes" if minutes >= 1.5 else "a minute or two"
+        how_long = "a minute or two" if minutes > 0.6 else "a minute at most"
+        if minutes >= 1.5:
+            how_long = f"about {_round_minutes(minutes)} minutes"
         workers = f"{self.workers} worker{'s' if self.workers > 1 else ''}"
         hard = " or more" if minutes >= 1.5 and "scene" in names else ""  # photos may be hard to place
         size = f"{self.photos} photos, {self.pairs} pair{'' if self.pairs == 1 else 's'}"

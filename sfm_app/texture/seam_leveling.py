@@ -78,9 +78,10 @@ def _solve(
         for c in range(channels):
             way[n, c] = residual[n, c] / diagonal[n]
             energy[c] += residual[n, c] * way[n, c]
-    enough[:] = RESIDUAL_TOLERANCE * RESIDUAL_TOLERANCE * energy
+    for c in range(channels):  # assigning rows compiles for a second
+        enough[c] = RESIDUAL_TOLERANCE * RESIDUAL_TOLERANCE * energy[c]
     for _ in range(STEPS):
-        if np.all(energy <= enough):
+        if energy[0] <= enough[0] and energy[1] <= enough[1] and energy[2] <= enough[2]:
             break
         along = np.zeros(channels)
         for n in range(size):

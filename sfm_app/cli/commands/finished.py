@@ -2,7 +2,6 @@
 
 import sys
 from pathlib import Path
-from threading import Thread
 
 import click
 
@@ -85,8 +84,8 @@ def view(out: Path, port: int, no_browser: bool) -> None:
         progress.close()
         print_lines([f"{address} shows {out}; Ctrl-C ends it"])
         sys.stdout.flush()  # whoever reads it through a pipe waits for it
-        if not no_browser:  # beside the page, which waits for it
-            Thread(target=open_browser, args=(address,), daemon=True).start()
+        if not no_browser:
+            open_browser(address)
 
     with Terminal(quiet=False) as progress:
         sfm_app.view_run(out, port=port, started=announce, progress=progress)

@@ -139,10 +139,11 @@ def _climb(
             value = _value(packed, weights, center_sigma, trial, sigma)
             if value <= floor:
                 for k in range(1, count):
-                    simplex[k] = 0.5 * (simplex[0] + simplex[k])
+                    for column in range(4):
+                        simplex[k, column] = 0.5 * (simplex[0, column] + simplex[k, column])
                     values[k] = _value(packed, weights, center_sigma, simplex[k], sigma)
                 continue
-        simplex[-1] = trial
+        _copy(trial, simplex[-1])
         values[-1] = value
     _sort(simplex, values)
     return simplex[0].copy(), float(values[0])
@@ -155,11 +156,18 @@ def _sort(simplex: FloatArray, values: FloatArray) -> None:
         row, value = simplex[k].copy(), values[k]
         i = k
         while i > 0 and values[i - 1] < value:
-            simplex[i] = simplex[i - 1]
+            _copy(simplex[i - 1], simplex[i])
             values[i] = values[i - 1]
             i -= 1
-        simplex[i] = row
+        _copy(row, simplex[i])
         values[i] = value
+
+
+@kernel
+def _copy(row: FloatArray, place: FloatArray) -> None:
+    """Write the entries of a row to a place; assigning rows compiles for a second and a half."""
+    for column in range(4):
+        place[column] = row[column]
 
 
 @kernel

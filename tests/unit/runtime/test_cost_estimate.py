@@ -26,7 +26,8 @@ def test_a_run_is_put_into_one_line():
     cost = r"about \d+ minutes or more; \d+\.\d GB with 2 workers"
     assert re.fullmatch(rf"200 photos, 6000 pairs: {cost}", text) and len(text) <= 74  # and an indent
     assert " or more" not in make_plan(photos(200), Settings(), 2).text(["match_graph"])
-    assert make_plan(photos(2), DRAFT, 1).text(["files"]).split(": ")[1].startswith("a minute or two; ")
+    assert make_plan(photos(2), DRAFT, 1).text(["files"]).split(": ")[1].startswith("a minute at most; ")
+    assert make_plan(photos(8), Settings(), 2).text(STAGES).split(": ")[1].startswith("a minute or two; ")
 
 
 @pytest.mark.parametrize(("count", "low", "high"), [(10, 1, 5), (100, 20, 45), (200, 60, 150)])
