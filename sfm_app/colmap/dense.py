@@ -139,7 +139,7 @@ class DenseStore:
 
         Args:
             view: an undistorted photo.
-            kind: photometric or geometric.
+            kind: which map.
         """
         # the depth map is written last
         return _map_path(self.dense_dir, DEPTHS, view, kind).is_file()
@@ -149,9 +149,27 @@ class DenseStore:
         confidence = _read_depth_format(self.dense_dir, CONFIDENCES, view, "photometric")
         return DepthEstimate(self.read_depth(view), confidence)
 
-    def read_depth(self, view: View) -> NDArray[np.float32]:
-        """Read the depths of the photometric map of a view."""
-        return read_depth(self.dense_dir, view, "photometric")
+    def read_depth(self, view: View, kind: Kind = "photometric") -> NDArray[np.float32]:
+        """Read the depths of a map of a view.
+
+        Args:
+            view: an undistorted photo.
+            kind: which map.
+        """
+        return read_depth(self.dense_dir, view, kind)
+
+    def read_maps(self, view: View) -> DepthMap:
+        """Read the geometric maps of a view."""
+        return DepthMap(self.read_depth(view, "geometric"), read_normals(self.dense_dir, view))
+
+    def write_proposal(self, view: View, depth: NDArray[np.float32]) -> None:
+        """Write what is proposed for the plain areas of a view.
+
+        Args:
+            view: an undistorted photo.
+            depth: (H, W), 0 where nothing is.
+        """
+        _write_depth_format(self.dense_dir, DEPTHS, view, depth, "proposed")
 
     def write_estimate(self, view: View, estimate: DepthEstimate) -> None:
         """Write the photometric map of a view, without depth where the photo is masked.
@@ -248,13 +266,14 @@ def mask_depths(dense_dir: Path, view: View) -> None:
 
 
 def drop_estimates(dense_dir: Path, views: Sequence[View]) -> None:
-    """Remove the photometric maps, which the geometric maps replace.
+    """Remove the photometric maps and the proposals, which the geometric maps replace.
 
     Args:
         dense_dir: folder with undistorted photos and their maps.
         views: all undistorted photos.
     """
     for view in views:
+        _map_path(dense_dir, DEPTHS, view, "proposed").unlink(missing_ok=True)
         for at_level in (view, *(view.halve(level) for level in range(1, MOST_LEVELS))):
             for folder in (DEPTHS, NORMALS, CONFIDENCES):
                 _map_path(dense_dir, folder, at_level, "photometric").unlink(missing_ok=True)

@@ -80,13 +80,34 @@ def count_confirming_maps(
         others: other photos with their depth maps.
         tolerance: largest relative difference in depth.
     """
-    agreeing = np.zeros(depth.shape, np.uint8)
+    return _count_maps(view, depth, others, (1.0 - tolerance, 1.0 + tolerance))
+
+
+def count_deeper_maps(
+    view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], tolerance: float
+) -> NDArray[np.uint8]:
+    """Count the other depth maps that see something behind each depth of a view, (H, W), so that it is not there.
+
+    Args:
+        view: the photo.
+        depth: (H, W) of the photo; 0 where unknown.
+        others: other photos with their depth maps.
+        tolerance: smallest relative difference in depth.
+    """
+    return _count_maps(view, depth, others, (1.0 + tolerance, np.inf))
+
+
+def _count_maps(
+    view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], limits: tuple[float, float]
+) -> NDArray[np.uint8]:
+    """Count the maps whose depth, divided by that of the point in the other view, lies between two positive limits."""
+    count = np.zeros(depth.shape, np.uint8)
     K_inv = np.linalg.inv(view.K)
     for other, other_depth in others:
         relative = other.R @ view.R.T
         P = other.K @ np.column_stack([relative @ K_inv, other.t - relative @ view.t])
-        _count(depth, other_depth, P, tolerance, view.sample_px, agreeing)
-    return agreeing
+        _count(depth, other_depth, P, limits, view.sample_px, count)
+    return count
 
 
 def filter_speckles(depth: DepthArray, tolerance: float) -> DepthArray:
@@ -112,9 +133,9 @@ def _count(
     depth: DepthArray,
     other_depth: DepthArray,
     P: FloatArray,
-    tolerance: float,
+    limits: tuple[float, float],
     sample_px: float,
-    agreeing: NDArray[np.uint8],
+    count: NDArray[np.uint8],
 ) -> None:
     height, width = other_depth.shape
     for row in range(depth.shape[0]):
@@ -129,5 +150,5 @@ def _count(
             u = (z * (P[0, 0] * x + P[0, 1] * y + P[0, 2]) + P[0, 3]) / w
             v = (z * (P[1, 0] * x + P[1, 1] * y + P[1, 2]) + P[1, 3]) / w
             j, i = int(np.floor(u - sample_px + 0.5)), int(np.floor(v - sample_px + 0.5))
-            if 0 <= i < height and 0 <= j < width and abs(other_depth[i, j] - w) <= tolerance * w:
-                agreeing[row, col] += 1
+            if 0 <= i < height and 0 <= j < width and limits[0] * w <= other_depth[i, j] <= limits[1] * w:
+                count[row, col] += 1

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from sfm_app.stereo.consistency import count_confirming_maps, filter_speckles, merge_hypotheses
 from sfm_app.stereo.edge_fattening import remove_spill, rim_mask
-from sfm_app.stereo.enclosure import enclosed_pixels
 from sfm_app.stereo.matching import depths_from_disparities, disparities
 from sfm_app.stereo.normals import fit_planes, plane_normals
 from sfm_app.stereo.patch_match import NO_MATCH, PlaneArray, improve_planes
-from sfm_app.stereo.planar_fill import fill_planar_areas
+from sfm_app.stereo.plain.enclosure import enclosed_pixels
+from sfm_app.stereo.plain.planar_fill import fill_planar_areas
+from sfm_app.stereo.plain.textureless import plain_walls, surfaceless_areas
 from sfm_app.stereo.rectify import rectify
-from sfm_app.stereo.textureless import plain_walls, surfaceless_areas
 from sfm_app.stereo.view import DepthArray, GrayImage, View
 from sfm_app.types import Rejected
 

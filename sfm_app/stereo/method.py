@@ -13,14 +13,16 @@ from sfm_app.settings import DepthSettings
 from sfm_app.settings.tables import AS_NEEDED
 from sfm_app.stereo.depth import DepthEstimate, DepthMap, confirm_depths, match_depths
 from sfm_app.stereo.levels import MOST_OPEN, fill_from_coarse, halve_views, open_share
+from sfm_app.stereo.normals import fit_planes, plane_normals
+from sfm_app.stereo.plain.plane_proposals import agreed_proposals, propose_planes
 from sfm_app.stereo.sky import blank_areas, near_pixels
 from sfm_app.stereo.view import DepthArray, GrayImage, View
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Rejected
 
 Result = TypeVar("Result")
-Kind = Literal["photometric", "geometric"]
-"""COLMAP's names for a depth map before and after the check against the other photos."""
+Kind = Literal["photometric", "geometric", "proposed"]
+"""COLMAP's names for a depth map before and after the check against the other photos; and planes in plain areas."""
 
 
 class DepthStore(Protocol):
@@ -40,8 +42,24 @@ class DepthStore(Protocol):
     def read_estimate(self, view: View, /) -> DepthEstimate:
         """Return the photometric map."""
 
-    def read_depth(self, view: View, /) -> DepthArray:
-        """Return the depths of the photometric map."""
+    def read_depth(self, view: View, kind: Kind = "photometric", /) -> DepthArray:
+        """Return the depths of a map.
+
+        Args:
+            view: the photo.
+            kind: which map.
+        """
+
+    def read_maps(self, view: View, /) -> DepthMap:
+        """Return the geometric maps."""
+
+    def write_proposal(self, view: View, depth: DepthArray, /) -> None:
+        """Keep what is proposed for plain areas.
+
+        Args:
+            view: the photo.
+            depth: (H, W), 0 where nothing is.
+        """
 
     def write_estimate(self, view: View, estimate: DepthEstimate, /) -> None:
         """Keep the photometric map.
@@ -116,7 +134,12 @@ def make_depth_maps_on_cpu(task: DepthTask) -> list[Rejected | None]:
     usable = np.array([found is None for found in matched])
     confirm = Task(_confirm, shared, usable)
     confirmed = iter(task.map(confirm, [index for index in everything if usable[index]], "confirming depths"))
-    return [next(confirmed) if found is None else found for found in matched]
+    found = [next(confirmed) if one is None else one for one in matched]
+    if len(inputs.levels) > 1:
+        known = [index for index in everything if found[index] is None]
+        task.map(Task(_propose, shared), known, "looking for planes")
+        task.map(Task(_fill_plain_areas, shared), known, "filling plain areas")
+    return found
 
 
 def _needs_coarser(task: DepthTask, inputs: _Inputs) -> bool:
@@ -169,6 +192,35 @@ def _confirm(inputs: Shared[_Inputs], usable: NDArray[np.bool_], index: int) -> 
         return found
     task.store.write_maps(view, found)
     return None
+
+
+def _propose(inputs: Shared[_Inputs], index: int) -> None:
+    """Keep planes for the plain areas of a photo, but for what may be a sky."""
+    task = inputs.value
+    view, store = task.levels[0][index], task.store
+    if not store.has(view, "proposed"):
+        photo, depth = store.photo(view), store.read_depth(view, "geometric")
+        proposed = propose_planes(depth, photo, task.tolerance(1))
+        proposed[near_pixels(blank_areas(photo, depth).blank, depth.shape)] = 0
+        store.write_proposal(view, proposed)
+
+
+def _fill_plain_areas(inputs: Shared[_Inputs], index: int) -> None:
+    """Fill the plain areas of a photo with the planes that others propose, too; once more changes nothing."""
+    task = inputs.value
+    views, store = task.levels[0], task.store
+
+    def read(view: View) -> tuple[DepthArray, DepthArray]:
+        return store.read_depth(view, "geometric"), store.read_depth(view, "proposed")
+
+    view, near = views[index], [views[other] for other in task.ranked[index]]
+    others = [(other, *read(other)) for other in near if store.has(other, "proposed")]
+    depth = agreed_proposals(view, read(view), others, task.tolerance(1))
+    maps = store.read_maps(view)
+    planes = fit_planes(depth)
+    filled = (maps.depth == 0) & (planes[..., 0] > 0)
+    normals = np.where(filled[..., None], plane_normals(planes, view), maps.normals)
+    store.write_maps(view, DepthMap(np.where(filled, depth, maps.depth), normals))
 
 
 def _confirm_level(task: _Inputs, level: int, usable: NDArray[np.bool_], index: int) -> DepthMap | Rejected:

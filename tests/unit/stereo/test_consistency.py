@@ -2,7 +2,13 @@
 
 import numpy as np
 
-from sfm_app.stereo.consistency import MIN_PATCH, count_confirming_maps, filter_speckles, merge_hypotheses
+from sfm_app.stereo.consistency import (
+    MIN_PATCH,
+    count_confirming_maps,
+    count_deeper_maps,
+    filter_speckles,
+    merge_hypotheses,
+)
 
 
 def pixels(*values: float) -> np.ndarray:
@@ -58,6 +64,20 @@ def test_true_depths_are_confirmed_and_wrong_ones_are_not(plane, make_view):
 def test_a_depth_behind_the_other_camera_is_not_confirmed(plane, make_view):
     view, ahead = make_view((0, 0, 0)), make_view((0, 0, 9))
     assert not count_confirming_maps(view, plane.depth(view), [(ahead, np.abs(plane.depth(ahead)))], 0.01).any()
+
+
+def test_a_map_that_sees_something_behind_a_depth_is_counted(plane, make_view):
+    view, other = make_view((0, 0, 0)), make_view((0.3, 0, 0))
+    depth = plane.depth(view)
+    depth[80:100, 100:140] *= 0.9  # the other photo sees the plane behind it
+    depth[100:110, 100:140] *= 1.2
+    depth[110:115] = 0
+
+    deeper = count_deeper_maps(view, depth, [(other, plane.depth(other))], 0.05)
+
+    assert deeper[80:100, 100:140].all()
+    assert deeper.sum() == 20 * 40
+    assert not count_deeper_maps(view, depth, [(other, np.zeros_like(depth))], 0.05).any()
 
 
 def test_specks_go_and_thin_things_stay():

@@ -65,6 +65,7 @@ class Memory:
     contrast: float = 0.04
     estimates: dict = field(default_factory=dict)
     maps: dict = field(default_factory=dict)
+    proposals: dict = field(default_factory=dict)
 
     def photo(self, view):
         full = replace(view, K=np.diag([2.0**view.level, 2.0**view.level, 1]) @ view.K, level=0,
@@ -78,13 +79,22 @@ class Memory:
         return cv2.resize(np.round(shown).astype(np.uint8), (view.width, view.height), interpolation=cv2.INTER_AREA)
 
     def has(self, view, kind):
-        return (view.name, view.level) in (self.maps if kind == "geometric" else self.estimates)
+        kept = {"geometric": self.maps, "photometric": self.estimates, "proposed": self.proposals}
+        return (view.name, view.level) in kept[kind]
 
     def read_estimate(self, view):
         return self.estimates[view.name, view.level]
 
-    def read_depth(self, view):
-        return self.estimates[view.name, view.level].depth
+    def read_depth(self, view, kind="photometric"):
+        if kind == "proposed":
+            return self.proposals[view.name, view.level]
+        return (self.maps if kind == "geometric" else self.estimates)[view.name, view.level].depth
+
+    def read_maps(self, view):
+        return self.maps[view.name, view.level]
+
+    def write_proposal(self, view, depth):
+        self.proposals[view.name, view.level] = depth
 
     def write_estimate(self, view, estimate):
         self.estimates[view.name, view.level] = estimate
@@ -187,3 +197,43 @@ def test_what_is_black_or_may_be_sky_is_not_open(plane, make_view):
 
     assert open_share(photo, estimate) == pytest.approx(0.25, abs=0.02)  # the dark band, not the bright one
     assert open_share(np.where(photo == 50, 10, photo).astype(np.uint8), estimate) < 0.02
+
+
+class Door(Memory):
+    """Photos of a plane with a plain door in the middle."""
+
+    def photo(self, view):
+        rays = self.plane._rays(view, 0.5)
+        places = view.center + self.plane.depth(replace(view, sample_px=0.5))[..., None] * rays
+        door = (np.abs(places[..., 0]) < 0.6) & (np.abs(places[..., 1]) < 0.5)
+        return np.where(door, 90, self.plane.photo(view)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("levels", [1, 2])
+def test_a_door_of_which_no_photo_shows_more_than_the_frame_is_closed(plane, make_view, monkeypatch, levels):
+    views = [make_view(0.5 * np.array(center), name=f"{k}.jpg") for k, center in enumerate(CENTERS)]
+    store, holes = Door(plane), {}
+
+    def confirm(view, photo, *_):
+        known = photo != 90
+        holes[view.name, view.level] = ~known
+        return maps_of_depth(np.where(known, plane.depth(view), np.float32(0)), view)
+
+    monkeypatch.setattr(method, "match_depths", lambda view, *_: DepthEstimate(plane.depth(view), plane.depth(view)))
+    monkeypatch.setattr(method, "confirm_depths", confirm)
+    task = task_of(views, store, levels)
+    assert make_depth_maps_on_cpu(task) == [None] * 5
+
+    before = {name: (maps.depth.copy(), maps.normals.copy()) for name, maps in store.maps.items()}
+    for view in views:
+        found, hole = store.maps[view.name, 0], holes[view.name, 0]
+        low, high = ((0.0, 0.15), (0.8, 1.0))[levels - 1]
+        assert low <= np.mean(found.depth[hole] > 0) < high
+        filled = hole & (found.depth > 0)
+        assert np.abs(found.depth / plane.depth(view) - 1)[filled].max(initial=0) < 1e-3
+        slant = found.normals[filled] @ view.R @ plane.normal
+        assert np.abs(slant + 1).max(initial=0) < 1e-3  # to the camera
+    make_depth_maps_on_cpu(task)
+    for name, (depth, normals) in before.items():
+        np.testing.assert_array_equal(store.maps[name].depth, depth)
+        np.testing.assert_array_equal(store.maps[name].normals, normals)

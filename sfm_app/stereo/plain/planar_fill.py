@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.stereo.enclosure import enclosed_pixels
+from sfm_app.stereo.plain.enclosure import enclosed_pixels
 from sfm_app.stereo.view import DepthArray, FloatArray, GrayImage
 
 BLUR_PX = 1.5
@@ -44,7 +44,7 @@ def fill_planar_areas(depth: DepthArray, image: GrayImage, tolerance: float, wal
         (H, W) depth, unchanged in other areas.
     """
     bridged = depth.copy()
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(_uniform_mask(image).view(np.uint8), connectivity=4)
+    labels, stats = uniform_areas(image)
     for label in range(1, len(stats)):
         left, top, width, height, area = stats[label]
         if area < MIN_AREA * image.size:
@@ -54,10 +54,13 @@ def fill_planar_areas(depth: DepthArray, image: GrayImage, tolerance: float, wal
     return bridged
 
 
-def _uniform_mask(image: GrayImage) -> NDArray[np.bool_]:
+def uniform_areas(image: GrayImage) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return (H, W) the numbers of areas of uniform color, 0 for none, and OpenCV's (N, 5) boxes and sizes of them."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR_PX)
     slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.125))
-    return np.asarray(slope < MAX_SLOPE)
+    uniform = np.asarray(slope < MAX_SLOPE)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(uniform.view(np.uint8), connectivity=4)
+    return np.asarray(labels, np.int32), np.asarray(stats, np.int32)
 
 
 def _fill_area(depth: DepthArray, area: NDArray[np.bool_], tolerance: float, walls: NDArray[np.bool_]) -> None:
@@ -68,22 +71,38 @@ def _fill_area(depth: DepthArray, area: NDArray[np.bool_], tolerance: float, wal
     row, col = np.nonzero(known)
     A = np.asarray(np.column_stack([np.ones(len(row)), col, row]), np.float64)
     inverse = np.asarray(1.0 / depth[known], np.float64)
-    plane = _consensus_plane(A, inverse, tolerance)
+    plane = consensus_plane(A, inverse, tolerance)
     residual = A @ plane / inverse - 1.0
     on_plane = np.abs(residual) < tolerance
     bend = _bend(row[on_plane], col[on_plane], residual[on_plane], depth.shape)
     if np.mean(on_plane) < MIN_ON_PLANE or bend > MAX_BEND * tolerance:
         return
-    certain, within = np.zeros(depth.shape, np.bool_), np.zeros(depth.shape, np.uint8)
+    certain = np.zeros(depth.shape, np.bool_)
     certain[row[on_plane], col[on_plane]] = True
-    hull = cv2.convexHull(np.column_stack([col, row])[on_plane].astype(np.int32))
-    cv2.fillConvexPoly(within, hull, 1)
-    row, col = np.nonzero(area & (within > 0) & (walls | enclosed_pixels(certain)))
+    row, col = np.nonzero(area & convex_hull(certain) & (walls | enclosed_pixels(certain)))
     depth[row, col] = 1.0 / (plane[0] + plane[1] * col + plane[2] * row)
 
 
-def _consensus_plane(A: FloatArray, inverse: FloatArray, tolerance: float) -> FloatArray:
-    """Estimate inverse depth as a linear function of column and row, (3,), by consensus of the pixels."""
+def convex_hull(pixels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mark the pixels (H, W) within the convex hull of some.
+
+    Args:
+        pixels: (H, W), at least one.
+    """
+    row, col = np.nonzero(pixels)
+    within = np.zeros(pixels.shape, np.uint8)
+    cv2.fillConvexPoly(within, cv2.convexHull(np.column_stack([col, row]).astype(np.int32)), 1)
+    return within > 0
+
+
+def consensus_plane(A: FloatArray, inverse: FloatArray, tolerance: float) -> FloatArray:
+    """Estimate inverse depth as a linear function of column and row, (3,), by consensus of the pixels.
+
+    Args:
+        A: (N, 3) one, column and row of each pixel.
+        inverse: (N,) inverse depths.
+        tolerance: largest relative difference of depths that agree.
+    """
     rng = np.random.default_rng(0)
     some, triples = rng.integers(0, len(A), SAMPLED_PIXELS), rng.integers(0, len(A), (SAMPLES, 3))
     triples = triples[np.abs(np.linalg.det(A[triples])) >= 1.0]  # the others are collinear
