@@ -200,7 +200,8 @@ class DepthSettings(Section):
         ge=AS_NEEDED,
         le=MOST_LEVELS,
         description="sizes at which depth maps are made, each half of the one before: smaller ones find more of plain "
-        "walls, furniture and floors; 0: a second one where the first leaves much open",
+        "walls, furniture and floors, and what is plain between known surfaces gets their plane; 0: a second one where "
+        "the first leaves much open",
     )
     neighbors: int = Field(4, ge=1, le=20, description="photos that each photo is matched with")
     consistency: float = Field(

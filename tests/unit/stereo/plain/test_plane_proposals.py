@@ -68,6 +68,14 @@ def test_without_a_plane_nothing_is_proposed(depth):
     assert np.mean(found[DOOR] > 0) < 0.1
 
 
+def test_a_dark_area_may_be_a_gate():
+    depth = np.where(DOOR, np.float32(0), rough(WALL))
+    gate = np.where(DOOR, np.uint8(30), paint(DOOR))  # the pattern has 127 in the median
+
+    assert not propose_planes(depth, gate, 0.02).any()
+    assert propose_planes(depth, np.where(DOOR, np.uint8(70), gate), 0.02).any()
+
+
 def test_an_area_that_shows_something_is_left_to_matching():
     depth = np.where(DOOR, np.float32(0), WALL)
 
