@@ -13,8 +13,7 @@ from sfm_app.settings import DepthSettings
 from sfm_app.settings.tables import AS_NEEDED
 from sfm_app.stereo.depth import DepthEstimate, DepthMap, confirm_depths, match_depths
 from sfm_app.stereo.levels import MOST_OPEN, fill_from_coarse, halve_views, open_share
-from sfm_app.stereo.normals import fit_planes, plane_normals
-from sfm_app.stereo.plain.plane_proposals import agreed_proposals, propose_planes
+from sfm_app.stereo.plain.plane_proposals import add_depths, agreed_proposals, propose_planes
 from sfm_app.stereo.sky import blank_areas, near_pixels
 from sfm_app.stereo.view import DepthArray, GrayImage, View
 from sfm_app.tasks import Shared, Task
@@ -215,12 +214,8 @@ def _fill_plain_areas(inputs: Shared[_Inputs], index: int) -> None:
 
     view, near = views[index], [views[other] for other in task.ranked[index]]
     others = [(other, *read(other)) for other in near if store.has(other, "proposed")]
-    depth = agreed_proposals(view, read(view), others, task.tolerance(1))
-    maps = store.read_maps(view)
-    planes = fit_planes(depth)
-    filled = (maps.depth == 0) & (planes[..., 0] > 0)
-    normals = np.where(filled[..., None], plane_normals(planes, view), maps.normals)
-    store.write_maps(view, DepthMap(np.where(filled, depth, maps.depth), normals))
+    agreed = agreed_proposals(view, read(view), others, task.tolerance(1))
+    store.write_maps(view, add_depths(store.read_maps(view), agreed, view))
 
 
 def _confirm_level(task: _Inputs, level: int, usable: NDArray[np.bool_], index: int) -> DepthMap | Rejected:

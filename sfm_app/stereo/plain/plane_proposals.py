@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.stereo.consistency import count_confirming_maps, count_deeper_maps
+from sfm_app.stereo.depth import DepthMap
+from sfm_app.stereo.normals import RADIUS_PX, fit_planes, plane_normals
 from sfm_app.stereo.plain.enclosure import enclosed_pixels
 from sfm_app.stereo.plain.planar_fill import MIN_AREA, consensus_plane, convex_hull, uniform_areas
 from sfm_app.stereo.view import DepthArray, FloatArray, GrayImage, View
@@ -23,6 +25,8 @@ MOST_PLANES = 4
 """Planes around an area. Chosen by hand."""
 LEAST_SHARE, LEAST_PX = 0.1, 100
 """Share of the known depths in and around an area that a plane holds, and fewest pixels. Chosen by hand."""
+ENOUGH_PX = 5000
+"""Most pixels that a plane is fitted to. Chosen by hand."""
 LEAST_AGREEING = 3
 """Other photos with the same depth. Chosen on kitchen1000, where with two, two in a hundred fewer are right."""
 DARK, BLUR_PX = 0.4, 2.0
@@ -88,7 +92,8 @@ def _planes(
             return
         A = np.asarray(np.column_stack([np.ones(len(row)), col, row]), np.float64)
         inverse = np.asarray(1.0 / depth[row, col], np.float64)
-        plane = consensus_plane(A, inverse, tolerance)
+        some = np.s_[:: -(-len(row) // ENOUGH_PX)]
+        plane = consensus_plane(A[some], inverse[some], tolerance)
         on_plane = np.abs(A @ plane / inverse - 1.0) < tolerance
         if np.count_nonzero(on_plane) < least:
             return
@@ -120,3 +125,20 @@ def agreed_proposals(
     contradicting = count_deeper_maps(view, proposed, only_seen, DEEPER * tolerance)
     agreed = (proposed > 0) & (agreeing >= LEAST_AGREEING) & (contradicting == 0)
     return np.where((depth == 0) & agreed, proposed, depth)
+
+
+def add_depths(maps: DepthMap, depth: DepthArray, view: View) -> DepthMap:
+    """Add depths to the maps of a photo where it has none.
+
+    Args:
+        maps: of the photo.
+        depth: (H, W) the same depths and others.
+        view: the photo.
+    """
+    new = ((maps.depth == 0) & (depth > 0)).view(np.uint8)
+    side = 2 * RADIUS_PX + 1
+    around = cv2.dilate(new, np.ones((side, side), np.uint8)) > 0
+    planes = fit_planes(np.where(around, depth, np.float32(0)))
+    added = (maps.depth == 0) & (planes[..., 0] > 0)
+    normals = np.where(added[..., None], plane_normals(planes, view), maps.normals)
+    return DepthMap(np.where(added, depth, maps.depth), normals)
