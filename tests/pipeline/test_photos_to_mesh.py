@@ -234,10 +234,13 @@ def test_a_run_killed_among_its_depth_maps_ends_with_the_same_bytes(finished, re
     assert stamps(maps, "*.photometric.bin").items() > matched.items()
     confirmed = stamps(maps, "*.geometric.bin")
     assert len(confirmed) == 2
+    killed_at(3, monkeypatch, DenseStore, "write_proposal", rendered[0], out, DRAFT)
+    assert stamps(maps, "*.geometric.bin").items() > confirmed.items()
+    assert len(stamps(maps, "*.proposed.bin")) == 2
     assert "depth_maps" not in Workspace(out).manifest.read()["stages"]
     run = sfm_app.reconstruct(rendered[0], out, DRAFT)
 
-    assert stamps(maps, "*.geometric.bin").items() > confirmed.items()
+    assert not stamps(maps, "*.proposed.bin")
     assert run.mesh_path.read_bytes() == expected
 
 
