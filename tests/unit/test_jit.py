@@ -1,3 +1,4 @@
+import importlib
 import subprocess
 import sys
 
@@ -71,12 +72,12 @@ def test_a_cache_that_names_a_class_which_is_gone_is_made_anew(tmp_path):
     assert list(tmp_path.rglob("*.nbi"))
 
 
-def test_who_waits_for_another_process_is_told_so():
-    seen = []
-
-    @kernel
-    def thrice(x):
-        return 3 * x
+def test_who_waits_for_another_process_is_told_so(tmp_path, monkeypatch):
+    """The kernel is in a folder of its own: beside this file, an earlier test run has left it in the cache."""
+    code = "from sfm_app.jit import kernel\n\n@kernel\ndef thrice(x):\n    return 3 * x\n"
+    (tmp_path / "waited_for.py").write_text(code, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    thrice, seen = importlib.import_module("waited_for").thrice, []
 
     def is_awaited(name, signature):
         seen.append((name.rpartition(".")[2], is_waiting()))
