@@ -194,12 +194,15 @@ def _confirm(inputs: Shared[_Inputs], usable: NDArray[np.bool_], index: int) -> 
 
 
 def _propose(inputs: Shared[_Inputs], index: int) -> None:
-    """Keep planes for the plain areas of a photo, but for what may be a sky."""
+    """Keep planes for the plain areas of a photo, but for what may be a sky; where that fails, none."""
     task = inputs.value
     view, store = task.levels[0][index], task.store
     if not store.has(view, "proposed"):
         photo, depth = store.photo(view), store.read_depth(view, "geometric")
-        proposed = propose_planes(depth, photo, task.tolerance(1))
+        try:
+            proposed = propose_planes(depth, photo, task.tolerance(1))
+        except FAILURES:  # plain areas stay open
+            proposed = np.zeros_like(depth)
         proposed[near_pixels(blank_areas(photo, depth).blank, depth.shape)] = 0
         store.write_proposal(view, proposed)
 
@@ -209,13 +212,20 @@ def _fill_plain_areas(inputs: Shared[_Inputs], index: int) -> None:
     task = inputs.value
     views, store = task.levels[0], task.store
 
-    def read(view: View) -> tuple[DepthArray, DepthArray]:
-        return store.read_depth(view, "geometric"), store.read_depth(view, "proposed")
-
     view, near = views[index], [views[other] for other in task.ranked[index]]
-    others = [(other, *read(other)) for other in near if store.has(other, "proposed")]
-    agreed = agreed_proposals(view, read(view), others, task.tolerance(1))
-    store.write_maps(view, add_depths(store.read_maps(view), agreed, view))
+    proposed = store.read_depth(view, "proposed")
+    if not proposed.any():
+        return
+    maps, others = (
+        store.read_maps(view),
+        [
+            (other, store.read_depth(other, "geometric"), store.read_depth(other, "proposed"))
+            for other in near
+            if store.has(other, "proposed")
+        ],
+    )
+    agreed = agreed_proposals(view, (maps.depth, proposed), others, task.tolerance(1))
+    store.write_maps(view, add_depths(maps, agreed, view))
 
 
 def _confirm_level(task: _Inputs, level: int, usable: NDArray[np.bool_], index: int) -> DepthMap | Rejected:

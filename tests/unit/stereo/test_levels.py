@@ -209,6 +209,22 @@ class Door(Memory):
         return np.where(door, 90, self.plane.photo(view)).astype(np.uint8)
 
 
+def test_a_photo_whose_planes_cannot_be_found_keeps_its_depths(plane, make_view, monkeypatch):
+    views = [make_view(0.5 * np.array(center), name=f"{k}.jpg") for k, center in enumerate(CENTERS)]
+
+    def fail(*_):
+        raise np.linalg.LinAlgError("no convergence")
+
+    monkeypatch.setattr(method, "match_depths", lambda view, *_: DepthEstimate(plane.depth(view), plane.depth(view)))
+    monkeypatch.setattr(method, "confirm_depths", lambda view, *_: maps_of(plane, view))
+    monkeypatch.setattr(method, "propose_planes", fail)
+    store = Door(plane)
+
+    assert make_depth_maps_on_cpu(task_of(views, store, 2)) == [None] * 5
+    for view in views:
+        np.testing.assert_array_equal(store.maps[view.name, 0].depth, maps_of(plane, view).depth)
+
+
 @pytest.mark.parametrize("levels", [1, 2])
 def test_a_door_of_which_no_photo_shows_more_than_the_frame_is_closed(plane, make_view, monkeypatch, levels):
     views = [make_view(0.5 * np.array(center), name=f"{k}.jpg") for k, center in enumerate(CENTERS)]
