@@ -1,8 +1,9 @@
 """The loop that runs stages: it skips what is up to date, redoes what is damaged and records everything."""
 
 import logging
+import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -112,6 +113,8 @@ class _Execution:
     products: Products = field(init=False)
     earlier: Earlier | None = None
     """What stages may go on from."""
+    has_ended: threading.Event = field(default_factory=threading.Event)
+    """Set where a stage fails: no worker waits for kernels any longer."""
 
     def __post_init__(self) -> None:
         self.products = Products(self.run, self.source)
@@ -131,12 +134,8 @@ class _Execution:
         reasons = spread_reasons(later, reasons, (photos.name,) if self.first == photos.name else ())
         ahead = [name for name, again in reasons.items() if again is not None]
         kernels = [part for part in PARTS if any(part in stage.kernels for stage in later if stage.name in ahead)]
-        with (
-            compiling_ahead(kernels, self.run.progress) as has_ended,
-            _limit_workers(self.products[photos], ahead, self.run) as run,
-            ExitStack() as first,
-        ):
-            first.callback(has_ended.set)  # else workers that wait for kernels hold up an interrupted run
+        with compiling_ahead(kernels, self.run.progress) as self.has_ended:
+            run = _limit_workers(self.products[photos], ahead, self.run)
             for stage in later:
                 self.run_stage(stage, reasons[stage.name], run)
                 forget_earlier(run, if_finished=True)
@@ -200,7 +199,8 @@ class _Execution:
         """Return the product of a stage, if its photos and the output folder stayed the same meanwhile."""
         photos = self.pipeline.photos
         try:
-            product = stage.make(self.products, run)
+            with self.own_workers(run) as own:
+                product = stage.make(self.products, own)
             used = product if isinstance(product, PhotoSet) else self.products[photos]
             check_undisturbed(self.source, used, run)
         except Exception as err:
@@ -208,6 +208,17 @@ class _Execution:
             check_undisturbed(self.source, None if stage is photos else self.products[photos], run, by=err)
             raise
         return product
+
+    @contextmanager
+    def own_workers(self, run: RunContext) -> Iterator[RunContext]:
+        """Provide workers for one stage: where it fails, none of its tasks is left to write on behind its back."""
+        with run.with_workers(run.workers) as own:
+            try:
+                yield own
+            except BaseException:
+                self.has_ended.set()  # else workers that wait for kernels hold it up
+                own.executor.shutdown(wait=False, cancel_futures=True)
+                raise
 
 
 def spread_reasons(
@@ -228,16 +239,14 @@ def spread_reasons(
     return found
 
 
-@contextmanager
-def _limit_workers(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> Iterator[RunContext]:
-    """Say what these stages will cost, and provide a run with as many workers as the memory allows.
+def _limit_workers(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> RunContext:
+    """Say what these stages will cost, and return the run with as many workers as the memory allows.
 
     Raises:
         ConfigError: the photos need more memory than the user allows.
     """
     if not ahead:
-        yield run
-        return
+        return run
     plan = choose_plan(photos.photos, run.settings, run.workers, run.memory_mb, ahead)
     if run.settings.max_memory_gb and plan.peak_mb(ahead) > run.memory_mb:
         raise ConfigError(
@@ -246,8 +255,7 @@ def _limit_workers(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> I
         )
     run.progress.say(plan.text(ahead))
     logger.info("%s", plan.text(ahead))
-    with run.with_workers(plan.workers) as narrower:
-        yield narrower
+    return replace(run, workers=plan.workers)
 
 
 def check_undisturbed(source: Source, photos: PhotoSet | None, run: RunContext, by: Exception | None = None) -> None:
