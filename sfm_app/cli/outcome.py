@@ -90,8 +90,11 @@ def _camera_lines(run: Run) -> Iterator[str]:
         label = f"{name}: " if len(cameras) > 1 else ""
         yield f"camera      {label}{'' if now.projection == EQUIRECTANGULAR else focal}{field_text(now)}"
         if not found.identifiable:
-            source = "only all photos together do" if after else f"this is {SOURCES.get(found.method, found.method)}"
-            yield f"            pairs of photos do not determine it, {source}: {found.reason}"
+            # a doubt of the pairs' that is settled would be read as one of the number above
+            source = "only all photos together do"
+            if after is None:
+                source = f"this is {SOURCES.get(found.method, found.method)}: {found.reason}"
+            yield f"            pairs of photos do not determine it, {source}"
     if len(cameras) > SHOWN:
         yield f"            and {len(cameras) - SHOWN} more cameras"
 

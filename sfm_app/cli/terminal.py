@@ -118,7 +118,7 @@ class Terminal:
         """
         with self.lock:
             self.works = True
-            self._show_bar(to_printable(label), total)
+            self._show_bar(to_printable(label), total if total > 1 else None)  # nothing of "0/1" is news
 
     def advance(self, steps: int = 1) -> None:
         """Move the bar forward by some steps."""

@@ -44,6 +44,20 @@ def make_truncated(folder):
         (folder / name).write_bytes((folder / name).read_bytes()[:1000])
 
 
+@pytest.mark.parametrize(("here", "out"), [("", "photos-model"), ("elsewhere", "{}/photos-model")])
+def test_a_run_without_an_output_folder_writes_beside_the_photos_and_names_that_as_people_do(
+    folder, tmp_path, monkeypatch, here, out
+):
+    (tmp_path / here).mkdir(exist_ok=True)
+    monkeypatch.chdir(tmp_path / here)
+    asked = []
+    monkeypatch.setattr("sfm_app.reconstruct", lambda _, place, *__, **___: asked.append(place), raising=False)
+
+    call("run", folder, "-q")
+
+    assert [str(place) for place in asked] == [out.format(tmp_path.resolve())]
+
+
 @pytest.mark.parametrize(
     ("make", "says"),
     [

@@ -38,6 +38,14 @@
     show();
   }
 
+  // a page that was opened from a file knows the folder that it lies in
+  function folder() {
+    if (location.protocol !== "file:") return "OUT";
+    const path = decodeURIComponent(location.pathname).replace(/\/[^/]*$/, "").replace(/^\/(?=[A-Za-z]:)/, "");
+    if (/^[\w@%+=:,./-]+$/.test(path)) return path;
+    return path[1] === ":" ? `"${path}"` : `'${path.replaceAll("'", `'"'"'`)}'`;
+  }
+
   // a line does not end within an option
   function write(id, command) {
     const parts = command.split(/(--\w*)/).map((part, k) => (k % 2 ? Object.assign(document.createElement("span"), { textContent: part }) : part));
@@ -54,7 +62,7 @@
       ? `A and B are ${length(a.distanceTo(b))} apart.${on ? " Another click begins again." : ""}`
       : `Mark ${a ? "B" : "A"}: click or tap on the model. By keyboard: turn the view until the cross is there, and press Enter.`;
     if (b) {
-      const places = `"${coordinates(a)}" "${coordinates(b)}"`, out = view.out || "OUT";
+      const places = `"${coordinates(a)}" "${coordinates(b)}"`, out = view.out || folder();
       write("command-scale", `sfm-app run PHOTOS -o ${out} --scale "${inModel(a)}" "${inModel(b)}" 1.25m`);
       // after "--", a negative coordinate is no option
       write("command-measure", `sfm-app measure ${out} ${places.includes('"-') ? "-- " : ""}${places}`);
