@@ -63,6 +63,7 @@
       : `Mark ${a ? "B" : "A"}: click or tap on the model. By keyboard: turn the view until the cross is there, and press Enter.`;
     if (b) {
       const places = `"${coordinates(a)}" "${coordinates(b)}"`, out = view.out || folder();
+      byId("out-stands").hidden = out !== "OUT";
       write("command-scale", `sfm-app run PHOTOS -o ${out} --scale "${inModel(a)}" "${inModel(b)}" 1.25m`);
       // after "--", a negative coordinate is no option
       write("command-measure", `sfm-app measure ${out} ${places.includes('"-') ? "-- " : ""}${places}`);
