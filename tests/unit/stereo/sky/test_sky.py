@@ -67,8 +67,13 @@ def test_a_sky_is_found_up_to_its_outlines(gray):
         assert found[inside].mean() < 0.002
 
 
-def test_depths_that_matching_carried_into_the_sky_are_in_it():
-    photos = [photograph(x, 220.0, sky) for x in SIDEWAYS]
+PALING = 130.0 + 0.5 * np.mgrid[:HEIGHT, :WIDTH][0]
+"""A sky that is paler at the horizon."""
+
+
+@pytest.mark.parametrize("gray", [220.0, PALING], ids=["even", "paling"])
+def test_depths_that_matching_carried_into_the_sky_are_in_it(gray):
+    photos = [photograph(x, gray, sky) for x in SIDEWAYS]
     carried = [cv2.dilate((~photo.blank).view(np.uint8), np.ones((13, 13))) > 0 for photo in photos]
     rims = [wide & photo.blank for wide, photo in zip(carried, photos, strict=True)]
     spoiled = [
