@@ -107,7 +107,7 @@ def candidate_pairs(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
 
 
 def _retry_pairs(first: MappedScene, pairs: Sequence[PairId], report: dict[str, Json]) -> MappedScene | None:
-    """Run all steps from features to models once more; return None if no pair has gained matches."""
+    """Run all steps from features to models once more; return None if none of it is of use."""
     run = _side_run(first.run)
     finer = replace(run, workspace=SubWorkspace(run.workspace, FEATURES))
     with translate_errors("looking for finer features"):
@@ -119,6 +119,8 @@ def _retry_pairs(first: MappedScene, pairs: Sequence[PairId], report: dict[str, 
         if not changed:
             return None
     fitted = to_view_graph(fit_pairs(matches, changed, run, first.views.lenses))
+    if not fitted.fits:  # such as of a photo of something else
+        return None
     asked = set(changed)
     kept = {pair: fit for pair, fit in first.views.fits.items() if pair not in asked}
     refused = {pair: why for pair, why in first.views.rejected.items() if pair not in asked}

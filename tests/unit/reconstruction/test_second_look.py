@@ -47,9 +47,12 @@ def first(synthetic, cameras, tmp_path):
 
 @pytest.fixture
 def finer(monkeypatch, synthetic):
-    """Lets finer features be those that COLMAP has made; what is asked for is noted. `places` of six find a place."""
+    """Lets finer features be those that COLMAP has made; what is asked for is noted. `places` of six find a place.
 
-    def make(places=6, failing=None):
+    Matches are wrong where their second features come in another `order`.
+    """
+
+    def make(places=6, failing=None, order=slice(None)):
         asked = []
 
         def fill_database(method, run, pairs):
@@ -59,7 +62,8 @@ def finer(monkeypatch, synthetic):
             for photo in sorted({photo for pair in pairs for photo in pair}):
                 write_keypoints(run.workspace.database, photo, synthetic.matches.keypoints[photo].astype(np.float32))
             for pair in pairs:
-                write_matches(run.workspace.database, pair, synthetic.matches.matches[pair])
+                rows = synthetic.matches.matches[pair]
+                write_matches(run.workspace.database, pair, np.stack([rows[:, 0], rows[order, 1]], axis=1))
 
         def reconstruct(matches, views, intrinsics, run):
             asked.append((matches, views, intrinsics))
@@ -102,6 +106,14 @@ def test_what_was_found_first_stays_where_no_more_photos_find_a_place(first, fin
 
     assert retry_lost_photos(first) is first
     assert first.run.statistics["second_look"]["taken"] is False
+
+
+def test_nothing_is_mapped_again_where_no_lost_photo_shows_the_same_scene(first, finer):
+    asked = finer(order=slice(None, None, -1))
+
+    assert retry_lost_photos(first) is first
+    assert len(asked) == 1
+    assert (first.run.statistics["second_look"]["placed"], first.run.statistics["second_look"]["taken"]) == ([5], False)
 
 
 def test_a_second_look_that_fails_costs_nothing(first, finer):
