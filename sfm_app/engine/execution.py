@@ -199,7 +199,7 @@ class _Execution:
         """Return the product of a stage, if its photos and the output folder stayed the same meanwhile."""
         photos = self.pipeline.photos
         try:
-            with self.own_workers(run) as own:
+            with self.open_workers(run) as own:
                 product = stage.make(self.products, own)
             used = product if isinstance(product, PhotoSet) else self.products[photos]
             check_undisturbed(self.source, used, run)
@@ -210,7 +210,7 @@ class _Execution:
         return product
 
     @contextmanager
-    def own_workers(self, run: RunContext) -> Iterator[RunContext]:
+    def open_workers(self, run: RunContext) -> Iterator[RunContext]:
         """Provide workers for one stage: where it fails, none of its tasks is left to write on behind its back."""
         with run.with_workers(run.workers) as own:
             try:

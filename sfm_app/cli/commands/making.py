@@ -46,7 +46,7 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: A
     from sfm_app.cli.terminal import Terminal
 
     settings, start = settings_from_flags(flags), monotonic()
-    place = out or _beside(photos.resolve())
+    place = out or _choose_place(photos.resolve())
     with Terminal(quiet=flags["quiet"]) as progress:
         done = sfm_app.reconstruct(photos, place, settings, first=first or "", last=last, progress=progress)
     if flags["as_json"]:
@@ -58,7 +58,7 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: A
     print_lines(run_steps(done, photos, out, settings, quiet=flags["quiet"]))
 
 
-def _beside(photos: Path) -> Path:
+def _choose_place(photos: Path) -> Path:
     """Return the folder for a run where none is named, as short as a person would write it here."""
     place, here = photos.with_name(f"{photos.name}-model"), Path.cwd()
     return place.relative_to(here) if place.is_relative_to(here) else place
