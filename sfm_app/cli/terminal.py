@@ -211,7 +211,7 @@ def progress_text(task: Task) -> str:
     """Return how far some work is, and how fast it goes."""
     if compiles():
         return "waits for kernels, compiled once on this machine"
-    if not task.total or task.total == 1:
+    if not task.total:
         return f"goes on, {task.elapsed or 0.0:.0f} s so far"
     left = left_text(task)
     return f"{task.completed:.0f} of {task.total:.0f}{f', {left}' if left else ''}"

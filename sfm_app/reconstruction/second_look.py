@@ -116,6 +116,7 @@ def _retry_pairs(first: MappedScene, pairs: Sequence[PairId], report: dict[str, 
     fill_database(run.plugins.feature_method(SIFT_DSP), finer, pairs)
     with translate_errors("adding matches"):
         matches, changed = add_matches(first.matches, *read_features(finer.workspace.database))
+        report["pairs_with_more_matches"] = len(changed)
         if not changed:
             return None
     fitted = to_view_graph(fit_pairs(matches, changed, run, first.views.lenses))
@@ -127,7 +128,7 @@ def _retry_pairs(first: MappedScene, pairs: Sequence[PairId], report: dict[str, 
     views = ViewGraph(
         dict(sorted((kept | dict(fitted.fits)).items())), refused | dict(fitted.rejected), first.views.lenses
     )
-    report |= {"pairs_with_more_matches": len(changed), "pairs_with_geometry": [len(first.views.fits), len(views.fits)]}
+    report["pairs_with_geometry"] = [len(first.views.fits), len(views.fits)]
     intrinsics = first.intrinsics if _is_mostly_calibrated(first) else find_intrinsics(matches, views, run)[0]
     return MappedScene(reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
 

@@ -216,14 +216,12 @@ def _fill_plain_areas(inputs: Shared[_Inputs], index: int) -> None:
     proposed = store.read_depth(view, "proposed")
     if not proposed.any():
         return
-    maps, others = (
-        store.read_maps(view),
-        [
-            (other, store.read_depth(other, "geometric"), store.read_depth(other, "proposed"))
-            for other in near
-            if store.has(other, "proposed")
-        ],
-    )
+    maps = store.read_maps(view)
+    others = [
+        (other, store.read_depth(other, "geometric"), store.read_depth(other, "proposed"))
+        for other in near
+        if store.has(other, "proposed")
+    ]
     agreed = agreed_proposals(view, (maps.depth, proposed), others, task.tolerance(1))
     store.write_maps(view, add_depths(maps, agreed, view))
 

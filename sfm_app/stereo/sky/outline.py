@@ -1,7 +1,5 @@
 """The pixels of a sky, given its cells: up to the outlines of what stands before it."""
 
-from itertools import combinations_with_replacement
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +23,7 @@ BLUR_PX = 2
 castle-P19, where photos that are left out fit 0.15 dB better with 1 and 0.4 dB better with 2; railing was left out."""
 STEADY = 0.3
 """Added, in squared cells, to the variance of the places by which the slope of a sky is told: few cells in a row tell
-none across it. Chosen on the fisheye demo; railing, garden, courtyard and town were left out, and gain by 0.1 to 1."""
+none across it. Chosen on the fisheye demo; railing, garden, courtyard and town were left out: 0.1 to 1 help all."""
 LEAST_WEIGHT = 1e-4
 """Of the sky around that is averaged. By definition: rounding."""
 
@@ -61,22 +59,21 @@ def _continue_sky(photo: GrayImage, cells: NDArray[np.bool_]) -> NDArray[np.floa
     """Return (h, w) the gray level of the sky around each cell, continued along its slope: skies pale downwards."""
     gray = cv2.resize(photo, cells.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float64)
     y, x = np.mgrid[: cells.shape[0], : cells.shape[1]].astype(np.float64)
-    weight = np.maximum(_blur(cells, 1.0), LEAST_WEIGHT)
-    x_mean, y_mean, level = (_blur(cells, values) / weight for values in (x, y, gray))
-    xx, xy, yy = (
-        _blur(cells, a * b) / weight - a_mean * b_mean
-        for (a, a_mean), (b, b_mean) in combinations_with_replacement([(x, x_mean), (y, y_mean)], 2)
-    )
-    xg, yg = (_blur(cells, a * gray) / weight - a_mean * level for a, a_mean in ((x, x_mean), (y, y_mean)))
-    xx, yy = xx + STEADY, yy + STEADY
+    weight = np.maximum(_blur(cells.astype(np.float64)), LEAST_WEIGHT)
+    x_mean, y_mean, level = (_blur(cells * values) / weight for values in (x, y, gray))
+    # variances and covariances of place and gray level, as a plane is fitted
+    xx = _blur(cells * x * x) / weight - x_mean * x_mean + STEADY
+    yy = _blur(cells * y * y) / weight - y_mean * y_mean + STEADY
+    xy = _blur(cells * x * y) / weight - x_mean * y_mean
+    xg, yg = _blur(cells * x * gray) / weight - x_mean * level, _blur(cells * y * gray) / weight - y_mean * level
     slope_x, slope_y = yy * xg - xy * yg, xx * yg - xy * xg
     slopes = slope_x * (x - x_mean) + slope_y * (y - y_mean)
     return np.asarray(level + slopes / (xx * yy - xy * xy), np.float32)
 
 
-def _blur(cells: NDArray[np.bool_], values: NDArray[np.float64] | float) -> NDArray[np.float64]:
-    """Return sums over the cells of the sky around each cell, those nearby with more weight."""
-    return np.asarray(cv2.GaussianBlur(cells * values, (0, 0), REACH * max(cells.shape)), np.float64)
+def _blur(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return sums (h, w) of the values around each cell, those nearby with more weight."""
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), REACH * max(values.shape)), np.float64)
 
 
 def _find_narrow_rims(sky: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -51,7 +51,7 @@ def test_a_run_without_an_output_folder_writes_beside_the_photos_and_names_that_
     (tmp_path / here).mkdir(exist_ok=True)
     monkeypatch.chdir(tmp_path / here)
     asked = []
-    monkeypatch.setattr("sfm_app.reconstruct", lambda _, place, *__, **___: asked.append(place), raising=False)
+    monkeypatch.setattr("sfm_app.reconstruct", lambda _, place, *__, **___: asked.append(place))
 
     call("run", folder, "-q")
 

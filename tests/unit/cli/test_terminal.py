@@ -102,6 +102,7 @@ def test_work_that_cannot_be_measured_is_named(shown, clock):
         display.look()
 
     assert paper.getvalue().splitlines()[1].strip() == "adjusting: goes on, 36 s so far"
+    assert display.bars.tasks[0].total is None  # a bar at 0/1 stands still
 
 
 def test_who_waits_for_kernels_says_so(shown, clock, monkeypatch):

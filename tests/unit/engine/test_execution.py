@@ -3,7 +3,6 @@
 import shutil
 import threading
 import time
-from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -89,4 +88,4 @@ def test_a_stage_that_has_failed_leaves_the_workers_of_the_run_at_work(two_worke
     with pytest.raises(ReconstructionError):
         pipeline(fail).run(source, two_workers)
 
-    assert replace(two_workers, workers=1).map(str, range(3), "numbers") == ["0", "1", "2"]
+    assert two_workers.map(str, range(3), "numbers") == ["0", "1", "2"]

@@ -40,7 +40,7 @@
 
   // a page that was opened from a file knows the folder that it lies in
   function folder() {
-    if (location.protocol !== "file:") return "OUT";
+    if (location.protocol !== "file:" || location.host) return "OUT";
     const path = decodeURIComponent(location.pathname).replace(/\/[^/]*$/, "").replace(/^\/(?=[A-Za-z]:)/, "");
     if (/^[\w@%+=:,./-]+$/.test(path)) return path;
     return path[1] === ":" ? `"${path}"` : `'${path.replaceAll("'", `'"'"'`)}'`;
