@@ -81,7 +81,7 @@ def fold_lines(lines: Iterable[str], width: int = WIDTH) -> list[str]:
 
 
 def to_printable(text: str) -> str:
-    """Escape unprintable characters: in a file's name, they could move the cursor or break the line."""
+    """Return a text with escaped unprintable characters: in a name, they could move the cursor or break the line."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 

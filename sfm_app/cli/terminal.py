@@ -134,7 +134,7 @@ class Terminal:
                 self._show_bar("", None)
 
     def check_silence(self) -> None:
-        """After a silence, print the title of the stage or the progress of its work."""
+        """Print the title of the stage or the progress of its work after a silence."""
         silent_s = self.clock() - self.last_output_s
         if self.title and silent_s >= SILENCE_S:
             self._print_title(end="")
