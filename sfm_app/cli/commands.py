@@ -124,7 +124,7 @@ def calibrate(photos: Path, out: Path | None, figure: Path | None, **flags: Any)
 )
 @click.option("--paper", type=click.Choice(PAPERS), default="a4", show_default=True, help="Size of the page.")
 def markers(side: str, target: Path, family: str, first: int, paper: str) -> None:
-    """Make a page of markers to print and to place in the scene; SIDE is the length of their side, such as 50mm.
+    """Make a page of markers to print and to place in the scene; SIDE is their side length, such as 50mm.
 
     `sfm-app run PHOTOS --markers 50mm` then gives the model its real size.
     """
