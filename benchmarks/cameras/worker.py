@@ -35,7 +35,7 @@ def run_ours(photos: Path, out: Path, options: Mapping[str, Any]) -> dict[str, A
     stages = json.loads(manifest.read_text(encoding="utf-8"))["stages"] if manifest.exists() else {}
     said = {"failed": failed, "exit code": code, "peak MB": peak_mb()}
     if run is not None:
-        from sfm_app.cli.display import run_lines  # imported late: its cost is not the method's
+        from sfm_app.cli.outcome import run_lines  # imported late: its cost is not the method's
 
         said["summary"] = list(run_lines(run))
     return said | {"seconds": {name: stage["seconds"] for name, stage in stages.items()}}

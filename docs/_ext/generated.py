@@ -10,8 +10,8 @@ from pydantic.fields import FieldInfo
 
 from sfm_app import errors
 from sfm_app.cli import main
-from sfm_app.cli.formats import known_formats
-from sfm_app.cli.setting_flags import SETTING_FLAGS, range_text
+from sfm_app.cli.commands import config, known_formats
+from sfm_app.cli.options import SETTING_FLAGS, range_text
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import QUALITY_PRESETS, Section, Settings, merge_nested
 
@@ -63,8 +63,7 @@ def setting_options() -> str:
 
 def _shared_flags() -> list[tuple[str, str]]:
     """Return the options of `sfm-app config`, which has no other."""
-    command = main.commands["config"]
-    return _options(command, click.Context(command))
+    return _options(config, click.Context(config))
 
 
 def _options(command: click.Command, context: click.Context) -> list[tuple[str, str]]:

@@ -1,4 +1,4 @@
-"""What this machine has and lacks."""
+"""State of this machine and of the installed libraries."""
 
 import platform
 import shutil
@@ -17,15 +17,15 @@ ENOUGH_DISK = 2 * GIGABYTE
 
 
 def examine() -> dict[str, str]:
-    """Return the state of the machine and of the installed parts, one line each."""
+    """Return the state of the machine and of the installed libraries, one line each."""
     disk = shutil.disk_usage(Path.cwd()).free
     return {
         "python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",
         "cores": str(worker_count(0)),
         "memory": f"{free_memory_mb() / MB_PER_GB:.0f} GB free",
         "free disk here": f"{disk / GIGABYTE:.0f} GB"
-        + ("" if disk > ENOUGH_DISK else ": little; dense stereo needs about 2 GB"),
-        "done without": ", ".join(missing_abilities()) or "nothing",
+        + ("" if disk > ENOUGH_DISK else "; low: dense stereo needs about 2 GB"),
+        "missing in this system": ", ".join(missing_abilities()) or "nothing",
         **versions(),
         "COLMAP with CUDA": "yes" if has_cuda() else "no",
         "depth maps": _depth_maps(),
@@ -51,16 +51,16 @@ def _open3d() -> str:
 
 def _plugins() -> str:
     try:
-        found = load_plugins()
+        methods = load_plugins()
     except SfmError as err:
         return f"broken: {err}"
     return ", ".join(
         f"{len(parts)} {name}"
         for name, parts in (
-            ("feature methods", found.features),
-            ("estimators", found.estimators),
-            ("calibrators", found.calibrators),
-            ("formats", {**found.exporters, **found.scene_exporters}),
-            ("depth methods", found.depth_methods),
+            ("feature methods", methods.features),
+            ("estimators", methods.estimators),
+            ("calibrators", methods.calibrators),
+            ("formats", {**methods.exporters, **methods.scene_exporters}),
+            ("depth methods", methods.depth_methods),
         )
     )

@@ -1,25 +1,44 @@
-"""Text on stdout and stderr: in 80 columns, without colors, and nothing that could move the cursor."""
+"""Text on stdout and stderr in 80 columns, without colors and control characters; pages in the browser."""
 
+import os
 import re
 import shutil
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from textwrap import wrap
+from threading import Thread
+from types import MappingProxyType
 from typing import Any, TextIO
 
 from sfm_app.numerical import json_text
 
 MEGABYTE, KILOBYTE = 1e6, 1e3
 WIDTH, WIDEST, NARROWEST = 80, 100, 40
-"""Columns of text where there is no terminal, and the most and the fewest that are used of one: long lines are hard to
-read."""
-DEEPEST = 24
-"""Column up to which a label is one: what is wrapped goes on below the text beside it. Chosen by hand."""
+"""Columns of text without a terminal; most and fewest columns on a terminal: long lines are hard to read."""
+WIDEST_LABEL = 24
+"""Columns; text behind a wider label is wrapped below the label. Chosen by hand."""
 LABEL = re.compile(r"(?=.{1,24}(?<=\s\s)\S)\s*\S.*?\s{2,}|\s+|(hint|error):\s")
-"""What stands before a text: spaces, a label with two spaces behind it, or the kind of a message."""
+"""Start of a line: spaces, a label with two spaces behind it, or the kind of a message."""
 FILE_LINE = re.compile(r"\s{2}(\d+ files, )?[\d.]+ (bytes|kB|MB)$")
-"""The end of a line of `file_lines`: a path is copied, so it stays in one piece."""
+"""End of a line of `file_lines`, which is not wrapped: users copy the path."""
+SCREEN_VARIABLES = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
+"""Environment variables of a screen, or of an editor that opens pages on the user's own machine."""
+BROWSER_WAIT_S = 2.0
+"""Longest wait for the browser. Chosen by hand."""
+STAGE_TITLES: Mapping[str, str] = MappingProxyType({
+    "photos": "reading photos",
+    "match_graph": "finding and matching features",
+    "view_graph": "fundamental matrices",
+    "intrinsics": "camera matrix",
+    "scene": "camera poses and points",
+    "scale": "real size",
+    "depth_maps": "depth maps",
+    "mesh": "surface",
+    "texture": "texture",
+    "files": "files",
+})  # fmt: skip
+"""By the name of the stage, in order; the same names as `pipeline.NAMES`, which takes a second to import."""
 
 
 def print_json(value: Any) -> None:
@@ -28,46 +47,41 @@ def print_json(value: Any) -> None:
 
 
 def print_lines(lines: Iterable[str]) -> None:
-    """Print lines on stdout as they are, but for characters that cannot be printed."""
+    """Print lines on stdout without folding; escape unprintable characters."""
     sys.stdout.write("".join(f"{to_printable(line)}\n" for line in lines))
 
 
 def print_text(lines: Iterable[str]) -> None:
-    """Print lines on stdout, those that are too long on several lines."""
-    print_lines(fold_lines(map(to_printable, lines), columns(sys.stdout) or WIDTH))
+    """Print lines on stdout, folded to the width of the terminal."""
+    print_lines(fold_lines(map(to_printable, lines), terminal_width(sys.stdout) or WIDTH))
 
 
-def columns(stream: TextIO) -> int | None:
-    """Return how many columns are used of the terminal that a stream ends in; None where it ends in no terminal."""
+def terminal_width(stream: TextIO) -> int | None:
+    """Return the columns to use of the stream's terminal; None if it is no terminal."""
     if not stream.isatty():
         return None
     return max(NARROWEST, min(WIDEST, shutil.get_terminal_size((WIDTH, 24)).columns))
 
 
 def fold_lines(lines: Iterable[str], width: int = WIDTH) -> list[str]:
-    """Return lines of at most so many columns: long ones go on below their text, behind their label.
+    """Return lines of at most `width` columns; continuation lines start below the text behind the label.
 
-    Words longer than that, such as paths, stay in one piece, and so do lines of `file_lines`.
-
-    Args:
-        lines: of text, some with a label and two spaces or more behind it.
-        width: most columns.
+    Does not break words, such as paths, nor lines of `file_lines`.
     """
-    found: list[str] = []
+    folded: list[str] = []
     for line in lines:
         label = LABEL.match(line)
-        depth = len(label[0]) if label is not None and len(label[0]) <= DEEPEST else 0
+        depth = len(label[0]) if label is not None and len(label[0]) <= WIDEST_LABEL else 0
         if len(line) <= width or FILE_LINE.search(line):
-            found.append(line)
+            folded.append(line)
             continue
         parts = wrap(line[depth:], width - depth, break_long_words=False, break_on_hyphens=False)
-        found += [f"{'' if number else line[:depth]}{'' if not number else ' ' * depth}{part}"
-                  for number, part in enumerate(parts)]  # fmt: skip
-    return found
+        folded += [f"{' ' * depth if number else line[:depth]}{part}" for number, part in enumerate(parts)]
+    return folded
 
 
 def to_printable(text: str) -> str:
-    """Return a text with unprintable characters escaped: a file's name could move the cursor or break the line."""
+    """Return a text with escaped unprintable characters: in a name, they could move the cursor or break the line."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
@@ -84,7 +98,7 @@ def _size_on_disk(path: Path) -> str:
 
 
 def size_text(size: int) -> str:
-    """Return a number of bytes with a suitable unit."""
+    """Return a number of bytes with its unit."""
     if size < KILOBYTE:
         return f"{size} bytes"
     return f"{size / MEGABYTE:.1f} MB" if size >= MEGABYTE else f"{size / KILOBYTE:.0f} kB"
@@ -94,3 +108,28 @@ def table(rows: Mapping[str, str]) -> list[str]:
     """Return lines with names and texts in two aligned columns."""
     width = max(map(len, rows), default=0)
     return [f"{name:{width}}  {text}" for name, text in rows.items()]
+
+
+def open_browser(address: str) -> bool:
+    """Open an address in the user's browser; return False if there is none.
+
+    Without a screen, Python would start a text browser in this terminal. Some browsers block until their window
+    closes: a thread calls them.
+    """
+    if sys.platform.startswith("linux") and not any(map(os.environ.get, SCREEN_VARIABLES)):
+        return False
+    import webbrowser
+
+    errors = []
+
+    def call() -> None:
+        try:
+            if not webbrowser.open(address):
+                errors.append("no browser")
+        except (webbrowser.Error, OSError) as err:
+            errors.append(str(err))
+
+    thread = Thread(target=call, daemon=True)
+    thread.start()
+    thread.join(BROWSER_WAIT_S)
+    return not errors

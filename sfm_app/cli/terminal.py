@@ -1,10 +1,12 @@
-"""What a person sees of a run that goes on, on stderr."""
+"""Progress of a run on stderr: a line per stage, and a bar on a terminal."""
 
 import os
 import sys
 import threading
 import time
+from collections.abc import Callable
 from types import TracebackType
+from typing import TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, TaskID, TextColumn
@@ -12,52 +14,61 @@ from rich.progress import Progress as Bars
 from rich.table import Column
 from rich.text import Text
 
-from sfm_app.cli.output import WIDTH, columns, fold_lines, to_printable
-from sfm_app.cli.stage_titles import STAGE_TITLES
+from sfm_app.cli.output import STAGE_TITLES, WIDTH, fold_lines, terminal_width, to_printable
 
 LONG_STAGE_S, SILENCE_S, LINE_EVERY_S = 10.0, 5.0, 30.0
-"""Seconds of a stage whose speed is told; seconds of silence after which the stage is named where there is no bar, and
-seconds between two lines on what it does then. Chosen by hand."""
-LOOK_EVERY_S = 1.0
-"""Seconds between two looks for silence."""
+"""Seconds of a stage from which on its speed is printed; without a bar, seconds until the title of a stage is printed,
+and seconds between two lines about its progress. Chosen by hand."""
+CHECK_EVERY_S = 1.0
+"""Seconds between two checks for these."""
 MINUTE_S, FAST = 60.0, 10.0
 LABEL_COLUMNS, BAR_COLUMNS, TITLE_COLUMNS = 32, 16, 38
-"""Of a bar's line, which has 80 at most, and of the title of a stage, with its seconds behind it."""
+"""Columns of a bar's label, of the bar, and of a stage's title in front of its seconds."""
 INDENT = " " * 6
-"""Before what belongs to a stage."""
+"""In front of the lines of a stage."""
 
 
 class Terminal:
-    """Progress on stderr: a line per stage and a bar on a terminal, some lines more elsewhere, nothing when quiet.
+    """Progress on stderr: a line per stage and a bar on a terminal, a few more lines elsewhere, nothing when quiet.
 
-    On a terminal something moves as long as a stage runs. Elsewhere, what takes long is named.
+    On a terminal the bar moves as long as a stage runs. Elsewhere, `check_silence` prints the title of a long stage.
+
+    Args:
+        quiet: print nothing.
+        stream: output; stderr if None.
+        clock: seconds from any start.
     """
 
-    def __init__(self, *, quiet: bool) -> None:
-        is_terminal, plain = sys.stderr.isatty(), "NO_COLOR" in os.environ
-        self.console = Console(stderr=True, quiet=quiet, highlight=False, force_terminal=is_terminal)
+    def __init__(
+        self, *, quiet: bool, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.stream, self.clock = stream or sys.stderr, clock
+        is_terminal, plain = self.stream.isatty(), "NO_COLOR" in os.environ
+        self.console = Console(file=self.stream, quiet=quiet, highlight=False, force_terminal=is_terminal)
         self.dim = "" if plain else "dim"
         self.has_bar = is_terminal and not quiet and not self.console.is_dumb_terminal
+        self.needs_lines = not quiet and not self.has_bar
         self.bars = Bars(
             TextColumn("  {task.description}", table_column=Column(width=LABEL_COLUMNS, no_wrap=True)),
             BarColumn(bar_width=BAR_COLUMNS),
             StepsColumn(table_column=Column(no_wrap=True)),
-            PaceColumn(table_column=Column(no_wrap=True)),
+            TimeColumn(table_column=Column(no_wrap=True)),
             console=self.console,
+            get_time=clock,
             transient=True,
             disable=not self.has_bar,
         )
         self.task: TaskID | None = None
-        self.title, self.works = "", False
-        """Of the current stage, while it is not printed yet; whether some work of it has started."""
+        self.title, self.has_work = "", False
+        """Title of the current stage, until it is printed; whether the bar shows some work of the stage."""
         self.is_open = False
-        """Whether the last line is a title that waits for its seconds."""
-        self.said_s = time.monotonic()
-        self.ended, self.lock = threading.Event(), threading.RLock()
-        if not quiet and not self.has_bar:
-            threading.Thread(target=self._look_for_silence, daemon=True).start()
+        """Whether the last line is a title without a line break, for the seconds of the stage."""
+        self.last_output_s = clock()
+        self.closed, self.lock = threading.Event(), threading.RLock()
 
     def __enter__(self) -> "Terminal":
+        if self.needs_lines:
+            threading.Thread(target=self._watch_silence, daemon=True).start()
         return self
 
     def __exit__(
@@ -66,9 +77,9 @@ class Terminal:
         self.close()
 
     def close(self) -> None:
-        """Remove the bar and end the line; nothing is shown any more."""
+        """Remove the bar, end the line and stop the output."""
         with self.lock:
-            self.ended.set()
+            self.closed.set()
             self._print_title()
             self._end_line()
             self._remove_bar()
@@ -77,77 +88,67 @@ class Terminal:
         """Announce a stage; its title is printed once it ends or takes long, and is above the bar until then.
 
         Args:
-            name: of the stage.
-            note: why it is skipped or done again; may be empty.
+            name: key of `STAGE_TITLES`, or any other title.
+            note: reason to skip or repeat the stage; may be empty.
         """
         with self.lock:
             self._print_title()
-            steps = list(STAGE_TITLES)
-            number = f"{steps.index(name) + 1:2}/{len(steps)} " if name in steps else ""
+            names = list(STAGE_TITLES)
+            number = f"{names.index(name) + 1:2}/{len(names)} " if name in names else ""
             self.title = f"{number}{STAGE_TITLES.get(name, name)}{f' ({note})' if note else ''}"
-            self.said_s = time.monotonic()
+            self.last_output_s = self.clock()
             self._show_bar(STAGE_TITLES.get(name, name), None)
 
     def finish_stage(self, seconds: float, photos: int = 0) -> None:
-        """Print how long the stage took, and its speed where that is of interest.
-
-        Args:
-            seconds: its duration.
-            photos: photos in use.
-        """
+        """Print the duration of the stage; for a long stage with photos, also its speed."""
         with self.lock:
             rate = f", {per_minute(photos / seconds)} photos per minute" if photos and seconds >= LONG_STAGE_S else ""
             self._remove_bar()
             if self.title:
                 self._print_title(end="")
-            self._print("" if self.is_open else INDENT, f"{seconds:.1f} s{rate}", goes_on=self.is_open)
+            self._print("" if self.is_open else INDENT, f"{seconds:.1f} s{rate}", continues=self.is_open)
 
     def say(self, text: str) -> None:
-        """Print a text, below the title of the stage that it belongs to."""
+        """Print a text below the title of its stage."""
         with self.lock:
             self._print_title()
-            for line in fold_lines([f"{INDENT}{to_printable(text)}"], columns(sys.stderr) or WIDTH):
+            for line in fold_lines([f"{INDENT}{to_printable(text)}"], terminal_width(self.stream) or WIDTH):
                 self._print(line)
 
     def start(self, label: str, total: int) -> None:
-        """Show a bar for work that begins.
-
-        Args:
-            label: what is done.
-            total: steps of the work.
-        """
+        """Show a bar for some work of `total` steps."""
         with self.lock:
-            self.works = True
-            self._show_bar(to_printable(label), total if total > 1 else None)  # nothing of "0/1" is news
+            self.has_work = True
+            self._show_bar(to_printable(label), total if total > 1 else None)  # a bar at 0/1 would stand still
 
     def advance(self, steps: int = 1) -> None:
         """Move the bar forward by some steps."""
-        if self.task is not None and self.works:
+        if self.task is not None and self.has_work:
             self.bars.advance(self.task, steps)
 
     def finish(self) -> None:
-        """Show a bar without an end again, since the stage goes on."""
+        """Show a bar without an end again: the stage continues."""
         with self.lock:
-            if self.works:
-                self.works = False
+            if self.has_work:
+                self.has_work = False
                 self._show_bar("", None)
 
-    def look(self) -> None:
-        """Print a line where there has been none for long: the title, or how far the work is."""
-        silent_s = time.monotonic() - self.said_s
+    def check_silence(self) -> None:
+        """Print the title of the stage or the progress of its work after a silence."""
+        silent_s = self.clock() - self.last_output_s
         if self.title and silent_s >= SILENCE_S:
             self._print_title(end="")
         elif self.bars.tasks and silent_s >= LINE_EVERY_S:
-            now = self.bars.tasks[0]
-            self._print(INDENT, f"{now.description}: {progress_text(now)}")
+            task = self.bars.tasks[0]
+            self._print(INDENT, f"{task.description}: {progress_text(task)}")
 
-    def _look_for_silence(self) -> None:
-        while not self.ended.wait(LOOK_EVERY_S):
+    def _watch_silence(self) -> None:
+        while not self.closed.wait(CHECK_EVERY_S):
             with self.lock:
-                self.look()
+                self.check_silence()
 
     def _print_title(self, end: str = "\n") -> None:
-        """Print the title of the stage, if that has not been done; without an end, its seconds may follow."""
+        """Print the title of the stage unless it has been; without an end, its seconds may follow."""
         title, self.title = self.title, ""
         if title:
             self._print(title if end else f"{title:{TITLE_COLUMNS}} ", end=end)
@@ -158,15 +159,15 @@ class Terminal:
             self.is_open = False
             self.console.print()
 
-    def _print(self, text: str, dim: str = "", *, end: str = "\n", goes_on: bool = False) -> None:
-        if goes_on:
+    def _print(self, text: str, dim: str = "", *, end: str = "\n", continues: bool = False) -> None:
+        if continues:
             self.is_open = False
         self._end_line()
-        self.said_s = time.monotonic()
+        self.last_output_s = self.clock()
         self.console.print(Text.assemble(to_printable(text), (dim, self.dim)), soft_wrap=True, end=end)
 
     def _show_bar(self, label: str, total: int | None) -> None:
-        """Show the bar with another label; an empty one leaves it as it is."""
+        """Show the bar with another label; an empty label keeps the present one."""
         if self.task is None:
             self.task = self.bars.add_task(label, total=total)
             self.bars.start()
@@ -177,55 +178,55 @@ class Terminal:
         if self.task is not None:
             self.bars.stop()
             self.bars.remove_task(self.task)
-            self.task, self.works = None, False
+            self.task, self.has_work = None, False
 
 
 class StepsColumn(ProgressColumn):
-    """How many steps are done; empty where they are not known."""
+    """Steps done, of all steps; empty if their number is unknown."""
 
     def render(self, task: Task) -> Text:
         """Return the text of a bar."""
         return MofNCompleteColumn().render(task) if task.total else Text("")
 
 
-class PaceColumn(ProgressColumn):
-    """The time that has passed and the time that is left, or what is waited for."""
+class TimeColumn(ProgressColumn):
+    """Elapsed time and time left, or that kernels are compiled."""
 
     def render(self, task: Task) -> Text:
         """Return the text of a bar."""
         minutes, seconds = divmod(int(task.elapsed or 0.0), 60)
-        passed = f"{minutes}:{seconds:02}"
-        if compiles():
-            return Text(f"{passed}, compiling, once")
-        left = left_text(task)
-        return Text(f"{passed}, {left}" if left else passed)
+        elapsed = f"{minutes}:{seconds:02}"
+        if is_compiling():
+            return Text(f"{elapsed}, compiling, once")
+        remaining = remaining_text(task)
+        return Text(f"{elapsed}, {remaining}" if remaining else elapsed)
 
 
-def compiles() -> bool:
-    """Return whether this process waits for machine code; numba is not loaded for the answer."""
+def is_compiling() -> bool:
+    """Return whether this process waits for machine code, without an import of numba."""
     jit = sys.modules.get("sfm_app.jit")
     return jit is not None and bool(jit.is_waiting())
 
 
 def progress_text(task: Task) -> str:
-    """Return how far some work is, and how fast it goes."""
-    if compiles():
-        return "waits for kernels, compiled once on this machine"
+    """Return the steps done and the time left, or the elapsed time."""
+    if is_compiling():
+        return "compiling kernels, once on this machine"
     if not task.total:
-        return f"goes on, {task.elapsed or 0.0:.0f} s so far"
-    left = left_text(task)
-    return f"{task.completed:.0f} of {task.total:.0f}{f', {left}' if left else ''}"
+        return f"{task.elapsed or 0.0:.0f} s so far"
+    remaining = remaining_text(task)
+    return f"{task.completed:.0f} of {task.total:.0f}{f', {remaining}' if remaining else ''}"
 
 
-def left_text(task: Task) -> str:
-    """Return the seconds or minutes that some work still takes; empty before it can be told."""
+def remaining_text(task: Task) -> str:
+    """Return the time left; empty before the first step."""
     if not task.elapsed or not task.completed or task.total is None:
         return ""
-    left = (task.total - task.completed) * task.elapsed / task.completed
-    return f"{left:.0f} s left" if left < MINUTE_S else f"{left / MINUTE_S:.0f} min left"
+    seconds = (task.total - task.completed) * task.elapsed / task.completed
+    return f"{seconds:.0f} s left" if seconds < MINUTE_S else f"{seconds / MINUTE_S:.0f} min left"
 
 
 def per_minute(per_second: float) -> str:
-    """Return a speed per minute, with two digits where it is small."""
+    """Return a speed per minute, with one decimal below `FAST`."""
     speed = MINUTE_S * per_second
     return f"{speed:.0f}" if speed >= FAST else f"{speed:.1f}"

@@ -53,7 +53,9 @@ def test_every_public_name_is_on_a_page():
 
 def test_every_command_and_option_is_on_a_page(tools):
     text = tools[0].commands() + tools[0].setting_options()
-    for name, command in main.commands.items():
+    context = click.Context(main)
+    for name in main.list_commands(context):
+        command = main.get_command(context, name)
         assert f"## sfm-app {name}" in text
         if not isinstance(command, click.Group):
             assert all(option in text for part in command.params for option in part.opts if option.startswith("--"))

@@ -20,6 +20,6 @@ def test_an_interrupted_run_says_how_to_go_on_and_does_so(undisturbed, refused, 
     again = undisturbed.run(out)
 
     refused(interrupted, 130)
-    assert "the same command continues" in interrupted.stderr
+    assert "run the same command again to resume" in interrupted.stderr
     assert again.returncode == 0, again.stderr
     assert undisturbed.result(out) == undisturbed.result(undisturbed.out)

@@ -71,7 +71,7 @@ def test_masks_are_counted_and_every_photo_has_one(folder, masks, tmp_path):
     told = read(folder, tmp_path / "out").stdout
 
     assert json.loads(result.stdout)["masks"] == {"photos": 1, "unused": ["notes.txt", "other.jpg.png"]}
-    assert "masks       1 of 3 photos\n            without a photo that is used: notes.txt, other.jpg.png\n" in told
+    assert "masks       1 of 3 photos\n            unused: notes.txt, other.jpg.png\n" in told
     assert [used_share(tmp_path / "out", name) for name in ("a.jpg", "b.png", "sub/a.jpg")] == [1.0, 1.0, 0.5]
 
 

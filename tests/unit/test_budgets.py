@@ -7,14 +7,6 @@ from pathlib import Path
 import sfm_app
 
 PACKAGE = Path(sfm_app.__file__).parent
-COMMANDS = tuple(
-    f"cli/commands/{name}"
-    for name in (
-        "making.py:run", "making.py:calibrate", "making.py:demo", "paper.py:markers", "finished.py:export",
-        "finished.py:measure", "finished.py:report", "finished.py:view", "machine.py:completion",
-    )
-)  # fmt: skip
-"""Their docstrings are what `--help` prints; click says what the options are."""
 
 
 @cache
@@ -68,10 +60,12 @@ def test_what_is_public_says_what_it_is():
 def test_public_functions_say_what_their_parameters_are():
     silent = []
     for name, tree in trees().items():
+        if name.startswith("cli/"):  # click says what the parameters of commands are
+            continue
         for place, node in public(tree.body, name):
             if isinstance(node, ast.FunctionDef):
                 given = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
                 count = sum(one.arg not in ("self", "cls") for one in given)
                 if count >= 2 and "Args:" not in (ast.get_docstring(node) or ""):
                     silent.append(place)
-    assert sorted(silent) == sorted(COMMANDS)
+    assert silent == []

@@ -17,7 +17,7 @@ ALLOWED = {
     ("photos/tiff.py", "ctypes"),  # the type of a callback
     ("colmap/database.py", "ctypes"),  # Python's own counter of references
     ("synthetic/photo_folder.py", "multiprocessing"),  # the context is named: see below
-    ("cli/browser.py", "platform"),  # whether somebody sits at a screen
+    ("cli/output.py", "platform"),  # whether somebody sits at a screen
     ("runtime/workspace.py", "platform"),  # names the machine
     ("cli/doctor.py", "platform"),  # says what this system is called
     ("runtime/parallel/worker_versions.py", "platform"),

@@ -5,6 +5,7 @@ import re
 import tomllib
 from pathlib import Path
 
+import click
 import pytest
 
 from sfm_app import errors
@@ -34,7 +35,8 @@ def read(page):
 
 def flags():
     """Every long flag of every command."""
-    commands = main.commands.values()
+    context = click.Context(main)
+    commands = [main.get_command(context, name) for name in main.list_commands(context)]
     return {flag for command in commands for parameter in command.params for flag in parameter.opts}
 
 

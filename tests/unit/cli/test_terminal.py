@@ -1,46 +1,40 @@
-"""What is seen of a run that goes on: one line per stage, and no long silence."""
+"""Progress of a run: one line per stage, and no long silence."""
 
 import io
 import re
 import sys
+import time
 
 import pytest
 from rich.console import Console
 
-from sfm_app.cli import terminal
+from sfm_app.cli.output import STAGE_TITLES
 from sfm_app.cli.terminal import Terminal, per_minute
 from sfm_app.pipeline import NAMES
 
 
 class Screen(io.StringIO):
-    """A terminal that keeps what is written to it."""
-
     def isatty(self):
         return True
 
 
 @pytest.fixture
-def clock(monkeypatch):
-    """The seconds that pass, in a list of one."""
-    now = [0.0]
-    monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
-    return now
+def clock():
+    """The time in a list of one."""
+    return [0.0]
 
 
 @pytest.fixture
-def shown(clock, monkeypatch):
-    """A display without a terminal, and what it has printed."""
+def shown(clock):
+    """A display without a terminal, and its output; without `with`, it does not check for silence by itself."""
     paper = io.StringIO()
-    monkeypatch.setattr(terminal, "LOOK_EVERY_S", 1000.0)
-    shown = Terminal(quiet=False)
-    shown.console.file = paper
-    shown.bars.get_time = lambda: clock[0]
-    yield shown, paper
-    shown.close()
+    display = Terminal(quiet=False, stream=paper, clock=lambda: clock[0])
+    yield display, paper
+    display.close()
 
 
 def test_every_stage_has_a_title_in_order():
-    assert tuple(terminal.STAGE_TITLES) == NAMES
+    assert tuple(STAGE_TITLES) == NAMES
 
 
 def test_a_short_stage_is_one_line_with_its_seconds(shown):
@@ -49,7 +43,7 @@ def test_a_short_stage_is_one_line_with_its_seconds(shown):
     display.start("photos", 10)
     display.advance(10)
     display.finish()
-    display.look()
+    display.check_silence()
     assert paper.getvalue() == ""
 
     display.finish_stage(0.42, 10)
@@ -63,28 +57,28 @@ def test_a_short_stage_is_one_line_with_its_seconds(shown):
     ]
 
 
-def test_a_long_stage_is_named_after_five_seconds_and_its_seconds_follow_on_the_line(shown, clock):
+def test_the_title_of_a_long_stage_is_printed_after_five_seconds_and_its_seconds_follow(shown, clock):
     display, paper = shown
     display.stage("intrinsics")
     clock[0] = 4.9
-    display.look()
+    display.check_silence()
     assert paper.getvalue() == ""
     clock[0] = 5.0
-    display.look()
+    display.check_silence()
     assert paper.getvalue().split() == ["4/10", "camera", "matrix"] and "\n" not in paper.getvalue()
 
     display.finish_stage(7.0)
     assert paper.getvalue().split() == ["4/10", "camera", "matrix", "7.0", "s"] and paper.getvalue().endswith("s\n")
 
 
-def test_a_long_work_says_every_half_minute_how_far_it_is(shown, clock):
+def test_long_work_prints_its_progress_every_half_minute(shown, clock):
     display, paper = shown
     display.stage("match_graph")
     display.start("matching", 400)
     for step in range(100):
         clock[0] = 1.0 + step
         display.advance()
-        display.look()
+        display.check_silence()
 
     title, *lines = paper.getvalue().splitlines()
     assert title.split() == ["2/10", "finding", "and", "matching", "features"]
@@ -93,31 +87,29 @@ def test_a_long_work_says_every_half_minute_how_far_it_is(shown, clock):
     ]  # fmt: skip
 
 
-def test_work_that_cannot_be_measured_is_named(shown, clock):
+def line_after_half_a_minute(shown, clock, stage, label, steps):
+    """The second line of a stage whose work makes no progress."""
     display, paper = shown
-    display.stage("scene")
-    display.start("adjusting", 1)
-    for now in (5.0, 36.0):
-        clock[0] = now
-        display.look()
-
-    assert paper.getvalue().splitlines()[1].strip() == "adjusting: goes on, 36 s so far"
-    assert display.bars.tasks[0].total is None  # a bar at 0/1 stands still
+    display.stage(stage)
+    display.start(label, steps)
+    for clock[0] in (5.0, 36.0):
+        display.check_silence()
+    return paper.getvalue().splitlines()[1].strip()
 
 
-def test_who_waits_for_kernels_says_so(shown, clock, monkeypatch):
-    display, paper = shown
+def test_work_of_one_step_prints_its_seconds(shown, clock):
+    assert line_after_half_a_minute(shown, clock, "scene", "adjusting", 1) == "adjusting: 36 s so far"
+    assert shown[0].bars.tasks[0].total is None  # a bar at 0/1 stands still
+
+
+def test_a_wait_for_kernels_is_named(shown, clock, monkeypatch):
     monkeypatch.setattr(sys.modules["sfm_app.jit"]._Waiting, "threads", {1})
-    display.stage("view_graph")
-    display.start("epipolar geometry", 10)
-    for now in (5.0, 36.0):
-        clock[0] = now
-        display.look()
+    line = line_after_half_a_minute(shown, clock, "view_graph", "epipolar geometry", 10)
 
-    assert paper.getvalue().splitlines()[1].strip().endswith("waits for kernels, compiled once on this machine")
+    assert line == "epipolar geometry: compiling kernels, once on this machine"
 
 
-def test_what_is_said_stands_below_the_title_in_80_columns(shown):
+def test_a_note_stands_below_the_title_in_80_columns(shown):
     display, paper = shown
     display.stage("photos")
     display.say("11 photos, 55 pairs: about 2 minutes, more for hard photos; up to 1.6 GB with 2 workers [of 2]")
@@ -138,25 +130,18 @@ def test_names_cannot_move_the_cursor(shown):
     assert "\x1b" not in paper.getvalue() and "left out: a\\x1b[2Jb\\n" in paper.getvalue()
 
 
-def test_nothing_is_shown_when_quiet(monkeypatch):
-    assert printed(monkeypatch, io.StringIO(), quiet=True) == ""
-    assert printed(monkeypatch, io.StringIO()) != ""
-
-
 @pytest.mark.parametrize("columns", [80, 60])
 def test_bars_fit_into_the_terminal(monkeypatch, columns):
-    screen = Screen()
+    screen, paper = Screen(), io.StringIO()
     monkeypatch.setenv("TERM", "xterm-256color")
-    monkeypatch.setattr(terminal.sys, "stderr", screen)
-    with Terminal(quiet=False) as display:
+    with Terminal(quiet=False, stream=screen) as display:
         display.stage("depth_maps")
         display.start("matching depths in smaller photos", 10_000)
         display.advance(4_999)
-        paper = Console(width=columns, file=io.StringIO())
-        paper.print(display.bars.get_renderable())
+        Console(width=columns, file=paper).print(display.bars.get_renderable())
         display.finish_stage(12.0, 10)
 
-    assert paper.file.getvalue().count("\n") == 1 and len(paper.file.getvalue().rstrip()) <= columns
+    assert paper.getvalue().count("\n") == 1 and len(paper.getvalue().rstrip()) <= columns
     assert "depth maps" in screen.getvalue() and "12.0 s" in screen.getvalue()
 
 
@@ -164,36 +149,57 @@ def test_slow_work_has_two_digits():
     assert [per_minute(1.0), per_minute(0.05), per_minute(0.17)] == ["60", "3.0", "10"]
 
 
-def printed(monkeypatch, paper, *, quiet=False, **environment):
-    """What a short run shows, with these variables."""
-    for name in ("NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE", "TTY_COMPATIBLE"):
-        monkeypatch.delenv(name, raising=False)
-    for name, value in {"TERM": "xterm-256color", "COLORTERM": "truecolor", **environment}.items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setattr(terminal.sys, "stderr", paper)
-    with Terminal(quiet=quiet) as display:
-        display.stage("photos")
-        display.say("a note")
-        display.start("photos", 3)
-        display.advance()
-        display.look()
-        display.finish_stage(12.0, 10)
-    return paper.getvalue()
+@pytest.fixture
+def output_of(monkeypatch):
+    """Shows a short run on a stream, and returns the text."""
+
+    def show(stream, *, quiet=False, **variables):
+        for name in ("NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE", "TTY_COMPATIBLE"):
+            monkeypatch.delenv(name, raising=False)
+        for name, value in {"TERM": "xterm-256color", "COLORTERM": "truecolor", **variables}.items():
+            monkeypatch.setenv(name, value)
+        with Terminal(quiet=quiet, stream=stream) as display:
+            display.stage("photos")
+            display.say("a note")
+            display.start("photos", 3)
+            display.advance()
+            display.check_silence()
+            display.finish_stage(12.0, 10)
+        return stream.getvalue()
+
+    return show
 
 
-@pytest.mark.parametrize("forced", [{}, {"FORCE_COLOR": "1"}])
-def test_a_pipe_gets_no_codes(monkeypatch, forced):
-    text = printed(monkeypatch, io.StringIO(), **forced)
+@pytest.mark.parametrize("variables", [{}, {"FORCE_COLOR": "1"}])
+def test_a_pipe_gets_no_codes(output_of, variables):
+    text = output_of(io.StringIO(), **variables)
 
     assert "\x1b" not in text and "reading photos" in text and "12.0 s" in text
     assert max(map(len, text.splitlines())) <= 80
 
 
-def test_a_terminal_without_colors_gets_none(monkeypatch):
+def test_quiet_prints_nothing(output_of):
+    assert output_of(io.StringIO(), quiet=True) == output_of(Screen(), quiet=True) == ""
+
+
+def test_a_terminal_without_colors_gets_none(output_of):
     styles = r"\x1b\[[0-9;]*m"
-    assert re.search(styles, printed(monkeypatch, Screen()))
-    assert not re.search(styles, printed(monkeypatch, Screen(), NO_COLOR="1"))
+    assert re.search(styles, output_of(Screen()))
+    assert not re.search(styles, output_of(Screen(), NO_COLOR="1"))
 
 
-def test_a_dumb_terminal_gets_lines(monkeypatch):
-    assert "\x1b" not in printed(monkeypatch, Screen(), TERM="dumb")
+def test_a_dumb_terminal_gets_lines(output_of):
+    assert "\x1b" not in output_of(Screen(), TERM="dumb")
+
+
+@pytest.mark.slow
+def test_the_display_checks_for_silence_by_itself(clock):
+    paper = io.StringIO()
+    with Terminal(quiet=False, stream=paper, clock=lambda: clock[0]) as display:
+        display.stage("mesh")
+        clock[0] = 5.0
+        for _ in range(200):
+            if "surface" in paper.getvalue():
+                return
+            time.sleep(0.1)
+    pytest.fail("no title")

@@ -54,7 +54,7 @@ def test_the_suffix_says_which_format(make_run, tmp_path, target, written):
     ("arguments", "says"),
     [
         (("--format", "laz", "-o", "cloud.ply"), "cloud.ply does not end in .laz"),
-        (("--format", "colmap", "--points"), "--points does not go with the format 'colmap'"),
+        (("--format", "colmap", "--points"), "--points does not apply to the format 'colmap'"),
         (("--format", "draco", "-o", "model.ply"), "model.ply does not end in .glb"),
     ],
 )

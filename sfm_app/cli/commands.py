@@ -1,0 +1,341 @@
+"""All commands. What takes long to import is imported when a command runs, so that --help prints at once."""
+
+import os
+import sys
+from pathlib import Path
+from time import monotonic
+from typing import TYPE_CHECKING, Any, get_args
+
+import click
+from click.shell_completion import get_completion_class
+
+import sfm_app
+from sfm_app.cli.options import (
+    complete_methods,
+    json_option,
+    output_options,
+    picture_option,
+    setting_field,
+    settings_from_flags,
+    settings_options,
+)
+from sfm_app.cli.output import STAGE_TITLES, file_lines, open_browser, print_json, print_lines, print_text, table
+from sfm_app.demo import COURTYARD, SCENES
+from sfm_app.errors import ConfigError
+from sfm_app.lengths import parse_length, parse_point
+
+if TYPE_CHECKING:
+    from sfm_app.formats.exporters import Exporter, SceneExporter
+
+PATH = click.Path(path_type=Path)
+STAGES = tuple(STAGE_TITLES)
+MARKER_FAMILIES = tuple(name for name in get_args(setting_field("scale.marker_family").annotation) if name != "auto")
+PAPERS = ("a4", "a3", "letter")
+SHELLS = ("bash", "zsh", "fish")
+
+
+@click.command()
+@click.argument("photos", type=PATH)
+@click.option("-o", "--out", type=PATH, help="Output folder.  [default: PHOTOS-model beside PHOTOS]")
+@click.option(
+    "--from",
+    "first",
+    type=click.Choice(STAGES),
+    metavar="STAGE",
+    default=None,
+    help=f"Run this stage and all later ones again: {', '.join(STAGES)}.",
+)
+@click.option(
+    "--until", "last", type=click.Choice(STAGES), metavar="STAGE", default="files", help="Stop after this stage."
+)
+@settings_options
+@picture_option
+@output_options
+def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: Any) -> None:
+    """Reconstruct PHOTOS, a folder or a video: cameras, poses and a textured mesh.
+
+    The mesh is OUT/model.ply and OUT/model.glb. An interrupted run resumes: stages with up-to-date results in OUT are
+    skipped.
+    """
+    from sfm_app.cli.ending.picture import print_picture
+    from sfm_app.cli.outcome import outcome_lines, run_lines, run_steps, run_summary
+    from sfm_app.cli.terminal import Terminal
+
+    settings, start_s, quiet = settings_from_flags(flags), monotonic(), flags["quiet"]
+    folder = out or _default_folder(photos.resolve())
+    with Terminal(quiet=quiet) as progress:
+        result = sfm_app.reconstruct(photos, folder, settings, first=first or "", last=last, progress=progress)
+    if flags["as_json"]:
+        print_json(run_summary(result))
+        return
+    seconds = monotonic() - start_s
+    print_picture(result, settings, quiet=quiet)
+    print_text(run_lines(result) if flags["verbose"] else outcome_lines(result, seconds))
+    if not quiet and sys.stdout.isatty():
+        print_lines(run_steps(result, photos, out, settings))
+
+
+def _default_folder(photos: Path) -> Path:
+    """Return the output folder beside the photos, relative to the current folder if it is inside."""
+    folder, here = photos.with_name(f"{photos.name}-model"), Path.cwd()
+    return folder.relative_to(here) if folder.is_relative_to(here) else folder
+
+
+@click.command()
+@click.argument("photos", type=PATH)
+@click.option("-o", "--out", type=PATH, help="Keep features and matches in this folder.")
+@click.option(
+    "--figure", type=PATH, help="Plot the pairs' votes, the lens curve and the residuals in this PNG, SVG or PDF file."
+)
+@settings_options
+@output_options
+def calibrate(photos: Path, out: Path | None, figure: Path | None, **flags: Any) -> None:
+    """Estimate the camera matrix of PHOTOS, a folder or a video, without reconstructing the scene."""
+    from sfm_app.cli.terminal import Terminal
+    from sfm_app.report.camera_text import intrinsics_lines, intrinsics_summary
+
+    settings = settings_from_flags(flags)
+    with Terminal(quiet=flags["quiet"]) as progress:
+        intrinsics = sfm_app.calibrate_photos(photos, settings, out=out, figure=figure, progress=progress)
+    print_json(intrinsics_summary(intrinsics)) if flags["as_json"] else print_text(intrinsics_lines(intrinsics))
+
+
+@click.command()
+@click.argument("side")
+@click.option(
+    "-o",
+    "--output",
+    "target",
+    type=PATH,
+    default=Path("markers.pdf"),
+    show_default=True,
+    help="PDF or SVG file to write.",
+)
+@click.option(
+    "--family",
+    type=click.Choice(MARKER_FAMILIES),
+    metavar="NAME",
+    default="apriltag-36h11",
+    show_default=True,
+    help=f"Marker family: {', '.join(MARKER_FAMILIES)}.",
+)
+@click.option(
+    "--first", type=click.IntRange(0, 10_000), default=0, show_default=True, help="Number of the first marker."
+)
+@click.option("--paper", type=click.Choice(PAPERS), default="a4", show_default=True, help="Size of the page.")
+def markers(side: str, target: Path, family: str, first: int, paper: str) -> None:
+    """Make a page of markers to print and to place in the scene; SIDE is their side length, such as 50mm.
+
+    `sfm-app run PHOTOS --markers 50mm` then gives the model its real size.
+    """
+    from sfm_app.scale.marker_page import write_marker_page
+
+    try:
+        count = write_marker_page(target, parse_length(side), family, first, paper)
+    except ValueError as err:
+        raise ConfigError(str(err), hint="sfm-app markers 50mm -o markers.pdf") from None
+    advice = f"{count} markers; print them, measure a side, and run: sfm-app run PHOTOS --markers {side}"
+    print_lines([*file_lines([target]), advice])
+
+
+@click.command()
+@click.option("-o", "--out", type=PATH, help="Output folder.  [default: demo, or demo-SCENE]")
+@click.option(
+    "--scene",
+    type=click.Choice(tuple(SCENES)),
+    metavar="NAME",
+    default=COURTYARD,
+    show_default=True,
+    help="Scene to photograph: " + "; ".join(f"{name}: {text}" for name, text in SCENES.items()) + ".",
+)
+@click.option(
+    "--open/--no-open", "opens", default=None, help="Open the report in the browser.  [default: only on a terminal]"
+)
+@settings_options
+@picture_option
+@output_options
+def demo(out: Path | None, scene: str, opens: bool | None, **flags: Any) -> None:
+    """Render photos of a known scene, reconstruct them and print the errors."""
+    from sfm_app.cli.ending.picture import print_picture
+    from sfm_app.cli.outcome import demo_steps
+    from sfm_app.cli.terminal import Terminal
+    from sfm_app.demo.result import demo_lines
+    from sfm_app.demo.running import run_demo
+
+    settings, quiet = settings_from_flags(flags), flags["quiet"]
+    folder = out or Path("demo" if scene == COURTYARD else f"demo-{scene}")
+    with Terminal(quiet=quiet) as progress:
+        run, result = run_demo(folder, scene, settings, progress)
+    interactive = sys.stdout.isatty() and not quiet
+    if flags["as_json"]:
+        print_json(result.to_dict())
+    else:
+        print_picture(run, settings, quiet=quiet)
+        print_text(demo_lines(result))
+        if interactive:
+            print_lines(demo_steps(run, scene))
+    if opens is None:
+        opens = interactive and not flags["as_json"] and not os.environ.get("CI")
+    if opens and run.report_path is not None:
+        open_browser(run.report_path.resolve().as_uri())
+
+
+@click.command()
+@click.argument("out", type=PATH)
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port to listen on.  [default: a free one]")
+@click.option("--no-browser", is_flag=True, help="Only print the address.")
+def view(out: Path, port: int, no_browser: bool) -> None:
+    """Show the run in OUT, with the model at full size, in the browser of this machine, until Ctrl-C."""
+    from sfm_app.cli.terminal import Terminal
+
+    def announce(address: str) -> None:
+        progress.close()
+        print_lines([f"{address} shows {out}; stop with Ctrl-C"])
+        sys.stdout.flush()  # a program may wait for the address
+        if not no_browser:
+            open_browser(address)
+
+    with Terminal(quiet=False) as progress:
+        sfm_app.view_run(out, port=port, started=announce, progress=progress)
+
+
+@click.command()
+@click.argument("out", type=PATH)
+@click.option("--compare", type=PATH, help="Output folder of another run, for a comparison.")
+def report(out: Path, compare: Path | None) -> None:
+    """Write OUT/report.html again: the results of the run in OUT on one page, which needs no network."""
+    print_lines(file_lines([sfm_app.write_report(out, compare)]))
+
+
+class ExportCommand(click.Command):
+    """A command whose help ends with the list of formats, those of plug-ins included."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the list of formats."""
+        with formatter.section("Formats"):
+            formatter.write_dl([(name, part.summary) for name, part in known_formats().items()])
+        super().format_epilog(ctx, formatter)
+
+
+@click.command(cls=ExportCommand)
+@click.argument("out", type=PATH)
+@click.option(
+    "--format",
+    "file_format",
+    default="",
+    metavar="NAME",
+    shell_complete=complete_methods("exporters", "scene_exporters"),
+    help="One of the formats below.  [default: the suffix of the output file]",
+)
+@click.option(
+    "-o",
+    "--output",
+    "target",
+    type=PATH,
+    help="File or folder to write.  [default: OUT/model.FORMAT, OUT/cameras.json, OUT/export/FORMAT, ...]",
+)
+@click.option("--points", is_flag=True, help="Export the sparse points and the cameras instead of the model.")
+@output_options
+def export(out: Path, file_format: str, target: Path | None, points: bool, quiet: bool, as_json: bool) -> None:
+    """Write the results of the run in OUT for another program, without recomputing anything."""
+    from sfm_app.cli.terminal import Terminal
+    from sfm_app.plugins import load_plugins
+
+    name = choose_format(file_format, target)
+    if name in load_plugins().scene_exporters:
+        if points:
+            raise ConfigError(f"--points does not apply to the format '{name}'", hint="omit it")
+        with Terminal(quiet=quiet or as_json) as progress:
+            paths = [sfm_app.export_scene(out, name, target, progress=progress)]
+    else:
+        paths = list(sfm_app.export_model(out, name, target, points=points))
+    print_json([str(path) for path in paths]) if as_json else print_lines(file_lines(paths))
+
+
+def known_formats() -> "dict[str, Exporter | SceneExporter]":
+    """Return all formats by name, those for models first."""
+    from sfm_app.plugins import load_plugins
+
+    methods = load_plugins()
+    return {**methods.exporters, **methods.scene_exporters}
+
+
+def choose_format(name: str, target: Path | None) -> str:
+    """Return the name of a format; an empty name stands for the suffix of the target.
+
+    Raises:
+        ConfigError: there is no such format, or neither a name nor a suffix.
+    """
+    formats = known_formats()
+    suffix = target.suffix.removeprefix(".").lower() if target is not None else ""
+    if not name and suffix:  # a format of that name has priority over others with that suffix
+        matches = [key for key, part in formats.items() if part.ending == suffix]
+        name = suffix if suffix in formats else next(iter(matches), suffix)
+    if name in formats:
+        return name
+    lines = [f"  {line}" for line in table({key: part.summary for key, part in formats.items()})]
+    message = f"no file format is named '{name}'" if name else "no format is given"
+    raise ConfigError(message, hint="\n".join(["add --format with one of these, or -o model.obj:", *lines]))
+
+
+@click.command(context_settings={"ignore_unknown_options": True})  # coordinates may begin with a minus
+@click.argument("out", type=PATH)
+@click.argument("a")
+@click.argument("b")
+@json_option
+def measure(out: Path, a: str, b: str, as_json: bool) -> None:
+    """Print the distance between the points A and B, with its standard deviation.
+
+    A point is x,y,z in the coordinates of OUT/model.glb.
+    """
+    from sfm_app.report.scale_text import distance_text
+
+    try:
+        distance = sfm_app.measure_distance(out, parse_point(a), parse_point(b))
+    except ValueError as err:
+        raise ConfigError(str(err), hint="sfm-app measure OUT 0.1,0.2,0.3 1,0,-0.5") from None
+    print_json(distance.to_dict()) if as_json else print_text([distance_text(distance)])
+
+
+@click.command()
+@json_option
+def doctor(as_json: bool) -> None:
+    """Check this machine and the installed libraries."""
+    from sfm_app.cli.doctor import examine
+
+    state = examine()
+    print_json(state) if as_json else print_text(table(state))
+
+
+@click.command()
+@settings_options
+def config(**flags: Any) -> None:
+    """Print all settings as TOML, with the changes of the other options."""
+    print_lines(settings_from_flags(flags).to_toml().splitlines())
+
+
+@click.command()
+def plugins() -> None:
+    """List features, estimators, calibrators, file formats and depth methods."""
+    from sfm_app.plugins import load_plugins
+
+    methods = load_plugins()
+    for kind in ("features", "estimators", "calibrators", "exporters", "scene_exporters", "depth_methods"):
+        rows = table({method.name: method.summary for method in getattr(methods, kind).values()})
+        print_text([f"{kind.replace('_', ' ')}:", *(f"  {row}" for row in rows)])
+
+
+@click.command()
+@click.argument("shell", type=click.Choice(SHELLS))
+@click.pass_context
+def completion(ctx: click.Context, shell: str) -> None:
+    """Print a script that completes commands, options and names of methods in SHELL.
+
+    \b
+    bash: sfm-app completion bash >> ~/.bashrc
+    zsh:  sfm-app completion zsh >> ~/.zshrc
+    fish: sfm-app completion fish > ~/.config/fish/completions/sfm-app.fish
+    """
+    kind = get_completion_class(shell)
+    if kind is not None:
+        print_lines(kind(ctx.find_root().command, {}, "sfm-app", "_SFM_APP_COMPLETE").source().splitlines())
