@@ -16,10 +16,9 @@ from sfm_app.runtime.parallel import worker_count
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages.texture import read_texture
-from sfm_app.synthetic.cameras import Camera, Views
-from sfm_app.synthetic.lenses import Lens
+from sfm_app.synthetic.cameras import Camera, Lens, Views
 from sfm_app.synthetic.photo_folder import Truth, add_missing_photos, load_truth, save_truth
-from sfm_app.synthetic.pictures import comparison_image
+from sfm_app.synthetic.render import comparison_image
 from sfm_app.types import CameraModel, Model, Scene
 
 TRUTH = "truth.json"

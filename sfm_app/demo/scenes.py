@@ -4,15 +4,12 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
+from benchmarks.synthetic.scenes import facade, facade_views
+from benchmarks.synthetic.town import TownPhotos, town, town_views
 from sfm_app.demo import COURTYARD
-from sfm_app.synthetic.cameras import ArcOptions, Camera, Views, arc, make_camera, make_wide_camera
-from sfm_app.synthetic.lenses import Lens
-from sfm_app.synthetic.scenes.bodies import SyntheticScene
-from sfm_app.synthetic.scenes.courtyard import courtyard
-from sfm_app.synthetic.scenes.facade import facade, facade_views
-from sfm_app.synthetic.scenes.statue import statue, statue_views
-from sfm_app.synthetic.scenes.town import town
-from sfm_app.synthetic.town.photos import TownPhotos, town_views
+from sfm_app.synthetic.cameras import ArcOptions, Camera, Lens, Views, arc, make_camera, make_wide_camera
+from sfm_app.synthetic.scenes import courtyard, statue, statue_views
+from sfm_app.synthetic.shapes import SyntheticScene
 
 SIZE = (960, 640)
 """Width and height of the photos of most scenes, in pixels: large enough for a good model, small enough to wait for."""

@@ -5,6 +5,8 @@ import json
 import numpy as np
 import pytest
 
+from benchmarks.synthetic.scenes import poster
+from benchmarks.synthetic.walks import orbit
 from sfm_app.demo import SCENES, running
 from sfm_app.demo.running import camera_of
 from sfm_app.demo.scenes import DEMO_SCENES, DemoScene
@@ -12,8 +14,7 @@ from sfm_app.errors import InputError
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.progress import SilentProgress
 from sfm_app.settings import Settings
-from sfm_app.synthetic.cameras import make_camera, orbit
-from sfm_app.synthetic.scenes.small_scenes import poster
+from sfm_app.synthetic.cameras import make_camera
 from sfm_app.types import CameraModel
 
 ONE_WORKER = Settings.from_mapping({"workers": 1})

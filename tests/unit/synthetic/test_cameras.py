@@ -5,19 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.synthetic.walks import orbit, panorama
 from sfm_app.errors import ConfigError
 from sfm_app.geometry.epipolar import fundamental_from_pose
-from sfm_app.synthetic.cameras import (
-    ArcOptions,
-    arc,
-    axis_rotation,
-    camera_center,
-    look_at,
-    make_camera,
-    orbit,
-    panorama,
-    pixel_rays,
-)
+from sfm_app.synthetic.cameras import ArcOptions, arc, axis_rotation, camera_center, look_at, make_camera, pixel_rays
 
 COORDINATES = st.floats(-5, 5)
 

@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
+from benchmarks.synthetic.detail_scenes import HIGH, WIDTH, carving, pebbles, relief, ridge, straight, tree, tube
+from benchmarks.synthetic.scenes import build_scene, scene_views
 from sfm_app.synthetic.cameras import Camera, camera_center, pixel_rays
-from sfm_app.synthetic.fine.fine_shapes import pebbles, relief, ridge, tube
-from sfm_app.synthetic.fine.ornament import HIGH, WIDTH, carving
-from sfm_app.synthetic.fine.railing import straight, tree
 from sfm_app.synthetic.render import cast_rays, ray_caster
-from sfm_app.synthetic.scenes.scene_catalog import build_scene, scene_views
 from tests.unit.synthetic.test_shapes import signed_volume
 
 pytestmark = pytest.mark.slow

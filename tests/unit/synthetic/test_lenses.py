@@ -6,8 +6,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from sfm_app.errors import ConfigError
-from sfm_app.synthetic.cameras import make_wide_camera, panorama_camera, pixel_rays
-from sfm_app.synthetic.lenses import PROJECTIONS, Lens
+from sfm_app.synthetic.cameras import PROJECTIONS, Lens, make_wide_camera, panorama_camera, pixel_rays
 
 WIDE = [name for name in PROJECTIONS if name not in ("perspective", "equirectangular")]
 

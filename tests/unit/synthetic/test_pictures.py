@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.synthetic.cameras import Camera, camera_center, look_at, make_camera
-from sfm_app.synthetic.lenses import Lens
-from sfm_app.synthetic.pictures import (
+from sfm_app.synthetic.cameras import Camera, Lens, camera_center, look_at, make_camera
+from sfm_app.synthetic.render import (
     comparison_image,
     orbited_pose,
     prepare_model,

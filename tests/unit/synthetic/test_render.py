@@ -3,12 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.synthetic.cameras import Camera, camera_center, look_at, make_camera, pixel_rays
-from sfm_app.synthetic.lenses import Lens
+from sfm_app.synthetic.cameras import Camera, Lens, camera_center, look_at, make_camera, pixel_rays
 from sfm_app.synthetic.render import cast_rays, prepare, ray_caster, render_scene
-from sfm_app.synthetic.scenes.bodies import Body, SyntheticScene
-from sfm_app.synthetic.scenes.shapes import box
-from sfm_app.synthetic.scenes.textures import Material
+from sfm_app.synthetic.shapes import Body, Material, SyntheticScene, box
 
 pytestmark = pytest.mark.slow
 

@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 
+from benchmarks.synthetic.scenes import PLASTER, WALKS, build_scene, corner, scene_views
+from benchmarks.synthetic.walks import WallWalkOptions, wall_walk
 from sfm_app.errors import ConfigError
-from sfm_app.synthetic.cameras import WallWalkOptions, camera_center, make_camera, pixel_rays, wall_walk
+from sfm_app.synthetic.cameras import camera_center, make_camera, pixel_rays
 from sfm_app.synthetic.render import GAMMA, cast_rays, prepare, ray_caster, render_scene
-from sfm_app.synthetic.scenes.corner import PLASTER, corner
-from sfm_app.synthetic.scenes.scene_catalog import WALKS, build_scene, scene_views
-from sfm_app.synthetic.scenes.shapes import assemble, ball, box, carve, waves
-from sfm_app.synthetic.scenes.statue import bust_field
+from sfm_app.synthetic.scenes import bust_field
+from sfm_app.synthetic.shapes import assemble, ball, box, carve, waves
 
 pytestmark = pytest.mark.slow
 

@@ -3,9 +3,9 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.synthetic.scenes import SCENES, build_scene
 from sfm_app.errors import ConfigError
-from sfm_app.synthetic.scenes.scene_catalog import SCENES, build_scene
-from sfm_app.synthetic.scenes.shapes import arch, ball, box, ground, revolve, torus
+from sfm_app.synthetic.shapes import arch, ball, box, ground, revolve, torus
 
 VASE = np.array([[0.0, 0.0], [0.3, 0.0], [0.2, 0.5], [0.4, 1.0], [0.0, 1.0]])
 

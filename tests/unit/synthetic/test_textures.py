@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm_app.synthetic.scenes.textures import PATTERNS, Material, bricks, cells, lattice, mixture, octaves, value_noise
+from sfm_app.synthetic.shapes import PATTERNS, Material, bricks, cells, lattice, mixture, octaves, value_noise
 
 POINTS = np.random.default_rng(0).uniform(-3, 3, (400, 3))
 UP = (0.0, 1.0, 0.0)

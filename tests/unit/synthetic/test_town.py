@@ -5,17 +5,28 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from benchmarks.synthetic.houses import DEPTH_M
+from benchmarks.synthetic.scenes import build_scene, scene_views
+from benchmarks.synthetic.town import (
+    BLOCK_M,
+    COPIES,
+    PITCH_M,
+    STREET_M,
+    HousePlace,
+    TownPhotos,
+    place_house,
+    plan_houses,
+    town,
+    town_of,
+    town_views,
+    walk_town,
+)
 from sfm_app.errors import ConfigError
 from sfm_app.synthetic import render
 from sfm_app.synthetic.cameras import camera_center, look_at, make_camera, pixel_rays
 from sfm_app.synthetic.render import cast_rays, prepare, ray_caster, render_scene
-from sfm_app.synthetic.scenes import town as town_module
-from sfm_app.synthetic.scenes.bodies import SyntheticScene
-from sfm_app.synthetic.scenes.scene_catalog import build_scene, scene_views
-from sfm_app.synthetic.scenes.town import COPIES, HousePlace, place_house, plan_houses, town
-from sfm_app.synthetic.town.houses import DEPTH_M
-from sfm_app.synthetic.town.photos import TownPhotos, town_of, town_views
-from sfm_app.synthetic.town_walk import BLOCK_M, PITCH_M, STREET_M, walk_town
+from sfm_app.synthetic.scenes import town
+from sfm_app.synthetic.shapes import SyntheticScene
 
 PLACES = [
     HousePlace(7, 8.0, (False, False), (40.0 * k, 0.0, 5.0 * k), turn, (k, 0)) for k, turn in enumerate((0.0, 90.0))

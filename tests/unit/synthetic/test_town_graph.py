@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sfm_app.synthetic.town_graph import TownOptions, make_town_graph
+from benchmarks.synthetic.matches import TownOptions, make_town_graph
 
 
 def test_no_keypoint_has_two_matches_in_a_photo_and_some_matches_are_wrong():

@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
+from benchmarks.synthetic.walks import WalkOptions, project_through_shutter, row_poses, walk
 from sfm_app.errors import ConfigError
 from sfm_app.synthetic.cameras import camera_center, make_camera
-from sfm_app.synthetic.trajectory import WalkOptions, project_through_shutter, row_poses, walk
 
 CAMERA = make_camera(640, 480)
 

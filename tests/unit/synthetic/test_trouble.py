@@ -5,20 +5,22 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfm_app.errors import InputError
-from sfm_app.synthetic.cameras import Views, camera_center, make_camera, pixel_rays
-from sfm_app.synthetic.scenes.bodies import Body
-from sfm_app.synthetic.scenes.strewn import fade_colors, moving_thing, repeated_things
-from sfm_app.synthetic.trouble import (
+from benchmarks.synthetic.trouble import (
     KINDS,
     PHOTOS,
     apply_motion_blur,
     cam_from_thing,
+    fade_colors,
+    moving_thing,
+    repeated_things,
     troubled_folder,
     with_distortion,
     with_zoom,
     write_troubled_folder,
 )
+from sfm_app.errors import InputError
+from sfm_app.synthetic.cameras import Views, camera_center, make_camera, pixel_rays
+from sfm_app.synthetic.shapes import Body
 
 pytestmark = pytest.mark.slow
 

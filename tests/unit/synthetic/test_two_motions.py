@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
+from benchmarks.synthetic.matches import LEAST_DEPARTURE_PX, make_two_motions
 from sfm_app.errors import ConfigError
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.synthetic.correspondences import PairOptions
-from sfm_app.synthetic.two_motions import LEAST_DEPARTURE_PX, make_two_motions
 
 
 @pytest.mark.parametrize("seed", range(8))
