@@ -11,11 +11,11 @@ import trimesh
 from hypothesis import settings
 from PIL import Image
 
-from sfm_app.synthetic.scenes import courtyard
 from benchmarks.synthetic.walks import orbit
 from sfm_app.operating_system import VARIABLE, abilities
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
 from sfm_app.synthetic.photo_folder import load_truth, save_truth, write_photo_folder
+from sfm_app.synthetic.scenes import courtyard
 from sfm_app.types import Frustum, Model, Surface, Texture
 
 # the time of an example depends on how busy the machine is

@@ -12,7 +12,6 @@ from PIL import Image
 
 from benchmarks.common.command_line import new_parser
 from benchmarks.surface.photos import placed_photos
-from sfm_app.synthetic.scenes import courtyard
 from sfm_app.api import reconstruct
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.geometry.camera import camera_matrix
@@ -23,6 +22,7 @@ from sfm_app.synthetic.cameras import ArcOptions, Camera, Lens, arc
 from sfm_app.synthetic.compare import surface_accuracy, surface_coverage
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder
 from sfm_app.synthetic.render import comparison_image, prepare_model
+from sfm_app.synthetic.scenes import courtyard
 
 SIZE, CENTER, RADIUS_PX = (800, 600), (410.0, 296.0), 300.0
 """Of the photos: size, optical center, and radius of the circle that shows 180 degrees."""

@@ -3,8 +3,8 @@
     python -m benchmarks.many
     python -m benchmarks.many --counts 500 1000
 
-A walk through a town of equal blocks, without pictures (`synthetic.town_graph`). Every number of photos is a process of
-its own, so that memory is its own.
+A walk through a town of equal blocks, without pictures (`benchmarks.synthetic.matches`). Every number of photos
+is a process of its own, so that memory is its own.
 """
 
 import argparse

@@ -3,8 +3,8 @@
     python -m benchmarks.many.parts --cache CACHE
     python -m benchmarks.many.parts --cache CACHE --data DATA --every 4
 
-A walk through a town without pictures (`synthetic.town_graph`) with small steps, and with --data the video kitchen1000,
-whose truth are the poses of another camera on the same rig.
+A walk through a town without pictures (`benchmarks.synthetic.matches`) with small steps, and with --data
+the video kitchen1000, whose truth are the poses of another camera on the same rig.
 """
 
 import argparse

@@ -5,10 +5,10 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks.common.photo_sets import PhotoSet, TrueCamera
-from sfm_app.synthetic.scenes import courtyard
 from benchmarks.synthetic.walks import orbit
 from sfm_app.synthetic.cameras import ArcOptions, Views, arc, make_camera
 from sfm_app.synthetic.photo_folder import load_truth, save_truth, write_photo_folder
+from sfm_app.synthetic.scenes import courtyard
 
 SIZE = (960, 640)
 LENSES = (-0.25, -0.1, 0.1)

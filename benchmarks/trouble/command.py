@@ -32,7 +32,8 @@ from benchmarks.synthetic.trouble import KINDS, troubled_folder, write_troubled_
 from sfm_app.synthetic.photo_folder import Truth, load_truth, save_truth
 
 ABOUT = (
-    "Rendered folders of 6 to 20 small photos, each with a few troubles drawn by its seed (`synthetic/trouble.py`), "
+    "Rendered folders of 6 to 20 small photos, each with a few troubles drawn by its seed "
+    "(`benchmarks/synthetic/trouble.py`), "
     "through `sfm-app run --until scene` in a process of its own, without EXIF. Exit codes 0 and 4 (the photos do not "
     "support a scene, and it says why) are expected, all others are failures. known: photos whose K is called "
     "identifiable before mapping; focal %: its error against the camera that took the photo, the worst photo; after: "

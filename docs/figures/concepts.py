@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sfm_app
-from sfm_app.synthetic.scenes import courtyard
 from sfm_app.geometry.epipolar import fundamental_from_pose, to_homogeneous
 from sfm_app.selfcal.consensus.consensus import Consensus
 from sfm_app.selfcal.inputs import prepare
@@ -19,6 +18,7 @@ from sfm_app.synthetic.cameras import Camera, arc, camera_center, make_camera, p
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.synthetic.render import GAMMA, cast_rays, render_scene
 from sfm_app.synthetic.render import prepare as prepare_scene
+from sfm_app.synthetic.scenes import courtyard
 from sfm_app.types import CameraPairs
 
 FloatArray = NDArray[np.float64]

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from sfm_app.synthetic.scenes import courtyard
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
+from sfm_app.synthetic.scenes import courtyard
 
 QUICK = ["--quality", "draft", "--set", "depth.max_image_size_px=240", "--faces", "3000", "-q", "--workers", "2"]
 if "SFM_APP_FAULTS" not in os.environ:  # a quarter of a run, thirty times

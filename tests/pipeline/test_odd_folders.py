@@ -9,10 +9,10 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from benchmarks.synthetic.scenes import heap, poster
-from sfm_app.synthetic.scenes import courtyard
+from benchmarks.synthetic.scenes import build_scene
 from benchmarks.synthetic.walks import panorama
 from sfm_app.cli import main
+from sfm_app.synthetic import scenes
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
 from sfm_app.synthetic.compare import focal_error_percent
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
@@ -45,7 +45,7 @@ def ends_with(result, *words):
 def courtyard(tmp_path_factory):
     """Six photos of the courtyard."""
     folder = tmp_path_factory.mktemp("courtyard")
-    write_photo_folder(folder, courtyard(), arc(CAMERA, ArcOptions(photos=6, sweep_deg=50.0)), FAST)
+    write_photo_folder(folder, scenes.courtyard(), arc(CAMERA, ArcOptions(photos=6, sweep_deg=50.0)), FAST)
     return folder
 
 
@@ -53,7 +53,7 @@ def courtyard(tmp_path_factory):
 def heap(tmp_path_factory):
     """Four photos of another place."""
     folder = tmp_path_factory.mktemp("heap")
-    write_photo_folder(folder, heap(), arc(CAMERA, ArcOptions(photos=4, sweep_deg=36.0), 2), FAST)
+    write_photo_folder(folder, build_scene("heap"), arc(CAMERA, ArcOptions(photos=4, sweep_deg=36.0), 2), FAST)
     return folder
 
 
@@ -106,7 +106,7 @@ def test_ten_photos_of_a_white_wall(folder, tmp_path, noise, says):
 
 
 def test_a_panorama(folder, tmp_path):
-    write_photo_folder(folder, courtyard(), panorama(CAMERA, 3, 20.0), FAST)
+    write_photo_folder(folder, scenes.courtyard(), panorama(CAMERA, 3, 20.0), FAST)
 
     result, out = run(folder, tmp_path)
 
@@ -164,7 +164,7 @@ def test_a_time_stamp_does_not_stop_the_camera(courtyard, folder, tmp_path):
 
 
 def test_two_photos_of_a_plane(folder, tmp_path):
-    write_photo_folder(folder, poster(), arc(CAMERA, ArcOptions(photos=2, sweep_deg=30.0)), FAST)
+    write_photo_folder(folder, build_scene("poster"), arc(CAMERA, ArcOptions(photos=2, sweep_deg=30.0)), FAST)
 
     result, out = run(folder, tmp_path)
 
@@ -174,7 +174,7 @@ def test_two_photos_of_a_plane(folder, tmp_path):
 
 def test_a_plane_seen_from_many_sides_is_reconstructed(folder, tmp_path):
     views = arc(CAMERA, ArcOptions(photos=6, sweep_deg=70.0))
-    truth = write_photo_folder(folder, poster(), views, FAST)
+    truth = write_photo_folder(folder, build_scene("poster"), views, FAST)
 
     result, _ = run(folder, tmp_path, "--json")
 

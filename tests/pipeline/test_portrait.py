@@ -8,10 +8,10 @@ import pytest
 from PIL import Image
 
 import sfm_app
-from sfm_app.synthetic.scenes import courtyard
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
 from sfm_app.synthetic.photo_folder import write_photo_folder
+from sfm_app.synthetic.scenes import courtyard
 
 SENSOR_FROM_UPRIGHT = {90: [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], 270: [[0, -1, 0], [1, 0, 0], [0, 0, 1]]}
 """By how far the picture has to be turned clockwise to be upright."""

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from sfm_app.synthetic.scenes import courtyard
 from sfm_app.cli import main
 from sfm_app.synthetic.cameras import look_at, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, develop
 from sfm_app.synthetic.render import prepare, render_scene
+from sfm_app.synthetic.scenes import courtyard
 
 SIZE = 320, 240
 FRAMES = 28

@@ -10,9 +10,14 @@ import sfm_app
 from sfm_app.cli.options import output_options, picture_option, settings_from_flags, settings_options
 from sfm_app.cli.output import print_json, print_lines, print_text
 from sfm_app.cli.stage_titles import STAGE_TITLES
-from sfm_app.demo import COURTYARD, SCENES
 
 STAGES = tuple(STAGE_TITLES)
+SCENES = {
+    "courtyard": "a court with things in it, 12 photos from its open side",
+    "statue": "a bust on a plinth, 18 photos all round it",
+    "fisheye": "the court again, 12 photos through a fisheye of 180 degrees",
+}
+"""What a demo shows, by the name of its scene in `sfm_app.demo`, which takes seconds to import."""
 
 
 @click.command()
@@ -91,7 +96,7 @@ def calibrate(photos: Path, out: Path | None, figure: Path | None, **flags: Any)
     "--scene",
     type=click.Choice(tuple(SCENES)),
     metavar="NAME",
-    default=COURTYARD,
+    default="courtyard",
     show_default=True,
     help="What is photographed: " + "; ".join(f"{name}: {text}" for name, text in SCENES.items()) + ".",
 )
@@ -110,11 +115,10 @@ def demo(out: Path | None, scene: str, opens: bool | None, **flags: Any) -> None
     from sfm_app.cli.ending.next_steps import demo_steps
     from sfm_app.cli.ending.picture import print_picture
     from sfm_app.cli.terminal import Terminal
-    from sfm_app.demo.result import demo_lines
-    from sfm_app.demo.running import run_demo
+    from sfm_app.demo import demo_lines, run_demo
 
     settings, quiet = settings_from_flags(flags), flags["quiet"]
-    place = out or Path("demo" if scene == COURTYARD else f"demo-{scene}")
+    place = out or Path("demo" if scene == "courtyard" else f"demo-{scene}")
     with Terminal(quiet=quiet) as progress:
         run, result = run_demo(place, scene, settings, progress)
     if flags["as_json"]:

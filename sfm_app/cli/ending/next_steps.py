@@ -42,7 +42,7 @@ def demo_steps(run: Run, scene: str, *, quiet: bool) -> list[str]:
     """
     if quiet or not sys.stdout.isatty():
         return []
-    other = "statue" if scene != "statue" else "facade"
+    other = "statue" if scene != "statue" else "fisheye"
     return _steps([
         (_view(run), "look at it"),
         (f"sfm-app demo --scene {other}", "another scene"),

@@ -12,12 +12,12 @@ from click.testing import CliRunner
 
 from sfm_app.api import Run
 from sfm_app.cli import main, output
+from sfm_app.cli.commands.making import SCENES
 from sfm_app.cli.display import run_lines
 from sfm_app.cli.outcome import outcome_lines
 from sfm_app.cli.output import file_lines, fold_lines, print_lines, print_text, table
 from sfm_app.cli.program import SECTIONS, fail
-from sfm_app.demo import SCENES
-from sfm_app.demo.result import DemoResult, demo_lines
+from sfm_app.demo import DemoResult, demo_lines
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.types import Calibration, CameraModel, Intrinsics, Scene
 

@@ -11,9 +11,9 @@ from click.testing import CliRunner
 
 from sfm_app.cli import main
 from sfm_app.cli.commands.machine import SHELLS
+from sfm_app.cli.commands.making import SCENES
 from sfm_app.cli.completions import BUILT_IN, names_of
 from sfm_app.cli.program import SECTIONS
-from sfm_app.demo import SCENES
 from sfm_app.pipeline import NAMES
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import QUALITY_PRESETS

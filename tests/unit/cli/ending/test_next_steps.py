@@ -53,7 +53,7 @@ def test_what_is_done_is_not_advised(screen, run):
     assert ["goes on to the model" in line for line in run_steps(stopped, PHOTOS, None, best, quiet=False)] == [True]
 
 
-@pytest.mark.parametrize(("scene", "other"), [("courtyard", "statue"), ("statue", "facade")])
+@pytest.mark.parametrize(("scene", "other"), [("courtyard", "statue"), ("statue", "fisheye")])
 def test_after_a_demo_come_another_one_and_own_photos(screen, run, scene, other):
     lines = demo_steps(run, scene, quiet=False)
 
