@@ -137,6 +137,13 @@ def render_photos(
 ) -> Truth:
     """Return the ground truth of the photos in OUT/photos; those that are missing are rendered.
 
+    Args:
+        out: output folder.
+        scene: its name in `scenes`.
+        settings: `workers` processes render.
+        progress: display.
+        scenes: by name.
+
     Raises:
         InputError: the folder has photos of another scene.
     """

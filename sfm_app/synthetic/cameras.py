@@ -381,6 +381,13 @@ def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> F
 
 
 def stratified_samples(limits: tuple[float, float], count: int, rng: np.random.Generator) -> FloatArray:
+    """Return (count,) values in random order, one from each equal part of the range.
+
+    Args:
+        limits: from and to.
+        count: parts.
+        rng: random generator.
+    """
     steps = (rng.permutation(count) + rng.uniform(0.2, 0.8, count)) / count
     return np.asarray(limits[0] + (limits[1] - limits[0]) * steps)
 
