@@ -11,10 +11,11 @@ import trimesh
 from hypothesis import settings
 from PIL import Image
 
+from benchmarks.synthetic.walks import orbit
 from sfm_app.operating_system import VARIABLE, abilities
-from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera, orbit
+from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
 from sfm_app.synthetic.photo_folder import load_truth, save_truth, write_photo_folder
-from sfm_app.synthetic.scenes.scene_catalog import build_scene
+from sfm_app.synthetic.scenes import courtyard
 from sfm_app.types import Frustum, Model, Surface, Texture
 
 # the time of an example depends on how busy the machine is
@@ -59,7 +60,7 @@ def rendered(tmp_path_factory):
     """Render a small photo folder, and return it with its truth."""
     place = tmp_path_factory.mktemp("rendered")
     views = arc(make_camera(480, 320), ArcOptions(photos=7, sweep_deg=50.0))
-    save_truth(write_photo_folder(place / "photos", build_scene(), views), place)
+    save_truth(write_photo_folder(place / "photos", courtyard(), views), place)
     return place / "photos", load_truth(place)
 
 

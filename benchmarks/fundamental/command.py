@@ -38,9 +38,9 @@ from benchmarks.fundamental.real_pairs import (
     cached_ratio_matches,
     load_pairs,
 )
+from benchmarks.synthetic.matches import make_two_motions
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
-from sfm_app.synthetic.two_motions import make_two_motions
 
 THRESHOLD_PX, CONFIDENCE, MAX_TRIALS = 1.5, 0.9999, 20_000
 OURS = ("lev-ransac", "lev-ransac-thesis", "msac")

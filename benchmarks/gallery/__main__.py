@@ -19,7 +19,7 @@ from benchmarks.surface.photos import placed_photos
 from benchmarks.surface.sets import RENDERED, finished_model, surface_set
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import Camera
-from sfm_app.synthetic.pictures import SUPERSAMPLING, orbited_pose, prepare_model, render_model, render_shape
+from sfm_app.synthetic.render import SUPERSAMPLING, orbited_pose, prepare_model, render_model, render_shape
 from sfm_app.types.model import Model
 
 Pixels = NDArray[np.uint8]

@@ -25,7 +25,7 @@ from benchmarks.common.results import RESULTS, Row, document, table, write
 from sfm_app.pipeline import NAMES
 from sfm_app.synthetic.cameras import make_camera
 from sfm_app.synthetic.photo_folder import write_photo_folder
-from sfm_app.synthetic.scenes.statue import statue, statue_views
+from sfm_app.synthetic.scenes import statue, statue_views
 
 ABOUT = (
     "`sfm-app run` as a user types it, on two cores: photos of the rendered statue from all round, enlarged to 3000 x "

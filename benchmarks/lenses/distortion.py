@@ -27,7 +27,7 @@ from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import view_graph
-from sfm_app.synthetic.lenses import Lens
+from sfm_app.synthetic.cameras import Lens
 from sfm_app.types import Calibration, MatchedImage, MatchGraph
 
 FloatArray = NDArray[np.float64]

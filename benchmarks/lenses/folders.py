@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from sfm_app.synthetic.cameras import ArcOptions, Camera, Views, WallWalkOptions, arc, make_wide_camera, wall_walk
-from sfm_app.synthetic.lenses import Lens
+from benchmarks.synthetic.scenes import build_scene
+from benchmarks.synthetic.walks import WallWalkOptions, wall_walk
+from sfm_app.synthetic.cameras import ArcOptions, Camera, Lens, Views, arc, make_wide_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder
-from sfm_app.synthetic.scenes.scene_catalog import build_scene
 
 SIZE = (960, 640)
 PHOTOS = 12

@@ -21,6 +21,7 @@ from benchmarks.common.command_line import new_parser
 from benchmarks.common.photo_sets import PhotoSet
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.surface.photos import placed_photos
+from benchmarks.synthetic.scenes import build_scene
 from sfm_app.api import reconstruct
 from sfm_app.colmap.backend import log_level, show_log
 from sfm_app.runtime.workspace import Workspace
@@ -29,7 +30,6 @@ from sfm_app.stages.texture import read_texture
 from sfm_app.synthetic.cameras import Views, look_at, panorama_camera
 from sfm_app.synthetic.compare import surface_accuracy, surface_coverage
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder
-from sfm_app.synthetic.scenes.scene_catalog import build_scene
 
 SCENES = ("courtyard", "facade")
 PHOTOS, WIDTH = 20, 1600

@@ -18,12 +18,11 @@ from sfm_app.geometry.camera import camera_matrix
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages.texture import read_texture
-from sfm_app.synthetic.cameras import ArcOptions, Camera, arc
+from sfm_app.synthetic.cameras import ArcOptions, Camera, Lens, arc
 from sfm_app.synthetic.compare import surface_accuracy, surface_coverage
-from sfm_app.synthetic.lenses import Lens
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder
-from sfm_app.synthetic.pictures import comparison_image, prepare_model
-from sfm_app.synthetic.scenes.scene_catalog import build_scene
+from sfm_app.synthetic.render import comparison_image, prepare_model
+from sfm_app.synthetic.scenes import courtyard
 
 SIZE, CENTER, RADIUS_PX = (800, 600), (410.0, 296.0), 300.0
 """Of the photos: size, optical center, and radius of the circle that shows 180 degrees."""
@@ -43,7 +42,7 @@ def render_circles(cache: Path) -> tuple[Path, Truth]:
     photos, truth = cache / "photos" / "circle", cache / "truth" / "circle"
     if not truth.exists():  # written last
         views = arc(circular_fisheye(), ArcOptions(photos=PHOTOS, distance=DISTANCE))
-        made = write_photo_folder(photos, build_scene("courtyard"), views, PhotoOptions())
+        made = write_photo_folder(photos, courtyard(), views, PhotoOptions())
         x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
         outside = np.hypot(x - CENTER[0], y - CENTER[1]) > RADIUS_PX - 2.0
         for path in sorted(photos.glob("*.jpg")):

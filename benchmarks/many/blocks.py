@@ -22,6 +22,7 @@ from benchmarks.common.photo_sets import link_or_copy
 from benchmarks.common.processes import row_of_module
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.many.true_town import true_scene
+from benchmarks.synthetic.town import TownPhotos, town_of, town_views
 from sfm_app.engine.usage import measure_usage
 from sfm_app.geometry.triangles import unique_edges
 from sfm_app.plugins import load_plugins
@@ -32,7 +33,6 @@ from sfm_app.settings import Settings
 from sfm_app.stages import depth_maps, mesh, texture
 from sfm_app.synthetic.cameras import make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, add_missing_photos
-from sfm_app.synthetic.town.photos import TownPhotos, town_of, town_views
 from sfm_app.types import Surface
 
 ABOUT = (

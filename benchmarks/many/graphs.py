@@ -3,8 +3,8 @@
     python -m benchmarks.many
     python -m benchmarks.many --counts 500 1000
 
-A walk through a town of equal blocks, without pictures (`synthetic.town_graph`). Every number of photos is a process of
-its own, so that memory is its own.
+A walk through a town of equal blocks, without pictures (`benchmarks.synthetic.matches`). Every number of photos
+is a process of its own, so that memory is its own.
 """
 
 import argparse
@@ -21,6 +21,7 @@ from benchmarks.common.command_line import new_parser
 from benchmarks.common.memory import peak_mb
 from benchmarks.common.processes import row_of_module
 from benchmarks.common.results import RESULTS, Row, document, table, write
+from benchmarks.synthetic.matches import TownGraph, TownOptions, make_town_graph
 from sfm_app.estimation.calibrating import photo_pairs, sample_pairs
 from sfm_app.plugins import load_plugins
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
@@ -30,7 +31,6 @@ from sfm_app.reconstruction.parts.parts_run import USUAL_PART
 from sfm_app.runtime.parallel import make_executor, ordered_map, worker_count
 from sfm_app.selfcal import calibrate_photo_set
 from sfm_app.settings import Settings
-from sfm_app.synthetic.town_graph import TownGraph, TownOptions, make_town_graph
 from sfm_app.types import Intrinsics, PoseGraph
 
 COUNTS = (1000, 2500, 10_000)

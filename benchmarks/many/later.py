@@ -25,7 +25,7 @@ from benchmarks.corpus.score import offset_figures
 from sfm_app.pipeline import NAMES
 from sfm_app.synthetic.cameras import make_camera
 from sfm_app.synthetic.photo_folder import save_truth, write_photo_folder
-from sfm_app.synthetic.scenes.statue import statue, statue_views
+from sfm_app.synthetic.scenes import statue, statue_views
 
 PHOTOS, STEP, KITCHEN_STEP, SIZE = 120, 6, 8, (360, 480)
 STATUE, KITCHEN = "statue", "kitchen1000"

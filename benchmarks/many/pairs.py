@@ -27,7 +27,7 @@ from benchmarks.corpus.score import OFFSETS, offset_figures
 from benchmarks.hundred.command import PHOTOS, SMALL, photo_folder
 from sfm_app.settings import MatchSettings
 from sfm_app.synthetic.cameras import make_camera
-from sfm_app.synthetic.scenes.statue import statue_views
+from sfm_app.synthetic.scenes import statue_views
 
 ABOUT = (
     "`sfm-app run --until scene` with all pairs and with pairs chosen by retrieval, one after the other. CPU: seconds "

@@ -3,8 +3,8 @@
     python -m benchmarks.many.parts --cache CACHE
     python -m benchmarks.many.parts --cache CACHE --data DATA --every 4
 
-A walk through a town without pictures (`synthetic.town_graph`) with small steps, and with --data the video kitchen1000,
-whose truth are the poses of another camera on the same rig.
+A walk through a town without pictures (`benchmarks.synthetic.matches`) with small steps, and with --data
+the video kitchen1000, whose truth are the poses of another camera on the same rig.
 """
 
 import argparse
@@ -27,6 +27,7 @@ from benchmarks.common.photo_sets import link_or_copy
 from benchmarks.common.processes import environment, module_command, row_of_module
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.many.graphs import calibrate_town
+from benchmarks.synthetic.matches import TownOptions, make_town_graph
 from sfm_app.colmap.bundle import adjust_or_keep
 from sfm_app.colmap.models.model import poses_and_points
 from sfm_app.colmap.types import Reconstruction
@@ -37,7 +38,6 @@ from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor, worker_count
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
-from sfm_app.synthetic.town_graph import TownOptions, make_town_graph
 
 FloatArray = NDArray[np.float64]
 Pose = FloatArray

@@ -18,13 +18,13 @@ from benchmarks.common.processes import module_command, run_command
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.many.blocks import WORKERS, camera_size
 from benchmarks.many.parts import FOLDED_M, pose_errors
+from benchmarks.synthetic.town import TownPhotos, town_of, town_views
 from sfm_app.colmap.models.model import poses_and_points
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.pipeline import NAMES
 from sfm_app.settings import QUALITY_PRESETS
 from sfm_app.synthetic.cameras import Camera, Views, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, add_missing_photos
-from sfm_app.synthetic.town.photos import TownPhotos, town_of, town_views
 
 ABOUT = (
     "`sfm-app run` on the first photos of a walk through a rendered town, as a user types it, with two workers. "

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.synthetic.scenes import marker_sheet
 from sfm_app.scale.markers import draw_pattern
 from sfm_app.synthetic.cameras import Views, camera_center
-from sfm_app.synthetic.scenes.bodies import SyntheticScene
-from sfm_app.synthetic.scenes.marker_sheet import marker_sheet
+from sfm_app.synthetic.shapes import SyntheticScene
 
 FloatArray = NDArray[np.float64]
 

@@ -5,9 +5,10 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks.common.photo_sets import PhotoSet, TrueCamera
-from sfm_app.synthetic.cameras import ArcOptions, Views, arc, make_camera, orbit
+from benchmarks.synthetic.walks import orbit
+from sfm_app.synthetic.cameras import ArcOptions, Views, arc, make_camera
 from sfm_app.synthetic.photo_folder import load_truth, save_truth, write_photo_folder
-from sfm_app.synthetic.scenes.scene_catalog import build_scene
+from sfm_app.synthetic.scenes import courtyard
 
 SIZE = (960, 640)
 LENSES = (-0.25, -0.1, 0.1)
@@ -52,5 +53,5 @@ def rendered_sets(seeds: int, cache: Path) -> Iterator[PhotoSet]:
 
 def _truth(views: Views, photos: Path, folder: Path) -> dict[str, TrueCamera]:
     if not folder.exists():  # written last
-        save_truth(write_photo_folder(photos, build_scene(), views), folder)
+        save_truth(write_photo_folder(photos, courtyard(), views), folder)
     return {Path(name).stem: TrueCamera(camera.K, camera.radial) for name, camera in load_truth(folder).cameras.items()}

@@ -48,7 +48,7 @@ from benchmarks.surface.sets import (
 )
 from benchmarks.surface.worker import run_stages
 from sfm_app.settings import Settings
-from sfm_app.synthetic.pictures import prepare_model
+from sfm_app.synthetic.render import prepare_model
 
 ABOUT = (
     "Photos only, through the whole program. Rendered scenes: the mesh is moved onto the truth by the camera centers; "

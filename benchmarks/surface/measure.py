@@ -27,8 +27,8 @@ from benchmarks.surface.sparse_poisson import sparse_surfaces
 from benchmarks.surface.worker import StageCost
 from sfm_app.errors import SfmError
 from sfm_app.synthetic.photo_folder import Truth
-from sfm_app.synthetic.pictures import PreparedModel, prepare_model
-from sfm_app.synthetic.scenes.bodies import SyntheticScene
+from sfm_app.synthetic.render import PreparedModel, prepare_model
+from sfm_app.synthetic.shapes import SyntheticScene
 from sfm_app.types import Surface
 
 FILES = ("glb", "ply", "obj")

@@ -11,7 +11,7 @@ from PIL import Image
 
 from benchmarks.common.results import Row
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.synthetic.pictures import Picture, PreparedModel, render_rays
+from sfm_app.synthetic.render import Picture, PreparedModel, render_rays
 
 Pixels = NDArray[np.uint8]
 FloatArray = NDArray[np.float64]

@@ -9,7 +9,7 @@ from PIL import Image
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.synthetic.cameras import Camera
-from sfm_app.synthetic.pictures import PreparedModel, comparison_image
+from sfm_app.synthetic.render import PreparedModel, comparison_image
 
 Pixels = NDArray[np.uint8]
 TALL_PX, WIDE_PX = 800, 1000

@@ -6,12 +6,12 @@ from pathlib import Path
 
 from benchmarks.common.photo_sets import FORMATS, link_or_copy, photo_set
 from benchmarks.surface.depth_camera.kinect import KinectTruth, load_kinect
+from benchmarks.synthetic.scenes import WALKS, build_scene, scene_views
 from sfm_app.api import open_run
 from sfm_app.pipeline import DEPTH_MAPS, NAMES, TEXTURE, run_stages
 from sfm_app.settings import Settings
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder
-from sfm_app.synthetic.scenes.bodies import SyntheticScene
-from sfm_app.synthetic.scenes.scene_catalog import WALKS, build_scene, scene_views
+from sfm_app.synthetic.shapes import SyntheticScene
 from sfm_app.types.model import Model
 
 RENDERED = ("statue", "facade", "corner")

@@ -28,11 +28,12 @@ from benchmarks.common.processes import run_command
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.corpus.kept_runs import FinishedRun, load_finished_run, record_run, run_key
 from benchmarks.corpus.score import Doubt, parameter_errors
+from benchmarks.synthetic.trouble import KINDS, troubled_folder, write_troubled_folder
 from sfm_app.synthetic.photo_folder import Truth, load_truth, save_truth
-from sfm_app.synthetic.trouble import KINDS, troubled_folder, write_troubled_folder
 
 ABOUT = (
-    "Rendered folders of 6 to 20 small photos, each with a few troubles drawn by its seed (`synthetic/trouble.py`), "
+    "Rendered folders of 6 to 20 small photos, each with a few troubles drawn by its seed "
+    "(`benchmarks/synthetic/trouble.py`), "
     "through `sfm-app run --until scene` in a process of its own, without EXIF. Exit codes 0 and 4 (the photos do not "
     "support a scene, and it says why) are expected, all others are failures. known: photos whose K is called "
     "identifiable before mapping; focal %: its error against the camera that took the photo, the worst photo; after: "

@@ -15,12 +15,12 @@ from benchmarks.cameras.score import TruePhoto, accuracy, read_models
 from benchmarks.cameras.worker import INCREMENTAL, OURS, RESULT
 from benchmarks.common.photo_sets import PhotoSet
 from benchmarks.common.results import Row
+from benchmarks.synthetic.scenes import build_scene
 from sfm_app.api import reconstruct
 from sfm_app.colmap.backend import log_level, show_log
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import Camera, Views
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder
-from sfm_app.synthetic.scenes.scene_catalog import build_scene
 
 FloatArray = NDArray[np.float64]
 

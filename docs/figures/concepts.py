@@ -18,7 +18,7 @@ from sfm_app.synthetic.cameras import Camera, arc, camera_center, make_camera, p
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.synthetic.render import GAMMA, cast_rays, render_scene
 from sfm_app.synthetic.render import prepare as prepare_scene
-from sfm_app.synthetic.scenes.scene_catalog import build_scene
+from sfm_app.synthetic.scenes import courtyard
 from sfm_app.types import CameraPairs
 
 FloatArray = NDArray[np.float64]
@@ -35,7 +35,7 @@ class TwoPhotos:
         first, second = (sorted(views.cam_from_world)[k] for k in (4, 6))
         self.camera: Camera = views.cameras[first]
         self.poses = views.cam_from_world[first], views.cam_from_world[second]
-        self.scene = prepare_scene(build_scene())
+        self.scene = prepare_scene(courtyard())
         self.photos = [np.clip(render_scene(self.scene, self.camera, pose), 0, 1) ** (1 / GAMMA) for pose in self.poses]
 
     @property

@@ -22,7 +22,7 @@ from sfm_app.report.page.depth_pictures import depth_colors
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.stages.texture import read_texture
 from sfm_app.synthetic.cameras import Camera
-from sfm_app.synthetic.pictures import prepare_model, render_model, render_shape
+from sfm_app.synthetic.render import prepare_model, render_model, render_shape
 
 PICTURES = Path(__file__).parents[1] / "pictures"
 SHOWN, HEIGHT = 8, 220

@@ -20,13 +20,18 @@ from sfm_app.cli.options import (
     settings_options,
 )
 from sfm_app.cli.output import STAGE_TITLES, file_lines, open_browser, print_json, print_lines, print_text, table
-from sfm_app.demo import COURTYARD, SCENES
 from sfm_app.errors import ConfigError
 from sfm_app.lengths import parse_length, parse_point
 
 if TYPE_CHECKING:
     from sfm_app.formats.exporters import Exporter, SceneExporter
 
+SCENES = {
+    "courtyard": "a court with things in it, 12 photos from its open side",
+    "statue": "a bust on a plinth, 18 photos all round it",
+    "fisheye": "the court again, 12 photos through a fisheye of 180 degrees",
+}
+"""Scenes of the demo by name; importing `sfm_app.demo` takes seconds."""
 PATH = click.Path(path_type=Path)
 STAGES = tuple(STAGE_TITLES)
 MARKER_FAMILIES = tuple(name for name in get_args(setting_field("scale.marker_family").annotation) if name != "auto")
@@ -144,7 +149,7 @@ def markers(side: str, target: Path, family: str, first: int, paper: str) -> Non
     "--scene",
     type=click.Choice(tuple(SCENES)),
     metavar="NAME",
-    default=COURTYARD,
+    default="courtyard",
     show_default=True,
     help="Scene to photograph: " + "; ".join(f"{name}: {text}" for name, text in SCENES.items()) + ".",
 )
@@ -159,11 +164,10 @@ def demo(out: Path | None, scene: str, opens: bool | None, **flags: Any) -> None
     from sfm_app.cli.ending.picture import print_picture
     from sfm_app.cli.outcome import demo_steps
     from sfm_app.cli.terminal import Terminal
-    from sfm_app.demo.result import demo_lines
-    from sfm_app.demo.running import run_demo
+    from sfm_app.demo import demo_lines, run_demo
 
     settings, quiet = settings_from_flags(flags), flags["quiet"]
-    folder = out or Path("demo" if scene == COURTYARD else f"demo-{scene}")
+    folder = out or Path("demo" if scene == "courtyard" else f"demo-{scene}")
     with Terminal(quiet=quiet) as progress:
         run, result = run_demo(folder, scene, settings, progress)
     interactive = sys.stdout.isatty() and not quiet

@@ -257,7 +257,7 @@ def run_steps(run: Run, photos: Path, out: Path | None, settings: Settings) -> l
 
 def demo_steps(run: Run, scene: str) -> list[str]:
     """Return the next commands after a demo of a scene."""
-    other = "statue" if scene != "statue" else "facade"
+    other = "statue" if scene != "statue" else "fisheye"
     return _align_steps([
         (_view_command(run), "view it"),
         (f"sfm-app demo --scene {other}", "another scene"),

@@ -16,7 +16,7 @@ from sfm_app.report.page.scene_view import view_points
 from sfm_app.scale import move_model
 from sfm_app.stages import texture
 from sfm_app.synthetic.cameras import Camera
-from sfm_app.synthetic.pictures import orbited_pose, render_model
+from sfm_app.synthetic.render import orbited_pose, render_model
 from sfm_app.types import Frustum, Model
 
 WIDTH_PX, SUPERSAMPLING = 640, 2

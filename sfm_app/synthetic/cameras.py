@@ -1,4 +1,4 @@
-"""Build synthetic cameras and their poses along typical photographers' paths."""
+"""Cameras with any lens, their poses along a photographer's path, and the rays of their pixels."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -9,9 +9,142 @@ from numpy.typing import NDArray
 
 from sfm_app.errors import ConfigError
 from sfm_app.geometry.camera import camera_matrix
-from sfm_app.synthetic.lenses import Lens
 
 FloatArray = NDArray[np.float64]
+
+NEWTON_STEPS = 100
+LEAST_SLOPE = 1e-3
+"""Of the distorted radius, so that a step near the fold stays finite."""
+FOLD_SAMPLES = 100_001
+PROJECTIONS = ("perspective", "stereographic", "equidistant", "equisolid", "equirectangular")
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """How rays become points of the normalized image plane, whose unit is the focal length.
+
+    A ray at the angle theta to the optical axis comes to lie at the radius r of its projection: tan(theta),
+    2 tan(theta / 2), theta, or 2 sin(theta / 2). Then x_d = x (1 + k1 r^2 + k2 r^4 + ...), and the tangential terms of
+    COLMAP's OPENCV are added. An equirectangular photo has longitude and latitude instead, and no such terms.
+
+    Raises:
+        ConfigError: the projection is unknown.
+    """
+
+    projection: str = "perspective"
+    """One of `PROJECTIONS`."""
+    radial: tuple[float, ...] = ()
+    """k1, k2, ...: with "perspective" those of COLMAP's OPENCV, with "equidistant" of its OPENCV_FISHEYE."""
+    tangential: tuple[float, float] = (0.0, 0.0)
+    """p1, p2."""
+
+    def __post_init__(self) -> None:
+        if self.projection not in PROJECTIONS:
+            raise ConfigError(f"synthetic lens: unknown projection {self.projection}", hint=", ".join(PROJECTIONS))
+
+    @property
+    def k1(self) -> float:
+        """First radial term, 0 without one."""
+        return self.radial[0] if self.radial else 0.0
+
+    def rays(self, points: FloatArray) -> FloatArray:
+        """Return (N, 3) directions, z = 1 with "perspective", else of length 1; NaN for points that no ray reaches.
+
+        Args:
+            points: (N, 2) on the normalized image plane.
+
+        Raises:
+            ConfigError: the distortion folds within these points, so that one of them has several rays.
+        """
+        if self.projection == "equirectangular":
+            longitude, latitude = points.T
+            level = np.cos(latitude)
+            return np.column_stack([level * np.sin(longitude), np.sin(latitude), level * np.cos(longitude)])
+        plain = self._undistort(points)
+        if self.projection == "perspective":
+            return np.column_stack([plain, np.ones(len(plain))])
+        radius = np.hypot(*plain.T)
+        theta = self._angle(radius)
+        along = np.divide(np.sin(theta), radius, out=np.ones_like(radius), where=radius > 0)
+        return np.column_stack([plain * along[:, None], np.cos(theta)])
+
+    def project(self, rays: FloatArray) -> FloatArray:
+        """Return (N, 2) points of the normalized image plane.
+
+        Args:
+            rays: (N, 3) of any length; in front of the camera with "perspective".
+        """
+        side = np.hypot(rays[:, 0], rays[:, 1])
+        if self.projection == "equirectangular":
+            level = np.hypot(rays[:, 0], rays[:, 2])
+            return np.column_stack([np.arctan2(rays[:, 0], rays[:, 2]), np.arctan2(rays[:, 1], level)])
+        radius = self._radius(np.arctan2(side, rays[:, 2]))
+        plain = rays[:, :2] * np.divide(radius, side, out=np.zeros_like(side), where=side > 0)[:, None]
+        return plain * self._factor(np.hypot(*plain.T))[:, None] + self._shift(plain)
+
+    def _radius(self, theta: FloatArray) -> FloatArray:
+        """Return the radius at which a ray at an angle to the optical axis comes to lie, before distortion."""
+        if self.projection == "perspective":
+            return np.asarray(np.tan(theta))
+        if self.projection == "stereographic":
+            return np.asarray(2.0 * np.tan(theta / 2.0))
+        return theta if self.projection == "equidistant" else np.asarray(2.0 * np.sin(theta / 2.0))
+
+    def _angle(self, radius: FloatArray) -> FloatArray:
+        """Return the angle to the optical axis; NaN beyond the ray that looks backwards."""
+        if self.projection == "stereographic":
+            return np.asarray(2.0 * np.arctan(radius / 2.0))
+        if self.projection == "equidistant":
+            return np.where(radius <= math.pi, radius, np.nan)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(2.0 * np.arcsin(radius / 2.0))
+
+    def _factor(self, radius: FloatArray, slope: bool = False) -> FloatArray:
+        """Return the distorted over the undistorted radius, or its derivative by the undistorted one."""
+        total = np.ones_like(radius)
+        for power, k in enumerate(self.radial, start=1):
+            total += (2 * power + 1 if slope else 1) * k * radius ** (2 * power)
+        return total
+
+    def _shift(self, plain: FloatArray) -> FloatArray:
+        """Return (N, 2) the tangential terms."""
+        (p1, p2), (x, y) = self.tangential, plain.T
+        square = x * x + y * y
+        return np.column_stack(
+            [2.0 * p1 * x * y + p2 * (square + 2.0 * x * x), p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y]
+        )
+
+    def _undistort(self, points: FloatArray) -> FloatArray:
+        """Return (N, 2) the points as they would lie without the radial and tangential terms."""
+        if not any(self.tangential):
+            return self._undistort_radius(points)
+        plain = points
+        for _ in range(NEWTON_STEPS):
+            before, plain = plain, self._undistort_radius(points - self._shift(plain))
+            if np.max(np.abs(plain - before), initial=0.0) < 1e-14:
+                break
+        return plain
+
+    def _undistort_radius(self, points: FloatArray) -> FloatArray:
+        """Return (N, 2) the points as they would lie without the radial terms, on the branch through the center."""
+        distorted = np.hypot(points[:, 0], points[:, 1])
+        r = distorted.copy()
+        if any(self.radial):
+            self._check_fold(float(distorted.max(initial=0.0)))
+        for _ in range(NEWTON_STEPS if any(self.radial) else 0):
+            step = (r * self._factor(r) - distorted) / np.maximum(self._factor(r, slope=True), LEAST_SLOPE)
+            r -= step
+            if np.all(np.abs(step) <= 2.0 * np.finfo(np.float64).eps * r):
+                break
+        return points * np.divide(r, distorted, out=np.ones_like(r), where=distorted > 0)[:, None]
+
+    def _check_fold(self, largest: float) -> None:
+        """Check that the distorted radius grows with the undistorted one up to the largest one of the photo."""
+        radius = np.linspace(0.0, 4.0 * max(largest, 1e-9), FOLD_SAMPLES)
+        ends = np.flatnonzero(self._factor(radius, slope=True) <= 0.0)
+        if len(ends) and (radius * self._factor(radius))[ends[0]] <= largest:
+            terms = ", ".join(f"{k:g}" for k in self.radial)
+            raise ConfigError(f"synthetic camera: a radial distortion of {terms} folds within the photo")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,7 +155,7 @@ class Camera:
     """(3, 3) camera matrix in pixels, zero skew."""
     width: int
     height: int
-    lens: Lens = Lens()  # noqa: RUF009 -- frozen
+    lens: Lens = Lens()
     """Projection and distortion, on the plane whose unit is the focal length."""
 
     @property
@@ -181,110 +314,13 @@ def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Vie
     count = options.photos
     # stratified, so that few photos already spread over the whole range
     azimuth = np.radians(options.sweep_deg) * (np.arange(count) / (count - 1) - 0.5)
-    distance = _stratified_samples(options.distance, count, rng)
-    height = _stratified_samples(options.height, count, rng)
-    roll_deg = _stratified_samples((-options.roll_deg, options.roll_deg), count, rng)
+    distance = stratified_samples(options.distance, count, rng)
+    height = stratified_samples(options.height, count, rng)
+    roll_deg = stratified_samples((-options.roll_deg, options.roll_deg), count, rng)
     aims = np.array(options.aim) + rng.uniform(-1.0, 1.0, (count, 3)) * options.aim_spread
     centers = np.column_stack([distance * np.sin(azimuth), height, distance * np.cos(azimuth)])
     poses = [look_at(center, aim, roll) for center, aim, roll in zip(centers, aims, roll_deg, strict=True)]
     return Views.from_poses(camera, poses)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WallWalkOptions:
-    """A hand-held walk along a wall that faces +z, each photo turned towards the middle by a random amount.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
-
-    photos: int = 12
-    """>= 2."""
-    length: float = 8.0
-    """Length of the walk along x, in scene units, > 0."""
-    distance: tuple[float, float] = (5.0, 7.0)
-    """Range of z, in scene units."""
-    height: tuple[float, float] = (1.2, 2.2)
-    """Range of y, in scene units."""
-    aim: tuple[float, float] = (2.0, 3.2)
-    """Range of the height on the wall that the photos look at, in scene units."""
-    roll_deg: float = 5.0
-    """Largest roll either way, in degrees, [0, 180]."""
-
-    def __post_init__(self) -> None:
-        if self.photos < 2 or not (0 < self.length < math.inf and 0 <= self.roll_deg <= 180):
-            raise ConfigError("synthetic cameras: photos, length or roll_deg is out of range")
-
-
-def wall_walk(camera: Camera, options: WallWalkOptions | None = None, seed: int = 0) -> Views:
-    """Return hand-held photos along a wall in the plane z = 0, from left to right, named view_00.jpg and so on.
-
-    Args:
-        camera: of all photos.
-        options: the walk; the default one if None.
-        seed: same seed, same poses.
-    """
-    options = options or WallWalkOptions()
-    rng = np.random.default_rng([seed, 13])
-    count = options.photos
-    x = options.length * (np.arange(count) / (count - 1) - 0.5)
-    centers = np.column_stack(
-        [x, _stratified_samples(options.height, count, rng), _stratified_samples(options.distance, count, rng)]
-    )
-    # parallel axes would leave the focal length undetermined
-    aims = np.column_stack(
-        [x * _stratified_samples((0.2, 0.9), count, rng), _stratified_samples(options.aim, count, rng), np.zeros(count)]
-    )
-    roll_deg = _stratified_samples((-options.roll_deg, options.roll_deg), count, rng)
-    return Views.from_poses(camera, [look_at(c, a, roll) for c, a, roll in zip(centers, aims, roll_deg, strict=True)])
-
-
-def orbit(
-    camera: Camera,
-    photos: int = 12,
-    sweep_deg: float = 80.0,
-    distance: float = 5.6,
-    aim: tuple[float, float, float] = (0.0, 1.3, -0.2),
-) -> Views:
-    """Place upright photos evenly on a level circle, all looking at its center; the focal length is undetermined.
-
-    Any two of the optical axes meet at the same distance from both cameras (isosceles), and then F does not
-    constrain the focal length (Sturm 2001); K is the same for all photos.
-
-    Args:
-        camera: takes all photos.
-        photos: >= 2.
-        sweep_deg: angle of the arc that the photos divide evenly, in degrees, (0, 360].
-        distance: radius of the circle, in scene units, > 0.
-        aim: the circle's center.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
-    if photos < 2 or not (0 < sweep_deg <= 360 and 0 < distance < math.inf):
-        raise ConfigError("synthetic orbit: photos, sweep_deg or distance is out of range")
-    # steps of sweep / photos, so that at 360 degrees the last photo does not repeat the first
-    azimuth = np.radians(sweep_deg) * ((np.arange(photos) + 0.5) / photos - 0.5)
-    around = np.column_stack([np.sin(azimuth), np.zeros(photos), np.cos(azimuth)])
-    middle = np.array(aim)
-    return Views.from_poses(camera, [look_at(middle + distance * way, middle) for way in around])
-
-
-def panorama(
-    camera: Camera, photos: int = 6, step_deg: float = 12.0, center: tuple[float, float, float] = (0.0, 1.5, 4.5)
-) -> Views:
-    """Return photos from one spot, panning left to right with slight tilt and roll: they have no parallax.
-
-    Args:
-        camera: takes all photos.
-        photos: >= 2.
-        step_deg: angle from photo to photo, in degrees.
-        center: the spot, in scene units; the middle photo looks towards -z.
-    """
-    azimuth = np.radians(step_deg) * (np.arange(photos) - (photos - 1) / 2)
-    tilt, roll_deg = 0.05 * np.cos(np.pi * np.arange(photos)), 3.0 * np.sin(2.0 * np.arange(photos))
-    spot, ways = np.array(center), np.column_stack([np.sin(azimuth), tilt, -np.cos(azimuth)])
-    return Views.from_poses(camera, [look_at(spot, spot + way, roll) for way, roll in zip(ways, roll_deg, strict=True)])
 
 
 def look_at(center: FloatArray, aim: FloatArray, roll_deg: float = 0.0) -> FloatArray:
@@ -344,7 +380,14 @@ def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> F
     return camera.lens.rays(np.column_stack([x, y]))
 
 
-def _stratified_samples(limits: tuple[float, float], count: int, rng: np.random.Generator) -> FloatArray:
+def stratified_samples(limits: tuple[float, float], count: int, rng: np.random.Generator) -> FloatArray:
+    """Return (count,) values in random order, one from each equal part of the range.
+
+    Args:
+        limits: from and to.
+        count: parts.
+        rng: random generator.
+    """
     steps = (rng.permutation(count) + rng.uniform(0.2, 0.8, count)) / count
     return np.asarray(limits[0] + (limits[1] - limits[0]) * steps)
 

@@ -14,6 +14,7 @@ from sfm_app.geometry.epipolar import fundamental_from_pose
 from sfm_app.synthetic.cameras import axis_rotation
 
 FloatArray = NDArray[np.float64]
+
 Poses = tuple[FloatArray, FloatArray]
 
 # Depth range from the first camera, in units of the distance to the middle of the scene.

@@ -12,7 +12,7 @@ import pytest
 
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
-from sfm_app.synthetic.scenes.scene_catalog import build_scene
+from sfm_app.synthetic.scenes import courtyard
 
 QUICK = ["--quality", "draft", "--set", "depth.max_image_size_px=240", "--faces", "3000", "-q", "--workers", "2"]
 if "SFM_APP_FAULTS" not in os.environ:  # a quarter of a run, thirty times
@@ -57,7 +57,7 @@ def undisturbed(tmp_path_factory, as_ordinary_user):
         pytest.skip("Windows has neither SIGKILL nor limits of processes")
     place = tmp_path_factory.mktemp("faults")
     views = arc(make_camera(480, 360), ArcOptions(photos=5, sweep_deg=40.0))
-    write_photo_folder(place / "photos", build_scene(), views, PhotoOptions(supersampling=1))
+    write_photo_folder(place / "photos", courtyard(), views, PhotoOptions(supersampling=1))
     folder = Folder(place / "photos", place / "out", as_ordinary_user)
     done = folder.run(place / "out")
     assert done.returncode == 0, done.stderr

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from sfm_app.cli import main
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
-from sfm_app.synthetic.scenes.scene_catalog import build_scene
+from sfm_app.synthetic.scenes import courtyard
 
 QUICK = (
     "--quality", "draft", "--set", "depth.max_image_size_px=160", "--set", "matching.max_image_size_px=320",
@@ -48,7 +48,7 @@ def photos(tmp_path_factory):
     """Four photos of a courtyard."""
     folder = tmp_path_factory.mktemp("fuzz") / "photos"
     views = arc(make_camera(400, 300), ArcOptions(photos=4, sweep_deg=30.0))
-    write_photo_folder(folder, build_scene(), views, PhotoOptions(supersampling=1))
+    write_photo_folder(folder, courtyard(), views, PhotoOptions(supersampling=1))
     return folder
 
 

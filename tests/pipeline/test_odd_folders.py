@@ -9,11 +9,13 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
+from benchmarks.synthetic.scenes import build_scene
+from benchmarks.synthetic.walks import panorama
 from sfm_app.cli import main
-from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera, panorama
+from sfm_app.synthetic import scenes
+from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
 from sfm_app.synthetic.compare import focal_error_percent
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
-from sfm_app.synthetic.scenes.scene_catalog import build_scene
 
 CAMERA = make_camera(480, 360)
 QUICK = "--quality", "draft", "--set", "report=false"
@@ -43,7 +45,7 @@ def ends_with(result, *words):
 def courtyard(tmp_path_factory):
     """Six photos of the courtyard."""
     folder = tmp_path_factory.mktemp("courtyard")
-    write_photo_folder(folder, build_scene(), arc(CAMERA, ArcOptions(photos=6, sweep_deg=50.0)), FAST)
+    write_photo_folder(folder, scenes.courtyard(), arc(CAMERA, ArcOptions(photos=6, sweep_deg=50.0)), FAST)
     return folder
 
 
@@ -104,7 +106,7 @@ def test_ten_photos_of_a_white_wall(folder, tmp_path, noise, says):
 
 
 def test_a_panorama(folder, tmp_path):
-    write_photo_folder(folder, build_scene(), panorama(CAMERA, 3, 20.0), FAST)
+    write_photo_folder(folder, scenes.courtyard(), panorama(CAMERA, 3, 20.0), FAST)
 
     result, out = run(folder, tmp_path)
 

@@ -11,7 +11,7 @@ import sfm_app
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
 from sfm_app.synthetic.photo_folder import write_photo_folder
-from sfm_app.synthetic.scenes.scene_catalog import build_scene
+from sfm_app.synthetic.scenes import courtyard
 
 SENSOR_FROM_UPRIGHT = {90: [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], 270: [[0, -1, 0], [1, 0, 0], [0, 0, 1]]}
 """By how far the picture has to be turned clockwise to be upright."""
@@ -28,7 +28,7 @@ def upright_photos(tmp_path_factory):
         name: np.array(SENSOR_FROM_UPRIGHT[TURNED[name]], float) @ pose if name in TURNED else pose
         for name, pose in views.cam_from_world.items()
     }
-    return place, write_photo_folder(place, build_scene(), replace(views, cam_from_world=poses))
+    return place, write_photo_folder(place, courtyard(), replace(views, cam_from_world=poses))
 
 
 @pytest.mark.parametrize("told", [True, False])

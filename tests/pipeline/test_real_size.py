@@ -11,14 +11,14 @@ import trimesh
 from scipy.spatial import KDTree
 
 import sfm_app
+from benchmarks.synthetic.scenes import marker_sheet
 from sfm_app.geometry.similarity import Similarity, umeyama
 from sfm_app.scale.markers import draw_pattern
 from sfm_app.settings import Settings
 from sfm_app.stages import scene as scene_stage
 from sfm_app.synthetic.cameras import ArcOptions, arc, camera_center, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
-from sfm_app.synthetic.scenes.marker_sheet import marker_sheet
-from sfm_app.synthetic.scenes.scene_catalog import build_scene
+from sfm_app.synthetic.scenes import courtyard
 
 pytestmark = pytest.mark.slow
 
@@ -34,7 +34,7 @@ GROUND = np.array(
 def measured(tmp_path_factory):
     """A run up to the size, of photos that show two markers."""
     place = tmp_path_factory.mktemp("size")
-    scene = build_scene()
+    scene = courtyard()
     markers = [
         *marker_sheet(draw_pattern("apriltag-36h11", 0), SIDE_M, (-0.85, 0.75, 0.75), 15, 75),
         *marker_sheet(draw_pattern("apriltag-36h11", 1), SIDE_M, (0.85, 0.72, 0.8), -20, 70),

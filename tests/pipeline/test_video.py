@@ -11,7 +11,7 @@ from sfm_app.cli import main
 from sfm_app.synthetic.cameras import look_at, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, develop
 from sfm_app.synthetic.render import prepare, render_scene
-from sfm_app.synthetic.scenes.scene_catalog import build_scene
+from sfm_app.synthetic.scenes import courtyard
 
 SIZE = 320, 240
 FRAMES = 28
@@ -21,7 +21,7 @@ FRAMES = 28
 def clip(tmp_path_factory):
     """Every seventh frame is blurred; the last four show the same."""
     path = tmp_path_factory.mktemp("video") / "clip.avi"
-    camera, scene, options = make_camera(*SIZE), prepare(build_scene()), PhotoOptions(supersampling=1)
+    camera, scene, options = make_camera(*SIZE), prepare(courtyard()), PhotoOptions(supersampling=1)
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"MJPG"), 30.0, SIZE)
     for k in range(FRAMES):
         if k < FRAMES - 3:

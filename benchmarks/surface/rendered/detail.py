@@ -9,7 +9,7 @@ from benchmarks.common.results import Row
 from benchmarks.surface.rendered.truth import Sights, sample_with_normals, sights_of
 from sfm_app.synthetic.compare import align_centers, sample_surface, scene_size, surface_distances
 from sfm_app.synthetic.photo_folder import Truth
-from sfm_app.synthetic.scenes.bodies import SyntheticScene
+from sfm_app.synthetic.shapes import SyntheticScene
 from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]

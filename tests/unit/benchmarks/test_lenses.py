@@ -5,8 +5,7 @@ import pytest
 
 from benchmarks.lenses.command import methods_for, page
 from benchmarks.lenses.radius import projection_of, radius_error_percent
-from sfm_app.synthetic.cameras import make_camera, make_wide_camera
-from sfm_app.synthetic.lenses import Lens
+from sfm_app.synthetic.cameras import Lens, make_camera, make_wide_camera
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.types import Calibration
 

@@ -15,11 +15,11 @@ from benchmarks.surface.report import page
 from benchmarks.surface.sets import REAL, RENDERED, SCANNED, SurfaceSet, first_photos, surface_set
 from benchmarks.surface.sparse_poisson import points_ply
 from benchmarks.surface.worker import StageCost
+from benchmarks.synthetic.scenes import WALKS
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.synthetic.cameras import Views, axis_rotation, look_at, make_camera
 from sfm_app.synthetic.photo_folder import Truth
-from sfm_app.synthetic.pictures import Picture
-from sfm_app.synthetic.scenes.scene_catalog import WALKS
+from sfm_app.synthetic.render import Picture
 from sfm_app.types import Surface
 
 TURN = Similarity(2.5, axis_rotation(np.array([0.6, 0.0, 0.8]), 40.0), np.array([3.0, -1.0, 2.0]))

@@ -3,11 +3,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from benchmarks.synthetic.walks import Trajectory, WalkOptions, project_through_shutter, walk
 from sfm_app.bundle_adjustment.normal_equations import Bundle
 from sfm_app.bundle_adjustment.readout import Rows
 from sfm_app.geometry.lenses.projections import CAMERA, PERSPECTIVE
 from sfm_app.synthetic.cameras import Camera, make_camera
-from sfm_app.synthetic.trajectory import Trajectory, WalkOptions, project_through_shutter, walk
 
 INTERVAL_S, POINTS, DEPTHS, NOISE_PX = 0.1, 500, (2.0, 8.0), 0.3
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from benchmarks.synthetic.walks import WalkOptions, walk
 from sfm_app.bundle_adjustment.path_velocity import FITS, local_fit_weights, path_velocities
-from sfm_app.synthetic.trajectory import WalkOptions, walk
 
 STEP_S = 1e-3
 

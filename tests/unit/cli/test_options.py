@@ -7,6 +7,7 @@ import pytest
 from click.shell_completion import ShellComplete
 
 from sfm_app.cli import commands, main
+from sfm_app.cli.commands import SCENES
 from sfm_app.cli.options import (
     SETTING_FLAGS,
     default_text,
@@ -16,7 +17,6 @@ from sfm_app.cli.options import (
     setting_value,
     settings_from_flags,
 )
-from sfm_app.demo import SCENES
 from sfm_app.errors import ConfigError
 from sfm_app.pipeline import NAMES
 from sfm_app.plugins import load_plugins

@@ -12,10 +12,10 @@ from click.testing import CliRunner
 
 from sfm_app.api import Run
 from sfm_app.cli import commands, main
+from sfm_app.cli.commands import SCENES
 from sfm_app.cli.outcome import demo_steps, outcome_lines, run_lines, run_steps, run_summary
 from sfm_app.cli.output import print_text
-from sfm_app.demo import SCENES
-from sfm_app.demo.result import DemoResult, demo_lines
+from sfm_app.demo import DemoResult, demo_lines
 from sfm_app.geometry.camera import camera_matrix, panorama_matrix
 from sfm_app.report.camera_text import contradiction_lines, intrinsics_lines, intrinsics_summary, refined_text
 from sfm_app.settings import Settings
@@ -339,7 +339,7 @@ def test_the_next_commands_depend_on_the_run():
     assert ["continue to the model" in line for line in run_steps(stopped, PHOTOS, None, best)] == [True]
 
 
-@pytest.mark.parametrize(("scene", "other"), [("courtyard", "statue"), ("statue", "facade")])
+@pytest.mark.parametrize(("scene", "other"), [("courtyard", "statue"), ("statue", "fisheye")])
 def test_after_a_demo_come_another_one_and_own_photos(scene, other):
     lines = demo_steps(MODEL, scene)
 

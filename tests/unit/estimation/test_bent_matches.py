@@ -12,7 +12,7 @@ from sfm_app.runtime.workspace import Workspace
 from sfm_app.selfcal import CalibratedCamera
 from sfm_app.settings import Settings
 from sfm_app.stages import view_graph
-from sfm_app.synthetic.lenses import Lens
+from sfm_app.synthetic.cameras import Lens
 from sfm_app.types import Calibration
 
 PHOTOS = (1, 2, 3, 4)

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.synthetic.scenes import build_scene, scene_views
 from sfm_app.orientation.camera_roll import TURN_COSTS, roll_hypotheses
 from sfm_app.orientation.up_cues import (
     brightness_normal_correlation,
@@ -16,7 +17,6 @@ from sfm_app.orientation.up_cues import (
 from sfm_app.orientation.up_direction import CUES, MAX_NATS, Cue, Scenery, odds, select_roll
 from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at, pixel_rays
 from sfm_app.synthetic.render import GAMMA, cast_rays, prepare, render_scene
-from sfm_app.synthetic.scenes.scene_catalog import build_scene, scene_views
 
 UP = np.array([0.0, 1.0, 0.0])
 VIEW_AXIS = np.array([0.0, 0.0, 1.0])

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.synthetic.matches import make_place, match_photos
 from sfm_app.geometry.epipolar import cross_matrix
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.posegraph import look_alikes as module
@@ -9,7 +10,6 @@ from sfm_app.posegraph.coverage import backbone
 from sfm_app.posegraph.graph import LOOKS_ALIKE
 from sfm_app.posegraph.look_alikes import find_look_alikes, group_doubted_pairs
 from sfm_app.synthetic.cameras import look_at
-from sfm_app.synthetic.scenes.look_alikes import make_place, match_photos
 from sfm_app.types import EpipolarFit, Intrinsics, ViewGraph
 
 

@@ -4,9 +4,7 @@ import pytest
 
 from sfm_app.synthetic.cameras import ArcOptions, Views, arc, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, write_photo_folder
-from sfm_app.synthetic.scenes.bodies import Body, SyntheticScene
-from sfm_app.synthetic.scenes.shapes import ball, box, ground
-from sfm_app.synthetic.scenes.textures import Material
+from sfm_app.synthetic.shapes import Body, Material, SyntheticScene, ball, box, ground
 
 
 @pytest.fixture(scope="session")

@@ -1,21 +1,23 @@
-from itertools import combinations
+"""Cameras, their lenses and their poses along an arc."""
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from benchmarks.synthetic.walks import orbit
 from sfm_app.errors import ConfigError
-from sfm_app.geometry.epipolar import fundamental_from_pose
 from sfm_app.synthetic.cameras import (
+    PROJECTIONS,
     ArcOptions,
+    Lens,
     arc,
     axis_rotation,
     camera_center,
     look_at,
     make_camera,
-    orbit,
-    panorama,
+    make_wide_camera,
+    panorama_camera,
     pixel_rays,
 )
 
@@ -121,41 +123,6 @@ def test_an_arc_is_no_orbit(seed):
     assert 0.1 < miss_of_axes(views).mean() < 1.0
 
 
-@pytest.mark.parametrize(("photos", "sweep_deg"), [(12, 80.0), (8, 360.0)])
-def test_in_an_orbit_all_axes_meet_at_one_distance(photos, sweep_deg):
-    aim = np.array([0.5, 1.0, -0.3])
-    views = orbit(make_camera(96, 64), photos, sweep_deg, distance=4.0, aim=tuple(aim))
-    poses = np.array(list(views.cam_from_world.values()))
-    centers = np.array([camera_center(pose) for pose in poses])
-
-    assert len(poses) == photos and miss_of_axes(views).max() < 1e-9
-    assert np.allclose(np.linalg.norm(centers - aim, axis=1), 4.0) and np.allclose(centers[:, 1], 1.0)
-    assert np.allclose(poses[:, 1, :3], [0, -1, 0]), "upright"
-    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
-    assert np.allclose(steps, 8.0 * np.sin(np.radians(sweep_deg / photos / 2)))
-
-
-def test_an_orbit_leaves_the_focal_undetermined():
-    """A wrong focal makes every pair essential as well; on an arc it does not."""
-    K = make_camera(96, 64, center=(0.5, 0.5)).K
-    wrong = K.copy()
-    wrong[0, 0] *= 1.3
-    wrong[1, 1] *= 1.3
-
-    def ratio(views):
-        poses = list(views.cam_from_world.values())
-        found = []
-        for first, second in combinations(poses[:5], 2):
-            R = second[:, :3] @ first[:, :3].T
-            F = fundamental_from_pose(K, K, R, second[:, 3] - R @ first[:, 3])
-            s = np.linalg.svd(wrong.T @ F @ wrong, compute_uv=False)
-            found.append(s[1] / s[0])
-        return min(found)
-
-    camera = make_camera(96, 64, center=(0.5, 0.5))
-    assert ratio(orbit(camera)) > 1 - 1e-9 > 0.99 > ratio(arc(camera))
-
-
 def test_photos_can_be_taken_with_another_camera():
     wide, tele = make_camera(96, 64), make_camera(96, 64, focal_widths=2.0)
     views = orbit(wide, 4).with_camera(tele, ["view_01.jpg", "view_03.jpg"])
@@ -164,12 +131,6 @@ def test_photos_can_be_taken_with_another_camera():
     assert list(views.cameras) == list(views.cam_from_world)
     with pytest.raises(ConfigError, match=r"no such photo: view_09\.jpg"):
         views.with_camera(tele, ["view_09.jpg"])
-
-
-@pytest.mark.parametrize("wrong", [{"photos": 1}, {"sweep_deg": 400.0}, {"distance": 0.0}])
-def test_impossible_orbits_are_refused(wrong):
-    with pytest.raises(ConfigError, match="orbit"):
-        orbit(make_camera(96, 64), **wrong)
 
 
 @pytest.mark.parametrize(
@@ -186,10 +147,75 @@ def test_impossible_cameras_are_refused():
         make_camera(960, 640, focal_widths=0.0)
 
 
-def test_a_panorama_is_taken_from_one_spot():
-    views = panorama(make_camera(96, 64), photos=5, step_deg=10.0, center=(1.0, 2.0, 3.0))
-    poses = list(views.cam_from_world.values())
-    turned = [np.degrees(np.arccos(np.clip(a[2, :3] @ b[2, :3], -1, 1))) for a, b in combinations(poses, 2)]
+WIDE = [name for name in PROJECTIONS if name not in ("perspective", "equirectangular")]
 
-    assert np.allclose([camera_center(pose) for pose in poses], [1.0, 2.0, 3.0])
-    assert 9.0 < min(turned) < 12.0 and 38.0 < max(turned) < 42.0
+
+def rays_at(theta, azimuth=0.3):
+    theta = np.asarray(theta, float)
+    return np.column_stack([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)])
+
+
+@pytest.mark.parametrize(
+    ("projection", "radius"),
+    [
+        ("perspective", np.tan),
+        ("stereographic", lambda theta: 2 * np.tan(theta / 2)),
+        ("equidistant", lambda theta: theta),
+        ("equisolid", lambda theta: 2 * np.sin(theta / 2)),
+    ],
+)
+def test_the_radius_is_that_of_the_projection(projection, radius):
+    theta = np.linspace(0.0, 1.5, 7)
+    points = Lens(projection).project(rays_at(theta))
+    np.testing.assert_allclose(np.hypot(*points.T), radius(theta), atol=1e-12)
+    np.testing.assert_allclose(np.arctan2(points[1:, 1], points[1:, 0]), 0.3, atol=1e-12)
+
+
+@given(
+    projection=st.sampled_from([name for name in PROJECTIONS if name != "equirectangular"]),
+    k1=st.floats(-0.05, 0.1), k2=st.floats(-0.005, 0.01), p=st.floats(-0.002, 0.002), theta=st.floats(0.0, 1.2),
+    azimuth=st.floats(-3.1, 3.1),
+)  # fmt: skip
+@settings(deadline=None)
+def test_a_ray_comes_back_through_the_lens(projection, k1, k2, p, theta, azimuth):
+    lens = Lens(projection, (k1, k2), (p, -p / 2))
+    ray = rays_at([theta], azimuth)
+    radii = np.hypot(*Lens(projection, (k1, k2)).project(rays_at(np.linspace(0.0, theta + 0.05, 200))).T)
+    assume((np.diff(radii) > 1e-6).all() or theta < 0.01)  # beyond its fold a lens has no inverse
+    back = lens.rays(lens.project(ray))[0]
+    np.testing.assert_allclose(back / np.linalg.norm(back), ray[0], atol=1e-10)
+
+
+def test_a_fisheye_sees_behind_itself_and_no_further_than_all_round():
+    lens = Lens("equidistant")
+    behind, beyond = lens.rays(np.array([[2.0, 0.0], [3.2, 0.0]]))
+    assert behind[2] < 0 and np.isnan(beyond).all()
+    assert np.isnan(Lens("equisolid").rays(np.array([[2.1, 0.0]]))).all()
+
+
+@pytest.mark.parametrize("projection", WIDE)
+@pytest.mark.parametrize("field_deg", [90.0, 150.0, 200.0])
+def test_the_field_of_view_is_what_was_asked_for(projection, field_deg):
+    camera = make_wide_camera(320, 240, field_deg, Lens(projection), center=(0.5, 0.5))
+    edge = camera.lens.rays(np.array([[160.0 / camera.K[0, 0], 0.0]]))[0]
+    assert np.degrees(np.arccos(edge[2])) == pytest.approx(field_deg / 2)
+
+
+def test_a_panorama_looks_all_round():
+    camera = panorama_camera(64)
+    rays = pixel_rays(camera).reshape(32, 64, 3)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=2), 1.0)
+    assert rays[16, 32] @ [0, 0, 1] > 0.99 and rays[16, 0] @ [0, 0, -1] > 0.99
+    assert rays[16, 48] @ [1, 0, 0] > 0.99 and rays[31, 5] @ [0, 1, 0] > 0.99
+    np.testing.assert_allclose(
+        camera.lens.rays(camera.lens.project(rays.reshape(-1, 3))), rays.reshape(-1, 3), atol=1e-12
+    )
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(ConfigError, match="unknown projection"):
+        Lens("pinhole")
+    with pytest.raises(ConfigError, match="folds within the photo"):
+        Lens(radial=(-0.3,)).rays(np.array([[1.5, 0.0]]))
+    with pytest.raises(ConfigError, match="out of range"):
+        make_wide_camera(320, 240, 180.0, Lens())

@@ -7,8 +7,7 @@ import pytest
 from PIL import Image
 
 from sfm_app.errors import ConfigError, InputError
-from sfm_app.synthetic.cameras import Camera, Views, make_camera
-from sfm_app.synthetic.lenses import Lens
+from sfm_app.synthetic.cameras import Camera, Lens, Views, make_camera
 from sfm_app.synthetic.photo_folder import (
     PhotoOptions,
     add_missing_photos,

@@ -1,16 +1,26 @@
+"""Photos of scenes, and pictures of models."""
+
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sfm_app.synthetic.cameras import Camera, camera_center, look_at, make_camera, pixel_rays
-from sfm_app.synthetic.lenses import Lens
-from sfm_app.synthetic.render import cast_rays, prepare, ray_caster, render_scene
-from sfm_app.synthetic.scenes.bodies import Body, SyntheticScene
-from sfm_app.synthetic.scenes.shapes import box
-from sfm_app.synthetic.scenes.textures import Material
-
-pytestmark = pytest.mark.slow
+from sfm_app.synthetic.cameras import Camera, Lens, camera_center, look_at, make_camera, pixel_rays
+from sfm_app.synthetic.render import (
+    cast_rays,
+    comparison_image,
+    orbited_pose,
+    prepare,
+    prepare_model,
+    ray_caster,
+    render_model,
+    render_rays,
+    render_scene,
+    render_shape,
+)
+from sfm_app.synthetic.shapes import Body, Material, SyntheticScene, box
+from sfm_app.types import Surface
+from sfm_app.types.model import Model, Texture
 
 
 @pytest.fixture(scope="module")
@@ -18,6 +28,7 @@ def prepared(still_life):
     return prepare(still_life)
 
 
+@pytest.mark.slow
 def test_two_views_show_the_same_surface_in_the_right_pixels(prepared, still_life, four_views):
     """What view 1 shows at a pixel, view 2 shows where the truth projects it to: half a pixel off would be noticed."""
     camera = make_camera(240, 160)
@@ -46,6 +57,7 @@ def test_two_views_show_the_same_surface_in_the_right_pixels(prepared, still_lif
     assert all(mismatch(dx, dy) > 1.2 * best for dx, dy in [(0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)])
 
 
+@pytest.mark.slow
 def test_a_pixel_is_seen_through_its_center():
     """A wall whose edges lie at x = 10.25 and 30.75, y = 4.25 and 15.75 pixels covers whole pixels by their centers."""
     white = Material(pattern="stone", base=(230, 230, 230), second=(230, 230, 230), joint=(230, 230, 230))
@@ -61,6 +73,7 @@ def test_a_pixel_is_seen_through_its_center():
     assert len(rows) == 21 * 12
 
 
+@pytest.mark.slow
 def test_the_sun_casts_a_shadow_away_from_it(prepared, still_life):
     sun = np.array(still_life.to_light)
     ball = np.array([0.0, 1.3, 0.0])
@@ -79,6 +92,7 @@ def test_the_sun_casts_a_shadow_away_from_it(prepared, still_life):
     assert darkened(shaded * [-2, 1, -2]) == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_the_sky_is_blue_and_darker_above(prepared):
     up = look_at(np.array([0.0, 5.0, 0.0]), np.array([0.0, 9.0, 9.0]))
     sky = render_scene(prepared, make_camera(60, 60), up)
@@ -86,6 +100,7 @@ def test_the_sky_is_blue_and_darker_above(prepared):
     assert sky[0].mean() < 0.9 * sky[-1].mean()
 
 
+@pytest.mark.slow
 def test_bodies_of_one_material_have_their_own_stains():
     white = Material(pattern="stone", base=(200, 200, 200), second=(100, 100, 100))
     twins = tuple(Body(box(1.0, 1.0, 1.0).move((x, 0.0, 0.0)), white) for x in (-0.5, 0.5))
@@ -96,6 +111,7 @@ def test_bodies_of_one_material_have_their_own_stains():
     assert left.std() > 0.01 and abs(np.corrcoef(left.ravel(), right.ravel())[0, 1]) < 0.5
 
 
+@pytest.mark.slow
 def test_rows_are_seen_from_poses_of_their_own(prepared, four_views):
     """The upper half of a frame whose lower rows are seen from elsewhere is that of the photo from the first pose."""
     camera = make_camera(60, 40)
@@ -109,15 +125,147 @@ def test_rows_are_seen_from_poses_of_their_own(prepared, four_views):
     assert np.abs(image[20:] - render_scene(prepared, camera, first)[20:]).mean() > 0.02
 
 
+@pytest.mark.slow
 def test_rendering_repeats_to_the_bit(prepared, four_views):
     pose = next(iter(four_views.cam_from_world.values()))
     camera = make_camera(60, 40)
     assert render_scene(prepared, camera, pose).tobytes() == render_scene(prepared, camera, pose).tobytes()
 
 
+@pytest.mark.slow
 def test_distortion_moves_the_rim_but_not_the_center(prepared, four_views):
     pose = next(iter(four_views.cam_from_world.values()))
     plain = make_camera(120, 80, center=(0.5, 0.5))
     barrel = Camera(plain.K, 120, 80, lens=Lens(radial=(-0.4,)))
     difference = np.abs(render_scene(prepared, plain, pose) - render_scene(prepared, barrel, pose)).mean(axis=2)
     assert difference[38:42, 58:62].mean() < 0.3 * difference[:, :10].mean()
+
+
+CAMERA = Camera(np.array([[20.0, 0, 20.0], [0, 20.0, 10.0], [0, 0, 1]]), 40, 20)
+STRAIGHT = np.eye(3, 4)
+SQUARE = np.array([[0.0, -0.5, 1.0], [1.0, -0.5, 1.0], [1.0, 0.5, 1.0], [0.0, 0.5, 1.0]])
+"""The right half of the picture, one unit in front."""
+FACES = np.array([[0, 3, 2], [0, 2, 1]])
+"""Counter-clockwise seen from the camera at the origin."""
+CORNER_UV = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+RED_TO_BLUE = np.array([[250, 0, 0], [250, 0, 0], [0, 0, 250], [0, 0, 250]], np.uint8)
+
+
+def square(faces=FACES, vertices=SQUARE):
+    return Surface(vertices, faces, RED_TO_BLUE)
+
+
+def textured(page, *, pages=1):
+    uv = CORNER_UV[FACES]
+    return Model(square(), Texture(uv, np.full(2, pages - 1, np.int32), (np.zeros_like(page),) * (pages - 1) + (page,)))
+
+
+@pytest.mark.slow
+def test_a_model_without_texture_has_the_colors_of_its_vertices():
+    picture = render_model(Model(square()), CAMERA, STRAIGHT)
+    assert np.array_equal(picture.covered, np.arange(40)[None, :].repeat(20, axis=0) >= 20)
+    share = (np.arange(20) + 0.5) / 20
+    assert np.allclose(picture.colors[:, 20:, 0], np.round(250 * (1 - share))[:, None], atol=1)
+    assert np.allclose(picture.colors[:, 20:, 2], np.round(250 * share)[:, None], atol=1)
+    assert not picture.colors[:, :20].any() and np.all(picture.with_background((1, 2, 3))[:, :20] == [1, 2, 3])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pages", [1, 3])
+def test_a_page_of_the_size_of_its_pixels_is_shown_texel_by_texel(pages):
+    """One texel per pixel: half a texel off, or an upside-down page, would be noticed."""
+    page = np.random.default_rng(0).integers(0, 256, (20, 20, 3)).astype(np.uint8)
+    picture = render_model(textured(page, pages=pages), CAMERA, STRAIGHT)
+    assert np.abs(picture.colors[:, 20:].astype(int) - page).max() <= 2
+    assert np.abs(picture.colors[:, 20:].astype(int) - np.roll(page, 1, axis=1)).mean() > 40
+
+
+@pytest.mark.slow
+def test_texels_are_mixed_between_their_centers_and_repeated_at_the_border():
+    page = np.zeros((1, 2, 3), np.uint8)
+    page[0, 1] = 200
+    row = render_model(textured(page), CAMERA, STRAIGHT).colors[10, 20:, 0].astype(float)
+    expected = 200 * np.clip(2 * (np.arange(20) + 0.5) / 20 - 0.5, 0, 1)
+    assert np.allclose(row, expected, atol=4), "the centers of the two texels lie at 1/4 and 3/4"
+
+
+@pytest.mark.slow
+def test_the_lens_bends_the_picture():
+    wide = Camera(np.array([[20.0, 0, 20.0], [0, 20.0, 10.0], [0, 0, 1]]), 40, 20, Lens(radial=(0.2,)))
+    far = square(vertices=SQUARE * [0.8, 0.5, 1.0])
+    plain, bent = (render_model(Model(far), camera, STRAIGHT).covered[10].sum() for camera in (CAMERA, wide))
+    # x = 0.8 (1 + 0.2 0.64) = 0.902, in pixels 18.05 instead of 16
+    assert (plain, bent) == (16, 18)
+
+
+@pytest.mark.slow
+def test_any_rays_give_the_picture_of_their_camera():
+    model = prepare_model(Model(square()))
+    x, y = np.meshgrid(np.arange(40) + 0.5, np.arange(20) + 0.5)
+    rays = np.stack([(x - 20) / 20, (y - 10) / 20, np.ones_like(x)], axis=-1)
+    same = render_rays(model, np.zeros(3), 3.0 * rays)
+    assert np.array_equal(same.colors, render_model(model, CAMERA, STRAIGHT).colors)
+
+
+@pytest.mark.slow
+def test_the_bare_shape_is_gray_outside_and_reddish_inside():
+    outside = render_shape(Model(square()), CAMERA, STRAIGHT)
+    inside = render_shape(Model(square(FACES[:, ::-1])), CAMERA, STRAIGHT)
+    assert np.array_equal(outside.covered, inside.covered)
+    gray, red = outside.colors[outside.covered], inside.colors[inside.covered]
+    assert np.all(gray[:, 0] == gray[:, 1]) and np.all(gray[:, 0] == gray[:, 2])
+    assert np.all(red[:, 0].astype(int) > red[:, 1].astype(int) + 20)
+
+
+@pytest.mark.slow
+def test_a_face_is_brighter_the_more_it_faces_the_lamp():
+    """The lamp is above on the left: faces that look down and right are in the dark, but not black."""
+    levels = []
+    for tilt in (-0.5, 0.0, 0.5):
+        tilted = SQUARE + np.array([0.0, 0.0, 1.0]) * (tilt * (SQUARE[:, :1] + SQUARE[:, 1:2]))
+        picture = render_shape(Model(square(vertices=tilted)), CAMERA, STRAIGHT)
+        levels.append(picture.colors[picture.covered].mean())
+    assert 205 * 0.25 < levels[2] < levels[1] - 40 and levels[1] + 20 < levels[0] < 206
+
+
+@pytest.mark.slow
+def test_a_model_without_triangles_is_not_seen():
+    empty = Model(Surface(np.zeros((3, 3)), np.zeros((0, 3), np.int64), np.zeros((3, 3), np.uint8)))
+    camera = make_camera(20, 16)
+    for picture in (render_model(empty, camera, STRAIGHT), render_shape(empty, camera, STRAIGHT)):
+        assert picture.colors.shape == (16, 20, 3) and not picture.covered.any()
+        assert np.all(picture.with_background() == 255)
+
+
+@pytest.mark.slow
+def test_beside_a_photo_stand_the_model_from_its_camera_from_aside_and_its_bare_shape():
+    camera = Camera(np.array([[20.0, 0, 40.0], [0, 20.0, 20.0], [0, 0, 1]]), 80, 40)
+    photo = np.full((80, 160, 3), (10, 200, 30), np.uint8)
+    page = comparison_image(photo, textured(np.full((8, 8, 3), (200, 40, 30), np.uint8)), camera, STRAIGHT)
+    views = {"photo": page[:40, :80], "model": page[:40, 80:], "aside": page[40:, :80], "shape": page[40:, 80:]}
+    seen = {name: np.any(view != 255, axis=2) for name, view in views.items()}
+
+    assert page.shape == (80, 160, 3) and page.dtype == np.uint8
+    assert np.all(views["photo"] == [10, 200, 30])
+    assert np.all(views["model"][10:30, 40:60] == [200, 40, 30]) and seen["model"].sum() == 20 * 20
+    # its right edge has come nearer: 20 cos 25 / (1 - sin 25) = 31 px from the left one, and 35 px high instead of 20
+    assert 700 < np.all(views["aside"] == [200, 40, 30], axis=2).sum() <= seen["aside"].sum() < 950
+    assert np.array_equal(seen["aside"], seen["shape"])
+    inner = views["shape"][np.all(views["aside"] == [200, 40, 30], axis=2)]
+    assert np.ptp(inner, axis=1).max() == 0 and 50 < inner.min() <= inner.max() < 206
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("angle_deg", [25.0, -90.0])
+def test_walking_around_keeps_height_distance_and_what_is_in_the_middle(angle_deg):
+    surface = Surface(np.random.default_rng(0).normal(size=(99, 3)), FACES, RED_TO_BLUE)
+    pose = look_at(np.array([1.0, 2.0, 6.0]), np.zeros(3))
+    walked = orbited_pose(pose, surface, angle_deg)
+    depth = np.median(surface.vertices @ pose[2, :3] + pose[2, 3])
+    middle = pose[:, :3].T @ (np.array([0.0, 0.0, depth]) - pose[:, 3])
+
+    assert walked[:, :3] @ middle + walked[:, 3] == pytest.approx([0.0, 0.0, depth])
+    before, after = camera_center(pose) - middle, camera_center(walked) - middle
+    assert after[1] == pytest.approx(before[1]) and np.linalg.norm(after) == pytest.approx(np.linalg.norm(before))
+    turned = before[[0, 2]] @ after[[0, 2]] / np.linalg.norm(before[[0, 2]]) ** 2
+    assert turned == pytest.approx(np.cos(np.radians(angle_deg)), abs=1e-9)

@@ -8,7 +8,7 @@ from sfm_app.photos.decode import UnreadableError, read_picture, upright_image
 from sfm_app.photos.panoramas.recognition import closes_around, is_panorama, read_panorama_entries
 from sfm_app.synthetic.cameras import Views, look_at, panorama_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
-from sfm_app.synthetic.scenes.scene_catalog import build_scene
+from sfm_app.synthetic.scenes import courtyard
 
 XMP = b"<x:xmpmeta xmlns:x='adobe:ns:meta/'><rdf:Description %s/></x:xmpmeta>"
 
@@ -18,7 +18,7 @@ def rendered(tmp_path_factory):
     """A panorama of the court."""
     folder = tmp_path_factory.mktemp("panorama")
     views = Views.from_poses(panorama_camera(512), [look_at(np.array([0.3, 1.6, 3.0]), np.array([1.0, 1.6, 0.0]))])
-    write_photo_folder(folder, build_scene("courtyard"), views, PhotoOptions(supersampling=1))
+    write_photo_folder(folder, courtyard(), views, PhotoOptions(supersampling=1))
     return Image.open(next(folder.glob("*.jpg"))).convert("RGB")
 
 

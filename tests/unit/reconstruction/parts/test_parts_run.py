@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.synthetic.matches import TownOptions, make_town_graph
 from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
 from sfm_app.colmap.models.model import poses_and_points
 from sfm_app.errors import BackendError, ClusterError
@@ -20,7 +21,6 @@ from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import SceneSettings, Settings
-from sfm_app.synthetic.town_graph import TownOptions, make_town_graph
 from sfm_app.types import Calibration, EpipolarFit, Intrinsics, LookAlikes
 
 PHOTOS, PART = 90, 30

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.common.metrics import pose_errors_deg
+from benchmarks.synthetic.walks import WalkOptions
 from benchmarks.videos.sequences import Kind, draw_sequence, map_sequence
 from benchmarks.videos.shutter import timed_matches
 from sfm_app.colmap.bundle import Adjustment, adjust
@@ -14,7 +15,6 @@ from sfm_app.colmap.models.model import posed_images
 from sfm_app.progress import SilentProgress
 from sfm_app.reconstruction.videos import rolling_shutter
 from sfm_app.reconstruction.videos.rolling_shutter import Readout, Unmeasured, follow_shutter
-from sfm_app.synthetic.trajectory import WalkOptions
 from sfm_app.types import MatchGraph
 
 pytestmark = pytest.mark.slow

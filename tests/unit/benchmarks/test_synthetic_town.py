@@ -1,3 +1,5 @@
+"""A town of streets and houses, and walks through it."""
+
 from collections import Counter, defaultdict
 from dataclasses import replace
 from itertools import pairwise
@@ -5,17 +7,27 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from benchmarks.synthetic.houses import DEPTH_M
+from benchmarks.synthetic.scenes import build_scene, scene_views
+from benchmarks.synthetic.town import (
+    BLOCK_M,
+    COPIES,
+    PITCH_M,
+    STREET_M,
+    HousePlace,
+    TownPhotos,
+    place_house,
+    plan_houses,
+    town,
+    town_of,
+    town_views,
+    walk_town,
+)
 from sfm_app.errors import ConfigError
 from sfm_app.synthetic import render
 from sfm_app.synthetic.cameras import camera_center, look_at, make_camera, pixel_rays
 from sfm_app.synthetic.render import cast_rays, prepare, ray_caster, render_scene
-from sfm_app.synthetic.scenes import town as town_module
-from sfm_app.synthetic.scenes.bodies import SyntheticScene
-from sfm_app.synthetic.scenes.scene_catalog import build_scene, scene_views
-from sfm_app.synthetic.scenes.town import COPIES, HousePlace, place_house, plan_houses, town
-from sfm_app.synthetic.town.houses import DEPTH_M
-from sfm_app.synthetic.town.photos import TownPhotos, town_of, town_views
-from sfm_app.synthetic.town_walk import BLOCK_M, PITCH_M, STREET_M, walk_town
+from sfm_app.synthetic.shapes import SyntheticScene
 
 PLACES = [
     HousePlace(7, 8.0, (False, False), (40.0 * k, 0.0, 5.0 * k), turn, (k, 0)) for k, turn in enumerate((0.0, 90.0))
@@ -126,13 +138,12 @@ def test_a_smaller_set_is_the_beginning_of_the_walk():
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_town(monkeypatch):
-    rows = town_module._rows(1)[:3]
-    monkeypatch.setattr(town_module, "_rows", lambda _: rows)
-    first, again, other = (town(1, seed=seed) for seed in (5, 5, 6))
+def test_the_same_seed_gives_the_same_town_which_is_as_large_as_the_walk(small_town):
+    assert walk_town(40, 1.2, 5).blocks == 2 and walk_town(1000, 1.5, 4).blocks == 3
+    first, again = town(2, 0.1, 5), town_of(TownPhotos(photos=40, look_alikes=0.1, seed=5))
     assert np.array_equal(first.vertices, again.vertices) and np.array_equal(first.faces, again.faces)
     assert [body.material for body in first.bodies] == [body.material for body in again.bodies]
-    assert first.vertices.shape != other.vertices.shape
+    assert first.vertices.shape != small_town.vertices.shape
 
 
 @pytest.mark.slow
@@ -167,11 +178,7 @@ def test_photos_of_the_town_have_detail(small_town, monkeypatch):
         assert np.mean(steps > 0.03) > 0.25 and 0.15 < levels.mean() < 0.75
 
 
-def test_towns_are_as_large_as_the_walk_and_options_are_checked(monkeypatch):
-    asked = []
-    monkeypatch.setattr("sfm_app.synthetic.town.photos.town", lambda *given: asked.append(given))
-    town_of(TownPhotos(photos=1000, step_m=1.5, look_alikes=0.2, seed=4))
-    assert asked == [(walk_town(1000, 1.5, 4).blocks, 0.2, 4)] and asked[0][0] == 3
+def test_impossible_towns_are_refused():
     with pytest.raises(ConfigError, match="photos, step_m or look_alikes"):
         TownPhotos(look_alikes=2.0)
     with pytest.raises(ConfigError, match="blocks or look_alikes"):

@@ -1,4 +1,4 @@
-"""Move a synthetic camera smoothly through time, and photograph with a shutter that reads one row after the other."""
+"""Walks past a wall, around and on one spot; smooth paths through time, and photos read row by row."""
 
 import math
 from dataclasses import dataclass
@@ -9,9 +9,107 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from sfm_app.errors import ConfigError
-from sfm_app.synthetic.cameras import Camera, look_at
+from sfm_app.synthetic.cameras import Camera, Views, look_at, stratified_samples
 
 FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WallWalkOptions:
+    """A hand-held walk along a wall that faces +z, each photo turned towards the middle by a random amount.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+
+    photos: int = 12
+    """>= 2."""
+    length: float = 8.0
+    """Length of the walk along x, in scene units, > 0."""
+    distance: tuple[float, float] = (5.0, 7.0)
+    """Range of z, in scene units."""
+    height: tuple[float, float] = (1.2, 2.2)
+    """Range of y, in scene units."""
+    aim: tuple[float, float] = (2.0, 3.2)
+    """Range of the height on the wall that the photos look at, in scene units."""
+    roll_deg: float = 5.0
+    """Largest roll either way, in degrees, [0, 180]."""
+
+    def __post_init__(self) -> None:
+        if self.photos < 2 or not (0 < self.length < math.inf and 0 <= self.roll_deg <= 180):
+            raise ConfigError("synthetic cameras: photos, length or roll_deg is out of range")
+
+
+def wall_walk(camera: Camera, options: WallWalkOptions | None = None, seed: int = 0) -> Views:
+    """Return hand-held photos along a wall in the plane z = 0, from left to right, named view_00.jpg and so on.
+
+    Args:
+        camera: of all photos.
+        options: the walk; the default one if None.
+        seed: same seed, same poses.
+    """
+    options = options or WallWalkOptions()
+    rng = np.random.default_rng([seed, 13])
+    count = options.photos
+    x = options.length * (np.arange(count) / (count - 1) - 0.5)
+    centers = np.column_stack(
+        [x, stratified_samples(options.height, count, rng), stratified_samples(options.distance, count, rng)]
+    )
+    # parallel axes would leave the focal length undetermined
+    aims = np.column_stack(
+        [x * stratified_samples((0.2, 0.9), count, rng), stratified_samples(options.aim, count, rng), np.zeros(count)]
+    )
+    roll_deg = stratified_samples((-options.roll_deg, options.roll_deg), count, rng)
+    return Views.from_poses(camera, [look_at(c, a, roll) for c, a, roll in zip(centers, aims, roll_deg, strict=True)])
+
+
+def orbit(
+    camera: Camera,
+    photos: int = 12,
+    sweep_deg: float = 80.0,
+    distance: float = 5.6,
+    aim: tuple[float, float, float] = (0.0, 1.3, -0.2),
+) -> Views:
+    """Place upright photos evenly on a level circle, all looking at its center; the focal length is undetermined.
+
+    Any two of the optical axes meet at the same distance from both cameras (isosceles), and then F does not
+    constrain the focal length (Sturm 2001); K is the same for all photos.
+
+    Args:
+        camera: takes all photos.
+        photos: >= 2.
+        sweep_deg: angle of the arc that the photos divide evenly, in degrees, (0, 360].
+        distance: radius of the circle, in scene units, > 0.
+        aim: the circle's center.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+    if photos < 2 or not (0 < sweep_deg <= 360 and 0 < distance < math.inf):
+        raise ConfigError("synthetic orbit: photos, sweep_deg or distance is out of range")
+    # steps of sweep / photos, so that at 360 degrees the last photo does not repeat the first
+    azimuth = np.radians(sweep_deg) * ((np.arange(photos) + 0.5) / photos - 0.5)
+    around = np.column_stack([np.sin(azimuth), np.zeros(photos), np.cos(azimuth)])
+    middle = np.array(aim)
+    return Views.from_poses(camera, [look_at(middle + distance * way, middle) for way in around])
+
+
+def panorama(
+    camera: Camera, photos: int = 6, step_deg: float = 12.0, center: tuple[float, float, float] = (0.0, 1.5, 4.5)
+) -> Views:
+    """Return photos from one spot, panning left to right with slight tilt and roll: they have no parallax.
+
+    Args:
+        camera: takes all photos.
+        photos: >= 2.
+        step_deg: angle from photo to photo, in degrees.
+        center: the spot, in scene units; the middle photo looks towards -z.
+    """
+    azimuth = np.radians(step_deg) * (np.arange(photos) - (photos - 1) / 2)
+    tilt, roll_deg = 0.05 * np.cos(np.pi * np.arange(photos)), 3.0 * np.sin(2.0 * np.arange(photos))
+    spot, ways = np.array(center), np.column_stack([np.sin(azimuth), tilt, -np.cos(azimuth)])
+    return Views.from_poses(camera, [look_at(spot, spot + way, roll) for way, roll in zip(ways, roll_deg, strict=True)])
+
 
 KNOTS_PER_S = 100.0
 """Knots of the splines: ten times the highest frequency of a hand."""

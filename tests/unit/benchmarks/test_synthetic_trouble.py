@@ -1,3 +1,5 @@
+"""Folders with random problems."""
+
 from dataclasses import replace
 from functools import cache
 
@@ -5,22 +7,22 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfm_app.errors import InputError
-from sfm_app.synthetic.cameras import Views, camera_center, make_camera, pixel_rays
-from sfm_app.synthetic.scenes.bodies import Body
-from sfm_app.synthetic.scenes.strewn import fade_colors, moving_thing, repeated_things
-from sfm_app.synthetic.trouble import (
+from benchmarks.synthetic.trouble import (
     KINDS,
     PHOTOS,
     apply_motion_blur,
     cam_from_thing,
+    fade_colors,
+    moving_thing,
+    repeated_things,
     troubled_folder,
     with_distortion,
     with_zoom,
     write_troubled_folder,
 )
-
-pytestmark = pytest.mark.slow
+from sfm_app.errors import InputError
+from sfm_app.synthetic.cameras import Views, camera_center, make_camera, pixel_rays
+from sfm_app.synthetic.shapes import Body
 
 
 @cache
@@ -54,6 +56,7 @@ def written(plan, folder):
     return photos
 
 
+@pytest.mark.slow
 def test_a_seed_is_a_folder():
     again = troubled_folder(17)
 
@@ -64,6 +67,7 @@ def test_a_seed_is_a_folder():
     assert np.array_equal(again.scene.vertices, plans()[17].scene.vertices)
 
 
+@pytest.mark.slow
 def test_every_trouble_comes_up_and_few_at_a_time():
     met = {kind for plan in plans() for kind in plan.troubles}
 
@@ -73,6 +77,7 @@ def test_every_trouble_comes_up_and_few_at_a_time():
     assert all(PHOTOS[0] <= len(plan.views.cameras) <= PHOTOS[1] for plan in plans())
 
 
+@pytest.mark.slow
 def test_cameras_are_those_of_the_trouble():
     for plan in plans():
         focals = {round(camera.K[0, 0], 6) for camera in plan.views.cameras.values()}
@@ -86,6 +91,7 @@ def test_cameras_are_those_of_the_trouble():
         pixel_rays(first)  # a lens that folds raises
 
 
+@pytest.mark.slow
 def test_a_way_straight_ahead_and_one_to_the_side():
     for walk, axis in (("forward", 2), ("sideways", 0)):
         plan = plan_with(walk)
@@ -96,6 +102,7 @@ def test_a_way_straight_ahead_and_one_to_the_side():
         assert (ahead @ [0.0, 0.0, -1.0]).min() > 0.98
 
 
+@pytest.mark.slow
 def test_a_lens_pushes_the_farthest_corner_by_what_is_asked_and_zooming_keeps_the_bend():
     camera = with_distortion(make_camera(640, 480, 1.0, center=(0.4, 0.55)), -0.08)
     corner = np.array([640.0, 0.0])
@@ -106,6 +113,7 @@ def test_a_lens_pushes_the_farthest_corner_by_what_is_asked_and_zooming_keeps_th
     assert with_zoom(camera, 2.0).K[1, 1] == 2 * camera.K[1, 1] and with_zoom(camera, 2.0).K[0, 2] == camera.K[0, 2]
 
 
+@pytest.mark.slow
 def test_motion_blur_smears_along_its_direction_and_keeps_the_light():
     image = np.zeros((31, 31, 3))
     image[15, 15] = 1.0
@@ -118,6 +126,7 @@ def test_motion_blur_smears_along_its_direction_and_keeps_the_light():
     assert np.array_equal(apply_motion_blur(image, 0.0, 1.0), image)
 
 
+@pytest.mark.slow
 def test_equal_things_are_equal_stain_by_stain():
     for body in repeated_things(np.random.default_rng(5)):
         half = len(body.shape.vertices) // 2
@@ -126,6 +135,7 @@ def test_equal_things_are_equal_stain_by_stain():
         assert np.array_equal(body.shape.texture[half:], body.shape.texture[:half])
 
 
+@pytest.mark.slow
 def test_what_moves_is_seen_elsewhere_and_the_rest_stays(tmp_path):
     plan = small(plan_with("moving object"), photos=1)
     name = "view_00.jpg"
@@ -146,6 +156,7 @@ def test_what_moves_is_seen_elsewhere_and_the_rest_stays(tmp_path):
     assert np.allclose(cam_from_thing(np.column_stack([R, t]), moving.spoiling.thing_at[name])[:, 3], R @ ahead + t)
 
 
+@pytest.mark.slow
 def test_faded_scenes_show_less(tmp_path):
     plan = small(plan_with("plane"), photos=1)
     plan = replace(plan, spoiling=replace(plan.spoiling, blur_px={}, defocus_px={}, thing=None))
@@ -156,6 +167,7 @@ def test_faded_scenes_show_less(tmp_path):
     assert np.abs(np.diff(poor, axis=1)).mean() < 0.6 * np.abs(np.diff(rich, axis=1)).mean()
 
 
+@pytest.mark.slow
 def test_the_folder_is_rendered_alike_twice_and_a_thing_stands_on_its_foot(tmp_path):
     plan = small(plan_with("motion blur"))
     write_troubled_folder(tmp_path / "a", plan)
@@ -168,6 +180,7 @@ def test_the_folder_is_rendered_alike_twice_and_a_thing_stands_on_its_foot(tmp_p
     assert all(isinstance(body, Body) for body in bodies) and min(b.shape.vertices[:, 1].min() for b in bodies) == 0.0
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_written_is_said(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write photos"):

@@ -1,10 +1,12 @@
+"""Matches without pictures: an object that moves by itself, and a walk through a town."""
+
 import numpy as np
 import pytest
 
+from benchmarks.synthetic.matches import LEAST_DEPARTURE_PX, TownOptions, make_town_graph, make_two_motions
 from sfm_app.errors import ConfigError
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.synthetic.correspondences import PairOptions
-from sfm_app.synthetic.two_motions import LEAST_DEPARTURE_PX, make_two_motions
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -55,3 +57,11 @@ def test_one_seed_one_scene():
 def test_the_still_scene_must_dominate(moving, outliers):
     with pytest.raises(ConfigError, match="share above 0 and below"):
         make_two_motions(PairOptions(outliers=outliers), moving, seed=0)
+
+
+def test_no_keypoint_has_two_matches_in_a_photo_and_some_matches_are_wrong():
+    town = make_town_graph(TownOptions(photos=40, neighbors=8, look_alikes=0.02), 0)
+
+    assert all(len(np.unique(rows[:, side])) == len(rows) for rows in town.matches.matches.values() for side in (0, 1))
+    right = np.concatenate([fit.inliers for pair, fit in town.views.fits.items() if pair not in town.look_alikes])
+    assert 0.65 < right.mean() < 0.85

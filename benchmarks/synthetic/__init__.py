@@ -1,0 +1,1 @@
+"""Scenes, walks and matches with known truth, for benchmarks and tests."""

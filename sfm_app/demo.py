@@ -1,0 +1,258 @@
+"""Demos: photos of a known scene are rendered, reconstructed and compared with the truth."""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from sfm_app.api import Run, reconstruct
+from sfm_app.errors import InputError
+from sfm_app.geometry.lenses.camera_models import calibration_from_model
+from sfm_app.progress import Progress
+from sfm_app.report.words import duration_text
+from sfm_app.runtime.parallel import worker_count
+from sfm_app.runtime.workspace import Workspace
+from sfm_app.settings import Settings
+from sfm_app.stages.texture import read_texture
+from sfm_app.synthetic.cameras import (
+    ArcOptions,
+    Camera,
+    Lens,
+    Views,
+    arc,
+    camera_center,
+    make_camera,
+    make_wide_camera,
+)
+from sfm_app.synthetic.compare import (
+    center_error_percent,
+    focal_error_percent,
+    surface_accuracy,
+    surface_coverage,
+    surface_error,
+)
+from sfm_app.synthetic.photo_folder import Truth, add_missing_photos, load_truth, save_truth
+from sfm_app.synthetic.render import comparison_image
+from sfm_app.synthetic.scenes import courtyard, statue, statue_views
+from sfm_app.synthetic.shapes import SyntheticScene
+from sfm_app.types import CameraModel, Model, Scene
+
+SIZE = (960, 640)
+"""Width and height of the photos of most scenes, in pixels: large enough for a good model, small enough to wait for."""
+WIDE_DEG = 150.0
+"""What the fisheye sees from left to right: 180 degrees from corner to corner, as fisheyes that fill the photo do."""
+CLOSE = (2.4, 3.6)
+"""Distance of the fisheye from the middle of the court: farther away, it shows little of it. Chosen by hand."""
+
+
+class DemoScene(NamedTuple):
+    """What is photographed, and from where."""
+
+    build: Callable[[], SyntheticScene]
+    views: Callable[[], Views]
+
+
+def fisheye_camera() -> Camera:
+    """Return a camera whose angles to the optical axis grow evenly with the distance from its center."""
+    return make_wide_camera(*SIZE, WIDE_DEG, Lens("equidistant"))
+
+
+SCENES: Mapping[str, DemoScene] = MappingProxyType({
+    "courtyard": DemoScene(courtyard, lambda: arc(make_camera(*SIZE))),
+    "statue": DemoScene(statue, lambda: statue_views(make_camera(*SIZE[::-1], focal_widths=1.35), photos=18)),
+    "fisheye": DemoScene(courtyard, lambda: arc(fisheye_camera(), ArcOptions(distance=CLOSE))),
+})  # fmt: skip
+"""By name. Sizes and numbers of photos are chosen so that each takes less than four minutes on two cores."""
+TRUTH = "truth.json"
+"""In OUT: which photos are rendered there, or will be."""
+
+
+@dataclass(frozen=True, slots=True)
+class DemoResult:
+    """How close the reconstruction of the demo scene came."""
+
+    photos: int
+    registered: int
+    true_K: list[list[float]]
+    found_K: list[list[float]]
+    """From the photos alone, before bundle adjustment."""
+    refined_K: list[list[float]]
+    focal_error_percent: float
+    refined_focal_error_percent: float
+    center_error_percent: float
+    refined_center_error_percent: float
+    surface_error_percent: float
+    """Median distance of the mesh to the true surface, in percent of the scene's size."""
+    surface_accuracy_percent: float
+    """Share of the mesh within 0.5 % of the scene's size of the true surface."""
+    surface_coverage_percent: float
+    """Share of what the photos see that the mesh covers within 1 % of the scene's size."""
+    triangles: int
+    pages_px: list[list[int]]
+    """Width and height of each page of texture."""
+    seconds_rendering: float
+    seconds_reconstruction: float
+    files: list[str]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return asdict(self)
+
+
+def run_demo(out: Path, scene: str, settings: Settings, progress: Progress) -> tuple[Run, DemoResult]:
+    """Render OUT/photos, reconstruct them into OUT/model, compare, and draw OUT/model.png.
+
+    Args:
+        out: output folder.
+        scene: one of `SCENES`.
+        settings: of the reconstruction.
+        progress: display.
+
+    Raises:
+        SfmError: see `sfm_app.errors`.
+    """
+    start = time.perf_counter()
+    truth = render_photos(out, scene, settings, progress)
+    rendered = time.perf_counter()
+    progress.finish_stage(rendered - start)
+    run = reconstruct(out / "photos", out / "model", settings, progress=progress)
+    done = time.perf_counter()
+    if run.scene is None or run.calibration is None:
+        raise InputError("the demo's reconstruction is incomplete", hint=f"remove {out} and try again")
+    progress.stage("comparing with the truth")
+    model = read_texture(Workspace(run.out))
+    draw(model, run.scene, out)
+    result = evaluate(run, run.scene, model, truth, (rendered - start, done - rendered), out)
+    progress.finish_stage(time.perf_counter() - done)
+    return run, result
+
+
+def render_photos(
+    out: Path, scene: str, settings: Settings, progress: Progress, scenes: Mapping[str, DemoScene] = SCENES
+) -> Truth:
+    """Return the ground truth of the photos in OUT/photos; those that are missing are rendered.
+
+    Args:
+        out: output folder.
+        scene: its name in `scenes`.
+        settings: `workers` processes render.
+        progress: display.
+        scenes: by name.
+
+    Raises:
+        InputError: the folder has photos of another scene.
+    """
+    demo = scenes[scene]
+    views, photos = demo.views(), out / "photos"
+    there = {path.name for path in photos.glob("*.jpg")}
+    progress.stage(f"rendering {len(views.cam_from_world)} photos: {scene}")
+    known = load_truth(out) if (out / TRUTH).exists() else None
+    is_known = known is not None and _is_of(known, views)
+    if there - set(views.cam_from_world) or (there and not is_known):
+        raise InputError(f"{photos} has other photos", hint="name another folder with -o, or remove this one")
+    if known is not None and is_known and there == set(views.cam_from_world):
+        return known
+    built = demo.build()
+    truth = Truth(dict(views.cameras), dict(views.cam_from_world), built.vertices, built.faces)
+    out.mkdir(parents=True, exist_ok=True)
+    save_truth(truth, out)  # first: it says what the photos are that a killed demo leaves
+    return add_missing_photos(photos, built, views, processes=worker_count(settings.workers), progress=progress)
+
+
+def _is_of(truth: Truth, views: Views) -> bool:
+    """Return whether the truth is that of these views."""
+    poses = views.cam_from_world
+    return truth.cam_from_world.keys() == poses.keys() and all(
+        np.allclose(truth.cam_from_world[name], pose)
+        and np.allclose(truth.cameras[name].K, views.cameras[name].K)
+        and truth.cameras[name].lens == views.cameras[name].lens
+        for name, pose in poses.items()
+    )
+
+
+def draw(model: Model, scene: Scene, out: Path) -> None:
+    """Draw OUT/model.png: a photo and the model from the same pose; below, the model from the side and from behind.
+
+    Args:
+        model: the finished model.
+        scene: cameras and poses of the photos.
+        out: output folder, which has the photos and gets the picture.
+    """
+    names = sorted(scene.cam_from_world)
+    name = names[len(names) // 2]
+    found = scene.cameras[scene.camera_of[name]]
+    photo = np.asarray(Image.open(out / "photos" / name).convert("RGB"))
+    Image.fromarray(comparison_image(photo, model, camera_of(found), scene.cam_from_world[name])).save(
+        out / "model.png"
+    )
+
+
+def camera_of(found: CameraModel) -> Camera:
+    """Return the camera through which a model looks as it does in the photo; of a fisheye with its lens."""
+    known = calibration_from_model(found.model, found.params, (found.width, found.height))
+    lens = Lens("equidistant", tuple(known.fisheye)) if known.projection == "fisheye" else Lens()
+    return Camera(found.K, found.width, found.height, lens)
+
+
+def evaluate(run: Run, scene: Scene, model: Model, truth: Truth, seconds: tuple[float, float], out: Path) -> DemoResult:
+    """Measure how close the reconstruction came to the ground truth.
+
+    Args:
+        run: the finished run.
+        scene: its cameras and poses.
+        model: its surface and texture.
+        truth: the rendered scene.
+        seconds: spent on rendering, and on the reconstruction.
+        out: output folder.
+    """
+    refined = next(iter(scene.cameras.values())).K
+    found = run.calibration.K if run.calibration else refined
+    centers = {name: camera_center(pose) for name, pose in scene.cam_from_world.items()}
+    surface, pages = model.surface, model.texture.pages if model.texture else ()
+    reports = [run.report_path] if run.report_path is not None else []
+    found_surface = surface.vertices, surface.faces, centers, truth
+    return DemoResult(
+        photos=len(truth.cam_from_world),
+        registered=len(scene.registered),
+        true_K=truth.K.tolist(),
+        found_K=found.tolist(),
+        refined_K=refined.tolist(),
+        focal_error_percent=round(focal_error_percent(found, truth), 3),
+        refined_focal_error_percent=round(focal_error_percent(refined, truth), 3),
+        center_error_percent=round(center_error_percent(found, truth), 3),
+        refined_center_error_percent=round(center_error_percent(refined, truth), 3),
+        surface_error_percent=round(100 * surface_error(*found_surface), 3),
+        surface_accuracy_percent=round(100 * surface_accuracy(*found_surface), 1),
+        surface_coverage_percent=round(100 * surface_coverage(*found_surface), 1),
+        triangles=len(surface.faces),
+        pages_px=[[page.shape[1], page.shape[0]] for page in pages],
+        seconds_rendering=round(seconds[0], 1),
+        seconds_reconstruction=round(seconds[1], 1),
+        files=[str(path) for path in (*reports, *sorted(run.out.glob("model.*")), out / "model.png")],
+    )
+
+
+def demo_lines(result: DemoResult) -> list[str]:
+    """Return the result as lines of text."""
+    placed = "all" if result.registered == result.photos else f"{result.registered} of"
+    seconds = result.seconds_reconstruction, result.seconds_rendering
+    shown = [path for path in result.files if path.endswith((".html", ".glb"))]
+    return [
+        f"camera      true   {k_text(result.true_K)}",
+        f"            found  {k_text(result.refined_K)}   {result.refined_focal_error_percent:.2g} % off",
+        f"mesh        of {placed} {result.photos} photos, {result.triangles:,} triangles: "
+        f"{result.surface_accuracy_percent} % within 0.5 % of the scene's size "
+        f"of the truth, {result.surface_coverage_percent} % of what the photos see",
+        f"took        {duration_text(seconds[0])}, and {duration_text(seconds[1])} to render the photos",
+        *(f"{'' if number else 'open':12}{path}" for number, path in enumerate(shown)),
+    ]
+
+
+def k_text(K: list[list[float]]) -> str:
+    """Return a camera matrix in one line."""
+    return f"fx {K[0][0]:7.2f}  fy {K[1][1]:7.2f}  cx {K[0][2]:7.2f}  cy {K[1][2]:7.2f}"

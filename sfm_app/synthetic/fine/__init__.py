@@ -1,1 +1,0 @@
-"""Scenes with real detail: ornaments, thin structures, rough ground; what smooth bodies say nothing about."""

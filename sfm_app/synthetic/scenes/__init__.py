@@ -1,1 +1,0 @@
-"""Define the synthetic scenes."""

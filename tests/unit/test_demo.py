@@ -1,0 +1,182 @@
+"""A demo renders its photos once, never mixes them with those of another scene, and says how close it came."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from sfm_app.cli.commands.making import SCENES as TEXTS
+
+from benchmarks.synthetic.scenes import poster
+from benchmarks.synthetic.walks import orbit
+from sfm_app.api import Run
+from sfm_app.cli.output import fold_lines
+from sfm_app.demo import SCENES, DemoScene, camera_of, demo_lines, draw, evaluate, render_photos
+from sfm_app.errors import InputError
+from sfm_app.geometry.camera import camera_matrix
+from sfm_app.progress import SilentProgress
+from sfm_app.settings import Settings
+from sfm_app.synthetic.cameras import make_camera
+from sfm_app.types import CameraModel, Model, Scene, Surface, Texture
+
+ONE_WORKER = Settings.from_mapping({"workers": 1})
+
+
+def small(sweep_deg=40.0, photos=3):
+    return DemoScene(poster, lambda: orbit(make_camera(48, 32), photos, sweep_deg))
+
+
+SMALL_SCENES = {"one": small(), "turned": small(60.0), "longer": small(40.0, 4)}
+
+
+class Stopping(SilentProgress):
+    """Stops as a person does, before the first photo."""
+
+    def start(self, *_):
+        raise KeyboardInterrupt
+
+
+def render(out, scene, progress=None):
+    return render_photos(out, scene, ONE_WORKER, progress or SilentProgress(), SMALL_SCENES)
+
+
+def changes(out):
+    return {path.name: path.stat().st_mtime_ns for path in (out / "photos").iterdir()}
+
+
+def test_photos_are_rendered_once(tmp_path):
+    truth = render(tmp_path, "one")
+    before = changes(tmp_path)
+    again = render(tmp_path, "one")
+
+    assert sorted(before) == sorted(truth.cam_from_world) == ["view_00.jpg", "view_01.jpg", "view_02.jpg"]
+    assert changes(tmp_path) == before
+    assert np.array_equal(again.vertices, truth.vertices) and np.array_equal(again.K, truth.K)
+
+
+def test_what_is_missing_is_rendered(tmp_path):
+    render(tmp_path, "one")
+    bytes_of_all = {path.name: path.read_bytes() for path in (tmp_path / "photos").iterdir()}
+    before = changes(tmp_path)
+    (tmp_path / "photos" / "view_01.jpg").unlink()
+    render(tmp_path, "one")
+
+    assert {name for name, when in changes(tmp_path).items() if when != before[name]} == {"view_01.jpg"}
+    assert {path.name: path.read_bytes() for path in (tmp_path / "photos").iterdir()} == bytes_of_all
+
+
+@pytest.mark.parametrize("other", ["turned", "longer"])
+def test_photos_of_another_scene_are_left_alone(tmp_path, other):
+    render(tmp_path, other)
+    before = changes(tmp_path)
+
+    with pytest.raises(InputError, match="has other photos"):
+        render(tmp_path, "one")
+    assert changes(tmp_path) == before
+
+
+def test_photos_without_a_truth_are_left_alone(tmp_path):
+    render(tmp_path, "one")
+    (tmp_path / "truth.json").unlink()
+
+    with pytest.raises(InputError, match="has other photos"):
+        render(tmp_path, "one")
+
+
+def test_the_truth_says_which_photos_a_killed_demo_has_begun(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        render(tmp_path, "one", Stopping())
+
+    assert len(json.loads((tmp_path / "truth.json").read_text(encoding="utf-8"))) > 0
+    assert len(render(tmp_path, "one").cam_from_world) == 3
+
+
+def test_a_fisheye_is_drawn_with_its_lens():
+    K = camera_matrix(366.0, 366.0, 480.0, 320.0)
+    wide = camera_of(CameraModel("OPENCV_FISHEYE", (366.0, 366.0, 480.0, 320.0, 0.01, 0, 0, 0), K, 960, 640))
+    plain = camera_of(CameraModel("OPENCV", (366.0, 366.0, 480.0, 320.0, 0.01, 0, 0, 0), K, 960, 640))
+
+    assert wide.lens.projection == "equidistant" and wide.lens.radial == (0.01, 0.0, 0.0, 0.0)
+    assert plain.lens.projection == "perspective"
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_a_scene_has_the_photos_that_its_text_says(name):
+    views = SCENES[name].views()
+
+    assert f", {len(views.cam_from_world)} photos " in TEXTS[name]
+    assert len({camera.K.tobytes() for camera in views.cameras.values()}) == 1
+    assert max(camera.width * camera.height for camera in views.cameras.values()) <= 960 * 640
+
+
+def test_every_scene_has_a_text():
+    assert tuple(SCENES) == tuple(TEXTS)
+
+
+@pytest.fixture(scope="module")
+def scene(rendered) -> Scene:
+    """The true cameras, but for 1 % of the focal."""
+    truth = rendered[1]
+    camera = truth.camera
+    K = camera.K * [[1.01, 1, 1], [1, 1.01, 1], [1, 1, 1]]
+    params = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    found = CameraModel("PINHOLE", params, K, camera.width, camera.height)
+    return Scene(
+        Path("sparse"), truth.cam_from_world, {}, {"one": found}, 0, 0, 0.0, dict.fromkeys(truth.cameras, "one")
+    )
+
+
+@pytest.fixture(scope="module")
+def model(rendered) -> Model:
+    """The true surface in red, on two pages."""
+    vertices, faces = rendered[1].vertices, rendered[1].faces
+    red = (200, 40, 30)
+    pages = np.full((20, 30, 3), red, np.uint8), np.full((16, 16, 3), red, np.uint8)
+    texture = Texture(np.full((len(faces), 3, 2), 0.5, np.float32), (np.arange(len(faces)) % 2).astype(np.int32), pages)
+    return Model(Surface(vertices, faces, np.zeros(vertices.shape, np.uint8)), texture)
+
+
+@pytest.mark.slow
+def test_what_was_found_is_set_beside_the_truth(rendered, scene, model, tmp_path):
+    truth = rendered[1]
+    run = Run(tmp_path, None, scene, None, None, {})
+    result = evaluate(run, scene, model, truth, (1.0, 2.0), tmp_path)
+
+    assert result.photos == result.registered == 7
+    assert result.refined_focal_error_percent == pytest.approx(1.0) and result.refined_center_error_percent == 0.0
+    assert result.surface_error_percent == 0.0
+    assert result.surface_accuracy_percent == result.surface_coverage_percent == 100.0
+    assert result.pages_px == [[30, 20], [16, 16]]
+    text = "\n".join(demo_lines(result))
+    assert f"mesh        of all 7 photos, {len(truth.faces):,} triangles: 100.0 % within 0.5 %" in text
+    assert "of the truth, 100.0 % of what the photos see" in text
+    assert re.search(r"found  fx .* 1 % off\n", text)
+    assert "took        2 s, and 1 s to render the photos" in text
+    assert max(len(line) for line in fold_lines(text.splitlines()) if str(tmp_path) not in line) <= 80
+
+
+@pytest.mark.slow
+def test_a_surface_partly_beside_the_truth_is_less_accurate(rendered, scene, model, tmp_path):
+    truth = rendered[1]
+    lifted = model.surface.vertices + np.array([0.0, 0.02 * np.linalg.norm(np.ptp(truth.vertices, axis=0)), 0.0])
+    beside = replace(model, surface=replace(model.surface, vertices=lifted), texture=None)
+    result = evaluate(Run(tmp_path, None, scene, None, None, {}), scene, beside, truth, (1.0, 2.0), tmp_path)
+
+    # walls slide along themselves, the ground rises
+    assert 5.0 < result.surface_accuracy_percent < 90.0
+    assert result.pages_px == []
+
+
+@pytest.mark.slow
+def test_the_picture_shows_a_photo_and_the_textured_model(rendered, scene, model, tmp_path):
+    (tmp_path / "photos").symlink_to(rendered[0])
+    draw(model, scene, tmp_path)
+
+    picture = np.asarray(Image.open(tmp_path / "model.png"))
+    photo = np.asarray(Image.open(rendered[0] / sorted(scene.cam_from_world)[3]))
+    assert picture.shape == (640, 960, 3)
+    assert np.array_equal(picture[:320, :480], photo)
+    assert 0.3 < np.all(picture[:320, 480:] == [200, 40, 30], axis=2).mean() <= 1.0
