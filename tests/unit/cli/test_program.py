@@ -172,3 +172,11 @@ def test_a_script_for_each_shell_calls_the_program(monkeypatch, shell):
 
 def test_no_script_for_another_shell():
     assert CliRunner().invoke(main, ["completion", "tcsh"]).exit_code == 2
+
+
+@pytest.mark.slow
+def test_a_warning_of_python_reaches_no_terminal():
+    code = "import warnings; from sfm_app.cli import main; main([], standalone_mode=False); warnings.warn('root of -1')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    assert "sfm-app run PHOTOS" in done.stdout and done.stderr == ""
