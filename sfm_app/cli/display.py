@@ -34,7 +34,7 @@ def run_summary(run: Run) -> dict[str, Any]:
         "seconds": {name: stage["seconds"] for name, stage in stages.items()},
     }
     if run.scene:
-        points = [str(path) for path in written_files(run, "scene")]
+        points = [str(path) for path in written_files(run, "scale")]
         summary["scene"] = {**scene_summary(run.scene, counts.get("scene", {})), "files": points}
     if "scale" in counts:
         summary["scale"] = counts["scale"]
@@ -65,7 +65,7 @@ def run_lines(run: Run) -> list[str]:
             lines += [f"            {text}" for text in contradiction_lines(stages.get(name, {}).get("counts", {}))]
     if run.scene:
         lines += scene_lines(run.scene, stages.get("scene", {}).get("counts", {}))
-        lines += [f"            points and cameras: {line}" for line in file_lines(written_files(run, "scene"))]
+        lines += [f"            points and cameras: {line}" for line in file_lines(written_files(run, "scale"))]
     if "scale" in summary:
         lines += scale_lines(summary["scale"])
     if run.mesh_path:

@@ -123,7 +123,7 @@ def _first_few(label: str, texts: list[str], what: str) -> Iterator[str]:
 
 def _place_lines(run: Run) -> Iterator[str]:
     """Yield the files to open."""
-    stage = "files" if run.mesh_path is not None else "scene"
+    stage = "files" if run.mesh_path is not None else "scale"
     paths = [*([run.report_path] if run.report_path else []), *written_files(run, stage)]
     for number, line in enumerate(file_lines(paths)):
         yield f"{'' if number else 'open':12}{line}"
