@@ -13,9 +13,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = "sfm_app"
 SMALL = 60
 """Lines below which a module is hardly a subject."""
-BRANCHES = (
-    ast.If, ast.IfExp, ast.For, ast.AsyncFor, ast.While, ast.ExceptHandler, ast.And, ast.Or, ast.comprehension, ast.match_case,
-)  # fmt: skip
+BRANCHES = (ast.If, ast.IfExp, ast.For, ast.While, ast.ExceptHandler, ast.comprehension, ast.match_case)
 
 
 def main() -> None:
@@ -94,7 +92,7 @@ def complexity(function: ast.FunctionDef) -> int:
 def _weight(node: ast.AST) -> int:
     if isinstance(node, ast.BoolOp):
         return len(node.values) - 1
-    return int(isinstance(node, BRANCHES) and not isinstance(node, ast.And | ast.Or))
+    return int(isinstance(node, BRANCHES))
 
 
 def count_numbers(tree: ast.Module) -> int:

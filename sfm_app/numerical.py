@@ -12,9 +12,9 @@ from sfm_app.errors import NumericalError
 Json: TypeAlias = "bool | int | float | str | Sequence[Json] | Mapping[str, Json] | None"
 """What JSON can hold."""
 
-FAILURES = (NumericalError, ArithmeticError, ValueError, IndexError)
-"""What our own computations raise on degenerate input: a singular matrix (NumPy's LinAlgError is a ValueError), a
-division by zero, the maximum of an empty array. Where a run can do without the result, it goes on."""
+FAILURES = (NumericalError, ArithmeticError, np.linalg.LinAlgError)
+"""Errors of computations on degenerate input: a singular matrix, a division by zero, points on a line. Where a run can
+do without the result, it goes on. ValueError and IndexError are no such errors: they are bugs, and end the run."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation, 1 / Phi^-1(3/4) (Rousseeuw and Leroy
 1987), with the digits that the thesis prints (5.7.2)."""

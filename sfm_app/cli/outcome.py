@@ -48,7 +48,7 @@ def run_summary(run: Run) -> dict[str, Any]:
         "seconds": {name: stage["seconds"] for name, stage in stages.items()},
     }
     if run.scene:
-        points = [str(path) for path in _model_files(run, "scene")]
+        points = [str(path) for path in _model_files(run, "scale")]
         summary["scene"] = {**scene_summary(run.scene, counts.get("scene", {})), "files": points}
     if "scale" in counts:
         summary["scale"] = counts["scale"]
@@ -78,7 +78,7 @@ def run_lines(run: Run) -> list[str]:
             lines += [f"{INDENT}{text}" for text in contradiction_lines(_counts(run, stage))]
     if run.scene:
         lines += scene_lines(run.scene, _counts(run, "scene"))
-        lines += [f"{INDENT}points and cameras: {line}" for line in file_lines(_model_files(run, "scene"))]
+        lines += [f"{INDENT}points and cameras: {line}" for line in file_lines(_model_files(run, "scale"))]
     if "scale" in summary:
         lines += scale_lines(summary["scale"])
     if run.mesh_path:
@@ -179,7 +179,7 @@ def _first_lines(label: str, texts: list[str], noun: str) -> Iterator[str]:
 
 def _file_lines(run: Run) -> Iterator[str]:
     """Yield the files to open."""
-    stage = "files" if run.mesh_path is not None else "scene"
+    stage = "files" if run.mesh_path is not None else "scale"
     paths = [*([run.report_path] if run.report_path else []), *_model_files(run, stage)]
     for number, line in enumerate(file_lines(paths)):
         yield f"{INDENT if number else 'open'.ljust(LABEL_COLUMNS)}{line}"

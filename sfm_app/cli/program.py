@@ -2,6 +2,7 @@
 
 import errno
 import gc
+import logging
 import os
 import shlex
 import sys
@@ -164,5 +165,6 @@ def fail(message: str, hint: str, code: int) -> None:
 def main(ctx: click.Context) -> None:
     """Turn a folder of uncalibrated photos, or a video, into a 3D model."""
     warnings.filterwarnings("ignore", module=r"PIL\b")  # the stage `photos` reports damaged photos itself
+    logging.captureWarnings(capture=True)  # log.txt has them: they tell a user nothing
     if ctx.invoked_subcommand is None:
         print_lines(WELCOME)

@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from sfm_app.runtime.context import RunContext
 
 logger = logging.getLogger("sfm_app")
+LOGGERS = (logger, logging.getLogger("py.warnings"))
+"""Those written to the log; the program sends warnings of Python to the second."""
 
 
 class LogFile(logging.FileHandler):
@@ -21,7 +23,8 @@ def log_to_file(run: RunContext) -> Iterator[None]:
     """Keep a log in the output folder, with the traceback of whatever ends the run."""
     handler = LogFile(run.workspace.log, encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
-    logger.addHandler(handler)
+    for each in LOGGERS:
+        each.addHandler(handler)
     logger.setLevel(logging.INFO)
     try:
         yield
@@ -29,5 +32,6 @@ def log_to_file(run: RunContext) -> Iterator[None]:
         logger.exception("the run ended here")
         raise
     finally:
-        logger.removeHandler(handler)
+        for each in LOGGERS:
+            each.removeHandler(handler)
         handler.close()

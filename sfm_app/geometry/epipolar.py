@@ -6,6 +6,8 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sfm_app.errors import NumericalError
+
 FloatArray = NDArray[np.float64]
 
 
@@ -37,15 +39,15 @@ def hartley_normalization(x: ArrayLike) -> FloatArray:
     """Return the (3, 3) similarity that puts the centroid at 0 and the mean distance from it at sqrt(2).
 
     Raises:
-        ValueError: no points, or all of them coincide.
+        NumericalError: no points, or all of them coincide.
     """
     points = to_homogeneous(x)[:, :2]
     if not len(points):
-        raise ValueError("no points to normalize")
+        raise NumericalError("no points to normalize")
     center = points.mean(axis=0)
     spread = float(np.hypot(*(points - center).T).mean())
     if not spread > 1e-9 * max(1.0, float(np.abs(center).max())):
-        raise ValueError("all points coincide")
+        raise NumericalError("all points coincide")
     scale = np.sqrt(2) / spread
     return np.array([[scale, 0, -scale * center[0]], [0, scale, -scale * center[1]], [0, 0, 1]])
 
@@ -62,11 +64,12 @@ def eight_point(x1: ArrayLike, x2: ArrayLike, weights: ArrayLike | None = None) 
         (3, 3), rank 2, Frobenius norm 1. If the matches do not determine F (all on one plane), one of the solutions.
 
     Raises:
-        ValueError: wrong shapes, fewer than 8 matches, or all points of a view coincide.
+        ValueError: wrong shapes.
+        NumericalError: fewer than 8 matches, or all points of a view coincide.
     """
     h1, h2 = homogeneous_pair(x1, x2)
     if len(h1) < 8:
-        raise ValueError(f"the 8-point algorithm needs 8 matches, got {len(h1)}")
+        raise NumericalError(f"the 8-point algorithm needs 8 matches, got {len(h1)}")
     T1, T2 = hartley_normalization(h1[:, :2]), hartley_normalization(h2[:, :2])
     h1, h2 = h1 @ T1.T, h2 @ T2.T
     design = (h2[:, :, None] * h1[:, None, :]).reshape(-1, 9)
@@ -88,12 +91,12 @@ def to_unit_norm(F: ArrayLike) -> FloatArray:
     """Return F with Frobenius norm 1 and its entry of largest magnitude positive.
 
     Raises:
-        ValueError: F is zero or not finite.
+        NumericalError: F is zero or not finite.
     """
     matrix = np.asarray(F, dtype=np.float64)
     norm = float(np.linalg.norm(matrix))
     if not (np.isfinite(norm) and norm > 0):
-        raise ValueError("F is zero or not finite")
+        raise NumericalError("F is zero or not finite")
     largest = matrix.flat[int(np.argmax(np.abs(matrix)))]
     return matrix / (norm if largest > 0 else -norm)
 
@@ -118,7 +121,7 @@ def canonical_cameras(F: ArrayLike) -> tuple[FloatArray, FloatArray]:
         P1, P2, both (3, 4), x1 ~ P1 X and x2 ~ P2 X.
 
     Raises:
-        ValueError: F is zero or not finite.
+        NumericalError: F is zero or not finite.
     """
     F = to_unit_norm(F)
     e1, e2 = epipoles(F)
@@ -143,7 +146,7 @@ def fundamental_from_pose(K1: ArrayLike, K2: ArrayLike, R: ArrayLike, t: ArrayLi
         t: (3,) translation, any length but zero.
 
     Raises:
-        ValueError: t is zero: without a baseline there is no epipolar geometry.
+        NumericalError: t is zero: without a baseline there is no epipolar geometry.
     """
     K1, K2, R = (np.asarray(m, dtype=np.float64) for m in (K1, K2, R))
     return to_unit_norm(np.linalg.inv(K2).T @ cross_matrix(t) @ R @ np.linalg.inv(K1))

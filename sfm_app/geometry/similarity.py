@@ -6,6 +6,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.errors import NumericalError
 from sfm_app.numerical import MAD_TO_SIGMA
 
 FloatArray = NDArray[np.float64]
@@ -66,7 +67,7 @@ def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
         b: (N, 3) points that they should map to, row by row; some may be wrong.
 
     Raises:
-        ValueError: fewer than 3 points, or all lie on a line.
+        NumericalError: fewer than 3 points, or all lie on a line.
     """
     count = len(a)
     triples = _triples(count)
@@ -80,7 +81,7 @@ def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
         if score < best:
             best, residual = score, distance
     if not np.isfinite(best):
-        raise ValueError("fewer than 3 points, or all on a line: they do not determine a rotation")
+        raise NumericalError("fewer than 3 points, or all on a line: they do not determine a rotation")
     agreeing = residual <= max(2.5 * MAD_TO_SIGMA * best, np.sort(residual)[2])
     return umeyama(a[agreeing], b[agreeing])
 

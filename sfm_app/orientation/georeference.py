@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.similarity import Similarity, robust_similarity
 from sfm_app.geometry.unit_vectors import perpendicular_basis
-from sfm_app.numerical import MAD_TO_SIGMA
+from sfm_app.numerical import FAILURES, MAD_TO_SIGMA
 from sfm_app.types import GpsPosition
 
 FloatArray = NDArray[np.float64]
@@ -226,7 +226,7 @@ def _up_from_positions(
         return None
     try:
         fit = robust_similarity(cameras, enu)
-    except ValueError:
+    except FAILURES:  # on a line
         return None
     moved = fit(cameras)
     narrow = np.sqrt(np.linalg.eigvalsh(np.cov(moved.T))[1])

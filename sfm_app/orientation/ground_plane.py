@@ -63,5 +63,6 @@ def _fit_plane(points: FloatArray, axis: FloatArray, share: float) -> Plane:
     spread = points - points.mean(axis=0)
     scatter = np.einsum("ni,nj->ij", spread, spread)
     small, middle, _ = np.linalg.eigvalsh(scatter)
-    deviation = np.degrees(np.arctan2(np.sqrt(small / len(points)), np.sqrt(max(middle, 1e-30))))
+    # rounding leaves the least eigenvalue of points on one plane below zero
+    deviation = np.degrees(np.arctan2(np.sqrt(max(small, 0.0) / len(points)), np.sqrt(max(middle, 1e-30))))
     return Plane(smallest_eigenvector(scatter, axis), share, float(deviation))

@@ -18,6 +18,7 @@ from sfm_app.colmap.models.joined_model import merge_models
 from sfm_app.colmap.models.model import points_by_keypoint, posed_photo_ids
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.geometry.similarity import robust_similarity
+from sfm_app.numerical import FAILURES
 from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, judge_model
 from sfm_app.reconstruction.model_split import sound_parts
 from sfm_app.runtime.context import RunContext
@@ -61,7 +62,7 @@ def _join_pair(
         return None
     try:
         similarity = robust_similarity(shared[:, 3:], shared[:, :3])
-    except ValueError:  # on a line
+    except FAILURES:  # on a line
         return None
     database: Path = run.workspace.database
     with translate_errors("joining two models"):

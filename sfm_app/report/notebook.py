@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from sfm_app.formats.frusta import center, scene_size
 from sfm_app.geometry.camera import camera_matrix
-from sfm_app.numerical import FAILURES
-from sfm_app.report.page.contents import RunContents
+from sfm_app.report.page.contents import UNREADABLE, RunContents
 from sfm_app.report.page.findings import glance
 from sfm_app.report.page.scene_view import view_points
 from sfm_app.scale import move_model
@@ -90,7 +89,7 @@ def _surface(contents: RunContents) -> Model | None:
         return None
     try:
         return move_model(texture.load(contents.run), contents.frame.from_model)
-    except (*FAILURES, OSError, KeyError):
+    except UNREADABLE:
         return None
 
 

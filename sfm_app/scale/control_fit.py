@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.similarity import Similarity, robust_similarity, umeyama
+from sfm_app.numerical import FAILURES
 from sfm_app.orientation.georeference import enu_m, position_from_enu
 from sfm_app.scale.sighted_points import SightedPoint
 from sfm_app.types import ControlPoint, ControlPoints, GpsPosition
@@ -60,7 +61,7 @@ def fit_control_points(given: ControlPoints, located: Mapping[str, SightedPoint]
     places = np.array([located[point.name].place for point in points])
     try:
         used = agreeing_points(places, targets)
-    except ValueError:
+    except FAILURES:
         return "the ground control points lie on a line: they do not determine which way is up"
     fit = umeyama(places[used], targets[used])
     off = np.linalg.norm(fit(places) - targets, axis=1)

@@ -18,12 +18,14 @@ from sfm_app.scale.evidence import GPS, ScaleEvidence, agree
 from sfm_app.scale.known_lengths import control_places, distance_evidence, marker_evidence
 from sfm_app.scale.metric_frame import MetricFrame, move_model
 from sfm_app.scale.photo_rays import PosedPhotos
-from sfm_app.stages.scene import POINTS
 from sfm_app.types import PhotoSet, Scene
+
+POINTS = "points"
+"""Name of the files with the points and cameras."""
 
 
 def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
-    """Find how large the scene is, and where, from all that is known of it; points and cameras are written again so.
+    """Find how large the scene is, and where, from all that is known of it; write its points and cameras in that frame.
 
     Nothing that is missing or contradictory ends the run: it is recorded, and the unit stays what it was.
 
@@ -32,12 +34,11 @@ def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
         scene: their poses.
         run: the run, with what the user knows.
     """
-    before = _earlier_frame(run.workspace)
     frame = find_frame(photos, scene, run)
     with replace_atomically(run.workspace.scale) as path:
         path.write_text(json_text(frame.to_dict()), encoding="utf-8", newline="\n")
-    if frame.changes or before.changes:
-        run.write_model(move_model(sparse_model(run.workspace.sparse), frame.from_model), POINTS)
+    points = sparse_model(run.workspace.sparse)
+    run.write_model(move_model(points, frame.from_model) if frame.changes else points, POINTS)
     return frame
 
 
@@ -147,11 +148,3 @@ def _agreed_frame(evidence: Sequence[ScaleEvidence], control: ControlFit | None,
         crs=control.crs,
         offset=control.offset,
     )
-
-
-def _earlier_frame(place: Workspace) -> MetricFrame:
-    """Return the frame in which points and cameras were written last."""
-    try:
-        return read_frame(place)
-    except (OSError, ValueError, KeyError, TypeError):  # none yet, or damaged
-        return MetricFrame()

@@ -10,7 +10,7 @@ from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_cle
 from sfm_app.colmap.backend import check_written, translate_errors
 from sfm_app.colmap.bundle import Adjustment, adjust_or_keep
 from sfm_app.colmap.models.model import color_points, posed_images, posed_photo_ids
-from sfm_app.colmap.models.stored_model import RefinedCamera, read_scene, sparse_model
+from sfm_app.colmap.models.stored_model import RefinedCamera, read_scene
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import ReconstructionError
 from sfm_app.estimation.camera_check import report_checks
@@ -30,9 +30,6 @@ from sfm_app.reconstruction.weak_scale import weakly_joined_parts
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import MAPPING, SubWorkspace, Workspace
 from sfm_app.types import Intrinsics, MatchGraph, Scene, ViewGraph
-
-POINTS = "points"
-"""Name of the files with the points and cameras."""
 
 
 def make(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Scene:
@@ -114,7 +111,6 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     turn_deg = None if run.settings.scene.photo_rotation_deg == "auto" else run.settings.scene.photo_rotation_deg
     orientations = [orient_or_keep(model, matches, looks, turn_deg) for model in models]
     write_models(models, run)
-    run.write_model(sparse_model(run.workspace.sparse), POINTS)
     members = [posed_photo_ids(model) for model in models]
     reasons = unregistered_reasons(set(members[0]), members[1:], matches, views, outcome.graph)
     scene = read_scene(run.workspace.sparse, names, reasons, refined_cameras(adjusted[0], names))

@@ -288,10 +288,10 @@ def test_calibrate_prints_json(rendered):
 
 
 def test_the_literal_methods_give_points_that_open(rendered, tmp_path):
-    """`--until scene` with the methods as they stand in print."""
+    """`--until scale` with the methods as they stand in print."""
     out = tmp_path / "out"
     literal = ["--estimator", "lev-ransac-thesis", "--calibrator", "zero-curves-thesis", "--set", "report=false"]
-    flags = ["-o", str(out), "--quality", "draft", *literal, "--until", "scene", "--json", "-q"]
+    flags = ["-o", str(out), "--quality", "draft", *literal, "--until", "scale", "--json", "-q"]
 
     result = CliRunner().invoke(main, ["run", str(rendered[0]), *flags])
 

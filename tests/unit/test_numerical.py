@@ -8,7 +8,7 @@ import pytest
 
 from sfm_app.colmap.backend import pycolmap, translate_errors
 from sfm_app.errors import BackendError, ConfigError, NumericalError
-from sfm_app.geometry.similarity import robust_similarity
+from sfm_app.geometry.similarity import umeyama
 from sfm_app.numerical import FAILURES, error_reason, finite_entries, json_text
 from sfm_app.runtime.manifest import Manifest, StageRecord
 from sfm_app.types import Calibration
@@ -20,10 +20,20 @@ OURS = {
     "division": lambda: 1.0 / (len([]) * 1.0),
     "the power of nothing": lambda: 0.0**-2.0,
     "overflow": lambda: 10.0**400,
+}
+BUGS = {
     "the quantile of nothing": lambda: np.quantile(np.zeros(0), 0.5),
     "the largest of nothing": lambda: np.ptp(np.zeros(0)),
-    "points on a line": lambda: robust_similarity(np.zeros((4, 3)), np.zeros((4, 3))),
+    "shapes that do not fit": lambda: umeyama(np.zeros((4, 3)), np.zeros((5, 3))),
 }
+
+
+@pytest.mark.parametrize("case", BUGS)
+def test_a_bug_of_ours_is_no_failed_computation(case):
+    with pytest.raises((ValueError, IndexError)) as caught, translate_errors("adjusting"):
+        BUGS[case]()
+
+    assert not isinstance(caught.value, FAILURES)
 
 
 @pytest.mark.parametrize("case", OURS)

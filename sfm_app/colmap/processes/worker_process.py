@@ -6,6 +6,7 @@ error like any other. The process ends with its parent, however that ends, so th
 
 import contextlib
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -242,6 +243,7 @@ def serve(work: Callable[[Task], None]) -> None:
     end_at_exit()
     os.dup2(sys.stdout.fileno(), REPORT_FD)
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # output of libraries must not mix with the reports
+    logging.captureWarnings(capture=True)  # -v shows what this process prints
     line = sys.stdin.readline()
     if not line:
         return

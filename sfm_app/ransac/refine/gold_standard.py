@@ -44,7 +44,7 @@ def refine_reprojection(
         (3, 3), rank 2, Frobenius norm 1.
 
     Raises:
-        ValueError: F is zero or not finite.
+        NumericalError: F is zero or not finite.
     """
     softness = 1.0 / (scale * scale)
     F = to_unit_norm(nearest_rank_two(to_unit_norm(F)))

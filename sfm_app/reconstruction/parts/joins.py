@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sfm_app.colmap.models.joined_model import PlacedPhotos
 from sfm_app.geometry.similarity import Similarity, robust_similarity
+from sfm_app.numerical import FAILURES
 from sfm_app.posegraph.pair_pose import is_in_front
 from sfm_app.posegraph.refine import pose_distances
 from sfm_app.types import MatchGraph, PairId, ViewGraph
@@ -180,7 +181,7 @@ class _SharedPhotos:
         chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), MOST_FITTED)).astype(np.int64)]
         try:
             return robust_similarity(self.Xb[chosen], self.Xa[chosen])
-        except ValueError:  # on a line
+        except FAILURES:  # on a line
             return similarity
 
 

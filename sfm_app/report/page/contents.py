@@ -7,7 +7,6 @@ from types import ModuleType
 from typing import Any, NamedTuple, TypeVar
 
 from sfm_app.errors import SfmError
-from sfm_app.numerical import FAILURES
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.manifest import PROBLEM
 from sfm_app.scale import MetricFrame
@@ -16,7 +15,7 @@ from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
 
 logger = logging.getLogger("sfm_app")
 
-UNREADABLE = (*FAILURES, SfmError, OSError, KeyError, TypeError)
+UNREADABLE = (SfmError, OSError, ArithmeticError, ValueError, LookupError, TypeError)
 """What reading damaged files raises."""
 Product = TypeVar("Product")
 

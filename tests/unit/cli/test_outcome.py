@@ -284,7 +284,12 @@ def test_model_files_stand_with_their_sizes_the_one_to_open_first(tmp_path):
     for name in ("model.ply", "model.glb", "points.glb"):
         (tmp_path / name).write_bytes(bytes(sizes[name]))
     counts = {
-        "scene": {"bytes": {name: sizes[name] for name in ("points.ply", "points.glb")}},
+        "scale": {
+            "bytes": {name: sizes[name] for name in ("points.ply", "points.glb")},
+            "unit": "arbitrary",
+            "contradictions": [],
+            "problems": [],
+        },
         "mesh": {"triangles": 7},
         "files": {
             "bytes": {name: sizes[name] for name in ("model.ply", "model.glb")},
@@ -298,8 +303,8 @@ def test_model_files_stand_with_their_sizes_the_one_to_open_first(tmp_path):
     lines = [line.strip() for line in run_lines(run)]
     start = lines.index("mesh        7 triangles, texture 4096 x 2048 and 512 x 512 px, JPEG quality 90")
     assert lines[start + 1 : start + 3] == [f"{tmp_path}/model.glb  4 kB", f"{tmp_path}/model.ply  2.3 MB"]
-    assert lines[start - 1] == f"points and cameras: {tmp_path}/points.glb  20 bytes"
-    assert lines[-1] == "seconds     scene 60.0, mesh 60.0, files 60.0; total 180.0"
+    assert lines[start - 2] == f"points and cameras: {tmp_path}/points.glb  20 bytes"
+    assert lines[-1] == "seconds     scale 60.0, mesh 60.0, files 60.0; total 180.0"
     summary = run_summary(run)
     assert [summary[part]["files"] for part in ("scene", "mesh")] == [
         [f"{tmp_path}/points.glb"],

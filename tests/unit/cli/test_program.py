@@ -404,3 +404,11 @@ def test_errors_fit_on_a_terminal(monkeypatch):
 
     check_text(text)
     assert len(re.findall(r"^(error|hint): ", text, re.MULTILINE)) == 2
+
+
+@pytest.mark.slow
+def test_a_warning_of_python_reaches_no_terminal():
+    code = "import warnings; from sfm_app.cli import main; main([], standalone_mode=False); warnings.warn('root of -1')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    assert "sfm-app run PHOTOS" in done.stdout and done.stderr == ""

@@ -213,7 +213,7 @@ def test_refined_with_photos_that_show_nothing_a_ball_stays_a_ball(dense, tmp_pa
 
 def test_a_refinement_that_fails_leaves_the_surface(dense, ball, tmp_path, monkeypatch):
     def fail(*_):
-        raise ValueError("a singular matrix")
+        raise np.linalg.LinAlgError("a singular matrix")
 
     monkeypatch.setattr(refining, "refine", fail)
 

@@ -51,7 +51,7 @@ def test_only_photos_that_take_part_are_partners(asked, tmp_path):
 
 def test_a_failure_is_a_reason(monkeypatch, tmp_path):
     def fail(*_):
-        raise ValueError("no depth")
+        raise np.linalg.LinAlgError("no depth")
 
     monkeypatch.setattr(Originals, "read", lambda *_: [])
     monkeypatch.setattr(refining, "refine", fail)

@@ -125,10 +125,6 @@ def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthe
     assert run.statistics["pairs_dropped"] == {"contradicts other pairs": 1}
     assert posed_photo_ids(pycolmap.Reconstruction(run.workspace.other_models / "1")) == [5, 6, 7]
 
-    assert list(run.statistics["bytes"]) == ["points.ply", "points.glb"]
-    for file, size in run.statistics["bytes"].items():
-        assert (run.workspace.root / file).stat().st_size == size > 1000
-
     again = scene.load(run)
     assert again.unregistered == found.unregistered and again.points == found.points
     assert all(np.array_equal(again.cam_from_world[key], value) for key, value in found.cam_from_world.items())

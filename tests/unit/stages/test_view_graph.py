@@ -104,3 +104,14 @@ def test_a_pair_on_which_an_estimator_fails_is_rejected_with_a_reason(build, mon
     graph, counts = build(match_graph())
 
     assert counts["rejected"] == {"the computation failed": 1} and list(graph.fits) == [(1, 2)]
+
+
+@pytest.mark.parametrize("error", [IndexError("out of bounds"), ValueError("shapes do not fit")])
+def test_a_bug_in_a_fit_ends_the_run(build, monkeypatch, error):
+    def failing(*_):
+        raise error
+
+    monkeypatch.setattr(fitting, "fit_moving", failing)
+
+    with pytest.raises(type(error), match=str(error)):
+        build(match_graph())

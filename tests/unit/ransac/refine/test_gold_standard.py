@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sfm_app.errors import NumericalError
 from sfm_app.geometry.distances import nearest_exact_matches, reprojection_distance, sampson_distance
 from sfm_app.geometry.epipolar import canonical_cameras, fundamental_from_pose, nearest_rank_two, to_homogeneous
 from sfm_app.ransac.points import prepare
@@ -180,5 +181,5 @@ def test_ten_thousand_matches_and_the_same_bytes_twice():
 
 @pytest.mark.parametrize("F", [np.zeros((3, 3)), np.full((3, 3), np.nan)])
 def test_no_start_is_refused(F):
-    with pytest.raises(ValueError, match="zero or not finite"):
+    with pytest.raises(NumericalError, match="zero or not finite"):
         refine_reprojection(CLOUD, F)
