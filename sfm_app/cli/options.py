@@ -39,19 +39,12 @@ def output_options(command: Command) -> Command:
     return click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")(command)
 
 
-def picture_option(command: Command) -> Command:
-    """Add --no-picture."""
-    return click.option("--no-picture", is_flag=True, help="Show no picture of the model at the end.")(command)
-
-
 def settings_from_flags(flags: Mapping[str, Any]) -> Settings:
     """Return settings from the shared options; flags override the file."""
     from sfm_app.colmap.backend import show_log  # loads COLMAP
 
     show_log(flags["verbose"])
     overrides: dict[str, Any] = {"plugins": False} if flags["no_plugins"] else {}
-    if flags.get("no_picture"):
-        overrides["picture"] = False
     for flag in SETTING_FLAGS:
         if (value := flags[flag.parameter]) not in (None, ()):
             overrides = merge_nested(overrides, flag.to_mapping(value))

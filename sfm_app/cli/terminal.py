@@ -189,28 +189,18 @@ class StepsColumn(ProgressColumn):
 
 
 class PaceColumn(ProgressColumn):
-    """The time that has passed and the time that is left, or what is waited for."""
+    """The time that has passed and the time that is left."""
 
     def render(self, task: Task) -> Text:
         """Return the text of a bar."""
         minutes, seconds = divmod(int(task.elapsed or 0.0), 60)
         passed = f"{minutes}:{seconds:02}"
-        if compiles():
-            return Text(f"{passed}, compiling, once")
         left = left_text(task)
         return Text(f"{passed}, {left}" if left else passed)
 
 
-def compiles() -> bool:
-    """Return whether this process waits for machine code; numba is not loaded for the answer."""
-    jit = sys.modules.get("sfm_app.jit")
-    return jit is not None and bool(jit.is_waiting())
-
-
 def progress_text(task: Task) -> str:
     """Return how far some work is, and how fast it goes."""
-    if compiles():
-        return "waits for kernels, compiled once on this machine"
     if not task.total:
         return f"goes on, {task.elapsed or 0.0:.0f} s so far"
     left = left_text(task)

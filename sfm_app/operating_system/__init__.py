@@ -32,13 +32,11 @@ from sfm_app.operating_system.processes import (
     keep_handler,
     watch_parent,
 )
-from sfm_app.operating_system.stand_ins import add_stand_ins
 
 __all__ = [
     "VARIABLE",
     "Ability",
     "ChildTimes",
-    "add_stand_ins",
     "cpu_seconds",
     "crash_name",
     "end_at_exit",

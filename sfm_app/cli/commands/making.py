@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 import sfm_app
-from sfm_app.cli.options import output_options, picture_option, settings_from_flags, settings_options
+from sfm_app.cli.options import output_options, settings_from_flags, settings_options
 from sfm_app.cli.output import print_json, print_lines, print_text
 from sfm_app.cli.stage_titles import STAGE_TITLES
 from sfm_app.demo import COURTYARD, SCENES
@@ -32,7 +32,6 @@ STAGES = tuple(STAGE_TITLES)
     "--until", "last", type=click.Choice(STAGES), metavar="STAGE", default="files", help="Stop after this stage."
 )
 @settings_options
-@picture_option
 @output_options
 def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: Any) -> None:
     """Reconstruct PHOTOS, a folder or a video: camera, poses and a mesh as OUT/model.ply and OUT/model.glb.
@@ -41,7 +40,6 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: A
     """
     from sfm_app.cli.display import run_lines, run_summary
     from sfm_app.cli.ending.next_steps import run_steps
-    from sfm_app.cli.ending.picture import print_picture
     from sfm_app.cli.outcome import outcome_lines
     from sfm_app.cli.terminal import Terminal
 
@@ -53,7 +51,6 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: A
         print_json(run_summary(done))
         return
     took_s = monotonic() - start
-    print_picture(done, settings, quiet=flags["quiet"])
     print_text(run_lines(done) if flags["verbose"] else outcome_lines(done, took_s))
     print_lines(run_steps(done, photos, out, settings, quiet=flags["quiet"]))
 
@@ -102,13 +99,11 @@ def calibrate(photos: Path, out: Path | None, figure: Path | None, **flags: Any)
     help="Open the report in the browser.  [default: on a terminal that has one]",
 )
 @settings_options
-@picture_option
 @output_options
 def demo(out: Path | None, scene: str, opens: bool | None, **flags: Any) -> None:
     """Render photos of a known scene, reconstruct them and print the errors."""
     from sfm_app.cli.browser import open_report
     from sfm_app.cli.ending.next_steps import demo_steps
-    from sfm_app.cli.ending.picture import print_picture
     from sfm_app.cli.terminal import Terminal
     from sfm_app.demo.result import demo_lines
     from sfm_app.demo.running import run_demo
@@ -120,7 +115,6 @@ def demo(out: Path | None, scene: str, opens: bool | None, **flags: Any) -> None
     if flags["as_json"]:
         print_json(result.to_dict())
     else:
-        print_picture(run, settings, quiet=quiet)
         print_text(demo_lines(result))
         print_lines(demo_steps(run, scene, quiet=quiet))
     open_report(run.report_path, opens, quiet=quiet or flags["as_json"])

@@ -129,7 +129,7 @@ def offered(*typed):
         (("demo", "--scene", ""), list(SCENES)),
         (("run", "--mapper", "i"), ["incremental"]),
         (("completion", ""), list(SHELLS)),
-        (("run", "--no-pi"), ["--no-picture"]),
+        (("run", "--no-pl"), ["--no-plugins"]),
     ],
 )
 def test_names_are_completed(typed, expected):

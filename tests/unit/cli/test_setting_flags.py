@@ -76,12 +76,11 @@ def test_a_flag_changes_its_setting_and_no_other(flag):
 
 def test_no_flag_changes_nothing():
     assert settings_from_flags(flags()) == Settings()
-    assert settings_from_flags(flags(no_picture=True)) == Settings.from_mapping({"picture": False})
     assert not settings_from_flags(flags(no_plugins=True)).plugins
 
 
 def test_every_flag_of_a_command_that_takes_settings_is_known():
-    shared = set(PARAMETERS) - {"photos", "out", "first", "last", "no_picture", "as_json", "quiet"}
+    shared = set(PARAMETERS) - {"photos", "out", "first", "last", "as_json", "quiet"}
     assert shared == {flag.parameter for flag in SETTING_FLAGS} | {"config", "no_plugins", "assignments", "verbose"}
 
 

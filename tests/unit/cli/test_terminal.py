@@ -2,7 +2,6 @@
 
 import io
 import re
-import sys
 
 import pytest
 from rich.console import Console
@@ -103,18 +102,6 @@ def test_work_that_cannot_be_measured_is_named(shown, clock):
 
     assert paper.getvalue().splitlines()[1].strip() == "adjusting: goes on, 36 s so far"
     assert display.bars.tasks[0].total is None  # a bar at 0/1 stands still
-
-
-def test_who_waits_for_kernels_says_so(shown, clock, monkeypatch):
-    display, paper = shown
-    monkeypatch.setattr(sys.modules["sfm_app.jit"]._Waiting, "threads", {1})
-    display.stage("view_graph")
-    display.start("epipolar geometry", 10)
-    for now in (5.0, 36.0):
-        clock[0] = now
-        display.look()
-
-    assert paper.getvalue().splitlines()[1].strip().endswith("waits for kernels, compiled once on this machine")
 
 
 def test_what_is_said_stands_below_the_title_in_80_columns(shown):
