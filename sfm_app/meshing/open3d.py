@@ -1,12 +1,12 @@
 """Import of Open3D, which is slow, logs much, and needs libraries that minimal Linux systems lack."""
 
-import ctypes
 import functools
 import importlib
 import re
 from typing import Any
 
 from sfm_app.errors import SfmError
+from sfm_app.operating_system import load_libusb
 
 PACKAGES = {
     "libEGL.so.1": "libegl1",
@@ -29,23 +29,13 @@ def load_open3d() -> Any:
     Raises:
         SfmError: the system lacks a library.
     """
-    _load_libusb()
+    load_libusb()
     try:
         open3d = importlib.import_module("open3d")
     except (ImportError, OSError) as err:
         raise SfmError(f"Open3D cannot be loaded: {err}", hint=_hint(str(err))) from err
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     return open3d
-
-
-def _load_libusb() -> None:
-    """Load the libusb of a wheel, to which Open3D links; only on Linux the wheel is a dependency."""
-    try:
-        import libusb_package
-    except ImportError:
-        return
-    if (path := libusb_package.get_library_path()) is not None:
-        ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
 
 
 def _hint(message: str) -> str:

@@ -11,7 +11,7 @@ from sfm_app.operating_system.files import (
     replace_file,
     share_bytes,
 )
-from sfm_app.operating_system.libraries import find_in_wheel
+from sfm_app.operating_system.libraries import find_in_wheel, load_libusb
 from sfm_app.operating_system.machine import (
     ChildTimes,
     cpu_seconds,
@@ -52,6 +52,7 @@ __all__ = [
     "keep_handler",
     "lacks",
     "link_or_copy",
+    "load_libusb",
     "machine_memory_mb",
     "missing_abilities",
     "move",
