@@ -1,25 +1,29 @@
 """How numeric kernels are compiled to machine code, in one place.
 
-Kernels release the GIL, so pairs run in parallel threads, and their machine code is cached beside the source, so
+Kernels release the GIL, so pairs run in parallel threads, and their machine code is cached beside the source, so that
 only the first run on a machine compiles.
 """
 
-import threading
-import time
+import os
 from collections.abc import Callable
-from typing import Any, ClassVar, TypeVar, cast
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, TypeVar, cast
 
 import numba
+from llvmlite.binding import get_host_cpu_name
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-ASKED_FOR: dict[tuple[str, tuple[Any, ...]], None] = {}
-"""Full names of the kernels that this process has looked for, with the types of their arguments, in order."""
-POLL_S = 0.05
-"""Seconds between two looks for a kernel that another process compiles. Chosen by hand."""
-
-IsAwaited = Callable[[str, Any], bool]
-"""Says of the name of a kernel and the types of its arguments whether another process is about to compile it."""
+HERE, HOME = Path(__file__).parent, Path(os.path.expanduser("~/.cache/sfm-app"))  # noqa: PTH111 - there may be no home
+CACHE = Path(
+    numba.config.CACHE_DIR or (HERE / "__pycache__" if os.access(HERE, os.W_OK) else HOME),
+    f"kernels-{version('sfm-app')}",
+)
+"""Folder of the compiled kernels of this version. Numba checks the file of a kernel, but not those of the kernels that
+it calls, and cannot read what refers to a class that is gone: an upgrade would fail, or run old code."""
+WARM = CACHE / f"warm-{numba.__version__}-{numba.config.CPU_NAME or get_host_cpu_name()}"
+"""Exists where the kernels of a run are compiled for this processor, see `engine.warm_up`."""
 
 
 def kernel(function: Function) -> Function:
@@ -35,69 +39,12 @@ def summing_kernel(function: Function) -> Function:
     return _compile(function, fastmath={"reassoc", "nsz"})
 
 
-def wait_where(is_awaited: IsAwaited | None) -> None:
-    """Let kernels be waited for where another process is about to compile them.
-
-    Args:
-        is_awaited: asked again and again while a kernel is not in the cache, and may raise; None for not waiting any
-            more.
-    """
-    _Waiting.is_awaited = is_awaited
-
-
-def is_waiting() -> bool:
-    """Return whether a thread of this process waits for a kernel that another process compiles."""
-    return bool(_Waiting.threads)
-
-
-class _Waiting:
-    is_awaited: IsAwaited | None = None
-    threads: ClassVar[set[int]] = set()
-    """Those that wait now."""
-
-
 def _compile(function: Function, *, fastmath: bool | set[str]) -> Function:
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": fastmath, "no_cfunc_wrapper": True}
+    before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(CACHE)
     try:
-        compiled: Function = numba.njit(cache=True, **options)(function)
+        return cast(Function, numba.njit(cache=True, **options)(function))
     except RuntimeError:  # no folder for the cache is writable: compile in every process
         return cast(Function, numba.njit(**options)(function))
-    name = f"{function.__module__}.{function.__qualname__}"
-    _forget_unreadable_cache(compiled)
-    _wait_for_others(name, compiled)
-    return compiled
-
-
-def _forget_unreadable_cache(compiled: Any) -> None:
-    """Let a kernel be recompiled where its cache refers to classes that no longer exist, as after an upgrade."""
-    cache_file = compiled._cache._cache_file
-    load = cache_file._load_index
-
-    def load_or_forget() -> dict[Any, Any]:
-        try:
-            return cast("dict[Any, Any]", load())
-        except (AttributeError, ImportError):
-            return {}
-
-    cache_file._load_index = load_or_forget
-
-
-def _wait_for_others(name: str, compiled: Any) -> None:
-    """Let a kernel be read from the cache as soon as another process has compiled it."""
-    load = compiled._cache.load_overload
-
-    def load_or_wait(signature: Any, target: Any) -> Any:
-        ASKED_FOR[name, tuple(signature)] = None
-        found, ask = load(signature, target), _Waiting.is_awaited
-        if found is not None or ask is None:
-            return found
-        _Waiting.threads.add(threading.get_ident())
-        try:
-            while found is None and ask(name, signature):
-                time.sleep(POLL_S)
-                found = load(signature, target)
-        finally:
-            _Waiting.threads.discard(threading.get_ident())
-        return found
-
-    compiled._cache.load_overload = load_or_wait
+    finally:
+        numba.config.CACHE_DIR = before

@@ -42,7 +42,6 @@ VIEW_GRAPH: Stage[ViewGraph] = Stage(
     make=lambda given, run: view_graph.make(given[MATCH_GRAPH], run),
     load=lambda _, run: view_graph.load(run),
     digest=view_graph.digest,
-    kernels=("pairs", "cameras"),
     grows=True,
 )
 INTRINSICS: Stage[Intrinsics] = Stage(
@@ -53,7 +52,6 @@ INTRINSICS: Stage[Intrinsics] = Stage(
     make=lambda given, run: intrinsics.make(given[MATCH_GRAPH], given[VIEW_GRAPH], run),
     load=lambda _, run: intrinsics.load(run),
     digest=intrinsics.digest,
-    kernels=("pairs", "cameras"),
     grows=True,
 )
 SCENE: Stage[Scene] = Stage(
@@ -64,7 +62,6 @@ SCENE: Stage[Scene] = Stage(
     make=lambda given, run: scene.make(given[MATCH_GRAPH], given[VIEW_GRAPH], given[INTRINSICS], run),
     load=lambda _, run: scene.load(run),
     digest=scene.digest,
-    kernels=("pairs", "cameras"),
     grows=True,
 )
 SCALE: Stage[MetricFrame] = Stage(
@@ -84,7 +81,6 @@ DEPTH_MAPS: Stage[Path] = Stage(
     make=lambda given, run: depth_maps.make(given[SCENE], run),
     load=lambda _, run: depth_maps.load(run),
     digest=depth_maps.digest,
-    kernels=("surface",),
 )
 MESH: Stage[Surface] = Stage(
     name="mesh",
@@ -94,7 +90,6 @@ MESH: Stage[Surface] = Stage(
     make=lambda given, run: mesh.make(given[SCENE], given[DEPTH_MAPS], run),
     load=lambda _, run: mesh.load(run),
     digest=mesh.digest,
-    kernels=("surface",),
 )
 TEXTURE: Stage[Model] = Stage(
     name="texture",
@@ -104,7 +99,6 @@ TEXTURE: Stage[Model] = Stage(
     make=lambda given, run: texture.make(given[SCENE], given[MESH], run),
     load=lambda _, run: texture.load(run),
     digest=texture.digest,
-    kernels=("surface",),
 )
 FILES: Stage[tuple[Path, ...]] = Stage(
     name="files",

@@ -1,7 +1,6 @@
 """Whole runs: from photos to a mesh, or to a camera, and finished ones read again."""
 
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,19 +41,18 @@ def reconstruct(
         (7, 'model.glb')
     """
     from sfm_app import pipeline  # loads COLMAP, which an estimator alone does not need
-    from sfm_app.report.page import EarlyFigures, finish_report
+    from sfm_app.report.page import finish_report
 
     with open_run(Path(out), settings or Settings(), progress) as run:
         run.plugins.depth_method(run.settings.depth.method)  # fail now, not halfway through the work
         wanted = (pipeline.INTRINSICS, pipeline.SCENE, pipeline.FILES)
-        early = EarlyFigures(run)
         try:
-            products = pipeline.run_stages(Path(photos), replace(run, begins=early.begin), first, last, wanted)
+            products = pipeline.run_stages(Path(photos), run, first, last, wanted)
         except SfmError as err:
-            if written := finish_report(run, err, early):
+            if written := finish_report(run, err):
                 run.progress.say(f"what was found until then: {written}")
             raise
-        return _as_run(run, products, last, finish_report(run, early=early))
+        return _as_run(run, products, last, finish_report(run))
 
 
 def read_run(out: PathLike) -> Run:

@@ -14,7 +14,6 @@ from sfm_app.cli.options import (
     complete_methods,
     json_option,
     output_options,
-    picture_option,
     setting_field,
     settings_from_flags,
     settings_options,
@@ -54,7 +53,6 @@ SHELLS = ("bash", "zsh", "fish")
     "--until", "last", type=click.Choice(STAGES), metavar="STAGE", default="files", help="Stop after this stage."
 )
 @settings_options
-@picture_option
 @output_options
 def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: Any) -> None:
     """Reconstruct PHOTOS, a folder or a video: cameras, poses and a textured mesh.
@@ -62,7 +60,6 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: A
     The mesh is OUT/model.ply and OUT/model.glb. An interrupted run resumes: stages with up-to-date results in OUT are
     skipped.
     """
-    from sfm_app.cli.ending.picture import print_picture
     from sfm_app.cli.outcome import outcome_lines, run_lines, run_steps, run_summary
     from sfm_app.cli.terminal import Terminal
 
@@ -74,7 +71,6 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: A
         print_json(run_summary(result))
         return
     seconds = monotonic() - start_s
-    print_picture(result, settings, quiet=quiet)
     print_text(run_lines(result) if flags["verbose"] else outcome_lines(result, seconds))
     if not quiet and sys.stdout.isatty():
         print_lines(run_steps(result, photos, out, settings))
@@ -157,11 +153,9 @@ def markers(side: str, target: Path, family: str, first: int, paper: str) -> Non
     "--open/--no-open", "opens", default=None, help="Open the report in the browser.  [default: only on a terminal]"
 )
 @settings_options
-@picture_option
 @output_options
 def demo(out: Path | None, scene: str, opens: bool | None, **flags: Any) -> None:
     """Render photos of a known scene, reconstruct them and print the errors."""
-    from sfm_app.cli.ending.picture import print_picture
     from sfm_app.cli.outcome import demo_steps
     from sfm_app.cli.terminal import Terminal
     from sfm_app.demo import demo_lines, run_demo
@@ -174,7 +168,6 @@ def demo(out: Path | None, scene: str, opens: bool | None, **flags: Any) -> None
     if flags["as_json"]:
         print_json(result.to_dict())
     else:
-        print_picture(run, settings, quiet=quiet)
         print_text(demo_lines(result))
         if interactive:
             print_lines(demo_steps(run, scene))

@@ -45,8 +45,8 @@ def _depth_maps() -> str:
 def _open3d() -> str:
     try:
         return f"works, {load_open3d().__version__}"
-    except (ImportError, OSError) as err:
-        return f"does not load: {err}"
+    except SfmError as err:
+        return f"{err}; {err.hint}"
 
 
 def _plugins() -> str:

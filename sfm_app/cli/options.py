@@ -101,11 +101,6 @@ def json_option(command: Command) -> Command:
     return click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")(command)
 
 
-def picture_option(command: Command) -> Command:
-    """Add --no-picture."""
-    return click.option("--no-picture", is_flag=True, help="Show no picture of the model at the end.")(command)
-
-
 def setting_option(flag: SettingFlag) -> Callable[[Command], Command]:
     """Return the click option of a setting; without the flag its value is None, or empty for several words."""
     kind: Any = setting_field(flag.setting).annotation
@@ -187,8 +182,6 @@ def settings_from_flags(flags: Mapping[str, Any]) -> Settings:
 
     show_log(flags["verbose"])
     overrides: dict[str, Any] = {"plugins": False} if flags["no_plugins"] else {}
-    if flags.get("no_picture"):
-        overrides["picture"] = False
     for flag in SETTING_FLAGS:
         if (value := flags[flag.parameter]) not in (None, ()):
             overrides = merge_nested(overrides, flag.to_mapping(value))

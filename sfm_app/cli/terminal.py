@@ -190,28 +190,18 @@ class StepsColumn(ProgressColumn):
 
 
 class TimeColumn(ProgressColumn):
-    """Elapsed time and time left, or that kernels are compiled."""
+    """Elapsed time and time left."""
 
     def render(self, task: Task) -> Text:
         """Return the text of a bar."""
         minutes, seconds = divmod(int(task.elapsed or 0.0), 60)
         elapsed = f"{minutes}:{seconds:02}"
-        if is_compiling():
-            return Text(f"{elapsed}, compiling, once")
         remaining = remaining_text(task)
         return Text(f"{elapsed}, {remaining}" if remaining else elapsed)
 
 
-def is_compiling() -> bool:
-    """Return whether this process waits for machine code, without an import of numba."""
-    jit = sys.modules.get("sfm_app.jit")
-    return jit is not None and bool(jit.is_waiting())
-
-
 def progress_text(task: Task) -> str:
     """Return the steps done and the time left, or the elapsed time."""
-    if is_compiling():
-        return "compiling kernels, once on this machine"
     if not task.total:
         return f"{task.elapsed or 0.0:.0f} s so far"
     remaining = remaining_text(task)

@@ -1,9 +1,8 @@
 """The loop that runs stages: it skips what is up to date, redoes what is damaged and records everything."""
 
 import logging
-import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -19,10 +18,10 @@ from sfm_app.engine.staleness import (
     stage_fingerprint,
 )
 from sfm_app.engine.usage import measure_usage
+from sfm_app.engine.warm_up import warming_up
 from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError
 from sfm_app.hashing import fingerprint
 from sfm_app.photos import Source
-from sfm_app.runtime.compiling import PARTS, compiling_ahead
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import choose_plan
 from sfm_app.runtime.earlier import Earlier
@@ -113,8 +112,6 @@ class _Execution:
     products: Products = field(init=False)
     earlier: Earlier | None = None
     """What stages may go on from."""
-    has_ended: threading.Event = field(default_factory=threading.Event)
-    """Set where a stage fails: no worker waits for kernels any longer."""
 
     def __post_init__(self) -> None:
         self.products = Products(self.run, self.source)
@@ -133,8 +130,7 @@ class _Execution:
         self.earlier = self.find_earlier(reasons)
         reasons = spread_reasons(later, reasons, (photos.name,) if self.first == photos.name else ())
         ahead = [name for name, again in reasons.items() if again is not None]
-        kernels = [part for part in PARTS if any(part in stage.kernels for stage in later if stage.name in ahead)]
-        with compiling_ahead(kernels, self.run.progress) as self.has_ended:
+        with warming_up(self.run.progress) if ahead else nullcontext():
             run = _limit_workers(self.products[photos], ahead, self.run)
             for stage in later:
                 self.run_stage(stage, reasons[stage.name], run)
@@ -173,7 +169,6 @@ class _Execution:
         run.progress.stage(stage.name, f"again: {again}" if again else "")
         logger.info("%s begins%s", stage.name, f" again: {again}" if again else "")
         run = self.stage_context(stage, run)
-        run.begins(stage.name)
         with measure_usage(partial(cpu_seconds_elsewhere, run.executor)) as used:
             product = self.make_product(stage, run)
         self.products.keep(stage, product)
@@ -216,7 +211,6 @@ class _Execution:
             try:
                 yield own
             except BaseException:
-                self.has_ended.set()  # else workers that wait for kernels hold it up
                 own.executor.shutdown(wait=False, cancel_futures=True)
                 raise
 

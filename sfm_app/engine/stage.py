@@ -32,8 +32,6 @@ class Stage(Generic[Product_co]):
     """Hashes what `load` reads; checked before anything is read, because COLMAP hangs or ends on damaged files."""
     grows: bool = False
     """Whether `make` can go on from what it made of other photos, see `runtime.earlier`."""
-    kernels: tuple[str, ...] = ()
-    """The parts of `runtime.compiling`'s list of kernels that it needs."""
 
     @property
     def depends_on(self) -> frozenset[str]:

@@ -11,7 +11,7 @@ from sfm_app.operating_system.files import (
     replace_file,
     share_bytes,
 )
-from sfm_app.operating_system.libraries import find_in_wheel
+from sfm_app.operating_system.libraries import find_in_wheel, load_libusb
 from sfm_app.operating_system.machine import (
     ChildTimes,
     cpu_seconds,
@@ -32,13 +32,11 @@ from sfm_app.operating_system.processes import (
     keep_handler,
     watch_parent,
 )
-from sfm_app.operating_system.stand_ins import add_stand_ins
 
 __all__ = [
     "VARIABLE",
     "Ability",
     "ChildTimes",
-    "add_stand_ins",
     "cpu_seconds",
     "crash_name",
     "end_at_exit",
@@ -54,6 +52,7 @@ __all__ = [
     "keep_handler",
     "lacks",
     "link_or_copy",
+    "load_libusb",
     "machine_memory_mb",
     "missing_abilities",
     "move",

@@ -20,3 +20,13 @@ def find_in_wheel(package: Path, project: str, name: str) -> Iterator[ctypes.CDL
     for folder in (package.parent / f"{project}.libs", package / ".dylibs"):  # Linux, macOS
         for file in folder.glob(f"{name}*"):
             yield ctypes.CDLL(str(file))
+
+
+def load_libusb() -> None:
+    """Load the libusb of a wheel, to which Open3D links; only on Linux the wheel is a dependency."""
+    try:
+        import libusb_package
+    except ImportError:
+        return
+    if (path := libusb_package.get_library_path()) is not None:
+        ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)

@@ -47,8 +47,6 @@ class RunContext:
     """Ground control points that the user knows."""
     earlier: Earlier | None = None
     """What the stage may go on from: files of a run with other photos; None where everything is done afresh."""
-    begins: Callable[[str], None] = field(default=lambda _: None)
-    """Called with the name of each stage that begins."""
     statistics: dict[str, Any] = field(default_factory=dict)
     """What the stage has counted so far, for the manifest; no part of a product is read from here."""
 

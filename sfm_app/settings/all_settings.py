@@ -40,9 +40,6 @@ class Settings(Section):
     )
     plugins: bool = Field(True, description="load installed plug-ins; false: only the program's own methods")
     report: bool = Field(True, description="write OUT/report.html at the end of every run; false: do not")
-    picture: bool = Field(
-        True, description="show a picture of the model at the end of a run, on terminals that can; false: do not"
-    )
     photos: PhotoSettings = PhotoSettings()
     matching: MatchSettings = MatchSettings()
     epipolar: EpipolarSettings = EpipolarSettings()

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
@@ -13,9 +12,7 @@ import sfm_app
 from sfm_app.api import open_run
 from sfm_app.cli import main
 from sfm_app.errors import InputError
-from sfm_app.pipeline import run_stages
-from sfm_app.report.page import REPORT, EarlyFigures, write_report
-from sfm_app.report.page.contents import read_contents
+from sfm_app.report.page import REPORT
 from sfm_app.report.view.resources import read_resources
 from sfm_app.settings import Settings
 
@@ -155,26 +152,6 @@ def test_a_run_that_changes_nothing_leaves_it_alone_and_the_command_makes_it_aga
 
     assert said.exit_code == 0 and REPORT in said.output
     assert (mapped.out / REPORT).stat().st_mtime_ns > before
-
-
-def test_figures_that_were_drawn_early_give_the_same_page(mapped):
-    with open_run(mapped.out, DRAFT, None) as run:
-        late = write_report(run).read_bytes()
-        early = EarlyFigures(run)
-        early.begin("mesh")
-        written = write_report(run, early=early)
-
-        assert early.take(read_contents(run)) is not None
-        assert written.read_bytes() == late and late.count(b"data:image/png;base64,") >= 4
-
-
-def test_stages_that_begin_are_told_and_those_up_to_date_are_not(rendered, tmp_path):
-    begun = []
-    with open_run(tmp_path / "out", DRAFT, None) as run:
-        for _ in range(2):
-            run_stages(rendered[0], replace(run, begins=begun.append), last="photos")
-
-    assert begun == ["photos"]
 
 
 def test_a_damaged_model_is_left_out_and_not_given_to_colmap(mapped, tmp_path, monkeypatch):

@@ -12,13 +12,14 @@ import jinja2
 from markupsafe import Markup
 
 from sfm_app.atomic_io import replace_atomically
+from sfm_app.colmap.figures.observations import ModelFigures, model_figures
 from sfm_app.errors import SfmError
 from sfm_app.numerical import Json, json_text
 from sfm_app.report.page import findings
-from sfm_app.report.page.contents import RunContents, read_contents
+from sfm_app.report.page.contents import UNREADABLE, RunContents, read_contents
 from sfm_app.report.page.correlations import correlation_text
 from sfm_app.report.page.depth_pictures import depth_pictures
-from sfm_app.report.page.early_figures import DrawnFigures, EarlyFigures
+from sfm_app.report.page.page_figures import page_figures
 from sfm_app.report.page.photo_rows import LEFT_OUT, PLACED, PhotoRow, embedded_pictures, photo_names, photo_rows
 from sfm_app.report.page.scene_view import embedded_view
 from sfm_app.report.page.three_script import three_script
@@ -31,13 +32,12 @@ REPORT = "report.html"
 ASSETS = Path(__file__).parent / "assets"
 
 
-def finish_report(run: RunContext, problem: SfmError | None = None, early: EarlyFigures | None = None) -> Path | None:
+def finish_report(run: RunContext, problem: SfmError | None = None) -> Path | None:
     """Note how a run ended, and write its report; no failure in it ends the run.
 
     Args:
         run: with its output folder.
         problem: that ended the run; None where it went to its end.
-        early: figures that were drawn while it went on; None for none.
 
     Returns:
         The report; None where there is none: no run has begun in the folder, or another one is at work in it.
@@ -53,29 +53,27 @@ def finish_report(run: RunContext, problem: SfmError | None = None, early: Early
             if problem is None and _is_up_to_date(place):
                 return place.root / REPORT
             run.progress.say(f"writing {REPORT}")
-            return write_report(run, early=early)
+            return write_report(run)
     except Exception as err:  # a run does not fail for its report
         logger.info("no report", exc_info=err)
         run.progress.say(f"there is no report of this run: {err}")
         return None
 
 
-def write_report(run: RunContext, beside_run: RunContext | None = None, early: EarlyFigures | None = None) -> Path:
+def write_report(run: RunContext, beside_run: RunContext | None = None) -> Path:
     """Write OUT/report.html from what the finished stages of a run have left, and return its path.
 
     Args:
         run: with its output folder.
         beside_run: another run to compare it with; None for none.
-        early: figures that may have been drawn already; None for none.
 
     Raises:
         InputError: a folder holds no run.
     """
     contents, other = read_run(run), read_run(beside_run) if beside_run is not None else None
     path = run.workspace.root / REPORT
-    drawn = early.take(contents) if early is not None else None
     with replace_atomically(path) as beside:
-        beside.write_text(render_page(contents, embed_parts(contents), other, drawn), encoding="utf-8", newline="\n")
+        beside.write_text(render_page(contents, embed_parts(contents), other), encoding="utf-8", newline="\n")
     return path
 
 
@@ -123,19 +121,16 @@ def read_run(run: RunContext) -> RunContents:
     return read_contents(run)
 
 
-def render_page(
-    contents: RunContents, parts: LargeParts, other: RunContents | None = None, drawn: DrawnFigures | None = None
-) -> str:
+def render_page(contents: RunContents, parts: LargeParts, other: RunContents | None = None) -> str:
     """Return the page as HTML.
 
     Args:
         contents: of the run.
         parts: pictures and view of this run.
         other: what another run has left, to compare it with.
-        drawn: its figures; None for drawing them now.
     """
-    drawn = drawn or DrawnFigures.draw(contents)
-    rows = photo_rows(contents, drawn.model, parts.pictures)
+    model = _read_model(contents)
+    rows = photo_rows(contents, model, parts.pictures)
     view = parts.view
     warnings, others = findings.remarks(contents)
     return _environment().get_template("page.html.jinja").render(
@@ -153,13 +148,24 @@ def render_page(
         changed=findings.changed_settings(contents),
         settings=json.dumps(contents.manifest.get("settings", {}), indent=1),
         versions=contents.manifest.get("versions", {}),
-        figures=drawn.figures,
+        figures=page_figures(contents, model),
         depths=depth_pictures(contents),
         view=view is not None and bool(three_script()),
         served=parts.is_served,
         data=script_data({"view": view, "photos": [_photo_data(row) for row in rows]}),
         three=Markup(three_script()),  # noqa: S704 - a script of an installed package, without user text
     )  # fmt: skip
+
+
+def _read_model(contents: RunContents) -> ModelFigures | None:
+    """Return None where there is no model, or it cannot be read."""
+    if contents.scene is None:
+        return None
+    try:
+        return model_figures(contents.scene.model_dir)
+    except UNREADABLE as err:
+        logger.info("the report has no figures of the model", exc_info=err)
+        return None
 
 
 def headline(contents: RunContents, rows: Sequence[PhotoRow]) -> str:

@@ -86,12 +86,11 @@ def test_a_flag_changes_its_setting_and_no_other(flag):
 
 def test_no_flag_changes_nothing():
     assert settings_from_flags(flags()) == Settings()
-    assert settings_from_flags(flags(no_picture=True)) == Settings.from_mapping({"picture": False})
     assert not settings_from_flags(flags(no_plugins=True)).plugins
 
 
 def test_run_has_every_flag():
-    shared = set(PARAMETERS) - {"photos", "out", "first", "last", "no_picture", "as_json", "quiet"}
+    shared = set(PARAMETERS) - {"photos", "out", "first", "last", "as_json", "quiet"}
     assert shared == {flag.parameter for flag in SETTING_FLAGS} | {"config", "no_plugins", "assignments", "verbose"}
 
 
@@ -122,7 +121,7 @@ def completions(*words):
         (("demo", "--scene", ""), list(SCENES)),
         (("run", "--mapper", "i"), ["incremental"]),
         (("completion", ""), list(commands.SHELLS)),
-        (("run", "--no-pi"), ["--no-picture"]),
+        (("run", "--no-pl"), ["--no-plugins"]),
     ],
 )
 def test_commands_choices_and_flags_are_completed(words, expected):

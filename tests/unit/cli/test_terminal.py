@@ -2,7 +2,6 @@
 
 import io
 import re
-import sys
 import time
 
 import pytest
@@ -100,13 +99,6 @@ def line_after_half_a_minute(shown, clock, stage, label, steps):
 def test_work_of_one_step_prints_its_seconds(shown, clock):
     assert line_after_half_a_minute(shown, clock, "scene", "adjusting", 1) == "adjusting: 36 s so far"
     assert shown[0].bars.tasks[0].total is None  # a bar at 0/1 stands still
-
-
-def test_a_wait_for_kernels_is_named(shown, clock, monkeypatch):
-    monkeypatch.setattr(sys.modules["sfm_app.jit"]._Waiting, "threads", {1})
-    line = line_after_half_a_minute(shown, clock, "view_graph", "epipolar geometry", 10)
-
-    assert line == "epipolar geometry: compiling kernels, once on this machine"
 
 
 def test_a_note_stands_below_the_title_in_80_columns(shown):

@@ -1,0 +1,93 @@
+"""Compile the kernels of a run for later ones on this machine: reconstruct small photos of the corner of a room.
+
+python -m sfm_app.warm_up FOLDER
+"""
+
+import os
+import shutil
+import sys
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.api import reconstruct
+from sfm_app.engine.warm_up import PARENT
+from sfm_app.jit import WARM
+from sfm_app.operating_system import end_own_group, watch_parent, yield_to_others
+from sfm_app.settings import Settings
+from sfm_app.synthetic.cameras import look_at
+
+FloatArray = NDArray[np.float64]
+WIDTH, HEIGHT, FOCAL = 480, 360, 520.0
+"""Of the photos, in pixels: the smallest that are mapped with certainty. Chosen by hand."""
+PHOTOS = 6
+SIDE = 640
+"""Of the pictures on the walls, in pixels."""
+NICENESS = 5
+"""Added to that of the run, which needs the cores more. Chosen by hand."""
+
+
+SETTINGS = {
+    "report": False,
+    "matching": {"enlarge_below": 0, "max_features": 2000},
+    "depth": {"max_image_size_px": 240},
+}
+"""That save time, and change none of the kernels."""
+
+
+def write_photos(folder: Path) -> None:
+    """Write photos of a floor and two walls of 2 units, each with a pattern of noise."""
+    rng = np.random.default_rng(0)
+    corners = np.array([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]])
+    walls = [(np.roll(corners, turn, axis=1), _noise(rng)) for turn in range(3)]
+    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    folder.mkdir(parents=True)
+    for number, angle in enumerate(np.linspace(0.35, 1.2, PHOTOS)):
+        center = np.array([4.0 * np.sin(angle), 1.6 + 0.2 * (number % 2), 4.0 * np.cos(angle)])
+        photo = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        for wall, picture in walls:
+            _paste(photo, picture, K @ look_at(center, np.full(3, 0.7)), wall)
+        cv2.imwrite(str(folder / f"{number}.png"), photo)
+
+
+def _noise(rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Return a picture (SIDE, SIDE, 3) with details of many sizes."""
+    layers = [
+        cv2.resize(rng.normal(size=(n, n, 3)), (SIDE, SIDE), interpolation=cv2.INTER_CUBIC) for n in (10, 40, 160)
+    ]
+    return np.asarray(np.clip(128 + 40 * sum(layers), 0, 255), np.uint8)
+
+
+def _paste(photo: NDArray[np.uint8], picture: NDArray[np.uint8], P: FloatArray, wall: FloatArray) -> None:
+    """Paint a wall, given by its four corners (4, 3), into a photo with the projection matrix P."""
+    seen = np.column_stack([wall, np.ones(4)]) @ P.T
+    corners = np.array([[0, 0], [SIDE, 0], [SIDE, SIDE], [0, SIDE]], np.float32)
+    H = cv2.getPerspectiveTransform(corners, np.asarray(seen[:, :2] / seen[:, 2:], np.float32))
+    cv2.warpPerspective(picture, H, (WIDTH, HEIGHT), dst=photo, flags=cv2.INTER_AREA, borderMode=cv2.BORDER_TRANSPARENT)
+
+
+def _end(folder: Path) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
+    end_own_group()
+
+
+def main() -> None:
+    """Compile, and note that it is done, even where a part of it fails: the next run would fare no better."""
+    folder = Path(sys.argv[1])
+    if PARENT in os.environ:
+        watch_parent(int(os.environ[PARENT]), partial(_end, folder))
+        yield_to_others(NICENESS)
+    os.environ[PARENT] = str(os.getpid())
+    try:
+        write_photos(folder / "photos")
+        reconstruct(folder / "photos", folder / "model", Settings.from_mapping(SETTINGS))
+    finally:
+        WARM.parent.mkdir(parents=True, exist_ok=True)
+        WARM.touch()
+
+
+if __name__ == "__main__":
+    main()
