@@ -1,5 +1,6 @@
 """Fixtures that several groups of tests share."""
 
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -21,6 +22,8 @@ from sfm_app.types import Frustum, Model, Surface, Texture
 # the time of an example depends on how busy the machine is
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
+
+os.environ.setdefault("SFM_APP_WARM_UP_OF", str(os.getpid()))  # no process beside each run compiles all kernels
 
 HANGS_S = 1200
 """A run that takes longer hangs: on a busy machine, where kernels are compiled first, one has taken 300 s."""

@@ -56,7 +56,7 @@ def test_all_stages_are_compiled(tmp_path):
     """With the cache of the other tests: only the file that says that all is compiled is elsewhere."""
     code = (
         "import pathlib, sys; from sfm_app import jit; jit.WARM = pathlib.Path(sys.argv[1]) / 'cache' / 'warm'; "
-        "from sfm_app.demo import warm_up; warm_up.main()"
+        "from sfm_app import warm_up; warm_up.main()"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=False, timeout=HANGS_S
