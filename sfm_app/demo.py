@@ -11,10 +11,10 @@ import numpy as np
 from PIL import Image
 
 from sfm_app.api import Run, reconstruct
+from sfm_app.camera.models import calibration_from_model
 from sfm_app.errors import InputError
-from sfm_app.geometry.lenses.camera_models import calibration_from_model
 from sfm_app.progress import Progress
-from sfm_app.report.words import duration_text
+from sfm_app.report.text import duration_text
 from sfm_app.runtime.parallel import worker_count
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings

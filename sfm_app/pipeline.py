@@ -8,10 +8,11 @@ from pathlib import Path
 from sfm_app.camera_files import read_given_cameras
 from sfm_app.engine.execution import Pipeline
 from sfm_app.engine.stage import Products, Stage
+from sfm_app.frame.control_points import read_control_points
+from sfm_app.frame.scale import MetricFrame
 from sfm_app.photos import read_source
 from sfm_app.runtime.context import CONTROL_POINTS, GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.parallel import ordered_map
-from sfm_app.scale import MetricFrame, read_control_points
 from sfm_app.stages import depth_maps, export, intrinsics, match_graph, mesh, photos, scale, scene, texture, view_graph
 from sfm_app.types import Intrinsics, MatchGraph, Model, PhotoSet, Scene, Surface, ViewGraph
 

@@ -7,6 +7,7 @@ A plug-in is an installed package with an entry point in the group ``sfm_app``; 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
@@ -15,28 +16,20 @@ import pluggy
 from numpy.typing import NDArray
 
 from sfm_app.errors import ConfigError, PluginError
-from sfm_app.formats import EXPORTERS, SCENE_EXPORTERS
 from sfm_app.formats.exporters import INSTALL_HINT, Exporter, SceneExporter
-from sfm_app.ransac import ESTIMATORS
-from sfm_app.selfcal import CALIBRATORS, SEVERAL_CAMERAS
 from sfm_app.settings import CalibrationSettings, EpipolarSettings, MatchSettings
 from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Features, Rejected
+from sfm_app.types.arrays import FloatArray
 
 if TYPE_CHECKING:  # OpenCV, which stereo needs, takes longer to load than an estimator to run
     from sfm_app.stereo import DepthTask
 
-GROUP = "sfm_app"
+GROUP, BUILT_IN = "sfm_app", "sfm_app.built_in"
+"""Entry points of plug-ins, and the module with our own methods, which comes through the same door."""
 AUTO, CPU = "auto", "cpu"
 SIFT, SIFT_DSP = "sift", "sift-dsp"
-SIFT_DSP_SUMMARY = "COLMAP's SIFT, slower: affine shape, domain-size pooling, fainter features; for plain things"
-SIFT_DSP_OPTIONS = {"estimate_affine_shape": True, "domain_size_pooling": True, "peak_threshold": 0.0007}
-"""A tenth of COLMAP's contrast. Chosen on dinoSparseRing, where half of all neighbors have no match with COLMAP's own:
-raw matches of the five weakest links of its ring are 0 0 16 0 19 with `sift`, 19 0 32 35 65 with 0.002, 28 27 42 49 97
-with 0.001, 36 31 40 51 109 with 0.0005, which takes twice as long as 0.001."""
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
-
-FloatArray = NDArray[np.float64]
 
 
 class FitFundamental(Protocol):
@@ -51,7 +44,7 @@ class Calibrate(Protocol):
     """Estimates one camera matrix from the fundamental matrices of pairs that share it; same seed, same result.
 
     Never raises on data: what is not determined comes back with ``identifiable=False`` and a reason. ValueError on
-    malformed arrays; `sfm_app.selfcal.inputs.prepare` checks them.
+    malformed arrays; `sfm_app.selfcal.pairs.prepare` checks them.
     """
 
     def __call__(self, pairs: CameraPairs, options: CalibrationSettings, seed: int, /) -> Calibration: ...
@@ -104,12 +97,6 @@ class MakeDepthMaps(Protocol):
 
 def _no_reason() -> str:
     return ""
-
-
-def _make_depth_maps_on_cpu(task: "DepthTask") -> list[Rejected | None]:
-    from sfm_app.stereo import make_depth_maps_on_cpu
-
-    return make_depth_maps_on_cpu(task)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,46 +161,6 @@ class Hooks:
     @hookspec
     def sfm_depth_methods(self) -> Iterable[DepthMethod]:  # type: ignore[empty-body]
         """Return ways to make depth maps."""
-
-
-class BuiltIns:
-    """What ships with the program, registered like any other plug-in."""
-
-    @hookimpl
-    def sfm_estimators(self) -> Iterable[Estimator]:
-        """Return the estimators of fundamental matrices."""
-        return [Estimator(name, fit, summary) for name, (fit, summary) in ESTIMATORS.items()]
-
-    @hookimpl
-    def sfm_calibrators(self) -> Iterable[Calibrator]:
-        """Return the calibrators."""
-        return [
-            Calibrator(name, calibrate, summary, together=name == SEVERAL_CAMERAS)
-            for name, (calibrate, summary) in CALIBRATORS.items()
-        ]
-
-    @hookimpl
-    def sfm_features(self) -> Iterable[FeatureMethod]:
-        """Return COLMAP's SIFT, plain and with domain size pooling."""
-        return [
-            FeatureMethod(SIFT, summary="COLMAP's SIFT", sift={}),
-            FeatureMethod(SIFT_DSP, summary=SIFT_DSP_SUMMARY, sift=SIFT_DSP_OPTIONS),
-        ]
-
-    @hookimpl
-    def sfm_exporters(self) -> Iterable[Exporter]:
-        """Return the file formats for models."""
-        return EXPORTERS.values()
-
-    @hookimpl
-    def sfm_scene_exporters(self) -> Iterable[SceneExporter]:
-        """Return the formats for cameras, poses, points and photos."""
-        return SCENE_EXPORTERS.values()
-
-    @hookimpl
-    def sfm_depth_methods(self) -> Iterable[DepthMethod]:
-        """Return the depth maps made on the CPU."""
-        return [DepthMethod(CPU, _make_depth_maps_on_cpu, "semi-global matching and PatchMatch, on every machine")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,7 +248,7 @@ def _load(modules: Sequence[ModuleType | object], installed: bool) -> Plugins:
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(Hooks)
     try:
-        for module in (BuiltIns(), *modules):
+        for module in (import_module(BUILT_IN), *modules):
             manager.register(module)
         if installed:
             manager.load_setuptools_entrypoints(GROUP)

@@ -19,8 +19,8 @@ from sfm_app.jit import WARM
 from sfm_app.operating_system import end_own_group, watch_parent, yield_to_others
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import look_at
+from sfm_app.types.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
 WIDTH, HEIGHT, FOCAL = 480, 360, 520.0
 """Of the photos, in pixels: the smallest that are mapped with certainty. Chosen by hand."""
 PHOTOS = 6

@@ -13,7 +13,8 @@ from hypothesis import settings
 from PIL import Image
 
 from benchmarks.synthetic.walks import orbit
-from sfm_app.operating_system import VARIABLE, abilities
+from sfm_app import operating_system
+from sfm_app.operating_system import VARIABLE
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
 from sfm_app.synthetic.photo_folder import load_truth, save_truth, write_photo_folder
 from sfm_app.synthetic.scenes import courtyard
@@ -141,7 +142,9 @@ def without(monkeypatch):
     """Return a function that takes abilities of the system away, here and in the processes that are started."""
 
     def take(*names):
-        monkeypatch.setattr(abilities, "HERE", abilities.HERE - {abilities.Ability(name) for name in names})
+        monkeypatch.setattr(
+            operating_system, "HERE", operating_system.HERE - {operating_system.Ability(name) for name in names}
+        )
         monkeypatch.setenv(VARIABLE, ",".join(names))
 
     return take

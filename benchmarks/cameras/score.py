@@ -22,7 +22,7 @@ from benchmarks.common.outputs import read_initial_cameras, read_refined_cameras
 from benchmarks.common.photo_sets import Step, changed_camera
 from benchmarks.common.results import Row
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.models.model import scale_matrix
+from sfm_app.colmap.model import scale_matrix
 
 LIMITS_DEG = (1, 3, 5, 10)
 FILES = ("cameras.bin", "images.bin", "points3D.bin")

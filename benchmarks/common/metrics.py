@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.distances import sampson_distance
-from sfm_app.geometry.essential import decompose_essential, essential_from_fundamental
-from sfm_app.geometry.similarity import umeyama
+from sfm_app.geometry.epipolar import decompose_essential, essential_from_fundamental, sampson_distance
+from sfm_app.geometry.poses import umeyama
 
 Pose = NDArray[np.float64]
 

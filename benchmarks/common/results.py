@@ -17,7 +17,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from sfm_app.engine.staleness import versions as program_versions
+from sfm_app.engine.stage import versions as program_versions
 
 SCHEMA = 1
 RESULTS = Path(__file__).parents[1] / "results"

@@ -12,7 +12,7 @@ from benchmarks.cameras.methods import Method, run
 from benchmarks.cameras.worker import OURS
 from benchmarks.common.photo_sets import PhotoSet
 from benchmarks.common.results import Row
-from sfm_app.engine.staleness import versions
+from sfm_app.engine.stage import versions
 
 RECORD = "corpus.json"
 """File in OUT with the key of a run and its result."""

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
 from benchmarks.common.metrics import Pose
-from sfm_app.geometry.similarity import Similarity, umeyama
+from sfm_app.geometry.poses import Similarity, umeyama
 
 LONG_STEPS = 5.0
 """A step of more than this many median steps is a jump."""

@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common.timing import Method
-from sfm_app.ransac.estimate import estimate
-from sfm_app.ransac.estimator_config import Recipe
-from sfm_app.ransac.lev_ransac import PRODUCTION
-from sfm_app.ransac.refine.final_refit import refit_sampson
-from sfm_app.ransac.scoring.leverage import prior_validity
-from sfm_app.ransac.scoring.robust_costs import msac
-from sfm_app.ransac.verification.pretests import FullVerification
-from sfm_app.ransac.verification.sprt import Sprt
+from sfm_app.fundamental.estimate import estimate
+from sfm_app.fundamental.lev_ransac import PRODUCTION
+from sfm_app.fundamental.leverage import prior_validity
+from sfm_app.fundamental.loop import Recipe
+from sfm_app.fundamental.pretests import FullVerification, Sprt
+from sfm_app.fundamental.refits import refit_sampson
+from sfm_app.fundamental.scores import msac
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit
 

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from benchmarks.common.metrics import load_truth
 from sfm_app.api import open_run
-from sfm_app.geometry.distances import sampson_distance
-from sfm_app.geometry.epipolar import fundamental_from_pose
+from sfm_app.geometry.epipolar import fundamental_from_pose, sampson_distance
 from sfm_app.pipeline import MATCH_GRAPH, run_stages
 from sfm_app.settings import Settings
 

@@ -20,7 +20,7 @@ from benchmarks.surface.sets import RENDERED, finished_model, surface_set
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import Camera
 from sfm_app.synthetic.render import SUPERSAMPLING, orbited_pose, prepare_model, render_model, render_shape
-from sfm_app.types.model import Model
+from sfm_app.types.surface import Model
 
 Pixels = NDArray[np.uint8]
 SIZE = (900, 600)

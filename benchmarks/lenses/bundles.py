@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.camera.models import camera_matrix
 from sfm_app.colmap.backend import log_level, pycolmap, show_log
-from sfm_app.geometry.camera import camera_matrix
 from sfm_app.synthetic.cameras import ArcOptions, Camera, Lens, Views, arc, make_wide_camera
 
 FloatArray = NDArray[np.float64]

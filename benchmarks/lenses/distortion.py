@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.common.command_line import new_parser
 from benchmarks.common.results import RESULTS, Row, document, table, write
+from sfm_app.camera.models import camera_matrix
 from sfm_app.estimation.calibrating import find_intrinsics
-from sfm_app.geometry.camera import camera_matrix
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor

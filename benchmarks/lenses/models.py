@@ -31,14 +31,12 @@ from benchmarks.lenses.bundles import (
     write_model,
 )
 from benchmarks.lenses.radius import radius_error_percent
-from sfm_app.bundle_adjustment.lens_evidence import estimate_lenses
-from sfm_app.bundle_adjustment.lens_parts import PARTS, model_name
-from sfm_app.bundle_adjustment.normal_equations import Bundle, best_step, project, reduce, residuals
+from sfm_app.bundle.lens_evidence import estimate_lenses
+from sfm_app.bundle.lens_parts import PARTS, model_name
+from sfm_app.bundle.normal_equations import Bundle, best_step, project, reduce, residuals
+from sfm_app.camera.projection import FISHEYE, PERSPECTIVE
 from sfm_app.colmap.backend import pycolmap, show_log
-from sfm_app.colmap.bundle import Adjustment, adjust
-from sfm_app.colmap.bundles.bundle_arrays import read_bundle
-from sfm_app.colmap.bundles.bundle_rounds import LOSS_SCALE_PX, lens_priors
-from sfm_app.geometry.lenses.projections import FISHEYE, PERSPECTIVE
+from sfm_app.colmap.bundle import LOSS_SCALE_PX, Adjustment, adjust, lens_priors, read_bundle
 
 FloatArray = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from PIL import Image
 from benchmarks.common.command_line import new_parser
 from benchmarks.surface.photos import placed_photos
 from sfm_app.api import reconstruct
+from sfm_app.camera.models import camera_matrix
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.geometry.camera import camera_matrix
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages.texture import read_texture

@@ -5,10 +5,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.lenses import bearings
+from sfm_app.camera import bearings
 from sfm_app.synthetic.cameras import Camera, pixel_rays
 from sfm_app.types import Calibration
-from sfm_app.types.calibration import PERSPECTIVE
+from sfm_app.types.camera import PERSPECTIVE
 
 FloatArray = NDArray[np.float64]
 Project = Callable[[FloatArray], FloatArray]

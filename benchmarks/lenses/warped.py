@@ -23,7 +23,7 @@ from benchmarks.cameras.worker import INCREMENTAL, OURS, RESULT
 from benchmarks.common.command_line import new_parser
 from benchmarks.common.photo_sets import PhotoSet
 from benchmarks.common.results import RESULTS, Row, document, table, write
-from sfm_app.geometry.camera import rays
+from sfm_app.camera.models import rays
 
 FloatArray = NDArray[np.float64]
 Source = Callable[[FloatArray, FloatArray], FloatArray]

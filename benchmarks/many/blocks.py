@@ -23,7 +23,7 @@ from benchmarks.common.processes import row_of_module
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.many.true_town import true_scene
 from benchmarks.synthetic.town import TownPhotos, town_of, town_views
-from sfm_app.engine.usage import measure_usage
+from sfm_app.engine.execution import measure_usage
 from sfm_app.geometry.triangles import unique_edges
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext

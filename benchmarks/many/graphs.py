@@ -23,11 +23,11 @@ from benchmarks.common.processes import row_of_module
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.synthetic.matches import TownGraph, TownOptions, make_town_graph
 from sfm_app.estimation.calibrating import photo_pairs, sample_pairs
+from sfm_app.mapping.part_mapping import cut_group
+from sfm_app.mapping.parts import USUAL_PART
 from sfm_app.plugins import load_plugins
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.posegraph.graph import average_pair_rotations
-from sfm_app.reconstruction.parts.cut import cut_group
-from sfm_app.reconstruction.parts.parts_run import USUAL_PART
 from sfm_app.runtime.parallel import make_executor, ordered_map, worker_count
 from sfm_app.selfcal import calibrate_photo_set
 from sfm_app.settings import Settings

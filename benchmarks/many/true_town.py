@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.geometry.culling import border_angle, cluster
-from sfm_app.meshing.occlusion import Occluders
-from sfm_app.meshing.open3d import load_open3d
+from sfm_app.geometry.triangles import border_angle, cluster
+from sfm_app.meshing.ray_casting import Occluders, load_open3d
 from sfm_app.synthetic.cameras import Camera, Views, camera_center
 from sfm_app.types import CameraModel, Scene
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.synthetic.scenes import marker_sheet
-from sfm_app.scale.markers import draw_pattern
+from sfm_app.frame.markers import draw_pattern
 from sfm_app.synthetic.cameras import Views, camera_center
 from sfm_app.synthetic.shapes import SyntheticScene
 

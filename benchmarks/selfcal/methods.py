@@ -11,8 +11,8 @@ import sfm_app
 from benchmarks.common.photo_sets import PhotoSet, TrueCamera
 from benchmarks.selfcal import view_graph_calibration as rival
 from sfm_app.api import open_run
+from sfm_app.camera.models import camera_matrix
 from sfm_app.estimation.calibrating import camera_pairs
-from sfm_app.geometry.camera import camera_matrix
 from sfm_app.pipeline import INTRINSICS, MATCH_GRAPH, VIEW_GRAPH, run_stages
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings, merge_nested

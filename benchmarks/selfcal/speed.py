@@ -12,7 +12,7 @@ from benchmarks.selfcal.coverage import estimate_pairs
 from benchmarks.selfcal.methods import PRODUCTION, WITHOUT_MATCHES, MatchedSet
 from sfm_app.estimation.calibrating import camera_pairs
 from sfm_app.plugins import load_plugins
-from sfm_app.selfcal.inputs import prepare
+from sfm_app.selfcal.pairs import prepare
 from sfm_app.selfcal.thesis.zero_curves import algorithm_4
 from sfm_app.settings import Settings, merge_nested
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks

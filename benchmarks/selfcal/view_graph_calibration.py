@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from sfm_app.camera.models import guessed_camera_matrix
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import SQUARE_PIXELS, camera_params, open_database
-from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.types import Calibration, MatchGraph, ViewGraph
 
 METHOD = "view-graph calibration"

@@ -8,7 +8,7 @@ from typing import Any
 from benchmarks.surface.photos import placed_photos
 from sfm_app.api import open_run
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.models.model import submodel
+from sfm_app.colmap.model import submodel
 from sfm_app.settings import Settings
 from sfm_app.stages import depth_maps, mesh, scene, texture
 from sfm_app.types import Model

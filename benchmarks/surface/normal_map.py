@@ -33,9 +33,9 @@ from benchmarks.surface.photos import placed_photo, placed_photos
 from benchmarks.surface.pictures import save_page
 from benchmarks.surface.sets import dense_stages, surface_set
 from benchmarks.surface.worker import run_stages
+from sfm_app.files import load_arrays
+from sfm_app.geometry.poses import normalize
 from sfm_app.geometry.triangles import vertex_normals
-from sfm_app.geometry.unit_vectors import normalize
-from sfm_app.hashing import load_arrays
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import merge_nested
 from sfm_app.stages.scale import read_frame

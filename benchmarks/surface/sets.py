@@ -12,7 +12,7 @@ from sfm_app.pipeline import DEPTH_MAPS, NAMES, TEXTURE, run_stages
 from sfm_app.settings import Settings
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder
 from sfm_app.synthetic.shapes import SyntheticScene
-from sfm_app.types.model import Model
+from sfm_app.types.surface import Model
 
 RENDERED = ("statue", "facade", "corner")
 DETAILED = ("ornament", "railing", "garden")

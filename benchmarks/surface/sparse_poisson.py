@@ -9,7 +9,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.meshing.open3d import load_open3d
+from sfm_app.meshing.ray_casting import load_open3d
 from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]

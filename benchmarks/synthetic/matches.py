@@ -18,12 +18,11 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from benchmarks.synthetic.town import BLOCK_M, PITCH_M, STREET_M, TownWalk, walk_town
+from sfm_app.camera.models import camera_matrix
 from sfm_app.errors import ConfigError
-from sfm_app.geometry.camera import camera_matrix
-from sfm_app.geometry.distances import sampson_distance
-from sfm_app.geometry.epipolar import fundamental_from_pose
-from sfm_app.ransac.refine.sampson_refit import refine_sampson
-from sfm_app.retrieval.choice import choose_by_rank
+from sfm_app.fundamental.refits import refine_sampson
+from sfm_app.geometry.epipolar import fundamental_from_pose, sampson_distance
+from sfm_app.retrieval import choose_by_rank
 from sfm_app.synthetic.correspondences import FAR, MAX_SETUPS, NEAR, PairOptions, TwoViews, make_pair, random_rotation
 from sfm_app.types import Calibration, EpipolarFit, MatchedImage, MatchGraph, PairId, RelativePose, ViewGraph
 

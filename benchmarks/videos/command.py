@@ -18,7 +18,7 @@ from benchmarks.common.command_line import add_rendered, new_parser
 from benchmarks.common.results import Row, document, table, write
 from benchmarks.synthetic.walks import WalkOptions, row_poses, walk
 from benchmarks.videos.rendered import RATE, frame_name, render_video, run_both
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.camera.models import camera_matrix
 from sfm_app.synthetic.cameras import Camera, Views
 
 CAMERA = Camera(camera_matrix(620.0, 620.0, 328.0, 208.0), 640, 426)

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from benchmarks.lenses.bundles import Drawn, adjust_like_mapping, write_model
 from benchmarks.synthetic.walks import WalkOptions, project_through_shutter, walk
+from sfm_app.camera.models import camera_matrix
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.geometry.camera import camera_matrix
 from sfm_app.synthetic.cameras import Camera, Lens, Views
 
 FloatArray = NDArray[np.float64]

@@ -21,13 +21,13 @@ from benchmarks.common.metrics import area_under_recall, pose_errors_deg
 from benchmarks.common.results import Row, document, table, write
 from benchmarks.synthetic.walks import WalkOptions
 from benchmarks.videos.sequences import FRAMES_PER_S, SIZE, STRONG_LENS, Kind, draw_sequence, map_sequence
-from sfm_app.bundle_adjustment.readout import ReadoutEstimate
+from sfm_app.bundle.rolling_shutter import ReadoutEstimate
 from sfm_app.colmap.backend import pycolmap, show_log
 from sfm_app.colmap.bundle import Adjustment, adjust
-from sfm_app.colmap.bundles.rolling_shutter import measure_readout, read_keypoints, straighten_model
-from sfm_app.colmap.models.model import posed_images
+from sfm_app.colmap.model import posed_images
+from sfm_app.colmap.rolling_shutter import measure_readout, read_keypoints, straighten_model
+from sfm_app.mapping.rolling_shutter import ROUNDS, Readout, follow_shutter
 from sfm_app.progress import SilentProgress
-from sfm_app.reconstruction.videos.rolling_shutter import ROUNDS, Readout, follow_shutter
 from sfm_app.types import MatchedImage, MatchGraph
 
 ABOUT = (

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from benchmarks.common.command_line import add_rendered, new_parser
 from benchmarks.common.results import Row, document, table, write
 from benchmarks.videos.rendered import frame_name, render_video, run_both
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.camera.models import camera_matrix
 from sfm_app.synthetic.cameras import Camera, Views, look_at
 
 FloatArray = NDArray[np.float64]

@@ -24,10 +24,10 @@ from PIL import Image
 
 from benchmarks.common.command_line import add_pictures, is_wanted, new_parser
 from benchmarks.common.results import RESULTS, document, table, write
-from sfm_app.colmap.models.stored_model import sparse_model
+from sfm_app.colmap.model import sparse_model
 from sfm_app.formats import EXPORTERS
 from sfm_app.formats.frusta import center, scene_size
-from sfm_app.meshing.open3d import load_open3d
+from sfm_app.meshing.ray_casting import load_open3d
 from sfm_app.types import Frustum, Model, Surface, Texture
 
 Row = dict[str, Any]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 import sfm_app
 from sfm_app.geometry.epipolar import fundamental_from_pose, to_homogeneous
-from sfm_app.selfcal.consensus.consensus import Consensus
-from sfm_app.selfcal.inputs import prepare
+from sfm_app.selfcal.consensus import Consensus
+from sfm_app.selfcal.pairs import prepare
 from sfm_app.selfcal.thesis.curves import focal_curves
 from sfm_app.synthetic.cameras import Camera, arc, camera_center, make_camera, pixel_rays
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks

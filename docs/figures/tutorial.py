@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import sfm_app
-from sfm_app.colmap.figures.depths import read_photo_and_depth
-from sfm_app.report.page.depth_pictures import depth_colors
+from sfm_app.colmap.dense import read_photo_and_depth
+from sfm_app.report.pictures import depth_colors
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.stages.texture import read_texture
 from sfm_app.synthetic.cameras import Camera

@@ -9,8 +9,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.fundamental.estimate import estimate_with
 from sfm_app.plugins import Estimator, hookimpl
-from sfm_app.ransac import estimate_with
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
 

@@ -9,7 +9,7 @@ import numpy as np
 import sfm_app_opencv
 
 import sfm_app
-from sfm_app.geometry.distances import sampson_distance
+from sfm_app.geometry.epipolar import sampson_distance
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 from sfm_app.types import Rejected

@@ -12,7 +12,7 @@ import pycolmap
 from sfm_app_pycolmap import fit_loransac
 
 import sfm_app
-from sfm_app.geometry.distances import sampson_distance
+from sfm_app.geometry.epipolar import sampson_distance
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 from sfm_app.types import Rejected

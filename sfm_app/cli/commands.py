@@ -20,7 +20,7 @@ from sfm_app.cli.options import (
 )
 from sfm_app.cli.output import STAGE_TITLES, file_lines, open_browser, print_json, print_lines, print_text, table
 from sfm_app.errors import ConfigError
-from sfm_app.lengths import parse_length, parse_point
+from sfm_app.wording import parse_length, parse_point
 
 if TYPE_CHECKING:
     from sfm_app.formats.exporters import Exporter, SceneExporter
@@ -93,7 +93,7 @@ def _default_folder(photos: Path) -> Path:
 def calibrate(photos: Path, out: Path | None, figure: Path | None, **flags: Any) -> None:
     """Estimate the camera matrix of PHOTOS, a folder or a video, without reconstructing the scene."""
     from sfm_app.cli.terminal import Terminal
-    from sfm_app.report.camera_text import intrinsics_lines, intrinsics_summary
+    from sfm_app.report.text import intrinsics_lines, intrinsics_summary
 
     settings = settings_from_flags(flags)
     with Terminal(quiet=flags["quiet"]) as progress:
@@ -129,7 +129,7 @@ def markers(side: str, target: Path, family: str, first: int, paper: str) -> Non
 
     `sfm-app run PHOTOS --markers 50mm` then gives the model its real size.
     """
-    from sfm_app.scale.marker_page import write_marker_page
+    from sfm_app.frame.markers import write_marker_page
 
     try:
         count = write_marker_page(target, parse_length(side), family, first, paper)
@@ -285,7 +285,7 @@ def measure(out: Path, a: str, b: str, as_json: bool) -> None:
 
     A point is x,y,z in the coordinates of OUT/model.glb.
     """
-    from sfm_app.report.scale_text import distance_text
+    from sfm_app.report.text import distance_text
 
     try:
         distance = sfm_app.measure_distance(out, parse_point(a), parse_point(b))

@@ -5,9 +5,9 @@ import shutil
 from pathlib import Path
 
 from sfm_app.colmap.backend import has_cuda
-from sfm_app.engine.staleness import versions
+from sfm_app.engine.stage import versions
 from sfm_app.errors import SfmError
-from sfm_app.meshing.open3d import load_open3d
+from sfm_app.meshing.ray_casting import load_open3d
 from sfm_app.operating_system import free_memory_mb, missing_abilities
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.parallel import worker_count

@@ -7,16 +7,24 @@ from textwrap import shorten
 from typing import Any
 
 from sfm_app.api import Run
+from sfm_app.camera.models import calibration_from_model
 from sfm_app.cli.output import WIDTH, file_lines
-from sfm_app.geometry.lenses.camera_models import calibration_from_model
-from sfm_app.name_lists import list_names
-from sfm_app.report.camera_text import SOURCES, contradiction_lines, intrinsics_lines, intrinsics_summary
-from sfm_app.report.scale_text import scale_lines
-from sfm_app.report.scene_text import scene_lines, scene_summary
-from sfm_app.report.words import WARNING, duration_text, field_text
-from sfm_app.runtime.manifest import model_triangles
+from sfm_app.report.text import (
+    GUESS_SOURCES,
+    WARNING,
+    contradiction_lines,
+    duration_text,
+    field_text,
+    intrinsics_lines,
+    intrinsics_summary,
+    scale_lines,
+    scene_lines,
+    scene_summary,
+)
+from sfm_app.runtime.workspace import model_triangles
 from sfm_app.settings import Settings
-from sfm_app.types.calibration import EQUIRECTANGULAR
+from sfm_app.types.camera import EQUIRECTANGULAR
+from sfm_app.wording import list_names
 
 LABEL_COLUMNS = 12
 INDENT = " " * LABEL_COLUMNS
@@ -150,7 +158,7 @@ def _camera_lines(run: Run) -> Iterator[str]:
         if not calibration.identifiable:
             source = "all photos together do"  # a reason would seem to concern the refined camera
             if model is None:
-                source = f"this is {SOURCES.get(calibration.method, calibration.method)}: {calibration.reason}"
+                source = f"this is {GUESS_SOURCES.get(calibration.method, calibration.method)}: {calibration.reason}"
             yield f"{INDENT}pairs of photos do not determine it; {source}"
     if len(cameras) > LINES_SHOWN:
         yield f"{INDENT}and {len(cameras) - LINES_SHOWN} more cameras"

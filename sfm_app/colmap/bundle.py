@@ -1,37 +1,497 @@
 """The last bundle adjustment: refines cameras, poses, points and tracks until they no longer change."""
 
 import logging
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
-from sfm_app.bundle_adjustment.camera_rules import calibration_from_params, fit_to_model, params_of_calibration
-from sfm_app.bundle_adjustment.lens_family import convert_lens
-from sfm_app.bundle_adjustment.lens_parts import part_names
-from sfm_app.colmap.backend import pycolmap, translate_errors
-from sfm_app.colmap.bundles.bundle_arrays import (
-    FILE_MODELS,
-    NO_RULES,
-    PLACES,
-    Rules,
-    camera_family,
-    file_model,
-    photos_per_camera,
-    read_camera,
-    write_camera,
+from sfm_app.bundle.lens_evidence import (
+    LensChoice,
+    LensEstimate,
+    asks_for_other_family,
+    convert_lens,
+    estimate_lenses,
+    family_evidence,
 )
-from sfm_app.colmap.bundles.bundle_rounds import Rounds, adjust_in_rounds, solve
-from sfm_app.colmap.bundles.lens_choice import Families, LensRecord, best_families, record_lenses
+from sfm_app.bundle.lens_parts import (
+    COUNT,
+    NO_RULE,
+    PARTS,
+    CameraRule,
+    LensPriors,
+    calibration_from_params,
+    choices_of_model,
+    consistent_choices,
+    fit_to_model,
+    params_of_calibration,
+    part_names,
+)
+from sfm_app.bundle.normal_equations import Bundle, best_step, cost, elimination_width, reduce
+from sfm_app.camera.projection import (
+    CAMERA,
+    CX,
+    CY,
+    FISHEYE,
+    FX,
+    FY,
+    K1,
+    K2,
+    K3,
+    K4,
+    K5,
+    K6,
+    P1,
+    P2,
+    PANORAMA,
+    PERSPECTIVE,
+    SX,
+    SY,
+)
+from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.models.model import finite_mask
+from sfm_app.colmap.model import finite_mask, posed_images, submodel
 from sfm_app.colmap.types import all_cameras, all_points
-from sfm_app.geometry.lenses.projections import FX, FY, PANORAMA
-from sfm_app.numerical import FAILURES, error_reason, finite_entries
+from sfm_app.errors import NumericalError
+from sfm_app.numerical import FAILURES, Json, error_reason, finite_entries
 from sfm_app.types import Calibration
-from sfm_app.types.correlations import named_correlations
+from sfm_app.types.arrays import FloatArray
+from sfm_app.types.camera import named_correlations
+
+# COLMAP's models as the arrays of our bundle adjustment, and back.
+
+PLACES = {
+    "f": (FX, FY), "fx": (FX,), "fy": (FY,), "cx": (CX,), "cy": (CY,), "k": (K1,), "k1": (K1,), "k2": (K2,),
+    "p1": (P1,), "p2": (P2,), "k3": (K3,), "k4": (K4,), "k5": (K5,), "k6": (K6,), "sx1": (SX,), "sy1": (SY,),
+}  # fmt: skip
+"""Indices in `Bundle.params` by COLMAP's names of parameters."""
+OPENCV = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+FILE_MODELS = {
+    PERSPECTIVE: {"OPENCV": OPENCV, "FULL_OPENCV": (*OPENCV, "k3", "k4", "k5", "k6")},
+    FISHEYE: {
+        "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+        "THIN_PRISM_FISHEYE": (*OPENCV, "k3", "k4", "sx1", "sy1"),
+    },
+}
+"""COLMAP's models that refined cameras are written as, with their parameters; the smaller one first."""
+EQUIRECTANGULAR = "EQUIRECTANGULAR"
+Rules = Mapping[int, CameraRule]
+"""What the user laid down about cameras, by id; cameras without a rule are free."""
+NO_RULES: Rules = MappingProxyType({})
+
+
+def camera_family(camera: pycolmap.Camera) -> int:
+    """Return the family of a camera, as in `Bundle`."""
+    if camera.model.name == EQUIRECTANGULAR:
+        return PANORAMA
+    return FISHEYE if "FISHEYE" in camera.model.name else PERSPECTIVE
+
+
+def read_camera(camera: pycolmap.Camera) -> FloatArray:
+    """Return the parameters (12,) of a camera, as in `Bundle`."""
+    params = np.zeros(CAMERA)
+    if camera_family(camera) == PANORAMA:
+        width, height = camera.width, camera.height
+        params[[FX, FY, CX, CY]] = width / (2.0 * np.pi), height / np.pi, width / 2.0, height / 2.0
+        return params
+    for name, value in zip(camera.params_info.split(", "), camera.params, strict=True):
+        params[list(PLACES[name])] = value
+    return params
+
+
+def write_camera(camera: pycolmap.Camera, params: FloatArray, family: int) -> None:
+    """Change a camera in place, to the smallest of FILE_MODELS that holds the values; a panorama stays as it is.
+
+    Args:
+        camera: COLMAP's camera.
+        params: (12,) as in `Bundle`.
+        family: of these parameters.
+    """
+    if family == PANORAMA:
+        return
+    name = file_model(params, family)
+    camera.model = pycolmap.CameraModelId.__members__[name]
+    camera.params = [float(params[PLACES[key][0]]) for key in FILE_MODELS[family][name]]
+
+
+def file_model(params: FloatArray, family: int) -> str:
+    """Return COLMAP's name of the model that a camera is written as.
+
+    Args:
+        params: (12,) as in `Bundle`.
+        family: PERSPECTIVE or FISHEYE.
+    """
+    models = FILE_MODELS[family]
+    for name, keys in models.items():
+        rest = np.delete(params, [PLACES[key][0] for key in keys])
+        if not rest.any():
+            return name
+    return list(models)[-1]
+
+
+def read_bundle(model: pycolmap.Reconstruction, rules: Rules = NO_RULES) -> tuple[list[int], Bundle]:
+    """Return the ids of the cameras in use, and the model as arrays.
+
+    Args:
+        model: COLMAP's reconstruction.
+        rules: of some cameras, by id; those that are kept are fixed.
+    """
+    images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
+    ids, points = sorted(photos_per_camera(model)), sorted(model.points3D)
+    rows = {point: row for row, point in enumerate(points)}
+    seen = [image.get_observation_points2D() for image in images]
+    fixed = np.array([camera_id in rules and rules[camera_id].kept for camera_id in ids], np.bool_)
+    poses = np.array([image.cam_from_world().matrix() for image in images])
+    return ids, Bundle(
+        params=np.array([read_camera(model.cameras[camera_id]) for camera_id in ids]),
+        camera=np.array([ids.index(image.camera_id) for image in images]),
+        R=poses[:, :, :3],
+        t=poses[:, :, 3],
+        X=np.array([model.points3D[point].xyz for point in points], np.float64).reshape(-1, 3),
+        photo=np.repeat(np.arange(len(images)), [len(one) for one in seen]),
+        point=np.array([rows[keypoint.point3D_id] for one in seen for keypoint in one], np.int64),
+        x=np.array([keypoint.xy for one in seen for keypoint in one], np.float64).reshape(-1, 2),
+        family=np.array([camera_family(model.cameras[camera_id]) for camera_id in ids], np.int64),
+        fixed=fixed if fixed.any() else None,
+    )
+
+
+def write_bundle(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle) -> None:
+    """Write arrays into a model, in place.
+
+    Args:
+        model: COLMAP's reconstruction.
+        ids: of the cameras, from `read_bundle`.
+        bundle: with cameras, photos and points in the order of `read_bundle`.
+    """
+    for camera_id, params, family in zip(ids, bundle.params, bundle.family, strict=True):
+        write_camera(model.cameras[camera_id], params, int(family))
+    for image_id, R, t in zip(sorted(model.reg_image_ids()), bundle.R, bundle.t, strict=True):
+        image = model.images[image_id]
+        model.frames[image.frame_id].set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pycolmap.Rotation3d(R), t))
+    for point, xyz in zip(sorted(model.points3D), bundle.X, strict=True):
+        model.points3D[point].xyz = xyz
+
+
+def photos_per_camera(model: pycolmap.Reconstruction) -> Counter[int]:
+    """Return the number of posed photos of each camera, by its id."""
+    return Counter(model.images[image_id].camera_id for image_id in sorted(model.reg_image_ids()))
+
+
+# Rounds of the last bundle adjustment: a step of everything, then tracks are completed and filtered.
+
+MIN_PHOTOS = 5
+"""Photos of a camera below which only its focal and k1 are refined: with fewer, effects that the camera model leaves
+out (a lens, a zoom) change its parameters more than the noise does."""
+
+LOSS_SCALE_PX = 0.5
+"""Scale of COLMAP's SOFT_L1 loss: about twice the noise of SIFT keypoints. Poses are better than with COLMAP's 1."""
+
+MAX_ERROR_PX, MIN_ANGLE_DEG = 4.0, 1.5
+"""COLMAP's own limits for a point: largest reprojection error, least angle between its rays."""
+
+ROUNDS, CHANGED_SHARE, STEP = 6, 0.0005, 0.2
+"""Largest number of rounds. They end early when less than this share of the observations changes, and no camera
+parameter by more than this share of its standard deviation."""
+
+MIN_KEPT_SHARE = 0.1
+"""Smallest share of the points that an adjustment must keep; one that drops more has diverged and is rejected. Chosen
+on no set; none of six that were run fell below it."""
+
+LONG_STEP = 1.0
+"""Step of the cameras, in standard deviations, above which the linear step of poses and points is too inaccurate and
+COLMAP's solver refines them."""
+
+MOST_TIED = 250
+"""Photos that a photo is tied to (`elimination_width`) above which COLMAP's solver takes conjugate gradients. Where all
+see the same, a factorization grows with the cube of the photos: on every 5th photo of kitchen1000 (200) they take half
+as long to the same cost. Along streets they take five times as long as a factorization (250 photos of a town)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rounds:
+    """What the last of some rounds found; its step is in the model."""
+
+    ids: list[int]
+    """Ids of the cameras, in the order of the arrays."""
+    bundle: Bundle
+    """Before the last step."""
+    found: LensEstimate
+    noise_px: float
+    """As in `ReducedSystem`."""
+    open_points: int
+    """Points that their rays did not determine when the rounds began."""
+
+
+def adjust_in_rounds(
+    model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph | None, rules: Rules = NO_RULES
+) -> Rounds:
+    """Refine cameras, poses, points and tracks of a model in place, until they no longer change.
+
+    Args:
+        model: COLMAP's reconstruction, with cameras of FILE_MODELS.
+        graph: of all matches; None to keep the tracks.
+        rules: of some cameras, by id.
+
+    Raises:
+        NumericalError: the adjustment diverges.
+    """
+    points, open_points = model.num_points3D(), []
+    for _ in range(ROUNDS):
+        ids, bundle = read_bundle(model, rules)
+        if not (np.isfinite(bundle.params).all() and (bundle.params[:, [FX, FY]] > 0).all()):
+            raise NumericalError("a camera has no focal length")
+        reduced = reduce(bundle, LOSS_SCALE_PX)
+        open_points.append(reduced.open_points)
+        found = estimate_lenses(bundle.params, reduced, lens_priors(model, ids, bundle, rules))
+        write_bundle(model, ids, best_step(bundle, reduced, found.params, LOSS_SCALE_PX))
+        if found.step > LONG_STEP:
+            solve(model)
+        changed = improve_tracks(model, graph) if graph else 0
+        if model.num_points3D() <= MIN_KEPT_SHARE * points:
+            raise NumericalError(f"it left {model.num_points3D()} of {points} points")
+        if found.step < STEP and changed < CHANGED_SHARE * len(bundle.x):
+            break
+    return Rounds(ids, bundle, found, reduced.noise_px, open_points[0])
+
+
+def solve(model: pycolmap.Reconstruction, refined: Collection[int] = ()) -> None:
+    """Adjust poses and points in place, on one thread: the order of sums over several threads is not fixed.
+
+    Args:
+        model: COLMAP's reconstruction.
+        refined: ids of the cameras whose focal is adjusted, too.
+    """
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.loss_function_scale = LOSS_SCALE_PX
+    options.ceres.solver_options.max_num_iterations = 50
+    options.ceres.solver_options.function_tolerance = 1e-5
+    options.ceres.solver_options.num_threads = 1
+    options.ceres.max_num_images_direct_sparse_cpu_solver = _choose_most_factored(model)
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in sorted(model.reg_image_ids()):
+        config.add_image(image_id)
+    options.refine_principal_point = options.refine_extra_params = False
+    for camera_id in sorted(photos_per_camera(model).keys() - set(refined)):
+        config.set_constant_cam_intrinsics(camera_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    run_in_daemon_thread(pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve)
+
+
+def _choose_most_factored(model: pycolmap.Reconstruction) -> int:
+    """Return up to how many photos COLMAP's solver is to factor the normal equations: all photos, or `MOST_TIED`."""
+    photos = sorted(model.reg_image_ids())
+    if len(photos) <= MOST_TIED:
+        return MOST_TIED
+    rows = {photo: row for row, photo in enumerate(photos)}
+    seen = [(rows[one.image_id], k) for k, (_, point) in enumerate(all_points(model)) for one in point.track.elements]
+    photo, point = np.array(seen, np.int64).reshape(-1, 2).T
+    return len(photos) if elimination_width(photo, point) <= MOST_TIED else MOST_TIED
+
+
+def improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph) -> int:
+    """Continue, merge and triangulate tracks, filter them, and return by how many observations their number changed.
+
+    Observations that are added and filtered again do not count: near the limits they come and go forever.
+
+    Args:
+        model: changed in place.
+        graph: of all matches.
+    """
+    before = model.compute_num_observations()
+    observations = pycolmap.ObservationManager(model, graph)
+    triangulator = pycolmap.IncrementalTriangulator(graph, model, observations)
+    options = pycolmap.IncrementalTriangulatorOptions()
+    triangulator.complete_all_tracks(options)
+    triangulator.merge_all_tracks(options)
+    triangulator.retriangulate(options)
+    observations.filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
+    return abs(int(model.compute_num_observations() - before))
+
+
+def lens_priors(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle, rules: Rules = NO_RULES) -> LensPriors:
+    """Return the priors of the cameras, before any evidence from the bundle.
+
+    Args:
+        model: has the photos and their sizes.
+        ids, bundle: from `read_bundle`.
+        rules: of some cameras, by id.
+    """
+    used = photos_per_camera(model)
+    sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)
+    many = np.array([used[camera_id] >= MIN_PHOTOS for camera_id in ids])
+    only_k1 = [[part.name == "k1" for part in PARTS[int(kind)]] for kind in bundle.family]
+    asked = (many[:, None] | np.array(only_k1).reshape(-1, COUNT)) & (bundle.family != PANORAMA)[:, None]
+    priors = LensPriors.from_cameras(bundle.params, bundle.family, sizes, asked)
+    return _apply_rules(priors, [rules.get(camera_id, NO_RULE) for camera_id in ids]) if rules else priors
+
+
+def _apply_rules(priors: LensPriors, rules: Sequence[CameraRule]) -> LensPriors:
+    """Return the priors with what the user laid down about each camera."""
+    asked, usual, choices = priors.asked.copy(), priors.usual.copy(), list(priors.choices)
+    for row, rule in enumerate(rules):
+        family = int(priors.family[row])
+        given, parts = rule.usual(family), rule.parts(family)
+        if given is not None:
+            usual[row] = given
+        if rule.kept:
+            asked[row] = False
+            choices[row] = priors.choices[row][:1]
+        elif parts is not None:
+            choices[row] = choices_of_model(parts, consistent_choices(family))
+            asked[row] = choices[row].any(axis=0)
+    fixed = np.array([rule.kept for rule in rules], np.bool_)
+    return replace(priors, asked=asked, usual=usual, choices=tuple(choices), fixed=fixed)
+
+
+# Which camera model the photos support: cameras tried as those of another family, and the ranking of all models.
 
 logger = logging.getLogger("sfm_app")
+
+OUTERMOST = 0.999
+"""Share of the observations that reach the radius up to which a lens is made like another: the rest may be wrong.
+Chosen by hand; not measured on its own."""
+MOST_COMPARED = 250
+"""Photos of a camera on which its families are compared, at even steps among all: each of them is adjusted several
+times. Chosen by hand."""
+RUNNERS_UP = 3
+"""Number of rivals of the same family in the manifest. Chosen by hand."""
+
+
+@dataclass(frozen=True, slots=True)
+class LensRecord:
+    """The model of a camera, and its rivals."""
+
+    chosen: LensChoice
+    file_model: str
+    """COLMAP's name of the model that it is written as."""
+    rivals: tuple[LensChoice, ...]
+    """The most probable other models, best first; their evidence is that which they lose against the chosen one."""
+    folding: bool
+    """Whether a more probable lens was refused, because it folds inside the photo."""
+
+    def to_dict(self) -> dict[str, Json]:
+        """Return plain values for the manifest."""
+        rivals: list[Json] = [
+            {"model": one.model, "free": list(one.free), "log_evidence_lost": round(one.log_evidence, 2)}
+            for one in self.rivals
+        ]
+        found: dict[str, Json] = {"model": self.chosen.model, "free": list(self.chosen.free), "file": self.file_model}
+        return found | {"runners_up": rivals} | ({"refused_as_folding": True} if self.folding else {})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Families:
+    """A model with cameras of the most probable families."""
+
+    model: pycolmap.Reconstruction
+    """The given one where no camera changes its family; else another, to be adjusted again."""
+    rivals: Mapping[int, LensChoice] = field(default_factory=dict)
+    """By camera id the model of the family that lost; its evidence is what it lost by."""
+
+
+def best_families(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules = NO_RULES) -> Families:
+    """Choose the better family for cameras that ask for the other one: what explains the observations better.
+
+    Both are adjusted to the same tracks.
+
+    Args:
+        model: adjusted; not changed.
+        rounds: the last rounds of its adjustment.
+        rules: of some cameras, by id; those that must be of a family are not tried as another.
+    """
+    rivals = {}
+    for row, camera_id in enumerate(rounds.ids):
+        family, params = int(rounds.bundle.family[row]), rounds.found.params[row]
+        reach, best = _observed_reach(rounds.bundle, row), rounds.found.ranking[row][0]
+        many = np.count_nonzero(rounds.bundle.camera == row) >= MIN_PHOTOS
+        is_open = many and rules.get(camera_id, NO_RULE).family is None
+        asks = is_open and asks_for_other_family(params, family, reach, best, bool(rounds.found.folding[row]))
+        other = convert_lens(params, family, reach) if asks else None
+        if other is None:
+            continue
+        photos = _spread_photos(model, camera_id)
+        part = model if photos is None else submodel(model, photos)
+        trial, same = pycolmap.Reconstruction(part), pycolmap.Reconstruction(part)
+        write_camera(trial.cameras[camera_id], other, FISHEYE if family == PERSPECTIVE else PERSPECTIVE)
+        try:
+            adjust_in_rounds(same, None, rules)
+            adjust_in_rounds(trial, None, rules)
+        except FAILURES as err:
+            logger.info("camera %d is not tried as another: %s", camera_id, error_reason(err))
+            continue
+        (kept, choice), (gained, rival) = _compare(same, trial, camera_id, rules)
+        if gained > kept:
+            model = trial if part is model else _with_camera(model, trial.cameras[camera_id])
+            choice, rival = rival, choice
+        rivals[camera_id] = replace(rival, log_evidence=abs(gained - kept))
+    return Families(model, rivals)
+
+
+def _spread_photos(model: pycolmap.Reconstruction, camera_id: int) -> list[int] | None:
+    """Return photos of a camera at even steps among all of them; None where all photos of the model are few."""
+    if model.num_reg_images() <= MOST_COMPARED:
+        return None
+    own = sorted(image.image_id for image in posed_images(model) if image.camera_id == camera_id)
+    return own[:: -(-len(own) // MOST_COMPARED)]
+
+
+def _with_camera(model: pycolmap.Reconstruction, camera: pycolmap.Camera) -> pycolmap.Reconstruction:
+    """Return a copy of a model with the lens of another model's camera."""
+    copy = pycolmap.Reconstruction(model)
+    own = copy.cameras[camera.camera_id]
+    own.model, own.params = camera.model, camera.params.tolist()
+    return copy
+
+
+def _compare(
+    first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, camera_id: int, rules: Rules
+) -> tuple[tuple[float, LensChoice], ...]:
+    """Return the evidence and the best model of a camera in two models with the same tracks."""
+    read = [(model, *read_bundle(model, rules)) for model in (first, second)]
+    reduced = [reduce(bundle, LOSS_SCALE_PX) for _, _, bundle in read]
+    noise_px = min(one.noise_px for one in reduced)
+    found = []
+    for (model, ids, bundle), system in zip(read, reduced, strict=True):
+        priors = lens_priors(model, ids, bundle, rules)
+        ranking = estimate_lenses(bundle.params, replace(system, noise_px=noise_px), priors).ranking
+        best = ranking[ids.index(camera_id)][0]
+        found.append((family_evidence(cost(bundle, LOSS_SCALE_PX), noise_px, best), best))
+    return tuple(found)
+
+
+def record_lenses(
+    model: pycolmap.Reconstruction, rounds: Rounds, others: Mapping[int, LensChoice]
+) -> dict[int, LensRecord]:
+    """Return the chosen model of each camera and its rivals, by camera id.
+
+    Args:
+        model: adjusted.
+        rounds: the last rounds of its adjustment.
+        others: rivals of the other family, from `best_families`.
+    """
+    found = {}
+    for row, camera_id in enumerate(rounds.ids):
+        best, *rest = rounds.found.ranking[row]
+        rivals = [replace(one, log_evidence=best.log_evidence - one.log_evidence) for one in rest]
+        rivals = rivals[:RUNNERS_UP] + ([others[camera_id]] if camera_id in others else [])
+        rivals.sort(key=lambda one: one.log_evidence)
+        name = model.cameras[camera_id].model.name
+        found[camera_id] = LensRecord(best, name, tuple(rivals), bool(rounds.found.folding[row]))
+    return found
+
+
+def _observed_reach(bundle: Bundle, row: int) -> float:
+    """Return the radius of the outermost observations of a camera, in focal lengths."""
+    params = bundle.params[row]
+    x = bundle.x[bundle.camera[bundle.photo] == row]
+    about = (x - params[[CX, CY]]) / params[[FX, FY]]
+    return float(np.quantile(np.hypot(*about.T), OUTERMOST)) if len(x) else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""COLMAP's SQLite database: write photos, cameras and relative poses, read keypoints and matches."""
+"""SIFT descriptors from COLMAP's database."""
 
 import contextlib
 import ctypes
@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.camera.models import guessed_camera_matrix, model_of_calibration
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.geometry.epipolar import cross_matrix
-from sfm_app.geometry.lenses.camera_models import model_of_calibration
 from sfm_app.types import (
     Calibration,
     Intrinsics,
@@ -24,8 +23,10 @@ from sfm_app.types import (
     PhotoSet,
     PoseGraph,
     RelativePose,
-)  # fmt: skip
-from sfm_app.types.calibration import EQUIRECTANGULAR, FISHEYE
+)
+from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE
+
+# COLMAP's SQLite database: write photos, cameras and relative poses, read keypoints and matches.
 
 SQUARE_PIXELS = "SIMPLE_RADIAL"
 """f, cx, cy, k: the model used in mapping where K has one focal; a second radial term diverges on the first photos."""
@@ -363,3 +364,24 @@ def _two_view_geometry(pose: RelativePose, matches: NDArray[np.uint32]) -> pycol
     geometry.tri_angle = float(np.radians(pose.angle_deg))
     geometry.inlier_matches = np.ascontiguousarray(matches[pose.inliers])
     return geometry
+
+
+def largest_descriptors(path: Path, photo: int, most: int) -> NDArray[np.uint8]:
+    """Return (N, 128) descriptors of a photo, those of the largest features first; none where it has none.
+
+    Args:
+        path: database file.
+        photo: id.
+        most: number of descriptors.
+    """
+    with open_database(path) as database:
+        if not database.exists_descriptors(photo):
+            return np.zeros((0, 128), np.uint8)
+        descriptors = _values(database.read_descriptors(photo))
+        shapes = np.asarray(database.read_keypoints(photo), np.float64)[:, 2:]
+    areas = np.abs(shapes[:, 0] * shapes[:, 3] - shapes[:, 1] * shapes[:, 2])
+    return descriptors[np.argsort(-areas, kind="stable")[:most]]
+
+
+def _values(descriptors: pycolmap.FeatureDescriptors) -> NDArray[np.uint8]:
+    return np.asarray(descriptors.data, np.uint8).reshape(-1, 128)

@@ -1,8 +1,9 @@
-"""COLMAP's dense workspace: undistorted photos, depth and normal maps."""
+"""A photo beside its depth map, read by name: a report needs no more of a dense workspace."""
 
 import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from math import ceil
 from pathlib import Path
 
 import cv2
@@ -10,14 +11,98 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import check_written, pycolmap, translate_errors
-from sfm_app.colmap.masks import used_pixels
-from sfm_app.colmap.processes.worker_process import UndistortTask, run_worker
 from sfm_app.colmap.types import all_images
-from sfm_app.hashing import digest_files, is_below
+from sfm_app.colmap.worker_process import UndistortTask, run_worker
+from sfm_app.files import digest_files, is_below
 from sfm_app.operating_system import replace_file
+from sfm_app.photos import mask_path, read_mask, save_mask
 from sfm_app.progress import Progress
-from sfm_app.settings.tables import MOST_LEVELS
+from sfm_app.settings import MOST_LEVELS
 from sfm_app.stereo import DepthEstimate, DepthMap, Kind, View
+from sfm_app.types.arrays import BoolArray
+
+# Masks in COLMAP's dense workspace: undistorted, at the size of the photos there.
+
+MASKS = "masks"
+REACH_PX = 2
+"""Width of the border around masked pixels that is not used either: colors are interpolated between four pixels, at
+most half a pixel aside."""
+
+
+class MaskUndistorter:
+    """Writes masks of undistorted photos; on its way to another process, it is the paths of its inputs.
+
+    Args:
+        model_dir: model with the cameras of the photos.
+        mask_dir: masks of the original photos.
+        dense_dir: workspace with the undistorted photos.
+    """
+
+    def __init__(self, model_dir: Path, mask_dir: Path, dense_dir: Path) -> None:
+        self._inputs = model_dir, mask_dir, dense_dir
+        with translate_errors("reading the model"):
+            model = pycolmap.Reconstruction(model_dir)
+            self._cameras = {image.name: model.cameras[image.camera_id] for image in all_images(model)}
+
+    def __reduce__(self) -> tuple[type["MaskUndistorter"], tuple[Path, Path, Path]]:
+        return MaskUndistorter, self._inputs
+
+    def __call__(self, view: View) -> None:
+        """Write the mask of an undistorted photo."""
+        _, mask_dir, dense_dir = self._inputs
+        used = _undistort_mask(read_mask(mask_dir, view.name), self._cameras[view.name], view)
+        save_mask(dense_dir / MASKS, view.name, used)
+
+
+def has_masks(dense_dir: Path) -> bool:
+    """Return whether any undistorted photo has a mask.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+    """
+    return (dense_dir / MASKS).is_dir()
+
+
+def used_pixels(dense_dir: Path, view: View) -> BoolArray | None:
+    """Return (H, W) which pixels of an undistorted photo may be used; None if it has no mask.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        view: an undistorted photo.
+    """
+    place = dense_dir / MASKS
+    return read_mask(place, view.name) if mask_path(place, view.name).exists() else None
+
+
+def _undistort_mask(used: BoolArray, camera: pycolmap.Camera, view: View) -> BoolArray:
+    """Return (H, W) the mask of an undistorted photo: a pixel is used if all original pixels under it are."""
+    x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(view.K).T
+    with translate_errors(f"undistorting the mask of {view.name}"):
+        at = np.floor(camera.img_from_cam(rays)).astype(np.int64).reshape(view.height, view.width, 2)
+    col, row = at[..., 0], at[..., 1]
+    height, width = used.shape
+    inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
+    whole = _erode(used, ceil(max(camera.focal_length_x / view.K[0, 0], camera.focal_length_y / view.K[1, 1])))
+    return shrink_mask(inside & whole[row.clip(0, height - 1), col.clip(0, width - 1)])
+
+
+def shrink_mask(used: BoolArray) -> BoolArray:
+    """Return the mask of an undistorted photo without its border, where colors are mixed.
+
+    Args:
+        used: (H, W) which pixels may be used.
+    """
+    return _erode(used, REACH_PX)
+
+
+def _erode(used: BoolArray, reach: int) -> BoolArray:
+    """Return the mask without pixels that have an unused one within `reach` pixels."""
+    square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    return np.asarray(cv2.erode(used.view(np.uint8), square)) > 0
+
+
+# COLMAP's dense workspace: undistorted photos, depth and normal maps.
 
 DEPTHS, NORMALS, CONFIDENCES = "depth_maps", "normal_maps", "confidence_maps"
 MASKED = -1.0
@@ -49,7 +134,7 @@ def undistort(
         "workers": workers,
         "output": "COLMAP",
     }
-    run_worker("sfm_app.colmap.processes.undistort_process", task, "undistorting photos", progress)
+    run_worker("sfm_app.colmap.undistort_process", task, "undistorting photos", progress)
 
 
 def read_views(dense_dir: Path) -> list[View]:
@@ -329,3 +414,27 @@ def _atomic_path(target: Path) -> Iterator[Path]:
     yield beside
     check_written(beside)
     replace_file(beside, target)
+
+
+def read_photo_and_depth(dense_dir: Path, name: str) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Return the undistorted photo (H, W, 3) RGB and its confirmed depths (H, W), <= 0 where there is none.
+
+    Args:
+        dense_dir: dense workspace.
+        name: of the undistorted photo.
+
+    Raises:
+        ValueError: the name leads out of the workspace, or the photo is none.
+        OSError: the photo is not there.
+        BackendError: the depth map cannot be read.
+    """
+    if not is_below(name):
+        raise ValueError(f"{name} does not lie in {dense_dir}")
+    # imdecode, because OpenCV does not open names beyond ASCII on every system
+    image = cv2.imdecode(np.fromfile(dense_dir / "images" / name, np.uint8), cv2.IMREAD_COLOR_RGB)
+    if image is None:
+        raise ValueError(f"{name} is no photo")
+    with translate_errors(f"reading the depth map of {name}"):
+        stored = pycolmap.DepthMap()
+        stored.read(dense_dir / "stereo" / "depth_maps" / f"{name}.geometric.bin")
+    return np.asarray(image, np.uint8), np.array(stored.to_array(), np.float32)

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from sfm_app.colmap.backend import check_written, pycolmap
 from sfm_app.colmap.database import SQUARE_PIXELS
-from sfm_app.colmap.processes.worker_process import GlobalMappingTask, MappingTask, start_worker
 from sfm_app.colmap.types import Cancellation, all_cameras
+from sfm_app.colmap.worker_process import GlobalMappingTask, MappingTask, start_worker
 
 LOCAL_GAIN, GLOBAL_GAIN, GLOBAL_REFINEMENT = 1e-3, 1e-4, 1.3
 """An adjustment ends at a step that lowers its cost by less than this share: local and global adjustments. Third, the
@@ -93,7 +93,7 @@ def map_globally(
         "seed": seed,
         "names": list(names),
     }
-    return _map_in_process("sfm_app.colmap.processes.global_mapping", task, "mapping all photos at once", token)
+    return _map_in_process("sfm_app.colmap.global_mapping", task, "mapping all photos at once", token)
 
 
 def map_with_colmap_defaults(
@@ -108,7 +108,7 @@ def map_with_colmap_defaults(
         scratch, seed, token: as in `map_globally`.
     """
     task: MappingTask = {"scratch": str(scratch), "photos": str(photo_dir), "seed": seed}
-    return _map_in_process("sfm_app.colmap.processes.baseline_mapping", task, "mapping photos by its defaults", token)
+    return _map_in_process("sfm_app.colmap.baseline_mapping", task, "mapping photos by its defaults", token)
 
 
 def _map_in_process(module: str, task: MappingTask, doing: str, token: Cancellation) -> pycolmap.Reconstruction | None:

@@ -8,7 +8,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import translate_errors
-from sfm_app.colmap.processes.worker_process import FuseTask, PoissonTask, SimplifyTask, run_worker
+from sfm_app.colmap.worker_process import FuseTask, PoissonTask, SimplifyTask, run_worker
 from sfm_app.types import Surface
 
 FUSED = "fused.ply"
@@ -41,7 +41,7 @@ def fuse(
         "box": box.tolist(),
         "cache_gb": cache_gb,
     }
-    run_worker("sfm_app.colmap.processes.surface_process", task, "fusing depth maps")
+    run_worker("sfm_app.colmap.surface_process", task, "fusing depth maps")
     target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # which photos see which point; not used
 
 
@@ -122,7 +122,7 @@ def poisson_surface(folder: Path, depth: int) -> Surface:
         "target": str(path),
         "depth": max(depth, MIN_DEPTH),
     }
-    run_worker("sfm_app.colmap.processes.surface_process", task, "finding the surface")
+    run_worker("sfm_app.colmap.surface_process", task, "finding the surface")
     surface = _read(path)
     path.unlink()
     return surface
@@ -151,7 +151,7 @@ def simplify(surface: Surface, most: int, max_error: float, scratch: Path, threa
         "max_error": max_error,
         "threads": threads,
     }
-    run_worker("sfm_app.colmap.processes.surface_process", task, "simplifying the surface")
+    run_worker("sfm_app.colmap.surface_process", task, "simplifying the surface")
     simple = _read(found)
     given.unlink()
     found.unlink()

@@ -8,19 +8,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.atomic_io import replace_atomically
+from sfm_app.camera.perspective_views import PerspectiveView, cover_rays
+from sfm_app.camera.projection import FISHEYE, FX, PANORAMA, SEEN_ANGLE, image_points
 from sfm_app.colmap.backend import pycolmap, translate_errors
-from sfm_app.colmap.bundles.bundle_arrays import camera_family, read_camera
-from sfm_app.colmap.masks import MASKS, shrink_mask
-from sfm_app.colmap.processes.undistort_process import JPEG_QUALITY
+from sfm_app.colmap.bundle import camera_family, read_camera
+from sfm_app.colmap.dense import MASKS, shrink_mask
 from sfm_app.colmap.types import all_images
-from sfm_app.geometry.lenses.perspective_views import PerspectiveView, cover_rays
-from sfm_app.geometry.lenses.projections import FISHEYE, FX, PANORAMA, SEEN_ANGLE, image_points
+from sfm_app.colmap.undistort_process import JPEG_QUALITY
+from sfm_app.files import replace_atomically
 from sfm_app.photos import read_mask, save_mask
-from sfm_app.photos.resample import resample, shrink
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from sfm_app.photos.panoramas import resample, shrink
+from sfm_app.types.arrays import BoolArray, FloatArray
 
 MOST_LOST = 0.1
 """Largest share of a photo that one undistorted photo may lose. By definition."""

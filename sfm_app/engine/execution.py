@@ -1,35 +1,130 @@
 """The loop that runs stages: it skips what is up to date, redoes what is damaged and records everything."""
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 
+import psutil
+
 from sfm_app.colmap.backend import check_written
-from sfm_app.engine.growth import find_earlier, forget_earlier, set_aside
-from sfm_app.engine.run_log import log_to_file
-from sfm_app.engine.stage import Product, Products, Stage
-from sfm_app.engine.staleness import (
+from sfm_app.engine.incremental import find_earlier, forget_earlier, set_aside
+from sfm_app.engine.stage import (
     PHOTOS_CHANGED,
+    Product,
+    Products,
+    Stage,
     manifest_head,
     rerun_reason,
     settings_and_versions,
     stage_fingerprint,
 )
-from sfm_app.engine.usage import measure_usage
 from sfm_app.engine.warm_up import warming_up
 from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError
-from sfm_app.hashing import fingerprint
+from sfm_app.files import fingerprint
+from sfm_app.operating_system import ChildTimes, cpu_seconds
 from sfm_app.photos import Source
-from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.context import Earlier, RunContext
 from sfm_app.runtime.cost_estimate import choose_plan
-from sfm_app.runtime.earlier import Earlier
-from sfm_app.runtime.manifest import StageRecord
 from sfm_app.runtime.parallel import cpu_seconds_elsewhere
+from sfm_app.runtime.workspace import StageRecord
 from sfm_app.types import PhotoSet
 
+# The log in the output folder.
+
 logger = logging.getLogger("sfm_app")
+LOGGERS = (logger, logging.getLogger("py.warnings"))
+"""Those written to the log; the program sends warnings of Python to the second."""
+
+
+class LogFile(logging.FileHandler):
+    """A log file that ignores write errors: the run itself reports a full disk."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Do nothing: the run itself reports a full disk."""
+
+
+@contextmanager
+def log_to_file(run: RunContext) -> Iterator[None]:
+    """Keep a log in the output folder, with the traceback of whatever ends the run."""
+    handler = LogFile(run.workspace.log, encoding="utf-8", errors="backslashreplace")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
+    for each in LOGGERS:
+        each.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    except BaseException:
+        logger.exception("the run ended here")
+        raise
+    finally:
+        for each in LOGGERS:
+            each.removeHandler(handler)
+        handler.close()
+
+
+# Seconds, CPU seconds and memory of a stage, with the processes that it starts.
+
+EVERY_S = 0.5
+"""Time between two looks at the memory, in seconds. Chosen by hand: a look takes some milliseconds."""
+MEGA = 1e6
+
+
+@dataclass(slots=True)
+class Usage:
+    """What a piece of work has used; complete once it has ended."""
+
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    """Of this process, of those that it has waited for, and of the workers of a cluster."""
+    peak_mb: int = 0
+    """Most resident memory at any look; pages that processes share count for each of them."""
+
+
+@contextmanager
+def measure_usage(elsewhere: Callable[[], float] = float) -> Iterator[Usage]:
+    """Measure the work within the block.
+
+    Args:
+        elsewhere: returns the CPU seconds so far of processes that work for this one without being waited for.
+    """
+    used, ended, children = Usage(), threading.Event(), ChildTimes()
+    start, cpu_start = time.perf_counter(), cpu_seconds() + elsewhere()
+    watcher = threading.Thread(target=_watch_memory, args=(used, children, ended), name="memory", daemon=True)
+    watcher.start()
+    try:
+        yield used
+    finally:
+        ended.set()
+        watcher.join()
+        used.peak_mb = max(used.peak_mb, _resident_mb(children))
+        used.seconds = time.perf_counter() - start
+        used.cpu_seconds = cpu_seconds() + children.seconds() + elsewhere() - cpu_start
+
+
+def _watch_memory(used: Usage, children: ChildTimes, ended: threading.Event) -> None:
+    while True:
+        used.peak_mb = max(used.peak_mb, _resident_mb(children))
+        if ended.wait(EVERY_S):
+            return
+
+
+def _resident_mb(times: ChildTimes) -> int:
+    """Return the memory of this process and of its children in MB, and note the time of the latter."""
+    me = psutil.Process()
+    command, total, children = me.cmdline(), int(me.memory_info().rss), me.children(recursive=True)
+    times.look(children)
+    for process in children:
+        try:
+            # until a child runs a program of its own, its memory is ours
+            if process.cmdline() not in ([], command):
+                total += process.memory_info().rss
+        except psutil.Error:  # it has ended meanwhile
+            continue
+    return round(total / MEGA)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,9 +11,9 @@ from statistics import median
 from typing import Literal
 
 from sfm_app.errors import ReconstructionError
-from sfm_app.posegraph.groups import connected_groups
-from sfm_app.ransac.degeneracy.watermark import ONLY_A_LOGO, SAME_PHOTO
-from sfm_app.ransac.estimate import count_matches_off_plane
+from sfm_app.fundamental.degeneracy import ONLY_A_LOGO, SAME_PHOTO
+from sfm_app.fundamental.estimate import count_matches_off_plane
+from sfm_app.posegraph.rotations import connected_groups
 from sfm_app.settings import EpipolarSettings, MatchSettings
 from sfm_app.types import MatchedImage, MatchGraph, PairId, ViewGraph
 

@@ -2,17 +2,20 @@
 
 from functools import partial
 
+from sfm_app.formats.clouds import write_cloud_ply, write_laz
 from sfm_app.formats.draco import write_draco
 from sfm_app.formats.exporters import CLOUD, Exporter, SceneExporter, missing_package
-from sfm_app.formats.glb import write_glb
-from sfm_app.formats.obj import write_obj
-from sfm_app.formats.ply import write_ply
-from sfm_app.formats.scenes.cameras import write_cameras
-from sfm_app.formats.scenes.clouds import write_cloud_ply, write_laz
-from sfm_app.formats.scenes.colmap_folder import write_bundler, write_colmap, write_colmap_text, write_splat
-from sfm_app.formats.scenes.nerfstudio import write_nerfstudio
-from sfm_app.formats.scenes.opencv import write_opencv
-from sfm_app.formats.stl import write_stl
+from sfm_app.formats.gltf import write_glb
+from sfm_app.formats.meshes import write_obj, write_ply, write_stl
+from sfm_app.formats.scenes import (
+    write_bundler,
+    write_cameras,
+    write_colmap,
+    write_colmap_text,
+    write_nerfstudio,
+    write_opencv,
+    write_splat,
+)
 from sfm_app.formats.usd import write_usd, write_usdz
 
 _no_usd = partial(missing_package, "usd-core", "pxr")

@@ -11,10 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.formats.checks import check
-from sfm_app.formats.glb import UNLIT, add_page_material, add_unlit_material, linear_colors, write_glb
-from sfm_app.formats.gltf import Glb
-from sfm_app.formats.pages import pages_in_use, split_corners
+from sfm_app.formats.exporters import check, pages_in_use, split_corners
+from sfm_app.formats.gltf import UNLIT, Glb, add_page_material, add_unlit_material, linear_colors, write_glb
 from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Model, Texture
 

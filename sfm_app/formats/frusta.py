@@ -4,9 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.types import Frustum, Model
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
+from sfm_app.types.arrays import FloatArray, IndexArray
 
 CAMERA_COLOR = (255, 96, 32)
 """sRGB of the cameras: an orange that walls, trees and skies do not have."""

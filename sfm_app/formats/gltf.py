@@ -1,11 +1,29 @@
-"""The container of binary glTF 2.0 (ISO/IEC 12113): a JSON tree, followed by one buffer of arrays."""
+"""Binary glTF 2.0: one file that web viewers, game engines and Blender open.
+
+Photographed colors already contain the lighting, and a viewer that lights them again makes one side darker and the
+other paler. So the material is KHR_materials_unlit: three.js, Babylon.js, model-viewer, Blender and others show the
+original colors. Viewers without the extension show a rough, matte surface, lit by means of the normals, which also
+allow relighting. The extension is not listed as required, so no viewer has to refuse the file. Without a material,
+viewers would use glTF's default, which is metallic and looks black.
+
+Unlit materials ignore normal maps, so a model with one is lit: rough, without metal, with the frame of the map at each
+vertex.
+"""
 
 import json
 import struct
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sfm_app.formats.exporters import NORMAL_TYPE, check, jpeg, normal_picture, pages_in_use, split_corners
+from sfm_app.formats.frusta import CAMERA_COLOR, camera_lines, center, frustum_depth
+from sfm_app.geometry.triangles import corner_tangents, unit_normals
+from sfm_app.types import Frustum, Model, Texture
+
+# The container of binary glTF 2.0 (ISO/IEC 12113): a JSON tree, followed by one buffer of arrays.
 
 MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 VERTICES, INDICES = 34962, 34963
@@ -80,3 +98,186 @@ class Glb:
         size = 12 + 8 + len(text) + 8 + self._length
         head = struct.pack("<IIIII", MAGIC, VERSION, size, len(text), JSON_CHUNK)
         return b"".join([head, text, struct.pack("<II", self._length, BINARY_CHUNK), *self._parts])
+
+
+UNLIT = "KHR_materials_unlit"
+POINTS, LINES = 0, 1
+LINEAR, MIPMAPS, CLAMPED = 9729, 9987, 33071
+
+FLIP = np.diag([1.0, -1.0, -1.0])
+"""COLMAP's camera looks along +z with y down, glTF's camera along -z with y up."""
+
+
+def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
+    """Write triangles with a texture or a color per vertex, or else points; and the cameras, if any.
+
+    Args:
+        model: what to write.
+        name: of the file, without suffix; also of the node in it.
+
+    Returns:
+        One file.
+
+    Raises:
+        ReconstructionError: the model is empty or not finite.
+    """
+    check(model)
+    texture = model.texture if len(model.surface.faces) else None
+    is_lit = texture is not None and bool(texture.normal_maps)
+    glb = Glb(**({} if is_lit and not model.cameras else {"extensionsUsed": [UNLIT]}), scene=0)
+    if texture is not None:
+        primitives = add_textured_primitives(glb, model, texture)
+    else:
+        primitives = [add_colored_primitive(glb, model)]
+    mesh = glb.add("meshes", {"name": name, "primitives": primitives})
+    nodes = [glb.add("nodes", {"name": name, "mesh": mesh})]
+    if model.cameras:
+        nodes += add_cameras(glb, model)
+    glb.add("scenes", {"name": name, "nodes": nodes})
+    return {f"{name}.glb": glb.to_bytes()}
+
+
+def add_textured_primitives(glb: Glb, model: Model, texture: Texture) -> list[dict[str, Any]]:
+    """Add an image and a material per page, and return one primitive for each.
+
+    Args:
+        glb: the file; it gets images, materials and vertices.
+        model: with its surface.
+        texture: of the model.
+    """
+    surface, normals = model.surface, unit_normals(model.surface)
+    at_corners, primitives = texture.uv, []
+    if texture.normal_maps:
+        tangents = corner_tangents(surface.vertices, normals, surface.faces, texture.uv, texture.page)
+        at_corners = np.concatenate([texture.uv, tangents], axis=2)
+    for page in pages_in_use(texture.page):
+        here = texture.page == page
+        old, values, faces = split_corners(surface.faces[here], at_corners[here])
+        material = add_page_material(glb, texture, page)
+        attributes = add_geometry(glb, surface.vertices[old], normals[old])
+        attributes["TEXCOORD_0"] = glb.add_vertices(values[:, :2])
+        if texture.normal_maps:
+            attributes["TANGENT"] = glb.add_vertices(values[:, 2:])
+        primitives.append({"attributes": attributes, "indices": glb.add_indices(faces, len(old)), "material": material})
+    return primitives
+
+
+def add_page_material(glb: Glb, texture: Texture, page: int) -> int:
+    """Add a page of texture, its normal map if it has one, and its material, and return the material's number.
+
+    Args:
+        glb: the file; its first page adds the sampler that all share.
+        texture: has the page.
+        page: its number.
+    """
+    if not glb.tree.get("samplers"):
+        glb.add("samplers", {"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED})
+    name = f"page {page}"
+    color = {"index": _add_picture(glb, name, "image/jpeg", jpeg(texture.pages[page]))}
+    if not texture.normal_maps:
+        return add_unlit_material(glb, name, baseColorTexture=color)
+    relief = _add_picture(glb, f"normals {page}", NORMAL_TYPE, normal_picture(texture.normal_maps[page]))
+    return glb.add("materials", _matte_material(name, baseColorTexture=color) | {"normalTexture": {"index": relief}})
+
+
+def _add_picture(glb: Glb, name: str, kind: str, data: bytes) -> int:
+    """Add an image and its texture, and return the number of the texture."""
+    image = glb.add("images", {"name": name, "mimeType": kind, "bufferView": glb.add_view(data)})
+    return glb.add("textures", {"sampler": 0, "source": image})
+
+
+def add_colored_primitive(glb: Glb, model: Model) -> dict[str, Any]:
+    """Add triangles, or points if there are none, with a color per vertex, and return the primitive.
+
+    Args:
+        glb: the file; it gets a material and vertices.
+        model: with a color per vertex.
+    """
+    surface = model.surface
+    normals = unit_normals(surface) if len(surface.faces) else None
+    attributes = add_geometry(glb, surface.vertices, normals) | {
+        "COLOR_0": glb.add_vertices(linear_colors(surface.colors))
+    }
+    primitive = {"attributes": attributes, "material": add_unlit_material(glb, "colors")}
+    if normals is None:
+        return primitive | {"mode": POINTS}
+    return primitive | {"indices": glb.add_indices(surface.faces, len(surface.vertices))}
+
+
+def add_geometry(glb: Glb, vertices: NDArray[np.float64], normals: NDArray[np.float64] | None) -> dict[str, int]:
+    """Add positions and normals of vertices; return the accessors' numbers by attribute.
+
+    Args:
+        glb: the file.
+        vertices: (V, 3).
+        normals: (V, 3) unit vectors, or None.
+    """
+    attributes = {"POSITION": glb.add_vertices(vertices.astype(np.float32), bounds=True)}
+    return attributes if normals is None else attributes | {"NORMAL": glb.add_vertices(normals.astype(np.float32))}
+
+
+def add_unlit_material(glb: Glb, name: str, **base: Any) -> int:
+    """Add an unlit material and return its number.
+
+    It is double-sided, because both sides of an open surface can be seen.
+
+    Args:
+        glb: the file.
+        name: of the material.
+        **base: color or texture, as in glTF's pbrMetallicRoughness.
+    """
+    return glb.add("materials", _matte_material(name, **base) | {"extensions": {UNLIT: {}}})
+
+
+def _matte_material(name: str, **base: Any) -> dict[str, Any]:
+    rough = {**base, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    return {"name": name, "doubleSided": True, "pbrMetallicRoughness": rough}
+
+
+def linear_colors(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return linear light in [0, 1] of 8-bit sRGB colors, same shape (IEC 61966-2-1).
+
+    glTF requires linear vertex colors, while photos are sRGB. Values are floats, because 8 linear bits show steps in
+    the shadows, and not every reader supports 16 bits.
+    """
+    value = np.arange(256) / 255.0
+    light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return light.astype(np.float32)[colors]
+
+
+def add_cameras(glb: Glb, model: Model) -> list[int]:
+    """Add the cameras twice: as lines that every viewer draws, and as glTF cameras to look through.
+
+    Args:
+        glb: the file.
+        model: with its cameras, at least one.
+
+    Returns:
+        The numbers of their nodes.
+    """
+    corners, lines = camera_lines(model)
+    color = linear_colors(np.array(CAMERA_COLOR, np.uint8))
+    material = add_unlit_material(glb, "cameras", baseColorFactor=[*(round(float(part), 6) for part in color), 1.0])
+    primitive = {
+        "attributes": add_geometry(glb, corners, None),
+        "indices": glb.add_indices(lines, len(corners)),
+        "mode": LINES,
+        "material": material,
+    }
+    mesh = glb.add("meshes", {"name": "cameras", "primitives": [primitive]})
+    nodes = [glb.add("nodes", {"name": "cameras", "mesh": mesh})]
+    near = 0.1 * frustum_depth(np.array([center(camera) for camera in model.cameras]), model.surface.vertices)
+    return nodes + [glb.add("nodes", _camera_node(glb, camera, near)) for camera in model.cameras]
+
+
+def _camera_node(glb: Glb, camera: Frustum, near: float) -> dict[str, Any]:
+    """Add a glTF camera at the photo's pose and return its node; its principal point is central, as glTF requires."""
+    lens = {
+        "yfov": float(2 * np.arctan(camera.height / (2 * camera.K[1, 1]))),
+        "aspectRatio": float(camera.width / camera.K[0, 0] * camera.K[1, 1] / camera.height),
+        "znear": near,
+    }
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = camera.cam_from_world[:, :3].T @ FLIP, center(camera)
+    number = glb.add("cameras", {"name": camera.name, "type": "perspective", "perspective": lens})
+    return {"name": camera.name, "camera": number, "matrix": matrix.T.ravel().tolist()}

@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.formats.checks import check
+from sfm_app.formats.exporters import NORMAL_SUFFIX, check, jpeg, normal_picture, pages_in_use
 from sfm_app.formats.frusta import center, frustum_depth
-from sfm_app.formats.glb import FLIP, linear_colors
-from sfm_app.formats.pages import NORMAL_SUFFIX, jpeg, normal_picture, pages_in_use
+from sfm_app.formats.gltf import FLIP, linear_colors
 from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Frustum, Model, Surface, Texture
 

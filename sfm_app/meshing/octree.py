@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from sfm_app.types.arrays import FloatArray
 
 LEAST_POINTS = 1.5
 """Smallest mean number of points in an occupied cell: finer cells, most with one point, would only model noise, with

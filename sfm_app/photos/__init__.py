@@ -1,8 +1,7 @@
 """Read folders of photos and videos: which files and frames are usable photos, and their metadata."""
 
-from sfm_app.photos.camera_groups import group_by_camera, split_by_given_camera
 from sfm_app.photos.decode import UnreadableError, read_picture, upright_image
-from sfm_app.photos.files import list_files, resolve_file
+from sfm_app.photos.files import is_video, list_files, read_head, resolve_file
 from sfm_app.photos.masks import (
     MASK_HINT,
     fill_masked,
@@ -14,17 +13,10 @@ from sfm_app.photos.masks import (
     save_mask,
     unused_masks,
 )
-from sfm_app.photos.probe import read_photo
-from sfm_app.photos.selection.duplicates import drop_duplicates
-from sfm_app.photos.selection.quality_filter import drop_unusable
-from sfm_app.photos.selection.stats_file import read_stats, write_stats
-from sfm_app.photos.selection.thumbnail_stats import PhotoStats
-from sfm_app.photos.source import Source, read_source
-from sfm_app.photos.staging import assign_names, is_laid_out, lay_out
-from sfm_app.photos.video.feature_tracking import CornerTracker, TrackedFrame
-from sfm_app.photos.video.keyframe_selection import select_keyframes
-from sfm_app.photos.video.video_formats import is_video, read_head
-from sfm_app.photos.video.video_reader import open_video
+from sfm_app.photos.probe import group_by_camera, read_photo, split_by_given_camera
+from sfm_app.photos.selection import PhotoStats, drop_duplicates, drop_unusable, read_stats, write_stats
+from sfm_app.photos.source import Source, assign_names, is_laid_out, lay_out, read_source
+from sfm_app.photos.video import CornerTracker, TrackedFrame, open_video, select_keyframes
 
 __all__ = [
     "MASK_HINT",

@@ -15,19 +15,16 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sfm_app.errors import InputError
-from sfm_app.photos.decode import UnreadableError, read_picture, rotate_to_sensor, undo_exif_orientation
-from sfm_app.photos.exif import orientation
+from sfm_app.photos.decode import UnreadableError, orientation, read_picture, rotate_to_sensor, undo_exif_orientation
 from sfm_app.photos.files import list_files, resolve_file
 from sfm_app.types import Photo, UnusablePhoto
+from sfm_app.types.arrays import BoolArray
 
 ENDING = ".png"
 MASK_HINT = "the mask of sub/a.jpg is sub/a.jpg.png or sub/a.png in the folder of masks, of the size of the photo"
 WHITE = 255
 FIRST_SIDEWAYS = 5
 """EXIF orientations from this value on swap width and height."""
-
-BoolImage = NDArray[np.bool_]
-"""(H, W)."""
 
 
 def list_masks(masks: Path, photos: Path, out: Path) -> list[str]:
@@ -110,7 +107,7 @@ def mask_path(target: Path, name: str) -> Path:
     return target / f"{name}{ENDING}"
 
 
-def save_mask(target: Path, name: str, used: BoolImage) -> None:
+def save_mask(target: Path, name: str, used: BoolArray) -> None:
     """Write the usable pixels of a photo as a black and white mask.
 
     Args:
@@ -123,7 +120,7 @@ def save_mask(target: Path, name: str, used: BoolImage) -> None:
     Image.fromarray(_to_uint8(used)).save(place, "PNG", compress_level=1)
 
 
-def read_mask(target: Path, name: str) -> BoolImage:
+def read_mask(target: Path, name: str) -> BoolArray:
     """Read the (H, W) mask that `save_mask` wrote.
 
     Args:
@@ -137,7 +134,7 @@ def read_mask(target: Path, name: str) -> BoolImage:
         return np.asarray(image) > 0
 
 
-def fill_masked(pixels: NDArray[np.uint8], used: BoolImage) -> NDArray[np.uint8]:
+def fill_masked(pixels: NDArray[np.uint8], used: BoolArray) -> NDArray[np.uint8]:
     """Return a photo whose masked pixels take the color of the nearest usable pixel.
 
     This keeps masked colors out of interpolation and downscaling.
@@ -156,7 +153,7 @@ def fill_masked(pixels: NDArray[np.uint8], used: BoolImage) -> NDArray[np.uint8]
     return np.asarray(pixels.reshape(-1, 3)[place[nearest]])
 
 
-def _load_fitted_mask(photo: Photo, folder: Path, masks: Path) -> BoolImage:
+def _load_fitted_mask(photo: Photo, folder: Path, masks: Path) -> BoolArray:
     """Return (H, W) usable pixels of the photo by its mask, in the orientation of the laid-out photo."""
     try:
         place = resolve_file(masks, photo.mask)
@@ -203,5 +200,5 @@ def _binarize(image: Image.Image) -> Image.Image:
     return Image.fromarray(_to_uint8(used))
 
 
-def _to_uint8(used: BoolImage) -> NDArray[np.uint8]:
+def _to_uint8(used: BoolArray) -> NDArray[np.uint8]:
     return np.where(used, np.uint8(WHITE), np.uint8(0))

@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.camera.models import camera_matrix
 from sfm_app.formats.frusta import center, scene_size
-from sfm_app.geometry.camera import camera_matrix
-from sfm_app.report.page.contents import UNREADABLE, RunContents
-from sfm_app.report.page.findings import glance
-from sfm_app.report.page.scene_view import view_points
-from sfm_app.scale import move_model
+from sfm_app.frame.scale import move_model
+from sfm_app.report.contents import UNREADABLE, RunContents
+from sfm_app.report.findings import glance
+from sfm_app.report.scene_view import view_points
 from sfm_app.stages import texture
 from sfm_app.synthetic.cameras import Camera
 from sfm_app.synthetic.render import orbited_pose, render_model

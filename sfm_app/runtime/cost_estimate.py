@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from sfm_app.retrieval.choice import expected_pairs
+from sfm_app.retrieval import expected_pairs
 from sfm_app.settings import MeshSettings, Settings
 from sfm_app.types import Photo
 

@@ -4,8 +4,8 @@ docs/symbols.md has the symbols of the thesis and their names here.
 """
 
 from sfm_app.selfcal import zero_curves
-from sfm_app.selfcal.cameras.photo_set import CalibratedCamera, CalibrateFunction, calibrate_photo_set
-from sfm_app.selfcal.inputs import pair_weights
+from sfm_app.selfcal.pairs import pair_weights
+from sfm_app.selfcal.photo_set import CalibratedCamera, CalibrateFunction, calibrate_photo_set
 from sfm_app.selfcal.thesis import geometric, huang_faugeras, kruppa, multi_start, perturbation
 from sfm_app.selfcal.thesis import zero_curves as zero_curves_thesis
 from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with

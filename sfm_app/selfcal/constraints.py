@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.selfcal.inputs import FloatArray, Pairs
+from sfm_app.selfcal.pairs import Pairs
+from sfm_app.types.arrays import FloatArray
 
 VANISHED = 1e-12
 """A polynomial is zero when it is this small beside the terms whose difference it is. Double precision leaves 1e-16;

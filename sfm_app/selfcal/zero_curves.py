@@ -10,19 +10,32 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.selfcal.adjustment.calibrate_pairs import Fit, extend_to_all_pairs, fit_cameras, undistorted_fundamentals
-from sfm_app.selfcal.adjustment.camera_priors import LENS, USUAL_FOCAL, CameraPriors
-from sfm_app.selfcal.adjustment.structureless_ba import Matches
-from sfm_app.selfcal.adjustment.uncertainty import camera_uncertainty, covariance, key_pairs
-from sfm_app.selfcal.consensus import consensus_peak
-from sfm_app.selfcal.consensus.consensus import Consensus
-from sfm_app.selfcal.consensus.peak_evidence import effective_count, spread_px
-from sfm_app.selfcal.critical_motions import critical_motion
-from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
-from sfm_app.selfcal.lens import KAPPA, LOG_FOCAL
-from sfm_app.selfcal.results import calibration_from_parameters, downgrade_to_estimate, guess_calibration
+from sfm_app.selfcal import consensus as consensus_peak
+from sfm_app.selfcal.adjustment import Matches
+from sfm_app.selfcal.calibrate_pairs import (
+    Fit,
+    camera_uncertainty,
+    covariance,
+    critical_motion,
+    extend_to_all_pairs,
+    fit_cameras,
+    key_pairs,
+    undistorted_fundamentals,
+)
+from sfm_app.selfcal.consensus import Consensus, effective_count, spread_px
+from sfm_app.selfcal.pairs import (
+    KAPPA,
+    LOG_FOCAL,
+    Pairs,
+    calibration_from_parameters,
+    downgrade_to_estimate,
+    guess_calibration,
+    prepare,
+)
+from sfm_app.selfcal.priors import LENS, USUAL_FOCAL, CameraPriors
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
+from sfm_app.types.arrays import FloatArray
 
 METHOD = "zero-curves"
 MIN_PAIRS = 3

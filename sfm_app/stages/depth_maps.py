@@ -10,11 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.atomic_io import mark_finished, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.colmap.dense import (
     DenseStore,
+    MaskUndistorter,
     digest_maps,
     drop_estimates,
+    has_masks,
     map_file,
     mask_depths,
     read_depth,
@@ -24,10 +25,9 @@ from sfm_app.colmap.dense import (
     write_depth,
     write_fusion_views,
 )
-from sfm_app.colmap.masks import MaskUndistorter, has_masks
 from sfm_app.colmap.wide_views import WideLens, split_wide_photos, write_model, write_views
 from sfm_app.errors import ReconstructionError
-from sfm_app.hashing import fingerprint, load_arrays
+from sfm_app.files import fingerprint, load_arrays, mark_finished, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.meshing.visibility import SKY
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace

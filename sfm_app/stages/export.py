@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from sfm_app.formats.pages import JPEG_QUALITY
-from sfm_app.hashing import digest_files
+from sfm_app.files import digest_files
+from sfm_app.formats.exporters import JPEG_QUALITY
+from sfm_app.frame.scale import MetricFrame, move_model
 from sfm_app.runtime.context import STANDARD_FORMATS, RunContext
 from sfm_app.runtime.workspace import Workspace
-from sfm_app.scale import MetricFrame, move_model
 from sfm_app.types import Model
 
 NAME = "model"

@@ -2,9 +2,8 @@
 
 import json
 
-from sfm_app.atomic_io import replace_atomically
-from sfm_app.estimation.growth.known_cameras import find_or_keep_intrinsics
-from sfm_app.hashing import digest_files
+from sfm_app.estimation.known import find_or_keep_intrinsics
+from sfm_app.files import digest_files, replace_atomically
 from sfm_app.numerical import json_text
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace

@@ -2,14 +2,14 @@
 
 from dataclasses import replace
 
-from sfm_app.atomic_io import is_made_from
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import create_database, digest_matches, is_sound, read_match_graph, remove_database
-from sfm_app.colmap.growth.grown_database import forget_changed_matches, grow_database
+from sfm_app.colmap.growth import forget_changed_matches, grow_database
 from sfm_app.estimation.diagnosis import NOTHING_MATCHED, diagnose_scene
-from sfm_app.estimation.match_rounds import match_probable_pairs
-from sfm_app.estimation.matching import find_all_features, forget_features, match_pairs
-from sfm_app.retrieval.choice import wants_all_pairs
+from sfm_app.files import is_made_from
+from sfm_app.matching.features import find_all_features, forget_features, match_pairs
+from sfm_app.matching.pairs import match_probable_pairs
+from sfm_app.retrieval import wants_all_pairs
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.types import MatchGraph, PhotoSet

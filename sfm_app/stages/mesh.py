@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.atomic_io import is_made_from, replace_atomically
 from sfm_app.colmap.dense import map_file, read_views
 from sfm_app.colmap.surface import FUSED, open_points, positions
 from sfm_app.errors import ReconstructionError
-from sfm_app.hashing import digest_files, load_arrays
+from sfm_app.files import digest_files, is_made_from, load_arrays, replace_atomically
 from sfm_app.meshing import drop_islands, make_manifold, trim
 from sfm_app.meshing.octree import LEAST_POINTS, cell_sizes, choose_cell, cube_around
 from sfm_app.meshing.refinement import STEPS
@@ -20,13 +19,19 @@ from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_count
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.runtime.workspace import Workspace
-from sfm_app.stages.blocks.fine import FineShape, save_fine
-from sfm_app.stages.blocks.fusion import fuse_maps
-from sfm_app.stages.blocks.judging import SurfaceJudge, judge_view, simplify_mesh
-from sfm_app.stages.blocks.poisson import EVERYWHERE, RecordCells, span_surface, with_halo
-from sfm_app.stages.blocks.refining import Originals, rank_partners, refine_surface
-from sfm_app.stages.blocks.surface import mesh_in_blocks
 from sfm_app.stereo import View
+from sfm_app.surface.blocks import (
+    EVERYWHERE,
+    RecordCells,
+    SurfaceJudge,
+    judge_view,
+    mesh_in_blocks,
+    simplify_mesh,
+    span_surface,
+    with_halo,
+)
+from sfm_app.surface.fusion import fuse_maps
+from sfm_app.surface.refining import FineShape, Originals, rank_partners, refine_surface, save_fine
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Scene, Surface
 

@@ -6,18 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm_app.atomic_io import replace_atomically
-from sfm_app.colmap.models.stored_model import sparse_model
-from sfm_app.geometry.similarity import Similarity
-from sfm_app.hashing import digest_files
+from sfm_app.colmap.model import sparse_model
+from sfm_app.files import digest_files, replace_atomically
+from sfm_app.frame.control_points import ControlFit, fit_control_points
+from sfm_app.frame.known_lengths import control_places, distance_evidence, marker_evidence
+from sfm_app.frame.scale import GPS, MetricFrame, ScaleEvidence, agree, move_model
+from sfm_app.frame.sighted_points import PosedPhotos
+from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import json_text
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
-from sfm_app.scale.control_fit import ControlFit, fit_control_points
-from sfm_app.scale.evidence import GPS, ScaleEvidence, agree
-from sfm_app.scale.known_lengths import control_places, distance_evidence, marker_evidence
-from sfm_app.scale.metric_frame import MetricFrame, move_model
-from sfm_app.scale.photo_rays import PosedPhotos
 from sfm_app.types import PhotoSet, Scene
 
 POINTS = "points"

@@ -6,27 +6,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.colmap.backend import check_written, translate_errors
 from sfm_app.colmap.bundle import Adjustment, adjust_or_keep
-from sfm_app.colmap.models.model import color_points, posed_images, posed_photo_ids
-from sfm_app.colmap.models.stored_model import RefinedCamera, read_scene
+from sfm_app.colmap.model import RefinedCamera, color_points, posed_images, posed_photo_ids, read_scene
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import ReconstructionError
-from sfm_app.estimation.camera_check import report_checks
-from sfm_app.estimation.camera_rules import camera_rules, given_and_found, refined_claims
 from sfm_app.estimation.diagnosis import diagnose_depth, diagnose_scene
-from sfm_app.estimation.exif_check import report_claims
-from sfm_app.hashing import digest_files
+from sfm_app.estimation.given_cameras import camera_rules, given_and_found, refined_claims, report_checks, report_claims
+from sfm_app.files import digest_files, mark_unfinished, replace_atomically, resume_or_clear
+from sfm_app.frame.upright import gps_deviation, orient_or_keep, submit_cue_extraction
+from sfm_app.mapping.attempt import photo_names, unregistered_reasons
+from sfm_app.mapping.feature_retry import MappedScene, retry_lost_photos
+from sfm_app.mapping.incremental import GROWN, map_new_photos
+from sfm_app.mapping.look_alikes import jumps, look_alike_entries
+from sfm_app.mapping.passes import Outcome, reconstruct
+from sfm_app.mapping.rolling_shutter import follow_shutter
+from sfm_app.mapping.split_and_merge import weakly_joined_parts
 from sfm_app.numerical import Json, json_text
 from sfm_app.operating_system import move
-from sfm_app.reconstruction import MappedScene, Outcome, reconstruct, retry_lost_photos
-from sfm_app.reconstruction.align_upright import gps_deviation, orient_or_keep, submit_cue_extraction
-from sfm_app.reconstruction.growth.known_model import GROWN, map_new_photos
-from sfm_app.reconstruction.look_alikes import jumps, look_alike_entries
-from sfm_app.reconstruction.unregistered import photo_names, unregistered_reasons
-from sfm_app.reconstruction.videos.rolling_shutter import follow_shutter
-from sfm_app.reconstruction.weak_scale import weakly_joined_parts
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import MAPPING, SubWorkspace, Workspace
 from sfm_app.types import Intrinsics, MatchGraph, Scene, ViewGraph

@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_clear
-from sfm_app.hashing import digest_files, fingerprint, load_arrays
-from sfm_app.meshing.nearest import NearestNormals
-from sfm_app.meshing.occlusion import Occluders
+from sfm_app.files import digest_files, fingerprint, load_arrays, mark_unfinished, replace_atomically, resume_or_clear
+from sfm_app.meshing.ray_casting import NearestNormals, Occluders
 from sfm_app.photos import fill_masked, read_mask
-from sfm_app.photos.panoramas.painted_parts import mask_part, panorama_parts, show_part
+from sfm_app.photos.panoramas import mask_part, panorama_parts, show_part
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.texture import PhotoView, bake_normals, part_view, photo_view, texture_surface

@@ -2,8 +2,7 @@
 
 from sfm_app.stereo.depth import DepthEstimate, DepthMap, confirm_depths, match_depths
 from sfm_app.stereo.method import DepthStore, DepthTask, Kind, make_depth_maps_on_cpu
-from sfm_app.stereo.neighbors import rank_neighbors
-from sfm_app.stereo.view import View, region
+from sfm_app.stereo.view import View, rank_neighbors, region
 
 __all__ = [
     "DepthEstimate",

@@ -1,18 +1,22 @@
-"""A plane for every pixel, propagated to neighboring pixels where it lowers the matching cost.
-
-Bleyer, Rhemann, Rother: PatchMatch stereo. BMVC 2011; Schoenberger et al.: Pixelwise view selection for unstructured
-multi-view stereo. ECCV 2016 (the weighted correlation). Semi-global matching prefers fronto-parallel surfaces and
-widens the foreground. Initialized with its depths, one or two sweeps find slanted surfaces and the true borders.
-"""
+"""Depths of an object that spill over its outline onto the background."""
 
 from collections.abc import Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel, summing_kernel
-from sfm_app.stereo.view import FloatArray, GrayImage, View
+from sfm_app.stereo.view import DepthArray, GrayImage, View
+from sfm_app.types.arrays import FloatArray
+
+# A plane for every pixel, propagated to neighboring pixels where it lowers the matching cost.
+#
+# Bleyer, Rhemann, Rother: PatchMatch stereo. BMVC 2011; Schoenberger et al.: Pixelwise view selection for
+# unstructured multi-view stereo. ECCV 2016 (the weighted correlation). Semi-global matching prefers fronto-parallel
+# surfaces and widens the foreground. Initialized with its depths, one or two sweeps find slanted surfaces and the
+# true borders.
 
 PlaneArray = NDArray[np.float32]
 """(H, W, 3): inverse depth q and its slopes, q + qu du + qv dv at (du, dv) pixels away; q = 0 where unknown."""
@@ -253,3 +257,168 @@ def _correlation(stack: NDArray[np.uint32], start: int, stride: int, affine: Any
     noise = NOISE_GRAY * NOISE_GRAY
     spread = (variance + noise) * (max(0.0, float(square - one * one)) + noise)
     return float((mixed - one * mean) / np.sqrt(spread))
+
+
+# Planes through depth maps, and their normals.
+
+NORMAL_SIGMA_PX = 2.5
+"""Standard deviation of the weights in the window; smaller keeps more detail, larger makes smoother normals."""
+RADIUS_PX = 5
+MAX_STEP = 0.02
+"""Relative depth difference beyond which a pixel belongs to another surface."""
+MIN_WEIGHT = 0.25
+"""Smallest share of the window's weight that must have a depth."""
+
+
+def fit_planes(depth: DepthArray) -> PlaneArray:
+    """Fit a plane to the surroundings of every pixel, by least squares.
+
+    A plane n'X = 1 has the inverse depth n'x at the ray x = K^-1 (u, v, 1), which is linear in n and in the noise.
+
+    Returns:
+        (H, W, 3) inverse depth at the pixel and its slopes per pixel; 0 where the depth is unknown or isolated.
+    """
+    planes = np.zeros((*depth.shape, 3), np.float32)
+    steps = np.arange(-RADIUS_PX, RADIUS_PX + 1)
+    profile = np.exp(-0.5 * (steps / NORMAL_SIGMA_PX) ** 2)
+    inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0, dtype=np.float64)
+    window = np.outer(profile, profile)
+    _fit(depth, inverse, (window, MIN_WEIGHT * float(window.sum())), planes)
+    return planes
+
+
+def plane_normals(planes: PlaneArray, view: View) -> NDArray[np.float32]:
+    """Return (H, W, 3) unit normals in the camera frame that point to the camera; 0 where the inverse depth is 0.
+
+    Args:
+        planes: (H, W, 3) inverse depth and its slopes per pixel, from `fit_planes`.
+        view: the photo.
+    """
+    normals = np.zeros_like(planes)
+    _find_normals(planes, view.K, view.sample_px, normals)
+    return normals
+
+
+@kernel
+def _find_normals(planes: PlaneArray, K: FloatArray, sample: float, normals: NDArray[np.float32]) -> None:
+    for row in range(planes.shape[0]):
+        for col in range(planes.shape[1]):
+            a, b = float(planes[row, col, 1]), float(planes[row, col, 2])
+            q = float(planes[row, col, 0])
+            if q <= 0:
+                continue
+            # n'K^-1 (u, v, 1) = q + a (u - u0) + b (v - v0) for all u, v
+            c = q - a * (col + sample) - b * (row + sample)
+            x = a * K[0, 0] + b * K[1, 0] + c * K[2, 0]
+            y = a * K[0, 1] + b * K[1, 1] + c * K[2, 1]
+            z = a * K[0, 2] + b * K[1, 2] + c * K[2, 2]
+            length = np.sqrt(x * x + y * y + z * z)
+            normals[row, col, 0], normals[row, col, 1], normals[row, col, 2] = -x / length, -y / length, -z / length
+
+
+@kernel
+def _fit(depth: DepthArray, inverse: FloatArray, weights: tuple[FloatArray, float], planes: PlaneArray) -> None:
+    for row in range(depth.shape[0]):
+        for col in range(depth.shape[1]):
+            if depth[row, col] > 0:
+                g0, gu, gv = _slopes(depth, inverse, row, col, weights)
+                if g0 > 0:
+                    planes[row, col, 0], planes[row, col, 1], planes[row, col, 2] = g0, gu, gv
+
+
+@kernel
+def _slopes(
+    depth: DepthArray, inverse: FloatArray, row: int, col: int, weights: tuple[FloatArray, float]
+) -> tuple[float, float, float]:
+    """Fit the inverse depth g0 + gu du + gv dv, (du, dv) in pixels from (col, row); g0 = 0 where undetermined."""
+    window, least = weights
+    height, width = depth.shape
+    z = depth[row, col]
+    n, su, sv, suu, suv, svv, q, qu, qv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(max(row - RADIUS_PX, 0), min(row + RADIUS_PX + 1, height)):
+        for j in range(max(col - RADIUS_PX, 0), min(col + RADIUS_PX + 1, width)):
+            other = depth[i, j]
+            if other <= 0 or abs(other - z) > MAX_STEP * z:
+                continue
+            weight = window[i - row + RADIUS_PX, j - col + RADIUS_PX]
+            du, dv, share = float(j - col), float(i - row), weight * inverse[i, j]
+            n += weight
+            su += weight * du
+            sv += weight * dv
+            suu += weight * du * du
+            suv += weight * du * dv
+            svv += weight * dv * dv
+            q += share
+            qu += du * share
+            qv += dv * share
+    if n < least:
+        return 0.0, 0.0, 0.0
+    suu, suv, svv = suu - su * su / n, suv - su * sv / n, svv - sv * sv / n
+    qu, qv = qu - su * q / n, qv - sv * q / n
+    det = suu * svv - suv * suv
+    if det < 1e-3 * n * n:  # all on one line
+        return 0.0, 0.0, 0.0
+    gu, gv = (svv * qu - suv * qv) / det, (suu * qv - suv * qu) / det
+    return (q - gu * su - gv * sv) / n, gu, gv
+
+
+REACH_PX = BORDER + 1
+"""A window centered this far from an outline still contains a pixel of it; on a textureless background that pixel
+alone decides."""
+SURROUNDINGS_PX = 4 * REACH_PX + 1
+"""Side of the square around a pixel that is compared with it: pixels with a depth, and pixels without one."""
+SENSOR_NOISE_GRAY = 3.0
+"""Smallest standard deviation of gray levels: sensor noise and compression artifacts."""
+MIN_ODDS = 8.0
+"""Smallest likelihood ratio of a pixel's gray, pixels without a depth over pixels with one, that removes its depth."""
+LEAST_PX = 5
+"""Fewest pixels that determine the gray distribution of the surroundings."""
+UNIFORM_LOG_LIKELIHOOD = 0.5 * np.log(2.0 * np.pi) - np.log(256.0)
+"""Log likelihood of a gray under the uniform distribution, for objects so thin that they consist of rim only."""
+
+
+def remove_spill(depth: DepthArray, image: GrayImage) -> DepthArray:
+    """Remove rim depths whose gray resembles the empty side rather than the surface that they extend.
+
+    Skies and plain backgrounds have no depth of their own, but a correlation window that reaches an object in front
+    of them finds the object's depth. The result is a seam half a window wide. It is the same in every photo, so no
+    check between photos removes it. The gray levels decide: around a pixel, those with a depth, away from the rim, and
+    those without one are each modeled as normally distributed. Next to gaps in a plain surface both distributions are
+    the same, and nothing is removed. Gaps narrower than two rims are ignored: they lie within surfaces.
+
+    Args:
+        depth: (H, W), 0 where unknown.
+        image: (H, W).
+    """
+    known = depth > 0
+    empty, rim = _broad_areas(~known), rim_mask(known)
+    gray = image.astype(np.float32)
+    thing = _log_likelihood(gray, known & ~rim)
+    spilt = _log_likelihood(gray, empty) > np.where(np.isnan(thing), UNIFORM_LOG_LIKELIHOOD, thing) + np.log(MIN_ODDS)
+    return np.where(spilt & rim, np.float32(0), depth)
+
+
+def rim_mask(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mark pixels with a depth within `REACH_PX` of a gap that is broader than two rims, (H, W)."""
+    away = cv2.distanceTransform(1 - _broad_areas(~known).view(np.uint8), cv2.DIST_L2, 3)
+    return np.asarray(known & (away <= REACH_PX))
+
+
+def _broad_areas(empty: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * REACH_PX + 1, 2 * REACH_PX + 1))
+    return np.asarray(cv2.morphologyEx(empty.view(np.uint8), cv2.MORPH_OPEN, disc)).view(np.bool_)
+
+
+def _log_likelihood(gray: NDArray[np.float32], among: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return (H, W) log likelihood of each pixel's gray, given the marked pixels around it.
+
+    NaN, which compares as false, where too few are marked.
+    """
+    side = (SURROUNDINGS_PX, SURROUNDINGS_PX)
+    marked = among.astype(np.float32)
+    count = cv2.blur(marked, side)
+    enough = count * SURROUNDINGS_PX**2 > LEAST_PX - 0.5
+    share = np.where(enough, count, np.float32(np.nan))
+    mean = cv2.blur(gray * marked, side) / share
+    variance = np.maximum(cv2.blur(gray * gray * marked, side) / share - mean * mean, 0.0) + SENSOR_NOISE_GRAY**2
+    return np.asarray(-0.5 * ((gray - mean) ** 2 / variance + np.log(variance)), np.float32)

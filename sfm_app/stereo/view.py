@@ -1,4 +1,4 @@
-"""Camera, pose and sparse points of a photo."""
+"""Selection of the neighbors that a photo is matched with."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -6,7 +6,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from sfm_app.types.arrays import FloatArray
+
+# Camera, pose and sparse points of a photo.
+
 DepthArray = NDArray[np.float32]
 """(H, W) depth along the optical axis in scene units, 0 where unknown."""
 GrayImage = NDArray[np.uint8]
@@ -79,3 +82,91 @@ def region(views: Sequence[View], margin: float = 0.2) -> FloatArray:
     points = np.concatenate([view.points for view in views])
     low, high = np.percentile(points, [1, 99], axis=0)
     return np.stack([low - margin * (high - low).max(), high + margin * (high - low).max()])
+
+
+MIN_SHARED_POINTS = 5
+BEST_ANGLE_DEG = 8.0
+"""Smaller angles give inexact depths, larger ones images that look different."""
+SAME_PLACE_DEG = 1e-6
+"""Views whose largest triangulation angle is smaller have the same center: they are parts of one wide photo. By
+definition: rounding."""
+
+
+def rank_neighbors(views: Sequence[View], count: int) -> list[list[int]]:
+    """Return for every view the indices of its best neighbors, best first.
+
+    Greedy coverage: the next neighbor is the one that adds most to the sparse points of the view. A point adds its
+    weight (triangulation angle, difference in scale), reduced by up to half for each neighbor that already covers it.
+    So the neighbors cover the whole photo instead of crowding on one side.
+
+    Args:
+        views: all photos, with their sparse points.
+        count: most neighbors per view.
+    """
+    ids = np.concatenate([np.empty(0, np.int64), *(view.point_ids for view in views)])
+    order = np.argsort(ids, kind="stable")
+    seers = np.repeat(np.arange(len(views)), [len(view.point_ids) for view in views])[order]
+    ranked = ids[order]
+    found = []
+    for index, view in enumerate(views):
+        ends = zip(*(np.searchsorted(ranked, view.point_ids, side) for side in ("left", "right")), strict=True)
+        others, shared = np.unique(np.concatenate([seers[:0], *(seers[a:b] for a, b in ends)]), return_counts=True)
+        found.append(_rank(index, [k for k in others[shared >= MIN_SHARED_POINTS] if k != index], views, count))
+    return found
+
+
+def _rank(index: int, others: Sequence[int], views: Sequence[View], count: int) -> list[int]:
+    """Return the best neighbors of a view among those that share points with it."""
+    view = views[index]
+    weights: dict[int, FloatArray] = {}
+    for number in map(int, others):
+        other = views[number]
+        if not _is_same_place(view, other):
+            shared = np.isin(view.point_ids, other.point_ids, assume_unique=True)
+            weights[number] = np.where(shared, point_weights(view, other, view.points), 0.0)
+    value, chosen = np.ones(len(view.point_ids)), list[int]()
+    while weights and len(chosen) < count:
+        # ties go to the lower index, so that the choice never depends on the order of a dictionary
+        best = max(weights, key=lambda index: (float(weights[index] @ value), -index))
+        weight = weights.pop(best)
+        if weight @ value <= 0:
+            break
+        chosen.append(best)
+        value *= 1.0 - 0.5 * weight
+    return chosen
+
+
+def _is_same_place(view: View, other: View) -> bool:
+    angles = triangulation_angles_deg(view.center, other.center, view.points)
+    return bool(angles.max(initial=0.0) < SAME_PLACE_DEG)
+
+
+def point_weights(view: View, other: View, points: FloatArray) -> FloatArray:
+    """Return (N,) in [0, 1]: how well points can be matched between two views, by angle and scale.
+
+    Args:
+        view: one view.
+        other: the other one.
+        points: (N, 3) in the world.
+    """
+    angle_deg = triangulation_angles_deg(view.center, other.center, points)
+    spread_deg = np.where(angle_deg < BEST_ANGLE_DEG, BEST_ANGLE_DEG / 3, 1.25 * BEST_ANGLE_DEG)
+    weight = np.exp(-0.5 * ((angle_deg - BEST_ANGLE_DEG) / spread_deg) ** 2)
+    depth, other_depth = points @ view.R[2] + view.t[2], points @ other.R[2] + other.t[2]
+    in_front = (depth > 0) & (other_depth > 0)
+    scale = np.divide(view.K[0, 0] * other_depth, other.K[0, 0] * depth, out=np.ones_like(depth), where=in_front)
+    return np.asarray(np.where(in_front, weight * np.minimum(scale, 1 / scale), 0.0))
+
+
+def triangulation_angles_deg(center1: FloatArray, center2: FloatArray, points: FloatArray) -> NDArray[np.float64]:
+    """Return (N,) angles in degrees between the rays from points to two centers.
+
+    Args:
+        center1: (3,) of one camera.
+        center2: (3,) of the other.
+        points: (N, 3).
+    """
+    ray1, ray2 = points - center1, points - center2
+    # atan2 keeps small angles exact, where arccos of a rounded cosine does not
+    sine = np.linalg.norm(np.cross(ray1, ray2), axis=1)
+    return np.asarray(np.degrees(np.arctan2(sine, np.sum(ray1 * ray2, axis=1))))

@@ -5,12 +5,10 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sfm_app.camera.models import camera_matrix
 from sfm_app.errors import ConfigError
-from sfm_app.geometry.camera import camera_matrix
-
-FloatArray = NDArray[np.float64]
+from sfm_app.types.arrays import FloatArray
 
 NEWTON_STEPS = 100
 LEAST_SLOPE = 1e-3

@@ -4,16 +4,13 @@ from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfm_app.geometry.similarity import Similarity, robust_similarity
-from sfm_app.meshing.open3d import load_open3d
+from sfm_app.geometry.poses import Similarity, robust_similarity
+from sfm_app.meshing.ray_casting import load_open3d
 from sfm_app.synthetic.cameras import Camera, camera_center, pixel_rays
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.synthetic.render import cast_rays, ray_caster
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
+from sfm_app.types.arrays import FloatArray, IndexArray
 
 # Rays along the longer side of each photo that determine which part of the true surface is visible.
 SEEN_RAYS = 96

@@ -8,12 +8,11 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.camera.models import camera_matrix
 from sfm_app.errors import ConfigError
-from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import fundamental_from_pose
 from sfm_app.synthetic.cameras import axis_rotation
-
-FloatArray = NDArray[np.float64]
+from sfm_app.types.arrays import FloatArray
 
 Poses = tuple[FloatArray, FloatArray]
 

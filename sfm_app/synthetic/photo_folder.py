@@ -13,14 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sfm_app.atomic_io import replace_atomically
 from sfm_app.errors import ConfigError, InputError
+from sfm_app.files import replace_atomically
 from sfm_app.progress import Progress, SilentProgress, track
 from sfm_app.synthetic.cameras import Camera, Lens, Views, camera_center
 from sfm_app.synthetic.render import GAMMA, PreparedScene, prepare, render_scene
 from sfm_app.synthetic.shapes import SyntheticScene
-
-FloatArray = NDArray[np.float64]
+from sfm_app.types.arrays import FloatArray
 
 TRUTH_FILE, SURFACE_FILE = "truth.json", "surface.ply"
 MOST_PROCESSES = 61

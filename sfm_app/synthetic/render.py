@@ -8,14 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.meshing.open3d import load_open3d
+from sfm_app.meshing.ray_casting import load_open3d
 from sfm_app.synthetic.cameras import Camera, camera_center, pixel_rays
 from sfm_app.synthetic.shapes import SyntheticScene, mixture
 from sfm_app.types import Surface
-from sfm_app.types.model import Model, Texture
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.types.surface import Model, Texture
 
 NO_HIT = 0xFFFFFFFF
 GAMMA = 2.2

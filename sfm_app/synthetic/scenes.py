@@ -21,8 +21,7 @@ from sfm_app.synthetic.shapes import (
     torus,
     waves,
 )
-
-FloatArray = NDArray[np.float64]
+from sfm_app.types.arrays import FloatArray
 
 SANDSTONE = Material(pattern="stone", base=(206, 186, 150), second=(158, 132, 98), scale=0.35)
 LIMESTONE = Material(pattern="stone", base=(214, 208, 194), second=(166, 158, 142), scale=0.3, contrast=0.45)

@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.synthetic.cameras import axis_rotation
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
+from sfm_app.types.arrays import FloatArray, IndexArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,27 +9,16 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.triangles import select_faces, split_fans
 from sfm_app.settings import TextureSettings
-from sfm_app.texture.appearance.border_agreement import doubtful_border
-from sfm_app.texture.appearance.exposure import photo_gains
-from sfm_app.texture.appearance.photo_consistency import outlier_mask
-from sfm_app.texture.appearance.sightings import Sightings, list_sightings
-from sfm_app.texture.appearance.view_scoring import FaceView, OcclusionTest, score_faces, sharpness_factors
-from sfm_app.texture.blending import Blend, blend_weights
-from sfm_app.texture.blocks import block_of_faces, lay_out
-from sfm_app.texture.charts import Charts, absorb_small_charts, make_charts
+from sfm_app.texture.appearance import doubtful_border, outlier_mask, photo_gains
+from sfm_app.texture.charts import Charts, Layout, absorb_small_charts, block_of_faces, lay_out, make_charts
 from sfm_app.texture.facets import NONE, Facets, IntArray, facets
-from sfm_app.texture.packing import Layout
-from sfm_app.texture.page_painting import CheckedViews, ParallelMap, TexturePlan, paint_blocks
-from sfm_app.texture.painting import fill_background
-from sfm_app.texture.seam_leveling import level_seams
-from sfm_app.texture.store import Store
-from sfm_app.texture.unseen_faces import SQUARE_CORNERS, square_texels, vertex_colors
+from sfm_app.texture.pages import CheckedViews, ParallelMap, Store, TexturePlan, fill_background, paint_blocks
+from sfm_app.texture.seams import SQUARE_CORNERS, Blend, blend_weights, level_seams, square_texels, vertex_colors
+from sfm_app.texture.sightings import FaceView, OcclusionTest, Sightings, list_sightings, score_faces, sharpness_factors
 from sfm_app.texture.view_selection import choose_photos
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import Model, Rejected, Surface, Texture
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
+from sfm_app.types.arrays import IndexArray
 
 
 def texture_surface(

@@ -1,20 +1,24 @@
-"""Charts: connected triangles of one photo, laid out by their projection in that photo.
+"""Blocks of a large surface: each has its own pages, so that few pages are in memory while photos are painted."""
 
-The photo is the parametrization: nothing is stretched, and a texel is a pixel. Triangles that a photo sees do not
-overlap in it, except at the rims of occluders; overlapping triangles get charts of their own.
-"""
-
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.triangles import morton_order
 from sfm_app.jit import kernel
-from sfm_app.texture.appearance.sightings import Sightings
+from sfm_app.settings import TextureSettings
 from sfm_app.texture.facets import NONE, Facets, IntArray, components
+from sfm_app.texture.seams import block_sizes, squares
+from sfm_app.texture.sightings import Sightings
 from sfm_app.texture.views import project
+from sfm_app.types.arrays import FloatArray, IndexArray
 
-FloatArray = NDArray[np.float64]
+# Charts: connected triangles of one photo, laid out by their projection in that photo.
+#
+# The photo is the parametrization: nothing is stretched, and a texel is a pixel. Triangles that a photo sees do not
+# overlap in it, except at the rims of occluders; overlapping triangles get charts of their own.
+
 Views = tuple[NDArray[np.int64], NDArray[np.int64], IntArray, NDArray[np.float32]]
 """The views by triangle, for kernels: starts, rows, photo and worth of each row."""
 
@@ -197,3 +201,243 @@ def _is_usable(views: Views, photo: int, face: int) -> bool:
         if photos[row] == photo:
             return bool(worth[row] > 0)
     return False
+
+
+# Packing of charts onto pages, as in Tetris (Levy et al., SIGGRAPH 2002, section 4).
+#
+# Each chart has a profile of its upper and lower side. It is placed on the horizon of the charts already on the
+# page, as close to the top as possible. Tall charts come first.
+
+CELL = 4
+"""Side of a cell of the profiles, in texels."""
+MARGIN = 2
+"""Width of the margin around a chart that belongs to it, in texels."""
+FILL = 0.7
+"""Expected share of a page that charts cover."""
+SCALE_STEP = 0.95
+"""Factor on the scale for the next attempt if the charts do not fit."""
+LEAST_SCALE = 0.05
+"""Below this scale the texture would be too coarse; pages are added instead."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layout:
+    """The positions of the charts on the pages."""
+
+    page: IntArray
+    """(C,) page of each chart."""
+    shift: IntArray
+    """(C, 2) integer offset in texels from the photo's pixels (times `scale`) to the page."""
+    scale: float
+    """Texels per pixel of the photos, <= 1."""
+    sizes: tuple[tuple[int, int], ...]
+    """(width, height) of each page."""
+
+
+def pack(
+    charts: Charts, blocks: IntArray, max_atlas_px: int, max_pages: int, largest_scale: float = 1.0
+) -> tuple[Layout, IntArray]:
+    """Place charts and additional rectangles on few pages; reduce the scale of the charts if they do not fit.
+
+    Args:
+        charts: their triangles in pixels of the photos.
+        blocks: (B, 2) widths and heights of rectangles in texels, which are never scaled.
+        max_atlas_px: longest side of a page.
+        max_pages: largest number of pages, exceeded only if the charts do not fit at `LEAST_SCALE`.
+        largest_scale: most texels per pixel of the photos.
+
+    Returns:
+        The layout of the charts, and (B, 3) page, x and y of the rectangles.
+    """
+    scale = min(largest_scale, float(np.sqrt(FILL * max_pages * max_atlas_px**2 / max(_area(charts), 1.0))))
+    while True:
+        placed = _try_to_pack(charts, blocks, scale, max_atlas_px, max_pages)
+        if placed is not None:
+            return placed
+        if scale > LEAST_SCALE:
+            scale *= SCALE_STEP
+        else:  # many small charts: their margins fill the pages
+            max_pages += 1
+
+
+def _area(charts: Charts) -> float:
+    """Return the area of all charts in square pixels."""
+    a, b, c = (charts.corners[:, k] for k in range(3))
+    turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    return float(np.sum(np.abs(turn[charts.chart_of_face != NONE])) / 2)
+
+
+def _try_to_pack(
+    charts: Charts, blocks: IntArray, scale: float, max_atlas_px: int, max_pages: int
+) -> tuple[Layout, IntArray] | None:
+    count = len(charts.photo)
+    origin, cells, starts, low, high = _profiles(charts, scale)
+    block_cells = -(-blocks // CELL)
+    area = float(np.sum(high - low)) + float(np.sum(block_cells.astype(np.int64).prod(axis=1)))
+    widest = max((int(c) for c in np.concatenate([cells[:, 0], block_cells[:, 0]])), default=1)
+    page_cells = max_atlas_px // CELL
+    width = page_cells if scale < 1.0 else min(page_cells, max(widest, int(np.ceil(np.sqrt(area / FILL)))))
+    if widest > page_cells or area > max_pages * page_cells * width:
+        return None
+    starts = np.concatenate([starts, starts[-1] + np.cumsum(block_cells[:, 0])])
+    low = np.concatenate([low, np.zeros(int(block_cells[:, 0].sum()), np.int64)])
+    high = np.concatenate([high, np.repeat(block_cells[:, 1], block_cells[:, 0]).astype(np.int64)])
+    heights = np.concatenate([cells[:, 1], block_cells[:, 1]]).astype(np.int64)
+    order = np.lexsort((np.arange(len(heights)), -heights))
+    place = np.full((len(heights), 3), NONE, np.int32)
+    horizon = np.zeros((max_pages, width), np.int64)
+    if not _set_down(order, starts, low, high, page_cells, horizon, place):
+        return None
+    used = int(place[:, 0].max(initial=-1)) + 1
+    sizes = tuple((width * CELL, int(horizon[page].max()) * CELL) for page in range(used))
+    shift = CELL * place[:count, 1:] - origin
+    return Layout(place[:count, 0], shift.astype(np.int32), scale, sizes), place[count:] * np.array([1, CELL, CELL])
+
+
+def _profiles(
+    charts: Charts, scale: float
+) -> tuple[IntArray, IntArray, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return origins in texels (C, 2), sizes in cells (C, 2), starts of columns (C + 1,), lower and upper profiles."""
+    count = len(charts.photo)
+    drawn = np.flatnonzero(charts.chart_of_face != NONE)
+    of, corners = charts.chart_of_face[drawn], charts.corners[drawn] * scale
+    least, most = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    for k in range(3):
+        np.minimum.at(least, of, corners[:, k])
+        np.maximum.at(most, of, corners[:, k])
+    origin = (np.floor(least) - MARGIN).astype(np.int32)
+    cells = (-(-(np.ceil(most) + MARGIN - origin) // CELL)).astype(np.int32)
+    starts = np.concatenate([[0], np.cumsum(cells[:, 0], dtype=np.int64)])
+    low = np.full(int(starts[-1]), np.iinfo(np.int64).max)
+    high = np.zeros(int(starts[-1]), np.int64)
+    _outline(of, corners - origin[of][:, None, :], starts, low, high)
+    return origin, cells, starts, np.minimum(low, high), high
+
+
+@kernel
+def _outline(
+    of: IntArray, corners: FloatArray, starts: NDArray[np.int64], low: NDArray[np.int64], high: NDArray[np.int64]
+) -> None:
+    """Widen the profiles of the charts to contain each triangle and its margin, column by column."""
+    for f in range(len(of)):
+        first, columns = starts[of[f]], starts[of[f] + 1] - starts[of[f]]
+        left = min(corners[f, 0, 0], corners[f, 1, 0], corners[f, 2, 0]) - MARGIN
+        right = max(corners[f, 0, 0], corners[f, 1, 0], corners[f, 2, 0]) + MARGIN
+        for column in range(max(int(left // CELL), 0), min(int(right // CELL) + 1, columns)):
+            x0, x1 = column * CELL - MARGIN, (column + 1) * CELL + MARGIN
+            top, bottom = np.inf, -np.inf
+            for k in range(3):
+                ax, ay = corners[f, k, 0], corners[f, k, 1]
+                bx, by = corners[f, (k + 1) % 3, 0], corners[f, (k + 1) % 3, 1]
+                if max(ax, bx) < x0 or min(ax, bx) > x1:
+                    continue
+                if ax == bx:
+                    top, bottom = min(top, ay, by), max(bottom, ay, by)
+                    continue
+                for x in (x0, x1):
+                    y = ay + min(max((x - ax) / (bx - ax), 0.0), 1.0) * (by - ay)
+                    top, bottom = min(top, y), max(bottom, y)
+            if top <= bottom:
+                low[first + column] = min(low[first + column], int((top - MARGIN) // CELL))
+                high[first + column] = max(high[first + column], int((bottom + MARGIN) // CELL) + 1)
+
+
+@kernel
+def _set_down(
+    order: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    low: NDArray[np.int64],
+    high: NDArray[np.int64],
+    page_height: int,
+    horizon: NDArray[np.int64],
+    place: IntArray,
+) -> bool:
+    """Place every chart; return False if one does not fit on any page."""
+    pages, width = horizon.shape
+    for c in order:
+        first, columns = starts[c], starts[c + 1] - starts[c]
+        deepest = 0
+        for j in range(columns):
+            deepest = max(deepest, high[first + j])
+        for page in range(pages):
+            best_x, best_y = -1, page_height - deepest + 1
+            for x in range(width - columns + 1):
+                y = 0
+                for j in range(columns):
+                    if high[first + j] > low[first + j]:
+                        y = max(y, horizon[page, x + j] - low[first + j])
+                        if y >= best_y:
+                            break
+                if y < best_y:
+                    best_x, best_y = x, y
+            if best_x < 0:
+                continue
+            place[c, 0], place[c, 1], place[c, 2] = page, best_x, best_y
+            for j in range(columns):
+                if high[first + j] > low[first + j]:
+                    horizon[page, best_x + j] = best_y + high[first + j]
+            break
+        if place[c, 0] == NONE:
+            return False
+    return True
+
+
+TRIANGLES = 400_000
+"""Triangles of a block. Chosen by hand: twice what a mesh has by default, so that those have one."""
+
+
+def block_of_faces(mesh: Facets) -> IntArray:
+    """Return the block of each triangle, (T,): equal parts of neighbors along the Morton curve.
+
+    Args:
+        mesh: the surface.
+    """
+    count = len(mesh.faces)
+    blocks = max(1, -(-count // TRIANGLES))
+    found = np.empty(count, np.int32)
+    found[mesh.clusters.order] = np.arange(count) * blocks // max(count, 1)
+    return found
+
+
+def lay_out(
+    charts: Charts, block_of: IntArray, mesh: Facets, options: TextureSettings
+) -> tuple[Layout, IndexArray, IntArray]:
+    """Give every block its own pages: place its charts and the squares of the triangles that no photo sees.
+
+    Args:
+        charts: none of them in two blocks.
+        block_of: (T,) block of each triangle.
+        mesh: the surface.
+        options: size of pages, and their number for each block.
+
+    Returns:
+        The layout; (U, 3) page, x and y of the squares of the triangles without a chart; and (P,) block of each page.
+    """
+    unseen = np.flatnonzero(charts.chart_of_face == NONE)
+    faces = [np.flatnonzero(block_of == block) for block in range(int(block_of.max(initial=0)) + 1)]
+    parts = [_part(charts, own) for own in faces]
+    rests = [block_sizes(int((part.chart_of_face == NONE).sum())) for _, part in parts]
+    packed = [
+        pack(part, rest, options.max_atlas_px, options.max_pages) for (_, part), rest in zip(parts, rests, strict=True)
+    ]
+    scale = min(layout.scale for layout, _ in packed)
+    page, shift = np.full(len(charts.photo), NONE, np.int32), np.zeros((len(charts.photo), 2), np.int32)
+    cells, sizes, owners = np.empty((len(unseen), 3), np.int64), list[tuple[int, int]](), list[int]()
+    for block, ((which, part), rest, found) in enumerate(zip(parts, rests, packed, strict=True)):
+        fits = found[0].scale == scale
+        layout, places = found if fits else pack(part, rest, options.max_atlas_px, options.max_pages, scale)
+        page[which], shift[which] = layout.page + len(sizes), layout.shift
+        own = np.flatnonzero(block_of[unseen] == block)
+        order = morton_order(mesh.vertices[mesh.faces[unseen[own]]].mean(axis=1))
+        cells[own[order]] = squares(places + np.array([len(sizes), 0, 0]), rest, len(own))
+        sizes += layout.sizes
+        owners += [block] * len(layout.sizes)
+    return Layout(page, shift, scale, tuple(sizes)), cells, np.array(owners, np.int32)
+
+
+def _part(charts: Charts, faces: IndexArray) -> tuple[IndexArray, Charts]:
+    """Return the numbers of the charts of a block, and these charts with the triangles of the block."""
+    of = charts.chart_of_face[faces]
+    which = np.unique(of[of != NONE])
+    own = np.where(of == NONE, NONE, np.searchsorted(which, of)).astype(np.int32)
+    return which, replace(charts, chart_of_face=own, photo=charts.photo[which], corners=charts.corners[faces])

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.culling import Clusters, cluster
-from sfm_app.geometry.triangles import bucket_order, unique_edges
+from sfm_app.geometry.triangles import Clusters, bucket_order, cluster, unique_edges
 from sfm_app.jit import kernel
 from sfm_app.types import Surface
+from sfm_app.types.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
 NONE = -1

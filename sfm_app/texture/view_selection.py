@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.texture.appearance.sightings import Sightings
 from sfm_app.texture.facets import NONE, Facets, IntArray
-
-FloatArray = NDArray[np.float64]
+from sfm_app.texture.sightings import Sightings
+from sfm_app.types.arrays import FloatArray
 
 CANDIDATES = 8
 """Number of best photos considered for each triangle."""

@@ -6,13 +6,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.camera.perspective_views import PerspectiveView
+from sfm_app.camera.projection import FISHEYE, PERSPECTIVE, shown_angle
 from sfm_app.errors import ReconstructionError
-from sfm_app.geometry.lenses.perspective_views import PerspectiveView
-from sfm_app.geometry.lenses.projections import FISHEYE, PERSPECTIVE, shown_angle
 from sfm_app.jit import kernel
 from sfm_app.types import CameraModel
-
-FloatArray = NDArray[np.float64]
+from sfm_app.types.arrays import FloatArray
 
 LENS, KIND, LIMIT, POSE = 12, 12, 13, 14
 """A camera row begins with the parameters of COLMAP's FULL_OPENCV or THIN_PRISM_FISHEYE: fx, fy, cx, cy, k1, k2, p1,

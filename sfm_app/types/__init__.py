@@ -8,19 +8,30 @@ Conventions:
 - Units are part of names: ``_px``, ``_deg``.
 """
 
-from sfm_app.types.calibration import Calibration, Intrinsics
-from sfm_app.types.camera_pairs import CameraPairs, PhotoPairs
-from sfm_app.types.control_points import ControlPoint, ControlPoints
-from sfm_app.types.epipolar import EpipolarFit, Rejected, ViewGraph
-from sfm_app.types.exported import SceneArrays
-from sfm_app.types.features import Features
-from sfm_app.types.given_cameras import GivenCameras
-from sfm_app.types.matches import MatchedImage, MatchGraph, PairId
-from sfm_app.types.model import Frustum, Model, Texture
-from sfm_app.types.photos import Frame, GpsPosition, Photo, PhotoSet, UnusablePhoto
-from sfm_app.types.pose_graph import LookAlikes, PoseGraph, RelativePose
-from sfm_app.types.scene import CameraModel, Scene
-from sfm_app.types.surface import Surface
+from sfm_app.types.camera import Calibration, GivenCameras, Intrinsics
+from sfm_app.types.evidence import (
+    CameraPairs,
+    EpipolarFit,
+    LookAlikes,
+    PhotoPairs,
+    PoseGraph,
+    Rejected,
+    RelativePose,
+    ViewGraph,
+)
+from sfm_app.types.photos import (
+    Features,
+    Frame,
+    GpsPosition,
+    MatchedImage,
+    MatchGraph,
+    PairId,
+    Photo,
+    PhotoSet,
+    UnusablePhoto,
+)
+from sfm_app.types.scene import CameraModel, ControlPoint, ControlPoints, Scene, SceneArrays
+from sfm_app.types.surface import Frustum, Model, Surface, Texture
 
 __all__ = [
     "Calibration",

@@ -1,9 +1,14 @@
-"""Photos of a folder, usable or not."""
+"""Photos, their features and their raw matches."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Photos of a folder, usable or not.
 
 Frame = tuple[int, int, int, int]
 """Left, top, width and height of a part of a photo, in pixels."""
@@ -98,3 +103,68 @@ class PhotoSet:
         for photo in self.photos:
             found.setdefault(photo.group, []).append(photo)
         return {name: tuple(members) for name, members in found.items()}
+
+
+# Features of one photo, as feature methods return them.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """Keypoints of one picture, the best first, with the data that their method needs to match them."""
+
+    size: tuple[int, int]
+    """Width and height of the picture in pixels."""
+    keypoints: NDArray[np.float64]
+    """(N, 2) x and y in pixels of the picture; the center of the top-left pixel is (0.5, 0.5)."""
+    values: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Descriptors, scores and the like, with N rows each."""
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+    def select(self, rows: NDArray[Any]) -> "Features":
+        """Return the features in these rows."""
+        return Features(self.size, self.keypoints[rows], {name: value[rows] for name, value in self.values.items()})
+
+
+# Keypoints and raw, unverified matches.
+
+PairId = tuple[int, int]
+"""(image id 1, image id 2) with id1 < id2, ids as in COLMAP's database."""
+
+
+@dataclass(frozen=True, slots=True)
+class MatchedImage:
+    """One photo as the match graph knows it."""
+
+    id: int
+    name: str
+    group: str
+    width: int
+    height: int
+    exif_focal_px: float | None = None
+    gps: GpsPosition | None = None
+    turn_deg: int = 0
+    """Clockwise rotation that makes it upright, according to EXIF and its shape."""
+    shown: Frame | None = None
+    """The picture inside the bars; None where there are no bars."""
+    projection: str = "perspective"
+    """"equirectangular" for a panorama, "perspective" for every other photo, also for fisheyes."""
+    time_s: float | None = None
+    """When it was taken, if it is a frame of a video: seconds from its start."""
+
+
+@dataclass(frozen=True, slots=True)
+class MatchGraph:
+    """Photos as nodes, raw matches as edges."""
+
+    images: Mapping[int, MatchedImage]
+    keypoints: Mapping[int, NDArray[np.float64]]
+    """Per image id: (N, 2) pixels."""
+    matches: Mapping[PairId, NDArray[np.uint32]]
+    """Per pair: (M, 2) keypoint indices in image 1 and image 2."""
+
+    def points(self, pair: PairId) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the matched points of one pair: x1, x2, each (M, 2) pixels."""
+        rows = self.matches[pair]
+        return self.keypoints[pair[0]][rows[:, 0]], self.keypoints[pair[1]][rows[:, 1]]

@@ -1,9 +1,11 @@
-"""A colored triangle mesh."""
+"""Colored and textured triangle meshes."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+# A colored triangle mesh.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -16,3 +18,43 @@ class Surface:
     """(T, 3) vertex indices, counter-clockwise seen from outside."""
     colors: NDArray[np.uint8]
     """(V, 3) RGB."""
+
+
+# Contents of a model file.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Texture:
+    """Pictures for the triangles of a surface."""
+
+    uv: NDArray[np.float32]
+    """(T, 3, 2) place of each corner of each triangle on its page, in [0, 1]; (0, 0) is the page's top-left corner."""
+    page: NDArray[np.int32]
+    """(T,) page of each triangle."""
+    pages: tuple[NDArray[np.uint8], ...]
+    """(H, W, 3) RGB each."""
+    normal_maps: tuple[NDArray[np.uint8], ...] = ()
+    """One (h, w, 3) per page, of its proportions: normals in the frames of `geometry.relief`, stored as glTF does:
+    0.5 + 0.5 n, linear, +y up; none where the surface has all its detail itself."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frustum:
+    """Intrinsics and pose of a photo in the scene."""
+
+    name: str
+    K: NDArray[np.float64]
+    """(3, 3) in pixels, without lens distortion."""
+    cam_from_world: NDArray[np.float64]
+    """(3, 4) [R | t]."""
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Model:
+    """A surface with or without a texture, or points (a surface without triangles) and the cameras that saw them."""
+
+    surface: Surface
+    texture: Texture | None = None
+    cameras: tuple[Frustum, ...] = ()

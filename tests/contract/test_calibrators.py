@@ -12,8 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_app.plugins import load_plugins
-from sfm_app.selfcal import calibrate_photo_set, pair_weights, zero_curves
-from sfm_app.selfcal.cameras import photo_set
+from sfm_app.selfcal import calibrate_photo_set, pair_weights, photo_set, zero_curves
 from sfm_app.settings import CalibrationSettings, ConstraintForm
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import Calibration, CameraPairs, PhotoPairs

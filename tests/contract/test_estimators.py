@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm_app.geometry.distances import sampson_distance
+from sfm_app.geometry.epipolar import sampson_distance
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair, random_rotation

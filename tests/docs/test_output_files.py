@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from sfm_app.runtime.manifest import CHECKSUM, StageRecord
+from sfm_app.runtime.workspace import CHECKSUM, StageRecord
 from tests.docs.pages import ROOT
 
 PAGE = (ROOT / "docs" / "reference" / "output-files.md").read_text(encoding="utf-8")

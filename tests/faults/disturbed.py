@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from sfm_app.cli import main
-from sfm_app.colmap.processes import worker_process
+from sfm_app.colmap import worker_process
 
 APPEARED = itertools.count(1)
 

@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 
 from sfm_app.photos import PhotoStats
+from sfm_app.photos.probe import read_photo
 from sfm_app.settings import PhotoSettings
-from sfm_app.stages.photos import read_photo
 
 
 def main(folder: Path, seconds: int, megabytes: int) -> None:

@@ -8,16 +8,14 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from sfm_app.engine.stage import Products
-from sfm_app.engine.staleness import rerun_reason
+from sfm_app.engine.stage import Products, rerun_reason
 from sfm_app.errors import SfmError
-from sfm_app.exports.stored import stored_model
+from sfm_app.exports import stored_model
 from sfm_app.photos import read_source
 from sfm_app.pipeline import NAMES, STAGES
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.manifest import StageRecord
-from sfm_app.runtime.workspace import Workspace
+from sfm_app.runtime.workspace import StageRecord, Workspace
 from sfm_app.settings import Settings
 
 from .mutations import ANYTHING, damaged, text_values

@@ -10,7 +10,7 @@ from PIL import Image
 
 import sfm_app
 from sfm_app.colmap.database import photo_names, read_features
-from sfm_app.geometry.similarity import robust_similarity
+from sfm_app.geometry.poses import robust_similarity
 from sfm_app.settings import Settings
 from sfm_app.stages import scene as scene_stage
 from sfm_app.synthetic.cameras import camera_center

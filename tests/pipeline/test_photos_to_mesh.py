@@ -29,7 +29,7 @@ from sfm_app.stages import texture
 from sfm_app.stages.texture import PARTS, FileStore, photo_views, read_texture
 from sfm_app.synthetic.cameras import camera_center
 from sfm_app.synthetic.compare import center_error_percent, focal_error_percent, surface_error
-from sfm_app.texture import atlas
+from sfm_app.texture import pages
 
 QUICK = {"quality": "draft", "report": False, "depth": {"max_image_size_px": 360}, "mesh": {"poisson_depth": 8}}
 DRAFT = Settings.from_mapping(QUICK)
@@ -248,15 +248,15 @@ def test_a_run_killed_in_its_texture_ends_with_the_same_bytes(finished, rendered
     whole, out = finished[0], tmp_path / "out"
     parts = out / "texture" / PARTS
     shutil.copytree(whole.out, out, symlinks=True)
-    monkeypatch.setattr(atlas, "EVERY_S", -1.0)
-    monkeypatch.setattr(atlas, "MOST_OF_THE_TIME", np.inf)
+    monkeypatch.setattr(pages, "EVERY_S", -1.0)
+    monkeypatch.setattr(pages, "MOST_OF_THE_TIME", np.inf)
 
     killed_at(4, monkeypatch, FileStore, "keep", rendered[0], out, DRAFT, first="texture")
     looks = stamps(parts, "look*.npz")
     assert len(looks) == 3
     killed_at(len(whole.scene.registered), monkeypatch, FileStore, "keep", rendered[0], out, DRAFT)
     assert stamps(parts, "look*.npz").items() > looks.items()
-    assert (parts / f"{atlas.GROUP_NAME}.npz").exists()
+    assert (parts / f"{pages.GROUP_NAME}.npz").exists()
     run = sfm_app.reconstruct(rendered[0], out, DRAFT)
 
     assert run.mesh_path.read_bytes() == whole.mesh_path.read_bytes()

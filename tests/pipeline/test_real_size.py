@@ -12,8 +12,8 @@ from scipy.spatial import KDTree
 
 import sfm_app
 from benchmarks.synthetic.scenes import marker_sheet
-from sfm_app.geometry.similarity import Similarity, umeyama
-from sfm_app.scale.markers import draw_pattern
+from sfm_app.frame.markers import draw_pattern
+from sfm_app.geometry.poses import Similarity, umeyama
 from sfm_app.settings import Settings
 from sfm_app.stages import scene as scene_stage
 from sfm_app.synthetic.cameras import ArcOptions, arc, camera_center, make_camera

@@ -13,7 +13,7 @@ from sfm_app.api import open_run
 from sfm_app.cli import main
 from sfm_app.errors import InputError
 from sfm_app.report.page import REPORT
-from sfm_app.report.view.resources import read_resources
+from sfm_app.report.server import read_resources
 from sfm_app.settings import Settings
 
 DRAFT = Settings.from_mapping({"quality": "draft"})
@@ -231,7 +231,7 @@ def test_a_report_that_cannot_be_made_does_not_end_the_run(rendered, tmp_path, m
     def fail(*_):
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr("sfm_app.report.page.writing.render_page", fail)
+    monkeypatch.setattr("sfm_app.report.page.render_page", fail)
 
     done = sfm_app.reconstruct(rendered[0], tmp_path / "out", DRAFT, last="photos")
 

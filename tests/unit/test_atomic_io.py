@@ -1,6 +1,6 @@
 import pytest
 
-from sfm_app.atomic_io import replace_atomically
+from sfm_app.files import replace_atomically
 
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):

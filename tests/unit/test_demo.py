@@ -13,10 +13,10 @@ from sfm_app.cli.commands.making import SCENES as TEXTS
 from benchmarks.synthetic.scenes import poster
 from benchmarks.synthetic.walks import orbit
 from sfm_app.api import Run
+from sfm_app.camera.models import camera_matrix
 from sfm_app.cli.output import fold_lines
 from sfm_app.demo import SCENES, DemoScene, camera_of, demo_lines, draw, evaluate, render_photos
 from sfm_app.errors import InputError
-from sfm_app.geometry.camera import camera_matrix
 from sfm_app.progress import SilentProgress
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import make_camera

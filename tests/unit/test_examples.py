@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from sfm_app.camera_files.recognition import read_given_cameras
+from sfm_app.camera_files import read_given_cameras
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
 ROOT = Path(__file__).parents[2]

@@ -10,10 +10,9 @@ from click.testing import CliRunner
 import sfm_app
 from sfm_app.cli import main
 from sfm_app.formats import EXPORTERS
+from sfm_app.frame.scale import MetricFrame
 from sfm_app.pipeline import NAMES, SCALE, STAGES
-from sfm_app.runtime.manifest import StageRecord
-from sfm_app.runtime.workspace import Workspace
-from sfm_app.scale import MetricFrame
+from sfm_app.runtime.workspace import StageRecord, Workspace
 
 LAST = STAGES[-1].takes[-1]
 """The stage whose product the files of the model hold."""

@@ -4,8 +4,8 @@ from pathlib import PureWindowsPath
 import numpy as np
 import pytest
 
-from sfm_app import hashing
-from sfm_app.hashing import MOST_BYTES, digest_files, fingerprint, is_below, load_arrays
+from sfm_app import files
+from sfm_app.files import MOST_BYTES, digest_files, fingerprint, is_below, load_arrays
 
 
 def test_arrays_come_back(tmp_path):
@@ -90,6 +90,6 @@ def test_fingerprints_ignore_order_of_keys_only():
     [("in\\x.jpg", True), ("C:x.jpg", False), ("\\x.jpg", False), ("C:\\x.jpg", False), ("..\\x", False)],
 )
 def test_drives_and_roots_of_windows_lead_out_of_the_folder(monkeypatch, name, below):
-    monkeypatch.setattr(hashing, "PurePath", PureWindowsPath)
+    monkeypatch.setattr(files, "PurePath", PureWindowsPath)
 
     assert is_below(name) == below

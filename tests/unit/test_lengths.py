@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.lengths import format_length, parse_length, parse_point
+from sfm_app.wording import format_length, parse_length, parse_point
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfm_app.name_lists import list_names
+from sfm_app.wording import list_names
 
 
 @pytest.mark.parametrize(

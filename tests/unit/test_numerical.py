@@ -8,9 +8,9 @@ import pytest
 
 from sfm_app.colmap.backend import pycolmap, translate_errors
 from sfm_app.errors import BackendError, ConfigError, NumericalError
-from sfm_app.geometry.similarity import umeyama
+from sfm_app.geometry.poses import umeyama
 from sfm_app.numerical import FAILURES, error_reason, finite_entries, json_text
-from sfm_app.runtime.manifest import Manifest, StageRecord
+from sfm_app.runtime.workspace import Manifest, StageRecord
 from sfm_app.types import Calibration
 
 OURS = {

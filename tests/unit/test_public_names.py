@@ -39,14 +39,14 @@ def test_the_import_leaves_out_what_an_estimator_does_not_need():
 
     done = subprocess.run([sys.executable, "-c", lists], capture_output=True, text=True, check=True)
 
-    assert "sfm_app.ransac.estimate" in done.stdout.split()
+    assert "sfm_app.fundamental.estimate" in done.stdout.split()
     assert heavy.isdisjoint(done.stdout.split())
 
 
 @pytest.mark.slow
 def test_the_processes_of_colmap_do_not_load_the_estimators():
-    heavy = {"numba", "sfm_app.api", "sfm_app.plugins", "sfm_app.ransac"}
-    lists = "import sys, sfm_app.colmap.processes.match_process; print(*sys.modules)"
+    heavy = {"numba", "sfm_app.api", "sfm_app.plugins", "sfm_app.fundamental"}
+    lists = "import sys, sfm_app.colmap.match_process; print(*sys.modules)"
 
     done = subprocess.run([sys.executable, "-c", lists], capture_output=True, text=True, check=True)
 

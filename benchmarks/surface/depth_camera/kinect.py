@@ -15,8 +15,8 @@ from benchmarks.common.results import Row
 from benchmarks.corpus.trajectory import offset_errors
 from benchmarks.surface.depth_camera.scan import Scan, align
 from benchmarks.surface.rendered.truth import sights_of
-from sfm_app.geometry.similarity import Similarity
-from sfm_app.meshing.open3d import load_open3d
+from sfm_app.geometry.poses import Similarity
+from sfm_app.meshing.ray_casting import load_open3d
 from sfm_app.synthetic.cameras import Camera, camera_center
 from sfm_app.synthetic.compare import sample_surface, surface_distances
 from sfm_app.synthetic.photo_folder import Truth

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.similarity import Similarity
+from sfm_app.geometry.poses import Similarity
 
 FloatArray = NDArray[np.float64]
 

@@ -7,13 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.ransac.points import Matches, prepare
-from sfm_app.ransac.refine.sampson_refit import fit_eight_point, refine_sampson
-from sfm_app.ransac.sampling.minimal_samples import SAMPLE_SIZE, RandomState, draw_uniform, draw_weighted, random_state
-from sfm_app.ransac.sampling.stopping import required_trials
-from sfm_app.ransac.scoring.leverage import cook_distances, leverages, mad_sigma, priors, studentized_residuals
-from sfm_app.ransac.scoring.robust_costs import squared_distances
-from sfm_app.ransac.solvers.minimal import MOST_MODELS, solve_sample
+from sfm_app.fundamental.leverage import cook_distances, leverages, mad_sigma, priors, studentized_residuals
+from sfm_app.fundamental.points import Matches, prepare
+from sfm_app.fundamental.refits import fit_eight_point, refine_sampson
+from sfm_app.fundamental.samples import (
+    SAMPLE_SIZE,
+    RandomState,
+    draw_uniform,
+    draw_weighted,
+    random_state,
+    required_trials,
+)
+from sfm_app.fundamental.scores import squared_distances
+from sfm_app.fundamental.solvers import MOST_MODELS, solve_sample
 from sfm_app.settings import EpipolarSettings
 
 FloatArray = NDArray[np.float64]

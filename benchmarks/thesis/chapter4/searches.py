@@ -4,11 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common.metrics import CAP_PX, mean_sampson_px
-from sfm_app.ransac.estimator_config import Recipe
-from sfm_app.ransac.estimator_configs import RECIPES
-from sfm_app.ransac.lev_ransac import PRODUCTION
-from sfm_app.ransac.loop import Hypothesis, search
-from sfm_app.ransac.points import Matches, prepare
+from sfm_app.fundamental.lev_ransac import PRODUCTION
+from sfm_app.fundamental.loop import Hypothesis, Recipe, search
+from sfm_app.fundamental.points import Matches, prepare
+from sfm_app.fundamental.recipes import RECIPES
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import TwoViews
 

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sfm_app
-from sfm_app.ransac.points import prepare
-from sfm_app.ransac.refine.sampson_refit import fit_eight_point
+from sfm_app.fundamental.points import prepare
+from sfm_app.fundamental.refits import fit_eight_point
 from sfm_app.types import EpipolarFit
-from sfm_app.types.matches import PairId
+from sfm_app.types.photos import PairId
 
 FloatArray = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from benchmarks.thesis.corners import load_corners
 from sfm_app.api import open_run
 from sfm_app.pipeline import MATCH_GRAPH, VIEW_GRAPH, run_stages
 from sfm_app.settings import Settings
-from sfm_app.types.matches import PairId
+from sfm_app.types.photos import PairId
 
 FloatArray = NDArray[np.float64]
 LEAST_CORNERS = 20

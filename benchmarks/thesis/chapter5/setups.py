@@ -14,7 +14,7 @@ from benchmarks.thesis.chapter5.fits import Fits, FloatArray, robust_fits, with_
 from benchmarks.thesis.chapter5.sequences import ImageSequence
 from benchmarks.thesis.corners import with_outliers
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks, pair_matches
-from sfm_app.types.matches import PairId
+from sfm_app.types.photos import PairId
 
 NOISE_PX = 0.5
 """Noise of all matches; the thesis states the noise for Figure 5.21 only."""

@@ -9,7 +9,7 @@ from benchmarks.thesis.chapter5.panels import Panel, draw, minimum_x, panel_rows
 from benchmarks.thesis.chapter5.sequences import ImageSequence
 from benchmarks.thesis.chapter5.setups import NOISE_PX
 from benchmarks.thesis.claims import Claim, verdict
-from sfm_app.selfcal.inputs import prepare
+from sfm_app.selfcal.pairs import prepare
 from sfm_app.selfcal.thesis.constraint_forms import Halves, essential, huang_faugeras
 from sfm_app.selfcal.thesis.kruppa import kruppa_equations, kruppa_ratios
 from sfm_app.synthetic.cameras import axis_rotation

@@ -19,8 +19,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.selfcal.inputs import FloatArray
 from sfm_app.settings import ConstraintForm
+from sfm_app.types.arrays import FloatArray
 
 _TINY = float(np.finfo(np.float64).tiny)
 """The smallest normal number in double precision; added to divisors, so that none is zero."""

@@ -1,10 +1,142 @@
 """Zero curves: the roots of one pair's constraint, swept over a parameter (thesis 5.8.3)."""
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sfm_app.jit import kernel
 from sfm_app.selfcal.constraints import center_polynomials, focal_polynomials
-from sfm_app.selfcal.inputs import FloatArray, Pairs
-from sfm_app.selfcal.thesis.roots import ComplexArray, swept_roots
+from sfm_app.selfcal.pairs import Pairs
+from sfm_app.types.arrays import FloatArray
+
+# All roots of many real polynomials (thesis 5.8.3): eigenvalues of companion matrices, followed along a sweep.
+
+ComplexArray = NDArray[np.complex128]
+
+_MOST_ROUNDS = 30
+"""Most rounds of Aberth's iteration for one sample. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+_NUDGE = 1e-3
+"""Roots start off those of the sample before by this share of their size, each in another direction. Chosen by hand;
+halved and doubled by `benchmarks.sensitivity`."""
+_ROUNDING = 1e-16
+"""Rounding error of a polynomial's value, as a share of the sizes of its terms: double precision."""
+_BLUR = 1e-10
+"""A root that rounding may shift by a larger share of its size counts as a multiple one. Chosen by hand; halved and
+doubled by `benchmarks.sensitivity`."""
+_NO_STEP = 1e-15
+"""A step that no longer counts, as a share of the root's size: double precision, times ten."""
+
+
+def companion_roots(coefficients: FloatArray) -> ComplexArray:
+    """Return all roots of real polynomials as the eigenvalues of their companion matrices.
+
+    Args:
+        coefficients: (..., n + 1), lowest power first.
+
+    Returns:
+        (..., n) roots; a polynomial of lower degree has roots far out in place of the missing ones, one that vanishes
+        has all roots 0.
+    """
+    monic = _make_monic(coefficients)
+    degree = coefficients.shape[-1] - 1
+    companion = np.zeros((*coefficients.shape[:-1], degree, degree))
+    companion[..., np.arange(1, degree), np.arange(degree - 1)] = 1.0
+    companion[..., :, -1] = -monic[..., :-1]
+    companion[np.all(coefficients == 0, axis=-1)] = 0.0
+    return np.linalg.eigvals(companion).astype(np.complex128)
+
+
+def swept_roots(coefficients: FloatArray) -> ComplexArray:
+    """Return `companion_roots` of polynomials that change little from one to the next along the second axis.
+
+    It is far faster: Aberth's iteration (Math. Comp. 27, 1973) carries all roots of one polynomial to those of the
+    next. Eigenvalues are used where it does not converge, and for multiple roots, which it finds less accurately.
+
+    Args:
+        coefficients: (P, S, n + 1), lowest power first.
+
+    Returns:
+        (P, S, n) roots; each sample's in no particular order.
+    """
+    vanished = np.all(coefficients == 0, axis=-1)
+    first = np.argmin(vanished, axis=1)
+    roots = np.zeros((*vanished.shape, coefficients.shape[-1] - 1), dtype=np.complex128)
+    start = companion_roots(coefficients[np.arange(len(first)), first])
+    settled = _follow(_make_monic(coefficients), start, first, roots)
+    lost = ~(settled | vanished)
+    roots[vanished] = 0.0
+    roots[lost] = companion_roots(coefficients[lost])
+    return roots
+
+
+def _make_monic(coefficients: FloatArray) -> FloatArray:
+    """Divide by the leading coefficient; one that vanishes is replaced by the smallest that counts."""
+    size = np.max(np.abs(coefficients), axis=-1, keepdims=True)
+    scaled = coefficients / np.where(size == 0, 1.0, size)
+    smallest = np.finfo(np.float64).eps
+    lead = scaled[..., -1:]
+    scaled[..., -1:] = np.where(np.abs(lead) < smallest, np.copysign(smallest, lead), lead)
+    return np.asarray(scaled / scaled[..., -1:])
+
+
+@kernel
+def _follow(monic: FloatArray, start: ComplexArray, first: NDArray[np.int64], roots: ComplexArray) -> NDArray[np.bool_]:
+    """Fill `roots` from the `first` sample of each pair on, whose roots are `start`; return where they converged."""
+    count, samples, degree = roots.shape
+    settled = np.zeros((count, samples), dtype=np.bool_)
+    for i in range(count):
+        before = start[i]
+        for j in range(first[i], samples):
+            here = roots[i, j]
+            for k in range(degree):
+                # two roots that meet on the real axis leave it there; estimates on the axis never would
+                here[k] = before[k] * complex(1.0 + _NUDGE * np.cos(k), _NUDGE * np.sin(k))
+            settled[i, j] = _settle(monic[i, j], here)
+            if settled[i, j]:
+                before = here
+    return settled
+
+
+@kernel
+def _settle(monic: FloatArray, roots: ComplexArray) -> bool:
+    """Move estimates of all roots to the roots; return False where they do not converge or are multiple."""
+    degree = len(roots)
+    for _ in range(_MOST_ROUNDS):
+        moved = False
+        for i in range(degree):
+            z = roots[i]
+            size = abs(z)
+            value, slope, rounding = complex(monic[degree], 0.0), complex(0.0, 0.0), 1.0
+            for power in range(degree - 1, -1, -1):
+                slope = slope * z + value
+                value = value * z + monic[power]
+                rounding = rounding * size + abs(monic[power])
+            noise = _ROUNDING * rounding
+            if abs(value) <= noise:
+                if noise > _BLUR * abs(slope) * size:
+                    return False
+                continue
+            # Newton's step for the polynomial divided by the other roots' factors
+            repelled = complex(0.0, 0.0)
+            for j in range(degree):
+                if j != i:
+                    repelled += _inverse(z - roots[j])
+            step = value * _inverse(slope - value * repelled)
+            roots[i] = z - step
+            length = abs(step)
+            if not length < np.inf:
+                return False
+            moved = moved or length > _NO_STEP * size
+        if not moved:
+            return True
+    return False
+
+
+@kernel
+def _inverse(z: complex) -> complex:
+    """Return 1 / z; infinite or NaN at 0, without an exception."""
+    square = z.real * z.real + z.imag * z.imag
+    return complex(z.real / square, -z.imag / square)
+
 
 ROOT_IS_ZERO = 1e-9
 """A real part below this, in image widths, counts as zero: such roots are spurious. Chosen by hand; halved and doubled

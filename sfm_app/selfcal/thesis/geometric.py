@@ -5,13 +5,14 @@ from functools import partial
 
 import numpy as np
 
-from sfm_app.geometry.distances import sampson_distance
-from sfm_app.selfcal.inputs import FloatArray, Pairs, check_pairs
+from sfm_app.geometry.epipolar import sampson_distance
+from sfm_app.selfcal.pairs import Pairs, check_pairs
 from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations
 from sfm_app.selfcal.thesis.least_squares import fit_camera
 from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
+from sfm_app.types.arrays import FloatArray
 
 METHOD = "geometric"
 LEAST_RESIDUAL_PX = 1e-3

@@ -2,7 +2,7 @@
 
 from functools import partial
 
-from sfm_app.selfcal.inputs import Pairs
+from sfm_app.selfcal.pairs import Pairs
 from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations
 from sfm_app.selfcal.thesis.least_squares import fit_camera
 from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with

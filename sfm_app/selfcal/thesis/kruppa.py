@@ -11,12 +11,13 @@ a^2 B11 / A22 = -ab B12 / A12 = b^2 B22 / A11. They contain no epipole.
 
 import numpy as np
 
-from sfm_app.selfcal.inputs import FloatArray, Pairs
+from sfm_app.selfcal.pairs import Pairs
 from sfm_app.selfcal.thesis.constraint_forms import Halves
 from sfm_app.selfcal.thesis.least_squares import fit_camera
 from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
+from sfm_app.types.arrays import FloatArray
 
 METHOD = "kruppa"
 VANISHED = 1e-9

@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.selfcal.inputs import FloatArray, Pairs
+from sfm_app.selfcal.pairs import Pairs
 from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations, Halves
 from sfm_app.selfcal.thesis.verdict import CameraParameters
+from sfm_app.types.arrays import FloatArray
 
 DEFAULT = EQUATIONS["huang-faugeras"]
 """The form that the thesis chooses (5.5.1)."""

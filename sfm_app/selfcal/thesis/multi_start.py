@@ -5,7 +5,7 @@ from math import ceil, comb, log
 
 import numpy as np
 
-from sfm_app.selfcal.inputs import Pairs
+from sfm_app.selfcal.pairs import Pairs
 from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations, Halves
 from sfm_app.selfcal.thesis.kruppa import pair_focals
 from sfm_app.selfcal.thesis.least_squares import DEFAULT, find_minima

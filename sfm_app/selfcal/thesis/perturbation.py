@@ -5,12 +5,13 @@ from functools import partial
 import numpy as np
 
 from sfm_app.numerical import MAD_TO_SIGMA
-from sfm_app.selfcal.inputs import FloatArray, Pairs
+from sfm_app.selfcal.pairs import Pairs
 from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations, essential
 from sfm_app.selfcal.thesis.least_squares import DEFAULT, fit_camera
 from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
+from sfm_app.types.arrays import FloatArray
 
 METHOD = "perturbation"
 MOST_ITERATIONS = 4

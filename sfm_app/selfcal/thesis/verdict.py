@@ -9,13 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_app.geometry.camera import camera_matrix
-from sfm_app.selfcal.consensus.consensus import Consensus
-from sfm_app.selfcal.consensus.peak_evidence import best_rival, disagreement, indecision, votes
-from sfm_app.selfcal.consensus.peak_search import SIGMAS
-from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
-from sfm_app.selfcal.results import guess_calibration
+from sfm_app.camera.models import camera_matrix
+from sfm_app.selfcal.consensus import SIGMAS, Consensus, best_rival, disagreement, indecision, votes
+from sfm_app.selfcal.pairs import Pairs, guess_calibration, prepare
 from sfm_app.types import Calibration, CameraPairs
+from sfm_app.types.arrays import FloatArray
 
 MIN_PAIRS = 3
 """Four unknowns and two constraints a pair; with two pairs nothing is left to contradict a wrong K. Counted, by

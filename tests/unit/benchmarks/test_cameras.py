@@ -9,7 +9,7 @@ from benchmarks.cameras.report import DEVIATIONS, compare_bytes, medians, page
 from benchmarks.cameras.score import Model, TruePhoto, accuracy, camera_errors, stated_deviations, times, true_photos
 from benchmarks.common.metrics import area_under_recall, pose_errors_deg, position_rms_percent
 from benchmarks.common.photo_sets import steps
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.camera.models import camera_matrix
 from sfm_app.synthetic.cameras import axis_rotation
 
 K = camera_matrix(1000.0, 1010.0, 400.0, 300.0)

@@ -34,8 +34,8 @@ from benchmarks.thesis.chapter5.slices import SCALES, focal_slice
 from benchmarks.thesis.chapter5.sweep_claims import CLAIMS, CurveClaim, check_levels, judge_claims
 from benchmarks.thesis.chapter5.sweeps import FIGURES
 from benchmarks.thesis.chapter5.zero_curve_plots import SIGMA, support
-from sfm_app.geometry.camera import camera_matrix
-from sfm_app.geometry.distances import sampson_distance
+from sfm_app.camera.models import camera_matrix
+from sfm_app.geometry.epipolar import sampson_distance
 from sfm_app.selfcal.thesis.constraint_forms import essential
 from sfm_app.synthetic.cameras import axis_rotation
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks, pair_matches

@@ -21,7 +21,7 @@ from benchmarks.corpus.report import corpus_page
 from benchmarks.corpus.score import Doubt, claimed_errors, fold_lines, parameter_counts, parameter_errors, walk_figures
 from benchmarks.corpus.trajectory import offset_errors, order_scores
 from benchmarks.corpus.tuning_sets import GROUPS, groups_table, seen_sets, unseen_rows
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.camera.models import camera_matrix
 from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at
 
 K = camera_matrix(1000.0, 1000.0, 400.0, 300.0)

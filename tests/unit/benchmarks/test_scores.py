@@ -10,7 +10,7 @@ from benchmarks.common.metrics import (
     summary_px,
 )
 from benchmarks.common.timing import take_turns
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.camera.models import camera_matrix
 from sfm_app.geometry.epipolar import fundamental_from_pose
 from sfm_app.synthetic.cameras import axis_rotation
 from sfm_app.synthetic.correspondences import PairOptions, make_pair

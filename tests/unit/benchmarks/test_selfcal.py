@@ -6,7 +6,7 @@ from benchmarks.common import photo_sets
 from benchmarks.selfcal import coverage as selfcal_coverage
 from benchmarks.selfcal import score as selfcal_score
 from benchmarks.selfcal.methods import MethodResult
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.camera.models import camera_matrix
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration
 

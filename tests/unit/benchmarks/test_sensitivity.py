@@ -57,20 +57,20 @@ def test_every_room_has_constants_and_kernels_are_known():
 def test_whoever_imports_a_constant_sees_it_scaled():
     code = (
         "import json; from benchmarks.sensitivity.constants import Constant, install;"
-        "install(Constant('sfm_app/selfcal/adjustment/camera_priors.py', 'HINT_SPREAD'), 2.0);"
+        "install(Constant('sfm_app/selfcal/priors.py', 'HINT_SPREAD'), 2.0);"
         "from sfm_app.selfcal.adjustment import camera_priors as here;"
         "from sfm_app.selfcal.cameras import multi_camera as there;"
         "print(json.dumps([here.HINT_SPREAD, there.HINT_SPREAD, here.FOCAL_SPREAD]))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment())
-    from sfm_app.selfcal.adjustment import camera_priors as usual
+    from sfm_app.selfcal import priors as usual
 
     assert json.loads(done.stdout) == [2 * usual.HINT_SPREAD, 2 * usual.HINT_SPREAD, usual.FOCAL_SPREAD]
 
 
 def test_a_module_that_is_imported_already_is_refused():
     with pytest.raises(RuntimeError, match="imported already"):
-        install(Constant("sfm_app/settings/tables.py", "ANY"), 2.0)
+        install(Constant("sfm_app/settings.py", "ANY"), 2.0)
 
 
 def test_rows_show_differences_and_failures():

@@ -16,7 +16,7 @@ from benchmarks.surface.sets import REAL, RENDERED, SCANNED, SurfaceSet, first_p
 from benchmarks.surface.sparse_poisson import points_ply
 from benchmarks.surface.worker import StageCost
 from benchmarks.synthetic.scenes import WALKS
-from sfm_app.geometry.similarity import Similarity
+from sfm_app.geometry.poses import Similarity
 from sfm_app.synthetic.cameras import Views, axis_rotation, look_at, make_camera
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.synthetic.render import Picture

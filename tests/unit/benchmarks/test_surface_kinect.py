@@ -18,7 +18,7 @@ from benchmarks.surface.depth_camera.kinect import (
 from benchmarks.surface.depth_camera.scan import PATCH, Scan, align
 from benchmarks.surface.report import page
 from benchmarks.surface.sets import SCANNED, surface_set
-from sfm_app.geometry.similarity import Similarity
+from sfm_app.geometry.poses import Similarity
 from sfm_app.synthetic.cameras import Camera, axis_rotation, camera_center, look_at
 from sfm_app.types import Surface
 

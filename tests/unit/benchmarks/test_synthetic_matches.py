@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.synthetic.matches import LEAST_DEPARTURE_PX, TownOptions, make_town_graph, make_two_motions
 from sfm_app.errors import ConfigError
-from sfm_app.geometry.distances import sampson_distance
+from sfm_app.geometry.epipolar import sampson_distance
 from sfm_app.synthetic.correspondences import PairOptions
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.cameras.score import TruePhoto
 from benchmarks.trouble import command as trouble
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.camera.models import camera_matrix
 
 K = camera_matrix(600.0, 600.0, 320.0, 240.0)
 LONG = camera_matrix(660.0, 660.0, 320.0, 240.0)

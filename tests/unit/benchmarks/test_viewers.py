@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.viewers import command as viewers
-from sfm_app.formats.glb import write_glb
-from sfm_app.formats.ply import write_ply
+from sfm_app.formats.gltf import write_glb
+from sfm_app.formats.meshes import write_ply
 
 SILENT = {
     "validator": {"errors": 0, "warnings": 0, "messages": [], "triangles": 5120},

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from benchmarks.synthetic.walks import Trajectory, WalkOptions, project_through_shutter, walk
-from sfm_app.bundle_adjustment.normal_equations import Bundle
-from sfm_app.bundle_adjustment.readout import Rows
-from sfm_app.geometry.lenses.projections import CAMERA, PERSPECTIVE
+from sfm_app.bundle.normal_equations import Bundle
+from sfm_app.bundle.rolling_shutter import Rows
+from sfm_app.camera.projection import CAMERA, PERSPECTIVE
 from sfm_app.synthetic.cameras import Camera, make_camera
 
 INTERVAL_S, POINTS, DEPTHS, NOISE_PX = 0.1, 500, (2.0, 8.0), 0.3

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.bundle_adjustment.elimination_width import elimination_width
+from sfm_app.bundle.normal_equations import elimination_width
 
 
 def observations(tracks):

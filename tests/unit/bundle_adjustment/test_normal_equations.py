@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.bundle_adjustment.normal_equations import LOST_PX, Bundle, cost, lost_points, project, reduce, usable_mask
-from sfm_app.geometry.lenses.projections import PERSPECTIVE
+from sfm_app.bundle.normal_equations import LOST_PX, Bundle, cost, lost_points, project, reduce, usable_mask
+from sfm_app.camera.projection import PERSPECTIVE
 
 CAMERA = np.array([[900.0, 900.0, 500.0, 400.0, *[0.0] * 8]])
 FAMILY = np.array([PERSPECTIVE])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.synthetic.walks import WalkOptions, walk
-from sfm_app.bundle_adjustment.path_velocity import FITS, local_fit_weights, path_velocities
+from sfm_app.bundle.rolling_shutter import FITS, local_fit_weights, path_velocities
 
 STEP_S = 1e-3
 

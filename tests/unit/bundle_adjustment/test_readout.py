@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sfm_app.bundle_adjustment.lens_parts import LensPriors
-from sfm_app.bundle_adjustment.normal_equations import apply_step, best_step, reduce
-from sfm_app.bundle_adjustment.readout import estimate_readout
+from sfm_app.bundle.lens_parts import LensPriors
+from sfm_app.bundle.normal_equations import apply_step, best_step, reduce
+from sfm_app.bundle.rolling_shutter import estimate_readout
 
 pytestmark = pytest.mark.slow
 

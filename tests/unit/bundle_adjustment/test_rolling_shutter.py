@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.synthetic.walks import project_through_shutter
-from sfm_app.bundle_adjustment.normal_equations import apply_step, project
-from sfm_app.bundle_adjustment.rolling_shutter import move_to_middle_row, project_rows
+from sfm_app.bundle.normal_equations import apply_step, project
+from sfm_app.bundle.rolling_shutter import move_to_middle_row, project_rows
 
 STEP = 1e-6
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.bundle_adjustment.schur import Linearized, eliminate_points
+from sfm_app.bundle.normal_equations import Linearized, eliminate_points
 
 PHOTOS, CAMERAS, POINTS, SEEN, DAMPING = 5, 3, 20, 60, 1e-3
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.bundle_adjustment.elimination import POSE
-from sfm_app.bundle_adjustment.shutter_equations import (
+from sfm_app.bundle.normal_equations import POSE
+from sfm_app.bundle.rolling_shutter import (
     ShutterBundle,
     add_points,
     apply_shutter_step,

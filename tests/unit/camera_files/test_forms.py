@@ -10,12 +10,11 @@ import pytest
 from hypothesis import given as given_values
 from hypothesis import strategies as st
 
-from sfm_app.camera_files import read_given_cameras
-from sfm_app.camera_files.colmap_files import MODEL_IDS
+from sfm_app.camera.bearings import RAY, bearings
+from sfm_app.camera.models import PARAMETERS, calibration_from_model
+from sfm_app.camera_files import MODEL_IDS, read_given_cameras
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.errors import InputError
-from sfm_app.geometry.lenses.bearings import RAY, bearings
-from sfm_app.geometry.lenses.camera_models import PARAMETERS, calibration_from_model
 from sfm_app.types import Calibration, CameraModel, Intrinsics
 
 WIDTH, HEIGHT = 1000, 800

@@ -18,10 +18,9 @@ from sfm_app.cli.options import (
     settings_from_flags,
 )
 from sfm_app.errors import ConfigError
+from sfm_app.frame.markers import FAMILIES, PAGES_MM
 from sfm_app.pipeline import NAMES
 from sfm_app.plugins import load_plugins
-from sfm_app.scale.marker_page import PAGES_MM
-from sfm_app.scale.markers import FAMILIES
 from sfm_app.settings import QUALITY_PRESETS, Settings
 
 PARAMETERS = {parameter.name: parameter for parameter in commands.run.params}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.colmap.models.arrays import model_arrays
+from sfm_app.colmap.model import model_arrays
 
 
 def test_points_fall_on_the_pixels_of_their_tracks(synthetic):

@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 
-from sfm_app.bundle_adjustment.normal_equations import reduce
+from sfm_app.bundle.normal_equations import reduce
+from sfm_app.camera.models import camera_matrix
+from sfm_app.camera.projection import CAMERA
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.bundle import adjust
-from sfm_app.colmap.bundles.bundle_arrays import read_bundle
-from sfm_app.colmap.bundles.bundle_rounds import LOSS_SCALE_PX, solve
+from sfm_app.colmap.bundle import LOSS_SCALE_PX, adjust, read_bundle, solve
 from sfm_app.colmap.database import camera_params
-from sfm_app.geometry.camera import camera_matrix
-from sfm_app.geometry.lenses.projections import CAMERA
 
 pytestmark = pytest.mark.slow
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap import bundle
+from sfm_app.colmap import bundle as bundle_rounds
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundle import adjust, adjust_or_keep
-from sfm_app.colmap.bundles import bundle_rounds
 from sfm_app.colmap.database import open_database
 from sfm_app.errors import BackendError, NumericalError
 

@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from sfm_app.bundle_adjustment.camera_rules import CameraRule
-from sfm_app.colmap.bundle import adjust
-from sfm_app.colmap.bundles.bundle_arrays import camera_family, read_camera
-from sfm_app.estimation.camera_check import find_contradictions
-from sfm_app.geometry.lenses.camera_models import calibration_from_model
-from sfm_app.geometry.lenses.projections import FISHEYE, FX, K1, K2, K3, P1
-from sfm_app.types.calibration import KEPT
+from sfm_app.bundle.lens_parts import CameraRule
+from sfm_app.camera.models import calibration_from_model
+from sfm_app.camera.projection import FISHEYE, FX, K1, K2, K3, P1
+from sfm_app.colmap.bundle import adjust, camera_family, read_camera
+from sfm_app.estimation.given_cameras import find_contradictions
+from sfm_app.types.camera import KEPT
 
 SIZE = (1000, 800)
 TRUE = [900.0, 900.0, 500.0, 400.0, -0.1, 0.02, 0.0, 0.0]

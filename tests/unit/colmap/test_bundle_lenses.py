@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
+from sfm_app.camera.projection import CAMERA, CX, CY, FX, FY, PANORAMA
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.bundle import adjust
-from sfm_app.colmap.bundles.bundle_arrays import camera_family, file_model, read_camera, write_camera
-from sfm_app.colmap.bundles.bundle_rounds import solve
-from sfm_app.geometry.lenses.projections import CAMERA, CX, CY, FX, FY, PANORAMA
+from sfm_app.colmap.bundle import adjust, camera_family, file_model, read_camera, solve, write_camera
 from sfm_app.numerical import json_text
 
 WIDTH, HEIGHT = 1000, 800
@@ -158,7 +156,7 @@ def test_colmap_moves_poses_and_points_of_a_model_of_three_families(mixed):
 @pytest.mark.slow
 @pytest.mark.parametrize("most", [250, 8])
 def test_a_narrow_lens_taken_for_a_fisheye_becomes_perspective(mapped, monkeypatch, most):
-    monkeypatch.setattr("sfm_app.colmap.bundles.lens_choice.MOST_COMPARED", most)
+    monkeypatch.setattr("sfm_app.colmap.bundle.MOST_COMPARED", most)
     model, database = mapped(
         [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=16, start=(893.0, 500.0, 400.0, 0.0)
     )

@@ -19,8 +19,8 @@ from sfm_app.colmap.database import (
     write_match_graph,
     write_pose_graph,
 )
-from sfm_app.colmap.models.model import model_from_seed
-from sfm_app.geometry.two_view_init import TwoViewSeed
+from sfm_app.colmap.model import model_from_seed
+from sfm_app.geometry.epipolar import TwoViewSeed
 from sfm_app.types import Calibration, Intrinsics, Photo, PhotoSet, PoseGraph, RelativePose
 
 NAMES = ("b.png", "a.png", "c.png")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.dense import read_views, undistort
-from sfm_app.colmap.perspective.larger_views import LargerViews
+from sfm_app.colmap.perspective import LargerViews
 from sfm_app.photos import save_mask
 from sfm_app.progress import SilentProgress
 from tests.unit.colmap.test_wide_views import CAMERAS, NAMES, SIZE, colors_of, fill, make_place

@@ -8,7 +8,7 @@ import pytest
 from sfm_app.colmap import mapping
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.processes.global_mapping import global_options
+from sfm_app.colmap.global_mapping import global_options
 from sfm_app.errors import BackendError
 
 pytestmark = pytest.mark.slow

@@ -9,16 +9,18 @@ from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import create_database, read_match_graph
 from sfm_app.colmap.dense import (
     MASKED,
+    REACH_PX,
     DenseStore,
+    MaskUndistorter,
     mask_depths,
     read_depth,
     read_views,
     undistort,
+    used_pixels,
     write_fusion_views,
     write_maps,
 )
 from sfm_app.colmap.features import find_and_match
-from sfm_app.colmap.masks import REACH_PX, MaskUndistorter, used_pixels
 from sfm_app.colmap.surface import FUSED, fuse, open_points, positions
 from sfm_app.photos import save_mask
 from sfm_app.progress import SilentProgress

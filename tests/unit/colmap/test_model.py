@@ -6,19 +6,19 @@ import pytest
 from sfm_app.colmap.backend import json_options, pycolmap, translate_errors
 from sfm_app.colmap.bundle import adjust
 from sfm_app.colmap.database import SQUARE_PIXELS, TWO_FOCALS, camera_params
-from sfm_app.colmap.models.model import (
+from sfm_app.colmap.model import (
     cameras_by_photo,
     focal_px,
     move,
     placed_views,
     posed_photo_ids,
     poses_and_points,
+    sparse_model,
     submodel,
     viewing_rays,
 )
-from sfm_app.colmap.models.stored_model import sparse_model
 from sfm_app.errors import BackendError, ConfigError
-from sfm_app.geometry.similarity import Similarity
+from sfm_app.geometry.poses import Similarity
 
 
 def test_a_model_moves_as_a_whole(synthetic):

@@ -9,23 +9,23 @@ import pytest
 from PIL import Image
 
 from sfm_app.colmap.database import create_database, digest_matches, open_database, unmatched_pairs
-from sfm_app.colmap.features import find_and_match
-from sfm_app.colmap.part_databases import (
+from sfm_app.colmap.features import (
     BLOCK,
     FEATURES,
     MATCHES,
     SiftInputs,
     enter_rows,
     exhaustive_pairs,
+    find_and_match,
     find_in_chunk,
     match_chunk,
     match_chunk_apart,
     photos_without_features,
     write_snapshot,
 )
-from sfm_app.colmap.processes.worker_process import ProcessGroup
+from sfm_app.colmap.worker_process import ProcessGroup
 from sfm_app.errors import BackendError
-from sfm_app.estimation.in_chunks.sift_chunks import chunks
+from sfm_app.matching.features import chunks
 from sfm_app.progress import SilentProgress
 from sfm_app.settings import MatchSettings
 from sfm_app.types import Photo, PhotoSet

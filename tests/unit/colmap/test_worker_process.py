@@ -9,7 +9,7 @@ import time
 import psutil
 import pytest
 
-from sfm_app.colmap.processes.worker_process import relay, start_worker
+from sfm_app.colmap.worker_process import relay, start_worker
 from sfm_app.errors import BackendError
 from sfm_app.operating_system import Ability
 
@@ -18,7 +18,7 @@ POSIX = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such 
 
 CHILD = """
 import os, signal, sys, time
-from sfm_app.colmap.processes.worker_process import ProgressReporter, report, serve
+from sfm_app.colmap.worker_process import ProgressReporter, report, serve
 
 def work(task):
     {work}
@@ -116,7 +116,7 @@ def test_a_process_is_ended_with_the_block(child):
 def test_a_process_ends_when_the_one_that_started_it_is_killed(child, without, taken):
     without(*taken)
     parent = (
-        "import sys; from sfm_app.colmap.processes.worker_process import start_worker\n"
+        "import sys; from sfm_app.colmap.worker_process import start_worker\n"
         "with start_worker(sys.argv[1], {}) as process:\n"
         "    for message in process.messages(): print(message['me'], flush=True)"
     )

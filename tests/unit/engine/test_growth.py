@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from sfm_app.engine.growth import find_earlier, forget_earlier, set_aside
-from sfm_app.engine.stage import Stage
-from sfm_app.engine.staleness import manifest_head, settings_and_versions
-from sfm_app.hashing import digest_files
-from sfm_app.runtime.manifest import StageRecord
+from sfm_app.engine.incremental import find_earlier, forget_earlier, set_aside
+from sfm_app.engine.stage import Stage, manifest_head, settings_and_versions
+from sfm_app.files import digest_files
+from sfm_app.runtime.workspace import StageRecord
 from sfm_app.settings import Settings
 
 BEFORE, NOW = {"a.jpg": "1", "b.jpg": "2"}, {"a.jpg": "1", "c.jpg": "3"}
@@ -66,7 +65,7 @@ def test_other_settings_end_what_can_be_gone_on_from(moved):
 
 
 def test_other_versions_end_it_too(moved, monkeypatch):
-    monkeypatch.setattr("sfm_app.engine.staleness.versions", lambda: {"numpy": "1.0"})
+    monkeypatch.setattr("sfm_app.engine.stage.versions", lambda: {"numpy": "1.0"})
 
     assert find_earlier(STAGES, NOW, "", moved) is None
 

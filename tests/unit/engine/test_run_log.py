@@ -5,7 +5,7 @@ import warnings
 
 import pytest
 
-from sfm_app.engine.run_log import log_to_file
+from sfm_app.engine.execution import log_to_file
 
 
 def test_warnings_of_python_stand_in_the_log(run):

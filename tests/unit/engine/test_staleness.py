@@ -2,10 +2,16 @@
 
 from dataclasses import replace
 
-from sfm_app.engine.stage import Stage
-from sfm_app.engine.staleness import manifest_head, nested_value, rerun_reason, settings_and_versions, stage_fingerprint
+from sfm_app.engine.stage import (
+    Stage,
+    manifest_head,
+    nested_value,
+    rerun_reason,
+    settings_and_versions,
+    stage_fingerprint,
+)
 from sfm_app.runtime.context import GIVEN_CAMERAS
-from sfm_app.runtime.manifest import StageRecord
+from sfm_app.runtime.workspace import StageRecord
 from sfm_app.settings import Settings
 from sfm_app.types import GivenCameras
 
@@ -64,7 +70,7 @@ def test_no_more_than_three_are_named(run):
 def test_photos_files_and_versions(run, monkeypatch):
     finished(run)
     assert why(run, "other photos") == "the photos have changed"
-    monkeypatch.setattr("sfm_app.engine.staleness.versions", lambda: {"numpy": "1.0"})
+    monkeypatch.setattr("sfm_app.engine.stage.versions", lambda: {"numpy": "1.0"})
     assert "-> " in why(run)
     (run.workspace.root / "x.txt").unlink()
     assert why(run) == "x.txt is gone or was changed"

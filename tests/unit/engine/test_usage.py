@@ -5,8 +5,8 @@ import time
 
 import pytest
 
-from sfm_app.engine import usage
-from sfm_app.engine.usage import _resident_mb, measure_usage
+from sfm_app.engine import execution
+from sfm_app.engine.execution import _resident_mb, measure_usage
 from sfm_app.operating_system import Ability, ChildTimes
 
 TRUE = ("cmd", "/c", "exit") if sys.platform == "win32" else ("true",)
@@ -51,7 +51,7 @@ def test_cpu_seconds_are_those_of_work_and_not_of_waiting():
 @pytest.mark.parametrize("taken", [(), (Ability.CHILD_TIMES,)], ids=["system", "looks"])
 def test_cpu_seconds_of_children_count_once(without, monkeypatch, taken):
     without(*taken)
-    monkeypatch.setattr(usage, "EVERY_S", 0.1)
+    monkeypatch.setattr(execution, "EVERY_S", 0.1)
     with measure_usage() as used:
         subprocess.run([sys.executable, "-c", "import time\nwhile time.process_time() < 1.0: pass"], check=True)
 

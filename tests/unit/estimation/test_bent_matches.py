@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.lenses.distortion import calibrate, photograph
-from sfm_app.estimation.bent_matches import choose_inliers_again
+from sfm_app.estimation.calibrating import choose_inliers_again
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
+from sfm_app.camera.models import camera_matrix
 from sfm_app.errors import ReconstructionError
 from sfm_app.estimation.diagnosis import HINTS, NOTHING_MATCHED, diagnose_depth, diagnose_scene
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.fundamental.degeneracy import ONLY_A_LOGO, SAME_PHOTO
 from sfm_app.geometry.epipolar import eight_point
-from sfm_app.ransac.degeneracy.watermark import ONLY_A_LOGO, SAME_PHOTO
 from sfm_app.settings import EpipolarSettings, MatchSettings
 from sfm_app.synthetic.cameras import axis_rotation
 from sfm_app.types import EpipolarFit, MatchedImage, MatchGraph, Rejected, ViewGraph

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.estimation.camera_rules import refined_claims
-from sfm_app.estimation.exif_check import FocalClaim, focal_claim, report_claims
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.camera.models import camera_matrix
+from sfm_app.estimation.given_cameras import FocalClaim, focal_claim, refined_claims, report_claims
 from sfm_app.plugins import load_plugins
 from sfm_app.progress import SilentProgress
 from sfm_app.runtime.context import RunContext

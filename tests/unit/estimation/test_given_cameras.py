@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm_app.camera.models import camera_matrix
 from sfm_app.errors import InputError
-from sfm_app.estimation.camera_check import find_contradictions
-from sfm_app.estimation.given_cameras import assign_cameras, fit_to_photos
-from sfm_app.geometry.camera import camera_matrix
-from sfm_app.photos.camera_groups import split_by_given_camera
+from sfm_app.estimation.given_cameras import assign_cameras, find_contradictions, fit_to_photos
+from sfm_app.photos.probe import split_by_given_camera
 from sfm_app.types import Calibration, GivenCameras, MatchedImage, MatchGraph, Photo
 
 

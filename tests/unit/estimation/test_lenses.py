@@ -6,17 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sfm_app.camera.bearings import fisheye_radius, project
 from sfm_app.errors import ConfigError
 from sfm_app.estimation.calibrating import find_intrinsics
-from sfm_app.estimation.fitting import ray_estimator
-from sfm_app.estimation.lenses import describe_lens, find_lenses, to_calibration
-from sfm_app.geometry.lenses.bearings import fisheye_radius, project
+from sfm_app.estimation.fitting import describe_lens, find_lenses, ray_estimator, to_calibration
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
-from sfm_app.selfcal.wide_angle.fisheye import Fisheye
-from sfm_app.selfcal.wide_angle.lens_search import LensEstimate
+from sfm_app.selfcal.wide_lens import Fisheye, LensEstimate
 from sfm_app.settings import Settings
 from sfm_app.stages import view_graph
 from sfm_app.types import Calibration, EpipolarFit, GivenCameras, MatchedImage, MatchGraph, Rejected

@@ -9,7 +9,7 @@ from PIL import Image
 from sfm_app.api import open_run
 from sfm_app.colmap.database import create_database, read_match_graph
 from sfm_app.errors import ConfigError, PluginError
-from sfm_app.estimation.matching import all_pairs, fill_database
+from sfm_app.matching.features import all_pairs, fill_database
 from sfm_app.plugins import FeatureMethod, hookimpl, load_plugins
 from sfm_app.settings import Settings
 from sfm_app.types import Features, Photo, PhotoSet

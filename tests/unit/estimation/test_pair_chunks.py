@@ -6,7 +6,7 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from sfm_app.estimation.in_chunks.pair_chunks import cut_pairs
+from sfm_app.matching.features import cut_pairs
 
 
 @given(

@@ -8,13 +8,12 @@ import pytest
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.surface import write_points
-from sfm_app.formats.ply import COLOR, NORMAL, PLACE
+from sfm_app.formats.meshes import COLOR, NORMAL, PLACE
+from sfm_app.frame.scale import MetricFrame
 from sfm_app.numerical import json_text
 from sfm_app.photos import save_mask
 from sfm_app.pipeline import MESH, NAMES, SCALE, SCENE
-from sfm_app.runtime.manifest import StageRecord
-from sfm_app.runtime.workspace import Workspace
-from sfm_app.scale import MetricFrame
+from sfm_app.runtime.workspace import StageRecord, Workspace
 
 SIZE = 240, 160
 CAMERAS = {

@@ -10,11 +10,11 @@ import trimesh
 from PIL import Image
 
 import sfm_app
+from sfm_app import exports
 from sfm_app.camera_files import read_given_cameras
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.exports import stored
-from sfm_app.formats.glb import FLIP
-from sfm_app.geometry.similarity import Similarity
+from sfm_app.formats.gltf import FLIP
+from sfm_app.geometry.poses import Similarity
 
 from .conftest import colors_of
 
@@ -25,7 +25,7 @@ MOVED = Similarity(3.5, cv2.Rodrigues(np.array([0.3, -0.2, 0.5]))[0], np.array([
 @pytest.fixture(params=[None, MOVED], ids=["own frame", "moved"])
 def frame(request, monkeypatch):
     """The frame of exports: the model's own, or another one."""
-    monkeypatch.setattr(stored, "export_frame", lambda _: request.param)
+    monkeypatch.setattr(exports, "export_frame", lambda _: request.param)
     return request.param or Similarity(1.0, np.eye(3), np.zeros(3))
 
 

@@ -6,11 +6,12 @@ import pytest
 from click.testing import CliRunner
 
 import sfm_app
+from sfm_app import exports
 from sfm_app.cli import main
-from sfm_app.exports import finished_scene
 from sfm_app.formats import EXPORTERS, SCENE_EXPORTERS
-from sfm_app.formats.scenes.names import plain_names
-from sfm_app.plugins import SceneExporter, hookimpl, load_plugins
+from sfm_app.formats.exporters import SceneExporter
+from sfm_app.formats.scenes import plain_names
+from sfm_app.plugins import hookimpl, load_plugins
 
 
 def call(*arguments):
@@ -135,8 +136,8 @@ def test_an_interrupted_export_leaves_the_folder_as_it_was(make_run, monkeypatch
             raise KeyboardInterrupt
         save(*given)
 
-    save = finished_scene.save_picture
-    monkeypatch.setattr(finished_scene, "save_picture", fail)
+    save = exports.save_picture
+    monkeypatch.setattr(exports, "save_picture", fail)
     with pytest.raises(KeyboardInterrupt):
         sfm_app.export_scene(run.out, "colmap")
 

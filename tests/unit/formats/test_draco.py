@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from sfm_app.formats.draco import DRACO, write_draco
-from sfm_app.formats.glb import linear_colors, write_glb
+from sfm_app.formats.gltf import linear_colors, write_glb
 
 
 def tree(data):

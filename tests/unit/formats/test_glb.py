@@ -10,9 +10,9 @@ import pytest
 import trimesh
 from PIL import Image
 
-from sfm_app.formats.glb import linear_colors, write_glb
-from sfm_app.formats.pages import jpeg, split_corners
-from sfm_app.meshing.open3d import load_open3d
+from sfm_app.formats.exporters import jpeg, split_corners
+from sfm_app.formats.gltf import linear_colors, write_glb
+from sfm_app.meshing.ray_casting import load_open3d
 from sfm_app.types import Model, Surface
 
 COMPONENTS = {5123: np.uint16, 5125: np.uint32, 5126: np.float32}

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 from PIL import Image
 
-from sfm_app.formats.obj import DIGITS, write_obj
-from sfm_app.meshing.open3d import load_open3d
+from sfm_app.formats.meshes import DIGITS, write_obj
+from sfm_app.meshing.ray_casting import load_open3d
 from sfm_app.types import Model, Surface
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import trimesh
 
 from sfm_app.formats.frusta import CAMERA_COLOR, DOTS
-from sfm_app.formats.ply import write_ply
-from sfm_app.meshing.open3d import load_open3d
+from sfm_app.formats.meshes import write_ply
+from sfm_app.meshing.ray_casting import load_open3d
 
 
 def rows(model):

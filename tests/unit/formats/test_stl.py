@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from sfm_app.errors import ReconstructionError
-from sfm_app.formats.stl import write_stl
+from sfm_app.formats.meshes import write_stl
 
 
 def test_a_ball_of_a_meter_is_closed_and_of_a_thousand_millimeters(ball):

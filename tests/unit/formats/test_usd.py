@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 from pxr import Ar, Gf, Usd, UsdGeom, UsdShade
 
+from sfm_app.camera.models import camera_matrix
 from sfm_app.formats.usd import ALIGNED, write_usd, write_usdz
-from sfm_app.geometry.camera import camera_matrix
 from sfm_app.types import Frustum, Model
 
 

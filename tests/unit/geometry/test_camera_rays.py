@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.camera import camera_matrix, rays
+from sfm_app.camera.models import camera_matrix, rays
 
 K = camera_matrix(900.0, 850.0, 480.0, 330.0)
 

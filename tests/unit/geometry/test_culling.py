@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.culling import border_angle, cluster, morton_order
+from sfm_app.geometry.triangles import border_angle, cluster, morton_order
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.damping import DampingRange, damped_step
+from sfm_app.geometry.least_squares import DampingRange, damped_step
 
 LIMITS = DampingRange(first=1e-4, least=1e-9, most=1e3)
 

@@ -6,14 +6,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from sfm_app.geometry.distances import (
+from sfm_app.geometry.epipolar import (
     algebraic_distance,
+    canonical_cameras,
+    cross_matrix,
+    epipoles,
     nearest_exact_matches,
+    nearest_rank_two,
     reprojection_distance,
     sampson_distance,
     symmetric_epipolar_distance,
+    to_homogeneous,
 )
-from sfm_app.geometry.epipolar import canonical_cameras, cross_matrix, epipoles, nearest_rank_two, to_homogeneous
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
 SEEDS = st.integers(0, 2**31)

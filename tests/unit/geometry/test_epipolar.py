@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfm_app.errors import NumericalError
-from sfm_app.geometry.distances import sampson_distance
 from sfm_app.geometry.epipolar import (
     canonical_cameras,
     cross_matrix,
@@ -15,6 +14,7 @@ from sfm_app.geometry.epipolar import (
     fundamental_from_pose,
     hartley_normalization,
     nearest_rank_two,
+    sampson_distance,
     to_homogeneous,
     to_unit_norm,
 )

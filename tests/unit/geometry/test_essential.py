@@ -4,9 +4,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.essential import decompose_essential, essential_from_fundamental, relative_pose
-from sfm_app.geometry.triangulation import triangulate, triangulation_angle_deg
-from sfm_app.geometry.two_view_init import two_view_seed
+from sfm_app.geometry.epipolar import (
+    decompose_essential,
+    essential_from_fundamental,
+    relative_pose,
+    triangulate,
+    triangulation_angle_deg,
+    two_view_seed,
+)
 
 angle = st.floats(-0.6, 0.6)
 component = st.floats(-1, 1)
@@ -98,7 +103,7 @@ def test_a_seed_tells_a_narrow_and_a_contradictory_pair():
 
 def test_points_at_infinity_are_in_front_of_no_camera(monkeypatch):
     points = np.array([[np.inf] * 3, [0.1, 0.2, 3.0]])
-    monkeypatch.setattr("sfm_app.geometry.essential.triangulate", lambda *_: points)
+    monkeypatch.setattr("sfm_app.geometry.epipolar.triangulate", lambda *_: points)
 
     in_front = relative_pose(cross([0.0, 0.0, 1.0]), np.zeros((2, 2)), np.zeros((2, 2)))[3]
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.model_selection import NormalPriors, binary_choices, cavity, posteriors
+from sfm_app.geometry.least_squares import NormalPriors, binary_choices, cavity, posteriors
 
 H, G = np.array([[40.0]]), np.array([12.0])
 PRIORS = NormalPriors(np.array([[100.0], [4.0]]), np.array([[0.1], [0.1]]), np.log([0.7, 0.3]))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.pose_manifold import retract, write_essential
+from sfm_app.geometry.poses import retract, write_essential
 
 
 def pose_of(seed=0):

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sfm_app.errors import NumericalError
-from sfm_app.geometry.similarity import Similarity, robust_similarity, umeyama
+from sfm_app.geometry.poses import Similarity, robust_similarity, umeyama
 
 
 def random_similarity(rng):

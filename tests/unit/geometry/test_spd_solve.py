@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sfm_app.errors import NumericalError
-from sfm_app.geometry.spd_solve import (
+from sfm_app.geometry.least_squares import (
     inverse_of_positive,
     inverses_of_positive,
     lift_eigenvalues,

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.relief.tangents import corner_angles, corner_tangents
-from sfm_app.geometry.triangles import vertex_normals
+from sfm_app.geometry.triangles import corner_angles, corner_tangents, vertex_normals
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]])

@@ -1,6 +1,6 @@
 import numpy as np
 
-from sfm_app.meshing.occlusion import Occluders
+from sfm_app.meshing.ray_casting import Occluders
 
 WALL = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]])

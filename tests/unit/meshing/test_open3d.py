@@ -5,7 +5,7 @@ import importlib
 import pytest
 
 from sfm_app.errors import SfmError
-from sfm_app.meshing.open3d import load_open3d
+from sfm_app.meshing.ray_casting import load_open3d
 
 
 @pytest.mark.parametrize(

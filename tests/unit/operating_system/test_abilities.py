@@ -2,8 +2,7 @@
 
 import pytest
 
-from sfm_app.operating_system import VARIABLE, Ability, lacks, missing_abilities
-from sfm_app.operating_system.abilities import find_abilities
+from sfm_app.operating_system import VARIABLE, Ability, find_abilities, lacks, missing_abilities
 
 
 @pytest.mark.parametrize(

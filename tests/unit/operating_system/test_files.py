@@ -6,7 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from sfm_app.operating_system import Ability, files, is_link, lacks, link_or_copy, move, replace_file, share_bytes
+from sfm_app import operating_system
+from sfm_app.operating_system import Ability, is_link, lacks, link_or_copy, move, replace_file, share_bytes
 
 NO_LINKS = [None, Ability.LINKS]
 
@@ -79,7 +80,7 @@ def test_a_file_that_somebody_looks_at_is_waited_for(photo, tmp_path, without, m
     act(photo, tmp_path / "new")
 
     assert (tmp_path / "new").read_bytes() == b"light" and not photo.exists()
-    assert slept == list(files.WAITS_S[:3])
+    assert slept == list(operating_system.WAITS_S[:3])
 
 
 def test_a_file_that_is_never_free_is_an_error(photo, tmp_path, without, monkeypatch):
@@ -88,11 +89,11 @@ def test_a_file_that_is_never_free_is_an_error(photo, tmp_path, without, monkeyp
 
     with pytest.raises(PermissionError):
         replace_file(photo, tmp_path / "new")
-    assert slept == list(files.WAITS_S) and photo.exists()
+    assert slept == list(operating_system.WAITS_S) and photo.exists()
 
 
 def test_elsewhere_a_refusal_is_final(photo, tmp_path, monkeypatch):
-    monkeypatch.setattr("sfm_app.operating_system.abilities.HERE", frozenset(Ability))
+    monkeypatch.setattr("sfm_app.operating_system.HERE", frozenset(Ability))
     slept = let_others_look(monkeypatch, times=1)
 
     with pytest.raises(PermissionError):
@@ -107,7 +108,7 @@ def refuse(*_arguments, **_options):
 def let_others_look(monkeypatch, times):
     """Refuse so many attempts to move a file, and return the list of the seconds that were waited."""
     slept, refused = [], []
-    monkeypatch.setattr(files.time, "sleep", slept.append)
+    monkeypatch.setattr(operating_system.time, "sleep", slept.append)
     for name, real in (("replace", os.replace), ("rename", os.rename)):
 
         def attempt(path, target, real=real):

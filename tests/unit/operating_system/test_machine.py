@@ -8,12 +8,12 @@ import time
 import psutil
 import pytest
 
+from sfm_app import operating_system
 from sfm_app.operating_system import (
     Ability,
     ChildTimes,
     cpu_seconds,
     free_memory_mb,
-    machine,
     machine_memory_mb,
     usable_cores,
     yield_to_others,
@@ -25,7 +25,7 @@ BUSY = "import time\nwhile time.process_time() < 0.5: pass\nprint(flush=True); i
 def test_cores_are_those_that_may_be_used(without, monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _process: {3, 5, 7}, raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
-    monkeypatch.setattr("sfm_app.operating_system.abilities.HERE", frozenset(Ability))
+    monkeypatch.setattr("sfm_app.operating_system.HERE", frozenset(Ability))
     assert usable_cores() == 3
 
     without(Ability.CORES)
@@ -37,8 +37,8 @@ def test_cores_are_those_that_may_be_used(without, monkeypatch):
 @pytest.mark.parametrize(("limit", "megabytes"), [("512000000\n", 512.0), ("max\n", None), (None, None)])
 def test_a_container_has_less_memory(tmp_path, without, monkeypatch, limit, megabytes):
     file, whole = tmp_path / "memory.max", psutil.virtual_memory().total / 1e6
-    monkeypatch.setattr(machine, "CONTAINER_LIMIT", file)
-    monkeypatch.setattr("sfm_app.operating_system.abilities.HERE", frozenset(Ability))
+    monkeypatch.setattr(operating_system, "CONTAINER_LIMIT", file)
+    monkeypatch.setattr("sfm_app.operating_system.HERE", frozenset(Ability))
     if limit:
         file.write_text(limit)
 
@@ -59,7 +59,7 @@ def test_times_of_children_are_looked_at_where_nobody_adds_them_up(without):
 
 
 def test_times_of_children_are_not_counted_twice(monkeypatch):
-    monkeypatch.setattr("sfm_app.operating_system.abilities.HERE", frozenset(Ability))
+    monkeypatch.setattr("sfm_app.operating_system.HERE", frozenset(Ability))
     times = ChildTimes()
     times.look([psutil.Process()])
 

@@ -9,6 +9,7 @@ import time
 import psutil
 import pytest
 
+from sfm_app import operating_system
 from sfm_app.operating_system import (
     Ability,
     crash_name,
@@ -19,7 +20,6 @@ from sfm_app.operating_system import (
     has_run_out,
     heed_requests_to_end,
     lacks,
-    processes,
 )
 
 pytestmark = pytest.mark.slow
@@ -85,7 +85,7 @@ def test_a_process_without_a_group_ends_itself_last(without, monkeypatch):
     without(Ability.GROUPS)
     killed = []
     monkeypatch.setattr(psutil.Process, "kill", lambda process: killed.append(process.pid))
-    monkeypatch.setattr(processes.os, "_exit", lambda code: killed.append(f"exit {code}"))
+    monkeypatch.setattr(operating_system.os, "_exit", lambda code: killed.append(f"exit {code}"))
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
         end_own_group()
 
@@ -158,7 +158,7 @@ def test_a_process_that_a_library_ends_cleans_nothing_up_while_its_threads_work(
 
 def test_without_exit_handlers_the_c_library_is_left_alone(without, monkeypatch):
     asked = []
-    monkeypatch.setattr(processes.ctypes, "CDLL", asked.append)
+    monkeypatch.setattr(operating_system.ctypes, "CDLL", asked.append)
     without(Ability.EXIT_HANDLERS)
 
     end_at_exit()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.orientation.vanishing_points import Segments, concatenate_segments, segment_planes
+from sfm_app.frame.vanishing_points import Segments, concatenate_segments, segment_planes
 from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at
 
 FOCAL_PX = 1000.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.orientation.georeference import enu_m, georeference, position_from_enu
+from sfm_app.frame.georeference import enu_m, georeference, position_from_enu
 from sfm_app.types import GpsPosition
 
 ORIGIN = GpsPosition(48.2, 16.37, 180.0)

@@ -1,11 +1,20 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.unit_vectors import axis_angle_deg
-from sfm_app.orientation.gravity import CAMERAS, GROUND, LINES, ROLL, WALL, up_direction, viewer_direction, viewer_frame
-from sfm_app.orientation.ground_plane import dominant_plane
-from sfm_app.orientation.up_direction import Scenery
-from sfm_app.orientation.vanishing_points import concatenate_segments, find_vanishing_direction
+from sfm_app.frame.up_direction import (
+    CAMERAS,
+    GROUND,
+    LINES,
+    ROLL,
+    WALL,
+    Scenery,
+    dominant_plane,
+    up_direction,
+    viewer_direction,
+    viewer_frame,
+)
+from sfm_app.frame.vanishing_points import concatenate_segments, find_vanishing_direction
+from sfm_app.geometry.poses import axis_angle_deg
 
 HAND_HELD = (1.0, -2.0, 0.5, 1.5, -1.0, 2.0, -0.5, -1.5)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.orientation.ground_plane import dominant_plane
+from sfm_app.frame.up_direction import dominant_plane
 
 UP = np.array([0.0, 1.0, 0.0])
 

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm_app.orientation.line_segments import line_segments
+from sfm_app.frame.vanishing_points import line_segments
 
 
 @pytest.mark.parametrize("size", [(600, 400), (3000, 2000)])

@@ -4,17 +4,18 @@ import numpy as np
 import pytest
 
 from benchmarks.synthetic.scenes import build_scene, scene_views
-from sfm_app.orientation.camera_roll import TURN_COSTS, roll_hypotheses
-from sfm_app.orientation.up_cues import (
+from sfm_app.frame.up_cues import (
+    TURN_COSTS,
     brightness_normal_correlation,
     depth_height_correlation,
     fit_surfaces,
     mean_upward_normal,
+    roll_hypotheses,
     sky_asymmetry,
     slope_asymmetry,
     small_picture,
 )
-from sfm_app.orientation.up_direction import CUES, MAX_NATS, Cue, Scenery, odds, select_roll
+from sfm_app.frame.up_direction import CUES, MAX_NATS, Cue, Scenery, odds, select_roll
 from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at, pixel_rays
 from sfm_app.synthetic.render import GAMMA, cast_rays, prepare, render_scene
 

@@ -10,8 +10,7 @@ from PIL import Image, features
 
 from sfm_app.operating_system import Ability, find_in_wheel
 from sfm_app.photos import UnreadableError, read_picture, upright_image
-from sfm_app.photos.decode import FORMATS
-from sfm_app.photos.tiff import _install_handler
+from sfm_app.photos.decode import FORMATS, _install_handler
 
 LIBTIFF = list(find_in_wheel(Path(PIL.__file__).parent, "pillow", "libtiff"))
 

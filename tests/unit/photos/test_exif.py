@@ -4,7 +4,7 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from sfm_app.photos.exif import EXIF_IFD, focal_px
+from sfm_app.photos.decode import EXIF_IFD, focal_px
 
 MM, EQUIVALENT, WIDTH, HEIGHT, RESOLUTION, UNIT = 0x920A, 0xA405, 0xA002, 0xA003, 0xA20E, 0xA210
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfm_app.photos.camera_groups import group_by_camera
-from sfm_app.photos.letterbox import shown_part, unify_frames
+from sfm_app.photos.probe import group_by_camera, shown_part, unify_frames
 from sfm_app.types import Photo
 
 

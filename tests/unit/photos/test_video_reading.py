@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm_app.photos import UnreadableError, is_video, open_video, read_head
-from sfm_app.photos.video import video_reader as video
+from sfm_app.photos import UnreadableError, is_video, open_video, read_head, video
 
 pytestmark = pytest.mark.slow
 

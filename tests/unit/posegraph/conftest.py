@@ -8,9 +8,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.camera.bearings import bearings
+from sfm_app.camera.models import camera_matrix
 from sfm_app.geometry.epipolar import cross_matrix
-from sfm_app.geometry.lenses.bearings import bearings
 from sfm_app.posegraph.pair_pose import Pair
 from sfm_app.types import Calibration
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.posegraph.folds import find_turns
-from sfm_app.posegraph.rotations import _residuals, average_rotations
+from sfm_app.posegraph.rotations import _residuals, average_rotations, find_turns
 
 TOWN, STREET, WINDOW = 30, 20, 9
 CORNER = TOWN

@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.camera import camera_matrix
-from sfm_app.geometry.distances import sampson_distance
-from sfm_app.geometry.epipolar import eight_point
+from sfm_app.camera.models import camera_matrix
+from sfm_app.geometry.epipolar import eight_point, sampson_distance
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
 from sfm_app.posegraph.graph import BEHIND, CONTRADICTS, NOT_COMPUTABLE, TOO_FEW, average_pair_rotations
-from sfm_app.posegraph.groups import connected_groups
+from sfm_app.posegraph.rotations import connected_groups
 from sfm_app.types import (
     Calibration,
     EpipolarFit,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.posegraph.guided import guided_pose, sample_direction
+from sfm_app.posegraph.graph import guided_pose, sample_direction
 
 LEAST = 16
 

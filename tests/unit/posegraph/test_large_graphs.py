@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from sfm_app.posegraph import rotations as module
-from sfm_app.posegraph.coverage import BACKBONE_SHARE, backbone
-from sfm_app.posegraph.groups import connected_groups
-from sfm_app.posegraph.rotations import average_rotations, check_loops
+from sfm_app.posegraph.look_alikes import BACKBONE_SHARE, backbone
+from sfm_app.posegraph.rotations import average_rotations, check_loops, connected_groups
 from tests.unit.posegraph.test_rotations import errors_deg, relative, truth
 
 

@@ -6,9 +6,8 @@ from benchmarks.synthetic.matches import make_place, match_photos
 from sfm_app.geometry.epipolar import cross_matrix
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.posegraph import look_alikes as module
-from sfm_app.posegraph.coverage import backbone
 from sfm_app.posegraph.graph import LOOKS_ALIKE
-from sfm_app.posegraph.look_alikes import find_look_alikes, group_doubted_pairs
+from sfm_app.posegraph.look_alikes import backbone, find_look_alikes, group_doubted_pairs
 from sfm_app.synthetic.cameras import look_at
 from sfm_app.types import EpipolarFit, Intrinsics, ViewGraph
 

@@ -2,12 +2,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.epipolar import cross_matrix, eight_point
-from sfm_app.geometry.essential import relative_pose
-from sfm_app.geometry.lenses.bearings import project
-from sfm_app.geometry.lenses.ray_epipolar import depths
-from sfm_app.geometry.triangulation import triangulate, triangulation_angle_deg
-from sfm_app.posegraph.pair_pose import Pair, estimate_pose, is_in_front, ray_angles_deg, rotation_residuals
+from sfm_app.camera.bearings import project
+from sfm_app.geometry.epipolar import (
+    cross_matrix,
+    depths,
+    eight_point,
+    relative_pose,
+    rotation_residuals,
+    triangulate,
+    triangulation_angle_deg,
+)
+from sfm_app.posegraph.pair_pose import Pair, estimate_pose, is_in_front, ray_angles_deg
 from sfm_app.types import Calibration, EpipolarFit
 
 

@@ -1,11 +1,9 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.distances import sampson_distance
-from sfm_app.geometry.epipolar import eight_point
-from sfm_app.geometry.essential import decompose_essential, nearest_essential
-from sfm_app.geometry.pose_manifold import retract
-from sfm_app.posegraph.refine import SIGMAS_PX, pose_distances, refine_pose
+from sfm_app.geometry.epipolar import decompose_essential, eight_point, nearest_essential, sampson_distance
+from sfm_app.geometry.poses import retract
+from sfm_app.posegraph.pair_pose import SIGMAS_PX, pose_distances, refine_pose
 
 
 def started(views, used):

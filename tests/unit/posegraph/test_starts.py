@@ -4,12 +4,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.camera.models import camera_matrix
 from sfm_app.geometry.epipolar import cross_matrix, eight_point
-from sfm_app.posegraph.guided import refine_direction
-from sfm_app.posegraph.pair_pose import Pair, estimate_pose, points_ahead
-from sfm_app.posegraph.refine import refine_pose
-from sfm_app.posegraph.starts import TURNS_DEG, planar_starts, turned_starts
+from sfm_app.posegraph.graph import refine_direction
+from sfm_app.posegraph.pair_pose import (
+    TURNS_DEG,
+    Pair,
+    estimate_pose,
+    planar_starts,
+    points_ahead,
+    refine_pose,
+    turned_starts,
+)
 from sfm_app.types import Calibration, EpipolarFit
 
 K = camera_matrix(3300.0, 3300.0, 320.0, 240.0)

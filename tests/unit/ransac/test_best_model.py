@@ -7,12 +7,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from sfm_app.ransac.best_model import BestModel
-from sfm_app.ransac.estimator_config import Recipe
-from sfm_app.ransac.inner_loop import GUIDED, UNGUIDED
-from sfm_app.ransac.points import prepare
-from sfm_app.ransac.scoring.robust_costs import geman_mcclure, msac, penalty, ransac, squared_distances
-from sfm_app.ransac.verification.pretests import NO_PRETEST
+from sfm_app.fundamental.loop import GUIDED, UNGUIDED, BestModel, Recipe
+from sfm_app.fundamental.points import prepare
+from sfm_app.fundamental.pretests import NO_PRETEST
+from sfm_app.fundamental.scores import geman_mcclure, msac, penalty, ransac, squared_distances
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
 PAIR = make_pair(PairOptions(points=300, outliers=0.3, sigma_px=0.5), 1)

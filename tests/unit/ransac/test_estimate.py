@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.distances import sampson_distance
-from sfm_app.geometry.epipolar import to_unit_norm
-from sfm_app.ransac import estimate_with, judge
+from sfm_app.fundamental.estimate import estimate_with, judge
+from sfm_app.geometry.epipolar import sampson_distance, to_unit_norm
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 from sfm_app.types import EpipolarFit, Rejected

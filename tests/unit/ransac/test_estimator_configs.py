@@ -6,11 +6,11 @@ import pickle
 import numpy as np
 import pytest
 
-from sfm_app.geometry.distances import sampson_distance
-from sfm_app.ransac import ESTIMATORS
-from sfm_app.ransac.estimator_configs import RECIPES, classical_estimator, median_sigma
-from sfm_app.ransac.loop import search
-from sfm_app.ransac.points import prepare
+from sfm_app.fundamental import ESTIMATORS
+from sfm_app.fundamental.loop import search
+from sfm_app.fundamental.points import prepare
+from sfm_app.fundamental.recipes import RECIPES, classical_estimator, median_sigma
+from sfm_app.geometry.epipolar import sampson_distance
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 

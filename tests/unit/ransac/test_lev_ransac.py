@@ -3,8 +3,8 @@
 import pytest
 
 from benchmarks.synthetic.matches import make_two_motions
-from sfm_app.geometry.distances import sampson_distance
-from sfm_app.ransac.lev_ransac import fit_lev_ransac
+from sfm_app.fundamental.lev_ransac import fit_lev_ransac
+from sfm_app.geometry.epipolar import sampson_distance
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 from sfm_app.types import EpipolarFit

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.essential import decompose_essential
-from sfm_app.geometry.lenses.bearings import bearings, project
-from sfm_app.ransac.lev_ransac import fit_lev_ransac
-from sfm_app.ransac.lev_ransac_rays import fit_lev_ransac_rays, validity
+from sfm_app.camera.bearings import bearings, project
+from sfm_app.fundamental.lev_ransac import fit_lev_ransac
+from sfm_app.fundamental.rays import fit_lev_ransac_rays, validity
+from sfm_app.geometry.epipolar import decompose_essential
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import Calibration, EpipolarFit, Rejected
 

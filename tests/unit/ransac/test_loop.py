@@ -5,15 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import sfm_app.ransac.loop as loop
-from sfm_app.ransac.estimator_config import Recipe
-from sfm_app.ransac.inner_loop import SamplingPlan, draw_until_better
-from sfm_app.ransac.loop import search
-from sfm_app.ransac.points import prepare
-from sfm_app.ransac.sampling.minimal_samples import random_state
-from sfm_app.ransac.scoring.mlesac import mlesac
-from sfm_app.ransac.scoring.robust_costs import msac, squared_distances
-from sfm_app.ransac.verification.pretests import NO_PRETEST, FullVerification, RandomizedTdd
+import sfm_app.fundamental.loop as loop
+from sfm_app.fundamental.loop import Recipe, SamplingPlan, draw_until_better, search
+from sfm_app.fundamental.points import prepare
+from sfm_app.fundamental.pretests import NO_PRETEST, FullVerification, RandomizedTdd
+from sfm_app.fundamental.samples import random_state
+from sfm_app.fundamental.scores import mlesac, msac, squared_distances
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 

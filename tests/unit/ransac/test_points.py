@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.geometry.distances import sampson_distance
-from sfm_app.ransac.points import check_points, prepare
-from sfm_app.ransac.scoring.robust_costs import squared_distances
+from sfm_app.fundamental.points import check_points, prepare
+from sfm_app.fundamental.scores import squared_distances
+from sfm_app.geometry.epipolar import sampson_distance
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sfm_app.camera.models import camera_matrix
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import open_database
-from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import eight_point
 from sfm_app.progress import SilentProgress
 from sfm_app.runtime.workspace import Workspace

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.reconstruction.added_matches import add_matches
+from sfm_app.mapping.feature_retry import add_matches
 from sfm_app.types import MatchGraph
 
 GRID = np.array([[10.0 * k, 5.0] for k in range(4)])

@@ -8,17 +8,11 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.models.model import poses_and_points
-from sfm_app.orientation.georeference import enu_m, position_from_enu
-from sfm_app.orientation.gravity import up_direction
-from sfm_app.reconstruction import align_upright
-from sfm_app.reconstruction.align_upright import (
-    extract_cues,
-    orient,
-    orient_or_keep,
-    submit_cue_extraction,
-    turn_camera,
-)
+from sfm_app.colmap.model import poses_and_points
+from sfm_app.frame import upright
+from sfm_app.frame.georeference import enu_m, position_from_enu
+from sfm_app.frame.up_direction import up_direction
+from sfm_app.frame.upright import extract_cues, orient, orient_or_keep, submit_cue_extraction, turn_camera
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.synthetic.cameras import arc, make_camera
 from sfm_app.types import GpsPosition, MatchedImage, MatchGraph
@@ -192,7 +186,7 @@ def test_gps_that_fails_leaves_the_model_upright_without_meters(tmp_path, monkey
         raise np.linalg.LinAlgError("Eigenvalues did not converge")
 
     _, model, matches, run = scene(tmp_path, true_positions)
-    monkeypatch.setattr(align_upright, "georeference", failing)
+    monkeypatch.setattr(upright, "georeference", failing)
 
     entry = orient_or_keep(model, matches, submit_cue_extraction([model], matches, run))
 
@@ -205,6 +199,6 @@ def test_up_that_nobody_knows_how_exactly_is_null_and_no_infinity(tmp_path, monk
         return replace(up_direction(*args, **others), deviation_deg=np.inf)
 
     _, model, matches, run = scene(tmp_path, lambda views: [None] * len(views.cam_from_world))
-    monkeypatch.setattr(align_upright, "up_direction", unsure)
+    monkeypatch.setattr(upright, "up_direction", unsure)
 
     assert orient_or_keep(model, matches, submit_cue_extraction([model], matches, run))["up_deviation_deg"] is None

@@ -5,12 +5,13 @@ from types import SimpleNamespace
 
 import pytest
 
+from sfm_app.camera.models import camera_matrix
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.models.model import MappedCamera
-from sfm_app.geometry.camera import camera_matrix
-from sfm_app.reconstruction import camera_per_photo
-from sfm_app.reconstruction import mapping_passes as module
-from sfm_app.reconstruction.camera_per_photo import (
+from sfm_app.colmap.model import MappedCamera
+from sfm_app.mapping import hypotheses
+from sfm_app.mapping import passes as module
+from sfm_app.mapping.attempt import Attempt, NoModel, PairSupport, explained_pairs
+from sfm_app.mapping.hypotheses import (
     MIN_PHOTOS,
     can_have_own_cameras,
     is_as_good,
@@ -18,9 +19,7 @@ from sfm_app.reconstruction.camera_per_photo import (
     with_camera_per_photo,
     with_two_cameras,
 )
-from sfm_app.reconstruction.mapping_passes import reconstruct
-from sfm_app.reconstruction.mapping_runs import Attempt, NoModel
-from sfm_app.reconstruction.support import PairSupport, explained_pairs
+from sfm_app.mapping.passes import reconstruct
 from sfm_app.settings import Settings
 from sfm_app.types import ViewGraph
 
@@ -119,7 +118,7 @@ def each_of(synthetic, cameras, focals):
 
 def test_photos_of_two_focals_get_two_cameras(synthetic, cameras, monkeypatch):
     model, each, found = each_of(synthetic, cameras, [1000.0, 1300.0, 1010.0, 1310.0, 990.0, 1290.0])
-    monkeypatch.setattr(camera_per_photo, "cameras_by_photo", lambda _: found)
+    monkeypatch.setattr(hypotheses, "cameras_by_photo", lambda _: found)
 
     two = with_two_cameras(model, each, synthetic.matches)
 
@@ -131,7 +130,7 @@ def test_photos_of_two_focals_get_two_cameras(synthetic, cameras, monkeypatch):
 
 def test_a_single_photo_of_another_focal_is_no_second_camera(synthetic, cameras, monkeypatch):
     model, each, found = each_of(synthetic, cameras, [1000.0, 1005.0, 1010.0, 1310.0, 990.0, 1001.0])
-    monkeypatch.setattr(camera_per_photo, "cameras_by_photo", lambda _: found)
+    monkeypatch.setattr(hypotheses, "cameras_by_photo", lambda _: found)
 
     assert with_two_cameras(model, each, synthetic.matches) is None
 

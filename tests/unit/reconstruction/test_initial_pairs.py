@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.camera.models import camera_matrix
 from sfm_app.geometry.epipolar import eight_point
+from sfm_app.mapping.attempt import agreement, coverage, rank_seeds, triangulate_seed
 from sfm_app.posegraph.pair_pose import Pair, estimate_pose
-from sfm_app.reconstruction.initial_pairs import agreement, coverage, rank_seeds, triangulate_seed
 from sfm_app.types import Calibration, EpipolarFit, Intrinsics, MatchedImage, MatchGraph, PoseGraph, RelativePose
 
 K = camera_matrix(800.0, 800.0, 320.0, 240.0)

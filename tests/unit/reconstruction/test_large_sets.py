@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from sfm_app.posegraph.groups import connected_groups
-from sfm_app.reconstruction import mapping_runs as module
-from sfm_app.reconstruction.mapping_runs import pairs_to_map
-from sfm_app.reconstruction.unregistered import are_worth_another_try
+from sfm_app.mapping import attempt as module
+from sfm_app.mapping.attempt import are_worth_another_try, pairs_to_map
+from sfm_app.posegraph.rotations import connected_groups
 from sfm_app.types import PoseGraph, RelativePose
 
 

@@ -3,13 +3,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sfm_app.reconstruction.look_alikes import (
-    drop_look_alikes,
-    jumps,
-    look_alike_entries,
-    sides,
-    with_earlier_look_alikes,
-)
+from sfm_app.mapping.look_alikes import drop_look_alikes, jumps, look_alike_entries, sides, with_earlier_look_alikes
 from sfm_app.types import EpipolarFit, LookAlikes, MatchedImage, MatchGraph, PoseGraph, ViewGraph
 
 COUNTS = {(1, 2): 90, (1, 11): 80, (2, 12): 70, (2, 11): 20, (11, 12): 90}

@@ -8,16 +8,15 @@ import pytest
 
 from sfm_app.colmap.bundle import adjust
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.models.model import posed_photo_ids
+from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.errors import BackendError
+from sfm_app.mapping import hypotheses
+from sfm_app.mapping import passes as module
+from sfm_app.mapping.attempt import Attempt, NoModel, PairSupport, explained_pairs
+from sfm_app.mapping.hypotheses import guessed_intrinsics
+from sfm_app.mapping.passes import learned_intrinsics, reconstruct
+from sfm_app.mapping.split_and_merge import split_attempt
 from sfm_app.posegraph.graph import LOOKS_ALIKE
-from sfm_app.reconstruction import baseline
-from sfm_app.reconstruction import mapping_passes as module
-from sfm_app.reconstruction.baseline import guessed_intrinsics
-from sfm_app.reconstruction.mapping_passes import learned_intrinsics, reconstruct
-from sfm_app.reconstruction.mapping_runs import Attempt, NoModel
-from sfm_app.reconstruction.model_split import split_attempt
-from sfm_app.reconstruction.support import PairSupport, explained_pairs
 from sfm_app.types import LookAlikes, PoseGraph
 
 pytestmark = pytest.mark.slow
@@ -333,8 +332,8 @@ def test_a_rival_that_fails_costs_nothing(synthetic, run, cameras, mapped, monke
     def fail(*_):
         raise BackendError("COLMAP failed")
 
-    monkeypatch.setattr(baseline, "map_with_colmap_defaults", fail)
-    monkeypatch.setattr(module, "map_baseline", baseline.map_baseline)
+    monkeypatch.setattr(hypotheses, "map_with_colmap_defaults", fail)
+    monkeypatch.setattr(module, "map_baseline", hypotheses.map_baseline)
 
     found = outcome(synthetic, cameras(method="guess", identifiable=False), run())
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from sfm_app.errors import BackendError
-from sfm_app.reconstruction import mapping_runs as module
-from sfm_app.reconstruction.mapping_runs import Attempt, Group, NoModel, best_attempt, choice_reason, map_group
-from sfm_app.reconstruction.support import PairSupport
+from sfm_app.mapping import attempt as module
+from sfm_app.mapping.attempt import Attempt, Group, NoModel, PairSupport, best_attempt, choice_reason, map_group
 from sfm_app.types import MatchedImage, MatchGraph, PoseGraph, RelativePose, ViewGraph
 
 pytestmark = pytest.mark.slow

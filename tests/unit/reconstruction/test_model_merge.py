@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.colmap.models.model import move, posed_photo_ids, poses_and_points, submodel
-from sfm_app.geometry.similarity import Similarity, umeyama
-from sfm_app.reconstruction import mapping_passes
-from sfm_app.reconstruction.mapping_passes import reconstruct
-from sfm_app.reconstruction.mapping_runs import judge_model
-from sfm_app.reconstruction.model_merge import LEAST_SHARED, join_models, shared_points
+from sfm_app.colmap.model import move, posed_photo_ids, poses_and_points, submodel
+from sfm_app.geometry.poses import Similarity, umeyama
+from sfm_app.mapping import passes
+from sfm_app.mapping.attempt import judge_model
+from sfm_app.mapping.passes import reconstruct
+from sfm_app.mapping.split_and_merge import LEAST_SHARED, join_models, shared_points
 from sfm_app.types import ViewGraph
 
 pytestmark = pytest.mark.slow
@@ -75,10 +75,10 @@ def test_matches_that_disagree_about_the_place_join_nothing(synthetic, halves, r
 
 
 def test_models_that_mapping_left_apart_are_joined_in_the_end(synthetic, halves, run, cameras, monkeypatch):
-    made = mapping_passes.Outcome(halves, _graph(synthetic), cameras(), ("half", "half"))
-    monkeypatch.setattr(mapping_passes, "_run_pass", lambda *_: made)
-    monkeypatch.setattr(mapping_passes, "try_rival", lambda outcome, *_: outcome)
-    monkeypatch.setattr(mapping_passes, "MOST_PASSES", 1)
+    made = passes.Outcome(halves, _graph(synthetic), cameras(), ("half", "half"))
+    monkeypatch.setattr(passes, "_run_pass", lambda *_: made)
+    monkeypatch.setattr(passes, "try_rival", lambda outcome, *_: outcome)
+    monkeypatch.setattr(passes, "MOST_PASSES", 1)
 
     found = reconstruct(synthetic.matches, synthetic.views, cameras(), run())
 
@@ -88,4 +88,4 @@ def test_models_that_mapping_left_apart_are_joined_in_the_end(synthetic, halves,
 
 
 def _graph(synthetic):
-    return mapping_passes.PoseGraph({}, {}, tuple((photo,) for photo in synthetic.matches.images))
+    return passes.PoseGraph({}, {}, tuple((photo,) for photo in synthetic.matches.images))

@@ -3,8 +3,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from sfm_app.reconstruction.model_split import sound_parts
-from sfm_app.reconstruction.support import PairSupport
+from sfm_app.mapping.attempt import PairSupport
+from sfm_app.mapping.split_and_merge import sound_parts
 
 
 def explained(worths):

@@ -7,13 +7,12 @@ import pytest
 
 from sfm_app.api import open_run
 from sfm_app.colmap.database import write_keypoints, write_matches
-from sfm_app.colmap.models.model import posed_photo_ids
+from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.errors import BackendError, ClusterError
-from sfm_app.reconstruction import second_look as module
-from sfm_app.reconstruction.mapping_passes import Outcome
-from sfm_app.reconstruction.mapping_runs import Attempt
-from sfm_app.reconstruction.second_look import LOOSE_RATIO, MappedScene, candidate_pairs, lost_photos, retry_lost_photos
-from sfm_app.reconstruction.support import explained_pairs
+from sfm_app.mapping import feature_retry as module
+from sfm_app.mapping.attempt import Attempt, explained_pairs
+from sfm_app.mapping.feature_retry import LOOSE_RATIO, MappedScene, candidate_pairs, lost_photos, retry_lost_photos
+from sfm_app.mapping.passes import Outcome
 from sfm_app.settings import Settings
 from sfm_app.types import MatchedImage, MatchGraph, PoseGraph, ViewGraph
 

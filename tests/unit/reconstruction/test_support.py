@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.reconstruction.support import PairSupport, explained_pairs, model_poses, support
+from sfm_app.mapping.attempt import PairSupport, explained_pairs, model_poses, support
 from sfm_app.types import MatchGraph, ViewGraph
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 
+from sfm_app.mapping.attempt import photo_names, unregistered_reasons
 from sfm_app.posegraph.graph import BEHIND, CONTRADICTS, TOO_FEW
-from sfm_app.reconstruction.unregistered import photo_names, unregistered_reasons
 from sfm_app.types import EpipolarFit, MatchedImage, MatchGraph, PoseGraph, RelativePose, ViewGraph
 
 

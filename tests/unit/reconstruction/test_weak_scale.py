@@ -2,7 +2,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from sfm_app.reconstruction.weak_scale import MIN_SHARED_POINTS, weakly_joined_parts
+from sfm_app.mapping.split_and_merge import MIN_SHARED_POINTS, weakly_joined_parts
 
 pytestmark = pytest.mark.slow
 

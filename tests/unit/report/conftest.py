@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.camera import camera_matrix, panorama_matrix
+from sfm_app.camera.bearings import project
+from sfm_app.camera.models import camera_matrix, panorama_matrix
 from sfm_app.geometry.epipolar import cross_matrix
-from sfm_app.geometry.lenses.bearings import project
 from sfm_app.types import Calibration, CameraPairs
 
 K = camera_matrix(800.0, 800.0, 510.0, 390.0)

@@ -5,9 +5,17 @@ import numpy as np
 import pytest
 
 from sfm_app.errors import ConfigError
-from sfm_app.report.calibration_figure import MOST_CAMERAS, Panel, calibration_text, check_figure, draw_calibration
-from sfm_app.report.vote_planes import center_plane, focal_plane, vote_shares
-from sfm_app.selfcal.inputs import prepare
+from sfm_app.report.figures import (
+    MOST_CAMERAS,
+    Panel,
+    calibration_text,
+    center_plane,
+    check_figure,
+    draw_calibration,
+    focal_plane,
+    vote_shares,
+)
+from sfm_app.selfcal.pairs import prepare
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import Calibration, CameraPairs
 

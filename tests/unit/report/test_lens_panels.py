@@ -5,11 +5,9 @@ import re
 import numpy as np
 import pytest
 
-from sfm_app.estimation.lenses import to_calibration
-from sfm_app.report.calibration_figure import Panel, draw_calibration
-from sfm_app.report.lens_panels import lens_curve
-from sfm_app.selfcal.wide_angle.fisheye import Fisheye
-from sfm_app.selfcal.wide_angle.lens_search import LensEstimate
+from sfm_app.estimation.fitting import to_calibration
+from sfm_app.report.figures import Panel, draw_calibration, lens_curve
+from sfm_app.selfcal.wide_lens import Fisheye, LensEstimate
 
 SAYS = {
     "perspective": ["ideal pinhole", "square pixels", "votes"],

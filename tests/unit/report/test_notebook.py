@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_app.report import notebook
-from sfm_app.report.page.findings import Fact
+from sfm_app.report.findings import Fact
 from sfm_app.synthetic.cameras import arc, make_camera
 from sfm_app.types import Frustum, Model, Surface
 

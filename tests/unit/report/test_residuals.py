@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.report.residuals import epipolar_residuals, residual_grid
+from sfm_app.report.figures import epipolar_residuals, residual_grid
 from sfm_app.types import CameraPairs
 
 

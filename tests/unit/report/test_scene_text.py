@@ -2,7 +2,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_app.report.scene_text import scene_lines, scene_summary
+from sfm_app.report.text import scene_lines, scene_summary
 from sfm_app.types import CameraModel, Scene
 
 K = np.array([[900.0, 0, 320], [0, 901.0, 240], [0, 0, 1]])

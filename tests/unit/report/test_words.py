@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.camera import camera_matrix
-from sfm_app.report.words import center_text, field_of_view_deg, field_text, focal_text, held_text, lens_text, verdict
+from sfm_app.camera.bearings import field_of_view_deg
+from sfm_app.camera.models import camera_matrix
+from sfm_app.report.text import center_text, field_text, focal_text, held_text, lens_text, verdict
 from sfm_app.types import Calibration
 
 

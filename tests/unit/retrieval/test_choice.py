@@ -2,8 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.retrieval.choice import choose_by_rank, expected_pairs, spread, wants_all_pairs
-from sfm_app.retrieval.order import pairs_in_order, pairs_nearby
+from sfm_app.retrieval import choose_by_rank, expected_pairs, pairs_in_order, pairs_nearby, spread, wants_all_pairs
 from sfm_app.settings import MatchSettings
 from sfm_app.types import GpsPosition, MatchedImage
 

@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 
-from sfm_app.retrieval.friends import count_shared_keypoints
-from sfm_app.retrieval.picture_features import describe_picture
-from sfm_app.retrieval.preview import count_preview_matches
-from sfm_app.retrieval.similarity import rank_similar
-from sfm_app.retrieval.vocabulary import learn_vocabulary, pool_descriptors
+from sfm_app.retrieval import (
+    count_preview_matches,
+    count_shared_keypoints,
+    describe_picture,
+    learn_vocabulary,
+    pool_descriptors,
+    rank_similar,
+)
 
 PHOTOS, SEEN, STEP = 40, 100, 20
 
@@ -104,7 +107,7 @@ def test_friends_of_many_photos_are_counted_block_by_block(monkeypatch):
     keypoints = dict.fromkeys(range(1, 30), 50)
     whole = count_shared_keypoints(keypoints, matches)
 
-    monkeypatch.setattr("sfm_app.retrieval.friends.BLOCK", 4)
+    monkeypatch.setattr("sfm_app.retrieval.BLOCK", 4)
 
     assert count_shared_keypoints(keypoints, matches) == whole and len(whole) > 50
 

@@ -12,12 +12,22 @@ import pytest
 
 from sfm_app.errors import ClusterError, ConfigError, InputError
 from sfm_app.progress import SilentProgress
-from sfm_app.runtime.parallel import cluster, make_executor, open_executor, ordered_map, threads_elsewhere
-from sfm_app.runtime.parallel.cluster import Cluster, local_workers
-from sfm_app.runtime.parallel.cluster_executor import describe_item
-from sfm_app.runtime.parallel.parcels import SMALL_BYTES, packing, unpack
-from sfm_app.runtime.parallel.remote_call import Probe, find_misfit, picklable
-from sfm_app.runtime.parallel.worker_versions import PROCESSOR, differences, worker_versions
+from sfm_app.runtime import cluster
+from sfm_app.runtime.cluster import (
+    PROCESSOR,
+    SMALL_BYTES,
+    Cluster,
+    Probe,
+    describe_item,
+    differences,
+    find_misfit,
+    local_workers,
+    packing,
+    picklable,
+    unpack,
+    worker_versions,
+)
+from sfm_app.runtime.parallel import make_executor, open_executor, ordered_map, threads_elsewhere
 from sfm_app.settings import ClusterSettings, Settings
 from sfm_app.tasks import Shared, Task
 

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from sfm_app.meshing.refinement.sights import MOST_PX
+from sfm_app.meshing.refinement import MOST_KEPT_PX
 from sfm_app.pipeline import NAMES
 from sfm_app.runtime import cost_estimate
 from sfm_app.runtime.cost_estimate import cache_gb, choose_plan, largest_photo_megapixels, make_plan
@@ -92,4 +92,4 @@ def test_two_hundred_photos_of_twelve_megapixels_need_no_more_than_eight_gigabyt
 
 
 def test_the_estimate_knows_how_many_photos_the_refinement_holds():
-    assert cost_estimate.REFINED_AT_ONCE_MP * 1e6 == MOST_PX
+    assert cost_estimate.REFINED_AT_ONCE_MP * 1e6 == MOST_KEPT_PX

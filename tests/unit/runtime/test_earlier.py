@@ -1,6 +1,6 @@
 from pathlib import Path
 
-from sfm_app.runtime.earlier import Earlier, split_names
+from sfm_app.runtime.context import Earlier, split_names
 from sfm_app.runtime.workspace import Workspace
 
 

@@ -3,7 +3,7 @@ import json
 import pytest
 
 from sfm_app.errors import InputError
-from sfm_app.runtime.manifest import Manifest, StageRecord, model_triangles
+from sfm_app.runtime.workspace import Manifest, StageRecord, model_triangles
 
 
 @pytest.fixture

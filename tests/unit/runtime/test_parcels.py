@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm_app.runtime.parallel.parcels import SMALL_BYTES, packing, unpack
+from sfm_app.runtime.cluster import SMALL_BYTES, packing, unpack
 from sfm_app.tasks import Shared
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from sfm_app.errors import InputError
-from sfm_app.scale import read_control_points
+from sfm_app.frame.control_points import read_control_points
 
 UTM = "EPSG:32632\n"
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.similarity import Similarity
-from sfm_app.scale.control_fit import ControlFit, agreeing_points, fit_control_points
-from sfm_app.scale.sighted_points import SightedPoint
+from sfm_app.frame.control_points import ControlFit, agreeing_points, fit_control_points
+from sfm_app.frame.sighted_points import SightedPoint
+from sfm_app.geometry.poses import Similarity
 from sfm_app.synthetic.cameras import axis_rotation
 from sfm_app.types import ControlPoint, ControlPoints
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.scale.evidence import ScaleEvidence, agree
+from sfm_app.frame.scale import ScaleEvidence, agree
 
 
 def pieces(scales, deviation=0.01):

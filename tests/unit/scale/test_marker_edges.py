@@ -4,9 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm_app.scale.marker_edges import edge_sides, fit_pattern
-from sfm_app.scale.marker_scale import side_px
-from sfm_app.scale.markers import draw_pattern, find_markers
+from sfm_app.frame.markers import draw_pattern, edge_sides, find_markers, fit_pattern, side_px
 
 FAMILY, NUMBER = "apriltag-36h11", 7
 SHARPNESS = 8

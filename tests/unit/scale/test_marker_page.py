@@ -8,8 +8,16 @@ import numpy as np
 import pytest
 
 from sfm_app.errors import ConfigError, InputError
-from sfm_app.scale.marker_page import PAGES_MM, marker_places, write_marker_page
-from sfm_app.scale.markers import AUTO, FAMILIES, TRIED, draw_pattern, find_markers
+from sfm_app.frame.markers import (
+    AUTO,
+    FAMILIES,
+    PAGES_MM,
+    TRIED,
+    draw_pattern,
+    find_markers,
+    marker_places,
+    write_marker_page,
+)
 from sfm_app.settings import ScaleSettings
 
 PX_PER_MM = 4.0

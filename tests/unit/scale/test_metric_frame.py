@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfm_app.geometry.similarity import Similarity
-from sfm_app.scale import MetricFrame, move_model
-from sfm_app.scale.evidence import ScaleEvidence
-from sfm_app.scale.photo_rays import layout_scale, unrotate_pixels
+from sfm_app.frame.scale import MetricFrame, ScaleEvidence, move_model
+from sfm_app.frame.sighted_points import layout_scale, unrotate_pixels
+from sfm_app.geometry.poses import Similarity
 from sfm_app.synthetic.cameras import axis_rotation
 from sfm_app.types import Photo
 

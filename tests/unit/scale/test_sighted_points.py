@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.scale.sighted_points import Sight, SightedPoint, locate_point
+from sfm_app.frame.sighted_points import Sight, SightedPoint, locate_point
 
 FOCAL = 1000.0
 

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from sfm_app.fundamental.refits import refine_sampson
 from sfm_app.geometry.epipolar import eight_point
-from sfm_app.ransac.refine.sampson_refit import refine_sampson
 from sfm_app.selfcal import pair_weights
 from sfm_app.types import CameraPairs, PhotoPairs
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfm_app.selfcal.constraints import center_polynomials, focal_polynomials, singular_value_ratio
-from sfm_app.selfcal.inputs import prepare
+from sfm_app.selfcal.pairs import prepare
 from sfm_app.types import CameraPairs
 
 seeds = st.integers(0, 2**32 - 1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_app.selfcal import pair_weights
-from sfm_app.selfcal.inputs import prepare
+from sfm_app.selfcal.pairs import prepare
 from sfm_app.types import CameraPairs
 
 FRAME = {"unit_px": 1000.0, "origin_px": (500.0, 375.0)}

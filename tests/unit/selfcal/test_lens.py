@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.lens import LEAST_SLOPE, undistort_kernel, write_camera, write_ray
+from sfm_app.selfcal.pairs import LEAST_SLOPE, undistort_kernel, write_camera, write_ray
 
 F, U, V, LOG_A = 1.1, 0.03, -0.02, 0.04
 

@@ -1,7 +1,7 @@
 import numpy as np
 
-from sfm_app.geometry.distances import sampson_distance
-from sfm_app.selfcal.undistort_pairs import undistort_pairs
+from sfm_app.geometry.epipolar import sampson_distance
+from sfm_app.selfcal.pairs import undistort_pairs
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import Calibration, CameraPairs
 

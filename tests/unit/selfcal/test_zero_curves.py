@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal import pair_weights, zero_curves
-from sfm_app.selfcal.consensus import consensus_peak
+from sfm_app.selfcal import consensus, pair_weights, zero_curves
 from sfm_app.selfcal.zero_curves import METHOD, calibrate
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import CameraPairs
@@ -82,7 +81,7 @@ def test_pixels_that_may_not_be_square_are_not_claimed_to_be_known(views):
 )
 def test_a_small_lead_counts_only_where_few_votes_are_missing(lead, missing, doubted):
     votes = np.full(10, 1.0 - missing)
-    answer = consensus_peak.Answer(np.zeros(4), consensus_peak.SQUARE_PIXELS, 0.01, lead * votes.sum(), votes, 0.0, ())
+    answer = consensus.Answer(np.zeros(4), consensus.SQUARE_PIXELS, 0.01, lead * votes.sum(), votes, 0.0, ())
     assert bool(answer.doubt_of_focal(np.ones(10))) is doubted
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.surface import positions
-from sfm_app.meshing.blocks.partition import split_points
-from sfm_app.stages.blocks import points as block_points
-from sfm_app.stages.blocks.points import POINTS, sort_points
+from sfm_app.meshing.blocks import split_points
+from sfm_app.surface import blocks as block_points
+from sfm_app.surface.blocks import POINTS, sort_points
 
 
 @pytest.fixture

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm_app.atomic_io import UNFINISHED
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.dense import MASKED, DenseStore, read_depth, read_views
 from sfm_app.errors import ConfigError, ReconstructionError
+from sfm_app.files import UNFINISHED
 from sfm_app.meshing.visibility import SKY
 from sfm_app.photos import save_mask
 from sfm_app.plugins import DepthMethod, hookimpl, load_plugins

@@ -3,11 +3,11 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from sfm_app.formats import EXPORTERS
-from sfm_app.formats.pages import JPEG_QUALITY
+from sfm_app.formats.exporters import JPEG_QUALITY
+from sfm_app.frame.scale import MetricFrame
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
-from sfm_app.scale import MetricFrame
 from sfm_app.settings import Settings
 from sfm_app.stages import export
 

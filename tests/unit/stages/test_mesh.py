@@ -19,9 +19,8 @@ from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import mesh
-from sfm_app.stages.blocks import fusion, refining
-from sfm_app.stages.blocks import surface as blocks
 from sfm_app.stereo import DepthMap
+from sfm_app.surface import blocks, fusion, refining
 from sfm_app.synthetic.cameras import look_at
 
 pytestmark = pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 
 from sfm_app.estimation.calibrating import camera_pairs, photo_pairs, to_whole_photo
 from sfm_app.selfcal import CalibratedCamera, pair_weights
-from sfm_app.selfcal.results import guess_calibration
+from sfm_app.selfcal.pairs import guess_calibration
 from sfm_app.types import EpipolarFit, MatchedImage, MatchGraph, Rejected, ViewGraph
 
 

@@ -5,9 +5,9 @@ import pytest
 
 from sfm_app.meshing.refinement import Refinement
 from sfm_app.settings import MeshSettings
-from sfm_app.stages.blocks import refining
-from sfm_app.stages.blocks.refining import PARTNERS, Originals, rank_partners, refine_surface
 from sfm_app.stereo import View
+from sfm_app.surface import refining
+from sfm_app.surface.refining import PARTNERS, Originals, rank_partners, refine_surface
 from sfm_app.types import Surface
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])

@@ -8,17 +8,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sfm_app.camera.models import camera_matrix
+from sfm_app.colmap import bundle
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.bundles import bundle_rounds
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.models.model import posed_photo_ids, submodel
+from sfm_app.colmap.model import posed_photo_ids, submodel
 from sfm_app.errors import ReconstructionError
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.mapping.attempt import Attempt, PairSupport
+from sfm_app.mapping.passes import Outcome
 from sfm_app.plugins import load_plugins
-from sfm_app.reconstruction import Outcome
-from sfm_app.reconstruction.mapping_runs import Attempt
-from sfm_app.reconstruction.support import PairSupport
-from sfm_app.report.scene_text import scene_lines
+from sfm_app.report.text import scene_lines
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import MAPPING, Workspace
 from sfm_app.settings import Settings
@@ -173,7 +172,7 @@ def test_a_model_that_cannot_be_adjusted_is_kept_and_the_run_says_so(synthetic, 
     true = synthetic[1]
     made = outcome(attempt(submodel(true, (1, 2, 3, 4))), attempt(submodel(true, (5, 6, 7))))
     mapped(made)
-    monkeypatch.setattr(bundle_rounds, "reduce", failing)
+    monkeypatch.setattr(bundle, "reduce", failing)
     matches, views = inputs(true)
 
     found = scene.make(matches, views, made.intrinsics, run)

@@ -11,7 +11,7 @@ from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
-from sfm_app.stages.video_frames import frame_stem, video_frames
+from sfm_app.stages.photos import frame_stem, video_frames
 
 pytestmark = pytest.mark.slow
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from sfm_app.estimation import fitting
+from sfm_app.fundamental.degeneracy import ONLY_A_LOGO
 from sfm_app.plugins import load_plugins
-from sfm_app.ransac.degeneracy.watermark import ONLY_A_LOGO
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace

@@ -2,13 +2,7 @@
 
 import numpy as np
 
-from sfm_app.stereo.consistency import (
-    MIN_PATCH,
-    count_confirming_maps,
-    count_deeper_maps,
-    filter_speckles,
-    merge_hypotheses,
-)
+from sfm_app.stereo.depth import MIN_PATCH, count_confirming_maps, count_deeper_maps, filter_speckles, merge_hypotheses
 
 
 def pixels(*values: float) -> np.ndarray:

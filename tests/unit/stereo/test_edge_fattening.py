@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.stereo.edge_fattening import REACH_PX, remove_spill, rim_mask
+from sfm_app.stereo.patch_match import REACH_PX, remove_spill, rim_mask
 
 SIDE = 80
 ROW, COL = np.indices((SIDE, SIDE))

@@ -8,8 +8,8 @@ import pytest
 
 from sfm_app.settings import DepthSettings
 from sfm_app.stereo import DepthEstimate, DepthMap, DepthTask, make_depth_maps_on_cpu, method, rank_neighbors
-from sfm_app.stereo.levels import fill_from_coarse, halve_views, open_share
-from sfm_app.stereo.normals import fit_planes, plane_normals
+from sfm_app.stereo.method import fill_from_coarse, halve_views, open_share
+from sfm_app.stereo.patch_match import fit_planes, plane_normals
 from sfm_app.types import Rejected
 
 CENTERS = [(-0.5, 0, 0), (0, 0, 0), (0.5, 0.1, 0), (0.1, 0.5, 0.05), (-0.2, -0.4, 0)]

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.stereo.matching import depths_from_disparities, disparities
-from sfm_app.stereo.rectify import rectify
+from sfm_app.stereo.rectify import depths_from_disparities, disparities, rectify
 
 
 @pytest.mark.parametrize("center", [(0.5, 0, 0), (-0.5, 0, 0), (0, 0.5, 0), (0.3, -0.3, 0.1), (0.1, 0, 0.9)])

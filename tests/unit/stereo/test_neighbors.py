@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.stereo.neighbors import BEST_ANGLE_DEG, point_weights, rank_neighbors, triangulation_angles_deg
-from sfm_app.stereo.view import View
+from sfm_app.stereo.view import BEST_ANGLE_DEG, View, point_weights, rank_neighbors, triangulation_angles_deg
 
 
 def view_at(center, points, ids=None, focal=500.0) -> View:

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm_app.stereo.normals import fit_planes, plane_normals
+from sfm_app.stereo.patch_match import fit_planes, plane_normals
 from sfm_app.stereo.view import View
 
 slope = st.floats(-1.0, 1.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from sfm_app.geometry.similarity import Similarity
+from sfm_app.geometry.poses import Similarity
 from sfm_app.synthetic.cameras import axis_rotation, make_camera
 from sfm_app.synthetic.compare import (
     align_centers,

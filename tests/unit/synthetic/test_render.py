@@ -20,7 +20,7 @@ from sfm_app.synthetic.render import (
 )
 from sfm_app.synthetic.shapes import Body, Material, SyntheticScene, box
 from sfm_app.types import Surface
-from sfm_app.types.model import Model, Texture
+from sfm_app.types.surface import Model, Texture
 
 
 @pytest.fixture(scope="module")

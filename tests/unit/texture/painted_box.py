@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 from sfm_app.texture import PhotoView
-from sfm_app.texture.appearance.sightings import make_sightings
+from sfm_app.texture.sightings import make_sightings
 from sfm_app.types import Surface
 
 HALF = np.array([1.0, 0.7, 0.8])

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from painted_box import HALF, Album, around, box, on_surface, one_by_one, paint_at
 
-from sfm_app.meshing.occlusion import Occluders
+from sfm_app.meshing.ray_casting import Occluders
 from sfm_app.settings import TextureSettings
-from sfm_app.texture import blocks, texture_surface
+from sfm_app.texture import charts, texture_surface
 from sfm_app.types import Model
 
 pytestmark = pytest.mark.slow
@@ -225,7 +225,7 @@ def _pixels(view, points):
 
 
 def test_in_blocks_every_point_has_its_color_too(plain, monkeypatch):
-    monkeypatch.setattr(blocks, "TRIANGLES", 600)
+    monkeypatch.setattr(charts, "TRIANGLES", 600)
     model, figures = textured(Album())
 
     assert len(model.texture.pages) == len(figures["pages"]) == 3
@@ -237,7 +237,7 @@ def test_in_blocks_every_point_has_its_color_too(plain, monkeypatch):
 
 
 def test_a_finished_block_is_not_painted_again(monkeypatch):
-    monkeypatch.setattr(blocks, "TRIANGLES", 600)
+    monkeypatch.setattr(charts, "TRIANGLES", 600)
     album = Album()
     first, _ = textured(album)
     assert {"block0", "block1", "block2"} <= set(album.kept)

@@ -5,7 +5,7 @@ import pytest
 from painted_box import sightings
 
 from sfm_app.geometry.triangles import select_faces
-from sfm_app.texture.appearance.border_agreement import CRUMBS, RINGS, doubtful_border
+from sfm_app.texture.appearance import CRUMBS, RINGS, doubtful_border
 from sfm_app.texture.facets import facets
 from sfm_app.types import Surface
 

@@ -5,9 +5,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from sfm_app.texture import painting
+from sfm_app.texture import pages
 from sfm_app.texture.facets import NONE, SPARSE, distinct, facets
-from sfm_app.texture.painting import owners
+from sfm_app.texture.pages import owners
 from sfm_app.texture.view_selection import _match_labels
 from sfm_app.types import Surface
 
@@ -44,7 +44,7 @@ def test_texels_have_the_same_owners_in_bands(monkeypatch):
     triangles = np.arange(30)
 
     whole = owners((96, 90), triangles, corners)
-    monkeypatch.setattr(painting, "BAND", 16)
+    monkeypatch.setattr(pages, "BAND", 16)
     with ThreadPoolExecutor(3) as threads:
         in_bands = owners((96, 90), triangles, corners, threads.map)
 

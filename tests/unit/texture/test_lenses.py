@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.lenses.projections import FISHEYE, PERSPECTIVE, project_points
-from sfm_app.photos.panoramas.painted_parts import panorama_parts
+from sfm_app.camera.projection import FISHEYE, PERSPECTIVE, project_points
+from sfm_app.photos.panoramas import panorama_parts
 from sfm_app.stages.texture import photo_views
 from sfm_app.texture.views import part_view, photo_view, project
 from sfm_app.types import CameraModel, Scene

@@ -7,13 +7,12 @@ import pytest
 from painted_box import one_by_one
 
 from benchmarks.surface.lit_model import angles_deg, read_lit
-from sfm_app.formats.glb import write_glb
-from sfm_app.geometry.similarity import Similarity
-from sfm_app.meshing.nearest import NearestNormals
+from sfm_app.formats.gltf import write_glb
+from sfm_app.frame.scale import move_model
+from sfm_app.geometry.poses import Similarity
+from sfm_app.meshing.ray_casting import NearestNormals
 from sfm_app.runtime.parallel import make_executor, ordered_map
-from sfm_app.scale import move_model
-from sfm_app.texture import bake_normals
-from sfm_app.texture.normal_map import bake
+from sfm_app.texture import bake_normals, normal_map
 from sfm_app.types import Model, Surface, Texture
 
 HEIGHT, WAVES = 0.008, 25.0
@@ -143,7 +142,7 @@ def test_triangles_that_no_photo_sees_stay_flat():
 
 
 def test_any_number_of_workers_gives_the_same_bytes(monkeypatch):
-    monkeypatch.setattr(bake, "BAND", 20 * SIDE)  # several parts
+    monkeypatch.setattr(normal_map, "BAND", 20 * SIDE)  # several parts
     found = []
     for workers in (1, 2):
         with make_executor(workers) as executor:

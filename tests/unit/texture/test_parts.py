@@ -10,19 +10,14 @@ from hypothesis import strategies as st
 from painted_box import around, box, sightings
 
 from sfm_app.errors import ReconstructionError
-from sfm_app.geometry.culling import morton_order
+from sfm_app.geometry.triangles import morton_order
 from sfm_app.texture import PhotoView, photo_view
-from sfm_app.texture.appearance.exposure import photo_gains
-from sfm_app.texture.appearance.median import median
-from sfm_app.texture.appearance.photo_consistency import outlier_mask
-from sfm_app.texture.appearance.view_scoring import sharpness, sharpness_factors
-from sfm_app.texture.blending import blend_weights
-from sfm_app.texture.charts import Charts, absorb_small_charts, folds
+from sfm_app.texture.appearance import median, outlier_mask, photo_gains
+from sfm_app.texture.charts import MARGIN, Charts, absorb_small_charts, folds, pack
 from sfm_app.texture.facets import NONE, components, facets
-from sfm_app.texture.packing import MARGIN, pack
-from sfm_app.texture.painting import canvas, fill_background
-from sfm_app.texture.seam_leveling import level_seams, solve_ties
-from sfm_app.texture.unseen_faces import block_sizes, square_texels, squares
+from sfm_app.texture.pages import canvas, fill_background
+from sfm_app.texture.seams import blend_weights, block_sizes, level_seams, solve_ties, square_texels, squares
+from sfm_app.texture.sightings import sharpness, sharpness_factors
 from sfm_app.texture.view_selection import PRICE_OF_DETAIL, choose_photos
 from sfm_app.texture.views import project, sample
 from sfm_app.types import CameraModel, Surface

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from painted_box import Album, around, box, one_by_one
 
-from sfm_app.meshing.occlusion import Occluders
+from sfm_app.meshing.ray_casting import Occluders
 from sfm_app.settings import TextureSettings
-from sfm_app.texture import atlas, texture_surface
+from sfm_app.texture import pages, texture_surface
 
 VIEWS, BOX = around(6, size=(160, 120)), box(6)
 NAMES = [view.name for view in VIEWS]
@@ -62,8 +62,8 @@ def test_photos_are_looked_at_once(whole):
 
 
 def test_photos_are_painted_once(whole, monkeypatch):
-    monkeypatch.setattr(atlas, "EVERY_S", -1.0)
-    monkeypatch.setattr(atlas, "MOST_OF_THE_TIME", np.inf)
+    monkeypatch.setattr(pages, "EVERY_S", -1.0)
+    monkeypatch.setattr(pages, "MOST_OF_THE_TIME", np.inf)
     album = interrupted_after(len(VIEWS) + 2)
 
     same(textured(album), whole)
@@ -73,7 +73,7 @@ def test_photos_are_painted_once(whole, monkeypatch):
 
 def test_pages_are_kept_now_and_then_only(whole):
     album = interrupted_after(len(VIEWS) + 2)
-    assert atlas.GROUP_NAME not in album.kept
+    assert pages.GROUP_NAME not in album.kept
 
     same(textured(album), whole)
 
@@ -82,15 +82,15 @@ def test_pages_are_kept_now_and_then_only(whole):
 
 def test_large_pages_are_kept_less_often(monkeypatch):
     clock = iter(range(0, 1000, 20))  # whatever is done takes twenty seconds
-    monkeypatch.setattr(atlas.time, "monotonic", lambda: float(next(clock)))
+    monkeypatch.setattr(pages.time, "monotonic", lambda: float(next(clock)))
     album = Album()
-    work = atlas.Pages([], 40, album)
+    work = pages.Pages([], 40, album)
     kept_after = []
     for photo in range(40):
-        before = album.kept.pop(atlas.GROUP_NAME, None)
+        before = album.kept.pop(pages.GROUP_NAME, None)
         assert before is None or before["has"].sum() == photo
         with work.lock_canvases(photo):
             pass
-        kept_after += [photo] if atlas.GROUP_NAME in album.kept else []
+        kept_after += [photo] if pages.GROUP_NAME in album.kept else []
 
     assert kept_after == [0, 20]

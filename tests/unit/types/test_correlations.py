@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.types.correlations import named_correlations
+from sfm_app.types.camera import named_correlations
 
 
 def test_pairs_of_parameters_have_the_correlation_of_drawn_values():

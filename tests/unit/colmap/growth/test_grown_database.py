@@ -9,9 +9,9 @@ from sfm_app.colmap.database import (
     read_features,
     unmatched_pairs,
 )
-from sfm_app.colmap.growth.grown_database import forget_changed_matches, grow_database
+from sfm_app.colmap.growth import forget_changed_matches, grow_database
 from sfm_app.types import Photo, PhotoSet
-from sfm_app.types.calibration import EQUIRECTANGULAR
+from sfm_app.types.camera import EQUIRECTANGULAR
 
 
 def photo_set(place, **groups):

@@ -3,8 +3,8 @@ import pytest
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.growth.grown_model import model_in_database
-from sfm_app.colmap.models.model import posed_photo_ids
+from sfm_app.colmap.growth import model_in_database
+from sfm_app.colmap.model import posed_photo_ids
 
 
 @pytest.fixture(scope="module")

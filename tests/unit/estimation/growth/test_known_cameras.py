@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sfm_app.estimation.growth import known_cameras as module
-from sfm_app.estimation.growth.known_cameras import find_or_keep_intrinsics, known_cameras, refined_camera
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.camera.models import camera_matrix
+from sfm_app.estimation import known as module
+from sfm_app.estimation.known import find_or_keep_intrinsics, known_cameras, refined_camera
 from sfm_app.selfcal import CalibratedCamera
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, GivenCameras, Intrinsics, MatchedImage, MatchGraph, ViewGraph

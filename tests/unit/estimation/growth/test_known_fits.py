@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.database import write_match_graph
-from sfm_app.estimation.growth.known_fits import known_fits, known_lenses
-from sfm_app.estimation.growth.same_matches import find_same_matches, pairs_with_news
+from sfm_app.estimation.known import known_fits, known_lenses
+from sfm_app.matching.known import find_same_matches, pairs_with_news
 from sfm_app.types import Calibration, EpipolarFit, MatchedImage, MatchGraph, Rejected, ViewGraph
 
 ROWS = np.column_stack([np.arange(4), np.arange(4)[::-1]]).astype(np.uint32)

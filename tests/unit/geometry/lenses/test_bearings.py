@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.lenses.bearings import bearings, depths_along, fold_angle, pixels_per_radian, project
+from sfm_app.camera.bearings import bearings, depths_along, fold_angle, pixels_per_radian, project
 from sfm_app.types import Calibration
 
 K = np.array([[200.0, 0.0, 400.0], [0.0, 210.0, 300.0], [0.0, 0.0, 1.0]])

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.lenses import distortion
-from sfm_app.geometry.lenses.distortion import fold_radius, radial_factor, undistort
-from sfm_app.geometry.lenses.projections import project_points
+from sfm_app.camera import bearings
+from sfm_app.camera.bearings import fold_radius, radial_factor, undistort
+from sfm_app.camera.projection import project_points
 
 TERMS = np.array([-0.1, 0.02, 0.001, -0.002, 0.01, 0.02, -0.001, 0.001])
 FAMILIES = {"perspective": 0, "fisheye": 1}
@@ -39,7 +39,7 @@ def test_points_beyond_the_fold_lie_on_it():
 def test_steps_end_where_more_of_them_change_nothing(projection, shifted, monkeypatch):
     terms = TERMS * ([1.0] * 8 if shifted else [1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
     points = np.random.default_rng(1).uniform(-1.5, 1.5, (500, 2))
-    monkeypatch.setattr(distortion, "PRECISION", 0.0)
+    monkeypatch.setattr(bearings, "PRECISION", 0.0)
     exact = undistort(points, terms, projection)
     monkeypatch.undo()
 

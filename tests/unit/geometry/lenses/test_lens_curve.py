@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.camera import camera_matrix, panorama_matrix
-from sfm_app.geometry.lenses.bearings import RAY, bearings
-from sfm_app.geometry.lenses.camera_models import calibration_from_model
-from sfm_app.geometry.lenses.lens_curve import corner_angle, field_of_view_deg, radius_deviation_px, radius_px
+from sfm_app.camera.bearings import RAY, bearings, corner_angle, field_of_view_deg, radius_deviation_px, radius_px
+from sfm_app.camera.models import calibration_from_model, camera_matrix, panorama_matrix
 from sfm_app.types import Calibration
 
 SIZE = (1000, 800)

@@ -3,14 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.camera import camera_matrix
-from sfm_app.geometry.lenses.perspective_views import (
-    MOST_FIELD_DEG,
-    OVERLAP_DEG,
-    PerspectiveView,
-    center_view,
-    cover_rays,
-)
+from sfm_app.camera.models import camera_matrix
+from sfm_app.camera.perspective_views import MOST_FIELD_DEG, OVERLAP_DEG, PerspectiveView, center_view, cover_rays
 
 
 def cone(across_deg, down_deg, count=161):

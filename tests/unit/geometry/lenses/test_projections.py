@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.bundle_adjustment.normal_equations import DAMPING, Bundle, apply_step, project, reduce, residuals
-from sfm_app.colmap.backend import pycolmap
-from sfm_app.geometry.lenses.projections import (
+from sfm_app.bundle.normal_equations import DAMPING, Bundle, apply_step, project, reduce, residuals
+from sfm_app.camera.projection import (
     CAMERA,
     FISHEYE,
     PANORAMA,
@@ -18,6 +17,7 @@ from sfm_app.geometry.lenses.projections import (
     project_points,
     radius_at,
 )
+from sfm_app.colmap.backend import pycolmap
 
 BENT = (900.0, 950.0, 510.0, 390.0, -0.1, 0.05, 0.002, -0.003, 0.01, 0.02, -0.01, 0.005)
 FULL = (400.0, 410.0, 510.0, 390.0, -0.02, 0.01, 0.002, -0.003, 0.004, -0.001, 0.003, -0.004)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.meshing.blocks.partition import split_points
+from sfm_app.meshing.blocks import split_points
 
 
 @pytest.mark.parametrize("blocks", [1, 2, 3, 7, 16])

@@ -6,8 +6,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from sfm_app.geometry.triangles import unique_edges, vertex_normals
-from sfm_app.meshing.blocks.weld import close_cracks, cut_at_plane, weld
-from sfm_app.meshing.manifold import make_manifold
+from sfm_app.meshing.blocks import close_cracks, cut_at_plane, weld
+from sfm_app.meshing.cleaning import make_manifold
 from sfm_app.types import Surface
 
 CELL, HALO = 0.07, 0.56

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from sfm_app.meshing.refinement import RefinePhoto
+from sfm_app.meshing.agreement import RefinePhoto
 from sfm_app.synthetic.cameras import look_at
 from sfm_app.types import Surface
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from sfm_app.geometry.triangles import vertex_normals
-from sfm_app.meshing.refinement import fairness
-from sfm_app.meshing.refinement.fairness import BEND, CREASE, HOLD, Neighbors, find_displacements
+from sfm_app.meshing import fairness
+from sfm_app.meshing.fairness import BEND, CREASE, HOLD, Neighbors, find_displacements
 from tests.unit.meshing.refinement.conftest import PIXEL, grid
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.meshing.refinement.rasterize import NOTHING, rasterize
+from sfm_app.meshing.agreement import NOTHING, rasterize
 
 P = np.array([[100.0, 0.0, 32.0, 0.0], [0.0, 100.0, 24.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
 """A camera at the origin that looks along z, y down."""

@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.meshing.refinement import refine
-from sfm_app.meshing.refinement.agreement import compare
-from sfm_app.meshing.refinement.refine import finest_pixels, look
+from sfm_app.meshing.agreement import compare
+from sfm_app.meshing.refinement import finest_pixels, look, refine
 from tests.unit.meshing.refinement.conftest import PIXEL, SIDE, grid
 
 BUMP_PX, WIDTH_PX = 3.0, 12.0

@@ -6,10 +6,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from sfm_app.meshing.refinement import sights
-from sfm_app.meshing.refinement.agreement import Sight
-from sfm_app.meshing.refinement.rasterize import Raster
-from sfm_app.meshing.refinement.sights import Sights
+from sfm_app.meshing import refinement
+from sfm_app.meshing.agreement import Raster, Sight
+from sfm_app.meshing.refinement import Sights
 
 
 def drawn(made, seconds=0.0):
@@ -31,7 +30,7 @@ def test_many_threads_that_ask_at_once_get_the_same_photo():
 
 
 def test_the_photo_that_was_not_used_longest_is_dropped(monkeypatch):
-    monkeypatch.setattr(sights, "MOST_PX", 200)
+    monkeypatch.setattr(refinement, "MOST_PX", 200)
     made = []
     kept = drawn(made)
     for number in (0, 1, 0, 2, 0, 1):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sfm_app.geometry.triangles import areas, unique_edges, vertex_normals
-from sfm_app.meshing.refinement.subdivide import split_long_edges
+from sfm_app.meshing.refinement import split_long_edges
 from sfm_app.synthetic.shapes import ball
 from sfm_app.types import Surface
 

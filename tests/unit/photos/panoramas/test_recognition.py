@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from sfm_app.photos.decode import UnreadableError, read_picture, upright_image
-from sfm_app.photos.panoramas.recognition import closes_around, is_panorama, read_panorama_entries
+from sfm_app.photos.panoramas import closes_around, is_panorama, read_panorama_entries
 from sfm_app.synthetic.cameras import Views, look_at, panorama_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
 from sfm_app.synthetic.scenes import courtyard

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.photos.panoramas.feature_views import PanoramaViews
-from sfm_app.photos.panoramas.painted_parts import mask_part, panorama_parts, show_part
-from sfm_app.photos.resample import resample, shrink
+from sfm_app.photos.panoramas import PanoramaViews, mask_part, panorama_parts, resample, show_part, shrink
 
 WIDTH = 512
 

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image, ImageDraw, ImageFilter
 
 from sfm_app.photos import drop_unusable
-from sfm_app.photos.selection.thumbnail_stats import measure_photo
+from sfm_app.photos.selection import measure_photo
 from sfm_app.types import Photo
 
 SIZE = (1024, 768)

@@ -7,8 +7,7 @@ import pytest
 from PIL import Image
 
 from sfm_app.photos.probe import read_photo
-from sfm_app.photos.selection.stats_file import read_stats, write_stats
-from sfm_app.photos.selection.thumbnail_stats import PhotoStats
+from sfm_app.photos.selection import PhotoStats, read_stats, write_stats
 from sfm_app.settings import PhotoSettings
 from sfm_app.types import GpsPosition, Photo
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.camera.models import camera_matrix
+from sfm_app.fundamental import ESTIMATORS
+from sfm_app.fundamental.degeneracy import is_rotation, off_line_mask
+from sfm_app.fundamental.estimate import count_matches_off_plane, judge
 from sfm_app.geometry.epipolar import fundamental_from_pose
-from sfm_app.ransac import ESTIMATORS, judge
-from sfm_app.ransac.degeneracy.degenerate_matches import is_rotation, off_line_mask
-from sfm_app.ransac.estimate import count_matches_off_plane
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.cameras import axis_rotation
 from sfm_app.synthetic.correspondences import PairOptions, make_pair

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.camera.models import camera_matrix
+from sfm_app.fundamental.degeneracy import dominant_homography, transfer_distance
+from sfm_app.fundamental.estimate import judge
 from sfm_app.geometry.epipolar import fundamental_from_pose
-from sfm_app.ransac import judge
-from sfm_app.ransac.degeneracy.dominant_plane import dominant_homography, transfer_distance
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import random_rotation
 

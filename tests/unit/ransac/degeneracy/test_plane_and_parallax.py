@@ -5,12 +5,12 @@ from functools import partial
 import numpy as np
 import pytest
 
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.camera.models import camera_matrix
+from sfm_app.fundamental.degeneracy import recover_epipole
+from sfm_app.fundamental.pretests import NO_PRETEST
+from sfm_app.fundamental.samples import random_state
+from sfm_app.fundamental.scores import geman_mcclure, penalty, squared_distances
 from sfm_app.geometry.epipolar import fundamental_from_pose
-from sfm_app.ransac.degeneracy.plane_and_parallax import recover_epipole
-from sfm_app.ransac.sampling.minimal_samples import random_state
-from sfm_app.ransac.scoring.robust_costs import geman_mcclure, penalty, squared_distances
-from sfm_app.ransac.verification.pretests import NO_PRETEST
 from sfm_app.synthetic.correspondences import random_rotation
 
 UNIT, THRESHOLD = 400.0, 1.5 / 400.0

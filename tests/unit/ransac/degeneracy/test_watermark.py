@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.ransac.degeneracy.watermark import (
+from sfm_app.fundamental.degeneracy import (
     ONLY_A_LOGO,
     SAME_PHOTO,
     find_stationary,
@@ -9,7 +9,7 @@ from sfm_app.ransac.degeneracy.watermark import (
     is_widespread,
     one_per_cell,
 )
-from sfm_app.ransac.lev_ransac import fit_lev_ransac
+from sfm_app.fundamental.lev_ransac import fit_lev_ransac
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.cameras import axis_rotation
 from sfm_app.types import EpipolarFit, Rejected

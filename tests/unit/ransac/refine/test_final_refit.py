@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.distances import reprojection_distance, sampson_distance
-from sfm_app.ransac import ESTIMATORS
-from sfm_app.ransac.points import prepare
-from sfm_app.ransac.refine.final_refit import REFITS, choose_refit
-from sfm_app.ransac.refine.sampson_refit import fit_eight_point
+from sfm_app.fundamental import ESTIMATORS
+from sfm_app.fundamental.points import prepare
+from sfm_app.fundamental.refits import REFITS, choose_refit, fit_eight_point
+from sfm_app.geometry.epipolar import reprojection_distance, sampson_distance
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 from sfm_app.types import EpipolarFit, Rejected

@@ -4,11 +4,17 @@ import numpy as np
 import pytest
 
 from sfm_app.errors import NumericalError
-from sfm_app.geometry.distances import nearest_exact_matches, reprojection_distance, sampson_distance
-from sfm_app.geometry.epipolar import canonical_cameras, fundamental_from_pose, nearest_rank_two, to_homogeneous
-from sfm_app.ransac.points import prepare
-from sfm_app.ransac.refine.gold_standard import refine_reprojection
-from sfm_app.ransac.refine.sampson_refit import fit_eight_point, refine_sampson
+from sfm_app.fundamental.points import prepare
+from sfm_app.fundamental.refits import fit_eight_point, refine_reprojection, refine_sampson
+from sfm_app.geometry.epipolar import (
+    canonical_cameras,
+    fundamental_from_pose,
+    nearest_exact_matches,
+    nearest_rank_two,
+    reprojection_distance,
+    sampson_distance,
+    to_homogeneous,
+)
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
 CLOUD = np.random.default_rng(3).normal(size=(60, 4))

@@ -5,11 +5,10 @@ import itertools
 import numpy as np
 import pytest
 
-from sfm_app.geometry.distances import sampson_distance
-from sfm_app.ransac.points import prepare
-from sfm_app.ransac.refine.rank_two import factorize
-from sfm_app.ransac.refine.sampson_refit import fit_algebraic, fit_eight_point, refine_mixture, refine_sampson
-from sfm_app.ransac.scoring.robust_costs import squared_distances
+from sfm_app.fundamental.points import prepare
+from sfm_app.fundamental.refits import factorize, fit_algebraic, fit_eight_point, refine_mixture, refine_sampson
+from sfm_app.fundamental.scores import squared_distances
+from sfm_app.geometry.epipolar import sampson_distance
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.ransac.sampling.minimal_samples import SAMPLE_SIZE, draw_uniform, draw_weighted, random_state, uniform
+from sfm_app.fundamental.samples import SAMPLE_SIZE, draw_uniform, draw_weighted, random_state, uniform
 
 DRAWS = 20_000
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.ransac.sampling.stopping import CONVERGED, has_converged, required_trials
+from sfm_app.fundamental.samples import CONVERGED, has_converged, required_trials
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.camera.models import camera_matrix
+from sfm_app.fundamental.lev_ransac import search_patience
 from sfm_app.geometry.epipolar import cross_matrix, fundamental_from_pose
-from sfm_app.ransac.sampling.termination import search_patience
 from sfm_app.synthetic.correspondences import random_rotation
 
 UNIT = 400.0

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.epipolar import eight_point
-from sfm_app.ransac.points import prepare
-from sfm_app.ransac.scoring.leverage import (
+from sfm_app.fundamental.leverage import (
     PARAMETERS,
     cook_distances,
     leverages,
@@ -14,6 +12,8 @@ from sfm_app.ransac.scoring.leverage import (
     priors,
     studentized_residuals,
 )
+from sfm_app.fundamental.points import prepare
+from sfm_app.geometry.epipolar import eight_point
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
 TWO_PIXELS = 2.0 / 140  # in units of the spread of points in photos of 512 px

@@ -5,10 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from sfm_app.fundamental.pretests import NO_PRETEST
+from sfm_app.fundamental.scores import SIGMAS, inlier_share, mlesac, outlier_window, penalty, squared_distances
 from sfm_app.geometry.epipolar import cross_matrix
-from sfm_app.ransac.scoring.mlesac import SIGMAS, inlier_share, mlesac, outlier_window
-from sfm_app.ransac.scoring.robust_costs import penalty, squared_distances
-from sfm_app.ransac.verification.pretests import NO_PRETEST
 
 SHIFT = cross_matrix([1.0, 0, 0]).reshape(9) / np.sqrt(2)
 SIGMA = 0.5

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from sfm_app.ransac.points import prepare
-from sfm_app.ransac.scoring.res_ransac import residual_validity, validity_from_residuals
+from sfm_app.fundamental.points import prepare
+from sfm_app.fundamental.scores import residual_validity, validity_from_residuals
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
 

@@ -5,9 +5,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from sfm_app.geometry.distances import sampson_distance
-from sfm_app.geometry.epipolar import cross_matrix
-from sfm_app.ransac.scoring.robust_costs import (
+from sfm_app.fundamental.pretests import BLOCK, NO_PRETEST, make_pretest
+from sfm_app.fundamental.scores import (
     geman_mcclure,
     lmeds,
     msac,
@@ -18,7 +17,7 @@ from sfm_app.ransac.scoring.robust_costs import (
     squared_distances,
     squared_sampson_distance,
 )
-from sfm_app.ransac.verification.pretests import BLOCK, NO_PRETEST, make_pretest
+from sfm_app.geometry.epipolar import cross_matrix, sampson_distance
 
 SOFT = partial(geman_mcclure, scale=0.25)
 SHIFT = cross_matrix([1.0, 0, 0]).reshape(9)

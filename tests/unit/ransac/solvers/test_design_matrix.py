@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.ransac.solvers.design_matrix import LANES, design_row, quadratic_forms, weighted_gram
+from sfm_app.fundamental.solvers import LANES, design_row, quadratic_forms, weighted_gram
 
 SIZES = [2, 7, LANES - 1, LANES, LANES + 1, 3 * LANES, 200]
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.ransac.solvers.eigenvalues import decompose_symmetric
+from sfm_app.fundamental.solvers import decompose_symmetric
 
 
 def solve(matrix):

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sfm_app.fundamental.solvers import solve_five_point
 from sfm_app.geometry.epipolar import cross_matrix
-from sfm_app.ransac.solvers.five_point import solve_five_point
 
 
 def samples(seed, count=20):

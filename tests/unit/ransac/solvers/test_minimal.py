@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sfm_app.fundamental.points import prepare
+from sfm_app.fundamental.solvers import design_row, is_oriented, real_cubic_roots, solve_sample
 from sfm_app.geometry.epipolar import cross_matrix, nearest_rank_two
-from sfm_app.ransac.points import prepare
-from sfm_app.ransac.solvers.minimal import design_row, is_oriented, real_cubic_roots, solve_sample
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
 ROOTS = st.floats(-10, 10)

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from sfm_app.geometry.epipolar import cross_matrix, eight_point
-from sfm_app.ransac import ESTIMATORS
-from sfm_app.ransac.points import prepare
-from sfm_app.ransac.scoring.robust_costs import squared_distances
-from sfm_app.ransac.verification.a_contrario import (
+from sfm_app.fundamental import ESTIMATORS
+from sfm_app.fundamental.a_contrario import (
     accidental_share,
     false_alarms,
     log_binomial_tail,
     squared_mismatch_distances,
 )
+from sfm_app.fundamental.points import prepare
+from sfm_app.fundamental.scores import squared_distances
+from sfm_app.geometry.epipolar import cross_matrix, eight_point
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 from sfm_app.types import EpipolarFit, Rejected

@@ -5,17 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from sfm_app.fundamental.pretests import BLOCK, BailOut, FullVerification, PreTest, RandomizedTdd, bail_out_table
+from sfm_app.fundamental.samples import required_trials
+from sfm_app.fundamental.scores import msac, penalty
 from sfm_app.geometry.epipolar import cross_matrix
-from sfm_app.ransac.sampling.stopping import required_trials
-from sfm_app.ransac.scoring.robust_costs import msac, penalty
-from sfm_app.ransac.verification.pretests import (
-    BLOCK,
-    BailOut,
-    FullVerification,
-    PreTest,
-    RandomizedTdd,
-    bail_out_table,
-)
 
 SHIFT = cross_matrix([1.0, 0, 0]).reshape(9)
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from sfm_app.ransac.verification.sprt import FIRST_DELTA, MODEL_COST, MODELS_PER_SAMPLE, SequentialTest, Sprt, design
+from sfm_app.fundamental.pretests import FIRST_DELTA, MODEL_COST, MODELS_PER_SAMPLE, SequentialTest, Sprt, design
 
 RUNS, COUNT = 20_000, 600
 CASES = [(0.8, 0.05), (0.5, 0.05), (0.5, 0.2), (0.3, 0.02)]

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.database import write_match_graph
-from sfm_app.colmap.models.model import posed_photo_ids, submodel
+from sfm_app.colmap.model import posed_photo_ids, submodel
+from sfm_app.mapping import incremental as module
+from sfm_app.mapping.attempt import Attempt, explained_pairs, model_poses
+from sfm_app.mapping.incremental import map_new_photos
+from sfm_app.mapping.passes import Outcome
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
-from sfm_app.reconstruction.growth import known_model as module
-from sfm_app.reconstruction.growth.known_model import map_new_photos
-from sfm_app.reconstruction.mapping_passes import Outcome
-from sfm_app.reconstruction.mapping_runs import Attempt
-from sfm_app.reconstruction.support import explained_pairs, model_poses
 from sfm_app.types import LookAlikes, PoseGraph, RelativePose
 
 pytestmark = pytest.mark.slow

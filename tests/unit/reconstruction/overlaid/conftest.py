@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.reconstruction.support import PairSupport
+from sfm_app.mapping.attempt import PairSupport
 
 WIDTH, HEIGHT, FOCAL, AWAY = 600, 450, 500.0, 5.0
 

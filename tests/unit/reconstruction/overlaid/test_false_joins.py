@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.reconstruction.mapping_runs import Attempt
-from sfm_app.reconstruction.overlaid.false_joins import LEAST_STRANGERS, find_false_joins, find_strangers, judge_places
-from sfm_app.reconstruction.overlaid.meetings import Meeting
-from sfm_app.reconstruction.support import PairSupport
+from sfm_app.mapping.attempt import Attempt, PairSupport
+from sfm_app.mapping.look_alikes import LEAST_STRANGERS, Meeting, find_false_joins, find_strangers, judge_places
 
 pytestmark = pytest.mark.slow
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.reconstruction.overlaid.meetings import find_meetings
+from sfm_app.mapping.look_alikes import find_meetings
 
 AWAY = 5.0
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sfm_app.camera.models import camera_matrix
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.models.joined_model import PlacedPhotos
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.colmap.joined_model import PlacedPhotos
 from sfm_app.geometry.epipolar import fundamental_from_pose
-from sfm_app.geometry.similarity import Similarity
-from sfm_app.reconstruction.parts.joins import Fragment
+from sfm_app.geometry.poses import Similarity
+from sfm_app.mapping.joins import Fragment
 from sfm_app.types import EpipolarFit, MatchedImage, MatchGraph, ViewGraph
 
 PHOTOS, POINTS, REACH = 40, 600, 8.0

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.posegraph.groups import connected_groups
-from sfm_app.reconstruction.parts.cut import LARGEST, SHARED_PHOTOS, SMALLEST, cut_group, link_weights
+from sfm_app.mapping.part_mapping import LARGEST, SHARED_PHOTOS, SMALLEST, cut_group, link_weights
+from sfm_app.posegraph.rotations import connected_groups
 from sfm_app.types import LookAlikes, PoseGraph, RelativePose
 
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.colmap.models.joined_model import PlacedPhotos
-from sfm_app.geometry.similarity import Similarity
-from sfm_app.reconstruction.parts.frames import align_fragments, loop_errors
-from sfm_app.reconstruction.parts.joins import Fragment, Join
+from sfm_app.colmap.joined_model import PlacedPhotos
+from sfm_app.geometry.poses import Similarity
+from sfm_app.mapping.joins import Fragment, Join, align_fragments, loop_errors
 
 COUNT = 8
 EMPTY = np.zeros(0, np.int64)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.models.joined_model import read_placed, settle, write_placed
-from sfm_app.colmap.models.model import poses_and_points
-from sfm_app.geometry.similarity import umeyama
+from sfm_app.colmap.joined_model import read_placed, settle, write_placed
+from sfm_app.colmap.model import poses_and_points
+from sfm_app.geometry.poses import umeyama
 
 pytestmark = pytest.mark.slow
 

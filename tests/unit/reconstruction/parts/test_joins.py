@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.similarity import Similarity
-from sfm_app.reconstruction.parts.joins import AcrossJoins, Fragment, find_join
+from sfm_app.geometry.poses import Similarity
+from sfm_app.mapping.joins import AcrossJoins, Fragment, find_join
 
 
 def off(found, true):

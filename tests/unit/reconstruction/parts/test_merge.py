@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm_app.geometry.similarity import Similarity
-from sfm_app.reconstruction.parts.merge import merge_fragments
+from sfm_app.geometry.poses import Similarity
+from sfm_app.mapping.joins import merge_fragments
 
 STILL = Similarity(1.0, np.eye(3), np.zeros(3))
 

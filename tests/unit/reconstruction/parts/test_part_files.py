@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 
-from sfm_app.reconstruction.mapping_runs import Group
-from sfm_app.reconstruction.parts.part_files import (
+from sfm_app.mapping.attempt import Group
+from sfm_app.mapping.part_mapping import (
     PartInputs,
     joins_from_plain,
     joins_to_plain,

@@ -7,16 +7,16 @@ import pytest
 
 from benchmarks.synthetic.matches import TownOptions, make_town_graph
 from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
-from sfm_app.colmap.models.model import poses_and_points
+from sfm_app.colmap.model import poses_and_points
 from sfm_app.errors import BackendError, ClusterError
-from sfm_app.geometry.similarity import umeyama
+from sfm_app.geometry.poses import umeyama
+from sfm_app.mapping import parts
+from sfm_app.mapping import passes as mapping_passes
+from sfm_app.mapping.attempt import Attempt, Group, NoModel, PairSupport, best_attempt
+from sfm_app.mapping.part_mapping import FOLDER, PartResult, PartTask, map_part
+from sfm_app.mapping.parts import is_convincing, map_in_parts, part_size
 from sfm_app.plugins import load_plugins
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
-from sfm_app.reconstruction import mapping_passes
-from sfm_app.reconstruction.mapping_runs import Attempt, Group, NoModel, best_attempt
-from sfm_app.reconstruction.parts import is_convincing, map_in_parts, part_size, parts_run
-from sfm_app.reconstruction.parts.part_mapping import FOLDER, PartResult, PartTask, map_part
-from sfm_app.reconstruction.support import PairSupport
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
@@ -95,7 +95,7 @@ def test_a_part_that_fails_is_left_to_the_others(start, monkeypatch):
         made.append(tasks)
         return PartResult((), "", ("failed: no memory",)) if len(made) == 2 else map_part(tasks)
 
-    monkeypatch.setattr("sfm_app.reconstruction.parts.part_mapping.map_part", some_fail)
+    monkeypatch.setattr("sfm_app.mapping.part_mapping.map_part", some_fail)
     found, run = start(1)
 
     (figures,) = run.statistics["parts"]
@@ -126,8 +126,8 @@ def test_pairs_that_the_pose_graph_has_dropped_do_not_refuse_a_join(group, start
 
 def test_where_no_part_is_mapped_the_reason_is_told(group, start, monkeypatch):
     failed = PartResult((), "", ("failed: no memory",))
-    monkeypatch.setattr(parts_run, "map_parts", lambda *_, **__: [failed] * 9)
-    monkeypatch.setattr(parts_run, "cut_group", lambda *_: [parts_run.Part((k,), (k,)) for k in range(1, 10)])
+    monkeypatch.setattr(parts, "map_parts", lambda *_, **__: [failed] * 9)
+    monkeypatch.setattr(parts, "cut_group", lambda *_: [parts.Part((k,), (k,)) for k in range(1, 10)])
 
     (found,) = start()[0]
 
@@ -140,7 +140,7 @@ def test_a_cluster_that_is_gone_ends_the_run_and_other_failures_leave_the_whole(
     def fail(*_, **__):
         raise error
 
-    monkeypatch.setattr(parts_run, "map_parts", fail)
+    monkeypatch.setattr(parts, "map_parts", fail)
     if passes:
         with pytest.raises(ClusterError, match="gone"):
             start()
@@ -200,8 +200,8 @@ def test_the_whole_is_mapped_where_parts_do_not_explain_it(group, start, monkeyp
 def test_parts_with_false_joins_are_not_joined_unless_nobody_asks(start, monkeypatch):
     join, more = LookAlikes(((1, 2), (3, 4)), 0.9), LookAlikes(((3, 4), (5, 6)), 0.7)
     results = [PartResult((), "", ("failed",), (one,)) for one in (join, more, join)]
-    monkeypatch.setattr(parts_run, "map_parts", lambda *_, **__: results)
-    monkeypatch.setattr(parts_run, "cut_group", lambda *_: [parts_run.Part((k,), (k,)) for k in (1, 2, 3)])
+    monkeypatch.setattr(parts, "map_parts", lambda *_, **__: results)
+    monkeypatch.setattr(parts, "cut_group", lambda *_: [parts.Part((k,), (k,)) for k in (1, 2, 3)])
 
     assert start(1, whole=True) == ([], (join, LookAlikes(((5, 6),), 0.7)))
     found, joins = start(2, whole=True, asked=False)

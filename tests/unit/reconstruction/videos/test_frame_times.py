@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfm_app.reconstruction.videos.frame_times import MIN_FRAMES, frame_times
+from sfm_app.mapping.rolling_shutter import MIN_FRAMES, frame_times
 from sfm_app.types import MatchedImage
 
 

@@ -11,10 +11,10 @@ from benchmarks.synthetic.walks import WalkOptions
 from benchmarks.videos.sequences import Kind, draw_sequence, map_sequence
 from benchmarks.videos.shutter import timed_matches
 from sfm_app.colmap.bundle import Adjustment, adjust
-from sfm_app.colmap.models.model import posed_images
+from sfm_app.colmap.model import posed_images
+from sfm_app.mapping import rolling_shutter
+from sfm_app.mapping.rolling_shutter import Readout, Unmeasured, follow_shutter
 from sfm_app.progress import SilentProgress
-from sfm_app.reconstruction.videos import rolling_shutter
-from sfm_app.reconstruction.videos.rolling_shutter import Readout, Unmeasured, follow_shutter
 from sfm_app.types import MatchGraph
 
 pytestmark = pytest.mark.slow

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sfm_app.report.page.correlations import correlation_table, correlation_text
+from sfm_app.report.findings import correlation_table, correlation_text
 from sfm_app.types import Calibration, CameraModel
 
 PAIRS = Calibration(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.dense import write_maps
-from sfm_app.report.page.depth_pictures import MOST_SHOWN, UNKNOWN, depth_colors, depth_pictures, spread_names
+from sfm_app.report.pictures import MOST_SHOWN, UNKNOWN, depth_colors, depth_pictures, spread_names
 from sfm_app.stereo import DepthMap, View
 
 

@@ -8,11 +8,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sfm_app.report.page.findings import changed_settings, duration_text, glance, unknown_cameras, value_text
-from sfm_app.report.page.photo_rows import ALL_PIXELS, LARGEST_PX, SMALLEST_PX, picture_side
-from sfm_app.report.page.scene_view import LIGHT_PAGE_PX, lighten
-from sfm_app.report.page.three_script import three_script
-from sfm_app.report.page.writing import script_data
+from sfm_app.report.findings import (
+    ALL_PIXELS,
+    LARGEST_PX,
+    SMALLEST_PX,
+    changed_settings,
+    glance,
+    picture_side,
+    unknown_cameras,
+    value_text,
+)
+from sfm_app.report.page import script_data, three_script
+from sfm_app.report.scene_view import LIGHT_PAGE_PX, lighten
+from sfm_app.report.text import duration_text
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, CameraModel
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfm_app.report.view.resources import RunResources
+from sfm_app.report.server import RunResources
 from sfm_app.types import Model, Surface
 
 PAGE = b"<!DOCTYPE html><title>a page</title>"

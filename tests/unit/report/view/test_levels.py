@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.report.view import levels
-from sfm_app.report.view.levels import point_levels
+from sfm_app.report import server
+from sfm_app.report.server import point_levels
 from sfm_app.types import Surface
 
 
@@ -19,7 +19,7 @@ def unpack(data, count):
 
 
 def test_levels_have_every_point_once_with_its_color(monkeypatch):
-    monkeypatch.setattr(levels, "FIRST_LEVEL", 20)
+    monkeypatch.setattr(server, "FIRST_LEVEL", 20)
     found = point_levels(surface(150))
 
     assert found.counts == [20, 40, 80, 10]

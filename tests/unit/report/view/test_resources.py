@@ -5,8 +5,8 @@ import io
 import pytest
 from PIL import Image
 
-from sfm_app.report.view import resources as module
-from sfm_app.report.view.resources import BYTES, GLB, HTML, JPEG, LARGE_PX, SMALL_PX
+from sfm_app.report import server as module
+from sfm_app.report.server import BYTES, GLB, HTML, JPEG, LARGE_PX, SMALL_PX
 
 
 def test_the_page_its_model_and_its_points_have_addresses(resources):

@@ -11,8 +11,8 @@ import pytest
 
 from sfm_app.errors import ConfigError
 from sfm_app.progress import SilentProgress
-from sfm_app.report.view import serving
-from sfm_app.report.view.serving import LOOPBACK, open_server, serve_run
+from sfm_app.report import server as serving
+from sfm_app.report.server import LOOPBACK, open_server, serve_run
 
 
 @pytest.fixture

@@ -5,17 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.adjustment.camera_priors import (
-    ASPECT,
-    CENTER,
-    FOCAL,
-    HINT_SPREAD,
-    LENS,
-    WIDE,
-    CameraPriors,
-    Evidence,
-    spare_share,
-)
+from sfm_app.selfcal.priors import ASPECT, CENTER, FOCAL, HINT_SPREAD, LENS, WIDE, CameraPriors, Evidence, spare_share
 from sfm_app.selfcal.zero_curves import calibrate
 from sfm_app.settings import CalibrationSettings
 

@@ -5,9 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.adjustment.calibrate_pairs import fit_cameras
-from sfm_app.selfcal.adjustment.camera_priors import CameraPriors
-from sfm_app.selfcal.adjustment.structureless_ba import (
+from sfm_app.selfcal.adjustment import (
     MOST_MATCHES,
     Matches,
     Prior,
@@ -17,6 +15,8 @@ from sfm_app.selfcal.adjustment.structureless_ba import (
     reweight,
     subsample_rows,
 )
+from sfm_app.selfcal.calibrate_pairs import fit_cameras
+from sfm_app.selfcal.priors import CameraPriors
 from sfm_app.selfcal.zero_curves import calibrate
 from sfm_app.settings import CalibrationSettings
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks

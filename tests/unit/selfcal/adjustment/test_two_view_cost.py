@@ -5,10 +5,10 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.distances import sampson_distance
-from sfm_app.geometry.pose_manifold import retract, write_essential
-from sfm_app.selfcal.adjustment.two_view_cost import ROBUST_SCALE, distances, pair_costs, pair_systems
-from sfm_app.selfcal.lens import undistort_kernel
+from sfm_app.geometry.epipolar import sampson_distance
+from sfm_app.geometry.poses import retract, write_essential
+from sfm_app.selfcal.adjustment import ROBUST_SCALE, distances, pair_costs, pair_systems
+from sfm_app.selfcal.pairs import undistort_kernel
 
 SIGMA = 2e-3
 THETAS = np.array([[0.1, 0.02, -0.03, 0.05, -0.08], [0.3, -0.04, 0.01, -0.1, 0.05]])

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.adjustment.calibrate_pairs import fit_cameras, jackknife_deviations
-from sfm_app.selfcal.adjustment.camera_priors import CameraPriors
-from sfm_app.selfcal.adjustment.structureless_ba import Matches
-from sfm_app.selfcal.adjustment.uncertainty import camera_uncertainty, covariance, key_pairs
-from sfm_app.selfcal.results import calibration_from_parameters, parameters_from_calibration
+from sfm_app.selfcal.adjustment import Matches
+from sfm_app.selfcal.calibrate_pairs import camera_uncertainty, covariance, fit_cameras, jackknife_deviations, key_pairs
+from sfm_app.selfcal.pairs import calibration_from_parameters, parameters_from_calibration
+from sfm_app.selfcal.priors import CameraPriors
 
 pytestmark = pytest.mark.slow
 

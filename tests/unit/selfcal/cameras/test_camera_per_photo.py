@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from sfm_app.selfcal import calibrate_photo_set
-from sfm_app.selfcal.adjustment.camera_priors import USUAL_FOCAL
-from sfm_app.selfcal.adjustment.tied_priors import FAMILY_SPREAD, TiedPriors
-from sfm_app.selfcal.cameras.camera_per_photo import LEAST_PHOTOS, cross_validate
-from sfm_app.selfcal.cameras.multi_camera import CameraGroup, VoteTables, calibrate_cameras
+from sfm_app.selfcal.groups import CameraGroup, VoteTables, calibrate_cameras
+from sfm_app.selfcal.other_cameras import LEAST_PHOTOS_PER_PHOTO, cross_validate
+from sfm_app.selfcal.priors import FAMILY_SPREAD, USUAL_FOCAL, TiedPriors
 from sfm_app.selfcal.zero_curves import calibrate
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import CameraPairs
@@ -75,7 +74,7 @@ def test_few_cameras_that_say_as_much_are_preferred(shots):
 
 
 def test_few_photos_are_never_asked(shots):
-    made = shots(LEAST_PHOTOS - 1, 1, focal=UNLIKE[: LEAST_PHOTOS - 1])
+    made = shots(LEAST_PHOTOS_PER_PHOTO - 1, 1, focal=UNLIKE[: LEAST_PHOTOS_PER_PHOTO - 1])
     assert asked(made) == (1.0, 1.0, 0.0, False)
 
 

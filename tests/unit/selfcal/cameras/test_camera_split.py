@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.cameras.camera_split import split_by_focal
-from sfm_app.selfcal.cameras.multi_camera import VoteTables
-from sfm_app.selfcal.lens import LOG_FOCAL
+from sfm_app.selfcal.groups import VoteTables
+from sfm_app.selfcal.other_cameras import split_by_focal
+from sfm_app.selfcal.pairs import LOG_FOCAL
 
 pytestmark = pytest.mark.slow
 

@@ -4,7 +4,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from sfm_app.selfcal.cameras.max_sum import best_places
+from sfm_app.selfcal.groups import best_places
 
 
 def value_of(places, own, between):

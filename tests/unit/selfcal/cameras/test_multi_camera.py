@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.cameras.multi_camera import CameraGroup, VoteTables, calibrate_cameras
-from sfm_app.selfcal.lens import LOG_FOCAL
+from sfm_app.selfcal.groups import CameraGroup, VoteTables, calibrate_cameras
+from sfm_app.selfcal.pairs import LOG_FOCAL
 from sfm_app.settings import CalibrationSettings
 
 pytestmark = pytest.mark.slow

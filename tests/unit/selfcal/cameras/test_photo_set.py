@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.selfcal import calibrate_photo_set
-from sfm_app.selfcal.cameras import photo_set
-from sfm_app.selfcal.results import guess_calibration
+from sfm_app.selfcal import calibrate_photo_set, photo_set
+from sfm_app.selfcal.pairs import guess_calibration
 from sfm_app.selfcal.zero_curves import calibrate
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import PhotoPairs

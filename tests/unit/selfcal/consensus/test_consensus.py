@@ -3,20 +3,24 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.consensus.consensus import Consensus
-from sfm_app.selfcal.consensus.peak_evidence import (
+from sfm_app.selfcal.consensus import (
+    FOCAL_RANGE,
+    FOCALS,
+    SIGMAS,
+    Consensus,
     best_rival,
     deviation,
     disagreement,
     effective_count,
     indecision,
+    peaks,
     resample_peak,
     residual_sigma,
+    scan,
     spread_px,
     votes,
 )
-from sfm_app.selfcal.consensus.peak_search import FOCAL_RANGE, FOCALS, SIGMAS, peaks, scan
-from sfm_app.selfcal.inputs import prepare
+from sfm_app.selfcal.pairs import prepare
 from sfm_app.types import CameraPairs
 
 FREE = (0, 1, 2)

@@ -1,6 +1,6 @@
 import numpy as np
 
-from sfm_app.selfcal.consensus.consensus_peak import objection
+from sfm_app.selfcal.consensus import objection
 
 
 def objected(theta, spread=0.001):

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from sfm_app.selfcal.constraints import center_polynomials, focal_polynomials
-from sfm_app.selfcal.inputs import prepare
-from sfm_app.selfcal.thesis.curves import center_curves, degeneracy, focal_curves, usable_curves
-from sfm_app.selfcal.thesis.roots import companion_roots
+from sfm_app.selfcal.pairs import prepare
+from sfm_app.selfcal.thesis.curves import center_curves, companion_roots, degeneracy, focal_curves, usable_curves
 from sfm_app.types import CameraPairs
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.inputs import prepare
+from sfm_app.selfcal.pairs import prepare
 from sfm_app.selfcal.thesis.constraint_forms import Halves
 from sfm_app.selfcal.thesis.kruppa import METHOD, calibrate, kruppa_equations, kruppa_ratios, pair_focals
 from sfm_app.settings import CalibrationSettings

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from sfm_app.selfcal.inputs import prepare
+from sfm_app.selfcal.pairs import prepare
 from sfm_app.selfcal.thesis.constraint_forms import Halves, huang_faugeras_equations
 from sfm_app.selfcal.thesis.least_squares import find_minima, fit_camera
 from sfm_app.selfcal.thesis.verdict import CameraParameters

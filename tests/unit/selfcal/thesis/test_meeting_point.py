@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.inputs import prepare
+from sfm_app.selfcal.pairs import prepare
 from sfm_app.selfcal.thesis.curves import focal_curves, usable_curves
-from sfm_app.selfcal.thesis.meeting_point import meeting_point, meeting_points
+from sfm_app.selfcal.thesis.zero_curves import meeting_point, meeting_points
 from sfm_app.types import CameraPairs
 
 X = np.linspace(0, 1, 101)

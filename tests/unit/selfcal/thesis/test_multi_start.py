@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.inputs import prepare
+from sfm_app.selfcal.pairs import prepare
 from sfm_app.selfcal.thesis.multi_start import (
     METHOD,
     MOST_STARTS,

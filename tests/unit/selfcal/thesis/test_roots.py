@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfm_app.selfcal.constraints import center_polynomials, focal_polynomials
-from sfm_app.selfcal.inputs import prepare
-from sfm_app.selfcal.thesis import roots as roots
-from sfm_app.selfcal.thesis.roots import companion_roots, swept_roots
+from sfm_app.selfcal.pairs import prepare
+from sfm_app.selfcal.thesis import curves as roots
+from sfm_app.selfcal.thesis.curves import companion_roots, swept_roots
 from sfm_app.types import CameraPairs
 
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.selfcal.wide_angle.fisheye import Fisheye, bearings_through
+from sfm_app.selfcal.wide_lens import Fisheye, bearings_through
 
 THETA = np.linspace(0.0, 1.4, 8)
 

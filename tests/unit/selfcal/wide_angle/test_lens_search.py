@@ -7,11 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_app
-from sfm_app.geometry.lenses.ray_epipolar import signed_distances, squared_distances
-from sfm_app.selfcal.wide_angle.fisheye import Fisheye, bearings_through
-from sfm_app.selfcal.wide_angle.lens_refinement import redundancy
-from sfm_app.selfcal.wide_angle.lens_search import find_lens, shows_whole_turn
-from sfm_app.selfcal.wide_angle.lens_support import search_rays
+from sfm_app.geometry.epipolar import signed_distances, squared_distances
+from sfm_app.selfcal.wide_lens import Fisheye, bearings_through, find_lens, redundancy, search_rays, shows_whole_turn
 
 pytestmark = pytest.mark.slow
 

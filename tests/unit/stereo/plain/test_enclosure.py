@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.stereo.plain.enclosure import enclosed_pixels
+from sfm_app.stereo.plain_areas import enclosed_pixels
 
 SHAPE = (120, 160)
 ROW, COL = np.mgrid[: SHAPE[0], : SHAPE[1]]

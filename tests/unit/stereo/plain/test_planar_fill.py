@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.stereo.plain.planar_fill import fill_planar_areas
+from sfm_app.stereo.plain_areas import fill_planar_areas
 
 HEIGHT, WIDTH = 240, 320
 ROW, COL = np.mgrid[:HEIGHT, :WIDTH]

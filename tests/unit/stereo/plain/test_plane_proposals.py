@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.stereo.plain.plane_proposals import LEAST_AGREEING, agreed_proposals, propose_planes
+from sfm_app.stereo.plane_proposals import LEAST_AGREEING, agreed_proposals, propose_planes
 
 HEIGHT, WIDTH = 240, 320
 ROW, COL = np.mgrid[:HEIGHT, :WIDTH]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.stereo.plain.textureless import FAR_SHARE, plain_walls, surfaceless_areas
+from sfm_app.stereo.plain_areas import FAR_SHARE, plain_walls, surfaceless_areas
 
 SHAPE = (120, 160)
 

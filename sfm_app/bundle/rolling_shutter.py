@@ -1,0 +1,582 @@
+"""The readout of a rolling shutter, by bundle adjustment of poses, points, cameras and one number for all photos.
+
+Ours. Bundle adjustment without it has hidden part of the shutter in poses, points and lens, so that residuals alone do
+not tell it. Here every photo moves while it is read: along the path through its neighbors, and by an offset of its own,
+because a hand shakes between two photos. How large offsets usually are, the photos say (MacKay 1992).
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from sfm_app.bundle.lens_evidence import MISFIT
+from sfm_app.bundle.lens_parts import LOG_ASPECT, LOG_FOCAL, LensPriors, step_cameras
+from sfm_app.bundle.normal_equations import (
+    DAMPING,
+    POSE,
+    USUAL_COUNT,
+    USUAL_NOISE_PX,
+    Bundle,
+    apply_step,
+    free_pose_columns,
+    loss,
+    usable_mask,
+    weigh,
+    whiten_points,
+)
+from sfm_app.camera.projection import CAMERA, FX, FY, project_points
+from sfm_app.geometry.least_squares import inverse_of_positive
+from sfm_app.jit import kernel
+from sfm_app.numerical import MAD_TO_SIGMA
+from sfm_app.types.arrays import FloatArray, IndexArray
+
+# Projection of points into photos whose rows are read one after the other. Ours; to first order in the motion of
+# the camera, the model is that of Hedborg et al. 2012.
+#
+# While a photo is read, its camera keeps its velocity. A row is given by its share: from -1/2, the first row that
+# is read, to 1/2, the last one. The pose of a photo is that of its middle row.
+
+
+class RowProjection(NamedTuple):
+    """Observations as a rolling shutter sees them, and their derivatives."""
+
+    x: FloatArray
+    """(N, 2) pixels."""
+    depth: FloatArray
+    """(N,) of the points before the camera, at the moment of their row."""
+    by_camera: FloatArray
+    """(N, 2, 12)"""
+    by_pose: FloatArray
+    """(N, 2, 6) as of `normal_equations.project`."""
+    by_motion: FloatArray
+    """(N, 2, 6)"""
+    by_point: FloatArray
+    """(N, 2, 3)"""
+
+
+def project_rows(bundle: Bundle, share: FloatArray, motion: FloatArray) -> RowProjection:
+    """Project the points of all observations, each from the pose at the time of its row.
+
+    Args:
+        bundle: the model, its poses those of the middle rows.
+        share: (N,) row of each observation.
+        motion: (I, 6) velocity of each photo as in `PathVelocity`, times the readout.
+    """
+    rows, R = bundle.camera[bundle.photo], bundle.R[bundle.photo]
+    points = np.einsum("nij,nj->ni", R, bundle.X[bundle.point])
+    middle, moved = points + bundle.t[bundle.photo], share[:, None] * motion[bundle.photo]
+    turn = Rotation.from_rotvec(moved[:, :3]).as_matrix()
+    seen = np.einsum("nij,nj->ni", turn, middle + moved[:, 3:])
+    found = project_points(seen, bundle.params[rows], bundle.family[rows])
+    by_middle = np.einsum("nij,njk->nik", found.by_point, turn)
+    by_motion = np.concatenate([np.cross(seen[:, None], found.by_point), by_middle], 2) * share[:, None, None]
+    by_pose = np.concatenate([np.cross(points[:, None], by_middle), by_middle], 2)
+    by_point = np.einsum("nij,njk->nik", by_middle, R)
+    return RowProjection(found.x, seen[:, 2], found.by_camera, by_pose, by_motion, by_point)
+
+
+def move_to_middle_row(points: FloatArray, share: FloatArray, motion: FloatArray) -> FloatArray:
+    """Return points (N, 3) of a camera's frame at the time of its middle row.
+
+    Args:
+        points: (N, 3) in the camera's frame at the time of their own rows.
+        share: (N,) these rows.
+        motion: (6,) of the photo, as in `project_rows`.
+    """
+    moved = share[:, None] * motion
+    return np.asarray(Rotation.from_rotvec(moved[:, :3]).inv().apply(points) - moved[:, 3:], np.float64)
+
+
+# How a camera moves at the moment of each photo, from the poses of the photos before and after it. Ours.
+#
+# Polynomials are fitted to the poses of some consecutive photos, and differentiated (Savitzky and Golay 1964, with
+# uneven steps). Which degree over how many photos, cross-validation decides: where photos follow each other faster
+# than a hand shakes, the path goes through all poses; where they do not, through their middle.
+
+FITS = ((5, 3), (3, 1), (7, 3), (9, 3), (5, 1), (7, 1), (9, 1))
+"""Photos in a window and degree of the polynomial. Even degrees give the slopes of the odd ones below them. Chosen by
+hand."""
+MIN_PHOTOS = 9
+"""Photos below which a path has no velocities: the longest window."""
+VELOCITY = 6
+"""Numbers of a velocity: a rotation vector, and the motion of a point at rest. By definition."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathVelocities:
+    """Velocities at the moments of some photos, per unit of time, from each of FITS."""
+
+    values: FloatArray
+    """(F, I, 6) rotation vector of the camera's turn in its own axes, applied to R from the left; then the velocity of
+    a point at rest in these axes, due to the motion of the camera's center."""
+    errors: FloatArray
+    """(F, I, 6) of the poses if they are left out, in radians and units of length."""
+
+    def select_most_predictive(self) -> NDArray[np.int64]:
+        """Return the fits (2,) of turns and of moves that predict left-out poses best."""
+        length = np.linalg.norm(self.errors.reshape(*self.errors.shape[:2], 2, 3), axis=3)
+        return np.asarray(np.argmin(np.median(length, axis=1), axis=0), np.int64)
+
+    def select(self, fits: NDArray[np.int64]) -> FloatArray:
+        """Return velocities (I, 6), turns and moves each from their fit (2,)."""
+        return np.concatenate([self.values[fits[0], :, :3], self.values[fits[1], :, 3:]], axis=1)
+
+    def deviations(self) -> FloatArray:
+        """Return (I, 6) rough standard deviations of the velocities: the difference of the two shortest fits."""
+        off = (self.values[0] - self.values[1]).reshape(-1, 2, 3)
+        usual = MAD_TO_SIGMA * np.median(np.abs(off), axis=(0, 2))
+        return np.asarray(np.repeat(np.maximum(np.sqrt(np.mean(off**2, axis=2)), usual), 3, axis=1), np.float64)
+
+
+def path_velocities(R: FloatArray, t: FloatArray, times: FloatArray) -> PathVelocities:
+    """Return velocities of photos.
+
+    Args:
+        R, t: (I, 3, 3) and (I, 3) camera from world, I >= 9.
+        times: (I,) of the photos, distinct.
+    """
+    order = np.argsort(times)
+    back = np.argsort(order)
+    fits = [_fit_windows(R[order], t[order], times[order], *fit) for fit in FITS]
+    values, errors = (np.array(part)[:, back] for part in zip(*fits, strict=True))
+    return PathVelocities(values, errors)
+
+
+def _fit_windows(
+    R: FloatArray, t: FloatArray, times: FloatArray, count: int, degree: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return velocities (I, 6) of photos sorted by time, and the errors (I, 6) of their poses if they are left out."""
+    places = np.arange(len(times))
+    first = np.clip(places - count // 2, 0, len(times) - count)
+    window = first[:, None] + np.arange(count)
+    turned = np.einsum("iwjk,ilk->iwjl", R[window], R)
+    turns = Rotation.from_matrix(turned.reshape(-1, 3, 3)).as_rotvec().reshape(-1, count, 3)
+    centers = -np.einsum("nji,nj->ni", R, t)
+    moves = -np.einsum("ijk,iwk->iwj", R, centers[window] - centers[:, None])
+    value, slope = local_fit_weights(times[window] - times[:, None], degree)
+    poses = np.concatenate([turns, moves], axis=2)  # 0 at the photo itself
+    own = value[places, places - first]
+    error = np.einsum("iw,iwj->ij", value, poses) / np.maximum(1.0 - own, np.finfo(float).eps)[:, None]
+    return np.einsum("iw,iwj->ij", slope, poses), error
+
+
+def local_fit_weights(offsets: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
+    """Return weights (I, k) that give the value at 0 and the derivative there of a polynomial fit.
+
+    Args:
+        offsets: (I, k) distinct times of the values that are fitted.
+        degree: of the polynomial, below k.
+    """
+    unit = np.abs(offsets).max(axis=1)
+    powers = (offsets / unit[:, None])[:, :, None] ** np.arange(degree + 1)
+    solution = np.linalg.pinv(powers)
+    return np.asarray(solution[:, 0]), np.asarray(solution[:, 1] / unit[:, None])
+
+
+# Normal equations of a bundle behind a rolling shutter: poses, motions, cameras and the readout, points eliminated.
+#
+# Unlike in `normal_equations`, a dense matrix is filled point by point: with the motions there are twice as many
+# unknowns to a photo, for which sparse products take ten times as long.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShutterBundle:
+    """A bundle whose photos a rolling shutter took."""
+
+    bundle: Bundle
+    """Its poses are those of the middle rows."""
+    share: FloatArray
+    """(N,) row of each observation, from -1/2 to 1/2 in the order of reading."""
+    readout: float
+    """Time from the first row to the last."""
+    velocity: FloatArray
+    """(I, 6) of the path, as in `PathVelocities`."""
+    offsets: FloatArray
+    """(I, 6) motion during the readout beyond that of the path."""
+
+    @classmethod
+    def motionless(cls, bundle: Bundle, share: FloatArray, readout: float) -> "ShutterBundle":
+        """Return a bundle whose photos do not move.
+
+        Args:
+            bundle, share, readout: as in the class.
+        """
+        nothing = np.zeros((len(bundle.R), VELOCITY))
+        return cls(bundle, share, readout, nothing, nothing)
+
+    @property
+    def motion(self) -> FloatArray:
+        """(I, 6) of each photo during the readout."""
+        return self.readout * self.velocity + self.offsets
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns besides the points: poses, offsets, cameras with log focal and log aspect, readout."""
+        return (POSE + VELOCITY) * len(self.bundle.R) + CAMERA * len(self.bundle.params) + 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShutterSystem:
+    """Normal equations S x = g of the unknowns besides the points."""
+
+    S: FloatArray
+    g: FloatArray
+    r: FloatArray
+    """(N, 2) weighted residuals."""
+    by_view: FloatArray
+    """(N, 2, 25) weighted derivatives by pose, offset, camera and readout."""
+    columns: IndexArray
+    """(N, 25) their unknowns."""
+    by_point: FloatArray
+    """(N, 2, 3) weighted derivatives by whitened points."""
+    whiten: FloatArray
+    """(P, 3, 3)"""
+    photo: IndexArray
+    point: IndexArray
+    free: IndexArray
+    """Unknowns that change."""
+    offsets: slice
+    """Which unknowns are offsets."""
+    spare: int
+    """How many more measurements than poses and points there are."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShutterStep:
+    """Solution of the normal equations."""
+
+    views: FloatArray
+    """(n,) change of the unknowns besides the points."""
+    points: FloatArray
+    """(P, 3)"""
+    noise_px: float
+    """Standard deviation of a coordinate."""
+    deviation: float
+    """Standard deviation of the readout."""
+    offset_variances: FloatArray
+    """(I, 6) of the offsets, without MISFIT."""
+
+
+def linearize(
+    model: ShutterBundle, precision: FloatArray, pull: FloatArray, scale_px: float, *, held: bool
+) -> ShutterSystem:
+    """Eliminate the points (Schur complement), in the Gauss-Newton approximation.
+
+    Args:
+        model: the bundle.
+        precision: (n,) of the priors on the unknowns, in 1 / px^2 like the squared derivatives.
+        pull: (n,) precisions times distances to the values that the priors expect.
+        scale_px: as of `normal_equations.reduce`.
+        held: whether the readout is known.
+    """
+    bundle, n = model.bundle, model.unknowns
+    r, by_view, by_point = _weighted_derivatives(model, scale_px)
+    whiten, rank = whiten_points(by_point, bundle.point, len(bundle.X))
+    by_point = np.einsum("nki,nji->nkj", by_point, whiten[bundle.point])
+    columns = _unknown_columns(model)
+    half, g = np.zeros((n, n)), np.zeros(n)
+    order = np.argsort(bundle.point, kind="stable")
+    starts = np.searchsorted(bundle.point[order], np.arange(len(bundle.X) + 1))
+    add_points((order, starts), columns, r, by_view, by_point, half, g)
+    S = half + half.T - np.diag(np.diag(half)) + np.diag(precision + DAMPING)
+    poses = free_pose_columns(bundle.R, bundle.t)
+    free = np.concatenate([poses, np.arange(POSE * len(bundle.R), n - held)])
+    spare = 2 * int(np.count_nonzero(r.any(axis=1))) - int(np.sum(rank)) - len(poses)
+    offsets = slice(POSE * len(bundle.R), (POSE + VELOCITY) * len(bundle.R))
+    return ShutterSystem(
+        S, g + pull, r, by_view, columns, by_point, whiten, bundle.photo, bundle.point, free, offsets, spare
+    )  # fmt: skip
+
+
+def _unknown_columns(model: ShutterBundle) -> IndexArray:
+    """Return (N, 25) the unknowns that each observation depends on."""
+    bundle, photos = model.bundle, len(model.bundle.R)
+    camera = (POSE + VELOCITY) * photos + CAMERA * bundle.camera[bundle.photo]
+    blocks = [
+        POSE * bundle.photo[:, None] + np.arange(POSE),
+        POSE * photos + VELOCITY * bundle.photo[:, None] + np.arange(VELOCITY),
+        camera[:, None] + np.arange(CAMERA),
+        np.full((len(bundle.x), 1), model.unknowns - 1),
+    ]
+    return np.hstack(blocks)
+
+
+def _weighted_derivatives(model: ShutterBundle, scale_px: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return weighted residuals (N, 2), and derivatives by views (N, 2, 25) and points (N, 2, 3).
+
+    Observations that are lost count nothing.
+    """
+    bundle = model.bundle
+    with np.errstate(all="ignore"):
+        seen = project_rows(bundle, model.share, model.motion)
+        r = bundle.x - seen.x
+        by_camera, params = seen.by_camera.copy(), bundle.params[bundle.camera[bundle.photo]]
+        by_fx, by_fy = by_camera[:, :, FX] * params[:, FX, None], by_camera[:, :, FY] * params[:, FY, None]
+        by_camera[:, :, LOG_FOCAL], by_camera[:, :, LOG_ASPECT] = by_fx + by_fy, 0.5 * (by_fy - by_fx)
+        by_readout = np.einsum("nij,nj->ni", seen.by_motion, model.velocity[bundle.photo])[:, :, None]
+        by_view = np.concatenate([seen.by_pose, seen.by_motion, by_camera, by_readout], 2)
+    return weigh(r, by_view, seen.by_point, usable_mask(bundle, r, seen.depth), scale_px)[:3]
+
+
+@kernel
+def add_points(
+    rows: tuple[IndexArray, IndexArray], columns: IndexArray, r: FloatArray, by_view: FloatArray, by_point: FloatArray,
+    half: FloatArray, g: FloatArray,
+) -> None:  # fmt: skip
+    """Add J'J - A'A and J'r - A'b of all points, A and b being J and r projected onto the point.
+
+    Args:
+        rows: (N,) observations sorted by point, and (P + 1,) where those of each point begin.
+        columns, r, by_view, by_point: as in `ShutterSystem`.
+        half: (n, n) changed in place: each pair of unknowns in one of its two places.
+        g: (n,) changed in place.
+    """
+    order, starts = rows
+    width, n = columns.shape[1], len(g)
+    A, b = np.zeros((3, n)), np.zeros(3)
+    touched, seen = np.zeros(n, np.int64), np.zeros(n, np.bool_)
+    for point in range(len(starts) - 1):
+        count = 0
+        b[:] = 0.0
+        for place in range(starts[point], starts[point + 1]):
+            k = order[place]
+            u, v = by_point[k, 0], by_point[k, 1]
+            for j in range(3):
+                b[j] += u[j] * r[k, 0] + v[j] * r[k, 1]
+            for one in range(width):
+                column, x, y = columns[k, one], by_view[k, 0, one], by_view[k, 1, one]
+                if not seen[column]:
+                    seen[column], touched[count] = True, column
+                    count += 1
+                g[column] += x * r[k, 0] + y * r[k, 1]
+                for j in range(3):
+                    A[j, column] += u[j] * x + v[j] * y
+                for two in range(one + 1):
+                    half[column, columns[k, two]] += x * by_view[k, 0, two] + y * by_view[k, 1, two]
+        for one in range(count):
+            column = touched[one]
+            x, y, z = A[0, column], A[1, column], A[2, column]
+            g[column] -= x * b[0] + y * b[1] + z * b[2]
+            for two in range(one + 1):
+                other = touched[two]
+                half[column, other] -= x * A[0, other] + y * A[1, other] + z * A[2, other]
+        for one in range(count):
+            seen[touched[one]] = False
+            A[:, touched[one]] = 0.0
+
+
+def solve_step(system: ShutterSystem) -> ShutterStep:
+    """Return the step; the deviation is at least that of the sandwich estimator with photos as clusters."""
+    n, free = len(system.g), system.free
+    inverse = inverse_of_positive(system.S[np.ix_(free, free)])
+    views, influence, variances = np.zeros(n), np.zeros(n), np.zeros(n)
+    views[free] = np.einsum("ij,j->i", inverse, system.g[free])
+    variances[free] = np.diag(inverse)
+    if free[-1] == n - 1:
+        influence[free] = inverse[:, -1]
+    points, left = _back_substitute(system, views, system.r)
+    _, influences = _back_substitute(system, -influence, np.zeros_like(system.r))
+    noise2 = float((np.sum(left**2) + USUAL_COUNT * USUAL_NOISE_PX**2) / (max(system.spare, 0) + USUAL_COUNT))
+    by_photo = np.bincount(system.photo, np.sum(influences * left, axis=1))
+    deviation = MISFIT * np.sqrt(max(noise2 * variances[-1], float(np.sum(by_photo**2))))
+    offsets = noise2 * variances[system.offsets].reshape(-1, VELOCITY)
+    moved = np.einsum("pji,pj->pi", system.whiten, points)
+    return ShutterStep(views, moved, float(np.sqrt(noise2)), float(deviation), offsets)
+
+
+def _back_substitute(system: ShutterSystem, views: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the best step of the whitened points (P, 3) after one of the views, and what it leaves of r (N, 2)."""
+    left = r - np.einsum("nij,nj->ni", system.by_view, views[system.columns])
+    along = np.einsum("nij,ni->nj", system.by_point, left)
+    sums = [np.bincount(system.point, along[:, j], len(system.whiten)) for j in range(3)]
+    points = np.array(sums, np.float64).T
+    return points, left - np.einsum("nij,nj->ni", system.by_point, points[system.point])
+
+
+def apply_shutter_step(model: ShutterBundle, step: ShutterStep, share: float) -> ShutterBundle:
+    """Return the model after a share of a step.
+
+    Args:
+        model: not changed in place.
+        step: from `solve_step`.
+        share: in (0, 1].
+    """
+    bundle = model.bundle
+    poses, offsets, cameras = np.split(share * step.views[:-1], np.cumsum([POSE, VELOCITY]) * len(bundle.R))
+    params = step_cameras(bundle.params, cameras.reshape(-1, CAMERA))
+    return replace(
+        model,
+        bundle=apply_step(bundle, params, poses.reshape(-1, POSE), share * step.points),
+        readout=model.readout + share * float(step.views[-1]),
+        offsets=model.offsets + offsets.reshape(-1, VELOCITY),
+    )
+
+
+def shutter_cost(model: ShutterBundle, scale_px: float) -> float:
+    """Return half the sum of the loss of `normal_equations.reduce`, in squared pixels.
+
+    Args:
+        model: the bundle.
+        scale_px: s of the loss, in pixels, > 0.
+    """
+    with np.errstate(all="ignore"):
+        seen = project_rows(model.bundle, model.share, model.motion)
+        r = model.bundle.x - seen.x
+    return loss(r, usable_mask(model.bundle, r, seen.depth), scale_px)
+
+
+STEPS, CONVERGED = 12, 1e-4
+"""Most Gauss-Newton steps, and the relative decrease of the cost below which they end: after three to six. Chosen on
+`python -m benchmarks.videos.shutter`."""
+HALVINGS = 3
+"""How often a step is halved that raises the cost. Chosen by hand; not measured on its own."""
+LEAST_READOUT = 1e-5
+"""Readout that offsets are expected for where it is smaller, as a share of the time between two photos: a precision of
+offsets must be finite. Chosen by hand; not measured on its own."""
+SHAKE = (0.2, 5.0)
+"""Range of the size of offsets, in deviations of the path's velocities times readout. Above it, offsets of all photos
+together bend the scene, and no readout is found. Chosen on `python -m benchmarks.videos.shutter`."""
+LEAST_MEASURED = 3.0
+"""Number of offsets that the photos must determine before their size is changed. Chosen by hand; not measured on its
+own."""
+SHAKE_CONVERGED = 1.1
+"""Factor by which the size of offsets may still change when the steps end. Chosen by hand; not measured on its own."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """When the observations of a bundle were seen."""
+
+    times: FloatArray
+    """(I,) of the photos, distinct: when the middle row was read."""
+    share: FloatArray
+    """(N,) row of each observation, from -1/2 to 1/2 in the order of reading."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadoutEstimate:
+    """The readout, and the model that goes with it."""
+
+    readout: float
+    """Time from the first row to the last, in the unit of the photos' times; negative where the last row is read
+    first."""
+    deviation: float
+    """Its standard deviation; 0 where it was known."""
+    bundle: Bundle
+    """Poses are those of the middle rows."""
+    motion: FloatArray
+    """(I, 6) of each photo during the readout: velocity as in `PathVelocities`, times readout."""
+    shake: FloatArray
+    """(2,) size of the offsets of turns and moves, in deviations of the path's velocities times readout."""
+    noise_px: float
+    """Standard deviation of a coordinate."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    """What does not change during the adjustment."""
+
+    rows: Rows
+    fits: NDArray[np.int64]
+    """(2,) of turns and moves, see `PathVelocities`."""
+    priors: LensPriors
+    precision: FloatArray
+    """(C, 12) of the priors on the cameras."""
+    scale_px: float
+    held: bool
+    """Whether the readout is known."""
+
+
+def estimate_readout(
+    bundle: Bundle, rows: Rows, priors: LensPriors, freed: NDArray[np.bool_], scale_px: float,
+    start: ReadoutEstimate | None = None, *, known: float | None = None,
+) -> ReadoutEstimate:  # fmt: skip
+    """Adjust poses, points, cameras and the readout together.
+
+    Args:
+        bundle: the model, adjusted as if a global shutter had taken its photos; nine or more.
+        rows: when its observations were seen.
+        priors: on the cameras.
+        freed: (C, 7) parts of the cameras that have the wide prior.
+        scale_px: as of `normal_equations.reduce`.
+        start: an earlier estimate for the same photos, of which readout and shake are taken.
+        known: the readout, if only poses and points are asked for.
+    """
+    fits = path_velocities(bundle.R, bundle.t, rows.times).select_most_predictive()
+    problem = _Problem(rows, fits, priors, priors.precision(freed), scale_px, known is not None)
+    readout, shake = (start.readout, start.shake) if start else (0.0, np.ones(2))
+    model = _follow_path(ShutterBundle.motionless(bundle, rows.share, readout if known is None else known), problem)
+    noise_px = USUAL_NOISE_PX
+    for _ in range(STEPS):
+        expected = _expected_offsets(model, problem, shake)
+        terms = _prior_terms(model, expected, problem, noise_px)
+        step = solve_step(linearize(model, *terms, scale_px, held=problem.held))
+        noise_px = step.noise_px
+        before = _cost(model, expected, problem, noise_px)
+        model, after = _take_step(model, step, expected, problem, before)
+        last, shake = shake, _update_shake(model.offsets / expected, step.offset_variances / expected**2, shake)
+        if after >= (1.0 - CONVERGED) * before and np.abs(np.log(shake / last)).max() < np.log(SHAKE_CONVERGED):
+            break
+    return ReadoutEstimate(model.readout, step.deviation, model.bundle, model.motion, shake, noise_px)
+
+
+def _follow_path(model: ShutterBundle, problem: _Problem) -> ShutterBundle:
+    """Return the model with the velocities of its path."""
+    path = path_velocities(model.bundle.R, model.bundle.t, problem.rows.times)
+    return replace(model, velocity=path.select(problem.fits))
+
+
+def _expected_offsets(model: ShutterBundle, problem: _Problem, shake: FloatArray) -> FloatArray:
+    """Return standard deviations (I, 6) of the offsets.
+
+    They are held during a step: if they grew with the readout, offsets would ask for a longer one.
+    """
+    times = problem.rows.times
+    path = path_velocities(model.bundle.R, model.bundle.t, times)
+    readout = max(abs(model.readout), LEAST_READOUT * float(np.median(np.diff(np.sort(times)))))
+    return np.asarray(readout * path.deviations() * np.repeat(shake, 3), np.float64)
+
+
+def _update_shake(offsets: FloatArray, variances: FloatArray, shake: FloatArray) -> FloatArray:
+    """Return the size of offsets (2,) from what the photos determine of them.
+
+    Args:
+        offsets, variances: (I, 6) in expected deviations, and their squares.
+        shake: (2,) that the expected deviations are based on.
+    """
+    measured = np.sum(1.0 - np.minimum(variances, 1.0).reshape(-1, 2, 3), axis=(0, 2))
+    squares = np.sum(offsets.reshape(-1, 2, 3) ** 2, axis=(0, 2))
+    factor = np.sqrt(squares / np.maximum(measured, LEAST_MEASURED))
+    return np.clip(np.where(measured < LEAST_MEASURED, 1.0, factor) * shake, *SHAKE)
+
+
+def _prior_terms(
+    model: ShutterBundle, expected: FloatArray, problem: _Problem, noise_px: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return precisions (n,) of the priors, in 1 / px^2, and precisions times distances to what they expect."""
+    poses, away = np.zeros(POSE * len(model.bundle.R)), problem.priors.prior_offsets(model.bundle.params)
+    precision = np.concatenate([poses, expected.ravel() ** -2.0, problem.precision.ravel(), [0.0]])
+    distance = np.concatenate([poses, -model.offsets.ravel(), away.ravel(), [0.0]])
+    return noise_px**2 * precision, noise_px**2 * precision * distance
+
+
+def _take_step(
+    model: ShutterBundle, step: ShutterStep, expected: FloatArray, problem: _Problem, before: float
+) -> tuple[ShutterBundle, float]:
+    """Return the model after the step, or after the part of it that lowers the cost, and its cost."""
+    for k in range(HALVINGS + 1):
+        tried = _follow_path(apply_shutter_step(model, step, 0.5**k), problem)
+        after = _cost(tried, expected, problem, step.noise_px)
+        if after < before:
+            return tried, after
+    return model, before
+
+
+def _cost(model: ShutterBundle, expected: FloatArray, problem: _Problem, noise_px: float) -> float:
+    """Return half the sum of the loss and of the squares of the priors, in squared pixels."""
+    away = problem.priors.prior_offsets(model.bundle.params)
+    squares = np.sum((model.offsets / expected) ** 2) + np.sum(problem.precision * away**2)
+    return shutter_cost(model, problem.scale_px) + 0.5 * noise_px**2 * float(squares)

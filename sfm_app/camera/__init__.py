@@ -1,0 +1,1 @@
+"""One camera: its models, projection and back-projection."""

@@ -1,0 +1,181 @@
+"""Camera matrices, and the camera models that we share with COLMAP."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE, GIVEN, PERSPECTIVE, Calibration
+
+# Camera matrices.
+
+GUESSED_FOCAL = 1.2
+"""Focal length of an unknown camera, in units of the longer side of its photo: COLMAP's guess, by definition."""
+
+NEWTON_STEPS, LEAST_SLOPE = 10, 0.2
+"""Steps of Newton's method in `rays`, and the least slope that it divides by: the slope is 0 where the lens folds.
+Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+
+
+def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
+    """Return the (3, 3) camera matrix without skew, in the unit of its arguments.
+
+    Args:
+        fx: focal length along x.
+        fy: focal length along y.
+        cx: x of the principal point.
+        cy: y of the principal point.
+    """
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def guessed_camera_matrix(size: tuple[int, int], focal_px: float | None = None) -> NDArray[np.float64]:
+    """Return the (3, 3) matrix of a camera with square pixels, a centered principal point and a given or guessed focal.
+
+    Args:
+        size: (width, height) in pixels.
+        focal_px: focal length; 1.2 times the longer side if None.
+    """
+    focal = GUESSED_FOCAL * max(size) if focal_px is None else focal_px
+    return camera_matrix(focal, focal, size[0] / 2, size[1] / 2)
+
+
+def panorama_matrix(size: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the (3, 3) matrix that states the scale of an equirectangular photo at its middle, in pixels per radian.
+
+    Args:
+        size: (width, height) in pixels, of a whole turn and of half a turn.
+    """
+    return camera_matrix(size[0] / (2.0 * np.pi), size[1] / np.pi, size[0] / 2, size[1] / 2)
+
+
+def rays(x: NDArray[np.float64], K: NDArray[np.float64], radial: float = 0.0) -> NDArray[np.float64]:
+    """Undistort pixels to (N, 2) points of the plane z = 1, for a lens x_d = x_u (1 + radial r_u^2).
+
+    Uses Newton's method from the distorted radius. A barrel lens folds where r (1 + radial r^2) stops growing with r;
+    pixels beyond the fold are mapped to it.
+
+    Args:
+        x: (N, 2) pixels.
+        K: (3, 3) camera matrix without skew.
+        radial: k1 of COLMAP's SIMPLE_RADIAL.
+    """
+    distorted = (x - K[:2, 2]) / np.diag(K)[:2]
+    if radial == 0.0:
+        return np.asarray(distorted, np.float64)
+    radius = np.hypot(distorted[:, 0], distorted[:, 1])
+    fold = (-3.0 * radial) ** -0.5 if radial < 0.0 else np.inf
+    r = np.minimum(radius / (1.0 + max(radial, 0.0) * radius**2), fold)
+    for _ in range(NEWTON_STEPS):
+        slope = np.maximum(1.0 + 3.0 * radial * r * r, LEAST_SLOPE)
+        r = np.minimum(r - (r * (1.0 + radial * r * r) - radius) / slope, fold)
+    return np.asarray(distorted * np.divide(r, radius, out=np.ones_like(r), where=radius > 0)[:, None], np.float64)
+
+
+# COLMAP's camera models by name: what their parameters are, and cameras made from them.
+#
+# A model with fewer parameters is a larger one with zeros: every perspective one of FULL_OPENCV (Brown 1971), every
+# fisheye of THIN_PRISM_FISHEYE (Kannala and Brandt 2006; Weng et al. 1992).
+
+SHARED = ("k1", "k2", "p1", "p2", "k3", "k4")
+TERMS: Mapping[str, tuple[str, ...]] = {PERSPECTIVE: (*SHARED, "k5", "k6"), FISHEYE: (*SHARED, "sx1", "sy1")}
+"""Names of the eight terms of `Calibration.distortion`, by projection."""
+ONE_FOCAL, TWO_FOCALS = ("f", "cx", "cy"), ("fx", "fy", "cx", "cy")
+PARAMETERS: Mapping[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ONE_FOCAL,
+    "PINHOLE": TWO_FOCALS,
+    "SIMPLE_RADIAL": (*ONE_FOCAL, "k1"),
+    "RADIAL": (*ONE_FOCAL, "k1", "k2"),
+    "OPENCV": (*TWO_FOCALS, "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": (*TWO_FOCALS, *TERMS[PERSPECTIVE]),
+    "SIMPLE_FISHEYE": ONE_FOCAL,
+    "FISHEYE": TWO_FOCALS,
+    "SIMPLE_RADIAL_FISHEYE": (*ONE_FOCAL, "k1"),
+    "RADIAL_FISHEYE": (*ONE_FOCAL, "k1", "k2"),
+    "OPENCV_FISHEYE": (*TWO_FOCALS, "k1", "k2", "k3", "k4"),
+    "THIN_PRISM_FISHEYE": (*TWO_FOCALS, *TERMS[FISHEYE]),
+    "EQUIRECTANGULAR": ("w", "h"),
+}
+"""Names of the parameters, in COLMAP's order, of the models that a run can use. By definition."""
+
+
+def projection_of_model(model: str) -> str:
+    """Return the projection of one of `PARAMETERS`."""
+    if model == "EQUIRECTANGULAR":
+        return EQUIRECTANGULAR
+    return FISHEYE if "FISHEYE" in model else PERSPECTIVE
+
+
+def calibration_from_model(model: str, params: Sequence[float], size: tuple[int, int]) -> Calibration:
+    """Return the camera with a model and parameters of COLMAP, as one that the user gave.
+
+    Args:
+        model: COLMAP's name.
+        params: in COLMAP's order; lengths in pixels.
+        size: (width, height) of the photos in pixels; 0, 0 where unknown.
+
+    Raises:
+        ValueError: no run can use the model, or the parameters are no camera.
+    """
+    names = PARAMETERS.get(model)
+    if names is None:
+        raise ValueError(f"the camera model {model} cannot be used: only {', '.join(PARAMETERS)}")
+    if len(params) != len(names):
+        raise ValueError(f"{model} has {len(names)} parameters ({', '.join(names)}), not {len(params)}")
+    values = dict(zip(names, (float(value) for value in params), strict=True))
+    projection = projection_of_model(model)
+    if projection == EQUIRECTANGULAR:
+        if not all(size):
+            size = int(values["w"]), int(values["h"])
+        return Calibration(panorama_matrix(size), *size, GIVEN, identifiable=True, projection=projection)
+    fx, fy = (values.get(name, values.get("f", 0.0)) for name in ("fx", "fy"))
+    if not (np.isfinite(list(values.values())).all() and fx > 0.0 and fy > 0.0):
+        raise ValueError(f"the parameters of {model} are not those of a camera: {', '.join(map(str, params))}")
+    plain = Calibration(
+        camera_matrix(fx, fy, values["cx"], values["cy"]), *size, GIVEN, identifiable=True, projection=projection
+    )
+    return with_terms(plain, tuple(values.get(name, 0.0) for name in TERMS[projection]))
+
+
+def with_terms(camera: Calibration, terms: Sequence[float]) -> Calibration:
+    """Return a camera with other distortion, in the smallest form that holds it.
+
+    Args:
+        camera: perspective or fisheye.
+        terms: eight, in the order of `TERMS`.
+    """
+    k1, k2, p1, p2, k3, k4, *last = (float(term) for term in terms)
+    if camera.projection == FISHEYE:
+        more = any((p1, p2, *last))
+        return replace(camera, radial=0.0, fisheye=(k1, k2, k3, k4), distortion=tuple(terms) if more else ())
+    more = any((k2, p1, p2, k3, k4, *last))
+    return replace(camera, radial=k1, fisheye=(), distortion=tuple(terms) if more else ())
+
+
+def distortion_terms(camera: Calibration) -> NDArray[np.float64]:
+    """Return (8,) all terms of a perspective or fisheye camera, in the order of `TERMS`."""
+    if camera.distortion:
+        return np.array(camera.distortion, np.float64)
+    found = np.zeros(8)
+    if camera.projection == FISHEYE:
+        found[[0, 1, 4, 5]] = camera.fisheye or (0.0, 0.0, 0.0, 0.0)
+    else:
+        found[0] = camera.radial
+    return found
+
+
+def model_of_calibration(camera: Calibration) -> tuple[str, list[float]]:
+    """Return the smallest of COLMAP's models with two focals that holds a camera with `distortion`, and its parameters.
+
+    Args:
+        camera: perspective or fisheye.
+    """
+    values = dict(zip(TERMS[camera.projection], distortion_terms(camera).tolist(), strict=True))
+    values |= {"fx": camera.K[0, 0], "fy": camera.K[1, 1], "cx": camera.K[0, 2], "cy": camera.K[1, 2]}
+    fisheye = camera.projection == FISHEYE
+    models = ("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE") if fisheye else ("OPENCV", "FULL_OPENCV")
+    for model in models:
+        if not any(value for name, value in values.items() if name not in PARAMETERS[model]):
+            break
+    return model, [float(values[name]) for name in PARAMETERS[model]]

@@ -1,0 +1,143 @@
+"""Perspective views that together show a photo of a wide lens.
+
+Depth maps and texture are made from perspective photos. One perspective photo cannot show 180 degrees, and stretches
+what is far from its axis long before. Ours.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.camera.models import camera_matrix
+from sfm_app.types.arrays import FloatArray
+
+MOST_FIELD_DEG = 95.0
+"""Largest angle along one side of a view, without its overlap. At its border, such a view shows things 2.2 times as
+large as at its middle. Chosen by hand; not measured on its own."""
+OVERLAP_DEG = 4.0
+"""Angle by which a view reaches beyond what it is responsible for, so that windows and triangles at the border are
+whole in one of the views. Chosen by hand; not measured on its own."""
+STRIP_PX = 256
+"""Rows that are projected at once, so that memory stays small. Chosen by hand; the result does not depend on it."""
+ROUNDING_PX = 1e-6
+"""Part of a pixel by which rounding may shrink a view. By definition."""
+HALVINGS = 50
+"""Steps of the search for the largest view inside another one: as many as numbers in double precision have bits."""
+WHOLE_TURN_DEG = 300.0
+"""A photo that shows more than this is a panorama: its views look through the faces of a cube. Chosen by hand; no lens
+lies between a fisheye and a panorama."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PerspectiveView:
+    """A view into a photo from the same center."""
+
+    R: FloatArray
+    """(3, 3) from the photo's frame to that of the view; x right, y down, z forward."""
+    K: FloatArray
+    """(3, 3) camera matrix in pixels of the view."""
+    width: int
+    height: int
+
+    def locate(self, project: Callable[[FloatArray], FloatArray]) -> NDArray[np.float32]:
+        """Return the pixels (height, width, 2) of the photo that the view shows.
+
+        Args:
+            project: takes rays (N, 3) of the photo's frame and returns their pixels (N, 2).
+        """
+        found = np.empty((self.height, self.width, 2), np.float32)
+        for top in range(0, self.height, STRIP_PX):
+            rays = self.rays(top, top + STRIP_PX)
+            found[top : top + STRIP_PX] = project(rays.reshape(-1, 3)).reshape(*rays.shape[:2], 2)
+        return found
+
+    def rays(self, top: int = 0, bottom: int | None = None) -> FloatArray:
+        """Return the rays (rows, width, 3) of the centers of pixels, in the photo's frame.
+
+        Args:
+            top, bottom: rows from the first to before the second; all of them by default.
+        """
+        rows = np.arange(self.height)[top:bottom]
+        x, y = np.meshgrid(np.arange(self.width) + 0.5, rows + 0.5)
+        plain = np.stack([(x - self.K[0, 2]) / self.K[0, 0], (y - self.K[1, 2]) / self.K[1, 1], np.ones_like(x)], -1)
+        return np.asarray(plain @ self.R, np.float64)
+
+
+def cover_rays(rays: FloatArray, focal_px: float, most_px: int) -> list[PerspectiveView]:
+    """Return perspective views that together show all rays of a photo.
+
+    Args:
+        rays: (N, 3) unit vectors, dense over what the photo shows.
+        focal_px: focal length of the views in pixels; smaller where a view would become too large.
+        most_px: longest side of a view.
+    """
+    axes = _axes(rays)
+    nearest = np.argmax(rays @ axes[:, 2].T, axis=1)
+    views = [_fit_view(axis, rays[nearest == k], focal_px, most_px) for k, axis in enumerate(axes)]
+    return [view for view in views if view is not None]
+
+
+def center_view(view: PerspectiveView) -> PerspectiveView:
+    """Return the view turned to the middle of what it shows, with square pixels and the optical center in the middle.
+
+    It is the largest view of the same aspect that shows nothing else. At its middle, things are as large as before.
+    """
+    middle = np.linalg.solve(view.K, [view.width / 2, view.height / 2, 1.0])
+    away = float(np.linalg.norm(middle))
+    x, y, z = middle / away
+    both = -x * y / (1.0 + z)
+    turn = np.array([[1.0 - x * x / (1.0 + z), both, -x], [both, 1.0 - y * y / (1.0 + z), -y], [x, y, z]])
+    focal = float(np.sqrt(view.K[0, 0] * view.K[1, 1])) * away
+    size = np.array([view.width / view.K[0, 0], view.height / view.K[1, 1]]) * focal
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * size / (2.0 * focal)
+
+    def fits(share: float) -> bool:
+        seen = np.column_stack([share * corners, np.ones(4)]) @ turn @ view.K.T
+        pixels = seen[:, :2] / seen[:, 2:]
+        return bool((seen[:, 2] > 0.0).all() and (pixels >= 0.0).all() and (pixels <= [view.width, view.height]).all())
+
+    low, high = 0.0, 2.0
+    for _ in range(HALVINGS):
+        low, high = ((low + high) / 2, high) if fits((low + high) / 2) else (low, (low + high) / 2)
+    # a view that is centered already fits but for rounding
+    width, height = (max(1, int(side + ROUNDING_PX)) for side in low * size)
+    return PerspectiveView(turn @ view.R, camera_matrix(focal, focal, width / 2, height / 2), width, height)
+
+
+def _axes(rays: FloatArray) -> FloatArray:
+    """Return (V, 3, 3) rotations into views that look at equal parts of the angles that the rays take."""
+    longitude, latitude = np.arctan2(rays[:, 0], rays[:, 2]), np.arcsin(np.clip(rays[:, 1], -1.0, 1.0))
+    if np.degrees(np.ptp(longitude)) > WHOLE_TURN_DEG:
+        turns = [_rotation(0.5 * np.pi * k, 0.0) for k in range(4)]
+        return np.stack([*turns, _rotation(0.0, 0.5 * np.pi), _rotation(0.0, -0.5 * np.pi)])
+    yaws, pitches = _centers(longitude), _centers(latitude)
+    return np.stack([_rotation(yaw, pitch) for pitch in pitches for yaw in yaws])
+
+
+def _centers(angles: FloatArray) -> FloatArray:
+    """Return the middles of as few equal parts of a range of angles as a view is wide."""
+    low, high = float(angles.min()), float(angles.max())
+    count = max(1, int(np.ceil(np.degrees(high - low) / MOST_FIELD_DEG)))
+    return np.asarray(low + (high - low) * (np.arange(count) + 0.5) / count, np.float64)
+
+
+def _rotation(yaw: float, pitch: float) -> FloatArray:
+    """Return the (3, 3) rotation into a view turned right by yaw, then down by pitch, in radians."""
+    level = np.array([[np.cos(yaw), 0.0, -np.sin(yaw)], [0.0, 1.0, 0.0], [np.sin(yaw), 0.0, np.cos(yaw)]])
+    tilt = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(pitch), -np.sin(pitch)], [0.0, np.sin(pitch), np.cos(pitch)]])
+    return np.asarray(tilt @ level, np.float64)
+
+
+def _fit_view(R: FloatArray, rays: FloatArray, focal_px: float, most_px: int) -> PerspectiveView | None:
+    """Return the view with this axis that just shows some rays; None where there are none."""
+    if not len(rays):
+        return None
+    seen = rays @ R.T
+    slopes = np.arctan(seen[:, :2] / seen[:, 2:])
+    reach = np.radians(OVERLAP_DEG)
+    low, high = np.tan(slopes.min(axis=0) - reach), np.tan(slopes.max(axis=0) + reach)
+    focal = min(focal_px, most_px / float((high - low).max()))
+    width, height = (max(1, int(side)) for side in np.ceil(focal * (high - low)).clip(max=most_px))
+    return PerspectiveView(R, camera_matrix(focal, focal, -focal * low[0], -focal * low[1]), width, height)

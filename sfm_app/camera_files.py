@@ -1,0 +1,474 @@
+"""Read the cameras that a user knows, from the files of several programs."""
+
+import json
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.camera.models import PARAMETERS, calibration_from_model
+from sfm_app.errors import InputError
+from sfm_app.files import fingerprint
+from sfm_app.numerical import finite_entries
+from sfm_app.types import Calibration, GivenCameras
+from sfm_app.types.camera import GIVEN, PROJECTIONS
+
+# Cameras of COLMAP's models on disk: cameras.txt and cameras.bin, and which photo has which camera.
+#
+# Read here and not by COLMAP, which ends the process on some damaged models.
+
+CAMERA_FILES = ("cameras.bin", "cameras.txt")
+"""Names of COLMAP's files of cameras; COLMAP, too, prefers the first."""
+MODEL_IDS = {
+    0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV", 5: "OPENCV_FISHEYE",
+    6: "FULL_OPENCV", 8: "SIMPLE_RADIAL_FISHEYE", 9: "RADIAL_FISHEYE", 10: "THIN_PRISM_FISHEYE", 14: "SIMPLE_FISHEYE",
+    15: "FISHEYE", 17: "EQUIRECTANGULAR",
+}  # fmt: skip
+"""COLMAP's numbers of the models that a run can use. By definition."""
+MOST_CAMERAS, LONGEST_NAME = 1_000_000, 4096
+DAMAGED = "its bytes are not those of a COLMAP model"
+
+
+def read_colmap_text(text: str) -> dict[str, Calibration]:
+    """Return the cameras of a cameras.txt by their ids.
+
+    Raises:
+        ValueError: a line is no camera.
+    """
+    found = {}
+    for line in _lines(text):
+        words = line.split()
+        if len(words) < 5 or not words[1].isupper():
+            raise ValueError(f"'{line[:60]}' is not a line of COLMAP's cameras.txt")
+        try:
+            size, params = (int(words[2]), int(words[3])), [float(word) for word in words[4:]]
+        except ValueError:
+            raise ValueError(f"'{line[:60]}' has something else than numbers after the model") from None
+        found[words[0]] = calibration_from_model(words[1], params, size)
+    return found
+
+
+def read_colmap_binary(data: bytes) -> dict[str, Calibration]:
+    """Return the cameras of a cameras.bin by their ids.
+
+    Raises:
+        ValueError: the bytes are not those of one, or no run can use a camera.
+    """
+    found, reader = {}, _Reader(data)
+    (count,) = reader.take("<Q")
+    if count > MOST_CAMERAS:
+        raise ValueError(DAMAGED)
+    for _ in range(int(count)):
+        camera_id, model_id, width, height = reader.take("<IiQQ")
+        if model_id not in MODEL_IDS:
+            raise ValueError(f"camera {camera_id} has a model that cannot be used: only {', '.join(PARAMETERS)}")
+        model = MODEL_IDS[int(model_id)]
+        params = reader.take(f"<{len(PARAMETERS[model])}d")
+        found[str(camera_id)] = calibration_from_model(model, params, (int(width), int(height)))
+    return found
+
+
+def read_colmap_folder(folder: Path) -> tuple[dict[str, Calibration], dict[str, str]]:
+    """Return the cameras of a model by their ids, and the id by photo where there is a file of its images.
+
+    Args:
+        folder: holds one of `CAMERA_FILES`.
+
+    Raises:
+        OSError: a file cannot be read.
+        ValueError: a file is damaged, or no run can use a camera.
+    """
+    if (folder / "cameras.bin").is_file():
+        images = folder / "images.bin"
+        known = dict(_binary_images(images.read_bytes())) if images.is_file() else {}
+        return read_colmap_binary((folder / "cameras.bin").read_bytes()), known
+    images = folder / "images.txt"
+    known = dict(_text_images(images.read_text(encoding="utf-8"))) if images.is_file() else {}
+    return read_colmap_text((folder / "cameras.txt").read_text(encoding="utf-8")), known
+
+
+def _lines(text: str) -> list[str]:
+    """Return the lines that are no comments; an image without points leaves an empty one, which counts."""
+    return [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+
+
+def _text_images(text: str) -> Iterator[tuple[str, str]]:
+    """Yield photos and the ids of their cameras from images.txt, where each photo has two lines."""
+    lines = [line for line in text.splitlines() if not line.lstrip().startswith("#")]
+    for line in lines[::2]:
+        words = line.split(maxsplit=9)
+        if words:
+            if len(words) < 10:
+                raise ValueError(f"'{line[:60]}' is not a line of COLMAP's images.txt")
+            yield words[9].strip(), words[8]
+
+
+def _binary_images(data: bytes) -> Iterator[tuple[str, str]]:
+    """Yield photos and the ids of their cameras from images.bin."""
+    reader = _Reader(data)
+    (count,) = reader.take("<Q")
+    for _ in range(int(count)):
+        *_, camera_id = reader.take("<I7dI")
+        name = reader.take_text()
+        (points,) = reader.take("<Q")
+        reader.skip(24 * int(points))
+        yield name, str(camera_id)
+
+
+class _Reader:
+    """Bytes that are taken one value after the other; ValueError at their end."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.place = data, 0
+
+    def take(self, form: str) -> tuple[float, ...]:
+        start = self.place
+        self.skip(struct.calcsize(form))
+        return struct.unpack_from(form, self.data, start)
+
+    def take_text(self) -> str:
+        end = self.data.find(b"\0", self.place, self.place + LONGEST_NAME)
+        if end < 0:
+            raise ValueError(DAMAGED)
+        text = self.data[self.place : end].decode("utf-8", "replace")
+        self.place = end + 1
+        return text
+
+    def skip(self, count: int) -> None:
+        if self.place + count > len(self.data):
+            raise ValueError(DAMAGED)
+        self.place += count
+
+
+# Cameras as OpenCV writes them: camera matrix and distortion coefficients in JSON, YAML or XML.
+#
+# OpenCV counts pixels from the center of the first one, which is (0.5, 0.5) here.
+
+FIRST_PIXEL = 0.5
+"""Our coordinates of the pixel that OpenCV calls (0, 0)."""
+MATRIX = ("cameramatrix", "k", "mtx", "intrinsicmatrix")
+DISTORTION = ("distcoeffs", "distortioncoefficients", "distortioncoeffs", "distortion", "dist", "d")
+WIDTH, HEIGHT, SIZE = ("imagewidth", "width"), ("imageheight", "height"), ("imagesize", "resolution")
+MODEL = ("fisheyemodel", "distortionmodel", "cameramodel", "model", "projection", "lens", "fisheye")
+"""Keys by which programs around OpenCV call each value, in small letters without underscores."""
+FISHEYE_WORDS = ("fisheye", "equidistant", "kannala")
+COUNTS = (0, 4, 5, 8, 12, 14)
+"""Numbers of coefficients that OpenCV knows: k1 k2 p1 p2, k3, k4 k5 k6, s1 s2 s3 s4, and two of a tilted sensor."""
+
+
+def is_opencv_camera(values: Mapping[str, Any]) -> bool:
+    """Return whether there is a camera matrix among the values."""
+    return _value(values, MATRIX) is not None
+
+
+def opencv_camera(values: Mapping[str, Any]) -> Calibration:
+    """Return the camera of OpenCV's values.
+
+    Args:
+        values: camera matrix, and optionally distortion coefficients, size, and whether the lens is a fisheye.
+
+    Raises:
+        ValueError: they are no camera, or one with coefficients that no run can use.
+    """
+    K = _numbers(_value(values, MATRIX), "the camera matrix")
+    if K.size != 9:
+        raise ValueError(f"the camera matrix has {K.size} values instead of 3 x 3")
+    (fx, skew, cx), (below, fy, cy), last = K.reshape(3, 3)
+    if skew != 0.0 or below != 0.0 or last.tolist() != [0.0, 0.0, 1.0]:
+        raise ValueError("the camera matrix is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    said = _value(values, DISTORTION)
+    coefficients = [] if said is None else _numbers(said, "the distortion").ravel().tolist()
+    model, terms = _model_and_terms(coefficients, fisheye=_is_fisheye(_value(values, MODEL)))
+    params = [fx, fy, cx + FIRST_PIXEL, cy + FIRST_PIXEL, *terms]
+    return calibration_from_model(model, params, _size(values))
+
+
+def read_file_storage(text: str) -> dict[str, Any]:
+    """Return the entries of OpenCV's YAML or XML: numbers, texts, lists and matrices.
+
+    Raises:
+        ValueError: OpenCV cannot read it.
+    """
+    try:
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        root = storage.root()
+        return {name: _node_value(root.getNode(name)) for name in root.keys()}  # noqa: SIM118 -- no mapping
+    except (cv2.error, SystemError):  # the constructor's own error comes as a SystemError
+        raise ValueError("OpenCV cannot read it") from None
+
+
+def _node_value(node: Any) -> Any:
+    if node.isInt() or node.isReal():
+        return node.real()
+    if node.isString():
+        return node.string()
+    if node.isSeq():
+        return [_node_value(node.at(k)) for k in range(node.size())]
+    if node.isMap() and "data" not in node.keys():  # noqa: SIM118 -- no mapping
+        return {name: _node_value(node.getNode(name)) for name in node.keys()}  # noqa: SIM118
+    return node.mat()
+
+
+def _model_and_terms(terms: list[float], *, fisheye: bool) -> tuple[str, list[float]]:
+    """Return COLMAP's model, and its terms in COLMAP's order, which is OpenCV's."""
+    if fisheye:
+        if len(terms) not in (0, 4):
+            raise ValueError(f"a fisheye of OpenCV has 4 distortion coefficients, not {len(terms)}")
+        return "OPENCV_FISHEYE", terms or [0.0] * 4
+    if len(terms) not in COUNTS:
+        raise ValueError(f"{len(terms)} distortion coefficients; OpenCV has {', '.join(map(str, COUNTS[1:]))}")
+    if any(terms[8:]):
+        raise ValueError("coefficients of a thin prism or of a tilted sensor cannot be used")
+    return "FULL_OPENCV", [*terms, *[0.0] * 8][:8]
+
+
+def _is_fisheye(said: Any) -> bool:
+    if isinstance(said, str):
+        return any(word in said.lower() for word in FISHEYE_WORDS)
+    return bool(said)
+
+
+def _size(values: Mapping[str, Any]) -> tuple[int, int]:
+    """Return width and height in pixels; 0 where they are not said."""
+    both = _value(values, SIZE)
+    if isinstance(both, Sequence) and not isinstance(both, str) and len(both) == 2:
+        width, height = both
+    else:
+        width, height = _value(values, WIDTH) or 0, _value(values, HEIGHT) or 0
+    if bool(width) != bool(height) or width < 0 or height < 0:
+        raise ValueError(f"a size of {width} x {height} pixels")
+    return int(width), int(height)
+
+
+def _value(values: Mapping[str, Any], names: Sequence[str]) -> Any:
+    """Return the value that goes by one of these names; None where there is none."""
+    plain = {str(key).lower().replace("_", "").replace(" ", ""): value for key, value in values.items()}
+    return next((plain[name] for name in names if plain.get(name) is not None), None)
+
+
+def _numbers(value: Any, what: str) -> NDArray[np.float64]:
+    """Return numbers from nested lists, or from a mapping with "data", as ROS and OpenCV write matrices."""
+    if isinstance(value, Mapping):
+        value = value.get("data")
+    try:
+        found = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{what} is not made of numbers") from None
+    if not np.isfinite(found).all():
+        raise ValueError(f"{what} is not finite")
+    return found
+
+
+# Cameras as OpenSfM writes them into camera_models.json, and OpenDroneMap into cameras.json.
+#
+# Lengths are in units of the longer side, and the center counts from the middle of the photo.
+
+MODELS = {
+    "perspective": ("FULL_OPENCV", ("k1", "k2")),
+    "simple_radial": ("FULL_OPENCV", ("k1",)),
+    "radial": ("FULL_OPENCV", ("k1", "k2")),
+    "brown": ("FULL_OPENCV", ("k1", "k2", "p1", "p2", "k3")),
+    "fisheye": ("THIN_PRISM_FISHEYE", ("k1", "k2")),
+    "fisheye_opencv": ("THIN_PRISM_FISHEYE", ("k1", "k2", "", "", "k3", "k4")),
+}
+"""By projection type: COLMAP's model of the same lens, and OpenSfM's names of its terms in COLMAP's order."""
+PANORAMAS = ("spherical", "equirectangular")
+
+
+def is_opensfm_camera(values: Mapping[str, Any]) -> bool:
+    """Return whether the values name a projection type, as OpenSfM's do."""
+    return "projection_type" in values
+
+
+def opensfm_camera(values: Mapping[str, Any]) -> Calibration:
+    """Return the camera of OpenSfM's values.
+
+    Args:
+        values: one entry of the file.
+
+    Raises:
+        ValueError: no run can use its projection type, or they are no camera.
+    """
+    kind = str(values["projection_type"]).lower()
+    width, height = (int(values.get(name, 0)) for name in ("width", "height"))
+    if width <= 0 or height <= 0:
+        raise ValueError("it has no width and height")
+    if kind in PANORAMAS:
+        return calibration_from_model("EQUIRECTANGULAR", (width, height), (width, height))
+    if kind not in MODELS:
+        raise ValueError(f"the projection type {kind[:40]} cannot be used: only {', '.join((*MODELS, *PANORAMAS))}")
+    if not values.get("focal_x", values.get("focal", 0.0)):
+        raise ValueError("it has no focal length")
+    side = float(max(width, height))
+    fx, fy = (side * float(values.get(name, values.get("focal", 0.0))) for name in ("focal_x", "focal_y"))
+    cx = side * float(values.get("c_x", 0.0)) + 0.5 * width
+    cy = side * float(values.get("c_y", 0.0)) + 0.5 * height
+    model, names = MODELS[kind]
+    terms = [float(values.get(name, 0.0)) if name else 0.0 for name in names]
+    return calibration_from_model(model, [fx, fy, cx, cy, *terms, *[0.0] * (8 - len(terms))], (width, height))
+
+
+# Cameras of earlier runs: calibration.json, scene.json, and what `sfm-app calibrate --json` prints.
+#
+# Only cameras that the photos of that run determined are used; the others were guesses.
+
+FIELDS = {field.name for field in fields(Calibration)}
+
+
+def is_run_file(values: Mapping[str, Any]) -> bool:
+    """Return whether the values are those of calibration.json or scene.json."""
+    return "cameras" in values and "camera_of" in values
+
+
+def run_file_cameras(values: Mapping[str, Any]) -> tuple[dict[str, Calibration], dict[str, str]]:
+    """Return the cameras of calibration.json or scene.json that are known, and the camera of each photo.
+
+    Raises:
+        ValueError: the values are no cameras.
+    """
+    found = {str(name): run_camera(entry) for name, entry in values["cameras"].items()}
+    cameras = {name: camera for name, camera in found.items() if camera is not None}
+    return cameras, {str(photo): str(name) for photo, name in values["camera_of"].items()}
+
+
+def is_run_camera(values: Mapping[str, Any]) -> bool:
+    """Return whether the values are those of one camera of a run."""
+    return "K" in values and ("identifiable" in values or "params" in values)
+
+
+def run_camera(values: Mapping[str, Any]) -> Calibration | None:
+    """Return a camera of a run, as one that the user gave; None where the photos did not determine it.
+
+    Args:
+        values: a `Calibration`, or a `CameraModel` after bundle adjustment, as plain values.
+
+    Raises:
+        ValueError: they are no camera.
+    """
+    if "params" in values:
+        size = int(values["width"]), int(values["height"])
+        found = calibration_from_model(str(values["model"]), values["params"], size)
+        spread, correlations = (finite_entries(values.get(name, {})) for name in ("deviations", "correlations"))
+        return replace(found, spread=spread, correlations=correlations)
+    if not values["identifiable"]:
+        return None
+    known = {name: value for name, value in values.items() if name in FIELDS}
+    found = Calibration.from_dict({"evidence": {}, **known, "held": (), "key_pairs": (), "method": GIVEN})
+    if found.projection not in PROJECTIONS or found.K.shape != (3, 3) or not min(np.diag(found.K)) > 0.0:
+        raise ValueError("its values are not those of a camera")
+    if not np.isfinite([*found.K.ravel(), found.radial, *found.fisheye, *found.distortion]).all():
+        raise ValueError("its values are not those of a camera")
+    return replace(found, evidence={})
+
+
+# Recognize the form of a calibration file by its content, and read it.
+
+FORMS = (
+    "known are: calibration.json, scene.json or an output folder of sfm-app; COLMAP's cameras.txt or cameras.bin, or a "
+    "folder with one; OpenCV's JSON, YAML or XML with camera_matrix and dist_coeffs; OpenSfM's camera_models.json and "
+    "ODM's cameras.json"
+)
+MOST_BYTES = 10_000_000
+"""Most bytes of a calibration file. One with a camera for each of a thousand photos has a tenth."""
+RUN_FILES = ("scene.json", "calibration.json")
+"""Files of an output folder, the better one first."""
+
+Cameras = tuple[dict[str, Calibration], dict[str, str]]
+"""Cameras by name, and the name of the camera by photo."""
+
+
+def read_given_cameras(path: Path) -> GivenCameras:
+    """Read a calibration file of any known form, or a folder that holds one.
+
+    Args:
+        path: file or folder.
+
+    Raises:
+        InputError: it is missing, of no known form, or holds values that are no camera.
+    """
+    try:
+        form, (cameras, camera_of) = _read_folder(path) if path.is_dir() else _read_file(path)
+        if not cameras:
+            raise ValueError("it holds no camera that is known")
+    except OSError as err:
+        raise InputError(f"cannot read the calibration file {path}: {err.strerror}", hint=FORMS) from err
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError, RecursionError) as err:
+        # Values of other programs may have any type, and any depth.
+        reason = str(err) if type(err) is ValueError else "it is of no known form"
+        raise InputError(f"{path} is no calibration file: {reason}", hint=FORMS) from err
+    known = {name: camera.to_dict() for name, camera in cameras.items()}
+    used = {photo: name for photo, name in camera_of.items() if name in cameras}
+    return GivenCameras(cameras, used, f"{path} ({form})", fingerprint(known, used))
+
+
+def _read_folder(folder: Path) -> tuple[str, Cameras]:
+    for name in RUN_FILES:
+        if (folder / name).is_file():
+            return _read_file(folder / name)
+    if not any((folder / name).is_file() for name in CAMERA_FILES):
+        raise ValueError(f"the folder holds none of {', '.join((*RUN_FILES, *CAMERA_FILES))}")
+    return "COLMAP", read_colmap_folder(folder)
+
+
+def _read_file(path: Path) -> tuple[str, Cameras]:
+    with path.open("rb") as file:
+        data = file.read(MOST_BYTES + 1)
+    if len(data) > MOST_BYTES:
+        raise ValueError(f"it is larger than {MOST_BYTES // 1_000_000} MB")
+    if b"\0" in data:
+        return "COLMAP", (read_colmap_binary(data), {})
+    try:
+        text = data.decode("utf-8-sig").strip()
+    except UnicodeDecodeError:
+        raise ValueError("it is neither text nor COLMAP's cameras.bin") from None
+    if text.startswith(("%YAML", "<?xml", "<opencv_storage")):
+        return "OpenCV", ({"": opencv_camera(read_file_storage(text))}, {})
+    if text.startswith(("{", "[")):
+        return _read_json(text)
+    return "COLMAP", (read_colmap_text(text), {})
+
+
+def _read_json(text: str) -> tuple[str, Cameras]:
+    try:
+        values: Any = json.loads(text)
+    except ValueError as err:
+        raise ValueError(f"it is not valid JSON: {err}") from None
+    if not isinstance(values, Mapping):
+        raise ValueError("its JSON is not an object")
+    if is_run_file(values):
+        return "sfm-app", run_file_cameras(values)
+    if is_run_camera(values):
+        camera = run_camera(values)
+        return "sfm-app", ({"": camera} if camera is not None else {}, {})
+    if is_opencv_camera(values):
+        return "OpenCV", ({"": opencv_camera(values)}, {})
+    for form, fits, read in _BY_NAME:
+        if values and all(isinstance(entry, Mapping) and fits(entry) for entry in values.values()):
+            return form, (dict(_read_by_name(values, read)), {})
+    raise ValueError("its JSON is of no known form")
+
+
+_BY_NAME: tuple[tuple[str, Callable[..., bool], Callable[..., Calibration | None]], ...] = (
+    ("sfm-app", is_run_camera, run_camera),
+    ("OpenSfM", is_opensfm_camera, opensfm_camera),
+    ("OpenCV", is_opencv_camera, opencv_camera),
+)
+"""Forms of JSON with cameras by name: what tells that an entry is of it, and what reads the entry."""
+
+
+def _read_by_name(
+    values: Mapping[str, Any], read: Callable[..., Calibration | None]
+) -> Iterator[tuple[str, Calibration]]:
+    """Yield the cameras by name; an error names its camera."""
+    for name, entry in values.items():
+        try:
+            camera = read(entry)
+        except ValueError as err:
+            raise ValueError(f"camera '{name[:60]}': {err}") from None
+        if camera is not None:
+            yield name, camera

@@ -1,0 +1,126 @@
+"""Continue from an earlier run: its database and its model, with other photos."""
+
+import contextlib
+import sqlite3
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.database import write_match_graph
+from sfm_app.colmap.model import pose_photo, posed_images, unposed_model
+from sfm_app.colmap.types import all_points
+from sfm_app.files import replace_atomically
+from sfm_app.types import MatchedImage, MatchGraph, PhotoSet
+
+# COLMAP's database of an earlier run, changed to the photos of this one.
+#
+# Photos that stayed keep their ids, keypoints, descriptors and matches. New photos get ids that no photo had
+# before.
+
+COPIES = (
+    ("SELECT * FROM keypoints", "INSERT INTO keypoints VALUES (?, ?, ?, ?)", lambda key: (key,)),
+    ("SELECT * FROM descriptors", "INSERT INTO descriptors VALUES (?, ?, ?, ?, ?)", lambda key: (key,)),
+    ("SELECT * FROM matches", "INSERT INTO matches VALUES (?, ?, ?, ?)", pycolmap.pair_id_to_image_pair),
+)
+"""Queries that copy tables, and the photos that a row with this key is about."""
+LAST_ID = "SELECT seq FROM sqlite_sequence WHERE name = 'images'"
+"""Query for the largest id that a photo had at any time."""
+
+
+def grow_database(path: Path, earlier: Path, photos: PhotoSet, known: Collection[str]) -> None:
+    """Make the database of these photos, with what that of an earlier run knows about the same photos.
+
+    Args:
+        path: database file; appears as a whole.
+        earlier: database of the earlier run; not changed.
+        photos: usable photos, grouped by camera.
+        known: names of the photos that are the same in both.
+    """
+    with _connection(earlier) as connection:
+        had = dict(connection.execute("SELECT name, image_id FROM images"))
+        last = max([0, *had.values(), *(seq for (seq,) in connection.execute(LAST_ID))])
+    ids = {name: key for name, key in had.items() if name in known}
+    members = [photo for group in photos.groups.values() for photo in sorted(group, key=lambda photo: photo.name)]
+    new = [photo.name for photo in members if photo.name not in ids]
+    ids |= {name: key for key, name in enumerate(new, start=last + 1)}
+    images = {
+        ids[photo.name]: MatchedImage(
+            ids[photo.name], photo.name, photo.group, photo.width, photo.height, projection=photo.projection
+        )
+        for photo in members
+    }
+    with replace_atomically(path) as beside:
+        write_match_graph(beside, MatchGraph(images, {}, {}))
+        _copy_rows(beside, earlier, {key for name, key in ids.items() if name in known})
+
+
+def forget_changed_matches(path: Path, earlier: Path) -> frozenset[str]:
+    """Remove the matches of photos whose keypoints are not those of an earlier run, and return the names of these.
+
+    A method that finds features again may find others, and matches are rows of keypoints.
+
+    Args:
+        path: database whose photos have keypoints.
+        earlier: database that its matches come from.
+    """
+    query = "SELECT image_id, rows, cols, data FROM keypoints"
+    with _connection(earlier) as before, _connection(path) as now:
+        old = {key: values for key, *values in before.execute(query)}
+        changed = {key for key, *values in now.execute(query) if key in old and values != old[key]}
+        pairs = [key for (key,) in now.execute("SELECT pair_id FROM matches")] if changed else []
+        left = [(key,) for key in pairs if not changed.isdisjoint(pycolmap.pair_id_to_image_pair(key))]
+        now.executemany("DELETE FROM matches WHERE pair_id = ?", left)
+        names = now.execute("SELECT image_id, name FROM images").fetchall()
+    return frozenset(name for key, name in names if key in changed)
+
+
+def _copy_rows(path: Path, earlier: Path, photos: Collection[int]) -> None:
+    """Copy what is known about these photos, and about pairs of them."""
+    known = frozenset(photos)
+    with _connection(earlier) as source, _connection(path) as target:
+        for read, write, about in COPIES:
+            rows = (row for row in source.execute(read) if known.issuperset(about(row[0])))
+            target.executemany(write, rows)
+
+
+@contextlib.contextmanager
+def _connection(path: Path) -> Iterator[sqlite3.Connection]:
+    """Provide a connection whose changes are written at the end."""
+    with contextlib.closing(sqlite3.connect(path)) as connection, connection:
+        yield connection
+
+
+# The model of an earlier run in the database of this one, as a start for further photos.
+
+
+def model_in_database(
+    database: Path, earlier: Path, photos: Collection[int], keypoints: Mapping[int, int]
+) -> pycolmap.Reconstruction:
+    """Return the part of an earlier model that some photos see, with the photos and cameras of a database.
+
+    Cameras get the parameters of the earlier model. Tracks lose the photos that are not there, and keypoints that only
+    the earlier run had; points that fewer than two photos see are left out.
+
+    Args:
+        database: holds photos, keypoints and cameras; known photos have the ids that they have in the model.
+        earlier: COLMAP's model on disk.
+        photos: ids of the known photos.
+        keypoints: number of keypoints of each photo in the database.
+    """
+    before = pycolmap.Reconstruction(earlier)
+    model = unposed_model(database)
+    placed = [image for image in posed_images(before) if image.image_id in photos]
+    for image in placed:
+        camera, known = model.cameras[model.images[image.image_id].camera_id], before.cameras[image.camera_id]
+        camera.model, camera.params = known.model, known.params.tolist()
+    for image in placed:
+        pose_photo(model, image.image_id, image.cam_from_world())
+    there = {image.image_id for image in placed}
+    for _, point in sorted(all_points(before), key=lambda item: item[0]):
+        track = pycolmap.Track()
+        for element in point.track.elements:
+            if element.image_id in there and element.point2D_idx < keypoints[element.image_id]:
+                track.add_element(element.image_id, element.point2D_idx)
+        if track.length() >= 2:
+            model.add_point3D(point.xyz, track, point.color)
+    return model

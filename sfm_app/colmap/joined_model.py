@@ -1,0 +1,144 @@
+"""One model of several: of two by a similarity, or of many as arrays."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sfm_app.colmap.backend import pycolmap, translate_errors
+from sfm_app.colmap.bundle import drop_infinite_points, find_correspondences, improve_tracks, solve
+from sfm_app.colmap.model import bearing_vectors, move, pose_photo, posed_images, unposed_model
+from sfm_app.colmap.types import all_points
+from sfm_app.geometry.poses import Similarity
+from sfm_app.types.arrays import FloatArray, IndexArray
+
+SETTLING_ROUNDS = 2
+"""Rounds of adjustment after models are joined, with tracks completed after each; the last adjustment follows."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedPhotos:
+    """Poses and points of a model."""
+
+    photos: IndexArray
+    """(I,) ids, sorted."""
+    R: FloatArray
+    """(I, 3, 3) rotations, camera from world."""
+    centers: FloatArray
+    """(I, 3) projection centers."""
+    X: FloatArray
+    """(P, 3) points."""
+    point: IndexArray
+    """(N,) row of the point of each observation; those of a point follow each other."""
+    photo: IndexArray
+    """(N,) id of the photo of each observation."""
+    keypoint: IndexArray
+    """(N,) index of the keypoint of each observation."""
+    cameras: Mapping[int, pycolmap.Camera]
+    """Camera of each photo, by its id."""
+
+    def bearings(self, photo: int, x: FloatArray) -> FloatArray:
+        """Return the bearing vectors (N, 9) of pixels of a photo.
+
+        Args:
+            photo: id.
+            x: (N, 2) pixels.
+        """
+        return bearing_vectors(self.cameras[photo], x)
+
+
+def read_placed(model_dir: Path) -> PlacedPhotos:
+    """Read a model on disk.
+
+    Args:
+        model_dir: COLMAP's model.
+    """
+    with translate_errors("reading the model of a part"):
+        model = pycolmap.Reconstruction(model_dir)
+        images = posed_images(model)
+        poses = np.array([image.cam_from_world().matrix() for image in images], np.float64).reshape(-1, 3, 4)
+        points = sorted(all_points(model), key=lambda entry: entry[0])
+        tracks = [[(one.image_id, one.point2D_idx) for one in point.track.elements] for _, point in points]
+        cameras = {image.image_id: pycolmap.Camera(model.cameras[image.camera_id].todict()) for image in images}
+        X = np.array([point.xyz for _, point in points], np.float64).reshape(-1, 3)
+    seen = np.array([element for track in tracks for element in track], np.int64).reshape(-1, 2)
+    R = poses[:, :, :3]
+    centers = -np.einsum("nji,nj->ni", R, poses[:, :, 3])
+    point = np.repeat(np.arange(len(tracks)), [len(track) for track in tracks])
+    return PlacedPhotos(np.array(sorted(cameras), np.int64), R, centers, X, point, seen[:, 0], seen[:, 1], cameras)
+
+
+def write_placed(database: Path, placed: PlacedPhotos) -> pycolmap.Reconstruction:
+    """Return poses and points as COLMAP's model.
+
+    Args:
+        database: holds the photos, keypoints and two-view geometries.
+        placed: each keypoint is in one point at most. Of the cameras of photos that share one in the database,
+            the one with the median focal is taken.
+    """
+    model = unposed_model(database)
+    _write_cameras(model, placed)
+    for photo, R, center in zip(placed.photos.tolist(), placed.R, placed.centers, strict=True):
+        pose_photo(model, photo, pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ center))
+    starts = np.searchsorted(placed.point, np.arange(len(placed.X) + 1)).tolist()
+    photos, keypoints = placed.photo.tolist(), placed.keypoint.tolist()
+    for row, xyz in enumerate(placed.X):
+        track = pycolmap.Track()
+        for k in range(starts[row], starts[row + 1]):
+            track.add_element(photos[k], keypoints[k])
+        model.add_point3D(xyz, track, np.zeros(3, np.uint8))
+    model.tear_down()
+    return model
+
+
+def _write_cameras(model: pycolmap.Reconstruction, placed: PlacedPhotos) -> None:
+    found: dict[int, list[tuple[float, int]]] = {}
+    for photo in placed.photos.tolist():
+        known = placed.cameras[photo]
+        focal = 0.0 if known.is_spherical() else known.mean_focal_length()
+        found.setdefault(model.images[photo].camera_id, []).append((focal, photo))
+    for camera_id, ranked in found.items():
+        camera, known = model.cameras[camera_id], placed.cameras[sorted(ranked)[len(ranked) // 2][1]]
+        camera.model, camera.params = known.model, known.params.tolist()
+
+
+def merge_models(
+    database: Path, first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, similarity: Similarity
+) -> pycolmap.Reconstruction:
+    """Return one model with the photos and points of two models that share no photo.
+
+    Args:
+        database: holds photos, keypoints and two-view geometries.
+        first: gives the frame, and the parameters of cameras that are in both models; not changed.
+        second: not changed.
+        similarity: from the frame of the second model into that of the first.
+    """
+    other = pycolmap.Reconstruction(second)
+    move(other, similarity)
+    model = unposed_model(database)
+    for one in (other, pycolmap.Reconstruction(first)):
+        for image in posed_images(one):
+            camera = model.cameras[image.camera_id]
+            known = one.cameras[image.camera_id]
+            camera.model, camera.params = known.model, known.params.tolist()
+            pose_photo(model, image.image_id, image.cam_from_world())
+        for key in sorted(one.points3D):
+            model.add_point3D(one.points3D[key].xyz, one.points3D[key].track, one.points3D[key].color)
+    model.tear_down()
+    return model
+
+
+def settle(model: pycolmap.Reconstruction, database: Path, refined: Sequence[int]) -> None:
+    """Adjust a joined model in place, and complete, merge and filter its tracks.
+
+    Args:
+        model: COLMAP's reconstruction.
+        database: has all keypoints and matches.
+        refined: ids of the cameras whose focal is refined; the others are held fixed.
+    """
+    drop_infinite_points(model)
+    graph = find_correspondences(model, database)
+    for _ in range(SETTLING_ROUNDS):
+        solve(model, refined)
+        improve_tracks(model, graph)

@@ -1,1 +1,0 @@
-"""COLMAP's sparse models: built, divided, joined, and read from the disk."""

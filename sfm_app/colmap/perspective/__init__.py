@@ -1,1 +1,0 @@
-"""A finished model as pinhole cameras at full size, for other programs."""

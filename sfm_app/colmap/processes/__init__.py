@@ -1,1 +1,0 @@
-"""Parts of COLMAP that run in separate processes."""

@@ -1,1 +1,0 @@
-"""Work of this package that is cut up for several processes."""

@@ -1,0 +1,434 @@
+"""Export finished runs: their cameras, points, photos and surface in the frame of the export."""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cached_property, partial
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.dense import shrink_mask
+from sfm_app.colmap.model import model_arrays, posed_images, read_model, sparse_model
+from sfm_app.colmap.perspective import (
+    PixelMaps,
+    ViewNames,
+    all_points,
+    full_size_lenses,
+    perspective_photos,
+    write_bundle,
+    write_view_model,
+)
+from sfm_app.colmap.surface import FUSED, open_points, positions
+from sfm_app.colmap.types import Reconstruction
+from sfm_app.colmap.wide_views import WideLens, render_views, save_picture
+from sfm_app.engine.stage import Products, Stage, check_undamaged, resume_hint
+from sfm_app.errors import InputError
+from sfm_app.files import replace_atomically
+from sfm_app.formats.scenes import plain_names
+from sfm_app.frame.scale import GPS, MetricFrame, move_model
+from sfm_app.frame.sighted_points import Distance, PosedPhotos, measure_distance
+from sfm_app.geometry.poses import Similarity
+from sfm_app.numerical import json_text
+from sfm_app.operating_system import is_link, move
+from sfm_app.photos import mask_path, save_mask
+from sfm_app.pipeline import MESH, SCALE, SCENE, TEXTURE
+from sfm_app.runtime.context import RunContext
+from sfm_app.types import Model, Scene, SceneArrays
+from sfm_app.types.scene import PerspectivePhoto, PointCloud
+from sfm_app.wording import list_names
+
+# What a finished run has to export, read from its output folder; nothing is computed.
+#
+# Everything that leaves here is in the frame of the export: poses, points and vertices are moved in this module
+# only.
+
+COLORS, NORMALS = ("red", "green", "blue"), ("nx", "ny", "nz")
+"""Fields of the dense cloud."""
+
+
+def stored_frame(run: RunContext) -> MetricFrame:
+    """Return the frame of a run's exports; that of its model where nothing is known of its size.
+
+    Args:
+        run: the finished run.
+    """
+    if run.workspace.manifest.record(SCALE.name) is not None:
+        return Products(run)[SCALE]
+    known = run.workspace.manifest.record(SCENE.name) is not None
+    deviation = Products(run)[SCENE].gps_deviation if known else None
+    return MetricFrame() if deviation is None else MetricFrame(deviation=deviation, source=GPS)
+
+
+def export_frame(run: RunContext) -> Similarity | None:
+    """Return the similarity from the frame of the run's model into that of its exports; None if they are the same."""
+    frame = stored_frame(run)
+    return frame.from_model if frame.changes else None
+
+
+def check_finished(run: RunContext, stages: Sequence[Stage[object]], what: str, otherwise: str = "") -> None:
+    """Check that stages of a run are finished.
+
+    Args:
+        run: the run.
+        stages: what the export needs.
+        what: what is exported, for the message.
+        otherwise: what the user can do without them; for the hint.
+
+    Raises:
+        InputError: there is no run, or a stage is missing (the message names it).
+    """
+    place = run.workspace
+    place.manifest.check_begun()
+    for stage in stages:
+        if place.manifest.record(stage.name) is None:
+            more = f"; {otherwise}" if otherwise and place.manifest.record(SCENE.name) else ""
+            message = f"{place.root} holds no {what} yet: stage `{stage.name}` is missing"
+            raise InputError(message, hint=resume_hint(run) + more)
+
+
+def stored_model(run: RunContext, *, points: bool = False) -> Model:
+    """Read the finished model, or the points and cameras, of a run.
+
+    Args:
+        run: the finished run.
+        points: whether to read the points and cameras instead of the textured surface.
+
+    Raises:
+        InputError: a stage has not run yet, or its files are missing or damaged.
+    """
+    if not points:
+        check_finished(run, [TEXTURE], "model", "`--points` exports the points and cameras")
+        return move_model(Products(run)[TEXTURE], stored_frame(run).from_model)
+    check_finished(run, [SCENE], "points")
+    with check_undamaged(SCENE, run):
+        return move_model(sparse_model(run.workspace.sparse), stored_frame(run).from_model)
+
+
+def stored_scene(run: RunContext) -> tuple[Scene, Reconstruction]:
+    """Read cameras and poses, and COLMAP's model with the points.
+
+    Args:
+        run: the finished run.
+
+    Raises:
+        InputError: the scene has not been made yet, or its files are missing or damaged.
+    """
+    check_finished(run, [SCENE], "cameras and points")
+    scene = Products(run)[SCENE]
+    model = read_model(scene.model_dir, export_frame(run))
+    poses = {image.name: np.asarray(image.cam_from_world().matrix(), np.float64) for image in posed_images(model)}
+    return replace(scene, cam_from_world=poses), model
+
+
+def stored_arrays(run: RunContext) -> SceneArrays:
+    """Read poses, cameras, points and tracks as plain arrays, in the frame of exports.
+
+    Args:
+        run: the finished run.
+
+    Raises:
+        InputError: the scene has not been made yet, or its files are missing or damaged.
+    """
+    _, model = stored_scene(run)
+    return model_arrays(model, metric=stored_frame(run).is_metric)
+
+
+def stored_distance(run: RunContext, ends: NDArray[np.float64]) -> Distance:
+    """Return the distance between two places in the frame of exports.
+
+    Args:
+        run: the finished run.
+        ends: (2, 3) the places.
+
+    Raises:
+        ValueError: both are the same.
+        InputError: the scene has not been made yet, or its files are missing or damaged.
+    """
+    check_finished(run, [SCENE], "camera poses")
+    frame = stored_frame(run)
+    a, b = frame.from_model.inverse()(ends)
+    with check_undamaged(SCENE, run):
+        model = PosedPhotos(run.workspace.sparse).sightlines()
+    return measure_distance(a, b, model, frame.from_model.scale, frame.deviation)
+
+
+def check_cloud(run: RunContext) -> Path:
+    """Return the file of the dense cloud.
+
+    Args:
+        run: the finished run.
+
+    Raises:
+        InputError: the depth maps have not been fused yet, or the file is gone.
+    """
+    check_finished(run, [MESH], "dense cloud", "`--points` exports the sparse points")
+    file = run.workspace.surface / FUSED
+    if not file.exists():
+        raise InputError(f"{file} is gone", f"`sfm-app run PHOTOS -o {run.workspace.root} --from mesh` makes it again")
+    return file
+
+
+def stored_cloud(run: RunContext) -> PointCloud:
+    """Read the points that the depth maps agree on.
+
+    Args:
+        run: the finished run.
+
+    Raises:
+        InputError: the depth maps have not been fused yet, or the file of the points is gone or damaged.
+    """
+    file = check_cloud(run)
+    with check_undamaged(MESH, run):
+        records = open_points(file)
+        points, colors, normals = (
+            positions(records),
+            np.array(_columns(records, COLORS), np.uint8),
+            _columns(records, NORMALS),
+        )
+    frame = export_frame(run)
+    if frame is not None:
+        points, normals = frame(points), normals @ frame.R.T
+    return PointCloud(points, colors, normals)
+
+
+def _columns(records: NDArray[np.void], names: Sequence[str]) -> NDArray[np.float64]:
+    """Return fields of records as the columns of an array."""
+    return np.stack([records[name] for name in names], axis=1).astype(np.float64)
+
+
+# A finished run as formats for scenes see it: `FinishedScene` and `PerspectiveScene` of `formats.exporters`.
+
+IMAGES, MASKS = "images", "masks"
+
+
+class StoredScene:
+    """The scene of a finished run.
+
+    Args:
+        run: the finished run.
+
+    Raises:
+        InputError: the scene has not been made yet, or its files are missing or damaged.
+    """
+
+    def __init__(self, run: RunContext) -> None:
+        self._run = run
+        self.scene, self._model = stored_scene(run)
+        self.images = dict[str, str]()
+        """Photo by name of the file that shows it, of all photos written so far."""
+
+    def points(self) -> PointCloud:
+        """Return the sparse points."""
+        return all_points(self._model)
+
+    def cloud(self) -> PointCloud:
+        """Return the dense cloud."""
+        return stored_cloud(self._run)
+
+    def perspective(self, *, centered: bool = False) -> "StoredPhotos":
+        """Return the undistorted photos.
+
+        Args:
+            centered: whether the optical center of every photo is in its middle.
+        """
+        found = StoredPhotos(self.scene, self._model, self._run, centered=centered)
+        self.images |= {photo.image: photo.photo for photo in found.photos}
+        return found
+
+    def record_entries(self, file_format: str) -> dict[str, object]:
+        """Return what the record of a folder says.
+
+        Args:
+            file_format: name of the format.
+        """
+        return {
+            "made_by": "sfm_app",
+            "format": file_format,
+            "photo_of": self.images,
+            "unregistered": dict(self.scene.unregistered),
+        }
+
+    def say(self, text: str) -> None:
+        """Show the user a message."""
+        self._run.progress.say(text)
+
+
+class StoredPhotos:
+    """The undistorted photos of a finished run.
+
+    Args:
+        scene: poses.
+        model: COLMAP's model of the photos.
+        run: has photos and masks.
+        centered: whether the optical center of every photo is in its middle.
+
+    Raises:
+        InputError: photos are gone.
+    """
+
+    def __init__(self, scene: Scene, model: Reconstruction, run: RunContext, *, centered: bool) -> None:
+        self._model, self._run = model, run
+        self._lenses = full_size_lenses(model, centered=centered)
+        names = {image.name: image.camera_id for image in model.images.values() if image.name in scene.cam_from_world}
+        self._names, self._camera_of = view_names(names, self._lenses), names
+        self._maps = PixelMaps(model, self._lenses)
+
+    @cached_property
+    def photos(self) -> tuple[PerspectivePhoto, ...]:
+        """All of them, by name of the photo."""
+        masked = self._has_masks
+        found = perspective_photos(self._model, self._lenses, self._names)
+        return tuple(_with_mask(photo) for photo in found) if masked else found
+
+    @property
+    def _mask_dir(self) -> Path | None:
+        return self._run.workspace.masks if self._run.workspace.masks.is_dir() else None
+
+    @property
+    def _has_masks(self) -> bool:
+        """Whether photos have masks: the user's, or of what views of a wide lens show beyond the photo."""
+        return self._mask_dir is not None or any(len(lens.views) > 1 for lens in self._lenses.values())
+
+    def write_photos(self, folder: Path) -> None:
+        """Write images/, and masks/ where photos have masks.
+
+        Args:
+            folder: where they go.
+
+        Raises:
+            InputError: photos are gone.
+        """
+        place = self._run.workspace.photos
+        gone = [name for name in self._camera_of if not (place / name).exists()]
+        if gone:
+            hint = f"{place} links to the photos of the run: put them back to where they were"
+            raise InputError(f"the photo {list_names(gone, 1)} is gone", hint=hint)
+        write = partial(self._write_photo, folder)
+        by_camera = sorted(self._camera_of, key=lambda name: (self._camera_of[name], name))
+        with self._run.with_workers(self._run.workers) as run:  # none of them writes on after an interrupt
+            run.map(write, by_camera, "undistorting photos at full size")
+
+    def _write_photo(self, folder: Path, name: str) -> None:
+        camera_id = self._camera_of[name]
+        with translate_errors(f"undistorting {name}"):
+            maps, place = self._maps.camera_maps(camera_id), self._run.workspace.photos
+            views = render_views(name, self._lenses[camera_id], place, self._mask_dir, maps)
+            for image, (pixels, shown) in zip(self._names[name], views, strict=True):
+                save_picture(folder / IMAGES / image, pixels)
+                if self._has_masks:
+                    save_mask(folder / MASKS, image, shrink_mask(shown))
+
+    def write_colmap(self, folder: Path, *, text: bool = False) -> None:
+        """Write COLMAP's model.
+
+        Args:
+            folder: created.
+            text: whether as text instead of binary.
+        """
+        write_view_model(self._model, self._lenses, self._names, folder, text=text)
+
+    def write_bundle(self, file: Path) -> None:
+        """Write Bundler's file; the photos lie in images/ beside it."""
+        scratch = file.with_name(".model")
+        try:
+            self.write_colmap(scratch)
+            write_bundle(scratch, file.parent / IMAGES, file, self._run.workers, self._run.progress)
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
+
+
+def view_names(cameras: dict[str, int], lenses: dict[int, WideLens]) -> ViewNames:
+    """Return the names of the files of the views of each photo: plain, without folders, and all different.
+
+    Args:
+        cameras: id of the camera by name of the photo.
+        lenses: views by id of the camera.
+    """
+    photos = sorted(cameras)
+    counts = [len(lenses[cameras[name]].views) for name in photos]
+    stems = [str(PurePosixPath(name).with_suffix("")) for name in photos]
+    views = [(stem, number, count) for stem, count in zip(stems, counts, strict=True) for number in range(count)]
+    plain = iter(plain_names([f"{stem}_{number + 1}" if count > 1 else stem for stem, number, count in views]))
+    return {photo: [f"{next(plain)}.jpg" for _ in range(count)] for photo, count in zip(photos, counts, strict=True)}
+
+
+def _with_mask(photo: PerspectivePhoto) -> PerspectivePhoto:
+    """Return the photo with the name of its mask."""
+    return replace(photo, mask=mask_path(Path(), photo.image).name)
+
+
+# Where exports go: a file or a folder, as a whole or not at all, and never over what no export has written.
+
+RECORD = "export.json"
+"""In a folder that an export has written: its format, its files, and which photo each picture shows."""
+ELSEWHERE = "name another place with -o"
+
+
+@contextmanager
+def fill_folder(target: Path, about: Callable[[], Mapping[str, object]]) -> Iterator[Path]:
+    """Provide an empty folder beside `target`, which takes its place once the block ends without an error.
+
+    Args:
+        target: folder; what an earlier export has written there is replaced.
+        about: what the record says besides the files; called at the end.
+
+    Raises:
+        InputError: the target is something else, or holds files that no export has written.
+    """
+    check_replaceable(target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    beside = target.with_name(f".{target.name}.unfinished")
+    shutil.rmtree(beside, ignore_errors=True)
+    beside.mkdir()
+    try:
+        yield beside
+        with replace_atomically(beside / RECORD) as path:
+            path.write_text(json_text({**about(), "files": _list_files(beside)}), encoding="utf-8", newline="\n")
+        check_replaceable(target)  # it may have been filled meanwhile
+        if target.exists():
+            old = target.with_name(f".{target.name}.old")
+            shutil.rmtree(old, ignore_errors=True)
+            move(target, old)
+            move(beside, target)
+            shutil.rmtree(old, ignore_errors=True)
+        else:
+            move(beside, target)
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+
+
+def check_replaceable(target: Path) -> None:
+    """Check that nothing is lost where a folder is written.
+
+    Args:
+        target: the folder; it may be missing.
+
+    Raises:
+        InputError: it is no folder, or it holds files that no export has written.
+    """
+    if is_link(target) or (target.exists() and not target.is_dir()):
+        raise InputError(f"{target} is no folder", hint=ELSEWHERE)
+    if not target.exists():
+        return
+    files = _list_files(target)
+    foreign = sorted(set(files) - {*_recorded_files(target), RECORD})
+    if foreign:
+        raise InputError(f"{target} holds files that no export has written, such as {foreign[0]}", hint=ELSEWHERE)
+
+
+def _list_files(folder: Path) -> list[str]:
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
+
+
+def _recorded_files(folder: Path) -> list[str]:
+    """Return the files that the record of an export lists; none where there is no sound record."""
+    try:
+        known = json.loads((folder / RECORD).read_text(encoding="utf-8"))["files"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return []
+    return [str(name) for name in known] if isinstance(known, list) else []

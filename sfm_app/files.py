@@ -1,0 +1,157 @@
+"""Write files atomically, and hash them."""
+
+import contextlib
+import hashlib
+import json
+import secrets
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path, PurePath
+from typing import Any
+from zipfile import ZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.operating_system import is_link, replace_file
+
+# Atomic writes of files, and markers of folders that the run after a killed one can go on filling.
+
+UNFINISHED = "unfinished.txt"
+"""Marker in a folder that a stage is filling: the fingerprint of the inputs, by which a killed run can resume."""
+
+
+@contextlib.contextmanager
+def replace_atomically(target: Path) -> Iterator[Path]:
+    """Provide a path beside `target`, which replaces it when the block ends without an error."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    beside = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")  # machines share process ids
+    try:
+        yield beside
+        replace_file(beside, target)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def resume_or_clear(folder: Path, made_from: str) -> bool:
+    """Return whether a killed run was filling this folder from the same inputs; remove the folder if not.
+
+    Args:
+        folder: may be missing.
+        made_from: fingerprint of the inputs.
+    """
+    if is_made_from(folder / UNFINISHED, made_from):
+        return True
+    shutil.rmtree(folder, ignore_errors=True)
+    return False
+
+
+def is_made_from(marker: Path, made_from: str) -> bool:
+    """Return whether a marker holds this fingerprint.
+
+    Args:
+        marker: text file; may be missing.
+        made_from: fingerprint of the inputs.
+    """
+    try:
+        return marker.read_text(encoding="utf-8") == made_from
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def mark_unfinished(folder: Path, made_from: str) -> None:
+    """Mark a folder as unfinished, so that a killed run can resume there.
+
+    Args:
+        folder: created if it is missing.
+        made_from: fingerprint of the inputs.
+    """
+    with replace_atomically(folder / UNFINISHED) as path:
+        path.write_text(made_from, encoding="utf-8", newline="\n")
+
+
+def mark_finished(folder: Path) -> None:
+    """Mark a folder as complete; the next run that fills it starts afresh."""
+    (folder / UNFINISHED).unlink()
+
+
+def save_files(files: Mapping[str, bytes], folder: Path) -> tuple[Path, ...]:
+    """Write files, each atomically, the first one last because it refers to the others.
+
+    Args:
+        files: contents by file name.
+        folder: where they go.
+    """
+    paths = tuple(folder / name for name in files)
+    for path, data in reversed(list(zip(paths, files.values(), strict=True))):
+        with replace_atomically(path) as beside:
+            beside.write_bytes(data)
+    return paths
+
+
+# Hashes of files, and reading of arrays within limits, since files may have been damaged.
+
+MOST_BYTES, MOST_INFLATED = 1_000_000_000, 200
+"""A file is refused if its arrays exceed both: this many bytes, and this many times the size of the file. Our own
+exceed one at most; deflate reaches 1000 times with zeros."""
+
+
+def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an .npz file; pickled objects, which could run code, are refused.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it holds something else, or exceeds the limits. Damaged files raise many other errors.
+    """
+    # opened here, because NumPy leaves a damaged file open
+    with path.open("rb") as file:
+        with ZipFile(file) as members:
+            inflated = sum(member.file_size for member in members.infolist())
+        if inflated > max(MOST_BYTES, MOST_INFLATED * path.stat().st_size):
+            raise ValueError(f"{path} is refused: it inflates to {inflated} bytes")
+        file.seek(0)
+        with np.load(file, allow_pickle=False) as stored:
+            return dict(stored)
+
+
+def digest_file(path: Path) -> str:
+    """Return hash of the bytes of a file.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "blake2b").hexdigest()
+
+
+def digest_files(root: Path, *names: str) -> str:
+    """Return a hash of the names and bytes of files, and of all files in folders, except links.
+
+    Raises:
+        FileNotFoundError: one of them is missing.
+    """
+    found = hashlib.blake2b(digest_size=16)
+    for name in names:
+        for path in _files(root / name):
+            found.update(f"{path.relative_to(root).as_posix()!r} {digest_file(path)}\n".encode())
+    return found.hexdigest()
+
+
+def fingerprint(*parts: Any) -> str:
+    """Return a hash of JSON-able parts, independent of the order of keys."""
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=str)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def is_below(name: str) -> bool:
+    """Return whether a name stays below the folder that it is joined to, judging by the name alone."""
+    path = PurePath(name)  # a drive of Windows leads elsewhere without being absolute
+    return bool(path.parts) and not path.anchor and ".." not in path.parts and "\0" not in name
+
+
+def _files(path: Path) -> Iterator[Path]:
+    if not path.is_dir():
+        yield path
+        return
+    below = (place for place in path.rglob("*") if place.is_file() and not is_link(place))
+    yield from sorted(place for place in below if not place.name.startswith("."))

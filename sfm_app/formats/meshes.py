@@ -1,0 +1,215 @@
+"""Meshes as PLY, OBJ and STL."""
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.errors import ReconstructionError
+from sfm_app.formats.exporters import NORMAL_SUFFIX, check, jpeg, normal_picture, pages_in_use
+from sfm_app.formats.frusta import append_cameras, camera_dots, scene_size
+from sfm_app.geometry.triangles import unit_normals
+from sfm_app.types import Model, Texture
+
+# Binary PLY, the Stanford polygon format, which all programs for point clouds and scanned surfaces open.
+
+PLY_NAMES = {"f": "float", "u": "uchar"}
+PLACE = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+NORMAL = [("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4")]
+COLOR = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+
+Columns = list[NDArray[Any]]
+
+
+def write_ply(model: Model, name: str) -> Mapping[str, bytes]:
+    """Write triangles with normals and a color per vertex, or points followed by the cameras as dotted frusta.
+
+    Cameras are dots, because readers differ on files with points and edges or points and triangles, and some then show
+    no points. All of them show a cloud of colored points in the same way.
+
+    Args:
+        model: what to write; PLY has no common way to store a texture, or cameras beside a surface: left out.
+        name: of the file, without suffix.
+
+    Returns:
+        One file.
+
+    Raises:
+        ReconstructionError: the model is empty or not finite.
+    """
+    check(model)
+    surface = model.surface
+    if len(surface.faces):
+        columns: Columns = [surface.vertices, unit_normals(surface), surface.colors]
+        elements = {"vertex": table(PLACE + NORMAL + COLOR, columns), "face": triangles(surface.faces)}
+    else:
+        dots, colors = camera_dots(model)
+        columns = [np.concatenate([surface.vertices, dots]), np.concatenate([surface.colors, colors])]
+        elements = {"vertex": table(PLACE + COLOR, columns)}
+    return {f"{name}.ply": header(elements).encode("ascii") + b"".join(rows.tobytes() for rows in elements.values())}
+
+
+def triangles(faces: NDArray[np.int64]) -> NDArray[np.void]:
+    """Return rows of three vertex indices."""
+    rows = np.empty(len(faces), [("count", "u1"), ("vertex_indices", "<i4", 3)])
+    rows["count"], rows["vertex_indices"] = 3, faces
+    return rows
+
+
+def table(kinds: list[tuple[str, str]], columns: Columns) -> NDArray[np.void]:
+    """Build rows with named columns.
+
+    Args:
+        kinds: name and NumPy type of each column.
+        columns: arrays (N, C), one column per name in total.
+    """
+    rows = np.empty(len(columns[0]), kinds)
+    values = [column[:, i] for column in columns for i in range(column.shape[1])]
+    for (key, _), column in zip(kinds, values, strict=True):
+        rows[key] = column
+    return rows
+
+
+def header(elements: Mapping[str, NDArray[np.void]]) -> str:
+    """Return the header, which describes the rows of each element."""
+    lines = ["ply", "format binary_little_endian 1.0", "comment sfm_app"]
+    for element, rows in elements.items():
+        lines.append(f"element {element} {len(rows)}")
+        if element == "face":
+            lines.append("property list uchar int vertex_indices")
+            continue
+        fields = [(key, rows.dtype[key].kind) for key in rows.dtype.names or ()]
+        lines += [f"property {PLY_NAMES[kind]} {key}" for key, kind in fields]
+    return "\n".join([*lines, "end_header", ""])
+
+
+# Wavefront OBJ, with materials (MTL) and texture pages (JPEG) in separate files.
+
+DIGITS = 6
+"""Significant digits of coordinates relative to the model's size, and decimals of texture coordinates."""
+
+KEY_BASE = 10 ** (DIGITS + 1)
+"""Base that combines both texture coordinates, as integers, into one key."""
+
+CHUNK = 50_000
+"""Rows formatted at once; Python numbers take several times the memory of their text."""
+
+MATERIAL = "newmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum {light}\n"
+"""`illum 0` shows the colors unlit: photos already contain the lighting; 1, with normal maps, lights them."""
+
+
+def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
+    """Write triangles with normals and a texture or a color per vertex, or else points; and cameras, if any, as lines.
+
+    Args:
+        model: what to write.
+        name: of the files, without suffix.
+
+    Returns:
+        The OBJ; if the model has a texture, also the MTL, a JPEG per page, and its normal map, if any.
+
+    Raises:
+        ReconstructionError: the model is empty or not finite.
+    """
+    check(model)
+    texture = model.texture if len(model.surface.faces) else None
+    beside = re.sub(r"\s", "_", name)  # many readers end file names at a blank
+    text = ["# sfm_app\n", *_vertex_lines(model, with_colors=texture is None)]
+    files: dict[str, bytes] = {}
+    if texture is None:
+        if len(model.surface.faces):
+            corners = model.surface.faces + 1
+            text.append(format_rows("f %d//%d %d//%d %d//%d\n", np.repeat(corners, 2, axis=1)))
+    else:
+        used = pages_in_use(texture.page)
+        pages = {page: f"{beside}_{page}.jpg" for page in used}
+        text += [f"mtllib {beside}.mtl\n", *_textured_lines(model, texture, used)]
+        maps = {page: f"{beside}_{page}_normals.{NORMAL_SUFFIX}" for page in used if texture.normal_maps}
+        materials = (_material(page, file, maps.get(page, "")) for page, file in pages.items())
+        files[f"{beside}.mtl"] = "\n".join(materials).encode()
+        files |= {file: jpeg(texture.pages[page]) for page, file in pages.items()}
+        files |= {file: normal_picture(texture.normal_maps[page]) for page, file in maps.items()}
+    return {f"{name}.obj": "".join(text).encode(), **files}
+
+
+def _material(page: int, picture: str, normal_map: str) -> str:
+    """Return the material of a page; `norm` is the name that readers have for normal maps (others are heights)."""
+    text = MATERIAL.format(name=f"page_{page}", light=1 if normal_map else 0) + f"map_Kd {picture}\n"
+    return text + (f"norm {normal_map}\n" if normal_map else "")
+
+
+def _vertex_lines(model: Model, *, with_colors: bool) -> Iterator[str]:
+    """Yield vertices, with colors after the coordinates as in MeshLab, normals, points and lines."""
+    vertices, colors, lines = append_cameras(model)
+    place = f"%.{decimals(model.surface.vertices)}f"
+    values, form = [vertices], [place] * 3
+    if with_colors:
+        values, form = [vertices, colors / 255.0], [*form, *["%.4f"] * 3]
+    yield format_rows(f"v {' '.join(form)}\n", np.concatenate(values, axis=1))
+    if len(model.surface.faces):
+        yield format_rows("vn %.4f %.4f %.4f\n", unit_normals(model.surface))
+    else:
+        yield format_rows("p %d\n", 1 + np.arange(len(model.surface.vertices))[:, None])
+    yield format_rows("l %d %d\n", lines + 1)
+
+
+def _textured_lines(model: Model, texture: Texture, pages: list[int]) -> Iterator[str]:
+    """Yield texture coordinates, each once, and the triangles page by page."""
+    steps = np.round(10**DIGITS * texture.uv.reshape(-1, 2).astype(np.float64)).astype(np.int64)
+    steps[:, 1] = 10**DIGITS - steps[:, 1]  # 0 is at the bottom in OBJ
+    keys, numbers = np.unique(steps @ np.array([KEY_BASE, 1]), return_inverse=True)
+    places = np.column_stack(np.divmod(keys, KEY_BASE)) / 10**DIGITS
+    yield format_rows(f"vt %.{DIGITS}f %.{DIGITS}f\n", places)
+    corners = np.repeat(model.surface.faces + 1, 3, axis=1)
+    corners[:, 1::3] = numbers.reshape(-1, 3) + 1
+    for page in pages:
+        yield f"usemtl page_{page}\n"
+        yield format_rows("f %d/%d/%d %d/%d/%d %d/%d/%d\n", corners[texture.page == page])
+
+
+def format_rows(form: str, values: NDArray[np.generic]) -> str:
+    """Return the rows of an array (N, C) as text; formatting many at once is ten times faster than one by one.
+
+    Args:
+        form: format of one row for the % operator, with C fields.
+        values: (N, C).
+    """
+    parts = (values[start : start + CHUNK] for start in range(0, len(values), CHUNK))
+    return "".join(form * len(part) % tuple(part.ravel().tolist()) for part in parts)
+
+
+def decimals(vertices: NDArray[np.float64]) -> int:
+    """Return the number of decimals that gives `DIGITS` significant digits of the model's size."""
+    return max(0, DIGITS - int(np.floor(np.log10(scene_size(vertices) or 1.0))))
+
+
+# Binary STL, which programs for 3D printers open: bare triangles, in millimeters, z up.
+
+MILLIMETERS = 1000.0
+"""Of a meter. STL names no unit, and printers take millimeters. By definition."""
+
+
+def write_stl(model: Model, name: str) -> Mapping[str, bytes]:
+    """Write the triangles of a model; STL has no colors.
+
+    Args:
+        model: what to write; its unit is taken for a meter, and its y axis, which points up, becomes z.
+        name: of the file, without suffix.
+
+    Returns:
+        One file.
+
+    Raises:
+        ReconstructionError: the model is not finite, or has no triangles.
+    """
+    import trimesh  # slow to load, and few need it
+
+    check(model)
+    surface = model.surface
+    if not len(surface.faces):
+        raise ReconstructionError("STL holds triangles only", hint="--format ply or glb for points and cameras")
+    x, y, z = MILLIMETERS * surface.vertices.T
+    mesh = trimesh.Trimesh(np.stack([x, -z, y], axis=1), surface.faces, process=False)
+    return {f"{name}.stl": bytes(mesh.export(file_type="stl"))}

@@ -1,0 +1,292 @@
+"""Cameras, photos and clouds for other programs."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.camera.models import PARAMETERS, calibration_from_model, distortion_terms
+from sfm_app.errors import InputError
+from sfm_app.files import replace_atomically
+from sfm_app.formats.clouds import cloud_ply
+from sfm_app.formats.exporters import FinishedScene
+from sfm_app.formats.gltf import FLIP
+from sfm_app.numerical import json_text
+from sfm_app.types import CameraModel, Scene
+from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE
+from sfm_app.types.scene import PerspectivePhoto
+
+# Names of files that every program can read.
+
+UNSAFE = re.compile(r"[^A-Za-z0-9-]+")
+"""What trainers stumble over: they cut names at the first dot or blank, drop folders, or read bytes one by one."""
+
+
+def plain_names(names: Sequence[str]) -> list[str]:
+    """Return one name for each, of letters, digits, - and _, all different even where case does not count.
+
+    Args:
+        names: of photos with their folders, but without suffix, or of cameras.
+    """
+    used, found = set[str](), []
+    for name in names:
+        plain = stem = UNSAFE.sub("_", name).strip("_") or "_"
+        number = 1
+        while plain.lower() in used:
+            number += 1
+            plain = f"{stem}_{number}"
+        used.add(plain.lower())
+        found.append(plain)
+    return found
+
+
+# Cameras and poses as JSON, for programs of any kind; `sfm-app run --calibration` reads the cameras, too.
+
+CONVENTIONS = {
+    "cam_from_world": "3 x 4 [R | t]: a point X of the world is R X + t in the camera; x right, y down, z forward",
+    "center": "the camera's place in the world, -R' t",
+    "pixels": "the center of the top left pixel is (0.5, 0.5)",
+    "model, params": "COLMAP's camera models; names of the parameters in `parameters`",
+    "K": "pixels; of a panorama, the scale at its middle",
+    "deviations": "standard deviations of the parameters, in pixels where the parameter is",
+    "determined": "parameters besides the focal length that the photos determine; others kept their values",
+    "unregistered": "photos without a pose, with the reason",
+}
+
+
+def write_cameras(scene: FinishedScene, target: Path) -> None:
+    """Write the cameras with their deviations, and the pose of each photo.
+
+    Args:
+        scene: the finished scene.
+        target: JSON file.
+    """
+    found = scene.scene
+    photos = {
+        name: {
+            "camera": found.camera_of[name],
+            "cam_from_world": pose.tolist(),
+            "center": (-pose[:, :3].T @ pose[:, 3]).tolist(),
+        }
+        for name, pose in found.cam_from_world.items()
+    }
+    content = {
+        "conventions": CONVENTIONS,
+        "cameras": {name: camera_entry(camera) for name, camera in found.cameras.items()},
+        "camera_of": dict(found.camera_of),
+        "photos": photos,
+        "unregistered": dict(found.unregistered),
+    }
+    target.write_text(json_text(content), encoding="utf-8", newline="\n")
+
+
+def camera_entry(camera: CameraModel) -> dict[str, Any]:
+    """Return a camera as plain values, with the names of its parameters."""
+    return camera.to_dict() | {"parameters": list(PARAMETERS.get(camera.model, ()))}
+
+
+# COLMAP's folder layout of undistorted photos, which Gaussian-splatting trainers read, and Bundler's files.
+
+MODEL = "sparse/0"
+
+
+def write_colmap(scene: FinishedScene, target: Path) -> None:
+    """Write undistorted photos and COLMAP's binary model.
+
+    Args:
+        scene: the finished scene.
+        target: folder to fill.
+    """
+    _write_folder(scene, target)
+
+
+def write_colmap_text(scene: FinishedScene, target: Path) -> None:
+    """Write undistorted photos and COLMAP's model as text.
+
+    Args:
+        scene: the finished scene.
+        target: folder to fill.
+    """
+    _write_folder(scene, target, text=True)
+
+
+def write_splat(scene: FinishedScene, target: Path) -> None:
+    """Write what `write_colmap` does, with every optical center in the middle of its photo.
+
+    Some trainers read the focal length only. A crop around the optical center would lose much of a cropped photo, so
+    the photo is turned instead, as if the camera had looked at its middle.
+
+    Args:
+        scene: the finished scene.
+        target: folder to fill.
+    """
+    _write_folder(scene, target, centered=True)
+
+
+def write_bundler(scene: FinishedScene, target: Path) -> None:
+    """Write Bundler's file by COLMAP's own writer, the list of photos, and the photos.
+
+    Bundler has one focal length, and takes the optical center for the middle.
+
+    Args:
+        scene: the finished scene.
+        target: folder to fill.
+    """
+    found = scene.perspective(centered=True)
+    found.write_photos(target)
+    found.write_bundle(target / "bundle.out")
+    lines = "".join(f"images/{photo.image}\n" for photo in found.photos)
+    (target / "list.txt").write_text(lines, encoding="ascii", newline="\n")
+
+
+def _write_folder(scene: FinishedScene, target: Path, *, text: bool = False, centered: bool = False) -> None:
+    found = scene.perspective(centered=centered)
+    found.write_photos(target)
+    found.write_colmap(target / MODEL, text=text)
+
+
+# The folder that nerfstudio trains from: transforms.json, photos, masks and the sparse points.
+#
+# Its cameras look along -z with y up. Its points and poses share a frame, which is that of the model; nerfstudio
+# turns and scales both as it loads them. Every photo has a mask, or none has.
+
+TRANSFORMS, POINTS = "transforms.json", "sparse_pc.ply"
+
+
+def write_nerfstudio(scene: FinishedScene, target: Path) -> None:
+    """Write transforms.json, the undistorted photos, their masks and the points.
+
+    Args:
+        scene: the finished scene.
+        target: folder to fill.
+    """
+    found = scene.perspective()
+    found.write_photos(target)
+    (target / POINTS).write_bytes(cloud_ply(scene.points()))
+    (target / TRANSFORMS).write_text(json_text(transforms(found.photos)), encoding="utf-8", newline="\n")
+
+
+def transforms(photos: tuple[PerspectivePhoto, ...]) -> dict[str, Any]:
+    """Return what transforms.json holds; intrinsics are at its top where all photos share them.
+
+    Args:
+        photos: undistorted, at least one.
+    """
+    lenses = [intrinsics(photo) for photo in photos]
+    shared = lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
+    frames = [({} if shared else lens) | frame(photo) for lens, photo in zip(lenses, photos, strict=True)]
+    return {"camera_model": "OPENCV", **shared, "ply_file_path": POINTS, "frames": frames}
+
+
+def intrinsics(photo: PerspectivePhoto) -> dict[str, float]:
+    """Return the intrinsics of a photo by nerfstudio's names."""
+    K = photo.K.tolist()
+    pinhole = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2], "w": photo.width, "h": photo.height}
+    return pinhole | dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
+
+
+def frame(photo: PerspectivePhoto) -> dict[str, Any]:
+    """Return the file and the pose of a photo."""
+    R, t = photo.cam_from_world[:, :3], photo.cam_from_world[:, 3]
+    world_from_cam = np.eye(4)
+    world_from_cam[:3, :3], world_from_cam[:3, 3] = R.T @ FLIP, -R.T @ t
+    found: dict[str, Any] = {"file_path": f"images/{photo.image}", "transform_matrix": world_from_cam.tolist()}
+    return found | ({"mask_path": f"masks/{photo.mask}"} if photo.mask else {})
+
+
+# Cameras as OpenCV's YAML, one file per camera, with the poses of its photos.
+#
+# OpenCV counts pixels from the center of the first one, which is (0.5, 0.5) here.
+
+FIRST_PIXEL = 0.5
+"""Our coordinates of the pixel that OpenCV calls (0, 0). By definition."""
+FISHEYE_TERMS, OTHER_TERMS = [0, 1, 4, 5], [2, 3, 6, 7]
+"""Of the eight terms of a fisheye, the four that OpenCV has, and the others."""
+
+
+def write_opencv(scene: FinishedScene, target: Path) -> None:
+    """Write a YAML file for each camera that OpenCV has a model for.
+
+    Args:
+        scene: the finished scene.
+        target: folder to fill.
+
+    Raises:
+        InputError: OpenCV has a model for none of the cameras.
+    """
+    found = scene.scene
+    files = dict(zip(found.cameras, plain_names(list(found.cameras)), strict=True))
+    reasons = {}
+    for name, camera in found.cameras.items():
+        try:
+            model, terms = opencv_lens(camera)
+        except ValueError as err:
+            reasons[name] = str(err)
+            continue
+        with replace_atomically(target / f"{files[name]}.yaml") as path:
+            path.write_text(camera_yaml(name, camera, (model, terms), found), encoding="utf-8", newline="\n")
+    lines = [f"camera {name} is left out: {reason}" for name, reason in reasons.items()]
+    if len(reasons) == len(found.cameras):
+        hint = "--format cameras writes cameras of every kind, --format colmap perspective views of the photos"
+        raise InputError("; ".join(lines) or "the scene has no cameras", hint=hint)
+    for line in lines:
+        scene.say(line)
+
+
+def opencv_lens(camera: CameraModel) -> tuple[str, NDArray[np.float64]]:
+    """Return OpenCV's name of the lens, and its coefficients: k1 k2 p1 p2 k3 k4 k5 k6, or four of a fisheye.
+
+    Args:
+        camera: after bundle adjustment.
+
+    Raises:
+        ValueError: OpenCV has no such lens.
+    """
+    found = calibration_from_model(camera.model, camera.params, (camera.width, camera.height))
+    if found.projection == EQUIRECTANGULAR:
+        raise ValueError("OpenCV has no model of a panorama")
+    terms = distortion_terms(found)
+    if found.projection != FISHEYE:
+        return "perspective", terms
+    if terms[OTHER_TERMS].any():
+        raise ValueError("OpenCV's fisheye has no tangential and thin prism terms")
+    return "fisheye", terms[FISHEYE_TERMS]
+
+
+def camera_yaml(name: str, camera: CameraModel, lens: tuple[str, NDArray[np.float64]], scene: Scene) -> str:
+    """Return the file of a camera: what cv2.FileStorage writes.
+
+    Args:
+        name: of the camera.
+        camera: after bundle adjustment.
+        lens: from `opencv_lens`.
+        scene: poses of the photos.
+    """
+    import cv2
+
+    K = camera.K.copy()
+    K[:2, 2] -= FIRST_PIXEL
+    storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.write("camera_name", name)
+    storage.write("image_width", camera.width)
+    storage.write("image_height", camera.height)
+    storage.write("distortion_model", lens[0])
+    storage.write("camera_matrix", K)
+    storage.write("distortion_coefficients", lens[1].reshape(1, -1))
+    storage.startWriteStruct("standard_deviations", cv2.FileNode_MAP)
+    for key, value in camera.deviations.items():
+        storage.write(key, float(value))
+    storage.endWriteStruct()
+    storage.startWriteStruct("photos", cv2.FileNode_SEQ)
+    for photo, pose in scene.cam_from_world.items():
+        if scene.camera_of[photo] == name:
+            storage.startWriteStruct("", cv2.FileNode_MAP)
+            storage.write("name", photo)
+            storage.write("rvec", cv2.Rodrigues(pose[:, :3])[0])
+            storage.write("tvec", pose[:, 3:].copy())
+            storage.endWriteStruct()
+    storage.endWriteStruct()
+    return str(storage.releaseAndGetString())

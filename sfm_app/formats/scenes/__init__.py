@@ -1,1 +1,0 @@
-"""Formats for whole scenes: cameras, poses, points and photos for other programs."""

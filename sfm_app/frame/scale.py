@@ -1,0 +1,191 @@
+"""The size of a model: known lengths as evidence, and the frame of exported files."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sfm_app.geometry.poses import Similarity
+from sfm_app.types import Frustum, Model
+from sfm_app.wording import format_length
+
+# What tells how large a model is, how far it can be trusted, and whether its parts agree.
+
+GPS = "GPS of the photos"
+CONTRADICTION = 4.0
+"""Standard deviations by which two that agree may differ. Chosen by hand: one pair of 16 000 differs by more."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleEvidence:
+    """One thing of known size in a model."""
+
+    name: str
+    """For people, such as "marker aruco-4x4 3"."""
+    scale: float
+    """Meters per unit of the model, > 0."""
+    deviation: float
+    """Its standard deviation, relative, > 0."""
+    photos: int = 0
+    """That show it."""
+
+
+@dataclass(frozen=True, slots=True)
+class AgreedScale:
+    """The scale that most of the evidence supports."""
+
+    scale: float
+    deviation: float
+    """Relative standard deviation; covers the contradiction where two pieces of evidence are left that differ."""
+    used: tuple[ScaleEvidence, ...]
+    contradictions: tuple[str, ...]
+
+
+def agree(evidence: Sequence[ScaleEvidence], shape: float = 0.0) -> AgreedScale:
+    """Weigh evidence of a scale, without what contradicts the rest.
+
+    What is farthest from the weighted mean of the others is left out as long as it differs by more than
+    `CONTRADICTION` of its standard deviations and two others remain. Two alone that differ are both named, the more
+    exact one is taken, and the deviation covers half of the difference.
+
+    Args:
+        evidence: at least one.
+        shape: relative deviation of the model's own shape: by it, two places may differ, and more evidence does not
+            make it smaller.
+    """
+    used, named = list(evidence), []
+    while len(used) > 2:
+        off = [_difference(one, _mean([other for other in used if other is not one]), shape) for one in used]
+        worst = int(np.argmax(off))
+        if off[worst] <= CONTRADICTION:
+            break
+        left_out = used.pop(worst)
+        named.append(_contradiction(left_out, _mean(used), f"the {len(used)} others"))
+    mean = _mean(used)
+    if len(used) == 2 and _difference(used[0], used[1], shape) > CONTRADICTION:
+        best, other = sorted(used, key=lambda one: one.deviation)
+        named.append(_contradiction(other, best, best.name))
+        half = abs(np.log(other.scale / best.scale)) / 2
+        mean, used = replace(best, deviation=max(best.deviation, float(half))), [best]
+    return AgreedScale(mean.scale, float(np.hypot(mean.deviation, shape)), tuple(used), tuple(named))
+
+
+def _mean(evidence: Sequence[ScaleEvidence]) -> ScaleEvidence:
+    """Return the weighted mean of logarithms, with a deviation that covers the scatter."""
+    logs = np.log([one.scale for one in evidence])
+    weights = 1.0 / np.square([one.deviation for one in evidence])
+    mean = float(weights @ logs / weights.sum())
+    freedom = max(len(logs) - 1, 1)
+    inflation = max(1.0, float(np.sqrt(weights @ (logs - mean) ** 2 / freedom)))
+    return ScaleEvidence("", float(np.exp(mean)), inflation / float(np.sqrt(weights.sum())))
+
+
+def _difference(one: ScaleEvidence, other: ScaleEvidence, shape: float) -> float:
+    """Return how many standard deviations two scales differ by."""
+    expected = np.linalg.norm([one.deviation, other.deviation, shape])
+    return abs(float(np.log(one.scale / other.scale))) / float(expected)
+
+
+def _contradiction(one: ScaleEvidence, against: ScaleEvidence, name: str) -> str:
+    share = 100.0 * (one.scale / against.scale - 1.0)
+    return (
+        f"{one.name} contradicts {name}: by it, the model is {abs(share):.2g} % {'larger' if share > 0 else 'smaller'}"
+    )
+
+
+def deviation_text(scale: float, deviation: float) -> str:
+    """Return a scale and its deviation for people.
+
+    Args:
+        scale: meters per unit of the model.
+        deviation: relative.
+    """
+    return f"a unit of the model is {format_length(scale)} +- {100 * deviation:.2g} %"
+
+
+# The frame of everything that leaves the program, and how well its unit is known.
+
+IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MetricFrame:
+    """A similarity from the frame of OUT/sparse into that of all exported files, y up in both."""
+
+    from_model: Similarity = IDENTITY
+    deviation: float | None = None
+    """Relative standard deviation of the unit, which is the meter; None where the unit is arbitrary."""
+    source: str = ""
+    """What tells the size, for people; empty where nothing does."""
+    evidence: tuple[ScaleEvidence, ...] = ()
+    contradictions: tuple[str, ...] = ()
+    """What was left out because it contradicts the rest."""
+    crs: str = ""
+    """Coordinate system of ground control points; empty without any."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """East, north and up of the frame's origin in that system: x is east, y up and z south of it."""
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether the unit is the meter."""
+        return self.deviation is not None
+
+    @property
+    def changes(self) -> bool:
+        """Whether anything has another place than in OUT/sparse."""
+        return self.from_model is not IDENTITY
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        similarity = self.from_model
+        return {
+            "scale": similarity.scale,
+            "R": similarity.R.tolist(),
+            "t": similarity.t.tolist(),
+            "unit": "meter" if self.is_metric else "arbitrary",
+            "deviation": self.deviation,
+            "source": self.source,
+            "evidence": [
+                {"name": one.name, "scale": one.scale, "deviation": one.deviation, "photos": one.photos}
+                for one in self.evidence
+            ],
+            "contradictions": list(self.contradictions),
+            "crs": self.crs,
+            "offset": list(self.offset),
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "MetricFrame":
+        """Read what `to_dict` gives."""
+        R, t = np.array(values["R"], np.float64), np.array(values["t"], np.float64)
+        similarity = Similarity(float(values["scale"]), R, t)
+        still = similarity.scale == 1.0 and (np.eye(3) == R).all() and not t.any()
+        east, north, up = map(float, values["offset"])
+        return cls(
+            IDENTITY if still else similarity,
+            values["deviation"],
+            values["source"],
+            tuple(ScaleEvidence(**one) for one in values["evidence"]),
+            tuple(values["contradictions"]),
+            values["crs"],
+            (east, north, up),
+        )
+
+
+def move_model(model: Model, similarity: Similarity) -> Model:
+    """Return a surface or points with their cameras in another frame.
+
+    Args:
+        model: not changed.
+        similarity: from its frame into the new one.
+    """
+    surface = replace(model.surface, vertices=similarity(model.surface.vertices))
+    return replace(model, surface=surface, cameras=tuple(_move_camera(one, similarity) for one in model.cameras))
+
+
+def _move_camera(camera: Frustum, similarity: Similarity) -> Frustum:
+    """Return a camera in another frame: lengths in its own frame grow, too, and rays stay what they are."""
+    R = camera.cam_from_world[:, :3] @ similarity.R.T
+    t = similarity.scale * camera.cam_from_world[:, 3] - R @ similarity.t
+    return replace(camera, cam_from_world=np.column_stack([R, t]))

@@ -1,0 +1,178 @@
+"""From the best model of a search to the answer: a fit with its evidence, or a rejection with its reason.
+
+Ours: the thesis ends with F*. The criteria come from thesis 4.2 (distances), 4.3 (the final fit) and Moisan and Stival
+(2004).
+"""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sfm_app.fundamental.a_contrario import MOST_FALSE_ALARMS, model_false_alarms, squared_mismatch_distances
+from sfm_app.fundamental.degeneracy import OFF_PLANE, dominant_homography, find_degeneracy, transfer_distance
+from sfm_app.fundamental.leverage import prior_validity
+from sfm_app.fundamental.loop import Recipe, search
+from sfm_app.fundamental.points import Matches, check_points, prepare
+from sfm_app.fundamental.refits import choose_refit
+from sfm_app.fundamental.scores import squared_distances
+from sfm_app.geometry.epipolar import nearest_rank_two
+from sfm_app.settings import EpipolarSettings
+from sfm_app.types import EpipolarFit, Rejected
+from sfm_app.types.arrays import FloatArray
+
+Find = Callable[[FloatArray, FloatArray, EpipolarSettings, int], tuple[ArrayLike, int] | None]
+"""(x1, x2, options, seed) -> F and the number of samples drawn, or None: an external search for `estimate_with`."""
+
+# why a pair is rejected, in the order of the checks
+TOO_FEW_MATCHES = "too few matches"
+NO_MODEL = "no model found"
+TOO_FEW_INLIERS = "too few inliers"
+CHANCE = "inliers no better than chance"
+
+
+def estimate(
+    x1: ArrayLike, x2: ArrayLike, options: EpipolarSettings, seed: int, recipe: Recipe
+) -> EpipolarFit | Rejected:
+    """Estimate one fundamental matrix from matches, many of which may be wrong.
+
+    Args:
+        x1: (N, 2) pixels.
+        x2: (N, 2) pixels, row by row the partners of x1.
+        options: threshold, confidence, largest number of samples, smallest number of inliers.
+        seed: same seed, same bytes.
+        recipe: the estimator.
+
+    Raises:
+        ValueError: the points are not as above (see `check_points`).
+    """
+    first, second = check_points(x1, x2)
+    matches = prepare(first, second, seed)
+    if len(matches.points) < options.min_inliers:
+        return Rejected(TOO_FEW_MATCHES)
+    found = search(matches, options, seed, recipe)
+    if found is None:
+        return Rejected(NO_MODEL)
+    threshold = options.max_error_px / matches.unit_px
+    F = choose_refit(options.refit, recipe.finish)(matches.points, found.F, threshold)
+    if not np.isfinite(F).all():
+        return Rejected(NO_MODEL)
+    return _judge(first, second, matches, F, found.trials, options)
+
+
+def estimate_with(
+    find: Find, x1: ArrayLike, x2: ArrayLike, options: EpipolarSettings, seed: int
+) -> EpipolarFit | Rejected:
+    """Run an external search and judge its F as for the built-in estimators; for plug-ins.
+
+    Args:
+        find: gets the distinct matches, at least `options.min_inliers`, as contiguous (M, 2) pixels about the middle of
+            each view, in an order that depends on the seed. Its F may have any scale; it is brought to rank 2. Inliers,
+            priors, degeneracy and the test against chance are computed from this F. `find` should not raise on data.
+        x1: (N, 2) pixels.
+        x2: (N, 2) pixels, row by row the partners of x1.
+        options: as in `estimate`.
+        seed: same seed, same bytes, if `find` is deterministic.
+
+    Raises:
+        ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
+    """
+    first, second = check_points(x1, x2)
+    matches = prepare(first, second, seed)
+    if len(matches.points) < options.min_inliers:
+        return Rejected(TOO_FEW_MATCHES)
+    px1, px2 = (np.ascontiguousarray(side) * matches.unit_px for side in np.hsplit(matches.points, 2))
+    found = find(px1, px2, options, seed)
+    if found is None:
+        return Rejected(NO_MODEL)
+    F, trials = found
+    return _check_and_judge(first, second, matches, _to_frame(F, matches.unit_px, np.zeros(4)), trials, options)
+
+
+def judge(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> EpipolarFit | Rejected:
+    """Judge a fundamental matrix from any source by the matches.
+
+    Args:
+        x1: (N, 2) pixels.
+        x2: (N, 2) pixels, row by row the partners of x1.
+        F: (3, 3) of any scale, x2' F x1 = 0 in pixels.
+        options: threshold and smallest number of inliers.
+
+    Returns:
+        The fit, with `trials` 1, or the reason why F is rejected.
+
+    Raises:
+        ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
+    """
+    first, second = check_points(x1, x2)
+    matches = prepare(first, second, seed=0)
+    if len(matches.points) < options.min_inliers:
+        return Rejected(TOO_FEW_MATCHES)
+    return _check_and_judge(first, second, matches, _to_frame(F, matches.unit_px, matches.center), 1, options)
+
+
+def count_matches_off_plane(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> int:
+    """Count the distinct inliers of F with parallax: those off the plane that holds most of them.
+
+    Args:
+        x1: (N, 2) pixels.
+        x2: (N, 2) pixels, row by row the partners of x1.
+        F: (3, 3) of rank 2, at least 3 inliers.
+        options: the threshold.
+
+    Raises:
+        ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
+    """
+    matches = prepare(*check_points(x1, x2), seed=0)
+    threshold = options.max_error_px / matches.unit_px
+    in_frame = _to_frame(F, matches.unit_px, matches.center)
+    f = np.ascontiguousarray(in_frame / np.linalg.norm(in_frame))
+    agreeing = np.asfortranarray(matches.points[squared_distances(matches.points, f.reshape(9)) <= threshold**2])
+    H = dominant_homography(agreeing, f, threshold)
+    return int(np.count_nonzero(transfer_distance(H, agreeing) > OFF_PLANE * threshold))
+
+
+def _to_frame(F: ArrayLike, unit_px: float, center: FloatArray) -> FloatArray:
+    """Return F of pixels as F of `Matches.points`: the inverse of `Matches.to_pixels`."""
+    pixels = np.asarray(F, dtype=np.float64)
+    if pixels.shape != (3, 3):
+        raise ValueError(f"F must have shape (3, 3), got {pixels.shape}")
+    to1, to2 = (np.array([[unit_px, 0, x], [0, unit_px, y], [0, 0, 1]]) for x, y in (center[:2], center[2:]))
+    with np.errstate(over="ignore", invalid="ignore"):  # an F that is not finite is rejected
+        return np.asarray(to2.T @ pixels @ to1)
+
+
+def _check_and_judge(
+    x1: FloatArray, x2: FloatArray, matches: Matches, F: FloatArray, trials: int, options: EpipolarSettings
+) -> EpipolarFit | Rejected:
+    """Judge an F of any scale and rank; reject it if it is not finite or its rank is below 2."""
+    largest = np.abs(F).max()
+    if not (np.isfinite(largest) and largest > 0) or np.linalg.matrix_rank(F / largest) < 2:
+        return Rejected(NO_MODEL)
+    return _judge(x1, x2, matches, nearest_rank_two(F / largest), trials, options)
+
+
+def _judge(
+    x1: FloatArray, x2: FloatArray, matches: Matches, F: FloatArray, trials: int, options: EpipolarSettings
+) -> EpipolarFit | Rejected:
+    points, threshold = matches.points, options.max_error_px / matches.unit_px
+    f = np.ascontiguousarray(F / np.linalg.norm(F)).reshape(9)
+    squared = squared_distances(points, f)
+    inliers = squared <= threshold * threshold
+    if np.count_nonzero(inliers) < options.min_inliers:
+        return Rejected(TOO_FEW_INLIERS)
+    wrong = squared_mismatch_distances(points, f)
+    if model_false_alarms(squared, wrong, threshold) > MOST_FALSE_ALARMS:
+        return Rejected(CHANCE)
+    F_px = matches.to_pixels(F)
+    squared_px = squared_distances(np.asfortranarray(np.hstack([x1, x2])), F_px.reshape(9))
+    accepted = squared_px <= options.max_error_px**2
+    return EpipolarFit(
+        F=F_px,
+        inliers=accepted,
+        priors=prior_validity(points, f, threshold, sigma_from_inliers=True)[matches.rows],
+        trials=trials,
+        rms_px=math.sqrt(float(squared_px[accepted].mean())),
+        degeneracy=find_degeneracy(points, F, inliers, wrong, threshold, matches.center / matches.unit_px),
+    )

@@ -1,0 +1,169 @@
+"""Regression diagnostics of the fundamental matrix (thesis 3.3.4 and 4.7.2): leverages, Cook's distances, priors.
+
+F is the unit vector f with A f = 0, where row i of the design matrix A is x2 (x) x1. Near a given f the unit vector
+moves in the eight directions perpendicular to it, so that this is a regression with p = 8 parameters, and the hat
+matrix is that of A restricted to them. The ninth direction, f itself, would divide by a number that only noise keeps
+from zero.
+
+Leverage and Cook's distance do not change when each view is shifted and scaled, because this maps the rows of A
+linearly (and A f is small): one well-scaled frame (`points.Matches`) gives the same as Hartley's normalization.
+"""
+
+import numpy as np
+
+from sfm_app.fundamental.scores import select, squared_distances
+from sfm_app.fundamental.solvers import quadratic_forms, weighted_gram
+from sfm_app.jit import kernel
+from sfm_app.numerical import MAD_TO_SIGMA
+from sfm_app.types.arrays import BoolArray, FloatArray
+
+PARAMETERS = 8
+"""p of Eq. 3.16 and 4.17: the directions perpendicular to the unit vector f (docs/algorithms.md, Fundamental
+matrices)."""
+_LEAST_VARIANCE = 1e-24
+"""Least variance of residuals, in units of the points' spread: perfect matches still have rounded coordinates. Double
+precision leaves 1e-16 of them, squared 1e-32; the margin was chosen by hand."""
+_LEAST_FREEDOM = 2.0**-52
+"""Least 1 - h: the distance of 1 to the next number in double precision."""
+_LEAST_SUPPORT = 1e-14
+"""Least eigenvalue of a direction, over the largest one. Double precision leaves 1e-16; the margin was chosen by
+hand."""
+_LARGEST_EXPONENT = 700.0
+"""Largest exponent x for which exp(-x) is computed and not taken as 0: in double precision exp(-746) is 0."""
+
+
+def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArray:
+    """Return the leverage h_ii of every match in a regression on the fitted matches and itself (thesis 3.11).
+
+    For a fitted match this is the diagonal of the hat matrix. For any other match the textbook formula would exceed 1.
+    Its leverage if it were fitted as well is g / (1 + g) with g = a_i' (A_in' A_in)^-1 a_i.
+
+    Args:
+        points: (N, 4) matches, of magnitude about 1.
+        f: (9,) the model, of norm 1.
+        fitted: (N,) the matches that the model was fitted to.
+
+    Returns:
+        (N,) in [0, 1].
+    """
+    tangent = _tangent_basis(f)
+    within = tangent.T @ weighted_gram(points, fitted.astype(np.float64)) @ tangent
+    values, vectors = np.linalg.eigh(within)
+    # no fitted match constrains such a direction: matches along it have leverage 1
+    floor = max(values[-1], 2.0**-1000) * _LEAST_SUPPORT
+    forms = quadratic_forms(points, tangent @ (vectors / np.sqrt(np.maximum(values, floor))))
+    return _leverages_from_forms(forms, fitted)
+
+
+@kernel
+def _leverages_from_forms(forms: FloatArray, fitted: BoolArray) -> FloatArray:
+    """Return h of the fitted matches, g / (1 + g) of the others; g may be inf in unconstrained directions."""
+    leverage = np.empty(forms.shape[0])
+    for i in range(forms.shape[0]):
+        leverage[i] = min(forms[i], 1.0) if fitted[i] else 1.0 / (1.0 + 1.0 / forms[i])
+    return leverage
+
+
+@kernel
+def _tangent_basis(f: FloatArray) -> FloatArray:
+    """Return (9, 8) orthonormal directions perpendicular to a unit vector.
+
+    They are the columns of a Householder reflection that maps f to an axis.
+    """
+    last = f[8] + 1.0 if f[8] >= 0.0 else f[8] - 1.0
+    basis = np.zeros((9, PARAMETERS))
+    for k in range(PARAMETERS):
+        basis[k, k] = 1.0
+        for j in range(9):
+            basis[j, k] -= (f[j] if j < 8 else last) * f[k] / abs(last)
+    return basis
+
+
+@kernel
+def studentized_residuals(residuals: FloatArray, leverage: FloatArray, fitted: BoolArray) -> FloatArray:
+    """Divide residuals by their standard deviation (thesis 3.14, 3.15), with the variance of the fitted matches.
+
+    Args:
+        residuals: (N,) distances to the model.
+        leverage: (N,) from `leverages`.
+        fitted: (N,) the matches that the model was fitted to.
+    """
+    count, total, moment = 0, 0.0, 0.0
+    for i in range(residuals.shape[0]):
+        if fitted[i]:
+            count += 1
+            total += residuals[i]
+    mean = total / max(count, 1)
+    for i in range(residuals.shape[0]):
+        if fitted[i]:
+            moment += (residuals[i] - mean) ** 2
+    variance = max(moment / max(count - PARAMETERS, 1), _LEAST_VARIANCE)
+    studentised = np.empty(residuals.shape[0])
+    for i in range(residuals.shape[0]):
+        studentised[i] = residuals[i] / np.sqrt(variance * max(1.0 - leverage[i], _LEAST_FREEDOM))
+    return studentised
+
+
+@kernel
+def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
+    """Return how far the fit would move without each match (thesis 3.16 and 4.17).
+
+    The square of d_i is missing in the thesis.
+
+    Args:
+        studentised: (N,) from `leverage.studentized_residuals`.
+        leverage: (N,) from `leverages`, in [0, 1].
+    """
+    distances = np.empty(studentised.shape[0])
+    for i in range(studentised.shape[0]):
+        odds = leverage[i] / max(1.0 - leverage[i], _LEAST_FREEDOM)
+        distances[i] = studentised[i] * studentised[i] / PARAMETERS * odds
+    return distances
+
+
+@kernel
+def priors(distances: FloatArray, sigma: float) -> FloatArray:
+    """Return p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels).
+
+    Args:
+        distances: (N,) Cook's distances, >= 0.
+        sigma: of the Gaussian, in the same units; with 0, p is 1 for the smallest distance and 0 for all others.
+    """
+    least, probable = np.inf, np.empty(distances.shape[0])
+    for i in range(distances.shape[0]):
+        least = min(least, distances[i])
+    for i in range(distances.shape[0]):
+        if sigma > 0.0:
+            # minus the smallest exponent, so that the largest value is 1
+            exponent = (distances[i] - least) / sigma * ((distances[i] + least) / sigma) / 2.0
+            probable[i] = np.exp(-exponent) if exponent < _LARGEST_EXPONENT else 0.0
+        else:
+            probable[i] = 1.0 if distances[i] <= least else 0.0
+    return probable
+
+
+@kernel
+def mad_sigma(distances: FloatArray) -> float:
+    """Return the standard deviation about zero from the median absolute deviation (thesis 4.7.3)."""
+    count = distances.shape[0]
+    deviations = np.empty(count)
+    for i in range(count):
+        deviations[i] = abs(distances[i])
+    return MAD_TO_SIGMA * select(deviations, count // 2) if count > 0 else 0.0
+
+
+def prior_validity(points: FloatArray, f: FloatArray, threshold: float, *, sigma_from_inliers: bool) -> FloatArray:
+    """Return p(v_i) of every match from its influence on the model f (thesis 4.7.2 and 4.7.3).
+
+    Args:
+        points: (N, 4) matches.
+        f: (9,) the best model so far, of norm 1.
+        threshold: largest distance of an inlier; the inliers are the fitted matches.
+        sigma_from_inliers: estimate sigma from the Cook's distances of the inliers; otherwise of all matches, as in the
+            thesis.
+    """
+    squared = squared_distances(points, f)
+    fitted = squared <= threshold * threshold
+    leverage = leverages(points, f, fitted)
+    distances = cook_distances(studentized_residuals(np.sqrt(squared), leverage, fitted), leverage)
+    return priors(distances, mad_sigma(distances[fitted] if sigma_from_inliers else distances))

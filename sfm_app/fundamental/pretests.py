@@ -1,0 +1,308 @@
+"""Quick tests of a model on few matches: T(d,d) and the sequential probability ratio test (thesis, chapter 4)."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from sfm_app.fundamental.samples import required_trials
+from sfm_app.types.arrays import IndexArray
+
+# Tests that decide which hypotheses are scored on all matches (thesis 4.4.4).
+#
+# A hypothesis is checked match by match, and every test here is one list: how many of the first m matches must be
+# inliers for the check to continue. The bail-out test and T(d,d) are defined this way. Wald's likelihood ratio
+# after m matches depends only on how many of them were inliers, so that its threshold is such a list, too: the line
+# of rejection numbers of sequential sampling inspection.
+#
+# Randomized tests begin at a new random match for every hypothesis. In a fixed order all hypotheses would be tested
+# on the same first matches: if these are outliers, every good model is rejected, however long the search is. The
+# stopping rules assume errors that are independent between hypotheses.
+
+BLOCK = 64
+"""Matches between two checks for an early exit, where no test needs more. Chosen by hand for speed."""
+
+LENIENCE = 0.5
+"""Least support of a model drawn without the priors, relative to that of the best sample. Chosen with the other
+constants of lev-ransac (benchmarks/corpus/tuning_sets.py); not measured on its own."""
+_BAIL_OUT_SIGMAS = 3.0
+"""Standard deviations that the hypergeometric count of a hypothesis may fall short by (Capel 2005): one of a thousand
+good hypotheses is rejected."""
+
+
+class PreTest(NamedTuple):
+    """A test and its statistics, as passed to kernels."""
+
+    least_inliers: IndexArray
+    """Inliers that a hypothesis must have after each `stride` matches; empty for no test."""
+    stride: int
+    random_start: bool
+    rejected: IndexArray
+    """(2,) matches checked on rejected hypotheses, and how many of them were inliers; the loop adds to it."""
+
+
+def make_pretest(least_inliers: IndexArray, stride: int, *, random_start: bool) -> PreTest:
+    """Make a pre-test with counts of 0.
+
+    Args:
+        least_inliers: (T,) inliers that a hypothesis must have at each check; empty for no test.
+        stride: matches between two checks, > 0.
+        random_start: begin at a random match for every hypothesis, not at the first.
+    """
+    return PreTest(least_inliers, stride, random_start, np.zeros(2, dtype=np.int64))
+
+
+NO_PRETEST = make_pretest(np.zeros(0, dtype=np.int64), BLOCK, random_start=False)
+"""No test: every hypothesis is scored in full, or until it cannot win."""
+
+
+class Verifier(Protocol):
+    """A test that adapts during a search, and the number of trials that allows for its errors."""
+
+    pretest: PreTest
+    lenient: PreTest
+    """Test of models from samples drawn without the priors."""
+    review: int
+    """Largest number of trials between two calls of `learn`."""
+
+    def learn(self, trials: int) -> None:
+        """Count samples that were drawn and tested."""
+
+    def expect(self, share: float) -> None:
+        """Expect this share of inliers, that of the best model."""
+
+    def required_trials(self, share: float, confidence: float) -> float:
+        """Return how many samples, those already drawn included, give a clean one that passes with this probability.
+
+        Args:
+            share: share of inliers, in [0, 1].
+            confidence: wanted probability, in (0, 1).
+        """
+
+
+class FullVerification:
+    """All hypotheses are scored on all matches."""
+
+    review = 2**62
+
+    def __init__(self, count: int, sample_size: int) -> None:
+        self.count, self.sample_size = count, sample_size
+        self.pretest = self.lenient = NO_PRETEST
+
+    def learn(self, trials: int) -> None:
+        """Do nothing: the test does not depend on the samples."""
+
+    def expect(self, share: float) -> None:
+        """Do nothing: the test does not depend on the share of inliers."""
+
+    def required_trials(self, share: float, confidence: float) -> float:
+        """Return how many samples give a clean one with this probability.
+
+        Args:
+            share: share of inliers, in [0, 1].
+            confidence: wanted probability, in (0, 1).
+        """
+        return required_trials(share**self.sample_size, confidence)
+
+
+class BailOut(FullVerification):
+    """Reject a hypothesis once it has too few inliers to be the best one (Capel 2005); matches are in random order."""
+
+    def expect(self, share: float) -> None:
+        """Make both tests for this share of inliers, that of the best model."""
+        least = bail_out_table(self.count, share)
+        self.pretest = make_pretest(least, BLOCK, random_start=False)
+        self.lenient = make_pretest((LENIENCE * least).astype(np.int64), BLOCK, random_start=False)
+
+
+class RandomizedTdd(FullVerification):
+    """T(d,d): the first d matches must all be inliers (Matas and Chum 2004, who find d = 1 best).
+
+    A clean model passes with probability share^d, so that more samples are needed.
+    """
+
+    d = 1
+
+    def __init__(self, count: int, sample_size: int) -> None:
+        super().__init__(count, sample_size)
+        self.pretest = self.lenient = make_pretest(np.arange(1, self.d + 1), 1, random_start=True)
+
+    def required_trials(self, share: float, confidence: float) -> float:
+        """Return how many samples give a clean one that passes with this probability.
+
+        Args:
+            share: share of inliers, in [0, 1].
+            confidence: wanted probability, in (0, 1).
+        """
+        return required_trials(share ** (self.sample_size + self.d), confidence)
+
+
+def bail_out_table(count: int, inlier_share: float) -> IndexArray:
+    """Return how many inliers a hypothesis must have after each block to be scored further.
+
+    A hypothesis as good as the best one has a share `inlier_share` of inliers; in the first m of N matches their number
+    is hypergeometric, and is below the returned counts about once in a thousand times.
+
+    Args:
+        count: number of matches.
+        inlier_share: share of inliers of the best model, in [0, 1].
+
+    Returns:
+        (blocks,) counts.
+    """
+    seen = np.arange(BLOCK, count, BLOCK, dtype=np.float64)
+    mean = seen * inlier_share
+    deviation = np.sqrt(mean * (1 - inlier_share) * (count - seen) / max(count - 1, 1))
+    return np.maximum(np.floor(mean - _BAIL_OUT_SIGMAS * deviation), 0).astype(np.int64)
+
+
+# Wald's sequential probability ratio test of hypotheses (Matas and Chum 2005, Chum and Matas 2008; thesis 4.9).
+#
+# Matches are inliers of a good model with probability epsilon, of a bad one with probability delta. The likelihood
+# ratio of "bad" to "good" is multiplied up match by match; when it exceeds A the model is rejected, which happens
+# to a good one with a probability of at most 1/A.
+
+FIRST_EPSILON, FIRST_DELTA = 0.1, 0.01
+"""Initial guesses: few inliers, and few chance inliers in a thin band around the epipolar lines. docs/algorithms.md,
+Fundamental matrices. Chosen by hand; not measured on their own."""
+MODEL_COST = {7: 160.0, 8: 160.0}
+"""t_M: time for a sample and its models over the time to check one match, by sample size; measured (1.1 us, 7 ns). The
+command is not on record; the figure stands in docs/algorithms.md, Fundamental matrices."""
+MODELS_PER_SAMPLE = {7: 2.45, 8: 1.0}
+"""m_S, by sample size; measured. The command is not on record; the thesis prints 2.3 (4.4.4)."""
+
+_MOST_EPSILON = 0.999
+"""Largest epsilon: beyond it the logarithm of 1 - epsilon is useless. Chosen by hand; not measured on its own."""
+_PRIOR_WEIGHT = 100.0
+"""Weight of the initial delta, in checked matches. Chosen by hand; not measured on its own."""
+_DELTA_TOLERANCE = 0.05
+"""Relative change of delta that requires a new test. docs/algorithms.md, Fundamental matrices. Chosen by hand; not
+measured on its own."""
+_REVIEW = 100
+"""Largest number of trials between two updates of delta. Chosen by hand; not measured on its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class SequentialTest:
+    """One test: the inlier probabilities it was designed for, and its threshold."""
+
+    epsilon: float
+    """Probability that a match is an inlier of a good model."""
+    delta: float
+    """Probability that a match is an inlier of a bad model."""
+    log_threshold: float
+    """log A; inf where delta and epsilon allow no test."""
+
+    def least_inliers(self, count: int) -> IndexArray:
+        """Return (count,) numbers of inliers below which the ratio exceeds A after 1, 2, ... matches."""
+        if math.isinf(self.log_threshold):
+            return np.zeros(0, dtype=np.int64)
+        hit, miss = self._log_steps()
+        seen = np.arange(1, count + 1)
+        # k hits and m - k misses: reject if k hit + (m - k) miss > log A
+        least: IndexArray = np.maximum(np.ceil((seen * miss - self.log_threshold) / (miss - hit)), 0).astype(np.int64)
+        return least
+
+    def pass_rate(self, share: float) -> float:
+        """Return the least probability that a good model with this true share of inliers passes: 1 - A^-h."""
+        if math.isinf(self.log_threshold):
+            return 1.0
+        return -math.expm1(-self.log_threshold * _exponent(*self._log_steps(), min(share, _MOST_EPSILON)))
+
+    def _log_steps(self) -> tuple[float, float]:
+        """Return the increments of the log-likelihood ratio for an inlier and for an outlier."""
+        return math.log(self.delta / self.epsilon), math.log((1 - self.delta) / (1 - self.epsilon))
+
+
+@lru_cache(maxsize=1024)  # called repeatedly with the same share
+def _exponent(hit: float, miss: float, share: float) -> float:
+    """Return the h > 0 with E[ratio^h] = 1 where `share` of the matches are inliers; h = 1 for share = epsilon.
+
+    Returns 0 if the ratio does not decrease on average: such a model is certain to be rejected in the end.
+    """
+    if share * hit + (1 - share) * miss >= 0:
+        return 0.0
+    low, high = 0.0, 1.0
+    while share * math.exp(high * hit) + (1 - share) * math.exp(high * miss) < 1:
+        low, high = high, 2 * high
+    for _ in range(60):
+        middle = (low + high) / 2
+        if share * math.exp(middle * hit) + (1 - share) * math.exp(middle * miss) < 1:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def design(epsilon: float, delta: float, sample_size: int) -> SequentialTest:
+    """Return the fastest test for these probabilities: A = t_M C / m_S + 1 + log A.
+
+    A larger A wastes matches on bad models; a smaller one wastes samples, because good models are rejected.
+
+    Args:
+        epsilon: share of inliers of a good model, in (0, 1].
+        delta: share of inliers of a bad model; a test needs 0 < delta < epsilon.
+        sample_size: matches in a sample, 7 or 8.
+    """
+    epsilon = min(epsilon, _MOST_EPSILON)
+    if not 0 < delta < epsilon:
+        return SequentialTest(epsilon, delta, math.inf)
+    # C: average increment of the log-likelihood ratio per match of a bad model
+    gain = (1 - delta) * math.log((1 - delta) / (1 - epsilon)) + delta * math.log(delta / epsilon)
+    cost = MODEL_COST[sample_size] * gain / MODELS_PER_SAMPLE[sample_size] + 1
+    threshold = cost
+    for _ in range(20):
+        threshold = cost + math.log(threshold)
+    return SequentialTest(epsilon, delta, math.log(threshold))
+
+
+class Sprt:
+    """The test as a verifier, designed again when the estimate of epsilon or delta changes."""
+
+    review = _REVIEW
+
+    def __init__(self, count: int, sample_size: int) -> None:
+        self._count, self._sample_size = count, sample_size
+        self._rejected = np.zeros(2, dtype=np.int64)
+        self._past: list[tuple[SequentialTest, int]] = []
+        self._begin(FIRST_EPSILON, FIRST_DELTA)
+
+    def _begin(self, epsilon: float, delta: float) -> None:
+        self._test, self._trials = design(epsilon, delta, self._sample_size), 0
+        self.pretest = self.lenient = PreTest(self._test.least_inliers(self._count), 1, True, self._rejected)
+
+    def _renew(self, epsilon: float) -> None:
+        self._past.append((self._test, self._trials))
+        self._begin(epsilon, self._delta())
+
+    def _delta(self) -> float:
+        """Return the share of inliers among the matches checked on rejected models, with the initial delta as prior."""
+        checked, inliers = self._rejected
+        return float((inliers + FIRST_DELTA * _PRIOR_WEIGHT) / (checked + _PRIOR_WEIGHT))
+
+    def learn(self, trials: int) -> None:
+        """Count samples that were drawn and tested; design a new test if delta has changed."""
+        self._trials += trials
+        if abs(self._delta() - self._test.delta) > _DELTA_TOLERANCE * self._test.delta:
+            self._renew(self._test.epsilon)
+
+    def expect(self, share: float) -> None:
+        """Make a new test for this share of inliers, that of the best model."""
+        self._renew(share)
+
+    def required_trials(self, share: float, confidence: float) -> float:
+        """Return the number of samples by (3.19); each test so far passed clean samples with its own probability.
+
+        Args:
+            share: share of inliers, in [0, 1].
+            confidence: wanted probability, in (0, 1).
+        """
+        clean = share**self._sample_size
+        missed, drawn = 0.0, 0  # log-probability that all samples so far were contaminated, or clean but rejected
+        for test, trials in self._past:
+            # with a share of 1, past samples would be certain successes
+            missed += trials * math.log1p(-min(clean * test.pass_rate(share), _MOST_EPSILON))
+            drawn += trials
+        return drawn + required_trials(clean * self._test.pass_rate(share), confidence, missed)

@@ -1,0 +1,97 @@
+"""The estimators of thesis chapter 4, each described by its parts.
+
+All of them run the same loop with different samplers, solvers, scores, verifiers or stopping rules. Parts that are not
+named are the defaults of `estimator_config.Recipe`. The threshold T is `max_error_px`; the thesis takes 1.96 px for a
+noise of 1 px.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+
+from sfm_app.fundamental.estimate import estimate
+from sfm_app.fundamental.leverage import prior_validity
+from sfm_app.fundamental.loop import Recipe
+from sfm_app.fundamental.pretests import RandomizedTdd, Sprt
+from sfm_app.fundamental.refits import refit_sampson
+from sfm_app.fundamental.scores import lmeds, mlesac, msac, msac_linear, ransac, residual_validity, squared_distances
+from sfm_app.numerical import MAD_TO_SIGMA
+from sfm_app.settings import EpipolarSettings
+from sfm_app.types import EpipolarFit, Rejected
+from sfm_app.types.arrays import FloatArray
+
+_LMEDS_SIGMAS = 2.5
+"""Robust standard deviations within which matches are inliers of LMedS (Rousseeuw and Leroy 1987)."""
+
+
+def _refit_to_median(points: FloatArray, F: FloatArray, _threshold: float) -> FloatArray:
+    """Refit to the matches within 2.5 robust standard deviations: LMedS knows the scale by itself."""
+    squared = squared_distances(points, np.ascontiguousarray(F).reshape(9))
+    return refit_sampson(points, F, _LMEDS_SIGMAS * median_sigma(squared))
+
+
+def median_sigma(squared: FloatArray) -> float:
+    """Return the standard deviation of the inliers from the median of the squared distances (Rousseeuw and Leroy 1987).
+
+    The factor 1 + 5 / (n - p) compensates for the p = 7 matches that a minimal model meets exactly.
+    """
+    return MAD_TO_SIGMA * (1 + 5 / max(len(squared) - 7, 1)) * math.sqrt(float(np.median(squared)))
+
+
+RANSAC = Recipe(score=ransac, finish=refit_sampson)
+LEV_RANSAC = replace(
+    RANSAC,
+    score=msac_linear,
+    validity=partial(prior_validity, sigma_from_inliers=False),
+    stop_on_convergence=True,
+)
+
+RECIPES: Mapping[str, tuple[Recipe, str]] = {
+    "lev-ransac-thesis": (LEV_RANSAC, "Algorithm 1 of the thesis to the letter"),
+    "lev-ransac-sprt": (
+        replace(LEV_RANSAC, verifier=Sprt),
+        "lev-ransac-thesis with Wald's sequential test of hypotheses",
+    ),
+    "lev-ransac-tdd": (
+        replace(LEV_RANSAC, verifier=RandomizedTdd),
+        "lev-ransac-thesis with the T(1,1) test of hypotheses",
+    ),
+    "res-ransac": (
+        replace(RANSAC, score=mlesac, validity=residual_validity, warmup_share=0.1),
+        "MLESAC with samples guided by the residuals of the best model",
+    ),
+    "mlesac": (replace(RANSAC, score=mlesac), "likelihood of Gaussian inliers and uniform outliers"),
+    "msac": (replace(RANSAC, score=msac), "uniform samples, truncated squared error"),
+    "ransac": (RANSAC, "uniform samples, number of outliers"),
+    "ransac-sprt": (replace(RANSAC, verifier=Sprt), "ransac with Wald's sequential test of hypotheses"),
+    "ransac-tdd": (replace(RANSAC, verifier=RandomizedTdd), "ransac with the T(1,1) test of hypotheses"),
+    "lmeds": (
+        replace(RANSAC, score=lmeds, assumed_share=0.5, finish=_refit_to_median),
+        "least median of squares, for up to half outliers",
+    ),
+}
+"""By name: recipe, and one line about it. RES-RANSAC draws a tenth of its trials before it has priors (thesis 4.6.2);
+LMedS assumes half outliers (4.4.1)."""
+
+
+class ClassicalEstimator:
+    """A callable that runs the recipe of a name in `RECIPES`; see `estimate`."""
+
+    def __init__(self, name: str) -> None:
+        self.__name__ = name
+
+    def __call__(self, x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
+        return estimate(x1, x2, options, seed, RECIPES[self.__name__][0])
+
+    def __reduce__(self) -> tuple[Callable[[str], "ClassicalEstimator"], tuple[str]]:
+        """Pickle by name, as functions are: a worker process looks up its own instance."""
+        return classical_estimator, (self.__name__,)
+
+
+@cache
+def classical_estimator(name: str) -> ClassicalEstimator:
+    """Return the estimator of a name in `RECIPES`, always the same object."""
+    return ClassicalEstimator(name)

@@ -1,0 +1,585 @@
+"""Fits to all inliers: rank two, Sampson distance, Gold Standard (thesis, chapter 4)."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_app.fundamental.leverage import mad_sigma
+from sfm_app.fundamental.scores import FIRST, fill_squared_distances, squared_distances
+from sfm_app.fundamental.solvers import LANES, add_products, decompose_symmetric, gather, mirror, weighted_gram
+from sfm_app.geometry.epipolar import nearest_exact_matches, nearest_rank_two, to_homogeneous, to_unit_norm
+from sfm_app.geometry.least_squares import DampingRange, damped_step
+from sfm_app.jit import kernel, summing_kernel
+from sfm_app.types.arrays import FloatArray
+
+# Matrices of rank 2 as rotations and a singular value: F = U diag(1, s, 0) V' (Bartoli and Sturm 2004).
+#
+# Three parameters of each rotation and s are seven in all: every step keeps rank 2, and scale is not a parameter. A
+# step replaces U by U exp([a]x) and V by V exp([b]x).
+
+LEAST_RATIO = 1e-12
+"""Least ratio of the first two singular values: below it a matrix counts as rank 1. Rounding in double precision leaves
+1e-16; the margin was chosen by hand."""
+
+
+@kernel
+def factorize(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
+    """Decompose the nearest matrix of rank 2, up to scale, into U diag(1, s, 0) V'; return U, s, V."""
+    gram, values, vectors = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                gram[i, j] += F[k, i] * F[k, j]
+    decompose_symmetric(gram, values, vectors)
+    U, V = np.empty((3, 3)), np.empty((3, 3))
+    for k in range(2):
+        for i in range(3):
+            V[i, k] = vectors[i, 2 - k]
+        for i in range(3):
+            U[i, k] = F[i, 0] * V[0, k] + F[i, 1] * V[1, k] + F[i, 2] * V[2, k]
+    first = _normalize(U, FIRST)
+    _orthogonalize(U)  # removes rounding errors, which matter where s is small
+    second = _normalize(U, 1)
+    if not second > LEAST_RATIO * first:  # rank 1: any second column will do
+        least = 0
+        for i in range(1, 3):
+            least = i if abs(U[i, 0]) < abs(U[least, 0]) else least
+        for i in range(3):
+            U[i, 1] = 1.0 if i == least else 0.0
+        _orthogonalize(U)
+        _normalize(U, 1)
+    for i in range(3):  # the third columns, of singular value 0, make both matrices rotations
+        j, k = (i + 1) % 3, (i + 2) % 3
+        U[i, 2] = U[j, 0] * U[k, 1] - U[k, 0] * U[j, 1]
+        V[i, 2] = V[j, 0] * V[k, 1] - V[k, 0] * V[j, 1]
+    return U, second / first, V
+
+
+@kernel
+def _normalize(U: FloatArray, k: int) -> float:
+    """Divide column k by its length; return the length."""
+    length = np.sqrt(U[0, k] * U[0, k] + U[1, k] * U[1, k] + U[2, k] * U[2, k])
+    for i in range(3):
+        U[i, k] /= length
+    return float(length)
+
+
+@kernel
+def _orthogonalize(U: FloatArray) -> None:
+    """Make the second column perpendicular to the first, a unit vector."""
+    dot = U[0, 0] * U[0, 1] + U[1, 0] * U[1, 1] + U[2, 0] * U[2, 1]
+    for i in range(3):
+        U[i, 1] -= dot * U[i, 0]
+
+
+@kernel
+def compose(U: FloatArray, s: float, V: FloatArray) -> FloatArray:
+    """Return the (9,) entries of U diag(1, s, 0) V' by rows.
+
+    Args:
+        U: (3, 3) rotation.
+        s: second singular value; the first is 1.
+        V: (3, 3) rotation.
+    """
+    f = np.empty(9)
+    for i in range(3):
+        for j in range(3):
+            f[3 * i + j] = U[i, 0] * V[j, 0] + s * U[i, 1] * V[j, 1]
+    return f
+
+
+@kernel
+def fill_tangent_basis(U: FloatArray, s: float, V: FloatArray, basis: FloatArray) -> None:
+    """Write the derivatives of F by the seven parameters, one row each: U [e_k]x S V', -U S [e_k]x V', u2 v2'.
+
+    Args:
+        U: (3, 3) rotation.
+        s: second singular value; the first is 1.
+        V: (3, 3) rotation.
+        basis: (7, 9), written to.
+    """
+    for i in range(3):
+        for j in range(3):
+            k = 3 * i + j
+            basis[0, k] = U[i, 2] * s * V[j, 1]
+            basis[1, k] = -U[i, 2] * V[j, 0]
+            basis[2, k] = U[i, 1] * V[j, 0] - U[i, 0] * s * V[j, 1]
+            basis[3, k] = s * U[i, 1] * V[j, 2]
+            basis[4, k] = -U[i, 0] * V[j, 2]
+            basis[5, k] = U[i, 0] * V[j, 1] - s * U[i, 1] * V[j, 0]
+            basis[6, k] = U[i, 1] * V[j, 1]
+
+
+@kernel
+def rotate(R: FloatArray, w: FloatArray) -> FloatArray:
+    """Return R exp([w]x) by Rodrigues' formula.
+
+    Args:
+        R: (3, 3) rotation.
+        w: (3,) rotation vector in radians.
+    """
+    angle = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    a = np.sin(angle) / angle if angle > 1e-8 else 1.0
+    b = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-8 else 0.5
+    product = np.empty((3, 3))
+    for i in range(3):
+        # row r of R times exp([w]x) = r - a (w x r) + b w x (w x r), because r [w]x = -(w x r)
+        x, y, z = R[i, 0], R[i, 1], R[i, 2]
+        cx, cy, cz = w[1] * z - w[2] * y, w[2] * x - w[0] * z, w[0] * y - w[1] * x
+        product[i, 0] = x - a * cx + b * (w[1] * cz - w[2] * cy)
+        product[i, 1] = y - a * cy + b * (w[2] * cx - w[0] * cz)
+        product[i, 2] = z - a * cz + b * (w[0] * cy - w[1] * cx)
+    return product
+
+
+# Non-linear refinement of F on the Sampson distance (thesis 4.3, Eq. 4.2), over its seven degrees of freedom.
+#
+# The parameters are those of `rank_two`. All fits are iteratively reweighted least squares: weigh the matches by
+# their distances, take one Levenberg-Marquardt step that lowers sum_i w_i r_i^2, weigh again. For a cost that is a
+# concave function of r^2, as robust costs are, such a step lowers the cost itself as well.
+
+_FIRST_DAMPING, _SMALLEST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e-12, 1e12
+"""Damping of Levenberg-Marquardt steps, relative to the curvature. Chosen by hand; not measured on their own."""
+_COST_TOLERANCE = 1e-9
+"""Relative decrease of the cost below which the iteration ends. Chosen by hand; not measured on its own."""
+_LIKELIHOOD_TOLERANCE = 1e-4
+"""Relative decrease of the cost below which the mixture fit ends. Chosen by hand; not measured on its own."""
+_NEGLIGIBLE = 1e-3
+"""Weight below which a match is left out of a step. Chosen by hand; not measured on its own."""
+_LEAST_SIGMA = 0.02
+"""Least sigma in thresholds: without it nearly perfect matches would exclude all others. Chosen by hand; not measured
+on its own."""
+_FIRST_SHARE, _MOST_SHARE = 0.9, 0.999
+"""Share of inliers among the matches within reach: initial value and upper bound in expectation maximization. Chosen by
+hand; not measured on their own."""
+_FIRST_ROUNDS = 6
+"""Rounds of expectation maximization before the first step; one before each later step. Chosen by hand; not measured
+on its own."""
+_LEAST_CURVATURE = 1e-9
+"""Least curvature that damping multiplies, relative to the largest: matches may leave a direction of F free. Chosen by
+hand; not measured on its own."""
+
+
+class Weighting(NamedTuple):
+    """How squared distances become weights: by a robust cost, or by a mixture of two densities."""
+
+    is_mixture: bool = False
+    softness: float = 0.0
+    """1 / c^2 of the robust cost r^2 / (1 + r^2 / c^2); 0 for least squares. Not used by the mixture."""
+    squared_reach: float = 0.0
+    """Mixture: squared distance within which matches count; outliers are uniform up to this distance."""
+    largest_variance: float = 0.0
+    """Mixture: upper bound of the inliers' variance."""
+    first_variance: float = 0.0
+    """Mixture: initial variance in expectation maximization."""
+
+
+def refine_sampson(
+    points: FloatArray, F: FloatArray, *, scale: float = np.inf, most_steps: int = 20, enough: float = _COST_TOLERANCE
+) -> FloatArray:
+    """Move F towards a minimum of sum_i r_i^2 / (1 + r_i^2 / c^2) (Geman and McClure 1987).
+
+    Args:
+        points: (N, 4) matches.
+        F: (3, 3) start.
+        scale: c, in the units of `points`; inf for least squares.
+        most_steps: largest number of Levenberg-Marquardt steps.
+        enough: relative decrease of the cost below which to stop.
+
+    Returns:
+        (3, 3), rank 2, its largest singular value 1.
+    """
+    weighing = Weighting(softness=float(scale**-2))
+    return _reweighted_least_squares(points, *factorize(F), weighing, most_steps, enough, np.empty((10, 10)))
+
+
+def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach: float, most_steps: int) -> FloatArray:
+    """Estimate F with the sigma and share of inliers by maximum likelihood: EM (thesis 3.5 and 4.6).
+
+    Among the matches within `reach` thresholds, signed distances of inliers are Gaussian about 0, those of outliers
+    uniform. The weight of a match is the probability that it is an inlier. sigma is at most one threshold.
+
+    Args:
+        points: (N, 4) matches.
+        F: (3, 3) start, near enough for its inliers to determine sigma.
+        threshold: largest distance of an inlier.
+        reach: thresholds within which matches count, > 1.
+        most_steps: largest number of steps.
+
+    Returns:
+        (3, 3), rank 2, its largest singular value 1.
+    """
+    U, s, V = factorize(F)
+    squared = squared_distances(points, compose(U, s, V))
+    inside = squared[squared <= threshold * threshold]
+    sigma = mad_sigma(np.sqrt(inside)) if len(inside) else threshold
+    squared_reach = float((reach * threshold) ** 2)
+    weighing = Weighting(
+        is_mixture=squared_reach > 0.0,  # where the squared threshold underflows, fall back to least squares
+        squared_reach=squared_reach,
+        largest_variance=float(threshold**2),
+        first_variance=float(min(sigma, threshold) ** 2),
+    )
+    return _reweighted_least_squares(points, U, s, V, weighing, most_steps, _LIKELIHOOD_TOLERANCE, np.empty((10, 10)))
+
+
+def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
+    """Apply the 8-point algorithm (thesis 4.3.2) on matches that are well scaled already.
+
+    Args:
+        points: (N, 4), of magnitude about 1.
+        weights: (N,) >= 0, how much each squared algebraic error counts; at least eight positive ones.
+
+    Returns:
+        (3, 3), rank 2.
+    """
+    U, s, V = factorize(fit_algebraic(points, weights))
+    return compose(U, s, V).reshape(3, 3)
+
+
+def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the (3, 3) matrix of norm 1 and any rank with the least algebraic error: `fit_eight_point` without rank 2.
+
+    Args:
+        points: (N, 4), of magnitude about 1.
+        weights: (N,) >= 0, at least eight positive ones.
+    """
+    _, vectors = np.linalg.eigh(weighted_gram(points, weights))
+    return np.ascontiguousarray(vectors[:, 0]).reshape(3, 3)
+
+
+@kernel
+def _reweighted_least_squares(
+    points: FloatArray, U: FloatArray, s: float, V: FloatArray, weighing: Weighting, most_steps: int, enough: float,
+    gram: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """Weigh and step in turn until a step lowers the cost by less than the relative decrease `enough`.
+
+    `gram` (10, 10) is a work array: if its size were known at compile time, the compiler would unroll all sums.
+    """
+    count = points.shape[0]
+    weights, squared, trial = np.empty(count), np.empty(count), np.empty(count)
+    normal, right, step = np.empty((7, 7)), np.empty(7), np.empty(7)
+    f = compose(U, s, V)
+    fill_squared_distances(points, f, FIRST, squared)
+    damping, variance, share = _FIRST_DAMPING, weighing.first_variance, _FIRST_SHARE
+    for n in range(most_steps):
+        if weighing.is_mixture:
+            rounds = _FIRST_ROUNDS if n == 0 else 1
+            variance, share = _weigh_by_mixture(squared, weighing, variance, share, rounds, weights)
+        else:
+            _weigh_robustly(squared, weighing.softness, weights)
+        cost = new_cost = _weighted_sum(squared, weights)
+        _normal_equations(points, f, weights, U, s, V, gram, normal, right)
+        improved = False
+        while not improved and damping < _LARGEST_DAMPING:
+            if _solve(normal, right, damping, step):
+                U_new, V_new, s_new = rotate(U, step[0:3]), rotate(V, step[3:6]), s + step[6]
+                new = compose(U_new, s_new, V_new)
+                fill_squared_distances(points, new, FIRST, trial)
+                new_cost = _weighted_sum(trial, weights)
+                improved = new_cost < cost
+            damping = max(damping * 0.1, _SMALLEST_DAMPING) if improved else damping * 10.0
+        if not improved:
+            break
+        U, V, s, f = U_new, V_new, s_new, new
+        squared, trial = trial, squared
+        if cost - new_cost <= enough * cost:
+            break
+    return f.reshape(3, 3)
+
+
+@kernel
+def _weigh_robustly(squared: FloatArray, softness: float, weights: FloatArray) -> None:
+    """Weigh matches by d/d(r^2) of r^2 / (1 + softness r^2)."""
+    for i in range(squared.shape[0]):
+        root = 1.0 / (1.0 + softness * squared[i])
+        weights[i] = root * root if root * root > _NEGLIGIBLE else 0.0
+
+
+@kernel
+def _weigh_by_mixture(
+    squared: FloatArray, weighing: Weighting, variance: float, share: float, rounds: int, weights: FloatArray
+) -> tuple[float, float]:
+    """Weigh matches by their probability to be inliers; return the new variance and share of inliers."""
+    reach, largest = weighing.squared_reach, weighing.largest_variance
+    for _ in range(rounds):
+        inlier, outlier = share * np.sqrt(2.0 / (np.pi * variance)), (1.0 - share) / np.sqrt(reach)
+        near, total, moment = 0, 0.0, 0.0
+        for i in range(squared.shape[0]):
+            weights[i] = 0.0
+            if squared[i] < reach:
+                near += 1
+                density = inlier * np.exp(-squared[i] / (2.0 * variance))
+                weight = density / (density + outlier)
+                total += weight
+                moment += weight * squared[i]
+                weights[i] = weight if weight > _NEGLIGIBLE else 0.0
+        variance = moment / max(total - 7.0, 1.0)  # seven parameters of F are fitted to the same matches
+        variance = min(max(variance, _LEAST_SIGMA * _LEAST_SIGMA * largest), largest)
+        share = min(max(total / max(near, 1), 1.0 - _MOST_SHARE), _MOST_SHARE)
+    return variance, share
+
+
+@summing_kernel
+def _weighted_sum(squared: FloatArray, weights: FloatArray) -> float:
+    total = 0.0
+    for i in range(squared.shape[0]):
+        total += weights[i] * squared[i] if weights[i] > 0.0 else 0.0
+    return total
+
+
+@kernel
+def _normal_equations(
+    points: FloatArray, f: FloatArray, weights: FloatArray, U: FloatArray, s: float, V: FloatArray,
+    gram: FloatArray, normal: FloatArray, right: FloatArray,
+) -> None:  # fmt: skip
+    """Write the weighted J'J and -J'r of the seven parameters to `normal` and `right`."""
+    size = gram.shape[0]
+    for j in range(size):
+        for k in range(size):
+            gram[j, k] = 0.0
+    block, rows = np.empty((5, LANES)), np.empty((size, LANES))
+    start = FIRST
+    while start < points.shape[0]:
+        count, start = gather(points, weights, start, block)
+        _derivatives(block, count, f, rows)
+        add_products(rows, count, gram)
+    mirror(gram)
+    basis = np.empty((7, 9))
+    fill_tangent_basis(U, s, V, basis)
+    _project(gram, basis, normal, right)
+
+
+@kernel
+def _derivatives(block: FloatArray, count: int, f: FloatArray, rows: FloatArray) -> None:
+    """Write dr / dF (9 rows) and r (the last row) of the matches of a block, times sqrt(weight).
+
+    r = n / g with n = x2' F x1 and g the norm of its gradient: dr = dn / g - r dg / g.
+    """
+    f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
+    for n in range(count):
+        x1, y1, x2, y2 = block[0, n], block[1, n], block[2, n], block[3, n]
+        ax, ay, az = f0 * x1 + f1 * y1 + f2, f3 * x1 + f4 * y1 + f5, f6 * x1 + f7 * y1 + f8
+        bx, by = f0 * x2 + f3 * y2 + f6, f1 * x2 + f4 * y2 + f7
+        inverse = 1.0 / np.sqrt(ax * ax + ay * ay + bx * bx + by * by)
+        residual = (x2 * ax + y2 * ay + az) * inverse
+        shrink, scale = residual * inverse, inverse * block[4, n]
+        rows[0, n] = (x2 * x1 - shrink * (ax * x1 + bx * x2)) * scale
+        rows[1, n] = (x2 * y1 - shrink * (ax * y1 + by * x2)) * scale
+        rows[2, n] = (x2 - shrink * ax) * scale
+        rows[3, n] = (y2 * x1 - shrink * (ay * x1 + bx * y2)) * scale
+        rows[4, n] = (y2 * y1 - shrink * (ay * y1 + by * y2)) * scale
+        rows[5, n] = (y2 - shrink * ay) * scale
+        rows[6, n] = (x1 - shrink * bx) * scale
+        rows[7, n] = (y1 - shrink * by) * scale
+        rows[8, n] = scale
+        rows[9, n] = residual * block[4, n]
+
+
+@kernel
+def _project(gram: FloatArray, basis: FloatArray, normal: FloatArray, right: FloatArray) -> None:
+    """Project the normal equations of the nine entries (last row: the gradient) to the seven parameters."""
+    part = np.empty(9)
+    for p in range(7):
+        right[p] = 0.0
+        for j in range(9):
+            right[p] -= basis[p, j] * gram[9, j]
+            part[j] = 0.0
+            for k in range(9):
+                part[j] += gram[j, k] * basis[p, k]
+        for q in range(7):
+            normal[p, q] = 0.0
+            for j in range(9):
+                normal[p, q] += part[j] * basis[q, j]
+
+
+@kernel
+def _solve(normal: FloatArray, right: FloatArray, damping: float, step: FloatArray) -> bool:
+    """Write the Cholesky solution of (normal + damping diag(normal)) step = right.
+
+    Returns False if the matrix is not positive definite.
+    """
+    lower = normal.copy()
+    largest = 0.0
+    for j in range(7):
+        largest = max(largest, normal[j, j])
+    for j in range(7):
+        lower[j, j] += damping * max(normal[j, j], _LEAST_CURVATURE * largest)
+    for j in range(7):
+        for k in range(j):
+            for n in range(k):
+                lower[j, k] -= lower[j, n] * lower[k, n]
+            lower[j, k] /= lower[k, k]
+            lower[j, j] -= lower[j, k] * lower[j, k]
+        if not lower[j, j] > 0.0:
+            return False
+        lower[j, j] = np.sqrt(lower[j, j])
+    for j in range(7):
+        step[j] = right[j]
+        for k in range(j):
+            step[j] -= lower[j, k] * step[k]
+        step[j] /= lower[j, j]
+    for j in range(6, -1, -1):
+        for k in range(j + 1, 7):
+            step[j] -= lower[k, j] * step[k]
+        step[j] /= lower[j, j]
+    return True
+
+
+# The Gold Standard refit: F of the projective reconstruction with least reprojection error (thesis 4.3, HZ
+# 11.4.1)::
+#
+# cost = sum_i c^2 log(1 + r_i^2 / c^2) (c = inf: least squares)
+#
+# with r_i the reprojection distance of match i, which is already minimized over its point X_i. Bundle adjustment of
+# two views has twelve camera parameters and three per point, but of the twelve only the seven of F count (2.34: v
+# and lambda are free), and the Schur complement of a point at its optimum leaves one equation per match: r_i, with
+# the derivative x2 x1' / |gradient of x2' F x1| over F, both evaluated at the nearest exact match. So this is
+# Levenberg-Marquardt over F alone, with the points eliminated exactly. It needs no depth: points at infinity are no
+# special case, and points near an epipole, whose depth is undetermined, do not hold back the others. Time and
+# memory grow with the number of matches.
+
+DAMPING = DampingRange(first=1e-4, least=1e-12, most=1e12)
+"""Damping of Levenberg-Marquardt steps. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+_LEAST_GOLD_CURVATURE = 1e-12
+"""Least curvature, relative to the largest: some matches leave a direction of F free. Chosen by hand; halved and
+doubled by `benchmarks.sensitivity`."""
+
+
+def refine_reprojection(
+    points: FloatArray, F: FloatArray, *, scale: float = np.inf, most_steps: int = 20
+) -> FloatArray:
+    """Move F to a local minimum of the cost above.
+
+    Args:
+        points: (N, 4) inliers, of magnitude about 1.
+        F: (3, 3) start.
+        scale: Cauchy scale c, in the units of `points`; inf for plain least squares.
+        most_steps: largest number of Levenberg-Marquardt steps.
+
+    Returns:
+        (3, 3), rank 2, Frobenius norm 1.
+
+    Raises:
+        NumericalError: F is zero or not finite.
+    """
+    softness = 1.0 / (scale * scale)
+    F = to_unit_norm(nearest_rank_two(to_unit_norm(F)))
+    moves = _moves(points, F)
+    cost, damping = _cost(moves, softness), DAMPING.first
+
+    def attempt(tried: float) -> tuple[FloatArray, FloatArray, float] | None:
+        step = np.linalg.solve(normal + tried * np.diag(curvature), right)
+        trial = to_unit_norm(nearest_rank_two(F + (step @ basis).reshape(3, 3)))
+        reached = _moves(points, trial)
+        lower = _cost(reached, softness)
+        return (trial, reached, lower) if lower < cost else None
+
+    for _ in range(most_steps):
+        if not 0 < cost < np.inf:
+            break
+        basis = _tangent_basis(F)
+        normal, right = _gold_normal_equations(points, F, moves, softness, basis)
+        curvature = np.maximum(np.diag(normal), _LEAST_GOLD_CURVATURE * np.diag(normal).max())
+        found, damping = damped_step(attempt, damping, DAMPING)
+        if found is None:
+            break
+        before, (F, moves, cost) = cost, found
+        if before - cost <= _COST_TOLERANCE * before:
+            break
+    return F
+
+
+def _moves(points: FloatArray, F: FloatArray) -> FloatArray:
+    """Return (N, 4) displacements from every match to the nearest exact match, where its best point projects."""
+    return np.hstack(nearest_exact_matches(F, points[:, :2], points[:, 2:])) - points
+
+
+def _cost(moves: FloatArray, softness: float) -> float:
+    squared = (moves**2).sum(axis=1)
+    return float((np.log1p(softness * squared) / softness if softness > 0 else squared).sum())
+
+
+def _tangent_basis(F: FloatArray) -> FloatArray:
+    """Return (7, 9) orthonormal directions that to first order keep the rank 2 and the norm 1 of F."""
+    U, _, Vt = np.linalg.svd(F)
+    basis: FloatArray = np.linalg.svd(np.stack([np.outer(U[:, 2], Vt[2]).ravel(), F.ravel()]))[2][2:]
+    return basis
+
+
+def _gold_normal_equations(
+    points: FloatArray, F: FloatArray, moves: FloatArray, softness: float, basis: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return weighted J'J (7, 7) and -J'r (7,) over the directions of `basis`, the points eliminated."""
+    exact1, exact2 = to_homogeneous(points[:, :2] + moves[:, :2]), to_homogeneous(points[:, 2:] + moves[:, 2:])
+    gradient = np.hstack([(exact2 @ F)[:, :2], (exact1 @ F.T)[:, :2]])
+    length = np.linalg.norm(gradient, axis=1)
+    inverse = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)  # 0 at both epipoles
+    residuals = -(moves * gradient).sum(axis=1) * inverse
+    rows = (exact2[:, :, None] * exact1[:, None, :]).reshape(-1, 9) * inverse[:, None]
+    jacobian = np.einsum("nk,jk->nj", rows, basis)  # einsum, because it sums in one thread and a fixed order
+    weighted = jacobian / (1.0 + softness * (moves**2).sum(axis=1))[:, None]
+    return np.einsum("nj,nk->jk", weighted, jacobian), -np.einsum("nj,n->j", weighted, residuals)
+
+
+# The final fit: the estimator's own, optionally followed by one that the settings name (thesis 4.3).
+#
+# The three named fits are least squares on the inliers of the given model. One minimizes the algebraic distance;
+# the other two start from its result and minimize the Sampson or the reprojection distance. With fewer than eight
+# inliers the model does not change.
+
+Refit = Callable[[FloatArray, FloatArray, float], FloatArray]
+"""(points, F, threshold) -> the final F."""
+
+
+def _refit_eight_point(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
+    """Apply the 8-point algorithm (thesis 4.3.2)."""
+    inliers = _inliers(points, F, threshold)
+    return F if len(inliers) < 8 else fit_eight_point(inliers, np.ones(len(inliers)))
+
+
+def refit_sampson(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
+    """Minimize the Sampson distance (thesis 4.2).
+
+    Args:
+        points: (N, 4) matches.
+        F: (3, 3) the model to start from.
+        threshold: largest distance of an inlier, in the units of the points.
+    """
+    inliers = _inliers(points, F, threshold)
+    return refine_sampson(inliers, _refit_eight_point(points, F, threshold)) if len(inliers) >= 8 else F
+
+
+def _refit_reprojection(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
+    """Minimize the reprojection distance (thesis 4.3), starting from the minimum of the Sampson distance."""
+    inliers = _inliers(points, F, threshold)
+    return F if len(inliers) < 8 else refine_reprojection(inliers, refit_sampson(points, F, threshold))
+
+
+REFITS: dict[str, Refit] = {
+    "eight-point": _refit_eight_point,
+    "sampson": refit_sampson,
+    "reprojection": _refit_reprojection,
+}
+"""Values of `EpipolarSettings.refit` besides "auto"."""
+
+
+def choose_refit(name: str, own: Refit) -> Refit:
+    """Return the estimator's own fit, followed by the named fit to its inliers unless the name is "auto".
+
+    The own fit always comes first: its inliers are better than those of the best sample.
+
+    Args:
+        name: "auto", or a name in `REFITS`.
+        own: the estimator's own fit.
+    """
+    if name == "auto":
+        return own
+    return lambda points, F, threshold: REFITS[name](points, own(points, F, threshold), threshold)
+
+
+def _inliers(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
+    chosen = squared_distances(points, np.ascontiguousarray(F).reshape(9)) <= threshold * threshold
+    return np.asfortranarray(points[chosen])

@@ -1,0 +1,144 @@
+"""Minimal samples, and when to stop drawing them."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.types.arrays import FloatArray, IndexArray
+
+# Random minimal samples, uniform or by weight, from a generator whose state is an argument.
+#
+# The generator is splitmix64 (Steele, Lea and Flood 2014): 64 bits of state, one multiplication chain per number.
+# Its state is an argument, so that pairs can run in parallel threads and still give the same bits.
+
+RandomState = NDArray[np.uint64]
+
+SAMPLE_SIZE = 7
+"""Matches of a minimal sample: F has seven degrees of freedom (thesis 4.3.1)."""
+
+_STEP = np.uint64(0x9E3779B97F4A7C15)
+"""Increment of the state of splitmix64: 2^64 over the golden ratio (Steele, Lea and Flood 2014)."""
+_MIX1 = np.uint64(0xBF58476D1CE4E5B9)
+"""First multiplier of splitmix64 (Steele, Lea and Flood 2014)."""
+_MIX2 = np.uint64(0x94D049BB133111EB)
+"""Second multiplier of splitmix64 (Steele, Lea and Flood 2014)."""
+_S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
+"""Shifts of splitmix64 (Steele, Lea and Flood 2014), and the last one, which leaves the 53 bits of a double."""
+_TO_UNIT = 2.0**-53
+"""From 53 random bits to [0, 1) in double precision."""
+_MOST_REDRAWS = 100
+"""Repeated draws of matches that the sample already holds, before the weights are given up. Chosen by hand; not
+measured on its own."""
+
+
+def random_state(seed: int) -> RandomState:
+    """Return the (1,) state of the generator for any integer seed."""
+    return np.array([seed % 2**64], dtype=np.uint64)
+
+
+@kernel
+def uniform(state: RandomState) -> float:
+    """Return the next number in [0, 1)."""
+    state[0] += _STEP
+    z = state[0]
+    z = (z ^ (z >> _S30)) * _MIX1
+    z = (z ^ (z >> _S27)) * _MIX2
+    return float((z ^ (z >> _S31)) >> _S11) * _TO_UNIT
+
+
+@kernel
+def draw_uniform(state: RandomState, count: int, sample: IndexArray) -> None:
+    """Fill a sample with distinct indices.
+
+    Args:
+        state: of the generator; it is advanced.
+        count: indices lie below it; at least the sample's length.
+        sample: (m,), written to.
+    """
+    for k in range(sample.shape[0]):
+        fresh = False
+        while not fresh:
+            sample[k] = int(uniform(state) * count)
+            fresh = _is_fresh(sample, k)
+
+
+@kernel
+def draw_weighted(state: RandomState, cumulative: FloatArray, sample: IndexArray) -> bool:
+    """Fill `sample` with distinct indices, each draw proportional to the weights of those that are left.
+
+    Drawing again when an index is already in the sample is the same as drawing from the others. Returns False when this
+    does not end, because fewer points than the sample needs hold nearly all the weight.
+
+    Args:
+        state: generator.
+        cumulative: (N,) running sum of weights >= 0, the last one > 0.
+        sample: (m,) filled with indices.
+    """
+    total = cumulative[-1]
+    redraws = 0
+    for k in range(sample.shape[0]):
+        fresh = False
+        while not fresh:
+            sample[k] = _search_sorted(cumulative, uniform(state) * total)
+            fresh = _is_fresh(sample, k)
+            redraws += not fresh
+            if redraws > _MOST_REDRAWS:
+                return False
+    return True
+
+
+@kernel
+def _is_fresh(sample: IndexArray, last: int) -> bool:
+    equal = 0
+    for k in range(last):
+        equal += sample[k] == sample[last]
+    return equal == 0
+
+
+@kernel
+def _search_sorted(cumulative: FloatArray, target: float) -> int:
+    low, high = 0, cumulative.shape[0] - 1
+    while low < high:
+        middle = (low + high) // 2
+        if cumulative[middle] > target:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+# When to stop drawing samples (thesis 3.3.6, 4.4.5 and 4.7.4).
+
+CONVERGED = 0.05
+"""G of the thesis (4.7.4, Eq. 4.18): priors have converged when the sum of their changes is below this."""
+
+
+def required_trials(success: float, confidence: float, log_missed: float = 0.0) -> float:
+    """Return how many samples make one success as probable as wanted (thesis 3.19); inf if none can succeed.
+
+    Args:
+        success: probability that one sample is clean, share^m, and that its model passes the test.
+        confidence: wanted probability, in (0, 1).
+        log_missed: logarithm of the probability that all samples drawn before failed; they are not counted again.
+    """
+    left = math.log1p(-confidence) - log_missed
+    if left >= 0:
+        return 0.0
+    if success >= 1:
+        return 1.0
+    return left / math.log1p(-success) if success > 0 else math.inf
+
+
+def has_converged(before: NDArray[np.float64], after: NDArray[np.float64], limit: float = CONVERGED) -> bool:
+    """Return whether the priors, normalized to sum 1, changed less than a limit in sum (thesis 4.18).
+
+    The printed sum grows with the number of matches; for probabilities that sum to 1 it lies in [0, 2].
+
+    Args:
+        before: (N,) priors >= 0, of any sum but zero.
+        after: (N,) the new priors.
+        limit: of the sum of the changes, in [0, 2].
+    """
+    return bool(np.abs(after / after.sum() - before / before.sum()).sum() < limit)

@@ -1,1 +1,0 @@
-"""Relief that is stored in a texture."""

@@ -1,0 +1,204 @@
+"""Place new photos in the model of an earlier run, and judge whether that explains as much as mapping all again.
+
+The poses of known photos are a start, not a given: the last adjustment refines them with all others. Holding them would
+keep the errors that the new photos could correct.
+"""
+
+import logging
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+from sfm_app.colmap.backend import run_interruptible, translate_errors
+from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
+from sfm_app.colmap.growth import model_in_database
+from sfm_app.colmap.mapping import map_incrementally
+from sfm_app.colmap.model import posed_photo_ids, submodel
+from sfm_app.colmap.types import CancellationToken, Reconstruction
+from sfm_app.errors import BackendError
+from sfm_app.estimation.calibrating import find_intrinsics
+from sfm_app.mapping.attempt import (
+    INCREMENTAL_FOLDER,
+    MIN_PHOTOS,
+    Attempt,
+    Group,
+    best_attempt,
+    explained_pairs,
+    is_well_known,
+    judge_model,
+    map_group,
+    model_poses,
+    pairs_to_map,
+    support,
+)
+from sfm_app.mapping.feature_retry import MappedScene
+from sfm_app.mapping.hypotheses import rival_reason
+from sfm_app.mapping.look_alikes import drop_look_alikes, judge_places
+from sfm_app.mapping.passes import Outcome, reconstruct
+from sfm_app.mapping.split_and_merge import split_attempt
+from sfm_app.matching.known import find_same_matches
+from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
+from sfm_app.runtime.context import Earlier, RunContext
+from sfm_app.types import Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
+
+logger = logging.getLogger("sfm_app")
+
+LEAST_KNOWN = 0.5
+"""Share of the photos that the earlier model must hold for it to be a start: by definition, most of them."""
+LEAST_SUPPORT = 0.99
+"""Share of the support of the earlier model that it must keep among its photos. As for models that count as equal, see
+`mapping_runs.EQUAL_TOLERANCE`."""
+GROWN = "grown"
+"""Name of this way to a model, in the manifest."""
+TWO_PLACES = "the model has two places in one"
+"""The doubt of a grown model whose pairs of look-alikes lie on top of each other."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Inputs:
+    """What a scene is made from."""
+
+    matches: MatchGraph
+    views: ViewGraph
+    intrinsics: Intrinsics
+    run: RunContext
+
+
+def map_new_photos(
+    matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext, earlier: Earlier
+) -> MappedScene:
+    """Return models of all photos: the earlier model with the new photos, or new ones where these explain more.
+
+    Args:
+        matches: keypoints and raw matches.
+        views: fundamental matrices.
+        intrinsics: cameras.
+        run: the run; its workspace is that of mapping.
+        earlier: what the earlier run left behind.
+    """
+    inputs = _Inputs(matches, views, intrinsics, run)
+    grown, doubt = _grow(inputs, earlier)
+    run.record(grown_from=0 if grown is None else len(earlier.known), mapped_again_because=doubt)
+    if grown is not None and not doubt:
+        return MappedScene(grown, matches, views, intrinsics, run)
+    run.progress.say(f"all photos are mapped again: {doubt}")
+    cameras = find_intrinsics(matches, views, replace(run, statistics={}))[0]
+    whole = reconstruct(matches, views, cameras, run)
+    both = [outcome.models[0] for outcome in (grown, whole) if outcome is not None and outcome.models]
+    is_folded = doubt == TWO_PLACES and bool(whole.models)  # look-alikes explain more, and are wrong
+    if grown is None or is_folded or best_attempt(both) is not grown.models[0]:
+        return MappedScene(whole, matches, views, cameras, run)
+    _write_graph(grown.graph, inputs)
+    return MappedScene(replace(grown, tried=(*whole.tried, *grown.tried)), matches, views, intrinsics, run)
+
+
+def _grow(inputs: _Inputs, earlier: Earlier) -> tuple[Outcome | None, str]:
+    """Return the earlier model with the new photos, if there is one, and why it is not to be relied on, if so."""
+    matches, views, run = inputs.matches, inputs.views, inputs.run
+    same = find_same_matches(matches, earlier).photos
+    with translate_errors("reading the earlier model"):
+        write_match_graph(run.workspace.database, matches)
+        write_calibrations(run.workspace.database, matches, inputs.intrinsics)
+        counts = {photo: len(points) for photo, points in matches.keypoints.items()}
+        start = model_in_database(run.workspace.database, earlier.place.sparse, same, counts)
+    placed = posed_photo_ids(start)
+    if len(placed) < max(MIN_PHOTOS, LEAST_KNOWN * len(matches.images)):
+        return None, f"only {len(placed)} of {len(matches.images)} photos have a place in the earlier model"
+    epipolar = run.settings.epipolar
+    known = model_poses(start, matches, epipolar.max_error_px, epipolar.min_inliers)
+    graph = _pose_graph(inputs, known)
+    _write_graph(graph, inputs)
+    matches, views = drop_look_alikes(matches, views, graph)
+    around = max(graph.groups, key=lambda photos: len(set(photos).intersection(placed)), default=())
+    if lost := set(placed).difference(around):  # COLMAP does not take photos of which the database has no pair
+        placed = [photo for photo in placed if photo not in lost]
+        start = submodel(start, placed)
+    group = Group(around, matches, views, graph, inputs.intrinsics)
+    before = support(explained_pairs(start, matches, views, epipolar.max_error_px))
+    model = _place(start, group, run)
+    how = f"{len(placed)} photos were known"
+    found = judge_model(matches, views, (GROWN, how), model, run)
+    if not isinstance(found, Attempt):
+        return None, f"the earlier model takes no new photos ({found.note})"
+    now, left = set(posed_photo_ids(found.model)), set(around).difference(placed)
+    others = _map_others(graph, {*now, *around}, replace(inputs, matches=matches, views=views))
+    reason = f"{how}, and {len(left & now)} of {len(left)} others found their place"
+    outcome = Outcome((found, *others), graph, inputs.intrinsics, (found.note,), reason)
+    return outcome, _doubt(found, placed, before, inputs.intrinsics, matches, views)
+
+
+def _doubt(
+    found: Attempt,
+    placed: Collection[int],
+    before: float,
+    intrinsics: Intrinsics,
+    matches: MatchGraph,
+    views: ViewGraph,
+) -> str:
+    """Return why a grown model is not to be relied on, in a few words; empty where nothing speaks against it.
+
+    It began with the photos `placed`, and had the support `before` among these.
+    """
+    parts = split_attempt(found)
+    if len(parts) != 1 or parts[0].photos != found.photos:
+        return "matches contradict how its parts are joined"
+    inside = set(placed)
+    after = support({pair: one for pair, one in found.explained.items() if inside.issuperset(pair)})
+    if after < LEAST_SUPPORT * before:
+        return "the model explains less of the known photos than before"
+    if judge_places([found])[0]:
+        return TWO_PLACES
+    return rival_reason(found, intrinsics, matches, views)
+
+
+def _pose_graph(inputs: _Inputs, known: dict[PairId, RelativePose]) -> PoseGraph:
+    """Return the pose graph: pairs that the earlier model explains have its poses, all others are estimated."""
+    epipolar, run = inputs.run.settings.epipolar, inputs.run
+    options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, run.seed)
+    return build_pose_graph(inputs.matches, inputs.views, inputs.intrinsics, options, run.map, known)
+
+
+def _write_graph(graph: PoseGraph, inputs: _Inputs) -> None:
+    database = inputs.run.workspace.database
+    with translate_errors("writing relative poses"):
+        write_calibrations(database, inputs.matches, inputs.intrinsics)
+        write_pose_graph(database, inputs.matches, pairs_to_map(graph))
+
+
+def _place(start: Reconstruction, group: Group, run: RunContext) -> Reconstruction | None:
+    """Return the earlier model with the photos of its group that COLMAP can place, one after the other."""
+    placed = posed_photo_ids(start)
+    left = len(set(group.photos).difference(placed))
+    if not left:
+        return submodel(start, placed)
+    found = list[Reconstruction | None]()
+    run.progress.start("mapping", left)
+    try:
+        with translate_errors("mapping photos"):
+            run_interruptible(lambda token: found.append(_extend(start, group, run, token)), lambda: None)
+    except BackendError as err:  # all photos are mapped again
+        logger.info("the earlier model could not be extended: %s", err)
+        return None
+    finally:
+        run.progress.finish()
+    return found[0]
+
+
+def _extend(start: Reconstruction, group: Group, run: RunContext, token: CancellationToken) -> Reconstruction | None:
+    cameras = {photo: group.intrinsics.camera(group.matches.images[photo]) for photo in group.photos}
+    kept = {start.images[photo].camera_id for photo, camera in cameras.items() if camera.is_kept}
+    place, is_known = run.workspace, all(is_well_known(camera) for camera in cameras.values())
+    return map_incrementally(
+        place.database, place.photos, start, place.root / INCREMENTAL_FOLDER, run.seed, run.progress.advance, token,
+        known=is_known, kept=kept,
+    )  # fmt: skip
+
+
+def _map_others(graph: PoseGraph, taken: Collection[int], inputs: _Inputs) -> list[Attempt]:
+    """Return models of the groups of photos that no pair connects with the earlier model."""
+    models = []
+    for photos in graph.groups:
+        if len(photos) >= MIN_PHOTOS and not set(photos).intersection(taken):
+            group = Group(photos, inputs.matches, inputs.views, graph, inputs.intrinsics)
+            best = best_attempt(map_group(group, inputs.run))
+            models += split_attempt(best) if best is not None else []
+    return sorted(models, key=lambda attempt: (-attempt.photos, -attempt.support))

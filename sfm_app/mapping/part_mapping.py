@@ -1,0 +1,502 @@
+"""Map the parts of a group side by side, each in a process and a folder of its own."""
+
+import json
+import logging
+import shutil
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from heapq import heappop, heappush
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.colmap.worker_process import MappingTask, start_worker
+from sfm_app.errors import BackendError
+from sfm_app.files import digest_file, load_arrays, replace_atomically
+from sfm_app.mapping.attempt import Group
+from sfm_app.numerical import json_text
+from sfm_app.operating_system import replace_file
+from sfm_app.posegraph.rotations import connected_groups
+from sfm_app.runtime.context import RunContext
+from sfm_app.settings import Settings
+from sfm_app.tasks import Task
+from sfm_app.types import Intrinsics, LookAlikes, MatchedImage, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
+
+# Divide a large group of photos into parts along the thin places of its pose graph.
+#
+# A group is divided in two again and again. From a photo at its rim, one side grows by the photo whose links lead
+# into it most; of all sizes that it passes through, the cut with the smallest weight in proportion to both sides is
+# taken (normalized cut, Shi and Malik 2000; growth as in METIS, Karypis and Kumar 1998), and photos at the cut
+# change sides where that lowers its weight. Neighboring parts then share the photos with most inliers across the
+# cut.
+
+Links = Mapping[int, Mapping[int, float]]
+"""Weight of the pairs of each photo, by the other photo."""
+
+SATURATION_INLIERS = 100.0
+"""Number of inliers above which the weight of a pair hardly grows. Chosen by hand."""
+DOUBTFUL_WEIGHT = 0.1
+"""Weight factor of pairs that may be look-alikes: a cut may well pass there. Chosen by hand."""
+LARGEST, SMALLEST = 1.3, 0.25
+"""Largest part, and smallest, as shares of the wanted size. Chosen by hand."""
+LEAST_SIDE = 1.0 / 3.0
+"""Smallest side of a cut, as a share of what is cut. Chosen by hand."""
+MOST_SWAPS = 8
+"""Most rounds in which photos change sides. Chosen by hand."""
+SHARED_PHOTOS = 10
+"""Photos that each of two neighboring parts gets from the other one. Chosen by hand."""
+LEAST_ACROSS = 3
+"""Smallest number of pairs between two parts that makes them neighbors. Chosen by hand."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Photos that are mapped together."""
+
+    own: tuple[int, ...]
+    """Photos of no other part."""
+    photos: tuple[int, ...]
+    """These, and those that it shares with its neighbors."""
+
+
+def cut_group(graph: PoseGraph, photos: Sequence[int], size: int) -> tuple[Part, ...]:
+    """Divide connected photos into overlapping parts, each connected; the same parts for the same graph.
+
+    Args:
+        graph: relative poses; its doubtful pairs count little.
+        photos: ids of the group.
+        size: wanted number of photos of a part.
+    """
+    links = link_weights(graph, photos)
+    owned = [sorted(part) for part in _join_small(_divide(links, size), links, SMALLEST * size)]
+    owned.sort(key=lambda part: part[0])
+    return tuple(
+        Part(tuple(own), tuple(sorted((*own, *more))))
+        for own, more in zip(owned, _borrowed_photos(owned, links), strict=True)
+    )
+
+
+def link_weights(graph: PoseGraph, photos: Collection[int]) -> dict[int, dict[int, float]]:
+    """Return the weight of every pair within some photos, by both of them.
+
+    Args:
+        graph: relative poses.
+        photos: ids.
+    """
+    doubtful = {pair for join in graph.doubtful for pair in join.pairs}
+    links: dict[int, dict[int, float]] = {photo: {} for photo in sorted(photos)}
+    for pair, pose in graph.poses.items():
+        a, b = pair
+        if a in links and b in links:
+            weight = pose.inlier_count / (1.0 + pose.inlier_count / SATURATION_INLIERS)
+            links[a][b] = links[b][a] = weight * (DOUBTFUL_WEIGHT if pair in doubtful else 1.0)
+    return links
+
+
+def _divide(links: Links, size: int) -> list[set[int]]:
+    waiting, parts = _components(set(links), links), []
+    while waiting:
+        photos = waiting.pop()
+        if len(photos) <= LARGEST * size:
+            parts.append(photos)
+        else:
+            waiting += _bisect(photos, links)
+    return parts
+
+
+def _bisect(photos: set[int], links: Links) -> tuple[set[int], set[int]]:
+    """Divide connected photos into two connected sides."""
+    end = _farthest_photo(min(photos), photos, links)
+    starts = (_farthest_photo(end, photos, links), end)
+    cuts = [_best_growth(start, photos, links) for start in starts]
+    side = min(cuts, key=lambda found: found[0])[1]
+    side = _swap_sides(side, photos, links)
+    # islands go over to the other side, to which they are linked
+    side = max(_components(side, links), key=_rank)
+    rest = max(_components(photos - side, links), key=_rank)
+    return photos - rest, rest
+
+
+def _rank(photos: set[int]) -> tuple[int, int]:
+    return len(photos), -min(photos)
+
+
+def _components(photos: set[int], links: Links) -> list[set[int]]:
+    pairs = ((a, b) for a in sorted(photos) for b in links[a] if a < b and b in photos)
+    return connected_groups(pairs, sorted(photos))
+
+
+def _farthest_photo(start: int, photos: set[int], links: Links) -> int:
+    """Return the photo that takes most links to reach; of several, the one with the smallest id."""
+    seen, rim = {start}, [start]
+    while True:
+        beyond = sorted({b for a in rim for b in links[a] if b in photos} - seen)
+        if not beyond:
+            return min(rim)
+        seen.update(beyond)
+        rim = beyond
+
+
+def _best_growth(start: int, photos: set[int], links: Links) -> tuple[float, set[int]]:
+    """Return the least normalized cut that a side passes through as it grows from a photo, and the side there."""
+    degree = {photo: sum(w for b, w in sorted(links[photo].items()) if b in photos) for photo in sorted(photos)}
+    total, inside = sum(degree.values()), dict.fromkeys(degree, 0.0)
+    waiting, order, grown = [(0.0, start)], list[int](), set[int]()
+    cut = volume = 0.0
+    best = float("inf"), 0
+    least = max(1, int(LEAST_SIDE * len(photos)))
+    while len(order) < len(photos) - least:
+        _, photo = heappop(waiting)
+        if photo in grown:
+            continue
+        grown.add(photo)
+        order.append(photo)
+        cut += degree[photo] - 2.0 * inside[photo]
+        volume += degree[photo]
+        if len(order) >= least:
+            best = min(best, (cut / max(min(volume, total - volume), 1e-300), len(order)))
+        for other, weight in links[photo].items():
+            if other in photos and other not in grown:
+                inside[other] += weight
+                heappush(waiting, (-inside[other] / degree[other], other))
+    return best[0], set(order[: best[1]])
+
+
+def _swap_sides(side: set[int], photos: set[int], links: Links) -> set[int]:
+    """Return a side after its photos, and those of the other one, have moved to where most of their links lead."""
+    side, least = set(side), int(LEAST_SIDE * len(photos))
+    for _ in range(MOST_SWAPS):
+        moved = 0
+        for photo in sorted(photos):
+            here = photo in side
+            across = sum(w for b, w in links[photo].items() if b in photos and (b in side) != here)
+            within = sum(w for b, w in links[photo].items() if b in photos and (b in side) == here)
+            size = len(side) if here else len(photos) - len(side)
+            if across > within and size > least:
+                side ^= {photo}
+                moved += 1
+        if not moved:
+            break
+    return side
+
+
+def _join_small(parts: list[set[int]], links: Links, least: float) -> list[set[int]]:
+    """Add parts that are too small to the neighbors to which most links lead."""
+    parts = sorted(parts, key=_rank)
+    while len(parts) > 1 and len(parts[0]) < least:
+        small, *others = parts
+        worth = [sum(w for a in sorted(small) for b, w in links[a].items() if b in other) for other in others]
+        best = max(range(len(others)), key=lambda k: worth[k])
+        if worth[best] == 0.0:  # a component of its own
+            return parts
+        others[best] = others[best] | small
+        parts = sorted(others, key=_rank)
+    return parts
+
+
+def _borrowed_photos(parts: Sequence[Sequence[int]], links: Links) -> list[set[int]]:
+    """Return the photos that each part gets from its neighbors."""
+    owner = {photo: number for number, part in enumerate(parts) for photo in part}
+    across: dict[tuple[int, int], list[PairId]] = {}
+    for a in sorted(links):
+        for b in links[a]:
+            if owner[a] != owner[b]:
+                across.setdefault((owner[a], owner[b]), []).append((a, b))
+    more: list[set[int]] = [set() for _ in parts]
+    for (here, _), pairs in sorted(across.items()):
+        if len(pairs) >= LEAST_ACROSS:
+            more[here] |= _best_across(pairs, links)
+    return more
+
+
+def _best_across(pairs: Sequence[PairId], links: Links) -> set[int]:
+    """Return the photos of the other part with most links to this one, spread over the photos that they link to.
+
+    Args:
+        pairs: links across the cut, the photo of this part first.
+        links: weights.
+    """
+    seen: dict[int, list[int]] = {}
+    for a, b in pairs:
+        seen.setdefault(b, []).append(a)
+    chosen, known = set[int](), dict.fromkeys([a for a, _ in pairs], 0.0)
+
+    def worth(photo: int) -> float:
+        return sum(links[photo][a] / (1.0 + known[a] / SATURATION_INLIERS) for a in seen[photo])
+
+    while len(chosen) < SHARED_PHOTOS and len(chosen) < len(seen):
+        best = max((photo for photo in sorted(seen) if photo not in chosen), key=worth)
+        chosen.add(best)
+        for a in seen[best]:
+            known[a] += links[best][a]
+    return chosen
+
+
+# The inputs of one part as a file, so that any process, here or elsewhere, can map it.
+
+INPUTS, RESULT = "inputs.npz", "result.json"
+"""Files in the folder of a part: what it is mapped from, and what became of it."""
+Arrays = dict[str, NDArray[Any]]
+
+
+def pairs_of_parts(pairs: Iterable[PairId], parts: Sequence[Sequence[int]]) -> list[list[PairId]]:
+    """Return the pairs within each part, in their order; one look at each pair, however many parts there are.
+
+    Args:
+        pairs: of photos.
+        parts: ids of their photos; parts may share photos.
+    """
+    members: dict[int, set[int]] = {}
+    for number, photos in enumerate(parts):
+        for photo in photos:
+            members.setdefault(photo, set()).add(number)
+    found: list[list[PairId]] = [[] for _ in parts]
+    nowhere: set[int] = set()
+    for a, b in pairs:
+        for number in members.get(a, nowhere) & members.get(b, nowhere):
+            found[number].append((a, b))
+    return found
+
+
+def part_of_group(group: Group, photos: Sequence[int], pairs: Sequence[PairId]) -> Group:
+    """Return what concerns some photos of a group.
+
+    Args:
+        group: photos with their matches, geometry and cameras.
+        photos: ids of the part.
+        pairs: those with matches, within the part.
+    """
+    matches, fits, poses = group.matches, group.views.fits, group.graph.poses
+    images = {photo: matches.images[photo] for photo in photos}
+    names = {image.name: group.intrinsics.camera_name(image) for image in images.values()}
+    cameras = {name: camera for name, camera in group.intrinsics.cameras.items() if name in set(names.values())}
+    return Group(
+        tuple(photos),
+        MatchGraph(
+            images,
+            {photo: matches.keypoints[photo] for photo in photos},
+            {pair: matches.matches[pair] for pair in pairs},
+        ),
+        ViewGraph({pair: fits[pair] for pair in pairs if pair in fits}, {}),
+        PoseGraph({pair: poses[pair] for pair in pairs if pair in poses}, {}, (tuple(photos),)),
+        Intrinsics(cameras, names, {photo: image.name for photo, image in images.items()}),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartInputs:
+    """What a part is mapped from."""
+
+    part: Group
+    """Photos, matches, geometry, relative poses and cameras."""
+    mapped: frozenset[PairId]
+    """Pairs of the pose graph that mapping follows."""
+    settings: Settings
+    asked: bool
+    """Whether everything is mapped anew where a false join is found, so that no other mapper is needed then."""
+
+
+def write_inputs(path: Path, inputs: PartInputs) -> None:
+    """Write the inputs of a part, as a whole.
+
+    Args:
+        path: file to write.
+        inputs: of the part.
+    """
+    part = inputs.part
+    known = {
+        "photos": list(part.photos),
+        # frames and times of photos do not matter to mapping
+        "images": [asdict(replace(image, gps=None, shown=None)) for image in part.matches.images.values()],
+        "intrinsics": part.intrinsics.to_dict(),
+        "settings": inputs.settings.model_dump(mode="json"),
+        "asked": inputs.asked,
+    }
+    arrays = _match_arrays(part.matches) | _pose_arrays(part.graph)
+    arrays |= {f"view_{name}": array for name, array in part.views.to_arrays().items()}
+    arrays |= {"mapped": np.array(sorted(inputs.mapped), np.int64).reshape(-1, 2), "known": np.array(json_text(known))}
+    with replace_atomically(path) as beside, beside.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
+
+
+def read_inputs(path: Path) -> PartInputs:
+    """Read back what `write_inputs` wrote."""
+    arrays = load_arrays(path)
+    known = json.loads(str(arrays["known"]))
+    images = {image["id"]: MatchedImage(**image) for image in known["images"]}
+    views = {name.removeprefix("view_"): array for name, array in arrays.items() if name.startswith("view_")}
+    part = Group(
+        tuple(known["photos"]),
+        _matches_from_arrays(images, arrays),
+        ViewGraph.from_arrays(views),
+        PoseGraph(_poses_from_arrays(arrays), {}, (tuple(known["photos"]),)),
+        Intrinsics.from_dict(known["intrinsics"]),
+    )
+    mapped = frozenset((int(a), int(b)) for a, b in arrays["mapped"])
+    return PartInputs(part, mapped, Settings.from_mapping(known["settings"]), known["asked"])
+
+
+PlainJoin = tuple[list[list[int]], float]
+"""Pairs of a false join, and the share that is missing across it, as JSON has them."""
+
+
+def joins_to_plain(joins: Sequence[LookAlikes]) -> list[PlainJoin]:
+    """Return false joins as plain values for JSON."""
+    return [([list(pair) for pair in join.pairs], join.missing) for join in joins]
+
+
+def joins_from_plain(values: Sequence[PlainJoin]) -> tuple[LookAlikes, ...]:
+    """Rebuild from `joins_to_plain`."""
+    return tuple(LookAlikes(tuple((a, b) for a, b in pairs), missing) for pairs, missing in values)
+
+
+def _match_arrays(matches: MatchGraph) -> Arrays:
+    keypoints, rows = list(matches.keypoints.values()), list(matches.matches.values())
+    return {
+        "keypoint_photos": np.array(list(matches.keypoints), np.int64),
+        "keypoint_counts": np.array([len(x) for x in keypoints], np.int64),
+        "keypoints": np.concatenate([*keypoints, np.zeros((0, 2))]),
+        "match_pairs": np.array(list(matches.matches), np.int64).reshape(-1, 2),
+        "match_counts": np.array([len(row) for row in rows], np.int64),
+        "matches": np.concatenate([*rows, np.zeros((0, 2), np.uint32)]).astype(np.uint32),
+    }
+
+
+def _matches_from_arrays(images: Mapping[int, MatchedImage], arrays: Mapping[str, NDArray[Any]]) -> MatchGraph:
+    keypoints = np.split(arrays["keypoints"], np.cumsum(arrays["keypoint_counts"]))[:-1]
+    rows = np.split(arrays["matches"], np.cumsum(arrays["match_counts"]))[:-1]
+    return MatchGraph(
+        images,
+        dict(zip(arrays["keypoint_photos"].tolist(), keypoints, strict=True)),
+        dict(zip(map(tuple, arrays["match_pairs"].tolist()), rows, strict=True)),
+    )
+
+
+def _pose_arrays(graph: PoseGraph) -> Arrays:
+    poses = list(graph.poses.values())
+    return {
+        "pose_pairs": np.array(list(graph.poses), np.int64).reshape(-1, 2),
+        "pose_R": np.array([pose.R for pose in poses]).reshape(-1, 3, 3),
+        "pose_t": np.array([pose.t for pose in poses]).reshape(-1, 3),
+        "pose_counts": np.array([len(pose.inliers) for pose in poses], np.int64),
+        "pose_inliers": np.concatenate([*(pose.inliers for pose in poses), np.zeros(0, bool)]),
+        "pose_angle_deg": np.array([pose.angle_deg for pose in poses], np.float64),
+        "pose_in_front": np.array([pose.in_front for pose in poses], np.float64),
+        "pose_kind": np.array([pose.kind for pose in poses], np.str_),
+        "pose_guided": np.array([pose.guided for pose in poses], np.bool_),
+    }
+
+
+def _poses_from_arrays(arrays: Mapping[str, NDArray[Any]]) -> dict[PairId, RelativePose]:
+    columns = (
+        arrays["pose_R"],
+        arrays["pose_t"],
+        np.split(arrays["pose_inliers"], np.cumsum(arrays["pose_counts"]))[:-1],
+        arrays["pose_angle_deg"].tolist(),
+        arrays["pose_in_front"].tolist(),
+        arrays["pose_kind"].tolist(),
+        arrays["pose_guided"].tolist(),
+    )
+    pairs = map(tuple, arrays["pose_pairs"].tolist())
+    return {pair: RelativePose(*values) for pair, *values in zip(pairs, *columns, strict=True)}
+
+
+logger = logging.getLogger("sfm_app")
+
+FOLDER, STOP = "parts", "stop"
+"""Folder of the parts, and the file in it that stops them all."""
+POLL_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class PartTask:
+    """One part to map: small, since its inputs are files that every worker can read."""
+
+    folder: str
+    """Holds the inputs, and gets the models."""
+    photos: str
+    """Folder with the photos; COLMAP requires it."""
+
+
+@dataclass(frozen=True, slots=True)
+class PartResult:
+    """What became of a part."""
+
+    models: tuple[str, ...]
+    """Folders of its models, the largest first; none where it was not mapped."""
+    mapper: str
+    tried: tuple[str, ...]
+    """Notes on all attempts, for people; the reason of a failure."""
+    false_joins: tuple[LookAlikes, ...] = ()
+    """Pairs that hold one place of the part on top of another."""
+
+
+def map_parts(
+    group: Group, parts: Sequence[Part], mapped: PoseGraph, run: RunContext, *, asked: bool
+) -> list[PartResult]:
+    """Map parts, as many at once as there are workers; one that fails is a result without models.
+
+    Parts that a killed run has finished are not mapped again.
+
+    Args:
+        group: connected photos, with their matches, geometry and cameras.
+        parts: of its photos.
+        mapped: the pose graph with the pairs that mapping follows.
+        run: the run.
+        asked: whether false joins within parts end the pass.
+    """
+    place = run.workspace.root / FOLDER
+    (place / STOP).unlink(missing_ok=True)
+    within = pairs_of_parts(group.matches.matches, [part.photos for part in parts])
+    members = (part_of_group(group, part.photos, pairs) for part, pairs in zip(parts, within, strict=True))
+    tasks = [_prepare_part(one, mapped, place, run, asked=asked) for one in members]
+    try:
+        return run.map(Task(map_part), tasks, f"mapping {len(parts)} parts")
+    except BaseException:  # also Ctrl-C: the processes end when they see the file
+        (place / STOP).touch()
+        raise
+
+
+def _prepare_part(members: Group, mapped: PoseGraph, place: Path, run: RunContext, *, asked: bool) -> PartTask:
+    """Write the inputs of a part, in a folder that is called after what they are."""
+    beside = place / INPUTS
+    followed = frozenset(pair for pair in members.graph.poses if pair in mapped.poses)
+    write_inputs(beside, PartInputs(members, followed, run.settings, asked))
+    folder = place / digest_file(beside)[:16]
+    folder.mkdir(exist_ok=True)
+    replace_file(beside, folder / INPUTS)
+    return PartTask(str(folder), str(run.workspace.photos))
+
+
+def map_part(task: PartTask) -> PartResult:
+    """Map one part in a process of its own, and wait for it. Depends on nothing but the task.
+
+    Args:
+        task: names the folder of the part.
+    """
+    folder = Path(task.folder)
+    if not (folder / RESULT).exists():
+        work: MappingTask = {"scratch": task.folder, "photos": task.photos, "seed": 0}
+        try:
+            with start_worker("sfm_app.mapping.part_process", work) as process:
+                while not process.has_ended(POLL_S):
+                    if (folder.parent / STOP).exists():
+                        return PartResult((), "", ("stopped",))
+                process.check("mapping a part")
+        except BackendError as err:  # its photos are left to the other parts
+            logger.info("a part was not mapped", exc_info=err)
+            return PartResult((), "", (f"failed: {err}",))
+    known = json.loads((folder / RESULT).read_text(encoding="utf-8"))
+    return PartResult(
+        tuple(str(folder / name) for name in known["models"]),
+        known["mapper"],
+        tuple(known["tried"]),
+        joins_from_plain(known["false_joins"]),
+    )
+
+
+def remove_parts(run: RunContext) -> None:
+    """Remove the folders of all parts."""
+    shutil.rmtree(run.workspace.root / FOLDER, ignore_errors=True)

@@ -1,0 +1,1 @@
+"""Features of photos, the pairs that are matched, and their matches."""

@@ -1,0 +1,445 @@
+"""How photos agree on a surface, and which way each vertex would have to move.
+
+A photo is seen through the surface from another one. Where both differ after local brightness and contrast have been
+made equal, the surface is too near or too far: the difference divided by its derivative along the viewing ray is the
+distance (Vu, Labatut, Pons, Keriven: High accuracy and visibility-consistent dense multiview stereo. PAMI 2012, with a
+gradient descent; here in Gauss-Newton steps, which need a tenth of the iterations).
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.types.arrays import FloatArray, IndexArray
+
+# A photo at some resolution, with its gradients.
+
+Gray = NDArray[np.float32]
+
+BLUR_PX = 0.6
+"""Standard deviation of the blur before gradients are taken: less leaves noise, more loses detail. Chosen on the scene
+`ornament`; not measured on its own."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RefinePhoto:
+    """A posed photo without distortion, x ~ K (R X + t), pixel centers at +0.5."""
+
+    K: FloatArray
+    """(3, 3) camera matrix in pixels."""
+    R: FloatArray
+    """(3, 3) rotation of cam_from_world."""
+    t: FloatArray
+    """(3,) translation of cam_from_world."""
+    gray: NDArray[np.uint8]
+    """(H, W)."""
+    masked: NDArray[np.bool_] | None = None
+    """(H, W) what a mask leaves out; None without a mask."""
+
+    @property
+    def center(self) -> FloatArray:
+        """(3,) center of projection in the world."""
+        return np.asarray(-self.R.T @ self.t)
+
+    @property
+    def focal_px(self) -> float:
+        """Pixels per unit of length at depth 1, the mean of both directions."""
+        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
+
+    def size_at(self, share: float) -> tuple[int, int]:
+        """Return height and width at a share of the full resolution."""
+        height, width = self.gray.shape
+        return max(2, round(share * height)), max(2, round(share * width))
+
+    def projection(self, share: float) -> FloatArray:
+        """Return the (3, 4) projection matrix at a share of the full resolution."""
+        (height, width), full = self.size_at(share), self.gray.shape
+        scale = np.diag([width / full[1], height / full[0], 1.0])
+        return np.asarray(scale @ self.K @ np.column_stack([self.R, self.t]))
+
+    def mask_at(self, share: float) -> NDArray[np.bool_] | None:
+        """Return the mask at a share of the full resolution: pixels of which any part is left out."""
+        if self.masked is None:
+            return None
+        size = self.size_at(share)[::-1]
+        return np.asarray(cv2.resize(self.masked.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0)
+
+    def level(self, share: float) -> "PhotoLevel":
+        """Return the photo at a share of its resolution, smoothed, with its gradients."""
+        height, width = self.size_at(share)
+        small = self.gray
+        if (height, width) != small.shape:
+            small = np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+        gray = np.asarray(cv2.GaussianBlur(small.astype(np.float32), (0, 0), BLUR_PX), np.float32)
+        by_x, by_y = (cv2.Sobel(gray, cv2.CV_32F, *axis, ksize=3, scale=1.0 / 8.0) for axis in ((1, 0), (0, 1)))
+        projection = self.projection(share)
+        rays = np.asarray(np.linalg.inv(projection[:, :3]), np.float64)
+        return PhotoLevel(projection, self.center, rays, np.stack([gray, by_x, by_y], axis=-1, dtype=np.float32))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotoLevel:
+    """A photo at one resolution."""
+
+    projection: FloatArray
+    """(3, 4) K [R | t]."""
+    center: FloatArray
+    """(3,) in the world."""
+    rays: FloatArray
+    """(3, 3) from pixels (x, y, 1) to rays in the world, at depth 1."""
+    image: Gray
+    """(H, W, 3) gray levels, and their derivatives by x and by y, per pixel."""
+
+
+# Draw a surface into a photo: which triangle each pixel shows, and how far away.
+
+NOTHING = -1
+NEAREST = 1e-6
+"""Depth below which nothing is drawn, in scene units. By definition: rounding."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Raster:
+    """A surface as a photo sees it."""
+
+    depth: NDArray[np.float32]
+    """(H, W) along the optical axis; infinite where nothing is."""
+    face: NDArray[np.int32]
+    """(H, W) triangle; NOTHING where none is, or where its back is seen."""
+
+
+def rasterize(vertices: FloatArray, faces: IndexArray, projection: FloatArray, size: tuple[int, int]) -> Raster:
+    """Draw a surface into a photo without distortion, at pixel centers.
+
+    Args:
+        vertices: (V, 3) in the world.
+        faces: (T, 3), counterclockwise seen from outside.
+        projection: (3, 4) K [R | t].
+        size: height and width in pixels.
+    """
+    nearness, face = np.zeros(size, np.float32), np.full(size, NOTHING, np.int32)
+    _draw(project_vertices(vertices, projection), faces, nearness, face)
+    with np.errstate(divide="ignore"):
+        return Raster(np.float32(1.0) / nearness, face)
+
+
+def project_vertices(vertices: FloatArray, projection: FloatArray) -> FloatArray:
+    """Return the pixels x, y of vertices and 1 / depth (V, 3); -1 for the last where one is not in front of the photo.
+
+    Args:
+        vertices: (V, 3).
+        projection: (3, 4) K [R | t].
+    """
+    seen = np.empty((len(vertices), 3))
+    _project(vertices, projection, seen)
+    return seen
+
+
+@kernel
+def _project(vertices: FloatArray, P: FloatArray, seen: FloatArray) -> None:
+    """Fill in the pixels of vertices, and 1 / depth, or -1 for those that are not in front of the photo."""
+    for k in range(len(vertices)):
+        x, y, z = vertices[k, 0], vertices[k, 1], vertices[k, 2]
+        w = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
+        near = 1.0 / w if w > NEAREST else -1.0
+        seen[k, 0] = near * (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3])
+        seen[k, 1] = near * (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3])
+        seen[k, 2] = near
+
+
+@kernel
+def _draw(seen: FloatArray, faces: IndexArray, nearness: NDArray[np.float32], face: NDArray[np.int32]) -> None:
+    """Fill in 1 / depth, which is linear in the photo, and the triangles; `seen` has pixels and 1 / depth."""
+    height, width = face.shape
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ax, ay, bx, by, cx, cy = seen[a, 0], seen[a, 1], seen[b, 0], seen[b, 1], seen[c, 0], seen[c, 1]
+        low, high = min(ay, by, cy), max(ay, by, cy)
+        if high < 0.5 or low > height - 0.5 or min(seen[a, 2], seen[b, 2], seen[c, 2]) < 0.0:
+            continue
+        left, right = min(ax, bx, cx), max(ax, bx, cx)
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if right < 0.5 or left > width - 0.5 or area == 0.0:
+            continue
+        first_column, last_column = max(int(left + 0.5), 0), min(int(right + 0.5), width)
+        near, over = seen[a, 2], 1.0 / area
+        # changes of both weights per pixel, and of nearness with them
+        bdx, bdy, cdx, cdy = (cy - ay) * over, (ax - cx) * over, (ay - by) * over, (bx - ax) * over
+        to_b, to_c = seen[b, 2] - near, seen[c, 2] - near
+        shown = f if area < 0.0 else NOTHING  # rows run down: what is counterclockwise has a negative area here
+        for i in range(max(int(low + 0.5), 0), min(int(high + 0.5), height)):
+            y = i + 0.5 - ay
+            for j in range(first_column, last_column):
+                x = j + 0.5 - ax
+                second, third = x * bdx + y * bdy, x * cdx + y * cdy
+                if second < 0.0 or third < 0.0 or second + third > 1.0:
+                    continue
+                here = np.float32(near + second * to_b + third * to_c)
+                if here > nearness[i, j]:
+                    nearness[i, j] = here
+                    face[i, j] = shown
+
+
+REACH = 3
+"""Pixels from the middle of a window to its border; brightness and contrast are made equal in windows. Chosen on
+`ornament`."""
+NOISE_GRAY = 3.0
+"""Standard deviation of gray levels that the surface does not explain. Chosen by hand."""
+OUTLIER = 3.0
+"""Differences of this many deviations count half (Cauchy). By definition of the weight."""
+UNRELATED, RELATED = 0.1, 0.5
+"""Correlations of a window at which it counts nothing, and fully. Chosen by hand."""
+LEAST_FACING = 0.2
+"""Least cosine between the normal and the rays to both photos. Chosen by hand."""
+HIDDEN = 0.003
+"""Relative difference in depth from what the other photo sees there, beyond which a place is hidden from it. Chosen by
+hand."""
+LEAST_SEEN = 0.6
+"""Least share of a window that both photos see. Chosen by hand."""
+SUMS = 7
+"""Sums over a window: pixels, both gray levels, their squares and product, and the slope."""
+
+
+@dataclass(slots=True, eq=False)
+class Pull:
+    """What photos say about the displacement d of each vertex along its normal: cost - 2 g d + h d^2."""
+
+    g: FloatArray
+    """(V,)."""
+    h: FloatArray
+    """(V,)."""
+    correlation: float = 0.0
+    """Sum of the correlations over pixels."""
+    pixels: float = 0.0
+    """Pixels that were compared."""
+
+    @classmethod
+    def zeros(cls, count: int) -> "Pull":
+        """Make that of `count` vertices which nothing pulls."""
+        return cls(np.zeros(count), np.zeros(count))
+
+    def add(self, other: "Pull") -> None:
+        """Add what other photos say."""
+        self.g += other.g
+        self.h += other.h
+        self.correlation += other.correlation
+        self.pixels += other.pixels
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """A photo, and the surface in it."""
+
+    level: PhotoLevel
+    raster: Raster
+
+
+def compare(vertices: FloatArray, faces: IndexArray, normals: Gray, here: Sight, others: Iterable[Sight]) -> Pull:
+    """Return what a photo and others say about the displacement of the vertices.
+
+    Args:
+        vertices: (V, 3).
+        faces: (T, 3).
+        normals: (T, 3) of the triangles, unit.
+        here: the photo.
+        others: those that it is compared with.
+    """
+    found, level, raster = Pull.zeros(len(vertices)), here.level, here.raster
+    shape = raster.depth.shape
+    g, h = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    views = np.empty((*shape, 3), np.float32)
+    sums = np.empty((SUMS, shape[1]))
+    for other in others:
+        H, p = other.level.projection[:, :3] @ level.rays, other.level.projection @ np.append(level.center, 1.0)
+        _look_through(
+            (raster.depth, raster.face, normals), (H, p), (level.rays, level.center - other.level.center),
+            (other.level.image, other.raster.depth), views,
+        )  # fmt: skip
+        correlation, pixels = _weigh(level.image, views, sums, g, h)
+        found.correlation += correlation
+        found.pixels += pixels
+    _sum_up((vertices, faces), (raster.face, raster.depth), (level.rays, level.center), (g, h), (found.g, found.h))
+    return found
+
+
+@kernel
+def _look_through(surface: Any, homography: Any, eyes: Any, other: Any, views: Gray) -> None:
+    """Fill in what the other photo shows at each pixel, its change per displacement of the surface, and 1 or 0: seen.
+
+    Arguments: the surface in the photo; what takes its pixels at depth z to those of the other one, z H x + p; rays of
+    the photo and the way to its center from the other one; the other photo, and the depths of the surface in it;
+    (H, W, 3) for what is found.
+    """
+    depth, face, normals = surface
+    H, p = homography
+    M, apart = eyes
+    image, other_depth = other
+    height, width = other_depth.shape
+    for i in range(depth.shape[0]):
+        y = i + 0.5
+        for j in range(depth.shape[1]):
+            views[i, j, 0], views[i, j, 1], views[i, j, 2] = 0.0, 0.0, 0.0
+            f = face[i, j]
+            if f < 0:
+                continue
+            x, z = j + 0.5, float(depth[i, j])
+            hz = H[2, 0] * x + H[2, 1] * y + H[2, 2]
+            w = z * hz + p[2]
+            if w <= 0.0:
+                continue
+            hx, hy = H[0, 0] * x + H[0, 1] * y + H[0, 2], H[1, 0] * x + H[1, 1] * y + H[1, 2]
+            over = 1.0 / w
+            u, v = (z * hx + p[0]) * over, (z * hy + p[1]) * over
+            if not (0.5 <= u < width - 0.5 and 0.5 <= v < height - 0.5):
+                continue
+            col, row = min(int(u - 0.5), width - 2), min(int(v - 0.5), height - 2)
+            limit = HIDDEN * w
+            near = int(abs(other_depth[row, col] - w) <= limit) + int(abs(other_depth[row, col + 1] - w) <= limit)
+            near += int(abs(other_depth[row + 1, col] - w) <= limit)
+            near += int(abs(other_depth[row + 1, col + 1] - w) <= limit)
+            if near < 2:
+                continue
+            rx, ry = M[0, 0] * x + M[0, 1] * y + M[0, 2], M[1, 0] * x + M[1, 1] * y + M[1, 2]
+            rz = M[2, 0] * x + M[2, 1] * y + M[2, 2]
+            nx, ny, nz = normals[f, 0], normals[f, 1], normals[f, 2]
+            along = nx * rx + ny * ry + nz * rz
+            if along >= 0.0 or along * along < LEAST_FACING * LEAST_FACING * (rx * rx + ry * ry + rz * rz):
+                continue
+            ox, oy, oz = z * rx + apart[0], z * ry + apart[1], z * rz + apart[2]
+            across = nx * ox + ny * oy + nz * oz
+            if across >= 0.0 or across * across < LEAST_FACING * LEAST_FACING * (ox * ox + oy * oy + oz * oz):
+                continue
+            # the displacement changes the depth by 1 / (normal ray)
+            change = over / along
+            du, dv = (hx - u * hz) * change, (hy - v * hz) * change
+            a, b = np.float32(u - 0.5 - col), np.float32(v - 0.5 - row)
+            for c in range(3):
+                upper = image[row, col, c] + a * (image[row, col + 1, c] - image[row, col, c])
+                lower = image[row + 1, col, c] + a * (image[row + 1, col + 1, c] - image[row + 1, col, c])
+                value = upper + b * (lower - upper)
+                if c == 0:
+                    views[i, j, 0] = value
+                else:
+                    views[i, j, 1] += value * (du if c == 1 else dv)
+            views[i, j, 2] = 1.0
+
+
+@kernel
+def _weigh(image: Gray, views: Gray, sums: FloatArray, g: Gray, h: Gray) -> tuple[float, float]:
+    """Add what each pixel says about the displacement; return the sum of correlations, and the number of pixels.
+
+    Windows have the same mean and contrast in both photos. `sums` (SUMS, W) is overwritten: sums over the rows of a
+    window.
+    """
+    height, width = views.shape[0], views.shape[1]
+    sums[:] = 0.0
+    total, count = 0.0, 0.0
+    noise = NOISE_GRAY * NOISE_GRAY
+    least = LEAST_SEEN * (2 * REACH + 1) ** 2
+    for i in range(-REACH, height):
+        if i + REACH < height:
+            _add_row(image, views, i + REACH, 1.0, sums)
+        if i > REACH:
+            _add_row(image, views, i - REACH - 1, -1.0, sums)
+        if i < 0:
+            continue
+        n, a, b, aa, bb, ab, s = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(-REACH, width):
+            if j + REACH < width:
+                k = j + REACH
+                n, a, b, aa = n + sums[0, k], a + sums[1, k], b + sums[2, k], aa + sums[3, k]
+                bb, ab, s = bb + sums[4, k], ab + sums[5, k], s + sums[6, k]
+            if j > REACH:
+                k = j - REACH - 1
+                n, a, b, aa = n - sums[0, k], a - sums[1, k], b - sums[2, k], aa - sums[3, k]
+                bb, ab, s = bb - sums[4, k], ab - sums[5, k], s - sums[6, k]
+            if j < 0 or views[i, j, 2] == 0.0:
+                continue
+            one = 1.0 / n
+            mean, other = a * one, b * one
+            variance, other_variance = (
+                max(aa * one - mean * mean, 0.0) + noise,
+                max(bb * one - other * other, 0.0) + noise,
+            )
+            gain = np.sqrt(variance / other_variance)
+            correlation = (ab * one - mean * other) / (gain * other_variance)
+            total += correlation
+            count += 1.0
+            related = min((correlation - UNRELATED) / (RELATED - UNRELATED), 1.0)
+            if n < least or related <= 0.0:
+                continue
+            off = (image[i, j, 0] - mean) - gain * (views[i, j, 0] - other)
+            slope = gain * (views[i, j, 1] - s * one)
+            far = off / (OUTLIER * NOISE_GRAY)
+            weight = related / ((1.0 + far * far) * (2.0 * noise))
+            g[i, j] += weight * slope * off
+            h[i, j] += weight * slope * slope
+    return total, count
+
+
+@kernel
+def _add_row(image: Gray, views: Gray, i: int, sign: float, sums: FloatArray) -> None:
+    """Add a row to the sums over rows, or take it away."""
+    for j in range(views.shape[1]):
+        if views[i, j, 2] > 0.0:
+            a, b = float(image[i, j, 0]), float(views[i, j, 0])
+            sums[0, j] += sign
+            sums[1, j] += sign * a
+            sums[2, j] += sign * b
+            sums[3, j] += sign * (a * a)
+            sums[4, j] += sign * (b * b)
+            sums[5, j] += sign * (a * b)
+            sums[6, j] += sign * views[i, j, 1]
+
+
+@kernel
+def _sum_up(mesh: Any, raster: Any, eye: Any, said: Any, found: Any) -> None:
+    """Add what each pixel says to the corners of its triangle, by its place on it."""
+    vertices, faces = mesh
+    face, depth = raster
+    M, center = eye
+    g, h = said
+    whole_g, whole_h = found
+    for i in range(face.shape[0]):
+        y = i + 0.5
+        for j in range(face.shape[1]):
+            if h[i, j] <= 0.0:
+                continue
+            x, z = j + 0.5, float(depth[i, j])
+            a, b, c = faces[face[i, j], 0], faces[face[i, j], 1], faces[face[i, j], 2]
+            second, third = _weights(
+                vertices[a], vertices[b], vertices[c],
+                (
+                    center[0] + z * (M[0, 0] * x + M[0, 1] * y + M[0, 2]),
+                    center[1] + z * (M[1, 0] * x + M[1, 1] * y + M[1, 2]),
+                    center[2] + z * (M[2, 0] * x + M[2, 1] * y + M[2, 2]),
+                ),
+            )  # fmt: skip
+            first = 1.0 - second - third
+            whole_g[a] += first * g[i, j]
+            whole_g[b] += second * g[i, j]
+            whole_g[c] += third * g[i, j]
+            whole_h[a] += first * h[i, j]
+            whole_h[b] += second * h[i, j]
+            whole_h[c] += third * h[i, j]
+
+
+@kernel
+def _weights(a: FloatArray, b: FloatArray, c: FloatArray, place: tuple[float, float, float]) -> tuple[float, float]:
+    """Return the weights of the second and the third corner of a triangle at a place on it, within [0, 1]."""
+    bb, cc, bc, bp, cp = 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(3):
+        to_b, to_c, to_p = b[k] - a[k], c[k] - a[k], place[k] - a[k]
+        bb += to_b * to_b
+        cc += to_c * to_c
+        bc += to_b * to_c
+        bp += to_b * to_p
+        cp += to_c * to_p
+    area = max(bb * cc - bc * bc, 1e-300)
+    second = min(max((cc * bp - bc * cp) / area, 0.0), 1.0)
+    return second, min(max((bb * cp - bc * bp) / area, 0.0), 1.0 - second)

@@ -1,1 +1,0 @@
-"""Surfaces too large for one reconstruction: cut into blocks, and joined along their faces."""

@@ -1,0 +1,132 @@
+"""Rays against a mesh: occlusion and nearest points, by Open3D."""
+
+import functools
+import importlib
+import re
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.errors import SfmError
+from sfm_app.geometry.triangles import median_edge_length, vertex_normals
+from sfm_app.operating_system import load_libusb
+
+# Import of Open3D, which is slow, logs much, and needs libraries that minimal Linux systems lack.
+
+PACKAGES = {
+    "libEGL.so.1": "libegl1",
+    "libGL.so.1": "libgl1",
+    "libX11.so.6": "libx11-6",
+    "libgomp.so.1": "libgomp1",
+    "libidn2.so.0": "libidn2-0",
+    "libudev.so.1": "libudev1",
+    "libusb-1.0.so.0": "libusb-1.0-0",
+}
+"""Packages of Debian and Ubuntu that have the libraries to which Open3D's wheels for Linux link."""
+
+
+@functools.cache
+def load_open3d() -> Any:
+    """Import Open3D, with little logging.
+
+    Call it inside the functions that need Open3D: the import takes more than a second.
+
+    Raises:
+        SfmError: the system lacks a library.
+    """
+    load_libusb()
+    try:
+        open3d = importlib.import_module("open3d")
+    except (ImportError, OSError) as err:
+        raise SfmError(f"Open3D cannot be loaded: {err}", hint=_hint(str(err))) from err
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
+    return open3d
+
+
+def _hint(message: str) -> str:
+    missing = re.search(r"(lib\S+\.so[.\d]*): cannot open", message)
+    packages = [PACKAGES[missing[1]]] if missing and missing[1] in PACKAGES else sorted(PACKAGES.values())
+    return f"on Debian and Ubuntu: apt-get install {' '.join(packages)}"
+
+
+# Normals of a fine surface at the places that are closest to points.
+
+REACH_EDGES = 4.0
+"""Distance from the fine surface, in median edges of it, beyond which it says nothing about a point. Chosen on
+fountain-P11 with 50 000 triangles (benchmarks/surface/normal_map.py): 1 leaves out 0.4 % of the texels, 16 none that 4
+leaves out; the angles are the same."""
+
+
+class NearestNormals:
+    """A fine surface, prepared to be asked for its normals near points; several threads may ask at once."""
+
+    def __init__(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
+        """Prepare the search.
+
+        Args:
+            vertices: (V, 3).
+            faces: (T, 3) vertex indices.
+        """
+        self._faces, self._scene = faces, None
+        if not len(faces):
+            return
+        places = vertices.astype(np.float64)
+        self._normals = vertex_normals(places, faces.astype(np.int64)).astype(np.float32)
+        self._reach = REACH_EDGES * median_edge_length(places, faces.astype(np.int64))
+        self._tensor = load_open3d().core.Tensor
+        self._scene = load_open3d().t.geometry.RaycastingScene(nthreads=1)
+        self._scene.add_triangles(self._tensor(vertices), self._tensor(faces.astype(np.uint32)))
+        self.find(vertices[:1], self._normals[:1])  # builds the tree, which only one thread may
+
+    def find(self, points: NDArray[np.float32], facing: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return (N, 3) unit normals, interpolated at the closest place; 0 where it is far away or faces elsewhere.
+
+        Args:
+            points: (N, 3).
+            facing: (N, 3) directions, from which a normal may differ by less than a right angle.
+        """
+        if self._scene is None or not len(points):
+            return np.zeros_like(points)
+        found = self._scene.compute_closest_points(self._tensor(np.ascontiguousarray(points)), nthreads=1)
+        second = found["primitive_uvs"].numpy()
+        shares = np.concatenate([1.0 - second.sum(axis=1, keepdims=True), second], axis=1)
+        corners = self._normals[self._faces[found["primitive_ids"].numpy().astype(np.int64)]]
+        normals = (shares[:, :, None] * corners).sum(axis=1)
+        length = np.linalg.norm(normals, axis=1)
+        good = np.linalg.norm(found["points"].numpy() - points, axis=1) <= self._reach
+        good &= ((normals * facing).sum(axis=1) > 0) & (length > 0)
+        return np.where(good[:, None], normals / np.where(good, length, 1.0)[:, None], 0).astype(np.float32)
+
+
+# Occlusion of points on a surface by the surface.
+
+
+class Occluders:
+    """Triangles that may hide points from cameras."""
+
+    def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
+        """Prepare for ray casting.
+
+        Args:
+            vertices: (V, 3).
+            faces: (T, 3) vertex indices.
+        """
+        self._tensor = load_open3d().core.Tensor
+        self._scene = load_open3d().t.geometry.RaycastingScene(nthreads=1)
+        self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(faces.astype(np.uint32)))
+
+    def is_hidden(self, center: NDArray[np.float64], slack: float, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return (N,) whether a triangle lies between a point and the camera.
+
+        Args:
+            center: (3,) of the camera.
+            slack: length of the start of each ray that is ignored, because the point's own triangles are there.
+            points: (N, 3).
+        """
+        way = center - points
+        length = np.linalg.norm(way, axis=1, keepdims=True)
+        start = points + way * np.minimum(slack / np.maximum(length, 1e-300), 1.0)
+        rays = np.concatenate([start, center - start], axis=1).astype(np.float32)
+        found = self._scene.test_occlusions(self._tensor(rays), 0.0, 1.0, nthreads=1)
+        return np.asarray(found.numpy(), np.bool_)

@@ -1,1 +1,0 @@
-"""Panoramas: how they are recognized, and the perspective views through which they are used."""

@@ -1,1 +1,0 @@
-"""Which photos are worth using: measured, compared, and left out."""

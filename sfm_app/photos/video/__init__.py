@@ -1,1 +1,0 @@
-"""Select the frames of a video that become photos."""

@@ -1,1 +1,0 @@
-"""When matches do not determine F (Chum, Werner and Matas 2005; an open problem in thesis 4.5)."""

@@ -1,1 +1,0 @@
-"""New photos in a model that is there."""

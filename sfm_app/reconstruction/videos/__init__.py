@@ -1,1 +1,0 @@
-"""What holds for frames of a video only."""

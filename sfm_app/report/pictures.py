@@ -1,0 +1,335 @@
+"""Pictures of the report: figures and depth maps."""
+
+import base64
+import io
+import logging
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.colmap.dense import read_photo_and_depth
+from sfm_app.colmap.model import ModelFigures
+from sfm_app.report.contents import UNREADABLE, RunContents
+from sfm_app.report.figures import MOST_PAIRS, draw_intrinsics
+from sfm_app.types.arrays import FloatArray
+
+# Figures of the page: the scene from above, which photos hang together, and what the cameras were found from.
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+logger = logging.getLogger("sfm_app")
+
+DPI = 130
+MOST_LINES = 4000
+"""Pairs of photos drawn as lines, those with most inliers first."""
+LONGEST_TRACK = 12
+"""Tracks of so many photos and more share the last bar."""
+INK, ACCENT, BAD = "#444444", "#c2410c", "#b91c1c"
+
+
+@dataclass(frozen=True, slots=True)
+class PageFigure:
+    """A picture of the page."""
+
+    title: str
+    text: str
+    """What one sees; also what is read out instead of it."""
+    address: str
+    """Its bytes as a data address."""
+
+
+def page_figures(contents: RunContents, figures: ModelFigures | None) -> dict[str, PageFigure]:
+    """Return the figures that can be drawn, by section of the page.
+
+    Args:
+        contents: of the run.
+        figures: of its model; None where there is none.
+    """
+    wanted: Mapping[str, Callable[[], PageFigure | None]] = {
+        "cameras": lambda: _draw_cameras(contents),
+        "pairs": lambda: _draw_pairs(contents),
+        "above": lambda: _draw_above(contents, figures),
+        "tracks": lambda: _draw_tracks(figures),
+    }
+    found = {}
+    for name, draw in wanted.items():
+        try:
+            figure = draw()
+        except UNREADABLE as err:  # the page has the others
+            logger.info("the report has no figure of %s", name, exc_info=err)
+            continue
+        if figure is not None:
+            found[name] = figure
+    return found
+
+
+def _draw_cameras(contents: RunContents) -> PageFigure | None:
+    matches, views, found = contents.matches, contents.views, contents.intrinsics
+    if matches is None or views is None or found is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "cameras.png"
+        draw_intrinsics(path, matches, views, found)
+        data = path.read_bytes()
+    text = (
+        "Above: what each pair of photos votes for, in the planes of the focal lengths and of the optical center, with "
+        "the zero curves of the best pairs; many pairs agree where it is bright. Below: the lens beside an ideal one, "
+        "and the residuals over the photo."
+    )
+    count = len(views.fits)
+    if count > MOST_PAIRS:
+        text += f" Of {count} pairs, at most {MOST_PAIRS} of each camera are drawn, those of most weight."
+    return PageFigure("Votes, curves and lens", text, _address(data))
+
+
+def _draw_pairs(contents: RunContents) -> PageFigure | None:
+    matches, views = contents.matches, contents.views
+    if matches is None or views is None or not matches.images:
+        return None
+    order = sorted(matches.images, key=lambda photo: matches.images[photo].name)
+    at = {photo: number for number, photo in enumerate(order)}
+    grid = np.full((len(order), len(order)), np.nan)
+    for (a, b), fit in views.fits.items():
+        grid[at[a], at[b]] = grid[at[b], at[a]] = np.log10(max(fit.inlier_count, 1))
+    dropped = np.array([(at[a], at[b]) for a, b in views.rejected if a in at and b in at]).reshape(-1, 2)
+
+    def draw(figure: "Figure") -> None:
+        axes = figure.add_subplot()
+        image = axes.imshow(grid, cmap="viridis", interpolation="nearest")
+        bar = figure.colorbar(image, ax=axes, shrink=0.8)
+        bar.set_label("inliers of the pair, as a power of ten")
+        size = max(1.0, 240.0 / len(order))
+        rows, columns = np.concatenate([dropped, dropped[:, ::-1]]).T
+        axes.scatter(columns, rows, s=size, marker="x", linewidths=0.6, color=BAD, label="matched, and dropped")
+        axes.set(xlabel="photos by name", ylabel="photos by name", facecolor="#f2f2f2")
+        if len(dropped):
+            axes.legend(loc="upper left", bbox_to_anchor=(0, 1.1), frameon=False, fontsize=8)
+
+    text = (
+        "Each cell is a pair of photos: its color says how many matches fit one fundamental matrix, red crosses are "
+        "pairs that were matched and dropped, gray ones were not matched. Photos that hang together form blocks."
+    )
+    return PageFigure("Which photos hang together", text, _png(draw, (6.4, 5.6)))
+
+
+def _draw_above(contents: RunContents, figures: ModelFigures | None) -> PageFigure | None:
+    scene, views, matches = contents.scene, contents.views, contents.matches
+    if scene is None or figures is None or not scene.cam_from_world:
+        return None
+    poses = {name: np.asarray(pose) for name, pose in scene.cam_from_world.items()}
+    centers = {name: -pose[:, :3].T @ pose[:, 3] for name, pose in poses.items()}
+    lines = []
+    if views is not None and matches is not None:
+        named = {pair: tuple(matches.images[photo].name for photo in pair) for pair in views.fits}
+        best = sorted(views.fits, key=lambda pair: (-views.fits[pair].inlier_count, pair))
+        lines = [named[pair] for pair in best if all(name in centers for name in named[pair])][:MOST_LINES]
+
+    at = np.array(list(centers.values()))
+    looks = np.array([pose[2, :3] for pose in poses.values()])
+    ends = [(centers[a], centers[b]) for a, b in lines]
+
+    def draw(figure: "Figure") -> None:
+        left, right = figure.subplots(1, 2)
+        _draw_network(left, at, looks, ends, figures.places)
+        _draw_overlap(figure, right, at, figures)
+        for axes in (left, right):
+            _frame(axes, at, figures.places)
+
+    text = (
+        "Left: the cameras from above, the direction in which they look, and lines between photos that share matches. "
+        "Right: the points, and by how many photos each is seen."
+    )
+    return PageFigure("Seen from above", text, _png(draw, (11.0, 5.2)))
+
+
+def _draw_network(
+    axes: "Axes", at: FloatArray, looks: FloatArray, ends: list[tuple[FloatArray, FloatArray]], places: FloatArray
+) -> None:
+    """Draw cameras at (C, 3) that look along (C, 3), and lines between pairs of them, over the points (P, 3)."""
+    from matplotlib.collections import LineCollection
+
+    axes.plot(places[:, 0], places[:, 2], ",", color="#9a9a9a", alpha=0.6)
+    flat = [[a[[0, 2]], b[[0, 2]]] for a, b in ends]
+    strength = min(0.6, 0.1 + 30.0 / max(len(flat), 1))
+    axes.add_collection(LineCollection(flat, colors=INK, linewidths=0.5, alpha=strength))
+    axes.quiver(at[:, 0], at[:, 2], looks[:, 0], looks[:, 2], color=ACCENT, angles="xy", scale=24.0, width=0.005)
+    axes.plot(at[:, 0], at[:, 2], "o", color=ACCENT, markersize=3.0)
+    axes.set_title("cameras, and pairs that share matches", fontsize=9.5)
+
+
+def _draw_overlap(figure: "Figure", axes: "Axes", at: FloatArray, found: ModelFigures) -> None:
+    """Draw the points by how many photos see them, the most seen ones on top, and the cameras at (C, 3)."""
+    order = np.argsort(found.tracks, kind="stable")
+    dots = axes.scatter(
+        found.places[order, 0], found.places[order, 2], c=np.minimum(found.tracks[order], LONGEST_TRACK),
+        s=2.0, linewidths=0.0, cmap="plasma", vmin=2, vmax=LONGEST_TRACK,
+    )  # fmt: skip
+    axes.plot(at[:, 0], at[:, 2], "o", color=INK, markersize=2.0)
+    figure.colorbar(dots, ax=axes, shrink=0.8, label=f"photos that see the point (up to {LONGEST_TRACK})")
+    axes.set_title("overlap", fontsize=9.5)
+
+
+def _frame(axes: "Axes", at: FloatArray, places: FloatArray) -> None:
+    """Show all cameras and nearly all points, with z downwards as seen from above."""
+    low, high = at[:, [0, 2]].min(axis=0), at[:, [0, 2]].max(axis=0)
+    if len(places):
+        near, far = np.percentile(places[:, [0, 2]], [2.0, 98.0], axis=0)
+        low, high = np.minimum(low, near), np.maximum(high, far)
+    middle, reach = (low + high) / 2, 0.54 * (float((high - low).max()) or 1.0)
+    axes.set(aspect="equal", xlabel="x", ylabel="z")
+    axes.set_xlim(middle[0] - reach, middle[0] + reach)
+    axes.set_ylim(middle[1] + reach, middle[1] - reach)
+
+
+def _draw_tracks(figures: ModelFigures | None) -> PageFigure | None:
+    if figures is None or not len(figures.tracks):
+        return None
+    counts = np.bincount(np.minimum(figures.tracks, LONGEST_TRACK), minlength=LONGEST_TRACK + 1)[2:]
+
+    def draw(figure: "Figure") -> None:
+        axes = figure.add_subplot()
+        names = [str(k) for k in range(2, LONGEST_TRACK)] + [f"{LONGEST_TRACK}+"]
+        axes.bar(names, counts, color="#0f766e")
+        axes.set(xlabel="photos that see a point", ylabel="points")
+        axes.spines[["top", "right"]].set_visible(False)
+
+    sure = int(counts[1:].sum())
+    text = f"{sure} of {int(counts.sum())} points are seen by three photos or more, which confirm each other."
+    return PageFigure("By how many photos points are seen", text, _png(draw, (6.4, 2.8)))
+
+
+def _png(draw: Callable[["Figure"], None], size: tuple[float, float]) -> str:
+    """Return a figure of this size in inches as a data address."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    file = io.BytesIO()
+    with rc_context({"font.size": 9}):
+        figure = Figure(figsize=size, layout="constrained")
+        draw(figure)
+        figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
+    return _address(file.getvalue())
+
+
+def _address(data: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(data).decode("ascii")
+
+
+# Some photos beside their depth maps, in colors from near to far.
+
+ByteArray = NDArray[np.uint8]
+
+
+MOST_SHOWN = 6
+"""Photos that are shown, spread over the set. Chosen by hand."""
+SIDE_PX = 480
+"""Longer side of each picture, and of the depth map beside it."""
+QUALITY = 78
+"""JPEG quality. Chosen by hand: colors of neighboring depths stay apart."""
+ENDS = (2.0, 98.0)
+"""Percentiles of the known depths at the ends of the colors: single wrong depths are as far as one likes."""
+UNKNOWN = (226, 226, 224)
+"""Color where there is no depth: a light gray, which is none of the colors of depths."""
+
+
+@dataclass(frozen=True, slots=True)
+class DepthPicture:
+    """A photo beside its depth map."""
+
+    name: str
+    text: str
+    """What one sees; also what is read out instead of it."""
+    address: str
+    """JPEG as a data address: the photo at the left, depths at the right."""
+    size: tuple[int, int]
+    """Its width and height in pixels, so that nothing on the page moves while it loads."""
+
+
+@dataclass(frozen=True, slots=True)
+class DepthPictures:
+    """Photos with their depth maps, spread over the set."""
+
+    pictures: Sequence[DepthPicture]
+    count: int
+    """Photos, or views of wide photos, that have a depth map."""
+
+
+def depth_pictures(contents: RunContents) -> DepthPictures | None:
+    """Return some photos beside their depth maps; None where there is none to show.
+
+    Args:
+        contents: of the run.
+    """
+    coverage: Mapping[str, float] = contents.counts("depth_maps").get("coverage", {})
+    dense = contents.run.workspace.dense
+    chosen = spread_names(sorted(coverage), MOST_SHOWN)
+    found = contents.run.map(lambda name: _draw(dense, name, coverage[name]), chosen, "depth maps of the report")
+    pictures = [picture for picture in found if picture is not None]
+    return DepthPictures(pictures, len(coverage)) if pictures else None
+
+
+def spread_names(names: Sequence[str], most: int) -> list[str]:
+    """Return some of the names at even steps, with the first and the last.
+
+    Args:
+        names: in order.
+        most: of them, > 0.
+    """
+    if not names:
+        return []
+    places = np.linspace(0, len(names) - 1, min(most, len(names)))
+    return [names[round(float(place))] for place in places]
+
+
+def _draw(dense: Path, name: str, share: float) -> DepthPicture | None:
+    """Return one photo beside its depths; None where a file is missing or damaged."""
+    try:
+        photo, depth = read_photo_and_depth(dense, name)
+        size = _shrunk_size(depth.shape[1], depth.shape[0])
+        small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+        nearest = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.float64)
+        colors, (near, far) = depth_colors(nearest)
+        data = cv2.imencode(".jpg", np.hstack([small, colors])[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+    except (*UNREADABLE, cv2.error) as err:  # the page has the others
+        logger.info("no picture of the depths of %s", name, exc_info=err)
+        return None
+    text = f"{100 * share:.0f} % of it has a depth, from {near:.3g} (yellow) to {far:.3g} (violet)"
+    address = "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+    return DepthPicture(name, text, address, (2 * size[0], size[1]))
+
+
+def depth_colors(depth: FloatArray) -> tuple[ByteArray, tuple[float, float]]:
+    """Return the colors (H, W, 3) RGB of depths, yellow near and violet far, and the depths at both ends.
+
+    Colors are even in 1 / depth, as disparities are: the near half of a scene would else have one color.
+
+    Args:
+        depth: (H, W), <= 0 or not finite where there is none.
+
+    Raises:
+        ValueError: no pixel has a depth.
+    """
+    known = np.isfinite(depth) & (depth > 0.0)
+    if not known.any():
+        raise ValueError("no pixel has a depth")
+    near, far = (float(value) for value in np.percentile(depth[known], ENDS))
+    inverse = 1.0 / np.where(known, depth, 1.0)
+    span = max(1.0 / near - 1.0 / far, 1e-12)
+    level = np.clip((inverse - 1.0 / far) / span, 0.0, 1.0)
+    colors = cv2.applyColorMap(np.round(255.0 * level).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]
+    return np.where(known[..., None], colors, np.array(UNKNOWN, np.uint8)).astype(np.uint8), (near, far)
+
+
+def _shrunk_size(width: int, height: int) -> tuple[int, int]:
+    """Return width and height at most SIDE_PX long, in the same ratio."""
+    scale = min(1.0, SIDE_PX / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))

@@ -1,0 +1,180 @@
+"""What the page's 3D view draws: the model, the points, and the cameras that were placed."""
+
+import base64
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.colmap.model import sparse_model
+from sfm_app.formats.frusta import center, frustum_depth, scene_size
+from sfm_app.formats.gltf import FLIP, write_glb
+from sfm_app.frame.scale import move_model
+from sfm_app.geometry.poses import Similarity
+from sfm_app.numerical import Json
+from sfm_app.report.contents import UNREADABLE, RunContents
+from sfm_app.stages import texture
+from sfm_app.types import Frustum, Model
+
+logger = logging.getLogger("sfm_app")
+
+MOST_GLB_BYTES = 16_000_000
+"""Largest model that the page carries as it is. Chosen by hand: a page of 40 MB still opens on a telephone."""
+LIGHT_PAGE_PX = 2048
+"""Longer side of a page of texture in the lighter model; normal maps have half of it."""
+MOST_POINTS = 60_000
+HEIGHTS = (2.0, 98.0)
+"""Percentiles of the heights of points between which the view looks. Chosen by hand: single wrong points are beyond."""
+
+
+def embedded_view(contents: RunContents, photos: Sequence[str]) -> Mapping[str, Json] | None:
+    """Return what the 3D view needs, with model and points in it, as plain values; None where no photo has a place.
+
+    Args:
+        contents: of the run.
+        photos: names of the photos in order of the page's rows.
+    """
+    points = view_points(contents)
+    if points is None:
+        return None
+    places, colors = _sample(points)
+    return {
+        "glb": _base64(_model_bytes(contents)),
+        "places": _base64(places.astype("<f4").tobytes()),
+        "colors": _base64(colors.tobytes()),
+    } | view_frame(contents, points, photos)
+
+
+def view_points(contents: RunContents) -> Model | None:
+    """Return the points and the cameras of the scene, in the frame of exported files; None where there are none.
+
+    Args:
+        contents: of the run.
+    """
+    if contents.scene is None:
+        return None
+    try:
+        return move_model(sparse_model(contents.scene.model_dir), contents.frame.from_model)
+    except UNREADABLE as err:
+        logger.info("the report has no 3D view", exc_info=err)
+        return None
+
+
+def view_frame(contents: RunContents, points: Model, photos: Sequence[str]) -> dict[str, Json]:
+    """Return what the 3D view needs besides model and points: the cameras, and where and how large the scene is.
+
+    Args:
+        contents: of the run.
+        points: the points and the cameras.
+        photos: names of the photos in order of the page's rows.
+    """
+    rows = {name: number for number, name in enumerate(photos)}
+    middle, size = _bounds(points)
+    return {
+        "cameras": [_camera(camera, rows.get(camera.name)) for camera in points.cameras],
+        "middle": middle,
+        "size": size,
+        "depth": frustum_depth(np.array([center(camera) for camera in points.cameras]), points.surface.vertices),
+        "unit": "m" if contents.is_metric else "",
+        "fromModel": _plain_similarity(contents.frame.from_model),
+    }
+
+
+def model_file(contents: RunContents) -> Path | None:
+    """Return the file of the finished model; None where there is none.
+
+    Args:
+        contents: of the run.
+    """
+    path = contents.run.workspace.root / "model.glb"
+    return path if "files" in contents.stages and path.exists() else None
+
+
+def light_model(contents: RunContents) -> bytes:
+    """Return the finished model as GLB with smaller pages of texture.
+
+    Args:
+        contents: of a run with a texture.
+    """
+    model = move_model(texture.load(contents.run), contents.frame.from_model)
+    return write_glb(lighten(model), "model")["model.glb"]
+
+
+def _model_bytes(contents: RunContents) -> bytes:
+    """Return the finished model as GLB, a lighter one where it is large; empty where there is none."""
+    path = model_file(contents)
+    if path is None:
+        return b""
+    try:
+        return path.read_bytes() if path.stat().st_size <= MOST_GLB_BYTES else light_model(contents)
+    except UNREADABLE as err:
+        logger.info("the report shows no surface", exc_info=err)
+        return b""
+
+
+def lighten(model: Model) -> Model:
+    """Return a textured model with smaller pages.
+
+    Args:
+        model: with a texture.
+    """
+    if model.texture is None:
+        return model
+    pages = tuple(_shrink(page, LIGHT_PAGE_PX) for page in model.texture.pages)
+    maps = tuple(_shrink(one, LIGHT_PAGE_PX // 2) for one in model.texture.normal_maps)
+    return replace(model, texture=replace(model.texture, pages=pages, normal_maps=maps))
+
+
+def _shrink(page: NDArray[np.uint8], most: int) -> NDArray[np.uint8]:
+    height, width = page.shape[:2]
+    scale = most / max(height, width)
+    if scale >= 1.0:
+        return page
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return np.asarray(cv2.resize(page, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _sample(points: Model) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Return places and colors of the points, or of a sample drawn with a fixed seed."""
+    places, colors = points.surface.vertices, points.surface.colors
+    chosen = np.sort(np.random.default_rng(0).permutation(len(places))[:MOST_POINTS])
+    return places[chosen], np.ascontiguousarray(colors[chosen])
+
+
+def _bounds(points: Model) -> tuple[list[float], float]:
+    """Return the middle of the points and the size of the scene; of the cameras where there are no points."""
+    places = points.surface.vertices
+    if not len(places):
+        places = np.array([center(camera) for camera in points.cameras]).reshape(-1, 3)
+    if not len(places):
+        return [0.0, 0.0, 0.0], 1.0
+    middle = np.median(places, axis=0)
+    middle[1] = np.percentile(places[:, 1], HEIGHTS).mean()  # most points may be on the ground
+    return middle.tolist(), scene_size(places) or 1.0
+
+
+def _camera(camera: Frustum, row: int | None) -> dict[str, Any]:
+    """Return pose and field of view of a photo; the matrix is by columns, of a camera that looks along -z."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = camera.cam_from_world[:, :3].T @ FLIP, center(camera)
+    return {
+        "name": camera.name,
+        "row": row,
+        "matrix": matrix.T.ravel().round(7).tolist(),
+        "across": float(camera.width / (2 * camera.K[0, 0])),
+        "down": float(camera.height / (2 * camera.K[1, 1])),
+    }
+
+
+def _plain_similarity(similarity: Similarity) -> dict[str, Json]:
+    """Return scale, rotation by rows and translation: `--scale` takes points in the frame before it."""
+    return {"scale": similarity.scale, "R": similarity.R.ravel().tolist(), "t": similarity.t.tolist()}
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")

@@ -1,1 +1,0 @@
-"""Which pairs of photos are worth matching, from the photos themselves."""

@@ -1,0 +1,547 @@
+"""Adjust K, lens and relative poses to the matches of all pairs, without points."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_app.geometry.least_squares import DampingRange, damped_step, solve_each
+from sfm_app.geometry.poses import POSE_DOF, retract, write_essential
+from sfm_app.jit import kernel
+from sfm_app.numerical import MAD_TO_SIGMA
+from sfm_app.selfcal.pairs import write_camera, write_ray
+from sfm_app.types.arrays import FloatArray, IndexArray
+
+# Cost of the matches of photo pairs over cameras and poses: Sampson distances of E = [t]x R, and derivatives.
+#
+# A pair has fifteen parameters: five of each camera (`lens`), and the five of its relative pose. The distance of a
+# match is Sampson's, in pixels of the photo as it is, so that undistorting does not change the weight of a pixel::
+#
+# r = C / |dC/d(x1, y1, x2, y2)|, C = q2' E q1, q = ray of a pixel
+#
+# That is Eq. 4.2 of the thesis for rays, with E of Eq. 5.7; adjusting cameras by it is ours. Matches that fit badly
+# are downweighted by the cost r^2 / (1 + r^2 / c^2) with c = 3 sigma (Geman and McClure 1987).
+
+CAMERA = 5
+"""Parameters of one camera. Counted: log f, u, v, log a, kappa, by definition in `lens`."""
+PAIR = 2 * CAMERA + POSE_DOF
+"""Parameters of a pair: two cameras and a pose, by definition."""
+ROBUST_SCALE = 3.0
+"""c of the robust cost, in sigma. docs/algorithms.md, Self-calibration, 2. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
+OVERFLOW_LIMIT = 1e60
+"""Squared distances in sigma^2, or derivatives, above this count as not finite. Its square is finite in double
+precision."""
+_STEP = 1e-6
+"""Step of the parameters for finite differences: curvature causes a relative error of about 1e-6, rounding in double
+precision 1e-10. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+
+
+@kernel
+def _distance(p: FloatArray, q: FloatArray, E: FloatArray) -> float:
+    """Return the distance r of the rays p of view 1 and q of view 2, each (7,) as `lens.write_ray` writes it."""
+    l0 = E[0, 0] * p[0] + E[0, 1] * p[1] + E[0, 2]
+    l1 = E[1, 0] * p[0] + E[1, 1] * p[1] + E[1, 2]
+    l2 = E[2, 0] * p[0] + E[2, 1] * p[1] + E[2, 2]
+    k0 = E[0, 0] * q[0] + E[1, 0] * q[1] + E[2, 0]
+    k1 = E[0, 1] * q[0] + E[1, 1] * q[1] + E[2, 1]
+    g0, g1 = p[2] * k0 + p[4] * k1, p[3] * k0 + p[5] * k1
+    h0, h1 = q[2] * l0 + q[4] * l1, q[3] * l0 + q[5] * l1
+    return float((q[0] * l0 + q[1] * l1 + l2) / np.sqrt(g0 * g0 + g1 * g1 + h0 * h0 + h1 * h1 + 1e-300))
+
+
+@kernel
+def distances(
+    matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray
+) -> FloatArray:
+    """Return (M,) signed Sampson distances, in the units of the matches.
+
+    Args:
+        matches: (M, 4) of all pairs, one after the other.
+        ends: (P + 1,) where each pair begins, and the end of the last.
+        thetas: (C, 5) parameters of the cameras.
+        cameras, poses: (P, 2) camera of view 1 and of view 2; (P, 12), see `write_essential`.
+    """
+    E, first, second = np.empty((3, 3)), np.empty(5), np.empty(5)
+    p, q = np.empty(7), np.empty(7)
+    found = np.empty(len(matches))
+    for k in range(len(poses)):
+        write_essential(poses[k], E)
+        write_camera(thetas[cameras[k, 0]], first)
+        write_camera(thetas[cameras[k, 1]], second)
+        for i in range(ends[k], ends[k + 1]):
+            write_ray(matches[i, 0], matches[i, 1], first, -1.0, p)
+            write_ray(matches[i, 2], matches[i, 3], second, -1.0, q)
+            found[i] = _distance(p, q, E)
+    return found
+
+
+@kernel
+def pair_costs(
+    matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray, sigma: float
+) -> FloatArray:
+    """Return (P,) half the sum over the matches of a pair of their robust squared distances, in sigma^2.
+
+    Args:
+        matches: (M, 4) of all pairs, one after the other.
+        ends: (P + 1,) where each pair begins, and the end of the last.
+        thetas: (C, 5) parameters of the cameras.
+        cameras: (P, 2) camera of view 1 and of view 2.
+        poses: (P, 12), see `write_essential`.
+        sigma: standard deviation of a distance, in the units of the matches.
+    """
+    found = distances(matches, ends, thetas, cameras, poses)
+    costs = np.zeros(len(poses))
+    for k in range(len(poses)):
+        for i in range(ends[k], ends[k + 1]):
+            r2 = (found[i] / sigma) ** 2
+            costs[k] += 0.5 * r2 / (1.0 + r2 / ROBUST_SCALE**2) if r2 < OVERFLOW_LIMIT else 0.5 * ROBUST_SCALE**2
+    return costs
+
+
+@kernel
+def pair_systems(
+    matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray, sigma: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return Gauss-Newton systems of all pairs in their fifteen parameters: camera 1, camera 2, pose.
+
+    Args:
+        matches: (M, 4) of all pairs, one after the other.
+        ends: (P + 1,) where each pair begins, and the end of the last.
+        thetas: (C, 5) parameters of the cameras.
+        cameras: (P, 2) camera of view 1 and of view 2.
+        poses: (P, 12), see `write_essential`.
+        sigma: standard deviation of a distance, in the units of the matches.
+
+    Returns:
+        (P, 15, 15) approximate Hessians of the costs and (P, 15) their negative gradients; where both views are of one
+        camera, all of its entries are in the first five rows and columns.
+    """
+    A, b = np.zeros((len(poses), PAIR, PAIR)), np.zeros((len(poses), PAIR))
+    # derivatives are finite differences: index 0 is unchanged, 1 to 5 have one parameter moved
+    lenses, Es = np.empty((2, 1 + CAMERA, 5)), np.empty((1 + POSE_DOF, 3, 3))
+    rays, J = np.empty((2, 1 + CAMERA, 7)), np.empty(PAIR)
+    for k in range(len(poses)):
+        shared = cameras[k, 0] == cameras[k, 1]
+        J[:] = 0.0
+        _write_poses(poses[k], Es)
+        for view in range(2):
+            _write_cameras(thetas[cameras[k, view]], lenses[view])
+        for i in range(ends[k], ends[k + 1]):
+            for view in range(2):
+                _write_rays(matches[i, 2 * view], matches[i, 2 * view + 1], lenses[view], rays[view])
+            r = _write_derivatives(rays, Es, sigma, shared, J)
+            if _is_finite(r, J):
+                _add_match(A[k], b[k], J, r, (1.0 + r * r / ROBUST_SCALE**2) ** -2)
+        _mirror(A[k])
+    return A, b
+
+
+@kernel
+def _write_poses(pose: FloatArray, Es: FloatArray) -> None:
+    """Write E of a pose, and with each of its five parameters moved, into `Es` (6, 3, 3)."""
+    step = np.zeros(POSE_DOF)
+    write_essential(pose, Es[0])
+    for j in range(POSE_DOF):
+        step[j] = _STEP
+        write_essential(retract(pose, step), Es[1 + j])
+        step[j] = 0.0
+
+
+@kernel
+def _write_cameras(theta: FloatArray, lenses: FloatArray) -> None:
+    """Write the camera of the parameters (5,), and with each of them moved, into `lenses` (6, 5)."""
+    trial = theta.copy()
+    write_camera(trial, lenses[0])
+    for j in range(CAMERA):
+        kept = trial[j]
+        trial[j] = kept + _STEP
+        write_camera(trial, lenses[1 + j])
+        trial[j] = kept
+
+
+@kernel
+def _write_rays(x: float, y: float, lenses: FloatArray, rays: FloatArray) -> None:
+    """Write the ray of a pixel through each of `lenses` (6, 5) into `rays` (6, 7); the first initializes the others."""
+    guess = -1.0
+    for j in range(1 + CAMERA):
+        write_ray(x, y, lenses[j], guess, rays[j])
+        guess = rays[0, 6]
+
+
+@kernel
+def _write_derivatives(rays: FloatArray, Es: FloatArray, sigma: float, shared: bool, J: FloatArray) -> float:
+    """Return the distance r of one match in sigma, and write dr over the fifteen parameters into `J` (15,).
+
+    Args:
+        rays: (2, 6, 7) from `_write_rays`, per view.
+        Es: (6, 3, 3) from `_write_poses`.
+        sigma: standard deviation of a distance.
+        shared: whether both views are of one camera: then both rays move with its parameters, in the first five.
+        J: filled; where shared, 5 to 9 stay as they are.
+    """
+    r = _distance(rays[0, 0], rays[1, 0], Es[0]) / sigma
+    for j in range(CAMERA):
+        if shared:
+            J[j] = (_distance(rays[0, 1 + j], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
+        else:
+            J[j] = (_distance(rays[0, 1 + j], rays[1, 0], Es[0]) / sigma - r) / _STEP
+            J[CAMERA + j] = (_distance(rays[0, 0], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
+    for j in range(POSE_DOF):
+        J[2 * CAMERA + j] = (_distance(rays[0, 0], rays[1, 0], Es[1 + j]) / sigma - r) / _STEP
+    return float(r)
+
+
+@kernel
+def _is_finite(r: float, J: FloatArray) -> bool:
+    """Return whether a distance and its derivatives are finite; at an epipole the gradient vanishes."""
+    total = r * r
+    for j in range(PAIR):
+        total += abs(J[j])
+    return bool(total < OVERFLOW_LIMIT)
+
+
+@kernel
+def _mirror(A: FloatArray) -> None:
+    """Copy the lower triangle to the upper one."""
+    for i in range(PAIR):
+        for j in range(i):
+            A[j, i] = A[i, j]
+
+
+@kernel
+def _add_match(A: FloatArray, b: FloatArray, J: FloatArray, r: float, weight: float) -> None:
+    """Add one match: weight J'J to the lower triangle of A, -weight J'r to b."""
+    for i in range(PAIR):
+        scaled = weight * J[i]
+        b[i] -= scaled * r
+        for j in range(i + 1):
+            A[i, j] += scaled * J[j]
+
+
+# Bundle adjustment without points: cameras and relative poses of all pairs, adjusted jointly to the matches.
+#
+# Ours. Bundle adjustment and the Schur complement: Triggs and others (2000). The weights do what Eq. 5.23 and 5.24
+# do in Algorithm 3 of the thesis.
+#
+# Every pair has its own relative pose, which is eliminated (Schur complement). What remains of a pair is its
+# information about the cameras: one Hessian and one gradient. A pair whose matches are right but whose geometry is
+# wrong (repeated facades, another camera, a zoom) pulls at the cameras far harder than its noise explains; such a
+# pair is downweighted.
+
+MOST_MATCHES = 1000
+"""Most matches of one pair; more are not independent, and would let one pair outvote all others. With 300, errors and
+deviations are half as large again (docs/algorithms.md, Self-calibration, Tried and left out)."""
+CONFLICT = 3.0
+"""Log-likelihood gain from cameras of its own at which a pair's weight is a quarter. By definition of chi^2 with two
+degrees of freedom, noise alone gains as much once in twenty times: exp(-3)."""
+OWN_CAMERA_SIGMAS = np.array([0.3, 0.15, 0.15, 0.2, 0.2])
+"""How far a pair's own cameras may deviate: standard deviations of log f, u, v, log a, kappa. Chosen by hand; halved
+and doubled by `benchmarks.sensitivity`."""
+LOWER_QUARTILE = 0.288
+"""Lower quartile of that gain for noise in two degrees of freedom: by definition of chi^2, -ln(3/4)."""
+LEAST_SIGMA_PX = 0.1
+"""Least standard deviation of a distance: noise-free synthetic matches would otherwise have unbounded weight. Chosen by
+hand; halved and doubled by `benchmarks.sensitivity`."""
+FEW_PHOTOS, FEW_PHOTOS_TRUST = 5, 0.25
+"""A camera of fewer photos absorbs unmodeled effects (a lens, a wall that is not quite still) into its focal and
+center; the information of its pairs counts as if their noise were twice as large. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
+ROUNDS = 25
+"""Most rounds of reweighting and stepping. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e8)
+"""Damping of Levenberg-Marquardt steps, relative to the diagonal. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
+CONVERGED = 2e-5
+"""Largest change of a camera's parameter that ends the rounds. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """Independent normal priors on the parameters of all cameras."""
+
+    mean: FloatArray
+    """(C, 5)."""
+    precision: FloatArray
+    """(C, 5), 1 / variance, > 0."""
+
+    def cost(self, thetas: FloatArray) -> float:
+        """Return negative log-density, without its constant."""
+        return 0.5 * float(np.sum(self.precision * (thetas - self.mean) ** 2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """State of the adjustment."""
+
+    thetas: FloatArray
+    """(C, 5) parameters of the cameras, see `lens`."""
+    poses: FloatArray
+    """(P, 12), see `pose_manifold.write_essential`."""
+    weights: FloatArray
+    """(P,) in [0, 1]: how well a pair agrees with the others."""
+    sigma: float
+    """Standard deviation of a Sampson distance."""
+    scale: float = 1.0
+    """How many times larger the pairs' disagreement is than their noise explains, >= 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Information:
+    """Information of each pair about the cameras, with its pose eliminated."""
+
+    hessians: FloatArray
+    """(P, 10, 10) of camera 1 and camera 2; where both are the same camera, all in the first five rows and columns."""
+    gradients: FloatArray
+    """(P, 10) negative gradients."""
+    gains: FloatArray
+    """(P,) log-likelihood that a pair would gain from cameras of its own."""
+
+
+class Matches:
+    """Inliers of all pairs, concatenated.
+
+    Args:
+        inliers: per pair (N, 4), from the middle of each photo, in longer sides of the largest photo.
+        cameras: (P, 2) numbers of the cameras, counted from 0.
+        photos: (P, 2) numbers of the photos.
+        unit_px: length of that unit, in pixels.
+        most: most matches of one pair; evenly chosen where there are more.
+        count: number of cameras.
+    """
+
+    def __init__(
+        self, inliers: Sequence[FloatArray], cameras: IndexArray, photos: IndexArray, unit_px: float,
+        most: int = MOST_MATCHES, count: int = 1,
+    ) -> None:  # fmt: skip
+        # points outside of the photos are no matches, and would overflow
+        kept = [subsample_rows(x[np.all(np.abs(x) <= 1.0, axis=1)], most) for x in inliers]
+        self.unit_px = unit_px
+        self.points = np.ascontiguousarray(np.concatenate([*kept, np.empty((0, 4))]))
+        self.ends = np.concatenate([[0], np.cumsum([len(x) for x in kept])]).astype(np.int64)
+        self.cameras = np.ascontiguousarray(cameras, dtype=np.int64)
+        self.photos = np.asarray(photos, dtype=np.int64)
+        self.count = count
+        self.least_sigma = LEAST_SIGMA_PX / unit_px
+        taken = [len(np.unique(self.photos[self.cameras == camera])) for camera in range(count)]
+        few = np.array(taken, np.int64) < FEW_PHOTOS
+        self.trust = np.where(few[self.cameras].any(axis=1), FEW_PHOTOS_TRUST, 1.0)
+
+    @cached_property
+    def redundancy(self) -> float:
+        """Number of matches per independent error, >= 1.
+
+        One keypoint in m photos gives m (m - 1) / 2 matches, but 2 m - 3 independent errors. The number of matches per
+        keypoint determines m.
+        """
+        if len(self.points) == 0:
+            return 1.0
+        photos = self.photos.repeat(np.diff(self.ends), axis=0)
+        views = [np.column_stack([photos[:, view], self.points[:, 2 * view : 2 * view + 2]]) for view in range(2)]
+        seen = np.concatenate(views)
+        seen = seen[np.lexsort(seen.T)]
+        each = 2 * len(self.points) / (1 + np.count_nonzero((seen[1:] != seen[:-1]).any(axis=1)))
+        return max(1.0, 0.5 * each * (each + 1.0) / (2.0 * each - 1.0))
+
+    def pair_matches(self, pair: int) -> FloatArray:
+        """Return the matches (N, 4) of one pair."""
+        return self.points[self.ends[pair] : self.ends[pair + 1]]
+
+    def select(self, which: IndexArray) -> "Matches":
+        """Return the matches of the given pairs only."""
+        if len(which) == len(self.cameras):
+            return self
+        inliers = [self.pair_matches(pair) for pair in which]
+        return Matches(inliers, self.cameras[which], self.photos[which], self.unit_px, count=self.count)
+
+    def subsample(self, most: int) -> "Matches":
+        """Return at most `most` matches of each pair, evenly chosen."""
+        inliers = [self.pair_matches(pair) for pair in range(len(self.cameras))]
+        return Matches(inliers, self.cameras, self.photos, self.unit_px, most, self.count)
+
+    def costs(self, state: State) -> FloatArray:
+        """Return (P,) robust costs of the pairs."""
+        return np.asarray(
+            pair_costs(self.points, self.ends, state.thetas, self.cameras, state.poses, state.sigma), np.float64
+        )
+
+    def noise(self, state: State) -> float:
+        """Return the standard deviation of the distances in agreeing pairs, from their median.
+
+        A pose absorbs five of a pair's degrees of freedom: the distances of few matches are smaller than their errors.
+        """
+        counts = np.diff(self.ends)
+        found = np.abs(distances(self.points, self.ends, state.thetas, self.cameras, state.poses))
+        found *= np.repeat(np.sqrt(counts / np.maximum(counts - POSE_DOF, 1)), counts)
+        agreeing = np.repeat(state.weights > 0.5, counts)
+        return max(MAD_TO_SIGMA * float(np.median(found[agreeing])) if agreeing.any() else 0.0, self.least_sigma)
+
+    def assemble(self, information: Information, factors: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Sum the information of the pairs into (5C, 5C) and (5C,) over the parameters of all cameras.
+
+        Args:
+            information: of P pairs.
+            factors: (P,) factor of each pair.
+        """
+        rows = (CAMERA * self.cameras[:, :, None] + np.arange(CAMERA)).reshape(-1, 2 * CAMERA)
+        H, b = np.zeros((CAMERA * self.count,) * 2), np.zeros(CAMERA * self.count)
+        np.add.at(H, (rows[:, :, None], rows[:, None, :]), factors[:, None, None] * information.hessians)
+        np.add.at(b, rows, factors[:, None] * information.gradients)
+        return H, b
+
+
+def subsample_rows(rows: FloatArray, most: int) -> FloatArray:
+    """Return at most `most` rows, evenly chosen.
+
+    Args:
+        rows: (N, ...) array.
+        most: largest number of rows to keep, > 0.
+    """
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
+
+
+def adjust_cameras(matches: Matches, state: State, prior: Prior, rounds: int = ROUNDS) -> State:
+    """Adjust cameras and poses: reweight the pairs and take a Levenberg-Marquardt step until the cameras converge.
+
+    Args:
+        matches: inliers of P pairs.
+        state: where to start.
+        prior: on the parameters of the cameras.
+        rounds: most steps, > 0.
+    """
+    damping = DAMPING.first
+    for _ in range(rounds):
+        system = _normal_equations(matches, state)
+        state = _weigh_pairs(state, system)
+        trial, damping = _take_step(matches, state, prior, system, damping)
+        moved_by = np.max(np.abs(trial.thetas - state.thetas), initial=0.0)
+        state = replace(trial, sigma=matches.noise(trial))
+        if moved_by < CONVERGED:
+            break
+    return reweight(matches, state)
+
+
+def reweight(matches: Matches, state: State) -> State:
+    """Weigh every pair by the log-likelihood that it would gain from cameras of its own.
+
+    Args:
+        matches: inliers of P pairs.
+        state: current state; only the weights and their scale change.
+    """
+    return _weigh_pairs(state, _normal_equations(matches, state))
+
+
+def pair_information(matches: Matches, state: State) -> Information:
+    """Eliminate the poses and return the information of each pair about the cameras.
+
+    Args:
+        matches: inliers of P pairs.
+        state: cameras and poses.
+    """
+    return _reduce_to_cameras(_normal_equations(matches, state))
+
+
+def _normal_equations(matches: Matches, state: State) -> tuple[FloatArray, FloatArray]:
+    return pair_systems(matches.points, matches.ends, state.thetas, matches.cameras, state.poses, state.sigma)
+
+
+def _reduce_to_cameras(system: tuple[FloatArray, FloatArray]) -> Information:
+    """Return the information of the pairs about their cameras, and the gains g = b' H^-1 b / 2 (see `_weigh_pairs`)."""
+    H, b, _, _ = _eliminate_poses(*system, 0.0)
+    gains = 0.5 * np.einsum(
+        "pi,pi->p", b, solve_each(H + np.diag(np.tile(OWN_CAMERA_SIGMAS**-2.0, 2)), b[..., None])[..., 0]
+    )
+    return Information(H, b, gains)
+
+
+def _weigh_pairs(state: State, system: tuple[FloatArray, FloatArray]) -> State:
+    """Weigh every pair by the log-likelihood g that it would gain from cameras of its own::
+
+        g = b' H^-1 b / 2,      w = (1 + g / (3 s))^-2,      s = max(1, lower quartile of all g / 0.288)
+
+    H and b are the pair's Hessian and negative gradient in its cameras, the poses eliminated, with the prior
+    `OWN_CAMERA_SIGMAS`.
+    With noise alone, g is half of a chi^2 variable of two degrees of freedom, whose lower quartile is 0.288. w is the
+    derivative of Geman and McClure's cost (1987) g / (1 + g / (3 s)): iteratively reweighted least squares.
+    """
+    gains = _reduce_to_cameras(system).gains
+    scale = max(1.0, float(np.quantile(gains, 0.25)) / LOWER_QUARTILE) if len(gains) else 1.0
+    return replace(state, weights=(1.0 + gains / (CONFLICT * scale)) ** -2, scale=scale)
+
+
+class ReducedSystem(NamedTuple):
+    """Normal equations of P pairs reduced to their cameras, and the terms for back substitution of the poses."""
+
+    hessians: FloatArray
+    """(P, 10, 10) U - W V^-1 W'."""
+    gradients: FloatArray
+    """(P, 10) b_cameras - W V^-1 b_pose."""
+    pose_by_cameras: FloatArray
+    """(P, 5, 10) V^-1 W': its product with the cameras' step is subtracted from the pose's step."""
+    pose_alone: FloatArray
+    """(P, 5) V^-1 b_pose: the pose's step if the cameras do not move."""
+
+    def pose_steps(self, camera_steps: FloatArray) -> FloatArray:
+        """Return (P, 5) steps of the poses by back substitution of the steps (P, 10) of the cameras."""
+        return np.asarray(self.pose_alone - (self.pose_by_cameras @ camera_steps[..., None])[..., 0], np.float64)
+
+
+def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> ReducedSystem:
+    """Eliminate the poses from the systems of all pairs by the Schur complement::
+
+        A = | U   W |     (U - W V^-1 W') d_cameras = b_cameras - W V^-1 b_pose
+            | W'  V |
+
+    Args:
+        A: (P, 15, 15) Hessians of two cameras and a pose, from `two_view_cost.pair_systems`.
+        b: (P, 15) their negative gradients.
+        damping: of V, relative to its diagonal.
+    """
+    n = 2 * CAMERA
+    V = A[:, n:, n:].copy()
+    diagonal = np.arange(V.shape[-1])
+    # few or degenerate matches leave a pose undetermined: the damping must not vanish beside the largest entry
+    least = 1e-9 + 1e-12 * np.max(V[:, diagonal, diagonal], axis=1, keepdims=True)
+    V[:, diagonal, diagonal] += damping * V[:, diagonal, diagonal] + least
+    solved = np.linalg.solve(V, np.concatenate([A[:, n:, :n], b[:, n:, None]], axis=2))
+    pose_by_cameras, pose_alone = np.split(solved, [n], axis=2)
+    W = A[:, :n, n:]
+    return ReducedSystem(
+        hessians=A[:, :n, :n] - W @ pose_by_cameras,
+        gradients=b[:, :n] - (W @ pose_alone)[..., 0],
+        pose_by_cameras=pose_by_cameras,
+        pose_alone=pose_alone[..., 0],
+    )
+
+
+def _take_step(
+    matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
+) -> tuple[State, float]:
+    """Take one step that lowers the cost, damped as far as needed; return the state and the next damping."""
+    factors = matches.trust * state.weights / state.scale
+    cost = float(factors @ matches.costs(state)) + prior.cost(state.thetas)
+
+    def attempt(tried: float) -> State | None:
+        trial = _solve_step(matches, state, prior, system, tried)
+        return trial if float(factors @ matches.costs(trial)) + prior.cost(trial.thetas) <= cost else None
+
+    found, damping = damped_step(attempt, damping, DAMPING)
+    return found or state, damping
+
+
+def _solve_step(
+    matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
+) -> State:
+    """Return the state after one damped step: cameras from all pairs and the prior, then each pose from its pair."""
+    reduced = _eliminate_poses(*system, damping)
+    said = Information(reduced.hessians, reduced.gradients, np.empty(0))
+    H, g = matches.assemble(said, matches.trust * state.weights / state.scale)
+    H += np.diag(prior.precision.ravel())
+    g += (prior.precision * (prior.mean - state.thetas)).ravel()
+    step = solve_each(H + damping * np.diag(np.diag(H)), g[:, None]).reshape(-1, CAMERA)
+    turns = reduced.pose_steps(step[matches.cameras].reshape(-1, 2 * CAMERA))
+    poses = np.array([retract(pose, turn) for pose, turn in zip(state.poses, turns, strict=True)]).reshape(-1, 12)
+    return replace(state, thetas=state.thetas + step, poses=poses)

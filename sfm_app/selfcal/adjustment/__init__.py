@@ -1,1 +1,0 @@
-"""Cameras adjusted to the matches of pairs, and how far to trust them. Ours."""

@@ -1,1 +1,0 @@
-"""Which photos of a set share a camera. Ours."""

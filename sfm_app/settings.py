@@ -1,0 +1,468 @@
+"""Every option of the program: typed, with unit, range and one line of help; TOML in and out.
+
+A section is a pydantic model; flags, help and the TOML file come from its fields. Presets are tables of values.
+"""
+
+import difflib
+import json
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from sfm_app.errors import ConfigError
+from sfm_app.wording import parse_length, parse_point
+
+# The tables of the settings file: every option in them, typed, with unit, range and one line of help.
+
+CameraModelName = Literal[
+    "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_FISHEYE",
+    "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "EQUIRECTANGULAR",
+]  # fmt: skip
+MarkerFamily = Literal[
+    "auto", "apriltag-36h11", "apriltag-25h9", "apriltag-16h5", "aruco-4x4", "aruco-4x4-1000", "aruco-5x5",
+    "aruco-5x5-1000", "aruco-6x6", "aruco-6x6-1000", "aruco-7x7", "aruco-7x7-1000", "aruco-original", "aruco-mip-36h12",
+]  # fmt: skip
+ConstraintForm = Literal["huang-faugeras", "frobenius", "trivedi", "polynomial"]
+AS_NEEDED, MOST_LEVELS = 0, 4
+"""Sizes at which depth maps are made: 0 for as many as the photos need, and the most. Chosen by hand: an eighth of a
+photo shows next to nothing."""
+
+
+LOCAL_ADDRESS = re.compile(r"local:([1-9]\d{0,2})")
+"""So many processes of this machine as a cluster."""
+SCHEDULER_ADDRESS = re.compile(r"(?:[a-z]+://)?(?:[\w.-]+|\[[\da-fA-F:.]+\]):\d{1,5}")
+"""Host, IPv4 or IPv6 address, and port, with Dask's name of a protocol or without."""
+
+
+class Section(BaseModel):
+    """One table of the settings file: frozen, and unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class PhotoSettings(Section):
+    """Which photos are used and which of them share a camera."""
+
+    images: str = Field("", description="text file that names the photos to use, one per line; all where empty")
+    masks: str = Field(
+        "", description="folder of masks: what is black in sub/a.jpg.png is left out of sub/a.jpg; none where empty"
+    )
+    cameras: Literal["auto", "single", "folder", "each"] = Field(
+        "auto",
+        description="auto: same size and same EXIF camera share one; single: all share one; folder: those of a folder; "
+        "each: none share",
+    )
+    max_frames: int = Field(100, ge=2, le=2000, description="most frames of a video that are used")
+    keep_low_quality: bool = Field(False, description="use copies, blurred photos and screenshots, too")
+    max_megapixels: float = Field(64.0, ge=0.1, le=178, description="larger photos are scaled down to this size")
+    min_side_px: int = Field(64, ge=16, le=4096, description="photos with a shorter side are left out, in pixels")
+
+
+class MatchSettings(Section):
+    """Features and matches."""
+
+    features: str = Field("sift", description="name of the way to find and match features (see `sfm-app plugins`)")
+    max_image_size_px: int = Field(
+        1600, ge=128, le=16384, description="longer side at which features are found, in pixels"
+    )
+    max_features: int = Field(8192, ge=100, le=100000, description="most features per photo")
+    enlarge_below: int = Field(
+        4000,
+        ge=0,
+        le=100000,
+        description="photos with fewer features are searched again at twice their size, which takes four times as "
+        "long; for SIFT",
+    )
+    max_ratio: float = Field(
+        0.8, gt=0, le=1, description="largest nearest over second nearest descriptor distance, for SIFT; 1: no limit"
+    )
+    pairs: Literal["auto", "all", "retrieval", "sequence"] = Field(
+        "auto",
+        description="pairs to match: all; retrieval: photos that look alike; sequence: mostly neighbors by name or "
+        "time; auto: all where that is cheaper, else retrieval",
+    )
+    neighbors: int = Field(30, ge=4, le=1000, description="photos that each one is matched with, where not with all")
+
+
+class EpipolarSettings(Section):
+    """Fundamental matrices, one per pair of photos."""
+
+    estimator: str = Field(
+        "lev-ransac", description="name of the estimator of fundamental matrices (see `sfm-app plugins`)"
+    )
+    max_error_px: float = Field(1.5, gt=0, le=100, description="inlier threshold on the Sampson distance, in pixels")
+    confidence: float = Field(0.9999, gt=0, lt=1, description="required probability that a sample is free of outliers")
+    max_trials: int = Field(20000, ge=1, le=10_000_000, description="most minimal samples per pair")
+    min_inliers: int = Field(16, ge=8, le=10000, description="a pair with fewer inliers is rejected")
+    refit: Literal["auto", "eight-point", "sampson", "reprojection"] = Field(
+        "auto",
+        description="error that a final refit to the inliers minimizes; auto: no refit after the estimator's own",
+    )
+
+
+class CalibrationSettings(Section):
+    """The camera matrix from the fundamental matrices."""
+
+    calibrator: str = Field("zero-curves", description="name of the calibrator (see `sfm-app plugins`)")
+    samples: int = Field(100, ge=10, le=10000, description="samples along one zero curve")
+    constraint_form: ConstraintForm = Field(
+        "huang-faugeras",
+        description="constraint that the thesis's least-squares calibrators minimize: huang-faugeras (5.8), "
+        "frobenius (5.9), trivedi (5.11) or polynomial (5.25)",
+    )
+    lens: bool = Field(True, description="estimate the radial distortion of the lens")
+    file: str = Field(
+        "",
+        description="calibration file or folder of COLMAP, OpenCV, OpenSfM or sfm-app with known cameras; none where "
+        "empty",
+    )
+    keep: bool = Field(
+        False, description="keep the cameras of the calibration file as they are, instead of refining them"
+    )
+    center_sigma: float = Field(
+        0.15,
+        gt=0,
+        le=10,
+        description="soft prior: standard deviation of the optical center about the middle, in image widths",
+    )
+
+
+class SceneSettings(Section):
+    """Poses, sparse points and bundle adjustment."""
+
+    mapper: Literal["auto", "incremental", "global"] = Field(
+        "auto",
+        description="incremental: photo after photo from a seed; global: all at once; auto: the one that explains more",
+    )
+    camera_model: CameraModelName = Field(
+        "auto",
+        description="COLMAP's camera model that the last adjustment ends with, such as OPENCV or OPENCV_FISHEYE; auto: "
+        "the one that the photos support best",
+    )
+    max_init_pairs: int = Field(5, ge=1, le=100, description="most seed pairs that are tried")
+    min_seed_angle_deg: float = Field(
+        2.0, gt=0, le=90, description="least median triangulation angle of a seed pair, in degrees"
+    )
+    part_photos: int = Field(
+        0,
+        ge=0,
+        le=100_000,
+        description="photos of a part, where more than half as many again are mapped in parts that are joined "
+        "afterwards; 0: parts of 150 for more than 400 photos",
+    )
+    min_points: int = Field(30, ge=6, le=10000, description="a model with fewer points counts as failed")
+    second_look: bool = Field(
+        True, description="find finer features in unplaced photos and their neighbors, and map again"
+    )
+    photo_rotation_deg: Literal["auto", 0, 90, 180, 270] = Field(
+        "auto", description="clockwise rotation that makes most photos upright, in degrees"
+    )
+
+
+class ScaleSettings(Section):
+    """Real size: what is known of lengths and places in the scene. Poses and depth do not depend on it."""
+
+    distances: tuple[tuple[str, str, str], ...] = Field(
+        (),
+        description='known distances, each ["x,y,z", "x,y,z", "1.25m"]: two points in the unit of OUT/sparse, and how '
+        "far apart they are; measure in the report prints them",
+    )
+    markers: str = Field(
+        "", description="side of the dark square of printed ArUco or AprilTag markers, such as 50mm; none where empty"
+    )
+    marker_family: MarkerFamily = Field("auto", description="family of these markers; auto: the common ones")
+    control_points: str = Field(
+        "", description="file with ground control points, as OpenDroneMap's gcp_list.txt; none where empty"
+    )
+
+    @field_validator("markers")
+    @classmethod
+    def check_side(cls, side: str) -> str:
+        """Return a length after checking its form; ValueError where it is none."""
+        if side:
+            parse_length(side)
+        return side
+
+    @field_validator("distances")
+    @classmethod
+    def check_distances(cls, distances: tuple[tuple[str, str, str], ...]) -> tuple[tuple[str, str, str], ...]:
+        """Return distances after checking their form; ValueError where a point or a length is none."""
+        for first, second, length in distances:
+            if parse_point(first) == parse_point(second):
+                raise ValueError("a distance needs two points")
+            parse_length(length)
+        return distances
+
+
+class DepthSettings(Section):
+    """Depth maps."""
+
+    method: str = Field(
+        "auto",
+        description="name of the method (see `sfm-app plugins`); auto: on the GPU where one can be used, else cpu",
+    )
+    max_image_size_px: int = Field(1000, ge=64, le=16384, description="longer side of the depth maps, in pixels")
+    levels: int = Field(
+        AS_NEEDED,
+        ge=AS_NEEDED,
+        le=MOST_LEVELS,
+        description="sizes at which depth maps are made, each half of the one before: smaller ones find more of plain "
+        "walls, furniture and floors, and what is plain between known surfaces gets their plane; 0: a second one where "
+        "the first leaves much open",
+    )
+    neighbors: int = Field(4, ge=1, le=20, description="photos that each photo is matched with")
+    consistency: float = Field(
+        0.01, gt=0, le=1, description="largest relative depth difference between photos that agree"
+    )
+    min_agreeing: int = Field(1, ge=1, le=20, description="other photos that have to agree with a depth")
+    drop_sky: bool = Field(
+        True, description="remove depths in bright, even areas that other photos show to be infinitely far; false: keep"
+    )
+
+
+class MeshSettings(Section):
+    """The surface through the depth maps."""
+
+    poisson_depth: int = Field(12, ge=5, le=14, description="greatest depth of the Poisson octree")
+    trim: bool = Field(True, description="cut off surface that no photo confirms; false closes large holes by a guess")
+    max_gap_triangles: float = Field(
+        20.0, ge=0, le=1000, description="gaps in what photos confirm are closed up to this width, in triangles"
+    )
+    min_island: float = Field(
+        0.003, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped"
+    )
+    max_error_edges: float = Field(
+        0.15, ge=0, le=10, description="most that simplification may move the surface, in edges of Poisson's triangles"
+    )
+    max_image_size_px: int = Field(
+        1600,
+        ge=0,
+        le=16384,
+        description="longer side of the photos by which the surface is refined, in pixels: it moves to where they "
+        "agree best; 0: it stays as the depth maps have it",
+    )
+    faces: int = Field(
+        200_000, ge=100, le=50_000_000, description="most triangles of the finished mesh, or of each of its blocks"
+    )
+    block_points: int = Field(
+        4_000_000,
+        ge=1000,
+        le=1_000_000_000,
+        description="more points of depth maps than these are meshed in blocks of half as many",
+    )
+
+
+class TextureSettings(Section):
+    """The texture of the surface."""
+
+    max_atlas_px: int = Field(4096, ge=256, le=16384, description="longest side of a page of texture, in pixels")
+    max_pages: int = Field(
+        4, ge=1, le=64, description="most pages of texture for each 400 000 triangles; more detail is scaled down"
+    )
+    unseen_faces: Literal["color", "cut"] = Field(
+        "color", description="triangles that no photo sees: color: painted like what is around them; cut: left out"
+    )
+    trim_borders: bool = Field(
+        True,
+        description="cut off borders of the surface about whose color photos disagree: they show what lies behind; "
+        "false, or where `mesh.trim` is false: keep them",
+    )
+    normal_map: bool = Field(
+        False,
+        description="keep the detail that simplification takes away as a normal map, which shows under light; false: "
+        "none, shown unlit",
+    )
+
+
+class ClusterSettings(Section):
+    """Dask's workers, on this machine or on others; results do not depend on them."""
+
+    address: str = Field(
+        "",
+        description="scheduler HOST:PORT of a Dask cluster, or local:N for N processes of this machine; none where "
+        "empty",
+    )
+    wait_s: float = Field(
+        60.0, gt=0, le=86400, description="seconds to wait for the scheduler, and for workers where it has none"
+    )
+
+    @field_validator("address")
+    @classmethod
+    def check_address(cls, address: str) -> str:
+        """Return an address after checking its form; ValueError where it has none."""
+        form = LOCAL_ADDRESS if address.startswith("local:") else SCHEDULER_ADDRESS
+        if address and not form.fullmatch(address):
+            raise ValueError("should be HOST:PORT or local:N")
+        return address
+
+
+# Settings files: TOML in and out.
+
+MOST_TOML_BYTES = 20_000
+"""Most bytes of a settings file. One with every setting has a fifth; a megabyte of dots takes minutes to parse."""
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file; ConfigError where it is not valid."""
+    hint = "`sfm-app config` prints a valid one"
+    try:
+        with path.open("rb") as file:
+            text = file.read(MOST_TOML_BYTES + 1)
+        if len(text) > MOST_TOML_BYTES:
+            raise ConfigError(f"{path} is no settings file: it is larger than {MOST_TOML_BYTES} bytes", hint=hint)
+        return tomllib.loads(text.decode("utf-8"))
+    except OSError as err:
+        raise ConfigError(f"cannot read {path}: {err.strerror}") from err
+    except RecursionError:
+        raise ConfigError(f"{path} is no settings file: it is nested too deeply", hint=hint) from None
+    except ValueError as err:  # not TOML, not UTF-8, numbers of thousands of digits
+        raise ConfigError(f"{path} is not a TOML file: {err}", hint=hint) from err
+
+
+def toml_lines(section: BaseModel, table: str = "") -> Iterator[str]:
+    """Yield the lines of a settings file, with the help of each setting as a comment.
+
+    Args:
+        section: settings, tables nested.
+        table: its name in the file; empty for the top.
+    """
+    fields = type(section).model_fields
+    tables = [name for name in fields if isinstance(getattr(section, name), BaseModel)]
+    if table:
+        yield f"\n# {(section.__doc__ or '').strip()}\n[{table}]"
+    for name, info in fields.items():
+        if name not in tables:
+            yield f"# {info.description}\n{name} = {json.dumps(getattr(section, name))}"
+    for name in tables:
+        yield from toml_lines(getattr(section, name), name)
+
+
+# All settings of a run, from defaults, the quality preset, the TOML file and flags, in rising priority.
+
+MAX_PROBLEMS, MAX_VALUE_CHARS = 20, 100
+"""Most problems that an error lists, and most characters of a wrong value that it shows."""
+
+Quality = Literal["draft", "normal", "high"]
+
+
+class Settings(Section):
+    """All settings of a run."""
+
+    seed: int = Field(0, ge=0, lt=2**32, description="same seed, same result")
+    workers: int = Field(0, ge=0, le=1024, description="parallel workers; 0: one per core")
+    quality: Quality = Field("normal", description="preset for image sizes and mesh resolution")
+    max_memory_gb: float = Field(
+        0.0, ge=0, le=4096, description="most memory that is used, in GB; 0: four fifths of what the machine has"
+    )
+    plugins: bool = Field(True, description="load installed plug-ins; false: only the program's own methods")
+    report: bool = Field(True, description="write OUT/report.html at the end of every run; false: do not")
+    photos: PhotoSettings = PhotoSettings()
+    matching: MatchSettings = MatchSettings()
+    epipolar: EpipolarSettings = EpipolarSettings()
+    calibration: CalibrationSettings = CalibrationSettings()
+    scene: SceneSettings = SceneSettings()
+    scale: ScaleSettings = ScaleSettings()
+    depth: DepthSettings = DepthSettings()
+    mesh: MeshSettings = MeshSettings()
+    texture: TextureSettings = TextureSettings()
+    cluster: ClusterSettings = ClusterSettings()
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any], where: str = "settings") -> "Settings":
+        """Check nested values on top of the preset that they name.
+
+        Args:
+            values: settings by name, tables nested.
+            where: source of the values, for the error message.
+
+        Raises:
+            ConfigError: a key is unknown, or a value has the wrong type or is out of range; lists the first few.
+
+        Examples:
+            >>> from sfm_app import Settings
+            >>> Settings.from_mapping({"quality": "draft", "depth": {"neighbors": 6}}).depth.neighbors
+            6
+            >>> Settings.from_mapping({"depth": {"neighbours": 6}})
+            Traceback (most recent call last):
+            sfm_app.errors.ConfigError: settings: unknown setting 'depth.neighbours'
+        """
+        preset = QUALITY_PRESETS.get(str(values.get("quality", "normal")), {})
+        try:
+            return cls.model_validate(merge_nested(preset, values))
+        except ValidationError as err:
+            errors = err.errors(include_url=False)
+            problems = [_problem(dict(e)) for e in errors[:MAX_PROBLEMS]]
+            more = f"; and {len(errors) - MAX_PROBLEMS} more" if len(errors) > MAX_PROBLEMS else ""
+            raise ConfigError(
+                f"{where}: " + "; ".join(text for text, _ in problems) + more,
+                hint=next((hint for _, hint in problems if hint), "`sfm-app config` prints every setting"),
+            ) from None
+
+    @classmethod
+    def from_toml(cls, path: Path, overrides: Mapping[str, Any] | None = None) -> "Settings":
+        """Read a settings file, with some values overridden.
+
+        Args:
+            path: TOML file.
+            overrides: nested values from flags; they win.
+        """
+        return cls.from_mapping(merge_nested(read_toml(path), overrides or {}), where=str(path))
+
+    def to_toml(self) -> str:
+        """Return every setting with its help as a comment; `from_toml` reads it back."""
+        return "\n".join(toml_lines(self)) + "\n"
+
+
+QUALITY_PRESETS: dict[str, dict[str, Any]] = {
+    "draft": {
+        "matching": {"max_features": 3072, "enlarge_below": 2000},
+        "depth": {"max_image_size_px": 640, "neighbors": 3},
+        "mesh": {"poisson_depth": 10, "faces": 50_000, "max_image_size_px": 0},
+        "texture": {"max_atlas_px": 2048, "max_pages": 1},
+    },
+    "normal": {},
+    "high": {
+        "matching": {"max_image_size_px": 3200, "max_features": 16384, "enlarge_below": 8000},
+        "depth": {"max_image_size_px": 1400, "neighbors": 5},
+        "mesh": {"poisson_depth": 13, "faces": 1_000_000, "max_image_size_px": 3200},
+        "texture": {"max_atlas_px": 8192},
+    },
+}
+
+
+def merge_nested(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
+    """Return two nested mappings merged into one.
+
+    Args:
+        low: values that are used where `high` has none.
+        high: values that win.
+    """
+    result = dict(low)
+    for key, value in high.items():
+        below = result.get(key)
+        result[key] = merge_nested(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
+    return result
+
+
+def _problem(error: dict[str, Any]) -> tuple[str, str]:
+    *table, key = [str(part) for part in error["loc"]] or ["settings"]
+    name = ".".join((*table, key))
+    if error["type"] != "extra_forbidden":
+        return f"'{name}': {error['msg'].lower().removeprefix('value error, ')}, got {_abbreviate(error['input'])}", ""
+    section: Any = Settings
+    for part in table:
+        section = section.model_fields[part].annotation
+    close = difflib.get_close_matches(key, section.model_fields, n=1)
+    return f"unknown setting {_abbreviate(name)}", f"did you mean '{'.'.join((*table, close[0]))}'?" if close else ""
+
+
+def _abbreviate(value: object) -> str:
+    try:
+        text = repr(value)
+    except (RecursionError, ValueError):  # deeply nested values, numbers of thousands of digits
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= MAX_VALUE_CHARS else f"{text[:MAX_VALUE_CHARS]}..."

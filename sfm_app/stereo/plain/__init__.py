@@ -1,1 +1,0 @@
-"""Plain areas, where matching finds nothing: what has a surface there, and where it is."""

@@ -1,0 +1,210 @@
+"""Depth maps fused block by block: COLMAP holds the maps of one block only.
+
+A block is a box. It gets a workspace of its own with the photos that have depths in it, and of these the depths in it
+and a little beyond, so that all blocks together are little more work than the whole.
+"""
+
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.colmap.dense import map_file, normals_file, read_depth, write_depth, write_fusion_views
+from sfm_app.colmap.surface import fuse, join_points
+from sfm_app.files import fingerprint, mark_unfinished, replace_atomically, resume_or_clear
+from sfm_app.meshing.blocks import split_points
+from sfm_app.operating_system import share_bytes
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.cost_estimate import FUSED_AT_ONCE_MP, MAPS_MB_PER_MP, cache_gb
+from sfm_app.stereo import View, region
+from sfm_app.tasks import Task
+from sfm_app.types.arrays import FloatArray
+
+MOST_PIXELS = int(1e6 * FUSED_AT_ONCE_MP)
+"""Pixels of depth maps that are fused at once."""
+STRIDE = 16
+"""Rows and columns of a map from one sample to the next. Chosen by hand."""
+BEYOND = 0.03
+"""Share of its depth that a pixel may lie outside of a block and still be part of its points: three times the most that
+COLMAP lets the depths of a point differ."""
+FUSING = "fusing"
+"""Folder beside the points while they are fused."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FusionTask:
+    """Everything that one block needs besides the files; it can be sent to another process."""
+
+    dense_dir: Path
+    folder: Path
+    """Where its files go."""
+    number: int
+    views: Sequence[View]
+    """The photos with depths in it."""
+    box: FloatArray
+    """(2, 3) lowest and highest coordinates of its points."""
+    min_views: int
+    """Photos that have to see a point."""
+    memory_gb: float
+    """For maps."""
+
+    @property
+    def path(self) -> Path:
+        """The points of the block."""
+        return self.folder / f"{self.number}.ply"
+
+
+def fuse_maps(dense_dir: Path, views: Sequence[View], min_views: int, target: Path, run: RunContext) -> None:
+    """Fuse all maps of a dense workspace into a PLY file of points, at once or block by block.
+
+    Args:
+        dense_dir: dense workspace.
+        views: photos with a map, and their sparse points.
+        min_views: photos that have to see a point.
+        target: PLY file.
+        run: the run.
+    """
+    pixels = sum(view.width * view.height for view in views)
+    if pixels <= MOST_PIXELS:
+        with run.step("fusing depth maps"), replace_atomically(target) as path:
+            fuse(dense_dir, min_views, region(views), path, _cache_gb(views, cache_gb(run.memory_mb)))
+        return
+    folder = target.parent / FUSING
+    made_from = fingerprint(run.fingerprint, [[view.name, _stamp(dense_dir, view)] for view in views], min_views)
+    if not resume_or_clear(folder, made_from):
+        mark_unfinished(folder, made_from)
+    tasks = plan_fusion(dense_dir, views, min_views, folder, run)
+    run.record(fusion_blocks=len(tasks))
+    run.map(Task(fuse_block), tasks, "fusing depth maps in blocks")
+    with replace_atomically(target) as path:
+        join_points([task.path for task in tasks if task.path.stat().st_size], path)
+    shutil.rmtree(folder)
+
+
+def plan_fusion(
+    dense_dir: Path, views: Sequence[View], min_views: int, folder: Path, run: RunContext
+) -> list[FusionTask]:
+    """Divide the space that the depth maps show into blocks.
+
+    Args:
+        dense_dir: dense workspace.
+        views: photos with a map, and their sparse points.
+        min_views: photos that have to see a point.
+        folder: where the blocks go.
+        run: the run.
+    """
+    pixels, whole = sum(view.width * view.height for view in views), region(views)
+    bare = [replace(view, point_ids=np.empty(0, np.int64), points=np.empty((0, 3))) for view in views]
+    samples = run.map(Task(sample_points, dense_dir), bare, "measuring depths")
+    inside = [part[((part >= whole[0]) & (part <= whole[1])).all(axis=1)] for part in samples]
+    partition = split_points(np.concatenate(inside), -(-pixels // MOST_PIXELS))
+    seen = [set(partition.find_blocks(part).tolist()) for part in inside]
+    memory_gb = cache_gb(run.memory_mb) / run.workers
+    return [
+        FusionTask(
+            dense_dir,
+            folder,
+            number,
+            [view for view, blocks in zip(bare, seen, strict=True) if number in blocks],
+            np.stack([np.maximum(box[0], whole[0]), np.minimum(box[1], whole[1])]),
+            min_views,
+            memory_gb,
+        )
+        for number, box in enumerate(partition.boxes)
+    ]
+
+
+def fuse_block(task: FusionTask) -> None:
+    """Write the points of a block, unless a killed run has; an empty file where there are none."""
+    if task.path.exists():
+        return
+    # a worker that was cut off from a cluster may still be at the same block
+    scratch = Path(tempfile.mkdtemp(dir=task.folder, prefix=f"{task.number}-"))
+    link_tree(task.dense_dir / "sparse", scratch / "sparse")
+    (scratch / "images").mkdir()
+    (scratch / "stereo").mkdir()
+    for view in task.views:
+        for kept in (Path("images") / view.name, normals_file(Path(), view)):
+            (scratch / kept).parent.mkdir(parents=True, exist_ok=True)
+            share_bytes(task.dense_dir / kept, scratch / kept)
+        depth = read_depth(task.dense_dir, view, "geometric")
+        write_depth(scratch, view, np.where(is_near(view, depth, task.box), depth, np.float32(0)))
+    write_fusion_views(scratch, task.views)
+    with replace_atomically(task.path) as path:
+        if task.views:
+            fuse(scratch, task.min_views, task.box, path, _cache_gb(task.views, task.memory_gb))
+        else:
+            path.touch()
+    shutil.rmtree(scratch)
+
+
+def _cache_gb(views: Sequence[View], memory_gb: float) -> float:
+    """Return the size of fusion's cache, 0 where memory holds all maps."""
+    needed_mb = MAPS_MB_PER_MP * sum(view.width * view.height for view in views) / 1e6
+    return memory_gb if needed_mb > 1000 * memory_gb else 0.0
+
+
+def sample_points(dense_dir: Path, view: View) -> FloatArray:
+    """Return points (N, 3) of every so many rows and columns of a map.
+
+    Args:
+        dense_dir: dense workspace.
+        view: a photo with a map.
+    """
+    depth = read_depth(dense_dir, view, "geometric")[::STRIDE, ::STRIDE]
+    points = world_points(view, depth, STRIDE)
+    return points[depth > 0]
+
+
+def is_near(view: View, depth: NDArray[np.float32], box: FloatArray) -> NDArray[np.bool_]:
+    """Return (H, W) whether the depths of a map lie in a box or little beyond it.
+
+    Args:
+        view: the photo.
+        depth: (H, W).
+        box: (2, 3) lowest and highest coordinates.
+    """
+    along = view.R.T @ np.linalg.inv(view.K)
+    rows, columns = depth.shape
+    x, y = np.arange(columns) + view.sample_px, np.arange(rows)[:, None] + view.sample_px
+    near, beyond = np.ones(depth.shape, np.bool_), np.float32(BEYOND) * depth
+    for axis, center in enumerate(view.center):
+        ray = (along[axis, 0] * x + along[axis, 2] + along[axis, 1] * y).astype(np.float32)
+        place = ray * depth + np.float32(center)
+        near &= (place >= np.float32(box[0, axis]) - beyond) & (place <= np.float32(box[1, axis]) + beyond)
+    return near
+
+
+def world_points(view: View, depth: NDArray[np.float32], step: int) -> FloatArray:
+    """Return the points (H, W, 3) of the depths (H, W) of a photo.
+
+    Args:
+        view: the photo.
+        depth: of every so many rows and columns.
+        step: rows and columns from one depth to the next.
+    """
+    rows, columns = depth.shape
+    x, y = np.meshgrid(step * np.arange(columns) + view.sample_px, step * np.arange(rows) + view.sample_px)
+    rays = np.stack([x, y, np.ones_like(x)], axis=2) @ np.linalg.inv(view.K).T
+    return np.asarray((rays * depth[..., None] - view.t) @ view.R)
+
+
+def link_tree(source: Path, target: Path) -> None:
+    """Make a folder with the files of another, which share their bytes where the system can.
+
+    Args:
+        source: the other folder.
+        target: made; its parent, too.
+    """
+    target.mkdir(parents=True)
+    for path in sorted(source.iterdir()):
+        if path.is_file():
+            share_bytes(path, target / path.name)
+
+
+def _stamp(dense_dir: Path, view: View) -> int:
+    return map_file(dense_dir, view).stat().st_mtime_ns

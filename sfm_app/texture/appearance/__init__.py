@@ -1,1 +1,0 @@
-"""What the photos show of every triangle, and how well."""

@@ -1,1 +1,0 @@
-"""The normal map: what a fine surface adds to the triangles of a light one."""

@@ -1,0 +1,254 @@
+"""Fundamental matrices, cameras and relative poses of pairs of photos."""
+
+import json
+from collections import Counter
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sfm_app.numerical import json_text
+from sfm_app.types.arrays import FloatArray
+from sfm_app.types.camera import Calibration
+from sfm_app.types.photos import PairId
+
+# Fundamental matrices of pairs of photos.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EpipolarFit:
+    """A fundamental matrix with its evidence."""
+
+    F: NDArray[np.float64]
+    """(3, 3), rank 2, Frobenius norm 1; x2' F x1 = 0 in pixels, or of bearing vectors where a lens is known before (see
+    `ViewGraph.lenses`)."""
+    inliers: NDArray[np.bool_]
+    """(N,) per match: within the threshold of the returned F."""
+    priors: NDArray[np.float64]
+    """(N,) in [0, 1] per match: its validity according to the estimator; p(v_i) of the thesis, largest value 1."""
+    trials: int
+    """Number of minimal samples drawn."""
+    rms_px: float
+    """Root mean square Sampson distance of the inliers."""
+    degeneracy: str = ""
+    """Why F is not determined by these matches ("collinear", "planar", "rotation"); empty when it is."""
+
+    @property
+    def inlier_count(self) -> int:
+        """Number of matches that agree with F."""
+        return int(np.count_nonzero(self.inliers))
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """A pair without a usable epipolar geometry, and why. Falsy, so that ``if fit:`` reads well."""
+
+    reason: str
+
+    def __bool__(self) -> bool:
+        return False
+
+
+@dataclass(frozen=True, slots=True)
+class ViewGraph:
+    """One epipolar geometry, or the reason for its absence, for every matched pair."""
+
+    fits: Mapping[PairId, EpipolarFit]
+    rejected: Mapping[PairId, Rejected]
+    lenses: Mapping[str, Calibration] = field(default_factory=dict)
+    """Cameras with a wide lens, by camera group: the curves of epipolar lines show them before there is any F. The F of
+    their pairs are of bearing vectors."""
+
+    @property
+    def reasons(self) -> dict[str, int]:
+        """How often each reason of rejection occurred, most frequent first."""
+        return dict(Counter(r.reason for r in self.rejected.values()).most_common())
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Return plain arrays for an .npz file; the matches of all pairs are concatenated."""
+        fits = list(self.fits.values())
+        return {
+            "pairs": np.array(list(self.fits), np.uint32).reshape(-1, 2),
+            "F": np.array([fit.F for fit in fits]).reshape(-1, 3, 3),
+            "match_counts": np.array([len(fit.inliers) for fit in fits], np.int64),
+            "inliers": np.concatenate([fit.inliers for fit in fits] or [np.zeros(0, bool)]),
+            "priors": np.concatenate([fit.priors for fit in fits] or [np.zeros(0)]),
+            "trials": np.array([fit.trials for fit in fits], np.int64),
+            "rms_px": np.array([fit.rms_px for fit in fits], np.float64),
+            "degeneracy": np.array([fit.degeneracy for fit in fits], np.str_),
+            "rejected_pairs": np.array(list(self.rejected), np.uint32).reshape(-1, 2),
+            "rejected_reasons": np.array([rejected.reason for rejected in self.rejected.values()], np.str_),
+            "lens_groups": np.array(list(self.lenses), np.str_),
+            "lenses": np.array([json_text(lens.to_dict()) for lens in self.lenses.values()], np.str_),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> "ViewGraph":
+        """Rebuild from `to_arrays`."""
+        cuts = np.cumsum(arrays["match_counts"])
+        columns = (
+            arrays["F"],
+            np.split(arrays["inliers"], cuts)[:-1],
+            np.split(arrays["priors"], cuts)[:-1],
+            arrays["trials"].tolist(),
+            arrays["rms_px"].tolist(),
+            arrays["degeneracy"].tolist(),
+        )
+        fits = {_pair(row): EpipolarFit(*values) for row, *values in zip(arrays["pairs"], *columns, strict=True)}
+        rejected = zip(arrays["rejected_pairs"], arrays["rejected_reasons"].tolist(), strict=True)
+        lenses = {
+            group: Calibration.from_dict(json.loads(text))
+            for group, text in zip(arrays["lens_groups"].tolist(), arrays["lenses"].tolist(), strict=True)
+        }
+        return cls(fits, {_pair(row): Rejected(reason) for row, reason in rejected}, lenses)
+
+
+def _pair(row: NDArray[np.uint32]) -> PairId:
+    return int(row[0]), int(row[1])
+
+
+# Pairs of photos with their data: the input of calibrators.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPairs:
+    """Fundamental matrices of pairs with the same camera, and data of each pair.
+
+    Nothing is checked here: a calibrator refuses malformed values with a ValueError, see `selfcal.inputs.prepare`.
+    """
+
+    Fs: NDArray[np.float64]
+    """(P, 3, 3) in pixels, x2' F x1 = 0, any scale."""
+    weights: NDArray[np.float64]
+    """(P,) >= 0, weight of each F."""
+    size: tuple[int, int]
+    """(width, height) of the photos in pixels."""
+    photos: tuple[PairId, ...] = ()
+    """Per pair the ids of its two photos; empty where they are unknown."""
+    inliers: tuple[NDArray[np.float64], ...] = ()
+    """Per pair (N, 4) x1, y1, x2, y2 in pixels: the matches behind F; empty where only the Fs are known."""
+    focal_hints_px: tuple[float, ...] = field(default=())
+    """Focal lengths claimed by EXIF, in pixels, one per photo that has one; hints, never trusted."""
+
+    @classmethod
+    def from_Fs(cls, Fs: ArrayLike, size: tuple[int, int], weights: ArrayLike | None = None) -> "CameraPairs":
+        """Make pairs from matrices alone.
+
+        Args:
+            Fs: (P, 3, 3) in pixels, x2' F x1 = 0, any scale.
+            size: width and height of the photos in pixels.
+            weights: (P,) >= 0; None for equal weights.
+        """
+        matrices = np.asarray(Fs, np.float64)
+        return cls(matrices, np.ones(len(matrices)) if weights is None else np.asarray(weights, np.float64), size)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotoPairs:
+    """All pairs of a set of photos, which may be of several cameras."""
+
+    Fs: NDArray[np.float64]
+    """(P, 3, 3) in pixels, x2' F x1 = 0, any scale."""
+    weights: NDArray[np.float64]
+    """(P,) >= 0, weight of each F."""
+    photos: tuple[PairId, ...]
+    """Per pair the ids of its two photos."""
+    inliers: tuple[NDArray[np.float64], ...]
+    """Per pair (N, 4) x1, y1, x2, y2 in pixels."""
+    sizes: Mapping[int, tuple[int, int]]
+    """(width, height) in pixels by photo."""
+    groups: Mapping[int, str]
+    """By photo the group that is assumed to share one camera."""
+    focal_hints_px: Mapping[int, float] = field(default_factory=dict)
+    """Claimed focal (EXIF) by photo, where there is one."""
+    padded_sizes: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    """By photo with bars the size including the bars; `sizes` then has that of the picture inside them. Photos that
+    bars bring to one size may each be of another camera."""
+
+    def with_origins(self, corners: Mapping[int, tuple[int, int]]) -> "PhotoPairs":
+        """Return the pairs with pixels counted from new origins (left, top), given by photo.
+
+        The sizes stay the same.
+        """
+        if not corners:
+            return self
+        at = np.array([[corners.get(photo, (0, 0)) for photo in pair] for pair in self.photos]).reshape(-1, 2, 2)
+        moves = np.tile(np.eye(3), (len(at), 2, 1, 1))
+        moves[:, :, :2, 2] = at
+        Fs = moves[:, 1].transpose(0, 2, 1) @ self.Fs @ moves[:, 0]
+        inliers = tuple(x - corner.reshape(4) for x, corner in zip(self.inliers, at, strict=True))
+        return replace(self, Fs=Fs, inliers=inliers)
+
+    def to_camera_pairs(self, members: Collection[int]) -> CameraPairs:
+        """Return the pairs whose photos are both members; all members have one size."""
+        wanted = set(members)
+        kept = [k for k, pair in enumerate(self.photos) if wanted.issuperset(pair)]
+        return CameraPairs(
+            Fs=self.Fs[kept].reshape(-1, 3, 3),
+            weights=self.weights[kept],
+            size=self.sizes[min(wanted)],
+            photos=tuple(self.photos[k] for k in kept),
+            inliers=tuple(self.inliers[k] for k in kept),
+            focal_hints_px=tuple(
+                self.focal_hints_px[photo] for photo in sorted(wanted) if photo in self.focal_hints_px
+            ),
+        )
+
+
+# Relative poses of pairs of photos, and the graph that they form.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelativePose:
+    """Pose of view 2 from view 1, with its evidence."""
+
+    R: FloatArray
+    """(3, 3) rotation."""
+    t: FloatArray
+    """(3,) direction of the translation, length 1."""
+    inliers: NDArray[np.bool_]
+    """(M,) per match of the pair: within the threshold of this pose."""
+    angle_deg: float
+    """Median triangulation angle of the inliers before both cameras."""
+    in_front: float
+    """Share of the inliers before both cameras, 0 to 1."""
+    kind: str = "calibrated"
+    """"calibrated", "uncalibrated" (a camera is a guess: the inliers are those of F), "planar" (all inliers on one
+    plane), "rotation" (they show no parallax, so that t means nothing)."""
+    guided: bool = False
+    """Whether it was found only with the help of other pairs."""
+
+    @property
+    def inlier_count(self) -> int:
+        """Number of matches that agree with the pose."""
+        return int(np.count_nonzero(self.inliers))
+
+
+@dataclass(frozen=True, slots=True)
+class LookAlikes:
+    """Pairs of photos that match equal things in two places as if they were one."""
+
+    pairs: tuple[PairId, ...]
+    missing: float
+    """Share, 0 to 1, of what these pairs would have in common if the places were one, but do not."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseGraph:
+    """Pairs whose relative poses agree with each other, and what happened to the others."""
+
+    poses: Mapping[PairId, RelativePose]
+    dropped: Mapping[PairId, str]
+    """Pairs with an epipolar geometry that were left out, with the reason."""
+    groups: tuple[tuple[int, ...], ...]
+    """Connected photos, the largest group first."""
+    look_alikes: tuple[LookAlikes, ...] = ()
+    """Look-alikes that were separated; their pairs are among the dropped ones."""
+    doubtful: tuple[LookAlikes, ...] = ()
+    """Loops, or look-alikes: pairs that stayed although the photos between theirs do not confirm them."""
+
+    def connected_photos(self, photo: int) -> tuple[int, ...]:
+        """Return all photos connected with this one; empty where there are none."""
+        return next((group for group in self.groups if photo in group), ())
