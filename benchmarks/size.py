@@ -97,13 +97,15 @@ def _weight(node: ast.AST) -> int:
 
 def count_numbers(tree: ast.Module) -> int:
     """Return how many constants at module level are numbers or tuples of numbers; A, B = 1, 2 are two."""
-    return sum(
-        sum(map(is_number, node.value.elts)) if isinstance(target, ast.Tuple) else is_number(node.value)
-        for node in tree.body
-        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None
-        for target in (node.targets if isinstance(node, ast.Assign) else [node.target])
-        if not isinstance(target, ast.Tuple) or isinstance(node.value, ast.Tuple)
-    )
+    count = 0
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+            values = [node.value]
+            if isinstance(target, ast.Tuple):
+                values = node.value.elts if isinstance(node.value, ast.Tuple) else []
+            count += sum(map(is_number, values))
+    return count
 
 
 def is_number(value: ast.expr) -> bool:

@@ -190,7 +190,7 @@ def _inlier_mask(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: fl
         pairs = np.random.default_rng(0).permutation(pairs)[:MAX_PAIRS]
     best, least = np.ones(len(z), bool), np.inf
     for pair in pairs:
-        if abs(w[pair[0]] - w[pair[1]]) < 1e-6 or z[pair[0]] == z[pair[1]]:
+        if abs(w[pair[0]] - w[pair[1]]) < 1e-6 or abs(z[pair[0]] - z[pair[1]]) < 1e-140:  # squares of less are zero
             continue
         a, b = _fit_complex_line(z[pair], w[pair])
         distance = np.abs(a * z + b - w)

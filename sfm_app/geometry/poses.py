@@ -216,4 +216,4 @@ def _triples(count: int) -> NDArray[np.intp]:
 
 def _is_collinear(points: FloatArray) -> bool:
     s = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(s[1] <= 1e-6 * s[0])
+    return bool(s[1] <= max(1e-6 * s[0], 1e-140))  # squares of less are zero

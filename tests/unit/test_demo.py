@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from sfm_app.cli.commands.making import SCENES as TEXTS
+from sfm_app.cli.commands import SCENES as TEXTS
 
 from benchmarks.synthetic.scenes import poster
 from benchmarks.synthetic.walks import orbit

@@ -116,3 +116,11 @@ def test_a_drone_says_where_up_is_when_its_cameras_do_not():
     assert found.enu_from_world.scale == pytest.approx(METRES, rel=0.02)
     flat = [replace(position, altitude_m=None) for position in positions]
     assert not georeference(enu / METRES, flat, wrong, up_is_sure=False)
+
+
+@pytest.mark.parametrize("up_is_sure", [True, False])
+def test_cameras_too_near_each_other_for_numbers_have_no_place(up_is_sure):
+    centers, positions, up, _ = walk(12, 60.0, 3.0)
+    positions = [replace(position, altitude_m=180.0 + k) for k, position in enumerate(positions)]
+
+    assert not georeference(1e-200 * centers, positions, up, up_is_sure=up_is_sure)
