@@ -57,7 +57,7 @@ GROUPS: Mapping[str, Group] = {
     ),
     "upright: cues, lines, roll": Group(
         ("orientation",),
-        FIRST_EIGHT, "the rendered courtyard, statue, facade and corner", "orientation/up_direction.py",
+        FIRST_EIGHT, "the rendered courtyard, statue, facade and corner", "frame/up_direction.py",
     ),
     "votes that a camera must keep, pairs that are listened to": Group(
         ("selfcal.zero_curves",), (*FIRST_EIGHT, "fox50", "kitchen25", "oats23", "books21"), "",

@@ -14,13 +14,13 @@ MODULES = {
     *("ctypes", "multiprocessing"),
 }
 ALLOWED = {
-    ("photos/tiff.py", "ctypes"),  # the type of a callback
+    ("photos/decode.py", "ctypes"),  # the type of a callback
     ("colmap/database.py", "ctypes"),  # Python's own counter of references
     ("synthetic/photo_folder.py", "multiprocessing"),  # the context is named: see below
     ("cli/output.py", "platform"),  # whether somebody sits at a screen
     ("runtime/workspace.py", "platform"),  # names the machine
     ("cli/doctor.py", "platform"),  # says what this system is called
-    ("runtime/parallel/worker_versions.py", "platform"),
+    ("runtime/cluster.py", "platform"),
 }
 NAMES = {
     *("killpg", "kill_tree", "setsid", "setpgid", "getpgid", "getppid", "fork", "forkpty", "sched_getaffinity", "nice"),
@@ -136,7 +136,7 @@ def test_texts_have_one_encoding_and_one_end_of_lines():
         for called, _, words in text_calls(path.read_text(encoding="utf-8"))
         if "encoding" not in words or (called == "write_text" and "newline" not in words)
     ]
-    assert found == [("colmap/perspective/view_model.py", "write_text")]  # COLMAP's own
+    assert found == [("colmap/perspective.py", "write_text")]  # COLMAP's own
 
 
 @pytest.mark.parametrize(
