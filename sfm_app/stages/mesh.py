@@ -12,7 +12,7 @@ from sfm_app.colmap.surface import FUSED, open_points, positions
 from sfm_app.errors import ReconstructionError
 from sfm_app.files import digest_files, is_made_from, load_arrays, replace_atomically
 from sfm_app.meshing import drop_islands, make_manifold, trim
-from sfm_app.meshing.octree import LEAST_POINTS, cell_sizes, choose_cell, cube_around
+from sfm_app.meshing.octree import CELLS, cell_sizes, choose_cell, cube_around
 from sfm_app.meshing.refinement import STEPS
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
@@ -117,7 +117,7 @@ def _span(points: NDArray[np.void], run: RunContext) -> Surface:
     most_cells = np.inf if options.max_image_size_px else MOST_CELLS_PER_FACE * options.faces
     sizes = list(cell_sizes(extent, options.poisson_depth))
     with run.step("finding the surface"):
-        cell = choose_cell(sizes, RecordCells(lambda: [points]), max(LEAST_POINTS, len(where) / most_cells))
+        cell = choose_cell(sizes, RecordCells(lambda: [points]), max(CELLS.least_points, len(where) / most_cells))
         cube = cube_around(bounds[0], bounds[1], cell)
         kept = with_halo(bounds, cell) if options.trim else EVERYWHERE
         surface, raw = span_surface(points, kept, cube, run.workspace.surface)

@@ -65,11 +65,7 @@ class BlockPoints:
         return np.fromfile(self.folder / str(number), self.fields)
 
     def read_box(self, box: FloatArray) -> NDArray[np.void]:
-        """Return the records of all blocks that lie in a box.
-
-        Args:
-            box: (2, 3) lowest and highest coordinates.
-        """
+        """Return the records of all blocks that lie in a box; box (2, 3) lowest and highest coordinates."""
         meet = ((self.bounds[:, 0] <= box[1]) & (self.bounds[:, 1] >= box[0])).all(axis=1)
         parts = [np.empty(0, self.fields)]
         for number in np.flatnonzero(meet).tolist():
@@ -146,11 +142,7 @@ def _normals(records: NDArray[np.void]) -> FloatArray:
 
 
 def with_halo(bounds: FloatArray, cell: float) -> FloatArray:
-    """Return (..., 2, 3) bounds with their halo.
-
-    Args:
-        bounds: (..., 2, 3) lowest and highest coordinates.
-    """
+    """Return (..., 2, 3) bounds with their halo; bounds (..., 2, 3) lowest and highest coordinates."""
     return bounds + HALO * cell * np.array([-1.0, 1.0])[:, None]
 
 
