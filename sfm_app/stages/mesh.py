@@ -69,7 +69,7 @@ def make(scene: Scene, dense_dir: Path, run: RunContext) -> Surface:
     points = _fused_points(dense_dir, views, run)
     originals = Originals(scene.model_dir, run.workspace.photos, run.mask_dir)
     if block_count(len(points), options) > 1:
-        surface = mesh_in_blocks((dense_dir, originals), views, points, _min_confirmed(views, run), run)
+        surface = mesh_in_blocks(dense_dir, originals, views, points, _min_confirmed(views, run), run)
     else:
         surface = _mesh_at_once((dense_dir, originals), views, points, run)
     run.record(vertices=len(surface.vertices), triangles=len(surface.faces))

@@ -97,11 +97,10 @@ def test_one_seed_one_pair():
 
 
 def test_impossible_options_say_so(monkeypatch):
-    monkeypatch.setattr(correspondences, "MAX_SETUPS", 20)
     with pytest.raises(ConfigError, match="no random camera pair"):
-        make_pair(PairOptions(focal_px=1e6), seed=0)
+        make_pair(PairOptions(focal_px=1e6), seed=0, max_setups=20)
     with pytest.raises(ConfigError, match="no random cameras"):
-        make_tracks(TrackOptions(focal_px=(1e6, 1e6)), seed=0)
+        make_tracks(TrackOptions(focal_px=(1e6, 1e6)), seed=0, max_setups=20)
 
 
 def test_all_wrong_options_are_named():
