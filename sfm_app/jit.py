@@ -1,7 +1,7 @@
-"""How numeric kernels are compiled to machine code, in one place.
+"""Compilation of numeric kernels to machine code.
 
-Kernels release the GIL, so pairs run in parallel threads, and their machine code is cached beside the source, so that
-only the first run on a machine compiles.
+Kernels release the GIL, so pairs run in parallel threads. Their machine code is cached beside the source, so only the
+first run on a machine compiles.
 """
 
 import os
@@ -20,10 +20,10 @@ CACHE = Path(
     numba.config.CACHE_DIR or (HERE / "__pycache__" if os.access(HERE, os.W_OK) else HOME),
     f"kernels-{version('sfm-app')}",
 )
-"""Folder of the compiled kernels of this version. Numba checks the file of a kernel, but not those of the kernels that
-it calls, and cannot read what refers to a class that is gone: an upgrade would fail, or run old code."""
+"""Folder of the compiled kernels of this version. Numba checks the file of a kernel, but not of kernels that it calls,
+and fails on references to removed classes: an upgrade would fail, or run old code."""
 WARM = CACHE / f"warm-{numba.__version__}-{numba.config.CPU_NAME or get_host_cpu_name()}"
-"""Exists where the kernels of a run are compiled for this processor, see `engine.warm_up`."""
+"""Exists after the kernels of a run are compiled for this processor, see `engine.warm_up`."""
 
 
 def kernel(function: Function) -> Function:
@@ -32,9 +32,9 @@ def kernel(function: Function) -> Function:
 
 
 def summing_kernel(function: Function) -> Function:
-    """Compile a kernel whose sums may be vectorized: several times faster, the same bytes on one kind of processor.
+    """Compile a kernel with vectorized sums: several times faster, the same bytes on one kind of processor.
 
-    Nothing else is relaxed: there are no assumptions about infinities or NaN, and no approximate division.
+    Infinities, NaN and division stay exact.
     """
     return _compile(function, fastmath={"reassoc", "nsz"})
 

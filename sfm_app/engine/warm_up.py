@@ -1,4 +1,4 @@
-"""Kernels are compiled by a process beside the first run on a machine, while that is busy elsewhere."""
+"""A process that compiles kernels beside the first run on a machine."""
 
 import contextlib
 import os
@@ -12,21 +12,19 @@ from sfm_app.operating_system import end_group, group_options
 from sfm_app.progress import Progress
 
 PARENT = "SFM_APP_WARM_UP_OF"
-"""Environment variable of the process: the number of the run for which it compiles."""
-MOST_S = 10.0
-"""Seconds that its end may take. Chosen by hand."""
+"""Environment variable of the process: the process id of its run."""
 
 
 @contextlib.contextmanager
 def warming_up(progress: Progress) -> Iterator[None]:
-    """Compile kernels in the background for the duration of the block, unless that has been done.
+    """Compile kernels in the background during the block, unless `WARM` exists.
 
-    The block does not wait for them: it takes from the cache what is there, and compiles the rest itself.
+    The block does not wait: it compiles the kernels that the cache lacks itself.
     """
     if WARM.exists() or PARENT in os.environ:
         yield
         return
-    progress.say("first run on this machine: parts of the program are compiled, half a minute more, once")
+    progress.say("first run on this machine: compiling the kernels takes half a minute more, once")
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         command = [sys.executable, "-P", "-m", "sfm_app.warm_up", folder]
         environment, quiet = os.environ | {PARENT: str(os.getpid())}, subprocess.DEVNULL
@@ -36,5 +34,5 @@ def warming_up(progress: Progress) -> Iterator[None]:
         try:
             yield
         finally:
-            end_group(process, MOST_S)
+            end_group(process, 10.0)  # seconds; by hand
             process.communicate()

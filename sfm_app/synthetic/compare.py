@@ -51,7 +51,8 @@ def surface_error(
         samples: points drawn evenly from the surface (fixed seed).
 
     Raises:
-        ValueError: fewer than 3 common photos, their centers lie on a line, or the surface has no area.
+        ValueError: fewer than 3 common photos, or the surface has no area.
+        NumericalError: the camera centers lie on a line.
     """
     return float(np.median(_distances_to_truth(vertices, faces, centers, truth, samples)))
 
@@ -103,7 +104,8 @@ def align_centers(centers: Mapping[str, FloatArray], truth: Truth) -> Similarity
     """Return the similarity from estimated camera centers (3,), by photo, to the true ones, robust to wrong poses.
 
     Raises:
-        ValueError: fewer than 3 common photos, or all centers lie on a line.
+        ValueError: fewer than 3 common photos.
+        NumericalError: the centers lie on a line.
     """
     true_centers = truth.centers
     names = sorted(set(centers) & set(true_centers))
