@@ -103,17 +103,14 @@ def test_a_fisheye_is_drawn_with_its_lens():
     assert plain.lens.projection == "perspective"
 
 
-@pytest.mark.parametrize("name", TEXTS)
-def test_a_scene_has_the_photos_that_its_text_says(name):
+@pytest.mark.parametrize("name", SCENES)
+def test_a_scene_has_the_photos_of_its_text(name):
     views = SCENES[name].views()
 
+    assert tuple(SCENES) == tuple(TEXTS)
     assert f", {len(views.cam_from_world)} photos " in TEXTS[name]
     assert len({camera.K.tobytes() for camera in views.cameras.values()}) == 1
     assert max(camera.width * camera.height for camera in views.cameras.values()) <= 960 * 640
-
-
-def test_every_scene_has_a_text():
-    assert tuple(SCENES) == tuple(TEXTS)
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +137,7 @@ def model(rendered) -> Model:
 
 
 @pytest.mark.slow
-def test_what_was_found_is_set_beside_the_truth(rendered, scene, model, tmp_path):
+def test_the_result_is_compared_with_the_truth(rendered, scene, model, tmp_path):
     truth = rendered[1]
     run = Run(tmp_path, None, scene, None, None, {})
     result = evaluate(run, scene, model, truth, (1.0, 2.0), tmp_path)
