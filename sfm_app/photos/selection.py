@@ -47,12 +47,7 @@ class PhotoStats:
 
 
 def measure_photo(photo: Photo, upright: Image.Image) -> PhotoStats:
-    """Measure the blur and flat areas of a photo, and make its thumbnail.
-
-    Args:
-        photo: metadata.
-        upright: its picture, upright.
-    """
+    """Measure the blur and flat areas of a photo, and make its thumbnail."""
     gray = upright.convert("L")
     return PhotoStats(photo, make_thumbnail(gray), edge_blur(gray), flat_share(gray))
 
@@ -105,14 +100,7 @@ READ_WITH = {"max_megapixels", "min_side_px"}
 def write_stats(
     path: Path, stats: Mapping[str, PhotoStats], digests: Mapping[str, str], options: PhotoSettings
 ) -> None:
-    """Write the statistics of photos.
-
-    Args:
-        path: the file, replaced.
-        stats: by path in the folder.
-        digests: hash of the bytes of each file, by the same path; photos without one are left out.
-        options: what they were read with.
-    """
+    """Write the statistics of photos."""
     kept = {name: one for name, one in stats.items() if name in digests}
     rows = [
         {"photo": one.photo.to_dict(), "blur": one.blur, "flat": one.flat, "digest": digests[name]}
@@ -129,11 +117,6 @@ def read_stats(path: Path, digests: Mapping[str, str], options: PhotoSettings) -
     """Return the statistics of the photos whose files are the same, by path in the folder.
 
     None are known if the file is missing, damaged, or of other settings or versions.
-
-    Args:
-        path: the file.
-        digests: hash of the bytes of each file now, by path in the folder.
-        options: what photos are read with.
     """
     try:
         arrays = load_arrays(path)
