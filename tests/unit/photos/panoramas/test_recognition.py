@@ -50,7 +50,7 @@ def test_parts_and_mirrored_pictures_are_none(rendered):
     mirrored = Image.fromarray(np.hstack([pixels[:, :256], pixels[:, 255::-1]]))  # its borders are equal
     turned = Image.fromarray(np.roll(pixels, 60, axis=0))  # no row is a pole
 
-    assert not looks_like_panorama(part) and not closes_around(turned)
+    assert not looks_like_panorama(part) and not looks_like_panorama(turned)
     assert not looks_like_panorama(Image.fromarray(np.full((256, 512, 3), 128, np.uint8)))
     assert part.size == (256, 128) and mirrored.size == (512, 256)
 
