@@ -122,8 +122,6 @@ def estimate_lenses(params: FloatArray, reduced: ReducedSystem, priors: LensPrio
 
     Args:
         params: (C, 12) cameras as in `Bundle`.
-        reduced: the cost about these cameras.
-        priors: on the cameras.
     """
     barred = np.zeros(len(params), np.bool_)
     while True:
@@ -331,10 +329,7 @@ def asks_for_other_family(params: FloatArray, family: int, reach: float, best: L
     if its view is so narrow that a perspective lens can show it.
 
     Args:
-        params: (12,) of the camera.
-        family: of the camera.
         reach: radius of the outermost observations, in focal lengths.
-        best: its most probable model.
         folding: whether a more probable lens folds inside the photo.
     """
     if family == PANORAMA:
@@ -351,8 +346,6 @@ def convert_lens(params: FloatArray, family: int, reach: float) -> FloatArray | 
     Center and aspect are kept, and tangential terms are dropped.
 
     Args:
-        params: (12,) of the camera.
-        family: PERSPECTIVE or FISHEYE.
         reach: radius up to which the two agree, in focal lengths.
     """
     for share in np.linspace(1.0, LEAST_REACH, 9):
@@ -379,8 +372,6 @@ def family_evidence(cost_px2: float, noise_px: float, best: LensChoice) -> float
     """Return the log-probability of a bundle with one of its cameras as it is, comparable between families.
 
     Args:
-        cost_px2: robust cost of the bundle.
         noise_px: the same for all that are compared.
-        best: the camera's most probable model.
     """
     return best.log_evidence - evidence_weight(noise_px) * cost_px2

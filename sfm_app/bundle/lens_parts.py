@@ -113,19 +113,13 @@ def part_names(family: int, chosen: BoolArray) -> tuple[str, ...]:
     """Return the names of some parts of a camera.
 
     Args:
-        family: of the camera.
         chosen: (7,) the parts.
     """
     return tuple(part.name for part, on in zip(PARTS[family], chosen, strict=True) if on)
 
 
 def model_name(family: int, freed: tuple[str, ...]) -> str:
-    """Return COLMAP's name of the smallest camera model that has some parts; the center alone makes no other model.
-
-    Args:
-        family: of the camera.
-        freed: names of the parts.
-    """
+    """Return COLMAP's name of the smallest camera model that has some parts; the center alone makes no other model."""
     if family == PANORAMA:
         return "EQUIRECTANGULAR"
     steps = _FISHEYE_MODELS if family == FISHEYE else _PERSPECTIVE_MODELS
@@ -175,7 +169,6 @@ class LensPriors:
 
         Args:
             params: (C, 12) cameras as in `Bundle`.
-            family, sizes, asked: as in the class.
         """
         reach = np.hypot(*sizes.T) / (2.0 * np.sqrt(params[:, FX] * params[:, FY]))
         reach = np.where(family == FISHEYE, np.minimum(reach, SEEN_ANGLE), reach)
@@ -196,7 +189,6 @@ class LensPriors:
         """Return the priors without some choices for a camera: those whose lens is that of one.
 
         Args:
-            camera: its row.
             free: (7,) the choice that is barred, with all of the same radial terms.
         """
         radial = [k for k, part in enumerate(PARTS[int(self.family[camera])]) if part.name.startswith("k")]
@@ -206,12 +198,7 @@ class LensPriors:
         return replace(self, choices=tuple(choices))
 
     def deviations(self, camera: int, free: BoolArray) -> FloatArray:
-        """Return (K, 12) standard deviations of the prior of a camera under choices (K, 7).
-
-        Args:
-            camera: its row.
-            free: the freed parts of each choice.
-        """
+        """Return (K, 12) standard deviations of the prior of a camera under choices (K, 7)."""
         found = np.full((len(free), CAMERA), FOCAL_SPREAD)
         for k, part in enumerate(PARTS[int(self.family[camera])]):
             unit = self.sides[camera] if part.name == "center" else 1.0
@@ -230,7 +217,6 @@ class LensPriors:
 
         Args:
             trials: (K, 7) the choices.
-            camera: row of the camera.
             away: (12,) from it to its usual values.
         """
         share = np.array([part.share for part in PARTS[int(self.family[camera])]])
@@ -266,7 +252,6 @@ class LensPriors:
         """Return whether the lens of a camera folds inside the photo.
 
         Args:
-            camera: its row.
             params: (12,) a candidate for it.
         """
         if self.family[camera] == PANORAMA or not np.isfinite(params).all() or min(params[FX], params[FY]) <= 0.0:
@@ -277,11 +262,7 @@ class LensPriors:
 
 
 def consistent_choices(family: int) -> BoolArray:
-    """Return (K, 7) choices of what is freed in which no part lacks what it needs; those that free less come first.
-
-    Args:
-        family: of the camera.
-    """
+    """Return (K, 7) choices of what is freed in which no part lacks what it needs; those that free less come first."""
     names = [part.name for part in PARTS[family]]
     trials = binary_choices(len(names))
     for k, part in enumerate(PARTS[family]):
@@ -361,10 +342,8 @@ def calibration_from_params(
 
     Args:
         params: (12,) of a perspective camera or a fisheye.
-        family: of the camera.
         size: (width, height) in pixels.
         deviations: (12,) their standard deviations.
-        determined: names of the parts that the photos determine.
     """
     K = camera_matrix(*(float(params[k]) for k in (FX, FY, CX, CY)))
     spread = {name: float(deviations[k]) for name, k in (("fx", FX), ("fy", FY), ("cx", CX), ("cy", CY), ("k1", K1))}
@@ -380,7 +359,6 @@ def fit_to_model(params: FloatArray, parts: BoolArray, family: int) -> FloatArra
     Args:
         params: (12,) as in `Bundle`.
         parts: (7,) that the model has.
-        family: of the camera.
     """
     found = params.copy()
     for part, on in zip(PARTS[family], parts, strict=True):

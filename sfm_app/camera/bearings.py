@@ -42,11 +42,7 @@ def radial_factor(r: FloatArray, terms: FloatArray, projection: str) -> FloatArr
 
 
 def fold_radius(terms: FloatArray, projection: str) -> float:
-    """Return the undistorted radius up to which the distorted one grows, at most `LARGEST_RADIUS`; pi for a fisheye.
-
-    Args:
-        terms, projection: as in `radial_factor`.
-    """
+    """Return the undistorted radius up to which the distorted one grows, at most `LARGEST_RADIUS`; pi for a fisheye."""
     r = np.linspace(0.0, np.pi if projection == FISHEYE else LARGEST_RADIUS, RADII)
     with np.errstate(all="ignore"):
         slopes = np.diff(r * radial_factor(r, terms, projection)) / (r[1] - r[0])
@@ -59,7 +55,6 @@ def undistort(points: FloatArray, terms: FloatArray, projection: str) -> FloatAr
 
     Args:
         points: (N, 2) in focal lengths from the optical center.
-        terms, projection: as in `radial_factor`.
     """
     fold = fold_radius(terms, projection)
     w = _undistort_radius(points, terms, projection, fold)
@@ -124,7 +119,6 @@ def bearings(x: FloatArray, camera: Calibration) -> FloatArray:
 
     Args:
         x: (N, 2) pixels.
-        camera: any projection.
     """
     found = np.zeros((len(x), BEARING))
     if camera.projection == EQUIRECTANGULAR:
@@ -156,7 +150,6 @@ def project(points: FloatArray, camera: Calibration) -> FloatArray:
 
     Args:
         points: (N, 3).
-        camera: any projection.
     """
     if camera.projection == EQUIRECTANGULAR:
         level = np.hypot(points[:, 0], points[:, 2])
@@ -178,7 +171,6 @@ def depths_along(points: FloatArray, camera: Calibration) -> FloatArray:
 
     Args:
         points: (N, 3) in the camera's frame.
-        camera: any projection.
     """
     if camera.projection in {EQUIRECTANGULAR, FISHEYE}:
         return np.asarray(np.linalg.norm(points, axis=1), np.float64)
@@ -303,7 +295,6 @@ def radius_deviation_px(theta: FloatArray, camera: Calibration) -> FloatArray:
 
     Args:
         theta: radians, >= 0.
-        camera: any projection.
     """
     stated = [camera.evidence.get(deviation_key(share)) for share in SHARES]
     values = [value for value in stated if value is not None]

@@ -19,14 +19,7 @@ Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
-    """Return the (3, 3) camera matrix without skew, in the unit of its arguments.
-
-    Args:
-        fx: focal length along x.
-        fy: focal length along y.
-        cx: x of the principal point.
-        cy: y of the principal point.
-    """
+    """Return the (3, 3) camera matrix without skew, in the unit of its arguments."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
@@ -111,7 +104,6 @@ def calibration_from_model(model: str, params: Sequence[float], size: tuple[int,
     """Return the camera with a model and parameters of COLMAP, as one that the user gave.
 
     Args:
-        model: COLMAP's name.
         params: in COLMAP's order; lengths in pixels.
         size: (width, height) of the photos in pixels; 0, 0 where unknown.
 
@@ -142,7 +134,6 @@ def with_terms(camera: Calibration, terms: Sequence[float]) -> Calibration:
     """Return a camera with other distortion, in the smallest form that holds it.
 
     Args:
-        camera: perspective or fisheye.
         terms: eight, in the order of `TERMS`.
     """
     k1, k2, p1, p2, k3, k4, *last = (float(term) for term in terms)
@@ -166,11 +157,7 @@ def distortion_terms(camera: Calibration) -> NDArray[np.float64]:
 
 
 def model_of_calibration(camera: Calibration) -> tuple[str, list[float]]:
-    """Return the smallest of COLMAP's models with two focals that holds a camera with `distortion`, and its parameters.
-
-    Args:
-        camera: perspective or fisheye.
-    """
+    """Return the smallest of COLMAP's models with two focals that holds a camera with `distortion`, and its parameters."""
     values = dict(zip(TERMS[camera.projection], distortion_terms(camera).tolist(), strict=True))
     values |= {"fx": camera.K[0, 0], "fy": camera.K[1, 1], "cx": camera.K[0, 2], "cy": camera.K[1, 2]}
     fisheye = camera.projection == FISHEYE

@@ -54,11 +54,7 @@ class PerspectiveView:
         return found
 
     def rays(self, top: int = 0, bottom: int | None = None) -> FloatArray:
-        """Return the rays (rows, width, 3) of the centers of pixels, in the photo's frame.
-
-        Args:
-            top, bottom: rows from the first to before the second; all of them by default.
-        """
+        """Return the rays (rows, width, 3) of the centers of pixels, in the photo's frame."""
         rows = np.arange(self.height)[top:bottom]
         x, y = np.meshgrid(np.arange(self.width) + 0.5, rows + 0.5)
         plain = np.stack([(x - self.K[0, 2]) / self.K[0, 0], (y - self.K[1, 2]) / self.K[1, 1], np.ones_like(x)], -1)
@@ -71,7 +67,6 @@ def cover_rays(rays: FloatArray, focal_px: float, most_px: int) -> list[Perspect
     Args:
         rays: (N, 3) unit vectors, dense over what the photo shows.
         focal_px: focal length of the views in pixels; smaller where a view would become too large.
-        most_px: longest side of a view.
     """
     axes = _axes(rays)
     nearest = np.argmax(rays @ axes[:, 2].T, axis=1)

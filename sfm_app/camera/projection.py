@@ -63,11 +63,7 @@ def project_points(points: FloatArray, params: FloatArray, family: IndexArray) -
 
 
 def image_points(points: FloatArray, params: FloatArray, family: IndexArray) -> FloatArray:
-    """Return (N, 2) pixels of points, without derivatives, as `project_points` does.
-
-    Args:
-        points, params, family: as in `project_points`.
-    """
+    """Return (N, 2) pixels of points, without derivatives, as `project_points` does."""
     kinds = np.unique(family)
     if len(kinds) == 1:
         return _POSITIONS[kinds[0]](points, params)
@@ -84,7 +80,6 @@ def wrap_residuals(r: FloatArray, params: FloatArray, family: IndexArray) -> Flo
     Args:
         r: (N, 2) pixels.
         params: (N, 12) camera of each residual.
-        family: (N,) of this camera.
     """
     around = family == PANORAMA
     if around.any():
@@ -99,8 +94,6 @@ def radius_at(angle: FloatArray, params: FloatArray, family: int) -> FloatArray:
 
     Args:
         angle: radians, >= 0; below a right angle for a perspective camera.
-        params: (12,) of the camera.
-        family: PERSPECTIVE or FISHEYE.
     """
     r = np.tan(angle) if family == PERSPECTIVE else angle
     return np.asarray(r * _radial_factor(r * r, np.asarray(params)[None], family)[0], np.float64)
@@ -110,8 +103,6 @@ def angle_limit(params: FloatArray, family: int, reach: float) -> float:
     """Return the angle at which the radius of a lens reaches the corner of the photo; NaN if it folds before that.
 
     Args:
-        params: (12,) of the camera.
-        family: PERSPECTIVE or FISHEYE.
         reach: radius of the corner in focal lengths.
     """
     angle = np.linspace(0.0, TANGENT_ANGLE if family == PERSPECTIVE else SEEN_ANGLE, ANGLES)
@@ -127,8 +118,6 @@ def shown_angle(params: FloatArray, family: int, reach: float) -> float:
     """Return the largest angle that a lens shows: where its radius reaches the corner of the photo, or folds.
 
     Args:
-        params: (12,) of the camera.
-        family: PERSPECTIVE or FISHEYE.
         reach: radius of the corner in focal lengths.
     """
     angle = np.linspace(0.0, TANGENT_ANGLE if family == PERSPECTIVE else SEEN_ANGLE, ANGLES)

@@ -175,15 +175,7 @@ def run_with_progress(
     total: int,
     progress: Progress,
 ) -> None:
-    """Run a long COLMAP call as `run_interruptible` does, with a progress bar.
-
-    Args:
-        call: ends early once its token is cancelled.
-        done: returns the number of finished steps.
-        label: text beside the bar.
-        total: number of steps.
-        progress: shows the bar.
-    """
+    """Run a long COLMAP call as `run_interruptible` does, with a progress bar."""
     seen = 0
 
     def poll() -> None:

@@ -106,9 +106,7 @@ def write_camera(camera: pycolmap.Camera, params: FloatArray, family: int) -> No
     """Change a camera in place, to the smallest of FILE_MODELS that holds the values; a panorama stays as it is.
 
     Args:
-        camera: COLMAP's camera.
         params: (12,) as in `Bundle`.
-        family: of these parameters.
     """
     if family == PANORAMA:
         return
@@ -136,7 +134,6 @@ def read_bundle(model: pycolmap.Reconstruction, rules: Rules = NO_RULES) -> tupl
     """Return the ids of the cameras in use, and the model as arrays.
 
     Args:
-        model: COLMAP's reconstruction.
         rules: of some cameras, by id; those that are kept are fixed.
     """
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
@@ -163,8 +160,6 @@ def write_bundle(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle)
     """Write arrays into a model, in place.
 
     Args:
-        model: COLMAP's reconstruction.
-        ids: of the cameras, from `read_bundle`.
         bundle: with cameras, photos and points in the order of `read_bundle`.
     """
     for camera_id, params, family in zip(ids, bundle.params, bundle.family, strict=True):
@@ -234,7 +229,6 @@ def adjust_in_rounds(
     Args:
         model: COLMAP's reconstruction, with cameras of FILE_MODELS.
         graph: of all matches; None to keep the tracks.
-        rules: of some cameras, by id.
 
     Raises:
         NumericalError: the adjustment diverges.
@@ -262,7 +256,6 @@ def solve(model: pycolmap.Reconstruction, refined: Collection[int] = ()) -> None
     """Adjust poses and points in place, on one thread: the order of sums over several threads is not fixed.
 
     Args:
-        model: COLMAP's reconstruction.
         refined: ids of the cameras whose focal is adjusted, too.
     """
     options = pycolmap.BundleAdjustmentOptions()
@@ -298,10 +291,6 @@ def improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.Correspondenc
     """Continue, merge and triangulate tracks, filter them, and return by how many observations their number changed.
 
     Observations that are added and filtered again do not count: near the limits they come and go forever.
-
-    Args:
-        model: changed in place.
-        graph: of all matches.
     """
     before = model.compute_num_observations()
     observations = pycolmap.ObservationManager(model, graph)
@@ -315,13 +304,7 @@ def improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.Correspondenc
 
 
 def lens_priors(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle, rules: Rules = NO_RULES) -> LensPriors:
-    """Return the priors of the cameras, before any evidence from the bundle.
-
-    Args:
-        model: has the photos and their sizes.
-        ids, bundle: from `read_bundle`.
-        rules: of some cameras, by id.
-    """
+    """Return the priors of the cameras, before any evidence from the bundle."""
     used = photos_per_camera(model)
     sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)
     many = np.array([used[camera_id] >= MIN_PHOTOS for camera_id in ids])
@@ -402,7 +385,6 @@ def best_families(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules =
 
     Args:
         model: adjusted; not changed.
-        rounds: the last rounds of its adjustment.
         rules: of some cameras, by id; those that must be of a family are not tried as another.
     """
     rivals = {}
@@ -471,8 +453,6 @@ def record_lenses(
     """Return the chosen model of each camera and its rivals, by camera id.
 
     Args:
-        model: adjusted.
-        rounds: the last rounds of its adjustment.
         others: rivals of the other family, from `best_families`.
     """
     found = {}
@@ -528,8 +508,6 @@ def adjust(
 
     Args:
         model: result of mapping; not changed.
-        database: has all keypoints and matches.
-        rules: what the user laid down about cameras, by id.
         settled: whether an adjustment of most of these photos has chosen between fisheye and perspective lenses.
 
     Raises:
@@ -563,9 +541,6 @@ def adjust_or_keep(
 ) -> Adjustment:
     """Adjust a model; where that fails numerically, return the given model with the reason.
 
-    Args:
-        model, database, rules, settled: as in `adjust`.
-
     Raises:
         BackendError: COLMAP failed.
     """
@@ -585,12 +560,7 @@ def drop_infinite_points(model: pycolmap.Reconstruction) -> None:
 
 
 def find_correspondences(model: pycolmap.Reconstruction, database: Path) -> pycolmap.CorrespondenceGraph:
-    """Return the graph of all matches between the photos of a model.
-
-    Args:
-        model: COLMAP's reconstruction.
-        database: has all keypoints and matches.
-    """
+    """Return the graph of all matches between the photos of a model."""
     options = pycolmap.DatabaseCacheOptions()
     options.load_all_images = True  # else photos that no pair in the database connects would be missing
     options.image_names = {model.images[image_id].name for image_id in model.reg_image_ids()}
@@ -636,7 +606,6 @@ def apply_rules(model: pycolmap.Reconstruction, rules: Rules) -> None:
 
     Args:
         model: as mapping left it, with cameras of FILE_MODELS.
-        rules: by camera id.
     """
     changed = False
     for camera_id, rule in rules.items():
@@ -664,11 +633,6 @@ def given_estimates(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules
     """Return what the photos say of the cameras that the user gave, by id; not of those that they do not determine.
 
     Where one is kept, everything is adjusted once more with free cameras, to the same tracks.
-
-    Args:
-        model: adjusted.
-        rounds: the last rounds of its adjustment.
-        rules: by camera id.
     """
     if all(rule.given is None for rule in rules.values()):
         return {}

@@ -105,10 +105,6 @@ def create_database(path: Path, photos: PhotoSet) -> None:
     """Enter photos and cameras in a fixed order.
 
     Feature extraction would enter them in the order in which its threads finish, which differs from run to run.
-
-    Args:
-        path: database file, created if it is missing.
-        photos: usable photos, grouped by camera.
     """
     with open_database(path) as database:
         for camera_id, members in enumerate(photos.groups.values(), start=1):
@@ -120,12 +116,7 @@ def create_database(path: Path, photos: PhotoSet) -> None:
 
 
 def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
-    """Return keypoints and raw matches of every photo in the database.
-
-    Args:
-        path: database file.
-        photos: the photos that the database was made from.
-    """
+    """Return keypoints and raw matches of every photo in the database."""
     by_name = {photo.name: photo for photo in photos.photos}
     with open_database(path) as database:
         images, keypoints = {}, {}
@@ -160,7 +151,6 @@ def unmatched_pairs(path: Path, pairs: Sequence[PairId]) -> list[PairId]:
     """Return the pairs that have no entry of matches in the database, not even an empty one.
 
     Args:
-        path: database file.
         pairs: ids, the smaller one first.
     """
     with open_database(path) as database:
@@ -171,8 +161,6 @@ def write_keypoints(path: Path, photo: int, keypoints: NDArray[np.float32]) -> N
     """Enter the keypoints of a photo, or replace them.
 
     Args:
-        path: database file.
-        photo: id.
         keypoints: (N, 2) pixels.
     """
     with open_database(path) as database:
@@ -188,7 +176,6 @@ def write_matches(path: Path, pair: PairId, rows: NDArray[np.uint32]) -> None:
     """Enter the matches of a pair that has none.
 
     Args:
-        path: database file.
         pair: ids, the smaller one first.
         rows: (M, 2) keypoint indices.
     """
@@ -200,9 +187,6 @@ def write_match_graph(path: Path, matches: MatchGraph) -> None:
     """Make a database of the photos, keypoints and raw matches of a match graph, with the same ids.
 
     Its cameras are guesses, one for each group of photos, until `write_calibrations` replaces them.
-
-    Args:
-        path, matches: database file, which is replaced if it exists; keypoints and raw matches.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_database(path)
@@ -232,13 +216,7 @@ def read_features(path: Path) -> tuple[dict[int, NDArray[np.float64]], dict[Pair
 
 
 def write_pose_graph(path: Path, matches: MatchGraph, graph: PoseGraph) -> None:
-    """Replace all two-view geometries by our relative poses and their essential matrices.
-
-    Args:
-        path: database file.
-        matches: raw matches, whose rows the inliers select.
-        graph: relative poses.
-    """
+    """Replace all two-view geometries by our relative poses and their essential matrices."""
     with open_database(path) as database:
         database.clear_two_view_geometries()
         for pair, pose in graph.poses.items():
@@ -246,12 +224,7 @@ def write_pose_graph(path: Path, matches: MatchGraph, graph: PoseGraph) -> None:
 
 
 def keep_raw_matches(path: Path, pairs: Collection[PairId]) -> None:
-    """Remove all two-view geometries, and all matches but those of the given pairs.
-
-    Args:
-        path: database file.
-        pairs: pairs whose matches are kept.
-    """
+    """Remove all two-view geometries, and all matches but those of the given pairs."""
     with open_database(path) as database:
         database.clear_two_view_geometries()
         for pair in {_pair(pair_id) for pair_id in database.read_all_matches()[0]}.difference(pairs):
@@ -263,9 +236,6 @@ def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) 
 
     Cameras are numbered in the order of their first photos, whatever the database held before. A K that the photos
     determine is marked as a prior focal length, a guess is not.
-
-    Args:
-        path, matches, intrinsics: database file; all photos; cameras, and the camera of each photo.
     """
     used = {image.id: intrinsics.camera_name(image) for image in matches.images.values()}
     ids = {name: number for number, name in enumerate(dict.fromkeys(used[key] for key in sorted(used)), start=1)}
@@ -342,7 +312,6 @@ def camera_params(K: NDArray[np.float64], camera_model: str, radial: float = 0.0
 
     Args:
         K: (3, 3) camera matrix, pixels.
-        camera_model: COLMAP's name of the model.
         radial: first radial term.
     """
     fx, fy, cx, cy = (float(K[row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
@@ -367,13 +336,7 @@ def _two_view_geometry(pose: RelativePose, matches: NDArray[np.uint32]) -> pycol
 
 
 def largest_descriptors(path: Path, photo: int, most: int) -> NDArray[np.uint8]:
-    """Return (N, 128) descriptors of a photo, those of the largest features first; none where it has none.
-
-    Args:
-        path: database file.
-        photo: id.
-        most: number of descriptors.
-    """
+    """Return (N, 128) descriptors of a photo, those of the largest features first; none where it has none."""
     with open_database(path) as database:
         if not database.exists_descriptors(photo):
             return np.zeros((0, 128), np.uint8)

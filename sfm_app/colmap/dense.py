@@ -30,13 +30,7 @@ most half a pixel aside."""
 
 
 class MaskUndistorter:
-    """Writes masks of undistorted photos; on its way to another process, it is the paths of its inputs.
-
-    Args:
-        model_dir: model with the cameras of the photos.
-        mask_dir: masks of the original photos.
-        dense_dir: workspace with the undistorted photos.
-    """
+    """Writes masks of undistorted photos; on its way to another process, it is the paths of its inputs."""
 
     def __init__(self, model_dir: Path, mask_dir: Path, dense_dir: Path) -> None:
         self._inputs = model_dir, mask_dir, dense_dir
@@ -55,21 +49,12 @@ class MaskUndistorter:
 
 
 def has_masks(dense_dir: Path) -> bool:
-    """Return whether any undistorted photo has a mask.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-    """
+    """Return whether any undistorted photo has a mask."""
     return (dense_dir / MASKS).is_dir()
 
 
 def used_pixels(dense_dir: Path, view: View) -> BoolArray | None:
-    """Return (H, W) which pixels of an undistorted photo may be used; None if it has no mask.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo.
-    """
+    """Return (H, W) which pixels of an undistorted photo may be used; None if it has no mask."""
     place = dense_dir / MASKS
     return read_mask(place, view.name) if mask_path(place, view.name).exists() else None
 
@@ -117,10 +102,7 @@ def undistort(
     """Write undistorted photos and the matching model into a dense workspace.
 
     Args:
-        model_dir, photo_dir, dense_dir: COLMAP model; the photos; dense workspace, created if it is missing.
         max_side_px: longest side of an undistorted photo; larger photos are scaled down.
-        workers: threads.
-        progress: shows a bar.
 
     Raises:
         BackendError: COLMAP cannot read the model or the photos, or cannot write.
@@ -166,45 +148,25 @@ def _view(model: pycolmap.Reconstruction, image: pycolmap.Image) -> View:
 
 
 def read_gray(dense_dir: Path, view: View) -> NDArray[np.uint8]:
-    """Return the undistorted photo of a view, (H, W).
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo.
-    """
+    """Return the undistorted photo of a view, (H, W)."""
     # imdecode, because OpenCV does not open names beyond ASCII on every system
     image = cv2.imdecode(np.fromfile(dense_dir / "images" / view.name, np.uint8), cv2.IMREAD_GRAYSCALE)
     return np.asarray(image, np.uint8)
 
 
 def read_color(dense_dir: Path, view: View) -> NDArray[np.uint8]:
-    """Return the undistorted photo of a view, (H, W, 3) RGB.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo.
-    """
+    """Return the undistorted photo of a view, (H, W, 3) RGB."""
     image = cv2.imdecode(np.fromfile(dense_dir / "images" / view.name, np.uint8), cv2.IMREAD_COLOR_RGB)
     return np.asarray(image, np.uint8)
 
 
 def map_file(dense_dir: Path, view: View) -> Path:
-    """Return the path of the confirmed depths of a view, whether or not it exists.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo.
-    """
+    """Return the path of the confirmed depths of a view, whether or not it exists."""
     return _map_path(dense_dir, DEPTHS, view, "geometric")
 
 
 def normals_file(dense_dir: Path, view: View) -> Path:
-    """Return the path of the normals of a view, whether or not it exists.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo.
-    """
+    """Return the path of the normals of a view, whether or not it exists."""
     return _map_path(dense_dir, NORMALS, view, "geometric")
 
 
@@ -220,12 +182,7 @@ class DenseStore:
         return _resize(photo, view) if view.level else photo
 
     def has(self, view: View, kind: Kind) -> bool:
-        """Return whether a depth map exists.
-
-        Args:
-            view: an undistorted photo.
-            kind: which map.
-        """
+        """Return whether a depth map exists."""
         # the depth map is written last
         return _map_path(self.dense_dir, DEPTHS, view, kind).is_file()
 
@@ -235,12 +192,7 @@ class DenseStore:
         return DepthEstimate(self.read_depth(view), confidence)
 
     def read_depth(self, view: View, kind: Kind = "photometric") -> NDArray[np.float32]:
-        """Read the depths of a map of a view.
-
-        Args:
-            view: an undistorted photo.
-            kind: which map.
-        """
+        """Read the depths of a map of a view."""
         return read_depth(self.dense_dir, view, kind)
 
     def read_maps(self, view: View) -> DepthMap:
@@ -251,18 +203,12 @@ class DenseStore:
         """Write what is proposed for the plain areas of a view.
 
         Args:
-            view: an undistorted photo.
             depth: (H, W), 0 where nothing is.
         """
         _write_depth_format(self.dense_dir, DEPTHS, view, depth, "proposed")
 
     def write_estimate(self, view: View, estimate: DepthEstimate) -> None:
-        """Write the photometric map of a view, without depth where the photo is masked.
-
-        Args:
-            view: an undistorted photo.
-            estimate: depths and their confidences.
-        """
+        """Write the photometric map of a view, without depth where the photo is masked."""
         used = used_pixels(self.dense_dir, view)
         if used is not None:
             if view.level:  # a pixel counts if all under it do
@@ -273,33 +219,17 @@ class DenseStore:
         _write_depth_format(self.dense_dir, DEPTHS, view, estimate.depth, "photometric")
 
     def write_maps(self, view: View, maps: DepthMap) -> None:
-        """Write the geometric maps of a view.
-
-        Args:
-            view: an undistorted photo.
-            maps: confirmed depths, and normals.
-        """
+        """Write the geometric maps of a view."""
         write_maps(self.dense_dir, view, maps)
 
 
 def read_depth(dense_dir: Path, view: View, kind: Kind) -> NDArray[np.float32]:
-    """Read a depth map, (H, W): 0 where unknown, MASKED where the photo is masked, SKY where it shows the sky.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo.
-        kind: photometric or geometric.
-    """
+    """Read a depth map, (H, W): 0 where unknown, MASKED where the photo is masked, SKY where it shows the sky."""
     return _read_depth_format(dense_dir, DEPTHS, view, kind)
 
 
 def read_normals(dense_dir: Path, view: View) -> NDArray[np.float32]:
-    """Read the normals of a view, (H, W, 3), as `write_maps` takes them.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: a photo with maps.
-    """
+    """Read the normals of a view, (H, W, 3), as `write_maps` takes them."""
     with translate_errors(f"reading the normal map of {view.name}"):
         stored = pycolmap.NormalMap()
         stored.read(_map_path(dense_dir, NORMALS, view))
@@ -312,8 +242,6 @@ def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
     """Write the confirmed depths and the normals of a view, as COLMAP's fusion expects them.
 
     Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo.
         maps: depths (H, W) and normals (H, W, 3).
     """
     # pycolmap takes (H, W, 3) but stores the bytes unchanged, while COLMAP keeps x, y and z in planes.
@@ -330,20 +258,13 @@ def write_depth(dense_dir: Path, view: View, depth: NDArray[np.float32]) -> None
     """Write the confirmed depths of a view.
 
     Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo.
         depth: (H, W), 0 where unknown.
     """
     _write_depth_format(dense_dir, DEPTHS, view, depth, "geometric")
 
 
 def mask_depths(dense_dir: Path, view: View) -> None:
-    """Write MASKED into the confirmed depths of a view where the photo is masked, whichever method made them.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo, masked or not.
-    """
+    """Write MASKED into the confirmed depths of a view where the photo is masked, whichever method made them."""
     used, file = used_pixels(dense_dir, view), map_file(dense_dir, view)
     if used is not None and file.exists():
         depth = read_depth(dense_dir, view, "geometric")
@@ -351,12 +272,7 @@ def mask_depths(dense_dir: Path, view: View) -> None:
 
 
 def drop_estimates(dense_dir: Path, views: Sequence[View]) -> None:
-    """Remove the photometric maps and the proposals, which the geometric maps replace.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        views: all undistorted photos.
-    """
+    """Remove the photometric maps and the proposals, which the geometric maps replace."""
     for view in views:
         _map_path(dense_dir, DEPTHS, view, "proposed").unlink(missing_ok=True)
         for at_level in (view, *(view.halve(level) for level in range(1, MOST_LEVELS))):
@@ -365,12 +281,7 @@ def drop_estimates(dense_dir: Path, views: Sequence[View]) -> None:
 
 
 def write_fusion_views(dense_dir: Path, views: Sequence[View]) -> None:
-    """Write the list of views that have maps, for COLMAP's fusion.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        views: all undistorted photos.
-    """
+    """Write the list of views that have maps, for COLMAP's fusion."""
     config = "".join(f"{view.name}\n" for view in views if map_file(dense_dir, view).exists())
     (dense_dir / "stereo" / "fusion.cfg").write_text(config, encoding="utf-8", newline="\n")
 
@@ -418,10 +329,6 @@ def _atomic_path(target: Path) -> Iterator[Path]:
 
 def read_photo_and_depth(dense_dir: Path, name: str) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Return the undistorted photo (H, W, 3) RGB and its confirmed depths (H, W), <= 0 where there is none.
-
-    Args:
-        dense_dir: dense workspace.
-        name: of the undistorted photo.
 
     Raises:
         ValueError: the name leads out of the workspace, or the photo is none.

@@ -41,12 +41,8 @@ def find_as_needed(
     """Find SIFT features of photos that have none yet, and enter them. Ours.
 
     Args:
-        database: holds the photos.
-        photo_dir: folder with the photos.
-        names: names of the photos.
         how: COLMAP's options for reading photos and masks, and for finding features; number of features below which a
             photo is enlarged.
-        token: ends the work early.
     """
     reader, extraction, _ = how
     with open_database(database) as before:
@@ -116,12 +112,8 @@ def extract_panoramas(
     Of too many features those of the largest scale are kept, as COLMAP does.
 
     Args:
-        database: holds the photos; keypoints and descriptors are entered.
-        photo_dir: folder with the photos.
-        names: names of the panoramas.
         mask_dir: has a mask of every photo; None without masks.
         extraction: COLMAP's options; the largest size is that of one view.
-        progress: shows a bar.
     """
     with open_database(database) as reader:
         images = {image.name: image.image_id for image in reader.read_all_images()}
@@ -184,8 +176,6 @@ def do_task(task: FeatureTask, progress: Progress, tell: Callable[..., None]) ->
     """Find features of photos, and match pairs of photos.
 
     Args:
-        task: what to do.
-        progress: shows a bar.
         tell: called with the options in force, as `extraction` or `matching`.
     """
     database, photo_dir, names = Path(task["database"]), Path(task["photos"]), task["names"]
@@ -219,13 +209,7 @@ def do_task(task: FeatureTask, progress: Progress, tell: Callable[..., None]) ->
 def extraction_options(
     options: MatchSettings, sift: Mapping[str, SiftOption], workers: int
 ) -> pycolmap.FeatureExtractionOptions:
-    """Return COLMAP's options for finding features.
-
-    Args:
-        options: largest photo size and largest number of features.
-        sift: options of COLMAP's SIFT, by name.
-        workers: threads.
-    """
+    """Return COLMAP's options for finding features."""
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = options.max_image_size_px
     extraction.num_threads = workers
@@ -244,16 +228,7 @@ def extract(
     extraction: pycolmap.FeatureExtractionOptions,
     progress: Progress,
 ) -> None:
-    """Find SIFT features of all photos.
-
-    Args:
-        database: holds the photos; keypoints are entered.
-        photo_dir: folder with the photos.
-        names: names of the photos.
-        reader: COLMAP's options for reading photos and masks.
-        extraction: see `extraction_options`.
-        progress: shows a bar.
-    """
+    """Find SIFT features of all photos."""
 
     def call(token: pycolmap.CancellationToken) -> None:
         pycolmap.extract_features(
@@ -282,11 +257,7 @@ def match(
     """Match pairs of photos, and return the effective options.
 
     Args:
-        database: holds the keypoints; matches are entered.
-        options: largest ratio of descriptor distances.
-        workers: threads.
         pairs: ids of the photos of each pair; None for every photo with every other.
-        progress: shows a bar.
     """
     matching = pycolmap.FeatureMatchingOptions()
     matching.skip_geometric_verification = True

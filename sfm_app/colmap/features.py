@@ -39,12 +39,6 @@ def find_and_match(
     """Find features of all photos and match every photo with every other; existing features and matches stay.
 
     Args:
-        database: database file with the photos.
-        photo_dir: folder with the photos.
-        names: names of the photos.
-        options: settings of features and matches.
-        workers: threads.
-        progress: shows a bar.
         mask_dir: has a mask of every photo, `name.png`: no keypoints where it is black.
         sift: options of COLMAP's SIFT that differ from its defaults.
         pairs: pairs of photos to match, instead of all.
@@ -72,12 +66,7 @@ def feature_task(
     sift: Mapping[str, SiftOption],
     pairs: Sequence[PairId] | None,
 ) -> FeatureTask:
-    """Return the task of a process that finds and matches features.
-
-    Args:
-        paths: database, photos, masks.
-        names, options, workers, sift, pairs: as in `find_and_match`.
-    """
+    """Return the task of a process that finds and matches features."""
     database, photo_dir, mask_dir = paths
     return {
         "database": str(database),
@@ -132,8 +121,6 @@ def write_snapshot(database: Path, target: Path, without: Sequence[str]) -> None
     """Copy a database that nobody is writing to into one that can be read over a network.
 
     Args:
-        database: of the run.
-        target: file to write, atomically.
         without: tables that stay empty.
 
     Raises:
@@ -151,10 +138,6 @@ def write_snapshot(database: Path, target: Path, without: Sequence[str]) -> None
 def find_in_chunk(inputs: SiftInputs, names: Sequence[str]) -> Part:
     """Find features of some photos, and leave their rows in a file.
 
-    Args:
-        inputs: of all chunks.
-        names: of the photos.
-
     Raises:
         BackendError: COLMAP failed.
     """
@@ -167,9 +150,7 @@ def match_chunk(inputs: SiftInputs, pairs: Sequence[PairId], progress: Progress 
     """Match some pairs, and leave their rows in a file.
 
     Args:
-        inputs: of all chunks.
         pairs: ids of photos; the order within a pair is that in which COLMAP matches them.
-        progress: counts pairs.
 
     Raises:
         BackendError: COLMAP failed.
@@ -183,12 +164,6 @@ def match_chunk(inputs: SiftInputs, pairs: Sequence[PairId], progress: Progress 
 
 def match_chunk_apart(inputs: SiftInputs, group: ProcessGroup, progress: Progress, pairs: Sequence[PairId]) -> Part:
     """Match some pairs in a process of its own.
-
-    Args:
-        inputs: of all chunks.
-        group: of the processes that match.
-        progress: counts pairs.
-        pairs: as in `match_chunk`.
 
     Raises:
         BackendError: COLMAP failed, or the group has ended.
@@ -204,11 +179,6 @@ def match_chunk_apart(inputs: SiftInputs, group: ProcessGroup, progress: Progres
 
 def enter_rows(database: Path, part: Path, tables: Sequence[str]) -> None:
     """Enter the rows that a worker has left into the run's database, and remove their file.
-
-    Args:
-        database: of the run.
-        part: file of the rows.
-        tables: that it holds.
 
     Raises:
         BackendError: the rows cannot be read or entered.

@@ -27,10 +27,6 @@ def global_options(seed: int, names: Sequence[str]) -> pycolmap.GlobalPipelineOp
     """Return COLMAP's defaults, except that our relative poses are used unchanged.
 
     COLMAP's adjustment is coarse, because the last adjustment is ours.
-
-    Args:
-        seed: seed of COLMAP's own sampling.
-        names: photos to place.
     """
     options = pycolmap.GlobalPipelineOptions()
     options.image_names = list(names)

@@ -31,9 +31,6 @@ def grow_database(path: Path, earlier: Path, photos: PhotoSet, known: Collection
     """Make the database of these photos, with what that of an earlier run knows about the same photos.
 
     Args:
-        path: database file; appears as a whole.
-        earlier: database of the earlier run; not changed.
-        photos: usable photos, grouped by camera.
         known: names of the photos that are the same in both.
     """
     with _connection(earlier) as connection:
@@ -60,7 +57,6 @@ def forget_changed_matches(path: Path, earlier: Path) -> frozenset[str]:
     A method that finds features again may find others, and matches are rows of keypoints.
 
     Args:
-        path: database whose photos have keypoints.
         earlier: database that its matches come from.
     """
     query = "SELECT image_id, rows, cols, data FROM keypoints"
@@ -103,9 +99,6 @@ def model_in_database(
 
     Args:
         database: holds photos, keypoints and cameras; known photos have the ids that they have in the model.
-        earlier: COLMAP's model on disk.
-        photos: ids of the known photos.
-        keypoints: number of keypoints of each photo in the database.
     """
     before = pycolmap.Reconstruction(earlier)
     model = unposed_model(database)

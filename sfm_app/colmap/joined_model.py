@@ -42,18 +42,13 @@ class PlacedPhotos:
         """Return the bearing vectors (N, 9) of pixels of a photo.
 
         Args:
-            photo: id.
             x: (N, 2) pixels.
         """
         return bearing_vectors(self.cameras[photo], x)
 
 
 def read_placed(model_dir: Path) -> PlacedPhotos:
-    """Read a model on disk.
-
-    Args:
-        model_dir: COLMAP's model.
-    """
+    """Read a model on disk."""
     with translate_errors("reading the model of a part"):
         model = pycolmap.Reconstruction(model_dir)
         images = posed_images(model)
@@ -73,7 +68,6 @@ def write_placed(database: Path, placed: PlacedPhotos) -> pycolmap.Reconstructio
     """Return poses and points as COLMAP's model.
 
     Args:
-        database: holds the photos, keypoints and two-view geometries.
         placed: each keypoint is in one point at most. Of the cameras of photos that share one in the database,
             the one with the median focal is taken.
     """
@@ -109,9 +103,7 @@ def merge_models(
     """Return one model with the photos and points of two models that share no photo.
 
     Args:
-        database: holds photos, keypoints and two-view geometries.
         first: gives the frame, and the parameters of cameras that are in both models; not changed.
-        second: not changed.
         similarity: from the frame of the second model into that of the first.
     """
     other = pycolmap.Reconstruction(second)
@@ -133,8 +125,6 @@ def settle(model: pycolmap.Reconstruction, database: Path, refined: Sequence[int
     """Adjust a joined model in place, and complete, merge and filter its tracks.
 
     Args:
-        model: COLMAP's reconstruction.
-        database: has all keypoints and matches.
         refined: ids of the cameras whose focal is refined; the others are held fixed.
     """
     drop_infinite_points(model)

@@ -29,12 +29,9 @@ def map_incrementally(
 
     Args:
         database: photos, keypoints, two-view geometries, K.
-        photo_dir: folder with the photos; COLMAP requires it.
         start: a reconstruction with at least two posed photos.
         scratch: a folder that is emptied first and removed afterwards.
-        seed: seed of COLMAP's own sampling.
         tick: called before every further photo.
-        token: stops the mapping.
         known: whether the cameras are known too well for mapping to improve them.
         kept: ids of cameras that the user gave and wants unchanged.
     """
@@ -75,11 +72,7 @@ def map_globally(
     COLMAP has no way to stop this, so it runs in a separate process.
 
     Args:
-        photo_dir: folder with the photos; COLMAP requires it.
-        names: photos to place.
         scratch: a folder from `copy_database`; removed afterwards.
-        seed: seed of COLMAP's own sampling.
-        token: stops the mapping.
 
     Returns:
         The model; None where the mapper was stopped or found none.
@@ -102,10 +95,6 @@ def map_with_colmap_defaults(
     """Verify the raw matches and map the photos by COLMAP's defaults, with the cameras of the database as first guess.
 
     Only the raw matches and the guess are ours. The result and the errors are those of `map_globally`.
-
-    Args:
-        photo_dir: folder with the photos.
-        scratch, seed, token: as in `map_globally`.
     """
     task: MappingTask = {"scratch": str(scratch), "photos": str(photo_dir), "seed": seed}
     return _map_in_process("sfm_app.colmap.baseline_mapping", task, "mapping photos by its defaults", token)
@@ -129,10 +118,6 @@ def incremental_options(seed: int, *, known: bool = False) -> pycolmap.Increment
     """Return COLMAP's defaults, except that two photos make a model and only the given model is extended.
 
     Adjustments stop when they gain little, and `known` cameras are held fixed: the last adjustment is ours.
-
-    Args:
-        seed: seed of COLMAP's own sampling.
-        known: whether cameras are held fixed.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 2

@@ -35,7 +35,6 @@ def unposed_model(database: Path, *, unconnected: bool = True) -> pycolmap.Recon
     """Return a reconstruction of the photos, keypoints and cameras of a database, without poses and points.
 
     Args:
-        database: holds photos, keypoints and two-view geometries.
         unconnected: whether photos are in it that no pair in the database connects.
     """
     options = pycolmap.DatabaseCacheOptions()
@@ -48,13 +47,7 @@ def unposed_model(database: Path, *, unconnected: bool = True) -> pycolmap.Recon
 
 
 def pose_photo(model: pycolmap.Reconstruction, photo: int, cam_from_world: pycolmap.Rigid3d) -> None:
-    """Give a photo of a model its pose, in place.
-
-    Args:
-        model: COLMAP's reconstruction.
-        photo: id.
-        cam_from_world: the pose.
-    """
+    """Give a photo of a model its pose, in place."""
     image = model.images[photo]
     model.frames[image.frame_id].set_cam_from_world(image.camera_id, cam_from_world)
     model.register_frame(image.frame_id)
@@ -66,8 +59,6 @@ def model_from_seed(
     """Return a reconstruction of two photos with our pose and our points.
 
     Args:
-        database: holds photos, keypoints and two-view geometries.
-        pair: ids of the two photos.
         matches: (N, 2) keypoint indices, one row per point of the seed.
         seed: pose and points; only its usable points are added.
     """
@@ -98,7 +89,6 @@ def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray
     """Return all photos of a model that have a pose, by id.
 
     Args:
-        model: COLMAP's reconstruction.
         keypoints: (N, 2) pixels, by photo id.
     """
     found = {}
@@ -113,7 +103,6 @@ def bearing_vectors(camera: pycolmap.Camera, x: NDArray[np.float64]) -> NDArray[
     """Return bearing vectors (N, 9), as `geometry.lenses.bearings` does.
 
     Args:
-        camera: COLMAP's camera.
         x: (N, 2) pixels.
     """
     if camera.is_perspective_fisheye() or camera.is_spherical():
@@ -159,23 +148,12 @@ def _mapped_camera(camera: pycolmap.Camera) -> MappedCamera:
 
 
 def color_points(model: pycolmap.Reconstruction, photo_dir: Path, workers: int) -> None:
-    """Give every point the mean color of its pixels.
-
-    Args:
-        model: changed in place.
-        photo_dir: folder with the photos.
-        workers: threads.
-    """
+    """Give every point the mean color of its pixels."""
     run_in_daemon_thread(lambda: model.extract_colors_for_all_images(photo_dir, num_threads=workers))
 
 
 def submodel(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.Reconstruction:
-    """Return a copy of a model with only the given photos, and the points that at least two of them see.
-
-    Args:
-        model: not changed.
-        photos: ids of the photos to keep.
-    """
+    """Return a copy of a model with only the given photos, and the points that at least two of them see."""
     part, members = pycolmap.Reconstruction(model), set(photos)
     for image in posed_images(model):
         if image.image_id not in members:
@@ -218,12 +196,7 @@ class SeenPoints:
 
 
 def seen_points(model: pycolmap.Reconstruction, most: int) -> SeenPoints:
-    """Return the finite points of a model, or a sample of them drawn with a fixed seed.
-
-    Args:
-        model: COLMAP's reconstruction, colored.
-        most: largest number of points.
-    """
+    """Return the finite points of a model, or a sample of them drawn with a fixed seed."""
     keys = [key for key in sorted(model.points3D) if finite_mask(model.points3D[key].xyz)]
     chosen = np.sort(np.random.default_rng(0).permutation(len(keys))[:most])
     found = [model.points3D[keys[k]] for k in chosen]
@@ -239,11 +212,7 @@ def seen_points(model: pycolmap.Reconstruction, most: int) -> SeenPoints:
 
 
 def scale_matrix(camera: pycolmap.Camera) -> NDArray[np.float64]:
-    """Return K (3, 3) of a camera; of a panorama, the scale at its middle.
-
-    Args:
-        camera: of any model.
-    """
+    """Return K (3, 3) of a camera; of a panorama, the scale at its middle."""
     if camera.is_spherical():
         return panorama_matrix((camera.width, camera.height))
     return np.asarray(camera.calibration_matrix(), np.float64)
@@ -253,8 +222,6 @@ def viewing_rays(model: pycolmap.Reconstruction, image_id: int, x: NDArray[np.fl
     """Return the viewing directions (N, 3) of pixels of a photo in the world, of any length.
 
     Args:
-        model: COLMAP's reconstruction.
-        image_id: id of a posed photo.
         x: (N, 2) pixels.
     """
     image = model.images[image_id]
@@ -263,12 +230,7 @@ def viewing_rays(model: pycolmap.Reconstruction, image_id: int, x: NDArray[np.fl
 
 
 def focal_px(model: pycolmap.Reconstruction, image_id: int) -> float:
-    """Return the focal length of the camera of a photo, in pixels.
-
-    Args:
-        model: COLMAP's reconstruction.
-        image_id: id of the photo.
-    """
+    """Return the focal length of the camera of a photo, in pixels."""
     return float(np.sqrt(np.prod(np.diag(scale_matrix(model.cameras[model.images[image_id].camera_id]))[:2])))
 
 
@@ -276,7 +238,6 @@ def move(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
     """Move a model into another frame.
 
     Args:
-        model: changed in place.
         similarity: from the frame of the model into the new one.
     """
     rotation = pycolmap.Rotation3d(similarity.R)
@@ -290,7 +251,6 @@ def model_arrays(model: pycolmap.Reconstruction, *, metric: bool) -> SceneArrays
     """Return poses, cameras, points and tracks of a model.
 
     Args:
-        model: COLMAP's reconstruction.
         metric: whether its unit is the meter.
     """
     images = sorted(posed_images(model), key=lambda image: image.name)
@@ -333,7 +293,6 @@ def read_model(model_dir: Path, frame: Similarity | None = None) -> pycolmap.Rec
     """Read a model on disk.
 
     Args:
-        model_dir: COLMAP's model.
         frame: from its frame into the one that is wanted; None for its own.
     """
     with translate_errors("reading the sparse model"):
@@ -386,7 +345,6 @@ def read_scene(
     """Read a model on disk as the scene that later stages use.
 
     Args:
-        model_dir: COLMAP's model.
         names, unregistered: the name of its camera, by photo; the reason why it has no pose, by photo.
         refined: deviations, determined parameters and correlations, by camera; may lack cameras.
     """
@@ -442,9 +400,6 @@ class ModelFigures:
 
 def model_figures(model_dir: Path) -> ModelFigures:
     """Return the figures of a model on disk.
-
-    Args:
-        model_dir: COLMAP's model.
 
     Raises:
         BackendError: it cannot be read.

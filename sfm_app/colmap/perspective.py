@@ -35,7 +35,6 @@ def full_size_lenses(model: pycolmap.Reconstruction, *, centered: bool) -> dict[
     """Return the views of every camera at full size, by its id.
 
     Args:
-        model: COLMAP's reconstruction.
         centered: whether the optical center of every view is in its middle, and its pixels are square.
     """
     with translate_errors("undistorting the cameras"):
@@ -46,12 +45,7 @@ def full_size_lenses(model: pycolmap.Reconstruction, *, centered: bool) -> dict[
 
 
 class PixelMaps:
-    """Which pixels of a photo its views show, by camera; those of the camera asked for last are kept for its photos.
-
-    Args:
-        model: COLMAP's reconstruction.
-        lenses: views by id of the camera.
-    """
+    """Which pixels of a photo its views show, by camera; those of the camera asked for last are kept for its photos."""
 
     def __init__(self, model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens]) -> None:
         self._model, self._lenses, self._lock = model, lenses, threading.Lock()
@@ -77,13 +71,7 @@ class PixelMaps:
 def perspective_photos(
     model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames
 ) -> tuple[PerspectivePhoto, ...]:
-    """Return the views of all posed photos, by name of the photo.
-
-    Args:
-        model: COLMAP's reconstruction.
-        lenses: views by id of the camera.
-        names: of the views.
-    """
+    """Return the views of all posed photos, by name of the photo."""
     return tuple(
         PerspectivePhoto(name, image.name, view.K, view.width, view.height, view.R @ image.cam_from_world().matrix())
         for image in sorted(posed_images(model), key=lambda image: image.name)
@@ -95,15 +83,7 @@ def write_view_model(
     model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames, folder: Path, *,
     text: bool = False,
 ) -> None:  # fmt: skip
-    """Write COLMAP's model of the views.
-
-    Args:
-        model: COLMAP's reconstruction of the photos.
-        lenses: views by id of the camera.
-        names: of the views.
-        folder: created.
-        text: whether as text instead of binary.
-    """
+    """Write COLMAP's model of the views."""
     folder.mkdir(parents=True, exist_ok=True)
     with translate_errors("writing the model of undistorted photos"):
         found = make_view_model(model, lenses, names)
@@ -114,13 +94,7 @@ def write_view_model(
 def make_view_model(
     model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames
 ) -> pycolmap.Reconstruction:
-    """Return the model of the views; points keep their ids, and those that no view shows are left out.
-
-    Args:
-        model: COLMAP's reconstruction of the photos.
-        lenses: views by id of the camera.
-        names: of the views.
-    """
+    """Return the model of the views; points keep their ids, and those that no view shows are left out."""
     found = pycolmap.Reconstruction()
     cameras = add_view_cameras(found, lenses)
     tracks = {point: pycolmap.Track() for point in sorted(model.points3D)}
@@ -146,12 +120,7 @@ def make_view_model(
 
 
 def tracked_rays(model: pycolmap.Reconstruction, image: pycolmap.Image) -> tuple[list[int], FloatArray]:
-    """Return the points that a photo sees, by id, and the rays (N, 3) of their keypoints in its frame.
-
-    Args:
-        model: COLMAP's reconstruction.
-        image: posed photo.
-    """
+    """Return the points that a photo sees, by id, and the rays (N, 3) of their keypoints in its frame."""
     tracked = [point for point in image.points2D if point.has_point3D()]
     x = np.array([point.xy for point in tracked], np.float64).reshape(-1, 2)
     rays = np.asarray(model.cameras[image.camera_id].cam_ray_from_img(x), np.float64).reshape(-1, 3)
@@ -163,7 +132,6 @@ def project_rays(rays: FloatArray, view: PerspectiveView) -> tuple[FloatArray, N
 
     Args:
         rays: (N, 3) in the photo's frame.
-        view: the view.
     """
     at = rays @ view.R.T @ view.K.T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -190,9 +158,6 @@ class LargerViews:
     """Undistorts photos again, as the dense workspace has them, but at another size.
 
     Args:
-        model_dir: COLMAP model of the photos.
-        photo_dir: the photos.
-        mask_dir: their masks; None without masks.
         views: of the dense workspace; photos without any are left out.
         max_side_px: longest side of a view; none is larger than its photo.
 
@@ -269,9 +234,6 @@ def write_bundle(model_dir: Path, photo_dir: Path, file: Path, workers: int, pro
     Args:
         model_dir: COLMAP's model, of one focal per camera and with optical centers in the middle.
         photo_dir: its photos; COLMAP writes them again, and they are thrown away.
-        file: file to write.
-        workers: threads.
-        progress: shows a bar.
 
     Raises:
         BackendError: COLMAP cannot read the model or the photos, or cannot write.

@@ -43,7 +43,6 @@ def measure_readout(
         adjusted: a model of photos of perspective or fisheye cameras, five or more.
         keypoints: of its photos, before any compensation.
         times: of its photos, distinct, by id.
-        start, known: as of `estimate_readout`.
     """
     model = adjusted.model
     ids, bundle = read_bundle(model)
@@ -69,8 +68,6 @@ def straighten_model(
     """Return a copy of a model with the estimated poses, points and cameras, and with its keypoints compensated.
 
     Args:
-        model: the one that the readout was measured with; not changed.
-        estimate: from `measure_readout`.
         keypoints: of its photos, before any compensation.
     """
     model = pycolmap.Reconstruction(model)

@@ -27,9 +27,7 @@ def fuse(
 
     Args:
         dense_dir: dense workspace; `dense.write_fusion_views` has listed the views that have maps.
-        min_views: smallest number of photos that see a point.
         box: (2, 3) lowest and highest coordinates that are kept.
-        target: PLY file, in any folder.
         cache_gb: memory for depth and normal maps; with less, they are read more often. 0: all are held, which takes
             half the time.
     """
@@ -67,12 +65,7 @@ def open_points(path: Path) -> NDArray[np.void]:
 
 
 def write_points(records: NDArray[np.void], path: Path) -> None:
-    """Write records with the fields of `open_points` as a PLY file.
-
-    Args:
-        records: (N,).
-        path: of the file.
-    """
+    """Write records with the fields of `open_points` as a PLY file."""
     with path.open("wb") as file:
         file.write(_header(records.dtype, len(records)))
         file.write(np.ascontiguousarray(records).tobytes())
@@ -87,12 +80,7 @@ def _header(fields: np.dtype[np.void], count: int) -> bytes:
 
 
 def join_points(parts: Sequence[Path], target: Path) -> None:
-    """Write the points of several files into one, without holding them all.
-
-    Args:
-        parts: files with the same fields, at least one.
-        target: PLY file.
-    """
+    """Write the points of several files into one, without holding them all."""
     records = [open_points(path) for path in parts]
     with target.open("wb") as file:
         file.write(_header(records[0].dtype, sum(map(len, records))))
@@ -111,7 +99,6 @@ def poisson_surface(folder: Path, depth: int) -> Surface:
     It has no colors of its own: all vertices have the same.
 
     Args:
-        folder: folder with the fused points.
         depth: depth of the octree, raised to the smallest one; the finest cell is the largest extent of the points
             over 2^depth.
     """
@@ -138,7 +125,6 @@ def simplify(surface: Surface, most: int, max_error: float, scratch: Path, threa
         most: triangles that may be left, >= 1.
         max_error: edges go on being collapsed up to this root of the summed squared distances of a vertex from the
             planes it replaces; 0: no more than `most` asks for.
-        scratch: folder for two temporary files.
         threads: number of threads; the surface is the same for any.
     """
     given, found = scratch / "fine.ply", scratch / "coarse.ply"

@@ -56,12 +56,7 @@ class WideLens:
 
 
 def split_wide_photos(model_dir: Path, max_side_px: int) -> dict[int, WideLens] | None:
-    """Return the perspective views of every camera, by its id; None where no camera needs more than COLMAP's one.
-
-    Args:
-        model_dir: COLMAP model.
-        max_side_px: longest side of a view.
-    """
+    """Return the perspective views of every camera, by its id; None where no camera needs more than COLMAP's one."""
     with translate_errors("reading the model"):
         model = pycolmap.Reconstruction(model_dir)
         if all(view is not None for view in _single_views(model, max_side_px).values()):
@@ -70,12 +65,7 @@ def split_wide_photos(model_dir: Path, max_side_px: int) -> dict[int, WideLens] 
 
 
 def perspective_lenses(model: pycolmap.Reconstruction, max_side_px: int) -> dict[int, WideLens]:
-    """Return the perspective views of every camera that has posed photos, one where that is enough, by its id.
-
-    Args:
-        model: COLMAP's reconstruction.
-        max_side_px: longest side of a view.
-    """
+    """Return the perspective views of every camera that has posed photos, one where that is enough, by its id."""
     single = _single_views(model, max_side_px)
     return {key: _make_lens(model.cameras[key], view, max_side_px) for key, view in single.items()}
 
@@ -90,7 +80,6 @@ def view_name(photo: str, number: int) -> str:
     """Return the name of a view in the dense workspace.
 
     Args:
-        photo: name of the photo.
         number: of the view in `WideLens.views`.
     """
     return f"{photo}.{number + 1}.jpg"
@@ -103,13 +92,7 @@ def parse_view_name(name: str) -> tuple[str, int]:
 
 
 def write_model(model_dir: Path, lenses: Mapping[int, WideLens], dense_dir: Path) -> list[tuple[str, int]]:
-    """Write the model of all views into a dense workspace, and return the name and the camera's id of each photo.
-
-    Args:
-        model_dir: COLMAP model of the photos.
-        lenses: from `split_wide_photos`.
-        dense_dir: dense workspace.
-    """
+    """Write the model of all views into a dense workspace, and return the name and the camera's id of each photo."""
     with translate_errors("writing the model of perspective views"):
         model, found = pycolmap.Reconstruction(model_dir), pycolmap.Reconstruction()
         images = sorted((image for image in all_images(model) if image.has_pose), key=lambda image: image.name)
@@ -129,13 +112,6 @@ def write_model(model_dir: Path, lenses: Mapping[int, WideLens], dense_dir: Path
 def write_views(name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | None, dense_dir: Path) -> None:
     """Write the views of a photo, and their masks where they have pixels that it does not show or that are masked.
 
-    Args:
-        name: of the photo.
-        lens: of the photo.
-        photo_dir: the photos.
-        mask_dir: their masks; None without masks.
-        dense_dir: dense workspace.
-
     Raises:
         BackendError: the photo cannot be read, or the views cannot be written.
     """
@@ -152,10 +128,6 @@ def render_views(
     """Yield each view of a photo, (H, W, 3) BGR, and (H, W) which of its pixels the photo shows and nothing masks.
 
     Args:
-        name: of the photo.
-        lens: of the photo.
-        photo_dir: the photos.
-        mask_dir: their masks; None without masks.
         maps: (H, W, 2) pixels of the photo that each view shows, -1 where it shows none; empty if not known.
     """
     photo = np.asarray(cv2.imdecode(np.fromfile(photo_dir / name, np.uint8), cv2.IMREAD_COLOR), np.uint8)
@@ -174,7 +146,6 @@ def save_picture(target: Path, pixels: NDArray[np.uint8]) -> None:
     """Write a picture as JPEG, as a whole or not at all.
 
     Args:
-        target: file; its folder is created.
         pixels: (H, W, 3) BGR.
     """
     with replace_atomically(target) as path:
@@ -220,12 +191,7 @@ def _shown_rays(camera: pycolmap.Camera) -> FloatArray:
 
 
 def add_view_cameras(found: pycolmap.Reconstruction, lenses: Mapping[int, WideLens]) -> dict[tuple[int, int], int]:
-    """Add a camera for every view, and return its id by the camera of the photo and the number of the view.
-
-    Args:
-        found: model of the views, changed in place.
-        lenses: views by id of the camera.
-    """
+    """Add a camera for every view, and return its id by the camera of the photo and the number of the view."""
     ids = dict[tuple[int, int], int]()
     for camera_id, lens in sorted(lenses.items()):
         for number, view in enumerate(lens.views):

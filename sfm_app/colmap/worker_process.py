@@ -157,12 +157,7 @@ class WorkerProcess:
 
 @contextlib.contextmanager
 def start_worker(module: str, task: Mapping[str, object]) -> Iterator[WorkerProcess]:
-    """Start a worker process on a task, and provide it; it is killed at the end of the block if it still runs.
-
-    Args:
-        module: module that calls `serve`.
-        task: task of the process; valid JSON.
-    """
+    """Start a worker process on a task, and provide it; it is killed at the end of the block if it still runs."""
     command = [sys.executable, "-P", "-m", module]  # -P: nothing is imported from the current folder
     loud = log_level()
     # the output goes to a file: nothing reads a pipe while the process runs, and a full pipe would block it forever
@@ -189,9 +184,6 @@ class ProcessGroup:
 
     def run(self, module: str, task: Mapping[str, object], doing: str, progress: Progress) -> dict[str, Json]:
         """Run a worker process to its end or that of the group, as `run_worker` does.
-
-        Args:
-            module, task, doing, progress: as in `run_worker`.
 
         Raises:
             BackendError: COLMAP failed, or the group has ended.
@@ -223,10 +215,7 @@ def run_worker(
     """Run a worker process to its end, and return what it has reported.
 
     Args:
-        module: module that calls `serve`.
-        task: task of the process; valid JSON.
         doing: description of the work, for error messages.
-        progress: shows the progress of the process.
 
     Raises:
         BackendError: COLMAP failed.
@@ -262,12 +251,7 @@ class ProgressReporter(SilentProgress):
     """Progress that is sent to the parent process; only the parent has stages."""
 
     def start(self, label: str, total: int) -> None:
-        """Send the start of work to the parent.
-
-        Args:
-            label: text beside the bar.
-            total: number of steps.
-        """
+        """Send the start of work to the parent."""
         report(start=label, total=total)
 
     def advance(self, steps: int = 1) -> None:
@@ -280,12 +264,7 @@ class ProgressReporter(SilentProgress):
 
 
 def relay(process: WorkerProcess, progress: Progress) -> dict[str, Json]:
-    """Show the progress of a process until it ends, and return its other messages.
-
-    Args:
-        process: the worker process.
-        progress: shows its progress.
-    """
+    """Show the progress of a process until it ends, and return its other messages."""
     found: dict[str, Json] = {}
     try:
         for message in process.messages():

@@ -34,12 +34,6 @@ def make(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: Run
 
     Where an earlier run has a model of most photos, the new ones are placed in that.
 
-    Args:
-        matches: keypoints and raw matches.
-        views: fundamental matrices.
-        intrinsics: cameras from pairs.
-        run: the run.
-
     Raises:
         ReconstructionError: no pair of photos grows into a model; the message says why.
     """
@@ -207,12 +201,7 @@ def _lens_choices(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, J
 
 
 def write_models(models: list[Reconstruction], run: RunContext) -> None:
-    """Write the main model to OUT/sparse and the others to OUT/other_models/1, 2, ..., each as a whole.
-
-    Args:
-        models: the main one first; at least one.
-        run: the run.
-    """
+    """Write the main model to OUT/sparse and the others to OUT/other_models/1, 2, ..., each as a whole."""
     place = run.workspace
     shutil.rmtree(place.other_models, ignore_errors=True)
     for number, model in enumerate(models[1:], start=1):
@@ -221,12 +210,7 @@ def write_models(models: list[Reconstruction], run: RunContext) -> None:
 
 
 def write_model(model: Reconstruction, target: Path) -> None:
-    """Write a model into a folder beside the target, then replace the target with it.
-
-    Args:
-        model: COLMAP's reconstruction.
-        target: folder, replaced if it exists.
-    """
+    """Write a model into a folder beside the target, then replace the target with it."""
     beside = target.with_name(f".{target.name}")
     shutil.rmtree(beside, ignore_errors=True)
     beside.mkdir(parents=True)
@@ -238,12 +222,7 @@ def write_model(model: Reconstruction, target: Path) -> None:
 
 
 def refined_cameras(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, RefinedCamera]:
-    """Return deviations, determined parameters and correlations of the refined cameras, by name of the camera.
-
-    Args:
-        adjusted: the model with the deviations of its cameras.
-        names: camera of each photo, by photo name.
-    """
+    """Return deviations, determined parameters and correlations of the refined cameras, by name of the camera."""
     cameras = {names[image.name]: image.camera_id for image in posed_images(adjusted.model)}
     return {
         name: {
@@ -256,12 +235,7 @@ def refined_cameras(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str,
 
 
 def write_scene(scene: Scene, run: RunContext) -> None:
-    """Write scene.json: what COLMAP's model does not hold.
-
-    Args:
-        scene: the scene.
-        run: the run.
-    """
+    """Write scene.json: what COLMAP's model does not hold."""
     known = {
         "cameras": {name: camera.to_dict() for name, camera in scene.cameras.items()},
         "camera_of": dict(scene.camera_of),

@@ -23,10 +23,6 @@ def make(matches: MatchGraph, run: RunContext) -> ViewGraph:
 
     Of photos that an earlier run has seen, its fits and lenses stay.
 
-    Args:
-        matches: keypoints and raw matches.
-        run: the run.
-
     Raises:
         ReconstructionError: no pair has a usable epipolar geometry.
     """
