@@ -11,7 +11,7 @@ from sfm_app.colmap.dense import map_file, read_views
 from sfm_app.colmap.surface import FUSED, open_points, positions
 from sfm_app.errors import ReconstructionError
 from sfm_app.files import digest_files, is_made_from, load_arrays, replace_atomically
-from sfm_app.meshing import drop_islands, make_manifold, trim
+from sfm_app.meshing.cleaning import drop_islands, make_manifold, trim
 from sfm_app.meshing.octree import CELLS, cell_sizes, choose_cell, cube_around
 from sfm_app.meshing.refinement import STEPS
 from sfm_app.progress import track

@@ -18,20 +18,10 @@ from sfm_app.colmap.surface import FUSED, poisson_surface, positions, simplify, 
 from sfm_app.errors import ReconstructionError
 from sfm_app.files import fingerprint, load_arrays, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.geometry.triangles import Clusters, border_angle, cluster, median_edge_length, select_faces, vertex_normals
-from sfm_app.meshing import (
-    CONFIRMED,
-    NO_EVIDENCE,
-    DepthView,
-    Paint,
-    Support,
-    drop_islands,
-    judge,
-    make_manifold,
-    sample_colors,
-    trim,
-)
 from sfm_app.meshing.blocks import Partition, Split, close_cracks, split_points, weld
+from sfm_app.meshing.cleaning import Support, drop_islands, make_manifold, trim
 from sfm_app.meshing.octree import CELLS, Cube, cell_sizes, choose_cell, count_bent, count_cells, cube_around
+from sfm_app.meshing.visibility import CONFIRMED, NO_EVIDENCE, DepthView, Paint, judge, sample_colors
 from sfm_app.operating_system import move
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_count, block_workers

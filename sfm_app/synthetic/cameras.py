@@ -215,17 +215,21 @@ class ArcOptions:
     """Largest roll either way, in degrees, [0, 180]."""
 
     def __post_init__(self) -> None:
-        checks = {
-            "photos": self.photos >= 2,
-            "sweep_deg": 0 < self.sweep_deg <= 360,
-            "distance": 0 < self.distance[0] <= self.distance[1] < math.inf,
-            "height": self.height[0] <= self.height[1],
-            "aim_spread": 0 <= self.aim_spread < math.inf,
-            "roll_deg": 0 <= self.roll_deg <= 180,
-        }
-        wrong = [name for name, holds in checks.items() if not holds]
-        if wrong:
-            raise ConfigError(f"synthetic cameras: out of range: {', '.join(wrong)}")
+        check_ranges(
+            "synthetic cameras",
+            photos=self.photos >= 2,
+            sweep_deg=0 < self.sweep_deg <= 360,
+            distance=0 < self.distance[0] <= self.distance[1] < math.inf,
+            height=self.height[0] <= self.height[1],
+            aim_spread=0 <= self.aim_spread < math.inf,
+            roll_deg=0 <= self.roll_deg <= 180,
+        )
+
+
+def check_ranges(subject: str, **valid: bool) -> None:
+    """Raise a ConfigError that names all values out of range."""
+    if wrong := [name for name, holds in valid.items() if not holds]:
+        raise ConfigError(f"{subject}: out of range: {', '.join(wrong)}")
 
 
 def make_camera(

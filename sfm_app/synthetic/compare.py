@@ -6,6 +6,7 @@ from functools import lru_cache
 import numpy as np
 
 from sfm_app.geometry.poses import Similarity, robust_similarity
+from sfm_app.geometry.triangles import areas
 from sfm_app.meshing.ray_casting import load_open3d
 from sfm_app.synthetic.cameras import Camera, camera_center, pixel_rays
 from sfm_app.synthetic.photo_folder import Truth
@@ -77,7 +78,7 @@ def surface_coverage(
     Arguments and errors are those of `surface_error`.
     """
     aligned = align_centers(centers, truth)(vertices)
-    if not _triangle_areas(aligned, faces).sum() > 0:
+    if not areas(aligned, faces).sum() > 0:
         raise ValueError("the surface has no area")
     return float(np.mean(surface_distances(seen_points(truth), aligned, faces) <= tolerance * scene_size(truth)))
 
@@ -129,7 +130,7 @@ def sample_triangles(
     vertices: FloatArray, faces: IndexArray, count: int, seed: int = 0
 ) -> tuple[FloatArray, IndexArray]:
     """Sample a surface as `sample_surface` does, with the triangle (count,) of each point."""
-    area = _triangle_areas(vertices, faces)
+    area = areas(vertices, faces)
     if not area.sum() > 0:
         raise ValueError("the surface has no area")
     rng = np.random.default_rng(seed)
@@ -160,10 +161,3 @@ def _coarse_camera(camera: Camera) -> Camera:
     shrink = 96 / max(camera.width, camera.height)
     K = np.diag([shrink, shrink, 1.0]) @ camera.K
     return Camera(K, round(camera.width * shrink), round(camera.height * shrink), camera.lens)
-
-
-def _triangle_areas(vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    corners = vertices[faces]
-    return np.asarray(
-        0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sfm_app.camera.models import camera_matrix
 from sfm_app.errors import ConfigError
 from sfm_app.geometry.epipolar import fundamental_from_pose
-from sfm_app.synthetic.cameras import axis_rotation
+from sfm_app.synthetic.cameras import axis_rotation, check_ranges
 from sfm_app.types.arrays import FloatArray
 
 Poses = tuple[FloatArray, FloatArray]
@@ -47,7 +47,8 @@ class PairOptions:
     """Largest distance between the cameras, as a share of the distance to the middle of the scene, (0, 3]."""
 
     def __post_init__(self) -> None:
-        _require(
+        check_ranges(
+            "synthetic correspondences",
             points=self.points >= 8,
             outliers=0 <= self.outliers < 1,
             sigma_px=0 <= self.sigma_px < math.inf,
@@ -95,7 +96,8 @@ class TrackOptions:
     """Largest shift of a camera away from the common start, as a share of the distance to the scene, (0, 2]."""
 
     def __post_init__(self) -> None:
-        _require(
+        check_ranges(
+            "synthetic correspondences",
             cameras=self.cameras >= 2,
             points=self.points >= 8,
             sigma_px=0 <= self.sigma_px < math.inf,
@@ -229,7 +231,10 @@ def pair_matches(
         ConfigError: a share is out of range or a pair is not in the tracks.
     """
     shares = outliers or {}
-    _require(outliers=set(shares) <= set(tracks.pairs) and all(0 <= share < 1 for share in shares.values()))
+    check_ranges(
+        "synthetic correspondences",
+        outliers=set(shares) <= set(tracks.pairs) and all(0 <= share < 1 for share in shares.values()),
+    )
     for i, j in tracks.pairs:
         rng = np.random.default_rng([seed, 554, i, j])
         x2, _ = _with_outliers(tracks.x[j], shares.get((i, j), 0.0), outlier_range_px, rng)
@@ -333,9 +338,3 @@ def _project(Ks: FloatArray, poses: Poses, X: FloatArray) -> FloatArray:
 def _random_direction(rng: np.random.Generator) -> FloatArray:
     v = rng.normal(size=3)
     return np.asarray(v / np.linalg.norm(v))
-
-
-def _require(**checks: bool) -> None:
-    wrong = [name for name, holds in checks.items() if not holds]
-    if wrong:
-        raise ConfigError(f"synthetic correspondences: out of range: {', '.join(wrong)}")

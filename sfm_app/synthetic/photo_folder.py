@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sfm_app.errors import ConfigError, InputError
+from sfm_app.errors import InputError
 from sfm_app.files import replace_atomically
 from sfm_app.progress import Progress, SilentProgress, track
-from sfm_app.synthetic.cameras import Camera, Lens, Views, camera_center
+from sfm_app.synthetic.cameras import Camera, Lens, Views, camera_center, check_ranges
 from sfm_app.synthetic.render import GAMMA, PreparedScene, prepare, render_scene
 from sfm_app.synthetic.shapes import SyntheticScene
 from sfm_app.types.arrays import FloatArray
@@ -46,17 +46,15 @@ class PhotoOptions:
     """Same seed, same noise."""
 
     def __post_init__(self) -> None:
-        checks = {
-            "supersampling": 1 <= self.supersampling <= 8,
-            "blur_px": 0 <= self.blur_px <= 100,
-            "noise": 0 <= self.noise <= 100,
-            "quality": 1 <= self.quality <= 95,
-            "exposure_ev": 0 <= self.exposure_ev <= 3,
-            "seed": self.seed >= 0,
-        }
-        wrong = [name for name, holds in checks.items() if not holds]
-        if wrong:
-            raise ConfigError(f"synthetic photos: out of range: {', '.join(wrong)}")
+        check_ranges(
+            "synthetic photos",
+            supersampling=1 <= self.supersampling <= 8,
+            blur_px=0 <= self.blur_px <= 100,
+            noise=0 <= self.noise <= 100,
+            quality=1 <= self.quality <= 95,
+            exposure_ev=0 <= self.exposure_ev <= 3,
+            seed=self.seed >= 0,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

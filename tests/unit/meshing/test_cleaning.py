@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfm_app.geometry.triangles import areas, select_faces, unique_edges
-from sfm_app.meshing import (
+from sfm_app.meshing.cleaning import (
     Support,
     bridge_gaps,
     cut,
