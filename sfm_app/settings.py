@@ -44,7 +44,7 @@ class PhotoSettings(Section):
 
     images: str = Field("", description="text file that names the photos to use, one per line; all where empty")
     masks: str = Field(
-        "", description="folder of masks: what is black in sub/a.jpg.png is left out of sub/a.jpg; none where empty"
+        "", description="folder of masks: black areas of sub/a.jpg.png are left out of sub/a.jpg; none where empty"
     )
     cameras: Literal["auto", "single", "folder", "each"] = Field(
         "auto",
@@ -131,12 +131,12 @@ class SceneSettings(Section):
 
     mapper: Literal["auto", "incremental", "global"] = Field(
         "auto",
-        description="incremental: photo after photo from a seed; global: all at once; auto: the one that explains more",
+        description="incremental: photo after photo from a seed; global: all at once; auto: the better of both",
     )
     camera_model: CameraModelName = Field(
         "auto",
         description="COLMAP's camera model that the last adjustment ends with, such as OPENCV or OPENCV_FISHEYE; auto: "
-        "the one that the photos support best",
+        "the model with the best support of the photos",
     )
     max_init_pairs: int = Field(5, ge=1, le=100, description="most seed pairs that are tried")
     min_seed_angle_deg: float = Field(
@@ -341,7 +341,7 @@ class Settings(Section):
     workers: int = Field(0, ge=0, le=1024, description="parallel workers; 0: one per core")
     quality: Quality = Field("normal", description="preset for image sizes and mesh resolution")
     max_memory_gb: float = Field(
-        0.0, ge=0, le=4096, description="most memory that is used, in GB; 0: four fifths of what the machine has"
+        0.0, ge=0, le=4096, description="memory limit in GB; 0: four fifths of the memory of the machine"
     )
     plugins: bool = Field(True, description="load installed plug-ins; false: only the program's own methods")
     report: bool = Field(True, description="write OUT/report.html at the end of every run; false: do not")

@@ -350,8 +350,8 @@ def _weigh(image: Gray, views: Gray, sums: FloatArray, g: Gray, h: Gray) -> tupl
                 continue
             off = (image[i, j, 0] - mean) - gain * (views[i, j, 0] - other)
             slope = gain * (views[i, j, 1] - s * one)
-            far = off / (OUTLIER * NOISE_GRAY)
-            weight = related / ((1.0 + far * far) * (2.0 * noise))
+            deviations = off / (OUTLIER * NOISE_GRAY)
+            weight = related / ((1.0 + deviations * deviations) * (2.0 * noise))
             g[i, j] += weight * slope * off
             h[i, j] += weight * slope * slope
     return total, count

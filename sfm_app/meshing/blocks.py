@@ -83,12 +83,12 @@ def split_points(points: FloatArray, blocks: int) -> Partition:
             boxes.append(box)
             return len(boxes) - 1
         axis = int(np.argmax(np.percentile(inside, 99, axis=0) - np.percentile(inside, 1, axis=0)))
-        left = count // 2
-        at = float(np.quantile(inside[:, axis], left / count))
+        half = count // 2
+        at = float(np.quantile(inside[:, axis], half / count))
         below, above = box.copy(), box.copy()
         below[1, axis] = above[0, axis] = at
         low = inside[:, axis] < at
-        return Split(axis, at, grow(inside[low], below, left), grow(inside[~low], above, count - left))
+        return Split(axis, at, grow(inside[low], below, half), grow(inside[~low], above, count - half))
 
     whole = np.stack([np.full(3, -np.inf), np.full(3, np.inf)])
     root = grow(sample, whole, blocks)
@@ -137,7 +137,7 @@ def weld(below: Surface, above: Surface, axis: int, at: float, cell: float, halo
         axis: 0, 1 or 2, the normal of the plane.
         at: coordinate of the plane.
         cell: side of the finest cells of both.
-        halo: distance up to which the second surface gives way.
+        halo: distance up to which the second surface is deformed.
     """
     first, one = cut_at_plane(below, axis, at, keep_below=True)
     second, other = cut_at_plane(above, axis, at, keep_below=False)
@@ -279,9 +279,9 @@ def _split_first(
     same = np.arange(len(vertices))
     used, movable = set[int](), set(moving.tolist())
     ends = one.ends[edge]
-    far = np.linalg.norm(vertices[ends] - vertices[moving][:, None], axis=2)
-    for k in np.flatnonzero(far.min(axis=1) <= tolerance):
-        nearest = int(ends[k, np.argmin(far[k])])
+    distance = np.linalg.norm(vertices[ends] - vertices[moving][:, None], axis=2)
+    for k in np.flatnonzero(distance.min(axis=1) <= tolerance):
+        nearest = int(ends[k, np.argmin(distance[k])])
         if nearest not in used:
             used.add(nearest)
             same[moving[k]] = nearest

@@ -79,13 +79,13 @@ class NearestNormals:
         """
         if self._scene is None or not len(points):
             return np.zeros_like(points)
-        found = self._scene.compute_closest_points(self._tensor(np.ascontiguousarray(points)), nthreads=1)
-        second = found["primitive_uvs"].numpy()
+        closest = self._scene.compute_closest_points(self._tensor(np.ascontiguousarray(points)), nthreads=1)
+        second = closest["primitive_uvs"].numpy()
         shares = np.concatenate([1.0 - second.sum(axis=1, keepdims=True), second], axis=1)
-        corners = self._normals[self._faces[found["primitive_ids"].numpy().astype(np.int64)]]
+        corners = self._normals[self._faces[closest["primitive_ids"].numpy().astype(np.int64)]]
         normals = (shares[:, :, None] * corners).sum(axis=1)
         length = np.linalg.norm(normals, axis=1)
-        good = np.linalg.norm(found["points"].numpy() - points, axis=1) <= self._reach
+        good = np.linalg.norm(closest["points"].numpy() - points, axis=1) <= self._reach
         good &= ((normals * facing).sum(axis=1) > 0) & (length > 0)
         return np.where(good[:, None], normals / np.where(good, length, 1.0)[:, None], 0).astype(np.float32)
 
@@ -111,5 +111,5 @@ class Occluders:
         length = np.linalg.norm(ray, axis=1, keepdims=True)
         start = points + ray * np.minimum(slack / np.maximum(length, 1e-300), 1.0)
         rays = np.concatenate([start, center - start], axis=1).astype(np.float32)
-        found = self._scene.test_occlusions(self._tensor(rays), 0.0, 1.0, nthreads=1)
-        return np.asarray(found.numpy(), np.bool_)
+        hidden = self._scene.test_occlusions(self._tensor(rays), 0.0, 1.0, nthreads=1)
+        return np.asarray(hidden.numpy(), np.bool_)

@@ -82,17 +82,17 @@ class Sights:
 
     def __init__(self, look: Callable[[int], Sight], most_px: int = MOST_KEPT_PX) -> None:
         self._look, self._most_px, self._lock = look, most_px, Lock()
-        self._kept = OrderedDict[int, Future[Sight]]()
+        self._sights = OrderedDict[int, Future[Sight]]()
 
     def __getitem__(self, number: int) -> Sight:
         with self._lock:
-            known = self._kept.get(number)
-            if known is None:
-                self._kept[number] = mine = Future[Sight]()
+            cached = self._sights.get(number)
+            if cached is None:
+                self._sights[number] = mine = Future[Sight]()
             else:
-                self._kept.move_to_end(number)
-        if known is not None:
-            return known.result()
+                self._sights.move_to_end(number)
+        if cached is not None:
+            return cached.result()
         try:
             mine.set_result(self._look(number))
         except BaseException as error:
@@ -103,13 +103,13 @@ class Sights:
 
     def _drop_oldest(self) -> None:
         with self._lock:
-            done = [(key, one.result()) for key, one in self._kept.items() if one.done() and not one.exception()]
+            done = [(key, one.result()) for key, one in self._sights.items() if one.done() and not one.exception()]
             pixels = sum(sight.raster.depth.size for _, sight in done)
             for key, sight in done[:-1]:
                 if pixels <= self._most_px:
                     break
                 pixels -= sight.raster.depth.size
-                del self._kept[key]
+                del self._sights[key]
 
 
 Spread = Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]]

@@ -54,7 +54,7 @@ class BlockOptions:
     least_confirmed: int = 200
     """Vertices of a block that a photo has to confirm to take part in the refinement. Chosen by hand."""
     weld_halo: float = 8.0
-    """Cells over which a block gives way to its neighbor. Chosen by hand."""
+    """Cells from a plane over which a block is deformed to fit its neighbor. Chosen by hand."""
     crack: float = 2.0
     """Cells from a plane within which small holes are cracks of the weld. Chosen by hand."""
 
