@@ -1,16 +1,17 @@
-"""The loop apart from its parts: trial counts, stopping rules, what is handed to whom."""
+"""Trial counts, stopping rules, and the best model."""
 
+import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
-import sfm_app.fundamental.loop as loop
-from sfm_app.fundamental.loop import Recipe, SamplingPlan, draw_until_better, search
+from sfm_app.fundamental.loop import GUIDED, UNGUIDED, BestModel, Recipe, SamplingPlan, draw_until_better, run_loop
 from sfm_app.fundamental.points import prepare
 from sfm_app.fundamental.pretests import NO_PRETEST, FullVerification, RandomizedTdd
 from sfm_app.fundamental.samples import random_state
-from sfm_app.fundamental.scores import mlesac, msac, squared_distances
+from sfm_app.fundamental.scores import geman_mcclure, mlesac, msac, penalty, ransac, squared_distances
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
@@ -34,31 +35,31 @@ def options(**values):
 
 @pytest.mark.parametrize("trials", [1, 2, 17])
 def test_no_more_samples_than_allowed(trials):
-    found = search(scene(outliers=0.8), options(max_trials=trials), 0, PLAIN)
+    found = run_loop(scene(outliers=0.8), options(max_trials=trials), 0, PLAIN)
     assert found is None or found.trials <= trials
     assert trials < 17 or found.trials == trials
 
 
 def test_clean_matches_need_few_samples():
     pair = make_pair(PairOptions(points=300, sigma_px=0.01), 1)
-    assert search(prepare(pair.x1, pair.x2, 0), options(), 0, PLAIN).trials < 10
+    assert run_loop(prepare(pair.x1, pair.x2, 0), options(), 0, PLAIN).trials < 10
 
 
 def test_half_outliers_need_what_the_formula_says():
     # 3.19 with a share of 0.5 and confidence 0.9999 asks for 1174 samples; a model of 7 noisy points sees fewer inliers
-    trials = [search(scene(0.5, seed), options(), seed, PLAIN).trials for seed in range(5)]
+    trials = [run_loop(scene(0.5, seed), options(), seed, PLAIN).trials for seed in range(5)]
     assert 400 < np.median(trials) < 20000
 
 
 def test_fewer_matches_than_a_sample():
-    assert search(scene(points=8), options(), 0, PLAIN) is not None
+    assert run_loop(scene(points=8), options(), 0, PLAIN) is not None
     m = scene(points=8)
-    assert search(replace(m, points=m.points[:6]), options(), 0, PLAIN) is None
+    assert run_loop(replace(m, points=m.points[:6]), options(), 0, PLAIN) is None
 
 
 def test_same_seed_same_bits_and_another_seed_other_samples():
     m = scene(0.4)
-    first, again, other = (search(m, options(max_trials=50), seed, PLAIN) for seed in (1, 1, 2))
+    first, again, other = (run_loop(m, options(max_trials=50), seed, PLAIN) for seed in (1, 1, 2))
     assert first.F.tobytes() == again.F.tobytes()
     assert first.F.tobytes() != other.F.tobytes()
 
@@ -67,13 +68,13 @@ def test_converged_priors_end_the_search():
     flat = replace(PLAIN, validity=always(np.ones(300)), stop_on_convergence=True)
     patient = replace(flat, stop_on_convergence=False)
     m = scene(0.5)
-    assert search(m, options(), 0, flat).trials < search(m, options(), 0, patient).trials
+    assert run_loop(m, options(), 0, flat).trials < run_loop(m, options(), 0, patient).trials
 
 
 def test_patience_ends_the_search():
     m = scene(0.6)
-    limited = search(m, options(), 0, replace(PLAIN, patience=always(5), least_trials=5)).trials
-    assert limited < search(m, options(), 0, PLAIN).trials
+    limited = run_loop(m, options(), 0, replace(PLAIN, patience=always(5), least_trials=5)).trials
+    assert limited < run_loop(m, options(), 0, PLAIN).trials
 
 
 def test_priors_guide_the_samples():
@@ -83,7 +84,7 @@ def test_priors_guide_the_samples():
     good[m.rows] = pair.is_inlier
     told = replace(PLAIN, validity=always(good))
 
-    guided, blind = (search(m, options(max_trials=150), 0, recipe) for recipe in (told, PLAIN))
+    guided, blind = (run_loop(m, options(max_trials=150), 0, recipe) for recipe in (told, PLAIN))
 
     def support(found):
         return np.count_nonzero(squared_distances(m.points, found.F.reshape(9)) < (3 / m.unit_px) ** 2)
@@ -93,12 +94,12 @@ def test_priors_guide_the_samples():
 
 def test_local_optimization_is_kept_only_if_better():
     m = scene(0.3)
-    truth = search(m, options(), 5, PLAIN)
+    truth = run_loop(m, options(), 5, PLAIN)
     told = replace(PLAIN, improve=always(truth.F))
     misled = replace(PLAIN, improve=always(np.eye(3)))
 
-    assert search(m, options(), 0, told).trials <= search(m, options(), 0, PLAIN).trials
-    assert search(m, options(), 0, misled).F.tobytes() == search(m, options(), 0, PLAIN).F.tobytes()
+    assert run_loop(m, options(), 0, told).trials <= run_loop(m, options(), 0, PLAIN).trials
+    assert run_loop(m, options(), 0, misled).F.tobytes() == run_loop(m, options(), 0, PLAIN).F.tobytes()
 
 
 def draw(points, draws, to_beat, best, limit=25, pretests=(NO_PRETEST, NO_PRETEST), seed=0):
@@ -173,16 +174,15 @@ class Script:
 
 
 @pytest.fixture
-def scripted(monkeypatch):
+def scripted():
     """Run a recipe on a scene whose true model the script hands out."""
     pair = make_pair(PairOptions(points=300, outliers=0.5, sigma_px=0.1), 0)
     m = prepare(pair.x1, pair.x2, 0)
-    truth = search(m, options(), 0, PLAIN).F.reshape(9)
+    truth = run_loop(m, options(), 0, PLAIN).F.reshape(9)
 
     def run(recipe, *better, model=truth, **values):
         script = Script(model, *better)
-        monkeypatch.setattr(loop, "draw_until_better", script)
-        return search(m, options(**values), 0, recipe), script.calls
+        return run_loop(m, options(**values), 0, recipe, script), script.calls
 
     return run
 
@@ -274,9 +274,8 @@ def test_only_kinds_of_samples_that_improved_are_asked(monkeypatch, improved, as
         best.to_beat[:] = 0.5  # as a new best model does: the bar of the other kind falls too
         return True
 
-    monkeypatch.setattr(loop, "draw_until_better", script)
-    monkeypatch.setattr(loop.BestModel, "update", update)
-    search(m, options(max_trials=120), 0, replace(PLAIN, least_trials=50, patience=always(200)))
+    monkeypatch.setattr(BestModel, "update", update)
+    run_loop(m, options(max_trials=120), 0, replace(PLAIN, least_trials=50, patience=always(200)), script)
     assert seen == asked
 
 
@@ -327,7 +326,7 @@ def test_an_outlier_in_front_does_not_spoil_a_randomized_test():
     inlier[m.rows] = pair.is_inlier
     spoilt = replace(m, points=np.asfortranarray(m.points[np.argsort(inlier)]))  # all outliers come first
 
-    found = search(spoilt, options(), 0, replace(PLAIN, verifier=RandomizedTdd))
+    found = run_loop(spoilt, options(), 0, replace(PLAIN, verifier=RandomizedTdd))
 
     near = squared_distances(spoilt.points, found.F.reshape(9)) < (3 / m.unit_px) ** 2
     assert near[np.sort(inlier)].mean() > 0.9
@@ -335,8 +334,137 @@ def test_an_outlier_in_front_does_not_spoil_a_randomized_test():
 
 def test_samples_of_eight_find_the_truth_too():
     m = scene(0.3)
-    seven, eight = (search(m, options(), 0, replace(PLAIN, sample_size=n)) for n in (7, 8))
+    seven, eight = (run_loop(m, options(), 0, replace(PLAIN, sample_size=n)) for n in (7, 8))
     near = [np.mean(squared_distances(m.points, h.F.reshape(9)) < (3 / m.unit_px) ** 2) for h in (seven, eight)]
     assert min(near) > 0.5
     assert eight.trials > seven.trials
-    assert search(replace(m, points=m.points[:7].copy()), options(), 0, replace(PLAIN, sample_size=8)) is None
+    assert run_loop(replace(m, points=m.points[:7].copy()), options(), 0, replace(PLAIN, sample_size=8)) is None
+
+
+PAIR = make_pair(PairOptions(points=300, outliers=0.3, sigma_px=0.5), 1)
+MATCHES = prepare(PAIR.x1, PAIR.x2, 0)
+POINTS, THRESHOLD = MATCHES.points, 2.0 / MATCHES.unit_px
+
+
+def in_frame(F):
+    to1, to2 = (
+        np.array([[MATCHES.unit_px, 0, x], [0, MATCHES.unit_px, y], [0, 0, 1]])
+        for x, y in (MATCHES.center[:2], MATCHES.center[2:])
+    )
+    F = to2.T @ F @ to1
+    return F / np.linalg.norm(F)
+
+
+GOOD = in_frame(PAIR.F)
+ROUGH = GOOD + 0.01 * np.random.default_rng(0).normal(size=(3, 3))
+ROUGH /= np.linalg.norm(ROUGH)
+BAD = np.diag([1.0, -1.0, 0.0]) / math.sqrt(2)
+
+ONE = Recipe(score=msac, finish=lambda _points, F, _threshold: F)
+TWO = replace(ONE, score=partial(geman_mcclure, scale=0.5), fine_score=partial(geman_mcclure, scale=0.1))
+
+
+def score_of(F, score):
+    return penalty(POINTS, 0, F.reshape(9), score(POINTS, THRESHOLD, None), math.inf, NO_PRETEST)
+
+
+def best_of(recipe):
+    return BestModel(POINTS, THRESHOLD, recipe)
+
+
+def meet(best, F, score, kind=GUIDED):
+    """What the loop does once a sample of that kind has given a better model."""
+    best.samples[kind], best.to_beat[kind] = F.reshape(9), score_of(F, score)
+    return best.update(kind)
+
+
+def test_there_is_none_at_first():
+    best = best_of(ONE)
+    assert not best
+    assert best.to_beat.tolist() == [math.inf, math.inf]
+
+
+def test_one_score_is_the_one_to_beat():
+    best = best_of(ONE)
+    assert meet(best, ROUGH, msac)
+    assert best
+    assert best.to_beat.tolist() == [score_of(ROUGH, msac)] * 2
+    np.testing.assert_array_equal(best.f, ROUGH.reshape(9))
+    assert best.inlier_share() == np.mean(squared_distances(POINTS, ROUGH.reshape(9)) <= THRESHOLD**2)
+
+    assert best.replace_if_better(7.0 * GOOD)
+    np.testing.assert_allclose(best.f, GOOD.reshape(9), atol=1e-15)
+    assert not best.replace_if_better(ROUGH)
+
+
+@pytest.mark.parametrize(("improved", "kept"), [(GOOD, GOOD), (BAD, ROUGH)])
+def test_with_one_score_an_improvement_is_kept_only_if_it_is_one(improved, kept):
+    best = best_of(replace(ONE, improve=lambda *_: 3.0 * improved))
+
+    assert meet(best, ROUGH, msac)
+
+    np.testing.assert_allclose(best.f, kept.reshape(9), atol=1e-15)
+    np.testing.assert_allclose(best.to_beat, score_of(kept, msac), rtol=1e-12)
+
+
+def test_with_two_scores_samples_compete_with_samples_and_improved_models_with_each_other():
+    answers = iter([GOOD, BAD, ROUGH])
+    best = best_of(replace(TWO, improve=lambda *_: next(answers)))
+
+    assert meet(best, BAD, TWO.score)  # a bad sample, improved to the truth
+    assert best.to_beat[0] == score_of(BAD, TWO.score) > score_of(GOOD, TWO.score)
+    np.testing.assert_allclose(best.f, GOOD.reshape(9), atol=1e-15)
+
+    assert not meet(best, ROUGH, TWO.score)  # a better sample, whose improvement is worse
+    assert best.to_beat[0] == score_of(ROUGH, TWO.score)
+    np.testing.assert_allclose(best.f, GOOD.reshape(9), atol=1e-15)
+
+    assert not best.replace_if_better(ROUGH)
+    assert best.to_beat[0] == score_of(ROUGH, TWO.score)
+
+
+def test_a_model_of_the_rest_needs_half_the_support_of_the_best_sample_once_the_rest_is_another():
+    answers = iter([BAD, ROUGH, GOOD])
+    best = best_of(replace(TWO, improve=lambda *_: next(answers)))
+    nothing = len(POINTS) * best.loss.worst
+
+    assert meet(best, ROUGH, TWO.score)
+    assert nothing - best.to_beat[1] == pytest.approx((nothing - score_of(ROUGH, TWO.score)) / 2)
+    assert meet(best, BAD, TWO.score, kind=UNGUIDED)  # its improvement wins; samples of all matches have their own bar
+    assert best.to_beat[0] == score_of(ROUGH, TWO.score)
+    np.testing.assert_allclose(best.f, ROUGH.reshape(9), atol=1e-15)
+    assert nothing - best.to_beat[1] == pytest.approx((nothing - score_of(ROUGH, TWO.score)) / 2)
+    assert meet(best, GOOD, TWO.score, kind=UNGUIDED)
+    np.testing.assert_allclose(best.f, GOOD.reshape(9), atol=1e-15)
+
+
+def test_the_finer_score_decides_between_improved_models():
+    # many matches at 0.4 thresholds, or fewer at 0: a coarse scale takes the first, a fine one the second
+    flat = np.zeros((100, 4))
+    flat[:, 0], flat[:, 2] = np.arange(100), np.arange(100) + 5.0
+    flat[60:, 3] = 0.4 * math.sqrt(2)
+    shift = np.array([0, 0, 0, 0, 0, -1, 0, 1, 0.0]) / math.sqrt(2)
+    middle = shift + np.array([0, 0, 0, 0, 0, 0, 0, 0, 0.2])
+    coarse, fine = partial(geman_mcclure, scale=1.0), partial(geman_mcclure, scale=0.05)
+    points, won = np.asfortranarray(flat), {}
+    for scores in ((coarse, fine), (fine, coarse), (fine, fine)):
+        best = BestModel(points, 1.0, replace(ONE, score=scores[0], fine_score=scores[1]))
+        best.samples[0], best.to_beat[0] = middle / np.linalg.norm(middle), 50.0
+        best.update(GUIDED)
+        won[scores] = best.replace_if_better(shift.reshape(3, 3))
+    assert won == {(coarse, fine): True, (fine, coarse): False, (fine, fine): True}
+
+
+def test_a_score_that_changes_with_the_best_model_is_taken_anew():
+    seen = []
+
+    def moody(points, threshold, best):
+        seen.append(best)
+        return (ransac if best is None else msac)(points, threshold, best)
+
+    best = best_of(replace(ONE, score=moody))
+    meet(best, ROUGH, ransac)
+    assert len(seen) == 2
+    assert seen[0] is None
+    assert best.loss == msac(POINTS, THRESHOLD, None)
+    assert best.to_beat.tolist() == [score_of(ROUGH, msac)] * 2

@@ -1,4 +1,4 @@
-"""Support that random matches would also give is no evidence, and 20 true inliers are."""
+"""Support by chance is no evidence, and 20 true inliers are."""
 
 import math
 
