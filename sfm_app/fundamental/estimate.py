@@ -131,7 +131,7 @@ def _to_frame(F: ArrayLike, unit_px: float, center: FloatArray) -> FloatArray:
 def _assess_external(
     x1: FloatArray, x2: FloatArray, matches: Matches, F: FloatArray, trials: int, options: EpipolarSettings
 ) -> EpipolarFit | Rejected:
-    """Assess an F of any scale and rank; reject it if it is not finite or its rank is below 2."""
+    """Judge an F of any scale and rank; reject it if it is not finite or its rank is below 2."""
     largest = np.abs(F).max()
     if not (np.isfinite(largest) and largest > 0) or np.linalg.matrix_rank(F / largest) < 2:
         return Rejected(NO_MODEL)

@@ -1,4 +1,4 @@
-"""From descriptors to pairs, on photos of a made-up street: each shows a stretch of a long row of things."""
+"""Vocabulary, similar photos and previews."""
 
 import numpy as np
 import pytest
@@ -100,16 +100,14 @@ def test_friends_are_counted_by_the_points_that_a_third_photo_shares_with_both()
     assert found == {(1, 3): 6}, "the points of (3, 4) are not those of (2, 3)"
 
 
-def test_friends_of_many_photos_are_counted_block_by_block(monkeypatch):
+def test_friends_of_many_photos_are_counted_block_by_block():
     rng = np.random.default_rng(0)
     pairs = {(a, b) for a, b in rng.integers(1, 30, (80, 2)).tolist() if a < b}
     matches = {pair: np.unique(rng.integers(0, 50, (20, 2)), axis=0).astype(np.uint32) for pair in sorted(pairs)}
     keypoints = dict.fromkeys(range(1, 30), 50)
     whole = count_shared_keypoints(keypoints, matches)
 
-    monkeypatch.setattr("sfm_app.retrieval.BLOCK", 4)
-
-    assert count_shared_keypoints(keypoints, matches) == whole and len(whole) > 50
+    assert count_shared_keypoints(keypoints, matches, block=4) == whole and len(whole) > 50
 
 
 def test_a_picture_is_described_whatever_its_features():
