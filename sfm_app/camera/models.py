@@ -157,7 +157,7 @@ def distortion_terms(camera: Calibration) -> NDArray[np.float64]:
 
 
 def model_of_calibration(camera: Calibration) -> tuple[str, list[float]]:
-    """Return the smallest of COLMAP's models with two focals that holds a camera with `distortion`, and its parameters."""
+    """Return the smallest of COLMAP's models with two focals that holds a camera, and its parameters."""
     values = dict(zip(TERMS[camera.projection], distortion_terms(camera).tolist(), strict=True))
     values |= {"fx": camera.K[0, 0], "fy": camera.K[1, 1], "cx": camera.K[0, 2], "cy": camera.K[1, 2]}
     fisheye = camera.projection == FISHEYE

@@ -51,10 +51,9 @@ from sfm_app.camera.projection import (
     SX,
     SY,
 )
-from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread, translate_errors
+from sfm_app.colmap.backend import all_cameras, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import finite_mask, posed_images, submodel
-from sfm_app.colmap.types import all_cameras, all_points
 from sfm_app.errors import NumericalError
 from sfm_app.numerical import FAILURES, Json, error_reason, finite_entries
 from sfm_app.types import Calibration

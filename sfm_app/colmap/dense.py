@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import check_written, pycolmap, translate_errors
-from sfm_app.colmap.types import all_images
+from sfm_app.colmap.backend import all_images, check_written, pycolmap, translate_errors
 from sfm_app.colmap.worker_process import UndistortTask, run_worker
 from sfm_app.files import digest_files, is_below
 from sfm_app.operating_system import replace_file
@@ -109,6 +108,7 @@ def undistort(
     """
     (dense_dir / "images").mkdir(parents=True, exist_ok=True)
     task: UndistortTask = {
+        "do": "undistort",
         "dense": str(dense_dir),
         "model": str(model_dir),
         "photos": str(photo_dir),
@@ -116,7 +116,7 @@ def undistort(
         "workers": workers,
         "output": "COLMAP",
     }
-    run_worker("sfm_app.colmap.undistort_process", task, "undistorting photos", progress)
+    run_worker(task, "undistorting photos", progress)
 
 
 def read_views(dense_dir: Path) -> list[View]:

@@ -5,10 +5,9 @@ import sqlite3
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
-from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.backend import all_points, pycolmap
 from sfm_app.colmap.database import write_match_graph
 from sfm_app.colmap.model import pose_photo, posed_images, unposed_model
-from sfm_app.colmap.types import all_points
 from sfm_app.files import replace_atomically
 from sfm_app.types import MatchedImage, MatchGraph, PhotoSet
 

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_app.colmap.backend import pycolmap, translate_errors
+from sfm_app.colmap.backend import all_points, pycolmap, translate_errors
 from sfm_app.colmap.bundle import drop_infinite_points, find_correspondences, improve_tracks, solve
 from sfm_app.colmap.model import bearing_vectors, move, pose_photo, posed_images, unposed_model
-from sfm_app.colmap.types import all_points
 from sfm_app.geometry.poses import Similarity
 from sfm_app.types.arrays import FloatArray, IndexArray
 

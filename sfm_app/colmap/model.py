@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from sfm_app.camera.bearings import BEARING, RAY
 from sfm_app.camera.models import camera_matrix, panorama_matrix
-from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread, translate_errors
+from sfm_app.colmap.backend import all_images, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.types import all_images, all_points
 from sfm_app.geometry.epipolar import TwoViewSeed
 from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import finite_entries

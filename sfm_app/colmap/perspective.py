@@ -242,6 +242,7 @@ def write_bundle(model_dir: Path, photo_dir: Path, file: Path, workers: int, pro
     try:
         scratch.mkdir()
         task: UndistortTask = {
+            "do": "undistort",
             "dense": str(scratch),
             "model": str(model_dir),
             "photos": str(photo_dir),
@@ -249,7 +250,7 @@ def write_bundle(model_dir: Path, photo_dir: Path, file: Path, workers: int, pro
             "workers": workers,
             "output": "PMVS",
         }
-        run_worker("sfm_app.colmap.undistort_process", task, "writing Bundler's file", progress)
+        run_worker(task, "writing Bundler's file", progress)
         replace_file(scratch / BUNDLE, file)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)

@@ -39,7 +39,7 @@ def fuse(
         "box": box.tolist(),
         "cache_gb": cache_gb,
     }
-    run_worker("sfm_app.colmap.surface_process", task, "fusing depth maps")
+    run_worker(task, "fusing depth maps")
     target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # which photos see which point; not used
 
 
@@ -109,7 +109,7 @@ def poisson_surface(folder: Path, depth: int) -> Surface:
         "target": str(path),
         "depth": max(depth, MIN_DEPTH),
     }
-    run_worker("sfm_app.colmap.surface_process", task, "finding the surface")
+    run_worker(task, "finding the surface")
     surface = _read(path)
     path.unlink()
     return surface
@@ -137,7 +137,7 @@ def simplify(surface: Surface, most: int, max_error: float, scratch: Path, threa
         "max_error": max_error,
         "threads": threads,
     }
-    run_worker("sfm_app.colmap.surface_process", task, "simplifying the surface")
+    run_worker(task, "simplifying the surface")
     simple = _read(found)
     given.unlink()
     found.unlink()

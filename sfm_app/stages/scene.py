@@ -6,10 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from sfm_app.colmap.backend import check_written, translate_errors
+from sfm_app.colmap.backend import Reconstruction, check_written, translate_errors
 from sfm_app.colmap.bundle import Adjustment, adjust_or_keep
 from sfm_app.colmap.model import RefinedCamera, color_points, posed_images, posed_photo_ids, read_scene
-from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import ReconstructionError
 from sfm_app.estimation.diagnosis import diagnose_depth, diagnose_scene
 from sfm_app.estimation.given_cameras import camera_rules, given_and_found, refined_claims, report_checks, report_claims

@@ -20,7 +20,7 @@ from sfm_app.colmap.dense import (
     write_fusion_views,
     write_maps,
 )
-from sfm_app.colmap.features import find_and_match
+from sfm_app.colmap.features import SiftSettings, find_and_match
 from sfm_app.colmap.surface import FUSED, fuse, open_points, positions
 from sfm_app.photos import save_mask
 from sfm_app.progress import SilentProgress
@@ -79,7 +79,7 @@ def test_no_keypoint_lies_in_what_is_masked(place, tmp_path):
     for masks in (None, root / "masks"):
         database = tmp_path / f"{masks is None}.db"
         create_database(database, photos)
-        find_and_match(database, root / "photos", NAMES, MatchSettings(), 1, SilentProgress(), masks)
+        find_and_match(database, SiftSettings(root / "photos", masks, MatchSettings()), NAMES, 1, SilentProgress())
         graph = read_match_graph(database, photos)
         found[masks] = {graph.images[key].name: np.floor(at).astype(int) for key, at in graph.keypoints.items()}
 
