@@ -92,7 +92,7 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     laid_down = [camera_rules(attempt.model, names, intrinsics, wanted) for attempt in outcome.models]
     with run.step("adjusting all cameras"):
         adjusted = [
-            adjust_or_keep(attempt.model, database, rules, settled=attempt.mapper == GROWN)
+            adjust_or_keep(attempt.model, database, rules, families_known=attempt.mapper == GROWN)
             for attempt, rules in zip(outcome.models, laid_down, strict=True)
         ]
     followed = [
