@@ -9,7 +9,6 @@ from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import create_database, read_match_graph
 from sfm_app.colmap.dense import (
     MASKED,
-    REACH_PX,
     DenseStore,
     MaskUndistorter,
     mask_depths,
@@ -95,7 +94,7 @@ def test_masks_are_undistorted_as_photos_are(place, dense):
     model = pycolmap.Reconstruction(root / "sparse")
     options = pycolmap.UndistortCameraOptions()
     options.max_image_size = 120
-    square = np.ones((2 * REACH_PX + 1, 2 * REACH_PX + 1), np.uint8)
+    square = np.ones((2 * 2 + 1, 2 * 2 + 1), np.uint8)
     for name, view in dense[1].items():
         bitmap = pycolmap.Bitmap.from_array(np.where(used[name], np.uint8(255), np.uint8(0)))
         theirs = pycolmap.undistort_image(options, bitmap, model.cameras[1])[0].to_array()
@@ -104,7 +103,7 @@ def test_masks_are_undistorted_as_photos_are(place, dense):
         assert seen.shape == theirs.shape == (view.height, view.width)
         near = cv2.erode(theirs, square)
         assert (near[seen] == 255).all()  # nothing masked shows through, and next to nothing is lost
-        wide = cv2.erode(theirs, np.ones((2 * REACH_PX + 5, 2 * REACH_PX + 5), np.uint8))
+        wide = cv2.erode(theirs, np.ones((2 * 2 + 5, 2 * 2 + 5), np.uint8))
         assert seen[wide == 255].all()
     assert used_pixels(dense[0], dense[1]["3.png"]).all()
 
