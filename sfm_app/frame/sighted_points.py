@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.backend import Reconstruction, translate_errors
 from sfm_app.colmap.model import focal_px, posed_images, seen_points, viewing_rays
-from sfm_app.colmap.types import Reconstruction
 from sfm_app.types import Photo
 from sfm_app.types.arrays import FloatArray
 

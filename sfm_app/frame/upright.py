@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.backend import Reconstruction, translate_errors
 from sfm_app.colmap.model import (
     finite_mask,
     focal_px,
@@ -20,7 +20,6 @@ from sfm_app.colmap.model import (
     seen_points,
     viewing_rays,
 )
-from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import NumericalError
 from sfm_app.frame.georeference import Georeference, NoGeoreference, georeference, position_from_enu
 from sfm_app.frame.up_cues import small_picture

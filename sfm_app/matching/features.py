@@ -19,6 +19,7 @@ from sfm_app.colmap.features import (
     MATCHES,
     Part,
     SiftInputs,
+    SiftSettings,
     count_features,
     enter_rows,
     exhaustive_pairs,
@@ -353,9 +354,16 @@ def _write_inputs(folder: Path, sift: Mapping[str, SiftOption], run: RunContext,
     place, folder = run.workspace, folder.absolute()
     folder.mkdir(parents=True)
     inputs = SiftInputs(
-        folder / "photos.db", folder / "features.db", place.photos.absolute(),
-        run.mask_dir.absolute() if run.mask_dir else None, run.settings.matching, dict(sift), folder,
-    )  # fmt: skip
+        folder / "photos.db",
+        folder / "features.db",
+        SiftSettings(
+            place.photos.absolute(),
+            run.mask_dir.absolute() if run.mask_dir else None,
+            run.settings.matching,
+            dict(sift),
+        ),
+        folder,
+    )
     write_snapshot(place.database, inputs.snapshot, (*FEATURES, *MATCHES))
     if with_features:
         write_snapshot(place.database, inputs.features, MATCHES)
@@ -390,10 +398,8 @@ def find_all_features(method: FeatureMethod, run: RunContext, pairs: Sequence[Pa
     if method.sift is not None and run.spread:
         return find_in_chunks(method.sift, list(names.values()), run)
     if method.sift is not None:
-        return find_and_match(
-            place.database, place.photos, list(names.values()), options, run.workers, run.progress, run.mask_dir,
-            method.sift, (),
-        )  # fmt: skip
+        settings = SiftSettings(place.photos, run.mask_dir, options, method.sift)
+        return find_and_match(place.database, settings, list(names.values()), run.workers, run.progress, ())
     if not resume_or_clear(place.feature_parts, run.fingerprint):
         mark_unfinished(place.feature_parts, run.fingerprint)
     find_features(method, names, run)
@@ -410,7 +416,8 @@ def match_pairs(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] 
     if method.sift is not None and (run.spread or run.workers > 1):
         return match_in_chunks(method.sift, pairs, run)
     if method.sift is not None:
-        return find_and_match(place.database, place.photos, [], options, 1, run.progress, sift=method.sift, pairs=pairs)
+        settings = SiftSettings(place.photos, None, options, method.sift)
+        return find_and_match(place.database, settings, [], 1, run.progress, pairs)
     _match(method, all_pairs(photo_names(place.database)) if pairs is None else pairs, run)
     return {}
 

@@ -104,7 +104,7 @@ def test_points_beyond_the_fold_lie_on_it():
 def test_steps_end_where_more_of_them_change_nothing(projection, shifted, monkeypatch):
     terms = TERMS * ([1.0] * 8 if shifted else [1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
     points = np.random.default_rng(1).uniform(-1.5, 1.5, (500, 2))
-    monkeypatch.setattr(lens_module, "PRECISION", 0.0)
+    monkeypatch.setattr(lens_module, "OPTIONS", lens_module.UndistortionOptions(precision=0.0))
     exact = undistort(points, terms, projection)
     monkeypatch.undo()
 

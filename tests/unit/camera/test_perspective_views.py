@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_app.camera.models import camera_matrix
-from sfm_app.camera.perspective_views import MOST_FIELD_DEG, OVERLAP_DEG, PerspectiveView, center_view, cover_rays
+from sfm_app.camera.perspective_views import OPTIONS, PerspectiveView, center_view, cover_rays
 
 
 def cone(across_deg, down_deg, count=161):
@@ -48,7 +48,7 @@ def test_every_ray_is_in_one_of_few_views(rays, count):
     assert len(views) == count
     # views are as large as whole pixels
     assert np.any([shown(view, rays, 1.0) for view in views], axis=0).all()
-    half = np.radians(0.5 * MOST_FIELD_DEG + OVERLAP_DEG)
+    half = np.radians(0.5 * OPTIONS.most_field_deg + OPTIONS.overlap_deg)
     for view in views:
         np.testing.assert_allclose(view.R @ view.R.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(view.R) == pytest.approx(1.0)

@@ -1,5 +1,6 @@
-"""A model whose photos a rolling shutter took: its readout is measured, and keypoints move to where a global shutter
-would have seen them at the middle row.
+"""Measure the readout of a rolling shutter on a model, and compensate its keypoints.
+
+A compensated keypoint is where a global shutter at the time of the middle row would see its point.
 """
 
 from collections.abc import Mapping
@@ -20,10 +21,6 @@ from sfm_app.types.arrays import FloatArray
 Keypoints = Mapping[int, FloatArray]
 """(N, 2) pixels, by photo id."""
 
-NEIGHBORS = 5
-"""Keypoints with a point in space that lend their inverse depth to one without. Chosen by hand; not measured on its
-own."""
-
 
 def read_keypoints(model: pycolmap.Reconstruction) -> dict[int, FloatArray]:
     """Return the keypoints (N, 2) of all posed photos by id, in pixels."""
@@ -37,12 +34,12 @@ def measure_readout(
     adjusted: Adjustment, keypoints: Keypoints, times: Mapping[int, float],
     start: ReadoutEstimate | None = None, *, known: float | None = None,
 ) -> ReadoutEstimate:  # fmt: skip
-    """Estimate the readout of the shutter from a model and the keypoints as they were found.
+    """Estimate the readout of the shutter from a model and uncompensated keypoints.
 
     Args:
         adjusted: a model of photos of perspective or fisheye cameras, five or more.
-        keypoints: of its photos, before any compensation.
-        times: of its photos, distinct, by id.
+        times: distinct, by photo id.
+        start, known: as of `estimate_readout`.
     """
     model = adjusted.model
     ids, bundle = read_bundle(model)
@@ -54,12 +51,12 @@ def measure_readout(
         [part.name in adjusted.lenses[camera_id].chosen.free for part in PARTS[int(family)]]
         for camera_id, family in zip(ids, bundle.family, strict=True)
     ]
-    found = Bundle(
+    uncompensated = Bundle(
         bundle.params, bundle.camera, bundle.R, bundle.t, bundle.X, bundle.photo, bundle.point,
         np.concatenate(tracked), bundle.family,
     )  # fmt: skip
-    priors = lens_priors(model, ids, found)
-    return estimate_readout(found, rows, priors, np.array(freed), LOSS_SCALE_PX, start, known=known)
+    priors = lens_priors(model, ids, uncompensated)
+    return estimate_readout(uncompensated, rows, priors, np.array(freed), LOSS_SCALE_PX, start, known=known)
 
 
 def straighten_model(
@@ -68,7 +65,7 @@ def straighten_model(
     """Return a copy of a model with the estimated poses, points and cameras, and with its keypoints compensated.
 
     Args:
-        keypoints: of its photos, before any compensation.
+        keypoints: uncompensated.
     """
     model = pycolmap.Reconstruction(model)
     ids, _ = read_bundle(model)
@@ -82,10 +79,9 @@ def straighten_model(
 
 
 def row_shares(x: FloatArray, camera: pycolmap.Camera) -> FloatArray:
-    """Return the shares (N,) of the rows of keypoints; rows are read along the shorter side of the sensor.
+    """Return the shares (N,) of the rows of keypoints (N, 2); rows are read along the shorter side of the sensor.
 
     Args:
-        x: (N, 2) pixels.
         camera: of the photo, which may stand upright.
     """
     upright = camera.height > camera.width
@@ -100,7 +96,7 @@ def _tracked_rows(image: pycolmap.Image) -> NDArray[np.int64]:
 def _compensate(
     model: pycolmap.Reconstruction, image: pycolmap.Image, x: FloatArray, estimate: ReadoutEstimate, row: int
 ) -> FloatArray:
-    """Return the keypoints (N, 2) of a photo as a global shutter would have seen them; unchanged without any point."""
+    """Return the compensated keypoints (N, 2) of a photo; unchanged if it sees no point."""
     tracked = _tracked_rows(image)
     if not len(tracked):
         return x
@@ -121,9 +117,9 @@ def _compensate(
 
 
 def _spread_inverse_depths(x: FloatArray, tracked: NDArray[np.int64], inverse: FloatArray) -> FloatArray:
-    """Return inverse depths (N,) of all keypoints from those of some; the others take the mean of their neighbors'."""
-    count = min(NEIGHBORS, len(tracked))
+    """Return inverse depths (N,) of all keypoints; untracked ones take the mean of their five nearest tracked ones."""
+    count = min(5, len(tracked))
     _, near = cKDTree(x[tracked]).query(x, k=np.arange(1, count + 1))
-    found = np.asarray(inverse[near].mean(axis=1), np.float64)
-    found[tracked] = inverse
-    return found
+    spread = np.asarray(inverse[near].mean(axis=1), np.float64)
+    spread[tracked] = inverse
+    return spread
