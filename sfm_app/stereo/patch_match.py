@@ -136,7 +136,7 @@ def _sweep(
 
 
 @kernel
-def _try_neighbors(  # noqa: PLR0913
+def _try_neighbors(
     row: int, col: int, step: int, planes: PlaneArray, unit: float,
     trial: FloatArray, best: FloatArray, lowest: float, window: Any, others: Any, costs: FloatArray,
 ) -> float:  # fmt: skip
