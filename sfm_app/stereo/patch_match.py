@@ -136,7 +136,7 @@ def _sweep(
 
 
 @kernel
-def _try_neighbors(
+def _try_neighbors(  # noqa: PLR0913
     row: int, col: int, step: int, planes: PlaneArray, unit: float,
     trial: FloatArray, best: FloatArray, lowest: float, window: Any, others: Any, costs: FloatArray,
 ) -> float:  # fmt: skip
@@ -195,7 +195,7 @@ def _inverse_depth_per_px(row: int, col: int, q: float, projections: FloatArray)
 
 
 @kernel
-def _try_plane(
+def _try_plane(  # noqa: PLR0913
     row: int, col: int, trial: FloatArray, best: FloatArray, lowest: float, window: Any, others: Any, costs: FloatArray
 ) -> float:
     """Replace the best plane if the trial costs less by `MIN_GAIN`; return the lowest cost."""

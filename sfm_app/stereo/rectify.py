@@ -232,7 +232,7 @@ def depths_from_disparities(
 
 
 @kernel
-def _lift(
+def _lift(  # noqa: PLR0913
     disparity: NDArray[np.float32],
     canvas: FloatArray,
     to_rectified: FloatArray,
