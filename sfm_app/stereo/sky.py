@@ -115,7 +115,7 @@ def blank_areas(photo: GrayImage, depth: DepthArray) -> PhotoAreas:
 
 
 def _keep_bright(labels: NDArray[np.int32], gray: NDArray[np.float32], surfaces: NDArray[np.float32]) -> IndexArray:
-    """Keep the areas brighter than most surfaces, numbered from 1; 0 elsewhere. The surfaces' gray levels (S,) ascend."""
+    """Keep the areas brighter than most surfaces, numbered from 1. The surfaces' gray levels (S,) ascend."""
     bright = np.searchsorted(surfaces, _mean_gray(labels, gray)) >= max(1.0, OPTIONS.bright_rank * len(surfaces))
     bright[0] = False
     return np.asarray((np.cumsum(bright) * bright)[labels])
