@@ -1,4 +1,4 @@
-"""A sky is what is infinitely far; a plain wall of the same gray is not."""
+"""A sky is at infinity; a plain wall of the same gray is not."""
 
 from dataclasses import dataclass
 
@@ -19,11 +19,11 @@ class Photo:
     gray: np.ndarray
     depth: np.ndarray
     blank: np.ndarray
-    """(H, W) what has no depth: sky or plain wall."""
+    """(H, W) sky or plain wall, without a depth."""
 
 
 def photograph(x, gray_of_blank, backdrop):
-    """Return a photo from (x, 0, 0): a textured ground, a textured tower, and what is behind them."""
+    """Return a photo from (x, 0, 0): a textured ground, a textured tower, and a backdrop."""
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     view = View(f"{x:.2f}", K, np.eye(3), np.array([-x, 0, 0]), WIDTH, HEIGHT)
     v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
@@ -45,9 +45,13 @@ def sky(x, ray):
 
 
 def plain_wall(x, ray):
-    """A wall 8 away that is textured but for a part."""
+    """A wall 8 away, textured but for a part."""
     at = x + 8.0 * ray[0]
     return np.where((at > -1.5) & (at < 1.5), np.inf, 8.0)
+
+
+def photograph_all(gray_of_blank, backdrop=sky):
+    return [photograph(x, gray_of_blank, backdrop) for x in SIDEWAYS]
 
 
 def skies_of(photos):
@@ -59,7 +63,7 @@ def skies_of(photos):
 
 @pytest.mark.parametrize("gray", [200.0, 250.0])
 def test_a_sky_is_found_up_to_its_outlines(gray):
-    photos = [photograph(x, gray, sky) for x in SIDEWAYS]
+    photos = photograph_all(gray)
 
     for photo, found in zip(photos, skies_of(photos), strict=True):
         assert found[photo.blank].mean() > 0.98
@@ -72,8 +76,8 @@ PALING = 130.0 + 0.5 * np.mgrid[:HEIGHT, :WIDTH][0]
 
 
 @pytest.mark.parametrize("gray", [220.0, PALING], ids=["even", "paling"])
-def test_depths_that_matching_carried_into_the_sky_are_in_it(gray):
-    photos = [photograph(x, gray, sky) for x in SIDEWAYS]
+def test_depths_extended_into_the_sky_are_sky(gray):
+    photos = photograph_all(gray)
     carried = [cv2.dilate((~photo.blank).view(np.uint8), np.ones((13, 13))) > 0 for photo in photos]
     rims = [wide & photo.blank for wide, photo in zip(carried, photos, strict=True)]
     spoiled = [
@@ -85,8 +89,8 @@ def test_depths_that_matching_carried_into_the_sky_are_in_it(gray):
         assert found[rim].mean() > 0.98
 
 
-def test_pixels_in_which_sky_and_tower_are_blurred_are_sky_and_no_more():
-    photos = [photograph(x, 220.0, sky) for x in SIDEWAYS]
+def test_mixed_pixels_of_sky_and_tower_are_sky():
+    photos = photograph_all(220.0)
     blurred = [Photo(p.view, cv2.GaussianBlur(p.gray, (0, 0), 1.0), p.depth, p.blank) for p in photos]
 
     for photo, found in zip(photos, skies_of(blurred), strict=True):
@@ -98,23 +102,21 @@ def test_pixels_in_which_sky_and_tower_are_blurred_are_sky_and_no_more():
 
 
 def test_a_plain_wall_is_no_sky():
-    photos = [photograph(x, 220.0, plain_wall) for x in SIDEWAYS]
+    photos = photograph_all(220.0, plain_wall)
 
     assert all(blank_areas(photo.gray, photo.depth).blank.any() for photo in photos)
     assert not any(found.any() for found in skies_of(photos))
 
 
 def test_a_dark_background_is_no_sky():
-    photos = [photograph(x, 10.0, sky) for x in SIDEWAYS]
-
-    assert not any(found.any() for found in skies_of(photos))
+    assert not any(found.any() for found in skies_of(photograph_all(10.0)))
 
 
-def test_a_wall_in_another_place_stays_where_the_scene_has_a_sky():
-    photos = [photograph(x, 230.0, sky) for x in SIDEWAYS]
+def test_a_wall_stays_in_a_scene_with_a_sky():
+    photos = photograph_all(230.0)
     walled = []
     for photo in photos:
-        # a window of the tower, as bright as the sky: in other photos it lies in other directions
+        # a window of the tower as bright as the sky; its direction changes from photo to photo
         at = photo.view.center[0] + 6.0 * (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL
         window = np.zeros_like(photo.blank)
         window[240:330] = np.abs(at - 0.5) < 0.5
@@ -128,7 +130,7 @@ def test_a_wall_in_another_place_stays_where_the_scene_has_a_sky():
         assert own[window].mean() < 0.05
 
 
-def test_one_photo_has_no_vote_about_itself():
+def test_one_photo_does_not_vote_about_itself():
     photo = photograph(0.0, 220.0, sky)
 
     assert not skies_of([photo])[0].any()

@@ -1,11 +1,11 @@
-"""Plain areas get the plane of what is known around them where other photos say so, and nothing else does."""
+"""Plain areas get the plane of their surroundings where other photos agree."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sfm_app.stereo.plane_proposals import LEAST_AGREEING, agreed_proposals, propose_planes
+from sfm_app.stereo.plane_proposals import OPTIONS, agreed_proposals, propose_planes
 
 HEIGHT, WIDTH = 240, 320
 ROW, COL = np.mgrid[:HEIGHT, :WIDTH]
@@ -105,9 +105,9 @@ def test_what_others_propose_or_see_is_filled(doors, plane):
 def test_too_few_others_are_no_proof(doors):
     (view, depth, proposed), *others = doors
 
-    for count in range(LEAST_AGREEING):
+    for count in range(OPTIONS.least_agreeing):
         np.testing.assert_array_equal(agreed_proposals(view, (depth, proposed), others[:count], 0.01), depth)
-    assert agreed_proposals(view, (depth, proposed), others[:LEAST_AGREEING], 0.01).all()
+    assert agreed_proposals(view, (depth, proposed), others[: OPTIONS.least_agreeing], 0.01).all()
 
 
 def test_what_one_photo_sees_through_is_an_opening(doors, plane):
