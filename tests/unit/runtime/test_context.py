@@ -17,7 +17,7 @@ def test_people_read_how_many_photos_are_known_new_and_left():
 
     assert text("abc", "de", "") == "3 photos are known, 2 are new"
     assert text("ab", "c", "c") == "2 photos are known, 1 are new"
-    assert text("ab", "", "cd") == "2 photos are known, 0 are new, 2 left"
+    assert text("ab", "", "cd") == "2 photos are known, 0 are new, 2 are gone"
 
 
 def test_photos_whose_features_are_others_count_as_replaced():
