@@ -131,7 +131,7 @@ def choose_frames(source: Path, run: RunContext) -> FrameChoice:
         raise InputError(f"cannot read {source}: no frame can be decoded", hint=DAMAGED)
     choice = select_keyframes(looks, most)
     if len(choice.frames) < 2:
-        why = "the camera does not move" if follower.seen else "there is hardly any texture to follow"
+        why = "the camera does not move" if follower.has_texture else "there is hardly any texture to follow"
         raise InputError(f"{why} in {source}: {video.frames} frames, and all show one view", hint=HINT)
     counts = {
         "frames": video.frames,
