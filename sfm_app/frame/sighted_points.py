@@ -303,8 +303,7 @@ def unrotate_pixels(photo: Photo, upright: FloatArray) -> FloatArray:
 
 
 def named_photos(photos: tuple[Photo, ...]) -> Mapping[str, Photo]:
-    """Return photos by every name that a user may give them: path in the folder, name, and file name where it is one.
-    """
+    """Return photos by every name that a user may give them: path in the folder, name, and file name where it is one."""
     files: dict[str, list[Photo]] = {}
     for photo in photos:
         files.setdefault(photo.path.rpartition("/")[2], []).append(photo)
