@@ -168,7 +168,8 @@ def _fit_on_ground(
     # for positions unrelated to the cameras, `unexplained` has the distribution function u^(n-2): Beta(n - 2, 1)
     if unexplained ** (used - 2) > OPTIONS.significance or deviation > OPTIONS.max_scale_deviation:
         return NoGeoreference(
-            f"{used} GPS positions with a spread of {extent:.0f} m and residuals of {rms:.1f} m do not determine a scale"
+            f"{used} GPS positions with a spread of {extent:.0f} m and residuals of {rms:.1f} m "
+            "do not determine a scale"
         )
     scale = float(np.abs(a))
     c = a / scale

@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.synthetic.scenes import build_scene, scene_views
 from sfm_app.frame.up_cues import (
-    TURN_COSTS,
+    ROLL_OPTIONS,
     brightness_normal_correlation,
     depth_height_correlation,
     fit_surfaces,
@@ -87,9 +87,9 @@ def test_rendered_photos_stand_upright_whichever_way_they_were_held(rendered, tu
     assert standing.roll.turn_deg == turn_deg
     assert standing.roll.up @ UP > np.cos(np.radians(20))
     # upside down, the habit of holding cameras upright speaks against what the scene shows
-    habit = TURN_COSTS[turn_deg // 90]
+    habit = ROLL_OPTIONS.turn_costs[turn_deg // 90]
     assert standing.sign_log_odds == pytest.approx(
-        sum(standing.evidence.values()) + TURN_COSTS[2] - 2 * habit, abs=1e-6
+        sum(standing.evidence.values()) + ROLL_OPTIONS.turn_costs[2] - 2 * habit, abs=1e-6
     )
     assert 2 < min(standing.sign_log_odds, standing.axis_log_odds) < 20
 
@@ -130,7 +130,7 @@ def test_without_scenery_cameras_are_held_upright(build_house):
     standing = select_roll(roll_hypotheses(house.rotations, house.centers), house.rotations, house.centers, nothing)
 
     assert standing.roll.turn_deg == 0 and not any(standing.evidence.values())
-    assert standing.sign_log_odds == pytest.approx(TURN_COSTS[2])
+    assert standing.sign_log_odds == pytest.approx(ROLL_OPTIONS.turn_costs[2])
 
 
 def test_opposite_turns_have_opposite_directions(build_house):
