@@ -27,7 +27,7 @@ TAPE_DEVIATION = 0.002
 
 
 def distance_evidence(distances: Sequence[tuple[str, str, str]], model: Sightlines) -> list[ScaleEvidence]:
-    """Return the scale by each known distance: two points in the frame of the model and a length, as in the settings."""
+    """Return the scale by each known distance: two points of the model and a length, as in the settings."""
     evidence = []
     for first, second, length in distances:
         a, b, meters = np.array(parse_point(first)), np.array(parse_point(second)), parse_length(length)

@@ -68,7 +68,7 @@ def roll_hypotheses(rotations: FloatArray, centers: FloatArray) -> tuple[Roll, .
     """Estimate up for photos turned by 0, 90, 180, 270 degrees: the direction that makes them most nearly level.
 
     Roll alone does not distinguish portrait photos of a wall from landscape photos of the same wall lying on its side,
-    so two weaker cues are added: people look nearly horizontally, and they walk rather than climb. The photos' proposals
+    so two weaker cues are added: people look nearly horizontally, and they walk rather than climb. Proposals of photos
     are refined by weighted least squares, and the cheapest is chosen. Opposite turns have opposite directions, unless
     cameras look steeply down.
 

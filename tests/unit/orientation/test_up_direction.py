@@ -15,7 +15,7 @@ from sfm_app.frame.up_cues import (
     slope_asymmetry,
     small_picture,
 )
-from sfm_app.frame.up_direction import CUES, MAX_NATS, Cue, Scenery, odds, select_roll
+from sfm_app.frame.up_direction import CUES, OPTIONS, Cue, Scenery, odds, select_roll
 from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at, pixel_rays
 from sfm_app.synthetic.render import GAMMA, cast_rays, prepare, render_scene
 
@@ -119,7 +119,10 @@ def test_no_single_cue_turns_photos_that_are_held_upright(build_house):
     standing = select_roll(roll_hypotheses(house.rotations, house.centers), house.rotations, house.centers, scenery)
 
     assert standing.roll.turn_deg == 0 and standing.roll.up @ house.up > 0.9
-    assert standing.evidence["low is near"] == -MAX_NATS and standing.evidence["tops are seen"] == -MAX_NATS
+    assert (
+        standing.evidence["low is near"] == -OPTIONS.max_nats
+        and standing.evidence["tops are seen"] == -OPTIONS.max_nats
+    )
     assert 0 <= standing.sign_log_odds < 0.1, "it is as likely as not, and says so"
 
 
@@ -223,7 +226,7 @@ def test_nats_grow_with_the_cue_and_with_the_points_and_end():
 
     assert cue.nats(0.05, 10**9) == pytest.approx(1.0) and cue.nats(-0.05, 10**9) == pytest.approx(-1.0)
     assert 0.1 < cue.nats(0.05, 100) < 0.25
-    assert cue.nats(5.0, 100) == MAX_NATS
+    assert cue.nats(5.0, 100) == OPTIONS.max_nats
     assert all(0 < CUES[name].mean < 0.5 and 0.05 < CUES[name].deviation < 0.5 for name in CUES)
 
 
