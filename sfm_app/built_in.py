@@ -1,4 +1,4 @@
-"""The methods of this package, registered like those of any other plug-in."""
+"""The methods of this package as a plug-in."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
@@ -44,7 +44,7 @@ def sfm_calibrators() -> Iterable[Calibrator]:
 
 @hookimpl
 def sfm_features() -> Iterable[FeatureMethod]:
-    """Return COLMAP's SIFT, plain and with domain size pooling."""
+    """Return COLMAP's SIFT, with and without domain size pooling."""
     return [
         FeatureMethod(SIFT, summary="COLMAP's SIFT", sift={}),
         FeatureMethod(SIFT_DSP, summary=SIFT_DSP_SUMMARY, sift=SIFT_DSP_OPTIONS),
@@ -65,5 +65,5 @@ def sfm_scene_exporters() -> Iterable[SceneExporter]:
 
 @hookimpl
 def sfm_depth_methods() -> Iterable[DepthMethod]:
-    """Return the depth maps made on the CPU."""
+    """Return the depth method of the CPU."""
     return [DepthMethod(CPU, _make_depth_maps_on_cpu, "semi-global matching and PatchMatch, on every machine")]

@@ -19,16 +19,7 @@ from sfm_app.runtime.parallel import worker_count
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages.texture import read_texture
-from sfm_app.synthetic.cameras import (
-    ArcOptions,
-    Camera,
-    Lens,
-    Views,
-    arc,
-    camera_center,
-    make_camera,
-    make_wide_camera,
-)
+from sfm_app.synthetic.cameras import ArcOptions, Camera, Lens, Views, arc, camera_center, make_camera, make_wide_camera
 from sfm_app.synthetic.compare import (
     center_error_percent,
     focal_error_percent,
@@ -43,44 +34,40 @@ from sfm_app.synthetic.shapes import SyntheticScene
 from sfm_app.types import CameraModel, Model, Scene
 
 SIZE = (960, 640)
-"""Width and height of the photos of most scenes, in pixels: large enough for a good model, small enough to wait for."""
-WIDE_DEG = 150.0
-"""What the fisheye sees from left to right: 180 degrees from corner to corner, as fisheyes that fill the photo do."""
-CLOSE = (2.4, 3.6)
-"""Distance of the fisheye from the middle of the court: farther away, it shows little of it. Chosen by hand."""
+"""Width and height of the photos of most scenes, in pixels. Chosen by hand."""
+TRUTH = "truth.json"
+"""File in OUT with the cameras and poses of the photos, rendered or missing."""
 
 
 class DemoScene(NamedTuple):
-    """What is photographed, and from where."""
+    """A scene, and the views of its photos."""
 
     build: Callable[[], SyntheticScene]
     views: Callable[[], Views]
 
 
-def fisheye_camera() -> Camera:
-    """Return a camera whose angles to the optical axis grow evenly with the distance from its center."""
-    return make_wide_camera(*SIZE, WIDE_DEG, Lens("equidistant"))
+def fisheye_views() -> Views:
+    """Return views of an equidistant fisheye of 180 degrees from corner to corner, close to the court."""
+    return arc(make_wide_camera(*SIZE, 150.0, Lens("equidistant")), ArcOptions(distance=(2.4, 3.6)))
 
 
 SCENES: Mapping[str, DemoScene] = MappingProxyType({
     "courtyard": DemoScene(courtyard, lambda: arc(make_camera(*SIZE))),
     "statue": DemoScene(statue, lambda: statue_views(make_camera(*SIZE[::-1], focal_widths=1.35), photos=18)),
-    "fisheye": DemoScene(courtyard, lambda: arc(fisheye_camera(), ArcOptions(distance=CLOSE))),
+    "fisheye": DemoScene(courtyard, fisheye_views),
 })  # fmt: skip
-"""By name. Sizes and numbers of photos are chosen so that each takes less than four minutes on two cores."""
-TRUTH = "truth.json"
-"""In OUT: which photos are rendered there, or will be."""
+"""By name. Each takes less than four minutes on two cores."""
 
 
 @dataclass(frozen=True, slots=True)
 class DemoResult:
-    """How close the reconstruction of the demo scene came."""
+    """The errors of a demo's reconstruction."""
 
     photos: int
     registered: int
     true_K: list[list[float]]
     found_K: list[list[float]]
-    """From the photos alone, before bundle adjustment."""
+    """Estimate before bundle adjustment."""
     refined_K: list[list[float]]
     focal_error_percent: float
     refined_focal_error_percent: float
@@ -91,7 +78,7 @@ class DemoResult:
     surface_accuracy_percent: float
     """Share of the mesh within 0.5 % of the scene's size of the true surface."""
     surface_coverage_percent: float
-    """Share of what the photos see that the mesh covers within 1 % of the scene's size."""
+    """Share of the visible true surface that the mesh covers within 1 % of the scene's size."""
     triangles: int
     pages_px: list[list[int]]
     """Width and height of each page of texture."""
@@ -100,7 +87,7 @@ class DemoResult:
     files: list[str]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
+        """Return JSON values."""
         return asdict(self)
 
 
@@ -129,25 +116,25 @@ def run_demo(out: Path, scene: str, settings: Settings, progress: Progress) -> t
 def render_photos(
     out: Path, scene: str, settings: Settings, progress: Progress, scenes: Mapping[str, DemoScene] = SCENES
 ) -> Truth:
-    """Return the ground truth of the photos in OUT/photos; those that are missing are rendered.
+    """Return the ground truth of the photos in OUT/photos after rendering the missing ones.
 
     Raises:
         InputError: the folder has photos of another scene.
     """
     demo = scenes[scene]
     views, photos = demo.views(), out / "photos"
-    there = {path.name for path in photos.glob("*.jpg")}
+    files = {path.name for path in photos.glob("*.jpg")}
     progress.stage(f"rendering {len(views.cam_from_world)} photos: {scene}")
     known = load_truth(out) if (out / TRUTH).exists() else None
     is_known = known is not None and _is_of(known, views)
-    if there - set(views.cam_from_world) or (there and not is_known):
-        raise InputError(f"{photos} has other photos", hint="name another folder with -o, or remove this one")
-    if known is not None and is_known and there == set(views.cam_from_world):
+    if files - set(views.cam_from_world) or (files and not is_known):
+        raise InputError(f"{photos} holds photos of another scene", hint="name another folder with -o, or remove it")
+    if known is not None and is_known and files == set(views.cam_from_world):
         return known
     built = demo.build()
     truth = Truth(dict(views.cameras), dict(views.cam_from_world), built.vertices, built.faces)
     out.mkdir(parents=True, exist_ok=True)
-    save_truth(truth, out)  # first: it says what the photos are that a killed demo leaves
+    save_truth(truth, out)  # first: it identifies the photos of a killed demo
     return add_missing_photos(photos, built, views, processes=worker_count(settings.workers), progress=progress)
 
 
@@ -166,41 +153,39 @@ def draw(model: Model, scene: Scene, out: Path) -> None:
     """Draw OUT/model.png: a photo and the model from the same pose; below, the model from the side and from behind."""
     names = sorted(scene.cam_from_world)
     name = names[len(names) // 2]
-    found = scene.cameras[scene.camera_of[name]]
+    camera = camera_of(scene.cameras[scene.camera_of[name]])
     photo = np.asarray(Image.open(out / "photos" / name).convert("RGB"))
-    Image.fromarray(comparison_image(photo, model, camera_of(found), scene.cam_from_world[name])).save(
-        out / "model.png"
-    )
+    Image.fromarray(comparison_image(photo, model, camera, scene.cam_from_world[name])).save(out / "model.png")
 
 
-def camera_of(found: CameraModel) -> Camera:
-    """Return the camera through which a model looks as it does in the photo; of a fisheye with its lens."""
-    known = calibration_from_model(found.model, found.params, (found.width, found.height))
+def camera_of(model: CameraModel) -> Camera:
+    """Return the camera of the renderer for an estimated camera; of lenses, it has that of a fisheye."""
+    known = calibration_from_model(model.model, model.params, (model.width, model.height))
     lens = Lens("equidistant", tuple(known.fisheye)) if known.projection == "fisheye" else Lens()
-    return Camera(found.K, found.width, found.height, lens)
+    return Camera(model.K, model.width, model.height, lens)
 
 
 def evaluate(run: Run, scene: Scene, model: Model, truth: Truth, seconds: tuple[float, float], out: Path) -> DemoResult:
-    """Measure how close the reconstruction came to the ground truth."""
+    """Return the errors of a reconstruction; `seconds` are of rendering and reconstruction."""
     refined = next(iter(scene.cameras.values())).K
-    found = run.calibration.K if run.calibration else refined
+    K = run.calibration.K if run.calibration else refined
     centers = {name: camera_center(pose) for name, pose in scene.cam_from_world.items()}
     surface, pages = model.surface, model.texture.pages if model.texture else ()
     reports = [run.report_path] if run.report_path is not None else []
-    found_surface = surface.vertices, surface.faces, centers, truth
+    mesh = surface.vertices, surface.faces, centers, truth
     return DemoResult(
         photos=len(truth.cam_from_world),
         registered=len(scene.registered),
         true_K=truth.K.tolist(),
-        found_K=found.tolist(),
+        found_K=K.tolist(),
         refined_K=refined.tolist(),
-        focal_error_percent=round(focal_error_percent(found, truth), 3),
+        focal_error_percent=round(focal_error_percent(K, truth), 3),
         refined_focal_error_percent=round(focal_error_percent(refined, truth), 3),
-        center_error_percent=round(center_error_percent(found, truth), 3),
+        center_error_percent=round(center_error_percent(K, truth), 3),
         refined_center_error_percent=round(center_error_percent(refined, truth), 3),
-        surface_error_percent=round(100 * surface_error(*found_surface), 3),
-        surface_accuracy_percent=round(100 * surface_accuracy(*found_surface), 1),
-        surface_coverage_percent=round(100 * surface_coverage(*found_surface), 1),
+        surface_error_percent=round(100 * surface_error(*mesh), 3),
+        surface_accuracy_percent=round(100 * surface_accuracy(*mesh), 1),
+        surface_coverage_percent=round(100 * surface_coverage(*mesh), 1),
         triangles=len(surface.faces),
         pages_px=[[page.shape[1], page.shape[0]] for page in pages],
         seconds_rendering=round(seconds[0], 1),
@@ -213,15 +198,15 @@ def demo_lines(result: DemoResult) -> list[str]:
     """Return the result as lines of text."""
     placed = "all" if result.registered == result.photos else f"{result.registered} of"
     seconds = result.seconds_reconstruction, result.seconds_rendering
-    shown = [path for path in result.files if path.endswith((".html", ".glb"))]
+    files = [path for path in result.files if path.endswith((".html", ".glb"))]
     return [
         f"camera      true   {k_text(result.true_K)}",
         f"            found  {k_text(result.refined_K)}   {result.refined_focal_error_percent:.2g} % off",
         f"mesh        of {placed} {result.photos} photos, {result.triangles:,} triangles: "
         f"{result.surface_accuracy_percent} % within 0.5 % of the scene's size "
-        f"of the truth, {result.surface_coverage_percent} % of what the photos see",
+        f"of the truth; it covers {result.surface_coverage_percent} % of the visible surface",
         f"took        {duration_text(seconds[0])}, and {duration_text(seconds[1])} to render the photos",
-        *(f"{'' if number else 'open':12}{path}" for number, path in enumerate(shown)),
+        *(f"{'' if number else 'open':12}{path}" for number, path in enumerate(files)),
     ]
 
 

@@ -1,7 +1,7 @@
-"""Plug-ins: typed hooks, and one registry in which the built-ins are registered like any other plug-in.
+"""Plug-ins: typed hooks, and one registry for built-in and installed methods.
 
 A plug-in is an installed package with an entry point in the group ``sfm_app``; its module holds functions marked with
-`hookimpl` that are named as in `Hooks`.
+`hookimpl` and named as in `Hooks`.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # OpenCV, which stereo needs, takes longer to load than an es
     from sfm_app.stereo import DepthTask
 
 GROUP, BUILT_IN = "sfm_app", "sfm_app.built_in"
-"""Entry points of plug-ins, and the module with our own methods, which comes through the same door."""
+"""Entry points of plug-ins, and the module of the built-in methods."""
 AUTO, CPU = "auto", "cpu"
 SIFT, SIFT_DSP = "sift", "sift-dsp"
 hookspec = pluggy.HookspecMarker(GROUP)
@@ -43,8 +43,8 @@ class FitFundamental(Protocol):
 class Calibrate(Protocol):
     """Estimates one camera matrix from the fundamental matrices of pairs that share it; same seed, same result.
 
-    Never raises on data: what is not determined comes back with ``identifiable=False`` and a reason. ValueError on
-    malformed arrays; `sfm_app.selfcal.pairs.prepare` checks them.
+    Never raises on data: an undetermined camera has ``identifiable=False`` and a reason. ValueError on malformed
+    arrays; `sfm_app.selfcal.pairs.prepare` checks them.
     """
 
     def __call__(self, pairs: CameraPairs, options: CalibrationSettings, seed: int, /) -> Calibration: ...
@@ -68,7 +68,7 @@ class MatchFeatures(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Estimator:
-    """A named way to estimate fundamental matrices."""
+    """A named estimator of fundamental matrices."""
 
     name: str
     fit: FitFundamental
@@ -80,7 +80,7 @@ class Estimator:
 
 @dataclass(frozen=True, slots=True)
 class Calibrator:
-    """A named way to get from fundamental matrices to the camera matrix."""
+    """A named method from fundamental matrices to the camera matrix."""
 
     name: str
     calibrate: Calibrate
@@ -90,7 +90,7 @@ class Calibrator:
 
 
 class MakeDepthMaps(Protocol):
-    """Writes geometric depth and normal maps to the workspace; returns for every view why it has none, or None."""
+    """Writes geometric depth and normal maps to the workspace; returns None per view, or why it has no map."""
 
     def __call__(self, task: "DepthTask", /) -> list[Rejected | None]: ...
 
@@ -101,25 +101,25 @@ def _no_reason() -> str:
 
 @dataclass(frozen=True, slots=True)
 class DepthMethod:
-    """A named way to make depth maps."""
+    """A named method for depth maps."""
 
     name: str
     make: MakeDepthMaps
     summary: str = ""
     unavailable: Callable[[], str] = _no_reason
-    """Why it cannot run on this machine; empty where it can."""
+    """Reason why it cannot run on this machine; empty if it can."""
 
 
 @dataclass(frozen=True, slots=True)
 class FeatureMethod:
-    """A named way to find features and to match them: two functions, or COLMAP's SIFT with other options."""
+    """A named method for features and matches: two functions, or COLMAP's SIFT with other options."""
 
     name: str
     find: FindFeatures | None = None
     match: MatchFeatures | None = None
     summary: str = ""
     unavailable: Callable[[], str] = _no_reason
-    """Why it cannot run on this machine; empty where it can."""
+    """Reason why it cannot run on this machine; empty if it can."""
     sift: Mapping[str, bool | int | float] | None = None
     """In place of functions: options of COLMAP's SIFT extraction that differ from its defaults."""
 
@@ -127,7 +127,7 @@ class FeatureMethod:
         functions = [self.find, self.match].count(None)
         if functions != (0 if self.sift is None else 2):
             raise PluginError(
-                f"the features '{self.name}' have to come with `find` and `match`, or with options of SIFT alone",
+                f"the feature method '{self.name}' needs `find` and `match`, or only options of SIFT",
                 hint="docs/plugins.md shows how",
             )
 
@@ -136,7 +136,7 @@ class FeatureMethod:
 
 
 class Hooks:
-    """What a plug-in may define, all optional."""
+    """The hooks of a plug-in, all optional."""
 
     @hookspec
     def sfm_estimators(self) -> Iterable[Estimator]:  # type: ignore[empty-body]
@@ -148,7 +148,7 @@ class Hooks:
 
     @hookspec
     def sfm_features(self) -> Iterable[FeatureMethod]:  # type: ignore[empty-body]
-        """Return ways to find features and to match them."""
+        """Return methods for features and matches."""
 
     @hookspec
     def sfm_exporters(self) -> Iterable[Exporter]:  # type: ignore[empty-body]
@@ -160,12 +160,12 @@ class Hooks:
 
     @hookspec
     def sfm_depth_methods(self) -> Iterable[DepthMethod]:  # type: ignore[empty-body]
-        """Return ways to make depth maps."""
+        """Return methods for depth maps."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plugins:
-    """Everything that can be chosen by name."""
+    """All methods and formats by name."""
 
     estimators: Mapping[str, Estimator]
     calibrators: Mapping[str, Calibrator]
@@ -175,44 +175,44 @@ class Plugins:
     features: Mapping[str, FeatureMethod]
 
     def estimator(self, name: str) -> Estimator:
-        """Return the estimator of that name; ConfigError names the known ones."""
+        """Return an estimator; ConfigError names the known ones."""
         return _look_up(self.estimators, name, "estimator")
 
     def calibrator(self, name: str) -> Calibrator:
-        """Return the calibrator of that name; ConfigError names the known ones."""
+        """Return a calibrator; ConfigError names the known ones."""
         return _look_up(self.calibrators, name, "calibrator")
 
     def exporter(self, name: str) -> Exporter:
-        """Return the file format for models of that name; ConfigError where there is none, or it cannot run here."""
+        """Return a file format for models; ConfigError where it is unknown or cannot run here."""
         return _check_available(_look_up(self.exporters, name, "file format"))
 
     def scene_exporter(self, name: str) -> SceneExporter:
-        """Return the format for scenes of that name; ConfigError as in `exporter`."""
+        """Return a format for scenes; ConfigError as in `exporter`."""
         return _check_available(_look_up(self.scene_exporters, name, "format for scenes"))
 
     def feature_method(self, name: str) -> FeatureMethod:
-        """Return the way to find features of that name; ConfigError where there is none, or it cannot run here."""
-        method = _look_up(self.features, name, "way to find features")
+        """Return a feature method; ConfigError where it is unknown or cannot run here."""
+        method = _look_up(self.features, name, "feature method")
         if reason := method.unavailable():
             hint = f"'{SIFT}' runs everywhere"
-            raise ConfigError(f"the features '{name}' cannot be used here: {reason}", hint=hint)
+            raise ConfigError(f"the feature method '{name}' cannot run here: {reason}", hint=hint)
         return method
 
     def depth_method(self, name: str) -> tuple[DepthMethod, str]:
-        """Return the way to make depth maps of that name, or with "auto" the best that runs here, and why this one.
+        """Return a depth method, or with "auto" the best that runs here, and the reason of the choice.
 
         Raises:
-            ConfigError: no method has that name, or it cannot run on this machine.
+            ConfigError: no method has this name, or it cannot run on this machine.
         """
         if name != AUTO:
             method = _look_up(self.depth_methods, name, "depth method")
             if reason := method.unavailable():
                 raise ConfigError(
                     f"the depth method '{name}' cannot run here: {reason}",
-                    hint=f"'{AUTO}' takes what this machine can do, '{CPU}' runs everywhere",
+                    hint=f"'{AUTO}' chooses the best method of this machine, '{CPU}' runs everywhere",
                 )
-            return method, "asked for"
-        # an installed method is meant to be used
+            return method, "chosen in the settings"
+        # an installed method has preference
         others = [method for method in self.depth_methods.values() if method.name != CPU]
         reasons = {method.name: method.unavailable() for method in others}
         for method in others:
@@ -223,20 +223,20 @@ class Plugins:
 
 
 def load_plugins(modules: Sequence[ModuleType | object] = (), *, installed: bool = True) -> Plugins:
-    """Register the built-ins, the given modules and, if wanted, every installed plug-in.
+    """Register the built-ins, the given modules and, if `installed`, every installed plug-in.
 
-    Without arguments the result is cached for the process: the search through all installed packages takes
-    milliseconds, longer than an estimator needs for an easy pair. `installed_plugins.cache_clear()` resets it.
+    Without arguments the result is cached for the process: the search through all packages takes longer than an easy
+    pair. `installed_plugins.cache_clear()` resets it.
 
     Raises:
-        PluginError: a hook is misspelt, a plug-in does not import, or two things share a name.
+        PluginError: a hook is misspelt, a plug-in does not import, or two methods share a name.
     """
     return installed_plugins() if installed and not modules else _load(modules, installed)
 
 
 @cache
 def installed_plugins() -> Plugins:
-    """Return the built-ins and every installed plug-in, as they were at the first call; errors as in `load_plugins`."""
+    """Return the built-ins and every plug-in installed at the first call; errors as in `load_plugins`."""
     return _load((), installed=True)
 
 
@@ -266,7 +266,7 @@ def _load(modules: Sequence[ModuleType | object], installed: bool) -> Plugins:
 
 @cache
 def _part_here(kind: str, name: str) -> Any:
-    """Return a part by its name in another process; no plug-in is loaded for what ships with the program."""
+    """Return a method by name in another process; built-in ones load no plug-in."""
     built_in = getattr(_load((), installed=False), kind)
     return built_in[name] if name in built_in else _look_up(getattr(installed_plugins(), kind), name, kind)
 
@@ -279,14 +279,14 @@ class _NamedPart(Protocol):
 Part = TypeVar("Part", bound=_NamedPart)
 
 
-def _index_by_name(results: Iterable[Iterable[Part]], taken: Iterable[str] = ()) -> Mapping[str, Part]:
+def _index_by_name(results: Iterable[Iterable[Part]], others: Iterable[str] = ()) -> Mapping[str, Part]:
     # pluggy calls the last registered first; reversed, the built-ins lead every listing
-    found: dict[str, Part] = {}
+    by_name: dict[str, Part] = {}
     for part in (part for parts in reversed(list(results)) for part in parts):
-        if part.name in found or part.name in taken:
+        if part.name in by_name or part.name in others:
             raise PluginError(f"two plug-ins offer '{part.name}'", hint="uninstall one of them")
-        found[part.name] = part
-    return MappingProxyType(found)
+        by_name[part.name] = part
+    return MappingProxyType(by_name)
 
 
 Format = TypeVar("Format", Exporter, SceneExporter)

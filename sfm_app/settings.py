@@ -16,8 +16,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from sfm_app.errors import ConfigError
 from sfm_app.wording import parse_length, parse_point
 
-# The tables of the settings file: every option in them, typed, with unit, range and one line of help.
-
 CameraModelName = Literal[
     "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_FISHEYE",
     "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "EQUIRECTANGULAR",
@@ -28,12 +26,9 @@ MarkerFamily = Literal[
 ]  # fmt: skip
 ConstraintForm = Literal["huang-faugeras", "frobenius", "trivedi", "polynomial"]
 AS_NEEDED, MOST_LEVELS = 0, 4
-"""Sizes at which depth maps are made: 0 for as many as the photos need, and the most. Chosen by hand: an eighth of a
-photo shows next to nothing."""
-
-
+"""Numbers of sizes of depth maps: 0 for as many as the photos need, and the most. Chosen by hand."""
 LOCAL_ADDRESS = re.compile(r"local:([1-9]\d{0,2})")
-"""So many processes of this machine as a cluster."""
+"""A cluster of so many processes of this machine."""
 SCHEDULER_ADDRESS = re.compile(r"(?:[a-z]+://)?(?:[\w.-]+|\[[\da-fA-F:.]+\]):\d{1,5}")
 """Host, IPv4 or IPv6 address, and port, with Dask's name of a protocol or without."""
 
@@ -45,7 +40,7 @@ class Section(BaseModel):
 
 
 class PhotoSettings(Section):
-    """Which photos are used and which of them share a camera."""
+    """Photos, and cameras that they share."""
 
     images: str = Field("", description="text file that names the photos to use, one per line; all where empty")
     masks: str = Field(
@@ -65,7 +60,7 @@ class PhotoSettings(Section):
 class MatchSettings(Section):
     """Features and matches."""
 
-    features: str = Field("sift", description="name of the way to find and match features (see `sfm-app plugins`)")
+    features: str = Field("sift", description="name of the feature method (see `sfm-app plugins`)")
     max_image_size_px: int = Field(
         1600, ge=128, le=16384, description="longer side at which features are found, in pixels"
     )
@@ -85,7 +80,7 @@ class MatchSettings(Section):
         description="pairs to match: all; retrieval: photos that look alike; sequence: mostly neighbors by name or "
         "time; auto: all where that is cheaper, else retrieval",
     )
-    neighbors: int = Field(30, ge=4, le=1000, description="photos that each one is matched with, where not with all")
+    neighbors: int = Field(30, ge=4, le=1000, description="photos to match with each one, where not all are")
 
 
 class EpipolarSettings(Section):
@@ -164,12 +159,12 @@ class SceneSettings(Section):
 
 
 class ScaleSettings(Section):
-    """Real size: what is known of lengths and places in the scene. Poses and depth do not depend on it."""
+    """Real size: known lengths and places in the scene. Poses and depth do not depend on it."""
 
     distances: tuple[tuple[str, str, str], ...] = Field(
         (),
-        description='known distances, each ["x,y,z", "x,y,z", "1.25m"]: two points in the unit of OUT/sparse, and how '
-        "far apart they are; measure in the report prints them",
+        description='known distances, each ["x,y,z", "x,y,z", "1.25m"]: two points in the unit of OUT/sparse, and '
+        "their distance; measure in the report prints them",
     )
     markers: str = Field(
         "", description="side of the dark square of printed ArUco or AprilTag markers, such as 50mm; none where empty"
@@ -182,7 +177,7 @@ class ScaleSettings(Section):
     @field_validator("markers")
     @classmethod
     def check_side(cls, side: str) -> str:
-        """Return a length after checking its form; ValueError where it is none."""
+        """Return a valid length; ValueError otherwise."""
         if side:
             parse_length(side)
         return side
@@ -190,10 +185,10 @@ class ScaleSettings(Section):
     @field_validator("distances")
     @classmethod
     def check_distances(cls, distances: tuple[tuple[str, str, str], ...]) -> tuple[tuple[str, str, str], ...]:
-        """Return distances after checking their form; ValueError where a point or a length is none."""
+        """Return valid distances; ValueError otherwise."""
         for first, second, length in distances:
             if parse_point(first) == parse_point(second):
-                raise ValueError("a distance needs two points")
+                raise ValueError("a distance needs two different points")
             parse_length(length)
         return distances
 
@@ -210,11 +205,11 @@ class DepthSettings(Section):
         AS_NEEDED,
         ge=AS_NEEDED,
         le=MOST_LEVELS,
-        description="sizes at which depth maps are made, each half of the one before: smaller ones find more of plain "
-        "walls, furniture and floors, and what is plain between known surfaces gets their plane; 0: a second one where "
-        "the first leaves much open",
+        description="sizes of depth maps, each half of the one before: smaller ones find more of plain walls, "
+        "furniture and floors, and plain areas between known surfaces get their plane; 0: a second one where the first "
+        "leaves much open",
     )
-    neighbors: int = Field(4, ge=1, le=20, description="photos that each photo is matched with")
+    neighbors: int = Field(4, ge=1, le=20, description="photos to match with each one")
     consistency: float = Field(
         0.01, gt=0, le=1, description="largest relative depth difference between photos that agree"
     )
@@ -228,9 +223,9 @@ class MeshSettings(Section):
     """The surface through the depth maps."""
 
     poisson_depth: int = Field(12, ge=5, le=14, description="greatest depth of the Poisson octree")
-    trim: bool = Field(True, description="cut off surface that no photo confirms; false closes large holes by a guess")
+    trim: bool = Field(True, description="remove surface that no photo confirms; false: close large holes by a guess")
     max_gap_triangles: float = Field(
-        20.0, ge=0, le=1000, description="gaps in what photos confirm are closed up to this width, in triangles"
+        20.0, ge=0, le=1000, description="largest width of a gap in the confirmed surface that is closed, in triangles"
     )
     min_island: float = Field(
         0.003, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped"
@@ -242,8 +237,8 @@ class MeshSettings(Section):
         1600,
         ge=0,
         le=16384,
-        description="longer side of the photos by which the surface is refined, in pixels: it moves to where they "
-        "agree best; 0: it stays as the depth maps have it",
+        description="longer side of the photos that refine the surface, in pixels: it moves to where they agree best; "
+        "0: no refinement",
     )
     faces: int = Field(
         200_000, ge=100, le=50_000_000, description="most triangles of the finished mesh, or of each of its blocks"
@@ -252,7 +247,7 @@ class MeshSettings(Section):
         4_000_000,
         ge=1000,
         le=1_000_000_000,
-        description="more points of depth maps than these are meshed in blocks of half as many",
+        description="most points of depth maps in one mesh; more are meshed in blocks of half as many",
     )
 
 
@@ -264,17 +259,17 @@ class TextureSettings(Section):
         4, ge=1, le=64, description="most pages of texture for each 400 000 triangles; more detail is scaled down"
     )
     unseen_faces: Literal["color", "cut"] = Field(
-        "color", description="triangles that no photo sees: color: painted like what is around them; cut: left out"
+        "color", description="triangles that no photo sees: color: painted like their surroundings; cut: removed"
     )
     trim_borders: bool = Field(
         True,
-        description="cut off borders of the surface about whose color photos disagree: they show what lies behind; "
+        description="remove borders of the surface where photos disagree about the color: they show the background; "
         "false, or where `mesh.trim` is false: keep them",
     )
     normal_map: bool = Field(
         False,
-        description="keep the detail that simplification takes away as a normal map, which shows under light; false: "
-        "none, shown unlit",
+        description="keep the detail that simplification removes as a normal map, visible under light; false: none, "
+        "shown unlit",
     )
 
 
@@ -293,17 +288,15 @@ class ClusterSettings(Section):
     @field_validator("address")
     @classmethod
     def check_address(cls, address: str) -> str:
-        """Return an address after checking its form; ValueError where it has none."""
+        """Return a valid address; ValueError otherwise."""
         form = LOCAL_ADDRESS if address.startswith("local:") else SCHEDULER_ADDRESS
         if address and not form.fullmatch(address):
             raise ValueError("should be HOST:PORT or local:N")
         return address
 
 
-# Settings files: TOML in and out.
-
 MOST_TOML_BYTES = 20_000
-"""Most bytes of a settings file. One with every setting has a fifth; a megabyte of dots takes minutes to parse."""
+"""Largest settings file. One with every setting has a fifth; a megabyte of dots takes minutes to parse."""
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -324,11 +317,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def toml_lines(section: BaseModel, table: str = "") -> Iterator[str]:
-    """Yield the lines of a settings file, with the help of each setting as a comment.
-
-    Args:
-        table: its name in the file; empty for the top.
-    """
+    """Yield the lines of a settings file, with the help of each setting as a comment; the top table has no name."""
     fields = type(section).model_fields
     tables = [name for name in fields if isinstance(getattr(section, name), BaseModel)]
     if table:
@@ -340,16 +329,13 @@ def toml_lines(section: BaseModel, table: str = "") -> Iterator[str]:
         yield from toml_lines(getattr(section, name), name)
 
 
-# All settings of a run, from defaults, the quality preset, the TOML file and flags, in rising priority.
-
-MAX_PROBLEMS, MAX_VALUE_CHARS = 20, 100
-"""Most problems that an error lists, and most characters of a wrong value that it shows."""
-
+MAX_PROBLEMS = 20
+"""Most problems in an error message."""
 Quality = Literal["draft", "normal", "high"]
 
 
 class Settings(Section):
-    """All settings of a run."""
+    """All settings of a run: from defaults, the quality preset, the TOML file and flags, in rising priority."""
 
     seed: int = Field(0, ge=0, lt=2**32, description="same seed, same result")
     workers: int = Field(0, ge=0, le=1024, description="parallel workers; 0: one per core")
@@ -425,11 +411,7 @@ QUALITY_PRESETS: dict[str, dict[str, Any]] = {
 
 
 def merge_nested(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
-    """Return two nested mappings merged into one.
-
-    Args:
-        low: values that are used where `high` has none.
-    """
+    """Return two nested mappings merged into one; values of `high` win."""
     result = dict(low)
     for key, value in high.items():
         below = result.get(key)
@@ -454,4 +436,4 @@ def _abbreviate(value: object) -> str:
         text = repr(value)
     except (RecursionError, ValueError):  # deeply nested values, numbers of thousands of digits
         text = f"a {type(value).__name__}"
-    return text if len(text) <= MAX_VALUE_CHARS else f"{text[:MAX_VALUE_CHARS]}..."
+    return text if len(text) <= 100 else f"{text[:100]}..."

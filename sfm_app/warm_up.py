@@ -21,20 +21,15 @@ from sfm_app.synthetic.cameras import look_at
 from sfm_app.types.arrays import FloatArray
 
 WIDTH, HEIGHT, FOCAL = 480, 360, 520.0
-"""Of the photos, in pixels: the smallest that are mapped with certainty. Chosen by hand."""
-PHOTOS = 6
+"""Size and focal length of the photos in pixels: small, and mapped with certainty. Chosen by hand."""
 SIDE = 640
-"""Of the pictures on the walls, in pixels."""
-NICENESS = 5
-"""Added to that of the run, which needs the cores more. Chosen by hand."""
-
-
+"""Side of the pictures on the walls, in pixels."""
 SETTINGS = {
     "report": False,
     "matching": {"enlarge_below": 0, "max_features": 2000},
     "depth": {"max_image_size_px": 240},
 }
-"""That save time, and change none of the kernels."""
+"""Settings that save time and need the same kernels."""
 
 
 def write_photos(folder: Path) -> None:
@@ -44,7 +39,7 @@ def write_photos(folder: Path) -> None:
     walls = [(np.roll(corners, turn, axis=1), _noise(rng)) for turn in range(3)]
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     folder.mkdir(parents=True)
-    for number, angle in enumerate(np.linspace(0.35, 1.2, PHOTOS)):
+    for number, angle in enumerate(np.linspace(0.35, 1.2, 6)):
         center = np.array([4.0 * np.sin(angle), 1.6 + 0.2 * (number % 2), 4.0 * np.cos(angle)])
         photo = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
         for wall, picture in walls:
@@ -62,9 +57,9 @@ def _noise(rng: np.random.Generator) -> NDArray[np.uint8]:
 
 def _paste(photo: NDArray[np.uint8], picture: NDArray[np.uint8], P: FloatArray, wall: FloatArray) -> None:
     """Paint a wall, given by its four corners (4, 3), into a photo with the projection matrix P."""
-    seen = np.column_stack([wall, np.ones(4)]) @ P.T
+    pixels = np.column_stack([wall, np.ones(4)]) @ P.T
     corners = np.array([[0, 0], [SIDE, 0], [SIDE, SIDE], [0, SIDE]], np.float32)
-    H = cv2.getPerspectiveTransform(corners, np.asarray(seen[:, :2] / seen[:, 2:], np.float32))
+    H = cv2.getPerspectiveTransform(corners, np.asarray(pixels[:, :2] / pixels[:, 2:], np.float32))
     cv2.warpPerspective(picture, H, (WIDTH, HEIGHT), dst=photo, flags=cv2.INTER_AREA, borderMode=cv2.BORDER_TRANSPARENT)
 
 
@@ -74,11 +69,11 @@ def _end(folder: Path) -> None:
 
 
 def main() -> None:
-    """Compile, and note that it is done, even where a part of it fails: the next run would fare no better."""
+    """Compile, and touch `WARM` even after a failure, which the next run would repeat."""
     folder = Path(sys.argv[1])
     if PARENT in os.environ:
         watch_parent(int(os.environ[PARENT]), partial(_end, folder))
-        yield_to_others(NICENESS)
+        yield_to_others(5)  # the run needs the cores more
     os.environ[PARENT] = str(os.getpid())
     try:
         write_photos(folder / "photos")

@@ -23,7 +23,7 @@ from sfm_app.errors import ConfigError
 from sfm_app.fundamental.refits import refine_sampson
 from sfm_app.geometry.epipolar import fundamental_from_pose, sampson_distance
 from sfm_app.retrieval import choose_by_rank
-from sfm_app.synthetic.correspondences import FAR, MAX_SETUPS, NEAR, PairOptions, TwoViews, make_pair, random_rotation
+from sfm_app.synthetic.correspondences import DEPTHS, MAX_SETUPS, PairOptions, TwoViews, make_pair, random_rotation
 from sfm_app.types import Calibration, EpipolarFit, MatchedImage, MatchGraph, PairId, RelativePose, ViewGraph
 
 FloatArray = NDArray[np.float64]
@@ -94,7 +94,7 @@ def _moving_object(
     size = np.array([options.width, options.height])
     for _ in range(MAX_SETUPS):
         pixel = np.append(rng.uniform(size=2) * size, 1.0)
-        center = np.linalg.inv(still.K1) @ pixel * rng.uniform(NEAR, FAR)
+        center = np.linalg.inv(still.K1) @ pixel * rng.uniform(*DEPTHS)
         turn = random_rotation(rng, MAX_TURN_DEG)
         shift = rng.uniform(-MAX_SHIFT, MAX_SHIFT, 3)
         R, t = still.R @ turn, still.R @ (center + shift - turn @ center) + still.t
@@ -102,7 +102,7 @@ def _moving_object(
         radii = rng.uniform(*RADIUS) * rng.uniform(size=(8 * count, 1)) ** (1 / 3)
         X = center + radii * directions / np.linalg.norm(directions, axis=1, keepdims=True)
         depths = np.stack([X[:, 2], (X @ R.T + t)[:, 2]])
-        X = X[(depths > NEAR / 4).all(axis=0)]
+        X = X[(depths > DEPTHS[0] / 4).all(axis=0)]
         x1, x2 = _project_object(still.K1, X), _project_object(still.K2, X @ R.T + t)
         seen = np.flatnonzero(((x1 >= 0) & (x1 <= size) & (x2 >= 0) & (x2 <= size)).all(axis=1))[:count]
         if len(seen) < count:

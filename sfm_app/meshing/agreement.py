@@ -1,9 +1,9 @@
-"""How photos agree on a surface, and which way each vertex would have to move.
+"""Agreement of photos on a surface, and the displacement of each vertex that would improve it.
 
-A photo is seen through the surface from another one. Where both differ after local brightness and contrast have been
-made equal, the surface is too near or too far: the difference divided by its derivative along the viewing ray is the
-distance (Vu, Labatut, Pons, Keriven: High accuracy and visibility-consistent dense multiview stereo. PAMI 2012, with a
-gradient descent; here in Gauss-Newton steps, which need a tenth of the iterations).
+A photo is warped through the surface into another one. Where both differ at equal local brightness and contrast, the
+surface is too near or too far: the difference divided by its derivative along the viewing ray is the distance (Vu,
+Labatut, Pons, Keriven: High accuracy and visibility-consistent dense multiview stereo. PAMI 2012, with a gradient
+descent; here in Gauss-Newton steps, which need a tenth of the iterations).
 """
 
 from collections.abc import Iterable
@@ -17,13 +17,21 @@ from numpy.typing import NDArray
 from sfm_app.jit import kernel
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-# A photo at some resolution, with its gradients.
-
 Gray = NDArray[np.float32]
 
-BLUR_PX = 0.6
-"""Standard deviation of the blur before gradients are taken: less leaves noise, more loses detail. Chosen on the scene
-`ornament`; not measured on its own."""
+NOTHING = -1
+"""Triangle of a pixel that shows none."""
+REACH = 3
+"""Pixels from the middle of a window to its border; windows have the same brightness and contrast in both photos.
+Chosen on `ornament`."""
+NOISE_GRAY = 3.0
+"""Standard deviation of gray levels that the surface does not explain. Chosen by hand."""
+OUTLIER = 3.0
+"""Differences of this many deviations count half (Cauchy). By definition of the weight."""
+UNRELATED, RELATED = 0.1, 0.5
+"""Correlations of a window at which it counts nothing, and fully. Chosen by hand."""
+LEAST_FACING = 0.2
+"""Least cosine between the normal and the rays to both photos. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +47,7 @@ class RefinePhoto:
     gray: NDArray[np.uint8]
     """(H, W)."""
     masked: NDArray[np.bool_] | None = None
-    """(H, W) what a mask leaves out; None without a mask."""
+    """(H, W) masked pixels."""
 
     @property
     def center(self) -> FloatArray:
@@ -63,7 +71,7 @@ class RefinePhoto:
         return np.asarray(scale @ self.K @ np.column_stack([self.R, self.t]))
 
     def mask_at(self, share: float) -> NDArray[np.bool_] | None:
-        """Return the mask at a share of the full resolution: pixels of which any part is left out."""
+        """Return the mask at a share of the full resolution: pixels of which any part is masked."""
         if self.masked is None:
             return None
         size = self.size_at(share)[::-1]
@@ -75,7 +83,7 @@ class RefinePhoto:
         small = self.gray
         if (height, width) != small.shape:
             small = np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-        gray = np.asarray(cv2.GaussianBlur(small.astype(np.float32), (0, 0), BLUR_PX), np.float32)
+        gray = np.asarray(cv2.GaussianBlur(small.astype(np.float32), (0, 0), 0.6), np.float32)  # chosen on `ornament`
         by_x, by_y = (cv2.Sobel(gray, cv2.CV_32F, *axis, ksize=3, scale=1.0 / 8.0) for axis in ((1, 0), (0, 1)))
         projection = self.projection(share)
         rays = np.asarray(np.linalg.inv(projection[:, :3]), np.float64)
@@ -96,21 +104,14 @@ class PhotoLevel:
     """(H, W, 3) gray levels, and their derivatives by x and by y, per pixel."""
 
 
-# Draw a surface into a photo: which triangle each pixel shows, and how far away.
-
-NOTHING = -1
-NEAREST = 1e-6
-"""Depth below which nothing is drawn, in scene units. By definition: rounding."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Raster:
-    """A surface as a photo sees it."""
+    """A surface drawn into a photo."""
 
     depth: NDArray[np.float32]
-    """(H, W) along the optical axis; infinite where nothing is."""
+    """(H, W) along the optical axis; infinite without surface."""
     face: NDArray[np.int32]
-    """(H, W) triangle; NOTHING where none is, or where its back is seen."""
+    """(H, W) triangle; NOTHING without surface, or where the photo sees its back."""
 
 
 def rasterize(vertices: FloatArray, faces: IndexArray, projection: FloatArray, size: tuple[int, int]) -> Raster:
@@ -129,49 +130,43 @@ def rasterize(vertices: FloatArray, faces: IndexArray, projection: FloatArray, s
 
 
 def project_vertices(vertices: FloatArray, projection: FloatArray) -> FloatArray:
-    """Return the pixels x, y of vertices and 1 / depth (V, 3); -1 for the last where one is not in front of the photo.
-
-    Args:
-        vertices: (V, 3).
-        projection: (3, 4) K [R | t].
-    """
-    seen = np.empty((len(vertices), 3))
-    _project(vertices, projection, seen)
-    return seen
+    """Return pixels x, y and 1 / depth (V, 3) of vertices (V, 3); the last is -1 behind the photo."""
+    pixels = np.empty((len(vertices), 3))
+    _project(vertices, projection, pixels)
+    return pixels
 
 
 @kernel
-def _project(vertices: FloatArray, P: FloatArray, seen: FloatArray) -> None:
-    """Fill in the pixels of vertices, and 1 / depth, or -1 for those that are not in front of the photo."""
+def _project(vertices: FloatArray, P: FloatArray, pixels: FloatArray) -> None:
     for k in range(len(vertices)):
         x, y, z = vertices[k, 0], vertices[k, 1], vertices[k, 2]
         w = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
-        near = 1.0 / w if w > NEAREST else -1.0
-        seen[k, 0] = near * (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3])
-        seen[k, 1] = near * (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3])
-        seen[k, 2] = near
+        near = 1.0 / w if w > 1e-6 else -1.0  # in scene units; by definition: rounding
+        pixels[k, 0] = near * (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3])
+        pixels[k, 1] = near * (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3])
+        pixels[k, 2] = near
 
 
 @kernel
-def _draw(seen: FloatArray, faces: IndexArray, nearness: NDArray[np.float32], face: NDArray[np.int32]) -> None:
-    """Fill in 1 / depth, which is linear in the photo, and the triangles; `seen` has pixels and 1 / depth."""
+def _draw(pixels: FloatArray, faces: IndexArray, nearness: NDArray[np.float32], face: NDArray[np.int32]) -> None:
+    """Fill in 1 / depth, which is linear in the photo, and the triangles; `pixels` from `project_vertices`."""
     height, width = face.shape
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ax, ay, bx, by, cx, cy = seen[a, 0], seen[a, 1], seen[b, 0], seen[b, 1], seen[c, 0], seen[c, 1]
+        ax, ay, bx, by, cx, cy = pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1], pixels[c, 0], pixels[c, 1]
         low, high = min(ay, by, cy), max(ay, by, cy)
-        if high < 0.5 or low > height - 0.5 or min(seen[a, 2], seen[b, 2], seen[c, 2]) < 0.0:
+        if high < 0.5 or low > height - 0.5 or min(pixels[a, 2], pixels[b, 2], pixels[c, 2]) < 0.0:
             continue
         left, right = min(ax, bx, cx), max(ax, bx, cx)
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if right < 0.5 or left > width - 0.5 or area == 0.0:
             continue
         first_column, last_column = max(int(left + 0.5), 0), min(int(right + 0.5), width)
-        near, over = seen[a, 2], 1.0 / area
+        near, over = pixels[a, 2], 1.0 / area
         # changes of both weights per pixel, and of nearness with them
         bdx, bdy, cdx, cdy = (cy - ay) * over, (ax - cx) * over, (ay - by) * over, (bx - ax) * over
-        to_b, to_c = seen[b, 2] - near, seen[c, 2] - near
-        shown = f if area < 0.0 else NOTHING  # rows run down: what is counterclockwise has a negative area here
+        to_b, to_c = pixels[b, 2] - near, pixels[c, 2] - near
+        shown = f if area < 0.0 else NOTHING  # rows run down: counterclockwise triangles have a negative area
         for i in range(max(int(low + 0.5), 0), min(int(high + 0.5), height)):
             y = i + 0.5 - ay
             for j in range(first_column, last_column):
@@ -185,29 +180,9 @@ def _draw(seen: FloatArray, faces: IndexArray, nearness: NDArray[np.float32], fa
                     face[i, j] = shown
 
 
-REACH = 3
-"""Pixels from the middle of a window to its border; brightness and contrast are made equal in windows. Chosen on
-`ornament`."""
-NOISE_GRAY = 3.0
-"""Standard deviation of gray levels that the surface does not explain. Chosen by hand."""
-OUTLIER = 3.0
-"""Differences of this many deviations count half (Cauchy). By definition of the weight."""
-UNRELATED, RELATED = 0.1, 0.5
-"""Correlations of a window at which it counts nothing, and fully. Chosen by hand."""
-LEAST_FACING = 0.2
-"""Least cosine between the normal and the rays to both photos. Chosen by hand."""
-HIDDEN = 0.003
-"""Relative difference in depth from what the other photo sees there, beyond which a place is hidden from it. Chosen by
-hand."""
-LEAST_SEEN = 0.6
-"""Least share of a window that both photos see. Chosen by hand."""
-SUMS = 7
-"""Sums over a window: pixels, both gray levels, their squares and product, and the slope."""
-
-
 @dataclass(slots=True, eq=False)
 class Pull:
-    """What photos say about the displacement d of each vertex along its normal: cost - 2 g d + h d^2."""
+    """The cost - 2 g d + h d^2 of the displacement d of each vertex along its normal, in terms of the photos."""
 
     g: FloatArray
     """(V,)."""
@@ -220,11 +195,11 @@ class Pull:
 
     @classmethod
     def zeros(cls, count: int) -> "Pull":
-        """Make that of `count` vertices which nothing pulls."""
+        """Make the pull of no photo on `count` vertices."""
         return cls(np.zeros(count), np.zeros(count))
 
     def add(self, other: "Pull") -> None:
-        """Add what other photos say."""
+        """Add the pull of other photos."""
         self.g += other.g
         self.h += other.h
         self.correlation += other.correlation
@@ -240,18 +215,18 @@ class Sight:
 
 
 def compare(vertices: FloatArray, faces: IndexArray, normals: Gray, here: Sight, others: Iterable[Sight]) -> Pull:
-    """Return what a photo and others say about the displacement of the vertices.
+    """Return the pull of the differences between a photo and others.
 
     Args:
         vertices: (V, 3).
         faces: (T, 3).
         normals: (T, 3) of the triangles, unit.
     """
-    found, level, raster = Pull.zeros(len(vertices)), here.level, here.raster
+    pull, level, raster = Pull.zeros(len(vertices)), here.level, here.raster
     shape = raster.depth.shape
     g, h = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     views = np.empty((*shape, 3), np.float32)
-    sums = np.empty((SUMS, shape[1]))
+    sums = np.empty((7, shape[1]))
     for other in others:
         H, p = other.level.projection[:, :3] @ level.rays, other.level.projection @ np.append(level.center, 1.0)
         _look_through(
@@ -259,19 +234,21 @@ def compare(vertices: FloatArray, faces: IndexArray, normals: Gray, here: Sight,
             (other.level.image, other.raster.depth), views,
         )  # fmt: skip
         correlation, pixels = _weigh(level.image, views, sums, g, h)
-        found.correlation += correlation
-        found.pixels += pixels
-    _sum_up((vertices, faces), (raster.face, raster.depth), (level.rays, level.center), (g, h), (found.g, found.h))
-    return found
+        pull.correlation += correlation
+        pull.pixels += pixels
+    _sum_up((vertices, faces), (raster.face, raster.depth), (level.rays, level.center), (g, h), (pull.g, pull.h))
+    return pull
 
 
 @kernel
 def _look_through(surface: Any, homography: Any, eyes: Any, other: Any, views: Gray) -> None:
-    """Fill in what the other photo shows at each pixel, its change per displacement of the surface, and 1 or 0: seen.
+    """Fill `views` (H, W, 3): gray level of the other photo, its change per displacement, and 1 where visible, else 0.
 
-    Arguments: the surface in the photo; what takes its pixels at depth z to those of the other one, z H x + p; rays of
-    the photo and the way to its center from the other one; the other photo, and the depths of the surface in it;
-    (H, W, 3) for what is found.
+    Args:
+        surface: depth, face and normals of the triangles in the photo.
+        homography: H and p take pixel x at depth z to z H x + p of the other photo.
+        eyes: rays of the photo, and its center relative to that of the other.
+        other: the other photo, and the depths of the surface in it.
     """
     depth, face, normals = surface
     H, p = homography
@@ -296,7 +273,7 @@ def _look_through(surface: Any, homography: Any, eyes: Any, other: Any, views: G
             if not (0.5 <= u < width - 0.5 and 0.5 <= v < height - 0.5):
                 continue
             col, row = min(int(u - 0.5), width - 2), min(int(v - 0.5), height - 2)
-            limit = HIDDEN * w
+            limit = 0.003 * w  # beyond, the place is hidden from the other photo; by hand
             near = int(abs(other_depth[row, col] - w) <= limit) + int(abs(other_depth[row, col + 1] - w) <= limit)
             near += int(abs(other_depth[row + 1, col] - w) <= limit)
             near += int(abs(other_depth[row + 1, col + 1] - w) <= limit)
@@ -329,16 +306,16 @@ def _look_through(surface: Any, homography: Any, eyes: Any, other: Any, views: G
 
 @kernel
 def _weigh(image: Gray, views: Gray, sums: FloatArray, g: Gray, h: Gray) -> tuple[float, float]:
-    """Add what each pixel says about the displacement; return the sum of correlations, and the number of pixels.
+    """Add the cost of each pixel to g and h; return the sum of correlations, and the number of pixels.
 
-    Windows have the same mean and contrast in both photos. `sums` (SUMS, W) is overwritten: sums over the rows of a
-    window.
+    Windows get the same mean and contrast in both photos. `sums` (7, W) is overwritten with sums over the rows of a
+    window: pixels, both gray levels, their squares and product, and the slope.
     """
     height, width = views.shape[0], views.shape[1]
     sums[:] = 0.0
     total, count = 0.0, 0.0
     noise = NOISE_GRAY * NOISE_GRAY
-    least = LEAST_SEEN * (2 * REACH + 1) ** 2
+    least = 0.6 * (2 * REACH + 1) ** 2  # pixels of a window that both photos see; by hand
     for i in range(-REACH, height):
         if i + REACH < height:
             _add_row(image, views, i + REACH, 1.0, sums)
@@ -396,13 +373,13 @@ def _add_row(image: Gray, views: Gray, i: int, sign: float, sums: FloatArray) ->
 
 
 @kernel
-def _sum_up(mesh: Any, raster: Any, eye: Any, said: Any, found: Any) -> None:
-    """Add what each pixel says to the corners of its triangle, by its place on it."""
+def _sum_up(mesh: Any, raster: Any, eye: Any, costs: Any, sums: Any) -> None:
+    """Add the cost of each pixel to the corners of its triangle, by its place on it."""
     vertices, faces = mesh
     face, depth = raster
     M, center = eye
-    g, h = said
-    whole_g, whole_h = found
+    g, h = costs
+    whole_g, whole_h = sums
     for i in range(face.shape[0]):
         y = i + 0.5
         for j in range(face.shape[1]):

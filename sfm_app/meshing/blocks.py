@@ -1,4 +1,10 @@
-"""Blocks of a large scene, and the weld of their meshes."""
+"""Blocks of a large scene, and the weld of their meshes.
+
+Blocks are boxes with about as many points each, the leaves of a k-d tree (Bentley, CACM 1975). The surfaces of two
+blocks overlap; each is cut at the plane between them. Both come from the same points, so that they nearly agree there.
+The weld makes one polyline of the two borders: each vertex of the second border moves onto the first, and takes the
+surface around it along, less with the distance; then each border gets the vertices of the other.
+"""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,11 +17,6 @@ from sfm_app.meshing.cleaning import cut, make_manifold
 from sfm_app.types import Surface
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-# Blocks of points: boxes with about as many points each, the leaves of a k-d tree (Bentley, CACM 1975).
-
-SAMPLE = 2_000_000
-"""Points by which the blocks are laid out. Chosen by hand."""
-
 
 @dataclass(frozen=True, slots=True)
 class Split:
@@ -24,7 +25,7 @@ class Split:
     axis: int
     at: float
     low: "Split | int"
-    """Half with the smaller coordinates; a number is that of a block."""
+    """Half with the smaller coordinates; an integer is a block."""
     high: "Split | int"
 
 
@@ -37,12 +38,8 @@ class Partition:
     """(B, 2, 3) lowest and highest coordinates of each block; infinite at the outside."""
 
     def find_blocks(self, points: FloatArray) -> NDArray[np.intp]:
-        """Return (N,) the number of the block in which each point lies.
-
-        Args:
-            points: (N, 3).
-        """
-        found = np.empty(len(points), np.intp)
+        """Return (N,) the number of the block in which each point lies; points (N, 3)."""
+        blocks = np.empty(len(points), np.intp)
         waiting: list[tuple[Split | int, NDArray[np.intp]]] = [(self.root, np.arange(len(points)))]
         while waiting:
             node, inside = waiting.pop()
@@ -50,25 +47,21 @@ class Partition:
                 low = points[inside, node.axis] < node.at
                 waiting += [(node.low, inside[low]), (node.high, inside[~low])]
             else:
-                found[inside] = node
-        return found
+                blocks[inside] = node
+        return blocks
 
     def planes(self) -> list[tuple[int, float]]:
         """Return axis and coordinate of all planes between blocks, those of the first cuts first."""
-        found, waiting = list[tuple[int, float]](), [self.root]
+        planes, waiting = list[tuple[int, float]](), [self.root]
         while waiting:
             node = waiting.pop(0)
             if isinstance(node, Split):
-                found.append((node.axis, node.at))
+                planes.append((node.axis, node.at))
                 waiting += [node.low, node.high]
-        return found
+        return planes
 
     def near_planes(self, points: FloatArray, distance: float) -> NDArray[np.bool_]:
-        """Return (N,) whether points lie close to a plane between blocks.
-
-        Args:
-            points: (N, 3).
-        """
+        """Return (N,) whether points lie close to a plane between blocks; points (N, 3)."""
         near = np.zeros(len(points), np.bool_)
         for axis, at in self.planes():
             near |= np.abs(points[:, axis] - at) <= distance
@@ -82,7 +75,7 @@ def split_points(points: FloatArray, blocks: int) -> Partition:
         points: (N, 3).
         blocks: number of boxes, >= 1.
     """
-    sample = points[:: max(1, len(points) // SAMPLE)]
+    sample = points[:: max(1, len(points) // 2_000_000)]  # enough to place the planes
     boxes: list[FloatArray] = []
 
     def grow(inside: FloatArray, box: FloatArray, count: int) -> Split | int:
@@ -102,26 +95,26 @@ def split_points(points: FloatArray, blocks: int) -> Partition:
     return Partition(root, np.stack(boxes))
 
 
-# Two surfaces that overlap, cut along a plane and welded there into one.
-#
-# Both come from the same points, so that they nearly agree at the plane. Their borders there become one polyline:
-# each vertex of the second border moves onto the first one, and takes the surface around it along, less and less
-# with the distance; then each border gets the vertices of the other.
+@dataclass(frozen=True, slots=True)
+class WeldOptions:
+    """Distances and limits of a weld; lengths in cells."""
 
-NONE = -1
-REACH = 2.5
-"""Distance in cells up to which the borders count as the same. Chosen by hand: simplification and noise move each by
-less than one."""
-SAME = 0.05
-"""Share of a cell within which two vertices become one. Chosen by hand."""
-STEP = 0.5
-"""Distance in cells of the places on the first border at which the second one looks for it. Chosen by hand."""
-NEAREST = 6
-"""Places on the first border that each vertex compares. Chosen by hand."""
-ROUNDS = 5
-"""Rounds in which vertices in the wrong order become one. Chosen by hand: two are enough for noise of a third cell."""
-LONGEST_CRACK = 24
-"""Edges of a loop between the two borders that is closed; longer ones are holes of the surface. Chosen by hand."""
+    reach: float = 2.5
+    """Distance up to which the borders count as the same. Chosen by hand: simplification and noise move each by less
+    than 1."""
+    same: float = 0.05
+    """Distance within which two vertices become one. Chosen by hand."""
+    step: float = 0.5
+    """Distance of the candidates on the first border for a vertex of the second. Chosen by hand."""
+    nearest: int = 6
+    """Candidates for each vertex. Chosen by hand."""
+    rounds: int = 5
+    """Rounds in which vertices in the wrong order become one. Chosen by hand: two suffice for noise of a third cell."""
+    longest_crack: int = 24
+    """Most edges of a crack between the two borders; longer loops are holes of the surface. Chosen by hand."""
+
+
+WELD = WeldOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,15 +130,14 @@ class Border:
 
 
 def weld(below: Surface, above: Surface, axis: int, at: float, cell: float, halo: float) -> tuple[Surface, int]:
-    """Join two surfaces at a plane: the first below it, the second above.
+    """Join two surfaces at a plane; return the surface, and the number of edges in the plane without counterpart.
 
     Args:
-        below: reaches beyond the plane.
-        above: reaches beyond the plane.
-        axis: 0, 1 or 2, across which the plane lies.
-
-    Returns:
-        The surface, and how many edges in the plane did not find their like.
+        below, above: each reaches beyond the plane.
+        axis: 0, 1 or 2, the normal of the plane.
+        at: coordinate of the plane.
+        cell: side of the finest cells of both.
+        halo: distance up to which the second surface gives way.
     """
     first, one = cut_at_plane(below, axis, at, keep_below=True)
     second, other = cut_at_plane(above, axis, at, keep_below=False)
@@ -162,40 +154,40 @@ def weld(below: Surface, above: Surface, axis: int, at: float, cell: float, halo
     own = np.arange(len(first.vertices), len(vertices))
     vertices[own] += _drag(vertices[own], vertices[moving], place - vertices[moving], halo)
     vertices[moving] = place
-    chains, same = _split_first(one, other, (moving, edge, share), vertices, SAME * cell)
+    chains, same = _split_first(one, other, moving, edge, share, vertices, WELD.same * cell)
     follow = _successors(chains)
-    seconds, lost = _split_second(same[other.ends], follow, {int(same[v]) for v in moving})
+    seconds, open_edges = _split_second(same[other.ends], follow, {int(same[v]) for v in moving})
     faces = same[both.faces]
     rest = np.ones(len(faces), np.bool_)
     rest[one.faces] = rest[other.faces] = False
     fans = _fans(faces, one, chains) + _fans(faces, other, seconds)
-    found = np.concatenate([faces[rest], np.array(fans, np.int64).reshape(-1, 3)])
-    cracks = _crack_fills(found, np.unique(np.concatenate([one.ends, other.ends])))
-    joined = Surface(vertices, np.concatenate([found, cracks]), both.colors)
-    return select_faces(joined, np.ones(len(joined.faces), np.bool_)), lost
+    faces = np.concatenate([faces[rest], np.array(fans, np.int64).reshape(-1, 3)])
+    cracks = _crack_fills(faces, np.unique(np.concatenate([one.ends, other.ends])))
+    joined = Surface(vertices, np.concatenate([faces, cracks]), both.colors)
+    return select_faces(joined, np.ones(len(joined.faces), np.bool_)), open_edges
 
 
 def close_cracks(surface: Surface, at_planes: NDArray[np.bool_]) -> Surface:
-    """Return the surface as an oriented manifold, with the short loops of open edges closed that touch a plane.
+    """Return the surface as an oriented manifold, and close the short loops of open edges at planes.
 
-    Triangles that welding has folded are removed, and the hole that each leaves is closed with larger ones. Where one
-    had two corners in one place, as planes that nearly touch leave them, these become one.
+    Triangles that welding has folded are removed, and the holes of these are closed with larger ones. Vertices in one
+    place, as planes that nearly touch have them, become one.
 
     Args:
-        at_planes: (V,) which of its vertices may be at a crack.
+        at_planes: (V,) vertices that may be at a crack.
     """
-    found = make_manifold(Surface(surface.vertices, surface.faces, np.column_stack([surface.colors, at_planes])))
-    for _ in range(ROUNDS):
-        found = _join_same_places(found)
-        fills = _crack_fills(found.faces, np.flatnonzero(found.colors[:, 3]))
+    mesh = make_manifold(Surface(surface.vertices, surface.faces, np.column_stack([surface.colors, at_planes])))
+    for _ in range(WELD.rounds):
+        mesh = _join_same_places(mesh)
+        fills = _crack_fills(mesh.faces, np.flatnonzero(mesh.colors[:, 3]))
         if not len(fills):
             break
-        found = make_manifold(Surface(found.vertices, np.concatenate([found.faces, fills]), found.colors))
-    return Surface(found.vertices, found.faces, found.colors[:, :3])
+        mesh = make_manifold(Surface(mesh.vertices, np.concatenate([mesh.faces, fills]), mesh.colors))
+    return Surface(mesh.vertices, mesh.faces, mesh.colors[:, :3])
 
 
 def _join_same_places(surface: Surface) -> Surface:
-    """Return the surface with the ends of open edges at planes as one vertex where they lie in one place."""
+    """Join the ends of open edges that lie in one place at a plane; the fourth color marks vertices at planes."""
     edges, edge_of = unique_edges(surface.faces)
     ends = np.unique(edges[np.bincount(edge_of.ravel(), minlength=len(edges)) == 1])
     ends = ends[surface.colors[ends, 3] != 0]
@@ -208,11 +200,7 @@ def _join_same_places(surface: Surface) -> Surface:
 
 
 def cut_at_plane(surface: Surface, axis: int, at: float, *, keep_below: bool) -> tuple[Surface, Border]:
-    """Return the part of a surface on one side of a plane, and its border there.
-
-    Args:
-        axis: 0, 1 or 2, across which the plane lies.
-    """
+    """Return the part of a surface on one side of a plane, normal to axis 0, 1 or 2, and its border there."""
     inside = (at - surface.vertices[:, axis]) * (1.0 if keep_below else -1.0)
     part = cut(surface, inside)
     if not len(part.faces):
@@ -232,9 +220,7 @@ def cut_at_plane(surface: Surface, axis: int, at: float, *, keep_below: bool) ->
 def _match(
     vertices: FloatArray, one: Border, other: Border, cell: float
 ) -> tuple[IndexArray, IndexArray, FloatArray, FloatArray]:
-    """Find the place on the first border of each vertex of the second.
-
-    Only edges that run in the opposite direction, as on the two sides of one surface, are compared.
+    """Find the place of each vertex of the second border on edges of the first that run in the opposite direction.
 
     Returns:
         (M,) the vertices that have a place, (M,) the edge of the first border, (M,) share of the way along it,
@@ -242,69 +228,64 @@ def _match(
     """
     from scipy.spatial import cKDTree
 
-    starts, ways = vertices[one.ends[:, 0]], vertices[one.ends[:, 1]] - vertices[one.ends[:, 0]]
-    steps = np.maximum(1, np.ceil(np.linalg.norm(ways, axis=1) / (STEP * cell))).astype(np.int64)
+    starts, edges = vertices[one.ends[:, 0]], vertices[one.ends[:, 1]] - vertices[one.ends[:, 0]]
+    steps = np.maximum(1, np.ceil(np.linalg.norm(edges, axis=1) / (WELD.step * cell))).astype(np.int64)
     of = np.repeat(np.arange(len(steps)), steps)
-    along = (np.arange(len(of)) - np.repeat(np.cumsum(steps) - steps, steps) + 0.5) / steps[of]
+    share = (np.arange(len(of)) - np.repeat(np.cumsum(steps) - steps, steps) + 0.5) / steps[of]
     moving = np.unique(other.ends)
     heading = np.zeros((len(vertices), 3))
     for end in (0, 1):
         np.add.at(heading, other.ends[:, end], vertices[other.ends[:, 1]] - vertices[other.ends[:, 0]])
-    near = cKDTree(starts[of] + along[:, None] * ways[of]).query(vertices[moving], min(NEAREST, len(of)))[1]
+    near = cKDTree(starts[of] + share[:, None] * edges[of]).query(vertices[moving], min(WELD.nearest, len(of)))[1]
     edge = of[near.reshape(len(moving), -1)]
-    length = np.maximum(np.einsum("ec,ec->e", ways, ways), 1e-300)
-    share = np.einsum("mkc,mkc->mk", vertices[moving, None] - starts[edge], ways[edge]) / length[edge]
+    length = np.maximum(np.einsum("ec,ec->e", edges, edges), 1e-300)
+    share = np.einsum("mkc,mkc->mk", vertices[moving, None] - starts[edge], edges[edge]) / length[edge]
     share = np.clip(share, 0.0, 1.0)
-    place = starts[edge] + share[..., None] * ways[edge]
-    away = np.linalg.norm(vertices[moving, None] - place, axis=2)
-    away[np.einsum("mc,mkc->mk", heading[moving], ways[edge]) >= 0.0] = np.inf
-    best = np.argmin(away, axis=1)
-    rows = np.flatnonzero(away[np.arange(len(moving)), best] <= REACH * cell)
+    place = starts[edge] + share[..., None] * edges[edge]
+    distance = np.linalg.norm(vertices[moving, None] - place, axis=2)
+    distance[np.einsum("mc,mkc->mk", heading[moving], edges[edge]) >= 0.0] = np.inf
+    best = np.argmin(distance, axis=1)
+    rows = np.flatnonzero(distance[np.arange(len(moving)), best] <= WELD.reach * cell)
     best = best[rows]
     return moving[rows], edge[rows, best], share[rows, best], place[rows, best]
 
 
-def _drag(points: FloatArray, from_: FloatArray, shift: FloatArray, halo: float) -> FloatArray:
-    """Return (N, 3) shifts of points near vertices that are shifted, falling linearly with the distance."""
+def _drag(points: FloatArray, centers: FloatArray, shift: FloatArray, halo: float) -> FloatArray:
+    """Return (N, 3) shifts of points around shifted centers, falling linearly with the distance to 0 at the halo."""
     from scipy.spatial import cKDTree
 
-    found = np.zeros_like(points)
-    if len(from_):
-        away, at = (np.asarray(part) for part in cKDTree(from_).query(points, distance_upper_bound=halo))
-        near = np.isfinite(away)
-        found[near] = shift[at[near]] * (1.0 - away[near] / halo)[:, None]
-    return found
+    shifts = np.zeros_like(points)
+    if len(centers):
+        distance, at = (np.asarray(part) for part in cKDTree(centers).query(points, distance_upper_bound=halo))
+        near = np.isfinite(distance)
+        shifts[near] = shift[at[near]] * (1.0 - distance[near] / halo)[:, None]
+    return shifts
 
 
 def _split_first(
-    one: Border,
-    other: Border,
-    places: tuple[IndexArray, IndexArray, FloatArray],
-    vertices: FloatArray,
-    tiny: float,
-) -> tuple[list[list[int]], IndexArray]:
-    """Put the moved vertices between the ends of the edges of the first border.
-
-    Where two of them would come in the wrong order, they become one.
+    one: Border, other: Border, moving: IndexArray, edge: IndexArray, share: FloatArray, vertices: FloatArray,
+    tolerance: float,
+) -> tuple[list[list[int]], IndexArray]:  # fmt: skip
+    """Insert the moved vertices into the edges of the first border; two in the wrong order become one.
 
     Args:
-        places: (M,) moved vertices, and for each the edge of the first border, and the share of the way along it.
+        moving, edge, share: (M,) moved vertices, edges of the first border, and positions along these, in [0, 1].
         vertices: (V, 3).
+        tolerance: distance within which a moved vertex becomes an end of the edge.
 
     Returns:
-        Per edge its vertices in their order, and (V,) the vertex that each one has become.
+        Per edge its vertices in order, and (V,) the vertex that replaces each one.
     """
-    moving, edge, share = places
     same = np.arange(len(vertices))
-    taken, movable = set[int](), set(moving.tolist())
+    used, movable = set[int](), set(moving.tolist())
     ends = one.ends[edge]
     far = np.linalg.norm(vertices[ends] - vertices[moving][:, None], axis=2)
-    for k in np.flatnonzero(far.min(axis=1) <= tiny):
+    for k in np.flatnonzero(far.min(axis=1) <= tolerance):
         nearest = int(ends[k, np.argmin(far[k])])
-        if nearest not in taken:
-            taken.add(nearest)
+        if nearest not in used:
+            used.add(nearest)
             same[moving[k]] = nearest
-    for _ in range(ROUNDS):
+    for _ in range(WELD.rounds):
         alone = np.flatnonzero(same[moving] == moving)
         chains = [[int(a), int(b)] for a, b in one.ends]
         for k in alone[np.lexsort((share[alone], edge[alone]))]:
@@ -330,14 +311,14 @@ def _successors(chains: list[list[int]]) -> dict[int, int]:
     return {a: b for chain in chains for a, b in pairwise(chain)}
 
 
-def _next_matched(start: int, follow: dict[int, int], matched: set[int]) -> int:
-    """Return the next vertex of both borders after one; -1 where there is none."""
-    at = start
+def _next_matched(start: int, follow: dict[int, int], matched: set[int]) -> int | None:
+    """Return the next vertex of both borders after one."""
+    at: int | None = start
     for _ in range(len(follow)):
-        at = follow.get(at, NONE)
-        if at == NONE or at in matched:
+        at = None if at is None else follow.get(at)
+        if at is None or at in matched:
             return at
-    return NONE
+    return None
 
 
 def _split_second(ends: IndexArray, follow: dict[int, int], matched: set[int]) -> tuple[list[list[int]], int]:
@@ -351,21 +332,21 @@ def _split_second(ends: IndexArray, follow: dict[int, int], matched: set[int]) -
     Returns:
         Per edge its vertices in their order, and how many edges have no counterpart.
     """
-    chains, lost = [], 0
+    chains, open_edges = [], 0
     for start, end in ends.tolist():
-        way = [end]
-        while (after := follow.get(way[-1])) is not None and len(way) <= len(follow):
-            way.append(after)
+        chain = [end]
+        while (after := follow.get(chain[-1])) is not None and len(chain) <= len(follow):
+            chain.append(after)
             if after in matched:
                 break
-        found = start != end and way[-1] == start and end in matched
-        chains.append(way[::-1] if found else [start, end])
-        lost += not found and start != end
-    return chains, lost
+        matches = start != end and chain[-1] == start and end in matched
+        chains.append(chain[::-1] if matches else [start, end])
+        open_edges += not matches and start != end
+    return chains, open_edges
 
 
 def _crack_fills(faces: IndexArray, at_plane: IndexArray) -> IndexArray:
-    """Return (F, 3) triangles that close the short loops of open edges among the vertices at the plane."""
+    """Return (F, 3) triangles that close the short loops of open edges between vertices at the plane."""
     edges, edge_of = unique_edges(faces)
     alone = (np.bincount(edge_of.ravel(), minlength=len(edges))[edge_of] == 1) & np.isin(faces, at_plane)
     alone &= np.isin(np.roll(faces, -1, axis=1), at_plane)
@@ -375,13 +356,13 @@ def _crack_fills(faces: IndexArray, at_plane: IndexArray) -> IndexArray:
         follow.setdefault(start, []).append(end)
     fills: list[tuple[int, int, int]] = []
     for first in sorted(follow):
-        way = [first]
-        while follow.get(way[-1]) and len(way) <= LONGEST_CRACK:
-            way.append(follow[way[-1]].pop())
-            if way[-1] in way[:-1]:
-                loop = way[way.index(way[-1]) : -1]
+        path = [first]
+        while follow.get(path[-1]) and len(path) <= WELD.longest_crack:
+            path.append(follow[path[-1]].pop())
+            if path[-1] in path[:-1]:
+                loop = path[path.index(path[-1]) : -1]
                 fills += [(loop[0], b, a) for a, b in pairwise(loop[1:])]
-                way = way[: way.index(way[-1]) + 1]
+                path = path[: path.index(path[-1]) + 1]
     return np.array(fills, np.int64).reshape(-1, 3)
 
 

@@ -1,4 +1,7 @@
-"""Clean meshes: islands, doubtful parts, ragged borders and edges of more than two triangles go."""
+"""Clean meshes: no islands, doubtful parts, ragged borders, or edges of more than two triangles.
+
+SciPy is imported where it is used: a program that only estimates fundamental matrices starts without it.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,17 +14,15 @@ from sfm_app.meshing.visibility import CONFIRMED, EMPTY, SEEN_THROUGH
 from sfm_app.types import Surface
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-# The removal of small connected parts.
-#
-# SciPy is imported where it is used: a program that only estimates fundamental matrices starts without it.
+Edges = tuple[IndexArray, IndexArray]
+"""The result of `unique_edges`."""
+
+MIN_HEIGHT = 1e-7
+"""A triangle is degenerate below this height, as a share of the surface's size. By definition: single precision."""
 
 
 def drop_islands(surface: Surface, min_share: float) -> Surface:
-    """Drop connected parts that have too few triangles.
-
-    Args:
-        min_share: smallest share of all triangles that is kept, in [0, 1].
-    """
+    """Drop connected parts with less than `min_share` of all triangles, in [0, 1]."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -34,12 +35,6 @@ def drop_islands(surface: Surface, min_share: float) -> Surface:
     part_of_face = part[a]
     triangles = np.bincount(part_of_face)
     return select_faces(surface, triangles[part_of_face] >= min_share * len(surface.faces))
-
-
-# Repair of a mesh: no degenerate or duplicate triangles, an oriented manifold.
-
-MIN_HEIGHT = 1e-7
-"""A triangle is degenerate below this height, as a share of the surface's size; single precision resolves no less."""
 
 
 def make_manifold(surface: Surface) -> Surface:
@@ -78,7 +73,7 @@ def _excess_faces(surface: Surface) -> NDArray[np.bool_]:
     """Mark the smallest triangle at every edge with too many triangles or two in the same direction, (T,)."""
     edges, edge_of = unique_edges(surface.faces)
     forward = surface.faces < np.roll(surface.faces, -1, axis=1)
-    uses = np.stack([np.bincount(edge_of[way], minlength=len(edges)) for way in (forward, ~forward)])
+    uses = np.stack([np.bincount(edge_of[same], minlength=len(edges)) for same in (forward, ~forward)])
     wrong = np.asarray((uses > 1).any(axis=0))
     bad = np.zeros(len(surface.faces), bool)
     if wrong.any():
@@ -90,21 +85,21 @@ def _excess_faces(surface: Surface) -> NDArray[np.bool_]:
     return bad
 
 
-# Trimming of a surface: small gaps in its support are bridged, and the border is cut along a smooth line.
-#
-# SciPy is imported where it is used: a program that only estimates fundamental matrices starts without it.
+@dataclass(frozen=True, slots=True)
+class TrimOptions:
+    """Thresholds of the trimming."""
 
-Edges = tuple[IndexArray, IndexArray]
-"""What `unique_edges` returns."""
+    smoothing: int = 20
+    """Iterations of averaging over neighbors that smooth the border. Chosen by hand."""
+    most_free: float = 0.1
+    """A gap is not bridged if photos see through this share of it: it is free space beside an edge. Chosen by hand."""
+    least_confirmed: float = 0.25
+    """Least share of photos that confirm a vertex among those that confirm it or have an empty depth map there. Flakes
+    of sky beside outlines are never seen through, and with more photos, one or two confirm more of them. Chosen by
+    hand."""
 
-SMOOTHING = 20
-"""Iterations of averaging over neighbors that smooth the border."""
-MAX_FREE = 0.1
-"""A gap is not bridged if photos see through this share of it: then it is free space beside an edge, not a hole."""
 
-MIN_SHARE = 0.25
-"""Smallest share of photos that confirm a vertex among those that confirm it or have an empty depth map there. Flakes
-of sky beside outlines are never seen through, and with more photos, one or two confirm more of them."""
+TRIM = TrimOptions()
 
 
 @dataclass(slots=True, eq=False)
@@ -120,16 +115,11 @@ class Support:
 
     @classmethod
     def zeros(cls, count: int) -> "Support":
-        """Make the zero counts of `count` vertices."""
+        """Return zero counts for `count` vertices."""
         return cls(*(np.zeros(count, np.int32) for _ in range(3)))
 
     def add(self, at: IndexArray, verdict: NDArray[np.uint8]) -> None:
-        """Add the verdict of one photo, from `judge`.
-
-        Args:
-            at: (N,) the vertices that were judged, each once.
-            verdict: (N,) of each.
-        """
+        """Add the verdicts (N,) of one photo, from `judge`, on vertices (N,), each once."""
         self.confirmed[at] += verdict == CONFIRMED
         self.seen_through[at] += verdict == SEEN_THROUGH
         self.empty[at] += verdict == EMPTY
@@ -141,16 +131,22 @@ class Support:
 
     @property
     def is_supported(self) -> NDArray[np.bool_]:
-        """(V,) whether enough of the photos that should see a vertex confirm it."""
-        enough = self.confirmed >= MIN_SHARE * (self.confirmed + self.empty)
+        """(V,) whether enough photos confirm a vertex among those with it in view."""
+        enough = self.confirmed >= TRIM.least_confirmed * (self.confirmed + self.empty)
         return np.asarray((self.confirmed > 0) & ~self.is_free & enough)
 
 
 def trim(surface: Surface, support: Support, max_gap_triangles: float, least: float) -> Surface:
-    """Keep the parts that photos confirm and do not see through, bridge small gaps, and smooth the border."""
+    """Keep the parts that photos confirm and do not see through, bridge small gaps, and smooth the border.
+
+    Args:
+        surface: closed, from Poisson reconstruction.
+        max_gap_triangles: as `max_width` of `bridge_gaps`.
+        least: as for `drop_doubtful_parts`.
+    """
     sign, edges = np.where(support.is_supported, 1.0, -1.0), unique_edges(surface.faces)
     bridged = bridge_gaps(surface, sign, support.is_free, max_gap_triangles, edges)
-    smooth = smooth_support(surface, bridged, SMOOTHING, edges)
+    smooth = smooth_support(surface, bridged, TRIM.smoothing, edges)
     whole = bridge_gaps(surface, smooth, support.is_free, max_gap_triangles, edges)
     return cut(surface, drop_doubtful_parts(surface, whole, support.confirmed, least, edges), edges)
 
@@ -158,9 +154,10 @@ def trim(surface: Surface, support: Support, max_gap_triangles: float, least: fl
 def bridge_gaps(
     surface: Surface, support: FloatArray, free: NDArray[np.bool_], max_width: float, known: Edges | None = None
 ) -> FloatArray:
-    """Add support to unsupported patches that are small and hardly seen through.
+    """Add support to small unsupported patches that hardly any photo sees through.
 
     Args:
+        max_width: largest width of a bridged patch, in edge lengths of its rim; its length is not limited.
         support: (V,) positive where photos confirm the surface, negative where none does.
         free: (V,) where photos see through the surface.
         known: edges of the surface; None for finding them.
@@ -181,12 +178,12 @@ def bridge_gaps(
     rim, rim_length = edges[ends_inside == 1], length[ends_inside == 1]
     rim_patch = patch[np.where(inside[rim[:, 0]], rim[:, 1], rim[:, 0])]
     scale = np.bincount(rim_patch, rim_length, count) / np.maximum(np.bincount(rim_patch, minlength=count), 1)
-    ways = _graph(edges, len(support), length)
-    reach = dijkstra(ways, directed=False, indices=np.flatnonzero(inside), min_only=True)
+    graph = _graph(edges, len(support), length)
+    reach = dijkstra(graph, directed=False, indices=np.flatnonzero(inside), min_only=True)
     depth = np.zeros(count)
     np.maximum.at(depth, patch, np.where(inside, 0.0, reach))
     free_share = np.bincount(patch, free, count) / np.bincount(patch, minlength=count)
-    bridged = (2.0 * depth <= max_width * scale) & (free_share < MAX_FREE)
+    bridged = (2.0 * depth <= max_width * scale) & (free_share < TRIM.most_free)
     return np.where(~inside & bridged[patch], 1.0, support)
 
 

@@ -1,4 +1,4 @@
-"""A surface that is no rougher than photos ask for: the curvature at each vertex against the pull of the photos."""
+"""The roughness of a surface: the curvature at each vertex against the pull of the photos."""
 
 from dataclasses import dataclass
 
@@ -9,15 +9,26 @@ from sfm_app.geometry.triangles import bucket_order, unique_edges
 from sfm_app.jit import kernel
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-BEND, CREASE = 0.1, 0.25
-"""Usual distance of a vertex from the mean of its neighbors, and distance from which the surface counts as creased, in
-edges. Chosen on `ornament`."""
-HOLD, UNSEEN = 1e-3, 10.0
-"""Weights that hold a vertex where it is, per squared edge: usual ones, and those that photos say nothing about. Chosen
-by hand."""
-STEPS, ACCURACY = 60, 1e-2
-"""Most steps of conjugate gradients, and the share of the first residual at which they end: the next iteration of the
-refinement goes on from there. Chosen by hand."""
+
+@dataclass(frozen=True, slots=True)
+class FairnessOptions:
+    """Weights of the fairness, and the end of its solver."""
+
+    bend: float = 0.1
+    """Usual distance of a vertex from the mean of its neighbors, in edges. Chosen on `ornament`."""
+    crease: float = 0.25
+    """Distance in edges from which the surface counts as creased. Chosen on `ornament`."""
+    hold: float = 1e-3
+    """Weight that holds a vertex in its place, per squared edge. Chosen by hand."""
+    unseen: float = 10.0
+    """The same for a vertex that no photo pulls. Chosen by hand."""
+    steps: int = 60
+    """Most steps of conjugate gradients. Chosen by hand."""
+    accuracy: float = 1e-2
+    """Share of the first residual at which they end; the next iteration of the refinement continues. Chosen by hand."""
+
+
+OPTIONS = FairnessOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,11 +44,7 @@ class Neighbors:
 
     @classmethod
     def from_faces(cls, faces: IndexArray, count: int) -> "Neighbors":
-        """Find the neighbors of `count` vertices.
-
-        Args:
-            faces: (T, 3) vertex indices.
-        """
+        """Find the neighbors of `count` vertices; faces (T, 3) vertex indices."""
         edges, edge_of = unique_edges(faces)
         own, other = edges.T[::-1].ravel(), edges.T.ravel()  # lower neighbors first: they ascend at each vertex
         starts = np.concatenate([[0], np.cumsum(np.bincount(own, minlength=count))])
@@ -47,18 +54,19 @@ class Neighbors:
 
     def edge_lengths(self, vertices: FloatArray) -> FloatArray:
         """Return (V,) the mean length of the edges at each vertex (V, 3); 0 without any."""
-        found = np.zeros(len(vertices))
-        _mean_lengths(self.starts, self.others, vertices, found)
-        return found
+        lengths = np.zeros(len(vertices))
+        _mean_lengths(self.starts, self.others, vertices, lengths)
+        return lengths
 
 
 def find_displacements(
-    vertices: FloatArray, normals: FloatArray, around: Neighbors, pull: tuple[FloatArray, FloatArray], size: FloatArray
-) -> FloatArray:
-    """Return (V,) the displacements along the normals that suit the photos and keep the surface fair.
+    vertices: FloatArray, normals: FloatArray, neighbors: Neighbors, pull: tuple[FloatArray, FloatArray],
+    size: FloatArray, options: FairnessOptions = OPTIONS,
+) -> FloatArray:  # fmt: skip
+    """Return (V,) displacements along the normals.
 
-    They minimize the sum of h d^2 - 2 g d over the vertices, and of the squared distances from the mean of the
-    neighbors, in usual ones; large distances, at creases, count less (Cauchy).
+    They minimize the sum of h d^2 - 2 g d over the vertices, plus the squared distances from the mean of the neighbors
+    in units of `bend`; large distances, at creases, count less (Cauchy).
 
     Args:
         vertices, normals: (V, 3).
@@ -67,48 +75,41 @@ def find_displacements(
     """
     g, h = pull
     bend = np.zeros(len(vertices))
-    _bends(around.starts, around.others, around.inner, vertices, normals, bend)
-    weight = around.inner / (BEND * size) ** 2 / (1.0 + (bend / (CREASE * size)) ** 2)
-    found = np.zeros(len(vertices))
-    _solve(
-        around.starts,
-        around.others,
-        h + np.where(h > 0.0, HOLD, UNSEEN) / size**2,
-        weight,
-        g,
-        bend,
-        (STEPS, ACCURACY),
-        found,
-    )
-    return found
+    _bends(neighbors.starts, neighbors.others, neighbors.inner, vertices, normals, bend)
+    weight = neighbors.inner / (options.bend * size) ** 2 / (1.0 + (bend / (options.crease * size)) ** 2)
+    stiff = h + np.where(h > 0.0, options.hold, options.unseen) / size**2
+    end = (options.steps, options.accuracy)
+    displacements = np.zeros(len(vertices))
+    _solve(neighbors.starts, neighbors.others, stiff, weight, g, bend, end, displacements)
+    return displacements
 
 
 @kernel
-def _mean_lengths(starts: IndexArray, others: IndexArray, vertices: FloatArray, found: FloatArray) -> None:
-    for v in range(len(found)):
+def _mean_lengths(starts: IndexArray, others: IndexArray, vertices: FloatArray, lengths: FloatArray) -> None:
+    for v in range(len(lengths)):
         total = 0.0
         for k in range(starts[v], starts[v + 1]):
             square = 0.0
             for axis in range(3):
                 square += (vertices[v, axis] - vertices[others[k], axis]) ** 2
             total += np.sqrt(square)
-        found[v] = total / max(starts[v + 1] - starts[v], 1)
+        lengths[v] = total / max(starts[v + 1] - starts[v], 1)
 
 
 @kernel
 def _bends(
     starts: IndexArray, others: IndexArray, inner: NDArray[np.bool_], vertices: FloatArray, normals: FloatArray,
-    found: FloatArray,
+    bend: FloatArray,
 ) -> None:  # fmt: skip
-    """Fill in how far the mean of the neighbors lies above each inner vertex, along its normal."""
-    for v in range(len(found)):
+    """Fill in the height of the mean of the neighbors above each inner vertex, along its normal."""
+    for v in range(len(bend)):
         if not inner[v]:
             continue
         total = 0.0
         for k in range(starts[v], starts[v + 1]):
             for axis in range(3):
                 total += (vertices[others[k], axis] - vertices[v, axis]) * normals[v, axis]
-        found[v] = total / (starts[v + 1] - starts[v])
+        bend[v] = total / (starts[v + 1] - starts[v])
 
 
 @kernel
@@ -116,14 +117,10 @@ def _apply(
     starts: IndexArray, others: IndexArray, share: FloatArray, weight: FloatArray, d: FloatArray, scratch: FloatArray,
     out: FloatArray,
 ) -> None:  # fmt: skip
-    """Fill in L' W L d; L d is the mean of the neighbors less the vertex.
+    """Fill in L' W L d (V,); L d is the mean of the neighbors less the vertex.
 
-    Args:
-        share: (V,) one over the number of neighbors.
-        weight: (V,) the diagonal of W; 0 where there are no neighbors.
-        d: (V,).
-        scratch: (V,), overwritten.
-        out: (V,), overwritten.
+    `share` is one over the number of neighbors, `weight` the diagonal of W, 0 without neighbors; `scratch` and `out`
+    are overwritten; (V,) each.
     """
     for v in range(len(d)):
         out[v] = 0.0
@@ -148,13 +145,13 @@ def _gather(starts: IndexArray, others: IndexArray, share: FloatArray, scratch: 
 
 
 @kernel
-def _solve(
+def _solve(  # noqa: PLR0913
     starts: IndexArray, others: IndexArray, stiff: FloatArray, weight: FloatArray, g: FloatArray, bend: FloatArray,
     end: tuple[int, float], d: FloatArray,
 ) -> None:  # fmt: skip
     """Solve (stiff + L' W L) d = g - L' W bend by conjugate gradients, scaled by the diagonal; sums run in order.
 
-    It ends after a number of steps, or at a share of the first residual.
+    `end` has the number of steps, and the share of the first residual at which they end.
     """
     count = len(d)
     share, scratch, diagonal, r = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
@@ -171,22 +168,22 @@ def _solve(
     for v in range(count):
         r[v] = g[v] - product[v]
         energy += r[v] * r[v] * scale[v]
-    way = r * scale
-    enough = end[1] * end[1] * energy
+    direction = r * scale
+    tolerance = end[1] * end[1] * energy
     for _ in range(end[0]):
-        if energy <= enough or energy <= 0.0:
+        if energy <= tolerance or energy <= 0.0:
             break
-        _apply(starts, others, share, weight, way, scratch, product)
-        along = 0.0
+        _apply(starts, others, share, weight, direction, scratch, product)
+        curvature = 0.0
         for v in range(count):
-            product[v] += stiff[v] * way[v]
-            along += way[v] * product[v]
-        step = energy / along
+            product[v] += stiff[v] * direction[v]
+            curvature += direction[v] * product[v]
+        step = energy / curvature
         before, energy = energy, 0.0
         for v in range(count):
-            d[v] += step * way[v]
+            d[v] += step * direction[v]
             r[v] -= step * product[v]
             energy += r[v] * r[v] * scale[v]
         ratio = energy / before
         for v in range(count):
-            way[v] = r[v] * scale[v] + ratio * way[v]
+            direction[v] = r[v] * scale[v] + ratio * direction[v]

@@ -11,26 +11,34 @@ from numpy.typing import NDArray
 
 from sfm_app.types.arrays import FloatArray
 
-LEAST_POINTS = 1.5
-"""Smallest mean number of points in an occupied cell: finer cells, most with one point, would only model noise, with
-four times the triangles per level. Chosen on `railing`."""
-MOST_POINTS = 2.5
-"""Mean number of points in an occupied cell where surfaces are smooth: finer cells than that show no more, once the
-photos refine them, and model the noise of lawns. Chosen on fountain-P11, Herz-Jesus-P8 and `garden`."""
-BENT_COSINE = 0.9
-"""Length of the mean of unit normals below which a cell is bent: they are 26 degrees off it. Chosen by hand."""
-BENT_SHARE = 0.025
-"""Share of bent cells from which on cells are finer. `railing` has 0.03 with one and a half points in a cell; with two
-and a half, `ornament` 0.045, `garden` 0.02, fountain-P11 and Herz-Jesus-P8 0.015."""
-MARGIN = 1.1
-"""Width of Poisson's cube in extents of its points."""
-ALIGNMENT = 16
-"""Cells at whose multiples Poisson's cubes begin, so that the cells of blocks side by side are the same down to a few
-levels. Chosen by hand."""
-DEEPEST = 20
-"""Levels of a grid over all points; blocks with more levels than allowed get coarser cells. Chosen by hand."""
-COARSEST_CUBE = 5
-"""Smallest depth of an octree: with less, small surfaces become too coarse."""
+
+@dataclass(frozen=True, slots=True)
+class CellOptions:
+    """The choice of Poisson's cells, and the grid on which its cubes lie."""
+
+    least_points: float = 1.5
+    """Smallest mean number of points in an occupied cell: finer cells, most with one point, would only model noise,
+    with four times the triangles per level. Chosen on `railing`."""
+    most_points: float = 2.5
+    """Mean number of points in an occupied cell of smooth surfaces: finer cells show no more after the refinement, and
+    model the noise of lawns. Chosen on fountain-P11, Herz-Jesus-P8 and `garden`."""
+    bent_cosine: float = 0.9
+    """Length of the mean of unit normals below which a cell is bent: 26 degrees off it. Chosen by hand."""
+    bent_share: float = 0.025
+    """Share of bent cells from which cells become finer. `railing` has 0.03 with 1.5 points in a cell; with 2.5,
+    `ornament` has 0.045, `garden` 0.02, fountain-P11 and Herz-Jesus-P8 0.015."""
+    margin: float = 1.1
+    """Width of Poisson's cube in extents of its points: the scale of PoissonRecon."""
+    alignment: int = 16
+    """Cells at whose multiples cubes begin, so that adjacent blocks have the same cells down to a few levels. Chosen
+    by hand."""
+    deepest: int = 20
+    """Levels of a grid over all points; blocks with more levels than allowed get coarser cells. Chosen by hand."""
+    coarsest_cube: int = 5
+    """Smallest depth of an octree: with less, small surfaces become too coarse. Chosen by hand."""
+
+
+CELLS = CellOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,37 +46,32 @@ class Cube:
     """Poisson's cube around points, on a grid that neighbors have in common."""
 
     depth: int
-    """Of the octree."""
+    """Maximum depth of the octree."""
     anchors: FloatArray
-    """(2, 3) lowest and highest corner of the points that give the octree this cube."""
+    """(2, 3) lowest and highest corner; points there give the octree this cube."""
 
 
 def cube_around(low: FloatArray, high: FloatArray, cell: float) -> Cube:
-    """Return the smallest cube on the common grid that holds points.
-
-    Args:
-        low: (3,) lowest coordinates of the points.
-        high: (3,) highest coordinates of the points.
-    """
-    step = ALIGNMENT * cell
-    depth = COARSEST_CUBE
+    """Return the smallest cube of cells of this side on the common grid that holds points from `low` to `high` (3,)."""
+    step = CELLS.alignment * cell
+    depth = CELLS.coarsest_cube
     while True:
         side = cell * 2.0**depth
         start = np.floor((0.5 * (low + high) - 0.5 * side) / step + 0.5) * step
-        inner = np.stack([start + 0.5 * (side - side / MARGIN), start + 0.5 * (side + side / MARGIN)])
+        inner = np.stack([start + 0.5 * (side - side / CELLS.margin), start + 0.5 * (side + side / CELLS.margin)])
         if (inner[0] <= low).all() and (inner[1] >= high).all():
             return Cube(depth, inner)
         depth += 1
 
 
 def cell_sizes(extent: float, depth: int) -> Iterator[float]:
-    """Yield sides of cells, the finest first, each twice the one before."""
-    for level in range(min(depth, DEEPEST), 1, -1):
-        yield MARGIN * extent / 2.0**level
+    """Yield sides of cells of an octree over all points, the finest first, each twice the one before."""
+    for level in range(min(depth, CELLS.deepest), 1, -1):
+        yield CELLS.margin * extent / 2.0**level
 
 
 class PointCells(Protocol):
-    """What is asked about the cells of a grid over oriented points."""
+    """Figures of the cells of a grid over oriented points."""
 
     def points_per_cell(self, cell: float) -> float:
         """Return the mean number of points in an occupied cell of that side."""
@@ -78,11 +81,7 @@ class PointCells(Protocol):
 
 
 def count_cells(points: FloatArray, cell: float) -> int:
-    """Return how many cells of a grid hold points.
-
-    Args:
-        points: (N, 3).
-    """
+    """Return how many cells of a grid hold points; points (N, 3)."""
     keys = np.sort(_number_cells(points, cell))
     return min(len(keys), 1) + int(np.count_nonzero(keys[1:] != keys[:-1]))
 
@@ -95,8 +94,8 @@ def count_bent(points: FloatArray, normals: FloatArray, cell: float) -> tuple[in
         normals: (N, 3) unit vectors.
     """
     _, own, count = np.unique(_number_cells(points, cell), return_inverse=True, return_counts=True)
-    total = np.stack([np.bincount(own, along, len(count)) for along in normals.T], axis=1)
-    bent = np.linalg.norm(total, axis=1) < BENT_COSINE * count
+    total = np.stack([np.bincount(own, component, len(count)) for component in normals.T], axis=1)
+    bent = np.linalg.norm(total, axis=1) < CELLS.bent_cosine * count
     return int(np.count_nonzero(bent & (count > 1))), int(np.count_nonzero(count > 1))
 
 
@@ -107,8 +106,8 @@ def _number_cells(points: FloatArray, cell: float) -> NDArray[np.int64]:
     return np.asarray((at[:, 0] << 42) + (at[:, 1] << 21) + at[:, 2])
 
 
-def choose_cell(sizes: Sequence[float], cells: PointCells, least: float = LEAST_POINTS) -> float:
-    """Return the side of Poisson's finest cells: as large as the points are many, smaller where surfaces are bent.
+def choose_cell(sizes: Sequence[float], cells: PointCells, least: float = CELLS.least_points) -> float:
+    """Return the side of Poisson's finest cells by the density of the points; smaller where surfaces are bent.
 
     Thin things and ornaments are lost in cells of several points, walls are not.
 
@@ -116,28 +115,28 @@ def choose_cell(sizes: Sequence[float], cells: PointCells, least: float = LEAST_
         sizes: allowed sides, the finest first, each twice the one before; not empty.
         least: smallest mean number of points in an occupied cell, > 0.
     """
-    held = cache(cells.points_per_cell)
-    fine, coarse = (find_size(sizes, held, points) for points in (least, max(least, MOST_POINTS)))
+    density = cache(cells.points_per_cell)
+    fine, coarse = (find_size(sizes, density, points) for points in (least, max(least, CELLS.most_points)))
     if fine == coarse:
         return fine
-    if (bent_if_coarse := cells.bent_share(2.0 * coarse)) <= BENT_SHARE:
+    if (bent_if_coarse := cells.bent_share(2.0 * coarse)) <= CELLS.bent_share:
         return coarse
-    if (bent_if_fine := cells.bent_share(2.0 * fine)) >= BENT_SHARE:
+    if (bent_if_fine := cells.bent_share(2.0 * fine)) >= CELLS.bent_share:
         return fine
-    way = log(BENT_SHARE / max(bent_if_fine, 1e-6)) / log(bent_if_coarse / max(bent_if_fine, 1e-6))
-    return float(fine * (coarse / fine) ** way)
+    share = log(CELLS.bent_share / max(bent_if_fine, 1e-6)) / log(bent_if_coarse / max(bent_if_fine, 1e-6))
+    return float(fine * (coarse / fine) ** share)
 
 
-def find_size(sizes: Sequence[float], points_per_cell: Callable[[float], float], wanted: float) -> float:
-    """Return the smallest side of cells that hold as many points; between two sizes, these follow a power of the side.
+def find_size(sizes: Sequence[float], points_per_cell: Callable[[float], float], points: float) -> float:
+    """Return the smallest side of cells with a mean number of points; between two sizes, it is a power of the side.
 
     Args:
         sizes: allowed sides, the finest first, each twice the one before.
-        wanted: that number, > 0.
+        points: per occupied cell, > 0.
     """
     cell, finer = 0.0, 0.0
     for cell in sizes:
-        if (held := points_per_cell(cell)) >= wanted:
-            return float(cell * 2.0 ** -(log(held / wanted) / log(held / finer))) if finer else cell
-        finer = held
+        if (density := points_per_cell(cell)) >= points:
+            return float(cell * 2.0 ** -(log(density / points) / log(density / finer))) if finer else cell
+        finer = density
     return cell

@@ -12,8 +12,6 @@ from sfm_app.errors import SfmError
 from sfm_app.geometry.triangles import median_edge_length, vertex_normals
 from sfm_app.operating_system import load_libusb
 
-# Import of Open3D, which is slow, logs much, and needs libraries that minimal Linux systems lack.
-
 PACKAGES = {
     "libEGL.so.1": "libegl1",
     "libGL.so.1": "libgl1",
@@ -23,7 +21,7 @@ PACKAGES = {
     "libudev.so.1": "libudev1",
     "libusb-1.0.so.0": "libusb-1.0-0",
 }
-"""Packages of Debian and Ubuntu that have the libraries to which Open3D's wheels for Linux link."""
+"""Packages of Debian and Ubuntu with the libraries to which Open3D's wheels for Linux link."""
 
 
 @functools.cache
@@ -50,24 +48,17 @@ def _hint(message: str) -> str:
     return f"on Debian and Ubuntu: apt-get install {' '.join(packages)}"
 
 
-# Normals of a fine surface at the places that are closest to points.
-
 REACH_EDGES = 4.0
-"""Distance from the fine surface, in median edges of it, beyond which it says nothing about a point. Chosen on
-fountain-P11 with 50 000 triangles (benchmarks/surface/normal_map.py): 1 leaves out 0.4 % of the texels, 16 none that 4
-leaves out; the angles are the same."""
+"""Largest distance of a point from the fine surface, in median edges of it. Chosen on fountain-P11 with 50 000
+triangles (benchmarks/surface/normal_map.py): 1 leaves out 0.4 % of the texels, 16 none that 4 leaves out, at equal
+angles."""
 
 
 class NearestNormals:
-    """A fine surface, prepared to be asked for its normals near points; several threads may ask at once."""
+    """Normals of a fine surface at the places closest to points; safe for threads."""
 
     def __init__(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
-        """Prepare the search.
-
-        Args:
-            vertices: (V, 3).
-            faces: (T, 3) vertex indices.
-        """
+        """Prepare the search; vertices (V, 3), faces (T, 3) vertex indices."""
         self._faces, self._scene = faces, None
         if not len(faces):
             return
@@ -99,19 +90,11 @@ class NearestNormals:
         return np.where(good[:, None], normals / np.where(good, length, 1.0)[:, None], 0).astype(np.float32)
 
 
-# Occlusion of points on a surface by the surface.
-
-
 class Occluders:
     """Triangles that may hide points from cameras."""
 
     def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
-        """Prepare for ray casting.
-
-        Args:
-            vertices: (V, 3).
-            faces: (T, 3) vertex indices.
-        """
+        """Prepare for ray casting; vertices (V, 3), faces (T, 3) vertex indices."""
         self._tensor = load_open3d().core.Tensor
         self._scene = load_open3d().t.geometry.RaycastingScene(nthreads=1)
         self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(faces.astype(np.uint32)))
@@ -124,9 +107,9 @@ class Occluders:
             slack: length of the start of each ray that is ignored, because the point's own triangles are there.
             points: (N, 3).
         """
-        way = center - points
-        length = np.linalg.norm(way, axis=1, keepdims=True)
-        start = points + way * np.minimum(slack / np.maximum(length, 1e-300), 1.0)
+        ray = center - points
+        length = np.linalg.norm(ray, axis=1, keepdims=True)
+        start = points + ray * np.minimum(slack / np.maximum(length, 1e-300), 1.0)
         rays = np.concatenate([start, center - start], axis=1).astype(np.float32)
         found = self._scene.test_occlusions(self._tensor(rays), 0.0, 1.0, nthreads=1)
         return np.asarray(found.numpy(), np.bool_)

@@ -1,4 +1,4 @@
-"""The refinement of a surface: from coarse photos to fine ones, in a few Gauss-Newton steps each."""
+"""Refinement of a surface by photos, from coarse to fine, in a few Gauss-Newton steps each."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
@@ -17,15 +17,9 @@ from sfm_app.meshing.fairness import Neighbors, find_displacements
 from sfm_app.types import Surface
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-# Divide triangles that are too large for the detail that photos show.
-
 
 def split_long_edges(surface: Surface, longest: FloatArray) -> Surface:
-    """Return the surface with every edge that is too long divided in the middle.
-
-    Args:
-        longest: (V,) longest edge at each vertex; the smaller one of both ends decides.
-    """
+    """Return the surface with long edges divided in the middle; the smaller limit (V,) of both ends decides."""
     edges, edge_of = unique_edges(surface.faces)
     middle = np.full(len(edges), -1)
     count = _number_long(edges, surface.vertices, longest, middle)
@@ -40,7 +34,7 @@ def split_long_edges(surface: Surface, longest: FloatArray) -> Surface:
 
 @kernel
 def _number_long(edges: IndexArray, vertices: FloatArray, longest: FloatArray, middle: IndexArray) -> int:
-    """Fill in the numbers of the new vertices in the middle of edges that are too long; return how many there are."""
+    """Fill in the numbers of the new vertices in the middle of long edges; return their number."""
     count = 0
     for k in range(len(edges)):
         a, b = edges[k, 0], edges[k, 1]
@@ -52,7 +46,7 @@ def _number_long(edges: IndexArray, vertices: FloatArray, longest: FloatArray, m
 
 
 def sort_in_space(surface: Surface) -> Surface:
-    """Return the surface with neighbors close to each other in memory: it is drawn and smoothed twice as fast."""
+    """Return the surface with neighbors close to each other in memory, which halves the time of a step."""
     order = morton_order(surface.vertices)
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
@@ -79,17 +73,15 @@ def _divide_triangles(faces: IndexArray, middle: IndexArray) -> IndexArray:
     return np.concatenate([*parts, middle[count == 3]])
 
 
-# Keep the photos that were used last, with the surface in them: each is drawn once, and memory stays bounded.
-
 MOST_KEPT_PX = 100_000_000
-"""Pixels of the photos that are kept: 2 GB. By the memory that a run may have."""
+"""Pixels of the photos that `Sights` keeps: 2 GB."""
 
 
 class Sights:
-    """Photos by their number, made when they are asked for first."""
+    """A cache of the last photos used, by number, each with the surface drawn into it."""
 
-    def __init__(self, look: Callable[[int], Sight]) -> None:
-        self._look, self._lock = look, Lock()
+    def __init__(self, look: Callable[[int], Sight], most_px: int = MOST_KEPT_PX) -> None:
+        self._look, self._most_px, self._lock = look, most_px, Lock()
         self._kept = OrderedDict[int, Future[Sight]]()
 
     def __getitem__(self, number: int) -> Sight:
@@ -114,7 +106,7 @@ class Sights:
             done = [(key, one.result()) for key, one in self._kept.items() if one.done() and not one.exception()]
             pixels = sum(sight.raster.depth.size for _, sight in done)
             for key, sight in done[:-1]:
-                if pixels <= MOST_KEPT_PX:
+                if pixels <= self._most_px:
                     break
                 pixels -= sight.raster.depth.size
                 del self._kept[key]
@@ -123,21 +115,29 @@ class Sights:
 Spread = Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]]
 """Calls a function for every number, possibly in parallel, and returns the results in order."""
 
-LEVELS = ((0.5, 2), (1.0, 3))
-"""Shares of the resolution of the photos, and iterations at each. Chosen on `ornament`, where three and two find less
-of the edges; on `garden`, which was left out, too."""
-STEPS = sum(iterations for _, iterations in LEVELS)
-"""Times that every photo is asked."""
-EDGE_PX = 8.0
-"""Longest edge in the photo that shows it best, in pixels. Chosen on `ornament`: half as long ones cost twice as much
-and find nothing more."""
-ROUNDS = 3
-"""Most times that edges are divided before a level."""
-LONGEST_STEP_PX = 1.0
-"""Longest step of a vertex, in pixels of the photo that shows it best: photos are smooth over about that. By
-definition of the blur."""
-MOST_EDGES = 0.5
-"""Longest step of a vertex in edges, so that triangles do not turn over. By definition."""
+
+@dataclass(frozen=True, slots=True)
+class RefineOptions:
+    """Levels and steps of the refinement."""
+
+    levels: tuple[tuple[float, int], ...] = ((0.5, 2), (1.0, 3))
+    """Shares of the resolution of the photos, and iterations at each. Chosen on `ornament`, where (3, 2) recovers fewer
+    edges; confirmed on `garden`."""
+    edge_px: float = 8.0
+    """Longest edge in pixels of the closest photo. Chosen on `ornament`: half of it doubles the cost for the same
+    surface."""
+    divisions: int = 3
+    """Most divisions of an edge before a level. Chosen by hand."""
+    longest_step_px: float = 1.0
+    """Longest step of a vertex in pixels of the closest photo: photos are smooth over about that. By definition of the
+    blur."""
+    longest_step_edges: float = 0.5
+    """Longest step of a vertex in edges: triangles do not turn over. By definition."""
+
+
+OPTIONS = RefineOptions()
+STEPS = sum(iterations for _, iterations in OPTIONS.levels)
+"""Iterations on all levels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,59 +148,60 @@ class Refinement:
     correlations: tuple[float, ...]
     """Mean correlation of photos through the surface, before each iteration."""
     failed: str = ""
-    """Why the surface is as it was; empty where it is refined."""
+    """Reason why the surface is not refined; empty where it is."""
 
 
 def refine(
     surface: Surface, photos: Sequence[RefinePhoto], partners: Sequence[Sequence[int]], most: int, spread: Spread = map
 ) -> Refinement:
-    """Move the vertices of a surface along their normals to where photos agree best; divide what is too coarse.
+    """Move the vertices of a surface along their normals to where photos agree best; divide coarse triangles.
 
     Args:
-        surface: triangles, counterclockwise seen from outside, about right to some pixels.
-        photos: posed photos without distortion.
-        partners: for each photo, numbers of others that it is compared with.
+        surface: triangles, counterclockwise seen from outside, with errors of some pixels.
+        partners: for each photo, numbers of the others for comparison.
     """
-    found = list[float]()
-    for share, iterations in LEVELS:
+    correlations = list[float]()
+    for share, iterations in OPTIONS.levels:
         surface = _divide_surface(surface, photos, share, most)
-        around = Neighbors.from_faces(surface.faces, len(surface.vertices))
-        reach = LONGEST_STEP_PX * finest_pixels(surface.vertices, photos, share)
+        neighbors = Neighbors.from_faces(surface.faces, len(surface.vertices))
+        reach = OPTIONS.longest_step_px * finest_pixels(surface.vertices, photos, share)
         for _ in range(iterations):
-            surface, correlation = _improve(surface, around, reach, (photos, partners, share), spread)
-            found.append(correlation)
-    return Refinement(surface, tuple(found))
+            surface, correlation = _improve(surface, neighbors, reach, photos, partners, share, spread)
+            correlations.append(correlation)
+    return Refinement(surface, tuple(correlations))
 
 
 def finest_pixels(vertices: FloatArray, photos: Sequence[RefinePhoto], share: float) -> FloatArray:
-    """Return (V,) the size of a pixel at each vertex, in the photo that has it in view and shows it largest.
+    """Return (V,) the size of a pixel at each vertex in the closest photo with it in view, infinite without one.
 
-    Infinite where no photo has it in view; what hides it does not matter.
+    Occlusion does not matter.
 
     Args:
         vertices: (V, 3).
     """
-    found = np.full(len(vertices), np.inf)
+    sizes = np.full(len(vertices), np.inf)
     for photo in photos:
-        seen = project_vertices(vertices, photo.projection(share))
-        _keep_finest(seen, photo.size_at(share), photo.focal_px, photo.gray.shape[1], found)
-    return found
+        pixels = project_vertices(vertices, photo.projection(share))
+        _keep_finest(pixels, photo.size_at(share), photo.focal_px, photo.gray.shape[1], sizes)
+    return sizes
 
 
 @kernel
-def _keep_finest(seen: FloatArray, shape: tuple[int, int], focal_px: float, full_width: int, found: FloatArray) -> None:
-    """Keep the smaller size of a pixel at each vertex, the known one or that of a photo with x, y, 1 / depth `seen`."""
+def _keep_finest(
+    pixels: FloatArray, shape: tuple[int, int], focal_px: float, full_width: int, sizes: FloatArray
+) -> None:
+    """Reduce the size of a pixel at each vertex to that of a photo, where smaller; `pixels` are x, y, 1 / depth."""
     height, width = shape
-    for v in range(len(found)):
-        x, y, near = seen[v, 0], seen[v, 1], seen[v, 2]
+    for v in range(len(sizes)):
+        x, y, near = pixels[v, 0], pixels[v, 1], pixels[v, 2]
         if near > 0.0 and 0.0 < x < width and 0.0 < y < height:
-            found[v] = min(found[v], 1.0 / (near * focal_px * width / full_width))
+            sizes[v] = min(sizes[v], 1.0 / (near * focal_px * width / full_width))
 
 
 def _divide_surface(surface: Surface, photos: Sequence[RefinePhoto], share: float, most: int) -> Surface:
-    """Return the surface with triangles as small as a level of the photos asks for, as far as `most` allows."""
-    for _ in range(ROUNDS):
-        finer = split_long_edges(surface, EDGE_PX * finest_pixels(surface.vertices, photos, share))
+    """Return the surface with triangles small enough for a level of the photos, as far as `most` allows."""
+    for _ in range(OPTIONS.divisions):
+        finer = split_long_edges(surface, OPTIONS.edge_px * finest_pixels(surface.vertices, photos, share))
         if len(finer.faces) == len(surface.faces) or len(finer.faces) > most:
             break
         surface = finer
@@ -208,33 +209,32 @@ def _divide_surface(surface: Surface, photos: Sequence[RefinePhoto], share: floa
 
 
 def _improve(
-    surface: Surface, around: Neighbors, reach: FloatArray,
-    seen: tuple[Sequence[RefinePhoto], Sequence[Sequence[int]], float], spread: Spread,
+    surface: Surface, neighbors: Neighbors, reach: FloatArray, photos: Sequence[RefinePhoto],
+    partners: Sequence[Sequence[int]], share: float, spread: Spread,
 ) -> tuple[Surface, float]:  # fmt: skip
     """Return the surface after one step, and the correlation of photos before it."""
-    photos, partners, share = seen
     vertices, faces = surface.vertices, surface.faces
     normals = vertex_normals(vertices, faces)
     facing = normalize(normals[faces].mean(axis=1)).astype(np.float32)
     sights = Sights(lambda k: look(surface, photos[k], share))
 
-    def ask(k: int) -> Pull:
+    def pull_of(k: int) -> Pull:
         return compare(vertices, faces, facing, sights[k], [sights[other] for other in partners[k]])
 
     whole = Pull.zeros(len(vertices))
-    for pull in spread(ask, range(len(photos))):
+    for pull in spread(pull_of, range(len(photos))):
         whole.add(pull)
-    size = np.maximum(around.edge_lengths(vertices), np.finfo(np.float64).tiny ** 0.25)
-    steps = find_displacements(vertices, normals, around, (whole.g, whole.h), size)
-    limit = np.minimum(np.where(np.isfinite(reach), reach, 0.0), MOST_EDGES * size)
+    size = np.maximum(neighbors.edge_lengths(vertices), np.finfo(np.float64).tiny ** 0.25)
+    steps = find_displacements(vertices, normals, neighbors, (whole.g, whole.h), size)
+    limit = np.minimum(np.where(np.isfinite(reach), reach, 0.0), OPTIONS.longest_step_edges * size)
     moved = vertices + np.clip(steps, -limit, limit)[:, None] * normals
     return replace(surface, vertices=moved), whole.correlation / max(whole.pixels, 1.0)
 
 
 def look(surface: Surface, photo: RefinePhoto, share: float) -> Sight:
-    """Return a photo, and the surface in it; nothing where the photo is masked."""
-    found = rasterize(surface.vertices, surface.faces, photo.projection(share), photo.size_at(share))
+    """Return a photo at a share of its resolution, and the surface in it; NOTHING where the photo is masked."""
+    raster = rasterize(surface.vertices, surface.faces, photo.projection(share), photo.size_at(share))
     masked = photo.mask_at(share)
     if masked is not None:
-        found.depth[masked], found.face[masked] = np.inf, NOTHING
-    return Sight(photo.level(share), found)
+        raster.depth[masked], raster.face[masked] = np.inf, NOTHING
+    return Sight(photo.level(share), raster)

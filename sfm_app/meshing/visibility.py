@@ -1,4 +1,4 @@
-"""Colors of a surface's vertices, from the photos that see them.
+"""Visibility of points in photos by their depth maps, and their colors there.
 
 SciPy is imported where it is used: a program that only estimates fundamental matrices starts without it.
 """
@@ -12,14 +12,10 @@ from sfm_app.geometry.triangles import border_angle
 from sfm_app.jit import kernel
 from sfm_app.types.arrays import FloatArray
 
-# Visibility of points in a photo: its depth map confirms them, sees through them, is empty, or is no evidence.
-
 DepthArray = NDArray[np.float32]
 """(H, W) depth along the optical axis in scene units, 0 where unknown."""
 
-NO_EVIDENCE, CONFIRMED, SEEN_THROUGH, EMPTY = 0, 1, 2, 3
-MIN_COSINE = 0.1
-"""Least cosine between a surface's normal and the ray to the photo that confirms it."""
+NO_EVIDENCE, CONFIRMED, SEEN_THROUGH, EMPTY = range(4)
 SKY = -2.0
 """Depth of a pixel that shows the sky; COLMAP's fusion reads it as no depth."""
 THROUGH = 3.0
@@ -37,7 +33,7 @@ class DepthView:
     t: FloatArray
     """(3,) translation of cam_from_world."""
     depth: DepthArray
-    """0 where unknown, SKY where the photo shows the sky; negative, too, where it is masked and gives no evidence."""
+    """0 where unknown, SKY at the sky; negative, too, where the photo is masked."""
     sample_px: float
     """Position inside the pixel at which a depth is sampled, in x and y; 0.5 is the pixel's center."""
 
@@ -53,12 +49,12 @@ class DepthView:
 
     @property
     def axis(self) -> FloatArray:
-        """(3,) unit vector along which it looks, in the world."""
+        """(3,) unit viewing direction in the world."""
         return np.asarray(self.R[2])
 
     @property
     def widest_angle(self) -> float:
-        """Upper bound in radians of the angle between the axis and what the photo shows."""
+        """Upper bound in radians of the angle between the axis and the rays of the photo."""
         return border_angle(self.K, self.depth.shape[1], self.depth.shape[0])
 
     @property
@@ -68,11 +64,11 @@ class DepthView:
 
 
 def judge(points: FloatArray, normals: FloatArray, eye: DepthView, tolerance: float) -> NDArray[np.uint8]:
-    """Judge points on a surface: CONFIRMED, SEEN_THROUGH, EMPTY or SILENT.
+    """Judge points on a surface: CONFIRMED, SEEN_THROUGH, EMPTY or NO_EVIDENCE.
 
     A point is CONFIRMED if it faces the photo and the surrounding depths agree with its own within the relative
     tolerance. It is SEEN_THROUGH if its pixel shows the sky, or if all four surrounding depths lie well behind it. It
-    is EMPTY if it faces the photo and no depth around it is known. Hidden points and points in masked areas are SILENT.
+    is EMPTY if it faces the photo and no depth around it is known. Hidden and masked points give NO_EVIDENCE.
 
     Args:
         points: (N, 3) in the world.
@@ -86,14 +82,9 @@ def judge(points: FloatArray, normals: FloatArray, eye: DepthView, tolerance: fl
 
 @kernel
 def _judge(
-    points: FloatArray,
-    normals: FloatArray,
-    P: FloatArray,
-    center: FloatArray,
-    depth: DepthArray,
-    options: FloatArray,
+    points: FloatArray, normals: FloatArray, P: FloatArray, center: FloatArray, depth: DepthArray, options: FloatArray,
     verdict: NDArray[np.uint8],
-) -> None:
+) -> None:  # fmt: skip
     height, width = depth.shape
     sample_px, tolerance = options[0], options[1]
     for k in range(len(points)):
@@ -109,25 +100,32 @@ def _judge(
         if depth[int(np.floor(v + 0.5)), int(np.floor(u + 0.5))] == SKY:
             verdict[k] = SEEN_THROUGH
             continue
-        low, high, known, masked, near = np.inf, 0.0, 0, 0, False
-        for i in range(row, row + 2):
-            for j in range(col, col + 2):
-                d = depth[i, j]
-                if d > 0:
-                    low, high, known = min(low, d), max(high, d), known + 1
-                    near = near or abs(d - z) <= tolerance * z
-                masked += d < 0
-        # on a slope the four depths bracket the point's; across a step they are of different surfaces
-        between = low <= z <= high and high - low <= 2.0 * THROUGH * tolerance * z
+        low, known, masked, agrees = _surrounding(depth, row, col, z, tolerance)
         if known == 0 and masked > 0:
             continue
-        if near or between or known == 0:
+        if agrees or known == 0:
             x, y, w = center[0] - X, center[1] - Y, center[2] - Z
             facing = normals[k, 0] * x + normals[k, 1] * y + normals[k, 2] * w
-            if facing > MIN_COSINE * np.sqrt(x * x + y * y + w * w):
+            if facing > 0.1 * np.sqrt(x * x + y * y + w * w):
                 verdict[k] = EMPTY if known == 0 else CONFIRMED
         elif known == 4 and low > (1.0 + THROUGH * tolerance) * z:
             verdict[k] = SEEN_THROUGH
+
+
+@kernel
+def _surrounding(depth: DepthArray, row: int, col: int, z: float, tolerance: float) -> tuple[float, int, int, bool]:
+    """Return the least of four depths, the numbers of known and masked ones, and whether they agree with z."""
+    low, high, known, masked, near = np.inf, 0.0, 0, 0, False
+    for i in range(row, row + 2):
+        for j in range(col, col + 2):
+            d = depth[i, j]
+            if d > 0:
+                low, high, known = min(low, d), max(high, d), known + 1
+                near = near or abs(d - z) <= tolerance * z
+            masked += d < 0
+    # on a slope the four depths bracket the point's; across a step they are of different surfaces
+    between = low <= z <= high and high - low <= 2.0 * THROUGH * tolerance * z
+    return low, known, masked, near or between
 
 
 ColorImage = NDArray[np.uint8]
@@ -149,20 +147,12 @@ class Paint:
         return cls(np.zeros((count, 3), np.float32), np.zeros(count, np.float32))
 
     def add(self, at: NDArray[np.int64], other: "Paint") -> None:
-        """Add the colors of another photo.
-
-        Args:
-            at: (N,) the vertices that it sampled, each once.
-        """
+        """Add the colors of another photo; at (N,) the vertices that it sampled, each once."""
         self.total[at] += other.total
         self.weight[at] += other.weight
 
     def mean_colors(self, points: FloatArray) -> NDArray[np.uint8]:
-        """Return (V, 3) mean colors of the photos; vertices that no photo shows have that of the nearest one shown.
-
-        Args:
-            points: (V, 3) vertices.
-        """
+        """Return (V, 3) mean colors at vertices (V, 3); vertices without photo get the color of the nearest other."""
         from scipy.spatial import cKDTree
 
         mean = self.total / np.maximum(self.weight, np.finfo(np.float32).tiny)[:, None]
@@ -175,9 +165,7 @@ class Paint:
 def sample_colors(
     points: FloatArray, normals: FloatArray, verdict: NDArray[np.uint8], eye: DepthView, image: ColorImage
 ) -> Paint:
-    """Sample colors of one photo at the points that it confirms.
-
-    The weight of a color is the area of a unit patch at the point, in pixels.
+    """Sample colors of one photo at the points that it confirms; their weight is the area of a unit patch in pixels.
 
     Args:
         points: (N, 3).
@@ -188,26 +176,20 @@ def sample_colors(
     paint = Paint.zeros(len(points))
     scale = np.array(image.shape[:2]) / eye.depth.shape
     projection = np.diag([scale[1], scale[0], 1.0]) @ eye.projection
-    seen = verdict == CONFIRMED
-    _sample(points, normals, seen, projection, eye.center, eye.focal_px**2, image, paint.total, paint.weight)
+    _sample(
+        points, normals, verdict == CONFIRMED, projection, eye.center, eye.focal_px**2, image, paint.total, paint.weight
+    )
     return paint
 
 
 @kernel
-def _sample(
-    points: FloatArray,
-    normals: FloatArray,
-    seen: NDArray[np.bool_],
-    P: FloatArray,
-    center: FloatArray,
-    scale: float,
-    image: ColorImage,
-    total: NDArray[np.float32],
-    weight: NDArray[np.float32],
-) -> None:
+def _sample(  # noqa: PLR0913
+    points: FloatArray, normals: FloatArray, confirmed: NDArray[np.bool_], P: FloatArray, center: FloatArray,
+    scale: float, image: ColorImage, total: NDArray[np.float32], weight: NDArray[np.float32],
+) -> None:  # fmt: skip
     height, width = image.shape[0], image.shape[1]
     for k in range(len(points)):
-        if not seen[k]:
+        if not confirmed[k]:
             continue
         X, Y, Z = points[k, 0], points[k, 1], points[k, 2]
         z = P[2, 0] * X + P[2, 1] * Y + P[2, 2] * Z + P[2, 3]

@@ -11,8 +11,8 @@ from sfm_app.colmap.dense import map_file, read_views
 from sfm_app.colmap.surface import FUSED, open_points, positions
 from sfm_app.errors import ReconstructionError
 from sfm_app.files import digest_files, is_made_from, load_arrays, replace_atomically
-from sfm_app.meshing import drop_islands, make_manifold, trim
-from sfm_app.meshing.octree import LEAST_POINTS, cell_sizes, choose_cell, cube_around
+from sfm_app.meshing.cleaning import drop_islands, make_manifold, trim
+from sfm_app.meshing.octree import CELLS, cell_sizes, choose_cell, cube_around
 from sfm_app.meshing.refinement import STEPS
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
@@ -53,11 +53,11 @@ def make(scene: Scene, dense_dir: Path, run: RunContext) -> Surface:
     run.workspace.fine_surface.unlink(missing_ok=True)
     views = [view for view in read_views(dense_dir) if map_file(dense_dir, view).exists()]
     points = _fused_points(dense_dir, views, run)
-    source = dense_dir, Originals(scene.model_dir, run.workspace.photos, run.mask_dir)
+    originals = Originals(scene.model_dir, run.workspace.photos, run.mask_dir)
     if block_count(len(points), options) > 1:
-        surface = mesh_in_blocks(source, views, points, _min_confirmed(views, run), run)
+        surface = mesh_in_blocks(dense_dir, originals, views, points, _min_confirmed(views, run), run)
     else:
-        surface = _mesh_at_once(source, views, points, run)
+        surface = _mesh_at_once((dense_dir, originals), views, points, run)
     run.record(vertices=len(surface.vertices), triangles=len(surface.faces))
     with replace_atomically(place / SURFACE) as path:
         np.savez(path, vertices=surface.vertices, faces=surface.faces, colors=surface.colors)
@@ -96,7 +96,7 @@ def _span(points: NDArray[np.void], run: RunContext) -> Surface:
     max_cells = np.inf if options.max_image_size_px else 1.6 * options.faces
     sizes = list(cell_sizes(extent, options.poisson_depth))
     with run.step("finding the surface"):
-        cell = choose_cell(sizes, RecordCells(lambda: [points]), max(LEAST_POINTS, len(xyz) / max_cells))
+        cell = choose_cell(sizes, RecordCells(lambda: [points]), max(CELLS.least_points, len(xyz) / max_cells))
         cube = cube_around(bounds[0], bounds[1], cell)
         region = with_halo(bounds, cell) if options.trim else EVERYWHERE
         surface, raw = span_surface(points, region, cube, run.workspace.surface)

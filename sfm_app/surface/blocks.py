@@ -1,7 +1,7 @@
-"""The surface in blocks: each is a task of its own, and they are joined along their faces.
+"""The surface in blocks: each is a task, and they are joined along their faces.
 
 A block reads the fused points in and around it and the depth maps, and writes its surface into a file; a killed run
-resumes at the blocks that are missing.
+resumes at the missing blocks.
 """
 
 import shutil
@@ -18,20 +18,10 @@ from sfm_app.colmap.surface import FUSED, poisson_surface, positions, simplify, 
 from sfm_app.errors import ReconstructionError
 from sfm_app.files import fingerprint, load_arrays, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.geometry.triangles import Clusters, border_angle, cluster, median_edge_length, select_faces, vertex_normals
-from sfm_app.meshing import (
-    CONFIRMED,
-    NO_EVIDENCE,
-    DepthView,
-    Paint,
-    Support,
-    drop_islands,
-    judge,
-    make_manifold,
-    sample_colors,
-    trim,
-)
 from sfm_app.meshing.blocks import Partition, Split, close_cracks, split_points, weld
-from sfm_app.meshing.octree import DEEPEST, Cube, cell_sizes, choose_cell, count_bent, count_cells, cube_around
+from sfm_app.meshing.cleaning import Support, drop_islands, make_manifold, trim
+from sfm_app.meshing.octree import CELLS, Cube, cell_sizes, choose_cell, count_bent, count_cells, cube_around
+from sfm_app.meshing.visibility import CONFIRMED, NO_EVIDENCE, DepthView, Paint, judge, sample_colors
 from sfm_app.operating_system import move
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_count, block_workers
@@ -42,12 +32,34 @@ from sfm_app.tasks import Shared, Task
 from sfm_app.types import Surface
 from sfm_app.types.arrays import FloatArray
 
-# The fused points sorted by blocks: each block's are in a file of its own, so that no block reads those of all.
-
 POINTS = "points"
-"""Folder with one file of records per block."""
-CHUNK = 4_000_000
-"""Points that are read at once."""
+"""Folder with one file of records per block: no block reads the points of all."""
+BLOCKS = "blocks"
+"""Folder beside the surface while its blocks are made."""
+EVERYWHERE = np.array([[-np.inf] * 3, [np.inf] * 3])
+"""Infinite bounds."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlockOptions:
+    """Limits of blocks."""
+
+    chunk: int = 4_000_000
+    """Points in memory while they are sorted. Chosen by hand."""
+    sample: int = 4_000_000
+    """Points that determine the blocks, at most twice as many. Chosen by hand."""
+    halo: int = 24
+    """Cells around a box to which the surface of its points reaches. Gaps of twenty triangles are closed in the same
+    way from both sides, and Poisson's surface does not depend on the end of the points. Chosen by hand."""
+    least_confirmed: int = 200
+    """Vertices of a block that a photo has to confirm to take part in the refinement. Chosen by hand."""
+    weld_halo: float = 8.0
+    """Cells over which a block gives way to its neighbor. Chosen by hand."""
+    crack: float = 2.0
+    """Cells from a plane within which small holes are cracks of the weld. Chosen by hand."""
+
+
+OPTIONS = BlockOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +68,7 @@ class BlockPoints:
 
     folder: Path
     fields: np.dtype[np.void]
-    """Of a record, as `open_points` has it."""
+    """Fields of a record, as from `open_points`."""
     bounds: FloatArray
     """(B, 2, 3) lowest and highest coordinates of the points of each block."""
 
@@ -65,41 +77,35 @@ class BlockPoints:
         return np.fromfile(self.folder / str(number), self.fields)
 
     def read_box(self, box: FloatArray) -> NDArray[np.void]:
-        """Return the records of all blocks that lie in a box.
-
-        Args:
-            box: (2, 3) lowest and highest coordinates.
-        """
-        meet = ((self.bounds[:, 0] <= box[1]) & (self.bounds[:, 1] >= box[0])).all(axis=1)
+        """Return the records of all blocks that lie in a box; box (2, 3) lowest and highest coordinates."""
+        overlaps = ((self.bounds[:, 0] <= box[1]) & (self.bounds[:, 1] >= box[0])).all(axis=1)
         parts = [np.empty(0, self.fields)]
-        for number in np.flatnonzero(meet).tolist():
+        for number in np.flatnonzero(overlaps).tolist():
             records = self.read(number)
-            where = positions(records)
-            parts.append(records[((where >= box[0]) & (where <= box[1])).all(axis=1)])
+            place = positions(records)
+            parts.append(records[((place >= box[0]) & (place <= box[1])).all(axis=1)])
         return np.concatenate(parts)
 
 
-def sort_points(points: NDArray[np.void], partition: Partition, folder: Path) -> BlockPoints:
-    """Write the points of each block into a file, unless a killed run has.
-
-    Args:
-        points: (N,) records of all points, as `open_points` has them.
-    """
+def sort_points(
+    points: NDArray[np.void], partition: Partition, folder: Path, chunk: int = OPTIONS.chunk
+) -> BlockPoints:
+    """Write the records of points (N,), from `open_points`, into a file per block, unless a killed run has."""
     place, unfinished, count = folder / POINTS, folder / f"{POINTS}-unfinished", len(partition.boxes)
     if not place.exists():
         shutil.rmtree(unfinished, ignore_errors=True)
         unfinished.mkdir()
         for number in range(count):
             (unfinished / str(number)).touch()
-        for start in range(0, len(points), CHUNK):
-            chunk = np.asarray(points[start : start + CHUNK])
-            _add(chunk, partition.find_blocks(positions(chunk)), unfinished, count)
+        for start in range(0, len(points), chunk):
+            part = np.asarray(points[start : start + chunk])
+            _add(part, partition.find_blocks(positions(part)), unfinished, count)
         move(unfinished, place)
-    found = BlockPoints(place, points.dtype, np.empty((count, 2, 3)))
+    blocks = BlockPoints(place, points.dtype, np.empty((count, 2, 3)))
     for number in range(count):
-        where = positions(found.read(number))
-        found.bounds[number] = where.min(axis=0, initial=np.inf), where.max(axis=0, initial=-np.inf)
-    return found
+        own = positions(blocks.read(number))
+        blocks.bounds[number] = own.min(axis=0, initial=np.inf), own.max(axis=0, initial=-np.inf)
+    return blocks
 
 
 def _add(records: NDArray[np.void], numbers: NDArray[np.intp], folder: Path, count: int) -> None:
@@ -111,21 +117,12 @@ def _add(records: NDArray[np.void], numbers: NDArray[np.intp], folder: Path, cou
             file.write(part.tobytes())
 
 
-# Poisson's surface of points, in a cube that two more points enlarge until its cells have the size asked for.
-
-HALO = 24
-"""Cells around a box to which the surface of its points reaches. Gaps of twenty triangles are closed in the same way
-from both sides of a block, and Poisson's surface no longer depends on where the points end. Chosen by hand."""
-EVERYWHERE = np.array([[-np.inf] * 3, [np.inf] * 3])
-"""Bounds without end."""
-
-
 @dataclass(frozen=True, slots=True)
 class RecordCells:
-    """The `PointCells` of the fused points, which may be too many to be held at once."""
+    """The `PointCells` of the fused points, which may exceed the memory."""
 
     read: Callable[[], Iterable[NDArray[np.void]]]
-    """Gives their records, part by part."""
+    """Yields their records, part by part."""
 
     def points_per_cell(self, cell: float) -> float:
         """Return the mean number of points in an occupied cell."""
@@ -136,8 +133,8 @@ class RecordCells:
     def bent_share(self, cell: float) -> float:
         """Return the share of cells whose normals differ."""
         counts = [count_bent(positions(part), _normals(part), cell) for part in self.read()]
-        bent, told = np.sum(counts, axis=0)
-        return float(bent / max(told, 1))
+        bent, several = np.sum(counts, axis=0)
+        return float(bent / max(several, 1))
 
 
 def _normals(records: NDArray[np.void]) -> FloatArray:
@@ -146,20 +143,14 @@ def _normals(records: NDArray[np.void]) -> FloatArray:
 
 
 def with_halo(bounds: FloatArray, cell: float) -> FloatArray:
-    """Return (..., 2, 3) bounds with their halo.
-
-    Args:
-        bounds: (..., 2, 3) lowest and highest coordinates.
-    """
-    return bounds + HALO * cell * np.array([-1.0, 1.0])[:, None]
+    """Return (..., 2, 3) bounds with their halo; bounds (..., 2, 3) lowest and highest coordinates."""
+    return bounds + OPTIONS.halo * cell * np.array([-1.0, 1.0])[:, None]
 
 
 def span_surface(records: NDArray[np.void], bounds: FloatArray, cube: Cube, place: Path) -> tuple[Surface, int]:
-    """Return Poisson's surface within bounds, and how many triangles all of it has.
+    """Return Poisson's surface of records (N,) within bounds (2, 3), and the number of triangles of all of it.
 
-    Args:
-        records: (N,) of the points, as `open_points` has them.
-        bounds: (2, 3) lowest and highest coordinates.
+    Two more points enlarge the cube of the octree until its cells have the size of `cube`.
     """
     anchors = np.zeros(2, records.dtype)
     for axis, letter in enumerate("xyz"):
@@ -172,48 +163,39 @@ def span_surface(records: NDArray[np.void], bounds: FloatArray, cube: Cube, plac
     return select_faces(raw, inside[raw.faces].all(axis=1)), len(raw.faces)
 
 
-# What the surface at once and the surface in blocks have in common: the photos' judgment, and simplification.
-
-LEAST_CONFIRMED = 200
-"""Vertices of a block that a photo has to confirm for taking part in its refinement. Chosen by hand."""
-
 Judgment = tuple[NDArray[np.int64], NDArray[np.uint8], Paint]
-"""Of one photo: the vertices (N,) it says something about, what it says of each (N,), and its colors there."""
+"""The judgment of one photo: vertices (N,), its verdict on each (N,), and its colors there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceJudge:
-    """Asks photos whether they confirm the vertices of a surface, and for their colors."""
+    """The judgment of photos on the vertices of a surface, and their colors."""
 
     surface: Surface
     normals: NDArray[np.float64]
-    """(V, 3)"""
+    """(V, 3)."""
     clusters: Clusters
-    """Of the vertices."""
+    """Clusters of the vertices."""
     dense_dir: Path
     """Folder with undistorted photos and their maps."""
     tolerance: float
-    """Relative difference in depth."""
+    """Relative difference in depth within which a photo confirms a vertex."""
 
     @classmethod
     def prepare(cls, surface: Surface, dense_dir: Path, tolerance: float) -> "SurfaceJudge":
-        """Prepare for a surface from Poisson reconstruction.
-
-        Args:
-            tolerance: relative difference in depth within which a photo confirms a vertex.
-        """
+        """Prepare for a surface from Poisson reconstruction."""
         normals = vertex_normals(surface.vertices, surface.faces)
         return cls(surface, normals, cluster(surface.vertices[:, None, :]), dense_dir, tolerance)
 
     def judge(self, view: View) -> Judgment:
-        """Let one photo judge the vertices that it has in view."""
+        """Return the judgment of a photo on the vertices in view."""
         eye = DepthView(view.K, view.R, view.t, read_depth(self.dense_dir, view, "geometric"), view.sample_px)
         near = self.clusters.find_in_cone(eye.center, eye.axis, eye.widest_angle)
         points, normals = self.surface.vertices[near], self.normals[near]
         verdict = judge(points, normals, eye, self.tolerance)
         paint = sample_colors(points, normals, verdict, eye, read_color(self.dense_dir, view))
-        said = verdict != NO_EVIDENCE
-        return near[said], verdict[said], Paint(paint.total[said], paint.weight[said])
+        judged = verdict != NO_EVIDENCE
+        return near[judged], verdict[judged], Paint(paint.total[judged], paint.weight[judged])
 
     def sum_up(self, judgments: Iterable[Judgment]) -> tuple[Surface, Support]:
         """Return the surface with colors from the photos, and their support for each of its vertices."""
@@ -226,58 +208,48 @@ class SurfaceJudge:
 
 
 def judge_by_all(judge: SurfaceJudge, views: Sequence[View]) -> tuple[Surface, Support, list[View]]:
-    """Return what `sum_up` does, and the photos that confirm enough of the surface to refine it."""
-    seers = list[View]()
+    """Return the result of `sum_up`, and the photos that confirm enough of the surface to refine it."""
+    witnesses = list[View]()
 
-    def ask(view: View) -> Judgment:
-        said = judge.judge(view)
-        if np.count_nonzero(said[1] == CONFIRMED) >= LEAST_CONFIRMED:
-            seers.append(view)
-        return said
+    def judge_by(view: View) -> Judgment:
+        judgment = judge.judge(view)
+        if np.count_nonzero(judgment[1] == CONFIRMED) >= OPTIONS.least_confirmed:
+            witnesses.append(view)
+        return judgment
 
-    return *judge.sum_up(map(ask, views)), seers
+    return *judge.sum_up(map(judge_by, views)), witnesses
 
 
 def judge_view(judges: Shared[SurfaceJudge], view: View) -> Judgment:
-    """Let one photo judge the vertices that it has in view, on any machine."""
+    """Return the judgment of a photo on the vertices in view, on any machine."""
     return judges.value.judge(view)
 
 
 def simplify_mesh(surface: Surface, options: MeshSettings, scratch: Path, threads: int = 1) -> Surface:
-    """Simplify to as few triangles as the error allows, and no more than asked for."""
+    """Simplify to as few triangles as the error allows, and at most those of the settings."""
     if not options.max_error_edges and len(surface.faces) <= options.faces:
         return surface
     edge = median_edge_length(surface.vertices, surface.faces)
     return simplify(surface, options.faces, options.max_error_edges * edge, scratch, threads)
 
 
-BLOCKS = "blocks"
-"""Folder beside the surface while its blocks are made."""
-GIVE_WAY = 8.0
-"""Cells over which a block gives way to its neighbor. Chosen by hand."""
-AT_PLANE = 2.0
-"""Cells from a plane within which small holes are cracks from joining. Chosen by hand."""
-SAMPLE = 4_000_000
-"""Points, at most twice as many, by which the blocks are laid out."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockTask:
-    """Everything that one block needs besides the files; it can be sent to another process."""
+    """Input of one block besides the files, for any process."""
 
     folder: Path
-    """Where its files go."""
+    """Folder of its files."""
     points: BlockPoints
-    """Those of all blocks."""
+    """Points of all blocks."""
     dense_dir: Path
     originals: Originals
     views: Sequence[View]
-    """The photos that may see it."""
+    """Photos with the block in view."""
     partners: Partners
-    """With which of the others each one is compared."""
+    """Photos with which each is compared."""
     number: int
     bounds: FloatArray
-    """(2, 3) of its points and halo."""
+    """(2, 3) bounds of its points and halo."""
     cell: float
     """Side of the finest cells."""
     cube: Cube
@@ -287,7 +259,7 @@ class BlockTask:
     least: float
     """Photos that have to confirm the average vertex of a part."""
     keeps_fine: bool
-    """Whether its surface is also kept as it is before it is simplified."""
+    """Whether its surface is also kept before simplification."""
 
     @property
     def path(self) -> Path:
@@ -301,23 +273,27 @@ class BlockTask:
 
 
 def mesh_in_blocks(
-    source: tuple[Path, Originals], views: Sequence[View], points: NDArray[np.void], least: float, run: RunContext
-) -> Surface:
+    dense_dir: Path, originals: Originals, views: Sequence[View], points: NDArray[np.void], least: float,
+    run: RunContext,
+) -> Surface:  # fmt: skip
     """Return the surface of all points, made block by block.
 
     Args:
         points: (N,) records of the fused points.
+        least: photos that have to confirm the average vertex of a part.
 
     Raises:
         ReconstructionError: there is no surface.
     """
-    (dense_dir, originals), place, options = source, run.workspace.surface, run.settings.mesh
-    folder = place / BLOCKS
+    options = run.settings.mesh
+    folder = run.workspace.surface / BLOCKS
     made_from = fingerprint(run.fingerprint, len(points), options.model_dump())
     if not resume_or_clear(folder, made_from):
         mark_unfinished(folder, made_from)
     with run.step("sorting the points"):
-        partition = split_points(_sample(points), block_count(len(points), options))
+        partition = split_points(
+            positions(points[:: max(1, len(points) // OPTIONS.sample)]), block_count(len(points), options)
+        )
         own = sort_points(points, partition, folder)
         sizes = sizes_for_blocks(own.bounds, options.poisson_depth)
         cell = choose_cell(sizes, RecordCells(lambda: map(own.read, range(len(own.bounds)))))
@@ -325,25 +301,24 @@ def mesh_in_blocks(
     cubes = [cube_around(low, high, cell) for low, high in bounds]
     farthest = run.map(Task(farthest_depth, dense_dir), views, "measuring depths")
     partners = rank_partners(views)
-    seers = _photos_in_reach(views, farthest, bounds)
     tasks = [
-        BlockTask(folder, own, dense_dir, originals, seen, {view.name: partners[view.name] for view in seen},
+        BlockTask(folder, own, dense_dir, originals, near, {view.name: partners[view.name] for view in near},
                   k, bounds[k], cell, cubes[k], options, run.settings.depth.consistency, least,
                   run.settings.texture.normal_map)
-        for k, seen in enumerate(seers)
+        for k, near in enumerate(_photos_in_reach(views, farthest, bounds))
     ]  # fmt: skip
     with run.with_workers(block_workers(run.workers, run.memory_mb, options)) as few:
         raw = few.map(Task(mesh_block), tasks, "finding the surface in blocks")
     with run.step("joining the blocks"):
-        joined, lost = join_blocks(partition.root, tasks, cell)
+        joined, open_edges = join_blocks(partition.root, tasks, cell)
         joined = drop_islands(joined, options.min_island / len(tasks))  # a share of the triangles of a block
-        surface = close_cracks(joined, partition.near_planes(joined.vertices, AT_PLANE * cell))
+        surface = close_cracks(joined, partition.near_planes(joined.vertices, OPTIONS.crack * cell))
     if not len(surface.faces):
         raise ReconstructionError(
             "the photos confirm no part of the surface", hint="take more photos, a step apart, with more overlap"
         )
     run.record(blocks=len(tasks), planes=[list(plane) for plane in partition.planes()])
-    run.record(cell=cell, raw_triangles=sum(raw), open_border_edges=lost)
+    run.record(cell=cell, raw_triangles=sum(raw), open_border_edges=open_edges)
     if run.settings.texture.normal_map:
         save_fine(_parts_without_halo(tasks, partition), run.workspace.fine_surface)
     shutil.rmtree(folder)
@@ -351,82 +326,70 @@ def mesh_in_blocks(
 
 
 def mesh_block(task: BlockTask) -> int:
-    """Write the surface of a block and its halo, unless a killed run has; return the triangles that Poisson found."""
+    """Write the surface of a block and its halo, unless a killed run has; return the number of Poisson's triangles."""
     if task.path.exists():
         return int(load_arrays(task.path)["raw"])
     # a worker that was cut off from a cluster may still be at the same block
     scratch = Path(tempfile.mkdtemp(dir=task.folder, prefix=f"{task.number}-"))
     near, raw = span_surface(task.points.read_box(task.bounds), task.bounds, task.cube, scratch)
     judge = SurfaceJudge.prepare(near, task.dense_dir, task.tolerance)
-    found, support, seers = judge_by_all(judge, task.views)
-    if task.options.trim and len(found.faces):
-        found = trim(found, support, task.options.max_gap_triangles, task.least)
-    if len(found.faces) and task.options.max_image_size_px:
-        found = refine_surface(found, task.originals, seers, task.partners, task.options).surface
-    found = _simplify_block(found, task, scratch)
+    surface, support, witnesses = judge_by_all(judge, task.views)
+    if task.options.trim and len(surface.faces):
+        surface = trim(surface, support, task.options.max_gap_triangles, task.least)
+    if len(surface.faces) and task.options.max_image_size_px:
+        surface = refine_surface(surface, task.originals, witnesses, task.partners, task.options).surface
+    if task.keeps_fine:
+        save_fine([FineShape.from_surface(surface)], task.fine_path)
+    if len(surface.faces):
+        surface = make_manifold(simplify_mesh(surface, task.options, scratch))
     with replace_atomically(task.path) as path:
-        np.savez(path, vertices=found.vertices, faces=found.faces, colors=found.colors, raw=raw)
+        np.savez(path, vertices=surface.vertices, faces=surface.faces, colors=surface.colors, raw=raw)
     shutil.rmtree(scratch)
     return raw
 
 
-def _simplify_block(found: Surface, task: BlockTask, scratch: Path) -> Surface:
-    """Return the surface of a block with few triangles, and keep it as it is where a normal map is made of it."""
-    if task.keeps_fine:
-        save_fine([FineShape.from_surface(found)], task.fine_path)
-    return make_manifold(simplify_mesh(found, task.options, scratch)) if len(found.faces) else found
-
-
 def _parts_without_halo(tasks: Sequence[BlockTask], partition: Partition) -> Iterator[FineShape]:
-    """Yield the fine surface of each block without its halo, which the neighbors have, too, and better."""
+    """Yield the fine surface of each block without its halo, where its neighbors are better."""
     for task in tasks:
         fine = FineShape.load(task.fine_path)
         yield fine.select(partition.find_blocks(fine.vertices[fine.faces].mean(axis=1)) == task.number)
 
 
 def join_blocks(node: Split | int, tasks: Sequence[BlockTask], cell: float) -> tuple[Surface, int]:
-    """Return the joined surface of all blocks below a node, and how many edges at their faces stayed open."""
+    """Return the joined surface of all blocks below a node, and the number of open edges at their faces."""
     if not isinstance(node, Split):
         stored = load_arrays(tasks[node].path)
         return Surface(stored["vertices"], stored["faces"], stored["colors"]), 0
-    (low, lost), (high, also) = (join_blocks(half, tasks, cell) for half in (node.low, node.high))
-    joined, here = weld(low, high, node.axis, node.at, cell, GIVE_WAY * cell)
-    return joined, here + lost + also
+    (low, low_edges), (high, high_edges) = (join_blocks(half, tasks, cell) for half in (node.low, node.high))
+    joined, edges = weld(low, high, node.axis, node.at, cell, OPTIONS.weld_halo * cell)
+    return joined, edges + low_edges + high_edges
 
 
 def sizes_for_blocks(bounds: FloatArray, most: int) -> list[float]:
-    """Return sides of cells for which no octree of a block is too deep, the finest first.
-
-    Args:
-        bounds: (B, 2, 3) of the points of each block.
-    """
+    """Return sides of cells, the finest first, with octrees of depth <= `most` in blocks of these bounds (B, 2, 3)."""
     extent = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
 
     def deepest(cell: float) -> int:
         return max(cube_around(low, high, cell).depth for low, high in with_halo(bounds, cell))
 
-    sizes = list(cell_sizes(extent, DEEPEST))
+    sizes = list(cell_sizes(extent, CELLS.deepest))
     return [cell for cell in sizes if deepest(cell) <= most] or sizes[-1:]
 
 
 def farthest_depth(dense_dir: Path, view: View) -> float:
-    """Return the largest depth that the map of a photo knows; beyond, it is no evidence."""
+    """Return the largest known depth of a photo; beyond, it is no evidence."""
     return float(read_depth(dense_dir, view, "geometric").max(initial=0.0))
 
 
-def _sample(points: NDArray[np.void]) -> FloatArray:
-    return positions(points[:: max(1, len(points) // SAMPLE)])
-
-
 def _photos_in_reach(views: Sequence[View], farthest: Sequence[float], bounds: FloatArray) -> list[list[View]]:
-    """Return for each block the photos that have it in view, and not only behind all that they know."""
+    """Return for each block the photos that have it in view, and not only behind all known depths."""
     centers = bounds.mean(axis=1)
     radii = 0.5 * np.linalg.norm(bounds[:, 1] - bounds[:, 0], axis=1)
     blocks = Clusters(np.arange(len(bounds)), np.arange(len(bounds) + 1), centers, radii)
-    found: list[list[View]] = [[] for _ in bounds]
+    near: list[list[View]] = [[] for _ in bounds]
     for view, far in zip(views, farthest, strict=True):
         bare = replace(view, point_ids=np.empty(0, np.int64), points=np.empty((0, 3)))
         for number in blocks.find_in_cone(view.center, view.R[2], border_angle(view.K, view.width, view.height)):
             if (centers[number] - view.center) @ view.R[2] - radii[number] <= far:
-                found[number].append(bare)
-    return found
+                near[number].append(bare)
+    return near

@@ -1,7 +1,7 @@
-"""Depth maps fused block by block: COLMAP holds the maps of one block only.
+"""Fusion of depth maps in blocks: COLMAP holds the maps of one block only.
 
-A block is a box. It gets a workspace of its own with the photos that have depths in it, and of these the depths in it
-and a little beyond, so that all blocks together are little more work than the whole.
+A block is a box. Its workspace has the photos with depths in it, and of these the depths in it and a little beyond, so
+that all blocks together are little more work than the whole.
 """
 
 import shutil
@@ -27,30 +27,30 @@ from sfm_app.types.arrays import FloatArray
 MOST_PIXELS = int(1e6 * FUSED_AT_ONCE_MP)
 """Pixels of depth maps that are fused at once."""
 STRIDE = 16
-"""Rows and columns of a map from one sample to the next. Chosen by hand."""
+"""Pixels from one sample of a map to the next. Chosen by hand."""
 BEYOND = 0.03
-"""Share of its depth that a pixel may lie outside of a block and still be part of its points: three times the most that
-COLMAP lets the depths of a point differ."""
+"""Largest distance of a pixel from a block, as a share of its depth: three times COLMAP's tolerance of the depths of a
+point."""
 FUSING = "fusing"
 """Folder beside the points while they are fused."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FusionTask:
-    """Everything that one block needs besides the files; it can be sent to another process."""
+    """Input of one block besides the files, for any process."""
 
     dense_dir: Path
     folder: Path
-    """Where its files go."""
+    """Folder of its files."""
     number: int
     views: Sequence[View]
-    """The photos with depths in it."""
+    """Photos with depths in the block."""
     box: FloatArray
     """(2, 3) lowest and highest coordinates of its points."""
     min_views: int
     """Photos that have to see a point."""
     memory_gb: float
-    """For maps."""
+    """Memory for maps."""
 
     @property
     def path(self) -> Path:
@@ -80,24 +80,20 @@ def fuse_maps(dense_dir: Path, views: Sequence[View], min_views: int, target: Pa
 def plan_fusion(
     dense_dir: Path, views: Sequence[View], min_views: int, folder: Path, run: RunContext
 ) -> list[FusionTask]:
-    """Divide the space that the depth maps show into blocks.
-
-    Args:
-        folder: where the blocks go.
-    """
+    """Divide the space that the depth maps show into blocks."""
     pixels, whole = sum(view.width * view.height for view in views), region(views)
     bare = [replace(view, point_ids=np.empty(0, np.int64), points=np.empty((0, 3))) for view in views]
     samples = run.map(Task(sample_points, dense_dir), bare, "measuring depths")
     inside = [part[((part >= whole[0]) & (part <= whole[1])).all(axis=1)] for part in samples]
     partition = split_points(np.concatenate(inside), -(-pixels // MOST_PIXELS))
-    seen = [set(partition.find_blocks(part).tolist()) for part in inside]
+    blocks_of = [set(partition.find_blocks(part).tolist()) for part in inside]
     memory_gb = cache_gb(run.memory_mb) / run.workers
     return [
         FusionTask(
             dense_dir,
             folder,
             number,
-            [view for view, blocks in zip(bare, seen, strict=True) if number in blocks],
+            [view for view, blocks in zip(bare, blocks_of, strict=True) if number in blocks],
             np.stack([np.maximum(box[0], whole[0]), np.minimum(box[1], whole[1])]),
             min_views,
             memory_gb,
@@ -116,9 +112,9 @@ def fuse_block(task: FusionTask) -> None:
     (scratch / "images").mkdir()
     (scratch / "stereo").mkdir()
     for view in task.views:
-        for kept in (Path("images") / view.name, normals_file(Path(), view)):
-            (scratch / kept).parent.mkdir(parents=True, exist_ok=True)
-            share_bytes(task.dense_dir / kept, scratch / kept)
+        for file in (Path("images") / view.name, normals_file(Path(), view)):
+            (scratch / file).parent.mkdir(parents=True, exist_ok=True)
+            share_bytes(task.dense_dir / file, scratch / file)
         depth = read_depth(task.dense_dir, view, "geometric")
         write_depth(scratch, view, np.where(is_near(view, depth, task.box), depth, np.float32(0)))
     write_fusion_views(scratch, task.views)
@@ -137,25 +133,20 @@ def _cache_gb(views: Sequence[View], memory_gb: float) -> float:
 
 
 def sample_points(dense_dir: Path, view: View) -> FloatArray:
-    """Return points (N, 3) of every so many rows and columns of a map."""
+    """Return points (N, 3) of every `STRIDE`-th row and column of a map."""
     depth = read_depth(dense_dir, view, "geometric")[::STRIDE, ::STRIDE]
     points = world_points(view, depth, STRIDE)
     return points[depth > 0]
 
 
 def is_near(view: View, depth: NDArray[np.float32], box: FloatArray) -> NDArray[np.bool_]:
-    """Return (H, W) whether the depths of a map lie in a box or little beyond it.
-
-    Args:
-        depth: (H, W).
-        box: (2, 3) lowest and highest coordinates.
-    """
-    along = view.R.T @ np.linalg.inv(view.K)
+    """Return (H, W) whether depths (H, W) lie in a box (2, 3) or little beyond it."""
+    rays = view.R.T @ np.linalg.inv(view.K)
     rows, columns = depth.shape
     x, y = np.arange(columns) + view.sample_px, np.arange(rows)[:, None] + view.sample_px
     near, beyond = np.ones(depth.shape, np.bool_), np.float32(BEYOND) * depth
     for axis, center in enumerate(view.center):
-        ray = (along[axis, 0] * x + along[axis, 2] + along[axis, 1] * y).astype(np.float32)
+        ray = (rays[axis, 0] * x + rays[axis, 2] + rays[axis, 1] * y).astype(np.float32)
         place = ray * depth + np.float32(center)
         near &= (place >= np.float32(box[0, axis]) - beyond) & (place <= np.float32(box[1, axis]) + beyond)
     return near
@@ -170,7 +161,7 @@ def world_points(view: View, depth: NDArray[np.float32], step: int) -> FloatArra
 
 
 def link_tree(source: Path, target: Path) -> None:
-    """Make a folder with the files of another, which share their bytes where the system can."""
+    """Copy the files of a folder; they share their bytes where the system can."""
     target.mkdir(parents=True)
     for path in sorted(source.iterdir()):
         if path.is_file():

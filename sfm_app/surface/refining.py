@@ -1,4 +1,4 @@
-"""The surface as it was before simplification, kept for the normal map."""
+"""The refinement of a surface before simplification, and its fine shape for the normal map."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,21 +17,17 @@ from sfm_app.settings import MeshSettings
 from sfm_app.stereo import View, rank_neighbors
 from sfm_app.types import Surface
 
-# The surface moved to where the photos agree best, before it is simplified.
-
 PARTNERS = 3
-"""Photos that each one is compared with. Chosen on `ornament`: with 2 the F-score at 0.05 % is 0.6 lower, with 4 it is
-0.6 higher."""
-FINER = 20
-"""Most triangles while the surface is refined, as a multiple of those that it may have in the end. Chosen by hand."""
+"""Photos with which each is compared. Chosen on `ornament`: with 2 the F-score at 0.05 % is 0.6 lower, with 4 it is 0.6
+higher."""
 
 Partners = Mapping[str, Sequence[str]]
-"""Names of the photos that each one is best compared with, best first."""
+"""Names of the photos for comparison with each one, best first."""
 
 
 @dataclass(frozen=True, slots=True)
 class Originals:
-    """Where the photos of a run are, as laid out by its first stage."""
+    """Folders of the photos of a run."""
 
     model_dir: Path
     """COLMAP model of the photos."""
@@ -39,11 +35,7 @@ class Originals:
     mask_dir: Path | None
 
     def read(self, views: Sequence[View], max_side_px: int, spread: Spread = map) -> list[RefinePhoto]:
-        """Return the photos without distortion, in the order of the views.
-
-        Args:
-            max_side_px: longest side in pixels.
-        """
+        """Return the photos without distortion, in the order of the views."""
         larger = LargerViews(self.model_dir, self.photo_dir, self.mask_dir, views, max_side_px)
         photos, poses, known = larger.photos, {view.name: view for view in views}, dict[str, RefinePhoto]()
 
@@ -53,13 +45,13 @@ class Originals:
                 for name, K, gray, shown in larger.render(photos[number])
             ]
 
-        for found in spread(look, range(len(photos))):
-            known.update(found)
+        for rendered in spread(look, range(len(photos))):
+            known.update(rendered)
         return [known[view.name] for view in views]
 
 
 def rank_partners(views: Sequence[View]) -> Partners:
-    """Return the names of the photos that each one is best compared with, best first."""
+    """Return the names of the photos for comparison with each one, best first."""
     ranked = rank_neighbors(views, 2 * PARTNERS)
     return {view.name: [views[k].name for k in best] for view, best in zip(views, ranked, strict=True)}
 
@@ -77,14 +69,14 @@ def refine_surface(
     number = {view.name: k for k, view in enumerate(views)}
     chosen = [[number[name] for name in partners[view.name] if name in number][:PARTNERS] for view in views]
     try:
-        return refine(surface, photos, chosen, FINER * options.faces, spread)
-    except FAILURES as err:  # the surface is there without it
+        return refine(surface, photos, chosen, 20 * options.faces, spread)  # by hand
+    except FAILURES as err:  # the surface exists without refinement
         return Refinement(surface, (), f"the computation failed: {error_reason(err)}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FineShape:
-    """Triangles without colors, as small as they are kept."""
+    """Triangles without colors, in single precision."""
 
     vertices: NDArray[np.float32]
     """(V, 3) in the frame of the scene."""
@@ -109,11 +101,7 @@ class FineShape:
 
 
 def save_fine(parts: Iterable[FineShape], path: Path) -> None:
-    """Write parts of a surface as one, atomically.
-
-    Args:
-        path: where they go.
-    """
+    """Write parts of a surface as one, atomically."""
     vertices, faces, count = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.int32)], 0
     for part in parts:
         vertices.append(part.vertices)

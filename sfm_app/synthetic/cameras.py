@@ -11,19 +11,16 @@ from sfm_app.errors import ConfigError
 from sfm_app.types.arrays import FloatArray
 
 NEWTON_STEPS = 100
-LEAST_SLOPE = 1e-3
-"""Of the distorted radius, so that a step near the fold stays finite."""
-FOLD_SAMPLES = 100_001
 PROJECTIONS = ("perspective", "stereographic", "equidistant", "equisolid", "equirectangular")
 
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """How rays become points of the normalized image plane, whose unit is the focal length.
+    """Projection and distortion, to the normalized image plane whose unit is the focal length.
 
-    A ray at the angle theta to the optical axis comes to lie at the radius r of its projection: tan(theta),
-    2 tan(theta / 2), theta, or 2 sin(theta / 2). Then x_d = x (1 + k1 r^2 + k2 r^4 + ...), and the tangential terms of
-    COLMAP's OPENCV are added. An equirectangular photo has longitude and latitude instead, and no such terms.
+    A ray at the angle theta to the optical axis has the radius r = tan(theta), 2 tan(theta / 2), theta, or
+    2 sin(theta / 2), by projection. Then x_d = x (1 + k1 r^2 + k2 r^4 + ...), plus the tangential terms of COLMAP's
+    OPENCV. An equirectangular photo has longitude and latitude instead, and no such terms.
 
     Raises:
         ConfigError: the projection is unknown.
@@ -46,7 +43,7 @@ class Lens:
         return self.radial[0] if self.radial else 0.0
 
     def rays(self, points: FloatArray) -> FloatArray:
-        """Return (N, 3) directions, z = 1 with "perspective", else of length 1; NaN for points that no ray reaches.
+        """Return (N, 3) directions, z = 1 with "perspective", else of length 1; NaN for points without ray.
 
         Args:
             points: (N, 2) on the normalized image plane.
@@ -63,8 +60,8 @@ class Lens:
             return np.column_stack([plain, np.ones(len(plain))])
         radius = np.hypot(*plain.T)
         theta = self._angle(radius)
-        along = np.divide(np.sin(theta), radius, out=np.ones_like(radius), where=radius > 0)
-        return np.column_stack([plain * along[:, None], np.cos(theta)])
+        scale = np.divide(np.sin(theta), radius, out=np.ones_like(radius), where=radius > 0)
+        return np.column_stack([plain * scale[:, None], np.cos(theta)])
 
     def project(self, rays: FloatArray) -> FloatArray:
         """Return (N, 2) points of the normalized image plane.
@@ -81,7 +78,7 @@ class Lens:
         return plain * self._factor(np.hypot(*plain.T))[:, None] + self._shift(plain)
 
     def _radius(self, theta: FloatArray) -> FloatArray:
-        """Return the radius at which a ray at an angle to the optical axis comes to lie, before distortion."""
+        """Return the radius before distortion of a ray at an angle to the optical axis."""
         if self.projection == "perspective":
             return np.asarray(np.tan(theta))
         if self.projection == "stereographic":
@@ -113,7 +110,7 @@ class Lens:
         )
 
     def _undistort(self, points: FloatArray) -> FloatArray:
-        """Return (N, 2) the points as they would lie without the radial and tangential terms."""
+        """Return (N, 2) points without the radial and tangential terms."""
         if not any(self.tangential):
             return self._undistort_radius(points)
         plain = points
@@ -124,21 +121,23 @@ class Lens:
         return plain
 
     def _undistort_radius(self, points: FloatArray) -> FloatArray:
-        """Return (N, 2) the points as they would lie without the radial terms, on the branch through the center."""
+        """Return (N, 2) points without the radial terms, on the branch through the center."""
         distorted = np.hypot(points[:, 0], points[:, 1])
         r = distorted.copy()
         if any(self.radial):
             self._check_fold(float(distorted.max(initial=0.0)))
         for _ in range(NEWTON_STEPS if any(self.radial) else 0):
-            step = (r * self._factor(r) - distorted) / np.maximum(self._factor(r, slope=True), LEAST_SLOPE)
+            step = (r * self._factor(r) - distorted) / np.maximum(
+                self._factor(r, slope=True), 1e-3
+            )  # finite near the fold
             r -= step
             if np.all(np.abs(step) <= 2.0 * np.finfo(np.float64).eps * r):
                 break
         return points * np.divide(r, distorted, out=np.ones_like(r), where=distorted > 0)[:, None]
 
     def _check_fold(self, largest: float) -> None:
-        """Check that the distorted radius grows with the undistorted one up to the largest one of the photo."""
-        radius = np.linspace(0.0, 4.0 * max(largest, 1e-9), FOLD_SAMPLES)
+        """Check that the distorted radius grows with the undistorted one up to the largest of the photo."""
+        radius = np.linspace(0.0, 4.0 * max(largest, 1e-9), 100_001)
         ends = np.flatnonzero(self._factor(radius, slope=True) <= 0.0)
         if len(ends) and (radius * self._factor(radius))[ends[0]] <= largest:
             terms = ", ".join(f"{k:g}" for k in self.radial)
@@ -171,15 +170,11 @@ class Views:
     cam_from_world: Mapping[str, FloatArray]
     """By photo name: (3, 4) [R | t]."""
     row_poses: Mapping[str, FloatArray] = field(default_factory=dict)
-    """By photo name, where a rolling shutter took it: (height, 3, 4) pose that each row is seen from."""
+    """By photo name with a rolling shutter: (height, 3, 4) pose of each row."""
 
     @classmethod
     def from_poses(cls, camera: Camera, poses: Sequence[FloatArray]) -> "Views":
-        """Return photos of one camera at several poses, named view_00.jpg and so on.
-
-        Args:
-            poses: (3, 4) cam_from_world each.
-        """
+        """Return photos of one camera at poses cam_from_world (3, 4), named view_00.jpg and so on."""
         named = {f"view_{k:02d}.jpg": pose for k, pose in enumerate(poses)}
         return cls(dict.fromkeys(named, camera), named)
 
@@ -189,9 +184,8 @@ class Views:
         Raises:
             ConfigError: a photo is not among the views.
         """
-        strangers = sorted(set(photos) - set(self.cameras))
-        if strangers:
-            raise ConfigError(f"synthetic cameras: no such photo: {', '.join(strangers)}")
+        if unknown := sorted(set(photos) - set(self.cameras)):
+            raise ConfigError(f"synthetic cameras: no such photo: {', '.join(unknown)}")
         return replace(self, cameras={**self.cameras, **dict.fromkeys(sorted(photos), camera)})
 
 
@@ -221,28 +215,28 @@ class ArcOptions:
     """Largest roll either way, in degrees, [0, 180]."""
 
     def __post_init__(self) -> None:
-        checks = {
-            "photos": self.photos >= 2,
-            "sweep_deg": 0 < self.sweep_deg <= 360,
-            "distance": 0 < self.distance[0] <= self.distance[1] < math.inf,
-            "height": self.height[0] <= self.height[1],
-            "aim_spread": 0 <= self.aim_spread < math.inf,
-            "roll_deg": 0 <= self.roll_deg <= 180,
-        }
-        wrong = [name for name, holds in checks.items() if not holds]
-        if wrong:
-            raise ConfigError(f"synthetic cameras: out of range: {', '.join(wrong)}")
+        check_ranges(
+            "synthetic cameras",
+            photos=self.photos >= 2,
+            sweep_deg=0 < self.sweep_deg <= 360,
+            distance=0 < self.distance[0] <= self.distance[1] < math.inf,
+            height=self.height[0] <= self.height[1],
+            aim_spread=0 <= self.aim_spread < math.inf,
+            roll_deg=0 <= self.roll_deg <= 180,
+        )
+
+
+def check_ranges(subject: str, **valid: bool) -> None:
+    """Raise a ConfigError that names all values out of range."""
+    if wrong := [name for name, holds in valid.items() if not holds]:
+        raise ConfigError(f"{subject}: out of range: {', '.join(wrong)}")
 
 
 def make_camera(
-    width: int,
-    height: int,
-    focal_widths: float = 1.05,
-    center: tuple[float, float] = (0.53, 0.48),
-    aspect: float = 1.0,
-    radial: float = 0.0,
-) -> Camera:
-    """Return a camera whose optical center is not the image center, so that a default guess is wrong.
+    width: int, height: int, focal_widths: float = 1.05, center: tuple[float, float] = (0.53, 0.48),
+    aspect: float = 1.0, radial: float = 0.0,
+) -> Camera:  # fmt: skip
+    """Return a camera with an optical center off the middle of the image, so that a default guess is wrong.
 
     Args:
         width, height: pixels, >= 16.
@@ -283,22 +277,14 @@ def make_wide_camera(
 
 
 def panorama_camera(width: int) -> Camera:
-    """Return the camera of an equirectangular photo: all round, twice as wide as high.
-
-    Args:
-        width: pixels, >= 32.
-    """
+    """Return the camera of an equirectangular photo of this width >= 32 pixels, twice as wide as high."""
     focal = width / (2.0 * math.pi)
     K = camera_matrix(focal, focal, width / 2, width / 4)
     return Camera(K, width, width // 2, Lens("equirectangular"))
 
 
 def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Views:
-    """Return hand-held photos along an arc in front of the scene (towards +z, y up), named view_00.jpg and so on.
-
-    Args:
-        options: the walk; the default one if None.
-    """
+    """Return hand-held photos along an arc in front of the scene (towards +z, y up), named view_00.jpg and so on."""
     options = options or ArcOptions()
     rng = np.random.default_rng([seed, 11])
     count = options.photos
@@ -317,9 +303,8 @@ def look_at(center: FloatArray, aim: FloatArray, roll_deg: float = 0.0) -> Float
     """Return (3, 4) cam_from_world of a camera that looks at a point, world y up.
 
     Args:
-        center: (3,) where the camera stands.
-        aim: (3,) what it looks at.
-        roll_deg: degrees about its optical axis.
+        center, aim: (3,) center of projection, and the point in the middle of the view.
+        roll_deg: rotation about the optical axis.
 
     Raises:
         ValueError: the camera looks straight up or down, so that its roll is undefined.
@@ -339,12 +324,7 @@ def camera_center(cam_from_world: FloatArray) -> FloatArray:
 
 
 def axis_rotation(axis: FloatArray, angle_deg: float) -> FloatArray:
-    """Return (3, 3) rotation about an axis, right-handed (Rodrigues).
-
-    Args:
-        axis: (3,) unit vector.
-        angle_deg: degrees.
-    """
+    """Return (3, 3) rotation about a unit vector (3,), right-handed (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     angle = math.radians(angle_deg)
@@ -358,7 +338,7 @@ def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> F
         offset_px: position of the ray in each pixel; (0.5, 0.5) is the center.
 
     Returns:
-        (height * width, 3), z = 1 with a perspective lens, else of length 1; NaN where the lens shows nothing.
+        (height * width, 3), z = 1 with a perspective lens, else of length 1; NaN outside the image circle.
 
     Raises:
         ConfigError: the radial distortion folds within the photo, so that a pixel has no unique ray.

@@ -6,27 +6,22 @@ from functools import lru_cache
 import numpy as np
 
 from sfm_app.geometry.poses import Similarity, robust_similarity
+from sfm_app.geometry.triangles import areas
 from sfm_app.meshing.ray_casting import load_open3d
 from sfm_app.synthetic.cameras import Camera, camera_center, pixel_rays
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.synthetic.render import cast_rays, ray_caster
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-# Rays along the longer side of each photo that determine which part of the true surface is visible.
-SEEN_RAYS = 96
-# Points sampled on a surface.
 SAMPLES = 20_000
+"""Points sampled on a surface."""
 
 
 def focal_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
     """Return e_focal of thesis section 5.5.3: mean error of fx and fy in percent of the truth.
 
-    Args:
-        K: (3, 3) estimate.
-        photo: name of the photo to which K belongs; needed if there are several cameras.
-
     Raises:
-        ValueError: the photos have several cameras and none is named.
+        ValueError: the photos have several cameras, and `photo` names none of them.
     """
     true = truth.cameras[photo].K if photo else truth.K
     return float(50.0 * sum(abs(K[i, i] / true[i, i] - 1.0) for i in (0, 1)))
@@ -35,23 +30,15 @@ def focal_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
 def center_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
     """Return e_OC of thesis section 5.5.3: mean error of the optical center's x and y in percent of the truth.
 
-    Args:
-        K: (3, 3) estimate.
-        photo: name of the photo to which K belongs; needed if there are several cameras.
-
     Raises:
-        ValueError: the photos have several cameras and none is named.
+        ValueError: the photos have several cameras, and `photo` names none of them.
     """
     true = truth.cameras[photo].K if photo else truth.K
     return float(50.0 * sum(abs(K[i, 2] / true[i, 2] - 1.0) for i in (0, 1)))
 
 
 def surface_error(
-    vertices: FloatArray,
-    faces: IndexArray,
-    centers: Mapping[str, FloatArray],
-    truth: Truth,
-    samples: int = SAMPLES,
+    vertices: FloatArray, faces: IndexArray, centers: Mapping[str, FloatArray], truth: Truth, samples: int = SAMPLES
 ) -> float:
     """Return the median distance of a reconstructed surface to the true one, as a share of the scene's size.
 
@@ -65,54 +52,33 @@ def surface_error(
         samples: points drawn evenly from the surface (fixed seed).
 
     Raises:
-        ValueError: fewer than 3 common photos, their centers lie on a line, or the surface has no area.
+        ValueError: fewer than 3 common photos, or the surface has no area.
+        NumericalError: the camera centers lie on a line.
     """
     return float(np.median(_distances_to_truth(vertices, faces, centers, truth, samples)))
 
 
 def surface_accuracy(
-    vertices: FloatArray,
-    faces: IndexArray,
-    centers: Mapping[str, FloatArray],
-    truth: Truth,
-    tolerance: float = 0.005,
+    vertices: FloatArray, faces: IndexArray, centers: Mapping[str, FloatArray], truth: Truth, tolerance: float = 0.005
 ) -> float:
     """Return the share of a reconstructed surface, by area, that lies within `tolerance` scene sizes of the true one.
 
-    Args:
-        vertices: (V, 3) in the reconstruction's frame.
-        faces: (T, 3) vertex indices.
-        centers: camera center (3,) by photo name, in the frame of `vertices`.
-        tolerance: share of the scene's size, > 0.
-
-    Raises:
-        ValueError: as for `surface_error`.
+    Arguments and errors are those of `surface_error`.
     """
     return float(np.mean(_distances_to_truth(vertices, faces, centers, truth) <= tolerance))
 
 
 def surface_coverage(
-    vertices: FloatArray,
-    faces: IndexArray,
-    centers: Mapping[str, FloatArray],
-    truth: Truth,
-    tolerance: float = 0.01,
+    vertices: FloatArray, faces: IndexArray, centers: Mapping[str, FloatArray], truth: Truth, tolerance: float = 0.01
 ) -> float:
     """Return the share of the visible true surface within `tolerance` scene sizes of the reconstructed surface.
 
     Every pixel of the photos that sees the surface has the same weight.
 
-    Args:
-        vertices: (V, 3) in the reconstruction's frame.
-        faces: (T, 3) vertex indices.
-        centers: camera center (3,) by photo name, in the frame of `vertices`.
-        tolerance: share of the scene's size, > 0.
-
-    Raises:
-        ValueError: as for `surface_error`.
+    Arguments and errors are those of `surface_error`.
     """
     aligned = align_centers(centers, truth)(vertices)
-    if not _triangle_areas(aligned, faces).sum() > 0:
+    if not areas(aligned, faces).sum() > 0:
         raise ValueError("the surface has no area")
     return float(np.mean(surface_distances(seen_points(truth), aligned, faces) <= tolerance * scene_size(truth)))
 
@@ -126,23 +92,21 @@ def scene_size(truth: Truth) -> float:
 def seen_points(truth: Truth) -> FloatArray:
     """Return (N, 3) points where a regular grid of rays through all photos meets the true surface."""
     caster = ray_caster(truth.vertices, truth.faces)
-    found = []
+    parts = []
     for name, pose in truth.cam_from_world.items():
         directions = pixel_rays(_coarse_camera(truth.cameras[name])) @ pose[:, :3]
         depth = cast_rays(caster, camera_center(pose), directions)["t_hit"].astype(np.float64)
         hit = np.isfinite(depth)
-        found.append(camera_center(pose) + directions[hit] * depth[hit, None])
-    return np.concatenate(found)
+        parts.append(camera_center(pose) + directions[hit] * depth[hit, None])
+    return np.concatenate(parts)
 
 
 def align_centers(centers: Mapping[str, FloatArray], truth: Truth) -> Similarity:
-    """Return the similarity from estimated to true camera centers, robust to wrongly placed photos.
-
-    Args:
-        centers: camera center (3,) by photo name, in the reconstruction's frame.
+    """Return the similarity from estimated camera centers (3,), by photo, to the true ones, robust to wrong poses.
 
     Raises:
-        ValueError: fewer than 3 common photos, or all centers lie on a line.
+        ValueError: fewer than 3 common photos.
+        NumericalError: the centers lie on a line.
     """
     true_centers = truth.centers
     names = sorted(set(centers) & set(true_centers))
@@ -154,11 +118,7 @@ def align_centers(centers: Mapping[str, FloatArray], truth: Truth) -> Similarity
 
 
 def sample_surface(vertices: FloatArray, faces: IndexArray, count: int, seed: int = 0) -> FloatArray:
-    """Return (count, 3) points drawn uniformly by area from the triangles.
-
-    Args:
-        vertices: (V, 3).
-        faces: (T, 3) vertex indices.
+    """Return (count, 3) points drawn uniformly by area from triangles (T, 3) of vertices (V, 3).
 
     Raises:
         ValueError: the surface has no area.
@@ -169,13 +129,8 @@ def sample_surface(vertices: FloatArray, faces: IndexArray, count: int, seed: in
 def sample_triangles(
     vertices: FloatArray, faces: IndexArray, count: int, seed: int = 0
 ) -> tuple[FloatArray, IndexArray]:
-    """Sample a surface as `sample_surface` does, with the triangle (count,) of each point.
-
-    Args:
-        vertices: (V, 3).
-        faces: (T, 3) vertex indices.
-    """
-    area = _triangle_areas(vertices, faces)
+    """Sample a surface as `sample_surface` does, with the triangle (count,) of each point."""
+    area = areas(vertices, faces)
     if not area.sum() > 0:
         raise ValueError("the surface has no area")
     rng = np.random.default_rng(seed)
@@ -189,23 +144,13 @@ def sample_triangles(
 
 
 def surface_distances(points: FloatArray, vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    """Return (N,) distances from points to the triangles, in single precision.
-
-    Args:
-        points: (N, 3).
-        vertices: (V, 3).
-        faces: (T, 3) vertex indices.
-    """
+    """Return (N,) distances from points (N, 3) to the triangles, in single precision."""
     queries = load_open3d().core.Tensor(points.astype(np.float32))
     return np.asarray(ray_caster(vertices, faces).compute_distance(queries).numpy(), dtype=np.float64)
 
 
 def _distances_to_truth(
-    vertices: FloatArray,
-    faces: IndexArray,
-    centers: Mapping[str, FloatArray],
-    truth: Truth,
-    samples: int = SAMPLES,
+    vertices: FloatArray, faces: IndexArray, centers: Mapping[str, FloatArray], truth: Truth, samples: int = SAMPLES
 ) -> FloatArray:
     """Return (samples,) distances from uniform samples of a reconstructed surface to the true one, in scene sizes."""
     points = sample_surface(align_centers(centers, truth)(vertices), faces, samples)
@@ -213,13 +158,6 @@ def _distances_to_truth(
 
 
 def _coarse_camera(camera: Camera) -> Camera:
-    shrink = SEEN_RAYS / max(camera.width, camera.height)
+    shrink = 96 / max(camera.width, camera.height)
     K = np.diag([shrink, shrink, 1.0]) @ camera.K
     return Camera(K, round(camera.width * shrink), round(camera.height * shrink), camera.lens)
-
-
-def _triangle_areas(vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    corners = vertices[faces]
-    return np.asarray(
-        0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    )

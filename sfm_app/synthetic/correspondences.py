@@ -11,16 +11,15 @@ from numpy.typing import NDArray
 from sfm_app.camera.models import camera_matrix
 from sfm_app.errors import ConfigError
 from sfm_app.geometry.epipolar import fundamental_from_pose
-from sfm_app.synthetic.cameras import axis_rotation
+from sfm_app.synthetic.cameras import axis_rotation, check_ranges
 from sfm_app.types.arrays import FloatArray
 
 Poses = tuple[FloatArray, FloatArray]
 
-# Depth range from the first camera, in units of the distance to the middle of the scene.
-NEAR, FAR = 0.6, 1.6
-# If the cameras share fewer of the first camera's points, the setup counts as non-convergent and is drawn again.
-MIN_OVERLAP = 0.3
+DEPTHS = (0.6, 1.6)
+"""Range of depths from the first camera, in distances to the middle of the scene."""
 MAX_SETUPS = 10_000
+"""Most draws of a setup of cameras."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +47,8 @@ class PairOptions:
     """Largest distance between the cameras, as a share of the distance to the middle of the scene, (0, 3]."""
 
     def __post_init__(self) -> None:
-        _require(
+        check_ranges(
+            "synthetic correspondences",
             points=self.points >= 8,
             outliers=0 <= self.outliers < 1,
             sigma_px=0 <= self.sigma_px < math.inf,
@@ -96,7 +96,8 @@ class TrackOptions:
     """Largest shift of a camera away from the common start, as a share of the distance to the scene, (0, 2]."""
 
     def __post_init__(self) -> None:
-        _require(
+        check_ranges(
+            "synthetic correspondences",
             cameras=self.cameras >= 2,
             points=self.points >= 8,
             sigma_px=0 <= self.sigma_px < math.inf,
@@ -169,7 +170,7 @@ class Tracks:
         return np.stack([pair.F for pair in self.pairs.values()])
 
 
-def make_pair(options: PairOptions, seed: int) -> TwoViews:
+def make_pair(options: PairOptions, seed: int, max_setups: int = MAX_SETUPS) -> TwoViews:
     """Return a random convergent camera pair and its matches, as in thesis section 4.8.
 
     Both images get Gaussian noise; then a uniform value is added in image 2 to the outliers, which are random rows.
@@ -180,7 +181,7 @@ def make_pair(options: PairOptions, seed: int) -> TwoViews:
     rng = np.random.default_rng([seed, 408])
     K = camera_matrix(options.focal_px, options.focal_px, options.width / 2, options.height / 2)
     size = (options.width, options.height)
-    for _ in range(MAX_SETUPS):
+    for _ in range(max_setups):
         R = random_rotation(rng, options.max_rotation_deg)
         # the minimum baseline keeps the motion away from a pure rotation
         center = _random_direction(rng) * options.max_baseline * rng.uniform(0.1, 1.0)
@@ -189,12 +190,12 @@ def make_pair(options: PairOptions, seed: int) -> TwoViews:
         if _is_convergent(Ks, poses, size, rng):
             exact = _project(Ks, poses, _visible_points(Ks, poses, size, options.points, rng))
             noisy = exact + rng.normal(scale=options.sigma_px, size=exact.shape)
-            wrong = (options.outliers, options.outlier_range_px)
-            return _two_views((0, 1), (exact, noisy), (Ks, *poses), wrong, rng)
+            outliers = (options.outliers, options.outlier_range_px)
+            return _two_views((0, 1), (exact, noisy), (Ks, *poses), outliers, rng)
     raise ConfigError("no random camera pair sees the same points", hint="lower max_rotation_deg or max_baseline")
 
 
-def make_tracks(options: TrackOptions, seed: int) -> Tracks:
+def make_tracks(options: TrackOptions, seed: int, max_setups: int = MAX_SETUPS) -> Tracks:
     """Draw cameras of one random K around a common pose, and points that all of them see, as in thesis 5.5.3.
 
     The orientations are perturbed like the locations, since cameras that only shift leave K undetermined.
@@ -204,7 +205,7 @@ def make_tracks(options: TrackOptions, seed: int) -> Tracks:
     """
     rng = np.random.default_rng([seed, 553])
     size = (options.width, options.height)
-    for _ in range(MAX_SETUPS):
+    for _ in range(max_setups):
         Ks = _random_intrinsics(options, rng)
         R = np.stack([random_rotation(rng, options.max_rotation_deg) for _ in range(options.cameras)])
         centers = np.stack([_random_direction(rng) * options.max_shift * rng.uniform() for _ in range(options.cameras)])
@@ -215,14 +216,10 @@ def make_tracks(options: TrackOptions, seed: int) -> Tracks:
 
 
 def pair_matches(
-    tracks: Tracks,
-    outliers: Mapping[tuple[int, int], float] | None = None,
-    outlier_range_px: float = 256.0,
+    tracks: Tracks, outliers: Mapping[tuple[int, int], float] | None = None, outlier_range_px: float = 256.0,
     seed: int = 0,
-) -> Iterator[tuple[tuple[int, int], FloatArray]]:
+) -> Iterator[tuple[tuple[int, int], FloatArray]]:  # fmt: skip
     """Yield the matches of every pair of cameras, with outliers in chosen pairs.
-
-    The same tracks can be corrupted in several ways.
 
     Args:
         outliers: share of wrong matches, in [0, 1), per pair; no pair by default.
@@ -234,7 +231,10 @@ def pair_matches(
         ConfigError: a share is out of range or a pair is not in the tracks.
     """
     shares = outliers or {}
-    _require(outliers=set(shares) <= set(tracks.pairs) and all(0 <= share < 1 for share in shares.values()))
+    check_ranges(
+        "synthetic correspondences",
+        outliers=set(shares) <= set(tracks.pairs) and all(0 <= share < 1 for share in shares.values()),
+    )
     for i, j in tracks.pairs:
         rng = np.random.default_rng([seed, 554, i, j])
         x2, _ = _with_outliers(tracks.x[j], shares.get((i, j), 0.0), outlier_range_px, rng)
@@ -242,11 +242,7 @@ def pair_matches(
 
 
 def random_rotation(rng: np.random.Generator, max_angle_deg: float) -> FloatArray:
-    """Return (3, 3) rotation about a uniformly random axis by a uniformly random angle.
-
-    Args:
-        max_angle_deg: degrees, >= 0.
-    """
+    """Return (3, 3) rotation about a uniformly random axis by a uniformly random angle."""
     return axis_rotation(_random_direction(rng), rng.uniform(0.0, max_angle_deg))
 
 
@@ -260,8 +256,8 @@ def _tracks(options: TrackOptions, Ks: FloatArray, poses: Poses, rng: np.random.
     corrupted = tuple(pairs[k] for k in sorted(chosen))
     views = {}
     for pair in pairs:
-        wrong = (options.outliers if pair in corrupted else 0.0, options.outlier_range_px)
-        views[pair] = _two_views(pair, (exact, noisy), (Ks, *poses), wrong, rng)
+        outliers = (options.outliers if pair in corrupted else 0.0, options.outlier_range_px)
+        views[pair] = _two_views(pair, (exact, noisy), (Ks, *poses), outliers, rng)
     return Tracks(views, corrupted, Ks, poses[0], poses[1], X, noisy, size)
 
 
@@ -276,18 +272,15 @@ def _random_intrinsics(options: TrackOptions, rng: np.random.Generator) -> Float
 
 
 def _two_views(
-    pair: tuple[int, int],
-    points: tuple[FloatArray, FloatArray],
-    cameras: tuple[FloatArray, FloatArray, FloatArray],
-    wrong: tuple[float, float],
-    rng: np.random.Generator,
-) -> TwoViews:
+    pair: tuple[int, int], points: tuple[FloatArray, FloatArray], cameras: tuple[FloatArray, FloatArray, FloatArray],
+    outliers: tuple[float, float], rng: np.random.Generator,
+) -> TwoViews:  # fmt: skip
     i, j = pair
     exact, noisy = points
     Ks, Rs, ts = cameras
     R = Rs[j] @ Rs[i].T
     t = ts[j] - R @ ts[i]
-    x2, is_inlier = _with_outliers(noisy[j], *wrong, rng)
+    x2, is_inlier = _with_outliers(noisy[j], *outliers, rng)
     F = fundamental_from_pose(Ks[i], Ks[j], R, t)
     return TwoViews(noisy[i].copy(), x2, is_inlier, F, Ks[i], Ks[j], R, t, exact[i], exact[j])
 
@@ -297,32 +290,32 @@ def _with_outliers(
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     is_inlier = np.ones(len(x), dtype=np.bool_)
     is_inlier[rng.permutation(len(x))[: round(share * len(x))]] = False
-    moved = x.copy()
-    moved[~is_inlier] += rng.uniform(-reach_px, reach_px, (np.count_nonzero(~is_inlier), 2))
-    return moved, is_inlier
+    displaced = x.copy()
+    displaced[~is_inlier] += rng.uniform(-reach_px, reach_px, (np.count_nonzero(~is_inlier), 2))
+    return displaced, is_inlier
 
 
 def _is_convergent(Ks: FloatArray, poses: Poses, size: tuple[int, int], rng: np.random.Generator) -> bool:
     drawn = next(_candidates(Ks, poses, size, rng))
-    return bool(np.mean(_is_in_all_views(Ks, poses, size, drawn)) >= MIN_OVERLAP)
+    return bool(np.mean(_is_in_all_views(Ks, poses, size, drawn)) >= 0.3)  # of the points of the first camera
 
 
 def _visible_points(
     Ks: FloatArray, poses: Poses, size: tuple[int, int], count: int, rng: np.random.Generator
 ) -> FloatArray:
-    found: list[FloatArray] = []
+    visible: list[FloatArray] = []
     for drawn in _candidates(Ks, poses, size, rng):
-        found.append(drawn[_is_in_all_views(Ks, poses, size, drawn)])
-        if sum(map(len, found)) >= count:
+        visible.append(drawn[_is_in_all_views(Ks, poses, size, drawn)])
+        if sum(map(len, visible)) >= count:
             break
-    return np.concatenate(found)[:count]
+    return np.concatenate(visible)[:count]
 
 
 def _candidates(Ks: FloatArray, poses: Poses, size: tuple[int, int], rng: np.random.Generator) -> Iterator[FloatArray]:
     # uniform in image 1 and in depth; callers keep the points that are visible in the other images
     while True:
         x = rng.uniform(size=(256, 2)) * size
-        depth = rng.uniform(NEAR, FAR, (256, 1))
+        depth = rng.uniform(*DEPTHS, (256, 1))
         rays = np.column_stack([x, np.ones(len(x))]) @ np.linalg.inv(Ks[0]).T
         yield (rays * depth - poses[1][0]) @ poses[0][0]
 
@@ -345,9 +338,3 @@ def _project(Ks: FloatArray, poses: Poses, X: FloatArray) -> FloatArray:
 def _random_direction(rng: np.random.Generator) -> FloatArray:
     v = rng.normal(size=3)
     return np.asarray(v / np.linalg.norm(v))
-
-
-def _require(**checks: bool) -> None:
-    wrong = [name for name, holds in checks.items() if not holds]
-    if wrong:
-        raise ConfigError(f"synthetic correspondences: out of range: {', '.join(wrong)}")

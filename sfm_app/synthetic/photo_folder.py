@@ -13,17 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sfm_app.errors import ConfigError, InputError
+from sfm_app.errors import InputError
 from sfm_app.files import replace_atomically
 from sfm_app.progress import Progress, SilentProgress, track
-from sfm_app.synthetic.cameras import Camera, Lens, Views, camera_center
+from sfm_app.synthetic.cameras import Camera, Lens, Views, camera_center, check_ranges
 from sfm_app.synthetic.render import GAMMA, PreparedScene, prepare, render_scene
 from sfm_app.synthetic.shapes import SyntheticScene
 from sfm_app.types.arrays import FloatArray
 
 TRUTH_FILE, SURFACE_FILE = "truth.json", "surface.ply"
-MOST_PROCESSES = 61
-"""Windows waits for no more at a time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,17 +46,15 @@ class PhotoOptions:
     """Same seed, same noise."""
 
     def __post_init__(self) -> None:
-        checks = {
-            "supersampling": 1 <= self.supersampling <= 8,
-            "blur_px": 0 <= self.blur_px <= 100,
-            "noise": 0 <= self.noise <= 100,
-            "quality": 1 <= self.quality <= 95,
-            "exposure_ev": 0 <= self.exposure_ev <= 3,
-            "seed": self.seed >= 0,
-        }
-        wrong = [name for name, holds in checks.items() if not holds]
-        if wrong:
-            raise ConfigError(f"synthetic photos: out of range: {', '.join(wrong)}")
+        check_ranges(
+            "synthetic photos",
+            supersampling=1 <= self.supersampling <= 8,
+            blur_px=0 <= self.blur_px <= 100,
+            noise=0 <= self.noise <= 100,
+            quality=1 <= self.quality <= 95,
+            exposure_ev=0 <= self.exposure_ev <= 3,
+            seed=self.seed >= 0,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,20 +94,10 @@ class Truth:
 
 
 def write_photo_folder(
-    folder: Path,
-    scene: SyntheticScene,
-    views: Views,
-    options: PhotoOptions | None = None,
+    folder: Path, scene: SyntheticScene, views: Views, options: PhotoOptions | None = None,
     progress: Progress | None = None,
-) -> Truth:
-    """Render one JPEG without EXIF per view into a folder.
-
-    The truth is not written; `save_truth` writes it outside the photo folder.
-
-    Args:
-        folder: created if missing.
-        views: camera and pose of each photo.
-        options: quality and noise of the photos; defaults if None.
+) -> Truth:  # fmt: skip
+    """Render one JPEG without EXIF per view into a folder; `save_truth` writes the truth elsewhere.
 
     Raises:
         InputError: the folder cannot be written.
@@ -128,24 +114,15 @@ def write_photo_folder(
 
 
 def add_missing_photos(
-    folder: Path,
-    scene: SyntheticScene,
-    views: Views,
-    options: PhotoOptions | None = None,
-    processes: int = 1,
+    folder: Path, scene: SyntheticScene, views: Views, options: PhotoOptions | None = None, processes: int = 1,
     progress: Progress | None = None,
-) -> Truth:
-    """Render the photos that a folder does not have yet, in parallel processes: a killed run resumes.
+) -> Truth:  # fmt: skip
+    """Render the missing photos of a folder in parallel processes; the bytes are those of `write_photo_folder`.
 
-    They have the bytes that `write_photo_folder` gives. A photo that is there must be of the same scene, views and
-    options, which is not checked.
+    Other photos of the folder must be of the same scene, views and options, which is not checked.
 
     Args:
-        folder: created if missing.
-        scene: what is photographed; each process prepares it, and holds one photo at a time.
-        views: camera and pose of each photo.
-        options: quality and noise of the photos; defaults if None.
-        processes: >= 1; with 1, this process renders. A script that asks for more needs a `__main__` guard.
+        processes: >= 1; with 1, this process renders. A script with more needs a `__main__` guard.
 
     Raises:
         InputError: the folder cannot be written.
@@ -159,9 +136,9 @@ def add_missing_photos(
             for k in track(shown, missing, "rendering photos", len(missing)):
                 _write_in_process(k)
         elif missing:
-            # a fork would copy the locks of Open3D's threads, but not the threads
+            # a fork would copy the locks of Open3D's threads, but not the threads; Windows waits for 61 processes
             with ProcessPoolExecutor(
-                min(processes, len(missing), MOST_PROCESSES), get_context("spawn"), _start_process, arguments
+                min(processes, len(missing), 61), get_context("spawn"), _start_process, arguments
             ) as pool:
                 done = pool.map(_write_in_process, missing)
                 for _ in track(shown, done, "rendering photos", len(missing)):
@@ -175,7 +152,7 @@ def add_missing_photos(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FolderWork:
-    """What is needed to write any photo of a folder."""
+    """The scene, views and options of a folder."""
 
     folder: Path
     prepared: PreparedScene
@@ -193,7 +170,7 @@ class _FolderWork:
 
 
 _WORK: dict[str, _FolderWork] = {}
-"""What this process renders, under "work"; filled once, when it starts."""
+"""The work of this process, under "work"; set once at its start."""
 
 
 def _start_process(folder: Path, scene: SyntheticScene, views: Views, options: PhotoOptions) -> None:
@@ -205,11 +182,7 @@ def _write_in_process(number: int) -> None:
 
 
 def develop(image: FloatArray, options: PhotoOptions, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Blur and expose the image, then apply gamma and sensor noise, from linear RGB to 8 bits.
-
-    Args:
-        image: (H, W, 3) linear RGB, about 0..1.
-    """
+    """Return an image (H, W, 3) of linear RGB, about 0..1, exposed and blurred, with gamma and noise, in 8 bits."""
     if options.exposure_ev > 0:
         image = image * 2.0 ** rng.normal(scale=options.exposure_ev)
     if options.blur_px > 0:
@@ -220,25 +193,12 @@ def develop(image: FloatArray, options: PhotoOptions, rng: np.random.Generator) 
 
 
 def save_truth(truth: Truth, folder: Path) -> None:
-    """Write truth.json (x ~ K d(R X + t) with lens distortion d) and surface.ply.
-
-    Args:
-        folder: created if missing; not the folder of the photos.
-    """
+    """Write truth.json (x ~ K d(R X + t) with lens distortion d) and surface.ply into a folder without photos."""
     images = []
     for name, pose in truth.cam_from_world.items():
         width, height, K, lens = _camera_values(truth.cameras[name])
-        images.append(
-            {
-                "file": name,
-                "width": width,
-                "height": height,
-                "K": K,
-                "lens": asdict(lens),
-                "R": pose[:, :3].tolist(),
-                "t": pose[:, 3].tolist(),
-            }
-        )
+        rows = {"R": pose[:, :3].tolist(), "t": pose[:, 3].tolist()}
+        images.append({"file": name, "width": width, "height": height, "K": K, "lens": asdict(lens)} | rows)
     text = {
         "convention": "x ~ K d(R X + t); world to camera; x right, y down, z forward; pixel centers at +0.5; "
         "d: the lens, x on the plane whose unit is the focal length",

@@ -22,7 +22,6 @@ SUNLIGHT = np.array([1.0, 0.93, 0.82])
 SKYLIGHT = np.array([0.82, 0.92, 1.0])
 ZENITH = np.array([0.20, 0.38, 0.72])
 HORIZON = np.array([0.66, 0.76, 0.86])
-AMBIENT_RAYS = 24
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,12 +100,7 @@ def _to_world(rays: FloatArray, cam_from_world: FloatArray) -> tuple[FloatArray,
 
 
 def ray_caster(vertices: FloatArray, faces: NDArray[np.int64]) -> Any:
-    """Return Open3D's RaycastingScene of one mesh, in single precision.
-
-    Args:
-        vertices: (V, 3).
-        faces: (T, 3) vertex indices.
-    """
+    """Return Open3D's RaycastingScene of triangles (T, 3) of vertices (V, 3), in single precision."""
     open3d = load_open3d()
     caster = open3d.t.geometry.RaycastingScene()
     tensor = open3d.core.Tensor
@@ -124,8 +118,8 @@ def cast_rays(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[s
     rays = np.empty((len(directions), 6), dtype=np.float32)
     rays[:, :3] = origin
     rays[:, 3:] = directions
-    found = caster.cast_rays(load_open3d().core.Tensor(rays))
-    return {key: found[key].numpy() for key in ("t_hit", "primitive_ids", "primitive_uvs", "primitive_normals")}
+    hits = caster.cast_rays(load_open3d().core.Tensor(rays))
+    return {key: hits[key].numpy() for key in ("t_hit", "primitive_ids", "primitive_uvs", "primitive_normals")}
 
 
 def _is_sunlit(
@@ -134,20 +128,21 @@ def _is_sunlit(
     """Return whether the sun reaches each hit; shadow rays are cast only where the surface faces the sun."""
     sun = scene.lights[0]
     lit = hits["primitive_normals"] @ sun.astype(np.float32) > 0
-    asked = np.flatnonzero(lit)
-    rays = np.empty((len(asked), 6), dtype=np.float32)
+    rows = np.flatnonzero(lit)
+    rays = np.empty((len(rows), 6), dtype=np.float32)
     # a step towards the sun keeps the surface from shadowing itself
-    origin = center if center.ndim == 1 else center[asked]
-    rays[:, :3] = origin + directions[asked] * hits["t_hit"][asked, None] + 4e-3 * sun
+    origin = center if center.ndim == 1 else center[rows]
+    rays[:, :3] = origin + directions[rows] * hits["t_hit"][rows, None] + 4e-3 * sun
     rays[:, 3:] = sun
-    lit[asked] = ~scene.rays.test_occlusions(load_open3d().core.Tensor(rays)).numpy()
+    lit[rows] = ~scene.rays.test_occlusions(load_open3d().core.Tensor(rays)).numpy()
     return np.asarray(lit)
 
 
 def _openness(caster: Any, vertices: FloatArray, normals: FloatArray) -> FloatArray:
     """Return the share of cosine-distributed rays (Fibonacci spiral) from each vertex that hit nothing nearby."""
-    k = np.arange(AMBIENT_RAYS) + 0.5
-    radius = np.sqrt(k / AMBIENT_RAYS)
+    count = 24
+    k = np.arange(count) + 0.5
+    radius = np.sqrt(k / count)
     angle = k * np.pi * (3.0 - np.sqrt(5.0))
     helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     u = np.cross(normals, helper)
@@ -158,7 +153,7 @@ def _openness(caster: Any, vertices: FloatArray, normals: FloatArray) -> FloatAr
         direction = r * np.cos(a) * u + r * np.sin(a) * v + np.sqrt(1.0 - r * r) * normals
         distance = cast_rays(caster, vertices + 1e-2 * normals, direction)["t_hit"].astype(np.float64)
         free += np.clip(distance / 1.5, 0.0, 1.0)  # surfaces beyond 1.5 units do not darken
-    return free / AMBIENT_RAYS
+    return free / count
 
 
 @kernel
@@ -201,14 +196,8 @@ def shade(hits: Any, tables: Any, total: NDArray[np.float64]) -> None:
 Colors = NDArray[np.uint8]
 GRAY, INSIDE = np.array([205.0, 205.0, 205.0]), np.array([196.0, 120.0, 110.0])
 """Colors of the untextured shape in full light, seen from outside and from inside."""
-AMBIENT = 0.25
-"""Ambient light on the untextured shape, 0..1."""
 LAMP = np.array([-0.45, -0.65, -1.0]) / np.linalg.norm([-0.45, -0.65, -1.0])
 """Direction from a face to the lamp, in the camera's frame: over the photographer's left shoulder."""
-SIDE_VIEW_DEG = 25.0
-"""Angle between the view of the photo and the side view."""
-SUPERSAMPLING = 2
-"""Supersampling factor, in x and in y, of the pictures next to a photo."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -241,25 +230,16 @@ def prepare_model(model: Model) -> PreparedModel:
 
 
 def render_model(model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
-    """Render the model unlit in its own colors: its texture, or its vertex colors if it has no texture.
+    """Render the model at a pose (3, 4), unlit in the colors of its texture or else of its vertices, from both sides.
 
-    Triangles are visible from both sides. Each pixel is sampled once at its center, so a texture much finer than the
-    pixels causes aliasing.
-
-    Args:
-        cam_from_world: (3, 4) pose.
+    Each pixel is sampled once at its center, so a texture much finer than the pixels causes aliasing.
     """
     directions = pixel_rays(camera) @ cam_from_world[:, :3]
     return render_rays(model, camera_center(cam_from_world), directions.reshape(camera.height, camera.width, 3))
 
 
 def render_rays(model: Model | PreparedModel, origin: FloatArray, directions: FloatArray) -> Picture:
-    """Render as `render_model` does, for any lens, with one given ray per pixel.
-
-    Args:
-        origin: (3,) where all rays start.
-        directions: (H, W, 3) of any length, one per pixel.
-    """
+    """Render as `render_model` does, with rays from one origin (3,) and a direction (H, W, 3) per pixel."""
     prepared = model if isinstance(model, PreparedModel) else prepare_model(model)
     shape = directions.shape[:2]
     if prepared.rays is None:
@@ -275,11 +255,7 @@ def render_rays(model: Model | PreparedModel, origin: FloatArray, directions: Fl
 
 
 def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
-    """Render the untextured shape in gray with flat shading, so that every bump shows; reddish from inside.
-
-    Args:
-        cam_from_world: (3, 4) pose.
-    """
+    """Render the untextured shape at a pose (3, 4) in gray with flat shading; reddish from inside."""
     prepared = model if isinstance(model, PreparedModel) else prepare_model(model)
     shape = camera.height, camera.width
     if prepared.rays is None:
@@ -290,7 +266,7 @@ def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: F
     normals = hits["primitive_normals"].astype(np.float64)
     inside = (normals * directions).sum(axis=1) > 0
     facing = np.abs(normals @ (LAMP @ R))
-    light = AMBIENT + (1.0 - AMBIENT) * np.where(np.isfinite(facing), facing, 0.0)
+    light = 0.25 + 0.75 * np.where(np.isfinite(facing), facing, 0.0)
     covered = np.isfinite(hits["t_hit"])
     colors = light[:, None] * np.where(inside[:, None], INSIDE, GRAY) * covered[:, None]
     return Picture(np.round(colors).astype(np.uint8).reshape(*shape, 3), covered.reshape(shape))
@@ -309,13 +285,8 @@ def comparison_image(photo: Colors, model: Model | PreparedModel, camera: Camera
     """
     prepared = model if isinstance(model, PreparedModel) else prepare_model(model)
     size = camera.width, camera.height
-    fine = Camera(
-        np.diag([SUPERSAMPLING, SUPERSAMPLING, 1.0]) @ camera.K,
-        SUPERSAMPLING * size[0],
-        SUPERSAMPLING * size[1],
-        camera.lens,
-    )
-    aside = orbited_pose(cam_from_world, prepared.model.surface, SIDE_VIEW_DEG)
+    fine = Camera(np.diag([2, 2, 1.0]) @ camera.K, 2 * size[0], 2 * size[1], camera.lens)
+    aside = orbited_pose(cam_from_world, prepared.model.surface, 25.0)
     views = [
         photo,
         render_model(prepared, fine, cam_from_world).with_background(),
@@ -327,12 +298,7 @@ def comparison_image(photo: Colors, model: Model | PreparedModel, camera: Camera
 
 
 def orbited_pose(pose: FloatArray, surface: Surface, angle_deg: float) -> FloatArray:
-    """Return a camera pose rotated about the vertical axis through the surface it looks at, in a frame with y up.
-
-    Args:
-        pose: (3, 4) cam_from_world of that camera.
-        angle_deg: degrees about y.
-    """
+    """Return a pose (3, 4) rotated about the vertical axis through the surface in view, in a frame with y up."""
     R, t = pose[:, :3], pose[:, 3]
     depth = float(np.median(surface.vertices @ R[2] + t[2]))
     middle = R.T @ (np.array([0.0, 0.0, depth]) - t)
@@ -350,11 +316,11 @@ def _texture_colors(texture: Texture, face: NDArray[np.int64], weights: FloatArr
     """Sample the texture bilinearly; texel centers at +0.5, the border repeated."""
     place = np.einsum("hwk,hwkc->hwc", weights, texture.uv[face].astype(np.float64))
     page_of = texture.page[face]
-    found = np.zeros((*face.shape, 3), np.uint8)
+    colors = np.zeros((*face.shape, 3), np.uint8)
     for number, page in enumerate(texture.pages):
         here = page_of == number
         if here.any():
             at = (place * [page.shape[1], page.shape[0]] - 0.5).astype(np.float32)
-            seen = cv2.remap(page, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            found[here] = seen[here]
-    return found
+            samples = cv2.remap(page, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            colors[here] = samples[here]
+    return colors

@@ -1,4 +1,4 @@
-"""Two scenes with real detail: a courtyard with things in it, and a bust on a plinth."""
+"""Two detailed scenes: a courtyard with objects, and a bust on a plinth."""
 
 from dataclasses import replace
 from functools import cache
@@ -52,8 +52,8 @@ PEDESTAL_TOP_Y = 1.36
 def courtyard() -> SyntheticScene:
     """Return the scene; it is best photographed from about 5 units away on the side of +z."""
     floor = Body(ground((-5.2, 5.2), (-3.0, 7.0), unevenness=0.02), PAVING)
-    bodies = [floor, *_back_wall(), *_arcade(), *_side_walls(), *_pedestal(), *_amphora(), *_leaning_things()]
-    return SyntheticScene("courtyard", (*bodies, *_round_things()))
+    bodies = [floor, *_back_wall(), *_arcade(), *_side_walls(), *_pedestal(), *_amphora(), *_leaning_objects()]
+    return SyntheticScene("courtyard", (*bodies, *_round_objects()))
 
 
 def _back_wall() -> list[Body]:
@@ -122,7 +122,7 @@ def _amphora() -> list[Body]:
     ]
 
 
-def _leaning_things() -> list[Body]:
+def _leaning_objects() -> list[Body]:
     drum = revolve(_profile((0.0, 0.27, 0.27, 0.0), (0.0, 0.0, 0.62, 0.62)), segments=96, sharp=True, flutes=(16, 0.08))
     small_brick = replace(BRICK, scale=0.1)
     return [
@@ -134,7 +134,7 @@ def _leaning_things() -> list[Body]:
     ]
 
 
-def _round_things() -> list[Body]:
+def _round_objects() -> list[Body]:
     radius = (0.0, 0.22, 0.34, 0.39, 0.39, 0.33, 0.31, 0.0)
     height = (0.0, 0.0, 0.5, 0.5, 0.58, 0.58, 0.52, 0.52)
     pot = revolve(_profile(radius, height), sharp=True)
@@ -163,11 +163,10 @@ def _catmull_rom(knots: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
 
 
 STONE = Material(pattern="stone", base=(222, 214, 198), second=(168, 158, 140), joint=(92, 86, 76), scale=0.22)
+BOX_LEAVES = Material(pattern="leaves", base=(50, 88, 38), second=(112, 142, 66), joint=(20, 34, 16), scale=0.045)
 BRONZE = Material(
     pattern="leaves", base=(74, 96, 66), second=(132, 118, 66), joint=(40, 44, 30), scale=0.035, contrast=0.4
 )
-SHARPNESS = 2.6
-"""Falloff of the blobs; larger values blend neighbors less."""
 PLINTH_TOP_Y = 1.02
 BLOBS = np.array([
     # middle x, y, z; half axes x, y, z; weight
@@ -203,11 +202,7 @@ def statue() -> SyntheticScene:
 
 
 def statue_views(camera: Camera, seed: int = 0, photos: int = 22) -> Views:
-    """Return hand-held photos all round.
-
-    Args:
-        photos: how many, >= 2.
-    """
+    """Return hand-held photos all round."""
     walk = ArcOptions(
         photos=photos, sweep_deg=344.0, distance=(3.3, 4.3), height=(1.0, 2.9), aim=(0.0, 1.2, 0.0), aim_spread=0.2,
         roll_deg=5.0,
@@ -229,15 +224,15 @@ def bust_field(points: FloatArray) -> FloatArray:
     middles, axes, weights = BLOBS[:, :3], BLOBS[:, 3:6], BLOBS[:, 6]
     # squared distances to all blob centers, in half axes, as matrix products
     squares = points**2 @ axes.T**-2.0 - 2.0 * points @ (middles / axes**2).T + ((middles / axes) ** 2).sum(axis=1)
-    parts = weights * np.exp(SHARPNESS * (1.0 - squares))
+    parts = weights * np.exp(2.6 * (1.0 - squares))  # a larger factor blends neighbors less
     hair = np.clip(parts[:, HAIR].sum(axis=1), 0.0, 1.0)
     x, y, z = points.T
     # rings about one shoulder, as cloth hangs from it
     folds = np.cos(46.0 * np.hypot(x - 0.42, y - 0.62) + 4.0 * z) * np.clip((0.52 - y) / 0.1, 0.0, 1.0)
-    found = parts.sum(axis=1) - 1.0 + 0.2 * np.clip((y - 0.06) / 0.04, 0.0, 1.0) * folds
+    value = parts.sum(axis=1) - 1.0 + 0.2 * np.clip((y - 0.06) / 0.04, 0.0, 1.0) * folds
     curly = hair > 0.01
-    found[curly] += 0.22 * hair[curly] * waves(9.0 * points[curly], 3)
-    return np.asarray(found)
+    value[curly] += 0.22 * hair[curly] * waves(9.0 * points[curly], 3)
+    return np.asarray(value)
 
 
 def _bust() -> list[Body]:
@@ -282,10 +277,7 @@ def _terrace() -> list[Body]:
         Body(ground((-1.7, 1.7), (-1.7, 1.7), unevenness=0.015), replace(PAVING, scale=0.35)),
         Body(drum.move((1.15, 0.17, 0.95), turn_deg=35.0, tilt_deg=90.0), LIMESTONE),
         Body(pot.move((-1.2, 0.0, 0.9)), TERRACOTTA),
-        Body(ball(0.24, bumps=0.09, seed=2).move((-1.2, 0.5, 0.9)), LEAVES_OF_BOX),
+        Body(ball(0.24, bumps=0.09, seed=2).move((-1.2, 0.5, 0.9)), BOX_LEAVES),
         Body(box(0.5, 0.22, 0.34, spacing=0.06).move((-1.0, 0.0, -1.1), turn_deg=25.0), SANDSTONE),
         Body(ball(0.2).move((1.2, 0.2, -1.05), turn_deg=40.0, tilt_deg=20.0), GREEN_MARBLE),
     ]
-
-
-LEAVES_OF_BOX = Material(pattern="leaves", base=(50, 88, 38), second=(112, 142, 66), joint=(20, 34, 16), scale=0.045)

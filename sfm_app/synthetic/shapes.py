@@ -30,12 +30,12 @@ class Shape:
     normals: FloatArray
     """(V, 3) unit normals; vertices are doubled along sharp edges."""
     texture: FloatArray
-    """(V, 3): vertices before the shape was moved into the scene, so that its texture moves with it."""
+    """(V, 3): vertices before `move`, so that the texture moves with the shape."""
 
     def move(
         self, to: tuple[float, float, float] = (0.0, 0.0, 0.0), turn_deg: float = 0.0, tilt_deg: float = 0.0
     ) -> "Shape":
-        """Tilt about x, then turn about y, then move."""
+        """Return the shape tilted about x, then turned about y, then translated."""
         R = axis_rotation(np.array([0.0, 1.0, 0.0]), turn_deg) @ axis_rotation(np.array([1.0, 0.0, 0.0]), tilt_deg)
         return Shape(self.vertices @ R.T + to, self.faces, self.normals @ R.T, self.texture)
 
@@ -58,18 +58,16 @@ def box(width: float, height: float, depth: float, spacing: float = 0.15) -> Sha
 
 
 def revolve(
-    profile: FloatArray,
-    segments: int = 64,
-    span_deg: float = 360.0,
-    sharp: bool = False,
+    profile: FloatArray, segments: int = 64, span_deg: float = 360.0, sharp: bool = False,
     flutes: tuple[int, float] = (0, 0.0),
-) -> Shape:
+) -> Shape:  # fmt: skip
     """Return the surface of revolution of a profile about the y axis.
 
     Args:
         profile: (P, 2) radius and height; with height up, the outside lies to the right of the path from the first to
-            the last point, so a vase runs from its foot to its lip and on down the inside.
-        span_deg: how far around, in degrees; less than 360 leaves the ends open.
+            the last point: a vase runs from its foot to its lip and down the inside.
+        span_deg: angle of the surface; less than 360 leaves the ends open.
+        sharp: whether the points of the profile are sharp edges.
         flutes: number of grooves around the axis, and their depth as a share of the radius.
     """
     strips = [profile[k : k + 2] for k in range(len(profile) - 1)] if sharp else [profile]
@@ -77,11 +75,7 @@ def revolve(
 
 
 def torus(radius: float, tube: float, span_deg: float = 360.0) -> Shape:
-    """Return a ring of round section about the y axis, centered at the origin.
-
-    Args:
-        span_deg: how far around, in degrees.
-    """
+    """Return a ring of round section about the y axis, centered at the origin."""
     angle = np.linspace(0.0, 2.0 * math.pi, 25)
     section = np.column_stack([radius + tube * np.cos(angle), tube * np.sin(angle)])
     return revolve(section, segments=max(8, round(span_deg / 5.0)), span_deg=span_deg)
@@ -99,11 +93,7 @@ def arch(radius: float, thickness: float, depth: float) -> Shape:
 
 
 def ball(radius: float, segments: int = 96, bumps: float = 0.0, seed: int = 0) -> Shape:
-    """Return a sphere around the origin.
-
-    Args:
-        bumps: depth of random dents as a share of the radius.
-    """
+    """Return a sphere around the origin; `bumps` is the depth of random dents as a share of the radius."""
     angle = np.linspace(-0.5, 0.5, segments // 2 + 1) * math.pi
     round_ball = _revolve_profile(np.column_stack([np.cos(angle), np.sin(angle)]), segments, 360.0, (0, 0.0))
     dents = waves(round_ball[0], seed)
@@ -111,49 +101,38 @@ def ball(radius: float, segments: int = 96, bumps: float = 0.0, seed: int = 0) -
 
 
 def waves(points: FloatArray, seed: int) -> FloatArray:
-    """Return (N,) smooth noise of unit variance: cosines in 24 directions with wavelengths of 0.7 to 3 units.
-
-    Args:
-        points: (N, 3).
-    """
+    """Return (N,) smooth noise of unit variance: cosines in 24 directions with wavelengths of 0.7 to 3 units."""
     rng = np.random.default_rng([seed, 7])
     vectors = rng.normal(size=(24, 3)) * np.linspace(2.0, 9.0, 24)[:, None]
-    found = np.cos(points @ vectors.T + rng.uniform(0.0, 2.0 * math.pi, 24)).sum(axis=1) / math.sqrt(12.0)
-    return np.asarray(found)
+    cosines = np.cos(points @ vectors.T + rng.uniform(0.0, 2.0 * math.pi, 24))
+    return np.asarray(cosines.sum(axis=1) / math.sqrt(12.0))
 
 
 def carve(
-    field: Callable[[FloatArray], FloatArray],
-    height: tuple[float, float],
-    reach: float,
-    rows: int = 220,
+    field: Callable[[FloatArray], FloatArray], height: tuple[float, float], reach: float, rows: int = 220,
     segments: int = 240,
-) -> Shape:
+) -> Shape:  # fmt: skip
     """Return the outer surface of a body around the y axis, closed at the top and the bottom.
 
     It keeps only the outermost radius in each direction, so undercuts are lost.
 
     Args:
         field: positive inside the body at points (N, 3).
-        height: lowest and highest level that is sampled.
+        height: lowest and highest sampled level.
+        reach: bound of the distance of the body from the axis.
     """
     angle = 2.0 * math.pi * np.arange(segments) / segments
     # turning from +x towards -z is right-handed about +y
-    ways = np.column_stack([np.cos(angle), np.zeros(segments), -np.sin(angle)])
+    directions = np.column_stack([np.cos(angle), np.zeros(segments), -np.sin(angle)])
     levels = np.linspace(*height, rows)
-    radius = np.stack([_outer_radius(field, ways, level, reach) for level in levels], axis=1)
+    radius = np.stack([_outer_radius(field, directions, level, reach) for level in levels], axis=1)
     radius[:, [0, -1]] = 0.0
-    vertices = ways[:, None] * radius[..., None] + np.array([0.0, 1.0, 0.0]) * levels[:, None]
+    vertices = directions[:, None] * radius[..., None] + np.array([0.0, 1.0, 0.0]) * levels[:, None]
     return _build_shape([(vertices.reshape(-1, 3), _strips(segments, rows, segments))])
 
 
 def assemble(parts: Sequence[Shape], keep_texture: bool = False) -> Shape:
-    """Join several shapes into one.
-
-    Args:
-        keep_texture: each part keeps its texture coordinates, so that equal shapes look equal; otherwise the texture
-            continues across the parts.
-    """
+    """Join several shapes; with `keep_texture`, equal parts look equal, else the texture continues across them."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
@@ -194,35 +173,28 @@ def _strips(segments: int, rows: int, count: int) -> IndexArray:
 
 
 def _outer_radius(
-    field: Callable[[FloatArray], FloatArray], ways: FloatArray, level: float, reach: float, steps: int = 32
+    field: Callable[[FloatArray], FloatArray], directions: FloatArray, level: float, reach: float, steps: int = 32
 ) -> FloatArray:
-    """Return the radius (N,) at which rays from outside along -`ways` (N, 3) enter the body at a level.
-
-    0 for rays that miss it.
-    """
+    """Return the radius (N,) at which rays along -`directions` (N, 3) enter the body at a level; 0 for misses."""
 
     def is_inside(radius: FloatArray) -> NDArray[np.bool_]:
-        points = ways[:, None] * radius[..., None] + np.array([0.0, level, 0.0])
+        points = directions[:, None] * radius[..., None] + np.array([0.0, level, 0.0])
         return np.asarray(field(points.reshape(-1, 3)).reshape(radius.shape) > 0)
 
-    radii = np.broadcast_to(np.linspace(reach, 0.0, steps + 1), (len(ways), steps + 1))
-    found = is_inside(radii)
-    at = found.argmax(axis=1)
+    radii = np.broadcast_to(np.linspace(reach, 0.0, steps + 1), (len(directions), steps + 1))
+    inside = is_inside(radii)
+    at = inside.argmax(axis=1)
     outer = np.take_along_axis(radii, np.maximum(at - 1, 0)[:, None], axis=1)
     inner = np.take_along_axis(radii, at[:, None], axis=1)
     for _ in range(8):
         middle = 0.5 * (outer + inner)
         is_in = is_inside(middle)
         inner, outer = np.where(is_in, middle, inner), np.where(is_in, outer, middle)
-    return np.where(found.any(axis=1), inner[:, 0], 0.0)
+    return np.where(inside.any(axis=1), inner[:, 0], 0.0)
 
 
 def grid(a: FloatArray, b: FloatArray) -> tuple[FloatArray, IndexArray]:
-    """Return the points (N, 2) of a grid, and two triangles (T, 3) for each of its squares.
-
-    Args:
-        a: steps along the first axis.
-    """
+    """Return the points (N, 2) of a grid, and two triangles (T, 3) for each of its squares."""
     points = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
     corner = (np.arange(len(a) - 1)[:, None] * len(b) + np.arange(len(b) - 1)).ravel()
     right, up = corner + len(b), corner + 1
@@ -235,13 +207,13 @@ def _build_shape(parts: list[tuple[FloatArray, IndexArray]]) -> Shape:
     faces = np.concatenate([faces + start for (_, faces), start in zip(parts, starts[:-1], strict=True)])
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    kept = np.linalg.norm(cross, axis=1) > 1e-12  # drops degenerate triangles at the poles of a revolved profile
+    proper = np.linalg.norm(cross, axis=1) > 1e-12  # not at the poles of a revolved profile
     normals = np.zeros_like(vertices)
     for k in range(3):
-        np.add.at(normals, faces[kept, k], cross[kept])
+        np.add.at(normals, faces[proper, k], cross[proper])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, length, out=np.tile([0.0, 1.0, 0.0], (len(normals), 1)), where=length > 0)
-    return Shape(vertices, faces[kept], normals, vertices)
+    return Shape(vertices, faces[proper], normals, vertices)
 
 
 Color = tuple[int, int, int]
@@ -417,7 +389,8 @@ def mixture(
 
     Args:
         row: from `Material.row()`.
-        n: unit normal there.
+        p: position before `move`.
+        n: unit normal.
         footprint: size of a pixel on the surface.
     """
     kind, scale, contrast, seed = int(row[0]), row[1], row[2], int(row[3])
@@ -480,7 +453,7 @@ class SyntheticScene:
     """Brightness of the sky on a surface that faces up."""
 
     bounced: float = 0.0
-    """Share of the sky's light that reaches what sees no sky, such as panes in deep windows; 0..1."""
+    """Share of the sky's light on places without sky in view, such as panes in deep windows; 0..1."""
 
     thin: tuple[FloatArray, ...] = ()
     """Lines (N, 4) of thin things: points on their axes, and the radius there."""

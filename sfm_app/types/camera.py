@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 from sfm_app.numerical import finite_entries
 from sfm_app.types.photos import MatchedImage, PairId, Photo
 
-# Camera matrices with their evidence.
-
 PERSPECTIVE, FISHEYE, EQUIRECTANGULAR = "perspective", "fisheye", "equirectangular"
 PROJECTIONS = (PERSPECTIVE, FISHEYE, EQUIRECTANGULAR)
 GIVEN, KEPT = "given", "kept"
-"""Methods of cameras from a calibration file: a start that may be refined, and one that nothing changes."""
+"""Methods of cameras from a calibration file: refined, and kept unchanged."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +49,7 @@ class Calibration:
     correlations: Mapping[str, float] = field(default_factory=dict)
     """Correlations of the parameters in `spread`, from -1 to 1, by two names with a space between: "fx k1"."""
     held: tuple[str, ...] = ()
-    """Parameters at their usual values because the photos do not determine them: "center", "aspect", "k1"."""
+    """Parameters kept at their usual values, as the photos do not determine them: "center", "aspect", "k1"."""
     key_pairs: tuple[PairId, ...] = ()
     """Pairs of photos best suited to start a reconstruction from, by their evidence on K; best first."""
     evidence: Mapping[str, float] = field(default_factory=dict)
@@ -83,7 +81,7 @@ class Calibration:
         return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
+        """Return JSON values."""
         plain = {field.name: getattr(self, field.name) for field in fields(self)}
         tables = {"K": self.K.tolist(), "spread": dict(self.spread), "evidence": dict(self.evidence)}
         tables["correlations"] = dict(self.correlations)
@@ -138,7 +136,7 @@ class Intrinsics:
         return self.main.identifiable
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
+        """Return JSON values."""
         cameras = {name: camera.to_dict() for name, camera in self.cameras.items()}
         photos = {str(key): name for key, name in self.photos.items()}
         return {"cameras": cameras, "camera_of": dict(self.camera_of), "photos": photos}
@@ -150,18 +148,8 @@ class Intrinsics:
         return cls(cameras, dict(values["camera_of"]), {int(key): name for key, name in values["photos"].items()})
 
 
-# How parameters depend on each other, by their names.
-
-DIGITS = 4
-"""Digits after the point that are kept: a correlation is not known more exactly."""
-
-
 def correlation_key(first: str, second: str) -> str:
-    """Return the name of a pair of parameters: their names with a space between.
-
-    Args:
-        first, second: names, in the order of the parameters.
-    """
+    """Return the name of a pair of parameters, "fx k1", in the order of the parameters."""
     return f"{first} {second}"
 
 
@@ -174,15 +162,12 @@ def named_correlations(names: Sequence[str], covariance: NDArray[np.float64]) ->
     """
     variances = np.diag(covariance)
     known = [k for k in range(len(names)) if np.isfinite(variances[k]) and variances[k] > 0.0]
-    found = {}
+    correlations = {}
     for i, j in combinations(known, 2):
         value = float(covariance[i, j] / np.sqrt(variances[i] * variances[j]))
         if np.isfinite(value):
-            found[correlation_key(names[i], names[j])] = round(float(np.clip(value, -1.0, 1.0)), DIGITS)
-    return found
-
-
-# Cameras that the user gave in a calibration file.
+            correlations[correlation_key(names[i], names[j])] = round(float(np.clip(value, -1.0, 1.0)), 4)
+    return correlations
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,17 +175,17 @@ class GivenCameras:
     """Contents of a calibration file; falsy where none was given."""
 
     cameras: Mapping[str, Calibration] = field(default_factory=dict)
-    """By their name in the file. Width and height are 0 where the file does not say for which photos K holds."""
+    """By name in the file. Width and height are 0 where the file does not give the size of the photos."""
     camera_of: Mapping[str, str] = field(default_factory=dict)
-    """Name of the camera by photo, where the file says so."""
+    """Name of the camera by photo, where the file assigns one."""
     source: str = ""
     """Path and form of the file, for people."""
     digest: str = ""
-    """Hash of what was read; empty where nothing was given."""
+    """Hash of the contents; empty without a file."""
 
     def __bool__(self) -> bool:
         return bool(self.cameras)
 
     def camera_name(self, photo: str) -> str | None:
-        """Return the name of the camera that the file gives a photo; None where it says nothing."""
+        """Return the name of the camera that the file assigns to a photo."""
         return self.camera_of.get(photo, photo if photo in self.cameras else None)

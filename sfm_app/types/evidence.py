@@ -14,8 +14,6 @@ from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import Calibration
 from sfm_app.types.photos import PairId
 
-# Fundamental matrices of pairs of photos.
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpipolarFit:
@@ -43,7 +41,7 @@ class EpipolarFit:
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """A pair without a usable epipolar geometry, and why. Falsy, so that ``if fit:`` reads well."""
+    """The reason why a pair has no usable epipolar geometry. Falsy, so that ``if fit:`` reads well."""
 
     reason: str
 
@@ -58,8 +56,8 @@ class ViewGraph:
     fits: Mapping[PairId, EpipolarFit]
     rejected: Mapping[PairId, Rejected]
     lenses: Mapping[str, Calibration] = field(default_factory=dict)
-    """Cameras with a wide lens, by camera group: the curves of epipolar lines show them before there is any F. The F of
-    their pairs are of bearing vectors."""
+    """Cameras with a wide lens, by camera group, estimated from curved epipolar lines. The F of their pairs are of
+    bearing vectors."""
 
     @property
     def reasons(self) -> dict[str, int]:
@@ -109,14 +107,11 @@ def _pair(row: NDArray[np.uint32]) -> PairId:
     return int(row[0]), int(row[1])
 
 
-# Pairs of photos with their data: the input of calibrators.
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPairs:
     """Fundamental matrices of pairs with the same camera, and data of each pair.
 
-    Nothing is checked here: a calibrator refuses malformed values with a ValueError, see `selfcal.inputs.prepare`.
+    Nothing is checked here: a calibrator refuses malformed values with a ValueError, see `selfcal.pairs.prepare`.
     """
 
     Fs: NDArray[np.float64]
@@ -183,21 +178,16 @@ class PhotoPairs:
 
     def to_camera_pairs(self, members: Collection[int]) -> CameraPairs:
         """Return the pairs whose photos are both members; all members have one size."""
-        wanted = set(members)
-        kept = [k for k, pair in enumerate(self.photos) if wanted.issuperset(pair)]
+        ids = set(members)
+        rows = [k for k, pair in enumerate(self.photos) if ids.issuperset(pair)]
         return CameraPairs(
-            Fs=self.Fs[kept].reshape(-1, 3, 3),
-            weights=self.weights[kept],
-            size=self.sizes[min(wanted)],
-            photos=tuple(self.photos[k] for k in kept),
-            inliers=tuple(self.inliers[k] for k in kept),
-            focal_hints_px=tuple(
-                self.focal_hints_px[photo] for photo in sorted(wanted) if photo in self.focal_hints_px
-            ),
+            Fs=self.Fs[rows].reshape(-1, 3, 3),
+            weights=self.weights[rows],
+            size=self.sizes[min(ids)],
+            photos=tuple(self.photos[k] for k in rows),
+            inliers=tuple(self.inliers[k] for k in rows),
+            focal_hints_px=tuple(self.focal_hints_px[photo] for photo in sorted(ids) if photo in self.focal_hints_px),
         )
-
-
-# Relative poses of pairs of photos, and the graph that they form.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,7 +208,7 @@ class RelativePose:
     """"calibrated", "uncalibrated" (a camera is a guess: the inliers are those of F), "planar" (all inliers on one
     plane), "rotation" (they show no parallax, so that t means nothing)."""
     guided: bool = False
-    """Whether it was found only with the help of other pairs."""
+    """Whether the poses of other pairs guided the estimate."""
 
     @property
     def inlier_count(self) -> int:
@@ -228,27 +218,27 @@ class RelativePose:
 
 @dataclass(frozen=True, slots=True)
 class LookAlikes:
-    """Pairs of photos that match equal things in two places as if they were one."""
+    """Pairs of photos with matches between equal things in two places."""
 
     pairs: tuple[PairId, ...]
     missing: float
-    """Share, 0 to 1, of what these pairs would have in common if the places were one, but do not."""
+    """Share of the overlap expected of one place that these pairs lack, 0 to 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseGraph:
-    """Pairs whose relative poses agree with each other, and what happened to the others."""
+    """Pairs whose relative poses agree with each other, and the reasons that exclude the others."""
 
     poses: Mapping[PairId, RelativePose]
     dropped: Mapping[PairId, str]
-    """Pairs with an epipolar geometry that were left out, with the reason."""
+    """Pairs with an epipolar geometry, excluded for a reason."""
     groups: tuple[tuple[int, ...], ...]
     """Connected photos, the largest group first."""
     look_alikes: tuple[LookAlikes, ...] = ()
     """Look-alikes that were separated; their pairs are among the dropped ones."""
     doubtful: tuple[LookAlikes, ...] = ()
-    """Loops, or look-alikes: pairs that stayed although the photos between theirs do not confirm them."""
+    """Loops or look-alikes: pairs that the photos between them do not confirm."""
 
     def connected_photos(self, photo: int) -> tuple[int, ...]:
-        """Return all photos connected with this one; empty where there are none."""
+        """Return the group of a photo; empty without one."""
         return next((group for group in self.groups if photo in group), ())

@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Photos of a folder, usable or not.
-
 Frame = tuple[int, int, int, int]
 """Left, top, width and height of a part of a photo, in pixels."""
 
@@ -31,9 +29,9 @@ class Photo:
     """One usable photo."""
 
     name: str
-    """Its name everywhere: its path inside the folder, with forward slashes, unless COLMAP cannot use that."""
+    """Path inside the folder, with forward slashes, or another name where COLMAP cannot use that."""
     width: int
-    """Width in pixels as it is laid out: in the sensor's orientation, so that photos of one camera have one size."""
+    """Width in pixels in the sensor's orientation, so that photos of one camera have one size."""
     height: int
     """Height in pixels."""
     group: str
@@ -51,15 +49,15 @@ class Photo:
     turn_deg: int = 0
     """Clockwise rotation that makes it upright: 0, 90, 180 or 270."""
     notes: tuple[str, ...] = ()
-    """Remarks for the user about how it was read."""
+    """Remarks for the user about decoding."""
     shown: Frame | None = None
-    """The picture inside bars of one color, as it is laid out; None where there are no bars."""
+    """The picture inside bars of one color, in the sensor's orientation; None without bars."""
     mask: str = ""
     """Path of its mask inside the folder of masks; empty where it has none."""
     projection: str = "perspective"
     """"equirectangular" for a panorama, "perspective" for every other photo, also for fisheyes: matches show those."""
     time_s: float | None = None
-    """When it was taken, in seconds from the start of the video that it is a frame of; None for other photos."""
+    """Seconds from the start of its video; None for photos."""
 
     @property
     def path(self) -> str:
@@ -80,7 +78,7 @@ class Photo:
 
 @dataclass(frozen=True, slots=True)
 class UnusablePhoto:
-    """One file that was left out, and why."""
+    """One excluded file, and the reason."""
 
     name: str
     reason: str
@@ -99,13 +97,10 @@ class PhotoSet:
     @property
     def groups(self) -> dict[str, tuple[Photo, ...]]:
         """Photos by camera group, in order of first appearance."""
-        found: dict[str, list[Photo]] = {}
+        groups: dict[str, list[Photo]] = {}
         for photo in self.photos:
-            found.setdefault(photo.group, []).append(photo)
-        return {name: tuple(members) for name, members in found.items()}
-
-
-# Features of one photo, as feature methods return them.
+            groups.setdefault(photo.group, []).append(photo)
+        return {name: tuple(members) for name, members in groups.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,15 +122,13 @@ class Features:
         return Features(self.size, self.keypoints[rows], {name: value[rows] for name, value in self.values.items()})
 
 
-# Keypoints and raw, unverified matches.
-
 PairId = tuple[int, int]
 """(image id 1, image id 2) with id1 < id2, ids as in COLMAP's database."""
 
 
 @dataclass(frozen=True, slots=True)
 class MatchedImage:
-    """One photo as the match graph knows it."""
+    """A photo of the match graph."""
 
     id: int
     name: str
@@ -147,11 +140,11 @@ class MatchedImage:
     turn_deg: int = 0
     """Clockwise rotation that makes it upright, according to EXIF and its shape."""
     shown: Frame | None = None
-    """The picture inside the bars; None where there are no bars."""
+    """The picture inside the bars; None without bars."""
     projection: str = "perspective"
     """"equirectangular" for a panorama, "perspective" for every other photo, also for fisheyes."""
     time_s: float | None = None
-    """When it was taken, if it is a frame of a video: seconds from its start."""
+    """Seconds from the start of its video; None for photos."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""A COLMAP model with its figures, control points, and what exporters get."""
+"""A COLMAP model with its figures, control points, and the arrays of exporters."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-# The sparse reconstruction as the rest of the program sees it.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,12 +23,12 @@ class CameraModel:
     deviations: Mapping[str, float] = field(default_factory=dict)
     """Standard deviations: "fx", "fy", "cx", "cy" in pixels, and the others by COLMAP's names; none of a panorama."""
     determined: tuple[str, ...] = ()
-    """What the photos determine besides the focal: "center", "aspect", "k1", ...; the others kept their values."""
+    """Parameters that photos determine besides the focal: "center", "aspect", "k1", ...; others kept their values."""
     correlations: Mapping[str, float] = field(default_factory=dict)
     """Correlations of the parameters in `deviations`, from -1 to 1, by two names with a space between: "fx k1"."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
+        """Return JSON values."""
         plain = {field.name: getattr(self, field.name) for field in fields(self)}
         return plain | {"K": self.K.tolist(), "params": list(self.params), "determined": list(self.determined)}
 
@@ -60,12 +58,9 @@ class Scene:
         return tuple(self.cam_from_world)
 
 
-# Ground control points that the user gave.
-
-
 @dataclass(frozen=True, slots=True)
 class ControlPoint:
-    """A point whose place is known, and where photos show it."""
+    """A point of known position, and its pixels in photos."""
 
     name: str
     position: tuple[float, float, float]
@@ -81,19 +76,16 @@ class ControlPoints:
 
     points: tuple[ControlPoint, ...] = ()
     crs: str = ""
-    """Coordinate system, as the file says it."""
+    """Coordinate system, as the file names it."""
     geographic: bool = False
     """Whether positions are longitude and latitude in degrees (WGS84)."""
     source: str = ""
     """Path of the file, for people."""
     digest: str = ""
-    """Hash of what was read; empty where nothing was given."""
+    """Hash of the contents; empty without a file."""
 
     def __bool__(self) -> bool:
         return bool(self.points)
-
-
-# A finished scene as it leaves the program: as plain arrays, and what formats are made of.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +97,7 @@ class PointCloud:
     colors: NDArray[np.uint8]
     """(P, 3) RGB."""
     normals: NDArray[np.float64] | None = None
-    """(P, 3) unit vectors; None where they are not known."""
+    """(P, 3) unit vectors; None where unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,14 +142,14 @@ class SceneArrays:
     track_points: NDArray[np.int64]
     """(M,) row of the point of each observation, ascending."""
     track_photos: NDArray[np.int64]
-    """(M,) row of the photo that sees it."""
+    """(M,) row of its photo."""
     track_pixels: NDArray[np.float64]
-    """(M, 2) where it sees it, as found, with the lens."""
+    """(M, 2) pixels of the keypoints, with the distortion of the lens."""
     metric: bool
     """Whether the unit is the meter."""
 
     @property
     def centers(self) -> NDArray[np.float64]:
-        """(N, 3) where the photos were taken from."""
+        """(N, 3) centers of projection in the world."""
         R, t = self.cam_from_world[:, :, :3], self.cam_from_world[:, :, 3]
         return np.asarray(-np.einsum("nji,nj->ni", R, t))

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-# A colored triangle mesh.
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
@@ -20,9 +18,6 @@ class Surface:
     """(V, 3) RGB."""
 
 
-# Contents of a model file.
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Texture:
     """Pictures for the triangles of a surface."""
@@ -34,8 +29,8 @@ class Texture:
     pages: tuple[NDArray[np.uint8], ...]
     """(H, W, 3) RGB each."""
     normal_maps: tuple[NDArray[np.uint8], ...] = ()
-    """One (h, w, 3) per page, of its proportions: normals in the frames of `geometry.relief`, stored as glTF does:
-    0.5 + 0.5 n, linear, +y up; none where the surface has all its detail itself."""
+    """One (h, w, 3) per page, of its proportions: normals in the frames of `geometry.triangles`, stored as glTF does:
+    0.5 + 0.5 n, linear, +y up; empty without normal maps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

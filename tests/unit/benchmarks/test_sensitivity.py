@@ -89,8 +89,7 @@ def test_constants_chosen_by_hand_are_found_in_options_too(room):
 
 
 @pytest.mark.parametrize(
-    ("names", "values"),
-    [("SPREAD, STEPS", (0.5, 8, 3.0, 2.0, 8)), ("LoopOptions.gain", (0.25, 4, 3.0, 4.0, 8))],
+    ("names", "values"), [("SPREAD, STEPS", (0.5, 8, 3.0, 2.0, 8)), ("LoopOptions.gain", (0.25, 4, 3.0, 4.0, 8))]
 )
 def test_whoever_imports_a_constant_sees_it_scaled(room, names, values):
     install(Constant("scaled_module.py", names), 2.0, room / "sfm_app" / "room")

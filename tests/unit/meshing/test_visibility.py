@@ -3,8 +3,17 @@
 import numpy as np
 import pytest
 
-from sfm_app.meshing import CONFIRMED, EMPTY, NO_EVIDENCE, SEEN_THROUGH, DepthView, Paint, judge, sample_colors
-from sfm_app.meshing.visibility import SKY
+from sfm_app.meshing.visibility import (
+    CONFIRMED,
+    EMPTY,
+    NO_EVIDENCE,
+    SEEN_THROUGH,
+    SKY,
+    DepthView,
+    Paint,
+    judge,
+    sample_colors,
+)
 
 FACING = np.array([[0.0, 0.0, -1.0]])
 

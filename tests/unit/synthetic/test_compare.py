@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
+from sfm_app.errors import NumericalError
 from sfm_app.geometry.poses import Similarity
 from sfm_app.synthetic.cameras import axis_rotation, make_camera
 from sfm_app.synthetic.compare import (
@@ -87,11 +88,11 @@ def test_alignment_needs_three_known_photos_off_a_line(photos):
     with pytest.raises(ValueError, match="2 of the estimated camera centers"):
         align_centers(two, truth)
     on_a_line = {name: np.array([float(k), 0.0, 0.0]) for k, name in enumerate(truth.centers)}
-    with pytest.raises(ValueError, match="on a line"):
+    with pytest.raises(NumericalError, match="on a line"):
         align_centers(on_a_line, truth)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_truth_in_another_frame_has_no_error(photos, seed):
     vertices, faces, centers = moved(photos[1], random_similarity(np.random.default_rng(seed)))
     assert surface_error(vertices, faces, centers, photos[1]) < 1e-5
@@ -152,9 +153,6 @@ def test_samples_spread_evenly_over_the_triangles():
 def test_a_surface_without_area_is_refused(photos):
     truth = photos[1]
     nothing = np.zeros((0, 3), dtype=np.int64)
-    with pytest.raises(ValueError, match="no area"):
-        surface_error(truth.vertices, nothing, truth.centers, truth)
-    with pytest.raises(ValueError, match="no area"):
-        surface_accuracy(truth.vertices, nothing, truth.centers, truth)
-    with pytest.raises(ValueError, match="no area"):
-        surface_coverage(truth.vertices, nothing, truth.centers, truth)
+    for measure in (surface_error, surface_accuracy, surface_coverage):
+        with pytest.raises(ValueError, match="no area"):
+            measure(truth.vertices, nothing, truth.centers, truth)

@@ -11,10 +11,8 @@ from sfm_app.synthetic.render import (
     comparison_image,
     orbited_pose,
     prepare,
-    prepare_model,
     ray_caster,
     render_model,
-    render_rays,
     render_scene,
     render_shape,
 )
@@ -22,13 +20,14 @@ from sfm_app.synthetic.shapes import Body, Material, SyntheticScene, box
 from sfm_app.types import Surface
 from sfm_app.types.surface import Model, Texture
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def prepared(still_life):
     return prepare(still_life)
 
 
-@pytest.mark.slow
 def test_two_views_show_the_same_surface_in_the_right_pixels(prepared, still_life, four_views):
     """What view 1 shows at a pixel, view 2 shows where the truth projects it to: half a pixel off would be noticed."""
     camera = make_camera(240, 160)
@@ -57,7 +56,6 @@ def test_two_views_show_the_same_surface_in_the_right_pixels(prepared, still_lif
     assert all(mismatch(dx, dy) > 1.2 * best for dx, dy in [(0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)])
 
 
-@pytest.mark.slow
 def test_a_pixel_is_seen_through_its_center():
     """A wall whose edges lie at x = 10.25 and 30.75, y = 4.25 and 15.75 pixels covers whole pixels by their centers."""
     white = Material(pattern="stone", base=(230, 230, 230), second=(230, 230, 230), joint=(230, 230, 230))
@@ -73,7 +71,6 @@ def test_a_pixel_is_seen_through_its_center():
     assert len(rows) == 21 * 12
 
 
-@pytest.mark.slow
 def test_the_sun_casts_a_shadow_away_from_it(prepared, still_life):
     sun = np.array(still_life.to_light)
     ball = np.array([0.0, 1.3, 0.0])
@@ -92,7 +89,6 @@ def test_the_sun_casts_a_shadow_away_from_it(prepared, still_life):
     assert darkened(shaded * [-2, 1, -2]) == pytest.approx(1.0, abs=0.05)
 
 
-@pytest.mark.slow
 def test_the_sky_is_blue_and_darker_above(prepared):
     up = look_at(np.array([0.0, 5.0, 0.0]), np.array([0.0, 9.0, 9.0]))
     sky = render_scene(prepared, make_camera(60, 60), up)
@@ -100,7 +96,6 @@ def test_the_sky_is_blue_and_darker_above(prepared):
     assert sky[0].mean() < 0.9 * sky[-1].mean()
 
 
-@pytest.mark.slow
 def test_bodies_of_one_material_have_their_own_stains():
     white = Material(pattern="stone", base=(200, 200, 200), second=(100, 100, 100))
     twins = tuple(Body(box(1.0, 1.0, 1.0).move((x, 0.0, 0.0)), white) for x in (-0.5, 0.5))
@@ -111,7 +106,6 @@ def test_bodies_of_one_material_have_their_own_stains():
     assert left.std() > 0.01 and abs(np.corrcoef(left.ravel(), right.ravel())[0, 1]) < 0.5
 
 
-@pytest.mark.slow
 def test_rows_are_seen_from_poses_of_their_own(prepared, four_views):
     """The upper half of a frame whose lower rows are seen from elsewhere is that of the photo from the first pose."""
     camera = make_camera(60, 40)
@@ -123,22 +117,6 @@ def test_rows_are_seen_from_poses_of_their_own(prepared, four_views):
     assert image[:20] == pytest.approx(render_scene(prepared, camera, first)[:20], abs=0.01)
     assert image[20:] == pytest.approx(render_scene(prepared, camera, second)[20:], abs=0.01)
     assert np.abs(image[20:] - render_scene(prepared, camera, first)[20:]).mean() > 0.02
-
-
-@pytest.mark.slow
-def test_rendering_repeats_to_the_bit(prepared, four_views):
-    pose = next(iter(four_views.cam_from_world.values()))
-    camera = make_camera(60, 40)
-    assert render_scene(prepared, camera, pose).tobytes() == render_scene(prepared, camera, pose).tobytes()
-
-
-@pytest.mark.slow
-def test_distortion_moves_the_rim_but_not_the_center(prepared, four_views):
-    pose = next(iter(four_views.cam_from_world.values()))
-    plain = make_camera(120, 80, center=(0.5, 0.5))
-    barrel = Camera(plain.K, 120, 80, lens=Lens(radial=(-0.4,)))
-    difference = np.abs(render_scene(prepared, plain, pose) - render_scene(prepared, barrel, pose)).mean(axis=2)
-    assert difference[38:42, 58:62].mean() < 0.3 * difference[:, :10].mean()
 
 
 CAMERA = Camera(np.array([[20.0, 0, 20.0], [0, 20.0, 10.0], [0, 0, 1]]), 40, 20)
@@ -160,7 +138,6 @@ def textured(page, *, pages=1):
     return Model(square(), Texture(uv, np.full(2, pages - 1, np.int32), (np.zeros_like(page),) * (pages - 1) + (page,)))
 
 
-@pytest.mark.slow
 def test_a_model_without_texture_has_the_colors_of_its_vertices():
     picture = render_model(Model(square()), CAMERA, STRAIGHT)
     assert np.array_equal(picture.covered, np.arange(40)[None, :].repeat(20, axis=0) >= 20)
@@ -170,7 +147,6 @@ def test_a_model_without_texture_has_the_colors_of_its_vertices():
     assert not picture.colors[:, :20].any() and np.all(picture.with_background((1, 2, 3))[:, :20] == [1, 2, 3])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("pages", [1, 3])
 def test_a_page_of_the_size_of_its_pixels_is_shown_texel_by_texel(pages):
     """One texel per pixel: half a texel off, or an upside-down page, would be noticed."""
@@ -180,7 +156,6 @@ def test_a_page_of_the_size_of_its_pixels_is_shown_texel_by_texel(pages):
     assert np.abs(picture.colors[:, 20:].astype(int) - np.roll(page, 1, axis=1)).mean() > 40
 
 
-@pytest.mark.slow
 def test_texels_are_mixed_between_their_centers_and_repeated_at_the_border():
     page = np.zeros((1, 2, 3), np.uint8)
     page[0, 1] = 200
@@ -189,7 +164,6 @@ def test_texels_are_mixed_between_their_centers_and_repeated_at_the_border():
     assert np.allclose(row, expected, atol=4), "the centers of the two texels lie at 1/4 and 3/4"
 
 
-@pytest.mark.slow
 def test_the_lens_bends_the_picture():
     wide = Camera(np.array([[20.0, 0, 20.0], [0, 20.0, 10.0], [0, 0, 1]]), 40, 20, Lens(radial=(0.2,)))
     far = square(vertices=SQUARE * [0.8, 0.5, 1.0])
@@ -198,16 +172,6 @@ def test_the_lens_bends_the_picture():
     assert (plain, bent) == (16, 18)
 
 
-@pytest.mark.slow
-def test_any_rays_give_the_picture_of_their_camera():
-    model = prepare_model(Model(square()))
-    x, y = np.meshgrid(np.arange(40) + 0.5, np.arange(20) + 0.5)
-    rays = np.stack([(x - 20) / 20, (y - 10) / 20, np.ones_like(x)], axis=-1)
-    same = render_rays(model, np.zeros(3), 3.0 * rays)
-    assert np.array_equal(same.colors, render_model(model, CAMERA, STRAIGHT).colors)
-
-
-@pytest.mark.slow
 def test_the_bare_shape_is_gray_outside_and_reddish_inside():
     outside = render_shape(Model(square()), CAMERA, STRAIGHT)
     inside = render_shape(Model(square(FACES[:, ::-1])), CAMERA, STRAIGHT)
@@ -217,7 +181,6 @@ def test_the_bare_shape_is_gray_outside_and_reddish_inside():
     assert np.all(red[:, 0].astype(int) > red[:, 1].astype(int) + 20)
 
 
-@pytest.mark.slow
 def test_a_face_is_brighter_the_more_it_faces_the_lamp():
     """The lamp is above on the left: faces that look down and right are in the dark, but not black."""
     levels = []
@@ -228,7 +191,6 @@ def test_a_face_is_brighter_the_more_it_faces_the_lamp():
     assert 205 * 0.25 < levels[2] < levels[1] - 40 and levels[1] + 20 < levels[0] < 206
 
 
-@pytest.mark.slow
 def test_a_model_without_triangles_is_not_seen():
     empty = Model(Surface(np.zeros((3, 3)), np.zeros((0, 3), np.int64), np.zeros((3, 3), np.uint8)))
     camera = make_camera(20, 16)
@@ -237,7 +199,6 @@ def test_a_model_without_triangles_is_not_seen():
         assert np.all(picture.with_background() == 255)
 
 
-@pytest.mark.slow
 def test_beside_a_photo_stand_the_model_from_its_camera_from_aside_and_its_bare_shape():
     camera = Camera(np.array([[20.0, 0, 40.0], [0, 20.0, 20.0], [0, 0, 1]]), 80, 40)
     photo = np.full((80, 160, 3), (10, 200, 30), np.uint8)
@@ -255,7 +216,6 @@ def test_beside_a_photo_stand_the_model_from_its_camera_from_aside_and_its_bare_
     assert np.ptp(inner, axis=1).max() == 0 and 50 < inner.min() <= inner.max() < 206
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("angle_deg", [25.0, -90.0])
 def test_walking_around_keeps_height_distance_and_what_is_in_the_middle(angle_deg):
     surface = Surface(np.random.default_rng(0).normal(size=(99, 3)), FACES, RED_TO_BLUE)

@@ -1,3 +1,5 @@
+"""A view graph survives its file."""
+
 import io
 
 import numpy as np
@@ -49,13 +51,3 @@ def test_an_empty_view_graph_survives_too():
 
     assert not back.fits
     assert back.reasons == {"x": 2, "y": 1}
-
-
-def test_a_calibration_survives_json():
-    one = Calibration(np.diag([5.0, 6, 1]), 640, 480, "zero-curves", True, spread={"fx": 1.5}, evidence={"pairs": 3})
-
-    back = Calibration.from_dict(one.to_dict())
-
-    assert np.array_equal(back.K, one.K)
-    assert (back.spread, back.evidence, back.identifiable) == ({"fx": 1.5}, {"pairs": 3}, True)
-    assert back.focal_px == np.sqrt(30)

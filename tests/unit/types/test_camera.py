@@ -1,9 +1,13 @@
+"""Calibrations survive their file; correlations are those of drawn values."""
+
 import json
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from sfm_app.types import Calibration, Intrinsics
+from sfm_app.types.camera import named_correlations
 
 FOUND = Calibration(
     np.array([[900.5, 0, 501.25], [0, 901.5, 373.0], [0, 0, 1]]), 1000, 750, "zero-curves", True, radial=-0.0625,
@@ -38,6 +42,10 @@ def test_distortion_is_written_only_where_there_is_any():
     assert one.is_kept and one.is_given and one.is_bent and not FOUND.is_given
 
 
+def test_the_focal_is_the_geometric_mean_of_both_directions():
+    assert replace(FOUND, K=np.diag([5.0, 6.0, 1.0])).focal_px == np.sqrt(30)
+
+
 def test_cameras_keep_their_order_names_and_photos():
     taken = {"b.jpg": "zoom", "a.jpg": "zoom #2"}
     one = Intrinsics({"zoom": FOUND, "zoom #2": UNKNOWN}, taken)
@@ -48,3 +56,22 @@ def test_cameras_keep_their_order_names_and_photos():
     assert back.camera_of == taken
     assert (back.main.method, back.identifiable) == ("zero-curves", True)
     np.testing.assert_array_equal(back.K, FOUND.K)
+
+
+def test_pairs_of_parameters_have_the_correlation_of_drawn_values():
+    root = np.array([[2.0, 0.0, 0.0], [-30.0, 10.0, 0.0], [0.001, 0.0, 0.003]])
+    drawn = np.random.default_rng(0).normal(size=(20_000, 3)) @ root.T
+    expected = np.corrcoef(drawn.T)
+
+    found = named_correlations(("fx", "cx", "k1"), root @ root.T)
+
+    assert list(found) == ["fx cx", "fx k1", "cx k1"]
+    assert list(found.values()) == pytest.approx(expected[np.triu_indices(3, 1)], abs=0.02)
+
+
+def test_fixed_and_unknown_parameters_have_no_correlation():
+    covariance = np.diag([1.0, 0.0, np.inf, 4.0])
+    covariance[0, 3] = covariance[3, 0] = 3.0  # more than a covariance can be: rounding may do so
+
+    assert named_correlations(("a", "b", "c", "d"), covariance) == {"a d": 1.0}
+    assert named_correlations((), np.zeros((0, 0))) == {}

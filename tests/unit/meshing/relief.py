@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-import pytest
 
 from sfm_app.meshing.agreement import RefinePhoto
 from sfm_app.synthetic.cameras import look_at
@@ -59,12 +58,6 @@ class Relief:
     partners: list
 
 
-@pytest.fixture
-def relief():
-    """Makes photos of a height field."""
-
-    def make(height):
-        photos = [photo_of(eye, height) for eye in EYES]
-        return Relief(height, photos, [[1, 2], [0, 2], [0, 1]])
-
-    return make
+def relief(height):
+    """Photos of a height field."""
+    return Relief(height, [photo_of(eye, height) for eye in EYES], [[1, 2], [0, 2], [0, 1]])

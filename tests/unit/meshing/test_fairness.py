@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from sfm_app.geometry.triangles import vertex_normals
-from sfm_app.meshing import fairness
-from sfm_app.meshing.fairness import BEND, CREASE, HOLD, Neighbors, find_displacements
-from tests.unit.meshing.refinement.conftest import PIXEL, grid
+from sfm_app.meshing.fairness import OPTIONS, FairnessOptions, Neighbors, find_displacements
+from tests.unit.meshing.relief import PIXEL, grid
 
 
 def flat(x, y):
@@ -46,20 +45,18 @@ def test_neighbors_of_a_grid():
     assert lengths[12] == pytest.approx(0.05 * (4 + 2 * np.sqrt(2)) / 6)
 
 
-def test_the_displacements_solve_the_normal_equations(monkeypatch):
-    monkeypatch.setattr(fairness, "ACCURACY", 1e-9)
-    monkeypatch.setattr(fairness, "STEPS", 2000)
+def test_the_displacements_solve_the_normal_equations():
     surface = grid(rough, half=0.06, step=0.02)
     vertices, normals, around, size = parts(surface)
     rng = np.random.default_rng(2)
     g, h = rng.normal(size=len(size)) / PIXEL, rng.uniform(0.0, 1.0, len(size)) / PIXEL**2
 
-    found = find_displacements(vertices, normals, around, (g, h), size)
+    found = find_displacements(vertices, normals, around, (g, h), size, FairnessOptions(steps=2000, accuracy=1e-9))
 
     L = laplacian(around)
     bend = ((L @ vertices) * normals).sum(axis=1)
-    W = np.diag(around.inner / (BEND * size) ** 2 / (1 + (bend / (CREASE * size)) ** 2))
-    expected = np.linalg.solve(np.diag(h + HOLD / size**2) + L.T @ W @ L, g - L.T @ W @ bend)
+    W = np.diag(around.inner / (OPTIONS.bend * size) ** 2 / (1 + (bend / (OPTIONS.crease * size)) ** 2))
+    expected = np.linalg.solve(np.diag(h + OPTIONS.hold / size**2) + L.T @ W @ L, g - L.T @ W @ bend)
     assert found == pytest.approx(expected, rel=1e-4, abs=1e-4 * np.abs(expected).max())
 
 

@@ -5,7 +5,6 @@ import pytest
 
 from sfm_app.colmap.surface import positions
 from sfm_app.meshing.blocks import split_points
-from sfm_app.surface import blocks as block_points
 from sfm_app.surface.blocks import POINTS, sort_points
 
 
@@ -20,11 +19,10 @@ def records():
 
 
 @pytest.mark.parametrize("at_once", [700, 5000])
-def test_every_point_is_in_one_file_and_in_the_bounds_of_its_block(records, at_once, tmp_path, monkeypatch):
-    monkeypatch.setattr(block_points, "CHUNK", at_once)
+def test_every_point_is_in_one_file_and_in_the_bounds_of_its_block(records, at_once, tmp_path):
     partition = split_points(positions(records), 7)
 
-    found = sort_points(records, partition, tmp_path)
+    found = sort_points(records, partition, tmp_path, at_once)
 
     numbers = partition.find_blocks(positions(records))
     for number in range(7):
