@@ -10,7 +10,7 @@ from sfm_app.api import Run
 from sfm_app.camera.models import calibration_from_model
 from sfm_app.cli.output import WIDTH, file_lines
 from sfm_app.report.text import (
-    GUESS_SOURCES,
+    SOURCES,
     WARNING,
     contradiction_lines,
     duration_text,
@@ -167,7 +167,7 @@ def _camera_lines(run: Run) -> Iterator[str]:
         if not calibration.identifiable:
             source = "all photos together do"  # a reason would seem to concern the refined camera
             if model is None:
-                source = f"this is {GUESS_SOURCES.get(calibration.method, calibration.method)}: {calibration.reason}"
+                source = f"this is {SOURCES.get(calibration.method, calibration.method)}: {calibration.reason}"
             yield f"{INDENT}pairs of photos do not determine it; {source}"
     if len(cameras) > LINES_SHOWN:
         yield f"{INDENT}and {len(cameras) - LINES_SHOWN} more cameras"

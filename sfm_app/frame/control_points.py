@@ -19,29 +19,24 @@ from sfm_app.numerical import FAILURES
 from sfm_app.types import ControlPoint, ControlPoints, GpsPosition
 from sfm_app.types.arrays import FloatArray
 
-# Read ground control points from OpenDroneMap's gcp_list.txt.
+# The file, OpenDroneMap's gcp_list.txt.
 #
 # The first line is the coordinate system: EPSG:32632, a proj string such as "+proj=utm +zone=32 +datum=WGS84", or
 # "WGS84 UTM 32N". Each other line is a mark in a photo: geo_x geo_y geo_z pixel_x pixel_y photo [name]. Marks with
-# one name, or without names those with one position, are of one point.
+# the same name, or without names at the same position, belong to one point.
 
 FORM = (
     "the first line is a coordinate system such as EPSG:32632, each other one: geo_x geo_y geo_z pixel_x pixel_y photo "
     "[name]"
 )
-MOST_BYTES = 10_000_000
 GEOGRAPHIC = re.compile(r"\+proj=(longlat|latlong)|^EPSG:4326$|^WGS ?84$", re.IGNORECASE)
 FEET = re.compile(r"\+units=(us-)?ft|\+to_meter", re.IGNORECASE)
 
 
 def read_control_points(path: Path) -> ControlPoints:
-    """Read a file of ground control points.
-
-    Raises:
-        InputError: it cannot be read, or a line of it is malformed; the message names the line.
-    """
+    """Read a file of ground control points; raise an InputError that names a malformed line."""
     try:
-        if path.stat().st_size > MOST_BYTES:
+        if path.stat().st_size > 10_000_000:
             raise ValueError("it is larger than 10 MB")
         lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
         crs = lines[0] if lines else ""
@@ -58,50 +53,52 @@ def read_control_points(path: Path) -> ControlPoints:
         raise InputError(f"cannot read the ground control points {path}: {err.strerror}", hint=hint) from err
     except ValueError as err:
         raise InputError(f"{path} holds no ground control points: {err}", hint=FORM) from err
-    known = [[one.name, one.position, one.marks] for one in points]
-    return ControlPoints(points, crs, geographic, str(path), fingerprint(crs, known))
+    content = [[one.name, one.position, one.marks] for one in points]
+    return ControlPoints(points, crs, geographic, str(path), fingerprint(crs, content))
 
 
 def _read_marks(lines: list[str], geographic: bool) -> tuple[ControlPoint, ...]:
-    """Return the points of all lines but the first; ValueError names a malformed line."""
+    """Return the points of all lines after the first; raise a ValueError that names a malformed line."""
     names: dict[tuple[object, ...], str] = {}
     positions: dict[str, tuple[float, float, float]] = {}
     marks: dict[str, dict[str, tuple[float, float]]] = {}
     for number, line in enumerate(lines[1:], start=2):
         if not line or line.startswith("#"):
             continue
-        words = line.split("\t") if "\t" in line else line.split()
         try:
-            east, north, up, x, y = map(float, words[:5])
-            photo = words[5].strip()
-        except (ValueError, IndexError):
-            raise ValueError(f"line {number} is malformed") from None
-        if not all(map(math.isfinite, (east, north, up, x, y))) or (geographic and not _is_on_earth(east, north)):
-            raise ValueError(f"line {number} has a value out of range")
-        given = words[6].strip() if len(words) > 6 else ""
-        name = given or names.setdefault((east, north, up), f"point {len(names) + 1}")
-        if positions.setdefault(name, (east, north, up)) != (east, north, up):
+            position, mark, photo, name = _read_mark(line, geographic)
+        except ValueError as err:
+            raise ValueError(f"line {number} {err}") from None
+        name = name or names.setdefault(position, f"point {len(names) + 1}")
+        if positions.setdefault(name, position) != position:
             raise ValueError(f"line {number} gives '{name}' another position than an earlier line")
-        marks.setdefault(name, {})[photo] = (x, y)
+        marks.setdefault(name, {})[photo] = mark
     return tuple(ControlPoint(name, positions[name], marks[name]) for name in positions)
 
 
-def _is_on_earth(longitude: float, latitude: float) -> bool:
-    return -180 <= longitude <= 360 and -90 <= latitude <= 90
+def _read_mark(line: str, geographic: bool) -> tuple[tuple[float, float, float], tuple[float, float], str, str]:
+    """Return the position, the mark, its photo and the name of the point, which may be empty."""
+    words = line.split("\t") if "\t" in line else line.split()
+    try:
+        east, north, up, x, y = map(float, words[:5])
+        photo = words[5].strip()
+    except (ValueError, IndexError):
+        raise ValueError("is malformed") from None
+    on_earth = not geographic or (-180 <= east <= 360 and -90 <= north <= 90)
+    if not all(map(math.isfinite, (east, north, up, x, y))) or not on_earth:
+        raise ValueError("has a value out of range")
+    return (east, north, up), (x, y), photo, words[6].strip() if len(words) > 6 else ""
 
 
-# Place and size of a model from ground control points, without those that contradict the others.
+# The fit of the model to the points, without points that contradict the others.
 
-LEAST_POINTS = 3
-CHECKED_POINTS = 5
-"""Points from which on a wrong one can be told: four others determine the seven numbers with five left over."""
 SIGNIFICANCE = 0.002
-"""Probability of a false alarm at each step. Chosen by hand; `tests/unit/scale/test_control_fit.py` counts those, and
-the wrong points that are found."""
+"""Probability of a false alarm at each step of the forward search. Chosen by hand; the unit tests count false alarms
+and detected wrong points."""
 UNKNOWNS = 7
-"""Of a similarity."""
-LEAST_SIGMA_M = 1e-4
-"""Least standard deviation of a control point, in meters: nobody measures better."""
+"""Parameters of a similarity. By definition."""
+MIN_SIGMA_M = 1e-4
+"""Least standard deviation of a control point, in meters. Chosen by hand."""
 EAST_UP_SOUTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """From east, north, up to x, y, z of exported files, with y up."""
 
@@ -121,13 +118,16 @@ class ControlFit:
     """Root mean square distance of the used points."""
     used: tuple[str, ...]
     wrong: Mapping[str, float]
-    """Distance in meters by which each left-out point misses the fit."""
+    """Distance of each rejected point from the fit, in meters."""
 
 
 def fit_control_points(given: ControlPoints, located: Mapping[str, SightedPoint]) -> ControlFit | str:
-    """Fit the similarity that takes the model to its ground control points, or say why there is none."""
+    """Fit the similarity from the model to its ground control points, given their places in the model by name.
+
+    Return the reason if the points do not determine one.
+    """
     points = [point for point in given.points if point.name in located]
-    if len(points) < LEAST_POINTS:
+    if len(points) < 3:
         return f"{len(points)} of {len(given.points)} ground control points have a place in the model, 3 are needed"
     targets, crs, offset = _target_positions(points, given)
     places = np.array([located[point.name].place for point in points])
@@ -136,46 +136,40 @@ def fit_control_points(given: ControlPoints, located: Mapping[str, SightedPoint]
     except FAILURES:
         return "the ground control points lie on a line: they do not determine which way is up"
     fit = umeyama(places[used], targets[used])
-    off = np.linalg.norm(fit(places) - targets, axis=1)
-    rms = float(np.sqrt(np.mean(off[used] ** 2)))
-    marked = [np.trace(located[point.name].covariance) / 3 for point, kept in zip(points, used, strict=True) if kept]
-    sigma = max(_sigma(off[used]), fit.scale * float(np.sqrt(np.mean(marked))), LEAST_SIGMA_M)
-    spread = float(np.sqrt((np.square(places[used] - places[used].mean(axis=0))).sum()))
+    distances = np.linalg.norm(fit(places) - targets, axis=1)
+    rms = float(np.sqrt(np.mean(distances[used] ** 2)))
     names = [point.name for point in points]
-    return ControlFit(
-        fit,
-        crs,
-        offset,
-        sigma / (fit.scale * spread),
-        rms,
-        tuple(name for name, kept in zip(names, used, strict=True) if kept),
-        {name: float(miss) for name, kept, miss in zip(names, used, off, strict=True) if not kept},
-    )
+    inliers = tuple(name for name, inlier in zip(names, used, strict=True) if inlier)
+    outliers = {name: float(miss) for name, inlier, miss in zip(names, used, distances, strict=True) if not inlier}
+    variances = [np.trace(located[name].covariance) / 3 for name in inliers]
+    sigma = max(_sigma(distances[used]), fit.scale * float(np.sqrt(np.mean(variances))), MIN_SIGMA_M)
+    spread = float(np.sqrt((np.square(places[used] - places[used].mean(axis=0))).sum()))
+    return ControlFit(fit, crs, offset, sigma / (fit.scale * spread), rms, inliers, outliers)
 
 
 def agreeing_points(places: FloatArray, targets: FloatArray) -> NDArray[np.bool_]:
-    """Return which points agree on one similarity; all of them where fewer than `CHECKED_POINTS` are given.
+    """Return which points agree on one similarity; all of fewer than five, which have too little redundancy.
 
-    A forward search (Atkinson and Riani 2000) begins with the four that agree best and adds the nearest one by one. A
-    point is left out where the fit without it, or without it and those added later, is better than chance allows: by
-    the F-test, with as many trials as there are ways to choose those left out.
+    A forward search (Atkinson and Riani 2000) begins with the four that agree best and adds the nearest one by one. The
+    points from some step on are rejected if the fit without them is better than chance allows: by the F-test, with as
+    many trials as there are ways to choose the rejected points.
 
     Args:
         places: (N, 3) in the model.
-        targets: (N, 3) where they should be, in meters.
+        targets: (N, 3) in meters.
 
     Raises:
-        ValueError: all lie on a line.
+        ValueError: all points lie on a line.
     """
     first = robust_similarity(places, targets)
-    if len(places) < CHECKED_POINTS:
+    if len(places) < 5:
         return np.ones(len(places), bool)
     members = np.argsort(np.linalg.norm(first(places) - targets, axis=1), kind="stable")[:4]
     searched = [members]
     squares = [_squared_error(places[members], targets[members])]
     while len(members) < len(places):
-        off = np.linalg.norm(umeyama(places[members], targets[members])(places) - targets, axis=1)
-        members = np.argsort(off, kind="stable")[: len(members) + 1]
+        distances = np.linalg.norm(umeyama(places[members], targets[members])(places) - targets, axis=1)
+        members = np.argsort(distances, kind="stable")[: len(members) + 1]
         searched.append(members)
         squares.append(_squared_error(places[members], targets[members]))
     last = len(searched) - 1
@@ -187,7 +181,7 @@ def agreeing_points(places: FloatArray, targets: FloatArray) -> NDArray[np.bool_
 
 
 def _chance(squares: Sequence[float], fewer: int, more: int) -> float:
-    """Return the probability that good points alone make the fit so much worse, from four points plus either count."""
+    """Return the probability that inliers alone make the fit of 4 + `more` points so much worse than of 4 + `fewer`."""
     from scipy.stats import f  # takes half a second to load
 
     extra, freedom = more - fewer, 3 * (fewer + 4) - UNKNOWNS
@@ -196,19 +190,19 @@ def _chance(squares: Sequence[float], fewer: int, more: int) -> float:
 
 
 def _squared_error(places: FloatArray, targets: FloatArray) -> float:
-    """Return the squared distances of points to their fit, as large as the least deviation at least."""
-    off = umeyama(places, targets)(places) - targets
-    return max(float((off**2).sum()), LEAST_SIGMA_M**2 * (3 * len(places) - UNKNOWNS))
+    """Return the sum of the squared distances of points to their fit, at least that of the least deviation."""
+    residuals = umeyama(places, targets)(places) - targets
+    return max(float((residuals**2).sum()), MIN_SIGMA_M**2 * (3 * len(places) - UNKNOWNS))
 
 
-def _sigma(off: FloatArray) -> float:
-    """Return the standard deviation of each coordinate of points from their distances to the fit."""
+def _sigma(distances: FloatArray) -> float:
+    """Return the standard deviation of each coordinate from the distances to the fit."""
     from scipy.stats import norm, t  # takes half a second to load
 
-    freedom = max(3 * len(off) - UNKNOWNS, 1)
-    # a deviation from few numbers may be too small: three of it are to cover as much as of a normal distribution
-    few = t.ppf(norm.cdf(3.0), freedom) / 3.0
-    return float(few * np.sqrt((off**2).sum() / freedom))
+    freedom = max(3 * len(distances) - UNKNOWNS, 1)
+    # widened for few points, so that three deviations cover as much as three of a normal distribution
+    widening = t.ppf(norm.cdf(3.0), freedom) / 3.0
+    return float(widening * np.sqrt((distances**2).sum() / freedom))
 
 
 def _target_positions(
@@ -223,7 +217,5 @@ def _target_positions(
     known = [GpsPosition(latitude, longitude, height) for longitude, latitude, height in positions.tolist()]
     middle = GpsPosition(*(float(value) for value in np.median(positions, axis=0)[[1, 0, 2]]))
     origin = position_from_enu(np.zeros(3), middle)
-    where = (
-        f"meters east, north and up of {origin.latitude_deg:.8f}, {origin.longitude_deg:.8f}, {origin.altitude_m:.3f}"
-    )
-    return enu_m(known, origin) @ EAST_UP_SOUTH.T, where, (0.0, 0.0, 0.0)
+    place = f"{origin.latitude_deg:.8f}, {origin.longitude_deg:.8f}, {origin.altitude_m:.3f}"
+    return enu_m(known, origin) @ EAST_UP_SOUTH.T, f"meters east, north and up of {place}", (0.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""What is known of lengths in a scene, as evidence of its scale."""
+"""Known lengths in a scene as evidence of its scale: distances, markers and ground control points."""
 
 from collections.abc import Mapping, Sequence
 
@@ -23,58 +23,57 @@ from sfm_app.types import ControlPoints, Photo, PhotoSet
 from sfm_app.wording import format_length, list_names, parse_length, parse_point
 
 TAPE_DEVIATION = 0.002
-"""Relative standard deviation of a distance that somebody measured: two millimeters per meter. Chosen by hand."""
-NAMES_SHOWN = 5
+"""Relative standard deviation of a distance measured by hand: two millimeters per meter. Chosen by hand."""
 
 
 def distance_evidence(distances: Sequence[tuple[str, str, str]], model: Sightlines) -> list[ScaleEvidence]:
-    """Return the scale by each known distance between two places."""
-    found = []
+    """Return the scale by each known distance: two points of the model and a length, as in the settings."""
+    evidence = []
     for first, second, length in distances:
         a, b, meters = np.array(parse_point(first)), np.array(parse_point(second)), parse_length(length)
-        apart = measure_distance(a, b, model, 1.0, None)
-        deviation = float(np.hypot(apart.deviation / apart.value, TAPE_DEVIATION))
-        found.append(ScaleEvidence(f"the distance of {format_length(meters)}", meters / apart.value, deviation))
-    return found
+        distance = measure_distance(a, b, model, 1.0, None)
+        deviation = float(np.hypot(distance.deviation / distance.value, TAPE_DEVIATION))
+        evidence.append(ScaleEvidence(f"the distance of {format_length(meters)}", meters / distance.value, deviation))
+    return evidence
 
 
 def marker_evidence(posed: PosedPhotos, run: RunContext, problems: list[str]) -> list[ScaleEvidence]:
-    """Return the scale by each printed marker, and note markers that tell nothing."""
+    """Return the scale by each printed marker, and add unusable markers to the problems."""
     options = run.settings.scale
     names = sorted(posed.names)
     task = Task(find_markers_in_file, run.workspace.photos, options.marker_family)
-    seen = dict(zip(names, run.map(task, names, "looking for markers"), strict=True))
-    rays = {name: [posed.sights(name, marker.corners) for marker in seen[name]] for name in names}
-    found = marker_scales(seen, rays, parse_length(options.markers))
-    run.record(markers={"photos": sum(map(bool, seen.values())), "not_used": dict(found.not_used)})
-    problems += [f"marker {name} is not used: {reason}" for name, reason in found.not_used.items()]
-    if not any(seen.values()):
+    markers = dict(zip(names, run.map(task, names, "detecting markers"), strict=True))
+    rays = {name: [posed.sights(name, marker.corners) for marker in markers[name]] for name in names}
+    evidence, unusable = marker_scales(markers, rays, parse_length(options.markers))
+    run.record(markers={"photos": sum(map(bool, markers.values())), "not_used": unusable})
+    problems += [f"marker {name} is not used: {reason}" for name, reason in unusable.items()]
+    if not any(markers.values()):
         problems.append("no photo shows a marker; print a page of them with `sfm-app markers`")
-    return list(found.evidence)
+    return evidence
 
 
 def control_places(
     photos: PhotoSet, posed: PosedPhotos, given: ControlPoints, problems: list[str]
 ) -> dict[str, SightedPoint]:
-    """Return the place in the model of each ground control point that two photos determine."""
-    names, found = named_photos(photos.photos), dict[str, SightedPoint]()
+    """Return the place in the model of each ground control point that its marks determine, and add problems."""
+    names, located = named_photos(photos.photos), dict[str, SightedPoint]()
     unknown = sorted({photo for point in given.points for photo in point.marks if photo not in names})
     if unknown:
-        problems.append(f"no photo in use is called {list_names(unknown, NAMES_SHOWN)}")
+        problems.append(f"no photo in use is called {list_names(unknown, 5)}")
     marked = {photo for point in given.points for photo in point.marks if photo in names}
     scales = {name: layout_scale(names[name], photos.folder) for name in sorted(marked)}
     for point in given.points:
         sights = _mark_sights(point.name, point.marks, names, scales, posed, problems)
-        placed = locate_point(sights)
-        if isinstance(placed, str):
-            problems.append(f"ground control point '{point.name}' is not used: {placed}")
+        place = locate_point(sights)
+        if isinstance(place, str):
+            problems.append(f"ground control point '{point.name}' is not used: {place}")
             continue
-        found[point.name] = placed
+        located[point.name] = place
         problems += [
             f"ground control point '{point.name}': its mark in {photo} contradicts the others, and is left out"
-            for photo in placed.left_out
+            for photo in place.left_out
         ]
-    return found
+    return located
 
 
 def _mark_sights(
@@ -85,7 +84,7 @@ def _mark_sights(
     posed: PosedPhotos,
     problems: list[str],
 ) -> list[Sight]:
-    """Return the rays of a point's marks in photos with a pose."""
+    """Return the rays of a point's marks in posed photos, and add marks outside of their photo to the problems."""
     sights = []
     for name, mark in marks.items():
         photo = names.get(name)

@@ -21,28 +21,55 @@ from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.types.arrays import FloatArray
 from sfm_app.wording import format_length
 
-# Find the corners of a marker in a photo to a few hundredths of a pixel, by all edges of its pattern.
-#
-# Detectors look for the outer contour. Blur and the tone curve of a camera move every edge towards its dark side,
-# so a contour comes out half a pixel too small: 1 % of a marker of 50 pixels. A pattern has edges with the dark
-# side on the left and on the right, above and below, which tell this shift from the size.
-
-ALONG = (0.25, 0.5, 0.75)
-"""Where an edge of a cell is measured, as shares of its length."""
-STEPS = 21
-"""Samples of a profile from the middle of a light cell to the middle of the dark one beside it."""
-ROUNDS = 4
+AUTO = "auto"
+FAMILIES = MappingProxyType({
+    "apriltag-36h11": "DICT_APRILTAG_36h11", "aruco-6x6": "DICT_6X6_250", "aruco-5x5": "DICT_5X5_250",
+    "aruco-4x4": "DICT_4X4_50", "aruco-7x7": "DICT_7X7_250", "aruco-original": "DICT_ARUCO_ORIGINAL",
+    "apriltag-25h9": "DICT_APRILTAG_25h9", "apriltag-16h5": "DICT_APRILTAG_16h5", "aruco-4x4-1000": "DICT_4X4_1000",
+    "aruco-5x5-1000": "DICT_5X5_1000", "aruco-6x6-1000": "DICT_6X6_1000", "aruco-7x7-1000": "DICT_7X7_1000",
+    "aruco-mip-36h12": "DICT_ARUCO_MIP_36h12",
+})  # fmt: skip
+"""OpenCV's dictionaries, by our names."""
+TRIED = ("apriltag-36h11", "aruco-6x6", "aruco-5x5", "aruco-4x4", "aruco-7x7")
+"""Families that `auto` looks for; families of few bits and many markers are found in brickwork or windows."""
 UNKNOWNS = 9
-"""Eight of a homography, and the shift of all edges towards their dark side."""
-LEAST_SHARE = 0.75
-"""Least share of the pattern's edges that are seen where they should be. Chosen by hand: another marker of the family
-has two thirds of them, its border included."""
-LEAST_CONTRAST = 0.3
-"""Least contrast of an edge that is used, as a share of the median: shadows and glare hide some. Chosen by hand."""
-MAX_RMS_CELLS = 0.25
-"""Largest scatter of the edges about the pattern, in cells. Chosen by hand: noise and blur reach a tenth, another
-pattern a half."""
-LEAST_SIGMA_PX = 0.01
+"""Eight of a homography, and the shift of all edges towards their dark side. By definition."""
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerOptions:
+    """Constants of the fit of patterns to photos."""
+
+    along: tuple[float, ...] = (0.25, 0.5, 0.75)
+    """Positions of the measurements on an edge of a cell, as shares of its length."""
+    steps: int = 21
+    """Samples of a profile from the middle of a light cell to the middle of the dark one beside it."""
+    rounds: int = 4
+    """Iterations of the fit."""
+    min_share: float = 0.75
+    """Least share of the pattern's edges that agree. Chosen by hand: other markers of a family reach two thirds."""
+    min_contrast: float = 0.3
+    """Least contrast of an edge, as a share of the median: shadows and glare hide some. Chosen by hand."""
+    max_rms_cells: float = 0.25
+    """Largest scatter of the edges about the pattern, in cells. Chosen by hand: noise and blur reach a tenth, another
+    pattern a half."""
+    min_sigma_px: float = 0.01
+    """Least standard deviation of a corner, in pixels. Chosen by hand."""
+    edge_bias_px: float = 0.05
+    """Standard deviation of the remaining bias of a side's length: 0.014 to 0.1 for markers of 30 to 45 pixels and blur
+    of 0.5 to 1.5, less for larger ones; on rendered photos, as in the unit tests."""
+    max_shape_error: float = 0.05
+    """Largest distance of a corner from the square, in sides. Chosen by hand: a wrong detection, or one number in two
+    places, is off by a side or more."""
+
+
+OPTIONS = MarkerOptions()
+
+# Corners, to a few hundredths of a pixel by all edges of the pattern.
+#
+# Detectors look for the outer contour. Blur and the camera's tone curve move every edge towards its dark side, so that
+# a contour is half a pixel too small: 1 % of a marker of 50 pixels. A pattern has edges with the dark side on either
+# side and above and below, which separate this shift from the size.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,68 +83,65 @@ class FittedMarker:
 
 
 def fit_pattern(gray: NDArray[np.uint8], pattern: NDArray[np.uint8], corners: FloatArray) -> FittedMarker | None:
-    """Fit the edges of a pattern to a photo, beginning with corners that are exact to a pixel or two.
+    """Fit the edges of a pattern to a photo (H, W), beginning with corners that are exact to a pixel or two.
+
+    Return None if too few edges are visible, or if they belong to another pattern.
 
     Args:
-        gray: (H, W) photo.
-        pattern: (N, N) cells of the marker with its dark border, 0 or 255; what surrounds it is light.
+        pattern: (N, N) cells of the marker with its dark border, 0 or 255; its surroundings are light.
         corners: (4, 2) in pixels, clockwise from the pattern's own top left; pixel centers at +0.5.
-
-    Returns:
-        The corners; None where too few edges are seen, or they are those of another pattern.
     """
     light, dark = edge_sides(pattern)
     middle, cells = (light + dark) / 2, float(len(pattern))
     square = np.array([[0.0, 0.0], [cells, 0.0], [cells, cells], [0.0, cells]])
     H = cv2.getPerspectiveTransform(square.astype(np.float32), corners.astype(np.float32)).astype(np.float64)
     edges, rms = 0, np.inf
-    for _ in range(ROUNDS):
-        seen, contrast = _crossings(gray, _project(H, light), _project(H, dark))
+    for _ in range(OPTIONS.rounds):
+        crossings, contrast = _crossings(gray, _project(H, light), _project(H, dark))
         normals = _normals(H, middle, dark - light)
-        off = np.einsum("ni,ni->n", normals, seen - _project(H, middle))
-        usable = np.isfinite(off) & (contrast > LEAST_CONTRAST * max(float(np.median(contrast)), 1.0))
-        if usable.sum() < LEAST_SHARE * len(middle):
+        residuals = np.einsum("ni,ni->n", normals, crossings - _project(H, middle))
+        usable = np.isfinite(residuals) & (contrast > OPTIONS.min_contrast * max(float(np.median(contrast)), 1.0))
+        if usable.sum() < OPTIONS.min_share * len(middle):
             return None
         J = np.column_stack([_derivatives(H, middle, normals), np.ones(len(middle))])
-        step, edges, rms = _solve_robustly(J[usable], off[usable])
+        step, edges, rms = _solve_robustly(J[usable], residuals[usable])
         H = H + np.append(step[:8], 0.0).reshape(3, 3)
-    found = _project(H, square)
-    if not np.isfinite(found).all():
+    corners = _project(H, square)
+    if not np.isfinite(corners).all():
         return None
-    cell_px = np.sqrt(cv2.contourArea(found.astype(np.float32))) / cells
-    if edges < LEAST_SHARE * len(middle) or rms > MAX_RMS_CELLS * cell_px:
+    cell_px = np.sqrt(cv2.contourArea(corners.astype(np.float32))) / cells
+    if edges < OPTIONS.min_share * len(middle) or rms > OPTIONS.max_rms_cells * cell_px:
         return None
-    # a corner is as sure as the two sides that meet in it, each measured by a share of the edges
-    return FittedMarker(found, max(float(rms * np.sqrt(UNKNOWNS / edges)), LEAST_SIGMA_PX))
+    # a corner has the deviation of its two sides, each measured by a share of the edges
+    return FittedMarker(corners, max(float(rms * np.sqrt(UNKNOWNS / edges)), OPTIONS.min_sigma_px))
 
 
 def edge_sides(pattern: NDArray[np.uint8]) -> tuple[FloatArray, FloatArray]:
-    """Return points (E, 2) in light cells, x and y in cells, and those in the dark ones beside them, across an edge.
+    """Return points (E, 2) in the light and in the dark cells on both sides of each edge, x and y in cells.
 
-    Args:
-        pattern: (N, N) cells of the marker, 0 or 255; what surrounds it is light.
+    The pattern (N, N) has values 0 and 255; its surroundings are light.
     """
     lit = np.pad(pattern > 127, 1, constant_values=True)
     light, dark = [], []
     for row, column in np.argwhere(lit):
         for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-            there = row + down, column + right
-            if min(there) < 0 or max(there) >= len(lit) or lit[there]:
+            neighbor = row + down, column + right
+            if min(neighbor) < 0 or max(neighbor) >= len(lit) or lit[neighbor]:
                 continue
-            for share in ALONG:
+            for share in OPTIONS.along:
                 offset = np.array([0.5, share] if right else [share, 0.5])
-                here = np.array([column - 1.0, row - 1.0]) + offset
-                light.append(here)
-                dark.append(here + np.array([right, down], np.float64))
+                point = np.array([column - 1.0, row - 1.0]) + offset
+                light.append(point)
+                dark.append(point + np.array([right, down], np.float64))
     return np.array(light).reshape(-1, 2), np.array(dark).reshape(-1, 2)
 
 
 def _crossings(gray: NDArray[np.uint8], light: FloatArray, dark: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return where (E, 2) profiles from light to dark pass the middle of their two gray levels, and the contrast (E,).
+    """Return the points (E, 2) where profiles from light to dark cross their middle gray level, and the contrast (E,).
 
-    A profile that does not pass it gives NaN.
+    A profile without a crossing gives NaN.
     """
-    along = np.linspace(0.0, 1.0, STEPS)
+    along = np.linspace(0.0, 1.0, OPTIONS.steps)
     places = (light[:, None] + along[None, :, None] * (dark - light)[:, None]).astype(np.float32) - np.float32(0.5)
     levels = cv2.remap(gray, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     profile = np.asarray(levels, np.float64)
@@ -129,8 +153,8 @@ def _crossings(gray: NDArray[np.uint8], light: FloatArray, dark: FloatArray) -> 
     with np.errstate(divide="ignore", invalid="ignore"):
         share = (high - (profile[:, 0] + profile[:, -1]) / 2) / (high - low)
     share[~below.any(axis=1)] = np.nan
-    place = (after - 1 + share) / (STEPS - 1)
-    return light + place[:, None] * (dark - light), contrast
+    crossing = (after - 1 + share) / (OPTIONS.steps - 1)
+    return light + crossing[:, None] * (dark - light), contrast
 
 
 def _project(H: FloatArray, points: FloatArray) -> FloatArray:
@@ -141,15 +165,15 @@ def _project(H: FloatArray, points: FloatArray) -> FloatArray:
 def _normals(H: FloatArray, middle: FloatArray, across: FloatArray) -> FloatArray:
     """Return unit normals (E, 2) of the edges in the photo, towards their dark side."""
     edge = 0.5 * np.column_stack([-across[:, 1], across[:, 0]])
-    drawn = _project(H, middle + edge) - _project(H, middle - edge)
-    normals = np.column_stack([drawn[:, 1], -drawn[:, 0]])
+    tangents = _project(H, middle + edge) - _project(H, middle - edge)
+    normals = np.column_stack([tangents[:, 1], -tangents[:, 0]])
     towards = _project(H, middle + 0.5 * across) - _project(H, middle)
     normals *= np.sign(np.einsum("ni,ni->n", normals, towards))[:, None]
     return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
 
 
 def _derivatives(H: FloatArray, points: FloatArray, normals: FloatArray) -> FloatArray:
-    """Return derivatives (E, 8) of the projections along the normals, by the entries of H but the last."""
+    """Return derivatives (E, 8) of the projections along the normals by the first eight entries of H."""
     homogeneous = np.column_stack([points, np.ones(len(points))])
     mapped = homogeneous @ H.T
     x = mapped[:, :2] / mapped[:, 2:]
@@ -158,37 +182,24 @@ def _derivatives(H: FloatArray, points: FloatArray, normals: FloatArray) -> Floa
     return np.hstack([normals[:, :1] * rows, normals[:, 1:] * rows, by_last])
 
 
-def _solve_robustly(J: FloatArray, off: FloatArray) -> tuple[FloatArray, int, float]:
-    """Solve J step = off without outliers; return the step, how many edges agree, and their scatter."""
-    kept = np.ones(len(off), bool)
+def _solve_robustly(J: FloatArray, r: FloatArray) -> tuple[FloatArray, int, float]:
+    """Solve J step = r without outliers; return the step, the number of inliers, and their scatter."""
+    inliers = np.ones(len(r), bool)
     units = np.maximum(np.abs(J).max(axis=0), 1e-12)
     for _ in range(3):
-        step = np.linalg.lstsq(J[kept] / units, off[kept], rcond=None)[0] / units
-        left = off - J @ step
-        sigma = MAD_TO_SIGMA * float(np.median(np.abs(left[kept])))
-        kept = np.abs(left) <= max(3.0 * sigma, 1e-3)
-    freedom = max(int(kept.sum()) - UNKNOWNS, 1)
-    return step, int(kept.sum()), float(np.sqrt((left[kept] ** 2).sum() / freedom))
+        step = np.linalg.lstsq(J[inliers] / units, r[inliers], rcond=None)[0] / units
+        errors = r - J @ step
+        sigma = MAD_TO_SIGMA * float(np.median(np.abs(errors[inliers])))
+        inliers = np.abs(errors) <= max(3.0 * sigma, 1e-3)
+    freedom = max(int(inliers.sum()) - UNKNOWNS, 1)
+    return step, int(inliers.sum()), float(np.sqrt((errors[inliers] ** 2).sum() / freedom))
 
 
-# Find printed ArUco and AprilTag markers in photos.
-
-AUTO = "auto"
-FAMILIES = MappingProxyType({
-    "apriltag-36h11": "DICT_APRILTAG_36h11", "aruco-6x6": "DICT_6X6_250", "aruco-5x5": "DICT_5X5_250",
-    "aruco-4x4": "DICT_4X4_50", "aruco-7x7": "DICT_7X7_250", "aruco-original": "DICT_ARUCO_ORIGINAL",
-    "apriltag-25h9": "DICT_APRILTAG_25h9", "apriltag-16h5": "DICT_APRILTAG_16h5", "aruco-4x4-1000": "DICT_4X4_1000",
-    "aruco-5x5-1000": "DICT_5X5_1000", "aruco-6x6-1000": "DICT_6X6_1000", "aruco-7x7-1000": "DICT_7X7_1000",
-    "aruco-mip-36h12": "DICT_ARUCO_MIP_36h12",
-})  # fmt: skip
-"""OpenCV's dictionaries, by our names."""
-TRIED = ("apriltag-36h11", "aruco-6x6", "aruco-5x5", "aruco-4x4", "aruco-7x7")
-"""Families that `auto` looks for. Families of few bits and many markers are left out: they are found in brickwork,
-and aruco-original in windows."""
+# Detection.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SeenMarker:
+class DetectedMarker:
     """A marker in one photo."""
 
     family: str
@@ -199,12 +210,12 @@ class SeenMarker:
 
     @property
     def name(self) -> str:
-        """What the marker is called in messages."""
+        """Name of the marker in messages."""
         return f"{self.family} {self.number}"
 
 
-def find_markers_in_file(photo_dir: Path, family: str, name: str) -> list[SeenMarker]:
-    """Return the markers in a photo; none where the photo cannot be read."""
+def find_markers_in_file(photo_dir: Path, family: str, name: str) -> list[DetectedMarker]:
+    """Return the markers of a family, or of `AUTO`, in a photo; none if it cannot be read."""
     try:
         with Image.open(photo_dir / name) as image:
             gray = np.asarray(image.convert("L"))
@@ -213,15 +224,11 @@ def find_markers_in_file(photo_dir: Path, family: str, name: str) -> list[SeenMa
     return find_markers(gray, TRIED if family == AUTO else (family,))
 
 
-def find_markers(gray: NDArray[np.uint8], families: Sequence[str]) -> list[SeenMarker]:
-    """Return the markers of some families in a photo, each with corners from all edges of its pattern.
-
-    Args:
-        gray: (H, W) photo.
-    """
+def find_markers(gray: NDArray[np.uint8], families: Sequence[str]) -> list[DetectedMarker]:
+    """Return the markers of some families in a photo (H, W), with corners from all edges of their patterns."""
     options = cv2.aruco.DetectorParameters()
     options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    found: list[SeenMarker] = []
+    markers: list[DetectedMarker] = []
     for family in families:
         dictionary = load_dictionary(family)
         corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary, options).detectMarkers(gray)
@@ -229,8 +236,8 @@ def find_markers(gray: NDArray[np.uint8], families: Sequence[str]) -> list[SeenM
             pattern = draw_pattern(family, int(number))
             fitted = fit_pattern(gray, pattern, np.asarray(outline, np.float64).reshape(4, 2) + 0.5)
             if fitted is not None:
-                found.append(SeenMarker(family, int(number), fitted.corners, fitted.sigma_px))
-    return found
+                markers.append(DetectedMarker(family, int(number), fitted.corners, fitted.sigma_px))
+    return markers
 
 
 def load_dictionary(family: str) -> cv2.aruco.Dictionary:
@@ -245,37 +252,45 @@ def draw_pattern(family: str, number: int) -> NDArray[np.uint8]:
 
 
 def marker_count(family: str) -> int:
-    """Return how many markers a family has."""
+    """Return the number of markers in a family."""
     return len(load_dictionary(family).bytesList)
 
 
-# Draw a page of markers to print.
+# Pages to print.
 
 PAGES_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
 """Width and height of a sheet of paper, by its name."""
-MARGIN_MM, LABEL_MM, RULER_MM = 10.0, 6.0, 100.0
-MOST_PER_PAGE = 12
 
-SUFFIXES = (".pdf", ".svg")
-MM_PER_INCH = 25.4
+
+@dataclass(frozen=True, slots=True)
+class PageOptions:
+    """Layout of a page of markers."""
+
+    margin_mm: float = 10.0
+    label_mm: float = 6.0
+    """Height of the line of text below a marker."""
+    ruler_mm: float = 100.0
+    """Length of the ruler to check the printer by."""
+    max_markers: int = 12
+
+
+PAGE = PageOptions()
 
 
 def write_marker_page(
     path: Path, side_m: float, family: str = "apriltag-36h11", first: int = 0, paper: str = "a4"
 ) -> int:
-    """Write a page of markers to print, true to scale, with a ruler to check the printer by.
+    """Write a page of markers to a PDF or SVG file, true to scale, and return their number.
 
     Args:
         side_m: side of the dark square of each marker, in meters.
-
-    Returns:
-        how many markers are on it.
+        first: number of the first marker in its family.
 
     Raises:
         ConfigError: no marker of that size fits on the page, or a name is unknown.
         InputError: the file cannot be written.
     """
-    if path.suffix.lower() not in SUFFIXES:
+    if path.suffix.lower() not in (".pdf", ".svg"):
         raise ConfigError(f"a page of markers is a PDF or SVG file, not {path.name}", hint="write -o markers.pdf")
     if family not in FAMILIES or paper not in PAGES_MM:
         raise ConfigError(
@@ -283,7 +298,7 @@ def write_marker_page(
             hint=f"known: {', '.join(FAMILIES if family not in FAMILIES else PAGES_MM)}",
         )
     places = marker_places(side_m, len(draw_pattern(family, 0)), paper)
-    places = places[: max(min(MOST_PER_PAGE, marker_count(family) - first), 0)]
+    places = places[: max(min(PAGE.max_markers, marker_count(family) - first), 0)]
     if not places:
         size = format_length(side_m)
         raise ConfigError(
@@ -299,18 +314,14 @@ def write_marker_page(
 
 
 def marker_places(side_m: float, cells: int, paper: str) -> list[tuple[float, float]]:
-    """Return the lower left corners in millimeters of as many markers as fit on a page, with a light cell around each.
-
-    Args:
-        side_m: side of a marker, in meters.
-    """
-    width, height = PAGES_MM[paper]
+    """Return the lower left corners, in mm, of as many markers as fit on a page, with a light cell around each."""
+    (width, height), margin, label = PAGES_MM[paper], PAGE.margin_mm, PAGE.label_mm
     side = side_m * 1000.0
     step = side * (1.0 + 2.0 / cells)
-    across = int((width - 2 * MARGIN_MM) / step)
-    down = int((height - 3 * MARGIN_MM - LABEL_MM) / (step + LABEL_MM))
+    across = int((width - 2 * margin) / step)
+    down = int((height - 3 * margin - label) / (step + label))
     left = (width - across * step) / 2 + side / cells
-    tops = [height - MARGIN_MM - row * (step + LABEL_MM) - step + side / cells for row in range(down)]
+    tops = [height - margin - row * (step + label) - step + side / cells for row in range(down)]
     return [(left + column * step, top) for top in tops for column in range(across)]
 
 
@@ -320,8 +331,8 @@ def _draw(places: list[tuple[float, float]], side: float, family: str, first: in
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
-    width, height = PAGES_MM[paper]
-    figure = Figure(figsize=(width / MM_PER_INCH, height / MM_PER_INCH))
+    (width, height), margin, ruler = PAGES_MM[paper], PAGE.margin_mm, PAGE.ruler_mm
+    figure = Figure(figsize=(width / 25.4, height / 25.4))
     (FigureCanvasPdf if suffix == "pdf" else FigureCanvasSVG)(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0, width), ylim=(0, height), aspect="equal")
@@ -331,33 +342,31 @@ def _draw(places: list[tuple[float, float]], side: float, family: str, first: in
         axes.fill(*_dark_bars(pattern, x, y, side), color="black", linewidth=0)
         label = f"{family} {number}, side {format_length(side / 1000.0)}"
         axes.text(x, y - side / len(pattern) - 1.0, label, fontsize=7, va="top")
-    axes.plot([MARGIN_MM, MARGIN_MM + RULER_MM], [MARGIN_MM] * 2, color="black", linewidth=0.5)
-    for tick in range(0, int(RULER_MM) + 1, 10):
-        axes.plot([MARGIN_MM + tick] * 2, [MARGIN_MM, MARGIN_MM + 2.0], color="black", linewidth=0.5)
-    note = (
-        f"Print at 100 %. This ruler has {RULER_MM:.0f} mm: measure it, and the dark squares. Glue them to stiff card."
-    )
-    axes.text(MARGIN_MM, MARGIN_MM + 3.0, note, fontsize=7)
+    axes.plot([margin, margin + ruler], [margin] * 2, color="black", linewidth=0.5)
+    for tick in range(0, int(ruler) + 1, 10):
+        axes.plot([margin + tick] * 2, [margin, margin + 2.0], color="black", linewidth=0.5)
+    note = f"Print at 100 %. This ruler has {ruler:.0f} mm: measure it, and the dark squares. Glue them to stiff card."
+    axes.text(margin, margin + 3.0, note, fontsize=7)
     file = io.BytesIO()
     undated = {"CreationDate": None} if suffix == "pdf" else {"Date": None}
-    with rc_context({"svg.hashsalt": family}):  # else names in it are random
+    with rc_context({"svg.hashsalt": family}):  # random names otherwise
         figure.savefig(file, format=suffix, metadata=undated)
     return file.getvalue()
 
 
 def _dark_bars(pattern: NDArray[np.uint8], x: float, y: float, side: float) -> list[FloatArray]:
-    """Return x and y of the dark bars of a marker, in turn, as `Axes.fill` takes them.
+    """Return x and y of the dark bars of a marker, alternating, for `Axes.fill`.
 
-    Bars along rows and along columns cover the seams of each other, which viewers would show as light lines.
+    Bars along rows and along columns cover each other's seams, which viewers would show as light lines.
     """
     cells = len(pattern)
     bars = [(row, row + 1, *bar) for row in range(cells) for bar in _runs(pattern[row] < 128)]
     bars += [(*bar, column, column + 1) for column in range(cells) for bar in _runs(pattern[:, column] < 128)]
-    drawn: list[FloatArray] = []
+    outlines: list[FloatArray] = []
     for top, bottom, left, right in bars:
-        drawn.append(x + side / cells * np.array([left, right, right, left], np.float64))
-        drawn.append(y + side / cells * (cells - np.array([top, top, bottom, bottom], np.float64)))
-    return drawn
+        outlines.append(x + side / cells * np.array([left, right, right, left], np.float64))
+        outlines.append(y + side / cells * (cells - np.array([top, top, bottom, bottom], np.float64)))
+    return outlines
 
 
 def _runs(dark: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -370,47 +379,35 @@ def _runs(dark: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 """Corners of a marker of side 1 about its middle, clockwise from its own top left."""
-EDGE_BIAS_PX = 0.05
-"""Standard deviation in pixels of what edges leave of a side's length: 0.014 to 0.1 pixels for markers of 30 to 45
-pixels and blur of 0.5 to 1.5, less for larger ones (`tests/unit/scale/test_marker_edges.py`)."""
-MAX_SHAPE_ERROR = 0.05
-"""Largest distance of a corner from the square, in sides, that is still a marker. Chosen by hand: a wrong detection, or
-one number in two places, is off by a side or more."""
-
-
-@dataclass(frozen=True, slots=True)
-class MarkerScales:
-    """What the markers of a set tell."""
-
-    evidence: tuple[ScaleEvidence, ...]
-    not_used: Mapping[str, str]
-    """Markers that tell nothing, by name, with the reason."""
 
 
 def marker_scales(
-    seen: Mapping[str, Sequence[SeenMarker]], rays: Mapping[str, Sequence[Sequence[Sight]]], side_m: float
-) -> MarkerScales:
-    """Return the scale of a model by each marker.
+    markers: Mapping[str, Sequence[DetectedMarker]], rays: Mapping[str, Sequence[Sequence[Sight]]], side_m: float
+) -> tuple[list[ScaleEvidence], dict[str, str]]:
+    """Return the scale by each marker, and the reason for each unusable marker by name.
 
     Args:
+        markers: by photo.
+        rays: by photo, for each of its markers, the rays of the four corners.
         side_m: side of each marker's dark square, in meters.
     """
     sights: dict[str, list[Sequence[Sight]]] = defaultdict(list)
     sizes: dict[str, list[float]] = defaultdict(list)
-    for photo, markers in seen.items():
-        names = [marker.name for marker in markers]
-        for marker, corners in zip(markers, rays[photo], strict=True):
-            if names.count(marker.name) == 1:  # two of one number in a photo: which is which is unknown
+    for photo, detected in markers.items():
+        names = [marker.name for marker in detected]
+        for marker, corners in zip(detected, rays[photo], strict=True):
+            if names.count(marker.name) == 1:  # two of one number in a photo are ambiguous
                 sights[marker.name].append(corners)
                 sizes[marker.name].append(side_px(marker.corners))
-    evidence, not_used = [], {}
+    evidence: list[ScaleEvidence] = []
+    unusable: dict[str, str] = {}
     for name in sorted(sights):
-        found = _measure_marker(name, sights[name], float(np.median(sizes[name])), side_m)
-        if isinstance(found, str):
-            not_used[name] = found
+        scale = _measure_marker(name, sights[name], float(np.median(sizes[name])), side_m)
+        if isinstance(scale, str):
+            unusable[name] = scale
         else:
-            evidence.append(found)
-    return MarkerScales(tuple(evidence), not_used)
+            evidence.append(scale)
+    return evidence, unusable
 
 
 def side_px(corners: FloatArray) -> float:
@@ -419,7 +416,7 @@ def side_px(corners: FloatArray) -> float:
 
 
 def _measure_marker(name: str, sights: Sequence[Sequence[Sight]], size_px: float, side_m: float) -> ScaleEvidence | str:
-    """Return the scale by one marker that several photos show, or why it tells none."""
+    """Return the scale by one marker in several photos, or the reason why it gives none."""
     corners: list[SightedPoint] = []
     for k in range(4):
         point = locate_point([photo[k] for photo in sights])
@@ -428,11 +425,11 @@ def _measure_marker(name: str, sights: Sequence[Sequence[Sight]], size_px: float
         corners.append(point)
     places = np.array([corner.place for corner in corners])
     fit = umeyama(SQUARE, places)
-    off = np.linalg.norm(fit(SQUARE) - places, axis=1).max() / fit.scale
-    if off > MAX_SHAPE_ERROR:
-        return f"it is no square in the model: a corner is off by {100 * off:.0f} % of its side; one number twice?"
+    error = np.linalg.norm(fit(SQUARE) - places, axis=1).max() / fit.scale
+    if error > OPTIONS.max_shape_error:
+        return f"it is no square in the model: a corner is off by {100 * error:.0f} % of its side; one number twice?"
     # the side is linear in the corners: s = sum a'R'b / sum a'a
     arms = SQUARE @ fit.R.T / (SQUARE**2).sum()
     variance = sum(arm @ corner.covariance @ arm for arm, corner in zip(arms, corners, strict=True))
-    deviation = float(np.hypot(np.sqrt(variance) / fit.scale, EDGE_BIAS_PX / size_px))
+    deviation = float(np.hypot(np.sqrt(variance) / fit.scale, OPTIONS.edge_bias_px / size_px))
     return ScaleEvidence(f"marker {name}", side_m / fit.scale, deviation, min(len(one.photos) for one in corners))

@@ -1,7 +1,7 @@
 """The size of a model: known lengths as evidence, and the frame of exported files."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,25 +10,24 @@ from sfm_app.geometry.poses import Similarity
 from sfm_app.types import Frustum, Model
 from sfm_app.wording import format_length
 
-# What tells how large a model is, how far it can be trusted, and whether its parts agree.
-
 GPS = "GPS of the photos"
 CONTRADICTION = 4.0
-"""Standard deviations by which two that agree may differ. Chosen by hand: one pair of 16 000 differs by more."""
+"""Largest difference of two agreeing scales, in standard deviations. Chosen by hand: one pair of 16 000 has more."""
+IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True)
 class ScaleEvidence:
-    """One thing of known size in a model."""
+    """The scale by one object of known size."""
 
     name: str
-    """For people, such as "marker aruco-4x4 3"."""
+    """Name of the object for people, such as "marker aruco-4x4 3"."""
     scale: float
     """Meters per unit of the model, > 0."""
     deviation: float
-    """Its standard deviation, relative, > 0."""
+    """Relative standard deviation, > 0."""
     photos: int = 0
-    """That show it."""
+    """Number of photos that show the object."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,37 +36,36 @@ class AgreedScale:
 
     scale: float
     deviation: float
-    """Relative standard deviation; covers the contradiction where two pieces of evidence are left that differ."""
+    """Relative standard deviation; covers half of the difference of two contradicting scales."""
     used: tuple[ScaleEvidence, ...]
     contradictions: tuple[str, ...]
 
 
 def agree(evidence: Sequence[ScaleEvidence], shape: float = 0.0) -> AgreedScale:
-    """Weigh evidence of a scale, without what contradicts the rest.
+    """Return the weighted mean of at least one scale, without scales that contradict the others.
 
-    What is farthest from the weighted mean of the others is left out as long as it differs by more than
-    `CONTRADICTION` of its standard deviations and two others remain. Two alone that differ are both named, the more
-    exact one is taken, and the deviation covers half of the difference.
+    The scale farthest from the mean of the others is dropped while it differs by more than `CONTRADICTION` and two
+    others remain. Of two contradicting scales, the more exact one counts, and the deviation covers half of the
+    difference.
 
     Args:
-        shape: relative deviation of the model's own shape: by it, two places may differ, and more evidence does not
-            make it smaller.
+        shape: relative deviation of the model's proportions, which more evidence does not reduce.
     """
-    used, named = list(evidence), []
+    used, contradictions = list(evidence), []
     while len(used) > 2:
-        off = [_difference(one, _mean([other for other in used if other is not one]), shape) for one in used]
-        worst = int(np.argmax(off))
-        if off[worst] <= CONTRADICTION:
+        differences = [_difference(one, _mean([other for other in used if other is not one]), shape) for one in used]
+        worst = int(np.argmax(differences))
+        if differences[worst] <= CONTRADICTION:
             break
-        left_out = used.pop(worst)
-        named.append(_contradiction(left_out, _mean(used), f"the {len(used)} others"))
+        outlier = used.pop(worst)
+        contradictions.append(_contradiction(outlier, _mean(used), f"the {len(used)} others"))
     mean = _mean(used)
     if len(used) == 2 and _difference(used[0], used[1], shape) > CONTRADICTION:
         best, other = sorted(used, key=lambda one: one.deviation)
-        named.append(_contradiction(other, best, best.name))
+        contradictions.append(_contradiction(other, best, best.name))
         half = abs(np.log(other.scale / best.scale)) / 2
         mean, used = replace(best, deviation=max(best.deviation, float(half))), [best]
-    return AgreedScale(mean.scale, float(np.hypot(mean.deviation, shape)), tuple(used), tuple(named))
+    return AgreedScale(mean.scale, float(np.hypot(mean.deviation, shape)), tuple(used), tuple(contradictions))
 
 
 def _mean(evidence: Sequence[ScaleEvidence]) -> ScaleEvidence:
@@ -81,7 +79,7 @@ def _mean(evidence: Sequence[ScaleEvidence]) -> ScaleEvidence:
 
 
 def _difference(one: ScaleEvidence, other: ScaleEvidence, shape: float) -> float:
-    """Return how many standard deviations two scales differ by."""
+    """Return the difference of two scales in standard deviations."""
     expected = np.linalg.norm([one.deviation, other.deviation, shape])
     return abs(float(np.log(one.scale / other.scale))) / float(expected)
 
@@ -94,18 +92,8 @@ def _contradiction(one: ScaleEvidence, against: ScaleEvidence, name: str) -> str
 
 
 def deviation_text(scale: float, deviation: float) -> str:
-    """Return a scale and its deviation for people.
-
-    Args:
-        scale: meters per unit of the model.
-        deviation: relative.
-    """
+    """Return a scale in meters per unit of the model, and its relative deviation, for people."""
     return f"a unit of the model is {format_length(scale)} +- {100 * deviation:.2g} %"
-
-
-# The frame of everything that leaves the program, and how well its unit is known.
-
-IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,12 +102,12 @@ class MetricFrame:
 
     from_model: Similarity = IDENTITY
     deviation: float | None = None
-    """Relative standard deviation of the unit, which is the meter; None where the unit is arbitrary."""
+    """Relative standard deviation of the unit, the meter; None if the unit is arbitrary."""
     source: str = ""
-    """What tells the size, for people; empty where nothing does."""
+    """Names of the evidence in use, for people; empty without any."""
     evidence: tuple[ScaleEvidence, ...] = ()
     contradictions: tuple[str, ...] = ()
-    """What was left out because it contradicts the rest."""
+    """Evidence that contradicts the rest, one sentence each."""
     crs: str = ""
     """Coordinate system of ground control points; empty without any."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -132,7 +120,7 @@ class MetricFrame:
 
     @property
     def changes(self) -> bool:
-        """Whether anything has another place than in OUT/sparse."""
+        """Whether exported files differ in frame from OUT/sparse."""
         return self.from_model is not IDENTITY
 
     def to_dict(self) -> dict[str, Any]:
@@ -145,10 +133,7 @@ class MetricFrame:
             "unit": "meter" if self.is_metric else "arbitrary",
             "deviation": self.deviation,
             "source": self.source,
-            "evidence": [
-                {"name": one.name, "scale": one.scale, "deviation": one.deviation, "photos": one.photos}
-                for one in self.evidence
-            ],
+            "evidence": [asdict(one) for one in self.evidence],
             "contradictions": list(self.contradictions),
             "crs": self.crs,
             "offset": list(self.offset),
@@ -156,13 +141,13 @@ class MetricFrame:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "MetricFrame":
-        """Read what `to_dict` gives."""
+        """Read the values of `to_dict`."""
         R, t = np.array(values["R"], np.float64), np.array(values["t"], np.float64)
         similarity = Similarity(float(values["scale"]), R, t)
-        still = similarity.scale == 1.0 and (np.eye(3) == R).all() and not t.any()
+        unchanged = similarity.scale == 1.0 and (np.eye(3) == R).all() and not t.any()
         east, north, up = map(float, values["offset"])
         return cls(
-            IDENTITY if still else similarity,
+            IDENTITY if unchanged else similarity,
             values["deviation"],
             values["source"],
             tuple(ScaleEvidence(**one) for one in values["evidence"]),
@@ -173,13 +158,13 @@ class MetricFrame:
 
 
 def move_model(model: Model, similarity: Similarity) -> Model:
-    """Return a surface or points with their cameras in another frame."""
+    """Return a surface or points with their cameras in the similarity's target frame."""
     surface = replace(model.surface, vertices=similarity(model.surface.vertices))
     return replace(model, surface=surface, cameras=tuple(_move_camera(one, similarity) for one in model.cameras))
 
 
 def _move_camera(camera: Frustum, similarity: Similarity) -> Frustum:
-    """Return a camera in another frame: lengths in its own frame grow, too, and rays stay what they are."""
+    """Return a camera in the target frame: lengths in the camera's frame scale, too, and rays stay."""
     R = camera.cam_from_world[:, :3] @ similarity.R.T
     t = similarity.scale * camera.cam_from_world[:, 3] - R @ similarity.t
     return replace(camera, cam_from_world=np.column_stack([R, t]))

@@ -10,25 +10,37 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.backend import Reconstruction, translate_errors
 from sfm_app.colmap.model import focal_px, posed_images, seen_points, viewing_rays
-from sfm_app.colmap.types import Reconstruction
 from sfm_app.types import Photo
 from sfm_app.types.arrays import FloatArray
 
-# Points that were marked in several photos, placed where their viewing rays meet.
 
-MAX_RESIDUAL_PX = 6.0
-"""Largest distance in pixels at which a photo agrees with a point: people mark to one or two pixels, and a marker that
-is seen obliquely is found to one. Chosen by hand; a wrong mark is off by tens."""
-LEAST_ANGLE_DEG = 1.0
-"""Least angle between two rays that place a point. Chosen by hand: its depth is then sixty times less sure than its
-direction."""
-LEAST_SIGMA_PX = 0.1
-"""Least standard deviation of a mark, in pixels: two photos agree by chance."""
-MAX_STARTS = 300
-"""Most pairs of rays that are tried."""
-ROUNDS = 6
+@dataclass(frozen=True, slots=True)
+class SightOptions:
+    """Constants of points in the model, by their marks in photos."""
+
+    max_residual_px: float = 6.0
+    """Largest residual of an inlier: people mark to one or two pixels, a marker that is seen obliquely is found to
+    one. Chosen by hand; a wrong mark is off by tens."""
+    min_angle_deg: float = 1.0
+    """Least angle between two rays that place a point. Chosen by hand: its depth is then sixty times less sure than its
+    direction."""
+    min_sigma_px: float = 0.1
+    """Least standard deviation of a mark: two photos agree by chance. Chosen by hand."""
+    max_pairs: int = 300
+    """Largest number of samples of two rays."""
+    rounds: int = 6
+    """Iterations of the weights."""
+    neighbors: int = 12
+    """Nearest points of the sparse model whose photos are taken to see a place. Chosen by hand."""
+    min_picked_sigma_px: float = 0.5
+    """Least standard deviation of a place picked on a surface. Chosen by hand."""
+    max_points: int = 200_000
+    """Largest number of points of a model among which the nearest to a place are sought."""
+
+
+OPTIONS = SightOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +53,12 @@ class Sight:
     ray: FloatArray
     """(3,) unit vector towards the point."""
     focal_px: float
-    """Pixels per radian there, about."""
+    """Approximate pixels per radian at the mark."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SightedPoint:
-    """A point in the model, and how well the photos determine it."""
+    """A point in the model by its marks in photos."""
 
     place: FloatArray
     """(3,)."""
@@ -60,38 +72,40 @@ class SightedPoint:
 
 
 def locate_point(sights: Sequence[Sight]) -> SightedPoint | str:
-    """Place a point where most of its rays meet, by least squares of the distances in pixels; else say why not."""
+    """Place a point by its sights, one per photo: least squares of the residuals in pixels, without outliers.
+
+    Return the reason if they do not determine it.
+    """
     if len(sights) < 2:
         return "it is marked in one photo with a pose, two are needed" if sights else "no photo with it has a pose"
     centers, rays = np.array([one.center for one in sights]), np.array([one.ray for one in sights])
     focals = np.array([one.focal_px for one in sights])
-    agreeing = _best_agreement(centers, rays, focals)
-    if agreeing is None:
+    inliers = _inliers_of_pairs(centers, rays, focals)
+    if inliers is None:
         return "its rays do not meet: they are almost parallel, or the marks contradict each other"
     for _ in range(3):
-        place = _meet(centers[agreeing], rays[agreeing], focals[agreeing])
-        after = _residuals_px(place, centers, rays, focals) < MAX_RESIDUAL_PX
-        if after.sum() < 2 or (after == agreeing).all():
+        place = _intersect(centers[inliers], rays[inliers], focals[inliers])
+        refitted = _residuals_px(place, centers, rays, focals) < OPTIONS.max_residual_px
+        if refitted.sum() < 2 or (refitted == inliers).all():
             break
-        agreeing = after
-    residuals = _residuals_px(place, centers, rays, focals)[agreeing]
+        inliers = refitted
+    residuals = _residuals_px(place, centers, rays, focals)[inliers]
     freedom = max(2 * len(residuals) - 3, 1)
-    sigma = max(float(np.sqrt((residuals**2).sum() / freedom)), LEAST_SIGMA_PX)
-    information = ray_information(place, centers[agreeing], rays[agreeing], focals[agreeing])
+    sigma = max(float(np.sqrt((residuals**2).sum() / freedom)), OPTIONS.min_sigma_px)
+    information = ray_information(place, centers[inliers], rays[inliers], focals[inliers])
     return SightedPoint(
         place,
         np.asarray(sigma**2 * np.linalg.inv(information), np.float64),
         float(np.sqrt(np.mean(residuals**2))),
-        tuple(one.photo for one, kept in zip(sights, agreeing, strict=True) if kept),
-        tuple(one.photo for one, kept in zip(sights, agreeing, strict=True) if not kept),
+        tuple(one.photo for one, inlier in zip(sights, inliers, strict=True) if inlier),
+        tuple(one.photo for one, inlier in zip(sights, inliers, strict=True) if not inlier),
     )
 
 
 def ray_information(place: FloatArray, centers: FloatArray, rays: FloatArray, focals: FloatArray) -> FloatArray:
-    """Return what rays tell of a point: the inverse of its covariance (3, 3) for marks that are exact to one pixel.
+    """Return the information matrix (3, 3) of a point (3,) for marks with a standard deviation of one pixel.
 
     Args:
-        place: (3,) the point.
         centers: (N, 3) of the cameras.
         rays: (N, 3) unit vectors.
         focals: (N,) pixels per radian.
@@ -101,29 +115,29 @@ def ray_information(place: FloatArray, centers: FloatArray, rays: FloatArray, fo
     return np.asarray((weights[:, None, None] * across).sum(axis=0))
 
 
-def _best_agreement(centers: FloatArray, rays: FloatArray, focals: FloatArray) -> NDArray[np.bool_] | None:
-    """Return the photos that agree with the best pair of rays; None where no pair meets in front of its cameras."""
+def _inliers_of_pairs(centers: FloatArray, rays: FloatArray, focals: FloatArray) -> NDArray[np.bool_] | None:
+    """Return the inliers (N,) of the best pair of rays; None if no pair meets in front of its cameras."""
     pairs = np.array(list(combinations(range(len(rays)), 2)), np.intp)
-    if len(pairs) > MAX_STARTS:
-        pairs = np.random.default_rng(0).permutation(pairs)[:MAX_STARTS]
+    if len(pairs) > OPTIONS.max_pairs:
+        pairs = np.random.default_rng(0).permutation(pairs)[: OPTIONS.max_pairs]
     best, least = None, np.inf
     for pair in pairs:
-        if np.linalg.norm(np.cross(*rays[pair])) < np.sin(np.radians(LEAST_ANGLE_DEG)):
+        if np.linalg.norm(np.cross(*rays[pair])) < np.sin(np.radians(OPTIONS.min_angle_deg)):
             continue
-        place = _meet(centers[pair], rays[pair], focals[pair])
-        distances = _residuals_px(place, centers, rays, focals)
-        cost = float((np.minimum(distances, MAX_RESIDUAL_PX) ** 2).sum())
-        agreeing = distances < MAX_RESIDUAL_PX
-        if cost < least and agreeing.sum() >= 2:
-            best, least = agreeing, cost
+        place = _intersect(centers[pair], rays[pair], focals[pair])
+        residuals = _residuals_px(place, centers, rays, focals)
+        cost = float((np.minimum(residuals, OPTIONS.max_residual_px) ** 2).sum())
+        inliers = residuals < OPTIONS.max_residual_px
+        if cost < least and inliers.sum() >= 2:
+            best, least = inliers, cost
     return best
 
 
-def _meet(centers: FloatArray, rays: FloatArray, focals: FloatArray) -> FloatArray:
-    """Return the point (3,) next to all rays: least squares, each weighted by its pixels per unit of length there."""
+def _intersect(centers: FloatArray, rays: FloatArray, focals: FloatArray) -> FloatArray:
+    """Return the point (3,) nearest to all rays: least squares, weighted by pixels per unit of length at the point."""
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     weights = np.ones(len(rays))
-    for _ in range(ROUNDS):
+    for _ in range(OPTIONS.rounds):
         A = (weights[:, None, None] * across).sum(axis=0)
         b = np.einsum("n,nij,nj->i", weights, across, centers)
         place = np.linalg.lstsq(A, b, rcond=None)[0]
@@ -133,7 +147,7 @@ def _meet(centers: FloatArray, rays: FloatArray, focals: FloatArray) -> FloatArr
 
 
 def _residuals_px(place: FloatArray, centers: FloatArray, rays: FloatArray, focals: FloatArray) -> FloatArray:
-    """Return (N,) angles between the rays and the point, in pixels."""
+    """Return the angles (N,) between the rays and the point, in pixels."""
     towards = place - centers
     along = np.einsum("ni,ni->n", towards, rays)
     across = np.linalg.norm(np.cross(towards, rays), axis=1)
@@ -141,11 +155,6 @@ def _residuals_px(place: FloatArray, centers: FloatArray, rays: FloatArray, foca
 
 
 # Distances in a finished model, with deviations.
-
-NEIGHBORS = 12
-"""Points of the sparse model next to a place whose photos are taken for those that show it. Chosen by hand."""
-LEAST_PICKED_SIGMA_PX = 0.5
-"""Least standard deviation of a place picked on a surface, in pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +164,7 @@ class Distance:
     value: float
     """In the unit of the exported files."""
     deviation: float
-    """Standard deviation, in the same unit; without that of the unit where it is arbitrary."""
+    """Standard deviation in the same unit; excludes the deviation of an arbitrary unit."""
     metric: bool
     """Whether the unit is the meter."""
 
@@ -166,7 +175,7 @@ class Distance:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sightlines:
-    """The cameras of a model, and which of them see which points."""
+    """The cameras of a model and the points they see."""
 
     centers: FloatArray
     """(C, 3)."""
@@ -175,62 +184,51 @@ class Sightlines:
     points: FloatArray
     """(P, 3)."""
     seen_by: tuple[NDArray[np.int64], ...]
-    """For each point, the rows of the cameras that see it."""
+    """For each point, the indices of the cameras that see it."""
     residual_px: float
     """Mean reprojection error."""
 
 
 def place_covariance(place: FloatArray, model: Sightlines) -> FloatArray:
-    """Return the covariance (3, 3) of a place on the surface, as the photos that see it determine it.
-
-    Args:
-        place: (3,) in the frame of the model.
-    """
-    near = np.argsort(np.linalg.norm(model.points - place, axis=1))[:NEIGHBORS]
+    """Return the covariance (3, 3) of a place (3,) on the surface from the photos that see it."""
+    near = np.argsort(np.linalg.norm(model.points - place, axis=1))[: OPTIONS.neighbors]
     counts = np.bincount(np.concatenate([model.seen_by[k] for k in near]), minlength=len(model.centers))
-    # as many photos as see one of the points, those that see most of them
+    # as many photos as see a typical neighbor: those that see most neighbors
     typical = max(int(np.median([len(model.seen_by[k]) for k in near])), 2)
     seeing = np.argsort(-counts, kind="stable")[:typical]
     towards = place - model.centers[seeing]
     rays = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-300)
     information = ray_information(place, model.centers[seeing], rays, model.focals[seeing])
-    return np.asarray(max(model.residual_px, LEAST_PICKED_SIGMA_PX) ** 2 * np.linalg.pinv(information))
+    return np.asarray(max(model.residual_px, OPTIONS.min_picked_sigma_px) ** 2 * np.linalg.pinv(information))
 
 
 def measure_distance(
     a: FloatArray, b: FloatArray, model: Sightlines, scale: float, deviation: float | None
 ) -> Distance:
-    """Return the distance between two places.
+    """Return the distance between two places (3,) in the frame of the model.
 
     Args:
-        a, b: (3,) in the frame of the model.
-        deviation: relative, of the scale; None where the unit is arbitrary.
+        scale: units of exported files per unit of the model.
+        deviation: relative, of the scale; None if the unit is arbitrary.
 
     Raises:
         ValueError: both places are the same.
     """
-    apart = float(np.linalg.norm(b - a))
-    if apart == 0:
+    length = float(np.linalg.norm(b - a))
+    if length == 0:
         raise ValueError("both places are the same")
-    along = (b - a) / apart
-    variance = along @ (place_covariance(a, model) + place_covariance(b, model)) @ along
-    value = scale * apart
+    direction = (b - a) / length
+    variance = direction @ (place_covariance(a, model) + place_covariance(b, model)) @ direction
+    value = scale * length
     spread = np.hypot(scale * np.sqrt(max(float(variance), 0.0)), value * (deviation or 0.0))
     return Distance(value, float(spread), deviation is not None)
 
 
-# Viewing rays of marks in photos, and what the photos of a model see.
-
-MOST_POINTS = 200_000
-"""Most points of a model among which the nearest to a place are sought."""
+# Photos.
 
 
 class PosedPhotos:
-    """The photos of a model on disk that have a pose.
-
-    Raises:
-        BackendError: it cannot be read.
-    """
+    """The posed photos of a COLMAP model on disk; raises a BackendError if the model cannot be read."""
 
     def __init__(self, model_dir: Path) -> None:
         with translate_errors("reading the sparse model"):
@@ -247,13 +245,9 @@ class PosedPhotos:
         return photo in self._ids
 
     def sights(self, photo: str, pixels: FloatArray) -> list[Sight]:
-        """Return the viewing rays of pixels.
-
-        Args:
-            pixels: (N, 2) as it is laid out; pixel centers at +0.5.
-        """
+        """Return the viewing rays of pixels (N, 2) of a laid-out photo, pixel centers at +0.5."""
         number = self._ids[photo]
-        with translate_errors("looking along the pixels of a photo"):
+        with translate_errors("computing viewing rays"):
             rays = viewing_rays(self._model, number, pixels)
             focal = focal_px(self._model, number)
             center = np.asarray(self._model.images[number].projection_center(), np.float64)
@@ -261,22 +255,22 @@ class PosedPhotos:
         return [Sight(photo, center, ray, focal) for ray in rays]
 
     def sightlines(self) -> Sightlines:
-        """Return the cameras, and which of them see which points."""
+        """Return the cameras and the points they see."""
         with translate_errors("reading the sparse model"):
-            found = seen_points(self._model, MOST_POINTS)
+            visible = seen_points(self._model, OPTIONS.max_points)
             ids = list(self._ids.values())
             centers = np.array([self._model.images[number].projection_center() for number in ids], np.float64)
             focals = np.array([focal_px(self._model, number) for number in ids])
             residual = float(self._model.compute_mean_reprojection_error())
-        cameras = np.concatenate([np.full(len(rows), k, np.int64) for k, rows in enumerate(found.seen)])
-        rows = np.concatenate(found.seen)
+        cameras = np.concatenate([np.full(len(rows), k, np.int64) for k, rows in enumerate(visible.seen)])
+        rows = np.concatenate(visible.seen)
         order = np.argsort(rows, kind="stable")
-        ends = np.cumsum(np.bincount(rows, minlength=len(found.points)))[:-1]
-        return Sightlines(centers, focals, found.points, tuple(np.split(cameras[order], ends)), residual)
+        ends = np.cumsum(np.bincount(rows, minlength=len(visible.points)))[:-1]
+        return Sightlines(centers, focals, visible.points, tuple(np.split(cameras[order], ends)), residual)
 
 
 def layout_scale(photo: Photo, folder: Path) -> float:
-    """Return how much smaller a photo is laid out than its file: 1 where it has its full size, or the file is gone."""
+    """Return the size of a laid-out photo relative to its file in a folder; 1 if the file is gone."""
     if not photo.needs_copy:
         return 1.0
     try:
@@ -287,11 +281,7 @@ def layout_scale(photo: Photo, folder: Path) -> float:
 
 
 def unrotate_pixels(photo: Photo, upright: FloatArray) -> FloatArray:
-    """Return pixels of the upright photo as pixels of the photo as it is laid out, in the sensor's orientation.
-
-    Args:
-        upright: (N, 2) x and y in the upright photo, at its laid-out size.
-    """
+    """Return pixels (N, 2) of the upright photo as pixels of the laid-out photo, in the sensor's orientation."""
     x, y = upright[:, 0], upright[:, 1]
     if photo.turn_deg == 90:
         return np.column_stack([y, photo.height - x])
@@ -303,10 +293,9 @@ def unrotate_pixels(photo: Photo, upright: FloatArray) -> FloatArray:
 
 
 def named_photos(photos: tuple[Photo, ...]) -> Mapping[str, Photo]:
-    """Return photos by every name that a user may give them: path in the folder, name, and file name where it is one.
-    """
+    """Return photos by path in the folder, by name, and by file name if it is unique."""
     files: dict[str, list[Photo]] = {}
     for photo in photos:
         files.setdefault(photo.path.rpartition("/")[2], []).append(photo)
-    alone = {name: found[0] for name, found in files.items() if len(found) == 1}
-    return alone | {photo.name: photo for photo in photos} | {photo.path: photo for photo in photos}
+    unique = {name: group[0] for name, group in files.items() if len(group) == 1}
+    return unique | {photo.name: photo for photo in photos} | {photo.path: photo for photo in photos}

@@ -1,8 +1,8 @@
-"""Which way up a scene is, where the roll of the cameras does not decide it.
+"""Orientation of a scene: the up direction, and the side that faces the viewer.
 
-The roll gives one vertical for photos that are upright or upside down, and one for photos on their side. Which of the
-two is right, and which of its ends is up, is decided by odds: the prior odds of people turning all their photos, times
-the evidence of the scene and the photos.
+The roll of the cameras gives one vertical for photos that are upright or upside down, and one for photos on their
+side. Odds decide between the two, and which end is up: the prior odds of people turning all their photos, times the
+evidence of the scene and the photos.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,16 +33,46 @@ from sfm_app.geometry.poses import (
 )
 from sfm_app.types.arrays import FloatArray
 
-# The plane that most points of a scene lie on, among planes of a given inclination.
+LINES, ROLL, GROUND, GPS = "vanishing lines", "camera roll", "ground plane", "GPS"
+WALL, CAMERAS = "wall", "cameras"
 
-TRIPLES, MOST_POINTS = 1000, 4000
-"""Number of samples of three points, and of the points that score them."""
 
-INLIER_DISTANCE = 0.01
-"""Points within this share of the scene's size lie on the plane."""
+@dataclass(frozen=True, slots=True)
+class UpOptions:
+    """Constants of the up direction and of the frame of viewers."""
 
-LEAST_SHARE = 0.15
-"""A plane needs this share of the points."""
+    samples: int = 1000
+    """Samples of three points for a plane."""
+    max_points: int = 4000
+    """Largest number of points that score a plane."""
+    inlier_distance: float = 0.01
+    """Largest distance of inliers from a plane, as a share of the scene's size."""
+    min_share: float = 0.15
+    """Least share of inliers of a plane."""
+    max_nats: float = 3.0
+    """Largest evidence of one cue: each of them is wrong in one place of twenty (a vault, a stage, snow)."""
+    ledge_nats: float = 10.0
+    """Nats for an axis per unit of `slope_asymmetry`. The other cues are as large sideways: along a wall, depth,
+    normals and light change from side to side."""
+    max_ledge_nats: float = 4.0
+    """Their maximum."""
+    highest_nats: float = 14.0
+    """Odds above a million to one are not distinguished."""
+    unsure_deg: float = 5.0
+    """Spread of the cameras' roll above which the ground plane is better evidence for up."""
+    floor_deg: tuple[float, float] = (0.0, 20.0)
+    """Range of the angle between up and the normals of floors."""
+    wall_deg: tuple[float, float] = (80.0, 90.0)
+    """Range of the angle between up and the normals of walls."""
+    square_deg: float = 30.0
+    """Largest angle by which a front is turned to face the viewer; a view of a corner is kept."""
+    quantiles: tuple[float, float] = (0.2, 0.8)
+    """Quantiles of the points with the middle of the scene halfway between them."""
+
+
+OPTIONS = UpOptions()
+
+# The plane with most points of a scene, among planes of a given inclination.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,29 +82,29 @@ class Plane:
     normal: FloatArray
     """(3,) unit vector on the side of the given axis."""
     share: float
-    """Share of the points that lie on it, 0 to 1."""
+    """Share of inliers, 0 to 1."""
     deviation_deg: float
     """Standard deviation of the normal, from the scatter of the points."""
 
 
 def dominant_plane(points: FloatArray, axis: FloatArray, between_deg: tuple[float, float]) -> Plane | None:
-    """Find the plane with most points whose normal is at a given angle to an axis: floors (0, 20), walls (80, 90).
+    """Find the plane with most points whose normal is at a given angle to an axis; None without enough inliers.
 
-    RANSAC with a fixed seed, then least squares on the points near the plane; None if no plane has enough of them.
+    RANSAC with a fixed seed, then least squares on the inliers.
 
     Args:
         points: (N, 3), of any scale.
         axis: (3,) unit vector.
-        between_deg: least and largest angle between normal and axis, in degrees in [0, 90].
+        between_deg: least and largest angle between normal and axis, in [0, 90].
     """
     rng = np.random.default_rng(0)
-    cloud = points[rng.permutation(len(points))[:MOST_POINTS]]
+    cloud = points[rng.permutation(len(points))[: OPTIONS.max_points]]
     if len(cloud) < 10:
         return None
     center = np.median(cloud, axis=0)
-    reach = INLIER_DISTANCE * float(np.percentile(np.linalg.norm(cloud - center, axis=1), 80))
-    best, most = None, LEAST_SHARE * len(cloud)
-    for triple in rng.integers(0, len(cloud), (TRIPLES, 3)):
+    reach = OPTIONS.inlier_distance * float(np.percentile(np.linalg.norm(cloud - center, axis=1), 80))
+    best, most = None, OPTIONS.min_share * len(cloud)
+    for triple in rng.integers(0, len(cloud), (OPTIONS.samples, 3)):
         a, b, c = cloud[triple]
         normal = normalize(np.cross(b - a, c - a))
         if not normal.any() or not between_deg[0] <= axis_angle_deg(normal, axis) <= between_deg[1]:
@@ -89,20 +119,12 @@ def _fit_plane(points: FloatArray, axis: FloatArray, share: float) -> Plane:
     spread = points - points.mean(axis=0)
     scatter = np.einsum("ni,nj->ij", spread, spread)
     small, middle, _ = np.linalg.eigvalsh(scatter)
-    # rounding leaves the least eigenvalue of points on one plane below zero
+    # rounding may leave the least eigenvalue of coplanar points below zero
     deviation = np.degrees(np.arctan2(np.sqrt(max(small, 0.0) / len(points)), np.sqrt(max(middle, 1e-30))))
     return Plane(smallest_eigenvector(scatter, axis), share, float(deviation))
 
 
-MAX_NATS = 3.0
-"""Largest evidence of one cue, in nats: each of them is wrong in one place of twenty (a vault, a stage, snow)."""
-
-LEDGE_NATS, MAX_LEDGE_NATS = 10.0, 4.0
-"""Nats for an axis per unit of `slope_asymmetry`, and their maximum. The other cues are as large sideways: along a
-wall, depth, normals and light change from side to side."""
-
-HIGHEST_NATS = 14.0
-"""Odds above a million to one are not distinguished."""
+# The choice between the hypotheses of roll.
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +140,7 @@ class Cue:
     def nats(self, value: float, points: int) -> float:
         """Return the log odds of up against down; the cue is normal under both, with opposite means."""
         variance = self.deviation**2 + self.noise / max(points, 1)
-        return float(np.clip(2.0 * self.mean * value / variance, -MAX_NATS, MAX_NATS))
+        return float(np.clip(2.0 * self.mean * value / variance, -OPTIONS.max_nats, OPTIONS.max_nats))
 
 
 CUES: Mapping[str, Cue] = {
@@ -128,32 +150,31 @@ CUES: Mapping[str, Cue] = {
     "ledges are lit": Cue(0.18, 0.17),
     "sky is above": Cue(0.20, 0.27),
 }
-"""Estimated on eight photo sets, three rendered ones and seven of corners only; figures from the others decide each
-set the same way. The noise exceeds 1 because neighboring points share it."""
+"""Estimated on eighteen photo sets; figures from the others decide each set the same way. The noise exceeds 1 because
+neighboring points share it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scenery:
-    """What a scene and its photos show."""
+    """Points of a scene, and its photos as small pictures."""
 
     points: FloatArray
     """(P, 3)"""
     brightness: FloatArray
     """(P,) 0 to 255."""
     seen: tuple[NDArray[np.int64], ...]
-    """Per photo, the indices of the points that it sees."""
+    """Per photo, the indices of its visible points."""
     pictures: tuple[NDArray[np.uint8] | None, ...]
-    """Per photo its `small_picture`; None if it was not read."""
+    """Per photo its `small_picture`, or None."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RollSelection:
-    """Which way up a scene is, and the odds of that."""
+    """The chosen hypothesis of roll, and its odds."""
 
     roll: Roll
-    """The estimate from roll that was chosen."""
     evidence: Mapping[str, float]
-    """By cue, log odds of up against down, in nats; negative if the cue contradicts."""
+    """Log odds of up against down by cue, in nats; negative for a contradicting cue."""
     sign_log_odds: float
     """Log odds of up against its opposite, including how cameras are held."""
     axis_log_odds: float
@@ -161,10 +182,10 @@ class RollSelection:
 
 
 def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArray, scenery: Scenery) -> RollSelection:
-    """Choose first the vertical, from how the cameras are held and the ledges; then which end of it is up.
+    """Choose the vertical by roll and ledges, then its upper end by all cues.
 
     Args:
-        rolls: estimates for photos turned by 0, 90, 180, 270 degrees, see `ups_from_roll`; opposites share a vertical.
+        rolls: estimates for photos turned by 0, 90, 180, 270 degrees; opposites share a vertical.
         rotations: (N, 3, 3) cam_from_world of the photos.
         centers: (N, 3) camera centers.
     """
@@ -173,11 +194,8 @@ def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArra
     upright, lying = (
         float(np.logaddexp(-roll.cost, -opposite.cost)) for roll, opposite in zip(rolls[:2], rolls[2:], strict=True)
     )
-    gap = (
-        upright
-        - lying
-        + float(np.clip(LEDGE_NATS * (abs(ledges[0]) - abs(ledges[1])), -MAX_LEDGE_NATS, MAX_LEDGE_NATS))
-    )
+    by_ledges, limit = OPTIONS.ledge_nats * (abs(ledges[0]) - abs(ledges[1])), OPTIONS.max_ledge_nats
+    gap = upright - lying + float(np.clip(by_ledges, -limit, limit))
     chosen = 0 if gap >= 0 else 1
     up, down = rolls[chosen], rolls[chosen + 2]
     values = {
@@ -196,25 +214,10 @@ def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArra
 
 def odds(nats: float) -> float:
     """Return log odds as odds to one, with two digits."""
-    return float(f"{np.exp(min(nats, HIGHEST_NATS)):.2g}")
+    return float(f"{np.exp(min(nats, OPTIONS.highest_nats)):.2g}")
 
 
-# Orientation of a reconstructed scene: which way is up, and which side faces the viewer.
-
-LINES, ROLL, GROUND, GPS = "vanishing lines", "camera roll", "ground plane", "GPS"
-WALL, CAMERAS = "wall", "cameras"
-
-UNSURE_DEG = 5.0
-"""Spread of the cameras' roll above which the ground plane is better evidence for up."""
-
-FLOOR_DEG, WALL_DEG = (0.0, 20.0), (80.0, 90.0)
-"""Ranges of the angle between up and the normals of floors, and of walls."""
-
-SQUARE_WITHIN_DEG = 30.0
-"""Largest angle by which a front is turned to face the viewer; a view of a corner is kept."""
-
-MIDDLE_QUANTILES = (0.2, 0.8)
-"""Quantiles of the points; the middle of the scene is halfway between them."""
+# The up direction, the side of the viewer, and the frame of both.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,17 +227,16 @@ class UpEstimate:
     up: FloatArray
     """(3,) unit vector in the world."""
     level: FloatArray | None
-    """(3,) main horizontal direction of the lines, perpendicular to `up`; None if none was found."""
+    """(3,) main horizontal direction of the lines, perpendicular to `up`; None without one."""
     method: str
     """Source of `up`: `LINES`, `ROLL`, `GROUND` or `GPS`."""
     deviation_deg: float
-    """Standard deviation of `up` in degrees, estimated from its evidence."""
+    """Standard deviation of `up`, from its evidence."""
     selection: RollSelection
-    """Which way up the photos are, and the odds of that."""
 
     @property
     def roll(self) -> Roll:
-        """Up from the cameras alone, for the turn of the photos that was chosen."""
+        """Up from the cameras alone, for the chosen turn of the photos."""
         return self.selection.roll
 
     @property
@@ -243,12 +245,7 @@ class UpEstimate:
         return float(axis_angle_deg(self.up, self.roll.up))
 
     def with_up(self, up: FloatArray, deviation_deg: float) -> "UpEstimate":
-        """Return a copy with up from GPS, whose sign is certain.
-
-        Args:
-            up: (3,) unit vector in the world.
-            deviation_deg: its standard deviation, degrees.
-        """
+        """Return a copy with up from GPS, a unit vector (3,) in the world whose sign is certain."""
         sure = RollSelection(self.roll, self.selection.evidence, np.inf, np.inf)
         return replace(self, up=up, level=None, method=GPS, deviation_deg=deviation_deg, selection=sure)
 
@@ -261,33 +258,36 @@ def up_direction(
     Args:
         rotations: (N, 3, 3) cam_from_world of the photos, N >= 1.
         centers: (N, 3) camera centers.
+        segments: lines in the photos; may be empty.
         turn_deg: clockwise turn that makes the photos upright: 0, 90, 180 or 270; None if unknown.
     """
     rolls = roll_hypotheses(rotations, centers)
     if turn_deg is None:
-        standing = select_roll(rolls, rotations, centers, scenery)
+        selection = select_roll(rolls, rotations, centers, scenery)
     else:
-        standing = RollSelection(rolls[turn_deg // 90], {}, np.inf, np.inf)
-    roll = standing.roll
+        selection = RollSelection(rolls[turn_deg // 90], {}, np.inf, np.inf)
+    roll = selection.roll
     lines = find_vanishing_direction(roll.up, segments)
     if lines is not None:
         level = level_direction(lines.direction, segments)
         if level is None:
-            return UpEstimate(lines.direction, None, LINES, lines.deviation_deg, standing)
+            return UpEstimate(lines.direction, None, LINES, lines.deviation_deg, selection)
         frame, deviation_deg = fit_orthogonal_frame(lines.direction, level, segments)
-        # verticals alone and all edges together have different errors: the gap between them is a measure of both
+        # verticals alone and all edges together have different errors; their angle measures both
         gap_deg = float(axis_angle_deg(frame[0], lines.direction))
-        return UpEstimate(frame[0], frame[1], LINES, float(np.hypot(deviation_deg, gap_deg)), standing)
-    ground = dominant_plane(scenery.points, roll.up, FLOOR_DEG) if roll.spread_deg > UNSURE_DEG else None
+        return UpEstimate(frame[0], frame[1], LINES, float(np.hypot(deviation_deg, gap_deg)), selection)
+    ground = (
+        dominant_plane(scenery.points, roll.up, OPTIONS.floor_deg) if roll.spread_deg > OPTIONS.unsure_deg else None
+    )
     if ground is not None:
-        return UpEstimate(ground.normal, None, GROUND, ground.deviation_deg, standing)
-    return UpEstimate(roll.up, None, ROLL, roll.deviation_deg, standing)
+        return UpEstimate(ground.normal, None, GROUND, ground.deviation_deg, selection)
+    return UpEstimate(roll.up, None, ROLL, roll.deviation_deg, selection)
 
 
 def viewer_direction(upright: UpEstimate, rotations: FloatArray, points: FloatArray) -> tuple[FloatArray, str]:
-    """Choose the horizontal direction (3,) that points to the viewer, and its source: `LINES`, `WALL` or `CAMERAS`.
+    """Choose the horizontal direction (3,) to the viewer, and its source: `LINES`, `WALL` or `CAMERAS`.
 
-    It points to the cameras; if lines or walls have a main direction near that, exactly along it.
+    It points to the cameras, or exactly along a main direction of lines or walls near that.
 
     Args:
         rotations: (N, 3, 3) of cam_from_world.
@@ -297,15 +297,15 @@ def viewer_direction(upright: UpEstimate, rotations: FloatArray, points: FloatAr
     towards = normalize(perpendicular_component(-rotations[:, 2].mean(axis=0), up))
     if not towards.any():
         towards = perpendicular_basis(up)[0]
-    axis, found_by = upright.level, LINES
-    if axis is None and (wall := dominant_plane(points, up, WALL_DEG)) is not None:
-        axis, found_by = normalize(perpendicular_component(wall.normal, up)), WALL
+    axis, source = upright.level, LINES
+    if axis is None and (wall := dominant_plane(points, up, OPTIONS.wall_deg)) is not None:
+        axis, source = normalize(perpendicular_component(wall.normal, up)), WALL
     if axis is None:
         return towards, CAMERAS
     sides = np.stack([axis, np.cross(up, axis), -axis, np.cross(axis, up)])
     nearest = sides[int(np.argmax(sides @ towards))]
-    square = nearest @ towards >= np.cos(np.radians(SQUARE_WITHIN_DEG))
-    return (np.asarray(nearest), found_by) if square else (towards, CAMERAS)
+    square = nearest @ towards >= np.cos(np.radians(OPTIONS.square_deg))
+    return (np.asarray(nearest), source) if square else (towards, CAMERAS)
 
 
 def viewer_frame(up: FloatArray, towards: FloatArray, points: FloatArray, meters: float | None = None) -> Similarity:
@@ -313,14 +313,14 @@ def viewer_frame(up: FloatArray, towards: FloatArray, points: FloatArray, meters
 
     Args:
         up: (3,) unit vector in the world.
-        towards: (3,) unit vector perpendicular to it, see `viewer_direction`.
+        towards: (3,) perpendicular unit vector, see `viewer_direction`.
         points: (P, 3) of the scene.
-        meters: per unit of the world; if None, four of five points will lie within 1 of the middle.
+        meters: per unit of the world; None for four of five points within 1 of the middle.
     """
     R = np.stack([np.cross(up, towards), up, towards])
-    # The median would follow the densest points, the bounding box the farthest few.
-    turned = points @ R.T
-    center = np.mean(np.quantile(turned, MIDDLE_QUANTILES, axis=0), axis=0)
-    size = float(np.percentile(np.linalg.norm(turned - center, axis=1), 80))
+    # the median would follow the densest points, the bounding box the farthest few
+    rotated = points @ R.T
+    center = np.mean(np.quantile(rotated, OPTIONS.quantiles, axis=0), axis=0)
+    size = float(np.percentile(np.linalg.norm(rotated - center, axis=1), 80))
     scale = 1.0 / max(size, 1e-12) if meters is None else meters
     return Similarity(scale, R, -scale * center)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.backend import Reconstruction, translate_errors
 from sfm_app.colmap.model import (
     finite_mask,
     focal_px,
@@ -20,7 +20,6 @@ from sfm_app.colmap.model import (
     seen_points,
     viewing_rays,
 )
-from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import NumericalError
 from sfm_app.frame.georeference import Georeference, NoGeoreference, georeference, position_from_enu
 from sfm_app.frame.up_cues import small_picture
@@ -35,13 +34,6 @@ from sfm_app.types.arrays import FloatArray
 logger = logging.getLogger("sfm_app")
 
 
-SAMPLED_PHOTOS = 10
-"""Number of photos per model that are searched for cues, spread over the set."""
-
-SCENERY_POINTS = 8000
-"""Number of points used to find the up direction; more of them do not improve it."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotoCues:
     """Cues to the up direction from one photo."""
@@ -49,49 +41,48 @@ class PhotoCues:
     lines: FloatArray
     """(N, 4) line segments in pixels of the photo."""
     picture: NDArray[np.uint8] | None
-    """The photo itself, gray and small; None if it could not be read."""
+    """The photo, gray and small; None if OpenCV cannot read it."""
 
 
 FutureCues = Mapping[int, "Future[PhotoCues]"]
-"""Futures of the cues, by photo."""
+"""By photo."""
 
 
 def submit_cue_extraction(models: Sequence[Reconstruction], matches: MatchGraph, run: RunContext) -> FutureCues:
-    """Start to extract cues from some photos of every model, in the background."""
-    looks = {}
+    """Start to extract cues from ten photos of every model in the background; no photo is in two models."""
+    cues = {}
     for model in models:
         posed = posed_photo_ids(model)
-        for k in np.unique(np.linspace(0, len(posed) - 1, SAMPLED_PHOTOS).astype(int)):
+        for k in np.unique(np.linspace(0, len(posed) - 1, 10).astype(int)):
             image = matches.images[posed[k]]
-            looks[posed[k]] = run.executor.submit(extract_cues, run.workspace.photos / image.name, image.turn_deg)
-    return looks
+            cues[posed[k]] = run.executor.submit(extract_cues, run.workspace.photos / image.name, image.turn_deg)
+    return cues
 
 
 def orient_or_keep(
-    model: Reconstruction, matches: MatchGraph, looks: FutureCues, turn_deg: int | None = None
+    model: Reconstruction, matches: MatchGraph, cues: FutureCues, turn_deg: int | None = None
 ) -> dict[str, Json]:
-    """Turn the model upright; where that fails numerically, leave it unchanged and return the reason."""
+    """Orient the model; on a numerical failure leave it unchanged and return the reason."""
     try:
-        return orient(model, matches, looks, turn_deg)
+        return orient(model, matches, cues, turn_deg)
     except FAILURES as err:
-        logger.info("the model could not be turned upright", exc_info=err)
+        logger.info("the model cannot be oriented", exc_info=err)
         return {
             "failed": error_reason(err),
             "unit": "that of mapping",
-            "gps": "not used: it is not known which way is up",
+            "gps": "not used: the up direction is unknown",
         }
 
 
 def orient(
-    model: Reconstruction, matches: MatchGraph, looks: FutureCues, turn_deg: int | None = None
+    model: Reconstruction, matches: MatchGraph, cues: FutureCues, turn_deg: int | None = None
 ) -> dict[str, Json]:
-    """Move the model into the frame of glTF viewers: y up, seen from +z, centered, of size about 1 or in meters.
+    """Move the colored model into the frame of glTF viewers: y up, seen from +z, centered, of size 1 or in meters.
+
+    Return the orientation and its evidence for the manifest.
 
     Args:
-        turn_deg: angle by which the photos have to be turned clockwise to stand upright; None if unknown.
-
-    Returns:
-        The orientation and its evidence, for the manifest.
+        turn_deg: clockwise turn that makes the photos upright; None if unknown.
 
     Raises:
         NumericalError: the model has no finite points.
@@ -105,8 +96,8 @@ def orient(
     centers = -np.einsum("nij,ni->nj", matrices[:, :, :3], matrices[:, :, 3])
     turns = [matches.images[photo].turn_deg for photo in poses]
     R = np.array([turn_camera(rotation, turn) for rotation, turn in zip(matrices[:, :, :3], turns, strict=True)])
-    found = {photo: looks[photo].result() for photo in poses if photo in looks}
-    upright = up_direction(R, centers, _scenery(model, found), _world_segments(model, found), turn_deg)
+    shown = {photo: cues[photo].result() for photo in poses if photo in cues}
+    upright = up_direction(R, centers, _scenery(model, shown), _world_segments(model, shown), turn_deg)
     positions = [matches.images[key].gps for key in poses]
     gps = _georeference(centers, positions, upright)
     meters = None
@@ -129,12 +120,12 @@ def _georeference(
     centers: FloatArray, positions: Sequence[GpsPosition | None], upright: UpEstimate
 ) -> Georeference | NoGeoreference:
     try:
-        found = georeference(centers, positions, upright.up, up_is_sure=upright.method == LINES)
+        gps = georeference(centers, positions, upright.up, up_is_sure=upright.method == LINES)
     except FAILURES as err:
-        logger.info("the GPS positions could not be used", exc_info=err)
+        logger.info("the GPS positions cannot be used", exc_info=err)
         return NoGeoreference(f"the computation failed: {error_reason(err)}")
-    if not isinstance(found, Georeference) or is_sound(found.enu_from_world):
-        return found
+    if not isinstance(gps, Georeference) or is_sound(gps.enu_from_world):
+        return gps
     return NoGeoreference("the positions give no scale")
 
 
@@ -144,40 +135,35 @@ def is_sound(similarity: Similarity) -> bool:
 
 
 def turn_camera(R: FloatArray, turn_deg: int) -> FloatArray:
-    """Return the rotation (3, 3) cam_from_world of a photo that is turned clockwise.
-
-    Args:
-        R: (3, 3) rotation cam_from_world of the photo before.
-        turn_deg: multiple of 90 degrees.
-    """
+    """Return the rotation (3, 3) cam_from_world after a clockwise turn of the photo by a multiple of 90 degrees."""
     cosine, sine = round(np.cos(np.radians(turn_deg))), round(np.sin(np.radians(turn_deg)))
     return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ R
 
 
-def _world_segments(model: Reconstruction, looks: Mapping[int, PhotoCues]) -> Segments:
-    """Return the line segments of the photos of a model, in the world frame."""
+def _world_segments(model: Reconstruction, cues: Mapping[int, PhotoCues]) -> Segments:
+    """Return the line segments of a model's photos in the world."""
     with translate_errors("computing viewing rays of line segments"):
-        return concatenate_segments([_to_world(model, photo, look.lines) for photo, look in looks.items()])
+        return concatenate_segments([_to_world(model, photo, one.lines) for photo, one in cues.items()])
 
 
-def _scenery(model: Reconstruction, looks: Mapping[int, PhotoCues]) -> Scenery:
-    """Return points of a model and its small photos, as evidence for the up direction."""
+def _scenery(model: Reconstruction, cues: Mapping[int, PhotoCues]) -> Scenery:
+    """Return points of a model and its small photos; more than 8000 points do not improve the up direction."""
     with translate_errors("reading the points"):
-        shown = seen_points(model, SCENERY_POINTS)
-    pictures = tuple(looks[photo].picture if photo in looks else None for photo in posed_photo_ids(model))
-    return Scenery(shown.points, shown.colors.mean(axis=1), shown.seen, pictures)
+        visible = seen_points(model, 8000)
+    pictures = tuple(cues[photo].picture if photo in cues else None for photo in posed_photo_ids(model))
+    return Scenery(visible.points, visible.colors.mean(axis=1), visible.seen, pictures)
 
 
 def extract_cues(path: Path, turn_deg: int = 0) -> PhotoCues:
-    """Return the line segments of a photo, and a small upright copy of it; empty if OpenCV cannot read the photo."""
+    """Return the line segments and a small copy of a photo that is upright after a clockwise turn by `turn_deg`."""
     try:
-        data = np.fromfile(path, np.uint8)  # OpenCV does not open names beyond ASCII on every system
+        data = np.fromfile(path, np.uint8)  # OpenCV opens names beyond ASCII on some systems only
     except OSError:
         data = np.zeros(0, np.uint8)
-    read = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
-    if read is None:
+    picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
+    if picture is None:
         return PhotoCues(np.zeros((0, 4)), None)
-    gray = np.asarray(read, np.uint8)
+    gray = np.asarray(picture, np.uint8)
     return PhotoCues(line_segments(gray), np.rot90(small_picture(gray), -turn_deg // 90))
 
 
@@ -188,29 +174,29 @@ def _to_world(model: Reconstruction, image_id: int, lines: FloatArray) -> Segmen
 
 def _orientation_entry(upright: UpEstimate, front: str) -> dict[str, Json]:
     """Return the up and front directions and their evidence, for the manifest."""
-    standing = upright.selection
+    selection = upright.selection
     return {
         "up": upright.method,
         "up_deviation_deg": round(upright.deviation_deg, 3) if np.isfinite(upright.deviation_deg) else None,
         "off_camera_roll_deg": round(upright.angle_to_roll_deg, 2),
         "camera_roll_spread_deg": round(upright.roll.spread_deg, 2),
         "photos_turned_deg": upright.roll.turn_deg,
-        "up_sign_odds": odds(standing.sign_log_odds),
-        "up_axis_odds": odds(standing.axis_log_odds),
-        "up_evidence_nats": {name: round(nats, 1) for name, nats in standing.evidence.items()},
+        "up_sign_odds": odds(selection.sign_log_odds),
+        "up_axis_odds": odds(selection.axis_log_odds),
+        "up_evidence_nats": {name: round(nats, 1) for name, nats in selection.evidence.items()},
         "front": front,
     }
 
 
 def gps_deviation(orientation: Mapping[str, Json]) -> float | None:
-    """Return the relative standard deviation of the meter by GPS; None where the unit is arbitrary."""
-    found = orientation.get("georeference")
-    percent = found.get("scale_deviation_percent") if isinstance(found, Mapping) else None
+    """Return the relative standard deviation of the meter by GPS, from the manifest's entry; None if it is unknown."""
+    entry = orientation.get("georeference")
+    percent = entry.get("scale_deviation_percent") if isinstance(entry, Mapping) else None
     return float(percent) / 100.0 if isinstance(percent, int | float) else None
 
 
 def _georeference_entry(viewer: Similarity, gps: Georeference | NoGeoreference) -> dict[str, Json]:
-    """Return the unit and georeference of the model that `viewer` has moved, for the manifest."""
+    """Return the unit and georeference of the model in the frame of the viewer, for the manifest."""
     if isinstance(gps, NoGeoreference):
         return {"unit": "about the size of the scene", "gps": f"not used: {gps.reason}"}
     enu_from_model = gps.enu_from_world.compose(viewer.inverse())

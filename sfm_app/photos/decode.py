@@ -49,7 +49,12 @@ def turn_deg(exif: Image.Exif) -> int:
 def camera_name(exif: Image.Exif) -> str:
     """Return make, model, focal length and digital zoom in one text; empty without them."""
     details = exif.get_ifd(IFD.Exif)
-    parts = [exif.get(Base.Make), exif.get(Base.Model), details.get(Base.FocalLength), _zoom(details.get(Base.DigitalZoomRatio))]
+    parts = [
+        exif.get(Base.Make),
+        exif.get(Base.Model),
+        details.get(Base.FocalLength),
+        _zoom(details.get(Base.DigitalZoomRatio)),
+    ]
     return " ".join(text for text in (printable_text(value) for value in parts) if text)
 
 

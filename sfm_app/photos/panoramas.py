@@ -75,7 +75,9 @@ def is_panorama(picture: DecodedPhoto, upright: Image.Image) -> bool:
         degrees = f"{360 * wide:.0f} x {180 * high:.0f} degrees"
         raise UnreadableError(f"a panorama of {degrees}: only full ones of 360 x 180 degrees can be used")
     if not _is_twice_as_wide(upright.size):
-        raise UnreadableError("a part of a panorama: its metadata claims the whole sphere, but it is not twice as wide as high")
+        raise UnreadableError(
+            "a part of a panorama: its metadata claims the whole sphere, but it is not twice as wide as high"
+        )
     return True
 
 
@@ -97,7 +99,9 @@ def looks_like_panorama(upright: Image.Image) -> bool:
     """Return whether an upright picture looks like a full panorama: borders continue, poles are points."""
     if not _is_twice_as_wide(upright.size):
         return False
-    small = upright.convert("RGB").resize((OPTIONS.width_px, OPTIONS.width_px // 2), Image.Resampling.BOX, reducing_gap=3.0)
+    small = upright.convert("RGB").resize(
+        (OPTIONS.width_px, OPTIONS.width_px // 2), Image.Resampling.BOX, reducing_gap=3.0
+    )
     pixels = np.asarray(small, np.float64)
     steps = np.abs(np.diff(pixels, axis=1)).mean(axis=(1, 2))
     return bool(max(steps[0], steps[-1]) <= OPTIONS.pole_share * steps.max()) and _borders_continue(pixels)

@@ -1,8 +1,8 @@
-"""Which photos share one camera."""
+"""Photos from files: their metadata, the picture within bars, and the camera they share with others."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -31,34 +31,46 @@ from sfm_app.settings import PhotoSettings
 from sfm_app.types import Frame, GivenCameras, Photo, UnusablePhoto
 from sfm_app.types.camera import EQUIRECTANGULAR, PERSPECTIVE
 
-# Find bars of one color around a picture, which services add to bring photos of any size to one size.
+# Bars of one color around a picture, which services add to bring photos of any size to one size.
 #
-# The picture within the bars is the photo: its size distinguishes cameras, and the optical center usually lies near
-# its middle, not near the middle of the whole. A bar has one color and ends at a straight edge, along which the
-# whole picture differs from it; a black background or an overexposed sky does not end like that.
+# The picture within the bars is the photo: its size distinguishes cameras, and the principal point usually lies near
+# its middle. A bar has one color and ends at a straight edge, along which the whole picture differs from it; a black
+# background or an overexposed sky does not end like that.
 
-BAR_TOLERANCE = 8
-"""Gray levels by which a bar may differ from its color: JPEG changes it by less, except for ringing beside the edge."""
-STRAY_SHARE = 0.01
-"""Share of the pixels of a line that may differ by more."""
-EDGE_CONTRAST, LEAST_EDGE = 16, 0.7
-"""Gray levels by which the line behind the edge must differ from the bar, and the share of its pixels that must."""
-BLUR_PX, RINGING_PX = 3, 18
-"""Largest distance, in lines, from the end of the uniform bar to the picture: resizing blurs the edge, and JPEG rings
-as far as its chroma blocks reach, 16 pixels. With ringing, the bar ends where the picture begins."""
-LEAST_PX, LEAST_SHARE = 4, 0.008
-"""Thinner bars, in pixels and in shares of the side, are ignored: they hardly move the middle."""
-MOST_SHARE = 0.7
-"""Largest share of a side that a bar may cover; beyond, it is an object in front of a plain background."""
-SAME_PX, SAME_SHARE = 4.0, 0.01
-"""Pictures whose edges differ by at most this, in pixels or in shares of the longer side, count as one size."""
+
+@dataclass(frozen=True, slots=True)
+class BarOptions:
+    """Constants of the detection of bars; sides are those of the picture across a bar."""
+
+    tolerance: int = 8
+    """Gray levels by which a bar may differ from its color: JPEG stays below, except for ringing at the edge."""
+    stray_share: float = 0.01
+    """Share of the pixels of a line that may differ more."""
+    edge_contrast: int = 16
+    """Gray levels by which the line behind the edge must differ from the bar."""
+    min_edge: float = 0.7
+    """Least share of its pixels that must."""
+    blur_px: int = 3
+    """Largest number of lines between bar and picture that resizing blurs."""
+    ringing_px: int = 18
+    """Largest number of lines that JPEG rings: a chroma block has 16. The bar then ends where the picture begins."""
+    min_px: int = 4
+    """Thinner bars are ignored: they hardly move the middle."""
+    min_share: float = 0.008
+    """The same, as a share of the side."""
+    max_share: float = 0.7
+    """Largest share of the side; a wider bar is the background of an object."""
+    same_px: float = 4.0
+    """Largest difference of the edges of pictures of one size."""
+    same_share: float = 0.01
+    """The same, as a share of the longer side; the larger one counts."""
+
+
+BARS = BarOptions()
 
 
 def shown_part(picture: Image.Image) -> Frame | None:
-    """Return the frame of the picture within bars; None without bars.
-
-    A bar above without one below is ignored: it may be a sky of one color above a level horizon.
-    """
+    """Return the frame of the picture within bars; None without bars. A bar above alone may be a sky, and is none."""
     pixels = np.asarray(picture.convert("RGB"))
     height, width = pixels.shape[:2]
     top, bottom = _bar_thickness(pixels), _bar_thickness(pixels[::-1])
@@ -71,34 +83,46 @@ def shown_part(picture: Image.Image) -> Frame | None:
     return left, top, width - left - right, height - top - bottom
 
 
-def unify_frames(photos: Sequence[Photo]) -> Iterator[Photo]:
-    """Yield photos of one size, with nearly equal picture frames replaced by their median.
+def unify_frames(photos: Sequence[Photo]) -> list[Photo]:
+    """Return photos of one size, with nearly equal picture frames replaced by their median.
 
-    If all detected bars agree, photos without detected bars (for example, with a sky of the same color) get them too.
-    Bars around fewer than half of the photos are ignored: a wall in front of an empty background also ends at straight
-    edges.
+    If all detected bars agree, photos without detected bars (with a sky of the same color, say) get them too. Bars
+    around fewer than half of the photos are ignored: a wall in front of a plain background also ends at straight edges.
     """
     if 2 * sum(photo.shown is not None for photo in photos) < len(photos):
         photos = [replace(photo, shown=None) for photo in photos]
-    frames: list[list[Frame]] = []
-    which: list[int] = []
+    clusters, numbers = _cluster_frames(photos)
+    barred = {number for number, photo in zip(numbers, photos, strict=True) if photo.shown}
+    if len(barred) == 1 and 2 * sum(not photo.shown for photo in photos) <= len(photos):
+        numbers = [*barred] * len(photos)
+    medians = [np.median([_edges(frame) for frame in frames], axis=0) for frames in clusters]
+    return [
+        replace(photo, shown=_frame_within(photo, medians[number]))
+        for photo, number in zip(photos, numbers, strict=True)
+    ]
+
+
+def _cluster_frames(photos: Sequence[Photo]) -> tuple[list[list[Frame]], list[int]]:
+    """Return the picture frames in clusters of nearly equal ones, and the number of each photo's cluster."""
+    clusters: list[list[Frame]] = []
+    numbers: list[int] = []
     for photo in photos:
-        own = photo.shown or (0, 0, photo.width, photo.height)
-        near = max(SAME_PX, SAME_SHARE * max(photo.width, photo.height))
-        alike = [k for k, known in enumerate(frames) if np.max(np.abs(_edges(known[0]) - _edges(own))) <= near]
-        if not alike:
-            frames.append([])
-        which.append(alike[0] if alike else len(frames) - 1)
-        frames[which[-1]].append(own)
-    seen = {number for number, photo in zip(which, photos, strict=True) if photo.shown}
-    hidden = [photo for photo in photos if not photo.shown]
-    if len(seen) == 1 and 2 * len(hidden) <= len(photos):
-        which = [*seen] * len(photos)
-    for photo, number in zip(photos, which, strict=True):
-        edges = np.median([_edges(frame) for frame in frames[number]], axis=0)
-        left, top, right, bottom = (round(float(value)) for value in edges)
-        whole = (left, top, right, bottom) == (0, 0, photo.width, photo.height)
-        yield replace(photo, shown=None if whole else (left, top, right - left, bottom - top))
+        frame = photo.shown or (0, 0, photo.width, photo.height)
+        limit = max(BARS.same_px, BARS.same_share * max(photo.width, photo.height))
+        near = (k for k, known in enumerate(clusters) if np.max(np.abs(_edges(known[0]) - _edges(frame))) <= limit)
+        number = next(near, len(clusters))
+        if number == len(clusters):
+            clusters.append([])
+        numbers.append(number)
+        clusters[number].append(frame)
+    return clusters, numbers
+
+
+def _frame_within(photo: Photo, edges: NDArray[np.float64]) -> Frame | None:
+    """Return the frame with these edges; None if it is the whole photo."""
+    left, top, right, bottom = (round(float(value)) for value in edges)
+    whole = (left, top, right, bottom) == (0, 0, photo.width, photo.height)
+    return None if whole else (left, top, right - left, bottom - top)
 
 
 def _edges(frame: Frame) -> NDArray[np.int64]:
@@ -109,16 +133,17 @@ def _edges(frame: Frame) -> NDArray[np.int64]:
 def _bar_thickness(lines: NDArray[np.uint8]) -> int:
     """Return how many of the first lines of (N, M, 3) form a bar."""
     color = np.median(lines[0], axis=0).astype(np.int16)
-    most = int(MOST_SHARE * len(lines))
-    first = next((k for k in range(most) if _differing_share(lines[k], color, BAR_TOLERANCE) > STRAY_SHARE), 0)
-    if first < max(LEAST_PX, LEAST_SHARE * len(lines)):
+    most = int(BARS.max_share * len(lines))
+    strays = (k for k in range(most) if _differing_share(lines[k], color, BARS.tolerance) > BARS.stray_share)
+    first = next(strays, 0)
+    if first < max(BARS.min_px, BARS.min_share * len(lines)):
         return 0
-    behind = range(first, min(first + RINGING_PX, most))
-    unlike = [_differing_share(lines[k], color, EDGE_CONTRAST) for k in behind]
-    edge = next((k for k, share in zip(behind, unlike, strict=True) if share >= LEAST_EDGE), 0)
-    if sum(share >= LEAST_EDGE / 2 for share in unlike[: max(edge - first, 0)]) > BLUR_PX:
+    behind = range(first, min(first + BARS.ringing_px, most))
+    shares = [_differing_share(lines[k], color, BARS.edge_contrast) for k in behind]
+    edge = next((k for k, share in zip(behind, shares, strict=True) if share >= BARS.min_edge), 0)
+    if sum(share >= BARS.min_edge / 2 for share in shares[: max(edge - first, 0)]) > BARS.blur_px:
         return 0  # a sloping edge belongs to an object, not to a bar
-    return first if 0 < edge <= first + BLUR_PX else edge
+    return first if 0 < edge <= first + BARS.blur_px else edge
 
 
 def _differing_share(line: NDArray[np.uint8], color: NDArray[np.int16], levels: int) -> float:
@@ -126,15 +151,11 @@ def _differing_share(line: NDArray[np.uint8], color: NDArray[np.int16], levels: 
     return float(np.mean(np.max(np.abs(line.astype(np.int16) - color), axis=1) > levels))
 
 
-# Examine one file of the folder: a usable photo, or the reason why it is not one.
-
-MEGA = 1_000_000
-LINKED_FORMATS = ("JPEG", "MPO", "PNG")
-"""Formats that COLMAP reads and writes without conversion."""
+# One file of the folder: a usable photo, or the reason why it is unusable.
 
 
 def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> PhotoStats | UnusablePhoto:
-    """Decode one file to check that it is intact, and measure what is needed to compare it with other photos."""
+    """Decode one file to check that it is intact, and measure the statistics that are compared between photos."""
     place = resolve_file(folder, name)
     if isinstance(place, str):
         return UnusablePhoto(name, place)
@@ -146,11 +167,7 @@ def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> PhotoStats
 
 
 def describe(name: str, picture: DecodedPhoto, options: PhotoSettings) -> PhotoStats | UnusablePhoto:
-    """Return a photo's metadata and image statistics.
-
-    Raises:
-        UnreadableError: it is a panorama that does not show the whole sphere.
-    """
+    """Return a photo's metadata and image statistics; raise an UnreadableError for a part of a panorama."""
     image, exif = picture.image, picture.exif
     upright = upright_image(picture)
     panorama = is_panorama(picture, upright)
@@ -158,102 +175,109 @@ def describe(name: str, picture: DecodedPhoto, options: PhotoSettings) -> PhotoS
     size = image.size[::-1] if orientation(exif) >= 5 and not turn else image.size
     if min(size) < options.min_side_px:
         return UnusablePhoto(name, f"smaller than {options.min_side_px} px")
-    width, height = scaled_size(size, options.max_megapixels * MEGA)
-    many = f"its {picture.frames}" if picture.frames <= MOST_FRAMES else f"more than {MOST_FRAMES}"
-    notes = [f"the first of {many} pictures"] if picture.frames > 1 else []
-    if (width, height) != size:
-        notes.append(f"scaled down from {size[0]} x {size[1]} to {width} x {height} pixels")
-    if panorama:
-        notes.append("a panorama of 360 x 180 degrees")
-    eight_bit = image.mode in ("RGB", "L") and "transparency" not in image.info
+    width, height = scaled_size(size, options.max_megapixels * 1_000_000)
     photo = Photo(
         name=name,
         width=width,
         height=height,
         group=camera_name(exif),
         exif_focal_px=None if panorama else focal_px(exif, max(width, height)),
-        needs_copy=not (
-            image.format in LINKED_FORMATS and eight_bit and orientation(exif) == 1 and (width, height) == size
-        ),
+        needs_copy=(width, height) != size or not _is_read_by_colmap(picture),
         gps=gps_position(exif),
         lossy=image.format in LOSSY,
         turn_deg=turn,
-        notes=tuple(notes),
+        notes=_notes(picture.frames, size, (width, height), panorama=panorama),
         projection=EQUIRECTANGULAR if panorama else PERSPECTIVE,
     )
     return measure_photo(photo if panorama else replace(photo, shown=_shown_frame(upright, photo)), upright)
 
 
-def _shown_frame(seen: Image.Image, photo: Photo) -> Frame | None:
+def _is_read_by_colmap(picture: DecodedPhoto) -> bool:
+    """Return whether COLMAP reads and writes the picture without conversion: 8 bits, opaque and not rotated."""
+    image = picture.image
+    plain = image.mode in ("RGB", "L") and "transparency" not in image.info
+    return image.format in ("JPEG", "MPO", "PNG") and plain and orientation(picture.exif) == 1
+
+
+def _notes(frames: int, size: tuple[int, int], laid: tuple[int, int], *, panorama: bool) -> tuple[str, ...]:
+    """Return notes for people on a file with several pictures, a photo that is scaled down, and a panorama."""
+    many = f"its {frames}" if frames <= MOST_FRAMES else f"more than {MOST_FRAMES}"
+    notes = [f"the first of {many} pictures"] if frames > 1 else []
+    if laid != size:
+        notes.append(f"scaled down from {size[0]} x {size[1]} to {laid[0]} x {laid[1]} pixels")
+    if panorama:
+        notes.append("a panorama of 360 x 180 degrees")
+    return tuple(notes)
+
+
+def _shown_frame(upright: Image.Image, photo: Photo) -> Frame | None:
     """Return the frame of the picture within bars, in pixels of the laid-out photo."""
-    laid = rotate_to_sensor(seen, photo.turn_deg)
-    found = shown_part(laid)
-    if found is None or laid.size == (photo.width, photo.height):
-        return found
+    laid = rotate_to_sensor(upright, photo.turn_deg)
+    frame = shown_part(laid)
+    if frame is None or laid.size == (photo.width, photo.height):
+        return frame
     x, y = photo.width / laid.width, photo.height / laid.height
-    return round(found[0] * x), round(found[1] * y), round(found[2] * x), round(found[3] * y)
+    return round(frame[0] * x), round(frame[1] * y), round(frame[2] * x), round(frame[3] * y)
 
 
 def scaled_size(size: tuple[int, int], most_px: float) -> tuple[int, int]:
-    """Return width and height after shrinking a picture to at most `most_px` pixels.
-
-    Args:
-        size: width and height in pixels.
-        most_px: pixels in all, >= 1.
-    """
+    """Return (width, height) reduced to at most `most_px` >= 1 pixels in all."""
     share = min(1.0, (most_px / (size[0] * size[1])) ** 0.5)
     return max(1, int(size[0] * share)), max(1, int(size[1] * share))
 
 
-PORTRAIT_TURN_DEG = 90
-"""Rotation assumed for a portrait photo whose EXIF does not give one. The opposite rotation would only mirror the
-optical center, which lies near the middle."""
+# Camera groups.
 
 
 def group_by_camera(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:
     """Yield photos with their groups, in their order; photos of one group share one camera.
 
     A camera in COLMAP has one image size. Photos without an EXIF rotation are therefore turned to the more common
-    orientation of their camera; photos that still differ in size get different groups. With "auto", so do letterboxed
-    photos whose pictures within the bars differ in size. Panoramas of one size always share one, with no other photos.
+    orientation of their camera, and photos that still differ in size get different groups. Panoramas of one size form
+    one group.
+
+    Args:
+        photos: their group is the camera named in EXIF.
+        cameras: "auto", by EXIF and the size within bars; "single", one for all; "folder", one each; "each", per photo.
     """
     photos = _complete_panoramas(photos)
     sizes = Counter((_camera_key(photo, cameras), photo.width, photo.height) for photo in photos)
-    found = []
+    grouped = []
     for photo in photos:
-        maker = _camera_key(photo, cameras)
-        here, across = (sizes[maker, *size] for size in ((photo.width, photo.height), (photo.height, photo.width)))
-        on_end = across > here or (across == here and photo.height > photo.width)
-        laid = _rotate(photo) if across and on_end and not photo.turn_deg else photo
-        found.append(replace(laid, group=" ".join(filter(None, (f"{laid.width}x{laid.height}", maker)))))
-    yield from _split_by_shown_size(found) if cameras == "auto" else (replace(photo, shown=None) for photo in found)
+        key = _camera_key(photo, cameras)
+        here, across = (sizes[key, *size] for size in ((photo.width, photo.height), (photo.height, photo.width)))
+        is_minority = across > here or (across == here and photo.height > photo.width)
+        laid = _rotate(photo) if across and is_minority and not photo.turn_deg else photo
+        grouped.append(replace(laid, group=" ".join(filter(None, (f"{laid.width}x{laid.height}", key)))))
+    yield from _split_by_shown_size(grouped) if cameras == "auto" else (replace(one, shown=None) for one in grouped)
 
 
 def _complete_panoramas(photos: Sequence[Photo]) -> list[Photo]:
-    """Return the photos, where most of a size are panoramas with all of that size as panoramas.
+    """Return the photos; those of a size of which most are panoramas are panoramas, too.
 
-    A panorama without metadata is known by its borders, which may be a blank wall.
+    A panorama without metadata is recognized by its borders, which may be a blank wall.
     """
-    sizes = Counter((photo.width, photo.height) for photo in photos)
-    around = Counter((photo.width, photo.height) for photo in photos if photo.projection == EQUIRECTANGULAR)
-    most = {size for size, count in around.items() if count > sizes[size] / 2 and size[0] == 2 * size[1]}
+    counts = Counter((photo.width, photo.height) for photo in photos)
+    panoramas = Counter((photo.width, photo.height) for photo in photos if photo.projection == EQUIRECTANGULAR)
+    sizes = {size for size, count in panoramas.items() if count > counts[size] / 2 and size[0] == 2 * size[1]}
     return [
-        replace(photo, projection=EQUIRECTANGULAR) if (photo.width, photo.height) in most else photo for photo in photos
+        replace(photo, projection=EQUIRECTANGULAR) if (photo.width, photo.height) in sizes else photo
+        for photo in photos
     ]
 
 
 def split_by_given_camera(photos: Sequence[Photo], given: GivenCameras) -> list[Photo]:
-    """Return the photos with groups of their own for those to which a calibration file gives different cameras."""
+    """Return the photos, with groups split where a calibration file gives their photos different cameras."""
     names: dict[str, set[str]] = {}
     for photo in photos:
         if name := given.camera_name(photo.name):
             names.setdefault(photo.group, set()).add(name)
     mixed = {group for group, cameras in names.items() if len(cameras) > 1}
-    found = []
+    split = []
     for photo in photos:
         name = given.camera_name(photo.name) if photo.group in mixed else None
-        found.append(replace(photo, group=f"{photo.group} by {name}") if name else photo)
-    return found
+        split.append(replace(photo, group=f"{photo.group} by {name}") if name else photo)
+    return split
 
 
 def _split_by_shown_size(photos: Sequence[Photo]) -> list[Photo]:
@@ -261,17 +285,17 @@ def _split_by_shown_size(photos: Sequence[Photo]) -> list[Photo]:
     groups: dict[str, list[int]] = {}
     for place, photo in enumerate(photos):
         groups.setdefault(photo.group, []).append(place)
-    found = list(photos)
+    split = list(photos)
     for places in groups.values():
         for place, photo in zip(places, unify_frames([photos[place] for place in places]), strict=True):
             inside = f"{photo.shown[2]}x{photo.shown[3]} in " if photo.shown else ""
-            found[place] = replace(photo, group=inside + photo.group)
-    return found
+            split[place] = replace(photo, group=inside + photo.group)
+    return split
 
 
 def _camera_key(photo: Photo, cameras: str) -> str:
     if photo.projection == EQUIRECTANGULAR:
-        return EQUIRECTANGULAR  # its projection is known, and no camera that was named has it
+        return EQUIRECTANGULAR
     return {
         "auto": photo.group,
         "single": "",
@@ -281,10 +305,9 @@ def _camera_key(photo: Photo, cameras: str) -> str:
 
 
 def _rotate(photo: Photo) -> Photo:
+    """Rotate a photo by 90 degrees; by 270 degrees, only the principal point, near the middle, would be mirrored."""
     shown = photo.shown
     if shown is not None:
         left, top, width, height = shown
         shown = (top, photo.width - left - width, height, width)
-    return replace(
-        photo, width=photo.height, height=photo.width, turn_deg=PORTRAIT_TURN_DEG, needs_copy=True, shown=shown
-    )
+    return replace(photo, width=photo.height, height=photo.width, turn_deg=90, needs_copy=True, shown=shown)

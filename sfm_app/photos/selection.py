@@ -153,7 +153,9 @@ def read_stats(path: Path, digests: Mapping[str, str], options: PhotoSettings) -
 
 
 def _fingerprint_reading(options: PhotoSettings) -> str:
-    return fingerprint(options.model_dump(include={"max_megapixels", "min_side_px"}), {name: version(name) for name in READERS})
+    return fingerprint(
+        options.model_dump(include={"max_megapixels", "min_side_px"}), {name: version(name) for name in READERS}
+    )
 
 
 # Copies: one picture saved twice, smaller, or in another format. They add nothing and have no parallax.

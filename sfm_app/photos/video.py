@@ -15,19 +15,15 @@ from sfm_app.photos.decode import UnreadableError
 from sfm_app.photos.files import is_video, read_head
 from sfm_app.types.arrays import BoolArray, FloatArray
 
-# Read a video frame by frame. FFmpeg opens one regular file, but no file or network address named in it.
-
 Picture = NDArray[np.uint8]
+Float32Array = NDArray[np.float32]
 
-SMALL_PX = 480
-"""Longer side of the pictures that frames are selected from."""
-SAMPLES_PER_S = 30
-"""Faster videos are subsampled to about this rate."""
-FASTEST = 240
-"""Frames per second; a higher rate in the file is taken as wrong."""
-CUT_SHORT = 0.95
-"""A file that ends before this share of its stated length is cut off or damaged."""
-JPEG_QUALITY = 95
+BLURRED = 0.5
+"""A frame with less than this share of its neighbors' sharpness is blurred."""
+MIN_CORNERS = 20
+"""Motion is not estimated from fewer corners."""
+
+# Reading, frame by frame. FFmpeg opens one regular file, but no file or network address named in it.
 
 FFMPEG = {
     "OPENCV_FFMPEG_CAPTURE_OPTIONS": "protocol_whitelist;file|format_whitelist;mov,matroska,webm,avi,mpeg,mpegts",
@@ -38,11 +34,7 @@ FFMPEG = {
 
 @contextmanager
 def open_video(path: Path) -> Iterator["Video"]:
-    """Provide a video that is open for one pass, with FFmpeg's messages silenced.
-
-    Raises:
-        UnreadableError: the file is not a video, or nothing in it can be read.
-    """
+    """Provide a video that is open for one pass, with FFmpeg silenced; raise an UnreadableError if there is none."""
     place = path.resolve()  # FFmpeg takes a relative name with a colon for a protocol
     if not is_video(read_head(place)):
         raise UnreadableError("not a video")
@@ -74,12 +66,12 @@ class Video:
         self.seconds = 0.0
         """Timestamp of the last of them."""
         self.black = 0
-        """Number of sampled frames that are entirely black, which is how OpenCV returns interlaced frames."""
+        """Number of entirely black sampled frames; OpenCV returns interlaced frames black."""
 
     @property
     def stride(self) -> int:
-        """Sampling interval in frames."""
-        return max(1, round(self.rate / SAMPLES_PER_S)) if self.rate <= FASTEST else 1
+        """Sampling interval in frames, for about 30 samples per second; rates above 240 are taken as wrong."""
+        return max(1, round(self.rate / 30)) if self.rate <= 240 else 1
 
     @property
     def sample_count(self) -> int:
@@ -88,43 +80,43 @@ class Video:
 
     @property
     def is_cut_short(self) -> bool:
-        """Whether the file ended before its stated length; known once all frames were read."""
+        """Whether the file ended before 95 % of its stated length; valid once all frames are read."""
         if not (self.rate and self.claimed):
             return False
-        # by time: a frame count that was derived from a wrong rate is wrong, too
-        return self.seconds + 2 / self.rate < CUT_SHORT * self.claimed / self.rate
+        # by time: a frame count derived from a wrong rate is wrong, too
+        return self.seconds + 2 / self.rate < 0.95 * self.claimed / self.rate
 
     def small_frames(self) -> Iterator[tuple[int, Picture]]:
-        """Yield small gray pictures of the sampled frames, with their numbers."""
+        """Yield gray pictures of the sampled frames, with a longer side of 480 pixels, with their numbers."""
         size: tuple[int, int] | None = None
         for number in self._grab_frames():
             if number % self.stride:
                 continue
-            found, picture = self._capture.retrieve()
-            if not found:
+            decoded, picture = self._capture.retrieve()
+            if not decoded:
                 continue
             if not picture.any():
                 self.black += 1
                 continue
             if size is None:
-                shrunk = min(1.0, SMALL_PX / max(picture.shape[:2]))
-                size = max(1, round(picture.shape[1] * shrunk)), max(1, round(picture.shape[0] * shrunk))
+                shrink = min(1.0, 480 / max(picture.shape[:2]))
+                size = max(1, round(picture.shape[1] * shrink)), max(1, round(picture.shape[0] * shrink))
             yield number, _to_gray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
     def jpegs(self, numbers: Sequence[int]) -> Iterator[tuple[int, bytes]]:
-        """Yield frames at full size as JPEG, with their numbers, in ascending order; fewer if the file has changed."""
-        wanted = set(numbers)
+        """Yield these frames at full size as JPEG, in ascending order; fewer if the file has changed."""
+        missing = set(numbers)
         for number in self._grab_frames():
-            if number in wanted:
-                found, picture = self._capture.retrieve()
-                if found:
-                    yield number, cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
-                wanted.remove(number)
-            if not wanted:
+            if number in missing:
+                decoded, picture = self._capture.retrieve()
+                if decoded:
+                    yield number, cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+                missing.remove(number)
+            if not missing:
                 return
 
     def _grab_frames(self) -> Iterator[int]:
-        """Yield frame numbers in order; a frame can be retrieved only until the next one is grabbed."""
+        """Yield frame numbers; each frame can be retrieved until the next one is grabbed."""
         while self._capture.grab():
             self.frames += 1
             self.seconds = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
@@ -150,29 +142,34 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-# Measure image motion and sharpness of a video, frame by frame.
+# Image motion and sharpness, frame by frame.
 
-Float32Array = NDArray[np.float32]
 
-STEP = 0.05
-"""One step of motion: the median displacement of the corners, as a share of the longer side."""
-MAX_BLURRED_STEPS = 1.5
-"""A blurred frame becomes a reference only after this many steps."""
-LEAST_TRACKED = 0.6
-"""Tracking a smaller share of the corners also counts as a step, since the overlap is shrinking."""
-BLURRED = 0.5
-"""A frame with less than this share of its neighbors' sharpness is blurred."""
-RECENT = 30
-"""Number of frames that sharpness is compared with; a blur longer than most of them counts as normal."""
-SHARP_PERCENTILE = 80
-"""Percentile of the recent sharpness that stands for a sharp frame, even if most are blurred."""
-CORNERS = 200
-MIN_CORNERS = 20
-"""Motion is not estimated from fewer corners."""
-FORWARD_BACKWARD_PX = 1.0
-"""Largest forward-backward error of a tracked corner; beyond, it is lost."""
-WINDOW_PX, LEVELS = 15, 3
-"""Window and pyramid levels of the Lucas-Kanade method."""
+@dataclass(frozen=True, slots=True)
+class TrackingOptions:
+    """Constants of the measurement of motion and sharpness."""
+
+    step: float = 0.05
+    """One step of motion: the median displacement of the corners, as a share of the longer side."""
+    max_blurred_steps: float = 1.5
+    """A blurred frame becomes the reference only after this many steps."""
+    min_tracked: float = 0.6
+    """Tracking a smaller share of the corners also counts as a step, since the overlap shrinks."""
+    recent: int = 30
+    """Number of frames that sharpness is compared with; a blur longer than most of them counts as normal."""
+    sharp_percentile: int = 80
+    """Percentile of the recent sharpness that stands for a sharp frame, even if most are blurred."""
+    corners: int = 200
+    """Largest number of corners."""
+    forward_backward_px: float = 1.0
+    """Largest forward-backward error of a tracked corner."""
+    window_px: int = 15
+    """Window of the Lucas-Kanade method."""
+    levels: int = 3
+    """Its pyramid levels."""
+
+
+OPTIONS = TrackingOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,73 +192,68 @@ class CornerTracker:
     """
 
     def __init__(self) -> None:
-        self.seen = False
+        self.has_texture = False
         """Whether any frame had enough corners to track."""
-        self._passed = 0.0
+        self._reference_steps = 0.0
         self._reference: Picture | None = None
         self._corners = np.zeros((0, 1, 2), np.float32)
         self._last = self._corners
-        self._moved = 0.0
-        self._recent: deque[float] = deque(maxlen=RECENT)
+        self._motion = 0.0
+        self._recent: deque[float] = deque(maxlen=OPTIONS.recent)
 
     def track(self, frame: int, gray: Picture) -> TrackedFrame:
-        """Measure sharpness and accumulated motion of the next frame."""
+        """Measure sharpness and accumulated motion of the next frame, a gray picture (H, W) of constant size."""
         sharpness = float(cv2.Laplacian(gray, cv2.CV_32F).var())
         self._recent.append(sharpness)
         if self._reference is None or len(self._corners) < MIN_CORNERS:
             self._set_reference(gray)
-            return TrackedFrame(frame, sharpness, self._passed)
-        self._moved, followed = self._track_corners(self._reference, gray)
+            return TrackedFrame(frame, sharpness, self._reference_steps)
+        self._motion, tracked = self._track_corners(self._reference, gray)
         # corners lost to blur reappear later, so they do not count as lost overlap
-        blurred = sharpness < BLURRED * float(np.percentile(self._recent, SHARP_PERCENTILE))
-        lost = 0.0 if blurred else min(1.0, (1 - followed) / (1 - LEAST_TRACKED))
-        part = max(self._moved / STEP, lost)
-        way = self._passed + part
-        if part >= (MAX_BLURRED_STEPS if blurred else 1.0):
-            self._passed = way
+        blurred = sharpness < BLURRED * float(np.percentile(self._recent, OPTIONS.sharp_percentile))
+        lost = 0.0 if blurred else min(1.0, (1 - tracked) / (1 - OPTIONS.min_tracked))
+        steps = max(self._motion / OPTIONS.step, lost)
+        path_steps = self._reference_steps + steps
+        if steps >= (OPTIONS.max_blurred_steps if blurred else 1.0):
+            self._reference_steps = path_steps
             self._set_reference(gray)
-        return TrackedFrame(frame, sharpness, way)
+        return TrackedFrame(frame, sharpness, path_steps)
 
     def _set_reference(self, gray: Picture) -> None:
-        corners = cv2.goodFeaturesToTrack(gray, CORNERS, qualityLevel=0.01, minDistance=max(gray.shape) / 60)
-        self._reference, self._moved = gray, 0.0
+        corners = cv2.goodFeaturesToTrack(gray, OPTIONS.corners, qualityLevel=0.01, minDistance=max(gray.shape) / 60)
+        self._reference, self._motion = gray, 0.0
         self._corners = np.zeros((0, 1, 2), np.float32) if corners is None else np.asarray(corners, np.float32)
         self._last = self._corners
-        self.seen = self.seen or len(self._corners) >= MIN_CORNERS
+        self.has_texture = self.has_texture or len(self._corners) >= MIN_CORNERS
 
     def _track_corners(self, reference: Picture, gray: Picture) -> tuple[float, float]:
-        """Return the median displacement of the corners, in longer sides, and the share of corners that are tracked."""
-        there, found = _optical_flow(reference, gray, self._corners, self._last)
-        back, found_back = _optical_flow(gray, reference, there, self._corners)
-        off = np.linalg.norm(back - self._corners, axis=2)[:, 0]
-        inside = np.all((there[:, 0] >= 0) & (there[:, 0] < gray.shape[::-1]), axis=1)
-        alive = found & found_back & (off < FORWARD_BACKWARD_PX) & inside
-        if np.count_nonzero(alive) < MIN_CORNERS:
-            return self._moved, float(np.mean(alive))
-        flow = (there - self._corners)[alive, 0]
+        """Return the median displacement of the corners in longer sides, and the share of tracked corners."""
+        forward, found = _optical_flow(reference, gray, self._corners, self._last)
+        back, found_back = _optical_flow(gray, reference, forward, self._corners)
+        error = np.linalg.norm(back - self._corners, axis=2)[:, 0]
+        inside = np.all((forward[:, 0] >= 0) & (forward[:, 0] < gray.shape[::-1]), axis=1)
+        tracked = found & found_back & (error < OPTIONS.forward_backward_px) & inside
+        if np.count_nonzero(tracked) < MIN_CORNERS:
+            return self._motion, float(np.mean(tracked))
+        flow = (forward - self._corners)[tracked, 0]
         # the next search for lost corners starts from the median flow
-        self._last = np.where(alive[:, None, None], there, self._corners + np.median(flow, axis=0)).astype(np.float32)
-        return float(np.median(np.linalg.norm(flow, axis=1))) / max(gray.shape), float(np.mean(alive))
+        guess = np.where(tracked[:, None, None], forward, self._corners + np.median(flow, axis=0))
+        self._last = guess.astype(np.float32)
+        return float(np.median(np.linalg.norm(flow, axis=1))) / max(gray.shape), float(np.mean(tracked))
 
 
 def _optical_flow(
     before: Picture, after: Picture, points: Float32Array, guess: Float32Array
 ) -> tuple[Float32Array, BoolArray]:
-    """Find points (N, 1, 2) of one picture in another; return their positions and whether each was found."""
-    there, found, _ = cv2.calcOpticalFlowPyrLK(
+    """Find points (N, 1, 2) of one picture in another; return their positions, and (N,) whether each was found."""
+    positions, found, _ = cv2.calcOpticalFlowPyrLK(
         before, after, points, guess.copy(),
-        winSize=(WINDOW_PX, WINDOW_PX), maxLevel=LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        winSize=(OPTIONS.window_px, OPTIONS.window_px), maxLevel=OPTIONS.levels, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
-    return there, found[:, 0] > 0
+    return positions, found[:, 0] > 0
 
 
-# Select the frames of a video that become photos: the sharpest frame around each step of motion.
-
-NEAR, FAR = 0.25, 0.5
-"""The sharpest frame is searched within NEAR steps on either side; within FAR steps if those are all blurred."""
-GAP = 1.5
-"""Longest gap between chosen frames, in steps, while all frames are blurred; then a blurred one is chosen."""
-HARDLY_MOVED, LESS_SHARP, TOO_MANY = "hardly moved on", "less sharp than a neighbor", "more than max_frames"
+# Choice of the frames that become photos: the sharpest one near each step of motion.
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,52 +265,50 @@ class Choice:
     """Number of frames by reason; each measured frame is either chosen or counted once."""
 
 
-def select_keyframes(looks: Sequence[TrackedFrame], most: int) -> Choice:
-    """Choose one frame per step of motion; the spacing grows if that would be more than `most` frames.
-
-    Args:
-        looks, most: measurements of the frames, in order; largest number of chosen frames, >= 2.
-    """
-    way = np.array([look.path_steps for look in looks], np.float64)
-    sharpness = np.array([look.sharpness for look in looks], np.float64)
-    if not len(way):
+def select_keyframes(frames: Sequence[TrackedFrame], most: int) -> Choice:
+    """Choose one frame per step of motion; the spacing grows if that would be more than `most` >= 2 frames."""
+    path = np.array([frame.path_steps for frame in frames], np.float64)
+    sharpness = np.array([frame.sharpness for frame in frames], np.float64)
+    if not len(path):
         return Choice((), {})
-    every, near = sharpest_frames(way, sharpness, 1.0)
+    every, candidates = sharpest_frames(path, sharpness, 1.0)
     chosen = every
     if len(every) > most:
-        chosen, near = sharpest_frames(way, sharpness, float(way.max()) / (most - 1) * (1 - 1e-12))
-    others = set(range(len(looks))) - set(chosen)
+        chosen, candidates = sharpest_frames(path, sharpness, float(path.max()) / (most - 1) * (1 - 1e-12))
+    others = set(range(len(frames))) - set(chosen)
     too_many = others & set(every)
-    less_sharp = (others & near) - too_many
+    less_sharp = (others & candidates) - too_many
     counts = {
-        HARDLY_MOVED: len(others) - len(too_many) - len(less_sharp),
-        LESS_SHARP: len(less_sharp),
-        TOO_MANY: len(too_many),
+        "hardly moved on": len(others) - len(too_many) - len(less_sharp),
+        "less sharp than a neighbor": len(less_sharp),
+        "more than max_frames": len(too_many),
     }
-    return Choice(tuple(looks[k].frame for k in chosen), {reason: count for reason, count in counts.items() if count})
+    return Choice(tuple(frames[k].frame for k in chosen), {reason: count for reason, count in counts.items() if count})
 
 
-def sharpest_frames(way: FloatArray, sharpness: FloatArray, spacing: float) -> tuple[list[int], set[int]]:
-    """Return the sharpest frame around every multiple of a spacing, and all candidates.
+def sharpest_frames(path: FloatArray, sharpness: FloatArray, spacing: float) -> tuple[list[int], set[int]]:
+    """Return the sharpest frame near every multiple of a spacing >= 1, and all candidates.
+
+    It lies within 0.25 steps of the multiple, or within 0.5 steps if the nearer frames are all blurred. A blurred frame
+    is chosen only 1.5 steps or more after the last one.
 
     Args:
-        way, sharpness: (N,) accumulated motion in steps, (N,) sharpness.
-        spacing: steps, >= 1.
+        path, sharpness: (N,) accumulated motion in steps, (N,) sharpness.
     """
     chosen: list[int] = []
     candidates: set[int] = set()
-    for target in np.arange(0.0, way.max() + 1e-9, spacing):
-        moment = int(np.argmax(way >= min(target, way.max())))
+    for target in np.arange(0.0, path.max() + 1e-9, spacing):
+        moment = int(np.argmax(path >= min(target, path.max())))
         if chosen and moment <= chosen[-1]:
             continue
         first = chosen[-1] + 1 if chosen else 0
-        near = _nearby_frames(way, moment, target, NEAR, first)
-        sharp = BLURRED * sharpness[_nearby_frames(way, moment, target, 1.0, 0)].max()
+        near = _nearby_frames(path, moment, target, 0.25, first)
+        sharp = BLURRED * sharpness[_nearby_frames(path, moment, target, 1.0, 0)].max()
         best = _sharpest_frame(sharpness, near)
         if sharpness[best] < sharp:
-            best = _sharpest_frame(sharpness, _nearby_frames(way, moment, target, FAR, first))
+            best = _sharpest_frame(sharpness, _nearby_frames(path, moment, target, 0.5, first))
         candidates.update(map(int, near))
-        if sharpness[best] >= sharp or not chosen or way[best] - way[chosen[-1]] >= GAP:
+        if sharpness[best] >= sharp or not chosen or path[best] - path[chosen[-1]] >= 1.5:
             chosen.append(best)
     return chosen, candidates
 
@@ -327,12 +317,12 @@ def _sharpest_frame(sharpness: FloatArray, frames: NDArray[np.int64]) -> int:
     return int(frames[np.argmax(sharpness[frames])])
 
 
-def _nearby_frames(way: FloatArray, moment: int, target: float, reach: float, first: int) -> NDArray[np.int64]:
-    """Return the consecutive frames around a moment whose accumulated motion lies within reach of the target."""
-    outside = np.abs(way - target) > reach
+def _nearby_frames(path: FloatArray, moment: int, target: float, reach: float, first: int) -> NDArray[np.int64]:
+    """Return the consecutive frames around a moment whose motion is within `reach` steps of the target."""
+    outside = np.abs(path - target) > reach
     outside[:first] = True
     before = np.flatnonzero(outside[:moment])
     after = np.flatnonzero(outside[moment + 1 :])
     start = int(before[-1]) + 1 if len(before) else 0
-    end = moment + 1 + int(after[0]) if len(after) else len(way)
+    end = moment + 1 + int(after[0]) if len(after) else len(path)
     return np.arange(max(start, first), end, dtype=np.int64)

@@ -39,35 +39,30 @@ from sfm_app.types import Rejected, Scene
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
 
 SKIES = "skies.npz"
-"""File with the cells of each photo that show sky."""
-CONFIRMING_FACTOR = 2
-"""A depth map is checked against this many times as many photos as it was made from."""
+"""File with each photo's cells of sky."""
 
 
 def make(scene: Scene, run: RunContext) -> Path:
-    """Make a depth and a normal map of every photo that has neighbors; a killed run can resume.
-
-    Returns:
-        The dense workspace.
+    """Make a depth and a normal map of every photo with neighbors in the dense workspace; a killed run can resume.
 
     Raises:
         ReconstructionError: no photo gets a depth map.
-        ConfigError: the method that was asked for cannot run here.
+        ConfigError: the chosen method cannot run here.
         BackendError: COLMAP failed.
     """
     dense_dir, options = run.workspace.dense, run.settings.depth
-    method, why = run.plugins.depth_method(options.method)
-    run.record(method=method.name, method_reason=why)
+    method, reason = run.plugins.depth_method(options.method)
+    run.record(method=method.name, method_reason=reason)
     prepare(scene, dense_dir, method.name, run)
     views = read_views(dense_dir)
-    ranked = rank_neighbors(views, CONFIRMING_FACTOR * options.neighbors)
+    ranked = rank_neighbors(views, 2 * options.neighbors)  # twice as many confirm a map as make it
     with single_threaded_opencv():
-        found = method.make(DepthTask(dense_dir, views, ranked, options, DenseStore(dense_dir), run.map))
+        rejections = method.make(DepthTask(dense_dir, views, ranked, options, DenseStore(dense_dir), run.map))
     if options.drop_sky:
         drop_skies(dense_dir, [view for view in views if map_file(dense_dir, view).exists()], run)
     if has_masks(dense_dir):
         run.map(Task(mask_depths, dense_dir), views, "masking depth maps")
-    record(dense_dir, views, found, run)
+    record(dense_dir, views, rejections, run)
     drop_estimates(dense_dir, views)
     write_fusion_views(dense_dir, views)
     mark_finished(dense_dir)
@@ -85,7 +80,7 @@ def digest(place: Workspace) -> str:
 
 
 def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None:
-    """Undistort photos and masks, unless a killed run has left a workspace made from the same inputs."""
+    """Undistort photos and masks, unless a killed run has left a workspace from the same inputs."""
     model = [(file.name, blake2b(file.read_bytes()).hexdigest()) for file in sorted(scene.model_dir.glob("*.bin"))]
     made_from = fingerprint(run.fingerprint, method, model)
     if not resume_or_clear(dense_dir, made_from):
@@ -97,18 +92,18 @@ def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None
                 undistort_mask = MaskUndistorter(scene.model_dir, run.mask_dir, dense_dir)
                 run.map(Task(undistort_mask), read_views(dense_dir), "undistorting masks")
         else:
-            look_into_photos(scene, lenses, dense_dir, run)
+            project_wide_photos(scene, lenses, dense_dir, run)
         mark_unfinished(dense_dir, made_from)
 
 
-def look_into_photos(scene: Scene, lenses: Mapping[int, WideLens], dense_dir: Path, run: RunContext) -> None:
+def project_wide_photos(scene: Scene, lenses: Mapping[int, WideLens], dense_dir: Path, run: RunContext) -> None:
     """Write several perspective views of each photo of a wide lens."""
-    look_into = Task(_look_into, Shared(lenses), run.workspace.photos, run.mask_dir, dense_dir)
-    run.map(look_into, write_model(scene.model_dir, lenses, dense_dir), "looking into wide photos")
+    project = Task(_project_wide_photo, Shared(lenses), run.workspace.photos, run.mask_dir, dense_dir)
+    run.map(project, write_model(scene.model_dir, lenses, dense_dir), "projecting wide photos")
     run.record(views_per_photo=max(len(lens.views) for lens in lenses.values()))
 
 
-def _look_into(
+def _project_wide_photo(
     lenses: Shared[Mapping[int, WideLens]], photo_dir: Path, mask_dir: Path | None, dense_dir: Path,
     photo: tuple[str, int],
 ) -> None:  # fmt: skip
@@ -117,25 +112,22 @@ def _look_into(
 
 
 def drop_skies(dense_dir: Path, views: Sequence[View], run: RunContext) -> None:
-    """Remove the depths of what is infinitely far: semi-global matching carries depths on along its rims."""
-    kept = dense_dir / SKIES
-    if not kept.exists():  # a killed run has removed depths by it, and would find other skies now
-        areas = run.map(Task(find_blank_areas, dense_dir), views, "looking for the sky")
+    """Remove the depths of sky: semi-global matching continues depths along its rims. The views have a map."""
+    file = dense_dir / SKIES
+    if not file.exists():  # a killed run has removed depths by these skies, and would find others now
+        areas = run.map(Task(find_blank_areas, dense_dir), views, "detecting the sky")
         votes = run.map(Task(_count_votes, Shared((areas, views))), range(len(views)), "comparing skies")
-        with replace_atomically(kept) as path:
-            np.savez(
-                path,
-                allow_pickle=False,
-                **{str(number): cells for number, cells in enumerate(find_skies(areas, votes))},
-            )
-    skies = load_arrays(kept)
-    under_sky = [(number, view) for number, view in enumerate(views) if skies[str(number)].any()]
-    shares = run.map(Task(_drop_sky, dense_dir, Shared(skies)), under_sky, "dropping the sky") if under_sky else []
+        cells = {str(number): sky for number, sky in enumerate(find_skies(areas, votes))}
+        with replace_atomically(file) as path:
+            np.savez(path, allow_pickle=False, **cells)
+    skies = load_arrays(file)
+    outdoor = [(number, view) for number, view in enumerate(views) if skies[str(number)].any()]
+    shares = run.map(Task(_drop_sky, dense_dir, Shared(skies)), outdoor, "removing the sky") if outdoor else []
     run.record(sky=round(sum(shares) / max(len(views), 1), 3))
 
 
 def find_blank_areas(dense_dir: Path, view: View) -> PhotoAreas:
-    """Return the blank areas of a photo."""
+    """Return the blank areas of a photo with a map."""
     return blank_areas(read_gray(dense_dir, view), read_depth(dense_dir, view, "geometric"))
 
 
@@ -152,20 +144,16 @@ def _drop_sky(dense_dir: Path, skies: Shared[Mapping[str, NDArray[np.bool_]]], p
     return float(sky.mean())
 
 
-def record(dense_dir: Path, views: Sequence[View], found: Sequence[Rejected | None], run: RunContext) -> None:
-    """Note the share of each photo that has a depth, and why photos have no depth map.
+def record(dense_dir: Path, views: Sequence[View], rejections: Sequence[Rejected | None], run: RunContext) -> None:
+    """Record each photo's share of depths, and the reasons for missing depth maps; None stands for a depth map.
 
-    Args:
-        found: per view why it has no depth map; None where it has one.
-
-    Raises:
-        ReconstructionError: no view has a depth map.
+    Raise a ReconstructionError if no view has a depth map.
     """
-    rejected = Counter(reason.reason for reason in found if reason is not None)
+    rejected = Counter(rejection.reason for rejection in rejections if rejection is not None)
     coverage = {
         view.name: round(float(np.mean(read_depth(dense_dir, view, "geometric") > 0)), 3)
-        for view, reason in zip(views, found, strict=True)
-        if reason is None
+        for view, rejection in zip(views, rejections, strict=True)
+        if rejection is None
     }
     run.record(depth_maps=len(coverage), rejected=dict(rejected), coverage=coverage)
     if not coverage:

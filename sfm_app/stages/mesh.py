@@ -37,24 +37,15 @@ from sfm_app.types import Scene, Surface
 
 SURFACE = "surface.npz"
 FUSED_DIGEST = "fused.txt"
-"""File with the hash of the fused points, so that a resumed run does not read damaged ones."""
+"""File with the hash of the fused points, by which a resumed run detects damage."""
 HINT = "take more photos, a step apart, with more overlap; OUT/points.ply and OUT/points.glb have the sparse points"
-
-FEWEST_POINTS = 100
-"""Fewer fused points carry no surface."""
-
-MOST_CELLS_PER_FACE = 1.6
-"""Occupied cells of Poisson's octree for each triangle of the finished mesh, where it is not refined: four triangles
-are simplified to one. Chosen at `draft` on fountain-P11."""
-CONFIRMED_SHARE = 2 / 3
-"""A part stays when this share of the photos that a fused point needs confirms its average vertex."""
 
 
 def make(scene: Scene, dense_dir: Path, run: RunContext) -> Surface:
-    """Span a surface over the fused points, keep what the photos confirm, refine it by them, and simplify it.
+    """Span a surface over the fused points, keep the confirmed parts, refine it by the photos, and simplify it.
 
     Raises:
-        ReconstructionError: the depth maps do not give a surface; the message says why.
+        ReconstructionError: the depth maps do not give a surface.
         BackendError: COLMAP failed.
     """
     place, options = run.workspace.surface, run.settings.mesh
@@ -76,18 +67,14 @@ def make(scene: Scene, dense_dir: Path, run: RunContext) -> Surface:
 def _mesh_at_once(
     source: tuple[Path, Originals], views: list[View], points: NDArray[np.void], run: RunContext
 ) -> Surface:
-    """Return the surface of all points.
-
-    Args:
-        points: (N,) records of the fused points.
-    """
+    """Return the surface of all fused points (N,), from the dense workspace and the original photos."""
     (dense_dir, originals), options = source, run.settings.mesh
     raw = _check_nonempty(_span(points, run), "the fused points span no surface")
     judges = SurfaceJudge.prepare(raw, dense_dir, run.settings.depth.consistency)
-    found = ordered_map(run.executor, Task(judge_view, Shared(judges)), views, ahead=run.workers)
-    colored, support = judges.sum_up(track(run.progress, found, "confirming the surface", len(views)))
-    least = _min_confirmed(views, run)
-    trimmed = trim(colored, support, options.max_gap_triangles, least) if options.trim else colored
+    judged = ordered_map(run.executor, Task(judge_view, Shared(judges)), views, ahead=run.workers)
+    colored, support = judges.sum_up(track(run.progress, judged, "confirming the surface", len(views)))
+    confirmed = _min_confirmed(views, run)
+    trimmed = trim(colored, support, options.max_gap_triangles, confirmed) if options.trim else colored
     detailed = _check_nonempty(drop_islands(trimmed, options.min_island), "the photos confirm no part of the surface")
     run.record(detailed_triangles=len(detailed.faces))
     if options.max_image_size_px:
@@ -100,19 +87,19 @@ def _mesh_at_once(
 
 
 def _span(points: NDArray[np.void], run: RunContext) -> Surface:
-    """Return Poisson's surface of all points, as fine as there are points, and as triangles are asked for."""
-    options, where = run.settings.mesh, positions(points)
-    bounds = np.stack([where.min(axis=0), where.max(axis=0)])
+    """Return Poisson's surface of all points, as fine as their density and the wanted number of triangles allow."""
+    options, xyz = run.settings.mesh, positions(points)
+    bounds = np.stack([xyz.min(axis=0), xyz.max(axis=0)])
     if (extent := float(np.ptp(bounds, axis=0).max())) == 0.0:
         raise ReconstructionError("the fused points have no extent", hint=HINT)
-    # a surface that is not refined loses most of its triangles at once
-    most_cells = np.inf if options.max_image_size_px else MOST_CELLS_PER_FACE * options.faces
+    # without refinement, 1.6 occupied cells per final triangle: four triangles are simplified to one (at `draft`)
+    max_cells = np.inf if options.max_image_size_px else 1.6 * options.faces
     sizes = list(cell_sizes(extent, options.poisson_depth))
     with run.step("finding the surface"):
-        cell = choose_cell(sizes, RecordCells(lambda: [points]), max(CELLS.least_points, len(where) / most_cells))
+        cell = choose_cell(sizes, RecordCells(lambda: [points]), max(CELLS.least_points, len(xyz) / max_cells))
         cube = cube_around(bounds[0], bounds[1], cell)
-        kept = with_halo(bounds, cell) if options.trim else EVERYWHERE
-        surface, raw = span_surface(points, kept, cube, run.workspace.surface)
+        region = with_halo(bounds, cell) if options.trim else EVERYWHERE
+        surface, raw = span_surface(points, region, cube, run.workspace.surface)
     run.record(cell=cell, raw_triangles=raw)
     return surface
 
@@ -121,27 +108,27 @@ def _refine(surface: Surface, originals: Originals, views: list[View], run: RunC
     """Return the surface with the detail of the photos."""
 
     def spread(ask: Callable[[int], Any], photos: Sequence[int]) -> Iterator[Any]:
-        for found in ordered_map(run.executor, ask, photos, ahead=2 * run.workers):
+        for answer in ordered_map(run.executor, ask, photos, ahead=2 * run.workers):
             run.progress.advance()
-            yield found
+            yield answer
 
-    run.progress.start("refining the surface", (1 + STEPS) * len(views))  # each is read, too
+    run.progress.start("refining the surface", (1 + STEPS) * len(views))  # reading counts as a step
     try:
-        found = refine_surface(surface, originals, views, rank_partners(views), run.settings.mesh, spread)
+        refined = refine_surface(surface, originals, views, rank_partners(views), run.settings.mesh, spread)
     finally:
         run.progress.finish()
-    if found.failed:
-        run.record(refinement_failed=found.failed)
-        run.progress.say(f"the surface stays as the depth maps have it: {found.failed}")
-    run.record(refined_triangles=len(found.surface.faces))
-    run.record(photo_correlations=[round(one, 4) for one in found.correlations])
-    return found.surface
+    if refined.failed:
+        run.record(refinement_failed=refined.failed)
+        run.progress.say(f"the surface is not refined by the photos: {refined.failed}")
+    run.record(refined_triangles=len(refined.surface.faces))
+    run.record(photo_correlations=[round(one, 4) for one in refined.correlations])
+    return refined.surface
 
 
-def _check_nonempty(surface: Surface, otherwise: str) -> Surface:
-    """Return the surface after checking that it has triangles; raise a ReconstructionError if it has none."""
+def _check_nonempty(surface: Surface, problem: str) -> Surface:
+    """Return the surface; raise a ReconstructionError if it has no triangles."""
     if not len(surface.faces):
-        raise ReconstructionError(otherwise, hint=HINT)
+        raise ReconstructionError(problem, hint=HINT)
     return surface
 
 
@@ -152,38 +139,38 @@ def load(run: RunContext) -> Surface:
 
 
 def digest(place: Workspace) -> str:
-    """Return a hash of the surface, and of the fine one where it is kept."""
+    """Return a hash of the surface, and of the fine surface if it is kept."""
     fine = place.fine_surface
     return digest_files(place.surface, SURFACE, *([fine.name] if fine.exists() else []))
 
 
 def _fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray[np.void]:
-    """Return the records (N,) of the fused points; fuse again only where a map or their folder is newer."""
+    """Return the records (N,) of the fused points; fuse again if they are damaged or a map is newer."""
     if not views:
         raise ReconstructionError("no photo has a depth map", hint=HINT)
     place = run.workspace.surface
     target = place / FUSED
     files = [map_file(dense_dir, view) for view in views]
-    youngest = max(path.stat().st_mtime_ns for path in (*files, files[0].parent))
-    whole = place / FUSED_DIGEST
-    sound = target.exists() and is_made_from(whole, digest_files(place, FUSED))
-    if not sound or target.stat().st_mtime_ns <= youngest:
+    newest = max(path.stat().st_mtime_ns for path in (*files, files[0].parent))
+    marker = place / FUSED_DIGEST
+    sound = target.exists() and is_made_from(marker, digest_files(place, FUSED))
+    if not sound or target.stat().st_mtime_ns <= newest:
         fuse_maps(dense_dir, views, _min_views(views, run), target, run)
-        whole.write_text(digest_files(place, FUSED), encoding="utf-8", newline="\n")
+        marker.write_text(digest_files(place, FUSED), encoding="utf-8", newline="\n")
     points = open_points(target)
     run.record(fused_points=len(points))
-    if len(points) < FEWEST_POINTS:
+    if len(points) < 100:
         raise ReconstructionError(
-            f"the {len(views)} depth maps agree on {len(points) or 'no'} points only: too few for a surface", hint=HINT
+            f"the {len(views)} depth maps agree on only {len(points)} points: too few for a surface", hint=HINT
         )
     return points
 
 
 def _min_views(views: list[View], run: RunContext) -> int:
-    """Return how many photos have to see a fused point."""
+    """Return the number of photos that have to see a fused point."""
     return min(1 + run.settings.depth.min_agreeing, len(views))
 
 
 def _min_confirmed(views: list[View], run: RunContext) -> float:
-    """Return how many photos have to confirm the average vertex of a part."""
-    return CONFIRMED_SHARE * _min_views(views, run)
+    """Return the number of photos that have to confirm the average vertex of a part."""
+    return 2 / 3 * _min_views(views, run)

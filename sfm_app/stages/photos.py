@@ -1,4 +1,4 @@
-"""The chosen frames of a video, written to OUT/frames as a folder of photos."""
+"""photos: folder or video -> PhotoSet."""
 
 import errno
 import json
@@ -45,109 +45,99 @@ from sfm_app.settings import PhotoSettings
 from sfm_app.tasks import Task
 from sfm_app.types import Photo, PhotoSet, UnusablePhoto
 
-HINT = "walk around while you film, slowly, and keep the object in view"
+MANY_FILES = 5000
+"""Number of files above which the folder may be a wrong one, such as a home. Chosen by hand."""
 DAMAGED = "play it to see whether it is whole; save it as MP4 with H.264"
-INTERLACED = "save it deinterlaced (progressive), as MP4 with H.264"
-BLACK = "black"
-LONGEST_STEM = 40
+
+# The chosen frames of a video, written to OUT/frames as a folder of photos.
 
 
 @dataclass(frozen=True, slots=True)
 class FrameChoice:
-    """The choice of frames of a video."""
+    """The chosen frames of a video."""
 
     made_from: str
     """Fingerprint of the inputs."""
     frames: tuple[int, ...]
-    """Numbers of the chosen frames."""
+    """Frame numbers."""
     times_s: tuple[float, ...]
-    """When they were taken."""
+    """Timestamps of the frames, in seconds."""
     counts: Mapping[str, Any]
     """Figures for the manifest."""
 
 
-@dataclass(frozen=True, slots=True)
-class VideoFrames:
-    """The chosen frames of a video as a folder."""
-
-    folder: Path
-    times_s: Mapping[str, float]
-    """When they were taken, by file name."""
-
-
 @contextmanager
-def video_frames(source: Path, run: RunContext) -> Iterator[VideoFrames]:
-    """Provide a folder with the chosen frames of a video.
+def video_frames(source: Path, run: RunContext) -> Iterator[dict[str, float]]:
+    """Write the chosen frames of a video to OUT/frames, and provide their timestamps in seconds by file name.
 
-    If the run is killed before the block ends, the next one keeps the choice.
-
-    Raises:
-        InputError: the video cannot be read, or shows too little.
+    If the run is killed before the block ends, the next one keeps the choice. Raise an InputError if the video cannot
+    be read or shows too little motion.
     """
-    chosen = read_choice(run)
-    if chosen is None:
-        chosen = choose_frames(source, run)
+    choice = read_choice(run)
+    if choice is None:
+        choice = choose_frames(source, run)
         shutil.rmtree(run.workspace.frames, ignore_errors=True)
         with replace_atomically(run.workspace.frames_marker) as path:
-            path.write_text(json.dumps(asdict(chosen)), encoding="utf-8", newline="\n")
-    _write_frames(source, chosen.frames, run)
-    run.record(video=chosen.counts)
-    names = (frame_name(source, frame) for frame in chosen.frames)
-    yield VideoFrames(run.workspace.frames, dict(zip(names, chosen.times_s, strict=True)))
+            path.write_text(json.dumps(asdict(choice)), encoding="utf-8", newline="\n")
+    _write_frames(source, choice.frames, run)
+    run.record(video=choice.counts)
+    names = (frame_name(source, frame) for frame in choice.frames)
+    yield dict(zip(names, choice.times_s, strict=True))
     run.workspace.frames_marker.unlink()
 
 
 def read_choice(run: RunContext) -> FrameChoice | None:
-    """Return the choice of a killed run from the same inputs; None where there is none."""
+    """Return the choice of a killed run from the same inputs, or None."""
     try:
-        found = json.loads(run.workspace.frames_marker.read_text(encoding="utf-8"))
-        frames, times_s = tuple(map(int, found["frames"])), tuple(map(float, found["times_s"]))
-        chosen = FrameChoice(found["made_from"], frames, times_s, dict(found["counts"]))
+        values = json.loads(run.workspace.frames_marker.read_text(encoding="utf-8"))
+        frames, times_s = tuple(map(int, values["frames"])), tuple(map(float, values["times_s"]))
+        choice = FrameChoice(values["made_from"], frames, times_s, dict(values["counts"]))
     except (OSError, ValueError, TypeError, LookupError):
         return None
-    return chosen if chosen.made_from == run.fingerprint and len(times_s) == len(frames) else None
+    return choice if choice.made_from == run.fingerprint and len(times_s) == len(frames) else None
 
 
 def choose_frames(source: Path, run: RunContext) -> FrameChoice:
     """Choose frames from the whole video."""
-    most = run.settings.photos.max_frames
     try:
         with open_video(source) as video:
-            follower = CornerTracker()
-            pictures = track(run.progress, video.small_frames(), "looking at frames", video.sample_count)
-            looks, moments = [], {}
+            tracker = CornerTracker()
+            pictures = track(run.progress, video.small_frames(), "tracking frames", video.sample_count)
+            tracked, times_s = [], {}
             for number, small in pictures:
-                looks.append(follower.track(number, small))
-                moments[number] = video.seconds
+                tracked.append(tracker.track(number, small))
+                times_s[number] = video.seconds
     except UnreadableError as err:
         raise InputError(f"cannot read {source}: {err}", hint=DAMAGED) from err
-    looked_at, notes = len(looks) + video.black, []
-    if video.black and not looks:
-        raise InputError(f"cannot read {source}: all frames come out black, as interlaced ones do", hint=INTERLACED)
+    sampled, notes = len(tracked) + video.black, []
+    if video.black and not tracked:
+        hint = "save it deinterlaced (progressive), as MP4 with H.264"
+        raise InputError(f"cannot read {source}: all frames are black, as those of interlaced videos", hint=hint)
     if video.is_cut_short:
-        looks = looks[:-1]  # it may be half a picture
-        notes = [f"the file is cut off or damaged after {video.seconds:.1f} s; what comes before is used"]
-    if not looks:
+        tracked = tracked[:-1]  # it may be half a picture
+        notes = [f"the file is cut off or damaged after {video.seconds:.1f} s; the frames before are used"]
+    if not tracked:
         raise InputError(f"cannot read {source}: no frame can be decoded", hint=DAMAGED)
-    choice = select_keyframes(looks, most)
+    choice = select_keyframes(tracked, run.settings.photos.max_frames)
     if len(choice.frames) < 2:
-        why = "the camera does not move" if follower.seen else "there is hardly any texture to follow"
-        raise InputError(f"{why} in {source}: {video.frames} frames, and all show one view", hint=HINT)
+        problem = "the camera does not move" if tracker.has_texture else "there is too little texture to track"
+        hint = "walk around while you film, slowly, and keep the object in view"
+        raise InputError(f"{problem} in {source}: its {video.frames} frames show one view", hint=hint)
     counts = {
         "frames": video.frames,
         "seconds": round(video.seconds, 2),
-        "looked_at": looked_at,
+        "looked_at": sampled,
         "chosen": len(choice.frames),
-        "left_out": choice.left_out | ({BLACK: video.black} if video.black else {}),
+        "left_out": choice.left_out | ({"black": video.black} if video.black else {}),
         "notes": notes,
     }
-    return FrameChoice(run.fingerprint, choice.frames, tuple(moments[frame] for frame in choice.frames), counts)
+    return FrameChoice(run.fingerprint, choice.frames, tuple(times_s[frame] for frame in choice.frames), counts)
 
 
 def _write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> None:
-    """Write the frames that are not there yet."""
-    for half in run.workspace.frames.glob(".*"):  # incomplete files of a killed run
-        half.unlink()
+    """Write the missing frames."""
+    for incomplete in run.workspace.frames.glob(".*"):  # files of a killed run
+        incomplete.unlink()
     places = {frame: run.workspace.frames / frame_name(source, frame) for frame in frames}
     missing = [frame for frame, place in places.items() if not place.exists()]
     if not missing:
@@ -166,34 +156,29 @@ def _write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> Non
 
 
 def frame_name(source: Path, frame: int) -> str:
-    """Return the name of the file of a frame."""
+    """Return the file name of a frame of a video."""
     return f"{frame_stem(source)}_{frame:06d}.jpg"
 
 
 def frame_stem(source: Path) -> str:
-    """Return the stem of the names of a video's frames: short, printable and not hidden."""
+    """Return the stem of a video's frames: short, printable and not hidden."""
     printable = "".join(c if c.isprintable() else "_" for c in source.stem)
-    return printable.lstrip(".")[:LONGEST_STEM] or "frame"
+    return printable.lstrip(".")[:40] or "frame"
 
 
-# photos: folder or video -> PhotoSet.
-
-MANY_FILES = 5000
-"""From so many on it is said that this may be another folder than meant, such as a home. Chosen by hand: five times the
-largest folder that was run."""
+# The stage.
 
 
 def make(source: Source, run: RunContext) -> PhotoSet:
     """Read every file of a folder, or the frames of a video, and lay the usable photos out for COLMAP.
 
-    Raises:
-        InputError: the source is missing, fewer than two photos are usable, or a mask is unusable.
+    Raise an InputError if the source is missing, fewer than two photos are usable, or a mask is unusable.
     """
     if not source.video:
         return _read_photos(source, source.path, list(source.files), {}, run)
-    with video_frames(source.path, run) as frames:
-        names = list_files(frames.folder, run.workspace.root)
-        return _read_photos(source, frames.folder, names, frames.times_s, run)
+    folder = run.workspace.frames
+    with video_frames(source.path, run) as times_s:
+        return _read_photos(source, folder, list_files(folder, run.workspace.root), times_s, run)
 
 
 def load(source: Source, run: RunContext) -> PhotoSet:
@@ -202,11 +187,7 @@ def load(source: Source, run: RunContext) -> PhotoSet:
 
 
 def read_photo_list(place: Workspace) -> PhotoSet:
-    """Read photos.json back as it is, for a reader that needs none of the laid-out photos.
-
-    Raises:
-        ValueError: it names a photo outside of the folder.
-    """
+    """Read photos.json without the laid-out photos; raise a ValueError if it names a photo outside of the folder."""
     values = json.loads(place.photo_set.read_text(encoding="utf-8"))
     photos = tuple(Photo.from_dict(entry) for entry in values["photos"])
     if not all(is_below(photo.name) for photo in photos):
@@ -222,14 +203,13 @@ def digest(place: Workspace) -> str:
 def _read_photos(
     source: Source, folder: Path, names: Sequence[str], times_s: Mapping[str, float], run: RunContext
 ) -> PhotoSet:
-    """Read these files of a folder and lay the usable photos out for COLMAP; errors as in `make`."""
+    """Read these files of a folder and lay the usable photos out for COLMAP."""
     options = limit_to_memory(run)
-    found = read_all(source, folder, names, options, run)
-    glances = [photo for photo in found if isinstance(photo, PhotoStats)]
-    unusable = [photo for photo in found if isinstance(photo, UnusablePhoto)]
-    glances, blackened = attach_masks(glances, folder, source, run)
-    photos, needless = select_photos(glances, keep_low_quality=options.keep_low_quality)
-    unusable = sorted(unusable + blackened + needless, key=lambda photo: photo.name)
+    contents = read_all(source, folder, names, options, run)
+    unreadable = [photo for photo in contents if isinstance(photo, UnusablePhoto)]
+    stats, masked = attach_masks([one for one in contents if isinstance(one, PhotoStats)], folder, source, run)
+    photos, useless = select_photos(stats, keep_low_quality=options.keep_low_quality)
+    unusable = sorted(unreadable + masked + useless, key=lambda photo: photo.name)
     if len(photos) < 2:
         raise InputError(
             _too_few_message(folder, len(photos), unusable),
@@ -254,21 +234,21 @@ def _read_photos(
 def read_all(
     source: Source, folder: Path, names: Sequence[str], options: PhotoSettings, run: RunContext
 ) -> list[PhotoStats | UnusablePhoto]:
-    """Return what the files of a folder hold; those that an earlier run has read are not decoded again."""
+    """Return the contents of the files of a folder; files that an earlier run has read are not decoded again."""
     digests, store = source.digests(), run.workspace.photo_stats
     known: dict[str, PhotoStats | UnusablePhoto] = {**read_stats(store, digests, options)}
-    left = [name for name in names if name not in known]
-    if len(left) > MANY_FILES:
-        run.progress.say(f"{len(left):,} files: if this is not the folder of the photos, stop with Ctrl-C")
-    found = known | dict(zip(left, run.map(Task(read_photo, folder, options=options), left, "photos"), strict=True))
-    usable = {name: one for name in names if isinstance(one := found[name], PhotoStats)}
-    if left and usable.keys() & digests.keys():
+    new = [name for name in names if name not in known]
+    if len(new) > MANY_FILES:
+        run.progress.say(f"{len(new):,} files: if this is not the folder of the photos, stop with Ctrl-C")
+    contents = known | dict(zip(new, run.map(Task(read_photo, folder, options=options), new, "photos"), strict=True))
+    usable = {name: one for name in names if isinstance(one := contents[name], PhotoStats)}
+    if new and usable.keys() & digests.keys():
         write_stats(store, usable, digests, options)
-    return [found[name] for name in names]
+    return [contents[name] for name in names]
 
 
 def limit_to_memory(run: RunContext) -> PhotoSettings:
-    """Return the photo settings; where the user limits the memory, `max_megapixels` is reduced to fit."""
+    """Return the photo settings, with `max_megapixels` reduced to the user's limit of memory."""
     options = run.settings.photos
     if not run.settings.max_memory_gb:
         return options
@@ -276,37 +256,30 @@ def limit_to_memory(run: RunContext) -> PhotoSettings:
     return options.model_copy(update={"max_megapixels": largest})
 
 
-def select_photos(glances: list[PhotoStats], *, keep_low_quality: bool) -> tuple[list[Photo], list[UnusablePhoto]]:
-    """Return the photos that are worth using, and the others."""
+def select_photos(stats: list[PhotoStats], *, keep_low_quality: bool) -> tuple[list[Photo], list[UnusablePhoto]]:
+    """Return the useful photos and the useless ones: blurred photos, screenshots and copies, unless these stay."""
     if keep_low_quality:
-        return [glance.photo for glance in glances], []
-    useful, useless = drop_unusable(glances)
-    photos, copies = drop_duplicates(useful)
-    return photos, useless + copies
+        return [one.photo for one in stats], []
+    usable, unusable = drop_unusable(stats)
+    photos, copies = drop_duplicates(usable)
+    return photos, unusable + copies
 
 
 def attach_masks(
-    glances: list[PhotoStats], folder: Path, source: Source, run: RunContext
+    stats: list[PhotoStats], folder: Path, source: Source, run: RunContext
 ) -> tuple[list[PhotoStats], list[UnusablePhoto]]:
-    """Return the photos with their masks, and those that their masks cover completely.
+    """Return the photos with their masks, and the completely masked photos.
 
-    Raises:
-        InputError: a mask cannot be used, or no photo has one.
+    Raise an InputError if a mask cannot be used, or no photo has one.
     """
     masks = source.mask_dir
     if masks is None:
-        return glances, []
-    found = run.map(Task(_find_mask, folder, masks), [glance.photo for glance in glances], "masks")
-    if glances and all(isinstance(photo, Photo) and not photo.mask for photo in found):
+        return stats, []
+    photos = run.map(Task(find_mask, folder=folder, masks=masks), [one.photo for one in stats], "masks")
+    if stats and all(isinstance(photo, Photo) and not photo.mask for photo in photos):
         raise InputError(f"none of the {len(source.masks)} files in {masks} is the mask of a photo", hint=MASK_HINT)
-    kept = [
-        replace(glance, photo=photo) for glance, photo in zip(glances, found, strict=True) if isinstance(photo, Photo)
-    ]
-    return kept, [photo for photo in found if isinstance(photo, UnusablePhoto)]
-
-
-def _find_mask(folder: Path, masks: Path, photo: Photo) -> Photo | UnusablePhoto:
-    return find_mask(photo, folder, masks)
+    used = [replace(one, photo=photo) for one, photo in zip(stats, photos, strict=True) if isinstance(photo, Photo)]
+    return used, [photo for photo in photos if isinstance(photo, UnusablePhoto)]
 
 
 def _lay_out_masks(photo_set: PhotoSet, masks: Path, names: Sequence[str], run: RunContext) -> None:
@@ -330,24 +303,25 @@ def lay_out_photo(photo: Photo, *, folder: Path, target: Path) -> None:
 def _save_photo_set(photos: PhotoSet, run: RunContext) -> None:
     """Write photos.json, with hashes of the copies."""
     entries = [photo.to_dict() for photo in photos.photos]
-    known = {"photos": entries, "unusable": [asdict(photo) for photo in photos.unusable]}
+    unusable = [asdict(photo) for photo in photos.unusable]
     copies = {photo.name: _copy_digest(photo, run) for photo in photos.photos}
+    values = {"photos": entries, "unusable": unusable, "copies": copies}
     with replace_atomically(run.workspace.photo_set) as path:
-        path.write_text(json.dumps({**known, "copies": copies}, indent=1) + "\n", encoding="utf-8", newline="\n")
+        path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8", newline="\n")
 
 
 def _copy_digest(photo: Photo, run: RunContext) -> str | None:
-    """Return a hash of the bytes of an 8-bit copy; None where the photo itself is laid out, or nothing."""
+    """Return a hash of the bytes of an 8-bit copy; None if the photo itself is laid out, or nothing."""
     place = run.workspace.photos / photo.name
     is_copy = photo.needs_copy and place.is_file() and not is_link(place)
     return digest_files(run.workspace.photos, photo.name) if is_copy else None
 
 
 def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoSet:
-    """Read photos.json back, and lay out what is missing."""
-    found = replace(read_photo_list(run.workspace), folder=folder, masks=masks)
+    """Read photos.json back, and lay out missing photos."""
+    photo_set = replace(read_photo_list(run.workspace), folder=folder, masks=masks)
     values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
-    for photo in found.photos:
+    for photo in photo_set.photos:
         copy = values["copies"].get(photo.name)
         if copy != _copy_digest(photo, run) or not (copy or is_laid_out(photo, folder, run.workspace.photos)):
             if folder == run.workspace.frames and not (folder / photo.path).exists():
@@ -355,12 +329,12 @@ def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoS
             lay_out_photo(photo, folder=folder, target=run.workspace.photos)
         if masks is not None and not mask_path(run.workspace.masks, photo.name).exists():
             lay_out_mask(photo, folder, masks, run.workspace.masks)
-    return found
+    return photo_set
 
 
 def _too_few_message(folder: Path, usable: int, unusable: list[UnusablePhoto]) -> str:
     """Return why there are not enough photos, in one line."""
     reasons = Counter("copies of another" if "same picture" in photo.reason else photo.reason for photo in unusable)
-    seen = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
+    counts = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
     number = "no usable photo" if usable == 0 else "only one usable photo"
-    return f"{number} in {folder}: " + (seen or ("the folder is empty" if usable == 0 else "nothing else is there"))
+    return f"{number} in {folder}: " + (counts or ("the folder is empty" if usable == 0 else "it has no other file"))

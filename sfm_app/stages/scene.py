@@ -6,10 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from sfm_app.colmap.backend import check_written, translate_errors
+from sfm_app.colmap.backend import Reconstruction, check_written, translate_errors
 from sfm_app.colmap.bundle import Adjustment, adjust_or_keep
 from sfm_app.colmap.model import RefinedCamera, color_points, posed_images, posed_photo_ids, read_scene
-from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import ReconstructionError
 from sfm_app.estimation.diagnosis import diagnose_depth, diagnose_scene
 from sfm_app.estimation.given_cameras import camera_rules, given_and_found, refined_claims, report_checks, report_claims
@@ -87,7 +86,7 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     laid_down = [camera_rules(attempt.model, names, intrinsics, wanted) for attempt in outcome.models]
     with run.step("adjusting all cameras"):
         adjusted = [
-            adjust_or_keep(attempt.model, database, rules, settled=attempt.mapper == GROWN)
+            adjust_or_keep(attempt.model, database, rules, families_known=attempt.mapper == GROWN)
             for attempt, rules in zip(outcome.models, laid_down, strict=True)
         ]
     followed = [

@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.synthetic.scenes import build_scene, scene_views
 from sfm_app.frame.up_cues import (
-    TURN_COSTS,
+    ROLL_OPTIONS,
     brightness_normal_correlation,
     depth_height_correlation,
     fit_surfaces,
@@ -15,7 +15,7 @@ from sfm_app.frame.up_cues import (
     slope_asymmetry,
     small_picture,
 )
-from sfm_app.frame.up_direction import CUES, MAX_NATS, Cue, Scenery, odds, select_roll
+from sfm_app.frame.up_direction import CUES, OPTIONS, Cue, Scenery, odds, select_roll
 from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at, pixel_rays
 from sfm_app.synthetic.render import GAMMA, cast_rays, prepare, render_scene
 
@@ -87,9 +87,9 @@ def test_rendered_photos_stand_upright_whichever_way_they_were_held(rendered, tu
     assert standing.roll.turn_deg == turn_deg
     assert standing.roll.up @ UP > np.cos(np.radians(20))
     # upside down, the habit of holding cameras upright speaks against what the scene shows
-    habit = TURN_COSTS[turn_deg // 90]
+    habit = ROLL_OPTIONS.turn_costs[turn_deg // 90]
     assert standing.sign_log_odds == pytest.approx(
-        sum(standing.evidence.values()) + TURN_COSTS[2] - 2 * habit, abs=1e-6
+        sum(standing.evidence.values()) + ROLL_OPTIONS.turn_costs[2] - 2 * habit, abs=1e-6
     )
     assert 2 < min(standing.sign_log_odds, standing.axis_log_odds) < 20
 
@@ -119,7 +119,10 @@ def test_no_single_cue_turns_photos_that_are_held_upright(build_house):
     standing = select_roll(roll_hypotheses(house.rotations, house.centers), house.rotations, house.centers, scenery)
 
     assert standing.roll.turn_deg == 0 and standing.roll.up @ house.up > 0.9
-    assert standing.evidence["low is near"] == -MAX_NATS and standing.evidence["tops are seen"] == -MAX_NATS
+    assert (
+        standing.evidence["low is near"] == -OPTIONS.max_nats
+        and standing.evidence["tops are seen"] == -OPTIONS.max_nats
+    )
     assert 0 <= standing.sign_log_odds < 0.1, "it is as likely as not, and says so"
 
 
@@ -130,7 +133,7 @@ def test_without_scenery_cameras_are_held_upright(build_house):
     standing = select_roll(roll_hypotheses(house.rotations, house.centers), house.rotations, house.centers, nothing)
 
     assert standing.roll.turn_deg == 0 and not any(standing.evidence.values())
-    assert standing.sign_log_odds == pytest.approx(TURN_COSTS[2])
+    assert standing.sign_log_odds == pytest.approx(ROLL_OPTIONS.turn_costs[2])
 
 
 def test_opposite_turns_have_opposite_directions(build_house):
@@ -223,7 +226,7 @@ def test_nats_grow_with_the_cue_and_with_the_points_and_end():
 
     assert cue.nats(0.05, 10**9) == pytest.approx(1.0) and cue.nats(-0.05, 10**9) == pytest.approx(-1.0)
     assert 0.1 < cue.nats(0.05, 100) < 0.25
-    assert cue.nats(5.0, 100) == MAX_NATS
+    assert cue.nats(5.0, 100) == OPTIONS.max_nats
     assert all(0 < CUES[name].mean < 0.5 and 0.05 < CUES[name].deviation < 0.5 for name in CUES)
 
 

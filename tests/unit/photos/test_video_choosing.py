@@ -138,7 +138,7 @@ def test_an_empty_picture_shows_nothing_to_follow(value):
     follower = CornerTracker()
     looks = [follower.track(k, np.full((HEIGHT, WIDTH), value, np.uint8)) for k in range(5)]
 
-    assert not follower.seen
+    assert not follower.has_texture
     assert [look.path_steps for look in looks] == [0.0] * 5
 
 

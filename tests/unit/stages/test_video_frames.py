@@ -43,8 +43,8 @@ def write(path, places):
 
 
 def frames_of(source, run):
-    with video_frames(source, run) as frames:
-        return sorted(path.name for path in frames.folder.iterdir())
+    with video_frames(source, run):
+        return sorted(path.name for path in run.workspace.frames.iterdir())
 
 
 def test_a_video_becomes_a_folder_of_frames(clip, run):
@@ -104,12 +104,12 @@ def test_other_inputs_choose_anew(clip, tmp_path, run):
 
 
 def test_the_times_of_the_frames_are_those_of_the_video(clip, run):
-    with video_frames(clip, run) as frames:
-        numbers = {path.name: int(path.stem.rpartition("_")[2]) for path in frames.folder.iterdir()}
+    with video_frames(clip, run) as times_s:
+        numbers = {path.name: int(path.stem.rpartition("_")[2]) for path in run.workspace.frames.iterdir()}
 
-    assert frames.times_s.keys() == numbers.keys()
+    assert times_s.keys() == numbers.keys()
     for name, number in numbers.items():
-        assert frames.times_s[name] == pytest.approx(number / 30, abs=0.002)
+        assert times_s[name] == pytest.approx(number / 30, abs=0.002)
 
 
 def test_a_video_that_is_cut_off_says_so(clip, run):
