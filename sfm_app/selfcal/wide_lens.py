@@ -30,7 +30,7 @@ LENS = 4
 STEP = 1e-6
 """Step of finite differences in parameters: curvature and rounding in double precision cost about 1e-6 of them."""
 RAY_STEP = 1e-5
-"""The same in points, in longer sides: they cost about 1e-10 of the derivatives."""
+"""The same in points, in longer sides: errors of about 1e-10 of the derivatives in double precision."""
 EQUIDISTANT_BELOW = 1e-6
 """Exponents nearer to 0 are taken as 0: the series agree to double precision."""
 
@@ -40,7 +40,7 @@ class LensSearchOptions:
     """The grid of lenses, the pairs that vote, and the verdict."""
 
     exponents: tuple[float, ...] = (0.5, 0.0, -0.5)
-    """Projections of the grid: stereographic, equidistant, equisolid."""
+    """Projections of the grid, by definition of the family: stereographic, equidistant, equisolid."""
     fields_deg: tuple[float, ...] = (60.0, 80.0, 100.0, 120.0, 140.0, 160.0, 180.0, 200.0)
     """Fields of view along the longer side for each projection; by hand."""
     most_pairs: int = 16
