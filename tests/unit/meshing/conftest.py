@@ -3,18 +3,15 @@
 import numpy as np
 import pytest
 
+from sfm_app.synthetic.shapes import grid
 from sfm_app.types import Surface
 
 
-def make_sheet(size: int, step: float = 1.0, origin=(0.0, 0.0, 0.0), flipped: bool = False) -> Surface:
-    """A square grid of size x size cells in the plane z = 0, facing +z."""
-    y, x = np.mgrid[: size + 1, : size + 1]
-    vertices = np.stack([x * step, y * step, np.zeros_like(x)], axis=-1).reshape(-1, 3) + origin
-    at = np.arange((size + 1) ** 2).reshape(size + 1, size + 1)
-    a, b, c, d = (corner.ravel() for corner in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]))
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    colors = np.arange(len(vertices) * 3).reshape(-1, 3) % 256
-    return Surface(vertices, faces[:, ::-1] if flipped else faces, colors.astype(np.uint8))
+def make_sheet(size: int, origin=(0.0, 0.0, 0.0)) -> Surface:
+    """A square grid of size x size cells of side 1 in the plane z = 0, facing +z."""
+    places, faces = grid(np.arange(size + 1.0), np.arange(size + 1.0))
+    colors = (np.arange(3 * len(places)).reshape(-1, 3) % 256).astype(np.uint8)
+    return Surface(np.column_stack([places, np.zeros(len(places))]) + origin, faces, colors)
 
 
 def join(*parts: Surface) -> Surface:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_app.meshing.agreement import RefinePhoto
+from sfm_app.synthetic import shapes
 from sfm_app.synthetic.cameras import look_at
 from sfm_app.types import Surface
 
@@ -27,14 +28,8 @@ def gray_at(x, y):
 def grid(height, half=0.42, step=2.0 * PIXEL):
     """A relief as triangles that face +z."""
     line = np.arange(-half, half + step / 2, step)
-    x, y = (axis.ravel() for axis in np.meshgrid(line, line, indexing="ij"))
-    n = len(line)
-    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
-    faces = np.concatenate([
-        np.stack([corner, corner + n, corner + n + 1], -1), np.stack([corner, corner + n + 1, corner + 1], -1)
-    ])  # fmt: skip
-    vertices = np.stack([x, y, height(x, y)], -1)
-    return Surface(vertices, faces, np.full((n * n, 3), 128, np.uint8))
+    places, faces = shapes.grid(line, line)
+    return Surface(np.column_stack([places, height(*places.T)]), faces, np.full((len(places), 3), 128, np.uint8))
 
 
 def photo_of(eye, height):

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from sfm_app.geometry.triangles import unique_edges, vertex_normals
 from sfm_app.meshing.blocks import close_cracks, cut_at_plane, split_points, weld
 from sfm_app.meshing.cleaning import make_manifold
+from sfm_app.synthetic.shapes import grid
 from sfm_app.types import Surface
 
 CELL, HALO = 0.07, 0.56
@@ -25,12 +26,8 @@ def ball(seed, noise=0.1):
 def sheet(seed, noise=0.2, size=40):
     """A rough plane z = 0 with cells of size 1."""
     rng = np.random.default_rng(seed)
-    y, x = np.mgrid[: size + 1, : size + 1].reshape(2, -1).astype(float)
-    x, y = x + 0.2 * rng.normal(size=x.shape), y + 0.2 * rng.normal(size=y.shape)
-    corner = (np.arange(size)[:, None] * (size + 1) + np.arange(size)).ravel()
-    a, b, c, d = corner, corner + 1, corner + size + 2, corner + size + 1
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    vertices = np.stack([x, y, noise * rng.normal(size=x.shape)], axis=1)
+    places, faces = grid(np.arange(size + 1.0), np.arange(size + 1.0))
+    vertices = np.column_stack([places, np.zeros(len(places))]) + rng.normal(size=(len(places), 3)) * [0.2, 0.2, noise]
     return Surface(vertices, faces, np.zeros((len(vertices), 3), np.uint8))
 
 
