@@ -17,103 +17,10 @@ from sfm_app.meshing.fairness import Neighbors, find_displacements
 from sfm_app.types import Surface
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-
-def split_long_edges(surface: Surface, longest: FloatArray) -> Surface:
-    """Return the surface with long edges divided in the middle; the smaller limit (V,) of both ends decides."""
-    edges, edge_of = unique_edges(surface.faces)
-    middle = np.full(len(edges), -1)
-    count = _number_long(edges, surface.vertices, longest, middle)
-    one, other = edges[middle >= 0].T
-    colors = (surface.colors[one].astype(np.uint16) + surface.colors[other]) // 2
-    return Surface(
-        np.concatenate([surface.vertices, (surface.vertices[one] + surface.vertices[other]) / 2.0]),
-        _divide_triangles(surface.faces, middle[edge_of]) if count else surface.faces,
-        np.concatenate([surface.colors, colors.astype(np.uint8)]),
-    )
-
-
-@kernel
-def _number_long(edges: IndexArray, vertices: FloatArray, longest: FloatArray, middle: IndexArray) -> int:
-    """Fill in the numbers of the new vertices in the middle of long edges; return their number."""
-    count = 0
-    for k in range(len(edges)):
-        a, b = edges[k, 0], edges[k, 1]
-        x, y, z = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
-        if np.sqrt(x * x + y * y + z * z) > min(longest[a], longest[b]):
-            middle[k] = len(vertices) + count
-            count += 1
-    return count
-
-
-def sort_in_space(surface: Surface) -> Surface:
-    """Return the surface with neighbors close to each other in memory, which halves the time of a step."""
-    order = morton_order(surface.vertices)
-    place = np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order))
-    faces = place[surface.faces]
-    faces = faces[np.argsort(faces.min(axis=1), kind="stable")]
-    return Surface(surface.vertices[order], faces, surface.colors[order])
-
-
-def _divide_triangles(faces: IndexArray, middle: IndexArray) -> IndexArray:
-    """Return the parts of triangles; `middle` (T, 3) has the new vertices on the edges ab, bc, ca, -1 for none."""
-    count = np.sum([side >= 0 for side in middle.T], axis=0)
-    parts = [faces[count == 0]]
-    for corner in range(3):
-        a, b, c = corner, (corner + 1) % 3, (corner + 2) % 3
-        one = (count == 1) & (middle[:, a] >= 0)
-        parts.append(np.stack([faces[one, a], middle[one, a], faces[one, c]], axis=1))
-        parts.append(np.stack([middle[one, a], faces[one, b], faces[one, c]], axis=1))
-        two = (count == 2) & (middle[:, a] < 0)
-        parts.append(np.stack([middle[two, c], middle[two, b], faces[two, c]], axis=1))
-        parts.append(np.stack([faces[two, a], faces[two, b], middle[two, b]], axis=1))
-        parts.append(np.stack([faces[two, a], middle[two, b], middle[two, c]], axis=1))
-        three = count == 3
-        parts.append(np.stack([faces[three, a], middle[three, a], middle[three, c]], axis=1))
-    return np.concatenate([*parts, middle[count == 3]])
-
-
-MOST_KEPT_PX = 100_000_000
-"""Pixels of the photos that `Sights` keeps: 2 GB."""
-
-
-class Sights:
-    """A cache of the last photos used, by number, each with the surface drawn into it."""
-
-    def __init__(self, look: Callable[[int], Sight], most_px: int = MOST_KEPT_PX) -> None:
-        self._look, self._most_px, self._lock = look, most_px, Lock()
-        self._sights = OrderedDict[int, Future[Sight]]()
-
-    def __getitem__(self, number: int) -> Sight:
-        with self._lock:
-            cached = self._sights.get(number)
-            if cached is None:
-                self._sights[number] = mine = Future[Sight]()
-            else:
-                self._sights.move_to_end(number)
-        if cached is not None:
-            return cached.result()
-        try:
-            mine.set_result(self._look(number))
-        except BaseException as error:
-            mine.set_exception(error)
-            raise
-        self._drop_oldest()
-        return mine.result()
-
-    def _drop_oldest(self) -> None:
-        with self._lock:
-            done = [(key, one.result()) for key, one in self._sights.items() if one.done() and not one.exception()]
-            pixels = sum(sight.raster.depth.size for _, sight in done)
-            for key, sight in done[:-1]:
-                if pixels <= self._most_px:
-                    break
-                pixels -= sight.raster.depth.size
-                del self._sights[key]
-
-
 Spread = Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]]
 """Calls a function for every number, possibly in parallel, and returns the results in order."""
+MOST_KEPT_PX = 100_000_000
+"""Pixels of the photos that `Sights` keeps: 2 GB."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +66,7 @@ def refine(
     Args:
         surface: triangles, counterclockwise seen from outside, with errors of some pixels.
         partners: for each photo, numbers of the others for comparison.
+        most: triangles beyond which no edge is divided.
     """
     correlations = list[float]()
     for share, iterations in OPTIONS.levels:
@@ -169,6 +77,16 @@ def refine(
             surface, correlation = _improve(surface, neighbors, reach, photos, partners, share, spread)
             correlations.append(correlation)
     return Refinement(surface, tuple(correlations))
+
+
+def _divide_surface(surface: Surface, photos: Sequence[RefinePhoto], share: float, most: int) -> Surface:
+    """Return the surface with triangles small enough for a level of the photos, as far as `most` allows."""
+    for _ in range(OPTIONS.divisions):
+        finer = split_long_edges(surface, OPTIONS.edge_px * finest_pixels(surface.vertices, photos, share))
+        if len(finer.faces) == len(surface.faces) or len(finer.faces) > most:
+            break
+        surface = finer
+    return sort_in_space(surface)
 
 
 def finest_pixels(vertices: FloatArray, photos: Sequence[RefinePhoto], share: float) -> FloatArray:
@@ -198,14 +116,59 @@ def _keep_finest(
             sizes[v] = min(sizes[v], 1.0 / (near * focal_px * width / full_width))
 
 
-def _divide_surface(surface: Surface, photos: Sequence[RefinePhoto], share: float, most: int) -> Surface:
-    """Return the surface with triangles small enough for a level of the photos, as far as `most` allows."""
-    for _ in range(OPTIONS.divisions):
-        finer = split_long_edges(surface, OPTIONS.edge_px * finest_pixels(surface.vertices, photos, share))
-        if len(finer.faces) == len(surface.faces) or len(finer.faces) > most:
-            break
-        surface = finer
-    return sort_in_space(surface)
+def split_long_edges(surface: Surface, longest: FloatArray) -> Surface:
+    """Return the surface with long edges divided in the middle; the smaller limit (V,) of both ends decides."""
+    edges, edge_of = unique_edges(surface.faces)
+    middle = np.full(len(edges), -1)
+    count = _number_long(edges, surface.vertices, longest, middle)
+    one, other = edges[middle >= 0].T
+    colors = (surface.colors[one].astype(np.uint16) + surface.colors[other]) // 2
+    return Surface(
+        np.concatenate([surface.vertices, (surface.vertices[one] + surface.vertices[other]) / 2.0]),
+        _divide_triangles(surface.faces, middle[edge_of]) if count else surface.faces,
+        np.concatenate([surface.colors, colors.astype(np.uint8)]),
+    )
+
+
+@kernel
+def _number_long(edges: IndexArray, vertices: FloatArray, longest: FloatArray, middle: IndexArray) -> int:
+    """Fill in the numbers of the new vertices in the middle of long edges; return their number."""
+    count = 0
+    for k in range(len(edges)):
+        a, b = edges[k, 0], edges[k, 1]
+        x, y, z = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+        if np.sqrt(x * x + y * y + z * z) > min(longest[a], longest[b]):
+            middle[k] = len(vertices) + count
+            count += 1
+    return count
+
+
+def _divide_triangles(faces: IndexArray, middle: IndexArray) -> IndexArray:
+    """Return the parts of triangles; `middle` (T, 3) has the new vertices on the edges ab, bc, ca, -1 for none."""
+    count = np.sum([side >= 0 for side in middle.T], axis=0)
+    parts = [faces[count == 0]]
+    for corner in range(3):
+        a, b, c = corner, (corner + 1) % 3, (corner + 2) % 3
+        one = (count == 1) & (middle[:, a] >= 0)
+        parts.append(np.stack([faces[one, a], middle[one, a], faces[one, c]], axis=1))
+        parts.append(np.stack([middle[one, a], faces[one, b], faces[one, c]], axis=1))
+        two = (count == 2) & (middle[:, a] < 0)
+        parts.append(np.stack([middle[two, c], middle[two, b], faces[two, c]], axis=1))
+        parts.append(np.stack([faces[two, a], faces[two, b], middle[two, b]], axis=1))
+        parts.append(np.stack([faces[two, a], middle[two, b], middle[two, c]], axis=1))
+        three = count == 3
+        parts.append(np.stack([faces[three, a], middle[three, a], middle[three, c]], axis=1))
+    return np.concatenate([*parts, middle[count == 3]])
+
+
+def sort_in_space(surface: Surface) -> Surface:
+    """Return the surface with neighbors close to each other in memory, which halves the time of a step."""
+    order = morton_order(surface.vertices)
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    faces = place[surface.faces]
+    faces = faces[np.argsort(faces.min(axis=1), kind="stable")]
+    return Surface(surface.vertices[order], faces, surface.colors[order])
 
 
 def _improve(
@@ -238,3 +201,38 @@ def look(surface: Surface, photo: RefinePhoto, share: float) -> Sight:
     if masked is not None:
         raster.depth[masked], raster.face[masked] = np.inf, NOTHING
     return Sight(photo.level(share), raster)
+
+
+class Sights:
+    """A cache of the last photos used, by number, each with the surface drawn into it."""
+
+    def __init__(self, look: Callable[[int], Sight], most_px: int = MOST_KEPT_PX) -> None:
+        self._look, self._most_px, self._lock = look, most_px, Lock()
+        self._sights = OrderedDict[int, Future[Sight]]()
+
+    def __getitem__(self, number: int) -> Sight:
+        with self._lock:
+            cached = self._sights.get(number)
+            if cached is None:
+                self._sights[number] = mine = Future[Sight]()
+            else:
+                self._sights.move_to_end(number)
+        if cached is not None:
+            return cached.result()
+        try:
+            mine.set_result(self._look(number))
+        except BaseException as error:
+            mine.set_exception(error)
+            raise
+        self._drop_oldest()
+        return mine.result()
+
+    def _drop_oldest(self) -> None:
+        with self._lock:
+            done = [(key, one.result()) for key, one in self._sights.items() if one.done() and not one.exception()]
+            pixels = sum(sight.raster.depth.size for _, sight in done)
+            for key, sight in done[:-1]:
+                if pixels <= self._most_px:
+                    break
+                pixels -= sight.raster.depth.size
+                del self._sights[key]
