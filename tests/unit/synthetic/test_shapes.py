@@ -219,6 +219,7 @@ def test_patterns_mix_within_range_and_vary(pattern):
     assert mixed[:, 0].std() > 0.05 and mixed[:, 2].std() > 0.05
     assert np.array_equal(mixed, again)
     assert not np.allclose(mixed[:, 2], elsewhere[:, 2]), "two bodies of one material differ"
+    assert row[:4].tolist() == [PATTERNS.index(pattern), 0.3, 0.5, 100]
     assert row[4:7] == pytest.approx((np.array([200, 10, 10]) / 255) ** 2.2), "colors are linear"
 
 
