@@ -95,9 +95,7 @@ def is_well_formed(found, count):
 @pytest.mark.parametrize("seed", range(4))
 def test_finds_the_truth_and_the_injected_noise(name, fit, accuracy_px, outliers, seed):
     pair = make_pair(PairOptions(outliers=outliers, **SCENE), seed)
-
     found = fit(pair.x1, pair.x2, OPTIONS, seed)
-
     assert is_well_formed(found, 400)
     noise = np.sqrt(np.mean(sampson_distance(found.F, pair.x1, pair.x2)[pair.is_inlier] ** 2))
     rough = name in UNREFINED
@@ -110,9 +108,7 @@ def test_finds_the_truth_and_the_injected_noise(name, fit, accuracy_px, outliers
 
 def test_evidence_is_that_of_the_returned_matrix(fit):
     pair = make_pair(PairOptions(outliers=0.3, **SCENE), 9)
-
     found = fit(pair.x1, pair.x2, OPTIONS, 0)
-
     distance = sampson_distance(found.F, pair.x1, pair.x2)
     np.testing.assert_array_equal(found.inliers, distance <= OPTIONS.max_error_px)
     assert found.rms_px == pytest.approx(np.sqrt(np.mean(distance[found.inliers] ** 2)))
@@ -240,9 +236,7 @@ def test_ten_runs_in_threads_give_the_same_bytes(fit):
 def test_a_repeated_match_counts_once_and_gets_one_verdict(fit):
     pair = make_pair(PairOptions(outliers=0.3, **SCENE), 3)
     once = fit(pair.x1, pair.x2, OPTIONS, 0)
-
     thrice = fit(np.tile(pair.x1, (3, 1)), np.tile(pair.x2, (3, 1)), OPTIONS, 0)
-
     np.testing.assert_array_equal(thrice.inliers, np.tile(thrice.inliers[:400], 3))
     np.testing.assert_array_equal(thrice.priors, np.tile(thrice.priors[:400], 3))
     assert np.mean(thrice.inliers[:400] == once.inliers) > 0.9
@@ -251,9 +245,7 @@ def test_a_repeated_match_counts_once_and_gets_one_verdict(fit):
 @pytest.mark.parametrize("seed", range(3))
 def test_twenty_noisy_matches_are_enough(name, fit, seed):
     pair = make_pair(PairOptions(**{**SCENE, "points": 20}), seed)
-
     found = fit(pair.x1, pair.x2, OPTIONS, 0)
-
     if name != "lev-ransac" and not found:  # what the others may miss, ours does not
         return
     assert is_well_formed(found, 20)
@@ -262,9 +254,7 @@ def test_twenty_noisy_matches_are_enough(name, fit, seed):
 
 def test_ten_thousand_matches(fit, accuracy_px):
     pair = make_pair(PairOptions(outliers=0.3, **{**SCENE, "points": 10_000}), 3)
-
     found = fit(pair.x1, pair.x2, OPTIONS, 0)
-
     assert is_well_formed(found, 10_000)
     assert 0 < np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2)) < accuracy_px
     assert found.inliers[pair.is_inlier].mean() > 0.9
@@ -282,9 +272,7 @@ def test_memory_is_linear_in_the_matches(fit):
     fit(few.x1, few.x2, options(max_trials=100), 0)  # loads and compiles
     Path("/proc/self/clear_refs").write_text("5")
     before = peak_bytes()
-
     assert fit(many.x1, many.x2, options(max_trials=100), 0)
-
     # one byte per pair of matches would be 400 MB
     assert peak_bytes() - before < 20_000 * 5000
 
@@ -292,9 +280,7 @@ def test_memory_is_linear_in_the_matches(fit):
 @pytest.mark.parametrize("outliers", [0.0, 0.3])
 def test_exact_matches_give_the_exact_answer(fit, outliers):
     pair = make_pair(PairOptions(outliers=outliers, **{**SCENE, "sigma_px": 0.0}), 3)
-
     found = fit(pair.x1, pair.x2, OPTIONS, 0)
-
     assert is_well_formed(found, 400)
     assert found.inliers[pair.is_inlier].all()
     assert (
@@ -304,9 +290,7 @@ def test_exact_matches_give_the_exact_answer(fit, outliers):
 
 def test_coordinates_a_million_pixels_away(fit, accuracy_px):
     pair = make_pair(PairOptions(outliers=0.3, **SCENE), 3)
-
     found = fit(pair.x1 + 1e6, pair.x2 - 1e6, OPTIONS, 0)
-
     assert is_well_formed(found, 400)
     error = np.median(sampson_distance(found.F, pair.exact_x1 + 1e6, pair.exact_x2 - 1e6))
     assert 0 < error < accuracy_px
@@ -316,9 +300,7 @@ def test_coordinates_a_million_pixels_away(fit, accuracy_px):
 @pytest.mark.parametrize("scale", [0.1, 10.0])
 def test_tiny_and_huge_images(fit, scale):
     pair = make_pair(PairOptions(outliers=0.3, **SCENE), 3)
-
     found = fit(pair.x1 * scale, pair.x2 * scale, options(max_error_px=2.0 * scale), 0)
-
     assert is_well_formed(found, 400)
     assert found.inliers[pair.is_inlier].mean() > 0.85
     assert found.inliers[~pair.is_inlier].mean() < 0.1
@@ -327,9 +309,7 @@ def test_tiny_and_huge_images(fit, scale):
 def test_one_match_far_away_is_an_outlier(fit):
     pair = make_pair(PairOptions(outliers=0.1, **SCENE), 3)
     pair.x1[0], pair.x2[1] = (1e5, 0.0), (0.0, -1e5)
-
     found = fit(pair.x1, pair.x2, OPTIONS, 0)
-
     assert found.inliers[2:][pair.is_inlier[2:]].mean() > 0.85
     assert not found.inliers[:2].any()
 
@@ -339,9 +319,7 @@ def test_absurd_matches_do_not_hide_the_scene():
     kept = pair.is_inlier.copy()
     kept[:3] = False
     pair.x1[0], pair.x2[1], pair.x1[2] = (1e10, 0.0), (0.0, -1e12), (-1e15, 1e15)
-
     found = ESTIMATORS["lev-ransac"].fit(pair.x1, pair.x2, OPTIONS, 0)
-
     assert found.inliers[kept].mean() > 0.97
     assert not found.inliers[:3].any()
     assert found.degeneracy == ""
@@ -350,9 +328,7 @@ def test_absurd_matches_do_not_hide_the_scene():
 
 def test_exchanged_views_give_the_transpose(name, fit, accuracy_px):
     pair = make_pair(PairOptions(outliers=0.2, **SCENE), 3)
-
     there, back = fit(pair.x1, pair.x2, OPTIONS, 0), fit(pair.x2, pair.x1, OPTIONS, 0)
-
     assert np.mean(there.inliers == back.inliers) > (0.85 if name in UNREFINED else 0.98)
     assert np.median(sampson_distance(back.F.T, pair.exact_x1, pair.exact_x2)) < accuracy_px
 

@@ -97,7 +97,6 @@ def test_local_optimization_is_kept_only_if_better():
     truth = run_loop(m, options(), 5, PLAIN)
     told = replace(PLAIN, improve=always(truth.F))
     misled = replace(PLAIN, improve=always(np.eye(3)))
-
     assert run_loop(m, options(), 0, told).trials <= run_loop(m, options(), 0, PLAIN).trials
     assert run_loop(m, options(), 0, misled).F.tobytes() == run_loop(m, options(), 0, PLAIN).F.tobytes()
 
@@ -325,9 +324,7 @@ def test_an_outlier_in_front_does_not_spoil_a_randomized_test():
     inlier = np.empty(300, dtype=bool)
     inlier[m.rows] = pair.is_inlier
     spoilt = replace(m, points=np.asfortranarray(m.points[np.argsort(inlier)]))  # all outliers come first
-
     found = run_loop(spoilt, options(), 0, replace(PLAIN, verifier=RandomizedTdd))
-
     near = squared_distances(spoilt.points, found.F.reshape(9)) < (3 / m.unit_px) ** 2
     assert near[np.sort(inlier)].mean() > 0.9
 
@@ -391,7 +388,6 @@ def test_one_score_is_the_one_to_beat():
     assert best.to_beat.tolist() == [score_of(ROUGH, msac)] * 2
     np.testing.assert_array_equal(best.f, ROUGH.reshape(9))
     assert best.inlier_share() == np.mean(squared_distances(POINTS, ROUGH.reshape(9)) <= THRESHOLD**2)
-
     assert best.replace_if_better(7.0 * GOOD)
     np.testing.assert_allclose(best.f, GOOD.reshape(9), atol=1e-15)
     assert not best.replace_if_better(ROUGH)
@@ -400,9 +396,7 @@ def test_one_score_is_the_one_to_beat():
 @pytest.mark.parametrize(("improved", "kept"), [(GOOD, GOOD), (BAD, ROUGH)])
 def test_with_one_score_an_improvement_is_kept_only_if_it_is_one(improved, kept):
     best = best_of(replace(ONE, improve=lambda *_: 3.0 * improved))
-
     assert meet(best, ROUGH, msac)
-
     np.testing.assert_allclose(best.f, kept.reshape(9), atol=1e-15)
     np.testing.assert_allclose(best.to_beat, score_of(kept, msac), rtol=1e-12)
 
@@ -410,15 +404,12 @@ def test_with_one_score_an_improvement_is_kept_only_if_it_is_one(improved, kept)
 def test_with_two_scores_samples_compete_with_samples_and_improved_models_with_each_other():
     answers = iter([GOOD, BAD, ROUGH])
     best = best_of(replace(TWO, improve=lambda *_: next(answers)))
-
     assert meet(best, BAD, TWO.score)  # a bad sample, improved to the truth
     assert best.to_beat[0] == score_of(BAD, TWO.score) > score_of(GOOD, TWO.score)
     np.testing.assert_allclose(best.f, GOOD.reshape(9), atol=1e-15)
-
     assert not meet(best, ROUGH, TWO.score)  # a better sample, whose improvement is worse
     assert best.to_beat[0] == score_of(ROUGH, TWO.score)
     np.testing.assert_allclose(best.f, GOOD.reshape(9), atol=1e-15)
-
     assert not best.replace_if_better(ROUGH)
     assert best.to_beat[0] == score_of(ROUGH, TWO.score)
 
@@ -427,7 +418,6 @@ def test_a_model_of_the_rest_needs_half_the_support_of_the_best_sample_once_the_
     answers = iter([BAD, ROUGH, GOOD])
     best = best_of(replace(TWO, improve=lambda *_: next(answers)))
     nothing = len(POINTS) * best.loss.worst
-
     assert meet(best, ROUGH, TWO.score)
     assert nothing - best.to_beat[1] == pytest.approx((nothing - score_of(ROUGH, TWO.score)) / 2)
     assert meet(best, BAD, TWO.score, kind=UNGUIDED)  # its improvement wins; samples of all matches have their own bar

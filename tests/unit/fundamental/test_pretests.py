@@ -46,9 +46,7 @@ def test_a_good_model_passes_tdd_with_probability_share_to_the_d(share, d):
     rng, count = np.random.default_rng(d), 4000
     inlier = rng.permutation(count) < share * count
     test = type("Tdd", (RandomizedTdd,), {"d": d})(count, 7)
-
     rate = passes(test.pretest, inlier).mean()
-
     assert rate == pytest.approx(share) if d == 1 else rate == pytest.approx(share**d, abs=0.02)
     assert test.pretest.random_start
     assert test.pretest.rejected[0] >= (1 - rate) * count

@@ -47,9 +47,7 @@ def test_gram_is_the_weighted_product(count, share):
     points, rng = matches(count), np.random.default_rng(count)
     weights = rng.uniform(size=count) * (rng.uniform(size=count) < share)
     A = dense(points)
-
     gram = weighted_gram(points, weights)
-
     np.testing.assert_allclose(gram, (A.T * weights) @ A, rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(gram, gram.T)
 
@@ -67,9 +65,7 @@ def test_matches_without_weight_may_be_anything():
 def test_forms_are_squared_lengths(count, directions):
     points = matches(count)
     whitening = np.random.default_rng(directions).normal(size=(9, directions))
-
     forms = quadratic_forms(points, whitening)
-
     np.testing.assert_allclose(forms, ((dense(points) @ whitening) ** 2).sum(axis=1), rtol=1e-12, atol=1e-12)
 
 
@@ -182,9 +178,7 @@ def test_dependent_samples_have_no_solution(case):
 def test_three_real_roots_are_found(a, b, c, lead):
     p = lead * np.poly([a, b, c])[::-1]
     roots = np.empty(3)
-
     count = real_cubic_roots(*p, roots)
-
     # close roots are ill-conditioned, so what counts is that the polynomial vanishes there
     assert count in (1, 3)
     assert np.abs(np.polyval(p[::-1], roots[:count])).max() < 1e-9 * lead * (1 + np.abs([a, b, c]).max()) ** 3
