@@ -96,7 +96,7 @@ class SamplingPlan(NamedTuple):
 
 
 @kernel
-def draw_until_better(
+def draw_until_better(  # noqa: PLR0913
     points: FloatArray,
     draws: SamplingPlan,
     loss: Loss,

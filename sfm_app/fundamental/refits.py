@@ -195,7 +195,7 @@ def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 @kernel
-def _reweighted_least_squares(
+def _reweighted_least_squares(  # noqa: PLR0913
     points: FloatArray, U: FloatArray, s: float, V: FloatArray, weighing: Weighting, most_steps: int, tolerance: float,
     gram: FloatArray,
 ) -> FloatArray:  # fmt: skip
@@ -277,7 +277,7 @@ def _weighted_sum(squared: FloatArray, weights: FloatArray) -> float:
 
 
 @kernel
-def _normal_equations(
+def _normal_equations(  # noqa: PLR0913
     points: FloatArray, f: FloatArray, weights: FloatArray, U: FloatArray, s: float, V: FloatArray,
     gram: FloatArray, normal: FloatArray, right: FloatArray,
 ) -> None:  # fmt: skip
