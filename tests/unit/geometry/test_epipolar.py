@@ -165,11 +165,6 @@ def test_sampson_distance_is_the_distance_to_the_nearest_exact_match(seed):
     assert 0.2 < np.sqrt(np.mean(distance**2)) < 0.8
 
 
-def test_vanishing_lines_are_infinitely_far():
-    assert sampson_distance(np.zeros((3, 3)), [[1, 2]], [[3, 4]]) == [np.inf]
-    assert symmetric_epipolar_distance(np.zeros((3, 3)), [[1, 2]], [[3, 4]]) == [np.inf]
-
-
 @pytest.mark.parametrize("function", MEASURES)
 @pytest.mark.parametrize(
     ("F", "x1", "x2", "message"),
@@ -204,7 +199,6 @@ def test_algebraic_distance_is_a_row_of_the_design_matrix_times_the_unit_vector(
     F, x1, x2 = random_case(3)
     design = np.einsum("ni,nj->nij", to_homogeneous(x2), to_homogeneous(x1)).reshape(-1, 9)
     np.testing.assert_allclose(algebraic_distance(F, x1, x2), np.abs(design @ F.ravel()) / np.linalg.norm(F))
-    assert algebraic_distance(np.zeros((3, 3)), [[1, 2]], [[3, 4]]) == [np.inf]
 
 
 @pytest.mark.parametrize("measure", MEASURES)
@@ -262,18 +256,14 @@ def test_nearest_exact_matches_are_exact_and_as_near_as_the_distance_says():
     assert moved.max() > 0.1
 
 
-def test_sampson_distance_is_the_first_order_of_the_reprojection_distance():
+def test_sampson_distance_is_the_first_order_of_the_reprojection_distance_and_all_of_it_for_an_affine_matrix():
     pair = make_pair(PairOptions(points=200, sigma_px=1), 4)
     differences = []
     for share in (1.0, 0.1):
         near = [exact + share * (x - exact) for x, exact in ((pair.x1, pair.exact_x1), (pair.x2, pair.exact_x2))]
-        sampson, exact = sampson_distance(pair.F, *near), reprojection_distance(pair.F, *near)
-        differences.append(np.abs(sampson - exact).max())
+        differences.append(np.abs(sampson_distance(pair.F, *near) - reprojection_distance(pair.F, *near)).max())
     assert 0 < differences[0] < 1e-2
     assert differences[1] == pytest.approx(differences[0] / 100, rel=0.3)
-
-
-def test_sampson_and_reprojection_agree_for_an_affine_matrix():
     F, x1, x2 = random_case(5)
     F[:2, :2] = 0
     np.testing.assert_allclose(reprojection_distance(F, x1, x2), sampson_distance(F, x1, x2), rtol=1e-12)
@@ -289,9 +279,10 @@ def test_a_match_between_two_nearest_ones_has_their_distance():
 
 
 def test_matrices_that_no_match_fits_are_infinitely_far():
-    nothing = np.diag([0.0, 0, 1])
-    assert reprojection_distance(nothing, [[1, 2]], [[3, 4]]) == [np.inf]
-    assert reprojection_distance(nothing, np.empty((0, 2)), np.empty((0, 2))).shape == (0,)
+    for measure in MEASURES:
+        nothing = np.diag([0.0, 0, 1]) if measure is reprojection_distance else np.zeros((3, 3))
+        assert measure(nothing, [[1, 2]], [[3, 4]]) == [np.inf]
+        assert measure(nothing, np.empty((0, 2)), np.empty((0, 2))).shape == (0,)
 
 
 angle = st.floats(-0.6, 0.6)

@@ -24,20 +24,16 @@ from sfm_app.geometry.least_squares import (
 
 
 @pytest.mark.parametrize("n", [1, 7, 8, 9, 37])
-def test_positive_systems_are_solved(n):
+def test_positive_systems_are_solved_and_the_arguments_stay(n):
     rng = np.random.default_rng(n)
     A = rng.normal(size=(n + 5, n))
     S, B = A.T @ A, rng.normal(size=(n, 3))
+    before = S.copy(), B.copy()
     assert S @ solve_positive(S, B) == pytest.approx(B, abs=1e-8)
     inverse = inverse_of_positive(S)
     assert inverse @ S == pytest.approx(np.eye(n), abs=1e-8)
     assert np.array_equal(inverse, inverse.T)
-
-
-def test_the_arguments_stay_as_they_are():
-    S, B = np.diag([1.0, 2.0, 4.0]), np.eye(3)
-    solve_positive(S, B)
-    assert np.array_equal(S, np.diag([1.0, 2.0, 4.0])) and np.array_equal(B, np.eye(3))
+    assert np.array_equal(S, before[0]) and np.array_equal(B, before[1])
 
 
 def singular(n, open_directions, seed=0):
@@ -149,20 +145,12 @@ def test_a_good_step_is_taken_at_once_and_the_next_is_bolder():
 
 def test_damping_grows_tenfold_until_a_step_lowers_the_cost():
     tried = []
-
-    def attempt(damping):
-        tried.append(damping)
-        return "found" if damping > 0.5 else None
-
-    found, left = damped_step(attempt, 1e-2, LIMITS)
-
-    assert (found, left) == ("found", pytest.approx(0.1))
-    np.testing.assert_allclose(tried, [1e-2, 0.1, 1.0])
-
-
-def test_it_gives_up_where_no_step_helps():
-    found, left = damped_step(lambda _: None, 1.0, LIMITS)
-    assert found is None and left >= LIMITS.most
+    step, damping = damped_step(
+        lambda damping: tried.append(damping) or (damping if damping > 0.5 else None), 1e-2, LIMITS
+    )
+    np.testing.assert_allclose([step, damping, *tried], [1.0, 0.1, 1e-2, 0.1, 1.0])
+    step, damping = damped_step(lambda _: None, 1.0, LIMITS)
+    assert step is None and damping >= LIMITS.most
 
 
 H, G = np.array([[40.0]]), np.array([12.0])

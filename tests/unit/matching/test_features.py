@@ -132,16 +132,16 @@ BROKEN_MATCHES = {
 }
 
 
-@pytest.mark.parametrize("how", BROKEN_FINDS)
-def test_features_that_cannot_be_end_the_run_with_their_name(filled, how):
+@pytest.mark.parametrize("find", BROKEN_FINDS.values(), ids=BROKEN_FINDS)
+def test_invalid_features_end_the_run_with_the_name_of_the_method(filled, find):
     with pytest.raises(PluginError, match="the features 'odd'"):
-        filled(FeatureMethod("odd", BROKEN_FINDS[how], CORNERS.match))
+        filled(FeatureMethod("odd", find, CORNERS.match))
 
 
-@pytest.mark.parametrize("how", BROKEN_MATCHES)
-def test_matches_that_cannot_be_end_the_run_with_their_name(filled, how):
+@pytest.mark.parametrize("rows", BROKEN_MATCHES.values(), ids=BROKEN_MATCHES)
+def test_invalid_matches_end_the_run_with_the_name_of_the_method(filled, rows):
     with pytest.raises(PluginError, match="the features 'odd'"):
-        filled(FeatureMethod("odd", CORNERS.find, lambda *_: np.array(BROKEN_MATCHES[how])))
+        filled(FeatureMethod("odd", CORNERS.find, lambda *_: np.array(rows)))
 
 
 def test_functions_and_options_of_sift_exclude_each_other():
