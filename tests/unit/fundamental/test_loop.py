@@ -284,6 +284,21 @@ def test_first_priors_come_at_their_share_of_the_trials(scripted):
     assert [(c[0], c[1]) for c in calls] == [(118, 0), (1057, 0), (775, 1)]
 
 
+def test_the_rest_are_matches_beyond_two_thresholds():
+    m, rests = scene(0.3), []
+    F = run_loop(m, options(), 0, PLAIN).F
+
+    def draw(_points, draws, _loss, _pretests, to_beat, limit, _state, best):
+        rests.append(draws.rest[-1])
+        if len(rests) == 1:
+            best[0], to_beat[0] = F.reshape(9), 1.0
+        return limit
+
+    recipe = replace(PLAIN, validity=always(np.ones(300)), rest_share=0.25, patience=always(100), least_trials=50)
+    run_loop(m, options(max_trials=200), 0, recipe, draw)
+    assert rests[:2] == [0.0, np.count_nonzero(squared_distances(m.points, F.reshape(9)) > (6 / m.unit_px) ** 2)]
+
+
 def test_a_renewed_measure_scores_the_best_model_anew(scripted):
     # the script says 1e6; what the next models have to beat is counted with the share of inliers that the best one has
     _, calls = scripted(replace(PLAIN, score=mlesac, assumed_share=0.5), (10, 1e6))

@@ -42,6 +42,11 @@ def test_a_photo_without_words_has_no_similar_ones():
     assert len(ranked[-1]) == 0 and all(PHOTOS not in others for others in ranked)
 
 
+def test_a_word_counts_with_the_root_of_its_frequency():
+    words = [np.array(one, np.int64) for one in ([0, 0, 0, 0, 1], [0, 3], [1], [5])]
+    assert rank_similar(words, 6, 3)[0].tolist() == [2, 1]  # four times as often: 4 * 0.45 > 1 > 2 * 0.45
+
+
 def test_words_are_whole_numbers_and_descriptors_belong_to_the_nearest():
     photos = street()
     vocabulary, words = words_of(photos)
