@@ -5,16 +5,17 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.spatial import cKDTree
 
 from sfm_app.settings import MatchSettings
 from sfm_app.types import MatchedImage, PairId
 from sfm_app.types.arrays import IndexArray
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 # Choice among similar photos: the nearest ones, and of the others some at every distance. In a video the most similar
 # photos are the neighbors, which add no parallax; less similar photos of the same place hold a model together.
@@ -99,6 +100,8 @@ def count_shared_keypoints(
 
     `keypoints` has their number by photo. They are counted for `block` photos at once.
     """
+    from scipy import sparse
+
     photos = sorted(keypoints)
     place = {photo: k for k, photo in enumerate(photos)}
     partners: list[list[tuple[int, IndexArray]]] = [[] for _ in photos]
@@ -115,10 +118,10 @@ def count_shared_keypoints(
     return {pair: count for pair, count in zip(named, shared.data.tolist(), strict=True) if pair not in matches}
 
 
-def _points_in_others(
-    partners: list[list[tuple[int, IndexArray]]], keypoints: list[int], photos: int
-) -> sparse.csr_array:
+def _points_in_others(partners: list[list[tuple[int, IndexArray]]], keypoints: list[int], photos: int) -> "csr_array":
     """Return (photos, keypoints of some photos): in which other photos each keypoint has a match."""
+    from scipy import sparse
+
     starts = np.cumsum([0, *keypoints])
     ends = [(other, rows + starts[k]) for k, others in enumerate(partners) for other, rows in others]
     owners = np.repeat(np.array([other for other, _ in ends], np.int64), [len(rows) for _, rows in ends])
@@ -143,6 +146,8 @@ def pairs_in_order(images: Sequence[MatchedImage], steps: Sequence[int]) -> set[
 
 def pairs_nearby(images: Sequence[MatchedImage], count: int) -> set[PairId]:
     """Return pairs of photos with the `count` photos whose GPS positions are nearest."""
+    from scipy.spatial import cKDTree
+
     located = [(image.id, image.gps) for image in images if image.gps is not None]
     if len(located) < 2:
         return set()
@@ -175,6 +180,8 @@ def describe_picture(pixels: NDArray[np.uint8], most: int) -> NDArray[np.uint8]:
 
     For photos whose own features are not SIFT.
     """
+    import cv2  # an estimate of the cost needs none of these libraries
+
     gray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
     scale = OPTIONS.longer_side_px / max(gray.shape)
     if scale < 1.0:
@@ -239,8 +246,10 @@ def rank_similar(words: Sequence[IndexArray], size: int, most: int) -> list[Inde
     return rows
 
 
-def _weigh(words: Sequence[IndexArray], size: int) -> sparse.csr_array:
+def _weigh(words: Sequence[IndexArray], size: int) -> "csr_array":
     """Return (photos, words) the weights of words in photos, with rows of length 1."""
+    from scipy import sparse
+
     photos = np.repeat(np.arange(len(words)), [len(one) for one in words])
     columns = np.concatenate([np.zeros(0, np.int64), *words])
     counts = sparse.coo_array((np.ones(len(columns)), (photos, columns)), shape=(len(words), size)).tocsr()

@@ -1,4 +1,4 @@
-"""Matches that do not determine a fundamental matrix: planes, watermarks, too few points."""
+"""Matches that do not determine F: planes, lines, rotations (Hartley and Zisserman 2004, 11.9), watermarks (ours)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

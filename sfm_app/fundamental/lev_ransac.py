@@ -104,10 +104,10 @@ def _optimize_locally(points: FloatArray, F: FloatArray, threshold: float) -> Fl
     """
     squared = squared_distances(points, np.ascontiguousarray(F).reshape(9))
     near = np.flatnonzero(squared <= (OPTIONS.sampson_reach * threshold) ** 2)[: OPTIONS.local_matches]
-    some, wide = np.asfortranarray(points[near]), squared[near] <= (OPTIONS.algebraic_reach * threshold) ** 2
-    F = fit_algebraic(some, wide.astype(np.float64)) if np.count_nonzero(wide) >= 8 else F
+    nearby, wide = np.asfortranarray(points[near]), squared[near] <= (OPTIONS.algebraic_reach * threshold) ** 2
+    F = fit_algebraic(nearby, wide.astype(np.float64)) if np.count_nonzero(wide) >= 8 else F
     for scale, steps in zip((OPTIONS.coarse, OPTIONS.fine), OPTIONS.local_steps, strict=True):
-        F = refine_sampson(some, F, scale=scale * threshold, most_steps=steps, tolerance=OPTIONS.local_tolerance)
+        F = refine_sampson(nearby, F, scale=scale * threshold, most_steps=steps, tolerance=OPTIONS.local_tolerance)
     return F
 
 

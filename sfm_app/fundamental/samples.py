@@ -1,4 +1,4 @@
-"""Minimal samples, and when to stop drawing them."""
+"""Minimal samples, and when to stop drawing them (thesis 3.3.6, 4.4.5 and 4.7.4)."""
 
 import math
 
@@ -89,7 +89,7 @@ def _search_sorted(cumulative: FloatArray, target: float) -> int:
     return low
 
 
-# When to stop drawing samples (thesis 3.3.6, 4.4.5 and 4.7.4).
+# Stopping rules.
 
 CONVERGED = 0.05
 """G of the thesis (4.7.4, Eq. 4.18): priors have converged when the sum of their changes is below this."""

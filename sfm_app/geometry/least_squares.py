@@ -220,11 +220,11 @@ class NormalPriors(NamedTuple):
     away: FloatArray
     """(K, n) from the present parameters to the priors' means."""
     log_odds: FloatArray
-    """(K,) log-probability of each choice before the photos are asked."""
+    """(K,) prior log-probability of each choice."""
 
 
 class Posteriors(NamedTuple):
-    """What K choices make of the same likelihood."""
+    """Posteriors of one likelihood under K choices of priors."""
 
     log_evidence: FloatArray
     """(K,) log-probability of each choice, up to a constant."""

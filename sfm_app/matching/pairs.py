@@ -37,7 +37,7 @@ ReadDescriptors = Callable[[int], DescriptorArray]
 
 
 @dataclass(frozen=True, slots=True)
-class PairOptions:
+class PairChoiceOptions:
     """How pairs are chosen."""
 
     largest_features: int = 1024
@@ -76,7 +76,7 @@ class PairOptions:
     """Fewest keypoints of third photos that match in both photos of a pair of the second round. Chosen by hand."""
 
 
-OPTIONS = PairOptions()
+OPTIONS = PairChoiceOptions()
 
 
 def first_pairs(
@@ -117,7 +117,7 @@ def _similar_pairs(
 
 
 def sequence_steps(count: int) -> tuple[int, ...]:
-    """Return the steps to the neighbors in a sequence: half of them next to each other, each other one twice as far."""
+    """Return the steps to the neighbors in a sequence: half of them adjacent, the others at doubling distances."""
     near = max(2, round(OPTIONS.sequence_share * count / 2))
     return (*range(1, near + 1), *(near * 2**k for k in range(1, 4)))
 
@@ -174,17 +174,17 @@ def match_probable_pairs(method: FeatureMethod, load: Callable[[], MatchGraph], 
         PluginError: the method raises, or returns invalid results.
         BackendError: COLMAP failed.
     """
-    before = load()
+    initial = load()
     known = run.earlier.known if run.earlier is not None else frozenset[str]()
-    new = {photo for photo, image in before.images.items() if image.name not in known}
+    new = {photo for photo, image in initial.images.items() if image.name not in known}
     if not new:  # photos were only removed
         run.record(matched_pairs=0, rounds=[0, 0])
         return {}
-    first = first_pairs(before.images, lambda photo: _descriptors(method, before.images[photo], run), run, new)
-    first = pairs_with_new_photos(first, before.images, known)
+    first = first_pairs(initial.images, lambda photo: _descriptors(method, initial.images[photo], run), run, new)
+    first = pairs_with_new_photos(first, initial.images, known)
     in_force = match_pairs(method, run, first)
     graph, matched = load(), set(first)
-    matched |= graph.matches.keys() - set(pairs_with_new_photos(graph.matches, before.images, known))
+    matched |= graph.matches.keys() - set(pairs_with_new_photos(graph.matches, initial.images, known))
     matches = {pair: rows for pair, rows in graph.matches.items() if pair in matched}
     counts = {photo: len(points) for photo, points in graph.keypoints.items()}
     second = second_pairs(counts, matches, matched, run.settings.matching, new)

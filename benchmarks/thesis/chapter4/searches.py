@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from benchmarks.common.metrics import CAP_PX, mean_sampson_px
 from sfm_app.fundamental.lev_ransac import PRODUCTION
-from sfm_app.fundamental.loop import Hypothesis, Recipe, search
+from sfm_app.fundamental.loop import Hypothesis, Recipe, run_loop
 from sfm_app.fundamental.points import Matches, prepare
 from sfm_app.fundamental.recipes import RECIPES
 from sfm_app.settings import EpipolarSettings
@@ -23,7 +23,7 @@ class Search:
 
     def __call__(self, x1: FloatArray, x2: FloatArray, seed: int) -> tuple[FloatArray | None, int | None]:
         matches = prepare(x1, x2, seed)
-        found = search(matches, self._options, seed, self._recipe)
+        found = run_loop(matches, self._options, seed, self._recipe)
         self._found.append((matches, found))
         return (None, None) if found is None else (matches.to_pixels(found.F), found.trials)
 

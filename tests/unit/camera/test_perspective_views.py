@@ -44,7 +44,6 @@ def shown(view, rays, margin_px=0.0):
 )
 def test_every_ray_is_in_one_of_few_views(rays, count):
     views = cover_rays(rays, 200.0, 10_000)
-
     assert len(views) == count
     # views are as large as whole pixels
     assert np.any([shown(view, rays, 1.0) for view in views], axis=0).all()
@@ -58,7 +57,6 @@ def test_every_ray_is_in_one_of_few_views(rays, count):
 
 def test_large_views_are_scaled_down():
     (view,) = cover_rays(cone(60, 45), 2000.0, 500)
-
     assert max(view.width, view.height) == 500
     assert 300.0 < view.K[0, 0] < 500.0 / (2.0 * np.tan(np.radians(30.0)))
 
@@ -66,7 +64,6 @@ def test_large_views_are_scaled_down():
 def test_rays_are_those_of_pixel_centers():
     view = cover_rays(cone(120, 80), 150.0, 1000)[1]
     rays = view.rays()
-
     assert rays.shape == (view.height, view.width, 3)
     seen = rays[7, 11] @ view.R.T @ view.K.T
     np.testing.assert_allclose(seen[:2] / seen[2], [11.5, 7.5], atol=1e-9)
@@ -75,7 +72,6 @@ def test_rays_are_those_of_pixel_centers():
 def test_views_next_to_each_other_overlap():
     rays = cone(120, 80)
     left, right = cover_rays(rays, 200.0, 1000)
-
     middle = np.column_stack([np.sin(t := np.radians(np.linspace(-3.0, 3.0, 9))), np.zeros(9), np.cos(t)])
     assert shown(left, middle).all() and shown(right, middle).all()
     aside = np.array([[np.sin(np.radians(20.0)), 0.0, np.cos(np.radians(20.0))]])
@@ -103,9 +99,7 @@ def test_a_centered_view_shows_nothing_else_and_as_much_as_it_can(center):
 
 def test_a_view_that_is_centered_stays_as_it_is():
     view = PerspectiveView(np.eye(3), camera_matrix(900.0, 900.0, 500.0, 400.0), 1000, 800)
-
     found = center_view(view)
-
     assert (found.width, found.height) == (1000, 800)
     np.testing.assert_allclose(found.K, view.K)
     np.testing.assert_allclose(found.R, view.R, atol=1e-15)

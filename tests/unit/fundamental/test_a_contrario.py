@@ -55,9 +55,7 @@ def test_mismatches_never_pair_a_point_with_its_partner():
     pair = make_pair(PairOptions(points=150, sigma_px=0), 0)
     m = prepare(pair.x1, pair.x2, 0)
     f = eight_point(m.points[:, :2], m.points[:, 2:]).reshape(9)
-
     wrong = squared_mismatch_distances(m.points, f)
-
     assert 7_800 <= len(wrong) <= 8_000
     assert wrong.min() > 1e4 * squared_distances(m.points, f).max()
 
@@ -80,17 +78,8 @@ def test_random_matches_are_rejected(name, count):
 def test_true_pairs_are_kept(true, false):
     kept = 0
     for seed in range(10):
-        pair = make_pair(
-            PairOptions(
-                points=true + false,
-                outliers=false / (true + false),
-                sigma_px=0.4,
-                width=1600,
-                height=1200,
-                focal_px=1500,
-            ),
-            seed,
-        )
+        size = {"points": true + false, "width": 1600, "height": 1200, "focal_px": 1500}
+        pair = make_pair(PairOptions(outliers=false / (true + false), sigma_px=0.4, **size), seed)
         fit = ESTIMATORS["lev-ransac"][0](pair.x1, pair.x2, EpipolarSettings(), seed)
         kept += isinstance(fit, EpipolarFit) and bool(fit.inliers[pair.is_inlier].mean() > 0.7)
     assert kept >= 9

@@ -36,9 +36,7 @@ def scene(outliers=0.3, seed=0, points=200):
 def test_leverages_are_the_hat_diagonal_of_the_tangent_regression():
     points, f, good = scene()
     X = design(points) @ np.linalg.svd(f[None])[2][1:].T
-
     h = leverages(points, f, good)
-
     inside = X[good]
     hat = inside @ np.linalg.inv(inside.T @ inside) @ inside.T
     np.testing.assert_allclose(h[good], np.diag(hat), rtol=1e-6)
@@ -87,7 +85,6 @@ def test_cook_distance_is_what_deletion_does():
         [X @ (np.linalg.lstsq(np.delete(X, i, 0), np.delete(y, i), rcond=None)[0] - beta) for i in range(40)]
     )
     studentised = residuals / np.sqrt(s2 * (1 - hat))
-
     np.testing.assert_allclose(cook_distances(studentised, hat), (moved**2).sum(axis=1) / (PARAMETERS * s2), rtol=1e-9)
 
 
@@ -117,9 +114,7 @@ def test_mad_of_a_gaussian_is_its_deviation():
 @pytest.mark.parametrize("seed", range(3))
 def test_priors_tell_inliers_from_outliers(seed, sigma_from_inliers):
     points, f, good = scene(outliers=0.4, seed=seed)
-
     p = prior_validity(points, f, TWO_PIXELS, sigma_from_inliers=sigma_from_inliers)
-
     assert p.max() == 1
     assert p.min() >= 0
     assert np.mean(p[good]) > 0.5

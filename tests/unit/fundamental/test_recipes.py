@@ -9,17 +9,17 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.synthetic.matches import make_two_motions
 from sfm_app.camera.bearings import bearings, project
-from sfm_app.camera.models import camera_matrix
 from sfm_app.fundamental import ESTIMATORS
 from sfm_app.fundamental.lev_ransac import fit_lev_ransac, search_patience
 from sfm_app.fundamental.loop import run_loop
 from sfm_app.fundamental.points import prepare
 from sfm_app.fundamental.rays import fit_lev_ransac_rays, validity
 from sfm_app.fundamental.recipes import RECIPES, classical_estimator, median_sigma
-from sfm_app.geometry.epipolar import cross_matrix, decompose_essential, fundamental_from_pose, sampson_distance
+from sfm_app.geometry.epipolar import cross_matrix, decompose_essential, sampson_distance
 from sfm_app.settings import EpipolarSettings
-from sfm_app.synthetic.correspondences import PairOptions, make_pair, random_rotation
+from sfm_app.synthetic.correspondences import PairOptions, make_pair
 from sfm_app.types import Calibration, EpipolarFit, Rejected
+from tests.unit.fundamental.conftest import UNIT, plane_scene
 
 OPTIONS = EpipolarSettings(max_error_px=1.96, max_trials=20_000)
 
@@ -103,36 +103,18 @@ def test_long_searches_give_the_same_bytes(seed):
     }
 
 
-UNIT = 400.0
 THRESHOLD = 1.5 / UNIT
-K = camera_matrix(900 / UNIT, 900 / UNIT, 0, 0)
-
-
-def scene(seed, *, on_plane, off_plane, outliers):
-    """Matches in random order with 0.3 px of noise, H of the plane and F; lengths in units of 400 px."""
-    rng = np.random.default_rng([seed, 31])
-    R, t, n = random_rotation(rng, 20.0), np.array([0.5, 0.1, 0.1]), rng.normal((0, 0, -1), 0.2)
-    count = on_plane + off_plane
-    x1 = rng.uniform(-1, 1, (count, 2))
-    rays = np.column_stack([x1, np.ones(count)]) @ np.linalg.inv(K).T
-    depth = -1 / (rays @ n)
-    depth[on_plane:] *= rng.uniform(0.5, 0.8, off_plane)
-    x2 = ((rays * depth[:, None]) @ R.T + t) @ K.T
-    points = np.column_stack([x1, x2[:, :2] / x2[:, 2:]]) + rng.normal(0, 0.3 / UNIT, (count, 4))
-    points = rng.permutation(np.vstack([points, rng.uniform(-1, 1, (outliers, 4))]))
-    H = K @ (R - np.outer(t, n)) @ np.linalg.inv(K)
-    return np.asfortranarray(points), H, fundamental_from_pose(K, K, R, t)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_scene_with_parallax_needs_little_patience(seed):
-    points, _, F = scene(seed, on_plane=150, off_plane=250, outliers=200)
+    points, _, F, _ = plane_scene(seed, on_plane=150, off_plane=250, outliers=200, sigma_px=0.3)
     assert 1 < search_patience(points, F, THRESHOLD) < 300
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_plane_with_a_wrong_epipole_needs_much(seed):
-    points, H, F = scene(seed, on_plane=200, off_plane=60, outliers=200)
+    points, H, F, _ = plane_scene(seed, on_plane=200, off_plane=60, outliers=200, sigma_px=0.3)
     epipole = np.append(np.random.default_rng(seed).uniform(-1, 1, 2), 1.0)
     wrong = cross_matrix(epipole) @ H
     long = search_patience(points, wrong / np.linalg.norm(wrong), THRESHOLD)
@@ -143,7 +125,7 @@ def test_a_plane_with_a_wrong_epipole_needs_much(seed):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_luck_is_waited_out_for_ever(seed):
-    points, _, F = scene(seed, on_plane=0, off_plane=0, outliers=400)
+    points, _, F, _ = plane_scene(seed, on_plane=0, off_plane=0, outliers=400, sigma_px=0.3)
     assert search_patience(points, F, THRESHOLD) == math.inf
     assert search_patience(points[:7].copy("F"), F, THRESHOLD) == math.inf
 
@@ -151,7 +133,7 @@ def test_luck_is_waited_out_for_ever(seed):
 def test_patience_falls_as_matches_off_the_plane_come_in():
     waits = []
     for off_plane in (0, 60, 120, 240):
-        points, _, F = scene(1, on_plane=200, off_plane=off_plane, outliers=100)
+        points, _, F, _ = plane_scene(1, on_plane=200, off_plane=off_plane, outliers=100, sigma_px=0.3)
         waits.append(search_patience(points, F, THRESHOLD))
     assert waits == sorted(waits, reverse=True)
     assert waits[0] > 10 * waits[-1]
@@ -188,7 +170,6 @@ def turn_error_deg(E):
 def test_right_matches_are_told_from_wrong_ones(seed, wrong):
     x1, x2 = matches_of(seed, wrong=wrong)
     found = fit_lev_ransac_rays(lines_of(x1, x2), DEFAULTS, seed)
-
     assert isinstance(found, EpipolarFit) and found.degeneracy == ""
     assert 0.93 < found.inliers[:200].mean() <= 1.0
     assert wrong == 0 or 0.0 < found.inliers[200:].mean() < 0.08

@@ -21,6 +21,7 @@ from sfm_app.fundamental.refits import (
 from sfm_app.fundamental.scores import squared_distances
 from sfm_app.geometry.epipolar import (
     canonical_cameras,
+    eight_point,
     fundamental_from_pose,
     nearest_exact_matches,
     nearest_rank_two,
@@ -50,40 +51,49 @@ def cost(points, F, scale=np.inf):
     return (squared / (1 + squared / scale**2)).sum()
 
 
+def cost_of(refine):
+    return cost if refine is refine_sampson else gold_cost
+
+
+@pytest.mark.parametrize("refine", [refine_sampson, refine_reprojection])
 @pytest.mark.parametrize("scale", [np.inf, 0.01])
 @pytest.mark.parametrize("seed", range(4))
-def test_no_neighbor_of_rank_two_is_better(seed, scale):
-    _, m, good = scene(seed, points=200)
-    start = fit_eight_point(m.points, good.astype(float))
+def test_no_neighbor_of_rank_two_is_better(refine, seed, scale):
+    _, m, _ = scene(seed, points=200)
+    start, own = fit_eight_point(m.points, np.ones(200)), cost_of(refine)
+    tolerance = {"tolerance": 0.0} if refine is refine_sampson else {}
 
-    F = refine_sampson(m.points, start, scale=scale, most_steps=100, tolerance=0.0)
+    F = refine(m.points, start, scale=scale, most_steps=100, **tolerance)
 
-    least = cost(m.points, F, scale)
-    assert least < cost(m.points, start, scale)
-    rng, (U, s, Vt) = np.random.default_rng(seed), np.linalg.svd(F)
-    assert s[2] < 1e-12
-    for _ in range(50):
-        turns = [np.linalg.qr(np.eye(3) + 1e-4 * rng.normal(size=(3, 3)))[0] for _ in range(2)]
-        near = U @ turns[0] @ np.diag([s[0], s[1] * (1 + 1e-4 * rng.normal()), 0]) @ turns[1] @ Vt
-        assert cost(m.points, near, scale) > least * (1 - 1e-9)
+    least = own(m.points, F, scale)
+    assert least < own(m.points, start, scale)
+    singular = np.linalg.svd(F, compute_uv=False)
+    assert singular[2] < 1e-12
+    assert (singular[0] if refine is refine_sampson else np.linalg.norm(F)) == pytest.approx(1)
+    rng = np.random.default_rng(seed)
+    for size in (1e-5, 1e-4, 1e-3):
+        for _ in range(30):
+            near = nearest_rank_two(F + size * rng.normal(size=(3, 3)))
+            assert own(m.points, near, scale) > least * (1 - 1e-9)
 
 
+@pytest.mark.parametrize(("refine", "worst_px"), [(refine_sampson, 1e-4), (refine_reprojection, 1e-6)])
 @pytest.mark.parametrize("seed", range(5))
-def test_exact_matches_give_the_exact_matrix(seed):
-    pair = make_pair(PairOptions(points=60, sigma_px=0), seed)
-    m = prepare(pair.x1, pair.x2, seed)
+def test_exact_matches_give_the_exact_matrix(refine, worst_px, seed):
+    pair, m, _ = scene(seed, points=60, sigma_px=0)
     rough = fit_eight_point(moved(m.points, 0.003, seed), np.ones(60))
-    assert np.sqrt(squared_distances(m.points, rough.reshape(9))).max() * m.unit_px > 0.1
-
-    F = m.to_pixels(refine_sampson(m.points, rough, most_steps=100))
-
-    assert sampson_distance(F, pair.x1, pair.x2).max() < 1e-4
+    assert sampson_distance(m.to_pixels(rough), pair.x1, pair.x2).max() > 0.1
+    F = m.to_pixels(refine(m.points, rough, most_steps=100))
+    assert sampson_distance(F, pair.x1, pair.x2).max() < worst_px
 
 
-def test_residuals_are_the_injected_noise():
+@pytest.mark.parametrize(
+    ("refine", "distance"), [(refine_sampson, sampson_distance), (refine_reprojection, reprojection_distance)]
+)
+def test_residuals_are_the_injected_noise(refine, distance):
     pair, m, _ = scene(0, points=1000, sigma_px=0.5)
-    F = m.to_pixels(refine_sampson(m.points, fit_eight_point(m.points, np.ones(1000))))
-    rms = np.sqrt(np.mean(sampson_distance(F, pair.x1, pair.x2) ** 2))
+    F = m.to_pixels(refine(m.points, fit_eight_point(m.points, np.ones(1000))))
+    rms = np.sqrt(np.mean(distance(F, pair.x1, pair.x2) ** 2))
     assert rms == pytest.approx(0.5 * np.sqrt(1 - 7 / 1000), rel=0.06)
 
 
@@ -108,18 +118,17 @@ def test_outliers_far_beyond_the_scale_do_not_pull():
 
 
 def test_eight_point_agrees_with_the_reference():
-    from sfm_app.geometry.epipolar import eight_point
-
     pair, m, _ = scene(2, points=50, sigma_px=0)
     F = m.to_pixels(fit_eight_point(m.points, np.ones(50)))
     np.testing.assert_allclose(F, eight_point(pair.x1, pair.x2), atol=1e-6)
 
 
-def test_steps_are_limited():
-    _, m, _ = scene(3, points=100)
-    start = fit_eight_point(m.points, np.ones(100))
-    costs = [cost(m.points, refine_sampson(m.points, start, most_steps=n)) for n in range(4)]
-    assert costs[0] == pytest.approx(cost(m.points, start), rel=1e-9)
+@pytest.mark.parametrize("refine", [refine_sampson, refine_reprojection])
+def test_steps_are_limited(refine):
+    _, m, _ = scene(3, points=100, sigma_px=3)
+    start, own = fit_eight_point(m.points, np.ones(100)), cost_of(refine)
+    costs = [own(m.points, refine(m.points, start, most_steps=n)) for n in range(4)]
+    assert costs[0] == pytest.approx(own(m.points, start), rel=1e-9)
     assert costs[0] > costs[1] >= costs[2] >= costs[3]
 
 
@@ -214,9 +223,7 @@ def test_the_algebraic_fit_is_the_smallest_singular_vector():
 def test_factors_are_those_of_the_nearest_matrix_of_rank_two(rank, seed):
     rng = np.random.default_rng([rank, seed])
     F = rng.normal(size=(3, rank)) @ rng.normal(size=(rank, 3)) * 10.0 ** rng.integers(-5, 5)
-
     U, s, V = factorize(F)
-
     for R in (U, V):
         np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-9)
         assert np.linalg.det(R) == pytest.approx(1)
@@ -258,44 +265,6 @@ def gold_scene(seed, **options):
 def gold_cost(points, F, scale=np.inf):
     squared = reprojection_distance(F, points[:, :2], points[:, 2:]) ** 2
     return squared.sum() if scale == np.inf else (scale**2 * np.log1p(squared / scale**2)).sum()
-
-
-@pytest.mark.parametrize("scale", [np.inf, 0.01])
-@pytest.mark.parametrize("seed", range(4))
-def test_no_neighbor_has_less_reprojection_error(seed, scale):
-    _, m, start = gold_scene(seed, points=100, sigma_px=3)
-
-    F = refine_reprojection(m.points, start, scale=scale, most_steps=100)
-
-    least = gold_cost(m.points, F, scale)
-    assert least < gold_cost(m.points, start, scale)
-    rng, singular = np.random.default_rng(seed), np.linalg.svd(F, compute_uv=False)
-    assert singular[2] < 1e-15
-    assert np.linalg.norm(F) == pytest.approx(1)
-    for size in (1e-5, 1e-4, 1e-3):
-        for _ in range(30):
-            near = nearest_rank_two(F + size * rng.normal(size=(3, 3)))
-            assert gold_cost(m.points, near, scale) > least * (1 - 1e-9)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_exact_matches_give_the_exact_gold_standard(seed):
-    pair, m, _ = gold_scene(seed, points=60, sigma_px=0)
-    rough = fit_eight_point(
-        np.asfortranarray(m.points + 0.003 * np.random.default_rng(seed).normal(size=(60, 4))), np.ones(60)
-    )
-    assert sampson_distance(m.to_pixels(rough), pair.x1, pair.x2).max() > 0.1
-
-    F = m.to_pixels(refine_reprojection(m.points, rough, most_steps=100))
-
-    assert sampson_distance(F, pair.x1, pair.x2).max() < 1e-6
-
-
-def test_reprojection_errors_are_the_injected_noise():
-    pair, m, start = gold_scene(0, points=1000, sigma_px=0.5)
-    F = m.to_pixels(refine_reprojection(m.points, start))
-    rms = np.sqrt(np.mean(reprojection_distance(F, pair.x1, pair.x2) ** 2))
-    assert rms == pytest.approx(0.5 * np.sqrt(1 - 7 / 1000), rel=0.06)
 
 
 def test_it_is_as_near_to_the_truth_as_the_refit_on_its_first_order():
@@ -362,9 +331,7 @@ def test_points_at_infinity_are_points():
     far = to_homogeneous(pair.exact_x1[:50]) @ (pair.K2 @ pair.R @ np.linalg.inv(pair.K1)).T
     x1, x2 = pair.exact_x1, np.vstack([far[:, :2] / far[:, 2:], pair.exact_x2[50:]])
     m = prepare(x1 + rng.normal(size=x1.shape), x2 + rng.normal(size=x2.shape), 0)
-
     F = m.to_pixels(refine_reprojection(m.points, fit_eight_point(m.points, np.ones(100))))
-
     assert 0.01 < np.sqrt(np.mean(sampson_distance(F, x1, x2) ** 2)) < 1
 
 
@@ -385,13 +352,6 @@ def test_matches_that_do_not_determine_the_matrix_still_get_one(case, seed):
     F = refine_reprojection(points, start)
     assert np.linalg.svd(F, compute_uv=False)[2] < 1e-15
     assert gold_cost(points, F) <= gold_cost(points, nearest_rank_two(start))
-
-
-def test_gold_standard_steps_are_limited():
-    _, m, start = gold_scene(3, points=100, sigma_px=3)
-    costs = [gold_cost(m.points, refine_reprojection(m.points, start, most_steps=n)) for n in range(4)]
-    assert costs[0] == pytest.approx(gold_cost(m.points, start), rel=1e-9)
-    assert costs[0] > costs[1] >= costs[2] >= costs[3]
 
 
 def test_ten_thousand_matches_and_the_same_bytes_twice():
@@ -415,32 +375,22 @@ def options(refit):
     return EpipolarSettings(max_error_px=2.0, max_trials=2000, refit=refit)
 
 
-def test_the_settings_offer_what_there_is():
+def test_the_settings_offer_every_refit():
     assert ["auto", *REFITS] == CHOICES
-    for name in CHOICES:
-        assert options(name).refit == name
-
-
-@pytest.mark.parametrize("refit", CHOICES)
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_every_choice_works_on_every_estimator(estimator, refit):
-    pair = make_pair(SCENE, 3)
-
-    found = ESTIMATORS[estimator][0](pair.x1, pair.x2, options(refit), 0)
-
-    assert isinstance(found, EpipolarFit), found
-    assert np.linalg.svd(found.F, compute_uv=False)[2] < 1e-12
-    assert 0.5 < np.sqrt(np.mean(sampson_distance(found.F, pair.x1, pair.x2)[pair.is_inlier] ** 2)) < 0.9
-    assert 0 < np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2)) < 0.4
+    assert [options(name).refit for name in CHOICES] == CHOICES
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_the_choices_differ_and_are_close(estimator):
-    pair = make_pair(SCENE, 3)
-    found = [ESTIMATORS[estimator][0](pair.x1, pair.x2, options(refit), 0).F for refit in CHOICES]
-    for k, F in enumerate(found[1:]):
-        assert np.abs(F - found[k]).max() > 0
-        assert np.median(sampson_distance(F, pair.exact_x1, pair.exact_x2)) < 0.4
+def test_every_choice_works_on_every_estimator_and_differs(estimator):
+    pair, before = make_pair(SCENE, 3), None
+    for refit in CHOICES:
+        found = ESTIMATORS[estimator][0](pair.x1, pair.x2, options(refit), 0)
+        assert isinstance(found, EpipolarFit), found
+        assert np.linalg.svd(found.F, compute_uv=False)[2] < 1e-12
+        assert 0.5 < np.sqrt(np.mean(sampson_distance(found.F, pair.x1, pair.x2)[pair.is_inlier] ** 2)) < 0.9
+        assert 0 < np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2)) < 0.4
+        assert before is None or np.abs(found.F - before).max() > 0
+        before = found.F
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -452,9 +402,7 @@ def test_each_is_best_at_its_own_distance_on_the_same_inliers(seed):
     threshold, start = 6.0 / m.unit_px, fit_eight_point(m.points, good)
     inliers = m.points[sampson_distance(start, m.points[:, :2], m.points[:, 2:]) <= threshold]
     assert len(inliers) > 120
-
     fits = {name: refit(m.points, start, threshold) for name, refit in REFITS.items()}
-
     views = inliers[:, :2], inliers[:, 2:]
     for loss, best in ((sampson_distance, "sampson"), (reprojection_distance, "reprojection")):
         costs = {name: (loss(F, *views) ** 2).sum() for name, F in fits.items()}

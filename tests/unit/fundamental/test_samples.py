@@ -53,7 +53,6 @@ def test_uniform_numbers_are_uniform():
 def test_uniform_samples_are_distinct_and_fair():
     state = random_state(3)
     found = samples(lambda sample: draw_uniform(state, 20, sample))
-
     assert all(len(set(row)) == SAMPLE_SIZE for row in found.tolist())
     share = np.bincount(found.ravel(), minlength=20) / DRAWS
     assert np.abs(share - SAMPLE_SIZE / 20).max() < 0.02
@@ -64,7 +63,6 @@ def test_weighted_samples_follow_the_weights():
     weights = np.arange(20.0)
     cumulative, state = np.cumsum(weights), random_state(5)
     found = samples(lambda sample: draw_weighted(state, cumulative, sample))
-
     assert all(len(set(row)) == SAMPLE_SIZE for row in found.tolist())
     assert not (found == 0).any()
     first = np.bincount(found[:, 0], minlength=20) / DRAWS

@@ -41,9 +41,7 @@ def matches_off_by(*pixels):
 def test_distances_agree_with_the_reference():
     rng = np.random.default_rng(0)
     points, F = np.asfortranarray(rng.normal(size=(50, 4))), rng.normal(size=(3, 3))
-
     squared = squared_distances(points, F.reshape(9))
-
     np.testing.assert_allclose(np.sqrt(squared), sampson_distance(F, points[:, :2], points[:, 2:]), rtol=1e-9)
     assert squared_sampson_distance(np.zeros(9), 1.0, 2.0, 3.0, 4.0) == np.inf
 
@@ -68,7 +66,6 @@ def test_a_score_that_cannot_win_is_left(score):
     points = matches_off_by(*np.linspace(0, 4, 1000))
     loss = score(points, 2.0, None)
     full = penalty(points, 0, SHIFT, loss, np.inf, NO_PRETEST)
-
     assert penalty(points, 0, SHIFT, loss, full * 1.001, NO_PRETEST) == full
     assert penalty(points, 0, SHIFT, loss, full, NO_PRETEST) == np.inf
 
@@ -85,7 +82,6 @@ def test_the_gate_turns_away_what_lacks_inliers_and_keeps_books():
     points = matches_off_by(*[9.0] * BLOCK, *[0.0] * 10 * BLOCK)
     loss = msac(points, 2.0, None)
     lenient, strict = (make_pretest(np.array([least]), BLOCK, random_start=False) for least in (0, 1))
-
     assert penalty(points, 0, SHIFT, loss, np.inf, lenient) == 4 * BLOCK
     assert penalty(points, 0, SHIFT, loss, np.inf, strict) == np.inf
     assert lenient.rejected.tolist() == [0, 0]
@@ -116,15 +112,8 @@ def test_quickselect_agrees_with_sorting(count):
 def test_a_soft_penalty_still_counts_inliers_for_the_gate():
     points = matches_off_by(*[1.9, 2.1] * BLOCK)
     for least, passes in ((BLOCK // 2, True), (BLOCK // 2 + 1, False)):
-        found = penalty(
-            points,
-            0,
-            SHIFT,
-            SOFT(points, 2.0, None),
-            np.inf,
-            make_pretest(np.array([least]), BLOCK, random_start=False),
-        )
-        assert (found < np.inf) == passes
+        pretest = make_pretest(np.array([least]), BLOCK, random_start=False)
+        assert (penalty(points, 0, SHIFT, SOFT(points, 2.0, None), np.inf, pretest) < np.inf) == passes
 
 
 def test_a_match_at_infinity_costs_the_most():
@@ -199,9 +188,7 @@ def test_a_small_example():
     last = 4 * math.exp(-(99.5**2) / (2 * np.mean(residuals**2)))
     first, second = (n * math.exp(-(q**2) / (2 * np.mean(residuals**2))) for n, q in ((1, 0.5), (2, 1.5)))
     total = first + second + last
-
     expected = [1 - first / total, *[1 - (first + second) / total] * 2, 0, 0, 0, 0]
-
     np.testing.assert_allclose(validity_from_residuals(residuals), expected, rtol=1e-12)
     assert 0.84 < expected[0] < 0.86
 
@@ -239,8 +226,6 @@ def test_the_true_model_puts_the_priors_on_inliers():
     shift1, shift2 = np.eye(3), np.eye(3)
     shift1[:2, 2], shift2[:2, 2] = m.center[:2], m.center[2:]
     f = (F.T @ shift2.T @ pair.F @ shift1 @ F).reshape(9)
-
     valid = residual_validity(m.points, f, 1.0)[m.rows]
-
     assert valid[pair.is_inlier].mean() > 5 * valid[~pair.is_inlier].mean()
     assert (valid > 0).mean() == pytest.approx(0.5, abs=0.02)

@@ -21,9 +21,7 @@ def test_umeyama_finds_the_similarity(seed, flat):
     rng = np.random.default_rng(seed)
     true = random_similarity(rng)
     a = rng.normal(size=(8, 3)) * [1.0, 1.0, 0.0 if flat else 1.0]
-
     found = umeyama(a, true(a))
-
     assert found.scale == pytest.approx(true.scale)
     assert np.allclose(found.R, true.R, atol=1e-6) and np.linalg.det(found.R) > 0
     assert np.allclose(found(a), true(a), atol=1e-6 * true.scale)
@@ -32,7 +30,6 @@ def test_umeyama_finds_the_similarity(seed, flat):
 def test_similarities_combine_and_undo():
     rng = np.random.default_rng(1)
     first, second, x = random_similarity(rng), random_similarity(rng), rng.normal(size=(5, 3))
-
     assert np.allclose(second.compose(first)(x), second(first(x)))
     assert np.allclose(first.inverse()(first(x)), x)
 
@@ -42,10 +39,8 @@ def test_wrong_points_do_not_spoil_the_robust_fit():
     true, a = random_similarity(rng), rng.normal(size=(12, 3))
     b = true(a + rng.normal(scale=1e-3, size=a.shape))
     b[:4] += true.scale * rng.normal(size=(4, 3))
-
     robust, plain = robust_similarity(a, b), umeyama(a, b)
     errors = [np.abs(fit(a[4:]) - b[4:]).mean() / true.scale for fit in (robust, plain)]
-
     assert 3e-4 < errors[0] < 3e-3 < 3e-2 < errors[1]
 
 
@@ -62,9 +57,7 @@ def test_thousands_of_points_with_a_third_wrong_take_no_memory():
     a = rng.normal(size=(3000, 3))
     b = true(a) + rng.normal(scale=1e-3, size=a.shape)
     b[:1000] = rng.normal(size=(1000, 3))
-
     found = robust_similarity(a, b)
-
     assert abs(found.scale - true.scale) < 1e-3 and np.allclose(found.R, true.R, atol=1e-3)
     assert np.allclose(found.t, true.t, atol=1e-3)
 
@@ -77,9 +70,7 @@ def pose_of(seed=0):
 
 def test_essential_is_t_cross_r():
     pose, E = pose_of(3), np.empty((3, 3))
-
     write_essential(pose, E)
-
     np.testing.assert_allclose(E, np.cross(pose[9:], pose[:9].reshape(3, 3), axisb=0, axisc=0))
 
 

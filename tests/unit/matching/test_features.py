@@ -1,20 +1,20 @@
-"""Features and matches by a plug-in, and chunks of pairs."""
+"""Features and matches by a plug-in, and the two rounds of matching."""
 
-import itertools
 from types import SimpleNamespace
 
-import hypothesis.strategies as st
+import cv2
 import numpy as np
 import pytest
-from hypothesis import given
 from PIL import Image
 
 from sfm_app.api import open_run
 from sfm_app.colmap.database import create_database, read_match_graph
 from sfm_app.errors import ConfigError, PluginError
-from sfm_app.matching.features import all_pairs, cut_pairs, fill_database
+from sfm_app.matching.features import all_pairs, fill_database
 from sfm_app.plugins import FeatureMethod, hookimpl, load_plugins
+from sfm_app.runtime.context import RunContext
 from sfm_app.settings import Settings
+from sfm_app.stages import match_graph
 from sfm_app.types import Features, Photo, PhotoSet
 
 pytestmark = pytest.mark.slow
@@ -68,7 +68,6 @@ def filled(tmp_path):
 def test_every_photo_is_seen_once_in_its_colors_and_every_pair_matched(filled):
     ways = Corners()
     graph = filled(ways.method)
-
     assert ways.seen == [(200, 100, (255, 0, 0)), (200, 100, (0, 255, 0)), (200, 100, (0, 0, 255))]
     assert list(graph.matches) == all_pairs([3, 1, 2]) == [(1, 2), (1, 3), (2, 3)]
     np.testing.assert_array_equal(graph.keypoints[2], [[50, 25], [150, 25], [50, 75], [150, 75]])
@@ -78,7 +77,6 @@ def test_every_photo_is_seen_once_in_its_colors_and_every_pair_matched(filled):
 def test_pictures_are_shrunk_and_keypoints_are_not(filled):
     ways = Corners()
     graph = filled(ways.method, max_image_size_px=150)
-
     assert {seen[:2] for seen in ways.seen} == {(150, 75)}
     np.testing.assert_array_equal(graph.keypoints[1], [[50, 25], [150, 25], [50, 75], [150, 75]])
 
@@ -94,7 +92,6 @@ def test_a_killed_run_goes_on_where_it_stopped(filled):
     with pytest.raises(KeyboardInterrupt):
         filled(first.method)
     graph = filled(second.method)
-
     assert second.seen == []
     assert second.matched == 2
     assert list(graph.matches) == [(1, 2), (1, 3), (2, 3)]
@@ -135,16 +132,16 @@ BROKEN_MATCHES = {
 }
 
 
-@pytest.mark.parametrize("how", BROKEN_FINDS)
-def test_features_that_cannot_be_end_the_run_with_their_name(filled, how):
+@pytest.mark.parametrize("find", BROKEN_FINDS.values(), ids=BROKEN_FINDS)
+def test_invalid_features_end_the_run_with_the_name_of_the_method(filled, find):
     with pytest.raises(PluginError, match="the features 'odd'"):
-        filled(FeatureMethod("odd", BROKEN_FINDS[how], CORNERS.match))
+        filled(FeatureMethod("odd", find, CORNERS.match))
 
 
-@pytest.mark.parametrize("how", BROKEN_MATCHES)
-def test_matches_that_cannot_be_end_the_run_with_their_name(filled, how):
+@pytest.mark.parametrize("rows", BROKEN_MATCHES.values(), ids=BROKEN_MATCHES)
+def test_invalid_matches_end_the_run_with_the_name_of_the_method(filled, rows):
     with pytest.raises(PluginError, match="the features 'odd'"):
-        filled(FeatureMethod("odd", CORNERS.find, lambda *_: np.array(BROKEN_MATCHES[how])))
+        filled(FeatureMethod("odd", CORNERS.find, lambda *_: np.array(rows)))
 
 
 def test_functions_and_options_of_sift_exclude_each_other():
@@ -166,36 +163,87 @@ def test_a_method_that_cannot_run_here_is_refused_before_any_work():
         plugins.feature_method("surf")
 
 
-@given(
-    st.sets(st.tuples(st.integers(1, 30), st.integers(1, 30)).filter(lambda pair: pair[0] < pair[1]), max_size=80),
-    st.integers(1, 20),
-)
-def test_every_pair_is_in_one_chunk_and_all_but_the_last_are_full(pairs, size):
-    found = cut_pairs(sorted(pairs), size)
-
-    assert sorted(pair for chunk in found for pair in chunk) == sorted(pairs)
-    assert all(len(chunk) == size for chunk in found[:-1])
-    assert all(1 <= len(chunk) <= size for chunk in found[-1:])
+PHOTOS, SIDE, STEP = 24, 200, 55
 
 
-def test_the_order_of_pairs_changes_nothing_but_the_order_within_a_pair_stays():
-    pairs = list(itertools.combinations(range(12), 2))
-    turned = [pair[::-1] for pair in reversed(pairs)]
+@pytest.fixture(scope="module")
+def wall():
+    """The wall as gray values, with things of all sizes."""
+    rng = np.random.default_rng(0)
+    size = PHOTOS * STEP + SIDE, SIDE
+    layers = [cv2.resize(rng.normal(size=(-(-size[1] // k), -(-size[0] // k))), size) * k for k in (4, 8, 16, 32)]
+    picture = sum(layers)
+    return np.uint8(255 * (picture - picture.min()) / np.ptp(picture))
 
-    assert cut_pairs(turned, 7) == [[pair[::-1] for pair in chunk] for chunk in cut_pairs(pairs, 7)]
+
+@pytest.fixture
+def matched(tmp_path, wall):
+    """Matches the photos, and gives the match graph and what the manifest says."""
+
+    def match(workers=1, method=None, names=None, **matching):
+        out = tmp_path / f"out{workers}"
+        named = names or [f"wall {k:02d}.png" for k in range(PHOTOS)]
+        photos = PhotoSet(tmp_path, tuple(Photo(name, SIDE, SIDE, "g") for name in sorted(named)))
+        settings = Settings.from_mapping({"workers": workers, "matching": {"neighbors": 4} | matching})
+        with open_run(out, settings, None) as opened:
+            run: RunContext = opened.with_fingerprint("same")
+            run.workspace.photos.mkdir(parents=True, exist_ok=True)
+            for k, name in enumerate(named):
+                Image.fromarray(wall[:, STEP * k : STEP * k + SIDE]).save(run.workspace.photos / name)
+            return match_graph.make(photos, run), run
+
+    return match
 
 
-@pytest.mark.parametrize(
-    ("pairs", "size", "most"),
-    [
-        (list(itertools.combinations(range(40), 2)), 100, 1.45),  # least: 15 photos in every chunk
-        ([(k, k + step) for k in range(300) for step in range(1, 11)], 250, 1.6),  # least: 31 photos
-    ],
-)
-def test_chunks_have_few_photos(pairs, size, most):
-    photos = [len({photo for pair in chunk for photo in pair}) for chunk in cut_pairs(pairs, size)]
-    in_order = [len({p for pair in pairs[k : k + size] for p in pair}) for k in range(0, len(pairs), size)]
+def apart(graph, names=None):
+    """Return how many steps the photos of each matched pair are apart."""
+    place = {image.name: k for k, image in enumerate(sorted(graph.images.values(), key=lambda one: one.name))}
+    if names:
+        place = {name: k for k, name in enumerate(names)}
+    return [abs(place[graph.images[a].name] - place[graph.images[b].name]) for a, b in graph.matches]
 
-    least = 15 if size == 100 else 31
-    assert least * 0.99 <= sum(photos) / len(photos) <= most * least
-    assert sum(photos) <= 1.02 * sum(in_order)
+
+def test_photos_are_matched_with_those_that_show_the_same(matched):
+    graph, run = matched()
+    asked = run.statistics["matched_pairs"]
+    assert PHOTOS < asked < 0.6 * PHOTOS * (PHOTOS - 1) / 2
+    gaps = apart(graph)
+    assert gaps.count(1) == PHOTOS - 1 and gaps.count(2) == PHOTOS - 2
+    strong = {pair for pair, rows in graph.matches.items() if len(rows) > 20}
+    assert all(gap <= 2 for gap, pair in zip(gaps, graph.matches, strict=True) if pair in strong)
+
+
+def test_names_that_say_nothing_do_not_matter(matched):
+    names = [f"{k:02d}.png" for k in np.random.default_rng(1).permutation(PHOTOS)]
+    graph, _ = matched(names=names)
+    gaps = apart(graph, names)
+    assert gaps.count(1) == PHOTOS - 1 and gaps.count(2) >= PHOTOS - 4
+
+
+def test_any_number_of_workers_matches_the_same(matched):
+    one, two = matched(workers=1)[0], matched(workers=2)[0]
+    assert list(one.matches) == list(two.matches)
+    assert all(np.array_equal(rows, two.matches[pair]) for pair, rows in one.matches.items())
+
+
+def test_photos_with_other_features_are_chosen_by_their_pictures(matched):
+    asked = []
+
+    def find(picture, _):
+        at = np.array([[20.0, 20.0], [180.0, 20.0], [20.0, 180.0]])
+        return Features(picture.shape[1::-1], at, {"number": np.arange(3)})
+
+    def match(first, second, _):
+        asked.append((first, second))
+        return np.column_stack([np.arange(3), np.arange(3)])
+
+    def look_up(self, name):
+        return FeatureMethod("three", find, match)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sfm_app.plugins.Plugins.feature_method", look_up)
+        graph, run = matched()
+
+    gaps = apart(graph)
+    assert len(asked) == len(gaps) == run.statistics["matched_pairs"] < PHOTOS * (PHOTOS - 1) / 2
+    assert gaps.count(1) == PHOTOS - 1 and gaps.count(2) >= PHOTOS - 4

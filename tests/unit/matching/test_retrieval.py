@@ -30,9 +30,7 @@ def words_of(photos, size=300):
 
 def test_the_rank_similar_photos_are_the_neighbors():
     vocabulary, words = words_of(street())
-
     ranked = rank_similar(words, len(vocabulary), 4)
-
     for photo, others in enumerate(ranked[4:-4], start=4):
         assert {photo - 1, photo + 1} == set(others[:2].tolist())
         assert np.abs(others - photo).max() <= 4
@@ -40,16 +38,18 @@ def test_the_rank_similar_photos_are_the_neighbors():
 
 def test_a_photo_without_words_has_no_similar_ones():
     vocabulary, words = words_of(street())
-
     ranked = rank_similar([*words, np.zeros(0, np.int64)], len(vocabulary), 5)
-
     assert len(ranked[-1]) == 0 and all(PHOTOS not in others for others in ranked)
+
+
+def test_a_word_counts_with_the_root_of_its_frequency():
+    words = [np.array(one, np.int64) for one in ([0, 0, 0, 0, 1], [0, 3], [1], [5])]
+    assert rank_similar(words, 6, 3)[0].tolist() == [2, 1]  # four times as often: 4 * 0.45 > 1 > 2 * 0.45
 
 
 def test_words_are_whole_numbers_and_descriptors_belong_to_the_nearest():
     photos = street()
     vocabulary, words = words_of(photos)
-
     assert 200 <= len(vocabulary) <= 320
     assert np.array_equal(vocabulary.words, np.rint(vocabulary.words))
     distances = np.linalg.norm(photos[3][:, None].astype(float) - vocabulary.words, axis=2)
@@ -60,7 +60,6 @@ def test_words_are_whole_numbers_and_descriptors_belong_to_the_nearest():
 @pytest.mark.parametrize("count", [0, 1, 5])
 def test_few_descriptors_give_few_words(count):
     descriptors = np.random.default_rng(0).integers(0, 256, (count, 128)).astype(np.uint8)
-
     if count:
         assert len(learn_vocabulary(descriptors, 100, 0)) == count
     assert len(pool_descriptors([descriptors], 100)) == count
@@ -68,14 +67,12 @@ def test_few_descriptors_give_few_words(count):
 
 def test_a_preview_counts_what_two_photos_share():
     photos = street()
-
     assert count_preview_matches(photos[5], photos[6:10]) == [80, 60, 40, 20]
     assert max(count_preview_matches(photos[5], photos[12:])) <= 3
 
 
 def test_a_preview_of_nothing_is_zero():
     nothing, some = np.zeros((0, 128), np.uint8), street()[0]
-
     assert count_preview_matches(nothing, [some, nothing]) == [0, 0]
     assert count_preview_matches(some, [nothing, some[:1]]) == [0, 0]
     assert count_preview_matches(some, []) == []
@@ -83,7 +80,6 @@ def test_a_preview_of_nothing_is_zero():
 
 def test_repeated_things_do_not_count_in_a_preview():
     photo = street()[0]
-
     assert count_preview_matches(photo, [np.concatenate([photo, photo])]) == [0]
 
 
@@ -94,9 +90,7 @@ def test_friends_are_counted_by_the_points_that_a_third_photo_shares_with_both()
         (2, 3): np.column_stack([rows[4:], rows[4:]]),
         (3, 4): np.column_stack([rows[:2], rows[:2]]),
     }
-
     found = count_shared_keypoints(dict.fromkeys(range(1, 6), 10), matches)
-
     assert found == {(1, 3): 6}, "the points of (3, 4) are not those of (2, 3)"
 
 
@@ -106,15 +100,12 @@ def test_friends_of_many_photos_are_counted_block_by_block():
     matches = {pair: np.unique(rng.integers(0, 50, (20, 2)), axis=0).astype(np.uint32) for pair in sorted(pairs)}
     keypoints = dict.fromkeys(range(1, 30), 50)
     whole = count_shared_keypoints(keypoints, matches)
-
     assert count_shared_keypoints(keypoints, matches, block=4) == whole and len(whole) > 50
 
 
 def test_a_picture_is_described_whatever_its_features():
     rng = np.random.default_rng(0)
     picture = np.kron(rng.integers(0, 255, (30, 40)), np.ones((16, 16)))[..., None].repeat(3, axis=2).astype(np.uint8)
-
     found = describe_picture(picture, 50)
-
     assert found.shape == (50, 128) and found.dtype == np.uint8 and found.any(axis=1).all()
     assert describe_picture(np.full((50, 50, 3), 128, np.uint8), 50).shape == (0, 128)
