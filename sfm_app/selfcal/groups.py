@@ -340,7 +340,7 @@ def _judge_camera(index: int, camera: CameraGroup, joint: _Joint, method: str) -
     # a motion that leaves the focal open is the reason only where the deviation is small
     elif not camera.is_whole and not (camera.divided and uncertain):
         reason = joint.motion
-    reason = reason or rejection_reason(_in_sides(theta, max(camera.size) / unit), spread, camera.size)
+    reason = reason or rejection_reason(_convert_to_sides(theta, max(camera.size) / unit), spread, camera.size)
     if reason:
         guess = guess_calibration(camera.size, reason, evidence)
         # it contains the mean of the family: a better start for mapping than the usual focal
@@ -361,7 +361,7 @@ def _judge_camera(index: int, camera: CameraGroup, joint: _Joint, method: str) -
     return calibration
 
 
-def _in_sides(theta: FloatArray, side: float) -> FloatArray:
+def _convert_to_sides(theta: FloatArray, side: float) -> FloatArray:
     in_sides = theta - np.array([np.log(side), 0.0, 0.0, 0.0, 0.0])
     in_sides[1:3] /= side
     return in_sides

@@ -131,8 +131,7 @@ def _distinct_indices(scaled: FloatArray) -> IndexArray:
 LOG_FOCAL, CENTER_U, CENTER_V, LOG_ASPECT, KAPPA = range(5)
 """Parameters theta of a camera: log f with f = sqrt(fx fy), center from the middle, log fy/fx, kappa."""
 LEAST_SLOPE = 0.2
-"""Least slope of the distorted over the undistorted radius; beyond it the lens continues linearly and does not fold. By
-hand."""
+"""Least slope of the distorted over the undistorted radius; a lens with less would fold, and is linear; by hand."""
 
 
 @kernel

@@ -187,7 +187,7 @@ class Equirectangular:
 
 Lens = Fisheye | RadialLens
 PERSPECTIVE = Fisheye(1.0, 1.0)
-"""A perspective lens; its focal does not matter to a fundamental matrix."""
+"""By definition a perspective lens; its focal does not matter to a fundamental matrix."""
 
 
 def bearings_through(lens: Lens | Equirectangular, matches: FloatArray) -> FloatArray:

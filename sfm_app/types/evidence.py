@@ -116,7 +116,7 @@ def _pair(row: NDArray[np.uint32]) -> PairId:
 class CameraPairs:
     """Fundamental matrices of pairs with the same camera, and data of each pair.
 
-    Nothing is checked here: a calibrator refuses malformed values with a ValueError, see `selfcal.inputs.prepare`.
+    Nothing is checked here: a calibrator refuses malformed values with a ValueError, see `selfcal.pairs.prepare`.
     """
 
     Fs: NDArray[np.float64]

@@ -42,7 +42,7 @@ def residual_weights(pairs: CameraPairs) -> FloatArray:
     Pairs of weight 0 keep it; a pair without inliers, or with infinite distances, gets weight 0.
 
     Raises:
-        ValueError: malformed input, see `selfcal.inputs.prepare`.
+        ValueError: malformed input, see `selfcal.pairs.prepare`.
     """
     check_pairs(pairs)
     residuals = [
