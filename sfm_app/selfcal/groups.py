@@ -38,9 +38,9 @@ from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs, PairId
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
-LEAST_PAIRS = 2
-"""Pairs that a camera needs: two constraints find its focal, two more contradict a wrong one. By definition of the
-constraint (thesis 5.2.4)."""
+LEAST_PAIRS_OF_SEVERAL = 2
+"""Pairs that one camera of several needs: two constraints find its focal, two more contradict a wrong one. By
+definition of the constraint (thesis 5.2.4)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,8 +333,8 @@ def _judge_camera(index: int, camera: CameraGroup, joint: _Joint, method: str) -
     }
     uncertain = uncertainty_reason(spread, one_of_many=camera.family >= 0)
     reason = ""
-    if len(own) < LEAST_PAIRS:
-        reason = f"{len(own)} usable pairs, {LEAST_PAIRS} are needed"
+    if len(own) < LEAST_PAIRS_OF_SEVERAL:
+        reason = f"{len(own)} usable pairs, {LEAST_PAIRS_OF_SEVERAL} are needed"
     elif not camera.known and margin < CONSENSUS.min_margin:
         reason = "the pairs fit other focals as well or better"
     # a motion that leaves the focal open is the reason only where the deviation is small

@@ -14,6 +14,9 @@ from sfm_app.types.arrays import FloatArray, IndexArray
 
 # The input of every calibrator: checked, of rank 2, in image units (thesis 5.6.4; rank 2 and epipoles are ours).
 
+LEAST_PAIRS = 3
+"""Pairs that one camera needs: each F gives two constraints, and with two pairs nothing contradicts a wrong K. By
+definition of the constraint (thesis 5.2.4)."""
 FULL_WEIGHT_INLIERS = 300
 """Inliers from which on a pair counts fully; by hand."""
 

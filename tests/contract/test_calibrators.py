@@ -136,7 +136,7 @@ def test_some_wrong_pairs_do_no_harm(name):
 
 
 @pytest.mark.parametrize("case", UNDETERMINED)
-def test_what_is_not_determined_is_a_guess_with_a_reason(calibrate, case):
+def test_undetermined_cameras_are_guesses_with_a_reason(calibrate, case):
     found = run(calibrate, UNDETERMINED[case])
     assert is_well_formed(found)
     assert not found.identifiable

@@ -122,7 +122,7 @@ def test_one_zoomed_photo_does_not_pull(shots):
     assert not [pair for pair in found.key_pairs if 6 in pair]
 
 
-def test_a_lens_is_only_sought_where_wanted(shots):
+def test_the_lens_can_be_switched_off(shots):
     made = shots(5, 5, k1=-0.05).pairs
     found = calibrate(made, OPTIONS.model_copy(update={"lens": False}), 0)
     assert abs(found.radial) < 1e-5
@@ -151,7 +151,7 @@ def test_settled_lowers_the_cost_and_stays_where_it_is_best(shots):
     np.testing.assert_allclose(back.thetas, there.thetas, atol=1e-3)
 
 
-def test_a_pair_is_measured_by_what_it_would_gain_alone(shots):
+def test_gains_of_own_cameras_show_disagreement(shots):
     matches, _ = laid_out(shots(5, 1, points=120).pairs)
     state = fitted(shots(5, 1, points=120).pairs).state
     gains = pair_information(matches, state).gains

@@ -138,7 +138,7 @@ def rejection(theta, spread=0.001):
     return rejection_reason(np.array(theta), spread, (1000, 750))
 
 
-def test_what_the_pairs_agree_on_can_still_be_wrong():
+def test_answers_of_agreeing_pairs_are_rejected_for_a_reason():
     assert rejection([0.0, 0.49, -0.37, 0.0]) == ""
     assert rejection([0.0, 0.0, 0.0, 0.0], spread=0.09) == ""
     assert "uncertain by 12 %" in rejection([0.0, 0.0, 0.0, 0.0], spread=0.12)

@@ -44,7 +44,7 @@ def test_wrong_pairs_do_not_split_a_camera(shots):
 
 
 @pytest.mark.parametrize("ratio", [1.5, 0.6])
-def test_two_cameras_are_told_apart(shots, ratio):
+def test_photos_are_split_by_camera(shots, ratio):
     right = 0
     for seed in range(20):
         made = shots(8, seed, focal=[1000.0] * 4 + [1000.0 * ratio] * 4, points=120)
@@ -54,7 +54,7 @@ def test_two_cameras_are_told_apart(shots, ratio):
     assert right >= 19
 
 
-def test_one_zoomed_photo_of_eight_is_found(shots):
+def test_one_zoomed_photo_of_eight_is_split_off(shots):
     right = 0
     for seed in range(20):
         made = shots(8, seed, focal=[1000.0] * 7 + [1500.0], points=120)
@@ -63,7 +63,7 @@ def test_one_zoomed_photo_of_eight_is_found(shots):
     assert right >= 19
 
 
-def test_close_focals_are_mostly_told_apart(shots):
+def test_close_focals_are_mostly_split(shots):
     # 20 %: one F in ten photos may vote for the wrong half, but every camera found is one of the two
     right = 0
     for seed in range(10):
@@ -91,7 +91,7 @@ def divided(made, Fs=None, kept=None, starts=(1.0,)):
 
 
 @pytest.mark.parametrize("ratio", [1.5, 0.65])
-def test_two_cameras_that_hardly_see_each_other_are_told_apart(shots, ratio):
+def test_two_cameras_with_hardly_any_common_pair_are_divided(shots, ratio):
     """No photo alone wants another focal: all that it shares pairs with would have to change with it."""
     right = 0
     for seed in range(10):
@@ -137,7 +137,7 @@ UNLIKE = 1000 * np.geomspace(0.7, 1.75, 10)
 """Ten focals, the last 2.5 times the first."""
 
 
-def asked(made, Fs=None, labels=None, seed=0):
+def validate(made, Fs=None, labels=None, seed=0):
     """What held pairs say."""
     Fs = MIDDLE.T @ (made.pairs.Fs if Fs is None else Fs) @ MIDDLE
     tables = VoteTables(Fs, np.zeros((len(Fs), 2), np.int64), made.pairs.weights)
@@ -155,10 +155,10 @@ def with_wrong(Fs, share, rng):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.4])
-def test_one_camera_stays_one_whatever_some_pairs_say(shots, share):
+def test_wrong_pairs_do_not_make_a_camera_per_photo(shots, share):
     for seed in range(8):
         made = shots(8, 300 + seed, noise_px=1.5, points=120)
-        found = asked(made, with_wrong(made.pairs.Fs, share, np.random.default_rng(seed)))
+        found = validate(made, with_wrong(made.pairs.Fs, share, np.random.default_rng(seed)))
         assert not found.is_camera_per_photo
         assert 0.5 < found.shared < 0.97
         assert found.own < found.shared + 0.04
@@ -167,14 +167,14 @@ def test_one_camera_stays_one_whatever_some_pairs_say(shots, share):
 def test_motions_that_leave_the_focal_open_are_no_reason_to_split(shots):
     for motion in (shots.orbit, shots.parallel, shots.onward, shots.turning):
         made = shots(8, 310, motion=motion, noise_px=1.0, points=120)
-        assert not asked(made).is_camera_per_photo
+        assert not validate(made).is_camera_per_photo
 
 
-def test_photos_of_unlike_cameras_are_told_apart(shots):
+def test_photos_of_unlike_cameras_have_a_camera_each(shots):
     right = 0
     for seed in range(8):
         focals = np.random.default_rng(seed).permutation(UNLIKE)
-        found = asked(shots(10, 320 + seed, focal=focals, noise_px=1.0, points=200))
+        found = validate(shots(10, 320 + seed, focal=focals, noise_px=1.0, points=200))
         right += found.is_camera_per_photo
         assert 0.1 < found.shared < 0.6
         assert found.own < 0.97
@@ -185,17 +185,17 @@ def test_few_cameras_that_say_as_much_are_preferred(shots):
     focals = [1000.0] * 5 + [1600.0] * 5
     for seed in range(4):
         made = shots(10, 330 + seed, focal=focals, points=200)
-        halves = asked(made, labels={photo: int(photo >= 5) for photo in range(10)})
+        halves = validate(made, labels={photo: int(photo >= 5) for photo in range(10)})
         assert not halves.is_camera_per_photo
         assert 0.85 < halves.shared < 1.0
 
 
-def test_few_photos_are_never_asked(shots):
+def test_few_photos_are_not_validated(shots):
     made = shots(PER_PHOTO.least_photos - 1, 1, focal=UNLIKE[: PER_PHOTO.least_photos - 1])
-    assert asked(made) == (1.0, 1.0, 0.0, False)
+    assert validate(made) == (1.0, 1.0, 0.0, False)
 
 
 def test_the_answer_is_the_same_for_every_order_of_the_cameras_of_a_pair(shots):
     made = shots(10, 321, focal=UNLIKE, points=200)
     turned = replace(made, pairs=replace(made.pairs, photos=tuple(pair[::-1] for pair in made.pairs.photos)))
-    assert asked(turned, made.pairs.Fs.transpose(0, 2, 1)) == pytest.approx(asked(made), abs=1e-9)
+    assert validate(turned, made.pairs.Fs.transpose(0, 2, 1)) == pytest.approx(validate(made), abs=1e-9)

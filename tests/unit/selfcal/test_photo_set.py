@@ -61,7 +61,7 @@ def test_a_claim_comes_before_a_guess(together):
     assert (camera.found.identifiable, camera.found.radial, camera.found.spread) == (False, 0.0, {})
 
 
-def test_what_the_pairs_determine_comes_before_a_wrong_claim(shots):
+def test_pairs_come_before_a_wrong_claim(shots):
     made = shots(6, 1)
     (camera,) = cameras_of(made.as_set(["one"] * 6, dict.fromkeys(range(6), 3000.0)))
     assert camera.found.identifiable
@@ -78,7 +78,7 @@ def test_a_group_of_two_cameras_is_split(shots):
         assert 0 < abs(camera.found.K[0, 0] / focals[camera.photos[0]] - 1) < 0.01
 
 
-def test_without_together_groups_stay_what_they_are(shots):
+def test_without_together_groups_are_not_split(shots):
     (camera,) = calibrate_photo_set(of_two(shots).as_set(["zoom"] * 8), unknown, OPTIONS, 0, together=False)
     assert camera.photos == tuple(range(8))
 
@@ -143,7 +143,7 @@ def test_a_calibrator_whose_numbers_fail_leaves_a_guess_with_the_reason(shots, t
     assert str(error) in cameras[0].found.reason
 
 
-def test_cameras_that_cannot_be_compared_stay_what_they_are_alone(shots, monkeypatch):
+def test_cameras_keep_their_own_calibration_if_the_joint_one_fails(shots, monkeypatch):
     def failing(*_):
         raise np.linalg.LinAlgError("Singular matrix")
 
@@ -211,7 +211,7 @@ def test_a_folder_of_unlike_cameras_gets_one_for_each_photo(shots):
     assert max(map(abs, known)) < 0.1
 
 
-def test_a_photo_about_which_nobody_says_anything_follows_the_others(shots):
+def test_a_photo_without_pairs_follows_the_others(shots):
     focals = 2.0 * UNLIKE
     made = shots(10, 322, focal=focals, noise_px=0.5, points=300)
     pairs = made.as_set(["web"] * 10)

@@ -33,7 +33,7 @@ SURE = [1e-3] * 5
 @pytest.mark.parametrize(
     ("offset", "place"), [((0, 0.05, 0, 0, 0), CENTER), ((0, 0, 0, 0.1, 0), ASPECT), ((0, 0, 0, 0, 0.08), LENS)]
 )
-def test_what_sure_pairs_contradict_is_freed_and_nothing_else(offset, place):
+def test_sure_pairs_free_the_part_that_they_contradict(offset, place):
     np.testing.assert_array_equal(evidence(SURE, offset).choose(NOTHING), freed(place))
 
 
@@ -86,7 +86,7 @@ def test_a_claim_counts_where_pairs_are_weak_and_loses_against_strong_ones():
     assert strong.posterior(strong.choose(NOTHING))[1][0] == pytest.approx(0.3, abs=1e-3)
 
 
-def test_where_nobody_claims_a_focal_none_is_freed():
+def test_without_a_claimed_focal_none_is_freed():
     found = evidence(SURE)
     assert found.posterior(freed(FOCAL))[0] == pytest.approx(found.posterior(NOTHING)[0])
     assert not found.choose(NOTHING)[0, FOCAL]
@@ -107,7 +107,7 @@ def test_the_covariance_covers_all_choices(offset):
     assert mixed[3, 3] < widest[3, 3]
 
 
-def test_what_is_nearly_free_is_nearly_as_uncertain():
+def test_nearly_freed_parts_are_nearly_as_uncertain():
     at = [np.sqrt(evidence([0.02] * 5, (0, u, 0, 0, 0)).covariance(NOTHING)[1, 1]) for u in (0.0, 0.04, 0.06)]
     assert at[0] < 0.016 < at[1] < 0.05
     assert at[1] > 1.1 * at[0]
@@ -170,7 +170,7 @@ def test_focals_of_a_family_scatter_about_their_mean():
     assert found.mean[:, 0] == pytest.approx(PRIORS.usual_log_focal + share * (np.log(2) - PRIORS.usual_log_focal))
 
 
-def test_families_are_apart_and_one_alone_has_nobody_to_follow():
+def test_families_are_apart_and_a_single_member_keeps_the_usual_focal():
     found = prior([-1, 5, -1])
     assert found.mean[:, 0] == pytest.approx(PRIORS.usual_log_focal)
     assert found.precision[:, 0] == pytest.approx(0.7**-2)

@@ -267,7 +267,7 @@ def test_focal_and_center_in_x_are_samples_of_the_sweep(views):
     assert found.K[0, 2] / 20 == pytest.approx(round(found.K[0, 2] / 20))
 
 
-def test_two_cameras_are_told_by_their_peaks(views):
+def test_two_cameras_have_two_peaks(views):
     fine = OPTIONS.model_copy(update={"samples": 200})
     one = run(views(5, 2, noise=5e-4, focal=1100), fine)
     pairs = [views(5, 1 + 100 * i, noise=5e-4, focal=focal) for i, focal in enumerate((700, 1500))]

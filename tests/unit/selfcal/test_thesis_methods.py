@@ -7,7 +7,7 @@ import pytest
 
 from sfm_app.geometry.epipolar import eight_point
 from sfm_app.selfcal.pairs import prepare
-from sfm_app.selfcal.thesis import geometric, huang_faugeras, multi_start, perturbation
+from sfm_app.selfcal.thesis import geometric, least_squares, multi_start, perturbation
 from sfm_app.selfcal.thesis.multi_start import MOST_STARTS, USUAL_FOCAL, focal_distribution, number_of_starts
 from sfm_app.selfcal.thesis.perturbation import discrepancy_weights, error_discrepancies
 from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
@@ -94,14 +94,14 @@ def test_discrepancies_that_do_not_scatter_leave_equal_weights():
 
 
 def test_it_outdoes_equal_weights_where_pairs_are_wrong(views, random_fundamentals):
-    errors = {perturbation: [], huang_faugeras: []}
+    errors = {perturbation: [], least_squares: []}
     for seed in range(4):
         Fs = views(6, seed, noise=3e-4).Fs.copy()
         Fs[[2, 9]] = random_fundamentals(2, seed)
         for method, off in errors.items():
             evidence = run(method, Fs).evidence
             off.append(abs(evidence["fx_px"] - 1000) + abs(evidence["fy_px"] - 1000))
-    assert np.median(errors[perturbation]) < 0.2 * np.median(errors[huang_faugeras])
+    assert np.median(errors[perturbation]) < 0.2 * np.median(errors[least_squares])
 
 
 def test_good_pairs_keep_their_say(views):
@@ -139,7 +139,7 @@ def test_residuals_tell_corrupted_pairs():
         weights = geometric.residual_weights(pairs)
         assert np.sort(weights)[1] < 0.1 < np.sort(weights)[2]
         assert np.mean(weights) == pytest.approx(1)
-        errors = [focal_error(method.calibrate(pairs, OPTIONS, 0), K) for method in (geometric, huang_faugeras)]
+        errors = [focal_error(method.calibrate(pairs, OPTIONS, 0), K) for method in (geometric, least_squares)]
         gains.append(errors[1] / errors[0])
     assert np.median(gains) > 2
 
@@ -149,7 +149,7 @@ def test_without_matches_the_given_weights_stand_in(views, random_fundamentals):
     Fs = np.concatenate([made.Fs, random_fundamentals(2)])
     pairs = CameraPairs.from_Fs(Fs, made.size, np.r_[np.ones(10), 1e-5, 1e-5])
     assert geometric.calibrate(pairs, OPTIONS, 0).evidence["fx_px"] == pytest.approx(1000, rel=0.03)
-    assert huang_faugeras.calibrate(pairs, OPTIONS, 0).evidence["fx_px"] != pytest.approx(1000, rel=0.1)
+    assert least_squares.calibrate(pairs, OPTIONS, 0).evidence["fx_px"] != pytest.approx(1000, rel=0.1)
 
 
 def test_pairs_that_do_not_take_part_get_no_weight():

@@ -232,7 +232,7 @@ def panoramas_of(points=600, photos=5, wrong=0.3):
 
 
 @slow
-def test_panoramas_are_told_from_photos_by_their_matches():
+def test_matches_distinguish_panoramas_from_photos():
     photos = photos_through(lens_of(120.0, 0.0))
     assert shows_panoramas(panoramas_of(), (800, 400))
     assert not shows_panoramas(panoramas_of(), (800, 401))

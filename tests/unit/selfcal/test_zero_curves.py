@@ -61,7 +61,7 @@ def test_pixels_stay_square_unless_the_pairs_clearly_say_otherwise(views, knobs)
         assert found.evidence["aspect_gain"] < 3.9
 
 
-def test_freeing_the_aspect_is_what_the_pairs_ask_for(views):
+def test_the_aspect_is_freed_where_the_pairs_require_it(views):
     found = run(views(6, aspect=0.75))
     assert found.K[1, 1] / found.K[0, 0] == pytest.approx(0.75, rel=0.02)
     assert 4 < found.evidence["aspect_gain"] < 15
