@@ -362,9 +362,8 @@ def _judge_camera(index: int, camera: CameraGroup, joint: _Joint, method: str) -
 
 
 def _convert_to_sides(theta: FloatArray, side: float) -> FloatArray:
-    in_sides = theta - np.array([np.log(side), 0.0, 0.0, 0.0, 0.0])
-    in_sides[1:3] /= side
-    return in_sides
+    focal, u, v, aspect, kappa = theta - np.array([np.log(side), 0.0, 0.0, 0.0, 0.0])
+    return np.array([focal, u / side, v / side, aspect, kappa])
 
 
 def _convert_to_units(
