@@ -6,7 +6,7 @@ docs/symbols.md has the symbols of the thesis and their names here.
 from sfm_app.selfcal import zero_curves
 from sfm_app.selfcal.pairs import pair_weights
 from sfm_app.selfcal.photo_set import CalibratedCamera, CalibrateFunction, calibrate_photo_set
-from sfm_app.selfcal.thesis import geometric, huang_faugeras, kruppa, multi_start, perturbation
+from sfm_app.selfcal.thesis import geometric, kruppa, least_squares, multi_start, perturbation
 from sfm_app.selfcal.thesis import zero_curves as zero_curves_thesis
 from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 
@@ -42,8 +42,8 @@ CALIBRATORS: dict[str, tuple[CalibrateFunction, str]] = {
         geometric.calibrate,
         "least squares weighted by the epipolar residuals of each pair, a benchmark of the thesis",
     ),
-    huang_faugeras.METHOD: (
-        huang_faugeras.calibrate,
+    least_squares.METHOD: (
+        least_squares.calibrate,
         "least squares with equal weights for all pairs, the thesis's non-robust benchmark",
     ),
     kruppa.METHOD: (

@@ -368,7 +368,7 @@ def subsample_rows(rows: FloatArray, most: int) -> FloatArray:
 
 
 def adjust_cameras(matches: Matches, state: State, prior: Prior, rounds: int = ADJUSTMENT.rounds) -> State:
-    """Reweight the pairs and take a Levenberg-Marquardt step until the cameras converge, in at most `rounds` rounds."""
+    """Adjust cameras and poses: reweight the pairs and take Levenberg-Marquardt steps until the cameras converge."""
     damping = DAMPING.first
     for _ in range(rounds):
         system = _normal_equations(matches, state)

@@ -432,14 +432,6 @@ class ConsensusPeak:
         """Return why pairs of weights (P,) do not determine a camera; empty where they do."""
         return support_reason(self.votes, weights) or ambiguity_reason(self.margin, self.votes)
 
-    def resample(self, consensus: Consensus, seed: int) -> FloatArray:
-        """Return (B, 4) the peak under resampled pairs, see `resample_peak`."""
-        return resample_peak(consensus, self.theta, self.free, self.sigma, seed)
-
-    def deviation(self, values: FloatArray) -> float:
-        """Return the standard deviation of an entry of theta from its resampled values (B,)."""
-        return deviation(values, effective_count(self.votes), len(self.free))
-
 
 def find_peak(consensus: Consensus) -> ConsensusPeak:
     """Find the highest peak with square pixels or, where the pairs clearly support it, with any aspect."""

@@ -30,10 +30,8 @@ the margin was chosen by hand (docs/algorithms.md, The thesis's methods)."""
 def singular_value_ratio(pair: FloatArray, fx: float, fy: float, u: float, v: float) -> float:
     """Return r = (s1 - s2) / (s1 + s2) of E = K'FK, in [0, 1]; 0 where K satisfies the constraint.
 
-    Unlike thesis (5.8) it is bounded, symmetric in the two views, and free of the scale of F.
-
-    Args:
-        pair: (16,) a row of `Pairs.packed_rows`.
+    Unlike thesis (5.8) it is bounded, symmetric in the two views, and free of the scale of F. `pair` is a row (16,) of
+    `Pairs.packed_rows`.
     """
     f11, f12, f13 = pair[0], pair[1], pair[2]
     f21, f22, f23 = pair[3], pair[4], pair[5]
@@ -54,12 +52,7 @@ def singular_value_ratio(pair: FloatArray, fx: float, fy: float, u: float, v: fl
 
 
 def focal_polynomials(pairs: Pairs, fx: FloatArray, center: tuple[float, float]) -> FloatArray:
-    """Return thesis (5.27): a^2 - 4p as a quartic in fy^2, with the center fixed.
-
-    Args:
-        pairs: P fundamental matrices.
-        fx: (S,) swept values, in the units of the pairs.
-        center: u, v in the same units.
+    """Return thesis (5.27): a^2 - 4p as a quartic in fy^2, for swept fx (S,) and a fixed center (u, v).
 
     Returns:
         (P, S, 5) coefficients, lowest power first; all zero where the constraint holds for any fy.
@@ -85,12 +78,7 @@ def focal_polynomials(pairs: Pairs, fx: FloatArray, center: tuple[float, float])
 
 
 def center_polynomials(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
-    """Return thesis (5.28): a^2 - 4p as an octic in v, with both focals fixed.
-
-    Args:
-        pairs: P fundamental matrices.
-        u: (S,) swept values, in the units of the pairs.
-        focal: fx, fy in the same units.
+    """Return thesis (5.28): a^2 - 4p as an octic in v, for swept u (S,) and fixed focals (fx, fy).
 
     Returns:
         (P, S, 9) coefficients, lowest power first; all zero where the constraint holds for any v.

@@ -38,9 +38,9 @@ from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs, PairId
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
-LEAST_PAIRS = 2
-"""Pairs that a camera needs: two constraints find its focal, two more contradict a wrong one. By definition of the
-constraint (thesis 5.2.4)."""
+LEAST_PAIRS_OF_SEVERAL = 2
+"""Pairs that one camera of several needs: two constraints find its focal, two more contradict a wrong one. By
+definition of the constraint (thesis 5.2.4)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,14 +333,14 @@ def _judge_camera(index: int, camera: CameraGroup, joint: _Joint, method: str) -
     }
     uncertain = uncertainty_reason(spread, one_of_many=camera.family >= 0)
     reason = ""
-    if len(own) < LEAST_PAIRS:
-        reason = f"{len(own)} usable pairs, {LEAST_PAIRS} are needed"
+    if len(own) < LEAST_PAIRS_OF_SEVERAL:
+        reason = f"{len(own)} usable pairs, {LEAST_PAIRS_OF_SEVERAL} are needed"
     elif not camera.known and margin < CONSENSUS.min_margin:
         reason = "the pairs fit other focals as well or better"
     # a motion that leaves the focal open is the reason only where the deviation is small
     elif not camera.is_whole and not (camera.divided and uncertain):
         reason = joint.motion
-    reason = reason or rejection_reason(_in_sides(theta, max(camera.size) / unit), spread, camera.size)
+    reason = reason or rejection_reason(_convert_to_sides(theta, max(camera.size) / unit), spread, camera.size)
     if reason:
         guess = guess_calibration(camera.size, reason, evidence)
         # it contains the mean of the family: a better start for mapping than the usual focal
@@ -361,10 +361,9 @@ def _judge_camera(index: int, camera: CameraGroup, joint: _Joint, method: str) -
     return calibration
 
 
-def _in_sides(theta: FloatArray, side: float) -> FloatArray:
-    in_sides = theta - np.array([np.log(side), 0.0, 0.0, 0.0, 0.0])
-    in_sides[1:3] /= side
-    return in_sides
+def _convert_to_sides(theta: FloatArray, side: float) -> FloatArray:
+    focal, u, v, aspect, kappa = theta - np.array([np.log(side), 0.0, 0.0, 0.0, 0.0])
+    return np.array([focal, u / side, v / side, aspect, kappa])
 
 
 def _convert_to_units(

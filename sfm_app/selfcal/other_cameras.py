@@ -99,13 +99,14 @@ class _PairVotes:
             for photo in pair:
                 self.pairs_of.setdefault(photo, []).append(k)
 
+    def votes(self, pair: int, first: FloatArray, second: FloatArray) -> FloatArray:
+        """Return (A, B) votes of a pair for all cameras (A, 5) of view 1 and (B, 5) of view 2."""
+        return self.tables.votes(pair, first, second, SPLIT.sigma)
+
     def find_core(self, theta: FloatArray, everyone: Sequence[int]) -> tuple[float, FloatArray, set[int]]:
         """Return the votes beyond the fair share of the photos that agree on a camera, the camera, and these photos."""
         beyond = [
-            float(
-                self.tables.votes(k, theta[None], theta[None], SPLIT.sigma)[0, 0]
-                - SPLIT.fair_share * self.tables.weights[k]
-            )
+            float(self.votes(k, theta[None], theta[None])[0, 0] - SPLIT.fair_share * self.tables.weights[k])
             for k in range(len(self.photos))
         ]
         core = set(everyone)
@@ -138,17 +139,15 @@ class _PairVotes:
         for k in self.pairs_of[photo]:
             first, second = self.photos[k]
             if first == photo and second in core:
-                votes += self.tables.votes(k, trials, theta[None], SPLIT.sigma)[:, 0]
+                votes += self.votes(k, trials, theta[None])[:, 0]
             elif second == photo and first in core:
-                votes += self.tables.votes(k, theta[None], trials, SPLIT.sigma)[0]
+                votes += self.votes(k, theta[None], trials)[0]
             else:
                 continue
             most += self.tables.weights[k]
         best = int(np.argmax(votes))
-        clear = (
-            votes[best] - votes[SPLIT.trials // 2] > SPLIT.least_focal_gain * most
-            and votes[best] >= SPLIT.fair_share * most
-        )
+        gain = votes[best] - votes[SPLIT.trials // 2]
+        clear = gain > SPLIT.least_focal_gain * most and votes[best] >= SPLIT.fair_share * most
         return [float(steps[best])] if clear and abs(steps[best]) > SPLIT.other_focal else []
 
     def assign_cameras(self, cameras: FloatArray, everyone: Sequence[int], core: set[int]) -> dict[int, int]:
@@ -161,9 +160,9 @@ class _PairVotes:
                 for k in self.pairs_of[photo]:
                     first, second = self.photos[k]
                     if first == photo and labels[second] >= 0:
-                        votes += self.tables.votes(k, cameras, cameras[labels[second]][None], SPLIT.sigma)[:, 0]
+                        votes += self.votes(k, cameras, cameras[labels[second]][None])[:, 0]
                     elif second == photo and labels[first] >= 0:
-                        votes += self.tables.votes(k, cameras[labels[first]][None], cameras, SPLIT.sigma)[0]
+                        votes += self.votes(k, cameras[labels[first]][None], cameras)[0]
                 labels[photo] = int(np.argmax(votes))
             if labels == before:
                 break
@@ -178,7 +177,7 @@ class _PairVotes:
         """Return the sum of the votes of all pairs."""
         return float(
             sum(
-                self.tables.votes(k, cameras[labels[first]][None], cameras[labels[second]][None], SPLIT.sigma)[0, 0]
+                self.votes(k, cameras[labels[first]][None], cameras[labels[second]][None])[0, 0]
                 for k, (first, second) in enumerate(self.photos)
             )
         )

@@ -14,6 +14,9 @@ from sfm_app.types.arrays import FloatArray, IndexArray
 
 # The input of every calibrator: checked, of rank 2, in image units (thesis 5.6.4; rank 2 and epipoles are ours).
 
+LEAST_PAIRS = 3
+"""Pairs that one camera needs: each F gives two constraints, and with two pairs nothing contradicts a wrong K. By
+definition of the constraint (thesis 5.2.4)."""
 FULL_WEIGHT_INLIERS = 300
 """Inliers from which on a pair counts fully; by hand."""
 
@@ -131,8 +134,7 @@ def _distinct_indices(scaled: FloatArray) -> IndexArray:
 LOG_FOCAL, CENTER_U, CENTER_V, LOG_ASPECT, KAPPA = range(5)
 """Parameters theta of a camera: log f with f = sqrt(fx fy), center from the middle, log fy/fx, kappa."""
 LEAST_SLOPE = 0.2
-"""Least slope of the distorted over the undistorted radius; beyond it the lens continues linearly and does not fold. By
-hand."""
+"""Least slope of the distorted over the undistorted radius; a lens with less would fold, and is linear; by hand."""
 
 
 @kernel

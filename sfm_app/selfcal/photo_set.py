@@ -157,16 +157,16 @@ def _split_group(
     """Return the camera itself, the cameras that its photos are divided among, or one for each photo."""
     if len(camera.photos) < SPLITTING.least_photos:
         return [camera]
-    own, found = pairs.to_camera_pairs(camera.photos), camera.found
+    own, calibration = pairs.to_camera_pairs(camera.photos), camera.found
     side = float(max(own.size))
-    if abs(found.radial) > SPLITTING.least_distortion:
-        own = undistort_pairs(own, found)
+    if abs(calibration.radial) > SPLITTING.least_distortion:
+        own = undistort_pairs(own, calibration)
     ready = prepare(own, unit_px=side, origin_px=(own.size[0] / 2, own.size[1] / 2))
     if len(ready) == 0:
         return [camera]
     starts = peak_cameras(Consensus(ready, options.center_sigma * own.size[0] / side))
-    if found.identifiable:
-        starts.append(np.append(parameters_from_calibration(found, side)[:4], 0.0))
+    if calibration.identifiable:
+        starts.append(np.append(parameters_from_calibration(calibration, side)[:4], 0.0))
     tables = VoteTables(ready.F, np.zeros((len(ready), 2), np.int64), ready.weights)
     photos = [own.photos[ready.indices[k]] for k in tables.indices]
     thetas, labels = split_by_focal(tables, photos, starts)
@@ -177,14 +177,8 @@ def _split_group(
         if two is None or not two.is_possible:
             return [camera]
         if not two.is_certain:
-            return [
-                replace(
-                    camera,
-                    found=downgrade_to_estimate(found, "the photos may come from two cameras")
-                    if found.identifiable
-                    else found,
-                )
-            ]
+            doubt = "the photos may come from two cameras" if calibration.identifiable else ""
+            return [replace(camera, found=downgrade_to_estimate(calibration, doubt))]
         thetas, labels = two.cameras, two.labels
     return _parts(camera, thetas, _confirmed_labels(labels, photos), pairs)
 
@@ -286,25 +280,25 @@ def _calibrate_from_all_pairs(
     ]
 
 
-def _downgrade_if_zoom(camera: CalibratedCamera, found: Calibration) -> Calibration:
+def _downgrade_if_zoom(camera: CalibratedCamera, calibration: Calibration) -> Calibration:
     """Return the calibration, as an estimate for one of many parts of a group, as a zoom has them."""
-    if not found.identifiable or camera.part_count < SPLITTING.many_parts:
-        return found
+    if not calibration.identifiable or camera.part_count < SPLITTING.many_parts:
+        return calibration
     reason = f"photos of one size split into {camera.part_count} cameras, which suggests a zoom lens"
-    return downgrade_to_estimate(found, reason)
+    return downgrade_to_estimate(calibration, reason)
 
 
 def _fall_back_to_guess(camera: CalibratedCamera, pairs: PhotoPairs) -> Calibration:
     """Return the calibration; for a guess, a K to start from: EXIF's claim, or 1.2 x the longer side."""
-    found = camera.found
-    if found.identifiable or found.method == ESTIMATE:
-        return found
+    calibration = camera.found
+    if calibration.identifiable or calibration.method == ESTIMATE:
+        return calibration
     claim = _claimed_focal(camera, pairs)
     size = pairs.sizes[camera.photos[0]]
     if not np.isfinite(claim):
-        return found if camera.family >= 0 else guess_calibration(size, found.reason, found.evidence)
+        return calibration if camera.family >= 0 else guess_calibration(size, calibration.reason, calibration.evidence)
     K = guessed_camera_matrix(size, claim)
-    return replace(found, K=K, method="exif", radial=0.0, spread={}, correlations={}, held=())
+    return replace(calibration, K=K, method="exif", radial=0.0, spread={}, correlations={}, held=())
 
 
 def _claimed_focal(camera: CalibratedCamera, pairs: PhotoPairs) -> float:

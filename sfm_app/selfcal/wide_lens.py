@@ -187,7 +187,7 @@ class Equirectangular:
 
 Lens = Fisheye | RadialLens
 PERSPECTIVE = Fisheye(1.0, 1.0)
-"""A perspective lens; its focal does not matter to a fundamental matrix."""
+"""By definition a perspective lens; its focal does not matter to a fundamental matrix."""
 
 
 def bearings_through(lens: Lens | Equirectangular, matches: FloatArray) -> FloatArray:
@@ -224,11 +224,11 @@ def search_rays(lines: FloatArray, samples: IndexArray, threshold: float) -> tup
         inliers = squared_distances(F[None], lines)[0] < threshold**2
         if np.count_nonzero(inliers) < SEARCH.least_inliers:
             break
-        again = fit_rays(p[inliers], q[inliers])
-        value = float(_supports(again[None], lines, threshold)[0])
+        refit = fit_rays(p[inliers], q[inliers])
+        value = float(_supports(refit[None], lines, threshold)[0])
         if value <= support:
             break
-        F, support = again, value
+        F, support = refit, value
     return support, F
 
 
@@ -250,7 +250,7 @@ class State(NamedTuple):
     parameters: FloatArray
     """(4,) log focal, exponent or radial term, center."""
     poses: tuple[FloatArray, ...]
-    """(12,) of each pair, see `pose_manifold`."""
+    """(12,) of each pair, see `geometry.poses`."""
     family: Family = Fisheye
 
     @property
@@ -265,15 +265,13 @@ class State(NamedTuple):
 
 
 class RefinedLens(NamedTuple):
-    """A lens with the least robust cost."""
+    """A lens with the least robust cost, in longer sides."""
 
-    parameters: FloatArray
-    """(4,) log focal, exponent or radial term, center, in longer sides."""
-    covariance: FloatArray
-    """(4, 4)"""
     state: State
+    covariance: FloatArray
+    """(4, 4) of its parameters."""
     sigma: float
-    """Standard deviation of a distance, in longer sides."""
+    """Standard deviation of a distance."""
 
 
 class System(NamedTuple):
@@ -284,9 +282,9 @@ class System(NamedTuple):
     g: FloatArray
     """(4,) negative gradient."""
     pose_by_lens: FloatArray
-    """(5, 4): the step of the pose less this much of the step of the lens."""
+    """(5, 4): its product with the step of the lens is subtracted from the step of the pose."""
     pose_alone: FloatArray
-    """(5,)"""
+    """(5,) step of the pose if the lens does not move."""
 
 
 def refine_lens(start: Lens, pairs: Sequence[Pair], sigma: float) -> RefinedLens:
@@ -308,16 +306,14 @@ def refine_lens(start: Lens, pairs: Sequence[Pair], sigma: float) -> RefinedLens
         state = _adjust(matches, state, sigma)
         sigma = _noise(matches, state)
     systems = _systems(matches, state, sigma)
-    H = sum(
-        (system.H for system in systems), np.diag([0.0, 0.0, REFINEMENT.center_sigma**-2, REFINEMENT.center_sigma**-2])
-    )
+    H = sum((system.H for system in systems), np.diag(_prior_precision()))
     inverse = inverse_of_positive(H)
     scores = np.array([system.g for system in systems])
-    few = len(pairs) / max(len(pairs) - LENS, 1)
-    sandwich = few * inverse @ (scores.T @ scores) @ inverse
+    small_sample = len(pairs) / max(len(pairs) - LENS, 1)
+    sandwich = small_sample * inverse @ (scores.T @ scores) @ inverse
     plain = redundancy(matches) * inverse
     wider = REFINEMENT.misfit * np.sqrt(np.maximum(np.diag(sandwich) / np.diag(plain), 1.0))
-    return RefinedLens(state.parameters, np.asarray(plain * np.outer(wider, wider), np.float64), state, sigma)
+    return RefinedLens(state, np.asarray(plain * np.outer(wider, wider), np.float64), sigma)
 
 
 def redundancy(matches: Sequence[FloatArray]) -> float:
@@ -325,6 +321,10 @@ def redundancy(matches: Sequence[FloatArray]) -> float:
     ends = np.concatenate([x[:, :2] for x in matches] + [x[:, 2:] for x in matches])
     each = len(ends) / max(len(np.unique(ends, axis=0)), 1)
     return max(1.0, 0.5 * each * (each + 1.0) / (2.0 * each - 1.0))
+
+
+def _prior_precision() -> FloatArray:
+    return np.array([0.0, 0.0, REFINEMENT.center_sigma**-2, REFINEMENT.center_sigma**-2])
 
 
 def _adjust(matches: Sequence[FloatArray], state: State, sigma: float) -> State:
@@ -350,7 +350,7 @@ def _adjust(matches: Sequence[FloatArray], state: State, sigma: float) -> State:
 
 def _step(state: State, systems: list[System], damping: float) -> State:
     """Return the state after one damped step: the lens by all pairs and the prior, then each pose by its pair."""
-    prior = np.array([0.0, 0.0, REFINEMENT.center_sigma**-2, REFINEMENT.center_sigma**-2])
+    prior = _prior_precision()
     H = sum((system.H for system in systems), np.diag(prior))
     g = sum((system.g for system in systems), -prior * state.parameters)
     step = solve_each(H + damping * np.diag(np.diag(H)), g[:, None])[:, 0]
@@ -478,7 +478,7 @@ def find_lens(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 
     if len(Fs) < SEARCH.least_pairs:
         return None
     refined = refine_lens(best, selected.with_matrices(Fs), pairs.threshold)
-    (log_focal, exponent, u, v), unit = refined.parameters, np.array([1.0, 1.0, side, side])
+    (log_focal, exponent, u, v), unit = refined.state.parameters, np.array([1.0, 1.0, side, side])
     rival = _radial_rival(best, size)
     return LensEstimate(
         lens=Fisheye(

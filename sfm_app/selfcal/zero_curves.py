@@ -1,8 +1,8 @@
 """Zero Curves as the program uses it: thesis (5.33) over all of K at once, then the matches themselves, then a verdict.
 
-Beyond the thesis: the center is sought together with the focal (cropped photos), fy/fx and a lens are freed where the
-evidence supports it, every parameter has a standard deviation, and K is refused where the pairs do not determine it.
-The consensus of the pairs finds the camera without a start; the adjustment of `calibrate_pairs` makes it exact.
+Beyond the thesis: the center is estimated together with the focal (cropped photos), fy/fx and a lens are freed where
+the evidence supports it, every parameter has a standard deviation, and K is rejected where the pairs do not determine
+it. The consensus of the pairs finds the camera without a start; the adjustment of `calibrate_pairs` makes it exact.
 """
 
 from dataclasses import dataclass, replace
@@ -23,14 +23,17 @@ from sfm_app.selfcal.calibrate_pairs import (
 from sfm_app.selfcal.consensus import (
     Consensus,
     ConsensusPeak,
+    deviation,
     effective_count,
     find_peak,
     rejection_reason,
+    resample_peak,
     spread_px,
     uncertainty_reason,
 )
 from sfm_app.selfcal.pairs import (
     KAPPA,
+    LEAST_PAIRS,
     LOG_FOCAL,
     Pairs,
     calibration_from_parameters,
@@ -45,9 +48,6 @@ from sfm_app.types import Calibration, CameraPairs
 from sfm_app.types.arrays import FloatArray, IndexArray
 
 METHOD = "zero-curves"
-MIN_PAIRS = 3
-"""Each F gives two constraints; below three pairs nothing is left to contradict a wrong K. By definition of the
-constraint (thesis 5.2.4)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,8 +95,8 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
     """
     usable = _prepare(pairs)
     evidence = {"pairs": float(len(usable))}
-    if len(usable) < MIN_PAIRS:
-        return guess_calibration(pairs.size, f"{len(usable)} usable pairs, {MIN_PAIRS} are needed", evidence)
+    if len(usable) < LEAST_PAIRS:
+        return guess_calibration(pairs.size, f"{len(usable)} usable pairs, {LEAST_PAIRS} are needed", evidence)
     if pairs.inliers:
         return _calibrate_from_matches(pairs, usable, options, evidence)
     return _calibrate_from_fundamentals(pairs, usable, options, seed)
@@ -107,20 +107,19 @@ def _calibrate_from_fundamentals(
 ) -> Calibration:
     """Find the camera from the matrices alone: the peak of the consensus."""
     side = float(max(pairs.size))
-    center_sigma = (
-        options.center_sigma
-        if len(usable) > ZERO_CURVES.few_pairs
-        else min(options.center_sigma, ZERO_CURVES.uncropped_sigma)
-    )
+    center_sigma = options.center_sigma
+    if len(usable) <= ZERO_CURVES.few_pairs:
+        center_sigma = min(center_sigma, ZERO_CURVES.uncropped_sigma)
     consensus = Consensus(usable, center_sigma * pairs.size[0] / side)
     peak = find_peak(consensus)
-    resampled = peak.resample(consensus, seed)
-    log_focal_spread = peak.deviation(resampled[:, LOG_FOCAL])
+    resampled = resample_peak(consensus, peak.theta, peak.free, peak.sigma, seed)
+    count, unknowns = effective_count(peak.votes), len(peak.free)
+    log_focal_spread = deviation(resampled[:, LOG_FOCAL], count, unknowns)
     evidence = {"pairs": float(len(usable)), **peak.evidence(usable.weights), "log_focal_spread": log_focal_spread}
     reason = peak.undetermined_reason(usable.weights) or rejection_reason(peak.theta, log_focal_spread, pairs.size)
     if reason:
         return guess_calibration(pairs.size, reason, evidence)
-    spread = spread_px(resampled, side, effective_count(peak.votes), len(peak.free))
+    spread = spread_px(resampled, side, count, unknowns)
     calibration = calibration_from_parameters(np.append(peak.theta, 0.0), pairs.size, METHOD)
     doubt = uncertainty_reason(log_focal_spread) or peak.rival_reason(usable.weights) or peak.aspect_reason
     return downgrade_to_estimate(replace(calibration, spread=spread, evidence=evidence), doubt)

@@ -25,17 +25,11 @@ from sfm_app.types.arrays import FloatArray
 _TINY = float(np.finfo(np.float64).tiny)
 """The smallest normal number in double precision; added to divisors, so that none is zero."""
 LEAST_COMPLEMENT = 1e-6
-"""(5.8) divides by s2; 1 - r is held above this, so that a matrix of rank 1 gets a large number, not infinity. Chosen
-by hand; halved and doubled by `benchmarks.sensitivity`."""
+"""(5.8) divides by s2; 1 - r is held above this, so that rank 1 gives a large number, not infinity; by hand."""
 
 
 def essential(F: FloatArray, K: FloatArray) -> FloatArray:
-    """Return (..., 3, 3) E = K'FK (thesis 5.7).
-
-    Args:
-        F: (..., 3, 3) fundamental matrices.
-        K: (3, 3) camera matrix of both views.
-    """
+    """Return (..., 3, 3) E = K'FK (thesis 5.7)."""
     return np.asarray(K.T @ F @ K)
 
 
@@ -110,17 +104,11 @@ class Halves:
 
 
 def equations(halves: Halves, cameras: FloatArray) -> FloatArray:
-    """Return two smooth equations for every pair whose norm is r = (s1 - s2) / (s1 + s2) of E.
+    """Return (..., 2) smooth equations of every pair whose norm is r = (s1 - s2) / (s1 + s2) of E.
 
     A 2 x 2 matrix is the sum of a similarity (a, -d; d, a) and a reflected one (b, c; c, -b); its singular values are
     the sum and the difference of their sizes. M has a positive determinant, so the similarity is the larger one, and
-    the equations are (b, c) / |(a, d)|.
-
-    Args:
-        cameras: (..., 4) fx, fy, u, v; its leading axes broadcast with those of `halves`.
-
-    Returns:
-        (..., 2).
+    the equations are (b, c) / |(a, d)|. The leading axes of `halves` and of cameras (..., 4) of fx, fy, u, v broadcast.
     """
     A, B = halves.grams(cameras)
     l11, l21, l22 = _cholesky(A)
@@ -133,12 +121,7 @@ def equations(halves: Halves, cameras: FloatArray) -> FloatArray:
 
 
 def huang_faugeras_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
-    """Return `equations` (..., 2), scaled so that their norm is (s1 - s2) / s2 = 2 r / (1 - r), the term of (5.8).
-
-    Args:
-        halves: (...,) fundamental matrices.
-        cameras: (..., 4) fx, fy, u, v; its leading axes broadcast with those of `halves`.
-    """
+    """Return `equations` (..., 2), scaled so that their norm is (s1 - s2) / s2 = 2 r / (1 - r), the term of (5.8)."""
     g = equations(halves, cameras)
     r = np.linalg.norm(g, axis=-1, keepdims=True)
     return np.asarray(2 * g / np.maximum(1.0 - r, LEAST_COMPLEMENT))

@@ -13,15 +13,13 @@ from sfm_app.types.arrays import FloatArray
 ComplexArray = NDArray[np.complex128]
 
 _MOST_ROUNDS = 30
-"""Most rounds of Aberth's iteration for one sample. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+"""Most rounds of Aberth's iteration for one sample; by hand."""
 _NUDGE = 1e-3
-"""Roots start off those of the sample before by this share of their size, each in another direction. Chosen by hand;
-halved and doubled by `benchmarks.sensitivity`."""
+"""Roots start off those of the sample before by this share of their size, each in another direction; by hand."""
 _ROUNDING = 1e-16
 """Rounding error of a polynomial's value, as a share of the sizes of its terms: double precision."""
 _BLUR = 1e-10
-"""A root that rounding may shift by a larger share of its size counts as a multiple one. Chosen by hand; halved and
-doubled by `benchmarks.sensitivity`."""
+"""A root that rounding may shift by a larger share of its size counts as a multiple one; by hand."""
 _NO_STEP = 1e-15
 """A step that no longer counts, as a share of the root's size: double precision, times ten."""
 
@@ -139,23 +137,15 @@ def _inverse(z: complex) -> complex:
 
 
 ROOT_IS_ZERO = 1e-9
-"""A real part below this, in image widths, counts as zero: such roots are spurious. Chosen by hand; halved and doubled
-by `benchmarks.sensitivity`."""
+"""A real part below this, in image widths, counts as zero: such roots are spurious; by hand."""
 MAX_OUT_OF_RANGE = 0.5
 """A curve with a larger share of samples out of range is degenerate (thesis 5.8.4, Eq. 5.35)."""
 
 
 def focal_curves(pairs: Pairs, fx: FloatArray, center: tuple[float, float]) -> FloatArray:
-    """Return Z^f of thesis (5.29), (5.31): fy at every swept fx.
+    """Return Z^f of thesis (5.29), (5.31): (P, S) fy at every swept fx (S,), in the units of the pairs.
 
-    Args:
-        pairs: P fundamental matrices.
-        fx: (S,) swept values, in the units of the pairs.
-        center: u, v in the same units.
-
-    Returns:
-        (P, S) fy; 0 where no root has a non-zero real part. Not clipped to a range: `degeneracy` counts values out of
-        range.
+    It is 0 where no root has a non-zero real part, and not clipped to a range: `degeneracy` counts values out of range.
     """
     coefficients = focal_polynomials(pairs, fx, center)
     # the quartic is in fy^2: a negative fy^2 becomes an fy without real part, which the choice of the root skips
@@ -166,33 +156,17 @@ def focal_curves(pairs: Pairs, fx: FloatArray, center: tuple[float, float]) -> F
 
 
 def center_curves(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
-    """Return Z^oc of thesis (5.30): (P, S) v at every swept u; as `focal_curves`.
-
-    Args:
-        pairs: P fundamental matrices.
-        u: (S,) swept values, in the units of the pairs.
-        focal: fx, fy in the same units.
-    """
+    """Return Z^oc of thesis (5.30): (P, S) v at every swept u (S,); as `focal_curves`."""
     return _select_roots(swept_roots(center_polynomials(pairs, u, focal)))
 
 
 def degeneracy(curves: FloatArray, upper: float) -> FloatArray:
-    """Return the share of the samples of each curve that lie out of range (thesis 5.35).
-
-    Args:
-        curves: (P, S) values.
-        upper: the range is (0, upper).
-    """
+    """Return the share of the samples of each curve (P, S) outside of (0, upper) (thesis 5.35)."""
     return np.asarray(np.mean((curves <= ROOT_IS_ZERO) | (curves >= upper), axis=1))
 
 
 def usable_curves(curves: FloatArray, upper: float) -> FloatArray:
-    """Return the curves that are not degenerate.
-
-    Args:
-        curves: (P, S) values.
-        upper: end of their range, see `degeneracy`.
-    """
+    """Return the curves that are not degenerate."""
     return curves[degeneracy(curves, upper) <= MAX_OUT_OF_RANGE]
 
 

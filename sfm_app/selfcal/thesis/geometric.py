@@ -16,20 +16,13 @@ from sfm_app.types.arrays import FloatArray
 
 METHOD = "geometric"
 LEAST_RESIDUAL_PX = 1e-3
-"""Least residual: it bounds the weight of exact matches. docs/algorithms.md, The thesis's methods. Chosen by hand;
-halved and doubled by `benchmarks.sensitivity`."""
+"""Least residual: it bounds the weight of exact matches. docs/algorithms.md, The thesis's methods; by hand."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Minimize (5.8) from K_init with each pair weighted by the inverse of its mean epipolar residual.
+    """Minimize (5.8), or `constraint_form`, from K_init with each pair weighted by 1 / its mean epipolar residual.
 
-    Args:
-        pairs: F's and inliers; without inliers the given weights stand in.
-        options: `constraint_form`, which says whether it is (5.8) or another form.
-        seed: unused, nothing is drawn at random.
-
-    Returns:
-        As `selfcal.thesis.verdict.calibrate_with`, which also says what is raised.
+    Without inliers the given weights stand in. Returns and raises as `verdict.calibrate_with`; the seed is unused.
     """
     del seed
     weighted = replace(pairs, weights=residual_weights(pairs)) if pairs.inliers else pairs
@@ -42,7 +35,7 @@ def residual_weights(pairs: CameraPairs) -> FloatArray:
     Pairs of weight 0 keep it; a pair without inliers, or with infinite distances, gets weight 0.
 
     Raises:
-        ValueError: malformed input, see `selfcal.inputs.prepare`.
+        ValueError: malformed input, see `selfcal.pairs.prepare`.
     """
     check_pairs(pairs)
     residuals = [

@@ -28,13 +28,7 @@ margin was chosen by hand."""
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
     """Minimize the squared Kruppa equations of all pairs, from the median of their focal-only solutions.
 
-    Args:
-        pairs: F's and weights.
-        options: unused.
-        seed: unused, nothing is drawn at random.
-
-    Returns:
-        As `selfcal.thesis.verdict.calibrate_with`, which also says what is raised.
+    Returns and raises as `verdict.calibrate_with`; options and seed are unused.
     """
     del options, seed
     return calibrate_with(METHOD, pairs, _find_camera)
@@ -51,28 +45,19 @@ def _find_camera(pairs: Pairs, tall: float, evidence: dict[str, float]) -> Camer
 
 
 def kruppa_ratios(halves: Halves, cameras: FloatArray) -> FloatArray:
-    """Return (..., 3) the ratios a^2 B11 / A22, -ab B12 / A12, b^2 B22 / A11: equal for the right camera.
+    """Return (..., 3) the ratios a^2 B11 / A22, -ab B12 / A12, b^2 B22 / A11: equal for the right K, NaN for 0 / 0.
 
-    NaN for 0 / 0.
-
-    Args:
-        halves: (...,) fundamental matrices.
-        cameras: (..., 4) fx, fy, u, v; its leading axes broadcast with those of `halves`.
+    The leading axes of `halves` and of cameras (..., 4) of fx, fy, u, v broadcast.
     """
     left, right = _sides(halves, cameras)
     return np.asarray(np.divide(left, right, out=np.full(left.shape, np.nan), where=right != 0))
 
 
 def kruppa_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
-    """Return the three equations between the ratios, multiplied out and divided by the sizes of both sides.
+    """Return (..., 3) the equations between the ratios, multiplied out and divided by the sizes of both sides.
 
-    They are the cross product of unit vectors: the norm is the sine of the angle between the two sides of (5.5).
-
-    Args:
-        cameras: (..., 4) fx, fy, u, v; its leading axes broadcast with those of `halves`.
-
-    Returns:
-        (..., 3), of which two are independent.
+    They are the cross product of unit vectors, two of them independent: the norm is the sine of the angle between the
+    two sides of (5.5). The arguments are those of `kruppa_ratios`.
     """
     left, right = _sides(halves, cameras)
     units = (side / np.linalg.norm(side, axis=-1, keepdims=True) for side in (left, right))
@@ -86,18 +71,11 @@ def _sides(halves: Halves, cameras: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def pair_focals(pairs: Pairs, center: tuple[float, float]) -> FloatArray:
-    """Return the focal of each pair, if the pixels are square and the center is known (Sturm 2001).
+    """Return (P,) focals of the pairs for square pixels and a known center (Sturm 2001), in the units of the pairs.
 
     The two equations with the off-diagonal entries are linear in f^2 once the trivial root f = 1 is divided out; they
     fail where the optical axes lie in one plane. The third is quadratic. Of the solutions of all, the one that
-    satisfies all three best is returned.
-
-    Args:
-        pairs: P fundamental matrices.
-        center: u, v in the units of the pairs.
-
-    Returns:
-        (P,) in the units of the pairs; NaN where the equations hold for any focal, or for none.
+    satisfies all three best is returned; NaN where the equations hold for any focal, or for none.
     """
     to_center = np.array([[1.0, 0.0, center[0]], [0.0, 1.0, center[1]], [0.0, 0.0, 1.0]])
     centered = Halves.from_fundamentals(to_center.T @ pairs.F @ to_center)

@@ -1,4 +1,7 @@
-"""Least squares over (fx, fy, u, v): the basis of all methods of the thesis but Zero Curves (5.6, 5.7)."""
+"""Least squares over (fx, fy, u, v): the basis of all methods of the thesis but Zero Curves (5.6, 5.7).
+
+The method `huang-faugeras` is the Huang-Faugeras constraint with equal weights: the thesis's "non-robust" one (5.5.3).
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -9,27 +12,26 @@ from numpy.typing import NDArray
 
 from sfm_app.selfcal.pairs import Pairs
 from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations, Halves
-from sfm_app.selfcal.thesis.verdict import CameraParameters
+from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
+from sfm_app.settings import CalibrationSettings
+from sfm_app.types import Calibration, CameraPairs
 from sfm_app.types.arrays import FloatArray
 
+METHOD = "huang-faugeras"
 DEFAULT = EQUATIONS["huang-faugeras"]
 """The form that the thesis chooses (5.5.1)."""
 FIRST_DAMPING = 1e-2
-"""First damping of Levenberg-Marquardt steps, relative to the diagonal. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
+"""First damping of Levenberg-Marquardt steps, relative to the diagonal; by hand."""
 DAMPING_RANGE = (1e-9, 1e9)
-"""Least and largest damping. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+"""Least and largest damping; by hand."""
 MOST_STEPS = 60
-"""Most steps of one search. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+"""Most steps of one search; by hand."""
 LONGEST_STEP = 0.5
-"""Longest step in any parameter; the focals are logarithms. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
+"""Longest step in any parameter; the focals are logarithms; by hand."""
 DIFFERENCE = 1e-7
-"""Step of the parameters for finite differences: near the square root of double precision. Chosen by hand; halved and
-doubled by `benchmarks.sensitivity`."""
+"""Step of the parameters for finite differences: near the square root of double precision; by hand."""
 FINISHED = 1e-9
-"""A search whose step lowers the sum by a smaller share has converged. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
+"""A search whose step lowers the sum by a smaller share has converged; by hand."""
 
 
 class Minima(NamedTuple):
@@ -44,14 +46,7 @@ class Minima(NamedTuple):
 def fit_camera(
     pairs: Pairs, start: CameraParameters, weights: FloatArray, equations: Equations = DEFAULT
 ) -> CameraParameters:
-    """Return the local minimum of sum_i w_i |equations_i|^2 / sum_i w_i that is reached from `start`, over all pairs.
-
-    Args:
-        pairs: P fundamental matrices.
-        start: where the search begins.
-        weights: (P,) w_i >= 0.
-        equations: form of the constraint.
-    """
+    """Return the local minimum near `start` of sum_i w_i |equations_i|^2 / sum_i w_i over all pairs."""
     found = find_minima(
         Halves.from_fundamentals(pairs.F)[np.arange(len(pairs))[None]], weights[None], np.array([start]), equations
     )
@@ -65,7 +60,7 @@ def find_minima(halves: Halves, weights: FloatArray, starts: FloatArray, equatio
 
     Args:
         halves: (B, P) pairs.
-        weights: (B, P) >= 0, their scale does not matter.
+        weights: (B, P) >= 0; their scale does not matter.
         starts: (B, 4) fx, fy, u, v, with focals > 0.
     """
     scale = np.sqrt(weights / np.sum(weights, axis=1, keepdims=True))[..., None]
@@ -108,3 +103,18 @@ def _step(residuals: Callable[[FloatArray], FloatArray], thetas: FloatArray, dam
 
 def _cameras(thetas: FloatArray) -> FloatArray:
     return np.column_stack([np.exp(thetas[:, :2]), thetas[:, 2:]])
+
+
+def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
+    """Minimize (5.8), or `constraint_form`, from K_init with equal weights.
+
+    The weights show which pairs take part (> 0), and count in the verdict only. Returns and raises as
+    `verdict.calibrate_with`; the seed is unused.
+    """
+    del seed
+    return calibrate_with(METHOD, pairs, partial(_find_camera, equations=EQUATIONS[options.constraint_form]))
+
+
+def _find_camera(pairs: Pairs, tall: float, evidence: dict[str, float], equations: Equations) -> CameraParameters:
+    del evidence
+    return fit_camera(pairs, CameraParameters.initial(tall), 0.0 * pairs.weights + 1.0, equations)

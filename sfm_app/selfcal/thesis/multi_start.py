@@ -20,7 +20,7 @@ CONFIDENCE = 0.95
 """Probability that any one triple is drawn (thesis 5.6.3)."""
 MOST_STARTS = 4000
 """MaxIter grows with the cube of the number of pairs; from 22 pairs on this is the limit (docs/algorithms.md, The
-thesis's methods). Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+thesis's methods); by hand."""
 FOCAL_RANGE = (0.1, 3.0)
 """Focals that count, in image widths: thesis (5.29) ends at 3. The lower end was chosen by hand."""
 USUAL_FOCAL = (1.0, 0.5)
@@ -31,13 +31,8 @@ USUAL_FOCAL = (1.0, 0.5)
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
     """Return the best of many least-squares solutions on three pairs each (thesis Algorithm 2).
 
-    Args:
-        pairs: F's and weights; the weights count in the distribution of the focal and in the residual.
-        options: `constraint_form`.
-        seed: of the triples and the starts.
-
-    Returns:
-        As `selfcal.thesis.verdict.calibrate_with`, which also says what is raised.
+    The weights count in the distribution of the focal and in the verdict; the seed is that of the triples and the
+    starts. Returns and raises as `verdict.calibrate_with`.
     """
     find = partial(algorithm_2, seed=seed, equations=EQUATIONS[options.constraint_form])
     return calibrate_with(METHOD, pairs, find, SAMPLE)
@@ -46,16 +41,10 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 def algorithm_2(
     pairs: Pairs, tall: float, evidence: dict[str, float], seed: int, equations: Equations = DEFAULT
 ) -> CameraParameters:
-    """Estimate the camera by Algorithm 2 as the thesis writes it.
+    """Estimate the camera by Algorithm 2 as the thesis writes it, in image widths.
 
     Residual(s) is that of the triple: the thesis writes that other pairs play no part, and that this costs accuracy.
-
-    Args:
-        pairs: P fundamental matrices in image widths.
-        tall: height of the photos in widths.
-        evidence: filled with the distribution of the focal and MaxIter.
-        seed: same seed, same result.
-        equations: form of the constraint.
+    Adds the distribution of the focal and MaxIter to the evidence.
     """
     rng = np.random.default_rng(seed)
     count = number_of_starts(len(pairs))
@@ -81,12 +70,7 @@ def number_of_starts(pairs: int) -> int:
 
 
 def focal_distribution(pairs: Pairs, tall: float) -> tuple[float, float]:
-    """Return thesis (5.12), (5.13): weighted mean and standard deviation of the pairs' own focals, in image widths.
-
-    Args:
-        pairs: P fundamental matrices in image widths.
-        tall: height of the photos in widths.
-    """
+    """Return thesis (5.12), (5.13): weighted mean and standard deviation of the pairs' own focals, in image widths."""
     focals = pair_focals(pairs, (0.5, 0.5 * tall))
     known = (focals > FOCAL_RANGE[0]) & (focals < FOCAL_RANGE[1])
     if not np.any(known):

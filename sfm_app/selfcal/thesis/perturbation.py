@@ -17,20 +17,14 @@ METHOD = "perturbation"
 MOST_ITERATIONS = 4
 """maxIter of Algorithm 3 (thesis 5.7.2)."""
 TOLERANCE = 1e-6
-"""T of Algorithm 3: a change of K, in image widths, that ends the iterations. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
+"""T of Algorithm 3: a change of K, in image widths, that ends the iterations; by hand."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Minimize (5.8) repeatedly, with weights from the error discrepancy (thesis Algorithm 3).
+    """Minimize (5.8), or `constraint_form`, repeatedly, with weights from the error discrepancy (thesis Algorithm 3).
 
-    Args:
-        pairs: F's; weights tell which pairs take part (> 0), and count in the verdict only.
-        options: `constraint_form`, which says whether it is (5.8) or another form.
-        seed: unused, nothing is drawn at random.
-
-    Returns:
-        As `selfcal.thesis.verdict.calibrate_with`, which also says what is raised.
+    The weights show which pairs take part (> 0), and count in the verdict only. Returns and raises as
+    `verdict.calibrate_with`; the seed is unused.
     """
     del seed
     return calibrate_with(METHOD, pairs, partial(algorithm_3, equations=EQUATIONS[options.constraint_form]))
@@ -39,13 +33,9 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 def algorithm_3(
     pairs: Pairs, tall: float, evidence: dict[str, float], equations: Equations = DEFAULT
 ) -> CameraParameters:
-    """Estimate the camera from K_init by Algorithm 3 as the thesis writes it.
+    """Estimate the camera from K_init by Algorithm 3 as the thesis writes it, in image widths.
 
-    Args:
-        pairs: P fundamental matrices in image widths.
-        tall: height of the photos in widths.
-        evidence: filled with the number of iterations and the effective number of pairs.
-        equations: form of the constraint.
+    Adds the number of iterations and the effective number of pairs to the evidence.
     """
     camera, weights = CameraParameters.initial(tall), np.ones(len(pairs))
     for iteration in range(1, MOST_ITERATIONS + 1):

@@ -11,13 +11,9 @@ import numpy as np
 
 from sfm_app.camera.models import camera_matrix
 from sfm_app.selfcal.consensus import CONSENSUS, Consensus, ambiguity_reason, best_rival, support_reason, votes
-from sfm_app.selfcal.pairs import Pairs, guess_calibration, prepare
+from sfm_app.selfcal.pairs import LEAST_PAIRS, Pairs, guess_calibration, prepare
 from sfm_app.types import Calibration, CameraPairs
 from sfm_app.types.arrays import FloatArray
-
-MIN_PAIRS = 3
-"""Four unknowns and two constraints a pair; with two pairs nothing is left to contradict a wrong K. Counted, by
-definition of the constraint (thesis 5.2.4)."""
 
 
 class CameraParameters(NamedTuple):
@@ -64,8 +60,8 @@ def calibrate_with(method: str, pairs: CameraPairs, find: Find, sample: int = 0)
     width, height = size = pairs.size
     usable = prepare(pairs, unit_px=width, origin_px=(0.0, 0.0))
     evidence = {"pairs": float(len(usable))}
-    if len(usable) < MIN_PAIRS:
-        return guess_calibration(size, f"{len(usable)} usable pairs, {MIN_PAIRS} are needed", evidence)
+    if len(usable) < LEAST_PAIRS:
+        return guess_calibration(size, f"{len(usable)} usable pairs, {LEAST_PAIRS} are needed", evidence)
     answer = find(usable, height / width, evidence)
     if isinstance(answer, str):
         return guess_calibration(size, answer, evidence)

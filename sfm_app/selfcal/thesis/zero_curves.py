@@ -16,11 +16,10 @@ from sfm_app.types.arrays import FloatArray
 # The point where most zero curves meet, or the points, where several cameras took the photos (thesis 5.8.4).
 
 SEPARATION = 1.25
-"""Peaks whose focals sqrt(fx fy) differ by a smaller factor are one. docs/algorithms.md, The thesis's methods. Chosen
-by hand; halved and doubled by `benchmarks.sensitivity`."""
+"""Peaks with focals sqrt(fx fy) within this factor are one. docs/algorithms.md, The thesis's methods; by hand."""
 LEAST_SHARE = 0.5
 """A peak has at least this share of the highest one's support; accidental meeting points mostly have less.
-docs/algorithms.md, The thesis's methods. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+docs/algorithms.md, The thesis's methods; by hand."""
 
 
 class Meeting(NamedTuple):
@@ -111,23 +110,14 @@ FOCAL_RANGE = 3.0
 SIGMA_SHARE = 0.1
 """sigma of rho, as a share of the range that is searched (thesis 5.8.4)."""
 PEAK_RANGE, PEAK_SIGMA = (0.3, FOCAL_RANGE), 0.1
-"""Where peaks are sought and how wide they are, in image widths: small beside the distance between two cameras. Chosen
-by hand; halved and doubled by `benchmarks.sensitivity`."""
+"""Range and width of the peaks, in image widths: small beside the distance between two cameras; by hand."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
     """Find K where the zero curves of all pairs meet (thesis Algorithm 4).
 
-    The thesis gives every pair the same weight: the given weights tell which pairs take part (> 0), and count in the
-    verdict only.
-
-    Args:
-        pairs: F's and weights.
-        options: `samples` along each curve.
-        seed: unused, nothing is drawn at random.
-
-    Returns:
-        As `selfcal.thesis.verdict.calibrate_with`, which also says what is raised.
+    The thesis gives every pair the same weight: the weights show which pairs take part (> 0), and count in the verdict
+    only. Returns and raises as `verdict.calibrate_with`; the seed is unused.
     """
     del seed
     return calibrate_with(METHOD, pairs, partial(algorithm_4, samples=options.samples))
@@ -136,13 +126,8 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: int) -> CameraParameters | str:
     """Estimate the camera by Algorithm 4 as the thesis writes it; return why not where too few curves are usable.
 
-    Several `focal_peaks` are several cameras (Figure 5.15), of which the answer is one.
-
-    Args:
-        pairs: P fundamental matrices in image widths.
-        tall: height of the photos in widths.
-        evidence: filled with the number of curves, their support where they meet, and the number of its peaks.
-        samples: of a sweep, > 0.
+    Several `focal_peaks` are several cameras (Figure 5.15), of which the answer is one. Adds the number of curves,
+    their support where they meet, and the number of its peaks to the evidence.
     """
     sweep = np.arange(1, samples + 1) / samples
     fx = FOCAL_RANGE * sweep

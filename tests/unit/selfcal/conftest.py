@@ -17,7 +17,7 @@ from sfm_app.types import CameraPairs, PhotoPairs
 
 @dataclass(frozen=True)
 class Views:
-    """(P, 3, 3) fundamental matrices and the camera they belong to."""
+    """(P, 3, 3) fundamental matrices and their camera."""
 
     Fs: NDArray[np.float64]
     K: NDArray[np.float64]
@@ -28,18 +28,48 @@ class Views:
         return np.ones(len(self.Fs))
 
 
+@dataclass(frozen=True)
+class Shots:
+    """Photos of random points: the input of a calibrator, and the cameras."""
+
+    pairs: CameraPairs
+    Ks: NDArray[np.float64]
+    sizes: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+
+    def as_set(self, groups, hints=None):
+        """`PhotoPairs` with the group of every photo."""
+        p = self.pairs
+        return PhotoPairs(p.Fs, p.weights, p.photos, p.inliers, self.sizes, dict(enumerate(groups)), hints or {})
+
+
+def looking(center, target, roll):
+    z = (target - center) / np.linalg.norm(target - center)
+    x = np.cross([0, 1.0, 0], z) / np.linalg.norm(np.cross([0, 1.0, 0], z))
+    return Rotation.from_rotvec([0, 0, roll]).as_matrix() @ np.stack([x, np.cross(z, x), z])
+
+
+# motions: random generator and number of cameras -> (R, C) of each
+
+
 def free_motion(rng, count):
-    """Cameras in front of a scene, each looking somewhere else in it."""
+    """Cameras in front of a scene, each directed at another point of it."""
     turn = rng.uniform(-0.5, 0.5, count)
     centers = np.stack([5 * np.sin(turn), rng.uniform(-1, 1, count), -5 * np.cos(turn)], axis=1)
     centers[:, 2] += rng.uniform(-0.8, 0.8, count)
-    return [(_looking(C, rng.normal(0, 0.5, 3), rng.normal(0, 0.3)), C) for C in centers]
+    return [(looking(C, rng.normal(0, 0.5, 3), rng.normal(0, 0.3)), C) for C in centers]
 
 
 def orbit(rng, count):
-    """Cameras on a circle that look at its center."""
+    """Cameras on a circle, directed at its center."""
     centers = [5 * np.array([np.sin(turn), 0, -np.cos(turn)]) for turn in 0.25 * np.arange(count)]
-    return [(_looking(C, np.zeros(3), 0.0), C) for C in centers]
+    return [(looking(C, np.zeros(3), 0.0), C) for C in centers]
+
+
+def level(rng, count):
+    """Cameras that only pan, at one height."""
+    turn = rng.uniform(-0.5, 0.5, count)
+    centers = np.stack([5 * np.sin(turn), np.zeros(count), -5 * np.cos(turn)], axis=1)
+    return [(looking(C, rng.normal(0, 0.5, 3) * [1, 0, 1], 0.0), C) for C in centers]
 
 
 def translation(rng, count):
@@ -47,28 +77,28 @@ def translation(rng, count):
     return [(np.eye(3), C) for C in rng.normal(size=(count, 3))]
 
 
-def level(rng, count):
-    """Cameras that only pan, at one height."""
-    turn = rng.uniform(-0.5, 0.5, count)
-    centers = np.stack([5 * np.sin(turn), np.zeros(count), -5 * np.cos(turn)], axis=1)
-    return [(_looking(C, rng.normal(0, 0.5, 3) * [1, 0, 1], 0.0), C) for C in centers]
+def parallel(rng, count):
+    """Cameras with parallel axes in front of the scene."""
+    return [(np.eye(3), np.array([0, 0, -5.0]) + C) for C in rng.uniform(-0.8, 0.8, (count, 3))]
 
 
-def _looking(center, target, roll):
-    z = (target - center) / np.linalg.norm(target - center)
-    x = np.cross([0, 1.0, 0], z) / np.linalg.norm(np.cross([0, 1.0, 0], z))
-    return Rotation.from_rotvec([0, 0, roll]).as_matrix() @ np.stack([x, np.cross(z, x), z])
+def turning(rng, count):
+    """Cameras that hardly leave one place."""
+    centers = np.array([0, 0, -5.0]) + rng.normal(0, 0.02, (count, 3))
+    return [(looking(C, rng.normal(0, 0.5, 3), rng.normal(0, 0.2)), C) for C in centers]
 
 
-def skew(t):
-    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+def onward(rng, count):
+    """Cameras that go straight ahead."""
+    centers = np.array([0, 0, -5.0]) + np.linspace(-1, 1, count)[:, None] * [0.05, 0.02, 1]
+    return [(Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix(), C) for C in centers]
 
 
 def fundamental(K, first, second, noise):
-    """F of two cameras (R, C); `noise` is added to every entry of the unit-norm E, before F."""
+    """F of two cameras (R, C); `noise` is added to every entry of the unit-norm E."""
     (R1, C1), (R2, C2) = first, second
-    E = skew(R2 @ (C1 - C2)) @ R2 @ R1.T
-    Ki = np.linalg.inv(K)
+    t, Ki = R2 @ (C1 - C2), np.linalg.inv(K)
+    E = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]]) @ R2 @ R1.T
     F = Ki.T @ (E / np.linalg.norm(E) + noise) @ Ki
     return F / np.linalg.norm(F)
 
@@ -93,7 +123,7 @@ def views():
 
 @pytest.fixture(scope="session")
 def random_fundamentals():
-    """Matrices that no camera has made: (P, 3, 3) for photos of about 1000 pixels."""
+    """Matrices of no camera: (P, 3, 3) for photos of about 1000 pixels."""
 
     def make(count, seed=0):
         scale = np.diag([1e-3, 1e-3, 1.0])
@@ -102,52 +132,22 @@ def random_fundamentals():
     return make
 
 
-@dataclass(frozen=True)
-class Shots:
-    """Photos of random points: what a calibrator gets, and the cameras."""
-
-    pairs: CameraPairs
-    Ks: NDArray[np.float64]
-    sizes: Mapping[int, tuple[int, int]] = field(default_factory=dict)
-
-    def as_set(self, groups, hints=None):
-        """`PhotoPairs` with the group of every photo."""
-        p = self.pairs
-        return PhotoPairs(p.Fs, p.weights, p.photos, p.inliers, self.sizes, dict(enumerate(groups)), hints or {})
-
-
-def parallel(rng, count):
-    """Cameras with parallel axes in front of the scene."""
-    return [(np.eye(3), np.array([0, 0, -5.0]) + C) for C in rng.uniform(-0.8, 0.8, (count, 3))]
-
-
-def turning(rng, count):
-    """Cameras that hardly move from one place."""
-    centers = np.array([0, 0, -5.0]) + rng.normal(0, 0.02, (count, 3))
-    return [(_looking(C, rng.normal(0, 0.5, 3), rng.normal(0, 0.2)), C) for C in centers]
-
-
-def onward(rng, count):
-    """Cameras that go straight ahead."""
-    centers = np.array([0, 0, -5.0]) + np.linspace(-1, 1, count)[:, None] * [0.05, 0.02, 1]
-    return [(Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix(), C) for C in centers]
-
-
-def _photo(X, pose, K, k1):
-    """(N, 2) pixels without noise, and (N,) what lies before the camera."""
+def photograph(X, pose, K, k1):
+    """(N, 2) pixels without noise, and (N,) which points lie before the camera."""
     R, C = pose
-    seen = (X - C) @ R.T
-    rays = seen[:, :2] / np.where(seen[:, 2:] > 0.1, seen[:, 2:], 1.0)
+    x = (X - C) @ R.T
+    rays = x[:, :2] / np.where(x[:, 2:] > 0.1, x[:, 2:], 1.0)
     rays = rays * (1 + k1 * np.sum(rays**2, axis=1, keepdims=True))
-    return rays * [K[0, 0], K[1, 1]] + K[:2, 2], seen[:, 2] > 0.1
+    return rays * [K[0, 0], K[1, 1]] + K[:2, 2], x[:, 2] > 0.1
 
 
-def _shots(motion, seed, points, Ks, sizes, k1, noise_px):
-    rng = np.random.default_rng([seed, 7])
+def match(motion, seed, points, Ks, sizes, k1, noise_px):
+    """F's, photos and matches of all pairs with 16 matches or more."""
+    rng, unit = np.random.default_rng([seed, 7]), np.diag([1e-3, 1e-3, 1.0])
     poses, X = motion(rng, len(Ks)), rng.uniform(-1.6, 1.6, (points, 3))
     photos = []
     for pose, K, size in zip(poses, Ks, sizes, strict=True):
-        x, before = _photo(X, pose, K, k1)
+        x, before = photograph(X, pose, K, k1)
         x = x + noise_px * rng.normal(size=x.shape)
         photos.append((x, before & np.all((x >= 0) & (x <= size), axis=1)))
     Fs, ids, inliers = [], [], []
@@ -155,7 +155,6 @@ def _shots(motion, seed, points, Ks, sizes, k1, noise_px):
         both = photos[i][1] & photos[j][1]
         if np.count_nonzero(both) >= 16:
             x = np.hstack([photos[i][0][both], photos[j][0][both]])
-            unit = np.diag([1e-3, 1e-3, 1.0])
             start = np.linalg.inv(unit) @ eight_point(x[:, :2], x[:, 2:]) @ np.linalg.inv(unit)
             Fs.append(unit @ refine_sampson(np.asfortranarray(x * 1e-3), start, scale=3e-3) @ unit)
             ids.append((i, j))
@@ -171,17 +170,14 @@ def shots():
         count=6, seed=0, *, motion=free_motion, focal=1000.0, aspect=1.0, center=(0.5, 0.5), size=(1000, 750), k1=0.0,
         noise_px=0.5, points=250, hints=(),
     ):  # fmt: skip
-        focals = np.broadcast_to(focal, count)
-        sizes = [size] * count if isinstance(size[0], int) else list(size)
-        root = np.sqrt(aspect)
+        sizes, root = [size] * count if isinstance(size[0], int) else list(size), np.sqrt(aspect)
         Ks = np.array(
             [[[f / root, 0, w * center[0]], [0, f * root, h * center[1]], [0, 0, 1]]
-             for f, (w, h) in zip(focals, sizes, strict=True)]
+             for f, (w, h) in zip(np.broadcast_to(focal, count), sizes, strict=True)]
         )  # fmt: skip
-        Fs, ids, inliers = _shots(motion, seed, points, Ks, sizes, k1, noise_px)
+        Fs, ids, inliers = match(motion, seed, points, Ks, sizes, k1, noise_px)
         weights = pair_weights([len(x) for x in inliers])
-        pairs = CameraPairs(Fs, weights, sizes[0], ids, inliers, tuple(hints))
-        return Shots(pairs, Ks, dict(enumerate(sizes)))
+        return Shots(CameraPairs(Fs, weights, sizes[0], ids, inliers, tuple(hints)), Ks, dict(enumerate(sizes)))
 
     make.free, make.orbit, make.level = free_motion, orbit, level
     make.parallel, make.turning, make.onward = parallel, turning, onward

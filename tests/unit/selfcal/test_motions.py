@@ -19,7 +19,7 @@ def off(found, made, k1):
 
 @pytest.mark.parametrize("motion", ["orbit", "parallel", "onward"])
 @pytest.mark.parametrize(("k1", "count"), [(0.0, 4), (-0.1, 5)])
-def test_what_matches_do_not_determine_is_not_given(shots, motion, k1, count):
+def test_critical_motions_give_a_guess(shots, motion, k1, count):
     for seed in range(1 if k1 else 3):
         made = shots(count, seed, motion=getattr(shots, motion), k1=k1, points=120)
         found = calibrate(made.pairs, OPTIONS, seed)
@@ -30,7 +30,7 @@ def test_what_matches_do_not_determine_is_not_given(shots, motion, k1, count):
 
 @pytest.mark.parametrize("motion", ["level", "turning"])
 @pytest.mark.parametrize(("k1", "count"), [(0.0, 4), (-0.1, 5)])
-def test_what_matches_hardly_determine_is_not_overstated(shots, motion, k1, count):
+def test_nearly_critical_motions_give_no_overstated_answer(shots, motion, k1, count):
     for seed in range(1 if k1 else 3):
         made = shots(count, seed, motion=getattr(shots, motion), k1=k1, points=120)
         assert off(calibrate(made.pairs, OPTIONS, seed), made, k1) < 3

@@ -1,9 +1,11 @@
 """The production calibrator on cameras that are cropped, squeezed, narrow, few, mixed or undetermined."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from sfm_app.selfcal import consensus, pair_weights, zero_curves
+from sfm_app.selfcal import pair_weights, zero_curves
 from sfm_app.selfcal.zero_curves import METHOD, calibrate
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import CameraPairs
@@ -42,9 +44,7 @@ def test_finds_the_camera(views, camera, seed):
     if "motion" in knobs:
         knobs["motion"] = getattr(views, knobs["motion"])
     made = views(7, seed, **knobs)
-
     found = run(made)
-
     assert found.identifiable, found.reason
     assert found.method == METHOD
     focal, center = errors(found, made.K, made.size)
@@ -61,7 +61,7 @@ def test_pixels_stay_square_unless_the_pairs_clearly_say_otherwise(views, knobs)
         assert found.evidence["aspect_gain"] < 3.9
 
 
-def test_freeing_the_aspect_is_what_the_pairs_ask_for(views):
+def test_the_aspect_is_freed_where_the_pairs_require_it(views):
     found = run(views(6, aspect=0.75))
     assert found.K[1, 1] / found.K[0, 0] == pytest.approx(0.75, rel=0.02)
     assert 4 < found.evidence["aspect_gain"] < 15
@@ -71,18 +71,8 @@ def test_pixels_that_may_not_be_square_are_not_claimed_to_be_known(views):
     """Between clearly square and clearly not, K may be off by as much as they are."""
     found = [run(views(4, seed, aspect=0.9)) for seed in range(8)]
     held = [one for one in found if one.K[0, 0] == pytest.approx(one.K[1, 1]) and one.evidence["aspect_gain"] > 1.0]
-
     assert len(held) >= 2 and not any(one.identifiable for one in held)
-    assert any(one.reason == "its pixels may not be square" for one in held)
-
-
-@pytest.mark.parametrize(
-    ("lead", "missing", "doubted"), [(0.1, 0.4, True), (0.3, 0.4, False), (0.1, 0.1, False), (0.3, 0.1, False)]
-)
-def test_a_small_lead_counts_only_where_few_votes_are_missing(lead, missing, doubted):
-    votes = np.full(10, 1.0 - missing)
-    answer = consensus.Answer(np.zeros(4), consensus.SQUARE_PIXELS, 0.01, lead * votes.sum(), votes, 0.0, ())
-    assert bool(answer.doubt_of_focal(np.ones(10))) is doubted
+    assert any(one.reason == "the pixels may not be square" for one in held)
 
 
 @pytest.mark.parametrize("count", [3, 5])
@@ -128,25 +118,6 @@ def test_weights_decide_between_two_cameras(views):
         assert found.K[0, 0] == pytest.approx(focal, rel=0.05)
 
 
-@pytest.mark.parametrize("motion", ["orbit", "translation"])
-@pytest.mark.parametrize("noise", [0.0, 3e-4, 3e-3])
-@pytest.mark.parametrize("count", [3, 7])
-def test_motions_that_do_not_determine_the_focal(views, motion, noise, count):
-    found = run(views(count, motion=getattr(views, motion), noise=noise))
-    assert not found.identifiable
-    assert found.reason
-    assert found.method == "guess"
-    np.testing.assert_array_equal(found.K, [[1200, 0, 500], [0, 1200, 375], [0, 0, 1]])
-
-
-@pytest.mark.parametrize("count", [3, 10, 45])
-def test_matrices_without_a_camera(random_fundamentals, count):
-    for seed in range(4):
-        found = calibrate(CameraPairs.from_Fs(random_fundamentals(count, seed), (1000, 750)), OPTIONS, 0)
-        assert not found.identifiable
-        assert "do not agree" in found.reason
-
-
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_pairs(views, count):
     made = views(3)
@@ -156,17 +127,9 @@ def test_too_few_pairs(views, count):
     assert found.evidence == {"pairs": count}
 
 
-def test_one_pair_repeated_is_one_pair(views):
-    for seed in range(4):
-        made = views(2, seed)
-        found = calibrate(CameraPairs.from_Fs(np.repeat(made.Fs, 10, axis=0), made.size), OPTIONS, 0)
-        assert not found.identifiable
-
-
 def test_three_pairs_leave_the_center_near_the_middle(views):
     made = views(3, 1, noise=4e-3)
     found = calibrate(CameraPairs.from_Fs(made.Fs, made.size), OPTIONS.model_copy(update={"center_sigma": 1.0}), 0)
-
     assert 0 < np.linalg.norm(found.K[:2, 2] - [500, 375]) < 60
 
 
@@ -200,11 +163,6 @@ def test_seed_changes_the_spread_only(views):
     assert first.spread["fx"] == pytest.approx(second.spread["fx"], rel=1.0)
 
 
-def test_inlier_counts_make_weights(views):
-    made = views(5)
-    assert run(made, weights=pair_weights(np.full(10, 200))).identifiable
-
-
 def with_other_pairs(shots, seed):
     """28 pairs of one camera among 378 of photos that have no camera in common, and the true K."""
     right, focals = shots(8, seed, points=400), np.random.default_rng(seed + 100).normal(np.log(620), 0.3, 28)
@@ -217,12 +175,10 @@ def with_other_pairs(shots, seed):
 
 def test_wrong_pairs_do_not_pull_a_camera_away_however_many_they_are(shots, monkeypatch):
     pairs, K = with_other_pairs(shots, seed=0)
-
     found = calibrate(pairs, OPTIONS, 0)
-
     assert found.identifiable, found.reason
     scores = [abs((found.K - K)[place]) / found.spread[name] for place, name in (((0, 0), "fx"), ((1, 2), "cy"))]
     assert max(scores) < 3 and found.spread["fx"] < 15
     assert 0.95 < found.evidence["votes_kept"] < 1.05
-    monkeypatch.setattr(zero_curves, "LEAST_KEPT_SHARE", 0.0)
+    monkeypatch.setattr(zero_curves, "ZERO_CURVES", replace(zero_curves.ZERO_CURVES, least_vote_share=0.0))
     assert calibrate(pairs, OPTIONS, 0).evidence["votes_kept"] < 0.5  # what the adjustment to all of them comes to

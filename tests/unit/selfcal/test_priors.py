@@ -1,11 +1,12 @@
-"""What is freed, and what is believed in the end."""
+"""The choice of free parameters, and hierarchical priors."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.priors import ASPECT, CENTER, FOCAL, HINT_SPREAD, LENS, WIDE, CameraPriors, Evidence, spare_share
+from sfm_app.selfcal import priors
+from sfm_app.selfcal.priors import ASPECT, CENTER, FOCAL, LENS, PRIORS, CameraPriors, Evidence, redundancy
 from sfm_app.selfcal.zero_curves import calibrate
 from sfm_app.settings import CalibrationSettings
 
@@ -21,7 +22,7 @@ def freed(*places):
 
 
 def evidence(deviations, offset=(0.0,) * 5, claim=NO_CLAIM, theta=(0.0,) * 5, pairs=1e6):
-    """Pairs that say theta + offset, with these standard deviations."""
+    """Pairs with the answer theta + offset and these standard deviations."""
     H = np.diag(np.asarray(deviations, float) ** -2.0)
     return Evidence(np.array([theta]), H, H @ np.asarray(offset), pairs, CameraPriors(np.ones(1), claim))
 
@@ -32,18 +33,14 @@ SURE = [1e-3] * 5
 @pytest.mark.parametrize(
     ("offset", "place"), [((0, 0.05, 0, 0, 0), CENTER), ((0, 0, 0, 0.1, 0), ASPECT), ((0, 0, 0, 0, 0.08), LENS)]
 )
-def test_what_sure_pairs_contradict_is_freed_and_nothing_else(offset, place):
+def test_sure_pairs_free_the_part_that_they_contradict(offset, place):
     np.testing.assert_array_equal(evidence(SURE, offset).choose(NOTHING), freed(place))
 
 
-def test_usual_cameras_stay_usual():
+def test_usual_cameras_stay_usual_and_unsure_pairs_free_nothing():
     for deviation in (1e-3, 0.01, 0.1, 1.0):
         np.testing.assert_array_equal(evidence([deviation] * 5).choose(freed(CENTER, ASPECT, LENS)), NOTHING)
-
-
-def test_unsure_pairs_free_nothing():
-    found = evidence([0.1] * 5, (0, 0.05, 0, 0.1, 0.08))
-    np.testing.assert_array_equal(found.choose(NOTHING), NOTHING)
+    np.testing.assert_array_equal(evidence([0.1] * 5, (0, 0.05, 0, 0.1, 0.08)).choose(NOTHING), NOTHING)
 
 
 def test_the_log_evidence_is_the_integral():
@@ -73,7 +70,7 @@ def test_mean_step_and_covariance_are_those_of_two_measurements():
     prior = found.priors.prior(NOTHING, found.thetas)
     _, step, covariance = found.posterior(NOTHING)
     weights = np.array([100.0, prior.precision[0, 0]])
-    share = spare_share(NOTHING, 1e6)
+    share = redundancy(NOTHING, 1e6)
     weights[0] *= share
     assert step[0] == pytest.approx(weights @ [0.2, prior.mean[0, 0]] / weights.sum())
     assert covariance[0, 0] == pytest.approx(1 / weights.sum())
@@ -82,15 +79,14 @@ def test_mean_step_and_covariance_are_those_of_two_measurements():
 def test_a_claim_counts_where_pairs_are_weak_and_loses_against_strong_ones():
     claim = np.array([1.0])
     weak, strong = evidence([0.3] * 5, (0.1, 0, 0, 0, 0), claim), evidence(SURE, (0.3, 0, 0, 0, 0), claim)
-
     assert not weak.choose(NOTHING)[0, FOCAL]
     assert abs(weak.posterior(NOTHING)[1][0]) < 0.01
-    assert 0.8 * HINT_SPREAD < np.sqrt(weak.covariance(NOTHING)[0, 0]) < 0.3
+    assert 0.8 * PRIORS.hint_spread < np.sqrt(weak.covariance(NOTHING)[0, 0]) < 0.3
     assert strong.choose(NOTHING)[0, FOCAL]
     assert strong.posterior(strong.choose(NOTHING))[1][0] == pytest.approx(0.3, abs=1e-3)
 
 
-def test_where_nobody_claims_a_focal_none_is_freed():
+def test_without_a_claimed_focal_none_is_freed():
     found = evidence(SURE)
     assert found.posterior(freed(FOCAL))[0] == pytest.approx(found.posterior(NOTHING)[0])
     assert not found.choose(NOTHING)[0, FOCAL]
@@ -104,7 +100,6 @@ def test_the_covariance_covers_all_choices(offset):
     found = replace(found, H=H)
     best = found.choose(NOTHING)
     mixed = found.covariance(best)
-
     np.testing.assert_allclose(mixed, mixed.T, rtol=1e-9)
     assert np.linalg.eigvalsh(mixed).min() > 0
     widest = found.posterior(freed(CENTER, ASPECT, LENS))[2]
@@ -112,7 +107,7 @@ def test_the_covariance_covers_all_choices(offset):
     assert mixed[3, 3] < widest[3, 3]
 
 
-def test_what_is_nearly_free_is_nearly_as_uncertain():
+def test_nearly_freed_parts_are_nearly_as_uncertain():
     at = [np.sqrt(evidence([0.02] * 5, (0, u, 0, 0, 0)).covariance(NOTHING)[1, 1]) for u in (0.0, 0.04, 0.06)]
     assert at[0] < 0.016 < at[1] < 0.05
     assert at[1] > 1.1 * at[0]
@@ -120,10 +115,10 @@ def test_what_is_nearly_free_is_nearly_as_uncertain():
 
 def test_few_pairs_say_less_than_their_scatter():
     free = freed(CENTER, ASPECT, LENS)
-    assert spare_share(free, 1e9) == pytest.approx(1.0)
-    assert spare_share(NOTHING, 3.0) == pytest.approx(1 - 1 / 6)
-    assert spare_share(free, 5.0) == pytest.approx(0.5)
-    assert spare_share(free, 0.0) == spare_share(free, 1.0) == 0.1
+    assert redundancy(free, 1e9) == pytest.approx(1.0)
+    assert redundancy(NOTHING, 3.0) == pytest.approx(1 - 1 / 6)
+    assert redundancy(free, 5.0) == pytest.approx(0.5)
+    assert redundancy(free, 0.0) == redundancy(free, 1.0) == 0.1
 
 
 def test_every_camera_has_its_own_choice():
@@ -134,10 +129,10 @@ def test_every_camera_has_its_own_choice():
 
 
 def test_k1_is_held_in_focal_lengths():
-    priors = CameraPriors(np.ones(1), NO_CLAIM)
+    lens = CameraPriors(np.ones(1), NO_CLAIM)
     for log_focal in (-0.5, 0.0, 0.8):
-        precision = priors.prior(freed(LENS), np.array([[log_focal, 0, 0, 0, 0]])).precision[0, 4]
-        assert precision**-0.5 * np.exp(2 * log_focal) == pytest.approx(WIDE[LENS])
+        precision = lens.prior(freed(LENS), np.array([[log_focal, 0, 0, 0, 0]])).precision[0, 4]
+        assert precision**-0.5 * np.exp(2 * log_focal) == pytest.approx(priors.WIDE[LENS])
 
 
 @pytest.mark.parametrize("claim", [500.0, 850.0, 1180.0, 4000.0])
@@ -156,3 +151,36 @@ def test_a_right_claim_helps_weak_pairs(shots):
         spreads.append(found.evidence["log_focal_spread"])
     assert spreads[1] < 0.8 * spreads[0]
     assert spreads[1] < 0.08
+
+
+def prior(families, free_focal=False, hints=None, focals=(1.0, 2.0, 4.0)):
+    thetas = np.zeros((3, 5))
+    thetas[:, 0] = np.log(focals)
+    tied = priors.TiedPriors(np.ones(3), np.full(3, np.nan) if hints is None else hints, families=np.array(families))
+    free = np.zeros((3, 4), np.bool_)
+    free[:, 3] = free_focal
+    return tied.prior(free, thetas)
+
+
+def test_focals_of_a_family_scatter_about_their_mean():
+    found = prior([0, 0, 0])
+    assert found.precision[:, 0] == pytest.approx(PRIORS.family_spread**-2)
+    # drawn towards the usual focal by a prior of 0.7 beside three of 0.3
+    share = 3 / PRIORS.family_spread**2 / (3 / PRIORS.family_spread**2 + 0.7**-2)
+    assert found.mean[:, 0] == pytest.approx(PRIORS.usual_log_focal + share * (np.log(2) - PRIORS.usual_log_focal))
+
+
+def test_families_are_apart_and_a_single_member_keeps_the_usual_focal():
+    found = prior([-1, 5, -1])
+    assert found.mean[:, 0] == pytest.approx(PRIORS.usual_log_focal)
+    assert found.precision[:, 0] == pytest.approx(0.7**-2)
+    two = prior([0, 0, 1])
+    assert two.mean[0, 0] == two.mean[1, 0] != two.mean[2, 0]
+
+
+def test_a_claim_comes_before_the_family():
+    found = prior([0, 0, 0], hints=np.array([3.0, np.nan, np.nan]))
+    assert found.mean[0, 0] == pytest.approx(np.log(3))
+    assert found.precision[0, 0] > 10 * found.precision[1, 0]
+    freed = prior([0, 0, 0], free_focal=True, hints=np.array([3.0, np.nan, np.nan]))
+    assert freed.mean[0, 0] == freed.mean[1, 0]

@@ -1,23 +1,23 @@
-"""The consensus over all of K at once, and what is said about its peak."""
+"""The consensus over all of K at once, and the verdict on its peak."""
 
 import numpy as np
 import pytest
 
 from sfm_app.selfcal.consensus import (
-    FOCAL_RANGE,
-    FOCALS,
-    SIGMAS,
+    CONSENSUS,
     Consensus,
+    ConsensusPeak,
+    ambiguity_reason,
     best_rival,
     deviation,
-    disagreement,
     effective_count,
-    indecision,
     peaks,
+    rejection_reason,
     resample_peak,
     residual_sigma,
     scan,
     spread_px,
+    support_reason,
     votes,
 )
 from sfm_app.selfcal.pairs import prepare
@@ -68,11 +68,9 @@ def test_climbing_moves_what_is_free_and_never_down(consensus):
 def test_the_highest_peak_is_the_truth(consensus, focal):
     made = consensus(focal=1000 * focal, center=(560, 340), noise=3e-4)
     profile = scan(made, (0.0,))
-    assert profile.thetas.shape == (FOCALS, 4)
-    np.testing.assert_allclose(np.exp(profile.thetas[[0, -1], 0]), FOCAL_RANGE)
-
+    assert profile.thetas.shape == (CONSENSUS.focals, 4)
+    np.testing.assert_allclose(np.exp(profile.thetas[[0, -1], 0]), CONSENSUS.focal_range)
     found = peaks(made, profile, FREE)
-
     assert [peak.value for peak in found] == sorted((peak.value for peak in found), reverse=True)
     assert np.exp(found[0].theta[0]) == pytest.approx(focal, rel=0.05)
     np.testing.assert_allclose(found[0].theta[1:3], [0.06, -0.035], atol=0.04)
@@ -83,10 +81,7 @@ def test_own_sigma_follows_the_scatter_within_bounds(consensus):
     assert sigmas[0] == 0.005
     assert 0.005 < sigmas[1] < 0.02
     assert sigmas[2] == 0.02
-
-
-def test_own_sigma_where_nothing_agrees(consensus):
-    assert residual_sigma(consensus(), truth(0.01)) == 0.02
+    assert residual_sigma(consensus(), truth(0.01)) == 0.02  # nothing agrees
 
 
 def test_effective_count():
@@ -95,24 +90,21 @@ def test_effective_count():
     assert effective_count(np.zeros(3)) == 0
 
 
-def test_too_few_votes_are_no_agreement():
-    assert disagreement(np.full(3, 0.9), np.ones(3)) == ""
-    assert "agree" in disagreement(np.array([1.0, 0.2, 0.1]), np.ones(3))
-    assert "agree" in disagreement(np.full(100, 0.05), np.ones(100))
-
-
-def test_a_lead_must_count_and_weigh():
-    assert indecision(0.6, np.ones(10)) == ""
-    assert "other focals" in indecision(0.4, np.ones(10))
-    assert "other focals" in indecision(2.0, np.ones(100))
+def test_few_votes_are_no_agreement_and_a_margin_must_count_and_weigh():
+    assert support_reason(np.full(3, 0.9), np.ones(3)) == ""
+    assert "agree" in support_reason(np.array([1.0, 0.2, 0.1]), np.ones(3))
+    assert "agree" in support_reason(np.full(100, 0.05), np.ones(100))
+    assert ambiguity_reason(0.6, np.ones(10)) == ""
+    assert "other focals" in ambiguity_reason(0.4, np.ones(10))
+    assert "other focals" in ambiguity_reason(2.0, np.ones(100))
 
 
 def test_rivals_are_far_below_the_truth_and_level_with_it_on_an_orbit(views, consensus):
     for motion, low, high in ((None, 3.0, 15.0), (views.orbit, -0.1, 0.05)):
         made = consensus(noise=3e-4, **({"motion": motion} if motion else {}))
-        value = made.evaluate(truth()[None], SIGMAS[-1])[0]
+        value = made.evaluate(truth()[None], CONSENSUS.sigmas[-1])[0]
         for profile in (None, scan(made, (0.0,))):
-            assert low < value - best_rival(made, truth(), FREE, SIGMAS, profile) < high
+            assert low < value - best_rival(made, truth(), FREE, CONSENSUS.sigmas, profile) < high
 
 
 def test_resampling_scatters_with_the_noise_and_repeats(consensus):
@@ -140,3 +132,26 @@ def test_spread_is_in_pixels():
     spread = spread_px(thetas, 1000.0, 1e6, 4)
     assert list(spread) == ["fx", "fy", "cx", "cy"]
     assert list(spread.values()) == pytest.approx([7.5, 30, 2, 3], rel=0.1)
+
+
+def rejection(theta, spread=0.001):
+    return rejection_reason(np.array(theta), spread, (1000, 750))
+
+
+def test_answers_of_agreeing_pairs_are_rejected_for_a_reason():
+    assert rejection([0.0, 0.49, -0.37, 0.0]) == ""
+    assert rejection([0.0, 0.0, 0.0, 0.0], spread=0.09) == ""
+    assert "uncertain by 12 %" in rejection([0.0, 0.0, 0.0, 0.0], spread=0.12)
+    assert "end of the range" in rejection([np.log(0.3), 0.0, 0.0, 0.0])
+    assert "end of the range" in rejection([np.log(5.1), 0.0, 0.0, 0.0])
+    assert "center" in rejection([0.0, 0.51, 0.0, 0.0])
+    assert "center" in rejection([0.0, 0.0, -0.38, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("margin", "missing", "doubted"), [(0.1, 0.4, True), (0.3, 0.4, False), (0.1, 0.1, False), (0.3, 0.1, False)]
+)
+def test_a_small_margin_counts_only_where_few_votes_are_missing(margin, missing, doubted):
+    votes = np.full(10, 1.0 - missing)
+    peak = ConsensusPeak(np.zeros(4), FREE, 0.01, margin * votes.sum(), votes, 0.0, ())
+    assert bool(peak.rival_reason(np.ones(10))) is doubted
