@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.bundle.normal_equations import LOST_PX, Bundle, cost, lost_points, project, reduce, usable_mask
+from sfm_app.bundle.normal_equations import REDUCTION, Bundle, cost, lost_points, project, reduce, usable_mask
 from sfm_app.camera.projection import PERSPECTIVE
 
 CAMERA = np.array([[900.0, 900.0, 500.0, 400.0, *[0.0] * 8]])
@@ -114,4 +114,4 @@ def test_what_cannot_be_seen_costs_more_than_what_is_off():
 
     assert lost_points(bundle).nonzero()[0].tolist() == [60] and not lost_points(off).any()
     assert np.count_nonzero(~usable_mask(bundle, np.zeros_like(bundle.x))) == 4
-    assert cost(bundle, SCALE_PX) > 3 * SCALE_PX * LOST_PX > 10 * cost(off, SCALE_PX)
+    assert cost(bundle, SCALE_PX) > 3 * SCALE_PX * REDUCTION.lost_px > 10 * cost(off, SCALE_PX)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.bundle.normal_equations import DAMPING, Bundle, apply_step, project, reduce, residuals
+from sfm_app.bundle.normal_equations import REDUCTION, Bundle, apply_step, project, reduce, residuals
 from sfm_app.camera.projection import (
     CAMERA,
     FISHEYE,
@@ -122,7 +122,7 @@ def test_derivatives_by_pose_and_world_point_of_a_mixed_bundle_are_those_of_diff
 def test_a_panorama_has_nothing_free_and_its_neighbors_all():
     H = reduce(mixed(), 1.0).H
 
-    assert np.abs(H[2 * CAMERA :]).max() <= DAMPING and np.abs(H[:, 2 * CAMERA :]).max() <= DAMPING
+    assert np.abs(H[2 * CAMERA :]).max() <= REDUCTION.damping and np.abs(H[:, 2 * CAMERA :]).max() <= REDUCTION.damping
     assert np.all(np.diag(H)[: 2 * CAMERA] > 0)
 
 
