@@ -40,7 +40,9 @@ def read_colmap_text(text: str) -> dict[str, Calibration]:
         ValueError: a line is no camera.
     """
     cameras = {}
-    for line in _lines(text):
+    for line in (line.strip() for line in text.splitlines()):
+        if not line or line.startswith("#"):
+            continue
         words = line.split()
         if len(words) < 5 or not words[1].isupper():
             raise ValueError(f"'{line[:60]}' is not a line of COLMAP's cameras.txt")
@@ -86,11 +88,6 @@ def read_colmap_folder(folder: Path) -> tuple[dict[str, Calibration], dict[str, 
     images = folder / "images.txt"
     known = dict(_text_images(images.read_text(encoding="utf-8"))) if images.is_file() else {}
     return read_colmap_text((folder / "cameras.txt").read_text(encoding="utf-8")), known
-
-
-def _lines(text: str) -> list[str]:
-    """Return the lines that are neither empty nor comments."""
-    return [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
 
 
 def _text_images(text: str) -> Iterator[tuple[str, str]]:
@@ -175,7 +172,9 @@ def opencv_camera(values: Mapping[str, Any]) -> Calibration:
         raise ValueError("the camera matrix is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     distortion = _value(values, DISTORTION)
     coefficients = [] if distortion is None else _numbers(distortion, "the distortion").ravel().tolist()
-    model, terms = _model_and_terms(coefficients, fisheye=_is_fisheye(_value(values, MODEL)))
+    stated = _value(values, MODEL)
+    fisheye = any(word in stated.lower() for word in FISHEYE_WORDS) if isinstance(stated, str) else bool(stated)
+    model, terms = _model_and_terms(coefficients, fisheye=fisheye)
     params = [fx, fy, cx + 0.5, cy + 0.5, *terms]
     return calibration_from_model(model, params, _size(values))
 
@@ -217,12 +216,6 @@ def _model_and_terms(terms: list[float], *, fisheye: bool) -> tuple[str, list[fl
     if any(terms[8:]):
         raise ValueError("coefficients of a thin prism or of a tilted sensor are not supported")
     return "FULL_OPENCV", [*terms, *[0.0] * 8][:8]
-
-
-def _is_fisheye(model: Any) -> bool:
-    if isinstance(model, str):
-        return any(word in model.lower() for word in FISHEYE_WORDS)
-    return bool(model)
 
 
 def _size(values: Mapping[str, Any]) -> tuple[int, int]:

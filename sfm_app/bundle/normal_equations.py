@@ -26,22 +26,22 @@ POSE = 6
 
 @dataclass(frozen=True, slots=True)
 class ReductionOptions:
-    """Limits of the reduction (docs/algorithms.md, Bundle adjustment). Chosen by hand, except where stated."""
+    """Limits of the reduction (docs/algorithms.md, Bundle adjustment)."""
 
     min_information: float = 1e-11
     """Share of a point's information below which a direction counts as undetermined: rounding leaves this much of the
-    depth of rays that nearly coincide. Two rays 1.5 degrees apart leave 2e-4."""
+    depth of rays that nearly coincide. Two rays 1.5 degrees apart leave 2e-4. Chosen by hand."""
     damping: float = 1e-6
-    """Added to the diagonal, so that a photo without observations does not make the system singular."""
+    """Added to the diagonal, so that a photo without observations does not make the system singular. Chosen by hand."""
     usual_noise_px: float = 0.25
-    """Prior noise of a keypoint coordinate: the usual noise of SIFT."""
+    """Prior noise of a keypoint coordinate: the usual noise of SIFT. Chosen by hand."""
     usual_count: float = 4.0
     """Weight of the prior noise as a number of measurements. It matters where there are hardly more observations than
-    unknowns."""
+    unknowns. Chosen by hand."""
     lost_px: float = 1e4
-    """Residual above which an observation is lost, i.e. not used; a lost observation costs as much."""
+    """Residual above which an observation is lost, i.e. not used; a lost observation costs as much. Chosen by hand."""
     max_derivative: float = 1e60
-    """Derivative above which an observation is lost."""
+    """Derivative above which an observation is lost. Chosen by hand."""
 
 
 REDUCTION = ReductionOptions()
@@ -163,16 +163,16 @@ class Linearized:
         change = np.hstack([poses.reshape(-1, POSE)[self.photo], cameras.reshape(-1, CAMERA)[self.camera]])
         return np.asarray(np.einsum("nki,ni->nk", self.by_view, change), np.float64)
 
-    def score(self, give: FloatArray, left_over: FloatArray) -> FloatArray:
+    def score(self, response: FloatArray, residue: FloatArray) -> FloatArray:
         """Return the scores (I, 12C) of the cameras' parameters, with poses and points eliminated.
 
         Args:
-            give: (6I, 12C) decrease of the best change of the poses per change of the cameras.
-            left_over: (N, 2) residuals after poses and points.
+            response: (6I, 12C) decrease of the best change of the poses per change of the cameras.
+            residue: (N, 2) residuals after poses and points.
         """
-        scores = np.zeros((give.shape[1], self.counts[0]))
+        scores = np.zeros((response.shape[1], self.counts[0]))
         observed = self.photo, self.camera, self.point, self.by_view, self.by_point
-        add_scores(observed, np.ascontiguousarray(give.T), left_over, self.counts[2], scores)
+        add_scores(observed, np.ascontiguousarray(response.T), residue, self.counts[2], scores)
         return scores.T
 
 
@@ -329,34 +329,34 @@ def eliminate_from_cameras(
 
 
 @kernel
-def add_scores(observed: Any, give: FloatArray, left_over: FloatArray, points: int, scores: FloatArray) -> None:
+def add_scores(observed: Any, response: FloatArray, residue: FloatArray, points: int, scores: FloatArray) -> None:
     """Add up the scores of each photo, in place, one parameter after the other.
 
     Args:
         observed: (N,) photo, camera and point; (N, 2, 18) and (N, 2, 3) derivatives by view and point.
-        give: (12C, 6I) decrease of the best change of the poses.
-        left_over: (N, 2) residuals.
+        response: (12C, 6I) decrease of the best change of the poses.
+        residue: (N, 2) residuals.
         scores: (12C, I), zeros at first.
     """
     photo, camera, point, by_view, by_point = observed
     change = np.empty((len(photo), 2))
-    for column in range(len(give)):
+    for column in range(len(response)):
         own, place = column // CAMERA, POSE + column % CAMERA
         along = np.zeros((points, 3))
         for k in range(len(photo)):
             for row in range(2):
                 total = by_view[k, row, place] if camera[k] == own else 0.0
                 for v in range(POSE):
-                    total -= by_view[k, row, v] * give[column, POSE * photo[k] + v]
+                    total -= by_view[k, row, v] * response[column, POSE * photo[k] + v]
                 change[k, row] = total
                 for axis in range(3):
                     along[point[k], axis] += by_point[k, row, axis] * total
         for k in range(len(photo)):
             for row in range(2):
-                left = change[k, row]
+                rest = change[k, row]
                 for axis in range(3):
-                    left -= by_point[k, row, axis] * along[point[k], axis]
-                scores[column, photo[k]] += left * left_over[k, row]
+                    rest -= by_point[k, row, axis] * along[point[k], axis]
+                scores[column, photo[k]] += rest * residue[k, row]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -106,7 +106,7 @@ class PathVelocities:
     """Velocities at the moments of some photos, per unit of time, from each of FITS."""
 
     values: FloatArray
-    """(F, I, 6) rotation vector of the camera's turn in its own axes, applied to R from the left; then the velocity of
+    """(F, I, 6) rotation vector of the camera in its own axes, applied to R from the left; then the velocity of
     a point at rest in these axes, due to the motion of the camera's center."""
     errors: FloatArray
     """(F, I, 6) errors of left-out poses, in radians and units of length."""
@@ -326,7 +326,7 @@ def add_points(
     order, starts = rows
     width, n = columns.shape[1], len(g)
     A, b = np.zeros((3, n)), np.zeros(3)
-    touched, seen = np.zeros(n, np.int64), np.zeros(n, np.bool_)
+    touched, marked = np.zeros(n, np.int64), np.zeros(n, np.bool_)
     for point in range(len(starts) - 1):
         count = 0
         b[:] = 0.0
@@ -337,8 +337,8 @@ def add_points(
                 b[j] += u[j] * r[k, 0] + v[j] * r[k, 1]
             for one in range(width):
                 column, x, y = columns[k, one], by_view[k, 0, one], by_view[k, 1, one]
-                if not seen[column]:
-                    seen[column], touched[count] = True, column
+                if not marked[column]:
+                    marked[column], touched[count] = True, column
                     count += 1
                 g[column] += x * r[k, 0] + y * r[k, 1]
                 for j in range(3):
@@ -353,7 +353,7 @@ def add_points(
                 other = touched[two]
                 half[column, other] -= x * A[0, other] + y * A[1, other] + z * A[2, other]
         for one in range(count):
-            seen[touched[one]] = False
+            marked[touched[one]] = False
             A[:, touched[one]] = 0.0
 
 
@@ -366,13 +366,13 @@ def solve_step(system: ShutterSystem) -> ShutterStep:
     variances[free] = np.diag(inverse)
     if free[-1] == n - 1:
         influence[free] = inverse[:, -1]
-    points, left = _back_substitute(system, views, system.r)
+    points, residue = _back_substitute(system, views, system.r)
     _, influences = _back_substitute(system, -influence, np.zeros_like(system.r))
     noise2 = float(
-        (np.sum(left**2) + REDUCTION.usual_count * REDUCTION.usual_noise_px**2)
+        (np.sum(residue**2) + REDUCTION.usual_count * REDUCTION.usual_noise_px**2)
         / (max(system.redundancy, 0) + REDUCTION.usual_count)
     )
-    by_photo = np.bincount(system.photo, np.sum(influences * left, axis=1))
+    by_photo = np.bincount(system.photo, np.sum(influences * residue, axis=1))
     deviation = MISFIT * np.sqrt(max(noise2 * variances[-1], float(np.sum(by_photo**2))))
     offsets = noise2 * variances[system.offsets].reshape(-1, VELOCITY)
     moved = np.einsum("pji,pj->pi", system.whiten, points)
@@ -381,11 +381,11 @@ def solve_step(system: ShutterSystem) -> ShutterStep:
 
 def _back_substitute(system: ShutterSystem, views: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the best step of the whitened points (P, 3) after one of the views, and the remaining r (N, 2)."""
-    left = r - np.einsum("nij,nj->ni", system.by_view, views[system.columns])
-    along = np.einsum("nij,ni->nj", system.by_point, left)
+    residue = r - np.einsum("nij,nj->ni", system.by_view, views[system.columns])
+    along = np.einsum("nij,ni->nj", system.by_point, residue)
     sums = [np.bincount(system.point, along[:, j], len(system.whiten)) for j in range(3)]
     points = np.array(sums, np.float64).T
-    return points, left - np.einsum("nij,nj->ni", system.by_point, points[system.point])
+    return points, residue - np.einsum("nij,nj->ni", system.by_point, points[system.point])
 
 
 def apply_shutter_step(model: ShutterBundle, step: ShutterStep, share: float) -> ShutterBundle:
@@ -411,24 +411,24 @@ def shutter_cost(model: ShutterBundle, scale_px: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class ReadoutOptions:
-    """Limits of the adjustment of the readout. Chosen by hand, except where stated."""
+    """Limits of the adjustment of the readout."""
 
     steps: int = 12
     """Most Gauss-Newton steps; three to six are usual (`python -m benchmarks.videos.shutter`)."""
     converged: float = 1e-4
     """Relative decrease of the cost below which the steps end (`python -m benchmarks.videos.shutter`)."""
     halvings: int = 3
-    """Most halvings of a step that raises the cost."""
+    """Most halvings of a step that raises the cost. Chosen by hand."""
     least_readout: float = 1e-5
     """Least readout for the expected size of offsets, as a share of the time between two photos: a precision of offsets
-    must be finite."""
+    must be finite. Chosen by hand."""
     shake: tuple[float, float] = (0.2, 5.0)
     """Range of the size of offsets, in deviations of the path's velocities times readout. Above it, offsets of all
     photos together bend the scene, and no readout is found (`python -m benchmarks.videos.shutter`)."""
     least_measured: float = 3.0
-    """Number of offsets that the photos must determine before their size changes."""
+    """Number of offsets that the photos must determine before their size changes. Chosen by hand."""
     shake_converged: float = 1.1
-    """Factor by which the size of offsets may still change when the steps end."""
+    """Factor by which the size of offsets may still change when the steps end. Chosen by hand."""
 
 
 OPTIONS = ReadoutOptions()

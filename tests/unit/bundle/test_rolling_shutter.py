@@ -333,15 +333,6 @@ def test_an_earlier_estimate_shortens_the_way(film):
 
 
 @pytest.mark.slow
-def test_the_same_bundle_gives_the_same_numbers(film):
-    walk = film(0.02, frames=12, swing_deg_s=60.0)
-
-    first, second = measure(walk), measure(walk)
-
-    assert first.readout == second.readout and np.array_equal(first.bundle.R, second.bundle.R)
-
-
-@pytest.mark.slow
 def test_points_far_off_do_not_stop_it(film):
     walk = film(0.02, frames=12, swing_deg_s=60.0)
     away = np.zeros_like(walk.bundle.X)
