@@ -20,7 +20,7 @@ from sfm_app.types.camera import GIVEN, PROJECTIONS
 
 # Cameras of COLMAP's models on disk: cameras.txt and cameras.bin, and which photo has which camera.
 #
-# Read here and not by COLMAP, which ends the process on some damaged models.
+# COLMAP itself ends the process on some damaged models.
 
 CAMERA_FILES = ("cameras.bin", "cameras.txt")
 """Names of COLMAP's files of cameras; COLMAP, too, prefers the first."""
@@ -29,8 +29,7 @@ MODEL_IDS = {
     6: "FULL_OPENCV", 8: "SIMPLE_RADIAL_FISHEYE", 9: "RADIAL_FISHEYE", 10: "THIN_PRISM_FISHEYE", 14: "SIMPLE_FISHEYE",
     15: "FISHEYE", 17: "EQUIRECTANGULAR",
 }  # fmt: skip
-"""COLMAP's numbers of the models that a run can use. By definition."""
-MOST_CAMERAS, LONGEST_NAME = 1_000_000, 4096
+"""COLMAP's numbers of the supported models. By definition."""
 DAMAGED = "its bytes are not those of a COLMAP model"
 
 
@@ -40,8 +39,10 @@ def read_colmap_text(text: str) -> dict[str, Calibration]:
     Raises:
         ValueError: a line is no camera.
     """
-    found = {}
-    for line in _lines(text):
+    cameras = {}
+    for line in (line.strip() for line in text.splitlines()):
+        if not line or line.startswith("#"):
+            continue
         words = line.split()
         if len(words) < 5 or not words[1].isupper():
             raise ValueError(f"'{line[:60]}' is not a line of COLMAP's cameras.txt")
@@ -49,36 +50,36 @@ def read_colmap_text(text: str) -> dict[str, Calibration]:
             size, params = (int(words[2]), int(words[3])), [float(word) for word in words[4:]]
         except ValueError:
             raise ValueError(f"'{line[:60]}' has something else than numbers after the model") from None
-        found[words[0]] = calibration_from_model(words[1], params, size)
-    return found
+        cameras[words[0]] = calibration_from_model(words[1], params, size)
+    return cameras
 
 
 def read_colmap_binary(data: bytes) -> dict[str, Calibration]:
     """Return the cameras of a cameras.bin by their ids.
 
     Raises:
-        ValueError: the bytes are not those of one, or no run can use a camera.
+        ValueError: the bytes are damaged, or a camera is not supported.
     """
-    found, reader = {}, _Reader(data)
+    cameras, reader = {}, _Reader(data)
     (count,) = reader.take("<Q")
-    if count > MOST_CAMERAS:
+    if count > 1_000_000:
         raise ValueError(DAMAGED)
     for _ in range(int(count)):
         camera_id, model_id, width, height = reader.take("<IiQQ")
         if model_id not in MODEL_IDS:
-            raise ValueError(f"camera {camera_id} has a model that cannot be used: only {', '.join(PARAMETERS)}")
+            raise ValueError(f"camera {camera_id} has a model that is not supported: only {', '.join(PARAMETERS)}")
         model = MODEL_IDS[int(model_id)]
         params = reader.take(f"<{len(PARAMETERS[model])}d")
-        found[str(camera_id)] = calibration_from_model(model, params, (int(width), int(height)))
-    return found
+        cameras[str(camera_id)] = calibration_from_model(model, params, (int(width), int(height)))
+    return cameras
 
 
 def read_colmap_folder(folder: Path) -> tuple[dict[str, Calibration], dict[str, str]]:
-    """Return the cameras of a model by their ids, and the id by photo where there is a file of its images.
+    """Return the cameras of a folder with one of `CAMERA_FILES`, by their ids, and the id by photo if there are images.
 
     Raises:
         OSError: a file cannot be read.
-        ValueError: a file is damaged, or no run can use a camera.
+        ValueError: a file is damaged, or a camera is not supported.
     """
     if (folder / "cameras.bin").is_file():
         images = folder / "images.bin"
@@ -87,11 +88,6 @@ def read_colmap_folder(folder: Path) -> tuple[dict[str, Calibration], dict[str, 
     images = folder / "images.txt"
     known = dict(_text_images(images.read_text(encoding="utf-8"))) if images.is_file() else {}
     return read_colmap_text((folder / "cameras.txt").read_text(encoding="utf-8")), known
-
-
-def _lines(text: str) -> list[str]:
-    """Return the lines that are no comments; an image without points leaves an empty one, which counts."""
-    return [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
 
 
 def _text_images(text: str) -> Iterator[tuple[str, str]]:
@@ -118,7 +114,7 @@ def _binary_images(data: bytes) -> Iterator[tuple[str, str]]:
 
 
 class _Reader:
-    """Bytes that are taken one value after the other; ValueError at their end."""
+    """Reads bytes one value after the other; ValueError at their end."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.place = data, 0
@@ -129,7 +125,7 @@ class _Reader:
         return struct.unpack_from(form, self.data, start)
 
     def take_text(self) -> str:
-        end = self.data.find(b"\0", self.place, self.place + LONGEST_NAME)
+        end = self.data.find(b"\0", self.place, self.place + 4096)
         if end < 0:
             raise ValueError(DAMAGED)
         text = self.data[self.place : end].decode("utf-8", "replace")
@@ -146,16 +142,12 @@ class _Reader:
 #
 # OpenCV counts pixels from the center of the first one, which is (0.5, 0.5) here.
 
-FIRST_PIXEL = 0.5
-"""Our coordinates of the pixel that OpenCV calls (0, 0)."""
 MATRIX = ("cameramatrix", "k", "mtx", "intrinsicmatrix")
 DISTORTION = ("distcoeffs", "distortioncoefficients", "distortioncoeffs", "distortion", "dist", "d")
 WIDTH, HEIGHT, SIZE = ("imagewidth", "width"), ("imageheight", "height"), ("imagesize", "resolution")
 MODEL = ("fisheyemodel", "distortionmodel", "cameramodel", "model", "projection", "lens", "fisheye")
-"""Keys by which programs around OpenCV call each value, in small letters without underscores."""
+"""Keys of programs around OpenCV for each value, in small letters without underscores."""
 FISHEYE_WORDS = ("fisheye", "equidistant", "kannala")
-COUNTS = (0, 4, 5, 8, 12, 14)
-"""Numbers of coefficients that OpenCV knows: k1 k2 p1 p2, k3, k4 k5 k6, s1 s2 s3 s4, and two of a tilted sensor."""
 
 
 def is_opencv_camera(values: Mapping[str, Any]) -> bool:
@@ -170,7 +162,7 @@ def opencv_camera(values: Mapping[str, Any]) -> Calibration:
         values: camera matrix, and optionally distortion coefficients, size, and whether the lens is a fisheye.
 
     Raises:
-        ValueError: they are no camera, or one with coefficients that no run can use.
+        ValueError: they are no camera, or a coefficient is not supported.
     """
     K = _numbers(_value(values, MATRIX), "the camera matrix")
     if K.size != 9:
@@ -178,10 +170,12 @@ def opencv_camera(values: Mapping[str, Any]) -> Calibration:
     (fx, skew, cx), (below, fy, cy), last = K.reshape(3, 3)
     if skew != 0.0 or below != 0.0 or last.tolist() != [0.0, 0.0, 1.0]:
         raise ValueError("the camera matrix is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-    said = _value(values, DISTORTION)
-    coefficients = [] if said is None else _numbers(said, "the distortion").ravel().tolist()
-    model, terms = _model_and_terms(coefficients, fisheye=_is_fisheye(_value(values, MODEL)))
-    params = [fx, fy, cx + FIRST_PIXEL, cy + FIRST_PIXEL, *terms]
+    distortion = _value(values, DISTORTION)
+    coefficients = [] if distortion is None else _numbers(distortion, "the distortion").ravel().tolist()
+    stated = _value(values, MODEL)
+    fisheye = any(word in stated.lower() for word in FISHEYE_WORDS) if isinstance(stated, str) else bool(stated)
+    model, terms = _model_and_terms(coefficients, fisheye=fisheye)
+    params = [fx, fy, cx + 0.5, cy + 0.5, *terms]
     return calibration_from_model(model, params, _size(values))
 
 
@@ -217,33 +211,27 @@ def _model_and_terms(terms: list[float], *, fisheye: bool) -> tuple[str, list[fl
         if len(terms) not in (0, 4):
             raise ValueError(f"a fisheye of OpenCV has 4 distortion coefficients, not {len(terms)}")
         return "OPENCV_FISHEYE", terms or [0.0] * 4
-    if len(terms) not in COUNTS:
-        raise ValueError(f"{len(terms)} distortion coefficients; OpenCV has {', '.join(map(str, COUNTS[1:]))}")
+    if len(terms) not in (0, 4, 5, 8, 12, 14):  # k1 k2 p1 p2, k3, k4 k5 k6, s1 s2 s3 s4, two of a tilted sensor
+        raise ValueError(f"{len(terms)} distortion coefficients; OpenCV has 4, 5, 8, 12, 14")
     if any(terms[8:]):
-        raise ValueError("coefficients of a thin prism or of a tilted sensor cannot be used")
+        raise ValueError("coefficients of a thin prism or of a tilted sensor are not supported")
     return "FULL_OPENCV", [*terms, *[0.0] * 8][:8]
 
 
-def _is_fisheye(said: Any) -> bool:
-    if isinstance(said, str):
-        return any(word in said.lower() for word in FISHEYE_WORDS)
-    return bool(said)
-
-
 def _size(values: Mapping[str, Any]) -> tuple[int, int]:
-    """Return width and height in pixels; 0 where they are not said."""
+    """Return width and height in pixels; 0 where unknown."""
     both = _value(values, SIZE)
     if isinstance(both, Sequence) and not isinstance(both, str) and len(both) == 2:
         width, height = both
     else:
         width, height = _value(values, WIDTH) or 0, _value(values, HEIGHT) or 0
     if bool(width) != bool(height) or width < 0 or height < 0:
-        raise ValueError(f"a size of {width} x {height} pixels")
+        raise ValueError(f"the size cannot be {width} x {height} pixels")
     return int(width), int(height)
 
 
 def _value(values: Mapping[str, Any], names: Sequence[str]) -> Any:
-    """Return the value that goes by one of these names; None where there is none."""
+    """Return the value of the first of these names; None without any."""
     plain = {str(key).lower().replace("_", "").replace(" ", ""): value for key, value in values.items()}
     return next((plain[name] for name in names if plain.get(name) is not None), None)
 
@@ -253,12 +241,12 @@ def _numbers(value: Any, what: str) -> NDArray[np.float64]:
     if isinstance(value, Mapping):
         value = value.get("data")
     try:
-        found = np.asarray(value, np.float64)
+        numbers = np.asarray(value, np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{what} is not made of numbers") from None
-    if not np.isfinite(found).all():
+        raise ValueError(f"{what} does not consist of numbers") from None
+    if not np.isfinite(numbers).all():
         raise ValueError(f"{what} is not finite")
-    return found
+    return numbers
 
 
 # Cameras as OpenSfM writes them into camera_models.json, and OpenDroneMap into cameras.json.
@@ -283,10 +271,10 @@ def is_opensfm_camera(values: Mapping[str, Any]) -> bool:
 
 
 def opensfm_camera(values: Mapping[str, Any]) -> Calibration:
-    """Return the camera of OpenSfM's values.
+    """Return the camera of OpenSfM's values, one entry of its file.
 
     Raises:
-        ValueError: no run can use its projection type, or they are no camera.
+        ValueError: its projection type is not supported, or they are no camera.
     """
     kind = str(values["projection_type"]).lower()
     width, height = (int(values.get(name, 0)) for name in ("width", "height"))
@@ -295,7 +283,7 @@ def opensfm_camera(values: Mapping[str, Any]) -> Calibration:
     if kind in PANORAMAS:
         return calibration_from_model("EQUIRECTANGULAR", (width, height), (width, height))
     if kind not in MODELS:
-        raise ValueError(f"the projection type {kind[:40]} cannot be used: only {', '.join((*MODELS, *PANORAMAS))}")
+        raise ValueError(f"the projection type {kind[:40]} is not supported: only {', '.join((*MODELS, *PANORAMAS))}")
     if not values.get("focal_x", values.get("focal", 0.0)):
         raise ValueError("it has no focal length")
     side = float(max(width, height))
@@ -309,7 +297,7 @@ def opensfm_camera(values: Mapping[str, Any]) -> Calibration:
 
 # Cameras of earlier runs: calibration.json, scene.json, and what `sfm-app calibrate --json` prints.
 #
-# Only cameras that the photos of that run determined are used; the others were guesses.
+# Only cameras that the photos of that run determined are used; the others are guesses.
 
 FIELDS = {field.name for field in fields(Calibration)}
 
@@ -320,13 +308,13 @@ def is_run_file(values: Mapping[str, Any]) -> bool:
 
 
 def run_file_cameras(values: Mapping[str, Any]) -> tuple[dict[str, Calibration], dict[str, str]]:
-    """Return the cameras of calibration.json or scene.json that are known, and the camera of each photo.
+    """Return the known cameras of calibration.json or scene.json, and the camera of each photo.
 
     Raises:
         ValueError: the values are no cameras.
     """
-    found = {str(name): run_camera(entry) for name, entry in values["cameras"].items()}
-    cameras = {name: camera for name, camera in found.items() if camera is not None}
+    entries = {str(name): run_camera(entry) for name, entry in values["cameras"].items()}
+    cameras = {name: camera for name, camera in entries.items() if camera is not None}
     return cameras, {str(photo): str(name) for photo, name in values["camera_of"].items()}
 
 
@@ -336,7 +324,7 @@ def is_run_camera(values: Mapping[str, Any]) -> bool:
 
 
 def run_camera(values: Mapping[str, Any]) -> Calibration | None:
-    """Return a camera of a run, as one that the user gave; None where the photos did not determine it.
+    """Return a camera of a run, as given by the user; None if its photos did not determine it.
 
     Args:
         values: a `Calibration`, or a `CameraModel` after bundle adjustment, as plain values.
@@ -346,18 +334,18 @@ def run_camera(values: Mapping[str, Any]) -> Calibration | None:
     """
     if "params" in values:
         size = int(values["width"]), int(values["height"])
-        found = calibration_from_model(str(values["model"]), values["params"], size)
+        camera = calibration_from_model(str(values["model"]), values["params"], size)
         spread, correlations = (finite_entries(values.get(name, {})) for name in ("deviations", "correlations"))
-        return replace(found, spread=spread, correlations=correlations)
+        return replace(camera, spread=spread, correlations=correlations)
     if not values["identifiable"]:
         return None
     known = {name: value for name, value in values.items() if name in FIELDS}
-    found = Calibration.from_dict({"evidence": {}, **known, "held": (), "key_pairs": (), "method": GIVEN})
-    if found.projection not in PROJECTIONS or found.K.shape != (3, 3) or not min(np.diag(found.K)) > 0.0:
+    camera = Calibration.from_dict({"evidence": {}, **known, "held": (), "key_pairs": (), "method": GIVEN})
+    if camera.projection not in PROJECTIONS or camera.K.shape != (3, 3) or not min(np.diag(camera.K)) > 0.0:
         raise ValueError("its values are not those of a camera")
-    if not np.isfinite([*found.K.ravel(), found.radial, *found.fisheye, *found.distortion]).all():
+    if not np.isfinite([*camera.K.ravel(), camera.radial, *camera.fisheye, *camera.distortion]).all():
         raise ValueError("its values are not those of a camera")
-    return replace(found, evidence={})
+    return replace(camera, evidence={})
 
 
 # Recognize the form of a calibration file by its content, and read it.
@@ -368,7 +356,7 @@ FORMS = (
     "ODM's cameras.json"
 )
 MOST_BYTES = 10_000_000
-"""Most bytes of a calibration file. One with a camera for each of a thousand photos has a tenth."""
+"""Most bytes of a calibration file; a camera for each of a thousand photos takes a tenth. Chosen by hand."""
 RUN_FILES = ("scene.json", "calibration.json")
 """Files of an output folder, the better one first."""
 
@@ -385,7 +373,7 @@ def read_given_cameras(path: Path) -> GivenCameras:
     try:
         form, (cameras, camera_of) = _read_folder(path) if path.is_dir() else _read_file(path)
         if not cameras:
-            raise ValueError("it holds no camera that is known")
+            raise ValueError("it holds no known camera")
     except OSError as err:
         raise InputError(f"cannot read the calibration file {path}: {err.strerror}", hint=FORMS) from err
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError, RecursionError) as err:
@@ -449,7 +437,7 @@ _BY_NAME: tuple[tuple[str, Callable[..., bool], Callable[..., Calibration | None
     ("OpenSfM", is_opensfm_camera, opensfm_camera),
     ("OpenCV", is_opencv_camera, opencv_camera),
 )
-"""Forms of JSON with cameras by name: what tells that an entry is of it, and what reads the entry."""
+"""Forms of JSON with cameras by name: the test and the reader of an entry."""
 
 
 def _read_by_name(

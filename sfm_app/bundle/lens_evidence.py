@@ -53,32 +53,36 @@ adjustment)."""
 
 @dataclass(frozen=True, slots=True)
 class LensOptions:
-    """Limits of the estimate and of the choice of a family. Chosen by hand, except where stated."""
+    """Limits of the estimate and of the choice of a family."""
 
     undetermined_share: float = 0.5
     """A part keeps its value unless the photos shrink its prior deviation below this share (docs/algorithms.md, Bundle
     adjustment)."""
     few_photos: float = 2.0
-    """Factor on the deviations of cameras with few photos, whose misfit does not average out."""
+    """Factor on the deviations of cameras with few photos, whose misfit does not average out. Chosen by hand."""
     sweeps: int = 5
-    """Most sweeps over all cameras in the choice of free parts."""
+    """Most sweeps over all cameras in the choice of free parts. Chosen by hand."""
     longest_step: float = 1.0
-    """Longest step of log f: a camera that moves further after mapping is not determined by its photos."""
+    """Longest step of log f: a camera that moves further after mapping is not determined by its photos. Chosen by
+    hand."""
     focals: tuple[float, float] = (0.05, 100.0)
-    """Range of focals in longer sides, views of 169 to 0.5 degrees; outside it, an estimate has diverged."""
+    """Range of focals in longer sides, views of 169 to 0.5 degrees; outside it, an estimate has diverged. Chosen by
+    hand."""
     zero_precision: float = 1e6
-    """Factor on the precision of a part that is set to its usual value, so that the others adapt to it."""
+    """Factor on the precision of a part that is set to its usual value, so that the others adapt to it. Chosen by
+    hand."""
     clamps: int = 8
-    """Most halvings of a step that makes a lens fold inside the photo."""
+    """Most halvings of a step that makes a lens fold inside the photo. Chosen by hand."""
     squeeze: float = 0.8
     """Share of the undistorted radius below which a perspective lens is tried as a fisheye, at the outermost
-    observations. An equidistant lens has 0.6 at 120 degrees and 0.76 at 95 degrees."""
+    observations. An equidistant lens has 0.6 at 120 degrees and 0.76 at 95 degrees. Chosen by hand."""
     narrow_angle: float = float(np.radians(65.0))
-    """Largest angle to the optical axis, in radians, up to which a fisheye is tried as a perspective lens."""
+    """Largest angle to the optical axis, in radians, up to which a fisheye is tried as a perspective lens. Chosen by
+    hand."""
     samples: int = 200
-    """Radii at which a lens is fitted to another."""
+    """Radii at which a lens is fitted to another. Chosen by hand."""
     least_reach: float = 0.2
-    """Smallest share of the observed radius up to which a lens must not fold to be tried as another."""
+    """Smallest share of the observed radius up to which a lens must not fold to be tried as another. Chosen by hand."""
 
 
 OPTIONS = LensOptions()

@@ -284,14 +284,14 @@ class CameraRule:
     """COLMAP's name of the camera model to fit; empty for the model that the photos support best."""
 
     @property
-    def kept(self) -> bool:
+    def is_kept(self) -> bool:
         """Whether no parameter may change."""
         return self.given is not None and self.given.is_kept
 
     @property
     def family(self) -> int | None:
         """Required family; None where the photos choose."""
-        if self.given is not None and self.kept:
+        if self.given is not None and self.is_kept:
             return FAMILIES[self.given.projection]
         return FAMILIES[projection_of_model(self.model)] if self.model else None
 

@@ -1,8 +1,8 @@
 """The readout of a rolling shutter, by bundle adjustment of poses, points, cameras and one number for all photos.
 
-Ours. Bundle adjustment without it has hidden part of the shutter in poses, points and lens, so that residuals alone do
-not tell it. Here every photo moves while it is read: along the path through its neighbors, and by an offset of its own,
-because a hand shakes between two photos. How large offsets usually are, the photos say (MacKay 1992).
+Ours. Bundle adjustment without a shutter hides part of it in poses, points and lens, so that residuals alone do not
+determine it. Here every photo moves while it is read: along the path through its neighbors, and by an offset of its
+own, because a hand shakes between two photos. The usual size of offsets is estimated from the photos (MacKay 1992).
 """
 
 from dataclasses import dataclass, replace
@@ -15,10 +15,8 @@ from scipy.spatial.transform import Rotation
 from sfm_app.bundle.lens_evidence import MISFIT
 from sfm_app.bundle.lens_parts import LOG_ASPECT, LOG_FOCAL, LensPriors, step_cameras
 from sfm_app.bundle.normal_equations import (
-    DAMPING,
     POSE,
-    USUAL_COUNT,
-    USUAL_NOISE_PX,
+    REDUCTION,
     Bundle,
     apply_step,
     free_pose_columns,
@@ -36,12 +34,12 @@ from sfm_app.types.arrays import FloatArray, IndexArray
 # Projection of points into photos whose rows are read one after the other. Ours; to first order in the motion of
 # the camera, the model is that of Hedborg et al. 2012.
 #
-# While a photo is read, its camera keeps its velocity. A row is given by its share: from -1/2, the first row that
-# is read, to 1/2, the last one. The pose of a photo is that of its middle row.
+# While a photo is read, its camera keeps its velocity. A row is given by its share: from -1/2, the first row, to 1/2,
+# the last row. The pose of a photo is that of its middle row.
 
 
 class RowProjection(NamedTuple):
-    """Observations as a rolling shutter sees them, and their derivatives."""
+    """Projections through a rolling shutter, and their derivatives."""
 
     x: FloatArray
     """(N, 2) pixels."""
@@ -61,20 +59,21 @@ def project_rows(bundle: Bundle, share: FloatArray, motion: FloatArray) -> RowPr
     """Project the points of all observations, each from the pose at the time of its row.
 
     Args:
-        bundle: the model, its poses those of the middle rows.
-        motion: (I, 6) velocity of each photo as in `PathVelocity`, times the readout.
+        bundle: with the poses of the middle rows.
+        share: (N,) row of each observation.
+        motion: (I, 6) velocity of each photo as in `PathVelocities`, times the readout.
     """
     rows, R = bundle.camera[bundle.photo], bundle.R[bundle.photo]
     points = np.einsum("nij,nj->ni", R, bundle.X[bundle.point])
-    middle, moved = points + bundle.t[bundle.photo], share[:, None] * motion[bundle.photo]
-    turn = Rotation.from_rotvec(moved[:, :3]).as_matrix()
-    seen = np.einsum("nij,nj->ni", turn, middle + moved[:, 3:])
-    found = project_points(seen, bundle.params[rows], bundle.family[rows])
-    by_middle = np.einsum("nij,njk->nik", found.by_point, turn)
-    by_motion = np.concatenate([np.cross(seen[:, None], found.by_point), by_middle], 2) * share[:, None, None]
+    middle, moves = points + bundle.t[bundle.photo], share[:, None] * motion[bundle.photo]
+    rotation = Rotation.from_rotvec(moves[:, :3]).as_matrix()
+    local = np.einsum("nij,nj->ni", rotation, middle + moves[:, 3:])
+    projected = project_points(local, bundle.params[rows], bundle.family[rows])
+    by_middle = np.einsum("nij,njk->nik", projected.by_point, rotation)
+    by_motion = np.concatenate([np.cross(local[:, None], projected.by_point), by_middle], 2) * share[:, None, None]
     by_pose = np.concatenate([np.cross(points[:, None], by_middle), by_middle], 2)
     by_point = np.einsum("nij,njk->nik", by_middle, R)
-    return RowProjection(found.x, seen[:, 2], found.by_camera, by_pose, by_motion, by_point)
+    return RowProjection(projected.x, local[:, 2], projected.by_camera, by_pose, by_motion, by_point)
 
 
 def move_to_middle_row(points: FloatArray, share: FloatArray, motion: FloatArray) -> FloatArray:
@@ -92,14 +91,12 @@ def move_to_middle_row(points: FloatArray, share: FloatArray, motion: FloatArray
 # How a camera moves at the moment of each photo, from the poses of the photos before and after it. Ours.
 #
 # Polynomials are fitted to the poses of some consecutive photos, and differentiated (Savitzky and Golay 1964, with
-# uneven steps). Which degree over how many photos, cross-validation decides: where photos follow each other faster
-# than a hand shakes, the path goes through all poses; where they do not, through their middle.
+# uneven steps). Cross-validation chooses the degree and the number of photos: where photos follow each other faster
+# than a hand shakes, the path goes through all poses, else through their middle.
 
 FITS = ((5, 3), (3, 1), (7, 3), (9, 3), (5, 1), (7, 1), (9, 1))
 """Photos in a window and degree of the polynomial. Even degrees give the slopes of the odd ones below them. Chosen by
 hand."""
-MIN_PHOTOS = 9
-"""Photos below which a path has no velocities: the longest window."""
 VELOCITY = 6
 """Numbers of a velocity: a rotation vector, and the motion of a point at rest. By definition."""
 
@@ -109,18 +106,18 @@ class PathVelocities:
     """Velocities at the moments of some photos, per unit of time, from each of FITS."""
 
     values: FloatArray
-    """(F, I, 6) rotation vector of the camera's turn in its own axes, applied to R from the left; then the velocity of
+    """(F, I, 6) rotation vector of the camera in its own axes, applied to R from the left; then the velocity of
     a point at rest in these axes, due to the motion of the camera's center."""
     errors: FloatArray
-    """(F, I, 6) of the poses if they are left out, in radians and units of length."""
+    """(F, I, 6) errors of left-out poses, in radians and units of length."""
 
     def select_most_predictive(self) -> NDArray[np.int64]:
-        """Return the fits (2,) of turns and of moves that predict left-out poses best."""
+        """Return the fits (2,) of rotations and of translations that predict left-out poses best."""
         length = np.linalg.norm(self.errors.reshape(*self.errors.shape[:2], 2, 3), axis=3)
         return np.asarray(np.argmin(np.median(length, axis=1), axis=0), np.int64)
 
     def select(self, fits: NDArray[np.int64]) -> FloatArray:
-        """Return velocities (I, 6), turns and moves each from their fit (2,)."""
+        """Return velocities (I, 6), rotations and translations each from their fit (2,)."""
         return np.concatenate([self.values[fits[0], :, :3], self.values[fits[1], :, 3:]], axis=1)
 
     def deviations(self) -> FloatArray:
@@ -147,27 +144,27 @@ def path_velocities(R: FloatArray, t: FloatArray, times: FloatArray) -> PathVelo
 def _fit_windows(
     R: FloatArray, t: FloatArray, times: FloatArray, count: int, degree: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return velocities (I, 6) of photos sorted by time, and the errors (I, 6) of their poses if they are left out."""
+    """Return velocities (I, 6) of photos sorted by time, and the errors (I, 6) of left-out poses."""
     places = np.arange(len(times))
     first = np.clip(places - count // 2, 0, len(times) - count)
     window = first[:, None] + np.arange(count)
-    turned = np.einsum("iwjk,ilk->iwjl", R[window], R)
-    turns = Rotation.from_matrix(turned.reshape(-1, 3, 3)).as_rotvec().reshape(-1, count, 3)
+    relative = np.einsum("iwjk,ilk->iwjl", R[window], R)
+    rotations = Rotation.from_matrix(relative.reshape(-1, 3, 3)).as_rotvec().reshape(-1, count, 3)
     centers = -np.einsum("nji,nj->ni", R, t)
-    moves = -np.einsum("ijk,iwk->iwj", R, centers[window] - centers[:, None])
+    translations = -np.einsum("ijk,iwk->iwj", R, centers[window] - centers[:, None])
     value, slope = local_fit_weights(times[window] - times[:, None], degree)
-    poses = np.concatenate([turns, moves], axis=2)  # 0 at the photo itself
+    poses = np.concatenate([rotations, translations], axis=2)  # 0 at the photo itself
     own = value[places, places - first]
     error = np.einsum("iw,iwj->ij", value, poses) / np.maximum(1.0 - own, np.finfo(float).eps)[:, None]
     return np.einsum("iw,iwj->ij", slope, poses), error
 
 
 def local_fit_weights(offsets: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
-    """Return weights (I, k) that give the value at 0 and the derivative there of a polynomial fit.
+    """Return weights (I, k) that give the value and the derivative at 0 of a polynomial fit.
 
     Args:
-        offsets: (I, k) distinct times of the values that are fitted.
-        degree: of the polynomial, below k.
+        offsets: (I, k) distinct times of the fitted values.
+        degree: below k.
     """
     unit = np.abs(offsets).max(axis=1)
     powers = (offsets / unit[:, None])[:, :, None] ** np.arange(degree + 1)
@@ -199,8 +196,8 @@ class ShutterBundle:
     @classmethod
     def motionless(cls, bundle: Bundle, share: FloatArray, readout: float) -> "ShutterBundle":
         """Return a bundle whose photos do not move."""
-        nothing = np.zeros((len(bundle.R), VELOCITY))
-        return cls(bundle, share, readout, nothing, nothing)
+        still = np.zeros((len(bundle.R), VELOCITY))
+        return cls(bundle, share, readout, still, still)
 
     @property
     def motion(self) -> FloatArray:
@@ -235,8 +232,8 @@ class ShutterSystem:
     """Unknowns that change."""
     offsets: slice
     """Which unknowns are offsets."""
-    spare: int
-    """How many more measurements than poses and points there are."""
+    redundancy: int
+    """Number of measurements less that of poses and points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,7 +259,8 @@ def linearize(
 
     Args:
         precision: (n,) of the priors on the unknowns, in 1 / px^2 like the squared derivatives.
-        pull: (n,) precisions times distances to the values that the priors expect.
+        pull: (n,) precisions times distances to the prior means.
+        held: whether the readout is known.
     """
     bundle, n = model.bundle, model.unknowns
     r, by_view, by_point = _weighted_derivatives(model, scale_px)
@@ -273,18 +271,18 @@ def linearize(
     order = np.argsort(bundle.point, kind="stable")
     starts = np.searchsorted(bundle.point[order], np.arange(len(bundle.X) + 1))
     add_points((order, starts), columns, r, by_view, by_point, half, g)
-    S = half + half.T - np.diag(np.diag(half)) + np.diag(precision + DAMPING)
+    S = half + half.T - np.diag(np.diag(half)) + np.diag(precision + REDUCTION.damping)
     poses = free_pose_columns(bundle.R, bundle.t)
     free = np.concatenate([poses, np.arange(POSE * len(bundle.R), n - held)])
-    spare = 2 * int(np.count_nonzero(r.any(axis=1))) - int(np.sum(rank)) - len(poses)
+    redundancy = 2 * int(np.count_nonzero(r.any(axis=1))) - int(np.sum(rank)) - len(poses)
     offsets = slice(POSE * len(bundle.R), (POSE + VELOCITY) * len(bundle.R))
     return ShutterSystem(
-        S, g + pull, r, by_view, columns, by_point, whiten, bundle.photo, bundle.point, free, offsets, spare
+        S, g + pull, r, by_view, columns, by_point, whiten, bundle.photo, bundle.point, free, offsets, redundancy
     )  # fmt: skip
 
 
 def _unknown_columns(model: ShutterBundle) -> IndexArray:
-    """Return (N, 25) the unknowns that each observation depends on."""
+    """Return the unknowns (N, 25) of each observation."""
     bundle, photos = model.bundle, len(model.bundle.R)
     camera = (POSE + VELOCITY) * photos + CAMERA * bundle.camera[bundle.photo]
     blocks = [
@@ -299,18 +297,18 @@ def _unknown_columns(model: ShutterBundle) -> IndexArray:
 def _weighted_derivatives(model: ShutterBundle, scale_px: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return weighted residuals (N, 2), and derivatives by views (N, 2, 25) and points (N, 2, 3).
 
-    Observations that are lost count nothing.
+    Lost observations are 0.
     """
     bundle = model.bundle
     with np.errstate(all="ignore"):
-        seen = project_rows(bundle, model.share, model.motion)
-        r = bundle.x - seen.x
-        by_camera, params = seen.by_camera.copy(), bundle.params[bundle.camera[bundle.photo]]
+        projected = project_rows(bundle, model.share, model.motion)
+        r = bundle.x - projected.x
+        by_camera, params = projected.by_camera.copy(), bundle.params[bundle.camera[bundle.photo]]
         by_fx, by_fy = by_camera[:, :, FX] * params[:, FX, None], by_camera[:, :, FY] * params[:, FY, None]
         by_camera[:, :, LOG_FOCAL], by_camera[:, :, LOG_ASPECT] = by_fx + by_fy, 0.5 * (by_fy - by_fx)
-        by_readout = np.einsum("nij,nj->ni", seen.by_motion, model.velocity[bundle.photo])[:, :, None]
-        by_view = np.concatenate([seen.by_pose, seen.by_motion, by_camera, by_readout], 2)
-    return weigh(r, by_view, seen.by_point, usable_mask(bundle, r, seen.depth), scale_px)[:3]
+        by_readout = np.einsum("nij,nj->ni", projected.by_motion, model.velocity[bundle.photo])[:, :, None]
+        by_view = np.concatenate([projected.by_pose, projected.by_motion, by_camera, by_readout], 2)
+    return weigh(r, by_view, projected.by_point, usable_mask(bundle, r, projected.depth), scale_px)[:3]
 
 
 @kernel
@@ -321,14 +319,14 @@ def add_points(
     """Add J'J - A'A and J'r - A'b of all points, A and b being J and r projected onto the point.
 
     Args:
-        rows: (N,) observations sorted by point, and (P + 1,) where those of each point begin.
+        rows: (N,) observations sorted by point, and (P + 1,) start of each point.
         half: (n, n) changed in place: each pair of unknowns in one of its two places.
         g: (n,) changed in place.
     """
     order, starts = rows
     width, n = columns.shape[1], len(g)
     A, b = np.zeros((3, n)), np.zeros(3)
-    touched, seen = np.zeros(n, np.int64), np.zeros(n, np.bool_)
+    touched, marked = np.zeros(n, np.int64), np.zeros(n, np.bool_)
     for point in range(len(starts) - 1):
         count = 0
         b[:] = 0.0
@@ -339,8 +337,8 @@ def add_points(
                 b[j] += u[j] * r[k, 0] + v[j] * r[k, 1]
             for one in range(width):
                 column, x, y = columns[k, one], by_view[k, 0, one], by_view[k, 1, one]
-                if not seen[column]:
-                    seen[column], touched[count] = True, column
+                if not marked[column]:
+                    marked[column], touched[count] = True, column
                     count += 1
                 g[column] += x * r[k, 0] + y * r[k, 1]
                 for j in range(3):
@@ -355,7 +353,7 @@ def add_points(
                 other = touched[two]
                 half[column, other] -= x * A[0, other] + y * A[1, other] + z * A[2, other]
         for one in range(count):
-            seen[touched[one]] = False
+            marked[touched[one]] = False
             A[:, touched[one]] = 0.0
 
 
@@ -368,10 +366,13 @@ def solve_step(system: ShutterSystem) -> ShutterStep:
     variances[free] = np.diag(inverse)
     if free[-1] == n - 1:
         influence[free] = inverse[:, -1]
-    points, left = _back_substitute(system, views, system.r)
+    points, residue = _back_substitute(system, views, system.r)
     _, influences = _back_substitute(system, -influence, np.zeros_like(system.r))
-    noise2 = float((np.sum(left**2) + USUAL_COUNT * USUAL_NOISE_PX**2) / (max(system.spare, 0) + USUAL_COUNT))
-    by_photo = np.bincount(system.photo, np.sum(influences * left, axis=1))
+    noise2 = float(
+        (np.sum(residue**2) + REDUCTION.usual_count * REDUCTION.usual_noise_px**2)
+        / (max(system.redundancy, 0) + REDUCTION.usual_count)
+    )
+    by_photo = np.bincount(system.photo, np.sum(influences * residue, axis=1))
     deviation = MISFIT * np.sqrt(max(noise2 * variances[-1], float(np.sum(by_photo**2))))
     offsets = noise2 * variances[system.offsets].reshape(-1, VELOCITY)
     moved = np.einsum("pji,pj->pi", system.whiten, points)
@@ -379,20 +380,16 @@ def solve_step(system: ShutterSystem) -> ShutterStep:
 
 
 def _back_substitute(system: ShutterSystem, views: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the best step of the whitened points (P, 3) after one of the views, and what it leaves of r (N, 2)."""
-    left = r - np.einsum("nij,nj->ni", system.by_view, views[system.columns])
-    along = np.einsum("nij,ni->nj", system.by_point, left)
+    """Return the best step of the whitened points (P, 3) after one of the views, and the remaining r (N, 2)."""
+    residue = r - np.einsum("nij,nj->ni", system.by_view, views[system.columns])
+    along = np.einsum("nij,ni->nj", system.by_point, residue)
     sums = [np.bincount(system.point, along[:, j], len(system.whiten)) for j in range(3)]
     points = np.array(sums, np.float64).T
-    return points, left - np.einsum("nij,nj->ni", system.by_point, points[system.point])
+    return points, residue - np.einsum("nij,nj->ni", system.by_point, points[system.point])
 
 
 def apply_shutter_step(model: ShutterBundle, step: ShutterStep, share: float) -> ShutterBundle:
-    """Return the model after a share of a step.
-
-    Args:
-        share: in (0, 1].
-    """
+    """Return the model after a share, in (0, 1], of a step."""
     bundle = model.bundle
     poses, offsets, cameras = np.split(share * step.views[:-1], np.cumsum([POSE, VELOCITY]) * len(bundle.R))
     params = step_cameras(bundle.params, cameras.reshape(-1, CAMERA))
@@ -407,35 +404,42 @@ def apply_shutter_step(model: ShutterBundle, step: ShutterStep, share: float) ->
 def shutter_cost(model: ShutterBundle, scale_px: float) -> float:
     """Return half the sum of the loss of `normal_equations.reduce`, in squared pixels."""
     with np.errstate(all="ignore"):
-        seen = project_rows(model.bundle, model.share, model.motion)
-        r = model.bundle.x - seen.x
-    return loss(r, usable_mask(model.bundle, r, seen.depth), scale_px)
+        projected = project_rows(model.bundle, model.share, model.motion)
+        r = model.bundle.x - projected.x
+    return loss(r, usable_mask(model.bundle, r, projected.depth), scale_px)
 
 
-STEPS, CONVERGED = 12, 1e-4
-"""Most Gauss-Newton steps, and the relative decrease of the cost below which they end: after three to six. Chosen on
-`python -m benchmarks.videos.shutter`."""
-HALVINGS = 3
-"""How often a step is halved that raises the cost. Chosen by hand; not measured on its own."""
-LEAST_READOUT = 1e-5
-"""Readout that offsets are expected for where it is smaller, as a share of the time between two photos: a precision of
-offsets must be finite. Chosen by hand; not measured on its own."""
-SHAKE = (0.2, 5.0)
-"""Range of the size of offsets, in deviations of the path's velocities times readout. Above it, offsets of all photos
-together bend the scene, and no readout is found. Chosen on `python -m benchmarks.videos.shutter`."""
-LEAST_MEASURED = 3.0
-"""Number of offsets that the photos must determine before their size is changed. Chosen by hand; not measured on its
-own."""
-SHAKE_CONVERGED = 1.1
-"""Factor by which the size of offsets may still change when the steps end. Chosen by hand; not measured on its own."""
+@dataclass(frozen=True, slots=True)
+class ReadoutOptions:
+    """Limits of the adjustment of the readout."""
+
+    steps: int = 12
+    """Most Gauss-Newton steps; three to six are usual (`python -m benchmarks.videos.shutter`)."""
+    converged: float = 1e-4
+    """Relative decrease of the cost below which the steps end (`python -m benchmarks.videos.shutter`)."""
+    halvings: int = 3
+    """Most halvings of a step that raises the cost. Chosen by hand."""
+    least_readout: float = 1e-5
+    """Least readout for the expected size of offsets, as a share of the time between two photos: a precision of offsets
+    must be finite. Chosen by hand."""
+    shake: tuple[float, float] = (0.2, 5.0)
+    """Range of the size of offsets, in deviations of the path's velocities times readout. Above it, offsets of all
+    photos together bend the scene, and no readout is found (`python -m benchmarks.videos.shutter`)."""
+    least_measured: float = 3.0
+    """Number of offsets that the photos must determine before their size changes. Chosen by hand."""
+    shake_converged: float = 1.1
+    """Factor by which the size of offsets may still change when the steps end. Chosen by hand."""
+
+
+OPTIONS = ReadoutOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """When the observations of a bundle were seen."""
+    """Times of the observations of a bundle."""
 
     times: FloatArray
-    """(I,) of the photos, distinct: when the middle row was read."""
+    """(I,) distinct times of the middle rows of photos."""
     share: FloatArray
     """(N,) row of each observation, from -1/2 to 1/2 in the order of reading."""
 
@@ -445,8 +449,7 @@ class ReadoutEstimate:
     """The readout, and the model that goes with it."""
 
     readout: float
-    """Time from the first row to the last, in the unit of the photos' times; negative where the last row is read
-    first."""
+    """Time from the first row to the last, in the unit of the photos' times; negative if the last row is read first."""
     deviation: float
     """Its standard deviation; 0 where it was known."""
     bundle: Bundle
@@ -461,7 +464,7 @@ class ReadoutEstimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    """What does not change during the adjustment."""
+    """Constants of the adjustment."""
 
     rows: Rows
     fits: NDArray[np.int64]
@@ -481,17 +484,18 @@ def estimate_readout(
     """Adjust poses, points, cameras and the readout together.
 
     Args:
-        bundle: the model, adjusted as if a global shutter had taken its photos; nine or more.
-        freed: (C, 7) parts of the cameras that have the wide prior.
-        start: an earlier estimate for the same photos, of which readout and shake are taken.
-        known: the readout, if only poses and points are asked for.
+        bundle: adjusted as if a global shutter had taken its photos; nine or more.
+        freed: (C, 7) parts of the cameras with the wide prior.
+        scale_px: as of `normal_equations.reduce`.
+        start: an earlier estimate for the same photos, whose readout and shake are the start.
+        known: the readout, if only poses and points are to be adjusted.
     """
     fits = path_velocities(bundle.R, bundle.t, rows.times).select_most_predictive()
     problem = _Problem(rows, fits, priors, priors.precision(freed), scale_px, known is not None)
     readout, shake = (start.readout, start.shake) if start else (0.0, np.ones(2))
     model = _follow_path(ShutterBundle.motionless(bundle, rows.share, readout if known is None else known), problem)
-    noise_px = USUAL_NOISE_PX
-    for _ in range(STEPS):
+    noise_px = REDUCTION.usual_noise_px
+    for _ in range(OPTIONS.steps):
         expected = _expected_offsets(model, problem, shake)
         terms = _prior_terms(model, expected, problem, noise_px)
         step = solve_step(linearize(model, *terms, scale_px, held=problem.held))
@@ -499,7 +503,9 @@ def estimate_readout(
         before = _cost(model, expected, problem, noise_px)
         model, after = _take_step(model, step, expected, problem, before)
         last, shake = shake, _update_shake(model.offsets / expected, step.offset_variances / expected**2, shake)
-        if after >= (1.0 - CONVERGED) * before and np.abs(np.log(shake / last)).max() < np.log(SHAKE_CONVERGED):
+        if after >= (1.0 - OPTIONS.converged) * before and np.abs(np.log(shake / last)).max() < np.log(
+            OPTIONS.shake_converged
+        ):
             break
     return ReadoutEstimate(model.readout, step.deviation, model.bundle, model.motion, shake, noise_px)
 
@@ -511,36 +517,34 @@ def _follow_path(model: ShutterBundle, problem: _Problem) -> ShutterBundle:
 
 
 def _expected_offsets(model: ShutterBundle, problem: _Problem, shake: FloatArray) -> FloatArray:
-    """Return standard deviations (I, 6) of the offsets.
-
-    They are held during a step: if they grew with the readout, offsets would ask for a longer one.
-    """
+    """Return standard deviations (I, 6) of the offsets; constant during a step, else offsets would enlarge the
+    readout."""
     times = problem.rows.times
     path = path_velocities(model.bundle.R, model.bundle.t, times)
-    readout = max(abs(model.readout), LEAST_READOUT * float(np.median(np.diff(np.sort(times)))))
+    readout = max(abs(model.readout), OPTIONS.least_readout * float(np.median(np.diff(np.sort(times)))))
     return np.asarray(readout * path.deviations() * np.repeat(shake, 3), np.float64)
 
 
 def _update_shake(offsets: FloatArray, variances: FloatArray, shake: FloatArray) -> FloatArray:
-    """Return the size of offsets (2,) from what the photos determine of them.
+    """Return the size of offsets (2,) from the offsets that the photos determine.
 
     Args:
         offsets, variances: (I, 6) in expected deviations, and their squares.
-        shake: (2,) that the expected deviations are based on.
+        shake: (2,) present size.
     """
     measured = np.sum(1.0 - np.minimum(variances, 1.0).reshape(-1, 2, 3), axis=(0, 2))
     squares = np.sum(offsets.reshape(-1, 2, 3) ** 2, axis=(0, 2))
-    factor = np.sqrt(squares / np.maximum(measured, LEAST_MEASURED))
-    return np.clip(np.where(measured < LEAST_MEASURED, 1.0, factor) * shake, *SHAKE)
+    factor = np.sqrt(squares / np.maximum(measured, OPTIONS.least_measured))
+    return np.clip(np.where(measured < OPTIONS.least_measured, 1.0, factor) * shake, *OPTIONS.shake)
 
 
 def _prior_terms(
     model: ShutterBundle, expected: FloatArray, problem: _Problem, noise_px: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return precisions (n,) of the priors, in 1 / px^2, and precisions times distances to what they expect."""
-    poses, away = np.zeros(POSE * len(model.bundle.R)), problem.priors.prior_offsets(model.bundle.params)
+    """Return precisions (n,) of the priors, in 1 / px^2, and precisions times distances to the prior means."""
+    poses, offsets = np.zeros(POSE * len(model.bundle.R)), problem.priors.prior_offsets(model.bundle.params)
     precision = np.concatenate([poses, expected.ravel() ** -2.0, problem.precision.ravel(), [0.0]])
-    distance = np.concatenate([poses, -model.offsets.ravel(), away.ravel(), [0.0]])
+    distance = np.concatenate([poses, -model.offsets.ravel(), offsets.ravel(), [0.0]])
     return noise_px**2 * precision, noise_px**2 * precision * distance
 
 
@@ -548,16 +552,16 @@ def _take_step(
     model: ShutterBundle, step: ShutterStep, expected: FloatArray, problem: _Problem, before: float
 ) -> tuple[ShutterBundle, float]:
     """Return the model after the step, or after the part of it that lowers the cost, and its cost."""
-    for k in range(HALVINGS + 1):
-        tried = _follow_path(apply_shutter_step(model, step, 0.5**k), problem)
-        after = _cost(tried, expected, problem, step.noise_px)
+    for k in range(OPTIONS.halvings + 1):
+        candidate = _follow_path(apply_shutter_step(model, step, 0.5**k), problem)
+        after = _cost(candidate, expected, problem, step.noise_px)
         if after < before:
-            return tried, after
+            return candidate, after
     return model, before
 
 
 def _cost(model: ShutterBundle, expected: FloatArray, problem: _Problem, noise_px: float) -> float:
     """Return half the sum of the loss and of the squares of the priors, in squared pixels."""
-    away = problem.priors.prior_offsets(model.bundle.params)
-    squares = np.sum((model.offsets / expected) ** 2) + np.sum(problem.precision * away**2)
+    offsets = problem.priors.prior_offsets(model.bundle.params)
+    squares = np.sum((model.offsets / expected) ** 2) + np.sum(problem.precision * offsets**2)
     return shutter_cost(model, problem.scale_px) + 0.5 * noise_px**2 * float(squares)

@@ -21,25 +21,26 @@ from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, Calibrat
 
 @dataclass(frozen=True, slots=True)
 class UndistortionOptions:
-    """Limits of undistortion. Chosen by hand, except where stated."""
+    """Limits of undistortion."""
 
     radius_steps: int = 30
-    """Most steps of Newton's method for the radius."""
+    """Most steps of Newton's method for the radius. Chosen by hand."""
     shift_steps: int = 50
     """Most steps by which the terms that are not radial are taken out. Counted: each step multiplies the error by about
     twice the radius times p1, 0.01 at most."""
     precision: float = 1e-13
-    """Change in focal lengths below which steps end."""
+    """Change in focal lengths below which steps end. Chosen by hand."""
     least_slope: float = 0.05
-    """Least slope of the distorted radius: below it, the lens is near its fold."""
+    """Least slope of the distorted radius: below it, the lens is near its fold. Chosen by hand."""
     largest_radius: float = 12.0
-    """Radius in focal lengths up to which a fold is sought: 85 degrees of a perspective lens, more than any fisheye."""
+    """Radius in focal lengths up to which a fold is sought: 85 degrees of a perspective lens, more than any fisheye.
+    Chosen by hand."""
     radii: int = 2048
-    """Number of radii at which a fold is sought."""
+    """Number of radii at which a fold is sought. Chosen by hand."""
     angle_steps: int = 20
-    """Steps of Newton's method for the angle of a fisheye."""
+    """Steps of Newton's method for the angle of a fisheye. Chosen by hand."""
     angles: int = 512
-    """Number of angles at which the fold of a fisheye is sought."""
+    """Number of angles at which the fold of a fisheye is sought. Chosen by hand."""
 
 
 OPTIONS = UndistortionOptions()

@@ -123,8 +123,7 @@ def calibration_from_model(model: str, params: Sequence[float], size: tuple[int,
 
 
 def with_terms(camera: Calibration, terms: Sequence[float]) -> Calibration:
-    """Return a perspective camera or fisheye with other distortion terms (eight, in the order of `TERMS`), in the
-    smallest form."""
+    """Return a perspective camera or fisheye with the eight distortion `terms` of `TERMS`, in the smallest form."""
     k1, k2, p1, p2, k3, k4, *last = (float(term) for term in terms)
     if camera.projection == FISHEYE:
         more = any((p1, p2, *last))

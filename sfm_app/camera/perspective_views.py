@@ -16,17 +16,17 @@ from sfm_app.types.arrays import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class ViewOptions:
-    """Sizes of perspective views. Chosen by hand."""
+    """Sizes of perspective views."""
 
     most_field_deg: float = 95.0
     """Largest angle along one side of a view, without its overlap. At its border, such a view shows things 2.2 times as
-    large as at its center."""
+    large as at its center. Chosen by hand."""
     overlap_deg: float = 4.0
     """Angle by which a view reaches beyond its own part of the photo, so that windows and triangles at the border are
-    whole in one of the views."""
+    whole in one of the views. Chosen by hand."""
     cube_field_deg: float = 300.0
     """Horizontal field above which a photo is a panorama, with views through the faces of a cube. No lens lies between
-    a fisheye and a panorama."""
+    a fisheye and a panorama. Chosen by hand."""
 
 
 OPTIONS = ViewOptions()

@@ -34,6 +34,7 @@ from sfm_app.bundle.lens_parts import (
     part_names,
 )
 from sfm_app.bundle.normal_equations import Bundle, best_step, cost, elimination_width, reduce
+from sfm_app.camera.models import PARAMETERS, TERMS, TWO_FOCALS
 from sfm_app.camera.projection import (
     CAMERA,
     CX,
@@ -42,17 +43,8 @@ from sfm_app.camera.projection import (
     FX,
     FY,
     K1,
-    K2,
-    K3,
-    K4,
-    K5,
-    K6,
-    P1,
-    P2,
     PANORAMA,
     PERSPECTIVE,
-    SX,
-    SY,
 )
 from sfm_app.colmap.backend import all_cameras, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
@@ -65,18 +57,12 @@ from sfm_app.types.camera import named_correlations
 
 # COLMAP's models as the arrays of our bundle adjustment, and back.
 
-PLACES = {
-    "f": (FX, FY), "fx": (FX,), "fy": (FY,), "cx": (CX,), "cy": (CY,), "k": (K1,), "k1": (K1,), "k2": (K2,),
-    "p1": (P1,), "p2": (P2,), "k3": (K3,), "k4": (K4,), "k5": (K5,), "k6": (K6,), "sx1": (SX,), "sy1": (SY,),
-}  # fmt: skip
+PLACES = {name: (k,) for k, name in enumerate((*TWO_FOCALS, *TERMS["perspective"]))}
+PLACES |= {name: (k,) for k, name in enumerate((*TWO_FOCALS, *TERMS["fisheye"]))} | {"f": (FX, FY), "k": (K1,)}
 """Indices in `Bundle.params` by COLMAP's names of parameters."""
-OPENCV = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 FILE_MODELS = {
-    PERSPECTIVE: {"OPENCV": OPENCV, "FULL_OPENCV": (*OPENCV, "k3", "k4", "k5", "k6")},
-    FISHEYE: {
-        "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
-        "THIN_PRISM_FISHEYE": (*OPENCV, "k3", "k4", "sx1", "sy1"),
-    },
+    PERSPECTIVE: {name: PARAMETERS[name] for name in ("OPENCV", "FULL_OPENCV")},
+    FISHEYE: {name: PARAMETERS[name] for name in ("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE")},
 }
 """COLMAP's models of refined cameras, with their parameters; the smaller one first."""
 EQUIRECTANGULAR = "EQUIRECTANGULAR"
@@ -133,7 +119,7 @@ def read_bundle(model: pycolmap.Reconstruction, rules: Rules = NO_RULES) -> tupl
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
     ids, points = sorted(photos_per_camera(model)), sorted(model.points3D)
     cameras = [model.cameras[camera_id] for camera_id in ids]
-    fixed = np.array([camera_id in rules and rules[camera_id].kept for camera_id in ids], np.bool_)
+    fixed = np.array([camera_id in rules and rules[camera_id].is_kept for camera_id in ids], np.bool_)
     poses = np.array([image.cam_from_world().matrix() for image in images])
     photo, point, x = _read_observations(images, points)
     return ids, Bundle(
@@ -190,35 +176,38 @@ LOSS_SCALE_PX = 0.5
 
 @dataclass(frozen=True, slots=True)
 class AdjustmentOptions:
-    """Limits of the last adjustment. Chosen by hand, except where stated."""
+    """Limits of the last adjustment."""
 
     min_photos: int = 5
     """Photos of a camera below which only its focal and k1 are refined. With fewer, effects that the camera model
-    leaves out change its parameters more than the noise does."""
+    leaves out change its parameters more than the noise does. Chosen by hand."""
     max_error_px: float = 4.0
     """Largest reprojection error of a point (COLMAP's)."""
     min_angle_deg: float = 1.5
     """Least angle between the rays of a point (COLMAP's)."""
     rounds: int = 6
-    """Most rounds."""
+    """Most rounds. Chosen by hand."""
     changed_share: float = 0.0005
-    """Share of the observations below which a change of their number lets the rounds end."""
+    """Share of the observations below which a change of their number lets the rounds end. Chosen by hand."""
     settled_step: float = 0.2
-    """Step of the cameras, in standard deviations, below which the rounds end."""
+    """Step of the cameras, in standard deviations, below which the rounds end. Chosen by hand."""
     min_point_share: float = 0.1
-    """Smallest share of the points after an adjustment; one that drops more has diverged and is rejected."""
+    """Smallest share of the points after an adjustment; one that drops more has diverged and is rejected. Chosen by
+    hand."""
     long_step: float = 1.0
     """Step of the cameras, in standard deviations, above which COLMAP's solver refines poses and points: the linear
-    step is then too inaccurate."""
+    step is then too inaccurate. Chosen by hand."""
     most_tied: int = 250
     """Photos that a photo is tied to (`elimination_width`) above which COLMAP's solver takes conjugate gradients. Where
-    all see the same, a factorization grows with the cube of the photos; along streets it is five times as fast."""
+    all see the same, a factorization grows with the cube of the photos; along streets it is five times as fast.
+    Measured on photos of a room and of a town."""
     outermost: float = 0.999
-    """Share of the observations within the radius up to which a lens is converted: the rest may be wrong."""
+    """Share of the observations within the radius up to which a lens is converted: the rest may be wrong. Chosen by
+    hand."""
     most_compared: int = 250
-    """Photos of a camera on which its families are compared, at even steps among all."""
+    """Photos of a camera on which its families are compared, at even steps among all. Chosen by hand."""
     runners_up: int = 3
-    """Rivals of the same family in the manifest."""
+    """Rivals of the same family in the manifest. Chosen by hand."""
 
 
 OPTIONS = AdjustmentOptions()
@@ -342,13 +331,13 @@ def _apply_rules(priors: LensPriors, rules: Sequence[CameraRule]) -> LensPriors:
         given, parts = rule.usual(family), rule.parts(family)
         if given is not None:
             usual[row] = given
-        if rule.kept:
+        if rule.is_kept:
             estimated[row] = False
             choices[row] = priors.choices[row][:1]
         elif parts is not None:
             choices[row] = choices_of_model(parts, consistent_choices(family))
             estimated[row] = choices[row].any(axis=0)
-    fixed = np.array([rule.kept for rule in rules], np.bool_)
+    fixed = np.array([rule.is_kept for rule in rules], np.bool_)
     return replace(priors, estimated=estimated, usual=usual, choices=tuple(choices), fixed=fixed)
 
 
@@ -540,9 +529,8 @@ def adjust(
     lenses = record_lenses(model, rounds, families.rivals)
     estimates = given_estimates(model, rounds, rules)
     return Adjustment(
-        model, *_summary(rounds), _correlations(rounds), held=held, open_points=open_points, lenses=lenses,
-        estimates=estimates,
-    )  # fmt: skip
+        model, *_uncertainty(rounds), held=held, open_points=open_points, lenses=lenses, estimates=estimates
+    )
 
 
 def adjust_or_keep(
@@ -577,26 +565,22 @@ def find_correspondences(model: pycolmap.Reconstruction, database: Path) -> pyco
         return pycolmap.DatabaseCache.create(db, options).correspondence_graph
 
 
-def _summary(rounds: Rounds) -> tuple[dict[int, dict[str, float]], dict[int, tuple[str, ...]]]:
-    """Return deviations and determined parameters, by camera id."""
+def _uncertainty(
+    rounds: Rounds,
+) -> tuple[dict[int, dict[str, float]], dict[int, tuple[str, ...]], dict[int, dict[str, float]]]:
+    """Return deviations, determined parts and correlations, by camera id."""
+    lenses = rounds.lenses
     deviations: dict[int, dict[str, float]] = {}
     determined: dict[int, tuple[str, ...]] = {}
-    for row, camera_id in enumerate(rounds.ids):
-        determined[camera_id] = part_names(int(rounds.bundle.family[row]), rounds.lenses.determined[row])
-        values = rounds.lenses.deviations[row]
-        entries = {key: float(values[PLACES[key][0]]) for key in _adjusted_names(rounds, row)}
-        deviations[camera_id] = finite_entries(entries)
-    return deviations, determined
-
-
-def _correlations(rounds: Rounds) -> dict[int, dict[str, float]]:
-    """Return the correlations of parameters, by camera id."""
-    correlations = {}
+    correlations: dict[int, dict[str, float]] = {}
     for row, camera_id in enumerate(rounds.ids):
         names = _adjusted_names(rounds, row)
         places = [PLACES[name][0] for name in names]
-        correlations[camera_id] = named_correlations(names, rounds.lenses.mean_squares[row][np.ix_(places, places)])
-    return correlations
+        entries = {name: float(lenses.deviations[row][place]) for name, place in zip(names, places, strict=True)}
+        deviations[camera_id] = finite_entries(entries)
+        determined[camera_id] = part_names(int(rounds.bundle.family[row]), lenses.determined[row])
+        correlations[camera_id] = named_correlations(names, lenses.mean_squares[row][np.ix_(places, places)])
+    return deviations, determined, correlations
 
 
 def _adjusted_names(rounds: Rounds, row: int) -> tuple[str, ...]:
@@ -623,13 +607,13 @@ def apply_rules(model: pycolmap.Reconstruction, rules: Rules) -> None:
         params, new_family = before, family if rule.family is None else rule.family
         if PANORAMA in (family, new_family):
             continue
-        if rule.given is not None and rule.kept:
+        if rule.given is not None and rule.is_kept:
             params = params_of_calibration(rule.given)
         elif new_family != family:
             reach = np.hypot(camera.width, camera.height) / (2.0 * np.sqrt(before[FX] * before[FY]))
             other = convert_lens(before, family, float(reach))
             params, new_family = (before, family) if other is None else (other, new_family)
-        parts = None if rule.kept else rule.parts(new_family)
+        parts = None if rule.is_kept else rule.parts(new_family)
         if parts is not None:
             params = fit_to_model(params, parts, new_family)
         changed = changed or new_family != family or not np.array_equal(params, before)
@@ -645,7 +629,7 @@ def given_estimates(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules
     """
     if all(rule.given is None for rule in rules.values()):
         return {}
-    if any(rule.kept for rule in rules.values()):
+    if any(rule.is_kept for rule in rules.values()):
         try:
             rounds = adjust_in_rounds(pycolmap.Reconstruction(model), None)
         except FAILURES as err:

@@ -1,6 +1,6 @@
 """COLMAP's SIFT features and raw matches, on the CPU and without its geometric verification.
 
-The features of a whole run are found and matched by one worker process. Workers on other machines take a few photos or
+One worker process finds and matches the features of a whole run. Workers on other machines take a few photos or
 pairs each: SQLite does not work over a network, so only one process opens the run's database. Workers copy a snapshot
 without features into a folder of their own, let COLMAP fill it, and leave the new rows as a file in the output folder.
 """
@@ -220,7 +220,7 @@ def _enter_rich(
     return rich
 
 
-# Features of panoramas, found in perspective views and entered as keypoints of the panorama.
+# Features of perspective views of panoramas, entered as keypoints of the panorama.
 
 
 def extract_panoramas(

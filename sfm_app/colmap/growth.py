@@ -72,8 +72,8 @@ def _copy_rows(path: Path, earlier: Path, photos: Collection[int]) -> None:
     """Copy the rows of these photos, and of pairs of them."""
     known = frozenset(photos)
     with _connection(earlier) as source, _connection(path) as target:
-        for read, write, about in COPIES:
-            rows = (row for row in source.execute(read) if known.issuperset(about(row[0])))
+        for read, write, photos_of in COPIES:
+            rows = (row for row in source.execute(read) if known.issuperset(photos_of(row[0])))
             target.executemany(write, rows)
 
 

@@ -49,11 +49,12 @@ def read_placed(model_dir: Path) -> PlacedPhotos:
         tracks = [[(one.image_id, one.point2D_idx) for one in point.track.elements] for _, point in points]
         cameras = {image.image_id: pycolmap.Camera(model.cameras[image.camera_id].todict()) for image in images}
         X = np.array([point.xyz for _, point in points], np.float64).reshape(-1, 3)
-    seen = np.array([element for track in tracks for element in track], np.int64).reshape(-1, 2)
+    elements = np.array([element for track in tracks for element in track], np.int64).reshape(-1, 2)
     R = poses[:, :, :3]
     centers = -np.einsum("nji,nj->ni", R, poses[:, :, 3])
     point = np.repeat(np.arange(len(tracks)), [len(track) for track in tracks])
-    return PlacedPhotos(np.array(sorted(cameras), np.int64), R, centers, X, point, seen[:, 0], seen[:, 1], cameras)
+    photo, keypoint = elements.T
+    return PlacedPhotos(np.array(sorted(cameras), np.int64), R, centers, X, point, photo, keypoint, cameras)
 
 
 def write_placed(database: Path, placed: PlacedPhotos) -> pycolmap.Reconstruction:

@@ -69,7 +69,7 @@ def map_globally(
         scratch: a folder from `copy_database`; removed afterwards.
 
     Returns:
-        The model; None where the mapper was stopped or found none.
+        The model; None if the mapper was stopped or gave none.
 
     Raises:
         BackendError: COLMAP failed.

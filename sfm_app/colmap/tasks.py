@@ -1,6 +1,6 @@
 """Tasks of COLMAP's worker processes, see `worker_process`; each task imports only what it needs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -184,7 +184,7 @@ def count_faces(mesh: Path) -> int:
         return next(int(line.split()[2]) for line in file if line.startswith(b"element face"))
 
 
-TASKS = {
+TASKS: dict[str, Callable[..., None]] = {
     "find_and_match": find_and_match,
     "match_chunk": match_chunk,
     "map_globally": map_globally,

@@ -199,7 +199,7 @@ def test_what_calibrate_prints_as_json_is_read(tmp_path):
 
 def test_a_single_camera_of_a_run_is_no_camera_of_opencv(tmp_path):
     assert only(tmp_path / "one.json", json.dumps(KNOWN.to_dict())).radial == KNOWN.radial
-    with pytest.raises(InputError, match="no camera that is known"):
+    with pytest.raises(InputError, match="holds no known camera"):
         given(tmp_path / "guess.json", json.dumps(GUESS.to_dict()))
     with pytest.raises(InputError, match="not those of a camera"):
         given(tmp_path / "nan.json", json.dumps(KNOWN.to_dict() | {"radial": float("nan")}))
@@ -235,11 +235,11 @@ def test_bytes_of_any_kind_end_in_cameras_or_in_one_error(tmp_path_factory, data
     ("data", "says"),
     [
         ("hello", "is not a line of COLMAP's cameras.txt"),
-        ("1 FOV 10 10 5 5 5 5 1", "the camera model FOV cannot be used"),
+        ("1 FOV 10 10 5 5 5 5 1", "the camera model FOV is not supported"),
         ("1 PINHOLE 10 10 5 5 5", "PINHOLE has 4 parameters"),
         ("1 PINHOLE 10 10 5 -5 5 5", "not those of a camera"),
         ("1 PINHOLE 10 10 5 5 five 5", "something else than numbers"),
-        ("", "holds no camera"),
+        ("", "holds no known camera"),
         ("{", "not valid JSON"),
         ("[1]", "not an object"),
         ('{"a": 3}', "of no known form"),
@@ -253,7 +253,7 @@ def test_bytes_of_any_kind_end_in_cameras_or_in_one_error(tmp_path_factory, data
         ('{"cameras": {"a": {"K": 3}}, "camera_of": {}}', "no known form"),
         ("%YAML:1.0\n---\n{[", "OpenCV cannot read it"),
         (b"\0\0\0\0", "not those of a COLMAP model"),
-        (struct.pack("<QIiQQ", 1, 1, 7, 9, 9), "model that cannot be used"),
+        (struct.pack("<QIiQQ", 1, 1, 7, 9, 9), "a model that is not supported"),
         (b"\xff\xfe\x31", "neither text nor"),
     ],
 )

@@ -1,9 +1,20 @@
-"""Bundles that do not determine what is asked of them: every answer is a number, and what is open stays."""
+"""Normal equations: of bundles that determine everything, and of others; elimination of points; widths."""
 
 import numpy as np
 import pytest
 
-from sfm_app.bundle.normal_equations import LOST_PX, Bundle, cost, lost_points, project, reduce, usable_mask
+from sfm_app.bundle.normal_equations import (
+    REDUCTION,
+    Bundle,
+    Linearized,
+    cost,
+    eliminate_points,
+    elimination_width,
+    lost_points,
+    project,
+    reduce,
+    usable_mask,
+)
 from sfm_app.camera.projection import PERSPECTIVE
 
 CAMERA = np.array([[900.0, 900.0, 500.0, 400.0, *[0.0] * 8]])
@@ -114,4 +125,110 @@ def test_what_cannot_be_seen_costs_more_than_what_is_off():
 
     assert lost_points(bundle).nonzero()[0].tolist() == [60] and not lost_points(off).any()
     assert np.count_nonzero(~usable_mask(bundle, np.zeros_like(bundle.x))) == 4
-    assert cost(bundle, SCALE_PX) > 3 * SCALE_PX * LOST_PX > 10 * cost(off, SCALE_PX)
+    assert cost(bundle, SCALE_PX) > 3 * SCALE_PX * REDUCTION.lost_px > 10 * cost(off, SCALE_PX)
+
+
+PHOTOS, CAMERAS, POINTS, SEEN, DAMPING = 5, 3, 20, 60, 1e-3
+
+
+@pytest.fixture
+def bundle():
+    """Observations in any order, some points twice in a photo or never, photos of several cameras, one of none."""
+    rng = np.random.default_rng(0)
+    photo = rng.integers(0, PHOTOS - 1, SEEN)
+    point = rng.integers(0, POINTS - 2, SEEN)
+    by_point = np.zeros((SEEN, 2, 3))
+    for p in np.unique(point):
+        rows = np.flatnonzero(point == p)
+        columns = min(3, 2 * len(rows))
+        by_point[rows, :, :columns] = np.linalg.qr(rng.normal(size=(2 * len(rows), columns)))[0].reshape(-1, 2, columns)
+    by_view = rng.normal(size=(SEEN, 2, 18))
+    return Linearized(photo, photo % CAMERAS, point, by_view, by_point, (PHOTOS, CAMERAS, POINTS))
+
+
+def dense(bundle):
+    """The derivatives by all poses and cameras, and by all points."""
+    J, Jp = np.zeros((SEEN, 2, 6 * PHOTOS + 12 * CAMERAS)), np.zeros((SEEN, 2, 3 * POINTS))
+    for k in range(SEEN):
+        first = 6 * bundle.photo[k], 6 * PHOTOS + 12 * bundle.camera[k]
+        J[k, :, first[0] : first[0] + 6] = bundle.by_view[k, :, :6]
+        J[k, :, first[1] : first[1] + 12] = bundle.by_view[k, :, 6:]
+        Jp[k, :, 3 * bundle.point[k] : 3 * bundle.point[k] + 3] = bundle.by_point[k]
+    return J.reshape(2 * SEEN, -1), Jp.reshape(2 * SEEN, -1)
+
+
+def test_the_matrix_is_that_of_all_derivatives_without_the_points(bundle):
+    J, Jp = dense(bundle)
+    expected = J.T @ J - J.T @ Jp @ Jp.T @ J + DAMPING * np.eye(J.shape[1])
+
+    S, rows = eliminate_points(bundle, DAMPING)
+
+    assert np.allclose(S.toarray(), expected[: 6 * PHOTOS, : 6 * PHOTOS], atol=1e-12)
+    assert np.allclose(rows, expected[6 * PHOTOS :], atol=1e-12)
+
+
+def test_products_are_those_of_all_derivatives(bundle):
+    J, Jp = dense(bundle)
+    rng = np.random.default_rng(1)
+    values, change = rng.normal(size=(SEEN, 2)), rng.normal(size=J.shape[1])
+
+    moved = bundle.move(change[: 6 * PHOTOS], change[6 * PHOTOS :])
+
+    assert np.allclose(bundle.sum_by_point(values).ravel(), Jp.T @ values.ravel(), atol=1e-12)
+    assert np.allclose(bundle.sum_by_view(values), J.T @ values.ravel(), atol=1e-12)
+    assert np.allclose(bundle.drop_points(values).ravel(), values.ravel() - Jp @ Jp.T @ values.ravel(), atol=1e-12)
+    assert np.allclose(moved.ravel(), J @ change, atol=1e-12)
+    assert np.allclose(bundle.camera_squares(), (J[:, 6 * PHOTOS :] ** 2).sum(axis=0), atol=1e-12)
+
+
+def test_scores_are_the_shares_of_the_photos_in_what_is_left(bundle):
+    J, Jp = dense(bundle)
+    rng = np.random.default_rng(2)
+    give, left_over = rng.normal(size=(6 * PHOTOS, 12 * CAMERAS)), rng.normal(size=(SEEN, 2))
+    follow = J @ np.vstack([-give, np.eye(12 * CAMERAS)])
+    products = (follow - Jp @ Jp.T @ follow) * left_over.ravel()[:, None]
+    expected = [products.reshape(SEEN, 2, -1)[bundle.photo == i].sum(axis=(0, 1)) for i in range(PHOTOS)]
+
+    assert np.allclose(bundle.score(give, left_over), expected, atol=1e-12)
+
+
+def test_a_bundle_of_nothing_leaves_the_damping():
+    none = np.empty(0, np.int64)
+    empty = Linearized(none, none, none, np.zeros((0, 2, 18)), np.zeros((0, 2, 3)), (2, 1, 0))
+
+    S, rows = eliminate_points(empty, DAMPING)
+
+    assert np.array_equal(S.toarray(), DAMPING * np.eye(12))
+    assert np.array_equal(rows, DAMPING * np.eye(24)[12:])
+
+
+def observations(tracks):
+    pairs = [(photo, point) for point, photos in enumerate(tracks) for photo in photos]
+    return np.array(pairs, np.int64).reshape(-1, 2).T
+
+
+@pytest.mark.parametrize("reach", [2, 5, 9])
+@pytest.mark.parametrize("seed", [None, 0, 1])
+def test_photos_along_a_street_are_tied_to_their_neighbors_whatever_their_numbers(reach, seed):
+    names = np.arange(200) if seed is None else np.random.default_rng(seed).permutation(200)
+
+    width = elimination_width(*observations([names[k : k + reach] for k in range(201 - reach)]))
+
+    assert 0.9 * reach <= width <= reach
+
+
+def test_photos_of_a_room_are_tied_to_all():
+    width = elimination_width(*observations([range(60)]))
+
+    assert width == pytest.approx(np.sqrt(np.mean(np.arange(1, 61) ** 2)))
+
+
+def test_a_street_that_ends_where_it_began_is_twice_as_wide():
+    ring = [[k % 200, (k + 1) % 200, (k + 2) % 200] for k in range(200)]
+
+    assert 4.0 <= elimination_width(*observations(ring)) <= 6.0
+
+
+def test_photos_that_share_no_point_are_alone():
+    assert elimination_width(*observations([[0], [1], [2]])) == 1.0
+    assert elimination_width(np.zeros(0, np.int64), np.zeros(0, np.int64)) == 0.0

@@ -1,0 +1,344 @@
+"""Projection through a rolling shutter, velocities of a path, and the readout of synthetic walks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.synthetic.walks import WalkOptions, project_through_shutter, walk
+from sfm_app.bundle.lens_parts import LensPriors
+from sfm_app.bundle.normal_equations import POSE, apply_step, best_step, project, reduce
+from sfm_app.bundle.rolling_shutter import (
+    FITS,
+    ShutterBundle,
+    add_points,
+    apply_shutter_step,
+    estimate_readout,
+    linearize,
+    local_fit_weights,
+    move_to_middle_row,
+    path_velocities,
+    project_rows,
+    shutter_cost,
+    solve_step,
+)
+
+STEP = 1e-6
+
+
+@pytest.fixture(scope="module")
+def seen(film):
+    found = film(0.02, frames=10, swing_deg_s=60.0)
+    motion = np.random.default_rng(1).normal(scale=0.003, size=(10, 6))
+    return found.bundle, found.rows.share, motion
+
+
+def test_without_motion_it_is_the_projection_of_a_global_shutter(seen):
+    bundle, share, motion = seen
+
+    found, plain = project_rows(bundle, share, 0.0 * motion), project(bundle)
+
+    assert found.x == pytest.approx(plain[0], abs=1e-9)
+    for ours, theirs in zip((found.by_camera, found.by_pose, found.by_point), plain[1:], strict=True):
+        assert ours == pytest.approx(theirs, abs=1e-9)
+
+
+@pytest.mark.parametrize("place", range(6))
+def test_derivatives_by_pose_and_motion_are_those_of_the_projection(seen, place):
+    bundle, share, motion = seen
+    change = np.zeros((10, 6))
+    change[:, place] = STEP
+    found = project_rows(bundle, share, motion)
+
+    posed = apply_step(bundle, bundle.params, change, np.zeros_like(bundle.X))
+    by_pose = (project_rows(posed, share, motion).x - found.x) / STEP
+    by_motion = (project_rows(bundle, share, motion + change).x - found.x) / STEP
+
+    scale = np.abs(found.by_motion[:, :, place]).max()
+    assert by_pose == pytest.approx(found.by_pose[:, :, place], abs=1e-3 * scale)
+    # a turn during the readout is differentiated at its end
+    assert by_motion == pytest.approx(found.by_motion[:, :, place], abs=0.02 * scale)
+
+
+@pytest.mark.parametrize("place", range(3))
+def test_derivatives_by_point_are_those_of_the_projection(seen, place):
+    bundle, share, motion = seen
+    found = project_rows(bundle, share, motion)
+
+    moved = project_rows(replace(bundle, X=bundle.X + STEP * np.eye(3)[place]), share, motion)
+
+    by_point = (moved.x - found.x) / STEP
+    assert by_point == pytest.approx(found.by_point[:, :, place], abs=1e-3 * np.abs(found.by_point).max())
+
+
+def test_points_return_to_the_time_of_the_middle_row():
+    rng = np.random.default_rng(2)
+    points, share, motion = rng.uniform([-2, -1, 3], [2, 1, 8], (20, 3)), rng.uniform(-0.5, 0.5, 20), rng.normal(size=6)
+    still = move_to_middle_row(points, np.zeros(20), 0.03 * motion)
+
+    assert still == pytest.approx(points)
+    assert np.abs(move_to_middle_row(points, share, 0.03 * motion) - points).max() > 0.01
+
+
+def test_keypoints_of_a_moving_camera_come_to_where_the_middle_pose_sees_them(film):
+    """At 60 degrees per second and 20 ms the rows are up to 10 pixels apart; a fiftieth of a pixel remains."""
+    found = film(0.02, frames=10, swing_deg_s=60.0, shake=0.0)
+    frame, path = 5, found.path
+    own = found.bundle.photo == frame
+    X, time = found.bundle.X[found.bundle.point[own]], found.rows.times[frame]
+    shuttered, still = (project_through_shutter(found.camera, path, time, readout, X) for readout in (0.02, 0.0))
+    before, now, after = path.poses(time + np.array([-1e-3, 0.0, 1e-3]))
+    turn = (after[:, :3] - before[:, :3]) @ now[:, :3].T / 2e-3
+    centers = [-pose[:, :3].T @ pose[:, 3] for pose in (before, after)]
+    move = -now[:, :3] @ (centers[1] - centers[0]) / 2e-3
+    motion = 0.02 * np.array([turn[2, 1], turn[0, 2], turn[1, 0], *move])
+    share = shuttered[:, 1] / 720 - 0.5
+    rays = np.column_stack([(shuttered - found.camera.K[:2, 2]) / found.camera.K[0, 0], np.ones(len(X))])
+    depth = (X @ now[:, :3].T + now[:, 3])[:, 2]
+
+    middle = move_to_middle_row(rays * depth[:, None], share, motion)
+
+    x = middle[:, :2] / middle[:, 2:] * found.camera.K[0, 0] + found.camera.K[:2, 2]
+    assert np.abs(shuttered - still).max() > 5.0
+    assert np.abs(x - still).max() < 0.3 and np.median(np.abs(x - still)) < 0.02
+
+
+STEP_S = 1e-3
+
+
+def velocities(poses, times):
+    return path_velocities(poses[:, :, :3], poses[:, :, 3], times)
+
+
+def true_velocities(path, times):
+    """From poses a millisecond apart."""
+    moments = [path.poses(times + k * STEP_S) for k in range(-4, 5)]
+    around = [np.array([poses[i] for poses in moments]) for i in range(len(times))]
+    return np.array([velocities(poses, STEP_S * np.arange(9.0)).values[0, 4] for poses in around])
+
+
+def test_a_turn_and_a_move_at_constant_speed_are_found_exactly():
+    times = np.sort(np.random.default_rng(0).uniform(0.0, 3.0, 12))
+    path = walk(WalkOptions(seconds=3.0, shake=0.0, heading_deg=90.0, look_deg=0.0))
+
+    found = velocities(path.poses(times), times)
+
+    for values in found.values:
+        assert values == pytest.approx(np.tile([0, 0, 0, -1.4, 0, 0], (12, 1)), abs=1e-6)
+
+
+def test_velocities_are_those_of_the_camera_as_accurately_as_said():
+    times = 0.1 * np.arange(30)
+    path = walk(WalkOptions(seconds=3.0, swing_deg_s=60.0))
+
+    found, true = velocities(path.poses(times), times), true_velocities(path, times)
+
+    best = found.select_most_predictive()
+    off = found.select(best) - true
+    assert [FITS[fit] for fit in best] == [(5, 3), (5, 3)]
+    for kind in (slice(0, 3), slice(3, 6)):
+        assert np.sqrt(np.mean(off[:, kind] ** 2)) < 0.1 * np.sqrt(np.mean(true[:, kind] ** 2))
+        ratio = np.sqrt(np.mean(off[:, kind] ** 2) / np.mean(found.deviations()[:, kind] ** 2))
+        assert 0.1 < ratio < 2.0
+
+
+def test_the_order_of_the_photos_does_not_matter():
+    times = 0.1 * np.arange(15)
+    poses = walk(WalkOptions()).poses(times)
+    mixed = np.random.default_rng(3).permutation(15)
+
+    there, here = velocities(poses[mixed], times[mixed]), velocities(poses, times)
+
+    assert there.values == pytest.approx(here.values[:, mixed], abs=1e-12)
+    assert there.deviations() == pytest.approx(here.deviations()[mixed], abs=1e-12)
+
+
+def test_where_poses_jump_about_the_path_goes_through_their_middle():
+    times = 0.1 * np.arange(40)
+    poses = walk(WalkOptions(seconds=4.0, shake=0.0)).poses(times)
+    jumping = poses.copy()
+    jumping[:, :, 3] += np.random.default_rng(0).normal(scale=0.05, size=(40, 3))
+    found, moves = velocities(jumping, times), slice(3, 6)
+
+    best = found.select_most_predictive()[1]
+
+    off = np.abs(found.values - velocities(poses, times).values)[:, :, moves].mean(axis=(1, 2))
+    assert FITS[best] in ((7, 1), (9, 1))
+    assert off[best] < 0.5 * off[0]
+
+
+def test_weights_differentiate_polynomials_up_to_their_degree():
+    offsets = np.array([[-0.3, -0.1, 0.0, 0.25, 0.4]])
+    value, slope = local_fit_weights(offsets, 3)
+
+    for power in range(4):
+        assert value[0] @ offsets[0] ** power == pytest.approx(float(power == 0), abs=1e-12)
+        assert slope[0] @ offsets[0] ** power == pytest.approx(float(power == 1), abs=1e-12)
+
+
+SCALE_PX = 0.5
+
+
+@pytest.fixture(scope="module")
+def model(film):
+    found = film(0.02, frames=9, swing_deg_s=60.0)
+    rng = np.random.default_rng(4)
+    velocity, offsets = rng.normal(scale=0.5, size=(9, 6)), rng.normal(scale=1e-3, size=(9, 6))
+    return ShutterBundle(found.bundle, found.rows.share, 0.02, velocity, offsets)
+
+
+def test_points_are_eliminated_as_by_dense_algebra():
+    rng = np.random.default_rng(0)
+    point, n = np.array([0, 0, 0, 1, 1, 1, 1]), 6
+    columns = np.array([[0, 1, 5], [2, 3, 5], [0, 1, 5], [0, 1, 5], [2, 3, 5], [2, 3, 5], [0, 1, 5]])
+    r, by_view, by_point = rng.normal(size=(7, 2)), rng.normal(size=(7, 2, 3)), rng.normal(size=(7, 2, 3))
+    for one in range(2):
+        Q = np.linalg.qr(by_point[point == one].reshape(-1, 3))[0]
+        by_point[point == one] = Q.reshape(-1, 2, 3)
+    J, Jp = np.zeros((14, n)), np.zeros((14, 6))
+    for k in range(7):
+        J[2 * k : 2 * k + 2, columns[k]] = by_view[k]
+        Jp[2 * k : 2 * k + 2, 3 * point[k] : 3 * point[k] + 3] = by_point[k]
+    half, g = np.zeros((n, n)), np.zeros(n)
+
+    add_points((np.arange(7), np.array([0, 3, 7])), columns, r, by_view, by_point, half, g)
+
+    left = np.eye(14) - Jp @ Jp.T
+    assert half + half.T - np.diag(np.diag(half)) == pytest.approx(J.T @ left @ J)
+    assert g == pytest.approx(J.T @ left @ r.ravel())
+
+
+def test_steps_lead_to_where_only_the_noise_is_left(model):
+    precision = np.zeros(model.unknowns)
+    offsets = slice(POSE * 9, 2 * POSE * 9)
+    precision[offsets], precision[offsets.stop :] = 1e3, 1e9
+    before = shutter_cost(model, SCALE_PX)
+
+    for _ in range(6):
+        pull = np.zeros_like(precision)
+        pull[offsets] = -precision[offsets] * model.offsets.ravel()
+        step = solve_step(linearize(model, precision, pull, SCALE_PX, held=True))
+        model = apply_shutter_step(model, step, 1.0)
+
+    assert shutter_cost(model, SCALE_PX) < 0.1 * before
+    assert 0.2 < step.noise_px < 0.35
+    assert np.abs(step.views).max() < 1e-3
+
+
+def test_a_known_readout_stays(model):
+    nothing = np.zeros(model.unknowns)
+
+    step = solve_step(linearize(model, nothing, nothing, SCALE_PX, held=True))
+
+    assert step.views[-1] == 0.0 and step.deviation == 0.0
+    assert apply_shutter_step(model, step, 1.0).readout == 0.02
+
+
+def test_priors_hold_what_they_are_sure_of(model):
+    precision = np.zeros(model.unknowns)
+    offsets = slice(POSE * 9, 2 * POSE * 9)
+    precision[offsets] = 1e12
+
+    free = solve_step(linearize(model, 0.0 * precision, 0.0 * precision, SCALE_PX, held=False))
+    held = solve_step(linearize(model, precision, 0.0 * precision, SCALE_PX, held=False))
+
+    assert np.abs(free.views[offsets]).max() > 1e-4
+    assert np.abs(held.views[offsets]).max() < 1e-6
+    assert held.deviation < free.deviation
+
+
+ALL = np.array([[True] * 5 + [False] * 2])
+
+
+def priors(bundle):
+    return LensPriors.from_cameras(bundle.params, bundle.family, np.array([[1280.0, 720.0]]), ALL)
+
+
+def ignore_shutter(bundle):
+    """The bundle after an adjustment that knows of no shutter."""
+    for _ in range(8):
+        reduced = reduce(bundle, SCALE_PX)
+        bundle = best_step(bundle, reduced, bundle.params, SCALE_PX)
+    return bundle
+
+
+def measure(film, **how):
+    bundle = ignore_shutter(film.bundle)
+    return estimate_readout(bundle, film.rows, priors(bundle), ALL, SCALE_PX, **how)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("readout_s", "speed", "swing_deg_s"), [(0.01, 1.4, 30.0), (0.03, 1.4, 0.0), (-0.02, 0.7, 90.0)]
+)
+def test_the_readout_is_found_as_accurately_as_said(film, readout_s, speed, swing_deg_s):
+    found = measure(film(readout_s, frames=20, speed=speed, swing_deg_s=swing_deg_s))
+
+    assert found.readout == pytest.approx(readout_s, rel=0.15)
+    assert abs(found.readout - readout_s) < 2.0 * found.deviation
+    assert 0.005 * abs(readout_s) < found.deviation < abs(readout_s) / 3.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_a_global_shutter_has_no_readout(film, seed):
+    found = measure(film(0.0, frames=20, swing_deg_s=30.0, seed=seed))
+
+    assert abs(found.readout) < found.deviation
+    assert 1e-5 < found.deviation < 0.003
+
+
+@pytest.mark.slow
+def test_straight_on_with_parallel_views_tells_nothing(film):
+    """A shutter that sees such a walk shears the scene, and nothing contradicts it."""
+    found = measure(film(0.03, frames=20, shake=0.0))
+
+    assert found.deviation > 0.01
+
+
+@pytest.mark.slow
+def test_poses_are_those_of_the_middle_rows(film):
+    bent = film(0.03, frames=20, swing_deg_s=60.0)
+    true, ignored = bent.bundle, ignore_shutter(bent.bundle)
+
+    found = estimate_readout(ignored, bent.rows, priors(ignored), ALL, SCALE_PX)
+
+    errors = [np.median(turn_errors_deg(one.R, true.R)) for one in (ignored, found.bundle)]
+    assert errors[0] > 0.2
+    assert errors[1] < 0.25 * errors[0]
+
+
+def turn_errors_deg(R, S):
+    """Of relative rotations of photos a second apart."""
+    ours, true = (np.einsum("nij,nkj->nik", one[10:], one[:-10]) for one in (R, S))
+    traces = np.einsum("nij,nij->n", ours, true)
+    return np.degrees(np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0)))
+
+
+@pytest.mark.slow
+def test_a_known_readout_is_kept(film):
+    found = measure(film(0.02, frames=12, swing_deg_s=60.0), known=0.02)
+
+    assert found.readout == 0.02 and found.deviation == 0.0
+
+
+@pytest.mark.slow
+def test_an_earlier_estimate_shortens_the_way(film):
+    walk = film(0.02, frames=12, swing_deg_s=60.0)
+    first = measure(walk)
+
+    again = estimate_readout(first.bundle, walk.rows, priors(first.bundle), ALL, SCALE_PX, first)
+
+    assert again.readout == pytest.approx(first.readout, abs=0.3 * first.deviation)
+
+
+@pytest.mark.slow
+def test_points_far_off_do_not_stop_it(film):
+    walk = film(0.02, frames=12, swing_deg_s=60.0)
+    away = np.zeros_like(walk.bundle.X)
+    away[:5] = 1e9
+    bundle = apply_step(walk.bundle, walk.bundle.params, np.zeros((12, 6)), away)
+
+    found = estimate_readout(bundle, walk.rows, priors(bundle), ALL, SCALE_PX)
+
+    assert found.readout == pytest.approx(0.02, rel=0.15)
