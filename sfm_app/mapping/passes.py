@@ -9,13 +9,12 @@ from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
 from sfm_app.colmap.model import cameras_by_photo, posed_photo_ids
 from sfm_app.mapping.attempt import (
-    ENOUGH_SHARE,
-    MIN_PHOTOS,
+    MAPPING,
     Attempt,
     Group,
     MappingResult,
     NoModel,
-    are_worth_another_try,
+    are_many_unregistered,
     best_attempt,
     choice_reason,
     map_group,
@@ -24,36 +23,43 @@ from sfm_app.mapping.attempt import (
     photo_names,
 )
 from sfm_app.mapping.hypotheses import (
-    can_have_own_cameras,
     guessed_intrinsics,
-    has_many_unplaced,
-    is_as_good,
-    is_better,
+    is_focal_doubtful,
+    is_shared_camera_doubtful,
     map_baseline,
+    own_cameras_explain_more,
     rival_reason,
+    two_cameras_suffice,
     with_camera_per_photo,
     with_two_cameras,
 )
 from sfm_app.mapping.look_alikes import (
-    MOST_FALSE_JOINS,
+    OVERLAPS,
     drop_look_alikes,
     judge_places,
     with_earlier_look_alikes,
     with_false_joins,
 )
-from sfm_app.mapping.parts import is_convincing, map_in_parts, part_size
-from sfm_app.mapping.split_and_merge import join_models, split_attempt
+from sfm_app.mapping.parts import map_in_parts, part_size, parts_suffice
+from sfm_app.mapping.split_and_merge import merge_into_main, split_attempt
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, LookAlikes, MatchGraph, PoseGraph, ViewGraph
 
-MOST_PASSES = 4
-"""Largest number of passes over all pairs. On dinoSparseRing with learned features the second finds a focal of 3272
-(true 3318), and the third places all photos with it."""
-OTHER_FOCALS = (0.6, 2.4, 4.8)
-"""Guesses of the focal besides the usual one, in longer sides: steps of a factor of two over the range of cameras."""
-FOCAL_TOLERANCE = 0.01
-"""Relative change of a focal in mapping above which another pass over the pairs is worth it."""
+
+@dataclass(frozen=True, slots=True)
+class PassOptions:
+    """When mapping is repeated."""
+
+    max_passes: int = 4
+    """Largest number of passes over all pairs; dinoSparseRing needs three. Measured."""
+    other_focals: tuple[float, ...] = (0.6, 2.4, 4.8)
+    """Guesses of the focal besides the usual one, in longer sides: steps of a factor of two. Chosen by hand."""
+    focal_tolerance: float = 0.01
+    """Relative change of a focal in mapping above which another pass is worth it. Chosen by hand."""
+
+
+OPTIONS = PassOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,14 +72,14 @@ class Outcome:
     intrinsics: Intrinsics
     """Cameras that the models were mapped with."""
     tried: tuple[str, ...]
-    """Notes on all attempts, for people."""
+    """Notes on all attempts."""
     reason: str = ""
     """Why the attempt behind the main model was chosen."""
     cuts: tuple[str, ...] = ()
     """Names of the photos of each part of a model that was cut because matches contradict the join."""
     passes: int = 1
-    thin: str = ""
-    """Why a rival was tried; empty where the evidence was good."""
+    rival_reason: str = ""
+    """Why a rival was tried, if so."""
     one_camera_each: str = ""
     """Result of trying a camera for each photo: "taken", "left" (rejected), or "two" where two cameras explain as much;
     empty if it was not tried."""
@@ -92,15 +98,9 @@ class Outcome:
 def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Outcome:
     """Return models of all connected groups of photos; none where no pair grows into a model.
 
-    Where the evidence for a model is weak, a rival is mapped, and the model that explains more is kept. Where cameras
-    were guesses, or photos of the main group are missing, a second pass starts from the cameras that mapping found,
-    which correct relative poses that were wrong before. Passes are repeated as long as they improve the model.
-
-    Args:
-        matches: keypoints and raw matches.
-        views: fundamental matrices.
-        intrinsics: cameras from pairs.
-        run: the run.
+    Where the evidence for a model is weak, a rival is mapped, and the model that explains more stays. Where cameras
+    were guesses, or photos of the main group are missing, a second pass starts from the cameras of the model, which
+    correct relative poses. Passes are repeated as long as they improve the model.
     """
     with translate_errors("entering photos"):
         write_match_graph(run.workspace.database, matches)
@@ -109,8 +109,8 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
     best = try_rival(best, matches, views, intrinsics, run)
     best = _try_other_focals(best, matches, views, intrinsics, run)
     best = _try_camera_per_photo(best, matches, views, intrinsics, run)
-    for number in range(2, MOST_PASSES + 1):
-        if not best.models or not is_pass_worthwhile(best, best.intrinsics, matches):
+    for number in range(2, OPTIONS.max_passes + 1):
+        if not best.models or not needs_another_pass(best, best.intrinsics, matches):
             break
         learned = learned_intrinsics(best.models[0], best.intrinsics, matches)
         again = _run_pass(matches, views, learned, run)
@@ -119,52 +119,52 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
             break
         graph, tried = with_earlier_look_alikes(again.graph, best.graph), best.tried + again.tried
         best = replace(
-            again, passes=number, thin=best.thin, graph=graph, tried=tried, one_camera_each=best.one_camera_each
+            again,
+            passes=number,
+            rival_reason=best.rival_reason,
+            graph=graph,
+            tried=tried,
+            one_camera_each=best.one_camera_each,
         )
         matches, views = drop_look_alikes(matches, views, best.graph)
-    return _with_joined_models(best, matches, views, run)
+    return _with_merged_models(best, matches, views, run)
 
 
 def _drop_false_joins(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: RunContext) -> Outcome:
-    """Map again without pairs that hold one place on top of another, and return the outcome with fewer strangers.
+    """Map again without pairs that merge two places, and return the outcome with fewer non-overlapping pairs.
 
     Where other pairs do not hold the photos together instead, as by day and by night, the joins stay, and are doubtful.
     """
-    joins, strangers = judge_places(outcome.models)
-    for _ in range(MOST_FALSE_JOINS):
+    joins, non_overlapping = judge_places(outcome.models)
+    for _ in range(OVERLAPS.max_passes):
         if not joins:
             return outcome
-        run.progress.say("the model has two places in one: mapping again without the look-alikes that join them")
+        run.progress.say("two different places are merged in the model; remapping without the ambiguous pairs")
         marked = with_false_joins(outcome.graph, joins)
         again = _run_pass(*drop_look_alikes(matches, views, marked), outcome.intrinsics, run)
-        joins_left, strangers_left = judge_places(again.models)
+        joins_now, non_overlapping_now = judge_places(again.models)
         tried = (*outcome.tried, *again.tried)
-        kept = again.main is not None and again.main.photos >= ENOUGH_SHARE * outcome.models[0].photos
-        if not kept or 2 * strangers_left > strangers:
+        holds_together = again.main is not None and again.main.photos >= MAPPING.enough_share * outcome.models[0].photos
+        if not holds_together or 2 * non_overlapping_now > non_overlapping:
             _write_graph(outcome.graph, outcome.intrinsics, matches, run)
             outcome = replace(outcome, tried=tried)
             break
         outcome = replace(again, graph=with_earlier_look_alikes(again.graph, marked), tried=tried)
-        joins, strangers = joins_left, strangers_left
+        joins, non_overlapping = joins_now, non_overlapping_now
     return replace(outcome, graph=replace(outcome.graph, doubtful=(*outcome.graph.doubtful, *joins)))
 
 
 def try_rival(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
-    """Map a rival where the evidence is weak, and return the outcome with the model that explains more.
-
-    Args:
-        outcome: models from relative poses.
-        matches, views, intrinsics, run: as in `reconstruct`.
-    """
+    """Map a rival where the evidence is weak, and return the outcome with the model that explains more."""
     main = outcome.main
-    thin = rival_reason(main, intrinsics, matches, views)
-    if not thin:
+    reason = rival_reason(main, intrinsics, matches, views)
+    if not reason:
         return outcome
-    run.progress.say(f"COLMAP's own way is tried beside ours: {thin}")
+    run.progress.say(f"also trying COLMAP's default pipeline (reason: {reason})")
     rival = map_baseline(matches, views, intrinsics, run)
-    outcome = replace(outcome, thin=thin, tried=(*outcome.tried, rival.note))
+    outcome = replace(outcome, rival_reason=reason, tried=(*outcome.tried, rival.note))
     both = [attempt for attempt in (main, rival) if attempt is not None]
     if isinstance(rival, NoModel) or best_attempt(both) is not rival:
         return outcome
@@ -182,13 +182,15 @@ def _try_other_focals(
 ) -> Outcome:
     """Map with other guesses of the focal where many photos are unregistered, and return the best outcome."""
     main = outcome.main
-    if not has_many_unplaced(main, intrinsics, views):
+    if not is_focal_doubtful(main, intrinsics, views):
         return outcome
-    run.progress.say("many photos have no place, and the focal length is a guess: other guesses are tried")
-    for focal in OTHER_FOCALS:
+    run.progress.say("many photos are unregistered and the focal length is a guess; trying other focal lengths")
+    for focal in OPTIONS.other_focals:
         other = _run_pass(matches, views, guessed_intrinsics(intrinsics, focal), run)
         tried = (*outcome.tried, *(f"{note} (focal {focal:g} longer sides)" for note in other.tried))
-        outcome = replace(other if other.support > outcome.support else outcome, thin=outcome.thin, tried=tried)
+        outcome = replace(
+            other if other.support > outcome.support else outcome, rival_reason=outcome.rival_reason, tried=tried
+        )
     if outcome.graph is not other.graph:
         _write_graph(outcome.graph, outcome.intrinsics, matches, run)
     return outcome
@@ -199,20 +201,20 @@ def _try_camera_per_photo(
 ) -> Outcome:
     """Map with a camera for each photo where shared ones explain too little, and return the better outcome."""
     main = outcome.main
-    if main is None or not can_have_own_cameras(main, intrinsics, views, run.settings):
+    if main is None or not is_shared_camera_doubtful(main, intrinsics, views, run.settings):
         return outcome
     each = with_camera_per_photo(main, intrinsics, matches)
     if each is None:
         return outcome
-    run.progress.say("one camera for all photos of a size does not explain them: one for each is tried")
+    run.progress.say("a shared camera does not fit; trying one camera per photo")
     own = _run_pass(matches, views, each, run)
     own = try_rival(own, matches, views, each, run)
     tried = (*outcome.tried, *(f"{note} (a camera for each photo)" for note in own.tried))
-    if not is_better(own.main, main):
+    if not own_cameras_explain_more(own.main, main):
         _write_graph(outcome.graph, outcome.intrinsics, matches, run)
         return replace(outcome, tried=tried, one_camera_each="left")
     return _try_two_cameras(
-        replace(own, thin=outcome.thin, tried=tried, one_camera_each="taken"), matches, views, each, run
+        replace(own, rival_reason=outcome.rival_reason, tried=tried, one_camera_each="taken"), matches, views, each, run
     )
 
 
@@ -223,78 +225,67 @@ def _try_two_cameras(own: Outcome, matches: MatchGraph, views: ViewGraph, each: 
         return own
     two = _run_pass(matches, views, between, run)
     tried = (*own.tried, *(f"{note} (two cameras)" for note in two.tried))
-    if is_as_good(two.main, own.models[0]):
-        return replace(two, thin=own.thin, tried=tried, one_camera_each="two")
+    if two_cameras_suffice(two.main, own.models[0]):
+        return replace(two, rival_reason=own.rival_reason, tried=tried, one_camera_each="two")
     _write_graph(own.graph, own.intrinsics, matches, run)
     return replace(own, tried=tried)
 
 
-def _with_joined_models(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: RunContext) -> Outcome:
+def _with_merged_models(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: RunContext) -> Outcome:
     """Return the outcome with models joined where they share points."""
     if len(outcome.models) < 2:
         return outcome
-    models = join_models(outcome.models, matches, views, run)
+    models = merge_into_main(outcome.models, matches, views, run)
     if len(models) == len(outcome.models):
         return outcome
-    run.progress.say(f"models were joined: {models[0].note}")
+    run.progress.say(f"merged models: {models[0].note}")
     graph = _update_graph(models[:1], outcome.graph, matches, run)
     _write_graph(graph, outcome.intrinsics, matches, run)
     tried = (*outcome.tried, models[0].note)
     return replace(outcome, models=models, graph=graph, tried=tried, reason=models[0].note)
 
 
-def is_pass_worthwhile(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:
-    """Return whether another pass with the cameras that mapping found may improve the model.
+def needs_another_pass(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:
+    """Tell whether another pass with the cameras of the model may improve it.
 
-    That is so if these cameras differ from those of the last pass, or if photos of the main group are missing.
-
-    Args:
-        outcome: outcome of the last pass; has a model.
-        intrinsics: cameras that it was mapped with.
-        matches: all photos.
+    That is so if they differ from the cameras of the last pass, or if photos of the main group are missing.
     """
     main = outcome.models[0]
     placed = posed_photo_ids(main.model)
-    if len(placed) < MIN_PHOTOS:
+    if len(placed) < MAPPING.min_photos:
         return False
     learned = learned_intrinsics(main, intrinsics, matches)
     used = {intrinsics.camera_name(matches.images[photo]) for photo in placed}
-    news = any(_has_changed(intrinsics.cameras[name], learned.cameras[name]) for name in used)
+    is_focal_new = any(_has_new_focal(intrinsics.cameras[name], learned.cameras[name]) for name in used)
     anywhere = {photo for model in outcome.models for photo in posed_photo_ids(model.model)}
     group = set(outcome.graph.connected_photos(placed[0]))
-    return news or are_worth_another_try(len(group - anywhere), len(group))
+    return is_focal_new or are_many_unregistered(len(group - anywhere), len(group))
 
 
 def learned_intrinsics(model: Attempt, intrinsics: Intrinsics, matches: MatchGraph) -> Intrinsics:
-    """Return the cameras with those of a model's photos replaced by what mapping found.
-
-    Args:
-        model: gives the cameras of its photos.
-        intrinsics: cameras before mapping, of all photos.
-        matches: all photos.
-    """
+    """Replace the cameras of the photos of a model by its own."""
     with translate_errors("reading cameras"):
-        found = cameras_by_photo(model.model)
+        learned = cameras_by_photo(model.model)
     cameras = dict(intrinsics.cameras)
-    for photo, camera in found.items():
+    for photo, camera in learned.items():
         name = intrinsics.camera_name(matches.images[photo])
-        before = intrinsics.cameras[name]
-        if before.is_kept:
+        earlier = intrinsics.cameras[name]
+        if earlier.is_kept:
             continue
         # mapping holds a lens with all terms as it was given
-        lens = before if before.distortion else replace(before, radial=camera.radial, fisheye=camera.fisheye)
+        lens = earlier if earlier.distortion else replace(earlier, radial=camera.radial, fisheye=camera.fisheye)
         cameras[name] = replace(lens, K=camera.K, identifiable=True, reason="", method="mapping")
     return replace(intrinsics, cameras=cameras)
 
 
-def _has_changed(before: Calibration, after: Calibration) -> bool:
-    return not before.is_estimated or abs(float(np.log(after.focal_px / before.focal_px))) > FOCAL_TOLERANCE
+def _has_new_focal(before: Calibration, after: Calibration) -> bool:
+    return not before.is_estimated or abs(float(np.log(after.focal_px / before.focal_px))) > OPTIONS.focal_tolerance
 
 
 def _run_pass(
-    matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext, chances: int = MOST_FALSE_JOINS
+    matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext, chances: int = OVERLAPS.max_passes
 ) -> Outcome:
-    """Map all groups from new relative poses, again up to `chances` times where parts have two places in one."""
+    """Map all groups from new relative poses, again up to `chances` times where parts merge two places."""
     epipolar = run.settings.epipolar
     options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, run.seed)
     graph = build_pose_graph(matches, views, intrinsics, options, run.map)
@@ -305,15 +296,17 @@ def _run_pass(
     tried: list[str] = []
     cuts: list[str] = []
     for number, photos in enumerate(graph.groups):
-        if number and len(photos) < MIN_PHOTOS:
+        if number and len(photos) < MAPPING.min_photos:
             continue
-        found, joins = _map_by_size(Group(photos, matches, views, graph, intrinsics), run, asked=chances > 0)
+        attempts, joins = _map_by_size(
+            Group(photos, matches, views, graph, intrinsics), run, stop_at_false_joins=chances > 0
+        )
         if joins:
-            return _run_pass_without(joins, graph, intrinsics, (matches, views), run, chances - 1)
-        tried += [attempt.note for attempt in found]
-        best = best_attempt(found)
+            return _run_pass_without(joins, graph, intrinsics, matches, views, run, chances - 1)
+        tried += [attempt.note for attempt in attempts]
+        best = best_attempt(attempts)
         if best is not None:
-            reasons[best.note] = choice_reason(best, found, len(photos))
+            reasons[best.note] = choice_reason(best, attempts, len(photos))
             parts = split_attempt(best)
             models += parts
             cuts += [
@@ -325,34 +318,41 @@ def _run_pass(
 
 
 def _run_pass_without(
-    joins: Sequence[LookAlikes], graph: PoseGraph, intrinsics: Intrinsics, pairs: tuple[MatchGraph, ViewGraph],
-    run: RunContext, chances: int,
-) -> Outcome:  # fmt: skip
-    """Run a pass without the false joins that parts have shown, before any is joined to others.
+    joins: Sequence[LookAlikes],
+    graph: PoseGraph,
+    intrinsics: Intrinsics,
+    matches: MatchGraph,
+    views: ViewGraph,
+    run: RunContext,
+    chances: int,
+) -> Outcome:
+    """Run a pass without the false joins of parts, before any part is joined to others.
 
-    The true pairs of the same corner had contradicted them, and come back with new relative poses. Where they do not
-    hold most photos together, the joins stay, and are doubtful.
+    True pairs of the same corner come back with new relative poses. Where they do not hold most photos together, the
+    joins stay, and are doubtful.
     """
-    run.progress.say("parts have two places in one: mapping again without the look-alikes that join them")
+    run.progress.say("two different places are merged in a part; remapping without the ambiguous pairs")
     marked = with_false_joins(graph, joins)
-    again = _run_pass(*drop_look_alikes(*pairs, marked), intrinsics, run, chances)
-    if again.main is not None and again.main.photos >= ENOUGH_SHARE * len(graph.groups[0]):
+    again = _run_pass(*drop_look_alikes(matches, views, marked), intrinsics, run, chances)
+    if again.main is not None and again.main.photos >= MAPPING.enough_share * len(graph.groups[0]):
         return replace(again, graph=with_earlier_look_alikes(again.graph, marked))
-    first = _run_pass(*pairs, intrinsics, run, 0)
+    first = _run_pass(matches, views, intrinsics, run, 0)
     return replace(first, graph=replace(first.graph, doubtful=(*first.graph.doubtful, *joins)))
 
 
-def _map_by_size(group: Group, run: RunContext, *, asked: bool) -> tuple[list[MappingResult], tuple[LookAlikes, ...]]:
+def _map_by_size(
+    group: Group, run: RunContext, *, stop_at_false_joins: bool
+) -> tuple[list[MappingResult], tuple[LookAlikes, ...]]:
     """Map a large group in parts, and a small one, or one that parts do not explain, as a whole.
 
-    Parts that are asked may show false joins instead.
+    Return false joins within parts instead if they stop the mapping.
     """
     if not part_size(len(group.photos), run.settings.scene):
         return map_group(group, run), ()
-    found, joins = map_in_parts(group, pairs_to_map(group.graph), run, asked=asked)
-    if joins or is_convincing(found, len(group.photos)):
-        return found, joins
-    return [*found, *map_group(group, run)], ()
+    attempts, joins = map_in_parts(group, pairs_to_map(group.graph), run, stop_at_false_joins=stop_at_false_joins)
+    if joins or parts_suffice(attempts, len(group.photos)):
+        return attempts, joins
+    return [*attempts, *map_group(group, run)], ()
 
 
 def _update_graph(models: Sequence[Attempt], graph: PoseGraph, matches: MatchGraph, run: RunContext) -> PoseGraph:

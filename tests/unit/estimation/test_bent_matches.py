@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.lenses.distortion import calibrate, photograph
-from sfm_app.estimation.calibrating import choose_inliers_again
+from sfm_app.estimation.calibrating import select_inliers_through_lens
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
@@ -40,7 +40,7 @@ def inliers_of(views):
 
 def test_the_right_lens_gives_inliers_back(bent):
     matches, views, K, run = bent
-    again = choose_inliers_again(matches, views, camera(K, 0.2), run)
+    again = select_inliers_through_lens(matches, views, camera(K, 0.2), run)
 
     right = sum(int(np.count_nonzero(rows[:, 0] == rows[:, 1])) for rows in matches.matches.values())
     assert inliers_of(views) < 0.85 * right
@@ -51,12 +51,12 @@ def test_the_right_lens_gives_inliers_back(bent):
 @pytest.mark.parametrize(("radial", "identifiable"), [(0.0, True), (0.01, True), (0.2, False)])
 def test_without_a_known_lens_nothing_changes(bent, radial, identifiable):
     matches, views, K, run = bent
-    assert choose_inliers_again(matches, views, camera(K, radial, identifiable=identifiable), run) is views
+    assert select_inliers_through_lens(matches, views, camera(K, radial, identifiable=identifiable), run) is views
 
 
 def test_a_wrong_lens_takes_no_inliers_away(bent):
     matches, views, K, run = bent
-    again = choose_inliers_again(matches, views, camera(K, -0.3), run)
+    again = select_inliers_through_lens(matches, views, camera(K, -0.3), run)
     for pair, fit in views.fits.items():
         assert again.fits[pair].inlier_count >= 0.7 * fit.inlier_count
 

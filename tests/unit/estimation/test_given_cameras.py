@@ -34,8 +34,8 @@ def test_a_single_camera_is_that_of_all_photos_of_its_shape():
     half = found.cameras["half"]
     assert (half.K[0, 0], half.K[0, 2], half.K[1, 2], half.width) == (450.0, 255.0, 195.0, 500)
     assert half.spread == {"fx": 2.0, "k1": 0.01}
-    assert "half is scaled: from 1000 x 800 to 500 x 400 pixels" in found.notes[0]
-    assert "square have no given camera" in found.notes[1] and "cropped" in found.notes[1]
+    assert "half: from 1000 x 800 to 500 x 400 pixels" in found.notes[0]
+    assert "no given camera for the photos square" in found.notes[1] and "cropped" in found.notes[1]
 
 
 def test_sizes_are_rounded_to_whole_pixels():
@@ -78,7 +78,7 @@ def test_sizes_decide_among_several_cameras_where_only_one_fits():
 
 
 def test_a_file_that_fits_no_photo_is_an_error_and_panoramas_need_none():
-    with pytest.raises(InputError, match="fits no photo: the photos a have no given camera"):
+    with pytest.raises(InputError, match="fits no photo: no given camera for the photos a"):
         assigned([photo(size=(800, 800))], {"1": camera()})
     assert not assigned([photo(projection="equirectangular")], {"1": camera()}).cameras
 

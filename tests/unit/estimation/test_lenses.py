@@ -129,7 +129,7 @@ def test_the_name_of_a_model_says_whether_the_lens_is_wide(run):
 def test_only_panoramas_can_be_panoramas(run):
     panoramic = replace(run, settings=Settings.from_mapping({"scene": {"camera_model": "EQUIRECTANGULAR"}}))
 
-    with pytest.raises(ConfigError, match=r"5 photos are no panoramas, such as 1\.jpg"):
+    with pytest.raises(ConfigError, match=r"5 photos are not panoramas, such as 1\.jpg"):
         find_lenses(photos_through(PLAIN), panoramic)
 
 

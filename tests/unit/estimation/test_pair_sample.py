@@ -1,5 +1,7 @@
 """Cameras are calibrated from a sample of the pairs of a large set, which every photo is part of."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from sfm_app.estimation import calibrating as module
@@ -24,20 +26,20 @@ def test_all_pairs_of_a_small_set_are_asked():
 
 
 def test_every_photo_of_a_large_set_is_asked_with_near_and_far_partners(monkeypatch):
-    monkeypatch.setattr(module, "ENOUGH_PAIRS", 300)
+    monkeypatch.setattr(module, "OPTIONS", replace(module.OPTIONS, all_pairs=300))
     views = view_graph(200, 20)
 
     found = sample_pairs(views, 200)
 
     counts = np.bincount(np.array(list(found.fits)).ravel(), minlength=200)
-    assert counts.min() >= module.PAIRS_PER_PHOTO
+    assert counts.min() >= module.OPTIONS.pairs_per_photo
     assert 400 <= len(found.fits) <= 800 < len(views.fits)
     gaps = [b - a for a, b in found.fits]
     assert min(gaps) == 1 and np.mean(np.array(gaps) > 10) > 0.2
 
 
 def test_pairs_that_determine_no_matrix_are_not_asked(monkeypatch):
-    monkeypatch.setattr(module, "ENOUGH_PAIRS", 300)
+    monkeypatch.setattr(module, "OPTIONS", replace(module.OPTIONS, all_pairs=300))
     flat = {(a, a + 1) for a in range(199)}
 
     found = sample_pairs(view_graph(200, 20, degenerate=flat), 200)

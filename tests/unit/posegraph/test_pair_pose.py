@@ -3,16 +3,34 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_app.camera.bearings import project
+from sfm_app.camera.models import camera_matrix
 from sfm_app.geometry.epipolar import (
     cross_matrix,
+    decompose_essential,
     depths,
     eight_point,
+    nearest_essential,
     relative_pose,
     rotation_residuals,
+    sampson_distance,
     triangulate,
     triangulation_angle_deg,
 )
-from sfm_app.posegraph.pair_pose import Pair, estimate_pose, is_in_front, ray_angles_deg
+from sfm_app.geometry.poses import retract
+from sfm_app.posegraph.graph import refine_direction
+from sfm_app.posegraph.pair_pose import (
+    OPTIONS,
+    SIGMAS_PX,
+    Pair,
+    estimate_pose,
+    is_in_front,
+    planar_starts,
+    points_ahead,
+    pose_distances,
+    ray_angles_deg,
+    refine_pose,
+    turned_starts,
+)
 from sfm_app.types import Calibration, EpipolarFit
 
 
@@ -183,3 +201,154 @@ def test_panoramas_that_face_away_from_each_other_have_a_pose(two_views):
 
     turned = np.degrees(np.arccos(np.clip(0.5 * (np.trace(pose.R @ R.T) - 1.0), -1.0, 1.0)))
     assert 0.0 < turned < 0.5 and t @ pose.t > 0.99 * np.linalg.norm(t)
+
+
+def started(views, used):
+    """The pose that eight points give, of the four the one nearest to the truth."""
+    E = eight_point(views.rays[used, :2], views.rays[used, 2:])
+    return min(decompose_essential(nearest_essential(E)), key=lambda pose: views.errors_deg(*pose).sum())
+
+
+def test_distances_are_those_of_sampson_in_pixels(two_views):
+    views = two_views(false=50)
+
+    found = pose_distances(views.lines, views.R, views.t)
+
+    np.testing.assert_allclose(found, sampson_distance(views.F, views.x1, views.x2), rtol=1e-6)
+
+
+def test_the_pose_of_exact_matches_is_exact(two_views):
+    views = two_views(noise_px=0.0)
+    start = started(two_views(noise_px=1.0), np.arange(30))
+    assert views.errors_deg(*start).max() > 0.1
+
+    R, t = refine_pose(views.lines, start[0], 7.0 * start[1])
+
+    assert views.errors_deg(R, t).max() < 1e-5
+    assert np.linalg.norm(t) == pytest.approx(1.0, abs=1e-12)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+
+
+def test_false_matches_and_a_second_structure_hardly_move_the_pose(two_views):
+    """Of 300 matches a quarter are wrong by chance and a tenth fit another pose."""
+    starts, ends, clean = [], [], []
+    for seed in range(8):
+        views = two_views(seed, right=195, second=30, false=75)
+        start = started(views, np.arange(40))
+        starts.append(views.errors_deg(*start))
+        ends.append(views.errors_deg(*refine_pose(views.lines, *start)))
+        clean.append(views.errors_deg(*refine_pose(views.lines[:195], *start)))
+    starts, ends, clean = (np.median(errors, axis=0) for errors in (starts, ends, clean))
+
+    assert np.all(ends < [0.05, 0.2]) and np.all(ends > [0.001, 0.005])
+    assert np.all(ends < 0.5 * starts)
+    assert np.all(ends < 1.5 * clean)
+
+
+def test_no_pose_nearby_explains_the_matches_better(two_views):
+    """The end is a minimum of Cauchy's loss at its last, narrow scale."""
+    views, rng = two_views(false=60, second=20), np.random.default_rng(0)
+    R, t = refine_pose(views.lines, *started(views, np.arange(40)))
+
+    def cost(pose):
+        squared = pose_distances(views.lines, pose[:9].reshape(3, 3), pose[9:]) ** 2
+        return np.log1p(squared / SIGMAS_PX[-1] ** 2).sum()
+
+    end = np.concatenate([R.ravel(), t])
+    nearby = [cost(retract(end, 2e-4 * rng.normal(size=5))) for _ in range(100)]
+    assert cost(end) < min(nearby) + 1e-4
+    assert cost(end) < 0.98 * cost(np.concatenate([np.ravel(part) for part in started(views, np.arange(40))]))
+
+
+def test_matches_that_say_nothing_leave_the_pose_as_it_is(two_views):
+    views = two_views()
+
+    R, t = refine_pose(np.empty((0, 18)), views.R, views.t)
+
+    np.testing.assert_allclose(R, views.R)
+    np.testing.assert_allclose(t, views.t)
+
+
+K_LONG = camera_matrix(3300.0, 3300.0, 320.0, 240.0)
+CAMERA = Calibration(K_LONG, 640, 480, "zero-curves", True)
+
+
+def orbit_pair(seed, turn_deg, points=150, noise_px=0.3, roll_deg=0.0):
+    """A thing of unit size seen from 9 units away, before and after a turn about it."""
+    rng = np.random.default_rng([seed, 7])
+    X = rng.uniform(-0.5, 0.5, (points, 3))
+    turn = Rotation.from_euler("zyx", [roll_deg, turn_deg, 3.0], degrees=True).as_matrix()
+    away = np.array([0.0, 0.0, 9.0])
+    views = []
+    for R in (np.eye(3), turn):
+        x = (X @ R.T + away) @ K_LONG.T
+        views.append(x[:, :2] / x[:, 2:] + rng.normal(0.0, noise_px, (points, 2)))
+    t = away - turn @ away
+    F = eight_point(*views)
+    return Pair(tuple(views), (CAMERA, CAMERA), 1.5), F, turn, t / np.linalg.norm(t)
+
+
+def pose_errors_deg(R, t, true_R, true_t):
+    return np.degrees(Rotation.from_matrix(R @ true_R.T).magnitude()), np.degrees(np.arccos(np.clip(t @ true_t, -1, 1)))
+
+
+@pytest.mark.parametrize("turn_deg", [-40.0, -20.0, 10.0, 25.0, 60.0])
+@pytest.mark.parametrize("roll_deg", [0.0, 100.0])
+def test_the_nearest_of_the_starts_is_near(turn_deg, roll_deg):
+    pair, F, R, t = orbit_pair(1, turn_deg, noise_px=0.0, roll_deg=roll_deg)
+    found = [pose_errors_deg(*start, R, t) for start in turned_starts(points_ahead(pair.lines), K_LONG.T @ F @ K_LONG)]
+
+    assert len(found) == len(OPTIONS.turns_deg)
+    nearest = min(found)
+    gaps = np.diff(sorted(OPTIONS.turns_deg))
+    assert 0.0 < nearest[0] < 0.5 * gaps.max() + 3.0
+    assert nearest[1] < 12.0
+    assert max(found)[0] > 40.0
+
+
+@pytest.mark.parametrize("turned_deg", [-60.0, 90.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_where_F_turns_the_camera_elsewhere_the_pair_is_posed_all_the_same(seed, turned_deg):
+    """Through a long lens all turns about the same axis have nearly the same epipolar lines."""
+    pair, _, R, t = orbit_pair(seed, 23.0)
+    wrong = Rotation.from_euler("zyx", [0.0, turned_deg, np.copysign(3.0, turned_deg)], degrees=True).as_matrix()
+    E = cross_matrix(np.array([0.0, 0.0, 9.0]) - wrong @ [0.0, 0.0, 9.0]) @ wrong
+    fit = EpipolarFit(np.linalg.inv(K_LONG).T @ E @ np.linalg.inv(K_LONG), np.ones(150, bool), np.ones(150), 10, 0.5)
+
+    alone = refine_pose(pair.lines, *pair.initial_pose(fit))
+    pose = estimate_pose(pair, fit)
+
+    assert pose_errors_deg(*alone, R, t)[0] > 20.0
+    assert 0.0 < pose_errors_deg(pose.R, pose.t, R, t)[0] < 2.0
+    assert pose.in_front == 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_of_the_poses_that_a_plane_allows_is_the_right_one(two_views, seed):
+    views = two_views(seed, scene="wall")
+    found = [views.errors_deg(*start).max() for start in planar_starts(views.rays)]
+
+    assert 2 <= len(found) <= 4
+    assert 0.0 < min(found) < 1.5
+    assert max(found) > 10.0
+
+
+def test_too_few_matches_and_those_on_a_line_have_no_plane():
+    line = np.column_stack([np.linspace(0, 1, 20)] * 4)
+    assert list(planar_starts(line[:7])) == []
+    assert all(np.isfinite(R).all() and np.isfinite(t).all() for R, t in planar_starts(line))
+
+
+def test_matches_without_extent_give_no_starts():
+    used = np.zeros((5, 4))
+    assert list(turned_starts(used, np.zeros((3, 3)))) == []
+    assert list(turned_starts(used, cross_matrix(np.array([0.0, 0.0, 1.0])))) == []
+
+
+def test_with_the_rotation_held_the_direction_is_found_from_nearby():
+    pair, _, R, t = orbit_pair(3, 20.0)
+    aside = Rotation.from_rotvec([0.0, 0.1, 0.1]).as_matrix() @ t
+    for sign in (1.0, -1.0):
+        found = refine_direction(pair, R, sign * aside)
+        assert 0.0 < np.degrees(np.arccos(sign * found @ t)) < 1.0
+        assert np.linalg.norm(found) == pytest.approx(1.0)

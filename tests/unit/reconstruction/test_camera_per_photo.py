@@ -12,10 +12,10 @@ from sfm_app.mapping import hypotheses
 from sfm_app.mapping import passes as module
 from sfm_app.mapping.attempt import Attempt, NoModel, PairSupport, explained_pairs
 from sfm_app.mapping.hypotheses import (
-    MIN_PHOTOS,
-    can_have_own_cameras,
-    is_as_good,
-    is_better,
+    OPTIONS,
+    is_shared_camera_doubtful,
+    two_cameras_suffice,
+    own_cameras_explain_more,
     with_camera_per_photo,
     with_two_cameras,
 )
@@ -49,7 +49,7 @@ def views(number):
         (6, 6, 1, AUTO, False),
         (4, 6, 0, AUTO, True),
         (5, 6, 0, AUTO, False),
-        (MIN_PHOTOS - 1, MIN_PHOTOS - 1, 2, AUTO, False),
+        (OPTIONS.min_photos - 1, OPTIONS.min_photos - 1, 2, AUTO, False),
         (101, 101, 2, AUTO, False),
         (6, 6, 2, Settings.from_mapping({"photos": {"cameras": "single"}}), False),
     ],
@@ -58,19 +58,19 @@ def test_it_is_asked_where_one_camera_does_not_explain_photos_that_nobody_groupe
     cameras, placed, number, contradicted, settings, asked
 ):
     guess = cameras(method="guess", identifiable=False)
-    assert can_have_own_cameras(attempt(photos(placed), contradicted), guess, views(number), settings) is asked
+    assert is_shared_camera_doubtful(attempt(photos(placed), contradicted), guess, views(number), settings) is asked
 
 
 def test_it_is_asked_of_photos_of_a_plane_whose_pairs_are_all_degenerate(cameras):
     none = ViewGraph({}, {})
     guess = cameras(method="guess", identifiable=False)
 
-    assert can_have_own_cameras(attempt(photos(6), 2), guess, none, AUTO)
-    assert not can_have_own_cameras(attempt(photos(MIN_PHOTOS - 1), 2), guess, none, AUTO)
+    assert is_shared_camera_doubtful(attempt(photos(6), 2), guess, none, AUTO)
+    assert not is_shared_camera_doubtful(attempt(photos(OPTIONS.min_photos - 1), 2), guess, none, AUTO)
 
 
 def test_without_a_model_it_is_not_asked(cameras):
-    assert not can_have_own_cameras(None, cameras(), views(6), AUTO)
+    assert not is_shared_camera_doubtful(None, cameras(), views(6), AUTO)
 
 
 def test_every_photo_gets_a_guess_of_its_own_that_begins_where_mapping_ended(synthetic, cameras):
@@ -105,7 +105,7 @@ def test_a_camera_that_pairs_determine_is_not_divided(synthetic, cameras):
     ],
 )
 def test_it_is_taken_where_it_explains_more_and_contradictions_go(own, better):
-    assert is_better(own, attempt(photos(6), 10)) is better
+    assert own_cameras_explain_more(own, attempt(photos(6), 10)) is better
 
 
 def each_of(synthetic, cameras, focals):
@@ -147,7 +147,7 @@ def test_a_single_photo_of_another_focal_is_no_second_camera(synthetic, cameras,
     ],
 )
 def test_two_cameras_are_taken_where_they_explain_as_much(two, as_good):
-    assert is_as_good(two, attempt(photos(6), 0, 1000, 1000)) is as_good
+    assert two_cameras_suffice(two, attempt(photos(6), 0, 1000, 1000)) is as_good
 
 
 @pytest.fixture
@@ -172,7 +172,7 @@ def zoom(monkeypatch, synthetic):
         monkeypatch.setattr(module, "map_group", attempts)
         monkeypatch.setattr(module, "map_baseline", lambda *_: NoModel("colmap", "no rival"))
         monkeypatch.setattr(module, "with_two_cameras", lambda *_: None)
-        monkeypatch.setattr(module, "MOST_PASSES", 1)
+        monkeypatch.setattr(module, "OPTIONS", replace(module.OPTIONS, max_passes=1))
         return asked
 
     return make
@@ -194,7 +194,7 @@ def test_photos_of_a_zoom_are_mapped_with_a_camera_each(synthetic, run, cameras,
 
 
 def test_photos_of_one_camera_keep_it_and_so_does_the_database(synthetic, run, cameras, zoom, monkeypatch):
-    monkeypatch.setattr(module, "can_have_own_cameras", lambda *_: True)
+    monkeypatch.setattr(module, "is_shared_camera_doubtful", lambda *_: True)
     asked = zoom(right=False)
     guess = cameras(method="guess", identifiable=False)
 

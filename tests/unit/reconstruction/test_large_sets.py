@@ -1,10 +1,12 @@
 """What changes with the number of photos: pairs that are mapped, and when all is mapped again."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sfm_app.mapping import attempt as module
-from sfm_app.mapping.attempt import are_worth_another_try, pairs_to_map
+from sfm_app.mapping.attempt import are_many_unregistered, pairs_to_map
 from sfm_app.posegraph.rotations import connected_groups
 from sfm_app.types import PoseGraph, RelativePose
 
@@ -26,13 +28,13 @@ def test_all_pairs_of_a_small_set_are_mapped():
 
 
 def test_some_pairs_of_each_photo_of_a_large_set_are_mapped(monkeypatch):
-    monkeypatch.setattr(module, "MOST_FULLY_MAPPED", 90)
+    monkeypatch.setattr(module, "MAPPING", replace(module.MAPPING, fully_mapped_photos=90))
     graph = pose_graph(100, 40)
 
     found = pairs_to_map(graph)
 
     counts = np.bincount(np.array(list(found.poses)).ravel(), minlength=100)
-    assert counts.min() >= module.MAPPED_PARTNERS
+    assert counts.min() >= module.MAPPING.mapped_partners
     assert len(found.poses) < 0.5 * len(graph.poses)
     assert len(connected_groups(found.poses)) == 1
     assert max(b - a for a, b in found.poses) > 20
@@ -43,4 +45,4 @@ def test_some_pairs_of_each_photo_of_a_large_set_are_mapped(monkeypatch):
     (0, 20, False), (1, 20, True), (1, 59, True), (2, 60, False), (3, 60, True), (49, 1000, False), (50, 1000, True),
 ])  # fmt: skip
 def test_a_few_lost_photos_of_many_are_no_reason_to_map_again(lost, photos, again):
-    assert are_worth_another_try(lost, photos) is again
+    assert are_many_unregistered(lost, photos) is again

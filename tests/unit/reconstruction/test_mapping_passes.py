@@ -95,14 +95,14 @@ def test_photos_are_mapped_again_without_a_false_join(synthetic, run, cameras, m
     assert len(geometries_in(run().workspace.database)) == 13
 
 
-@pytest.mark.parametrize(("lost", "strangers"), [([], 15), ([6], 0)])
+@pytest.mark.parametrize(("lost", "non_overlapping"), [([], 15), ([6], 0)])
 def test_a_false_join_without_a_better_rival_is_only_named(
-    synthetic, run, cameras, mapped, monkeypatch, lost, strangers
+    synthetic, run, cameras, mapped, monkeypatch, lost, non_overlapping
 ):
     first = with_camera(synthetic.copy(), TRUE)
     mapped(first, without(with_camera(synthetic.copy(), TRUE), lost))
     join = LookAlikes(((1, 4), (2, 4)), 0.9)
-    judgments(monkeypatch, ([join], 20), ([join], strangers))
+    judgments(monkeypatch, ([join], 20), ([join], non_overlapping))
 
     found = outcome(synthetic, cameras(), run())
 
@@ -132,9 +132,9 @@ def in_parts(monkeypatch, synthetic):
     def make(joins, *models):
         seen, left, ready = [], list(joins), list(models)
 
-        def attempts(group, followed, run, *, asked):
-            seen.append((set(group.graph.poses), set(followed.poses), asked))
-            if asked and left:
+        def attempts(group, followed, run, *, stop_at_false_joins):
+            seen.append((set(group.graph.poses), set(followed.poses), stop_at_false_joins))
+            if stop_at_false_joins and left:
                 return [], left.pop(0)
             explained = explained_pairs(model := ready.pop(0), synthetic.matches, synthetic.views, 1.5)
             return [Attempt("parts", model, explained, f"{model.num_reg_images()} photos")], ()
@@ -266,9 +266,9 @@ def test_a_rival_that_explains_more_goes_on(synthetic, run, cameras, mapped, mon
 
     found = outcome(synthetic, cameras(), run())
 
-    assert len(asked) == 1 and found.thin == "photos that match others have no place: 1"
+    assert len(asked) == 1 and found.rival_reason == "unregistered photos with matches: 1"
     assert (found.models[0].mapper, found.models[0].photos) == ("colmap", 6)
-    assert "the rival" in found.tried and found.reason.startswith("it places all 6 photos")
+    assert "the rival" in found.tried and found.reason.startswith("it registers all 6 photos")
 
 
 def test_later_steps_know_the_pairs_of_a_rival_that_goes_on(synthetic, run, cameras, mapped, monkeypatch):
@@ -291,7 +291,7 @@ def test_a_rival_that_explains_less_is_named_and_left(synthetic, run, cameras, m
 
     found = outcome(synthetic, cameras(method="guess", identifiable=False), run())
 
-    assert len(asked) == 1 and found.thin == "the pairs do not determine a camera"
+    assert len(asked) == 1 and found.rival_reason == "the pairs do not determine a camera"
     assert (found.models[0].mapper, found.models[0].photos) == ("incremental", 6)
     assert "the rival" in found.tried
 
@@ -302,7 +302,7 @@ def test_good_evidence_needs_no_rival(synthetic, run, cameras, mapped, monkeypat
 
     found = outcome(synthetic, cameras(), run())
 
-    assert asked == [] and found.thin == "" and found.models[0].photos == 6
+    assert asked == [] and found.rival_reason == "" and found.models[0].photos == 6
 
 
 def test_where_a_guess_leaves_many_photos_out_other_focals_are_tried(synthetic, run, cameras, mapped):
@@ -338,7 +338,7 @@ def test_a_rival_that_fails_costs_nothing(synthetic, run, cameras, mapped, monke
     found = outcome(synthetic, cameras(method="guess", identifiable=False), run())
 
     assert found.models[0].photos == 6
-    assert any("as COLMAP does by itself: failed" in note for note in found.tried)
+    assert any("COLMAP's default pipeline: failed" in note for note in found.tried)
 
 
 def learned(model, synthetic, intrinsics):
@@ -348,7 +348,7 @@ def learned(model, synthetic, intrinsics):
 def worth(model, synthetic, intrinsics, photos=6):
     graph = PoseGraph({}, {}, (tuple(range(1, photos + 1)),))
     found = module.Outcome((Attempt("global", model, {}, ""),), graph, intrinsics, ())
-    return module.is_pass_worthwhile(found, intrinsics, synthetic.matches)
+    return module.needs_another_pass(found, intrinsics, synthetic.matches)
 
 
 def test_two_photos_teach_no_camera(synthetic, cameras):
@@ -439,7 +439,7 @@ def test_lonely_photos_and_lesser_pairs_are_left_out(synthetic):
 
 def test_the_parts_of_a_cut_model_are_models_of_their_own_and_named(synthetic, run, cameras, mapped, monkeypatch):
     mapped(synthetic.copy())
-    monkeypatch.setattr(module, "join_models", lambda models, *_: models)  # what contradicts is made up
+    monkeypatch.setattr(module, "merge_into_main", lambda models, *_: models)  # what contradicts is made up
     cut = joined(GOOD, AGAINST)
     del cut[5, 6]
     attempts = module.map_group

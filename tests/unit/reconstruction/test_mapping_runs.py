@@ -125,7 +125,7 @@ def test_both_mappers_are_tried_and_one_good_model_is_enough(try_out):
 
 
 def test_where_it_is_easy_the_other_mapper_begins_only_if_it_is_needed(try_out, monkeypatch):
-    monkeypatch.setattr(module, "_is_easy", lambda _: True)
+    monkeypatch.setattr(module, "_likely_needs_one_mapper", lambda _: True)
 
     found, calls = try_out([10], at_once=10)
     assert summary(found) == [("incremental", 10), ("global", 0)] and calls == ["incremental"]
@@ -145,7 +145,7 @@ def test_it_is_easy_with_known_cameras_and_few_contradictions(cameras, deviation
     sure = {name: replace(one, spread={"fx": deviation}) for name, one in known.cameras.items()}
     group = Group(tuple(images), MatchGraph(images, {}, {}), ViewGraph({}, {}), graph, replace(known, cameras=sure))
 
-    assert module._is_easy(group) is easy
+    assert module._likely_needs_one_mapper(group) is easy
 
 
 @pytest.mark.parametrize("late", ["global", "incremental"])
@@ -172,11 +172,11 @@ def test_why_a_model_was_taken_is_said():
     best, rival, nothing = attempt(10, 1000), attempt(9, 900), NoModel("global", "")
     contradicted = Attempt("global", model(10), {(0, 1): PairSupport(90, 100, 10)}, "")
 
-    assert choice_reason(best, [best, nothing], 10) == "it places all 10 photos and next to nothing contradicts it"
-    assert choice_reason(contradicted, [contradicted, nothing], 10) == "nothing else gave a model"
-    assert choice_reason(contradicted, [contradicted], 10) == "it explains enough to need no other way"
+    assert choice_reason(best, [best, nothing], 10) == "it registers all 10 photos, and almost no match contradicts it"
+    assert choice_reason(contradicted, [contradicted, nothing], 10) == "no other attempt gave a model"
+    assert choice_reason(contradicted, [contradicted], 10) == "it explains enough; no other model was needed"
     assert (
-        choice_reason(best, [rival, best], 11) == "it explains 2000 matches with 10 photos, the next best 1800 with 9"
+        choice_reason(best, [rival, best], 11) == "it explains 2000 matches with 10 photos, the second best 1800 with 9"
     )
 
 
@@ -222,7 +222,7 @@ def test_photos_that_the_global_mapper_left_out_get_a_second_chance(try_out):
     found, _ = try_out([3], at_once=8, completed=10, max_init_pairs=1)
 
     assert summary(found) == [("incremental", 3), ("global", 8), ("incremental", 10)]
-    assert found[2].note == "what was left out, photo by photo: 10 photos"
+    assert found[2].note == "missing photos added one by one: 10 photos"
 
 
 def test_of_two_photos_positions_have_no_scale_to_agree_on(try_out):

@@ -11,7 +11,7 @@ from sfm_app.geometry.poses import Similarity, umeyama
 from sfm_app.mapping import passes
 from sfm_app.mapping.attempt import judge_model
 from sfm_app.mapping.passes import reconstruct
-from sfm_app.mapping.split_and_merge import LEAST_SHARED, join_models, shared_points
+from sfm_app.mapping.split_and_merge import OPTIONS, merge_into_main, shared_points
 from sfm_app.types import ViewGraph
 
 pytestmark = pytest.mark.slow
@@ -25,7 +25,7 @@ def halves(synthetic, run):
     first, second = submodel(synthetic.model, (1, 2, 3)), submodel(synthetic.model, (4, 5, 6))
     move(second, ELSEWHERE)
     return tuple(
-        judge_model(synthetic.matches, synthetic.views, ("incremental", "half"), model, run())
+        judge_model(synthetic.matches, synthetic.views, "incremental", "half", model, run())
         for model in (first, second)
     )
 
@@ -47,7 +47,7 @@ def test_points_that_both_know_are_found_once_with_both_their_places(synthetic, 
 
 
 def test_halves_become_one_model_as_exact_as_the_whole(synthetic, halves, run):
-    (found,) = join_models(halves, synthetic.matches, synthetic.views, run())
+    (found,) = merge_into_main(halves, synthetic.matches, synthetic.views, run())
 
     assert posed_photo_ids(found.model) == [1, 2, 3, 4, 5, 6]
     assert found.note.startswith("3 and 3 photos joined by ")
@@ -60,8 +60,8 @@ def test_halves_become_one_model_as_exact_as_the_whole(synthetic, halves, run):
 def test_what_shares_too_few_points_stays_apart(synthetic, halves, run):
     views = ViewGraph({pair: fit for pair, fit in synthetic.views.fits.items() if within(pair)}, {})
 
-    assert len(shared_points(halves[0].model, halves[1].model, synthetic.matches, views)) < LEAST_SHARED
-    assert join_models(halves, synthetic.matches, views, run()) == halves
+    assert len(shared_points(halves[0].model, halves[1].model, synthetic.matches, views)) < OPTIONS.min_shared
+    assert merge_into_main(halves, synthetic.matches, views, run()) == halves
 
 
 def test_matches_that_disagree_about_the_place_join_nothing(synthetic, halves, run):
@@ -71,14 +71,14 @@ def test_matches_that_disagree_about_the_place_join_nothing(synthetic, halves, r
         for pair, row in synthetic.matches.matches.items()
     }
 
-    assert join_models(halves, replace(synthetic.matches, matches=rows), synthetic.views, run()) == halves
+    assert merge_into_main(halves, replace(synthetic.matches, matches=rows), synthetic.views, run()) == halves
 
 
 def test_models_that_mapping_left_apart_are_joined_in_the_end(synthetic, halves, run, cameras, monkeypatch):
     made = passes.Outcome(halves, _graph(synthetic), cameras(), ("half", "half"))
     monkeypatch.setattr(passes, "_run_pass", lambda *_: made)
     monkeypatch.setattr(passes, "try_rival", lambda outcome, *_: outcome)
-    monkeypatch.setattr(passes, "MOST_PASSES", 1)
+    monkeypatch.setattr(passes, "OPTIONS", replace(passes.OPTIONS, max_passes=1))
 
     found = reconstruct(synthetic.matches, synthetic.views, cameras(), run())
 

@@ -11,7 +11,7 @@ from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.errors import BackendError, ClusterError
 from sfm_app.mapping import feature_retry as module
 from sfm_app.mapping.attempt import Attempt, explained_pairs
-from sfm_app.mapping.feature_retry import LOOSE_RATIO, MappedScene, candidate_pairs, lost_photos, retry_lost_photos
+from sfm_app.mapping.feature_retry import OPTIONS, MappedScene, candidate_pairs, lost_photos, retry_lost_photos
 from sfm_app.mapping.passes import Outcome
 from sfm_app.settings import Settings
 from sfm_app.types import MatchedImage, MatchGraph, PoseGraph, ViewGraph
@@ -80,7 +80,7 @@ def test_a_lost_photo_finds_its_place_by_finer_features(first, finer):
 
     found = retry_lost_photos(first)
 
-    assert asked[0] == ("sift-dsp", [(k, LOST) for k in range(1, LOST)], LOOSE_RATIO)
+    assert asked[0] == ("sift-dsp", [(k, LOST) for k in range(1, LOST)], OPTIONS.max_ratio)
     matches, views, intrinsics = asked[1]
     assert intrinsics is first.intrinsics  # it was known
     assert all((k, LOST) in views.fits and len(matches.matches[k, LOST]) >= 100 for k in range(1, LOST))

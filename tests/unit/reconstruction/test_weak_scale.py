@@ -2,7 +2,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from sfm_app.mapping.split_and_merge import MIN_SHARED_POINTS, weakly_joined_parts
+from sfm_app.mapping.split_and_merge import OPTIONS, weakly_joined_parts
 
 pytestmark = pytest.mark.slow
 
@@ -22,11 +22,11 @@ def model(*tracks):
 
 
 def test_photos_that_see_what_two_others_see_are_well_joined():
-    assert weakly_joined_parts(model(((1, 2, 3), 40), ((2, 3, 4), 40), ((3, 4, 5), MIN_SHARED_POINTS))) == []
+    assert weakly_joined_parts(model(((1, 2, 3), 40), ((2, 3, 4), 40), ((3, 4, 5), OPTIONS.min_common_points))) == []
 
 
 def test_parts_that_share_hardly_a_point_of_three_photos_are_named():
-    tracks = ((1, 2, 3), 40), ((3, 4), 200), ((2, 3, 4), MIN_SHARED_POINTS - 1), ((4, 5, 6), 30)
+    tracks = ((1, 2, 3), 40), ((3, 4), 200), ((2, 3, 4), OPTIONS.min_common_points - 1), ((4, 5, 6), 30)
     # 4 hangs on four points, and 5 and 6 on photo 4 alone
     assert weakly_joined_parts(model(*tracks)) == [["1.jpg", "2.jpg"], ["5.jpg", "6.jpg"]]
 

@@ -81,7 +81,7 @@ def test_a_known_photo_whose_pairs_were_dropped_leaves_and_keeps_no_other_from_i
     found, _ = grow(submodel(synthetic.model, [1, 2, 3, 4]), (1, 2, 3, 4), whole=submodel(synthetic.model, [1, 2]))
 
     assert posed_photo_ids(found.outcome.models[0].model) == [2, 3, 4, 5, 6]
-    assert found.outcome.reason == "3 photos were known, and 2 of 2 others found their place"
+    assert found.outcome.reason == "3 photos were known, and 2 of 2 others were registered"
 
 
 def test_a_wrong_earlier_model_is_mapped_again(grow, synthetic):
@@ -126,7 +126,7 @@ def test_a_grown_model_with_two_places_in_one_stays_only_where_nothing_else_is_f
         submodel(synthetic.model, [1, 2, 3, 4]), (1, 2, 3, 4), whole=left and submodel(synthetic.model, left)
     )
 
-    assert figures["mapped_again_because"] == "the model has two places in one"
+    assert figures["mapped_again_because"] == "two different places are merged in the model"
     assert found.outcome.models[0].mapper == mapper
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_app.mapping.attempt import Attempt, PairSupport
-from sfm_app.mapping.look_alikes import LEAST_STRANGERS, Meeting, find_false_joins, find_strangers, judge_places
+from sfm_app.mapping.look_alikes import OVERLAPS, ExpectedOverlap, find_false_joins, find_non_overlapping, judge_places
 
 pytestmark = pytest.mark.slow
 
@@ -23,13 +23,13 @@ def two_streets(walls, length=24, alike=(10.0, 14.0)):
 def test_a_house_in_two_streets_is_found_and_nothing_else(walls):
     model, explained = two_streets(walls)
 
-    joins, strangers = judge_places([Attempt("incremental", model, explained, "")])
+    joins, non_overlapping = judge_places([Attempt("incremental", model, explained, "")])
 
     across = {pair for pair, found in explained.items() if pair[0] < 100 < pair[1] and found.matches >= 16}
     assert len(joins) == 1
     assert set(joins[0].pairs) == across
     assert 0.5 < joins[0].missing < 1.0
-    assert strangers >= 40
+    assert non_overlapping >= 40
 
 
 def test_one_street_that_is_walked_twice_is_no_false_join(walls):
@@ -46,47 +46,47 @@ def test_a_loop_whose_ends_were_hardly_matched_stays():
     """A quarter of the photos that should share much share nothing: matching failed, the rest bears the loop out."""
     explained = {(a, 100 + b): PairSupport(200, 200, 0) for a in range(12) for b in range(12) if (a + b) % 4}
     explained |= {(a + side, a + 1 + side): PairSupport(500, 500, 0) for a in range(11) for side in (0, 100)}
-    meetings = {(a, 100 + b): Meeting(60, 0 if (a + b) % 4 == 0 else 50) for a in range(12) for b in range(12)}
+    overlaps = {(a, 100 + b): ExpectedOverlap(60, 0 if (a + b) % 4 == 0 else 50) for a in range(12) for b in range(12)}
     beside = [(a + side, b + side) for a in range(12) for b in range(a + 1, min(a + 5, 12)) for side in (0, 100)]
-    meetings |= dict.fromkeys(beside, Meeting(60, 58))
+    overlaps |= dict.fromkeys(beside, ExpectedOverlap(60, 58))
 
-    assert len(find_strangers(meetings, explained)) >= LEAST_STRANGERS
-    assert find_false_joins(meetings, explained) == []
+    assert len(find_non_overlapping(overlaps, explained)) >= OVERLAPS.min_pairs
+    assert find_false_joins(overlaps, explained) == []
 
 
 def test_photos_whose_matches_hold_are_no_strangers():
-    meetings = {(1, 2): Meeting(50, 0), (1, 3): Meeting(50, 0), (2, 3): Meeting(50, 20)}
+    overlaps = {(1, 2): ExpectedOverlap(50, 0), (1, 3): ExpectedOverlap(50, 0), (2, 3): ExpectedOverlap(50, 20)}
 
-    found = find_strangers(meetings, {(1, 2): PairSupport(40, 40, 0), (1, 3): PairSupport(5, 5, 0)})
+    found = find_non_overlapping(overlaps, {(1, 2): PairSupport(40, 40, 0), (1, 3): PairSupport(5, 5, 0)})
 
     assert set(found) == {(1, 3)}
 
 
 def test_a_few_strangers_prove_nothing():
-    pairs = [(a, a + 100) for a in range(LEAST_STRANGERS - 1)]
+    pairs = [(a, a + 100) for a in range(OVERLAPS - 1)]
     explained = {(0, 100): PairSupport(300, 300, 0)} | {
         (a + side, a + 1 + side): PairSupport(500, 500, 0) for a in range(20) for side in (0, 100)
     }
-    assert find_false_joins({pair: Meeting(60, 0) for pair in pairs}, explained) == []
+    assert find_false_joins({pair: ExpectedOverlap(60, 0) for pair in pairs}, explained) == []
 
 
 def test_two_false_joins_are_told_apart():
     """Two pairs of streets, each pair on one place, far from each other."""
-    meetings, explained = {}, {}
+    overlaps, explained = {}, {}
     for base in (0, 1000):
         for a in range(20):
             for side in (0, 100):
                 explained[base + side + a, base + side + a + 1] = PairSupport(500, 500, 0)
-                meetings[base + side + a, base + side + a + 1] = Meeting(60, 57)
+                overlaps[base + side + a, base + side + a + 1] = ExpectedOverlap(60, 57)
             for b in range(20):
                 alike = 8 <= a <= 10 and 8 <= b <= 10
-                meetings[base + a, base + 100 + b] = Meeting(60, 30 if alike else 0)
+                overlaps[base + a, base + 100 + b] = ExpectedOverlap(60, 30 if alike else 0)
                 if alike:
                     explained[base + a, base + 100 + b] = PairSupport(300, 300, 0)
     explained[20, 1000] = PairSupport(200, 200, 0)
-    meetings[5, 5000] = Meeting(40, 20)  # a photo that no pair holds
+    overlaps[5, 5000] = ExpectedOverlap(40, 20)  # a photo that no pair holds
 
-    found = find_false_joins(meetings, explained)
+    found = find_false_joins(overlaps, explained)
 
     assert len(found) == 2
     for join, base in zip(sorted(found, key=lambda one: one.pairs), (0, 1000), strict=True):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.mapping.part_mapping import LARGEST, SHARED_PHOTOS, SMALLEST, cut_group, link_weights
+from sfm_app.mapping.part_mapping import OPTIONS, cut_group, link_weights
 from sfm_app.posegraph.rotations import connected_groups
 from sfm_app.types import LookAlikes, PoseGraph, RelativePose
 
@@ -46,13 +46,13 @@ def test_parts_hold_every_photo_once_are_connected_balanced_and_overlap(photos, 
     parts = cut_group(graph, range(photos), size)
 
     assert sorted(photo for part in parts for photo in part.own) == list(range(photos))
-    assert all(SMALLEST * size <= len(part.own) <= LARGEST * size for part in parts)
+    assert all(OPTIONS.smallest * size <= len(part.own) <= OPTIONS.largest * size for part in parts)
     assert 0.75 * photos / size <= len(parts) <= 3.0 * photos / size
     assert all(is_connected(part.own, graph) and is_connected(part.photos, graph) for part in parts)
     for part in parts:
         assert set(part.own) < set(part.photos)
         others = [len(set(part.photos) & set(other.photos)) for other in parts if other is not part]
-        assert max(others) >= min(2 * SHARED_PHOTOS, 2 * reach)
+        assert max(others) >= min(2 * OPTIONS.shared_photos, 2 * reach)
 
 
 def test_a_cut_passes_through_the_thin_places():

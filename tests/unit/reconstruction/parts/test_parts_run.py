@@ -14,7 +14,7 @@ from sfm_app.mapping import parts
 from sfm_app.mapping import passes as mapping_passes
 from sfm_app.mapping.attempt import Attempt, Group, NoModel, PairSupport, best_attempt
 from sfm_app.mapping.part_mapping import FOLDER, PartResult, PartTask, map_part
-from sfm_app.mapping.parts import is_convincing, map_in_parts, part_size
+from sfm_app.mapping.parts import parts_suffice, map_in_parts, part_size
 from sfm_app.plugins import load_plugins
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.runtime.context import RunContext
@@ -46,7 +46,7 @@ def group(town):
 def start(group, tmp_path):
     """Maps the group in parts with some workers, in a folder of its own."""
 
-    def run_with(workers=2, *, whole=False, group=group, asked=True):
+    def run_with(workers=2, *, whole=False, group=group, stop_at_false_joins=True):
         place = Workspace(tmp_path / f"of-{workers}")
         place.photos.mkdir(parents=True)
         write_match_graph(place.database, group.matches)
@@ -55,7 +55,7 @@ def start(group, tmp_path):
         settings = Settings.from_mapping({"scene": {"part_photos": PART}})
         with make_executor(workers) as executor:
             run = RunContext(settings, place, load_plugins(installed=False), executor, workers)
-            found = map_in_parts(group, group.graph, run, asked=asked)
+            found = map_in_parts(group, group.graph, run, stop_at_false_joins=stop_at_false_joins)
             return found if whole else (found[0], run)
 
     return run_with
@@ -76,7 +76,7 @@ def test_parts_become_one_exact_model_with_all_photos_whatever_the_workers(town,
     true = town.centers[np.array(photos) - 1]
     away = np.linalg.norm(umeyama(centers, true)(centers) - true, axis=1)
     assert 0.0005 < np.median(away) < 0.1 and away.max() < 0.5
-    assert is_convincing(found, len(group.photos))
+    assert parts_suffice(found, len(group.photos))
     (figures,) = run.statistics["parts"]
     assert len(figures["parts"]) >= 3 and len(figures["joins"]) >= len(figures["parts"]) - 1
     assert not figures["dropped_joins"] and not figures["left_out"]
@@ -131,8 +131,8 @@ def test_where_no_part_is_mapped_the_reason_is_told(group, start, monkeypatch):
 
     (found,) = start()[0]
 
-    assert isinstance(found, NoModel) and found.note == "in 9 parts: none was mapped; failed: no memory"
-    assert not is_convincing([found], PHOTOS)
+    assert isinstance(found, NoModel) and found.note == "in 9 parts: no part has a model; failed: no memory"
+    assert not parts_suffice([found], PHOTOS)
 
 
 @pytest.mark.parametrize(("error", "passes"), [(ClusterError("gone"), True), (BackendError("failed"), False)])
@@ -176,7 +176,7 @@ def attempt(photos, contradicted=0, mapper="parts", matches=100):
     ([attempt(200)], True), ([attempt(195)], True), ([attempt(180)], False), ([attempt(200, 6)], False), ([], False),
 ])  # fmt: skip
 def test_a_model_of_parts_convinces_with_nearly_all_photos_and_few_contradictions(found, good):
-    assert is_convincing(found, 200) is good
+    assert parts_suffice(found, 200) is good
 
 
 @pytest.mark.parametrize(("of_parts", "taken"), [(attempt(200), "parts"), (attempt(100, matches=50), "whole")])
@@ -191,7 +191,7 @@ def test_the_whole_is_mapped_where_parts_do_not_explain_it(group, start, monkeyp
     monkeypatch.setattr(mapping_passes, "map_in_parts", lambda *_, **__: ([of_parts], ()))
     monkeypatch.setattr(mapping_passes, "part_size", lambda *_: 100)
 
-    found, joins = mapping_passes._map_by_size(replace(group, photos=tuple(range(200))), _run(), asked=True)
+    found, joins = mapping_passes._map_by_size(replace(group, photos=tuple(range(200))), _run(), stop_at_false_joins=True)
 
     assert best_attempt(found).mapper == taken and joins == ()
     assert len(whole) == (taken == "whole")
@@ -204,8 +204,8 @@ def test_parts_with_false_joins_are_not_joined_unless_nobody_asks(start, monkeyp
     monkeypatch.setattr(parts, "cut_group", lambda *_: [parts.Part((k,), (k,)) for k in (1, 2, 3)])
 
     assert start(1, whole=True) == ([], (join, LookAlikes(((5, 6),), 0.7)))
-    found, joins = start(2, whole=True, asked=False)
-    assert joins == () and [one.note for one in found] == ["in 3 parts: none was mapped; failed"]
+    found, joins = start(2, whole=True, stop_at_false_joins=False)
+    assert joins == () and [one.note for one in found] == ["in 3 parts: no part has a model; failed"]
 
 
 @pytest.mark.parametrize("asked", [True, False])
@@ -213,11 +213,11 @@ def test_false_joins_of_parts_go_up_and_nothing_else_is_mapped(group, monkeypatc
     join = LookAlikes(((1, 2),), 0.9)
     monkeypatch.setattr(mapping_passes, "map_group", lambda *_: pytest.fail("the whole was mapped"))
     monkeypatch.setattr(
-        mapping_passes, "map_in_parts", lambda *_, asked: ([], (join,)) if asked else ([attempt(200)], ())
+        mapping_passes, "map_in_parts", lambda *_, stop_at_false_joins: ([], (join,)) if stop_at_false_joins else ([attempt(200)], ())
     )
     monkeypatch.setattr(mapping_passes, "part_size", lambda *_: 100)
 
-    found, joins = mapping_passes._map_by_size(replace(group, photos=tuple(range(200))), _run(), asked=asked)
+    found, joins = mapping_passes._map_by_size(replace(group, photos=tuple(range(200))), _run(), stop_at_false_joins=asked)
 
     assert joins == ((join,) if asked else ()) and len(found) == (0 if asked else 1)
 

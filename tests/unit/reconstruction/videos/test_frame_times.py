@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfm_app.mapping.rolling_shutter import MIN_FRAMES, frame_times
+from sfm_app.mapping.rolling_shutter import OPTIONS, frame_times
 from sfm_app.types import MatchedImage
 
 
@@ -23,7 +23,7 @@ def test_times_are_those_of_the_video_and_the_interval_that_of_its_frames():
 @pytest.mark.parametrize(
     "images",
     [
-        frames(range(MIN_FRAMES - 1)),
+        frames(range(OPTIONS.min_frames - 1)),
         frames(range(20), times=[None] * 20),
         frames(range(20), times=[*(k / 30 for k in range(19)), None]),
         frames(range(20), times=[0.0] * 20),

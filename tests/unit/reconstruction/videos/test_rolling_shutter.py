@@ -109,7 +109,7 @@ def test_a_model_that_could_not_be_adjusted_is_not_asked(still):
 
 
 def test_too_many_frames_are_not_asked_and_the_reason_is_given(still, monkeypatch):
-    monkeypatch.setattr(rolling_shutter, "MAX_FRAMES", KIND.frames - 1)
+    monkeypatch.setattr(rolling_shutter, "OPTIONS", replace(rolling_shutter.OPTIONS, max_frames=KIND.frames - 1))
     said = Said()
 
     model, found = follow(still, said)
