@@ -62,7 +62,7 @@ OPTIONS = CalibratingOptions()
 def select_inliers_through_lens(
     matches: MatchGraph, views: ViewGraph, cameras: Sequence[CalibratedCamera], run: RunContext
 ) -> ViewGraph:
-    """Select the inliers of pairs through the lenses of known cameras; return the same graph where none bends."""
+    """Choose the inliers of pairs through the lenses of known cameras; return the same graph where none bends."""
     known = {photo: camera.found for camera in cameras for photo in camera.photos if camera.found.is_estimated}
     pairs = [pair for pair, fit in views.fits.items() if not fit.degeneracy and _is_bent(pair, known, views, matches)]
     if not pairs:

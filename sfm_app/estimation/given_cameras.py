@@ -178,7 +178,7 @@ class Contradiction:
 
 
 def report_checks(checked: Mapping[str, tuple[Calibration, Calibration | None]], run: RunContext) -> None:
-    """Warn of contradictions, and record all checks: by name the given camera and that of the photos, if any."""
+    """Announce contradictions, and record all checks: by name the given camera and that of the photos, if any."""
     if not checked:
         return
     contradictions = {
@@ -288,7 +288,7 @@ def shown_share(image: MatchedImage) -> float:
 
 
 def report_claims(found: Mapping[str, FocalClaim | None], run: RunContext) -> None:
-    """Report the claims that the photos contradict, and record all, by name of the camera."""
+    """Announce the claims that the photos contradict, and record all, by name of the camera."""
     known = {name: claim for name, claim in found.items() if claim is not None}
     if not known:
         return

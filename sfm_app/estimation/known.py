@@ -118,7 +118,7 @@ def _is_contradicted(
     camera: Calibration, images: Sequence[MatchedImage], matches: MatchGraph, views: ViewGraph, run: RunContext,
     known: Collection[str],
 ) -> bool:  # fmt: skip
-    """Tell whether EXIF or the pairs of the new photos of a group contradict the camera."""
+    """Return whether EXIF or the pairs of the new photos of a group contradict the camera."""
     new = [image for image in images if image.name not in known]
     claim, before = (
         focal_claim(some, camera.focal_px, camera.spread["fx"])
@@ -148,7 +148,7 @@ def _pair_contradictions(
 
 
 def _is_zoom(one: Contradiction) -> bool:
-    """Tell whether two cameras differ by more than focusing changes."""
+    """Return whether two cameras differ by more than focusing changes."""
     return one.what not in CENTERS and abs(one.given_px - one.found_px) > 0.05 * one.found_px  # chosen by hand
 
 

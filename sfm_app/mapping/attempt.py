@@ -218,7 +218,7 @@ def saturate(matches: Sequence[int]) -> FloatArray:
 
 
 def are_many_unregistered(lost: int, photos: int) -> bool:
-    """Tell whether unregistered photos justify another mapping of all photos."""
+    """Return whether unregistered photos justify another mapping of all photos."""
     return lost > 0 and (photos < MAPPING.many_photos or lost >= MAPPING.few_lost * photos)
 
 
@@ -395,7 +395,7 @@ def choice_reason(best: Attempt, results: Sequence[MappingResult], photos: int) 
 
 
 def _is_complete_and_consistent(attempt: Attempt, photos: int) -> bool:
-    """Tell whether a model holds all photos, and hardly any inliers contradict it."""
+    """Return whether a model holds all photos, and hardly any inliers contradict it."""
     inliers = sum(pair.inliers for pair in attempt.explained.values())
     against = sum(pair.contradicted for pair in attempt.explained.values())
     return attempt.photos == photos and against <= MAPPING.max_contradicted_share * inliers
@@ -446,7 +446,7 @@ def _run_first_round(
 
 
 def _likely_needs_one_mapper(group: Group) -> bool:
-    """Tell whether cameras are well known, and hardly any pair contradicts the others."""
+    """Return whether cameras are well known, and hardly any pair contradicts the others."""
     inside = set(group.photos)
     posed = sum(inside.issuperset(pair) for pair in group.graph.poses)
     dropped = sum(inside.issuperset(pair) for pair in group.graph.dropped)
@@ -455,7 +455,7 @@ def _likely_needs_one_mapper(group: Group) -> bool:
 
 
 def _has_placed_enough(results: Sequence[MappingResult], photos: int) -> bool:
-    """Tell whether another seed is unlikely to place more photos."""
+    """Return whether another seed is unlikely to place more photos."""
     counts = [attempt.photos for attempt in results if isinstance(attempt, Attempt)]
     largest = max(counts, default=0)
     return largest >= MAPPING.enough_share * photos or (
@@ -502,7 +502,7 @@ def _grow(group: Group, start: Reconstruction, run: RunContext, token: Cancellat
 
 
 def is_focal_accurate(camera: Calibration) -> bool:
-    """Tell whether a focal is known so well that the first photos of a mapping cannot improve it."""
+    """Return whether a focal is known so well that the first photos of a mapping cannot improve it."""
     spread = 0.0 if camera.is_kept else camera.spread.get("fx", np.inf)
     return camera.identifiable and spread <= MAPPING.max_focal_deviation * camera.K[0, 0]
 

@@ -185,7 +185,7 @@ def _retry_pairs(first: MappedScene, pairs: Sequence[PairId], report: dict[str, 
 
 
 def _is_mostly_calibrated(scene: MappedScene) -> bool:
-    """Tell whether pairs determine the cameras of at least half of the photos; more pairs then change little."""
+    """Return whether pairs determine the cameras of at least half of the photos; more pairs then change little."""
     images = scene.matches.images.values()
     return 2 * sum(scene.intrinsics.camera(image).is_estimated for image in images) >= len(images)
 
@@ -205,7 +205,7 @@ def _placed_count(outcome: Outcome) -> int:
 
 
 def _places_and_explains_more(second: MappedScene, first: MappedScene) -> bool:
-    """Tell whether the second main model places more photos, and explains more of all matches."""
+    """Return whether the second main model places more photos, and explains more of all matches."""
     if not second.outcome.models or _placed_count(second.outcome) <= _placed_count(first.outcome):
         return False
     models = [_judge(second, scene.outcome) for scene in (first, second) if scene.outcome.models]

@@ -103,7 +103,7 @@ def map_baseline(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, 
 
 
 def is_focal_doubtful(model: Attempt | None, intrinsics: Intrinsics, views: ViewGraph) -> bool:
-    """Tell whether a wrong guess of the focal may be why photos that match others are unregistered.
+    """Return whether a wrong guess of the focal may be why photos that match others are unregistered.
 
     This is not so where any camera is known. With many photos, a pass costs more than it promises.
     """
@@ -132,7 +132,7 @@ def guessed_intrinsics(intrinsics: Intrinsics, sides: float = GUESSED_FOCAL) -> 
 
 
 def has_stated_focal(camera: Calibration) -> bool:
-    """Tell whether the focal comes from EXIF or from the user."""
+    """Return whether the focal comes from EXIF or from the user."""
     return camera.method == "exif" or camera.is_given
 
 
@@ -150,7 +150,7 @@ def _guess_by_sides(camera: Calibration, sides: float) -> Calibration:
 def is_shared_camera_doubtful(
     model: Attempt | None, intrinsics: Intrinsics, views: ViewGraph, settings: Settings
 ) -> bool:
-    """Tell whether photos of one size may have a camera each: the model is contradicted, or lacks many photos.
+    """Return whether photos of one size may have a camera each: the model is contradicted, or lacks many photos.
 
     A user's choice of which photos share a camera stays.
     """
@@ -210,14 +210,14 @@ def with_two_cameras(model: Attempt, each: Intrinsics, matches: MatchGraph) -> I
 
 
 def two_cameras_suffice(two: Attempt | None, own: Attempt) -> bool:
-    """Tell whether a model with two cameras explains the matches as well as one with a camera per photo."""
+    """Return whether a model with two cameras explains the matches as well as one with a camera per photo."""
     if two is None or two.photos < own.photos or two.support < (1.0 - MAPPING.equal_tolerance) * own.support:
         return False
     return _contradicted_share(two) <= _contradicted_share(own) + OPTIONS.share_tolerance
 
 
-def own_cameras_explain_more(own: Attempt | None, shared: Attempt) -> bool:
-    """Tell whether a camera per photo explains more matches, and registers more photos or removes contradictions."""
+def camera_per_photo_explains_more(own: Attempt | None, shared: Attempt) -> bool:
+    """Return whether a camera per photo explains more matches, and registers more photos or removes contradictions."""
     if own is None or own.photos < shared.photos or own.support <= shared.support:
         return False
     return own.photos > shared.photos or _contradicted_share(own) <= OPTIONS.max_remaining_share * _contradicted_share(

@@ -129,7 +129,7 @@ def _range(counts: Sequence[int]) -> str:
 
 
 def parts_suffice(attempts: Sequence[MappingResult], photos: int) -> bool:
-    """Tell whether a model of parts makes mapping of the whole group of `photos` photos needless."""
+    """Return whether a model of parts makes mapping of the whole group of `photos` photos needless."""
     best = best_attempt(attempts)
     if best is None or are_many_unregistered(photos - best.photos, photos):
         return False

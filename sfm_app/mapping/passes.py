@@ -23,11 +23,11 @@ from sfm_app.mapping.attempt import (
     photo_names,
 )
 from sfm_app.mapping.hypotheses import (
+    camera_per_photo_explains_more,
     guessed_intrinsics,
     is_focal_doubtful,
     is_shared_camera_doubtful,
     map_baseline,
-    own_cameras_explain_more,
     rival_reason,
     two_cameras_suffice,
     with_camera_per_photo,
@@ -210,7 +210,7 @@ def _try_camera_per_photo(
     own = _run_pass(matches, views, each, run)
     own = try_rival(own, matches, views, each, run)
     tried = (*outcome.tried, *(f"{note} (a camera for each photo)" for note in own.tried))
-    if not own_cameras_explain_more(own.main, main):
+    if not camera_per_photo_explains_more(own.main, main):
         _write_graph(outcome.graph, outcome.intrinsics, matches, run)
         return replace(outcome, tried=tried, one_camera_each="left")
     return _try_two_cameras(
@@ -246,7 +246,7 @@ def _with_merged_models(outcome: Outcome, matches: MatchGraph, views: ViewGraph,
 
 
 def needs_another_pass(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:
-    """Tell whether another pass with the cameras of the model may improve it.
+    """Return whether another pass with the cameras of the model may improve it.
 
     That is so if they differ from the cameras of the last pass, or if photos of the main group are missing.
     """

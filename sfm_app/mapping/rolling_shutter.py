@@ -156,7 +156,7 @@ def _compensate(
 
 
 def _has_converged(before: ReadoutEstimate | None, after: ReadoutEstimate) -> bool:
-    """Tell whether the readout has not changed since the round before."""
+    """Return whether the readout has not changed since the round before."""
     return before is not None and abs(after.readout - before.readout) <= OPTIONS.converged * after.deviation
 
 

@@ -108,7 +108,7 @@ def _part(attempt: Attempt, photos: Sequence[int]) -> Attempt:
 def merge_into_main(
     models: tuple[Attempt, ...], matches: MatchGraph, views: ViewGraph, run: RunContext
 ) -> tuple[Attempt, ...]:
-    """Merge into the main model, the first, all others that fit; the rest stay unchanged. No two hold one photo."""
+    """Join to the main model, the first, all others that fit; the rest stay unchanged. No two hold one photo."""
     main, others = models[0], list(models[1:])
     waiting = list(others)
     while waiting:
@@ -124,7 +124,7 @@ def merge_into_main(
 def _merge_pair(
     first: Attempt, second: Attempt, matches: MatchGraph, views: ViewGraph, run: RunContext
 ) -> Attempt | None:
-    """Merge both models; return None where they share too few points, or matches contradict the merge."""
+    """Join both models; return None where they share too few points, or matches contradict the merge."""
     shared = shared_points(first.model, second.model, matches, views)
     if len(shared) < OPTIONS.min_shared:
         return None

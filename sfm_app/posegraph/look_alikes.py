@@ -334,7 +334,7 @@ class FeatureTracks:
         return int(np.count_nonzero(tracked & (first == second))), int(np.count_nonzero(tracked))
 
     def is_contradicted_by(self, pair: PairId, rows: IndexArray, least: int = OPTIONS.min_tracked) -> bool:
-        """Tell whether a pair joins points on different tracks; no with fewer than `least` tracked matches."""
+        """Return whether a pair joins points on different tracks; no with fewer than `least` tracked matches."""
         same, tracked = self.count_agreement(pair, rows)
         return tracked >= least and same <= OPTIONS.same_track_share * tracked
 
@@ -349,7 +349,7 @@ class LookAlikeVerdict:
     tracks: FeatureTracks
 
     def is_look_alike(self, pair: PairId, rows: IndexArray) -> bool:
-        """Tell whether a pair that was estimated later joins look-alikes, too, by its matches (N, 2)."""
+        """Return whether a pair that was estimated later joins look-alikes, too, by its matches (N, 2)."""
         return bool(self.joins) and self.tracks.is_contradicted_by(pair, rows, OPTIONS.min_tracked_nearby)
 
 

@@ -116,7 +116,8 @@ def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray,
 # Refinement. F has seven parameters, a relative pose five: with K known, the other two no longer fit noise.
 
 SIGMAS_PX = (0.5, 0.2)
-"""Scales of the Cauchy loss, one after the other: keypoints are accurate to about 0.2 px."""
+"""Scales of the Cauchy loss, one after the other: keypoints are accurate to about 0.2 px. Measured; docs/algorithms.md, From K
+to relative poses."""
 STEPS = 12
 """Largest number of steps at each scale. Chosen by hand."""
 DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e6)
@@ -359,7 +360,7 @@ def _refine_best_start(pair: Pair, fit: EpipolarFit, start: Pose) -> Pose:
 
 
 def _is_known(pose: Pose, tried: Sequence[Pose]) -> bool:
-    """Tell whether a pose was tried; t and -t have the same epipolar lines."""
+    """Return whether a pose was tried; t and -t have the same epipolar lines."""
     R, t = pose
     differences = (max(np.abs(R - A).max(), min(np.abs(t - b).max(), np.abs(t + b).max())) for A, b in tried)
     return bool(min(differences) < OPTIONS.same_pose)

@@ -15,7 +15,7 @@ from sfm_app.mapping.hypotheses import (
     OPTIONS,
     is_shared_camera_doubtful,
     two_cameras_suffice,
-    own_cameras_explain_more,
+    camera_per_photo_explains_more,
     with_camera_per_photo,
     with_two_cameras,
 )
@@ -105,7 +105,7 @@ def test_a_camera_that_pairs_determine_is_not_divided(synthetic, cameras):
     ],
 )
 def test_it_is_taken_where_it_explains_more_and_contradictions_go(own, better):
-    assert own_cameras_explain_more(own, attempt(photos(6), 10)) is better
+    assert camera_per_photo_explains_more(own, attempt(photos(6), 10)) is better
 
 
 def each_of(synthetic, cameras, focals):

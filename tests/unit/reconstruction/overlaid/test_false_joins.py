@@ -63,7 +63,7 @@ def test_photos_whose_matches_hold_are_no_strangers():
 
 
 def test_a_few_strangers_prove_nothing():
-    pairs = [(a, a + 100) for a in range(OVERLAPS - 1)]
+    pairs = [(a, a + 100) for a in range(OVERLAPS.min_pairs - 1)]
     explained = {(0, 100): PairSupport(300, 300, 0)} | {
         (a + side, a + 1 + side): PairSupport(500, 500, 0) for a in range(20) for side in (0, 100)
     }

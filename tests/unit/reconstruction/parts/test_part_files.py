@@ -59,7 +59,7 @@ def test_inputs_are_read_back_as_they_were(street, tmp_path):
     found = again.part
 
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    assert again.mapped == {(21, 22), (21, 23)} and again.settings == settings and again.asked
+    assert again.mapped == {(21, 22), (21, 23)} and again.settings == settings and again.stop_at_false_joins
     assert found.photos == part.photos and found.matches.images == part.matches.images
     assert list(found.matches.matches) == list(part.matches.matches)
     assert all(np.array_equal(found.matches.matches[pair], rows) for pair, rows in part.matches.matches.items())
