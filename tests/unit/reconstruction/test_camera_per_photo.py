@@ -13,13 +13,13 @@ from sfm_app.mapping import passes as module
 from sfm_app.mapping.attempt import Attempt, NoModel, PairSupport, explained_pairs
 from sfm_app.mapping.hypotheses import (
     OPTIONS,
+    camera_per_photo_explains_more,
     is_shared_camera_doubtful,
     two_cameras_suffice,
-    camera_per_photo_explains_more,
     with_camera_per_photo,
     with_two_cameras,
 )
-from sfm_app.mapping.passes import reconstruct
+from sfm_app.mapping.passes import Mappers, reconstruct
 from sfm_app.settings import Settings
 from sfm_app.types import ViewGraph
 
@@ -169,11 +169,10 @@ def zoom(monkeypatch, synthetic):
                 }
             return [Attempt("incremental", model, explained, f"{len(names)} cameras")]
 
-        monkeypatch.setattr(module, "map_group", attempts)
-        monkeypatch.setattr(module, "map_baseline", lambda *_: NoModel("colmap", "no rival"))
+        mappers = Mappers(map_group=attempts, map_baseline=lambda *_: NoModel("colmap", "no rival"))
         monkeypatch.setattr(module, "with_two_cameras", lambda *_: None)
         monkeypatch.setattr(module, "OPTIONS", replace(module.OPTIONS, max_passes=1))
-        return asked
+        return asked, mappers
 
     return make
 
@@ -184,9 +183,9 @@ def cameras_in(path):
 
 
 def test_photos_of_a_zoom_are_mapped_with_a_camera_each(synthetic, run, cameras, zoom):
-    asked = zoom(right=True)
+    asked, mappers = zoom(right=True)
 
-    found = reconstruct(synthetic.matches, synthetic.views, cameras(method="guess", identifiable=False), run())
+    found = reconstruct(synthetic.matches, synthetic.views, cameras(method="guess", identifiable=False), run(), mappers)
 
     assert asked == [1, 6]
     assert len(found.intrinsics.cameras) == 6 and cameras_in(run().workspace.database) == 6
@@ -195,10 +194,10 @@ def test_photos_of_a_zoom_are_mapped_with_a_camera_each(synthetic, run, cameras,
 
 def test_photos_of_one_camera_keep_it_and_so_does_the_database(synthetic, run, cameras, zoom, monkeypatch):
     monkeypatch.setattr(module, "is_shared_camera_doubtful", lambda *_: True)
-    asked = zoom(right=False)
+    asked, mappers = zoom(right=False)
     guess = cameras(method="guess", identifiable=False)
 
-    found = reconstruct(synthetic.matches, synthetic.views, guess, run())
+    found = reconstruct(synthetic.matches, synthetic.views, guess, run(), mappers)
 
     assert asked == [1, 6]
     assert found.intrinsics is guess and cameras_in(run().workspace.database) == 1

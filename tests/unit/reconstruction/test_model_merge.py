@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sfm_app.colmap.database import write_match_graph
 from sfm_app.colmap.model import move, posed_photo_ids, poses_and_points, submodel
 from sfm_app.geometry.poses import Similarity, umeyama
 from sfm_app.mapping import passes
 from sfm_app.mapping.attempt import judge_model
-from sfm_app.mapping.passes import reconstruct
 from sfm_app.mapping.split_and_merge import OPTIONS, merge_into_main, shared_points
 from sfm_app.types import ViewGraph
 
@@ -74,13 +74,13 @@ def test_matches_that_disagree_about_the_place_join_nothing(synthetic, halves, r
     assert merge_into_main(halves, replace(synthetic.matches, matches=rows), synthetic.views, run()) == halves
 
 
-def test_models_that_mapping_left_apart_are_joined_in_the_end(synthetic, halves, run, cameras, monkeypatch):
+def test_models_that_mapping_left_apart_are_joined_in_the_end(synthetic, halves, run, cameras):
     made = passes.Outcome(halves, _graph(synthetic), cameras(), ("half", "half"))
-    monkeypatch.setattr(passes, "_run_pass", lambda *_: made)
-    monkeypatch.setattr(passes, "try_rival", lambda outcome, *_: outcome)
-    monkeypatch.setattr(passes, "OPTIONS", replace(passes.OPTIONS, max_passes=1))
 
-    found = reconstruct(synthetic.matches, synthetic.views, cameras(), run())
+    context = run()
+    write_match_graph(context.workspace.database, synthetic.matches)
+
+    found = passes.Passes(context).merge_models(made, synthetic.matches, synthetic.views)
 
     assert [model.photos for model in found.models] == [6]
     assert found.reason == found.tried[-1] == found.models[0].note

@@ -53,8 +53,12 @@ def test_inputs_are_read_back_as_they_were(street, tmp_path):
     part = part_of_group(group, range(21, 41), pairs)
     settings = Settings.from_mapping({"seed": 7, "scene": {"part_photos": 33}})
 
-    write_inputs(tmp_path / "a.npz", PartInputs(part, frozenset([(21, 22), (21, 23)]), settings, stop_at_false_joins=True))
-    write_inputs(tmp_path / "b.npz", PartInputs(part, frozenset([(21, 23), (21, 22)]), settings, stop_at_false_joins=True))
+    write_inputs(
+        tmp_path / "a.npz", PartInputs(part, frozenset([(21, 22), (21, 23)]), settings, stop_at_false_joins=True)
+    )
+    write_inputs(
+        tmp_path / "b.npz", PartInputs(part, frozenset([(21, 23), (21, 22)]), settings, stop_at_false_joins=True)
+    )
     again = read_inputs(tmp_path / "a.npz")
     found = again.part
 

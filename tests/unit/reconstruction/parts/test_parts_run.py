@@ -11,10 +11,10 @@ from sfm_app.colmap.model import poses_and_points
 from sfm_app.errors import BackendError, ClusterError
 from sfm_app.geometry.poses import umeyama
 from sfm_app.mapping import parts
-from sfm_app.mapping import passes as mapping_passes
 from sfm_app.mapping.attempt import Attempt, Group, NoModel, PairSupport, best_attempt
 from sfm_app.mapping.part_mapping import FOLDER, PartResult, PartTask, map_part
-from sfm_app.mapping.parts import parts_suffice, map_in_parts, part_size
+from sfm_app.mapping.parts import map_in_parts, part_size, parts_suffice
+from sfm_app.mapping.passes import Mappers, Passes
 from sfm_app.plugins import load_plugins
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.runtime.context import RunContext
@@ -180,18 +180,18 @@ def test_a_model_of_parts_convinces_with_nearly_all_photos_and_few_contradiction
 
 
 @pytest.mark.parametrize(("of_parts", "taken"), [(attempt(200), "parts"), (attempt(100, matches=50), "whole")])
-def test_the_whole_is_mapped_where_parts_do_not_explain_it(group, start, monkeypatch, of_parts, taken):
+def test_the_whole_is_mapped_where_parts_do_not_explain_it(group, of_parts, taken):
     whole = []
 
     def map_whole(*_):
         whole.append(attempt(190, mapper="whole"))
         return whole
 
-    monkeypatch.setattr(mapping_passes, "map_group", map_whole)
-    monkeypatch.setattr(mapping_passes, "map_in_parts", lambda *_, **__: ([of_parts], ()))
-    monkeypatch.setattr(mapping_passes, "part_size", lambda *_: 100)
+    mappers = Mappers(lambda *_: 100, map_whole, lambda *_, **__: ([of_parts], ()))
 
-    found, joins = mapping_passes._map_by_size(replace(group, photos=tuple(range(200))), _run(), stop_at_false_joins=True)
+    found, joins = Passes(_run(), mappers).map_by_size(
+        replace(group, photos=tuple(range(200))), stop_at_false_joins=True
+    )
 
     assert best_attempt(found).mapper == taken and joins == ()
     assert len(whole) == (taken == "whole")
@@ -209,15 +209,17 @@ def test_parts_with_false_joins_are_not_joined_unless_nobody_asks(start, monkeyp
 
 
 @pytest.mark.parametrize("asked", [True, False])
-def test_false_joins_of_parts_go_up_and_nothing_else_is_mapped(group, monkeypatch, asked):
+def test_false_joins_of_parts_go_up_and_nothing_else_is_mapped(group, asked):
     join = LookAlikes(((1, 2),), 0.9)
-    monkeypatch.setattr(mapping_passes, "map_group", lambda *_: pytest.fail("the whole was mapped"))
-    monkeypatch.setattr(
-        mapping_passes, "map_in_parts", lambda *_, stop_at_false_joins: ([], (join,)) if stop_at_false_joins else ([attempt(200)], ())
-    )
-    monkeypatch.setattr(mapping_passes, "part_size", lambda *_: 100)
 
-    found, joins = mapping_passes._map_by_size(replace(group, photos=tuple(range(200))), _run(), stop_at_false_joins=asked)
+    def in_parts(*_, stop_at_false_joins):
+        return ([], (join,)) if stop_at_false_joins else ([attempt(200)], ())
+
+    mappers = Mappers(lambda *_: 100, lambda *_: pytest.fail("the whole was mapped"), in_parts)
+
+    found, joins = Passes(_run(), mappers).map_by_size(
+        replace(group, photos=tuple(range(200))), stop_at_false_joins=asked
+    )
 
     assert joins == ((join,) if asked else ()) and len(found) == (0 if asked else 1)
 
