@@ -111,7 +111,7 @@ def open_run(out: Path, settings: Settings, progress: Progress | Callback | None
     plugins.calibrator(settings.calibration.calibrator)
     plugins.feature_method(settings.matching.features)
     place, shown = Workspace(out), as_progress(progress)
-    with open_executor(settings, place.parcels, shown) as (executor, workers):
+    with open_executor(settings, place.cluster_files, shown) as (executor, workers):
         yield RunContext(settings, place, plugins, executor, workers, shown)
 
 

@@ -76,9 +76,6 @@ def read_colmap_binary(data: bytes) -> dict[str, Calibration]:
 def read_colmap_folder(folder: Path) -> tuple[dict[str, Calibration], dict[str, str]]:
     """Return the cameras of a model by their ids, and the id by photo where there is a file of its images.
 
-    Args:
-        folder: holds one of `CAMERA_FILES`.
-
     Raises:
         OSError: a file cannot be read.
         ValueError: a file is damaged, or no run can use a camera.
@@ -288,9 +285,6 @@ def is_opensfm_camera(values: Mapping[str, Any]) -> bool:
 def opensfm_camera(values: Mapping[str, Any]) -> Calibration:
     """Return the camera of OpenSfM's values.
 
-    Args:
-        values: one entry of the file.
-
     Raises:
         ValueError: no run can use its projection type, or they are no camera.
     """
@@ -384,9 +378,6 @@ Cameras = tuple[dict[str, Calibration], dict[str, str]]
 
 def read_given_cameras(path: Path) -> GivenCameras:
     """Read a calibration file of any known form, or a folder that holds one.
-
-    Args:
-        path: file or folder.
 
     Raises:
         InputError: it is missing, of no known form, or holds values that are no camera.

@@ -107,12 +107,6 @@ class DemoResult:
 def run_demo(out: Path, scene: str, settings: Settings, progress: Progress) -> tuple[Run, DemoResult]:
     """Render OUT/photos, reconstruct them into OUT/model, compare, and draw OUT/model.png.
 
-    Args:
-        out: output folder.
-        scene: one of `SCENES`.
-        settings: of the reconstruction.
-        progress: display.
-
     Raises:
         SfmError: see `sfm_app.errors`.
     """
@@ -136,13 +130,6 @@ def render_photos(
     out: Path, scene: str, settings: Settings, progress: Progress, scenes: Mapping[str, DemoScene] = SCENES
 ) -> Truth:
     """Return the ground truth of the photos in OUT/photos; those that are missing are rendered.
-
-    Args:
-        out: output folder.
-        scene: its name in `scenes`.
-        settings: `workers` processes render.
-        progress: display.
-        scenes: by name.
 
     Raises:
         InputError: the folder has photos of another scene.
@@ -176,13 +163,7 @@ def _is_of(truth: Truth, views: Views) -> bool:
 
 
 def draw(model: Model, scene: Scene, out: Path) -> None:
-    """Draw OUT/model.png: a photo and the model from the same pose; below, the model from the side and from behind.
-
-    Args:
-        model: the finished model.
-        scene: cameras and poses of the photos.
-        out: output folder, which has the photos and gets the picture.
-    """
+    """Draw OUT/model.png: a photo and the model from the same pose; below, the model from the side and from behind."""
     names = sorted(scene.cam_from_world)
     name = names[len(names) // 2]
     found = scene.cameras[scene.camera_of[name]]
@@ -200,16 +181,7 @@ def camera_of(found: CameraModel) -> Camera:
 
 
 def evaluate(run: Run, scene: Scene, model: Model, truth: Truth, seconds: tuple[float, float], out: Path) -> DemoResult:
-    """Measure how close the reconstruction came to the ground truth.
-
-    Args:
-        run: the finished run.
-        scene: its cameras and poses.
-        model: its surface and texture.
-        truth: the rendered scene.
-        seconds: spent on rendering, and on the reconstruction.
-        out: output folder.
-    """
+    """Measure how close the reconstruction came to the ground truth."""
     refined = next(iter(scene.cameras.values())).K
     found = run.calibration.K if run.calibration else refined
     centers = {name: camera_center(pose) for name, pose in scene.cam_from_world.items()}

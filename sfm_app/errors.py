@@ -18,19 +18,16 @@ from typing import ClassVar
 
 
 class SfmError(Exception):
-    """Base class: what went wrong, in one line, and what the user can do about it.
+    """Base class: one line about the error, and one about the remedy.
 
     Args:
-        message: one line.
-        hint: what to do, one line; may be empty.
-        photos: the photos concerned, each with its reason.
+        photos: reason by photo.
     """
 
     exit_code: ClassVar[int] = 1
 
     def __init__(self, message: str, hint: str = "", photos: Mapping[str, str] | None = None) -> None:
-        # Both go to the base class, so that the error survives pickling between worker processes.
-        super().__init__(message, hint)
+        super().__init__(message, hint)  # both, for pickling
         self.message = message
         self.hint = hint
         self.photos = dict(photos or {})
@@ -52,13 +49,7 @@ class InputError(SfmError):
 
 
 class DamagedProductError(InputError):
-    """The files of a stage in the output folder can no longer be read.
-
-    Args:
-        message: one line.
-        hint: what to do, one line.
-        stage: name of the stage that has to run again.
-    """
+    """The files of a stage in the output folder can no longer be read; the stage has to run again."""
 
     def __init__(self, message: str, hint: str, stage: str) -> None:
         super().__init__(message, hint)

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.backend import Reconstruction, translate_errors
 from sfm_app.colmap.dense import shrink_mask
 from sfm_app.colmap.model import model_arrays, posed_images, read_model, sparse_model
 from sfm_app.colmap.perspective import (
@@ -24,7 +24,6 @@ from sfm_app.colmap.perspective import (
     write_view_model,
 )
 from sfm_app.colmap.surface import FUSED, open_points, positions
-from sfm_app.colmap.types import Reconstruction
 from sfm_app.colmap.wide_views import WideLens, render_views, save_picture
 from sfm_app.engine.stage import Products, Stage, check_undamaged, resume_hint
 from sfm_app.errors import InputError

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from sfm_app.operating_system import is_link, replace_file
 
-# Atomic writes of files, and markers of folders that the run after a killed one can go on filling.
+# Atomic writes, and markers of folders that the run after a killed one may resume.
 
 UNFINISHED = "unfinished.txt"
-"""Marker in a folder that a stage is filling: the fingerprint of the inputs, by which a killed run can resume."""
+"""Marker in a folder that a stage is filling: the fingerprint of the inputs."""
 
 
 @contextlib.contextmanager
@@ -34,12 +34,7 @@ def replace_atomically(target: Path) -> Iterator[Path]:
 
 
 def resume_or_clear(folder: Path, made_from: str) -> bool:
-    """Return whether a killed run was filling this folder from the same inputs; remove the folder if not.
-
-    Args:
-        folder: may be missing.
-        made_from: fingerprint of the inputs.
-    """
+    """Return whether a killed run was filling this folder from the same inputs (fingerprint); if not, remove it."""
     if is_made_from(folder / UNFINISHED, made_from):
         return True
     shutil.rmtree(folder, ignore_errors=True)
@@ -47,12 +42,7 @@ def resume_or_clear(folder: Path, made_from: str) -> bool:
 
 
 def is_made_from(marker: Path, made_from: str) -> bool:
-    """Return whether a marker holds this fingerprint.
-
-    Args:
-        marker: text file; may be missing.
-        made_from: fingerprint of the inputs.
-    """
+    """Return whether a marker file, which may be missing, holds this fingerprint."""
     try:
         return marker.read_text(encoding="utf-8") == made_from
     except (OSError, UnicodeDecodeError):
@@ -60,12 +50,7 @@ def is_made_from(marker: Path, made_from: str) -> bool:
 
 
 def mark_unfinished(folder: Path, made_from: str) -> None:
-    """Mark a folder as unfinished, so that a killed run can resume there.
-
-    Args:
-        folder: created if it is missing.
-        made_from: fingerprint of the inputs.
-    """
+    """Mark a folder as unfinished with the fingerprint of its inputs, so that a killed run can resume."""
     with replace_atomically(folder / UNFINISHED) as path:
         path.write_text(made_from, encoding="utf-8", newline="\n")
 
@@ -76,12 +61,7 @@ def mark_finished(folder: Path) -> None:
 
 
 def save_files(files: Mapping[str, bytes], folder: Path) -> tuple[Path, ...]:
-    """Write files, each atomically, the first one last because it refers to the others.
-
-    Args:
-        files: contents by file name.
-        folder: where they go.
-    """
+    """Write files by name, each atomically, the first one last because it refers to the others."""
     paths = tuple(folder / name for name in files)
     for path, data in reversed(list(zip(paths, files.values(), strict=True))):
         with replace_atomically(path) as beside:
@@ -89,11 +69,11 @@ def save_files(files: Mapping[str, bytes], folder: Path) -> tuple[Path, ...]:
     return paths
 
 
-# Hashes of files, and reading of arrays within limits, since files may have been damaged.
+# Hashes, and arrays within limits, since files may be damaged.
 
 MOST_BYTES, MOST_INFLATED = 1_000_000_000, 200
-"""A file is refused if its arrays exceed both: this many bytes, and this many times the size of the file. Our own
-exceed one at most; deflate reaches 1000 times with zeros."""
+"""Limits of arrays: bytes, and multiple of the file's size. A file that exceeds both is refused; deflate reaches 1000
+times with zeros. By hand."""
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -101,7 +81,7 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it holds something else, or exceeds the limits. Damaged files raise many other errors.
+        ValueError: it is no such file, or exceeds the limits. Damaged files raise many other errors.
     """
     # opened here, because NumPy leaves a damaged file open
     with path.open("rb") as file:
@@ -115,7 +95,7 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def digest_file(path: Path) -> str:
-    """Return hash of the bytes of a file.
+    """Return a hash of the bytes of a file.
 
     Raises:
         OSError: it cannot be read.
@@ -130,11 +110,11 @@ def digest_files(root: Path, *names: str) -> str:
     Raises:
         FileNotFoundError: one of them is missing.
     """
-    found = hashlib.blake2b(digest_size=16)
+    digest = hashlib.blake2b(digest_size=16)
     for name in names:
         for path in _files(root / name):
-            found.update(f"{path.relative_to(root).as_posix()!r} {digest_file(path)}\n".encode())
-    return found.hexdigest()
+            digest.update(f"{path.relative_to(root).as_posix()!r} {digest_file(path)}\n".encode())
+    return digest.hexdigest()
 
 
 def fingerprint(*parts: Any) -> str:
@@ -144,8 +124,8 @@ def fingerprint(*parts: Any) -> str:
 
 
 def is_below(name: str) -> bool:
-    """Return whether a name stays below the folder that it is joined to, judging by the name alone."""
-    path = PurePath(name)  # a drive of Windows leads elsewhere without being absolute
+    """Return whether a joined name stays below its folder, judging by the name alone."""
+    path = PurePath(name)  # a drive of Windows is not absolute
     return bool(path.parts) and not path.anchor and ".." not in path.parts and "\0" not in name
 
 
@@ -153,5 +133,5 @@ def _files(path: Path) -> Iterator[Path]:
     if not path.is_dir():
         yield path
         return
-    below = (place for place in path.rglob("*") if place.is_file() and not is_link(place))
-    yield from sorted(place for place in below if not place.name.startswith("."))
+    files = (file for file in path.rglob("*") if file.is_file() and not is_link(file))
+    yield from sorted(file for file in files if not file.name.startswith("."))

@@ -1,17 +1,23 @@
-"""How numeric kernels are compiled to machine code, in one place.
+"""Compile numeric kernels to machine code, in each process or ahead in a process beside the first run.
 
-Kernels release the GIL, so pairs run in parallel threads, and their machine code is cached beside the source, so that
-only the first run on a machine compiles.
+Kernels release the GIL, so pairs run in parallel threads. Their machine code is cached beside the source, so that only
+the first run on a machine compiles.
 """
 
+import contextlib
 import os
-from collections.abc import Callable
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 from llvmlite.binding import get_host_cpu_name
+
+from sfm_app.operating_system import end_group, group_options
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -20,10 +26,12 @@ CACHE = Path(
     numba.config.CACHE_DIR or (HERE / "__pycache__" if os.access(HERE, os.W_OK) else HOME),
     f"kernels-{version('sfm-app')}",
 )
-"""Folder of the compiled kernels of this version. Numba checks the file of a kernel, but not those of the kernels that
-it calls, and cannot read what refers to a class that is gone: an upgrade would fail, or run old code."""
+"""Folder of the compiled kernels of this version. Numba does not check the files of kernels that a kernel calls, and
+cannot read references to removed classes: without a folder per version, an upgrade would fail, or run old code."""
 WARM = CACHE / f"warm-{numba.__version__}-{numba.config.CPU_NAME or get_host_cpu_name()}"
-"""Exists where the kernels of a run are compiled for this processor, see `engine.warm_up`."""
+"""Exists when all kernels of a run are compiled for this processor."""
+PARENT = "SFM_APP_WARM_UP_OF"
+"""Environment variable of the compiling process: the number of the process of the run."""
 
 
 def kernel(function: Function) -> Function:
@@ -48,3 +56,26 @@ def _compile(function: Function, *, fastmath: bool | set[str]) -> Function:
         return cast(Function, numba.njit(**options)(function))
     finally:
         numba.config.CACHE_DIR = before
+
+
+@contextlib.contextmanager
+def warming_up(say: Callable[[str], None], warm: Path = WARM) -> Iterator[None]:
+    """Compile all kernels in another process during the block, unless `warm` exists.
+
+    The block does not wait: it takes kernels from the cache, and compiles the others itself.
+    """
+    if warm.exists() or PARENT in os.environ:
+        yield
+        return
+    say("first run on this machine: compiling parts of the program takes half a minute more, once")
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        command = [sys.executable, "-P", "-m", "sfm_app.warm_up", folder]
+        environment, quiet = os.environ | {PARENT: str(os.getpid())}, subprocess.DEVNULL
+        process = subprocess.Popen(  # noqa: S603 - our module
+            command, env=environment, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet, **group_options()
+        )
+        try:
+            yield
+        finally:
+            end_group(process, 10.0)
+            process.communicate()

@@ -1,4 +1,4 @@
-"""Errors of computations, values that are not finite, and a constant that all packages share."""
+"""Errors of computations, finite values, JSON, and a shared constant."""
 
 import json
 import math
@@ -10,29 +10,29 @@ import numpy as np
 from sfm_app.errors import NumericalError
 
 Json: TypeAlias = "bool | int | float | str | Sequence[Json] | Mapping[str, Json] | None"
-"""What JSON can hold."""
+"""Values of JSON."""
 
 FAILURES = (NumericalError, ArithmeticError, np.linalg.LinAlgError)
-"""Errors of computations on degenerate input: a singular matrix, a division by zero, points on a line. Where a run can
-do without the result, it goes on. ValueError and IndexError are no such errors: they are bugs, and end the run."""
+"""Errors of computations on degenerate input: a singular matrix, a division by zero, points on a line. A run continues
+without an optional result. ValueError and IndexError are bugs, and end the run."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation, 1 / Phi^-1(3/4) (Rousseeuw and Leroy
 1987), with the digits that the thesis prints (5.7.2)."""
 
 
 def error_reason(err: Exception) -> str:
-    """Return the last line of an error's message; the name of its class where there is none."""
+    """Return the last line of an error's message; the name of its class without a message."""
     lines = str(err).strip().splitlines()
     return lines[-1] if lines else type(err).__name__
 
 
 def finite_entries(values: Mapping[str, float | None]) -> dict[str, float]:
-    """Return the entries that are finite."""
+    """Return the finite entries."""
     return {name: value for name, value in values.items() if value is not None and np.isfinite(value)}
 
 
 def json_text(value: Any) -> str:
-    """Return plain values as JSON; infinities and NaN become null, which every reader understands."""
+    """Return plain values as JSON; infinities and NaN become null."""
     return json.dumps(_replace_nonfinite(value), indent=1, allow_nan=False) + "\n"
 
 

@@ -121,8 +121,9 @@ def run_stages(
     """Turn a folder of photos, or a video, into products.
 
     Args:
-        photo_dir, run, wanted: folder or video; the run; stages whose products are loaded before returning.
-        first, last: stage from which on everything is redone, empty for none; stage to stop after.
+        first: stage from which on all stages run again; empty for none.
+        last: last stage to run.
+        wanted: stages whose products are loaded before returning.
     """
     options, place = run.settings.photos, run.workspace
     place.check_no_overlap(photo_dir)

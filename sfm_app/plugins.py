@@ -228,10 +228,6 @@ def load_plugins(modules: Sequence[ModuleType | object] = (), *, installed: bool
     Without arguments the result is cached for the process: the search through all installed packages takes
     milliseconds, longer than an estimator needs for an easy pair. `installed_plugins.cache_clear()` resets it.
 
-    Args:
-        modules: plug-ins besides the installed ones.
-        installed: whether to register the installed plug-ins, too.
-
     Raises:
         PluginError: a hook is misspelt, a plug-in does not import, or two things share a name.
     """

@@ -16,51 +16,54 @@ from sfm_app.settings import MatchSettings
 from sfm_app.types import MatchedImage, PairId
 from sfm_app.types.arrays import IndexArray
 
-# Which of the similar photos are matched: the nearest ones, and of the others some at every distance.
-#
-# In a video the most similar photos are the neighbors, which add no parallax. Photos that are less similar, but
-# still show the same place, are what holds a model together.
+# Choice among similar photos: the nearest ones, and of the others some at every distance. In a video the most similar
+# photos are the neighbors, which add no parallax; less similar photos of the same place hold a model together.
 
-NEAREST_SHARE = 0.4
-"""Share of the partners of a photo that are its nearest; the others are spread evenly over what is left. Chosen by
-hand on the video kitchen1000."""
+
+@dataclass(frozen=True, slots=True)
+class RetrievalOptions:
+    """Choice of partners, previews and vocabulary."""
+
+    nearest_share: float = 0.4
+    """Share of the partners of a photo that are its nearest; the others are spread evenly. Chosen by hand on the video
+    kitchen1000."""
+    longer_side_px: int = 1000
+    """Longer side of pictures with SIFT descriptors: large features are visible in small pictures. Chosen by hand."""
+    max_ratio: float = 0.8
+    """Largest ratio of the distances to the nearest and the second nearest descriptor (Lowe 2004)."""
+    branches: int = 64
+    """Words of the first level; each is divided again, so that learning takes the square root of the time."""
+    rounds: int = 8
+    """Rounds of k-means at each level; words only have to be dense where descriptors are. Chosen by hand."""
+    samples_per_word: int = 16
+    """Descriptors from which a word is learned, on average. Chosen by hand."""
+
+
+OPTIONS = RetrievalOptions()
+BLOCK = 256
+"""Photos whose keypoints or similarities are in memory at once; no result depends on it. Chosen by hand."""
 
 
 def wants_all_pairs(photos: int, options: MatchSettings) -> bool:
-    """Return whether all pairs are matched: as the user says, or because there is little to choose.
-
-    Args:
-        photos: number of photos.
-        options: settings of matching.
-    """
+    """Return whether all pairs are matched: as the user says, or because there is little to choose."""
     if options.pairs == "all" or photos <= options.neighbors + 1:
         return True
     return options.pairs == "auto" and math.comb(photos, 2) <= expected_pairs(photos, options)
 
 
 def expected_pairs(photos: int, options: MatchSettings) -> int:
-    """Return about how many pairs are matched.
-
-    Args:
-        photos: number of photos.
-        options: settings of matching.
-    """
+    """Return about how many pairs are matched."""
     every = math.comb(photos, 2)
     return every if options.pairs == "all" else min(every, photos * options.neighbors)
 
 
 def spread(ranked: Sequence[int], count: int) -> list[int]:
-    """Return at most `count` of some photos: the first ones, and others at even steps among the rest.
-
-    Args:
-        ranked: photos, the best first.
-        count: most that are returned, > 0.
-    """
+    """Return at most `count` > 0 of ranked photos: the best, and others at even steps among the rest."""
     if len(ranked) <= count:
         return list(ranked)
-    first = round(NEAREST_SHARE * count)
-    rest, wanted = ranked[first:], count - first
-    return [*ranked[:first], *(rest[(2 * k + 1) * len(rest) // (2 * wanted)] for k in range(wanted))]
+    first = round(OPTIONS.nearest_share * count)
+    rest, others = ranked[first:], count - first
+    return [*ranked[:first], *(rest[(2 * k + 1) * len(rest) // (2 * others)] for k in range(others))]
 
 
 def choose_by_rank(
@@ -68,42 +71,33 @@ def choose_by_rank(
 ) -> set[PairId]:
     """Return pairs so that each photo has some with its best and its fair partners.
 
-    Args:
-        scores: of candidate pairs.
-        least: pairs with a lower score are left out.
-        count: partners for each photo; it may get more that chose it.
-        choosers: photos that need partners; None for all.
+    Pairs with a score below `least` are left out. Each of the `choosers` (None: all photos) gets `count` partners, and
+    those that chose it.
     """
     partners: dict[int, list[tuple[int, int]]] = {}
     for (a, b), score in scores.items():
         if score >= least:
             partners.setdefault(a, []).append((-score, b))
             partners.setdefault(b, []).append((-score, a))
-    found = set()
+    pairs = set[PairId]()
     for photo, ranked in partners.items():
         if choosers is not None and photo not in choosers:
             continue
         chosen = spread([other for _, other in sorted(ranked)], count)
-        found |= {(min(photo, other), max(photo, other)) for other in chosen}
-    return found
+        pairs |= {(min(photo, other), max(photo, other)) for other in chosen}
+    return pairs
 
 
-# Pairs along the graph of matches: what two photos share with a third one, they probably share with each other.
-#
-# The second round of matching. It closes loops: where one pair joins two places, their neighbors are asked, too.
-
-PHOTO_BLOCK = 256
-"""Photos whose keypoints are counted at once."""
+# Pairs along the graph of matches: photos that match the same keypoints of a third one. The second round closes
+# loops: where one pair joins two places, their neighbors are compared, too.
 
 
 def count_shared_keypoints(
-    keypoints: Mapping[int, int], matches: Mapping[PairId, NDArray[np.uint32]]
+    keypoints: Mapping[int, int], matches: Mapping[PairId, NDArray[np.uint32]], block: int = BLOCK
 ) -> dict[PairId, int]:
-    """Count, for pairs without matches, the keypoints of third photos that match in both.
+    """Count, for pairs without matches (N, 2), the keypoints of third photos that match in both.
 
-    Args:
-        keypoints: number of keypoints of each photo.
-        matches: (N, 2) matching keypoints by pair.
+    `keypoints` has their number by photo. They are counted for `block` photos at once.
     """
     photos = sorted(keypoints)
     place = {photo: k for k, photo in enumerate(photos)}
@@ -112,59 +106,49 @@ def count_shared_keypoints(
         partners[place[a]].append((place[b], rows[:, 0].astype(np.int64)))
         partners[place[b]].append((place[a], rows[:, 1].astype(np.int64)))
     total = sparse.csr_array((len(photos), len(photos)), dtype=np.int64)
-    for start in range(0, len(photos), PHOTO_BLOCK):
-        part = range(start, min(start + PHOTO_BLOCK, len(photos)))
-        seen = _points_in_others([partners[k] for k in part], [keypoints[photos[k]] for k in part], len(photos))
-        total = sparse.csr_array(total + seen @ seen.T)
-    found = sparse.triu(total, k=1).tocoo()
-    named = ((photos[i], photos[j]) for i, j in zip(*(axis.tolist() for axis in found.coords), strict=True))
-    return {pair: count for pair, count in zip(named, found.data.tolist(), strict=True) if pair not in matches}
+    for start in range(0, len(photos), block):
+        part = range(start, min(start + block, len(photos)))
+        incidence = _points_in_others([partners[k] for k in part], [keypoints[photos[k]] for k in part], len(photos))
+        total = sparse.csr_array(total + incidence @ incidence.T)
+    shared = sparse.triu(total, k=1).tocoo()
+    named = ((photos[i], photos[j]) for i, j in zip(*(axis.tolist() for axis in shared.coords), strict=True))
+    return {pair: count for pair, count in zip(named, shared.data.tolist(), strict=True) if pair not in matches}
 
 
 def _points_in_others(
     partners: list[list[tuple[int, IndexArray]]], keypoints: list[int], photos: int
 ) -> sparse.csr_array:
-    """Return (photos, keypoints of some photos) in which other photos each keypoint has a match."""
+    """Return (photos, keypoints of some photos): in which other photos each keypoint has a match."""
     starts = np.cumsum([0, *keypoints])
-    ends = [(other, rows + starts[k]) for k, found in enumerate(partners) for other, rows in found]
-    others = np.repeat(np.array([other for other, _ in ends], np.int64), [len(rows) for _, rows in ends])
+    ends = [(other, rows + starts[k]) for k, others in enumerate(partners) for other, rows in others]
+    owners = np.repeat(np.array([other for other, _ in ends], np.int64), [len(rows) for _, rows in ends])
     points = np.concatenate([np.zeros(0, np.int64), *(rows for _, rows in ends)])
-    return sparse.coo_array((np.ones(len(points), np.int64), (others, points)), shape=(photos, starts[-1])).tocsr()
+    return sparse.coo_array((np.ones(len(points), np.int64), (owners, points)), shape=(photos, starts[-1])).tocsr()
 
 
 # Photos that were taken beside each other: by name, by time and by GPS.
 
 
 def pairs_in_order(images: Sequence[MatchedImage], steps: Sequence[int]) -> set[PairId]:
-    """Return pairs of photos that are some steps apart in time, or in the order of their names within a folder.
-
-    Args:
-        images: all photos.
-        steps: numbers of steps, > 0.
-    """
+    """Return pairs of photos that are some steps > 0 apart in time, or in the order of their names within a folder."""
     rows: dict[str, list[MatchedImage]] = {}
     for image in images:
         rows.setdefault(image.name.rpartition("/")[0], []).append(image)
-    found = set()
+    pairs = set[PairId]()
     for row in rows.values():
         ordered = [image.id for image in sorted(row, key=_order_key)]
-        found |= {_pair(a, b) for step in steps for a, b in zip(ordered, ordered[step:], strict=False)}
-    return found
+        pairs |= {_pair(a, b) for step in steps for a, b in zip(ordered, ordered[step:], strict=False)}
+    return pairs
 
 
 def pairs_nearby(images: Sequence[MatchedImage], count: int) -> set[PairId]:
-    """Return pairs of photos with those whose GPS positions are nearest.
-
-    Args:
-        images: all photos; those without a position have no such pairs.
-        count: photos that each one is paired with.
-    """
+    """Return pairs of photos with the `count` photos whose GPS positions are nearest."""
     located = [(image.id, image.gps) for image in images if image.gps is not None]
     if len(located) < 2:
         return set()
     angles = np.radians([(gps.latitude_deg, gps.longitude_deg) for _, gps in located])
-    places = _unit_vectors(angles)
-    nearest = np.atleast_2d(cKDTree(places).query(places, k=min(count + 1, len(located)))[1]).tolist()
+    positions = _unit_vectors(angles)
+    nearest = np.atleast_2d(cKDTree(positions).query(positions, k=min(count + 1, len(located)))[1]).tolist()
     ids = [photo for photo, _ in located]
     return {_pair(ids[row], ids[k]) for row, others in enumerate(nearest) for k in others if k != row}
 
@@ -185,21 +169,14 @@ def _pair(a: int, b: int) -> PairId:
     return (a, b) if a < b else (b, a)
 
 
-# SIFT descriptors of a small picture, for photos whose own features are not SIFT.
-
-LONGER_SIDE_PX = 1000
-"""Large features are seen in a small picture, too."""
-
-
 def describe_picture(pixels: NDArray[np.uint8], most: int) -> NDArray[np.uint8]:
-    """Return (N, 128) descriptors of a picture, those of the largest features first.
+    """Return (N, 128) SIFT descriptors of an (H, W, 3) RGB picture, at most `most`, those of the largest features
+    first.
 
-    Args:
-        pixels: (H, W, 3) RGB.
-        most: number of descriptors.
+    For photos whose own features are not SIFT.
     """
     gray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
-    scale = LONGER_SIDE_PX / max(gray.shape)
+    scale = OPTIONS.longer_side_px / max(gray.shape)
     if scale < 1.0:
         gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     keypoints, descriptors = cv2.SIFT.create().detectAndCompute(gray, None)
@@ -209,22 +186,15 @@ def describe_picture(pixels: NDArray[np.uint8], most: int) -> NDArray[np.uint8]:
     return np.asarray(np.clip(np.rint(descriptors[order]), 0, 255), np.uint8)
 
 
-# A glance at two photos before they are matched: do their largest features match (Wu 2013)?
-#
-# The few largest features tell whether two photos overlap, at a hundredth of the cost of matching all of them.
+# Previews: a few of the largest features show whether two photos overlap, at a hundredth of the cost (Wu 2013).
 
 DescriptorArray = NDArray[np.uint8]
-
-MAX_RATIO = 0.8
-"""Largest ratio of the distances to the nearest and the second nearest descriptor (Lowe 2004)."""
 
 
 def count_preview_matches(first: DescriptorArray, others: Sequence[DescriptorArray]) -> list[int]:
     """Count the features of a photo and of each other photo that are each other's nearest, and clearly so.
 
-    Args:
-        first: (N, 128) descriptors of the largest features of the photo.
-        others: (M, 128) of each other photo.
+    Descriptors are (N, 128), those of the largest features.
     """
     if not others or not len(first):
         return [0] * len(others)
@@ -245,35 +215,28 @@ def _count_mutual(squares: NDArray[np.float32]) -> int:
     nearest = squares.argmin(axis=1)
     least = squares[rows, nearest]
     squares[rows, nearest] = np.inf
-    return int(np.count_nonzero((least < MAX_RATIO**2 * squares.min(axis=1)) & (owners[nearest] == rows)))
+    return int(np.count_nonzero((least < OPTIONS.max_ratio**2 * squares.min(axis=1)) & (owners[nearest] == rows)))
 
 
-# Which photos share visual words: inverted files with weights by frequency (Sivic and Zisserman 2003).
-
-BLOCK = 256
-"""Photos whose similarities to all others are held at once."""
+# Similar photos: inverted files with weights by frequency (Sivic and Zisserman 2003).
 
 
 def rank_similar(words: Sequence[IndexArray], size: int, most: int) -> list[IndexArray]:
-    """Rank for each photo the photos that share most with it, the most similar first.
+    """Rank for each photo at most `most` photos with common words, from the words (N,) of each; the most similar come
+    first.
 
-    Photos that share no word are left out. A word counts with the root of its frequency in the photo, since patterns
-    repeat within photos (Jegou 2009), and less if it is in many photos.
-
-    Args:
-        words: of each photo (N,) numbers of words.
-        size: number of words in the vocabulary.
-        most: photos returned for each.
+    A word counts with the root of its frequency in the photo, since patterns repeat within photos (Jegou 2009), and
+    less if it is in many photos. `size` is that of the vocabulary.
     """
     vectors = _weigh(words, size)
-    turned, found = vectors.T.tocsc(), []
+    transposed, rows = vectors.T.tocsc(), []
     for start in range(0, len(words), BLOCK):
-        scores = (vectors[start : start + BLOCK] @ turned).toarray()
+        scores = (vectors[start : start + BLOCK] @ transposed).toarray()
         for row, values in enumerate(scores):
             values[start + row] = 0.0
             order = np.argsort(-values, kind="stable")[:most]
-            found.append(order[values[order] > 0.0].astype(np.int64))
-    return found
+            rows.append(order[values[order] > 0.0].astype(np.int64))
+    return rows
 
 
 def _weigh(words: Sequence[IndexArray], size: int) -> sparse.csr_array:
@@ -282,26 +245,16 @@ def _weigh(words: Sequence[IndexArray], size: int) -> sparse.csr_array:
     columns = np.concatenate([np.zeros(0, np.int64), *words])
     counts = sparse.coo_array((np.ones(len(columns)), (photos, columns)), shape=(len(words), size)).tocsr()
     counts.sum_duplicates()
-    seen = np.bincount(counts.indices, minlength=size)
-    rarity = np.log(len(words) / np.maximum(seen, 1))
+    photos_with = np.bincount(counts.indices, minlength=size)
+    rarity = np.log(len(words) / np.maximum(photos_with, 1))
     counts.data = np.sqrt(counts.data) * rarity[counts.indices]
     lengths = np.sqrt(np.asarray(counts.multiply(counts).sum(axis=1)).ravel())
     return sparse.csr_array(sparse.diags_array(1.0 / np.maximum(lengths, 1e-12)) @ counts)
 
 
-# A vocabulary of visual words, learned from the descriptors of the set itself.
-#
-# Descriptors are whole numbers, and so are words: products of both are exact in 32 bits of a float, in any order of
-# summation, so that the same photos give the same words on every machine and with any number of threads.
-
-BRANCHES = 64
-"""Words of the first level; each is divided again, so that learning takes the square root of the time."""
-ROUNDS = 8
-"""Rounds of k-means at each level; words only have to be dense where descriptors are. Chosen by hand."""
-SAMPLES_PER_WORD = 16
-"""Descriptors from which a word is learned, on average. Chosen by hand."""
-DESCRIPTOR_BLOCK = 4096
-"""Descriptors that are compared with all words at once."""
+# Vocabulary of visual words, learned from the photos themselves. Descriptors and words are whole numbers: products of
+# both are exact in 32-bit floats, in any order of summation. So the same photos give the same words on every machine
+# and with any number of threads.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -315,26 +268,16 @@ class Vocabulary:
         return len(self.words)
 
     def quantize(self, descriptors: DescriptorArray) -> IndexArray:
-        """Return (N,) the nearest word of each descriptor.
-
-        Args:
-            descriptors: (N, 128).
-        """
+        """Return (N,) the nearest word of each descriptor (N, 128)."""
         return _nearest(descriptors.astype(np.float32), self.words)
 
 
 def learn_vocabulary(descriptors: DescriptorArray, size: int, seed: int) -> Vocabulary:
-    """Learn words by k-means in two levels.
-
-    Args:
-        descriptors: (N, 128) of photos of the whole set; N > 0.
-        size: most words.
-        seed: of the first centers.
-    """
+    """Learn at most `size` words by k-means in two levels from descriptors (N, 128), N > 0, of all photos."""
     rng = np.random.default_rng(seed)
-    most = min(len(descriptors), SAMPLES_PER_WORD * size)
+    most = min(len(descriptors), OPTIONS.samples_per_word * size)
     data = descriptors[np.sort(rng.permutation(len(descriptors))[:most])].astype(np.float32)
-    branches = _cluster(data, min(BRANCHES, max(1, size // 2)), rng)
+    branches = _cluster(data, min(OPTIONS.branches, max(1, size // 2)), rng)
     nearest = _nearest(data, branches)
     parts = [data[nearest == k] for k in range(len(branches))]
     shares = [max(1, round(size * len(part) / len(data))) for part in parts]
@@ -345,35 +288,30 @@ def learn_vocabulary(descriptors: DescriptorArray, size: int, seed: int) -> Voca
 def _cluster(data: NDArray[np.float32], count: int, rng: np.random.Generator) -> NDArray[np.float32]:
     """Return the centers of clusters, rounded to whole numbers; fewer where there are fewer data."""
     centers = np.unique(data[rng.permutation(len(data))[:count]], axis=0)
-    for _ in range(ROUNDS):
+    for _ in range(OPTIONS.rounds):
         nearest = _nearest(data, centers)
         order = np.argsort(nearest, kind="stable")
         used, starts = np.unique(nearest[order], return_index=True)
         sums = np.add.reduceat(data[order].astype(np.int64), starts, axis=0)
         counts = np.diff(np.append(starts, len(data)))
-        moved = np.rint(sums / counts[:, None]).astype(np.float32)
-        if len(used) == len(centers) and np.array_equal(moved, centers):
+        means = np.rint(sums / counts[:, None]).astype(np.float32)
+        if len(used) == len(centers) and np.array_equal(means, centers):
             break
-        centers = np.unique(moved, axis=0)
+        centers = np.unique(means, axis=0)
     return centers
 
 
 def _nearest(data: NDArray[np.float32], centers: NDArray[np.float32]) -> IndexArray:
     """Return (N,) rows of the centers that are nearest to the data (N, 128); of equal ones the first."""
     half = 0.5 * np.einsum("kd,kd->k", centers, centers)
-    found = np.empty(len(data), np.int64)
-    for start in range(0, len(data), DESCRIPTOR_BLOCK):
-        part = slice(start, start + DESCRIPTOR_BLOCK)
-        found[part] = np.argmax(data[part] @ centers.T - half, axis=1)
-    return found
+    nearest = np.empty(len(data), np.int64)
+    for start in range(0, len(data), 4096):
+        part = slice(start, start + 4096)
+        nearest[part] = np.argmax(data[part] @ centers.T - half, axis=1)
+    return nearest
 
 
 def pool_descriptors(photos: Sequence[DescriptorArray], most: int) -> DescriptorArray:
-    """Return descriptors of all photos, of each the first ones and about as many.
-
-    Args:
-        photos: (N, 128) of each photo, the largest features first.
-        most: descriptors altogether.
-    """
+    """Return at most `most` descriptors, the first ones of each photo and about equally many of each."""
     each = max(1, most // max(len(photos), 1))
     return np.concatenate([np.zeros((0, 128), np.uint8), *(one[:each] for one in photos)])

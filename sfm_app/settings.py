@@ -327,7 +327,6 @@ def toml_lines(section: BaseModel, table: str = "") -> Iterator[str]:
     """Yield the lines of a settings file, with the help of each setting as a comment.
 
     Args:
-        section: settings, tables nested.
         table: its name in the file; empty for the top.
     """
     fields = type(section).model_fields
@@ -375,10 +374,6 @@ class Settings(Section):
     def from_mapping(cls, values: Mapping[str, Any], where: str = "settings") -> "Settings":
         """Check nested values on top of the preset that they name.
 
-        Args:
-            values: settings by name, tables nested.
-            where: source of the values, for the error message.
-
         Raises:
             ConfigError: a key is unknown, or a value has the wrong type or is out of range; lists the first few.
 
@@ -404,12 +399,7 @@ class Settings(Section):
 
     @classmethod
     def from_toml(cls, path: Path, overrides: Mapping[str, Any] | None = None) -> "Settings":
-        """Read a settings file, with some values overridden.
-
-        Args:
-            path: TOML file.
-            overrides: nested values from flags; they win.
-        """
+        """Read a settings file, with some values overridden."""
         return cls.from_mapping(merge_nested(read_toml(path), overrides or {}), where=str(path))
 
     def to_toml(self) -> str:
@@ -439,7 +429,6 @@ def merge_nested(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, A
 
     Args:
         low: values that are used where `high` has none.
-        high: values that win.
     """
     result = dict(low)
     for key, value in high.items():

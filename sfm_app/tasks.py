@@ -1,4 +1,4 @@
-"""Work that may be done on another machine: a function that can be named, and large values that it needs."""
+"""Tasks that another machine can do: a named function, and large values for it."""
 
 from functools import partial
 from typing import Generic, TypeVar
@@ -10,18 +10,15 @@ Result = TypeVar("Result")
 class Task(partial[Result]):
     """A function with some of its arguments that any worker can apply, on this machine or on another.
 
-    Function, arguments and result are pickled where the worker is another process: the function stands in a module,
-    what it needs besides is small, `Shared`, or in the output folder, and what it gives is returned or written there.
-    In threads nothing is pickled. A function that is no task stays in the process that the user started.
+    A worker in another process needs pickles: the function is part of a module; its arguments are small, `Shared`, or
+    files
+    in the output folder; its result is returned or written there. Threads need no pickles. Other functions stay in the
+    process of the run.
     """
 
 
 class Shared(Generic[Value]):
-    """A large value that many calls need; it leaves the process once, as a file in the output folder, if at all.
-
-    Args:
-        value: read only.
-    """
+    """A large read-only value of many calls; it leaves the process at most once, as a file in the output folder."""
 
     __slots__ = ("value",)
 

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.api import reconstruct
-from sfm_app.engine.warm_up import PARENT
-from sfm_app.jit import WARM
+from sfm_app.jit import PARENT, WARM
 from sfm_app.operating_system import end_own_group, watch_parent, yield_to_others
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import look_at

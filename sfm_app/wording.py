@@ -1,24 +1,15 @@
-"""Lists of names, and lengths, as text."""
+"""Names and lengths as text, and lengths and points from text."""
 
 import math
 import re
 from collections.abc import Sequence
 
-# Lists of names in sentences.
-
 
 def list_names(names: Sequence[str], most: int) -> str:
-    """Return the first few names with commas, and how many more there are.
-
-    Args:
-        names: any number of them.
-        most: how many are named.
-    """
+    """Return the first names with commas, and the number of further names."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return f"{', '.join(names[:most])}{more}"
 
-
-# Read lengths with a unit, and points in space, as people write them.
 
 METERS = {
     "mm": 1e-3, "cm": 1e-2, "dm": 1e-1, "m": 1.0, "km": 1e3, "in": 0.0254, "inch": 0.0254, '"': 0.0254, "ft": 0.3048,
@@ -29,24 +20,20 @@ LENGTH = re.compile(r"\s*([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*([a-zA-Z'\"]*)\s*")
 
 
 def parse_length(text: str) -> float:
-    """Read a length such as 1.25m, 50 mm or 3ft.
+    """Return a length such as 1.25m, 50 mm or 3ft in meters.
 
-    Args:
-        text: a positive number and its unit. A bare number is refused: 50 may be meant as millimeters.
-
-    Returns:
-        meters.
+    A bare number is refused: 50 may mean millimeters.
 
     Raises:
         ValueError: it is no length, not positive, or of an unknown unit.
     """
-    found = LENGTH.fullmatch(text)
-    unit = found.group(2).lower() if found else ""
-    if found is None or unit not in METERS:
-        reason = f"'{text}' is no length" if unit or not found else f"'{text}' is no length without a unit"
+    match = LENGTH.fullmatch(text)
+    unit = match.group(2).lower() if match else ""
+    if match is None or unit not in METERS:
+        reason = f"'{text}' is no length" if unit or not match else f"'{text}' is no length without a unit"
         raise ValueError(f"{reason}; write 1.25m, 50mm or 3ft")
     try:
-        length = float(found.group(1)) * METERS[unit]
+        length = float(match.group(1)) * METERS[unit]
     except ValueError:
         raise ValueError(f"'{text}' is no length; write 1.25m, 50mm or 3ft") from None
     if not (0 < length < math.inf):
@@ -55,10 +42,7 @@ def parse_length(text: str) -> float:
 
 
 def parse_point(text: str) -> tuple[float, float, float]:
-    """Read a point in space, such as 0.5,-1.25,3.
-
-    Args:
-        text: three numbers with commas between them.
+    """Return a point such as 0.5,-1.25,3.
 
     Raises:
         ValueError: it is not three finite numbers.
@@ -73,11 +57,7 @@ def parse_point(text: str) -> tuple[float, float, float]:
 
 
 def format_length(meters: float) -> str:
-    """Return a length in the unit that reads best, with four digits.
-
-    Args:
-        meters: any length >= 0.
-    """
+    """Return a length >= 0 with four digits in the most readable unit."""
     for unit in ("km", "m", "cm", "mm"):
         if meters >= METERS[unit] or unit == "mm":
             return f"{meters / METERS[unit]:.4g} {unit}"

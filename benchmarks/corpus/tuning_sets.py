@@ -48,7 +48,7 @@ GROUPS: Mapping[str, Group] = {
         ("posegraph",), WITH_TRUTH, "", "docs/algorithms.md, From K to relative poses",
     ),
     "mapping: seeds, choice of the model, joins, passes": Group(
-        ("reconstruction", "colmap.mapping", "colmap.processes.global_mapping"), FIRST_EIGHT, "",
+        ("reconstruction", "colmap.mapping", "colmap.tasks"), FIRST_EIGHT, "",
         "docs/algorithms.md, Mapping; sets are not written down",
     ),
     "bundle adjustment: priors, misfit, settling": Group(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common.timing import Method
-from sfm_app.fundamental.estimate import estimate
+from sfm_app.fundamental.estimate import fit_by_recipe
 from sfm_app.fundamental.lev_ransac import PRODUCTION
 from sfm_app.fundamental.leverage import prior_validity
 from sfm_app.fundamental.loop import Recipe
@@ -49,7 +49,7 @@ def ablated_estimators(options: EpipolarSettings) -> dict[str, Method]:
 
 def _make_method(recipe: Recipe, options: EpipolarSettings) -> Method:
     def fit(x1: FloatArray, x2: FloatArray, seed: int) -> tuple[FloatArray | None, int | None]:
-        found = estimate(x1, x2, options, seed, recipe)
+        found = fit_by_recipe(x1, x2, options, seed, recipe)
         return (found.F, found.trials) if isinstance(found, EpipolarFit) else (None, None)
 
     return fit

@@ -28,9 +28,9 @@ from benchmarks.common.processes import environment, module_command, row_of_modu
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.many.graphs import calibrate_town
 from benchmarks.synthetic.matches import TownOptions, make_town_graph
+from sfm_app.colmap.backend import Reconstruction
 from sfm_app.colmap.bundle import adjust_or_keep
 from sfm_app.colmap.model import poses_and_points
-from sfm_app.colmap.types import Reconstruction
 from sfm_app.geometry.poses import robust_similarity, umeyama
 from sfm_app.mapping.passes import reconstruct
 from sfm_app.plugins import load_plugins

@@ -19,8 +19,8 @@ from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.many.blocks import WORKERS, camera_size
 from benchmarks.many.parts import FOLDED_M, pose_errors
 from benchmarks.synthetic.town import TownPhotos, town_of, town_views
+from sfm_app.colmap.backend import Reconstruction
 from sfm_app.colmap.model import poses_and_points
-from sfm_app.colmap.types import Reconstruction
 from sfm_app.pipeline import NAMES
 from sfm_app.settings import QUALITY_PRESETS
 from sfm_app.synthetic.cameras import Camera, Views, make_camera

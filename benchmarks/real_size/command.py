@@ -19,8 +19,8 @@ from benchmarks.common.processes import module_command, run_command
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.real_size.measured_scene import UTM, add_markers, center_and_aim, write_control_points
 from benchmarks.synthetic.scenes import WALKS, build_scene, scene_views
+from sfm_app.colmap.backend import Reconstruction
 from sfm_app.colmap.model import poses_and_points
-from sfm_app.colmap.types import Reconstruction
 from sfm_app.geometry.poses import Similarity, umeyama
 from sfm_app.synthetic.cameras import Views, camera_center
 from sfm_app.synthetic.photo_folder import PhotoOptions, add_missing_photos

@@ -138,7 +138,7 @@ def read_rows(path: Path, *, again: bool) -> list[Row]:
 
 
 def page(rows: list[Row]) -> str:
-    """The table, the constants that matter most first."""
+    """Return the table, the constants that matter most first."""
 
     def weight(row: Row) -> float:
         values = [row[column] for column in COLUMNS[1:3]]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).parents[2]
-ROOMS = ("ransac", "selfcal", "geometry", "posegraph")
+ROOMS = ("fundamental", "selfcal", "geometry", "posegraph")
 """Whose constants are asked. What mapping and surfaces do takes minutes for each of them."""
 BY_HAND = "by hand"
 SCALE = "_scale_constant"
@@ -29,7 +29,7 @@ class Constant:
     path: str
     """Of the module, below the project's root."""
     names: str
-    """As they are assigned, joined by commas."""
+    """As they are assigned, joined by commas; a field is `LoopOptions.name`."""
 
     @property
     def module(self) -> str:
@@ -37,18 +37,21 @@ class Constant:
         return self.path.removesuffix(".py").replace("/", ".")
 
 
-def constants(rooms: Sequence[str] = ROOMS) -> list[Constant]:
+def constants(rooms: Sequence[str] = ROOMS, root: Path = ROOT) -> list[Constant]:
     """Return every constant whose docstring says that it was chosen by hand."""
-    found = []
-    for path in sorted(path for room in rooms for path in (ROOT / "sfm_app" / room).rglob("*.py")):
-        for names, _, about in assignments(ast.parse(path.read_text(encoding="utf-8"))):
-            if BY_HAND in about:
-                found.append(Constant(path.relative_to(ROOT).as_posix(), names))
-    return found
+    return [
+        Constant(path.relative_to(root).as_posix(), names)
+        for path in sorted(path for room in rooms for path in (root / "sfm_app" / room).rglob("*.py"))
+        for names, _, about in assignments(ast.parse(path.read_text(encoding="utf-8")))
+        if BY_HAND in about.lower()
+    ]
 
 
-def assignments(tree: ast.Module) -> Iterator[tuple[str, ast.Assign | ast.AnnAssign, str]]:
-    """Yield names, statement and docstring of what a module assigns."""
+def assignments(tree: ast.Module | ast.ClassDef) -> Iterator[tuple[str, ast.Assign | ast.AnnAssign, str]]:
+    """Yield names, statement and docstring of the constants of a module, with the fields of its `*Options` classes.
+
+    The docstring of a field is followed by that of its class.
+    """
     for statement, after in pairwise([*tree.body, None]):
         if isinstance(statement, ast.Assign | ast.AnnAssign) and statement.value is not None:
             targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
@@ -56,6 +59,10 @@ def assignments(tree: ast.Module) -> Iterator[tuple[str, ast.Assign | ast.AnnAss
             text = after.value if isinstance(after, ast.Expr) else None
             about = str(text.value) if isinstance(text, ast.Constant) else ""
             yield ", ".join(names), statement, " ".join(about.split())
+        elif isinstance(statement, ast.ClassDef) and statement.name.endswith("Options"):
+            whole = " ".join((ast.get_docstring(statement) or "").split())
+            for name, field, about in assignments(statement):
+                yield f"{statement.name}.{name}", field, f"{about} {whole}".strip()
 
 
 def is_compiled(constant: Constant) -> bool:
@@ -127,19 +134,19 @@ class ScaledLoader(SourceFileLoader):
 class ScaledFinder(MetaPathFinder):
     """Finds the module of a constant before anybody else does."""
 
-    def __init__(self, constant: Constant, factor: float) -> None:
-        self.constant, self.factor = constant, factor
+    def __init__(self, constant: Constant, factor: float, root: Path) -> None:
+        self.constant, self.factor, self.root = constant, factor, root
 
     def find_spec(self, fullname: str, *_: object) -> ModuleSpec | None:
         """Return how to load the module of this dotted name; None for all others."""
         if fullname != self.constant.module:
             return None
-        file = str(ROOT / self.constant.path)
+        file = str(self.root / self.constant.path)
         loader: Loader = ScaledLoader(fullname, file, self.constant.names, self.factor)
         return spec_from_file_location(fullname, file, loader=loader)
 
 
-def install(constant: Constant, factor: float) -> None:
+def install(constant: Constant, factor: float, root: Path = ROOT) -> None:
     """Scale a constant in whatever is imported from now on.
 
     Raises:
@@ -147,4 +154,4 @@ def install(constant: Constant, factor: float) -> None:
     """
     if constant.module in sys.modules:
         raise RuntimeError(f"{constant.module} is imported already")
-    sys.meta_path.insert(0, ScaledFinder(constant, factor))
+    sys.meta_path.insert(0, ScaledFinder(constant, factor, root))

@@ -25,7 +25,7 @@ from sfm_app.bundle.rolling_shutter import ReadoutEstimate
 from sfm_app.colmap.backend import pycolmap, show_log
 from sfm_app.colmap.bundle import Adjustment, adjust
 from sfm_app.colmap.model import posed_images
-from sfm_app.colmap.rolling_shutter import measure_readout, read_keypoints, straighten_model
+from sfm_app.colmap.readout import measure_readout, read_keypoints, straighten_model
 from sfm_app.mapping.rolling_shutter import OPTIONS, Readout, follow_shutter
 from sfm_app.progress import SilentProgress
 from sfm_app.types import MatchedImage, MatchGraph

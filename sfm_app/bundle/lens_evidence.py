@@ -1,7 +1,12 @@
-"""A camera as one of another family: a wide perspective lens as a fisheye, and back.
+"""Cameras from the normal equations of a bundle: free parts, estimates, deviations, and the family of a lens.
 
-Ours. A perspective lens with strong distortion is often a fisheye. Which of the two it is, the photos say: both are
-adjusted to the same observations, and their evidence is compared (`family_evidence`).
+Ours; the choice by marginal likelihood is that of `geometry.model_selection`. As for pairs (`selfcal.priors`), each
+part of a camera has a narrow prior about its usual value and a wide one. A part is freed where the evidence for the
+wide prior outweighs how rare such cameras are. Freed or not, the prior stays in the estimate, so undetermined parts
+stay near their usual values. A lens that would fold inside the photo is refused.
+
+A perspective lens with strong distortion is often a fisheye. Both are adjusted to the same observations, and their
+evidence is compared (`family_evidence`).
 """
 
 from dataclasses import dataclass, replace
@@ -40,39 +45,43 @@ from sfm_app.camera.projection import (
 from sfm_app.geometry.least_squares import cavity, inverse_of_positive, posteriors
 from sfm_app.types.arrays import BoolArray, FloatArray
 
-# Cameras from the normal equations of a bundle: which parts are freed, their estimates and deviations.
-#
-# Ours; the choice by marginal likelihood is that of `geometry.model_selection`.
-#
-# As for pairs (`camera_priors`): each part of a camera has a narrow prior about its usual value and a wide one, and
-# is freed where the evidence for the wide one outweighs how rare such cameras are. Freed or not, the prior stays in
-# the estimate: what the photos do not determine stays where it usually is. A lens that would fold inside the photo
-# is not taken.
-
-UNDETERMINED = 0.5
-"""A part keeps its value unless the photos shrink its prior deviation below this share: freeing it adds error.
-docs/algorithms.md, Bundle adjustment. Chosen by hand; not measured on its own."""
-FEW = 2.0
-"""Factor on the deviations of cameras with few photos, whose misfit does not average out. docs/algorithms.md, Bundle
-adjustment. Chosen by hand; not measured on its own."""
-SWEEPS = 5
-"""Most sweeps over all cameras in the choice of free parts. Chosen by hand; not measured on its
-own."""
-LONGEST_STEP = 1.0
-"""Longest step of log f: a camera that moves further after mapping is not determined by its photos. Chosen
-by hand, on no set: it is more than the prior's standard deviation, and none of six sets that were run reached it."""
-FOCALS = (0.05, 100.0)
-"""In longer sides: a view of 169 degrees, and one of half a degree. What lies outside has run away. docs/algorithms.md,
-Bundle adjustment. Chosen by hand; not measured on their own."""
 MISFIT = 4.0
 """Ratio of the errors of cameras to those that independent noise explains: lens models are inexact, and errors of
-neighboring observations are correlated. Chosen on the photo sets with known cameras (docs/algorithms.md, Bundle
+neighboring observations are correlated. Chosen on photo sets with known cameras (docs/algorithms.md, Bundle
 adjustment)."""
-EXACTLY = 1e6
-"""Factor on the precision of a part that is set to its usual value, so that the others adapt to it. Chosen by hand; not
-measured on its own."""
-CLAMPS = 8
-"""How often a step is halved that makes a lens fold inside the photo. Chosen by hand; not measured on its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class LensOptions:
+    """Limits of the estimate and of the choice of a family. Chosen by hand, except where stated."""
+
+    undetermined_share: float = 0.5
+    """A part keeps its value unless the photos shrink its prior deviation below this share (docs/algorithms.md, Bundle
+    adjustment)."""
+    few_photos: float = 2.0
+    """Factor on the deviations of cameras with few photos, whose misfit does not average out."""
+    sweeps: int = 5
+    """Most sweeps over all cameras in the choice of free parts."""
+    longest_step: float = 1.0
+    """Longest step of log f: a camera that moves further after mapping is not determined by its photos."""
+    focals: tuple[float, float] = (0.05, 100.0)
+    """Range of focals in longer sides, views of 169 to 0.5 degrees; outside it, an estimate has diverged."""
+    zero_precision: float = 1e6
+    """Factor on the precision of a part that is set to its usual value, so that the others adapt to it."""
+    clamps: int = 8
+    """Most halvings of a step that makes a lens fold inside the photo."""
+    squeeze: float = 0.8
+    """Share of the undistorted radius below which a perspective lens is tried as a fisheye, at the outermost
+    observations. An equidistant lens has 0.6 at 120 degrees and 0.76 at 95 degrees."""
+    narrow_angle: float = float(np.radians(65.0))
+    """Largest angle to the optical axis, in radians, up to which a fisheye is tried as a perspective lens."""
+    samples: int = 200
+    """Radii at which a lens is fitted to another."""
+    least_reach: float = 0.2
+    """Smallest share of the observed radius up to which a lens must not fold to be tried as another."""
+
+
+OPTIONS = LensOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,56 +105,54 @@ class LensEstimate:
     deviations: FloatArray
     """(C, 12) their standard deviations."""
     mean_squares: FloatArray
-    """(C, 12, 12) mean squares about `params`, over all choices of freed parts: how they are off together. 0 where
-    the camera is fixed, or diverged."""
+    """(C, 12, 12) mean squares and products of the errors of `params`, over all choices of freed parts. 0 for cameras
+    that are fixed or diverged."""
     free: BoolArray
-    """(C, 7) the parts that have the wide prior, in the order of PARTS."""
+    """(C, 7) parts with the wide prior, in the order of PARTS."""
     determined: BoolArray
-    """(C, 7) the parts that the photos determine better than the prior."""
+    """(C, 7) parts that the photos determine better than the prior."""
     step: float
     """The largest change of a parameter, in standard deviations."""
     held: BoolArray
-    """(C,) cameras whose step was refused because it diverged; no part of them counts as determined."""
+    """(C,) cameras whose step diverged and was refused; no part of them counts as determined."""
     ranking: tuple[tuple[LensChoice, ...], ...]
     """For each camera the best choice of every model, the most probable first."""
     folding: BoolArray
-    """(C,) cameras of which a more probable lens was refused, because it folds inside the photo."""
+    """(C,) cameras with a more probable lens that folds inside the photo, and was refused."""
 
 
 def estimate_lenses(params: FloatArray, reduced: ReducedSystem, priors: LensPriors) -> LensEstimate:
     """Return the most probable cameras under the most probable choice of freed parts; undetermined parts stay.
 
-    Deviations are root mean squares about the returned values, over all choices of freed parts. They are at least
-    those of the sandwich estimator with photos as clusters, which grows where photos contradict each other (a zoom, a
-    rolling shutter, look-alikes). Choices whose lens folds inside the photo are barred; where all do, the step is
-    shortened.
+    Deviations are root mean squares about these cameras, over all choices of freed parts. They are at least those of
+    the sandwich estimator with photos as clusters, which grows where photos contradict each other. Choices whose lens
+    folds inside the photo are barred; if all do, the step is shortened.
 
     Args:
         params: (C, 12) cameras as in `Bundle`.
         reduced: the cost about these cameras.
-        priors: on the cameras.
     """
     barred = np.zeros(len(params), np.bool_)
     while True:
         chosen, ranking = _choose(*_weigh(params, reduced, priors), priors)
-        found = _estimate(params, reduced, priors, chosen)
-        folding = [k for k, row in enumerate(found.params) if not priors.fixed[k] and priors.folds(k, row)]
+        estimate = _estimate(params, reduced, priors, chosen)
+        folding = [k for k, row in enumerate(estimate.params) if not priors.fixed[k] and priors.folds(k, row)]
         others = {camera: priors.drop_lens(camera, chosen[camera]) for camera in folding}
-        ways_out = [camera for camera, other in others.items() if len(other.choices[camera])]
-        if not ways_out:
+        with_choice = [camera for camera, other in others.items() if len(other.choices[camera])]
+        if not with_choice:
             break
-        for camera in ways_out:
+        for camera in with_choice:
             priors = priors.drop_lens(camera, chosen[camera])
-        barred[ways_out] = True
-    clamped = found.params.copy()
+        barred[with_choice] = True
+    clamped = estimate.params.copy()
     for camera in folding:
         clamped[camera] = _shorten_step(params[camera], clamped[camera], camera, priors)
     barred[folding] = True
-    return replace(found, params=clamped, ranking=ranking, folding=barred)
+    return replace(estimate, params=clamped, ranking=ranking, folding=barred)
 
 
 def _weigh(params: FloatArray, reduced: ReducedSystem, priors: LensPriors) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return H (12C, 12C) and g (12C,) by the logarithms of focal and aspect, and the offsets of the priors (C, 12)."""
+    """Return H (12C, 12C) and g (12C,) by log focal and log aspect, and the offsets of the priors (C, 12)."""
     T, weight = _logarithm_jacobian(params), evidence_weight(reduced.noise_px)
     return weight * (T.T @ (reduced.H @ T)), weight * (T.T @ reduced.g), priors.prior_offsets(params)
 
@@ -157,30 +164,33 @@ def evidence_weight(noise_px: float) -> float:
 
 def _estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors, free: BoolArray) -> LensEstimate:
     """Return the most probable cameras for a choice of freed parts (C, 7), without a ranking."""
-    H, g, away = _weigh(params, reduced, priors)
+    H, g, offsets = _weigh(params, reduced, priors)
     T = _logarithm_jacobian(params)
     precision = priors.precision(free)
-    mean, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
-    determined = priors.asked & _find_determined(covariance, precision, priors)
-    changing = priors.parameter_mask(determined | (priors.asked & ~priors.part_mask("stays")) | priors.demanded)
-    absent = priors.parameter_mask(priors.asked & ~free & priors.part_mask("exact"))
-    absent[:, [FX, FY]] = False
-    step, own = _posterior(H, g, np.where(absent, EXACTLY, 1.0) * precision, away, changing)
-    about = _mean_squares(step, (mean, covariance), precision, away, priors)
+    mean, covariance = _posterior(H, g, precision, offsets, np.ones_like(offsets, np.bool_))
+    determined = priors.estimated & _find_determined(covariance, precision, priors)
+    changing = priors.parameter_mask(determined | (priors.estimated & ~priors.part_mask("stays")) | priors.required)
+    zero = priors.parameter_mask(priors.estimated & ~free & priors.part_mask("exact"))
+    zero[:, [FX, FY]] = False
+    step, step_covariance = _posterior(H, g, np.where(zero, OPTIONS.zero_precision, 1.0) * precision, offsets, changing)
+    squares = _mean_squares(step, (mean, covariance), precision, offsets, priors)
     photos = evidence_weight(reduced.noise_px) * (reduced.scores @ T)
     by_photo = _multiply(photos, covariance) @ T.T
-    mean_squares = np.asarray((T @ about) @ T.T, np.float64)
+    mean_squares = np.asarray((T @ squares) @ T.T, np.float64)
     variances = np.maximum(np.einsum("ii->i", mean_squares), np.sum(by_photo**2, axis=0))
-    deviations = np.sqrt(variances).reshape(params.shape) * np.where(priors.asked.all(axis=1), 1.0, FEW)[:, None]
-    largest = np.abs(step) / np.sqrt(np.diag(own), out=np.ones_like(step), where=(changing & ~absent).ravel())
-    largest = np.where(absent.ravel(), 0.0, largest)
+    deviations = (
+        np.sqrt(variances).reshape(params.shape)
+        * np.where(priors.estimated.all(axis=1), 1.0, OPTIONS.few_photos)[:, None]
+    )
+    largest = np.abs(step) / np.sqrt(np.diag(step_covariance), out=np.ones_like(step), where=(changing & ~zero).ravel())
+    largest = np.where(zero.ravel(), 0.0, largest)
     moved, held = _apply_step(params, step.reshape(params.shape), priors.sides)
-    moved[absent] = priors.usual[absent]
+    moved[zero] = priors.usual[zero]
     moved[priors.fixed], held[priors.fixed], deviations[priors.fixed] = params[priors.fixed], False, 0.0
-    prior, stays = _prior_deviations(params, priors), priors.parameter_mask(priors.asked) & ~changing
+    prior, undetermined = _prior_deviations(params, priors), priors.parameter_mask(priors.estimated) & ~changing
     deviations[held] = np.maximum(deviations[held], prior[held])
-    # photos make nothing less certain than it was: more than that is rounding, where nearly all of H cancels
-    deviations[stays] = np.minimum(deviations, np.hypot(prior, away))[stays]
+    # photos make no part less certain than its prior: a larger deviation is rounding, where nearly all of H cancels
+    deviations[undetermined] = np.minimum(deviations, np.hypot(prior, offsets))[undetermined]
     determined[held] = False
     own_squares = _camera_blocks(mean_squares) * (~held & ~priors.fixed)[:, None, None]
     return LensEstimate(
@@ -190,20 +200,20 @@ def _estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors, fr
 
 
 def _posterior(
-    H: FloatArray, g: FloatArray, precision: FloatArray, away: FloatArray, changing: BoolArray
+    H: FloatArray, g: FloatArray, precision: FloatArray, offsets: FloatArray, changing: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean step (12C,) and covariance (12C, 12C) of the parameters in `changing` (C, 12); 0 elsewhere."""
     places = np.flatnonzero(changing)
     step, covariance = np.zeros(len(g)), np.zeros_like(H)
     block = np.ix_(places, places)
     covariance[block] = inverse_of_positive((H + np.diag(precision.ravel()))[block])
-    step[places] = _multiply(covariance[block], (g + (precision * away).ravel())[places])
+    step[places] = _multiply(covariance[block], (g + (precision * offsets).ravel())[places])
     return step, covariance
 
 
 def _find_determined(covariance: FloatArray, precision: FloatArray, priors: LensPriors) -> BoolArray:
     """Return (C, 7) as in `LensEstimate`."""
-    narrower = np.sqrt(np.diag(covariance)).reshape(precision.shape) < UNDETERMINED * precision**-0.5
+    narrower = np.sqrt(np.diag(covariance)).reshape(precision.shape) < OPTIONS.undetermined_share * precision**-0.5
     rows = [
         [row[list(part.places)].all() for part in PARTS[int(kind)]]
         for row, kind in zip(narrower, priors.family, strict=True)
@@ -212,56 +222,56 @@ def _find_determined(covariance: FloatArray, precision: FloatArray, priors: Lens
 
 
 def _choose(
-    H: FloatArray, g: FloatArray, away: FloatArray, priors: LensPriors
+    H: FloatArray, g: FloatArray, offsets: FloatArray, priors: LensPriors
 ) -> tuple[BoolArray, tuple[tuple[LensChoice, ...], ...]]:
     """Return the most probable choice (C, 7), and the ranking of `LensEstimate`.
 
-    In one sweep all cameras are asked, with the choices for the others as they were before it. `camera_priors` asks
-    one after the other: a posterior of all for each of them, which is too slow for hundreds of cameras.
+    One sweep asks all cameras, with the choices for the others from before the sweep. Asking one after the other, as
+    `selfcal.priors` does, takes a posterior of all cameras for each, which is too slow for hundreds.
     """
-    free, everything = np.zeros((len(away), COUNT), np.bool_), np.ones_like(away, np.bool_)
+    free, everything = np.zeros((len(offsets), COUNT), np.bool_), np.ones_like(offsets, np.bool_)
     ranking: list[tuple[LensChoice, ...]] = []
-    for _ in range(SWEEPS):
+    for _ in range(OPTIONS.sweeps):
         before, precision, ranking = free, priors.precision(free), []
-        step, covariance = _posterior(H, g, precision, away, everything)
+        step, covariance = _posterior(H, g, precision, offsets, everything)
         free = np.empty_like(before)
-        for camera, own in enumerate(np.arange(len(g)).reshape(away.shape)):
-            trials = priors.choices[camera]
-            said = cavity(covariance[np.ix_(own, own)], step[own], precision[camera], away[camera])
-            found = posteriors(*said, priors.choice_priors(trials, camera, away[camera])).log_evidence
-            free[camera] = trials[np.argmax(found)]
-            ranking.append(_rank(int(priors.family[camera]), trials, found))
+        for camera, own in enumerate(np.arange(len(g)).reshape(offsets.shape)):
+            choices = priors.choices[camera]
+            likelihood = cavity(covariance[np.ix_(own, own)], step[own], precision[camera], offsets[camera])
+            evidence = posteriors(*likelihood, priors.choice_priors(choices, camera, offsets[camera])).log_evidence
+            free[camera] = choices[np.argmax(evidence)]
+            ranking.append(_rank(int(priors.family[camera]), choices, evidence))
         if np.array_equal(free, before):
             break
     return free, tuple(ranking)
 
 
-def _rank(family: int, trials: BoolArray, log_evidence: FloatArray) -> tuple[LensChoice, ...]:
+def _rank(family: int, choices: BoolArray, log_evidence: FloatArray) -> tuple[LensChoice, ...]:
     """Return the best choice of every model, best first."""
     best: dict[str, LensChoice] = {}
     for k in np.argsort(-log_evidence, kind="stable"):
-        free = part_names(family, trials[k])
+        free = part_names(family, choices[k])
         name = model_name(family, free)
         best.setdefault(name, LensChoice(name, free, float(log_evidence[k])))
     return tuple(best.values())
 
 
 def _mean_squares(
-    step: FloatArray, posterior: tuple[FloatArray, FloatArray], precision: FloatArray, away: FloatArray,
+    step: FloatArray, posterior: tuple[FloatArray, FloatArray], precision: FloatArray, offsets: FloatArray,
     priors: LensPriors,
 ) -> FloatArray:  # fmt: skip
     """Return (12C, 12C) mean squares of the cameras about a step, over all choices for each, the others as they are.
 
-    Choices that the photos were not asked about count, too: a part is no better known because nobody asked.
+    Barred choices and parts that are not estimated count, too: not estimating a part makes it no better known.
     """
     mean, covariance = posterior
-    found = covariance + np.outer(mean - step, mean - step)
-    for camera, own in enumerate(np.arange(len(step)).reshape(away.shape)):
+    squares = covariance + np.outer(mean - step, mean - step)
+    for camera, own in enumerate(np.arange(len(step)).reshape(offsets.shape)):
         block = np.ix_(own, own)
-        said = cavity(covariance[block], mean[own], precision[camera], away[camera])
-        choices = priors.choice_priors(consistent_choices(int(priors.family[camera])), camera, away[camera])
-        found[block] = posteriors(*said, choices).mean_squares(step[own])
-    return found
+        likelihood = cavity(covariance[block], mean[own], precision[camera], offsets[camera])
+        choices = priors.choice_priors(consistent_choices(int(priors.family[camera])), camera, offsets[camera])
+        squares[block] = posteriors(*likelihood, choices).mean_squares(step[own])
+    return squares
 
 
 def _camera_blocks(squares: FloatArray) -> FloatArray:
@@ -291,8 +301,9 @@ def _apply_step(params: FloatArray, step: FloatArray, sides: FloatArray) -> tupl
     with np.errstate(over="ignore", invalid="ignore"):
         moved = step_cameras(params, step)
         focals = moved[:, [FX, FY]] / sides[:, None]
-    priors = np.isfinite(moved).all(axis=1) & np.all((focals > FOCALS[0]) & (focals < FOCALS[1]), axis=1)
-    return moved, ~priors | (np.abs(step[:, LOG_FOCAL]) > LONGEST_STEP)
+    low, high = OPTIONS.focals
+    is_plausible = np.isfinite(moved).all(axis=1) & np.all((focals > low) & (focals < high), axis=1)
+    return moved, ~is_plausible | (np.abs(step[:, LOG_FOCAL]) > OPTIONS.longest_step)
 
 
 def _prior_deviations(params: FloatArray, priors: LensPriors) -> FloatArray:
@@ -306,43 +317,26 @@ def _shorten_step(before: FloatArray, after: FloatArray, camera: int, priors: Le
     """Return a camera (12,) between two that does not fold; the second where the first folds, too."""
     if priors.folds(camera, before):
         return after
-    halves = (before + 0.5**k * (after - before) for k in range(1, CLAMPS + 1))
+    halves = (before + 0.5**k * (after - before) for k in range(1, OPTIONS.clamps + 1))
     return next((one for one in halves if not priors.folds(camera, one)), before)
 
 
-SQUEEZE = 0.8
-"""Share of the undistorted radius at which a perspective lens puts the outermost observations, below which it is tried
-as a fisheye: at 120 degrees an equidistant lens has 0.6, and at 95 degrees 0.76. Chosen by hand; not measured on its
-own."""
-NARROW_ANGLE = np.radians(65.0)
-"""Largest angle to the optical axis up to which a fisheye is tried as a perspective lens. Chosen by hand; not measured
-on its own."""
-SAMPLES = 200
-"""Radii at which a lens is made like another. Chosen by hand; not measured on its own."""
-LEAST_REACH = 0.2
-"""Smallest share of the observed radius up to which a lens must not fold to be tried as another. Chosen by hand; not
-measured on its own."""
-
-
-def asks_for_other_family(params: FloatArray, family: int, reach: float, best: LensChoice, folding: bool) -> bool:
-    """Return whether a camera is to be tried as one of the other family.
+def suggests_other_family(params: FloatArray, family: int, reach: float, best: LensChoice, folding: bool) -> bool:
+    """Return whether a camera is worth trying as one of the other family.
 
     A perspective lens is, if it needs many terms, would fold, or puts the outermost points far inwards. A fisheye is,
-    if its view is so narrow that a perspective lens can show it.
+    if a perspective lens can show its narrow view.
 
     Args:
-        params: (12,) of the camera.
-        family: of the camera.
         reach: radius of the outermost observations, in focal lengths.
-        best: its most probable model.
         folding: whether a more probable lens folds inside the photo.
     """
     if family == PANORAMA:
         return False
     angle = angle_limit(params, family, reach)
     if family == FISHEYE:
-        return bool(angle < NARROW_ANGLE)
-    return folding or "k3" in best.free or bool(np.isnan(angle) or reach < SQUEEZE * np.tan(angle))
+        return bool(angle < OPTIONS.narrow_angle)
+    return folding or "k3" in best.free or bool(np.isnan(angle) or reach < OPTIONS.squeeze * np.tan(angle))
 
 
 def convert_lens(params: FloatArray, family: int, reach: float) -> FloatArray | None:
@@ -351,27 +345,25 @@ def convert_lens(params: FloatArray, family: int, reach: float) -> FloatArray | 
     Center and aspect are kept, and tangential terms are dropped.
 
     Args:
-        params: (12,) of the camera.
-        family: PERSPECTIVE or FISHEYE.
         reach: radius up to which the two agree, in focal lengths.
     """
-    for share in np.linspace(1.0, LEAST_REACH, 9):
+    for share in np.linspace(1.0, OPTIONS.least_reach, 9):
         angle = angle_limit(params, family, float(share * reach))
         if np.isfinite(angle):
             break
     else:
         return None
-    angles = np.linspace(0.0, angle, SAMPLES + 1)[1:]
+    angles = np.linspace(0.0, angle, OPTIONS.samples + 1)[1:]
     places, base = ((K1, K2, K3, K4), angles) if family == PERSPECTIVE else ((K1, K2, K3), np.tan(angles))
     terms = base[:, None] ** (2 * np.arange(len(places) + 1) + 1)
     size = np.linalg.norm(terms, axis=0)
-    found = np.linalg.lstsq(terms / size, radius_at(angles, params, family), rcond=1e-10)[0] / size
-    if not found[0] > 0.0:
+    fitted = np.linalg.lstsq(terms / size, radius_at(angles, params, family), rcond=1e-10)[0] / size
+    if not fitted[0] > 0.0:
         return None
     other = np.zeros(CAMERA)
     other[[FX, FY, CX, CY]] = params[[FX, FY, CX, CY]]
-    other[[FX, FY]] *= found[0]
-    other[list(places)] = found[1:] / found[0]
+    other[[FX, FY]] *= fitted[0]
+    other[list(places)] = fitted[1:] / fitted[0]
     return other
 
 
@@ -379,8 +371,6 @@ def family_evidence(cost_px2: float, noise_px: float, best: LensChoice) -> float
     """Return the log-probability of a bundle with one of its cameras as it is, comparable between families.
 
     Args:
-        cost_px2: robust cost of the bundle.
-        noise_px: the same for all that are compared.
-        best: the camera's most probable model.
+        noise_px: the same for all candidates.
     """
     return best.log_evidence - evidence_weight(noise_px) * cost_px2

@@ -1,4 +1,8 @@
-"""What the user lays down about a camera: its values, that these stay, or the model that it ends with."""
+"""Parts of a camera that bundle adjustment frees together, their priors, and the user's rules about a camera.
+
+Ours; the choice of free parts by marginal likelihood is that of `geometry.model_selection`. A part has a narrow prior
+about its usual value and a wide one.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -41,19 +45,13 @@ from sfm_app.types import Calibration
 from sfm_app.types import camera as kinds
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
-# Parts of a camera that are freed together, with their priors, for each family of lenses.
-#
-# Ours; the choice by marginal likelihood is that of `geometry.model_selection`. A part has a narrow prior about its
-# usual value and a wide one.
-
 LOG_FOCAL, LOG_ASPECT = FX, FY
 """Columns of log sqrt(fx fy) and log fy/fx, which replace fx and fy."""
 FOCAL_SPREAD = 0.7
-"""Prior standard deviation of log f about the value from mapping: hardly a constraint. Chosen by hand; not measured on
-its own."""
+"""Prior standard deviation of log f about the value from mapping: hardly a constraint. Chosen by hand."""
 ABSENT = 1e-4
-"""Standard deviation of the terms of `Part.exact` where they are not freed, as a share of the radius of the corner: a
-tenth of a pixel. They are then set to 0. Chosen by hand; not measured on its own."""
+"""Narrow prior of the terms of `Part.exact`, as a share of the radius of the corner: a tenth of a pixel. They are then
+set to 0. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +66,11 @@ class Part:
     share: float
     """Share of cameras for which the wide prior is the right one."""
     stays: bool = False
-    """Whether it keeps its value where the photos do not determine it; otherwise it moves to its usual value. Mapping
-    starts from a calibrated center and aspect, but estimates distortion without a prior."""
+    """Whether an undetermined part keeps its value; otherwise it moves to its usual value. Mapping starts from a
+    calibrated center and aspect, but estimates distortion without a prior."""
     powers: tuple[int, ...] = ()
-    """Powers of the radius that the terms are multiplied with. Their deviations then state a share of the radius at the
-    corner of the photo; without powers they are those of the parameters."""
+    """Powers of the radius in the terms. Deviations then state a share of the radius at the corner of the photo;
+    without powers, those of the parameters."""
     needs: tuple[str, ...] = ()
     """Parts that are freed before this one."""
     exact: bool = False
@@ -90,8 +88,8 @@ PERSPECTIVE_PARTS = (
     Part("k3", (K3,), ABSENT, 0.03, 0.1, powers=(6,), needs=("k1", "k2"), exact=True),
     Part("k4 k5 k6", (K4, K5, K6), ABSENT, 0.05, 0.05, powers=(2, 4, 6), needs=("k1", "k2", "k3"), exact=True),
 )
-"""The priors of center, aspect and k1 are those of `camera_priors`; the others: docs/algorithms.md, Bundle adjustment.
-Chosen by hand; not measured on their own."""
+"""The priors of center, aspect and k1 are those of `selfcal.priors`; the others: docs/algorithms.md, Bundle adjustment.
+Chosen by hand."""
 FISHEYE_PARTS = (
     _CENTER,
     _ASPECT,
@@ -102,34 +100,24 @@ FISHEYE_PARTS = (
     Part("thin prism", (SX, SY), ABSENT, 0.002, 0.05, powers=(1, 1), needs=("p1 p2",), exact=True),
 )
 """An equidistant lens is the usual one. At 175 degrees a stereographic lens has k1 0.19 and k2 0.05 of the radius, an
-equisolid one k1 -0.1. docs/algorithms.md, Bundle adjustment. Chosen by hand; not measured on their own."""
+equisolid one k1 -0.1. docs/algorithms.md, Bundle adjustment. Chosen by hand."""
 PARTS = {PERSPECTIVE: PERSPECTIVE_PARTS, FISHEYE: FISHEYE_PARTS, PANORAMA: PERSPECTIVE_PARTS}
-"""By family; a panorama is never asked about any."""
+"""By family; of a panorama, none is estimated."""
 COUNT = len(PERSPECTIVE_PARTS)
 """Number of parts of a camera of any family."""
 
 
 def part_names(family: int, chosen: BoolArray) -> tuple[str, ...]:
-    """Return the names of some parts of a camera.
-
-    Args:
-        family: of the camera.
-        chosen: (7,) the parts.
-    """
+    """Return the names of parts (7,) of a camera."""
     return tuple(part.name for part, on in zip(PARTS[family], chosen, strict=True) if on)
 
 
 def model_name(family: int, freed: tuple[str, ...]) -> str:
-    """Return COLMAP's name of the smallest camera model that has some parts; the center alone makes no other model.
-
-    Args:
-        family: of the camera.
-        freed: names of the parts.
-    """
+    """Return COLMAP's name of the smallest camera model with these parts; a free center makes no other model."""
     if family == PANORAMA:
         return "EQUIRECTANGULAR"
     steps = _FISHEYE_MODELS if family == FISHEYE else _PERSPECTIVE_MODELS
-    return next((name for name, wants in steps if set(freed) & wants), steps[-1][0])
+    return next((name for name, needs in steps if set(freed) & needs), steps[-1][0])
 
 
 _PERSPECTIVE_MODELS = (
@@ -158,34 +146,34 @@ class LensPriors:
     family: IndexArray
     """(C,) as in `Bundle`."""
     reach: FloatArray
-    """(C,) radius of the corners in focal lengths, at most that of what a fisheye shows."""
-    asked: BoolArray
-    """(C, 7) parts that are estimated, in the order of PARTS; the others keep their values."""
+    """(C,) radius of the corners in focal lengths; of a fisheye, at most that of its largest angle."""
+    estimated: BoolArray
+    """(C, 7) parts to estimate, in the order of PARTS; the others keep their values."""
     choices: tuple[BoolArray, ...]
-    """For each camera (K, 7) which parts may be freed together; those that free less come first."""
+    """For each camera (K, 7) parts that may be freed together; choices that free less come first."""
     usual: FloatArray
-    """(C, 12) the usual values: of any camera, or those that the user gave for this one. Of fx and fy only the ratio
-    counts."""
+    """(C, 12) usual values of any camera, or the user's values for this one. Of fx and fy only the ratio counts."""
     fixed: BoolArray
     """(C,) cameras that keep all of their parameters."""
 
     @classmethod
-    def from_cameras(cls, params: FloatArray, family: IndexArray, sizes: FloatArray, asked: BoolArray) -> "LensPriors":
+    def from_cameras(
+        cls, params: FloatArray, family: IndexArray, sizes: FloatArray, estimated: BoolArray
+    ) -> "LensPriors":
         """Return the priors before any evidence.
 
         Args:
             params: (C, 12) cameras as in `Bundle`.
-            family, sizes, asked: as in the class.
         """
         reach = np.hypot(*sizes.T) / (2.0 * np.sqrt(params[:, FX] * params[:, FY]))
         reach = np.where(family == FISHEYE, np.minimum(reach, SEEN_ANGLE), reach)
         choices = []
-        for kind, row in zip(family, asked, strict=True):
+        for kind, row in zip(family, estimated, strict=True):
             allowed = consistent_choices(int(kind))
             choices.append(allowed[~np.any(allowed & ~row, axis=1)])
         usual = np.zeros_like(params)
         usual[:, [FX, FY]], usual[:, [CX, CY]] = 1.0, sizes / 2.0
-        return cls(sizes, family, reach, asked, tuple(choices), usual, np.zeros(len(params), np.bool_))
+        return cls(sizes, family, reach, estimated, tuple(choices), usual, np.zeros(len(params), np.bool_))
 
     @property
     def sides(self) -> FloatArray:
@@ -193,56 +181,44 @@ class LensPriors:
         return np.asarray(self.sizes.max(axis=1), np.float64)
 
     def drop_lens(self, camera: int, free: BoolArray) -> "LensPriors":
-        """Return the priors without some choices for a camera: those whose lens is that of one.
+        """Return the priors without the choices for a camera that have the radial terms of one choice.
 
         Args:
-            camera: its row.
-            free: (7,) the choice that is barred, with all of the same radial terms.
+            free: (7,) the barred choice.
         """
         radial = [k for k, part in enumerate(PARTS[int(self.family[camera])]) if part.name.startswith("k")]
-        kept = np.any(self.choices[camera][:, radial] != free[radial], axis=1)
+        differs = np.any(self.choices[camera][:, radial] != free[radial], axis=1)
         choices = list(self.choices)
-        choices[camera] = choices[camera][kept]
+        choices[camera] = choices[camera][differs]
         return replace(self, choices=tuple(choices))
 
     def deviations(self, camera: int, free: BoolArray) -> FloatArray:
-        """Return (K, 12) standard deviations of the prior of a camera under choices (K, 7).
-
-        Args:
-            camera: its row.
-            free: the freed parts of each choice.
-        """
-        found = np.full((len(free), CAMERA), FOCAL_SPREAD)
+        """Return (K, 12) standard deviations of the prior of a camera under choices (K, 7)."""
+        deviations = np.full((len(free), CAMERA), FOCAL_SPREAD)
         for k, part in enumerate(PARTS[int(self.family[camera])]):
             unit = self.sides[camera] if part.name == "center" else 1.0
             sigma = np.where(free[:, k], part.wide, part.narrow) * unit
             for place, power in zip(part.places, part.powers or (0,) * len(part.places), strict=True):
-                found[:, place] = sigma * self.reach[camera] ** -power
-        return found
+                deviations[:, place] = sigma * self.reach[camera] ** -power
+        return deviations
 
     def precision(self, free: BoolArray) -> FloatArray:
         """Return (C, 12) precisions of the prior, the wide one for the parts in `free` (C, 7)."""
         rows = [self.deviations(camera, free[[camera]])[0] for camera in range(len(free))]
         return np.asarray(np.array(rows).reshape(-1, CAMERA) ** -2.0, np.float64)
 
-    def choice_priors(self, trials: BoolArray, camera: int, away: FloatArray) -> NormalPriors:
-        """Return the priors of one camera under each of K choices.
-
-        Args:
-            trials: (K, 7) the choices.
-            camera: row of the camera.
-            away: (12,) from it to its usual values.
-        """
+    def choice_priors(self, choices: BoolArray, camera: int, offsets: FloatArray) -> NormalPriors:
+        """Return the priors of one camera under choices (K, 7), for offsets (12,) from it to its usual values."""
         share = np.array([part.share for part in PARTS[int(self.family[camera])]])
-        log_odds = np.sum(np.log(np.where(trials, share, 1.0 - share)), axis=1)
-        return NormalPriors(self.deviations(camera, trials) ** -2.0, np.tile(away, (len(trials), 1)), log_odds)
+        log_odds = np.sum(np.log(np.where(choices, share, 1.0 - share)), axis=1)
+        return NormalPriors(self.deviations(camera, choices) ** -2.0, np.tile(offsets, (len(choices), 1)), log_odds)
 
     def prior_offsets(self, params: FloatArray) -> FloatArray:
         """Return (C, 12) offsets from the cameras to their usual values; 0 for focals and for parts not estimated."""
-        away = self.usual - params
-        away[:, LOG_FOCAL] = 0.0
-        away[:, LOG_ASPECT] = np.log(params[:, FX] / params[:, FY]) - np.log(self.usual[:, FX] / self.usual[:, FY])
-        return np.where(self.parameter_mask(self.asked), away, 0.0)
+        offsets = self.usual - params
+        offsets[:, LOG_FOCAL] = 0.0
+        offsets[:, LOG_ASPECT] = np.log(params[:, FX] / params[:, FY]) - np.log(self.usual[:, FX] / self.usual[:, FY])
+        return np.where(self.parameter_mask(self.estimated), offsets, 0.0)
 
     def parameter_mask(self, parts: BoolArray) -> BoolArray:
         """Return (C, 12) mask of the parameters of some parts (C, 7), and of the focal."""
@@ -253,8 +229,8 @@ class LensPriors:
         return chosen
 
     @property
-    def demanded(self) -> BoolArray:
-        """(C, 7) parts that every choice frees, because the user named the model; they move, determined or not."""
+    def required(self) -> BoolArray:
+        """(C, 7) parts that every choice frees because the user named the model; they move, determined or not."""
         return np.array([one.all(axis=0) & (len(one) > 0) for one in self.choices], np.bool_).reshape(-1, COUNT)
 
     def part_mask(self, quality: str) -> BoolArray:
@@ -263,12 +239,7 @@ class LensPriors:
         return np.array(rows, np.bool_).reshape(-1, COUNT)
 
     def folds(self, camera: int, params: FloatArray) -> bool:
-        """Return whether the lens of a camera folds inside the photo.
-
-        Args:
-            camera: its row.
-            params: (12,) a candidate for it.
-        """
+        """Return whether parameters (12,) of a camera fold inside the photo."""
         if self.family[camera] == PANORAMA or not np.isfinite(params).all() or min(params[FX], params[FY]) <= 0.0:
             return False
         corners = self.sizes[camera] * np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) - params[[CX, CY]]
@@ -277,30 +248,25 @@ class LensPriors:
 
 
 def consistent_choices(family: int) -> BoolArray:
-    """Return (K, 7) choices of what is freed in which no part lacks what it needs; those that free less come first.
-
-    Args:
-        family: of the camera.
-    """
+    """Return choices (K, 7) in which no free part lacks a part that it needs; choices that free less come first."""
     names = [part.name for part in PARTS[family]]
-    trials = binary_choices(len(names))
+    choices = binary_choices(len(names))
     for k, part in enumerate(PARTS[family]):
         needed = [names.index(name) for name in part.needs]
-        trials = trials[~trials[:, k] | trials[:, needed].all(axis=1)]
-    return trials
+        choices = choices[~choices[:, k] | choices[:, needed].all(axis=1)]
+    return choices
 
 
 def step_cameras(params: FloatArray, step: FloatArray) -> FloatArray:
     """Return cameras (C, 12) after a step.
 
     Args:
-        params: (C, 12) before it.
         step: (C, 12), with log sqrt(fx fy) and log fy/fx in place of fx and fy.
     """
-    moved = params + step
-    moved[:, FX] = params[:, FX] * np.exp(step[:, LOG_FOCAL] - 0.5 * step[:, LOG_ASPECT])
-    moved[:, FY] = params[:, FY] * np.exp(step[:, LOG_FOCAL] + 0.5 * step[:, LOG_ASPECT])
-    return moved
+    result = params + step
+    result[:, FX] = params[:, FX] * np.exp(step[:, LOG_FOCAL] - 0.5 * step[:, LOG_ASPECT])
+    result[:, FY] = params[:, FY] * np.exp(step[:, LOG_FOCAL] + 0.5 * step[:, LOG_ASPECT])
+    return result
 
 
 FAMILIES = {kinds.PERSPECTIVE: PERSPECTIVE, kinds.FISHEYE: FISHEYE, kinds.EQUIRECTANGULAR: PANORAMA}
@@ -310,12 +276,12 @@ PROJECTIONS = {family: projection for projection, family in FAMILIES.items()}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraRule:
-    """What holds for one camera in bundle adjustment, whatever the photos say."""
+    """The user's rule about one camera in bundle adjustment."""
 
     given: Calibration | None = None
-    """Camera that the user gave: where its parameters are not determined, they stay near these values."""
+    """The user's camera: parameters that the photos do not determine stay near these values."""
     model: str = ""
-    """COLMAP's name of the camera model that is fitted; empty for the one that the photos support best."""
+    """COLMAP's name of the camera model to fit; empty for the model that the photos support best."""
 
     @property
     def kept(self) -> bool:
@@ -324,19 +290,19 @@ class CameraRule:
 
     @property
     def family(self) -> int | None:
-        """Family that the camera must have; None where the photos choose."""
+        """Required family; None where the photos choose."""
         if self.given is not None and self.kept:
             return FAMILIES[self.given.projection]
         return FAMILIES[projection_of_model(self.model)] if self.model else None
 
     def usual(self, family: int) -> FloatArray | None:
-        """Return the given parameters (12,) of a family; None where none are given in it."""
+        """Return the user's parameters (12,); None if they are not of this family."""
         if self.given is None or FAMILIES[self.given.projection] != family:
             return None
         return params_of_calibration(self.given)
 
     def parts(self, family: int) -> BoolArray | None:
-        """Return (7,) which parts the model has besides its center; None where it is not of this family, or open."""
+        """Return (7,) the parts of the model besides its center; None if it is open, or not of this family."""
         if not self.model or self.family != family or family == PANORAMA:
             return None
         names = (*TWO_FOCALS, *TERMS[PROJECTIONS[family]])
@@ -361,9 +327,8 @@ def calibration_from_params(
 
     Args:
         params: (12,) of a perspective camera or a fisheye.
-        family: of the camera.
         size: (width, height) in pixels.
-        deviations: (12,) their standard deviations.
+        deviations: (12,) standard deviations.
         determined: names of the parts that the photos determine.
     """
     K = camera_matrix(*(float(params[k]) for k in (FX, FY, CX, CY)))
@@ -375,27 +340,21 @@ def calibration_from_params(
 
 
 def fit_to_model(params: FloatArray, parts: BoolArray, family: int) -> FloatArray:
-    """Return a camera (12,) without the parameters that its model lacks: square pixels, terms of 0.
-
-    Args:
-        params: (12,) as in `Bundle`.
-        parts: (7,) that the model has.
-        family: of the camera.
-    """
-    found = params.copy()
+    """Return a camera (12,) without the parameters of parts (7,) that its model lacks: square pixels, terms of 0."""
+    fitted = params.copy()
     for part, on in zip(PARTS[family], parts, strict=True):
         if part.name == "aspect" and not on:
-            found[[FX, FY]] = np.sqrt(params[FX] * params[FY])
+            fitted[[FX, FY]] = np.sqrt(params[FX] * params[FY])
         elif part.name != "center" and not on:
-            found[list(part.places)] = 0.0
-    return found
+            fitted[list(part.places)] = 0.0
+    return fitted
 
 
 def choices_of_model(parts: BoolArray, choices: BoolArray) -> BoolArray:
-    """Return (K, 7) the choices of freed parts that make exactly a model, with and without a free center.
+    """Return the choices (K, 7) that make exactly a model, with and without a free center.
 
     Args:
-        parts: (7,) that the model has besides its center.
+        parts: (7,) of the model, besides its center.
         choices: (M, 7) all consistent choices.
     """
     center = np.array([part.name == "center" for part in PARTS[PERSPECTIVE]], np.bool_)

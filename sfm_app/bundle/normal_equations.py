@@ -33,7 +33,6 @@ def whiten_points(by_point: FloatArray, point: NDArray[np.int64], points: int) -
     Args:
         by_point: (N, 2, 3) weighted derivatives of the observations by their points.
         point: (N,) row of the point of each observation.
-        points: P.
     """
     H = np.zeros((points, 3, 3))
     products = np.einsum("nki,nkj->nij", by_point, by_point)
@@ -174,12 +173,7 @@ class Linearized:
 
 
 def eliminate_points(seen: Linearized, damping: float) -> tuple[sparse.csr_array, FloatArray]:
-    """Return the matrix (6I, 6I) of the poses, and the rows (12C, 6I + 12C) of the cameras, after the points.
-
-    Args:
-        seen: all observations.
-        damping: added to the diagonal.
-    """
+    """Return the matrix (6I, 6I) of the poses, and the rows (12C, 6I + 12C) of the cameras, after the points."""
     photos, cameras, points = seen.counts
     A = np.einsum("nki,nkj->nij", seen.by_point, seen.by_view)
     order = np.lexsort((seen.photo, seen.point))
@@ -230,7 +224,6 @@ def couple_poses(observed: Any, order: Any, pattern: Any, damping: float, blocks
             their products (N, 3, 6) with those by point.
         order: these observations by photo; where those of each photo begin there, and those of each point above.
         pattern: first block of each photo, and the other photo of each block, ascending.
-        damping: added to the diagonal.
         blocks: (B, 6, 6), zeros at first.
     """
     photo, point, by_pose, A = observed
@@ -266,7 +259,6 @@ def mirror_blocks(starts: Any, others: Any, blocks: FloatArray) -> None:
     """Copy the blocks above the diagonal to their places below, in place.
 
     Args:
-        starts, others: the pattern, as in `couple_poses`.
         blocks: (B, 6, 6), without those below the diagonal at first.
     """
     below = starts[:-1].astype(np.int64)
@@ -289,7 +281,6 @@ def couple_cameras(observed: Any, groups: Any, poses: int, damping: float, rows:
         groups: (N,) group of the observations of a point by one camera; (G,) their cameras; first group of each point;
             (G, 3, 12) zeros.
         poses: columns of the poses, before those of the cameras.
-        damping: added to the diagonal.
         rows: (12C, 6I + 12C), zeros at first.
     """
     photo, camera, point, by_view, A = observed
@@ -332,7 +323,6 @@ def add_scores(observed: Any, give: FloatArray, left_over: FloatArray, points: i
         observed: (N,) photo, camera and point; (N, 2, 18) and (N, 2, 3) derivatives by view and point.
         give: (12C, 6I) decrease of the best change of the poses.
         left_over: (N, 2) residuals.
-        points: P.
         scores: (12C, I), zeros at first.
     """
     photo, camera, point, by_view, by_point = observed
@@ -454,7 +444,6 @@ def residuals(bundle: Bundle, predicted: FloatArray) -> FloatArray:
     """Return (N, 2) observed less predicted positions, in pixels; in panoramas the short way round.
 
     Args:
-        bundle: the model.
         predicted: (N, 2) from `project` or `predict`.
     """
     rows = bundle.camera[bundle.photo]
@@ -516,7 +505,6 @@ def apply_step(bundle: Bundle, params: FloatArray, poses: FloatArray, points: Fl
     """Return the bundle with new cameras, and with changed poses and points.
 
     Args:
-        bundle: bundle to change; not changed in place.
         params: (C, 12) the new cameras, see `Bundle.params`.
         poses: (I, 6) changes: a rotation vector in the camera's axes, and a shift of t.
         points: (P, 3) shifts of the points.
@@ -531,10 +519,7 @@ def best_step(bundle: Bundle, reduced: ReducedSystem, params: FloatArray, scale_
     A point that would move behind a camera stays: along an undetermined direction a linear step has no bound.
 
     Args:
-        bundle: bundle to change; not changed in place.
-        reduced: the cost about it.
         params: (C, 12) the new cameras.
-        scale_px: as in `reduce`.
     """
     nowhere = np.zeros((len(bundle.R), POSE)), np.zeros_like(bundle.X)
     poses, points = reduced.back_substitute(params - bundle.params)
@@ -547,12 +532,7 @@ def best_step(bundle: Bundle, reduced: ReducedSystem, params: FloatArray, scale_
 
 
 def cost(bundle: Bundle, scale_px: float) -> float:
-    """Return half the sum of the loss of `reduce`; lost observations count with a residual of LOST_PX.
-
-    Args:
-        bundle: the model.
-        scale_px: s of the loss, in pixels, > 0.
-    """
+    """Return half the sum of the loss of `reduce`; lost observations count with a residual of LOST_PX."""
     with np.errstate(all="ignore"):
         r = residuals(bundle, predict(bundle))
     return loss(r, usable_mask(bundle, r), scale_px)
@@ -563,8 +543,6 @@ def loss(r: FloatArray, usable: NDArray[np.bool_], scale_px: float) -> float:
 
     Args:
         r: (N, 2) residuals in pixels.
-        usable: (N,) from `usable_mask`.
-        scale_px: s of the loss, in pixels, > 0.
     """
     with np.errstate(all="ignore"):
         squares = np.where(usable, np.einsum("ni,ni->n", r, r), LOST_PX**2)
@@ -577,7 +555,6 @@ def usable_mask(bundle: Bundle, r: FloatArray, depth: FloatArray | None = None) 
     A panorama also sees what is behind it.
 
     Args:
-        bundle: the model.
         r: (N, 2) residuals in pixels.
         depth: (N,) of the points before their cameras; from the poses if None.
     """
@@ -616,8 +593,6 @@ def weigh(
     Args:
         r: (N, 2) residuals in pixels.
         by_view, by_point: (N, 2, k) and (N, 2, 3) derivatives of the projections.
-        usable: (N,) from `usable_mask`.
-        scale_px: as in `loss`.
     """
     with np.errstate(all="ignore"):
         largest = np.maximum(np.abs(by_view).max(axis=(1, 2), initial=0.0), np.abs(by_point).max(axis=(1, 2)))

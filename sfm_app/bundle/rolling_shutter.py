@@ -62,7 +62,6 @@ def project_rows(bundle: Bundle, share: FloatArray, motion: FloatArray) -> RowPr
 
     Args:
         bundle: the model, its poses those of the middle rows.
-        share: (N,) row of each observation.
         motion: (I, 6) velocity of each photo as in `PathVelocity`, times the readout.
     """
     rows, R = bundle.camera[bundle.photo], bundle.R[bundle.photo]
@@ -199,11 +198,7 @@ class ShutterBundle:
 
     @classmethod
     def motionless(cls, bundle: Bundle, share: FloatArray, readout: float) -> "ShutterBundle":
-        """Return a bundle whose photos do not move.
-
-        Args:
-            bundle, share, readout: as in the class.
-        """
+        """Return a bundle whose photos do not move."""
         nothing = np.zeros((len(bundle.R), VELOCITY))
         return cls(bundle, share, readout, nothing, nothing)
 
@@ -266,11 +261,8 @@ def linearize(
     """Eliminate the points (Schur complement), in the Gauss-Newton approximation.
 
     Args:
-        model: the bundle.
         precision: (n,) of the priors on the unknowns, in 1 / px^2 like the squared derivatives.
         pull: (n,) precisions times distances to the values that the priors expect.
-        scale_px: as of `normal_equations.reduce`.
-        held: whether the readout is known.
     """
     bundle, n = model.bundle, model.unknowns
     r, by_view, by_point = _weighted_derivatives(model, scale_px)
@@ -330,7 +322,6 @@ def add_points(
 
     Args:
         rows: (N,) observations sorted by point, and (P + 1,) where those of each point begin.
-        columns, r, by_view, by_point: as in `ShutterSystem`.
         half: (n, n) changed in place: each pair of unknowns in one of its two places.
         g: (n,) changed in place.
     """
@@ -400,8 +391,6 @@ def apply_shutter_step(model: ShutterBundle, step: ShutterStep, share: float) ->
     """Return the model after a share of a step.
 
     Args:
-        model: not changed in place.
-        step: from `solve_step`.
         share: in (0, 1].
     """
     bundle = model.bundle
@@ -416,12 +405,7 @@ def apply_shutter_step(model: ShutterBundle, step: ShutterStep, share: float) ->
 
 
 def shutter_cost(model: ShutterBundle, scale_px: float) -> float:
-    """Return half the sum of the loss of `normal_equations.reduce`, in squared pixels.
-
-    Args:
-        model: the bundle.
-        scale_px: s of the loss, in pixels, > 0.
-    """
+    """Return half the sum of the loss of `normal_equations.reduce`, in squared pixels."""
     with np.errstate(all="ignore"):
         seen = project_rows(model.bundle, model.share, model.motion)
         r = model.bundle.x - seen.x
@@ -498,10 +482,7 @@ def estimate_readout(
 
     Args:
         bundle: the model, adjusted as if a global shutter had taken its photos; nine or more.
-        rows: when its observations were seen.
-        priors: on the cameras.
         freed: (C, 7) parts of the cameras that have the wide prior.
-        scale_px: as of `normal_equations.reduce`.
         start: an earlier estimate for the same photos, of which readout and shake are taken.
         known: the readout, if only poses and points are asked for.
     """

@@ -1,7 +1,7 @@
-"""Perspective views that together show a photo of a wide lens.
+"""Perspective views that together show a photo of a wide lens. Ours.
 
 Depth maps and texture are made from perspective photos. One perspective photo cannot show 180 degrees, and stretches
-what is far from its axis long before. Ours.
+things far from its axis long before.
 """
 
 from collections.abc import Callable
@@ -13,21 +13,23 @@ from numpy.typing import NDArray
 from sfm_app.camera.models import camera_matrix
 from sfm_app.types.arrays import FloatArray
 
-MOST_FIELD_DEG = 95.0
-"""Largest angle along one side of a view, without its overlap. At its border, such a view shows things 2.2 times as
-large as at its middle. Chosen by hand; not measured on its own."""
-OVERLAP_DEG = 4.0
-"""Angle by which a view reaches beyond what it is responsible for, so that windows and triangles at the border are
-whole in one of the views. Chosen by hand; not measured on its own."""
-STRIP_PX = 256
-"""Rows that are projected at once, so that memory stays small. Chosen by hand; the result does not depend on it."""
-ROUNDING_PX = 1e-6
-"""Part of a pixel by which rounding may shrink a view. By definition."""
-HALVINGS = 50
-"""Steps of the search for the largest view inside another one: as many as numbers in double precision have bits."""
-WHOLE_TURN_DEG = 300.0
-"""A photo that shows more than this is a panorama: its views look through the faces of a cube. Chosen by hand; no lens
-lies between a fisheye and a panorama."""
+
+@dataclass(frozen=True, slots=True)
+class ViewOptions:
+    """Sizes of perspective views. Chosen by hand."""
+
+    most_field_deg: float = 95.0
+    """Largest angle along one side of a view, without its overlap. At its border, such a view shows things 2.2 times as
+    large as at its center."""
+    overlap_deg: float = 4.0
+    """Angle by which a view reaches beyond its own part of the photo, so that windows and triangles at the border are
+    whole in one of the views."""
+    cube_field_deg: float = 300.0
+    """Horizontal field above which a photo is a panorama, with views through the faces of a cube. No lens lies between
+    a fisheye and a panorama."""
+
+
+OPTIONS = ViewOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,31 +49,27 @@ class PerspectiveView:
         Args:
             project: takes rays (N, 3) of the photo's frame and returns their pixels (N, 2).
         """
-        found = np.empty((self.height, self.width, 2), np.float32)
-        for top in range(0, self.height, STRIP_PX):
-            rays = self.rays(top, top + STRIP_PX)
-            found[top : top + STRIP_PX] = project(rays.reshape(-1, 3)).reshape(*rays.shape[:2], 2)
-        return found
+        pixels = np.empty((self.height, self.width, 2), np.float32)
+        strip = 256  # rows that are projected at once, so that memory stays small
+        for top in range(0, self.height, strip):
+            rays = self.rays(top, top + strip)
+            pixels[top : top + strip] = project(rays.reshape(-1, 3)).reshape(*rays.shape[:2], 2)
+        return pixels
 
     def rays(self, top: int = 0, bottom: int | None = None) -> FloatArray:
-        """Return the rays (rows, width, 3) of the centers of pixels, in the photo's frame.
-
-        Args:
-            top, bottom: rows from the first to before the second; all of them by default.
-        """
+        """Return the rays (rows, width, 3) of the centers of pixels in rows top to bottom, in the photo's frame."""
         rows = np.arange(self.height)[top:bottom]
         x, y = np.meshgrid(np.arange(self.width) + 0.5, rows + 0.5)
-        plain = np.stack([(x - self.K[0, 2]) / self.K[0, 0], (y - self.K[1, 2]) / self.K[1, 1], np.ones_like(x)], -1)
-        return np.asarray(plain @ self.R, np.float64)
+        local = np.stack([(x - self.K[0, 2]) / self.K[0, 0], (y - self.K[1, 2]) / self.K[1, 1], np.ones_like(x)], -1)
+        return np.asarray(local @ self.R, np.float64)
 
 
 def cover_rays(rays: FloatArray, focal_px: float, most_px: int) -> list[PerspectiveView]:
-    """Return perspective views that together show all rays of a photo.
+    """Return perspective views that together show all rays of a photo, with sides of at most `most_px`.
 
     Args:
-        rays: (N, 3) unit vectors, dense over what the photo shows.
+        rays: (N, 3) unit vectors, dense over the field of the photo.
         focal_px: focal length of the views in pixels; smaller where a view would become too large.
-        most_px: longest side of a view.
     """
     axes = _axes(rays)
     nearest = np.argmax(rays @ axes[:, 2].T, axis=1)
@@ -80,36 +78,38 @@ def cover_rays(rays: FloatArray, focal_px: float, most_px: int) -> list[Perspect
 
 
 def center_view(view: PerspectiveView) -> PerspectiveView:
-    """Return the view turned to the middle of what it shows, with square pixels and the optical center in the middle.
+    """Return the view turned to the center of its field, with square pixels and the optical center in the middle.
 
-    It is the largest view of the same aspect that shows nothing else. At its middle, things are as large as before.
+    It is the largest such view of the same aspect inside the given one. At its center, things keep their size.
     """
     middle = np.linalg.solve(view.K, [view.width / 2, view.height / 2, 1.0])
-    away = float(np.linalg.norm(middle))
-    x, y, z = middle / away
-    both = -x * y / (1.0 + z)
-    turn = np.array([[1.0 - x * x / (1.0 + z), both, -x], [both, 1.0 - y * y / (1.0 + z), -y], [x, y, z]])
-    focal = float(np.sqrt(view.K[0, 0] * view.K[1, 1])) * away
+    length = float(np.linalg.norm(middle))
+    x, y, z = middle / length
+    mixed = -x * y / (1.0 + z)
+    rotation = np.array([[1.0 - x * x / (1.0 + z), mixed, -x], [mixed, 1.0 - y * y / (1.0 + z), -y], [x, y, z]])
+    focal = float(np.sqrt(view.K[0, 0] * view.K[1, 1])) * length
     size = np.array([view.width / view.K[0, 0], view.height / view.K[1, 1]]) * focal
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * size / (2.0 * focal)
 
     def fits(share: float) -> bool:
-        seen = np.column_stack([share * corners, np.ones(4)]) @ turn @ view.K.T
-        pixels = seen[:, :2] / seen[:, 2:]
-        return bool((seen[:, 2] > 0.0).all() and (pixels >= 0.0).all() and (pixels <= [view.width, view.height]).all())
+        projected = np.column_stack([share * corners, np.ones(4)]) @ rotation @ view.K.T
+        pixels = projected[:, :2] / projected[:, 2:]
+        return bool(
+            (projected[:, 2] > 0.0).all() and (pixels >= 0.0).all() and (pixels <= [view.width, view.height]).all()
+        )
 
     low, high = 0.0, 2.0
-    for _ in range(HALVINGS):
+    for _ in range(50):  # as many halvings as numbers in double precision have bits
         low, high = ((low + high) / 2, high) if fits((low + high) / 2) else (low, (low + high) / 2)
-    # a view that is centered already fits but for rounding
-    width, height = (max(1, int(side + ROUNDING_PX)) for side in low * size)
-    return PerspectiveView(turn @ view.R, camera_matrix(focal, focal, width / 2, height / 2), width, height)
+    # rounding may make a view smaller that is centered already
+    width, height = (max(1, int(side + 1e-6)) for side in low * size)
+    return PerspectiveView(rotation @ view.R, camera_matrix(focal, focal, width / 2, height / 2), width, height)
 
 
 def _axes(rays: FloatArray) -> FloatArray:
-    """Return (V, 3, 3) rotations into views that look at equal parts of the angles that the rays take."""
+    """Return rotations (V, 3, 3) into views of equal parts of the angles of the rays."""
     longitude, latitude = np.arctan2(rays[:, 0], rays[:, 2]), np.arcsin(np.clip(rays[:, 1], -1.0, 1.0))
-    if np.degrees(np.ptp(longitude)) > WHOLE_TURN_DEG:
+    if np.degrees(np.ptp(longitude)) > OPTIONS.cube_field_deg:
         turns = [_rotation(0.5 * np.pi * k, 0.0) for k in range(4)]
         return np.stack([*turns, _rotation(0.0, 0.5 * np.pi), _rotation(0.0, -0.5 * np.pi)])
     yaws, pitches = _centers(longitude), _centers(latitude)
@@ -117,9 +117,9 @@ def _axes(rays: FloatArray) -> FloatArray:
 
 
 def _centers(angles: FloatArray) -> FloatArray:
-    """Return the middles of as few equal parts of a range of angles as a view is wide."""
+    """Return the centers of as few equal parts of a range of angles as views can show."""
     low, high = float(angles.min()), float(angles.max())
-    count = max(1, int(np.ceil(np.degrees(high - low) / MOST_FIELD_DEG)))
+    count = max(1, int(np.ceil(np.degrees(high - low) / OPTIONS.most_field_deg)))
     return np.asarray(low + (high - low) * (np.arange(count) + 0.5) / count, np.float64)
 
 
@@ -131,12 +131,12 @@ def _rotation(yaw: float, pitch: float) -> FloatArray:
 
 
 def _fit_view(R: FloatArray, rays: FloatArray, focal_px: float, most_px: int) -> PerspectiveView | None:
-    """Return the view with this axis that just shows some rays; None where there are none."""
+    """Return the smallest view with this axis that shows some rays; None without rays."""
     if not len(rays):
         return None
-    seen = rays @ R.T
-    slopes = np.arctan(seen[:, :2] / seen[:, 2:])
-    reach = np.radians(OVERLAP_DEG)
+    local = rays @ R.T
+    slopes = np.arctan(local[:, :2] / local[:, 2:])
+    reach = np.radians(OPTIONS.overlap_deg)
     low, high = np.tan(slopes.min(axis=0) - reach), np.tan(slopes.max(axis=0) + reach)
     focal = min(focal_px, most_px / float((high - low).max()))
     width, height = (max(1, int(side)) for side in np.ceil(focal * (high - low)).clip(max=most_px))

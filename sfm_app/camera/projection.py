@@ -18,21 +18,16 @@ SX, SY = K5, K6
 CAMERA = 12
 """Number of parameters of a camera. By definition."""
 PERSPECTIVE, FISHEYE, PANORAMA = range(3)
-"""Families of cameras. A panorama has fx, fy, cx, cy in pixels per radian and pixels, and none of them is free."""
+"""Families of cameras. A panorama has fx and fy in pixels per radian, cx and cy in pixels, and none of them is free."""
 NEAR_AXIS = 1e-5
-"""Slope below which a ray counts as the optical axis of a fisheye, where its derivatives are 0/0: the first term that
-is left out is its square. By definition: the root of double precision, rounded."""
+"""Slope below which a ray counts as the optical axis of a fisheye, where its derivatives are 0/0: the first neglected
+term is its square. By definition: the root of double precision, rounded."""
 SEEN_ANGLE = 0.5 * np.pi
 """Largest angle to the optical axis that a fisheye shows: COLMAP 4.2 projects nothing behind it. By definition."""
-TANGENT_ANGLE = np.radians(85.0)
-"""Largest angle at which a perspective lens is asked whether it folds: a view of 170 degrees. Chosen by hand; not
-measured on its own."""
-ANGLES = 256
-"""Number of angles at which a fold is sought. Chosen by hand; not measured on its own."""
 
 
 class Projected(NamedTuple):
-    """Points of photos, and their derivatives."""
+    """Projected points, and their derivatives."""
 
     x: FloatArray
     """(N, 2) pixels."""
@@ -43,10 +38,9 @@ class Projected(NamedTuple):
 
 
 def project_points(points: FloatArray, params: FloatArray, family: IndexArray) -> Projected:
-    """Project points of the cameras' frames; infinite, NaN or meaningless where a camera cannot see them.
+    """Project points (N, 3) of the cameras' frames; infinite, NaN or meaningless where a camera cannot see them.
 
     Args:
-        points: (N, 3).
         params: (N, 12) camera of each point.
         family: (N,) of this camera.
     """
@@ -54,20 +48,16 @@ def project_points(points: FloatArray, params: FloatArray, family: IndexArray) -
     if len(kinds) == 1:
         return _PROJECTIONS[kinds[0]](points, params)
     N = len(points)
-    found = Projected(np.zeros((N, 2)), np.zeros((N, 2, CAMERA)), np.zeros((N, 2, 3)))
+    projected = Projected(np.zeros((N, 2)), np.zeros((N, 2, CAMERA)), np.zeros((N, 2, 3)))
     for kind in kinds:
         rows = np.flatnonzero(family == kind)
-        for whole, part in zip(found, _PROJECTIONS[kind](points[rows], params[rows]), strict=True):
+        for whole, part in zip(projected, _PROJECTIONS[kind](points[rows], params[rows]), strict=True):
             whole[rows] = part
-    return found
+    return projected
 
 
 def image_points(points: FloatArray, params: FloatArray, family: IndexArray) -> FloatArray:
-    """Return (N, 2) pixels of points, without derivatives, as `project_points` does.
-
-    Args:
-        points, params, family: as in `project_points`.
-    """
+    """Return pixels (N, 2) of points, without derivatives, as `project_points` does."""
     kinds = np.unique(family)
     if len(kinds) == 1:
         return _POSITIONS[kinds[0]](points, params)
@@ -79,18 +69,12 @@ def image_points(points: FloatArray, params: FloatArray, family: IndexArray) -> 
 
 
 def wrap_residuals(r: FloatArray, params: FloatArray, family: IndexArray) -> FloatArray:
-    """Return residuals (N, 2) with those of panoramas taken the short way round.
-
-    Args:
-        r: (N, 2) pixels.
-        params: (N, 12) camera of each residual.
-        family: (N,) of this camera.
-    """
-    around = family == PANORAMA
-    if around.any():
+    """Return residuals (N, 2) in pixels, with those of panoramas taken the short way round."""
+    panoramic = family == PANORAMA
+    if panoramic.any():
         r = r.copy()
-        turn = 2.0 * np.pi * params[around, FX]
-        r[around, 0] -= turn * np.rint(r[around, 0] / turn)
+        width = 2.0 * np.pi * params[panoramic, FX]
+        r[panoramic, 0] -= width * np.rint(r[panoramic, 0] / width)
     return r
 
 
@@ -99,8 +83,7 @@ def radius_at(angle: FloatArray, params: FloatArray, family: int) -> FloatArray:
 
     Args:
         angle: radians, >= 0; below a right angle for a perspective camera.
-        params: (12,) of the camera.
-        family: PERSPECTIVE or FISHEYE.
+        params: (12,) of a perspective camera or fisheye.
     """
     r = np.tan(angle) if family == PERSPECTIVE else angle
     return np.asarray(r * _radial_factor(r * r, np.asarray(params)[None], family)[0], np.float64)
@@ -110,32 +93,28 @@ def angle_limit(params: FloatArray, family: int, reach: float) -> float:
     """Return the angle at which the radius of a lens reaches the corner of the photo; NaN if it folds before that.
 
     Args:
-        params: (12,) of the camera.
-        family: PERSPECTIVE or FISHEYE.
         reach: radius of the corner in focal lengths.
     """
-    angle = np.linspace(0.0, TANGENT_ANGLE if family == PERSPECTIVE else SEEN_ANGLE, ANGLES)
-    radius = radius_at(angle, params, family)
+    angle, radius = _sampled_curve(params, family)
     ends = np.flatnonzero(radius >= reach)
     # a fisheye may end inside the photo, at a right angle
-    end = ends[0] if len(ends) else ANGLES - 1
+    end = ends[0] if len(ends) else len(angle) - 1
     grows = np.isfinite(radius[: end + 1]).all() and np.all(np.diff(radius[: end + 1]) > 0.0)
     return float(angle[end]) if grows and (len(ends) or family == FISHEYE) else float("nan")
 
 
 def shown_angle(params: FloatArray, family: int, reach: float) -> float:
-    """Return the largest angle that a lens shows: where its radius reaches the corner of the photo, or folds.
-
-    Args:
-        params: (12,) of the camera.
-        family: PERSPECTIVE or FISHEYE.
-        reach: radius of the corner in focal lengths.
-    """
-    angle = np.linspace(0.0, TANGENT_ANGLE if family == PERSPECTIVE else SEEN_ANGLE, ANGLES)
-    radius = radius_at(angle, params, family)
+    """Return the largest angle that a lens shows: where its radius reaches `reach` (see `angle_limit`), or folds."""
+    angle, radius = _sampled_curve(params, family)
     folds, ends = np.flatnonzero(~(np.diff(radius) > 0.0)), np.flatnonzero(radius >= reach)
-    last = ANGLES - 1
+    last = len(angle) - 1
     return float(angle[min(folds[0] if len(folds) else last, ends[0] if len(ends) else last)])
+
+
+def _sampled_curve(params: FloatArray, family: int) -> tuple[FloatArray, FloatArray]:
+    """Return 256 angles, up to 85 degrees of a perspective lens (chosen by hand), and their radii."""
+    angle = np.linspace(0.0, np.radians(85.0) if family == PERSPECTIVE else SEEN_ANGLE, 256)
+    return angle, radius_at(angle, params, family)
 
 
 def _place_perspective(points: FloatArray, params: FloatArray) -> FloatArray:
@@ -165,7 +144,7 @@ _POSITIONS = {PERSPECTIVE: _place_perspective, FISHEYE: _place_fisheye, PANORAMA
 
 
 def _axial_gain(side: FloatArray, theta: FloatArray, Z: FloatArray) -> FloatArray:
-    """Return the angle over the distance to the optical axis, of points (N,)."""
+    """Return ratios (N,) of the angle to the distance from the optical axis."""
     near = (side < NEAR_AXIS * np.abs(Z)) & (Z > 0.0)
     return np.where(near, 1.0 / Z, theta / np.where(near, 1.0, side))
 
@@ -200,16 +179,16 @@ def _project_fisheye(points: FloatArray, params: FloatArray) -> Projected:
     t2 = theta * theta
     radial, slope, _ = _radial_factor(t2, params, FISHEYE)
     terms = [t2, t2**2, t2**3, t2**4]
-    found = _distort(u, v, (radial, slope), params, (terms, (K1, K2, K3, K4)), uv_by_x)
+    projected = _distort(u, v, (radial, slope), params, (terms, (K1, K2, K3, K4)), uv_by_x)
     prism = params[:, [SX, SY]]
     if prism.any():
         outward = np.einsum("ni,nij->nj", np.stack([u, v], -1), uv_by_x)
         scale = params[:, [FX, FY]] * prism
-        found.by_point[:] += 2.0 * scale[:, :, None] * outward[:, None]
-        found.x[:] += scale * t2[:, None]
-        found.by_camera[:, [0, 1], [FX, FY]] += prism * t2[:, None]
-    found.by_camera[:, [0, 1], [SX, SY]] = params[:, [FX, FY]] * t2[:, None]
-    return found
+        projected.by_point[:] += 2.0 * scale[:, :, None] * outward[:, None]
+        projected.x[:] += scale * t2[:, None]
+        projected.by_camera[:, [0, 1], [FX, FY]] += prism * t2[:, None]
+    projected.by_camera[:, [0, 1], [SX, SY]] = params[:, [FX, FY]] * t2[:, None]
+    return projected
 
 
 def _project_panorama(points: FloatArray, params: FloatArray) -> Projected:
@@ -238,7 +217,7 @@ def _radial_factor(r2: FloatArray, params: FloatArray, family: int) -> tuple[Flo
 
 
 def _bend(u: FloatArray, v: FloatArray, factor: FloatArray, params: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points (N,), (N,) of the plane behind the distortion, in focal lengths; `factor` is that of the radius."""
+    """Return distorted coordinates (N,), (N,) in focal lengths; `factor` is the radial one."""
     p1, p2 = params[:, [P1, P2]].T
     r2, uv = u * u + v * v, 2.0 * u * v
     return u * factor + p1 * uv + p2 * (r2 + 2.0 * u * u), v * factor + p2 * uv + p1 * (r2 + 2.0 * v * v)
@@ -253,13 +232,11 @@ def _distort(
     u: FloatArray, v: FloatArray, radial: tuple[FloatArray, FloatArray], params: FloatArray,
     terms: tuple[list[FloatArray], tuple[int, ...]], uv_by_x: FloatArray,
 ) -> Projected:  # fmt: skip
-    """Return the projection of points (N,), (N,) of the plane before distortion.
+    """Return the projection of undistorted points u, v, (N,) each in focal lengths.
 
     Args:
-        u, v: (N,) in focal lengths.
         radial: factor of the radius, and its derivative by the squared radius.
-        params: (N, 12).
-        terms: derivatives of the factor by some radial parameters, and the indices of these.
+        terms: derivatives of the factor by radial parameters, and the indices of these.
         uv_by_x: (N, 2, 3) derivatives of u and v by the point.
     """
     fx, fy = params[:, : FY + 1].T

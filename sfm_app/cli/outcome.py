@@ -10,7 +10,7 @@ from sfm_app.api import Run
 from sfm_app.camera.models import calibration_from_model
 from sfm_app.cli.output import WIDTH, file_lines
 from sfm_app.report.text import (
-    GUESS_SOURCES,
+    SOURCES,
     WARNING,
     contradiction_lines,
     duration_text,
@@ -55,6 +55,11 @@ def run_summary(run: Run) -> dict[str, Any]:
         "report": str(run.report_path) if run.report_path else None,
         "seconds": {name: stage["seconds"] for name, stage in stages.items()},
     }
+    return summary | _model_summary(run, counts)
+
+
+def _model_summary(run: Run, counts: Mapping[str, Any]) -> dict[str, Any]:
+    summary: dict[str, Any] = {}
     if run.scene:
         points = [str(path) for path in _model_files(run, "scale")]
         summary["scene"] = {**scene_summary(run.scene, counts.get("scene", {})), "files": points}
@@ -63,23 +68,14 @@ def run_summary(run: Run) -> dict[str, Any]:
     if run.mesh_path:
         files = [str(path) for path in _model_files(run, "files")]
         texture = {key: counts["files"][key] for key in ("pages_px", "jpeg_quality") if key in counts["files"]}
-        summary["mesh"] = {"triangles": model_triangles(stages), **texture, "files": files}
+        summary["mesh"] = {"triangles": model_triangles(_stages(run)), **texture, "files": files}
     return summary
 
 
 def run_lines(run: Run) -> list[str]:
     """Return all figures of a run as lines of text."""
     summary = run_summary(run)
-    lines = list(_video_lines(summary["video"])) if "video" in summary else []
-    lines.append(f"photos      {summary['photos']['usable']} usable")
-    lines += [f"{INDENT}{line}" for line in _photo_lines(summary["photos"])]
-    if summary["masks"] is not None:
-        lines += _mask_lines(summary["masks"], summary["photos"]["usable"])
-    if summary["pairs"]["kept"] is not None:
-        rejected = ", ".join(f"{count} {reason}" for reason, count in summary["pairs"]["rejected"].items())
-        lines.append(
-            f"pairs       {summary['pairs']['kept']} verified" + (f"; rejected: {rejected}" if rejected else "")
-        )
+    lines = [*_input_lines(summary)]
     if run.calibration:
         lines += intrinsics_lines(run.calibration)
         for stage in ("view_graph", "intrinsics"):
@@ -97,6 +93,19 @@ def run_lines(run: Run) -> list[str]:
     seconds = summary["seconds"]
     parts = ", ".join(f"{name} {value:.1f}" for name, value in seconds.items())
     return [*lines, f"seconds     {parts}; total {sum(seconds.values()):.1f}"]
+
+
+def _input_lines(summary: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the photos, masks and pairs of a run."""
+    if "video" in summary:
+        yield from _video_lines(summary["video"])
+    yield f"photos      {summary['photos']['usable']} usable"
+    yield from (f"{INDENT}{line}" for line in _photo_lines(summary["photos"]))
+    if summary["masks"] is not None:
+        yield from _mask_lines(summary["masks"], summary["photos"]["usable"])
+    if summary["pairs"]["kept"] is not None:
+        rejected = ", ".join(f"{count} {reason}" for reason, count in summary["pairs"]["rejected"].items())
+        yield f"pairs       {summary['pairs']['kept']} verified" + (f"; rejected: {rejected}" if rejected else "")
 
 
 def outcome_lines(run: Run, seconds: float) -> list[str]:
@@ -158,7 +167,7 @@ def _camera_lines(run: Run) -> Iterator[str]:
         if not calibration.identifiable:
             source = "all photos together do"  # a reason would seem to concern the refined camera
             if model is None:
-                source = f"this is {GUESS_SOURCES.get(calibration.method, calibration.method)}: {calibration.reason}"
+                source = f"this is {SOURCES.get(calibration.method, calibration.method)}: {calibration.reason}"
             yield f"{INDENT}pairs of photos do not determine it; {source}"
     if len(cameras) > LINES_SHOWN:
         yield f"{INDENT}and {len(cameras) - LINES_SHOWN} more cameras"

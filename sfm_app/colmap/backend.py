@@ -1,45 +1,32 @@
-"""Safe import of pycolmap, and translation of its errors into ours."""
+"""Safe import of pycolmap, its types, and translation of its errors into ours."""
 
 import contextlib
 import tempfile
 import threading
 import traceback
 import zlib  # before pycolmap, whose own deflate symbols otherwise break every later use of zlib in this process
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
-import pycolmap
+import pycolmap as pycolmap
 
 from sfm_app.errors import BackendError, NumericalError, SfmError
 from sfm_app.numerical import FAILURES, Json, error_reason
 from sfm_app.operating_system import keep_handler
 from sfm_app.progress import Progress
 
-__all__ = [
-    "check_written",
-    "has_cuda",
-    "has_running_call",
-    "json_options",
-    "log_level",
-    "pycolmap",
-    "run_in_daemon_thread",
-    "run_interruptible",
-    "run_with_progress",
-    "show_log",
-    "translate_errors",
-    "versions",
-]  # fmt: skip
-
 Result = TypeVar("Result")
 
-THREAD_NAME, POLL_S = "colmap-alone", 0.2
-"""Name of the threads that nothing waits for, and the interval at which they are polled."""
-MIN_FREE_BYTES = 1_000_000
-"""Free bytes that the disk must have: more than any program buffers before it writes."""
+THREAD_NAME = "colmap-alone"
+"""Name of the threads that nothing waits for."""
+
+Reconstruction = pycolmap.Reconstruction
+Camera = pycolmap.Camera
+CancellationToken = pycolmap.CancellationToken
 
 zlib.crc32(b"")  # zlib is imported for its side effect
 keep_handler()
@@ -47,6 +34,40 @@ _Level = pycolmap.logging.Level
 pycolmap.logging.minloglevel = _Level.FATAL.value
 
 LEVELS = tuple(level.value for level in (_Level.FATAL, _Level.WARNING, _Level.INFO))
+
+
+class Cancellation(Protocol):
+    """Token that tells a mapper to stop: COLMAP's, or one of ours."""
+
+    @property
+    def is_cancelled(self) -> bool:
+        """Whether to stop."""
+
+
+# The stubs of pycolmap 4.2 do not type the elements of COLMAP's maps.
+
+
+def all_cameras(model: pycolmap.Reconstruction) -> Iterable[pycolmap.Camera]:
+    """Return all cameras of a model."""
+    cameras: Iterable[pycolmap.Camera] = model.cameras.values()
+    return cameras
+
+
+def all_images(model: pycolmap.Reconstruction) -> Iterable[pycolmap.Image]:
+    """Return all photos of a model, with and without a pose."""
+    images: Iterable[pycolmap.Image] = model.images.values()
+    return images
+
+
+def all_points(model: pycolmap.Reconstruction) -> Iterable[tuple[int, pycolmap.Point3D]]:
+    """Return all points of a model with their ids."""
+    points: Iterable[tuple[int, pycolmap.Point3D]] = model.points3D.items()
+    return points
+
+
+def largest_model(models: Mapping[int, pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:
+    """Return the model with most photos; None if there is no model."""
+    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
 
 def show_log(level: int) -> None:
@@ -100,15 +121,15 @@ def _is_ours(err: Exception) -> bool:
     if isinstance(err, np.linalg.LinAlgError | ArithmeticError):
         return True
     frames = [frame for frame, _ in traceback.walk_tb(err.__traceback__)]
-    where = str(frames[-1].f_globals.get("__name__", ""))
-    if where.startswith(("sfm_app.colmap.", "pycolmap")):
+    module = str(frames[-1].f_globals.get("__name__", ""))
+    if module.startswith(("sfm_app.colmap.", "pycolmap")):
         return False
     called = len(frames) > 2  # the first frame is that of `translate_errors`, the second that of the `with` block
-    return called and where.startswith(("sfm_app.", "numpy.", "scipy.", "cv2"))
+    return called and module.startswith(("sfm_app.", "numpy.", "scipy.", "cv2"))
 
 
 def check_written(*files: Path) -> None:
-    """Check that the disk is not full after COLMAP has written files: COLMAP does not report it.
+    """Check that the disk has a free megabyte after COLMAP has written files: COLMAP does not report a full disk.
 
     Raises:
         OSError: the disk takes no more bytes.
@@ -116,7 +137,7 @@ def check_written(*files: Path) -> None:
     longest = max((file.stat().st_size for file in files), default=0)
     with tempfile.TemporaryFile(dir=files[0].parent) as probe:
         probe.seek(longest)
-        probe.write(bytes(MIN_FREE_BYTES))
+        probe.write(bytes(1_000_000))
 
 
 def run_in_daemon_thread(call: Callable[[], Result]) -> Result:
@@ -124,20 +145,20 @@ def run_in_daemon_thread(call: Callable[[], Result]) -> Result:
 
     After Ctrl-C the call goes on in its daemon thread; see `has_running_call`.
     """
-    found: Future[Result] = Future()
+    future: Future[Result] = Future()
 
     def run() -> None:
         try:
-            found.set_result(call())
+            future.set_result(call())
         except BaseException as err:
-            found.set_exception(err)
+            future.set_exception(err)
 
     threading.Thread(target=run, name=THREAD_NAME, daemon=True).start()
     while True:
         with contextlib.suppress(NotYet):
-            return found.result(timeout=POLL_S)
-        if found.done():
-            return found.result()
+            return future.result(timeout=0.2)
+        if future.done():
+            return future.result()
 
 
 def has_running_call() -> bool:
@@ -175,21 +196,13 @@ def run_with_progress(
     total: int,
     progress: Progress,
 ) -> None:
-    """Run a long COLMAP call as `run_interruptible` does, with a progress bar.
-
-    Args:
-        call: ends early once its token is cancelled.
-        done: returns the number of finished steps.
-        label: text beside the bar.
-        total: number of steps.
-        progress: shows the bar.
-    """
-    seen = 0
+    """Run a long COLMAP call as `run_interruptible` does, with a progress bar; `done` counts the finished steps."""
+    steps = 0
 
     def poll() -> None:
-        nonlocal seen
-        before, seen = seen, done()
-        progress.advance(seen - before)
+        nonlocal steps
+        before, steps = steps, done()
+        progress.advance(steps - before)
 
     progress.start(label, total)
     try:

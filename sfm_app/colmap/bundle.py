@@ -1,4 +1,7 @@
-"""The last bundle adjustment: refines cameras, poses, points and tracks until they no longer change."""
+"""The last bundle adjustment: refine cameras, poses, points and tracks until they no longer change.
+
+COLMAP finds poses and points; the cameras, their priors and their lens models are ours (`sfm_app.bundle`).
+"""
 
 import logging
 from collections import Counter
@@ -12,10 +15,10 @@ import numpy as np
 from sfm_app.bundle.lens_evidence import (
     LensChoice,
     LensEstimate,
-    asks_for_other_family,
     convert_lens,
     estimate_lenses,
     family_evidence,
+    suggests_other_family,
 )
 from sfm_app.bundle.lens_parts import (
     COUNT,
@@ -51,14 +54,13 @@ from sfm_app.camera.projection import (
     SX,
     SY,
 )
-from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread, translate_errors
+from sfm_app.colmap.backend import all_cameras, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import finite_mask, posed_images, submodel
-from sfm_app.colmap.types import all_cameras, all_points
 from sfm_app.errors import NumericalError
 from sfm_app.numerical import FAILURES, Json, error_reason, finite_entries
 from sfm_app.types import Calibration
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import FloatArray, IndexArray
 from sfm_app.types.camera import named_correlations
 
 # COLMAP's models as the arrays of our bundle adjustment, and back.
@@ -76,10 +78,10 @@ FILE_MODELS = {
         "THIN_PRISM_FISHEYE": (*OPENCV, "k3", "k4", "sx1", "sy1"),
     },
 }
-"""COLMAP's models that refined cameras are written as, with their parameters; the smaller one first."""
+"""COLMAP's models of refined cameras, with their parameters; the smaller one first."""
 EQUIRECTANGULAR = "EQUIRECTANGULAR"
 Rules = Mapping[int, CameraRule]
-"""What the user laid down about cameras, by id; cameras without a rule are free."""
+"""The user's rules, by camera id; cameras without a rule are free."""
 NO_RULES: Rules = MappingProxyType({})
 
 
@@ -103,13 +105,8 @@ def read_camera(camera: pycolmap.Camera) -> FloatArray:
 
 
 def write_camera(camera: pycolmap.Camera, params: FloatArray, family: int) -> None:
-    """Change a camera in place, to the smallest of FILE_MODELS that holds the values; a panorama stays as it is.
-
-    Args:
-        camera: COLMAP's camera.
-        params: (12,) as in `Bundle`.
-        family: of these parameters.
-    """
+    """Change a camera in place to the smallest of FILE_MODELS that holds parameters (12,); a panorama stays as it
+    is."""
     if family == PANORAMA:
         return
     name = file_model(params, family)
@@ -118,12 +115,7 @@ def write_camera(camera: pycolmap.Camera, params: FloatArray, family: int) -> No
 
 
 def file_model(params: FloatArray, family: int) -> str:
-    """Return COLMAP's name of the model that a camera is written as.
-
-    Args:
-        params: (12,) as in `Bundle`.
-        family: PERSPECTIVE or FISHEYE.
-    """
+    """Return COLMAP's name of the file model of a perspective or fisheye camera (12,)."""
     models = FILE_MODELS[family]
     for name, keys in models.items():
         rest = np.delete(params, [PLACES[key][0] for key in keys])
@@ -136,37 +128,44 @@ def read_bundle(model: pycolmap.Reconstruction, rules: Rules = NO_RULES) -> tupl
     """Return the ids of the cameras in use, and the model as arrays.
 
     Args:
-        model: COLMAP's reconstruction.
         rules: of some cameras, by id; those that are kept are fixed.
     """
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
     ids, points = sorted(photos_per_camera(model)), sorted(model.points3D)
-    rows = {point: row for row, point in enumerate(points)}
-    seen = [image.get_observation_points2D() for image in images]
+    cameras = [model.cameras[camera_id] for camera_id in ids]
     fixed = np.array([camera_id in rules and rules[camera_id].kept for camera_id in ids], np.bool_)
     poses = np.array([image.cam_from_world().matrix() for image in images])
+    photo, point, x = _read_observations(images, points)
     return ids, Bundle(
-        params=np.array([read_camera(model.cameras[camera_id]) for camera_id in ids]),
+        params=np.array([read_camera(camera) for camera in cameras]),
         camera=np.array([ids.index(image.camera_id) for image in images]),
         R=poses[:, :, :3],
         t=poses[:, :, 3],
-        X=np.array([model.points3D[point].xyz for point in points], np.float64).reshape(-1, 3),
-        photo=np.repeat(np.arange(len(images)), [len(one) for one in seen]),
-        point=np.array([rows[keypoint.point3D_id] for one in seen for keypoint in one], np.int64),
-        x=np.array([keypoint.xy for one in seen for keypoint in one], np.float64).reshape(-1, 2),
-        family=np.array([camera_family(model.cameras[camera_id]) for camera_id in ids], np.int64),
+        X=np.array([model.points3D[point_id].xyz for point_id in points], np.float64).reshape(-1, 3),
+        photo=photo,
+        point=point,
+        x=x,
+        family=np.array([camera_family(camera) for camera in cameras], np.int64),
         fixed=fixed if fixed.any() else None,
     )
 
 
-def write_bundle(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle) -> None:
-    """Write arrays into a model, in place.
+def _read_observations(
+    images: Sequence[pycolmap.Image], points: Sequence[int]
+) -> tuple[IndexArray, IndexArray, FloatArray]:
+    """Return rows (N,) of the photo and (N,) of the point of each observation, and its position (N, 2)."""
+    rows = {point_id: row for row, point_id in enumerate(points)}
+    observed = [image.get_observation_points2D() for image in images]
+    keypoints = [keypoint for one in observed for keypoint in one]
+    return (
+        np.repeat(np.arange(len(images)), [len(one) for one in observed]),
+        np.array([rows[keypoint.point3D_id] for keypoint in keypoints], np.int64),
+        np.array([keypoint.xy for keypoint in keypoints], np.float64).reshape(-1, 2),
+    )
 
-    Args:
-        model: COLMAP's reconstruction.
-        ids: of the cameras, from `read_bundle`.
-        bundle: with cameras, photos and points in the order of `read_bundle`.
-    """
+
+def write_bundle(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle) -> None:
+    """Write cameras, poses and points, in the order of `read_bundle`, into a model in place."""
     for camera_id, params, family in zip(ids, bundle.params, bundle.family, strict=True):
         write_camera(model.cameras[camera_id], params, int(family))
     for image_id, R, t in zip(sorted(model.reg_image_ids()), bundle.R, bundle.t, strict=True):
@@ -183,43 +182,57 @@ def photos_per_camera(model: pycolmap.Reconstruction) -> Counter[int]:
 
 # Rounds of the last bundle adjustment: a step of everything, then tracks are completed and filtered.
 
-MIN_PHOTOS = 5
-"""Photos of a camera below which only its focal and k1 are refined: with fewer, effects that the camera model leaves
-out (a lens, a zoom) change its parameters more than the noise does."""
+logger = logging.getLogger("sfm_app")
 
 LOSS_SCALE_PX = 0.5
 """Scale of COLMAP's SOFT_L1 loss: about twice the noise of SIFT keypoints. Poses are better than with COLMAP's 1."""
 
-MAX_ERROR_PX, MIN_ANGLE_DEG = 4.0, 1.5
-"""COLMAP's own limits for a point: largest reprojection error, least angle between its rays."""
 
-ROUNDS, CHANGED_SHARE, STEP = 6, 0.0005, 0.2
-"""Largest number of rounds. They end early when less than this share of the observations changes, and no camera
-parameter by more than this share of its standard deviation."""
+@dataclass(frozen=True, slots=True)
+class AdjustmentOptions:
+    """Limits of the last adjustment. Chosen by hand, except where stated."""
 
-MIN_KEPT_SHARE = 0.1
-"""Smallest share of the points that an adjustment must keep; one that drops more has diverged and is rejected. Chosen
-on no set; none of six that were run fell below it."""
+    min_photos: int = 5
+    """Photos of a camera below which only its focal and k1 are refined. With fewer, effects that the camera model
+    leaves out change its parameters more than the noise does."""
+    max_error_px: float = 4.0
+    """Largest reprojection error of a point (COLMAP's)."""
+    min_angle_deg: float = 1.5
+    """Least angle between the rays of a point (COLMAP's)."""
+    rounds: int = 6
+    """Most rounds."""
+    changed_share: float = 0.0005
+    """Share of the observations below which a change of their number lets the rounds end."""
+    settled_step: float = 0.2
+    """Step of the cameras, in standard deviations, below which the rounds end."""
+    min_point_share: float = 0.1
+    """Smallest share of the points after an adjustment; one that drops more has diverged and is rejected."""
+    long_step: float = 1.0
+    """Step of the cameras, in standard deviations, above which COLMAP's solver refines poses and points: the linear
+    step is then too inaccurate."""
+    most_tied: int = 250
+    """Photos that a photo is tied to (`elimination_width`) above which COLMAP's solver takes conjugate gradients. Where
+    all see the same, a factorization grows with the cube of the photos; along streets it is five times as fast."""
+    outermost: float = 0.999
+    """Share of the observations within the radius up to which a lens is converted: the rest may be wrong."""
+    most_compared: int = 250
+    """Photos of a camera on which its families are compared, at even steps among all."""
+    runners_up: int = 3
+    """Rivals of the same family in the manifest."""
 
-LONG_STEP = 1.0
-"""Step of the cameras, in standard deviations, above which the linear step of poses and points is too inaccurate and
-COLMAP's solver refines them."""
 
-MOST_TIED = 250
-"""Photos that a photo is tied to (`elimination_width`) above which COLMAP's solver takes conjugate gradients. Where all
-see the same, a factorization grows with the cube of the photos: on every 5th photo of kitchen1000 (200) they take half
-as long to the same cost. Along streets they take five times as long as a factorization (250 photos of a town)."""
+OPTIONS = AdjustmentOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rounds:
-    """What the last of some rounds found; its step is in the model."""
+    """Result of the last round; its step is in the model."""
 
     ids: list[int]
     """Ids of the cameras, in the order of the arrays."""
     bundle: Bundle
     """Before the last step."""
-    found: LensEstimate
+    lenses: LensEstimate
     noise_px: float
     """As in `ReducedSystem`."""
     open_points: int
@@ -232,37 +245,35 @@ def adjust_in_rounds(
     """Refine cameras, poses, points and tracks of a model in place, until they no longer change.
 
     Args:
-        model: COLMAP's reconstruction, with cameras of FILE_MODELS.
+        model: with cameras of FILE_MODELS.
         graph: of all matches; None to keep the tracks.
-        rules: of some cameras, by id.
 
     Raises:
         NumericalError: the adjustment diverges.
     """
     points, open_points = model.num_points3D(), []
-    for _ in range(ROUNDS):
+    for _ in range(OPTIONS.rounds):
         ids, bundle = read_bundle(model, rules)
         if not (np.isfinite(bundle.params).all() and (bundle.params[:, [FX, FY]] > 0).all()):
             raise NumericalError("a camera has no focal length")
         reduced = reduce(bundle, LOSS_SCALE_PX)
         open_points.append(reduced.open_points)
-        found = estimate_lenses(bundle.params, reduced, lens_priors(model, ids, bundle, rules))
-        write_bundle(model, ids, best_step(bundle, reduced, found.params, LOSS_SCALE_PX))
-        if found.step > LONG_STEP:
+        lenses = estimate_lenses(bundle.params, reduced, lens_priors(model, ids, bundle, rules))
+        write_bundle(model, ids, best_step(bundle, reduced, lenses.params, LOSS_SCALE_PX))
+        if lenses.step > OPTIONS.long_step:
             solve(model)
         changed = improve_tracks(model, graph) if graph else 0
-        if model.num_points3D() <= MIN_KEPT_SHARE * points:
-            raise NumericalError(f"it left {model.num_points3D()} of {points} points")
-        if found.step < STEP and changed < CHANGED_SHARE * len(bundle.x):
+        if model.num_points3D() <= OPTIONS.min_point_share * points:
+            raise NumericalError(f"only {model.num_points3D()} of {points} points remain")
+        if lenses.step < OPTIONS.settled_step and changed < OPTIONS.changed_share * len(bundle.x):
             break
-    return Rounds(ids, bundle, found, reduced.noise_px, open_points[0])
+    return Rounds(ids, bundle, lenses, reduced.noise_px, open_points[0])
 
 
 def solve(model: pycolmap.Reconstruction, refined: Collection[int] = ()) -> None:
     """Adjust poses and points in place, on one thread: the order of sums over several threads is not fixed.
 
     Args:
-        model: COLMAP's reconstruction.
         refined: ids of the cameras whose focal is adjusted, too.
     """
     options = pycolmap.BundleAdjustmentOptions()
@@ -284,24 +295,22 @@ def solve(model: pycolmap.Reconstruction, refined: Collection[int] = ()) -> None
 
 
 def _choose_most_factored(model: pycolmap.Reconstruction) -> int:
-    """Return up to how many photos COLMAP's solver is to factor the normal equations: all photos, or `MOST_TIED`."""
+    """Return the number of photos up to which COLMAP's solver factors the normal equations: all, or `most_tied`."""
     photos = sorted(model.reg_image_ids())
-    if len(photos) <= MOST_TIED:
-        return MOST_TIED
+    if len(photos) <= OPTIONS.most_tied:
+        return OPTIONS.most_tied
     rows = {photo: row for row, photo in enumerate(photos)}
-    seen = [(rows[one.image_id], k) for k, (_, point) in enumerate(all_points(model)) for one in point.track.elements]
-    photo, point = np.array(seen, np.int64).reshape(-1, 2).T
-    return len(photos) if elimination_width(photo, point) <= MOST_TIED else MOST_TIED
+    tracked = [
+        (rows[one.image_id], k) for k, (_, point) in enumerate(all_points(model)) for one in point.track.elements
+    ]
+    photo, point = np.array(tracked, np.int64).reshape(-1, 2).T
+    return len(photos) if elimination_width(photo, point) <= OPTIONS.most_tied else OPTIONS.most_tied
 
 
 def improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph) -> int:
-    """Continue, merge and triangulate tracks, filter them, and return by how many observations their number changed.
+    """Continue, merge, triangulate and filter tracks in place; return by how many observations their number changed.
 
     Observations that are added and filtered again do not count: near the limits they come and go forever.
-
-    Args:
-        model: changed in place.
-        graph: of all matches.
     """
     before = model.compute_num_observations()
     observations = pycolmap.ObservationManager(model, graph)
@@ -310,57 +319,40 @@ def improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.Correspondenc
     triangulator.complete_all_tracks(options)
     triangulator.merge_all_tracks(options)
     triangulator.retriangulate(options)
-    observations.filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
+    observations.filter_all_points3D(OPTIONS.max_error_px, OPTIONS.min_angle_deg)
     return abs(int(model.compute_num_observations() - before))
 
 
 def lens_priors(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle, rules: Rules = NO_RULES) -> LensPriors:
-    """Return the priors of the cameras, before any evidence from the bundle.
-
-    Args:
-        model: has the photos and their sizes.
-        ids, bundle: from `read_bundle`.
-        rules: of some cameras, by id.
-    """
+    """Return the priors of the cameras, before any evidence from the bundle."""
     used = photos_per_camera(model)
     sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)
-    many = np.array([used[camera_id] >= MIN_PHOTOS for camera_id in ids])
+    many = np.array([used[camera_id] >= OPTIONS.min_photos for camera_id in ids])
     only_k1 = [[part.name == "k1" for part in PARTS[int(kind)]] for kind in bundle.family]
-    asked = (many[:, None] | np.array(only_k1).reshape(-1, COUNT)) & (bundle.family != PANORAMA)[:, None]
-    priors = LensPriors.from_cameras(bundle.params, bundle.family, sizes, asked)
+    estimated = (many[:, None] | np.array(only_k1).reshape(-1, COUNT)) & (bundle.family != PANORAMA)[:, None]
+    priors = LensPriors.from_cameras(bundle.params, bundle.family, sizes, estimated)
     return _apply_rules(priors, [rules.get(camera_id, NO_RULE) for camera_id in ids]) if rules else priors
 
 
 def _apply_rules(priors: LensPriors, rules: Sequence[CameraRule]) -> LensPriors:
-    """Return the priors with what the user laid down about each camera."""
-    asked, usual, choices = priors.asked.copy(), priors.usual.copy(), list(priors.choices)
+    """Return the priors under the user's rules, one for each camera."""
+    estimated, usual, choices = priors.estimated.copy(), priors.usual.copy(), list(priors.choices)
     for row, rule in enumerate(rules):
         family = int(priors.family[row])
         given, parts = rule.usual(family), rule.parts(family)
         if given is not None:
             usual[row] = given
         if rule.kept:
-            asked[row] = False
+            estimated[row] = False
             choices[row] = priors.choices[row][:1]
         elif parts is not None:
             choices[row] = choices_of_model(parts, consistent_choices(family))
-            asked[row] = choices[row].any(axis=0)
+            estimated[row] = choices[row].any(axis=0)
     fixed = np.array([rule.kept for rule in rules], np.bool_)
-    return replace(priors, asked=asked, usual=usual, choices=tuple(choices), fixed=fixed)
+    return replace(priors, estimated=estimated, usual=usual, choices=tuple(choices), fixed=fixed)
 
 
-# Which camera model the photos support: cameras tried as those of another family, and the ranking of all models.
-
-logger = logging.getLogger("sfm_app")
-
-OUTERMOST = 0.999
-"""Share of the observations that reach the radius up to which a lens is made like another: the rest may be wrong.
-Chosen by hand; not measured on its own."""
-MOST_COMPARED = 250
-"""Photos of a camera on which its families are compared, at even steps among all: each of them is adjusted several
-times. Chosen by hand."""
-RUNNERS_UP = 3
-"""Number of rivals of the same family in the manifest. Chosen by hand."""
+# The camera model that the photos support: other families of a lens, and the ranking of all models.
 
 
 @dataclass(frozen=True, slots=True)
@@ -369,11 +361,11 @@ class LensRecord:
 
     chosen: LensChoice
     file_model: str
-    """COLMAP's name of the model that it is written as."""
+    """COLMAP's name of its model in files."""
     rivals: tuple[LensChoice, ...]
-    """The most probable other models, best first; their evidence is that which they lose against the chosen one."""
+    """The most probable other models, best first; their evidence is what they lose against the chosen model."""
     folding: bool
-    """Whether a more probable lens was refused, because it folds inside the photo."""
+    """Whether a more probable lens folds inside the photo, and was refused."""
 
     def to_dict(self) -> dict[str, Json]:
         """Return plain values for the manifest."""
@@ -381,8 +373,8 @@ class LensRecord:
             {"model": one.model, "free": list(one.free), "log_evidence_lost": round(one.log_evidence, 2)}
             for one in self.rivals
         ]
-        found: dict[str, Json] = {"model": self.chosen.model, "free": list(self.chosen.free), "file": self.file_model}
-        return found | {"runners_up": rivals} | ({"refused_as_folding": True} if self.folding else {})
+        record: dict[str, Json] = {"model": self.chosen.model, "free": list(self.chosen.free), "file": self.file_model}
+        return record | {"runners_up": rivals} | ({"refused_as_folding": True} if self.folding else {})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -390,29 +382,28 @@ class Families:
     """A model with cameras of the most probable families."""
 
     model: pycolmap.Reconstruction
-    """The given one where no camera changes its family; else another, to be adjusted again."""
+    """The given model where no camera changes its family; else another, to be adjusted again."""
     rivals: Mapping[int, LensChoice] = field(default_factory=dict)
-    """By camera id the model of the family that lost; its evidence is what it lost by."""
+    """By camera id, the best model of the rejected family; its evidence is what it loses."""
 
 
 def best_families(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules = NO_RULES) -> Families:
-    """Choose the better family for cameras that ask for the other one: what explains the observations better.
+    """Choose the family of every camera that suggests the other one, by the evidence of its observations.
 
-    Both are adjusted to the same tracks.
+    Both families are adjusted to the same tracks.
 
     Args:
         model: adjusted; not changed.
-        rounds: the last rounds of its adjustment.
-        rules: of some cameras, by id; those that must be of a family are not tried as another.
+        rules: by camera id; a camera with a required family is not tried as another.
     """
     rivals = {}
     for row, camera_id in enumerate(rounds.ids):
-        family, params = int(rounds.bundle.family[row]), rounds.found.params[row]
-        reach, best = _observed_reach(rounds.bundle, row), rounds.found.ranking[row][0]
-        many = np.count_nonzero(rounds.bundle.camera == row) >= MIN_PHOTOS
+        family, params = int(rounds.bundle.family[row]), rounds.lenses.params[row]
+        reach, best = _observed_reach(rounds.bundle, row), rounds.lenses.ranking[row][0]
+        many = np.count_nonzero(rounds.bundle.camera == row) >= OPTIONS.min_photos
         is_open = many and rules.get(camera_id, NO_RULE).family is None
-        asks = is_open and asks_for_other_family(params, family, reach, best, bool(rounds.found.folding[row]))
-        other = convert_lens(params, family, reach) if asks else None
+        is_doubtful = is_open and suggests_other_family(params, family, reach, best, bool(rounds.lenses.folding[row]))
+        other = convert_lens(params, family, reach) if is_doubtful else None
         if other is None:
             continue
         photos = _spread_photos(model, camera_id)
@@ -423,26 +414,26 @@ def best_families(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules =
             adjust_in_rounds(same, None, rules)
             adjust_in_rounds(trial, None, rules)
         except FAILURES as err:
-            logger.info("camera %d is not tried as another: %s", camera_id, error_reason(err))
+            logger.info("the other family of camera %d could not be tried: %s", camera_id, error_reason(err))
             continue
-        (kept, choice), (gained, rival) = _compare(same, trial, camera_id, rules)
-        if gained > kept:
+        (evidence, choice), (other_evidence, rival) = _compare(same, trial, camera_id, rules)
+        if other_evidence > evidence:
             model = trial if part is model else _with_camera(model, trial.cameras[camera_id])
             choice, rival = rival, choice
-        rivals[camera_id] = replace(rival, log_evidence=abs(gained - kept))
+        rivals[camera_id] = replace(rival, log_evidence=abs(other_evidence - evidence))
     return Families(model, rivals)
 
 
 def _spread_photos(model: pycolmap.Reconstruction, camera_id: int) -> list[int] | None:
-    """Return photos of a camera at even steps among all of them; None where all photos of the model are few."""
-    if model.num_reg_images() <= MOST_COMPARED:
+    """Return photos of a camera at even steps among all of them; None if the model has few photos."""
+    if model.num_reg_images() <= OPTIONS.most_compared:
         return None
     own = sorted(image.image_id for image in posed_images(model) if image.camera_id == camera_id)
-    return own[:: -(-len(own) // MOST_COMPARED)]
+    return own[:: -(-len(own) // OPTIONS.most_compared)]
 
 
 def _with_camera(model: pycolmap.Reconstruction, camera: pycolmap.Camera) -> pycolmap.Reconstruction:
-    """Return a copy of a model with the lens of another model's camera."""
+    """Return a copy of a model with another lens for one camera."""
     copy = pycolmap.Reconstruction(model)
     own = copy.cameras[camera.camera_id]
     own.model, own.params = camera.model, camera.params.tolist()
@@ -456,13 +447,13 @@ def _compare(
     read = [(model, *read_bundle(model, rules)) for model in (first, second)]
     reduced = [reduce(bundle, LOSS_SCALE_PX) for _, _, bundle in read]
     noise_px = min(one.noise_px for one in reduced)
-    found = []
+    compared = []
     for (model, ids, bundle), system in zip(read, reduced, strict=True):
         priors = lens_priors(model, ids, bundle, rules)
         ranking = estimate_lenses(bundle.params, replace(system, noise_px=noise_px), priors).ranking
         best = ranking[ids.index(camera_id)][0]
-        found.append((family_evidence(cost(bundle, LOSS_SCALE_PX), noise_px, best), best))
-    return tuple(found)
+        compared.append((family_evidence(cost(bundle, LOSS_SCALE_PX), noise_px, best), best))
+    return tuple(compared)
 
 
 def record_lenses(
@@ -471,27 +462,25 @@ def record_lenses(
     """Return the chosen model of each camera and its rivals, by camera id.
 
     Args:
-        model: adjusted.
-        rounds: the last rounds of its adjustment.
         others: rivals of the other family, from `best_families`.
     """
-    found = {}
+    records = {}
     for row, camera_id in enumerate(rounds.ids):
-        best, *rest = rounds.found.ranking[row]
+        best, *rest = rounds.lenses.ranking[row]
         rivals = [replace(one, log_evidence=best.log_evidence - one.log_evidence) for one in rest]
-        rivals = rivals[:RUNNERS_UP] + ([others[camera_id]] if camera_id in others else [])
+        rivals = rivals[: OPTIONS.runners_up] + ([others[camera_id]] if camera_id in others else [])
         rivals.sort(key=lambda one: one.log_evidence)
         name = model.cameras[camera_id].model.name
-        found[camera_id] = LensRecord(best, name, tuple(rivals), bool(rounds.found.folding[row]))
-    return found
+        records[camera_id] = LensRecord(best, name, tuple(rivals), bool(rounds.lenses.folding[row]))
+    return records
 
 
 def _observed_reach(bundle: Bundle, row: int) -> float:
     """Return the radius of the outermost observations of a camera, in focal lengths."""
     params = bundle.params[row]
     x = bundle.x[bundle.camera[bundle.photo] == row]
-    about = (x - params[[CX, CY]]) / params[[FX, FY]]
-    return float(np.quantile(np.hypot(*about.T), OUTERMOST)) if len(x) else 0.0
+    offsets = (x - params[[CX, CY]]) / params[[FX, FY]]
+    return float(np.quantile(np.hypot(*offsets.T), OPTIONS.outermost)) if len(x) else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -506,7 +495,7 @@ class Adjustment:
     correlations: dict[int, dict[str, float]] = field(default_factory=dict)
     """Correlations of parameters by camera id, as in `CameraModel`; lacks cameras without any."""
     failure: str = ""
-    """Why the adjustment failed, empty where it did not; the model is then the given one, without deviations."""
+    """Why the adjustment failed, and left the given model without deviations; empty if it succeeded."""
     held: tuple[int, ...] = ()
     """Ids of cameras whose estimate diverged; they keep their parameters."""
     open_points: int = 0
@@ -514,11 +503,11 @@ class Adjustment:
     lenses: dict[int, LensRecord] = field(default_factory=dict)
     """The chosen camera model and its rivals, by camera id; empty where the adjustment failed."""
     estimates: dict[int, Calibration] = field(default_factory=dict)
-    """What the photos say of the cameras that the user gave, by camera id; lacks those that they do not determine."""
+    """Estimates of the cameras that the user gave, by camera id; lacks cameras that the photos do not determine."""
 
 
 def adjust(
-    model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RULES, *, settled: bool = False
+    model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RULES, *, families_known: bool = False
 ) -> Adjustment:
     """Refine cameras, poses, points and tracks in turn; only camera parameters that the photos determine are freed.
 
@@ -528,9 +517,7 @@ def adjust(
 
     Args:
         model: result of mapping; not changed.
-        database: has all keypoints and matches.
-        rules: what the user laid down about cameras, by id.
-        settled: whether an adjustment of most of these photos has chosen between fisheye and perspective lenses.
+        families_known: whether an earlier adjustment has chosen between fisheye and perspective lenses.
 
     Raises:
         NumericalError: the adjustment diverges; the given model is unchanged.
@@ -544,12 +531,12 @@ def adjust(
     graph = find_correspondences(model, database)
     rounds = adjust_in_rounds(model, graph, rules)
     open_points = rounds.open_points
-    families = Families(model) if settled else best_families(model, rounds, rules)
+    families = Families(model) if families_known else best_families(model, rounds, rules)
     if families.model is not model:
         model = families.model
         rounds = adjust_in_rounds(model, graph, rules)
     model.update_point_3d_errors()
-    held = tuple(camera_id for camera_id, away in zip(rounds.ids, rounds.found.held, strict=True) if away)
+    held = tuple(camera_id for camera_id, diverged in zip(rounds.ids, rounds.lenses.held, strict=True) if diverged)
     lenses = record_lenses(model, rounds, families.rivals)
     estimates = given_estimates(model, rounds, rules)
     return Adjustment(
@@ -559,23 +546,20 @@ def adjust(
 
 
 def adjust_or_keep(
-    model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RULES, *, settled: bool = False
+    model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RULES, *, families_known: bool = False
 ) -> Adjustment:
     """Adjust a model; where that fails numerically, return the given model with the reason.
-
-    Args:
-        model, database, rules, settled: as in `adjust`.
 
     Raises:
         BackendError: COLMAP failed.
     """
     try:
         with translate_errors("adjusting the bundle"):
-            return adjust(model, database, rules, settled=settled)
+            return adjust(model, database, rules, families_known=families_known)
     except FAILURES as err:
         logger.info("the last adjustment failed", exc_info=err)
-        nothing: dict[int, dict[str, float]] = {camera_id: {} for camera_id in photos_per_camera(model)}
-        return Adjustment(model, nothing, dict.fromkeys(nothing, ()), failure=error_reason(err))
+        unknown: dict[int, dict[str, float]] = {camera_id: {} for camera_id in photos_per_camera(model)}
+        return Adjustment(model, unknown, dict.fromkeys(unknown, ()), failure=error_reason(err))
 
 
 def drop_infinite_points(model: pycolmap.Reconstruction) -> None:
@@ -585,12 +569,7 @@ def drop_infinite_points(model: pycolmap.Reconstruction) -> None:
 
 
 def find_correspondences(model: pycolmap.Reconstruction, database: Path) -> pycolmap.CorrespondenceGraph:
-    """Return the graph of all matches between the photos of a model.
-
-    Args:
-        model: COLMAP's reconstruction.
-        database: has all keypoints and matches.
-    """
+    """Return the graph of all matches between the photos of a model."""
     options = pycolmap.DatabaseCacheOptions()
     options.load_all_images = True  # else photos that no pair in the database connects would be missing
     options.image_names = {model.images[image_id].name for image_id in model.reg_image_ids()}
@@ -599,76 +578,70 @@ def find_correspondences(model: pycolmap.Reconstruction, database: Path) -> pyco
 
 
 def _summary(rounds: Rounds) -> tuple[dict[int, dict[str, float]], dict[int, tuple[str, ...]]]:
-    """Return deviations and determined parameters of `Adjustment`."""
+    """Return deviations and determined parameters, by camera id."""
     deviations: dict[int, dict[str, float]] = {}
     determined: dict[int, tuple[str, ...]] = {}
     for row, camera_id in enumerate(rounds.ids):
-        determined[camera_id] = part_names(int(rounds.bundle.family[row]), rounds.found.determined[row])
-        values = rounds.found.deviations[row]
+        determined[camera_id] = part_names(int(rounds.bundle.family[row]), rounds.lenses.determined[row])
+        values = rounds.lenses.deviations[row]
         entries = {key: float(values[PLACES[key][0]]) for key in _adjusted_names(rounds, row)}
         deviations[camera_id] = finite_entries(entries)
     return deviations, determined
 
 
 def _correlations(rounds: Rounds) -> dict[int, dict[str, float]]:
-    """Return the correlations of `Adjustment`."""
-    found = {}
+    """Return the correlations of parameters, by camera id."""
+    correlations = {}
     for row, camera_id in enumerate(rounds.ids):
         names = _adjusted_names(rounds, row)
         places = [PLACES[name][0] for name in names]
-        found[camera_id] = named_correlations(names, rounds.found.mean_squares[row][np.ix_(places, places)])
-    return found
+        correlations[camera_id] = named_correlations(names, rounds.lenses.mean_squares[row][np.ix_(places, places)])
+    return correlations
 
 
 def _adjusted_names(rounds: Rounds, row: int) -> tuple[str, ...]:
-    """Return COLMAP's names of the parameters of a camera that were adjusted; none of a panorama or a fixed camera."""
+    """Return COLMAP's names of the adjusted parameters of a camera; none of a panorama or a fixed camera."""
     family = int(rounds.bundle.family[row])
     is_fixed = rounds.bundle.fixed is not None and bool(rounds.bundle.fixed[row])
     if family not in FILE_MODELS or is_fixed:
         return ()
-    return tuple(FILE_MODELS[family][file_model(rounds.found.params[row], family)])
+    return tuple(FILE_MODELS[family][file_model(rounds.lenses.params[row], family)])
 
 
 def apply_rules(model: pycolmap.Reconstruction, rules: Rules) -> None:
-    """Give cameras the values or the model that the user laid down, in place, and adjust poses and points to them.
+    """Give cameras the user's values or model, in place, and adjust poses and points to them.
 
     Mapping may have changed a camera that is kept, and may have used another model.
 
     Args:
         model: as mapping left it, with cameras of FILE_MODELS.
-        rules: by camera id.
     """
     changed = False
     for camera_id, rule in rules.items():
         camera = model.cameras[camera_id]
         family, before = camera_family(camera), read_camera(camera)
-        params, wanted = before, family if rule.family is None else rule.family
-        if PANORAMA in (family, wanted):
+        params, new_family = before, family if rule.family is None else rule.family
+        if PANORAMA in (family, new_family):
             continue
         if rule.given is not None and rule.kept:
             params = params_of_calibration(rule.given)
-        elif wanted != family:
+        elif new_family != family:
             reach = np.hypot(camera.width, camera.height) / (2.0 * np.sqrt(before[FX] * before[FY]))
             other = convert_lens(before, family, float(reach))
-            params, wanted = (before, family) if other is None else (other, wanted)
-        parts = None if rule.kept else rule.parts(wanted)
+            params, new_family = (before, family) if other is None else (other, new_family)
+        parts = None if rule.kept else rule.parts(new_family)
         if parts is not None:
-            params = fit_to_model(params, parts, wanted)
-        changed = changed or wanted != family or not np.array_equal(params, before)
-        write_camera(camera, params, wanted)
+            params = fit_to_model(params, parts, new_family)
+        changed = changed or new_family != family or not np.array_equal(params, before)
+        write_camera(camera, params, new_family)
     if changed:
         solve(model)
 
 
 def given_estimates(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules) -> dict[int, Calibration]:
-    """Return what the photos say of the cameras that the user gave, by id; not of those that they do not determine.
+    """Return estimates of the user's cameras by id, if the photos determine them.
 
-    Where one is kept, everything is adjusted once more with free cameras, to the same tracks.
-
-    Args:
-        model: adjusted.
-        rounds: the last rounds of its adjustment.
-        rules: by camera id.
+    If one is kept, everything is adjusted once more with free cameras, to the same tracks.
     """
     if all(rule.given is None for rule in rules.values()):
         return {}
@@ -676,16 +649,16 @@ def given_estimates(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules
         try:
             rounds = adjust_in_rounds(pycolmap.Reconstruction(model), None)
         except FAILURES as err:
-            logger.info("the given cameras could not be checked", exc_info=err)
+            logger.info("the user's cameras could not be checked", exc_info=err)
             return {}
-    estimates, found = {}, rounds.found
+    estimates, lenses = {}, rounds.lenses
     for row, camera_id in enumerate(rounds.ids):
         family = int(rounds.bundle.family[row])
-        if camera_id not in rules or rules[camera_id].given is None or found.held[row] or family == PANORAMA:
+        if camera_id not in rules or rules[camera_id].given is None or lenses.held[row] or family == PANORAMA:
             continue
         camera = model.cameras[camera_id]
-        determined = part_names(family, found.determined[row])
+        determined = part_names(family, lenses.determined[row])
         estimates[camera_id] = calibration_from_params(
-            found.params[row], family, (camera.width, camera.height), found.deviations[row], determined
+            lenses.params[row], family, (camera.width, camera.height), lenses.deviations[row], determined
         )
     return estimates

@@ -1,4 +1,4 @@
-"""SIFT descriptors from COLMAP's database."""
+"""COLMAP's SQLite database: photos, cameras, features, matches and relative poses."""
 
 import contextlib
 import ctypes
@@ -26,32 +26,22 @@ from sfm_app.types import (
 )
 from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE
 
-# COLMAP's SQLite database: write photos, cameras and relative poses, read keypoints and matches.
-
 SQUARE_PIXELS = "SIMPLE_RADIAL"
-"""f, cx, cy, k: the model used in mapping where K has one focal; a second radial term diverges on the first photos."""
-
+"""f, cx, cy, k: the model for mapping with one focal; a second radial term diverges on the first photos."""
 TWO_FOCALS = "OPENCV"
 """fx, fy, cx, cy, k1, k2, p1, p2: COLMAP's smallest model with two focals and lens distortion."""
-
 WIDE_MODELS = {FISHEYE: "OPENCV_FISHEYE", EQUIRECTANGULAR: "EQUIRECTANGULAR"}
 """COLMAP's models of projections that are not perspective."""
 
 KINDS = {
-    "calibrated": "CALIBRATED",
-    "uncalibrated": "UNCALIBRATED",
-    "planar": "PLANAR",
-    "rotation": "PANORAMIC",
-}
+    "calibrated": "CALIBRATED", "uncalibrated": "UNCALIBRATED", "planar": "PLANAR", "rotation": "PANORAMIC"
+}  # fmt: skip
 """COLMAP's names for the kinds of relative poses."""
-
-SQUARE_TOLERANCE = 0.005
-"""Largest |fy/fx - 1| of square pixels: calibrators give no more where the photos show no other aspect."""
 
 
 @contextlib.contextmanager
 def open_database(path: Path) -> Iterator[pycolmap.Database]:
-    """Provide the database, and close it in any case."""
+    """Provide an open database."""
     database = pycolmap.Database.open(path)
     try:
         yield database
@@ -64,7 +54,7 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
 
 
 def is_sound(path: Path) -> bool:
-    """Return whether SQLite finds a database intact, after rolling back what a killed run left unfinished."""
+    """Return whether a database is intact, after SQLite has rolled back an unfinished transaction."""
     if not path.is_file():
         return False
     try:
@@ -80,19 +70,19 @@ MATCH_QUERIES = (
     "SELECT image_id, rows, cols, data FROM keypoints ORDER BY image_id",
     "SELECT pair_id, rows, cols, data FROM matches ORDER BY pair_id",
 )
-"""Queries for what no longer changes once the photos are matched."""
+"""Tables that no longer change once the photos are matched."""
 
 
 def digest_matches(path: Path) -> str:
     """Return the hash of photos, keypoints and matches."""
-    found = hashlib.blake2b(digest_size=16)
+    digest = hashlib.blake2b(digest_size=16)
     with contextlib.closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True)) as connection:
         for query in MATCH_QUERIES:
             for row in connection.execute(query):
                 for value in row:
-                    found.update(value if isinstance(value, bytes) else repr(value).encode())
-                    found.update(b"\0")
-    return found.hexdigest()
+                    digest.update(value if isinstance(value, bytes) else repr(value).encode())
+                    digest.update(b"\0")
+    return digest.hexdigest()
 
 
 def remove_database(path: Path) -> None:
@@ -105,10 +95,6 @@ def create_database(path: Path, photos: PhotoSet) -> None:
     """Enter photos and cameras in a fixed order.
 
     Feature extraction would enter them in the order in which its threads finish, which differs from run to run.
-
-    Args:
-        path: database file, created if it is missing.
-        photos: usable photos, grouped by camera.
     """
     with open_database(path) as database:
         for camera_id, members in enumerate(photos.groups.values(), start=1):
@@ -120,12 +106,7 @@ def create_database(path: Path, photos: PhotoSet) -> None:
 
 
 def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
-    """Return keypoints and raw matches of every photo in the database.
-
-    Args:
-        path: database file.
-        photos: the photos that the database was made from.
-    """
+    """Return keypoints and raw matches of every photo in the database, which was made from these photos."""
     by_name = {photo.name: photo for photo in photos.photos}
     with open_database(path) as database:
         images, keypoints = {}, {}
@@ -135,10 +116,10 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
                 entry.image_id, photo.name, photo.group, photo.width, photo.height,
                 photo.exif_focal_px, photo.gps, photo.turn_deg, photo.shown, photo.projection, photo.time_s,
             )  # fmt: skip
-            found = np.asarray(database.read_keypoints(entry.image_id), np.float64)
-            keypoints[entry.image_id] = found[:, :2].copy() if len(found) else np.zeros((0, 2))  # a white wall
-        pair_ids, rows = database.read_all_matches()
-    matches = {_pair(key): np.asarray(row, np.uint32) for key, row in zip(pair_ids, rows, strict=True) if len(row)}
+            rows = np.asarray(database.read_keypoints(entry.image_id), np.float64)
+            keypoints[entry.image_id] = rows[:, :2].copy() if len(rows) else np.zeros((0, 2))  # a white wall
+        pair_ids, indices = database.read_all_matches()
+    matches = {_pair(key): np.asarray(row, np.uint32) for key, row in zip(pair_ids, indices, strict=True) if len(row)}
     return MatchGraph(images, keypoints, dict(sorted(matches.items())))
 
 
@@ -157,24 +138,13 @@ def photo_names(path: Path) -> dict[int, str]:
 
 
 def unmatched_pairs(path: Path, pairs: Sequence[PairId]) -> list[PairId]:
-    """Return the pairs that have no entry of matches in the database, not even an empty one.
-
-    Args:
-        path: database file.
-        pairs: ids, the smaller one first.
-    """
+    """Return the pairs, smaller id first, without an entry of matches in the database, not even an empty one."""
     with open_database(path) as database:
         return [pair for pair in pairs if not database.exists_matches(*pair)]
 
 
 def write_keypoints(path: Path, photo: int, keypoints: NDArray[np.float32]) -> None:
-    """Enter the keypoints of a photo, or replace them.
-
-    Args:
-        path: database file.
-        photo: id.
-        keypoints: (N, 2) pixels.
-    """
+    """Enter the keypoints (N, 2) of a photo in pixels, or replace them."""
     with open_database(path) as database:
         _put_keypoints(database, photo, keypoints)
 
@@ -188,7 +158,6 @@ def write_matches(path: Path, pair: PairId, rows: NDArray[np.uint32]) -> None:
     """Enter the matches of a pair that has none.
 
     Args:
-        path: database file.
         pair: ids, the smaller one first.
         rows: (M, 2) keypoint indices.
     """
@@ -197,12 +166,9 @@ def write_matches(path: Path, pair: PairId, rows: NDArray[np.uint32]) -> None:
 
 
 def write_match_graph(path: Path, matches: MatchGraph) -> None:
-    """Make a database of the photos, keypoints and raw matches of a match graph, with the same ids.
+    """Make or replace a database of the photos, keypoints and raw matches of a match graph, with the same ids.
 
     Its cameras are guesses, one for each group of photos, until `write_calibrations` replaces them.
-
-    Args:
-        path, matches: database file, which is replaced if it exists; keypoints and raw matches.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_database(path)
@@ -225,20 +191,14 @@ def write_match_graph(path: Path, matches: MatchGraph) -> None:
 def read_features(path: Path) -> tuple[dict[int, NDArray[np.float64]], dict[PairId, NDArray[np.uint32]]]:
     """Return keypoints (N, 2) of every photo that has any, and the raw matches of pairs."""
     with open_database(path) as database:
-        found = {image.image_id: database.read_keypoints(image.image_id) for image in database.read_all_images()}
+        features = {image.image_id: database.read_keypoints(image.image_id) for image in database.read_all_images()}
         pair_ids, rows = database.read_all_matches()
-    keypoints = {photo: np.asarray(x, np.float64)[:, :2].copy() for photo, x in sorted(found.items()) if len(x)}
+    keypoints = {photo: np.asarray(x, np.float64)[:, :2].copy() for photo, x in sorted(features.items()) if len(x)}
     return keypoints, {_pair(key): np.asarray(row, np.uint32) for key, row in zip(pair_ids, rows, strict=True)}
 
 
 def write_pose_graph(path: Path, matches: MatchGraph, graph: PoseGraph) -> None:
-    """Replace all two-view geometries by our relative poses and their essential matrices.
-
-    Args:
-        path: database file.
-        matches: raw matches, whose rows the inliers select.
-        graph: relative poses.
-    """
+    """Replace all two-view geometries by our relative poses and their essential matrices."""
     with open_database(path) as database:
         database.clear_two_view_geometries()
         for pair, pose in graph.poses.items():
@@ -246,12 +206,7 @@ def write_pose_graph(path: Path, matches: MatchGraph, graph: PoseGraph) -> None:
 
 
 def keep_raw_matches(path: Path, pairs: Collection[PairId]) -> None:
-    """Remove all two-view geometries, and all matches but those of the given pairs.
-
-    Args:
-        path: database file.
-        pairs: pairs whose matches are kept.
-    """
+    """Remove all two-view geometries, and the matches of all other pairs."""
     with open_database(path) as database:
         database.clear_two_view_geometries()
         for pair in {_pair(pair_id) for pair_id in database.read_all_matches()[0]}.difference(pairs):
@@ -263,9 +218,6 @@ def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) 
 
     Cameras are numbered in the order of their first photos, whatever the database held before. A K that the photos
     determine is marked as a prior focal length, a guess is not.
-
-    Args:
-        path, matches, intrinsics: database file; all photos; cameras, and the camera of each photo.
     """
     used = {image.id: intrinsics.camera_name(image) for image in matches.images.values()}
     ids = {name: number for number, name in enumerate(dict.fromkeys(used[key] for key in sorted(used)), start=1)}
@@ -284,7 +236,7 @@ def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) 
 
 
 def _guess_calibration(photo: Photo | MatchedImage) -> Calibration:
-    """Return what stands in for the camera of a photo until it is known; a panorama has nothing to find out."""
+    """Return a guess of the camera of a photo; that of a panorama is exact."""
     size = photo.width, photo.height
     return Calibration(guessed_camera_matrix(size), *size, "guess", False, projection=photo.projection)
 
@@ -322,7 +274,8 @@ def camera_model(calibration: Calibration) -> str:
         return model_of_calibration(calibration)[0]
     if calibration.projection in WIDE_MODELS:
         return WIDE_MODELS[calibration.projection]
-    K, tolerance = calibration.K, 0.0 if calibration.is_given else SQUARE_TOLERANCE
+    # largest |fy/fx - 1| of square pixels: calibrators give no more where the photos show no other aspect
+    K, tolerance = calibration.K, 0.0 if calibration.is_given else 0.005
     square = "aspect" in calibration.held or K[0, 0] == K[1, 1] or abs(K[1, 1] / K[0, 0] - 1.0) < tolerance
     return SQUARE_PIXELS if square else TWO_FOCALS
 
@@ -333,18 +286,12 @@ def params_of_calibration(calibration: Calibration) -> list[float]:
         return [float(calibration.width), float(calibration.height)]
     if calibration.distortion:
         return model_of_calibration(calibration)[1]
-    found = camera_params(calibration.K, camera_model(calibration), calibration.radial)
-    return [*found[:4], *calibration.fisheye] if calibration.projection == FISHEYE else found
+    params = camera_params(calibration.K, camera_model(calibration), calibration.radial)
+    return [*params[:4], *calibration.fisheye] if calibration.projection == FISHEYE else params
 
 
 def camera_params(K: NDArray[np.float64], camera_model: str, radial: float = 0.0) -> list[float]:
-    """Return COLMAP's parameters of a perspective camera.
-
-    Args:
-        K: (3, 3) camera matrix, pixels.
-        camera_model: COLMAP's name of the model.
-        radial: first radial term.
-    """
+    """Return parameters of a COLMAP model with one or two focals, from K (3, 3) in pixels and the first radial term."""
     fx, fy, cx, cy = (float(K[row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
     if camera_model == SQUARE_PIXELS:
         return [(fx * fy) ** 0.5, cx, cy, radial]
@@ -367,21 +314,11 @@ def _two_view_geometry(pose: RelativePose, matches: NDArray[np.uint32]) -> pycol
 
 
 def largest_descriptors(path: Path, photo: int, most: int) -> NDArray[np.uint8]:
-    """Return (N, 128) descriptors of a photo, those of the largest features first; none where it has none.
-
-    Args:
-        path: database file.
-        photo: id.
-        most: number of descriptors.
-    """
+    """Return descriptors (N, 128) of the `most` largest features of a photo, largest first; none where it has none."""
     with open_database(path) as database:
         if not database.exists_descriptors(photo):
             return np.zeros((0, 128), np.uint8)
-        descriptors = _values(database.read_descriptors(photo))
+        descriptors = np.asarray(database.read_descriptors(photo).data, np.uint8).reshape(-1, 128)
         shapes = np.asarray(database.read_keypoints(photo), np.float64)[:, 2:]
     areas = np.abs(shapes[:, 0] * shapes[:, 3] - shapes[:, 1] * shapes[:, 2])
     return descriptors[np.argsort(-areas, kind="stable")[:most]]
-
-
-def _values(descriptors: pycolmap.FeatureDescriptors) -> NDArray[np.uint8]:
-    return np.asarray(descriptors.data, np.uint8).reshape(-1, 128)

@@ -1,17 +1,17 @@
-"""A photo beside its depth map, read by name: a report needs no more of a dense workspace."""
+"""COLMAP's dense workspace: undistorted photos, their masks, depth maps and normal maps."""
 
 import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from math import ceil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import check_written, pycolmap, translate_errors
-from sfm_app.colmap.types import all_images
+from sfm_app.colmap.backend import all_images, check_written, pycolmap, translate_errors
 from sfm_app.colmap.worker_process import UndistortTask, run_worker
 from sfm_app.files import digest_files, is_below
 from sfm_app.operating_system import replace_file
@@ -21,22 +21,16 @@ from sfm_app.settings import MOST_LEVELS
 from sfm_app.stereo import DepthEstimate, DepthMap, Kind, View
 from sfm_app.types.arrays import BoolArray
 
-# Masks in COLMAP's dense workspace: undistorted, at the size of the photos there.
-
 MASKS = "masks"
-REACH_PX = 2
-"""Width of the border around masked pixels that is not used either: colors are interpolated between four pixels, at
-most half a pixel aside."""
+DEPTHS, NORMALS, CONFIDENCES = "depth_maps", "normal_maps", "confidence_maps"
+MASKED = -1.0
+"""Depth of a masked pixel. COLMAP's fusion reads it as no depth; `sfm_app.meshing` does not read it as empty space."""
+MAPS = ("sparse", "images", f"stereo/{DEPTHS}", f"stereo/{NORMALS}")
+"""Folders from which a finished workspace is read."""
 
 
 class MaskUndistorter:
-    """Writes masks of undistorted photos; on its way to another process, it is the paths of its inputs.
-
-    Args:
-        model_dir: model with the cameras of the photos.
-        mask_dir: masks of the original photos.
-        dense_dir: workspace with the undistorted photos.
-    """
+    """Writes masks of undistorted photos; pickled as the paths of its inputs."""
 
     def __init__(self, model_dir: Path, mask_dir: Path, dense_dir: Path) -> None:
         self._inputs = model_dir, mask_dir, dense_dir
@@ -55,32 +49,23 @@ class MaskUndistorter:
 
 
 def has_masks(dense_dir: Path) -> bool:
-    """Return whether any undistorted photo has a mask.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-    """
+    """Return whether any undistorted photo has a mask."""
     return (dense_dir / MASKS).is_dir()
 
 
 def used_pixels(dense_dir: Path, view: View) -> BoolArray | None:
-    """Return (H, W) which pixels of an undistorted photo may be used; None if it has no mask.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo.
-    """
+    """Return the mask (H, W) of an undistorted photo, true where pixels may be used; None without mask."""
     place = dense_dir / MASKS
     return read_mask(place, view.name) if mask_path(place, view.name).exists() else None
 
 
 def _undistort_mask(used: BoolArray, camera: pycolmap.Camera, view: View) -> BoolArray:
-    """Return (H, W) the mask of an undistorted photo: a pixel is used if all original pixels under it are."""
+    """Return the mask (H, W) of an undistorted photo: a pixel is used if all original pixels under it are."""
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(view.K).T
     with translate_errors(f"undistorting the mask of {view.name}"):
-        at = np.floor(camera.img_from_cam(rays)).astype(np.int64).reshape(view.height, view.width, 2)
-    col, row = at[..., 0], at[..., 1]
+        pixels = np.floor(camera.img_from_cam(rays)).astype(np.int64).reshape(view.height, view.width, 2)
+    col, row = pixels[..., 0], pixels[..., 1]
     height, width = used.shape
     inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
     whole = _erode(used, ceil(max(camera.focal_length_x / view.K[0, 0], camera.focal_length_y / view.K[1, 1])))
@@ -88,45 +73,33 @@ def _undistort_mask(used: BoolArray, camera: pycolmap.Camera, view: View) -> Boo
 
 
 def shrink_mask(used: BoolArray) -> BoolArray:
-    """Return the mask of an undistorted photo without its border, where colors are mixed.
+    """Return the mask (H, W) of an undistorted photo without the two pixels beside masked ones.
 
-    Args:
-        used: (H, W) which pixels may be used.
+    Colors there are mixed: they are interpolated between four pixels, at most half a pixel aside.
     """
-    return _erode(used, REACH_PX)
+    return _erode(used, 2)
 
 
 def _erode(used: BoolArray, reach: int) -> BoolArray:
-    """Return the mask without pixels that have an unused one within `reach` pixels."""
+    """Return the mask without pixels within `reach` pixels of an unused one."""
     square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     return np.asarray(cv2.erode(used.view(np.uint8), square)) > 0
-
-
-# COLMAP's dense workspace: undistorted photos, depth and normal maps.
-
-DEPTHS, NORMALS, CONFIDENCES = "depth_maps", "normal_maps", "confidence_maps"
-MASKED = -1.0
-"""Depth of a masked pixel. COLMAP's fusion reads it as no depth; `sfm_app.meshing` does not read it as empty space."""
-MAPS = ("sparse", "images", f"stereo/{DEPTHS}", f"stereo/{NORMALS}")
-"""Folders from which a finished workspace is read."""
 
 
 def undistort(
     model_dir: Path, photo_dir: Path, dense_dir: Path, max_side_px: int, workers: int, progress: Progress
 ) -> None:
-    """Write undistorted photos and the matching model into a dense workspace.
+    """Write undistorted photos and the matching model into a dense workspace, which is created if it is missing.
 
     Args:
-        model_dir, photo_dir, dense_dir: COLMAP model; the photos; dense workspace, created if it is missing.
         max_side_px: longest side of an undistorted photo; larger photos are scaled down.
-        workers: threads.
-        progress: shows a bar.
 
     Raises:
         BackendError: COLMAP cannot read the model or the photos, or cannot write.
     """
     (dense_dir / "images").mkdir(parents=True, exist_ok=True)
     task: UndistortTask = {
+        "do": "undistort",
         "dense": str(dense_dir),
         "model": str(model_dir),
         "photos": str(photo_dir),
@@ -134,7 +107,7 @@ def undistort(
         "workers": workers,
         "output": "COLMAP",
     }
-    run_worker("sfm_app.colmap.undistort_process", task, "undistorting photos", progress)
+    run_worker(task, "undistorting photos", progress)
 
 
 def read_views(dense_dir: Path) -> list[View]:
@@ -143,7 +116,7 @@ def read_views(dense_dir: Path) -> list[View]:
         model = pycolmap.Reconstruction(dense_dir / "sparse")
         images = sorted(all_images(model), key=lambda image: image.name)
         if not all(is_below(image.name) for image in images):
-            raise ValueError(f"{dense_dir} names photos outside of it")
+            raise ValueError(f"the model in {dense_dir} names photos outside of it")
         return [_view(model, image) for image in images if image.has_pose]
 
 
@@ -166,66 +139,44 @@ def _view(model: pycolmap.Reconstruction, image: pycolmap.Image) -> View:
 
 
 def read_gray(dense_dir: Path, view: View) -> NDArray[np.uint8]:
-    """Return the undistorted photo of a view, (H, W).
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo.
-    """
-    # imdecode, because OpenCV does not open names beyond ASCII on every system
-    image = cv2.imdecode(np.fromfile(dense_dir / "images" / view.name, np.uint8), cv2.IMREAD_GRAYSCALE)
-    return np.asarray(image, np.uint8)
+    """Return the undistorted photo (H, W) of a view."""
+    return np.asarray(_decode(dense_dir, view.name, cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
 def read_color(dense_dir: Path, view: View) -> NDArray[np.uint8]:
-    """Return the undistorted photo of a view, (H, W, 3) RGB.
+    """Return the undistorted photo (H, W, 3) of a view, RGB."""
+    return np.asarray(_decode(dense_dir, view.name, cv2.IMREAD_COLOR_RGB), np.uint8)
 
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo.
-    """
-    image = cv2.imdecode(np.fromfile(dense_dir / "images" / view.name, np.uint8), cv2.IMREAD_COLOR_RGB)
-    return np.asarray(image, np.uint8)
+
+def _decode(dense_dir: Path, name: str, flags: int) -> Any:
+    """Return an undistorted photo; None if the file is no photo."""
+    # imdecode, because OpenCV does not open names beyond ASCII on every system
+    return cv2.imdecode(np.fromfile(dense_dir / "images" / name, np.uint8), flags)
 
 
 def map_file(dense_dir: Path, view: View) -> Path:
-    """Return the path of the confirmed depths of a view, whether or not it exists.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo.
-    """
+    """Return the path of the confirmed depths of a view, whether or not it exists."""
     return _map_path(dense_dir, DEPTHS, view, "geometric")
 
 
 def normals_file(dense_dir: Path, view: View) -> Path:
-    """Return the path of the normals of a view, whether or not it exists.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo.
-    """
+    """Return the path of the normals of a view, whether or not it exists."""
     return _map_path(dense_dir, NORMALS, view, "geometric")
 
 
 class DenseStore:
-    """The photos and maps of a dense workspace; implements `sfm_app.stereo.DepthStore`."""
+    """Photos and maps of a dense workspace; implements `sfm_app.stereo.DepthStore`."""
 
     def __init__(self, dense_dir: Path) -> None:
         self.dense_dir = dense_dir
 
     def photo(self, view: View) -> NDArray[np.uint8]:
-        """Return the undistorted photo, (H, W), at the size of the view."""
+        """Return the undistorted photo (H, W) at the size of the view."""
         photo = read_gray(self.dense_dir, view)
         return _resize(photo, view) if view.level else photo
 
     def has(self, view: View, kind: Kind) -> bool:
-        """Return whether a depth map exists.
-
-        Args:
-            view: an undistorted photo.
-            kind: which map.
-        """
+        """Return whether a depth map exists."""
         # the depth map is written last
         return _map_path(self.dense_dir, DEPTHS, view, kind).is_file()
 
@@ -235,12 +186,7 @@ class DenseStore:
         return DepthEstimate(self.read_depth(view), confidence)
 
     def read_depth(self, view: View, kind: Kind = "photometric") -> NDArray[np.float32]:
-        """Read the depths of a map of a view.
-
-        Args:
-            view: an undistorted photo.
-            kind: which map.
-        """
+        """Read the depths of a map of a view."""
         return read_depth(self.dense_dir, view, kind)
 
     def read_maps(self, view: View) -> DepthMap:
@@ -248,24 +194,14 @@ class DenseStore:
         return DepthMap(self.read_depth(view, "geometric"), read_normals(self.dense_dir, view))
 
     def write_proposal(self, view: View, depth: NDArray[np.float32]) -> None:
-        """Write what is proposed for the plain areas of a view.
-
-        Args:
-            view: an undistorted photo.
-            depth: (H, W), 0 where nothing is.
-        """
+        """Write proposed depths (H, W) of the plain areas of a view, 0 where unknown."""
         _write_depth_format(self.dense_dir, DEPTHS, view, depth, "proposed")
 
     def write_estimate(self, view: View, estimate: DepthEstimate) -> None:
-        """Write the photometric map of a view, without depth where the photo is masked.
-
-        Args:
-            view: an undistorted photo.
-            estimate: depths and their confidences.
-        """
+        """Write the photometric map of a view, without depth where the photo is masked."""
         used = used_pixels(self.dense_dir, view)
         if used is not None:
-            if view.level:  # a pixel counts if all under it do
+            if view.level:  # a pixel is used if all pixels under it are
                 used = _resize(used.view(np.uint8) * np.uint8(255), view) == 255
             # full confidence, so that masked pixels do not become part of a blank area beside them
             estimate = DepthEstimate(estimate.depth * used, np.where(used, estimate.confidence, np.float32(1)))
@@ -273,33 +209,17 @@ class DenseStore:
         _write_depth_format(self.dense_dir, DEPTHS, view, estimate.depth, "photometric")
 
     def write_maps(self, view: View, maps: DepthMap) -> None:
-        """Write the geometric maps of a view.
-
-        Args:
-            view: an undistorted photo.
-            maps: confirmed depths, and normals.
-        """
+        """Write the geometric maps of a view."""
         write_maps(self.dense_dir, view, maps)
 
 
 def read_depth(dense_dir: Path, view: View, kind: Kind) -> NDArray[np.float32]:
-    """Read a depth map, (H, W): 0 where unknown, MASKED where the photo is masked, SKY where it shows the sky.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo.
-        kind: photometric or geometric.
-    """
+    """Read a depth map (H, W): 0 where unknown, MASKED where the photo is masked, SKY where it shows the sky."""
     return _read_depth_format(dense_dir, DEPTHS, view, kind)
 
 
 def read_normals(dense_dir: Path, view: View) -> NDArray[np.float32]:
-    """Read the normals of a view, (H, W, 3), as `write_maps` takes them.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: a photo with maps.
-    """
+    """Read the normals (H, W, 3) of a view."""
     with translate_errors(f"reading the normal map of {view.name}"):
         stored = pycolmap.NormalMap()
         stored.read(_map_path(dense_dir, NORMALS, view))
@@ -309,13 +229,7 @@ def read_normals(dense_dir: Path, view: View) -> NDArray[np.float32]:
 
 
 def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
-    """Write the confirmed depths and the normals of a view, as COLMAP's fusion expects them.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo.
-        maps: depths (H, W) and normals (H, W, 3).
-    """
+    """Write the confirmed depths (H, W) and the normals (H, W, 3) of a view, as COLMAP's fusion expects them."""
     # pycolmap takes (H, W, 3) but stores the bytes unchanged, while COLMAP keeps x, y and z in planes.
     planes = np.ascontiguousarray(maps.normals.transpose(2, 0, 1)).reshape(maps.normals.shape)
     with (
@@ -327,23 +241,12 @@ def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
 
 
 def write_depth(dense_dir: Path, view: View, depth: NDArray[np.float32]) -> None:
-    """Write the confirmed depths of a view.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo.
-        depth: (H, W), 0 where unknown.
-    """
+    """Write the confirmed depths (H, W) of a view, 0 where unknown."""
     _write_depth_format(dense_dir, DEPTHS, view, depth, "geometric")
 
 
 def mask_depths(dense_dir: Path, view: View) -> None:
-    """Write MASKED into the confirmed depths of a view where the photo is masked, whichever method made them.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: an undistorted photo, masked or not.
-    """
+    """Write MASKED into the confirmed depths of a view where the photo is masked."""
     used, file = used_pixels(dense_dir, view), map_file(dense_dir, view)
     if used is not None and file.exists():
         depth = read_depth(dense_dir, view, "geometric")
@@ -351,26 +254,16 @@ def mask_depths(dense_dir: Path, view: View) -> None:
 
 
 def drop_estimates(dense_dir: Path, views: Sequence[View]) -> None:
-    """Remove the photometric maps and the proposals, which the geometric maps replace.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        views: all undistorted photos.
-    """
+    """Remove the photometric maps and the proposals of all views."""
     for view in views:
         _map_path(dense_dir, DEPTHS, view, "proposed").unlink(missing_ok=True)
-        for at_level in (view, *(view.halve(level) for level in range(1, MOST_LEVELS))):
+        for scaled in (view, *(view.halve(level) for level in range(1, MOST_LEVELS))):
             for folder in (DEPTHS, NORMALS, CONFIDENCES):
-                _map_path(dense_dir, folder, at_level, "photometric").unlink(missing_ok=True)
+                _map_path(dense_dir, folder, scaled, "photometric").unlink(missing_ok=True)
 
 
 def write_fusion_views(dense_dir: Path, views: Sequence[View]) -> None:
-    """Write the list of views that have maps, for COLMAP's fusion.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        views: all undistorted photos.
-    """
+    """Write the list of views that have maps, for COLMAP's fusion."""
     config = "".join(f"{view.name}\n" for view in views if map_file(dense_dir, view).exists())
     (dense_dir / "stereo" / "fusion.cfg").write_text(config, encoding="utf-8", newline="\n")
 
@@ -419,22 +312,17 @@ def _atomic_path(target: Path) -> Iterator[Path]:
 def read_photo_and_depth(dense_dir: Path, name: str) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Return the undistorted photo (H, W, 3) RGB and its confirmed depths (H, W), <= 0 where there is none.
 
-    Args:
-        dense_dir: dense workspace.
-        name: of the undistorted photo.
-
     Raises:
-        ValueError: the name leads out of the workspace, or the photo is none.
-        OSError: the photo is not there.
+        ValueError: the name leads out of the workspace, or the file is no photo.
+        OSError: the photo does not exist.
         BackendError: the depth map cannot be read.
     """
     if not is_below(name):
-        raise ValueError(f"{name} does not lie in {dense_dir}")
-    # imdecode, because OpenCV does not open names beyond ASCII on every system
-    image = cv2.imdecode(np.fromfile(dense_dir / "images" / name, np.uint8), cv2.IMREAD_COLOR_RGB)
+        raise ValueError(f"{name} is not in {dense_dir}")
+    image = _decode(dense_dir, name, cv2.IMREAD_COLOR_RGB)
     if image is None:
         raise ValueError(f"{name} is no photo")
     with translate_errors(f"reading the depth map of {name}"):
         stored = pycolmap.DepthMap()
-        stored.read(dense_dir / "stereo" / "depth_maps" / f"{name}.geometric.bin")
+        stored.read(dense_dir / "stereo" / DEPTHS / f"{name}.geometric.bin")
     return np.asarray(image, np.uint8), np.array(stored.to_array(), np.float32)

@@ -1,45 +1,40 @@
-"""Continue from an earlier run: its database and its model, with other photos."""
+"""Continue from an earlier run: its database and its model, with other photos.
+
+Known photos keep their ids, keypoints, descriptors and matches. New photos get ids that no photo had before.
+"""
 
 import contextlib
 import sqlite3
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
-from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.backend import all_points, pycolmap
 from sfm_app.colmap.database import write_match_graph
 from sfm_app.colmap.model import pose_photo, posed_images, unposed_model
-from sfm_app.colmap.types import all_points
 from sfm_app.files import replace_atomically
 from sfm_app.types import MatchedImage, MatchGraph, PhotoSet
-
-# COLMAP's database of an earlier run, changed to the photos of this one.
-#
-# Photos that stayed keep their ids, keypoints, descriptors and matches. New photos get ids that no photo had
-# before.
 
 COPIES = (
     ("SELECT * FROM keypoints", "INSERT INTO keypoints VALUES (?, ?, ?, ?)", lambda key: (key,)),
     ("SELECT * FROM descriptors", "INSERT INTO descriptors VALUES (?, ?, ?, ?, ?)", lambda key: (key,)),
     ("SELECT * FROM matches", "INSERT INTO matches VALUES (?, ?, ?, ?)", pycolmap.pair_id_to_image_pair),
 )
-"""Queries that copy tables, and the photos that a row with this key is about."""
+"""Queries that copy tables, and the ids of photos in the key of a row."""
 LAST_ID = "SELECT seq FROM sqlite_sequence WHERE name = 'images'"
-"""Query for the largest id that a photo had at any time."""
+"""Query for the largest id that a photo ever had."""
 
 
 def grow_database(path: Path, earlier: Path, photos: PhotoSet, known: Collection[str]) -> None:
-    """Make the database of these photos, with what that of an earlier run knows about the same photos.
+    """Make the database of these photos, with the features and matches of an earlier run.
 
     Args:
-        path: database file; appears as a whole.
-        earlier: database of the earlier run; not changed.
-        photos: usable photos, grouped by camera.
+        earlier: not changed.
         known: names of the photos that are the same in both.
     """
     with _connection(earlier) as connection:
-        had = dict(connection.execute("SELECT name, image_id FROM images"))
-        last = max([0, *had.values(), *(seq for (seq,) in connection.execute(LAST_ID))])
-    ids = {name: key for name, key in had.items() if name in known}
+        earlier_ids = dict(connection.execute("SELECT name, image_id FROM images"))
+        last = max([0, *earlier_ids.values(), *(seq for (seq,) in connection.execute(LAST_ID))])
+    ids = {name: key for name, key in earlier_ids.items() if name in known}
     members = [photo for group in photos.groups.values() for photo in sorted(group, key=lambda photo: photo.name)]
     new = [photo.name for photo in members if photo.name not in ids]
     ids |= {name: key for key, name in enumerate(new, start=last + 1)}
@@ -55,27 +50,26 @@ def grow_database(path: Path, earlier: Path, photos: PhotoSet, known: Collection
 
 
 def forget_changed_matches(path: Path, earlier: Path) -> frozenset[str]:
-    """Remove the matches of photos whose keypoints are not those of an earlier run, and return the names of these.
+    """Remove the matches of photos whose keypoints differ from those of an earlier run, and return their names.
 
     A method that finds features again may find others, and matches are rows of keypoints.
 
     Args:
-        path: database whose photos have keypoints.
-        earlier: database that its matches come from.
+        earlier: database that the matches come from.
     """
     query = "SELECT image_id, rows, cols, data FROM keypoints"
     with _connection(earlier) as before, _connection(path) as now:
         old = {key: values for key, *values in before.execute(query)}
         changed = {key for key, *values in now.execute(query) if key in old and values != old[key]}
         pairs = [key for (key,) in now.execute("SELECT pair_id FROM matches")] if changed else []
-        left = [(key,) for key in pairs if not changed.isdisjoint(pycolmap.pair_id_to_image_pair(key))]
-        now.executemany("DELETE FROM matches WHERE pair_id = ?", left)
+        affected = [(key,) for key in pairs if not changed.isdisjoint(pycolmap.pair_id_to_image_pair(key))]
+        now.executemany("DELETE FROM matches WHERE pair_id = ?", affected)
         names = now.execute("SELECT image_id, name FROM images").fetchall()
     return frozenset(name for key, name in names if key in changed)
 
 
 def _copy_rows(path: Path, earlier: Path, photos: Collection[int]) -> None:
-    """Copy what is known about these photos, and about pairs of them."""
+    """Copy the rows of these photos, and of pairs of them."""
     known = frozenset(photos)
     with _connection(earlier) as source, _connection(path) as target:
         for read, write, about in COPIES:
@@ -90,20 +84,16 @@ def _connection(path: Path) -> Iterator[sqlite3.Connection]:
         yield connection
 
 
-# The model of an earlier run in the database of this one, as a start for further photos.
-
-
 def model_in_database(
     database: Path, earlier: Path, photos: Collection[int], keypoints: Mapping[int, int]
 ) -> pycolmap.Reconstruction:
     """Return the part of an earlier model that some photos see, with the photos and cameras of a database.
 
-    Cameras get the parameters of the earlier model. Tracks lose the photos that are not there, and keypoints that only
-    the earlier run had; points that fewer than two photos see are left out.
+    Cameras get the parameters of the earlier model. Tracks lose photos that are not known, and keypoints that the
+    database lacks; points with fewer than two photos are left out.
 
     Args:
-        database: holds photos, keypoints and cameras; known photos have the ids that they have in the model.
-        earlier: COLMAP's model on disk.
+        database: known photos have the ids of the model.
         photos: ids of the known photos.
         keypoints: number of keypoints of each photo in the database.
     """
@@ -115,11 +105,11 @@ def model_in_database(
         camera.model, camera.params = known.model, known.params.tolist()
     for image in placed:
         pose_photo(model, image.image_id, image.cam_from_world())
-    there = {image.image_id for image in placed}
+    members = {image.image_id for image in placed}
     for _, point in sorted(all_points(before), key=lambda item: item[0]):
         track = pycolmap.Track()
         for element in point.track.elements:
-            if element.image_id in there and element.point2D_idx < keypoints[element.image_id]:
+            if element.image_id in members and element.point2D_idx < keypoints[element.image_id]:
                 track.add_element(element.image_id, element.point2D_idx)
         if track.length() >= 2:
             model.add_point3D(point.xyz, track, point.color)

@@ -1,4 +1,4 @@
-"""One model of several: of two by a similarity, or of many as arrays."""
+"""Join models: two by a similarity, or many as arrays."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,15 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_app.colmap.backend import pycolmap, translate_errors
+from sfm_app.colmap.backend import all_points, pycolmap, translate_errors
 from sfm_app.colmap.bundle import drop_infinite_points, find_correspondences, improve_tracks, solve
 from sfm_app.colmap.model import bearing_vectors, move, pose_photo, posed_images, unposed_model
-from sfm_app.colmap.types import all_points
 from sfm_app.geometry.poses import Similarity
 from sfm_app.types.arrays import FloatArray, IndexArray
-
-SETTLING_ROUNDS = 2
-"""Rounds of adjustment after models are joined, with tracks completed after each; the last adjustment follows."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +26,7 @@ class PlacedPhotos:
     X: FloatArray
     """(P, 3) points."""
     point: IndexArray
-    """(N,) row of the point of each observation; those of a point follow each other."""
+    """(N,) row of the point of each observation, ascending."""
     photo: IndexArray
     """(N,) id of the photo of each observation."""
     keypoint: IndexArray
@@ -39,21 +35,12 @@ class PlacedPhotos:
     """Camera of each photo, by its id."""
 
     def bearings(self, photo: int, x: FloatArray) -> FloatArray:
-        """Return the bearing vectors (N, 9) of pixels of a photo.
-
-        Args:
-            photo: id.
-            x: (N, 2) pixels.
-        """
+        """Return the bearing vectors (N, 9) of pixels (N, 2) of a photo."""
         return bearing_vectors(self.cameras[photo], x)
 
 
 def read_placed(model_dir: Path) -> PlacedPhotos:
-    """Read a model on disk.
-
-    Args:
-        model_dir: COLMAP's model.
-    """
+    """Read a model on disk."""
     with translate_errors("reading the model of a part"):
         model = pycolmap.Reconstruction(model_dir)
         images = posed_images(model)
@@ -70,12 +57,10 @@ def read_placed(model_dir: Path) -> PlacedPhotos:
 
 
 def write_placed(database: Path, placed: PlacedPhotos) -> pycolmap.Reconstruction:
-    """Return poses and points as COLMAP's model.
+    """Return poses and points as COLMAP's model, with the photos of a database.
 
-    Args:
-        database: holds the photos, keypoints and two-view geometries.
-        placed: each keypoint is in one point at most. Of the cameras of photos that share one in the database,
-            the one with the median focal is taken.
+    Of the cameras of photos that share one in the database, the camera with the median focal is taken. Each keypoint is
+    in one point at most.
     """
     model = unposed_model(database)
     _write_cameras(model, placed)
@@ -93,12 +78,12 @@ def write_placed(database: Path, placed: PlacedPhotos) -> pycolmap.Reconstructio
 
 
 def _write_cameras(model: pycolmap.Reconstruction, placed: PlacedPhotos) -> None:
-    found: dict[int, list[tuple[float, int]]] = {}
+    ranked_focals: dict[int, list[tuple[float, int]]] = {}
     for photo in placed.photos.tolist():
         known = placed.cameras[photo]
         focal = 0.0 if known.is_spherical() else known.mean_focal_length()
-        found.setdefault(model.images[photo].camera_id, []).append((focal, photo))
-    for camera_id, ranked in found.items():
+        ranked_focals.setdefault(model.images[photo].camera_id, []).append((focal, photo))
+    for camera_id, ranked in ranked_focals.items():
         camera, known = model.cameras[camera_id], placed.cameras[sorted(ranked)[len(ranked) // 2][1]]
         camera.model, camera.params = known.model, known.params.tolist()
 
@@ -109,7 +94,6 @@ def merge_models(
     """Return one model with the photos and points of two models that share no photo.
 
     Args:
-        database: holds photos, keypoints and two-view geometries.
         first: gives the frame, and the parameters of cameras that are in both models; not changed.
         second: not changed.
         similarity: from the frame of the second model into that of the first.
@@ -129,16 +113,14 @@ def merge_models(
     return model
 
 
-def settle(model: pycolmap.Reconstruction, database: Path, refined: Sequence[int]) -> None:
-    """Adjust a joined model in place, and complete, merge and filter its tracks.
+def adjust_joined(model: pycolmap.Reconstruction, database: Path, refined: Sequence[int]) -> None:
+    """Adjust a joined model in place, and complete, merge and filter its tracks; the last adjustment follows.
 
     Args:
-        model: COLMAP's reconstruction.
-        database: has all keypoints and matches.
         refined: ids of the cameras whose focal is refined; the others are held fixed.
     """
     drop_infinite_points(model)
     graph = find_correspondences(model, database)
-    for _ in range(SETTLING_ROUNDS):
+    for _ in range(2):
         solve(model, refined)
         improve_tracks(model, graph)

@@ -1,4 +1,4 @@
-"""How well each photo is tied to a finished model: its points, their residuals, and where in the photo they lie."""
+"""COLMAP's sparse model: build, divide and move it, read it as arrays, as a scene, and as figures of its photos."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,33 +10,24 @@ from numpy.typing import NDArray
 
 from sfm_app.camera.bearings import BEARING, RAY
 from sfm_app.camera.models import camera_matrix, panorama_matrix
-from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread, translate_errors
+from sfm_app.colmap.backend import all_images, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.types import all_images, all_points
 from sfm_app.geometry.epipolar import TwoViewSeed
 from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import finite_entries
 from sfm_app.types import CameraModel, Frustum, Model, PairId, Scene, SceneArrays, Surface
 
-# COLMAP's sparse model: build it from our two-view seed, divide and transform it, and read it.
-
-STEP_PX = 1e-3
-"""Step of the derivatives of bearing vectors: curvature and rounding in double precision cost about 1e-9 of them."""
-MAX_COORDINATE = 1e100
-"""Largest coordinate of a finite point: squares of much larger ones overflow."""
-
 
 def finite_mask(xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return (...) which points (..., 3) are finite, and near enough that their distances do not overflow."""
-    return np.asarray((np.abs(xyz) < MAX_COORDINATE).all(axis=-1))
+    """Return (...) which points (..., 3) are finite, and near enough that squares do not overflow."""
+    return np.asarray((np.abs(xyz) < 1e100).all(axis=-1))
 
 
 def unposed_model(database: Path, *, unconnected: bool = True) -> pycolmap.Reconstruction:
     """Return a reconstruction of the photos, keypoints and cameras of a database, without poses and points.
 
     Args:
-        database: holds photos, keypoints and two-view geometries.
-        unconnected: whether photos are in it that no pair in the database connects.
+        unconnected: whether to include photos that no pair in the database connects.
     """
     options = pycolmap.DatabaseCacheOptions()
     options.load_all_images = unconnected
@@ -48,13 +39,7 @@ def unposed_model(database: Path, *, unconnected: bool = True) -> pycolmap.Recon
 
 
 def pose_photo(model: pycolmap.Reconstruction, photo: int, cam_from_world: pycolmap.Rigid3d) -> None:
-    """Give a photo of a model its pose, in place.
-
-    Args:
-        model: COLMAP's reconstruction.
-        photo: id.
-        cam_from_world: the pose.
-    """
+    """Give a photo of a model its pose, in place."""
     image = model.images[photo]
     model.frames[image.frame_id].set_cam_from_world(image.camera_id, cam_from_world)
     model.register_frame(image.frame_id)
@@ -66,8 +51,6 @@ def model_from_seed(
     """Return a reconstruction of two photos with our pose and our points.
 
     Args:
-        database: holds photos, keypoints and two-view geometries.
-        pair: ids of the two photos.
         matches: (N, 2) keypoint indices, one row per point of the seed.
         seed: pose and points; only its usable points are added.
     """
@@ -91,39 +74,35 @@ class PlacedView:
     t: NDArray[np.float64]
     """(3,) translation, camera from world."""
     lines: NDArray[np.float64]
-    """(N, 9) bearing vectors of keypoints, see `geometry.lenses.bearings`."""
+    """(N, 9) bearing vectors of keypoints, see `camera.bearings`."""
 
 
 def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray[np.float64]]) -> dict[int, PlacedView]:
     """Return all photos of a model that have a pose, by id.
 
     Args:
-        model: COLMAP's reconstruction.
         keypoints: (N, 2) pixels, by photo id.
     """
-    found = {}
+    views = {}
     for image in posed_images(model):
         camera, pose = model.cameras[image.camera_id], image.cam_from_world().matrix()
         lines = bearing_vectors(camera, keypoints[image.image_id])
-        found[image.image_id] = PlacedView(pose[:, :3].copy(), pose[:, 3].copy(), lines)
-    return found
+        views[image.image_id] = PlacedView(pose[:, :3].copy(), pose[:, 3].copy(), lines)
+    return views
 
 
 def bearing_vectors(camera: pycolmap.Camera, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return bearing vectors (N, 9), as `geometry.lenses.bearings` does.
-
-    Args:
-        camera: COLMAP's camera.
-        x: (N, 2) pixels.
-    """
+    """Return bearing vectors (N, 9) of pixels (N, 2), as `camera.bearings` does."""
     if camera.is_perspective_fisheye() or camera.is_spherical():
-        steps = np.vstack([x + step for step in ([0.0, 0.0], [STEP_PX, 0.0], [0.0, STEP_PX])])
+        # step of the derivatives: curvature and rounding in double precision cost about 1e-9 of them
+        step_px = 1e-3
+        steps = np.vstack([x + step for step in ([0.0, 0.0], [step_px, 0.0], [0.0, step_px])])
         here, right, down = np.asarray(camera.cam_ray_from_img(steps), np.float64).reshape(3, -1, 3)
-        return np.hstack([here, (right - here) / STEP_PX, (down - here) / STEP_PX])
-    found = np.zeros((len(x), BEARING))
-    found[:, :2], found[:, 2] = np.asarray(camera.cam_from_img(x), np.float64).reshape(-1, 2), 1.0
-    found[:, 3], found[:, 7] = 1.0 / camera.focal_length_x, 1.0 / camera.focal_length_y
-    return found
+        return np.hstack([here, (right - here) / step_px, (down - here) / step_px])
+    lines = np.zeros((len(x), BEARING))
+    lines[:, :2], lines[:, 2] = np.asarray(camera.cam_from_img(x), np.float64).reshape(-1, 2), 1.0
+    lines[:, 3], lines[:, 7] = 1.0 / camera.focal_length_x, 1.0 / camera.focal_length_y
+    return lines
 
 
 def posed_photo_ids(model: pycolmap.Reconstruction) -> list[int]:
@@ -132,7 +111,7 @@ def posed_photo_ids(model: pycolmap.Reconstruction) -> list[int]:
 
 
 class MappedCamera(NamedTuple):
-    """A camera as mapping left it; see `Calibration`."""
+    """A camera after mapping; see `Calibration`."""
 
     K: NDArray[np.float64]
     radial: float = 0.0
@@ -147,10 +126,8 @@ def cameras_by_photo(model: pycolmap.Reconstruction) -> dict[int, MappedCamera]:
 def _mapped_camera(camera: pycolmap.Camera) -> MappedCamera:
     if camera.is_spherical():
         return MappedCamera(panorama_matrix((camera.width, camera.height)))
-    K, terms = (
-        np.asarray(camera.calibration_matrix(), np.float64),
-        [camera.params[k] for k in camera.extra_params_idxs()],
-    )
+    K = np.asarray(camera.calibration_matrix(), np.float64)
+    terms = [camera.params[k] for k in camera.extra_params_idxs()]
     if camera.is_perspective_fisheye():
         if camera.model.name == "THIN_PRISM_FISHEYE":
             terms = [terms[k] for k in (0, 1, 4, 5)]
@@ -159,23 +136,12 @@ def _mapped_camera(camera: pycolmap.Camera) -> MappedCamera:
 
 
 def color_points(model: pycolmap.Reconstruction, photo_dir: Path, workers: int) -> None:
-    """Give every point the mean color of its pixels.
-
-    Args:
-        model: changed in place.
-        photo_dir: folder with the photos.
-        workers: threads.
-    """
+    """Give every point the mean color of its pixels, in place."""
     run_in_daemon_thread(lambda: model.extract_colors_for_all_images(photo_dir, num_threads=workers))
 
 
 def submodel(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.Reconstruction:
-    """Return a copy of a model with only the given photos, and the points that at least two of them see.
-
-    Args:
-        model: not changed.
-        photos: ids of the photos to keep.
-    """
+    """Return a copy of a model with only the given photos, and the points that at least two of them see."""
     part, members = pycolmap.Reconstruction(model), set(photos)
     for image in posed_images(model):
         if image.image_id not in members:
@@ -205,6 +171,17 @@ def poses_and_points(model: pycolmap.Reconstruction) -> tuple[dict[int, NDArray[
     return poses, points
 
 
+def finite_points(model: pycolmap.Reconstruction) -> list[pycolmap.Point3D]:
+    """Return the finite points of a model, in order of ids."""
+    return [model.points3D[key] for key in sorted(model.points3D) if finite_mask(model.points3D[key].xyz)]
+
+
+def point_arrays(points: Sequence[pycolmap.Point3D]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Return positions (P, 3) and colors (P, 3) of points."""
+    xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
+    return xyz, np.array([point.color for point in points], np.uint8).reshape(-1, 3)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenPoints:
     """Points of a model, and the photos that see them."""
@@ -214,108 +191,71 @@ class SeenPoints:
     colors: NDArray[np.uint8]
     """(P, 3)"""
     seen: tuple[NDArray[np.int64], ...]
-    """For each posed photo, in order of ids, the rows of the points that it sees."""
+    """For each posed photo, in order of ids, the rows of its points."""
 
 
 def seen_points(model: pycolmap.Reconstruction, most: int) -> SeenPoints:
-    """Return the finite points of a model, or a sample of them drawn with a fixed seed.
-
-    Args:
-        model: COLMAP's reconstruction, colored.
-        most: largest number of points.
-    """
-    keys = [key for key in sorted(model.points3D) if finite_mask(model.points3D[key].xyz)]
-    chosen = np.sort(np.random.default_rng(0).permutation(len(keys))[:most])
-    found = [model.points3D[keys[k]] for k in chosen]
-    seen: dict[int, list[int]] = {image_id: [] for image_id in posed_photo_ids(model)}
-    for number, point in enumerate(found):
-        for image_id in {element.image_id for element in point.track.elements} & seen.keys():
-            seen[image_id].append(number)
-    return SeenPoints(
-        np.array([point.xyz for point in found], np.float64).reshape(-1, 3),
-        np.array([point.color for point in found], np.uint8).reshape(-1, 3),
-        tuple(np.array(numbers, np.int64) for numbers in seen.values()),
-    )
+    """Return the finite points of a colored model, or a sample of at most `most`, drawn with a fixed seed."""
+    points = finite_points(model)
+    sample = [points[k] for k in np.sort(np.random.default_rng(0).permutation(len(points))[:most])]
+    rows: dict[int, list[int]] = {image_id: [] for image_id in posed_photo_ids(model)}
+    for row, point in enumerate(sample):
+        for image_id in {element.image_id for element in point.track.elements} & rows.keys():
+            rows[image_id].append(row)
+    return SeenPoints(*point_arrays(sample), tuple(np.array(own, np.int64) for own in rows.values()))
 
 
 def scale_matrix(camera: pycolmap.Camera) -> NDArray[np.float64]:
-    """Return K (3, 3) of a camera; of a panorama, the scale at its middle.
-
-    Args:
-        camera: of any model.
-    """
+    """Return K (3, 3) of a camera; of a panorama, the scale at its center."""
     if camera.is_spherical():
         return panorama_matrix((camera.width, camera.height))
     return np.asarray(camera.calibration_matrix(), np.float64)
 
 
 def viewing_rays(model: pycolmap.Reconstruction, image_id: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the viewing directions (N, 3) of pixels of a photo in the world, of any length.
-
-    Args:
-        model: COLMAP's reconstruction.
-        image_id: id of a posed photo.
-        x: (N, 2) pixels.
-    """
+    """Return viewing directions (N, 3), of any length, of pixels (N, 2) of a posed photo, in the frame of the world."""
     image = model.images[image_id]
     R = image.cam_from_world().matrix()[:, :3]
     return np.asarray(bearing_vectors(model.cameras[image.camera_id], np.asarray(x, np.float64))[:, RAY] @ R)
 
 
 def focal_px(model: pycolmap.Reconstruction, image_id: int) -> float:
-    """Return the focal length of the camera of a photo, in pixels.
-
-    Args:
-        model: COLMAP's reconstruction.
-        image_id: id of the photo.
-    """
+    """Return the focal length of the camera of a photo, in pixels."""
     return float(np.sqrt(np.prod(np.diag(scale_matrix(model.cameras[model.images[image_id].camera_id]))[:2])))
 
 
 def move(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
-    """Move a model into another frame.
-
-    Args:
-        model: changed in place.
-        similarity: from the frame of the model into the new one.
-    """
+    """Move a model in place, by a similarity from its frame into the new one."""
     rotation = pycolmap.Rotation3d(similarity.R)
     model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.t))
 
 
-# COLMAP's sparse model as plain arrays.
-
-
 def model_arrays(model: pycolmap.Reconstruction, *, metric: bool) -> SceneArrays:
-    """Return poses, cameras, points and tracks of a model.
-
-    Args:
-        model: COLMAP's reconstruction.
-        metric: whether its unit is the meter.
-    """
+    """Return poses, cameras, points and tracks of a model, whose unit may be the meter (`metric`)."""
     images = sorted(posed_images(model), key=lambda image: image.name)
     cameras = [model.cameras[image.camera_id] for image in images]
-    found = [model.points3D[key] for key in sorted(model.points3D)]
+    points = [model.points3D[key] for key in sorted(model.points3D)]
     rows = {image.image_id: row for row, image in enumerate(images)}
     keypoints = [np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2) for image in images]
-    seen = [
+    observations = [
         (row, rows[member.image_id], member.point2D_idx)
-        for row, point in enumerate(found)
+        for row, point in enumerate(points)
         for member in point.track.elements
         if member.image_id in rows
     ]
-    point, photo, keypoint = np.array(seen, np.int64).reshape(-1, 3).T
+    point, photo, keypoint = np.array(observations, np.int64).reshape(-1, 3).T
     starts = np.cumsum([0, *map(len, keypoints)])
     pixels = np.concatenate([*keypoints, np.zeros((0, 2))])[starts[photo] + keypoint]
     poses = [image.cam_from_world().matrix() for image in images]
+    xyz, colors = point_arrays(points)
     return SceneArrays(
         photos=tuple(image.name for image in images),
         cam_from_world=np.array(poses, np.float64).reshape(-1, 3, 4),
         K=np.array([scale_matrix(camera) for camera in cameras], np.float64).reshape(-1, 3, 3),
         sizes=np.array([(camera.width, camera.height) for camera in cameras], np.int64).reshape(-1, 2),
-        points=np.array([point.xyz for point in found], np.float64).reshape(-1, 3),
-        colors=np.array([point.color for point in found], np.uint8).reshape(-1, 3),
-        errors_px=np.array([point.error for point in found], np.float64),
+        points=xyz,
+        colors=colors,
+        errors_px=np.array([point.error for point in points], np.float64),
         track_points=point,
         track_photos=photo,
         track_pixels=pixels,
@@ -323,19 +263,11 @@ def model_arrays(model: pycolmap.Reconstruction, *, metric: bool) -> SceneArrays
     )
 
 
-# COLMAP's sparse model on disk, as a scene and as points with cameras.
-
-MIN_CONFIRMED_POINTS = 100
-"""Points seen by three or more photos from which on their bounding box limits the scene."""
+# The model on disk.
 
 
 def read_model(model_dir: Path, frame: Similarity | None = None) -> pycolmap.Reconstruction:
-    """Read a model on disk.
-
-    Args:
-        model_dir: COLMAP's model.
-        frame: from its frame into the one that is wanted; None for its own.
-    """
+    """Read a model on disk, and move it by a similarity, if one is given."""
     with translate_errors("reading the sparse model"):
         model = pycolmap.Reconstruction(model_dir)
         if frame is not None:
@@ -346,23 +278,23 @@ def read_model(model_dir: Path, frame: Similarity | None = None) -> pycolmap.Rec
 def sparse_model(model_dir: Path) -> Model:
     """Return the colored points of a model on disk, and its posed photos as frusta, in order of ids.
 
-    No third photo confirms points that only two photos see. Wrong ones among them lie far away and would shrink the
-    scene to a dot in a viewer, so points outside the bounding box of the confirmed points are left out.
+    No third photo confirms points that only two photos see. Wrong points among these are far away, and would shrink the
+    scene to a dot in a viewer. So points outside the bounding box of the confirmed points are left out, if a hundred or
+    more are confirmed.
 
     Raises:
         BackendError: it cannot be read.
     """
     model = read_model(model_dir)
-    found = [model.points3D[key] for key in sorted(model.points3D) if finite_mask(model.points3D[key].xyz)]
-    places = np.array([point.xyz for point in found], np.float64).reshape(-1, 3)
-    colors = np.array([point.color for point in found], np.uint8).reshape(-1, 3)
-    confirmed = np.array([point.track.length() > 2 for point in found], bool)
-    if np.count_nonzero(confirmed) >= MIN_CONFIRMED_POINTS:
-        low, high = places[confirmed].min(axis=0), places[confirmed].max(axis=0)
-        inside = ((places >= low) & (places <= high)).all(axis=1)
-        places, colors = places[inside], colors[inside]
+    points = finite_points(model)
+    xyz, colors = point_arrays(points)
+    confirmed = np.array([point.track.length() > 2 for point in points], bool)
+    if np.count_nonzero(confirmed) >= 100:
+        low, high = xyz[confirmed].min(axis=0), xyz[confirmed].max(axis=0)
+        inside = ((xyz >= low) & (xyz <= high)).all(axis=1)
+        xyz, colors = xyz[inside], colors[inside]
     cameras = tuple(_frustum(image, model.cameras[image.camera_id]) for image in posed_images(model))
-    return Model(Surface(places, np.zeros((0, 3), np.int64), colors), cameras=cameras)
+    return Model(Surface(xyz, np.zeros((0, 3), np.int64), colors), cameras=cameras)
 
 
 def _frustum(image: pycolmap.Image, camera: pycolmap.Camera) -> Frustum:
@@ -383,11 +315,11 @@ class RefinedCamera(TypedDict, total=False):
 def read_scene(
     model_dir: Path, names: Mapping[str, str], unregistered: Mapping[str, str], refined: Mapping[str, RefinedCamera]
 ) -> Scene:
-    """Read a model on disk as the scene that later stages use.
+    """Read a model on disk as the scene of later stages.
 
     Args:
-        model_dir: COLMAP's model.
-        names, unregistered: the name of its camera, by photo; the reason why it has no pose, by photo.
+        names: name of the camera of each photo.
+        unregistered: why a photo has no pose.
         refined: deviations, determined parameters and correlations, by camera; may lack cameras.
     """
     model = pycolmap.Reconstruction(model_dir)
@@ -413,19 +345,15 @@ def _camera(camera: pycolmap.Camera, refined: RefinedCamera) -> CameraModel:
     return CameraModel(camera.model.name, params, K, camera.width, camera.height, deviations, determined, correlations)
 
 
-CELLS = 8
-"""Cells along each side of a photo whose share with points is its coverage. Chosen by hand."""
-
-
 @dataclass(frozen=True, slots=True)
 class PhotoObservations:
-    """What one photo sees of a model."""
+    """Observations of one photo."""
 
     points: int
     residual_px: float
     """Mean distance between its keypoints and the points that they observe; NaN without any."""
     coverage: float
-    """Share of its cells with a point in them."""
+    """Share of its 8 x 8 cells with a keypoint that observes a point."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -435,7 +363,7 @@ class ModelFigures:
     photos: dict[str, PhotoObservations]
     """By name, of the posed photos."""
     tracks: NDArray[np.int64]
-    """(P,) how many photos see each point."""
+    """(P,) number of photos that see each point."""
     places: NDArray[np.float64]
     """(P, 3) the points."""
 
@@ -443,31 +371,26 @@ class ModelFigures:
 def model_figures(model_dir: Path) -> ModelFigures:
     """Return the figures of a model on disk.
 
-    Args:
-        model_dir: COLMAP's model.
-
     Raises:
         BackendError: it cannot be read.
     """
     with translate_errors("reading the sparse model"):
         model = pycolmap.Reconstruction(model_dir)
-        places = {key: np.asarray(point.xyz) for key, point in model.points3D.items()}
-        photos = {image.name: _observe(image, model.cameras[image.camera_id], places) for image in posed_images(model)}
-        keys = [key for key in sorted(places) if finite_mask(places[key])]
+        xyz = {key: np.asarray(point.xyz) for key, point in model.points3D.items()}
+        photos = {image.name: _observe(image, model.cameras[image.camera_id], xyz) for image in posed_images(model)}
+        keys = [key for key in sorted(xyz) if finite_mask(xyz[key])]
         tracks = np.array([model.points3D[key].track.length() for key in keys], np.int64)
-    return ModelFigures(photos, tracks, np.array([places[key] for key in keys]).reshape(-1, 3))
+    return ModelFigures(photos, tracks, np.array([xyz[key] for key in keys]).reshape(-1, 3))
 
 
-def _observe(
-    image: pycolmap.Image, camera: pycolmap.Camera, places: dict[int, NDArray[np.float64]]
-) -> PhotoObservations:
-    seen = image.get_observation_points2D()
-    if not seen:
+def _observe(image: pycolmap.Image, camera: pycolmap.Camera, xyz: dict[int, NDArray[np.float64]]) -> PhotoObservations:
+    keypoints = image.get_observation_points2D()
+    if not keypoints:
         return PhotoObservations(0, float("nan"), 0.0)
-    pixels = np.array([point.xy for point in seen], np.float64)
+    pixels = np.array([point.xy for point in keypoints], np.float64)
     pose = image.cam_from_world().matrix()
-    local = np.array([places[point.point3D_id] for point in seen]) @ pose[:, :3].T + pose[:, 3]
+    local = np.array([xyz[point.point3D_id] for point in keypoints]) @ pose[:, :3].T + pose[:, 3]
     off = np.linalg.norm(np.asarray(camera.img_from_cam(local), np.float64) - pixels, axis=1)
-    cells = np.clip(pixels / (camera.width, camera.height) * CELLS, 0, CELLS - 1).astype(np.int64)
-    coverage = len(np.unique(cells[:, 1] * CELLS + cells[:, 0])) / CELLS**2
-    return PhotoObservations(len(seen), float(np.nanmean(off)), coverage)
+    cells = np.clip(pixels / (camera.width, camera.height) * 8, 0, 7).astype(np.int64)
+    coverage = len(np.unique(cells, axis=0)) / 8**2
+    return PhotoObservations(len(keypoints), float(np.nanmean(off)), coverage)

@@ -1,4 +1,4 @@
-"""Undistorted perspective photos of wide ones, larger ones, and Bundler's files."""
+"""Undistorted perspective photos for export and refinement: their model, larger ones, and Bundler's file."""
 
 import shutil
 import threading
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sfm_app.camera.perspective_views import PerspectiveView, center_view
 from sfm_app.camera.projection import FX
 from sfm_app.colmap.backend import check_written, pycolmap, translate_errors
-from sfm_app.colmap.model import finite_mask, posed_images
+from sfm_app.colmap.model import finite_points, point_arrays, posed_images
 from sfm_app.colmap.wide_views import WideLens, add_view_cameras, parse_view_name, perspective_lenses, render_views
 from sfm_app.colmap.worker_process import UndistortTask, run_worker
 from sfm_app.operating_system import replace_file
@@ -21,11 +21,6 @@ from sfm_app.progress import Progress
 from sfm_app.stereo import View
 from sfm_app.types.arrays import FloatArray
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
-
-# The model of undistorted photos at full size: every keypoint where it was found, seen through a pinhole.
-
-FULL_SIZE = 65_000
-"""Longest side of a view in pixels, which no photo has: what JPEG can hold, rounded down."""
 
 ViewNames = Mapping[str, Sequence[str]]
 """Names of the views of each photo, by its name."""
@@ -35,23 +30,17 @@ def full_size_lenses(model: pycolmap.Reconstruction, *, centered: bool) -> dict[
     """Return the views of every camera at full size, by its id.
 
     Args:
-        model: COLMAP's reconstruction.
-        centered: whether the optical center of every view is in its middle, and its pixels are square.
+        centered: whether every view has square pixels and its optical center in the middle.
     """
     with translate_errors("undistorting the cameras"):
-        lenses = perspective_lenses(model, FULL_SIZE)
+        lenses = perspective_lenses(model, 65_000)  # pixels: what JPEG can hold, rounded down
     if not centered:
         return lenses
     return {key: replace(lens, views=tuple(map(center_view, lens.views))) for key, lens in lenses.items()}
 
 
 class PixelMaps:
-    """Which pixels of a photo its views show, by camera; those of the camera asked for last are kept for its photos.
-
-    Args:
-        model: COLMAP's reconstruction.
-        lenses: views by id of the camera.
-    """
+    """Pixels of a photo that its views show, by camera; those of the last camera are kept for its other photos."""
 
     def __init__(self, model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens]) -> None:
         self._model, self._lenses, self._lock = model, lenses, threading.Lock()
@@ -70,20 +59,14 @@ class PixelMaps:
         def project(rays: FloatArray) -> FloatArray:
             return np.nan_to_num(np.asarray(camera.img_from_cam(rays), np.float64), nan=-1.0)
 
-        # COLMAP is many times faster, but does not know where a wide lens ends
+        # COLMAP is many times faster, but does not know the border of a wide lens
         return [view.locate(project if len(lens.views) == 1 else lens.locate) for view in lens.views]
 
 
 def perspective_photos(
     model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames
 ) -> tuple[PerspectivePhoto, ...]:
-    """Return the views of all posed photos, by name of the photo.
-
-    Args:
-        model: COLMAP's reconstruction.
-        lenses: views by id of the camera.
-        names: of the views.
-    """
+    """Return the views of all posed photos, by name of the photo."""
     return tuple(
         PerspectivePhoto(name, image.name, view.K, view.width, view.height, view.R @ image.cam_from_world().matrix())
         for image in sorted(posed_images(model), key=lambda image: image.name)
@@ -95,40 +78,26 @@ def write_view_model(
     model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames, folder: Path, *,
     text: bool = False,
 ) -> None:  # fmt: skip
-    """Write COLMAP's model of the views.
-
-    Args:
-        model: COLMAP's reconstruction of the photos.
-        lenses: views by id of the camera.
-        names: of the views.
-        folder: created.
-        text: whether as text instead of binary.
-    """
+    """Write COLMAP's model of the views into a new or existing folder, as text or binary."""
     folder.mkdir(parents=True, exist_ok=True)
     with translate_errors("writing the model of undistorted photos"):
-        found = make_view_model(model, lenses, names)
-        found.write_text(folder) if text else found.write(folder)
+        view_model = make_view_model(model, lenses, names)
+        view_model.write_text(folder) if text else view_model.write(folder)
     check_written(*folder.iterdir())
 
 
 def make_view_model(
     model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames
 ) -> pycolmap.Reconstruction:
-    """Return the model of the views; points keep their ids, and those that no view shows are left out.
-
-    Args:
-        model: COLMAP's reconstruction of the photos.
-        lenses: views by id of the camera.
-        names: of the views.
-    """
-    found = pycolmap.Reconstruction()
-    cameras = add_view_cameras(found, lenses)
+    """Return the model of the views; points keep their ids, and points that no view shows are left out."""
+    view_model = pycolmap.Reconstruction()
+    cameras = add_view_cameras(view_model, lenses)
     tracks = {point: pycolmap.Track() for point in sorted(model.points3D)}
     for image in sorted(posed_images(model), key=lambda image: image.name):
         points, rays = tracked_rays(model, image)
         for number, view in enumerate(lenses[image.camera_id].views):
             x, shown = project_rays(rays, view)
-            image_id = found.num_images() + 1
+            image_id = view_model.num_images() + 1
             for index, row in enumerate(shown):
                 tracks[points[row]].add_element(image_id, index)
             camera_id = cameras[image.camera_id, number]
@@ -136,22 +105,17 @@ def make_view_model(
                 name=names[image.name][number], keypoints=x[shown], camera_id=camera_id, image_id=image_id
             )
             pose = pycolmap.Rigid3d(view.R @ image.cam_from_world().matrix())
-            found.add_image_with_trivial_frame(added, pose)
+            view_model.add_image_with_trivial_frame(added, pose)
     for point_id, track in tracks.items():
         if track.length():
             old = model.points3D[point_id]
-            found.add_point3D_with_id(point_id, pycolmap.Point3D(xyz=old.xyz, color=old.color, track=track))
-    found.update_point_3d_errors()
-    return found
+            view_model.add_point3D_with_id(point_id, pycolmap.Point3D(xyz=old.xyz, color=old.color, track=track))
+    view_model.update_point_3d_errors()
+    return view_model
 
 
 def tracked_rays(model: pycolmap.Reconstruction, image: pycolmap.Image) -> tuple[list[int], FloatArray]:
-    """Return the points that a photo sees, by id, and the rays (N, 3) of their keypoints in its frame.
-
-    Args:
-        model: COLMAP's reconstruction.
-        image: posed photo.
-    """
+    """Return the ids of the points of a photo, and the rays (N, 3) of their keypoints in its frame."""
     tracked = [point for point in image.points2D if point.has_point3D()]
     x = np.array([point.xy for point in tracked], np.float64).reshape(-1, 2)
     rays = np.asarray(model.cameras[image.camera_id].cam_ray_from_img(x), np.float64).reshape(-1, 3)
@@ -159,40 +123,26 @@ def tracked_rays(model: pycolmap.Reconstruction, image: pycolmap.Image) -> tuple
 
 
 def project_rays(rays: FloatArray, view: PerspectiveView) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Return the pixels (N, 2) of rays in a view, and which rows are inside of it.
-
-    Args:
-        rays: (N, 3) in the photo's frame.
-        view: the view.
-    """
-    at = rays @ view.R.T @ view.K.T
+    """Return the pixels in a view (N, 2) of rays (N, 3) of the photo's frame, and the rows inside of the view."""
+    projected = rays @ view.R.T @ view.K.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        x = at[:, :2] / at[:, 2:]
-    return x, np.flatnonzero((at[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1))
+        x = projected[:, :2] / projected[:, 2:]
+    return x, np.flatnonzero((projected[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1))
 
 
 def all_points(model: pycolmap.Reconstruction) -> PointCloud:
     """Return the finite points of a model, in order of ids."""
-    found = [model.points3D[key] for key in sorted(model.points3D) if finite_mask(model.points3D[key].xyz)]
-    return PointCloud(
-        np.array([point.xyz for point in found], np.float64).reshape(-1, 3),
-        np.array([point.color for point in found], np.uint8).reshape(-1, 3),
-    )
+    return PointCloud(*point_arrays(finite_points(model)))
 
-
-# The undistorted photos of a dense workspace once more at another size, straight from the originals.
 
 LargerView = tuple[str, NDArray[np.float64], NDArray[np.uint8], NDArray[np.bool_]]
-"""Name of a view, its K (3, 3) in pixels, its gray levels (H, W), and which of its pixels may be used (H, W)."""
+"""Name of a view, its K (3, 3) in pixels, its gray levels (H, W), and the mask (H, W) of usable pixels."""
 
 
 class LargerViews:
-    """Undistorts photos again, as the dense workspace has them, but at another size.
+    """Undistorts the photos of a dense workspace again, at another size.
 
     Args:
-        model_dir: COLMAP model of the photos.
-        photo_dir: the photos.
-        mask_dir: their masks; None without masks.
         views: of the dense workspace; photos without any are left out.
         max_side_px: longest side of a view; none is larger than its photo.
 
@@ -206,14 +156,12 @@ class LargerViews:
         self._photo_dir, self._mask_dir = photo_dir, mask_dir
         with translate_errors("reading the model"):
             model = pycolmap.Reconstruction(model_dir)
-            lenses, images = (
-                perspective_lenses(model, max_side_px),
-                {image.name: image for image in posed_images(model)},
-            )
+            lenses = perspective_lenses(model, max_side_px)
+            images = {image.name: image for image in posed_images(model)}
         parts: dict[int, dict[int, PerspectiveView]] = {}
         self._camera, self._numbers = dict[str, int](), dict[str, dict[int, str]]()
         for view in views:
-            # a photo that one view is enough for has its own name
+            # a single view has the name of its photo
             name, number = (view.name, 0) if view.name in images else parse_view_name(view.name)
             image = images[name]
             R = view.R @ image.cam_from_world().matrix()[:, :3].T
@@ -221,7 +169,7 @@ class LargerViews:
             parts.setdefault(image.camera_id, {}).setdefault(number, _resize(view, R, focal_px, max_side_px))
             self._camera[name] = image.camera_id
             self._numbers.setdefault(name, {})[number] = view.name
-        self._order = {key: sorted(found) for key, found in parts.items()}
+        self._order = {key: sorted(numbers) for key, numbers in parts.items()}
         self._lenses = {
             key: replace(lenses[key], views=tuple(parts[key][k] for k in order)) for key, order in self._order.items()
         }
@@ -240,7 +188,7 @@ class LargerViews:
         """
         camera_id, names = self._camera[photo], self._numbers[photo]
         lens, maps = self._lenses[camera_id], self._maps.camera_maps(camera_id)
-        with translate_errors(f"looking into {photo}"):
+        with translate_errors(f"reading {photo}"):
             pictures = render_views(photo, lens, self._photo_dir, self._mask_dir, maps)
             for number, view, (pixels, shown) in zip(self._order[camera_id], lens.views, pictures, strict=True):
                 if number in names:
@@ -249,29 +197,18 @@ class LargerViews:
 
 
 def _resize(view: View, R: NDArray[np.float64], focal_px: float, max_side_px: int) -> PerspectiveView:
-    """Return a view in the resolution of its photo, or smaller where its longest side would be too large."""
+    """Return a view in the resolution of its photo, or smaller if its longest side is limited."""
     scale = min(max_side_px / max(view.width, view.height), focal_px / float(view.K[0, 0]))
     width, height = max(1, round(scale * view.width)), max(1, round(scale * view.height))
     K = np.diag([width / view.width, height / view.height, 1.0]) @ view.K
     return PerspectiveView(R, np.asarray(K, np.float64), width, height)
 
 
-# Bundler's file, which COLMAP writes along with undistorted photos for PMVS.
-
-BUNDLE = "pmvs/bundle.rd.out"
-ANY_SIZE = -1
-"""COLMAP's number for photos of any size."""
-
-
 def write_bundle(model_dir: Path, photo_dir: Path, file: Path, workers: int, progress: Progress) -> None:
-    """Write the cameras, poses and points of a model for Bundler.
+    """Write the cameras, poses and points of a model for Bundler; COLMAP also writes photos, which are thrown away.
 
     Args:
-        model_dir: COLMAP's model, of one focal per camera and with optical centers in the middle.
-        photo_dir: its photos; COLMAP writes them again, and they are thrown away.
-        file: file to write.
-        workers: threads.
-        progress: shows a bar.
+        model_dir: COLMAP's model, with one focal per camera and optical centers in the middle.
 
     Raises:
         BackendError: COLMAP cannot read the model or the photos, or cannot write.
@@ -280,14 +217,15 @@ def write_bundle(model_dir: Path, photo_dir: Path, file: Path, workers: int, pro
     try:
         scratch.mkdir()
         task: UndistortTask = {
+            "do": "undistort",
             "dense": str(scratch),
             "model": str(model_dir),
             "photos": str(photo_dir),
-            "max_side_px": ANY_SIZE,
+            "max_side_px": -1,  # any size
             "workers": workers,
             "output": "PMVS",
         }
-        run_worker("sfm_app.colmap.undistort_process", task, "writing Bundler's file", progress)
-        replace_file(scratch / BUNDLE, file)
+        run_worker(task, "writing Bundler's file", progress)
+        replace_file(scratch / "pmvs/bundle.rd.out", file)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)

@@ -12,26 +12,15 @@ from sfm_app.colmap.worker_process import FuseTask, PoissonTask, SimplifyTask, r
 from sfm_app.types import Surface
 
 FUSED = "fused.ply"
-MIN_DEPTH = 5
-"""Smallest depth of Poisson's octree: with less, small surfaces become too coarse."""
 
 
-def fuse(
-    dense_dir: Path,
-    min_views: int,
-    box: NDArray[np.float64],
-    target: Path,
-    cache_gb: float = 0.0,
-) -> None:
+def fuse(dense_dir: Path, min_views: int, box: NDArray[np.float64], target: Path, cache_gb: float = 0.0) -> None:
     """Fuse the geometric maps of a dense workspace into the PLY file `target`.
 
     Args:
-        dense_dir: dense workspace; `dense.write_fusion_views` has listed the views that have maps.
-        min_views: smallest number of photos that see a point.
-        box: (2, 3) lowest and highest coordinates that are kept.
-        target: PLY file, in any folder.
-        cache_gb: memory for depth and normal maps; with less, they are read more often. 0: all are held, which takes
-            half the time.
+        dense_dir: dense workspace; `dense.write_fusion_views` has listed the views with maps.
+        box: (2, 3) lowest and highest coordinates of points.
+        cache_gb: memory for depth and normal maps; with less, they are read more often. 0 holds all, in half the time.
     """
     task: FuseTask = {
         "do": "fuse",
@@ -41,12 +30,12 @@ def fuse(
         "box": box.tolist(),
         "cache_gb": cache_gb,
     }
-    run_worker("sfm_app.colmap.surface_process", task, "fusing depth maps")
-    target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # which photos see which point; not used
+    run_worker(task, "fusing depth maps")
+    target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # photos of each point; not used
 
 
 def open_points(path: Path) -> NDArray[np.void]:
-    """Return the records (N,) of COLMAP's points with their fields x, y, z, nx, ..., read from the file as needed.
+    """Return the records (N,) of COLMAP's points, with fields x, y, z, nx, ..., mapped from the file.
 
     Raises:
         BackendError: it is no binary PLY file of points.
@@ -55,7 +44,7 @@ def open_points(path: Path) -> NDArray[np.void]:
         count, fields = -1, list[tuple[str, str]]()
         while (words := file.readline().split()) != [b"end_header"]:
             if not words:
-                raise ValueError(f"{path} has no end of its header")
+                raise ValueError(f"the header of {path} has no end")
             if words[:2] == [b"element", b"vertex"]:
                 count = int(words[2])
             elif words[0] == b"property":
@@ -67,12 +56,7 @@ def open_points(path: Path) -> NDArray[np.void]:
 
 
 def write_points(records: NDArray[np.void], path: Path) -> None:
-    """Write records with the fields of `open_points` as a PLY file.
-
-    Args:
-        records: (N,).
-        path: of the file.
-    """
+    """Write records (N,) with the fields of `open_points` as a PLY file."""
     with path.open("wb") as file:
         file.write(_header(records.dtype, len(records)))
         file.write(np.ascontiguousarray(records).tobytes())
@@ -81,18 +65,13 @@ def write_points(records: NDArray[np.void], path: Path) -> None:
 def _header(fields: np.dtype[np.void], count: int) -> bytes:
     """Return the header of a PLY file of points."""
     kinds = {"f": "float", "u": "uchar"}
-    said = [f"property {kinds[kind[0].kind]} {name}" for name, kind in (fields.fields or {}).items()]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *said, "end_header", ""]
+    properties = [f"property {kinds[kind[0].kind]} {name}" for name, kind in (fields.fields or {}).items()]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header", ""]
     return "\n".join(lines).encode("ascii")
 
 
 def join_points(parts: Sequence[Path], target: Path) -> None:
-    """Write the points of several files into one, without holding them all.
-
-    Args:
-        parts: files with the same fields, at least one.
-        target: PLY file.
-    """
+    """Write the points of several files with the same fields into one, without holding them all."""
     records = [open_points(path) for path in parts]
     with target.open("wb") as file:
         file.write(_header(records[0].dtype, sum(map(len, records))))
@@ -106,23 +85,22 @@ def positions(records: NDArray[np.void]) -> NDArray[np.float64]:
 
 
 def poisson_surface(folder: Path, depth: int) -> Surface:
-    """Return Poisson's closed surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points.
+    """Return Poisson's closed surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points of a folder.
 
     It has no colors of its own: all vertices have the same.
 
     Args:
-        folder: folder with the fused points.
-        depth: depth of the octree, raised to the smallest one; the finest cell is the largest extent of the points
-            over 2^depth.
+        depth: depth of the octree, raised to 5, with which small surfaces become fine enough; the finest cell is the
+            largest extent of the points over 2^depth.
     """
     path = folder / "poisson.ply"
     task: PoissonTask = {
         "do": "poisson",
         "points": str(folder / FUSED),
         "target": str(path),
-        "depth": max(depth, MIN_DEPTH),
+        "depth": max(depth, 5),
     }
-    run_worker("sfm_app.colmap.surface_process", task, "finding the surface")
+    run_worker(task, "finding the surface")
     surface = _read(path)
     path.unlink()
     return surface
@@ -135,39 +113,36 @@ def simplify(surface: Surface, most: int, max_error: float, scratch: Path, threa
 
     Args:
         surface: a manifold; its borders are kept.
-        most: triangles that may be left, >= 1.
-        max_error: edges go on being collapsed up to this root of the summed squared distances of a vertex from the
-            planes it replaces; 0: no more than `most` asks for.
+        most: largest number of triangles, >= 1.
+        max_error: edges go on collapsing up to this root of the summed squared distances of a vertex from the planes it
+            replaces; 0: no further than to `most`.
         scratch: folder for two temporary files.
-        threads: number of threads; the surface is the same for any.
+        threads: the surface is the same for any number.
     """
-    given, found = scratch / "fine.ply", scratch / "coarse.ply"
-    trimesh.Trimesh(surface.vertices, surface.faces, process=False).export(given)
+    fine, coarse = scratch / "fine.ply", scratch / "coarse.ply"
+    trimesh.Trimesh(surface.vertices, surface.faces, process=False).export(fine)
     task: SimplifyTask = {
         "do": "simplify",
-        "mesh": str(given),
-        "target": str(found),
+        "mesh": str(fine),
+        "target": str(coarse),
         "most": most,
         "max_error": max_error,
         "threads": threads,
     }
-    run_worker("sfm_app.colmap.surface_process", task, "simplifying the surface")
-    simple = _read(found)
-    given.unlink()
-    found.unlink()
+    run_worker(task, "simplifying the surface")
+    simple = _read(coarse)
+    fine.unlink()
+    coarse.unlink()
     return Surface(simple.vertices, simple.faces, _mean_colors(surface, simple.vertices, threads))
 
 
 def _mean_colors(surface: Surface, vertices: NDArray[np.float64], threads: int) -> NDArray[np.uint8]:
-    """Return (V, 3) mean colors of the old vertices whose nearest new vertex (V, 3) is each one.
-
-    They are computed here because pycolmap 4.2 reads no colors.
-    """
+    """Return mean colors (V, 3) of the old vertices nearest to each new vertex (V, 3); pycolmap 4.2 reads no colors."""
     from scipy.spatial import cKDTree
 
-    _, at = cKDTree(vertices).query(surface.vertices, workers=threads)
-    count = np.bincount(at, minlength=len(vertices))
-    total = np.stack([np.bincount(at, channel, len(vertices)) for channel in surface.colors.T], axis=1)
+    _, nearest = cKDTree(vertices).query(surface.vertices, workers=threads)
+    count = np.bincount(nearest, minlength=len(vertices))
+    total = np.stack([np.bincount(nearest, channel, len(vertices)) for channel in surface.colors.T], axis=1)
     mean = np.rint(total / np.maximum(count, 1)[:, None]).astype(np.uint8)
     alone = np.flatnonzero(count == 0)
     mean[alone] = surface.colors[cKDTree(surface.vertices).query(vertices[alone])[1]]

@@ -1,4 +1,4 @@
-"""Photos of wide lenses in COLMAP's dense workspace: as several perspective views where one would lose too much."""
+"""Photos of wide lenses in COLMAP's dense workspace, as several perspective views if one would lose too much."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,23 +10,14 @@ from numpy.typing import NDArray
 
 from sfm_app.camera.perspective_views import PerspectiveView, cover_rays
 from sfm_app.camera.projection import FISHEYE, FX, PANORAMA, SEEN_ANGLE, image_points
-from sfm_app.colmap.backend import pycolmap, translate_errors
+from sfm_app.colmap.backend import all_images, pycolmap, translate_errors
 from sfm_app.colmap.bundle import camera_family, read_camera
 from sfm_app.colmap.dense import MASKS, shrink_mask
-from sfm_app.colmap.types import all_images
-from sfm_app.colmap.undistort_process import JPEG_QUALITY
+from sfm_app.colmap.tasks import JPEG_QUALITY
 from sfm_app.files import replace_atomically
 from sfm_app.photos import read_mask, save_mask
 from sfm_app.photos.panoramas import resample, shrink
 from sfm_app.types.arrays import BoolArray, FloatArray
-
-MOST_LOST = 0.1
-"""Largest share of a photo that one undistorted photo may lose. By definition."""
-GRID = 257
-"""Rows and columns of pixels of a photo whose rays are looked at. Chosen by hand; not measured on its own."""
-AGREE_PX = 0.5
-"""Largest distance between a pixel and its ray's projection, in pixels: where it is larger, the lens shows nothing or
-folds. Chosen by hand; not measured on its own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +25,7 @@ class WideLens:
     """A camera, with the perspective views that show its photos."""
 
     params: FloatArray
-    """(12,) as in `geometry.lenses.projections`."""
+    """(12,) as in `camera.projection`."""
     family: int
     size: tuple[int, int]
     """(width, height) of its photos."""
@@ -43,11 +34,7 @@ class WideLens:
     views: tuple[PerspectiveView, ...]
 
     def locate(self, rays: FloatArray) -> FloatArray:
-        """Return the pixels (N, 2) of rays; -1 for those that the photos do not show.
-
-        Args:
-            rays: (N, 3) in the camera's frame.
-        """
+        """Return the pixels (N, 2) of rays (N, 3) of the camera's frame; -1 for rays that the photos do not show."""
         with np.errstate(divide="ignore", invalid="ignore"):
             x = image_points(rays, np.tile(self.params, (len(rays), 1)), np.full(len(rays), self.family))
             shown = rays[:, 2] >= self.least_cosine * np.linalg.norm(rays, axis=1)
@@ -56,12 +43,7 @@ class WideLens:
 
 
 def split_wide_photos(model_dir: Path, max_side_px: int) -> dict[int, WideLens] | None:
-    """Return the perspective views of every camera, by its id; None where no camera needs more than COLMAP's one.
-
-    Args:
-        model_dir: COLMAP model.
-        max_side_px: longest side of a view.
-    """
+    """Return the perspective views of every camera, by its id; None if COLMAP's single view is enough for each."""
     with translate_errors("reading the model"):
         model = pycolmap.Reconstruction(model_dir)
         if all(view is not None for view in _single_views(model, max_side_px).values()):
@@ -70,29 +52,19 @@ def split_wide_photos(model_dir: Path, max_side_px: int) -> dict[int, WideLens] 
 
 
 def perspective_lenses(model: pycolmap.Reconstruction, max_side_px: int) -> dict[int, WideLens]:
-    """Return the perspective views of every camera that has posed photos, one where that is enough, by its id.
-
-    Args:
-        model: COLMAP's reconstruction.
-        max_side_px: longest side of a view.
-    """
+    """Return the perspective views of every camera with posed photos, by its id; one view where that is enough."""
     single = _single_views(model, max_side_px)
     return {key: _make_lens(model.cameras[key], view, max_side_px) for key, view in single.items()}
 
 
 def _single_views(model: pycolmap.Reconstruction, max_side_px: int) -> dict[int, PerspectiveView | None]:
-    """Return the undistorted photo of every camera in use, by its id; None where one loses too much."""
+    """Return the single view of every camera with posed photos, by its id; None where one loses too much."""
     used = sorted({image.camera_id for image in all_images(model) if image.has_pose})
     return {camera_id: _one_view(model.cameras[camera_id], max_side_px) for camera_id in used}
 
 
 def view_name(photo: str, number: int) -> str:
-    """Return the name of a view in the dense workspace.
-
-    Args:
-        photo: name of the photo.
-        number: of the view in `WideLens.views`.
-    """
+    """Return the name of a view in the dense workspace; its number is that in `WideLens.views`."""
     return f"{photo}.{number + 1}.jpg"
 
 
@@ -103,43 +75,31 @@ def parse_view_name(name: str) -> tuple[str, int]:
 
 
 def write_model(model_dir: Path, lenses: Mapping[int, WideLens], dense_dir: Path) -> list[tuple[str, int]]:
-    """Write the model of all views into a dense workspace, and return the name and the camera's id of each photo.
-
-    Args:
-        model_dir: COLMAP model of the photos.
-        lenses: from `split_wide_photos`.
-        dense_dir: dense workspace.
-    """
+    """Write the model of all views into a dense workspace; return the name and the camera's id of each photo."""
     with translate_errors("writing the model of perspective views"):
-        model, found = pycolmap.Reconstruction(model_dir), pycolmap.Reconstruction()
+        model, view_model = pycolmap.Reconstruction(model_dir), pycolmap.Reconstruction()
         images = sorted((image for image in all_images(model) if image.has_pose), key=lambda image: image.name)
-        ids = add_view_cameras(found, lenses)
+        ids = add_view_cameras(view_model, lenses)
         tracks = {point: pycolmap.Track() for point in sorted(model.points3D)}
         for image in images:
-            for number, view in enumerate(lenses[image.camera_id].views):
-                _add_view(found, model, image, view, (ids[image.camera_id, number], number), tracks)
+            lens = lenses[image.camera_id]
+            for number in range(len(lens.views)):
+                _add_view(view_model, model, image, lens, number, ids[image.camera_id, number], tracks)
         for point, track in tracks.items():
             if track.length():
-                found.add_point3D(model.points3D[point].xyz, track, model.points3D[point].color)
+                view_model.add_point3D(model.points3D[point].xyz, track, model.points3D[point].color)
         (dense_dir / "sparse").mkdir(parents=True, exist_ok=True)
-        found.write(dense_dir / "sparse")
+        view_model.write(dense_dir / "sparse")
         return [(image.name, image.camera_id) for image in images]
 
 
 def write_views(name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | None, dense_dir: Path) -> None:
-    """Write the views of a photo, and their masks where they have pixels that it does not show or that are masked.
-
-    Args:
-        name: of the photo.
-        lens: of the photo.
-        photo_dir: the photos.
-        mask_dir: their masks; None without masks.
-        dense_dir: dense workspace.
+    """Write the views of a photo, and masks of views with pixels that it does not show or that are masked.
 
     Raises:
         BackendError: the photo cannot be read, or the views cannot be written.
     """
-    with translate_errors(f"looking into {name}"):
+    with translate_errors(f"reading {name}"):
         for number, (pixels, shown) in enumerate(render_views(name, lens, photo_dir, mask_dir)):
             save_picture(dense_dir / "images" / view_name(name, number), pixels)
             if not shown.all():
@@ -149,40 +109,31 @@ def write_views(name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | Non
 def render_views(
     name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | None, maps: Sequence[NDArray[np.float32]] = ()
 ) -> Iterator[tuple[NDArray[np.uint8], BoolArray]]:
-    """Yield each view of a photo, (H, W, 3) BGR, and (H, W) which of its pixels the photo shows and nothing masks.
+    """Yield each view of a photo, (H, W, 3) BGR, and the mask (H, W) of pixels that it shows and nothing masks.
 
     Args:
-        name: of the photo.
-        lens: of the photo.
-        photo_dir: the photos.
-        mask_dir: their masks; None without masks.
         maps: (H, W, 2) pixels of the photo that each view shows, -1 where it shows none; empty if not known.
     """
     photo = np.asarray(cv2.imdecode(np.fromfile(photo_dir / name, np.uint8), cv2.IMREAD_COLOR), np.uint8)
     used = None if mask_dir is None else read_mask(mask_dir, name)
     for number, view in enumerate(lens.views):
-        at = maps[number] if maps else view.locate(lens.locate)
-        shown = at[..., 0] >= 0.0
+        pixels = maps[number] if maps else view.locate(lens.locate)
+        shown = pixels[..., 0] >= 0.0
         small = shrink(photo, view.K[0, 0] / lens.params[FX])
         if used is not None:
-            row, column = (np.minimum(at[..., axis].astype(np.int64), lens.size[axis] - 1) for axis in (1, 0))
+            row, column = (np.minimum(pixels[..., axis].astype(np.int64), lens.size[axis] - 1) for axis in (1, 0))
             shown &= used[row, column]
-        yield resample(small, at, lens.size, wraps=lens.family == PANORAMA), shown
+        yield resample(small, pixels, lens.size, wraps=lens.family == PANORAMA), shown
 
 
 def save_picture(target: Path, pixels: NDArray[np.uint8]) -> None:
-    """Write a picture as JPEG, as a whole or not at all.
-
-    Args:
-        target: file; its folder is created.
-        pixels: (H, W, 3) BGR.
-    """
+    """Write a picture (H, W, 3) BGR as JPEG, as a whole or not at all; its folder is created."""
     with replace_atomically(target) as path:
         path.write_bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes())
 
 
 def _one_view(camera: pycolmap.Camera, max_side_px: int) -> PerspectiveView | None:
-    """Return the undistorted photo of a camera as COLMAP makes it; None where that loses too much of it."""
+    """Return COLMAP's undistorted photo of a camera; None if it loses more than a tenth of the photo."""
     rays = _shown_rays(camera)
     if camera_family(camera) == PANORAMA or not len(rays):
         return None
@@ -192,12 +143,12 @@ def _one_view(camera: pycolmap.Camera, max_side_px: int) -> PerspectiveView | No
     view = PerspectiveView(np.eye(3), np.array(flat.calibration_matrix()), flat.width, flat.height)
     with np.errstate(divide="ignore", invalid="ignore"):
         x = (rays @ view.K.T)[:, :2] / rays[:, 2:]
-    kept = (rays[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1)
-    return view if np.mean(kept) >= 1.0 - MOST_LOST else None
+    inside = (rays[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1)
+    return view if np.mean(inside) >= 1.0 - 0.1 else None
 
 
 def _make_lens(camera: pycolmap.Camera, single: PerspectiveView | None, max_side_px: int) -> WideLens:
-    """Return a camera with the views that show its photos: the only one, or several."""
+    """Return a camera with the views of its photos: the single one, or several."""
     rays, params = _shown_rays(camera), read_camera(camera)
     views = [single] if single is not None else cover_rays(rays, float(params[FX]), max_side_px)
     least = float(rays[:, 2].min())
@@ -206,26 +157,23 @@ def _make_lens(camera: pycolmap.Camera, single: PerspectiveView | None, max_side
 
 def _shown_rays(camera: pycolmap.Camera) -> FloatArray:
     """Return unit vectors (N, 3) of a grid of pixels, without pixels that no ray reaches."""
-    x, y = np.meshgrid(np.linspace(0.0, camera.width, GRID), np.linspace(0.0, camera.height, GRID))
+    grid = 257  # rows and columns of pixels; chosen by hand
+    x, y = np.meshgrid(np.linspace(0.0, camera.width, grid), np.linspace(0.0, camera.height, grid))
     pixels = np.column_stack([x.ravel(), y.ravel()])
     rays, family = np.array(camera.cam_ray_from_img(pixels), np.float64), camera_family(camera)
     with np.errstate(divide="ignore", invalid="ignore"):
-        again = image_points(rays, np.tile(read_camera(camera), (len(rays), 1)), np.full(len(rays), family))
+        projected = image_points(rays, np.tile(read_camera(camera), (len(rays), 1)), np.full(len(rays), family))
+        # if a pixel is far from the projection of its ray, the lens shows nothing or folds (limit chosen by hand);
         # the seam of a panorama is at both of its borders
-        sound = (family == PANORAMA) | (np.linalg.norm(again - pixels, axis=1) < AGREE_PX)
+        sound = (family == PANORAMA) | (np.linalg.norm(projected - pixels, axis=1) < 0.5)
         sound &= np.isfinite(rays).all(axis=1)
         if family == FISHEYE:
             sound &= rays[:, 2] >= np.cos(SEEN_ANGLE)
     return np.asarray(rays[sound], np.float64)
 
 
-def add_view_cameras(found: pycolmap.Reconstruction, lenses: Mapping[int, WideLens]) -> dict[tuple[int, int], int]:
-    """Add a camera for every view, and return its id by the camera of the photo and the number of the view.
-
-    Args:
-        found: model of the views, changed in place.
-        lenses: views by id of the camera.
-    """
+def add_view_cameras(view_model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens]) -> dict[tuple[int, int], int]:
+    """Add a camera for every view, and return its id by the camera of the photo and the number of the view."""
     ids = dict[tuple[int, int], int]()
     for camera_id, lens in sorted(lenses.items()):
         for number, view in enumerate(lens.views):
@@ -235,37 +183,32 @@ def add_view_cameras(found: pycolmap.Reconstruction, lenses: Mapping[int, WideLe
                 camera_id=len(ids), model="PINHOLE", width=view.width, height=view.height,
                 params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
             )  # fmt: skip
-            found.add_camera_with_trivial_rig(camera)
+            view_model.add_camera_with_trivial_rig(camera)
     return ids
 
 
 def _add_view(
-    found: pycolmap.Reconstruction, model: pycolmap.Reconstruction, image: pycolmap.Image, view: PerspectiveView,
-    ids: tuple[int, int], tracks: Mapping[int, pycolmap.Track],
-) -> None:  # fmt: skip
-    """Add a view of a photo, and the points that it shows to their tracks.
-
-    Args:
-        found: model of the views.
-        model: model of the photos.
-        image: the photo.
-        view: the view.
-        ids: id of the view's camera, and the number of the view.
-        tracks: by id of the point in `model`.
-    """
-    camera_id, number = ids
-    pose = image.cam_from_world().matrix()
-    pose = view.R @ pose
+    view_model: pycolmap.Reconstruction,
+    model: pycolmap.Reconstruction,
+    image: pycolmap.Image,
+    lens: WideLens,
+    number: int,
+    camera_id: int,
+    tracks: Mapping[int, pycolmap.Track],
+) -> None:
+    """Add a view of a photo to the model of the views, and its points to their tracks, by id of the point."""
+    view = lens.views[number]
+    pose = view.R @ image.cam_from_world().matrix()
     points = [point.point3D_id for point in image.points2D if point.has_point3D()]
     X = np.array([model.points3D[point].xyz for point in points], np.float64).reshape(-1, 3)
-    at = (X @ pose[:, :3].T + pose[:, 3]) @ view.K.T
+    projected = (X @ pose[:, :3].T + pose[:, 3]) @ view.K.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        x = at[:, :2] / at[:, 2:]
-    shown = np.flatnonzero((at[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1))
-    image_id = found.num_images() + 1
+        x = projected[:, :2] / projected[:, 2:]
+    shown = np.flatnonzero((projected[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1))
+    image_id = view_model.num_images() + 1
     for index, row in enumerate(shown):
         tracks[points[row]].add_element(image_id, index)
     added = pycolmap.Image(
         name=view_name(image.name, number), keypoints=x[shown], camera_id=camera_id, image_id=image_id
     )
-    found.add_image_with_trivial_frame(added, pycolmap.Rigid3d(pose))
+    view_model.add_image_with_trivial_frame(added, pycolmap.Rigid3d(pose))

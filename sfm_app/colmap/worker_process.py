@@ -1,7 +1,7 @@
-"""Separate processes for parts of COLMAP that cannot be stopped, or that may end the process they run in.
+"""Separate processes for COLMAP calls that cannot be stopped, or that may crash.
 
-COLMAP aborts where its database cannot be written, and a decoder may crash on a photo. In a separate process that is an
-error like any other. The process ends with its parent, however that ends, so that nothing goes on writing.
+COLMAP aborts if it cannot write its database, and a decoder may crash on a photo. In a separate process, both are
+ordinary errors. The process ends with its parent, however that ends, so that nothing goes on writing.
 """
 
 import contextlib
@@ -21,7 +21,8 @@ from sfm_app.numerical import Json
 from sfm_app.operating_system import crash_name, end_at_exit, has_run_out, ignore_interrupts, watch_parent
 from sfm_app.progress import Progress, SilentProgress
 
-ENDED_EARLY = 1
+TASKS = "sfm_app.colmap.tasks"
+"""Module of the processes that do the tasks below."""
 REPORT_FD = 3
 """File descriptor for messages of a worker process to its parent."""
 
@@ -32,8 +33,9 @@ Task = TypeVar("Task", bound=Mapping[str, object])
 
 
 class FeatureTask(TypedDict):
-    """Task of `feature_process`, with the arguments of `features.find_and_match`."""
+    """Arguments of `features.find_and_match`."""
 
+    do: Literal["find_and_match"]
     database: str
     photos: str
     masks: str | None
@@ -46,8 +48,9 @@ class FeatureTask(TypedDict):
 
 
 class MatchTask(TypedDict):
-    """Task of `match_process`, with the arguments of `part_databases.match_chunk`."""
+    """Arguments of `features.match_chunk`."""
 
+    do: Literal["match_chunk"]
     snapshot: str
     features: str
     photos: str
@@ -59,7 +62,7 @@ class MatchTask(TypedDict):
 
 
 class MappingTask(TypedDict):
-    """Task of `baseline_mapping`, with the arguments of `mapping.map_with_colmap_defaults`."""
+    """Arguments of a mapper."""
 
     scratch: str
     photos: str
@@ -67,25 +70,33 @@ class MappingTask(TypedDict):
 
 
 class GlobalMappingTask(MappingTask):
-    """Task of `global_mapping`, with the arguments of `mapping.map_globally`."""
+    """Arguments of `mapping.map_globally`."""
 
+    do: Literal["map_globally"]
     names: list[str]
 
 
-class UndistortTask(TypedDict):
-    """Task of `undistort_process`, with the arguments of `dense.undistort`."""
+class DefaultMappingTask(MappingTask):
+    """Arguments of `mapping.map_with_colmap_defaults`."""
 
+    do: Literal["map_with_defaults"]
+
+
+class UndistortTask(TypedDict):
+    """Arguments of `dense.undistort`."""
+
+    do: Literal["undistort"]
     dense: str
     model: str
     photos: str
     max_side_px: int
     workers: int
     output: Literal["COLMAP", "PMVS"]
-    """Layout of the workspace by COLMAP's name."""
+    """COLMAP's name of the layout of the workspace."""
 
 
 class FuseTask(TypedDict):
-    """Task of `surface_process`, with the arguments of `surface.fuse`."""
+    """Arguments of `surface.fuse`."""
 
     do: Literal["fuse"]
     dense: str
@@ -96,7 +107,7 @@ class FuseTask(TypedDict):
 
 
 class PoissonTask(TypedDict):
-    """Task of `surface_process`, with the arguments of `surface.poisson_surface`."""
+    """Arguments of `surface.poisson_surface`."""
 
     do: Literal["poisson"]
     points: str
@@ -105,7 +116,7 @@ class PoissonTask(TypedDict):
 
 
 class SimplifyTask(TypedDict):
-    """Task of `surface_process`, with the arguments of `surface.simplify`."""
+    """Arguments of `surface.simplify`."""
 
     do: Literal["simplify"]
     mesh: str
@@ -118,8 +129,8 @@ class SimplifyTask(TypedDict):
 class WorkerProcess:
     """A running worker process."""
 
-    def __init__(self, process: "subprocess.Popen[str]", said: IO[bytes]) -> None:
-        self.process, self._said = process, said
+    def __init__(self, process: "subprocess.Popen[str]", output: IO[bytes]) -> None:
+        self.process, self._output = process, output
 
     def messages(self) -> Iterator[dict[str, Json]]:
         """Yield the messages of the process, until it ends."""
@@ -128,7 +139,7 @@ class WorkerProcess:
                 yield json.loads(line)
 
     def has_ended(self, wait_s: float) -> bool:
-        """Return whether the process has ended, or ends within that time."""
+        """Return whether the process ends within `wait_s` seconds."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(wait_s)
         return self.process.poll() is not None
@@ -144,38 +155,33 @@ class WorkerProcess:
             return
         if has_run_out(code):
             raise BackendError(
-                f"COLMAP was ended from outside while {doing}: perhaps the memory was full",
+                f"the system killed COLMAP while {doing}, perhaps because memory ran out",
                 hint="run again with --workers 1, or with --quality draft",
             )
-        self._said.seek(0)
-        lines = self._said.read().decode(errors="replace").split("\n")
+        self._output.seek(0)
+        lines = self._output.read().decode(errors="replace").split("\n")
         last = next((line.strip() for line in reversed(lines) if line.strip()), f"it ended with {code}")
         crash = crash_name(code)  # after a crash, the last line of the output is a stack address
-        why = f"it crashed ({crash})" if crash else last
-        raise BackendError(f"COLMAP failed while {doing}: {why}", hint="run again with -v to see what COLMAP says")
+        reason = f"it crashed ({crash})" if crash else last
+        raise BackendError(f"COLMAP failed while {doing}: {reason}", hint="run again with -v to see what COLMAP says")
 
 
 @contextlib.contextmanager
 def start_worker(module: str, task: Mapping[str, object]) -> Iterator[WorkerProcess]:
-    """Start a worker process on a task, and provide it; it is killed at the end of the block if it still runs.
-
-    Args:
-        module: module that calls `serve`.
-        task: task of the process; valid JSON.
-    """
+    """Start a process that runs a module, which calls `serve`, on a task; kill it at the end of the block."""
     command = [sys.executable, "-P", "-m", module]  # -P: nothing is imported from the current folder
-    loud = log_level()
+    level = log_level()
     # the output goes to a file: nothing reads a pipe while the process runs, and a full pipe would block it forever
     with (
-        tempfile.TemporaryFile() as said,
+        tempfile.TemporaryFile() as output,
         subprocess.Popen(  # noqa: S603 - our module
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=None if loud else said, encoding="utf-8"
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=None if level else output, encoding="utf-8"
         ) as process,
     ):
         try:
             with contextlib.suppress(OSError):  # the process has failed already; `check` reports why
-                print(json.dumps({"log_level": loud, "parent": os.getpid(), **task}), file=process.stdin, flush=True)
-            yield WorkerProcess(process, said)
+                print(json.dumps({"log_level": level, "parent": os.getpid(), **task}), file=process.stdin, flush=True)
+            yield WorkerProcess(process, output)
         finally:
             if process.poll() is None:
                 process.kill()
@@ -187,54 +193,46 @@ class ProcessGroup:
     def __init__(self) -> None:
         self._running, self._lock, self._has_ended = set[WorkerProcess](), threading.Lock(), False
 
-    def run(self, module: str, task: Mapping[str, object], doing: str, progress: Progress) -> dict[str, Json]:
-        """Run a worker process to its end or that of the group, as `run_worker` does.
-
-        Args:
-            module, task, doing, progress: as in `run_worker`.
+    def run(self, task: Mapping[str, object], doing: str, progress: Progress) -> dict[str, Json]:
+        """Run a task to its end or that of the group, as `run_worker` does.
 
         Raises:
             BackendError: COLMAP failed, or the group has ended.
         """
-        with start_worker(module, task) as process:
+        with start_worker(TASKS, task) as process:
             with self._lock:
                 self._running.add(process)
                 if self._has_ended:
                     process.process.kill()
             try:
-                found = relay(process, progress)
+                results = relay(process, progress)
                 process.check(doing)
             finally:
                 with self._lock:
                     self._running.discard(process)
-        return found
+        return results
 
     def stop(self) -> None:
-        """Stop all processes, and those that are started from now on."""
+        """Stop all processes, and those that start later."""
         with self._lock:
             self._has_ended = True
             for process in self._running:
                 process.process.kill()
 
 
-def run_worker(
-    module: str, task: Mapping[str, object], doing: str, progress: Progress | None = None
-) -> dict[str, Json]:
-    """Run a worker process to its end, and return what it has reported.
+def run_worker(task: Mapping[str, object], doing: str, progress: Progress | None = None) -> dict[str, Json]:
+    """Run one of COLMAP's tasks in a process, and return its results.
 
     Args:
-        module: module that calls `serve`.
-        task: task of the process; valid JSON.
         doing: description of the work, for error messages.
-        progress: shows the progress of the process.
 
     Raises:
         BackendError: COLMAP failed.
     """
-    with start_worker(module, task) as process:
-        found = relay(process, progress or SilentProgress())
+    with start_worker(TASKS, task) as process:
+        results = relay(process, progress or SilentProgress())
         process.check(doing)
-    return found
+    return results
 
 
 def serve(work: Callable[[Task], None]) -> None:
@@ -249,7 +247,7 @@ def serve(work: Callable[[Task], None]) -> None:
         return
     task = json.loads(line)
     show_log(task["log_level"])
-    watch_parent(task["parent"], lambda: os._exit(ENDED_EARLY))
+    watch_parent(task["parent"], lambda: os._exit(1))
     work(task)
 
 
@@ -259,15 +257,10 @@ def report(**message: Json) -> None:
 
 
 class ProgressReporter(SilentProgress):
-    """Progress that is sent to the parent process; only the parent has stages."""
+    """Sends progress to the parent process; only the parent has stages."""
 
     def start(self, label: str, total: int) -> None:
-        """Send the start of work to the parent.
-
-        Args:
-            label: text beside the bar.
-            total: number of steps.
-        """
+        """Send the start of work to the parent."""
         report(start=label, total=total)
 
     def advance(self, steps: int = 1) -> None:
@@ -280,13 +273,8 @@ class ProgressReporter(SilentProgress):
 
 
 def relay(process: WorkerProcess, progress: Progress) -> dict[str, Json]:
-    """Show the progress of a process until it ends, and return its other messages.
-
-    Args:
-        process: the worker process.
-        progress: shows its progress.
-    """
-    found: dict[str, Json] = {}
+    """Show the progress of a process until it ends, and return its other messages as one dictionary."""
+    results: dict[str, Json] = {}
     try:
         for message in process.messages():
             match message:
@@ -297,7 +285,7 @@ def relay(process: WorkerProcess, progress: Progress) -> dict[str, Json]:
                 case {"finish": True}:
                     progress.finish()
                 case _:
-                    found |= message
+                    results |= message
     finally:
         progress.finish()
-    return found
+    return results

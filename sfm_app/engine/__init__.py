@@ -1,1 +1,1 @@
-"""Running stages: which are up to date, how they get their inputs, and what interfered with them."""
+"""Running stages: their order, skipping, resuming, and measuring."""

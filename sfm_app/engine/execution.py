@@ -1,4 +1,4 @@
-"""The loop that runs stages: it skips what is up to date, redoes what is damaged and records everything."""
+"""The loop that runs stages: it skips up-to-date ones, repeats damaged ones and records all."""
 
 import logging
 import threading
@@ -22,9 +22,9 @@ from sfm_app.engine.stage import (
     settings_and_versions,
     stage_fingerprint,
 )
-from sfm_app.engine.warm_up import warming_up
 from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError
 from sfm_app.files import fingerprint
+from sfm_app.jit import warming_up
 from sfm_app.operating_system import ChildTimes, cpu_seconds
 from sfm_app.photos import Source
 from sfm_app.runtime.context import Earlier, RunContext
@@ -33,23 +33,21 @@ from sfm_app.runtime.parallel import cpu_seconds_elsewhere
 from sfm_app.runtime.workspace import StageRecord
 from sfm_app.types import PhotoSet
 
-# The log in the output folder.
-
 logger = logging.getLogger("sfm_app")
 LOGGERS = (logger, logging.getLogger("py.warnings"))
-"""Those written to the log; the program sends warnings of Python to the second."""
+"""Loggers of the program and of Python's warnings."""
 
 
 class LogFile(logging.FileHandler):
     """A log file that ignores write errors: the run itself reports a full disk."""
 
     def handleError(self, record: logging.LogRecord) -> None:
-        """Do nothing: the run itself reports a full disk."""
+        """Do nothing."""
 
 
 @contextmanager
 def log_to_file(run: RunContext) -> Iterator[None]:
-    """Keep a log in the output folder, with the traceback of whatever ends the run."""
+    """Keep a log in the output folder, with the traceback of an error."""
     handler = LogFile(run.workspace.log, encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
     for each in LOGGERS:
@@ -68,63 +66,60 @@ def log_to_file(run: RunContext) -> Iterator[None]:
 
 # Seconds, CPU seconds and memory of a stage, with the processes that it starts.
 
-EVERY_S = 0.5
-"""Time between two looks at the memory, in seconds. Chosen by hand: a look takes some milliseconds."""
-MEGA = 1e6
-
 
 @dataclass(slots=True)
 class Usage:
-    """What a piece of work has used; complete once it has ended."""
+    """Cost of a piece of work; complete when it has ended."""
 
     seconds: float = 0.0
     cpu_seconds: float = 0.0
-    """Of this process, of those that it has waited for, and of the workers of a cluster."""
+    """Of this process, its finished children, and the workers of a cluster."""
     peak_mb: int = 0
-    """Most resident memory at any look; pages that processes share count for each of them."""
+    """Peak resident memory; shared pages count for each process."""
 
 
 @contextmanager
-def measure_usage(elsewhere: Callable[[], float] = float) -> Iterator[Usage]:
+def measure_usage(elsewhere: Callable[[], float] = float, every_s: float = 0.5) -> Iterator[Usage]:
     """Measure the work within the block.
 
     Args:
-        elsewhere: returns the CPU seconds so far of processes that work for this one without being waited for.
+        elsewhere: returns the CPU seconds so far of processes that this one does not wait for.
+        every_s: seconds between two measurements of the memory, which take some milliseconds.
     """
     used, ended, children = Usage(), threading.Event(), ChildTimes()
     start, cpu_start = time.perf_counter(), cpu_seconds() + elsewhere()
-    watcher = threading.Thread(target=_watch_memory, args=(used, children, ended), name="memory", daemon=True)
+
+    def watch() -> None:
+        while True:
+            used.peak_mb = max(used.peak_mb, resident_mb(children))
+            if ended.wait(every_s):
+                return
+
+    watcher = threading.Thread(target=watch, name="memory", daemon=True)
     watcher.start()
     try:
         yield used
     finally:
         ended.set()
         watcher.join()
-        used.peak_mb = max(used.peak_mb, _resident_mb(children))
+        used.peak_mb = max(used.peak_mb, resident_mb(children))
         used.seconds = time.perf_counter() - start
         used.cpu_seconds = cpu_seconds() + children.seconds() + elsewhere() - cpu_start
 
 
-def _watch_memory(used: Usage, children: ChildTimes, ended: threading.Event) -> None:
-    while True:
-        used.peak_mb = max(used.peak_mb, _resident_mb(children))
-        if ended.wait(EVERY_S):
-            return
-
-
-def _resident_mb(times: ChildTimes) -> int:
-    """Return the memory of this process and of its children in MB, and note the time of the latter."""
+def resident_mb(times: ChildTimes) -> int:
+    """Return the memory of this process and of its children in MB, and record the time of the latter."""
     me = psutil.Process()
     command, total, children = me.cmdline(), int(me.memory_info().rss), me.children(recursive=True)
     times.look(children)
     for process in children:
         try:
-            # until a child runs a program of its own, its memory is ours
+            # a child that has not started its program yet shares our memory
             if process.cmdline() not in ([], command):
                 total += process.memory_info().rss
-        except psutil.Error:  # it has ended meanwhile
+        except psutil.Error:  # it has ended
             continue
-    return round(total / MEGA)
+    return round(total / 1e6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,23 +141,21 @@ class Pipeline:
         return tuple(stage.name for stage in self.stages)
 
     def stages_until(self, last: str) -> tuple[Stage[object], ...]:
-        """Return the stages up to and including the one of this name."""
+        """Return the stages up to and including this one."""
         return self.stages[: self.names.index(last) + 1]
 
     def run(
         self, source: Source, run: RunContext, first: str = "", last: str = "", wanted: Sequence[Stage[object]] = ()
     ) -> Products:
-        """Run the stages that are not up to date, and those whose files are damaged.
+        """Run the stages that are not up to date, and those with damaged files.
 
         Args:
-            source: the user's photos or video.
-            run: the run.
-            first: stage from which on everything is redone.
-            last: stage to stop after; empty for the last one.
+            first: stage from which on all stages run again.
+            last: last stage to run; empty for all.
             wanted: stages whose products are loaded before returning.
 
         Raises:
-            SfmError: see errors.py; stages that finished before stay valid.
+            SfmError: see errors.py; finished stages stay valid.
         """
         for name in filter(None, (first, last)):
             if name not in self.names:
@@ -176,21 +169,15 @@ class Pipeline:
                     return _Execution(self, source, run, first).execute(stages, wanted)
                 except DamagedProductError as err:
                     logger.info("%s", err, exc_info=err)
-                    run.progress.stage(err.stage, "damaged: done again")
+                    run.progress.stage(err.stage, "damaged: running again")
                     self.forget(err.stage, run)
                     first = ""
             return _Execution(self, source, run, first).execute(stages, wanted)
 
     def forget(self, name: str, run: RunContext) -> None:
-        """Remove a stage and those that depend on it from the manifest; the photos stage alone: none needs its files.
-
-        Args:
-            name: of the stage.
-            run: the run.
-        """
-        alone = name == self.photos.name
-        dependent = () if alone else (stage.name for stage in self.stages if name in stage.depends_on)
-        run.workspace.manifest.forget((name, *dependent))
+        """Remove a stage and its dependents from the manifest; of the photos stage, none needs the files."""
+        dependents = (stage.name for stage in self.stages if name in stage.depends_on and name != self.photos.name)
+        run.workspace.manifest.forget((name, *dependents))
 
 
 @dataclass(slots=True, eq=False)
@@ -201,18 +188,18 @@ class _Execution:
     source: Source
     run: RunContext
     first: str
-    """Stage from which on everything is redone; empty for none."""
+    """Stage from which on all stages run again; empty for none."""
     fingerprints: dict[str, str] = field(default_factory=dict)
-    """By stage: hash of everything that its result depends on."""
+    """By stage: hash of everything that determines its result."""
     products: Products = field(init=False)
     earlier: Earlier | None = None
-    """What stages may go on from."""
+    """Run that stages may resume from."""
 
     def __post_init__(self) -> None:
         self.products = Products(self.run, self.source)
 
     def execute(self, stages: Sequence[Stage[object]], wanted: Sequence[Stage[object]]) -> Products:
-        """Run these stages where they are not up to date, and load the wanted products."""
+        """Run these stages unless they are up to date, and load the products of the `wanted` ones."""
         photos, later = self.pipeline.photos, stages[1:]
         again = self.stage_rerun_reason(photos, (self.source.fingerprint,))
         self.run_stage(photos, again, self.run)
@@ -225,7 +212,7 @@ class _Execution:
         self.earlier = self.find_earlier(reasons)
         reasons = spread_reasons(later, reasons, (photos.name,) if self.first == photos.name else ())
         ahead = [name for name, again in reasons.items() if again is not None]
-        with warming_up(self.run.progress) if ahead else nullcontext():
+        with warming_up(self.run.progress.say) if ahead else nullcontext():
             run = _limit_workers(self.products[photos], ahead, self.run)
             for stage in later:
                 self.run_stage(stage, reasons[stage.name], run)
@@ -236,21 +223,19 @@ class _Execution:
         return self.products
 
     def find_earlier(self, reasons: Mapping[str, str | None]) -> Earlier | None:
-        """Return what stages may go on from; where only photos came or went, the files of the finished ones."""
+        """Return the earlier run to resume from; if only photos changed, its files are set aside first."""
         stages, photos = self.pipeline.later_stages, self.source.photo_hashes(self.products[self.pipeline.photos])
-        if reasons.get(stages[0].name) == PHOTOS_CHANGED and self.first not in (
-            self.pipeline.photos.name,
-            stages[0].name,
-        ):
+        redone = self.first in (self.pipeline.photos.name, stages[0].name)
+        if reasons.get(stages[0].name) == PHOTOS_CHANGED and not redone:
             set_aside(stages, self.run)
         earlier = find_earlier(stages, photos, self.first, self.run)
         if earlier is not None and any(reasons.get(name) is not None for name in earlier.stages):
-            self.run.progress.say(f"{earlier.text}; from the start, all of them would cost this:")
-            logger.info("%s: stages %s go on from an earlier run", earlier.text, ", ".join(earlier.stages))
+            self.run.progress.say(f"{earlier.text}; estimate for a full run:")
+            logger.info("%s: stages %s resume from an earlier run", earlier.text, ", ".join(earlier.stages))
         return earlier
 
     def stage_rerun_reason(self, stage: Stage[object], inputs: Sequence[str]) -> str | None:
-        """Return why a stage has to run, None if it is up to date; keep the fingerprint of what it depends on."""
+        """Return why a stage has to run, None if it is up to date; keep its fingerprint."""
         self.fingerprints[stage.name] = stage_fingerprint(stage, inputs, self.run)
         again = rerun_reason(stage, self.fingerprints[stage.name], self.run)
         return "as asked" if again is None and stage.name == self.first else again
@@ -279,14 +264,14 @@ class _Execution:
         run.progress.finish_stage(seconds, len(self.products[self.pipeline.photos].photos))
 
     def stage_context(self, stage: Stage[object], run: RunContext) -> RunContext:
-        """Return the run for a stage: what it may go on from, and the fingerprint by which it resumes."""
+        """Return the run for a stage, with the earlier run, and the fingerprint by which it resumes."""
         inputs, earlier = self.fingerprints[stage.name], self.earlier
         if earlier is None or stage.name not in earlier.stages:
             return run.with_fingerprint(inputs)
         return replace(run.with_fingerprint(fingerprint(inputs, earlier.fingerprint)), earlier=earlier)
 
     def make_product(self, stage: Stage[Product], run: RunContext) -> Product:
-        """Return the product of a stage, if its photos and the output folder stayed the same meanwhile."""
+        """Return the product of a stage, after checking that photos and output folder did not change."""
         photos = self.pipeline.photos
         try:
             with self.open_workers(run) as own:
@@ -301,7 +286,7 @@ class _Execution:
 
     @contextmanager
     def open_workers(self, run: RunContext) -> Iterator[RunContext]:
-        """Provide workers for one stage: where it fails, none of its tasks is left to write on behind its back."""
+        """Provide workers for one stage; on failure, cancel the stage's remaining tasks."""
         with run.with_workers(run.workers) as own:
             try:
                 yield own
@@ -313,23 +298,17 @@ class _Execution:
 def spread_reasons(
     stages: Sequence[Stage[object]], reasons: Mapping[str, str | None], redone: Sequence[str] = ()
 ) -> dict[str, str | None]:
-    """Return why each stage runs again, where what it depends on does, too.
-
-    Args:
-        stages: in order.
-        reasons: of each stage by itself; None for those that are up to date.
-        redone: stages before them that run again.
-    """
-    found: dict[str, str | None] = {}
+    """Return why each stage runs again, with the stages that depend on them; `redone` ones are before all."""
+    spread: dict[str, str | None] = {}
     for stage in stages:
-        again, before = reasons[stage.name], [*redone, *(name for name, why in found.items() if why is not None)]
+        again, before = reasons[stage.name], [*redone, *(name for name, reason in spread.items() if reason is not None)]
         causes = [name for name in before if name in stage.depends_on]
-        found[stage.name] = f"after {causes[-1]}" if causes and again in (None, PHOTOS_CHANGED) else again
-    return found
+        spread[stage.name] = f"after {causes[-1]}" if causes and again in (None, PHOTOS_CHANGED) else again
+    return spread
 
 
 def _limit_workers(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> RunContext:
-    """Say what these stages will cost, and return the run with as many workers as the memory allows.
+    """Announce the cost of these stages, and return the run with as many workers as the memory allows.
 
     Raises:
         ConfigError: the photos need more memory than the user allows.
@@ -348,12 +327,10 @@ def _limit_workers(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> R
 
 
 def check_undisturbed(source: Source, photos: PhotoSet | None, run: RunContext, by: Exception | None = None) -> None:
-    """Check that nothing outside the program has interfered with a stage.
+    """Check that photos and output folder did not change during a stage.
 
     Args:
-        source: the user's photos or video.
-        photos: the photos in use; None if they are not known yet.
-        run: the run.
+        photos: the photos in use, if known.
         by: the error of the stage, if it has failed.
 
     Raises:

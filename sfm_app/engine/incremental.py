@@ -1,8 +1,7 @@
-"""Photos that come and go: the files of a finished run are set aside, and handed to the stages that go on from them.
+"""Photos that come and go: the files of a finished run are set aside for the stages that resume from them.
 
-The files move to OUT/.earlier, with a manifest of their own, before the first stage that takes the photos runs again.
-They stay there until every stage that could go on from them is finished, so that a killed run begins again at the same
-place.
+The files move to OUT/.earlier, with their own manifest, before the first stage that takes the photos runs again. They
+stay there until all stages that could resume are finished, so that a killed run starts again at the same point.
 """
 
 import json
@@ -22,12 +21,7 @@ logger = logging.getLogger("sfm_app")
 
 
 def set_aside(stages: Sequence[Stage[object]], run: RunContext) -> None:
-    """Move the files of the finished stages aside, unless an earlier run that got further is there already.
-
-    Args:
-        stages: all stages after the photos, in order; only those that can grow are moved.
-        run: the run.
-    """
+    """Move the files of finished stages aside, unless those of a more complete run are there already."""
     manifest, place = run.workspace.manifest, run.workspace.earlier
     growing = [stage.name for stage in stages if stage.grows]
     finished = list(takewhile(lambda name: manifest.record(name) is not None, growing))
@@ -43,13 +37,12 @@ def set_aside(stages: Sequence[Stage[object]], run: RunContext) -> None:
 def find_earlier(
     stages: Sequence[Stage[object]], photos: Mapping[str, str], first: str, run: RunContext
 ) -> Earlier | None:
-    """Return what stages can go on from; None, and nothing is left of it, where there is nothing.
+    """Return the earlier run to resume from; if its files are not usable, remove them and return None.
 
     Args:
         stages: all stages after the photos, in order.
-        photos: hashes of the photos of this run, by name.
-        first: stage from which on everything is to be done afresh; empty for none.
-        run: the run.
+        photos: hashes of this run's photos, by name.
+        first: stage from which on all stages run again; empty for none.
     """
     place = run.workspace.earlier
     if not place.root.is_dir():
@@ -66,25 +59,20 @@ def find_earlier(
 
 
 def forget_earlier(run: RunContext, *, if_finished: bool = False) -> None:
-    """Remove what was set aside.
-
-    Args:
-        run: the run.
-        if_finished: only if all stages that it has are finished in this run, too.
-    """
+    """Remove the files set aside; with `if_finished` only when this run has finished all their stages."""
     here, there = (place.manifest.read().get("stages", {}) for place in (run.workspace, run.workspace.earlier))
     if not if_finished or here.keys() >= there.keys():
         shutil.rmtree(run.workspace.earlier.root, ignore_errors=True)
 
 
 def _stages_before(first: str, stages: Sequence[Stage[object]]) -> Sequence[Stage[object]]:
-    """Return the stages before one of them; all of them before none, and none before any other, such as the photos."""
+    """Return the stages before `first`: all for an empty name, none for the photos stage."""
     names = [stage.name for stage in stages]
     return stages if not first else stages[: names.index(first)] if first in names else ()
 
 
 def _move_files(stages: Sequence[Stage[object]], run: RunContext) -> None:
-    """Move the files of the stages that were set aside, as far as that was not done yet."""
+    """Move the files of the stages set aside, unless they have moved already."""
     place, here = run.workspace.earlier, run.workspace
     listed = place.manifest.read().get("stages", {})
     for stage in stages:
@@ -96,7 +84,7 @@ def _move_files(stages: Sequence[Stage[object]], run: RunContext) -> None:
 
 
 def _is_usable(stage: Stage[object], run: RunContext) -> bool:
-    """Return whether a stage that was set aside had the same settings and versions, and its files are undamaged."""
+    """Return whether a stage set aside had the same settings and versions, and its files are undamaged."""
     place = run.workspace.earlier
     record: StageRecord | None = place.manifest.record(stage.name)
     made_with = json.loads(json.dumps(settings_and_versions(stage, run)))
@@ -105,5 +93,5 @@ def _is_usable(stage: Stage[object], run: RunContext) -> bool:
     try:
         return record.digest == stage.digest(place)
     except Exception as err:  # decoders of damaged bytes raise all kinds of errors
-        logger.info("what stage `%s` left behind cannot be read", stage.name, exc_info=err)
+        logger.info("cannot read the earlier files of stage `%s`", stage.name, exc_info=err)
         return False

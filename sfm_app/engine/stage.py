@@ -1,4 +1,4 @@
-"""What a stage's result depends on (photos, settings, versions), and why a stage has to run again."""
+"""A stage, the products of stages, and why a stage has to run again."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,8 +16,6 @@ from sfm_app.runtime.context import CONTROL_POINTS, GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.workspace import PROGRAM, Workspace
 from sfm_app.wording import list_names
 
-# What a stage is, and how its product is looked up.
-
 Product = TypeVar("Product")
 Product_co = TypeVar("Product_co", covariant=True)
 
@@ -30,20 +28,20 @@ class Stage(Generic[Product_co]):
     takes: tuple["Stage[object]", ...]
     """Stages whose products it needs."""
     settings: tuple[str, ...]
-    """Settings, or tables of them, that its result depends on."""
+    """Settings, or tables of them, that determine its result."""
     files: tuple[str, ...]
     """Its files and folders in the output folder; nothing else writes them."""
     make: Callable[["Products", RunContext], Product_co]
     load: Callable[["Products", RunContext], Product_co]
     """Reads the product that `make` has written."""
     digest: Callable[[Workspace], str]
-    """Hashes what `load` reads; checked before anything is read, because COLMAP hangs or ends on damaged files."""
+    """Hashes the files that `load` reads; checked before reading, because COLMAP hangs on damaged files."""
     grows: bool = False
-    """Whether `make` can go on from what it made of other photos, see `runtime.earlier`."""
+    """Whether `make` can resume from its product for other photos, see `runtime.context.Earlier`."""
 
     @property
     def depends_on(self) -> frozenset[str]:
-        """Names of all stages whose products its result depends on, directly or not."""
+        """Names of all direct and indirect inputs."""
         return frozenset(name for stage in self.takes for name in (stage.name, *stage.depends_on))
 
 
@@ -51,8 +49,7 @@ class Products:
     """Products by stage; those of skipped stages are loaded on first use.
 
     Args:
-        run: has the files to load them from.
-        source: the user's photos or video; None where no product that depends on them is loaded.
+        source: the user's photos or video; None if no product needs them.
     """
 
     def __init__(self, run: RunContext, source: Source | None = None) -> None:
@@ -78,22 +75,13 @@ class Products:
         return cast(Product, self._known[stage.name])
 
     def keep(self, stage: Stage[Product], product: Product) -> None:
-        """Keep the product that a stage has just made.
-
-        Args:
-            stage: the stage.
-            product: its product.
-        """
+        """Keep the new product of a stage."""
         self._known[stage.name] = product
 
 
 @contextmanager
 def check_undamaged(stage: Stage[object], run: RunContext) -> Iterator[None]:
     """Check the files of a stage, and turn errors of reading them in the block into one that names the stage.
-
-    Args:
-        stage: the one whose files are read in the block.
-        run: has the files and the manifest.
 
     Raises:
         DamagedProductError: the files have changed, or cannot be read.
@@ -106,52 +94,33 @@ def check_undamaged(stage: Stage[object], run: RunContext) -> Iterator[None]:
     except InputError:
         raise
     except Exception as err:  # decoders of damaged bytes raise all kinds of errors
-        what = f"is not complete: {err.filename} is gone" if isinstance(err, FileNotFoundError) else "is damaged"
-        left = f"what stage `{stage.name}` left in {run.workspace.root} {what}"
-        raise DamagedProductError(left, resume_hint(run), stage.name) from err
+        state = f"incomplete: {err.filename} is gone" if isinstance(err, FileNotFoundError) else "damaged"
+        message = f"the files of stage `{stage.name}` in {run.workspace.root} are {state}"
+        raise DamagedProductError(message, resume_hint(run), stage.name) from err
 
 
 def resume_hint(run: RunContext) -> str:
-    """Say which command resumes a run."""
+    """Return the command that resumes a run."""
     return f"`sfm-app run PHOTOS -o {run.workspace.root}` resumes where it stopped"
 
 
 PHOTOS_CHANGED = "the photos have changed"
-CHANGES_SHOWN = 3
-"""Most changes that are named."""
 
 
 def stage_fingerprint(stage: Stage[object], inputs: Sequence[str], run: RunContext) -> str:
-    """Return a hash of everything that a stage's result depends on: its inputs, its settings, the versions.
-
-    Args:
-        stage: the stage.
-        inputs: fingerprints of its inputs.
-        run: has the settings.
-    """
+    """Return a hash of everything that determines a stage's result: inputs, settings and versions."""
     return fingerprint(stage.name, settings_and_versions(stage, run), inputs)
 
 
 def settings_and_versions(stage: Stage[object], run: RunContext) -> dict[str, Any]:
-    """Return the values of a stage's settings, and the versions of the program and its libraries.
-
-    Args:
-        stage: names the settings it depends on.
-        run: has the settings.
-    """
+    """Return the values of a stage's settings, and the versions of the program and its libraries."""
     files = {GIVEN_CAMERAS: run.given.digest, CONTROL_POINTS: run.control_points.digest}
     values = run.settings.model_dump() | files
     return {"settings": {key: nested_value(values, key) for key in stage.settings}, "versions": versions()}
 
 
 def rerun_reason(stage: Stage[object], inputs: str, run: RunContext) -> str | None:
-    """Return why a stage has to run; empty if it never ran, None if it is up to date.
-
-    Args:
-        stage: the stage.
-        inputs: fingerprint of everything that its result depends on now.
-        run: the run.
-    """
+    """Return why a stage with this fingerprint has to run; empty if it never ran, None if it is up to date."""
     record = run.workspace.manifest.record(stage.name)
     if record is None:
         return ""
@@ -159,12 +128,12 @@ def rerun_reason(stage: Stage[object], inputs: str, run: RunContext) -> str | No
         return f"{changed[0]} is gone or was changed"
     if record.fingerprint == inputs:
         return None
-    found = list(_changes(record.made_with, json.loads(json.dumps(settings_and_versions(stage, run)))))
-    return list_names(found, CHANGES_SHOWN) if found else PHOTOS_CHANGED
+    changes = list(_changes(record.made_with, json.loads(json.dumps(settings_and_versions(stage, run)))))
+    return list_names(changes, 3) if changes else PHOTOS_CHANGED
 
 
 def _changes(before: Any, now: Mapping[str, Any], name: str = "") -> Iterator[str]:
-    """Yield the values that have changed, with their dotted names."""
+    """Yield changed values with their dotted names."""
     for key, new in now.items():
         old = before.get(key) if isinstance(before, Mapping) else None
         inner = f"{name}.{key}".removeprefix(".").removeprefix("settings.").removeprefix("versions.")
@@ -175,12 +144,7 @@ def _changes(before: Any, now: Mapping[str, Any], name: str = "") -> Iterator[st
 
 
 def nested_value(values: Any, key: str) -> Any:
-    """Return a value of nested mappings by its dotted name; None where there is none.
-
-    Args:
-        values: nested mappings.
-        key: dotted name, such as `mesh.faces`.
-    """
+    """Return a value of nested mappings by its dotted name, such as `mesh.faces`; None if there is none."""
     for name in key.split("."):
         values = values.get(name) if isinstance(values, Mapping) else None
     return values
@@ -195,12 +159,8 @@ def manifest_head(run: RunContext) -> dict[str, Any]:
 def versions() -> dict[str, str]:
     """Return the versions of the program and of the libraries that compute the result."""
     parts = ("sfm-app", "numpy", "numba", "opencv-contrib-python-headless")
-    return {name: version(name) for name in parts} | {"open3d": _open3d_version()} | colmap_versions()
-
-
-def _open3d_version() -> str:
-    """Return the version of Open3D, whose wheel without CUDA has a name of its own, and which few systems have."""
     try:
-        return version("open3d-cpu")
+        open3d = version("open3d-cpu")  # the wheel without CUDA, which few systems have
     except PackageNotFoundError:
-        return version("open3d")
+        open3d = version("open3d")
+    return {name: version(name) for name in parts} | {"open3d": open3d} | colmap_versions()

@@ -21,7 +21,7 @@ from sfm_app.plugins import Estimator
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import ordered_map
-from sfm_app.selfcal.wide_lens import LensEstimate, find_lens, needs_fisheye, shows_whole_turn
+from sfm_app.selfcal.wide_lens import LensEstimate, find_lens, needs_fisheye, shows_panoramas
 from sfm_app.settings import EpipolarSettings, Settings
 from sfm_app.tasks import Task
 from sfm_app.types import Calibration, EpipolarFit, MatchedImage, MatchGraph, PairId, Rejected, ViewGraph
@@ -150,7 +150,7 @@ def _search_lens(
     size, ids = (images[0].width, images[0].height), {image.id for image in images}
     pairs = [np.hstack(matches.points(pair)) for pair in matches.matches if ids.issuperset(pair)]
     try:
-        if not is_wide and shows_whole_turn(pairs, size, run.seed):
+        if not is_wide and shows_panoramas(pairs, size, run.seed):
             return panorama(size)
         estimate = find_lens(pairs, size, run.seed) if is_wide or needs_fisheye(pairs, size, run.seed) else None
     except FAILURES as err:

@@ -7,9 +7,9 @@ import numpy as np
 
 from sfm_app.bundle.lens_parts import CameraRule
 from sfm_app.camera.bearings import corner_angle, radius_deviation_px, radius_px
+from sfm_app.colmap.backend import Reconstruction
 from sfm_app.colmap.bundle import Adjustment
 from sfm_app.colmap.model import posed_images
-from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import InputError
 from sfm_app.numerical import Json
 from sfm_app.runtime.context import RunContext

@@ -1,12 +1,12 @@
-"""File formats: models as bytes by file name, and whole scenes as files or folders; all are offered like plug-ins."""
+"""File formats for models and whole scenes, offered like plug-ins."""
 
+from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 
-from sfm_app.formats.clouds import write_cloud_ply, write_laz
-from sfm_app.formats.draco import write_draco
-from sfm_app.formats.exporters import CLOUD, Exporter, SceneExporter, missing_package
+from sfm_app.formats.exporters import CLOUD, Exporter, FinishedScene, SceneExporter, missing_package
 from sfm_app.formats.gltf import write_glb
-from sfm_app.formats.meshes import write_obj, write_ply, write_stl
+from sfm_app.formats.meshes import write_cloud_ply, write_obj, write_ply, write_stl
 from sfm_app.formats.scenes import (
     write_bundler,
     write_cameras,
@@ -16,7 +16,36 @@ from sfm_app.formats.scenes import (
     write_opencv,
     write_splat,
 )
-from sfm_app.formats.usd import write_usd, write_usdz
+from sfm_app.types import Model
+
+
+def write_draco(model: Model, name: str) -> Mapping[str, bytes]:
+    """Load the Draco module and write a model."""
+    from sfm_app.formats import draco
+
+    return draco.write_draco(model, name)
+
+
+def write_usd(model: Model, name: str) -> Mapping[str, bytes]:
+    """Load the USD module and write a model."""
+    from sfm_app.formats import usd
+
+    return usd.write_usd(model, name)
+
+
+def write_usdz(model: Model, name: str) -> Mapping[str, bytes]:
+    """Load the USD module and write a model as a package."""
+    from sfm_app.formats import usd
+
+    return usd.write_usdz(model, name)
+
+
+def write_laz(scene: FinishedScene, target: Path) -> None:
+    """Load the LAZ module and write the dense cloud."""
+    from sfm_app.formats import laz
+
+    laz.write_laz(scene, target)
+
 
 _no_usd = partial(missing_package, "usd-core", "pxr")
 _no_draco = partial(missing_package, "DracoPy", "DracoPy")

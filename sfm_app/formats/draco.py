@@ -1,45 +1,50 @@
 """GLB whose triangles are compressed by Draco (KHR_draco_mesh_compression); needs DracoPy.
 
-Draco drops and reorders vertices as it compresses, so counts and bounds are those of what it decodes to. Points and
-cameras are written as they are: the extension is for triangles only.
+Draco drops and reorders vertices, so counts and bounds are those of the decoded triangles. The extension is for
+triangles only: points and cameras stay uncompressed.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.formats.exporters import check, pages_in_use, split_corners
-from sfm_app.formats.gltf import UNLIT, Glb, add_page_material, add_unlit_material, linear_colors, write_glb
+from sfm_app.formats.gltf import COMPONENTS, UNLIT, Glb, add_page_material, add_unlit_material, linear_colors, write_glb
 from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Model, Texture
 
 DRACO = "KHR_draco_mesh_compression"
-POSITION_BITS = 20
-"""Bits of a coordinate along the longest side of a primitive: an error of half a millionth of it. With 14 bits, as in
-Blender, the error is 3e-5 and the courtyard of `sfm-app demo` takes 0.97 instead of 1.10 MB, uncompressed 4.36 MB."""
-NORMAL_BITS, UV_BITS = 10, 16
-"""Bits of normals, an error of a tenth of a degree, and of texture coordinates, a quarter pixel of the largest page.
-Chosen by hand."""
-LEVEL = 7
-"""Of Draco's 0 (fast) to 10 (small); its own tools use 7. By definition."""
-FLOAT, UINT16 = 5126, 5123
-"""glTF's types of components."""
 COLOR_ID = 7
-"""Draco's number of the attribute with colors; its own are counted from 0. Chosen by hand."""
+"""Draco's number of the attribute with colors; Draco counts its own from 0. By definition."""
+
+
+@dataclass(frozen=True, slots=True)
+class DracoOptions:
+    """Precision of the compressed values."""
+
+    position_bits: int = 20
+    """Bits of a coordinate along the longest side of a primitive: an error of half a millionth of it. Blender's 14 bits
+    give an error of 3e-5 and files that are an eighth smaller. Chosen by hand."""
+    normal_bits: int = 10
+    """Bits of a normal: an error of a tenth of a degree. Chosen by hand."""
+    uv_bits: int = 16
+    """Bits of a texture coordinate: a quarter pixel of the largest page. Chosen by hand."""
+    level: int = 7
+    """Compression from 0 (fast) to 10 (small); Draco's own tools use 7. By definition."""
+
+
+OPTIONS = DracoOptions()
 
 
 def write_draco(model: Model, name: str) -> Mapping[str, bytes]:
     """Write compressed triangles with a texture or a color per vertex; points as in a plain GLB.
 
     Args:
-        model: what to write; cameras beside triangles are left out.
+        model: cameras beside triangles are left out.
         name: of the file, without suffix; also of the node in it.
-
-    Returns:
-        One file.
 
     Raises:
         ReconstructionError: the model is empty or not finite.
@@ -82,8 +87,9 @@ def _compressed_primitive(
     import DracoPy
 
     data = DracoPy.encode(
-        vertices.astype(np.float32), faces.astype(np.uint32), quantization_bits=POSITION_BITS, compression_level=LEVEL,
-        tex_coord_quantization_bits=UV_BITS, normal_quantization_bits=NORMAL_BITS, **arrays,
+        vertices.astype(np.float32), faces.astype(np.uint32), quantization_bits=OPTIONS.position_bits,
+        compression_level=OPTIONS.level, tex_coord_quantization_bits=OPTIONS.uv_bits,
+        normal_quantization_bits=OPTIONS.normal_bits, **arrays,
     )  # fmt: skip
     decoded = DracoPy.decode(data)
     kinds = {
@@ -98,7 +104,7 @@ def _compressed_primitive(
         ids[named] = attribute["unique_id"]
         attributes[named] = glb.add("accessors", _accessor(named, np.asarray(attribute["data"])))
     corners = np.asarray(decoded.faces)
-    indices = {"componentType": 5125, "count": int(corners.size), "type": "SCALAR"}
+    indices = {"componentType": COMPONENTS[np.dtype(np.uint32)], "count": int(corners.size), "type": "SCALAR"}
     extension = {"bufferView": glb.add_view(data), "attributes": ids}
     return {
         "attributes": attributes,
@@ -108,8 +114,8 @@ def _compressed_primitive(
 
 
 def _accessor(named: str, values: NDArray[np.generic]) -> dict[str, Any]:
-    """Return the description of an attribute; its values are Draco's."""
-    kind = UINT16 if named == "COLOR_0" else FLOAT
+    """Return the description of an attribute; Draco's bytes hold its values."""
+    kind = COMPONENTS[np.dtype(np.uint16 if named == "COLOR_0" else np.float32)]
     entry: dict[str, Any] = {"componentType": kind, "count": len(values), "type": f"VEC{values.shape[1]}"}
     if named == "COLOR_0":
         entry["normalized"] = True

@@ -1,4 +1,4 @@
-"""Texture pages and normal maps as files, and the vertices of their triangles."""
+"""Exporters: what each file format offers, and the parts that formats share."""
 
 import io
 from collections.abc import Callable, Mapping
@@ -15,19 +15,17 @@ from sfm_app.types import Model, Scene
 from sfm_app.types.arrays import IndexArray
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
 
-# What a file format is: one for models, or one for whole scenes with their photos.
-
 INSTALL_HINT = "pip install 'sfm-app[export]'"
 SCENE, CLOUD = "scene", "cloud"
-"""What a format for scenes needs of a run: cameras, poses and sparse points; or the dense cloud, too."""
+"""Input of a scene format: cameras, poses and sparse points; or the dense cloud, too."""
 
 
 class WriteModel(Protocol):
     """Makes model files by name: first the one to open (`name` with the format's suffix), then those it refers to.
 
     Takes a surface with a texture (pages of pictures, perhaps with normal maps), a surface with a color per vertex, or
-    points and cameras; the same model gives the same bytes. ReconstructionError where the model is empty, or has no
-    triangles and the format holds nothing else.
+    points and cameras. The same model gives the same bytes. ReconstructionError: the model is empty, or has no
+    triangles and the format needs them.
     """
 
     def __call__(self, model: Model, name: str, /) -> Mapping[str, bytes]: ...
@@ -45,12 +43,11 @@ class Exporter:
     write: WriteModel
     summary: str = ""
     suffix: str = ""
-    """Suffix, without dot, of the file to open; empty where it is the name."""
+    """Suffix, without dot, of the file to open; empty if it equals the name."""
     unavailable: Callable[[], str] = _no_reason
-    """Why it cannot be written on this machine; empty where it can."""
-
+    """Why this machine cannot write it; empty if it can."""
     holds_points: bool = True
-    """Whether it holds points and cameras, too."""
+    """Whether it stores points and cameras, too."""
 
     @property
     def ending(self) -> str:
@@ -63,25 +60,20 @@ class PerspectiveScene(Protocol):
 
     @property
     def photos(self) -> tuple[PerspectivePhoto, ...]:
-        """All of them, by name of the photo."""
+        """All photos, by name."""
 
     def write_photos(self, folder: Path, /) -> None:
-        """Write them into `folder`/images, and their masks, if any, into `folder`/masks."""
+        """Write photos into `folder`/images, and masks, if any, into `folder`/masks."""
 
     def write_colmap(self, folder: Path, /, *, text: bool = False) -> None:
-        """Write COLMAP's model of them: cameras, poses, points, and where photos see them.
-
-        Args:
-            folder: created.
-            text: whether as text instead of binary.
-        """
+        """Write COLMAP's model into a new folder: cameras, poses, points and their tracks."""
 
     def write_bundle(self, file: Path, /) -> None:
-        """Write Bundler's file of them by COLMAP; exact where K is that of `centered`."""
+        """Write Bundler's file by COLMAP; exact where K is that of `centered`."""
 
 
 class FinishedScene(Protocol):
-    """What a format for scenes is made from; everything is in the frame of the export."""
+    """A scene in the frame of the export."""
 
     @property
     def scene(self) -> Scene:
@@ -94,14 +86,14 @@ class FinishedScene(Protocol):
         """Return the dense cloud."""
 
     def perspective(self, *, centered: bool = False) -> PerspectiveScene:
-        """Return the photos undistorted, with `centered` turned so that the optical center is in the middle."""
+        """Return the undistorted photos; `centered` turns them so that the optical center is in the middle."""
 
     def say(self, text: str, /) -> None:
         """Show the user a message."""
 
 
 class WriteScene(Protocol):
-    """Writes a scene to a path: a file, or a folder that is there and empty; the same scene gives the same bytes."""
+    """Writes a scene to a file, or into an empty folder; the same scene gives the same bytes."""
 
     def __call__(self, scene: FinishedScene, target: Path, /) -> None: ...
 
@@ -114,29 +106,21 @@ class SceneExporter:
     write: WriteScene
     summary: str = ""
     file: str = ""
-    """Usual name of the file that it writes; empty where it fills a folder."""
+    """Usual name of its file; empty if it fills a folder."""
     needs: str = SCENE
     """`SCENE` or `CLOUD`."""
     unavailable: Callable[[], str] = _no_reason
-    """Why it cannot be written on this machine; empty where it can."""
+    """Why this machine cannot write it; empty if it can."""
 
     @property
     def ending(self) -> str:
-        """Suffix, without dot, of the file that it writes; empty for a folder."""
+        """Suffix of its file, without dot; empty for a folder."""
         return Path(self.file).suffix.removeprefix(".")
 
 
 def missing_package(package: str, module: str) -> str:
-    """Return that a package is not installed; empty where it is.
-
-    Args:
-        package: its name in the registry.
-        module: one that it installs.
-    """
+    """Return that a package of the registry is not installed; "" if `module`, one of its modules, exists."""
     return "" if find_spec(module) else f"the package {package} is not installed"
-
-
-# Checks that all file formats share.
 
 
 def check(model: Model) -> None:
@@ -154,18 +138,16 @@ def check(model: Model) -> None:
 
 
 JPEG_QUALITY = 90
-"""Quality of texture pages on libjpeg's scale: lower values show blocks, higher ones make much larger files."""
-
+"""Quality of texture pages on libjpeg's scale: lower values show blocks, higher ones make much larger files.
+By hand."""
 NORMAL_QUALITY, NORMAL_SUFFIX, NORMAL_TYPE = 92, "jpg", "image/jpeg"
-"""Quality and kind of normal maps. Chosen on fountain-P11 (benchmarks/surface/normal_map.py): 0.5 MB, and shading 1.7
-degrees off on average; PNG takes 1.3 MB for 1.1 degrees, quality 80 takes 0.3 MB for 2.2 degrees."""
+"""Quality and type of normal maps: shading is 1.7 degrees off on average (benchmarks/surface/normal_map.py)."""
 
 
 def jpeg(page: NDArray[np.uint8]) -> bytes:
     """Return a texture page (H, W, 3) as JPEG, without chroma subsampling.
 
-    JPEG's usual chroma subsampling smears colors across the borders of charts: on the page of a brick wall it costs
-    3 dB. At equal file size, full resolution with lower quality is 1.5 dB closer to the page.
+    Chroma subsampling smears colors across chart borders. At equal file size, full resolution is closer to the page.
     """
     try:
         return _encode(page, JPEG_QUALITY, optimize=True)
@@ -174,7 +156,7 @@ def jpeg(page: NDArray[np.uint8]) -> bytes:
 
 
 def normal_picture(page: NDArray[np.uint8]) -> bytes:
-    """Return a normal map (H, W, 3) as a file, of the kind that `NORMAL_SUFFIX` names."""
+    """Return a normal map (H, W, 3) as a file of type `NORMAL_TYPE`."""
     return _encode(page, NORMAL_QUALITY, optimize=False)
 
 
@@ -191,20 +173,19 @@ def split_corners(faces: IndexArray, uv: NDArray[np.float32]) -> tuple[IndexArra
 
     Args:
         faces: (T, 3) vertex indices.
-        uv: (T, 3, C) texture coordinates of their corners, and whatever else may differ there.
+        uv: (T, 3, C) texture coordinates of the corners, and other values per corner.
 
     Returns:
-        For each of N new vertices, in the order of the old ones: the old vertex (N,) and the texture coordinates
-        (N, C); and the faces (T, 3) of new vertices.
+        Old vertex (N,) and texture coordinates (N, C) of each new vertex, sorted by old vertex; new faces (T, 3).
     """
-    at, place = faces.ravel(), np.ascontiguousarray(uv, np.float32).reshape(faces.size, -1)
-    order = np.lexsort((*place.T[::-1], at))
-    first = np.ones(len(order), bool)
-    first[1:] = (np.diff(at[order]) != 0) | (np.diff(place[order], axis=0) != 0).any(axis=1)
+    vertices, values = faces.ravel(), np.ascontiguousarray(uv, np.float32).reshape(faces.size, -1)
+    order = np.lexsort((*values.T[::-1], vertices))
+    is_first = np.ones(len(order), bool)
+    is_first[1:] = (np.diff(vertices[order]) != 0) | (np.diff(values[order], axis=0) != 0).any(axis=1)
     new = np.empty(len(order), np.int64)
-    new[order] = np.cumsum(first) - 1
-    kept = order[first]
-    return at[kept], place[kept], new.reshape(-1, 3)
+    new[order] = np.cumsum(is_first) - 1
+    corners = order[is_first]
+    return vertices[corners], values[corners], new.reshape(-1, 3)
 
 
 def pages_in_use(pages: NDArray[np.int32]) -> list[int]:

@@ -7,17 +7,11 @@ from sfm_app.types import Frustum, Model
 from sfm_app.types.arrays import FloatArray, IndexArray
 
 CAMERA_COLOR = (255, 96, 32)
-"""sRGB of the cameras: an orange that walls, trees and skies do not have."""
-
+"""sRGB of the cameras: an orange that walls, trees and skies do not have. By hand."""
 FRUSTUM_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
 """Lines between the camera's center (0) and the corners of its image (1 to 4)."""
-
 DOTS = 12
-"""Dots per edge, for formats without lines."""
-
-LEAST_SHARE, MOST_SHARE = 0.01, 0.1
-"""Smallest and largest depth of a frustum, relative to the scene: visible, but without hiding the scene. Of many
-cameras, the smallest is a third of their distance if they stood in one line: a hundredth of a town hides the next."""
+"""Dots per edge, for formats without lines. By hand."""
 
 
 def camera_lines(model: Model) -> tuple[FloatArray, IndexArray]:
@@ -34,8 +28,8 @@ def camera_lines(model: Model) -> tuple[FloatArray, IndexArray]:
 def camera_dots(model: Model) -> tuple[FloatArray, NDArray[np.uint8]]:
     """Return the cameras of a model as dotted wire frames: points (D, 3) and colors (D, 3)."""
     corners, lines = camera_lines(model)
-    along = np.linspace(0.0, 1.0, DOTS, endpoint=False)[:, None, None]
-    dots = ((1 - along) * corners[lines[:, 0]] + along * corners[lines[:, 1]]).reshape(-1, 3)
+    share = np.linspace(0.0, 1.0, DOTS, endpoint=False)[:, None, None]
+    dots = ((1 - share) * corners[lines[:, 0]] + share * corners[lines[:, 1]]).reshape(-1, 3)
     return dots, camera_colors(len(dots))
 
 
@@ -50,16 +44,11 @@ def center(camera: Frustum) -> FloatArray:
 
 
 def frustum_corners(camera: Frustum, depth: float) -> FloatArray:
-    """Return (5, 3) the camera's center and the corners of its image, clockwise from the top left.
-
-    Args:
-        camera: posed, without distortion.
-        depth: distance of the image along the optical axis, > 0.
-    """
+    """Return (5, 3) the camera's center and the corners of its image at this depth, clockwise from the top left."""
     pixels = [(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)]
     rays = np.linalg.solve(camera.K, np.column_stack([np.array(pixels, np.float64), np.ones(4)]).T).T
-    seen = np.concatenate([np.zeros((1, 3)), depth * rays])
-    return np.asarray((seen - camera.cam_from_world[:, 3]) @ camera.cam_from_world[:, :3])
+    corners = np.concatenate([np.zeros((1, 3)), depth * rays])
+    return np.asarray((corners - camera.cam_from_world[:, 3]) @ camera.cam_from_world[:, :3])
 
 
 def frustum_depth(centers: FloatArray, points: FloatArray) -> float:
@@ -72,11 +61,12 @@ def frustum_depth(centers: FloatArray, points: FloatArray) -> float:
     from scipy.spatial import cKDTree
 
     size = max(scene_size(centers), scene_size(points)) or 1.0
-    # two neighbors are asked for, since the nearest one is the camera itself
-    away = np.asarray(cKDTree(centers).query(centers, 2)[0]) if len(centers) > 1 else np.full((1, 2), np.inf)
-    step = float(np.median(away[:, 1]))
-    least = min(LEAST_SHARE, 1.0 / (3.0 * max(len(centers), 1)))
-    return float(np.clip(step / 3, least * size, MOST_SHARE * size))
+    # the nearest neighbor of a camera is the camera itself
+    distances = np.asarray(cKDTree(centers).query(centers, 2)[0]) if len(centers) > 1 else np.full((1, 2), np.inf)
+    step = float(np.median(distances[:, 1]))
+    # a hundredth to a tenth of the scene is visible and hides little; many cameras on one line need smaller frusta
+    least = min(0.01, 1.0 / (3.0 * max(len(centers), 1)))
+    return float(np.clip(step / 3, least * size, 0.1 * size))
 
 
 def scene_size(points: FloatArray) -> float:
@@ -86,7 +76,7 @@ def scene_size(points: FloatArray) -> float:
 
 
 def append_cameras(model: Model) -> tuple[FloatArray, NDArray[np.uint8], IndexArray]:
-    """Return the vertices of a model followed by the corners of its cameras, their colors, and the cameras' lines."""
+    """Return a model's vertices followed by its cameras' corners, their colors, and the cameras' lines."""
     corners, lines = camera_lines(model)
     surface = model.surface
     colors = np.concatenate([surface.colors, camera_colors(len(corners))])

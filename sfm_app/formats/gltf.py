@@ -1,13 +1,11 @@
 """Binary glTF 2.0: one file that web viewers, game engines and Blender open.
 
-Photographed colors already contain the lighting, and a viewer that lights them again makes one side darker and the
-other paler. So the material is KHR_materials_unlit: three.js, Babylon.js, model-viewer, Blender and others show the
-original colors. Viewers without the extension show a rough, matte surface, lit by means of the normals, which also
-allow relighting. The extension is not listed as required, so no viewer has to refuse the file. Without a material,
-viewers would use glTF's default, which is metallic and looks black.
+Photos contain the lighting; a viewer that lights their colors again makes one side darker and the other paler. So the
+material is KHR_materials_unlit: three.js, Babylon.js, model-viewer, Blender and others show the original colors. Other
+viewers show a rough, matte surface, lit by means of the normals. The extension is not required, so every viewer may
+open the file. Without a material, viewers would use glTF's default, which is metallic and looks black.
 
-Unlit materials ignore normal maps, so a model with one is lit: rough, without metal, with the frame of the map at each
-vertex.
+Unlit materials ignore normal maps, so a model with normal maps is lit: rough, without metal, with tangents.
 """
 
 import json
@@ -26,16 +24,14 @@ from sfm_app.types import Frustum, Model, Texture
 # The container of binary glTF 2.0 (ISO/IEC 12113): a JSON tree, followed by one buffer of arrays.
 
 MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
-VERTICES, INDICES = 34962, 34963
-"""Types of buffer views, by their OpenGL constants."""
+VERTICES, INDICES, LINEAR, MIPMAPS, CLAMPED = 34962, 34963, 9729, 9987, 33071
+"""OpenGL's constants for buffer views, filters, wrapping and types of components. By definition."""
 COMPONENTS = {np.dtype(np.uint16): 5123, np.dtype(np.uint32): 5125, np.dtype(np.float32): 5126}
 SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
-RESTART = 0xFFFF
-"""The largest 16-bit number cannot be an index: OpenGL reserves it as the primitive-restart index."""
 
 
 class Glb:
-    """A file being built: methods add to the JSON `tree` and to the buffer, `to_bytes` returns the file."""
+    """A file under construction: methods add to the JSON `tree` and to the buffer, `to_bytes` returns the file."""
 
     def __init__(self, **tree: Any) -> None:
         self.tree: dict[str, Any] = {"asset": {"version": "2.0", "generator": "sfm_app"}, **tree}
@@ -43,12 +39,7 @@ class Glb:
         self._length = 0
 
     def add(self, table: str, entry: dict[str, Any]) -> int:
-        """Add an entry to a table of the tree and return its number.
-
-        Args:
-            table: "meshes", "nodes", ...
-            entry: the JSON object.
-        """
+        """Add an entry to a table of the tree ("meshes", "nodes", ...) and return its number."""
         entries = self.tree.setdefault(table, [])
         entries.append(entry)
         return len(entries) - 1
@@ -65,8 +56,8 @@ class Glb:
         """Add a vertex attribute and return the accessor's number.
 
         Args:
-            values: (N, 2), (N, 3) or (N, 4), one row per vertex.
-            bounds: whether to include the lowest and highest values, which glTF requires for positions.
+            values: (N, 2), (N, 3) or (N, 4).
+            bounds: whether to include lowest and highest values, which glTF requires for positions.
         """
         entry = self._accessor(values, VERTICES)
         if bounds:
@@ -74,13 +65,8 @@ class Glb:
         return self.add("accessors", entry)
 
     def add_indices(self, values: NDArray[np.int64], vertices: int) -> int:
-        """Add vertex indices in the smallest type that fits and return the accessor's number.
-
-        Args:
-            values: vertex indices, of any shape.
-            vertices: number of vertices.
-        """
-        small = values.ravel().astype(np.uint16 if vertices <= RESTART else np.uint32)
+        """Add indices of so many vertices in the smallest type that fits, and return the accessor's number."""
+        small = values.ravel().astype(np.uint16 if vertices <= 0xFFFF else np.uint32)  # 0xFFFF restarts
         return self.add("accessors", self._accessor(small, INDICES))
 
     def _accessor(self, values: NDArray[Any], target: int) -> dict[str, Any]:
@@ -101,9 +87,6 @@ class Glb:
 
 
 UNLIT = "KHR_materials_unlit"
-POINTS, LINES = 0, 1
-LINEAR, MIPMAPS, CLAMPED = 9729, 9987, 33071
-
 FLIP = np.diag([1.0, -1.0, -1.0])
 """COLMAP's camera looks along +z with y down, glTF's camera along -z with y up."""
 
@@ -112,11 +95,7 @@ def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
     """Write triangles with a texture or a color per vertex, or else points; and the cameras, if any.
 
     Args:
-        model: what to write.
         name: of the file, without suffix; also of the node in it.
-
-    Returns:
-        One file.
 
     Raises:
         ReconstructionError: the model is empty or not finite.
@@ -138,13 +117,7 @@ def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
 
 
 def add_textured_primitives(glb: Glb, model: Model, texture: Texture) -> list[dict[str, Any]]:
-    """Add an image and a material per page, and return one primitive for each.
-
-    Args:
-        glb: the file; it gets images, materials and vertices.
-        model: with its surface.
-        texture: of the model.
-    """
+    """Add an image and a material per page, and return one primitive for each."""
     surface, normals = model.surface, unit_normals(model.surface)
     at_corners, primitives = texture.uv, []
     if texture.normal_maps:
@@ -163,13 +136,7 @@ def add_textured_primitives(glb: Glb, model: Model, texture: Texture) -> list[di
 
 
 def add_page_material(glb: Glb, texture: Texture, page: int) -> int:
-    """Add a page of texture, its normal map if it has one, and its material, and return the material's number.
-
-    Args:
-        glb: the file; its first page adds the sampler that all share.
-        texture: has the page.
-        page: its number.
-    """
+    """Add a page of texture with its normal map, if any, and its material; return the material's number."""
     if not glb.tree.get("samplers"):
         glb.add("samplers", {"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED})
     name = f"page {page}"
@@ -187,12 +154,7 @@ def _add_picture(glb: Glb, name: str, kind: str, data: bytes) -> int:
 
 
 def add_colored_primitive(glb: Glb, model: Model) -> dict[str, Any]:
-    """Add triangles, or points if there are none, with a color per vertex, and return the primitive.
-
-    Args:
-        glb: the file; it gets a material and vertices.
-        model: with a color per vertex.
-    """
+    """Add triangles, or points if there are none, with a color per vertex, and return the primitive."""
     surface = model.surface
     normals = unit_normals(surface) if len(surface.faces) else None
     attributes = add_geometry(glb, surface.vertices, normals) | {
@@ -200,30 +162,20 @@ def add_colored_primitive(glb: Glb, model: Model) -> dict[str, Any]:
     }
     primitive = {"attributes": attributes, "material": add_unlit_material(glb, "colors")}
     if normals is None:
-        return primitive | {"mode": POINTS}
+        return primitive | {"mode": 0}
     return primitive | {"indices": glb.add_indices(surface.faces, len(surface.vertices))}
 
 
 def add_geometry(glb: Glb, vertices: NDArray[np.float64], normals: NDArray[np.float64] | None) -> dict[str, int]:
-    """Add positions and normals of vertices; return the accessors' numbers by attribute.
-
-    Args:
-        glb: the file.
-        vertices: (V, 3).
-        normals: (V, 3) unit vectors, or None.
-    """
+    """Add positions (V, 3) and unit normals (V, 3) of vertices; return the accessors' numbers by attribute."""
     attributes = {"POSITION": glb.add_vertices(vertices.astype(np.float32), bounds=True)}
     return attributes if normals is None else attributes | {"NORMAL": glb.add_vertices(normals.astype(np.float32))}
 
 
 def add_unlit_material(glb: Glb, name: str, **base: Any) -> int:
-    """Add an unlit material and return its number.
-
-    It is double-sided, because both sides of an open surface can be seen.
+    """Add an unlit material and return its number; it is double-sided, because surfaces are open.
 
     Args:
-        glb: the file.
-        name: of the material.
         **base: color or texture, as in glTF's pbrMetallicRoughness.
     """
     return glb.add("materials", _matte_material(name, **base) | {"extensions": {UNLIT: {}}})
@@ -237,8 +189,8 @@ def _matte_material(name: str, **base: Any) -> dict[str, Any]:
 def linear_colors(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return linear light in [0, 1] of 8-bit sRGB colors, same shape (IEC 61966-2-1).
 
-    glTF requires linear vertex colors, while photos are sRGB. Values are floats, because 8 linear bits show steps in
-    the shadows, and not every reader supports 16 bits.
+    glTF requires linear vertex colors. Values are floats: 8 linear bits show steps in the shadows, and not every reader
+    supports 16 bits.
     """
     value = np.arange(256) / 255.0
     light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
@@ -246,22 +198,14 @@ def linear_colors(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def add_cameras(glb: Glb, model: Model) -> list[int]:
-    """Add the cameras twice: as lines that every viewer draws, and as glTF cameras to look through.
-
-    Args:
-        glb: the file.
-        model: with its cameras, at least one.
-
-    Returns:
-        The numbers of their nodes.
-    """
+    """Add the cameras as lines, which every viewer draws, and as glTF cameras; return their nodes' numbers."""
     corners, lines = camera_lines(model)
     color = linear_colors(np.array(CAMERA_COLOR, np.uint8))
     material = add_unlit_material(glb, "cameras", baseColorFactor=[*(round(float(part), 6) for part in color), 1.0])
     primitive = {
         "attributes": add_geometry(glb, corners, None),
         "indices": glb.add_indices(lines, len(corners)),
-        "mode": LINES,
+        "mode": 1,
         "material": material,
     }
     mesh = glb.add("meshes", {"name": "cameras", "primitives": [primitive]})
@@ -271,7 +215,7 @@ def add_cameras(glb: Glb, model: Model) -> list[int]:
 
 
 def _camera_node(glb: Glb, camera: Frustum, near: float) -> dict[str, Any]:
-    """Add a glTF camera at the photo's pose and return its node; its principal point is central, as glTF requires."""
+    """Add a glTF camera at the photo's pose and return its node; glTF's principal point is central."""
     lens = {
         "yfov": float(2 * np.arctan(camera.height / (2 * camera.K[1, 1]))),
         "aspectRatio": float(camera.width / camera.K[0, 0] * camera.K[1, 1] / camera.height),

@@ -2,16 +2,18 @@
 
 import re
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.errors import ReconstructionError
-from sfm_app.formats.exporters import NORMAL_SUFFIX, check, jpeg, normal_picture, pages_in_use
+from sfm_app.formats.exporters import NORMAL_SUFFIX, FinishedScene, check, jpeg, normal_picture, pages_in_use
 from sfm_app.formats.frusta import append_cameras, camera_dots, scene_size
 from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Model, Texture
+from sfm_app.types.scene import PointCloud
 
 # Binary PLY, the Stanford polygon format, which all programs for point clouds and scanned surfaces open.
 
@@ -26,15 +28,11 @@ Columns = list[NDArray[Any]]
 def write_ply(model: Model, name: str) -> Mapping[str, bytes]:
     """Write triangles with normals and a color per vertex, or points followed by the cameras as dotted frusta.
 
-    Cameras are dots, because readers differ on files with points and edges or points and triangles, and some then show
-    no points. All of them show a cloud of colored points in the same way.
+    Cameras are dots: readers differ on files with points and edges, but all show colored points in the same way. PLY
+    has no common way to store a texture, or cameras beside a surface: both are left out.
 
     Args:
-        model: what to write; PLY has no common way to store a texture, or cameras beside a surface: left out.
         name: of the file, without suffix.
-
-    Returns:
-        One file.
 
     Raises:
         ReconstructionError: the model is empty or not finite.
@@ -59,12 +57,7 @@ def triangles(faces: NDArray[np.int64]) -> NDArray[np.void]:
 
 
 def table(kinds: list[tuple[str, str]], columns: Columns) -> NDArray[np.void]:
-    """Build rows with named columns.
-
-    Args:
-        kinds: name and NumPy type of each column.
-        columns: arrays (N, C), one column per name in total.
-    """
+    """Build rows with columns of these names and NumPy types from arrays (N, C) with as many columns in total."""
     rows = np.empty(len(columns[0]), kinds)
     values = [column[:, i] for column in columns for i in range(column.shape[1])]
     for (key, _), column in zip(kinds, values, strict=True):
@@ -73,7 +66,7 @@ def table(kinds: list[tuple[str, str]], columns: Columns) -> NDArray[np.void]:
 
 
 def header(elements: Mapping[str, NDArray[np.void]]) -> str:
-    """Return the header, which describes the rows of each element."""
+    """Return PLY's header, which describes the rows of each element."""
     lines = ["ply", "format binary_little_endian 1.0", "comment sfm_app"]
     for element, rows in elements.items():
         lines.append(f"element {element} {len(rows)}")
@@ -85,17 +78,25 @@ def header(elements: Mapping[str, NDArray[np.void]]) -> str:
     return "\n".join([*lines, "end_header", ""])
 
 
+def write_cloud_ply(scene: FinishedScene, target: Path) -> None:
+    """Write the dense cloud as binary PLY with normals and colors."""
+    target.write_bytes(cloud_ply(scene.cloud()))
+
+
+def cloud_ply(cloud: PointCloud) -> bytes:
+    """Return points as binary PLY, with their normals, if any."""
+    columns: Columns = [cloud.points, cloud.colors]
+    kinds = PLACE + COLOR
+    if cloud.normals is not None:
+        columns, kinds = [cloud.points, cloud.normals, cloud.colors], PLACE + NORMAL + COLOR
+    rows = table(kinds, columns)
+    return header({"vertex": rows}).encode("ascii") + rows.tobytes()
+
+
 # Wavefront OBJ, with materials (MTL) and texture pages (JPEG) in separate files.
 
 DIGITS = 6
-"""Significant digits of coordinates relative to the model's size, and decimals of texture coordinates."""
-
-KEY_BASE = 10 ** (DIGITS + 1)
-"""Base that combines both texture coordinates, as integers, into one key."""
-
-CHUNK = 50_000
-"""Rows formatted at once; Python numbers take several times the memory of their text."""
-
+"""Significant digits of coordinates relative to the model's size, and decimals of texture coordinates. By hand."""
 MATERIAL = "newmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum {light}\n"
 """`illum 0` shows the colors unlit: photos already contain the lighting; 1, with normal maps, lights them."""
 
@@ -104,7 +105,6 @@ def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
     """Write triangles with normals and a texture or a color per vertex, or else points; and cameras, if any, as lines.
 
     Args:
-        model: what to write.
         name: of the files, without suffix.
 
     Returns:
@@ -135,7 +135,7 @@ def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
 
 
 def _material(page: int, picture: str, normal_map: str) -> str:
-    """Return the material of a page; `norm` is the name that readers have for normal maps (others are heights)."""
+    """Return the material of a page; readers call normal maps `norm`, and heights `bump`."""
     text = MATERIAL.format(name=f"page_{page}", light=1 if normal_map else 0) + f"map_Kd {picture}\n"
     return text + (f"norm {normal_map}\n" if normal_map else "")
 
@@ -159,8 +159,9 @@ def _textured_lines(model: Model, texture: Texture, pages: list[int]) -> Iterato
     """Yield texture coordinates, each once, and the triangles page by page."""
     steps = np.round(10**DIGITS * texture.uv.reshape(-1, 2).astype(np.float64)).astype(np.int64)
     steps[:, 1] = 10**DIGITS - steps[:, 1]  # 0 is at the bottom in OBJ
-    keys, numbers = np.unique(steps @ np.array([KEY_BASE, 1]), return_inverse=True)
-    places = np.column_stack(np.divmod(keys, KEY_BASE)) / 10**DIGITS
+    base = 10 ** (DIGITS + 1)  # both coordinates, as integers, make one key
+    keys, numbers = np.unique(steps @ np.array([base, 1]), return_inverse=True)
+    places = np.column_stack(np.divmod(keys, base)) / 10**DIGITS
     yield format_rows(f"vt %.{DIGITS}f %.{DIGITS}f\n", places)
     corners = np.repeat(model.surface.faces + 1, 3, axis=1)
     corners[:, 1::3] = numbers.reshape(-1, 3) + 1
@@ -170,13 +171,9 @@ def _textured_lines(model: Model, texture: Texture, pages: list[int]) -> Iterato
 
 
 def format_rows(form: str, values: NDArray[np.generic]) -> str:
-    """Return the rows of an array (N, C) as text; formatting many at once is ten times faster than one by one.
-
-    Args:
-        form: format of one row for the % operator, with C fields.
-        values: (N, C).
-    """
-    parts = (values[start : start + CHUNK] for start in range(0, len(values), CHUNK))
+    """Return the rows of an array (N, C) as text, by a % format with C fields; one call for many rows is fast."""
+    chunk = 50_000  # Python numbers take several times the memory of their text
+    parts = (values[start : start + chunk] for start in range(0, len(values), chunk))
     return "".join(form * len(part) % tuple(part.ravel().tolist()) for part in parts)
 
 
@@ -187,19 +184,13 @@ def decimals(vertices: NDArray[np.float64]) -> int:
 
 # Binary STL, which programs for 3D printers open: bare triangles, in millimeters, z up.
 
-MILLIMETERS = 1000.0
-"""Of a meter. STL names no unit, and printers take millimeters. By definition."""
-
 
 def write_stl(model: Model, name: str) -> Mapping[str, bytes]:
     """Write the triangles of a model; STL has no colors.
 
     Args:
-        model: what to write; its unit is taken for a meter, and its y axis, which points up, becomes z.
+        model: its unit is taken for a meter, and its y axis, which points up, becomes z.
         name: of the file, without suffix.
-
-    Returns:
-        One file.
 
     Raises:
         ReconstructionError: the model is not finite, or has no triangles.
@@ -210,6 +201,6 @@ def write_stl(model: Model, name: str) -> Mapping[str, bytes]:
     surface = model.surface
     if not len(surface.faces):
         raise ReconstructionError("STL holds triangles only", hint="--format ply or glb for points and cameras")
-    x, y, z = MILLIMETERS * surface.vertices.T
+    x, y, z = 1000.0 * surface.vertices.T  # STL names no unit, and printers take millimeters
     mesh = trimesh.Trimesh(np.stack([x, -z, y], axis=1), surface.faces, process=False)
     return {f"{name}.stl": bytes(mesh.export(file_type="stl"))}

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from sfm_app.camera.models import PARAMETERS, calibration_from_model, distortion_terms
 from sfm_app.errors import InputError
 from sfm_app.files import replace_atomically
-from sfm_app.formats.clouds import cloud_ply
 from sfm_app.formats.exporters import FinishedScene
 from sfm_app.formats.gltf import FLIP
+from sfm_app.formats.meshes import cloud_ply
 from sfm_app.numerical import json_text
 from sfm_app.types import CameraModel, Scene
 from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE
@@ -22,16 +22,16 @@ from sfm_app.types.scene import PerspectivePhoto
 # Names of files that every program can read.
 
 UNSAFE = re.compile(r"[^A-Za-z0-9-]+")
-"""What trainers stumble over: they cut names at the first dot or blank, drop folders, or read bytes one by one."""
+"""Characters that break trainers: they cut names at the first dot or blank, drop folders, or read single bytes."""
 
 
 def plain_names(names: Sequence[str]) -> list[str]:
-    """Return one name for each, of letters, digits, - and _, all different even where case does not count.
+    """Return a name of letters, digits, - and _ for each name, all different even where case does not count.
 
     Args:
-        names: of photos with their folders, but without suffix, or of cameras.
+        names: of photos with their folders, without suffix, or of cameras.
     """
-    used, found = set[str](), []
+    used, unique = set[str](), []
     for name in names:
         plain = stem = UNSAFE.sub("_", name).strip("_") or "_"
         number = 1
@@ -39,8 +39,8 @@ def plain_names(names: Sequence[str]) -> list[str]:
             number += 1
             plain = f"{stem}_{number}"
         used.add(plain.lower())
-        found.append(plain)
-    return found
+        unique.append(plain)
+    return unique
 
 
 # Cameras and poses as JSON, for programs of any kind; `sfm-app run --calibration` reads the cameras, too.
@@ -58,27 +58,22 @@ CONVENTIONS = {
 
 
 def write_cameras(scene: FinishedScene, target: Path) -> None:
-    """Write the cameras with their deviations, and the pose of each photo.
-
-    Args:
-        scene: the finished scene.
-        target: JSON file.
-    """
-    found = scene.scene
+    """Write a JSON file with the cameras, their deviations, and the pose of each photo."""
+    result = scene.scene
     photos = {
         name: {
-            "camera": found.camera_of[name],
+            "camera": result.camera_of[name],
             "cam_from_world": pose.tolist(),
             "center": (-pose[:, :3].T @ pose[:, 3]).tolist(),
         }
-        for name, pose in found.cam_from_world.items()
+        for name, pose in result.cam_from_world.items()
     }
     content = {
         "conventions": CONVENTIONS,
-        "cameras": {name: camera_entry(camera) for name, camera in found.cameras.items()},
-        "camera_of": dict(found.camera_of),
+        "cameras": {name: camera_entry(camera) for name, camera in result.cameras.items()},
+        "camera_of": dict(result.camera_of),
         "photos": photos,
-        "unregistered": dict(found.unregistered),
+        "unregistered": dict(result.unregistered),
     }
     target.write_text(json_text(content), encoding="utf-8", newline="\n")
 
@@ -94,58 +89,40 @@ MODEL = "sparse/0"
 
 
 def write_colmap(scene: FinishedScene, target: Path) -> None:
-    """Write undistorted photos and COLMAP's binary model.
-
-    Args:
-        scene: the finished scene.
-        target: folder to fill.
-    """
+    """Write undistorted photos and COLMAP's binary model into a folder."""
     _write_folder(scene, target)
 
 
 def write_colmap_text(scene: FinishedScene, target: Path) -> None:
-    """Write undistorted photos and COLMAP's model as text.
-
-    Args:
-        scene: the finished scene.
-        target: folder to fill.
-    """
+    """Write undistorted photos and COLMAP's model as text into a folder."""
     _write_folder(scene, target, text=True)
 
 
 def write_splat(scene: FinishedScene, target: Path) -> None:
-    """Write what `write_colmap` does, with every optical center in the middle of its photo.
+    """Write the folder of `write_colmap`, with every optical center in the middle of its photo.
 
     Some trainers read the focal length only. A crop around the optical center would lose much of a cropped photo, so
-    the photo is turned instead, as if the camera had looked at its middle.
-
-    Args:
-        scene: the finished scene.
-        target: folder to fill.
+    the photo is rotated instead, as if the camera had looked at its middle.
     """
     _write_folder(scene, target, centered=True)
 
 
 def write_bundler(scene: FinishedScene, target: Path) -> None:
-    """Write Bundler's file by COLMAP's own writer, the list of photos, and the photos.
+    """Write Bundler's file by COLMAP's own writer, the list of photos, and the photos, into a folder.
 
     Bundler has one focal length, and takes the optical center for the middle.
-
-    Args:
-        scene: the finished scene.
-        target: folder to fill.
     """
-    found = scene.perspective(centered=True)
-    found.write_photos(target)
-    found.write_bundle(target / "bundle.out")
-    lines = "".join(f"images/{photo.image}\n" for photo in found.photos)
+    views = scene.perspective(centered=True)
+    views.write_photos(target)
+    views.write_bundle(target / "bundle.out")
+    lines = "".join(f"images/{photo.image}\n" for photo in views.photos)
     (target / "list.txt").write_text(lines, encoding="ascii", newline="\n")
 
 
 def _write_folder(scene: FinishedScene, target: Path, *, text: bool = False, centered: bool = False) -> None:
-    found = scene.perspective(centered=centered)
-    found.write_photos(target)
-    found.write_colmap(target / MODEL, text=text)
+    views = scene.perspective(centered=centered)
+    views.write_photos(target)
+    views.write_colmap(target / MODEL, text=text)
 
 
 # The folder that nerfstudio trains from: transforms.json, photos, masks and the sparse points.
@@ -157,24 +134,15 @@ TRANSFORMS, POINTS = "transforms.json", "sparse_pc.ply"
 
 
 def write_nerfstudio(scene: FinishedScene, target: Path) -> None:
-    """Write transforms.json, the undistorted photos, their masks and the points.
-
-    Args:
-        scene: the finished scene.
-        target: folder to fill.
-    """
-    found = scene.perspective()
-    found.write_photos(target)
+    """Write transforms.json, the undistorted photos, their masks and the points into a folder."""
+    views = scene.perspective()
+    views.write_photos(target)
     (target / POINTS).write_bytes(cloud_ply(scene.points()))
-    (target / TRANSFORMS).write_text(json_text(transforms(found.photos)), encoding="utf-8", newline="\n")
+    (target / TRANSFORMS).write_text(json_text(transforms(views.photos)), encoding="utf-8", newline="\n")
 
 
 def transforms(photos: tuple[PerspectivePhoto, ...]) -> dict[str, Any]:
-    """Return what transforms.json holds; intrinsics are at its top where all photos share them.
-
-    Args:
-        photos: undistorted, at least one.
-    """
+    """Return the content of transforms.json; intrinsics are at its top if all photos share them."""
     lenses = [intrinsics(photo) for photo in photos]
     shared = lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
     frames = [({} if shared else lens) | frame(photo) for lens, photo in zip(lenses, photos, strict=True)]
@@ -193,43 +161,34 @@ def frame(photo: PerspectivePhoto) -> dict[str, Any]:
     R, t = photo.cam_from_world[:, :3], photo.cam_from_world[:, 3]
     world_from_cam = np.eye(4)
     world_from_cam[:3, :3], world_from_cam[:3, 3] = R.T @ FLIP, -R.T @ t
-    found: dict[str, Any] = {"file_path": f"images/{photo.image}", "transform_matrix": world_from_cam.tolist()}
-    return found | ({"mask_path": f"masks/{photo.mask}"} if photo.mask else {})
+    entry: dict[str, Any] = {"file_path": f"images/{photo.image}", "transform_matrix": world_from_cam.tolist()}
+    return entry | ({"mask_path": f"masks/{photo.mask}"} if photo.mask else {})
 
 
 # Cameras as OpenCV's YAML, one file per camera, with the poses of its photos.
 #
 # OpenCV counts pixels from the center of the first one, which is (0.5, 0.5) here.
 
-FIRST_PIXEL = 0.5
-"""Our coordinates of the pixel that OpenCV calls (0, 0). By definition."""
-FISHEYE_TERMS, OTHER_TERMS = [0, 1, 4, 5], [2, 3, 6, 7]
-"""Of the eight terms of a fisheye, the four that OpenCV has, and the others."""
-
 
 def write_opencv(scene: FinishedScene, target: Path) -> None:
-    """Write a YAML file for each camera that OpenCV has a model for.
-
-    Args:
-        scene: the finished scene.
-        target: folder to fill.
+    """Write a YAML file into a folder for each camera that OpenCV has a model for.
 
     Raises:
         InputError: OpenCV has a model for none of the cameras.
     """
-    found = scene.scene
-    files = dict(zip(found.cameras, plain_names(list(found.cameras)), strict=True))
+    result = scene.scene
+    files = dict(zip(result.cameras, plain_names(list(result.cameras)), strict=True))
     reasons = {}
-    for name, camera in found.cameras.items():
+    for name, camera in result.cameras.items():
         try:
             model, terms = opencv_lens(camera)
         except ValueError as err:
             reasons[name] = str(err)
             continue
         with replace_atomically(target / f"{files[name]}.yaml") as path:
-            path.write_text(camera_yaml(name, camera, (model, terms), found), encoding="utf-8", newline="\n")
+            path.write_text(camera_yaml(name, camera, (model, terms), result), encoding="utf-8", newline="\n")
     lines = [f"camera {name} is left out: {reason}" for name, reason in reasons.items()]
-    if len(reasons) == len(found.cameras):
+    if len(reasons) == len(result.cameras):
         hint = "--format cameras writes cameras of every kind, --format colmap perspective views of the photos"
         raise InputError("; ".join(lines) or "the scene has no cameras", hint=hint)
     for line in lines:
@@ -239,36 +198,26 @@ def write_opencv(scene: FinishedScene, target: Path) -> None:
 def opencv_lens(camera: CameraModel) -> tuple[str, NDArray[np.float64]]:
     """Return OpenCV's name of the lens, and its coefficients: k1 k2 p1 p2 k3 k4 k5 k6, or four of a fisheye.
 
-    Args:
-        camera: after bundle adjustment.
-
     Raises:
         ValueError: OpenCV has no such lens.
     """
-    found = calibration_from_model(camera.model, camera.params, (camera.width, camera.height))
-    if found.projection == EQUIRECTANGULAR:
+    calibration = calibration_from_model(camera.model, camera.params, (camera.width, camera.height))
+    if calibration.projection == EQUIRECTANGULAR:
         raise ValueError("OpenCV has no model of a panorama")
-    terms = distortion_terms(found)
-    if found.projection != FISHEYE:
+    terms = distortion_terms(calibration)
+    if calibration.projection != FISHEYE:
         return "perspective", terms
-    if terms[OTHER_TERMS].any():
+    if terms[[2, 3, 6, 7]].any():
         raise ValueError("OpenCV's fisheye has no tangential and thin prism terms")
-    return "fisheye", terms[FISHEYE_TERMS]
+    return "fisheye", terms[[0, 1, 4, 5]]
 
 
 def camera_yaml(name: str, camera: CameraModel, lens: tuple[str, NDArray[np.float64]], scene: Scene) -> str:
-    """Return the file of a camera: what cv2.FileStorage writes.
-
-    Args:
-        name: of the camera.
-        camera: after bundle adjustment.
-        lens: from `opencv_lens`.
-        scene: poses of the photos.
-    """
+    """Return the file of a camera as cv2.FileStorage writes it; `lens` is from `opencv_lens`."""
     import cv2
 
     K = camera.K.copy()
-    K[:2, 2] -= FIRST_PIXEL
+    K[:2, 2] -= 0.5
     storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("camera_name", name)
     storage.write("image_width", camera.width)

@@ -1,7 +1,7 @@
 """USD, which Pixar's tools, Blender, Houdini and Apple's Quick Look open, alone or packed as USDZ; needs usd-core.
 
-A stage stands upright (y up) and counts in meters. The texture is the diffuse color of a rough surface, since USD has
-no unlit material that all viewers know.
+A stage is y-up and in meters. The texture is the diffuse color of a rough surface, since USD has no unlit material that
+all viewers know.
 """
 
 import io
@@ -26,22 +26,13 @@ if TYPE_CHECKING:
 
 ROOT = "/model"
 FILM_MM = 36.0
-"""Width of the film in millimeters, as which USD states a field of view: that of 35 mm film. By definition."""
-ALIGNED = 64
-"""Every file in a USDZ starts at a multiple of so many bytes (USDZ specification)."""
-PADDING_ID = 0x1986
-"""Number of the ZIP field that pads up to it; USD's own packer uses it. By definition."""
-POINT_SHARE = 2e-3
-"""Width of a drawn point over the depth of a drawn camera. Chosen by hand."""
-EARLIEST = (1980, 1, 1, 0, 0, 0)
-"""Time of all files in a USDZ: the first that ZIP can say, so that the same model gives the same bytes."""
+"""Width of 35 mm film in millimeters, by which USD states a field of view. By definition."""
 
 
 def write_usd(model: Model, name: str) -> Mapping[str, bytes]:
     """Write triangles with a texture or a color per vertex, or points; and the cameras, if any.
 
     Args:
-        model: what to write.
         name: of the files, without suffix.
 
     Returns:
@@ -56,14 +47,7 @@ def write_usd(model: Model, name: str) -> Mapping[str, bytes]:
 
 
 def write_usdz(model: Model, name: str) -> Mapping[str, bytes]:
-    """Write what `write_usd` does into one uncompressed package.
-
-    Args:
-        model: what to write.
-        name: of the file, without suffix.
-
-    Returns:
-        One file.
+    """Write the files of `write_usd` into one uncompressed package.
 
     Raises:
         ReconstructionError: the model is empty or not finite.
@@ -74,12 +58,7 @@ def write_usdz(model: Model, name: str) -> Mapping[str, bytes]:
 
 
 def page_files(model: Model, name: str) -> dict[int, str]:
-    """Return the files of the pages of texture by their numbers; empty without a texture.
-
-    Args:
-        model: the model.
-        name: of the file, without suffix.
-    """
+    """Return the files of the pages of texture by their numbers; empty without a texture."""
     if model.texture is None or not len(model.surface.faces):
         return {}
     beside = re.sub(r"\s", "_", name)
@@ -87,42 +66,33 @@ def page_files(model: Model, name: str) -> dict[int, str]:
 
 
 def normal_file(picture: str) -> str:
-    """Return the file of the normal map that belongs to a page of texture."""
+    """Return the file of the normal map of a page of texture."""
     return f"{Path(picture).stem}_normals.{NORMAL_SUFFIX}"
 
 
 def _pictures(model: Model, pages: Mapping[int, str]) -> dict[str, bytes]:
     if model.texture is None:
         return {}
-    found = {file: jpeg(model.texture.pages[page]) for page, file in pages.items()}
+    pictures = {file: jpeg(model.texture.pages[page]) for page, file in pages.items()}
     maps = model.texture.normal_maps
-    return found | {normal_file(file): normal_picture(maps[page]) for page, file in pages.items() if maps}
+    return pictures | {normal_file(file): normal_picture(maps[page]) for page, file in pages.items() if maps}
 
 
 def pack(files: Mapping[str, bytes]) -> bytes:
-    """Return a USDZ package: a ZIP file without compression, in which every file starts at a multiple of 64 bytes.
-
-    Args:
-        files: contents by file name; the first is the stage to open.
-    """
-    found = io.BytesIO()
-    with zipfile.ZipFile(found, "w", zipfile.ZIP_STORED) as package:
+    """Return a USDZ package: an uncompressed ZIP of aligned files, the stage first."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as package:
         for name, data in files.items():
-            start = found.tell() + 30 + len(name.encode()) + 4  # after the entry's header and that of the padding
-            gap = -start % ALIGNED
-            entry = zipfile.ZipInfo(name, EARLIEST)
-            entry.extra = PADDING_ID.to_bytes(2, "little") + gap.to_bytes(2, "little") + bytes(gap)
+            start = stream.tell() + 30 + len(name.encode()) + 4  # after the headers of entry and padding
+            gap = -start % 64  # USDZ specification
+            entry = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))  # ZIP's first date: same model, same bytes
+            entry.extra = (0x1986).to_bytes(2, "little") + gap.to_bytes(2, "little") + bytes(gap)  # as USD's packer
             package.writestr(entry, data)
-    return found.getvalue()
+    return stream.getvalue()
 
 
 def stage_bytes(model: Model, pages: Mapping[int, str]) -> bytes:
-    """Return a stage in USD's binary form.
-
-    Args:
-        model: what it shows.
-        pages: files of the pages of texture by their numbers.
-    """
+    """Return a stage in USD's binary form; `pages` are files by number of the page."""
     with tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch:
         path = Path(scratch) / "model.usdc"
         _write_stage(path, model, pages)
@@ -130,7 +100,7 @@ def stage_bytes(model: Model, pages: Mapping[int, str]) -> bytes:
 
 
 def _write_stage(path: Path, model: Model, pages: Mapping[int, str]) -> None:
-    """Write a stage. Nothing keeps it beyond this function, so that the file is closed and can be removed."""
+    """Write a stage. Nothing refers to it after this function, so that the file is closed and can be removed."""
     from pxr import Usd, UsdGeom
 
     stage = Usd.Stage.CreateNew(str(path))
@@ -148,12 +118,7 @@ def _write_stage(path: Path, model: Model, pages: Mapping[int, str]) -> None:
 
 
 def add_mesh(stage: "Usd.Stage", surface: Surface) -> "UsdGeom.Mesh":
-    """Add triangles with normals and a color per vertex.
-
-    Args:
-        stage: changed in place.
-        surface: the triangles.
-    """
+    """Add triangles with normals and a color per vertex."""
     from pxr import UsdGeom, Vt
 
     mesh = UsdGeom.Mesh.Define(stage, f"{ROOT}/surface")
@@ -170,13 +135,7 @@ def add_mesh(stage: "Usd.Stage", surface: Surface) -> "UsdGeom.Mesh":
 
 
 def add_texture(stage: "Usd.Stage", mesh: "UsdGeom.Mesh", texture: Texture, pages: Mapping[int, str]) -> None:
-    """Add texture coordinates, and a material for the triangles of each page.
-
-    Args:
-        stage, mesh: changed in place.
-        texture: of the mesh.
-        pages: files by number of the page.
-    """
+    """Add texture coordinates, and a material for the triangles of each page."""
     from pxr import Sdf, UsdGeom, UsdShade, Vt
 
     places = texture.uv.reshape(-1, 2).astype(np.float32) * (1.0, -1.0) + (0.0, 1.0)  # 0 is at the bottom in USD
@@ -222,7 +181,7 @@ def _page_material(stage: "Usd.Stage", path: str, file: str) -> "UsdShade.Materi
 
 
 def _add_normal_map(material: "UsdShade.Material", file: str) -> None:  # type: ignore[name-defined]  # noqa: F821
-    """Add a normal map to a material from `_page_material`; its texels count from 0 to 1, normals from -1 to 1."""
+    """Add a normal map to a material; its texels count from 0 to 1, normals from -1 to 1."""
     from pxr import Gf, Sdf, UsdShade
 
     types, stage, path = Sdf.ValueTypeNames, material.GetPrim().GetStage(), material.GetPath()
@@ -240,54 +199,41 @@ def _add_normal_map(material: "UsdShade.Material", file: str) -> None:  # type: 
 
 
 def add_points(stage: "Usd.Stage", model: Model) -> None:
-    """Add colored points.
-
-    Args:
-        stage: changed in place.
-        model: points and cameras.
-    """
+    """Add colored points."""
     from pxr import UsdGeom, Vt
 
     surface = model.surface
     points = UsdGeom.Points.Define(stage, f"{ROOT}/points")
     points.CreatePointsAttr(_vectors(surface.vertices))
     centers = np.array([center(camera) for camera in model.cameras] or [np.zeros(3)])
-    points.CreateWidthsAttr(Vt.FloatArray([POINT_SHARE * frustum_depth(centers, surface.vertices)]))
+    width = 2e-3 * frustum_depth(centers, surface.vertices)  # by hand
+    points.CreateWidthsAttr(Vt.FloatArray([width]))
     points.SetWidthsInterpolation(UsdGeom.Tokens.constant)
     points.CreateExtentAttr(_vectors(np.stack([surface.vertices.min(axis=0), surface.vertices.max(axis=0)])))
     points.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(_vectors(linear_colors(surface.colors)))
 
 
 def add_cameras(stage: "Usd.Stage", model: Model) -> None:
-    """Add a camera for every photo, with its optical center where it is.
-
-    Args:
-        stage: changed in place.
-        model: with its cameras, perhaps none.
-    """
+    """Add a camera with its principal point for every photo."""
     from pxr import Gf, UsdGeom
 
     for number, camera in enumerate(model.cameras):
         film = film_of(camera)
-        found = UsdGeom.Camera.Define(stage, f"{ROOT}/cameras/photo_{number + 1}")
-        found.GetPrim().SetCustomDataByKey("photo", camera.name)
-        found.CreateProjectionAttr(UsdGeom.Tokens.perspective)
-        found.CreateFocalLengthAttr(film["focal"])
-        found.CreateHorizontalApertureAttr(film["width"])
-        found.CreateVerticalApertureAttr(film["height"])
-        found.CreateHorizontalApertureOffsetAttr(film["right"])
-        found.CreateVerticalApertureOffsetAttr(film["up"])
+        lens = UsdGeom.Camera.Define(stage, f"{ROOT}/cameras/photo_{number + 1}")
+        lens.GetPrim().SetCustomDataByKey("photo", camera.name)
+        lens.CreateProjectionAttr(UsdGeom.Tokens.perspective)
+        lens.CreateFocalLengthAttr(film["focal"])
+        lens.CreateHorizontalApertureAttr(film["width"])
+        lens.CreateVerticalApertureAttr(film["height"])
+        lens.CreateHorizontalApertureOffsetAttr(film["right"])
+        lens.CreateVerticalApertureOffsetAttr(film["up"])
         matrix = np.eye(4)  # of rows, as USD multiplies
         matrix[:3, :3], matrix[3, :3] = FLIP @ camera.cam_from_world[:, :3], center(camera)
-        UsdGeom.Xformable(found).AddTransformOp().Set(Gf.Matrix4d(matrix.tolist()))
+        UsdGeom.Xformable(lens).AddTransformOp().Set(Gf.Matrix4d(matrix.tolist()))
 
 
 def film_of(camera: Frustum) -> dict[str, float]:
-    """Return the film of a camera in millimeters: focal, width, height, and how far its middle is right and up.
-
-    Args:
-        camera: without distortion.
-    """
+    """Return the film of a camera in millimeters: focal, width, height, and its middle's offset right and up."""
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
     focal = FILM_MM * fx / camera.width
     right, up = focal * (camera.width / 2 - cx) / fx, focal * (cy - camera.height / 2) / fy

@@ -37,9 +37,6 @@ FEET = re.compile(r"\+units=(us-)?ft|\+to_meter", re.IGNORECASE)
 def read_control_points(path: Path) -> ControlPoints:
     """Read a file of ground control points.
 
-    Args:
-        path: of the form of OpenDroneMap's gcp_list.txt.
-
     Raises:
         InputError: it cannot be read, or a line of it is malformed; the message names the line.
     """
@@ -128,12 +125,7 @@ class ControlFit:
 
 
 def fit_control_points(given: ControlPoints, located: Mapping[str, SightedPoint]) -> ControlFit | str:
-    """Fit the similarity that takes the model to its ground control points, or say why there is none.
-
-    Args:
-        given: the user's points.
-        located: places in the model, by name of the point.
-    """
+    """Fit the similarity that takes the model to its ground control points, or say why there is none."""
     points = [point for point in given.points if point.name in located]
     if len(points) < LEAST_POINTS:
         return f"{len(points)} of {len(given.points)} ground control points have a place in the model, 3 are needed"

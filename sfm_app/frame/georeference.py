@@ -76,7 +76,6 @@ def georeference(
         centers: (N, 3) camera centers.
         positions: per photo; None if it has none.
         up: (3,) unit vector in the world.
-        up_is_sure: whether `up` rests on more than the cameras' roll.
     """
     known = [k for k, position in enumerate(positions) if position is not None]
     given = [position for position in positions if position is not None]
@@ -100,7 +99,6 @@ def enu_m(positions: Sequence[GpsPosition], origin: GpsPosition) -> FloatArray:
     First-order in the angles, with the ellipsoid's radii at the origin: the error is 1 m over 5 km.
 
     Args:
-        positions: on earth; those without altitude have up 0.
         origin: where (0, 0, 0) is.
     """
     meridian, parallel = _radii_m(origin)

@@ -28,12 +28,7 @@ NAMES_SHOWN = 5
 
 
 def distance_evidence(distances: Sequence[tuple[str, str, str]], model: Sightlines) -> list[ScaleEvidence]:
-    """Return the scale by each known distance between two places.
-
-    Args:
-        distances: two points in the frame of the model and a length each, as in the settings.
-        model: its cameras and points.
-    """
+    """Return the scale by each known distance between two places."""
     found = []
     for first, second, length in distances:
         a, b, meters = np.array(parse_point(first)), np.array(parse_point(second)), parse_length(length)
@@ -44,13 +39,7 @@ def distance_evidence(distances: Sequence[tuple[str, str, str]], model: Sightlin
 
 
 def marker_evidence(posed: PosedPhotos, run: RunContext, problems: list[str]) -> list[ScaleEvidence]:
-    """Return the scale by each printed marker, and note markers that tell nothing.
-
-    Args:
-        posed: the photos with a pose.
-        run: has the photos, the size and the family of the markers.
-        problems: what was not as it should be, for people; added to.
-    """
+    """Return the scale by each printed marker, and note markers that tell nothing."""
     options = run.settings.scale
     names = sorted(posed.names)
     task = Task(find_markers_in_file, run.workspace.photos, options.marker_family)
@@ -67,14 +56,7 @@ def marker_evidence(posed: PosedPhotos, run: RunContext, problems: list[str]) ->
 def control_places(
     photos: PhotoSet, posed: PosedPhotos, given: ControlPoints, problems: list[str]
 ) -> dict[str, SightedPoint]:
-    """Return the place in the model of each ground control point that two photos determine.
-
-    Args:
-        photos: by whose names the points are marked.
-        posed: those with a pose.
-        given: the points.
-        problems: what was not as it should be, for people; added to.
-    """
+    """Return the place in the model of each ground control point that two photos determine."""
     names, found = named_photos(photos.photos), dict[str, SightedPoint]()
     unknown = sorted({photo for point in given.points for photo in point.marks if photo not in names})
     if unknown:

@@ -204,13 +204,7 @@ class SeenMarker:
 
 
 def find_markers_in_file(photo_dir: Path, family: str, name: str) -> list[SeenMarker]:
-    """Return the markers in a photo; none where the photo cannot be read.
-
-    Args:
-        photo_dir: folder of the photo.
-        family: one of `FAMILIES`, or `AUTO`.
-        name: of the photo.
-    """
+    """Return the markers in a photo; none where the photo cannot be read."""
     try:
         with Image.open(photo_dir / name) as image:
             gray = np.asarray(image.convert("L"))
@@ -224,7 +218,6 @@ def find_markers(gray: NDArray[np.uint8], families: Sequence[str]) -> list[SeenM
 
     Args:
         gray: (H, W) photo.
-        families: names in `FAMILIES`.
     """
     options = cv2.aruco.DetectorParameters()
     options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -241,31 +234,18 @@ def find_markers(gray: NDArray[np.uint8], families: Sequence[str]) -> list[SeenM
 
 
 def load_dictionary(family: str) -> cv2.aruco.Dictionary:
-    """Return OpenCV's dictionary of a family.
-
-    Args:
-        family: name in `FAMILIES`.
-    """
+    """Return OpenCV's dictionary of a family."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, FAMILIES[family]))
 
 
 def draw_pattern(family: str, number: int) -> NDArray[np.uint8]:
-    """Return the (N, N) cells of a marker with its dark border, 0 or 255.
-
-    Args:
-        family: name in `FAMILIES`.
-        number: of the marker in the family.
-    """
+    """Return the (N, N) cells of a marker with its dark border, 0 or 255."""
     dictionary = load_dictionary(family)
     return np.asarray(cv2.aruco.generateImageMarker(dictionary, number, dictionary.markerSize + 2), np.uint8)
 
 
 def marker_count(family: str) -> int:
-    """Return how many markers a family has.
-
-    Args:
-        family: name in `FAMILIES`.
-    """
+    """Return how many markers a family has."""
     return len(load_dictionary(family).bytesList)
 
 
@@ -286,11 +266,7 @@ def write_marker_page(
     """Write a page of markers to print, true to scale, with a ruler to check the printer by.
 
     Args:
-        path: PDF or SVG file.
         side_m: side of the dark square of each marker, in meters.
-        family: one of `FAMILIES`.
-        first: number of the first marker.
-        paper: a4, a3 or letter.
 
     Returns:
         how many markers are on it.
@@ -327,8 +303,6 @@ def marker_places(side_m: float, cells: int, paper: str) -> list[tuple[float, fl
 
     Args:
         side_m: side of a marker, in meters.
-        cells: along a side of its pattern.
-        paper: name in `PAGES_MM`.
     """
     width, height = PAGES_MM[paper]
     side = side_m * 1000.0
@@ -419,8 +393,6 @@ def marker_scales(
     """Return the scale of a model by each marker.
 
     Args:
-        seen: markers by photo.
-        rays: by photo, for each of these markers, the rays of its four corners.
         side_m: side of each marker's dark square, in meters.
     """
     sights: dict[str, list[Sequence[Sight]]] = defaultdict(list)

@@ -50,7 +50,6 @@ def agree(evidence: Sequence[ScaleEvidence], shape: float = 0.0) -> AgreedScale:
     exact one is taken, and the deviation covers half of the difference.
 
     Args:
-        evidence: at least one.
         shape: relative deviation of the model's own shape: by it, two places may differ, and more evidence does not
             make it smaller.
     """
@@ -174,12 +173,7 @@ class MetricFrame:
 
 
 def move_model(model: Model, similarity: Similarity) -> Model:
-    """Return a surface or points with their cameras in another frame.
-
-    Args:
-        model: not changed.
-        similarity: from its frame into the new one.
-    """
+    """Return a surface or points with their cameras in another frame."""
     surface = replace(model.surface, vertices=similarity(model.surface.vertices))
     return replace(model, surface=surface, cameras=tuple(_move_camera(one, similarity) for one in model.cameras))
 

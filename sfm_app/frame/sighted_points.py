@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.backend import Reconstruction, translate_errors
 from sfm_app.colmap.model import focal_px, posed_images, seen_points, viewing_rays
-from sfm_app.colmap.types import Reconstruction
 from sfm_app.types import Photo
 from sfm_app.types.arrays import FloatArray
 
@@ -60,11 +59,7 @@ class SightedPoint:
 
 
 def locate_point(sights: Sequence[Sight]) -> SightedPoint | str:
-    """Place a point where most of its rays meet, by least squares of the distances in pixels; else say why not.
-
-    Args:
-        sights: of one point, one per photo.
-    """
+    """Place a point where most of its rays meet, by least squares of the distances in pixels; else say why not."""
     if len(sights) < 2:
         return "it is marked in one photo with a pose, two are needed" if sights else "no photo with it has a pose"
     centers, rays = np.array([one.center for one in sights]), np.array([one.ray for one in sights])
@@ -189,7 +184,6 @@ def place_covariance(place: FloatArray, model: Sightlines) -> FloatArray:
 
     Args:
         place: (3,) in the frame of the model.
-        model: cameras and points.
     """
     near = np.argsort(np.linalg.norm(model.points - place, axis=1))[:NEIGHBORS]
     counts = np.bincount(np.concatenate([model.seen_by[k] for k in near]), minlength=len(model.centers))
@@ -209,8 +203,6 @@ def measure_distance(
 
     Args:
         a, b: (3,) in the frame of the model.
-        model: cameras and points in that frame.
-        scale: units of exported files per unit of the model.
         deviation: relative, of the scale; None where the unit is arbitrary.
 
     Raises:
@@ -235,9 +227,6 @@ MOST_POINTS = 200_000
 class PosedPhotos:
     """The photos of a model on disk that have a pose.
 
-    Args:
-        model_dir: COLMAP's model.
-
     Raises:
         BackendError: it cannot be read.
     """
@@ -260,7 +249,6 @@ class PosedPhotos:
         """Return the viewing rays of pixels.
 
         Args:
-            photo: that has a pose.
             pixels: (N, 2) as it is laid out; pixel centers at +0.5.
         """
         number = self._ids[photo]
@@ -287,12 +275,7 @@ class PosedPhotos:
 
 
 def layout_scale(photo: Photo, folder: Path) -> float:
-    """Return how much smaller a photo is laid out than its file: 1 where it has its full size, or the file is gone.
-
-    Args:
-        photo: as it is laid out.
-        folder: of the files.
-    """
+    """Return how much smaller a photo is laid out than its file: 1 where it has its full size, or the file is gone."""
     if not photo.needs_copy:
         return 1.0
     try:
@@ -306,7 +289,6 @@ def unrotate_pixels(photo: Photo, upright: FloatArray) -> FloatArray:
     """Return pixels of the upright photo as pixels of the photo as it is laid out, in the sensor's orientation.
 
     Args:
-        photo: its size and by how much it is turned.
         upright: (N, 2) x and y in the upright photo, at its laid-out size.
     """
     x, y = upright[:, 0], upright[:, 1]
@@ -321,9 +303,6 @@ def unrotate_pixels(photo: Photo, upright: FloatArray) -> FloatArray:
 
 def named_photos(photos: tuple[Photo, ...]) -> Mapping[str, Photo]:
     """Return photos by every name that a user may give them: path in the folder, name, and file name where it is one.
-
-    Args:
-        photos: all of them.
     """
     files: dict[str, list[Photo]] = {}
     for photo in photos:

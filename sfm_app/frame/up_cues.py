@@ -216,7 +216,6 @@ def fit_surfaces(
     Args:
         points: (P, 3).
         brightness: (P,) 0 to 255.
-        seen: per photo, the indices of the points that it sees.
         centers: (N, 3) camera centers of the photos.
     """
     from scipy.spatial import cKDTree
@@ -254,7 +253,6 @@ def depth_height_correlation(
         rotations: (N, 3, 3) of cam_from_world.
         centers: (N, 3) of the cameras.
         points: (P, 3) in the world.
-        seen: per photo, the indices of the points that it sees.
     """
     found = []
     for R, center, chosen in zip(rotations, centers, seen, strict=True):
@@ -278,7 +276,6 @@ def mean_upward_normal(up: FloatArray, surfaces: Surfaces) -> float:
 
     Args:
         up: (3,) unit vector in the world.
-        surfaces: patches around the points.
     """
     return float(component_along(surfaces.normals, up).mean()) if len(surfaces.normals) else 0.0
 
@@ -290,7 +287,6 @@ def brightness_normal_correlation(up: FloatArray, surfaces: Surfaces) -> float:
 
     Args:
         up: (3,) unit vector in the world.
-        surfaces: patches around the points.
     """
     if not len(surfaces.normals):
         return 0.0

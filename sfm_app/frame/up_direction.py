@@ -116,12 +116,7 @@ class Cue:
     """Its variance within a scene, times the number of points."""
 
     def nats(self, value: float, points: int) -> float:
-        """Return the log odds of up against down; the cue is normal under both, with opposite means.
-
-        Args:
-            value: of the cue; positive is evidence for up.
-            points: number of surface patches that it comes from.
-        """
+        """Return the log odds of up against down; the cue is normal under both, with opposite means."""
         variance = self.deviation**2 + self.noise / max(points, 1)
         return float(np.clip(2.0 * self.mean * value / variance, -MAX_NATS, MAX_NATS))
 
@@ -172,7 +167,6 @@ def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArra
         rolls: estimates for photos turned by 0, 90, 180, 270 degrees, see `ups_from_roll`; opposites share a vertical.
         rotations: (N, 3, 3) cam_from_world of the photos.
         centers: (N, 3) camera centers.
-        scenery: what the photos show.
     """
     surfaces = fit_surfaces(scenery.points, scenery.brightness, scenery.seen, centers)
     ledges = [slope_asymmetry(roll.up, rotations, scenery.pictures) for roll in rolls[:2]]
@@ -267,8 +261,6 @@ def up_direction(
     Args:
         rotations: (N, 3, 3) cam_from_world of the photos, N >= 1.
         centers: (N, 3) camera centers.
-        scenery: what the photos show; decides which way up they were taken.
-        segments: lines in the photos; may be empty.
         turn_deg: clockwise turn that makes the photos upright: 0, 90, 180 or 270; None if unknown.
     """
     rolls = roll_hypotheses(rotations, centers)
@@ -298,7 +290,6 @@ def viewer_direction(upright: UpEstimate, rotations: FloatArray, points: FloatAr
     It points to the cameras; if lines or walls have a main direction near that, exactly along it.
 
     Args:
-        upright: which way is up.
         rotations: (N, 3, 3) of cam_from_world.
         points: (P, 3) in the world.
     """

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.backend import Reconstruction, translate_errors
 from sfm_app.colmap.model import (
     finite_mask,
     focal_px,
@@ -20,7 +20,6 @@ from sfm_app.colmap.model import (
     seen_points,
     viewing_rays,
 )
-from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import NumericalError
 from sfm_app.frame.georeference import Georeference, NoGeoreference, georeference, position_from_enu
 from sfm_app.frame.up_cues import small_picture
@@ -57,13 +56,7 @@ FutureCues = Mapping[int, "Future[PhotoCues]"]
 
 
 def submit_cue_extraction(models: Sequence[Reconstruction], matches: MatchGraph, run: RunContext) -> FutureCues:
-    """Start to extract cues from some photos of every model, in the background.
-
-    Args:
-        models: models of the scene; no two hold the same photo.
-        matches: knows the names and turns of photos.
-        run: has the photos and the workers.
-    """
+    """Start to extract cues from some photos of every model, in the background."""
     looks = {}
     for model in models:
         posed = posed_photo_ids(model)
@@ -76,11 +69,7 @@ def submit_cue_extraction(models: Sequence[Reconstruction], matches: MatchGraph,
 def orient_or_keep(
     model: Reconstruction, matches: MatchGraph, looks: FutureCues, turn_deg: int | None = None
 ) -> dict[str, Json]:
-    """Turn the model upright; where that fails numerically, leave it unchanged and return the reason.
-
-    Args:
-        model, matches, looks, turn_deg: as in `orient`.
-    """
+    """Turn the model upright; where that fails numerically, leave it unchanged and return the reason."""
     try:
         return orient(model, matches, looks, turn_deg)
     except FAILURES as err:
@@ -98,9 +87,6 @@ def orient(
     """Move the model into the frame of glTF viewers: y up, seen from +z, centered, of size about 1 or in meters.
 
     Args:
-        model: COLMAP's model, colored; changed in place.
-        matches: knows the photos' names and GPS positions.
-        looks: cues of photos.
         turn_deg: angle by which the photos have to be turned clockwise to stand upright; None if unknown.
 
     Returns:
@@ -182,12 +168,7 @@ def _scenery(model: Reconstruction, looks: Mapping[int, PhotoCues]) -> Scenery:
 
 
 def extract_cues(path: Path, turn_deg: int = 0) -> PhotoCues:
-    """Return the line segments of a photo, and a small upright copy of it; empty if OpenCV cannot read the photo.
-
-    Args:
-        path: photo file.
-        turn_deg: angle by which it has to be turned clockwise to stand upright, a multiple of 90.
-    """
+    """Return the line segments of a photo, and a small upright copy of it; empty if OpenCV cannot read the photo."""
     try:
         data = np.fromfile(path, np.uint8)  # OpenCV does not open names beyond ASCII on every system
     except OSError:
@@ -221,11 +202,7 @@ def _orientation_entry(upright: UpEstimate, front: str) -> dict[str, Json]:
 
 
 def gps_deviation(orientation: Mapping[str, Json]) -> float | None:
-    """Return the relative standard deviation of the meter by GPS; None where the unit is arbitrary.
-
-    Args:
-        orientation: entry for the manifest, of `orient_or_keep`.
-    """
+    """Return the relative standard deviation of the meter by GPS; None where the unit is arbitrary."""
     found = orientation.get("georeference")
     percent = found.get("scale_deviation_percent") if isinstance(found, Mapping) else None
     return float(percent) / 100.0 if isinstance(percent, int | float) else None

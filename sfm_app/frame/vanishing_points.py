@@ -104,7 +104,6 @@ def segment_planes(first: FloatArray, second: FloatArray, photo: int, scale_px: 
     Args:
         first: (N, 3) directions from the camera center to one end of each.
         second: (N, 3) to the other end.
-        photo: the photo's number.
         scale_px: focal length in pixels, to turn angles into lengths.
     """
     a, b = normalize(first), normalize(second)
@@ -139,7 +138,6 @@ def find_vanishing_direction(start: FloatArray, segments: Segments) -> Vanishing
 
     Args:
         start: (3,) unit vector.
-        segments: of all photos.
     """
     if len(segments) < LEAST_SEGMENTS or not segments.lengths.sum() > 0.0:
         return None
@@ -157,7 +155,6 @@ def level_direction(up: FloatArray, segments: Segments) -> FloatArray | None:
 
     Args:
         up: (3,) unit vector in the world.
-        segments: of all photos.
     """
     on_horizon = np.abs(component_along(segments.normals, up)) > np.cos(np.radians(SEPARATION_DEG))
     level = segments.take(~on_horizon & (_residuals_deg(up, segments) > SEPARATION_DEG / 2))
@@ -185,7 +182,6 @@ def fit_orthogonal_frame(up: FloatArray, level: FloatArray, segments: Segments) 
     Args:
         up: (3,) unit vector near the first direction.
         level: (3,) unit vector near the second, perpendicular to `up`.
-        segments: of all photos.
 
     Returns:
         (3, 3) with the directions as rows, and the standard deviation of the first in degrees, see
@@ -228,7 +224,6 @@ def refine_direction(direction: FloatArray, segments: Segments) -> FloatArray:
 
     Args:
         direction: (3,) unit vector to start from.
-        segments: of all photos.
     """
     for width_deg in WIDTHS_DEG:
         for _ in range(10):

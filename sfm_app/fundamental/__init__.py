@@ -1,23 +1,22 @@
 """Robust estimation of fundamental matrices (thesis, chapter 4).
 
-An estimator is an `estimator_config.Recipe`: sampler, solver, score, verifier, stopping rule and final fit.
-`loop.search` runs it, `estimate.estimate` judges its model, and `estimate.estimate_with` judges the models of other
-libraries. `lev_ransac` is the estimator that the program uses; `estimator_configs` has the others.
+An estimator is a `loop.Recipe`: sampler, solver, score, pre-test, stopping rule and final fit. In the order of a run:
 
-From matches to the answer, in the order of a run:
+1. `points` checks and scales the matches.
+2. `loop` draws `samples`, solves (`solvers`), tests (`pretests`) and scores (`scores`) until a stopping rule holds.
+3. `refits` computes the final F.
+4. `estimate` asks whether the support can be chance (`a_contrario`) and whether the matches determine F (`degeneracy`).
 
-1. `points`: check and scale the matches.
-2. `loop` and `inner_loop`: draw (`sampling`), solve (`solvers`), test and score (`verification`, `scoring`), until
-   `sampling.stopping` or `sampling.termination` ends the search; `best_model` holds the best model so far.
-3. `refine`: the final fit.
-4. `estimate`: could the support be chance (`verification.a_contrario`), and do the matches determine F (`degeneracy`)?
+`lev_ransac` is the program's estimator, `rays` the one for known lenses, `recipes` has the thesis's.
 
-docs/symbols.md has the symbols of the thesis and their names here.
+In all modules `points` are (N, 4) matches x1, y1, x2, y2 in random order and of magnitude about 1; `F` is (3, 3) and
+`f` its (9,) entries by rows; `threshold` is the largest distance of an inlier in the unit of the points. The same seed
+gives the same bytes. docs/symbols.md has the symbols of the thesis and their names here.
 """
 
 from collections.abc import Callable
 
-from sfm_app.fundamental.estimate import estimate_with, judge
+from sfm_app.fundamental.estimate import assess_fundamental, estimate_with
 from sfm_app.fundamental.lev_ransac import fit_lev_ransac
 from sfm_app.fundamental.points import check_points
 from sfm_app.fundamental.recipes import RECIPES, classical_estimator
@@ -31,6 +30,6 @@ ESTIMATORS: dict[str, tuple[FitFundamentalLike, str]] = {
     "lev-ransac": (fit_lev_ransac, "samples guided by Cook's distances, local optimization, robust refit; the default"),
     **{name: (classical_estimator(name), about) for name, (_, about) in RECIPES.items()},
 }
-"""By name: the function that fits, and one line about it."""
+"""By name: the estimator and one line about it."""
 
-__all__ = ["ESTIMATORS", "FitFundamentalLike", "check_points", "estimate_with", "judge"]
+__all__ = ["ESTIMATORS", "FitFundamentalLike", "assess_fundamental", "check_points", "estimate_with"]

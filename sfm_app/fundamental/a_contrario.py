@@ -11,16 +11,8 @@ from sfm_app.jit import kernel
 from sfm_app.types.arrays import FloatArray
 
 MOST_FALSE_ALARMS = 1e-2
-"""Support counts as real when fewer than this number of models with as much are expected in random matches.
+"""Expected number of models with as much support in random matches, above which support counts as chance.
 docs/algorithms.md, All estimators. Chosen by hand; not measured on its own."""
-
-_FRACTIONS = (1.0, 0.5, 0.25)
-"""Support is judged at these fractions of the threshold: precise inliers are stronger evidence. docs/algorithms.md, All
-estimators. Chosen by hand; not measured on their own."""
-_MISMATCHES = 8000
-"""Approximate number of mismatches that measure chance agreement. Chosen by hand; not measured on its own."""
-_LARGEST_COUNT = 1e300
-"""Largest number of false alarms that is returned: near the largest number in double precision."""
 
 
 def model_false_alarms(squared: FloatArray, wrong: FloatArray, threshold: float) -> float:
@@ -28,48 +20,32 @@ def model_false_alarms(squared: FloatArray, wrong: FloatArray, threshold: float)
 
     Args:
         squared: (N,) squared distances of the matches to the model.
-        wrong: (M,) those of mismatches, from `a_contrario.squared_mismatch_distances`.
-        threshold: largest distance of an inlier.
+        wrong: (M,) those of mismatches, from `squared_mismatch_distances`.
     """
-    tried = []
-    for fraction in _FRACTIONS:
+    fractions = 1.0, 0.5, 0.25  # precise inliers are stronger evidence; docs/algorithms.md, All estimators
+    alarms = []
+    for fraction in fractions:
         inliers = int(np.count_nonzero(squared <= (fraction * threshold) ** 2))
         chance = accidental_share(wrong, fraction * threshold)
-        tried.append(false_alarms(len(squared), inliers, SAMPLE_SIZE, chance))
-    return min(_LARGEST_COUNT, len(_FRACTIONS) * MOST_MODELS * min(tried))
+        alarms.append(false_alarms(len(squared), inliers, SAMPLE_SIZE, chance))
+    return min(1e300, len(fractions) * MOST_MODELS * min(alarms))
 
 
 def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> float:
-    """Return the expected number of minimal samples whose model has this many inliers, if every match is wrong.
+    """Return an upper bound, at most 1e300, of the samples whose model has so many inliers if all matches are wrong.
 
-    Each of the C(count, s) samples agrees with itself, and with each of the other matches by chance, so that the
-    expectation is C(count, s) P(Binomial(count - s, chance) >= inliers - s).
-
-    Args:
-        count: number of matches.
-        inliers: number of matches that agree with the model.
-        sample_size: s, the matches that determine a model.
-        chance: probability that a wrong match agrees with a model, in (0, 1).
-
-    Returns:
-        An upper bound of the number, at most 1e300.
+    Each of the C(count, s) samples agrees with itself, and with each of the other matches by chance: the expectation is
+    C(count, s) P(Binomial(count - s, chance) >= inliers - s).
     """
     if inliers <= sample_size:
-        return _LARGEST_COUNT
+        return 1e300
     logarithm = _log_choose(count, sample_size) + log_binomial_tail(count - sample_size, inliers - sample_size, chance)
-    return min(_LARGEST_COUNT, math.exp(min(logarithm, 700.0)))
+    return min(1e300, math.exp(min(logarithm, 700.0)))
 
 
 def squared_mismatch_distances(points: FloatArray, f: FloatArray) -> FloatArray:
-    """Return (M,) squared Sampson distances of deliberate mismatches.
-
-    Each pairs a point of view 1 with the partner of another point.
-
-    Args:
-        points: (N, 4) distinct matches in random order, N >= 2.
-        f: (9,) model.
-    """
-    return _shifted_distances(points, f, min(len(points) - 1, max(1, _MISMATCHES // len(points))))
+    """Return (M,) squared Sampson distances of points of view 1 with the partners of other points; N >= 2."""
+    return _shifted_distances(points, f, min(len(points) - 1, max(1, 8000 // len(points))))
 
 
 @kernel
@@ -86,25 +62,15 @@ def _shifted_distances(points: FloatArray, f: FloatArray, shifts: int) -> FloatA
 
 
 def accidental_share(wrong: FloatArray, threshold: float) -> float:
-    """Return the probability that a wrong match agrees with a model, in (0, 1).
+    """Return the probability that a wrong match agrees with a model, in (0, 1), from squared mismatch distances (M,).
 
-    It is measured, not modeled, and so includes the extent of the photos, clusters of points and the epipoles.
-
-    Args:
-        wrong: (M,) squared distances of mismatches to the model.
-        threshold: largest distance of an inlier, in the same units.
+    Measured, not modeled: it includes the extent of the photos, clusters of points and the epipoles.
     """
     return (int(np.count_nonzero(wrong <= threshold * threshold)) + 1.0) / (len(wrong) + 2.0)
 
 
 def log_binomial_tail(count: int, least: int, chance: float) -> float:
-    """Return an upper bound of log P(Binomial(count, chance) >= least) (Chernoff 1952).
-
-    Args:
-        count: number of trials, > 0.
-        least: least number of successes.
-        chance: probability of one success, in (0, 1).
-    """
+    """Return an upper bound of log P(Binomial(count, chance) >= least) (Chernoff 1952); `chance` in (0, 1)."""
     share = least / count
     if share <= chance:
         return 0.0

@@ -1,6 +1,7 @@
 """Matches that do not determine a fundamental matrix: planes, watermarks, too few points."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,44 +17,23 @@ from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
 from sfm_app.types.arrays import BoolArray, FloatArray
 
-# The plane that holds most of a model's inliers, and the matches off it.
-#
-# Hartley and Zisserman (2004), Result 13.6, as a regression whose weights are ours.
-#
-# Where one homography H explains the matches, every F = [e]x H does, for any epipole e: the estimator then picks
-# the e that gets the most inliers by chance. The evidence for an epipole is matches off the plane.
+# Dominant plane: the plane with most of a model's inliers, and the matches off it. Hartley and Zisserman (2004),
+# Result 13.6, as a regression whose weights are ours. Where one homography H explains the matches, every F = [e]x H
+# does, for any epipole e. Only matches off the plane are evidence for an epipole.
 
 OFF_PLANE = 2.0
-"""Transfer distance in thresholds beyond which a match is off the plane. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-_PLANE_SAMPLES, _PLANE_SAMPLE_SIZE = 64, 3
-"""Samples of three matches: a plane that holds half of them is missed twice in ten thousand times, (7/8)^64. Chosen by
-hand; halved and doubled by `benchmarks.sensitivity`."""
-_LEAST_AREA = 1e-3
-"""Twice the area of the triangle of a sample, in squares of the points' spread: thinner ones determine no plane. Chosen
-by hand; halved and doubled by `benchmarks.sensitivity`."""
-_MOST_SCORED_ON_PLANE = 300
-"""Matches that a sampled plane is scored on. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-_LEAST_SUPPORT = 1e-12
-"""Smallest over largest eigenvalue of the regression for a plane. Double precision leaves 1e-16 of the largest. Chosen
-by hand; halved and doubled by `benchmarks.sensitivity`."""
+"""Transfer distance in thresholds beyond which a match is off the plane. Chosen by hand."""
+_MOST_SCORED = 300
+"""Inliers that sampled planes and lines are scored on, and a dominant plane is fitted to. Chosen by hand."""
 
 
 @kernel
 def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """Return the homography of the plane that holds the most matches, among those compatible with F.
+    """Return H (3, 3), x2 ~ H x1, of the plane that holds the most of F's inliers, N >= 3, compatible with F.
 
-    Such homographies are H = A - e2 v' with A = [e2]x F and v' x1 = b for every match on the plane, where
-    b = (x2 x A x1)'(x2 x e2) / |x2 x e2|^2 (Hartley and Zisserman, Result 13.6): a linear regression with three
-    parameters. Its noise is proportional to 1 / |x2 x e2|, so each match has the weight |x2 x e2|^2.
-
-    Args:
-        points: (N, 4) inliers of F in random order, N >= 3.
-        F: (3, 3).
-        threshold: largest distance of a match to the plane.
-
-    Returns:
-        (3, 3), x2 ~ H x1.
+    Such homographies are H = A - e2 v' with A = [e2]x F and v' x1 = b for every match on the plane, where b = (x2 x A
+    x1)'(x2 x e2) / |x2 x e2|^2 (Hartley and Zisserman, Result 13.6): a linear regression with three parameters. Its
+    noise is proportional to 1 / |x2 x e2|, so each match has the weight |x2 x e2|^2.
     """
     U, _, _ = factorize(F)
     e2, A = np.empty(3), np.empty((3, 3))
@@ -72,7 +52,7 @@ def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> 
             on_plane += 1
         else:
             weights[i] = 0.0
-    if on_plane >= _PLANE_SAMPLE_SIZE and _fit_plane(points, b, weights, best):
+    if on_plane >= 3 and _fit_plane(points, b, weights, best):
         H = _homography(A, e2, best)
     return H
 
@@ -97,17 +77,14 @@ def _plane_equations(points: FloatArray, A: FloatArray, e2: FloatArray) -> tuple
         pz = A[2, 0] * x1 + A[2, 1] * y1 + A[2, 2]
         tx, ty, tz = y2 * e2[2] - e2[1], e2[0] - x2 * e2[2], x2 * e2[1] - y2 * e2[0]
         weights[i] = tx * tx + ty * ty + tz * tz
-        along = (y2 * pz - py) * tx + (px - x2 * pz) * ty + (x2 * py - y2 * px) * tz
-        b[i] = along / max(weights[i], 1e-300)
+        moment = (y2 * pz - py) * tx + (px - x2 * pz) * ty + (x2 * py - y2 * px) * tz
+        b[i] = moment / max(weights[i], 1e-300)
     return b, weights
 
 
 @kernel
 def _fit_plane(points: FloatArray, b: FloatArray, weights: FloatArray, plane: FloatArray) -> bool:
-    """Fit v' x1 = b by weighted least squares and write v to `plane` (3,).
-
-    Returns False and writes nothing for points on one line.
-    """
+    """Fit v' x1 = b by weighted least squares and write v to `plane` (3,); return False for points on one line."""
     gram, values, vectors = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
     right, row = np.zeros(3), np.ones(3)
     for i in range(points.shape[0]):
@@ -117,47 +94,47 @@ def _fit_plane(points: FloatArray, b: FloatArray, weights: FloatArray, plane: Fl
             for k in range(3):
                 gram[j, k] += weights[i] * row[j] * row[k]
     decompose_symmetric(gram, values, vectors)
-    if not values[0] > _LEAST_SUPPORT * values[2]:
+    if not values[0] > 1e-12 * values[2]:
         return False
     for j in range(3):
         plane[j] = 0.0
     for n in range(3):
-        along = 0.0
+        projection = 0.0
         for j in range(3):
-            along += vectors[j, n] * right[j]
+            projection += vectors[j, n] * right[j]
         for j in range(3):
-            plane[j] += along / values[n] * vectors[j, n]
+            plane[j] += projection / values[n] * vectors[j, n]
     return True
 
 
 @kernel
 def _sample_plane(points: FloatArray, b: FloatArray, A: FloatArray, e2: FloatArray, limit: float) -> FloatArray:
     """Return the v through three sampled matches whose H maps most of the first matches to within sqrt(limit)."""
-    count, most, state = min(points.shape[0], _MOST_SCORED_ON_PLANE), -1, np.empty(1, dtype=np.uint64)
+    count, most, state = min(points.shape[0], _MOST_SCORED), -1, np.empty(1, dtype=np.uint64)
     best, corner, v = np.zeros(3), np.empty(3, dtype=np.int64), np.empty(3)
     state[0] = count
     mapped = np.empty((3, count))
     for i in range(count):
         for r in range(3):
             mapped[r, i] = A[r, 0] * points[i, 0] + A[r, 1] * points[i, 1] + A[r, 2]
-    for _ in range(_PLANE_SAMPLES):
+    for _ in range(64):  # misses a plane with half of the matches twice in ten thousand times, (7/8)^64
         for k in range(3):
             corner[k] = int(uniform(state) * count)
         p, q, r = corner[0], corner[1], corner[2]
         x, y = points[q, 0] - points[p, 0], points[q, 1] - points[p, 1]
         z, w = points[r, 0] - points[p, 0], points[r, 1] - points[p, 1]
         area = x * w - z * y
-        if not abs(area) > _LEAST_AREA:
+        if not abs(area) > 1e-3:  # thinner triangles determine no plane
             continue
         v[0] = ((b[q] - b[p]) * w - (b[r] - b[p]) * y) / area
         v[1] = (x * (b[r] - b[p]) - z * (b[q] - b[p])) / area
         v[2] = b[p] - v[0] * points[p, 0] - v[1] * points[p, 1]
         on_plane = 0
         for i in range(count):
-            along = v[0] * points[i, 0] + v[1] * points[i, 1] + v[2]
-            depth = mapped[2, i] - e2[2] * along
-            dx = mapped[0, i] - e2[0] * along - points[i, 2] * depth
-            dy = mapped[1, i] - e2[1] * along - points[i, 3] * depth
+            shift = v[0] * points[i, 0] + v[1] * points[i, 1] + v[2]
+            depth = mapped[2, i] - e2[2] * shift
+            dx = mapped[0, i] - e2[0] * shift - points[i, 2] * depth
+            dy = mapped[1, i] - e2[1] * shift - points[i, 3] * depth
             on_plane += dx * dx + dy * dy <= limit * depth * depth
         if on_plane > most:
             most = on_plane
@@ -167,12 +144,7 @@ def _sample_plane(points: FloatArray, b: FloatArray, A: FloatArray, e2: FloatArr
 
 
 def transfer_distance(H: FloatArray, points: FloatArray) -> FloatArray:
-    """Return (N,) |x2 - H x1| / sqrt(2): about the distance in 4D of (x1, x2) to the nearest match that fits H exactly.
-
-    Args:
-        H: (3, 3) homography, view 2 from view 1.
-        points: (N, 4) matches, in the same frame.
-    """
+    """Return (N,) |x2 - H x1| / sqrt(2), about the distance in 4D of (x1, x2) to the nearest match that fits H."""
     return np.sqrt(_squared_transfer_distances(points, H))
 
 
@@ -188,38 +160,34 @@ def _squared_transfer_distances(points: FloatArray, H: FloatArray) -> FloatArray
     return squared
 
 
-# Matches that do not determine F: all on one line of a photo, on one plane, or from a camera that did not move.
-#
-# Ours, with Hartley and Zisserman (2004), 11.9, on the parameters that a line or a plane leaves free, and Moisan
-# and Stival (2004) on chance.
-#
-# Matches on a line of one view leave two parameters of F free, on a line of both views four. As many other matches
-# fix them, even mismatches: the evidence is more matches off the line than expected by chance. In the same way the
-# evidence for an epipole is matches off the dominant plane (see `dominant_plane`).
+# Degenerate matches: all on one line of a photo, on one plane, or from a camera that only rotated. Ours, with Hartley
+# and Zisserman (2004), 11.9, and Moisan and Stival (2004) on chance. Matches on a line of one view leave two
+# parameters of F free, on a line of both views four. As many other matches fix them, even mismatches. The evidence is
+# more matches off the line, or off the plane, than expected by chance.
 
-_LINE_SAMPLE, _PARALLAX_SAMPLE = 4, 2
-"""Matches that fix the parameters of F that a line, or a plane, leaves free. Counted: parameters of F
-(docs/algorithms.md, All estimators)."""
-_OFF_LINE = 2.0
-"""Distance in thresholds beyond which a match is off the line, as for planes `dominant_plane.OFF_PLANE`. Chosen by
-hand; halved and doubled by `benchmarks.sensitivity`."""
-_LINES, _MOST_SCORED = 16, 300
-"""Sampled lines, and the inliers that each is scored on. A relevant line holds most inliers, so few samples find it:
-one of 16 pairs lies on a line that holds half of them 99 times in 100. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-_EXTENT_QUANTILES = (0.01, 0.99)
-"""Quantiles that bound the points of a view, without a few gross outliers. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-_FOCALS = np.geomspace(0.4, 6.0, 60)
-"""Focal lengths that are tried for a rotation, in sides of the box around the points. Chosen by hand; halved and
-doubled by `benchmarks.sensitivity`."""
-_LEAST_PARALLAX_SHARE = 0.05
-"""Share of the inliers off the plane below which a rotation counts as one. Mismatches on rows of bricks share a
-vanishing point: they agree with an epipole there far more often than by chance. On the real photo sets no pair has such
-a homography and less than 40 % off it (docs/algorithms.md, All estimators)."""
-_ROTATION_TOLERANCE = 0.05
-"""Largest relative stretch of a homography that counts as a rotation, for some focal length; a rotation has none.
-Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+
+@dataclass(frozen=True, slots=True)
+class DegeneracyOptions:
+    """When matches count as degenerate."""
+
+    line_sample: int = 4
+    """Matches that fix the parameters of F that a line leaves free. Counted (docs/algorithms.md, All estimators)."""
+    parallax_sample: int = 2
+    """Matches that fix the parameters of F that a plane leaves free. Counted (docs/algorithms.md, All estimators)."""
+    off_line: float = 2.0
+    """Distance in thresholds beyond which a match is off the line. Chosen by hand, as `OFF_PLANE`."""
+    extent_quantiles: tuple[float, float] = (0.01, 0.99)
+    """Quantiles that bound the points of a view, without a few gross outliers. Chosen by hand."""
+    focals: tuple[float, float, int] = (0.4, 6.0, 60)
+    """Focal lengths that a rotation may have, in sides of the box around the points: range, number. Chosen by hand."""
+    least_parallax_share: float = 0.05
+    """Share of the inliers off the plane below which a rotation counts as one (docs/algorithms.md, All estimators).
+    Mismatches on rows of bricks agree with a vanishing point as epipole far more often than by chance."""
+    rotation_tolerance: float = 0.05
+    """Largest relative stretch of a rotation's homography, for some focal length. Chosen by hand."""
+
+
+DEGENERACY = DegeneracyOptions()
 
 
 def find_degeneracy(
@@ -228,50 +196,37 @@ def find_degeneracy(
     """Return the kind of degeneracy that leaves F undetermined.
 
     Args:
-        points: (N, 4) matches in random order.
-        F: (3, 3) the model.
         inliers: (N,) mask, at least 3 of them True.
-        wrong: (M,) squared distances of mismatches to F, from `a_contrario.squared_mismatch_distances`.
-        threshold: largest distance of an inlier.
+        wrong: (M,) squared distances of mismatches to F, from `squared_mismatch_distances`.
         centers: (4,) the origin of `points` in a frame that both views share, in the same units.
 
     Returns:
-        "collinear" where all matches lie on one line of a photo or at one point (except for a few that may be chance),
-        "rotation" where the camera only rotated, "planar" where all matches lie on one plane or too close to one, ""
-        where F is determined.
+        "collinear" where all matches lie on one line of a photo or at one point (up to a few that may be chance),
+            "rotation" where the camera only rotated, "planar" where all matches lie on one plane or too close to it, ""
+            where F is determined.
     """
     chance = accidental_share(wrong, threshold)
     for view in range(2):
-        off_line = off_line_mask(points, inliers, view, _OFF_LINE * threshold)
-        if _can_be_accident(off_line, inliers, _LINE_SAMPLE, chance):
+        off_line = off_line_mask(points, inliers, view, DEGENERACY.off_line * threshold)
+        if _can_be_chance(off_line, inliers, DEGENERACY.line_sample, chance):
             return "collinear"
     H = dominant_homography(np.asfortranarray(points[inliers]), F, threshold)
     off_plane = transfer_distance(H, points) > OFF_PLANE * threshold
-    planar = _can_be_accident(off_plane, inliers, _PARALLAX_SAMPLE, chance)
+    planar = _can_be_chance(off_plane, inliers, DEGENERACY.parallax_sample, chance)
     parallax = np.count_nonzero(off_plane & inliers) / np.count_nonzero(inliers)
-    if (planar or parallax < _LEAST_PARALLAX_SHARE) and is_rotation(H, points, centers):
+    if (planar or parallax < DEGENERACY.least_parallax_share) and is_rotation(H, points, centers):
         return "rotation"
     return "planar" if planar else ""
 
 
-def _can_be_accident(off: BoolArray, inliers: BoolArray, sample_size: int, chance: float) -> bool:
+def _can_be_chance(off: BoolArray, inliers: BoolArray, sample_size: int, chance: float) -> bool:
     """Return whether the inliers among the matches `off` a line or plane could all be mismatches."""
     agreeing = int(np.count_nonzero(off & inliers))
     return false_alarms(int(np.count_nonzero(off)), agreeing, sample_size, chance) > MOST_FALSE_ALARMS
 
 
 def off_line_mask(points: FloatArray, inliers: BoolArray, view: int, width: float) -> BoolArray:
-    """Return which matches lie further than `width` from the line that holds the most inliers of a view.
-
-    Args:
-        points: (N, 4) matches in random order.
-        inliers: (N,) mask, at least one of them True.
-        view: 0 or 1.
-        width: in the units of `points`.
-
-    Returns:
-        (N,) mask.
-    """
+    """Return (N,) which matches lie further than `width` from the line with the most inliers (N,) of view 0 or 1."""
     x, y = points[:, 2 * view], points[:, 2 * view + 1]
     a, b, c = _dominant_line(x[inliers], y[inliers], width)
     return np.asarray(np.abs(a * x + b * y + c) > width)
@@ -282,7 +237,7 @@ def _dominant_line(x: FloatArray, y: FloatArray, width: float) -> tuple[float, f
     """Return the line a x + b y + c = 0, a^2 + b^2 = 1, through two sampled points, near most of the first points."""
     count, most, best, state = x.shape[0], -1, (1.0, 0.0, 0.0), np.empty(1, dtype=np.uint64)
     state[0] = count
-    for _ in range(_LINES):
+    for _ in range(16):  # misses a line with half of the inliers once in a hundred times
         i, j = int(uniform(state) * count), int(uniform(state) * count)
         a, b = y[i] - y[j], x[j] - x[i]
         norm = np.sqrt(a * a + b * b)
@@ -299,39 +254,27 @@ def is_rotation(H: FloatArray, points: FloatArray, centers: FloatArray) -> bool:
     """Return whether H = K R K^-1 for one focal length, with the center in the middle of the points of both views.
 
     Args:
-        H: (3, 3) homography, view 2 from view 1, in the frame of the points.
-        points: (N, 4) matches.
         centers: (4,) the origin of `points` in a frame that both views share, in the same units.
     """
-    placed = points + centers
-    low, high = np.quantile(np.vstack([placed[:, :2], placed[:, 2:]]), _EXTENT_QUANTILES, axis=0)
+    shifted = points + centers
+    low, high = np.quantile(np.vstack([shifted[:, :2], shifted[:, 2:]]), DEGENERACY.extent_quantiles, axis=0)
     middle, side = (low + high) / 2, float((high - low).max())
     to1, to2 = _translation(middle - centers[:2]), _translation(centers[2:] - middle)
-    for focal in _FOCALS * side:
+    for focal in np.geomspace(*DEGENERACY.focals) * side:
         K = np.diag([focal, focal, 1.0])
         stretch = np.linalg.svd(np.linalg.inv(K) @ to2 @ H @ to1 @ K, compute_uv=False)
-        if stretch[0] <= (1 + _ROTATION_TOLERANCE) * stretch[2]:
+        if stretch[0] <= (1 + DEGENERACY.rotation_tolerance) * stretch[2]:
             return True
     return False
 
 
-def _translation(by: FloatArray) -> FloatArray:
-    return np.array([[1, 0, by[0]], [0, 1, by[1]], [0, 0, 1]], dtype=np.float64)
+def _translation(t: FloatArray) -> FloatArray:
+    return np.array([[1, 0, t[0]], [0, 1, t[1]], [0, 0, 1]], dtype=np.float64)
 
 
-# Plane and parallax: the right epipole for a model found on a dominant plane (after Chum, Werner and Matas 2005).
-#
-# Samples from a scene with one large plane mostly lie on it; their F has the right homography H of the plane, but a
-# wrong epipole. With H given, two matches off the plane are a minimal sample: the lines from H x1 to x2 meet in the
-# epipole.
-
-_PARALLAX_SAMPLES = 100
-"""Samples of two matches off the plane. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-_LEAST_INLIERS = 8
-"""Fewer do not determine the dominant plane. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-_MOST_INLIERS = 300
-"""Largest number of inliers that the plane is fitted to. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
+# Plane and parallax: the right epipole for a model of a dominant plane (after Chum, Werner and Matas 2005). Samples
+# from one large plane give its homography H but a wrong epipole. With H given, two matches off the plane are a
+# minimal sample: the lines from H x1 to x2 meet in the epipole.
 
 
 def recover_epipole(
@@ -339,24 +282,19 @@ def recover_epipole(
 ) -> FloatArray | None:
     """Estimate the best model with the dominant plane of F's inliers; None without a plane and two matches off it.
 
-    Args:
-        points, F: (N, 4) in random order, and (3, 3).
-        threshold: largest distance of an inlier.
-        loss: the penalty.
-        pretest: the test that a model has to pass, without a random start.
-        state: random generator.
+    `points` are in random order; `pretest` has no random start.
     """
     inliers = squared_distances(points, np.ascontiguousarray(F).reshape(9)) <= threshold * threshold
-    if np.count_nonzero(inliers) < _LEAST_INLIERS:
+    if np.count_nonzero(inliers) < 8:
         return None
-    chosen = np.asfortranarray(points[np.flatnonzero(inliers)[:_MOST_INLIERS]])
+    chosen = np.asfortranarray(points[np.flatnonzero(inliers)[:_MOST_SCORED]])
     H = dominant_homography(chosen, F, threshold)
     off_plane = np.flatnonzero(transfer_distance(H, points) > OFF_PLANE * threshold)
     if len(off_plane) < 2:
         return None
     best = np.empty(9)
-    found = _search_epipole(points, H, off_plane, loss, pretest, state, best)
-    return best.reshape(3, 3) if np.isfinite(found) else None
+    lowest = _search_epipole(points, H, off_plane, loss, pretest, state, best)
+    return best.reshape(3, 3) if np.isfinite(lowest) else None
 
 
 @kernel
@@ -365,7 +303,7 @@ def _search_epipole(
     best: FloatArray,
 ) -> float:  # fmt: skip
     lowest, line, f = np.inf, np.empty((2, 3)), np.empty(9)
-    for _ in range(_PARALLAX_SAMPLES):
+    for _ in range(100):
         for k in range(2):
             i = off_plane[int(uniform(state) * off_plane.shape[0])]
             hx = H[0, 0] * points[i, 0] + H[0, 1] * points[i, 1] + H[0, 2]
@@ -396,70 +334,72 @@ def _search_epipole(
     return lowest
 
 
-# Matches that stay in place while the scene moves: logos, time stamps, dust, or the same photo twice.
-#
-# Ours; the name is COLMAP's.
-#
-# A logo agrees with F = [t]x for any t, so that enough of its matches make the camera appear not to rotate. A scene
-# may also stay in place in the image, such as an object that the photographer kept in the middle. A logo differs by
-# its peak: displacements of a scene vary smoothly with depth and position, and are 0 no more often than any value
-# near 0.
+# Watermarks: logos, time stamps, dust, or the same photo twice. Ours; the name is COLMAP's. A logo agrees with F =
+# [t]x for any t, so that enough of its matches hide the rotation. A scene may stay in place, too. A logo differs by
+# its peak: displacements of a scene vary smoothly, and are 0 no more often than any value near 0.
 
 Fit = Callable[[FloatArray, FloatArray, EpipolarSettings, int], EpipolarFit | Rejected]
 
 SAME_PHOTO = "the same photo twice, or nearly"
 ONLY_A_LOGO = "nothing in common but a logo or time stamp"
 
-PEAK, STATIONARY, RING = 1.0, 2.0, 4.0
-"""Largest displacements at the peak, of stationary matches, and of the ring around the peak, in units of keypoint
-noise. Checked on the real photo sets, where they affect one pair of 456 (docs/algorithms.md, All estimators)."""
-LEAST_PEAK = 8
-"""Least number of matches at the peak; fewer are left to the estimator. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-MOST_LOST = 0.2
-"""Share of the stationary matches, or of the others, that may be removed from the scene with a logo.
-docs/algorithms.md, All estimators. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-CELLS, WIDE_SHARE = 8, 0.25
-"""Cells of the photo along each side, and the share of the cells with keypoints that a logo does not exceed. Chosen by
-hand; halved and doubled by `benchmarks.sensitivity`."""
-EXPLAINED_SHARE = 0.9
-"""Share of the stationary matches that a motion without rotation explains. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
+
+@dataclass(frozen=True, slots=True)
+class WatermarkOptions:
+    """When matches that stay in place are no part of the scene."""
+
+    peak: float = 1.0
+    """Largest displacement at the peak, in units of keypoint noise (docs/algorithms.md, All estimators)."""
+    stationary: float = 2.0
+    """Largest displacement of a stationary match, in the same unit (docs/algorithms.md, All estimators)."""
+    ring: float = 4.0
+    """Outer radius of the ring around the peak, in the same unit (docs/algorithms.md, All estimators)."""
+    least_peak: int = 8
+    """Least number of matches at the peak; the estimator copes with fewer. Chosen by hand."""
+    most_lost: float = 0.2
+    """Largest share of the stationary matches, or of the others, that the scene loses with a logo
+    (docs/algorithms.md, All estimators). Chosen by hand."""
+    cells: int = 8
+    """Cells of a photo along each side. Chosen by hand."""
+    wide_share: float = 0.25
+    """Share of the cells with keypoints that a logo does not exceed. Chosen by hand."""
+    explained_share: float = 0.9
+    """Share of the stationary matches that a motion without rotation explains. Chosen by hand."""
+
+
+WATERMARK = WatermarkOptions()
 
 
 def find_stationary(x1: FloatArray, x2: FloatArray, unit_px: float = 1.0) -> BoolArray:
-    """Find the matches that stay in place although the others move, or because nothing moves at all.
+    """Find the matches (N,) that stay in place although the others move, or because nothing moves at all.
 
     The displacements of a scene are spread along a curve or over an area around 0: between one and four units there are
-    at least three times as many as below one. Matches count as stationary where the peak holds no fewer than that
-    ring, and where few matches of the scene are lost: video frames in which all move by a few pixels keep theirs.
+    at least three times as many as below one. Matches are stationary where the peak holds no fewer than that ring, and
+    where the scene loses few matches: video frames in which all move by a few pixels keep theirs.
 
     Args:
-        x1: (N, 2) pixels.
-        x2: (N, 2) pixels in a photo of the same size.
-        unit_px: generous noise of the keypoints; more than 1 where they were found in a smaller image.
-
-    Returns:
-        (N,) mask; all False where there is no such peak.
+        x1, x2: (N, 2) pixels in two photos of the same size.
+        unit_px: generous noise of the keypoints; more than 1 where they were detected in a smaller image.
     """
     squared = np.square(x2 - x1).sum(axis=1) / unit_px**2
-    peak, held, reached = (int(np.count_nonzero(squared <= steps**2)) for steps in (PEAK, STATIONARY, RING))
-    ring = reached - peak
+    peak, stationary, within_ring = (
+        int(np.count_nonzero(squared <= radius**2)) for radius in (WATERMARK.peak, WATERMARK.stationary, WATERMARK.ring)
+    )
+    ring = within_ring - peak
     # of a scene on a line through 0, each unit of displacement holds a third of the ring
-    lost = ring * STATIONARY / (RING - PEAK)
-    is_peak = peak >= max(LEAST_PEAK, ring) and lost <= MOST_LOST * max(held, len(x1) - held)
-    return squared <= STATIONARY**2 if is_peak else np.zeros(len(x1), bool)
+    lost = ring * WATERMARK.stationary / (WATERMARK.ring - WATERMARK.peak)
+    is_peak = peak >= max(WATERMARK.least_peak, ring) and lost <= WATERMARK.most_lost * max(
+        stationary, len(x1) - stationary
+    )
+    return squared <= WATERMARK.stationary**2 if is_peak else np.zeros(len(x1), bool)
 
 
 def is_widespread(points: FloatArray, keypoints: FloatArray, size: tuple[int, int]) -> bool:
-    """Return whether points are spread over a large part of a photo.
-
-    Args:
-        points: (N, 2) pixels.
-        keypoints: (M, 2) pixels of all keypoints of the photo.
-        size: (width, height) of the photo in pixels.
+    """Return whether points (N, 2) cover a large part of a photo, compared with all its keypoints (M, 2); all in
+    pixels.
     """
-    return len(_occupied_cells(points, size)) > WIDE_SHARE * len(_occupied_cells(keypoints, size))
+    occupied, with_keypoints = (len(np.unique(_cells(some, size))) for some in (points, keypoints))
+    return occupied > WATERMARK.wide_share * with_keypoints
 
 
 def fit_moving(
@@ -468,49 +408,40 @@ def fit_moving(
 ) -> EpipolarFit | Rejected:  # fmt: skip
     """Estimate the epipolar geometry of the moving matches; the stationary ones are no inliers and have prior 0.
 
-    Where the camera moved without rotation, distant objects stay in place, too: stationary matches all over the photo
-    that agree with the geometry of the others belong to the scene, and all matches are fitted together.
+    Where the camera moved without rotation, distant objects stay in place, too. Widespread stationary matches that
+    agree with the geometry of the others belong to the scene, and all matches are fitted together.
 
     Args:
-        fit: the estimator.
         points: x1, x2, each (N, 2) pixels.
         stationary: (N,) mask from `find_stationary`.
-        wide: whether these lie all over the photo, see `watermark.is_widespread`.
-        options: settings of the estimator.
-        seed: seed of the estimator.
+        wide: `is_widespread` of these.
 
     Returns:
-        A fit whose inliers and priors are (N,); or, where the moving matches have no fit, the kind of stationary ones.
+        A fit whose inliers and priors are (N,), or the kind of stationary matches if the moving ones have no fit.
     """
     x1, x2 = points
-    found = fit(x1[~stationary], x2[~stationary], options, seed)
-    if not isinstance(found, EpipolarFit):
+    moving = fit(x1[~stationary], x2[~stationary], options, seed)
+    if not isinstance(moving, EpipolarFit):
         return Rejected(SAME_PHOTO if wide else ONLY_A_LOGO)
-    if wide and not found.degeneracy:
-        still = np.asfortranarray(np.hstack([x1[stationary], x2[stationary]]))
-        agreeing = squared_distances(still, np.ascontiguousarray(found.F).reshape(9)) <= options.max_error_px**2
-        if agreeing.mean() >= EXPLAINED_SHARE:
+    if wide and not moving.degeneracy:
+        points_in_place = np.asfortranarray(np.hstack([x1[stationary], x2[stationary]]))
+        agreeing = (
+            squared_distances(points_in_place, np.ascontiguousarray(moving.F).reshape(9)) <= options.max_error_px**2
+        )
+        if agreeing.mean() >= WATERMARK.explained_share:
             return fit(x1, x2, options, seed)
     inliers, priors = np.zeros(len(x1), bool), np.zeros(len(x1))
-    inliers[~stationary], priors[~stationary] = found.inliers, found.priors
-    return EpipolarFit(found.F, inliers, priors, found.trials, found.rms_px, found.degeneracy)
+    inliers[~stationary], priors[~stationary] = moving.inliers, moving.priors
+    return replace(moving, inliers=inliers, priors=priors)
 
 
 def one_per_cell(points: FloatArray, size: tuple[int, int]) -> FloatArray:
-    """Return (C, 2) one point of each cell of a photo that has any; `is_widespread` needs no more of all keypoints.
-
-    Args:
-        points: (N, 2) pixels.
-        size: (width, height) of the photo in pixels.
-    """
+    """Return (C, 2) one point of each occupied cell of a photo; `is_widespread` needs no more of all keypoints."""
     return points[np.unique(_cells(points, size), return_index=True)[1]]
-
-
-def _occupied_cells(points: FloatArray, size: tuple[int, int]) -> NDArray[np.int64]:
-    return np.unique(_cells(points, size))
 
 
 def _cells(points: FloatArray, size: tuple[int, int]) -> NDArray[np.int64]:
     """Return (N,) the number of the cell of each point."""
-    columns, rows = (points / size * CELLS).astype(np.int64).clip(0, CELLS - 1).T
-    return np.asarray(CELLS * rows + columns)
+    cells = WATERMARK.cells
+    columns, rows = (points / size * cells).astype(np.int64).clip(0, cells - 1).T
+    return np.asarray(cells * rows + columns)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from sfm_app.fundamental.a_contrario import MOST_FALSE_ALARMS, model_false_alarms, squared_mismatch_distances
 from sfm_app.fundamental.degeneracy import OFF_PLANE, dominant_homography, find_degeneracy, transfer_distance
 from sfm_app.fundamental.leverage import prior_validity
-from sfm_app.fundamental.loop import Recipe, search
+from sfm_app.fundamental.loop import Recipe, run_loop
 from sfm_app.fundamental.points import Matches, check_points, prepare
 from sfm_app.fundamental.refits import choose_refit
 from sfm_app.fundamental.scores import squared_distances
@@ -22,27 +22,20 @@ from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
 from sfm_app.types.arrays import FloatArray
 
-Find = Callable[[FloatArray, FloatArray, EpipolarSettings, int], tuple[ArrayLike, int] | None]
-"""(x1, x2, options, seed) -> F and the number of samples drawn, or None: an external search for `estimate_with`."""
+ExternalSearch = Callable[[FloatArray, FloatArray, EpipolarSettings, int], tuple[ArrayLike, int] | None]
+"""(x1, x2, options, seed) -> F and the number of samples drawn, or None; for `estimate_with`."""
 
-# why a pair is rejected, in the order of the checks
+# reasons of a rejection, in the order of the checks
 TOO_FEW_MATCHES = "too few matches"
 NO_MODEL = "no model found"
 TOO_FEW_INLIERS = "too few inliers"
 CHANCE = "inliers no better than chance"
 
 
-def estimate(
+def fit_by_recipe(
     x1: ArrayLike, x2: ArrayLike, options: EpipolarSettings, seed: int, recipe: Recipe
 ) -> EpipolarFit | Rejected:
-    """Estimate one fundamental matrix from matches, many of which may be wrong.
-
-    Args:
-        x1: (N, 2) pixels.
-        x2: (N, 2) pixels, row by row the partners of x1.
-        options: threshold, confidence, largest number of samples, smallest number of inliers.
-        seed: same seed, same bytes.
-        recipe: the estimator.
+    """Estimate one fundamental matrix from matches, many of which may be wrong: x1, x2 (N, 2) pixels, row by row.
 
     Raises:
         ValueError: the points are not as above (see `check_points`).
@@ -51,29 +44,30 @@ def estimate(
     matches = prepare(first, second, seed)
     if len(matches.points) < options.min_inliers:
         return Rejected(TOO_FEW_MATCHES)
-    found = search(matches, options, seed, recipe)
-    if found is None:
+    best = run_loop(matches, options, seed, recipe)
+    if best is None:
         return Rejected(NO_MODEL)
     threshold = options.max_error_px / matches.unit_px
-    F = choose_refit(options.refit, recipe.finish)(matches.points, found.F, threshold)
+    F = choose_refit(options.refit, recipe.finish)(matches.points, best.F, threshold)
     if not np.isfinite(F).all():
         return Rejected(NO_MODEL)
-    return _judge(first, second, matches, F, found.trials, options)
+    return _assess_model(first, second, matches, F, best.trials, options)
 
 
 def estimate_with(
-    find: Find, x1: ArrayLike, x2: ArrayLike, options: EpipolarSettings, seed: int
+    search: ExternalSearch, x1: ArrayLike, x2: ArrayLike, options: EpipolarSettings, seed: int
 ) -> EpipolarFit | Rejected:
-    """Run an external search and judge its F as for the built-in estimators; for plug-ins.
+    """Run an external search and assess its F as for the built-in estimators; for plug-ins.
 
     Args:
-        find: gets the distinct matches, at least `options.min_inliers`, as contiguous (M, 2) pixels about the middle of
-            each view, in an order that depends on the seed. Its F may have any scale; it is brought to rank 2. Inliers,
-            priors, degeneracy and the test against chance are computed from this F. `find` should not raise on data.
+        search: gets the distinct matches, at least `options.min_inliers`, as contiguous (M, 2) pixels about the middle
+            of each view, in an order that depends on the seed. Its F may have any scale; it is brought to rank 2.
+            Inliers, priors, degeneracy and the test against chance are computed from this F. It should not raise on
+            data.
         x1: (N, 2) pixels.
         x2: (N, 2) pixels, row by row the partners of x1.
-        options: as in `estimate`.
-        seed: same seed, same bytes, if `find` is deterministic.
+        options: threshold, confidence, largest number of samples, smallest number of inliers.
+        seed: same seed, same bytes, if `search` is deterministic.
 
     Raises:
         ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
@@ -83,24 +77,21 @@ def estimate_with(
     if len(matches.points) < options.min_inliers:
         return Rejected(TOO_FEW_MATCHES)
     px1, px2 = (np.ascontiguousarray(side) * matches.unit_px for side in np.hsplit(matches.points, 2))
-    found = find(px1, px2, options, seed)
-    if found is None:
+    answer = search(px1, px2, options, seed)
+    if answer is None:
         return Rejected(NO_MODEL)
-    F, trials = found
-    return _check_and_judge(first, second, matches, _to_frame(F, matches.unit_px, np.zeros(4)), trials, options)
+    F, trials = answer
+    return _assess_external(first, second, matches, _to_frame(F, matches.unit_px, np.zeros(4)), trials, options)
 
 
-def judge(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> EpipolarFit | Rejected:
-    """Judge a fundamental matrix from any source by the matches.
+def assess_fundamental(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> EpipolarFit | Rejected:
+    """Return the fit of a given fundamental matrix to matches, with `trials` 1, or the reason of its rejection.
 
     Args:
         x1: (N, 2) pixels.
         x2: (N, 2) pixels, row by row the partners of x1.
         F: (3, 3) of any scale, x2' F x1 = 0 in pixels.
         options: threshold and smallest number of inliers.
-
-    Returns:
-        The fit, with `trials` 1, or the reason why F is rejected.
 
     Raises:
         ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
@@ -109,20 +100,14 @@ def judge(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings)
     matches = prepare(first, second, seed=0)
     if len(matches.points) < options.min_inliers:
         return Rejected(TOO_FEW_MATCHES)
-    return _check_and_judge(first, second, matches, _to_frame(F, matches.unit_px, matches.center), 1, options)
+    return _assess_external(first, second, matches, _to_frame(F, matches.unit_px, matches.center), 1, options)
 
 
 def count_matches_off_plane(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> int:
-    """Count the distinct inliers of F with parallax: those off the plane that holds most of them.
-
-    Args:
-        x1: (N, 2) pixels.
-        x2: (N, 2) pixels, row by row the partners of x1.
-        F: (3, 3) of rank 2, at least 3 inliers.
-        options: the threshold.
+    """Count the distinct inliers of F, at least 3, with parallax: those off the plane that holds most of them.
 
     Raises:
-        ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
+        ValueError: the points are not (N, 2) pixels (see `check_points`), or F is not (3, 3).
     """
     matches = prepare(*check_points(x1, x2), seed=0)
     threshold = options.max_error_px / matches.unit_px
@@ -143,17 +128,17 @@ def _to_frame(F: ArrayLike, unit_px: float, center: FloatArray) -> FloatArray:
         return np.asarray(to2.T @ pixels @ to1)
 
 
-def _check_and_judge(
+def _assess_external(
     x1: FloatArray, x2: FloatArray, matches: Matches, F: FloatArray, trials: int, options: EpipolarSettings
 ) -> EpipolarFit | Rejected:
     """Judge an F of any scale and rank; reject it if it is not finite or its rank is below 2."""
     largest = np.abs(F).max()
     if not (np.isfinite(largest) and largest > 0) or np.linalg.matrix_rank(F / largest) < 2:
         return Rejected(NO_MODEL)
-    return _judge(x1, x2, matches, nearest_rank_two(F / largest), trials, options)
+    return _assess_model(x1, x2, matches, nearest_rank_two(F / largest), trials, options)
 
 
-def _judge(
+def _assess_model(
     x1: FloatArray, x2: FloatArray, matches: Matches, F: FloatArray, trials: int, options: EpipolarSettings
 ) -> EpipolarFit | Rejected:
     points, threshold = matches.points, options.max_error_px / matches.unit_px

@@ -18,39 +18,23 @@ from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.types.arrays import BoolArray, FloatArray
 
 PARAMETERS = 8
-"""p of Eq. 3.16 and 4.17: the directions perpendicular to the unit vector f (docs/algorithms.md, Fundamental
-matrices)."""
-_LEAST_VARIANCE = 1e-24
-"""Least variance of residuals, in units of the points' spread: perfect matches still have rounded coordinates. Double
-precision leaves 1e-16 of them, squared 1e-32; the margin was chosen by hand."""
+"""p of Eq. 3.16 and 4.17: directions perpendicular to the unit vector f."""
 _LEAST_FREEDOM = 2.0**-52
 """Least 1 - h: the distance of 1 to the next number in double precision."""
-_LEAST_SUPPORT = 1e-14
-"""Least eigenvalue of a direction, over the largest one. Double precision leaves 1e-16; the margin was chosen by
-hand."""
-_LARGEST_EXPONENT = 700.0
-"""Largest exponent x for which exp(-x) is computed and not taken as 0: in double precision exp(-746) is 0."""
 
 
 def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArray:
-    """Return the leverage h_ii of every match in a regression on the fitted matches and itself (thesis 3.11).
+    """Return the leverage h_ii of every match, in [0, 1], in a regression on the fitted matches and itself (thesis
+    3.11).
 
-    For a fitted match this is the diagonal of the hat matrix. For any other match the textbook formula would exceed 1.
-    Its leverage if it were fitted as well is g / (1 + g) with g = a_i' (A_in' A_in)^-1 a_i.
-
-    Args:
-        points: (N, 4) matches, of magnitude about 1.
-        f: (9,) the model, of norm 1.
-        fitted: (N,) the matches that the model was fitted to.
-
-    Returns:
-        (N,) in [0, 1].
+    For a fitted match (mask (N,)) this is the diagonal of the hat matrix. For any other match the textbook formula
+    would exceed 1. Its leverage if it were fitted as well is g / (1 + g) with g = a_i' (A_in' A_in)^-1 a_i.
     """
     tangent = _tangent_basis(f)
     within = tangent.T @ weighted_gram(points, fitted.astype(np.float64)) @ tangent
     values, vectors = np.linalg.eigh(within)
-    # no fitted match constrains such a direction: matches along it have leverage 1
-    floor = max(values[-1], 2.0**-1000) * _LEAST_SUPPORT
+    # directions that no fitted match constrains, up to rounding: matches along them have leverage 1
+    floor = max(values[-1], 2.0**-1000) * 1e-14
     forms = quadratic_forms(points, tangent @ (vectors / np.sqrt(np.maximum(values, floor))))
     return _leverages_from_forms(forms, fitted)
 
@@ -66,10 +50,7 @@ def _leverages_from_forms(forms: FloatArray, fitted: BoolArray) -> FloatArray:
 
 @kernel
 def _tangent_basis(f: FloatArray) -> FloatArray:
-    """Return (9, 8) orthonormal directions perpendicular to a unit vector.
-
-    They are the columns of a Householder reflection that maps f to an axis.
-    """
+    """Return (9, 8) orthonormal directions perpendicular to a unit vector: columns of a Householder reflection."""
     last = f[8] + 1.0 if f[8] >= 0.0 else f[8] - 1.0
     basis = np.zeros((9, PARAMETERS))
     for k in range(PARAMETERS):
@@ -81,13 +62,7 @@ def _tangent_basis(f: FloatArray) -> FloatArray:
 
 @kernel
 def studentized_residuals(residuals: FloatArray, leverage: FloatArray, fitted: BoolArray) -> FloatArray:
-    """Divide residuals by their standard deviation (thesis 3.14, 3.15), with the variance of the fitted matches.
-
-    Args:
-        residuals: (N,) distances to the model.
-        leverage: (N,) from `leverages`.
-        fitted: (N,) the matches that the model was fitted to.
-    """
+    """Divide residuals (N,) by their standard deviation (thesis 3.14, 3.15), from the fitted matches."""
     count, total, moment = 0, 0.0, 0.0
     for i in range(residuals.shape[0]):
         if fitted[i]:
@@ -97,7 +72,7 @@ def studentized_residuals(residuals: FloatArray, leverage: FloatArray, fitted: B
     for i in range(residuals.shape[0]):
         if fitted[i]:
             moment += (residuals[i] - mean) ** 2
-    variance = max(moment / max(count - PARAMETERS, 1), _LEAST_VARIANCE)
+    variance = max(moment / max(count - PARAMETERS, 1), 1e-24)  # even perfect matches have rounded coordinates
     studentised = np.empty(residuals.shape[0])
     for i in range(residuals.shape[0]):
         studentised[i] = residuals[i] / np.sqrt(variance * max(1.0 - leverage[i], _LEAST_FREEDOM))
@@ -106,14 +81,7 @@ def studentized_residuals(residuals: FloatArray, leverage: FloatArray, fitted: B
 
 @kernel
 def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
-    """Return how far the fit would move without each match (thesis 3.16 and 4.17).
-
-    The square of d_i is missing in the thesis.
-
-    Args:
-        studentised: (N,) from `leverage.studentized_residuals`.
-        leverage: (N,) from `leverages`, in [0, 1].
-    """
+    """Return how far the fit would move without each match (thesis 3.16, 4.17, where the square of d_i is missing)."""
     distances = np.empty(studentised.shape[0])
     for i in range(studentised.shape[0]):
         odds = leverage[i] / max(1.0 - leverage[i], _LEAST_FREEDOM)
@@ -125,9 +93,7 @@ def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
 def priors(distances: FloatArray, sigma: float) -> FloatArray:
     """Return p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels).
 
-    Args:
-        distances: (N,) Cook's distances, >= 0.
-        sigma: of the Gaussian, in the same units; with 0, p is 1 for the smallest distance and 0 for all others.
+    With a sigma of 0, p is 1 for the smallest distance and 0 for all others.
     """
     least, probable = np.inf, np.empty(distances.shape[0])
     for i in range(distances.shape[0]):
@@ -136,7 +102,7 @@ def priors(distances: FloatArray, sigma: float) -> FloatArray:
         if sigma > 0.0:
             # minus the smallest exponent, so that the largest value is 1
             exponent = (distances[i] - least) / sigma * ((distances[i] + least) / sigma) / 2.0
-            probable[i] = np.exp(-exponent) if exponent < _LARGEST_EXPONENT else 0.0
+            probable[i] = np.exp(-exponent) if exponent < 700.0 else 0.0
         else:
             probable[i] = 1.0 if distances[i] <= least else 0.0
     return probable
@@ -153,14 +119,9 @@ def mad_sigma(distances: FloatArray) -> float:
 
 
 def prior_validity(points: FloatArray, f: FloatArray, threshold: float, *, sigma_from_inliers: bool) -> FloatArray:
-    """Return p(v_i) of every match from its influence on the model f (thesis 4.7.2 and 4.7.3).
+    """Return p(v_i) of every match from its influence on the model f, of norm 1 (thesis 4.7.2 and 4.7.3).
 
-    Args:
-        points: (N, 4) matches.
-        f: (9,) the best model so far, of norm 1.
-        threshold: largest distance of an inlier; the inliers are the fitted matches.
-        sigma_from_inliers: estimate sigma from the Cook's distances of the inliers; otherwise of all matches, as in the
-            thesis.
+    sigma is estimated from the Cook's distances of the inliers, or of all matches as in the thesis.
     """
     squared = squared_distances(points, f)
     fitted = squared <= threshold * threshold

@@ -1,4 +1,4 @@
-"""The loop of every estimator: draw, solve, test, score, refine, stop (thesis, chapter 4)."""
+"""The loop of every estimator: draw, solve, test, score, refine, stop (thesis 4.4, Figure 3.7 and Algorithm 1)."""
 
 import math
 from collections.abc import Callable
@@ -24,10 +24,6 @@ from sfm_app.jit import kernel
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-# The parts of an estimator: sampler, solver, score, verifier, stopping rule, final fit.
-#
-# They are the stages of thesis Figure 3.7 and section 4.4; each can be exchanged.
-
 Refine = Callable[[FloatArray, FloatArray, float], FloatArray]
 """(points, F, threshold) -> a better F."""
 Recover = Callable[[FloatArray, FloatArray, float, Loss, PreTest, RandomState], FloatArray | None]
@@ -41,31 +37,31 @@ class Recipe:
     """One estimator: sampler, solver, score, verifier, stopping rule, final fit."""
 
     score: Score
-    """The penalty to minimize (see `scoring.robust_costs` and `scoring.mlesac`)."""
+    """The penalty to minimize."""
     finish: Refine
     """The final fit, from the best model of the loop."""
     sample_size: int = SAMPLE_SIZE
-    """7: all models through seven matches; 8: the linear model through eight matches."""
+    """7: all models through seven matches; 8: the linear model through eight."""
     validity: Validity | None = None
     """Priors from a new best model; None: all samples are uniform."""
     guided_share: float = 1.0
     """Share of the samples that are drawn by the priors."""
     rest_share: float = 0.0
-    """Share of the samples that are drawn from matches that the best model does not explain, once there are priors."""
+    """Share of the samples drawn from matches beyond two thresholds of the best model, once there are priors."""
     batch: int = 1
     """Samples between two checks for a better model."""
     warmup_share: float = 0.0
     """Share of the trials before the first priors."""
     verifier: Callable[[int, int], Verifier] = FullVerification
-    """(number of matches, sample size) -> the test that hypotheses take before they are scored in full."""
+    """(number of matches, sample size) -> the pre-test of hypotheses."""
     assumed_share: float | None = None
     """Share of inliers for the number of trials (thesis 3.19); None: that of the best model."""
     least_trials: int = 0
-    """Samples that are drawn in any case, even if (3.19) needs fewer, and before the first call of `patience`."""
+    """Least number of samples, also if (3.19) needs fewer, and before the first call of `patience`."""
     stop_on_convergence: bool = False
     """End when the priors have converged (thesis 4.18)."""
     patience: Callable[[FloatArray, FloatArray, float], float] | None = None
-    """(points, F, threshold) -> samples without a better model that end the search (see `sampling.termination`)."""
+    """(points, F, threshold) -> samples without a better model that end the search."""
     improve: Refine | None = None
     """Local optimization of every new best model of a sample."""
     fine_score: Score | None = None
@@ -76,10 +72,6 @@ class Recipe:
     """Drop models that put a sampled point behind a camera before they are scored."""
 
 
-# The inner loop: draw, solve and score until a better model is found.
-#
-# Thesis 4.7.5, lines 3 to 6 of Algorithm 1.
-
 GUIDED, UNGUIDED = range(2)
 """Kinds of samples: drawn by the priors (or any sample while there are no priors), and drawn without them."""
 
@@ -88,18 +80,17 @@ class SamplingPlan(NamedTuple):
     """How samples are drawn and models computed from them."""
 
     sample_size: int
-    """7 or 8, see `solvers.minimal`."""
+    """7 or 8."""
     oriented: bool
     """Whether models that put a sampled point behind a camera are dropped."""
     batch: int
     """Samples between two checks for a better model."""
     guided_share: float
-    """Share of the samples that are drawn by the priors."""
+    """Share of the samples drawn by the priors."""
     priors: FloatArray
     """(N,) running sum of the priors p(v_i)."""
     rest_share: float
-    """Share of the samples drawn from the rest, matches that the best model does not explain; the others are
-    uniform."""
+    """Share of the samples drawn from the rest, matches that the best model does not explain; others are uniform."""
     rest: FloatArray
     """(N,) running count of the matches in the rest."""
 
@@ -115,25 +106,18 @@ def draw_until_better(
     state: RandomState,
     best: FloatArray,
 ) -> int:
-    """Draw samples until a model has a smaller penalty than the best of its kind.
+    """Draw samples until a model has a smaller penalty than the best of its kind; return their number.
 
-    Lines 4 to 6 of Algorithm 1. Samples drawn without the priors compete only among themselves: a second motion, or
-    inliers that a wrong model took for outliers, would never win against samples that the priors have made nearly
-    perfect.
+    Lines 4 to 6 of Algorithm 1. Samples drawn without the priors compete only among themselves: a second motion would
+    never win against samples that the priors have made nearly perfect.
 
     Args:
-        points: (N, 4) matches in random order, N >= the sample size; repeated to (2 N, 4) for a pre-test with a random
-            start, so that any N consecutive rows hold all matches.
-        draws: how samples are drawn and models computed.
-        loss: the penalty.
-        pretests: the tests that a model has to pass, by the kind of its sample: `GUIDED`, `UNGUIDED`.
+        points: N >= the sample size; repeated to (2 N, 4) for a pre-test with a random start, so that any N consecutive
+            rows hold all matches.
+        pretests: by the kind of the sample: `GUIDED`, `UNGUIDED`.
         to_beat: (2,) smallest penalty so far of each kind; lowered.
         limit: largest number of samples.
-        state: random generator.
         best: (2, 9) set to the better models.
-
-    Returns:
-        Number of samples drawn.
     """
     count = draws.priors.shape[0]
     sample = np.empty(draws.sample_size, dtype=np.int64)
@@ -146,9 +130,9 @@ def draw_until_better(
             if draws.oriented and not is_oriented(points, sample, models[k]):
                 continue
             start = int(uniform(state) * count) if pretest.random_start else 0
-            found = penalty(points, start, models[k], loss, to_beat[kind], pretest)
-            if found < to_beat[kind]:
-                to_beat[kind], better = found, True
+            score = penalty(points, start, models[k], loss, to_beat[kind], pretest)
+            if score < to_beat[kind]:
+                to_beat[kind], better = score, True
                 for j in range(9):
                     best[kind, j] = models[k, j]
         if better and trial % draws.batch == 0:
@@ -158,15 +142,9 @@ def draw_until_better(
 
 @kernel
 def draw_sample(draws: SamplingPlan, state: RandomState, sample: IndexArray) -> int:
-    """Draw one sample by the priors, from the rest, or uniformly, and return its kind.
+    """Draw one sample (m,) by the priors, from the rest, or uniformly, as a random number chooses; return its kind.
 
-    A random number chooses among the three. Samples are uniform, too, while there are no priors, and where too few
-    matches hold nearly all the weight.
-
-    Args:
-        draws: the shares of the three, and the weights.
-        state: random generator.
-        sample: (m,) filled with indices.
+    Samples are uniform, too, while there are no priors, and where too few matches hold nearly all the weight.
     """
     guided = draws.guided_share
     guided_or_rest = guided + draws.rest_share if draws.rest[-1] >= draws.sample_size else guided
@@ -182,22 +160,17 @@ def draw_sample(draws: SamplingPlan, state: RandomState, sample: IndexArray) -> 
     return kind
 
 
-# The best model of a search, and the penalties that the next one has to beat.
-#
-# Thesis 4.7.5, lines 6 and 7 of Algorithm 1 (F*, Q*). Two scores at once, and separate bars for the two kinds of
-# samples, are ours.
-
-
 class BestModel:
-    """The best model so far.
+    """The best model so far, and the penalties that the next one has to beat: F* and Q* of Algorithm 1.
 
-    Algorithm 1 starts with Q* = 0 in print; a penalty to be minimized has to start at infinity.
+    The thesis starts with Q* = 0; a penalty to be minimized has to start at infinity. Two scores at once, and a bar for
+    each kind of sample, are ours.
     """
 
     f: FloatArray
     """(9,) entries of F, norm 1; F* of the thesis."""
     to_beat: FloatArray
-    """(2,) bars, one per kind of sample: penalties that models must stay below (see `inner_loop.draw_until_better`)."""
+    """(2,) bars, one per kind of sample: penalties that models must stay below (see `draw_until_better`)."""
     samples: FloatArray
     """(2, 9) for each kind, the last model of a sample that was below the bar."""
 
@@ -209,7 +182,7 @@ class BestModel:
         self.to_beat, self.samples = np.full(2, math.inf), np.zeros((2, 9))
 
     def __bool__(self) -> bool:
-        """Return whether a model was found yet."""
+        """Return whether there is a model yet."""
         return self._lowest < math.inf
 
     def inlier_share(self) -> float:
@@ -217,47 +190,38 @@ class BestModel:
         return float(np.mean(squared_distances(self._points, self.f) <= self._threshold**2))
 
     def update(self, kind: int) -> bool:
-        """Update the best model and the bars with the sample that was below the bar of its kind.
+        """Update the best model and the bars with the sample below the bar of its kind; return whether it changed.
 
         With one score the sample is the new best model, and its penalty the bar of both kinds. With two scores its
         model is locally optimized and has to win by the finer score; each kind then has a bar of its own.
-
-        Returns:
-            Whether the best model changed.
         """
         if self._fine is None:
             self._replace(self.samples[kind].copy(), float(self.to_beat[kind]))
-            self._set_common_bar()
+            self.to_beat[:] = self._lowest
             return True
         if not self.replace_if_better(self.samples[kind].reshape(3, 3)):
             return False
-        self._set_unguided_bar()
+        # unguided samples need `LENIENCE` of the support of the best guided one: the penalty saved by its inliers
+        worst = len(self._points) * self.loss.worst
+        self.to_beat[UNGUIDED] = worst - LENIENCE * (worst - self.to_beat[GUIDED])
         return True
 
-    def _set_common_bar(self) -> None:
-        """Set both bars to the penalty of the best model."""
-        self.to_beat[:] = self._lowest
-
-    def _set_unguided_bar(self) -> None:
-        """Set the bar of unguided samples to `LENIENCE` of the support of the best guided sample.
-
-        Support is the penalty of a model without any inliers minus the penalty of the model.
-        """
-        nothing = len(self._points) * self.loss.worst
-        self.to_beat[UNGUIDED] = nothing - LENIENCE * (nothing - self.to_beat[GUIDED])
-
-    def _replace(self, model: FloatArray, found: float) -> None:
+    def _replace(self, model: FloatArray, score: float) -> None:
         """Replace the best model by that of a sample, locally optimized where this lowers the penalty."""
-        self.f, self._lowest = model, found
+        self.f, self._lowest = model, score
         if self._recipe.improve is not None:
             improved = self._improve(model.reshape(3, 3))
-            score = penalty(self._points, 0, improved, self.loss, math.inf, NO_PRETEST)
-            if score < found:
-                self.f, self._lowest = improved, score
-        self._rescore()
+            improved_score = penalty(self._points, 0, improved, self.loss, math.inf, NO_PRETEST)
+            if improved_score < score:
+                self.f, self._lowest = improved, improved_score
+        # the penalty of MLESAC depends on the best model; comparing penalties across the change is not always sensible
+        # (thesis 4.6)
+        loss = self._recipe.score(self._points, self._threshold, self.f)
+        if loss != self.loss:
+            self.loss, self._lowest = loss, penalty(self._points, 0, self.f, loss, math.inf, NO_PRETEST)
 
     def replace_if_better(self, F: FloatArray) -> bool:
-        """Replace the best model by the optimized F (3, 3) if its finer penalty is lower; return whether it is."""
+        """Replace the best model by the optimized F if its finer penalty is lower; return whether it is."""
         improved = self._improve(F)
         score = penalty(self._points, 0, improved, self._fine or self.loss, self._lowest, NO_PRETEST)
         if score < self._lowest:
@@ -270,22 +234,6 @@ class BestModel:
             F = self._recipe.improve(self._points, F, self._threshold)
         return np.asarray(np.ascontiguousarray(F).reshape(9) / np.linalg.norm(F))
 
-    def _rescore(self) -> None:
-        """Score the best model again if the penalty changed: that of MLESAC depends on the best model.
-
-        The thesis notes that comparing penalties across such a change is not always sensible.
-        """
-        renewed = self._recipe.score(self._points, self._threshold, self.f)
-        if renewed != self.loss:
-            self.loss, self._lowest = renewed, penalty(self._points, 0, self.f, renewed, math.inf, NO_PRETEST)
-
-
-# Algorithm 1 of the thesis: the loop that all estimators share.
-
-_EXPLAINED = 2.0
-"""Thresholds within which a match counts as explained by the best model. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypothesis:
@@ -296,21 +244,16 @@ class Hypothesis:
     trials: int
 
 
-def search(matches: Matches, options: EpipolarSettings, seed: int, recipe: Recipe) -> Hypothesis | None:
-    """Draw samples by the priors until a stopping rule holds (thesis, Algorithm 1).
-
-    Args:
-        matches: the distinct matches of a pair.
-        options: threshold, confidence, largest number of samples.
-        seed: same seed, same result.
-        recipe: the estimator.
-    """
+def run_loop(
+    matches: Matches, options: EpipolarSettings, seed: int, recipe: Recipe, draw: Callable[..., int] = draw_until_better
+) -> Hypothesis | None:
+    """Draw samples by the priors until a stopping rule holds (thesis, Algorithm 1); None without a model."""
     if len(matches.points) < recipe.sample_size:
         return None
-    return _Search(matches, options, seed, recipe).run()
+    return _Loop(matches, options, seed, recipe, draw).run()
 
 
-class _Search:
+class _Loop:
     """The state of Algorithm 1: the best model so far, and from it the priors and limits for the next samples."""
 
     share: float
@@ -322,17 +265,19 @@ class _Search:
     patience: float
     """Samples without a better model after which the evidence for the best one is evaluated."""
 
-    def __init__(self, matches: Matches, options: EpipolarSettings, seed: int, recipe: Recipe) -> None:
+    def __init__(
+        self, matches: Matches, options: EpipolarSettings, seed: int, recipe: Recipe, draw: Callable[..., int]
+    ) -> None:
         self.points, self.threshold = matches.points, options.max_error_px / matches.unit_px
-        self.options, self.recipe = options, recipe
+        self.options, self.recipe, self.draw_until_better = options, recipe, draw
         self.test = recipe.verifier(len(self.points), recipe.sample_size)
         self.best, self.share = BestModel(self.points, self.threshold, recipe), recipe.assumed_share or 0.0
         self.priors, self.state = np.ones(len(self.points)), random_state(seed)
         no_rest = np.zeros(1)
         equal = np.cumsum(self.priors)
         self.draws = SamplingPlan(recipe.sample_size, recipe.oriented, recipe.batch, 0.0, equal, 0.0, no_rest)
-        twice = self.test.pretest.random_start
-        self.circle = np.asfortranarray(np.vstack([self.points] * 2)) if twice else self.points
+        random_start = self.test.pretest.random_start
+        self.circle = np.asfortranarray(np.vstack([self.points] * 2)) if random_start else self.points
         self.trials, self.idle, self.has_priors = 0, 0, False
         self.patience = recipe.least_trials if recipe.patience is not None else math.inf
         self._update_limits()
@@ -341,7 +286,7 @@ class _Search:
         """Continue until the samples are used up, the priors have converged, or patience has run out."""
         while self.trials < self.limit:
             better = self._draw()
-            if self._update_priors(better) or self._has_waited_enough():
+            if self._update_priors(better) or self._is_patience_over():
                 break
         if not self.best:
             return None
@@ -350,21 +295,23 @@ class _Search:
 
     def _draw(self) -> bool:
         """Draw samples until a better model or the next decision; return whether the best model changed."""
-        left = min(self.limit - self.trials, self.test.review, self.patience - self.idle)
+        most = min(self.limit - self.trials, self.test.review, self.patience - self.idle)
         if self.trials < self.warmup_trials:
-            left = min(left, self.warmup_trials - self.trials)
+            most = min(most, self.warmup_trials - self.trials)
         best, before = self.best, self.best.to_beat.copy()
-        parts = self.draws, best.loss, (self.test.pretest, self.test.lenient)  # guided, unguided
-        drawn = draw_until_better(self.circle, *parts, best.to_beat, int(left), self.state, best.samples)
+        pretests = self.test.pretest, self.test.lenient  # guided, unguided
+        drawn = self.draw_until_better(
+            self.circle, self.draws, best.loss, pretests, best.to_beat, int(most), self.state, best.samples
+        )
         self.trials += drawn
         self.idle += drawn
         self.test.learn(drawn)
         improved = np.flatnonzero(best.to_beat < before).tolist()
         better = any([best.update(kind) for kind in improved])  # noqa: C419  update both kinds
         if better:
-            seen = best.inlier_share()
-            self.idle, self.share = 0, self.recipe.assumed_share or max(self.share, seen)
-            self.test.expect(seen)
+            share = best.inlier_share()
+            self.idle, self.share = 0, self.recipe.assumed_share or max(self.share, share)
+            self.test.expect(share)
             if self.recipe.patience is not None:
                 self.patience = self.recipe.least_trials
         self._update_limits()
@@ -386,21 +333,21 @@ class _Search:
         before, self.priors = self.priors, recipe.validity(self.points, self.best.f, self.threshold)
         self.draws = self.draws._replace(guided_share=recipe.guided_share, priors=np.cumsum(self.priors))
         if recipe.rest_share > 0:
-            rest = squared_distances(self.points, self.best.f) > (_EXPLAINED * self.threshold) ** 2
+            rest = squared_distances(self.points, self.best.f) > (2.0 * self.threshold) ** 2
             self.draws = self.draws._replace(rest_share=recipe.rest_share, rest=np.cumsum(rest, dtype=np.float64))
         return recipe.stop_on_convergence and has_converged(before, self.priors)
 
-    def _has_waited_enough(self) -> bool:
+    def _is_patience_over(self) -> bool:
         """Return whether the best model has survived as many samples as its evidence requires."""
         if self.recipe.patience is None or self.idle < self.patience:
             return False
         if not self.best:
             self.patience += self.recipe.least_trials
             return False
-        wanted = self.recipe.patience(self.points, self.best.f.reshape(3, 3), self.threshold)
-        if math.isinf(wanted):  # support that may be chance must not guide the sampling
+        patience = self.recipe.patience(self.points, self.best.f.reshape(3, 3), self.threshold)
+        if math.isinf(patience):  # support that may be chance must not guide the sampling
             self.draws = self.draws._replace(guided_share=0.0, rest_share=0.0)
-        self.patience = math.ceil(min(wanted, self.options.max_trials))
+        self.patience = math.ceil(min(patience, self.options.max_trials))
         return self.patience <= self.idle
 
     def _recover(self) -> None:
@@ -408,6 +355,6 @@ class _Search:
             return
         pretest = NO_PRETEST if self.test.pretest.random_start else self.test.pretest
         F = self.best.f.reshape(3, 3)
-        another = self.recipe.recover(self.points, F, self.threshold, self.best.loss, pretest, self.state)
-        if another is not None:
-            self.best.replace_if_better(another)
+        recovered = self.recipe.recover(self.points, F, self.threshold, self.best.loss, pretest, self.state)
+        if recovered is not None:
+            self.best.replace_if_better(recovered)

@@ -1,7 +1,6 @@
 """Preparation of matched points: check them, drop duplicates, shuffle, and scale to numbers near 1.
 
-Thesis 4.3.2 asks for normalized points, as Hartley (1997) does; the robust frame, which gross outliers do not move, is
-ours.
+Thesis 4.3.2 asks for normalized points, as Hartley (1997) does; the robust frame is ours.
 """
 
 from dataclasses import dataclass
@@ -14,20 +13,10 @@ from sfm_app.types.arrays import FloatArray
 
 _LARGEST_PX = 1e15
 """Largest coordinate of a pixel: beyond it double precision resolves only an eighth of a pixel."""
-_FRAME_QUANTILE, _QUANTILE_TO_RMS = 0.9, 1.56
-"""Quantile of the deviations that measures the spread, and its ratio to their root mean square, if uniform. The second
-follows from the first: 0.9 sqrt(3). Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 def check_points(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return matched points as contiguous float64 arrays.
-
-    Args:
-        x1: (N, 2) pixels, any real number type; N may be 0.
-        x2: (N, 2) pixels, row by row the partners of x1.
-
-    Returns:
-        Two (N, 2) arrays.
+    """Return matched points as two contiguous (N, 2) float64 arrays of pixels; N may be 0.
 
     Raises:
         ValueError: not (N, 2), not of equal length, not real numbers, not finite, or beyond 1e15 px.
@@ -82,12 +71,7 @@ def prepare(x1: FloatArray, x2: FloatArray, seed: int) -> Matches:
     """Drop repeated matches, shuffle and scale the rest.
 
     SIFT returns a keypoint once per orientation, so that one match may occur several times. Repeats would count as
-    support and make samples degenerate. The random order lets a scorer stop early: its first points are a fair sample.
-
-    Args:
-        x1: (N, 2) pixels in photo 1.
-        x2: (N, 2) pixels in photo 2, row by row the partners of x1.
-        seed: seed of the random order.
+    support and make samples degenerate. In random order the first points are a fair sample for an early exit.
     """
     stacked = np.hstack([x1, x2])
     # one key per match: a projection with incommensurable weights is equal for equal rows, and sorts faster than rows
@@ -106,15 +90,13 @@ def prepare(x1: FloatArray, x2: FloatArray, seed: int) -> Matches:
 
 
 def _robust_frame(points: FloatArray) -> tuple[FloatArray, float]:
-    """Return the origin (4,) and the unit in which most coordinates are of magnitude 1.
-
-    A few gross outliers do not change them.
-    """
+    """Return the origin (4,) and the unit in which most coordinates are of magnitude 1, in spite of gross outliers."""
     if not len(points):
         return np.zeros(4), 1.0
     middle, deviations = len(points) // 2, np.empty_like(points)
     center = np.array([np.partition(column, middle)[middle] for column in points.T])
     np.abs(points - center, out=deviations)
-    ranked = int(_FRAME_QUANTILE * (deviations.size - 1))
-    unit_px = float(np.partition(deviations.ravel(order="K"), ranked)[ranked]) / _QUANTILE_TO_RMS
+    # the 0.9 quantile of uniform deviations is 0.9 sqrt(3) = 1.56 times their root mean square
+    rank = int(0.9 * (deviations.size - 1))
+    unit_px = float(np.partition(deviations.ravel(order="K"), rank)[rank]) / 1.56
     return center, unit_px or float(np.sqrt((deviations**2).mean())) or 1.0

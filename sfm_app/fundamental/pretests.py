@@ -1,4 +1,4 @@
-"""Quick tests of a model on few matches: T(d,d) and the sequential probability ratio test (thesis, chapter 4)."""
+"""Pre-tests of models before they are scored: bail-out, T(d,d) and sequential probability ratio (thesis 4.4.4)."""
 
 import math
 from dataclasses import dataclass
@@ -10,26 +10,19 @@ import numpy as np
 from sfm_app.fundamental.samples import required_trials
 from sfm_app.types.arrays import IndexArray
 
-# Tests that decide which hypotheses are scored on all matches (thesis 4.4.4).
+# Every test is one list: how many of the first m matches must be inliers for the check of a hypothesis to continue.
+# Wald's likelihood ratio after m matches depends only on how many of them were inliers, so that its threshold is such
+# a list, too.
 #
-# A hypothesis is checked match by match, and every test here is one list: how many of the first m matches must be
-# inliers for the check to continue. The bail-out test and T(d,d) are defined this way. Wald's likelihood ratio
-# after m matches depends only on how many of them were inliers, so that its threshold is such a list, too: the line
-# of rejection numbers of sequential sampling inspection.
-#
-# Randomized tests begin at a new random match for every hypothesis. In a fixed order all hypotheses would be tested
-# on the same first matches: if these are outliers, every good model is rejected, however long the search is. The
-# stopping rules assume errors that are independent between hypotheses.
+# Randomized tests begin at a new random match for every hypothesis. In a fixed order, outliers among the first
+# matches would reject every good model. The stopping rules assume errors that are independent between hypotheses.
 
 BLOCK = 64
 """Matches between two checks for an early exit, where no test needs more. Chosen by hand for speed."""
 
 LENIENCE = 0.5
-"""Least support of a model drawn without the priors, relative to that of the best sample. Chosen with the other
-constants of lev-ransac (benchmarks/corpus/tuning_sets.py); not measured on its own."""
-_BAIL_OUT_SIGMAS = 3.0
-"""Standard deviations that the hypergeometric count of a hypothesis may fall short by (Capel 2005): one of a thousand
-good hypotheses is rejected."""
+"""Least support of a model drawn without the priors, relative to that of the best sample. Chosen with the constants of
+`lev_ransac` (benchmarks/corpus/tuning_sets.py); not measured on its own."""
 
 
 class PreTest(NamedTuple):
@@ -44,13 +37,7 @@ class PreTest(NamedTuple):
 
 
 def make_pretest(least_inliers: IndexArray, stride: int, *, random_start: bool) -> PreTest:
-    """Make a pre-test with counts of 0.
-
-    Args:
-        least_inliers: (T,) inliers that a hypothesis must have at each check; empty for no test.
-        stride: matches between two checks, > 0.
-        random_start: begin at a random match for every hypothesis, not at the first.
-    """
+    """Make a pre-test with counts of 0 from the inliers (T,) that a hypothesis must have at each check."""
     return PreTest(least_inliers, stride, random_start, np.zeros(2, dtype=np.int64))
 
 
@@ -74,12 +61,7 @@ class Verifier(Protocol):
         """Expect this share of inliers, that of the best model."""
 
     def required_trials(self, share: float, confidence: float) -> float:
-        """Return how many samples, those already drawn included, give a clean one that passes with this probability.
-
-        Args:
-            share: share of inliers, in [0, 1].
-            confidence: wanted probability, in (0, 1).
-        """
+        """Return how many samples, drawn ones included, give a clean one that passes with probability `confidence`."""
 
 
 class FullVerification:
@@ -98,12 +80,7 @@ class FullVerification:
         """Do nothing: the test does not depend on the share of inliers."""
 
     def required_trials(self, share: float, confidence: float) -> float:
-        """Return how many samples give a clean one with this probability.
-
-        Args:
-            share: share of inliers, in [0, 1].
-            confidence: wanted probability, in (0, 1).
-        """
+        """Return how many samples give a clean one with this probability."""
         return required_trials(share**self.sample_size, confidence)
 
 
@@ -111,7 +88,7 @@ class BailOut(FullVerification):
     """Reject a hypothesis once it has too few inliers to be the best one (Capel 2005); matches are in random order."""
 
     def expect(self, share: float) -> None:
-        """Make both tests for this share of inliers, that of the best model."""
+        """Make both tests for this share of inliers."""
         least = bail_out_table(self.count, share)
         self.pretest = make_pretest(least, BLOCK, random_start=False)
         self.lenient = make_pretest((LENIENCE * least).astype(np.int64), BLOCK, random_start=False)
@@ -130,58 +107,53 @@ class RandomizedTdd(FullVerification):
         self.pretest = self.lenient = make_pretest(np.arange(1, self.d + 1), 1, random_start=True)
 
     def required_trials(self, share: float, confidence: float) -> float:
-        """Return how many samples give a clean one that passes with this probability.
-
-        Args:
-            share: share of inliers, in [0, 1].
-            confidence: wanted probability, in (0, 1).
-        """
+        """Return how many samples give a clean one that passes with this probability."""
         return required_trials(share ** (self.sample_size + self.d), confidence)
 
 
 def bail_out_table(count: int, inlier_share: float) -> IndexArray:
-    """Return how many inliers a hypothesis must have after each block to be scored further.
+    """Return how many inliers (blocks,) a hypothesis must have after each block to be scored further.
 
     A hypothesis as good as the best one has a share `inlier_share` of inliers; in the first m of N matches their number
-    is hypergeometric, and is below the returned counts about once in a thousand times.
-
-    Args:
-        count: number of matches.
-        inlier_share: share of inliers of the best model, in [0, 1].
-
-    Returns:
-        (blocks,) counts.
+    is hypergeometric, and is three standard deviations below its mean about once in a thousand times (Capel 2005).
     """
-    seen = np.arange(BLOCK, count, BLOCK, dtype=np.float64)
-    mean = seen * inlier_share
-    deviation = np.sqrt(mean * (1 - inlier_share) * (count - seen) / max(count - 1, 1))
-    return np.maximum(np.floor(mean - _BAIL_OUT_SIGMAS * deviation), 0).astype(np.int64)
+    checked = np.arange(BLOCK, count, BLOCK, dtype=np.float64)
+    mean = checked * inlier_share
+    deviation = np.sqrt(mean * (1 - inlier_share) * (count - checked) / max(count - 1, 1))
+    return np.maximum(np.floor(mean - 3.0 * deviation), 0).astype(np.int64)
 
 
 # Wald's sequential probability ratio test of hypotheses (Matas and Chum 2005, Chum and Matas 2008; thesis 4.9).
-#
 # Matches are inliers of a good model with probability epsilon, of a bad one with probability delta. The likelihood
-# ratio of "bad" to "good" is multiplied up match by match; when it exceeds A the model is rejected, which happens
-# to a good one with a probability of at most 1/A.
+# ratio of "bad" to "good" is multiplied up match by match; above A the model is rejected, which happens to a good one
+# with a probability of at most 1/A.
 
-FIRST_EPSILON, FIRST_DELTA = 0.1, 0.01
-"""Initial guesses: few inliers, and few chance inliers in a thin band around the epipolar lines. docs/algorithms.md,
-Fundamental matrices. Chosen by hand; not measured on their own."""
 MODEL_COST = {7: 160.0, 8: 160.0}
-"""t_M: time for a sample and its models over the time to check one match, by sample size; measured (1.1 us, 7 ns). The
-command is not on record; the figure stands in docs/algorithms.md, Fundamental matrices."""
+"""t_M: time for a sample and its models over the time to check one match, by sample size; measured, 1.1 us and 7 ns
+(docs/algorithms.md, Fundamental matrices)."""
 MODELS_PER_SAMPLE = {7: 2.45, 8: 1.0}
-"""m_S, by sample size; measured. The command is not on record; the thesis prints 2.3 (4.4.4)."""
+"""m_S, by sample size; measured. The thesis prints 2.3 (4.4.4)."""
 
-_MOST_EPSILON = 0.999
-"""Largest epsilon: beyond it the logarithm of 1 - epsilon is useless. Chosen by hand; not measured on its own."""
-_PRIOR_WEIGHT = 100.0
-"""Weight of the initial delta, in checked matches. Chosen by hand; not measured on its own."""
-_DELTA_TOLERANCE = 0.05
-"""Relative change of delta that requires a new test. docs/algorithms.md, Fundamental matrices. Chosen by hand; not
-measured on its own."""
-_REVIEW = 100
-"""Largest number of trials between two updates of delta. Chosen by hand; not measured on its own."""
+
+@dataclass(frozen=True, slots=True)
+class SprtOptions:
+    """First guesses and limits of the sequential test."""
+
+    first_epsilon: float = 0.1
+    """First epsilon: few inliers (docs/algorithms.md, Fundamental matrices). Chosen by hand."""
+    first_delta: float = 0.01
+    """First delta: few chance inliers near epipolar lines (docs/algorithms.md, Fundamental matrices). By hand."""
+    most_epsilon: float = 0.999
+    """Largest epsilon: beyond it the logarithm of 1 - epsilon is useless. Chosen by hand."""
+    prior_weight: float = 100.0
+    """Weight of the first delta, in checked matches. Chosen by hand."""
+    delta_tolerance: float = 0.05
+    """Relative change of delta that calls for a new test (docs/algorithms.md, Fundamental matrices). Chosen by hand."""
+    review: int = 100
+    """Largest number of trials between two updates of delta. Chosen by hand."""
+
+
+SPRT = SprtOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,16 +172,18 @@ class SequentialTest:
         if math.isinf(self.log_threshold):
             return np.zeros(0, dtype=np.int64)
         hit, miss = self._log_steps()
-        seen = np.arange(1, count + 1)
+        checked = np.arange(1, count + 1)
         # k hits and m - k misses: reject if k hit + (m - k) miss > log A
-        least: IndexArray = np.maximum(np.ceil((seen * miss - self.log_threshold) / (miss - hit)), 0).astype(np.int64)
+        least: IndexArray = np.maximum(np.ceil((checked * miss - self.log_threshold) / (miss - hit)), 0).astype(
+            np.int64
+        )
         return least
 
     def pass_rate(self, share: float) -> float:
         """Return the least probability that a good model with this true share of inliers passes: 1 - A^-h."""
         if math.isinf(self.log_threshold):
             return 1.0
-        return -math.expm1(-self.log_threshold * _exponent(*self._log_steps(), min(share, _MOST_EPSILON)))
+        return -math.expm1(-self.log_threshold * _exponent(*self._log_steps(), min(share, SPRT.most_epsilon)))
 
     def _log_steps(self) -> tuple[float, float]:
         """Return the increments of the log-likelihood ratio for an inlier and for an outlier."""
@@ -237,16 +211,12 @@ def _exponent(hit: float, miss: float, share: float) -> float:
 
 
 def design(epsilon: float, delta: float, sample_size: int) -> SequentialTest:
-    """Return the fastest test for these probabilities: A = t_M C / m_S + 1 + log A.
+    """Return the fastest test for these probabilities: A = t_M C / m_S + 1 + log A; without 0 < delta < epsilon, no
+    test.
 
     A larger A wastes matches on bad models; a smaller one wastes samples, because good models are rejected.
-
-    Args:
-        epsilon: share of inliers of a good model, in (0, 1].
-        delta: share of inliers of a bad model; a test needs 0 < delta < epsilon.
-        sample_size: matches in a sample, 7 or 8.
     """
-    epsilon = min(epsilon, _MOST_EPSILON)
+    epsilon = min(epsilon, SPRT.most_epsilon)
     if not 0 < delta < epsilon:
         return SequentialTest(epsilon, delta, math.inf)
     # C: average increment of the log-likelihood ratio per match of a bad model
@@ -261,13 +231,13 @@ def design(epsilon: float, delta: float, sample_size: int) -> SequentialTest:
 class Sprt:
     """The test as a verifier, designed again when the estimate of epsilon or delta changes."""
 
-    review = _REVIEW
+    review = SPRT.review
 
     def __init__(self, count: int, sample_size: int) -> None:
         self._count, self._sample_size = count, sample_size
         self._rejected = np.zeros(2, dtype=np.int64)
         self._past: list[tuple[SequentialTest, int]] = []
-        self._begin(FIRST_EPSILON, FIRST_DELTA)
+        self._begin(SPRT.first_epsilon, SPRT.first_delta)
 
     def _begin(self, epsilon: float, delta: float) -> None:
         self._test, self._trials = design(epsilon, delta, self._sample_size), 0
@@ -280,29 +250,24 @@ class Sprt:
     def _delta(self) -> float:
         """Return the share of inliers among the matches checked on rejected models, with the initial delta as prior."""
         checked, inliers = self._rejected
-        return float((inliers + FIRST_DELTA * _PRIOR_WEIGHT) / (checked + _PRIOR_WEIGHT))
+        return float((inliers + SPRT.first_delta * SPRT.prior_weight) / (checked + SPRT.prior_weight))
 
     def learn(self, trials: int) -> None:
-        """Count samples that were drawn and tested; design a new test if delta has changed."""
+        """Count samples; design a new test if delta has changed."""
         self._trials += trials
-        if abs(self._delta() - self._test.delta) > _DELTA_TOLERANCE * self._test.delta:
+        if abs(self._delta() - self._test.delta) > SPRT.delta_tolerance * self._test.delta:
             self._renew(self._test.epsilon)
 
     def expect(self, share: float) -> None:
-        """Make a new test for this share of inliers, that of the best model."""
+        """Make a new test for this share of inliers."""
         self._renew(share)
 
     def required_trials(self, share: float, confidence: float) -> float:
-        """Return the number of samples by (3.19); each test so far passed clean samples with its own probability.
-
-        Args:
-            share: share of inliers, in [0, 1].
-            confidence: wanted probability, in (0, 1).
-        """
+        """Return the number of samples by (3.19); each test so far passed clean samples with its own probability."""
         clean = share**self._sample_size
         missed, drawn = 0.0, 0  # log-probability that all samples so far were contaminated, or clean but rejected
         for test, trials in self._past:
             # with a share of 1, past samples would be certain successes
-            missed += trials * math.log1p(-min(clean * test.pass_rate(share), _MOST_EPSILON))
+            missed += trials * math.log1p(-min(clean * test.pass_rate(share), SPRT.most_epsilon))
             drawn += trials
         return drawn + required_trials(clean * self._test.pass_rate(share), confidence, missed)

@@ -1,16 +1,17 @@
-"""LEV-RANSAC by rays, for photos whose lens is known: curved epipolar lines are no outliers.
+"""LEV-RANSAC by rays, for photos with known lenses, whose epipolar lines are curved.
 
-As `lev_ransac` (thesis 4.7): samples guided by Cook's distances, a smooth cost at a coarse and a fine scale, local
-optimization. Ours: samples of five (Nistér 2004), since the cameras are known, and distances by bearing vectors.
+As `lev_ransac` (thesis 4.7); ours: samples of five (Nistér 2004), and distances by bearing vectors. `lines` are (N, 18)
+matches as bearing vectors in pixels, see `camera.bearings`; `E` is of rays, q' E p = 0.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from sfm_app.fundamental.a_contrario import MOST_FALSE_ALARMS, model_false_alarms
 from sfm_app.fundamental.estimate import CHANCE, NO_MODEL, TOO_FEW_INLIERS, TOO_FEW_MATCHES
-from sfm_app.fundamental.lev_ransac import COARSE, FINE
+from sfm_app.fundamental.lev_ransac import OPTIONS as LEV_RANSAC
 from sfm_app.fundamental.leverage import cook_distances, mad_sigma, priors, studentized_residuals
 from sfm_app.fundamental.solvers import RAY_SAMPLE_SIZE, solve_five_point
 from sfm_app.geometry.epipolar import (
@@ -28,59 +29,59 @@ from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-BATCH, GUIDED_SHARE, LEAST_TRIALS, MOST_TRIALS = 32, 0.5, 128, 4096
-"""Samples that are solved at once, the share of them that the priors draw, and the least and the most samples. Chosen
-by hand; not measured on their own."""
-MOST_SCORED = 500
-"""Matches that samples are scored on. Chosen by hand; not measured on its own."""
-STEPS = (5, 3)
-"""Reweighted fits at either scale in local optimization, as in `lev_ransac`. Chosen by hand."""
-MISMATCHES = 8
-"""Shifts of the partners that measure chance. Chosen by hand; not measured on its own."""
-CLEAR_SHARE, ROTATION_FACTOR = 0.95, 2.0
-"""A pair is a rotation if one explains this share of its inliers within so many thresholds. As in
-`posegraph.pair_pose`. Chosen by hand."""
+
+@dataclass(frozen=True, slots=True)
+class RayOptions:
+    """Samples, scores and the test for a rotation; none was measured on its own."""
+
+    batch: int = 32
+    """Samples solved at once. Chosen by hand."""
+    guided_share: float = 0.5
+    """Share of the samples drawn by the priors. Chosen by hand."""
+    least_trials: int = 128
+    """Fewest samples. Chosen by hand."""
+    most_trials: int = 4096
+    """Most samples. Chosen by hand."""
+    most_scored: int = 500
+    """Matches that samples are scored on. Chosen by hand."""
+    mismatches: int = 8
+    """Shifts of the partners that measure chance. Chosen by hand."""
+    clear_share: float = 0.95
+    """Share of the inliers that a rotation explains, as in `posegraph.pair_pose`. Chosen by hand."""
+    rotation_factor: float = 2.0
+    """Thresholds within which it explains them, as in `posegraph.pair_pose`. Chosen by hand."""
+
+
+OPTIONS = RayOptions()
 
 
 def fit_lev_ransac_rays(lines: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
     """Estimate the essential matrix of a pair with known lenses from matches, many of which may be wrong.
 
-    Its `F` is of rays: q' F p = 0 for the bearing vectors p of view 1 and q of view 2. Where a focal is a guess, it is
-    of little worth, but its inliers are not.
-
-    Args:
-        lines: (N, 18) matches as bearing vectors in pixels, see `geometry.lenses.bearings`.
-        options: threshold, confidence, largest number of samples, smallest number of inliers.
-        seed: same seed, same result.
+    Where a focal length is a guess, E is of little worth, but its inliers are not.
     """
     _, first = np.unique(np.hstack([lines[:, FIRST], lines[:, SECOND]]).round(9), axis=0, return_index=True)
     rng = np.random.default_rng(seed)
-    some = lines[rng.permutation(np.sort(first))]
-    if len(some) < options.min_inliers:
+    distinct = lines[rng.permutation(np.sort(first))]
+    if len(distinct) < options.min_inliers:
         return Rejected(TOO_FEW_MATCHES)
-    E, trials = _search(some, options, rng)
+    E, trials = _search(distinct, options, rng)
     if E is None:
         return Rejected(NO_MODEL)
-    squared = squared_distances(E[None], some)[0]
+    squared = squared_distances(E[None], distinct)[0]
     inliers = squared <= options.max_error_px**2
     if np.count_nonzero(inliers) < options.min_inliers:
         return Rejected(TOO_FEW_INLIERS)
-    if model_false_alarms(squared, _mismatch_distances(E, some), options.max_error_px) > MOST_FALSE_ALARMS:
+    if model_false_alarms(squared, _mismatch_distances(E, distinct), options.max_error_px) > MOST_FALSE_ALARMS:
         return Rejected(CHANCE)
     all_squared = squared_distances(E[None], lines)[0]
     accepted = all_squared <= options.max_error_px**2
-    rms, kind = math.sqrt(float(all_squared[accepted].mean())), _find_degeneracy(E, some[inliers], options)
+    rms, kind = math.sqrt(float(all_squared[accepted].mean())), _find_degeneracy(E, distinct[inliers], options)
     return EpipolarFit(E, accepted, validity(lines, E, options.max_error_px), trials, rms, kind)
 
 
 def validity(lines: FloatArray, E: FloatArray, threshold: float) -> FloatArray:
-    """Return (N,) p(v_i) of every match from its influence on E (thesis 4.7.2 and 4.7.3).
-
-    Args:
-        lines: (N, 18) matches.
-        E: (3, 3) of rays, the best model so far.
-        threshold: largest distance of an inlier, in pixels.
-    """
+    """Return (N,) p(v_i) of every match from its influence on E (thesis 4.7.2 and 4.7.3)."""
     distances = np.abs(signed_distances(E, lines))
     fitted = distances <= threshold
     if np.count_nonzero(fitted) <= 9:
@@ -97,34 +98,38 @@ def validity(lines: FloatArray, E: FloatArray, threshold: float) -> FloatArray:
 
 def _search(lines: FloatArray, options: EpipolarSettings, rng: np.random.Generator) -> tuple[FloatArray | None, int]:
     """Return the best E and the number of samples: Algorithm 1, a batch at a time."""
-    scored, threshold = lines[:MOST_SCORED], options.max_error_px
+    scored, threshold = lines[: OPTIONS.most_scored], options.max_error_px
     best, lowest, coarse = None, math.inf, math.inf
-    chances, trials, limit = np.ones(len(lines)), 0, min(options.max_trials, MOST_TRIALS)
+    chances, trials, limit = np.ones(len(lines)), 0, min(options.max_trials, OPTIONS.most_trials)
     while trials < limit:
         samples = _draw(rng, chances if best is not None else None, len(lines))
-        trials += BATCH
+        trials += OPTIONS.batch
         models = solve_five_point(lines[samples][..., FIRST], lines[samples][..., SECOND])
         if not len(models):
             continue
-        costs = _costs(squared_distances(models, scored), COARSE * threshold).sum(axis=1)
-        leader = int(np.argmin(costs))
-        if costs[leader] >= coarse:
+        costs = _costs(squared_distances(models, scored), LEV_RANSAC.coarse * threshold).sum(axis=1)
+        k = int(np.argmin(costs))
+        if costs[k] >= coarse:
             continue
-        coarse = float(costs[leader])
-        tried = _optimize_locally(lines, models[leader], threshold)
-        cost = float(_costs(squared_distances(tried[None], lines), FINE * threshold).sum())
+        coarse = float(costs[k])
+        optimized = _optimize_locally(lines, models[k], threshold)
+        cost = float(_costs(squared_distances(optimized[None], lines), LEV_RANSAC.fine * threshold).sum())
         if cost < lowest:
-            best, lowest, chances = tried, cost, validity(lines, tried, threshold)
-            share = float(np.mean(squared_distances(tried[None], lines)[0] <= threshold**2))
-            limit = min(options.max_trials, MOST_TRIALS, max(LEAST_TRIALS, _samples_needed(share, options.confidence)))
+            best, lowest, chances = optimized, cost, validity(lines, optimized, threshold)
+            share = float(np.mean(squared_distances(optimized[None], lines)[0] <= threshold**2))
+            limit = min(
+                options.max_trials,
+                OPTIONS.most_trials,
+                max(OPTIONS.least_trials, _samples_needed(share, options.confidence)),
+            )
     return best, trials
 
 
 def _draw(rng: np.random.Generator, chances: FloatArray | None, count: int) -> IndexArray:
-    """Return (BATCH, 5) samples, a share of them by the priors once there are any."""
-    keys = rng.random((BATCH, count))
+    """Return (OPTIONS.batch, 5) samples, a share of them by the priors once there are any."""
+    keys = rng.random((OPTIONS.batch, count))
     if chances is not None:  # the smallest of exponential times are a weighted sample without replacement
-        guided = int(GUIDED_SHARE * BATCH)
+        guided = int(OPTIONS.guided_share * OPTIONS.batch)
         keys[:guided] = rng.exponential(size=(guided, count)) / np.maximum(chances, 1e-12)
     return np.argpartition(keys, RAY_SAMPLE_SIZE, axis=1)[:, :RAY_SAMPLE_SIZE]
 
@@ -132,7 +137,7 @@ def _draw(rng: np.random.Generator, chances: FloatArray | None, count: int) -> I
 def _optimize_locally(lines: FloatArray, E: FloatArray, threshold: float) -> FloatArray:
     """Refit to all matches with weights by the cost at the coarse scale, then at the fine one."""
     p, q = lines[:, FIRST], lines[:, SECOND]
-    for scale, steps in zip((COARSE, FINE), STEPS, strict=True):
+    for scale, steps in zip((LEV_RANSAC.coarse, LEV_RANSAC.fine), LEV_RANSAC.local_steps, strict=True):
         for _ in range(steps):
             squared, slope = squared_distances(E[None], lines)[0], gradients(E, lines)
             weights = (1.0 + squared / (scale * threshold) ** 2) ** -2 * slope**-2
@@ -151,14 +156,14 @@ def _samples_needed(share: float, confidence: float) -> int:
 
 
 def _mismatch_distances(E: FloatArray, lines: FloatArray) -> FloatArray:
-    shifts = range(1, min(MISMATCHES, len(lines) - 1) + 1)
+    shifts = range(1, min(OPTIONS.mismatches, len(lines) - 1) + 1)
     wrong = [np.hstack([lines[:, :9], np.roll(lines[:, 9:], shift, axis=0)]) for shift in shifts]
     return np.concatenate([squared_distances(E[None], one)[0] for one in wrong])
 
 
 def _find_degeneracy(E: FloatArray, inliers: FloatArray, options: EpipolarSettings) -> str:
     """Return "rotation" if one of the two rotations of E explains the inliers alone."""
-    within = ROTATION_FACTOR * options.max_error_px
-    turns = (decompose_essential(E)[0][0], decompose_essential(E)[2][0])
-    shares = [float(np.mean(rotation_residuals(inliers, R) <= within)) for R in turns]
-    return "rotation" if max(shares) >= CLEAR_SHARE else ""
+    within = OPTIONS.rotation_factor * options.max_error_px
+    rotations = (decompose_essential(E)[0][0], decompose_essential(E)[2][0])
+    shares = [float(np.mean(rotation_residuals(inliers, R) <= within)) for R in rotations]
+    return "rotation" if max(shares) >= OPTIONS.clear_share else ""

@@ -1,8 +1,6 @@
-"""The estimators of thesis chapter 4, each described by its parts.
+"""The estimators of thesis chapter 4, each described by the parts that differ from the defaults of `loop.Recipe`.
 
-All of them run the same loop with different samplers, solvers, scores, verifiers or stopping rules. Parts that are not
-named are the defaults of `estimator_config.Recipe`. The threshold T is `max_error_px`; the thesis takes 1.96 px for a
-noise of 1 px.
+The threshold T is `max_error_px`; the thesis takes 1.96 px for a noise of 1 px.
 """
 
 import math
@@ -12,7 +10,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from sfm_app.fundamental.estimate import estimate
+from sfm_app.fundamental.estimate import fit_by_recipe
 from sfm_app.fundamental.leverage import prior_validity
 from sfm_app.fundamental.loop import Recipe
 from sfm_app.fundamental.pretests import RandomizedTdd, Sprt
@@ -23,14 +21,11 @@ from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
 from sfm_app.types.arrays import FloatArray
 
-_LMEDS_SIGMAS = 2.5
-"""Robust standard deviations within which matches are inliers of LMedS (Rousseeuw and Leroy 1987)."""
-
 
 def _refit_to_median(points: FloatArray, F: FloatArray, _threshold: float) -> FloatArray:
-    """Refit to the matches within 2.5 robust standard deviations: LMedS knows the scale by itself."""
+    """Refit to the matches within 2.5 robust standard deviations (Rousseeuw and Leroy 1987)."""
     squared = squared_distances(points, np.ascontiguousarray(F).reshape(9))
-    return refit_sampson(points, F, _LMEDS_SIGMAS * median_sigma(squared))
+    return refit_sampson(points, F, 2.5 * median_sigma(squared))
 
 
 def median_sigma(squared: FloatArray) -> float:
@@ -73,18 +68,18 @@ RECIPES: Mapping[str, tuple[Recipe, str]] = {
         "least median of squares, for up to half outliers",
     ),
 }
-"""By name: recipe, and one line about it. RES-RANSAC draws a tenth of its trials before it has priors (thesis 4.6.2);
+"""By name: recipe and one line about it. RES-RANSAC draws a tenth of its trials before it has priors (thesis 4.6.2);
 LMedS assumes half outliers (4.4.1)."""
 
 
 class ClassicalEstimator:
-    """A callable that runs the recipe of a name in `RECIPES`; see `estimate`."""
+    """The estimator of a name in `RECIPES`, as a function that can be pickled."""
 
     def __init__(self, name: str) -> None:
         self.__name__ = name
 
     def __call__(self, x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
-        return estimate(x1, x2, options, seed, RECIPES[self.__name__][0])
+        return fit_by_recipe(x1, x2, options, seed, RECIPES[self.__name__][0])
 
     def __reduce__(self) -> tuple[Callable[[str], "ClassicalEstimator"], tuple[str]]:
         """Pickle by name, as functions are: a worker process looks up its own instance."""

@@ -13,14 +13,9 @@ from sfm_app.geometry.least_squares import DampingRange, damped_step
 from sfm_app.jit import kernel, summing_kernel
 from sfm_app.types.arrays import FloatArray
 
-# Matrices of rank 2 as rotations and a singular value: F = U diag(1, s, 0) V' (Bartoli and Sturm 2004).
-#
-# Three parameters of each rotation and s are seven in all: every step keeps rank 2, and scale is not a parameter. A
-# step replaces U by U exp([a]x) and V by V exp([b]x).
-
-LEAST_RATIO = 1e-12
-"""Least ratio of the first two singular values: below it a matrix counts as rank 1. Rounding in double precision leaves
-1e-16; the margin was chosen by hand."""
+# Matrices of rank 2 as rotations and a singular value: F = U diag(1, s, 0) V' (Bartoli and Sturm 2004). Three
+# parameters of each rotation and s are seven: every step keeps rank 2, and scale is no parameter. A step replaces U
+# by U exp([a]x) and V by V exp([b]x).
 
 
 @kernel
@@ -41,7 +36,7 @@ def factorize(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
     first = _normalize(U, FIRST)
     _orthogonalize(U)  # removes rounding errors, which matter where s is small
     second = _normalize(U, 1)
-    if not second > LEAST_RATIO * first:  # rank 1: any second column will do
+    if not second > 1e-12 * first:  # rank 1 but for rounding: any second column will do
         least = 0
         for i in range(1, 3):
             least = i if abs(U[i, 0]) < abs(U[least, 0]) else least
@@ -75,13 +70,7 @@ def _orthogonalize(U: FloatArray) -> None:
 
 @kernel
 def compose(U: FloatArray, s: float, V: FloatArray) -> FloatArray:
-    """Return the (9,) entries of U diag(1, s, 0) V' by rows.
-
-    Args:
-        U: (3, 3) rotation.
-        s: second singular value; the first is 1.
-        V: (3, 3) rotation.
-    """
+    """Return the (9,) entries of U diag(1, s, 0) V' by rows."""
     f = np.empty(9)
     for i in range(3):
         for j in range(3):
@@ -91,14 +80,7 @@ def compose(U: FloatArray, s: float, V: FloatArray) -> FloatArray:
 
 @kernel
 def fill_tangent_basis(U: FloatArray, s: float, V: FloatArray, basis: FloatArray) -> None:
-    """Write the derivatives of F by the seven parameters, one row each: U [e_k]x S V', -U S [e_k]x V', u2 v2'.
-
-    Args:
-        U: (3, 3) rotation.
-        s: second singular value; the first is 1.
-        V: (3, 3) rotation.
-        basis: (7, 9), written to.
-    """
+    """Write the derivatives (7, 9) of F by the parameters: U [e_k]x S V', -U S [e_k]x V', u2 v2'."""
     for i in range(3):
         for j in range(3):
             k = 3 * i + j
@@ -113,12 +95,7 @@ def fill_tangent_basis(U: FloatArray, s: float, V: FloatArray, basis: FloatArray
 
 @kernel
 def rotate(R: FloatArray, w: FloatArray) -> FloatArray:
-    """Return R exp([w]x) by Rodrigues' formula.
-
-    Args:
-        R: (3, 3) rotation.
-        w: (3,) rotation vector in radians.
-    """
+    """Return R exp([w]x) by Rodrigues' formula; w (3,) in radians."""
     angle = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
     a = np.sin(angle) / angle if angle > 1e-8 else 1.0
     b = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-8 else 0.5
@@ -133,40 +110,22 @@ def rotate(R: FloatArray, w: FloatArray) -> FloatArray:
     return product
 
 
-# Non-linear refinement of F on the Sampson distance (thesis 4.3, Eq. 4.2), over its seven degrees of freedom.
-#
-# The parameters are those of `rank_two`. All fits are iteratively reweighted least squares: weigh the matches by
-# their distances, take one Levenberg-Marquardt step that lowers sum_i w_i r_i^2, weigh again. For a cost that is a
+# Refinement on the Sampson distance (thesis 4.3, Eq. 4.2) by iteratively reweighted least squares: weigh the matches
+# by their distances, take one Levenberg-Marquardt step that lowers sum_i w_i r_i^2, weigh again. For a cost that is a
 # concave function of r^2, as robust costs are, such a step lowers the cost itself as well.
 
-_FIRST_DAMPING, _SMALLEST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e-12, 1e12
-"""Damping of Levenberg-Marquardt steps, relative to the curvature. Chosen by hand; not measured on their own."""
 _COST_TOLERANCE = 1e-9
-"""Relative decrease of the cost below which the iteration ends. Chosen by hand; not measured on its own."""
-_LIKELIHOOD_TOLERANCE = 1e-4
-"""Relative decrease of the cost below which the mixture fit ends. Chosen by hand; not measured on its own."""
+"""Relative decrease of the cost that ends least squares. Chosen by hand; not measured on its own."""
 _NEGLIGIBLE = 1e-3
 """Weight below which a match is left out of a step. Chosen by hand; not measured on its own."""
-_LEAST_SIGMA = 0.02
-"""Least sigma in thresholds: without it nearly perfect matches would exclude all others. Chosen by hand; not measured
-on its own."""
-_FIRST_SHARE, _MOST_SHARE = 0.9, 0.999
-"""Share of inliers among the matches within reach: initial value and upper bound in expectation maximization. Chosen by
-hand; not measured on their own."""
-_FIRST_ROUNDS = 6
-"""Rounds of expectation maximization before the first step; one before each later step. Chosen by hand; not measured
-on its own."""
-_LEAST_CURVATURE = 1e-9
-"""Least curvature that damping multiplies, relative to the largest: matches may leave a direction of F free. Chosen by
-hand; not measured on its own."""
 
 
 class Weighting(NamedTuple):
-    """How squared distances become weights: by a robust cost, or by a mixture of two densities."""
+    """Weights of squared distances: by a robust cost, or by a mixture of two densities."""
 
     is_mixture: bool = False
     softness: float = 0.0
-    """1 / c^2 of the robust cost r^2 / (1 + r^2 / c^2); 0 for least squares. Not used by the mixture."""
+    """Robust cost: 1 / c^2 of r^2 / (1 + r^2 / c^2); 0 for least squares."""
     squared_reach: float = 0.0
     """Mixture: squared distance within which matches count; outliers are uniform up to this distance."""
     largest_variance: float = 0.0
@@ -176,44 +135,38 @@ class Weighting(NamedTuple):
 
 
 def refine_sampson(
-    points: FloatArray, F: FloatArray, *, scale: float = np.inf, most_steps: int = 20, enough: float = _COST_TOLERANCE
+    points: FloatArray,
+    F: FloatArray,
+    *,
+    scale: float = np.inf,
+    most_steps: int = 20,
+    tolerance: float = _COST_TOLERANCE,
 ) -> FloatArray:
     """Move F towards a minimum of sum_i r_i^2 / (1 + r_i^2 / c^2) (Geman and McClure 1987).
 
-    Args:
-        points: (N, 4) matches.
-        F: (3, 3) start.
-        scale: c, in the units of `points`; inf for least squares.
-        most_steps: largest number of Levenberg-Marquardt steps.
-        enough: relative decrease of the cost below which to stop.
+    `scale` is c; inf for least squares. The steps end at a relative decrease of the cost below `tolerance`.
 
     Returns:
         (3, 3), rank 2, its largest singular value 1.
     """
     weighing = Weighting(softness=float(scale**-2))
-    return _reweighted_least_squares(points, *factorize(F), weighing, most_steps, enough, np.empty((10, 10)))
+    return _reweighted_least_squares(points, *factorize(F), weighing, most_steps, tolerance, np.empty((10, 10)))
 
 
 def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach: float, most_steps: int) -> FloatArray:
     """Estimate F with the sigma and share of inliers by maximum likelihood: EM (thesis 3.5 and 4.6).
 
-    Among the matches within `reach` thresholds, signed distances of inliers are Gaussian about 0, those of outliers
-    uniform. The weight of a match is the probability that it is an inlier. sigma is at most one threshold.
-
-    Args:
-        points: (N, 4) matches.
-        F: (3, 3) start, near enough for its inliers to determine sigma.
-        threshold: largest distance of an inlier.
-        reach: thresholds within which matches count, > 1.
-        most_steps: largest number of steps.
+    Among the matches within `reach` > 1 thresholds, signed distances of inliers are Gaussian about 0, with a sigma of
+    at most one threshold, those of outliers uniform. The weight of a match is the probability that it is an inlier. F
+    must be near enough for its inliers to determine sigma.
 
     Returns:
         (3, 3), rank 2, its largest singular value 1.
     """
     U, s, V = factorize(F)
     squared = squared_distances(points, compose(U, s, V))
-    inside = squared[squared <= threshold * threshold]
-    sigma = mad_sigma(np.sqrt(inside)) if len(inside) else threshold
+    inliers = squared[squared <= threshold * threshold]
+    sigma = mad_sigma(np.sqrt(inliers)) if len(inliers) else threshold
     squared_reach = float((reach * threshold) ** 2)
     weighing = Weighting(
         is_mixture=squared_reach > 0.0,  # where the squared threshold underflows, fall back to least squares
@@ -221,29 +174,21 @@ def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach
         largest_variance=float(threshold**2),
         first_variance=float(min(sigma, threshold) ** 2),
     )
-    return _reweighted_least_squares(points, U, s, V, weighing, most_steps, _LIKELIHOOD_TOLERANCE, np.empty((10, 10)))
+    return _reweighted_least_squares(points, U, s, V, weighing, most_steps, 1e-4, np.empty((10, 10)))
 
 
 def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """Apply the 8-point algorithm (thesis 4.3.2) on matches that are well scaled already.
+    """Apply the 8-point algorithm (thesis 4.3.2) on well-scaled matches; returns (3, 3) of rank 2.
 
-    Args:
-        points: (N, 4), of magnitude about 1.
-        weights: (N,) >= 0, how much each squared algebraic error counts; at least eight positive ones.
-
-    Returns:
-        (3, 3), rank 2.
+    `weights` (N,) >= 0, at least eight of them positive, multiply the squared algebraic errors.
     """
     U, s, V = factorize(fit_algebraic(points, weights))
     return compose(U, s, V).reshape(3, 3)
 
 
 def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the (3, 3) matrix of norm 1 and any rank with the least algebraic error: `fit_eight_point` without rank 2.
-
-    Args:
-        points: (N, 4), of magnitude about 1.
-        weights: (N,) >= 0, at least eight positive ones.
+    """Return the (3, 3) matrix of norm 1 and any rank with the least algebraic error; `weights` as in
+    `fit_eight_point`.
     """
     _, vectors = np.linalg.eigh(weighted_gram(points, weights))
     return np.ascontiguousarray(vectors[:, 0]).reshape(3, 3)
@@ -251,10 +196,10 @@ def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
 
 @kernel
 def _reweighted_least_squares(
-    points: FloatArray, U: FloatArray, s: float, V: FloatArray, weighing: Weighting, most_steps: int, enough: float,
+    points: FloatArray, U: FloatArray, s: float, V: FloatArray, weighing: Weighting, most_steps: int, tolerance: float,
     gram: FloatArray,
 ) -> FloatArray:  # fmt: skip
-    """Weigh and step in turn until a step lowers the cost by less than the relative decrease `enough`.
+    """Weigh and step in turn until a step lowers the cost by less than the relative decrease `tolerance`.
 
     `gram` (10, 10) is a work array: if its size were known at compile time, the compiler would unroll all sums.
     """
@@ -263,29 +208,29 @@ def _reweighted_least_squares(
     normal, right, step = np.empty((7, 7)), np.empty(7), np.empty(7)
     f = compose(U, s, V)
     fill_squared_distances(points, f, FIRST, squared)
-    damping, variance, share = _FIRST_DAMPING, weighing.first_variance, _FIRST_SHARE
+    damping, variance, share = 1e-4, weighing.first_variance, 0.9
     for n in range(most_steps):
         if weighing.is_mixture:
-            rounds = _FIRST_ROUNDS if n == 0 else 1
+            rounds = 6 if n == 0 else 1
             variance, share = _weigh_by_mixture(squared, weighing, variance, share, rounds, weights)
         else:
             _weigh_robustly(squared, weighing.softness, weights)
         cost = new_cost = _weighted_sum(squared, weights)
         _normal_equations(points, f, weights, U, s, V, gram, normal, right)
         improved = False
-        while not improved and damping < _LARGEST_DAMPING:
+        while not improved and damping < 1e12:
             if _solve(normal, right, damping, step):
                 U_new, V_new, s_new = rotate(U, step[0:3]), rotate(V, step[3:6]), s + step[6]
                 new = compose(U_new, s_new, V_new)
                 fill_squared_distances(points, new, FIRST, trial)
                 new_cost = _weighted_sum(trial, weights)
                 improved = new_cost < cost
-            damping = max(damping * 0.1, _SMALLEST_DAMPING) if improved else damping * 10.0
+            damping = max(damping * 0.1, 1e-12) if improved else damping * 10.0
         if not improved:
             break
         U, V, s, f = U_new, V_new, s_new, new
         squared, trial = trial, squared
-        if cost - new_cost <= enough * cost:
+        if cost - new_cost <= tolerance * cost:
             break
     return f.reshape(3, 3)
 
@@ -317,8 +262,9 @@ def _weigh_by_mixture(
                 moment += weight * squared[i]
                 weights[i] = weight if weight > _NEGLIGIBLE else 0.0
         variance = moment / max(total - 7.0, 1.0)  # seven parameters of F are fitted to the same matches
-        variance = min(max(variance, _LEAST_SIGMA * _LEAST_SIGMA * largest), largest)
-        share = min(max(total / max(near, 1), 1.0 - _MOST_SHARE), _MOST_SHARE)
+        # sigma within 0.02 to 1 thresholds: without a bound nearly perfect matches would exclude all others
+        variance = min(max(variance, 0.02 * 0.02 * largest), largest)
+        share = min(max(total / max(near, 1), 1.0 - 0.999), 0.999)
     return variance, share
 
 
@@ -397,16 +343,15 @@ def _project(gram: FloatArray, basis: FloatArray, normal: FloatArray, right: Flo
 
 @kernel
 def _solve(normal: FloatArray, right: FloatArray, damping: float, step: FloatArray) -> bool:
-    """Write the Cholesky solution of (normal + damping diag(normal)) step = right.
-
-    Returns False if the matrix is not positive definite.
+    """Write the Cholesky solution of (normal + damping diag(normal)) step = right; False if it is not positive
+    definite.
     """
     lower = normal.copy()
     largest = 0.0
     for j in range(7):
         largest = max(largest, normal[j, j])
     for j in range(7):
-        lower[j, j] += damping * max(normal[j, j], _LEAST_CURVATURE * largest)
+        lower[j, j] += damping * max(normal[j, j], 1e-9 * largest)  # matches may leave a direction of F free
     for j in range(7):
         for k in range(j):
             for n in range(k):
@@ -428,39 +373,24 @@ def _solve(normal: FloatArray, right: FloatArray, damping: float, step: FloatArr
     return True
 
 
-# The Gold Standard refit: F of the projective reconstruction with least reprojection error (thesis 4.3, HZ
-# 11.4.1)::
+# The Gold Standard refit: F of the projective reconstruction with least reprojection error (thesis 4.3, HZ 11.4.1),
+# cost = sum_i c^2 log(1 + r_i^2 / c^2) (c = inf: least squares), with r_i the reprojection distance of match i.
 #
-# cost = sum_i c^2 log(1 + r_i^2 / c^2) (c = inf: least squares)
-#
-# with r_i the reprojection distance of match i, which is already minimized over its point X_i. Bundle adjustment of
-# two views has twelve camera parameters and three per point, but of the twelve only the seven of F count (2.34: v
-# and lambda are free), and the Schur complement of a point at its optimum leaves one equation per match: r_i, with
-# the derivative x2 x1' / |gradient of x2' F x1| over F, both evaluated at the nearest exact match. So this is
-# Levenberg-Marquardt over F alone, with the points eliminated exactly. It needs no depth: points at infinity are no
-# special case, and points near an epipole, whose depth is undetermined, do not hold back the others. Time and
-# memory grow with the number of matches.
+# The points are eliminated exactly. The Schur complement of a point at its optimum leaves one equation per match:
+# r_i, with the derivative x2 x1' / |gradient of x2' F x1| over F, both at the nearest exact match; of the twelve
+# camera parameters only the seven of F count (thesis 2.34). Depth plays no part: points at infinity and near an
+# epipole are no special case.
 
-DAMPING = DampingRange(first=1e-4, least=1e-12, most=1e12)
-"""Damping of Levenberg-Marquardt steps. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-_LEAST_GOLD_CURVATURE = 1e-12
-"""Least curvature, relative to the largest: some matches leave a direction of F free. Chosen by hand; halved and
-doubled by `benchmarks.sensitivity`."""
+_DAMPING = DampingRange(first=1e-4, least=1e-12, most=1e12)
+"""Damping of Levenberg-Marquardt steps relative to the curvature, as in the kernels above. Chosen by hand."""
 
 
 def refine_reprojection(
     points: FloatArray, F: FloatArray, *, scale: float = np.inf, most_steps: int = 20
 ) -> FloatArray:
-    """Move F to a local minimum of the cost above.
+    """Move F to a local minimum of the cost above; returns (3, 3), rank 2, Frobenius norm 1.
 
-    Args:
-        points: (N, 4) inliers, of magnitude about 1.
-        F: (3, 3) start.
-        scale: Cauchy scale c, in the units of `points`; inf for plain least squares.
-        most_steps: largest number of Levenberg-Marquardt steps.
-
-    Returns:
-        (3, 3), rank 2, Frobenius norm 1.
+    `points` are inliers; `scale` is the Cauchy scale c, inf for least squares.
 
     Raises:
         NumericalError: F is zero or not finite.
@@ -468,25 +398,25 @@ def refine_reprojection(
     softness = 1.0 / (scale * scale)
     F = to_unit_norm(nearest_rank_two(to_unit_norm(F)))
     moves = _moves(points, F)
-    cost, damping = _cost(moves, softness), DAMPING.first
+    cost, damping = _cost(moves, softness), _DAMPING.first
 
-    def attempt(tried: float) -> tuple[FloatArray, FloatArray, float] | None:
-        step = np.linalg.solve(normal + tried * np.diag(curvature), right)
+    def attempt(damping: float) -> tuple[FloatArray, FloatArray, float] | None:
+        step = np.linalg.solve(normal + damping * np.diag(curvature), right)
         trial = to_unit_norm(nearest_rank_two(F + (step @ basis).reshape(3, 3)))
-        reached = _moves(points, trial)
-        lower = _cost(reached, softness)
-        return (trial, reached, lower) if lower < cost else None
+        trial_moves = _moves(points, trial)
+        trial_cost = _cost(trial_moves, softness)
+        return (trial, trial_moves, trial_cost) if trial_cost < cost else None
 
     for _ in range(most_steps):
         if not 0 < cost < np.inf:
             break
         basis = _tangent_basis(F)
         normal, right = _gold_normal_equations(points, F, moves, softness, basis)
-        curvature = np.maximum(np.diag(normal), _LEAST_GOLD_CURVATURE * np.diag(normal).max())
-        found, damping = damped_step(attempt, damping, DAMPING)
-        if found is None:
+        curvature = np.maximum(np.diag(normal), 1e-12 * np.diag(normal).max())
+        step, damping = damped_step(attempt, damping, _DAMPING)
+        if step is None:
             break
-        before, (F, moves, cost) = cost, found
+        before, (F, moves, cost) = cost, step
         if before - cost <= _COST_TOLERANCE * before:
             break
     return F
@@ -524,11 +454,8 @@ def _gold_normal_equations(
     return np.einsum("nj,nk->jk", weighted, jacobian), -np.einsum("nj,n->j", weighted, residuals)
 
 
-# The final fit: the estimator's own, optionally followed by one that the settings name (thesis 4.3).
-#
-# The three named fits are least squares on the inliers of the given model. One minimizes the algebraic distance;
-# the other two start from its result and minimize the Sampson or the reprojection distance. With fewer than eight
-# inliers the model does not change.
+# The final fit: the estimator's own, optionally followed by a least-squares fit to its inliers (thesis 4.3). With
+# fewer than eight inliers the model does not change.
 
 Refit = Callable[[FloatArray, FloatArray, float], FloatArray]
 """(points, F, threshold) -> the final F."""
@@ -541,13 +468,7 @@ def _refit_eight_point(points: FloatArray, F: FloatArray, threshold: float) -> F
 
 
 def refit_sampson(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """Minimize the Sampson distance (thesis 4.2).
-
-    Args:
-        points: (N, 4) matches.
-        F: (3, 3) the model to start from.
-        threshold: largest distance of an inlier, in the units of the points.
-    """
+    """Minimize the Sampson distance (thesis 4.2) of the inliers, starting from the 8-point fit."""
     inliers = _inliers(points, F, threshold)
     return refine_sampson(inliers, _refit_eight_point(points, F, threshold)) if len(inliers) >= 8 else F
 
@@ -567,13 +488,9 @@ REFITS: dict[str, Refit] = {
 
 
 def choose_refit(name: str, own: Refit) -> Refit:
-    """Return the estimator's own fit, followed by the named fit to its inliers unless the name is "auto".
+    """Return the estimator's own fit, followed by the named one in `REFITS` to its inliers unless the name is "auto".
 
     The own fit always comes first: its inliers are better than those of the best sample.
-
-    Args:
-        name: "auto", or a name in `REFITS`.
-        own: the estimator's own fit.
     """
     if name == "auto":
         return own
@@ -581,5 +498,5 @@ def choose_refit(name: str, own: Refit) -> Refit:
 
 
 def _inliers(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    chosen = squared_distances(points, np.ascontiguousarray(F).reshape(9)) <= threshold * threshold
-    return np.asfortranarray(points[chosen])
+    inliers = squared_distances(points, np.ascontiguousarray(F).reshape(9)) <= threshold * threshold
+    return np.asfortranarray(points[inliers])

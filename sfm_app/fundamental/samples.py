@@ -8,10 +8,8 @@ from numpy.typing import NDArray
 from sfm_app.jit import kernel
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-# Random minimal samples, uniform or by weight, from a generator whose state is an argument.
-#
-# The generator is splitmix64 (Steele, Lea and Flood 2014): 64 bits of state, one multiplication chain per number.
-# Its state is an argument, so that pairs can run in parallel threads and still give the same bits.
+# Minimal samples, uniform or by weight. The generator is splitmix64 (Steele, Lea and Flood 2014). Its state is an
+# argument, so that pairs can run in parallel threads and still give the same bits.
 
 RandomState = NDArray[np.uint64]
 
@@ -19,18 +17,11 @@ SAMPLE_SIZE = 7
 """Matches of a minimal sample: F has seven degrees of freedom (thesis 4.3.1)."""
 
 _STEP = np.uint64(0x9E3779B97F4A7C15)
-"""Increment of the state of splitmix64: 2^64 over the golden ratio (Steele, Lea and Flood 2014)."""
-_MIX1 = np.uint64(0xBF58476D1CE4E5B9)
-"""First multiplier of splitmix64 (Steele, Lea and Flood 2014)."""
-_MIX2 = np.uint64(0x94D049BB133111EB)
-"""Second multiplier of splitmix64 (Steele, Lea and Flood 2014)."""
+"""Increment of the state: 2^64 over the golden ratio (Steele, Lea and Flood 2014)."""
+_MIX1, _MIX2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+"""Multipliers of splitmix64 (Steele, Lea and Flood 2014)."""
 _S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
-"""Shifts of splitmix64 (Steele, Lea and Flood 2014), and the last one, which leaves the 53 bits of a double."""
-_TO_UNIT = 2.0**-53
-"""From 53 random bits to [0, 1) in double precision."""
-_MOST_REDRAWS = 100
-"""Repeated draws of matches that the sample already holds, before the weights are given up. Chosen by hand; not
-measured on its own."""
+"""Shifts of splitmix64 (Steele, Lea and Flood 2014), and the one that leaves the 53 bits of a double."""
 
 
 def random_state(seed: int) -> RandomState:
@@ -45,18 +36,12 @@ def uniform(state: RandomState) -> float:
     z = state[0]
     z = (z ^ (z >> _S30)) * _MIX1
     z = (z ^ (z >> _S27)) * _MIX2
-    return float((z ^ (z >> _S31)) >> _S11) * _TO_UNIT
+    return float((z ^ (z >> _S31)) >> _S11) * 2.0**-53
 
 
 @kernel
 def draw_uniform(state: RandomState, count: int, sample: IndexArray) -> None:
-    """Fill a sample with distinct indices.
-
-    Args:
-        state: of the generator; it is advanced.
-        count: indices lie below it; at least the sample's length.
-        sample: (m,), written to.
-    """
+    """Fill a sample (m,) with distinct indices below `count`, which is at least m."""
     for k in range(sample.shape[0]):
         fresh = False
         while not fresh:
@@ -66,15 +51,10 @@ def draw_uniform(state: RandomState, count: int, sample: IndexArray) -> None:
 
 @kernel
 def draw_weighted(state: RandomState, cumulative: FloatArray, sample: IndexArray) -> bool:
-    """Fill `sample` with distinct indices, each draw proportional to the weights of those that are left.
+    """Fill a sample (m,) with distinct indices, each draw proportional to the weights of the remaining ones.
 
-    Drawing again when an index is already in the sample is the same as drawing from the others. Returns False when this
-    does not end, because fewer points than the sample needs hold nearly all the weight.
-
-    Args:
-        state: generator.
-        cumulative: (N,) running sum of weights >= 0, the last one > 0.
-        sample: (m,) filled with indices.
+    `cumulative` (N,) is the running sum of weights >= 0. Repeated indices are drawn again; False after 100 repetitions,
+    because fewer points than the sample needs hold nearly all the weight.
     """
     total = cumulative[-1]
     redraws = 0
@@ -84,7 +64,7 @@ def draw_weighted(state: RandomState, cumulative: FloatArray, sample: IndexArray
             sample[k] = _search_sorted(cumulative, uniform(state) * total)
             fresh = _is_fresh(sample, k)
             redraws += not fresh
-            if redraws > _MOST_REDRAWS:
+            if redraws > 100:
                 return False
     return True
 
@@ -116,29 +96,23 @@ CONVERGED = 0.05
 
 
 def required_trials(success: float, confidence: float, log_missed: float = 0.0) -> float:
-    """Return how many samples make one success as probable as wanted (thesis 3.19); inf if none can succeed.
+    """Return how many samples reach a success with probability `confidence` (thesis 3.19); inf if none can succeed.
 
     Args:
         success: probability that one sample is clean, share^m, and that its model passes the test.
-        confidence: wanted probability, in (0, 1).
-        log_missed: logarithm of the probability that all samples drawn before failed; they are not counted again.
+        log_missed: logarithm of the probability that all earlier samples failed; they are not counted again.
     """
-    left = math.log1p(-confidence) - log_missed
-    if left >= 0:
+    remaining = math.log1p(-confidence) - log_missed
+    if remaining >= 0:
         return 0.0
     if success >= 1:
         return 1.0
-    return left / math.log1p(-success) if success > 0 else math.inf
+    return remaining / math.log1p(-success) if success > 0 else math.inf
 
 
 def has_converged(before: NDArray[np.float64], after: NDArray[np.float64], limit: float = CONVERGED) -> bool:
-    """Return whether the priors, normalized to sum 1, changed less than a limit in sum (thesis 4.18).
+    """Return whether the priors (N,), normalized to sum 1, changed by less than `limit` in sum (thesis 4.18).
 
     The printed sum grows with the number of matches; for probabilities that sum to 1 it lies in [0, 2].
-
-    Args:
-        before: (N,) priors >= 0, of any sum but zero.
-        after: (N,) the new priors.
-        limit: of the sum of the changes, in [0, 2].
     """
     return bool(np.abs(after / after.sum() - before / before.sum()).sum() < limit)

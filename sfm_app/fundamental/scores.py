@@ -1,4 +1,4 @@
-"""Scores of a model: robust costs of its residuals (thesis, chapter 4)."""
+"""Scores of a model: penalties on the Sampson distances of all matches, with early exits (thesis 4.4.1)."""
 
 import math
 from collections.abc import Callable
@@ -10,8 +10,6 @@ from sfm_app.fundamental.pretests import BLOCK, PreTest
 from sfm_app.jit import kernel
 from sfm_app.types.arrays import FloatArray
 
-# How well F explains all matches: penalties on the Sampson distance, with early exits (thesis 4.4.1).
-#
 # Penalties are minimized. A score is a function (points, threshold, best model or None) -> `Loss`, called again at
 # every new best model; only that of MLESAC changes during the search.
 
@@ -20,11 +18,6 @@ FIRST = cast("int", np.int64(0))
 
 RANSAC, MSAC, MSAC_LINEAR, MLESAC, LMEDS, GEMAN_MCCLURE = range(6)
 """Kinds of `Loss`, one for each penalty below."""
-
-
-_SMALL_BLOCK = 16
-"""Matches whose distances are computed at once where the pre-test checks often. Chosen by hand for speed: no result
-depends on it."""
 
 
 class Loss(NamedTuple):
@@ -46,35 +39,17 @@ Score = Callable[[FloatArray, float, FloatArray | None], Loss]
 
 
 def ransac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return the number of outliers as a `Loss`: 1 for each match beyond the threshold (thesis 3.20, 4.4).
-
-    Args:
-        _points: not used; all scores take them.
-        threshold: largest distance of an inlier, in the units of the points.
-        _best: not used.
-    """
+    """Return the number of outliers as a `Loss`: 1 for each match beyond the threshold (thesis 3.20, 4.4)."""
     return Loss(RANSAC, threshold * threshold, threshold * threshold, 1.0)
 
 
 def msac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return the squared distance, at most the squared threshold, as a `Loss` (Torr and Zisserman 2000).
-
-    Args:
-        _points: not used; all scores take them.
-        threshold: largest distance of an inlier, in the units of the points.
-        _best: not used.
-    """
+    """Return the squared distance, at most the squared threshold, as a `Loss` (Torr and Zisserman 2000)."""
     return Loss(MSAC, threshold * threshold, threshold * threshold, threshold * threshold)
 
 
 def msac_linear(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return the distance, at most the threshold, as a `Loss` (thesis 4.5 as printed).
-
-    Args:
-        _points: not used; all scores take them.
-        threshold: largest distance of an inlier, in the units of the points.
-        _best: not used.
-    """
+    """Return the distance, at most the threshold, as a `Loss` (thesis 4.5 as printed)."""
     return Loss(MSAC_LINEAR, threshold * threshold, threshold * threshold, threshold)
 
 
@@ -82,36 +57,19 @@ def lmeds(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Lo
     """Return the median of the squared distances as a `Loss` (Rousseeuw 1984; thesis 4.4.1).
 
     Args:
-        _points: not used; all scores take them.
         threshold: largest distance of an inlier; used only to count inliers.
-        _best: not used.
     """
     return Loss(LMEDS, threshold * threshold, np.inf, np.inf)
 
 
 def geman_mcclure(_points: FloatArray, threshold: float, _best: FloatArray | None, *, scale: float) -> Loss:
-    """Return r^2 / (r^2 + c^2) as a `Loss`: smooth, and close matches count most (Geman and McClure 1987).
-
-    Args:
-        _points: not used; all scores take them.
-        threshold: largest distance of an inlier, in the units of the points.
-        _best: not used.
-        scale: c in thresholds, > 0.
-    """
+    """Return r^2 / (r^2 + c^2) as a `Loss`, c = `scale` thresholds (Geman and McClure 1987)."""
     return Loss(GEMAN_MCCLURE, threshold * threshold, np.inf, 1.0, (scale * threshold) ** -2)
 
 
 @kernel
 def squared_sampson_distance(f: FloatArray, x1: float, y1: float, x2: float, y2: float) -> float:
-    """Return the squared Sampson distance (thesis 4.2) of one match.
-
-    Args:
-        f: (9,) entries of F by rows.
-        x1: x of the point in view 1.
-        y1: y of the point in view 1.
-        x2: x of its partner in view 2.
-        y2: y of its partner in view 2.
-    """
+    """Return the squared Sampson distance (thesis 4.2) of one match."""
     ax, ay, az = f[0] * x1 + f[1] * y1 + f[2], f[3] * x1 + f[4] * y1 + f[5], f[6] * x1 + f[7] * y1 + f[8]
     bx, by = f[0] * x2 + f[3] * y2 + f[6], f[1] * x2 + f[4] * y2 + f[7]
     algebraic = x2 * ax + y2 * ay + az
@@ -121,12 +79,7 @@ def squared_sampson_distance(f: FloatArray, x1: float, y1: float, x2: float, y2:
 
 @kernel
 def squared_distances(points: FloatArray, f: FloatArray) -> FloatArray:
-    """Return (N,) squared Sampson distances of all matches.
-
-    Args:
-        points: (N, 4) matches.
-        f: (9,) entries of F by rows.
-    """
+    """Return (N,) squared Sampson distances of all matches."""
     squared = np.empty(points.shape[0])
     fill_squared_distances(points, f, FIRST, squared)
     return squared
@@ -134,14 +87,7 @@ def squared_distances(points: FloatArray, f: FloatArray) -> FloatArray:
 
 @kernel
 def fill_squared_distances(points: FloatArray, f: FloatArray, start: int, squared: FloatArray) -> None:
-    """Write the squared Sampson distances of consecutive matches.
-
-    Args:
-        points: (N, 4) matches.
-        f: (9,) entries of F by rows.
-        start: row of the first match.
-        squared: (n,), written to; n <= N - start.
-    """
+    """Write the squared Sampson distances of the matches from row `start` on to `squared` (n,)."""
     f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
     for i in range(squared.shape[0]):  # scalars, so that the compiler vectorizes over matches
         x1, y1, x2, y2 = points[start + i, 0], points[start + i, 1], points[start + i, 2], points[start + i, 3]
@@ -173,12 +119,10 @@ def penalty(points: FloatArray, start: int, f: FloatArray, loss: Loss, to_beat: 
     """Return the penalty of all matches, or inf as soon as f cannot stay below `to_beat` or fails the pre-test.
 
     Args:
-        points: (N, 4) matches in random order; repeated to (2 N, 4) for a pre-test with a random start.
+        points: in random order; repeated to (2 N, 4) for a pre-test with a random start.
         start: the match to begin with.
-        f: (9,) entries of F.
-        loss: which penalty. The pre-test is not applied to the median.
         to_beat: best penalty so far; inf for a full count.
-        pretest: how many inliers f must have after each part of the matches.
+        pretest: how many inliers f must have after each part of the matches; not applied to the median.
     """
     if loss.kind == LMEDS:
         return _median_of_squares(points, f, to_beat)
@@ -187,7 +131,7 @@ def penalty(points: FloatArray, start: int, f: FloatArray, loss: Loss, to_beat: 
     squared = np.empty(BLOCK)
     while done < count:
         often = pretest.stride < BLOCK and done < pretest.stride * pretest.least_inliers.shape[0]
-        size = min(_SMALL_BLOCK if often else BLOCK, count - done)
+        size = min(16 if often else BLOCK, count - done)  # for speed: no result depends on it
         fill_squared_distances(points, f, start + done, squared[:size])
         if often:  # the pre-test checks after every few matches, and rejects most models at the first checks
             for i in range(size):
@@ -196,8 +140,8 @@ def penalty(points: FloatArray, start: int, f: FloatArray, loss: Loss, to_beat: 
                 if not _check_pretest(pretest, done + i + 1, inliers):
                     return np.inf
         else:
-            more, cost = _sum_costs(squared[:size], loss)
-            inliers += more
+            added, cost = _sum_costs(squared[:size], loss)
+            inliers += added
             total += cost
             if not _check_pretest(pretest, done + size, inliers):
                 return np.inf
@@ -210,11 +154,11 @@ def penalty(points: FloatArray, start: int, f: FloatArray, loss: Loss, to_beat: 
 @kernel
 def _check_pretest(pretest: PreTest, done: int, inliers: int) -> bool:
     """Return whether a model with this many inliers passes the pre-test; count it if it is rejected."""
-    looks = done // pretest.stride
+    check = done // pretest.stride
     if (
         done % pretest.stride != 0
-        or looks > pretest.least_inliers.shape[0]
-        or inliers >= pretest.least_inliers[looks - 1]
+        or check > pretest.least_inliers.shape[0]
+        or inliers >= pretest.least_inliers[check - 1]
     ):
         return True
     pretest.rejected[0] += done
@@ -253,12 +197,7 @@ def _median_of_squares(points: FloatArray, f: FloatArray, to_beat: float) -> flo
 
 @kernel
 def select(values: FloatArray, rank: int) -> float:
-    """Return the value that sorting would put at `rank`, by Hoare's quickselect.
-
-    Args:
-        values: (N,) numbers; they are reordered.
-        rank: in [0, N), 0 for the smallest.
-    """
+    """Return the value that sorting would put at `rank` (0: smallest), by Hoare's quickselect; reorder `values`."""
     low, high = 0, values.shape[0] - 1
     while low < high:
         pivot, i, j = values[(low + high) // 2], low, high
@@ -279,39 +218,21 @@ def select(values: FloatArray, rank: int) -> float:
     return float(values[rank])
 
 
-# MLESAC: the likelihood of F under Gaussian inliers and uniform outliers (Torr and Zisserman 2000; thesis 3.5,
-# 4.6).
-#
-# The distances of inliers are taken as the absolute values of a Gaussian about 0, those of outliers as uniform over
-# the window w. Each match costs::
-#
-# q = log((1 + odds) / (exp(-r^2 / (2 sigma^2)) + odds)), odds = (1 - gamma) / gamma * sigma sqrt(2 pi) / w
-#
-# which is -log p(r) of 3.5 minus its value at r = 0: no penalty is negative, so that scoring can stop early.
+# MLESAC: the likelihood of F under Gaussian inliers and uniform outliers (Torr and Zisserman 2000; thesis 3.5, 4.6).
+# The distances of inliers are absolute values of a Gaussian about 0, those of outliers uniform over the window w.
+# Each match costs q = log((1 + odds) / (exp(-r^2 / (2 sigma^2)) + odds)), odds = (1 - gamma) / gamma * sigma sqrt(2
+# pi) / w, which is -log p(r) of 3.5 minus its value at r = 0: no penalty is negative, so that scoring can stop early.
 
 SIGMAS = 1.96
 """Standard deviations of the inliers in a threshold (thesis 3.3.6)."""
-_NEGLIGIBLE = 1e-12
-"""Density of an inlier, relative to that of the outliers, below which a match costs as much as an outlier. Chosen by
-hand; not measured on its own."""
-_MOST_STEPS = 100
-"""Largest number of steps of expectation maximization. Chosen by hand; not measured on its own."""
-_GAMMA_TOLERANCE = 1e-5
-"""Change of gamma that ends expectation maximization. Chosen by hand; not measured on its own."""
 
 
 def mlesac(points: FloatArray, threshold: float, best: FloatArray | None) -> Loss:
-    """Return the penalty above; gamma is the share of inliers of the best model, one half before there is one.
-
-    Args:
-        points: (N, 4) matches.
-        threshold: largest distance of an inlier, in the units of the points.
-        best: (9,) entries of the best model; None before there is one.
-    """
+    """Return the penalty above; gamma is the share of inliers of the best model, one half before there is one."""
     sigma, width = threshold / SIGMAS, outlier_window(points)
     gamma = 0.5 if best is None else inlier_share(squared_distances(points, best), sigma, width)
     odds = (1 - gamma) / gamma * sigma * math.sqrt(2 * math.pi) / width
-    reach = -math.log(_NEGLIGIBLE * min(odds, 1.0)) * 2 * sigma * sigma
+    reach = -math.log(1e-12 * min(odds, 1.0)) * 2 * sigma * sigma
     return Loss(MLESAC, threshold * threshold, reach, math.log((1 + odds) / odds), 1 / (2 * sigma * sigma), odds)
 
 
@@ -322,60 +243,42 @@ def outlier_window(points: FloatArray) -> float:
 
 
 def inlier_share(squared: FloatArray, sigma: float, width: float) -> float:
-    """Estimate gamma = p(v) of the mixture by expectation maximization, for given sigma and w.
+    """Estimate gamma = p(v) of the mixture by expectation maximization, within [1 / N, 1 - 1 / N], for given sigma and
+    w.
 
-    Args:
-        squared: (N,) squared distances to the model.
-        sigma: standard deviation of the inliers.
-        width: range of the outliers.
-
-    Returns:
-        Within [1 / N, 1 - 1 / N]: a share of 0 or 1 would make some distances impossible.
+    A share of 0 or 1 would make some of the distances, `squared` (N,), impossible.
     """
     inlier = np.exp(-squared / (2 * sigma * sigma)) / (sigma * math.sqrt(2 * math.pi))
     least = 1 / max(len(squared), 2)
     gamma = 0.5
-    for _ in range(_MOST_STEPS):
+    for _ in range(100):
         before = gamma
         gamma = float(np.mean(gamma * inlier / (gamma * inlier + (1 - gamma) / width)))
         gamma = min(max(gamma, least), 1 - least)
-        if abs(gamma - before) < _GAMMA_TOLERANCE:
+        if abs(gamma - before) < 1e-5:
             break
     return gamma
 
 
-# RES-RANSAC: priors from the residuals to the best model (thesis 4.6).
-#
-# The validity of a match is the probability of an error above its own, p(v | r_i) = 1 - p(0 <= r <= r_i) (4.10).
-# The distribution of r is a histogram times a Gaussian (4.13); the thesis prints exp(-r / (2 sigma)), which is not
-# a Gaussian and not free of units: exp(-r^2 / (2 sigma^2)) is meant.
+# RES-RANSAC: priors from the residuals to the best model (thesis 4.6). The validity of a match is the probability of
+# an error above its own, p(v | r_i) = 1 - p(0 <= r <= r_i) (4.10). The distribution of r is a histogram times a
+# Gaussian (4.13); the thesis prints exp(-r / (2 sigma)), which has a unit: exp(-r^2 / (2 sigma^2)) is meant.
 
 BINS = 100
 """Bins of the histogram, each a hundredth of the median wide (thesis 4.6.1)."""
 
 
 def residual_validity(points: FloatArray, f: FloatArray, _threshold: float) -> FloatArray:
-    """Return p(v_i) of every match from its Sampson distance to the best model.
-
-    Args:
-        points: (N, 4) matches.
-        f: (9,) entries of F by rows.
-        _threshold: not used; all such functions take it.
-    """
+    """Return p(v_i) of every match from its Sampson distance to the best model."""
     return validity_from_residuals(np.sqrt(squared_distances(points, f)))
 
 
 def validity_from_residuals(residuals: FloatArray) -> FloatArray:
-    """Return p(v_i | r_i) of 4.10 to 4.15.
+    """Return p(v_i | r_i) of 4.10 to 4.15, in [0, 1], at least one of them > 0; all 1 where one bin holds all
+    residuals.
 
     The bins are a hundredth of the median wide, and the last one holds all larger residuals: there p(0 <= r <= r_i) is
     1 and p(v) is 0, so that samples come from the better half of the matches only.
-
-    Args:
-        residuals: (N,) distances >= 0.
-
-    Returns:
-        (N,) in [0, 1], at least one of them > 0; all 1 where one bin holds all residuals.
     """
     width = float(np.median(residuals)) / BINS
     if not 0 < width < np.inf:  # half of the residuals are 0, or infinite
@@ -388,5 +291,5 @@ def validity_from_residuals(residuals: FloatArray) -> FloatArray:
     mass = np.bincount(bins, minlength=BINS) * np.exp(-(middles**2) / (2 * variance))
     valid = 1 - np.minimum(np.cumsum(mass / mass.sum()), 1.0)
     valid[-1] = 0.0
-    chosen = valid[bins]
-    return chosen if chosen.any() else np.ones(len(residuals))
+    validity = valid[bins]
+    return validity if validity.any() else np.ones(len(residuals))

@@ -9,42 +9,28 @@ from sfm_app.fundamental.scores import FIRST
 from sfm_app.jit import kernel, summing_kernel
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-# The design matrix A of the matches, row by row x2 (x) x1, and its products (thesis 2.27): x2' F x1 = 0 is A f = 0.
-#
-# Matches are processed in blocks that fit in the first-level cache, each quantity contiguous, so that sums over
-# matches are vectorized.
+# Design matrix A of the matches, row by row x2 (x) x1 (thesis 2.27): x2' F x1 = 0 is A f = 0. Sums over matches run
+# in blocks that fit in the first-level cache, each quantity contiguous, so that they are vectorized.
 
 LANES = 64
-"""Matches in a block. With the rows of A they take 7 kB. Chosen by hand for speed."""
+"""Matches in a block; with the rows of A they take 7 kB. Chosen by hand for speed."""
 
 
 @kernel
 def design_row(point: FloatArray, row: FloatArray) -> None:
-    """Write x2 (x) x1, the coefficients of the entries of F (by rows) in x2' F x1 = 0.
-
-    Args:
-        point: (4,) match x1, y1, x2, y2.
-        row: (9,), written to.
-    """
+    """Write x2 (x) x1 (9,), the coefficients of the entries of F in x2' F x1 = 0, for one match (4,)."""
     for i in range(3):
-        from2 = point[2 + i] if i < 2 else 1.0
-        row[3 * i] = from2 * point[0]
-        row[3 * i + 1] = from2 * point[1]
-        row[3 * i + 2] = from2
+        factor = point[2 + i] if i < 2 else 1.0
+        row[3 * i] = factor * point[0]
+        row[3 * i + 1] = factor * point[1]
+        row[3 * i + 2] = factor
 
 
 @kernel
 def gather(points: FloatArray, weights: FloatArray, start: int, block: FloatArray) -> tuple[int, int]:
-    """Copy the next matches of positive weight, as columns x1, y1, x2, y2, sqrt(weight), to `block`.
+    """Copy the next matches of positive weight to the columns of `block` (5, LANES): x1, y1, x2, y2, sqrt(weight).
 
-    Args:
-        points: (N, 4) matches.
-        weights: (N,) >= 0.
-        start: row to begin at.
-        block: (5, LANES), written to.
-
-    Returns:
-        Number of columns filled, and the row to continue at.
+    Returns the number of columns, and the row of `points` to continue at.
     """
     filled, i = 0, start
     while i < points.shape[0] and filled < LANES:
@@ -69,13 +55,7 @@ def _design_columns(block: FloatArray, count: int, rows: FloatArray) -> None:
 
 @summing_kernel
 def add_products(rows: FloatArray, count: int, gram: FloatArray) -> None:
-    """Add the sums over n of rows[j, n] rows[k, n] to gram[j, k] for all k <= j.
-
-    Args:
-        rows: (9, LANES) columns of the design matrix, each contiguous.
-        count: number of n, from 0 on.
-        gram: (9, 9), added to.
-    """
+    """Add the sums over the first `count` columns of rows[j] rows[k] to gram[j, k] for all k <= j."""
     for j in range(rows.shape[0]):
         for k in range(j + 1):
             total = 0.0
@@ -93,12 +73,7 @@ def mirror(gram: FloatArray) -> None:
 
 
 def weighted_gram(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the (9, 9) matrix A' W A of the matches.
-
-    Args:
-        points: (N, 4) matches.
-        weights: (N,) >= 0.
-    """
+    """Return the (9, 9) matrix A' W A for weights (N,) >= 0."""
     gram = np.zeros((9, 9))
     _add_gram(points, weights, gram)
     return gram
@@ -118,12 +93,7 @@ def _add_gram(points: FloatArray, weights: FloatArray, gram: FloatArray) -> None
 
 @kernel
 def quadratic_forms(points: FloatArray, whitening: FloatArray) -> FloatArray:
-    """Return (N,) squared lengths of the rows of A after whitening.
-
-    Args:
-        points: (N, 4) matches.
-        whitening: (9, p) matrix that the rows of A are multiplied by.
-    """
+    """Return (N,) squared lengths of the rows of A times `whitening` (9, p)."""
     count = points.shape[0]
     forms, ones = np.zeros(count), np.ones(count)
     block, rows, dots = np.empty((5, LANES)), np.empty((9, LANES)), np.empty(LANES)
@@ -144,38 +114,24 @@ def quadratic_forms(points: FloatArray, whitening: FloatArray) -> FloatArray:
     return forms
 
 
-# Eigenvalues of small symmetric matrices inside kernels, where a call to LAPACK costs more than the work itself.
-#
-# Jacobi's rotations (Golub and Van Loan 2013, 8.5).
-
-_MOST_SWEEPS = 30
-"""Largest number of sweeps over all rotations; convergence is quadratic (Golub and Van Loan 2013). Chosen by hand; not
-measured on its own."""
-_OFF_DIAGONAL_TOLERANCE = 1e-32
-"""Sum of the squared off-diagonal entries over that of the diagonal ones, at convergence: 1e-16, what double precision
-leaves, squared."""
+# Eigenvalues by Jacobi's rotations (Golub and Van Loan 2013, 8.5): in kernels a call to LAPACK costs more than the
+# work.
 
 
 @kernel
 def decompose_symmetric(matrix: FloatArray, values: FloatArray, vectors: FloatArray) -> None:
-    """Write the eigenvalues in ascending order and the unit eigenvectors, by Jacobi's rotations.
-
-    Args:
-        matrix: (n, n) symmetric; overwritten.
-        values: (n,) filled.
-        vectors: (n, n) filled, one eigenvector per column.
-    """
+    """Write the ascending eigenvalues (n,) and the unit eigenvectors, one per column; overwrite `matrix`."""
     size = matrix.shape[0]
     for i in range(size):
         for j in range(size):
             vectors[i, j] = 1.0 if i == j else 0.0
-    for _ in range(_MOST_SWEEPS):
+    for _ in range(30):  # convergence is quadratic
         off, diagonal = 0.0, 0.0
         for i in range(size):
             diagonal += matrix[i, i] * matrix[i, i]
             for j in range(i):
                 off += matrix[i, j] * matrix[i, j]
-        if not off > _OFF_DIAGONAL_TOLERANCE * diagonal:
+        if not off > 1e-32 * diagonal:  # rounding in double precision, squared
             break
         for p in range(size - 1):
             for q in range(p + 1, size):
@@ -221,29 +177,16 @@ def _sort(values: FloatArray, vectors: FloatArray) -> None:
 
 MOST_MODELS = 3
 """Real roots of the cubic det F = 0 (thesis 4.3.1)."""
-_RANK_TOLERANCE = 1e-9
-"""Pivot, relative to the largest, below which the constraints are linearly dependent. Chosen by hand; not measured on
-its own."""
-_SQUARINGS = 6
-"""Squarings of C'C: each doubles the exponent of the ratio of its eigenvalues, to 64. Chosen by hand; not measured on
-its own."""
 
 
 @kernel
 def solve_sample(points: FloatArray, sample: IndexArray, models: FloatArray) -> int:
-    """Compute F from a minimal sample: all solutions through seven matches, or the linear one through eight.
+    """Write to `models` (3, 9) all F of norm 1 through seven sampled matches, or the linear F of eight; return their
+    number.
 
-    Seven constraints leave F = a + z b; one more determines z: det F = 0, a cubic with one or three real roots, or an
+    Seven constraints leave F = a + z b. One more determines z: det F = 0, a cubic with one or three real roots, or an
     eighth match. The linear solution is then replaced by the nearest matrix of rank 2, which with noise no longer fits
-    its sample exactly.
-
-    Args:
-        points: (N, 4) x1, y1, x2, y2, of magnitude about 1.
-        sample: (7,) or (8,) rows of `points`.
-        models: (3, 9) filled with the solutions, row by row, each of norm 1.
-
-    Returns:
-        Number of solutions, 0 to 3; 0 where the constraints are linearly dependent (repeated or coplanar points).
+    its sample exactly. The number is 0 where the constraints are linearly dependent (repeated or coplanar points).
     """
     basis = np.empty((2, 9))
     if not _null_space(points, sample, basis):
@@ -299,8 +242,8 @@ def _solve_eighth_match(point: FloatArray, basis: FloatArray, model: FloatArray)
 def _smallest_singular_vector(f: FloatArray, v: FloatArray) -> bool:
     """Write the right singular vector of F's smallest singular value to v (3,); return False for a rank below 2.
 
-    The cofactors C of F have the same singular vectors with the values s2 s3, s1 s3, s1 s2, so that this vector
-    dominates C'C, and more strongly after each squaring.
+    The cofactors C of F have the same singular vectors with the values s2 s3, s1 s3, s1 s2: this vector dominates C'C,
+    and more strongly after each squaring.
     """
     cofactors, gram, square = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
@@ -311,7 +254,7 @@ def _smallest_singular_vector(f: FloatArray, v: FloatArray) -> bool:
     for i in range(3):
         for j in range(3):
             gram[i, j] = _dot3(cofactors[i], cofactors[j])
-    for _ in range(_SQUARINGS):
+    for _ in range(6):  # each squaring doubles the exponent of the ratio of eigenvalues, to 64
         trace = gram[0, 0] + gram[1, 1] + gram[2, 2]
         if not trace > 0.0:
             return False
@@ -338,13 +281,8 @@ def _dot3(a: FloatArray, b: FloatArray) -> float:
 def is_oriented(points: FloatArray, sample: IndexArray, f: FloatArray) -> bool:
     """Return whether the sampled matches can all lie in front of both cameras of f (Chum, Werner and Matas 2004).
 
-    For such points e2 x x2 and F x1 are the same line up to a factor whose sign is the same for all matches.
-    Wrong models rarely pass; those that fail need not be scored.
-
-    Args:
-        points: (N, 4) matches.
-        sample: (m,) rows of `points`.
-        f: (9,) entries of F by rows.
+    For such points e2 x x2 and F x1 are the same line up to a factor whose sign is the same for all matches. Wrong
+    models rarely pass.
     """
     largest = -1.0  # e2 is perpendicular to the columns of F: the most stable cross product of two of them
     e2 = np.empty(3)
@@ -369,14 +307,8 @@ def is_oriented(points: FloatArray, sample: IndexArray, f: FloatArray) -> bool:
 
 @kernel
 def real_cubic_roots(c0: float, c1: float, c2: float, c3: float, roots: FloatArray) -> int:
-    """Write the real roots of c0 + c1 z + c2 z^2 + c3 z^3 and return their number: 1 or 3, or 0 if c3 is 0.
-
-    Args:
-        c0: constant coefficient.
-        c1: coefficient of z.
-        c2: coefficient of z^2.
-        c3: coefficient of z^3.
-        roots: (3,), written to.
+    """Write the real roots of c0 + c1 z + c2 z^2 + c3 z^3 to `roots` (3,); return their number: 1 or 3, or 0 if c3 is
+    0.
     """
     if c3 == 0.0:
         return 0
@@ -406,10 +338,10 @@ def real_cubic_roots(c0: float, c1: float, c2: float, c3: float, roots: FloatArr
 
 @kernel
 def _null_space(points: FloatArray, sample: IndexArray, basis: FloatArray) -> bool:
-    """Write two orthonormal vectors perpendicular to the first seven design rows of the sample, by elimination.
+    """Write two orthonormal vectors perpendicular to the first seven design rows; return False if the rows are
+    dependent.
 
-    With complete pivoting it is as exact as Householder reflections, in half the time. Returns False where the rows are
-    linearly dependent.
+    Elimination with complete pivoting is as exact as Householder reflections, in half the time.
     """
     rows, place = np.empty((SAMPLE_SIZE, 9)), np.empty(9, dtype=np.int64)
     for j in range(9):
@@ -420,7 +352,7 @@ def _null_space(points: FloatArray, sample: IndexArray, basis: FloatArray) -> bo
     for k in range(SAMPLE_SIZE):
         pivot = _swap_pivot(rows, place, k)
         largest = max(largest, pivot)
-        if not pivot > _RANK_TOLERANCE * largest:
+        if not pivot > 1e-9 * largest:
             return False
         for j in range(k + 1, 9):
             rows[k, j] /= rows[k, k]
@@ -431,10 +363,10 @@ def _null_space(points: FloatArray, sample: IndexArray, basis: FloatArray) -> bo
         for j in range(9):
             basis[n, j] = 1.0 if j == place[SAMPLE_SIZE + n] else 0.0
         for k in range(SAMPLE_SIZE - 1, -1, -1):
-            behind = rows[k, SAMPLE_SIZE + n]
+            pending = rows[k, SAMPLE_SIZE + n]
             for j in range(k + 1, SAMPLE_SIZE):
-                behind += rows[k, j] * basis[n, place[j]]
-            basis[n, place[k]] = -behind
+                pending += rows[k, j] * basis[n, place[j]]
+            basis[n, place[k]] = -pending
     _orthonormalize(basis[0], basis[1])
     return True
 
@@ -459,7 +391,7 @@ def _swap_pivot(rows: FloatArray, place: IndexArray, k: int) -> float:
 
 @kernel
 def _orthonormalize(a: FloatArray, b: FloatArray) -> None:
-    length, dot, left = 0.0, 0.0, 0.0
+    length, dot, rest = 0.0, 0.0, 0.0
     for j in range(9):
         length += a[j] * a[j]
     for j in range(9):
@@ -467,9 +399,9 @@ def _orthonormalize(a: FloatArray, b: FloatArray) -> None:
         dot += a[j] * b[j]
     for j in range(9):
         b[j] -= dot * a[j]
-        left += b[j] * b[j]
+        rest += b[j] * b[j]
     for j in range(9):
-        b[j] /= np.sqrt(left)
+        b[j] /= np.sqrt(rest)
 
 
 @kernel
@@ -493,36 +425,31 @@ def _mixed_det(m: FloatArray, n: FloatArray) -> float:
     )
 
 
-# Essential matrices from five rays and their partners (Nistér 2004), by eigenvectors of an action matrix.
-#
-# The ten cubic equations 2 E E'E = tr(E E') E and det E = 0 in the coordinates of the null space are solved as
-# Stewénius, Engels and Nistér (2006) do; derived here from the products of linear forms.
+# Essential matrices from five rays and their partners (Nistér 2004). The ten cubic equations 2 E E'E = tr(E E') E and
+# det E = 0 in the coordinates of the null space are solved by an action matrix (Stewénius, Engels and Nistér 2006);
+# derived here from the products of linear forms.
 
 RAY_SAMPLE_SIZE = 5
-"""Matches of a sample. Counted: E has five degrees of freedom."""
+"""Matches of a sample: E has five degrees of freedom. Counted."""
 _MONOMIALS = (
     "xxx", "xxy", "xxz", "xyy", "xyz", "xzz", "yyy", "yyz", "yzz", "zzz",
     "xx1", "xy1", "xz1", "yy1", "yz1", "zz1", "x11", "y11", "z11", "111",
 )  # fmt: skip
-"""Products of three of x, y, z and 1: the cubic ones, then the basis of what they leave."""
+"""Products of three of x, y, z and 1: cubic monomials, then the basis of the quotient ring."""
 _PLACES = {"".join(sorted(name)): place for place, name in enumerate(_MONOMIALS)}
 _SUM = np.zeros((64, 20))
-"""Adds up products of three letters to monomials. By definition."""
+"""From products of three letters to monomials. By definition."""
 for _row, _letters in enumerate(product("xyz1", repeat=3)):
     _SUM[_row, _PLACES["".join(sorted(_letters))]] = 1.0
 _LEVI_CIVITA = np.zeros((3, 3, 3))
 """Signs of permutations. By definition."""
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _LEVI_CIVITA[_i, _j, _k], _LEVI_CIVITA[_i, _k, _j] = 1.0, -1.0
-_REAL = 1e-6
-"""Largest imaginary part of a root that counts as real. Chosen by hand; not measured on its own."""
 
 
 def solve_five_point(p: FloatArray, q: FloatArray) -> FloatArray:
-    """Return (M, 3, 3) essential matrices, of Frobenius norm 1, through samples of five matches; none is dropped.
-
-    Args:
-        p, q: (S, 5, 3) rays of view 1; partners in view 2.
+    """Return (M, 3, 3) essential matrices, of norm 1, through samples of five matches: rays p of view 1 and q of view
+    2, (S, 5, 3).
     """
     rows = (q[..., :, None] * p[..., None, :]).reshape(len(p), RAY_SAMPLE_SIZE, 9)
     null = np.linalg.svd(rows)[2][:, RAY_SAMPLE_SIZE:].reshape(-1, 4, 3, 3)
@@ -532,22 +459,22 @@ def solve_five_point(p: FloatArray, q: FloatArray) -> FloatArray:
     cubes -= np.einsum("sab,sikc->sikabc", np.einsum("siiab->sab", products), E)
     determinant = np.einsum("ijk,sia,sjb,skc->sabc", _LEVI_CIVITA, E[:, 0], E[:, 1], E[:, 2], optimize=True)
     equations = np.concatenate([cubes.reshape(len(p), 9, 64), determinant.reshape(len(p), 1, 64)], 1) @ _SUM
-    sound = np.abs(np.linalg.det(equations[:, :, :10])) > 1e-300
-    equations, null = equations[sound], null[sound]
+    regular = np.abs(np.linalg.det(equations[:, :, :10])) > 1e-300
+    equations, null = equations[regular], null[regular]
     if not len(null):
         return np.zeros((0, 3, 3))
-    left = -np.linalg.solve(equations[:, :, :10], equations[:, :, 10:])
+    reduced = -np.linalg.solve(equations[:, :, :10], equations[:, :, 10:])
     action = np.zeros((len(null), 10, 10))
-    action[:, :6] = left[:, :6]  # x times xx, xy, xz, yy, yz, zz
+    action[:, :6] = reduced[:, :6]  # x times xx, xy, xz, yy, yz, zz
     action[:, [6, 7, 8, 9], [0, 1, 2, 6]] = 1.0  # x times x, y, z, 1
     if not np.isfinite(action).all():
         action = np.nan_to_num(action, nan=0.0, posinf=0.0, neginf=0.0)
     values, vectors = np.linalg.eig(action)
     last = vectors[:, 9]
-    real = (np.abs(values.imag) <= _REAL * (1.0 + np.abs(values))) & (np.abs(last) > 1e-12)
+    real = (np.abs(values.imag) <= 1e-6 * (1.0 + np.abs(values))) & (np.abs(last) > 1e-12)
     sample, root = np.nonzero(real)
     roots = (vectors[sample, 6:9, root] / vectors[sample, 9, root][:, None]).real
-    found = np.einsum("na,naij->nij", np.column_stack([roots, np.ones(len(roots))]), null[sample])
-    lengths = np.linalg.norm(found, axis=(1, 2))
-    kept = np.isfinite(lengths) & (lengths > 0.0)
-    return np.asarray(found[kept] / lengths[kept, None, None], np.float64)
+    models = np.einsum("na,naij->nij", np.column_stack([roots, np.ones(len(roots))]), null[sample])
+    lengths = np.linalg.norm(models, axis=(1, 2))
+    valid = np.isfinite(lengths) & (lengths > 0.0)
+    return np.asarray(models[valid] / lengths[valid, None, None], np.float64)

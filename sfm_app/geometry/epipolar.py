@@ -1,4 +1,8 @@
-"""Epipolar geometry of two views: F, E, distances, poses and triangulation, for pixels and for rays."""
+"""Epipolar geometry of two views: F, E, distances, poses and triangulation, for pixels and for rays.
+
+x2' F x1 = 0 throughout. Unless stated otherwise, x1 and x2 are (N, 2) pixels, row by row partners, and F is (3, 3) of
+any scale; other shapes raise ValueError. HZ: Hartley and Zisserman, Multiple View Geometry, 2nd edition.
+"""
 
 from dataclasses import dataclass
 
@@ -8,11 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from sfm_app.camera.bearings import pixels_per_radian
 from sfm_app.errors import NumericalError
 from sfm_app.types.arrays import FloatArray
-
-# The epipolar geometry of two views: the 8-point algorithm, and quantities that follow from F.
-#
-# ``x2' F x1 = 0`` throughout. Points are (N, 2) pixels. Hartley and Zisserman, Multiple View Geometry, 2nd edition
-# (HZ).
 
 
 def to_homogeneous(x: ArrayLike) -> FloatArray:
@@ -24,15 +23,7 @@ def to_homogeneous(x: ArrayLike) -> FloatArray:
 
 
 def homogeneous_pair(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return both views of N matches as (N, 3).
-
-    Args:
-        x1: (N, 2) points.
-        x2: (N, 2) points, row by row the partners of x1.
-
-    Raises:
-        ValueError: other shapes, or rows that do not pair up.
-    """
+    """Return both views of N matches as (N, 3)."""
     h1, h2 = to_homogeneous(x1), to_homogeneous(x2)
     if len(h1) != len(h2):
         raise ValueError(f"x1 and x2 must pair up, got {len(h1)} and {len(h2)} points")
@@ -59,16 +50,10 @@ def hartley_normalization(x: ArrayLike) -> FloatArray:
 def eight_point(x1: ArrayLike, x2: ArrayLike, weights: ArrayLike | None = None) -> FloatArray:
     """Estimate F by the normalized 8-point algorithm (thesis 4.3.2): algebraic least squares, then the nearest rank 2.
 
-    Args:
-        x1: (N, 2) pixels, N >= 8.
-        x2: (N, 2) pixels, the partners.
-        weights: (N,) >= 0, how much each squared algebraic error counts; all 1 if None.
-
-    Returns:
-        (3, 3), rank 2, Frobenius norm 1. If the matches do not determine F (all on one plane), one of the solutions.
+    `weights` (N,) >= 0 multiply the squared algebraic errors. F has rank 2 and Frobenius norm 1; if the matches do not
+    determine it (all on one plane), it is one of the solutions.
 
     Raises:
-        ValueError: wrong shapes.
         NumericalError: fewer than 8 matches, or all points of a view coincide.
     """
     h1, h2 = homogeneous_pair(x1, x2)
@@ -79,7 +64,7 @@ def eight_point(x1: ArrayLike, x2: ArrayLike, weights: ArrayLike | None = None) 
     design = (h2[:, :, None] * h1[:, None, :]).reshape(-1, 9)
     if weights is not None:
         design *= np.sqrt(np.asarray(weights, dtype=np.float64))[:, None]
-    # all of V is wanted, but not all of U, which is as large as the number of matches squared
+    # all of V, but not all of U, which is as large as the number of matches squared
     F = np.linalg.svd(design, full_matrices=len(design) < 9)[2][8].reshape(3, 3)
     return to_unit_norm(T2.T @ nearest_rank_two(F) @ T1)
 
@@ -116,13 +101,7 @@ def canonical_cameras(F: ArrayLike) -> tuple[FloatArray, FloatArray]:
 
     v is free: it selects the plane of the scene that lies at infinity. With F of norm 1, singular values s1 >= s2, and
     v = sqrt(s1 s2) e1 the left 3 x 3 of P2 has the singular values s1, sqrt(s1 s2), s2: invertible, and as well
-    conditioned as F lets it be. In pixels s1 / s2 is large: pass the F of centered points with coordinates near 1.
-
-    Args:
-        F: (3, 3), rank 2, any scale.
-
-    Returns:
-        P1, P2, both (3, 4), x1 ~ P1 X and x2 ~ P2 X.
+    conditioned as F permits. In pixels s1 / s2 is large: pass the F of centered points with coordinates near 1.
 
     Raises:
         NumericalError: F is zero or not finite.
@@ -143,12 +122,6 @@ def cross_matrix(v: ArrayLike) -> FloatArray:
 def fundamental_from_pose(K1: ArrayLike, K2: ArrayLike, R: ArrayLike, t: ArrayLike) -> FloatArray:
     """Return F of two cameras with x1 ~ K1 X and x2 ~ K2 (R X + t) (HZ 9.12), Frobenius norm 1.
 
-    Args:
-        K1: (3, 3) camera matrix of view 1.
-        K2: (3, 3) camera matrix of view 2.
-        R: (3, 3) rotation of view 2 from view 1.
-        t: (3,) translation, any length but zero.
-
     Raises:
         NumericalError: t is zero: without a baseline there is no epipolar geometry.
     """
@@ -156,37 +129,21 @@ def fundamental_from_pose(K1: ArrayLike, K2: ArrayLike, R: ArrayLike, t: ArrayLi
     return to_unit_norm(np.linalg.inv(K2).T @ cross_matrix(t) @ R @ np.linalg.inv(K1))
 
 
-# How far a match is from an epipolar geometry: the four error measures of thesis section 4.2.
-#
-# Linear fits minimize `algebraic_distance`; `symmetric_epipolar_distance` is measured from points to lines;
-# `sampson_distance` is the first-order approximation of `reprojection_distance`, the distance itself: the length of
-# the shortest move of both points, in 4D, that makes the match exact. Points are (N, 2) pixels, ``x2' F x1 = 0``.
+# The four error measures of thesis section 4.2. Linear fits minimize `algebraic_distance`;
+# `symmetric_epipolar_distance` is measured from points to lines; `sampson_distance` is the first-order approximation
+# of `reprojection_distance`, the length of the shortest move of both points, in 4D, that makes the match exact.
 
 _EPS = float(np.finfo(float).eps)
 """Spacing of numbers at 1 in double precision."""
 _TINY = float(np.finfo(float).tiny)
 """The smallest normal number in double precision."""
-_MOST_STEPS = 100
-"""Most steps of the root search: bisection alone needs 60, Newton's method 3 to 6. Chosen by hand; halved and doubled
-by `benchmarks.sensitivity`."""
 
 
 def algebraic_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
-    """Return |x2' F x1| with F of Frobenius norm 1 and points (x, y, 1): |A b| per match (thesis 2.28 and 4.2).
+    """Return (N,) |x2' F x1| with F of Frobenius norm 1 and points (x, y, 1): |A b| per match (thesis 2.28 and 4.2).
 
-    Unlike the other distances it has no unit, and it depends on the origin and scale of the coordinates: pass points
-    and F in the intended frame, such as that of `hartley_normalization`.
-
-    Args:
-        F: (3, 3), any scale.
-        x1: (N, 2) points in any frame.
-        x2: (N, 2) points, row by row the partners of x1.
-
-    Returns:
-        (N,) >= 0; inf where F is zero.
-
-    Raises:
-        ValueError: the shapes are not as above.
+    It has no unit and depends on the origin and scale of the coordinates: pass points and F in the intended frame, such
+    as that of `hartley_normalization`. It is inf where F is zero.
     """
     algebraic, _, _ = _constraint(F, x1, x2)
     return _ratio(np.abs(algebraic), np.full(len(algebraic), np.linalg.norm(np.asarray(F, dtype=np.float64))))
@@ -195,16 +152,7 @@ def algebraic_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray
 def symmetric_epipolar_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
     """Return the root mean square of a match's distances to its two epipolar lines (HZ 11.10, thesis 4.1).
 
-    Args:
-        F: (3, 3), any scale.
-        x1: (N, 2) pixels.
-        x2: (N, 2) pixels, row by row the partners of x1.
-
-    Returns:
-        (N,) distances in pixels, >= 0; inf where an epipolar line vanishes.
-
-    Raises:
-        ValueError: the shapes are not as above.
+    (N,) pixels; inf where an epipolar line vanishes.
     """
     algebraic, line1, line2 = _constraint(F, x1, x2)
     to1 = _ratio(np.abs(algebraic), np.hypot(line1[:, 0], line1[:, 1]))
@@ -217,16 +165,7 @@ def sampson_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
 
         |x2' F x1| / sqrt((F x1)_1^2 + (F x1)_2^2 + (F' x2)_1^2 + (F' x2)_2^2)
 
-    Args:
-        F: (3, 3), any scale.
-        x1: (N, 2) pixels.
-        x2: (N, 2) pixels, row by row the partners of x1.
-
-    Returns:
-        (N,) distances in pixels, >= 0; inf where both epipolar lines vanish.
-
-    Raises:
-        ValueError: the shapes are not as above.
+    (N,) pixels; inf where both epipolar lines vanish.
     """
     algebraic, line1, line2 = _constraint(F, x1, x2)
     squared = (line1[:, :2] ** 2).sum(axis=1) + (line2[:, :2] ** 2).sum(axis=1)
@@ -237,37 +176,16 @@ def reprojection_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatAr
     """Return the 4D distance of each match to the nearest exact one: min over X of sqrt(d(x1, P1 X)^2 + d(x2, P2 X)^2).
 
     With the `canonical_cameras` P1, P2 of F this is the term of thesis 4.3 before squaring; every other pair of cameras
-    with this F gives the same value (HZ 12.5). The minimum is global, see `nearest_exact_matches`.
-
-    Args:
-        F: (3, 3), any scale.
-        x1: (N, 2) pixels.
-        x2: (N, 2) pixels, row by row the partners of x1.
-
-    Returns:
-        (N,) distances in pixels, >= 0; inf where no match fits F.
-
-    Raises:
-        ValueError: the shapes are not as above.
+    with this F gives the same value (HZ 12.5). The minimum is global, see `nearest_exact_matches`. (N,) pixels; inf
+    where no match fits F.
     """
     return np.asarray(np.linalg.norm(_shortest_moves(F, x1, x2), axis=1))
 
 
 def nearest_exact_matches(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return the matches nearest to the given ones that satisfy x2' F x1 = 0.
+    """Return the nearest matches with x2' F x1 = 0: optimal triangulation in the images (HZ 12.5).
 
-    This is optimal triangulation in the images (HZ 12.5).
-
-    Args:
-        F: (3, 3), any scale.
-        x1: (N, 2) pixels.
-        x2: (N, 2) pixels, row by row the partners of x1.
-
-    Returns:
-        (N, 2), (N, 2) pixels; where several are equally near (both points on the epipoles of a bad match), one of them.
-
-    Raises:
-        ValueError: the shapes are not as above.
+    Where several are equally near (both points on the epipoles of a bad match), one of them.
     """
     moves = _shortest_moves(F, x1, x2)
     return np.asarray(x1, dtype=np.float64) + moves[:, :2], np.asarray(x2, dtype=np.float64) + moves[:, 2:]
@@ -307,11 +225,11 @@ def _multiplier(c: FloatArray, g: FloatArray, d: FloatArray, a: float) -> FloatA
     """Find the root (N,) of phi between 0 and 1/a."""
     low, high = np.zeros(len(c)), np.full(len(c), (1.0 - 4.0 * _EPS) / max(a, _TINY))
     k = low.copy()
-    for _ in range(_MOST_STEPS):
+    for _ in range(100):  # bisection alone takes 60, Newton's method 3 to 6
         phi = _phi(c, g, d, k[:, None])
         low, high = np.where(phi > 0, k, low), np.where(phi > 0, high, k)
-        falls = (g**2 / (1.0 + k[:, None] * d) ** 3).sum(axis=1)
-        after = k + np.divide(phi, falls, out=np.full(len(c), np.inf), where=falls > 0)
+        slope = (g**2 / (1.0 + k[:, None] * d) ** 3).sum(axis=1)
+        after = k + np.divide(phi, slope, out=np.full(len(c), np.inf), where=slope > 0)
         after = np.where((after >= low) & (after <= high), after, (low + high) / 2)
         done = np.abs(after - k) <= 4.0 * _EPS * after
         k = after
@@ -339,20 +257,10 @@ def _ratio(above: FloatArray, below: FloatArray) -> FloatArray:
     return np.asarray(np.divide(above, below, out=np.full(len(above), np.inf), where=below > 0))
 
 
-# Triangulation of points from two views.
-
-
 def triangulate(P1: FloatArray, P2: FloatArray, x1: FloatArray, x2: FloatArray) -> FloatArray:
-    """Compute points by linear triangulation (thesis Eq. 2.33): the null vector of x x PX = 0 in both views.
+    """Compute points (N, 3) by linear triangulation (thesis Eq. 2.33): the null vector of x x PX = 0 in both views.
 
-    Args:
-        P1: (3, 4) projection matrix of view 1.
-        P2: (3, 4) projection matrix of view 2.
-        x1: (N, 2) points in the image coordinates that P1 projects to.
-        x2: (N, 2) partners in view 2.
-
-    Returns:
-        (N, 3) points; inf where the rays meet at infinity.
+    x1, x2 are in the image coordinates that P1, P2 (3, 4) project to. Points are inf where the rays meet at infinity.
     """
     rows = [x1[:, :1] * P1[2] - P1[0], x1[:, 1:] * P1[2] - P1[1], x2[:, :1] * P2[2] - P2[0], x2[:, 1:] * P2[2] - P2[1]]
     A = np.stack(rows, axis=1)
@@ -365,16 +273,7 @@ def triangulate(P1: FloatArray, P2: FloatArray, x1: FloatArray, x2: FloatArray) 
 
 
 def triangulation_angle_deg(X: FloatArray, center1: FloatArray, center2: FloatArray) -> FloatArray:
-    """Return the angle between the two rays to each point.
-
-    Args:
-        X: (N, 3) points.
-        center1: (3,) camera center of view 1, in the frame of the points.
-        center2: (3,) camera center of view 2.
-
-    Returns:
-        (N,) degrees in [0, 180].
-    """
+    """Return the angle (N,) between the two rays to each point (N, 3), in degrees in [0, 180]."""
     ray1, ray2 = X - center1, X - center2
     with np.errstate(invalid="ignore"):
         cosine = (ray1 * ray2).sum(axis=1) / (np.linalg.norm(ray1, axis=1) * np.linalg.norm(ray2, axis=1))
@@ -382,28 +281,15 @@ def triangulation_angle_deg(X: FloatArray, center1: FloatArray, center2: FloatAr
     return angles
 
 
-# Essential matrices and the relative poses that they encode.
-
-
 def essential_from_fundamental(F: FloatArray, K1: FloatArray, K2: FloatArray) -> FloatArray:
-    """Return the essential matrix nearest to K2' F K1 (thesis Eq. 5.7; Eq. 2.30 inverts K by misprint).
-
-    Args:
-        F: (3, 3), any scale, x2' F x1 = 0 in pixels.
-        K1: (3, 3) camera matrix of view 1.
-        K2: (3, 3) camera matrix of view 2.
-
-    Returns:
-        (3, 3) with singular values (1, 1, 0).
-    """
+    """Return the essential matrix nearest to K2' F K1 (thesis Eq. 5.7; Eq. 2.30 inverts K by misprint)."""
     return nearest_essential(K2.T @ F @ K1)
 
 
 def nearest_essential(E: FloatArray) -> FloatArray:
     """Return the essential matrix nearest to E (3, 3), with singular values (1, 1, 0).
 
-    Noise makes the singular values of E unequal; in the nearest essential matrix in the Frobenius norm their mean
-    replaces both, and the third is 0 (Hartley & Zisserman, 2nd ed., section 11.7.3). Its scale is then set to 1.
+    The nearest one in the Frobenius norm has the mean of the first two (HZ 11.7.3); its scale is then set to 1.
     """
     U, _, Vt = np.linalg.svd(E)
     nearest: FloatArray = U @ np.diag([1.0, 1.0, 0.0]) @ Vt
@@ -429,89 +315,60 @@ def relative_pose(
 ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
     """Choose the one of the four poses of E with most points in front of both cameras.
 
-    Args:
-        E: (3, 3) essential matrix.
-        x1: (N, 2) normalized image points of view 1, that is (K1^-1 x)_1,2.
-        x2: (N, 2) partners in view 2.
-
-    Returns:
-        R (3, 3) and t (3,) of view 2 from view 1; X (N, 3) points in the frame of view 1; in_front (N,) whether a point
-        lies in front of both cameras.
+    x1, x2 (N, 2) are normalized image points (K^-1 x)_1,2. Returns R (3, 3) and t (3,) of view 2 from view 1, X (N, 3)
+    in the frame of view 1, and (N,) whether a point lies in front of both cameras.
     """
-    found = []
+    poses = []
     for R, t in decompose_essential(E):
         X = triangulate(np.eye(3, 4), np.column_stack([R, t]), x1, x2)
-        known = np.isfinite(X[:, 2])
+        finite = np.isfinite(X[:, 2])
         with np.errstate(invalid="ignore"):  # some BLAS warn of points at infinity, others do not
-            in_front = known & (X[:, 2] > 0) & ((X @ R.T + t)[:, 2] > 0)
-        found.append((int(np.count_nonzero(in_front)), R, t, X, in_front))
-    _, R, t, X, in_front = max(found, key=lambda pose: pose[0])
+            in_front = finite & (X[:, 2] > 0) & ((X @ R.T + t)[:, 2] > 0)
+        poses.append((int(np.count_nonzero(in_front)), R, t, X, in_front))
+    _, R, t, X, in_front = max(poses, key=lambda pose: pose[0])
     return R, t, X, in_front
 
 
-# The epipolar geometry of two photos through known lenses, by rays: q' F p = 0, also where rays look backwards.
-#
-# The eight-point method (thesis 4.3.2) on rays, and Sampson's distance (thesis 4.2) in the photos, where the noise
-# is. Matches are rows of 18 numbers: the bearing vectors of `bearings` in view 1 and in view 2.
+# Epipolar geometry through known lenses, by rays: q' F p = 0, also where rays look backwards. The eight-point method
+# (thesis 4.3.2) on rays, and Sampson's distance (thesis 4.2) in the photos, where the noise is. Matches are rows of
+# 18 numbers: the bearing vectors of `camera.bearings` in view 1 and in view 2.
 
 FIRST, SECOND = slice(0, 3), slice(9, 12)
 """Columns of the rays of view 1 and of view 2. By definition."""
 _SLOPES_1, _SLOPES_2 = (slice(3, 6), slice(6, 9)), (slice(12, 15), slice(15, 18))
 """Columns of their derivatives. By definition."""
-ROTATION_ROUNDS = 10
-"""Rounds of reweighted fits of a rotation. Chosen by hand; not measured on its own."""
-LEAST = 1e-30
-"""Added to squared derivatives. Its square root is far above rounding in double precision."""
+_LEAST = 1e-30
+"""Added to squared derivatives; its square root is far above rounding in double precision."""
 
 
 def squared_distances(Fs: FloatArray, lines: FloatArray) -> FloatArray:
-    """Return (S, N) squared Sampson distances in the photos, in their unit.
-
-    Args:
-        Fs: (S, 3, 3) of rays.
-        lines: (N, 18) matches.
-    """
+    """Return (S, N) squared Sampson distances in the photos, in their unit, for matrices of rays (S, 3, 3)."""
     p, q = lines[:, FIRST], lines[:, SECOND]
     terms = [(q, p), *((lines[:, side], p) for side in _SLOPES_2), *((q, lines[:, side]) for side in _SLOPES_1)]
     design = np.concatenate([(b[:, :, None] * a[:, None, :]).reshape(-1, 9) for b, a in terms])
     algebraic, *slopes = (design @ Fs.reshape(-1, 9).T).reshape(5, len(lines), len(Fs))
-    return np.asarray((algebraic**2 / (sum(slope**2 for slope in slopes) + LEAST)).T, np.float64)
+    return np.asarray((algebraic**2 / (sum(slope**2 for slope in slopes) + _LEAST)).T, np.float64)
 
 
 def signed_distances(E: FloatArray, lines: FloatArray) -> FloatArray:
-    """Return (N,) signed Sampson distances of one matrix, in the unit of the photos.
-
-    Args:
-        E: (3, 3) essential or fundamental matrix of rays.
-        lines: (N, 18) matches.
-    """
+    """Return (N,) signed Sampson distances of one matrix of rays, in the unit of the photos."""
     p, q = lines[:, FIRST], lines[:, SECOND]
     return np.asarray(np.einsum("ni,ni->n", q, p @ E.T) / gradients(E, lines), np.float64)
 
 
 def gradients(E: FloatArray, lines: FloatArray) -> FloatArray:
-    """Return (N,) lengths of the gradients of q' E p by the four pixel coordinates, > 0.
-
-    Args:
-        E: (3, 3) of rays.
-        lines: (N, 18) matches.
-    """
+    """Return (N,) lengths > 0 of the gradients of q' E p by the four pixel coordinates."""
     line2, line1 = lines[:, FIRST] @ E.T, lines[:, SECOND] @ E
     slopes = sum(
-        np.einsum("ni,ni->n", lines[:, columns], across) ** 2
-        for across, both in ((line2, _SLOPES_2), (line1, _SLOPES_1))
+        np.einsum("ni,ni->n", lines[:, columns], line) ** 2
+        for line, both in ((line2, _SLOPES_2), (line1, _SLOPES_1))
         for columns in both
     )
-    return np.asarray(np.sqrt(slopes + LEAST), np.float64)
+    return np.asarray(np.sqrt(slopes + _LEAST), np.float64)
 
 
 def fit_rays(p: FloatArray, q: FloatArray, weights: FloatArray | None = None) -> FloatArray:
-    """Return (..., 3, 3) of rank two with the least weighted sum of (q' F p)^2.
-
-    Args:
-        p, q: (..., N, 3) rays of view 1; partners in view 2.
-        weights: (..., N); all alike if None.
-    """
+    """Return (..., 3, 3) of rank two with the least weighted sum of (q' F p)^2, from rays p and q (..., N, 3)."""
     rows = (q[..., :, None] * p[..., None, :]).reshape(*p.shape[:-1], 9)
     weighted = rows if weights is None else rows * weights[..., None]
     _, vectors = np.linalg.eigh(np.swapaxes(weighted, -1, -2) @ rows)
@@ -520,17 +377,11 @@ def fit_rays(p: FloatArray, q: FloatArray, weights: FloatArray | None = None) ->
     return np.asarray((U * s[..., None, :]) @ Vt, np.float64)
 
 
-def depths(used: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the depths (N,) in view 1 and (N,) in view 2 at which the two rays of each match are closest.
-
-    Depths are multiples of the rays.
-
-    Args:
-        used: (N, 18) matches.
-        R: (3, 3) rotation of view 2 from view 1.
-        t: (3,) translation.
+def depths(lines: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the depths (N,) in view 1 and (N,) in view 2, as multiples of the rays, at which the rays of matches are
+    closest.
     """
-    h1, h2 = used[:, FIRST] @ R.T, used[:, SECOND]
+    h1, h2 = lines[:, FIRST] @ R.T, lines[:, SECOND]
     # least squares of d1 h1 + t = d2 h2
     a, b, c = (h1 * h1).sum(1), (h1 * h2).sum(1), (h2 * h2).sum(1)
     p, q = h1 @ t, h2 @ t
@@ -538,18 +389,14 @@ def depths(used: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, 
     return (b * q - c * p) / determinant, (a * q - b * p) / determinant
 
 
-def rotation_residuals(used: FloatArray, R: FloatArray) -> FloatArray:
+def rotation_residuals(lines: FloatArray, R: FloatArray) -> FloatArray:
     """Return residuals (N,), in pixels of view 2, of the rotation near R that explains most matches.
 
     Rays are rotated onto their partners (Kabsch), with robust weights.
-
-    Args:
-        used: (N, 18) matches as bearing vectors, view 1 and view 2.
-        R: (3, 3) rotation of view 2 from view 1, to start from.
     """
-    h1, h2 = (_normalize(used[:, view]) for view in (FIRST, SECOND))
-    focal = pixels_per_radian(used.reshape(-1, 9))
-    for _ in range(ROTATION_ROUNDS):
+    h1, h2 = (_normalize(lines[:, view]) for view in (FIRST, SECOND))
+    focal = pixels_per_radian(lines.reshape(-1, 9))
+    for _ in range(10):
         distances = focal * np.linalg.norm(h1 @ R.T - h2, axis=1)
         weights = 1.0 / (1.0 + distances**2)
         U, _, Vt = np.linalg.svd(np.einsum("ni,nj->ij", h2 * weights[:, None], h1))
@@ -561,11 +408,9 @@ def _normalize(h: FloatArray) -> FloatArray:
     return np.asarray(h / np.linalg.norm(h, axis=1, keepdims=True), np.float64)
 
 
-# Two-view reconstructions that a mapping can start from.
-
 GOOD_ANGLE_DEG = 12.0
-"""Wider angles than this make no better seed: depth is well determined already, and matches get rarer.
-docs/algorithms.md, Mapping. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+"""Triangulation angle in degrees beyond which seeds do not get better: depth is well determined, and matches get rarer.
+docs/algorithms.md, Mapping. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -585,24 +430,12 @@ class TwoViewSeed:
 
 
 def two_view_seed(E: FloatArray, x1: FloatArray, x2: FloatArray) -> TwoViewSeed:
-    """Decompose E and triangulate all its inliers.
-
-    Args:
-        E: (3, 3) with x2' E x1 = 0; the nearest essential matrix is used.
-        x1: (N, 2) inliers as points of the plane z = 1, see `geometry.camera.rays`.
-        x2: (N, 2) partners.
-    """
+    """Decompose E and triangulate all its inliers (N, 2), points of the plane z = 1."""
     return _judge_seed(*relative_pose(nearest_essential(E), x1, x2))
 
 
 def ray_seed(R: FloatArray, t: FloatArray, lines: FloatArray) -> TwoViewSeed:
-    """Return the seed of a pose, with each inlier at the point midway between its rays.
-
-    Args:
-        R: (3, 3) rotation of view 2 from view 1.
-        t: (3,) unit vector along its translation.
-        lines: (N, 18) inliers as bearing vectors, see `geometry.lenses.bearings`, view 1 and view 2.
-    """
+    """Return the seed of a pose R, t (unit vector), with each inlier at the point midway between its rays."""
     first, second = depths(lines, R, t)
     X = 0.5 * (first[:, None] * lines[:, FIRST] + (second[:, None] * lines[:, SECOND] - t) @ R)
     return _judge_seed(R, t, X, (first > 0) & (second > 0))

@@ -1,6 +1,11 @@
-"""Positive definite systems, damped steps, and the choice between nested models."""
+"""Positive definite, even nearly singular systems, damped steps, and the choice between nested models.
+
+No sum depends on the number of LAPACK's threads, except in large systems. Matrices are symmetric and positive definite
+up to rounding; those with infinite or NaN entries raise NumericalError.
+"""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -9,47 +14,44 @@ import numpy as np
 from sfm_app.errors import NumericalError
 from sfm_app.types.arrays import BoolArray, FloatArray
 
-# Linear systems with positive definite, even nearly singular matrices; no sum depends on LAPACK's threads.
-
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 
-BLOCK = 8
-"""Rows that are eliminated at once, without BLAS. Chosen by hand for speed."""
 EIGENVALUE_FLOOR = 1e-13
 """Eigenvalues below this, of a matrix scaled to a unit diagonal, are zeros with rounding errors: some hundred sums of
 doubles. docs/algorithms.md, Where numbers end."""
 PIVOT_FLOOR = 1e-10
 """Share of a pivot that elimination must leave for a solution to move along it: a smaller pivot multiplies the rounding
-of all later steps by more than a million. Neither figure was chosen on a set: both follow from the precision of
-doubles. docs/algorithms.md, Where numbers end."""
+of later steps by more than a million. It follows from double precision. docs/algorithms.md, Where numbers end."""
 
-MOST_ELIMINATED = 1500
-"""Unknowns up to which systems are solved without LAPACK: the time grows with the cube. Chosen by hand for speed."""
-MOST_DENSE, LEAST_DENSE = 12_000, 0.05
-"""Unknowns, and share of entries that are not 0, at which a sparse system is solved as a dense one: such systems fill
-up in elimination. Chosen by hand for speed and memory."""
-RIDGES = (1e-13, 1e-11, 1e-9, 1e-7)
-"""Shares by which the diagonal of a large system is raised, one after the other. Not chosen on a set: they follow from
-the precision of doubles. docs/algorithms.md, Where numbers end."""
+
+@dataclass(frozen=True, slots=True)
+class SystemOptions:
+    """How systems of different size are solved."""
+
+    most_eliminated: int = 1500
+    """Unknowns up to which systems are solved without LAPACK: the time grows with the cube. By hand, for speed."""
+    most_dense: int = 12_000
+    """Unknowns up to which a sparse system may be solved as a dense one. Chosen by hand for speed and memory."""
+    least_dense: float = 0.05
+    """Share of nonzero entries above which it is: such systems fill up in elimination. Chosen by hand for speed."""
+    ridges: tuple[float, ...] = (1e-13, 1e-11, 1e-9, 1e-7)
+    """Shares by which the diagonal of a large system is raised, one after the other. They follow from double precision.
+    docs/algorithms.md, Where numbers end."""
+
+
+OPTIONS = SystemOptions()
+
 
 NOT_FINITE = "a matrix has infinite or NaN entries", "this is a bug; please report it with OUT/log.txt"
 
 
 def lift_eigenvalues(S: FloatArray, least: float = EIGENVALUE_FLOOR, to: float = EIGENVALUE_FLOOR) -> FloatArray:
-    """Lift eigenvalues below `least` to `to`; matrices without any are returned unchanged.
+    """Lift eigenvalues below `least` to `to`, in [least, 1]; matrices (..., n, n) without any are returned unchanged.
 
-    Eigenvalues are those of the matrix scaled to a unit diagonal, so that units do not matter. With `to` = LEAST the
+    Eigenvalues are those of the matrix scaled to a unit diagonal, so that units do not matter. With `to` = `least` the
     inverse is nearly infinite along such a direction; with `to` = 1 a solution hardly moves along it.
-
-    Args:
-        S: (..., n, n), symmetric.
-        least: > 0.
-        to: in [least, 1].
-
-    Raises:
-        NumericalError: S has infinite or NaN entries.
     """
     if not np.isfinite(S).all():
         raise NumericalError(*NOT_FINITE)
@@ -64,50 +66,37 @@ def lift_eigenvalues(S: FloatArray, least: float = EIGENVALUE_FLOOR, to: float =
     return np.where(singular, np.einsum("...ik,...k,...jk->...ij", vectors, raised, vectors) * pairs, S)
 
 
-def solve_positive(S: FloatArray, B: FloatArray) -> FloatArray:
-    """Compute S^-1 B by Gauss-Jordan elimination in small blocks, without pivoting.
+def solve_positive(S: FloatArray, B: FloatArray, options: SystemOptions = OPTIONS) -> FloatArray:
+    """Solve S X = B, (n, k), by Gauss-Jordan elimination in small blocks, without pivoting.
 
     Along directions that S does not determine, the solution stays near 0. Large systems are solved by LAPACK, whose
     sums depend on the number of its threads, but not on the workers of a run.
-
-    Args:
-        S: (n, n), symmetric and positive definite up to rounding.
-        B: (n, k).
-
-    Raises:
-        NumericalError: S has infinite or NaN entries.
     """
-    return _eliminate(S, B, PIVOT_FLOOR, 1.0) if len(S) <= MOST_ELIMINATED else _solve_by_cholesky(S, B)
+    if len(S) <= options.most_eliminated:
+        return _eliminate(S, B, PIVOT_FLOOR, 1.0)
+    return _solve_by_cholesky(S, B)
 
 
-def solve_sparse_positive(S: "csr_array", B: FloatArray) -> FloatArray:
-    """Compute S^-1 B of a sparse matrix; one with few zeros is solved as a dense one.
-
-    Args:
-        S: (n, n), symmetric and positive definite up to rounding.
-        B: (n, k).
-
-    Raises:
-        NumericalError: S has infinite or NaN entries.
-    """
+def solve_sparse_positive(S: "csr_array", B: FloatArray, options: SystemOptions = OPTIONS) -> FloatArray:
+    """Solve S X = B for a sparse matrix; one with few zeros is solved as a dense one."""
     from scipy import sparse
     from scipy.sparse.linalg import splu
 
     n = S.shape[0]
-    if n <= MOST_ELIMINATED or (n <= MOST_DENSE and S.nnz > LEAST_DENSE * n * n):
-        return solve_positive(S.toarray(), B)
+    if n <= options.most_eliminated or (n <= options.most_dense and S.nnz > options.least_dense * n * n):
+        return solve_positive(S.toarray(), B, options)
     if not np.isfinite(S.data).all():
         raise NumericalError(*NOT_FINITE)
     diagonal = S.diagonal()
     scale = np.where(diagonal > 0.0, diagonal, 1.0) ** -0.5
     balance = sparse.diags_array(scale)
-    unit = sparse.csc_array(balance @ S @ balance + RIDGES[0] * sparse.eye_array(n))
+    unit = sparse.csc_array(balance @ S @ balance + OPTIONS.ridges[0] * sparse.eye_array(n))
     factor = splu(unit, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     return np.asarray(scale[:, None] * factor.solve(np.ascontiguousarray(scale[:, None] * B)), np.float64)
 
 
 def _solve_by_cholesky(S: FloatArray, B: FloatArray) -> FloatArray:
-    """Compute S^-1 B; where rounding has made S indefinite, the diagonal is raised until it no longer is."""
+    """Solve S X = B; where rounding has made S indefinite, the diagonal is raised until it no longer is."""
     from scipy.linalg import cho_factor, cho_solve
 
     diagonal = np.diag(S)
@@ -115,8 +104,8 @@ def _solve_by_cholesky(S: FloatArray, B: FloatArray) -> FloatArray:
     unit = S / scale[:, None] / scale
     if not np.isfinite(unit).all():
         raise NumericalError(*NOT_FINITE)
-    for raised in RIDGES:
-        unit[np.diag_indices(len(unit))] = 1.0 + raised
+    for ridge in OPTIONS.ridges:
+        unit[np.diag_indices(len(unit))] = 1.0 + ridge
         try:
             factor = cho_factor(unit, lower=True, check_finite=False)
         except np.linalg.LinAlgError:
@@ -126,40 +115,25 @@ def _solve_by_cholesky(S: FloatArray, B: FloatArray) -> FloatArray:
 
 
 def inverse_of_positive(S: FloatArray) -> FloatArray:
-    """Invert a symmetric (n, n), positive definite up to rounding; the inverse is symmetric, with a positive diagonal.
-
-    Raises:
-        NumericalError: S has infinite or NaN entries.
-    """
+    """Invert a matrix (n, n); the inverse is symmetric, with a positive diagonal."""
     inverse = _eliminate(S, np.eye(len(S)), EIGENVALUE_FLOOR, EIGENVALUE_FLOOR)
     return 0.5 * (inverse + inverse.T)
 
 
 def inverses_of_positive(S: FloatArray) -> FloatArray:
-    """Invert many small positive definite matrices (..., n, n).
-
-    Raises:
-        NumericalError: S has infinite or NaN entries.
-    """
+    """Invert many small matrices (..., n, n)."""
     return np.asarray(np.linalg.inv(lift_eigenvalues(S)), np.float64)
 
 
 def solve_each(S: FloatArray, B: FloatArray) -> FloatArray:
-    """Compute S^-1 B for many small systems; see `solve_positive`.
-
-    Args:
-        S: (..., n, n), symmetric and positive definite up to rounding.
-        B: (..., n, k) right-hand sides.
-    """
+    """Solve many small systems S X = B, (..., n, n) and (..., n, k), as `solve_positive` does."""
     return np.asarray(np.linalg.solve(lift_eigenvalues(S, PIVOT_FLOOR, 1.0), B), np.float64)
 
 
 def project_to_psd(S: FloatArray, before: FloatArray) -> FloatArray:
     """Return the nearest positive semidefinite matrix (n, n): eigenvalues that rounding made negative become 0.
 
-    Args:
-        S: (n, n), symmetric, left by elimination.
-        before: (n,) its diagonal before elimination, which rounding is relative to.
+    `before` (n,) is the diagonal before the elimination that left S; rounding is relative to it.
     """
     scale = np.sqrt(np.where(before > 0.0, before, 1.0))
     pairs = scale[:, None] * scale
@@ -174,8 +148,8 @@ def _eliminate(S: FloatArray, B: FloatArray, least: float, to: float) -> FloatAr
     M = np.hstack([S, B])
     # a pivot is only rounding if it is tiny relative to its value before elimination
     before = np.sqrt(np.where(np.diag(S) > 0.0, np.diag(S), 1.0))
-    for start in range(0, n, BLOCK):
-        pivot = slice(start, min(start + BLOCK, n))
+    for start in range(0, n, 8):  # a few rows at once, without BLAS
+        pivot = slice(start, min(start + 8, n))
         rest = np.r_[0:start, pivot.stop : n]
         block = _lift_pivot(M[pivot, pivot], before[pivot], least, to)
         row = np.einsum("ij,jk->ik", np.linalg.inv(block), M[pivot, pivot.stop :])
@@ -185,7 +159,7 @@ def _eliminate(S: FloatArray, B: FloatArray, least: float, to: float) -> FloatAr
 
 
 def _lift_pivot(block: FloatArray, before: FloatArray, least: float, to: float) -> FloatArray:
-    """Lift eigenvalues of which only rounding is left; `before` (n,) is the root of the diagonal before elimination."""
+    """Lift eigenvalues of mere rounding; `before` (n,) is the root of the diagonal before elimination."""
     if not np.isfinite(block).all():
         raise NumericalError(*NOT_FINITE)
     scale = before[:, None] * before
@@ -197,10 +171,9 @@ def _lift_pivot(block: FloatArray, before: FloatArray, least: float, to: float) 
     )
 
 
-# Damping of Levenberg-Marquardt steps (Marquardt 1963), for every adjustment written in Python.
-#
-# The kernels of `ransac.refine.sampson_refit` and `posegraph.refine`, and `selfcal.thesis.least_squares` with its
-# many simultaneous starts, do the same inside their loops.
+# Damping of Levenberg-Marquardt steps (Marquardt 1963). The kernels of `fundamental.refits` and
+# `posegraph.pair_pose`, and `selfcal.thesis.least_squares` with its simultaneous starts, do the same inside their
+# loops.
 
 Trial = TypeVar("Trial")
 
@@ -222,13 +195,8 @@ def damped_step(
 ) -> tuple[Trial | None, float]:
     """Find a step that lowers the cost, raising the damping until one does.
 
-    Args:
-        attempt: takes a damping; returns the result of the step, or None if it does not lower the cost.
-        damping: initial damping, > 0.
-        limits: range of the damping.
-
-    Returns:
-        The result of the step, None if no step lowers the cost, and the damping for the next step.
+    `attempt` takes a damping and returns the result of the step, or None if it does not lower the cost. Returns the
+    result or None, and the damping for the next step.
     """
     while damping < limits.most:
         trial = attempt(damping)
@@ -238,12 +206,10 @@ def damped_step(
     return None, damping
 
 
-# Choose which parameters of a camera are free: models compared by their marginal likelihood.
-#
-# The marginal likelihood, by Laplace's approximation, is MacKay's (1992). About the present cameras the negative
-# log-likelihood of a step d is -g'd + d'Hd / 2. Every part of a camera (center, aspect, lens) has a narrow prior
-# about its usual value and a wide one; a choice says which of the two each part has. `camera_priors` asks pairs of
-# photos in this way, `lens_evidence` a whole bundle.
+# Which parameters of a camera are free: models compared by their marginal likelihood (Laplace's approximation, MacKay
+# 1992). About the present cameras the negative log-likelihood of a step d is -g'd + d'Hd / 2. Every part of a camera
+# (center, aspect, lens) has a narrow prior about its usual value and a wide one; a choice says which of the two each
+# part has.
 
 
 class NormalPriors(NamedTuple):
@@ -268,11 +234,7 @@ class Posteriors(NamedTuple):
     """(K, n, n)"""
 
     def mean_squares(self, about: FloatArray) -> FloatArray:
-        """Return (n, n) the second moments over all choices, each counting by its probability.
-
-        Args:
-            about: (n,) the step that they are taken about.
-        """
+        """Return (n, n) the second moments about a step (n,) over all choices, each weighted by its probability."""
         odds = np.exp(self.log_evidence - self.log_evidence.max())
         odds /= odds.sum()
         off = self.steps - about
@@ -282,14 +244,14 @@ class Posteriors(NamedTuple):
 
 
 def binary_choices(count: int) -> BoolArray:
-    """Return (2^count, count) all choices of what is freed; those that free less come first."""
+    """Return (2^count, count) all choices of free parameters; those that free fewer come first."""
     return np.array(sorted(product((False, True), repeat=count), key=sum), np.bool_)
 
 
 def cavity(
     covariance: FloatArray, step: FloatArray, precision: FloatArray, away: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return H (n, n) and g (n,) of what all but a camera's own prior says about it: its posterior less that prior.
+    """Return H (n, n) and g (n,), the evidence about a camera without its own prior: posterior less prior.
 
     Args:
         covariance: (n, n) of this camera in the posterior of all cameras.
@@ -304,10 +266,7 @@ def cavity(
 def posteriors(H: FloatArray, g: FloatArray, priors: NormalPriors) -> Posteriors:
     """Return the posterior and the evidence of each of K choices.
 
-    Args:
-        H: (n, n) or (K, n, n) Hessian of the negative log-likelihood.
-        g: (n,) or (K, n) its negative gradient.
-        priors: of the K choices.
+    H, (n, n) or (K, n, n), is the Hessian of the negative log-likelihood; g, (n,) or (K, n), its negative gradient.
     """
     precision, away, log_odds = priors
     covariances = inverses_of_positive(H + precision[:, :, None] * np.eye(precision.shape[1]))

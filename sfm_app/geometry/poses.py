@@ -11,8 +11,6 @@ from sfm_app.jit import kernel
 from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.types.arrays import FloatArray
 
-# Directions in space: unit vectors and the angles between them.
-
 
 def normalize(vectors: ArrayLike) -> FloatArray:
     """Return vectors (..., 3) with length 1; those of length 0 stay 0."""
@@ -22,12 +20,7 @@ def normalize(vectors: ArrayLike) -> FloatArray:
 
 
 def axis_angle_deg(first: ArrayLike, second: ArrayLike) -> FloatArray:
-    """Return the angle between the lines along vectors, ignoring their signs, in degrees in [0, 90].
-
-    Args:
-        first: (..., 3) vectors of any length but zero.
-        second: (..., 3) likewise; the two are broadcast.
-    """
+    """Return the angle between the lines along vectors (..., 3), ignoring their signs, in degrees in [0, 90]."""
     a, b = normalize(first), normalize(second)
     # the cross product keeps its digits where the arc cosine loses them
     sine = np.linalg.norm(np.cross(a, b), axis=-1)
@@ -35,22 +28,12 @@ def axis_angle_deg(first: ArrayLike, second: ArrayLike) -> FloatArray:
 
 
 def component_along(vectors: FloatArray, axis: FloatArray) -> FloatArray:
-    """Return the components (N,) of vectors along an axis, without BLAS, whose rounding depends on its threads.
-
-    Args:
-        vectors: (N, 3).
-        axis: (3,), of length 1 for components in the unit of the vectors.
-    """
+    """Return the components (N,) of vectors (N, 3) along an axis; without BLAS, whose rounding depends on threads."""
     return np.asarray(np.einsum("ni,i->n", vectors, axis))
 
 
 def perpendicular_component(vector: ArrayLike, axis: FloatArray) -> FloatArray:
-    """Return the component of vectors perpendicular to an axis.
-
-    Args:
-        vector: (..., 3) one vector or many.
-        axis: (3,) unit vector.
-    """
+    """Return the component of vectors (..., 3) perpendicular to an axis, a unit vector (3,)."""
     values = np.asarray(vector, np.float64)
     return np.asarray(values - (values @ axis)[..., None] * axis)
 
@@ -63,14 +46,11 @@ def perpendicular_basis(axis: FloatArray) -> FloatArray:
 
 
 def smallest_eigenvector(matrix: FloatArray, like: FloatArray) -> FloatArray:
-    """Return the eigenvector (3,) of the smallest eigenvalue.
-
-    Args:
-        matrix: (3, 3), symmetric.
-        like: (3,) direction; the sign of the result is such that their dot product is not negative.
+    """Return the eigenvector (3,) of the smallest eigenvalue of a symmetric (3, 3), with the sign of the direction
+    `like`.
     """
-    found: FloatArray = np.linalg.eigh(matrix)[1][:, 0]
-    return found if found @ like >= 0 else -found
+    vector: FloatArray = np.linalg.eigh(matrix)[1][:, 0]
+    return vector if vector @ like >= 0 else -vector
 
 
 # Relative poses for kernels: twelve numbers, R by rows and then the unit vector t; five degrees of freedom.
@@ -81,12 +61,7 @@ POSE_DOF = 5
 
 @kernel
 def write_essential(pose: FloatArray, E: FloatArray) -> None:
-    """Write the essential matrix [t]x R of a pose.
-
-    Args:
-        pose: (12,) R by rows, then the unit vector t.
-        E: (3, 3), written to.
-    """
+    """Write the essential matrix [t]x R (3, 3) of a pose (12,)."""
     x, y, z = pose[9], pose[10], pose[11]
     for j in range(3):
         E[0, j] = y * pose[6 + j] - z * pose[3 + j]
@@ -96,12 +71,7 @@ def write_essential(pose: FloatArray, E: FloatArray) -> None:
 
 @kernel
 def retract(pose: FloatArray, step: FloatArray) -> FloatArray:
-    """Return the pose (12,) after a step: R turned by exp([w]x), t moved in its tangent plane.
-
-    Args:
-        pose: (12,) R by rows, then the unit vector t.
-        step: (5,) w in radians, then the move of t along two unit vectors perpendicular to it.
-    """
+    """Return the pose (12,) after a step (5,): R rotated by exp([w]x), t displaced in its tangent plane."""
     wx, wy, wz = step[0], step[1], step[2]
     angle = np.sqrt(wx * wx + wy * wy + wz * wz)
     sine = np.sin(angle) / angle if angle > 1e-12 else 1.0
@@ -128,24 +98,13 @@ def retract(pose: FloatArray, step: FloatArray) -> FloatArray:
     return out
 
 
-# Similarities between two sets of points in space: scale, rotation, translation.
-
-MAX_TRIPLES = 500
-"""Triples of points that are tried. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-MOST_LISTED = 60
-"""Most points whose triples are all listed before some are drawn; a thousand points have 166 million. Chosen by hand;
-halved and doubled by `benchmarks.sensitivity`."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity:
     """x -> scale R x + t."""
 
     scale: float
     R: FloatArray
-    """(3, 3) rotation."""
     t: FloatArray
-    """(3,)."""
 
     def __call__(self, points: FloatArray) -> FloatArray:
         """Apply the similarity to points (N, 3)."""
@@ -161,12 +120,7 @@ class Similarity:
 
 
 def umeyama(a: FloatArray, b: FloatArray) -> Similarity:
-    """Fit the similarity that maps points to others with least squared error (Umeyama 1991).
-
-    Args:
-        a: (N, 3) points, N >= 3.
-        b: (N, 3) points that they should map to, row by row.
-    """
+    """Fit the similarity from a to b, (N, 3) with N >= 3, with least squared error (Umeyama 1991)."""
     mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
     u, s, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a))
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
@@ -176,22 +130,17 @@ def umeyama(a: FloatArray, b: FloatArray) -> Similarity:
 
 
 def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
-    """Fit the similarity that maps most of the points to others, robust to wrong ones.
+    """Fit the similarity that maps most of the points a (N, 3) to b, robust to wrong ones.
 
-    Least median of squares over triples, then Umeyama on the points that agree with the best triple (Rousseeuw 1984;
-    the threshold is 2.5 robust standard deviations).
-
-    Args:
-        a: (N, 3) points.
-        b: (N, 3) points that they should map to, row by row; some may be wrong.
+    Least median of squares over triples, then Umeyama on the points within 2.5 robust standard deviations of the best
+    triple (Rousseeuw 1984).
 
     Raises:
         NumericalError: fewer than 3 points, or all lie on a line.
     """
     count = len(a)
-    triples = _triples(count)
     best, residual = np.inf, np.zeros(count)
-    for triple in triples:
+    for triple in _triples(count):
         if _is_collinear(a[triple]) or _is_collinear(b[triple]):
             continue
         distance = np.linalg.norm(umeyama(a[triple], b[triple])(a) - b, axis=1)
@@ -206,12 +155,12 @@ def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
 
 
 def _triples(count: int) -> NDArray[np.intp]:
-    """List all triples of `count` points, or `MAX_TRIPLES` of them, drawn with a fixed seed."""
-    rng = np.random.default_rng(0)
-    if count > MOST_LISTED:
-        return np.array([rng.choice(count, 3, replace=False) for _ in range(MAX_TRIPLES)], np.intp)
+    """List all triples of `count` points, or 500 of them, drawn with a fixed seed."""
+    most, rng = 500, np.random.default_rng(0)
+    if count > 60:  # too many triples to list them all before some are drawn
+        return np.array([rng.choice(count, 3, replace=False) for _ in range(most)], np.intp)
     triples = np.array(list(combinations(range(count), 3)), np.intp).reshape(-1, 3)
-    return rng.permutation(triples)[:MAX_TRIPLES] if len(triples) > MAX_TRIPLES else triples
+    return rng.permutation(triples)[:most] if len(triples) > most else triples
 
 
 def _is_collinear(points: FloatArray) -> bool:

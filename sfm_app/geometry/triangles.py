@@ -1,7 +1,4 @@
-"""Culling: which points or triangles a camera can have in view, without looking at each of them.
-
-They are put into clusters of neighbors, each in a ball; a camera looks at those whose ball reaches into its cone.
-"""
+"""Triangles in space: normals, edges, areas, tangents, and culling by clusters of neighbors."""
 
 from dataclasses import dataclass
 
@@ -13,16 +10,9 @@ from sfm_app.jit import kernel
 from sfm_app.types import Surface
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-# Triangles in space.
-
 
 def vertex_normals(vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    """Return (V, 3) unit normals, means over the triangles at each vertex weighted by area; 0 at unused vertices.
-
-    Args:
-        vertices: (V, 3).
-        faces: (T, 3) vertex indices, counter-clockwise seen from outside.
-    """
+    """Return (V, 3) unit normals: means over adjacent triangles weighted by area; 0 at unused vertices."""
     total = np.zeros((len(vertices), 3))
     _add_normals(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64), total)
     length = np.linalg.norm(total, axis=1, keepdims=True)
@@ -45,10 +35,7 @@ def _add_normals(vertices: FloatArray, faces: IndexArray, total: FloatArray) -> 
 
 
 def unit_normals(surface: Surface) -> FloatArray:
-    """Return (V, 3) unit normals; (0, 1, 0) where triangles without area do not define one.
-
-    glTF requires unit normals.
-    """
+    """Return (V, 3) unit normals, as glTF requires; (0, 1, 0) where triangles without area do not define one."""
     normals = vertex_normals(surface.vertices, surface.faces)
     normals[np.linalg.norm(normals, axis=1) < 0.5] = (0.0, 1.0, 0.0)
     return normals
@@ -66,7 +53,7 @@ def unique_edges(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
 def _number_edges(faces: IndexArray, size: int, edges: IndexArray, edge_of: IndexArray) -> int:
     """Fill in every edge once, in order, and the number of each one per triangle; return how many there are.
 
-    They are put in order by the higher vertex and then by the lower one, in as many buckets as there are vertices.
+    Edges are sorted by the higher vertex and then by the lower one, in as many buckets as there are vertices.
     """
     sides = 3 * len(faces)
     low, high = np.empty(sides, np.int64), np.empty(sides, np.int64)
@@ -88,7 +75,7 @@ def _number_edges(faces: IndexArray, size: int, edges: IndexArray, edge_of: Inde
 
 
 @kernel
-def _put_in_buckets(key: IndexArray, order: IndexArray, size: int, found: IndexArray) -> None:
+def _put_in_buckets(key: IndexArray, order: IndexArray, size: int, placed: IndexArray) -> None:
     """Fill in the members of `order` by their key, below `size`; those of one key stay in order."""
     place = np.zeros(size + 1, np.int64)
     for k in range(len(order)):
@@ -96,62 +83,38 @@ def _put_in_buckets(key: IndexArray, order: IndexArray, size: int, found: IndexA
     for k in range(size):
         place[k + 1] += place[k]
     for member in order:
-        found[place[key[member]]] = member
+        placed[place[key[member]]] = member
         place[key[member]] += 1
 
 
 def bucket_order(keys: IndexArray, size: int) -> IndexArray:
-    """Return the order (N,) that sorts keys, as a stable sort does, in time that grows with them and their range.
-
-    Args:
-        keys: (N,) in [0, size).
-        size: number of different keys, about N or less.
-    """
-    found = np.empty(len(keys), np.int64)
-    _put_in_buckets(np.ascontiguousarray(keys, np.int64), np.arange(len(keys)), size, found)
-    return found
+    """Return the order (N,) that sorts keys in [0, size), as a stable sort does, in time linear in N and size."""
+    order = np.empty(len(keys), np.int64)
+    _put_in_buckets(np.ascontiguousarray(keys, np.int64), np.arange(len(keys)), size, order)
+    return order
 
 
 def areas(vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    """Return the areas (T,) of triangles.
-
-    Args:
-        vertices: (V, 3) points.
-        faces: (T, 3) vertex indices.
-    """
+    """Return the areas (T,) of triangles."""
     corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return np.asarray(0.5 * np.linalg.norm(across, axis=1))
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(0.5 * np.linalg.norm(normals, axis=1))
 
 
 def median_edge_length(vertices: FloatArray, faces: IndexArray) -> float:
-    """Return the median length of the edges.
-
-    Args:
-        vertices: (V, 3) points.
-        faces: (T, 3) vertex indices.
-    """
+    """Return the median length of the edges."""
     edges, _ = unique_edges(faces)
     return float(np.median(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)))
 
 
 def select_faces(surface: Surface, keep: NDArray[np.bool_]) -> Surface:
-    """Return the marked triangles with the vertices that they use, in the same order.
-
-    Args:
-        surface: T triangles and their vertices.
-        keep: (T,) True for the triangles to keep.
-    """
+    """Return the triangles with True in `keep` (T,), and the vertices that they use, in the same order."""
     used, faces = number_vertices(surface.faces[keep])
     return Surface(surface.vertices[used], faces.astype(np.int64), surface.colors[used])
 
 
 def number_vertices(faces: NDArray[np.integer]) -> tuple[IndexArray, IndexArray]:
-    """Return the vertices (N,) that triangles use, in order, and the triangles (T, 3) with indices among these.
-
-    Args:
-        faces: (T, 3) vertex indices.
-    """
+    """Return the vertices (N,) that triangles use, in order, and the triangles (T, 3) with indices among these."""
     is_used = np.zeros(int(faces.max(initial=-1)) + 1, np.bool_)
     is_used[faces] = True
     return np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[faces].reshape(-1, 3)
@@ -164,7 +127,7 @@ def split_fans(surface: Surface) -> Surface:
 
     count = len(surface.faces)
     edges, edge_of = unique_edges(surface.faces)
-    # corners of two triangles belong together where the triangles share an edge that ends there
+    # corners of two triangles belong together where their common edge ends there
     order = bucket_order(edge_of.ravel(), len(edges))
     same = np.flatnonzero(np.diff(edge_of.ravel()[order]) == 0)
     face_a, side_a = np.divmod(order[same], 3)
@@ -185,10 +148,7 @@ def split_fans(surface: Surface) -> Surface:
     return Surface(surface.vertices[vertex], rank[fan].reshape(-1, 3), surface.colors[vertex])
 
 
-# The frames along a texture in which a normal map is stored, as glTF 2.0 has them.
-
-DEGENERATE = 1e-6
-"""Share of its longest possible length below which a tangent has no direction. Chosen by hand."""
+# Tangent frames along a texture, in which a normal map is stored (glTF 2.0).
 
 
 def corner_tangents(
@@ -202,29 +162,21 @@ def corner_tangents(
 
     The tangent points right in the texture; the bitangent, handedness times the cross product of normal and tangent,
     points up. A tangent is the mean over the triangles that share a vertex, its place on the page and the handedness,
-    weighted by their angles there, at a right angle to the normal.
-
-    Args:
-        vertices, normals: (V, 3), the latter unit vectors.
-        faces: (T, 3) vertex indices.
-        uv, page: (T, 3, 2) places of the corners on their page, from its top left, and (T,) the page.
+    weighted by their angles there, at a right angle to the unit normals (V, 3). `uv` (T, 3, 2) are the places of the
+    corners on their pages (T,), from the top left.
     """
     corners = vertices[faces]
-    along, handed = _face_tangents(corners, uv.astype(np.float64))
-    weighted = corner_angles(corners)[:, :, None] * along[:, None, :]
+    tangents, handed = _face_tangents(corners, uv.astype(np.float64))
+    weighted = corner_angles(corners)[:, :, None] * tangents[:, None, :]
     total = _group_sums(weighted.reshape(-1, 3), _shared_corners(faces, uv, page, handed))
-    found = _straighten(total, normals[faces].reshape(-1, 3)).reshape(-1, 3, 3)
-    return np.concatenate([found, np.repeat(handed, 3).reshape(-1, 3, 1)], axis=2).astype(np.float32)
+    straight = _straighten(total, normals[faces].reshape(-1, 3)).reshape(-1, 3, 3)
+    return np.concatenate([straight, np.repeat(handed, 3).reshape(-1, 3, 1)], axis=2).astype(np.float32)
 
 
 def corner_angles(corners: FloatArray) -> FloatArray:
-    """Return (T, 3) the angles of triangles in radians.
-
-    Args:
-        corners: (T, 3, 3) their corners.
-    """
-    ahead = normalize(np.roll(corners, -1, axis=1) - corners)
-    cosine = -(ahead * np.roll(ahead, 1, axis=1)).sum(axis=2)
+    """Return (T, 3) the angles of triangles in radians from their corners (T, 3, 3)."""
+    sides = normalize(np.roll(corners, -1, axis=1) - corners)
+    cosine = -(sides * np.roll(sides, 1, axis=1)).sum(axis=2)
     return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
@@ -239,10 +191,10 @@ def _face_tangents(corners: FloatArray, places: FloatArray) -> tuple[FloatArray,
     """Return (T, 3) where the texture goes right on each triangle, as a unit vector, and (T,) the handedness."""
     b, c = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     (ub, vb), (uc, vc) = (places[:, 1] - places[:, 0]).T, (places[:, 2] - places[:, 0]).T
-    turn = ub * vc - uc * vb
-    # v grows downward: triangles that are counter-clockwise from outside turn to the negative where nothing is mirrored
-    handed = np.where(turn > 0, -1.0, 1.0)
-    return normalize(np.sign(turn)[:, None] * (vc[:, None] * b - vb[:, None] * c)), handed
+    area = ub * vc - uc * vb
+    # v grows downward: triangles counter-clockwise from outside have a negative area unless mirrored
+    handed = np.where(area > 0, -1.0, 1.0)
+    return normalize(np.sign(area)[:, None] * (vc[:, None] * b - vb[:, None] * c)), handed
 
 
 def _shared_corners(
@@ -255,32 +207,24 @@ def _shared_corners(
     first = np.zeros(len(order), bool)
     for key in keys:
         first[1:] |= np.diff(key[order]) != 0
-    found = np.empty(len(order), np.int64)
-    found[order] = np.cumsum(first)
-    return found
+    groups = np.empty(len(order), np.int64)
+    groups[order] = np.cumsum(first)
+    return groups
 
 
 def _straighten(tangents: FloatArray, normals: FloatArray) -> FloatArray:
-    """Return unit vectors (N, 3) at right angles to normals, as close to tangents as can be; any where those have none.
-
-    Args:
-        tangents: (N, 3) of any length.
-        normals: (N, 3) unit vectors.
+    """Return unit vectors (N, 3) at right angles to unit normals, as close to tangents as can be; any where those have
+    none.
     """
     straight = tangents - (tangents * normals).sum(axis=1, keepdims=True) * normals
     length = np.linalg.norm(straight, axis=1)
-    lost = length <= DEGENERATE * np.linalg.norm(tangents, axis=1)
-    away = np.eye(3)[np.abs(normals[lost]).argmin(axis=1)]
-    straight[lost] = away - (away * normals[lost]).sum(axis=1, keepdims=True) * normals[lost]
+    degenerate = length <= 1e-6 * np.linalg.norm(tangents, axis=1)
+    axes = np.eye(3)[np.abs(normals[degenerate]).argmin(axis=1)]
+    straight[degenerate] = axes - (axes * normals[degenerate]).sum(axis=1, keepdims=True) * normals[degenerate]
     return normalize(straight)
 
 
-CLUSTER = 256
-"""Members of a cluster. Chosen by hand: of 100 000 triangles, the 400 balls are tested in no time."""
-CURVE_BITS = 12
-"""Cells along a side of the grid of the Morton curve, as a power of two. Chosen by hand."""
-SLACK = 1e-6
-"""Radians, and share of a ball's radius, by which rounding may be off. By definition."""
+# Culling: clusters of neighbors, each in a ball; a camera looks at those whose ball reaches into its cone.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -299,31 +243,25 @@ class Clusters:
     def find_in_cone(self, apex: FloatArray, axis: FloatArray, half_angle: float) -> IndexArray:
         """Return (M,) the members, ascending, of all clusters that reach into a cone; it misses none inside.
 
-        Args:
-            apex: (3,) center of the camera.
-            axis: (3,) unit vector along which it looks.
-            half_angle: of the cone, in radians, up to pi.
+        `half_angle` is in radians, up to pi.
         """
-        way = self.centers - apex
-        distance = np.linalg.norm(way, axis=1)
-        radii = self.radii * (1.0 + SLACK) + SLACK * distance
+        slack = 1e-6  # bounds rounding: radians, and share of a radius or distance
+        direction = self.centers - apex
+        distance = np.linalg.norm(direction, axis=1)
+        radii = self.radii * (1.0 + slack) + slack * distance
         outside = distance > radii
-        angle = np.arctan2(np.linalg.norm(np.cross(way, axis), axis=1), way @ axis)
+        angle = np.arctan2(np.linalg.norm(np.cross(direction, axis), axis=1), direction @ axis)
         reach = np.arcsin(np.clip(np.divide(radii, distance, out=np.ones_like(radii), where=outside), 0.0, 1.0))
-        near = np.flatnonzero(~outside | (angle - reach <= half_angle + SLACK))
+        near = np.flatnonzero(~outside | (angle - reach <= half_angle + slack))
         if not len(near):
             return np.empty(0, np.int64)
         return np.sort(np.concatenate([self.order[self.starts[k] : self.starts[k + 1]] for k in near]))
 
 
 def cluster(corners: FloatArray) -> Clusters:
-    """Put points or triangles into clusters.
-
-    Args:
-        corners: (N, K, 3) of each member; K is 1 for points and 3 for triangles.
-    """
+    """Put points (K = 1) or triangles (K = 3), corners (N, K, 3), into clusters."""
     order = morton_order(corners.mean(axis=1))
-    starts = np.append(np.arange(0, len(order), CLUSTER), len(order)).astype(np.int64)
+    starts = np.append(np.arange(0, len(order), 256), len(order)).astype(np.int64)
     if not len(order):
         return Clusters(order, np.zeros(1, np.int64), np.empty((0, 3)), np.empty(0))
     lowest = np.minimum.reduceat(corners.min(axis=1)[order], starts[:-1])
@@ -338,22 +276,17 @@ def morton_order(points: FloatArray) -> IndexArray:
     """Return the Morton order (N,) of points (N, 3), in which nearby points are mostly adjacent (Morton 1966)."""
     low = points.min(axis=0, initial=np.inf)
     span = max(float(np.max(points.max(axis=0, initial=-np.inf) - low, initial=0.0)), 1e-300)
-    grid = ((points - low) / span * (2**CURVE_BITS - 1)).astype(np.int64)
+    bits = 12
+    grid = ((points - low) / span * (2**bits - 1)).astype(np.int64)
     code = np.zeros(len(points), np.int64)
-    for bit in range(CURVE_BITS):
+    for bit in range(bits):
         for axis in range(3):
             code |= ((grid[:, axis] >> bit) & 1) << (3 * bit + axis)
     return np.argsort(code, kind="stable")
 
 
 def border_angle(K: FloatArray, width: float, height: float) -> float:
-    """Return the largest angle in radians between the optical axis and what a photo without distortion shows.
-
-    Args:
-        K: (3, 3) camera matrix in pixels.
-        width: of the photo in pixels.
-        height: of the photo in pixels.
-    """
+    """Return the largest angle in radians between the optical axis and the border of a photo without distortion."""
     corners = np.array([[x, y, 1.0] for x in (-1.0, width + 1.0) for y in (-1.0, height + 1.0)])
     rays = np.linalg.solve(K, corners.T).T
     return float(np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2]).max())

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.camera.bearings import bearings, plane_points
-from sfm_app.colmap.backend import run_interruptible, translate_errors
-from sfm_app.colmap.mapping import copy_database, map_globally, map_incrementally
+from sfm_app.colmap.backend import Cancellation, CancellationToken, Reconstruction, run_interruptible, translate_errors
+from sfm_app.colmap.mapping import copy_database, incremental_options, map_globally, map_incrementally
 from sfm_app.colmap.model import model_from_seed, placed_views
-from sfm_app.colmap.types import Cancellation, CancellationToken, Reconstruction
 from sfm_app.errors import BackendError
 from sfm_app.geometry.epipolar import GOOD_ANGLE_DEG, TwoViewSeed, cross_matrix, ray_seed, two_view_seed
 from sfm_app.numerical import FAILURES, error_reason
@@ -496,8 +495,9 @@ def _grow(group: Group, start: Reconstruction, run: RunContext, token: Cancellat
     place, cameras = run.workspace, {k: group.intrinsics.camera(group.matches.images[k]) for k in group.photos}
     kept = {start.images[k].camera_id for k, camera in cameras.items() if camera.is_kept and start.exists_image(k)}
     return map_incrementally(
-        place.database, place.photos, start, place.root / INCREMENTAL_FOLDER, run.seed, run.progress.advance, token,
-        known=all(is_focal_accurate(camera) for camera in cameras.values()), kept=kept,
+        place.database, place.photos, start, place.root / INCREMENTAL_FOLDER,
+        incremental_options(run.seed, known=all(map(is_focal_accurate, cameras.values())), kept=kept),
+        run.progress.advance, token,
     )  # fmt: skip
 
 

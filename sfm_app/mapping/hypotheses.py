@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_app.camera.models import GUESSED_FOCAL, guessed_camera_matrix
-from sfm_app.colmap.backend import run_interruptible, translate_errors
+from sfm_app.colmap.backend import Reconstruction, run_interruptible, translate_errors
 from sfm_app.colmap.database import keep_raw_matches, write_calibrations
 from sfm_app.colmap.mapping import copy_database, map_with_colmap_defaults
 from sfm_app.colmap.model import cameras_by_photo, posed_photo_ids
-from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import BackendError
 from sfm_app.mapping.attempt import MAPPING, Attempt, NoModel, are_many_unregistered, judge_model
 from sfm_app.runtime.context import RunContext

@@ -8,12 +8,11 @@ import logging
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
-from sfm_app.colmap.backend import run_interruptible, translate_errors
+from sfm_app.colmap.backend import CancellationToken, Reconstruction, run_interruptible, translate_errors
 from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
 from sfm_app.colmap.growth import model_in_database
-from sfm_app.colmap.mapping import map_incrementally
+from sfm_app.colmap.mapping import incremental_options, map_incrementally
 from sfm_app.colmap.model import posed_photo_ids, submodel
-from sfm_app.colmap.types import CancellationToken, Reconstruction
 from sfm_app.errors import BackendError
 from sfm_app.estimation.calibrating import find_intrinsics
 from sfm_app.mapping.attempt import (
@@ -35,7 +34,7 @@ from sfm_app.mapping.hypotheses import rival_reason
 from sfm_app.mapping.look_alikes import drop_look_alikes, judge_places
 from sfm_app.mapping.passes import Outcome, reconstruct
 from sfm_app.mapping.split_and_merge import split_attempt
-from sfm_app.matching.known import find_same_matches
+from sfm_app.matching.pairs import find_same_matches
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.runtime.context import Earlier, RunContext
 from sfm_app.types import Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
@@ -177,8 +176,8 @@ def _extend(start: Reconstruction, group: Group, run: RunContext, token: Cancell
     kept = {start.images[photo].camera_id for photo, camera in cameras.items() if camera.is_kept}
     place, is_known = run.workspace, all(is_focal_accurate(camera) for camera in cameras.values())
     return map_incrementally(
-        place.database, place.photos, start, place.root / INCREMENTAL_FOLDER, run.seed, run.progress.advance, token,
-        known=is_known, kept=kept,
+        place.database, place.photos, start, place.root / INCREMENTAL_FOLDER,
+        incremental_options(run.seed, known=is_known, kept=kept), run.progress.advance, token,
     )  # fmt: skip
 
 

@@ -13,9 +13,8 @@ from itertools import chain
 import numpy as np
 from scipy.spatial import KDTree
 
-from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.backend import Camera, Reconstruction, all_points, translate_errors
 from sfm_app.colmap.model import focal_px, posed_images
-from sfm_app.colmap.types import Camera, Reconstruction, all_points
 from sfm_app.errors import BackendError
 from sfm_app.mapping.attempt import Attempt, PairSupport, photo_names, saturate
 from sfm_app.mapping.split_and_merge import OPTIONS as SPLIT

@@ -7,7 +7,7 @@ from itertools import combinations
 from pathlib import Path
 
 from sfm_app.colmap.backend import run_in_daemon_thread, translate_errors
-from sfm_app.colmap.joined_model import read_placed, settle, write_placed
+from sfm_app.colmap.joined_model import read_placed, adjust_joined, write_placed
 from sfm_app.errors import BackendError
 from sfm_app.mapping.attempt import (
     Attempt,
@@ -176,7 +176,7 @@ def _merge(group: Group, joined: JoinedParts, run: RunContext) -> list[MappingRe
     with translate_errors("joining parts"), run.step("adjusting all parts together"):
         model = write_placed(database, merged)
         refined = sorted({model.images[photo].camera_id for photo in free})
-        run_in_daemon_thread(lambda: settle(model, database, refined))
+        run_in_daemon_thread(lambda: adjust_joined(model, database, refined))
     how = f"in {count} parts, {len(joined.alignment.kept)} joins"
     return [judge_model(group.matches, group.views, MAPPER, how, model, run)]
 

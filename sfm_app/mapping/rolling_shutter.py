@@ -12,7 +12,7 @@ from sfm_app.bundle.rolling_shutter import ReadoutEstimate
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.bundle import NO_RULES, Adjustment, Rules, adjust_or_keep
 from sfm_app.colmap.model import posed_photo_ids
-from sfm_app.colmap.rolling_shutter import measure_readout, read_keypoints, straighten_model
+from sfm_app.colmap.readout import measure_readout, read_keypoints, straighten_model
 from sfm_app.numerical import FAILURES, Json
 from sfm_app.progress import Progress
 from sfm_app.types import MatchedImage, MatchGraph

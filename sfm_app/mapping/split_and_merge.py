@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse import csr_array, triu
 
-from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.backend import Reconstruction, all_points, translate_errors
 from sfm_app.colmap.bundle import adjust_or_keep
 from sfm_app.colmap.joined_model import merge_models
 from sfm_app.colmap.model import points_by_keypoint, posed_images, posed_photo_ids, submodel
-from sfm_app.colmap.types import Reconstruction, all_points
 from sfm_app.geometry.poses import robust_similarity
 from sfm_app.mapping.attempt import MAPPING, Attempt, NoModel, PairSupport, judge_model
 from sfm_app.numerical import FAILURES

@@ -19,6 +19,7 @@ from sfm_app.colmap.features import (
     MATCHES,
     Part,
     SiftInputs,
+    SiftSettings,
     count_features,
     enter_rows,
     exhaustive_pairs,
@@ -43,19 +44,12 @@ from sfm_app.settings import MatchSettings
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Features, PairId
 
-# Features of photos by a method of two functions, in COLMAP's database and in parts that keep its descriptors.
-#
-# A method gets pictures of the right size; its results are checked, scaled to the photos' pixels and freed of
-# masked points.
+# Features of photos by a plug-in, in COLMAP's database and in parts that keep its descriptors. The method gets
+# pictures of the right size; its results are checked, scaled to the photos' pixels and freed of masked points.
 
 
 def find_features(method: FeatureMethod, names: Mapping[int, str], run: RunContext) -> None:
-    """Write the features of every photo to its part, and its keypoints to the database.
-
-    Args:
-        method: of finding features.
-        names: photos by id; those that have a part are skipped.
-        run: the run.
+    """Write the features of every photo without a part to its part, and its keypoints to the database.
 
     Raises:
         PluginError: the method raises, or returns invalid results.
@@ -63,47 +57,43 @@ def find_features(method: FeatureMethod, names: Mapping[int, str], run: RunConte
     place, panoramas = run.workspace, panorama_names(run.workspace.database)
     folders = _Folders(place.photos, run.mask_dir, place.feature_parts)
     find = Task(_find_and_save, method, run.settings.matching, folders)
-    left = [
-        _Wanted(photo, name, name in panoramas)
+    photos = [
+        _PhotoFile(photo, name, name in panoramas)
         for photo, name in names.items()
         if not part_path(photo, place.feature_parts).exists()
     ]
-    found = track(run.progress, ordered_map(run.executor, find, left, run.workers), "features", len(left))
-    for photo, keypoints in found:
+    features = track(run.progress, ordered_map(run.executor, find, photos, run.workers), "features", len(photos))
+    for photo, keypoints in features:
         with translate_errors("writing keypoints"):
             write_keypoints(run.workspace.database, photo, keypoints)
 
 
 @dataclass(frozen=True, slots=True)
 class _Folders:
-    """Where photos, masks and features are."""
-
     photos: Path
     masks: Path | None
     parts: Path
 
 
 @dataclass(frozen=True, slots=True)
-class _Wanted:
-    """A photo whose features are wanted."""
-
+class _PhotoFile:
     id: int
     name: str
     panorama: bool
 
 
 def _find_and_save(
-    method: FeatureMethod, options: MatchSettings, folders: _Folders, photo: _Wanted
+    method: FeatureMethod, options: MatchSettings, folders: _Folders, photo: _PhotoFile
 ) -> tuple[int, NDArray[np.float32]]:
     """Write the features of one photo to its part, and return its id and its keypoints."""
     pixels = read_pixels(folders.photos / photo.name)
     features, to_photo, size = _find_in_photo(method, photo.name, pixels, options, panorama=photo.panorama)
     keypoints = features.keypoints * to_photo
     if folders.masks is not None:
-        used = read_mask(folders.masks, photo.name)
+        mask = read_mask(folders.masks, photo.name)
         column, row = np.clip(keypoints.astype(np.int64), 0, np.array(size) - 1).T
-        seen = used[row, column]
-        features, keypoints = features.select(seen), keypoints[seen]
+        unmasked = mask[row, column]
+        features, keypoints = features.select(unmasked), keypoints[unmasked]
     rows = np.arange(min(len(keypoints), options.max_features))
     _save(features.select(rows), part_path(photo.id, folders.parts))
     return photo.id, keypoints[rows].astype(np.float32)
@@ -121,39 +111,39 @@ def _find_in_photo(
         scale = options.max_image_size_px / longer
         size = max(1, round(width * scale)), max(1, round(height * scale))
         pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
-    shown = pixels.shape[1], pixels.shape[0]
-    features = _check_features(method, name, shown, _call_find(method, name, pixels, options))
-    return features, np.array([width / shown[0], height / shown[1]]), (width, height)
+    size = pixels.shape[1], pixels.shape[0]
+    features = _check_features(method, name, size, _call_find(method, name, pixels, options))
+    return features, np.array([width / size[0], height / size[1]]), (width, height)
 
 
 def _find_in_views(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings) -> Features:
-    """Return the features of a panorama, found in its perspective views; the best of each view come first."""
+    """Return the features of a panorama from its perspective views; the best of each view come first."""
     size = pixels.shape[1], pixels.shape[0]
     views = PanoramaViews.cover(size, options.max_image_size_px)
-    pixels, found, ranks = views.shrink(pixels), [], []
+    pixels, parts, ranks = views.shrink(pixels), [], []
     for view in range(len(views.rotations)):
-        shown = views.render(pixels, view)
-        features = _check_features(method, name, (views.side_px,) * 2, _call_find(method, name, shown, options))
+        picture = views.render(pixels, view)
+        features = _check_features(method, name, (views.side_px,) * 2, _call_find(method, name, picture, options))
         own = np.flatnonzero(views.is_nearest(features.keypoints, view))
-        at = views.to_panorama(features.keypoints[own], view)
-        found.append(Features(size, at, features.select(own).values))
+        keypoints = views.to_panorama(features.keypoints[own], view)
+        parts.append(Features(size, keypoints, features.select(own).values))
         ranks.append(own)
-    together = {key: np.concatenate([one.values[key] for one in found]) for key in found[0].values}
-    every = Features(size, np.concatenate([one.keypoints for one in found]), together)
-    return every.select(np.argsort(np.concatenate(ranks), kind="stable"))
+    values = {key: np.concatenate([part.values[key] for part in parts]) for key in parts[0].values}
+    joined = Features(size, np.concatenate([part.keypoints for part in parts]), values)
+    return joined.select(np.argsort(np.concatenate(ranks), kind="stable"))
 
 
 def read_pixels(path: Path) -> NDArray[np.uint8]:
-    """Return (H, W, 3) RGB of a photo as it is laid out.
+    """Return (H, W, 3) RGB of a photo in the workspace.
 
     Raises:
         InputError: it can no longer be read.
     """
     data = np.fromfile(path, np.uint8)
-    read = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
-    if read is None:
+    pixels = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
+    if pixels is None:
         raise InputError(f"{path} can no longer be read", hint="run again with --from photos")
-    return np.asarray(read, np.uint8)
+    return np.asarray(pixels, np.uint8)
 
 
 def _call_find(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings) -> Features:
@@ -162,38 +152,28 @@ def _call_find(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], opti
     try:
         return method.find(pixels, options)
     except Exception as err:  # a plug-in may raise anything
-        raise method_error(method, f"failed on {name}: {type(err).__name__}: {err}") from err
+        raise _method_error(method, f"failed on {name}: {type(err).__name__}: {err}") from err
 
 
 def _check_features(method: FeatureMethod, name: str, size: tuple[int, int], features: Features) -> Features:
     """Return the features after checking that they are valid for a picture of this size."""
     points = np.asarray(features.keypoints, np.float64)
     if features.size != size:
-        raise method_error(method, f"report a size of {features.size} for {name} instead of {size}")
+        raise _method_error(method, f"report a size of {features.size} for {name} instead of {size}")
     if points.ndim != 2 or points.shape[1] != 2 or any(len(value) != len(points) for value in features.values.values()):
-        raise method_error(method, f"have arrays of other shapes than (N, 2) and (N, ...) for {name}")
+        raise _method_error(method, f"have arrays of other shapes than (N, 2) and (N, ...) for {name}")
     if not (np.isfinite(points).all() and (points >= 0).all() and (points <= size).all()):
-        raise method_error(method, f"put keypoints outside of {name}")
+        raise _method_error(method, f"put keypoints outside of {name}")
     return Features(size, points, features.values)
 
 
-def method_error(method: FeatureMethod, what: str) -> PluginError:
-    """Return the error of a feature method.
-
-    Args:
-        method: the method.
-        what: it did wrong.
-    """
+def _method_error(method: FeatureMethod, what: str) -> PluginError:
+    """Return the error of a feature method, of which `what` says what it did."""
     return PluginError(f"the features '{method.name}' {what}", hint="choose others with --features")
 
 
 def part_path(photo: int, folder: Path) -> Path:
-    """Return the file that keeps the features of a photo until all are matched.
-
-    Args:
-        photo: id.
-        folder: of the parts.
-    """
+    """Return the file that keeps the features of a photo until all are matched."""
     return folder / f"{photo:06d}.npz"
 
 
@@ -204,117 +184,111 @@ def _save(features: Features, path: Path) -> None:
 
 
 def load_features(photo: int, folder: Path) -> Features:
-    """Read the features of a photo from its part.
-
-    Args:
-        photo: id.
-        folder: of the parts.
-    """
+    """Read the features of a photo from its part in `folder`."""
     arrays = load_arrays(part_path(photo, folder))
     values = {name.removeprefix("value_"): value for name, value in arrays.items() if name.startswith("value_")}
     width, height = arrays["size"]
     return Features((int(width), int(height)), arrays["keypoints"], values)
 
 
-# Put pairs of photos into chunks that have few photos each, since every chunk makes its own indexes of features.
-#
-# A chunk grows photo by photo: the next is the one with most pairs among its photos, as in the growth of parts.
+# Chunks of pairs with few photos each, since every chunk makes its own indexes of features. A chunk grows photo by
+# photo: the next is the one with most pairs among its photos.
 
 
 def cut_pairs(pairs: Sequence[PairId], size: int) -> list[list[PairId]]:
-    """Return all pairs in chunks of `size`, the last of which may be smaller.
+    """Return all pairs in chunks of `size` > 0, the last of which may be smaller.
 
-    Args:
-        pairs: ids of photos, each pair once; their order and that within a pair do not change the chunks.
-        size: of a chunk, > 0.
+    The order of the pairs and that within a pair do not change the chunks.
     """
     names = sorted({photo for pair in pairs for photo in pair})
     number = {name: k for k, name in enumerate(names)}
-    left: list[dict[int, PairId]] = [{} for _ in names]
+    remaining: list[dict[int, PairId]] = [{} for _ in names]
     for pair in sorted(pairs, key=sorted):
         a, b = (number[photo] for photo in pair)
-        left[a][b] = left[b][a] = pair
-    found = list[list[PairId]]()
-    while any(left):
-        found.append(_grow_chunk(left, size))
-    return found
+        remaining[a][b] = remaining[b][a] = pair
+    chunks = list[list[PairId]]()
+    while any(remaining):
+        chunks.append(_grow_chunk(remaining, size))
+    return chunks
 
 
-def _grow_chunk(left: list[dict[int, PairId]], size: int) -> list[PairId]:
-    """Take the pairs of one chunk out of those that are left, by photo and partner, and return them."""
-    count = len(left)
-    links, degree = np.zeros(count, np.int64), np.array([len(partners) for partners in left])
+def _grow_chunk(remaining: list[dict[int, PairId]], size: int) -> list[PairId]:
+    """Take the pairs of one chunk out of the remaining ones, by photo and partner, and return them."""
+    count = len(remaining)
+    links, degree = np.zeros(count, np.int64), np.array([len(partners) for partners in remaining])
     outside, chunk = degree > 0, list[PairId]()
     while len(chunk) < size and outside.any():
-        # of the photos with most links, the one that leaves fewest pairs to others: scraps are dear
+        # of the photos with most links, the one that leaves fewest pairs to other chunks
         best = int(np.argmax(np.where(outside, links * (count + 1) + count - degree, -1)))
-        inside = [other for other in left[best] if not outside[other]][: size - len(chunk)]
+        inside = [other for other in remaining[best] if not outside[other]][: size - len(chunk)]
         for other in inside:
-            chunk.append(left[best].pop(other))
-            del left[other][best]
+            chunk.append(remaining[best].pop(other))
+            del remaining[other][best]
         degree[best] -= len(inside)
         outside[best] = False
-        links[list(left[best])] += 1
+        links[list(remaining[best])] += 1
     return chunk
 
 
-# COLMAP's SIFT in chunks, on a cluster or in processes of this machine; this process enters their rows in order.
-#
-# COLMAP's matcher loses matches now and then where several threads of a process match: of 1540 pairs of small
-# photos, one or two pairs differ in half of the runs. So each process has one thread.
+# COLMAP's SIFT in chunks, on a cluster or in processes of this machine; this process enters their rows in order. Each
+# process has one thread: with several, COLMAP's matcher loses matches now and then (of 1540 pairs of small photos,
+# one or two differ in half of the runs).
 
-MOST_PHOTOS = 8
-"""Photos whose features a worker finds at once: a process of COLMAP's takes a second to start. Chosen by hand."""
-CHUNK_S, FEATURE_S = 30.0, 1.1e-5
-"""Seconds that a chunk of pairs should take, and those of a pair for each feature of its photos. An index of a photo's
-descriptors costs as much as 1.5 pairs, and each chunk makes its own. Measured on castle-P19 and kitchen1000."""
-LEAST_PAIRS, MOST_PAIRS = 64, 4096
-"""Pairs of a chunk. Chosen by hand."""
+
+@dataclass(frozen=True, slots=True)
+class ChunkOptions:
+    """Sizes of chunks of work."""
+
+    most_photos: int = 8
+    """Photos whose features a worker detects at once: a process of COLMAP's takes a second to start. Chosen by hand."""
+    chunk_s: float = 30.0
+    """Seconds that a chunk of pairs should take. Chosen by hand."""
+    feature_s: float = 1.1e-5
+    """Seconds that a pair takes for each feature of its photos. An index of a photo's descriptors costs as much as 1.5
+    pairs, and each chunk makes its own. Measured on castle-P19 and kitchen1000."""
+    least_pairs: int = 64
+    """Fewest pairs of a chunk. Chosen by hand."""
+    most_pairs: int = 4096
+    """Most pairs of a chunk. Chosen by hand."""
+    photos_in_memory: int = 32
+    """Photos whose features stay in memory while pairs are matched; the others are read again. Chosen by hand."""
+
+
+CHUNKS = ChunkOptions()
 
 Item = TypeVar("Item")
 
 
 def find_in_chunks(sift: Mapping[str, SiftOption], names: Sequence[str], run: RunContext) -> dict[str, Json]:
-    """Find features of photos on a cluster; those that are in the database stay.
-
-    Args:
-        sift: options of COLMAP's SIFT that differ from its defaults.
-        names: of the photos.
-        run: the run.
-
-    Returns:
-        The options in force, for the manifest.
+    """Find features of photos on a cluster, except those in the database; return the options in force.
 
     Raises:
         BackendError: COLMAP failed.
         ClusterError: the cluster is gone.
     """
-    wanted = set(names)
-    left = [name for name in photos_without_features(run.workspace.database).values() if name in wanted]
-    parts = chunks(left, MOST_PHOTOS, run.spread)
+    chosen = set(names)
+    missing = [name for name in photos_without_features(run.workspace.database).values() if name in chosen]
+    parts = chunks(missing, CHUNKS.most_photos, run.spread)
     return _do_in_chunks(partial(Task, find_in_chunk), parts, FEATURES, sift, run)
 
 
 def match_in_chunks(sift: Mapping[str, SiftOption], pairs: Sequence[PairId] | None, run: RunContext) -> dict[str, Json]:
-    """Match pairs of photos on a cluster, or in processes of this machine; pairs that are in the database stay.
+    """Match pairs, all if None, on a cluster or in processes of this machine, except those in the database.
 
-    Args:
-        sift: as in `find_in_chunks`.
-        pairs: ids of photos; None for all.
-        run: the run.
-
-    Returns:
-        The options in force, for the manifest.
+    Returns the options in force.
 
     Raises:
         BackendError: COLMAP failed.
         ClusterError: the cluster is gone.
     """
     database = run.workspace.database
-    asked = exhaustive_pairs(sorted(photo_names(database))) if pairs is None else list(pairs)
-    left = set(unmatched_pairs(database, [(min(pair), max(pair)) for pair in asked]))
-    todo = [pair for pair in asked if (min(pair), max(pair)) in left]
-    parts = _chunks_of_pairs(todo, count_features(database), run.spread or run.workers)
+    every = exhaustive_pairs(sorted(photo_names(database))) if pairs is None else list(pairs)
+    unmatched = set(unmatched_pairs(database, [(min(pair), max(pair)) for pair in every]))
+    missing = [pair for pair in every if (min(pair), max(pair)) in unmatched]
+    features = count_features(database)
+    pair_s = CHUNKS.feature_s * max(sum(features) / max(len(features), 1), 1.0)
+    most = min(max(int(CHUNKS.chunk_s / pair_s), CHUNKS.least_pairs), CHUNKS.most_pairs)
+    parts = cut_pairs(missing, chunk_size(len(missing), most, run.spread or run.workers))
     if run.spread:
         return _do_in_chunks(partial(Task, match_chunk), parts, MATCHES, sift, run)
     group, counter = ProcessGroup(), _PairCounter(run.progress)
@@ -327,7 +301,7 @@ def match_in_chunks(sift: Mapping[str, SiftOption], pairs: Sequence[PairId] | No
 
 
 class _PairCounter(SilentProgress):
-    """Counts the pairs of several processes on one bar."""
+    """Progress of several processes on one bar."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress, self._lock = progress, Lock()
@@ -337,32 +311,14 @@ class _PairCounter(SilentProgress):
             self._progress.advance(steps)
 
 
-def _chunks_of_pairs(pairs: Sequence[PairId], features: Sequence[int], workers: int) -> list[list[PairId]]:
-    """Return pairs in chunks of few photos each."""
-    pair_s = FEATURE_S * max(sum(features) / max(len(features), 1), 1.0)
-    return cut_pairs(pairs, chunk_size(len(pairs), min(max(int(CHUNK_S / pair_s), LEAST_PAIRS), MOST_PAIRS), workers))
-
-
 def chunks(items: Sequence[Item], most: int, workers: int) -> list[Sequence[Item]]:
-    """Return items in chunks of about the same size, as many for each worker.
-
-    Args:
-        items: to cut.
-        most: items of a chunk.
-        workers: that share the chunks.
-    """
+    """Return items in chunks of about the same size, at most `most`, equally many for each worker."""
     size = chunk_size(len(items), most, workers)
     return [items[first : first + size] for first in range(0, len(items), size)]
 
 
 def chunk_size(count: int, most: int, workers: int) -> int:
-    """Return the items of each chunk, so that workers get as many chunks.
-
-    Args:
-        count: items to cut.
-        most: items of a chunk.
-        workers: that share the chunks.
-    """
+    """Return the items of each chunk, at most `most`, so that all workers get equally many chunks."""
     rounds = -(-count // (most * max(1, workers)))
     return max(1, -(-count // max(1, rounds * workers)))
 
@@ -383,10 +339,10 @@ def _do_in_chunks(
     inputs = _write_inputs(folder, sift, run, with_features=tables is MATCHES)
     run.progress.start(label, sum(len(part) for part in parts))
     try:
-        for found in ordered_map(run.executor, prepare(inputs), parts, ahead=run.workers):
-            enter_rows(place.database, found.path, tables)
-            in_force |= found.in_force
-            run.progress.advance(found.count)
+        for part in ordered_map(run.executor, prepare(inputs), parts, ahead=run.workers):
+            enter_rows(place.database, part.path, tables)
+            in_force |= part.in_force
+            run.progress.advance(part.count)
     finally:
         run.progress.finish()
         shutil.rmtree(folder, ignore_errors=True)
@@ -398,35 +354,30 @@ def _write_inputs(folder: Path, sift: Mapping[str, SiftOption], run: RunContext,
     place, folder = run.workspace, folder.absolute()
     folder.mkdir(parents=True)
     inputs = SiftInputs(
-        folder / "photos.db", folder / "features.db", place.photos.absolute(),
-        run.mask_dir.absolute() if run.mask_dir else None, run.settings.matching, dict(sift), folder,
-    )  # fmt: skip
+        folder / "photos.db",
+        folder / "features.db",
+        SiftSettings(
+            place.photos.absolute(),
+            run.mask_dir.absolute() if run.mask_dir else None,
+            run.settings.matching,
+            dict(sift),
+        ),
+        folder,
+    )
     write_snapshot(place.database, inputs.snapshot, (*FEATURES, *MATCHES))
     if with_features:
         write_snapshot(place.database, inputs.features, MATCHES)
     return inputs
 
 
-# Features of photos and matches of pairs, found by the chosen method, in COLMAP's database.
-#
-# COLMAP's SIFT fills the database by itself. Any other method is two functions; `feature_parts` calls the first of
-# them.
-
-PHOTOS_IN_MEMORY = 32
-"""Photos whose features are held in memory while pairs are matched; the others are read again."""
+# All features and matches, by COLMAP's SIFT or by a plug-in of two functions.
 
 
 def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Json]:
-    """Find features of photos and match them, in the run's database.
+    """Find features of photos and match them, in the run's database; return the options in force, for the manifest.
 
-    Args:
-        method: of finding and matching.
-        run: its database lists the photos, which are laid out.
-        pairs: the pairs to match, the smaller id first; features are found in their photos only. None for all pairs of
-            all photos; without any pair, features are found in all photos.
-
-    Returns:
-        The options in force, for the manifest.
+    Features are computed in the photos of `pairs` only, with the smaller id first; for None, all photos and all pairs.
+    Without any pair, all photos get features.
 
     Raises:
         PluginError: the method raises, or returns invalid results.
@@ -439,18 +390,7 @@ def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId
 
 
 def find_all_features(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Json]:
-    """Find features of photos; those that a killed run has found are kept.
-
-    Args:
-        method, run, pairs: as in `fill_database`.
-
-    Returns:
-        The options in force, for the manifest.
-
-    Raises:
-        PluginError: the method raises, or returns invalid results.
-        BackendError: COLMAP failed.
-    """
+    """Find features of photos, except those of a killed run; arguments and errors as in `fill_database`."""
     place, options = run.workspace, run.settings.matching
     names = photo_names(place.database)
     if pairs:
@@ -458,10 +398,8 @@ def find_all_features(method: FeatureMethod, run: RunContext, pairs: Sequence[Pa
     if method.sift is not None and run.spread:
         return find_in_chunks(method.sift, list(names.values()), run)
     if method.sift is not None:
-        return find_and_match(
-            place.database, place.photos, list(names.values()), options, run.workers, run.progress, run.mask_dir,
-            method.sift, (),
-        )  # fmt: skip
+        settings = SiftSettings(place.photos, run.mask_dir, options, method.sift)
+        return find_and_match(place.database, settings, list(names.values()), run.workers, run.progress, ())
     if not resume_or_clear(place.feature_parts, run.fingerprint):
         mark_unfinished(place.feature_parts, run.fingerprint)
     find_features(method, names, run)
@@ -469,19 +407,8 @@ def find_all_features(method: FeatureMethod, run: RunContext, pairs: Sequence[Pa
 
 
 def match_pairs(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Json]:
-    """Match pairs of photos whose features are known; matches that a killed run has found are kept.
-
-    Args:
-        method: of matching.
-        run: its database has the keypoints.
-        pairs: the pairs to match, the smaller id first; None for all.
-
-    Returns:
-        The options in force, for the manifest.
-
-    Raises:
-        PluginError: the method raises, or returns invalid results.
-        BackendError: COLMAP failed.
+    """Match pairs of photos with known features, except those of a killed run; arguments and errors as in
+    `fill_database`.
     """
     place, options = run.workspace, run.settings.matching
     if pairs is not None and not pairs:
@@ -489,17 +416,14 @@ def match_pairs(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] 
     if method.sift is not None and (run.spread or run.workers > 1):
         return match_in_chunks(method.sift, pairs, run)
     if method.sift is not None:
-        return find_and_match(place.database, place.photos, [], options, 1, run.progress, sift=method.sift, pairs=pairs)
+        settings = SiftSettings(place.photos, None, options, method.sift)
+        return find_and_match(place.database, settings, [], 1, run.progress, pairs)
     _match(method, all_pairs(photo_names(place.database)) if pairs is None else pairs, run)
     return {}
 
 
 def forget_features(run: RunContext) -> None:
-    """Remove the parts of features, which are of no use once all pairs are matched.
-
-    Args:
-        run: the run.
-    """
+    """Remove the parts of features, once all pairs are matched."""
     shutil.rmtree(run.workspace.feature_parts, ignore_errors=True)
 
 
@@ -512,29 +436,24 @@ def all_pairs(photos: Sequence[int] | Mapping[int, str]) -> list[PairId]:
 def _match(method: FeatureMethod, pairs: Sequence[PairId], run: RunContext) -> None:
     """Write the matches of every pair into the database, also where there are none."""
     options, database = run.settings.matching, run.workspace.database
-    reader = FeatureReader(run.workspace.feature_parts, max(PHOTOS_IN_MEMORY, 2 * run.workers))
+    reader = FeatureReader(run.workspace.feature_parts, max(CHUNKS.photos_in_memory, 2 * run.workers))
     match = Task(_read_and_match, method, options, Shared(reader))
-    left = unmatched_pairs(database, pairs)
-    found = track(run.progress, ordered_map(run.executor, match, left, 2 * run.workers), "matching", len(left))
-    for pair, rows in found:
+    unmatched = unmatched_pairs(database, pairs)
+    matches = ordered_map(run.executor, match, unmatched, 2 * run.workers)
+    for pair, rows in track(run.progress, matches, "matching", len(unmatched)):
         with translate_errors("writing matches"):
             write_matches(database, pair, rows)
 
 
 class FeatureReader:
-    """Reads the features of photos, and keeps those of some; in another process, it begins with none.
+    """Reads the features of photos; those of `count` photos stay in memory. In another process it begins with none."""
 
-    Args:
-        folder: of the parts of features.
-        kept: photos whose features stay in memory.
-    """
-
-    def __init__(self, folder: Path, kept: int) -> None:
-        self._made_of = folder, kept
-        self.read = lru_cache(kept)(partial(load_features, folder=folder))
+    def __init__(self, folder: Path, count: int) -> None:
+        self._arguments = folder, count
+        self.read = lru_cache(count)(partial(load_features, folder=folder))
 
     def __reduce__(self) -> tuple[type["FeatureReader"], tuple[Path, int]]:
-        return FeatureReader, self._made_of
+        return FeatureReader, self._arguments
 
 
 def _read_and_match(
@@ -553,12 +472,12 @@ def _match_pair(method: FeatureMethod, pair: tuple[Features, Features], options:
     try:
         rows = np.asarray(method.match(*pair, options))
     except Exception as err:  # a plug-in may raise anything
-        raise method_error(method, f"failed to match two photos: {type(err).__name__}: {err}") from err
+        raise _method_error(method, f"failed to match two photos: {type(err).__name__}: {err}") from err
     if rows.size == 0:
         return np.zeros((0, 2), np.uint32)
     if rows.ndim != 2 or rows.shape[1] != 2 or not np.issubdtype(rows.dtype, np.integer):
-        raise method_error(method, "have matches that are not (M, 2) integers")
+        raise _method_error(method, "have matches that are not (M, 2) integers")
     for column, features in zip(rows.T, pair, strict=True):
         if column.min() < 0 or column.max() >= len(features) or len(np.unique(column)) < len(column):
-            raise method_error(method, "match a keypoint twice, or one that does not exist")
+            raise _method_error(method, "match a keypoint twice, or one that does not exist")
     return rows.astype(np.uint32)

@@ -246,8 +246,6 @@ def compare(vertices: FloatArray, faces: IndexArray, normals: Gray, here: Sight,
         vertices: (V, 3).
         faces: (T, 3).
         normals: (T, 3) of the triangles, unit.
-        here: the photo.
-        others: those that it is compared with.
     """
     found, level, raster = Pull.zeros(len(vertices)), here.level, here.raster
     shape = raster.depth.shape

@@ -68,7 +68,6 @@ class Partition:
 
         Args:
             points: (N, 3).
-            distance: up to which they are close.
         """
         near = np.zeros(len(points), np.bool_)
         for axis, at in self.planes():
@@ -144,9 +143,6 @@ def weld(below: Surface, above: Surface, axis: int, at: float, cell: float, halo
         below: reaches beyond the plane.
         above: reaches beyond the plane.
         axis: 0, 1 or 2, across which the plane lies.
-        at: coordinate of the plane.
-        cell: side of the finest cells of both.
-        halo: distance up to which the second surface gives way.
 
     Returns:
         The surface, and how many edges in the plane did not find their like.
@@ -186,7 +182,6 @@ def close_cracks(surface: Surface, at_planes: NDArray[np.bool_]) -> Surface:
     had two corners in one place, as planes that nearly touch leave them, these become one.
 
     Args:
-        surface: welded.
         at_planes: (V,) which of its vertices may be at a crack.
     """
     found = make_manifold(Surface(surface.vertices, surface.faces, np.column_stack([surface.colors, at_planes])))
@@ -200,11 +195,7 @@ def close_cracks(surface: Surface, at_planes: NDArray[np.bool_]) -> Surface:
 
 
 def _join_same_places(surface: Surface) -> Surface:
-    """Return the surface with the ends of open edges at planes as one vertex where they lie in one place.
-
-    Args:
-        surface: the fourth of its colors says which vertices are at a plane.
-    """
+    """Return the surface with the ends of open edges at planes as one vertex where they lie in one place."""
     edges, edge_of = unique_edges(surface.faces)
     ends = np.unique(edges[np.bincount(edge_of.ravel(), minlength=len(edges)) == 1])
     ends = ends[surface.colors[ends, 3] != 0]
@@ -220,10 +211,7 @@ def cut_at_plane(surface: Surface, axis: int, at: float, *, keep_below: bool) ->
     """Return the part of a surface on one side of a plane, and its border there.
 
     Args:
-        surface: any.
         axis: 0, 1 or 2, across which the plane lies.
-        at: coordinate of the plane.
-        keep_below: whether the side with the smaller coordinates is kept.
     """
     inside = (at - surface.vertices[:, axis]) * (1.0 if keep_below else -1.0)
     part = cut(surface, inside)
@@ -300,10 +288,8 @@ def _split_first(
     Where two of them would come in the wrong order, they become one.
 
     Args:
-        one, other: the borders.
         places: (M,) moved vertices, and for each the edge of the first border, and the share of the way along it.
         vertices: (V, 3).
-        tiny: distance within which a moved vertex becomes an end of the edge.
 
     Returns:
         Per edge its vertices in their order, and (V,) the vertex that each one has become.

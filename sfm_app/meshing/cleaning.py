@@ -20,7 +20,6 @@ def drop_islands(surface: Surface, min_share: float) -> Surface:
     """Drop connected parts that have too few triangles.
 
     Args:
-        surface: any.
         min_share: smallest share of all triangles that is kept, in [0, 1].
     """
     from scipy.sparse import coo_array
@@ -148,14 +147,7 @@ class Support:
 
 
 def trim(surface: Surface, support: Support, max_gap_triangles: float, least: float) -> Surface:
-    """Keep the parts that photos confirm and do not see through, bridge small gaps, and smooth the border.
-
-    Args:
-        surface: closed, from Poisson reconstruction.
-        support: of its vertices.
-        max_gap_triangles: as for `bridge_gaps`.
-        least: as for `drop_doubtful_parts`.
-    """
+    """Keep the parts that photos confirm and do not see through, bridge small gaps, and smooth the border."""
     sign, edges = np.where(support.is_supported, 1.0, -1.0), unique_edges(surface.faces)
     bridged = bridge_gaps(surface, sign, support.is_free, max_gap_triangles, edges)
     smooth = smooth_support(surface, bridged, SMOOTHING, edges)
@@ -169,10 +161,8 @@ def bridge_gaps(
     """Add support to unsupported patches that are small and hardly seen through.
 
     Args:
-        surface: closed or open.
         support: (V,) positive where photos confirm the surface, negative where none does.
         free: (V,) where photos see through the surface.
-        max_width: largest width of a bridged patch, in edge lengths of its rim; its length is not limited.
         known: edges of the surface; None for finding them.
 
     Returns:
@@ -208,7 +198,6 @@ def drop_doubtful_parts(
     Examples are fragments around outlines: two or three photos agree by chance, and the gaps between are bridged.
 
     Args:
-        surface: its edges define the connected parts.
         support: (V,) positive where photos confirm the surface.
         confirmed: (V,) photos that confirm each vertex.
         least: smallest mean number of photos, >= 0.
@@ -227,7 +216,6 @@ def smooth_support(surface: Surface, support: FloatArray, steps: int, known: Edg
     """Average the support over each vertex and its neighbors, (V,), to smooth the border.
 
     Args:
-        surface: its edges are used.
         support: (V,) positive where photos confirm the surface.
         steps: iterations, >= 0.
         known: edges of the surface; None for finding them.
@@ -254,7 +242,6 @@ def cut(surface: Surface, support: FloatArray, known: Edges | None = None) -> Su
     Triangles on the border are split.
 
     Args:
-        surface: any.
         support: (V,).
         known: edges of the surface; None for finding them.
     """

@@ -37,7 +37,6 @@ class Neighbors:
 
         Args:
             faces: (T, 3) vertex indices.
-            count: number of vertices.
         """
         edges, edge_of = unique_edges(faces)
         own, other = edges.T[::-1].ravel(), edges.T.ravel()  # lower neighbors first: they ascend at each vertex
@@ -63,7 +62,6 @@ def find_displacements(
 
     Args:
         vertices, normals: (V, 3).
-        around: neighbors of the vertices.
         pull: g and h of the photos, (V,) each.
         size: (V,) mean length of the edges at each vertex, > 0.
     """
@@ -121,7 +119,6 @@ def _apply(
     """Fill in L' W L d; L d is the mean of the neighbors less the vertex.
 
     Args:
-        starts, others: the neighbors.
         share: (V,) one over the number of neighbors.
         weight: (V,) the diagonal of W; 0 where there are no neighbors.
         d: (V,).

@@ -49,7 +49,6 @@ def cube_around(low: FloatArray, high: FloatArray, cell: float) -> Cube:
     Args:
         low: (3,) lowest coordinates of the points.
         high: (3,) highest coordinates of the points.
-        cell: side of the finest cells.
     """
     step = ALIGNMENT * cell
     depth = COARSEST_CUBE
@@ -63,12 +62,7 @@ def cube_around(low: FloatArray, high: FloatArray, cell: float) -> Cube:
 
 
 def cell_sizes(extent: float, depth: int) -> Iterator[float]:
-    """Yield sides of cells, the finest first, each twice the one before.
-
-    Args:
-        extent: largest of all points.
-        depth: greatest depth of an octree over them all.
-    """
+    """Yield sides of cells, the finest first, each twice the one before."""
     for level in range(min(depth, DEEPEST), 1, -1):
         yield MARGIN * extent / 2.0**level
 
@@ -88,7 +82,6 @@ def count_cells(points: FloatArray, cell: float) -> int:
 
     Args:
         points: (N, 3).
-        cell: side of a cell.
     """
     keys = np.sort(_number_cells(points, cell))
     return min(len(keys), 1) + int(np.count_nonzero(keys[1:] != keys[:-1]))
@@ -100,7 +93,6 @@ def count_bent(points: FloatArray, normals: FloatArray, cell: float) -> tuple[in
     Args:
         points: (N, 3).
         normals: (N, 3) unit vectors.
-        cell: side of a cell.
     """
     _, own, count = np.unique(_number_cells(points, cell), return_inverse=True, return_counts=True)
     total = np.stack([np.bincount(own, along, len(count)) for along in normals.T], axis=1)
@@ -122,7 +114,6 @@ def choose_cell(sizes: Sequence[float], cells: PointCells, least: float = LEAST_
 
     Args:
         sizes: allowed sides, the finest first, each twice the one before; not empty.
-        cells: of the points.
         least: smallest mean number of points in an occupied cell, > 0.
     """
     held = cache(cells.points_per_cell)
@@ -142,7 +133,6 @@ def find_size(sizes: Sequence[float], points_per_cell: Callable[[float], float],
 
     Args:
         sizes: allowed sides, the finest first, each twice the one before.
-        points_per_cell: mean number of points in an occupied cell of a side.
         wanted: that number, > 0.
     """
     cell, finer = 0.0, 0.0

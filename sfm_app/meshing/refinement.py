@@ -24,7 +24,6 @@ def split_long_edges(surface: Surface, longest: FloatArray) -> Surface:
     """Return the surface with every edge that is too long divided in the middle.
 
     Args:
-        surface: triangles.
         longest: (V,) longest edge at each vertex; the smaller one of both ends decides.
     """
     edges, edge_of = unique_edges(surface.faces)
@@ -161,8 +160,6 @@ def refine(
         surface: triangles, counterclockwise seen from outside, about right to some pixels.
         photos: posed photos without distortion.
         partners: for each photo, numbers of others that it is compared with.
-        most: triangles; edges are no longer divided beyond.
-        spread: applies a function to photos, possibly in parallel.
     """
     found = list[float]()
     for share, iterations in LEVELS:
@@ -182,8 +179,6 @@ def finest_pixels(vertices: FloatArray, photos: Sequence[RefinePhoto], share: fl
 
     Args:
         vertices: (V, 3).
-        photos: posed photos.
-        share: of their resolution.
     """
     found = np.full(len(vertices), np.inf)
     for photo in photos:
@@ -237,13 +232,7 @@ def _improve(
 
 
 def look(surface: Surface, photo: RefinePhoto, share: float) -> Sight:
-    """Return a photo, and the surface in it; nothing where the photo is masked.
-
-    Args:
-        surface: triangles.
-        photo: the photo.
-        share: of its resolution.
-    """
+    """Return a photo, and the surface in it; nothing where the photo is masked."""
     found = rasterize(surface.vertices, surface.faces, photo.projection(share), photo.size_at(share))
     masked = photo.mask_at(share)
     if masked is not None:

@@ -77,7 +77,6 @@ def judge(points: FloatArray, normals: FloatArray, eye: DepthView, tolerance: fl
     Args:
         points: (N, 3) in the world.
         normals: (N, 3) unit vectors.
-        eye: the photo.
         tolerance: relative difference in depth.
     """
     verdict = np.zeros(len(points), np.uint8)
@@ -154,7 +153,6 @@ class Paint:
 
         Args:
             at: (N,) the vertices that it sampled, each once.
-            other: its colors at these.
         """
         self.total[at] += other.total
         self.weight[at] += other.weight
@@ -185,7 +183,6 @@ def sample_colors(
         points: (N, 3).
         normals: (N, 3) unit.
         verdict: (N,) from `judge`.
-        eye: the photo's camera.
         image: (H, W, 3) the same field of view as the depth map, at any size.
     """
     paint = Paint.zeros(len(points))

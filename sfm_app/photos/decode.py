@@ -15,30 +15,29 @@ import numpy as np
 import PIL
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError, features
+from PIL.ExifTags import GPS, IFD, Base
 
 from sfm_app.operating_system import find_in_wheel
 from sfm_app.photos.files import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
 from sfm_app.types import GpsPosition
 
-# Read EXIF: hints about a photo that are never trusted.
+FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
+"""Formats that every Pillow can read."""
+LOSSY = ("JPEG", "MPO", "WEBP", "HEIF", "AVIF")
+"""Lossy formats: a copy as JPEG loses almost nothing more."""
+LARGE_PX = 50_000_000
+MOST_FRAMES = 100
+DAMAGED = "truncated or damaged"
+LARGE_PHOTO_LOCK = Lock()
+SENSOR_UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+"""Length of EXIF's units of the sensor's resolution; 2, the inch, is the default. By definition."""
 
-MAKE, MODEL, ORIENTATION, EXIF_IFD, GPS_IFD = 0x010F, 0x0110, 0x0112, 0x8769, 0x8825
-FOCAL_MM, FOCAL_35MM, ZOOM = 0x920A, 0xA405, 0xA404
-GPS_LATITUDE_REF, GPS_LATITUDE, GPS_LONGITUDE_REF, GPS_LONGITUDE, GPS_ALTITUDE_REF, GPS_ALTITUDE = range(1, 7)
-
-TAKEN_WIDTH, TAKEN_HEIGHT, SENSOR_RESOLUTION, SENSOR_UNIT = 0xA002, 0xA003, 0xA20E, 0xA210
-
-FULL_FRAME_WIDTH_MM = 36.0
-INCH = 2
-SENSOR_UNITS_MM = {INCH: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-"""Lengths of EXIF's units of the resolution of a sensor; the inch where nothing is said. By definition."""
-LOWEST_M, HIGHEST_M = -1000.0, 20_000.0
-"""Range of plausible altitudes."""
+# EXIF: hints about a photo that are never trusted.
 
 
 def orientation(exif: Image.Exif) -> int:
     """Return the EXIF orientation, 1 to 8; 1 (upright) if it is missing or invalid."""
-    value = exif.get(ORIENTATION, 1)
+    value = exif.get(Base.Orientation, 1)
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
@@ -48,23 +47,18 @@ def turn_deg(exif: Image.Exif) -> int:
 
 
 def camera_name(exif: Image.Exif) -> str:
-    """Return make, model, focal length and digital zoom in one text; empty if EXIF has none of them."""
-    details = exif.get_ifd(EXIF_IFD)
-    said = [exif.get(MAKE), exif.get(MODEL), details.get(FOCAL_MM), _zoom(details.get(ZOOM))]
-    return " ".join(text for text in (printable_text(value) for value in said) if text)
+    """Return make, model, focal length and digital zoom in one text; empty without them."""
+    details = exif.get_ifd(IFD.Exif)
+    parts = [exif.get(Base.Make), exif.get(Base.Model), details.get(Base.FocalLength), _zoom(details.get(Base.DigitalZoomRatio))]
+    return " ".join(text for text in (printable_text(value) for value in parts) if text)
 
 
 def focal_px(exif: Image.Exif, longer_side: int) -> float | None:
-    """Return the focal length in pixels that EXIF claims; None if it says nothing plausible.
+    """Return EXIF's focal length in pixels, for the longer side in pixels; None if it is implausible.
 
-    It follows from the 35 mm equivalent; without that, from the focal length in millimeters and the resolution of the
-    sensor.
-
-    Args:
-        exif: of the photo.
-        longer_side: of the photo, pixels.
+    The 35 mm equivalent comes first, then the focal length in millimeters with the sensor's resolution.
     """
-    details = exif.get_ifd(EXIF_IFD)
+    details = exif.get_ifd(IFD.Exif)
     for claim in (_equivalent_focal, _sensor_focal):
         try:
             focal = longer_side * claim(details)
@@ -76,28 +70,24 @@ def focal_px(exif: Image.Exif, longer_side: int) -> float | None:
 
 
 def _equivalent_focal(details: Mapping[int, Any]) -> float:
-    """Return the focal length of the 35 mm equivalent in longer sides."""
-    return float(details.get(FOCAL_35MM, 0.0)) / FULL_FRAME_WIDTH_MM
+    return float(details.get(Base.FocalLengthIn35mmFilm, 0.0)) / 36.0  # the width of full frame, mm
 
 
 def _sensor_focal(details: Mapping[int, Any]) -> float:
-    """Return the focal length in longer sides of the photo that the camera took, before it was scaled."""
-    unit_mm = SENSOR_UNITS_MM[int(details.get(SENSOR_UNIT, INCH))]
-    taken = max(float(details[TAKEN_WIDTH]), float(details[TAKEN_HEIGHT]))
-    return float(details[FOCAL_MM]) * float(details[SENSOR_RESOLUTION]) / unit_mm / taken
+    """Return the focal length in longer sides of the photo as taken, before it was scaled."""
+    unit_mm = SENSOR_UNITS_MM[int(details.get(Base.FocalPlaneResolutionUnit, 2))]
+    longer_px = max(float(details[Base.ExifImageWidth]), float(details[Base.ExifImageHeight]))
+    return float(details[Base.FocalLength]) * float(details[Base.FocalPlaneXResolution]) / unit_mm / longer_px
 
 
 def gps_position(exif: Image.Exif) -> GpsPosition | None:
-    """Return the GPS position; None if it is missing or implausible.
-
-    Cameras without a fix write zeros: latitude and longitude 0 is open sea and counts as missing.
-    """
-    entries: Mapping[int, Any] = exif.get_ifd(GPS_IFD)
-    latitude = _degrees(entries.get(GPS_LATITUDE), entries.get(GPS_LATITUDE_REF), "NS", 90.0)
-    longitude = _degrees(entries.get(GPS_LONGITUDE), entries.get(GPS_LONGITUDE_REF), "EW", 180.0)
+    """Return the GPS position; None if it is missing, implausible, or 0, 0, which cameras without a fix write."""
+    entries: Mapping[int, Any] = exif.get_ifd(IFD.GPSInfo)
+    latitude = _degrees(entries.get(GPS.GPSLatitude), entries.get(GPS.GPSLatitudeRef), "NS", 90.0)
+    longitude = _degrees(entries.get(GPS.GPSLongitude), entries.get(GPS.GPSLongitudeRef), "EW", 180.0)
     if latitude is None or longitude is None or latitude == longitude == 0.0:
         return None
-    return GpsPosition(latitude, longitude, _altitude_m(entries.get(GPS_ALTITUDE), entries.get(GPS_ALTITUDE_REF)))
+    return GpsPosition(latitude, longitude, _altitude_m(entries.get(GPS.GPSAltitude), entries.get(GPS.GPSAltitudeRef)))
 
 
 def printable_text(value: object) -> str:
@@ -107,7 +97,7 @@ def printable_text(value: object) -> str:
 
 
 def _zoom(value: Any) -> str | None:
-    """Return the digital zoom, which crops like another camera; None for 0 and 1, which mean no zoom."""
+    """Return the digital zoom, which crops like another camera; None for 0 and 1, no zoom."""
     try:
         return None if float(value) in (0.0, 1.0) else f"x{float(value):g}"
     except (TypeError, ValueError, ZeroDivisionError):
@@ -134,10 +124,10 @@ def _altitude_m(altitude: Any, reference: Any) -> float | None:
         return None
     below = reference in (1, b"\x01")
     value = -value if below else value
-    return value if LOWEST_M <= value <= HIGHEST_M else None
+    return value if -1000.0 <= value <= 20_000.0 else None
 
 
-# Collect libtiff's errors, which it would print while returning a damaged picture; Pillow does not check them.
+# libtiff prints its errors and returns a damaged picture; Pillow does not check them.
 
 HANDLER = ctypes.CFUNCTYPE(None, ctypes.c_char_p, ctypes.c_char_p, ctypes.c_void_p)
 """Type of libtiff's error callback: module, format and arguments of a message."""
@@ -149,8 +139,7 @@ _thread_errors = threading.local()
 def libtiff_errors() -> Iterator[list[str]]:
     """Provide a list that collects libtiff's errors while this thread decodes.
 
-    It stays empty if Pillow's libtiff is no library of its own, as on Windows: what Pillow itself notices is still an
-    error, but damage after which libtiff goes on decoding is not noticed.
+    It stays empty if Pillow links libtiff statically, as on Windows; damage that libtiff survives is then not noticed.
     """
     _install_handler()
     _thread_errors.errors = []
@@ -176,32 +165,22 @@ def _install_handler() -> None:
         set_handler(ERROR_CALLBACK)
 
 
-FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
-"""Formats that every Pillow can read."""
-LOSSY = ("JPEG", "MPO", "WEBP", "HEIF", "AVIF")
-"""Lossy formats: a copy as JPEG loses almost nothing more."""
-
-LARGE_PX = 50_000_000
-LEAST_BYTES_PER_PX = 0.02
-"""Real photos have more, even at high compression; decompression bombs of one color have less."""
-MOST_FRAMES = 100
-DAMAGED = "truncated or damaged"
-LARGE_PHOTO_LOCK = Lock()
+# Pictures of files.
 
 
 class UnreadableError(Exception):
-    """Why a file gives no picture; the message is for people."""
+    """A file gives no picture; the message, for people, says why."""
 
 
 @cache
 def formats() -> tuple[str, ...]:
-    """Return the formats that this installation reads: HEIC needs the extra, AVIF a Pillow built with it."""
-    found = FORMATS + (("AVIF",) if features.check("avif") else ())
+    """Return the readable formats: HEIC needs the extra, AVIF a Pillow built with it."""
+    plain = FORMATS + (("AVIF",) if features.check("avif") else ())
     try:
         importlib.import_module("pillow_heif").register_heif_opener()
     except ImportError:
-        return found
-    return (*found, "HEIF")
+        return plain
+    return (*plain, "HEIF")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,19 +196,15 @@ class DecodedPhoto:
 
 
 def read_picture(path: Path) -> DecodedPhoto:
-    """Decode a whole file.
-
-    Raises:
-        UnreadableError: the file is not a photo, or it is damaged.
-    """
+    """Decode a whole file; raise UnreadableError if it is damaged or no photo."""
     try:
         with Image.open(path, formats=formats()) as image:
             _refuse_bombs(image, path)
             frames = _frame_count(image)
             image.seek(0)
-            with libtiff_errors() as wrong:
+            with libtiff_errors() as errors:
                 image.load()
-            if wrong:
+            if errors:
                 raise UnreadableError(DAMAGED)
             return DecodedPhoto(image, _read_exif(image), frames)
     except UnidentifiedImageError:
@@ -248,7 +223,7 @@ def read_picture(path: Path) -> DecodedPhoto:
 
 @contextmanager
 def large_photo_lock(path: Path) -> Iterator[None]:
-    """Hold a lock while a large photo is decoded, because each takes ten bytes per pixel or more."""
+    """Hold a lock while a large photo is decoded, which takes at least ten bytes per pixel."""
     try:
         with Image.open(path, formats=formats()) as image:
             pixels = image.width * image.height
@@ -259,14 +234,14 @@ def large_photo_lock(path: Path) -> Iterator[None]:
 
 
 def _refuse_bombs(image: Image.Image, path: Path) -> None:
-    """Refuse decompression bombs that are below Pillow's own limit."""
+    """Refuse decompression bombs below Pillow's own limit: real photos have more than 0.02 bytes per pixel."""
     pixels = image.width * image.height
-    if pixels > LARGE_PX and path.stat().st_size < LEAST_BYTES_PER_PX * pixels:
+    if pixels > LARGE_PX and path.stat().st_size < 0.02 * pixels:
         raise UnreadableError("too many pixels for a file of its size")
 
 
 def _frame_count(image: Image.Image) -> int:
-    """Return the number of pictures, for a TIFF at most MOST_FRAMES + 1; 1 for an MPO, whose others are previews."""
+    """Return the number of pictures, at most MOST_FRAMES + 1 for a TIFF; 1 for an MPO, which adds previews."""
     if image.format == "MPO":
         return 1
     if image.format != "TIFF":
@@ -282,8 +257,8 @@ def _frame_count(image: Image.Image) -> int:
 def _read_exif(image: Image.Image) -> Image.Exif:
     try:
         exif = image.getexif()
-        exif.get_ifd(EXIF_IFD)
-        exif.get_ifd(GPS_IFD)
+        exif.get_ifd(IFD.Exif)
+        exif.get_ifd(IFD.GPSInfo)
     except Exception:  # damaged EXIF raises anything
         return Image.Exif()
     return exif
@@ -293,29 +268,6 @@ def upright_image(picture: DecodedPhoto) -> Image.Image:
     """Return the picture upright by EXIF, in 8-bit RGB or gray, with transparent pixels on white."""
     return undo_exif_orientation(_to_eight_bit(picture.image), orientation(picture.exif))
 
-
-def undo_exif_orientation(image: Image.Image, turned: int) -> Image.Image:
-    """Turn an image upright by its EXIF orientation.
-
-    Args:
-        image: as stored in the file.
-        turned: EXIF orientation, 1 to 8; other values leave the image unchanged.
-    """
-    return image.transpose(ORIENTATIONS[turned]) if turned in ORIENTATIONS else image
-
-
-def rotate_to_sensor(upright: Image.Image, turn_deg: int) -> Image.Image:
-    """Turn an upright image back to the orientation of the sensor.
-
-    Args:
-        upright: image as displayed.
-        turn_deg: clockwise rotation from sensor to upright, in degrees: 0, 90, 180 or 270.
-    """
-    return upright.transpose(TURNS[turn_deg]) if turn_deg else upright
-
-
-TURNS = {90: Image.Transpose.ROTATE_90, 180: Image.Transpose.ROTATE_180, 270: Image.Transpose.ROTATE_270}
-"""Pillow's transposition for each counterclockwise rotation, in degrees."""
 
 ORIENTATIONS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -329,6 +281,17 @@ ORIENTATIONS = {
 """Pillow's transposition that undoes each EXIF orientation."""
 
 
+def undo_exif_orientation(image: Image.Image, orientation: int) -> Image.Image:
+    """Turn an image as stored upright; orientations outside of 2 to 8 leave it unchanged."""
+    return image.transpose(ORIENTATIONS[orientation]) if orientation in ORIENTATIONS else image
+
+
+def rotate_to_sensor(upright: Image.Image, turn_deg: int) -> Image.Image:
+    """Turn an upright image back to the sensor's orientation, which is upright after 0, 90, 180 or 270 degrees."""
+    turns = {90: Image.Transpose.ROTATE_90, 180: Image.Transpose.ROTATE_180, 270: Image.Transpose.ROTATE_270}
+    return upright.transpose(turns[turn_deg]) if turn_deg else upright
+
+
 def _to_eight_bit(image: Image.Image) -> Image.Image:
     if image.mode.startswith("I") or image.mode == "F":
         return Image.fromarray(_to_gray_levels(np.asarray(image)))
@@ -339,7 +302,7 @@ def _to_eight_bit(image: Image.Image) -> Image.Image:
 
 
 def _to_gray_levels(deep: NDArray[Any]) -> NDArray[np.uint8]:
-    """Map 16-bit gray, or gray of any other range, to 256 levels."""
+    """Map gray of 16 bits or any other range to 256 levels."""
     values = np.nan_to_num(deep.astype(np.float64))
     low, high = values.min(), values.max()
     if deep.dtype.kind in "iu" and low >= 0 and high <= 65535:
@@ -358,6 +321,5 @@ def _unreadable_reason(path: Path) -> str:
     if head[4:8] == b"ftyp" and head[8:12] in HEIC_BRANDS:
         return DAMAGED if "HEIF" in formats() else "HEIC photos need `pip install 'sfm-app[heic]'`"
     if head[4:8] == b"ftyp" and head[8:12] in AVIF_BRANDS:
-        needed = "AVIF photos need a newer Pillow: `pip install -U pillow`"
-        return DAMAGED if "AVIF" in formats() else needed
+        return DAMAGED if "AVIF" in formats() else "AVIF photos need a newer Pillow: `pip install -U pillow`"
     return f"a video; run it alone: sfm-app run {printable_text(path.name)}" if is_video(head) else "not a photo"

@@ -8,10 +8,8 @@ from pathlib import Path
 from sfm_app.errors import InputError
 from sfm_app.operating_system import is_link
 
-# Recognize videos by their first bytes, not by their names; playlists are not videos.
-
-ENDINGS = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts", ".3gp")
-"""Extensions of videos; used only to word error messages."""
+EXTENSIONS = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts", ".3gp")
+"""Of videos, for error messages only: videos are recognized by their first bytes, and playlists are none."""
 HEAD_BYTES = 400
 """Enough for three packets of an MPEG transport stream."""
 HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")
@@ -52,24 +50,22 @@ def _has_packets(head: bytes, first: int, length: int) -> bool:
     return len(head) == HEAD_BYTES and all(head[k] == 0x47 for k in range(first, HEAD_BYTES, length))
 
 
-# List the files of a folder and resolve their paths. Nothing outside the folder is read.
+# Nothing outside the folder of the photos is read.
 
 HINT = "name the folder that holds the photos"
-VIDEO_HINT = "MP4, MOV, MKV, WebM, AVI and MPEG are read: copy the file again, or save it as MP4"
 
 
 def list_files(folder: Path, out: Path, listed_in: Path | None = None, closed: Sequence[Path] = ()) -> list[str]:
     """Return the names of all files below the folder, with forward slashes, sorted.
 
-    Hidden folders and links to folders are not entered; each counts as one file. The output folder is left out.
+    Hidden folders and links to folders are not entered; each counts as one file. The output folder `out` and the
+    folders `closed` are left out.
 
     Args:
-        folder, out: of the photos; output folder, which may lie in it.
-        listed_in: text file of the names to return, one per line, relative to the folder; None for all files.
-        closed: other folders that are left out, like the output folder.
+        listed_in: text file with the names to return instead, one per line, relative to the folder.
 
     Raises:
-        InputError: there is no such folder, or it cannot be read.
+        InputError: the folder does not exist or cannot be read.
     """
     if not folder.is_dir():
         raise _bad_path_error(folder)
@@ -79,44 +75,41 @@ def list_files(folder: Path, out: Path, listed_in: Path | None = None, closed: S
         raise InputError(f"cannot read {folder}: {err.strerror}") from err
     if listed_in is not None:
         return _read_list(listed_in)
-    left_out = {place.resolve() for place in (out, *closed)}
-    return sorted(path.relative_to(folder).as_posix() for path in _walk(folder, left_out))
+    excluded = {place.resolve() for place in (out, *closed)}
+    return sorted(path.relative_to(folder).as_posix() for path in _walk(folder, excluded))
 
 
 def _bad_path_error(path: Path) -> InputError:
     """Return the error for a path that is neither a folder nor a video."""
     if not path.exists():
-        what = "file" if path.suffix.lower() in ENDINGS else "folder"
-        beside = path.parent.iterdir() if os.access(path.parent, os.R_OK) and path.parent.is_dir() else ()
-        near = get_close_matches(path.name, sorted(other.name for other in beside), 1)
-        meant = f"\nis it {path.with_name(near[0])}?" if near else ""
-        return InputError(f"no such {what}: {path}", hint=f"{HINT}, or a video{meant}")
-    if path.suffix.lower() not in ENDINGS or not path.is_file():
+        kind = "file" if path.suffix.lower() in EXTENSIONS else "folder"
+        siblings = path.parent.iterdir() if os.access(path.parent, os.R_OK) and path.parent.is_dir() else ()
+        similar = get_close_matches(path.name, sorted(other.name for other in siblings), 1)
+        suggestion = f"\nis it {path.with_name(similar[0])}?" if similar else ""
+        return InputError(f"no such {kind}: {path}", hint=f"{HINT}, or a video{suggestion}")
+    if path.suffix.lower() not in EXTENSIONS or not path.is_file():
         return InputError(f"not a folder: {path}", hint=f"{HINT}, or a video, not a photo")
     if not os.access(path, os.R_OK):
         return InputError(f"cannot read {path}: permission denied")
-    return InputError(f"{path} is empty" if not path.stat().st_size else f"not a video: {path}", hint=VIDEO_HINT)
+    hint = "MP4, MOV, MKV, WebM, AVI and MPEG are read: copy the file again, or save it as MP4"
+    return InputError(f"{path} is empty" if not path.stat().st_size else f"not a video: {path}", hint=hint)
 
 
 def resolve_file(folder: Path, name: str) -> Path | str:
-    """Return the path of a file with links resolved, or the reason why it is not opened.
-
-    Args:
-        folder, name: of the photos (nothing outside it is opened); path inside the folder.
-    """
+    """Return the path of a file in a folder with links resolved, or the reason why it is not opened."""
     root, place = folder.resolve(), folder / name
     if Path(name).name.startswith("."):
         return "hidden"
     try:
         real = place.resolve()
-        there = real.exists()
-    except RuntimeError:  # links in a ring
+        exists = real.exists()
+    except RuntimeError:  # a cycle of links
         return "a link that leads nowhere"
     except (OSError, ValueError) as err:  # lists may hold invalid names; folders may be inaccessible
         return f"not readable: {getattr(err, 'strerror', 'no name').lower()}"
     if not real.is_relative_to(root):
         return "a link out of the folder" if is_link(place) else "outside the folder"
-    if not there:
+    if not exists:
         return "a link that leads nowhere" if is_link(place) else "not there"
     if real.is_dir():
         return "a link to a folder" if is_link(place) else "a folder"
@@ -132,9 +125,9 @@ def _read_list(file: Path) -> list[str]:
     return sorted({Path(line).as_posix() for line in lines if line.strip()})
 
 
-def _walk(folder: Path, left_out: set[Path]) -> Iterator[Path]:
+def _walk(folder: Path, excluded: set[Path]) -> Iterator[Path]:
     for place, folders, files in os.walk(folder):
         here = Path(place)
         closed = [name for name in folders if name.startswith(".") or is_link(here / name)]
-        folders[:] = [name for name in folders if name not in closed and (here / name).resolve() not in left_out]
+        folders[:] = [name for name in folders if name not in closed and (here / name).resolve() not in excluded]
         yield from (here / name for name in (*files, *closed))

@@ -22,126 +22,73 @@ from sfm_app.types.arrays import BoolArray
 
 ENDING = ".png"
 MASK_HINT = "the mask of sub/a.jpg is sub/a.jpg.png or sub/a.png in the folder of masks, of the size of the photo"
-WHITE = 255
-FIRST_SIDEWAYS = 5
-"""EXIF orientations from this value on swap width and height."""
 
 
 def list_masks(masks: Path, photos: Path, out: Path) -> list[str]:
     """Return the names of all files below the folder of masks, as `list_files` does, without photos and output.
 
-    Args:
-        masks: folder of the masks.
-        photos: folder of the photos.
-        out: output folder; may lie inside the folder of masks.
-
-    Raises:
-        InputError: there is no such folder, or it is also the folder of the photos.
+    Raise an InputError if the folder does not exist or is also the folder of the photos.
     """
     if not masks.is_dir():
-        what = "not a folder" if masks.exists() else "no such folder"
-        raise InputError(f"{what} of masks: {masks}", hint=MASK_HINT)
+        problem = "not a folder" if masks.exists() else "no such folder"
+        raise InputError(f"{problem} of masks: {masks}", hint=MASK_HINT)
     if masks.resolve() == photos.resolve():
         raise InputError(f"the masks lie among the photos in {photos}", hint="give the masks a folder of their own")
     return list_files(masks, out, closed=(photos,))
 
 
 def find_mask(photo: Photo, folder: Path, masks: Path) -> Photo | UnusablePhoto:
-    """Return the photo with its mask, if it has one; an unusable photo if everything is masked.
+    """Return the photo with its mask, if it has one; an unusable photo if its mask is all black.
 
-    Args:
-        photo: as it was read.
-        folder: of the photos.
-        masks: folder of the masks.
-
-    Raises:
-        InputError: the mask cannot be used.
+    Raise an InputError if the mask cannot be used.
     """
     names = f"{photo.path}{ENDING}", str(PurePosixPath(photo.path).with_suffix(ENDING))
     name = next((name for name in names if os.path.lexists(masks / name)), "")
     if not name:
         return photo
-    found = replace(photo, mask=name)
-    if not np.any(_load_fitted_mask(found, folder, masks)):
+    masked = replace(photo, mask=name)
+    if not np.any(_load_fitted_mask(masked, folder, masks)):
         return UnusablePhoto(photo.path, f"its mask {name} is all black")
-    return found
+    return masked
 
 
 def unused_masks(names: Sequence[str], photos: Sequence[Photo]) -> list[str]:
-    """Return the files in the folder of masks that belong to no photo; hidden files are ignored.
-
-    Args:
-        names: from `list_masks`.
-        photos: those of the run, with their masks.
-    """
+    """Return the files in the folder of masks that belong to no photo; hidden files are ignored."""
     used = {photo.mask for photo in photos}
     return [name for name in names if name not in used and not PurePosixPath(name).name.startswith(".")]
 
 
 def lay_out_mask(photo: Photo, folder: Path, masks: Path, target: Path) -> None:
-    """Write the mask of a photo, in the orientation of the laid-out photo; all white if it has none.
+    """Write the mask of a photo in the orientation of the laid-out photo; all white if it has none.
 
-    COLMAP skips photos without a mask as soon as it is given any masks.
-
-    Args:
-        photo: with its mask, if it has one.
-        folder: of the photos.
-        masks: folder of the masks.
-        target: folder to write to.
-
-    Raises:
-        InputError: as `find_mask`.
-        OSError: the target cannot be written.
+    COLMAP skips photos without a mask once it is given any masks. Errors are those of `find_mask`.
     """
     used = _load_fitted_mask(photo, folder, masks) if photo.mask else np.full((photo.height, photo.width), True)
     save_mask(target, photo.name, used)
 
 
 def mask_path(target: Path, name: str) -> Path:
-    """Return the path of the staged mask of a photo.
-
-    Args:
-        target: folder of the staged masks.
-        name: of the photo.
-    """
+    """Return the path of the staged mask of a photo."""
     return target / f"{name}{ENDING}"
 
 
 def save_mask(target: Path, name: str, used: BoolArray) -> None:
-    """Write the usable pixels of a photo as a black and white mask.
-
-    Args:
-        target: folder of the staged masks.
-        name: of the photo.
-        used: (H, W), in the orientation of the laid-out photo.
-    """
+    """Write the (H, W) usable pixels of a laid-out photo as a black and white mask."""
     place = mask_path(target, name)
     place.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(_to_uint8(used)).save(place, "PNG", compress_level=1)
+    _black_and_white(used).save(place, "PNG", compress_level=1)
 
 
 def read_mask(target: Path, name: str) -> BoolArray:
-    """Read the (H, W) mask that `save_mask` wrote.
-
-    Args:
-        target: folder of the staged masks.
-        name: of the photo.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """Read the (H, W) mask that `save_mask` wrote; raise an OSError if it cannot be read."""
     with Image.open(mask_path(target, name)) as image:
         return np.asarray(image) > 0
 
 
 def fill_masked(pixels: NDArray[np.uint8], used: BoolArray) -> NDArray[np.uint8]:
-    """Return a photo whose masked pixels take the color of the nearest usable pixel.
+    """Return an RGB photo (H, W, 3) whose masked pixels take the color of the nearest usable pixel of (H, W).
 
     This keeps masked colors out of interpolation and downscaling.
-
-    Args:
-        pixels: (H, W, 3) RGB.
-        used: (H, W), whether each pixel may be used.
     """
     if used.all() or not used.any():
         return pixels
@@ -154,7 +101,7 @@ def fill_masked(pixels: NDArray[np.uint8], used: BoolArray) -> NDArray[np.uint8]
 
 
 def _load_fitted_mask(photo: Photo, folder: Path, masks: Path) -> BoolArray:
-    """Return (H, W) usable pixels of the photo by its mask, in the orientation of the laid-out photo."""
+    """Return the (H, W) usable pixels of the laid-out photo."""
     try:
         place = resolve_file(masks, photo.mask)
         if isinstance(place, str):
@@ -174,9 +121,9 @@ def _orient_mask(photo: Photo, size: tuple[int, int], mask: Image.Image, folder:
     """Apply the photo's EXIF orientation to a mask that was painted on the pixels as stored in the file."""
     if _has_same_aspect(mask.size[::-1], size):
         source = resolve_file(folder, photo.path)
-        turned = orientation(read_picture(source).exif) if isinstance(source, Path) else 1
-        if turned >= FIRST_SIDEWAYS:
-            return undo_exif_orientation(mask, turned)
+        stored = orientation(read_picture(source).exif) if isinstance(source, Path) else 1
+        if stored >= 5:  # these swap width and height
+            return undo_exif_orientation(mask, stored)
     width, height = mask.size
     raise UnreadableError(f"it has {width} x {height} pixels, its photo {size[0]} x {size[1]}")
 
@@ -187,7 +134,7 @@ def _has_same_aspect(one: tuple[int, int], other: tuple[int, int]) -> bool:
 
 
 def _binarize(image: Image.Image) -> Image.Image:
-    """Return white where any channel is nonzero and the pixel is not transparent."""
+    """Return white where any channel is nonzero and the pixel is opaque."""
     if image.mode.startswith("I") or image.mode == "F":
         used = np.asarray(image) != 0
     elif image.mode in ("1", "L") and "transparency" not in image.info:
@@ -197,8 +144,8 @@ def _binarize(image: Image.Image) -> Image.Image:
     else:
         channels = np.asarray(image.convert("RGBA"))
         used = channels[..., :3].any(axis=2) & (channels[..., 3] > 0)
-    return Image.fromarray(_to_uint8(used))
+    return _black_and_white(used)
 
 
-def _to_uint8(used: BoolArray) -> NDArray[np.uint8]:
-    return np.where(used, np.uint8(WHITE), np.uint8(0))
+def _black_and_white(used: BoolArray) -> Image.Image:
+    return Image.fromarray(np.where(used, np.uint8(255), np.uint8(0)))

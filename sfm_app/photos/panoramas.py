@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from PIL.ExifTags import Base
 
 from sfm_app.camera.bearings import RAY, bearings, project
 from sfm_app.camera.models import panorama_matrix
@@ -18,103 +19,100 @@ from sfm_app.photos.decode import DecodedPhoto, UnreadableError
 from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import EQUIRECTANGULAR, Calibration
 
-# Recognize panoramas: equirectangular photos, whose columns are longitudes and whose rows are latitudes.
+# Recognition of equirectangular photos, whose columns are longitudes and whose rows are latitudes. Ours.
 #
-# Cameras and stitchers say so in the file (Google's Photo Sphere metadata, `GPano`). Without it, a full one is
-# known by what no other picture has: it is twice as wide as high, its left and right borders continue each other,
-# and its first and last row each show a single point, the zenith and the nadir.
+# Cameras and stitchers name the projection in the file (Google's Photo Sphere metadata, `GPano`). Without metadata, a
+# full panorama is twice as wide as high, its left and right borders continue each other, and its first and last row
+# each show one point: zenith and nadir.
 
-XMP_KEYS = ("xmp", "XML:com.adobe.xmp")
-"""Where Pillow keeps XMP in `Image.info`: JPEG and WebP, PNG."""
-XMP_TIFF = 700
 ENTRY = re.compile(rb"""<GPano:(\w+)[^>]*>([^<]*)</|GPano:(\w+)\s*=\s*["']([^"']*)""")
 """An entry of Google's metadata, as an element or as an attribute."""
-WHOLE = 0.995
-"""Least share of the sphere that counts as all of it: stitchers round. Chosen by hand; not measured on its own."""
-ASPECT_TOLERANCE = 0.01
-"""Largest error of the ratio of width to height, which is 2. Chosen by hand; not measured on its own."""
-WIDTH_PX = 512
-"""Width at which borders are compared. Chosen by hand; not measured on its own."""
-SEAM_STEPS = 3.0
-"""Largest difference of the border columns, in median differences of neighboring columns. Chosen on 2:1 parts of real
-photos and on rendered panoramas: docs/algorithms.md, Panoramas."""
-SEAM_SHARE = 0.5
-"""Largest difference of the border columns, as a share of the least difference of one of them to any column an eighth
-of a turn or more away. Chosen as `SEAM_STEPS`."""
-LEAST_CONTRAST = 10.0
-"""Standard deviation of a border column in gray levels, below which it cannot be told from others. Chosen by hand; not
-measured on its own."""
-POLE_SHARE = 0.2
-"""Largest mean step from column to column of the first and the last row, as a share of that of the busiest row: a point
-that is stretched over the whole width hardly changes. Chosen as `SEAM_STEPS`."""
+
+
+@dataclass(frozen=True, slots=True)
+class PanoramaOptions:
+    """Constants of panoramas. Recognition: chosen on 2:1 parts of real photos and on rendered panoramas."""
+
+    whole: float = 0.995
+    """Least share of the sphere that counts as all of it: stitchers round. Chosen by hand."""
+    aspect_tolerance: float = 0.01
+    """Largest error of the ratio of width to height, which is 2. Chosen by hand."""
+    width_px: int = 512
+    """Width at which borders are compared. Chosen by hand."""
+    seam_steps: float = 3.0
+    """Largest difference of the border columns, in median differences of neighboring columns."""
+    seam_share: float = 0.5
+    """Largest such difference, as a share of the least difference to a column an eighth of a turn or more away."""
+    min_contrast: float = 10.0
+    """Least standard deviation of a border column, in gray levels. Chosen by hand."""
+    pole_share: float = 0.2
+    """Largest mean step between columns in the first and last row, as a share of the row with the largest steps."""
+    seam_px: int = 4
+    """Columns of the other border that are added for interpolation. Chosen by hand."""
+    field_deg: float = 90.0
+    """Field of view of a feature view. The farthest point nearest to a view's axis lies 37 degrees from it, so that
+    the surroundings of every keypoint are inside. Chosen by hand."""
+    grid: int = 257
+    """Rows and columns of a panorama whose rays the painted views cover. Chosen by hand."""
+
+
+OPTIONS = PanoramaOptions()
 
 
 def is_panorama(picture: DecodedPhoto, upright: Image.Image) -> bool:
-    """Return whether a photo is a full equirectangular panorama, by its metadata or else by its pixels. Ours.
+    """Return whether a photo is a full equirectangular panorama, by its metadata or else by its upright pixels.
 
-    Args:
-        picture: what the file holds.
-        upright: its picture, upright.
-
-    Raises:
-        UnreadableError: it is a panorama that does not show the whole sphere, or one of another projection.
+    Raise an UnreadableError for a panorama of another projection or of a part of the sphere.
     """
     entries = read_panorama_entries(picture.image)
     kind = entries.get("ProjectionType", "").strip().lower()
     if not kind:
-        return closes_around(upright)
+        return looks_like_panorama(upright)
     if kind != "equirectangular":
         raise UnreadableError(f"a panorama of the projection '{kind[:40]}': only equirectangular ones can be used")
     wide, high = (_covered_share(entries, side) for side in ("Width", "Height"))
-    if min(wide, high) < WHOLE:
+    if min(wide, high) < OPTIONS.whole:
         degrees = f"{360 * wide:.0f} x {180 * high:.0f} degrees"
         raise UnreadableError(f"a panorama of {degrees}: only full ones of 360 x 180 degrees can be used")
     if not _is_twice_as_wide(upright.size):
-        raise UnreadableError("a part of a panorama: said to be all round, but not twice as wide as high")
+        raise UnreadableError("a part of a panorama: its metadata claims the whole sphere, but it is not twice as wide as high")
     return True
 
 
 def read_panorama_entries(image: Image.Image) -> dict[str, str]:
-    """Return the entries of Google's Photo Sphere metadata by name; empty without.
-
-    Args:
-        image: decoded, as stored in the file.
-    """
-    found = next((image.info[key] for key in XMP_KEYS if image.info.get(key)), None)
-    if found is None and image.format == "TIFF":
-        found = getattr(image, "tag_v2", {}).get(XMP_TIFF)
-    if isinstance(found, str):
-        found = found.encode()
-    if not isinstance(found, bytes):
+    """Return the entries of Google's Photo Sphere metadata of a decoded image by name; empty without."""
+    keys = ("xmp", "XML:com.adobe.xmp")  # of JPEG and WebP; of PNG
+    xmp = next((image.info[key] for key in keys if image.info.get(key)), None)
+    if xmp is None and image.format == "TIFF":
+        xmp = getattr(image, "tag_v2", {}).get(Base.XMLPacket)
+    if isinstance(xmp, str):
+        xmp = xmp.encode()
+    if not isinstance(xmp, bytes):
         return {}
-    entries = ((a or c, b or d) for a, b, c, d in ENTRY.findall(found))
+    entries = ((a or c, b or d) for a, b, c, d in ENTRY.findall(xmp))
     return {name.decode(): value.decode(errors="replace").strip() for name, value in entries}
 
 
-def closes_around(upright: Image.Image) -> bool:
-    """Return whether a picture looks like a full panorama: its borders continue each other, its poles are points. Ours.
-
-    Args:
-        upright: upright picture.
-    """
+def looks_like_panorama(upright: Image.Image) -> bool:
+    """Return whether an upright picture looks like a full panorama: borders continue, poles are points."""
     if not _is_twice_as_wide(upright.size):
         return False
-    small = upright.convert("RGB").resize((WIDTH_PX, WIDTH_PX // 2), Image.Resampling.BOX, reducing_gap=3.0)
+    small = upright.convert("RGB").resize((OPTIONS.width_px, OPTIONS.width_px // 2), Image.Resampling.BOX, reducing_gap=3.0)
     pixels = np.asarray(small, np.float64)
-    busy = np.abs(np.diff(pixels, axis=1)).mean(axis=(1, 2))
-    return bool(max(busy[0], busy[-1]) <= POLE_SHARE * busy.max()) and _borders_continue(pixels)
+    steps = np.abs(np.diff(pixels, axis=1)).mean(axis=(1, 2))
+    return bool(max(steps[0], steps[-1]) <= OPTIONS.pole_share * steps.max()) and _borders_continue(pixels)
 
 
 def _borders_continue(pixels: NDArray[np.float64]) -> bool:
     """Return whether the last column continues in the first, and far better than in any other."""
     width, edge = pixels.shape[1], (pixels[:, :1], pixels[:, -1:])
-    if min(float(np.std(column.mean(axis=2))) for column in edge) < LEAST_CONTRAST:
+    if min(float(np.std(column.mean(axis=2))) for column in edge) < OPTIONS.min_contrast:
         return False
     seam = _difference(edge[0], edge[1])[0]
     steps = _difference(pixels[:, 1:], pixels[:, :-1])
     far = slice(width // 8, -(width // 8))
     others = min(_difference(column, pixels[:, far]).min() for column in edge)
-    return bool(seam <= SEAM_STEPS * np.median(steps) and seam <= SEAM_SHARE * others)
+    return bool(seam <= OPTIONS.seam_steps * np.median(steps) and seam <= OPTIONS.seam_share * others)
 
 
 def _difference(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -123,11 +121,11 @@ def _difference(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.fl
 
 
 def _is_twice_as_wide(size: tuple[int, int]) -> bool:
-    return abs(size[0] / size[1] - 2.0) <= ASPECT_TOLERANCE
+    return abs(size[0] / size[1] - 2.0) <= OPTIONS.aspect_tolerance
 
 
 def _covered_share(entries: dict[str, str], side: str) -> float:
-    """Return the share of the sphere that the picture covers along its width or height, 1 where nothing is said."""
+    """Return the share of the sphere that the picture covers along its "Width" or "Height"; 1 if unknown."""
     try:
         part, whole = (float(entries[name]) for name in (f"CroppedAreaImage{side}Pixels", f"FullPano{side}Pixels"))
         return min(part / whole, 1.0) if part > 0 else 1.0
@@ -135,23 +133,19 @@ def _covered_share(entries: dict[str, str], side: str) -> float:
         return 1.0
 
 
-# Photos sampled at other positions, such as those of a perspective view.
-
-SEAM_PX = 4
-"""Columns of the other border that are added at either one, for interpolation. Chosen by hand; not measured on its
-own."""
+# Resampling.
 
 
 def resample(
     photo: NDArray[np.uint8], at: NDArray[np.floating[Any]], size: tuple[int, int], wraps: bool = False
 ) -> NDArray[np.uint8]:
-    """Return a photo (H, W, 3) at given positions, by cubic interpolation; beyond its border, the border is repeated.
+    """Return a photo (H, W, 3) at given positions by cubic interpolation; outside, the border is repeated.
 
     Args:
-        photo: (h, w, 3), perhaps scaled down.
-        at: (H, W, 2) pixels of the photo in its own size; centers at +0.5.
-        size: (width, height) of the photo in its own size.
-        wraps: whether its left and right border are the same place, as those of a panorama.
+        photo: (h, w, 3), possibly scaled down.
+        at: (H, W, 2) pixels of the photo at its own size, centers at +0.5.
+        size: (width, height) at its own size.
+        wraps: whether the left border continues the right one, as in a panorama.
     """
     height, width = photo.shape[:2]
     x, y = (
@@ -159,34 +153,23 @@ def resample(
         for axis, side in enumerate((width, height))
     )
     if wraps:
-        photo = cv2.copyMakeBorder(photo, 0, 0, SEAM_PX, SEAM_PX, cv2.BORDER_WRAP)
-        x += SEAM_PX
+        photo = cv2.copyMakeBorder(photo, 0, 0, OPTIONS.seam_px, OPTIONS.seam_px, cv2.BORDER_WRAP)
+        x += OPTIONS.seam_px
     return np.asarray(cv2.remap(photo, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 def shrink(photo: NDArray[np.uint8], share: float) -> NDArray[np.uint8]:
-    """Return a photo (h, w, 3) scaled down by averaging, so that sampling it does not alias.
-
-    Args:
-        photo: (H, W, 3).
-        share: of its size; with 1 or more it stays as it is.
-    """
+    """Return a photo (H, W, 3) scaled down to a share of its size by averaging, to avoid aliasing; never enlarged."""
     if share >= 1.0:
         return photo
     size = max(1, round(photo.shape[1] * share)), max(1, round(photo.shape[0] * share))
     return np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-# Look into a panorama through perspective views, where methods made for ordinary photos find features.
+# Feature views: perspective views in which feature methods meet neither the stretched poles nor the cut borders.
 #
-# An equirectangular photo stretches what is near its poles and cuts what lies at its borders; a view does neither.
-# The views look through the corners of an icosahedron, and each is responsible for what lies nearer to its axis
-# than to any other: so nothing is found twice where they overlap, at the borders of the panorama or elsewhere.
-# Ours.
-
-FIELD_DEG = 90.0
-"""Field of view along the sides. The farthest point that a view is responsible for lies 37 degrees from its axis, so
-that the surroundings of every keypoint are inside. Chosen by hand; not measured on its own."""
+# Their axes pass through the corners of an icosahedron. Each view owns the directions nearest to its axis, so that
+# no feature is found twice. Ours.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -196,71 +179,44 @@ class PanoramaViews:
     size: tuple[int, int]
     """Width and height of the panorama in pixels."""
     side_px: int
-    """Side of a view."""
+    """Side of each view."""
     rotations: FloatArray
     """(V, 3, 3) from the panorama's frame to that of each view; x right, y down, z forward."""
 
     @classmethod
     def cover(cls, size: tuple[int, int], most_px: int) -> "PanoramaViews":
-        """Return views in the panorama's own resolution, or in a lower one where that would make them too large.
-
-        Args:
-            size: width and height of the panorama in pixels.
-            most_px: largest side of a view.
-        """
+        """Return views of a panorama of (width, height) in its resolution, with sides of at most `most_px`."""
         focal = size[0] / (2.0 * math.pi)
-        side = 2.0 * focal * math.tan(math.radians(FIELD_DEG / 2.0))
+        side = 2.0 * focal * math.tan(math.radians(OPTIONS.field_deg / 2.0))
         return cls(size, max(1, min(round(side), most_px)), view_rotations())
 
     @property
     def focal_px(self) -> float:
         """Focal length of the views in pixels."""
-        return self.side_px / (2.0 * math.tan(math.radians(FIELD_DEG / 2.0)))
+        return self.side_px / (2.0 * math.tan(math.radians(OPTIONS.field_deg / 2.0)))
 
     def render(self, panorama: NDArray[np.uint8], view: int) -> NDArray[np.uint8]:
-        """Return the picture (side, side, 3) of a view.
-
-        Args:
-            panorama: (H, W, 3), of the size of the panorama or smaller; see `shrink`.
-            view: number of the view.
-        """
+        """Return the picture (side, side, 3) of a view of the panorama (H, W, 3), possibly scaled by `shrink`."""
         row, column = np.mgrid[: self.side_px, : self.side_px]
         at = self.to_panorama(np.column_stack([column.ravel(), row.ravel()]) + 0.5, view)
         return resample(panorama, at.reshape(self.side_px, self.side_px, 2), self.size, wraps=True)
 
     def shrink(self, panorama: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the panorama in the resolution of the views, so that they show it without aliasing.
-
-        Args:
-            panorama: (H, W, 3) of the size of the panorama.
-        """
+        """Return the panorama (H, W, 3) in the resolution of the views, to avoid aliasing."""
         return shrink(panorama, 2.0 * math.pi * self.focal_px / self.size[0])
 
     def to_panorama(self, x: FloatArray, view: int) -> FloatArray:
-        """Return (N, 2) pixels of the panorama for pixels of a view.
-
-        Args:
-            x: (N, 2) pixels of the view.
-            view: number of the view.
-        """
-        return project(self._rays(x, view), self._camera())
+        """Return (N, 2) pixels of the panorama for (N, 2) pixels of a view."""
+        return project(self._rays(x, view), _camera(self.size))
 
     def is_nearest(self, x: FloatArray, view: int) -> NDArray[np.bool_]:
-        """Return (N,) whether a view is the one whose axis is nearest to each of its pixels.
-
-        Args:
-            x: (N, 2) pixels of the view.
-            view: number of the view.
-        """
+        """Return (N,) whether no other view's axis is nearer to each of the (N, 2) pixels of a view."""
         return np.asarray(np.argmax(self._rays(x, view) @ self.rotations[:, 2].T, axis=1) == view)
 
     def _rays(self, x: FloatArray, view: int) -> FloatArray:
         """Return (N, 3) rays of pixels of a view in the panorama's frame."""
         plain = np.column_stack([(x - self.side_px / 2.0) / self.focal_px, np.ones(len(x))])
         return np.asarray(plain @ self.rotations[view], np.float64)
-
-    def _camera(self) -> Calibration:
-        return Calibration(panorama_matrix(self.size), *self.size, "panorama", True, projection=EQUIRECTANGULAR)
 
 
 def view_rotations() -> FloatArray:
@@ -280,49 +236,32 @@ def _axes(longitude: FloatArray, latitude: float) -> FloatArray:
 
 
 def _look_along(axis: FloatArray) -> FloatArray:
-    """Return the (3, 3) rotation into the frame of a view whose z is this axis, upright where that has a meaning."""
+    """Return the (3, 3) rotation into the frame of a view along this axis, upright except at the poles."""
     down = np.array([0.0, 0.0, 1.0]) if abs(axis[1]) > 0.9 else np.array([0.0, 1.0, 0.0])
     right = np.cross(down, axis)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(axis, right), axis])
 
 
-# The perspective views in which a panorama is painted onto a surface: the faces of a cube, in its own resolution.
-
-GRID = 257
-"""Rows and columns of a panorama whose rays are covered. Chosen by hand; not measured on its own."""
+# Texture views: the faces of a cube, in the panorama's own resolution, from which surfaces are painted.
 
 
 def panorama_parts(size: tuple[int, int]) -> list[PerspectiveView]:
-    """Return the views of a panorama.
-
-    Args:
-        size: (width, height) of the panorama in pixels.
-    """
-    x, y = np.meshgrid(np.linspace(0.0, size[0], GRID), np.linspace(0.0, size[1], GRID))
+    """Return the texture views of a panorama of (width, height) pixels."""
+    x, y = np.meshgrid(np.linspace(0.0, size[0], OPTIONS.grid), np.linspace(0.0, size[1], OPTIONS.grid))
     rays = bearings(np.column_stack([x.ravel(), y.ravel()]), _camera(size))[:, RAY]
     return cover_rays(rays, size[0] / (2.0 * np.pi), size[0])
 
 
 def show_part(panorama: NDArray[np.uint8], part: PerspectiveView) -> NDArray[np.uint8]:
-    """Return a view (h, w, 3) into a panorama.
-
-    Args:
-        panorama: (H, W, 3).
-        part: the view.
-    """
+    """Return the picture (h, w, 3) of a view of a panorama (H, W, 3)."""
     height, width = panorama.shape[:2]
     at = part.locate(partial(project, camera=_camera((width, height))))
     return resample(panorama, at, (width, height), wraps=True)
 
 
 def mask_part(used: NDArray[np.bool_], part: PerspectiveView) -> NDArray[np.bool_]:
-    """Return (h, w) which pixels of a view into a panorama may be used.
-
-    Args:
-        used: (H, W) of the panorama.
-        part: the view.
-    """
+    """Return the usable pixels (h, w) of a view of a panorama with usable pixels (H, W)."""
     height, width = used.shape
     at = part.locate(partial(project, camera=_camera((width, height))))
     column, row = np.moveaxis(at.astype(np.int64), -1, 0)

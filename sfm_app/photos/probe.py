@@ -134,13 +134,7 @@ LINKED_FORMATS = ("JPEG", "MPO", "PNG")
 
 
 def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> PhotoStats | UnusablePhoto:
-    """Decode one file to check that it is intact, and measure what is needed to compare it with other photos.
-
-    Args:
-        folder: of the photos.
-        name: path inside the folder.
-        options: smallest and largest size.
-    """
+    """Decode one file to check that it is intact, and measure what is needed to compare it with other photos."""
     place = resolve_file(folder, name)
     if isinstance(place, str):
         return UnusablePhoto(name, place)
@@ -153,11 +147,6 @@ def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> PhotoStats
 
 def describe(name: str, picture: DecodedPhoto, options: PhotoSettings) -> PhotoStats | UnusablePhoto:
     """Return a photo's metadata and image statistics.
-
-    Args:
-        name: path inside the folder.
-        picture: what the file holds.
-        options: smallest and largest size.
 
     Raises:
         UnreadableError: it is a panorama that does not show the whole sphere.
@@ -227,10 +216,6 @@ def group_by_camera(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:
     A camera in COLMAP has one image size. Photos without an EXIF rotation are therefore turned to the more common
     orientation of their camera; photos that still differ in size get different groups. With "auto", so do letterboxed
     photos whose pictures within the bars differ in size. Panoramas of one size always share one, with no other photos.
-
-    Args:
-        photos: their group is the camera named in EXIF.
-        cameras: "auto": by EXIF; "single": one camera for all; "folder": one per folder; "each": one per photo.
     """
     photos = _complete_panoramas(photos)
     sizes = Counter((_camera_key(photo, cameras), photo.width, photo.height) for photo in photos)
@@ -258,12 +243,7 @@ def _complete_panoramas(photos: Sequence[Photo]) -> list[Photo]:
 
 
 def split_by_given_camera(photos: Sequence[Photo], given: GivenCameras) -> list[Photo]:
-    """Return the photos with groups of their own for those to which a calibration file gives different cameras.
-
-    Args:
-        photos: with the names that they have everywhere.
-        given: contents of the file.
-    """
+    """Return the photos with groups of their own for those to which a calibration file gives different cameras."""
     names: dict[str, set[str]] = {}
     for photo in photos:
         if name := given.camera_name(photo.name):

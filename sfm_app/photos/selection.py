@@ -1,4 +1,4 @@
-"""Which photos are used: duplicates and unusable ones go."""
+"""Choice of photos: statistics of each, then copies and unusable photos are dropped."""
 
 import json
 import logging
@@ -17,20 +17,51 @@ from sfm_app.files import fingerprint, load_arrays, replace_atomically
 from sfm_app.settings import PhotoSettings
 from sfm_app.types import Photo, UnusablePhoto
 
-# Measure a thumbnail, blur and flat areas of a photo: enough to compare it with the others.
+logger = logging.getLogger("sfm_app")
 
 SIDE_PX = 32
-"""Side of the small pictures that are compared."""
-ANALYSIS_PX = 1024
-"""Longer side to which photos are downsampled for measuring; smaller ones are not resized."""
-EDGE_PERCENTILE = 99
-"""Percentile of the gradients that counts as edge slope; noise has smaller gradients."""
-NOISE_PX, WIDE_PX = 1.5, 17
-"""Standard deviation of the blur that removes noise, and width of the further blur that edges are compared with."""
-BLOCK_PX = 8
-"""Side of the squares that are tested for having one color."""
-LEAST_CONTRAST, LEAST_PX = 4.0, 200
-"""Contrast in gray levels and shorter side in pixels, below which sharpness is not measured."""
+"""Side of the thumbnails that are compared."""
+READERS = ("sfm-app", "pillow", "opencv-contrib-python-headless")
+"""Packages that decode and measure."""
+
+
+@dataclass(frozen=True, slots=True)
+class SelectionOptions:
+    """Constants of the statistics of photos and of the choice by them."""
+
+    analysis_px: int = 1024
+    """Longer side to which photos are reduced for measuring."""
+    edge_percentile: int = 99
+    """Percentile of the gradients that counts as edge slope; noise has smaller gradients."""
+    noise_px: float = 1.5
+    """Standard deviation of the blur that removes noise."""
+    wide_px: int = 17
+    """Width of the additional blur that edges are compared with."""
+    block_px: int = 8
+    """Side of the squares that are tested for one color."""
+    min_sharpness_contrast: float = 4.0
+    """Least contrast in gray levels at which sharpness is measured."""
+    min_side_px: int = 200
+    """Least shorter side at which sharpness is measured."""
+    max_difference: float = 0.015
+    """Largest RMS difference between copies, as a share of the contrast. Moving the camera sideways by a thousandth of
+    the width gives more; saving a picture again, smaller or as JPEG, gives less."""
+    min_contrast: float = 4.0
+    """Least contrast in gray levels of pictures that are compared."""
+    block_rows: int = 512
+    """Photos that are compared with all others at once."""
+    blurred: float = 0.85
+    """Least share of their slope that edges of a blurred photo keep after one more blur. Sharp photos: 0.33 to 0.70. At
+    0.85, a blur of 0.8 % of the width or a smear of 2.5 %, 1 to 5 % of the inliers remain."""
+    blurred_margin: float = 0.15
+    """Least excess of that share over the median photo's."""
+    flat_share: float = 0.5
+    """Least share of flat squares of screenshots and drawings."""
+    odd_size_share: float = 0.2
+    """A size is odd if a smaller share of the photos has it."""
+
+
+OPTIONS = SelectionOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,99 +72,68 @@ class PhotoStats:
     thumbnail: NDArray[np.float32]
     """(SIDE_PX, SIDE_PX) upright and gray."""
     blur: float = 0.0
-    """Share of their slope that edges keep when they are blurred once more; near 1 if the photo is already blurred."""
+    """Share of their slope that edges keep after one more blur; near 1 if the photo is blurred."""
     flat: float = 0.0
-    """Share of the picture in which neighboring pixels are exactly equal."""
+    """Share of the picture in squares of one color."""
 
 
 def measure_photo(photo: Photo, upright: Image.Image) -> PhotoStats:
-    """Measure the blur and flat areas of a photo, and make its thumbnail.
-
-    Args:
-        photo: metadata.
-        upright: its picture, upright.
-    """
+    """Measure the blur and flat areas of an upright photo, and make its thumbnail."""
     gray = upright.convert("L")
-    return PhotoStats(photo, make_thumbnail(gray), edge_blur(gray), flat_share(gray))
-
-
-def make_thumbnail(gray: Image.Image) -> NDArray[np.float32]:
-    """Return the thumbnail that is compared to find copies."""
-    return np.asarray(gray.resize((SIDE_PX, SIDE_PX), Image.Resampling.LANCZOS, reducing_gap=6.0), np.float32)
+    small = gray.resize((SIDE_PX, SIDE_PX), Image.Resampling.LANCZOS, reducing_gap=6.0)
+    return PhotoStats(photo, np.asarray(small, np.float32), edge_blur(gray), flat_share(gray))
 
 
 def edge_blur(gray: Image.Image) -> float:
-    """Return the share of their slope that edges keep when they are blurred once more, in [0, 1].
-
-    The larger value of the horizontal and vertical directions.
-    """
+    """Return the share of their slope that edges keep after one more blur: the larger of both axes, in [0, 1]."""
     gray = gray.copy()
-    gray.thumbnail((ANALYSIS_PX, ANALYSIS_PX), Image.Resampling.BOX)
-    fine = cv2.GaussianBlur(np.asarray(gray, np.float32), (0, 0), NOISE_PX)
-    if fine.std() < LEAST_CONTRAST or min(fine.shape) < LEAST_PX:
+    gray.thumbnail((OPTIONS.analysis_px, OPTIONS.analysis_px), Image.Resampling.BOX)
+    fine = cv2.GaussianBlur(np.asarray(gray, np.float32), (0, 0), OPTIONS.noise_px)
+    if fine.std() < OPTIONS.min_sharpness_contrast or min(fine.shape) < OPTIONS.min_side_px:
         return 0.0
-    wide = cv2.blur(fine, (WIDE_PX, 1)), cv2.blur(fine, (1, WIDE_PX))
-    kept = [_edge_slope(wide[k], 1 - k) / max(_edge_slope(fine, 1 - k), 1e-6) for k in (0, 1)]
-    return round(min(max(kept), 1.0), 3)
+    wide = cv2.blur(fine, (OPTIONS.wide_px, 1)), cv2.blur(fine, (1, OPTIONS.wide_px))
+    ratios = [_edge_slope(wide[k], 1 - k) / max(_edge_slope(fine, 1 - k), 1e-6) for k in (0, 1)]
+    return round(min(max(ratios), 1.0), 3)
 
 
 def flat_share(picture: Image.Image) -> float:
     """Return the share of small squares of the picture that have one color."""
-    gray = np.asarray(picture)
-    height, width = (side // BLOCK_PX * BLOCK_PX for side in gray.shape)
+    gray, block = np.asarray(picture), OPTIONS.block_px
+    height, width = (side // block * block for side in gray.shape)
     if not height or not width:
         return 0.0
-    rows = gray[:height, :width].reshape(height // BLOCK_PX, BLOCK_PX, width)  # whole rows first: many times as fast
-    low, high = (ends.reshape(len(rows), -1, BLOCK_PX) for ends in (rows.min(axis=1), rows.max(axis=1)))
+    rows = gray[:height, :width].reshape(height // block, block, width)  # whole rows first, for speed
+    low, high = (ends.reshape(len(rows), -1, block) for ends in (rows.min(axis=1), rows.max(axis=1)))
     return float(np.mean(low.min(axis=2) == high.max(axis=2)))
 
 
 def _edge_slope(image: NDArray[np.float32], axis: int) -> float:
-    return float(np.percentile(np.abs(np.diff(image, axis=axis)), EDGE_PERCENTILE))
+    return float(np.percentile(np.abs(np.diff(image, axis=axis)), OPTIONS.edge_percentile))
 
 
 # The statistics of all photos in a file, so that a photo is decoded once for all runs.
-
-logger = logging.getLogger("sfm_app")
-
-READERS = ("sfm-app", "pillow", "opencv-contrib-python-headless")
-"""Packages that decode and measure."""
-READ_WITH = {"max_megapixels", "min_side_px"}
-"""Settings that decide how a file is read."""
 
 
 def write_stats(
     path: Path, stats: Mapping[str, PhotoStats], digests: Mapping[str, str], options: PhotoSettings
 ) -> None:
-    """Write the statistics of photos.
-
-    Args:
-        path: the file, replaced.
-        stats: by path in the folder.
-        digests: hash of the bytes of each file, by the same path; photos without one are left out.
-        options: what they were read with.
-    """
-    kept = {name: one for name, one in stats.items() if name in digests}
+    """Write the statistics of the photos that have a digest; all keys are paths in the folder."""
+    stats = {name: one for name, one in stats.items() if name in digests}
     rows = [
         {"photo": one.photo.to_dict(), "blur": one.blur, "flat": one.flat, "digest": digests[name]}
-        for name, one in kept.items()
+        for name, one in stats.items()
     ]
     # thumbnails have whole gray levels
-    thumbnails = np.array([one.thumbnail for one in kept.values()]).astype(np.uint8)
-    known = {"read with": _fingerprint_reading(options), "names": list(kept), "rows": rows}
+    thumbnails = np.array([one.thumbnail for one in stats.values()]).astype(np.uint8)
+    known = {"read with": _fingerprint_reading(options), "names": list(stats), "rows": rows}
     with replace_atomically(path) as beside, beside.open("wb") as file:
         np.savez_compressed(file, known=np.array(json.dumps(known)), thumbnails=thumbnails)
 
 
 def read_stats(path: Path, digests: Mapping[str, str], options: PhotoSettings) -> dict[str, PhotoStats]:
-    """Return the statistics of the photos whose files are the same, by path in the folder.
+    """Return the statistics of photos with unchanged digests, by path in the folder.
 
-    None are known if the file is missing, damaged, or of other settings or versions.
-
-    Args:
-        path: the file.
-        digests: hash of the bytes of each file now, by path in the folder.
-        options: what photos are read with.
+    Empty if the file is missing, damaged, or of other settings or versions.
     """
     try:
         arrays = load_arrays(path)
@@ -148,97 +148,69 @@ def read_stats(path: Path, digests: Mapping[str, str], options: PhotoSettings) -
         }
     except Exception as err:  # decoders of damaged bytes raise all kinds of errors
         if path.exists():
-            logger.info("the statistics of photos cannot be read back; all photos are read again", exc_info=err)
+            logger.info("the statistics of photos cannot be read; all photos are decoded again", exc_info=err)
         return {}
 
 
 def _fingerprint_reading(options: PhotoSettings) -> str:
-    return fingerprint(options.model_dump(include=READ_WITH), {name: version(name) for name in READERS})
+    return fingerprint(options.model_dump(include={"max_megapixels", "min_side_px"}), {name: version(name) for name in READERS})
 
 
-# Find copies: one picture saved twice, smaller, or in another format. They add nothing and have no parallax.
-
-MAX_DIFFERENCE = 0.015
-"""Largest root mean square difference between copies, as a share of the contrast. Moving the camera sideways by a
-thousandth of the width gives a larger difference; saving a picture again, smaller or as JPEG, a smaller one."""
-LEAST_COMPARED_CONTRAST = 4.0
-"""Gray levels; pictures with less contrast are not compared."""
-
-COMPARED_BLOCK = 512
-"""Photos that are compared with all others at once."""
+# Copies: one picture saved twice, smaller, or in another format. They add nothing and have no parallax.
 
 
-def drop_duplicates(glances: Sequence[PhotoStats]) -> tuple[list[Photo], list[UnusablePhoto]]:
-    """Return one photo per picture, and the copies of them; both in the order given.
-
-    Of several copies, one with a mask is preferred, then the largest.
-    """
-    order = sorted(range(len(glances)), key=lambda k: (not glances[k].photo.mask, -_pixel_count(glances[k].photo), k))
-    small = np.array([glance.thumbnail for glance in glances], np.float32).reshape(len(glances), SIDE_PX**2)
+def drop_duplicates(stats: Sequence[PhotoStats]) -> tuple[list[Photo], list[UnusablePhoto]]:
+    """Return one photo per picture, and its copies, in the given order; photos with a mask, then large ones stay."""
+    photos = [one.photo for one in stats]
+    order = sorted(range(len(photos)), key=lambda k: (not photos[k].mask, -photos[k].width * photos[k].height, k))
+    small = np.array([one.thumbnail for one in stats], np.float32).reshape(len(stats), SIDE_PX**2)
     contrast = small.std(axis=1)
-    kept: dict[int, None] = {}
-    same: dict[int, int] = {}
-    near = _similar_rows(small, MAX_DIFFERENCE * np.maximum(contrast, LEAST_COMPARED_CONTRAST))
+    originals: set[int] = set()
+    original_of: dict[int, int] = {}
+    similar = _similar_rows(small, OPTIONS.max_difference * np.maximum(contrast, OPTIONS.min_contrast))
     for k in order:
-        others = [j for j in near[k] if j in kept] if contrast[k] >= LEAST_COMPARED_CONTRAST else []
-        off = np.sqrt(np.mean((small[others] - small[k]) ** 2, axis=1)) / max(contrast[k], LEAST_COMPARED_CONTRAST)
-        if off.min(initial=np.inf) < MAX_DIFFERENCE:
-            same[k] = others[int(off.argmin())]
+        others = [j for j in similar[k] if j in originals] if contrast[k] >= OPTIONS.min_contrast else []
+        off = np.sqrt(np.mean((small[others] - small[k]) ** 2, axis=1)) / max(contrast[k], OPTIONS.min_contrast)
+        if off.min(initial=np.inf) < OPTIONS.max_difference:
+            original_of[k] = others[int(off.argmin())]
         else:
-            kept[k] = None
-    photos = [glances[k].photo for k in sorted(kept)]
+            originals.add(k)
     copies = [
-        UnusablePhoto(glances[k].photo.path, f"the same picture as {glances[same[k]].photo.path}") for k in sorted(same)
+        UnusablePhoto(photos[k].path, f"the same picture as {photos[original_of[k]].path}") for k in sorted(original_of)
     ]
-    return photos, copies
+    return [photos[k] for k in sorted(originals)], copies
 
 
 def _similar_rows(small: NDArray[np.float32], limits: NDArray[np.floating]) -> list[list[int]]:
-    """Return for each row (N, D) the rows whose root mean square difference is below its limit, or hardly above."""
+    """Return for each row of (N, D) the rows with an RMS difference below its limit, or hardly above."""
     exact = small.astype(np.float64)
-    squares, found = np.einsum("nd,nd->n", exact, exact), []
-    for start in range(0, len(exact), COMPARED_BLOCK):
-        part = slice(start, start + COMPARED_BLOCK)
+    squares, similar = np.einsum("nd,nd->n", exact, exact), []
+    for start in range(0, len(exact), OPTIONS.block_rows):
+        part = slice(start, start + OPTIONS.block_rows)
         apart = squares[part, None] + squares - 2.0 * exact[part] @ exact.T
         close = apart < (1.01 * limits[part, None]) ** 2 * exact.shape[1] + 1e-3
-        found += [np.flatnonzero(row).tolist() for row in close]
-    return found
+        similar += [np.flatnonzero(row).tolist() for row in close]
+    return similar
 
 
-def _pixel_count(photo: Photo) -> int:
-    return photo.width * photo.height
+# Unusable photos: blurred ones, and screenshots among photos. Some photos always remain.
 
 
-# Drop photos that cannot help: blurred beyond use, or screenshots among photos. Some photos always remain.
-
-BLURRED, BLURRED_MORE = 0.85, 0.15
-"""A photo is blurred if, after one more blur, its edges keep more than the first share of their slope, and more than
-the median photo's share plus the second.
-Sharp photos: 0.33 to 0.70. At 0.85, a blur of 0.8 % of the width or a smear of 2.5 %, 1 to 5 % of inliers are left."""
-FLAT_SHARE = 0.5
-"""Share of a picture with no change from pixel to pixel; screenshots and drawings have more."""
-ODD_SIZE_SHARE = 0.2
-"""A size is odd if a smaller share of the photos has it."""
-
-
-def drop_unusable(glances: Sequence[PhotoStats]) -> tuple[list[PhotoStats], list[UnusablePhoto]]:
-    """Return the usable and the unusable photos, both in the order given."""
-    most = float(np.median([glance.blur for glance in glances])) if glances else 0.0
-    sizes = Counter(_size_key(glance.photo) for glance in glances)
-    photographic = np.mean([glance.flat < FLAT_SHARE for glance in glances]) > 0.5 if glances else False
-    kept, left_out = [], []
-    for glance in glances:
-        if glance.blur > max(BLURRED, most + BLURRED_MORE):
-            left_out.append(UnusablePhoto(glance.photo.path, "blurred beyond use"))
-        elif (
-            photographic
-            and glance.flat >= FLAT_SHARE
-            and sizes[_size_key(glance.photo)] < ODD_SIZE_SHARE * len(glances)
-        ):
-            left_out.append(UnusablePhoto(glance.photo.path, "a screenshot or drawing, of another size"))
+def drop_unusable(stats: Sequence[PhotoStats]) -> tuple[list[PhotoStats], list[UnusablePhoto]]:
+    """Return the usable and the unusable photos, both in the given order."""
+    median = float(np.median([one.blur for one in stats])) if stats else 0.0
+    sizes = Counter(_size_key(one.photo) for one in stats)
+    photographic = np.mean([one.flat < OPTIONS.flat_share for one in stats]) > 0.5 if stats else False
+    usable, unusable = [], []
+    for one in stats:
+        odd = sizes[_size_key(one.photo)] < OPTIONS.odd_size_share * len(stats)
+        if one.blur > max(OPTIONS.blurred, median + OPTIONS.blurred_margin):
+            unusable.append(UnusablePhoto(one.photo.path, "blurred beyond use"))
+        elif photographic and one.flat >= OPTIONS.flat_share and odd:
+            unusable.append(UnusablePhoto(one.photo.path, "a screenshot or drawing, of another size"))
         else:
-            kept.append(glance)
-    return kept, left_out
+            usable.append(one)
+    return usable, unusable
 
 
 def _size_key(photo: Photo) -> tuple[int, int]:

@@ -19,8 +19,6 @@ from sfm_app.photos.masks import list_masks
 from sfm_app.settings import PhotoSettings, Settings
 from sfm_app.types import Photo, PhotoSet
 
-# Read the user's input: a folder of photos or a video, optional masks, and the hashes of all files.
-
 Stamp = tuple[int, int]
 """Size in bytes, and time of the last change in nanoseconds."""
 UNREADABLE = "unreadable"
@@ -36,7 +34,7 @@ class Source:
     path: Path
     video: bool
     files: Mapping[str, str]
-    """Hashes of all files of the folder by name; for a video, its hash under an empty name."""
+    """Hashes of the files by name; for a video, one hash under an empty name."""
     mask_dir: Path | None
     """Folder of masks, if given."""
     masks: Mapping[str, str]
@@ -50,62 +48,41 @@ class Source:
         return fingerprint(str(self.path.resolve()), self.files, self.masks)
 
     def check_settings(self, settings: Settings) -> None:
-        """Check that the settings can be used with the source.
-
-        Raises:
-            ConfigError: a setting cannot be used with a video.
-        """
+        """Check that the settings suit the source; raise a ConfigError if a video has a list of images."""
         if self.video and settings.photos.images:
             raise ConfigError("--images lists photos of a folder, not frames of a video", hint="leave --images out")
 
     def content_hash(self, photos: PhotoSet) -> str:
-        """Return a hash of the used photos and their masks; other files of the folder do not enter.
-
-        Nor do camera groups: features and matches do not depend on which camera took a photo.
-        """
+        """Return a hash of the used photos and their masks, without camera groups, which do not affect features."""
         used = [self._content(photo) | {"group": ""} for photo in photos.photos]
         return fingerprint(used, photos.masks is not None)
 
     def photo_hashes(self, photos: PhotoSet) -> dict[str, str]:
-        """Return a hash of each used photo by name: of its bytes, its mask, its size, and its camera group."""
+        """Return a hash of the bytes, mask, size and camera group of each used photo, by name."""
         return {photo.name: fingerprint(self._content(photo), photos.masks is not None) for photo in photos.photos}
 
     def _content(self, photo: Photo) -> dict[str, Any]:
-        """Return what results depend on of a photo."""
-        read = {"bytes": self.files.get(photo.path, self.files.get("")), "mask bytes": self.masks.get(photo.mask)}
-        return asdict(photo) | {"notes": ()} | read
+        """Return all values of a photo that results depend on."""
+        hashes = {"bytes": self.files.get(photo.path, self.files.get("")), "mask bytes": self.masks.get(photo.mask)}
+        return asdict(photo) | {"notes": ()} | hashes
 
     def digests(self) -> dict[str, str]:
-        """Return the hashes of the files that can be read, by path in the folder; none for a video."""
+        """Return the hashes of readable files by path in the folder; none for a video."""
         return {name: digest for name, digest in self.files.items() if name and digest != UNREADABLE}
 
     def check(self, photos: PhotoSet) -> None:
-        """Check that the video, these photos and their masks have not changed since the run began.
-
-        Raises:
-            InputError: a file has changed.
-        """
+        """Raise an InputError if the video, a photo or its mask has changed since the run began."""
         used = {self.path} | {self.path / photo.path for photo in photos.photos}
         used |= {photos.masks / photo.mask for photo in photos.photos if photos.masks and photo.mask}
         for path in sorted(used & self.stamps.keys()):
-            now = _stamp(path)
-            if now != self.stamps[path]:
-                what = "is gone" if now is None else "has changed"
-                raise InputError(f"{path} {what} since the run began", hint="run again once the files are restored")
+            stamp = _stamp(path)
+            if stamp != self.stamps[path]:
+                change = "is gone" if stamp is None else "has changed"
+                raise InputError(f"{path} {change} since the run began", hint="run again once the files are restored")
 
 
 def read_source(path: Path, out: Path, options: PhotoSettings, spread: ParallelMap) -> Source:
-    """List the input files and compute their hashes.
-
-    Args:
-        path: a folder of photos, or a video.
-        out: the output folder; its files are not listed.
-        options: may name a folder of masks or a list of the photos to use.
-        spread: maps a function over files, possibly in parallel.
-
-    Raises:
-        InputError: the photos or the masks cannot be used.
-    """
+    """List the input files and compute their hashes; raise an InputError if the photos or the masks cannot be used."""
     video, mask_dir = is_video(read_head(path)), Path(options.masks) if options.masks else None
     listed = Path(options.images) if options.images else None
     names = [""] if video else list_files(path, out, listed, closed=() if mask_dir is None else (mask_dir,))
@@ -128,14 +105,14 @@ def digest(file: Path) -> str:
 def _stamp(path: Path) -> Stamp | None:
     """Return size and time of a regular file; None if there is none."""
     try:
-        found = path.stat()
+        stat = path.stat()
     except (OSError, ValueError):
         return None
-    return (found.st_size, found.st_mtime_ns) if S_ISREG(found.st_mode) else None
+    return (stat.st_size, stat.st_mtime_ns) if S_ISREG(stat.st_mode) else None
 
 
 def _digests(folder: Path, names: Sequence[str], spread: ParallelMap) -> dict[str, str]:
-    """Return the hashes of files in a folder by name; the reason instead of a hash if a file is not read."""
+    """Return the hashes of files by name; for a file that is not opened, the reason."""
 
     def file_digest(name: str) -> str:
         place = resolve_file(folder, name)
@@ -146,22 +123,14 @@ def _digests(folder: Path, names: Sequence[str], spread: ParallelMap) -> dict[st
 
 # Lay photos out for COLMAP: links to files that it can read, 8-bit copies of the others, in sensor orientation.
 
-READ_BY_COLMAP = (".jpg", ".jpeg", ".png")
-"""File extensions by which COLMAP chooses the format it writes."""
-JPEG_QUALITY = 95
-
 
 def assign_names(photos: Iterable[Photo]) -> Iterator[Photo]:
-    """Yield photos with names that COLMAP can write into databases and line-based lists.
-
-    A name is printable and has an extension that COLMAP knows; a name that already fits is kept. Names differ by more
-    than capitals, which many file systems do not tell apart.
-    """
+    """Yield photos with unique printable names, also without case, and an extension that COLMAP writes."""
     photos = list(photos)
     given, taken = {photo.path.casefold() for photo in photos}, set[str]()
     for photo in photos:
         name = "".join(c if c.isprintable() else "_" for c in photo.path)
-        if PurePosixPath(name).suffix.lower() not in READ_BY_COLMAP:
+        if PurePosixPath(name).suffix.lower() not in (".jpg", ".jpeg", ".png"):
             name += ".jpg" if photo.lossy else ".png"
         while name.casefold() in taken or (name != photo.path and name.casefold() in given):
             name = str(PurePosixPath(name).with_name(f"_{PurePosixPath(name).name}"))
@@ -170,15 +139,7 @@ def assign_names(photos: Iterable[Photo]) -> Iterator[Photo]:
 
 
 def lay_out(photo: Photo, folder: Path, target: Path) -> None:
-    """Link or copy one photo to where COLMAP reads it.
-
-    Args:
-        photo, folder, target: as read; folder of the photos; folder to put the link or copy in.
-
-    Raises:
-        OSError: the target cannot be written.
-        UnreadableError: the file has changed since it was read.
-    """
+    """Link or copy one photo to where COLMAP reads it; raise an UnreadableError if its file has changed."""
     place = target / photo.name
     if not (is_below(photo.name) and place.parent.resolve().is_relative_to(target.resolve())):
         raise UnreadableError("its name leads out of the folder")
@@ -195,11 +156,7 @@ def lay_out(photo: Photo, folder: Path, target: Path) -> None:
 
 
 def is_laid_out(photo: Photo, folder: Path, target: Path) -> bool:
-    """Return whether the link to a photo, or its unchanged copy, is where COLMAP reads it.
-
-    Args:
-        photo, folder, target: as in `lay_out`; a photo that COLMAP can read as it is.
-    """
+    """Return whether the target holds the link to a photo without conversion, or its unchanged copy."""
     place, source = target / photo.name, resolve_file(folder, photo.path)
     if isinstance(source, str) or not place.is_file():
         return False
@@ -211,11 +168,11 @@ def _copy(photo: Photo, source: Path, place: Path) -> None:
     if copy.size != (photo.width, photo.height):
         copy = copy.resize((photo.width, photo.height), Image.Resampling.LANCZOS)
     if photo.lossy:
-        copy.save(place, "JPEG", quality=JPEG_QUALITY)
+        copy.save(place, "JPEG", quality=95)
     else:
         copy.save(place, "PNG", compress_level=1)
 
 
 def _link(source: Path, place: Path, *, relative: bool) -> None:
-    """Link a photo, or copy it; a relative link is for video frames, which move together with the output folder."""
+    """Link or copy a photo; links to video frames are relative, since both move with the output folder."""
     link_or_copy(place, os.path.relpath(source, place.parent.resolve()) if relative else source, source)

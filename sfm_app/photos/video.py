@@ -205,12 +205,7 @@ class CornerTracker:
         self._recent: deque[float] = deque(maxlen=RECENT)
 
     def track(self, frame: int, gray: Picture) -> TrackedFrame:
-        """Measure sharpness and accumulated motion of the next frame.
-
-        Args:
-            frame: its number.
-            gray: (H, W); all frames have one size.
-        """
+        """Measure sharpness and accumulated motion of the next frame."""
         sharpness = float(cv2.Laplacian(gray, cv2.CV_32F).var())
         self._recent.append(sharpness)
         if self._reference is None or len(self._corners) < MIN_CORNERS:

@@ -1,4 +1,4 @@
-"""Figures and texts about the cameras of a run."""
+"""The page of a run, the figure of its cameras, and its results in words."""
 
 from sfm_app.report.figures import check_figure, draw_intrinsics
 from sfm_app.report.text import field_text, held_text, lens_text

@@ -1,4 +1,4 @@
-"""What an output folder holds, read for the page; a stage that has not run, or whose files are damaged, is left out."""
+"""Products in an output folder, read for the page; unfinished and damaged stages are left out."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -16,17 +16,17 @@ from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
 logger = logging.getLogger("sfm_app")
 
 UNREADABLE = (SfmError, OSError, ArithmeticError, ValueError, LookupError, TypeError)
-"""What reading damaged files raises."""
+"""Errors of reading damaged files."""
 Product = TypeVar("Product")
 
 
 class Problem(NamedTuple):
-    """What ended a run."""
+    """The error that ended a run."""
 
     message: str
     hint: str
     photos: Mapping[str, str]
-    """The photos concerned, each with its reason."""
+    """Reason by photo."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,15 +41,15 @@ class RunContents:
     intrinsics: Intrinsics | None = None
     scene: Scene | None = None
     frame: MetricFrame = field(default_factory=MetricFrame)
-    """That of exported files; that of the scene where nothing is known of its size."""
+    """Frame of exported files; without a known scale, that of the scene."""
 
     @property
     def problem(self) -> "Problem | None":
-        """What ended the last run; None where it went to its end."""
-        noted = self.manifest.get(PROBLEM)
-        if not noted:
+        """The error that ended the last run; None if it finished."""
+        entry = self.manifest.get(PROBLEM)
+        if not entry:
             return None
-        return Problem(noted.get("message", ""), noted.get("hint", ""), noted.get("photos", {}))
+        return Problem(entry.get("message", ""), entry.get("hint", ""), entry.get("photos", {}))
 
     @property
     def is_metric(self) -> bool:
@@ -60,21 +60,17 @@ class RunContents:
     @property
     def stages(self) -> Mapping[str, Any]:
         """Records of the finished stages, by name."""
-        found: Mapping[str, Any] = self.manifest.get("stages", {})
-        return found
+        records: Mapping[str, Any] = self.manifest.get("stages", {})
+        return records
 
     def counts(self, stage: str) -> Mapping[str, Any]:
-        """Return the figures of a stage; empty where it has not run."""
-        found: Mapping[str, Any] = self.stages.get(stage, {}).get("counts", {})
-        return found
+        """Return the figures of a stage; empty if it has not run."""
+        figures: Mapping[str, Any] = self.stages.get(stage, {}).get("counts", {})
+        return figures
 
 
 def read_contents(run: RunContext) -> RunContents:
-    """Read what the finished stages of a run have left.
-
-    Args:
-        run: with its output folder.
-    """
+    """Read the products of all finished stages."""
     manifest = run.workspace.manifest.read()
     listed = _read(run, manifest, photos, lambda: photos.read_photo_list(run.workspace))
     return RunContents(
@@ -90,29 +86,25 @@ def read_contents(run: RunContext) -> RunContents:
 
 
 def read_scene(run: RunContext) -> RunContents:
-    """Read only what a picture of the model needs: matches of many photos take long to read.
-
-    Args:
-        run: with its output folder.
-    """
+    """Read the scene and its frame only: matches of many photos take long to read."""
     manifest = run.workspace.manifest.read()
-    found = _read(run, manifest, scene, lambda: scene.load(run))
+    product = _read(run, manifest, scene, lambda: scene.load(run))
     frame = _read(run, manifest, scale, lambda: scale.load(run)) or MetricFrame()
-    return RunContents(run, manifest, scene=found, frame=frame)
+    return RunContents(run, manifest, scene=product, frame=frame)
 
 
 def _read(
     run: RunContext, manifest: Mapping[str, Any], module: ModuleType, load: Callable[[], Product | None]
 ) -> Product | None:
-    """Return what a stage has left; None where it has not run, or its files are damaged."""
+    """Return the product of a stage; None if it has not run, or its files are damaged."""
     stage, done = module.__name__.rpartition(".")[2], manifest.get("stages", {})
     if stage not in done:
         return None
     try:
-        # compared before anything is read, because COLMAP never ends on some damaged models
+        # checked before reading, because COLMAP never ends on some damaged models
         if done[stage]["digest"] != module.digest(run.workspace):
             raise ValueError(f"the files of stage {stage} have changed")
         return load()
-    except UNREADABLE as err:  # the page shows what is left
+    except UNREADABLE as err:  # the page shows the other stages
         logger.info("the report leaves out stage %s", stage, exc_info=err)
         return None

@@ -1,4 +1,4 @@
-"""A finished run as a notebook shows it: a picture of the model, and what was found."""
+"""A finished run in a notebook: a picture of the model, and the figures at a glance."""
 
 import base64
 from html import escape
@@ -19,72 +19,55 @@ from sfm_app.synthetic.render import orbited_pose, render_model
 from sfm_app.types import Frustum, Model
 
 WIDTH_PX, SUPERSAMPLING = 640, 2
-ASIDE_DEG = 20.0
-"""Angle from the photo in the middle to the view of the picture: from the photo itself, a model looks flat."""
-LEAST_FOCAL = 0.6
-"""Of the width of the picture: it shows at most 80 degrees, else a plane picture is mostly stretched borders."""
 POINT_PX = 2
-"""Side of the square that a point is drawn as."""
+"""Side of the square of a point. By hand."""
 
 
 def run_html(contents: RunContents) -> str:
-    """Return a picture of the model and a table of what was found, as HTML.
-
-    Args:
-        contents: of the run.
-    """
+    """Return a picture of the model and the figures at a glance as HTML."""
     rows = "".join(
         f"<tr><th style='text-align:left'>{escape(fact.name)}</th>"
         f"<td style='text-align:left'>{escape(f'{fact.value} {fact.note}'.strip())}</td></tr>"
         for fact in glance(contents)
     )
-    shown = model_picture(contents)
-    picture = ""
-    if shown is not None:
-        data = base64.b64encode(cv2.imencode(".png", shown[..., ::-1])[1].tobytes()).decode("ascii")
-        picture = f"<img src='data:image/png;base64,{data}' alt='the model' width='{shown.shape[1]}'>"
-    return f"<div>{picture}<table>{rows}</table></div>"
+    picture, image = model_picture(contents), ""
+    if picture is not None:
+        data = base64.b64encode(cv2.imencode(".png", picture[..., ::-1])[1].tobytes()).decode("ascii")
+        image = f"<img src='data:image/png;base64,{data}' alt='the model' width='{picture.shape[1]}'>"
+    return f"<div>{image}<table>{rows}</table></div>"
 
 
 def model_picture(contents: RunContents) -> NDArray[np.uint8] | None:
-    """Return a picture (H, W, 3) RGB of the model, or of its points, on white; None where no photo has a place.
-
-    Args:
-        contents: of the run.
-    """
-    found = model_cutout(contents)
-    if found is None:
+    """Return a picture (H, W, 3) RGB of the model, or of its points, on white; None if no photo is placed."""
+    cutout = model_cutout(contents)
+    if cutout is None:
         return None
-    share = found[..., 3:] / 255.0
-    return np.asarray(np.round(share * found[..., :3] + (1.0 - share) * 255.0), np.uint8)
+    share = cutout[..., 3:] / 255.0
+    return np.asarray(np.round(share * cutout[..., :3] + (1.0 - share) * 255.0), np.uint8)
 
 
 def model_cutout(contents: RunContents) -> NDArray[np.uint8] | None:
-    """Return a picture (H, W, 4) RGBA of the model, or of its points, on nothing; None where no photo has a place.
-
-    Args:
-        contents: of the run.
-    """
-    found = view_points(contents)
-    if found is None or not found.cameras:
+    """Return a transparent picture (H, W, 4) RGBA of the model, or of its points; None if no photo is placed."""
+    points = view_points(contents)
+    if points is None or not points.cameras:
         return None
-    middle = sorted(found.cameras, key=lambda camera: camera.name)[len(found.cameras) // 2]
+    middle = sorted(points.cameras, key=lambda camera: camera.name)[len(points.cameras) // 2]
     camera = _scaled_camera(middle, SUPERSAMPLING * WIDTH_PX)
     model = _surface(contents)
     if model is None:
-        return _draw_points(found, camera, middle.cam_from_world)
-    pose = orbited_pose(middle.cam_from_world, model.surface, ASIDE_DEG)
+        return _draw_points(points, camera, middle.cam_from_world)
+    pose = orbited_pose(middle.cam_from_world, model.surface, 20.0)  # from the photo itself, a model looks flat
     size = camera.width // SUPERSAMPLING, camera.height // SUPERSAMPLING
     fine = render_model(model, camera, pose)
     covered = fine.covered.astype(np.float32)[..., None]
-    # colors of covered samples alone, so that none gets darker at an outline
+    # only covered samples count, so that outlines do not get darker
     alpha = cv2.resize(covered, size, interpolation=cv2.INTER_AREA)[..., None]
     colors = cv2.resize(fine.colors * covered, size, interpolation=cv2.INTER_AREA) / np.maximum(alpha, 1e-6)
     return np.asarray(np.round(np.concatenate([colors, 255.0 * alpha], axis=2)), np.uint8)
 
 
 def _surface(contents: RunContents) -> Model | None:
-    """Return the textured surface in the frame of exported files; None where there is none, or it is damaged."""
+    """Return the textured surface in the frame of exported files; None if it is missing or damaged."""
     if "texture" not in contents.stages:
         return None
     try:
@@ -94,27 +77,29 @@ def _surface(contents: RunContents) -> Model | None:
 
 
 def _scaled_camera(photo: Frustum, width: int) -> Camera:
-    """Return the camera of a photo without its lens, for a picture of some width; a wide lens shows its middle."""
+    """Return a pinhole camera at a photo's pose, for a picture of this width; a wide lens shows its middle."""
     scale, height = width / photo.width, max(1, round(width / photo.width * photo.height))
     K = np.diag([scale, scale, 1.0]) @ photo.K
-    if K[0, 0] < LEAST_FOCAL * width:
-        K = camera_matrix(LEAST_FOCAL * width, LEAST_FOCAL * width, width / 2, height / 2)
+    least = 0.6 * width  # 80 degrees: the borders of a wider plane picture are stretched. By hand
+    if K[0, 0] < least:
+        K = camera_matrix(least, least, width / 2, height / 2)
     return Camera(K, width, height)
 
 
-def _draw_points(found: Model, camera: Camera, pose: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Return the points as squares on nothing, the near ones over the far ones, at the size of a picture."""
+def _draw_points(model: Model, camera: Camera, pose: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Return the points as opaque squares, near ones over far ones, at the size of a picture."""
     size = camera.width // SUPERSAMPLING, camera.height // SUPERSAMPLING
     picture = np.zeros((size[1], size[0], 4), np.uint8)
-    X = found.surface.vertices @ pose[:, :3].T + pose[:, 3]
-    least = 1e-3 * scene_size(np.array([center(one) for one in found.cameras] + [found.surface.vertices.mean(axis=0)]))
+    X = model.surface.vertices @ pose[:, :3].T + pose[:, 3]
+    middle = model.surface.vertices.mean(axis=0)
+    least = 1e-3 * scene_size(np.array([center(photo) for photo in model.cameras] + [middle]))
     ahead = np.flatnonzero(X[:, 2] > least)
     order = ahead[np.argsort(-X[ahead, 2], kind="stable")]
     x = X[order] @ camera.K.T
     place = np.floor(x[:, :2] / x[:, 2:] / SUPERSAMPLING)
     inside = ((place >= 0) & (place < np.array(size) - POINT_PX)).all(axis=1)
     columns, rows = place[inside].astype(np.int64).T
-    colors = np.column_stack([found.surface.colors[order[inside]], np.full(len(rows), 255, np.uint8)])
+    colors = np.column_stack([model.surface.colors[order[inside]], np.full(len(rows), 255, np.uint8)])
     for down in range(POINT_PX):
         for right in range(POINT_PX):
             picture[rows + down, columns + right] = colors

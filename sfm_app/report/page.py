@@ -1,4 +1,4 @@
-"""Write the page: the template filled with what was found, style and scripts put in, nothing to be loaded."""
+"""report.html: the template filled with results, style and scripts; it loads nothing else."""
 
 import json
 import logging
@@ -33,18 +33,22 @@ from sfm_app.report.scene_view import embedded_view
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import LOCK, Workspace
 
-# three.js, out of the viewer that trimesh's wheel carries, so that no third-party code lies in this project.
-#
-# The script of that viewer has three.js with a loader of GLB files, and then its own page, which is cut off.
+logger = logging.getLogger("sfm_app")
+
+REPORT = "report.html"
+ASSETS = Path(__file__).parent / "assets"
+
+# three.js from the viewer in trimesh's wheel, so that this project contains no third-party code. The viewer's script is
+# three.js, a loader of GLB files, and then the viewer's own page, which is cut off.
 
 BEGIN, END, OWN_PART = "<script>", "</script>", "var camera,controls,scene"
 NEEDED = ("THREE={}", "THREE.GLTFLoader=GLTFLoader")
-"""Without these the wheel carries something else."""
+"""Text of the script that the page needs."""
 
 
 @cache
 def three_script() -> str:
-    """Return three.js with its loader of GLB files as one script; empty where trimesh does not carry it."""
+    """Return three.js with its loader of GLB files as one script; empty if trimesh does not carry it."""
     packed = resources.files("trimesh") / "resources" / "templates" / "viewer.zip"
     try:
         with packed.open("rb") as file, zipfile.ZipFile(file) as archive:
@@ -55,28 +59,22 @@ def three_script() -> str:
     return script if all(part in script for part in NEEDED) and END not in script else ""
 
 
-logger = logging.getLogger("sfm_app")
-
-REPORT = "report.html"
-ASSETS = Path(__file__).parent / "assets"
-
-
 def finish_report(run: RunContext, problem: SfmError | None = None) -> Path | None:
-    """Note how a run ended, and write its report; no failure in it ends the run.
+    """Record how a run ended, and write its report; a failure here does not end the run.
 
     Args:
-        run: with its output folder.
-        problem: that ended the run; None where it went to its end.
+        problem: the error that ended the run; None if it finished.
 
     Returns:
-        The report; None where there is none: no run has begun in the folder, or another one is at work in it.
+        The report; None if no run has begun in the folder, or another run is using it.
     """
     place = run.workspace
     if not (place.root / LOCK).exists():
         return None
     try:
         with place.hold_lock():
-            place.manifest.note_problem({} if problem is None else _as_plain(problem))
+            entry = {} if problem is None else {key: getattr(problem, key) for key in ("message", "hint", "photos")}
+            place.manifest.note_problem(entry)
             if not run.settings.report:
                 return None
             if problem is None and _is_up_to_date(place):
@@ -85,16 +83,15 @@ def finish_report(run: RunContext, problem: SfmError | None = None) -> Path | No
             return write_report(run)
     except Exception as err:  # a run does not fail for its report
         logger.info("no report", exc_info=err)
-        run.progress.say(f"there is no report of this run: {err}")
+        run.progress.say(f"cannot write the report of this run: {err}")
         return None
 
 
 def write_report(run: RunContext, beside_run: RunContext | None = None) -> Path:
-    """Write OUT/report.html from what the finished stages of a run have left, and return its path.
+    """Write OUT/report.html from the products of the finished stages, and return its path.
 
     Args:
-        run: with its output folder.
-        beside_run: another run to compare it with; None for none.
+        beside_run: another run to compare it with.
 
     Raises:
         InputError: a folder holds no run.
@@ -112,36 +109,25 @@ def _is_up_to_date(place: Workspace) -> bool:
     return report.exists() and manifest.exists() and report.stat().st_mtime_ns >= manifest.stat().st_mtime_ns
 
 
-def _as_plain(problem: SfmError) -> dict[str, Any]:
-    return {"message": problem.message, "hint": problem.hint, "photos": problem.photos}
-
-
 @dataclass(frozen=True, slots=True)
 class LargeParts:
-    """The parts of the page that are too large for one file where the model is large."""
+    """The large parts of the page: a page of a large model loads them from files."""
 
     pictures: Mapping[str, str]
-    """Addresses of small pictures, by name of the photo; may lack some."""
+    """Addresses of small pictures by photo; some may be missing."""
     view: Mapping[str, Json] | None
-    """What the 3D view needs; None where no photo has a place."""
+    """Data of the 3D view; None if no photo is placed."""
     is_served: bool
-    """Whether they are loaded from where the page is from; else they are in the page, and it may load nothing."""
+    """Whether the page loads them from its server; else they are in the page."""
 
 
 def embed_parts(contents: RunContents) -> LargeParts:
-    """Return the large parts as data in the page.
-
-    Args:
-        contents: of the run.
-    """
+    """Return the large parts as data in the page."""
     return LargeParts(embedded_pictures(contents), embedded_view(contents, photo_names(contents)), is_served=False)
 
 
 def read_run(run: RunContext) -> RunContents:
-    """Return what a run has left.
-
-    Args:
-        run: with its output folder.
+    """Return the products of a run.
 
     Raises:
         InputError: the folder holds no run.
@@ -151,16 +137,9 @@ def read_run(run: RunContext) -> RunContents:
 
 
 def render_page(contents: RunContents, parts: LargeParts, other: RunContents | None = None) -> str:
-    """Return the page as HTML.
-
-    Args:
-        contents: of the run.
-        parts: pictures and view of this run.
-        other: what another run has left, to compare it with.
-    """
+    """Return the page as HTML; `other` is a run to compare with."""
     model = _read_model(contents)
     rows = photo_rows(contents, model, parts.pictures)
-    view = parts.view
     warnings, others = findings.remarks(contents)
     return _environment().get_template("page.html.jinja").render(
         title=contents.run.workspace.root.resolve().name,
@@ -179,15 +158,15 @@ def render_page(contents: RunContents, parts: LargeParts, other: RunContents | N
         versions=contents.manifest.get("versions", {}),
         figures=page_figures(contents, model),
         depths=depth_pictures(contents),
-        view=view is not None and bool(three_script()),
+        view=parts.view is not None and bool(three_script()),
         served=parts.is_served,
-        data=script_data({"view": view, "photos": [_photo_data(row) for row in rows]}),
+        data=script_data({"view": parts.view, "photos": [_photo_data(row) for row in rows]}),
         three=Markup(three_script()),  # noqa: S704 - a script of an installed package, without user text
     )  # fmt: skip
 
 
 def _read_model(contents: RunContents) -> ModelFigures | None:
-    """Return None where there is no model, or it cannot be read."""
+    """Return the figures of COLMAP's model; None if there is none, or it cannot be read."""
     if contents.scene is None:
         return None
     try:
@@ -198,12 +177,7 @@ def _read_model(contents: RunContents) -> ModelFigures | None:
 
 
 def headline(contents: RunContents, rows: Sequence[PhotoRow]) -> str:
-    """Return what came of the run, in one sentence.
-
-    Args:
-        contents: of the run.
-        rows: of all photos.
-    """
+    """Return the result of the run in one sentence."""
     if contents.problem is not None:
         return "There is no model." if contents.scene is None else "The run ended early."
     placed, count = sum(row.state == PLACED for row in rows), sum(row.state != LEFT_OUT for row in rows)
@@ -218,18 +192,18 @@ def _photo_data(row: PhotoRow) -> dict[str, Any]:
 
 
 def script_data(value: Any) -> Markup:
-    """Return plain values as JSON that no text in them can end: `<` is escaped."""
+    """Return plain values as JSON in a script; `<` is escaped, so that no text ends the script."""
     text = json_text(value).replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
     return Markup(text)  # noqa: S704 - escaped in the line above
 
 
 @cache
 def _environment() -> jinja2.Environment:
-    """Return the templates, which escape every text that is put into them."""
-    found = jinja2.Environment(
+    """Return the templates, which escape all texts."""
+    environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(ASSETS), autoescape=True, undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    found.globals["correlation_text"] = correlation_text
-    found.globals["asset"] = lambda name: Markup((ASSETS / name).read_text(encoding="utf-8"))  # noqa: S704 - our files
-    return found
+    environment.globals["correlation_text"] = correlation_text
+    environment.globals["asset"] = lambda name: Markup((ASSETS / name).read_text(encoding="utf-8"))  # noqa: S704 - our files
+    return environment

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from sfm_app.colmap.dense import read_photo_and_depth
 from sfm_app.colmap.model import ModelFigures
 from sfm_app.report.contents import UNREADABLE, RunContents
-from sfm_app.report.figures import MOST_PAIRS, draw_intrinsics
+from sfm_app.report.figures import OPTIONS, draw_intrinsics
 from sfm_app.types.arrays import FloatArray
 
-# Figures of the page: the scene from above, which photos hang together, and what the cameras were found from.
+# Figures: cameras, matched pairs of photos, the scene from above, and lengths of tracks.
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,11 +28,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger("sfm_app")
 
-DPI = 130
-MOST_LINES = 4000
-"""Pairs of photos drawn as lines, those with most inliers first."""
 LONGEST_TRACK = 12
-"""Tracks of so many photos and more share the last bar."""
+"""Photos of a track; longer tracks share the last bar. By hand."""
 INK, ACCENT, BAD = "#444444", "#c2410c", "#b91c1c"
 
 
@@ -42,52 +39,47 @@ class PageFigure:
 
     title: str
     text: str
-    """What one sees; also what is read out instead of it."""
+    """Caption, and text for screen readers."""
     address: str
     """Its bytes as a data address."""
 
 
 def page_figures(contents: RunContents, figures: ModelFigures | None) -> dict[str, PageFigure]:
-    """Return the figures that can be drawn, by section of the page.
-
-    Args:
-        contents: of the run.
-        figures: of its model; None where there is none.
-    """
-    wanted: Mapping[str, Callable[[], PageFigure | None]] = {
+    """Return the figures that can be drawn, by section of the page."""
+    sections: Mapping[str, Callable[[], PageFigure | None]] = {
         "cameras": lambda: _draw_cameras(contents),
         "pairs": lambda: _draw_pairs(contents),
         "above": lambda: _draw_above(contents, figures),
         "tracks": lambda: _draw_tracks(figures),
     }
-    found = {}
-    for name, draw in wanted.items():
+    drawn = {}
+    for name, draw in sections.items():
         try:
             figure = draw()
         except UNREADABLE as err:  # the page has the others
             logger.info("the report has no figure of %s", name, exc_info=err)
             continue
         if figure is not None:
-            found[name] = figure
-    return found
+            drawn[name] = figure
+    return drawn
 
 
 def _draw_cameras(contents: RunContents) -> PageFigure | None:
-    matches, views, found = contents.matches, contents.views, contents.intrinsics
-    if matches is None or views is None or found is None:
+    matches, views, intrinsics = contents.matches, contents.views, contents.intrinsics
+    if matches is None or views is None or intrinsics is None:
         return None
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cameras.png"
-        draw_intrinsics(path, matches, views, found)
+        draw_intrinsics(path, matches, views, intrinsics)
         data = path.read_bytes()
     text = (
-        "Above: what each pair of photos votes for, in the planes of the focal lengths and of the optical center, with "
-        "the zero curves of the best pairs; many pairs agree where it is bright. Below: the lens beside an ideal one, "
+        "Above: the votes of all pairs of photos in the planes of the focal lengths and of the optical center, with "
+        "the zero curves of the best pairs; many pairs agree at bright places. Below: the lens beside an ideal one, "
         "and the residuals over the photo."
     )
-    count = len(views.fits)
-    if count > MOST_PAIRS:
-        text += f" Of {count} pairs, at most {MOST_PAIRS} of each camera are drawn, those of most weight."
+    count, most = len(views.fits), OPTIONS.most_pairs
+    if count > most:
+        text += f" Of {count} pairs, the figure shows at most {most} of each camera, those of most weight."
     return PageFigure("Votes, curves and lens", text, _address(data))
 
 
@@ -109,33 +101,27 @@ def _draw_pairs(contents: RunContents) -> PageFigure | None:
         bar.set_label("inliers of the pair, as a power of ten")
         size = max(1.0, 240.0 / len(order))
         rows, columns = np.concatenate([dropped, dropped[:, ::-1]]).T
-        axes.scatter(columns, rows, s=size, marker="x", linewidths=0.6, color=BAD, label="matched, and dropped")
+        axes.scatter(columns, rows, s=size, marker="x", linewidths=0.6, color=BAD, label="matched, then rejected")
         axes.set(xlabel="photos by name", ylabel="photos by name", facecolor="#f2f2f2")
         if len(dropped):
             axes.legend(loc="upper left", bbox_to_anchor=(0, 1.1), frameon=False, fontsize=8)
 
     text = (
-        "Each cell is a pair of photos: its color says how many matches fit one fundamental matrix, red crosses are "
-        "pairs that were matched and dropped, gray ones were not matched. Photos that hang together form blocks."
+        "Each cell is a pair of photos. Its color is the number of matches that fit one fundamental matrix; red "
+        "crosses are rejected pairs, gray cells are unmatched pairs. Connected photos form blocks."
     )
-    return PageFigure("Which photos hang together", text, _png(draw, (6.4, 5.6)))
+    return PageFigure("Connected photos", text, _png(draw, (6.4, 5.6)))
 
 
 def _draw_above(contents: RunContents, figures: ModelFigures | None) -> PageFigure | None:
-    scene, views, matches = contents.scene, contents.views, contents.matches
+    scene = contents.scene
     if scene is None or figures is None or not scene.cam_from_world:
         return None
     poses = {name: np.asarray(pose) for name, pose in scene.cam_from_world.items()}
     centers = {name: -pose[:, :3].T @ pose[:, 3] for name, pose in poses.items()}
-    lines = []
-    if views is not None and matches is not None:
-        named = {pair: tuple(matches.images[photo].name for photo in pair) for pair in views.fits}
-        best = sorted(views.fits, key=lambda pair: (-views.fits[pair].inlier_count, pair))
-        lines = [named[pair] for pair in best if all(name in centers for name in named[pair])][:MOST_LINES]
-
     at = np.array(list(centers.values()))
     looks = np.array([pose[2, :3] for pose in poses.values()])
-    ends = [(centers[a], centers[b]) for a, b in lines]
+    ends = [(centers[a], centers[b]) for a, b in _strongest_pairs(contents, centers)]
 
     def draw(figure: "Figure") -> None:
         left, right = figure.subplots(1, 2)
@@ -145,10 +131,20 @@ def _draw_above(contents: RunContents, figures: ModelFigures | None) -> PageFigu
             _frame(axes, at, figures.places)
 
     text = (
-        "Left: the cameras from above, the direction in which they look, and lines between photos that share matches. "
-        "Right: the points, and by how many photos each is seen."
+        "Left: the cameras from above, their viewing directions, and lines between photos that share matches. "
+        "Right: the points, and the number of photos that see each."
     )
     return PageFigure("Seen from above", text, _png(draw, (11.0, 5.2)))
+
+
+def _strongest_pairs(contents: RunContents, centers: Mapping[str, FloatArray]) -> list[tuple[str, ...]]:
+    """Return the placed pairs of photos with most inliers, by name."""
+    views, matches = contents.views, contents.matches
+    if views is None or matches is None:
+        return []
+    named = {pair: tuple(matches.images[photo].name for photo in pair) for pair in views.fits}
+    best = sorted(views.fits, key=lambda pair: (-views.fits[pair].inlier_count, pair))
+    return [named[pair] for pair in best if all(name in centers for name in named[pair])][:4000]
 
 
 def _draw_network(
@@ -166,11 +162,11 @@ def _draw_network(
     axes.set_title("cameras, and pairs that share matches", fontsize=9.5)
 
 
-def _draw_overlap(figure: "Figure", axes: "Axes", at: FloatArray, found: ModelFigures) -> None:
-    """Draw the points by how many photos see them, the most seen ones on top, and the cameras at (C, 3)."""
-    order = np.argsort(found.tracks, kind="stable")
+def _draw_overlap(figure: "Figure", axes: "Axes", at: FloatArray, model: ModelFigures) -> None:
+    """Draw the points by number of photos, long tracks on top, and the cameras at (C, 3)."""
+    order = np.argsort(model.tracks, kind="stable")
     dots = axes.scatter(
-        found.places[order, 0], found.places[order, 2], c=np.minimum(found.tracks[order], LONGEST_TRACK),
+        model.places[order, 0], model.places[order, 2], c=np.minimum(model.tracks[order], LONGEST_TRACK),
         s=2.0, linewidths=0.0, cmap="plasma", vmin=2, vmax=LONGEST_TRACK,
     )  # fmt: skip
     axes.plot(at[:, 0], at[:, 2], "o", color=INK, markersize=2.0)
@@ -179,7 +175,7 @@ def _draw_overlap(figure: "Figure", axes: "Axes", at: FloatArray, found: ModelFi
 
 
 def _frame(axes: "Axes", at: FloatArray, places: FloatArray) -> None:
-    """Show all cameras and nearly all points, with z downwards as seen from above."""
+    """Set limits for all cameras and nearly all points, with z downwards as seen from above."""
     low, high = at[:, [0, 2]].min(axis=0), at[:, [0, 2]].max(axis=0)
     if len(places):
         near, far = np.percentile(places[:, [0, 2]], [2.0, 98.0], axis=0)
@@ -203,8 +199,8 @@ def _draw_tracks(figures: ModelFigures | None) -> PageFigure | None:
         axes.spines[["top", "right"]].set_visible(False)
 
     sure = int(counts[1:].sum())
-    text = f"{sure} of {int(counts.sum())} points are seen by three photos or more, which confirm each other."
-    return PageFigure("By how many photos points are seen", text, _png(draw, (6.4, 2.8)))
+    text = f"{sure} of {int(counts.sum())} points have three or more observations, which confirm each other."
+    return PageFigure("Observations per point", text, _png(draw, (6.4, 2.8)))
 
 
 def _png(draw: Callable[["Figure"], None], size: tuple[float, float]) -> str:
@@ -216,7 +212,7 @@ def _png(draw: Callable[["Figure"], None], size: tuple[float, float]) -> str:
     with rc_context({"font.size": 9}):
         figure = Figure(figsize=size, layout="constrained")
         draw(figure)
-        figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
+        figure.savefig(file, format="png", dpi=130, metadata={"Software": None})
     return _address(file.getvalue())
 
 
@@ -228,17 +224,12 @@ def _address(data: bytes) -> str:
 
 ByteArray = NDArray[np.uint8]
 
-
 MOST_SHOWN = 6
-"""Photos that are shown, spread over the set. Chosen by hand."""
+"""Number of depth pictures. By hand."""
 SIDE_PX = 480
-"""Longer side of each picture, and of the depth map beside it."""
-QUALITY = 78
-"""JPEG quality. Chosen by hand: colors of neighboring depths stay apart."""
-ENDS = (2.0, 98.0)
-"""Percentiles of the known depths at the ends of the colors: single wrong depths are as far as one likes."""
+"""Longer side of each photo, and of the depth map beside it. By hand."""
 UNKNOWN = (226, 226, 224)
-"""Color where there is no depth: a light gray, which is none of the colors of depths."""
+"""Color of unknown depths: a light gray, which no depth has. By hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,43 +238,34 @@ class DepthPicture:
 
     name: str
     text: str
-    """What one sees; also what is read out instead of it."""
+    """Caption, and text for screen readers."""
     address: str
     """JPEG as a data address: the photo at the left, depths at the right."""
     size: tuple[int, int]
-    """Its width and height in pixels, so that nothing on the page moves while it loads."""
+    """Width and height in pixels, so that the layout is stable while it loads."""
 
 
 @dataclass(frozen=True, slots=True)
 class DepthPictures:
-    """Photos with their depth maps, spread over the set."""
+    """Some photos with their depth maps."""
 
     pictures: Sequence[DepthPicture]
     count: int
-    """Photos, or views of wide photos, that have a depth map."""
+    """Photos, or views of wide photos, with a depth map."""
 
 
 def depth_pictures(contents: RunContents) -> DepthPictures | None:
-    """Return some photos beside their depth maps; None where there is none to show.
-
-    Args:
-        contents: of the run.
-    """
+    """Return some photos beside their depth maps; None without depth maps."""
     coverage: Mapping[str, float] = contents.counts("depth_maps").get("coverage", {})
     dense = contents.run.workspace.dense
     chosen = spread_names(sorted(coverage), MOST_SHOWN)
-    found = contents.run.map(lambda name: _draw(dense, name, coverage[name]), chosen, "depth maps of the report")
-    pictures = [picture for picture in found if picture is not None]
+    drawn = contents.run.map(lambda name: _draw(dense, name, coverage[name]), chosen, "depth maps of the report")
+    pictures = [picture for picture in drawn if picture is not None]
     return DepthPictures(pictures, len(coverage)) if pictures else None
 
 
 def spread_names(names: Sequence[str], most: int) -> list[str]:
-    """Return some of the names at even steps, with the first and the last.
-
-    Args:
-        names: in order.
-        most: of them, > 0.
-    """
+    """Return at most `most` > 0 of the names at even steps, with the first and the last."""
     if not names:
         return []
     places = np.linspace(0, len(names) - 1, min(most, len(names)))
@@ -291,14 +273,14 @@ def spread_names(names: Sequence[str], most: int) -> list[str]:
 
 
 def _draw(dense: Path, name: str, share: float) -> DepthPicture | None:
-    """Return one photo beside its depths; None where a file is missing or damaged."""
+    """Return one photo beside its depths; None if a file is missing or damaged."""
     try:
         photo, depth = read_photo_and_depth(dense, name)
         size = _shrunk_size(depth.shape[1], depth.shape[0])
         small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
         nearest = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.float64)
         colors, (near, far) = depth_colors(nearest)
-        data = cv2.imencode(".jpg", np.hstack([small, colors])[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+        data = cv2.imencode(".jpg", np.hstack([small, colors])[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 78])[1]
     except (*UNREADABLE, cv2.error) as err:  # the page has the others
         logger.info("no picture of the depths of %s", name, exc_info=err)
         return None
@@ -310,10 +292,10 @@ def _draw(dense: Path, name: str, share: float) -> DepthPicture | None:
 def depth_colors(depth: FloatArray) -> tuple[ByteArray, tuple[float, float]]:
     """Return the colors (H, W, 3) RGB of depths, yellow near and violet far, and the depths at both ends.
 
-    Colors are even in 1 / depth, as disparities are: the near half of a scene would else have one color.
+    Colors are even in 1 / depth, as disparities are: otherwise the near half of a scene has one color.
 
     Args:
-        depth: (H, W), <= 0 or not finite where there is none.
+        depth: (H, W), <= 0 or not finite for unknown depths.
 
     Raises:
         ValueError: no pixel has a depth.
@@ -321,7 +303,7 @@ def depth_colors(depth: FloatArray) -> tuple[ByteArray, tuple[float, float]]:
     known = np.isfinite(depth) & (depth > 0.0)
     if not known.any():
         raise ValueError("no pixel has a depth")
-    near, far = (float(value) for value in np.percentile(depth[known], ENDS))
+    near, far = (float(value) for value in np.percentile(depth[known], (2.0, 98.0)))
     inverse = 1.0 / np.where(known, depth, 1.0)
     span = max(1.0 / near - 1.0 / far, 1e-12)
     level = np.clip((inverse - 1.0 / far) / span, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""What the page's 3D view draws: the model, the points, and the cameras that were placed."""
+"""Data of the page's 3D view: the model, the points, and the placed cameras."""
 
 import base64
 import logging
@@ -24,21 +24,13 @@ from sfm_app.types import Frustum, Model
 logger = logging.getLogger("sfm_app")
 
 MOST_GLB_BYTES = 16_000_000
-"""Largest model that the page carries as it is. Chosen by hand: a page of 40 MB still opens on a telephone."""
+"""Largest model in a page without a lighter one: a page of 40 MB opens on a telephone. By hand."""
 LIGHT_PAGE_PX = 2048
-"""Longer side of a page of texture in the lighter model; normal maps have half of it."""
-MOST_POINTS = 60_000
-HEIGHTS = (2.0, 98.0)
-"""Percentiles of the heights of points between which the view looks. Chosen by hand: single wrong points are beyond."""
+"""Longer side of a page of texture in the lighter model; normal maps have half of it. By hand."""
 
 
 def embedded_view(contents: RunContents, photos: Sequence[str]) -> Mapping[str, Json] | None:
-    """Return what the 3D view needs, with model and points in it, as plain values; None where no photo has a place.
-
-    Args:
-        contents: of the run.
-        photos: names of the photos in order of the page's rows.
-    """
+    """Return the data of the 3D view, with model and points; None if no photo is placed."""
     points = view_points(contents)
     if points is None:
         return None
@@ -51,11 +43,7 @@ def embedded_view(contents: RunContents, photos: Sequence[str]) -> Mapping[str, 
 
 
 def view_points(contents: RunContents) -> Model | None:
-    """Return the points and the cameras of the scene, in the frame of exported files; None where there are none.
-
-    Args:
-        contents: of the run.
-    """
+    """Return points and cameras in the frame of exported files; None if there is no model."""
     if contents.scene is None:
         return None
     try:
@@ -66,12 +54,10 @@ def view_points(contents: RunContents) -> Model | None:
 
 
 def view_frame(contents: RunContents, points: Model, photos: Sequence[str]) -> dict[str, Json]:
-    """Return what the 3D view needs besides model and points: the cameras, and where and how large the scene is.
+    """Return the data of the 3D view besides model and points: cameras, and the scene's place and size.
 
     Args:
-        contents: of the run.
-        points: the points and the cameras.
-        photos: names of the photos in order of the page's rows.
+        photos: names of the photos in the order of the page's rows.
     """
     rows = {name: number for number, name in enumerate(photos)}
     middle, size = _bounds(points)
@@ -86,27 +72,19 @@ def view_frame(contents: RunContents, points: Model, photos: Sequence[str]) -> d
 
 
 def model_file(contents: RunContents) -> Path | None:
-    """Return the file of the finished model; None where there is none.
-
-    Args:
-        contents: of the run.
-    """
+    """Return the file of the finished model; None if there is none."""
     path = contents.run.workspace.root / "model.glb"
     return path if "files" in contents.stages and path.exists() else None
 
 
 def light_model(contents: RunContents) -> bytes:
-    """Return the finished model as GLB with smaller pages of texture.
-
-    Args:
-        contents: of a run with a texture.
-    """
+    """Return the finished textured model as GLB with smaller pages of texture."""
     model = move_model(texture.load(contents.run), contents.frame.from_model)
     return write_glb(lighten(model), "model")["model.glb"]
 
 
 def _model_bytes(contents: RunContents) -> bytes:
-    """Return the finished model as GLB, a lighter one where it is large; empty where there is none."""
+    """Return the finished model as GLB, lighter if it is large; empty if there is none."""
     path = model_file(contents)
     if path is None:
         return b""
@@ -118,11 +96,7 @@ def _model_bytes(contents: RunContents) -> bytes:
 
 
 def lighten(model: Model) -> Model:
-    """Return a textured model with smaller pages.
-
-    Args:
-        model: with a texture.
-    """
+    """Return a textured model with smaller pages."""
     if model.texture is None:
         return model
     pages = tuple(_shrink(page, LIGHT_PAGE_PX) for page in model.texture.pages)
@@ -140,21 +114,21 @@ def _shrink(page: NDArray[np.uint8], most: int) -> NDArray[np.uint8]:
 
 
 def _sample(points: Model) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return places and colors of the points, or of a sample drawn with a fixed seed."""
+    """Return places and colors of at most 60 000 points, drawn with a fixed seed."""
     places, colors = points.surface.vertices, points.surface.colors
-    chosen = np.sort(np.random.default_rng(0).permutation(len(places))[:MOST_POINTS])
+    chosen = np.sort(np.random.default_rng(0).permutation(len(places))[:60_000])
     return places[chosen], np.ascontiguousarray(colors[chosen])
 
 
 def _bounds(points: Model) -> tuple[list[float], float]:
-    """Return the middle of the points and the size of the scene; of the cameras where there are no points."""
+    """Return the middle of the points and the size of the scene; without points, of the cameras."""
     places = points.surface.vertices
     if not len(places):
         places = np.array([center(camera) for camera in points.cameras]).reshape(-1, 3)
     if not len(places):
         return [0.0, 0.0, 0.0], 1.0
     middle = np.median(places, axis=0)
-    middle[1] = np.percentile(places[:, 1], HEIGHTS).mean()  # most points may be on the ground
+    middle[1] = np.percentile(places[:, 1], (2.0, 98.0)).mean()  # most points may be on the ground
     return middle.tolist(), scene_size(places) or 1.0
 
 
@@ -172,7 +146,7 @@ def _camera(camera: Frustum, row: int | None) -> dict[str, Any]:
 
 
 def _plain_similarity(similarity: Similarity) -> dict[str, Json]:
-    """Return scale, rotation by rows and translation: `--scale` takes points in the frame before it."""
+    """Return scale, rotation by rows and translation; `--scale` takes points in the model's frame."""
     return {"scale": similarity.scale, "R": similarity.R.ravel().tolist(), "t": similarity.t.tolist()}
 
 

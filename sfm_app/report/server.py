@@ -29,24 +29,19 @@ from sfm_app.report.scene_view import MOST_GLB_BYTES, light_model, model_file, v
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Model, Surface
 
-# Points in levels, from a coarse sample of the whole scene to all of them.
-
-FIRST_LEVEL = 20_000
-"""Points of the first level; each later one has twice as many as the one before it. Chosen by hand: 300 kB."""
-MOST_SERVED = 4_000_000
-"""Points of all levels together: 60 MB."""
+# Points in levels, from a coarse sample of the whole scene to all points.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointLevels:
-    """Points in an order in which every beginning is spread over the scene."""
+    """Points in an order in which each prefix is spread over the scene."""
 
     places: NDArray[np.float32]
     """(N, 3)"""
     colors: NDArray[np.uint8]
     """(N, 3) sRGB"""
     cuts: Sequence[int]
-    """Where each level begins, and the end of the last."""
+    """Start of each level, and end of the last one."""
 
     @property
     def counts(self) -> list[int]:
@@ -55,9 +50,6 @@ class PointLevels:
 
     def pack(self, level: int) -> bytes:
         """Return a level as bytes: x, y, z of all its points as little-endian floats, then their colors.
-
-        Args:
-            level: from 0.
 
         Raises:
             IndexError: there is no such level.
@@ -68,51 +60,50 @@ class PointLevels:
         return self.places[part].astype("<f4").tobytes() + self.colors[part].tobytes()
 
 
-def point_levels(points: Surface) -> PointLevels:
-    """Return the points of a scene in levels, in an order drawn with a fixed seed.
-
-    Args:
-        points: with colors.
-    """
-    order = np.random.default_rng(0).permutation(len(points.vertices))[:MOST_SERVED]
+def point_levels(points: Surface, first: int = 20_000) -> PointLevels:
+    """Return colored points in levels, in an order drawn with a fixed seed; `first` points in the first level."""
+    order = np.random.default_rng(0).permutation(len(points.vertices))[:4_000_000]  # 60 MB
     cuts = [0]
     while cuts[-1] < len(order):
-        cuts.append(min(len(order), cuts[-1] + FIRST_LEVEL * 2 ** (len(cuts) - 1)))
+        cuts.append(min(len(order), cuts[-1] + first * 2 ** (len(cuts) - 1)))
     return PointLevels(points.vertices[order].astype(np.float32), points.colors[order], cuts)
 
 
-# What the page of a run is served with. A request names a number, never a file, so it cannot name one outside OUT.
+# Resources of the page. A request names a number, never a file, so it cannot reach files outside OUT.
 
 logger = logging.getLogger("sfm_app")
 
 SMALL_PX, LARGE_PX = 320, 2400
-"""Longer sides of the pictures in the table, and of those that are asked for by a click."""
+"""Longer sides of the pictures in the table, and of those opened by a click. By hand."""
 HTML, JPEG, GLB, BYTES = "text/html; charset=utf-8", "image/jpeg", "model/gltf-binary", "application/octet-stream"
 NUMBERED = re.compile(r"/(pictures|photos|points)/([0-9]{1,9})")
-"""Addresses of what there are many of."""
+"""Addresses of numbered resources."""
 
 
 @dataclass(frozen=True, slots=True)
 class Resource:
-    """What a request is answered with."""
+    """Answer to a request."""
 
     kind: str
     """Its media type."""
     content: bytes | Path
-    """A file is sent piece by piece."""
+    """Bytes, or a file."""
 
 
 @dataclass
 class RunResources:
-    """The page of a run, and what it loads."""
+    """The page of a run, and the files that it loads."""
 
     contents: RunContents
     names: list[str]
-    """Names of the photos in order of the page's rows."""
+    """Names of the photos in the order of the page's rows."""
     points: Model | None
-    """Points and cameras; None where no photo has a place."""
+    """Points and cameras; None if no photo is placed."""
     lock: Lock = field(default_factory=Lock)
-    """Held while something is made that several requests may ask for."""
+    """Held while a shared resource is computed."""
+    most_bytes: int = MOST_GLB_BYTES
+    """Larger models have a lighter one."""
+    make_light: Callable[[RunContents], bytes] = light_model
 
     @cached_property
     def page(self) -> bytes:
@@ -128,14 +119,10 @@ class RunResources:
     @cached_property
     def light(self) -> bytes:
         """The model with smaller pages of texture."""
-        return light_model(self.contents)
+        return self.make_light(self.contents)
 
     def find(self, address: str) -> Resource | None:
-        """Return what lies at an address of the page; None where there is nothing.
-
-        Args:
-            address: the path of a request, with or without a query.
-        """
+        """Return the resource at the path of a request, with or without a query; None if there is none."""
         path = address.partition("?")[0]
         if path == "/":
             return Resource(HTML, self.page)
@@ -148,13 +135,13 @@ class RunResources:
         return self._find_numbered(numbered[1], int(numbered[2])) if numbered else None
 
     def _find_light(self) -> Resource | None:
-        """Return the lighter model where one is needed; None where it cannot be made, too."""
+        """Return the lighter model; None if it is not needed or fails."""
         if not self._is_large():
             return None
         try:
             with self.lock:
                 return Resource(GLB, self.light)
-        except UNREADABLE as err:  # the page goes on to the full model
+        except UNREADABLE as err:  # the page loads the full model
             logger.info("there is no lighter model", exc_info=err)
             return None
 
@@ -169,12 +156,12 @@ class RunResources:
         return Resource(JPEG, jpeg) if jpeg else None
 
     def _is_large(self) -> bool:
-        """Return whether the model is so large that a lighter one is shown first."""
+        """Return whether the page shows a lighter model first."""
         model = model_file(self.contents)
-        return model is not None and model.stat().st_size > MOST_GLB_BYTES
+        return model is not None and model.stat().st_size > self.most_bytes
 
     def _view(self) -> dict[str, Json] | None:
-        """Return what the 3D view needs, with addresses instead of data."""
+        """Return the data of the 3D view, with addresses instead of model and points."""
         if self.points is None or self.levels is None:
             return None
         models = ["model.glb"] if model_file(self.contents) is not None else []
@@ -188,25 +175,19 @@ class RunResources:
 
 
 def read_resources(run: RunContext) -> RunResources:
-    """Return what the page of a run is served with, its page made.
-
-    Args:
-        run: with its output folder.
+    """Return the resources of a run, with its page rendered.
 
     Raises:
         InputError: the folder holds no run.
     """
     contents = read_run(run)
-    found = RunResources(contents, photo_names(contents), view_points(contents))
-    _ = found.page
-    return found
+    resources = RunResources(contents, photo_names(contents), view_points(contents))
+    _ = resources.page
+    return resources
 
 
-# A server for the browsers of this machine.
-#
-# It listens on the loopback address only. A page on the internet can let its own name point there (DNS rebinding),
-# and its scripts would then read the answers: so requests are refused unless they name the loopback address as
-# their host.
+# The server listens on the loopback address only. The name of an internet page can point there, too (DNS rebinding),
+# and its scripts would read the answers: so requests have to name the loopback address as their host.
 
 LOOPBACK = "127.0.0.1"
 HEADERS = {
@@ -216,12 +197,11 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-"""Sent with every answer: no other page may embed or read it, and the next run on this port shows its own."""
-TAKEN = (errno.EADDRINUSE, errno.EACCES)
+"""Of every answer: no other page may embed or read it, and browsers do not keep it."""
 
 
 class ViewServer(ThreadingTCPServer):
-    """Serves the page of one run. It is no HTTPServer, which asks the network for the name of this machine."""
+    """Serves the page of one run. An HTTPServer would ask the network for the name of this machine."""
 
     daemon_threads = True
     allow_reuse_address = not lacks(Ability.REUSED_PORTS)
@@ -237,22 +217,18 @@ class ViewServer(ThreadingTCPServer):
 
     @property
     def address(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         return f"http://{LOOPBACK}:{self.port}/"
 
     @property
     def hosts(self) -> tuple[str, ...]:
-        """What requests may call their host."""
+        """Allowed hosts of requests."""
         names = (LOOPBACK, "localhost")
         return (*(f"{name}:{self.port}" for name in names), *(names if self.port == 80 else ()))
 
     def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002 - the base class gives it
-        """Note that a request was not answered to its end: mostly, the browser has left.
-
-        Args:
-            request, client_address: of the request.
-        """
-        logger.debug("a request of %s was not answered", client_address, exc_info=True)
+        """Note in the log that a request failed: mostly, the browser has left."""
+        logger.debug("a request of %s failed", client_address, exc_info=True)
 
 
 class ViewHandler(BaseHTTPRequestHandler):
@@ -264,45 +240,41 @@ class ViewHandler(BaseHTTPRequestHandler):
     timeout = 60.0
 
     def do_GET(self) -> None:
-        """Send what lies at the address."""
+        """Send the resource at the address."""
         self._answer()
 
     def do_HEAD(self) -> None:
-        """Send the headers of what lies at the address."""
+        """Send the headers of the resource at the address."""
         self._answer()
 
     def log_message(self, format: str, *values: Any) -> None:  # noqa: A002 - the name that the base class gives it
-        """Note a request in the log.
-
-        Args:
-            format, values: the message.
-        """
+        """Note a request in the log."""
         logger.debug(format, *values)
 
     def _answer(self) -> None:
         if self.headers.get_all("Host", []) not in [[host] for host in self.server.hosts]:
-            self._refuse(HTTPStatus.FORBIDDEN, "This page is only for the machine that it is on.")
+            self._refuse(HTTPStatus.FORBIDDEN, "This page is only for the machine that serves it.")
             return
-        found = self.server.resources.find(self.path)
-        if found is None:
+        resource = self.server.resources.find(self.path)
+        if resource is None:
             self._refuse(HTTPStatus.NOT_FOUND, "There is nothing at this address.")
         else:
-            self._send(HTTPStatus.OK, found)
+            self._send(HTTPStatus.OK, resource)
 
     def _refuse(self, status: HTTPStatus, text: str) -> None:
         self.close_connection = True
         self._send(status, Resource("text/plain; charset=utf-8", text.encode("utf-8")))
 
-    def _send(self, status: HTTPStatus, found: Resource) -> None:
-        if isinstance(found.content, Path):
-            with found.content.open("rb") as file:
-                self._send_headers(status, found.kind, os.fstat(file.fileno()).st_size)
+    def _send(self, status: HTTPStatus, resource: Resource) -> None:
+        if isinstance(resource.content, Path):
+            with resource.content.open("rb") as file:
+                self._send_headers(status, resource.kind, os.fstat(file.fileno()).st_size)
                 if self.command != "HEAD":
                     shutil.copyfileobj(file, self.wfile)
             return
-        self._send_headers(status, found.kind, len(found.content))
+        self._send_headers(status, resource.kind, len(resource.content))
         if self.command != "HEAD":
-            self.wfile.write(found.content)
+            self.wfile.write(resource.content)
 
     def _send_headers(self, status: HTTPStatus, kind: str, length: int) -> None:
         self.send_response(status)
@@ -312,11 +284,7 @@ class ViewHandler(BaseHTTPRequestHandler):
 
 
 def open_server(resources: RunResources, port: int = 0) -> ViewServer:
-    """Start to listen, and return the server.
-
-    Args:
-        resources: of the run.
-        port: 0 for any that is free.
+    """Start to listen, and return the server; port 0 stands for any free port.
 
     Raises:
         ConfigError: the port cannot be used.
@@ -324,18 +292,18 @@ def open_server(resources: RunResources, port: int = 0) -> ViewServer:
     try:
         return ViewServer(resources, port)
     except (OSError, OverflowError) as err:
-        taken = isinstance(err, OSError) and err.errno in TAKEN
-        why = f"is taken ({err.strerror})" if isinstance(err, OSError) and taken else f"cannot be used: {err}"
-        raise ConfigError(f"port {port} {why}", hint="leave the port out for a free one") from err
+        reason = f"cannot be used: {err}"
+        if isinstance(err, OSError) and err.errno in (errno.EADDRINUSE, errno.EACCES):
+            reason = f"is taken ({err.strerror})"
+        raise ConfigError(f"port {port} {reason}", hint="leave the port out for a free one") from err
 
 
 def serve_run(run: RunContext, port: int, started: Callable[[str], None]) -> None:
     """Serve the page of a run until Ctrl-C.
 
     Args:
-        run: with its output folder.
-        port: 0 for any that is free.
-        started: called with the address once the page can be opened.
+        port: 0 for any free port.
+        started: called with the address when the page can be opened.
 
     Raises:
         InputError: the folder holds no run.

@@ -1,4 +1,8 @@
-"""A Dask cluster: its workers, and tasks and values on their way to them."""
+"""Run tasks on a Dask cluster: serialization, checks of the workers, connection and executor.
+
+``python -m sfm_app.runtime.cluster SCHEDULER COUNT FOLDER PARENT`` starts workers on this machine, one process of one
+thread each, in a process group of their own: Ctrl-C does not reach it, and it ends with its parent.
+"""
 
 import contextlib
 import hashlib
@@ -14,7 +18,6 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
@@ -25,37 +28,57 @@ from typing import IO, Any, TypeVar
 
 from sfm_app.errors import BackendError, ClusterError, ConfigError
 from sfm_app.files import replace_atomically
-from sfm_app.operating_system import cpu_seconds, end_group, group_options
+from sfm_app.operating_system import cpu_seconds, end_group, end_own_group, group_options, watch_parent
+from sfm_app.runtime.parallel import RemoteExecutor
 from sfm_app.settings import LOCAL_ADDRESS, ClusterSettings
 from sfm_app.tasks import Shared, Task
 
-# Values on their way between processes: small ones as bytes, large ones as files of a folder that all can read.
-#
-# This is the only place where pickles are read, since they may run anything. Their bytes, or the hashes of their
-# files, come through the network of the cluster, which has to be trusted as a whole. A file that is not the one
-# that was sent is refused.
-
-SMALL_BYTES = 500_000
-"""Larger values travel as files. Chosen by hand: the scheduler passes on what is smaller."""
-KEPT = 2
-"""Shared values that a worker keeps in memory: those of this step, and of one beside it. Chosen by hand."""
-SHARED, PATH = "shared", "path"
-"""What is not pickled itself."""
+logger = logging.getLogger("sfm_app")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True)
-class Parcel:
-    """A pickled value."""
+class TransferOptions:
+    """Sizes and times of the work on a cluster."""
+
+    small_bytes: int = 500_000
+    """Larger values travel as files; the scheduler forwards smaller ones. Chosen by hand."""
+    look_s: float = 2.0
+    """Seconds between two counts of the workers. Chosen by hand."""
+    connecting_s: float = 10.0
+    """Most seconds for a connection to a scheduler or worker. Chosen by hand."""
+    closing_s: float = 5.0
+    """Most seconds to leave a scheduler or end workers. Chosen by hand."""
+    in_flight: int = 3
+    """Calls in flight per thread of the cluster: one runs, one waits, one returns. Chosen by hand."""
+    call_s: float = 0.4
+    """Seconds that a call should take: short items travel together. Chosen by hand."""
+    most_items: int = 32
+    """Most items of a call: the cost of a lost worker. Chosen by hand."""
+
+
+OPTIONS = TransferOptions()
+
+# Serialization. Pickles are read here only, since they may run any code. Their bytes, or the hashes of their files,
+# come through the network of the cluster, which has to be trusted as a whole. A file with another hash is refused.
+
+SHARED, PATH = "shared", "path"
+"""Kinds of values that are not pickled themselves."""
+
+
+@dataclass(frozen=True, slots=True)
+class Serialized:
+    """A pickled value, in memory or in a file."""
 
     data: bytes
     path: str = ""
     """File that has the value instead; empty where `data` has it."""
     digest: str = ""
-    """Hash of the file."""
+    """Of the file."""
 
 
-class Packer:
-    """Packs values for other processes; each shared value becomes a file once, and is removed with the packer.
+class Serializer:
+    """Serializes values for other processes; each shared value becomes one file.
 
     Args:
         folder: all processes read and write it under this path.
@@ -65,26 +88,26 @@ class Packer:
         self.folder = folder
         self._shared: dict[int, tuple[Shared[Any], Path, str]] = {}
 
-    def pack(self, value: object) -> Parcel:
-        """Return a value as a parcel."""
+    def serialize(self, value: object) -> Serialized:
+        """Return a value as bytes, or as a file if it is large."""
         buffer = io.BytesIO()
         _Pickler(buffer, self).dump(value)
         data = buffer.getvalue()
-        if len(data) <= SMALL_BYTES:
-            return Parcel(data)
-        path = self.folder / f"parcel-{secrets.token_hex(8)}.pickle"
+        if len(data) <= OPTIONS.small_bytes:
+            return Serialized(data)
+        path = self.folder / f"value-{secrets.token_hex(8)}.pickle"
         with replace_atomically(path) as beside:
             beside.write_bytes(data)
-        return Parcel(b"", str(path), hashlib.blake2b(data).hexdigest())
+        return Serialized(b"", str(path), hashlib.blake2b(data).hexdigest())
 
     def share(self, value: Shared[Any]) -> tuple[str, str]:
-        """Return the path and the hash of the file of a shared value; it is written if it is not yet there."""
+        """Return path and hash of the file of a shared value; the first call writes it."""
         known = self._shared.get(id(value))
         if known is None:
             path = self.folder / f"shared-{secrets.token_hex(8)}.pickle"
             with replace_atomically(path) as beside, beside.open("wb") as file:
                 _Pickler(file, self).dump(value.value)
-            # the value is held, so that its id stays its own
+            # holding the value keeps its id unique
             known = self._shared[id(value)] = value, path, _digest(path)
         return str(known[1]), known[2]
 
@@ -92,60 +115,43 @@ class Packer:
         """Remove the files of shared values."""
         for _, path, _ in self._shared.values():
             path.unlink(missing_ok=True)
-        self._shared.clear()
 
 
 @contextmanager
-def packing(folder: Path) -> Iterator[Packer]:
-    """Provide a packer, and remove the files of shared values at the end of the block.
-
-    Args:
-        folder: where the files go; created if it is missing.
-    """
+def open_serializer(folder: Path) -> Iterator[Serializer]:
+    """Provide a serializer on a folder, which may be missing; its shared files are removed at the end."""
     folder.mkdir(parents=True, exist_ok=True)
-    packer = Packer(folder)
+    serializer = Serializer(folder)
     try:
-        yield packer
+        yield serializer
     finally:
-        packer.remove_shared()
+        serializer.remove_shared()
 
 
-def unpack(parcel: Parcel, *, remove: bool = False) -> Any:
-    """Return the value of a parcel.
-
-    Args:
-        parcel: from `Packer.pack`.
-        remove: whether its file is no longer needed.
+def deserialize(message: Serialized, *, remove: bool = False) -> Any:
+    """Return a value, and `remove` its file.
 
     Raises:
-        OSError: the file cannot be read here, or is not the one that was sent.
+        OSError: the file cannot be read here, or has another hash.
     """
-    if not parcel.path:
-        return _Unpickler(io.BytesIO(parcel.data)).load()
-    value = _load(parcel.path, parcel.digest)
+    if not message.path:
+        return _Unpickler(io.BytesIO(message.data)).load()
+    value = _load(message.path, message.digest)
     if remove:
-        Path(parcel.path).unlink(missing_ok=True)
+        Path(message.path).unlink(missing_ok=True)
     return value
 
 
-def survives_travel(value: object) -> bool:
-    """Return whether a value has the same type after it was pickled and read again."""
-    try:
-        return type(pickle.loads(pickle.dumps(value))) is type(value)  # noqa: S301 - its own bytes
-    except Exception:  # `__reduce__` and `__init__` may raise anything
-        return False
-
-
 class _Pickler(pickle.Pickler):
-    """Leaves shared values out, and makes paths absolute: workers have another current folder."""
+    """Replaces shared values by their files, and makes paths absolute: workers have another current folder."""
 
-    def __init__(self, file: IO[bytes], packer: Packer) -> None:
+    def __init__(self, file: IO[bytes], serializer: Serializer) -> None:
         super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
-        self._packer = packer
+        self._serializer = serializer
 
     def persistent_id(self, value: object) -> tuple[str, str, str] | None:
         if isinstance(value, Shared):
-            return SHARED, *self._packer.share(value)
+            return SHARED, *self._serializer.share(value)
         return (PATH, str(value.absolute()), "") if isinstance(value, Path) else None
 
 
@@ -155,13 +161,12 @@ class _Unpickler(pickle.Unpickler):
         return _read_shared(path, digest) if kind == SHARED else Path(path)
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=2)  # the shared values of two steps. Chosen by hand
 def _read_shared(path: str, digest: str) -> Shared[Any]:
     return Shared(_load(path, digest))
 
 
 def _load(path: str, digest: str) -> Any:
-    """Return the value in a file, if it is the one that was sent."""
     if _digest(Path(path)) != digest:
         raise OSError(f"{path} is not the file that was sent")
     with Path(path).open("rb") as file:
@@ -173,37 +178,32 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "blake2b").hexdigest()
 
 
-# What has to be the same on all machines, so that the same seed gives the same bytes.
+# Versions that have to agree on all machines, so that the same seed gives the same bytes.
 
 LIBRARIES = (
     "sfm-app", "numpy", "scipy", "numba", "opencv-contrib-python-headless", "open3d", "open3d-cpu", "pillow",
     "pycolmap", "dask", "distributed",
 )  # fmt: skip
-"""Packages that compute results, or that the machines talk through."""
+"""Packages that compute or transport results."""
 PROCESSOR = "processor"
-"""Name of the one entry that may differ: results then agree as numbers, but not byte by byte."""
+"""Entry that may differ: results then agree as numbers, not as bytes."""
 
 
 @cache
 def worker_versions() -> dict[str, str]:
-    """Return the versions of Python, of the program and its plug-ins, of libraries, and the kind of processor."""
+    """Return the versions of Python, program, plug-ins and libraries, and the kind of processor."""
     plugins = {point.dist.name: point.dist.version for point in entry_points(group="sfm_app") if point.dist}
     return {
         "python": ".".join(platform.python_version_tuple()[:2]),
         **{name: _version(name) for name in LIBRARIES},
-        **{name: found for name, found in sorted(plugins.items()) if name != "sfm-app"},
+        **{name: number for name, number in sorted(plugins.items()) if name != "sfm-app"},
         "the program's files": _digest_program(),
         PROCESSOR: _processor(),
     }
 
 
 def differences(ours: Mapping[str, str], theirs: Mapping[str, str]) -> list[str]:
-    """Return what differs between two machines, as texts such as "numpy 2.1 instead of 2.0"; the processor may.
-
-    Args:
-        ours: versions of this machine.
-        theirs: versions of a worker.
-    """
+    """Return the differing versions, such as "numpy 2.1 instead of 2.0"; processors may differ."""
     names = [name for name in {**ours, **theirs} if name != PROCESSOR and ours.get(name) != theirs.get(name)]
     return [f"{name} {theirs.get(name, 'missing')} instead of {ours.get(name, 'none')}" for name in names]
 
@@ -216,11 +216,11 @@ def _version(name: str) -> str:
 
 
 def _digest_program() -> str:
-    """Return a hash of the program's source, which two checkouts of the same version may differ in."""
-    found, root = hashlib.blake2b(digest_size=6), Path(__file__).parents[2]
+    """Return a hash of the package's source files: two checkouts of one version may differ."""
+    digest, root = hashlib.blake2b(digest_size=6), Path(__file__).parents[1]
     for path in sorted(root.rglob("*.py")):
-        found.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
-    return found.hexdigest()
+        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def _processor() -> str:
@@ -229,51 +229,50 @@ def _processor() -> str:
     return str(llvmlite.binding.get_host_cpu_name())
 
 
-# What a worker of the cluster does: checks that it fits, applies a task to some items, and reports.
+# The work of a worker: check the versions, apply a task to some items, reply.
 
-OF_THE_MACHINE = (OSError, MemoryError, BackendError)
-"""Errors that a machine may be to blame for: a full disk, little memory, a folder that is not mounted."""
-_FITS: set["Probe"] = set()
+MACHINE_ERRORS = (OSError, MemoryError, BackendError)
+"""Errors with causes on one machine: a full disk, little memory, a folder that is not mounted."""
+_PASSED: set["Probe"] = set()
 """Probes that this process has passed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """What a worker has to have: the same versions, and the same folder."""
+    """Requirements that each worker has to meet: versions, and the shared folder."""
 
     versions: tuple[tuple[str, str], ...]
     folder: str
-    """Folder of parcels, in the output folder."""
+    """For large values, in the output folder."""
     name: str
-    """File in it that the coordinator has written."""
+    """File in it that the coordinator wrote."""
 
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A task and some of its items, on the way to a worker."""
+    """A task and some of its items."""
 
     probe: Probe
-    function: Parcel
-    items: Parcel
+    function: Serialized
+    items: Serialized
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """What a worker has to say of a call."""
+    """Results of a call, and its cost."""
 
-    results: Parcel | None = None
-    """List of the results of the first items, up to one that failed."""
+    results: Serialized | None = None
+    """Of the items before the first one that failed."""
     error: Exception | None = None
     """Of the first item that failed."""
-    is_of_machine: bool = False
-    """Whether the error may be the machine's."""
+    is_machine_error: bool = False
     unfit: str = ""
-    """Why the worker cannot be used; it has not begun."""
+    """Why the worker cannot be used; empty if it can."""
     worker: str = ""
-    """Its address, where it cannot be used."""
+    """Address of an unfit worker."""
     seconds: float = 0.0
     cpu_seconds: float = 0.0
-    """Of the worker, and of processes that it has waited for."""
+    """Of the worker and its finished child processes."""
 
 
 def answer(call: Call) -> Reply:
@@ -286,41 +285,46 @@ def answer(call: Call) -> Reply:
     _use_one_thread()
     results: list[Any] = []
     error: Exception | None = None
-    is_of_machine = False
+    is_machine_error = False
     try:
-        function = unpack(call.function)
-        for item in unpack(call.items):
-            results.append(function(item))  # noqa: PERF401 - what was done before an error is kept
-    except Exception as err:  # of whatever kind: the coordinator raises it
+        function = deserialize(call.function)
+        for item in deserialize(call.items):
+            results.append(function(item))  # noqa: PERF401 - results before an error count
+    except Exception as err:  # the coordinator raises it
         error = picklable(err)
-        is_of_machine = isinstance(err, OF_THE_MACHINE)
-    packed = Packer(Path(call.probe.folder)).pack(results)
+        is_machine_error = isinstance(err, MACHINE_ERRORS)
+    serialized = Serializer(Path(call.probe.folder)).serialize(results)
     took, used = time.perf_counter() - start, cpu_seconds() - spent
-    return Reply(packed, error, is_of_machine=is_of_machine, seconds=took, cpu_seconds=used)
+    return Reply(serialized, error, is_machine_error=is_machine_error, seconds=took, cpu_seconds=used)
 
 
 def find_misfit(probe: Probe) -> str:
-    """Return why this process cannot be a worker of a run; empty where it can."""
-    if probe in _FITS:
+    """Return why this process cannot work for a run; empty if it can."""
+    if probe in _PASSED:
         return ""
     if wrong := differences(dict(probe.versions), worker_versions()):
         return "it has " + ", ".join(wrong)
-    place = Path(probe.folder)
+    folder = Path(probe.folder)
     try:
-        if (place / probe.name).read_text(encoding="utf-8") != probe.name:
-            return f"it has another {place.parent}"
-        mark = place / f".{os.getpid()}-{time.monotonic_ns()}"
+        if (folder / probe.name).read_text(encoding="utf-8") != probe.name:
+            return f"it has another {folder.parent}"
+        mark = folder / f".{os.getpid()}-{time.monotonic_ns()}"
         mark.touch()
         mark.unlink()
     except OSError as err:
-        return f"{place.parent} cannot be used there: {err.strerror or err}"
-    _FITS.add(probe)
+        return f"{folder.parent} cannot be used there: {err.strerror or err}"
+    _PASSED.add(probe)
     return ""
 
 
 def picklable(err: Exception) -> Exception:
-    """Return an error as it can travel: itself, or its text where it cannot be pickled."""
-    return err if survives_travel(err) else RuntimeError(f"{type(err).__name__}: {err}")
+    """Return the error, or its text where it cannot be pickled and read again."""
+    try:
+        if type(pickle.loads(pickle.dumps(err))) is type(err):  # noqa: S301 - its own bytes
+            return err
+    except Exception:  # noqa: S110 - `__reduce__` and `__init__` may raise anything
+        pass
+    return RuntimeError(f"{type(err).__name__}: {err}")
 
 
 def _use_one_thread() -> None:
@@ -331,33 +335,24 @@ def _use_one_thread() -> None:
         cv2.setNumThreads(1)
 
 
-# A Dask cluster: one that runs somewhere, or some processes of this machine that end with the run.
+# The connection: to a running cluster, or to processes of this machine that end with the run.
 
-logger = logging.getLogger("sfm_app")
-
-GOES_ON = "start it again, and the same command goes on where this one stopped; or leave --cluster out"
-LOOK_S = 2.0
-"""Time between two looks at which workers there are, in seconds. Chosen by hand."""
-CONNECTING_S = 10.0
-"""Most seconds that a scheduler, or a worker, may take to answer a connection. Chosen by hand."""
-CLOSING_S = 5.0
-"""Most seconds that it takes to say good-bye to a scheduler. Chosen by hand."""
+RESUME_HINT = "start it again, and the same command resumes; or leave --cluster out"
 
 
 def local_workers(address: str) -> int:
-    """Return how many processes of this machine an address such as `local:2` asks for; 0 for any other."""
-    found = LOCAL_ADDRESS.fullmatch(address)
-    return int(found[1]) if found else 0
+    """Return the number of processes that an address such as `local:2` asks for; 0 for other addresses."""
+    local = LOCAL_ADDRESS.fullmatch(address)
+    return int(local[1]) if local else 0
 
 
 class Cluster:
-    """The workers of a cluster, as the process that the user has started sees them.
+    """The workers of a cluster, seen from the coordinating process.
 
     Args:
         client: Dask's client.
-        folder: for large values on their way, in the output folder.
-        settings: how long to wait.
-        limit: most workers that may work at once; 0 for all. Those of this machine share its memory.
+        folder: for large values, in the output folder.
+        limit: most workers at once; 0 for all. Those of this machine share its memory.
     """
 
     def __init__(self, client: Any, folder: Path, settings: ClusterSettings, limit: int = 0) -> None:
@@ -381,90 +376,84 @@ class Cluster:
         return max(1, self._count_threads())
 
     def _count_threads(self) -> int:
-        """Return the threads of all workers as of a moment ago; each question takes the scheduler some time."""
+        """Return the threads of all workers; the scheduler is asked at most every `look_s` seconds."""
         if self.client.status != "running":
             raise self.make_loss_error()
         now = time.monotonic()
-        if now - self._looked_at > LOOK_S:
+        if now - self._looked_at > OPTIONS.look_s:
             self._threads = int(self.client.scheduler_info(n_workers=0).get("total_threads", -1))
             self._looked_at = now
-        if self._threads < 0:  # the connection broke meanwhile
+        if self._threads < 0:  # the connection broke
             raise self.make_loss_error()
         return self._threads
 
     def probe(self) -> Probe:
-        """Return what a worker has to have, after checking that all those that are there have it.
+        """Return the requirements of this run, after checking all present workers.
 
         Raises:
-            ClusterError: one of them has other versions, or does not see the output folder.
+            ClusterError: a worker has other versions, or does not see the output folder.
         """
         if self._probe is None:
             self.folder.mkdir(parents=True, exist_ok=True)
             name = f"probe-{secrets.token_hex(8)}.txt"
             (self.folder / name).write_text(name, encoding="utf-8", newline="\n")
             probe = Probe(tuple(worker_versions().items()), str(self.folder.resolve()), name)
-            found = self.ask_all(find_misfit, probe)
-            self._refuse({worker: why for worker, why in found.items() if why})
+            reasons = self.ask_all(find_misfit, probe)
+            self._refuse({worker: reason for worker, reason in reasons.items() if reason})
             self._probe = probe
         return self._probe
 
     def check_versions(self) -> list[str]:
-        """Check that all workers have the same versions, and return the other kinds of processors among them.
+        """Return the other kinds of processors among the workers.
 
         Raises:
-            ClusterError: one has not.
+            ClusterError: a worker has other versions.
         """
         ours = worker_versions()
-        found = self.ask_all(worker_versions)
-        wrong = {worker: differences(ours, theirs) for worker, theirs in found.items()}
-        self._refuse({worker: "it has " + ", ".join(what) for worker, what in wrong.items() if what})
-        return sorted({theirs[PROCESSOR] for theirs in found.values()} - {ours[PROCESSOR]})
+        others = self.ask_all(worker_versions)
+        wrong = {worker: differences(ours, theirs) for worker, theirs in others.items()}
+        self._refuse({worker: "it has " + ", ".join(texts) for worker, texts in wrong.items() if texts})
+        return sorted({theirs[PROCESSOR] for theirs in others.values()} - {ours[PROCESSOR]})
 
     def _refuse(self, unfit: dict[str, str]) -> None:
-        for worker, why in unfit.items():
+        for worker, reason in unfit.items():
             raise ClusterError(
-                f"the worker {worker} cannot be used: {why}",
+                f"the worker {worker} cannot be used: {reason}",
                 hint="every machine needs the same installation, and OUT under the same path: see docs/cluster.md",
             )
 
     def ask_all(self, question: Any, *about: Any) -> dict[str, Any]:
-        """Return the answer of each worker by its address, without those that cannot be reached at the moment.
+        """Return the answer of each reachable worker, by its address.
 
         Raises:
             ClusterError: none answers, or one does not have the program.
         """
         try:
-            found = dict(self.client.run(question, *about, on_error="return"))
-        except Exception as err:  # of whatever kind: the scheduler itself could not ask
+            answers = dict(self.client.run(question, *about, on_error="return"))
+        except Exception as err:  # the scheduler itself could not ask
             raise self.make_loss_error() from err
-        for worker, said in list(found.items()):
-            if isinstance(said, OSError):  # its connection broke: it has left, or it will be back and be asked again
-                logger.info("the worker %s does not answer: %s", worker, said)
-                del found[worker]
-            elif isinstance(said, Exception):
-                self._refuse({worker: f"it cannot run the program: {said}"})
-        if not found:
-            raise ClusterError(f"no worker of {self.address} answers", hint=GOES_ON)
-        return found
+        for worker, reply in list(answers.items()):
+            if isinstance(reply, OSError):  # its connection broke: it has left, or it is asked again later
+                logger.info("the worker %s does not answer: %s", worker, reply)
+                del answers[worker]
+            elif isinstance(reply, Exception):
+                self._refuse({worker: f"it cannot run the program: {reply}"})
+        if not answers:
+            raise ClusterError(f"no worker of {self.address} answers", hint=RESUME_HINT)
+        return answers
 
     def submit(self, call: Call, key: str) -> Any:
-        """Send a call to some worker, and return Dask's future of its reply.
-
-        Args:
-            call: what to do.
-            key: name that is new.
-        """
+        """Send a call to some worker, and return Dask's future of its reply; the key is unique."""
         try:
             return self.client.submit(answer, call, key=key, pure=False)
         except Exception as err:  # the client is closed, or its connection broke
             raise self.make_loss_error() from err
 
     def wait(self, future: Any, what: str) -> Reply | None:
-        """Return the reply of a call, None where it has ended every worker that it met.
+        """Return the reply of a call; None if each worker that tried it ended.
 
         Args:
-            future: of the call.
-            what: is done, for messages.
+            what: name of the task, for messages.
 
         Raises:
             ClusterError: the scheduler is gone, or it has had no workers for too long.
@@ -484,24 +473,20 @@ class Cluster:
                 raise self.make_loss_error() from err
             except KilledWorker:
                 return None
-            except Exception as err:  # the worker could not even begin
+            except Exception as err:  # the worker could not begin
                 raise ClusterError(f"{what} cannot run on a worker: {err}", hint="see docs/cluster.md") from err
             self._empty_since = None
             self.cpu_seconds += reply.cpu_seconds
             return reply  # type: ignore[no-any-return]
 
     def leave_out(self, address: str) -> None:
-        """Remove a worker that cannot be used.
-
-        Args:
-            address: of the worker.
-        """
+        """Remove an unfit worker."""
         with contextlib.suppress(Exception):  # it may be gone already
             self.client.retire_workers([address], close_workers=True)
 
     def make_loss_error(self) -> ClusterError:
         """Return the error that says that the scheduler is gone."""
-        return ClusterError(f"the scheduler of the cluster ({self.address}) is gone", hint=GOES_ON)
+        return ClusterError(f"the scheduler of the cluster ({self.address}) is gone", hint=RESUME_HINT)
 
     def _check_alive(self) -> None:
         if self._count_threads():
@@ -512,20 +497,19 @@ class Cluster:
         if now - self._empty_since > self.settings.wait_s:
             raise ClusterError(
                 f"the cluster {self.address} has had no workers for {self.settings.wait_s:.0f} seconds",
-                hint="start workers; the same command goes on where this one stopped",
+                hint="start workers; the same command resumes",
             )
 
 
 @contextlib.contextmanager
 def connect(settings: ClusterSettings, folder: Path) -> Iterator[Cluster]:
-    """Provide the cluster of an address; one on this machine is made, and ends with the block in any case.
+    """Provide the cluster of an address; a cluster on this machine ends with the block.
 
     Args:
-        settings: its address, `HOST:PORT` or `local:N`.
-        folder: for large values on their way, in the output folder.
+        folder: for large values, in the output folder.
 
     Raises:
-        ConfigError: Dask is not installed, or the address is none.
+        ConfigError: Dask is not installed.
         ClusterError: no scheduler answers, or it has no workers.
     """
     count = local_workers(settings.address)
@@ -539,13 +523,13 @@ def connect(settings: ClusterSettings, folder: Path) -> Iterator[Cluster]:
     import dask
 
     with contextlib.ExitStack() as stack:
-        stack.enter_context(dask.config.set({"distributed.comm.timeouts.connect": f"{CONNECTING_S:.0f}s"}))
+        stack.enter_context(dask.config.set({"distributed.comm.timeouts.connect": f"{OPTIONS.connecting_s:.0f}s"}))
         address = stack.enter_context(_local_scheduler(settings.wait_s)) if count else settings.address
         try:
             client = distributed.Client(address, timeout=settings.wait_s, set_as_default=False)
         except (OSError, ValueError, TypeError) as err:
             logger.info("no scheduler answers", exc_info=err)
-            raise ClusterError(f"no scheduler answers at {settings.address}", hint=GOES_ON) from err
+            raise ClusterError(f"no scheduler answers at {settings.address}", hint=RESUME_HINT) from err
         stack.callback(_close, client)
         if count:
             stack.enter_context(_start_workers(address, count))
@@ -574,16 +558,15 @@ def _local_scheduler(wait_s: float) -> Iterator[str]:
         yield str(scheduler.scheduler_address)
     finally:
         with contextlib.suppress(Exception):
-            scheduler.close(timeout=min(CLOSING_S, wait_s))
+            scheduler.close(timeout=min(OPTIONS.closing_s, wait_s))
 
 
 @contextlib.contextmanager
 def _start_workers(address: str, count: int) -> Iterator[None]:
-    """Run workers in processes that end with the block, and with this process, however that ends."""
+    """Run worker processes that end with the block, and with this process."""
     with tempfile.TemporaryDirectory(prefix="sfm-app-workers-", ignore_cleanup_errors=True) as scratch:
         command: Sequence[str] = (
-            sys.executable, "-P", "-m", "sfm_app.runtime.local_workers", address, str(count), scratch,
-            str(os.getpid()),
+            sys.executable, "-P", "-m", "sfm_app.runtime.cluster", address, str(count), scratch, str(os.getpid()),
         )  # fmt: skip
         with subprocess.Popen(  # noqa: S603 - our module
             command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
@@ -592,90 +575,102 @@ def _start_workers(address: str, count: int) -> Iterator[None]:
             try:
                 yield
             finally:
-                end_group(process, CLOSING_S)
+                end_group(process, OPTIONS.closing_s)
 
 
 def _close(client: Any) -> None:
-    """Leave a scheduler, also one that is gone."""
     with contextlib.suppress(Exception):
-        client.close(timeout=CLOSING_S)
+        client.close(timeout=OPTIONS.closing_s)
 
 
 def _quiet() -> None:
-    """Keep Dask's own messages off the terminal: what matters is said in one line by this program."""
+    """Silence Dask's own messages; this program reports errors in one line."""
     known = [name for name in logging.root.manager.loggerDict if name.startswith("distributed.")]
     for name in ("distributed", "tornado", "asyncio", *known):
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
 
-# An executor that sends tasks to a cluster, and does everything else in threads of this process.
+def run_local_workers(scheduler: str, count: str, scratch: str, parent: str) -> None:
+    """Run `count` workers until the process with the number `parent` ends; `scratch` is Dask's folder."""
+    import dask
+    from distributed.cli.dask_worker import main as run_workers
 
-Result = TypeVar("Result")
+    dask.config.set({"distributed.worker.profile.enabled": False})  # it samples all threads a hundred times a second
+    watch_parent(int(parent), end_own_group)
+    options = {
+        "nworkers": count, "nthreads": "1", "memory-limit": "0", "local-directory": scratch, "no-dashboard": "",
+        "death-timeout": "60",
+    }  # fmt: skip
+    run_workers([scheduler, *(f"--{name}={value}" if value else f"--{name}" for name, value in options.items())])
 
-IN_FLIGHT = 3
-"""Calls on their way for each thread of the cluster: one that runs, one that waits beside it, one that comes back."""
-CALL_S = 0.4
-"""Seconds that a call should take: short items travel together, since each call costs some milliseconds."""
-MOST_ITEMS = 32
-"""Most items of a call: a worker that is lost costs no more. Chosen by hand, like those before."""
+
+# The executor: tasks go to the cluster, other functions to threads of this process.
 
 
 @dataclass(slots=True, eq=False)
 class _Flight:
-    """Some items on their way."""
+    """Items sent to a worker."""
 
     items: list[Any]
     future: Any = field(default=None)
 
 
-class ClusterExecutor(ThreadPoolExecutor):
+class ClusterExecutor(RemoteExecutor):
     """Threads of this process, and a cluster for tasks.
 
     Args:
-        cluster: does tasks.
-        workers: threads, for everything that is no task; and how many tasks may run at once on this machine.
+        workers: number of threads; on this machine, also the most tasks at once.
     """
 
     def __init__(self, cluster: Cluster, workers: int) -> None:
         super().__init__(max_workers=workers, thread_name_prefix="sfm")
         self.cluster, self.workers = cluster, workers
 
-    def spread(self, task: Task[Result], items: Iterable[Any]) -> Iterator[Result]:
-        """Yield the results of a task for all items, in their order.
+    def resized(self, workers: int) -> "ClusterExecutor":
+        """Return an executor of the same cluster with another number of threads."""
+        return ClusterExecutor(self.cluster, workers)
 
-        A call whose worker is lost is done by another. What fails for a reason that may be the machine's is done once
-        more in this process.
+    def threads_elsewhere(self) -> int:
+        """Return how many tasks the cluster does at once."""
+        return self.cluster.threads()
+
+    def cpu_seconds_elsewhere(self) -> float:
+        """Return the CPU seconds of all tasks that the cluster has finished."""
+        return self.cluster.cpu_seconds
+
+    def spread(self, task: Task[Result], items: Iterable[Any]) -> Iterator[Result]:
+        """Yield the results of a task in the order of the items.
+
+        Another worker repeats a call whose worker is lost. This process repeats items that fail with a machine error.
 
         Args:
-            task: what is done.
             items: drawn only as they are needed.
 
         Raises:
-            ClusterError: the scheduler is gone, or an item ends every worker that it meets.
+            ClusterError: the scheduler is gone, or an item ends each worker that tries it.
         """
-        with packing(self.cluster.folder) as packer:
-            yield from _Spreading(self, task, packer).results(iter(items))
+        with open_serializer(self.cluster.folder) as serializer:
+            yield from _Spreading(self, task, serializer).results(iter(items))
 
     def count_in_flight(self) -> int:
-        """Return how many calls may be on their way; on this machine, the memory is what was planned for."""
+        """Return the most calls in flight; on this machine, planned memory limits them."""
         threads = self.cluster.threads()
-        narrow = self.cluster.limit > self.workers
-        return self.workers if narrow else IN_FLIGHT * threads
+        return self.workers if self.cluster.limit > self.workers else OPTIONS.in_flight * threads
 
 
 class _Spreading:
-    """One task on its way through all items."""
+    """One task applied to all items."""
 
-    def __init__(self, executor: ClusterExecutor, task: Task[Any], packer: Packer) -> None:
-        self.executor, self.cluster, self.task, self.packer = executor, executor.cluster, task, packer
+    def __init__(self, executor: ClusterExecutor, task: Task[Any], serializer: Serializer) -> None:
+        self.executor, self.cluster, self.task, self.serializer = executor, executor.cluster, task, serializer
         self.probe = self.cluster.probe()
-        self.function: Parcel = packer.pack(task)
+        self.function: Serialized = serializer.serialize(task)
         self.name = getattr(task.func, "__name__", "task").lstrip("_")
         self._keys = (f"sfm-{self.name}-{secrets.token_hex(6)}-{number}" for number in count())
         self._size = 1
 
     def results(self, items: Iterator[Any]) -> Iterator[Any]:
-        """Yield results in the order of the items; what is on its way is canceled where the caller stops."""
+        """Yield results in the order of the items; calls in flight are canceled if the caller stops."""
         flights: deque[_Flight] = deque()
         try:
             while True:
@@ -692,58 +687,58 @@ class _Spreading:
             self._cancel(flights)
 
     def _send(self, items: list[Any]) -> _Flight:
-        call = Call(self.probe, self.function, self.packer.pack(items))
+        call = Call(self.probe, self.function, self.serializer.serialize(items))
         return _Flight(items, self.cluster.submit(call, next(self._keys)))
 
     def _land(self, flight: _Flight) -> Iterator[Any]:
-        """Yield the results of some items, wherever they are computed in the end."""
+        """Yield the results of one call."""
         reply = self._wait(flight)
-        if reply is None:  # they need not be to blame: what waited on the same workers counts as lost with them, too
+        if reply is None:  # calls that waited on the lost workers count as lost, too: find the one to blame
             for item in flight.items:
                 yield from self._land_alone(item)
             return
-        done = unpack(reply.results, remove=True) if reply.results is not None else []
+        done = deserialize(reply.results, remove=True) if reply.results is not None else []
         self._adapt(reply, len(done))
         yield from done
-        left = flight.items[len(done) :]
-        if reply.error is not None and reply.is_of_machine:
-            logger.info("%s is done here, since a worker failed: %s", self.name, reply.error, exc_info=reply.error)
-            for item in left:
+        rest = flight.items[len(done) :]
+        if reply.error is not None and reply.is_machine_error:
+            logger.info("this process does %s, since a worker failed: %s", self.name, reply.error, exc_info=reply.error)
+            for item in rest:
                 yield self.executor.submit(self.task, item).result()
         elif reply.error is not None:
             raise reply.error
 
     def _land_alone(self, item: Any) -> Iterator[Any]:
-        """Yield the result of an item that has lost its workers, sent once more and alone."""
+        """Yield the result of an item that lost its workers, sent once more and alone."""
         flight = self._send([item])
         reply = self._wait(flight)
         if reply is None:
             raise ClusterError(
                 f"{self.name} of {describe_item(item)} ended every worker that tried: perhaps their memory was full",
-                hint="give workers more memory, or use --quality draft; the same command goes on",
+                hint="give workers more memory, or use --quality draft; the same command resumes",
             )
-        if reply.error is not None and not reply.is_of_machine:
+        if reply.error is not None and not reply.is_machine_error:
             raise reply.error
         if reply.error is not None or reply.results is None:
             yield self.executor.submit(self.task, item).result()
         else:
-            yield from unpack(reply.results, remove=True)
+            yield from deserialize(reply.results, remove=True)
 
     def _wait(self, flight: _Flight) -> Reply | None:
-        """Return the reply of a call; a worker that cannot be used is left out, and the call is sent again."""
+        """Return the reply of a call; an unfit worker is removed, and the call is sent again."""
         while True:
             reply = self.cluster.wait(flight.future, self.name)
             if reply is None or not reply.unfit:
                 return reply
-            logger.info("a worker is left out: %s", reply.unfit)
+            logger.info("the program removes a worker: %s", reply.unfit)
             self.cluster.leave_out(reply.worker)
             flight.future = self._send(flight.items).future
 
     def _adapt(self, reply: Reply, done: int) -> None:
-        """Choose how many items travel together from how long they took."""
+        """Choose the number of items per call from the duration of the last one."""
         if done:
-            wanted = CALL_S * done / max(reply.seconds, 1e-6)
-            self._size = max(1, min(MOST_ITEMS, int(wanted), 2 * self._size))
+            best = OPTIONS.call_s * done / max(reply.seconds, 1e-6)
+            self._size = max(1, min(OPTIONS.most_items, int(best), 2 * self._size))
 
     def _cancel(self, flights: Iterable[_Flight]) -> None:
         futures = [flight.future for flight in flights]
@@ -752,8 +747,12 @@ class _Spreading:
 
 
 def describe_item(item: object) -> str:
-    """Return a few words that tell which item of a task it is."""
+    """Return a short name of an item of a task."""
     name = getattr(item, "name", None) or getattr(item, "pair", None)
     if name is None and isinstance(item, str | int | tuple):
         name = item
     return str(name)[:80] if name is not None else type(item).__name__
+
+
+if __name__ == "__main__":
+    run_local_workers(*sys.argv[1:])

@@ -1,4 +1,4 @@
-"""What a stage gets besides its inputs: settings, workers, progress, and a place to record its figures."""
+"""The context of a stage: settings, workers, progress, output folder, earlier run, statistics."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -17,38 +17,32 @@ from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.types import ControlPoints, GivenCameras, Model
 
-# What a finished run of other photos in the same folder left behind, for stages that go on from it.
-
 
 @dataclass(frozen=True, slots=True)
 class Earlier:
-    """Stages of an earlier run with the same settings and versions, whose photos partly are those of this run."""
+    """Finished stages of an earlier run with the same settings and versions, and other photos."""
 
     place: Workspace
-    """Where their files were put; not to be changed."""
+    """Folder of their files; read only."""
     stages: tuple[str, ...]
-    """Names of the stages whose files are complete, in order."""
+    """Names of the stages with complete files, in order."""
     fingerprint: str
-    """Hash of what these stages were made from."""
+    """Hash of the inputs of these stages."""
     known: frozenset[str]
-    """Names of the photos that are the same: in content, name, size, camera group and mask."""
+    """Names of the unchanged photos: same content, name, size, camera group and mask."""
     new: frozenset[str]
-    """Names of photos that came, or that were replaced."""
+    """Names of added or replaced photos."""
     gone: frozenset[str]
-    """Names of photos that were taken away, or replaced."""
+    """Names of removed or replaced photos."""
 
     @property
     def text(self) -> str:
-        """What changed, for people."""
-        left = f", {len(self.gone - self.new)} left" if self.gone - self.new else ""
-        return f"{len(self.known)} photos are known, {len(self.new)} are new{left}"
+        """The change of photos in words."""
+        removed = f", {len(self.gone - self.new)} are gone" if self.gone - self.new else ""
+        return f"{len(self.known)} photos are known, {len(self.new)} are new{removed}"
 
     def with_replaced(self, names: Collection[str]) -> "Earlier":
-        """Return the same, with some known photos as replaced ones.
-
-        Args:
-            names: of photos whose features are not those that the earlier run found.
-        """
+        """Return the same, with photos whose features differ from the earlier run's as replaced ones."""
         changed = self.known.intersection(names)
         return replace(self, known=self.known - changed, new=self.new | changed, gone=self.gone | changed)
 
@@ -56,12 +50,7 @@ class Earlier:
 def split_names(
     before: Mapping[str, str], now: Mapping[str, str]
 ) -> tuple[frozenset[str], frozenset[str], frozenset[str]]:
-    """Return the names of photos that stayed the same, that are new, and that are gone; a replaced one is both.
-
-    Args:
-        before: hash of each photo of the earlier run, by name.
-        now: those of this run.
-    """
+    """Return the names of known, new and gone photos from hashes by name; a replaced photo is new and gone."""
     known = frozenset(name for name, digest in now.items() if before.get(name) == digest)
     return known, frozenset(now) - known, frozenset(before) - known
 
@@ -70,11 +59,9 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 STANDARD_FORMATS = ("ply", "glb")
-"""Formats in which every run writes its models; `sfm-app export` writes others."""
-
+"""Formats of the models of every run; `sfm-app export` writes others."""
 GIVEN_CAMERAS, CONTROL_POINTS = "given_cameras", "control_points"
-"""Names by which a stage says, among its settings, that it depends on what the calibration file, or the file of ground
-control points, holds."""
+"""Entries of `Stage.settings` for the content of the calibration file, and of the file of ground control points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,28 +75,27 @@ class RunContext:
     workers: int
     progress: Progress = field(default_factory=SilentProgress)
     fingerprint: str = ""
-    """Hash of everything that the stage's result depends on."""
+    """Hash of everything that determines the stage's result."""
     given: GivenCameras = field(default_factory=GivenCameras)
-    """Cameras that the user knows."""
+    """Cameras from the user's calibration file."""
     control_points: ControlPoints = field(default_factory=ControlPoints)
-    """Ground control points that the user knows."""
     earlier: Earlier | None = None
-    """What the stage may go on from: files of a run with other photos; None where everything is done afresh."""
+    """Files of a run with other photos, from which the stage may resume."""
     statistics: dict[str, Any] = field(default_factory=dict)
-    """What the stage has counted so far, for the manifest; no part of a product is read from here."""
+    """Figures of the stage for the manifest; no part of a product is read from here."""
 
     def with_fingerprint(self, fingerprint: str) -> "RunContext":
-        """Return the same run for a stage that has counted nothing yet."""
+        """Return the same run for another stage, without statistics."""
         return replace(self, fingerprint=fingerprint, statistics={})
 
     @property
     def seed(self) -> int:
-        """The run's seed; parts derive theirs from it and from their own ids."""
+        """The run's seed; parts derive their seeds from it and from their ids."""
         return self.settings.seed
 
     @property
     def spread(self) -> int:
-        """How many tasks a cluster does at once; 0 where they stay in this process."""
+        """Tasks at once on a cluster; 0 without a cluster."""
         return threads_elsewhere(self.executor)
 
     @property
@@ -125,40 +111,29 @@ class RunContext:
 
     @property
     def mask_dir(self) -> Path | None:
-        """Folder of the laid-out masks of all photos; None where no masks are given."""
+        """Folder of the masks; None without masks."""
         return self.workspace.masks if self.settings.photos.masks else None
 
     def map(self, function: Callable[[Item], Result], items: Sequence[Item], label: str) -> list[Result]:
-        """Return results in the order of the items, computed in parallel, with a progress bar.
-
-        Args:
-            function: applied to each item.
-            items: its arguments.
-            label: what is done, for people.
-        """
+        """Return results in the order of the items, computed in parallel, with a progress bar of this label."""
         results = ordered_map(self.executor, function, items, ahead=2 * self.workers)
         return list(track(self.progress, results, label, len(items)))
 
     @contextmanager
     def step(self, label: str) -> Iterator[None]:
-        """Show that a long piece of work without measurable progress is under way."""
+        """Show work without measurable progress."""
         yield from track(self.progress, [None], label, 1)
 
     def record(self, **figures: Any) -> None:
-        """Note figures of the stage for the manifest; plain numbers, strings, lists and dicts."""
+        """Add figures to the stage's statistics: plain numbers, strings, lists and dicts."""
         self.statistics.update(figures)
 
     def model_paths(self, name: str) -> tuple[Path, ...]:
-        """Return the paths of a model of this name in the output folder."""
+        """Return the paths of a model in the output folder, one per standard format."""
         return tuple(self.workspace.root / f"{name}.{suffix}" for suffix in STANDARD_FORMATS)
 
     def write_model(self, model: Model, name: str) -> tuple[Path, ...]:
-        """Write a model into the output folder in every standard format and note how large the files are.
-
-        Args:
-            model: the finished model.
-            name: of the files, without suffix.
-        """
+        """Write a model in every standard format under this name, and record the sizes of the files."""
         paths = self.model_paths(name)
         for suffix in STANDARD_FORMATS:
             save_files(self.plugins.exporter(suffix).write(model, name), self.workspace.root)

@@ -5,11 +5,10 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from sfm_app.operating_system import usable_cores
 from sfm_app.progress import Progress
-from sfm_app.runtime.cluster import ClusterExecutor, connect, local_workers
 from sfm_app.settings import Settings
 from sfm_app.tasks import Task
 
@@ -17,20 +16,39 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def worker_count(wanted: int) -> int:
+class RemoteExecutor(ThreadPoolExecutor):
+    """Threads of this process, and workers elsewhere for tasks, such as `runtime.cluster.ClusterExecutor`."""
+
+    def resized(self, workers: int) -> "RemoteExecutor":
+        """Return an executor with the same workers elsewhere and another number of threads."""
+        raise NotImplementedError
+
+    def spread(self, task: Task[Result], items: Iterable[Any]) -> Iterator[Result]:
+        """Yield the results of a task in the order of the items."""
+        raise NotImplementedError
+
+    def threads_elsewhere(self) -> int:
+        """Return how many tasks the workers elsewhere do at once."""
+        raise NotImplementedError
+
+    def cpu_seconds_elsewhere(self) -> float:
+        """Return the CPU seconds of all tasks finished elsewhere."""
+        raise NotImplementedError
+
+
+def worker_count(setting: int) -> int:
     """Return the number of workers; 0 stands for one per core that this process may use."""
-    return wanted if wanted > 0 else usable_cores()
+    return setting if setting > 0 else usable_cores()
 
 
 def make_executor(workers: int, like: Executor | None = None) -> Executor:
     """Make a thread pool: the heavy work (numba, OpenCV, COLMAP) releases the GIL, and nothing has to be pickled.
 
     Args:
-        workers: threads.
-        like: where it sends tasks to a cluster, the new one does so, too.
+        like: an executor with workers elsewhere; the new one shares them.
     """
-    if isinstance(like, ClusterExecutor):
-        return ClusterExecutor(like.cluster, workers)
+    if isinstance(like, RemoteExecutor):
+        return like.resized(workers)
     return ThreadPoolExecutor(max_workers=workers, thread_name_prefix="sfm")
 
 
@@ -39,9 +57,7 @@ def open_executor(settings: Settings, folder: Path, progress: Progress) -> Itera
     """Provide the executor of a run, and its number of workers; both end with the block.
 
     Args:
-        settings: number of workers, and the cluster, if any.
-        folder: for large values on their way to the cluster, in the output folder; removed at the end.
-        progress: shows with whom the run works.
+        folder: for large values sent to a cluster, in the output folder; removed at the end.
 
     Raises:
         ConfigError: Dask is not installed.
@@ -52,13 +68,15 @@ def open_executor(settings: Settings, folder: Path, progress: Progress) -> Itera
         with make_executor(workers) as threads:
             yield threads, workers
         return
+    from sfm_app.runtime.cluster import ClusterExecutor, connect, local_workers
+
     workers = local_workers(settings.cluster.address) or worker_count(settings.workers)
     if not local_workers(settings.cluster.address):
-        waits = f"it may take {settings.cluster.wait_s:.0f} seconds to answer"
-        progress.say(f"looking for the cluster {settings.cluster.address}; {waits}")
+        address, wait_s = settings.cluster.address, settings.cluster.wait_s
+        progress.say(f"connecting to the cluster {address}; this may take {wait_s:.0f} seconds")
     with connect(settings.cluster, folder) as cluster:
         others = cluster.check_versions()
-        progress.say(f"{cluster.threads()} workers of the cluster {cluster.address}")
+        progress.say(f"the cluster {cluster.address} has {cluster.threads()} workers")
         if others:
             progress.say(f"workers with other processors ({', '.join(others)}): results may differ in the last digits")
         try:
@@ -73,17 +91,17 @@ def ordered_map(
 ) -> Iterator[Result]:
     """Yield results in the order of the items, with few of them in flight, so that memory stays bounded.
 
-    When the caller stops early or an item fails, the calls that have not begun are canceled.
+    If the caller stops early or an item fails, calls that have not begun are canceled.
 
     Args:
-        executor, function: its workers apply the function to each item; only a `Task` leaves this process.
+        function: only a `Task` leaves this process.
         items: drawn only as they are needed.
-        ahead: most items in flight; at least 1. On a cluster, its size decides.
+        ahead: most items in flight; at least 1. A cluster chooses its own number.
 
     Raises:
-        ClusterError: the cluster is gone, or a task ends every worker that it meets.
+        ClusterError: the cluster is gone, or a task ends each worker that tries it.
     """
-    if isinstance(executor, ClusterExecutor) and isinstance(function, Task):
+    if isinstance(executor, RemoteExecutor) and isinstance(function, Task):
         yield from executor.spread(function, items)
         return
     waiting: list[Future[Result]] = []
@@ -100,10 +118,10 @@ def ordered_map(
 
 
 def threads_elsewhere(executor: Executor) -> int:
-    """Return how many tasks other processes do at once for an executor; 0 where it has none."""
-    return executor.cluster.threads() if isinstance(executor, ClusterExecutor) else 0
+    """Return how many tasks other processes do at once for an executor; 0 without such processes."""
+    return executor.threads_elsewhere() if isinstance(executor, RemoteExecutor) else 0
 
 
 def cpu_seconds_elsewhere(executor: Executor) -> float:
-    """Return the CPU seconds of all tasks so far that other processes have done for an executor."""
-    return executor.cluster.cpu_seconds if isinstance(executor, ClusterExecutor) else 0.0
+    """Return the CPU seconds of all tasks that other processes have finished for an executor."""
+    return executor.cpu_seconds_elsewhere() if isinstance(executor, RemoteExecutor) else 0.0

@@ -1,4 +1,18 @@
-"""Adjust K, lens and relative poses to the matches of all pairs, without points."""
+"""Bundle adjustment without points: cameras and relative poses of all pairs, adjusted jointly to their matches.
+
+Ours. A pair has fifteen parameters: five of each camera (`pairs`), and five of its relative pose. The distance of a
+match is Sampson's (thesis 4.2) for rays, with E = [t]x R of thesis (5.7), in pixels of the photo as it is, so that
+undistorting does not change the weight of a pixel::
+
+    r = C / |dC/d(x1, y1, x2, y2)|,    C = q2' E q1,    q = ray of a pixel
+
+Matches that fit badly are downweighted by the cost r^2 / (1 + r^2 / c^2) with c = 3 sigma (Geman and McClure 1987).
+
+Every pair has its own pose, which is eliminated (Schur complement; Triggs and others 2000). What remains of a pair is
+its information about the cameras: one Hessian and one gradient. A pair with right matches but wrong geometry (repeated
+facades, another camera, a zoom) pulls at the cameras far harder than its noise explains, and is downweighted, as by
+thesis (5.23) and (5.24) in Algorithm 3.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,34 +28,50 @@ from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.selfcal.pairs import write_camera, write_ray
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-# Cost of the matches of photo pairs over cameras and poses: Sampson distances of E = [t]x R, and derivatives.
-#
-# A pair has fifteen parameters: five of each camera (`lens`), and the five of its relative pose. The distance of a
-# match is Sampson's, in pixels of the photo as it is, so that undistorting does not change the weight of a pixel::
-#
-# r = C / |dC/d(x1, y1, x2, y2)|, C = q2' E q1, q = ray of a pixel
-#
-# That is Eq. 4.2 of the thesis for rays, with E of Eq. 5.7; adjusting cameras by it is ours. Matches that fit badly
-# are downweighted by the cost r^2 / (1 + r^2 / c^2) with c = 3 sigma (Geman and McClure 1987).
-
 CAMERA = 5
-"""Parameters of one camera. Counted: log f, u, v, log a, kappa, by definition in `lens`."""
+"""Parameters of one camera: log f, u, v, log a, kappa, by definition in `pairs`."""
 PAIR = 2 * CAMERA + POSE_DOF
 """Parameters of a pair: two cameras and a pose, by definition."""
 ROBUST_SCALE = 3.0
-"""c of the robust cost, in sigma. docs/algorithms.md, Self-calibration, 2. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
+"""c of the robust cost, in sigma. docs/algorithms.md, Self-calibration, 2; by hand."""
 OVERFLOW_LIMIT = 1e60
-"""Squared distances in sigma^2, or derivatives, above this count as not finite. Its square is finite in double
-precision."""
+"""Squared distances in sigma^2, or derivatives, above this are not finite; its square is, in double precision."""
 _STEP = 1e-6
-"""Step of the parameters for finite differences: curvature causes a relative error of about 1e-6, rounding in double
-precision 1e-10. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+"""Step of finite differences in the parameters: curvature costs about 1e-6, rounding 1e-10; by hand."""
+
+
+@dataclass(frozen=True, slots=True)
+class AdjustmentOptions:
+    """Weights of matches and pairs, and the end of the adjustment."""
+
+    most_matches: int = 1000
+    """Most matches of one pair; more are not independent, and would let one pair outvote all others. With 300, errors
+    and deviations are half as large again (docs/algorithms.md, Self-calibration, Tried and left out)."""
+    conflict: float = 3.0
+    """Log-likelihood gain from own cameras at which a pair's weight is a quarter. By definition of chi^2 with two
+    degrees of freedom, noise alone gains as much once in twenty times: exp(-3)."""
+    own_camera_sigmas: tuple[float, ...] = (0.3, 0.15, 0.15, 0.2, 0.2)
+    """Standard deviations of a pair's own cameras from the common ones, in log f, u, v, log a, kappa; by hand."""
+    least_sigma_px: float = 0.1
+    """Least standard deviation of a distance: matches without noise would have unbounded weight; by hand."""
+    few_photos: int = 5
+    """Photos below which a camera absorbs unmodeled effects (a lens, a moving wall) into focal and center; by hand."""
+    few_photos_trust: float = 0.25
+    """Factor on the information of its pairs, as if their noise were twice as large; by hand."""
+    rounds: int = 25
+    """Most rounds of reweighting and stepping; by hand."""
+    converged: float = 2e-5
+    """Largest change of a camera's parameter that ends the rounds; by hand."""
+
+
+ADJUSTMENT = AdjustmentOptions()
+DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e8)
+"""Damping of Levenberg-Marquardt steps, relative to the diagonal; by hand."""
 
 
 @kernel
 def _distance(p: FloatArray, q: FloatArray, E: FloatArray) -> float:
-    """Return the distance r of the rays p of view 1 and q of view 2, each (7,) as `lens.write_ray` writes it."""
+    """Return the distance r of the rays p of view 1 and q of view 2, each (7,) as `pairs.write_ray` writes it."""
     l0 = E[0, 0] * p[0] + E[0, 1] * p[1] + E[0, 2]
     l1 = E[1, 0] * p[0] + E[1, 1] * p[1] + E[1, 2]
     l2 = E[2, 0] * p[0] + E[2, 1] * p[1] + E[2, 2]
@@ -60,13 +90,14 @@ def distances(
 
     Args:
         matches: (M, 4) of all pairs, one after the other.
-        ends: (P + 1,) where each pair begins, and the end of the last.
+        ends: (P + 1,) first match of each pair, and the end of the last.
         thetas: (C, 5) parameters of the cameras.
-        cameras, poses: (P, 2) camera of view 1 and of view 2; (P, 12), see `write_essential`.
+        cameras: (P, 2) camera of view 1 and of view 2.
+        poses: (P, 12), see `write_essential`.
     """
     E, first, second = np.empty((3, 3)), np.empty(5), np.empty(5)
     p, q = np.empty(7), np.empty(7)
-    found = np.empty(len(matches))
+    signed = np.empty(len(matches))
     for k in range(len(poses)):
         write_essential(poses[k], E)
         write_camera(thetas[cameras[k, 0]], first)
@@ -74,29 +105,20 @@ def distances(
         for i in range(ends[k], ends[k + 1]):
             write_ray(matches[i, 0], matches[i, 1], first, -1.0, p)
             write_ray(matches[i, 2], matches[i, 3], second, -1.0, q)
-            found[i] = _distance(p, q, E)
-    return found
+            signed[i] = _distance(p, q, E)
+    return signed
 
 
 @kernel
 def pair_costs(
     matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray, sigma: float
 ) -> FloatArray:
-    """Return (P,) half the sum over the matches of a pair of their robust squared distances, in sigma^2.
-
-    Args:
-        matches: (M, 4) of all pairs, one after the other.
-        ends: (P + 1,) where each pair begins, and the end of the last.
-        thetas: (C, 5) parameters of the cameras.
-        cameras: (P, 2) camera of view 1 and of view 2.
-        poses: (P, 12), see `write_essential`.
-        sigma: standard deviation of a distance, in the units of the matches.
-    """
-    found = distances(matches, ends, thetas, cameras, poses)
+    """Return (P,) half the sum of the robust squared distances of each pair, in sigma^2; arguments as `distances`."""
+    signed = distances(matches, ends, thetas, cameras, poses)
     costs = np.zeros(len(poses))
     for k in range(len(poses)):
         for i in range(ends[k], ends[k + 1]):
-            r2 = (found[i] / sigma) ** 2
+            r2 = (signed[i] / sigma) ** 2
             costs[k] += 0.5 * r2 / (1.0 + r2 / ROBUST_SCALE**2) if r2 < OVERFLOW_LIMIT else 0.5 * ROBUST_SCALE**2
     return costs
 
@@ -105,19 +127,11 @@ def pair_costs(
 def pair_systems(
     matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray, sigma: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return Gauss-Newton systems of all pairs in their fifteen parameters: camera 1, camera 2, pose.
-
-    Args:
-        matches: (M, 4) of all pairs, one after the other.
-        ends: (P + 1,) where each pair begins, and the end of the last.
-        thetas: (C, 5) parameters of the cameras.
-        cameras: (P, 2) camera of view 1 and of view 2.
-        poses: (P, 12), see `write_essential`.
-        sigma: standard deviation of a distance, in the units of the matches.
+    """Return Gauss-Newton systems of all pairs in their fifteen parameters; arguments as `distances`.
 
     Returns:
-        (P, 15, 15) approximate Hessians of the costs and (P, 15) their negative gradients; where both views are of one
-        camera, all of its entries are in the first five rows and columns.
+        (P, 15, 15) approximate Hessians of the costs and (P, 15) negative gradients, over camera 1, camera 2 and pose.
+        Where both views are of one camera, all of its entries are in the first five rows and columns.
     """
     A, b = np.zeros((len(poses), PAIR, PAIR)), np.zeros((len(poses), PAIR))
     # derivatives are finite differences: index 0 is unchanged, 1 to 5 have one parameter moved
@@ -141,7 +155,7 @@ def pair_systems(
 
 @kernel
 def _write_poses(pose: FloatArray, Es: FloatArray) -> None:
-    """Write E of a pose, and with each of its five parameters moved, into `Es` (6, 3, 3)."""
+    """Write E of a pose, and with each of its five parameters a step away, into `Es` (6, 3, 3)."""
     step = np.zeros(POSE_DOF)
     write_essential(pose, Es[0])
     for j in range(POSE_DOF):
@@ -152,14 +166,14 @@ def _write_poses(pose: FloatArray, Es: FloatArray) -> None:
 
 @kernel
 def _write_cameras(theta: FloatArray, lenses: FloatArray) -> None:
-    """Write the camera of the parameters (5,), and with each of them moved, into `lenses` (6, 5)."""
+    """Write the camera of the parameters (5,), and with each of them a step away, into `lenses` (6, 5)."""
     trial = theta.copy()
     write_camera(trial, lenses[0])
     for j in range(CAMERA):
-        kept = trial[j]
-        trial[j] = kept + _STEP
+        value = trial[j]
+        trial[j] = value + _STEP
         write_camera(trial, lenses[1 + j])
-        trial[j] = kept
+        trial[j] = value
 
 
 @kernel
@@ -178,9 +192,7 @@ def _write_derivatives(rays: FloatArray, Es: FloatArray, sigma: float, shared: b
     Args:
         rays: (2, 6, 7) from `_write_rays`, per view.
         Es: (6, 3, 3) from `_write_poses`.
-        sigma: standard deviation of a distance.
-        shared: whether both views are of one camera: then both rays move with its parameters, in the first five.
-        J: filled; where shared, 5 to 9 stay as they are.
+        shared: both views are of one camera: both rays move with its first five parameters, and J[5:10] stays.
     """
     r = _distance(rays[0, 0], rays[1, 0], Es[0]) / sigma
     for j in range(CAMERA):
@@ -221,44 +233,6 @@ def _add_match(A: FloatArray, b: FloatArray, J: FloatArray, r: float, weight: fl
             A[i, j] += scaled * J[j]
 
 
-# Bundle adjustment without points: cameras and relative poses of all pairs, adjusted jointly to the matches.
-#
-# Ours. Bundle adjustment and the Schur complement: Triggs and others (2000). The weights do what Eq. 5.23 and 5.24
-# do in Algorithm 3 of the thesis.
-#
-# Every pair has its own relative pose, which is eliminated (Schur complement). What remains of a pair is its
-# information about the cameras: one Hessian and one gradient. A pair whose matches are right but whose geometry is
-# wrong (repeated facades, another camera, a zoom) pulls at the cameras far harder than its noise explains; such a
-# pair is downweighted.
-
-MOST_MATCHES = 1000
-"""Most matches of one pair; more are not independent, and would let one pair outvote all others. With 300, errors and
-deviations are half as large again (docs/algorithms.md, Self-calibration, Tried and left out)."""
-CONFLICT = 3.0
-"""Log-likelihood gain from cameras of its own at which a pair's weight is a quarter. By definition of chi^2 with two
-degrees of freedom, noise alone gains as much once in twenty times: exp(-3)."""
-OWN_CAMERA_SIGMAS = np.array([0.3, 0.15, 0.15, 0.2, 0.2])
-"""How far a pair's own cameras may deviate: standard deviations of log f, u, v, log a, kappa. Chosen by hand; halved
-and doubled by `benchmarks.sensitivity`."""
-LOWER_QUARTILE = 0.288
-"""Lower quartile of that gain for noise in two degrees of freedom: by definition of chi^2, -ln(3/4)."""
-LEAST_SIGMA_PX = 0.1
-"""Least standard deviation of a distance: noise-free synthetic matches would otherwise have unbounded weight. Chosen by
-hand; halved and doubled by `benchmarks.sensitivity`."""
-FEW_PHOTOS, FEW_PHOTOS_TRUST = 5, 0.25
-"""A camera of fewer photos absorbs unmodeled effects (a lens, a wall that is not quite still) into its focal and
-center; the information of its pairs counts as if their noise were twice as large. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-ROUNDS = 25
-"""Most rounds of reweighting and stepping. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e8)
-"""Damping of Levenberg-Marquardt steps, relative to the diagonal. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-CONVERGED = 2e-5
-"""Largest change of a camera's parameter that ends the rounds. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
     """Independent normal priors on the parameters of all cameras."""
@@ -278,9 +252,9 @@ class State:
     """State of the adjustment."""
 
     thetas: FloatArray
-    """(C, 5) parameters of the cameras, see `lens`."""
+    """(C, 5) parameters of the cameras, see `pairs`."""
     poses: FloatArray
-    """(P, 12), see `pose_manifold.write_essential`."""
+    """(P, 12), see `geometry.poses.write_essential`."""
     weights: FloatArray
     """(P,) in [0, 1]: how well a pair agrees with the others."""
     sigma: float
@@ -306,29 +280,29 @@ class Matches:
 
     Args:
         inliers: per pair (N, 4), from the middle of each photo, in longer sides of the largest photo.
-        cameras: (P, 2) numbers of the cameras, counted from 0.
+        cameras: (P, 2) numbers of the cameras, from 0.
         photos: (P, 2) numbers of the photos.
         unit_px: length of that unit, in pixels.
-        most: most matches of one pair; evenly chosen where there are more.
+        most: most matches of one pair, evenly chosen.
         count: number of cameras.
     """
 
     def __init__(
         self, inliers: Sequence[FloatArray], cameras: IndexArray, photos: IndexArray, unit_px: float,
-        most: int = MOST_MATCHES, count: int = 1,
+        most: int = ADJUSTMENT.most_matches, count: int = 1,
     ) -> None:  # fmt: skip
         # points outside of the photos are no matches, and would overflow
-        kept = [subsample_rows(x[np.all(np.abs(x) <= 1.0, axis=1)], most) for x in inliers]
+        inside = [subsample_rows(x[np.all(np.abs(x) <= 1.0, axis=1)], most) for x in inliers]
         self.unit_px = unit_px
-        self.points = np.ascontiguousarray(np.concatenate([*kept, np.empty((0, 4))]))
-        self.ends = np.concatenate([[0], np.cumsum([len(x) for x in kept])]).astype(np.int64)
+        self.points = np.ascontiguousarray(np.concatenate([*inside, np.empty((0, 4))]))
+        self.ends = np.concatenate([[0], np.cumsum([len(x) for x in inside])]).astype(np.int64)
         self.cameras = np.ascontiguousarray(cameras, dtype=np.int64)
         self.photos = np.asarray(photos, dtype=np.int64)
         self.count = count
-        self.least_sigma = LEAST_SIGMA_PX / unit_px
-        taken = [len(np.unique(self.photos[self.cameras == camera])) for camera in range(count)]
-        few = np.array(taken, np.int64) < FEW_PHOTOS
-        self.trust = np.where(few[self.cameras].any(axis=1), FEW_PHOTOS_TRUST, 1.0)
+        self.least_sigma = ADJUSTMENT.least_sigma_px / unit_px
+        photo_counts = [len(np.unique(self.photos[self.cameras == camera])) for camera in range(count)]
+        few = np.array(photo_counts, np.int64) < ADJUSTMENT.few_photos
+        self.trust = np.where(few[self.cameras].any(axis=1), ADJUSTMENT.few_photos_trust, 1.0)
 
     @cached_property
     def redundancy(self) -> float:
@@ -341,21 +315,21 @@ class Matches:
             return 1.0
         photos = self.photos.repeat(np.diff(self.ends), axis=0)
         views = [np.column_stack([photos[:, view], self.points[:, 2 * view : 2 * view + 2]]) for view in range(2)]
-        seen = np.concatenate(views)
-        seen = seen[np.lexsort(seen.T)]
-        each = 2 * len(self.points) / (1 + np.count_nonzero((seen[1:] != seen[:-1]).any(axis=1)))
+        keypoints = np.concatenate(views)
+        keypoints = keypoints[np.lexsort(keypoints.T)]
+        each = 2 * len(self.points) / (1 + np.count_nonzero((keypoints[1:] != keypoints[:-1]).any(axis=1)))
         return max(1.0, 0.5 * each * (each + 1.0) / (2.0 * each - 1.0))
 
     def pair_matches(self, pair: int) -> FloatArray:
         """Return the matches (N, 4) of one pair."""
         return self.points[self.ends[pair] : self.ends[pair + 1]]
 
-    def select(self, which: IndexArray) -> "Matches":
+    def select(self, pairs: IndexArray) -> "Matches":
         """Return the matches of the given pairs only."""
-        if len(which) == len(self.cameras):
+        if len(pairs) == len(self.cameras):
             return self
-        inliers = [self.pair_matches(pair) for pair in which]
-        return Matches(inliers, self.cameras[which], self.photos[which], self.unit_px, count=self.count)
+        inliers = [self.pair_matches(pair) for pair in pairs]
+        return Matches(inliers, self.cameras[pairs], self.photos[pairs], self.unit_px, count=self.count)
 
     def subsample(self, most: int) -> "Matches":
         """Return at most `most` matches of each pair, evenly chosen."""
@@ -374,18 +348,13 @@ class Matches:
         A pose absorbs five of a pair's degrees of freedom: the distances of few matches are smaller than their errors.
         """
         counts = np.diff(self.ends)
-        found = np.abs(distances(self.points, self.ends, state.thetas, self.cameras, state.poses))
-        found *= np.repeat(np.sqrt(counts / np.maximum(counts - POSE_DOF, 1)), counts)
+        residuals = np.abs(distances(self.points, self.ends, state.thetas, self.cameras, state.poses))
+        residuals *= np.repeat(np.sqrt(counts / np.maximum(counts - POSE_DOF, 1)), counts)
         agreeing = np.repeat(state.weights > 0.5, counts)
-        return max(MAD_TO_SIGMA * float(np.median(found[agreeing])) if agreeing.any() else 0.0, self.least_sigma)
+        return max(MAD_TO_SIGMA * float(np.median(residuals[agreeing])) if agreeing.any() else 0.0, self.least_sigma)
 
     def assemble(self, information: Information, factors: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Sum the information of the pairs into (5C, 5C) and (5C,) over the parameters of all cameras.
-
-        Args:
-            information: of P pairs.
-            factors: (P,) factor of each pair.
-        """
+        """Sum the information of the pairs, times (P,) factors, into (5C, 5C) and (5C,) over all cameras."""
         rows = (CAMERA * self.cameras[:, :, None] + np.arange(CAMERA)).reshape(-1, 2 * CAMERA)
         H, b = np.zeros((CAMERA * self.count,) * 2), np.zeros(CAMERA * self.count)
         np.add.at(H, (rows[:, :, None], rows[:, None, :]), factors[:, None, None] * information.hessians)
@@ -394,53 +363,31 @@ class Matches:
 
 
 def subsample_rows(rows: FloatArray, most: int) -> FloatArray:
-    """Return at most `most` rows, evenly chosen.
-
-    Args:
-        rows: (N, ...) array.
-        most: largest number of rows to keep, > 0.
-    """
+    """Return at most `most` rows, evenly chosen."""
     return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
 
 
-def adjust_cameras(matches: Matches, state: State, prior: Prior, rounds: int = ROUNDS) -> State:
-    """Adjust cameras and poses: reweight the pairs and take a Levenberg-Marquardt step until the cameras converge.
-
-    Args:
-        matches: inliers of P pairs.
-        state: where to start.
-        prior: on the parameters of the cameras.
-        rounds: most steps, > 0.
-    """
+def adjust_cameras(matches: Matches, state: State, prior: Prior, rounds: int = ADJUSTMENT.rounds) -> State:
+    """Reweight the pairs and take a Levenberg-Marquardt step until the cameras converge, in at most `rounds` rounds."""
     damping = DAMPING.first
     for _ in range(rounds):
         system = _normal_equations(matches, state)
         state = _weigh_pairs(state, system)
         trial, damping = _take_step(matches, state, prior, system, damping)
-        moved_by = np.max(np.abs(trial.thetas - state.thetas), initial=0.0)
+        change = np.max(np.abs(trial.thetas - state.thetas), initial=0.0)
         state = replace(trial, sigma=matches.noise(trial))
-        if moved_by < CONVERGED:
+        if change < ADJUSTMENT.converged:
             break
     return reweight(matches, state)
 
 
 def reweight(matches: Matches, state: State) -> State:
-    """Weigh every pair by the log-likelihood that it would gain from cameras of its own.
-
-    Args:
-        matches: inliers of P pairs.
-        state: current state; only the weights and their scale change.
-    """
+    """Return the state with new weights of the pairs and their scale."""
     return _weigh_pairs(state, _normal_equations(matches, state))
 
 
 def pair_information(matches: Matches, state: State) -> Information:
-    """Eliminate the poses and return the information of each pair about the cameras.
-
-    Args:
-        matches: inliers of P pairs.
-        state: cameras and poses.
-    """
+    """Eliminate the poses and return the information of each pair about the cameras."""
     return _reduce_to_cameras(_normal_equations(matches, state))
 
 
@@ -451,9 +398,8 @@ def _normal_equations(matches: Matches, state: State) -> tuple[FloatArray, Float
 def _reduce_to_cameras(system: tuple[FloatArray, FloatArray]) -> Information:
     """Return the information of the pairs about their cameras, and the gains g = b' H^-1 b / 2 (see `_weigh_pairs`)."""
     H, b, _, _ = _eliminate_poses(*system, 0.0)
-    gains = 0.5 * np.einsum(
-        "pi,pi->p", b, solve_each(H + np.diag(np.tile(OWN_CAMERA_SIGMAS**-2.0, 2)), b[..., None])[..., 0]
-    )
+    own = np.diag(np.tile(np.array(ADJUSTMENT.own_camera_sigmas) ** -2.0, 2))
+    gains = 0.5 * np.einsum("pi,pi->p", b, solve_each(H + own, b[..., None])[..., 0])
     return Information(H, b, gains)
 
 
@@ -463,13 +409,13 @@ def _weigh_pairs(state: State, system: tuple[FloatArray, FloatArray]) -> State:
         g = b' H^-1 b / 2,      w = (1 + g / (3 s))^-2,      s = max(1, lower quartile of all g / 0.288)
 
     H and b are the pair's Hessian and negative gradient in its cameras, the poses eliminated, with the prior
-    `OWN_CAMERA_SIGMAS`.
-    With noise alone, g is half of a chi^2 variable of two degrees of freedom, whose lower quartile is 0.288. w is the
-    derivative of Geman and McClure's cost (1987) g / (1 + g / (3 s)): iteratively reweighted least squares.
+    `own_camera_sigmas`. With noise alone, g is half of a chi^2 variable of two degrees of freedom, whose lower quartile
+    is 0.288 = -ln(3/4). w is the derivative of Geman and McClure's cost (1987) g / (1 + g / (3 s)): iteratively
+    reweighted least squares.
     """
     gains = _reduce_to_cameras(system).gains
-    scale = max(1.0, float(np.quantile(gains, 0.25)) / LOWER_QUARTILE) if len(gains) else 1.0
-    return replace(state, weights=(1.0 + gains / (CONFLICT * scale)) ** -2, scale=scale)
+    scale = max(1.0, float(np.quantile(gains, 0.25)) / 0.288) if len(gains) else 1.0
+    return replace(state, weights=(1.0 + gains / (ADJUSTMENT.conflict * scale)) ** -2, scale=scale)
 
 
 class ReducedSystem(NamedTuple):
@@ -490,15 +436,12 @@ class ReducedSystem(NamedTuple):
 
 
 def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> ReducedSystem:
-    """Eliminate the poses from the systems of all pairs by the Schur complement::
+    """Eliminate the poses from the systems of all pairs (`pair_systems`) by the Schur complement::
 
         A = | U   W |     (U - W V^-1 W') d_cameras = b_cameras - W V^-1 b_pose
             | W'  V |
 
-    Args:
-        A: (P, 15, 15) Hessians of two cameras and a pose, from `two_view_cost.pair_systems`.
-        b: (P, 15) their negative gradients.
-        damping: of V, relative to its diagonal.
+    The damping of V is relative to its diagonal.
     """
     n = 2 * CAMERA
     V = A[:, n:, n:].copy()
@@ -524,12 +467,12 @@ def _take_step(
     factors = matches.trust * state.weights / state.scale
     cost = float(factors @ matches.costs(state)) + prior.cost(state.thetas)
 
-    def attempt(tried: float) -> State | None:
-        trial = _solve_step(matches, state, prior, system, tried)
+    def attempt(damping: float) -> State | None:
+        trial = _solve_step(matches, state, prior, system, damping)
         return trial if float(factors @ matches.costs(trial)) + prior.cost(trial.thetas) <= cost else None
 
-    found, damping = damped_step(attempt, damping, DAMPING)
-    return found or state, damping
+    better, damping = damped_step(attempt, damping, DAMPING)
+    return better or state, damping
 
 
 def _solve_step(
@@ -537,11 +480,11 @@ def _solve_step(
 ) -> State:
     """Return the state after one damped step: cameras from all pairs and the prior, then each pose from its pair."""
     reduced = _eliminate_poses(*system, damping)
-    said = Information(reduced.hessians, reduced.gradients, np.empty(0))
-    H, g = matches.assemble(said, matches.trust * state.weights / state.scale)
+    information = Information(reduced.hessians, reduced.gradients, np.empty(0))
+    H, g = matches.assemble(information, matches.trust * state.weights / state.scale)
     H += np.diag(prior.precision.ravel())
     g += (prior.precision * (prior.mean - state.thetas)).ravel()
     step = solve_each(H + damping * np.diag(np.diag(H)), g[:, None]).reshape(-1, CAMERA)
-    turns = reduced.pose_steps(step[matches.cameras].reshape(-1, 2 * CAMERA))
-    poses = np.array([retract(pose, turn) for pose, turn in zip(state.poses, turns, strict=True)]).reshape(-1, 12)
+    pose_steps = reduced.pose_steps(step[matches.cameras].reshape(-1, 2 * CAMERA))
+    poses = np.array([retract(pose, step) for pose, step in zip(state.poses, pose_steps, strict=True)]).reshape(-1, 12)
     return replace(state, thetas=state.thetas + step, poses=poses)

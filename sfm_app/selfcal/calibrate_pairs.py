@@ -1,6 +1,8 @@
-"""Critical motions leave the focal open: E = K'FK has equal singular values at any focal.
+"""Fit cameras to the matches of pairs, with their uncertainty and the motions that leave the focal open.
 
-Sturm (1999); the degenerate motions of thesis 5.4. Recognizing them by the estimated poses is ours.
+Ours; the thesis calibrates from fundamental matrices alone. Cameras are adjusted from several starts, the parameters
+that the evidence supports are freed, and the cameras are adjusted again. The jackknife over photos is Efron's (1982);
+key pairs are a wish of thesis chapter 6; the degenerate motions are those of thesis 5.4 and Sturm (1999).
 """
 
 from collections.abc import Sequence
@@ -13,9 +15,9 @@ from sfm_app.fundamental.refits import refine_sampson
 from sfm_app.geometry.epipolar import essential_from_fundamental, relative_pose
 from sfm_app.geometry.least_squares import lift_eigenvalues
 from sfm_app.selfcal.adjustment import (
+    ADJUSTMENT,
     CAMERA,
-    CONFLICT,
-    OWN_CAMERA_SIGMAS,
+    ROBUST_SCALE,
     Information,
     Matches,
     Prior,
@@ -31,31 +33,39 @@ from sfm_app.types import PairId
 from sfm_app.types.arrays import BoolArray, FloatArray
 from sfm_app.types.camera import named_correlations
 
-# Fit initial cameras to their matches: adjust, free the parameters that the evidence supports, adjust again.
-#
-# Ours; the thesis calibrates from fundamental matrices alone.
 
-FEW_MATCHES = 100
-"""Matches per pair until the cameras have nearly converged. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-FIRST_ROUNDS, LAST_ROUNDS = 8, 12
-"""Rounds before starts are compared, and rounds with all matches. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-POSE_MATCHES = 30
-"""Matches that decide which of the four poses of an E is right. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-EVIDENCE_ROUNDS = 3
-"""Most rounds of choosing the free parameters by the evidence and adjusting again. Chosen by hand; halved and doubled
-by `benchmarks.sensitivity`."""
-JACKKNIFE_GROUPS = 8
-"""Groups of neighboring photos that are left out in turn (docs/algorithms.md, Self-calibration, 4). Chosen by hand;
-halved and doubled by `benchmarks.sensitivity`."""
-LEAST_PHOTOS, LEAST_REMAINING_WEIGHT = 6, 4.0
-"""Photos, and weight of the remaining pairs, below which a jackknife reflects the missing pairs rather than errors.
-docs/algorithms.md, Self-calibration, 4. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-REFIT_SCALE = 3.0
-"""Scale of the robust refit of an F, in sigma. As `two_view_cost.ROBUST_SCALE`. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
+@dataclass(frozen=True, slots=True)
+class FitOptions:
+    """Rounds of the fit, and its uncertainty. Sections are those of Self-calibration in docs/algorithms.md."""
+
+    few_matches: int = 100
+    """Matches per pair until the cameras have nearly converged; by hand."""
+    first_rounds: int = 8
+    """Rounds before the fits of several starts are compared; by hand."""
+    last_rounds: int = 12
+    """Rounds with all matches; by hand."""
+    pose_matches: int = 30
+    """Matches that choose among the four poses of an E; by hand."""
+    evidence_rounds: int = 3
+    """Most rounds of choosing the free parameters by the evidence and adjusting again; by hand."""
+    jackknife_groups: int = 8
+    """Groups of neighboring photos that are left out in turn. Section 4; by hand."""
+    least_photos: int = 6
+    """Photos below which a jackknife reflects missing pairs rather than errors. Section 4; by hand."""
+    least_remaining_weight: float = 4.0
+    """The same limit for the weight of the remaining pairs. Section 4; by hand."""
+    model_error: tuple[float, ...] = (1e-3, 1e-3, 1e-3, 1e-3, 3e-3)
+    """Standard deviations of errors that no lens model covers: of log f, u and v in longer sides, log a, and k1.
+    Section 4; by hand."""
+    least_key_weight: float = 0.5
+    """Least weight of a key pair in the fit. Section 7; by hand."""
+    least_rotation_deg: float = 3.0
+    """Median rotation of pairs below which the axes count as parallel; by hand."""
+    isosceles: float = 0.1
+    """Largest median deviation, in cosines, of pairs whose axes meet at one distance from both cameras; by hand."""
+
+
+FITTING = FitOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +75,7 @@ class Fit:
     matches: Matches
     state: State
     free: BoolArray
-    """(C, 4) which parameters the evidence freed, see `camera_priors`."""
+    """(C, 4) parameters that the evidence freed, see `priors`."""
     prior: Prior
     priors: CameraPriors
     held: BoolArray | None = None
@@ -82,7 +92,7 @@ class Fit:
 
     @property
     def trust(self) -> FloatArray:
-        """(P,) factor of each pair's information, reduced because matches that share keypoints are not independent."""
+        """(P,) factor of each pair's information; matches that share keypoints are not independent."""
         return np.asarray(
             self.matches.trust * self.state.weights / (self.state.scale * self.matches.redundancy), np.float64
         )
@@ -96,15 +106,14 @@ class Fit:
     def cost(self, sigma: float, scale: float) -> float:
         """Return the negative log-probability that ranks fits from different starts, each pair's part bounded.
 
-        Args:
-            sigma: standard deviation of a distance, the same for all fits: its own larger one would favor a wrong fit.
-            scale: scale of the disagreement, the same for all fits for that reason.
+        The deviation of a distance and the scale of the disagreement are the same for all fits: their own larger ones
+        would favor wrong fits.
         """
         state = reweight(self.matches, replace(self.state, sigma=sigma))
         gains = pair_information(self.matches, state).gains / (scale * self.matches.redundancy)
         H = replace(self, state=state).evidence.H + np.diag(self.prior.precision.ravel())
         volume = 0.5 * float(np.linalg.slogdet(lift_eigenvalues(H))[1] - np.sum(np.log(self.prior.precision)))
-        bounded = float(np.sum(gains / (1.0 + gains / CONFLICT)))
+        bounded = float(np.sum(gains / (1.0 + gains / ADJUSTMENT.conflict)))
         return bounded + self.prior.cost(state.thetas) + volume - self.priors.log_odds(self.free)
 
 
@@ -112,37 +121,30 @@ def fit_cameras(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], 
     """Fit the cameras from all starts, then with non-square pixels, and return the best fit.
 
     Args:
-        matches: inliers, with the origin at the middle of each photo.
+        matches: inliers, from the middle of each photo.
         Fs: (P, 3, 3) in the same frame and units; initialize the poses.
         starts: (C, 5) each, initial cameras, the most likely first.
-        priors: prior knowledge about the cameras.
     """
-    few = matches.subsample(FEW_MATCHES)
+    few = matches.subsample(FITTING.few_matches)
     best = _select_best([_fit_from_start(few, Fs, thetas, priors, square=True) for thetas in starts])
     others = [_fit_from_start(few, Fs, thetas, priors, square=False) for thetas in (best.state.thetas, starts[0])]
     fit = _select_best([best, *others])
     state = adjust_cameras(few, fit.state, fit.prior)
-    fit = replace(fit, matches=matches, state=adjust_cameras(matches, state, fit.prior, LAST_ROUNDS))
-    for _ in range(EVIDENCE_ROUNDS):
+    fit = replace(fit, matches=matches, state=adjust_cameras(matches, state, fit.prior, FITTING.last_rounds))
+    for _ in range(FITTING.evidence_rounds):
         free = fit.evidence.choose(fit.free)
         if np.array_equal(free, fit.free):
             break
         prior = priors.prior(free, fit.state.thetas)
         state = adjust_cameras(few, fit.state, prior)
-        fit = Fit(matches, adjust_cameras(matches, state, prior, LAST_ROUNDS), free, prior, priors)
+        fit = Fit(matches, adjust_cameras(matches, state, prior, FITTING.last_rounds), free, prior, priors)
     held = fit.evidence.undetermined_parts(fit.free)
     prior = priors.prior(fit.free, fit.state.thetas, held)
-    return replace(fit, prior=prior, held=held, state=adjust_cameras(matches, fit.state, prior, LAST_ROUNDS))
+    return replace(fit, prior=prior, held=held, state=adjust_cameras(matches, fit.state, prior, FITTING.last_rounds))
 
 
 def extend_to_all_pairs(fit: Fit, matches: Matches, Fs: FloatArray) -> Fit:
-    """Return the fit with a pose for every pair, including pairs that it was not adjusted to.
-
-    Args:
-        fit: cameras adjusted to some of the pairs.
-        matches: inliers of all P pairs.
-        Fs: (P, 3, 3) in the frame and units of the matches; initialize the poses.
-    """
+    """Return the fit with a pose for every pair, including pairs that it was not adjusted to."""
     if len(matches.cameras) == len(fit.matches.cameras):
         return fit
     state = replace(fit.state, poses=_estimate_poses(matches, Fs, fit.state.thetas), weights=np.ones(len(Fs)))
@@ -156,18 +158,18 @@ def jackknife_deviations(fit: Fit) -> FloatArray:
     With each group left out, the cameras take the step of the remaining pairs. The weights of the pairs stay fixed:
     otherwise wrong pairs would gain weight where right ones are left out.
     """
-    photos, nothing = np.unique(fit.matches.photos), np.zeros(fit.state.thetas.size)
-    if len(photos) < LEAST_PHOTOS:
-        return nothing
-    groups = np.array_split(photos, min(JACKKNIFE_GROUPS, len(photos)))
+    photos, zeros = np.unique(fit.matches.photos), np.zeros(fit.state.thetas.size)
+    if len(photos) < FITTING.least_photos:
+        return zeros
+    groups = np.array_split(photos, min(FITTING.jackknife_groups, len(photos)))
     information, trust, steps = fit.information, fit.trust, []
     for group in groups:
-        left = ~np.isin(fit.matches.photos, group).any(axis=1)
-        if np.sum(fit.state.weights[left]) < LEAST_REMAINING_WEIGHT:
-            return nothing
-        H, g = fit.matches.assemble(information, np.where(left, trust, 0.0))
-        precision, away = fit.prior.precision.ravel(), (fit.prior.mean - fit.state.thetas).ravel()
-        steps.append(np.linalg.solve(H + np.diag(precision), g + precision * away))
+        remaining = ~np.isin(fit.matches.photos, group).any(axis=1)
+        if np.sum(fit.state.weights[remaining]) < FITTING.least_remaining_weight:
+            return zeros
+        H, g = fit.matches.assemble(information, np.where(remaining, trust, 0.0))
+        precision, offset = fit.prior.precision.ravel(), (fit.prior.mean - fit.state.thetas).ravel()
+        steps.append(np.linalg.solve(H + np.diag(precision), g + precision * offset))
     spread = np.array(steps) - np.mean(steps, axis=0)
     return np.asarray(np.sqrt((len(groups) - 1) / len(groups) * np.sum(spread**2, axis=0)), np.float64)
 
@@ -175,16 +177,16 @@ def jackknife_deviations(fit: Fit) -> FloatArray:
 def undistorted_fundamentals(fit: Fit) -> FloatArray:
     """Return (P, 3, 3) F's of the undistorted photos, refitted to the matches without assuming a K."""
     thetas, cameras = fit.state.thetas, fit.matches.cameras
-    found = np.empty((len(cameras), 3, 3))
+    Fs = np.empty((len(cameras), 3, 3))
     for pair, (first, second) in enumerate(cameras):
         x = fit.matches.pair_matches(pair)
         views = (undistort_points(x[:, :2], thetas[first]), undistort_points(x[:, 2:], thetas[second]))
         inverses = [np.linalg.inv(intrinsic_matrix(thetas[camera])) for camera in (first, second)]
         E = _essential_matrix(fit.state.poses[pair])
         start = inverses[1].T @ E @ inverses[0]
-        refit = refine_sampson(np.asfortranarray(np.hstack(views)), start, scale=REFIT_SCALE * fit.state.sigma)
-        found[pair] = refit if np.isfinite(refit).all() and refit.any() else start
-    return found
+        refit = refine_sampson(np.asfortranarray(np.hstack(views)), start, scale=ROBUST_SCALE * fit.state.sigma)
+        Fs[pair] = refit if np.isfinite(refit).all() and refit.any() else start
+    return Fs
 
 
 def intrinsic_matrix(theta: FloatArray) -> FloatArray:
@@ -203,7 +205,7 @@ def _fit_from_start(few: Matches, Fs: FloatArray, thetas: FloatArray, priors: Ca
     free[:, ASPECT] = not square
     prior = priors.prior(free, thetas)
     state = State(thetas, _estimate_poses(few, Fs, thetas), np.ones(len(Fs)), few.least_sigma)
-    state = adjust_cameras(few, replace(state, sigma=few.noise(state)), prior, FIRST_ROUNDS)
+    state = adjust_cameras(few, replace(state, sigma=few.noise(state)), prior, FITTING.first_rounds)
     return Fit(few, state, free, prior, priors)
 
 
@@ -211,7 +213,7 @@ def _estimate_poses(few: Matches, Fs: FloatArray, thetas: FloatArray) -> FloatAr
     poses = np.empty((len(Fs), 12))
     for pair, (first, second) in enumerate(few.cameras):
         K1, K2 = intrinsic_matrix(thetas[first]), intrinsic_matrix(thetas[second])
-        x = subsample_rows(few.pair_matches(pair), POSE_MATCHES)
+        x = subsample_rows(few.pair_matches(pair), FITTING.pose_matches)
         rays = [
             (undistort_points(points, thetas[camera]) - K[:2, 2]) / K[[0, 1], [0, 1]]
             for points, camera, K in ((x[:, :2], first, K1), (x[:, 2:], second, K2))
@@ -226,40 +228,31 @@ def _essential_matrix(pose: FloatArray) -> FloatArray:
     return np.asarray(np.cross(t, R, axisb=0, axisc=0), np.float64)
 
 
-# Uncertainty of a fit: covariances, standard deviations in pixels, and the most informative pairs.
-#
-# Ours; leaving out photos is the jackknife (Efron 1982). Key pairs are what chapter 6 of the thesis asks for.
+# Uncertainty.
 
 PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1")
-MODEL_ERROR = np.array([1e-3, 1e-3, 1e-3, 1e-3, 3e-3])
-"""Standard deviations of errors that no lens model covers: of log f, u and v in longer sides, log a, and k1.
-docs/algorithms.md, Self-calibration, 4. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-LEAST_KEY_WEIGHT = 0.5
-"""A pair with a smaller weight in the fit is no key pair. docs/algorithms.md, Self-calibration, 7. Chosen by hand;
-halved and doubled by `benchmarks.sensitivity`."""
 
 
 def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> FloatArray:
     """Return the (5C, 5C) covariance of all parameters over all choices of free ones, plus the model error.
 
     Args:
-        fit: cameras adjusted to matches.
         sides: (C,) longer sides of the photos.
         resampled: widen it where leaving photos out moves the cameras further than it predicts.
     """
-    found = fit.evidence.covariance(fit.free)
+    total = fit.evidence.covariance(fit.free)
     if resampled:
-        deviations = np.sqrt(np.diag(found))
+        deviations = np.sqrt(np.diag(total))
         wider = np.maximum(jackknife_deviations(fit) / deviations, 1.0)
-        found = found * np.outer(wider, wider)
-    floor = np.tile(MODEL_ERROR, (len(sides), 1))
+        total = total * np.outer(wider, wider)
+    floor = np.tile(FITTING.model_error, (len(sides), 1))
     floor[:, CENTER_U : CENTER_V + 1] *= sides[:, None]
     floor[:, KAPPA] /= np.exp(2.0 * fit.state.thetas[:, LOG_FOCAL])
-    return np.asarray(found + np.diag(floor.ravel() ** 2), np.float64)
+    return np.asarray(total + np.diag(floor.ravel() ** 2), np.float64)
 
 
 class Uncertainty(NamedTuple):
-    """How far the parameters of a camera may be off, and which of them are off together; as in `Calibration`."""
+    """Standard deviations of the parameters of a camera, and their correlations; as in `Calibration`."""
 
     spread: dict[str, float]
     correlations: dict[str, float]
@@ -269,9 +262,7 @@ def camera_uncertainty(theta: FloatArray, cov: FloatArray, unit_px: float) -> Un
     """Return the standard deviations of fx, fy, cx, cy in pixels and of k1, and their correlations.
 
     Args:
-        theta: (5,) parameters of the camera.
-        cov: (5, 5) their covariance.
-        unit_px: pixels per unit of theta.
+        cov: (5, 5) covariance of theta (5,).
     """
     focal, squared = float(np.exp(theta[LOG_FOCAL])) * unit_px, float(np.exp(2.0 * theta[LOG_FOCAL]))
     half = float(np.exp(0.5 * theta[LOG_ASPECT]))
@@ -281,43 +272,26 @@ def camera_uncertainty(theta: FloatArray, cov: FloatArray, unit_px: float) -> Un
     slopes[1, [LOG_FOCAL, LOG_ASPECT]] = focal * half, 0.5 * focal * half
     slopes[2, CENTER_U] = slopes[3, CENTER_V] = unit_px
     slopes[4, [LOG_FOCAL, KAPPA]] = 2.0 * theta[KAPPA] * squared, squared
-    found = slopes @ cov @ slopes.T
-    deviations = np.sqrt(np.maximum(np.diag(found), 0.0))
+    in_px = slopes @ cov @ slopes.T
+    deviations = np.sqrt(np.maximum(np.diag(in_px), 0.0))
     return Uncertainty(
-        dict(zip(PARAMETER_NAMES, deviations.tolist(), strict=True)), named_correlations(PARAMETER_NAMES, found)
+        dict(zip(PARAMETER_NAMES, deviations.tolist(), strict=True)), named_correlations(PARAMETER_NAMES, in_px)
     )
 
 
 def key_pairs(fit: Fit, photos: tuple[PairId, ...]) -> tuple[PairId, ...]:
-    """Return the pairs that agree with the cameras, the most informative first.
-
-    Their views differ in more than position.
-
-    Args:
-        fit: cameras adjusted to P pairs.
-        photos: (P,) the two photos of each; may be empty.
-    """
+    """Return those of the `photos` pairs that agree with the cameras, the most informative first."""
     if not photos:
         return ()
-    alone = np.tile(OWN_CAMERA_SIGMAS, 2)
-    news = np.linalg.slogdet(lift_eigenvalues(np.eye(2 * CAMERA) + alone[:, None] * fit.information.hessians * alone))[
-        1
-    ]
-    worth = fit.state.weights * news
-    order = [pair for pair in np.argsort(-worth, kind="stable") if fit.state.weights[pair] >= LEAST_KEY_WEIGHT]
+    own = np.tile(ADJUSTMENT.own_camera_sigmas, 2)
+    gains = np.linalg.slogdet(lift_eigenvalues(np.eye(2 * CAMERA) + own[:, None] * fit.information.hessians * own))[1]
+    scores = fit.state.weights * gains
+    order = [pair for pair in np.argsort(-scores, kind="stable") if fit.state.weights[pair] >= FITTING.least_key_weight]
     return tuple(photos[pair] for pair in order)
 
 
-LEAST_ROTATION_DEG = 3.0
-"""Median rotation of pairs below which the axes count as parallel. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-ISOSCELES = 0.1
-"""Largest median deviation, in cosines, of pairs whose axes meet at one distance from both cameras. Chosen by hand;
-halved and doubled by `benchmarks.sensitivity`."""
-
-
 def critical_motion(fit: Fit) -> str:
-    """Return the critical motion of most pairs in words for the user; empty where there is none.
+    """Return the critical motion of most pairs, for the user; empty where there is none.
 
     Parallel axes, and axes that meet at one distance from both cameras (an isosceles triangle, as on an orbit), are the
     two for which one pair does not constrain the focal (Sturm 1999).
@@ -325,14 +299,14 @@ def critical_motion(fit: Fit) -> str:
     R = fit.state.poses[:, :9].reshape(-1, 3, 3)
     if len(R) == 0:
         return ""
-    turned = np.degrees(np.arccos(np.clip((np.trace(R, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)))
-    if np.median(turned) < LEAST_ROTATION_DEG:
-        return "the camera hardly turned between the photos (parallel axes)"
+    rotation_deg = np.degrees(np.arccos(np.clip((np.trace(R, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)))
+    if np.median(rotation_deg) < FITTING.least_rotation_deg:
+        return "the camera hardly turns between the photos (parallel axes)"
     baseline = -np.einsum("pij,pi->pj", R, fit.state.poses[:, 9:])
     second = R[:, 2]
     # in the frame of view 1, whose axis is z: both axes lean alike towards the baseline, and all three lie in a plane
     lean = np.abs(baseline[:, 2] + np.einsum("pi,pi->p", second, baseline))
     out_of_plane = np.abs(np.cross(second, baseline)[:, 2])
-    if np.median(np.maximum(lean, out_of_plane)) < ISOSCELES:
-        return "the photos look at one point from one distance (an orbit)"
+    if np.median(np.maximum(lean, out_of_plane)) < FITTING.isosceles:
+        return "the cameras face one point from one distance (an orbit)"
     return ""

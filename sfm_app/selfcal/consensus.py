@@ -1,6 +1,14 @@
 """The K that most pairs agree on: the highest peak of the joint consensus, and the evidence for and against it.
 
-Thesis 5.8.4 extended from a plane to all of K; the evidence is ours.
+Thesis (5.33) seeks the point where most zero curves meet, in one plane of K at a time. Here all of K is searched at
+once: at the parameters ``theta = (log f, u, v, log a)``, with f = sqrt(fx fy) and a = fy / fx, how many pairs satisfy
+the constraint? Each pair votes with at most its weight, so that outliers have little influence::
+
+    support(theta) = sum_i w_i exp(-r_i(theta) / sigma),    r = (s1 - s2) / (s1 + s2) of E_i = K'F_iK
+
+A vote is taken as a log-likelihood, to which a log-prior on the center is added: the prior decides where pairs are few
+and fades where they are many. The evidence is ours: the bootstrap is Rubin's (1981), the effective sample size Kish's
+(1965).
 """
 
 from collections.abc import Sequence
@@ -14,35 +22,81 @@ from sfm_app.selfcal.constraints import singular_value_ratio
 from sfm_app.selfcal.pairs import Pairs
 from sfm_app.types.arrays import FloatArray
 
-# The consensus of all pairs over all of K at once.
-#
-# Thesis (5.33) seeks the point where most zero curves meet, in one plane of K at a time. Here all of K is searched
-# at once: at the parameters ``theta = (log f, u, v, log a)``, with f = sqrt(fx fy) and a = fy / fx, how many pairs
-# satisfy the constraint? Each pair votes with at most its weight, so that outliers have little influence::
-#
-# support(theta) = sum_i w_i exp(-r_i(theta) / sigma), r = (s1 - s2) / (s1 + s2) of E_i = K'F_iK
-#
-# A vote is taken as a log-likelihood, to which a log-prior on the center is added: the prior decides where pairs
-# are few and fades where they are many.
-
 LOG_FOCAL, CENTER_U, CENTER_V, LOG_ASPECT = range(4)
 """Places in theta."""
-FIRST_STEPS = np.array([0.05, 0.03, 0.03, 0.05])
-"""First steps of the local search along theta. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-FINISHED_STEP, FINISHED_VALUE = 1e-5, 1e-6
-"""A simplex of this extent in theta and in value has converged. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-MOST_STEPS = 300
-"""Most steps of a simplex. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+SQUARE_PIXELS = (LOG_FOCAL, CENTER_U, CENTER_V)
+"""Places in theta that are free for square pixels."""
+ANY_PIXELS = (*SQUARE_PIXELS, LOG_ASPECT)
+"""Places in theta that are free for any pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class ConsensusOptions:
+    """Search and verdict. Sections are those of Self-calibration in docs/algorithms.md."""
+
+    first_steps: tuple[float, ...] = (0.05, 0.03, 0.03, 0.05)
+    """First steps of a local search along theta; by hand."""
+    focal_range: tuple[float, float] = (0.3, 5.0)
+    """Focals of the grid, in longer sides: 118 to 11 degrees of view. Section 5; by hand."""
+    focals: int = 29
+    """Focals of the grid, 10 % apart; by hand."""
+    center_reach: float = 0.4
+    """Largest distance of a center of the grid from the middle along an axis, in longer sides; by hand."""
+    center_step: float = 0.08
+    """Distance of two centers of the grid, in longer sides; by hand."""
+    log_aspects: tuple[float, ...] = tuple(np.linspace(-0.6, 0.6, 9))
+    """log fy/fx of the grid: 0.55 to 1.8; by hand."""
+    starts: int = 4
+    """Tops of the grid that a local search begins from; by hand."""
+    sigmas: tuple[float, float] = (0.05, 0.02)
+    """Widths of a vote, in r: the first finds a peak, the second refines and compares it. Section 1; by hand."""
+    own_sigma_range: tuple[float, float] = (0.005, 0.02)
+    """Bounds of the last width, in r, which follows the data; by hand."""
+    own_sigma_factor: float = 1.5
+    """That width in medians of r: half of the agreeing pairs give more than half their vote. Section 1; by hand."""
+    min_agreeing: float = 2.25
+    """Least effective number of agreeing pairs; any three parameters satisfy one and a half. Section 5; by hand."""
+    min_support: float = 0.12
+    """Least share of the votes; many pairs without a common K reach 0.06. Section 5; by hand."""
+    rival_ratio: float = 1.25
+    """Ratio of focals from which on K is another answer. Section 5; by hand."""
+    min_margin: float = 0.5
+    """Least margin over every other focal, in votes. Section 5; by hand."""
+    min_margin_share: float = 0.03
+    """Least margin as a share of the votes for K: many pairs may barely distinguish focals. Section 5; by hand."""
+    resamples: int = 25
+    """Resamples of the Bayesian bootstrap. Section "without matches"; by hand."""
+    stable_sigma: float = 0.01
+    """Least width of resampled fits, in r: below it they snap to single pairs; by hand."""
+    aspect_gain: float = float(np.log(50))
+    """Least gain of a free aspect, in votes: one photo set in fifty has other pixels. Section 1; by hand."""
+    doubtful_aspect_gain: float = float(np.log(50 * 0.05))
+    """Gain, in votes, above which square pixels are less than 95 % sure; 47 answers of `benchmarks.trouble`."""
+    max_log_focal_spread: float = 0.1
+    """Largest standard deviation of log f; beyond it a guess is as good a start. Section 5; by hand."""
+    identified_log_focal_spread: float = 0.02
+    """Largest standard deviation of log f of a known focal; beyond it the answer is an estimate. Chosen on 109 cameras
+    of `benchmarks.trouble`, seeds 0 to 180, 1000 to 1035 and 2000 to 2139."""
+    identified_of_many: float = 0.015
+    """The same where every photo has its own focal: the worst of many is further off. Section 6; by hand."""
+    safe_margin_share: float = 0.2
+    """Margin, as a share of the votes, below which the focal is poorly determined (walks to the side or on one plane).
+    Chosen on the same 109 cameras, section 5."""
+    safe_support: float = 0.8
+    """Share of all votes that K then needs: a cause of missing votes may bias the others. Chosen with it."""
+    edge: float = 1.02
+    """Factor within which a focal counts as being at an end of the range; by hand."""
+
+
+CONSENSUS = ConsensusOptions()
 
 
 class Consensus:
     """The function that the right K maximizes.
 
     Args:
-        pairs: the pairs that vote.
         center_sigma: standard deviation of the prior on (u, v) about (0, 0), in units of the pairs; may be inf.
-        weights: (P,) to use instead of those of the pairs.
+        weights: (P,) weights; those of the pairs for None.
     """
 
     def __init__(self, pairs: Pairs, center_sigma: float, weights: FloatArray | None = None) -> None:
@@ -56,12 +110,7 @@ class Consensus:
         return Consensus(self.pairs, self.center_sigma, weights)
 
     def evaluate(self, thetas: FloatArray, sigma: float) -> FloatArray:
-        """Return (N,) supports plus log-priors at `thetas`.
-
-        Args:
-            thetas: (N, 4) parameters of K.
-            sigma: width of a vote, in units of r, > 0.
-        """
+        """Return (N,) supports plus log-priors at (N, 4) thetas; sigma is the width of a vote, in r."""
         return np.asarray(_values(self._packed, self.weights, self.center_sigma, thetas, sigma))
 
     def ratios(self, theta: FloatArray) -> FloatArray:
@@ -69,22 +118,14 @@ class Consensus:
         return np.asarray(_ratios(self._packed, theta))
 
     def climb(self, start: FloatArray, free: Sequence[int], sigmas: Sequence[float]) -> tuple[FloatArray, float]:
-        """Return the local maximum reached from a start by moving some entries of theta, through falling sigmas.
+        """Return the local maximum (4,) near a start, over the free places of theta, and its value at the last sigma.
 
         Nelder-Mead, because the consensus has a cusp wherever a pair is satisfied exactly. For every sigma it runs a
         second time, from the end of the first with a tenth of its steps: a simplex can stall on a ridge.
-
-        Args:
-            start: (4,) theta to begin at.
-            free: places in theta that may move.
-            sigmas: falling widths of a vote, at least one.
-
-        Returns:
-            theta (4,) and the value there, at the last sigma.
         """
-        theta, value = start.copy(), 0.0
+        theta, value, first_steps = start.copy(), 0.0, np.array(CONSENSUS.first_steps)
         for sigma in sigmas:
-            for steps in (FIRST_STEPS, 0.1 * FIRST_STEPS):
+            for steps in (first_steps, 0.1 * first_steps):
                 simplex = np.tile(theta, (len(free) + 1, 1))
                 for row, index in enumerate(free):
                     simplex[row + 1, index] += steps[index]
@@ -128,9 +169,9 @@ def _climb(
     """Find a maximum by Nelder and Mead (1965) from a simplex (n + 1, 4), with their coefficients 1, 2, 1/2, 1/2."""
     count = len(simplex)
     values = _values(packed, weights, center_sigma, simplex, sigma)
-    for _ in range(MOST_STEPS):
+    for _ in range(300):
         _sort(simplex, values)
-        if values[0] - values[-1] <= FINISHED_VALUE and _extent(simplex) <= FINISHED_STEP:
+        if values[0] - values[-1] <= 1e-6 and _extent(simplex) <= 1e-5:
             break
         worst = values[-1]
         trial = _reflect(simplex, 1.0)
@@ -158,7 +199,7 @@ def _climb(
 
 @kernel
 def _sort(simplex: FloatArray, values: FloatArray) -> None:
-    """Sort in place, highest first; equal values keep their order. Loops compile in a tenth of the time of argsort."""
+    """Sort in place, highest first; equal values keep their order. Loops compile faster than argsort."""
     for k in range(1, len(values)):
         row, value = simplex[k].copy(), values[k]
         i = k
@@ -172,7 +213,7 @@ def _sort(simplex: FloatArray, values: FloatArray) -> None:
 
 @kernel
 def _copy(row: FloatArray, place: FloatArray) -> None:
-    """Write the entries of a row to a place; assigning rows compiles for a second and a half."""
+    """Copy a row; assigning rows compiles for a second and a half."""
     for column in range(4):
         place[column] = row[column]
 
@@ -199,26 +240,7 @@ def _extent(simplex: FloatArray) -> float:
     return extent
 
 
-# The highest peak of the joint consensus: a coarse grid over K, then local searches from its best cells.
-#
-# Ours, in place of the search along zero curves of thesis 5.8.4 (Eq. 5.33).
-
-FOCAL_RANGE = (0.3, 5.0)
-"""Focals that are tried, in units of the longer side: 118 to 11 degrees of view. docs/algorithms.md, Self-calibration,
-5. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-FOCALS = 29
-"""Focals on the grid, each 10 % above the one before. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-CENTER_REACH = 0.4
-"""Centers are tried up to this far from the middle, in units of the longer side. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-CENTER_STEP = 0.08
-"""Between centers on the grid, in the same units. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-SIGMAS = (0.05, 0.02)
-"""Widths of the consensus, in units of r: the first finds a peak, the second refines it and compares it with others.
-docs/algorithms.md, Self-calibration, 1. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-MOST_STARTS = 4
-"""Tops of the grid that a local search begins from. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+# The search: a coarse grid over K, then local searches from its best cells (ours, in place of thesis 5.8.4).
 
 
 class Peak(NamedTuple):
@@ -234,102 +256,52 @@ class Profile(NamedTuple):
     """The best cell of the grid for every focal."""
 
     thetas: FloatArray
-    """(FOCALS, 4), by rising focal."""
+    """(G, 4), by rising focal."""
     values: FloatArray
-    """(FOCALS,) support plus log-prior at the first of `SIGMAS`."""
+    """(G,) support plus log-prior at the first sigma."""
 
 
 def scan(consensus: Consensus, log_aspects: Sequence[float]) -> Profile:
-    """Find the best cell of the grid over K for every focal.
-
-    Args:
-        consensus: of all pairs.
-        log_aspects: log fy/fx of the grid.
-    """
-    focals = np.geomspace(*FOCAL_RANGE, FOCALS)
-    centers = np.arange(-CENTER_REACH, CENTER_REACH + CENTER_STEP / 2, CENTER_STEP)
+    """Return the best cell of the grid over K for every focal."""
+    focals = np.geomspace(*CONSENSUS.focal_range, CONSENSUS.focals)
+    centers = np.arange(
+        -CONSENSUS.center_reach, CONSENSUS.center_reach + CONSENSUS.center_step / 2, CONSENSUS.center_step
+    )
     cells = np.meshgrid(np.log(focals), centers, centers, np.asarray(log_aspects), indexing="ij")
-    thetas = np.stack(cells, axis=-1).reshape(FOCALS, -1, 4)
-    values = consensus.evaluate(thetas.reshape(-1, 4), SIGMAS[0]).reshape(FOCALS, -1)
+    thetas = np.stack(cells, axis=-1).reshape(CONSENSUS.focals, -1, 4)
+    values = consensus.evaluate(thetas.reshape(-1, 4), CONSENSUS.sigmas[0]).reshape(CONSENSUS.focals, -1)
     best = np.argmax(values, axis=1)
-    rows = np.arange(FOCALS)
+    rows = np.arange(CONSENSUS.focals)
     return Profile(thetas[rows, best], values[rows, best])
 
 
 def peaks(consensus: Consensus, profile: Profile, free: Sequence[int]) -> list[Peak]:
-    """Return the peaks reached by climbing from the best local maxima of the profile, highest first.
-
-    Args:
-        consensus: of all pairs.
-        profile: from `scan`.
-        free: places in theta that may move.
-    """
+    """Return the peaks that climbing from the best local maxima of the profile reaches, highest first."""
     padded = np.concatenate([[-np.inf], profile.values, [-np.inf]])
     is_top = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
     tops = np.flatnonzero(is_top)
-    starts = tops[np.argsort(-profile.values[tops], kind="stable")][:MOST_STARTS]
-    ends = [Peak(*consensus.climb(profile.thetas[start], free, SIGMAS)) for start in starts]
+    starts = tops[np.argsort(-profile.values[tops], kind="stable")][: CONSENSUS.starts]
+    ends = [Peak(*consensus.climb(profile.thetas[start], free, CONSENSUS.sigmas)) for start in starts]
     return sorted(ends, key=lambda peak: -peak.value)
 
 
-# Evidence for a peak of the joint consensus: how many pairs support it, its best rival, its stability.
-#
-# Ours; the bootstrap is Rubin's (1981), the effective sample size Kish's (1965).
-
-OWN_SIGMA_RANGE = (0.005, 0.02)
-"""The last width of the consensus follows the data within these bounds, in units of r. Chosen by hand; halved and
-doubled by `benchmarks.sensitivity`."""
-OWN_SIGMA_FACTOR = 1.5
-"""That width in medians of r: half of the agreeing pairs then vote with more than half their weight.
-docs/algorithms.md, Self-calibration, 1. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-MIN_AGREEING = 2.25
-"""Effective number of pairs that must agree; three parameters satisfy one and a half pairs in any case.
-docs/algorithms.md, Self-calibration, 5. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-MIN_SUPPORT = 0.12
-"""Share of the votes that K must win; many pairs without any common K give up to 0.06. docs/algorithms.md,
-Self-calibration, 5. The command that gave 0.06 is not on record."""
-RIVAL_RATIO = 1.25
-"""A K with a focal this many times longer or shorter is another answer. docs/algorithms.md, Self-calibration, 5. Chosen
-by hand; halved and doubled by `benchmarks.sensitivity`."""
-MIN_LEAD = 0.5
-"""Votes by which K must lead every other focal. docs/algorithms.md, Self-calibration, 5. Chosen by hand; halved and
-doubled by `benchmarks.sensitivity`."""
-MIN_LEAD_SHARE = 0.03
-"""That lead as a share of the votes for K: many pairs that barely distinguish focals do not determine one.
-docs/algorithms.md, Self-calibration, 5. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-RESAMPLES = 25
-"""Number of resamples of the Bayesian bootstrap (docs/algorithms.md, Self-calibration, without matches). Chosen by
-hand; halved and doubled by `benchmarks.sensitivity`."""
-STABLE_SIGMA = 0.01
-"""Resampled fits use at least this width: below it they snap to single pairs. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
+# Evidence for a peak: the pairs that support it, its best rival, its stability.
 
 
 def residual_sigma(consensus: Consensus, theta: FloatArray) -> float:
-    """Return the width that fits the scatter of the agreeing pairs: 1.5 times the weighted median of their r.
-
-    Args:
-        consensus: of all pairs.
-        theta: (4,) the peak.
-    """
+    """Return the width that fits the scatter of the agreeing pairs: 1.5 times the weighted median of their r."""
     r = consensus.ratios(theta)
-    agreeing = r < SIGMAS[0]
+    agreeing = r < CONSENSUS.sigmas[0]
     if not np.any(agreeing):
-        return OWN_SIGMA_RANGE[1]
+        return CONSENSUS.own_sigma_range[1]
     order = np.argsort(r[agreeing], kind="stable")
     mass = np.cumsum(consensus.weights[agreeing][order])
     median = r[agreeing][order][np.searchsorted(mass, 0.5 * mass[-1])]
-    return float(np.clip(OWN_SIGMA_FACTOR * median, *OWN_SIGMA_RANGE))
+    return float(np.clip(CONSENSUS.own_sigma_factor * median, *CONSENSUS.own_sigma_range))
 
 
 def votes(consensus: Consensus, theta: FloatArray, sigma: float) -> FloatArray:
-    """Return (P,) votes of the pairs for K: w_i exp(-r_i / sigma).
-
-    Args:
-        consensus: of P pairs.
-        theta: (4,) parameters of K.
-        sigma: width of a vote, in units of r, > 0.
-    """
+    """Return (P,) votes of the pairs for theta: w_i exp(-r_i / sigma)."""
     return np.asarray(consensus.weights * np.exp(-consensus.ratios(theta) / sigma))
 
 
@@ -339,27 +311,17 @@ def effective_count(votes: FloatArray) -> float:
     return total * total / squares if squares > 0 else 0.0
 
 
-def disagreement(given: FloatArray, weights: FloatArray) -> str:
-    """Return why the votes do not suffice for a camera; empty where they do.
-
-    Args:
-        given: (P,) votes for K.
-        weights: (P,) the most that each pair can give.
-    """
-    count, support = effective_count(given), float(np.sum(given) / np.sum(weights))
-    if count >= MIN_AGREEING and support >= MIN_SUPPORT:
+def support_reason(votes: FloatArray, weights: FloatArray) -> str:
+    """Return why the votes (P,) do not suffice for a camera, beside the weights (P,); empty where they do."""
+    count, support = effective_count(votes), float(np.sum(votes) / np.sum(weights))
+    if count >= CONSENSUS.min_agreeing and support >= CONSENSUS.min_support:
         return ""
-    return f"the pairs do not agree on a camera: {100 * support:.0f} % of the votes, worth {count:.1f} pairs"
+    return f"the pairs do not agree on a camera: {100 * support:.0f} % of the votes, or {count:.1f} effective pairs"
 
 
-def indecision(lead: float, given: FloatArray) -> str:
-    """Return why a lead over the best rival is not enough; empty where it is.
-
-    Args:
-        lead: votes by which K leads.
-        given: (P,) votes for K.
-    """
-    if lead >= max(MIN_LEAD, MIN_LEAD_SHARE * float(np.sum(given))):
+def ambiguity_reason(margin: float, votes: FloatArray) -> str:
+    """Return why a margin over the best rival is not enough beside the votes (P,); empty where it is."""
+    if margin >= max(CONSENSUS.min_margin, CONSENSUS.min_margin_share * float(np.sum(votes))):
         return ""
     return "the pairs fit other focals as well or better (too little rotation, parallel axes, or an orbit)"
 
@@ -371,21 +333,14 @@ def best_rival(
     sigmas: Sequence[float],
     profile: Profile | None = None,
 ) -> float:
-    """Return the highest value, at the last sigma, of a focal `RIVAL_RATIO` away with everything else adapted to it.
+    """Return the highest value, at the last sigma, of a focal `rival_ratio` away with all other free places adapted.
 
-    It is climbed to from `theta` and, where a profile is given, from the best cell of the grid for that focal. Where
-    the consensus does not depend on the focal (orbits, parallel axes) it equals the value at theta.
-
-    Args:
-        consensus: of all pairs.
-        theta: (4,) the peak.
-        free: places in theta that may move; the focal stays in any case.
-        sigmas: falling widths of a vote.
-        profile: best cells of the grid, from `scan`.
+    The climbs start from theta and, given a profile, from its cell for that focal. Where the consensus does not depend
+    on the focal (orbits, parallel axes) the rival equals the value at theta.
     """
     adapted = [index for index in free if index != LOG_FOCAL]
     values = []
-    for log_focal in theta[LOG_FOCAL] + np.log(RIVAL_RATIO) * np.array([-1.0, 1.0]):
+    for log_focal in theta[LOG_FOCAL] + np.log(CONSENSUS.rival_ratio) * np.array([-1.0, 1.0]):
         starts = [theta.copy()]
         if profile is not None:
             starts.append(profile.thetas[np.argmin(np.abs(profile.thetas[:, LOG_FOCAL] - log_focal))].copy())
@@ -396,120 +351,70 @@ def best_rival(
 
 
 def resample_peak(consensus: Consensus, theta: FloatArray, free: Sequence[int], sigma: float, seed: int) -> FloatArray:
-    """Return the peak (RESAMPLES, 4) under randomly reweighted pairs: the Bayesian bootstrap (Rubin 1981).
+    """Return the peak (B, 4) under randomly reweighted pairs: the Bayesian bootstrap (Rubin 1981).
 
     Weights instead of draws, because three pairs drawn with replacement are often one pair three times.
-
-    Args:
-        consensus: of all pairs.
-        theta: (4,) the peak, where every climb starts.
-        free: places in theta that may move.
-        sigma: width of a vote, in units of r.
-        seed: same seed, same result.
     """
     rng = np.random.default_rng(seed)
     weights = consensus.weights
-    found = []
-    for _ in range(RESAMPLES):
+    thetas = []
+    for _ in range(CONSENSUS.resamples):
         drawn = weights * rng.exponential(size=len(weights))
-        again = consensus.with_weights(drawn * (np.sum(weights) / np.sum(drawn)))
-        found.append(again.climb(theta, free, (max(sigma, STABLE_SIGMA),))[0])
-    return np.array(found)
+        resampled = consensus.with_weights(drawn * (np.sum(weights) / np.sum(drawn)))
+        thetas.append(resampled.climb(theta, free, (max(sigma, CONSENSUS.stable_sigma),))[0])
+    return np.array(thetas)
 
 
 def deviation(values: FloatArray, count: float, parameters: int) -> float:
-    """Return the standard deviation of an unknown over resampled peaks, corrected for degrees of freedom.
+    """Return the standard deviation of an unknown over resampled peaks (B,), corrected for degrees of freedom.
 
     A pair gives two constraints. With three pairs and three unknowns half of the scatter has gone into the fit, and the
-    resampled peaks scatter too little by the same share: the usual correction for degrees of freedom.
-
-    Args:
-        values: (B,) one unknown at each peak, B >= 2.
-        count: effective number of pairs.
-        parameters: number of unknowns.
+    resampled peaks scatter too little by the same share. `count` is the effective number of pairs.
     """
-    spare = max(count - 0.5 * parameters, 0.5)
-    return float(np.std(values, ddof=1) * np.sqrt(max(count, 1.0) / spare))
+    freedom = max(count - 0.5 * parameters, 0.5)
+    return float(np.std(values, ddof=1) * np.sqrt(max(count, 1.0) / freedom))
 
 
 def spread_px(thetas: FloatArray, unit_px: float, count: float, parameters: int) -> dict[str, float]:
-    """Return the standard deviations of fx, fy, cx, cy, in pixels; see `deviation`.
-
-    Args:
-        thetas: (B, 4) resampled peaks, B >= 2.
-        unit_px: pixels per unit of theta.
-        count: effective number of pairs.
-        parameters: number of unknowns.
-    """
+    """Return the standard deviations of fx, fy, cx, cy in pixels over (B, 4) resampled thetas, see `deviation`."""
     focal, half = np.exp(thetas[:, LOG_FOCAL]) * unit_px, np.exp(0.5 * thetas[:, LOG_ASPECT])
     columns = {"fx": focal / half, "fy": focal * half}
     columns |= {"cx": thetas[:, CENTER_U] * unit_px, "cy": thetas[:, CENTER_V] * unit_px}
     return {name: deviation(column, count, parameters) for name, column in columns.items()}
 
 
-SQUARE_PIXELS = (LOG_FOCAL, CENTER_U, CENTER_V)
-"""Places in theta that are sought when pixels are square."""
-ANY_PIXELS = (*SQUARE_PIXELS, LOG_ASPECT)
-"""Places in theta that are sought when they need not be."""
-LOG_ASPECTS = tuple(np.linspace(-0.6, 0.6, 9))
-"""log fy/fx on the grid: 0.55 to 1.8. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-ASPECT_GAIN = float(np.log(50))
-"""Votes that freeing fy/fx must win: about one photo set in fifty has pixels that are not square. docs/algorithms.md,
-Self-calibration, 1. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-PERHAPS_ASPECT_GAIN = float(np.log(50 * 0.05))
-"""Votes from which on square pixels are less than 95 % sure. Of 47 answers with square pixels on the photo sets and on
-folders 0 to 170 of `python -m benchmarks.trouble`, one had more (1.55), and its pixels were not square."""
-MAX_LOG_FOCAL_SPREAD = 0.1
-"""Largest standard deviation of log f: a focal that is less certain starts bundle adjustment no better than a guess.
-docs/algorithms.md, Self-calibration, 5. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-IDENTIFIED_LOG_FOCAL_SPREAD = 0.02
-"""Largest standard deviation of log f that counts as known: with 0.025 one focal of twenty is off by 5 %, which is too
-much to be called identifiable. Between this and the limit above the answer is an estimate: a better start than a guess,
-and no more. Of 109 cameras of seeds 0 to 180, 1000 to 1035 and 2000 to 2139 of `python -m benchmarks.trouble` four lie
-between 0.02 and 0.03: off by 10, 7, 2 and 1 %."""
-SAFE_LEAD_SHARE, SAFE_SUPPORT = 0.2, 0.8
-"""Where a focal a quarter away loses less than the first share of the votes (walks to the side or on one plane), the
-focal is poorly determined. Then pairs must win the second share of all votes: what misled the missing ones may have
-biased the others. Of the same 109 cameras eight are short of both: off by 43, 10, 6, 4, 4, 1, 0.3 and 0.2 %; no other
-of them whose deviation is below 0.02 is off by more than 2.5 %. docs/algorithms.md, Self-calibration, 5."""
-IDENTIFIED_OF_MANY = 0.015
-"""Largest such deviation where every photo has its own focal: the worst of many is further off than a single one.
-docs/algorithms.md, Self-calibration, 6. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-EDGE = 1.02
-"""A focal within this factor of an end of the range counts as having run to that end. Chosen by hand; halved and
-doubled by `benchmarks.sensitivity`."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class Answer:
+class ConsensusPeak:
     """A peak with everything that a verdict needs."""
 
     theta: FloatArray
     """(4,) log f, u, v, log a."""
     free: tuple[int, ...]
-    """Places in theta that were sought."""
+    """Places in theta that were free."""
     sigma: float
     """Width of the consensus that fits the agreeing pairs."""
-    lead: float
-    """Votes by which it leads every other focal."""
+    margin: float
+    """Votes for it beyond those for any other focal."""
     votes: FloatArray
     """(P,) votes of the pairs for it."""
     gain: float
     """Votes that freeing fy/fx wins."""
-    others: tuple[FloatArray, ...]
-    """(4,) each: lower peaks, highest first."""
+    rivals: tuple[FloatArray, ...]
+    """(4,) each: lower peaks at other focals, highest first."""
 
     @property
-    def doubt_of_pixels(self) -> str:
-        """Why an answer with square pixels is only an estimate; empty where it is not."""
-        doubtful = LOG_ASPECT not in self.free and self.gain >= PERHAPS_ASPECT_GAIN
-        return "its pixels may not be square" if doubtful else ""
+    def aspect_reason(self) -> str:
+        """Why square pixels make the answer an estimate; empty where they do not."""
+        doubtful = LOG_ASPECT not in self.free and self.gain >= CONSENSUS.doubtful_aspect_gain
+        return "the pixels may not be square" if doubtful else ""
 
-    def doubt_of_focal(self, weights: FloatArray) -> str:
-        """Return why an answer to pairs of weights (P,) is an estimate despite a small deviation; empty for none."""
+    def rival_reason(self, weights: FloatArray) -> str:
+        """Return why the answer to pairs of weights (P,) is an estimate despite a small deviation; empty for none."""
         mass = float(np.sum(self.votes))
-        doubtful = self.lead < SAFE_LEAD_SHARE * mass and mass < SAFE_SUPPORT * float(np.sum(weights))
-        return "many pairs fit other focals nearly as well, and some fit none" if doubtful else ""
+        doubtful = self.margin < CONSENSUS.safe_margin_share * mass and mass < CONSENSUS.safe_support * float(
+            np.sum(weights)
+        )
+        return "many pairs fit other focals nearly as well; some pairs fit none" if doubtful else ""
 
     def evidence(self, weights: FloatArray) -> dict[str, float]:
         """Return figures for the report, by name."""
@@ -517,81 +422,75 @@ class Answer:
         return {
             "support": mass / float(np.sum(weights)),
             "agreeing_pairs": effective_count(self.votes),
-            "lead": self.lead,
-            "lead_share": self.lead / mass if mass > 0 else 0.0,
+            "lead": self.margin,
+            "lead_share": self.margin / mass if mass > 0 else 0.0,
             "sigma": self.sigma,
             "aspect_gain": self.gain,
         }
 
-    def contradiction(self, weights: FloatArray) -> str:
-        """Return why pairs of the given weights (P,) do not determine a camera; empty where they do."""
-        return disagreement(self.votes, weights) or indecision(self.lead, self.votes)
+    def undetermined_reason(self, weights: FloatArray) -> str:
+        """Return why pairs of weights (P,) do not determine a camera; empty where they do."""
+        return support_reason(self.votes, weights) or ambiguity_reason(self.margin, self.votes)
 
     def resample(self, consensus: Consensus, seed: int) -> FloatArray:
-        """Return (B, 4) the peak under resampled pairs, see `peak_evidence.resample_peak`.
-
-        Args:
-            consensus: of all pairs.
-            seed: same seed, same result.
-        """
+        """Return (B, 4) the peak under resampled pairs, see `resample_peak`."""
         return resample_peak(consensus, self.theta, self.free, self.sigma, seed)
 
     def deviation(self, values: FloatArray) -> float:
-        """Return the standard deviation of an entry of theta from its resampled `values` (B,)."""
+        """Return the standard deviation of an entry of theta from its resampled values (B,)."""
         return deviation(values, effective_count(self.votes), len(self.free))
 
 
-def find_peak(consensus: Consensus) -> Answer:
+def find_peak(consensus: Consensus) -> ConsensusPeak:
     """Find the highest peak with square pixels or, where the pairs clearly support it, with any aspect."""
     profile = scan(consensus, (0.0,))
     square = peaks(consensus, profile, SQUARE_PIXELS)
-    free_profile = scan(consensus, LOG_ASPECTS)
+    free_profile = scan(consensus, CONSENSUS.log_aspects)
     free = peaks(consensus, free_profile, ANY_PIXELS)
     # both use the width that fits the freer one: a wrong square answer would choose a lenient width
     sigmas = (residual_sigma(consensus, free[0].theta),)
     theta, value = consensus.climb(square[0].theta, SQUARE_PIXELS, sigmas)
     gain = max(consensus.climb(start, ANY_PIXELS, sigmas)[1] for start in (theta, free[0].theta)) - value
-    if gain >= ASPECT_GAIN:
+    if gain >= CONSENSUS.aspect_gain:
         return _examine(consensus, free, free_profile, ANY_PIXELS, gain)
     return _examine(consensus, square, profile, SQUARE_PIXELS, gain)
 
 
-def _examine(consensus: Consensus, ends: list[Peak], profile: Profile, free: tuple[int, ...], gain: float) -> Answer:
+def _examine(
+    consensus: Consensus, ends: list[Peak], profile: Profile, free: tuple[int, ...], gain: float
+) -> ConsensusPeak:
     """Refine the highest peak with the width that fits its pairs, and collect the evidence for it."""
     best = ends[0]
     sigma = residual_sigma(consensus, best.theta)
     theta, _ = consensus.climb(best.theta, free, (sigma,))
-    value = float(consensus.evaluate(theta[None, :], SIGMAS[-1])[0])
-    far = [peak for peak in ends[1:] if abs(peak.theta[LOG_FOCAL] - theta[LOG_FOCAL]) > np.log(RIVAL_RATIO)]
-    lead = value - max([best_rival(consensus, theta, free, SIGMAS, profile), *(peak.value for peak in far)])
-    given = votes(consensus, theta, SIGMAS[-1])
-    return Answer(theta, free, sigma, lead, given, gain, tuple(peak.theta for peak in far))
+    value = float(consensus.evaluate(theta[None, :], CONSENSUS.sigmas[-1])[0])
+    far = [peak for peak in ends[1:] if abs(peak.theta[LOG_FOCAL] - theta[LOG_FOCAL]) > np.log(CONSENSUS.rival_ratio)]
+    margin = value - max([best_rival(consensus, theta, free, CONSENSUS.sigmas, profile), *(peak.value for peak in far)])
+    cast = votes(consensus, theta, CONSENSUS.sigmas[-1])
+    return ConsensusPeak(theta, free, sigma, margin, cast, gain, tuple(peak.theta for peak in far))
 
 
-def vagueness(log_focal_spread: float, *, one_of_many: bool = False) -> str:
-    """Return why an answer without objections is only an estimate; empty where it is identifiable.
+def uncertainty_reason(log_focal_spread: float, *, one_of_many: bool = False) -> str:
+    """Return why an accepted answer is only an estimate; empty where it is identifiable.
 
-    Args:
-        log_focal_spread: standard deviation of log f.
-        one_of_many: whether every photo has a focal of its own; a smaller spread is required then.
+    `one_of_many` asks for a smaller spread: every photo has its own focal.
     """
-    vague = log_focal_spread > (IDENTIFIED_OF_MANY if one_of_many else IDENTIFIED_LOG_FOCAL_SPREAD)
+    vague = log_focal_spread > (CONSENSUS.identified_of_many if one_of_many else CONSENSUS.identified_log_focal_spread)
     return f"the focal is uncertain by {100 * log_focal_spread:.0f} %" if vague else ""
 
 
-def objection(theta: FloatArray, log_focal_spread: float, half_size: tuple[float, float]) -> str:
-    """Return why an answer that the pairs agree on is not trusted; empty where it is.
+def rejection_reason(theta: FloatArray, log_focal_spread: float, size: tuple[int, int]) -> str:
+    """Return why an answer that the pairs agree on is rejected; empty where it is accepted.
 
     Args:
         theta: log f, u, v, ... in longer sides from the middle.
-        log_focal_spread: standard deviation of log f.
-        half_size: half of the photo's width and height in longer sides.
+        size: (width, height) of the photo, in any unit.
     """
-    focal, (low, high) = float(np.exp(theta[LOG_FOCAL])), FOCAL_RANGE
-    if not low * EDGE < focal < high / EDGE:
-        return f"the focal runs to the end of the range, {focal:.2f} longer sides"
-    if np.any(np.abs(theta[CENTER_U : CENTER_V + 1]) > half_size):
-        return "the optical center runs out of the photo"
-    if log_focal_spread > MAX_LOG_FOCAL_SPREAD:
+    focal, (low, high) = float(np.exp(theta[LOG_FOCAL])), CONSENSUS.focal_range
+    if not low * CONSENSUS.edge < focal < high / CONSENSUS.edge:
+        return f"the focal is at the end of the range: {focal:.2f} times the longer side"
+    if np.any(np.abs(theta[CENTER_U : CENTER_V + 1]) > 0.5 * np.array(size) / max(size)):
+        return "the optical center lies outside the photo"
+    if log_focal_spread > CONSENSUS.max_log_focal_spread:
         return f"the focal is uncertain by {100 * log_focal_spread:.0f} %"
     return ""

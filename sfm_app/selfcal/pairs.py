@@ -1,24 +1,21 @@
-"""Pairs of photos as self-calibration takes them: fundamental matrices, matches, and the lens."""
+"""Pairs as self-calibration takes them, camera parameters, the lens, and the calibration as a result."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sfm_app.camera.models import camera_matrix, guessed_camera_matrix
 from sfm_app.fundamental.refits import refine_sampson
 from sfm_app.jit import kernel
 from sfm_app.types import Calibration, CameraPairs
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import FloatArray, IndexArray
 
-# Fundamental matrices as every calibrator expects them: checked, of rank 2, in image units.
-#
-# Thesis 5.6.4 brings every F to norm 1; rank 2 and the epipoles are ours.
+# The input of every calibrator: checked, of rank 2, in image units (thesis 5.6.4; rank 2 and epipoles are ours).
 
 FULL_WEIGHT_INLIERS = 300
-"""A pair with this many inliers or more counts fully. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
+"""Inliers from which on a pair counts fully; by hand."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,8 +32,8 @@ class Pairs:
     """(P,) products of the two non-zero singular values of F."""
     weights: FloatArray
     """(P,) how far each F is trusted, > 0."""
-    kept: NDArray[np.int64]
-    """(P,) their indices among the given matrices."""
+    indices: IndexArray
+    """(P,) rows of the given matrices."""
 
     def __len__(self) -> int:
         return len(self.F)
@@ -48,24 +45,18 @@ class Pairs:
 
 
 def pair_weights(inlier_counts: ArrayLike) -> FloatArray:
-    """Return the weights of fundamental matrices from their numbers n of inliers: min(1, n / 300)."""
+    """Return min(1, n / 300) for n inliers."""
     counts = np.asarray(inlier_counts, dtype=np.float64)
     return np.minimum(1.0, counts / FULL_WEIGHT_INLIERS)
 
 
 def prepare(pairs: CameraPairs, *, unit_px: float, origin_px: tuple[float, float]) -> Pairs:
-    """Check the input of a calibrator and express it in units of `unit_px` from `origin_px`.
+    """Check the pairs and express them in units of `unit_px` from the pixel `origin_px`.
 
-    Pairs of weight 0 are left out, and so is an F that repeats another, in either direction: it is no further evidence.
-
-    Args:
-        pairs: P may be 0.
-        unit_px: length that becomes 1, in pixels.
-        origin_px: pixel that becomes (0, 0).
+    Pairs of weight 0 are left out; so is an F that repeats another, in either direction: it is no further evidence.
 
     Raises:
-        ValueError: a shape is wrong, a number is not finite, a weight is negative, an F is zero, or the size or a
-            claimed focal is not positive.
+        ValueError: the pairs are malformed, see `check_pairs`.
     """
     raw, trust, used = check_pairs(pairs)
     to_pixels = np.array([[unit_px, 0.0, origin_px[0]], [0.0, unit_px, origin_px[1]], [0.0, 0.0, 1.0]])
@@ -81,19 +72,19 @@ def prepare(pairs: CameraPairs, *, unit_px: float, origin_px: tuple[float, float
         e2=U[:, :, 2],
         product=s[:, 0] * s[:, 1],
         weights=trust,
-        kept=used[distinct],
+        indices=used[distinct],
     )
 
 
-def check_pairs(pairs: CameraPairs) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
-    """Return matrices (Q, 3, 3) and weights (Q,) of the pairs with a weight, and their indices.
+def check_pairs(pairs: CameraPairs) -> tuple[FloatArray, FloatArray, IndexArray]:
+    """Return matrices (Q, 3, 3), weights (Q,) and rows of the pairs with a weight.
 
     Raises:
-        ValueError: as `prepare`.
+        ValueError: a shape is wrong, a number is not finite, a weight is negative, an F is zero, or the size or a
+            claimed focal is not positive.
     """
     raw = np.asarray(pairs.Fs, dtype=np.float64)
     trust = np.asarray(pairs.weights, dtype=np.float64)
-    size = pairs.size
     if raw.size == 0:
         raw = raw.reshape(0, 3, 3)
     if raw.ndim != 3 or raw.shape[1:] != (3, 3):
@@ -101,60 +92,52 @@ def check_pairs(pairs: CameraPairs) -> tuple[FloatArray, FloatArray, NDArray[np.
     if trust.shape != (len(raw),):
         raise ValueError(f"weights must have shape ({len(raw)},), one per fundamental matrix, not {trust.shape}")
     if not np.all(np.isfinite(raw)):
-        raise ValueError("fundamental matrices must be finite, found NaN or infinity")
+        raise ValueError("fundamental matrices must be finite; one has NaN or infinity")
     if not np.all(np.isfinite(trust) & (trust >= 0)):
         raise ValueError("weights must be finite and >= 0")
     if np.any(np.all(raw == 0, axis=(1, 2))):
         raise ValueError("a fundamental matrix is zero")
-    if len(size) != 2 or not all(np.isfinite(side) and side > 0 for side in size):
-        raise ValueError(f"size must be (width, height) in pixels, both > 0, not {size}")
-    if pairs.inliers and len(pairs.inliers) != len(raw):
-        raise ValueError(f"inliers of {len(pairs.inliers)} pairs were given for {len(raw)} fundamental matrices")
-    if any(x.ndim != 2 or x.shape[1] != 4 or not np.all(np.isfinite(x)) for x in map(np.asarray, pairs.inliers)):
-        raise ValueError("inliers must have shape (N, 4) per pair and be finite")
-    if not all(np.isfinite(focal) and focal > 0 for focal in pairs.focal_hints_px):
-        raise ValueError("claimed focals must be finite and > 0")
-    if pairs.photos and len(pairs.photos) != len(raw):
-        raise ValueError(f"photos of {len(pairs.photos)} pairs were given for {len(raw)} fundamental matrices")
+    _check_photos(pairs, len(raw))
     used = np.flatnonzero(trust > 0)
     return raw[used], trust[used], used
 
 
-def _distinct_indices(scaled: FloatArray) -> NDArray[np.int64]:
-    """Return the indices of the first of all matrices that agree to 9 digits up to sign and transposition."""
-    seen: dict[bytes, int] = {}
+def _check_photos(pairs: CameraPairs, count: int) -> None:
+    size = pairs.size
+    if len(size) != 2 or not all(np.isfinite(side) and side > 0 for side in size):
+        raise ValueError(f"size must be (width, height) in pixels, both > 0, not {size}")
+    for name, values in (("inliers", pairs.inliers), ("photos", pairs.photos)):
+        if values and len(values) != count:
+            raise ValueError(f"there are {count} fundamental matrices, but {name} of {len(values)} pairs")
+    if any(x.ndim != 2 or x.shape[1] != 4 or not np.all(np.isfinite(x)) for x in map(np.asarray, pairs.inliers)):
+        raise ValueError("inliers must have shape (N, 4) per pair and be finite")
+    if not all(np.isfinite(focal) and focal > 0 for focal in pairs.focal_hints_px):
+        raise ValueError("claimed focals must be finite and > 0")
+
+
+def _distinct_indices(scaled: FloatArray) -> IndexArray:
+    """Return the first row of all matrices that agree to 9 digits up to sign and transposition."""
+    first: dict[bytes, int] = {}
     for index, F in enumerate(scaled):
         keys = [(np.round(sign * G, 9) + 0.0).tobytes() for sign in (1, -1) for G in (F, F.T)]
-        seen.setdefault(min(keys), index)
-    return np.array(sorted(seen.values()), dtype=np.int64)
+        first.setdefault(min(keys), index)
+    return np.array(sorted(first.values()), dtype=np.int64)
 
 
-# From pixels to rays through a lens with one radial term.
-#
-# Ours; the thesis has no lens.
-#
-# The lens is COLMAP's SIMPLE_RADIAL: x_d = x_u (1 + k1 r_u^2) about the optical center, r_u in focal lengths. While
-# the focal is sought, the parameter of the lens is kappa = k1 / f^2, with f and lengths in longer sides: the
-# displacement of a point of the photo must not depend on the focal that is tried.
+# The lens, with one radial term (ours; the thesis has none), is COLMAP's SIMPLE_RADIAL: x_d = x_u (1 + k1 r_u^2)
+# about the optical center, r_u in focal lengths. While the focal is sought, its parameter is kappa = k1 / f^2, with f
+# and lengths in longer sides: the displacement of a point must not depend on the focal under trial.
 
 LOG_FOCAL, CENTER_U, CENTER_V, LOG_ASPECT, KAPPA = range(5)
-"""Places in the parameters of a camera: log f with f = sqrt(fx fy), center from the middle, log fy/fx, kappa."""
+"""Parameters theta of a camera: log f with f = sqrt(fx fy), center from the middle, log fy/fx, kappa."""
 LEAST_SLOPE = 0.2
-"""Least slope of the distorted over the undistorted radius; beyond it the lens continues linearly, so that it does not
-fold. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-NEWTON_STEPS = 20
-"""Most steps; three or four are enough except for the strongest pincushions. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
+"""Least slope of the distorted over the undistorted radius; beyond it the lens continues linearly and does not fold. By
+hand."""
 
 
 @kernel
 def write_camera(theta: FloatArray, camera: FloatArray) -> None:
-    """Write fx, fy, u, v, k1 of a camera.
-
-    Args:
-        theta: (5,) log f, u, v, log a, kappa.
-        camera: (5,), written to.
-    """
+    """Write fx, fy, u, v, k1 of the parameters (5,) into `camera` (5,)."""
     f, half = np.exp(theta[0]), np.exp(0.5 * theta[3])
     camera[0], camera[1], camera[2], camera[3] = f / half, f * half, theta[1], theta[2]
     camera[4] = theta[4] * f * f
@@ -162,13 +145,7 @@ def write_camera(theta: FloatArray, camera: FloatArray) -> None:
 
 @kernel
 def undistort_radius(radius: float, k1: float, guess: float) -> float:
-    """Return the undistorted radius r_u of a distorted one, in focal lengths, by Newton's method.
-
-    Args:
-        radius: r_d in focal lengths, >= 0.
-        k1: of the lens.
-        guess: r_u to start from.
-    """
+    """Return the radius r_u of a distorted one, both in focal lengths, by Newton's method from `guess`."""
     if k1 == 0.0 or radius < 1e-9:
         return radius
     if k1 < 0.0:
@@ -177,7 +154,7 @@ def undistort_radius(radius: float, k1: float, guess: float) -> float:
         if beyond >= 0.0:
             return float(last + beyond / LEAST_SLOPE)
     r = guess
-    for _ in range(NEWTON_STEPS):
+    for _ in range(20):  # three or four are enough but for the strongest pincushions
         slope = max(1.0 + 3.0 * k1 * r * r, LEAST_SLOPE)
         step = (r * (1.0 + k1 * r * r) - radius) / slope
         r -= step
@@ -188,14 +165,12 @@ def undistort_radius(radius: float, k1: float, guess: float) -> float:
 
 @kernel
 def write_ray(x: float, y: float, camera: FloatArray, guess: float, out: FloatArray) -> None:
-    """Write the point (a, b) of the plane z = 1 that a pixel sees, its derivatives, and r_u.
+    """Write the point (a, b) of the plane z = 1 that the pixel x, y sees, its derivatives, and r_u.
 
     Args:
-        x: column of the pixel, in the units of the camera.
-        y: row of the pixel, in the units of the camera.
         camera: (5,) fx, fy, u, v, k1.
-        guess: r_u of a similar camera, to start from; negative for none.
-        out: (7,), written to: a, b, da/dx, da/dy, db/dx, db/dy, r_u.
+        guess: r_u of a similar camera; negative for none.
+        out: (7,) a, b, da/dx, da/dy, db/dx, db/dy, r_u.
     """
     a, b = (x - camera[2]) / camera[0], (y - camera[3]) / camera[1]
     r2 = a * a + b * b
@@ -203,23 +178,18 @@ def write_ray(x: float, y: float, camera: FloatArray, guess: float, out: FloatAr
     if guess < 0.0:
         guess = radius / (1.0 + k1 * r2) if k1 > 0.0 else radius
     r = undistort_radius(radius, k1, guess)
-    along = r / radius if radius > 1e-9 else 1.0
+    scale = r / radius if radius > 1e-9 else 1.0
     radial = 1.0 / max(1.0 + 3.0 * k1 * r * r, LEAST_SLOPE)
-    bend = (radial - along) / r2 if r2 > 1e-18 else 0.0
-    out[0], out[1] = along * a, along * b
-    out[2], out[3] = (along + bend * a * a) / camera[0], bend * a * b / camera[1]
-    out[4], out[5] = bend * a * b / camera[0], (along + bend * b * b) / camera[1]
+    bend = (radial - scale) / r2 if r2 > 1e-18 else 0.0
+    out[0], out[1] = scale * a, scale * b
+    out[2], out[3] = (scale + bend * a * a) / camera[0], bend * a * b / camera[1]
+    out[4], out[5] = bend * a * b / camera[0], (scale + bend * b * b) / camera[1]
     out[6] = r
 
 
 @kernel
 def undistort_kernel(points: FloatArray, theta: FloatArray) -> FloatArray:
-    """Return (N, 2) undistorted points.
-
-    Args:
-        points: (N, 2) from the middle of the photo.
-        theta: (5,) parameters of the camera, in the same units.
-    """
+    """Return (N, 2) undistorted points of a camera (5,); both count from the middle of the photo."""
     camera, out, straight = np.empty(5), np.empty(7), np.empty_like(points)
     write_camera(theta, camera)
     for i in range(len(points)):
@@ -229,102 +199,69 @@ def undistort_kernel(points: FloatArray, theta: FloatArray) -> FloatArray:
     return straight
 
 
-# Results of a calibrator.
-#
-# Ours; the thesis gives a K in any case.
-
 GUESS = "guess"
 ESTIMATE = "estimate"
 """Method of a camera that the photos determine roughly."""
 
 
 def guess_calibration(size: tuple[int, int], reason: str, evidence: Mapping[str, float]) -> Calibration:
-    """Return the usual guess with the reason why nothing better is known.
-
-    Args:
-        size: (width, height) of the photos in pixels.
-        reason: why nothing better is known, for the user.
-        evidence: numbers by name, to go with the answer.
-    """
+    """Return the usual guess, with the reason for the user and the evidence."""
     K = guessed_camera_matrix(size)
     return Calibration(K, *size, GUESS, identifiable=False, reason=reason, evidence=dict(evidence))
 
 
 def calibration_from_parameters(
-    theta: NDArray[np.float64], size: tuple[int, int], method: str, unit_px: float | None = None
+    theta: FloatArray, size: tuple[int, int], method: str, unit_px: float | None = None
 ) -> Calibration:
-    """Return the calibration with the parameters of `lens`, which count from the middle of the photo.
-
-    Args:
-        theta: (5,) log f, u, v, log a, kappa.
-        size: (width, height) of the photo in pixels.
-        method: name of what found them.
-        unit_px: pixels per unit of theta; the longer side where None.
-    """
-    unit = float(max(size)) if unit_px is None else unit_px
+    """Return the calibration of theta (5,), in units of `unit_px` (the longer side for None) from the middle."""
+    unit = unit_px or float(max(size))
     focal, half = float(np.exp(theta[LOG_FOCAL])), float(np.exp(0.5 * theta[LOG_ASPECT]))
     cx, cy = unit * theta[CENTER_U] + size[0] / 2, unit * theta[CENTER_V] + size[1] / 2
     K = camera_matrix(unit * focal / half, unit * focal * half, float(cx), float(cy))
     return Calibration(K, *size, method, identifiable=True, radial=float(theta[KAPPA]) * focal**2)
 
 
-def downgrade_to_estimate(found: Calibration, reason: str) -> Calibration:
-    """Return the calibration, as an estimate that is not relied on if there is a reason for that.
-
-    Args:
-        found: the answer.
-        reason: why it is not relied on, for the user; empty for none.
-    """
-    return replace(found, identifiable=False, method=ESTIMATE, reason=reason) if reason else found
+def downgrade_to_estimate(calibration: Calibration, reason: str) -> Calibration:
+    """Return the calibration as an estimate if there is a reason; unchanged for an empty reason."""
+    return replace(calibration, identifiable=False, method=ESTIMATE, reason=reason) if reason else calibration
 
 
-def parameters_from_calibration(found: Calibration, unit_px: float) -> NDArray[np.float64]:
-    """Return the parameters (5,) that `calibration_from_parameters` was made from.
-
-    Args:
-        found: the answer.
-        unit_px: pixels per unit of the parameters.
-    """
-    focal = found.focal_px / unit_px
-    u, v = (found.K[0, 2] - found.width / 2) / unit_px, (found.K[1, 2] - found.height / 2) / unit_px
-    return np.array([np.log(focal), u, v, np.log(found.K[1, 1] / found.K[0, 0]), found.radial / focal**2])
-
-
-# Pairs without lens distortion: only of these do the zero curves meet.
-#
-# Ours; the thesis has no lens.
-
-REACH_PX = 3.0
-"""Scale of the robust refit of an F. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+def parameters_from_calibration(calibration: Calibration, unit_px: float) -> FloatArray:
+    """Return theta (5,), the inverse of `calibration_from_parameters`."""
+    focal = calibration.focal_px / unit_px
+    u, v = (
+        (calibration.K[0, 2] - calibration.width / 2) / unit_px,
+        (calibration.K[1, 2] - calibration.height / 2) / unit_px,
+    )
+    return np.array(
+        [np.log(focal), u, v, np.log(calibration.K[1, 1] / calibration.K[0, 0]), calibration.radial / focal**2]
+    )
 
 
 def undistort_pairs(pairs: CameraPairs, camera: Calibration) -> CameraPairs:
-    """Undistort the inliers and refit every F to them; return the pairs themselves where no lens is known.
-
-    Args:
-        pairs: P fundamental matrices in pixels, with or without their inliers.
-        camera: the camera of all photos.
-    """
+    """Undistort the inliers and refit every F; return the pairs unchanged without a lens or without inliers."""
     if camera.radial == 0.0 or not pairs.inliers:
         return pairs
     side, middle = float(max(pairs.size)), np.array(pairs.size) / 2
+    scale = 3.0 / side  # of the robust refit: 3 px
     theta = parameters_from_calibration(camera, side)
-    to_sides = np.array([[1 / side, 0, -middle[0] / side], [0, 1 / side, -middle[1] / side], [0, 0, 1]])
+    to_sides = sides_from_pixels(pairs.size)
     back = np.linalg.inv(to_sides)
     Fs, inliers = np.empty_like(pairs.Fs), []
-    for k, seen in enumerate(pairs.inliers):
-        views = [undistort_points((np.asarray(seen)[:, i : i + 2] - middle) / side, theta) for i in (0, 2)]
+    for k, matches in enumerate(pairs.inliers):
+        views = [undistort_points((np.asarray(matches)[:, i : i + 2] - middle) / side, theta) for i in (0, 2)]
         points = np.asfortranarray(np.hstack(views))
-        Fs[k] = to_sides.T @ refine_sampson(points, back.T @ pairs.Fs[k] @ back, scale=REACH_PX / side) @ to_sides
+        Fs[k] = to_sides.T @ refine_sampson(points, back.T @ pairs.Fs[k] @ back, scale=scale) @ to_sides
         inliers.append(points * side + np.tile(middle, 2))
     return replace(pairs, Fs=Fs, inliers=tuple(inliers))
 
 
-def undistort_points(points: FloatArray, theta: FloatArray) -> FloatArray:
-    """Return (N, 2) undistorted points of a camera.
+def sides_from_pixels(size: tuple[int, int]) -> FloatArray:
+    """Return the (3, 3) transform from pixels to longer sides from the middle of the photo."""
+    side = float(max(size))
+    return np.array([[1 / side, 0, -size[0] / 2 / side], [0, 1 / side, -size[1] / 2 / side], [0, 0, 1]])
 
-    Args:
-        points: (N, 2) from the middle of the photo.
-        theta: (5,) parameters of the camera, see `lens`, in the same units.
-    """
+
+def undistort_points(points: FloatArray, theta: FloatArray) -> FloatArray:
+    """Return (N, 2) undistorted points of a camera (5,); both count from the middle of the photo."""
     return np.asarray(undistort_kernel(np.ascontiguousarray(points, np.float64), theta), np.float64)

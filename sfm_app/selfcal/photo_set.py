@@ -34,20 +34,22 @@ logger = logging.getLogger("sfm_app")
 
 CalibrateFunction = Callable[[CameraPairs, CalibrationSettings, int], Calibration]
 
-LEAST_TO_SPLIT = 4
-"""Photos below which a group is not split: too few to tell which of them disagree. Chosen by hand; halved and doubled
-by `benchmarks.sensitivity`."""
-SAME_FOCAL = 0.03
-"""Parts of a group whose log f differ by less are one camera. docs/algorithms.md, Self-calibration, 6. Chosen by hand;
-halved and doubled by `benchmarks.sensitivity`."""
-MANY_PARTS, PERHAPS_ZOOM = 3, "photos of one size fall into {count} cameras, as those of a zoom do"
-"""Parts of a group from which on the borders between them may be anywhere, so that none is relied on; and the reason.
-Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-PERHAPS_TWO = "its photos may be of two cameras"
-UNASSIGNED_REASON = "no usable pair shows which camera took its photos"
-LEAST_DISTORTION = 0.01
-"""|k1| from which on photos are undistorted before they are tested for one camera. Chosen by hand; halved and doubled
-by `benchmarks.sensitivity`."""
+
+@dataclass(frozen=True, slots=True)
+class SplitOptions:
+    """When photos of one group are of several cameras. Section 6 of Self-calibration in docs/algorithms.md."""
+
+    least_photos: int = 4
+    """Photos below which a group is not split: too few to tell which of them disagree; by hand."""
+    same_focal: float = 0.03
+    """Parts of a group whose log f differ by less are one camera. Section 6; by hand."""
+    many_parts: int = 3
+    """Parts from which on their borders are uncertain, as for a zoom, so that no part is relied on; by hand."""
+    least_distortion: float = 0.01
+    """|k1| from which on photos are undistorted before they are tested for one camera; by hand."""
+
+
+SPLITTING = SplitOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +74,6 @@ def calibrate_photo_set(
     Args:
         pairs: all pairs that are not degenerate.
         calibrate: finds one camera from its own pairs.
-        options: passed to `calibrate`.
-        seed: passed to `calibrate`.
         together: also use the pairs between cameras.
         split: with `together`, also split groups whose photos disagree.
     """
@@ -99,7 +99,7 @@ def _calibrate_alone(
     try:
         return calibrate(own, options, seed)
     except FAILURES as err:
-        logger.info("a camera could not be calibrated", exc_info=err)
+        logger.info("calibration of a camera failed", exc_info=err)
         return guess_calibration(
             own.size, f"the computation failed: {error_reason(err)}", {"pairs": float(len(own.Fs))}
         )
@@ -116,7 +116,7 @@ def _calibrate_jointly(
             else _calibrate_from_all_pairs(cameras, pairs, options)
         )
     except FAILURES as err:
-        logger.info("the cameras could not be compared", exc_info=err)
+        logger.info("joint calibration of the cameras failed", exc_info=err)
         return cameras
 
 
@@ -125,42 +125,41 @@ def _split_and_calibrate(
 ) -> list[CalibratedCamera]:
     """Divide groups whose photos disagree, and calibrate all cameras from all pairs.
 
-    A group of which two parts turn out to have the same focal stays whole.
+    A group with two parts of the same focal stays whole.
     """
-    unlike = _mixed_padded_groups(whole, pairs, seed)
+    families = _mixed_padded_groups(whole, pairs, seed)
     parts = [
-        _split_by_photo(camera, len(whole) + unlike[camera.name], pairs)
-        if camera.name in unlike
+        _split_by_photo(camera, len(whole) + families[camera.name], pairs)
+        if camera.name in families
         else _split_group(camera, number, pairs, options, seed)
         for number, camera in enumerate(whole)
     ]
-    found = _calibrate_from_all_pairs(list(chain.from_iterable(parts)), pairs, options)
-    focals = {camera.name: camera.found.focal_px for camera in found if camera.found.is_estimated}
-    kept = [
+    calibrated = _calibrate_from_all_pairs(list(chain.from_iterable(parts)), pairs, options)
+    focals = {camera.name: camera.found.focal_px for camera in calibrated if camera.found.is_estimated}
+    groups = [
         [camera]
         if split[0].family < 0 and _has_equal_focals([focals[p.name] for p in split if p.name in focals])
         else split
         for camera, split in zip(whole, parts, strict=True)
     ]
-    if sum(map(len, kept)) == len(found):
-        return found
-    return _calibrate_from_all_pairs(list(chain.from_iterable(kept)), pairs, options)
+    if sum(map(len, groups)) == len(calibrated):
+        return calibrated
+    return _calibrate_from_all_pairs(list(chain.from_iterable(groups)), pairs, options)
 
 
 def _has_equal_focals(focals: Sequence[float]) -> bool:
-    """Return whether two of the focals are the same."""
-    return bool(np.any(np.diff(np.sort(np.log(focals))) < SAME_FOCAL))
+    return bool(np.any(np.diff(np.sort(np.log(focals))) < SPLITTING.same_focal))
 
 
 def _split_group(
     camera: CalibratedCamera, number: int, pairs: PhotoPairs, options: CalibrationSettings, seed: int
 ) -> list[CalibratedCamera]:
     """Return the camera itself, the cameras that its photos are divided among, or one for each photo."""
-    if len(camera.photos) < LEAST_TO_SPLIT:
+    if len(camera.photos) < SPLITTING.least_photos:
         return [camera]
     own, found = pairs.to_camera_pairs(camera.photos), camera.found
     side = float(max(own.size))
-    if abs(found.radial) > LEAST_DISTORTION:
+    if abs(found.radial) > SPLITTING.least_distortion:
         own = undistort_pairs(own, found)
     ready = prepare(own, unit_px=side, origin_px=(own.size[0] / 2, own.size[1] / 2))
     if len(ready) == 0:
@@ -169,7 +168,7 @@ def _split_group(
     if found.identifiable:
         starts.append(np.append(parameters_from_calibration(found, side)[:4], 0.0))
     tables = VoteTables(ready.F, np.zeros((len(ready), 2), np.int64), ready.weights)
-    photos = [own.photos[ready.kept[k]] for k in tables.kept]
+    photos = [own.photos[ready.indices[k]] for k in tables.indices]
     thetas, labels = split_by_focal(tables, photos, starts)
     if cross_validate(tables, photos, starts, labels, seed).is_camera_per_photo:
         return _split_by_photo(camera, number, pairs)
@@ -178,7 +177,14 @@ def _split_group(
         if two is None or not two.is_possible:
             return [camera]
         if not two.is_certain:
-            return [replace(camera, found=downgrade_to_estimate(found, PERHAPS_TWO) if found.identifiable else found)]
+            return [
+                replace(
+                    camera,
+                    found=downgrade_to_estimate(found, "the photos may come from two cameras")
+                    if found.identifiable
+                    else found,
+                )
+            ]
         thetas, labels = two.cameras, two.labels
     return _parts(camera, thetas, _confirmed_labels(labels, photos), pairs)
 
@@ -186,7 +192,7 @@ def _split_group(
 def _confirmed_labels(labels: Mapping[int, int], photos: Sequence[PairId]) -> dict[int, int]:
     """Return the labels of photos that share a pair with another of their camera, or are its only photo.
 
-    A pair between two cameras does not tell which of its photos is of which.
+    A pair between two cameras does not show which of its photos belongs to which.
     """
     count = Counter(labels.values())
     inside = {photo for pair in photos if labels[pair[0]] == labels[pair[1]] for photo in pair}
@@ -196,32 +202,19 @@ def _confirmed_labels(labels: Mapping[int, int], photos: Sequence[PairId]) -> di
 def _parts(
     camera: CalibratedCamera, thetas: FloatArray, labels: Mapping[int, int], pairs: PhotoPairs
 ) -> list[CalibratedCamera]:
-    """Return the cameras that a group was divided into.
-
-    Photos without a label form another camera, which is not known.
-    """
+    """Return the cameras that a group was divided into; photos without a label form another, unknown camera."""
     names, size = _names(camera, pairs), pairs.sizes[camera.photos[0]]
     parts = []
     for part, theta in enumerate(thetas):
         members = tuple(photo for photo in camera.photos if labels.get(photo) == part)
         theta[4] = camera.found.radial / np.exp(2.0 * theta[0])
-        parts.append(
-            CalibratedCamera(
-                next(names),
-                members,
-                calibration_from_parameters(theta, size, camera.found.method),
-                part_count=len(thetas),
-            )
-        )
+        calibration = calibration_from_parameters(theta, size, camera.found.method)
+        parts.append(CalibratedCamera(next(names), members, calibration, part_count=len(thetas)))
     rest = tuple(photo for photo in camera.photos if photo not in labels)
-    return (
-        [
-            *parts,
-            CalibratedCamera(next(names), rest, guess_calibration(size, UNASSIGNED_REASON, {}), part_count=len(thetas)),
-        ]
-        if rest
-        else parts
-    )
+    if rest:
+        unknown = guess_calibration(size, "no usable pair assigns these photos to a camera", {})
+        parts.append(CalibratedCamera(next(names), rest, unknown, part_count=len(thetas)))
+    return parts
 
 
 def _names(camera: CalibratedCamera, pairs: PhotoPairs) -> Iterator[str]:
@@ -231,7 +224,7 @@ def _names(camera: CalibratedCamera, pairs: PhotoPairs) -> Iterator[str]:
 
 
 def _split_by_photo(camera: CalibratedCamera, family: int, pairs: PhotoPairs) -> list[CalibratedCamera]:
-    """Return a camera, not calibrated yet, for each photo of a group."""
+    """Return an uncalibrated camera for each photo of a group."""
     nothing, names = guess_calibration(pairs.sizes[camera.photos[0]], "", {}), _names(camera, pairs)
     return [CalibratedCamera(next(names), (photo,), nothing, family) for photo in sorted(camera.photos)]
 
@@ -239,26 +232,25 @@ def _split_by_photo(camera: CalibratedCamera, family: int, pairs: PhotoPairs) ->
 def _mixed_padded_groups(whole: Sequence[CalibratedCamera], pairs: PhotoPairs, seed: int) -> dict[str, int]:
     """Find groups that bars have brought to one size with others and whose photos each have their own camera.
 
-    The result maps the name of the group to a number of that size.
-
     All groups of one size are tested together: if the photos of the others are not of one camera, neither are its own.
+    Returns a number of that size by the name of the group.
     """
-    found: dict[str, int] = {}
+    families: dict[str, int] = {}
     for number, size in enumerate(sorted(set(pairs.padded_sizes.values()))):
         groups = [camera for camera in whole if pairs.padded_sizes.get(camera.photos[0]) == size]
         labels = {photo: k for k, camera in enumerate(groups) for photo in camera.photos}
-        among = [k for k, pair in enumerate(pairs.photos) if labels.keys() >= set(pair)]
-        if len(groups) == 1 or not among:
+        rows = [k for k, pair in enumerate(pairs.photos) if labels.keys() >= set(pair)]
+        if len(groups) == 1 or not rows:
             continue
         to_px = {photo: _sides_to_pixels(pairs.sizes[photo]) for photo in labels}
-        Fs = [to_px[second].T @ pairs.Fs[k] @ to_px[first] for k in among for first, second in (pairs.photos[k],)]
-        padded = CameraPairs.from_Fs(np.array(Fs), (1, 1), pairs.weights[among])
+        Fs = [to_px[second].T @ pairs.Fs[k] @ to_px[first] for k in rows for first, second in (pairs.photos[k],)]
+        padded = CameraPairs.from_Fs(np.array(Fs), (1, 1), pairs.weights[rows])
         ready = prepare(padded, unit_px=1.0, origin_px=(0.0, 0.0))
         tables = VoteTables(ready.F, np.zeros((len(ready), 2), np.int64), ready.weights)
-        photos = [pairs.photos[among[k]] for k in ready.kept]
+        photos = [pairs.photos[rows[k]] for k in ready.indices]
         if len(photos) and cross_validate(tables, photos, [], labels, seed).is_camera_per_photo:
-            found |= dict.fromkeys((camera.name for camera in groups), number)
-    return found
+            families |= dict.fromkeys((camera.name for camera in groups), number)
+    return families
 
 
 def _sides_to_pixels(size: tuple[int, int]) -> FloatArray:
@@ -276,7 +268,7 @@ def _calibrate_from_all_pairs(
     number = {photo: k for k, camera in enumerate(cameras) for photo in camera.photos}
     everything = CameraPairs(pairs.Fs, pairs.weights, (1, 1), pairs.photos, pairs.inliers)
     members = np.array([[number[first], number[second]] for first, second in pairs.photos]).reshape(-1, 2)
-    asked = [
+    groups = [
         CameraGroup(
             size=pairs.sizes[camera.photos[0]],
             start=camera.found if camera.found.identifiable else None,
@@ -287,18 +279,23 @@ def _calibrate_from_all_pairs(
         )
         for camera in cameras
     ]
-    answers = calibrate_cameras(asked, everything, members, options, METHOD)
-    return [replace(one, found=_downgrade_if_zoom(one, answer)) for one, answer in zip(cameras, answers, strict=True)]
+    calibrations = calibrate_cameras(groups, everything, members, options, METHOD)
+    return [
+        replace(one, found=_downgrade_if_zoom(one, calibration))
+        for one, calibration in zip(cameras, calibrations, strict=True)
+    ]
 
 
 def _downgrade_if_zoom(camera: CalibratedCamera, found: Calibration) -> Calibration:
-    """Return the calibration, as an estimate where the group was split into many cameras, as photos of a zoom are."""
-    many = found.identifiable and camera.part_count >= MANY_PARTS
-    return downgrade_to_estimate(found, PERHAPS_ZOOM.format(count=camera.part_count)) if many else found
+    """Return the calibration, as an estimate for one of many parts of a group, as a zoom has them."""
+    if not found.identifiable or camera.part_count < SPLITTING.many_parts:
+        return found
+    reason = f"photos of one size split into {camera.part_count} cameras, which suggests a zoom lens"
+    return downgrade_to_estimate(found, reason)
 
 
 def _fall_back_to_guess(camera: CalibratedCamera, pairs: PhotoPairs) -> Calibration:
-    """Return the calibration; where nothing was found, a K to start from: EXIF's claim, or 1.2 x the longer side."""
+    """Return the calibration; for a guess, a K to start from: EXIF's claim, or 1.2 x the longer side."""
     found = camera.found
     if found.identifiable or found.method == ESTIMATE:
         return found

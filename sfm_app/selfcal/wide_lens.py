@@ -1,4 +1,11 @@
-"""Lenses of wide angle, found from rays before everything else."""
+"""Lenses of wide angle, found from matches alone, before everything else and up to more than 180 degrees. Ours.
+
+With the right lens the rays of right matches satisfy q' F p = 0 for some F, whatever the poses; with a wrong one curved
+epipolar lines leave matches outside. So the search counts for every lens of a grid how many matches the pairs keep with
+it (by samples of eight, scored as in MSAC: Torr and Zisserman 2000), and refines the best one together with its center
+and the relative poses. Where the lens bends much, its curvature alone determines the focal; the equal singular values
+of E (thesis 5.2) determine it where it bends little.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,33 +16,110 @@ from numpy.typing import NDArray
 
 from sfm_app.camera.models import camera_matrix, rays
 from sfm_app.geometry.epipolar import FIRST, SECOND, decompose_essential, fit_rays, signed_distances, squared_distances
-from sfm_app.geometry.least_squares import DampingRange, damped_step, inverse_of_positive, solve_each
+from sfm_app.geometry.least_squares import damped_step, inverse_of_positive, solve_each
 from sfm_app.geometry.poses import POSE_DOF, retract, write_essential
 from sfm_app.numerical import MAD_TO_SIGMA
+from sfm_app.selfcal.adjustment import DAMPING, ROBUST_SCALE
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-# Lenses of two parameters: from points of a photo to directions, also behind the camera.
-#
-# Ours; the projections are the textbook's. A ray at the angle theta to the optical axis comes to lie at the radius,
-# in focal lengths,
-#
-# r = tan(e theta) / e (e > 0), theta (e = 0), sin(-e theta) / -e (e < 0).
-#
-# e = 1 is a perspective lens, 1/2 stereographic, 0 equidistant, -1/2 equisolid, -1 orthographic. All have the same
-# scale about the center, the focal length.
+# Lenses: from points of a photo to directions, also behind the camera.
 
-PERSPECTIVE, STEREOGRAPHIC, EQUIDISTANT, EQUISOLID = 1.0, 0.5, 0.0, -0.5
-"""Exponents, by definition of the family."""
+
+LENS = 4
+"""Parameters of a lens: log focal, exponent or radial term, center. By definition."""
+STEP = 1e-6
+"""Step of finite differences in parameters: curvature and rounding in double precision cost about 1e-6 of them."""
+RAY_STEP = 1e-5
+"""The same in points, in longer sides: they cost about 1e-10 of the derivatives."""
 EQUIDISTANT_BELOW = 1e-6
 """Exponents nearer to 0 are taken as 0: the series agree to double precision."""
-RADIUS_STEP = 1e-5
-"""Step of the derivatives by finite differences, in longer sides: curvature and rounding in double precision cost about
-1e-10 of them."""
+
+
+@dataclass(frozen=True, slots=True)
+class LensSearchOptions:
+    """The grid of lenses, the pairs that vote, and the verdict."""
+
+    exponents: tuple[float, ...] = (0.5, 0.0, -0.5)
+    """Projections of the grid: stereographic, equidistant, equisolid."""
+    fields_deg: tuple[float, ...] = (60.0, 80.0, 100.0, 120.0, 140.0, 160.0, 180.0, 200.0)
+    """Fields of view along the longer side for each projection; by hand."""
+    most_pairs: int = 16
+    """Most pairs that vote, evenly chosen; by hand."""
+    most_matches: int = 500
+    """Most matches of each; by hand."""
+    samples: int = 150
+    """Samples of eight matches of each; by hand."""
+    refits: int = 3
+    """Most refits to the inliers of the best sample; by hand."""
+    least_inliers: int = 12
+    """Inliers below which there is no refit: eight determine F; by hand."""
+    least_matches: int = 60
+    """Matches below which a pair does not vote; by hand."""
+    least_pairs: int = 3
+    """Pairs below which there is no answer; by hand."""
+    threshold_px: float = 2.0
+    """Largest distance of an inlier: a lens between two of the grid still keeps its matches; by hand."""
+    least_support: float = 0.5
+    """Share of its matches that a pair must keep with the best lens of the grid to take part in the refinement; by
+    hand."""
+    clear_gain: float = 0.05
+    """Share of the matches that a fisheye must keep beyond a perspective lens; by hand."""
+    first_fields_deg: tuple[float, ...] = (55.0, 80.0, 120.0, 170.0)
+    """Fields of view of an equidistant lens in a first look; by hand."""
+    first_pairs: int = 8
+    """Most pairs of a first look; by hand."""
+    first_matches: int = 300
+    """Most matches of each; by hand."""
+    first_gain: float = 0.02
+    """Gain in a first look from which on all lenses of the grid are searched; by hand."""
+    least_radial: float = -0.5
+    """Least radial term that the perspective rival starts from; by hand."""
+    angles: int = 100
+    """Angles at which two lenses are compared; by hand."""
+    widest_perspective: float = float(np.radians(75.0))
+    """Half the field of view from which on no perspective lens compares, in radians; by hand."""
+    largest_departure_px: float = 1.0
+    """Departure from a fisheye up to which a perspective lens takes its place: features are accurate to half of it; by
+    hand."""
+
+
+@dataclass(frozen=True, slots=True)
+class LensRefinementOptions:
+    """Adjustment of a lens and the poses of its pairs."""
+
+    center_sigma: float = 0.02
+    """Prior standard deviation of the center from the middle, in longer sides; by hand."""
+    rounds: int = 30
+    """Most steps for each noise level; by hand."""
+    converged: float = 1e-6
+    """Largest change of a parameter that ends them; by hand."""
+    most_log_focal: float = 10.0
+    """Largest |log f|, f in longer sides: beyond it there is no lens, and soon an overflow; by hand."""
+    misfit: float = 3.0
+    """Ratio of the errors of a lens to those that the scatter between pairs explains: all pairs share what no lens of
+    the family describes. Chosen on fountain-P11 through a fisheye (`benchmarks.lenses.warped`)."""
+    noise_rounds: int = 3
+    """Estimates of the noise from the distances; by hand."""
+    least_sigma: float = 1e-4
+    """Least standard deviation of a distance, in longer sides: matches without noise would have unbounded weight; by
+    hand."""
+
+
+SEARCH = LensSearchOptions()
+REFINEMENT = LensRefinementOptions()
 
 
 @dataclass(frozen=True, slots=True)
 class Fisheye:
-    """A lens with one focal, in any unit of length."""
+    """A lens with one focal, in any unit of length.
+
+    A ray at the angle theta to the optical axis comes to lie at the radius, in focal lengths::
+
+        r = tan(e theta) / e (e > 0),    theta (e = 0),    sin(-e theta) / -e (e < 0).
+
+    e = 1 is a perspective lens, 1/2 stereographic, 0 equidistant, -1/2 equisolid, -1 orthographic. All have the same
+    scale about the center, the focal length.
+    """
 
     focal: float
     exponent: float
@@ -71,11 +155,7 @@ class Fisheye:
         return rays[:, :2] * np.divide(radius, side, out=np.zeros_like(side), where=side > 0.0)[:, None] + self.center
 
     def field_deg(self, width: float) -> float:
-        """Return the angle between the rays to both ends of a width about the center, in degrees.
-
-        Args:
-            width: in the units of the focal.
-        """
+        """Return the angle between the rays to both ends of a width about the center, in degrees."""
         return float(2.0 * np.degrees(self.angle(np.array([0.5 * width]))[0]))
 
 
@@ -90,12 +170,12 @@ class RadialLens:
     def rays(self, points: FloatArray) -> FloatArray:
         """Return (N, 3) directions of length 1 of points (N, 2)."""
         plane = rays(points, camera_matrix(self.focal, self.focal, *self.center), self.radial)
-        found = np.column_stack([plane, np.ones(len(plane))])
-        return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True), np.float64)
+        directions = np.column_stack([plane, np.ones(len(plane))])
+        return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True), np.float64)
 
 
 @dataclass(frozen=True, slots=True)
-class WholeTurn:
+class Equirectangular:
     """An equirectangular photo with the origin in its middle and a width of 1; its columns are longitudes."""
 
     def rays(self, points: FloatArray) -> FloatArray:
@@ -106,33 +186,23 @@ class WholeTurn:
 
 
 Lens = Fisheye | RadialLens
+PERSPECTIVE = Fisheye(1.0, 1.0)
+"""A perspective lens; its focal does not matter to a fundamental matrix."""
 
 
-def bearings_through(lens: Lens | WholeTurn, matches: FloatArray) -> FloatArray:
-    """Return (N, 18) bearing vectors of matches, with their derivatives by x and y: view 1, view 2.
-
-    Args:
-        lens: of both photos, in longer sides.
-        matches: (N, 4) x1, y1, x2, y2 in the same unit.
-    """
+def bearings_through(lens: Lens | Equirectangular, matches: FloatArray) -> FloatArray:
+    """Return (N, 18) bearing vectors of matches (N, 4), with their derivatives by x and y: view 1, view 2."""
     return np.hstack([_rays_and_slopes(lens, matches[:, :2]), _rays_and_slopes(lens, matches[:, 2:])])
 
 
-def _rays_and_slopes(lens: Lens | WholeTurn, points: FloatArray) -> FloatArray:
-    here, right, down = lens.rays(points), np.array([RADIUS_STEP, 0.0]), np.array([0.0, RADIUS_STEP])
+def _rays_and_slopes(lens: Lens | Equirectangular, points: FloatArray) -> FloatArray:
+    here, right, down = lens.rays(points), np.array([RAY_STEP, 0.0]), np.array([0.0, RAY_STEP])
     return np.hstack(
-        [here, (lens.rays(points + right) - here) / RADIUS_STEP, (lens.rays(points + down) - here) / RADIUS_STEP]
+        [here, (lens.rays(points + right) - here) / RAY_STEP, (lens.rays(points + down) - here) / RAY_STEP]
     )
 
 
-# How many matches of a pair a lens explains, by samples of eight.
-#
-# Samples are scored by a truncated loss (MSAC, Torr and Zisserman 2000).
-
-REFITS = 3
-"""Refits to the inliers of the best sample. Chosen by hand; not measured on its own."""
-MIN_INLIERS = 12
-"""Fewer inliers are not refitted: eight determine F. Chosen by hand; not measured on its own."""
+# Search.
 
 
 def search_rays(lines: FloatArray, samples: IndexArray, threshold: float) -> tuple[float, FloatArray]:
@@ -141,18 +211,18 @@ def search_rays(lines: FloatArray, samples: IndexArray, threshold: float) -> tup
     A match counts 1 - d^2 / threshold^2, or nothing beyond the threshold.
 
     Args:
-        lines: (N, 18) matches, as in `geometry.lenses.ray_epipolar`.
+        lines: (N, 18) matches, from `bearings_through`.
         samples: (S, 8) rows of them.
-        threshold: largest distance of an inlier, in the unit of the photo, > 0.
+        threshold: largest distance of an inlier, in the unit of the photo.
     """
     p, q = lines[:, FIRST], lines[:, SECOND]
     Fs = fit_rays(p[samples], q[samples])
     supports = _supports(Fs, lines, threshold)
     best = int(np.argmax(supports))
     F, support = Fs[best], float(supports[best])
-    for _ in range(REFITS):
+    for _ in range(SEARCH.refits):
         inliers = squared_distances(F[None], lines)[0] < threshold**2
-        if np.count_nonzero(inliers) < MIN_INLIERS:
+        if np.count_nonzero(inliers) < SEARCH.least_inliers:
             break
         again = fit_rays(p[inliers], q[inliers])
         value = float(_supports(again[None], lines, threshold)[0])
@@ -166,38 +236,8 @@ def _supports(Fs: FloatArray, lines: FloatArray, threshold: float) -> FloatArray
     return np.asarray(np.sum(1.0 - np.minimum(squared_distances(Fs, lines) / threshold**2, 1.0), axis=1), np.float64)
 
 
-# A lens, its center and the relative poses of pairs adjusted to their matches at once.
-#
-# Ours, as `structureless_ba` does it for lenses with one radial term: every pair has its own pose, which is
-# eliminated (Schur complement, Triggs and others 2000). Distances are Sampson's (thesis 4.2) in the photos,
-# downweighted by the cost of Geman and McClure (1987).
+# Refinement.
 
-LENS = 4
-"""Parameters of a lens: log focal, exponent, center. Counted."""
-ROBUST_SCALE = 3.0
-"""Of Geman and McClure's cost, in sigma, as in `two_view_cost`. Chosen by hand; not measured on its own."""
-CENTER_SIGMA = 0.02
-"""Prior standard deviation of the center from the middle, in longer sides. Chosen by hand; not measured on its own."""
-REFINEMENT_STEP = 1e-6
-"""Step of the derivatives by finite differences: curvature and rounding in double precision cost about 1e-6 of them."""
-MAX_ROUNDS = 30
-"""Most steps for each noise level. Chosen by hand; not measured on its own."""
-CONVERGED = 1e-6
-"""Largest change of a parameter that ends them. Chosen by hand; not measured on its own."""
-DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e8)
-"""Of Levenberg and Marquardt's steps, relative to the diagonal. Chosen by hand; not measured on their own."""
-MOST_LOG_FOCAL = 10.0
-"""Largest logarithm of a focal in longer sides, either way: beyond it there is no lens, and soon an overflow. Chosen by
-hand; not measured on its own."""
-MISFIT = 3.0
-"""Ratio of the errors of a lens to those that the scatter between pairs explains: what no lens of the family shows is
-alike in all pairs. Chosen on fountain-P11 through a fisheye, which needs 4.5 without it
-(`python -m benchmarks.lenses.warped`); left out: Herz-Jesus-P8 needs 2, castle-P19 2 to 7, rendered folders up to 3."""
-NOISE_ROUNDS = 3
-"""Times the noise is estimated from the distances. Chosen by hand; not measured on its own."""
-LEAST_SIGMA = 1e-4
-"""Least standard deviation of a distance, in longer sides: matches without noise would weigh without bound. Chosen by
-hand; not measured on its own."""
 
 Family = type[Fisheye] | type[RadialLens]
 Pair = tuple[FloatArray, FloatArray]
@@ -205,7 +245,7 @@ Pair = tuple[FloatArray, FloatArray]
 
 
 class State(NamedTuple):
-    """Where the adjustment stands."""
+    """State of the adjustment."""
 
     parameters: FloatArray
     """(4,) log focal, exponent or radial term, center."""
@@ -252,38 +292,36 @@ class System(NamedTuple):
 def refine_lens(start: Lens, pairs: Sequence[Pair], sigma: float) -> RefinedLens:
     """Return the lens of the family of `start` with the least robust cost, with its covariance.
 
-    The covariance is the sandwich with pairs as clusters, times MISFIT squared; matches of one keypoint in several
-    pairs count as what they are worth.
+    As `adjustment` for lenses with one radial term: distances are Sampson's (thesis 4.2) in the photos, downweighted by
+    the cost of Geman and McClure (1987), and the pose of every pair is eliminated. The covariance is the sandwich with
+    pairs as clusters, times the squared misfit, for matches that share keypoints (`redundancy`).
 
     Args:
         start: in longer sides of the photos, the center in the middle.
-        pairs: matches and first F of each.
         sigma: first standard deviation of a distance, in longer sides.
     """
     matches = [x for x, _ in pairs]
     poses = tuple(_pose_of(F) for _, F in pairs)
     shape = start.exponent if isinstance(start, Fisheye) else start.radial
     state = State(np.array([np.log(start.focal), shape, *start.center]), poses, type(start))
-    for _ in range(NOISE_ROUNDS):
+    for _ in range(REFINEMENT.noise_rounds):
         state = _adjust(matches, state, sigma)
         sigma = _noise(matches, state)
     systems = _systems(matches, state, sigma)
-    H = sum((system.H for system in systems), np.diag([0.0, 0.0, CENTER_SIGMA**-2, CENTER_SIGMA**-2]))
+    H = sum(
+        (system.H for system in systems), np.diag([0.0, 0.0, REFINEMENT.center_sigma**-2, REFINEMENT.center_sigma**-2])
+    )
     inverse = inverse_of_positive(H)
     scores = np.array([system.g for system in systems])
     few = len(pairs) / max(len(pairs) - LENS, 1)
     sandwich = few * inverse @ (scores.T @ scores) @ inverse
     plain = redundancy(matches) * inverse
-    wider = MISFIT * np.sqrt(np.maximum(np.diag(sandwich) / np.diag(plain), 1.0))
+    wider = REFINEMENT.misfit * np.sqrt(np.maximum(np.diag(sandwich) / np.diag(plain), 1.0))
     return RefinedLens(state.parameters, np.asarray(plain * np.outer(wider, wider), np.float64), state, sigma)
 
 
 def redundancy(matches: Sequence[FloatArray]) -> float:
-    """Return matches over independent errors, >= 1: one keypoint in m photos gives m (m - 1) / 2 matches of 2 m - 3.
-
-    Args:
-        matches: (N, 4) of each pair.
-    """
+    """Return matches over independent errors, >= 1: one keypoint in m photos gives m (m - 1) / 2 matches of 2 m - 3."""
     ends = np.concatenate([x[:, :2] for x in matches] + [x[:, 2:] for x in matches])
     each = len(ends) / max(len(np.unique(ends, axis=0)), 1)
     return max(1.0, 0.5 * each * (each + 1.0) / (2.0 * each - 1.0))
@@ -291,28 +329,28 @@ def redundancy(matches: Sequence[FloatArray]) -> float:
 
 def _adjust(matches: Sequence[FloatArray], state: State, sigma: float) -> State:
     damping = DAMPING.first
-    for _ in range(MAX_ROUNDS):
+    for _ in range(REFINEMENT.rounds):
         systems, cost = _systems(matches, state, sigma), robust_cost(matches, state, sigma)
 
-        def attempt(tried: float, begin: State = state, systems: list[System] = systems) -> State | None:
-            trial = _step(begin, systems, tried)
-            if abs(trial.parameters[0]) > MOST_LOG_FOCAL:
+        def attempt(damping: float, begin: State = state, systems: list[System] = systems) -> State | None:
+            trial = _step(begin, systems, damping)
+            if abs(trial.parameters[0]) > REFINEMENT.most_log_focal:
                 return None
             return trial if robust_cost(matches, trial, sigma) < cost else None  # noqa: B023 -- called in this round
 
-        found, damping = damped_step(attempt, damping, DAMPING)
-        if found is None:
+        better, damping = damped_step(attempt, damping, DAMPING)
+        if better is None:
             break
-        change = np.max(np.abs(found.parameters - state.parameters))
-        state = found
-        if change < CONVERGED:
+        change = np.max(np.abs(better.parameters - state.parameters))
+        state = better
+        if change < REFINEMENT.converged:
             break
     return state
 
 
 def _step(state: State, systems: list[System], damping: float) -> State:
     """Return the state after one damped step: the lens by all pairs and the prior, then each pose by its pair."""
-    prior = np.array([0.0, 0.0, CENTER_SIGMA**-2, CENTER_SIGMA**-2])
+    prior = np.array([0.0, 0.0, REFINEMENT.center_sigma**-2, REFINEMENT.center_sigma**-2])
     H = sum((system.H for system in systems), np.diag(prior))
     g = sum((system.g for system in systems), -prior * state.parameters)
     step = solve_each(H + damping * np.diag(np.diag(H)), g[:, None])[:, 0]
@@ -325,46 +363,34 @@ def _step(state: State, systems: list[System], damping: float) -> State:
 
 def _systems(matches: Sequence[FloatArray], state: State, sigma: float) -> list[System]:
     """Return the normal equations of every pair, with derivatives by finite differences."""
-    lenses = [state.lens, *(state.lens_at(state.parameters + REFINEMENT_STEP * axis) for axis in np.eye(LENS))]
+    lenses = [state.lens, *(state.lens_at(state.parameters + STEP * axis) for axis in np.eye(LENS))]
     return [_system(x, lenses, pose, sigma) for x, pose in zip(matches, state.poses, strict=True)]
 
 
 def _system(x: FloatArray, lenses: list[Lens], pose: FloatArray, sigma: float) -> System:
-    """Return the normal equations of a pair; the first lens is where it stands, the others are a step away."""
-    (lens, *moved), E = lenses, _essential(pose)
+    """Return the normal equations of a pair, for a lens and the lenses a step away from it."""
+    (lens, *steps), E = lenses, _essential(pose)
     pair = bearings_through(lens, x)
     r = signed_distances(E, pair)
-    by_lens = [signed_distances(E, bearings_through(other, x)) - r for other in moved]
-    by_pose = [
-        signed_distances(_essential(retract(pose, REFINEMENT_STEP * axis)), pair) - r for axis in np.eye(POSE_DOF)
-    ]
-    J, r = np.column_stack(by_lens + by_pose) / (REFINEMENT_STEP * sigma), r / sigma
+    by_lens = [signed_distances(E, bearings_through(other, x)) - r for other in steps]
+    by_pose = [signed_distances(_essential(retract(pose, STEP * axis)), pair) - r for axis in np.eye(POSE_DOF)]
+    J, r = np.column_stack(by_lens + by_pose) / (STEP * sigma), r / sigma
     weights = (1.0 + (r / ROBUST_SCALE) ** 2) ** -2
     H, g = (J * weights[:, None]).T @ J, -J.T @ (weights * r)
     U, W, V = H[:LENS, :LENS], H[:LENS, LENS:], H[LENS:, LENS:]
     solved = np.linalg.solve(V + 1e-9 * np.trace(V) * np.eye(POSE_DOF), np.column_stack([W.T, g[LENS:]]))
-    by, alone = solved[:, :LENS], solved[:, LENS]
-    return System(U - W @ by, g[:LENS] - W @ alone, by, alone)
+    pose_by_lens, pose_alone = solved[:, :LENS], solved[:, LENS]
+    return System(U - W @ pose_by_lens, g[:LENS] - W @ pose_alone, pose_by_lens, pose_alone)
 
 
 def robust_cost(matches: Sequence[FloatArray], state: State, sigma: float) -> float:
-    """Return half the robust squared distances in sigma^2, and the prior's.
-
-    Args:
-        matches: (N, 4) of each pair, in longer sides.
-        state: the lens and the pose of each pair.
-        sigma: standard deviation of a distance.
-    """
-    prior = 0.5 * float(np.sum((state.parameters[2:] / CENTER_SIGMA) ** 2))
+    """Return half the robust squared distances in sigma^2, plus the prior's cost."""
+    prior = 0.5 * float(np.sum((state.parameters[2:] / REFINEMENT.center_sigma) ** 2))
     return float(np.sum(pair_costs(matches, state, sigma))) + prior
 
 
 def pair_costs(matches: Sequence[FloatArray], state: State, sigma: float) -> FloatArray:
-    """Return half the robust squared distances of each pair (P,), in sigma^2.
-
-    Args:
-        matches, state, sigma: as for `robust_cost`.
-    """
+    """Return (P,) half the robust squared distances of each pair, in sigma^2."""
     squared = [(r / sigma) ** 2 for r in _distances(matches, state)]
     return np.array([0.5 * float(np.sum(d / (1.0 + d / ROBUST_SCALE**2))) for d in squared], np.float64)
 
@@ -372,7 +398,7 @@ def pair_costs(matches: Sequence[FloatArray], state: State, sigma: float) -> Flo
 def _noise(matches: Sequence[FloatArray], state: State) -> float:
     """Return the standard deviation of a distance, from the median of all."""
     distances = np.abs(np.concatenate(_distances(matches, state)))
-    return max(MAD_TO_SIGMA * float(np.median(distances)), LEAST_SIGMA)
+    return max(MAD_TO_SIGMA * float(np.median(distances)), REFINEMENT.least_sigma)
 
 
 def _distances(matches: Sequence[FloatArray], state: State) -> list[FloatArray]:
@@ -393,45 +419,6 @@ def _essential(pose: FloatArray) -> FloatArray:
     return E
 
 
-# The lens that most pairs agree on: focal, projection and center from matches alone, up to more than 180 degrees.
-#
-# Ours. With the right lens the rays of right matches satisfy q' F p = 0 for some F, whatever the poses; with a
-# wrong one curved epipolar lines leave matches outside. So every lens of a grid is asked how many matches it lets
-# the pairs keep, and the best one is refined together with the center and the relative poses. Where the lens bends
-# much, its curvature alone determines the focal; the equal singular values of E (thesis 5.2) determine it where it
-# bends little.
-
-EXPONENTS = (STEREOGRAPHIC, EQUIDISTANT, EQUISOLID)
-FIELDS_DEG = (60.0, 80.0, 100.0, 120.0, 140.0, 160.0, 180.0, 200.0)
-"""Fields of view along the longer side that are tried with each projection. Chosen by hand; not measured on their
-own."""
-MAX_PAIRS, MAX_MATCHES, SAMPLES = 16, 500, 150
-"""Pairs that are asked, evenly chosen; matches of each; samples of eight of them. Chosen by hand; not measured on
-their own."""
-MIN_MATCHES, MIN_PAIRS = 60, 3
-"""Pairs with fewer matches are not asked, and fewer pairs not believed. Chosen by hand; not measured on their own."""
-THRESHOLD_PX = 2.0
-"""Of an inlier in the grid: a lens between two of the grid still keeps its matches. Chosen by hand; not measured on its
-own."""
-MIN_KEPT = 0.5
-"""Share of its matches that a pair must keep with the best lens of the grid to take part in the refinement. Chosen by
-hand; not measured on its own."""
-CLEAR_GAIN = 0.05
-"""Share of the matches that a fisheye must let the pairs keep beyond a perspective lens. Chosen by hand; not measured
-on its own."""
-FIRST_FIELDS_DEG, FIRST_PAIRS, FIRST_MATCHES, FIRST_GAIN = (55.0, 80.0, 120.0, 170.0), 8, 300, 0.02
-"""A first look: fields of view of an equidistant lens, pairs, matches of each, and the gain from which on all lenses
-are asked. Chosen by hand; not measured on their own."""
-LEAST_RADIAL = -0.5
-"""Radial term of the perspective rival to start from, at least. Chosen by hand; not measured on its own."""
-ANGLES, WIDEST_PERSPECTIVE = 100, np.radians(75.0)
-"""Angles of the comparison, and the half field of view from which on no perspective lens compares. Chosen by hand; not
-measured on their own."""
-LARGEST_SIDEWAYS_PX = 1.0
-"""Largest distance in pixels, at the best focal and radial term, between a fisheye and a perspective lens that take its
-place. Chosen by hand: features are accurate to half of it; not measured on its own."""
-
-
 @dataclass(frozen=True, slots=True)
 class LensEstimate:
     """The lens of photos of one size."""
@@ -445,23 +432,23 @@ class LensEstimate:
     perspective_support: float
     """The same with a perspective lens, whatever its focal."""
     pairs: int
-    """Number of pairs that were asked."""
+    """Number of pairs that voted."""
     size: tuple[int, int]
     """(width, height) of the photos."""
     log_odds: float = np.inf
-    """By how much its robust cost is below that of the best perspective lens with one radial term, without the pair
-    that says so most: repeated things can bring a pair to favor any lens."""
+    """Robust cost of the best perspective lens with one radial term minus its own, without the pair that favors it
+    most: repeated structure can make a pair favor any lens."""
 
     @property
     def is_fisheye(self) -> bool:
         """Whether a fisheye explains clearly more than any perspective lens, and no radial term could replace it."""
-        clear = self.support - self.perspective_support > CLEAR_GAIN and self.log_odds > 0.0
-        return clear and self.sideways_px() > LARGEST_SIDEWAYS_PX
+        clear = self.support - self.perspective_support > SEARCH.clear_gain and self.log_odds > 0.0
+        return clear and self.departure_px() > SEARCH.largest_departure_px
 
-    def sideways_px(self) -> float:
-        """Return by how many pixels the best perspective lens with one radial term departs from it; inf if none can."""
-        found = _fit_radial(self.lens, 0.5 * float(np.hypot(*self.size)))
-        return found[2] if found is not None else float("inf")
+    def departure_px(self) -> float:
+        """Return the departure of the best perspective lens with one radial term, in pixels; inf if none can."""
+        radial = _fit_radial(self.lens, 0.5 * float(np.hypot(*self.size)))
+        return radial[2] if radial is not None else float("inf")
 
     def radius_deviation_px(self, theta: FloatArray) -> FloatArray:
         """Return (N,) standard deviations of the radius at angles (N,) to the optical axis, in pixels."""
@@ -475,127 +462,124 @@ def find_lens(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 
     """Find the lens of photos of one size from the raw matches of their pairs; None where too few pairs have matches.
 
     Args:
-        matches: per pair (N, 4) x1, y1, x2, y2 in pixels; wrong ones among them are expected.
+        matches: per pair (N, 4) x1, y1, x2, y2 in pixels, wrong ones included.
         size: (width, height) of the photos.
         seed: of the samples.
     """
     side = float(max(size))
-    given = _prepare(matches, size, np.random.default_rng(seed), MAX_PAIRS, MAX_MATCHES)
-    if given is None:
+    pairs = _sample(matches, size, np.random.default_rng(seed), SEARCH.most_pairs, SEARCH.most_matches)
+    if pairs is None:
         return None
-    grid = [_lens_of(field, exponent) for exponent in EXPONENTS for field in FIELDS_DEG]
-    searches = [given.search(lens) for lens in grid]
-    first = int(np.argmax([given.support(found) for found in searches]))
-    best, found = grid[first], searches[first]
-    kept, Fs = given.select(found)
-    if len(Fs) < MIN_PAIRS:
+    grid = [_lens_of(field, exponent) for exponent in SEARCH.exponents for field in SEARCH.fields_deg]
+    searches = [pairs.search(lens) for lens in grid]
+    first = int(np.argmax([pairs.support(search) for search in searches]))
+    best, search = grid[first], searches[first]
+    selected, Fs = pairs.select(search)
+    if len(Fs) < SEARCH.least_pairs:
         return None
-    refined = refine_lens(best, kept.with_matrices(Fs), given.threshold)
-    parameters, covariance = refined.parameters, refined.covariance
+    refined = refine_lens(best, selected.with_matrices(Fs), pairs.threshold)
+    (log_focal, exponent, u, v), unit = refined.parameters, np.array([1.0, 1.0, side, side])
     rival = _radial_rival(best, size)
-    ahead = _log_odds(refined, rival, kept, Fs) if rival is not None else np.inf
-    unit = np.array([1.0, 1.0, side, side])
-    center = side * parameters[2] + size[0] / 2.0, side * parameters[3] + size[1] / 2.0
-    scaled = covariance * np.outer(unit, unit)
     return LensEstimate(
-        Fisheye(float(np.exp(parameters[0])) * side, float(parameters[1]), (float(center[0]), float(center[1]))),
-        tuple(map(tuple, scaled.tolist())), given.support(found),
-        given.support(given.search(Fisheye(1.0, PERSPECTIVE))), len(given.matches), size,
-        ahead,
+        lens=Fisheye(
+            float(np.exp(log_focal)) * side, float(exponent),
+            (float(side * u + size[0] / 2.0), float(side * v + size[1] / 2.0)),
+        ),
+        covariance=tuple(map(tuple, (refined.covariance * np.outer(unit, unit)).tolist())),
+        support=pairs.support(search),
+        perspective_support=pairs.support(pairs.search(PERSPECTIVE)),
+        pairs=len(pairs.matches),
+        size=size,
+        log_odds=_log_odds(refined, rival, selected, Fs) if rival is not None else np.inf,
     )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Given:
-    """Matches (N, 4) of some pairs in longer sides about the middle, and samples (S, 8) of each."""
+class _SampledPairs:
+    """Matches (N, 4) of some pairs in longer sides from the middle, and samples (S, 8) of each."""
 
     matches: tuple[FloatArray, ...]
     samples: tuple[NDArray[np.int64], ...]
     threshold: float
 
-    def search(self, lens: Lens | WholeTurn) -> list[tuple[float, FloatArray]]:
+    def search(self, lens: Lens | Equirectangular) -> list[tuple[float, FloatArray]]:
         both = zip(self.matches, self.samples, strict=True)
         return [search_rays(bearings_through(lens, x), rows, self.threshold) for x, rows in both]
 
-    def select(self, found: list[tuple[float, FloatArray]]) -> tuple["_Given", list[FloatArray]]:
+    def select(self, searches: list[tuple[float, FloatArray]]) -> tuple["_SampledPairs", list[FloatArray]]:
         """Return the pairs that keep enough of their matches in a search, and their fundamental matrices."""
-        rows = [k for k, (count, _) in enumerate(found) if count >= MIN_KEPT * len(self.matches[k])]
+        rows = [k for k, (count, _) in enumerate(searches) if count >= SEARCH.least_support * len(self.matches[k])]
         matches, samples = tuple(self.matches[k] for k in rows), tuple(self.samples[k] for k in rows)
-        return _Given(matches, samples, self.threshold), [found[k][1] for k in rows]
+        return _SampledPairs(matches, samples, self.threshold), [searches[k][1] for k in rows]
 
     def with_matrices(self, Fs: Sequence[FloatArray]) -> list[Pair]:
         return list(zip(self.matches, Fs, strict=True))
 
-    def support(self, found: list[tuple[float, FloatArray]]) -> float:
-        return sum(count for count, _ in found) / float(sum(map(len, self.matches)))
+    def support(self, searches: list[tuple[float, FloatArray]]) -> float:
+        return sum(count for count, _ in searches) / float(sum(map(len, self.matches)))
 
 
-def _prepare(
+def _sample(
     matches: Sequence[FloatArray], size: tuple[int, int], rng: np.random.Generator, most_pairs: int, most_matches: int
-) -> _Given | None:
+) -> _SampledPairs | None:
     side, middle = float(max(size)), np.tile(np.array(size) / 2.0, 2)
-    usable = [(np.asarray(x, np.float64) - middle) / side for x in matches if len(x) >= MIN_MATCHES]
-    if len(usable) < MIN_PAIRS:
+    usable = [(np.asarray(x, np.float64) - middle) / side for x in matches if len(x) >= SEARCH.least_matches]
+    if len(usable) < SEARCH.least_pairs:
         return None
     chosen = np.linspace(0, len(usable) - 1, min(len(usable), most_pairs)).astype(np.int64)
     thinned = [x[rng.permutation(len(x))[:most_matches]] for x in (usable[k] for k in chosen)]
-    return _Given(tuple(thinned), tuple(rng.integers(0, len(x), (SAMPLES, 8)) for x in thinned), THRESHOLD_PX / side)
+    return _SampledPairs(
+        tuple(thinned), tuple(rng.integers(0, len(x), (SEARCH.samples, 8)) for x in thinned), SEARCH.threshold_px / side
+    )
 
 
 def needs_fisheye(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 0) -> bool:
-    """Return whether a first look at a few pairs shows that some fisheye explains more than any perspective lens.
-
-    Args:
-        matches, size, seed: as for `find_lens`.
-    """
-    given = _prepare(matches, size, np.random.default_rng(seed), FIRST_PAIRS, FIRST_MATCHES)
-    if given is None:
-        return False
-    fields = [_lens_of(field, EQUIDISTANT) for field in FIRST_FIELDS_DEG]
-    supports = [given.support(given.search(lens)) for lens in (Fisheye(1.0, PERSPECTIVE), *fields)]
-    return max(supports[1:]) - supports[0] > FIRST_GAIN
+    """Return whether some fisheye explains more matches of a few pairs than any perspective lens; as `find_lens`."""
+    look = _first_look(matches, size, seed)
+    return look is not None and max(look[1][1:]) - look[1][0] > SEARCH.first_gain
 
 
-def shows_whole_turn(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 0) -> bool:
-    """Return whether photos are panoramas: as such, a few pairs keep clearly more matches than with any other lens.
-
-    Args:
-        matches, size, seed: as for `find_lens`.
-    """
-    given = _prepare(matches, size, np.random.default_rng(seed), FIRST_PAIRS, FIRST_MATCHES)
-    if given is None or size[0] != 2 * size[1]:
-        return False
-    others = (_lens_of(field, EQUIDISTANT) for field in FIRST_FIELDS_DEG)
-    rivals = [given.support(given.search(lens)) for lens in (Fisheye(1.0, PERSPECTIVE), *others)]
-    return given.support(given.search(WholeTurn())) - max(rivals) > CLEAR_GAIN
+def shows_panoramas(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 0) -> bool:
+    """Return whether photos are panoramas: as such, a few pairs keep clearly more matches than with any other lens."""
+    look = _first_look(matches, size, seed) if size[0] == 2 * size[1] else None
+    return look is not None and look[0].support(look[0].search(Equirectangular())) - max(look[1]) > SEARCH.clear_gain
 
 
-def _log_odds(refined: RefinedLens, rival: RadialLens, kept: _Given, Fs: Sequence[FloatArray]) -> float:
+def _first_look(
+    matches: Sequence[FloatArray], size: tuple[int, int], seed: int
+) -> tuple[_SampledPairs, list[float]] | None:
+    """Return a few pairs, and their supports for a perspective lens and fisheyes; None where too few have matches."""
+    pairs = _sample(matches, size, np.random.default_rng(seed), SEARCH.first_pairs, SEARCH.first_matches)
+    if pairs is None:
+        return None
+    lenses = (PERSPECTIVE, *(_lens_of(field, 0.0) for field in SEARCH.first_fields_deg))
+    return pairs, [pairs.support(pairs.search(lens)) for lens in lenses]
+
+
+def _log_odds(refined: RefinedLens, rival: RadialLens, pairs: _SampledPairs, Fs: Sequence[FloatArray]) -> float:
     """Return by how much less a lens costs than a perspective rival, without the pair in which it gains most.
 
     Args:
-        refined: the lens.
-        rival: to start from; it begins as wide as the lens did, with these matrices and with its own.
-        kept: the pairs.
-        Fs: their fundamental matrices, which suit the lens.
+        rival: first lens; it starts with the matrices of the lens, and with its own.
+        Fs: fundamental matrices that suit the lens.
     """
-    starts = Fs, [F for _, F in kept.search(rival)]
-    others = (refine_lens(rival, kept.with_matrices(start), kept.threshold).state for start in starts)
-    costs = min((pair_costs(kept.matches, state, refined.sigma) for state in others), key=np.sum)
-    ahead = costs - pair_costs(kept.matches, refined.state, refined.sigma)
-    return float(np.sum(ahead) - np.max(ahead))
+    starts = Fs, [F for _, F in pairs.search(rival)]
+    rivals = (refine_lens(rival, pairs.with_matrices(start), pairs.threshold).state for start in starts)
+    costs = min((pair_costs(pairs.matches, state, refined.sigma) for state in rivals), key=np.sum)
+    gains = costs - pair_costs(pairs.matches, refined.state, refined.sigma)
+    return float(np.sum(gains) - np.max(gains))
 
 
 def _radial_rival(lens: Fisheye, size: tuple[int, int]) -> RadialLens | None:
-    """Return the perspective lens with one radial term next to a fisheye in longer sides; None where none compares."""
-    found = _fit_radial(lens, 0.5 * float(np.hypot(*size)) / max(size))
-    return RadialLens(found[0], max(found[1], LEAST_RADIAL)) if found is not None else None
+    """Return the perspective lens with one radial term nearest to a fisheye, in longer sides; None for none."""
+    radial = _fit_radial(lens, 0.5 * float(np.hypot(*size)) / max(size))
+    return RadialLens(radial[0], max(radial[1], SEARCH.least_radial)) if radial is not None else None
 
 
 def _fit_radial(lens: Fisheye, reach: float) -> tuple[float, float, float] | None:
     """Return focal, radial term and largest departure of the perspective lens nearest to a fisheye up to a radius."""
-    theta = np.linspace(0.0, float(lens.angle(np.array([reach]))[0]), ANGLES)[1:]
-    if theta[-1] >= WIDEST_PERSPECTIVE:
+    theta = np.linspace(0.0, float(lens.angle(np.array([reach]))[0]), SEARCH.angles)[1:]
+    if theta[-1] >= SEARCH.widest_perspective:
         return None
     plain, radius = np.tan(theta), lens.radius(theta)
     terms, *_ = np.linalg.lstsq(np.column_stack([plain, plain**3]), radius, rcond=None)
@@ -604,5 +588,5 @@ def _fit_radial(lens: Fisheye, reach: float) -> tuple[float, float, float] | Non
 
 
 def _lens_of(field_deg: float, exponent: float) -> Fisheye:
-    """Return the lens of a projection that sees so much along the longer side, which is 1."""
+    """Return the lens of a projection with a field of view along the longer side, which is 1."""
     return Fisheye(0.5 / float(Fisheye(1.0, exponent).radius(np.radians(field_deg / 2.0))), exponent)

@@ -47,10 +47,6 @@ CONFIRMING_FACTOR = 2
 def make(scene: Scene, run: RunContext) -> Path:
     """Make a depth and a normal map of every photo that has neighbors; a killed run can resume.
 
-    Args:
-        scene: cameras, poses and points.
-        run: the run.
-
     Returns:
         The dense workspace.
 
@@ -89,14 +85,7 @@ def digest(place: Workspace) -> str:
 
 
 def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None:
-    """Undistort photos and masks, unless a killed run has left a workspace made from the same inputs.
-
-    Args:
-        scene: cameras, poses and points.
-        dense_dir: dense workspace to fill.
-        method: name of the depth method.
-        run: the run.
-    """
+    """Undistort photos and masks, unless a killed run has left a workspace made from the same inputs."""
     model = [(file.name, blake2b(file.read_bytes()).hexdigest()) for file in sorted(scene.model_dir.glob("*.bin"))]
     made_from = fingerprint(run.fingerprint, method, model)
     if not resume_or_clear(dense_dir, made_from):
@@ -113,14 +102,7 @@ def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None
 
 
 def look_into_photos(scene: Scene, lenses: Mapping[int, WideLens], dense_dir: Path, run: RunContext) -> None:
-    """Write several perspective views of each photo of a wide lens.
-
-    Args:
-        scene: cameras, poses and points.
-        lenses: views by id of the camera.
-        dense_dir: dense workspace to fill.
-        run: the run.
-    """
+    """Write several perspective views of each photo of a wide lens."""
     look_into = Task(_look_into, Shared(lenses), run.workspace.photos, run.mask_dir, dense_dir)
     run.map(look_into, write_model(scene.model_dir, lenses, dense_dir), "looking into wide photos")
     run.record(views_per_photo=max(len(lens.views) for lens in lenses.values()))
@@ -135,13 +117,7 @@ def _look_into(
 
 
 def drop_skies(dense_dir: Path, views: Sequence[View], run: RunContext) -> None:
-    """Remove the depths of what is infinitely far: semi-global matching carries depths on along its rims.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        views: those that have a map.
-        run: the run.
-    """
+    """Remove the depths of what is infinitely far: semi-global matching carries depths on along its rims."""
     kept = dense_dir / SKIES
     if not kept.exists():  # a killed run has removed depths by it, and would find other skies now
         areas = run.map(Task(find_blank_areas, dense_dir), views, "looking for the sky")
@@ -159,12 +135,7 @@ def drop_skies(dense_dir: Path, views: Sequence[View], run: RunContext) -> None:
 
 
 def find_blank_areas(dense_dir: Path, view: View) -> PhotoAreas:
-    """Return the blank areas of a photo.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: a photo with a map.
-    """
+    """Return the blank areas of a photo."""
     return blank_areas(read_gray(dense_dir, view), read_depth(dense_dir, view, "geometric"))
 
 
@@ -185,10 +156,7 @@ def record(dense_dir: Path, views: Sequence[View], found: Sequence[Rejected | No
     """Note the share of each photo that has a depth, and why photos have no depth map.
 
     Args:
-        dense_dir: folder with undistorted photos and their maps.
-        views: all undistorted photos.
         found: per view why it has no depth map; None where it has one.
-        run: the run.
 
     Raises:
         ReconstructionError: no view has a depth map.

@@ -13,13 +13,7 @@ NAME = "model"
 
 
 def make(model: Model, frame: MetricFrame, run: RunContext) -> tuple[Path, ...]:
-    """Write the finished model in every standard format; the last one is the one to open.
-
-    Args:
-        model: the textured surface.
-        frame: in which it is written.
-        run: the run.
-    """
+    """Write the finished model in every standard format; the last one is the one to open."""
     paths = run.write_model(move_model(model, frame.from_model), NAME)
     if model.texture is not None:
         sizes = [[page.shape[1], page.shape[0]] for page in model.texture.pages]

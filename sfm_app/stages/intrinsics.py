@@ -11,13 +11,7 @@ from sfm_app.types import Calibration, Intrinsics, MatchGraph, ViewGraph
 
 
 def make(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
-    """Find the cameras, write them to calibration.json and record their figures.
-
-    Args:
-        matches: keypoints and raw matches.
-        views: fundamental matrices.
-        run: the run.
-    """
+    """Find the cameras, write them to calibration.json and record their figures."""
     intrinsics, cameras = find_or_keep_intrinsics(matches, views, run)
     run.record(
         cameras={name: _summary(camera) for name, camera in intrinsics.cameras.items()},

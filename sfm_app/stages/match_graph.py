@@ -21,10 +21,6 @@ def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
     Features and matches that a killed run has found in the same photos are reused, and those of photos that an earlier
     run has seen.
 
-    Args:
-        photos: usable photos, laid out in the workspace.
-        run: the run.
-
     Raises:
         ReconstructionError: no two photos have matches.
     """
@@ -66,10 +62,6 @@ def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
 
 def load(photos: PhotoSet, run: RunContext) -> MatchGraph:
     """Read the match graph back from the database.
-
-    Args:
-        photos: those that the database was made from.
-        run: the run.
 
     Raises:
         ValueError: the database is damaged; COLMAP would end the program on it.

@@ -53,11 +53,6 @@ CONFIRMED_SHARE = 2 / 3
 def make(scene: Scene, dense_dir: Path, run: RunContext) -> Surface:
     """Span a surface over the fused points, keep what the photos confirm, refine it by them, and simplify it.
 
-    Args:
-        scene: cameras and poses.
-        dense_dir: dense workspace with depth maps.
-        run: the run.
-
     Raises:
         ReconstructionError: the depth maps do not give a surface; the message says why.
         BackendError: COLMAP failed.
@@ -84,10 +79,7 @@ def _mesh_at_once(
     """Return the surface of all points.
 
     Args:
-        source: dense workspace with depth maps, and the photos.
-        views: photos with a depth map.
         points: (N,) records of the fused points.
-        run: the run.
     """
     (dense_dir, originals), options = source, run.settings.mesh
     raw = _check_nonempty(_span(points, run), "the fused points span no surface")
@@ -147,11 +139,7 @@ def _refine(surface: Surface, originals: Originals, views: list[View], run: RunC
 
 
 def _check_nonempty(surface: Surface, otherwise: str) -> Surface:
-    """Return the surface after checking that it has triangles.
-
-    Raises:
-        ReconstructionError: it has none.
-    """
+    """Return the surface after checking that it has triangles; raise a ReconstructionError if it has none."""
     if not len(surface.faces):
         raise ReconstructionError(otherwise, hint=HINT)
     return surface

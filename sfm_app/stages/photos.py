@@ -81,10 +81,6 @@ def video_frames(source: Path, run: RunContext) -> Iterator[VideoFrames]:
 
     If the run is killed before the block ends, the next one keeps the choice.
 
-    Args:
-        source: video file.
-        run: the run.
-
     Raises:
         InputError: the video cannot be read, or shows too little.
     """
@@ -113,12 +109,7 @@ def read_choice(run: RunContext) -> FrameChoice | None:
 
 
 def choose_frames(source: Path, run: RunContext) -> FrameChoice:
-    """Choose frames from the whole video.
-
-    Args:
-        source: video file.
-        run: the run.
-    """
+    """Choose frames from the whole video."""
     most = run.settings.photos.max_frames
     try:
         with open_video(source) as video:
@@ -175,12 +166,7 @@ def _write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> Non
 
 
 def frame_name(source: Path, frame: int) -> str:
-    """Return the name of the file of a frame.
-
-    Args:
-        source: video file.
-        frame: its number.
-    """
+    """Return the name of the file of a frame."""
     return f"{frame_stem(source)}_{frame:06d}.jpg"
 
 
@@ -200,10 +186,6 @@ largest folder that was run."""
 def make(source: Source, run: RunContext) -> PhotoSet:
     """Read every file of a folder, or the frames of a video, and lay the usable photos out for COLMAP.
 
-    Args:
-        source: folder or video.
-        run: the run.
-
     Raises:
         InputError: the source is missing, fewer than two photos are usable, or a mask is unusable.
     """
@@ -215,20 +197,12 @@ def make(source: Source, run: RunContext) -> PhotoSet:
 
 
 def load(source: Source, run: RunContext) -> PhotoSet:
-    """Read photos.json back; laid-out photos that are missing or damaged are laid out again.
-
-    Args:
-        source: what the photos were read from.
-        run: the run.
-    """
+    """Read photos.json back; laid-out photos that are missing or damaged are laid out again."""
     return _read_photo_set(run.workspace.frames if source.video else source.path, source.mask_dir, run)
 
 
 def read_photo_list(place: Workspace) -> PhotoSet:
     """Read photos.json back as it is, for a reader that needs none of the laid-out photos.
-
-    Args:
-        place: the output folder.
 
     Raises:
         ValueError: it names a photo outside of the folder.
@@ -280,14 +254,7 @@ def _read_photos(
 def read_all(
     source: Source, folder: Path, names: Sequence[str], options: PhotoSettings, run: RunContext
 ) -> list[PhotoStats | UnusablePhoto]:
-    """Return what the files of a folder hold; those that an earlier run has read are not decoded again.
-
-    Args:
-        source: has the hashes of the files.
-        folder, names: the files.
-        options: smallest and largest size.
-        run: the run.
-    """
+    """Return what the files of a folder hold; those that an earlier run has read are not decoded again."""
     digests, store = source.digests(), run.workspace.photo_stats
     known: dict[str, PhotoStats | UnusablePhoto] = {**read_stats(store, digests, options)}
     left = [name for name in names if name not in known]
@@ -310,12 +277,7 @@ def limit_to_memory(run: RunContext) -> PhotoSettings:
 
 
 def select_photos(glances: list[PhotoStats], *, keep_low_quality: bool) -> tuple[list[Photo], list[UnusablePhoto]]:
-    """Return the photos that are worth using, and the others.
-
-    Args:
-        glances: photos with their measured quality.
-        keep_low_quality: whether blurred and repeated ones stay.
-    """
+    """Return the photos that are worth using, and the others."""
     if keep_low_quality:
         return [glance.photo for glance in glances], []
     useful, useless = drop_unusable(glances)
@@ -327,11 +289,6 @@ def attach_masks(
     glances: list[PhotoStats], folder: Path, source: Source, run: RunContext
 ) -> tuple[list[PhotoStats], list[UnusablePhoto]]:
     """Return the photos with their masks, and those that their masks cover completely.
-
-    Args:
-        glances: photos with their measured quality.
-        folder, source: folder of the photos; source with the folder of masks.
-        run: the run.
 
     Raises:
         InputError: a mask cannot be used, or no photo has one.
@@ -361,16 +318,7 @@ def _lay_out_masks(photo_set: PhotoSet, masks: Path, names: Sequence[str], run: 
 
 
 def lay_out_photo(photo: Photo, *, folder: Path, target: Path) -> None:
-    """Put one photo into the workspace.
-
-    Args:
-        photo: what is known about it.
-        folder: where it is read from.
-        target: folder of laid-out photos.
-
-    Raises:
-        InputError: it has changed since it was first read.
-    """
+    """Put one photo into the workspace; raise an InputError if it has changed since it was first read."""
     try:
         lay_out(photo, folder, target)
     except UnreadableError as err:

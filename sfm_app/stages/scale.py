@@ -26,11 +26,6 @@ def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
     """Find how large the scene is, and where, from all that is known of it; write its points and cameras in that frame.
 
     Nothing that is missing or contradictory ends the run: it is recorded, and the unit stays what it was.
-
-    Args:
-        photos: in which marks and markers are.
-        scene: their poses.
-        run: the run, with what the user knows.
     """
     frame = find_frame(photos, scene, run)
     with replace_atomically(run.workspace.scale) as path:
@@ -56,11 +51,7 @@ def read_frame(place: Workspace) -> MetricFrame:
 
 
 def find_frame(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
-    """Return the frame that the evidence supports, and record the evidence.
-
-    Args:
-        photos, scene, run: as in `make`.
-    """
+    """Return the frame that the evidence supports, and record the evidence."""
     options, evidence, problems = run.settings.scale, list[ScaleEvidence](), list[str]()
     if scene.gps_deviation is not None:
         evidence.append(ScaleEvidence(GPS, 1.0, max(scene.gps_deviation, 1e-4), len(scene.registered)))
@@ -115,9 +106,6 @@ def shape_deviation(scene: Scene) -> float:
     """Return the relative standard deviation of the proportions of a scene, by which places in it differ in scale.
 
     A focal length that is off by a share bends depths against widths by about as much.
-
-    Args:
-        scene: with the deviations of its cameras.
     """
     known = (one.deviations.get("fx", 0.0) / one.K[0, 0] for one in scene.cameras.values())
     return float(max((share for share in known if np.isfinite(share)), default=0.0))

@@ -6,10 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from sfm_app.colmap.backend import check_written, translate_errors
+from sfm_app.colmap.backend import Reconstruction, check_written, translate_errors
 from sfm_app.colmap.bundle import Adjustment, adjust_or_keep
 from sfm_app.colmap.model import RefinedCamera, color_points, posed_images, posed_photo_ids, read_scene
-from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import ReconstructionError
 from sfm_app.estimation.diagnosis import diagnose_depth, diagnose_scene
 from sfm_app.estimation.given_cameras import camera_rules, given_and_found, refined_claims, report_checks, report_claims
@@ -33,12 +32,6 @@ def make(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: Run
     """Map the photos and adjust everything; later stages use the largest model, the others are kept beside it.
 
     Where an earlier run has a model of most photos, the new ones are placed in that.
-
-    Args:
-        matches: keypoints and raw matches.
-        views: fundamental matrices.
-        intrinsics: cameras from pairs.
-        run: the run.
 
     Raises:
         ReconstructionError: no pair of photos grows into a model; the message says why.
@@ -93,7 +86,7 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     laid_down = [camera_rules(attempt.model, names, intrinsics, wanted) for attempt in outcome.models]
     with run.step("adjusting all cameras"):
         adjusted = [
-            adjust_or_keep(attempt.model, database, rules, settled=attempt.mapper == GROWN)
+            adjust_or_keep(attempt.model, database, rules, families_known=attempt.mapper == GROWN)
             for attempt, rules in zip(outcome.models, laid_down, strict=True)
         ]
     followed = [
@@ -207,12 +200,7 @@ def _lens_choices(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, J
 
 
 def write_models(models: list[Reconstruction], run: RunContext) -> None:
-    """Write the main model to OUT/sparse and the others to OUT/other_models/1, 2, ..., each as a whole.
-
-    Args:
-        models: the main one first; at least one.
-        run: the run.
-    """
+    """Write the main model to OUT/sparse and the others to OUT/other_models/1, 2, ..., each as a whole."""
     place = run.workspace
     shutil.rmtree(place.other_models, ignore_errors=True)
     for number, model in enumerate(models[1:], start=1):
@@ -221,12 +209,7 @@ def write_models(models: list[Reconstruction], run: RunContext) -> None:
 
 
 def write_model(model: Reconstruction, target: Path) -> None:
-    """Write a model into a folder beside the target, then replace the target with it.
-
-    Args:
-        model: COLMAP's reconstruction.
-        target: folder, replaced if it exists.
-    """
+    """Write a model into a folder beside the target, then replace the target with it."""
     beside = target.with_name(f".{target.name}")
     shutil.rmtree(beside, ignore_errors=True)
     beside.mkdir(parents=True)
@@ -238,12 +221,7 @@ def write_model(model: Reconstruction, target: Path) -> None:
 
 
 def refined_cameras(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, RefinedCamera]:
-    """Return deviations, determined parameters and correlations of the refined cameras, by name of the camera.
-
-    Args:
-        adjusted: the model with the deviations of its cameras.
-        names: camera of each photo, by photo name.
-    """
+    """Return deviations, determined parameters and correlations of the refined cameras, by name of the camera."""
     cameras = {names[image.name]: image.camera_id for image in posed_images(adjusted.model)}
     return {
         name: {
@@ -256,12 +234,7 @@ def refined_cameras(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str,
 
 
 def write_scene(scene: Scene, run: RunContext) -> None:
-    """Write scene.json: what COLMAP's model does not hold.
-
-    Args:
-        scene: the scene.
-        run: the run.
-    """
+    """Write scene.json: what COLMAP's model does not hold."""
     known = {
         "cameras": {name: camera.to_dict() for name, camera in scene.cameras.items()},
         "camera_of": dict(scene.camera_of),

@@ -32,11 +32,6 @@ def make(scene: Scene, surface: Surface, run: RunContext) -> Model:
     """Paint the surface with the photos at full size.
 
     A killed run can resume.
-
-    Args:
-        scene: cameras and poses.
-        surface: triangles without a texture.
-        run: the run.
     """
     views, parts = photo_views(scene), run.workspace.texture / PARTS
     cameras = [(view.name, view.row.tolist(), view.width, view.height) for view in views]
@@ -89,12 +84,7 @@ class FileStore:
             return None
 
     def keep(self, name: str, arrays: Mapping[str, NDArray[np.generic]]) -> None:
-        """Keep arrays in a file, written atomically.
-
-        Args:
-            name: of the file, without suffix.
-            arrays: by their own names.
-        """
+        """Keep arrays in a file, written atomically."""
         with replace_atomically(self._path(name)) as path:
             np.savez(path, allow_pickle=False, **arrays)
 
@@ -127,8 +117,6 @@ def read_photo(photo_dir: Path, view: PhotoView, used: NDArray[np.bool_] | None 
     """Return (height, width, 3) RGB of a photo at the size of the view; it is scaled down by averaging.
 
     Args:
-        photo_dir: folder with the photos.
-        view: name and size of the photo.
         used: (H, W) pixels of the view that may be seen; None for all.
     """
     with Image.open(photo_dir / view.source) as image:
@@ -144,12 +132,7 @@ def read_photo(photo_dir: Path, view: PhotoView, used: NDArray[np.bool_] | None 
 
 
 def save_texture(model: Model, run: RunContext) -> None:
-    """Write texture/texture.npz.
-
-    Args:
-        model: surface and texture.
-        run: the run.
-    """
+    """Write texture/texture.npz."""
     surface, texture = model.surface, model.texture
     stored: dict[str, Any] = {"vertices": surface.vertices, "faces": surface.faces, "colors": surface.colors}
     if texture is not None:

@@ -9,7 +9,7 @@ from sfm_app.estimation.diagnosis import diagnose_scene
 from sfm_app.estimation.fitting import find_lenses, fit_pairs, to_view_graph
 from sfm_app.estimation.known import known_fits, known_lenses
 from sfm_app.files import digest_files, load_arrays, replace_atomically
-from sfm_app.matching.known import find_same_matches
+from sfm_app.matching.pairs import find_same_matches
 from sfm_app.runtime.context import GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.types import MatchGraph, ViewGraph
@@ -22,10 +22,6 @@ def make(matches: MatchGraph, run: RunContext) -> ViewGraph:
     """Find wide lenses, fit every pair on its own, and count why pairs were rejected.
 
     Of photos that an earlier run has seen, its fits and lenses stay.
-
-    Args:
-        matches: keypoints and raw matches.
-        run: the run.
 
     Raises:
         ReconstructionError: no pair has a usable epipolar geometry.

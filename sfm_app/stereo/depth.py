@@ -21,28 +21,118 @@ from sfm_app.stereo.plain_areas import enclosed_pixels, fill_planar_areas, plain
 from sfm_app.stereo.rectify import depths_from_disparities, disparities, rectify
 from sfm_app.stereo.view import DepthArray, GrayImage, View
 from sfm_app.types import Rejected
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray
 
-# Which depths other photos confirm.
 
-MIN_PATCH = 2e-4
-"""Smallest patch kept, as a share of the photo: wrong depths agree by chance, but not over a connected area."""
-LEVELS = 16
-"""Integer levels per tolerance when depths are quantized for the speckle filter."""
+@dataclass(frozen=True, slots=True)
+class DepthOptions:
+    """When a depth counts as confirmed."""
+
+    min_patch: float = 2e-4
+    """Smallest patch, as a share of the photo: wrong depths agree by chance, but not over a connected area."""
+    weak_correlation: float = 0.3
+    """Correlation without texture. In skies, depths agree by chance; on plain walls, semi-global matching interpolates
+    in the same way in every photo."""
+    weak_extra_maps: int = 3
+    """Additional depth maps that must agree at a weak correlation; with too few maps, the depth is dropped."""
+    unsure_correlation: float = 0.5
+    """Correlation below which one more depth map must agree."""
+    clipped_gray: int = 4
+    """Gray levels from black or white within which pixels are clipped: their depths come from neighboring pixels."""
+
+
+OPTIONS = DepthOptions()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthMap:
+    """Depths of one photo."""
+
+    depth: DepthArray
+    normals: NDArray[np.float32]
+    """(H, W, 3) unit, camera frame, towards the camera; 0 where the depth is 0."""
+
+    @classmethod
+    def unknown(cls, view: View) -> "DepthMap":
+        """Make a map without any depth."""
+        return cls(np.zeros((view.height, view.width), np.float32), np.zeros((view.height, view.width, 3), np.float32))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthEstimate:
+    """Depths of one photo before the check against other depth maps."""
+
+    depth: DepthArray
+    confidence: NDArray[np.float32]
+    """(H, W) in [0, 1]: mean correlation with the better half of the neighbors; 0 where the depth is 0."""
+
+
+def match_depths(
+    view: View, candidates: Sequence[View], load: Callable[[View], GrayImage], count: int, tolerance: float
+) -> DepthEstimate | Rejected:
+    """Match a photo with the first `count` candidates that can be rectified with it, and combine the results.
+
+    Semi-global matching with each neighbor gives depths; the merged depths initialize PatchMatch with all neighbors.
+
+    Args:
+        view: the photo.
+        candidates: possible neighbors, best first.
+        load: returns the gray photo of a view.
+        count: most neighbors.
+        tolerance: relative difference within which depths agree.
+    """
+    image = load(view)
+    # gray values are sampled at pixel centers
+    centered = replace(view, sample_px=0.5)
+    neighbors: list[tuple[View, GrayImage]] = []
+    depths: list[DepthArray] = []
+    parallaxes: list[NDArray[np.float32]] = []
+    reason = "no photo shares enough points"
+    for neighbor in candidates:
+        rectification = rectify(centered, neighbor)
+        if isinstance(rectification, Rejected):
+            reason = rectification.reason
+            continue
+        neighbors.append((neighbor, load(neighbor)))
+        left, right = rectification.warp(image, neighbors[-1][1], (centered, neighbor))
+        disparity = disparities(left, right, rectification.disparities)
+        depth, parallax = depths_from_disparities(disparity, rectification, centered, neighbor)
+        depths.append(depth)
+        parallaxes.append(parallax)
+        if len(depths) == count:
+            break
+    if not depths:
+        return Rejected(reason)
+    merged, _ = merge_hypotheses(np.stack(depths), np.stack(parallaxes), tolerance)
+    planes = fit_planes(merged)
+    planes[..., 0] = np.divide(1, merged, out=np.zeros_like(merged), where=merged > 0)
+    cost = improve_planes(planes, centered, image, neighbors, sweeps=1)  # a second sweep improves 1 % of the pixels
+    cost[_clipped_mask(image)] = NO_MATCH
+    return _sample_planes(planes, cost, view.sample_px)
+
+
+def _clipped_mask(image: GrayImage) -> BoolArray:
+    """Mark pixels (H, W) whose 3 x 3 mean is nearly black or white."""
+    mean = cv2.blur(image, (3, 3))
+    return np.asarray((mean <= OPTIONS.clipped_gray) | (mean >= 255 - OPTIONS.clipped_gray))
+
+
+def _sample_planes(planes: PlaneArray, cost: NDArray[np.float32], sample_px: float) -> DepthEstimate:
+    """Sample depths and confidences at a view's position inside the pixel."""
+    shift = np.float32(sample_px - 0.5)
+    inverse = planes[..., 0] + shift * (planes[..., 1] + planes[..., 2])
+    known = (planes[..., 0] > 0) & (inverse > 0) & (cost < NO_MATCH)
+    depth = np.divide(1, inverse, out=np.zeros_like(inverse), where=known)
+    return DepthEstimate(depth, np.where(known, np.maximum(1 - cost, 0), np.float32(0)))
 
 
 def merge_hypotheses(
     depths: NDArray[np.float32], parallaxes: NDArray[np.float32], tolerance: float
 ) -> tuple[DepthArray, NDArray[np.uint8]]:
-    """Fuse the depths from all neighbors into one depth per pixel.
+    """Fuse depths (N, H, W) of all neighbors, 0 where unknown, with their parallaxes (N, H, W) in pixels.
 
-    At each pixel, the largest-weight group of depths within the tolerance of one of them wins and is averaged. The
-    weight of a depth is its squared parallax, which is inversely proportional to its variance.
-
-    Args:
-        depths: (N, H, W), 0 where unknown.
-        parallaxes: (N, H, W) in pixels.
-        tolerance: largest relative difference of depths that agree.
+    At each pixel, the largest-weight group of depths within the relative tolerance of one of them wins and is averaged.
+    The weight of a depth is its squared parallax, which is inversely proportional to its variance.
 
     Returns:
         (H, W) depth, 0 where no neighbor has one, and (H, W) number of neighbors that agree with it.
@@ -86,15 +176,9 @@ def _merge(
 def count_confirming_maps(
     view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], tolerance: float
 ) -> NDArray[np.uint8]:
-    """Count the other depth maps that confirm each depth of a view, (H, W).
+    """Count the other depth maps, (H, W), within a relative tolerance of each depth (H, W) of a view, 0 where unknown.
 
     A map confirms a point if the point's depth in the other view is within the tolerance of the map's depth there.
-
-    Args:
-        view: the photo.
-        depth: (H, W) of the photo; 0 where unknown.
-        others: other photos with their depth maps.
-        tolerance: largest relative difference in depth.
     """
     return _count_maps(view, depth, others, (1.0 - tolerance, 1.0 + tolerance))
 
@@ -102,21 +186,14 @@ def count_confirming_maps(
 def count_deeper_maps(
     view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], tolerance: float
 ) -> NDArray[np.uint8]:
-    """Count the other depth maps that see something behind each depth of a view, (H, W), so that it is not there.
-
-    Args:
-        view: the photo.
-        depth: (H, W) of the photo; 0 where unknown.
-        others: other photos with their depth maps.
-        tolerance: smallest relative difference in depth.
-    """
+    """Count the other depth maps, (H, W), deeper than each depth of a view by a relative tolerance: they contradict."""
     return _count_maps(view, depth, others, (1.0 + tolerance, np.inf))
 
 
 def _count_maps(
     view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], limits: tuple[float, float]
 ) -> NDArray[np.uint8]:
-    """Count the maps whose depth, divided by that of the point in the other view, lies between two positive limits."""
+    """Count the maps whose depth lies between two limits, relative to the depth of the point in the other view."""
     count = np.zeros(depth.shape, np.uint8)
     K_inv = np.linalg.inv(view.K)
     for other, other_depth in others:
@@ -127,20 +204,16 @@ def _count_maps(
 
 
 def filter_speckles(depth: DepthArray, tolerance: float) -> DepthArray:
-    """Remove small patches in which depths differ by less than the tolerance from pixel to pixel.
-
-    Args:
-        depth: (H, W); 0 where unknown.
-        tolerance: relative difference in depth.
-    """
+    """Remove small patches in which depths differ by less than a relative tolerance from pixel to pixel."""
     known = depth > 0
     if not known.any():
         return depth
     logarithm = np.log(np.where(known, depth, depth[known].min()), dtype=np.float32)
-    levels = 1 + (logarithm - logarithm.min()) * (LEVELS / tolerance)
+    steps = 16  # integer levels per tolerance
+    levels = 1 + (logarithm - logarithm.min()) * (steps / tolerance)
     # OpenCV needs 16 bits; depths beyond that range share one level
     patches = np.where(known, np.clip(levels, 1, 32000), -32000).astype(np.int16)
-    cv2.filterSpeckles(patches, -32000, int(MIN_PATCH * depth.size), LEVELS)
+    cv2.filterSpeckles(patches, -32000, int(OPTIONS.min_patch * depth.size), steps)
     return np.where(patches > 0, depth, np.float32(0))
 
 
@@ -170,105 +243,6 @@ def _count(
                 count[row, col] += 1
 
 
-SWEEPS = 1
-"""The second improves a hundredth of the pixels and takes as long as the first."""
-WEAK_CORRELATION = 0.3
-"""Correlation below which there is hardly any texture: in skies depths agree only by chance, and on plain walls
-semi-global matching interpolates between the windows in the same way in every photo."""
-WEAK_EXTRA_MAPS = 3
-"""Additional depth maps that have to agree at such a correlation; with too few maps, the depth is dropped."""
-UNSURE_CORRELATION = 0.5
-"""Correlation below which one more depth map has to agree."""
-
-CLIPPED_GRAY = 4
-"""Gray levels from black or white within which pixels are clipped: their depths come from neighboring pixels."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DepthMap:
-    """Depths of one photo."""
-
-    depth: DepthArray
-    normals: NDArray[np.float32]
-    """(H, W, 3) unit, camera frame, towards the camera; 0 where the depth is 0."""
-
-    @classmethod
-    def unknown(cls, view: View) -> "DepthMap":
-        """Return a map of a photo without any depth."""
-        return cls(np.zeros((view.height, view.width), np.float32), np.zeros((view.height, view.width, 3), np.float32))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DepthEstimate:
-    """Depths of one photo before the check against other depth maps."""
-
-    depth: DepthArray
-    confidence: NDArray[np.float32]
-    """(H, W) in [0, 1]: mean correlation with the better half of the neighbors; 0 where the depth is 0."""
-
-
-def match_depths(
-    view: View, candidates: Sequence[View], load: Callable[[View], GrayImage], count: int, tolerance: float
-) -> DepthEstimate | Rejected:
-    """Match a photo with the first candidates that can be rectified with it, and combine the results.
-
-    Semi-global matching with each neighbor gives depths; the merged depths initialize PatchMatch with all neighbors.
-
-    Args:
-        view: the photo.
-        candidates: possible neighbors, best first.
-        load: returns the gray photo of a view.
-        count: neighbors at most.
-        tolerance: relative difference within which depths agree.
-    """
-    image = load(view)
-    # gray values are sampled at pixel centers
-    centered = replace(view, sample_px=0.5)
-    used: list[tuple[View, GrayImage]] = []
-    found: list[tuple[DepthArray, DepthArray]] = []
-    reason = "no photo shares enough points"
-    for neighbor in candidates:
-        rectification = rectify(centered, neighbor)
-        if isinstance(rectification, Rejected):
-            reason = rectification.reason
-            continue
-        used.append((neighbor, load(neighbor)))
-        left, right = rectification.warp(image, used[-1][1], (centered, neighbor))
-        disparity = disparities(left, right, rectification.disparities)
-        found.append(depths_from_disparities(disparity, rectification, centered, neighbor))
-        if len(found) == count:
-            break
-    if not found:
-        return Rejected(reason)
-    depth, _ = merge_hypotheses(np.stack([d for d, _ in found]), np.stack([p for _, p in found]), tolerance)
-    planes = _initial_planes(depth)
-    cost = improve_planes(planes, centered, image, used, SWEEPS)
-    cost[clipped_mask(image)] = NO_MATCH
-    return _sample_planes(planes, cost, view.sample_px)
-
-
-def clipped_mask(image: GrayImage) -> NDArray[np.bool_]:
-    """Return (H, W) whether the 3x3 mean around a pixel is nearly black or white."""
-    around = cv2.blur(image, (3, 3))
-    return np.asarray((around <= CLIPPED_GRAY) | (around >= 255 - CLIPPED_GRAY))
-
-
-def _initial_planes(depth: DepthArray) -> PlaneArray:
-    """Return planes with the exact depth of each pixel and the slopes fitted to its surroundings."""
-    planes = fit_planes(depth)
-    planes[..., 0] = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
-    return planes
-
-
-def _sample_planes(planes: PlaneArray, cost: NDArray[np.float32], sample_px: float) -> DepthEstimate:
-    """Sample depths and confidences at the position inside the pixel that a view asks for."""
-    shift = np.float32(sample_px - 0.5)
-    inverse = planes[..., 0] + shift * (planes[..., 1] + planes[..., 2])
-    known = (planes[..., 0] > 0) & (inverse > 0) & (cost < NO_MATCH)
-    depth = np.divide(1, inverse, out=np.zeros_like(inverse), where=known)
-    return DepthEstimate(depth, np.where(known, np.maximum(1 - cost, 0), np.float32(0)))
-
-
 def confirm_depths(
     view: View,
     image: GrayImage,
@@ -279,28 +253,20 @@ def confirm_depths(
 ) -> DepthMap | Rejected:
     """Keep depths that enough other maps confirm; remove spill and specks, fill plain walls, add normals.
 
-    The required number is `min_agreeing`; one more at low correlation and next to broad gaps; three more at very low
-    correlation. There, a depth must belong to a plain wall or lie between surer ones, too. Depths in skies are always
-    dropped.
-
-    Args:
-        view: the photo.
-        image: (H, W) gray photo.
-        estimate: from `match_depths`.
-        others: other photos with their depth maps.
-        min_agreeing: maps, >= 1.
-        tolerance: relative difference within which depths agree.
+    The required number is `min_agreeing` >= 1; one more at low correlation and next to broad gaps; three more at very
+    low correlation. There, a depth must also belong to a plain wall or lie between surer depths. Depths in skies are
+    always dropped. Depths agree within a relative tolerance.
     """
     if not others:
         return Rejected("no other depth map to compare with")
     agreeing = count_confirming_maps(view, estimate.depth, others, tolerance)
     confidence = estimate.confidence
     least, more = (min(need, len(others)) for need in (min_agreeing, min_agreeing + 1))
-    enough = np.where(confidence < UNSURE_CORRELATION, more, least)
-    enough[confidence < WEAK_CORRELATION] = min_agreeing + WEAK_EXTRA_MAPS
-    sound = (estimate.depth > 0) & (agreeing >= enough)
-    # without texture, semi-global matching carries depths on beyond the outline of a thing, in all photos alike
-    weak = confidence < WEAK_CORRELATION
+    needed = np.where(confidence < OPTIONS.unsure_correlation, more, least)
+    # without texture, semi-global matching extends depths beyond an object's outline, in all photos alike
+    weak = confidence < OPTIONS.weak_correlation
+    needed[weak] = min_agreeing + OPTIONS.weak_extra_maps
+    sound = (estimate.depth > 0) & (agreeing >= needed)
     walls = plain_walls(weak, sound)
     sound &= ~weak | walls | enclosed_pixels(sound & ~weak)
     confirmed = np.where(sound & ~surfaceless_areas(confidence, sound), estimate.depth, np.float32(0))

@@ -1,6 +1,12 @@
-"""Depths of an object that spill over its outline onto the background."""
+"""PatchMatch: a plane for every pixel, propagated to neighboring pixels where it lowers the matching cost.
+
+Bleyer, Rhemann, Rother: PatchMatch stereo. BMVC 2011; Schoenberger et al.: Pixelwise view selection for unstructured
+multi-view stereo. ECCV 2016 (the weighted correlation). Semi-global matching prefers fronto-parallel surfaces and
+widens the foreground. Initialized with its depths, one or two sweeps find slanted surfaces and the true borders.
+"""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -9,14 +15,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel, summing_kernel
 from sfm_app.stereo.view import DepthArray, GrayImage, View
-from sfm_app.types.arrays import FloatArray
-
-# A plane for every pixel, propagated to neighboring pixels where it lowers the matching cost.
-#
-# Bleyer, Rhemann, Rother: PatchMatch stereo. BMVC 2011; Schoenberger et al.: Pixelwise view selection for
-# unstructured multi-view stereo. ECCV 2016 (the weighted correlation). Semi-global matching prefers fronto-parallel
-# surfaces and widens the foreground. Initialized with its depths, one or two sweeps find slanted surfaces and the
-# true borders.
+from sfm_app.types.arrays import BoolArray, FloatArray
 
 PlaneArray = NDArray[np.float32]
 """(H, W, 3): inverse depth q and its slopes, q + qu du + qv dv at (du, dv) pixels away; q = 0 where unknown."""
@@ -28,12 +27,7 @@ SIDE = 2 * REACH + 1
 BORDER = REACH * STRIDE_PX
 STEPS = np.arange(-REACH, REACH + 1, dtype=np.float32) * STRIDE_PX
 ACROSS, DOWN = np.tile(STEPS, SIDE), np.repeat(STEPS, SIDE)
-"""Of each pixel of the window from its middle, row by row."""
-SIGMA_PX = 4.0
-FALLOFF_GRAY = 12.0
-"""Difference in gray from the center pixel at which the weight is 1/e: the pixel may be of another object."""
-NOISE_GRAY = 2.0
-"""Standard deviation of gray levels without texture."""
+"""Offsets of the window's pixels from its center, row by row."""
 NO_MATCH = 2.0
 """The cost where no neighbor sees the pixel; no correlation costs more."""
 LOW = np.uint32(0xFF)
@@ -41,53 +35,63 @@ MIN_GAIN = 0.01
 """Smallest decrease of the cost that replaces a plane; without it, noise would make flat areas rough."""
 STEP_PX = 0.3
 """Largest random change of a trial plane, in pixels of parallax."""
-SLOPE = 0.2
-"""Largest random change of the slopes, as a share of `STEP_PX` per pixel."""
-SAME_PX, SAME_SLOPE = 0.1, 0.03
-"""Parallax within which two planes count as equal, at the pixel and per pixel of distance."""
-MIN_AREA, MAX_AREA = 0.1, 8.0
-"""Smallest and largest area of a warped pixel in the neighbor, in pixels, at which the two are compared."""
+RADIUS_PX = 5
+"""Radius of the window of a plane fit."""
+MAX_STEP = 0.02
+"""Relative depth difference beyond which a pixel belongs to another surface."""
+
+
+@dataclass(frozen=True, slots=True)
+class PatchOptions:
+    """Weights in windows, and the gray levels of spill."""
+
+    sigma_px: float = 4.0
+    """Standard deviation of the weights in the correlation window."""
+    falloff_gray: float = 12.0
+    """Difference in gray from the center pixel at which the weight is 1/e: the pixel may be of another object."""
+    normal_sigma_px: float = 2.5
+    """Standard deviation of the weights of a plane fit; smaller keeps more detail, larger makes smoother normals."""
+    min_weight: float = 0.25
+    """Smallest share of the weight of a plane fit that must have a depth."""
+    sensor_noise_gray: float = 3.0
+    """Smallest standard deviation of gray levels: sensor noise and compression artifacts."""
+    min_odds: float = 8.0
+    """Smallest likelihood ratio of a pixel's gray, pixels without a depth over pixels with one, that removes its
+    depth."""
+
+
+OPTIONS = PatchOptions()
 
 
 def improve_planes(
     planes: PlaneArray, view: View, image: GrayImage, others: Sequence[tuple[View, GrayImage]], sweeps: int
 ) -> NDArray[np.float32]:
-    """Improve planes about the pixel centers in place: sweep down and to the right, then back, and so on.
+    """Improve planes (H, W, 3) about the pixel centers in place: sweep down and to the right, then back, and so on.
 
     A pixel tries the planes of its two preceding neighbors in the sweep, and small random changes of its own plane. The
     cost of a plane is 1 - the normalized cross-correlation of the pixel's window with its image in a neighboring photo,
     averaged over the better half of the photos, because the others may be occluded. Weights in the window fall with the
-    distance and with the difference in gray from the center.
-
-    Args:
-        planes: (H, W, 3) inverse depth and its slopes per pixel; changed.
-        view: the photo.
-        image: (H, W) gray photo.
-        others: neighbors and their gray photos.
-        sweeps: number of sweeps, >= 0.
-
-    Returns:
-        (H, W) cost in [0, 2]; 2 where unknown.
+    distance and with the difference in gray from the center. Returns the cost (H, W) in [0, 2]; 2 where unknown.
     """
     height, width = (max(photo.shape[side] for _, photo in others) for side in (0, 1))
     stack = np.zeros((len(others), height, width), np.uint32)
     projections, sizes = np.empty((len(others), 3, 4)), np.empty((len(others), 2), np.int64)
     K_inv = np.linalg.inv(view.K)
     for k, (other, photo) in enumerate(others):
-        stack[k, : photo.shape[0] - 1, : photo.shape[1] - 1] = pack_squares(photo)
+        stack[k, : photo.shape[0] - 1, : photo.shape[1] - 1] = _pack_squares(photo)
         sizes[k] = photo.shape
         relative = other.R @ view.R.T
         projections[k] = other.K @ np.column_stack([relative @ K_inv, other.t - relative @ view.t])
-    near = np.exp(-0.5 * (STEPS[:, None] ** 2 + STEPS**2) / SIGMA_PX**2)
-    alike = np.exp(-np.arange(256) / FALLOFF_GRAY)
+    near = np.exp(-0.5 * (STEPS[:, None] ** 2 + STEPS**2) / OPTIONS.sigma_px**2)
+    alike = np.exp(-np.arange(256) / OPTIONS.falloff_gray)
     cost = np.full(image.shape, NO_MATCH, np.float32)
     for sweep in range(sweeps):
         _sweep(sweep, image, (near, alike), (stack.ravel(), width, sizes, projections), planes, cost)
     return cost
 
 
-def pack_squares(image: GrayImage) -> NDArray[np.uint32]:
-    """Return (H - 1, W - 1) numbers of four bytes: a pixel, the one to its right, and the two below them."""
+def _pack_squares(image: GrayImage) -> NDArray[np.uint32]:
+    """Return (H - 1, W - 1) numbers of four bytes: a pixel, its right neighbor, and the two below them."""
     wide = image.astype(np.uint32)
     packed = wide[:-1, :-1] | wide[:-1, 1:] << 8 | wide[1:, :-1] << 16 | wide[1:, 1:] << 24
     return np.asarray(packed, np.uint32)
@@ -117,26 +121,38 @@ def _sweep(
             if known and sweep == 0:
                 lowest = _cost(row, col, best, window, others, costs)
             unit = _inverse_depth_per_px(row, col, best[0], others[3]) if known else 0.0
-            for side in range(2):
-                r, s = (row - step, col) if side == 0 else (row, col - step)
-                if planes[r, s, 0] <= 0:
-                    continue
-                trial[1], trial[2] = planes[r, s, 1], planes[r, s, 2]
-                trial[0] = planes[r, s, 0] + (col - s) * trial[1] + (row - r) * trial[2]
-                slopes = abs(trial[1] - best[1]) + abs(trial[2] - best[2])
-                if abs(trial[0] - best[0]) < SAME_PX * unit and slopes < SAME_SLOPE * unit:
-                    continue
-                lowest = _try_plane(row, col, trial, best, lowest, window, others, costs)
+            lowest = _try_neighbors(row, col, step, planes, unit, trial, best, lowest, window, others, costs)
             if lowest < NO_MATCH:
                 unit = _inverse_depth_per_px(row, col, best[0], others[3])
                 for c in range(3):
                     state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
                     number = 2.0 * (np.float64(state >> np.uint64(11)) / 9007199254740992.0) - 1.0  # in [-1, 1)
-                    trial[c] = best[c] + number * STEP_PX * unit * (1.0 if c == 0 else SLOPE)
+                    # slopes change by a fifth of `STEP_PX` per pixel
+                    trial[c] = best[c] + number * STEP_PX * unit * (1.0 if c == 0 else 0.2)
                 lowest = _try_plane(row, col, trial, best, lowest, window, others, costs)
             for c in range(3):
                 planes[row, col, c] = best[c]
             cost[row, col] = lowest
+
+
+@kernel
+def _try_neighbors(  # noqa: PLR0913
+    row: int, col: int, step: int, planes: PlaneArray, unit: float,
+    trial: FloatArray, best: FloatArray, lowest: float, window: Any, others: Any, costs: FloatArray,
+) -> float:  # fmt: skip
+    """Try the planes of the two preceding neighbors; return the lowest cost."""
+    for side in range(2):
+        r, s = (row - step, col) if side == 0 else (row, col - step)
+        if planes[r, s, 0] <= 0:
+            continue
+        trial[1], trial[2] = planes[r, s, 1], planes[r, s, 2]
+        trial[0] = planes[r, s, 0] + (col - s) * trial[1] + (row - r) * trial[2]
+        slopes = abs(trial[1] - best[1]) + abs(trial[2] - best[2])
+        # equal planes: in pixels of parallax, at the pixel and per pixel of distance
+        if abs(trial[0] - best[0]) < 0.1 * unit and slopes < 0.03 * unit:
+            continue
+        lowest = _try_plane(row, col, trial, best, lowest, window, others, costs)
+    return lowest
 
 
 @kernel
@@ -179,18 +195,18 @@ def _inverse_depth_per_px(row: int, col: int, q: float, projections: FloatArray)
 
 
 @kernel
-def _try_plane(
+def _try_plane(  # noqa: PLR0913
     row: int, col: int, trial: FloatArray, best: FloatArray, lowest: float, window: Any, others: Any, costs: FloatArray
 ) -> float:
     """Replace the best plane if the trial costs less by `MIN_GAIN`; return the lowest cost."""
     if trial[0] <= 0:
         return lowest
-    found = _cost(row, col, trial, window, others, costs)
-    if found >= lowest - MIN_GAIN:
+    cost = _cost(row, col, trial, window, others, costs)
+    if cost >= lowest - MIN_GAIN:
         return lowest
     for c in range(3):
         best[c] = trial[c]
-    return found
+    return cost
 
 
 @kernel
@@ -214,15 +230,16 @@ def _cost(row: int, col: int, plane: FloatArray, window: Any, others: Any, costs
         u, v = u - 0.5, v - 0.5
         du, dv = BORDER * (abs(uu) + abs(uv)), BORDER * (abs(vu) + abs(vv))
         inside = u - du >= 0 and v - dv >= 0 and u + du < sizes[k, 1] - 1 and v + dv < sizes[k, 0] - 1
-        if not (inside and MIN_AREA < uu * vv - uv * vu < MAX_AREA):
+        # area of a warped pixel in the neighbor
+        if not (inside and 0.1 < uu * vv - uv * vu < 8.0):
             continue
         start = k * (len(stack) // len(projections))
-        found = 1.0 - _correlation(stack, start, stride, (u, v, uu, uv, vu, vv), window)
+        cost = 1.0 - _correlation(stack, start, stride, (u, v, uu, uv, vu, vv), window)
         place = count  # insertion keeps the costs in rising order
-        while place > 0 and costs[place - 1] > found:
+        while place > 0 and costs[place - 1] > cost:
             costs[place] = costs[place - 1]
             place -= 1
-        costs[place] = found
+        costs[place] = cost
         count += 1
     if count == 0:
         return NO_MATCH
@@ -254,20 +271,12 @@ def _correlation(stack: NDArray[np.uint32], start: int, stride: int, affine: Any
         one += weighted
         square += weighted * gray
         mixed += weighted * grays[k]
-    noise = NOISE_GRAY * NOISE_GRAY
+    noise = 2.0 * 2.0  # variance of gray levels without texture
     spread = (variance + noise) * (max(0.0, float(square - one * one)) + noise)
     return float((mixed - one * mean) / np.sqrt(spread))
 
 
 # Planes through depth maps, and their normals.
-
-NORMAL_SIGMA_PX = 2.5
-"""Standard deviation of the weights in the window; smaller keeps more detail, larger makes smoother normals."""
-RADIUS_PX = 5
-MAX_STEP = 0.02
-"""Relative depth difference beyond which a pixel belongs to another surface."""
-MIN_WEIGHT = 0.25
-"""Smallest share of the window's weight that must have a depth."""
 
 
 def fit_planes(depth: DepthArray) -> PlaneArray:
@@ -280,20 +289,15 @@ def fit_planes(depth: DepthArray) -> PlaneArray:
     """
     planes = np.zeros((*depth.shape, 3), np.float32)
     steps = np.arange(-RADIUS_PX, RADIUS_PX + 1)
-    profile = np.exp(-0.5 * (steps / NORMAL_SIGMA_PX) ** 2)
+    profile = np.exp(-0.5 * (steps / OPTIONS.normal_sigma_px) ** 2)
     inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0, dtype=np.float64)
     window = np.outer(profile, profile)
-    _fit(depth, inverse, (window, MIN_WEIGHT * float(window.sum())), planes)
+    _fit(depth, inverse, (window, OPTIONS.min_weight * float(window.sum())), planes)
     return planes
 
 
 def plane_normals(planes: PlaneArray, view: View) -> NDArray[np.float32]:
-    """Return (H, W, 3) unit normals in the camera frame that point to the camera; 0 where the inverse depth is 0.
-
-    Args:
-        planes: (H, W, 3) inverse depth and its slopes per pixel, from `fit_planes`.
-        view: the photo.
-    """
+    """Return (H, W, 3) unit normals in the camera frame that point to the camera; 0 where the inverse depth is 0."""
     normals = np.zeros_like(planes)
     _find_normals(planes, view.K, view.sample_px, normals)
     return normals
@@ -362,17 +366,14 @@ def _slopes(
     return (q - gu * su - gv * sv) / n, gu, gv
 
 
+# Depths of an object that spill over its outline onto the background.
+
 REACH_PX = BORDER + 1
 """A window centered this far from an outline still contains a pixel of it; on a textureless background that pixel
 alone decides."""
 SURROUNDINGS_PX = 4 * REACH_PX + 1
 """Side of the square around a pixel that is compared with it: pixels with a depth, and pixels without one."""
-SENSOR_NOISE_GRAY = 3.0
-"""Smallest standard deviation of gray levels: sensor noise and compression artifacts."""
-MIN_ODDS = 8.0
-"""Smallest likelihood ratio of a pixel's gray, pixels without a depth over pixels with one, that removes its depth."""
-LEAST_PX = 5
-"""Fewest pixels that determine the gray distribution of the surroundings."""
+
 UNIFORM_LOG_LIKELIHOOD = 0.5 * np.log(2.0 * np.pi) - np.log(256.0)
 """Log likelihood of a gray under the uniform distribution, for objects so thin that they consist of rim only."""
 
@@ -381,44 +382,39 @@ def remove_spill(depth: DepthArray, image: GrayImage) -> DepthArray:
     """Remove rim depths whose gray resembles the empty side rather than the surface that they extend.
 
     Skies and plain backgrounds have no depth of their own, but a correlation window that reaches an object in front
-    of them finds the object's depth. The result is a seam half a window wide. It is the same in every photo, so no
-    check between photos removes it. The gray levels decide: around a pixel, those with a depth, away from the rim, and
-    those without one are each modeled as normally distributed. Next to gaps in a plain surface both distributions are
-    the same, and nothing is removed. Gaps narrower than two rims are ignored: they lie within surfaces.
-
-    Args:
-        depth: (H, W), 0 where unknown.
-        image: (H, W).
+    of them finds the object's depth. The seam is half a window wide, and the same in every photo, so no check between
+    photos removes it. The gray levels decide. Around a pixel, pixels with a depth (away from the rim) and pixels
+    without one are each modeled as normally distributed. Beside gaps in a plain surface both distributions are the
+    same, and nothing is removed. Gaps narrower than two rims are ignored: they lie within surfaces.
     """
     known = depth > 0
     empty, rim = _broad_areas(~known), rim_mask(known)
     gray = image.astype(np.float32)
-    thing = _log_likelihood(gray, known & ~rim)
-    spilt = _log_likelihood(gray, empty) > np.where(np.isnan(thing), UNIFORM_LOG_LIKELIHOOD, thing) + np.log(MIN_ODDS)
-    return np.where(spilt & rim, np.float32(0), depth)
+    surface = _log_likelihood(gray, known & ~rim)
+    surface = np.where(np.isnan(surface), UNIFORM_LOG_LIKELIHOOD, surface)
+    spill = _log_likelihood(gray, empty) > surface + np.log(OPTIONS.min_odds)
+    return np.where(spill & rim, np.float32(0), depth)
 
 
-def rim_mask(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def rim_mask(known: BoolArray) -> BoolArray:
     """Mark pixels with a depth within `REACH_PX` of a gap that is broader than two rims, (H, W)."""
     away = cv2.distanceTransform(1 - _broad_areas(~known).view(np.uint8), cv2.DIST_L2, 3)
     return np.asarray(known & (away <= REACH_PX))
 
 
-def _broad_areas(empty: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _broad_areas(empty: BoolArray) -> BoolArray:
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * REACH_PX + 1, 2 * REACH_PX + 1))
     return np.asarray(cv2.morphologyEx(empty.view(np.uint8), cv2.MORPH_OPEN, disc)).view(np.bool_)
 
 
-def _log_likelihood(gray: NDArray[np.float32], among: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return (H, W) log likelihood of each pixel's gray, given the marked pixels around it.
-
-    NaN, which compares as false, where too few are marked.
-    """
+def _log_likelihood(gray: NDArray[np.float32], among: BoolArray) -> NDArray[np.float32]:
+    """Return (H, W) log likelihood of each pixel's gray given the marked pixels around it; NaN if fewer than 5."""
     side = (SURROUNDINGS_PX, SURROUNDINGS_PX)
     marked = among.astype(np.float32)
     count = cv2.blur(marked, side)
-    enough = count * SURROUNDINGS_PX**2 > LEAST_PX - 0.5
-    share = np.where(enough, count, np.float32(np.nan))
+    share = np.where(count * SURROUNDINGS_PX**2 > 4.5, count, np.float32(np.nan))
     mean = cv2.blur(gray * marked, side) / share
-    variance = np.maximum(cv2.blur(gray * gray * marked, side) / share - mean * mean, 0.0) + SENSOR_NOISE_GRAY**2
+    variance = (
+        np.maximum(cv2.blur(gray * gray * marked, side) / share - mean * mean, 0.0) + OPTIONS.sensor_noise_gray**2
+    )
     return np.asarray(-0.5 * ((gray - mean) ** 2 / variance + np.log(variance)), np.float32)

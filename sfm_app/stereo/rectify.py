@@ -1,4 +1,9 @@
-"""Disparities of rectified photos, and the corresponding depths."""
+"""Rectification of two posed photos, disparities on the canvases, and the corresponding depths.
+
+Rows of a canvas are epipolar planes, columns are angles from the baseline. Pollefeys, Koch, Van Gool: A simple and
+efficient rectification method for general motion. ICCV 1999; here on the sphere of directions. Planar rectification
+stretches photos without limit towards the epipole; this one handles motion forward, backward and sideways.
+"""
 
 from dataclasses import dataclass
 
@@ -9,25 +14,28 @@ from numpy.typing import NDArray
 from sfm_app.jit import kernel
 from sfm_app.stereo.view import DepthArray, GrayImage, View
 from sfm_app.types import Rejected
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import FloatArray, IndexArray
 
-# Rectification of two posed photos: rows are epipolar planes, columns are angles from the baseline.
-#
-# Pollefeys, Koch, Van Gool: A simple and efficient rectification method for general motion. ICCV 1999; here on the
-# sphere of directions. Planar rectification stretches photos without limit towards the epipole; this one handles
-# motion in any direction: forward, backward and sideways.
-
-MAX_DISPARITIES = 256
-MAX_GROWTH = 2.0
-"""Largest area of the canvas, relative to the photo."""
 DISPARITY_STEP = 16
-"""OpenCV requires multiples of this."""
-MIN_POINTS = 5
-MARGIN_PX = 4.0
-"""Disparities searched beyond those of the sparse points, at either end."""
-NEAR_FACTOR = 2.0
-"""Largest triangulation angle searched, relative to the nearest sparse points: near surfaces lack features."""
-BORDER_SAMPLES = 33
+"""OpenCV requires multiples of this number of disparities."""
+
+
+@dataclass(frozen=True, slots=True)
+class RectifyOptions:
+    """Limits of canvases and disparities."""
+
+    max_disparities: int = 256
+    max_growth: float = 2.0
+    """Largest area of the canvas, relative to the photo."""
+    min_points: int = 5
+    """Fewest sparse points in front of both photos."""
+    margin_px: float = 4.0
+    """Disparities searched beyond those of the sparse points, at either end."""
+    near_factor: float = 2.0
+    """Largest triangulation angle searched, relative to the nearest sparse points: near surfaces lack features."""
+
+
+OPTIONS = RectifyOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,8 +44,8 @@ class Rectification:
 
     A direction at the angle theta from the baseline, in the plane at the angle phi about it, maps to the row
     ``(phi - phi_min) * rows_per_rad`` and the column ``(theta_max - theta) * columns_per_rad + disparities`` of the
-    left canvas, `offset_px` further right in the right one. So the disparity of a point is its triangulation angle
-    times `columns_per_rad`, less `offset_px`, and lies in [0, disparities).
+    left canvas, `offset_px` further right in the right one. The disparity of a point is its triangulation angle times
+    `columns_per_rad`, less `offset_px`, and lies in [0, disparities).
     """
 
     rotation: FloatArray
@@ -53,13 +61,7 @@ class Rectification:
     disparities: int
 
     def warp(self, reference: GrayImage, neighbor: GrayImage, views: tuple[View, View]) -> tuple[GrayImage, GrayImage]:
-        """Warp both photos to the canvas, black where they have no pixels.
-
-        Args:
-            reference: (H, W) gray; may be smaller than its view.
-            neighbor: the other photo, with the same conditions.
-            views: reference and neighbor.
-        """
+        """Warp both photos, which may be smaller than their views, to the canvas; black where they have no pixels."""
         left = self._warp(reference, views[0], 0.0)
         return left, self._warp(neighbor, views[1], self.offset_px)
 
@@ -83,20 +85,17 @@ def rectify(reference: View, neighbor: View) -> Rectification | Rejected:
     """Compute canvases whose rows lie along the epipolar planes, for any direction of the baseline.
 
     The canvas covers the overlap of both photos for the depths that the reference's sparse points span. It has the
-    reference's resolution, or less if the disparities would exceed `MAX_DISPARITIES` or its area `MAX_GROWTH`.
-
-    Args:
-        reference: the view of the left canvas, with its sparse points.
-        neighbor: the view of the right one.
+    reference's resolution, or less if the disparities or its area would exceed their limits.
     """
     rotation = _rectified_rotation(reference, neighbor)
     if rotation is None:
         return Rejected("the photos were taken from the same place")
     angles = _triangulation_angles(reference, neighbor, rotation)
-    if len(angles) < MIN_POINTS:
+    if len(angles) < OPTIONS.min_points:
         return Rejected("too few sparse points")
     per_rad = float(np.sqrt(reference.K[0, 0] * reference.K[1, 1]))
-    near, far = _angle_range(angles, (MAX_DISPARITIES - 2 * MARGIN_PX) / per_rad)
+    most, margin_px = OPTIONS.max_disparities, OPTIONS.margin_px
+    near, far = _angle_range(angles, (most - 2 * margin_px) / per_rad)
     left, right = _bounds(rotation, reference), _bounds(rotation, neighbor)
     # theta grows by the triangulation angle from the reference to the neighbor
     low = np.maximum(left[0], right[0] - [near, 0])
@@ -105,9 +104,9 @@ def rectify(reference: View, neighbor: View) -> Rectification | Rejected:
         return Rejected("the photos do not overlap")
     widest = 1.0 if low[0] < np.pi / 2 < high[0] else float(np.sin([low[0], high[0]]).max())
     area = per_rad**2 * widest * float(np.prod(high - low))
-    largest = MAX_GROWTH * reference.width * reference.height
-    per_rad *= min(1.0, MAX_DISPARITIES / (per_rad * (near - far) + 2 * MARGIN_PX), float(np.sqrt(largest / area)))
-    steps = int(np.ceil((per_rad * (near - far) + 2 * MARGIN_PX) / DISPARITY_STEP))
+    largest = OPTIONS.max_growth * reference.width * reference.height
+    per_rad *= min(1.0, most / (per_rad * (near - far) + 2 * margin_px), float(np.sqrt(largest / area)))
+    steps = int(np.ceil((per_rad * (near - far) + 2 * margin_px) / DISPARITY_STEP))
     width = int(np.ceil(per_rad * (high[0] - low[0]))) + steps * DISPARITY_STEP
     height = int(np.ceil(per_rad * widest * (high[1] - low[1])))
     return Rectification(
@@ -118,7 +117,7 @@ def rectify(reference: View, neighbor: View) -> Rectification | Rejected:
         columns_per_rad=per_rad,
         rows_per_rad=per_rad * widest,
         size=(width, height),
-        offset_px=per_rad * far - MARGIN_PX,
+        offset_px=per_rad * far - margin_px,
         disparities=steps * DISPARITY_STEP,
     )
 
@@ -137,12 +136,12 @@ def _rectified_rotation(reference: View, neighbor: View) -> FloatArray | None:
 
 
 def _directions(rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return for rays (N, 3) the angle theta from the x axis, and the angle phi about it, from the z axis."""
+    """Return, for rays (N, 3), the angle theta from the x axis and the angle phi about it from the z axis."""
     return np.arctan2(np.hypot(rays[:, 1], rays[:, 2]), rays[:, 0]), np.arctan2(rays[:, 1], rays[:, 2])
 
 
 def _triangulation_angles(reference: View, neighbor: View, rotation: FloatArray) -> FloatArray:
-    """Return (N,) triangulation angles, in radians, of the reference's sparse points in front of both."""
+    """Return (N,) triangulation angles, in radians, of the reference's sparse points in front of both photos."""
     ahead = (reference.depths > 0) & (reference.points @ neighbor.R[2] + neighbor.t[2] > 0)
     points = reference.points[ahead]
     return np.asarray(
@@ -160,50 +159,42 @@ def _angle_range(angles: FloatArray, room: float) -> tuple[float, float]:
     low, high = np.percentile(angles, [1, 99])
     margin = 0.15 * (high - low) + 0.02 * high
     far = max(low - margin, 0.25 * low)
-    return float(max(high + margin, min(NEAR_FACTOR * high, far + room))), float(far)
+    return float(max(high + margin, min(OPTIONS.near_factor * high, far + room))), float(far)
 
 
 def _bounds(rotation: FloatArray, view: View) -> FloatArray:
     """Return lowest and highest theta and phi of a photo, (2, 2); the full range of phi if it contains an epipole."""
-    s, e = np.linspace(0, 1, BORDER_SAMPLES), np.ones(BORDER_SAMPLES)
+    s, e = np.linspace(0, 1, 33), np.ones(33)
     border = np.concatenate([np.stack(side, -1) for side in ((s, 0 * e), (s, e), (0 * e, s), (e, s))])
     pixels = np.column_stack([border * [view.width, view.height], np.ones(len(border))])
     theta, phi = _directions(pixels @ np.linalg.inv(view.K).T @ view.R @ rotation.T)
     low, high = np.array([theta.min(), phi.min()]), np.array([theta.max(), phi.max()])
     for sign, end in ((1.0, 0.0), (-1.0, np.pi)):
         epipole = sign * (view.K @ view.R @ rotation[0])
-        shown = epipole[2] > 0 and 0 <= epipole[0] <= view.width * epipole[2]
-        if shown and 0 <= epipole[1] <= view.height * epipole[2]:
+        inside = epipole[2] > 0 and 0 <= epipole[0] <= view.width * epipole[2]
+        if inside and 0 <= epipole[1] <= view.height * epipole[2]:
             low, high = np.array([min(low[0], end), -np.pi]), np.array([max(high[0], end), np.pi])
     if high[1] - low[1] > np.pi:  # the photo lies across the seam at phi = pi
         low[1], high[1] = -np.pi, np.pi
     return np.stack([low, high])
 
 
-BLOCK_PX = 3
-NO_DISPARITY = -1.0
-MIN_PARALLAX_PX = 1.0
-"""Smaller parallaxes, near the epipole and far away, do not determine the depth."""
-
-
 def disparities(left: GrayImage, right: GrayImage, count: int) -> NDArray[np.float32]:
     """Compute subpixel disparities in [0, count) by semi-global matching (Hirschmueller, PAMI 2008; OpenCV's variant).
 
-    Args:
-        left: (H, W) rectified.
-        right: (H, W) rectified.
-        count: pixels, a multiple of 16.
+    The photos are rectified; `count` is a multiple of 16.
 
     Returns:
         (H, W) disparity of the left image in pixels; -1 where left and right disagree by more than a pixel, where a
         second disparity is nearly as good, and on small specks.
     """
+    block_px = 3
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=count,
-        blockSize=BLOCK_PX,
-        P1=8 * BLOCK_PX**2,
-        P2=32 * BLOCK_PX**2,
+        blockSize=block_px,
+        P1=8 * block_px**2,
+        P2=32 * block_px**2,
         disp12MaxDiff=1,
         preFilterCap=63,
         uniquenessRatio=10,
@@ -212,23 +203,17 @@ def disparities(left: GrayImage, right: GrayImage, count: int) -> NDArray[np.flo
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,  # five directions take a third longer without better results
     )
     sixteenths = matcher.compute(left, right)
-    return np.where(sixteenths < 0, NO_DISPARITY, sixteenths / 16.0).astype(np.float32)
+    return np.where(sixteenths < 0, -1.0, sixteenths / 16.0).astype(np.float32)
 
 
 def depths_from_disparities(
     disparity: NDArray[np.float32], rectification: Rectification, reference: View, neighbor: View
 ) -> tuple[DepthArray, DepthArray]:
-    """Lift a rectified disparity map to depths of the reference.
-
-    Args:
-        disparity: (H, W) of the left canvas in pixels; < 0 where unknown.
-        rectification: of the two views.
-        reference: the view of the left canvas.
-        neighbor: the view of the right one.
+    """Lift a disparity map (H, W) of the left canvas, < 0 where unknown, to depths of the reference.
 
     Returns:
-        (H, W) depth of the reference's pixels, 0 where unknown or not seen by the neighbor, and (H, W) the parallax
-        in pixels, to which the relative accuracy of the depth is proportional.
+        (H, W) depth of the reference's pixels, 0 where unknown or outside the neighbor, and (H, W) the parallax in
+        pixels, to which the relative accuracy of the depth is proportional.
     """
     K_inv = np.linalg.inv(reference.K)
     to_rectified = rectification.rotation @ reference.R.T @ K_inv
@@ -247,13 +232,13 @@ def depths_from_disparities(
 
 
 @kernel
-def _lift(
+def _lift(  # noqa: PLR0913
     disparity: NDArray[np.float32],
     canvas: FloatArray,
     to_rectified: FloatArray,
     P: FloatArray,
     sample: float,
-    size: NDArray[np.int64],
+    size: IndexArray,
     depth: DepthArray,
     parallax: DepthArray,
 ) -> None:
@@ -278,7 +263,8 @@ def _lift(
             # law of sines in the epipolar triangle; across = |ray| sin(theta)
             sine = np.sin(angle) * np.sin(theta + angle) / np.sin(theta)
             shift = columns_per_rad * sine
-            if shift < MIN_PARALLAX_PX:
+            # smaller parallaxes, near the epipole and far away, do not determine the depth
+            if shift < 1.0:
                 continue
             z = baseline * np.sin(theta + angle) / np.sin(angle) / np.sqrt(a * a + across * across)
             p2 = z * (P[2, 0] * x + P[2, 1] * y + P[2, 2]) + P[2, 3]
@@ -294,7 +280,7 @@ def _lift(
 
 @kernel
 def _interpolate(disparity: NDArray[np.float32], u: float, v: float) -> float:
-    """Return the bilinear value where the surface is continuous, else the nearest one; -1 where there is none."""
+    """Return the bilinear value where the surface is continuous, else the nearest value; -1 where unknown."""
     height, width = disparity.shape
     i, j = int(np.floor(v)), int(np.floor(u))
     if i < 0 or j < 0 or i + 1 >= height or j + 1 >= width:

@@ -1,4 +1,4 @@
-"""Selection of the neighbors that a photo is matched with."""
+"""Views of photos, and the neighbors that each is matched with."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -6,22 +6,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.types.arrays import FloatArray
-
-# Camera, pose and sparse points of a photo.
+from sfm_app.types.arrays import FloatArray, IndexArray
 
 DepthArray = NDArray[np.float32]
 """(H, W) depth along the optical axis in scene units, 0 where unknown."""
 GrayImage = NDArray[np.uint8]
 """(H, W)."""
-
-
-def _no_ids() -> NDArray[np.int64]:
-    return np.empty(0, np.int64)
-
-
-def _no_points() -> FloatArray:
-    return np.empty((0, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,14 +27,14 @@ class View:
     """(3,) translation of cam_from_world."""
     width: int
     height: int
-    point_ids: NDArray[np.int64] = field(default_factory=_no_ids)
+    point_ids: IndexArray = field(default_factory=lambda: np.empty(0, np.int64))
     """(M,) ids of the sparse points that this photo observes, ascending."""
-    points: FloatArray = field(default_factory=_no_points)
+    points: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     """(M, 3) those points in the world."""
     sample_px: float = 0.5
     """Position of a depth inside its pixel, in x and y: 0.5 is the pixel's center, 0 its top-left corner."""
     level: int = 0
-    """How many times the photo was halved."""
+    """Number of halvings of the photo."""
 
     @property
     def center(self) -> FloatArray:
@@ -62,61 +52,45 @@ class View:
         return self.K @ np.column_stack([self.R, self.t])
 
     def halve(self, level: int) -> "View":
-        """Return the view of the photo at half the size, and half of that, and so on; depths are at pixel centers.
-
-        Args:
-            level: how many times, >= 1.
-        """
+        """Return the view of the photo halved `level` >= 1 times; depths are at pixel centers."""
         width, height = (max(1, side >> level) for side in (self.width, self.height))
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return replace(self, K=scale @ self.K, width=width, height=height, sample_px=0.5, level=level)
 
 
 def region(views: Sequence[View], margin: float = 0.2) -> FloatArray:
-    """Return (2, 3) lowest and highest coordinates of the sparse points without outliers, plus a margin.
-
-    Args:
-        views: with their sparse points.
-        margin: share of the longest side added at every side.
-    """
+    """Return (2, 3) bounds of the sparse points without outliers, widened by a share of the longest side."""
     points = np.concatenate([view.points for view in views])
     low, high = np.percentile(points, [1, 99], axis=0)
     return np.stack([low - margin * (high - low).max(), high + margin * (high - low).max()])
 
 
-MIN_SHARED_POINTS = 5
 BEST_ANGLE_DEG = 8.0
-"""Smaller angles give inexact depths, larger ones images that look different."""
-SAME_PLACE_DEG = 1e-6
-"""Views whose largest triangulation angle is smaller have the same center: they are parts of one wide photo. By
-definition: rounding."""
+"""Best triangulation angle. Smaller angles give inexact depths, larger ones images that look different."""
 
 
 def rank_neighbors(views: Sequence[View], count: int) -> list[list[int]]:
-    """Return for every view the indices of its best neighbors, best first.
+    """Rank at most `count` neighbors of every view by greedy coverage, best first.
 
-    Greedy coverage: the next neighbor is the one that adds most to the sparse points of the view. A point adds its
-    weight (triangulation angle, difference in scale), reduced by up to half for each neighbor that already covers it.
-    So the neighbors cover the whole photo instead of crowding on one side.
-
-    Args:
-        views: all photos, with their sparse points.
-        count: most neighbors per view.
+    The next neighbor adds most to the sparse points of the view. A point adds its weight (triangulation angle,
+    difference in scale), reduced by up to half per neighbor that covers it. So the neighbors cover the whole photo.
     """
     ids = np.concatenate([np.empty(0, np.int64), *(view.point_ids for view in views)])
     order = np.argsort(ids, kind="stable")
-    seers = np.repeat(np.arange(len(views)), [len(view.point_ids) for view in views])[order]
-    ranked = ids[order]
-    found = []
+    observers = np.repeat(np.arange(len(views)), [len(view.point_ids) for view in views])[order]
+    ids = ids[order]
+    ranked = []
     for index, view in enumerate(views):
-        ends = zip(*(np.searchsorted(ranked, view.point_ids, side) for side in ("left", "right")), strict=True)
-        others, shared = np.unique(np.concatenate([seers[:0], *(seers[a:b] for a, b in ends)]), return_counts=True)
-        found.append(_rank(index, [k for k in others[shared >= MIN_SHARED_POINTS] if k != index], views, count))
-    return found
+        ends = zip(*(np.searchsorted(ids, view.point_ids, side) for side in ("left", "right")), strict=True)
+        others, shared = np.unique(
+            np.concatenate([observers[:0], *(observers[a:b] for a, b in ends)]), return_counts=True
+        )
+        ranked.append(_rank(index, [k for k in others[shared >= 5] if k != index], views, count))
+    return ranked
 
 
 def _rank(index: int, others: Sequence[int], views: Sequence[View], count: int) -> list[int]:
-    """Return the best neighbors of a view among those that share points with it."""
+    """Return the best neighbors of a view among others with common points."""
     view = views[index]
     weights: dict[int, FloatArray] = {}
     for number in map(int, others):
@@ -137,18 +111,12 @@ def _rank(index: int, others: Sequence[int], views: Sequence[View], count: int) 
 
 
 def _is_same_place(view: View, other: View) -> bool:
-    angles = triangulation_angles_deg(view.center, other.center, view.points)
-    return bool(angles.max(initial=0.0) < SAME_PLACE_DEG)
+    """Return whether two views have the same center up to rounding: both are parts of one wide photo."""
+    return bool(triangulation_angles_deg(view.center, other.center, view.points).max(initial=0.0) < 1e-6)
 
 
 def point_weights(view: View, other: View, points: FloatArray) -> FloatArray:
-    """Return (N,) in [0, 1]: how well points can be matched between two views, by angle and scale.
-
-    Args:
-        view: one view.
-        other: the other one.
-        points: (N, 3) in the world.
-    """
+    """Weigh points (N, 3) in the world by triangulation angle and scale: (N,) in [0, 1], 1 for the best match."""
     angle_deg = triangulation_angles_deg(view.center, other.center, points)
     spread_deg = np.where(angle_deg < BEST_ANGLE_DEG, BEST_ANGLE_DEG / 3, 1.25 * BEST_ANGLE_DEG)
     weight = np.exp(-0.5 * ((angle_deg - BEST_ANGLE_DEG) / spread_deg) ** 2)
@@ -158,14 +126,8 @@ def point_weights(view: View, other: View, points: FloatArray) -> FloatArray:
     return np.asarray(np.where(in_front, weight * np.minimum(scale, 1 / scale), 0.0))
 
 
-def triangulation_angles_deg(center1: FloatArray, center2: FloatArray, points: FloatArray) -> NDArray[np.float64]:
-    """Return (N,) angles in degrees between the rays from points to two centers.
-
-    Args:
-        center1: (3,) of one camera.
-        center2: (3,) of the other.
-        points: (N, 3).
-    """
+def triangulation_angles_deg(center1: FloatArray, center2: FloatArray, points: FloatArray) -> FloatArray:
+    """Return (N,) angles in degrees between the rays from points (N, 3) to two centers (3,)."""
     ray1, ray2 = points - center1, points - center2
     # atan2 keeps small angles exact, where arccos of a rounded cosine does not
     sine = np.linalg.norm(np.cross(ray1, ray2), axis=1)

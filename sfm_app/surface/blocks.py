@@ -61,11 +61,7 @@ class BlockPoints:
     """(B, 2, 3) lowest and highest coordinates of the points of each block."""
 
     def read(self, number: int) -> NDArray[np.void]:
-        """Return the records of a block.
-
-        Args:
-            number: of the block.
-        """
+        """Return the records of a block."""
         return np.fromfile(self.folder / str(number), self.fields)
 
     def read_box(self, box: FloatArray) -> NDArray[np.void]:
@@ -88,8 +84,6 @@ def sort_points(points: NDArray[np.void], partition: Partition, folder: Path) ->
 
     Args:
         points: (N,) records of all points, as `open_points` has them.
-        partition: the blocks.
-        folder: gets a folder with the files.
     """
     place, unfinished, count = folder / POINTS, folder / f"{POINTS}-unfinished", len(partition.boxes)
     if not place.exists():
@@ -134,21 +128,13 @@ class RecordCells:
     """Gives their records, part by part."""
 
     def points_per_cell(self, cell: float) -> float:
-        """Return the mean number of points in an occupied cell.
-
-        Args:
-            cell: side of a cell.
-        """
+        """Return the mean number of points in an occupied cell."""
         counts = [(len(part), count_cells(positions(part), cell)) for part in self.read()]
         points, occupied = np.sum(counts, axis=0)
         return float(points / occupied)
 
     def bent_share(self, cell: float) -> float:
-        """Return the share of cells whose normals differ.
-
-        Args:
-            cell: side of a cell.
-        """
+        """Return the share of cells whose normals differ."""
         counts = [count_bent(positions(part), _normals(part), cell) for part in self.read()]
         bent, told = np.sum(counts, axis=0)
         return float(bent / max(told, 1))
@@ -164,7 +150,6 @@ def with_halo(bounds: FloatArray, cell: float) -> FloatArray:
 
     Args:
         bounds: (..., 2, 3) lowest and highest coordinates.
-        cell: side of the finest cells.
     """
     return bounds + HALO * cell * np.array([-1.0, 1.0])[:, None]
 
@@ -175,8 +160,6 @@ def span_surface(records: NDArray[np.void], bounds: FloatArray, cube: Cube, plac
     Args:
         records: (N,) of the points, as `open_points` has them.
         bounds: (2, 3) lowest and highest coordinates.
-        cube: of the octree.
-        place: folder for files that do not stay.
     """
     anchors = np.zeros(2, records.dtype)
     for axis, letter in enumerate("xyz"):
@@ -217,8 +200,6 @@ class SurfaceJudge:
         """Prepare for a surface from Poisson reconstruction.
 
         Args:
-            surface: triangles.
-            dense_dir: folder with undistorted photos and their maps.
             tolerance: relative difference in depth within which a photo confirms a vertex.
         """
         normals = vertex_normals(surface.vertices, surface.faces)
@@ -235,11 +216,7 @@ class SurfaceJudge:
         return near[said], verdict[said], Paint(paint.total[said], paint.weight[said])
 
     def sum_up(self, judgments: Iterable[Judgment]) -> tuple[Surface, Support]:
-        """Return the surface with colors from the photos, and their support for each of its vertices.
-
-        Args:
-            judgments: of all photos, in their order.
-        """
+        """Return the surface with colors from the photos, and their support for each of its vertices."""
         support, paint = Support.zeros(len(self.normals)), Paint.zeros(len(self.normals))
         for at, verdict, colors in judgments:
             support.add(at, verdict)
@@ -249,12 +226,7 @@ class SurfaceJudge:
 
 
 def judge_by_all(judge: SurfaceJudge, views: Sequence[View]) -> tuple[Surface, Support, list[View]]:
-    """Return what `sum_up` does, and the photos that confirm enough of the surface to refine it.
-
-    Args:
-        judge: prepared for the surface.
-        views: the photos.
-    """
+    """Return what `sum_up` does, and the photos that confirm enough of the surface to refine it."""
     seers = list[View]()
 
     def ask(view: View) -> Judgment:
@@ -267,24 +239,12 @@ def judge_by_all(judge: SurfaceJudge, views: Sequence[View]) -> tuple[Surface, S
 
 
 def judge_view(judges: Shared[SurfaceJudge], view: View) -> Judgment:
-    """Let one photo judge the vertices that it has in view, on any machine.
-
-    Args:
-        judges: prepared for the surface.
-        view: the photo.
-    """
+    """Let one photo judge the vertices that it has in view, on any machine."""
     return judges.value.judge(view)
 
 
 def simplify_mesh(surface: Surface, options: MeshSettings, scratch: Path, threads: int = 1) -> Surface:
-    """Simplify to as few triangles as the error allows, and no more than asked for.
-
-    Args:
-        surface: detailed triangles.
-        options: largest error, and most triangles.
-        scratch: folder for temporary files.
-        threads: number of threads; the surface is the same for any.
-    """
+    """Simplify to as few triangles as the error allows, and no more than asked for."""
     if not options.max_error_edges and len(surface.faces) <= options.faces:
         return surface
     edge = median_edge_length(surface.vertices, surface.faces)
@@ -346,11 +306,7 @@ def mesh_in_blocks(
     """Return the surface of all points, made block by block.
 
     Args:
-        source: dense workspace with depth maps, and the photos.
-        views: photos with a depth map.
         points: (N,) records of the fused points.
-        least: photos that have to confirm the average vertex of a part.
-        run: the run.
 
     Raises:
         ReconstructionError: there is no surface.
@@ -429,13 +385,7 @@ def _parts_without_halo(tasks: Sequence[BlockTask], partition: Partition) -> Ite
 
 
 def join_blocks(node: Split | int, tasks: Sequence[BlockTask], cell: float) -> tuple[Surface, int]:
-    """Return the joined surface of all blocks below a node, and how many edges at their faces stayed open.
-
-    Args:
-        node: of the partition.
-        tasks: the blocks, all written.
-        cell: side of the finest cells.
-    """
+    """Return the joined surface of all blocks below a node, and how many edges at their faces stayed open."""
     if not isinstance(node, Split):
         stored = load_arrays(tasks[node].path)
         return Surface(stored["vertices"], stored["faces"], stored["colors"]), 0
@@ -449,7 +399,6 @@ def sizes_for_blocks(bounds: FloatArray, most: int) -> list[float]:
 
     Args:
         bounds: (B, 2, 3) of the points of each block.
-        most: greatest depth of a block's octree.
     """
     extent = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
 
@@ -461,12 +410,7 @@ def sizes_for_blocks(bounds: FloatArray, most: int) -> list[float]:
 
 
 def farthest_depth(dense_dir: Path, view: View) -> float:
-    """Return the largest depth that the map of a photo knows; beyond, it is no evidence.
-
-    Args:
-        dense_dir: folder with undistorted photos and their maps.
-        view: a photo with a map.
-    """
+    """Return the largest depth that the map of a photo knows; beyond, it is no evidence."""
     return float(read_depth(dense_dir, view, "geometric").max(initial=0.0))
 
 

@@ -59,15 +59,7 @@ class FusionTask:
 
 
 def fuse_maps(dense_dir: Path, views: Sequence[View], min_views: int, target: Path, run: RunContext) -> None:
-    """Fuse all maps of a dense workspace into a PLY file of points, at once or block by block.
-
-    Args:
-        dense_dir: dense workspace.
-        views: photos with a map, and their sparse points.
-        min_views: photos that have to see a point.
-        target: PLY file.
-        run: the run.
-    """
+    """Fuse all maps of a dense workspace into a PLY file of points, at once or block by block."""
     pixels = sum(view.width * view.height for view in views)
     if pixels <= MOST_PIXELS:
         with run.step("fusing depth maps"), replace_atomically(target) as path:
@@ -91,11 +83,7 @@ def plan_fusion(
     """Divide the space that the depth maps show into blocks.
 
     Args:
-        dense_dir: dense workspace.
-        views: photos with a map, and their sparse points.
-        min_views: photos that have to see a point.
         folder: where the blocks go.
-        run: the run.
     """
     pixels, whole = sum(view.width * view.height for view in views), region(views)
     bare = [replace(view, point_ids=np.empty(0, np.int64), points=np.empty((0, 3))) for view in views]
@@ -149,12 +137,7 @@ def _cache_gb(views: Sequence[View], memory_gb: float) -> float:
 
 
 def sample_points(dense_dir: Path, view: View) -> FloatArray:
-    """Return points (N, 3) of every so many rows and columns of a map.
-
-    Args:
-        dense_dir: dense workspace.
-        view: a photo with a map.
-    """
+    """Return points (N, 3) of every so many rows and columns of a map."""
     depth = read_depth(dense_dir, view, "geometric")[::STRIDE, ::STRIDE]
     points = world_points(view, depth, STRIDE)
     return points[depth > 0]
@@ -164,7 +147,6 @@ def is_near(view: View, depth: NDArray[np.float32], box: FloatArray) -> NDArray[
     """Return (H, W) whether the depths of a map lie in a box or little beyond it.
 
     Args:
-        view: the photo.
         depth: (H, W).
         box: (2, 3) lowest and highest coordinates.
     """
@@ -180,13 +162,7 @@ def is_near(view: View, depth: NDArray[np.float32], box: FloatArray) -> NDArray[
 
 
 def world_points(view: View, depth: NDArray[np.float32], step: int) -> FloatArray:
-    """Return the points (H, W, 3) of the depths (H, W) of a photo.
-
-    Args:
-        view: the photo.
-        depth: of every so many rows and columns.
-        step: rows and columns from one depth to the next.
-    """
+    """Return the points (H, W, 3) of the depths (H, W) of a photo."""
     rows, columns = depth.shape
     x, y = np.meshgrid(step * np.arange(columns) + view.sample_px, step * np.arange(rows) + view.sample_px)
     rays = np.stack([x, y, np.ones_like(x)], axis=2) @ np.linalg.inv(view.K).T
@@ -194,12 +170,7 @@ def world_points(view: View, depth: NDArray[np.float32], step: int) -> FloatArra
 
 
 def link_tree(source: Path, target: Path) -> None:
-    """Make a folder with the files of another, which share their bytes where the system can.
-
-    Args:
-        source: the other folder.
-        target: made; its parent, too.
-    """
+    """Make a folder with the files of another, which share their bytes where the system can."""
     target.mkdir(parents=True)
     for path in sorted(source.iterdir()):
         if path.is_file():

@@ -42,9 +42,7 @@ class Originals:
         """Return the photos without distortion, in the order of the views.
 
         Args:
-            views: as the depth maps have them.
             max_side_px: longest side in pixels.
-            spread: applies a function to photos, possibly in parallel.
         """
         larger = LargerViews(self.model_dir, self.photo_dir, self.mask_dir, views, max_side_px)
         photos, poses, known = larger.photos, {view.name: view for view in views}, dict[str, RefinePhoto]()
@@ -61,11 +59,7 @@ class Originals:
 
 
 def rank_partners(views: Sequence[View]) -> Partners:
-    """Return the names of the photos that each one is best compared with, best first.
-
-    Args:
-        views: all photos, with their sparse points.
-    """
+    """Return the names of the photos that each one is best compared with, best first."""
     ranked = rank_neighbors(views, 2 * PARTNERS)
     return {view.name: [views[k].name for k in best] for view, best in zip(views, ranked, strict=True)}
 
@@ -75,14 +69,6 @@ def refine_surface(
     spread: Spread = map,
 ) -> Refinement:  # fmt: skip
     """Return a surface with the detail of the photos.
-
-    Args:
-        surface: what the depth maps give.
-        originals: the photos.
-        views: those that may see the surface, as the depth maps have them.
-        partners: from `rank_partners`.
-        options: how large the photos are, and how many triangles the mesh may have in the end.
-        spread: applies a function to the numbers of photos, possibly in parallel.
 
     Raises:
         BackendError: a photo cannot be read.
@@ -126,7 +112,6 @@ def save_fine(parts: Iterable[FineShape], path: Path) -> None:
     """Write parts of a surface as one, atomically.
 
     Args:
-        parts: one after the other.
         path: where they go.
     """
     vertices, faces, count = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.int32)], 0

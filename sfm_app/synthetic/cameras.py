@@ -178,7 +178,6 @@ class Views:
         """Return photos of one camera at several poses, named view_00.jpg and so on.
 
         Args:
-            camera: of all photos.
             poses: (3, 4) cam_from_world each.
         """
         named = {f"view_{k:02d}.jpg": pose for k, pose in enumerate(poses)}
@@ -186,10 +185,6 @@ class Views:
 
     def with_camera(self, camera: Camera, photos: Collection[str]) -> "Views":
         """Return the views with another camera for some photos.
-
-        Args:
-            camera: the other camera.
-            photos: names of photos among the views.
 
         Raises:
             ConfigError: a photo is not among the views.
@@ -273,7 +268,6 @@ def make_wide_camera(
     Args:
         width, height: pixels, >= 16.
         field_deg: from one end of the longer side to the other, in degrees, (0, 360); below 180 with "perspective".
-        lens: projection and distortion.
         center: optical center as shares of width and height.
 
     Raises:
@@ -303,9 +297,7 @@ def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Vie
     """Return hand-held photos along an arc in front of the scene (towards +z, y up), named view_00.jpg and so on.
 
     Args:
-        camera: of all photos.
         options: the walk; the default one if None.
-        seed: same seed, same poses.
     """
     options = options or ArcOptions()
     rng = np.random.default_rng([seed, 11])
@@ -363,7 +355,6 @@ def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> F
     """Return viewing directions in the camera frame, row by row.
 
     Args:
-        camera: its lens is undone exactly.
         offset_px: position of the ray in each pixel; (0.5, 0.5) is the center.
 
     Returns:
@@ -379,13 +370,7 @@ def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> F
 
 
 def stratified_samples(limits: tuple[float, float], count: int, rng: np.random.Generator) -> FloatArray:
-    """Return (count,) values in random order, one from each equal part of the range.
-
-    Args:
-        limits: from and to.
-        count: parts.
-        rng: random generator.
-    """
+    """Return (count,) values in random order, one from each equal part of the range."""
     steps = (rng.permutation(count) + rng.uniform(0.2, 0.8, count)) / count
     return np.asarray(limits[0] + (limits[1] - limits[0]) * steps)
 

@@ -23,7 +23,6 @@ def focal_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
 
     Args:
         K: (3, 3) estimate.
-        truth: of the photo folder.
         photo: name of the photo to which K belongs; needed if there are several cameras.
 
     Raises:
@@ -38,7 +37,6 @@ def center_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
 
     Args:
         K: (3, 3) estimate.
-        truth: of the photo folder.
         photo: name of the photo to which K belongs; needed if there are several cameras.
 
     Raises:
@@ -64,7 +62,6 @@ def surface_error(
     Args:
         vertices, faces: (V, 3) in the reconstruction's frame, and (T, 3) vertex indices.
         centers: camera center (3,) by photo name in the frame of `vertices`; at least 3 photos of the truth.
-        truth: of the photo folder.
         samples: points drawn evenly from the surface (fixed seed).
 
     Raises:
@@ -86,7 +83,6 @@ def surface_accuracy(
         vertices: (V, 3) in the reconstruction's frame.
         faces: (T, 3) vertex indices.
         centers: camera center (3,) by photo name, in the frame of `vertices`.
-        truth: of the photo folder.
         tolerance: share of the scene's size, > 0.
 
     Raises:
@@ -110,7 +106,6 @@ def surface_coverage(
         vertices: (V, 3) in the reconstruction's frame.
         faces: (T, 3) vertex indices.
         centers: camera center (3,) by photo name, in the frame of `vertices`.
-        truth: of the photo folder.
         tolerance: share of the scene's size, > 0.
 
     Raises:
@@ -145,7 +140,6 @@ def align_centers(centers: Mapping[str, FloatArray], truth: Truth) -> Similarity
 
     Args:
         centers: camera center (3,) by photo name, in the reconstruction's frame.
-        truth: of the photo folder.
 
     Raises:
         ValueError: fewer than 3 common photos, or all centers lie on a line.
@@ -165,8 +159,6 @@ def sample_surface(vertices: FloatArray, faces: IndexArray, count: int, seed: in
     Args:
         vertices: (V, 3).
         faces: (T, 3) vertex indices.
-        count: points to draw.
-        seed: same seed, same points.
 
     Raises:
         ValueError: the surface has no area.
@@ -182,8 +174,6 @@ def sample_triangles(
     Args:
         vertices: (V, 3).
         faces: (T, 3) vertex indices.
-        count: points to draw.
-        seed: same seed, same points.
     """
     area = _triangle_areas(vertices, faces)
     if not area.sum() > 0:

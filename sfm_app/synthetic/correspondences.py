@@ -174,10 +174,6 @@ def make_pair(options: PairOptions, seed: int) -> TwoViews:
 
     Both images get Gaussian noise; then a uniform value is added in image 2 to the outliers, which are random rows.
 
-    Args:
-        options: sizes, noise and outliers.
-        seed: same seed, same pair.
-
     Raises:
         ConfigError: the options leave no convergent setup.
     """
@@ -202,10 +198,6 @@ def make_tracks(options: TrackOptions, seed: int) -> Tracks:
     """Draw cameras of one random K around a common pose, and points that all of them see, as in thesis 5.5.3.
 
     The orientations are perturbed like the locations, since cameras that only shift leave K undetermined.
-
-    Args:
-        options: sizes, noise and outliers.
-        seed: same seed, same tracks.
 
     Raises:
         ConfigError: the options leave no convergent setup.
@@ -233,10 +225,7 @@ def pair_matches(
     The same tracks can be corrupted in several ways.
 
     Args:
-        tracks: their noise is kept, their outliers are not.
         outliers: share of wrong matches, in [0, 1), per pair; no pair by default.
-        outlier_range_px: outliers are off by a uniform value in [-range, range] in x and in y in the second view.
-        seed: a pair's outliers depend only on the seed and the pair.
 
     Yields:
         Pair (i, j) in the order of `tracks.pairs`, and (N, 4) x1, y1, x2, y2 in pixels.
@@ -256,7 +245,6 @@ def random_rotation(rng: np.random.Generator, max_angle_deg: float) -> FloatArra
     """Return (3, 3) rotation about a uniformly random axis by a uniformly random angle.
 
     Args:
-        rng: random generator.
         max_angle_deg: degrees, >= 0.
     """
     return axis_rotation(_random_direction(rng), rng.uniform(0.0, max_angle_deg))

@@ -110,10 +110,8 @@ def write_photo_folder(
 
     Args:
         folder: created if missing.
-        scene: what is photographed.
         views: camera and pose of each photo.
         options: quality and noise of the photos; defaults if None.
-        progress: advances with every photo.
 
     Raises:
         InputError: the folder cannot be written.
@@ -148,7 +146,6 @@ def add_missing_photos(
         views: camera and pose of each photo.
         options: quality and noise of the photos; defaults if None.
         processes: >= 1; with 1, this process renders. A script that asks for more needs a `__main__` guard.
-        progress: advances with every photo that was missing.
 
     Raises:
         InputError: the folder cannot be written.
@@ -212,8 +209,6 @@ def develop(image: FloatArray, options: PhotoOptions, rng: np.random.Generator) 
 
     Args:
         image: (H, W, 3) linear RGB, about 0..1.
-        options: blur, exposure and noise.
-        rng: random generator of exposure and noise.
     """
     if options.exposure_ev > 0:
         image = image * 2.0 ** rng.normal(scale=options.exposure_ev)
@@ -228,7 +223,6 @@ def save_truth(truth: Truth, folder: Path) -> None:
     """Write truth.json (x ~ K d(R X + t) with lens distortion d) and surface.ply.
 
     Args:
-        truth: of the photo folder.
         folder: created if missing; not the folder of the photos.
     """
     images = []

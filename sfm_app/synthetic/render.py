@@ -65,8 +65,6 @@ def render_scene(
     """Render the image of a camera, before blur, noise and gamma.
 
     Args:
-        scene: from `prepare`.
-        camera: intrinsics, size and distortion.
         cam_from_world: (3, 4) pose; with a rolling shutter (height, 3, 4), one for each row.
         supersampling: rays per pixel in x and in y, >= 1; each has its own shadow ray.
 
@@ -120,7 +118,6 @@ def cast_rays(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[s
     """Return the first hits of rays, by Open3D's names; t_hit is inf for rays that hit nothing.
 
     Args:
-        caster: from `ray_caster`.
         origin: (3,), or (N, 3) one per ray.
         directions: (N, 3) of any length, which is the unit of t_hit.
     """
@@ -170,7 +167,6 @@ def shade(hits: Any, tables: Any, total: NDArray[np.float64]) -> None:
 
     Args:
         hits: directions (N, 3), primitive ids (N,), barycentric uv (N, 2), pixel size there (N,), in sunlight (N,).
-        tables: faces, vertex table, material per face, materials and lights of `PreparedScene`.
         total: (N, 3) linear RGB, changed in place.
     """
     directions, ids, uvs, pixel, lit = hits
@@ -251,8 +247,6 @@ def render_model(model: Model | PreparedModel, camera: Camera, cam_from_world: F
     pixels causes aliasing.
 
     Args:
-        model: in the frame of `cam_from_world`.
-        camera: intrinsics, size and distortion.
         cam_from_world: (3, 4) pose.
     """
     directions = pixel_rays(camera) @ cam_from_world[:, :3]
@@ -263,7 +257,6 @@ def render_rays(model: Model | PreparedModel, origin: FloatArray, directions: Fl
     """Render as `render_model` does, for any lens, with one given ray per pixel.
 
     Args:
-        model: in the frame of the rays.
         origin: (3,) where all rays start.
         directions: (H, W, 3) of any length, one per pixel.
     """
@@ -285,8 +278,6 @@ def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: F
     """Render the untextured shape in gray with flat shading, so that every bump shows; reddish from inside.
 
     Args:
-        model: in the frame of `cam_from_world`.
-        camera: intrinsics, size and distortion.
         cam_from_world: (3, 4) pose.
     """
     prepared = model if isinstance(model, PreparedModel) else prepare_model(model)
@@ -310,7 +301,6 @@ def comparison_image(photo: Colors, model: Model | PreparedModel, camera: Camera
 
     Args:
         photo: (h, w, 3) RGB; resized to the camera's size.
-        model: in the frame of `cam_from_world`, with y up.
         camera: intrinsics and distortion, and the size of each of the four pictures.
         cam_from_world: (3, 4) pose.
 
@@ -341,7 +331,6 @@ def orbited_pose(pose: FloatArray, surface: Surface, angle_deg: float) -> FloatA
 
     Args:
         pose: (3, 4) cam_from_world of that camera.
-        surface: its median depth gives the center of rotation on the optical axis.
         angle_deg: degrees about y.
     """
     R, t = pose[:, :3], pose[:, 3]

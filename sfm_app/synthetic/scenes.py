@@ -206,8 +206,6 @@ def statue_views(camera: Camera, seed: int = 0, photos: int = 22) -> Views:
     """Return hand-held photos all round.
 
     Args:
-        camera: of all photos.
-        seed: same seed, same poses.
         photos: how many, >= 2.
     """
     walk = ArcOptions(

@@ -35,26 +35,13 @@ class Shape:
     def move(
         self, to: tuple[float, float, float] = (0.0, 0.0, 0.0), turn_deg: float = 0.0, tilt_deg: float = 0.0
     ) -> "Shape":
-        """Tilt about x, then turn about y, then move.
-
-        Args:
-            to: translation along x, y and z.
-            turn_deg: about y, right-handed.
-            tilt_deg: about x, right-handed.
-        """
+        """Tilt about x, then turn about y, then move."""
         R = axis_rotation(np.array([0.0, 1.0, 0.0]), turn_deg) @ axis_rotation(np.array([1.0, 0.0, 0.0]), tilt_deg)
         return Shape(self.vertices @ R.T + to, self.faces, self.normals @ R.T, self.texture)
 
 
 def box(width: float, height: float, depth: float, spacing: float = 0.15) -> Shape:
-    """Return a box centered in x and z that stands on y = 0, its sides divided into squares.
-
-    Args:
-        width: along x.
-        height: along y.
-        depth: along z.
-        spacing: approximate side of a square.
-    """
+    """Return a box centered in x and z that stands on y = 0, its sides divided into squares."""
     size = np.array([width, height, depth])
     parts = []
     for axis in range(3):
@@ -82,9 +69,7 @@ def revolve(
     Args:
         profile: (P, 2) radius and height; with height up, the outside lies to the right of the path from the first to
             the last point, so a vase runs from its foot to its lip and on down the inside.
-        segments: steps around the axis.
         span_deg: how far around, in degrees; less than 360 leaves the ends open.
-        sharp: whether the points of the profile are sharp edges.
         flutes: number of grooves around the axis, and their depth as a share of the radius.
     """
     strips = [profile[k : k + 2] for k in range(len(profile) - 1)] if sharp else [profile]
@@ -95,8 +80,6 @@ def torus(radius: float, tube: float, span_deg: float = 360.0) -> Shape:
     """Return a ring of round section about the y axis, centered at the origin.
 
     Args:
-        radius: from the axis to the middle of the tube.
-        tube: radius of the tube.
         span_deg: how far around, in degrees.
     """
     angle = np.linspace(0.0, 2.0 * math.pi, 25)
@@ -105,13 +88,7 @@ def torus(radius: float, tube: float, span_deg: float = 360.0) -> Shape:
 
 
 def arch(radius: float, thickness: float, depth: float) -> Shape:
-    """Return half a ring of square section standing on y = 0 across x, its back at z = 0.
-
-    Args:
-        radius: of the opening.
-        thickness: of the ring, outwards.
-        depth: along z.
-    """
+    """Return half a ring of square section standing on y = 0 across x, its back at z = 0."""
     inner, outer = radius, radius + thickness
     section = np.array([[inner, 0.0], [outer, 0.0], [outer, depth], [inner, depth], [inner, 0.0]])
     lying = revolve(section, segments=40, span_deg=180.0, sharp=True)
@@ -125,10 +102,7 @@ def ball(radius: float, segments: int = 96, bumps: float = 0.0, seed: int = 0) -
     """Return a sphere around the origin.
 
     Args:
-        radius: before the dents.
-        segments: steps around the axis.
         bumps: depth of random dents as a share of the radius.
-        seed: same seed, same dents.
     """
     angle = np.linspace(-0.5, 0.5, segments // 2 + 1) * math.pi
     round_ball = _revolve_profile(np.column_stack([np.cos(angle), np.sin(angle)]), segments, 360.0, (0, 0.0))
@@ -141,7 +115,6 @@ def waves(points: FloatArray, seed: int) -> FloatArray:
 
     Args:
         points: (N, 3).
-        seed: same seed, same noise.
     """
     rng = np.random.default_rng([seed, 7])
     vectors = rng.normal(size=(24, 3)) * np.linspace(2.0, 9.0, 24)[:, None]
@@ -163,9 +136,6 @@ def carve(
     Args:
         field: positive inside the body at points (N, 3).
         height: lowest and highest level that is sampled.
-        reach: the body lies within this distance of the axis.
-        rows: levels.
-        segments: steps around the axis.
     """
     angle = 2.0 * math.pi * np.arange(segments) / segments
     # turning from +x towards -z is right-handed about +y
@@ -181,7 +151,6 @@ def assemble(parts: Sequence[Shape], keep_texture: bool = False) -> Shape:
     """Join several shapes into one.
 
     Args:
-        parts: at least one.
         keep_texture: each part keeps its texture coordinates, so that equal shapes look equal; otherwise the texture
             continues across the parts.
     """
@@ -193,14 +162,7 @@ def assemble(parts: Sequence[Shape], keep_texture: bool = False) -> Shape:
 
 
 def ground(x: tuple[float, float], z: tuple[float, float], unevenness: float, spacing: float = 0.1) -> Shape:
-    """Return an uneven floor around y = 0.
-
-    Args:
-        x: from and to.
-        z: from and to.
-        unevenness: approximate largest height.
-        spacing: approximate side of a square.
-    """
+    """Return an uneven floor around y = 0."""
     xs, zs = (np.linspace(a, b, 1 + max(1, round((b - a) / spacing))) for a, b in (x, z))
     floor, faces = grid(zs, xs)
     height = np.sin(1.3 * floor[:, 1] + 0.7) * np.sin(1.7 * floor[:, 0] + 2.1) + 0.5 * np.sin(3.1 * floor.sum(axis=1))
@@ -260,7 +222,6 @@ def grid(a: FloatArray, b: FloatArray) -> tuple[FloatArray, IndexArray]:
 
     Args:
         a: steps along the first axis.
-        b: steps along the second.
     """
     points = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
     corner = (np.arange(len(a) - 1)[:, None] * len(b) + np.arange(len(b) - 1)).ravel()
@@ -311,14 +272,7 @@ class Material:
 
 @kernel
 def lattice(ix: int, iy: int, iz: int, seed: int) -> float:
-    """Return a pseudo-random number in [0, 1) for a lattice point; wraps after 2^32.
-
-    Args:
-        ix: step along x.
-        iy: step along y.
-        iz: step along z.
-        seed: another seed, other numbers.
-    """
+    """Return a pseudo-random number in [0, 1) for a lattice point; wraps after 2^32."""
     h = uint32(ix) * uint32(0x8DA6B343) ^ uint32(iy) * uint32(0xD8163841)
     h = uint32(h ^ uint32(iz) * uint32(0xCB1AB31F) ^ uint32(seed) * uint32(0x165667B1))
     h = uint32((h ^ (h >> uint32(15))) * uint32(0x2C1B3C6D))
@@ -329,14 +283,7 @@ def lattice(ix: int, iy: int, iz: int, seed: int) -> float:
 
 @kernel
 def value_noise(x: float, y: float, z: float, seed: int) -> float:
-    """Return smooth noise in [-1, 1) on the unit lattice (Perlin's interpolation of lattice values).
-
-    Args:
-        x: in lattice steps.
-        y: in lattice steps.
-        z: in lattice steps.
-        seed: another seed, another noise.
-    """
+    """Return smooth noise in [-1, 1) on the unit lattice (Perlin's interpolation of lattice values)."""
     fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
     ix, iy, iz = int(fx), int(fy), int(fz)
     u, v, w = x - fx, y - fy, z - fz
@@ -358,7 +305,6 @@ def octaves(p: tuple[float, float, float], size: float, gain: float, footprint: 
         size: of the broadest noise, > 0.
         gain: amplitude of each octave over the one before, in (0, 1).
         footprint: size of a pixel on the surface; octaves fade out between twice that size and that size.
-        seed: another seed, another noise.
     """
     total = 0.0
     amplitude = 1.0
@@ -377,11 +323,6 @@ def cells(a: float, b: float, seed: int) -> tuple[float, float]:
     """Return border distance and number of the cell at a point, for random cells in the plane.
 
     The distance is in cells; the number, in [0, 1), identifies the cell.
-
-    Args:
-        a: across, in cells.
-        b: up, in cells.
-        seed: another seed, other cells.
     """
     ia, ib = math.floor(a), math.floor(b)
     first, second, name = 9.0, 9.0, 0.0
@@ -399,13 +340,7 @@ def cells(a: float, b: float, seed: int) -> tuple[float, float]:
 
 @kernel
 def bricks(a: float, b: float, seed: int) -> tuple[float, float]:
-    """Return border distance and number as `cells` does, for bricks twice as long as high in running bond.
-
-    Args:
-        a: along the row, in brick heights.
-        b: up, in brick heights.
-        seed: another seed, other names.
-    """
+    """Return border distance and number as `cells` does, for bricks twice as long as high in running bond."""
     row = math.floor(b)
     a = 0.5 * a + 0.5 * (row % 2.0)
     column = math.floor(a)
@@ -430,10 +365,8 @@ def tiles(
 
     Args:
         kind: 1, 2, 6 or 8, as above.
-        p: position on the body before it was moved.
         n: unit normal there.
         scale: size of a tile, > 0.
-        seed: another seed, other tiles.
     """
     if kind == 6:
         if abs(n[1]) >= max(abs(n[0]), abs(n[2])):
@@ -455,7 +388,6 @@ def ceramic(p: tuple[float, float, float], scale: float) -> tuple[float, float]:
     Bands follow the height, figures the angle about the y axis.
 
     Args:
-        p: position on the body before it was moved.
         scale: height of a band, > 0.
     """
     band = p[1] / scale
@@ -485,7 +417,6 @@ def mixture(
 
     Args:
         row: from `Material.row()`.
-        p: position on the body before it was moved.
         n: unit normal there.
         footprint: size of a pixel on the surface.
     """

@@ -1,4 +1,6 @@
-"""How alike the photos of a surface are: agreement, exposure, outliers."""
+"""Agreement of the photos of a surface: outliers, doubtful borders, exposure."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,21 +9,57 @@ from sfm_app.geometry.least_squares import solve_positive
 from sfm_app.jit import kernel
 from sfm_app.texture.facets import NONE, IntArray, components, ranges
 from sfm_app.texture.sightings import Sightings
-from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
-# The median of a few numbers, inside kernels.
+LEAST_VIEWS = 3
+"""If only two photos disagree, it is unknown which of them is right."""
+LEVELS = 10.0
+"""Normal difference between colors of one triangle, in gray levels."""
+OUTLIER_FACTOR = 3.0
+"""Deviation of an outlier, relative to the median deviation of the triangle."""
+
+
+@dataclass(frozen=True, slots=True)
+class BorderOptions:
+    """Which triangles are cut from the border of a surface."""
+
+    doubtful: float = 5.0
+    """Disagreement of a doubtful triangle, in medians of all triangles. Chosen with `rings` and `smoothing` on
+    fountain-P11 and Herz-Jesus-P8, by photos left out, and on `railing`, whose rods are thin: 3.5 gains a tenth of a dB
+    on both sets, and cuts a sixth of the rods instead of a twentieth."""
+    rings: int = 20
+    """Most rings of triangles cut from the border: hedges and water stay."""
+    smoothing: int = 2
+    """Rounds of averaging the disagreement over neighbors, and of straightening the cut."""
+    crumbs: int = 20
+    """Parts with fewer triangles are cut with the border beside them. Chosen on `railing`: 200 cuts pieces of rods."""
+
+
+@dataclass(frozen=True, slots=True)
+class GainOptions:
+    """Samples and weights of the exposure estimate."""
+
+    samples: int = 30_000
+    """Approximate number of sampled triangles, evenly spaced."""
+    samples_per_photo: int = 100
+    """Triangles per photo of a large set. Chosen by hand: a third of the value for a hundred photos."""
+    darkest: int = 8
+    """Darker gray levels are nearly clipped and do not determine the gain."""
+    brightest: int = 247
+    """Brighter gray levels are nearly clipped and do not determine the gain."""
+    rounds: int = 15
+    """Rounds of reweighting."""
+    prior: float = 0.01
+    """Weight of "no gain", as a share of the mean weight of a photo: keeps undetermined gains at 1."""
+
+
+BORDERS = BorderOptions()
+GAINS = GainOptions()
 
 
 @kernel
-def median(values: NDArray[np.float64], count: int) -> float:
-    """Sort the first values in place and return their median.
-
-    It replaces NumPy's sort, which takes seconds to compile.
-
-    Args:
-        values: (N,) changed.
-        count: number of first values used, 1 to N.
-    """
+def median(values: FloatArray, count: int) -> float:
+    """Sort the first `count` >= 1 values in place and return their median; NumPy's sort takes seconds to compile."""
     for k in range(1, count):
         value, at = values[k], k
         while at > 0 and values[at - 1] > value:
@@ -32,72 +70,48 @@ def median(values: NDArray[np.float64], count: int) -> float:
     return middle
 
 
-# Outlier views, which show something other than the surface: passers-by, cars, leaves, reflections.
+# Outlier views, which do not show the surface: passers-by, cars, leaves, reflections.
 #
-# Where at least three photos see a triangle, a color far from their median is not the surface's. A single triangle
+# If at least three photos show a triangle, a color far from their median is not the surface's. A single triangle
 # may deviate by chance, but a person covers many triangles, so deviations are averaged over neighbors. After Sinha
 # et al. 2008 and Waechter et al. 2014 (section 3.1), with medians in place of their Gaussian.
 
-LEAST_VIEWS = 3
-"""If only two photos disagree, it is unknown which of them is right."""
-LEVELS = 10.0
-"""Normal difference between colors of one triangle, in gray levels."""
-OUTLIER_FACTOR = 3.0
-"""Deviation beyond which a photo is left out, relative to the usual deviation of a triangle."""
-OUTLIER_ROUNDS = 4
-"""Rounds of averaging over neighbors: about the number of adjacent triangles that make an outlier."""
 
-
-def outlier_mask(seen: Sightings, gains: NDArray[np.float64], neighbors: IntArray) -> NDArray[np.bool_]:
-    """Mark photos at the triangles where they show something other than the surface.
-
-    Args:
-        seen: which photos see which triangles, in which colors.
-        gains: (P, 3) of the photos.
-        neighbors: (T, 3) triangles beside each triangle, -1 for none.
-
-    Returns:
-        (N,) for each of the views.
-    """
-    score = np.zeros(len(seen.face), np.float32)
-    _deviations(seen.face_starts, seen.face_rows, seen.colors, seen.photo, 1.0 / gains, score)
-    found = np.zeros(len(seen.face), np.bool_)
-    row_of = np.full(seen.triangles, NONE, np.int64)
-    for photo in range(seen.photos):
-        rows = seen.rows(photo)
-        face = seen.face[rows]
+def outlier_mask(sightings: Sightings, gains: FloatArray, neighbors: IntArray) -> BoolArray:
+    """Mark outlier views (N,), given the gains (P, 3) of the photos."""
+    deviation = np.zeros(len(sightings.face), np.float32)
+    _deviations(sightings.face_starts, sightings.face_rows, sightings.colors, sightings.photo, 1.0 / gains, deviation)
+    outlier = np.zeros(len(sightings.face), np.bool_)
+    row_of = np.full(sightings.triangles, NONE, np.int64)
+    for photo in range(sightings.photos):
+        rows = sightings.rows(photo)
+        face = sightings.face[rows]
         row_of[face] = np.arange(len(face))
         across = neighbors[face]
         beside = np.where(across == NONE, NONE, row_of[across])
         row_of[face] = NONE
-        smooth = score[rows].copy()
-        for _ in range(OUTLIER_ROUNDS):
+        smooth = deviation[rows].copy()
+        for _ in range(4):  # about the number of adjacent triangles that make an outlier
             before = smooth.copy()
-            _average_beside(before, beside, smooth)
-        _mark(smooth, beside, found[rows])
-    found &= np.diff(seen.face_starts)[seen.face] >= LEAST_VIEWS
-    _keep_majority(seen.face_starts, seen.face_rows, found)
-    return found
+            _average_neighbors(before, beside, smooth)
+        _mark(smooth, beside, outlier[rows])
+    outlier &= np.diff(sightings.face_starts)[sightings.face] >= LEAST_VIEWS
+    _keep_majority(sightings.face_starts, sightings.face_rows, outlier)
+    return outlier
 
 
 @kernel
-def measure_deviations(
-    here: NDArray[np.int64],
+def _measure_deviations(
+    here: IndexArray,
     colors: NDArray[np.uint8],
     photo: IntArray,
-    scale: NDArray[np.float64],
-    level: NDArray[np.float64],
-    far: NDArray[np.float64],
+    scale: FloatArray,
+    level: FloatArray,
+    far: FloatArray,
 ) -> None:
-    """Write the largest deviations over the channels from the median color of a triangle.
+    """Write the largest deviations `far` over the channels from the median color of a triangle with views `here`.
 
-    Args:
-        here: (K,) rows of its views.
-        colors: (N, 3) RGB of all views.
-        photo: (N,) of all views.
-        scale: (P, 3) by which the colors of each photo are multiplied.
-        level: (K or more,) changed.
-        far: (K or more,) the deviations in gray levels.
+    `scale` (P, 3) are factors on the colors of each photo; `level` is a buffer.
     """
     count = len(here)
     far[:count] = 0.0
@@ -111,31 +125,31 @@ def measure_deviations(
 
 @kernel
 def _deviations(
-    starts: NDArray[np.int64],
-    rows: NDArray[np.int64],
+    starts: IndexArray,
+    rows: IndexArray,
     colors: NDArray[np.uint8],
     photo: IntArray,
-    scale: NDArray[np.float64],
-    score: NDArray[np.float32],
+    scale: FloatArray,
+    deviation: NDArray[np.float32],
 ) -> None:
-    """Write the largest deviation from the median color over all channels, divided by the usual deviation."""
+    """Write the largest deviation from the median color over all channels, relative to the median deviation."""
     level, far = np.empty(len(scale)), np.empty(len(scale))
     for f in range(len(starts) - 1):
         here = rows[starts[f] : starts[f + 1]]
         count = len(here)
         if count < LEAST_VIEWS:
             continue
-        measure_deviations(here, colors, photo, scale, level, far)
+        _measure_deviations(here, colors, photo, scale, level, far)
         for k in range(count):
             level[k] = far[k]
-        usual = LEVELS + median(level, count)
+        median_far = LEVELS + median(level, count)
         for k in range(count):
-            score[here[k]] = far[k] / usual
+            deviation[here[k]] = far[k] / median_far
 
 
 @kernel
-def _average_beside(before: NDArray[np.float32], beside: NDArray[np.int64], after: NDArray[np.float32]) -> None:
-    """Average over each triangle and its neighbors that the photo sees."""
+def _average_neighbors(before: NDArray[np.float32], beside: IndexArray, after: NDArray[np.float32]) -> None:
+    """Average over each triangle and its visible neighbors."""
     for f in range(len(before)):
         total, count = before[f], 1
         for k in range(3):
@@ -147,119 +161,108 @@ def _average_beside(before: NDArray[np.float32], beside: NDArray[np.int64], afte
 
 
 @kernel
-def _mark(score: NDArray[np.float32], beside: NDArray[np.int64], found: NDArray[np.bool_]) -> None:
-    """Mark triangles that deviate, and their neighbors, which the outlier may cover in part."""
-    for f in range(len(score)):
-        found[f] = score[f] > OUTLIER_FACTOR
+def _mark(deviation: NDArray[np.float32], beside: IndexArray, outlier: BoolArray) -> None:
+    """Mark triangles with a large deviation, and their neighbors, which the outlier may cover in part."""
+    for f in range(len(deviation)):
+        outlier[f] = deviation[f] > OUTLIER_FACTOR
         for k in range(3):
             g = beside[f, k]
-            if g != NONE and score[g] > OUTLIER_FACTOR:
-                found[f] = True
+            if g != NONE and deviation[g] > OUTLIER_FACTOR:
+                outlier[f] = True
 
 
 @kernel
-def _keep_majority(starts: NDArray[np.int64], rows: NDArray[np.int64], found: NDArray[np.bool_]) -> None:
-    """Keep all photos of a triangle where at most half would remain: without agreement none is an outlier."""
+def _keep_majority(starts: IndexArray, rows: IndexArray, outlier: BoolArray) -> None:
+    """Keep all photos of a triangle if at most half would remain: without agreement none is an outlier."""
     for f in range(len(starts) - 1):
-        left, total = 0, starts[f + 1] - starts[f]
+        inliers, total = 0, starts[f + 1] - starts[f]
         for row in rows[starts[f] : starts[f + 1]]:
-            left += not found[row]
-        if 2 * left <= total:
+            inliers += not outlier[row]
+        if 2 * inliers <= total:
             for row in rows[starts[f] : starts[f + 1]]:
-                found[row] = False
+                outlier[row] = False
 
 
-# Borders of a surface where photos disagree about its color: there is no surface, each shows what lies behind.
+# Borders without a surface: photos disagree about their color, since each shows another part of the background.
 #
-# Depth maps reach over the outlines of things, by the same pixels in every photo, so that they agree with each
+# Depth maps reach over the outlines of objects, by the same pixels in every photo, so that they agree with each
 # other. But behind the outline each photo shows another part of the background.
 
-DOUBTFUL = 5.0
-"""Disagreement of a doubtful triangle, in medians of all triangles. Chosen with `RINGS` and `SMOOTHING` on fountain-P11
-and Herz-Jesus-P8, by photos that are left out, and on `railing`, whose rods are thin: 3.5 gains a tenth of a dB on both
-sets, and cuts a sixth of the rods instead of a twentieth. Left out: castle-P19, `ornament`, `garden`."""
-RINGS = 20
-"""Most rings of triangles that are cut from the border: what photos see of a hedge or of water stays."""
-SMOOTHING = 2
-"""Rounds of averaging the disagreement over neighbors, and of straightening the cut."""
-PASSERS_BY = 1
-"""Most photos that may show something before the surface instead of it; where more are outliers, they have a say.
-Chosen by hand: people move on."""
-CRUMBS = 20
-"""Parts with fewer triangles go with the border that held them. Chosen on `railing`: with 200, pieces of rods go."""
 
-
-def doubtful_border(seen: Sightings, gains: FloatArray, neighbors: IntArray) -> BoolArray:
-    """Mark triangles to cut from the border, (T,): photos disagree about them more than about the surface elsewhere.
-
-    Args:
-        seen: which photos see which triangles, in which colors; the worth of outliers is negative.
-        gains: (P, 3) of the photos.
-        neighbors: (T, 3) triangles beside each triangle, -1 for none.
-    """
-    disagreement = np.full(seen.triangles, np.nan)
-    _disagreement(seen.face_starts, seen.face_rows, seen.worth, seen.colors, seen.photo, 1.0 / gains, disagreement)
+def doubtful_border(sightings: Sightings, gains: FloatArray, neighbors: IntArray) -> BoolArray:
+    """Mark triangles to cut from the border, (T,): photos disagree about them more than about the surface elsewhere."""
+    disagreement = np.full(sightings.triangles, np.nan)
+    _disagreement(
+        sightings.face_starts,
+        sightings.face_rows,
+        sightings.score,
+        sightings.colors,
+        sightings.photo,
+        1.0 / gains,
+        disagreement,
+    )
     if not np.isfinite(disagreement).any():
-        return np.zeros(seen.triangles, np.bool_)
-    usual = float(np.nanmedian(disagreement))
-    for _ in range(SMOOTHING):
+        return np.zeros(sightings.triangles, np.bool_)
+    middle = float(np.nanmedian(disagreement))
+    for _ in range(BORDERS.smoothing):
         disagreement = _average_known(disagreement, neighbors)
-    doubtful = disagreement > max(DOUBTFUL * usual, LEVELS)
-    cut = _straighten(_reach(doubtful, neighbors), neighbors)
+    doubtful = disagreement > max(BORDERS.doubtful * middle, LEVELS)
+    cut = _straighten(_grow_from_border(doubtful, neighbors), neighbors)
     return cut | _crumbs(cut, neighbors)
 
 
 @kernel
 def _disagreement(
-    starts: NDArray[np.int64], rows: NDArray[np.int64], worth: NDArray[np.float32], colors: NDArray[np.uint8],
-    photo: IntArray, scale: FloatArray, found: FloatArray,
+    starts: IndexArray, rows: IndexArray, score: NDArray[np.float32], colors: NDArray[np.uint8],
+    photo: IntArray, scale: FloatArray, disagreement: FloatArray,
 ) -> None:  # fmt: skip
     """Write the mean deviation of the views of each triangle from their median color, in gray levels."""
     level, far, used = np.empty(len(scale)), np.empty(len(scale)), np.empty(len(scale), np.int64)
     for f in range(len(starts) - 1):
-        count = strange = 0
+        count = outliers = 0
         for row in rows[starts[f] : starts[f + 1]]:
-            strange += worth[row] < 0
+            outliers += score[row] < 0
         for row in rows[starts[f] : starts[f + 1]]:
-            if worth[row] > 0 or strange > PASSERS_BY:
+            # one photo may show a passer-by; more outliers count as disagreement
+            if score[row] > 0 or outliers > 1:
                 used[count] = row
                 count += 1
         if count < 2:
             continue
-        measure_deviations(used[:count], colors, photo, scale, level, far)
-        found[f] = 0.0
+        _measure_deviations(used[:count], colors, photo, scale, level, far)
+        disagreement[f] = 0.0
         for k in range(count):
-            found[f] += far[k] / count
+            disagreement[f] += far[k] / count
 
 
 def _average_known(values: FloatArray, neighbors: IntArray) -> FloatArray:
-    """Return (T,) means over each triangle and its neighbors, of those that have a value."""
+    """Return (T,) means of the known values of each triangle and its neighbors."""
     known = np.isfinite(values)
     total, count = np.where(known, values, 0.0), known.astype(np.float64)
     for beside in neighbors.T:
-        there = (beside != NONE) & known[beside]
-        total += np.where(there, values[beside], 0.0)
-        count += there
+        usable = (beside != NONE) & known[beside]
+        total += np.where(usable, values[beside], 0.0)
+        count += usable
     return np.asarray(np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0))
 
 
-def _reach(doubtful: BoolArray, neighbors: IntArray) -> BoolArray:
-    """Return (T,) the doubtful triangles that are connected with the border by others, within some rings."""
+def _grow_from_border(doubtful: BoolArray, neighbors: IntArray) -> BoolArray:
+    """Return (T,) the doubtful triangles connected with the border by doubtful ones, ring by ring."""
     front = doubtful & (neighbors == NONE).any(axis=1)
-    found = front.copy()
-    for _ in range(RINGS):
+    region = front.copy()
+    for _ in range(BORDERS.rings):
         beside = neighbors[front]
-        near = np.zeros(len(found), np.bool_)
+        near = np.zeros(len(region), np.bool_)
         near[beside[beside != NONE]] = True
-        front = near & doubtful & ~found
-        found |= front
-    return np.asarray(found, np.bool_)
+        front = near & doubtful & ~region
+        region |= front
+    return np.asarray(region, np.bool_)
 
 
 def _straighten(cut: BoolArray, neighbors: IntArray) -> BoolArray:
-    """Return (T,) the cut with triangles that would stay as spikes: two of their sides would be open."""
+    """Return (T,) the cut with spikes: triangles with two open sides."""
     cut = cut.copy()
-    for _ in range(SMOOTHING):
+    for _ in range(BORDERS.smoothing):
         beside = (neighbors != NONE) & cut[neighbors]
         is_open = beside | (neighbors == NONE)
         cut |= beside.any(axis=1) & (is_open.sum(axis=1) >= 2)
@@ -267,64 +270,47 @@ def _straighten(cut: BoolArray, neighbors: IntArray) -> BoolArray:
 
 
 def _crumbs(cut: BoolArray, neighbors: IntArray) -> BoolArray:
-    """Mark (T,) small connected parts that touch the cut."""
+    """Mark (T,) small connected parts beside the cut."""
     part, count = components(np.where(cut, NONE, 0), neighbors)
     beside_cut = ~cut & ((neighbors != NONE) & cut[neighbors]).any(axis=1)
-    crumb = np.bincount(part[~cut], minlength=count) < CRUMBS
+    crumb = np.bincount(part[~cut], minlength=count) < BORDERS.crumbs
     crumb &= np.bincount(part[beside_cut], minlength=count) > 0
     return np.asarray(~cut & crumb[part], np.bool_)
 
 
-# Exposure and white balance of the photos, from triangles that several of them see.
+# Exposure and white balance of the photos, from triangles in several of them.
 #
 # Each photo multiplies every channel by a gain: log c[f, p] = log a[f] + g[p] + noise, for triangle f and photo p.
 # The colors a of the surface are eliminated, the gains g come from iteratively reweighted least squares (Cauchy),
 # so that shadows, highlights and passers-by have little weight.
 
-SAMPLES = 30_000
-"""Approximate number of sampled triangles, evenly spaced."""
-SAMPLES_PER_PHOTO = 100
-"""Triangles for each photo of a large set. Chosen by hand: a third of what each of a hundred photos has."""
-DARKEST, BRIGHTEST = 8, 247
-"""Gray levels outside this range are nearly clipped and do not determine the gain."""
-NOISE = 0.05
-"""Scale of the Cauchy weights, in log colors; larger deviations are downweighted."""
-EXPOSURE_ROUNDS = 15
-PRIOR = 0.01
-"""Weight of "no gain", as a share of the mean weight of a photo: keeps undetermined gains at 1."""
 
-
-def photo_gains(seen: Sightings) -> FloatArray:
-    """Estimate the gain of every photo and channel; the geometric mean of the gains is 1.
-
-    Args:
-        seen: which photos see which triangles, in which colors.
-
-    Returns:
-        (P, 3) gains; dividing a photo by its gains makes it consistent with the others.
-    """
-    counts = np.diff(seen.face_starts)
+def photo_gains(sightings: Sightings) -> FloatArray:
+    """Estimate gains (P, 3), of geometric mean 1; dividing a photo by its gains makes it consistent with the others."""
+    counts = np.diff(sightings.face_starts)
     shared = np.flatnonzero(counts > 1)
-    samples = max(SAMPLES, SAMPLES_PER_PHOTO * seen.photos)
+    samples = max(GAINS.samples, GAINS.samples_per_photo * sightings.photos)
     picked = shared[:: max(1, len(shared) // samples)]
-    rows = seen.face_rows[ranges(seen.face_starts[picked], seen.face_starts[picked + 1])]
+    rows = sightings.face_rows[ranges(sightings.face_starts[picked], sightings.face_starts[picked + 1])]
     starts = np.concatenate([[0], np.cumsum(counts[picked])]).astype(np.int64)
-    photo = seen.photo[rows].astype(np.int64)
-    gains = np.zeros((seen.photos, 3))
+    photo = sightings.photo[rows].astype(np.int64)
+    gains = np.zeros((sightings.photos, 3))
     for channel in range(3):
-        values = seen.colors[rows, channel]
-        usable = (values >= DARKEST) & (values <= BRIGHTEST)
-        left = np.concatenate([[0], np.cumsum(usable)])[starts]
-        gains[:, channel] = _log_gains(np.log(values[usable].astype(np.float64)), photo[usable], left, seen.photos)
+        values = sightings.colors[rows, channel]
+        usable = (values >= GAINS.darkest) & (values <= GAINS.brightest)
+        first = np.concatenate([[0], np.cumsum(usable)])[starts]
+        gains[:, channel] = _log_gains(
+            np.log(values[usable].astype(np.float64)), photo[usable], first, sightings.photos
+        )
     return np.exp(gains)
 
 
-def _log_gains(logs: FloatArray, photo: NDArray[np.int64], starts: NDArray[np.int64], photos: int) -> FloatArray:
+def _log_gains(logs: FloatArray, photo: IndexArray, starts: IndexArray, photos: int) -> FloatArray:
     gains = np.zeros(photos)
-    for _ in range(EXPOSURE_ROUNDS):
+    for _ in range(GAINS.rounds):
         normal, right = np.zeros((photos, photos)), np.zeros(photos)
         _add_equations(logs, photo, starts, gains, normal, right)
-        prior = PRIOR * max(np.trace(normal) / photos, 1e-12)
+        prior = GAINS.prior * max(np.trace(normal) / photos, 1e-12)
         gains = solve_positive(normal + prior * np.eye(photos), right[:, None])[:, 0]
         gains -= gains.mean()
     return gains
@@ -333,13 +319,13 @@ def _log_gains(logs: FloatArray, photo: NDArray[np.int64], starts: NDArray[np.in
 @kernel
 def _add_equations(
     logs: FloatArray,
-    photo: NDArray[np.int64],
-    starts: NDArray[np.int64],
+    photo: IndexArray,
+    starts: IndexArray,
     gains: FloatArray,
     normal: FloatArray,
     right: FloatArray,
 ) -> None:
-    """Add the normal equations of the gains at the present weights, with the color of each triangle eliminated."""
+    """Add the normal equations of the gains at the current weights, with the color of each triangle eliminated."""
     weight, level = np.empty(len(right)), np.empty(len(right))
     for f in range(len(starts) - 1):
         first, count = starts[f], starts[f + 1] - starts[f]
@@ -351,7 +337,8 @@ def _add_equations(
         total = mean = 0.0
         for k in range(count):
             row = first + k
-            weight[k] = 1.0 / (1.0 + ((logs[row] - gains[photo[row]] - middle) / NOISE) ** 2)
+            # Cauchy weights of scale 0.05 in log colors
+            weight[k] = 1.0 / (1.0 + ((logs[row] - gains[photo[row]] - middle) / 0.05) ** 2)
             total += weight[k]
             mean += weight[k] * logs[row]
         mean /= total

@@ -18,7 +18,7 @@ from sfm_app.texture.sightings import FaceView, OcclusionTest, Sightings, list_s
 from sfm_app.texture.view_selection import choose_photos
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import Model, Rejected, Surface, Texture
-from sfm_app.types.arrays import IndexArray
+from sfm_app.types.arrays import BoolArray, IndexArray
 
 
 def texture_surface(
@@ -29,43 +29,44 @@ def texture_surface(
     options: TextureSettings,
     spread: ParallelMap,
 ) -> tuple[Model, dict[str, Any]]:
-    """Paint a surface with photos.
+    """Paint a surface, in the frame of the views, with photos.
 
-    Args:
-        surface: triangles in the frame of the views.
-        views: the registered photos.
-        store: reads photos, and keeps the results of each, so that a killed run can continue.
-        hidden: the occlusion test for this surface.
-        options: size and number of pages, and treatment of triangles that no photo sees.
-        spread: applies a function to all photos.
-
-    Returns:
-        The surface with texture and colors from the photos, cut if the options say so; and figures for the manifest.
+    The store keeps the results of each photo, so that a killed run can continue. Returns the surface with texture and
+    colors from the photos, cut if the options say so, and figures for the manifest.
     """
     mesh = facets(surface)
-    looks = _score_photos(views, mesh, store, hidden, spread)
-    seen, trimmed = _check_views(looks, mesh), 0
-    if options.trim_borders:
-        border = doubtful_border(seen.all, seen.gains, mesh.neighbors)
-        mesh, seen, trimmed = *_cut_faces(border, mesh, seen), int(border.sum())
-    chosen = absorb_small_charts(choose_photos(seen.all, mesh), seen.all, mesh.neighbors)
-    unseen = chosen == NONE
-    if options.unseen_faces == "cut" and not unseen.all():
-        mesh, seen = _cut_faces(unseen, mesh, seen)
-        chosen = chosen[~unseen]
-    plan = _plan(mesh, seen, chosen, (views, options), spread)
-    rejected = [look if isinstance(look, Rejected) else None for look in looks]
-    painted = paint_blocks(plan, views, store, spread, [reason is None for reason in rejected])
-    return _finish(plan, painted), _figures(plan, views, rejected, (int(unseen.sum()), trimmed))
 
-
-def _score_photos(
-    views: Sequence[PhotoView], mesh: Facets, store: Store, hidden: OcclusionTest, spread: ParallelMap
-) -> list[FaceView | Rejected]:
     def score(photo: int) -> FaceView | Rejected:
         return _score_photo(f"look{photo}", views[photo], mesh, store, hidden)
 
-    return spread(score, range(len(views)), "looking at the surface")
+    face_views = spread(score, range(len(views)), "finding visible triangles")
+    checked, trimmed = _check_views(face_views, mesh), 0
+    if options.trim_borders:
+        border = doubtful_border(checked.sightings, checked.gains, mesh.neighbors)
+        mesh, checked, trimmed = *_cut_faces(border, mesh, checked), int(border.sum())
+    chosen = absorb_small_charts(choose_photos(checked.sightings, mesh), checked.sightings, mesh.neighbors)
+    unseen = chosen == NONE
+    if options.unseen_faces == "cut" and not unseen.all():
+        mesh, checked = _cut_faces(unseen, mesh, checked)
+        chosen = chosen[~unseen]
+    plan = _plan(mesh, checked, chosen, views, options, spread)
+    rejected = [view if isinstance(view, Rejected) else None for view in face_views]
+    painted = paint_blocks(plan, views, store, spread, [reason is None for reason in rejected])
+    return _finish(plan, painted), {
+        "triangles": len(plan.mesh.faces),
+        "charts": len(plan.charts.photo),
+        "pages": [list(size) for size in plan.layout.sizes],
+        "texels": sum(width * height for width, height in plan.layout.sizes),
+        "scale": round(plan.layout.scale, 3),
+        "unseen_triangles": int(unseen.sum()),
+        "trimmed_triangles": trimmed,
+        "strange_views_of_triangles": plan.checked.outliers,
+        "gains": {
+            view.name: [round(float(gain), 3) for gain in gains]
+            for view, gains in zip(views, plan.checked.gains, strict=True)
+        },
+        "rejected": {view.name: one.reason for view, one in zip(views, rejected, strict=True) if one is not None},
+    }
 
 
 def _score_photo(name: str, view: PhotoView, mesh: Facets, store: Store, hidden: OcclusionTest) -> FaceView | Rejected:
@@ -76,39 +77,41 @@ def _score_photo(name: str, view: PhotoView, mesh: Facets, store: Store, hidden:
         photo, used = store.photo(view), store.usable_pixels(view)
     except OSError as err:
         return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
-    found = score_faces(view, photo, used, mesh, hidden)
-    sharp = np.array(found.sharpness)
-    store.keep(name, {"face": found.face, "worth": found.worth, "color": found.color, "sharpness": sharp})
-    return found
+    face_view = score_faces(view, photo, used, mesh, hidden)
+    parts = {"face": face_view.face, "worth": face_view.score, "color": face_view.color}
+    store.keep(name, parts | {"sharpness": np.array(face_view.sharpness)})
+    return face_view
 
 
-def _check_views(looks: Sequence[FaceView | Rejected], mesh: Facets) -> CheckedViews:
-    """Adjust the worths by sharpness, estimate gains, and mark outliers by negative worths."""
-    found = [None if isinstance(look, Rejected) else look for look in looks]
-    sharpness = np.array([0.0 if look is None else look.sharpness for look in found])
-    read = sharpness > 0
-    sharp = np.zeros(len(read))
-    sharp[read] = sharpness_factors(sharpness[read])
-    seen = list_sightings([look if use else None for look, use in zip(found, read, strict=True)], len(mesh.faces))
-    seen = seen.with_worth(seen.worth * sharp[seen.photo].astype(np.float32))
-    gains = photo_gains(seen)
-    strange = outlier_mask(seen, gains, mesh.neighbors)
-    return CheckedViews(seen.with_worth(np.where(strange, -seen.worth, seen.worth)), gains, int(strange.sum()))
+def _check_views(face_views: Sequence[FaceView | Rejected], mesh: Facets) -> CheckedViews:
+    """Adjust the scores by sharpness, estimate gains, and mark outliers by negative scores."""
+    sharpness = np.array([0.0 if isinstance(view, Rejected) else view.sharpness for view in face_views])
+    sharp = sharpness > 0
+    factor = np.zeros(len(sharp))
+    factor[sharp] = sharpness_factors(sharpness[sharp])
+    usable = [
+        None if isinstance(view, Rejected) or not use else view for view, use in zip(face_views, sharp, strict=True)
+    ]
+    sightings = list_sightings(usable, len(mesh.faces))
+    sightings = sightings.with_score(sightings.score * factor[sightings.photo].astype(np.float32))
+    gains = photo_gains(sightings)
+    outlier = outlier_mask(sightings, gains, mesh.neighbors)
+    score = np.where(outlier, -sightings.score, sightings.score)
+    return CheckedViews(sightings.with_score(score), gains, int(outlier.sum()))
 
 
-def _cut_faces(gone: NDArray[np.bool_], mesh: Facets, seen: CheckedViews) -> tuple[Facets, CheckedViews]:
-    """Return the surface and its views without some triangles (T,), if others are left."""
-    if gone.all() or not gone.any():
-        return mesh, seen
-    kept = facets(split_fans(select_faces(mesh.surface, ~gone)))
-    return kept, replace(seen, all=seen.all.select_triangles(~gone))
+def _cut_faces(cut: BoolArray, mesh: Facets, checked: CheckedViews) -> tuple[Facets, CheckedViews]:
+    """Cut triangles (T,) from the surface and its views, but not all."""
+    if cut.all() or not cut.any():
+        return mesh, checked
+    rest = facets(split_fans(select_faces(mesh.surface, ~cut)))
+    return rest, replace(checked, sightings=checked.sightings.select_triangles(~cut))
 
 
 def _plan(
-    mesh: Facets, seen: CheckedViews, chosen: IntArray, given: tuple[Sequence[PhotoView], TextureSettings],
+    mesh: Facets, checked: CheckedViews, chosen: IntArray, views: Sequence[PhotoView], options: TextureSettings,
     spread: ParallelMap,
 ) -> TexturePlan:  # fmt: skip
-    views, options = given
     block_of = block_of_faces(mesh)
 
     def place() -> tuple[Charts, tuple[Layout, IndexArray, IntArray]]:
@@ -116,7 +119,7 @@ def _plan(
         return charts, lay_out(charts, block_of, mesh, options)
 
     def mix() -> Blend:
-        return level_seams(blend_weights(chosen, seen.all, mesh), seen.all, seen.gains, mesh)
+        return level_seams(blend_weights(chosen, checked.sightings, mesh), checked.sightings, checked.gains, mesh)
 
     (charts, (layout, cells, block_of_page)), blend = spread(lambda job: job(), (place, mix), "planning the texture")
     corners, page = charts.corners * layout.scale, np.zeros(len(chosen), np.int32)
@@ -124,32 +127,32 @@ def _plan(
     corners[drawn] += layout.shift[charts.chart_of_face[drawn]][:, None, :]
     page[drawn] = layout.page[charts.chart_of_face[drawn]]
     page[~drawn] = cells[:, 0]
-    allowed = _allowed_weight(blend, seen.all, chosen, mesh)
-    return TexturePlan(mesh, seen, chosen, charts, layout, corners, page, block_of_page, cells, blend, allowed)
+    allowed = _allowed_weight(blend, checked.sightings, chosen, mesh)
+    return TexturePlan(mesh, checked, chosen, charts, layout, corners, page, block_of_page, cells, blend, allowed)
 
 
-def _allowed_weight(blend: Blend, seen: Sightings, chosen: IntArray, mesh: Facets) -> NDArray[np.float32]:
+def _allowed_weight(blend: Blend, sightings: Sightings, chosen: IntArray, mesh: Facets) -> NDArray[np.float32]:
     total = np.zeros(mesh.faces.shape, np.float32)
     weight = np.zeros(len(mesh.vertices), np.float32)
-    for photo in range(seen.photos):
+    for photo in range(sightings.photos):
         part = blend.photo_rows(photo)
         near = mesh.faces_at(blend.vertex[part])
-        near = near[seen.is_usable(photo, near) | (chosen[near] == photo)]
+        near = near[sightings.is_usable(photo, near) | (chosen[near] == photo)]
         weight[blend.vertex[part]] = blend.weight[part]
         total[near] += weight[mesh.faces[near]]
         weight[blend.vertex[part]] = 0.0
     return total
 
 
-def _finish(plan: TexturePlan, finished: Sequence[tuple[NDArray[np.uint8], NDArray[np.bool_]]]) -> Model:
-    """Round the pages, color triangles that no photo sees, and fill the space between charts."""
+def _finish(plan: TexturePlan, finished: Sequence[tuple[NDArray[np.uint8], BoolArray]]) -> Model:
+    """Color triangles without a photo, and fill the space between charts."""
     drawn = plan.chosen != NONE
     pages, painted = (list(part) for part in zip(*finished, strict=True))
     corner_colors = np.zeros((len(drawn), 3, 3))
     for number, page in enumerate(pages):
-        there = np.flatnonzero(drawn & (plan.page == number))
-        at = np.floor(plan.corners[there]).astype(np.int64)
-        corner_colors[there] = page[at[..., 1].clip(0, page.shape[0] - 1), at[..., 0].clip(0, page.shape[1] - 1)]
+        own = np.flatnonzero(drawn & (plan.page == number))
+        at = np.floor(plan.corners[own]).astype(np.int64)
+        corner_colors[own] = page[at[..., 1].clip(0, page.shape[0] - 1), at[..., 0].clip(0, page.shape[1] - 1)]
     colors = vertex_colors(plan.mesh, drawn, corner_colors[drawn])
     corners = plan.corners.copy()
     texels = square_texels(colors[plan.mesh.faces[~drawn]])
@@ -166,25 +169,3 @@ def _finish(plan: TexturePlan, finished: Sequence[tuple[NDArray[np.uint8], NDArr
     surface = Surface(plan.mesh.vertices, plan.mesh.faces, np.round(colors).astype(np.uint8))
     filled = tuple(fill_background(page, mask) for page, mask in zip(pages, painted, strict=True))
     return Model(surface, Texture(uv, plan.page, filled))
-
-
-def _figures(
-    plan: TexturePlan, views: Sequence[PhotoView], rejected: Sequence[Rejected | None], counts: tuple[int, int]
-) -> dict[str, Any]:
-    """Return the figures for the manifest; the counts are those of unseen triangles and of trimmed ones."""
-    covered = sum(width * height for width, height in plan.layout.sizes)
-    return {
-        "triangles": len(plan.mesh.faces),
-        "charts": len(plan.charts.photo),
-        "pages": [list(size) for size in plan.layout.sizes],
-        "texels": covered,
-        "scale": round(plan.layout.scale, 3),
-        "unseen_triangles": counts[0],
-        "trimmed_triangles": counts[1],
-        "strange_views_of_triangles": plan.seen.outliers,
-        "gains": {
-            view.name: [round(float(gain), 3) for gain in gains]
-            for view, gains in zip(views, plan.seen.gains, strict=True)
-        },
-        "rejected": {view.name: found.reason for view, found in zip(views, rejected, strict=True) if found is not None},
-    }

@@ -1,4 +1,4 @@
-"""Blocks of a large surface: each has its own pages, so that few pages are in memory while photos are painted."""
+"""Charts of a texture, and their layout on the pages of each block of the surface."""
 
 from dataclasses import dataclass, replace
 
@@ -12,25 +12,43 @@ from sfm_app.texture.facets import NONE, Facets, IntArray, components
 from sfm_app.texture.seams import block_sizes, squares
 from sfm_app.texture.sightings import Sightings
 from sfm_app.texture.views import project
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 # Charts: connected triangles of one photo, laid out by their projection in that photo.
 #
 # The photo is the parametrization: nothing is stretched, and a texel is a pixel. Triangles that a photo sees do not
 # overlap in it, except at the rims of occluders; overlapping triangles get charts of their own.
 
-Views = tuple[NDArray[np.int64], NDArray[np.int64], IntArray, NDArray[np.float32]]
-"""The views by triangle, for kernels: starts, rows, photo and worth of each row."""
+Views = tuple[IndexArray, IndexArray, IntArray, NDArray[np.float32]]
+"""The views by triangle, for kernels: starts, rows, photo and score of each row."""
 
-MOST_LAYERS = 4
-"""Layers of overlapping triangles that are separated; further ones share their pixels."""
 SMALL = 12
-"""Charts of fewer triangles take the photo of a neighboring chart, if it sees them."""
-ROUNDS = 3
-LAYER_BITS, BLOCK_BITS = 40, 44
-"""Bits of a group's number above which the layer and the block are counted. By definition."""
-EDGE = 1e-6
-"""Points with a smaller barycentric coordinate count as on the edge."""
+"""Charts of fewer triangles take the photo of a neighboring chart, if it shows them."""
+CELL = 4
+"""Side of a cell of the profiles, in texels."""
+MARGIN = 2
+"""Width of the margin of a chart, in texels."""
+
+
+@dataclass(frozen=True, slots=True)
+class LayoutOptions:
+    """Charts, their packing, and blocks."""
+
+    most_layers: int = 4
+    """Layers of overlapping triangles that are separated; further ones share their pixels."""
+    absorb_rounds: int = 3
+    """Most rounds of absorbing small charts."""
+    fill: float = 0.7
+    """Expected share of a page under charts."""
+    scale_step: float = 0.95
+    """Factor on the scale for the next attempt if the charts do not fit."""
+    least_scale: float = 0.05
+    """Below this scale the texture would be too coarse; pages are added instead."""
+    block_triangles: int = 400_000
+    """Most triangles of a block. Chosen by hand: twice the triangles of a mesh by default, so that those have one."""
+
+
+OPTIONS = LayoutOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,40 +64,29 @@ class Charts:
 
 
 def make_charts(chosen: IntArray, cameras: FloatArray, mesh: Facets, tile_px: float, block_of: IntArray) -> Charts:
-    """Build charts from one photo per triangle.
+    """Build charts from the photo of each triangle (T,), -1 for none, and the camera rows (P, 26).
 
-    Args:
-        chosen: (T,) photo of each triangle, -1 for none.
-        cameras: (P, 26) from `PhotoView.row`.
-        mesh: the surface.
-        tile_px: charts are cut at multiples of this in the photo, so that each fits on a page.
-        block_of: (T,) block of each triangle; no chart lies in two.
+    Charts are cut at multiples of `tile_px` in the photo, so that each fits on a page, and between blocks (T,).
     """
     corners = np.zeros((len(mesh.faces), 3, 2))
     _project_corners(chosen, cameras, mesh.vertices, mesh.faces, corners)
     tiles = np.floor(corners.mean(axis=1) / tile_px).astype(np.int64)
     group = np.where(chosen == NONE, NONE, (chosen * 4096 + tiles[:, 1]) * 4096 + tiles[:, 0])
-    group = np.where(chosen == NONE, NONE, group + (block_of.astype(np.int64) << BLOCK_BITS))
+    group = np.where(chosen == NONE, NONE, group + (block_of.astype(np.int64) << 44))  # layers have bits 40 to 43
     of, count = components(group, mesh.neighbors)
-    for layer in range(1, MOST_LAYERS):
+    for layer in range(1, OPTIONS.most_layers):
         folded = folds(of, count, corners)
         if not folded.any():
             break
-        group[folded] += layer << LAYER_BITS
+        group[folded] += layer << 40
         of, count = components(group, mesh.neighbors)
     photo = np.full(count, NONE, np.int32)
     photo[of[of != NONE]] = chosen[of != NONE]
     return Charts(of, photo, corners)
 
 
-def folds(of: IntArray, count: int, corners: FloatArray) -> NDArray[np.bool_]:
-    """Mark triangles that overlap others of the same chart, (T,).
-
-    Args:
-        of: (T,) chart of each triangle, -1 for none.
-        count: number of charts.
-        corners: (T, 3, 2) pixels.
-    """
+def folds(of: IntArray, count: int, corners: FloatArray) -> BoolArray:
+    """Mark triangles (T,) that overlap others of the same of `count` charts; `of` is the chart of each triangle."""
     order = np.argsort(of, kind="stable")[np.count_nonzero(of == NONE) :]
     starts = np.concatenate([[0], np.cumsum(np.bincount(of[order], minlength=count))])
     folded = np.zeros(len(of), np.bool_)
@@ -88,9 +95,7 @@ def folds(of: IntArray, count: int, corners: FloatArray) -> NDArray[np.bool_]:
 
 
 @kernel
-def _find_folds(
-    order: NDArray[np.int64], starts: NDArray[np.int64], corners: FloatArray, folded: NDArray[np.bool_]
-) -> None:
+def _find_folds(order: IndexArray, starts: IndexArray, corners: FloatArray, folded: BoolArray) -> None:
     """Draw each chart pixel by pixel; a triangle that reaches an occupied pixel is folded."""
     for c in range(len(starts) - 1):
         left = top = np.inf
@@ -113,22 +118,16 @@ def _find_folds(
                     # strictly inside: neighbors share the pixels on their common edge
                     u = ((x - ax) * (cy - ay) - (y - ay) * (cx - ax)) / turn
                     v = ((bx - ax) * (y - ay) - (by - ay) * (x - ax)) / turn
-                    if min(u, v, 1.0 - u - v) > EDGE:
+                    if min(u, v, 1.0 - u - v) > 1e-6:
                         folded[f] = folded[f] or taken[y, x]
                         taken[y, x] = True
 
 
-def absorb_small_charts(chosen: IntArray, seen: Sightings, neighbors: IntArray) -> IntArray:
-    """Give small charts the photo of a neighboring chart that may be used for all their triangles.
-
-    Args:
-        chosen: (T,) photo of each triangle, -1 for none.
-        seen: which photos see which triangles; not used where the worth is negative.
-        neighbors: (T, 3) triangle across each edge, -1 for none.
-    """
+def absorb_small_charts(chosen: IntArray, sightings: Sightings, neighbors: IntArray) -> IntArray:
+    """Give small charts the photo of a neighboring chart with usable views of all their triangles."""
     chosen = chosen.copy()
-    views = seen.face_starts, seen.face_rows, seen.photo, seen.worth
-    for _ in range(ROUNDS):
+    views = sightings.face_starts, sightings.face_rows, sightings.photo, sightings.score
+    for _ in range(OPTIONS.absorb_rounds):
         of, count = components(chosen.astype(np.int64), neighbors)
         sizes = np.bincount(of[of != NONE], minlength=count)
         order = np.argsort(of, kind="stable").astype(np.int32)
@@ -140,7 +139,7 @@ def absorb_small_charts(chosen: IntArray, seen: Sightings, neighbors: IntArray) 
 
 @kernel
 def _project_corners(
-    chosen: IntArray, cameras: FloatArray, vertices: FloatArray, faces: NDArray[np.int64], corners: FloatArray
+    chosen: IntArray, cameras: FloatArray, vertices: FloatArray, faces: IndexArray, corners: FloatArray
 ) -> None:
     for f in range(len(faces)):
         if chosen[f] == NONE:
@@ -153,8 +152,8 @@ def _project_corners(
 
 @kernel
 def _absorb(
-    sizes: NDArray[np.int64],
-    starts: NDArray[np.int64],
+    sizes: IndexArray,
+    starts: IndexArray,
     order: IntArray,
     views: Views,
     neighbors: IntArray,
@@ -162,62 +161,60 @@ def _absorb(
 ) -> int:
     """Give small components the neighboring photo with the longest common border; return how many changed."""
     absorbed = 0
-    around = np.empty(3 * SMALL, np.int64)
+    beside = np.empty(3 * SMALL, np.int64)
     for c in range(len(sizes)):
         if sizes[c] >= SMALL:
             continue
-        count = 0
-        own = chosen[order[starts[c]]]
-        for at in range(starts[c], starts[c + 1]):
-            for k in range(3):
-                g = neighbors[order[at], k]
-                if g != NONE and chosen[g] != NONE and chosen[g] != own:
-                    around[count] = chosen[g]
-                    count += 1
+        faces = order[starts[c] : starts[c + 1]]
+        count = _list_border_photos(faces, neighbors, chosen, beside)
         best, longest = NONE, 0
         for k in range(count):
-            p, border = around[k], 0
+            p, border = beside[k], 0
             for j in range(count):
-                border += around[j] == p
+                border += beside[j] == p
             if border < longest or (border == longest and p >= best):
                 continue
-            possible = True
-            for at in range(starts[c], starts[c + 1]):
-                possible = possible and _is_usable(views, p, order[at])
-            if possible:
+            if _is_usable(views, p, faces):
                 best, longest = p, border
         if best != NONE:
-            for at in range(starts[c], starts[c + 1]):
-                chosen[order[at]] = best
+            for f in faces:
+                chosen[f] = best
             absorbed += 1
     return absorbed
 
 
 @kernel
-def _is_usable(views: Views, photo: int, face: int) -> bool:
-    """Return whether a photo sees a triangle and shows the surface there."""
-    starts, rows, photos, worth = views
-    for row in rows[starts[face] : starts[face + 1]]:
-        if photos[row] == photo:
-            return bool(worth[row] > 0)
-    return False
+def _list_border_photos(faces: IntArray, neighbors: IntArray, chosen: IntArray, beside: IndexArray) -> int:
+    """Write the other photo across each border edge of triangles of one photo; return their number."""
+    count, own = 0, chosen[faces[0]]
+    for f in faces:
+        for k in range(3):
+            g = neighbors[f, k]
+            if g != NONE and chosen[g] != NONE and chosen[g] != own:
+                beside[count] = chosen[g]
+                count += 1
+    return count
+
+
+@kernel
+def _is_usable(views: Views, photo: int, faces: IntArray) -> bool:
+    """Return whether a photo shows the surface at all triangles."""
+    starts, rows, photos, score = views
+    for f in faces:
+        usable = False
+        for row in rows[starts[f] : starts[f + 1]]:
+            if photos[row] == photo:
+                usable = bool(score[row] > 0)
+                break
+        if not usable:
+            return False
+    return True
 
 
 # Packing of charts onto pages, as in Tetris (Levy et al., SIGGRAPH 2002, section 4).
 #
 # Each chart has a profile of its upper and lower side. It is placed on the horizon of the charts already on the
 # page, as close to the top as possible. Tall charts come first.
-
-CELL = 4
-"""Side of a cell of the profiles, in texels."""
-MARGIN = 2
-"""Width of the margin around a chart that belongs to it, in texels."""
-FILL = 0.7
-"""Expected share of a page that charts cover."""
-SCALE_STEP = 0.95
-"""Factor on the scale for the next attempt if the charts do not fit."""
-LEAST_SCALE = 0.05
-"""Below this scale the texture would be too coarse; pages are added instead."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,7 +224,7 @@ class Layout:
     page: IntArray
     """(C,) page of each chart."""
     shift: IntArray
-    """(C, 2) integer offset in texels from the photo's pixels (times `scale`) to the page."""
+    """(C, 2) offset in texels from the photo's pixels (times `scale`) to the page."""
     scale: float
     """Texels per pixel of the photos, <= 1."""
     sizes: tuple[tuple[int, int], ...]
@@ -237,25 +234,25 @@ class Layout:
 def pack(
     charts: Charts, blocks: IntArray, max_atlas_px: int, max_pages: int, largest_scale: float = 1.0
 ) -> tuple[Layout, IntArray]:
-    """Place charts and additional rectangles on few pages; reduce the scale of the charts if they do not fit.
+    """Place charts and rectangles on few pages; reduce the scale of the charts if they do not fit.
 
     Args:
         charts: their triangles in pixels of the photos.
         blocks: (B, 2) widths and heights of rectangles in texels, which are never scaled.
         max_atlas_px: longest side of a page.
-        max_pages: largest number of pages, exceeded only if the charts do not fit at `LEAST_SCALE`.
+        max_pages: most pages, exceeded only if the charts do not fit at the least scale.
         largest_scale: most texels per pixel of the photos.
 
     Returns:
         The layout of the charts, and (B, 3) page, x and y of the rectangles.
     """
-    scale = min(largest_scale, float(np.sqrt(FILL * max_pages * max_atlas_px**2 / max(_area(charts), 1.0))))
+    scale = min(largest_scale, float(np.sqrt(OPTIONS.fill * max_pages * max_atlas_px**2 / max(_area(charts), 1.0))))
     while True:
-        placed = _try_to_pack(charts, blocks, scale, max_atlas_px, max_pages)
-        if placed is not None:
-            return placed
-        if scale > LEAST_SCALE:
-            scale *= SCALE_STEP
+        packed = _try_to_pack(charts, blocks, scale, max_atlas_px, max_pages)
+        if packed is not None:
+            return packed
+        if scale > OPTIONS.least_scale:
+            scale *= OPTIONS.scale_step
         else:  # many small charts: their margins fill the pages
             max_pages += 1
 
@@ -276,7 +273,7 @@ def _try_to_pack(
     area = float(np.sum(high - low)) + float(np.sum(block_cells.astype(np.int64).prod(axis=1)))
     widest = max((int(c) for c in np.concatenate([cells[:, 0], block_cells[:, 0]])), default=1)
     page_cells = max_atlas_px // CELL
-    width = page_cells if scale < 1.0 else min(page_cells, max(widest, int(np.ceil(np.sqrt(area / FILL)))))
+    width = page_cells if scale < 1.0 else min(page_cells, max(widest, int(np.ceil(np.sqrt(area / OPTIONS.fill)))))
     if widest > page_cells or area > max_pages * page_cells * width:
         return None
     starts = np.concatenate([starts, starts[-1] + np.cumsum(block_cells[:, 0])])
@@ -294,9 +291,7 @@ def _try_to_pack(
     return Layout(place[:count, 0], shift.astype(np.int32), scale, sizes), place[count:] * np.array([1, CELL, CELL])
 
 
-def _profiles(
-    charts: Charts, scale: float
-) -> tuple[IntArray, IntArray, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+def _profiles(charts: Charts, scale: float) -> tuple[IntArray, IntArray, IndexArray, IndexArray, IndexArray]:
     """Return origins in texels (C, 2), sizes in cells (C, 2), starts of columns (C + 1,), lower and upper profiles."""
     count = len(charts.photo)
     drawn = np.flatnonzero(charts.chart_of_face != NONE)
@@ -315,9 +310,7 @@ def _profiles(
 
 
 @kernel
-def _outline(
-    of: IntArray, corners: FloatArray, starts: NDArray[np.int64], low: NDArray[np.int64], high: NDArray[np.int64]
-) -> None:
+def _outline(of: IntArray, corners: FloatArray, starts: IndexArray, low: IndexArray, high: IndexArray) -> None:
     """Widen the profiles of the charts to contain each triangle and its margin, column by column."""
     for f in range(len(of)):
         first, columns = starts[of[f]], starts[of[f] + 1] - starts[of[f]]
@@ -344,32 +337,23 @@ def _outline(
 
 @kernel
 def _set_down(
-    order: NDArray[np.int64],
-    starts: NDArray[np.int64],
-    low: NDArray[np.int64],
-    high: NDArray[np.int64],
+    order: IndexArray,
+    starts: IndexArray,
+    low: IndexArray,
+    high: IndexArray,
     page_height: int,
-    horizon: NDArray[np.int64],
+    horizon: IndexArray,
     place: IntArray,
 ) -> bool:
     """Place every chart; return False if one does not fit on any page."""
-    pages, width = horizon.shape
     for c in order:
         first, columns = starts[c], starts[c + 1] - starts[c]
         deepest = 0
         for j in range(columns):
             deepest = max(deepest, high[first + j])
-        for page in range(pages):
-            best_x, best_y = -1, page_height - deepest + 1
-            for x in range(width - columns + 1):
-                y = 0
-                for j in range(columns):
-                    if high[first + j] > low[first + j]:
-                        y = max(y, horizon[page, x + j] - low[first + j])
-                        if y >= best_y:
-                            break
-                if y < best_y:
-                    best_x, best_y = x, y
+        own_low, own_high = low[first : first + columns], high[first : first + columns]
+        for page in range(len(horizon)):
+            best_x, best_y = _find_place(own_low, own_high, horizon[page], page_height - deepest + 1)
             if best_x < 0:
                 continue
             place[c, 0], place[c, 1], place[c, 2] = page, best_x, best_y
@@ -382,36 +366,41 @@ def _set_down(
     return True
 
 
-TRIANGLES = 400_000
-"""Triangles of a block. Chosen by hand: twice what a mesh has by default, so that those have one."""
+@kernel
+def _find_place(low: IndexArray, high: IndexArray, horizon: IndexArray, limit: int) -> tuple[int, int]:
+    """Return the leftmost of the highest places above `limit` for a profile on a page; x is -1 if none exists."""
+    best_x, best_y = -1, limit
+    for x in range(len(horizon) - len(low) + 1):
+        y = 0
+        for j in range(len(low)):
+            if high[j] > low[j]:
+                y = max(y, horizon[x + j] - low[j])
+                if y >= best_y:
+                    break
+        if y < best_y:
+            best_x, best_y = x, y
+    return best_x, best_y
+
+
+# Blocks of a large surface have their own pages, so that few pages are in memory while photos are painted.
 
 
 def block_of_faces(mesh: Facets) -> IntArray:
-    """Return the block of each triangle, (T,): equal parts of neighbors along the Morton curve.
-
-    Args:
-        mesh: the surface.
-    """
+    """Return the block of each triangle, (T,): equal parts of neighbors along the Morton curve."""
     count = len(mesh.faces)
-    blocks = max(1, -(-count // TRIANGLES))
-    found = np.empty(count, np.int32)
-    found[mesh.clusters.order] = np.arange(count) * blocks // max(count, 1)
-    return found
+    blocks = max(1, -(-count // OPTIONS.block_triangles))
+    block_of = np.empty(count, np.int32)
+    block_of[mesh.clusters.order] = np.arange(count) * blocks // max(count, 1)
+    return block_of
 
 
 def lay_out(
     charts: Charts, block_of: IntArray, mesh: Facets, options: TextureSettings
 ) -> tuple[Layout, IndexArray, IntArray]:
-    """Give every block its own pages: place its charts and the squares of the triangles that no photo sees.
-
-    Args:
-        charts: none of them in two blocks.
-        block_of: (T,) block of each triangle.
-        mesh: the surface.
-        options: size of pages, and their number for each block.
+    """Give every block (T,) its own pages: place its charts and the squares of triangles without a chart.
 
     Returns:
-        The layout; (U, 3) page, x and y of the squares of the triangles without a chart; and (P,) block of each page.
+        The layout; (U, 3) page, x and y of the squares; and (P,) block of each page.
     """
     unseen = np.flatnonzero(charts.chart_of_face == NONE)
     faces = [np.flatnonzero(block_of == block) for block in range(int(block_of.max(initial=0)) + 1)]
@@ -423,10 +412,10 @@ def lay_out(
     scale = min(layout.scale for layout, _ in packed)
     page, shift = np.full(len(charts.photo), NONE, np.int32), np.zeros((len(charts.photo), 2), np.int32)
     cells, sizes, owners = np.empty((len(unseen), 3), np.int64), list[tuple[int, int]](), list[int]()
-    for block, ((which, part), rest, found) in enumerate(zip(parts, rests, packed, strict=True)):
-        fits = found[0].scale == scale
-        layout, places = found if fits else pack(part, rest, options.max_atlas_px, options.max_pages, scale)
-        page[which], shift[which] = layout.page + len(sizes), layout.shift
+    for block, ((numbers, part), rest, own_packing) in enumerate(zip(parts, rests, packed, strict=True)):
+        is_common = own_packing[0].scale == scale
+        layout, places = own_packing if is_common else pack(part, rest, options.max_atlas_px, options.max_pages, scale)
+        page[numbers], shift[numbers] = layout.page + len(sizes), layout.shift
         own = np.flatnonzero(block_of[unseen] == block)
         order = morton_order(mesh.vertices[mesh.faces[unseen[own]]].mean(axis=1))
         cells[own[order]] = squares(places + np.array([len(sizes), 0, 0]), rest, len(own))
@@ -438,6 +427,6 @@ def lay_out(
 def _part(charts: Charts, faces: IndexArray) -> tuple[IndexArray, Charts]:
     """Return the numbers of the charts of a block, and these charts with the triangles of the block."""
     of = charts.chart_of_face[faces]
-    which = np.unique(of[of != NONE])
-    own = np.where(of == NONE, NONE, np.searchsorted(which, of)).astype(np.int32)
-    return which, replace(charts, chart_of_face=own, photo=charts.photo[which], corners=charts.corners[faces])
+    numbers = np.unique(of[of != NONE])
+    own = np.where(of == NONE, NONE, np.searchsorted(numbers, of)).astype(np.int32)
+    return numbers, replace(charts, chart_of_face=own, photo=charts.photo[numbers], corners=charts.corners[faces])

@@ -8,31 +8,29 @@ from numpy.typing import NDArray
 from sfm_app.geometry.triangles import Clusters, bucket_order, cluster, unique_edges
 from sfm_app.jit import kernel
 from sfm_app.types import Surface
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import FloatArray, IndexArray
 
 IntArray = NDArray[np.int32]
 
 NONE = -1
-SPARSE = 64
-"""One of so many or fewer: sorting them is faster than marking them among all. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Facets:
-    """A surface with tables that several steps of texturing use."""
+    """A surface with the tables of texturing."""
 
     surface: Surface
     neighbors: IntArray
     """(T, 3) triangle across edge k, from corner k to corner k + 1; -1 at borders and where more than two meet."""
-    edges: NDArray[np.int64]
+    edges: IndexArray
     """(E, 2) vertices of every edge, each once, smaller first."""
     spacing: float
     """Median length of an edge."""
     clusters: Clusters
     """The triangles in clusters of neighbors."""
-    fan_starts: NDArray[np.int64]
-    """(V + 1,) the triangles at vertex v are fans[fan_starts[v]] to fans[fan_starts[v + 1] - 1]."""
-    fans: NDArray[np.int64]
+    fan_starts: IndexArray
+    """(V + 1,) The triangles at vertex v are fans[fan_starts[v]] to fans[fan_starts[v + 1] - 1]."""
+    fans: IndexArray
     """(3 T,)"""
 
     @property
@@ -41,27 +39,27 @@ class Facets:
         return self.surface.vertices
 
     @property
-    def faces(self) -> NDArray[np.int64]:
+    def faces(self) -> IndexArray:
         """(T, 3) vertex indices."""
         return self.surface.faces
 
     @property
-    def valence(self) -> NDArray[np.int64]:
+    def valence(self) -> IndexArray:
         """(V,) number of triangles at each vertex."""
         return np.asarray(np.diff(self.fan_starts))
 
-    def faces_at(self, vertices: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return (M,) the triangles at some vertices (N,), each once, ascending."""
-        found = self.fans[ranges(self.fan_starts[vertices], self.fan_starts[vertices + 1])]
-        return distinct(found, len(self.faces))
+    def faces_at(self, vertices: IndexArray) -> IndexArray:
+        """Return (M,) the triangles at vertices (N,), each once, ascending."""
+        triangles = self.fans[ranges(self.fan_starts[vertices], self.fan_starts[vertices + 1])]
+        return distinct(triangles, len(self.faces))
 
-    def edges_among(self, vertices: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return (M,) the edges between vertices (N,) of a set, ascending; the vertices ascend."""
+    def edges_among(self, vertices: IndexArray) -> IndexArray:
+        """Return (M,) the edges between ascending vertices (N,), ascending."""
         first, end = (np.searchsorted(self.edges[:, 0], vertices, side) for side in ("left", "right"))
-        found = ranges(first, end)
-        other = self.edges[found, 1]
+        edges = ranges(first, end)
+        other = self.edges[edges, 1]
         at = np.minimum(np.searchsorted(vertices, other), max(len(vertices) - 1, 0))
-        return np.asarray(found[vertices[at] == other]) if len(found) else found
+        return np.asarray(edges[vertices[at] == other]) if len(edges) else edges
 
 
 def facets(surface: Surface) -> Facets:
@@ -81,57 +79,30 @@ def facets(surface: Surface) -> Facets:
     return Facets(surface, neighbors.reshape(-1, 3), edges, spacing, near, fan_starts.astype(np.int64), fans)
 
 
-def distinct(numbers: NDArray[np.int64], size: int) -> NDArray[np.int64]:
-    """Return (M,) the different ones of some numbers, ascending.
-
-    Args:
-        numbers: (N,) in [0, size).
-        size: number of those that may be there.
-    """
-    if SPARSE * len(numbers) < size:
+def distinct(numbers: IndexArray, size: int) -> IndexArray:
+    """Return (M,) distinct values of numbers (N,) in [0, size), ascending."""
+    if 64 * len(numbers) < size:  # sorting few numbers is faster than marking them
         return np.unique(numbers)
-    is_there = np.zeros(size, np.bool_)
-    is_there[numbers] = True
-    return np.flatnonzero(is_there)
+    is_present = np.zeros(size, np.bool_)
+    is_present[numbers] = True
+    return np.flatnonzero(is_present)
 
 
-def ranges(starts: NDArray[np.int64], ends: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return (M,) the numbers from each start (N,) up to, but without, its end (N,), one after the other.
-
-    Args:
-        starts: (N,) first number of each range.
-        ends: (N,) number after the last of each range.
-    """
+def ranges(starts: IndexArray, ends: IndexArray) -> IndexArray:
+    """Return (M,) the concatenated ranges from each start (N,) to its end (N,), exclusive."""
     counts = ends - starts
     total = np.cumsum(counts)
     return np.asarray(np.arange(total[-1] if len(total) else 0) + np.repeat(starts - total + counts, counts))
 
 
-def sum_at_vertices(values: FloatArray, faces: NDArray[np.int64], size: int) -> FloatArray:
-    """Sum values of triangle corners at each vertex, (V,).
-
-    Args:
-        values: (T,) one per triangle, or (T, 3) one per corner.
-        faces: (T, 3) vertex indices.
-        size: number of vertices V.
-    """
-    per_corner = np.broadcast_to(values[:, None] if values.ndim == 1 else values, faces.shape)
-    return np.asarray(np.bincount(faces.ravel(), per_corner.ravel(), size), np.float64)
-
-
-def components(group: NDArray[np.int64], neighbors: IntArray) -> tuple[IntArray, int]:
-    """Find connected triangles of equal group: (T,) component, -1 where the group is -1, and number of components.
-
-    Args:
-        group: (T,) only triangles of equal numbers are connected; -1 for none.
-        neighbors: (T, 3) triangle across each edge, -1 for none.
-    """
+def components(group: IndexArray, neighbors: IntArray) -> tuple[IntArray, int]:
+    """Find connected triangles of equal group (T,): component (T,), -1 where the group is -1, and their number."""
     of = np.full(len(group), NONE, np.int32)
     return of, _flood(group, neighbors, of)
 
 
 @kernel
-def _flood(group: NDArray[np.int64], neighbors: IntArray, of: IntArray) -> int:
+def _flood(group: IndexArray, neighbors: IntArray, of: IntArray) -> int:
     stack = np.empty(len(group), np.int64)
     count = 0
     for seed in range(len(group)):

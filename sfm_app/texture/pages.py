@@ -1,4 +1,4 @@
-"""Paint the pages of a texture."""
+"""Pages of a texture: their texels get owners, photos are painted on them, and gaps are filled."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -17,99 +17,86 @@ from sfm_app.texture.facets import NONE, Facets, IntArray
 from sfm_app.texture.seams import Blend
 from sfm_app.texture.sightings import Sightings
 from sfm_app.texture.views import PhotoView, project, sample
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
-# The interface for reading photos and for keeping intermediate results of a run.
+BAND = 512
+"""Rows of a page whose texels get owners at once. Chosen by hand: a few for each of two workers."""
+LEVELS_PER_GRAY = 256
+"""Levels of the integer sums per gray level."""
+GROUP_NAME = "pages"
+"""Name of the checkpoint in the store."""
+
+Spread = Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]]
+"""Calls a function for every number, possibly in parallel, and returns the results in order."""
+Page = tuple[NDArray[np.uint8], BoolArray]
+"""Colors (H, W, 3), and (H, W) whether a texel has one."""
+ParallelMap = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
+"""Applies a function to all items, possibly in parallel, and returns results in order; the label names the progress."""
 
 
 class Store(Protocol):
     """Reads photos, and keeps arrays by name; kept arrays come from the same inputs and settings and can be reused."""
 
     def photo(self, view: PhotoView, /) -> NDArray[np.uint8]:
-        """Return (height, width, 3) RGB of a view at the view's size; OSError where it cannot be read."""
+        """Return (height, width, 3) RGB of a view at the view's size; OSError if it cannot be read."""
 
-    def usable_pixels(self, view: PhotoView, /) -> NDArray[np.bool_] | None:
+    def usable_pixels(self, view: PhotoView, /) -> BoolArray | None:
         """Return (height, width) which pixels of a photo at full size may be used; None if all may.
 
-        The other pixels have the color of a usable pixel in `photo`. OSError where the mask cannot be read.
+        The other pixels have the color of a usable pixel in `photo`. OSError if the mask cannot be read.
         """
 
     def recall(self, name: str, /) -> Mapping[str, NDArray[Any]] | None:
-        """Return the arrays kept under a name; None if there are none."""
+        """Return the arrays kept under a name, or None."""
 
     def keep(self, name: str, /, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Keep arrays under a name, replacing previous ones, complete or not at all.
-
-        Args:
-            name: of the group of arrays.
-            arrays: by name.
-        """
+        """Keep arrays, by their names, under the name of a group, replacing it, complete or not at all."""
 
 
 # Painting of photos onto the texels of the pages.
 #
-# First every texel gets an owner: the triangle that contains it or, in the margin of a chart, the nearest one. Then
-# each photo adds its share to the texels of the triangles that it contributes to. The texel's point on the surface
-# is projected through pose and lens, and the photo is sampled there, so photos are resampled only once.
-
-Spread = Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]]
-"""Calls a function for every number, possibly in parallel, and returns the results in order."""
-
-BAND = 512
-"""Rows of a page whose texels get owners at once. Chosen by hand: a few for each of two workers."""
-LEVELS_PER_GRAY = 256
-INSET_PX, MOST_INSET = 1.5, 0.3
-"""At an edge where the visible surface ends, pixels mix with the background. Texels closer to it than this distance in
-texels, or this share of the triangle's height, repeat the color at that distance."""
-NO_LIMIT = -9.0
+# First every texel gets an owner: the triangle around it or, in the margin of a chart, the nearest one. Then each
+# photo adds its share to the texels of its triangles. The texel's point on the surface is projected through pose and
+# lens, and the photo is sampled there, so photos are resampled only once.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Canvas:
-    """A page that is being painted."""
+    """An unfinished page."""
 
     owner: IntArray
-    """(H, W) triangle that a texel belongs to, -1 for none."""
+    """(H, W) triangle of each texel, -1 for none."""
     total: IntArray
-    """(H, W, 3) weighted sum over photos, in 1 / FINE gray levels; sums of integers do not depend on the order."""
+    """(H, W, 3) weighted sum over photos, in levels; sums of integers do not depend on the order."""
 
 
-def canvas(size: tuple[int, int], triangles: NDArray[np.int64], corners: FloatArray, spread: Spread = map) -> Canvas:
-    """Make an empty page whose texels have owners.
-
-    Args:
-        size: (width, height) of the page.
-        triangles: (N,) indices of the page's triangles.
-        corners: (T, 3, 2) texels.
-        spread: applies a function to parts of the page, possibly in parallel.
-    """
-    return Canvas(owners(size, triangles, corners, spread), np.zeros((size[1], size[0], 3), np.int32))
-
-
-def owners(size: tuple[int, int], triangles: NDArray[np.int64], corners: FloatArray, spread: Spread = map) -> IntArray:
-    """Return (H, W) the triangle that each texel belongs to, -1 for none.
+def owners(
+    size: tuple[int, int], triangles: IndexArray, corners: FloatArray, spread: Spread = map, band: int = BAND
+) -> IntArray:
+    """Return (H, W) the triangle of each texel of a page, -1 for none.
 
     Args:
         size: (width, height) of the page.
         triangles: (N,) indices of the page's triangles.
         corners: (T, 3, 2) texels.
         spread: applies a function to parts of the page, possibly in parallel.
+        band: rows of a part.
     """
     owner = np.full((size[1], size[0]), NONE, np.int32)
 
     def claim(top: int) -> None:
-        band = owner[top : top + BAND]  # who owns a texel does not depend on the others
-        _claim_texels(triangles, corners, top, 0.0, band)
+        rows = owner[top : top + band]  # owners of texels are independent
+        _claim_texels(triangles, corners, top, 0.0, rows)
         for margin in range(1, MARGIN + 1):
-            _claim_texels(triangles, corners, top, margin - 0.5, band)
+            _claim_texels(triangles, corners, top, margin - 0.5, rows)
 
-    for _ in spread(claim, range(0, size[1], BAND)):
+    for _ in spread(claim, range(0, size[1], band)):
         pass
     return owner
 
 
 @kernel
-def _claim_texels(triangles: NDArray[np.int64], corners: FloatArray, top: int, reach: float, owner: IntArray) -> None:
+def _claim_texels(triangles: IndexArray, corners: FloatArray, top: int, reach: float, owner: IntArray) -> None:
     """Claim free texels within `reach` of each triangle, in a band of a page; `top` is its first row."""
     height, width = owner.shape
     for f in triangles:
@@ -143,15 +130,15 @@ def _distance(corner: FloatArray, x: float, y: float) -> float:
 
 
 @kernel
-def paint(
+def paint(  # noqa: PLR0913
     photo: NDArray[np.uint8],
     camera: FloatArray,
     brightness: FloatArray,
-    triangles: NDArray[np.int64],
+    triangles: IndexArray,
     corners: FloatArray,
     points: FloatArray,
     shares: NDArray[np.float32],
-    rims: NDArray[np.bool_],
+    rims: BoolArray,
     owner: IntArray,
     total: IntArray,
 ) -> None:
@@ -161,11 +148,11 @@ def paint(
         photo: (height, width, 3) RGB.
         camera: (26,) lens and pose of the photo at this size.
         brightness: (3,) factors, the inverse of the photo's gains.
-        triangles: (N,) indices of the page's triangles that the photo contributes to.
+        triangles: (N,) indices of the page's triangles with a share of the photo.
         corners: (T, 3, 2) texels.
         points: (N, 3, 3) corners in the scene.
         shares: (N, 3, 4) weight of the photo at each corner, and offsets of its channels in gray levels.
-        rims: (N, 3) whether the photo sees no triangle across the edge from corner k to k + 1.
+        rims: (N, 3) whether no triangle is visible across the edge from corner k to k + 1.
         owner: (H, W) of the page.
         total: (H, W, 3) of the page.
     """
@@ -194,13 +181,7 @@ def paint(
 
 @kernel
 def set_shares(corner: FloatArray, x: float, y: float, part: FloatArray) -> None:
-    """Set the barycentric coordinates of a texel, which may lie in the margin of its triangle.
-
-    Args:
-        corner: (3, 2) corners of the triangle in texels.
-        x, y: center of the texel.
-        part: (3,) is set.
-    """
+    """Set the barycentric coordinates (3,) of a texel in or near a triangle (3, 2)."""
     ax, ay = corner[0, 0], corner[0, 1]
     bx, by, cx, cy = corner[1, 0] - ax, corner[1, 1] - ay, corner[2, 0] - ax, corner[2, 1] - ay
     turn, dx, dy = bx * cy - by * cx, x - ax, y - ay
@@ -236,13 +217,17 @@ def _add(
 
 
 @kernel
-def _set_insets(corner: FloatArray, rim: NDArray[np.bool_], double_area: float, least: FloatArray) -> None:
-    """Set lower bounds of barycentric coordinates that keep texels away from rims; other edges have none."""
+def _set_insets(corner: FloatArray, rim: BoolArray, double_area: float, least: FloatArray) -> None:
+    """Set lower bounds of barycentric coordinates that keep texels away from rims; other edges have none.
+
+    At a rim, pixels mix with the background. Texels closer to it than 1.5 texels, or 0.3 of the triangle's height,
+    repeat the color at that distance.
+    """
     for k in range(3):
         a, b = (k + 1) % 3, (k + 2) % 3
         length = np.hypot(corner[b, 0] - corner[a, 0], corner[b, 1] - corner[a, 1])
         height_px = max(double_area / max(length, 1e-9), 1e-9)
-        least[k] = min(INSET_PX / height_px, MOST_INSET) if rim[a] else NO_LIMIT
+        least[k] = min(1.5 / height_px, 0.3) if rim[a] else -9.0
 
 
 @kernel
@@ -257,8 +242,8 @@ def _clamp_coordinates(part: FloatArray, least: FloatArray) -> None:
             part[k] = least[k]
 
 
-def finish_page(page: Canvas) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Return the page as 8-bit RGB, black at texels without an owner, and (H, W) whether a texel has one."""
+def _finish_page(page: Canvas) -> Page:
+    """Return the page in 8-bit RGB, black at texels without an owner, and (H, W) whether a texel has an owner."""
     rounded = np.empty(page.total.shape, np.uint8)
     _round_levels(page.total, rounded)
     return rounded, page.owner != NONE
@@ -274,14 +259,10 @@ def _round_levels(total: IntArray, rounded: NDArray[np.uint8]) -> None:
                 rounded[y, x, channel] = min(max(level, 0), 255)
 
 
-def fill_background(page: NDArray[np.uint8], painted: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Fill texels without an owner with the mean painted color of the smallest block around them that has one.
+def fill_background(page: NDArray[np.uint8], painted: BoolArray) -> NDArray[np.uint8]:
+    """Fill unpainted texels of a page (H, W, 3) with the mean painted color of the smallest block around them.
 
     The blocks are those of mipmaps, so a page downsampled by a viewer keeps its colors up to the rims of the charts.
-
-    Args:
-        page: (H, W, 3) RGB.
-        painted: (H, W) whether a texel has an owner.
     """
     if painted.all() or min(page.shape[:2]) < 2:
         return page
@@ -294,10 +275,8 @@ def fill_background(page: NDArray[np.uint8], painted: NDArray[np.bool_]) -> NDAr
 
 
 @kernel
-def _average_blocks(
-    page: NDArray[np.uint8], painted: NDArray[np.bool_], means: NDArray[np.uint8], known: NDArray[np.bool_]
-) -> None:
-    """Fill in the mean painted color of each block of 2 x 2 texels, and whether it has one."""
+def _average_blocks(page: NDArray[np.uint8], painted: BoolArray, means: NDArray[np.uint8], known: BoolArray) -> None:
+    """Write the mean painted color of each block of 2 x 2 texels, and whether it has one."""
     for y in range(known.shape[0]):
         for x in range(known.shape[1]):
             count = 0
@@ -313,7 +292,7 @@ def _average_blocks(
 
 
 @kernel
-def _fill_gaps(coarse: NDArray[np.uint8], painted: NDArray[np.bool_], page: NDArray[np.uint8]) -> None:
+def _fill_gaps(coarse: NDArray[np.uint8], painted: BoolArray, page: NDArray[np.uint8]) -> None:
     """Give texels without an owner the color of their block."""
     for y in range(page.shape[0]):
         for x in range(page.shape[1]):
@@ -324,20 +303,27 @@ def _fill_gaps(coarse: NDArray[np.uint8], painted: NDArray[np.bool_], page: NDAr
                     ]
 
 
-# The pages of a texture while photos are painted on them, with periodic checkpoints.
+# Checkpoints of the pages of a block.
 
-GROUP_NAME = "pages"
-EVERY_S = 10.0
-"""Shortest time between checkpoints, in seconds; a killed run loses the photos since the last one."""
-MOST_OF_THE_TIME = 0.05
-"""Largest share of the time spent on checkpoints; large pages are saved less often."""
+
+@dataclass(frozen=True, slots=True)
+class CheckpointOptions:
+    """How often unfinished pages are saved."""
+
+    every_s: float = 10.0
+    """Shortest time between checkpoints, in seconds; a killed run loses the photos since the last one."""
+    most_time: float = 0.05
+    """Largest share of the time spent on checkpoints; large pages are saved less often."""
+
+
+CHECKPOINTS = CheckpointOptions()
 
 
 class Pages:
-    """Canvases with sums over photos; sums of integers do not depend on the order of the photos."""
+    """The canvases of a block, with checkpoints."""
 
     def __init__(self, canvases: Sequence[Canvas], photos: int, store: Store, block: int = 0) -> None:
-        """Fill empty canvases from the checkpoint of a killed run, if it was at this block."""
+        """Fill empty canvases from the checkpoint of a killed run at the same block."""
         self.canvases, self.has = canvases, np.zeros(photos, np.bool_)
         self._store, self._lock, self._block = store, Lock(), block
         kept = store.recall(GROUP_NAME)
@@ -345,11 +331,11 @@ class Pages:
             self.has[:] = kept["has"]
             for number, page in enumerate(canvases):
                 page.total[:] = kept[f"page{number}"]
-        self._due_s = time.monotonic() + EVERY_S
+        self._due_s = time.monotonic() + CHECKPOINTS.every_s
 
     @contextmanager
     def lock_canvases(self, photo: int) -> Iterator[Sequence[Canvas]]:
-        """Provide the canvases to one photo at a time, and mark it as painted afterwards."""
+        """Provide the canvases to one photo at a time, then mark it as painted."""
         with self._lock:
             yield self.canvases
             self.has[photo] = True
@@ -361,106 +347,96 @@ class Pages:
         totals = {f"page{number}": page.total for number, page in enumerate(self.canvases)}
         self._store.keep(GROUP_NAME, {"block": np.array(self._block), "has": self.has, **totals})
         end = time.monotonic()
-        self._due_s = end + max(EVERY_S, (end - start) / MOST_OF_THE_TIME)
+        self._due_s = end + max(CHECKPOINTS.every_s, (end - start) / CHECKPOINTS.most_time)
 
 
 # The plan of a texture, and its pages painted block by block.
-
-Page = tuple[NDArray[np.uint8], NDArray[np.bool_]]
-"""Colors (H, W, 3), and (H, W) whether a texel has one."""
-ParallelMap = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
-"""Applies a function to all items, possibly in parallel, and returns results in order; the label names the progress."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedViews:
     """The views of triangles, weighted by sharpness, with gains and outliers."""
 
-    all: Sightings
-    """Negative worth for outliers, which show something other than the surface."""
+    sightings: Sightings
+    """With negative scores of outliers."""
     gains: FloatArray
     """(P, 3)"""
     outliers: int
-    """Number of outliers: views of triangles that show something other than the surface."""
+    """Number of views that do not show the surface."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TexturePlan:
-    """Everything that is computed before photos are painted."""
+    """Charts, pages and weights of the photos."""
 
     mesh: Facets
-    seen: CheckedViews
+    checked: CheckedViews
     chosen: IntArray
     """(T,) photo of each triangle, -1 for none."""
     charts: Charts
     layout: Layout
     corners: FloatArray
-    """(T, 3, 2) corners in texels, of the triangles that photos see."""
+    """(T, 3, 2) corners in texels of triangles with a photo."""
     page: IntArray
     """(T,) page of each triangle."""
     block_of_page: IntArray
     """(G,) block of each page."""
-    squares: NDArray[np.int64]
-    """(U, 3) page, x, y of the squares of the triangles that no photo sees."""
+    squares: IndexArray
+    """(U, 3) page, x, y of the squares of triangles without a photo."""
     blend: Blend
     allowed_weight: NDArray[np.float32]
-    """(T, 3) sum of weights at each corner over the photos that may be used for the triangle."""
+    """(T, 3) sum of weights at each corner over the usable photos of the triangle."""
 
 
 def paint_blocks(
     plan: TexturePlan, views: Sequence[PhotoView], store: Store, spread: ParallelMap, readable: Sequence[bool]
 ) -> list[Page]:
-    """Paint all pages; only those of one block are in memory with their sums.
-
-    Args:
-        plan: where every triangle lies, and what each photo contributes.
-        views: the photos.
-        store: reads photos, and keeps finished blocks.
-        spread: applies a function to all photos.
-        readable: (P,) whether a photo can be read.
-    """
-    found = list[Page]()
+    """Paint all pages with the readable photos; only the sums of one block are in memory."""
+    finished = list[Page]()
     blocks = int(plan.block_of_page.max(initial=0)) + 1
-    touched = _blocks_of_photos(plan) if blocks > 1 else None
+    block_sets = _blocks_of_photos(plan) if blocks > 1 else None
     for block in range(blocks):
         numbers = np.flatnonzero(plan.block_of_page == block).tolist()
-        photos = [p for p, can in enumerate(readable) if can and (touched is None or block in touched[p])]
+        photos = [p for p, can in enumerate(readable) if can and (block_sets is None or block in block_sets[p])]
         kept = store.recall(f"block{block}") if blocks > 1 else None
         if kept is not None:
-            found += [(kept[f"page{number}"], kept[f"mask{number}"]) for number in numbers]
+            finished += [(kept[f"page{number}"], kept[f"mask{number}"]) for number in numbers]
             continue
         pages = Pages([_new_canvas(number, plan, spread) for number in numbers], len(views), store, block)
         work = partial(_paint_photo, plan=plan, numbers=numbers, views=views, store=store, pages=pages)
         spread(work, photos, "painting" if blocks == 1 else f"painting block {block + 1} of {blocks}")
-        done = [finish_page(page) for page in pages.canvases]
+        rounded = [_finish_page(page) for page in pages.canvases]
         if blocks > 1:
-            colors = {f"page{number}": page for number, (page, _) in zip(numbers, done, strict=True)}
-            masks = {f"mask{number}": mask for number, (_, mask) in zip(numbers, done, strict=True)}
+            colors = {f"page{number}": page for number, (page, _) in zip(numbers, rounded, strict=True)}
+            masks = {f"mask{number}": mask for number, (_, mask) in zip(numbers, rounded, strict=True)}
             store.keep(f"block{block}", colors | masks)
-        found += done
-    return found
+        finished += rounded
+    return finished
 
 
-def _new_canvas(number: int, plan: TexturePlan, spread: ParallelMap) -> Any:
+def _new_canvas(number: int, plan: TexturePlan, spread: ParallelMap) -> Canvas:
     own = np.flatnonzero((plan.page == number) & (plan.chosen != NONE))
-    size = plan.layout.sizes[number]
-    return canvas(size, own, plan.corners, lambda claim, bands: spread(claim, bands, "dividing a page"))
+    width, height = plan.layout.sizes[number]
+    owner = owners(
+        (width, height), own, plan.corners, lambda claim, bands: spread(claim, bands, "assigning texels to triangles")
+    )
+    return Canvas(owner, np.zeros((height, width, 3), np.int32))
 
 
 def _blocks_of_photos(plan: TexturePlan) -> list[set[int]]:
-    """Return for each photo the blocks on whose pages it may appear."""
-    found = []
-    for photo in range(plan.seen.all.photos):
+    """Return, for each photo, the blocks with its triangles."""
+    block_sets = []
+    for photo in range(plan.checked.sightings.photos):
         near = plan.mesh.faces_at(plan.blend.vertex[plan.blend.photo_rows(photo)])
         pages = np.union1d(plan.page[near], plan.page[plan.chosen == photo])
-        found.append(set(plan.block_of_page[pages].tolist()))
-    return found
+        block_sets.append(set(plan.block_of_page[pages].tolist()))
+    return block_sets
 
 
 def _paint_photo(
     photo: int, plan: TexturePlan, numbers: Sequence[int], views: Sequence[PhotoView], store: Store, pages: Pages
 ) -> None:
-    """Add one photo to the pages of a block, unless they contain it; photos are read in parallel, painted in turn."""
+    """Add one photo to the pages of a block, unless they contain it; only reading is parallel."""
     if pages.has[photo]:
         return
     triangles, shares = _shares(photo, plan)
@@ -469,30 +445,30 @@ def _paint_photo(
     if not len(triangles):
         return
     beside = plan.mesh.neighbors[triangles]
-    rims = (beside == NONE) | (plan.seen.all.find(photo, beside) == NONE)
+    rims = (beside == NONE) | (plan.checked.sightings.find(photo, beside) == NONE)
     view, scale = views[photo], plan.layout.scale
     if scale < 1.0:
         view = view.with_size(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
     pixels, points = store.photo(view), plan.mesh.vertices[plan.mesh.faces[triangles]]
     with pages.lock_canvases(photo) as canvases:
         for number, page in zip(numbers, canvases, strict=True):
-            there = plan.page[triangles] == number
-            what = triangles[there], plan.corners, points[there], shares[there], rims[there]
-            paint(pixels, view.row, 1.0 / plan.seen.gains[photo], *what, page.owner, page.total)
+            own = plan.page[triangles] == number
+            content = triangles[own], plan.corners, points[own], shares[own], rims[own]
+            paint(pixels, view.row, 1.0 / plan.checked.gains[photo], *content, page.owner, page.total)
 
 
-def _shares(photo: int, plan: TexturePlan) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the triangles that a photo contributes to, and its weight and offsets (N, 3, 4) at their corners."""
+def _shares(photo: int, plan: TexturePlan) -> tuple[IndexArray, NDArray[np.float32]]:
+    """Return the triangles with a share of a photo, and its weight and offsets (N, 3, 4) at their corners."""
     mesh, part = plan.mesh, plan.blend.photo_rows(photo)
     weight = np.zeros(len(mesh.vertices), np.float32)
     offset = np.zeros((len(mesh.vertices), 3), np.float32)
     weight[plan.blend.vertex[part]], offset[plan.blend.vertex[part]] = plan.blend.weight[part], plan.blend.offset[part]
     near = np.union1d(np.flatnonzero(plan.chosen == photo), mesh.faces_at(plan.blend.vertex[part]))
     own = plan.chosen[near] == photo
-    allowed = (plan.seen.all.is_usable(photo, near) | own) & (plan.chosen[near] != NONE)
+    allowed = (plan.checked.sightings.is_usable(photo, near) | own) & (plan.chosen[near] != NONE)
     shares = np.where(allowed[:, None], weight[mesh.faces[near]], 0.0)
     whole = plan.allowed_weight[near]
     with np.errstate(invalid="ignore", divide="ignore"):
         shares = np.where(whole > 0, shares / whole, own[:, None]).astype(np.float32)
-    some = (shares > 0).any(axis=1)
-    return near[some], np.concatenate([shares[some][:, :, None], offset[mesh.faces[near[some]]]], axis=2)
+    used = (shares > 0).any(axis=1)
+    return near[used], np.concatenate([shares[used][:, :, None], offset[mesh.faces[near[used]]]], axis=2)

@@ -1,4 +1,4 @@
-"""Colors and texels of triangles that no photo sees, from the surrounding triangles."""
+"""Blending and leveling of photos at seams, and colors of triangles without a photo."""
 
 from dataclasses import dataclass, replace
 
@@ -6,30 +6,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.texture.facets import NONE, Facets, IntArray, distinct, sum_at_vertices
+from sfm_app.texture.facets import NONE, Facets, IntArray, distinct
 from sfm_app.texture.sightings import Sightings
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
+
+SQUARE_CORNERS = np.array([[0.5, 0.5], [1.5, 0.5], [0.5, 1.5]])
+"""Corners of a triangle in its square, on the centers of texels."""
+CELL = 2
+"""Side of the square of a triangle without a photo, in texels; bilinear interpolation inside it is exact."""
+BLOCK = 64
+"""Most squares along a side of a block."""
+
+
+@dataclass(frozen=True, slots=True)
+class SeamOptions:
+    """Weights of the blend, and of the least squares of offsets and colors."""
+
+    rings: int = 3
+    """Rings of vertices on either side of a seam over which photos are blended."""
+    faint: float = 0.02
+    """Smaller weights are dropped."""
+    stiffness: float = 4.0
+    """Weight of differences of offsets along a chart, relative to 1 for differences at seams."""
+    prior: float = 1e-3
+    """Weight of zero offsets."""
+    previous_color: float = 1e-4
+    """Weight of the previous color of a vertex without a photo, relative to 1 per neighbor, for isolated parts."""
+    rounding: float = 5e-3
+    """Rounding of a corner, in texels: single precision on the largest page gives a thousandth. Chosen by hand."""
+
+
+OPTIONS = SeamOptions()
 
 # Blending near seams: weights of the photos at the vertices, and offsets that remove color differences.
 #
-# The weight of a photo at a vertex starts as the share of the vertex's triangles that it colors. It is diffused
-# over a few rings of vertices, as far as the photo sees them. Where two photos meet at a vertex, their colors
-# should be equal: offsets that vary slowly over the chart make them so (Lempitsky & Ivanov 2007; Waechter et al.
-# 2014, section 3.2).
-
-RINGS = 3
-"""Rings of vertices on either side of a seam over which photos are blended."""
-FAINT = 0.02
-"""Smaller weights are dropped."""
+# The weight of a photo at a vertex starts as its share of the vertex's triangles. It is diffused over a few rings
+# of vertices with usable views. Where two photos meet at a vertex, slowly varying offsets make their colors equal
+# (Lempitsky & Ivanov 2007; Waechter et al. 2014, section 3.2).
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Blend:
-    """Nodes, each a photo at a vertex. Those of photo p are the rows starts[p] to starts[p + 1] - 1."""
+    """Nodes, each a photo at a vertex. Photo p has the rows starts[p] to starts[p + 1] - 1."""
 
-    starts: NDArray[np.int64]
+    starts: IndexArray
     """(P + 1,)"""
-    vertex: NDArray[np.int64]
+    vertex: IndexArray
     """(N,) ascending within a photo."""
     weight: NDArray[np.float32]
     """(N,) weight of the photo at the vertex; the weights at each vertex sum to 1."""
@@ -41,24 +63,18 @@ class Blend:
         return slice(int(self.starts[photo]), int(self.starts[photo + 1]))
 
 
-def blend_weights(chosen: IntArray, seen: Sightings, mesh: Facets) -> Blend:
-    """Compute weights of the photos that blend them across seams.
-
-    Args:
-        chosen: (T,) photo of each triangle, -1 for none.
-        seen: which photos see which triangles; not used where the worth is negative.
-        mesh: the surface.
-    """
+def blend_weights(chosen: IntArray, sightings: Sightings, mesh: Facets) -> Blend:
+    """Compute weights that blend the photos of triangles (T,), -1 for none, across seams."""
     size = len(mesh.vertices)
     degree = np.maximum(np.bincount(mesh.edges.ravel(), minlength=size), 1)
     order = np.argsort(chosen, kind="stable")
-    starts = np.searchsorted(chosen[order], np.arange(seen.photos + 1))
+    starts = np.searchsorted(chosen[order], np.arange(sightings.photos + 1))
     vertices, weights = [], []
-    for photo in range(seen.photos):
+    for photo in range(sightings.photos):
         own = order[starts[photo] : starts[photo + 1]]
-        at, share = _photo_weights(photo, own, chosen, seen, mesh, degree)
-        vertices.append(at[share > FAINT])
-        weights.append(share[share > FAINT])
+        at, share = _photo_weights(photo, own, chosen, sightings, mesh, degree)
+        vertices.append(at[share > OPTIONS.faint])
+        weights.append(share[share > OPTIONS.faint])
     rows = np.concatenate([[0], np.cumsum([len(at) for at in vertices])]).astype(np.int64)
     vertex, weight = np.concatenate(vertices).astype(np.int64), np.concatenate(weights)
     total = np.bincount(vertex, weight, size)
@@ -66,30 +82,24 @@ def blend_weights(chosen: IntArray, seen: Sightings, mesh: Facets) -> Blend:
 
 
 def _photo_weights(
-    photo: int, own: IndexArray, chosen: IntArray, seen: Sightings, mesh: Facets, degree: IndexArray
+    photo: int, own: IndexArray, chosen: IntArray, sightings: Sightings, mesh: Facets, degree: IndexArray
 ) -> tuple[IndexArray, FloatArray]:
-    """Return the vertices (N,) to which the share of a photo spreads, ascending, and its share (N,) at each.
+    """Return the vertices (N,) near the `own` triangles of a photo, ascending, and its share (N,) at each.
 
-    Args:
-        photo: its number.
-        own: (M,) triangles that it colors, ascending.
-        chosen: (T,) photo of each triangle.
-        seen: which photos see which triangles.
-        mesh: the surface.
-        degree: (V,) number of edges at each vertex.
+    `degree` (V,) is the number of edges at each vertex.
     """
     at = distinct(mesh.faces[own].ravel(), len(mesh.vertices))
-    for _ in range(RINGS):
+    for _ in range(OPTIONS.rings):
         at = distinct(mesh.faces[mesh.faces_at(at)].ravel(), len(mesh.vertices))
     near = mesh.faces_at(at)
-    allowed = np.isin(near, seen.usable_faces(photo), assume_unique=True) | np.isin(chosen[near], (photo, NONE))
+    allowed = np.isin(near, sightings.usable_faces(photo), assume_unique=True) | np.isin(chosen[near], (photo, NONE))
     corners = np.searchsorted(at, mesh.faces[near][~allowed].ravel()).clip(max=max(len(at) - 1, 0))
     barred = np.zeros(len(at), np.bool_)
     barred[corners[at[corners] == mesh.faces[near][~allowed].ravel()]] = True
     count = np.bincount(np.searchsorted(at, mesh.faces[own].ravel()), minlength=len(at)).astype(np.float64)
     share = count / np.maximum(mesh.valence[at], 1.0)
     edges = np.searchsorted(at, mesh.edges[mesh.edges_among(at)])
-    for _ in range(RINGS):
+    for _ in range(OPTIONS.rings):
         share = np.where(barred, 0.0, _spread(share, edges, degree[at]))
     return at, share
 
@@ -97,45 +107,27 @@ def _photo_weights(
 def _spread(share: FloatArray, edges: IndexArray, degree: IndexArray) -> FloatArray:
     """Average each value with the mean of its neighboring vertices."""
     one, other = edges[:, 0], edges[:, 1]
-    around = np.bincount(one, share[other], len(share)) + np.bincount(other, share[one], len(share))
-    return np.asarray(0.5 * share + 0.5 * around / degree, np.float64)
+    total = np.bincount(one, share[other], len(share)) + np.bincount(other, share[one], len(share))
+    return np.asarray(0.5 * share + 0.5 * total / degree, np.float64)
 
 
-# Offsets that make colors of photos equal at seams; see `blending`.
-
-STIFFNESS = 4.0
-"""Weight of differences of offsets along a chart, relative to 1 for differences at seams."""
-PRIOR_WEIGHT = 1e-3
-"""Weight of the prior that offsets are zero."""
-STEPS = 100
-RESIDUAL_TOLERANCE = 1e-2
-"""Norm of the preconditioned residual at which the solver stops, relative to its initial value."""
-
-
-def level_seams(blend: Blend, seen: Sightings, gains: FloatArray, mesh: Facets) -> Blend:
-    """Estimate the offsets of a blend by least squares.
-
-    Args:
-        blend: weights of the photos at the vertices.
-        seen: which photos see which triangles, in which colors; not used where the worth is negative.
-        gains: (P, 3) of the photos.
-        mesh: the surface.
-    """
-    first, second, gap = _gaps(blend, seen, gains, mesh)
+def level_seams(blend: Blend, sightings: Sightings, gains: FloatArray, mesh: Facets) -> Blend:
+    """Estimate the offsets of a blend by least squares, given the gains (P, 3) of the photos."""
+    first, second, gap = _gaps(blend, sightings, gains, mesh)
     start, end = _ties(blend, mesh)
     right = np.zeros((len(blend.vertex), 3))
     for channel in range(3):
         right[:, channel] += np.bincount(first, gap[:, channel], len(right))
         right[:, channel] -= np.bincount(second, gap[:, channel], len(right))
-    weights = np.concatenate([np.ones(len(first)), np.full(len(start), STIFFNESS)])
-    offsets = solve_ties(np.concatenate([first, start]), np.concatenate([second, end]), weights, PRIOR_WEIGHT, right)
+    weights = np.concatenate([np.ones(len(first)), np.full(len(start), OPTIONS.stiffness)])
+    offsets = solve_ties(np.concatenate([first, start]), np.concatenate([second, end]), weights, OPTIONS.prior, right)
     return replace(blend, offset=offsets.astype(np.float32))
 
 
 def solve_ties(
-    one: NDArray[np.int64], other: NDArray[np.int64], weights: FloatArray, hold: float | FloatArray, right: FloatArray
+    one: IndexArray, other: IndexArray, weights: FloatArray, hold: float | FloatArray, right: FloatArray
 ) -> FloatArray:
-    """Return (N, 3) x that solves (graph Laplacian + hold) x = right, by conjugate gradients.
+    """Solve (graph Laplacian + hold) x = right (N, 3) by conjugate gradients.
 
     Args:
         one: (E,) node at one end of each edge of the graph.
@@ -160,106 +152,130 @@ def _solve(
     starts: NDArray[np.int32], others: NDArray[np.int32], weights: FloatArray, diagonal: FloatArray, right: FloatArray,
     x: FloatArray,
 ) -> None:  # fmt: skip
-    """Solve (diagonal - weights) x = right by conjugate gradients from x = 0, scaled by the diagonal."""
+    """Solve (diagonal - weights) x = right by conjugate gradients from x = 0, scaled by the diagonal.
+
+    At most 100 steps, until the norm of the preconditioned residual is 1 % of its initial value.
+    """
     size, channels = len(right), 3
-    residual, way, moved = right.copy(), np.empty_like(right), np.empty_like(right)
-    energy, enough, step = np.zeros(channels), np.zeros(channels), np.zeros(channels)
-    for n in range(size):
-        for c in range(channels):
-            way[n, c] = residual[n, c] / diagonal[n]
-            energy[c] += residual[n, c] * way[n, c]
+    residual, direction, product = right.copy(), np.empty_like(right), np.empty_like(right)
+    tolerance, step = np.zeros(channels), np.zeros(channels)
+    energy = _precondition(residual, diagonal, direction)
     for c in range(channels):  # assigning rows compiles for a second
-        enough[c] = RESIDUAL_TOLERANCE * RESIDUAL_TOLERANCE * energy[c]
-    for _ in range(STEPS):
-        if energy[0] <= enough[0] and energy[1] <= enough[1] and energy[2] <= enough[2]:
+        tolerance[c] = 1e-2 * 1e-2 * energy[c]
+    for _ in range(100):
+        if energy[0] <= tolerance[0] and energy[1] <= tolerance[1] and energy[2] <= tolerance[2]:
             break
-        along = np.zeros(channels)
-        for n in range(size):
-            red, green, blue = diagonal[n] * way[n, 0], diagonal[n] * way[n, 1], diagonal[n] * way[n, 2]
-            for k in range(starts[n], starts[n + 1]):
-                weight, other = weights[k], others[k]
-                red -= weight * way[other, 0]
-                green -= weight * way[other, 1]
-                blue -= weight * way[other, 2]
-            moved[n, 0], moved[n, 1], moved[n, 2] = red, green, blue
-            along[0] += way[n, 0] * red
-            along[1] += way[n, 1] * green
-            along[2] += way[n, 2] * blue
-        before = energy.copy()
+        curvature = _multiply(starts, others, weights, diagonal, direction, product)
+        before = energy
         for c in range(channels):
-            step[c] = energy[c] / along[c] if along[c] > 0.0 else 0.0
-            energy[c] = 0.0
+            step[c] = energy[c] / curvature[c] if curvature[c] > 0.0 else 0.0
         for n in range(size):
             for c in range(channels):
-                x[n, c] += step[c] * way[n, c]
-                residual[n, c] -= step[c] * moved[n, c]
-                moved[n, c] = residual[n, c] / diagonal[n]
-                energy[c] += residual[n, c] * moved[n, c]
+                x[n, c] += step[c] * direction[n, c]
+                residual[n, c] -= step[c] * product[n, c]
+        energy = _precondition(residual, diagonal, product)
         for c in range(channels):
             step[c] = energy[c] / before[c] if before[c] > 0.0 else 0.0
         for n in range(size):
             for c in range(channels):
-                way[n, c] = moved[n, c] + step[c] * way[n, c]
+                direction[n, c] = product[n, c] + step[c] * direction[n, c]
+
+
+@kernel
+def _precondition(residual: FloatArray, diagonal: FloatArray, scaled: FloatArray) -> FloatArray:
+    """Write the residual over the diagonal; return (3,) the products of both."""
+    energy = np.zeros(3)
+    for n in range(len(residual)):
+        for c in range(3):
+            scaled[n, c] = residual[n, c] / diagonal[n]
+            energy[c] += residual[n, c] * scaled[n, c]
+    return energy
+
+
+@kernel
+def _multiply(
+    starts: NDArray[np.int32], others: NDArray[np.int32], weights: FloatArray, diagonal: FloatArray,
+    direction: FloatArray, product: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """Write the product of the matrix and a direction; return (3,) the products of both."""
+    curvature = np.zeros(3)
+    for n in range(len(diagonal)):
+        red, green, blue = diagonal[n] * direction[n, 0], diagonal[n] * direction[n, 1], diagonal[n] * direction[n, 2]
+        for k in range(starts[n], starts[n + 1]):
+            weight, other = weights[k], others[k]
+            red -= weight * direction[other, 0]
+            green -= weight * direction[other, 1]
+            blue -= weight * direction[other, 2]
+        product[n, 0], product[n, 1], product[n, 2] = red, green, blue
+        curvature[0] += direction[n, 0] * red
+        curvature[1] += direction[n, 1] * green
+        curvature[2] += direction[n, 2] * blue
+    return curvature
 
 
 def _gaps(
-    blend: Blend, seen: Sightings, gains: FloatArray, mesh: Facets
-) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+    blend: Blend, sightings: Sightings, gains: FloatArray, mesh: Facets
+) -> tuple[IndexArray, IndexArray, FloatArray]:
     """Find nodes where two photos meet at a vertex, and their color differences.
 
-    Colors are compared on the triangles at the vertex that both photos may be used for; pairs without any are left out.
+    Colors are compared on triangles at the vertex with usable views of both photos; pairs without any are omitted.
 
     Returns:
         (M,) node, (M,) node of the largest weight at its vertex, and (M, 3) color of the latter minus the former.
     """
     others, heads = _seam_pairs(blend, len(mesh.vertices))
-    photo_of = np.repeat(np.arange(seen.photos), np.diff(blend.starts))
+    photo_of = np.repeat(np.arange(sightings.photos), np.diff(blend.starts))
     order = np.argsort(photo_of[others], kind="stable")
-    starts = np.searchsorted(photo_of[others][order], np.arange(seen.photos + 1))
+    starts = np.searchsorted(photo_of[others][order], np.arange(sightings.photos + 1))
     head_photo = np.full(len(mesh.vertices), NONE, np.int64)
     place = np.zeros(len(mesh.vertices), np.int64)
     gaps = np.full((len(others), 3), np.nan)
-    for photo in range(seen.photos):
+    for photo in range(sightings.photos):
         rows = order[starts[photo] : starts[photo + 1]]
         at = blend.vertex[others[rows]]
         head_photo[at], place[at] = photo_of[heads[rows]], np.arange(len(rows))
-        around = mesh.faces_at(at)
-        near = around[seen.is_usable(photo, around)]
+        fan = mesh.faces_at(at)
+        near = fan[sightings.is_usable(photo, fan)]
         corners = head_photo[mesh.faces[near]], place[mesh.faces[near]]
-        gaps[rows] = _photo_gaps(photo, near, corners, seen, gains, len(rows))
+        gaps[rows] = _photo_gaps(photo, near, corners, sightings, gains, len(rows))
         head_photo[at] = NONE
     known = np.isfinite(gaps[:, 0])
     return others[known], heads[known], gaps[known]
 
 
 def _photo_gaps(
-    photo: int, near: IndexArray, corners: tuple[IndexArray, IndexArray], seen: Sightings, gains: FloatArray, size: int
+    photo: int,
+    near: IndexArray,
+    corners: tuple[IndexArray, IndexArray],
+    sightings: Sightings,
+    gains: FloatArray,
+    size: int,
 ) -> FloatArray:
-    """Return (size, 3) mean color of other photos at vertices minus that of one photo; NaN where unknown.
+    """Return (size, 3) mean color of other photos at vertices minus the color of one photo; NaN where unknown.
 
     Args:
         photo: number of the one photo.
-        near: (M,) triangles that it may be used for.
-        corners: (M, 3) the other photo at each corner, -1 for none; and (M, 3) number of the vertex there.
-        seen: views of triangles in photos.
+        near: (M,) triangles with usable views in it.
+        corners: (M, 3) the other photo at each corner, -1 for none; and (M, 3) number of the vertex.
+        sightings: views of triangles in photos.
         gains: (P, 3) of the photos.
         size: number of vertices.
     """
     head, place = corners
-    row = seen.find(head, np.where(head == NONE, NONE, near[:, None]))
-    both = (row != NONE) & (seen.worth[row] > 0)
-    own = seen.colors[seen.find(photo, near)] / gains[photo]
-    difference = seen.colors[row] / gains[head] - own[:, None]
+    row = sightings.find(head, np.where(head == NONE, NONE, near[:, None]))
+    both = (row != NONE) & (sightings.score[row] > 0)
+    own = sightings.colors[sightings.find(photo, near)] / gains[photo]
+    difference = sightings.colors[row] / gains[head] - own[:, None]
     count = np.bincount(place[both], minlength=size)
-    found = np.full((size, 3), np.nan)
+    gaps = np.full((size, 3), np.nan)
     for channel in range(3):
         total = np.bincount(place[both], difference[..., channel][both], size)
-        np.divide(total, count, out=found[:, channel], where=count > 0)
-    return found
+        np.divide(total, count, out=gaps[:, channel], where=count > 0)
+    return gaps
 
 
-def _seam_pairs(blend: Blend, size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return all nodes except the one of the largest weight at each vertex, and for each the one it is paired with."""
+def _seam_pairs(blend: Blend, size: int) -> tuple[IndexArray, IndexArray]:
+    """Return all nodes but the heaviest at each vertex, and for each node the heaviest."""
     order = np.lexsort((-blend.weight, blend.vertex))
     heads = np.full(size, -1, np.int64)
     ranked = blend.vertex[order]
@@ -269,7 +285,7 @@ def _seam_pairs(blend: Blend, size: int) -> tuple[NDArray[np.int64], NDArray[np.
     return others, heads[blend.vertex[others]]
 
 
-def _ties(blend: Blend, mesh: Facets) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _ties(blend: Blend, mesh: Facets) -> tuple[IndexArray, IndexArray]:
     """Return pairs of nodes of the same photo at the two ends of an edge."""
     start, end = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     node = np.full(len(mesh.vertices), -1, np.int64)
@@ -283,31 +299,16 @@ def _ties(blend: Blend, mesh: Facets) -> tuple[NDArray[np.int64], NDArray[np.int
     return np.concatenate(start), np.concatenate(end)
 
 
-CELL = 2
-"""Side of the square of an unseen triangle, in texels; bilinear interpolation inside it is exact."""
-BLOCK = 64
-"""Largest number of squares along a side of a block."""
-SQUARE_CORNERS = np.array([[0.5, 0.5], [1.5, 0.5], [0.5, 1.5]])
-"""Corners of a triangle in its square, on the centers of texels."""
-ROUNDING = 5e-3
-"""Texels that a corner may be off: single precision on the largest page gives a thousandth. Chosen by hand."""
-PREVIOUS_COLOR_WEIGHT = 1e-4
-"""Weight of the previous color of an unseen vertex, relative to 1 per neighbor, for parts that no photo sees."""
+# Triangles without a photo: colors from the surrounding triangles, and a square of texels for each.
 
 
-def vertex_colors(mesh: Facets, seen: NDArray[np.bool_], corner_colors: FloatArray) -> FloatArray:
-    """Compute colors of all vertices, diffused from the triangles that photos see to the others.
+def vertex_colors(mesh: Facets, painted: BoolArray, corner_colors: FloatArray) -> FloatArray:
+    """Compute colors (V, 3) in 0..255 of all vertices, diffused from painted triangles (T,) to the others.
 
-    Args:
-        mesh: the surface; its colors stay in parts that no photo sees.
-        seen: (T,) whether a photo sees the triangle.
-        corner_colors: (S, 3, 3) RGB at the corners of the seen triangles.
-
-    Returns:
-        (V, 3) in 0..255.
+    `corner_colors` (S, 3, 3) are RGB at the corners of the painted triangles. Parts without any keep their colors.
     """
-    faces, size = mesh.faces[seen], len(mesh.vertices)
-    count = sum_at_vertices(np.ones(len(faces)), faces, size)
+    faces, size = mesh.faces[painted], len(mesh.vertices)
+    count = np.bincount(faces.ravel(), minlength=size)
     sums = [np.bincount(faces.ravel(), corner_colors[..., channel].ravel(), size) for channel in range(3)]
     known = count > 0
     colors = mesh.surface.colors.astype(np.float64)
@@ -321,8 +322,8 @@ def vertex_colors(mesh: Facets, seen: NDArray[np.bool_], corner_colors: FloatArr
     rim = (ends >= 0).any(axis=1) & ~inner
     outside = np.where(ends[rim, 0] < 0, mesh.edges[rim, 0], mesh.edges[rim, 1])
     inside = ends[rim].max(axis=1)
-    hold = np.asarray(PREVIOUS_COLOR_WEIGHT + np.bincount(inside, minlength=int((~known).sum())), np.float64)
-    right = PREVIOUS_COLOR_WEIGHT * colors[~known]
+    hold = np.asarray(OPTIONS.previous_color + np.bincount(inside, minlength=int((~known).sum())), np.float64)
+    right = OPTIONS.previous_color * colors[~known]
     for channel in range(3):
         right[:, channel] += np.bincount(inside, colors[outside, channel], len(right))
     spread = solve_ties(ends[inner, 0], ends[inner, 1], np.ones(int(inner.sum())), hold, right)
@@ -331,7 +332,7 @@ def vertex_colors(mesh: Facets, seen: NDArray[np.bool_], corner_colors: FloatArr
 
 
 def block_sizes(triangles: int) -> NDArray[np.int32]:
-    """Return (B, 2) widths and heights in texels of blocks that hold one square per triangle."""
+    """Return (B, 2) widths and heights in texels of blocks with one square per triangle."""
     sizes = []
     for start in range(0, triangles, BLOCK * BLOCK):
         count = min(triangles - start, BLOCK * BLOCK)
@@ -340,37 +341,27 @@ def block_sizes(triangles: int) -> NDArray[np.int32]:
     return np.array(sizes, np.int32).reshape(-1, 2)
 
 
-def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int) -> NDArray[np.int64]:
+def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int) -> IndexArray:
     """Return (N, 3) page, x and y of the square of each triangle, row by row through the blocks.
 
-    Args:
-        places: (B, 3) page, left and top of each block, in texels.
-        sizes: (B, 2) from `block_sizes`.
-        triangles: number of triangles.
+    `places` (B, 3) are page, left and top of each block, in texels; `sizes` (B, 2) come from `block_sizes`.
     """
-    found: list[NDArray[np.int64]] = []
+    parts = [np.empty((0, 3), np.int64)]
     for number, ((page, left, top), (width, _)) in enumerate(zip(places, sizes, strict=True)):
         count = min(triangles - number * BLOCK * BLOCK, BLOCK * BLOCK)
         row, column = np.divmod(np.arange(count), width // CELL)
-        found.append(np.column_stack([np.full(count, page), left + CELL * column, top + CELL * row]))
-    return np.concatenate(found).astype(np.int64) if found else np.empty((0, 3), np.int64)
+        parts.append(np.column_stack([np.full(count, page), left + CELL * column, top + CELL * row]))
+    return np.concatenate(parts).astype(np.int64)
 
 
-def are_squares(corners: FloatArray) -> NDArray[np.bool_]:
-    """Return (T,) which triangles are those of squares, by their corners.
-
-    Args:
-        corners: (T, 3, 2) texels, off by single precision.
-    """
+def are_squares(corners: FloatArray) -> BoolArray:
+    """Mark triangles (T,) with the corners (T, 3, 2) of a square, in texels of single precision."""
     first = np.floor(corners[:, :1])
-    return np.asarray((np.abs(corners - first - SQUARE_CORNERS) < ROUNDING).all(axis=(1, 2)))
+    return np.asarray((np.abs(corners - first - SQUARE_CORNERS) < OPTIONS.rounding).all(axis=(1, 2)))
 
 
 def square_texels(corner_colors: FloatArray) -> NDArray[np.uint8]:
-    """Return (N, 2, 2, 3) texels whose bilinear interpolation gives colors (N, 3, 3) at the corners.
-
-    The corners lie on texel centers: the first top left, the second top right, the third bottom left.
-    """
+    """Return (N, 2, 2, 3) texels whose bilinear interpolation gives colors (N, 3, 3) at `SQUARE_CORNERS`."""
     a, b, c = (corner_colors[:, k] for k in range(3))
     texels = np.stack([np.stack([a, b], axis=1), np.stack([c, b + c - a], axis=1)], axis=1)
     return np.asarray(np.round(np.clip(texels, 0, 255)), np.uint8)

@@ -1,4 +1,4 @@
-"""Which photos see which triangles, in lists: a photo sees few of a town's triangles."""
+"""Sightings: the triangles in each photo, with score and color, in lists by photo and by triangle."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -12,34 +12,44 @@ from sfm_app.geometry.triangles import number_vertices
 from sfm_app.jit import kernel
 from sfm_app.texture.facets import NONE, Facets, IntArray
 from sfm_app.texture.views import POSE, PhotoView, project, sample
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
-# Views of the triangles in one photo: which triangles it sees, how well, and in which colors.
-
-OcclusionTest = Callable[[FloatArray, float, FloatArray], NDArray[np.bool_]]
+OcclusionTest = Callable[[FloatArray, float, FloatArray], BoolArray]
 """Takes a camera center (3,), the slack at a point, and points (N, 3); returns whether each is hidden, (N,)."""
 
-SLACK = 1.0
-"""Slack of the occlusion test, in median edge lengths, so that the surface's roughness hides nothing."""
 MIN_COSINE = 0.1
 """Smallest cosine of the viewing angle; from more oblique views, few pixels would be stretched over the triangle."""
 BORDER_PX = 2.0
 """Width of the unused border of a photo, where resampling and demosaicing are incomplete."""
-RIM_RINGS, RIM_WORTH = 2, 0.5
-"""Rings of triangles next to those that a photo does not see, and the factor on their worth per ring: where the
-surface is off by a pixel, they show the foreground or background."""
 MASK_RIM_PX = 1.0
 """A triangle this close to a masked pixel is not used, because colors are interpolated between pixels."""
-SHARPNESS_RANGE = (0.2, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class SightingOptions:
+    """Occlusion, and factors on the scores."""
+
+    slack: float = 1.0
+    """Slack of the occlusion test, in median edge lengths, so that the surface's roughness hides nothing."""
+    rim_rings: int = 2
+    """Rings of triangles around hidden ones with a lower score: where the surface is off by a pixel, they show the
+    foreground or background."""
+    rim_factor: float = 0.5
+    """Factor on their score per ring."""
+    sharpness_range: tuple[float, float] = (0.2, 1.0)
+    """Smallest and largest factor on the scores of a photo."""
+
+
+OPTIONS = SightingOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceView:
-    """One photo's view of the triangles that it sees."""
+    """One photo's view of its visible triangles."""
 
     face: IntArray
     """(M,) the triangles, ascending."""
-    worth: NDArray[np.float32]
+    score: NDArray[np.float32]
     """(M,) pixels times cosine of the viewing angle, > 0."""
     color: NDArray[np.uint8]
     """(M, 3) mean RGB."""
@@ -48,73 +58,58 @@ class FaceView:
 
 
 def score_faces(
-    view: PhotoView, photo: NDArray[np.uint8], used: NDArray[np.bool_] | None, mesh: Facets, hidden: OcclusionTest
+    view: PhotoView, photo: NDArray[np.uint8], used: BoolArray | None, mesh: Facets, hidden: OcclusionTest
 ) -> FaceView:
-    """Score the triangles in one photo.
-
-    Args:
-        view: lens and pose.
-        photo: (height, width, 3) RGB, of the view's size.
-        used: (height, width) which of its pixels may be used; None where all may.
-        mesh: the surface.
-        hidden: the occlusion test.
-    """
+    """Score the triangles in a photo (height, width, 3) of the view's size; `used` masks its usable pixels."""
     near = mesh.clusters.find_in_cone(view.center, view.axis, view.widest_angle)
-    worth, color = np.zeros(len(near), np.float32), np.zeros((len(near), 3), np.uint8)
-    _measure(view.row, photo, mesh.vertices, mesh.faces[near], worth, color)
+    score, color = np.zeros(len(near), np.float32), np.zeros((len(near), 3), np.uint8)
+    _measure(view.row, photo, mesh.vertices, mesh.faces[near], score, color)
     if used is not None:
         masked = np.zeros((view.height + 1, view.width + 1), np.int32)
         np.cumsum(np.cumsum(~used, axis=0, dtype=np.int32), axis=1, out=masked[1:, 1:])
-        _drop_masked(view.row, masked, mesh.vertices, mesh.faces[near], worth)
-    candidates = np.flatnonzero(worth)
-    occluded = _occluded_mask(near[candidates], mesh, partial(hidden, view.center, SLACK * mesh.spacing))
-    seen = candidates[~occluded]
-    face, worth = near[seen], worth[seen]
-    _lower_rims(face, worth, mesh)
-    shown = worth > 0
-    return FaceView(face[shown].astype(np.int32), worth[shown], color[seen[shown]], sharpness(photo, used))
+        _drop_masked(view.row, masked, mesh.vertices, mesh.faces[near], score)
+    candidates = np.flatnonzero(score)
+    occluded = _occluded_mask(near[candidates], mesh, partial(hidden, view.center, OPTIONS.slack * mesh.spacing))
+    visible = candidates[~occluded]
+    face, score = near[visible], score[visible]
+    _lower_rims(face, score, mesh)
+    usable = score > 0
+    return FaceView(face[usable].astype(np.int32), score[usable], color[visible[usable]], sharpness(photo, used))
 
 
-def _lower_rims(face: NDArray[np.int64], worth: NDArray[np.float32], mesh: Facets) -> None:
-    """Weigh seen triangles less, in place, ring by ring from those that the photo does not see."""
+def _lower_rims(face: IndexArray, score: NDArray[np.float32], mesh: Facets) -> None:
+    """Lower the scores of visible triangles, in place, ring by ring from the hidden ones."""
     inner = np.arange(len(face))
-    for _ in range(RIM_RINGS):
+    for _ in range(OPTIONS.rim_rings):
         corners = mesh.faces[face[inner]]
         vertices, at = number_vertices(corners)
         whole = np.bincount(at.ravel(), minlength=len(vertices)) == mesh.valence[vertices]
         inside = whole[at].all(axis=1)
         beyond = np.ones(len(face), np.bool_)
         beyond[inner[inside]] = False
-        worth[beyond] *= RIM_WORTH
+        score[beyond] *= OPTIONS.rim_factor
         inner = inner[inside]
 
 
-def _occluded_mask(
-    candidates: NDArray[np.int64], mesh: Facets, hidden: Callable[[FloatArray], NDArray[np.bool_]]
-) -> NDArray[np.bool_]:
-    """Mark triangles that are hidden at the center or at two corners, (N,)."""
+def _occluded_mask(candidates: IndexArray, mesh: Facets, hidden: Callable[[FloatArray], BoolArray]) -> BoolArray:
+    """Mark triangles hidden at the center or at two corners, (N,)."""
     corners = mesh.faces[candidates]
     points, at = number_vertices(corners)
     blocked = hidden(mesh.vertices[points])[at].sum(axis=1, dtype=np.int8) > 1
-    open_ones = np.flatnonzero(~blocked)
-    blocked[open_ones] = hidden(mesh.vertices[corners[open_ones]].mean(axis=1))
+    rest = np.flatnonzero(~blocked)
+    blocked[rest] = hidden(mesh.vertices[corners[rest]].mean(axis=1))
     return np.asarray(blocked, np.bool_)
 
 
-def sharpness(photo: NDArray[np.uint8], used: NDArray[np.bool_] | None = None) -> float:
-    """Return the ratio of Laplacian energies at full and at half size, >= 0, over usable pixels.
-
-    Args:
-        photo: (H, W, 3) RGB.
-        used: (H, W) which pixels may be used; all where None.
-    """
+def sharpness(photo: NDArray[np.uint8], used: BoolArray | None = None) -> float:
+    """Return the ratio of Laplacian energies of a photo (H, W, 3) at full and at half size, >= 0, over used pixels."""
     gray = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
     half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     fine, coarse = (_energy(part, used) for part in (gray, half))
     return fine / coarse if coarse > 0 else 0.0
 
 
-def _energy(gray: NDArray[np.uint8], used: NDArray[np.bool_] | None) -> float:
+def _energy(gray: NDArray[np.uint8], used: BoolArray | None) -> float:
     energy = np.square(cv2.Laplacian(gray, cv2.CV_32F))
     if used is None:
         return float(np.mean(energy))
@@ -123,11 +118,11 @@ def _energy(gray: NDArray[np.uint8], used: NDArray[np.bool_] | None) -> float:
     return float(np.mean(counted)) if counted.size else 0.0
 
 
-def sharpness_factors(sharpness_of: NDArray[np.float64]) -> FloatArray:
-    """Return (P,) factors on the worth of each photo, 1 for the median sharpness."""
-    middle = float(np.median(sharpness_of)) if len(sharpness_of) else 0.0
-    relative = sharpness_of / middle if middle > 0 else np.ones(len(sharpness_of))
-    return np.asarray(np.clip(relative, *SHARPNESS_RANGE), np.float64)
+def sharpness_factors(sharpness: FloatArray) -> FloatArray:
+    """Return (P,) factors on the scores of each photo, 1 for the median sharpness."""
+    median = float(np.median(sharpness)) if len(sharpness) else 0.0
+    relative = sharpness / median if median > 0 else np.ones(len(sharpness))
+    return np.asarray(np.clip(relative, *OPTIONS.sharpness_range), np.float64)
 
 
 @kernel
@@ -135,8 +130,8 @@ def _measure(
     camera: FloatArray,
     photo: NDArray[np.uint8],
     vertices: FloatArray,
-    faces: NDArray[np.int64],
-    worth: NDArray[np.float32],
+    faces: IndexArray,
+    score: NDArray[np.float32],
     color: NDArray[np.uint8],
 ) -> None:
     """Write area in pixels times cosine, and mean color, of triangles within the photo that face the camera."""
@@ -160,7 +155,7 @@ def _measure(
         area = -0.5 * ((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]))
         if cosine < MIN_COSINE or area <= 0.0:
             continue
-        worth[f] = area * cosine
+        score[f] = area * cosine
         for channel in range(3):
             total = 0.0
             for k in range(4):
@@ -173,21 +168,13 @@ def _drop_masked(
     camera: FloatArray,
     masked: NDArray[np.int32],
     vertices: FloatArray,
-    faces: NDArray[np.int64],
-    worth: NDArray[np.float32],
+    faces: IndexArray,
+    score: NDArray[np.float32],
 ) -> None:
-    """Set the worth of the triangles that show a masked pixel to 0.
-
-    Args:
-        camera: lens and pose.
-        masked: (height + 1, width + 1) integral image of masked pixels, above and to the left of each.
-        vertices: of the surface.
-        faces: of the surface.
-        worth: (T,) positive only for triangles within the photo.
-    """
+    """Set the score of triangles with a masked pixel to 0; `masked` is the integral image (height + 1, width + 1)."""
     corner = np.empty((3, 2))
     for f in range(len(faces)):
-        if worth[f] <= 0.0:
+        if score[f] <= 0.0:
             continue
         for k in range(3):
             v = faces[f, k]
@@ -201,7 +188,7 @@ def _drop_masked(
             x0 = max(int(left - MASK_RIM_PX), 0)
             x1 = min(int(right + MASK_RIM_PX) + 1, masked.shape[1] - 1)
             if x0 < x1 and masked[y + 1, x1] - masked[y, x1] - masked[y + 1, x0] + masked[y, x0] > 0:
-                worth[f] = 0.0
+                score[f] = 0.0
                 break
 
 
@@ -252,12 +239,12 @@ class Sightings:
     """(P + 1,)"""
     face: IntArray
     """(N,) triangles, ascending within a photo."""
-    worth: NDArray[np.float32]
-    """(N,) of each view, see `FaceView`; negative for outliers, which show something other than the surface."""
+    score: NDArray[np.float32]
+    """(N,) of each view, see `FaceView`; negative for outliers, which do not show the surface."""
     colors: NDArray[np.uint8]
     """(N, 3) RGB."""
     face_starts: IndexArray
-    """(T + 1,) the views of triangle f are face_rows[face_starts[f]] to face_rows[face_starts[f + 1] - 1]."""
+    """(T + 1,) The views of triangle f are face_rows[face_starts[f]] to face_rows[face_starts[f + 1] - 1]."""
     face_rows: IndexArray
     """(N,) rows by triangle, ascending for each."""
 
@@ -281,86 +268,56 @@ class Sightings:
         return slice(int(self.starts[photo]), int(self.starts[photo + 1]))
 
     def find(self, photos: IndexArray | int, faces: NDArray[np.integer]) -> IndexArray:
-        """Return the rows of views, -1 for those that are not there.
+        """Return the rows of views by photo, one or (M,), and triangle (M,), -1 for none; -1 for missing views."""
+        row = np.full(faces.shape, NONE, np.int64)
+        photos = np.broadcast_to(np.asarray(photos, np.int64), faces.shape).ravel()
+        _find(self.starts, self.face, photos, faces.ravel().astype(np.int64), row.ravel())
+        return row
 
-        Args:
-            photos: (M,) photo of each view, or one for all.
-            faces: (M,) triangle of each view; -1 for none.
-        """
-        found = np.full(faces.shape, NONE, np.int64)
-        _find(self.starts, self.face, np.broadcast_to(np.asarray(photos, np.int64), faces.shape).ravel(),
-              faces.ravel().astype(np.int64), found.ravel())  # fmt: skip
-        return found
-
-    def is_usable(self, photos: IndexArray | int, faces: NDArray[np.integer]) -> NDArray[np.bool_]:
-        """Return (M,) whether photos see triangles and show the surface there.
-
-        Args:
-            photos: (M,) photo of each view, or one for all.
-            faces: (M,) triangle of each view; -1 for none.
-        """
+    def is_usable(self, photos: IndexArray | int, faces: NDArray[np.integer]) -> BoolArray:
+        """Return (M,) whether views by photo, one or (M,), and triangle (M,), -1 for none, show the surface."""
         row = self.find(photos, faces)
-        return np.asarray((row != NONE) & (self.worth[row] > 0)) if len(self.worth) else np.zeros(row.shape, np.bool_)
+        return np.asarray((row != NONE) & (self.score[row] > 0)) if len(self.score) else np.zeros(row.shape, np.bool_)
 
     def usable_faces(self, photo: int) -> IndexArray:
-        """Return (M,) the triangles that a photo may be used for, ascending."""
+        """Return (M,) the triangles with a usable view in a photo, ascending."""
         rows = self.rows(photo)
-        return self.face[rows][self.worth[rows] > 0].astype(np.int64)
+        return self.face[rows][self.score[rows] > 0].astype(np.int64)
 
-    def select_triangles(self, kept: NDArray[np.bool_]) -> "Sightings":
-        """Return the views of some triangles, which are numbered anew.
+    def select_triangles(self, selected: BoolArray) -> "Sightings":
+        """Return the views of selected triangles (T,), renumbered."""
+        rows = selected[self.face]
+        counts = np.diff(np.concatenate([[0], np.cumsum(rows)])[self.starts])
+        face = (np.cumsum(selected) - 1)[self.face[rows]].astype(np.int32)
+        return make_sightings(counts, face, self.score[rows], self.colors[rows], int(selected.sum()))
 
-        Args:
-            kept: (T,) triangles to keep.
-        """
-        return _gather(self, kept[self.face], np.cumsum(kept) - 1, int(kept.sum()))
-
-    def with_worth(self, worth: NDArray[np.float32]) -> "Sightings":
-        """Return the same views with another worth."""
-        return replace(self, worth=worth)
+    def with_score(self, score: NDArray[np.float32]) -> "Sightings":
+        """Return the same views with other scores."""
+        return replace(self, score=score)
 
 
-def list_sightings(looks: Sequence[FaceView | None], triangles: int) -> Sightings:
-    """List what all photos see.
-
-    Args:
-        looks: of each photo; None where it cannot be read.
-        triangles: of the surface.
-    """
+def list_sightings(face_views: Sequence[FaceView | None], triangles: int) -> Sightings:
+    """List the views of all photos, None for unreadable ones, of a surface with a number of triangles."""
     empty = FaceView(np.empty(0, np.int32), np.empty(0, np.float32), np.empty((0, 3), np.uint8), 0.0)
-    found = [look or empty for look in looks]
+    views = [view or empty for view in face_views]
     return make_sightings(
-        np.array([len(look.face) for look in found], np.int64),
-        np.concatenate([empty.face, *(look.face for look in found)]),
-        np.concatenate([empty.worth, *(look.worth for look in found)]),
-        np.concatenate([empty.color, *(look.color for look in found)]),
+        np.array([len(view.face) for view in views], np.int64),
+        np.concatenate([empty.face, *(view.face for view in views)]),
+        np.concatenate([empty.score, *(view.score for view in views)]),
+        np.concatenate([empty.color, *(view.color for view in views)]),
         triangles,
     )
 
 
 def make_sightings(
-    counts: IndexArray, face: IntArray, worth: NDArray[np.float32], colors: NDArray[np.uint8], triangles: int
+    counts: IndexArray, face: IntArray, score: NDArray[np.float32], colors: NDArray[np.uint8], triangles: int
 ) -> Sightings:
-    """List views by photo and by triangle.
-
-    Args:
-        counts: (P,) views of each photo.
-        face: (N,) triangles, ascending within a photo.
-        worth: (N,) of each view.
-        colors: (N, 3) RGB.
-        triangles: of the surface.
-    """
+    """List views by photo and by triangle: `counts` (P,) of them per photo, with triangles (N,) ascending in each."""
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     face_starts = np.concatenate([[0], np.cumsum(np.bincount(face, minlength=triangles))]).astype(np.int64)
     rows = np.empty(len(face), np.int64)
     _rank(face, face_starts[:-1].copy(), rows)
-    return Sightings(starts, face, worth, colors, face_starts, rows)
-
-
-def _gather(old: Sightings, kept: NDArray[np.bool_], number: IndexArray, triangles: int) -> Sightings:
-    counts = np.diff(np.concatenate([[0], np.cumsum(kept)])[old.starts])
-    face = number[old.face[kept]].astype(np.int32)
-    return make_sightings(counts, face, old.worth[kept], old.colors[kept], triangles)
+    return Sightings(starts, face, score, colors, face_starts, rows)
 
 
 @kernel
@@ -372,7 +329,7 @@ def _rank(face: IntArray, next_place: IndexArray, rows: IndexArray) -> None:
 
 
 @kernel
-def _find(starts: IndexArray, face: IntArray, photos: IndexArray, faces: IndexArray, found: IndexArray) -> None:
+def _find(starts: IndexArray, face: IntArray, photos: IndexArray, faces: IndexArray, rows: IndexArray) -> None:
     """Find views by bisection among the rows of their photo."""
     for k in range(len(faces)):
         if faces[k] == NONE or photos[k] == NONE:
@@ -385,4 +342,4 @@ def _find(starts: IndexArray, face: IntArray, photos: IndexArray, faces: IndexAr
             else:
                 high = middle
         if low < starts[photos[k] + 1] and face[low] == faces[k]:
-            found[k] = low
+            rows[k] = low

@@ -5,50 +5,53 @@ a triangle grows with the loss of detail, and an edge between different photos c
 tree-reweighted message passing (Kolmogorov, PAMI 2006), then improved triangle by triangle.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.texture.facets import NONE, Facets, IntArray
 from sfm_app.texture.sightings import Sightings
-from sfm_app.types.arrays import FloatArray
-
-CANDIDATES = 8
-"""Number of best photos considered for each triangle."""
-PRICE_OF_DETAIL = 0.35
-"""Cost of a photo with 1/e of the best photo's worth, relative to 1 for a seam as long as the triangle's edge."""
-MAX_LOSS = 3.0
-"""Upper bound of the loss, the natural logarithm of the best worth over the photo's worth."""
-ROUNDS = 12
-TINY = 1e-30
+from sfm_app.types.arrays import FloatArray, IndexArray
 
 
-def choose_photos(seen: Sightings, mesh: Facets) -> IntArray:
-    """Choose the photo that colors each triangle.
+@dataclass(frozen=True, slots=True)
+class SelectionOptions:
+    """Costs of the random field, and the effort of its solution."""
 
-    Args:
-        seen: which photos see which triangles; not used where the worth is negative.
-        mesh: the surface.
+    candidates: int = 8
+    """Number of best photos considered for each triangle."""
+    price_of_detail: float = 0.35
+    """Cost of a photo with 1/e of the best photo's score, relative to 1 for a seam as long as the triangle's edge."""
+    max_loss: float = 3.0
+    """Upper bound of the loss, the natural logarithm of the best score over the photo's score."""
+    rounds: int = 12
+    """Rounds of message passing, and most rounds of the final improvement."""
 
-    Returns:
-        (T,) index of a photo, -1 where none may be used.
-    """
-    triangles, kept = seen.triangles, min(CANDIDATES, seen.photos)
-    labels, values = np.full((triangles, kept), NONE, np.int32), np.zeros((triangles, kept), np.float32)
-    _keep_best(seen.starts, seen.face, seen.worth, labels, values)
-    lost = np.log(np.maximum(values[:, :1], TINY) / np.maximum(values, TINY))
-    cost = (PRICE_OF_DETAIL * _relative_size(mesh)[:, None] * np.minimum(lost, MAX_LOSS)).astype(np.float32)
+
+OPTIONS = SelectionOptions()
+
+
+def choose_photos(sightings: Sightings, mesh: Facets) -> IntArray:
+    """Choose the photo of each triangle, (T,), among its views with a positive score; -1 for none."""
+    triangles, candidates = sightings.triangles, min(OPTIONS.candidates, sightings.photos)
+    labels, values = np.full((triangles, candidates), NONE, np.int32), np.zeros((triangles, candidates), np.float32)
+    _keep_best(sightings.starts, sightings.face, sightings.score, labels, values)
+    loss = np.log(np.maximum(values[:, :1], 1e-30) / np.maximum(values, 1e-30))
+    size = _relative_size(mesh)[:, None]
+    cost = (OPTIONS.price_of_detail * size * np.minimum(loss, OPTIONS.max_loss)).astype(np.float32)
     price = _edge_prices(mesh)
     back = _reverse_edge_indices(mesh.neighbors)
-    same = np.full((triangles, 3, kept), NONE, np.int8)
+    same = np.full((triangles, 3, candidates), NONE, np.int8)
     _match_labels(labels, mesh.neighbors, same)
     chosen = np.full(triangles, NONE, np.int32)
-    messages = np.zeros((triangles, 3, kept), np.float32)
-    for _ in range(ROUNDS):
+    messages = np.zeros((triangles, 3, candidates), np.float32)
+    for _ in range(OPTIONS.rounds):
         for forward in (True, False):
             _pass_messages(labels, cost, (mesh.neighbors, back, same), price, messages, forward)
     _decode(labels, cost, mesh.neighbors, price, messages, chosen)
-    for _ in range(ROUNDS):
+    for _ in range(OPTIONS.rounds):
         if not _improve(labels, cost, mesh.neighbors, price, chosen):
             break
     return chosen
@@ -58,8 +61,8 @@ def _relative_size(mesh: Facets) -> FloatArray:
     """Return (T,) square root of each triangle's area relative to an equilateral one with median edges."""
     corners = mesh.vertices[mesh.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    usual = np.sqrt(3.0) / 4.0 * max(mesh.spacing, 1e-300) ** 2
-    return np.asarray(np.sqrt(0.5 * np.linalg.norm(across, axis=1) / usual), np.float64)
+    equilateral = np.sqrt(3.0) / 4.0 * max(mesh.spacing, 1e-300) ** 2
+    return np.asarray(np.sqrt(0.5 * np.linalg.norm(across, axis=1) / equilateral), np.float64)
 
 
 def _edge_prices(mesh: Facets) -> NDArray[np.float32]:
@@ -77,33 +80,33 @@ def _reverse_edge_indices(neighbors: IntArray) -> IntArray:
 
 @kernel
 def _keep_best(
-    starts: NDArray[np.int64], face: IntArray, worth: NDArray[np.float32], labels: IntArray, values: NDArray[np.float32]
+    starts: IndexArray, face: IntArray, score: NDArray[np.float32], labels: IntArray, values: NDArray[np.float32]
 ) -> None:
-    """Keep the photos of largest worth for each triangle, best first; ties go to the lower index."""
-    kept = labels.shape[1]
+    """Keep the photos of largest score for each triangle, best first; ties go to the lower index."""
+    last = labels.shape[1] - 1
     for p in range(len(starts) - 1):
         for row in range(starts[p], starts[p + 1]):
             f = face[row]
-            if worth[row] <= values[f, kept - 1]:
+            if score[row] <= values[f, last]:
                 continue
-            at = kept - 1
-            while at > 0 and worth[row] > values[f, at - 1]:
+            at = last
+            while at > 0 and score[row] > values[f, at - 1]:
                 values[f, at], labels[f, at] = values[f, at - 1], labels[f, at - 1]
                 at -= 1
-            values[f, at], labels[f, at] = worth[row], p
+            values[f, at], labels[f, at] = score[row], p
 
 
 @kernel
 def _match_labels(labels: IntArray, neighbors: IntArray, same: NDArray[np.int8]) -> None:
     """Fill in same[f, k, n], the column of the n-th label of neighbor k among the labels of f; -1 for none."""
-    triangles, kept = labels.shape
+    triangles, count = labels.shape
     for f in range(triangles):
         for k in range(3):
             g = neighbors[f, k]
             if g == NONE:
                 continue
-            for n in range(kept):
-                for m in range(kept):
+            for n in range(count):
+                for m in range(count):
                     if labels[g, n] != NONE and labels[f, m] == labels[g, n]:
                         same[f, k, n] = m
 
@@ -122,8 +125,8 @@ def _pass_messages(
     `beside` has the neighbors, the column of each triangle in its neighbor's row, and the labels that both have.
     """
     neighbors, back, same = beside
-    triangles, kept = labels.shape
-    belief, kept_back = np.empty(kept), np.empty(kept)
+    triangles, count = labels.shape
+    belief, rest = np.empty(count), np.empty(count)
     for step in range(triangles):
         f = step if forward else triangles - 1 - step
         before = after = 0
@@ -131,25 +134,25 @@ def _pass_messages(
             before += NONE < neighbors[f, k] < f
             after += neighbors[f, k] > f
         share = 1.0 / max(before, after, 1)
-        for m in range(kept):
+        for m in range(count):
             belief[m] = cost[f, m] + messages[f, 0, m] + messages[f, 1, m] + messages[f, 2, m]
         for k in range(3):
             g = neighbors[f, k]
             if g == NONE or (g > f) != forward or labels[f, 0] == NONE or labels[g, 0] == NONE:
                 continue
             least = np.inf
-            for m in range(kept):
-                kept_back[m] = share * belief[m] - messages[f, k, m]
+            for m in range(count):
+                rest[m] = share * belief[m] - messages[f, k, m]
                 if labels[f, m] != NONE:
-                    least = min(least, kept_back[m])
+                    least = min(least, rest[m])
             lowest = np.inf
-            for n in range(kept):
+            for n in range(count):
                 value, m = least + price[f, k], same[f, k, n]
                 if m != NONE:
-                    value = min(value, kept_back[m])
+                    value = min(value, rest[m])
                 messages[g, back[f, k], n] = value
                 lowest = min(lowest, value)
-            for n in range(kept):
+            for n in range(count):
                 messages[g, back[f, k], n] -= lowest
 
 

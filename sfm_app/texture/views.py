@@ -13,23 +13,22 @@ from sfm_app.jit import kernel
 from sfm_app.types import CameraModel
 from sfm_app.types.arrays import FloatArray
 
-LENS, KIND, LIMIT, POSE = 12, 12, 13, 14
-"""A camera row begins with the parameters of COLMAP's FULL_OPENCV or THIN_PRISM_FISHEYE: fx, fy, cx, cy, k1, k2, p1,
-p2, k3, k4, then k5, k6 or sx1, sy1. The kind of lens follows, the squared radius before distortion up to which it
-shows anything, and the pose [R | t]."""
-ANGLES, TURNS = 360, 720
-"""Rays on which the widest angle of a photo is looked for: half a degree apart from its axis, and around it."""
+LENS = 12
+"""Number of lens parameters at the start of a camera row: COLMAP's FULL_OPENCV or THIN_PRISM_FISHEYE, fx, fy, cx, cy,
+k1, k2, p1, p2, k3, k4, then k5, k6 or sx1, sy1."""
+KIND, LIMIT, POSE = range(LENS, LENS + 3)
+"""Columns of the kind of lens, of the squared radius before distortion at the end of the image, and of [R | t]."""
+ANGLES = 360
+"""Rays from the axis to the back, half a degree apart, that are searched for the widest angle of a photo."""
 OPENCV, RATIONAL, ANGULAR = 0.0, 1.0, 2.0
-"""Kinds of lenses: polynomial and rational perspective ones, and fisheyes."""
+"""Kinds of lenses: polynomial perspective, rational perspective, fisheye."""
 KINDS = {
     "OPENCV": (OPENCV, (0, 1, 2, 3, 4, 5, 6, 7)),
     "FULL_OPENCV": (RATIONAL, (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11)),
     "OPENCV_FISHEYE": (ANGULAR, (0, 1, 2, 3, 4, 5, 8, 9)),
     "THIN_PRISM_FISHEYE": (ANGULAR, (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11)),
 }
-"""Kind of COLMAP's models, and the places of their parameters in a camera row."""
-LEAST_SLOPE = 0.1
-"""Smallest derivative of the distorted radius by the undistorted one; below it, the distortion is near its fold."""
+"""Kind of COLMAP's models, and the columns of their parameters in a camera row."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,11 +44,11 @@ class PhotoView:
     height: int
     kind: float = OPENCV
     limit: float = np.inf
-    """Squared radius before distortion up to which the lens shows anything: squared tangent or angle."""
+    """Squared radius before distortion at the end of the image: squared tangent or angle."""
     part: PerspectiveView | None = None
-    """The view into the panorama `photo`; None where the whole photo is the view."""
+    """The view into the panorama `photo`; None for a whole photo."""
     photo: str = ""
-    """Name of the photo, where it differs from that of the view."""
+    """Name of the photo, if it differs from the view's."""
 
     @property
     def row(self) -> FloatArray:
@@ -59,7 +58,7 @@ class PhotoView:
 
     @property
     def source(self) -> str:
-        """Name of the photo that the view shows."""
+        """Name of the photo of the view."""
         return self.photo or self.name
 
     @property
@@ -69,61 +68,44 @@ class PhotoView:
 
     @property
     def axis(self) -> FloatArray:
-        """(3,) unit vector along which it looks, in the world."""
+        """(3,) unit vector of the optical axis, in the world."""
         return np.asarray(self.cam_from_world[2, :3], np.float64)
 
     @property
     def widest_angle(self) -> float:
-        """Upper bound in radians of the angle between the axis and what the photo shows."""
+        """Upper bound in radians of the angle between the axis and the visible rays."""
         return _widest_angle(self.lens, self.kind, self.limit, self.width, self.height)
 
     def with_size(self, width: int, height: int) -> "PhotoView":
-        """Return the same view for a photo of another size.
-
-        Args:
-            width: pixels, > 0.
-            height: pixels, > 0.
-        """
+        """Return the same view for a photo of another size in pixels."""
         sx, sy = width / self.width, height / self.height
         fx, fy, cx, cy, *rest = self.lens
         return replace(self, lens=(fx * sx, fy * sy, cx * sx, cy * sy, *rest), width=width, height=height)
 
 
 def photo_view(name: str, camera: CameraModel, cam_from_world: FloatArray) -> PhotoView:
-    """Return the view of a registered photo.
-
-    Args:
-        name: of the photo.
-        camera: of one of the models `KINDS`.
-        cam_from_world: (3, 4) [R | t].
+    """Return the view of a registered photo with the pose [R | t] (3, 4).
 
     Raises:
-        ReconstructionError: the camera has another model; every run writes its cameras as one of these.
+        ReconstructionError: the camera is of no model in `KINDS`; every run writes its cameras as one of these.
     """
     if camera.model not in KINDS:
-        raise ReconstructionError(f"the texture cannot use a camera of the model {camera.model}")
-    kind, places = KINDS[camera.model]
+        raise ReconstructionError(f"texturing does not support the camera model {camera.model}")
+    kind, columns = KINDS[camera.model]
     lens = np.zeros(LENS)
-    lens[list(places)] = camera.params
-    limit = np.inf if kind == OPENCV else _shown_limit(lens, kind, camera.width, camera.height)
+    lens[list(columns)] = camera.params
+    limit = np.inf if kind == OPENCV else _image_limit(lens, kind, camera.width, camera.height)
     return PhotoView(name, tuple(lens.tolist()), cam_from_world, camera.width, camera.height, kind, limit)
 
 
 def part_view(name: str, photo: str, part: PerspectiveView, cam_from_world: FloatArray) -> PhotoView:
-    """Return a perspective view into a panorama.
-
-    Args:
-        name: of the view.
-        photo: name of the panorama.
-        part: the view in the panorama's frame.
-        cam_from_world: (3, 4) [R | t] of the panorama.
-    """
+    """Return a perspective view, given in the frame of the panorama `photo`, whose pose is [R | t] (3, 4)."""
     lens = part.K[0, 0], part.K[1, 1], part.K[0, 2], part.K[1, 2]
     return PhotoView(name, lens, part.R @ cam_from_world, part.width, part.height, part=part, photo=photo)
 
 
-def _shown_limit(lens: FloatArray, kind: float, width: int, height: int) -> float:
-    """Return the squared tangent or angle at which the radius of a lens reaches the corner of the photo, or folds."""
+def _image_limit(lens: FloatArray, kind: float, width: int, height: int) -> float:
+    """Return the squared tangent or angle at which a lens reaches the corner of the photo, or folds."""
     corners = np.abs([[x - lens[2], y - lens[3]] for x in (0.0, width) for y in (0.0, height)]) / lens[:2]
     reach = float(np.linalg.norm(corners, axis=1).max())
     angle = shown_angle(lens, FISHEYE if kind == ANGULAR else PERSPECTIVE, reach)
@@ -132,16 +114,16 @@ def _shown_limit(lens: FloatArray, kind: float, width: int, height: int) -> floa
 
 @cache
 def _widest_angle(lens: tuple[float, ...], kind: float, limit: float, width: int, height: int) -> float:
-    """Return the largest angle from the axis that a photo shows, found on rays all round, and two steps more."""
+    """Return the largest angle from the axis of visible rays in all directions, plus two steps."""
     row = PhotoView("", lens, np.eye(3, 4), width, height, kind, limit).row
-    return min(np.pi, _largest_shown(row, width, height) + 2.0 * np.pi / ANGLES)
+    return min(np.pi, _largest_angle(row, width, height) + 2.0 * np.pi / ANGLES)
 
 
 @kernel
-def _largest_shown(camera: FloatArray, width: float, height: float) -> float:
-    largest = 0.0
-    for j in range(TURNS):
-        turn = 2.0 * np.pi * j / TURNS
+def _largest_angle(camera: FloatArray, width: float, height: float) -> float:
+    largest, turns = 0.0, 2 * ANGLES
+    for j in range(turns):
+        turn = 2.0 * np.pi * j / turns
         for i in range(ANGLES):
             angle = np.pi * (i + 1) / ANGLES
             side = np.sin(angle)
@@ -153,13 +135,9 @@ def _largest_shown(camera: FloatArray, width: float, height: float) -> float:
 
 @kernel
 def project(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Project a world point: return its pixel, and its depth or, for a fisheye, its distance.
+    """Project a world point through a camera row (26,): its pixel, and its depth or, for a fisheye, its distance.
 
-    All are 0 if the camera cannot see the point: it is behind it, or outside the valid range of the distortion.
-
-    Args:
-        camera: (26,) from `PhotoView.row`.
-        x, y, z: in the world.
+    All are 0 if the point is invisible: behind the camera, or outside the valid range of the distortion.
     """
     depth = camera[22] * x + camera[23] * y + camera[24] * z + camera[25]
     u = camera[14] * x + camera[15] * y + camera[16] * z + camera[17]
@@ -178,7 +156,8 @@ def project(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, fl
             1.0 + r2 * (camera[9] + r2 * (camera[10] + r2 * camera[11]))
         )
     else:
-        if 1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2) < LEAST_SLOPE:
+        # derivative of the distorted radius: near 0, the distortion folds
+        if 1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2) < 0.1:
             return 0.0, 0.0, 0.0
         radial = 1.0 + r2 * (k1 + k2 * r2)
     ud = u * radial + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u)
@@ -188,7 +167,7 @@ def project(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, fl
 
 @kernel
 def _project_fisheye(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Project a point of the camera's frame through COLMAP's THIN_PRISM_FISHEYE; see `project`."""
+    """Project a point in the camera frame through COLMAP's THIN_PRISM_FISHEYE; see `project`."""
     side = np.hypot(x, y)
     theta = np.arctan2(side, z)
     r2 = theta * theta
@@ -205,14 +184,7 @@ def _project_fisheye(camera: FloatArray, x: float, y: float, z: float) -> tuple[
 
 @kernel
 def sample(photo: NDArray[np.uint8], x: float, y: float, channel: int) -> float:
-    """Return the bilinear value at a pixel position, clamped to the photo.
-
-    Args:
-        photo: (H, W, 3) RGB.
-        x: pixels across; centers at +0.5.
-        y: pixels down; centers at +0.5.
-        channel: 0, 1 or 2.
-    """
+    """Return the bilinear value of a photo (H, W, 3) at a pixel, centers at +0.5, clamped to the photo."""
     height, width = photo.shape[0], photo.shape[1]
     x = min(max(x - 0.5, 0.0), width - 1.0)
     y = min(max(y - 0.5, 0.0), height - 1.0)

@@ -109,9 +109,7 @@ def test_the_page_says_what_was_found(mapped):
     focal = next(iter(mapped.scene.cameras.values())).K[0, 0]
 
     assert "Cameras and points from all 7 photos." in page.text
-    assert (
-        f"{focal:.0f} px" in page.text and "Seen from above" in page.text and "Which photos hang together" in page.text
-    )
+    assert f"{focal:.0f} px" in page.text and "Seen from above" in page.text and "Connected photos" in page.text
     assert mapped.report_path == mapped.out / REPORT
 
 
@@ -165,7 +163,7 @@ def test_a_damaged_model_is_left_out_and_not_given_to_colmap(mapped, tmp_path, m
 
     text, page = read(out)
     assert data_of(text)["view"] is None and [row["state"] for row in data_of(text)["photos"][:7]] == ["usable"] * 7
-    assert "Which photos hang together" in page.text
+    assert "Connected photos" in page.text
 
 
 def test_a_folder_without_photos_says_why_and_names_the_files(rendered, tmp_path):

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from sfm_app.cli.commands import SCENES as TEXTS
 
 from benchmarks.synthetic.scenes import poster
 from benchmarks.synthetic.walks import orbit
 from sfm_app.api import Run
 from sfm_app.camera.models import camera_matrix
+from sfm_app.cli.commands import SCENES as TEXTS
 from sfm_app.cli.output import fold_lines
 from sfm_app.demo import SCENES, DemoScene, camera_of, demo_lines, draw, evaluate, render_photos
 from sfm_app.errors import InputError

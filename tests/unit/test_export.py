@@ -127,7 +127,7 @@ def test_a_surface_that_was_cut_off_is_no_crash(finished, left):
 
     result = call(finished, "--format", "ply")
 
-    assert (result.exit_code, "is damaged" in result.stderr) == (3, True)
+    assert (result.exit_code, "are damaged" in result.stderr) == (3, True)
     assert "resumes where it stopped" in result.stderr
 
 

@@ -1,13 +1,18 @@
+"""Compilation of kernels, in this process and in one beside the first run."""
+
 import os
 import subprocess
 import sys
+import time
 from importlib.metadata import version
+from pathlib import Path
 
 import numba
 import numpy as np
+import psutil
 import pytest
 
-from sfm_app.jit import kernel, summing_kernel
+from sfm_app.jit import PARENT, kernel, summing_kernel, warming_up
 
 pytestmark = pytest.mark.slow
 
@@ -33,10 +38,10 @@ def test_a_kernel_compiles_where_nothing_can_be_cached(monkeypatch, decorator):
 def test_sums_in_lanes_still_know_infinities():
     @summing_kernel
     def total(values):
-        found = 0.0
+        result = 0.0
         for k in range(values.shape[0]):
-            found += values[k]
-        return found
+            result += values[k]
+        return result
 
     values = np.random.default_rng(0).normal(size=1001)
     assert total(values) == pytest.approx(values.sum(), rel=1e-12)
@@ -63,3 +68,60 @@ def test_kernels_are_cached_in_a_folder_of_this_version(tmp_path):
 
 def test_the_cache_of_other_functions_stays_where_it_is():
     assert os.environ.get("NUMBA_CACHE_DIR", "") == numba.config.CACHE_DIR
+
+
+HANGS_S = 600
+
+
+@pytest.fixture
+def cold(tmp_path, monkeypatch):
+    """The missing marker of compiled kernels, on a machine without any."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.delenv(PARENT, raising=False)
+    return tmp_path / "cache" / "warm"
+
+
+def compilers():
+    return [one for one in psutil.Process().children() if "sfm_app.warm_up" in one.cmdline()]
+
+
+def test_kernels_are_compiled_while_the_block_lasts(cold):
+    with warming_up([].append, cold):
+        until = time.monotonic() + HANGS_S
+        while not compilers() and time.monotonic() < until:  # the arguments of a new process can be read a moment later
+            time.sleep(0.01)
+        (process,) = compilers()
+        folder = Path(process.cmdline()[-1])
+        assert folder.is_dir()
+
+    assert not compilers() and not folder.exists()
+
+
+def test_compiled_kernels_are_not_compiled_again(cold):
+    cold.parent.mkdir()
+    cold.touch()
+
+    with warming_up([].append, cold):
+        assert not compilers()
+
+
+def test_the_process_starts_no_other(cold, monkeypatch):
+    monkeypatch.setenv(PARENT, "1")
+
+    with warming_up([].append, cold):
+        assert not compilers()
+
+
+@pytest.mark.slow
+def test_all_stages_are_compiled(tmp_path):
+    """With the cache of the other tests: only the file that says that all is compiled is elsewhere."""
+    code = (
+        "import pathlib, sys; from sfm_app import jit; jit.WARM = pathlib.Path(sys.argv[1]) / 'cache' / 'warm'; "
+        "from sfm_app import warm_up; warm_up.main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=False, timeout=HANGS_S
+    )
+
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "model" / "model.glb").exists() and (tmp_path / "cache" / "warm").exists()

@@ -46,7 +46,7 @@ def test_the_import_leaves_out_what_an_estimator_does_not_need():
 @pytest.mark.slow
 def test_the_processes_of_colmap_do_not_load_the_estimators():
     heavy = {"numba", "sfm_app.api", "sfm_app.plugins", "sfm_app.fundamental"}
-    lists = "import sys, sfm_app.colmap.match_process; print(*sys.modules)"
+    lists = "import sys, sfm_app.colmap.tasks, sfm_app.colmap.features; print(*sys.modules)"
 
     done = subprocess.run([sys.executable, "-c", lists], capture_output=True, text=True, check=True)
 

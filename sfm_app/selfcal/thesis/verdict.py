@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_app.camera.models import camera_matrix
-from sfm_app.selfcal.consensus import SIGMAS, Consensus, best_rival, disagreement, indecision, votes
+from sfm_app.selfcal.consensus import CONSENSUS, Consensus, ambiguity_reason, best_rival, support_reason, votes
 from sfm_app.selfcal.pairs import Pairs, guess_calibration, prepare
 from sfm_app.types import Calibration, CameraPairs
 from sfm_app.types.arrays import FloatArray
@@ -51,44 +51,41 @@ def calibrate_with(method: str, pairs: CameraPairs, find: Find, sample: int = 0)
     """Run a method and judge its answer.
 
     Args:
-        method: its name.
-        pairs: what it works from.
-        find: the method.
-        sample: number of pairs that it picks and fits alone. These agree even with a wrong answer, so that the others
-            must confirm it.
+        sample: number of pairs that the method picks and fits alone. These agree even with a wrong answer, so that the
+            others must confirm it.
 
     Returns:
-        K with ``identifiable=True``, or a guess and the reason. `evidence` has what the method answered in both cases,
-        as fx_px, fy_px, cx_px and cy_px.
+        K with ``identifiable=True``, or a guess and the reason. In both cases `evidence` has the answer of the method:
+        fx_px, fy_px, cx_px and cy_px.
 
     Raises:
-        ValueError: malformed input, see `selfcal.inputs.prepare`.
+        ValueError: malformed input, see `selfcal.pairs.prepare`.
     """
     width, height = size = pairs.size
     usable = prepare(pairs, unit_px=width, origin_px=(0.0, 0.0))
     evidence = {"pairs": float(len(usable))}
     if len(usable) < MIN_PAIRS:
         return guess_calibration(size, f"{len(usable)} usable pairs, {MIN_PAIRS} are needed", evidence)
-    found = find(usable, height / width, evidence)
-    if isinstance(found, str):
-        return guess_calibration(size, found, evidence)
-    in_px = [float(width * value) for value in found]
+    answer = find(usable, height / width, evidence)
+    if isinstance(answer, str):
+        return guess_calibration(size, answer, evidence)
+    in_px = [float(width * value) for value in answer]
     evidence |= dict(zip(("fx_px", "fy_px", "cx_px", "cy_px"), in_px, strict=True))
-    reason = _objection(found, usable, sample, evidence)
+    reason = _rejection_reason(answer, usable, sample, evidence)
     if reason:
         return guess_calibration(size, reason, evidence)
     return Calibration(camera_matrix(*in_px), width, height, method, identifiable=True, evidence=evidence)
 
 
-def _objection(found: CameraParameters, pairs: Pairs, sample: int, evidence: dict[str, float]) -> str:
+def _rejection_reason(answer: CameraParameters, pairs: Pairs, sample: int, evidence: dict[str, float]) -> str:
     """Return why the answer is not trusted, or an empty string; add support and lead to the evidence."""
-    theta = np.array([0.5 * np.log(found.fx * found.fy), found.u, found.v, np.log(found.fy / found.fx)])
+    theta = np.array([0.5 * np.log(answer.fx * answer.fy), answer.u, answer.v, np.log(answer.fy / answer.fx)])
     # the wider sigma: these answers are no maxima of the consensus, and may be off by a per cent
-    consensus, sigmas = Consensus(pairs, np.inf), SIGMAS[:1]
-    given = votes(consensus, theta, sigmas[-1])
-    lead = float(np.sum(given)) - best_rival(consensus, theta, range(4), sigmas)
-    evidence |= {"support": float(np.sum(given) / np.sum(pairs.weights)), "lead": lead}
+    consensus, sigmas = Consensus(pairs, np.inf), CONSENSUS.sigmas[:1]
+    cast = votes(consensus, theta, sigmas[-1])
+    margin = float(np.sum(cast)) - best_rival(consensus, theta, range(4), sigmas)
+    evidence |= {"support": float(np.sum(cast) / np.sum(pairs.weights)), "lead": margin}
     if len(pairs) <= sample:
-        return f"{sample} pairs were fitted, and no others are there to confirm it"
-    others = np.argsort(given, kind="stable")[: len(pairs) - sample]
-    return disagreement(given[others], pairs.weights[others]) or indecision(lead, given)
+        return f"the answer fits {sample} pairs, and no other pairs confirm it"
+    others = np.argsort(cast, kind="stable")[: len(pairs) - sample]
+    return support_reason(cast[others], pairs.weights[others]) or ambiguity_reason(margin, cast)

@@ -170,7 +170,7 @@ def test_an_unknown_scale_names_the_remedy(finished):
     lines = outcome_lines(replace(finished, manifest={"stages": stages}), 250.0)
     [size] = [line for line in lines if line.startswith("size")]
 
-    assert '"measure" in the report' in size and len(size) <= 80
+    assert "measure it in the report" in size and len(size) <= 80
 
 
 def test_a_run_of_some_stages_has_its_own_headline(finished):
@@ -193,7 +193,7 @@ def test_every_parameter_stands_beside_its_deviation():
         "sees 93 degrees from left to right, 78 from top to bottom",
         "The lens bends lines outwards (barrel), k1 -0.050 +- 0.010.",
         "Assumed, since the photos do not determine it: square pixels.",
-        "best pairs of photos to start from: a.jpg + b.jpg, b.jpg + c.jpg, c.jpg + 4",
+        "best initial pairs of photos: a.jpg + b.jpg, b.jpg + c.jpg, c.jpg + 4",
     ]
 
 
@@ -205,7 +205,7 @@ def test_fisheyes_and_panoramas_have_their_field_of_view():
     lines = [line.strip() for line in intrinsics_lines(Intrinsics({"one": fisheye, "two": panorama}))]
 
     assert lines[1] == "a fisheye that sees 120 degrees from left to right, 96 from top to bottom"
-    assert lines[2:] == ["camera      two: panoramas of a whole turn, 1000 x 500 px"]
+    assert lines[2:] == ["camera      two: 360-degree panoramas, 1000 x 500 px"]
 
 
 def test_a_given_camera_is_marked():
@@ -221,7 +221,7 @@ def test_refined_cameras_have_their_field_of_view():
     plain = CameraModel("OPENCV", (500, 510, 480, 410, 0, 0, 0, 0), K, 1000, 800)
 
     assert refined_text(fisheye).endswith("; a fisheye that sees 120 degrees from left to right, 96 from top to bottom")
-    assert refined_text(panorama) == "panoramas of a whole turn, 1000 x 500 px"
+    assert refined_text(panorama) == "360-degree panoramas, 1000 x 500 px"
     assert refined_text(plain) == "fx 500.0  fy 510.0  cx 480.0  cy 410.0 px"
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_app.camera.projection import CAMERA, CX, CY, FX, FY, PANORAMA
+from sfm_app.colmap import bundle
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundle import adjust, camera_family, file_model, read_camera, solve, write_camera
 from sfm_app.numerical import json_text
@@ -112,7 +113,7 @@ def test_the_model_of_every_camera_is_named_with_its_rivals(mixed):
 def test_other_families_are_not_tried_where_that_is_settled(mixed, monkeypatch):
     monkeypatch.setattr("sfm_app.colmap.bundle.best_families", None)
 
-    found = adjust(*mixed, settled=True)
+    found = adjust(*mixed, families_known=True)
 
     assert [found.model.cameras[key].model.name for key in (1, 2)] == ["OPENCV", "OPENCV_FISHEYE"]
     assert found.lenses[1].chosen.model == "SIMPLE_PINHOLE"
@@ -156,7 +157,7 @@ def test_colmap_moves_poses_and_points_of_a_model_of_three_families(mixed):
 @pytest.mark.slow
 @pytest.mark.parametrize("most", [250, 8])
 def test_a_narrow_lens_taken_for_a_fisheye_becomes_perspective(mapped, monkeypatch, most):
-    monkeypatch.setattr("sfm_app.colmap.bundle.MOST_COMPARED", most)
+    monkeypatch.setattr(bundle, "OPTIONS", bundle.AdjustmentOptions(most_compared=most))
     model, database = mapped(
         [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=16, start=(893.0, 500.0, 400.0, 0.0)
     )

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from sfm_app.colmap.database import create_database, read_match_graph
-from sfm_app.colmap.features import find_and_match
+from sfm_app.colmap.features import SiftSettings, find_and_match
 from sfm_app.progress import SilentProgress
 from sfm_app.settings import MatchSettings
 from sfm_app.types import Photo, PhotoSet
@@ -38,7 +38,9 @@ def find(place, database, **options):
     photos = PhotoSet(place, tuple(Photo(name, *SIZE, "g") for name in (RICH, POOR, EMPTY)))
     if not database.exists():
         create_database(database, photos)
-    find_and_match(database, place, (RICH, POOR, EMPTY), MatchSettings(**options), 1, SilentProgress(), pairs=())
+    find_and_match(
+        database, SiftSettings(place, None, MatchSettings(**options)), (RICH, POOR, EMPTY), 1, SilentProgress(), ()
+    )
     graph = read_match_graph(database, photos)
     return {graph.images[key].name: at for key, at in graph.keypoints.items()}
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap import mapping
-from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.backend import largest_model, pycolmap
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.global_mapping import global_options
+from sfm_app.colmap.tasks import global_options
 from sfm_app.errors import BackendError
 
 pytestmark = pytest.mark.slow
@@ -42,7 +42,7 @@ def test_mapping_seeks_the_lens_only_where_nothing_is_known_about_it(tmp_path, m
     monkeypatch.setattr(mapping.pycolmap, "incremental_mapping", grow)
     place = tmp_path / "database.db", tmp_path, start, tmp_path / "scratch"
 
-    found = mapping.map_incrementally(*place, 0, lambda: None, NEVER, known=False)
+    found = mapping.map_incrementally(*place, mapping.incremental_options(0), lambda: None, NEVER)
 
     assert found is start
     assert seen == [sought]
@@ -56,7 +56,7 @@ def test_kept_cameras_are_constant_for_colmap(tmp_path, monkeypatch):
     place = tmp_path / "database.db", tmp_path, pycolmap.Reconstruction(), tmp_path / "scratch"
 
     for kept in ({2, 3}, ()):
-        mapping.map_incrementally(*place, 0, lambda: None, NEVER, known=False, kept=kept)
+        mapping.map_incrementally(*place, mapping.incremental_options(0, kept=kept), lambda: None, NEVER)
 
     assert seen == [{2, 3}, set()]
 
@@ -154,5 +154,5 @@ def test_options_are_ours_for_both_mappers():
 def test_of_several_models_the_one_with_most_photos_counts():
     models = {key: SimpleNamespace(num_reg_images=lambda count=count: count) for key, count in ((0, 2), (1, 5), (2, 3))}
 
-    assert mapping.largest_model(models) is models[1]
-    assert mapping.largest_model({}) is None
+    assert largest_model(models) is models[1]
+    assert largest_model({}) is None

@@ -9,7 +9,6 @@ from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import create_database, read_match_graph
 from sfm_app.colmap.dense import (
     MASKED,
-    REACH_PX,
     DenseStore,
     MaskUndistorter,
     mask_depths,
@@ -20,7 +19,7 @@ from sfm_app.colmap.dense import (
     write_fusion_views,
     write_maps,
 )
-from sfm_app.colmap.features import find_and_match
+from sfm_app.colmap.features import SiftSettings, find_and_match
 from sfm_app.colmap.surface import FUSED, fuse, open_points, positions
 from sfm_app.photos import save_mask
 from sfm_app.progress import SilentProgress
@@ -79,7 +78,7 @@ def test_no_keypoint_lies_in_what_is_masked(place, tmp_path):
     for masks in (None, root / "masks"):
         database = tmp_path / f"{masks is None}.db"
         create_database(database, photos)
-        find_and_match(database, root / "photos", NAMES, MatchSettings(), 1, SilentProgress(), masks)
+        find_and_match(database, SiftSettings(root / "photos", masks, MatchSettings()), NAMES, 1, SilentProgress())
         graph = read_match_graph(database, photos)
         found[masks] = {graph.images[key].name: np.floor(at).astype(int) for key, at in graph.keypoints.items()}
 
@@ -95,7 +94,7 @@ def test_masks_are_undistorted_as_photos_are(place, dense):
     model = pycolmap.Reconstruction(root / "sparse")
     options = pycolmap.UndistortCameraOptions()
     options.max_image_size = 120
-    square = np.ones((2 * REACH_PX + 1, 2 * REACH_PX + 1), np.uint8)
+    square = np.ones((2 * 2 + 1, 2 * 2 + 1), np.uint8)
     for name, view in dense[1].items():
         bitmap = pycolmap.Bitmap.from_array(np.where(used[name], np.uint8(255), np.uint8(0)))
         theirs = pycolmap.undistort_image(options, bitmap, model.cameras[1])[0].to_array()
@@ -104,7 +103,7 @@ def test_masks_are_undistorted_as_photos_are(place, dense):
         assert seen.shape == theirs.shape == (view.height, view.width)
         near = cv2.erode(theirs, square)
         assert (near[seen] == 255).all()  # nothing masked shows through, and next to nothing is lost
-        wide = cv2.erode(theirs, np.ones((2 * REACH_PX + 5, 2 * REACH_PX + 5), np.uint8))
+        wide = cv2.erode(theirs, np.ones((2 * 2 + 5, 2 * 2 + 5), np.uint8))
         assert seen[wide == 255].all()
     assert used_pixels(dense[0], dense[1]["3.png"]).all()
 

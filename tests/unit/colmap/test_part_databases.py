@@ -10,10 +10,10 @@ from PIL import Image
 
 from sfm_app.colmap.database import create_database, digest_matches, open_database, unmatched_pairs
 from sfm_app.colmap.features import (
-    BLOCK,
     FEATURES,
     MATCHES,
     SiftInputs,
+    SiftSettings,
     enter_rows,
     exhaustive_pairs,
     find_and_match,
@@ -40,6 +40,8 @@ class Counted(SilentProgress):
 
 
 OPTIONS = MatchSettings(max_features=200)
+BLOCK = 50
+"""Photos of a block in COLMAP's exhaustive matching."""
 COUNT = BLOCK + 3
 
 
@@ -57,13 +59,15 @@ def made(tmp_path_factory):
         wall.crop((left, top, left + 96, top + 96)).save(place / "photos" / photos[-1].name)
     create_database(place / "empty.db", PhotoSet(place / "photos", tuple(photos), (), None))
     shutil.copyfile(place / "empty.db", place / "whole.db")
-    find_and_match(place / "whole.db", place / "photos", [photo.name for photo in photos], OPTIONS, 1, SilentProgress())
+    settings = SiftSettings(place / "photos", None, OPTIONS)
+    find_and_match(place / "whole.db", settings, [photo.name for photo in photos], 1, SilentProgress())
     return place
 
 
 def inputs_of(place, database, folder):
     folder.mkdir()
-    inputs = SiftInputs(folder / "photos.db", folder / "features.db", place / "photos", None, OPTIONS, {}, folder)
+    settings = SiftSettings(place / "photos", None, OPTIONS)
+    inputs = SiftInputs(folder / "photos.db", folder / "features.db", settings, folder)
     write_snapshot(database, inputs.snapshot, (*FEATURES, *MATCHES))
     write_snapshot(database, inputs.features, MATCHES)
     return inputs
@@ -112,7 +116,7 @@ def test_a_process_that_is_stopped_leaves_nothing(made, tmp_path):
     before = sorted(path.name for path in inputs.folder.iterdir())
     group.stop()
 
-    with pytest.raises(BackendError, match="ended"):
+    with pytest.raises(BackendError, match="killed"):
         match_chunk_apart(inputs, group, SilentProgress(), [(1, 2)])
 
     assert sorted(path.name for path in inputs.folder.iterdir()) == before

@@ -94,7 +94,7 @@ def test_progress_comes_through(child):
         ("os._exit(7)", "COLMAP failed while working: it ended with 7"),
         pytest.param(
             "os.kill(os.getpid(), signal.SIGKILL)",
-            "ended from outside while working: perhaps the memory was full",
+            "the system killed COLMAP while working, perhaps because memory ran out",
             marks=POSIX,
         ),
     ],

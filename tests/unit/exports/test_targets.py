@@ -163,7 +163,7 @@ def test_a_cloud_that_was_cut_off_or_removed_is_no_crash(make_run):
     file.unlink()
     gone = call(run.out, "--format", "cloud-ply")
 
-    assert (cut.exit_code, "is damaged" in cut.stderr) == (3, True), cut.stderr
+    assert (cut.exit_code, "are damaged" in cut.stderr) == (3, True), cut.stderr
     assert (gone.exit_code, "--from mesh" in gone.stderr) == (3, True), gone.stderr
 
 

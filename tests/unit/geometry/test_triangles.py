@@ -1,11 +1,17 @@
-"""Triangles in space."""
+"""Normals, edges, tangents and culling of triangles."""
 
 import numpy as np
+import pytest
 
 from sfm_app.geometry.triangles import (
     areas,
+    border_angle,
     bucket_order,
+    cluster,
+    corner_angles,
+    corner_tangents,
     median_edge_length,
+    morton_order,
     number_vertices,
     unique_edges,
     vertex_normals,
@@ -65,3 +71,103 @@ def test_used_vertices_are_numbered_in_order():
     np.testing.assert_array_equal(used, [2, 4, 7, 9])
     np.testing.assert_array_equal(faces, [[2, 0, 3], [0, 3, 1]])
     assert [len(part) for part in number_vertices(np.empty((0, 3), np.int64))] == [0, 0]
+
+
+@pytest.fixture(scope="module")
+def triangles():
+    rng = np.random.default_rng(0)
+    return rng.uniform(-50, 50, (20_000, 1, 3)) + rng.normal(0, 0.3, (20_000, 3, 3))
+
+
+@pytest.mark.parametrize("angle_deg", [5.0, 30.0, 90.0, 150.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_in_the_cone_is_missed(triangles, angle_deg, seed):
+    rng = np.random.default_rng(seed)
+    apex, axis = rng.uniform(-40, 40, 3), rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    way = triangles - apex
+    cosine = way @ axis / np.linalg.norm(way, axis=2)
+    inside = np.flatnonzero((cosine >= np.cos(np.radians(angle_deg))).any(axis=1))
+
+    found = cluster(triangles).find_in_cone(apex, axis, np.radians(angle_deg))
+
+    assert np.isin(inside, found).all()
+    assert (np.diff(found) > 0).all()
+
+
+def test_a_narrow_cone_looks_at_few(triangles):
+    found = cluster(triangles).find_in_cone(np.array([-150.0, 0, 0]), np.array([1.0, 0, 0]), np.radians(3))
+
+    assert 0 < len(found) < 0.6 * len(triangles)
+
+
+def test_nothing_is_in_view_of_a_camera_that_looks_away(triangles):
+    assert len(cluster(triangles).find_in_cone(np.array([150.0, 0, 0]), np.array([1.0, 0, 0]), np.radians(30))) == 0
+
+
+def test_of_nothing_nothing_is_seen():
+    found = cluster(np.empty((0, 3, 3))).find_in_cone(np.zeros(3), np.array([0, 0, 1.0]), 1.0)
+
+    assert len(found) == len(morton_order(np.empty((0, 3)))) == 0
+
+
+def test_the_border_of_a_photo_is_that_of_its_corners():
+    K = np.array([[100.0, 0, 40], [0, 100, 30], [0, 0, 1]])
+
+    assert np.degrees(border_angle(K, 80, 60)) == pytest.approx(np.degrees(np.arctan(0.5)), abs=1.0)
+    assert border_angle(K, 80, 60) > np.arctan(0.5)
+
+
+TANGENT_SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+FACES = np.array([[0, 1, 2], [0, 2, 3]])
+ONE_PAGE = np.zeros(2, np.int32)
+
+
+def tangents(uv, vertices=TANGENT_SQUARE, page=ONE_PAGE):
+    normals = vertex_normals(vertices, FACES)
+    return corner_tangents(vertices, normals, FACES, uv.astype(np.float32), page)
+
+
+def pictured(flat):
+    """Texture coordinates that show a square as it is, from the top left."""
+    return flat[FACES][..., :2] * [1, -1] + [0, 1]
+
+
+def test_a_picture_that_lies_upright_has_the_axes_as_its_frame():
+    np.testing.assert_allclose(tangents(pictured(TANGENT_SQUARE)), np.broadcast_to([1, 0, 0, 1], (2, 3, 4)), atol=1e-7)
+
+
+def test_a_mirrored_picture_has_its_right_on_the_left_and_still_its_up_on_top():
+    found = tangents(1.0 - pictured(TANGENT_SQUARE) * [1, -1] - [0, 1])  # left and right exchanged
+
+    np.testing.assert_allclose(found, np.broadcast_to([-1, 0, 0, -1], (2, 3, 4)), atol=1e-7)
+    np.testing.assert_allclose(
+        found[..., 3:] * np.cross([0, 0, 1], found[..., :3]), np.broadcast_to([0, 1, 0], (2, 3, 3))
+    )
+
+
+def test_corners_share_a_tangent_where_they_share_vertex_place_and_page():
+    bent = np.column_stack([TANGENT_SQUARE[:, :2], [0, 0.3, 0, -0.2]])
+    uv = pictured(TANGENT_SQUARE) * [1, 0.7] + np.array([[[0, 0]] * 3, [[0.1, 0], [0, 0.05], [0, 0]]])
+    joined, parted = tangents(pictured(TANGENT_SQUARE), bent), tangents(uv, bent)
+    on_pages = tangents(pictured(TANGENT_SQUARE), bent, np.array([0, 1], np.int32))
+
+    np.testing.assert_array_equal(joined[0, [0, 2]], joined[1, [0, 1]])
+    assert (parted[0, 0] != parted[1, 0]).any()
+    assert (on_pages[0, 0] != on_pages[1, 0]).any()
+    normals = vertex_normals(bent, FACES)[FACES]
+    for found in (joined, parted, on_pages):
+        np.testing.assert_allclose(np.linalg.norm(found[..., :3], axis=2), 1, atol=1e-6)
+        np.testing.assert_allclose(np.sum(found[..., :3] * normals, axis=2), 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("uv", [np.zeros((2, 3, 2)), np.full((2, 3, 2), 0.5) * [[0], [1], [2]]], ids=["point", "line"])
+def test_a_texture_without_area_still_has_unit_tangents(uv):
+    found = tangents(uv)
+
+    np.testing.assert_allclose(np.linalg.norm(found[..., :3], axis=2), 1, atol=1e-6)
+    np.testing.assert_allclose(found[..., 2], 0, atol=1e-6)
+
+
+def test_angles_of_triangles():
+    np.testing.assert_allclose(np.degrees(corner_angles(TANGENT_SQUARE[FACES])), [[45, 90, 45], [45, 45, 90]])

@@ -2,16 +2,17 @@
 
 import pytest
 from PIL import Image
+from PIL.ExifTags import IFD
 from PIL.TiffImagePlugin import IFDRational
 
-from sfm_app.photos.decode import EXIF_IFD, focal_px
+from sfm_app.photos.decode import focal_px
 
 MM, EQUIVALENT, WIDTH, HEIGHT, RESOLUTION, UNIT = 0x920A, 0xA405, 0xA002, 0xA003, 0xA20E, 0xA210
 
 
 def claimed(longer_side, **tags):
     exif = Image.Exif()
-    exif.get_ifd(EXIF_IFD).update({globals()[name]: value for name, value in tags.items()})
+    exif.get_ifd(IFD.Exif).update({globals()[name]: value for name, value in tags.items()})
     return focal_px(exif, longer_side)
 
 

@@ -83,7 +83,7 @@ def try_out(run, cameras, monkeypatch):
             done[mapper].set()
             return result
 
-        def grow(database, photo_dir, start, scratch, seed, tick, token, *, known, kept):
+        def grow(database, photo_dir, start, scratch, options, tick, token):
             if not isinstance(start, tuple):  # what another mapper made
                 return model(completed, points) if completed else None
             placed = grown[start[0] - 1] if start[0] <= len(grown) else 0

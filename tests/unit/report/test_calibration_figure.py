@@ -6,7 +6,7 @@ import pytest
 
 from sfm_app.errors import ConfigError
 from sfm_app.report.figures import (
-    MOST_CAMERAS,
+    OPTIONS,
     Panel,
     calibration_text,
     center_plane,
@@ -66,8 +66,8 @@ def test_votes_are_unanimous_at_the_camera_and_nowhere_higher(panel, make):
     row, column = np.unravel_index(np.argmax(shares), shares.shape)
     cells = len(shares)
     peak = left + (right - left) * (column + 0.5) / cells, bottom + (top - bottom) * (row + 0.5) / cells
-    assert abs(peak[0] - plane.found[0]) <= abs(right - left) / cells
-    assert abs(peak[1] - plane.found[1]) <= abs(top - bottom) / cells
+    assert abs(peak[0] - plane.estimate[0]) <= abs(right - left) / cells
+    assert abs(peak[1] - plane.estimate[1]) <= abs(top - bottom) / cells
     assert 0.8 < shares.max() <= 1.0
 
 
@@ -75,10 +75,10 @@ def test_votes_are_unanimous_at_the_camera_and_nowhere_higher(panel, make):
 def test_curves_pass_through_the_camera(panel, make):
     plane = make(panel.camera, prepared(panel))
 
-    there = plane.curves(np.array([plane.found[0]]))[:, 0]
+    there = plane.curves(np.array([plane.estimate[0]]))[:, 0]
 
     # a pair may have a second real root there, and the curve may be the other one
-    assert np.mean(np.abs(there - plane.found[1]) < 0.5) >= 0.7
+    assert np.mean(np.abs(there - plane.estimate[1]) < 0.5) >= 0.7
 
 
 def test_a_guess_is_drawn_without_pairs(panel, tmp_path):
@@ -92,12 +92,12 @@ def test_a_guess_is_drawn_without_pairs(panel, tmp_path):
 
 @pytest.mark.slow
 def test_of_many_cameras_the_first_are_drawn(panel, tmp_path):
-    for count in (1, MOST_CAMERAS + 1):
+    for count in (1, OPTIONS.most_cameras + 1):
         draw_calibration(tmp_path / f"{count}.svg", [panel._replace(name=f"camera-{k}") for k in range(count)])
 
-    text = (tmp_path / f"{MOST_CAMERAS + 1}.svg").read_text()
-    assert f"camera-{MOST_CAMERAS - 1}, one of {MOST_CAMERAS + 1}" in text
-    assert f"camera-{MOST_CAMERAS}," not in text
+    text = (tmp_path / f"{OPTIONS.most_cameras + 1}.svg").read_text()
+    assert f"camera-{OPTIONS.most_cameras - 1}, one of {OPTIONS.most_cameras + 1}" in text
+    assert f"camera-{OPTIONS.most_cameras}," not in text
     assert "camera-0" not in (tmp_path / "1.svg").read_text()
 
 

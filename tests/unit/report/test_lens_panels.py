@@ -12,7 +12,7 @@ from sfm_app.selfcal.wide_lens import Fisheye, LensEstimate
 SAYS = {
     "perspective": ["ideal pinhole", "square pixels", "votes"],
     "fisheye": ["ideal equidistant lens", "stereographic", "a fisheye that sees 141 degrees"],
-    "equirectangular": ["a whole turn", "Panoramas of a whole turn, 1000 x 500 px"],
+    "equirectangular": ["equirectangular", "360-degree panoramas, 1000 x 500 px"],
 }
 
 

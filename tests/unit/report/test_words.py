@@ -36,7 +36,7 @@ def test_wide_lenses_say_what_they_see():
         "Focal length 400 px: a fisheye that sees 143 degrees from left to right, 115 from top to bottom."
     )
     assert field_text(narrow) == "sees 64 degrees from left to right, 51 from top to bottom"
-    assert focal_text(panorama) == "Panoramas of a whole turn, 1000 x 800 px." and center_text(panorama) == ""
+    assert focal_text(panorama) == "360-degree panoramas, 1000 x 800 px." and center_text(panorama) == ""
     assert verdict(camera(method="given")).startswith("Given: ")
 
 
@@ -59,8 +59,7 @@ def test_the_center_is_told_from_the_middle(cx, cy, says):
 def test_a_guess_says_what_it_is_and_why():
     text = verdict(camera(identifiable=False, method="exif", reason="an orbit"))
 
-    assert text.startswith("Not known: what follows is what the camera wrote into the files")
-    assert text.endswith("an orbit.")
+    assert text == "Not known: these photos do not determine the camera: an orbit. Its values are from EXIF."
 
 
 def test_a_lens_and_what_is_held_are_told_only_where_there_is_something_to_tell():

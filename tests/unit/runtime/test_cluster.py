@@ -1,6 +1,7 @@
-"""Tasks on a cluster of this machine: the same results in the same order, whatever becomes of its workers."""
+"""Tasks on a cluster of this machine: the same results in the same order, even if workers are killed."""
 
 import os
+import pickle
 import sys
 import textwrap
 import time
@@ -14,17 +15,17 @@ from sfm_app.errors import ClusterError, ConfigError, InputError
 from sfm_app.progress import SilentProgress
 from sfm_app.runtime import cluster
 from sfm_app.runtime.cluster import (
+    OPTIONS,
     PROCESSOR,
-    SMALL_BYTES,
     Cluster,
     Probe,
     describe_item,
+    deserialize,
     differences,
     find_misfit,
     local_workers,
-    packing,
+    open_serializer,
     picklable,
-    unpack,
     worker_versions,
 )
 from sfm_app.runtime.parallel import make_executor, open_executor, ordered_map, threads_elsewhere
@@ -96,30 +97,30 @@ def two(place, tasks):
         assert (workers, threads_elsewhere(executor)) == (2, 2)
         yield executor
     assert not (place / "out" / ".cluster").exists()
-    left = [child for child in psutil.Process().children(recursive=True) if "local_workers" in str(child.cmdline())]
-    assert left == []
+    rest = [child for child in psutil.Process().children(recursive=True) if "runtime.cluster" in str(child.cmdline())]
+    assert rest == []
 
 
 @pytest.mark.slow
 def test_results_keep_their_order_and_come_from_other_processes(two, tasks):
-    found = list(ordered_map(two, Task(tasks.double), range(40), ahead=2))
-    assert [value for value, _ in found] == [2 * x for x in range(40)]
-    assert os.getpid() not in {pid for _, pid in found}
+    results = list(ordered_map(two, Task(tasks.double), range(40), ahead=2))
+    assert [value for value, _ in results] == [2 * x for x in range(40)]
+    assert os.getpid() not in {pid for _, pid in results}
 
 
 @pytest.mark.slow
-def test_what_is_no_task_stays_here(two):
-    seen = []
-    assert list(ordered_map(two, seen.append, range(5), ahead=2)) == [None] * 5
-    assert sorted(seen) == [0, 1, 2, 3, 4]
+def test_functions_that_are_no_tasks_stay_in_this_process(two):
+    items = []
+    assert list(ordered_map(two, items.append, range(5), ahead=2)) == [None] * 5
+    assert sorted(items) == [0, 1, 2, 3, 4]
 
 
 @pytest.mark.slow
 def test_large_values_travel_as_files_that_do_not_stay(two, tasks, place, monkeypatch):
     monkeypatch.chdir(place)
     values = np.arange(100_000, dtype=np.float64)
-    found = list(ordered_map(two, Task(tasks.add, Shared(values), Path("photos")), range(9), ahead=2))
-    assert found == [(float(x), str(place / "photos")) for x in range(9)]
+    results = list(ordered_map(two, Task(tasks.add, Shared(values), Path("photos")), range(9), ahead=2))
+    assert results == [(float(x), str(place / "photos")) for x in range(9)]
     arrays = list(ordered_map(two, Task(tasks.large), range(3), ahead=2))
     assert [array[0] for array in arrays] == [0, 1, 2]
     assert {path.name.split("-")[0] for path in (place / "out" / ".cluster").iterdir()} == {"probe"}
@@ -135,7 +136,7 @@ def test_an_error_of_a_task_is_raised_as_it_is(two, tasks):
 
 
 @pytest.mark.slow
-def test_what_fails_on_a_machine_is_done_here(two, tasks):
+def test_this_process_repeats_tasks_that_fail_on_a_machine(two, tasks):
     assert list(ordered_map(two, Task(tasks.only_here, os.getpid()), range(6), ahead=2)) == list(range(6))
 
 
@@ -171,7 +172,7 @@ def test_no_scheduler_is_one_line(tmp_path):
         pass
 
 
-def test_without_dask_the_command_to_install_it_is_said(tmp_path, monkeypatch):
+def test_a_missing_dask_is_an_error_with_the_command_to_install_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with (
         pytest.raises(ConfigError, match="Dask") as caught,
@@ -182,7 +183,7 @@ def test_without_dask_the_command_to_install_it_is_said(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("address", ["local:0", "local:", "localhost", "http://a/b:1", "a b:1", "local:2000"])
-def test_what_is_no_address_is_refused(address):
+def test_a_malformed_address_is_refused(address):
     with pytest.raises(ConfigError, match="address"):
         Settings.from_mapping({"cluster": {"address": address}})
 
@@ -194,21 +195,56 @@ def test_addresses():
     assert [local_workers(address) for address in known] == [0, 3, 0, 0, 0]
 
 
-def test_values_of_every_size_come_back(tmp_path):
-    with packing(tmp_path) as packer:
-        for size in (0, SMALL_BYTES - 100, SMALL_BYTES + 100):
-            parcel = packer.pack(bytes(size))
-            assert bool(parcel.path) == (size > SMALL_BYTES)
-            assert unpack(parcel, remove=True) == bytes(size)
-    assert list(tmp_path.iterdir()) == []
+class Trap:
+    """Creates a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = str(path)
+
+    def __reduce__(self):
+        return Path.touch, (Path(self.path),)
+
+
+@pytest.mark.parametrize("size", [10, OPTIONS.small_bytes])
+def test_values_arrive_whatever_their_size(tmp_path, size):
+    with open_serializer(tmp_path) as serializer:
+        value = serializer.serialize([np.arange(size), Path("here")])
+        values, path = deserialize(value)
+    np.testing.assert_array_equal(values, np.arange(size))
+    assert path == Path("here").absolute()
+    assert bool(value.path) == (size == OPTIONS.small_bytes)
+
+
+def test_a_file_that_was_exchanged_is_not_unpickled(tmp_path):
+    sprung = tmp_path / "sprung"
+    with open_serializer(tmp_path / "values") as serializer:
+        value = serializer.serialize(np.arange(OPTIONS.small_bytes))
+        Path(value.path).write_bytes(pickle.dumps(Trap(sprung)))
+        with pytest.raises(OSError, match="not the file that was sent"):
+            deserialize(value)
+    assert not sprung.exists()
+    pickle.loads(pickle.dumps(Trap(sprung)))  # noqa: S301
+    assert sprung.exists()  # the trap works
+
+
+def test_a_shared_file_that_was_exchanged_is_not_unpickled(tmp_path):
+    sprung = tmp_path / "sprung"
+    with open_serializer(tmp_path / "values") as serializer:
+        value = serializer.serialize([Shared(np.arange(10))])
+        (file,) = (tmp_path / "values").iterdir()
+        assert deserialize(serializer.serialize([Shared(5)]))[0].value == 5
+        file.write_bytes(pickle.dumps(Trap(sprung)))
+        with pytest.raises(OSError, match="not the file that was sent"):
+            deserialize(value)
+    assert not sprung.exists()
 
 
 def test_a_shared_value_is_written_once_and_read_once(tmp_path):
     shared = Shared(list(range(1000)))
-    with packing(tmp_path) as packer:
-        parcels = [packer.pack((shared, number)) for number in range(3)]
+    with open_serializer(tmp_path) as serializer:
+        values = [serializer.serialize((shared, number)) for number in range(3)]
         assert len(list(tmp_path.iterdir())) == 1
-        (first, _), (second, number) = unpack(parcels[0]), unpack(parcels[1])
+        (first, _), (second, number) = deserialize(values[0]), deserialize(values[1])
         assert first is second
         assert (first.value, number) == (shared.value, 1)
     assert list(tmp_path.iterdir()) == []
@@ -252,9 +288,9 @@ class Late:
 
 
 def test_a_worker_that_differs_is_refused_by_name(tmp_path):
-    found = Cluster(FakeClient({**worker_versions(), "numpy": "1.0"}), tmp_path, ClusterSettings(address="host:8786"))
+    results = Cluster(FakeClient({**worker_versions(), "numpy": "1.0"}), tmp_path, ClusterSettings(address="host:8786"))
     with pytest.raises(ClusterError, match=r"10\.0\.0\.7:4000 cannot be used: it has numpy 1\.0 instead of"):
-        found.check_versions()
+        results.check_versions()
 
 
 @pytest.mark.parametrize(
@@ -263,10 +299,10 @@ def test_a_worker_that_differs_is_refused_by_name(tmp_path):
      (FakeClient(workers=0), "has had no workers for 0 seconds")],
 )  # fmt: skip
 def test_nobody_waits_forever(tmp_path, client, says):
-    found = Cluster(client, tmp_path, ClusterSettings(address="host:8786", wait_s=0.001))
+    results = Cluster(client, tmp_path, ClusterSettings(address="host:8786", wait_s=0.001))
     start = time.monotonic()
     with pytest.raises(ClusterError, match=says):
-        found.wait(Late(), "waiting")
+        results.wait(Late(), "waiting")
     assert time.monotonic() - start < 5
 
 

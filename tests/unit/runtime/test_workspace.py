@@ -1,9 +1,11 @@
+import json
+
 import pytest
 from filelock import FileLock
 
 from sfm_app.errors import InputError
 from sfm_app.runtime import workspace
-from sfm_app.runtime.workspace import LOCK, Workspace
+from sfm_app.runtime.workspace import LOCK, Manifest, StageRecord, Workspace, model_triangles
 
 
 def test_a_file_in_place_of_the_folder_is_an_input_error(tmp_path):
@@ -31,7 +33,7 @@ def test_what_a_run_wrote_after_its_folder_was_removed_is_not_foreign_to_the_nex
     place = Workspace(tmp_path / "out")
     place.create()
     (place.dense / "images").mkdir(parents=True)  # no lock, as after `rm -r out`
-    with pytest.raises(InputError, match="was removed while"):
+    with pytest.raises(InputError, match="was removed during"):
         place.check_exists()
 
     place.create()
@@ -42,7 +44,7 @@ def test_a_folder_that_somebody_put_in_the_place_of_the_output_stays_foreign(tmp
     place.create()
     place.dense.mkdir()
     (place.root / "my notes.txt").touch()
-    with pytest.raises(InputError, match="was removed while"):
+    with pytest.raises(InputError, match="was removed during"):
         place.check_exists()
 
     with pytest.raises(InputError, match="no run has made it"):
@@ -74,3 +76,93 @@ def test_a_lock_that_somebody_removed_is_not_brought_back(tmp_path):
         (place.root / LOCK).unlink()
 
     assert not (place.root / LOCK).exists()
+
+
+@pytest.fixture
+def manifest(tmp_path):
+    return Manifest(tmp_path)
+
+
+def finish(manifest, name="photos", print_of_inputs="abc", files=("a.txt",)):
+    manifest.finish(name, StageRecord(print_of_inputs, 1.0, {"usable": 2}, manifest.sizes(files)), {"program": "test"})
+
+
+def is_current(manifest, stage, print_of_inputs):
+    record = manifest.record(stage)
+    return record is not None and record.fingerprint == print_of_inputs and not manifest.changed_files(record)
+
+
+def test_a_finished_stage_is_current_until_its_inputs_change(manifest):
+    (manifest.root / "a.txt").write_text("1234")
+    finish(manifest)
+
+    assert is_current(manifest, "photos", "abc")
+    assert not is_current(manifest, "photos", "other")
+    assert not is_current(manifest, "match_graph", "abc")
+
+
+@pytest.mark.parametrize("damage", ["cut", "removed"])
+def test_a_stage_whose_file_changed_is_not_current(manifest, damage):
+    path = manifest.root / "a.txt"
+    path.write_text("1234")
+    finish(manifest)
+    if damage == "cut":
+        path.write_text("12")
+    else:
+        path.unlink()
+
+    assert not is_current(manifest, "photos", "abc")
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"stages": {"photos": 3}}', '{"stages": {"photos": {"odd": 1}}}'])
+def test_a_broken_manifest_counts_as_none(manifest, text):
+    (manifest.root / "manifest.json").write_text(text)
+
+    assert manifest.record("photos") is None
+
+
+def test_forgotten_stages_leave_the_others(manifest):
+    (manifest.root / "a.txt").write_text("1234")
+    for name in ("photos", "intrinsics", "scene"):
+        finish(manifest, name)
+    manifest.forget(("intrinsics", "scene", "mesh"))
+
+    assert manifest.record("scene") is None and manifest.record("intrinsics") is None
+    assert manifest.record("photos") is not None
+    assert json.loads((manifest.root / "manifest.json").read_text())["program"] == "test"
+
+
+def test_the_database_may_grow_but_not_vanish(manifest):
+    (manifest.root / "database.db").write_text("1234")
+    finish(manifest, files=("database.db",))
+    (manifest.root / "database.db").write_text("123456")
+
+    assert is_current(manifest, "photos", "abc")
+    (manifest.root / "database.db").unlink()
+    assert not is_current(manifest, "photos", "abc")
+
+
+@pytest.mark.parametrize("version", [None, 1, "2"])
+def test_a_run_of_another_version_is_refused_in_one_line(manifest, version):
+    finish(manifest)
+    manifest.check_format()
+    known = json.loads(manifest.path.read_text())
+    manifest.path.write_text(json.dumps({**known, "format": version, "program": "sfm-app"}))
+
+    with pytest.raises(InputError, match="made by another version") as err:
+        manifest.check_format()
+    assert "-o" in err.value.hint and "\n" not in str(err.value)
+
+
+def test_a_folder_without_a_run_of_ours_has_no_format(manifest):
+    manifest.check_format()
+    manifest.write({"program": "another", "format": 1, "stages": {"photos": {}}})
+    manifest.check_format()
+
+
+def test_a_model_has_the_triangles_that_texturing_has_left():
+    mesh, texture = {"counts": {"triangles": 9}}, {"counts": {"triangles": 7}}
+    assert model_triangles({"mesh": mesh, "texture": texture}) == 7
+    assert model_triangles({"mesh": mesh, "texture": {"counts": {}}}) == 9  # of an earlier version
+    assert model_triangles({"mesh": mesh}) == 9
+    assert model_triangles({}) is None

@@ -1,11 +1,18 @@
-"""Rectification: rows match and disparities are as promised in every direction; hopeless pairs have a reason."""
+"""Rectification in every direction, reasons of rejected pairs, disparities and their depths."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.stereo.rectify import DISPARITY_STEP, MAX_DISPARITIES, MAX_GROWTH, Rectification, rectify
+from sfm_app.stereo.rectify import (
+    DISPARITY_STEP,
+    OPTIONS,
+    Rectification,
+    depths_from_disparities,
+    disparities,
+    rectify,
+)
 from sfm_app.stereo.view import View
 from sfm_app.types import Rejected
 
@@ -33,7 +40,7 @@ def cloud() -> np.ndarray:
 
 
 def on_canvas(found: Rectification, view: View, points: np.ndarray, shift_px: float = 0.0) -> np.ndarray:
-    """(N, 2) where points lie on the canvas of a view."""
+    """(N, 2) pixels of points on the canvas of a view."""
     x, y, z = ((points - view.center) @ found.rotation.T).T
     theta, phi = np.arctan2(np.hypot(y, z), x), np.arctan2(y, z)
     columns = (found.theta_max - theta) * found.columns_per_rad + found.disparities + shift_px
@@ -50,7 +57,7 @@ sphere = st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-1, 1)).filter(
 
 
 @given(direction=sphere, turns=st.tuples(small, small, small))
-def test_rows_match_and_disparities_follow_depth_whatever_the_motion(direction, turns):
+def test_rows_match_and_disparities_follow_depth_for_any_motion(direction, turns):
     points = cloud()
     reference = view_at([0, 0, 0], points=points)
     neighbor = view_at(0.6 * np.array(direction) / np.linalg.norm(direction), turned(*turns))
@@ -71,11 +78,11 @@ def test_rows_match_and_disparities_follow_depth_whatever_the_motion(direction, 
     within = (disparity >= 0) & (disparity < found.disparities)
     assert within[both].mean() > 0.97  # the range is that of the points but for the strays
     assert np.all((left[both & within] >= [found.disparities - 1e-6, -1e-6]) & (left[both & within] <= found.size))
-    assert np.prod(found.size - np.array([found.disparities, 0])) < 1.05 * MAX_GROWTH * 320 * 240
+    assert np.prod(found.size - np.array([found.disparities, 0])) < 1.05 * OPTIONS.max_growth * 320 * 240
 
 
 @pytest.mark.parametrize("center", [(0.5, 0, 0), (-0.5, 0, 0), (0, 0.5, 0), (0.02, 0.01, 0.5), (0, 0, -0.5)])
-def test_photos_are_warped_to_where_the_points_are(center):
+def test_photos_are_warped_to_the_pixels_of_points(center):
     reference, neighbor = view_at([0, 0, 0], points=cloud()), view_at(center, turned(0, 0, 0.1))
     found = rectify(reference, neighbor)
     point = np.array([[0.5, 0.4, 5.0]])
@@ -113,20 +120,46 @@ def test_disparities_are_limited_by_shrinking():
 
     assert isinstance(found, Rectification), found
     assert found.disparities % DISPARITY_STEP == 0
-    assert MAX_DISPARITIES / 2 < found.disparities <= MAX_DISPARITIES + DISPARITY_STEP
+    assert OPTIONS.max_disparities / 2 < found.disparities <= OPTIONS.max_disparities + DISPARITY_STEP
     assert 0.5 * K[0, 0] < found.columns_per_rad < 1.8 * K[0, 0]
 
 
-@pytest.mark.parametrize(
-    ("center", "rotation", "reason"),
-    [((0, 0, 0), np.eye(3), "same place"), ((0.5, 0, 0), turned(0.9, 0, 0), "overlap")],
-)
-def test_refuses_with_a_reason(center, rotation, reason):
-    found = rectify(view_at([0, 0, 0], points=cloud()), view_at(center, rotation))
+def test_rejected_pairs_have_a_reason():
+    reference = view_at([0, 0, 0], points=cloud())
 
-    assert isinstance(found, Rejected)
-    assert reason in found.reason
-
-
-def test_refuses_without_sparse_points():
+    assert rectify(reference, reference) == Rejected("the photos were taken from the same place")
+    assert rectify(reference, view_at((0.5, 0, 0), turned(0.9, 0, 0))) == Rejected("the photos do not overlap")
     assert rectify(view_at([0, 0, 0]), view_at([0.5, 0, 0])) == Rejected("too few sparse points")
+
+
+@pytest.mark.parametrize("center", [(0.5, 0, 0), (-0.5, 0, 0), (0, 0.5, 0), (0.3, -0.3, 0.1), (0.1, 0, 0.9)])
+@pytest.mark.parametrize("sample_px", [0.0, 0.5])
+def test_depths_lie_on_the_plane_for_any_baseline(plane, make_view, center, sample_px):
+    view, neighbor = make_view((0, 0, 0), sample_px=sample_px), make_view(center, turn=(0.02, -0.03, 0.05))
+    rectification = rectify(view, neighbor)
+
+    canvases = rectification.warp(plane.photo(view), plane.photo(neighbor), (view, neighbor))
+    disparity = disparities(*canvases, rectification.disparities)
+    depth, parallax = depths_from_disparities(disparity, rectification, view, neighbor)
+
+    known = depth > 0
+    error_px = ((depth / plane.depth(view) - 1) * parallax)[known]
+    assert np.mean(known) > (0.7 if center[2] < 0.5 else 0.5)  # forward there is nothing about the epipole
+    assert abs(np.median(error_px)) < 0.08  # pixel centers misplaced in one of the photos would make it 0.5
+    assert 0.01 < np.median(np.abs(error_px)) < 0.15
+    assert np.array_equal(parallax > 0, known)
+
+
+def test_pixels_outside_the_neighbor_have_no_depth(make_view):
+    view, neighbor = make_view((0, 0, 0)), make_view((1.0, 0, 0))
+    rectification = rectify(view, neighbor)
+    everywhere = np.full(rectification.size[::-1], 20, np.float32)
+
+    depth, _ = depths_from_disparities(everywhere, rectification, view, neighbor)
+
+    # the neighbor stands to the right and sees everything further left
+    row, col = np.nonzero(depth)
+    moved = col + 0.5 - 230 * 1.0 / depth[row, col]
+    assert np.all(moved > 0)
+    assert not depth[:, :40].any()
+    assert np.mean(depth[5:-5, 120:-5] > 0) > 0.95

@@ -8,7 +8,7 @@ import pytest
 
 from sfm_app.colmap.database import write_match_graph
 from sfm_app.estimation.known import known_fits, known_lenses
-from sfm_app.matching.known import find_same_matches, pairs_with_news
+from sfm_app.matching.pairs import find_same_matches, pairs_with_new_photos
 from sfm_app.types import Calibration, EpipolarFit, MatchedImage, MatchGraph, Rejected, ViewGraph
 
 ROWS = np.column_stack([np.arange(4), np.arange(4)[::-1]]).astype(np.uint32)
@@ -58,8 +58,8 @@ def test_photos_with_other_keypoints_names_or_contents_are_not_the_same(tmp_path
 def test_pairs_of_known_photos_are_not_matched_again():
     images = {key: image(key) for key in (1, 2, 3)}
 
-    assert pairs_with_news([(1, 2), (1, 3), (2, 3)], images, {"1.jpg", "2.jpg"}) == [(1, 3), (2, 3)]
-    assert pairs_with_news([(1, 2)], images, set()) == [(1, 2)]
+    assert pairs_with_new_photos([(1, 2), (1, 3), (2, 3)], images, {"1.jpg", "2.jpg"}) == [(1, 3), (2, 3)]
+    assert pairs_with_new_photos([(1, 2)], images, set()) == [(1, 2)]
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from sfm_app.photos.decode import UnreadableError, read_picture, upright_image
-from sfm_app.photos.panoramas import closes_around, is_panorama, read_panorama_entries
+from sfm_app.photos.panoramas import looks_like_panorama, is_panorama, read_panorama_entries
 from sfm_app.synthetic.cameras import Views, look_at, panorama_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
 from sfm_app.synthetic.scenes import courtyard
@@ -41,7 +41,7 @@ def test_a_panorama_is_recognized_by_its_pixels(rendered, tmp_path):
 def test_its_heading_does_not_matter(rendered, turn_deg):
     pixels = np.roll(np.asarray(rendered), turn_deg * 512 // 360, axis=1)
 
-    assert closes_around(Image.fromarray(pixels))
+    assert looks_like_panorama(Image.fromarray(pixels))
 
 
 def test_parts_and_mirrored_pictures_are_none(rendered):
@@ -50,8 +50,8 @@ def test_parts_and_mirrored_pictures_are_none(rendered):
     mirrored = Image.fromarray(np.hstack([pixels[:, :256], pixels[:, 255::-1]]))  # its borders are equal
     turned = Image.fromarray(np.roll(pixels, 60, axis=0))  # no row is a pole
 
-    assert not closes_around(part) and not closes_around(turned)
-    assert not closes_around(Image.fromarray(np.full((256, 512, 3), 128, np.uint8)))
+    assert not looks_like_panorama(part) and not looks_like_panorama(turned)
+    assert not looks_like_panorama(Image.fromarray(np.full((256, 512, 3), 128, np.uint8)))
     assert part.size == (256, 128) and mirrored.size == (512, 256)
 
 
@@ -60,7 +60,7 @@ def test_photos_twice_as_wide_as_high_are_none(seed):
     rng = np.random.default_rng(seed)
     coarse = Image.fromarray(rng.integers(0, 255, (20, 40, 3), np.uint8))
 
-    assert not closes_around(coarse.resize((800, 400), Image.Resampling.BICUBIC))
+    assert not looks_like_panorama(coarse.resize((800, 400), Image.Resampling.BICUBIC))
 
 
 def test_metadata_decides_where_it_is(rendered, tmp_path):

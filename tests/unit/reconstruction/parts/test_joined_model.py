@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.joined_model import read_placed, settle, write_placed
+from sfm_app.colmap.joined_model import read_placed, adjust_joined, write_placed
 from sfm_app.colmap.model import poses_and_points
 from sfm_app.geometry.poses import umeyama
 
@@ -54,7 +54,7 @@ def test_settling_brings_joined_parts_together(synthetic, placed, refined, focal
     off = replace(placed, centers=placed.centers + rng.normal(scale=0.01 * size, size=placed.centers.shape))
     model = write_placed(synthetic.database, with_focals(off, [1305.0] * 6))
 
-    settle(model, synthetic.database, refined)
+    adjust_joined(model, synthetic.database, refined)
 
     (camera,) = model.cameras.values()
     assert camera.params[0] == pytest.approx(focal, rel=0.005 if refined else 1e-12)

@@ -36,7 +36,7 @@ def test_the_last_adjustment_counts_and_terms_that_are_zero_do_not():
 
     assert found.source == "after the last adjustment"
     assert list(found.names) == ["fx", "fy", "cx", "cy", "k1", "p1", "p2"]
-    assert list(found.texts) == ["none hides in another: the strongest is fx with fy, 0.40"]
+    assert list(found.texts) == ["no strong correlation; the strongest is fx with fy, 0.40"]
 
 
 def test_a_long_list_is_cut_and_counted():

@@ -92,7 +92,7 @@ def test_a_camera_that_pairs_do_not_determine_comes_with_what_to_do(after):
     [said] = unknown_cameras(contents)
 
     assert said.startswith("Pairs of photos do not determine the camera b: an orbit. A focal of 768 px is a guess")
-    assert ("came to 675.1 ± 2.5 px" in said) == (after is not None)
+    assert ("gives 675.1 ± 2.5 px" in said) == (after is not None)
     assert "What to do: add photos" in said
 
 
@@ -111,7 +111,7 @@ def test_a_camera_of_no_placed_photo_is_passed_over():
     assert len(said_with({})) == 2
 
 
-@pytest.mark.parametrize(("unusable", "more"), [(0, ""), (1, "1 more was left out"), (2, "2 more were left out")])
+@pytest.mark.parametrize(("unusable", "more"), [(0, ""), (2, "and 2 unusable")])
 def test_photos_that_were_left_out_are_counted_beside_those_that_are_placed(unusable, more):
     counts = {"photos": {"unusable": {str(k): "blurred" for k in range(unusable)}}}
     scene = SimpleNamespace(

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from sfm_app.report import server
 from sfm_app.report.server import point_levels
 from sfm_app.types import Surface
 
@@ -18,9 +17,8 @@ def unpack(data, count):
     return np.frombuffer(data, "<f4", 3 * count).reshape(-1, 3), np.frombuffer(data, np.uint8, offset=12 * count)
 
 
-def test_levels_have_every_point_once_with_its_color(monkeypatch):
-    monkeypatch.setattr(server, "FIRST_LEVEL", 20)
-    found = point_levels(surface(150))
+def test_levels_have_every_point_once_with_its_color():
+    found = point_levels(surface(150), first=20)
 
     assert found.counts == [20, 40, 80, 10]
     parts = [unpack(found.pack(level), count) for level, count in enumerate(found.counts)]

@@ -5,7 +5,6 @@ import io
 import pytest
 from PIL import Image
 
-from sfm_app.report import server as module
 from sfm_app.report.server import BYTES, GLB, HTML, JPEG, LARGE_PX, SMALL_PX
 
 
@@ -36,20 +35,19 @@ def test_nothing_else_has_an_address(resources, address):
     assert resources.find(address) is None
 
 
-def test_a_lighter_model_is_made_once_and_only_where_the_model_is_large(resources, monkeypatch):
+def test_a_lighter_model_is_made_once_and_only_for_a_large_model(resources):
     made = []
-    monkeypatch.setattr(module, "light_model", lambda contents: made.append(contents) or b"light")
+    resources.make_light = lambda contents: made.append(contents) or b"light"
 
     assert resources.find("/light.glb") is None and made == []
-    monkeypatch.setattr(module, "MOST_GLB_BYTES", 10)
+    resources.most_bytes = 10
     assert [resources.find("/light.glb").content for _ in range(2)] == [b"light"] * 2 and len(made) == 1
 
 
-def test_a_lighter_model_that_cannot_be_made_is_not_there(resources, monkeypatch):
+def test_a_lighter_model_that_fails_has_no_address(resources):
     def fail(contents):
         raise ValueError("no texture")
 
-    monkeypatch.setattr(module, "MOST_GLB_BYTES", 10)
-    monkeypatch.setattr(module, "light_model", fail)
+    resources.most_bytes, resources.make_light = 10, fail
 
     assert resources.find("/light.glb") is None

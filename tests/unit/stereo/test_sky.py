@@ -1,0 +1,151 @@
+"""A sky is at infinity; a plain wall of the same gray is not."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm_app.stereo import View
+from sfm_app.stereo.sky import blank_areas, count_votes, find_skies, sky_pixels, spread_partners
+
+WIDTH, HEIGHT, FOCAL = 640, 480, 500.0
+SIDEWAYS = np.linspace(-2.0, 2.0, 6)
+
+
+@dataclass(frozen=True)
+class Photo:
+    view: View
+    gray: np.ndarray
+    depth: np.ndarray
+    blank: np.ndarray
+    """(H, W) sky or plain wall, without a depth."""
+
+
+def photograph(x, gray_of_blank, backdrop):
+    """Return a photo from (x, 0, 0): a textured ground, a textured tower, and a backdrop."""
+    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    view = View(f"{x:.2f}", K, np.eye(3), np.array([-x, 0, 0]), WIDTH, HEIGHT)
+    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    ray = np.stack([(u - K[0, 2]) / FOCAL, (v - K[1, 2]) / FOCAL])
+    with np.errstate(divide="ignore"):
+        ground = np.where(ray[1] > 0, 1.5 / ray[1], np.inf)
+    at = x + 6.0 * ray[0]
+    tower = np.where((np.abs(at - 0.5) < 0.8) & (6.0 * ray[1] > -1.2), 6.0, np.inf)
+    behind = backdrop(x, ray)
+    depth = np.minimum(np.minimum(ground, tower), behind)
+    blank = ~np.isfinite(depth)
+    rng = np.random.default_rng(3)
+    shown = np.where(blank, gray_of_blank, rng.uniform(20, 160, depth.shape)) + rng.normal(0, 1.5, depth.shape)
+    return Photo(view, shown.clip(0, 255).astype(np.uint8), np.where(blank, 0, depth).astype(np.float32), blank)
+
+
+def sky(x, ray):
+    return np.full(ray.shape[1:], np.inf)
+
+
+def plain_wall(x, ray):
+    """A wall 8 away, textured but for a part."""
+    at = x + 8.0 * ray[0]
+    return np.where((at > -1.5) & (at < 1.5), np.inf, 8.0)
+
+
+def photograph_all(gray_of_blank, backdrop=sky):
+    return [photograph(x, gray_of_blank, backdrop) for x in SIDEWAYS]
+
+
+def skies_of(photos):
+    areas = [blank_areas(photo.gray, photo.depth) for photo in photos]
+    views = [photo.view for photo in photos]
+    cells = find_skies(areas, [count_votes(areas, views, index) for index in range(len(views))])
+    return [sky_pixels(photo.gray, own) for photo, own in zip(photos, cells, strict=True)]
+
+
+@pytest.mark.parametrize("gray", [200.0, 250.0])
+def test_a_sky_is_found_up_to_its_outlines(gray):
+    photos = photograph_all(gray)
+
+    for photo, found in zip(photos, skies_of(photos), strict=True):
+        assert found[photo.blank].mean() > 0.98
+        inside = cv2.erode((~photo.blank).view(np.uint8), np.ones((5, 5))) > 0  # but for the blur of outlines
+        assert found[inside].mean() < 0.002
+
+
+PALING = 130.0 + 0.5 * np.mgrid[:HEIGHT, :WIDTH][0]
+"""A sky that is paler at the horizon."""
+
+
+@pytest.mark.parametrize("gray", [220.0, PALING], ids=["even", "paling"])
+def test_depths_extended_into_the_sky_are_sky(gray):
+    photos = photograph_all(gray)
+    carried = [cv2.dilate((~photo.blank).view(np.uint8), np.ones((13, 13))) > 0 for photo in photos]
+    rims = [wide & photo.blank for wide, photo in zip(carried, photos, strict=True)]
+    spoiled = [
+        Photo(photo.view, photo.gray, np.where(rim, np.float32(6), photo.depth), photo.blank)
+        for photo, rim in zip(photos, rims, strict=True)
+    ]
+
+    for rim, found in zip(rims, skies_of(spoiled), strict=True):
+        assert found[rim].mean() > 0.98
+
+
+def test_mixed_pixels_of_sky_and_tower_are_sky():
+    photos = photograph_all(220.0)
+    blurred = [Photo(p.view, cv2.GaussianBlur(p.gray, (0, 0), 1.0), p.depth, p.blank) for p in photos]
+
+    for photo, found in zip(photos, skies_of(blurred), strict=True):
+        things = (~photo.blank).view(np.uint8)
+        beside = photo.blank & (cv2.dilate(things, np.ones((3, 3))) > 0)
+        inside = cv2.erode(things, np.ones((7, 7))) > 0
+        assert found[beside].mean() > 0.95
+        assert found[inside].mean() < 0.002
+
+
+def test_a_plain_wall_is_no_sky():
+    photos = photograph_all(220.0, plain_wall)
+
+    assert all(blank_areas(photo.gray, photo.depth).blank.any() for photo in photos)
+    assert not any(found.any() for found in skies_of(photos))
+
+
+def test_a_dark_background_is_no_sky():
+    assert not any(found.any() for found in skies_of(photograph_all(10.0)))
+
+
+def test_a_wall_stays_in_a_scene_with_a_sky():
+    photos = photograph_all(230.0)
+    walled = []
+    for photo in photos:
+        # a window of the tower as bright as the sky; its direction changes from photo to photo
+        at = photo.view.center[0] + 6.0 * (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL
+        window = np.zeros_like(photo.blank)
+        window[240:330] = np.abs(at - 0.5) < 0.5
+        gray = np.where(window, 226, photo.gray).astype(np.uint8)
+        walled.append((Photo(photo.view, gray, np.where(window, np.float32(0), photo.depth), photo.blank), window))
+
+    found = skies_of([photo for photo, _ in walled])
+
+    for (photo, window), own in zip(walled, found, strict=True):
+        assert own[photo.blank].mean() > 0.98
+        assert own[window].mean() < 0.05
+
+
+def test_one_photo_does_not_vote_about_itself():
+    photo = photograph(0.0, 220.0, sky)
+
+    assert not skies_of([photo])[0].any()
+    assert spread_partners([photo.view, photo.view], 0) == []  # of the same place
+
+
+def test_no_photos_have_no_skies():
+    assert find_skies([], []) == []
+
+
+def test_partners_are_near_and_far():
+    views = [photograph(x, 220.0, sky).view for x in np.linspace(0, 5, 40)]
+
+    partners = spread_partners(views, 0)
+
+    assert len(partners) == len(set(partners)) == 16
+    assert partners[0] == 1
+    assert partners[-1] == 39
