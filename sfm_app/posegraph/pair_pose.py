@@ -116,8 +116,8 @@ def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray,
 # Refinement. F has seven parameters, a relative pose five: with K known, the other two no longer fit noise.
 
 SIGMAS_PX = (0.5, 0.2)
-"""Scales of the Cauchy loss, one after the other: keypoints are accurate to about 0.2 px. Measured; docs/algorithms.md, From K
-to relative poses."""
+"""Scales of the Cauchy loss, one after the other: keypoints are accurate to about 0.2 px. Measured;
+docs/algorithms.md, From K to relative poses."""
 STEPS = 12
 """Largest number of steps at each scale. Chosen by hand."""
 DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e6)
