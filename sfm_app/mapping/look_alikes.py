@@ -21,12 +21,7 @@ from sfm_app.mapping.split_and_merge import OPTIONS as SPLIT
 from sfm_app.numerical import FAILURES, Json
 from sfm_app.posegraph.graph import LOOKS_ALIKE
 from sfm_app.posegraph.look_alikes import OPTIONS as LOOK_ALIKES
-from sfm_app.posegraph.look_alikes import (
-    cell_numbers,
-    group_doubted_pairs,
-    is_matched_again,
-    is_well_inside,
-)
+from sfm_app.posegraph.look_alikes import cell_numbers, group_doubted_pairs, is_matched_again, is_well_inside
 from sfm_app.posegraph.rotations import find_cut
 from sfm_app.types import LookAlikes, MatchGraph, PairId, PoseGraph, ViewGraph
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray

@@ -243,10 +243,7 @@ class Passes:
             self._write_graph(outcome.graph, outcome.intrinsics, matches)
             return replace(outcome, tried=tried, one_camera_each="left")
         return self._try_two_cameras(
-            replace(own, rival_reason=outcome.rival_reason, tried=tried, one_camera_each="taken"),
-            matches,
-            views,
-            each,
+            replace(own, rival_reason=outcome.rival_reason, tried=tried, one_camera_each="taken"), matches, views, each
         )
 
     def _try_two_cameras(self, own: Outcome, matches: MatchGraph, views: ViewGraph, each: Intrinsics) -> Outcome:

@@ -31,7 +31,6 @@ def row_of_photos(photos, reach, degenerate=()):
 
 def test_all_pairs_of_a_small_set_are_asked():
     views = row_of_photos(20, 10)
-
     assert sample_pairs(views, 20) is views
 
 
@@ -51,9 +50,7 @@ def test_every_photo_of_a_large_set_is_asked_with_near_and_far_partners(monkeypa
 def test_pairs_that_determine_no_matrix_are_not_asked(monkeypatch):
     monkeypatch.setattr(module, "OPTIONS", replace(module.OPTIONS, all_pairs=300))
     flat = {(a, a + 1) for a in range(199)}
-
     found = sample_pairs(row_of_photos(200, 20, degenerate=flat), 200)
-
     assert flat.isdisjoint(found.fits)
 
 
@@ -83,7 +80,6 @@ def inliers_of(views):
 def test_the_right_lens_gives_inliers_back(bent):
     matches, views, K, run = bent
     again = select_inliers_through_lens(matches, views, camera(K, 0.2), run)
-
     right = sum(int(np.count_nonzero(rows[:, 0] == rows[:, 1])) for rows in matches.matches.values())
     assert inliers_of(views) < 0.85 * right
     assert 0.97 * right < inliers_of(again) < 1.03 * right

@@ -59,7 +59,6 @@ def test_sizes_are_rounded_to_whole_pixels():
 
 def test_the_picture_inside_bars_may_be_what_the_camera_took():
     found, _ = fit_to_photos(camera(size=(1000, 500)), photo(size=(1000, 800), shown=(0, 150, 1000, 500)))
-
     assert (found.K[0, 2], found.K[1, 2], found.height) == (510.0, 540.0, 800)
 
 
@@ -75,7 +74,6 @@ def test_keep_marks_the_camera():
 
 def test_names_of_photos_and_groups_come_before_sizes():
     cameras = {"a": camera(800.0), "b": camera(900.0)}
-
     assert assigned([photo(1, "a"), photo(2, "b")], cameras).cameras["b"].K[0, 0] == 900.0
     assert assigned([photo(1, "x")], cameras, {"1.jpg": "b"}).cameras["x"].K[0, 0] == 900.0
     assert assigned([photo(1, "x")], {"1.jpg": camera(700.0), "b": camera()}).cameras["x"].K[0, 0] == 700.0
@@ -83,7 +81,6 @@ def test_names_of_photos_and_groups_come_before_sizes():
 
 def test_sizes_decide_among_several_cameras_where_only_one_fits():
     cameras = {"p": camera(800.0, (640, 480), (320.0, 240.0)), "q": camera(900.0)}
-
     assert assigned([photo(1, "x", (1000, 800))], cameras).cameras["x"].K[0, 0] == 900.0
     assert assigned([photo(1, "x", (320, 240))], cameras).cameras["x"].K[0, 0] == 400.0
     with pytest.raises(InputError, match="2 cameras of the file fit them, and none is named 'x'"):
@@ -99,7 +96,6 @@ def test_a_file_that_fits_no_photo_is_an_error_and_panoramas_need_none():
 def test_photos_of_one_group_with_different_cameras_are_divided():
     photos = [Photo(f"{k}.jpg", 10, 8, "10x8") for k in range(4)]
     given = GivenCameras({"p": camera(), "q": camera()}, {"0.jpg": "p", "1.jpg": "q", "2.jpg": "p"})
-
     groups = [one.group for one in split_by_given_camera(photos, given)]
     assert groups == ["10x8 by p", "10x8 by q", "10x8 by p", "10x8"]
     assert [one.group for one in split_by_given_camera(photos[::2], given)] == ["10x8", "10x8"]
@@ -116,7 +112,6 @@ def found(focal, deviation=5.0, **values):
 )
 def test_a_focal_is_contradicted_beyond_three_deviations_and_a_percent(focal, deviation, contradicted):
     said = find_contradictions(camera(), found(focal, deviation))
-
     assert [one.what for one in said] == (["focal length"] if contradicted else [])
     if contradicted:
         assert said[0].text == f"focal length: given 900 px, the photos say {focal:.0f} +- {deviation:.3g} px"
@@ -128,7 +123,6 @@ def test_the_deviation_of_the_given_camera_counts():
 
 def test_a_center_is_contradicted_where_the_photos_determine_it():
     moved = camera(center=(560.0, 390.0))
-
     [said] = find_contradictions(moved, found(900.0))
     assert (said.what, said.given_px, said.found_px) == ("optical center, across", 560.0, 510.0)
     assert find_contradictions(moved, found(900.0, held=("center",))) == []
@@ -164,7 +158,6 @@ def test_a_claim_is_the_median_of_the_photos_inside_their_bars():
     claim = focal_claim(
         [exif_photo(1, 1200.0), exif_photo(2, 1210.0), exif_photo(3), exif_photo(4, 9000.0)], 1850.0, 20.0
     )
-
     assert (claim.claimed_px, claim.photos) == (1210.0, 3)
     assert focal_claim([exif_photo(1)], 1850.0, 20.0) is None
     assert focal_claim([exif_photo(1, 1200.0, shown=(0, 0, 500, 800))], 9.0, 9.0).claimed_px == 960.0
@@ -215,6 +208,5 @@ def test_bundle_adjustment_judges_claims_that_pairs_could_not_judge():
     scene = Scene(None, {"1.jpg": np.eye(3, 4)}, {}, {"a": refined}, 9, 9, 0.3, {"1.jpg": "a"})
     matches = MatchGraph({1: exif_photo(1, 1200.0), 2: exif_photo(2, 99.0)}, {}, {})
     unknown = Calibration(K, 1000, 800, "exif", False, "an orbit")
-
     assert refined_claims(scene, Intrinsics({"a": unknown}), matches)["a"].claimed_px == 1200.0
     assert refined_claims(scene, Intrinsics({"a": replace(unknown, identifiable=True)}), matches) == {}

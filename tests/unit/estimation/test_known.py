@@ -53,7 +53,6 @@ def test_pairs_with_the_same_bytes_are_the_same(tmp_path):
     now = graph((1, 2, 3, 4))
     same = find_same_matches(now, earlier)
     assert same.photos == {1, 2, 3} and same.pairs == {(1, 2), (1, 3), (2, 3)}
-
     other = find_same_matches(replace(now, matches=now.matches | {(1, 3): ROWS[:3]}), earlier)
     assert other.photos == {1, 2, 3} and other.pairs == {(1, 2), (2, 3)}
 
@@ -62,7 +61,6 @@ def test_photos_with_other_keypoints_names_or_contents_are_not_the_same(tmp_path
     earlier = earlier_run(tmp_path, graph(), {"1.jpg", "2.jpg"})
     now = graph()
     assert find_same_matches(now, earlier).photos == {1, 2}  # the third was replaced
-
     moved = replace(now, keypoints=now.keypoints | {1: now.keypoints[1] + 0.5})
     assert find_same_matches(moved, earlier).photos == {2}
     swapped = replace(now, images=now.images | {1: image(1, name="2.jpg"), 2: image(2, name="1.jpg")})
@@ -71,7 +69,6 @@ def test_photos_with_other_keypoints_names_or_contents_are_not_the_same(tmp_path
 
 def test_pairs_of_known_photos_are_not_matched_again():
     images = {key: image(key) for key in (1, 2, 3)}
-
     assert pairs_with_new_photos([(1, 2), (1, 3), (2, 3)], images, {"1.jpg", "2.jpg"}) == [(1, 3), (2, 3)]
     assert pairs_with_new_photos([(1, 2)], images, set()) == [(1, 2)]
 
@@ -98,9 +95,7 @@ def test_lenses_stay_where_most_photos_are_known(lens):
     images = {key: image(key, "wide" if key < 4 else "usual" if key < 7 else "half") for key in range(1, 9)}
     matches = graph(range(1, 9), images=images)
     earlier = SimpleNamespace(known=frozenset({"1.jpg", "2.jpg", "4.jpg", "5.jpg", "7.jpg"}))
-
     found = known_lenses(matches, ViewGraph({}, {}, {"wide": lens, "half": lens}), earlier)
-
     assert found == {"wide": lens, "usual": None}
 
 
@@ -142,7 +137,6 @@ def kept(run, matches):
 
 def test_a_refined_camera_is_a_start_with_its_deviations():
     found = refined_camera(REFINED)
-
     assert found.identifiable and not found.is_given and found.spread["fx"] == 1.5
     assert np.allclose(found.K, REFINED["K"]) and found.distortion[:2] == (-0.1, 0.01)
     assert found.held == ("center",)
@@ -159,7 +153,6 @@ def test_it_stays_where_most_photos_of_its_group_are_known(run):
 def test_a_group_that_was_split_is_calibrated_again(run, tmp_path):
     of = {"a": "one", "b": "one", "c": "one/2", "d": "one/2"}
     (tmp_path / "scene.json").write_text(json.dumps({"cameras": {"one": REFINED}, "camera_of": of}))
-
     assert kept(run, photo_graph(*KNOWN)) == {}
 
 

@@ -79,9 +79,7 @@ def seeded(matches, intrinsics):
 
 def test_a_seed_is_made_from_what_the_photos_show_without_their_lens():
     matches = two_views(radial=-0.25)
-
     straight, bent = (seeded(matches, Intrinsics({"one": known(radial)})) for radial in (-0.25, 0.0))
-
     off = [np.degrees(np.arccos(min(1, (np.trace(seed.R) - 1) / 2))) for seed in (straight, bent)]
     assert off[0] < 0.3 < off[1]
     assert abs(straight.t @ [-1, 0, 0]) > 0.9999
@@ -93,9 +91,7 @@ def test_cameras_are_those_that_took_the_photos_not_those_of_their_group():
     matches = two_views()
     other = known(K=np.diag([2.0, 2.0, 1.0]) @ K)
     apart = Intrinsics({"one": other, "one #2": known()}, {"1.jpg": "one #2", "2.jpg": "one #2"})
-
     right, wrong = seeded(matches, Intrinsics({"one": known()})), seeded(matches, Intrinsics({"one": other}))
-
     assert np.array_equal(seeded(matches, apart).points, right.points)
     assert not np.allclose(wrong.points, right.points, rtol=0.1)
 
@@ -135,14 +131,12 @@ def test_many_points_come_before_few_and_points_behind_a_camera_count_strongly_a
 
 def test_pairs_that_agree_with_the_camera_start_before_pairs_that_do_not():
     poses = {(1, 2): pose(100), (1, 3): pose(300)}
-
     assert order(poses) == [(1, 3), (1, 2)]
     assert order(poses, known(key_pairs=((1, 2),))) == [(1, 2), (1, 3)]
 
 
 def test_only_photos_of_one_camera_can_contradict_it():
     one, two = known(key_pairs=((1, 2),)), known(key_pairs=((3, 4),))
-
     assert agreement((1, 2), (one, one)) == 1.0
     assert 0.0 < agreement((1, 3), (one, one)) < 0.5
     assert agreement((1, 3), (one, two)) == 1.0
@@ -151,13 +145,11 @@ def test_only_photos_of_one_camera_can_contradict_it():
 
 def test_a_turn_never_starts_and_a_wall_starts_later():
     poses = {(1, 2): pose(kind="rotation", angle_deg=20), (1, 3): pose(kind="planar"), (2, 3): pose(150)}
-
     assert order(poses) == [(2, 3), (1, 3)]
 
 
 def test_only_pairs_within_the_group_start():
     poses = {(1, 2): pose(), (2, 3): pose(), (3, 4): pose()}
-
     assert order(poses, members=(1, 2, 3)) == [(1, 2), (2, 3)]
     assert order(poses, members=(1, 4)) == []
 
@@ -165,7 +157,6 @@ def test_only_pairs_within_the_group_start():
 def test_points_all_over_the_photos_come_before_a_clump():
     _, clump = photos(4, spread=0.2)
     poses = {(1, 2): pose(220), (3, 4): pose(200)}
-
     assert order(poses, keypoints={1: clump[1], 2: clump[2]}) == [(3, 4), (1, 2)]
 
 
@@ -199,7 +190,6 @@ def turned(model, photo, degrees):
 
 def test_the_true_model_explains_all_right_matches_and_contradicts_none(synthetic):
     found = explained(synthetic.model, synthetic)
-
     assert list(found) == list(synthetic.matches.matches)
     assert all(pair.inliers == 100 and pair.contradicted == 0 for pair in found.values())
     assert all(100 <= pair.matches <= 115 for pair in found.values())
@@ -209,9 +199,7 @@ def test_the_true_model_explains_all_right_matches_and_contradicts_none(syntheti
 def test_a_photo_that_looks_the_wrong_way_contradicts_its_pairs_and_no_others(synthetic):
     model = synthetic.copy()
     turned(model, 3, 5.0)
-
     found = explained(model, synthetic)
-
     for pair, counts in found.items():
         assert (counts.contradicted > 60) == (3 in pair), pair
         assert (counts.matches < 50) == (3 in pair), pair
@@ -235,24 +223,19 @@ def test_points_behind_a_camera_are_not_explained(synthetic):
 def test_only_pairs_of_photos_with_a_place_are_asked(synthetic):
     model = synthetic.copy()
     model.deregister_frame(model.images[6].frame_id)
-
     assert set(explained(model, synthetic)) == {pair for pair in synthetic.matches.matches if 6 not in pair}
 
 
 def test_a_pair_without_F_contradicts_nothing_but_counts(synthetic):
     fits = {pair: fit for pair, fit in synthetic.views.fits.items() if pair != (1, 2)}
-
     found = explained(synthetic.model, synthetic, ViewGraph(fits, {}))[1, 2]
-
     assert (found.inliers, found.contradicted) == (0, 0) and found.matches >= 100
 
 
 def test_a_model_does_not_explain_matches_that_nobody_made(synthetic):
     rows = {pair: row[100:] for pair, row in synthetic.matches.matches.items()}
     matches = MatchGraph(synthetic.matches.images, synthetic.matches.keypoints, rows)
-
     found = explained_pairs(synthetic.model, matches, ViewGraph({}, {}), 1.5)
-
     assert sum(pair.matches for pair in found.values()) < 0.3 * 20 * len(found)
 
 
@@ -301,7 +284,6 @@ def test_a_photo_without_features_says_so():
     reasons = unregistered_reasons(
         {1, 2}, [], photo_graph(4, blank=(4,)), ViewGraph({(1, 2): fit(40)}, {}), graph_of_poses()
     )
-
     assert reasons == {"3.jpg": "shares no scene with any other photo", "4.jpg": "no features were found in it"}
 
 
@@ -372,7 +354,6 @@ def row_of_photos(photos, reach):
 
 def test_all_pairs_of_a_small_set_are_mapped():
     graph = row_of_photos(100, 40)
-
     assert pairs_to_map(graph) is graph
 
 
@@ -413,7 +394,6 @@ def attempt(photos, support, points=500, mapper="incremental"):
 @pytest.mark.slow
 def test_the_attempt_that_explains_more_is_better_whatever_it_holds():
     more, most_photos = attempt(8, 1000, 100), attempt(10, 900, 9000)
-
     assert best_attempt([most_photos, more]) is more
     assert best_attempt([more, most_photos]) is more
 
@@ -421,7 +401,6 @@ def test_the_attempt_that_explains_more_is_better_whatever_it_holds():
 @pytest.mark.slow
 def test_of_equal_ones_the_one_with_more_photos_and_then_with_more_points():
     fewer, denser, more = attempt(9, 10050, 900), attempt(9, 10000, 901), attempt(10, 10000, 10)
-
     assert best_attempt([fewer, denser]) is denser
     assert best_attempt([fewer, denser, more]) is more
     assert (
@@ -432,7 +411,6 @@ def test_of_equal_ones_the_one_with_more_photos_and_then_with_more_points():
 @pytest.mark.slow
 def test_what_gave_no_model_is_never_better():
     nothing = NoModel("incremental", "")
-
     assert best_attempt([]) is None and best_attempt([nothing]) is None
     assert best_attempt([nothing, attempt(2, 0)]).photos == 2
 
@@ -506,7 +484,6 @@ def summary(found):
 @pytest.mark.slow
 def test_both_mappers_are_tried_and_one_good_model_is_enough(try_out):
     found, _ = try_out([9, 10], at_once=3)
-
     assert summary(found) == [("incremental", 9), ("global", 3)]
     assert [attempt.note for attempt in found] == ["from 1.jpg + 2.jpg: 9 photos", "all at once: 3 photos"]
     assert found[0].support == 50 and found[0].model.num_reg_images() == 9
@@ -515,7 +492,6 @@ def test_both_mappers_are_tried_and_one_good_model_is_enough(try_out):
 @pytest.mark.slow
 def test_where_it_is_easy_the_other_mapper_begins_only_if_it_is_needed(try_out, monkeypatch):
     monkeypatch.setattr(module, "_likely_needs_one_mapper", lambda _: True)
-
     found, calls = try_out([10], at_once=10)
     assert summary(found) == [("incremental", 10), ("global", 0)] and calls == ["incremental"]
     found, calls = try_out([9], at_once=10)
@@ -542,7 +518,6 @@ def test_it_is_easy_with_known_cameras_and_few_contradictions(cameras, deviation
 @pytest.mark.parametrize("late", ["global", "incremental"])
 def test_a_flawless_model_makes_the_other_one_needless_whether_or_not_it_is_there(try_out, late):
     found, _ = try_out([10], at_once=10 if late == "incremental" else None)
-
     assert summary(found) == [("incremental", 10), ("global", 0)]
     assert found[1].note == "all at once: not needed"
 
@@ -556,7 +531,6 @@ def test_a_model_of_all_photos_that_matches_contradict_is_not_flawless(try_out):
 @pytest.mark.slow
 def test_a_contradicted_model_that_says_enough_makes_the_other_one_needless(try_out):
     found, _ = try_out([10], at_once=10, contradicted=2, settled=True)
-
     assert summary(found) == [("incremental", 10), ("global", 0)]
     assert found[1].note == "all at once: not needed"
 
@@ -577,7 +551,6 @@ def test_why_a_model_was_taken_is_said():
 @pytest.mark.slow
 def test_a_global_mapper_that_fails_leaves_the_other_model(try_out):
     found, _ = try_out([9], at_once=BackendError("bad day"))
-
     assert summary(found) == [("incremental", 9), ("global", 0)]
     assert found[1].note == "all at once: failed, bad day"
 
@@ -597,7 +570,6 @@ def test_a_global_mapper_that_fails_leaves_the_other_model(try_out):
 )
 def test_seeds_are_tried_until_one_grows(try_out, grown, at_once, counts):
     found, _ = try_out(grown, at_once, max_init_pairs=5)
-
     assert [placed(attempt) for attempt in found] == counts
 
 
@@ -605,7 +577,6 @@ def test_seeds_are_tried_until_one_grows(try_out, grown, at_once, counts):
 @pytest.mark.parametrize("late", ["global", "incremental"])
 def test_it_does_not_matter_which_mapper_is_done_first(try_out, late):
     found, calls = try_out([4, 7, 7, 7], at_once=4, late=late)
-
     assert calls[:2] == (["incremental", "global"] if late == "global" else ["global", "incremental"])
     assert summary(found) == [("incremental", 4), ("global", 4), ("incremental", 7), ("incremental", 7)]
 
@@ -619,7 +590,6 @@ def test_one_mapper_alone(try_out):
 @pytest.mark.slow
 def test_photos_that_the_global_mapper_left_out_get_a_second_chance(try_out):
     found, _ = try_out([3], at_once=8, completed=10, max_init_pairs=1)
-
     assert summary(found) == [("incremental", 3), ("global", 8), ("incremental", 10)]
     assert found[2].note == "missing photos added one by one: 10 photos"
 
@@ -633,7 +603,6 @@ def test_of_two_photos_positions_have_no_scale_to_agree_on(try_out):
 @pytest.mark.slow
 def test_without_seeds_all_photos_can_still_be_placed_at_once(try_out):
     found, _ = try_out([10], at_once=10, min_seed_angle_deg=25.0)
-
     assert summary(found) == [("global", 10)]
     assert try_out([10], min_seed_angle_deg=25.0, mapper="incremental")[0] == []
 
@@ -641,7 +610,6 @@ def test_without_seeds_all_photos_can_still_be_placed_at_once(try_out):
 @pytest.mark.slow
 def test_a_model_with_too_few_points_is_none(try_out):
     found, _ = try_out([10], at_once=10, points=29)
-
     assert all(isinstance(attempt, NoModel) for attempt in found)
     assert [attempt.note for attempt in found[:2]] == ["from 1.jpg + 2.jpg: 10 photos", "all at once: 10 photos"]
     assert len(try_out([10], at_once=10, points=30)[0]) == 2

@@ -103,16 +103,13 @@ def test_a_lost_photo_finds_its_place_by_finer_features(first, finer):
 def test_cameras_that_were_not_known_are_found_anew(first, finer, cameras, monkeypatch):
     asked, anew = finer(), cameras(focal=1200.0)
     monkeypatch.setattr(module, "find_intrinsics", lambda *_: (anew, ()))
-
     retry_lost_photos(replace(first, intrinsics=cameras(method="guess", identifiable=False)))
-
     assert asked[1][2] is anew
 
 
 @pytest.mark.slow
 def test_what_was_found_first_stays_where_no_more_photos_find_a_place(first, finer):
     finer(places=5)
-
     assert retry_lost_photos(first) is first
     assert first.run.statistics["second_look"]["taken"] is False
 
@@ -120,7 +117,6 @@ def test_what_was_found_first_stays_where_no_more_photos_find_a_place(first, fin
 @pytest.mark.slow
 def test_nothing_is_mapped_again_where_no_lost_photo_shows_the_same_scene(first, finer):
     asked = finer(order=slice(None, None, -1))
-
     assert retry_lost_photos(first) is first
     assert len(asked) == 1
     assert (first.run.statistics["second_look"]["placed"], first.run.statistics["second_look"]["taken"]) == ([5], False)
@@ -129,7 +125,6 @@ def test_nothing_is_mapped_again_where_no_lost_photo_shows_the_same_scene(first,
 @pytest.mark.slow
 def test_a_second_look_that_fails_costs_nothing(first, finer):
     finer(failing=BackendError("the disk is full"))
-
     assert retry_lost_photos(first) is first
     assert first.run.statistics["second_look"]["failed"] == "the disk is full"
 
@@ -137,7 +132,6 @@ def test_a_second_look_that_fails_costs_nothing(first, finer):
 @pytest.mark.slow
 def test_a_second_look_whose_cluster_is_gone_is_not_skipped(first, finer):
     finer(failing=ClusterError("the scheduler is gone"))
-
     with pytest.raises(ClusterError, match="scheduler"):
         retry_lost_photos(first)
 
@@ -146,7 +140,6 @@ def test_a_second_look_whose_cluster_is_gone_is_not_skipped(first, finer):
 def test_nobody_looks_twice_where_all_photos_have_a_place(first, finer, synthetic):
     asked = finer()
     whole = replace(first, outcome=outcome_of(synthetic, first.matches, first.views, 6))
-
     assert retry_lost_photos(whole) is whole and asked == [] and "second_look" not in first.run.statistics
 
 
@@ -155,7 +148,6 @@ def test_nobody_looks_twice_where_all_photos_have_a_place(first, finer, syntheti
 def test_nobody_looks_twice_where_that_is_not_wanted(first, finer, chosen):
     asked = finer()
     unasked = replace(first, run=replace(first.run, settings=Settings.from_mapping(chosen)))
-
     assert retry_lost_photos(unasked) is unasked and asked == []
 
 
@@ -173,9 +165,7 @@ def test_in_small_sets_a_lost_photo_is_matched_with_all_others():
 @pytest.mark.slow
 def test_in_large_sets_it_is_matched_with_its_neighbors():
     graph = photos(100, [((50, k), 100 + k) for k in range(80, 100)] + [((10, 50), 500)])
-
     found = candidate_pairs([50], graph)
-
     near = {(48, 50), (49, 50), (50, 51), (50, 52)}
     likely = {(10, 50)} | {(50, k) for k in range(93, 100)}
     assert found == sorted(near | likely)
@@ -186,7 +176,6 @@ def test_in_large_sets_it_is_matched_with_its_neighbors():
 def test_few_lost_photos_of_many_are_left(monkeypatch, count, lost, seen):
     monkeypatch.setattr(module, "posed_photo_ids", lambda _: range(1, count - lost + 1))
     outcome = Outcome((Attempt("incremental", object(), {}, ""),), PoseGraph({}, {}, ()), None, ())
-
     assert len(lost_photos(MappedScene(outcome, photos(count), ViewGraph({}, {}), None, None))) == seen
 
 
@@ -200,9 +189,7 @@ def graph(known=()):
 
 def test_keypoints_in_one_place_are_one_and_others_are_appended():
     found = {1: np.array([[10.3, 5.0], [14.0, 5.0]]), 2: np.array([[1.0, 6.0], [90.0, 9.0]])}
-
     merged, changed = add_matches(graph(known=[[0, 3]]), found, {(1, 2): np.array([[0, 0], [1, 1]], np.uint32)})
-
     np.testing.assert_array_equal(merged.keypoints[1], np.vstack([GRID, found[1]]))
     np.testing.assert_array_equal(merged.matches[1, 2], [[0, 3], [1, 0], [5, 5]])
     assert changed == ((1, 2),)
@@ -211,7 +198,6 @@ def test_keypoints_in_one_place_are_one_and_others_are_appended():
 def test_a_keypoint_that_has_a_match_gets_no_other():
     found = {1: GRID, 2: GRID + 1.0}
     merged, changed = add_matches(graph(known=[[0, 3]]), found, {(1, 2): np.array([[0, 1], [2, 3]], np.uint32)})
-
     np.testing.assert_array_equal(merged.matches[1, 2], [[0, 3]])
     assert changed == ()
 
@@ -219,7 +205,6 @@ def test_a_keypoint_that_has_a_match_gets_no_other():
 def test_a_pair_and_a_photo_without_anything_get_what_was_found():
     found = {1: GRID, 3: GRID}
     merged, changed = add_matches(graph(), found, {(1, 3): np.array([[3, 1]], np.uint32)})
-
     np.testing.assert_array_equal(merged.matches[1, 3], [[3, 1]])
     assert changed == ((1, 3),) and len(merged.keypoints[3]) == 4
 

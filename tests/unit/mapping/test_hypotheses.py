@@ -64,7 +64,6 @@ def test_it_is_asked_where_one_camera_does_not_explain_photos_that_nobody_groupe
 def test_it_is_asked_of_photos_of_a_plane_whose_pairs_are_all_degenerate(cameras):
     none = ViewGraph({}, {})
     guess = cameras(method="guess", identifiable=False)
-
     assert is_shared_camera_doubtful(attempt(photos(6), 2), guess, none, AUTO)
     assert not is_shared_camera_doubtful(attempt(photos(OPTIONS.min_photos - 1), 2), guess, none, AUTO)
 
@@ -119,9 +118,7 @@ def each_of(synthetic, cameras, focals):
 def test_photos_of_two_focals_get_two_cameras(synthetic, cameras, monkeypatch):
     model, each, found = each_of(synthetic, cameras, [1000.0, 1300.0, 1010.0, 1310.0, 990.0, 1290.0])
     monkeypatch.setattr(hypotheses, "cameras_by_photo", lambda _: found)
-
     two = with_two_cameras(model, each, synthetic.matches)
-
     names = {photo: two.camera_name(synthetic.matches.images[photo]) for photo in range(1, 7)}
     assert len(two.cameras) == 2 and names[1] == names[3] == names[5] != names[2] == names[4] == names[6]
     assert [two.cameras[names[photo]].focal_px for photo in (1, 2)] == pytest.approx([1000.0, 1300.0])
@@ -131,7 +128,6 @@ def test_photos_of_two_focals_get_two_cameras(synthetic, cameras, monkeypatch):
 def test_a_single_photo_of_another_focal_is_no_second_camera(synthetic, cameras, monkeypatch):
     model, each, found = each_of(synthetic, cameras, [1000.0, 1005.0, 1010.0, 1310.0, 990.0, 1001.0])
     monkeypatch.setattr(hypotheses, "cameras_by_photo", lambda _: found)
-
     assert with_two_cameras(model, each, synthetic.matches) is None
 
 
@@ -184,9 +180,7 @@ def cameras_in(path):
 
 def test_photos_of_a_zoom_are_mapped_with_a_camera_each(synthetic, run, cameras, zoom):
     asked, mappers = zoom(right=True)
-
     found = reconstruct(synthetic.matches, synthetic.views, cameras(method="guess", identifiable=False), run(), mappers)
-
     assert asked == [1, 6]
     assert len(found.intrinsics.cameras) == 6 and cameras_in(run().workspace.database) == 6
     assert found.tried[-2:] == ("6 cameras (a camera for each photo)", "no rival (a camera for each photo)")
@@ -196,8 +190,6 @@ def test_photos_of_one_camera_keep_it_and_so_does_the_database(synthetic, run, c
     monkeypatch.setattr(module, "is_shared_camera_doubtful", lambda *_: True)
     asked, mappers = zoom(right=False)
     guess = cameras(method="guess", identifiable=False)
-
     found = reconstruct(synthetic.matches, synthetic.views, guess, run(), mappers)
-
     assert asked == [1, 6]
     assert found.intrinsics is guess and cameras_in(run().workspace.database) == 1

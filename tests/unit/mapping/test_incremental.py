@@ -64,7 +64,6 @@ def test_new_photos_join_the_model_and_nothing_is_mapped_again(grow, synthetic):
 
 def test_photos_that_left_leave_the_model(grow, synthetic):
     found, figures = grow(synthetic.copy(), (1, 2, 3, 4, 5))
-
     assert figures["mapped_again_because"] == ""
     assert len(posed_photo_ids(found.outcome.models[0].model)) == 6  # the sixth was replaced, and is placed anew
 
@@ -99,18 +98,15 @@ def test_a_wrong_earlier_model_is_mapped_again(grow, synthetic):
 
 def test_a_model_of_few_of_the_photos_is_no_start(grow, synthetic):
     found, figures = grow(submodel(synthetic.model, [1, 2]), (1, 2), whole=synthetic.copy())
-
     assert "only 2 of 6 photos" in figures["mapped_again_because"]
     assert found.outcome.models[0].photos == 6
 
 
 def test_the_grown_model_stays_where_all_again_explains_less(grow, synthetic, monkeypatch):
     monkeypatch.setattr(module, "rival_reason", lambda *_: "a doubt")
-
     found, figures = grow(
         submodel(synthetic.model, [1, 2, 3, 4]), (1, 2, 3, 4), whole=submodel(synthetic.model, [1, 2, 3])
     )
-
     assert figures["mapped_again_because"] == "a doubt"
     assert found.outcome.models[0].mapper == "grown" and found.outcome.models[0].photos == 6
     assert found.outcome.tried[0] == "all again"
@@ -121,11 +117,9 @@ def test_a_grown_model_with_two_places_in_one_stays_only_where_nothing_else_is_f
     grow, synthetic, monkeypatch, left, mapper
 ):
     monkeypatch.setattr(module, "judge_places", lambda _: ([LookAlikes(((1, 6),), 0.9)], 12))
-
     found, figures = grow(
         submodel(synthetic.model, [1, 2, 3, 4]), (1, 2, 3, 4), whole=left and submodel(synthetic.model, left)
     )
-
     assert figures["mapped_again_because"] == "two different places are merged in the model"
     assert found.outcome.models[0].mapper == mapper
 

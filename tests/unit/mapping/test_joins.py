@@ -22,7 +22,6 @@ def difference_of(found, true):
 
 def test_a_join_recovers_the_similarity(two_parts):
     join = find_join(0, 1, two_parts.fragments)
-
     assert (join.first, join.second, join.photos, join.shared) == (0, 1, 8, 8)
     angle, scale, place = difference_of(join.similarity, two_parts.true)
     assert angle < 0.3 and scale < 0.01 and 0.0 < place < 0.05
@@ -48,17 +47,14 @@ def test_photos_that_one_part_has_misplaced_do_not_count(two_parts):
 def test_three_shared_photos_join_two_do_not(street, shared):
     first = Fragment(0, frozenset(range(1, 21)), street.placed(range(1, 21)))
     second = Fragment(1, frozenset(range(21, 41)), street.placed(range(21 - shared, 41)))
-
     assert (find_join(0, 1, [first, second]) is not None) is (shared == 3)
 
 
 def test_matches_across_bear_out_a_right_join_and_contradict_a_wrong_one(street, two_parts):
     across = AcrossJoins(*street.graphs(), 1.5)
     join = find_join(0, 1, two_parts.fragments)
-
     explained, contradicted = across.count(join, two_parts.fragments)
     assert explained > 800 and contradicted < 0.01 * explained
-
     aside = Similarity(join.similarity.scale, join.similarity.R, join.similarity.t + np.array([0.0, 3.0, 0.0]))
     explained, contradicted = across.count(replace(join, similarity=aside), two_parts.fragments)
     assert contradicted > 3 * explained
@@ -111,9 +107,7 @@ def off(frames, true):
 
 def test_frames_are_as_exact_as_the_joins(ring):
     fragments, true, joins = ring
-
     found = align_fragments(fragments, joins)
-
     assert not found.dropped and len(found.kept) == len(joins)
     angle, scale, shift = off(found.frames, true)
     assert 0.01 < angle < 1.0 and 0.0005 < scale < 0.03 and 0.001 < shift < 0.15
@@ -145,9 +139,7 @@ def test_a_street_folded_onto_another_is_found_by_its_loop(ring):
     fragments, true, joins = ring
     plain = [join for join in joins if (join.second - join.first) in (1, COUNT - 1)]
     chord = Join(0, 4, Similarity(1.0, np.eye(3), np.zeros(3)), 4, 5, 40, 0.3, 0.02, np.zeros((1, 3)), 30, 0)
-
     found = align_fragments(fragments, [*plain, chord])
-
     assert [join for join, _ in found.dropped] == [chord]
     assert len(found.frames) == COUNT and off(found.frames, true)[0] < 2.0
 
@@ -168,9 +160,7 @@ def test_errors_around_loops_name_the_loop(ring):
 def test_what_no_join_connects_has_no_frame(ring):
     fragments, _, joins = ring
     within = [join for join in joins if join.first >= 2 and join.second >= 2]
-
     found = align_fragments(fragments, within)
-
     assert sorted(found.frames) == [2, 3, 4, 5, 6, 7]
     assert sorted(align_fragments(fragments, []).frames) == [0]
 
@@ -180,7 +170,6 @@ STILL = Similarity(1.0, np.eye(3), np.zeros(3))
 
 def test_every_photo_is_there_once_where_it_belongs(street, two_parts):
     found = merge_fragments(two_parts.fragments, {0: STILL, 1: two_parts.true})
-
     assert found.photos.tolist() == list(range(1, 41))
     away = np.linalg.norm(found.centers - street.centers, axis=1)
     assert 0.001 < away.max() < 0.06
@@ -230,7 +219,6 @@ def test_two_keypoints_of_a_photo_do_not_end_in_one_point(two_parts):
 
 def test_what_has_no_frame_stays_out(two_parts):
     found = merge_fragments(two_parts.fragments, {1: STILL})
-
     assert found.photos.tolist() == list(range(17, 41))
     assert np.allclose(found.centers, two_parts.fragments[1].placed.centers)
 
@@ -266,7 +254,6 @@ def test_a_model_is_the_same_as_arrays_and_back(synthetic, placed):
 @pytest.mark.slow
 def test_photos_that_share_a_camera_get_the_one_with_the_median_focal(synthetic, placed):
     found = write_placed(synthetic.database, with_focals(placed, [1200, 1290, 1400, 1275, 1285, 1270]))
-
     (camera,) = found.cameras.values()
     assert camera.params[0] == 1285
 

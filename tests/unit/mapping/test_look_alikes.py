@@ -43,9 +43,7 @@ def graph(*joins, dropped=None):
 def test_matches_of_look_alikes_do_not_speak(matches):
     fit = EpipolarFit(np.eye(3), np.ones(1, bool), np.ones(1), 1, 0.1)
     views = ViewGraph({(1, 2): fit, (1, 11): fit}, {})
-
     kept, seen = drop_look_alikes(matches, views, graph(JOIN))
-
     assert set(kept.matches) == {(1, 2), (11, 12)} and set(seen.fits) == {(1, 2)}
     assert drop_look_alikes(matches, views, graph()) == (matches, views)
 
@@ -53,9 +51,7 @@ def test_matches_of_look_alikes_do_not_speak(matches):
 def test_a_second_pass_knows_what_the_first_told_apart():
     later = LookAlikes(((3, 4),), 0.5)
     first = graph(JOIN, dropped=dict.fromkeys(JOIN.pairs, "alike") | {(7, 8): "else"})
-
     found = with_earlier_look_alikes(graph(later, dropped={(3, 4): "alike"}), first)
-
     assert found.look_alikes == (JOIN, later)
     assert found.dropped == dict.fromkeys((*JOIN.pairs, (3, 4)), "alike")
 
@@ -78,7 +74,6 @@ def model(places):
 
 def test_a_walk_that_jumps_is_named_where_it_does():
     steady = np.arange(36) + np.tile([0.0, 0.1], 18)
-
     assert jumps(model(steady)) == []
     assert jumps(model([*steady[:7], *(steady[7:] + 12.0)])) == [["06.jpg", "07.jpg"]]
     assert jumps(model([*steady[:7], *(steady[7:] + 2.0)])) == []
@@ -86,7 +81,6 @@ def test_a_walk_that_jumps_is_named_where_it_does():
 
 def test_photos_in_no_order_do_not_jump():
     rng = np.random.default_rng(0)
-
     assert jumps(model(rng.permutation(40).astype(float))) == []
     assert jumps(model(np.where(np.arange(40) % 4 == 3, 100.0, 0.0) + np.arange(40))) == []
     assert jumps(model([*range(14), *range(50, 64)])) == [], "too few"
@@ -153,9 +147,7 @@ def walls():
 def test_photos_of_one_wall_share_what_they_should(walls):
     wall = walls.add_points(0, 12, seed=1)
     walls.add_walk(range(1, 13), np.linspace(3, 9, 12), wall)
-
     found = find_expected_overlaps(walls.finish()[0])
-
     assert {(1, 2), (5, 6), (11, 12)} <= found.keys()
     assert all(meeting.shared == meeting.expected for meeting in found.values())
     assert 2 * 12 * 6 < found[5, 6].expected <= 2 * 12 * 9
@@ -165,9 +157,7 @@ def test_photos_of_one_wall_share_what_they_should(walls):
 def test_photos_of_two_walls_in_one_place_share_nothing(walls):
     walls.add_walk(range(1, 7), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=1))
     walls.add_walk(range(11, 17), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=2))
-
     found = find_expected_overlaps(walls.finish()[0])
-
     across = [meeting for (a, b), meeting in found.items() if (a < 10) != (b < 10)]
     assert len(across) >= 6
     assert all(meeting.shared == 0 < meeting.expected for meeting in across)
@@ -179,9 +169,7 @@ def test_a_photo_expects_nothing_behind_what_it_sees(walls, behind, sides):
     """Those who see the far wall should see the near one, too, and not the other way round."""
     walls.add_walk(range(1, 7), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=1))
     walls.add_walk(range(11, 17), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=2, away=AWAY + behind))
-
     found = find_expected_overlaps(walls.finish()[0])
-
     assert (sides - 1) * 12 * 9 < found[3, 13].expected <= sides * 12 * 9
 
 
@@ -189,7 +177,6 @@ def test_a_photo_expects_nothing_behind_what_it_sees(walls, behind, sides):
 def test_a_photo_with_another_focal_length_need_not_match(walls):
     walls.add_walk(range(1, 7), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=1))
     walls.add_walk(range(11, 17), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=2), zoom=1.6)
-
     assert all((a < 10) == (b < 10) for a, b in find_expected_overlaps(walls.finish()[0]))
 
 
@@ -197,7 +184,6 @@ def test_a_photo_with_another_focal_length_need_not_match(walls):
 def test_points_of_two_photos_prove_nothing(walls):
     walls.add_walk((1, 2), (3, 3.5), walls.add_points(0, 9, seed=1))
     walls.add_walk((11, 12), (3, 3.5), walls.add_points(0, 9, seed=2))
-
     assert find_expected_overlaps(walls.finish()[0]) == {}
 
 
@@ -205,7 +191,6 @@ def test_points_of_two_photos_prove_nothing(walls):
 def test_photos_far_apart_do_not_meet(walls):
     walls.add_walk(range(1, 7), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=1))
     walls.add_walk(range(11, 17), np.linspace(30, 33, 6), walls.add_points(27, 36, seed=2))
-
     assert all((a < 10) == (b < 10) for a, b in find_expected_overlaps(walls.finish()[0]))
 
 
@@ -228,9 +213,7 @@ def two_streets(walls, length=24, alike=(10.0, 14.0)):
 @pytest.mark.slow
 def test_a_house_in_two_streets_is_found_and_nothing_else(walls):
     model, explained = two_streets(walls)
-
     joins, non_overlapping = judge_places([Attempt("incremental", model, explained, "")])
-
     across = {pair for pair, found in explained.items() if pair[0] < 100 < pair[1] and found.matches >= 16}
     assert len(joins) == 1
     assert set(joins[0].pairs) == across
@@ -245,7 +228,6 @@ def test_one_street_that_is_walked_twice_is_no_false_join(walls):
     walls.add_walk(range(1, 1 + len(places)), places, wall)
     walls.add_walk(range(101, 101 + len(places)), places + 0.2, wall, shift=0.3)
     model, explained = walls.finish()
-
     assert judge_places([Attempt("incremental", model, explained, "")]) == ([], 0)
 
 
@@ -265,9 +247,7 @@ def test_a_loop_whose_ends_were_hardly_matched_stays():
 @pytest.mark.slow
 def test_photos_whose_matches_hold_are_no_strangers():
     overlaps = {(1, 2): ExpectedOverlap(50, 0), (1, 3): ExpectedOverlap(50, 0), (2, 3): ExpectedOverlap(50, 20)}
-
     found = find_non_overlapping(overlaps, {(1, 2): PairSupport(40, 40, 0), (1, 3): PairSupport(5, 5, 0)})
-
     assert set(found) == {(1, 3)}
 
 

@@ -73,9 +73,7 @@ def test_parts_hold_every_photo_once_are_connected_balanced_and_overlap(photos, 
 
 def test_a_cut_passes_through_the_thin_places():
     graph = graph_of(clusters(6, 50))
-
     parts = cut_group(graph, range(300), 50)
-
     assert [part.own for part in parts] == [tuple(range(50 * k, 50 * k + 50)) for k in range(6)]
     assert all(len(part.photos) == 58 for part in parts)  # four from either side
 
@@ -84,23 +82,19 @@ def test_doubtful_pairs_hold_nothing_together():
     counts = row(80, 8) | row(80, 8, start=80) | {(k, 80 + k): 100 for k in range(0, 80, 2)}
     firm = {(k, 80 + k): 60 for k in range(76, 80)}
     graph = graph_of(counts | firm, doubtful=[pair for pair in counts if pair[1] - pair[0] == 80])
-
     parts = cut_group(graph, range(160), 80)
-
     assert [part.own for part in parts] == [tuple(range(80)), tuple(range(80, 160))]
     assert link_weights(graph, range(160))[0][80] == pytest.approx(0.1 * link_weights(graph, range(160))[0][1])
 
 
 def test_a_small_group_is_one_part_and_the_same_graph_gives_the_same_parts():
     graph = graph_of(row(60, 10))
-
     assert [part.photos for part in cut_group(graph, range(60), 60)] == [tuple(range(60))]
     assert cut_group(graph, range(60), 20) == cut_group(graph_of(row(60, 10)), range(59, -1, -1), 20)
 
 
 def test_a_photo_that_nothing_connects_is_a_part_of_its_own():
     parts = cut_group(graph_of(row(50, 10)), range(51), 60)
-
     assert [part.own for part in parts] == [tuple(range(50)), (50,)]
 
 
@@ -120,7 +114,6 @@ def test_a_part_of_a_group_has_what_concerns_its_photos(street):
     group = group_of(street)
     pairs, _ = pairs_of_parts(group.matches.matches, [(3, 4, 5), (5, 6)])
     part = part_of_group(group, (3, 4, 5), pairs)
-
     assert list(part.matches.images) == list(part.matches.keypoints) == [3, 4, 5]
     assert list(part.matches.matches) == list(part.views.fits) == list(part.graph.poses) == [(3, 4), (3, 5), (4, 5)]
     assert part.graph.groups == ((3, 4, 5),) and list(part.intrinsics.cameras) == ["one"]
@@ -128,7 +121,6 @@ def test_a_part_of_a_group_has_what_concerns_its_photos(street):
 
 def test_pairs_belong_to_every_part_that_has_both_photos():
     pairs = [(1, 2), (2, 3), (3, 4), (1, 4), (4, 5)]
-
     assert pairs_of_parts(pairs, [(1, 2, 3), (2, 3, 4), (9,)]) == [[(1, 2), (2, 3)], [(2, 3), (3, 4)], []]
 
 
@@ -164,5 +156,4 @@ def test_inputs_are_read_back_as_they_were(street, tmp_path):
 
 def test_false_joins_travel_as_plain_values():
     joins = (LookAlikes(((1, 2), (3, 4)), 0.875), LookAlikes(((5, 6),), 0.5))
-
     assert joins_from_plain(json.loads(json.dumps(joins_to_plain(joins)))) == joins

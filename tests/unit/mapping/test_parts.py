@@ -128,9 +128,7 @@ def test_where_no_part_is_mapped_the_reason_is_told(group, start, monkeypatch):
     failed = PartResult((), "", ("failed: no memory",))
     monkeypatch.setattr(parts, "map_parts", lambda *_, **__: [failed] * 9)
     monkeypatch.setattr(parts, "cut_group", lambda *_: [parts.Part((k,), (k,)) for k in range(1, 10)])
-
     (found,) = start()[0]
-
     assert isinstance(found, NoModel) and found.note == "in 9 parts: no part has a model; failed: no memory"
     assert not parts_suffice([found], PHOTOS)
 
@@ -151,7 +149,6 @@ def test_a_cluster_that_is_gone_ends_the_run_and_other_failures_leave_the_whole(
 
 def test_the_size_of_parts_is_that_of_the_settings_or_usual_for_large_groups():
     auto, own = SceneSettings(), SceneSettings(part_photos=60)
-
     assert [part_size(count, auto) for count in (3, 400, 401, 9000)] == [0, 0, 150, 150]
     assert [part_size(count, own) for count in (90, 91, 1000)] == [0, 60, 60]
     assert part_size(100, SceneSettings(part_photos=1)) == 20
@@ -202,7 +199,6 @@ def test_parts_with_false_joins_are_not_joined_unless_nobody_asks(start, monkeyp
     results = [PartResult((), "", ("failed",), (one,)) for one in (join, more, join)]
     monkeypatch.setattr(parts, "map_parts", lambda *_, **__: results)
     monkeypatch.setattr(parts, "cut_group", lambda *_: [parts.Part((k,), (k,)) for k in (1, 2, 3)])
-
     assert start(1, whole=True) == ([], (join, LookAlikes(((5, 6),), 0.7)))
     found, joins = start(2, whole=True, stop_at_false_joins=False)
     assert joins == () and [one.note for one in found] == ["in 3 parts: no part has a model; failed"]
@@ -235,6 +231,5 @@ def test_a_task_is_small_and_travels(tmp_path):
     import pickle
 
     task = PartTask(str(tmp_path), str(tmp_path / "photos"))
-
     assert len(pickle.dumps((map_part, task))) < 1000
     assert pickle.loads(pickle.dumps((map_part, task))) == (map_part, task)  # noqa: S301

@@ -192,18 +192,14 @@ def test_false_joins_of_parts_stay_where_nothing_else_holds_the_photos_together(
 def test_parts_are_asked_a_few_times_only(synthetic, run, cameras, mapped):
     joins = [(LookAlikes((pair,), 0.9),) for pair in ((1, 4), (2, 5), (3, 6), (1, 5))]
     seen = mapped.parts(joins, with_camera(synthetic.copy(), TRUE))
-
     found = mapped.outcome(cameras(), run())
-
     assert [asked for *_, asked in seen] == [True, True, True, False]
     assert found.graph.look_alikes == tuple(join for (join,) in joins[:3])
 
 
 def test_a_camera_that_was_known_and_stayed_is_not_looked_at_twice(synthetic, run, cameras, mapped):
     seen = mapped(with_camera(synthetic.copy(), [FOCAL * 1.009, 512.0, 384.0, 0.01]))
-
     found = mapped.outcome(cameras(), run())
-
     assert len(seen) == 1 and found.passes == 1
     assert found.tried == ("6 photos",) and found.cuts == ()
     assert found.graph.groups == ((1, 2, 3, 4, 5, 6),) and seen[0][0] == (1, 2, 3, 4, 5, 6)
@@ -246,17 +242,13 @@ def test_a_second_pass_that_explains_less_is_thrown_away_with_all_that_it_wrote(
 
 def test_a_second_pass_that_finds_nothing_leaves_the_first(synthetic, run, cameras, mapped):
     mapped(with_camera(synthetic.copy(), TRUE), None)
-
     found = mapped.outcome(cameras(method="guess", identifiable=False), run())
-
     assert (found.passes, found.models[0].photos) == (1, 6)
 
 
 def test_without_a_model_there_is_nothing_to_learn(synthetic, run, cameras, mapped):
     seen = mapped(None, None, None, None)
-
     found = mapped.outcome(cameras(method="guess", identifiable=False), run())
-
     assert found.models == () and found.support == 0.0 and found.tried[:2] == ("nothing", "no rival")
     assert len(seen) == 4 and len(found.tried) == 5  # the usual guess, and three others
 
@@ -264,9 +256,7 @@ def test_without_a_model_there_is_nothing_to_learn(synthetic, run, cameras, mapp
 def test_a_rival_that_explains_more_goes_on(synthetic, run, cameras, mapped):
     mapped(without(with_camera(synthetic.copy(), TRUE), [6]), None)
     asked = mapped.rival(with_camera(synthetic.copy(), TRUE))
-
     found = mapped.outcome(cameras(), run())
-
     assert len(asked) == 1 and found.rival_reason == "unregistered photos with matches: 1"
     assert (found.models[0].mapper, found.models[0].photos) == ("colmap", 6)
     assert "the rival" in found.tried and found.reason.startswith("it registers all 6 photos")
@@ -289,9 +279,7 @@ def test_later_steps_know_the_pairs_of_a_rival_that_goes_on(synthetic, run, came
 def test_a_rival_that_explains_less_is_named_and_left(synthetic, run, cameras, mapped):
     mapped(with_camera(synthetic.copy(), TRUE), None)
     asked = mapped.rival(without(with_camera(synthetic.copy(), TRUE), [5, 6]))
-
     found = mapped.outcome(cameras(method="guess", identifiable=False), run())
-
     assert len(asked) == 1 and found.rival_reason == "the pairs do not determine a camera"
     assert (found.models[0].mapper, found.models[0].photos) == ("incremental", 6)
     assert "the rival" in found.tried
@@ -300,9 +288,7 @@ def test_a_rival_that_explains_less_is_named_and_left(synthetic, run, cameras, m
 def test_good_evidence_needs_no_rival(synthetic, run, cameras, mapped):
     mapped(with_camera(synthetic.copy(), TRUE))
     asked = mapped.rival(synthetic.copy())
-
     found = mapped.outcome(cameras(), run())
-
     assert asked == [] and found.rival_reason == "" and found.models[0].photos == 6
 
 
@@ -321,9 +307,7 @@ def test_where_a_guess_leaves_many_photos_out_other_focals_are_tried(synthetic, 
 
 def test_no_other_focals_are_tried_where_one_is_known(synthetic, run, cameras, mapped):
     seen = mapped(without(synthetic.copy(), [4, 5, 6]), None)
-
     mapped.outcome(cameras(), run())
-
     assert all(intrinsics.main.focal_px == pytest.approx(FOCAL, rel=0.01) for _, intrinsics in seen)
 
 
@@ -354,14 +338,12 @@ def worth(model, synthetic, intrinsics, photos=6):
 
 def test_two_photos_teach_no_camera(synthetic, cameras):
     guess = cameras(method="guess", identifiable=False)
-
     assert not worth(without(synthetic.copy(), [3, 4, 5, 6]), synthetic, guess)
     assert worth(without(synthetic.copy(), [4, 5, 6]), synthetic, guess)
 
 
 def test_photos_of_the_main_group_that_stayed_out_are_worth_another_pass(synthetic, cameras):
     known = cameras(FOCAL)
-
     assert not worth(with_camera(synthetic.copy(), TRUE), synthetic, known)
     assert worth(without(with_camera(synthetic.copy(), TRUE), [6]), synthetic, known)
     assert not worth(without(with_camera(synthetic.copy(), TRUE), [6]), synthetic, known, photos=5)
@@ -370,9 +352,7 @@ def test_photos_of_the_main_group_that_stayed_out_are_worth_another_pass(synthet
 def test_what_is_learned_is_focal_center_and_lens(synthetic, cameras):
     guess = cameras(FOCAL * 1.2, method="guess", identifiable=False, reason="an orbit", held=("center",))
     model = with_camera(synthetic.copy(), [1300.0, 500.0, 390.0, -0.07])
-
     found = learned(model, synthetic, guess).main
-
     assert found.K.tolist() == [[1300.0, 0, 500.0], [0, 1300.0, 390.0], [0, 0, 1]]
     assert (found.radial, found.reason, found.held) == (-0.07, "", ("center",))
 
@@ -414,9 +394,7 @@ GOOD, AGAINST, FOR = PairSupport(100, 100, 0), PairSupport(5, 60, 55), PairSuppo
 
 def test_a_model_whose_join_is_contradicted_gives_its_parts(synthetic):
     attempt = Attempt("global", synthetic.copy(), joined(GOOD, AGAINST), "how")
-
     first, second = split_attempt(attempt)
-
     assert [posed_photo_ids(part.model) for part in (first, second)] == [[1, 2, 3], [4, 5, 6]]
     assert set(first.explained) == {(1, 2), (1, 3), (2, 3)} and set(second.explained) == {(4, 5), (4, 6), (5, 6)}
     assert (first.mapper, first.note) == ("global", "how")
@@ -426,15 +404,12 @@ def test_a_model_whose_join_is_contradicted_gives_its_parts(synthetic):
 
 def test_a_model_whose_join_holds_stays_as_it_is(synthetic):
     attempt = Attempt("global", synthetic.copy(), joined(GOOD, FOR), "how")
-
     assert split_attempt(attempt) == [attempt]
 
 
 def test_lonely_photos_and_lesser_pairs_are_left_out(synthetic):
     pairs = {(1, 2): GOOD, (1, 3): GOOD, (4, 5): GOOD}
-
     [part] = split_attempt(Attempt("global", synthetic.copy(), pairs, "how"))
-
     assert posed_photo_ids(part.model) == [1, 2, 3]
 
 
@@ -465,9 +440,7 @@ def only(synthetic, *pairs):
 
 def test_a_group_of_two_photos_is_mapped_when_there_is_no_other(synthetic, run, cameras, mapped):
     seen = mapped(without(synthetic.copy(), [1, 2, 4, 6]))
-
     found = mapped.outcome(cameras(), run(), *only(synthetic, (3, 5)))
-
     assert [photos for photos, _ in seen] == [(3, 5)]
     assert posed_photo_ids(found.models[0].model) == [3, 5]
 
@@ -475,9 +448,7 @@ def test_a_group_of_two_photos_is_mapped_when_there_is_no_other(synthetic, run, 
 def test_the_model_with_most_photos_is_the_main_one(synthetic, run, cameras, mapped):
     pairs = [(1, 2), (1, 3), (2, 3), (4, 5), (4, 6), (5, 6)]
     mapped(without(synthetic.copy(), [3, 4, 5, 6]), without(synthetic.copy(), [1, 2, 3]))
-
     found = mapped.outcome(cameras(), run(), *only(synthetic, *pairs))
-
     assert [posed_photo_ids(attempt.model) for attempt in found.models] == [[4, 5, 6], [1, 2]]
     assert found.tried == ("2 photos", "3 photos", "no rival")
 
@@ -485,9 +456,7 @@ def test_the_model_with_most_photos_is_the_main_one(synthetic, run, cameras, map
 def test_every_group_is_mapped_but_lesser_ones_of_two_photos(synthetic, run, cameras, mapped):
     matches, views = only(synthetic, (1, 2), (3, 4), (3, 5), (4, 5))
     seen = mapped(without(synthetic.copy(), [1, 2, 6]))
-
     found = mapped.outcome(cameras(), run(), matches, views)
-
     assert found.graph.groups == ((3, 4, 5), (1, 2))
     assert [photos for photos, _ in seen] == [(3, 4, 5)]
     assert posed_photo_ids(found.models[0].model) == [3, 4, 5]

@@ -87,7 +87,6 @@ def test_a_rolling_shutter_is_measured_and_its_poses_are_put_right(video):
 @pytest.mark.slow
 def test_a_global_shutter_is_measured_and_left_alone(still):
     model, found = follow(still)
-
     assert model is still.adjusted
     assert found.refused == "none is seen" and found.to_dict()["because"] == "none is seen"
     assert abs(found.readout) < 3.0 * found.deviation < 0.01
@@ -97,16 +96,13 @@ def test_a_global_shutter_is_measured_and_left_alone(still):
 def test_photos_of_a_folder_have_no_shutter_to_follow(still):
     images = {key: replace(image, time_s=None) for key, image in still.matches.images.items()}
     said = Said()
-
     model, found = follow(replace(still, matches=MatchGraph(images, {}, {})), said)
-
     assert model is still.adjusted and found is None and not said.texts
 
 
 @pytest.mark.slow
 def test_a_model_that_could_not_be_adjusted_is_not_asked(still):
     failed = replace(still.adjusted, failure="it diverged")
-
     assert follow(replace(still, adjusted=failed)) == (failed, None)
 
 
@@ -134,7 +130,6 @@ def frames(numbers, times=None, stem="clip_"):
 
 def test_times_are_those_of_the_video_and_the_interval_that_of_its_frames():
     found = frame_times(frames(range(0, 60, 5)))
-
     assert found.interval == pytest.approx(1 / 30) and found.times[3] == pytest.approx(10 / 30)
 
 

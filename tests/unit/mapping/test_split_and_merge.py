@@ -38,7 +38,6 @@ def test_a_chain_holds_together_by_its_neighbors():
 
 def test_a_join_that_many_matches_contradict_is_cut():
     contradictions = {(3, 6): -40, (2, 5): -40}
-
     assert parts(LEFT | RIGHT | {(4, 5): 60} | contradictions, range(1, 8)) == [(1, 2, 3, 4), (5, 6, 7)]
 
 
@@ -48,7 +47,6 @@ def test_a_join_that_outweighs_what_contradicts_it_holds():
 
 def test_a_handful_of_matches_neither_joins_nor_cuts():
     few = dict.fromkeys([(1, 5), (1, 6), (2, 5), (2, 6), (3, 5)], 15)
-
     assert parts(LEFT | RIGHT | few, range(1, 8)) == [(1, 2, 3, 4), (5, 6, 7)]
     assert parts(LEFT | RIGHT | {(4, 5): 16} | dict.fromkeys(few, -15), range(1, 8)) == [tuple(range(1, 8))]
 
@@ -101,7 +99,6 @@ def centers(model):
 @pytest.mark.slow
 def test_points_that_both_know_are_found_once_with_both_their_places(synthetic, halves):
     shared = shared_points(halves[0].model, halves[1].model, synthetic.matches, synthetic.views)
-
     assert 50 < len(shared) <= halves[0].model.num_points3D()
     assert np.allclose(ELSEWHERE(shared[:, :3]), shared[:, 3:], atol=0.2)
 
@@ -109,7 +106,6 @@ def test_points_that_both_know_are_found_once_with_both_their_places(synthetic, 
 @pytest.mark.slow
 def test_halves_become_one_model_as_exact_as_the_whole(synthetic, halves, run):
     (found,) = merge_into_main(halves, synthetic.matches, synthetic.views, run())
-
     assert posed_photo_ids(found.model) == [1, 2, 3, 4, 5, 6]
     assert found.note.startswith("3 and 3 photos joined by ")
     true, got = centers(synthetic.model), centers(found.model)
@@ -121,7 +117,6 @@ def test_halves_become_one_model_as_exact_as_the_whole(synthetic, halves, run):
 @pytest.mark.slow
 def test_what_shares_too_few_points_stays_apart(synthetic, halves, run):
     views = ViewGraph({pair: fit for pair, fit in synthetic.views.fits.items() if within(pair)}, {})
-
     assert len(shared_points(halves[0].model, halves[1].model, synthetic.matches, views)) < OPTIONS.min_shared
     assert merge_into_main(halves, synthetic.matches, views, run()) == halves
 
@@ -133,19 +128,15 @@ def test_matches_that_disagree_about_the_place_join_nothing(synthetic, halves, r
         pair: row if within(pair) else np.column_stack([row[:, 0], rng.permutation(row[:, 1])])
         for pair, row in synthetic.matches.matches.items()
     }
-
     assert merge_into_main(halves, replace(synthetic.matches, matches=rows), synthetic.views, run()) == halves
 
 
 @pytest.mark.slow
 def test_models_that_mapping_left_apart_are_joined_in_the_end(synthetic, halves, run, cameras):
     made = passes.Outcome(halves, _graph(synthetic), cameras(), ("half", "half"))
-
     context = run()
     write_match_graph(context.workspace.database, synthetic.matches)
-
     found = passes.Passes(context).merge_models(made, synthetic.matches, synthetic.views)
-
     assert [model.photos for model in found.models] == [6]
     assert found.reason == found.tried[-1] == found.models[0].note
     assert len(found.graph.poses) == 15

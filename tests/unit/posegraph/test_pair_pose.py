@@ -47,10 +47,8 @@ def fit_of(views, F=None):
 @pytest.mark.parametrize("seed", range(3))
 def test_a_pair_is_called_what_its_inliers_are_of(two_views, scene, kind, seed):
     views = two_views(seed, scene=scene)
-
     # F of a plane or a turn is as good as any that holds it
     pose = estimate_pose(views.pair(), fit_of(views, views.F))
-
     assert pose.kind == kind
     assert views.errors_deg(pose.R, pose.t)[0] < 0.3
     assert not pose.guided
@@ -70,9 +68,7 @@ def test_some_points_off_the_wall_make_a_pair_that_is_not_planar(two_views):
 
 def test_the_pose_is_right_and_false_matches_are_no_inliers(two_views):
     views = two_views(false=100)
-
     pose = estimate_pose(views.pair(), fit_of(views))
-
     assert 0.001 < views.errors_deg(pose.R, pose.t).max() < 0.3
     assert pose.inliers[: views.right].mean() > 0.99 and pose.inliers[views.right :].mean() < 0.1
     assert pose.in_front > 0.98
@@ -82,32 +78,26 @@ def test_the_pose_is_right_and_false_matches_are_no_inliers(two_views):
 
 def test_where_a_camera_is_a_guess_the_inliers_of_F_stay(two_views):
     views, guess = two_views(false=20), two_views.camera(method="guess", identifiable=False)
-
     pose = estimate_pose(views.pair((two_views.camera(), guess)), fit_of(views))
-
     assert pose.kind == "uncalibrated"
     assert np.array_equal(pose.inliers, fit_of(views).inliers)
 
 
 def test_a_focal_from_exif_is_trusted(two_views):
     claimed = two_views.camera(method="exif", identifiable=False)
-
     assert two_views().pair((claimed, claimed)).trusted
     assert estimate_pose(two_views().pair((claimed, claimed)), fit_of(two_views())).kind == "calibrated"
 
 
 def test_too_few_matches_have_no_pose(two_views):
     views = two_views(right=7, false=0)
-
     assert estimate_pose(views.pair(), fit_of(views, views.F)) is None
 
 
 def test_the_pose_is_right_only_when_the_camera_knows_its_lens(two_views):
     views = two_views(radial=-0.2)
     bent, straight = (views.pair([two_views.camera(radial)] * 2) for radial in (0.0, -0.2))
-
     errors = [views.errors_deg(*((p := estimate_pose(pair, fit_of(views))).R, p.t)).max() for pair in (bent, straight)]
-
     assert 0.001 < errors[1] < 0.3
     assert errors[0] > 4 * errors[1] and errors[0] > 1.0
 
@@ -117,7 +107,6 @@ def test_a_pose_starts_from_rays_where_a_lens_has_bent_the_photos(two_views, see
     """F knows no lens, and is off by degrees where there is one."""
     views = two_views(seed, radial=-0.2)
     pair, bent = views.pair([two_views.camera(-0.2)] * 2), views.pair()
-
     assert views.errors_deg(*pair.initial_pose(fit_of(views))).max() < 0.7
     assert views.errors_deg(*bent.initial_pose(fit_of(views))).max() > 1.5
 
@@ -152,7 +141,6 @@ def test_the_points_before_both_cameras_are_those_that_triangulation_finds_there
 def test_a_turn_explains_matches_without_parallax_and_no_others(two_views):
     tilted = Rotation.from_euler("y", 8.0, degrees=True).as_matrix()
     turn, box = two_views(scene="turn"), two_views(false=0)
-
     assert np.median(rotation_residuals(turn.lines, tilted @ turn.R)) < 0.5
     assert np.median(rotation_residuals(box.lines, box.R)) > 5.0
     mixed = np.vstack([turn.lines, two_views(3).lines[:80]])
@@ -211,9 +199,7 @@ def started(views, used):
 
 def test_distances_are_those_of_sampson_in_pixels(two_views):
     views = two_views(false=50)
-
     found = pose_distances(views.lines, views.R, views.t)
-
     np.testing.assert_allclose(found, sampson_distance(views.F, views.x1, views.x2), rtol=1e-6)
 
 
@@ -221,9 +207,7 @@ def test_the_pose_of_exact_matches_is_exact(two_views):
     views = two_views(noise_px=0.0)
     start = started(two_views(noise_px=1.0), np.arange(30))
     assert views.errors_deg(*start).max() > 0.1
-
     R, t = refine_pose(views.lines, start[0], 7.0 * start[1])
-
     assert views.errors_deg(R, t).max() < 1e-5
     assert np.linalg.norm(t) == pytest.approx(1.0, abs=1e-12)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
@@ -262,9 +246,7 @@ def test_no_pose_nearby_explains_the_matches_better(two_views):
 
 def test_matches_that_say_nothing_leave_the_pose_as_it_is(two_views):
     views = two_views()
-
     R, t = refine_pose(np.empty((0, 18)), views.R, views.t)
-
     np.testing.assert_allclose(R, views.R)
     np.testing.assert_allclose(t, views.t)
 
@@ -327,7 +309,6 @@ def test_where_F_turns_the_camera_elsewhere_the_pair_is_posed_all_the_same(seed,
 def test_one_of_the_poses_that_a_plane_allows_is_the_right_one(two_views, seed):
     views = two_views(seed, scene="wall")
     found = [views.errors_deg(*start).max() for start in planar_starts(views.rays)]
-
     assert 2 <= len(found) <= 4
     assert 0.0 < min(found) < 1.5
     assert max(found) > 10.0

@@ -63,9 +63,7 @@ def two_facades(seed):
 @pytest.mark.parametrize("seed", range(10))
 def test_a_third_of_all_pairs_may_take_one_facade_for_another(seed):
     rotations, pairs, weights, wrong, _ = two_facades(seed)
-
     found, angles = average_rotations(pairs, weights)
-
     assert 0.05 < errors_deg(found, rotations).max() < 1.5
     assert min(angles[pair] for pair in wrong) > 85
     assert max(angle for pair, angle in angles.items() if pair not in wrong) < 3
@@ -76,9 +74,7 @@ def test_pairs_that_are_wrong_each_in_its_own_way_may_weigh_as_much_as_others():
     pairs = relative(rotations, combinations(range(12), 2))
     wrong = [pair for k, pair in enumerate(pairs) if k % 3 == 0]
     pairs |= dict(zip(wrong, truth(len(wrong), 5), strict=True))
-
     found, angles = average_rotations(pairs, dict.fromkeys(pairs, 1.0))
-
     assert 0.05 < errors_deg(found, rotations).max() < 1.0
     assert min(angles[pair] for pair in wrong) > 10 > 2 > max(angles[pair] for pair in pairs if pair not in wrong)
 
@@ -128,9 +124,7 @@ def test_every_group_stands_straight_in_a_world_of_its_own():
 def test_a_chain_without_loops_is_multiplied_out():
     rotations, chain = truth(5), [(0, 1), (1, 3), (2, 3), (2, 4)]
     pairs = relative(rotations, chain, noise_deg=0.0)
-
     found, angles = average_rotations(pairs, dict.fromkeys(chain, 30.0))
-
     assert errors_deg(found, rotations).max() < 1e-4
     assert max(angles.values()) < 1e-5
 
@@ -183,15 +177,12 @@ def test_a_loop_counts_by_its_weaker_other_pair():
     pairs = relative(rotations, [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3)], noise_deg=0.0)
     pairs[1, 3] = QUARTER @ pairs[1, 3]
     weights = {(0, 1): 10.0, (0, 2): 40.0, (1, 2): 8.0, (0, 3): 6.0, (1, 3): 90.0}
-
     found = supported(pairs, weights)
-
     assert found[0, 1] == pytest.approx((8 + 1) / (8 + 6 + 1))
 
 
 def test_pairs_in_no_loop_are_all_alike():
     rotations = truth(4)
-
     assert set(
         supported(relative(rotations, [(0, 1), (1, 2), (2, 3)]), dict.fromkeys(combinations(range(4), 2), 5.0)).values()
     ) == {1.0}
@@ -225,9 +216,7 @@ def arrays(turns, weights):
 
 def test_the_street_comes_to_where_most_pairs_want_it(graph):
     true, turns, weights, wrong = graph
-
     found, angles = average_rotations(turns, weights)
-
     off = np.array([true[k].T @ found[k] for k in range(len(true))])
     assert np.degrees(Rotation.from_matrix(off @ off[0].T).magnitude()).max() < 0.5
     assert {pair for pair, angle in angles.items() if angle > 5} == set(wrong)
@@ -251,7 +240,6 @@ def test_a_folded_street_turns_as_a_whole(graph):
 def test_nothing_turns_for_pairs_that_weigh_less_than_those_in_their_way(graph):
     true, turns, weights, _ = graph
     edges, relative, strengths = arrays(turns, weights)
-
     assert list(find_corrections(len(true), edges, _residuals(true, edges, relative), strengths)) == []
 
 
@@ -259,14 +247,12 @@ def test_nothing_turns_where_nothing_contradicts(graph):
     true, turns, weights, wrong = graph
     right = {pair: turn for pair, turn in turns.items() if pair not in wrong}
     edges, relative, strengths = arrays(right, weights)
-
     assert list(find_corrections(len(true), edges, _residuals(true, edges, relative), strengths)) == []
 
 
 def test_pairs_without_others_do_not_end_in_an_error():
     true = Rotation.random(4, random_state=2).as_matrix()
     edges, relative = np.array([[0, 1], [0, 2], [0, 3]]), true[1:] @ true[0].T
-
     assert (
         list(find_corrections(4, edges, _residuals(np.tile(np.eye(3), (4, 1, 1)), edges, relative), np.ones(3))) == []
     )
@@ -292,9 +278,7 @@ def test_the_backbone_has_the_pairs_near_the_weakest_one_on_the_best_path(seed):
     pairs = random_pairs(12, 30, seed)
     values = np.random.default_rng(seed).permutation(len(pairs)) / len(pairs) + 0.1
     covered = dict(zip(pairs, values.tolist(), strict=True))
-
     expected = {pair for pair in pairs if covered[pair] >= OPTIONS.backbone_share * bottleneck(covered, *pair)}
-
     assert backbone(covered) == expected
     assert 11 <= len(expected) < len(pairs)
 
@@ -318,10 +302,8 @@ def test_conjugate_gradients_give_the_rotations_of_the_dense_solution(monkeypatc
     turns = relative(truth(120), steps)
     weights = dict.fromkeys(steps, 1.0)
     dense, _ = average_rotations(turns, weights)
-
     monkeypatch.setattr(module, "AVERAGING", replace(module.AVERAGING, dense_photos=0))
     found, _ = average_rotations(turns, weights)
-
     assert errors_deg(found, dense).max() < 1e-4
 
 
@@ -329,9 +311,7 @@ def test_the_photos_of_a_long_walk_agree():
     photos = 1500
     steps = [(k, k + step) for step in (1, 2, 4, 8) for k in range(photos - step)]
     rotations = truth(photos)
-
     found, angles = average_rotations(relative(rotations, steps), dict.fromkeys(steps, 1.0))
-
     near = errors_deg(found, rotations, range(0, photos, 50))
     assert 0.1 < np.median(near) < 4.0
     assert np.median(list(angles.values())) < 0.6
