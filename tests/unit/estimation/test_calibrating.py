@@ -37,9 +37,7 @@ def test_all_pairs_of_a_small_set_are_asked():
 def test_every_photo_of_a_large_set_is_asked_with_near_and_far_partners(monkeypatch):
     monkeypatch.setattr(module, "OPTIONS", replace(module.OPTIONS, all_pairs=300))
     views = row_of_photos(200, 20)
-
     found = sample_pairs(views, 200)
-
     counts = np.bincount(np.array(list(found.fits)).ravel(), minlength=200)
     assert counts.min() >= module.OPTIONS.pairs_per_photo
     assert 400 <= len(found.fits) <= 800 < len(views.fits)

@@ -106,9 +106,7 @@ def test_a_given_perspective_camera_is_checked_by_the_calibrator(run):
     matches = photos_through(PLAIN, 6, away=14.0)
     wrong = given(run, replace(PLAIN, K=PLAIN.K * [[1.2], [1.2], [1.0]]))
     views = view_graph.make(matches, wrong)
-
     intrinsics, cameras = find_intrinsics(matches, views, wrong)
-
     assert [(camera.name, camera.found.method) for camera in cameras] == [("960x640", "given")]
     assert intrinsics.main.focal_px == pytest.approx(1080.0)
     [said] = run.statistics["given_cameras"]["960x640"]["contradicted"][:1]

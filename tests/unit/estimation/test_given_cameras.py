@@ -41,7 +41,6 @@ def assigned(images, cameras, camera_of=None, *, keep=False):
 def test_a_single_camera_is_that_of_all_photos_of_its_shape():
     images = [photo(1, "a"), photo(2, "half", (500, 400)), photo(3, "square", (800, 800))]
     found = assigned(images, {"1": camera(spread={"fx": 4.0, "k1": 0.01})})
-
     assert list(found.cameras) == ["a", "half"]
     assert found.cameras["a"].K.tolist() == camera().K.tolist()
     half = found.cameras["half"]

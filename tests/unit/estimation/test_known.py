@@ -83,7 +83,6 @@ def test_fits_stay_where_matches_and_lenses_are_the_same(lens):
     matches = graph((1, 2, 3, 4), images=images)
     before = ViewGraph({(1, 2): fit(), (1, 3): fit()}, {(2, 3): Rejected("too few")}, {"wide": lens})
     same = {(1, 2), (1, 3), (2, 3), (1, 4)}
-
     assert known_fits(matches, before, same, {"wide": lens}).keys() == {(1, 2), (1, 3), (2, 3)}
     assert known_fits(matches, before, same, {}).keys() == {(1, 2)}
     other = replace(lens, fisheye=(0.2, 0.0, 0.0, 0.0))

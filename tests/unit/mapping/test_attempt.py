@@ -214,9 +214,7 @@ def test_points_behind_a_camera_are_not_explained(synthetic):
     there = 2.0 * center[0] - center[1]
     moved = pycolmap.Rigid3d(pycolmap.Rotation3d(second[:, :3]), -second[:, :3] @ there)
     model.frames[model.images[2].frame_id].rig_from_world = moved
-
     found = explained(model, synthetic)
-
     assert found[1, 2].matches < 10 and found[1, 2].contradicted == 100
 
 
@@ -253,7 +251,6 @@ def test_many_matches_of_one_pair_count_less_than_some_of_many():
 
 def test_relative_poses_of_a_model_are_those_of_its_photos_with_the_matches_that_lie_right(synthetic):
     found = model_poses(synthetic.model, synthetic.matches, 1.5, 100)
-
     first, second = (synthetic.model.images[photo].cam_from_world().matrix() for photo in (1, 2))
     R = second[:, :3] @ first[:, :3].T
     t = second[:, 3] - R @ first[:, 3]
@@ -310,10 +307,8 @@ def test_every_photo_without_a_place_has_a_reason():
 def test_a_photo_whose_nearest_pair_was_dropped_says_why():
     views = ViewGraph({(1, 2): fit(40), (1, 3): fit(17), (2, 3): fit(20), (2, 4): fit(30), (1, 5): fit(18)}, {})
     dropped = {(1, 3): BEHIND, (2, 3): CONTRADICTS, (1, 5): TOO_FEW}
-
     reasons = unregistered_reasons({1, 2}, [], photo_graph(5), views, graph_of_poses(dropped))
     near = "inliers with the nearest placed photo"
-
     assert reasons == {
         "3.jpg": f"could not be placed: 20 {near}, but that pair was dropped: {CONTRADICTS}",
         "4.jpg": f"could not be placed: 30 {near}",
@@ -323,7 +318,6 @@ def test_a_photo_whose_nearest_pair_was_dropped_says_why():
 
 def test_of_photos_equally_near_the_first_is_the_nearest():
     views = ViewGraph({(1, 3): fit(20), (2, 3): fit(20)}, {})
-
     assert (
         CONTRADICTS
         not in unregistered_reasons({1, 2}, [], photo_graph(3), views, graph_of_poses({(2, 3): CONTRADICTS}))["3.jpg"]
@@ -360,9 +354,7 @@ def test_all_pairs_of_a_small_set_are_mapped():
 def test_some_pairs_of_each_photo_of_a_large_set_are_mapped(monkeypatch):
     monkeypatch.setattr(module, "MAPPING", replace(module.MAPPING, fully_mapped_photos=90))
     graph = row_of_photos(100, 40)
-
     found = pairs_to_map(graph)
-
     counts = np.bincount(np.array(list(found.poses)).ravel(), minlength=100)
     assert counts.min() >= module.MAPPING.mapped_partners
     assert len(found.poses) < 0.5 * len(graph.poses)
@@ -510,7 +502,6 @@ def test_it_is_easy_with_known_cameras_and_few_contradictions(cameras, deviation
     known = cameras()
     sure = {name: replace(one, spread={"fx": deviation}) for name, one in known.cameras.items()}
     group = Group(tuple(images), MatchGraph(images, {}, {}), ViewGraph({}, {}), graph, replace(known, cameras=sure))
-
     assert module._likely_needs_one_mapper(group) is easy
 
 
@@ -539,7 +530,6 @@ def test_a_contradicted_model_that_says_enough_makes_the_other_one_needless(try_
 def test_why_a_model_was_taken_is_said():
     best, rival, nothing = attempt(10, 1000), attempt(9, 900), NoModel("global", "")
     contradicted = Attempt("global", model(10), {(0, 1): PairSupport(90, 100, 10)}, "")
-
     assert choice_reason(best, [best, nothing], 10) == "it registers all 10 photos, and almost no match contradicts it"
     assert choice_reason(contradicted, [contradicted, nothing], 10) == "no other attempt gave a model"
     assert choice_reason(contradicted, [contradicted], 10) == "it explains enough; no other model was needed"

@@ -51,7 +51,6 @@ def grow(synthetic, cameras, run, tmp_path, monkeypatch):
 
 def test_new_photos_join_the_model_and_nothing_is_mapped_again(grow, synthetic):
     found, figures = grow(submodel(synthetic.model, [1, 2, 3, 4]), (1, 2, 3, 4))
-
     main = found.outcome.models[0]
     assert posed_photo_ids(main.model) == [1, 2, 3, 4, 5, 6]
     assert main.mapper == "grown" and figures["mapped_again_because"] == "" and figures["grown_from"] == 4
@@ -89,9 +88,7 @@ def test_a_wrong_earlier_model_is_mapped_again(grow, synthetic):
         frames = [wrong.frames[wrong.images[key].frame_id] for key in (photo, other)]
         poses = [frame.rig_from_world for frame in frames]
         frames[0].rig_from_world, frames[1].rig_from_world = poses[1], poses[0]
-
     found, figures = grow(wrong, (1, 2, 3, 4), whole=synthetic.copy())
-
     assert figures["mapped_again_because"]
     assert found.outcome.models[0].note == "all again"
 

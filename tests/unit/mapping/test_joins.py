@@ -35,9 +35,7 @@ def test_photos_that_one_part_has_misplaced_do_not_count(two_parts):
     centers = second.placed.centers.copy()
     centers[:3] += np.array([0.0, 3.0, 1.0])  # of eight shared photos
     moved = replace(second, placed=replace(second.placed, centers=centers))
-
     join = find_join(0, 1, [first, moved])
-
     assert (join.photos, join.shared) == (5, 8)
     angle, scale, place = difference_of(join.similarity, two_parts.true)
     assert angle < 0.3 and scale < 0.01 and place < 0.05
@@ -124,9 +122,7 @@ WRONG = {
 def test_loops_find_a_wrong_join(ring, what):
     fragments, true, joins = ring
     wrong = replace(joins[5], similarity=WRONG[what](joins[5].similarity))
-
     found = align_fragments(fragments, [*joins[:5], wrong, *joins[6:]])
-
     assert [join for join, _ in found.dropped] == [wrong]
     assert found.dropped[0][1].excess > 1.0
     assert all(error.excess < 0.5 for _, error in found.kept)
@@ -147,9 +143,7 @@ def test_a_street_folded_onto_another_is_found_by_its_loop(ring):
 def test_errors_around_loops_name_the_loop(ring):
     fragments, _, joins = ring
     plain = [join for join in joins if (join.second - join.first) in (1, COUNT - 1)]
-
     ((way, error),) = loop_errors(fragments, plain)
-
     assert sorted(way) == list(range(COUNT))
     assert 0.0 < error.off_deg < 3.0 and abs(error.scale) < 0.1 and 0.0 < error.shift < 0.5
     wrong = replace(plain[0], similarity=WRONG["scale"](plain[0].similarity), photos=1, explained=0)
@@ -180,7 +174,6 @@ def test_every_photo_is_there_once_where_it_belongs(street, two_parts):
 
 def test_tracks_with_a_keypoint_in_common_become_one(street, two_parts):
     found = merge_fragments(two_parts.fragments, {0: STILL, 1: two_parts.true})
-
     views = np.bincount(np.concatenate([street.seen[k] for k in range(40)]), minlength=len(street.X))
     assert len(found.X) == np.count_nonzero(views >= 2)
     assert sorted(np.bincount(found.point)) == sorted(views[views >= 2])
@@ -195,9 +188,7 @@ def test_a_part_that_has_a_photo_elsewhere_does_not_say_what_it_sees(street, two
     centers = second.placed.centers.copy()
     centers[0] += 5.0
     wrong = [first, replace(second, placed=replace(second.placed, centers=centers))]
-
     found = merge_fragments(wrong, {0: STILL, 1: two_parts.true})
-
     assert np.linalg.norm(found.centers - street.centers, axis=1).max() < 0.06
     # photo 17 now sees only what the first part has triangulated
     assert set(found.keypoint[found.photo == 17]) <= set(first.placed.keypoint[first.placed.photo == 17])
@@ -209,9 +200,7 @@ def test_two_keypoints_of_a_photo_do_not_end_in_one_point(two_parts):
     (twice,) = np.flatnonzero((second.placed.photo == 18) & (keypoint == keypoint[second.placed.photo == 18][5]))
     keypoint[twice] = 5000  # another keypoint of photo 18, in the track of a point that the first part also has
     changed = [first, replace(second, placed=replace(second.placed, keypoint=keypoint))]
-
     found = merge_fragments(changed, {0: STILL, 1: two_parts.true})
-
     pairs = found.point * 100 + found.photo
     assert len(np.unique(pairs)) == len(pairs)
     assert np.bincount(found.point).min() >= 2
@@ -241,7 +230,6 @@ def with_focals(placed, focals):
 @pytest.mark.slow
 def test_a_model_is_the_same_as_arrays_and_back(synthetic, placed):
     found = write_placed(synthetic.database, placed)
-
     (poses, points), (true, seen) = poses_and_points(found), poses_and_points(synthetic.model)
     assert list(poses) == list(true) == placed.photos.tolist()
     assert all(np.allclose(poses[photo], true[photo], atol=1e-12) for photo in true)

@@ -239,7 +239,6 @@ def test_a_loop_whose_ends_were_hardly_matched_stays():
     overlaps = {(a, 100 + b): ExpectedOverlap(60, 0 if (a + b) % 4 == 0 else 50) for a in range(12) for b in range(12)}
     beside = [(a + side, b + side) for a in range(12) for b in range(a + 1, min(a + 5, 12)) for side in (0, 100)]
     overlaps |= dict.fromkeys(beside, ExpectedOverlap(60, 58))
-
     assert len(find_non_overlapping(overlaps, explained)) >= OVERLAPS.min_pairs
     assert find_false_joins(overlaps, explained) == []
 

@@ -139,9 +139,7 @@ def test_a_false_join_without_a_better_rival_is_only_named(synthetic, run, camer
     mapped(first, without(with_camera(synthetic.copy(), TRUE), lost))
     join = LookAlikes(((1, 4), (2, 4)), 0.9)
     mapped.judge(([join], 20), ([join], non_overlapping))
-
     found = mapped.outcome(cameras(), run())
-
     assert found.models[0].model is first
     assert found.graph.look_alikes == () and found.graph.doubtful == (join,)
     assert found.tried == ("6 photos", f"{6 - len(lost)} photos")
@@ -153,9 +151,7 @@ def test_false_joins_are_looked_for_a_few_times_only(synthetic, run, cameras, ma
     mapped(*models)
     joins = [LookAlikes((pair,), 0.9) for pair in ((1, 4), (2, 5), (3, 6), (1, 5))]
     mapped.judge(*(([join], count) for join, count in zip(joins, (80, 40, 20, 10), strict=True)))
-
     found = mapped.outcome(cameras(), run())
-
     assert found.models[0].model is models[3]
     assert set(found.graph.look_alikes) == set(joins[:3])
     assert found.graph.doubtful == (joins[3],)
@@ -180,9 +176,7 @@ def test_false_joins_of_parts_stay_where_nothing_else_holds_the_photos_together(
     join = LookAlikes(((1, 4), (2, 4)), 0.9)
     first = with_camera(synthetic.copy(), TRUE)
     seen = mapped.parts([(join,)], without(with_camera(synthetic.copy(), TRUE), [6]), first)
-
     found = mapped.outcome(cameras(), run())
-
     assert [(len(poses), asked) for poses, _, asked in seen] == [(15, True), (13, True), (15, False)]
     assert found.models[0].model is first
     assert found.graph.look_alikes == () and found.graph.doubtful == (join,)
@@ -211,9 +205,7 @@ def test_a_camera_that_was_known_and_stayed_is_not_looked_at_twice(synthetic, ru
 )
 def test_a_camera_that_was_a_guess_or_moved_is_mapped_with_again(synthetic, run, cameras, mapped, camera):
     seen = mapped(without(with_camera(synthetic.copy(), TRUE), [6]), with_camera(synthetic.copy(), TRUE))
-
     found = mapped.outcome(cameras(**camera), run())
-
     assert found.passes == 2 and found.models[0].photos == 6
     assert len(seen) == 2
     learned = seen[1][1].main
@@ -268,9 +260,7 @@ def test_later_steps_know_the_pairs_of_a_rival_that_goes_on(synthetic, run, came
     mapped(without(with_camera(synthetic.copy(), TRUE), [5, 6]), None)
     mapped.rival(with_camera(synthetic.copy(), TRUE))
     made = run()
-
     found = mapped.outcome(cameras(), made, views=views)
-
     assert found.models[0].photos == 6 and {(k, 6) for k in range(1, 6)} <= found.graph.poses.keys()
     assert len(geometries_in(made.workspace.database)) == 15
     assert posed_photo_ids(adjust(found.models[0].model, made.workspace.database).model) == [1, 2, 3, 4, 5, 6]
@@ -295,9 +285,7 @@ def test_good_evidence_needs_no_rival(synthetic, run, cameras, mapped):
 def test_where_a_guess_leaves_many_photos_out_other_focals_are_tried(synthetic, run, cameras, mapped):
     few = without(synthetic.copy(), [4, 5, 6])
     seen = mapped(few, few, with_camera(synthetic.copy(), TRUE), None, None)
-
     found = mapped.outcome(cameras(method="guess", identifiable=False), run())
-
     focals = [intrinsics.main.focal_px / 1024 for _, intrinsics in seen]
     assert focals[1:4] == pytest.approx([0.6, 2.4, 4.8])
     assert focals[4:] == pytest.approx([FOCAL / 1024])  # what the best of them has found is gone on with
@@ -362,7 +350,6 @@ def test_of_given_cameras_nothing_is_learned_where_they_are_kept_and_all_terms_s
     kept = cameras(FOCAL * 1.1, method="kept")
     given = cameras(FOCAL * 1.1, method="given", radial=-0.07, distortion=terms)
     model = with_camera(synthetic.copy(), [1300.0, 500.0, 390.0, -0.01])
-
     assert learned(model, synthetic, kept).main is kept.main
     found = learned(model, synthetic, given).main
     assert (found.K[0, 0], found.distortion, found.radial) == (1300.0, terms, -0.07)
@@ -376,9 +363,7 @@ def test_a_camera_of_no_photo_in_the_model_stays_what_it_was(synthetic, cameras)
         cameras(FOCAL * 1.1), cameras={**cameras(FOCAL * 1.1).cameras, "two": two},
         camera_of={synthetic.matches.images[6].name: "two"},
     )  # fmt: skip
-
     found = learned(without(with_camera(synthetic.copy(), TRUE), [6]), synthetic, intrinsics)
-
     assert found.cameras["two"] is two
     assert found.cameras["one"].focal_px == FOCAL
 

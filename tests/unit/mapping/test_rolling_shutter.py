@@ -72,9 +72,7 @@ def turn_errors_deg(found, truth):
 @pytest.mark.slow
 def test_a_rolling_shutter_is_measured_and_its_poses_are_put_right(video):
     rolling, said = video(0.02), Said()
-
     straight, found = follow(rolling, said)
-
     assert isinstance(found, Readout) and not found.refused
     assert found.readout == pytest.approx(0.02, rel=0.1)
     assert abs(found.readout - 0.02) < 3.0 * found.deviation
@@ -110,9 +108,7 @@ def test_a_model_that_could_not_be_adjusted_is_not_asked(still):
 def test_too_many_frames_are_not_asked_and_the_reason_is_given(still, monkeypatch):
     monkeypatch.setattr(rolling_shutter, "OPTIONS", replace(rolling_shutter.OPTIONS, max_frames=KIND.frames - 1))
     said = Said()
-
     model, found = follow(still, said)
-
     assert model is still.adjusted and not said.texts
     assert isinstance(found, Unmeasured)
     assert found.to_dict() == {

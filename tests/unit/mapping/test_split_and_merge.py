@@ -65,9 +65,7 @@ def test_the_order_in_which_pairs_come_does_not_matter(seed):
     worths = {pair: int(rng.integers(-60, 90)) for pair in combinations(range(9), 2) if rng.random() < 0.6}
     names = list(worths)
     shuffled = {names[k]: worths[names[k]] for k in rng.permutation(len(names))}
-
     found = parts(worths, range(9))
-
     assert found == parts(shuffled, reversed(range(9)))
     assert sorted(photo for part in found for photo in part) == list(range(9))
     assert found == sorted(found, key=lambda part: (-len(part), part))

@@ -117,9 +117,7 @@ SIX = (1, 2, 3, 4, 5, 6)
 
 def test_photos_of_one_place_hang_together():
     photos = Photos([SIX])
-
     graph = photos.graph()
-
     assert list(graph.poses) == list(combinations(SIX, 2)) and graph.dropped == {}
     assert graph.groups == (SIX,)
     rotations = average_pair_rotations(graph.poses)[0]
@@ -190,9 +188,7 @@ def test_where_cameras_are_guesses_pairs_keep_the_inliers_of_F():
     photos = Photos([SIX])
     photos.spoil((1, 5), 40)
     photos.rejected[1, 5] = Rejected("too few inliers")
-
     graph = photos.graph(method="guess", identifiable=False)
-
     assert {pose.kind for pose in graph.poses.values()} == {"uncalibrated"}
     fits = photos.views.fits
     assert all(np.array_equal(pose.inliers, fits[pair].inliers) for pair, pose in graph.poses.items())
@@ -255,9 +251,7 @@ def test_a_pair_whose_inliers_lie_in_one_point_has_no_pose_and_the_others_have_t
     photos.match((1, 2), np.random.default_rng(0).uniform(0, 700, (40, 2)), np.full((40, 2), 300.0))
     fits = {**views.fits, (1, 2): EpipolarFit(np.diag([1.0, 1.0, 0.0]), np.ones(40, bool), np.ones(40), 1, 0.1)}
     bent = Intrinsics({"one": Calibration(K, 1000, 750, "zero-curves", True, radial=-1e-3)})
-
     graph = build_pose_graph(photos.matches, ViewGraph(fits, views.rejected), bent, OPTIONS, in_turn)
-
     assert graph.dropped == {(1, 2): NOT_COMPUTABLE}
     assert sorted(graph.poses) == [(1, 3), (2, 3)] and graph.groups == ((1, 2, 3),)
 

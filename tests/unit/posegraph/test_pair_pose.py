@@ -62,7 +62,6 @@ def test_some_points_off_the_wall_make_a_pair_that_is_not_planar(two_views):
             *(np.vstack([a[off:], b[:off]]) for a, b in ((wall.x1, box.x1), (wall.x2, box.x2))), 200, wall.R, wall.t
         )
         share[off] = estimate_pose(both.pair(), fit_of(both, both.F)).kind
-
     assert share == {4: "planar", 40: "calibrated"}
 
 
@@ -115,9 +114,7 @@ def test_depths_are_those_of_triangulated_points(two_views):
     views = two_views(noise_px=0.0)
     x1, x2 = views.rays[:, :2], views.rays[:, 2:]
     X = triangulate(np.eye(3, 4), np.column_stack([views.R, views.t]), x1, x2)
-
     first, second = depths(views.lines, views.R, views.t)
-
     np.testing.assert_allclose(first, X[:, 2], rtol=1e-6)
     np.testing.assert_allclose(second, (X @ views.R.T + views.t)[:, 2], rtol=1e-6)
     angles = triangulation_angle_deg(X, np.zeros(3), -views.R.T @ views.t)
@@ -129,10 +126,8 @@ def test_the_points_before_both_cameras_are_those_that_triangulation_finds_there
     lines, rays = views.lines, views.rays
     lines[:60] = np.roll(lines[:60], 9, axis=1)  # matches the wrong way round
     rays[:60] = rays[:60][:, [2, 3, 0, 1]]
-
     front = is_in_front(lines, views.R, views.t)
     expected = relative_pose(cross_matrix(views.t) @ views.R, rays[:, :2], rays[:, 2:])[3]
-
     assert front[60:].all()
     assert not is_in_front(views.lines, views.R, -views.t).any()
     assert np.array_equal(front[60:], expected[60:])
@@ -279,7 +274,6 @@ def pose_errors_deg(R, t, true_R, true_t):
 def test_the_nearest_of_the_starts_is_near(turn_deg, roll_deg):
     pair, F, R, t = orbit_pair(1, turn_deg, noise_px=0.0, roll_deg=roll_deg)
     found = [pose_errors_deg(*start, R, t) for start in turned_starts(points_ahead(pair.lines), K_LONG.T @ F @ K_LONG)]
-
     assert len(found) == len(OPTIONS.turns_deg)
     nearest = min(found)
     gaps = np.diff(sorted(OPTIONS.turns_deg))

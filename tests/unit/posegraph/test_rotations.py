@@ -87,18 +87,14 @@ def test_wrong_pairs_with_more_matches_than_others_are_seen_through_by_loops(see
     wrong = [list(pairs)[k] for k in rng.permutation(len(pairs))[:22]]
     pairs |= dict(zip(wrong, truth(len(wrong), seed + 100), strict=True))
     weights = {pair: (75.0 if pair in wrong else 50.0) * rng.uniform(0.8, 1.2) for pair in pairs}
-
     found, _ = average_rotations(pairs, weights)
-
     assert 0.05 < errors_deg(found, rotations).max() < 1.5
 
 
 def test_averaging_makes_the_noise_of_pairs_smaller():
     rotations = truth(12)
     pairs = relative(rotations, combinations(range(12), 2), noise_deg=2.0)
-
     found, angles = average_rotations(pairs, dict.fromkeys(pairs, 1.0))
-
     before = np.degrees(
         [Rotation.from_matrix(turn @ (rotations[j] @ rotations[i].T).T).magnitude() for (i, j), turn in pairs.items()]
     )
@@ -163,9 +159,7 @@ def test_loops_support_the_pairs_in_them():
     rotations = truth(5)
     pairs = relative(rotations, [(0, 1), (0, 2), (1, 2), (1, 3), (2, 3), (3, 4)], noise_deg=0.2)
     pairs[1, 3] = QUARTER @ pairs[1, 3]
-
     found = supported(pairs, dict.fromkeys(pairs, 10.0))
-
     assert found[0, 1] == found[0, 2] == 1.0  # their only loop agrees
     assert found[1, 3] == found[2, 3] == pytest.approx(1 / 11)  # their only one does not
     assert found[1, 2] == pytest.approx(11 / 21)  # one of two
@@ -288,9 +282,7 @@ def test_all_loops_of_three_are_found():
     known = set(pairs)
     expected = {(a, b, c) for a, b in pairs for c in range(b + 1, 30) if (b, c) in known and (a, c) in known}
     turns = relative(rotations, pairs)
-
     loops, agree = check_loops(np.array(pairs), np.array([turns[pair] for pair in pairs]))
-
     found = [(pairs[k][0], pairs[k][1], pairs[j][1]) for k, j, _ in loops]
     assert sorted(found) == sorted(expected) and len(set(found)) == len(found) > 20
     assert all(pairs[i] == (a, c) for (a, _, c), (_, _, i) in zip(found, loops, strict=True))
