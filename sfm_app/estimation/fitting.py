@@ -212,7 +212,7 @@ def fit_pairs(
     """
     estimator = run.plugins.estimator(run.settings.epipolar.estimator)
     fit_pair = Task(_fit_pair, estimator, run.settings, dict(lenses))
-    return _fit_all(fit_pair, lambda left: _matched_pairs(matches, left), pairs, run)
+    return _fit_all(fit_pair, lambda missing: _matched_pairs(matches, missing), pairs, run)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

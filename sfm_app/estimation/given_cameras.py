@@ -199,42 +199,44 @@ def report_checks(checked: Mapping[str, tuple[Calibration, Calibration | None]],
     run.record(given_cameras=figures)
 
 
-def find_contradictions(given: Calibration, found: Calibration) -> list[Contradiction]:
+def find_contradictions(given: Calibration, estimated: Calibration) -> list[Contradiction]:
     """Return the properties of a given camera that the photos contradict; empty where they do not determine it."""
-    if EQUIRECTANGULAR in (given.projection, found.projection) or not found.identifiable:
+    if EQUIRECTANGULAR in (given.projection, estimated.projection) or not estimated.identifiable:
         return []
-    return [*_curve_contradictions(given, found), *_center_contradictions(given, found)]
+    return [*_curve_contradictions(given, estimated), *_center_contradictions(given, estimated)]
 
 
-def _curve_contradictions(given: Calibration, found: Calibration) -> list[Contradiction]:
+def _curve_contradictions(given: Calibration, estimated: Calibration) -> list[Contradiction]:
     """Return at most one: focal lengths where these differ, else radii at the angle where they differ most."""
-    theta = np.linspace(OPTIONS.inner, OPTIONS.outer, OPTIONS.angles) * min(corner_angle(given), corner_angle(found))
-    radii = radius_px(theta, given), radius_px(theta, found)
-    deviations = np.hypot(radius_deviation_px(theta, given), radius_deviation_px(theta, found))
+    theta = np.linspace(OPTIONS.inner, OPTIONS.outer, OPTIONS.angles) * min(
+        corner_angle(given), corner_angle(estimated)
+    )
+    radii = radius_px(theta, given), radius_px(theta, estimated)
+    deviations = np.hypot(radius_deviation_px(theta, given), radius_deviation_px(theta, estimated))
     difference = np.abs(radii[0] - radii[1])
     clear = (difference > OPTIONS.sigmas * deviations) & (difference > OPTIONS.min_share * radii[1])
     if not clear.any():
         return []
-    focals = given.focal_px, found.focal_px
-    of_focal = float(np.hypot(given.spread.get("fx", 0.0), found.spread.get("fx", 0.0)))
-    same = given.projection == found.projection
+    focals = given.focal_px, estimated.focal_px
+    of_focal = float(np.hypot(given.spread.get("fx", 0.0), estimated.spread.get("fx", 0.0)))
+    same = given.projection == estimated.projection
     if same and abs(focals[0] - focals[1]) > max(OPTIONS.min_share * focals[1], OPTIONS.sigmas * of_focal):
         return [Contradiction("focal length", *focals, of_focal)]
     worst = int(np.argmax(np.where(clear, difference / radii[1], 0.0)))
     what = f"radius of what is {np.degrees(theta[worst]):.0f} degrees off the axis"
     if not same:
-        what = f"a {given.projection} lens is given, and the photos show a {found.projection} one; {what}"
+        what = f"a {given.projection} lens is given, and the photos show a {estimated.projection} one; {what}"
     return [Contradiction(what, float(radii[0][worst]), float(radii[1][worst]), float(deviations[worst]))]
 
 
-def _center_contradictions(given: Calibration, found: Calibration) -> list[Contradiction]:
-    if "center" in found.held:
+def _center_contradictions(given: Calibration, estimated: Calibration) -> list[Contradiction]:
+    if "center" in estimated.held:
         return []
-    least, contradictions = OPTIONS.min_share * max(found.width, found.height), []
+    least, contradictions = OPTIONS.min_share * max(estimated.width, estimated.height), []
     for name, axis, what in (("cx", 0, CENTERS[0]), ("cy", 1, CENTERS[1])):
-        values = float(given.K[axis, 2]), float(found.K[axis, 2])
-        deviation = float(np.hypot(given.spread.get(name, 0.0), found.spread.get(name, 0.0)))
-        if name in found.spread and abs(values[0] - values[1]) > max(least, OPTIONS.sigmas * deviation):
+        values = float(given.K[axis, 2]), float(estimated.K[axis, 2])
+        deviation = float(np.hypot(given.spread.get(name, 0.0), estimated.spread.get(name, 0.0)))
+        if name in estimated.spread and abs(values[0] - values[1]) > max(least, OPTIONS.sigmas * deviation):
             contradictions.append(Contradiction(what, *values, deviation))
     return contradictions
 
@@ -287,15 +289,15 @@ def shown_share(image: MatchedImage) -> float:
     return max(image.shown[2:]) / max(image.width, image.height) if image.shown else 1.0
 
 
-def report_claims(found: Mapping[str, FocalClaim | None], run: RunContext) -> None:
+def report_claims(claims: Mapping[str, FocalClaim | None], run: RunContext) -> None:
     """Announce the claims that the photos contradict, and record all, by name of the camera."""
-    known = {name: claim for name, claim in found.items() if claim is not None}
-    if not known:
+    stated = {name: claim for name, claim in claims.items() if claim is not None}
+    if not stated:
         return
-    for name, claim in known.items():
+    for name, claim in stated.items():
         if claim.is_contradicted:
             run.progress.say(f"the photos {name}: {claim.text}")
-    run.record(exif_focals={name: claim.to_dict() for name, claim in known.items()})
+    run.record(exif_focals={name: claim.to_dict() for name, claim in stated.items()})
 
 
 # Rules of the last adjustment, and checks after it.

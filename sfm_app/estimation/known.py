@@ -144,7 +144,7 @@ def _pair_contradictions(
     calibrator = run.plugins.calibrator(options.calibrator)
     own = calibrate_photo_set(pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=False)
     cameras = [to_whole_photo(mine, new[0]).found for mine in own]
-    return [one for found in cameras for one in find_contradictions(camera, found) if _is_zoom(one)]
+    return [one for estimated in cameras for one in find_contradictions(camera, estimated) if _is_zoom(one)]
 
 
 def _is_zoom(one: Contradiction) -> bool:

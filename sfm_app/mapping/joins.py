@@ -182,8 +182,8 @@ class _SharedPhotos:
 
     def agreement(self, similarity: Similarity) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
         """Return (n,) which photos agree, their angles in degrees, and their shifts by the distance of their points."""
-        turned = np.einsum("nij,kj->nik", self.Rb, similarity.R)
-        traces = np.einsum("nij,nij->n", self.Ra, turned)
+        rotated = np.einsum("nij,kj->nik", self.Rb, similarity.R)
+        traces = np.einsum("nij,nij->n", self.Ra, rotated)
         angles = np.degrees(np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0)))
         shifts = np.linalg.norm(similarity(self.cb) - self.ca, axis=1) / self.distance
         return (angles <= OPTIONS.agreement_deg) & (shifts <= OPTIONS.agreement_shift), angles, shifts
@@ -230,9 +230,9 @@ class AcrossJoins:
             x_a, x_b = self.matches.keypoints[photo_a][rows[:, 0]], self.matches.keypoints[photo_b][rows[:, 1]]
             lines = np.hstack([a.bearings(photo_a, x_a), b.bearings(photo_b, x_b)])
             at_a, at_b = np.searchsorted(a.photos, photo_a), np.searchsorted(b.photos, photo_b)
-            turned = b.R[at_b] @ join.similarity.R.T
-            t = turned @ (a.centers[at_a] - join.similarity(b.centers[at_b][None])[0])
-            R, t = turned @ a.R[at_a].T, t / max(float(np.linalg.norm(t)), 1e-300)
+            R_b = b.R[at_b] @ join.similarity.R.T
+            t = R_b @ (a.centers[at_a] - join.similarity(b.centers[at_b][None])[0])
+            R, t = R_b @ a.R[at_a].T, t / max(float(np.linalg.norm(t)), 1e-300)
             within = pose_distances(lines, R, t) <= OPTIONS.loose_factor * self.max_error_px
             explained_matches = within & is_in_front(lines, R, t)
             explained += int(np.count_nonzero(explained_matches))
@@ -300,8 +300,8 @@ def align_fragments(fragments: Sequence[Fragment], joins: Sequence[Join]) -> Ali
             break
         dropped.append((remaining.pop(worst), errors[worst]))
     main = _main_group(fragments, remaining)
-    kept = tuple(zip(remaining, errors, strict=True))
-    return Alignment({number: frames[number] for number in sorted(main)}, kept, tuple(dropped))
+    accepted = tuple(zip(remaining, errors, strict=True))
+    return Alignment({number: frames[number] for number in sorted(main)}, accepted, tuple(dropped))
 
 
 def _main_group(fragments: Sequence[Fragment], joins: Sequence[Join]) -> set[int]:
@@ -341,8 +341,8 @@ def _synchronize(joins: Sequence[Join], count: int) -> dict[int, Similarity]:
         return frames
     pairs = [(join.first, join.second) for join in joins]
     weights = {pair: join.weight for pair, join in zip(pairs, joins, strict=True)}
-    turned = {pair: join.similarity.R.T for pair, join in zip(pairs, joins, strict=True)}
-    rotations = {number: R.T for number, R in average_rotations(turned, weights)[0].items()}
+    relative = {pair: join.similarity.R.T for pair, join in zip(pairs, joins, strict=True)}
+    rotations = {number: R.T for number, R in average_rotations(relative, weights)[0].items()}
     strengths = np.array([join.weight for join in joins])
     edges = np.array(pairs, np.int64)
     logs = np.log([join.similarity.scale for join in joins])[:, None]
@@ -431,12 +431,12 @@ def merge_fragments(fragments: Sequence[Fragment], frames: Mapping[int, Similari
 
     The part that owns a photo determines its pose, else the largest fragment with it.
     """
-    moved = {number: _move(fragments[number].placed, frame) for number, frame in sorted(frames.items())}
-    photos, R, centers, source = _choose_poses(fragments, moved)
+    models = {number: _move(fragments[number].placed, frame) for number, frame in sorted(frames.items())}
+    photos, R, centers, source = _choose_poses(fragments, models)
     cameras = {
-        photo: moved[number].cameras[photo] for photo, number in zip(photos.tolist(), source.tolist(), strict=True)
+        photo: models[number].cameras[photo] for photo, number in zip(photos.tolist(), source.tolist(), strict=True)
     }
-    tracks = [_sound_observations(model, photos, R, centers) for model in moved.values()]
+    tracks = [_sound_observations(model, photos, R, centers) for model in models.values()]
     X, point, photo, keypoint = _merge_tracks(tracks)
     return PlacedPhotos(photos, R, centers, X, point, photo, keypoint, cameras)
 
@@ -449,11 +449,11 @@ def _move(model: PlacedPhotos, frame: Similarity) -> PlacedPhotos:
 
 
 def _choose_poses(
-    fragments: Sequence[Fragment], moved: Mapping[int, PlacedPhotos]
+    fragments: Sequence[Fragment], models: Mapping[int, PlacedPhotos]
 ) -> tuple[IndexArray, FloatArray, FloatArray, IndexArray]:
     """Return ids of all photos, their rotations and centers, and the fragments that these are from."""
     best: dict[int, tuple[tuple[bool, int, int], int, int]] = {}
-    for number, model in moved.items():
+    for number, model in models.items():
         for row, photo in enumerate(model.photos.tolist()):
             rank = photo in fragments[number].own, len(model.photos), -number
             if photo not in best or rank > best[photo][0]:
@@ -462,8 +462,8 @@ def _choose_poses(
     chosen = [best[photo][1:] for photo in photos]
     return (
         np.array(photos, np.int64),
-        np.array([moved[number].R[row] for number, row in chosen]).reshape(-1, 3, 3),
-        np.array([moved[number].centers[row] for number, row in chosen]).reshape(-1, 3),
+        np.array([models[number].R[row] for number, row in chosen]).reshape(-1, 3, 3),
+        np.array([models[number].centers[row] for number, row in chosen]).reshape(-1, 3),
         np.array([number for number, _ in chosen], np.int64),
     )
 

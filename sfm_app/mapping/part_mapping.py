@@ -107,7 +107,7 @@ def _bisect(photos: set[int], links: Links) -> tuple[set[int], set[int]]:
     end = _farthest_photo(min(photos), photos, links)
     starts = (_farthest_photo(end, photos, links), end)
     cuts = [_best_growth(start, photos, links) for start in starts]
-    side = min(cuts, key=lambda found: found[0])[1]
+    side = min(cuts, key=lambda cut: cut[0])[1]
     side = _swap_sides(side, photos, links)
     # islands go over to the other side, to which they are linked
     side = max(_components(side, links), key=_rank)
@@ -217,11 +217,11 @@ def _best_across(pairs: Sequence[PairId], links: Links) -> set[int]:
         partners.setdefault(b, []).append(a)
     chosen, linked = set[int](), dict.fromkeys([a for a, _ in pairs], 0.0)
 
-    def worth(photo: int) -> float:
+    def gain(photo: int) -> float:
         return sum(links[photo][a] / (1.0 + linked[a] / OPTIONS.saturation_inliers) for a in partners[photo])
 
     while len(chosen) < OPTIONS.shared_photos and len(chosen) < len(partners):
-        best = max((photo for photo in sorted(partners) if photo not in chosen), key=worth)
+        best = max((photo for photo in sorted(partners) if photo not in chosen), key=gain)
         chosen.add(best)
         for a in partners[best]:
             linked[a] += links[best][a]

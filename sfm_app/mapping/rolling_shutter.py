@@ -165,9 +165,9 @@ def _reason_to_refuse(
 ) -> str:
     """Return why the compensated model is rejected; empty where it is accepted."""
     if OPTIONS.significance * estimate.deviation >= frames.interval:
-        return "the motion of the camera does not tell it"
+        return "the motion of the camera does not determine it"
     if abs(estimate.readout) < OPTIONS.significance * estimate.deviation:
-        return "none is seen"
+        return "it is not significant"
     if abs(estimate.readout) > OPTIONS.longest * frames.interval:
         return "it would be longer than a frame lasts"
     if compensated.failure:

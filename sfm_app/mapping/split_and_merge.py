@@ -209,9 +209,9 @@ def _joining_order(visibility: csr_array) -> list[tuple[int, int]]:
     for photo in growth.best_pair():
         growth.join(photo)
     joined = []
-    while growth.left:
+    while growth.remaining:
         count, photo = heappop(growth.waiting)
-        if photo in growth.left and -count == growth.known[photo]:
+        if photo in growth.remaining and -count == growth.known[photo]:
             joined.append((photo, -count))
             growth.join(photo)
     return joined
@@ -228,7 +228,7 @@ class _Growth:
         self.views = np.zeros(points, np.int64)
         self.known = np.zeros(photos, np.int64)
         """Points seen by a photo and by two that have joined."""
-        self.left = set(range(photos))
+        self.remaining = set(range(photos))
         self.waiting = [(0, photo) for photo in range(photos)]
         """Heap of photos by their number of known points; entries that have changed are out of date."""
 
@@ -247,4 +247,4 @@ class _Growth:
         for other, more in zip(*np.unique(newly_known.indices, return_counts=True), strict=True):
             self.known[other] += more
             heappush(self.waiting, (-int(self.known[other]), int(other)))
-        self.left.discard(photo)
+        self.remaining.discard(photo)

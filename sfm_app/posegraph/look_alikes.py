@@ -142,9 +142,9 @@ def backbone(covered: Mapping[PairId, float]) -> set[PairId]:
         partners[b].append(a)
     groups, chosen = DisjointGroups(partners), set()
     for a, b in sorted(covered, key=lambda pair: (-covered[pair], pair)):
-        moved = groups.join(a, b)
-        inside = set(moved)
-        for photo in moved:
+        joining = groups.join(a, b)
+        inside = set(joining)
+        for photo in joining:
             across = (
                 other for other in partners[photo] if other not in inside and groups.name[other] == groups.name[a]
             )

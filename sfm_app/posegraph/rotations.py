@@ -39,10 +39,10 @@ class DisjointGroups:
             return []
         if len(self.members[larger]) < len(self.members[smaller]):
             larger, smaller = smaller, larger
-        moved = self.members.pop(smaller)
-        self.members[larger] += moved
-        self.name |= dict.fromkeys(moved, larger)
-        return moved
+        photos = self.members.pop(smaller)
+        self.members[larger] += photos
+        self.name |= dict.fromkeys(photos, larger)
+        return photos
 
 
 def connected_groups(pairs: Iterable[PairId], photos: Iterable[int] = ()) -> list[set[int]]:
@@ -242,9 +242,9 @@ def _apply_corrections(
     for _ in range(CORRECTIONS.max_turns):
         residuals = _residuals(rotations, edges, turns)
         for correction in find_corrections(len(rotations), edges, residuals, strengths):
-            turned = np.where(correction.photos[:, None, None], rotations @ correction.R, rotations)
-            if _robust_cost(_residuals(turned, edges, turns), strengths) < _robust_cost(residuals, strengths):
-                rotations = _descend(turned, edges, turns, strengths, 0)
+            corrected = np.where(correction.photos[:, None, None], rotations @ correction.R, rotations)
+            if _robust_cost(_residuals(corrected, edges, turns), strengths) < _robust_cost(residuals, strengths):
+                rotations = _descend(corrected, edges, turns, strengths, 0)
                 break
         else:
             break

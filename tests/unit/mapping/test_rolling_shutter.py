@@ -86,7 +86,7 @@ def test_a_rolling_shutter_is_measured_and_its_poses_are_put_right(video):
 def test_a_global_shutter_is_measured_and_left_alone(still):
     model, found = follow(still)
     assert model is still.adjusted
-    assert found.refused == "none is seen" and found.to_dict()["because"] == "none is seen"
+    assert found.refused == "it is not significant" and found.to_dict()["because"] == "it is not significant"
     assert abs(found.readout) < 3.0 * found.deviation < 0.01
 
 
