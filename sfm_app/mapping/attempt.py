@@ -1,6 +1,5 @@
 """One attempt to map a group: pairs to start from, COLMAP's mappers, and how well a model explains its matches."""
 
-import contextlib
 import logging
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -337,8 +336,25 @@ def pairs_to_map(graph: PoseGraph) -> PoseGraph:
     return replace(graph, poses={pair: pose for pair, pose in graph.poses.items() if pair in chosen})
 
 
+@dataclass(frozen=True, slots=True)
+class ColmapMappers:
+    """COLMAP's mappers and the score of their models; tests pass others."""
+
+    copy_database: Callable[..., object] = copy_database
+    model_from_seed: Callable[..., Reconstruction] = model_from_seed
+    map_incrementally: Callable[..., Reconstruction | None] = map_incrementally
+    map_globally: Callable[..., Reconstruction | None] = map_globally
+    explained_pairs: Callable[..., dict[PairId, PairSupport]] = explained_pairs
+
+
+COLMAP = ColmapMappers()
+
+
 def map_group(
-    group: Group, run: RunContext, is_sufficient: Callable[[Attempt], bool] = lambda _: False
+    group: Group,
+    run: RunContext,
+    is_sufficient: Callable[[Attempt], bool] = lambda _: False,
+    colmap: ColmapMappers = COLMAP,
 ) -> list[MappingResult]:
     """Return the results of the mappers on a group.
 
@@ -347,28 +363,112 @@ def map_group(
     which mapper ends first: a complete, consistent incremental model discards the global one. `is_sufficient` accepts
     an incremental model although it is incomplete or contradicted.
     """
-    options = run.settings.scene
+    options, mapper = run.settings.scene, _GroupMapper(group, run, colmap)
     with_global = options.mapper != "incremental" and len(group.photos) >= MAPPING.min_photos
     seeds = rank_seeds(group.matches, group.graph, group.intrinsics, group.photos, options.min_seed_angle_deg)
     seeds = seeds[: options.max_init_pairs] if options.mapper != "global" or not with_global else []
     if with_global:
-        copy_database(run.workspace.database, run.workspace.root / GLOBAL_FOLDER)
-    with _attempt_runner(group, run) as run_maker:
-        results = run_maker(lambda token: _run_first_round(group, seeds[:1], with_global, run, is_sufficient, token))
+        colmap.copy_database(run.workspace.database, run.workspace.root / GLOBAL_FOLDER)
+    with translate_errors("mapping photos"):
+        results = mapper.run_maker(lambda token: mapper.first_round(seeds[:1], with_global, is_sufficient, token))
         for seed in seeds[1:]:
             if _has_placed_enough(results, len(group.photos)):
                 break
-            results += run_maker(partial(_attempt_from_seed, group, seed, run))
+            results += mapper.run_maker(partial(mapper.from_seed, seed))
         best = best_attempt(results)
         if best is not None and best.mapper == "global" and best.photos < len(group.photos):
-            results += run_maker(partial(_attempt_completion, group, best, run))
+            results += mapper.run_maker(partial(mapper.completion, best))
     return results
 
 
 def complete_attempt(group: Group, attempt: Attempt, run: RunContext) -> list[MappingResult]:
     """Continue a model photo by photo, with the missing photos of its group."""
-    with _attempt_runner(group, run) as run_maker:
-        return run_maker(partial(_attempt_completion, group, attempt, run))
+    mapper = _GroupMapper(group, run, COLMAP)
+    with translate_errors("mapping photos"):
+        return mapper.run_maker(partial(mapper.completion, attempt))
+
+
+class _GroupMapper:
+    """Attempts to map a group."""
+
+    def __init__(self, group: Group, run: RunContext, colmap: ColmapMappers) -> None:
+        self.group, self.run, self.colmap = group, run, colmap
+
+    def run_maker(self, make: Maker) -> list[MappingResult]:
+        """Make attempts in a thread that Ctrl-C can stop."""
+        results: list[MappingResult] = []
+        self.run.progress.start("mapping", max(len(self.group.photos) - 2, 1))
+        try:
+            run_interruptible(lambda token: results.extend(make(token)), lambda: None)
+        finally:
+            self.run.progress.finish()
+        return results
+
+    def first_round(
+        self,
+        seeds: Sequence[Candidate],
+        with_global: bool,
+        is_sufficient: Callable[[Attempt], bool],
+        token: CancellationToken,
+    ) -> list[MappingResult]:
+        stop = StopSignal(token)
+
+        def map_from_seed(seed: Candidate) -> MappingResult:
+            (attempt,) = self.from_seed(seed, token)
+            stop.needless = isinstance(attempt, Attempt) and (
+                _is_complete_and_consistent(attempt, len(self.group.photos)) or is_sufficient(attempt)
+            )
+            return attempt
+
+        threads = 1 if seeds and likely_needs_one_mapper(self.group) else min(self.run.workers, 2)
+        with ThreadPoolExecutor(threads, thread_name_prefix="mapper") as pool:
+            incremental = [pool.submit(map_from_seed, seed) for seed in seeds]
+            global_results = [pool.submit(self.all_at_once, stop)] if with_global else []
+            results = [future.result() for future in (*incremental, *global_results)]
+        if stop.needless:
+            results[1:] = [NoModel("global", "all at once: not needed") for _ in global_results]
+        return results
+
+    def all_at_once(self, stop: StopSignal) -> MappingResult:
+        names, scratch = photo_names(self.group.photos, self.group.matches), self.run.workspace.root / GLOBAL_FOLDER
+        photos, seed = self.run.workspace.photos, self.run.seed
+        try:
+            model = None if stop.is_cancelled else self.colmap.map_globally(photos, names, scratch, seed, stop)
+        except BackendError as err:  # another mapper may do better
+            logger.info("the global mapper failed: %s", err)
+            return NoModel("global", f"all at once: failed, {err}")
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
+        return self._judge("global", "all at once", model)
+
+    def from_seed(self, seed: Candidate, token: CancellationToken) -> list[MappingResult]:
+        group = self.group
+        how = f"from {' + '.join(photo_names(seed.pair, group.matches))}"
+        rows = group.matches.matches[seed.pair][seed.pose.inliers]
+        try:
+            points = triangulate_seed(group.matches, seed, group.intrinsics)
+        except FAILURES as err:
+            return [NoModel("incremental", f"{how}: no points, {error_reason(err)}")]
+        start = self.colmap.model_from_seed(self.run.workspace.database, seed.pair, rows, points)
+        return [self._judge("incremental", how, self._grow(start, token))]
+
+    def completion(self, best: Attempt, token: CancellationToken) -> list[MappingResult]:
+        """Continue a model photo by photo, with its missing photos."""
+        return [self._judge("incremental", "missing photos added one by one", self._grow(best.model, token))]
+
+    def _grow(self, start: Reconstruction, token: CancellationToken) -> Reconstruction | None:
+        group, run, place = self.group, self.run, self.run.workspace
+        cameras = {k: group.intrinsics.camera(group.matches.images[k]) for k in group.photos}
+        kept = {start.images[k].camera_id for k, camera in cameras.items() if camera.is_kept and start.exists_image(k)}
+        options = incremental_options(run.seed, known=all(map(is_focal_accurate, cameras.values())), kept=kept)
+        scratch = place.root / INCREMENTAL_FOLDER
+        return self.colmap.map_incrementally(
+            place.database, place.photos, start, scratch, options, run.progress.advance, token
+        )
+
+    def _judge(self, mapper: str, how: str, model: Reconstruction | None) -> MappingResult:
+        matches, views = self.group.matches, self.group.views
+        return judge_model(matches, views, mapper, how, model, self.run, self.colmap.explained_pairs)
 
 
 def best_attempt(results: Sequence[MappingResult]) -> Attempt | None:
@@ -400,51 +500,7 @@ def _is_complete_and_consistent(attempt: Attempt, photos: int) -> bool:
     return attempt.photos == photos and against <= MAPPING.max_contradicted_share * inliers
 
 
-@contextlib.contextmanager
-def _attempt_runner(group: Group, run: RunContext) -> Iterator[Callable[[Maker], list[MappingResult]]]:
-    """Provide a function that makes attempts in a thread that Ctrl-C can stop."""
-
-    def run_maker(make: Maker) -> list[MappingResult]:
-        results: list[MappingResult] = []
-        run.progress.start("mapping", max(len(group.photos) - 2, 1))
-        try:
-            run_interruptible(lambda token: results.extend(make(token)), lambda: None)
-        finally:
-            run.progress.finish()
-        return results
-
-    with translate_errors("mapping photos"):
-        yield run_maker
-
-
-def _run_first_round(
-    group: Group,
-    seeds: Sequence[Candidate],
-    with_global: bool,
-    run: RunContext,
-    is_sufficient: Callable[[Attempt], bool],
-    token: CancellationToken,
-) -> list[MappingResult]:
-    stop = StopSignal(token)
-
-    def map_from_seed(seed: Candidate) -> MappingResult:
-        (attempt,) = _attempt_from_seed(group, seed, run, token)
-        stop.needless = isinstance(attempt, Attempt) and (
-            _is_complete_and_consistent(attempt, len(group.photos)) or is_sufficient(attempt)
-        )
-        return attempt
-
-    threads = 1 if seeds and _likely_needs_one_mapper(group) else min(run.workers, 2)
-    with ThreadPoolExecutor(threads, thread_name_prefix="mapper") as pool:
-        incremental = [pool.submit(map_from_seed, seed) for seed in seeds]
-        global_results = [pool.submit(_attempt_globally, group, run, stop)] if with_global else []
-        results = [future.result() for future in (*incremental, *global_results)]
-    if stop.needless:
-        results[1:] = [NoModel("global", "all at once: not needed") for _ in global_results]
-    return results
-
-
-def _likely_needs_one_mapper(group: Group) -> bool:
+def likely_needs_one_mapper(group: Group) -> bool:
     """Return whether cameras are well known, and hardly any pair contradicts the others."""
     inside = set(group.photos)
     posed = sum(inside.issuperset(pair) for pair in group.graph.poses)
@@ -462,45 +518,6 @@ def _has_placed_enough(results: Sequence[MappingResult], photos: int) -> bool:
     )
 
 
-def _attempt_globally(group: Group, run: RunContext, stop: StopSignal) -> MappingResult:
-    names, scratch = photo_names(group.photos, group.matches), run.workspace.root / GLOBAL_FOLDER
-    try:
-        model = None if stop.is_cancelled else map_globally(run.workspace.photos, names, scratch, run.seed, stop)
-    except BackendError as err:  # another mapper may do better
-        logger.info("the global mapper failed: %s", err)
-        return NoModel("global", f"all at once: failed, {err}")
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
-    return judge_model(group.matches, group.views, "global", "all at once", model, run)
-
-
-def _attempt_from_seed(group: Group, seed: Candidate, run: RunContext, token: CancellationToken) -> list[MappingResult]:
-    how = f"from {' + '.join(photo_names(seed.pair, group.matches))}"
-    rows = group.matches.matches[seed.pair][seed.pose.inliers]
-    try:
-        points = triangulate_seed(group.matches, seed, group.intrinsics)
-    except FAILURES as err:
-        return [NoModel("incremental", f"{how}: no points, {error_reason(err)}")]
-    start = model_from_seed(run.workspace.database, seed.pair, rows, points)
-    return [judge_model(group.matches, group.views, "incremental", how, _grow(group, start, run, token), run)]
-
-
-def _attempt_completion(group: Group, best: Attempt, run: RunContext, token: CancellationToken) -> list[MappingResult]:
-    """Continue a model of the global mapper photo by photo, with its missing photos."""
-    model = _grow(group, best.model, run, token)
-    return [judge_model(group.matches, group.views, "incremental", "missing photos added one by one", model, run)]
-
-
-def _grow(group: Group, start: Reconstruction, run: RunContext, token: CancellationToken) -> Reconstruction | None:
-    place, cameras = run.workspace, {k: group.intrinsics.camera(group.matches.images[k]) for k in group.photos}
-    kept = {start.images[k].camera_id for k, camera in cameras.items() if camera.is_kept and start.exists_image(k)}
-    return map_incrementally(
-        place.database, place.photos, start, place.root / INCREMENTAL_FOLDER,
-        incremental_options(run.seed, known=all(map(is_focal_accurate, cameras.values())), kept=kept),
-        run.progress.advance, token,
-    )  # fmt: skip
-
-
 def is_focal_accurate(camera: Calibration) -> bool:
     """Return whether a focal is known so well that the first photos of a mapping cannot improve it."""
     spread = 0.0 if camera.is_kept else camera.spread.get("fx", np.inf)
@@ -508,7 +525,13 @@ def is_focal_accurate(camera: Calibration) -> bool:
 
 
 def judge_model(
-    matches: MatchGraph, views: ViewGraph, mapper: str, how: str, model: Reconstruction | None, run: RunContext
+    matches: MatchGraph,
+    views: ViewGraph,
+    mapper: str,
+    how: str,
+    model: Reconstruction | None,
+    run: RunContext,
+    explain: Callable[..., dict[PairId, PairSupport]] = explained_pairs,
 ) -> MappingResult:
     """Count the matches that a model explains."""
     placed = model.num_reg_images() if model is not None else 0
@@ -516,7 +539,7 @@ def judge_model(
     if model is None or placed < 2 or model.num_points3D() < run.settings.scene.min_points:
         return NoModel(mapper, note)
     try:
-        explained = explained_pairs(model, matches, views, run.settings.epipolar.max_error_px)
+        explained = explain(model, matches, views, run.settings.epipolar.max_error_px)
     except FAILURES as err:
         logger.info("a model could not be judged", exc_info=err)
         return NoModel(mapper, f"{note}, but it could not be scored: {error_reason(err)}")

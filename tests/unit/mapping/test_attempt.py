@@ -14,6 +14,7 @@ from sfm_app.geometry.epipolar import eight_point
 from sfm_app.mapping import attempt as module
 from sfm_app.mapping.attempt import (
     Attempt,
+    ColmapMappers,
     Group,
     NoModel,
     PairSupport,
@@ -23,6 +24,7 @@ from sfm_app.mapping.attempt import (
     choice_reason,
     coverage,
     explained_pairs,
+    likely_needs_one_mapper,
     map_group,
     model_poses,
     pairs_to_map,
@@ -411,7 +413,7 @@ COUNT = 10
 
 
 @pytest.fixture
-def try_out(run, cameras, monkeypatch):
+def try_out(run, cameras):
     """What is tried on ten photos in a chain when mappers place so many photos; runs the two side by side.
 
     Seeds are the pairs (1, 2), (2, 3), ... in this order; `grown` says what becomes of each. A mapper that is `late`
@@ -454,13 +456,9 @@ def try_out(run, cameras, monkeypatch):
                 raise at_once
             return finish("global", model(at_once, points) if at_once else None)
 
-        monkeypatch.setattr(module, "model_from_seed", lambda *arguments: arguments[1])
-        monkeypatch.setattr(module, "map_incrementally", grow)
-        monkeypatch.setattr(module, "map_globally", place)
-        monkeypatch.setattr(module, "copy_database", lambda *_: None)
         explained = {(0, 1): PairSupport(100, 100, contradicted)}
-        monkeypatch.setattr(module, "explained_pairs", lambda *_: explained)
-        return map_group(group, run(**scene), lambda _: settled), calls
+        colmap = ColmapMappers(lambda *_: None, lambda *arguments: arguments[1], grow, place, lambda *_: explained)
+        return map_group(group, run(**scene), lambda _: settled, colmap), calls
 
     return make
 
@@ -483,7 +481,7 @@ def test_both_mappers_are_tried_and_one_good_model_is_enough(try_out):
 
 @pytest.mark.slow
 def test_where_it_is_easy_the_other_mapper_begins_only_if_it_is_needed(try_out, monkeypatch):
-    monkeypatch.setattr(module, "_likely_needs_one_mapper", lambda _: True)
+    monkeypatch.setattr(module, "likely_needs_one_mapper", lambda _: True)
     found, calls = try_out([10], at_once=10)
     assert summary(found) == [("incremental", 10), ("global", 0)] and calls == ["incremental"]
     found, calls = try_out([9], at_once=10)
@@ -502,7 +500,7 @@ def test_it_is_easy_with_known_cameras_and_few_contradictions(cameras, deviation
     known = cameras()
     sure = {name: replace(one, spread={"fx": deviation}) for name, one in known.cameras.items()}
     group = Group(tuple(images), MatchGraph(images, {}, {}), ViewGraph({}, {}), graph, replace(known, cameras=sure))
-    assert module._likely_needs_one_mapper(group) is easy
+    assert likely_needs_one_mapper(group) is easy
 
 
 @pytest.mark.slow
