@@ -421,7 +421,16 @@ def try_out(run, cameras):
     """
 
     def make(
-        grown, at_once=None, late="", count=COUNT, points=500, contradicted=0, completed=0, settled=False, **scene
+        grown,
+        at_once=None,
+        late="",
+        count=COUNT,
+        points=500,
+        contradicted=0,
+        completed=0,
+        settled=False,
+        sure=False,
+        **scene,
     ):
         images = {key: MatchedImage(key, f"{key}.jpg", "one", 1024, 768) for key in range(1, count + 1)}
         rng = np.random.default_rng(0)
@@ -432,7 +441,13 @@ def try_out(run, cameras):
             for key in range(1, count)
         }
         matches = MatchGraph(images, keypoints, dict.fromkeys(poses, rows))
-        group = Group(tuple(images), matches, ViewGraph({}, {}), PoseGraph(poses, {}, ()), cameras())
+        group = Group(
+            tuple(images),
+            matches,
+            ViewGraph({}, {}),
+            PoseGraph(poses, {}, ()),
+            cameras(spread={"fx": 1.0} if sure else {}),
+        )
         done, calls = {"global": threading.Event(), "incremental": threading.Event()}, []
 
         def finish(mapper, result):
@@ -480,11 +495,10 @@ def test_both_mappers_are_tried_and_one_good_model_is_enough(try_out):
 
 
 @pytest.mark.slow
-def test_where_it_is_easy_the_other_mapper_begins_only_if_it_is_needed(try_out, monkeypatch):
-    monkeypatch.setattr(module, "likely_needs_one_mapper", lambda _: True)
-    found, calls = try_out([10], at_once=10)
+def test_where_it_is_easy_the_other_mapper_begins_only_if_it_is_needed(try_out):
+    found, calls = try_out([10], at_once=10, sure=True)
     assert summary(found) == [("incremental", 10), ("global", 0)] and calls == ["incremental"]
-    found, calls = try_out([9], at_once=10)
+    found, calls = try_out([9], at_once=10, sure=True)
     assert summary(found) == [("incremental", 9), ("global", 10)] and calls == ["incremental", "global"]
 
 
