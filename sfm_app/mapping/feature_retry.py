@@ -5,7 +5,7 @@ threshold and a looser ratio test give more there. For all photos they would cos
 """
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -106,7 +106,19 @@ class MappedScene:
     """Run whose workspace holds the database of these matches."""
 
 
-def retry_lost_photos(first: MappedScene) -> MappedScene:
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """Steps of mapping; tests pass others."""
+
+    fill_database: Callable[..., object] = fill_database
+    find_intrinsics: Callable[..., tuple[Intrinsics, object]] = find_intrinsics
+    reconstruct: Callable[..., Outcome] = reconstruct
+
+
+STEPS = Steps()
+
+
+def retry_lost_photos(first: MappedScene, steps: Steps = STEPS) -> MappedScene:
     """Map again with finer features for unregistered photos, and return the result that registers more of them.
 
     If the attempt fails, the first result stays.
@@ -120,7 +132,7 @@ def retry_lost_photos(first: MappedScene) -> MappedScene:
     run.progress.say(f"{count} unregistered; extracting finer features in {len(photos)} photos")
     report: dict[str, Json] = {"photos": photo_names(lost, first.matches), "pairs": len(pairs)}
     try:
-        second = _retry_pairs(first, pairs, report)
+        second = _retry_pairs(first, pairs, report, steps)
     except ClusterError:  # the same command would give another scene on a cluster that stays
         raise
     except SfmError as err:  # the first result is not lost with it
@@ -157,14 +169,16 @@ def candidate_pairs(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
     return sorted(pairs)
 
 
-def _retry_pairs(first: MappedScene, pairs: Sequence[PairId], report: dict[str, Json]) -> MappedScene | None:
+def _retry_pairs(
+    first: MappedScene, pairs: Sequence[PairId], report: dict[str, Json], steps: Steps
+) -> MappedScene | None:
     """Run all steps from features to models once more; return None if there is no new geometry."""
     run = _side_run(first.run)
     finer = replace(run, workspace=SubWorkspace(run.workspace, FEATURES))
     with translate_errors("extracting finer features"):
         if not finer.workspace.database.exists():
             write_match_graph(finer.workspace.database, replace(first.matches, keypoints={}, matches={}))
-    fill_database(run.plugins.feature_method(SIFT_DSP), finer, pairs)
+    steps.fill_database(run.plugins.feature_method(SIFT_DSP), finer, pairs)
     with translate_errors("adding matches"):
         matches, enriched = add_matches(first.matches, *read_features(finer.workspace.database))
         report["pairs_with_more_matches"] = len(enriched)
@@ -180,8 +194,8 @@ def _retry_pairs(first: MappedScene, pairs: Sequence[PairId], report: dict[str, 
         dict(sorted((fits | dict(fitted.fits)).items())), rejected | dict(fitted.rejected), first.views.lenses
     )
     report["pairs_with_geometry"] = [len(first.views.fits), len(views.fits)]
-    intrinsics = first.intrinsics if _is_mostly_calibrated(first) else find_intrinsics(matches, views, run)[0]
-    return MappedScene(reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
+    intrinsics = first.intrinsics if _is_mostly_calibrated(first) else steps.find_intrinsics(matches, views, run)[0]
+    return MappedScene(steps.reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
 
 
 def _is_mostly_calibrated(scene: MappedScene) -> bool:

@@ -5,7 +5,7 @@ keep the errors that the new photos could correct.
 """
 
 import logging
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 from sfm_app.colmap.backend import CancellationToken, Reconstruction, run_interruptible, translate_errors
@@ -37,7 +37,7 @@ from sfm_app.mapping.split_and_merge import split_attempt
 from sfm_app.matching.pairs import find_same_matches
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.runtime.context import Earlier, RunContext
-from sfm_app.types import Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
+from sfm_app.types import Intrinsics, LookAlikes, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
 
 logger = logging.getLogger("sfm_app")
 
@@ -45,6 +45,25 @@ GROWN = "grown"
 """Name of this mapper in the manifest."""
 TWO_PLACES = "two different places are merged in the model"
 """The doubt of a grown model with false joins."""
+
+
+def find_cameras(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
+    """Find the cameras of all photos anew; the record of the run stays."""
+    return find_intrinsics(matches, views, replace(run, statistics={}))[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """Steps of mapping; tests pass others."""
+
+    find_cameras: Callable[[MatchGraph, ViewGraph, RunContext], Intrinsics] = find_cameras
+    reconstruct: Callable[..., Outcome] = reconstruct
+    build_pose_graph: Callable[..., PoseGraph] = build_pose_graph
+    rival_reason: Callable[..., str] = rival_reason
+    judge_places: Callable[[Sequence[Attempt]], tuple[list[LookAlikes], int]] = judge_places
+
+
+STEPS = Steps()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,20 +74,26 @@ class _Inputs:
     views: ViewGraph
     intrinsics: Intrinsics
     run: RunContext
+    steps: Steps
 
 
 def map_new_photos(
-    matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext, earlier: Earlier
+    matches: MatchGraph,
+    views: ViewGraph,
+    intrinsics: Intrinsics,
+    run: RunContext,
+    earlier: Earlier,
+    steps: Steps = STEPS,
 ) -> MappedScene:
     """Return the earlier model with the new photos, or new models of all photos where these explain more."""
-    inputs = _Inputs(matches, views, intrinsics, run)
+    inputs = _Inputs(matches, views, intrinsics, run, steps)
     grown, doubt = _grow(inputs, earlier)
     run.record(grown_from=0 if grown is None else len(earlier.known), mapped_again_because=doubt)
     if grown is not None and not doubt:
         return MappedScene(grown, matches, views, intrinsics, run)
     run.progress.say(f"mapping all photos again (reason: {doubt})")
-    cameras = find_intrinsics(matches, views, replace(run, statistics={}))[0]
-    whole = reconstruct(matches, views, cameras, run)
+    cameras = steps.find_cameras(matches, views, run)
+    whole = steps.reconstruct(matches, views, cameras, run)
     both = [outcome.models[0] for outcome in (grown, whole) if outcome is not None and outcome.models]
     is_folded = doubt == TWO_PLACES and bool(whole.models)  # look-alikes explain more, and are wrong
     if grown is None or is_folded or best_attempt(both) is not grown.models[0]:
@@ -95,9 +120,8 @@ def _grow(inputs: _Inputs, earlier: Earlier) -> tuple[Outcome | None, str]:
     _write_graph(graph, inputs)
     matches, views = drop_look_alikes(matches, views, graph)
     connected = max(graph.groups, key=lambda photos: len(set(photos).intersection(placed)), default=())
-    if unconnected := set(placed).difference(
-        connected
-    ):  # COLMAP does not take photos of which the database has no pair
+    unconnected = set(placed).difference(connected)
+    if unconnected:  # COLMAP does not take photos without a pair in the database
         placed = [photo for photo in placed if photo not in unconnected]
         start = submodel(start, placed)
     group = Group(connected, matches, views, graph, inputs.intrinsics)
@@ -111,17 +135,10 @@ def _grow(inputs: _Inputs, earlier: Earlier) -> tuple[Outcome | None, str]:
     others = _map_others(graph, {*now, *connected}, replace(inputs, matches=matches, views=views))
     reason = f"{how}, and {len(unplaced & now)} of {len(unplaced)} others were registered"
     outcome = Outcome((attempt, *others), graph, inputs.intrinsics, (attempt.note,), reason)
-    return outcome, _doubt(attempt, placed, before, inputs.intrinsics, matches, views)
+    return outcome, _doubt(attempt, placed, before, replace(inputs, matches=matches, views=views))
 
 
-def _doubt(
-    attempt: Attempt,
-    placed: Collection[int],
-    before: float,
-    intrinsics: Intrinsics,
-    matches: MatchGraph,
-    views: ViewGraph,
-) -> str:
+def _doubt(attempt: Attempt, placed: Collection[int], before: float, inputs: _Inputs) -> str:
     """Return why a grown model is unreliable; empty where nothing speaks against it.
 
     It began with the photos `placed`, and had the support `before` among these.
@@ -133,16 +150,16 @@ def _doubt(
     after = support({pair: one for pair, one in attempt.explained.items() if inside.issuperset(pair)})
     if after < (1.0 - MAPPING.equal_tolerance) * before:
         return "the model explains fewer matches of the known photos than the earlier one"
-    if judge_places([attempt])[0]:
+    if inputs.steps.judge_places([attempt])[0]:
         return TWO_PLACES
-    return rival_reason(attempt, intrinsics, matches, views)
+    return inputs.steps.rival_reason(attempt, inputs.intrinsics, inputs.matches, inputs.views)
 
 
 def _pose_graph(inputs: _Inputs, known: dict[PairId, RelativePose]) -> PoseGraph:
     """Return the pose graph: pairs that the earlier model explains have its poses, all others are estimated."""
     epipolar, run = inputs.run.settings.epipolar, inputs.run
     options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, run.seed)
-    return build_pose_graph(inputs.matches, inputs.views, inputs.intrinsics, options, run.map, known)
+    return inputs.steps.build_pose_graph(inputs.matches, inputs.views, inputs.intrinsics, options, run.map, known)
 
 
 def _write_graph(graph: PoseGraph, inputs: _Inputs) -> None:

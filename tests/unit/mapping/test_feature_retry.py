@@ -16,6 +16,7 @@ from sfm_app.mapping.attempt import Attempt, explained_pairs
 from sfm_app.mapping.feature_retry import (
     OPTIONS,
     MappedScene,
+    Steps,
     add_matches,
     candidate_pairs,
     lost_photos,
@@ -52,7 +53,7 @@ def first(synthetic, cameras, tmp_path):
 
 
 @pytest.fixture
-def finer(monkeypatch, synthetic):
+def finer(synthetic):
     """Lets finer features be those that COLMAP has made; what is asked for is noted. `places` of six find a place.
 
     Matches are wrong where their second features come in another `order`.
@@ -75,18 +76,16 @@ def finer(monkeypatch, synthetic):
             asked.append((matches, views, intrinsics))
             return outcome_of(synthetic, matches, views, places)
 
-        monkeypatch.setattr(module, "fill_database", fill_database)
-        monkeypatch.setattr(module, "reconstruct", reconstruct)
-        return asked
+        return asked, Steps(fill_database, reconstruct=reconstruct)
 
     return make
 
 
 @pytest.mark.slow
 def test_a_lost_photo_finds_its_place_by_finer_features(first, finer):
-    asked = finer()
+    asked, steps = finer()
 
-    found = retry_lost_photos(first)
+    found = retry_lost_photos(first, steps)
 
     assert asked[0] == ("sift-dsp", [(k, LOST) for k in range(1, LOST)], OPTIONS.max_ratio)
     matches, views, intrinsics = asked[1]
@@ -100,55 +99,55 @@ def test_a_lost_photo_finds_its_place_by_finer_features(first, finer):
 
 
 @pytest.mark.slow
-def test_cameras_that_were_not_known_are_found_anew(first, finer, cameras, monkeypatch):
-    asked, anew = finer(), cameras(focal=1200.0)
-    monkeypatch.setattr(module, "find_intrinsics", lambda *_: (anew, ()))
-    retry_lost_photos(replace(first, intrinsics=cameras(method="guess", identifiable=False)))
+def test_cameras_that_were_not_known_are_found_anew(first, finer, cameras):
+    (asked, steps), anew = finer(), cameras(focal=1200.0)
+    steps = replace(steps, find_intrinsics=lambda *_: (anew, ()))
+    retry_lost_photos(replace(first, intrinsics=cameras(method="guess", identifiable=False)), steps)
     assert asked[1][2] is anew
 
 
 @pytest.mark.slow
 def test_what_was_found_first_stays_where_no_more_photos_find_a_place(first, finer):
-    finer(places=5)
-    assert retry_lost_photos(first) is first
+    _, steps = finer(places=5)
+    assert retry_lost_photos(first, steps) is first
     assert first.run.statistics["second_look"]["taken"] is False
 
 
 @pytest.mark.slow
 def test_nothing_is_mapped_again_where_no_lost_photo_shows_the_same_scene(first, finer):
-    asked = finer(order=slice(None, None, -1))
-    assert retry_lost_photos(first) is first
+    asked, steps = finer(order=slice(None, None, -1))
+    assert retry_lost_photos(first, steps) is first
     assert len(asked) == 1
     assert (first.run.statistics["second_look"]["placed"], first.run.statistics["second_look"]["taken"]) == ([5], False)
 
 
 @pytest.mark.slow
 def test_a_second_look_that_fails_costs_nothing(first, finer):
-    finer(failing=BackendError("the disk is full"))
-    assert retry_lost_photos(first) is first
+    _, steps = finer(failing=BackendError("the disk is full"))
+    assert retry_lost_photos(first, steps) is first
     assert first.run.statistics["second_look"]["failed"] == "the disk is full"
 
 
 @pytest.mark.slow
 def test_a_second_look_whose_cluster_is_gone_is_not_skipped(first, finer):
-    finer(failing=ClusterError("the scheduler is gone"))
+    _, steps = finer(failing=ClusterError("the scheduler is gone"))
     with pytest.raises(ClusterError, match="scheduler"):
-        retry_lost_photos(first)
+        retry_lost_photos(first, steps)
 
 
 @pytest.mark.slow
 def test_nobody_looks_twice_where_all_photos_have_a_place(first, finer, synthetic):
-    asked = finer()
+    asked, steps = finer()
     whole = replace(first, outcome=outcome_of(synthetic, first.matches, first.views, 6))
-    assert retry_lost_photos(whole) is whole and asked == [] and "second_look" not in first.run.statistics
+    assert retry_lost_photos(whole, steps) is whole and asked == [] and "second_look" not in first.run.statistics
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("chosen", [{"scene": {"second_look": False}}, {"matching": {"features": "sift-dsp"}}])
 def test_nobody_looks_twice_where_that_is_not_wanted(first, finer, chosen):
-    asked = finer()
+    asked, steps = finer()
     unasked = replace(first, run=replace(first.run, settings=Settings.from_mapping(chosen)))
-    assert retry_lost_photos(unasked) is unasked and asked == []
+    assert retry_lost_photos(unasked, steps) is unasked and asked == []
 
 
 def photos(count, matches=()):
