@@ -24,7 +24,7 @@ from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.synthetic.matches import TownGraph, TownOptions, make_town_graph
 from sfm_app.estimation.calibrating import photo_pairs, sample_pairs
 from sfm_app.mapping.part_mapping import cut_group
-from sfm_app.mapping.parts import USUAL_PART
+from sfm_app.mapping.parts import OPTIONS as PARTS
 from sfm_app.plugins import load_plugins
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.posegraph.graph import average_pair_rotations
@@ -65,7 +65,7 @@ def measure(photos: int, seed: int) -> Row:
     calibrated = time.perf_counter()
     graph = build_pose_graph(town.matches, town.views, intrinsics, PoseGraphOptions(1.5, 16, seed), run_map)
     posed = time.perf_counter()
-    parts = cut_group(graph, graph.groups[0], USUAL_PART)
+    parts = cut_group(graph, graph.groups[0], PARTS.usual_size)
     end = time.perf_counter()
     (camera,) = intrinsics.cameras.values()
     off = rotation_errors_deg(town, graph)

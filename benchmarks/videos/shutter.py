@@ -26,7 +26,7 @@ from sfm_app.colmap.backend import pycolmap, show_log
 from sfm_app.colmap.bundle import Adjustment, adjust
 from sfm_app.colmap.model import posed_images
 from sfm_app.colmap.readout import measure_readout, read_keypoints, straighten_model
-from sfm_app.mapping.rolling_shutter import ROUNDS, Readout, follow_shutter
+from sfm_app.mapping.rolling_shutter import OPTIONS, Readout, follow_shutter
 from sfm_app.progress import SilentProgress
 from sfm_app.types import MatchedImage, MatchGraph
 
@@ -99,7 +99,7 @@ def follow_known(adjusted: Adjustment, matches: MatchGraph, readout_s: float, da
     keypoints = read_keypoints(adjusted.model)
     estimate: ReadoutEstimate | None = None
     times = {key: float(image.time_s or 0.0) for key, image in matches.images.items()}
-    for _ in range(ROUNDS - 1):
+    for _ in range(OPTIONS.rounds - 1):
         estimate = measure_readout(adjusted, keypoints, times, estimate, known=readout_s)
         adjusted = adjust(straighten_model(adjusted.model, estimate, keypoints), database)
     return adjusted

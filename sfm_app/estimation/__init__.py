@@ -1,1 +1,1 @@
-"""Features, matches, fundamental matrices and cameras by the chosen methods, and diagnoses of unusable photos."""
+"""Fundamental matrices and cameras of all photos, and diagnoses of unusable photos."""

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,32 +33,36 @@ from sfm_app.types import (
 )
 from sfm_app.types.camera import EQUIRECTANGULAR
 
-# Inliers that a lens hid: through a barrel or pincushion lens, right matches lie off straight epipolar lines.
-#
-# Ours. A fundamental matrix of pixels keeps the matches that a lens bends least, and cameras adjusted to these
-# alone have too long or too short a focal. With the lens that they give, each pair chooses its inliers among all
-# its matches again.
-
 logger = logging.getLogger("sfm_app")
 
-LEAST_RADIAL = 0.02
-"""|k1| from which on matches are chosen again. Chosen on synthetic matches with k1 from -0.35 to 0.2
-(`python -m benchmarks.lenses.distortion`): at 0.1 the focal is off by 0.4 % without."""
-LEAST_KEPT = 0.7
-"""Share of its inliers that a pair must keep for its new ones to be taken. Chosen by hand; not measured on its own."""
+
+@dataclass(frozen=True, slots=True)
+class CalibratingOptions:
+    """Pairs that calibrate, and inliers through a lens."""
+
+    min_radial: float = 0.02
+    """|k1| from which on inliers are chosen again. Chosen on `benchmarks.lenses.distortion`."""
+    min_kept: float = 0.7
+    """Share of its inliers that a pair must keep then. Chosen by hand."""
+    all_pairs: int = 2000
+    """Pairs up to which all calibrate. Chosen by hand."""
+    pairs_per_photo: int = 4
+    """Least partners of each photo in a sample of more. Chosen by hand."""
+    lens_rounds: int = 2
+    """Times that inliers are chosen through the lens so far. Chosen on `benchmarks.lenses.distortion`."""
 
 
-def choose_inliers_again(
+OPTIONS = CalibratingOptions()
+
+
+# Inliers through a lens (ours). A fundamental matrix of pixels keeps the matches that a lens bends least, and cameras
+# adjusted to these alone have too long or too short a focal. With their lens, each pair selects its inliers again.
+
+
+def select_inliers_through_lens(
     matches: MatchGraph, views: ViewGraph, cameras: Sequence[CalibratedCamera], run: RunContext
 ) -> ViewGraph:
-    """Return the view graph with the inliers of its pairs chosen through their lenses; the same one where none bends.
-
-    Args:
-        matches: keypoints and raw matches.
-        views: fundamental matrices.
-        cameras: those of all photos, in pixels of whole photos.
-        run: the run.
-    """
+    """Choose the inliers of pairs through the lenses of known cameras; return the same graph where none bends."""
     known = {photo: camera.found for camera in cameras for photo in camera.photos if camera.found.is_estimated}
     pairs = [pair for pair, fit in views.fits.items() if not fit.degeneracy and _is_bent(pair, known, views, matches)]
     if not pairs:
@@ -67,47 +71,36 @@ def choose_inliers_again(
     def choose(pair: PairId) -> EpipolarFit:
         fit = views.fits[pair]
         try:
-            lens = Pair(matches.points(pair), [known[photo] for photo in pair], run.settings.epipolar.max_error_px)
-            pose = estimate_pose(lens, fit)
+            matched = Pair(matches.points(pair), [known[photo] for photo in pair], run.settings.epipolar.max_error_px)
+            pose = estimate_pose(matched, fit)
         except FAILURES as err:
-            logger.info("the matches of pair %s could not be chosen again", pair, exc_info=err)
+            logger.info("the inliers of pair %s could not be selected through the lens", pair, exc_info=err)
             return fit
-        kept = pose is not None and pose.inlier_count >= LEAST_KEPT * fit.inlier_count
-        return replace(fit, inliers=pose.inliers) if pose is not None and kept else fit
+        keeps_inliers = pose is not None and pose.inlier_count >= OPTIONS.min_kept * fit.inlier_count
+        return replace(fit, inliers=pose.inliers) if pose is not None and keeps_inliers else fit
 
-    found = dict(zip(pairs, run.map(choose, pairs, "matches through the lens"), strict=True))
-    return replace(views, fits={pair: found.get(pair, fit) for pair, fit in views.fits.items()})
+    selected = dict(zip(pairs, run.map(choose, pairs, "matches through the lens"), strict=True))
+    return replace(views, fits={pair: selected.get(pair, fit) for pair, fit in views.fits.items()})
 
 
 def _is_bent(pair: PairId, known: Mapping[int, Calibration], views: ViewGraph, matches: MatchGraph) -> bool:
     if not known.keys() >= set(pair) or any(matches.images[photo].group in views.lenses for photo in pair):
         return False
-    return max(abs(known[photo].radial) for photo in pair) >= LEAST_RADIAL
-
-
-ENOUGH_PAIRS, PAIRS_PER_PHOTO = 2000, 4
-"""Pairs up to which all are used for calibration, and partners of each photo in a sample of more. Chosen by hand."""
-LENS_ROUNDS = 2
-"""Times the inliers are chosen again through the lens that the cameras so far have. Chosen on synthetic matches
-(`python -m benchmarks.lenses.distortion`)."""
+    return max(abs(known[photo].radial) for photo in pair) >= OPTIONS.min_radial
 
 
 def find_intrinsics(
     matches: MatchGraph, views: ViewGraph, run: RunContext
 ) -> tuple[Intrinsics, Sequence[CalibratedCamera]]:
-    """Find K and lens of every camera, and the camera of every photo; unidentifiable cameras fall back to a guess.
-
-    Args:
-        matches, views, run: keypoints and raw matches; fundamental matrices; the run.
-    """
+    """Find K and lens of every camera, and the camera of every photo; unidentifiable cameras become a guess."""
     sample = sample_pairs(views, len(matches.images))
     run.record(pairs_asked=len(sample.fits))
     cameras = _calibrate(matches, sample, run)
-    for _ in range(LENS_ROUNDS):
-        seen = choose_inliers_again(matches, sample, cameras, run)
-        if seen is sample:
+    for _ in range(OPTIONS.lens_rounds):
+        selected = select_inliers_through_lens(matches, sample, cameras, run)
+        if selected is sample:
             break
-        cameras = _calibrate(matches, seen, run)
+        cameras = _calibrate(matches, selected, run)
     cameras += cameras_with_lens(matches, views)
     report_claims({camera.name: _exif_claim(camera, matches) for camera in cameras}, run)
     cameras = sorted(_take_given_cameras(cameras, matches, run), key=lambda one: (-len(one.photos), one.name))
@@ -123,15 +116,11 @@ def sample_pairs(views: ViewGraph, photos: int) -> ViewGraph:
     """Return the view graph with as many pairs as cameras need; all of them in small sets.
 
     Each photo keeps some pairs: those with most inliers, and others of any number, which have more parallax.
-
-    Args:
-        views: fundamental matrices.
-        photos: number of photos.
     """
     counts = {pair: fit.inlier_count for pair, fit in views.fits.items() if not fit.degeneracy}
-    if len(counts) <= ENOUGH_PAIRS:
+    if len(counts) <= OPTIONS.all_pairs:
         return views
-    chosen = choose_by_rank(counts, 0, max(PAIRS_PER_PHOTO, ENOUGH_PAIRS // max(photos, 1)))
+    chosen = choose_by_rank(counts, 0, max(OPTIONS.pairs_per_photo, OPTIONS.all_pairs // max(photos, 1)))
     return replace(views, fits={pair: fit for pair, fit in views.fits.items() if pair in chosen})
 
 
@@ -149,43 +138,38 @@ def _calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> list[C
 
 
 def _exif_claim(camera: CalibratedCamera, matches: MatchGraph) -> FocalClaim | None:
-    """Return EXIF's claim about a camera that its photos determine."""
-    found, images = camera.found, [matches.images[photo] for photo in camera.photos]
-    if not found.identifiable or found.is_given or found.projection == EQUIRECTANGULAR:
+    """Return the claim of EXIF about a camera that its photos determine."""
+    calibration, images = camera.found, [matches.images[photo] for photo in camera.photos]
+    if not calibration.identifiable or calibration.is_given or calibration.projection == EQUIRECTANGULAR:
         return None
-    return focal_claim(images, found.focal_px, found.spread.get("fx", 0.0))
+    return focal_claim(images, calibration.focal_px, calibration.spread.get("fx", 0.0))
 
 
 def _take_given_cameras(
     cameras: Sequence[CalibratedCamera], matches: MatchGraph, run: RunContext
 ) -> list[CalibratedCamera]:
-    """Return the cameras with those that the user gave in place of the calibrated ones, which are checked first.
+    """Replace calibrated cameras by those that the user gave, after a check.
 
-    Those with a wide lens were checked before the fundamental matrices.
+    Given cameras with a wide lens were checked before the fundamental matrices.
     """
     given = assign_cameras(matches, run.given, keep=run.settings.calibration.keep).cameras
-    found, checked = [], {}
+    result, checked = [], {}
     for camera in cameras:
         group = matches.images[camera.photos[0]].group
         if group not in given or camera.found.is_given:
-            found.append(camera)
+            result.append(camera)
             continue
         checked[camera.name] = given[group], camera.found
         if camera.name == group:
             photos = tuple(photo for photo, image in matches.images.items() if image.group == group)
             own = replace(given[group], key_pairs=camera.found.key_pairs)
-            found.append(CalibratedCamera(group, photos, own))
+            result.append(CalibratedCamera(group, photos, own))
     report_checks(checked, run)
-    return found
+    return result
 
 
 def cameras_with_lens(matches: MatchGraph, views: ViewGraph) -> list[CalibratedCamera]:
-    """Return the cameras with a wide lens, which were found before the fundamental matrices.
-
-    Args:
-        matches: all photos.
-        views: has the lenses.
-    """
+    """Return the cameras with a wide lens, which precede the fundamental matrices."""
     return [
         CalibratedCamera(group, tuple(photo for photo, one in matches.images.items() if one.group == group), lens)
         for group, lens in views.lenses.items()
@@ -193,12 +177,7 @@ def cameras_with_lens(matches: MatchGraph, views: ViewGraph) -> list[CalibratedC
 
 
 def explain_failure(camera: CalibratedCamera, views: ViewGraph) -> Calibration:
-    """Return the calibration; if it failed because most pairs are degenerate, its reason says how.
-
-    Args:
-        camera: the calibrated camera with its photos.
-        views: fundamental matrices.
-    """
+    """Return the calibration; if it failed because most pairs are degenerate, its reason names the degeneracy."""
     kinds = inliers_by_degeneracy(views, camera.photos)
     if camera.found.identifiable or not kinds.total() > kinds[""]:
         return camera.found
@@ -206,12 +185,7 @@ def explain_failure(camera: CalibratedCamera, views: ViewGraph) -> Calibration:
 
 
 def to_whole_photo(camera: CalibratedCamera, image: MatchedImage) -> CalibratedCamera:
-    """Return a camera in pixels of the whole photo, if it was found in those of the picture inside the bars.
-
-    Args:
-        camera: as returned by calibration.
-        image: one of its photos.
-    """
+    """Return a camera of the picture inside the bars of a photo in pixels of the whole photo."""
     if image.shown is None:
         return camera
     K = camera.found.K.copy()
@@ -220,14 +194,7 @@ def to_whole_photo(camera: CalibratedCamera, image: MatchedImage) -> CalibratedC
 
 
 def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> PhotoPairs:
-    """Return the pairs of some photos that are not degenerate, in pixels of the pictures inside their bars.
-
-    Args:
-        images: the photos.
-        matches: keypoints and raw matches.
-        views: fundamental matrices.
-    """
-    shown = {image.id: image.shown for image in images if image.shown}
+    """Return the pairs of some photos that are not degenerate, in pixels of the pictures inside their bars."""
     ids = {image.id for image in images}
     fits = {pair: fit for pair, fit in views.fits.items() if ids.issuperset(pair) and not fit.degeneracy}
     return PhotoPairs(
@@ -239,15 +206,9 @@ def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGrap
         groups={image.id: image.group for image in images},
         focal_hints_px={image.id: image.exif_focal_px * shown_share(image) for image in images if image.exif_focal_px},
         padded_sizes={image.id: (image.width, image.height) for image in images if image.shown},
-    ).with_origins({photo: frame[:2] for photo, frame in shown.items()})
+    ).with_origins({image.id: image.shown[:2] for image in images if image.shown})
 
 
 def camera_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> CameraPairs:
-    """Return the input of a calibrator for the photos of one camera.
-
-    Args:
-        images: photos of the camera.
-        matches: keypoints and raw matches.
-        views: fundamental matrices.
-    """
+    """Return the input of a calibrator for the photos of one camera."""
     return photo_pairs(images, matches, views).to_camera_pairs([image.id for image in images])

@@ -28,37 +28,48 @@ from sfm_app.types import Calibration, EpipolarFit, MatchedImage, MatchGraph, Pa
 from sfm_app.types.arrays import BoolArray, FloatArray
 from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE
 
-# Wide lenses of camera groups, given or from raw matches: before them, no fundamental matrix fits.
-
 logger = logging.getLogger("sfm_app")
 
-
 METHOD, PANORAMA = "lens", "panorama"
-"""Names of what found a camera: curved epipolar lines, and the photos themselves."""
-MAX_DEVIATION = 0.01
-"""Largest standard deviation of a radius, as a share of the width, of a lens that counts as determined. Chosen by
-hand; not measured on its own."""
-TERMS, ANGLES = 4, 200
-"""Terms of COLMAP's OPENCV_FISHEYE, and angles at which they are fitted. Counted; chosen by hand."""
-NONE_DECIDED: Mapping[str, Calibration | None] = MappingProxyType({})
-"""No lens is known from an earlier run."""
+"""Sources of a camera: curved epipolar lines, and the photos themselves."""
+
+
+@dataclass(frozen=True, slots=True)
+class LensOptions:
+    """A fisheye as a camera of COLMAP."""
+
+    max_deviation: float = 0.01
+    """Standard deviation of a radius up to which a lens is determined, as a share of the width. Chosen by hand."""
+    terms: int = 4
+    """Terms of COLMAP's OPENCV_FISHEYE. By definition."""
+    angles: int = 200
+    """Angles at which the terms are fitted. Chosen by hand."""
+
+
+LENS = LensOptions()
+
+NONE_KNOWN: Mapping[str, Calibration | None] = MappingProxyType({})
+
+PairFit = tuple[EpipolarFit | Rejected, int]
+"""Fit of a pair, or why there is none, and the number of its matches that are stationary in the picture."""
+
+PART = 64
+"""Pairs per file; after a killed run, finished pairs outside complete files are fitted again."""
+
+# Wide lenses of camera groups, given or from raw matches: without them, no fundamental matrix fits.
 
 
 def find_lenses(
-    matches: MatchGraph, run: RunContext, decided: Mapping[str, Calibration | None] = NONE_DECIDED
+    matches: MatchGraph, run: RunContext, known_lenses: Mapping[str, Calibration | None] = NONE_KNOWN
 ) -> dict[str, Calibration]:
     """Find the cameras whose lens no perspective camera describes, by camera group.
 
-    Those that the user gave are taken, and checked against what the matches say.
-
-    Args:
-        matches: keypoints and raw matches.
-        run: the run.
-        decided: wide lenses that an earlier run found, by camera group; None where it found that there is none.
+    Given cameras are taken, and checked against the matches. `known_lenses` are those of an earlier run, None for no
+    wide lens.
 
     Raises:
         InputError: the calibration file fits no photo.
-        ConfigError: the photos are no panoramas, as the user says.
+        ConfigError: the user states panoramas, and some photos are none.
     """
     _check_panoramas(matches, run)
     given = assign_cameras(matches, run.given, keep=run.settings.calibration.keep)
@@ -69,26 +80,26 @@ def find_lenses(
     groups: dict[str, list[MatchedImage]] = {}
     for _, image in sorted(matches.images.items()):
         groups.setdefault(image.group, []).append(image)
-    found, checked = {}, {}
+    lenses, checked = {}, {}
     for group, images in groups.items():
-        known = given.cameras.get(group)
-        if known is not None:
-            checked[group] = known, _seen_lens(known, images, matches, run)
-            lens = known if known.projection == FISHEYE else None
+        given_camera = given.cameras.get(group)
+        if given_camera is not None:
+            checked[group] = given_camera, _lens_of_matches(given_camera, images, matches, run)
+            lens = given_camera if given_camera.projection == FISHEYE else None
         else:
-            lens = decided[group] if group in decided else _find_lens(images, matches, run)
+            lens = known_lenses[group] if group in known_lenses else _find_lens(images, matches, run)
         if lens is not None:
-            found[group] = lens
-            run.progress.say(f"the photos {group} are taken with a wide lens: {describe_lens(lens)}")
+            lenses[group] = lens
+            run.progress.say(f"the photos {group} have a wide lens: {describe_lens(lens)}")
     report_checks(checked, run)
-    run.record(lenses={group: describe_lens(lens) for group, lens in found.items()})
-    return found
+    run.record(lenses={group: describe_lens(lens) for group, lens in lenses.items()})
+    return lenses
 
 
 def describe_lens(lens: Calibration) -> str:
-    """Return a wide lens in a few words."""
+    """Describe a wide lens in a few words."""
     if lens.projection == EQUIRECTANGULAR:
-        return "panoramas of a whole turn"
+        return "equirectangular panoramas"
     return f"a fisheye with {max(field_of_view_deg(lens)):.0f} degrees along the longer side"
 
 
@@ -99,28 +110,30 @@ def _find_lens(images: Sequence[MatchedImage], matches: MatchGraph, run: RunCont
         return panorama(size)
     model = run.settings.scene.camera_model
     if model != "auto":
-        asked = projection_of_model(model) == FISHEYE
-        return _search_lens(images, matches, run, is_wide=True) if asked else None
+        is_fisheye = projection_of_model(model) == FISHEYE
+        return _search_lens(images, matches, run, is_wide=True) if is_fisheye else None
     return _search_lens(images, matches, run, is_wide=False) if run.settings.calibration.lens else None
 
 
 def panorama(size: tuple[int, int]) -> Calibration:
-    """Return the camera of panoramas.
-
-    Args:
-        size: (width, height) in pixels.
-    """
-    nothing_open = dict.fromkeys(("fx", "fy", "cx", "cy"), 0.0)
+    """Return the camera of panoramas of (width, height) pixels."""
     K = panorama_matrix(size)
-    return Calibration(K, *size, PANORAMA, identifiable=True, projection=EQUIRECTANGULAR, spread=nothing_open)
+    return Calibration(
+        K,
+        *size,
+        PANORAMA,
+        identifiable=True,
+        projection=EQUIRECTANGULAR,
+        spread=dict.fromkeys(("fx", "fy", "cx", "cy"), 0.0),
+    )
 
 
-def _seen_lens(
+def _lens_of_matches(
     known: Calibration, images: Sequence[MatchedImage], matches: MatchGraph, run: RunContext
 ) -> Calibration | None:
-    """Return what the matches of a group with a given camera say of its lens; None where they say nothing.
+    """Return the lens that the matches of a group with a given camera show; None where they show none.
 
-    Of a given perspective camera, they only say something where the lens is a fisheye.
+    For a given perspective camera, they show one only where the lens is a fisheye.
     """
     if not run.settings.calibration.lens:
         return None
@@ -132,52 +145,48 @@ def _search_lens(
 ) -> Calibration | None:
     """Return the lens that the raw matches of a group show; None where there is none, or a perspective one is enough.
 
-    Where it is known to be wide, the best one is returned whether or not it is better than a perspective one.
+    For a lens known to be wide, a perspective one is not tested.
     """
     size, ids = (images[0].width, images[0].height), {image.id for image in images}
     pairs = [np.hstack(matches.points(pair)) for pair in matches.matches if ids.issuperset(pair)]
     try:
         if not is_wide and shows_panoramas(pairs, size, run.seed):
             return panorama(size)
-        found = find_lens(pairs, size, run.seed) if is_wide or needs_fisheye(pairs, size, run.seed) else None
+        estimate = find_lens(pairs, size, run.seed) if is_wide or needs_fisheye(pairs, size, run.seed) else None
     except FAILURES as err:
-        logger.info("the lens of a group could not be found", exc_info=err)
+        logger.info("the lens of a group could not be estimated", exc_info=err)
         return None
-    return to_calibration(found, size) if found is not None and (is_wide or found.is_fisheye) else None
+    return to_calibration(estimate, size) if estimate is not None and (is_wide or estimate.is_fisheye) else None
 
 
 def _check_panoramas(matches: MatchGraph, run: RunContext) -> None:
-    """Check that photos are panoramas where the user says so: no other photo can be one."""
+    """Check that all photos are panoramas if the user states so."""
     others = [image.name for image in matches.images.values() if image.projection != EQUIRECTANGULAR]
     if run.settings.scene.camera_model == "EQUIRECTANGULAR" and others:
         raise ConfigError(
-            f"{len(others)} photos are no panoramas, such as {others[0]}",
-            hint="leave --camera-model EQUIRECTANGULAR out; panoramas are recognized without it",
+            f"{len(others)} photos are not panoramas, such as {others[0]}",
+            hint="omit --camera-model EQUIRECTANGULAR; panoramas are detected automatically",
         )
 
 
-def to_calibration(found: LensEstimate, size: tuple[int, int]) -> Calibration:
-    """Return a lens as the camera that a run uses, with its radius as a polynomial of the angle.
-
-    Args:
-        found: the lens in pixels.
-        size: (width, height) of the photos.
-    """
-    lens, side = found.lens, float(max(size))
+def to_calibration(estimate: LensEstimate, size: tuple[int, int]) -> Calibration:
+    """Return a lens as the camera of a run, with its radius as a polynomial of the angle; size in pixels."""
+    lens, side = estimate.lens, float(max(size))
     corners = np.array([[x, y] for x in (0.0, size[0]) for y in (0.0, size[1])], np.float64)
     farthest = float(np.max(np.hypot(*(corners - np.array(lens.center)).T)))
-    theta = np.linspace(0.0, float(lens.angle(np.array([farthest]))[0]), ANGLES + 1)[1:]
-    powers = theta[:, None] ** (2.0 * np.arange(1, TERMS + 1) + 1.0)
+    theta = np.linspace(0.0, float(lens.angle(np.array([farthest]))[0]), LENS.angles + 1)[1:]
+    powers = theta[:, None] ** (2.0 * np.arange(1, LENS.terms + 1) + 1.0)
     terms = np.linalg.lstsq(powers, lens.radius(theta) / lens.focal - theta, rcond=None)[0]
-    deviations = np.sqrt(np.diag(np.array(found.covariance)))
-    radius_px = float(np.max(found.radius_deviation_px(theta)))
-    determined = radius_px <= MAX_DEVIATION * side
+    deviations = np.sqrt(np.diag(np.array(estimate.covariance)))
+    radius_px = float(np.max(estimate.radius_deviation_px(theta)))
+    determined = radius_px <= LENS.max_deviation * side
     focal_px = float(deviations[0]) * lens.focal
     evidence = {
-        "pairs": float(found.pairs), "exponent": lens.exponent, "field_deg": lens.field_deg(side),
-        "support": found.support, "support of a perspective lens": found.perspective_support,
+        "pairs": float(estimate.pairs), "exponent": lens.exponent, "field_deg": lens.field_deg(side),
+        "support": estimate.support, "support of a perspective lens": estimate.perspective_support,
         "radius_deviation_px": radius_px,
-    } | {deviation_key(share): float(found.radius_deviation_px(share * theta[-1:])[0]) for share in SHARES}  # fmt: skip
+    }  # fmt: skip
+    evidence |= {deviation_key(share): float(estimate.radius_deviation_px(share * theta[-1:])[0]) for share in SHARES}
     return Calibration(
         camera_matrix(lens.focal, lens.focal, *lens.center), *size, METHOD if determined else "estimate",
         identifiable=determined,
@@ -190,34 +199,25 @@ def to_calibration(found: LensEstimate, size: tuple[int, int]) -> Calibration:
     )  # fmt: skip
 
 
-PairFit = tuple[EpipolarFit | Rejected, int]
-"""Fit of a pair, or why there is none, and how many of its matches are stationary in the picture."""
-
-PART = 64
-"""Pairs per file; after a killed run, finished pairs outside complete files are fitted again."""
+# Fits of pairs.
 
 
 def fit_pairs(
     matches: MatchGraph, pairs: Sequence[PairId], run: RunContext, lenses: Mapping[str, Calibration]
 ) -> dict[PairId, PairFit]:
-    """Fit every pair on its own, seeded by the run's seed and its ids.
+    """Fit every pair on its own, seeded by the seed of the run and the ids of the photos.
 
-    Finished pairs stay in `view_graph_parts` until the caller removes it, so that a killed run can resume.
-
-    Args:
-        matches: keypoints and raw matches.
-        pairs: the pairs to fit.
-        run: the run.
-        lenses: cameras with a wide lens, by camera group; their pairs are fitted by bearing vectors.
+    Finished pairs stay in `view_graph_parts` until the caller removes it, so that a killed run can resume. Pairs of
+    `lenses`, the wide lenses by camera group, are fitted by bearing vectors.
     """
     estimator = run.plugins.estimator(run.settings.epipolar.estimator)
     fit_pair = Task(_fit_pair, estimator, run.settings, dict(lenses))
-    return _fit_all(fit_pair, lambda left: _matched_pairs(matches, left), pairs, run)
+    return _fit_all(fit_pair, lambda missing: _matched_pairs(matches, missing), pairs, run)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedPair:
-    """All that the fit of a pair needs of the match graph."""
+    """Part of the match graph for the fit of a pair."""
 
     pair: PairId
     images: tuple[MatchedImage, MatchedImage]
@@ -228,7 +228,7 @@ class MatchedPair:
 
 
 def _matched_pairs(matches: MatchGraph, pairs: Iterable[PairId]) -> Iterator[MatchedPair]:
-    """Yield what the fits of these pairs need."""
+    """Yield the input of the fits of these pairs."""
     spreads: dict[int, FloatArray] = {}
     for pair in pairs:
         first, second = (matches.images[photo] for photo in pair)
@@ -251,25 +251,21 @@ def _fit_or_raise(
     estimator: Estimator, settings: Settings, lenses: Mapping[str, Calibration], matched: MatchedPair
 ) -> PairFit:
     seed = int(np.random.SeedSequence([settings.seed, *matched.pair]).generate_state(1)[0])
-    points, still = matched.points, _stationary_matches(matched, settings)
+    points, stationary = matched.points, _stationary_matches(matched, settings)
     by_rays = ray_estimator(matched.images, lenses)
     fit = by_rays or estimator.fit
-    if not still.any():
+    if not stationary.any():
         return fit(*points, settings.epipolar, seed), 0
     image = matched.images[0]
-    wide = is_widespread(points[0][still], matched.spread, (image.width, image.height))
+    wide = is_widespread(points[0][stationary], matched.spread, (image.width, image.height))
     wide = wide and by_rays is None  # its test needs an F of pixels
-    return fit_moving(fit, points, still, wide, settings.epipolar, seed), int(np.count_nonzero(still))
+    return fit_moving(fit, points, stationary, wide, settings.epipolar, seed), int(np.count_nonzero(stationary))
 
 
 def ray_estimator(images: Sequence[MatchedImage], lenses: Mapping[str, Calibration]) -> FitFundamentalLike | None:
     """Return an estimator by bearing vectors for a pair of photos; None where neither has a wide lens.
 
-    The other camera of a pair is taken as the usual guess.
-
-    Args:
-        images: both photos.
-        lenses: cameras with a wide lens, by camera group.
+    The other camera of a pair is the usual guess.
     """
     if not any(image.group in lenses for image in images):
         return None
@@ -285,17 +281,12 @@ def ray_estimator(images: Sequence[MatchedImage], lenses: Mapping[str, Calibrati
 
 
 def to_view_graph(
-    found: Mapping[PairId, PairFit], lenses: Mapping[str, Calibration] = MappingProxyType({})
+    results: Mapping[PairId, PairFit], lenses: Mapping[str, Calibration] = MappingProxyType({})
 ) -> ViewGraph:
-    """Return the view graph of fitted and rejected pairs.
-
-    Args:
-        found: fit of every pair, or why it has none.
-        lenses: cameras with a wide lens, by camera group.
-    """
+    """Return the view graph of fitted and rejected pairs."""
     return ViewGraph(
-        fits={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, EpipolarFit)},
-        rejected={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, Rejected)},
+        fits={pair: fit for pair, (fit, _) in results.items() if isinstance(fit, EpipolarFit)},
+        rejected={pair: fit for pair, (fit, _) in results.items() if isinstance(fit, Rejected)},
         lenses=lenses,
     )
 
@@ -306,56 +297,46 @@ def _fit_all(
     pairs: Sequence[PairId],
     run: RunContext,
 ) -> dict[PairId, PairFit]:
-    """Return the result of `fit_pair` for every pair, in order; each part is written to a file once it is complete."""
+    """Return the result of `fit_pair` for every pair, in order; each complete part is written to a file."""
     folder = run.workspace.view_graph_parts
     if not resume_or_clear(folder, run.fingerprint):
         mark_unfinished(folder, run.fingerprint)
     parts = {folder / f"{first:06d}.npz": pairs[first : first + PART] for first in range(0, len(pairs), PART)}
-    known = {path: read_part(path, part) for path, part in parts.items()}
-    left = [pair for path, part in parts.items() if known[path] is None for pair in part]
-    fitted = ordered_map(run.executor, fit_pair, load(left), ahead=2 * run.workers)
-    results = track(run.progress, fitted, "epipolar geometry", len(left))
-    found: dict[PairId, PairFit] = {}
+    stored = {path: read_part(path, part) for path, part in parts.items()}
+    missing = [pair for path, part in parts.items() if stored[path] is None for pair in part]
+    fitted = ordered_map(run.executor, fit_pair, load(missing), ahead=2 * run.workers)
+    results = track(run.progress, fitted, "epipolar geometry", len(missing))
+    fits: dict[PairId, PairFit] = {}
     for path, part in parts.items():
-        done = known[path]
-        if done is None:
-            done = dict(zip(part, results, strict=False))
-            write_part(path, done)
-        found |= done
-    return {pair: found[pair] for pair in pairs}
+        finished = stored[path]
+        if finished is None:
+            finished = dict(zip(part, results, strict=False))
+            write_part(path, finished)
+        fits |= finished
+    return {pair: fits[pair] for pair in pairs}
 
 
-def write_part(path: Path, found: Mapping[PairId, PairFit]) -> None:
-    """Write the results of some pairs.
-
-    Args:
-        path: file, written atomically.
-        found: fit, or why there is none, and number of stationary matches.
-    """
-    still = np.array([[*pair, count] for pair, (_, count) in found.items()], np.int64)
+def write_part(path: Path, results: Mapping[PairId, PairFit]) -> None:
+    """Write the results of some pairs to a file, atomically."""
+    still = np.array([[*pair, count] for pair, (_, count) in results.items()], np.int64)
     with replace_atomically(path) as beside:
-        np.savez(beside, allow_pickle=False, still=still, **to_view_graph(found).to_arrays())
+        np.savez(beside, allow_pickle=False, still=still, **to_view_graph(results).to_arrays())
 
 
 def read_part(path: Path, pairs: Sequence[PairId]) -> dict[PairId, PairFit] | None:
-    """Return what `write_part` has written; None where the file is missing or damaged.
-
-    Args:
-        path: file; may be missing or damaged.
-        pairs: those that it has to hold.
-    """
+    """Read the results of these pairs by `write_part`; None where the file is missing or damaged."""
     try:
         arrays = load_arrays(path)
         graph = ViewGraph.from_arrays(arrays)
-        every: dict[PairId, EpipolarFit | Rejected] = {**graph.fits, **graph.rejected}
+        all_results: dict[PairId, EpipolarFit | Rejected] = {**graph.fits, **graph.rejected}
         still = {(int(a), int(b)): int(count) for a, b, count in arrays["still"]}
-        return {pair: (every[pair], still[pair]) for pair in pairs}
+        return {pair: (all_results[pair], still[pair]) for pair in pairs}
     except Exception:  # decoders of damaged bytes raise all kinds of errors
         return None
 
 
 def _stationary_matches(matched: MatchedPair, settings: Settings) -> BoolArray:
-    """Return a mask of the matches of a pair that are stationary in the picture; none if the photos differ in size."""
+    """Return a mask of the matches that are stationary in the picture; none if the photos differ in size."""
     first, second = matched.images
     if (first.width, first.height) != (second.width, second.height):
         return np.zeros(len(matched.points[0]), bool)

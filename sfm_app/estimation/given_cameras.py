@@ -16,11 +16,7 @@ from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, GivenCameras, Intrinsics, MatchedImage, MatchGraph, Scene
 from sfm_app.types.camera import EQUIRECTANGULAR, KEPT
 
-# Which photos each camera of a calibration file took, and that camera for the size of these photos.
-
-ROUNDING_PX = 1.0
-"""Largest difference in pixels of the shorter side of photos that were only scaled: sizes are whole pixels. By
-definition."""
+# Cameras of a calibration file, for the photos of a run.
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +33,7 @@ def assign_cameras(matches: MatchGraph, given: GivenCameras, *, keep: bool) -> A
     """Return the given camera of every camera group that has one.
 
     A group has the camera that the file names for its photos, or by the name of the group; else the only one of the
-    file, or the only one of the size or the shape of its photos.
-
-    Args:
-        matches: has the photos.
-        given: contents of the calibration file.
-        keep: whether the user wants the cameras unchanged.
+    file, or the only one of the size or the shape of its photos. With `keep`, cameras stay unchanged.
 
     Raises:
         InputError: the file has no camera for any of the photos.
@@ -52,30 +43,28 @@ def assign_cameras(matches: MatchGraph, given: GivenCameras, *, keep: bool) -> A
     groups: dict[str, list[MatchedImage]] = {}
     for _, image in sorted(matches.images.items()):
         groups.setdefault(image.group, []).append(image)
-    cameras, notes, refused = {}, [], []
+    cameras, notes, rejections = {}, [], []
     for group, images in groups.items():
         if images[0].projection == EQUIRECTANGULAR:
             continue  # nothing about a panorama is unknown
-        name, why = _choose_name(group, images, given)
-        found, note = fit_to_photos(given.cameras[name], images[0]) if name is not None else (None, why)
-        if found is None:
-            refused.append(f"the photos {group} have no given camera: {note}")
+        name, reason = _choose_name(group, images, given)
+        camera, note = fit_to_photos(given.cameras[name], images[0]) if name is not None else (None, reason)
+        if camera is None:
+            rejections.append(f"no given camera for the photos {group}: {note}")
         else:
-            cameras[group] = replace(found, method=KEPT) if keep else found
-            notes += [f"the given camera of the photos {group} is scaled: {note}"] if note else []
-    if not cameras and refused:
-        raise InputError(f"{given.source} fits no photo: {refused[0]}", hint="leave --calibration out to do without")
-    return AssignedCameras(cameras, (*notes, *refused))
+            cameras[group] = replace(camera, method=KEPT) if keep else camera
+            notes += [f"scaled the given camera of the photos {group}: {note}"] if note else []
+    if not cameras and rejections:
+        raise InputError(
+            f"{given.source} fits no photo: {rejections[0]}", hint="omit --calibration to estimate the cameras"
+        )
+    return AssignedCameras(cameras, (*notes, *rejections))
 
 
 def fit_to_photos(camera: Calibration, image: MatchedImage) -> tuple[Calibration | None, str]:
     """Return a camera in pixels of a photo, and a note if it was scaled; None with the reason where it cannot be.
 
-    Photos of another shape were cropped, nobody knows where.
-
-    Args:
-        camera: for photos of its own size; of any size where that is 0.
-        image: one of the photos.
+    Photos of another shape were cropped, at an unknown place. A camera of width 0 fits any size.
     """
     size = image.width, image.height
     if camera.projection == EQUIRECTANGULAR:
@@ -83,17 +72,17 @@ def fit_to_photos(camera: Calibration, image: MatchedImage) -> tuple[Calibration
     if not camera.width:
         cx, cy = camera.K[:2, 2]
         inside = 0.0 < cx < size[0] and 0.0 < cy < size[1]
-        says = f"its optical center lies outside of {size[0]} x {size[1]} pixels"
-        return (replace(camera, width=size[0], height=size[1]), "") if inside else (None, says)
-    left, top, *shown = image.shown or (0, 0, *size)
-    for frame in ((0, 0, *size), (left, top, *shown)):
+        reason = f"its optical center lies outside of {size[0]} x {size[1]} pixels"
+        return (replace(camera, width=size[0], height=size[1]), "") if inside else (None, reason)
+    x, y, *shown = image.shown or (0, 0, *size)
+    for frame in ((0, 0, *size), (x, y, *shown)):
         across, down = frame[2] / camera.width, frame[3] / camera.height
-        if abs(across * camera.height - frame[3]) <= ROUNDING_PX or abs(down * camera.width - frame[2]) <= ROUNDING_PX:
+        if min(abs(across * camera.height - frame[3]), abs(down * camera.width - frame[2])) <= 1.0:  # whole pixels
             return _scale(camera, across, down, frame[:2], size)
-    turned = camera.width * size[0] == camera.height * size[1]
+    is_turned = camera.width * size[0] == camera.height * size[1]
     return None, (
         f"the file's camera took photos of {camera.width} x {camera.height} pixels, these have {size[0]} x {size[1]}: "
-        f"they were {'turned' if turned else 'cropped, or are from another camera'}"
+        f"they were {'is_turned' if is_turned else 'cropped, or are from another camera'}"
     )
 
 
@@ -134,18 +123,36 @@ def _choose_name(group: str, images: Sequence[MatchedImage], given: GivenCameras
     return None, f"{len(alike)} cameras of the file fit them, and none is named '{group}'"
 
 
-# Check cameras that were known before against what the photos say.
+# Checks of given cameras against the photos.
 
-CONTRADICTING_SIGMAS, LEAST_SHARE = 3.0, 0.01
-"""A difference contradicts a camera if it exceeds both: this many standard deviations, and this share of the radius, or
-of the longer side for the optical center. Chosen by hand: lenses are calibrated at one focus and used at another, which
-changes the focal by a few tenths of a percent; not measured on their own."""
-INNER, OUTER, ANGLES = 0.3, 0.8, 20
-"""Range of angles that are compared, as shares of that of the corner, and their number. Nearer to the axis a focal and
-a distortion compensate each other, and the corners hold few matches. Chosen by hand; not measured on their own."""
+
+@dataclass(frozen=True, slots=True)
+class CheckOptions:
+    """When photos contradict a stated camera."""
+
+    sigmas: float = 3.0
+    """Standard deviations that a difference must exceed. Chosen by hand."""
+    min_share: float = 0.01
+    """Share of the radius, or of the longer side for the center, that it must exceed: focusing changes less. Chosen
+    by hand."""
+    inner: float = 0.3
+    """Smallest compared angle, as a share of that of the corner: a focal compensates distortion there. Chosen by
+    hand."""
+    outer: float = 0.8
+    """Largest compared angle: the corners hold few matches. Chosen by hand."""
+    angles: int = 20
+    """Number of compared angles. Chosen by hand."""
+    exif_tolerance: float = 0.08
+    """Share of the focal by which EXIF may be off: rounding, the diagonal, and breathing lenses. Chosen by hand."""
+    exif_sigmas: float = 3.0
+    """Standard deviations of the focal that the difference to EXIF must exceed, too. Chosen by hand."""
+
+
+OPTIONS = CheckOptions()
+
 
 CENTERS = ("optical center, across", "optical center, down")
-"""What a contradiction of the optical center is about."""
+"""Coordinates of the optical center."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,90 +178,76 @@ class Contradiction:
 
 
 def report_checks(checked: Mapping[str, tuple[Calibration, Calibration | None]], run: RunContext) -> None:
-    """Say where the photos contradict given cameras, and record it in the manifest; nothing where none was given.
-
-    Args:
-        checked: by name of the camera the given one, and what the photos say; None where they say nothing.
-        run: the run.
-    """
+    """Announce contradictions, and record all checks: by name the given camera and that of the photos, if any."""
     if not checked:
         return
-    answers = {name: find_contradictions(given, found) if found else [] for name, (given, found) in checked.items()}
-    for name, contradicted in answers.items():
+    contradictions = {
+        name: find_contradictions(given, estimate) if estimate else [] for name, (given, estimate) in checked.items()
+    }
+    for name, contradicted in contradictions.items():
         for one in contradicted:
             run.progress.say(f"beware: the photos contradict the given camera {name}: {one.text}")
     figures = {
         name: {
             "from": run.given.source,
             "kept": given.is_kept,
-            "checked": found is not None and found.identifiable,
-            "contradicted": [one.to_dict() | {"text": one.text} for one in answers[name]],
+            "checked": estimate is not None and estimate.identifiable,
+            "contradicted": [one.to_dict() | {"text": one.text} for one in contradictions[name]],
         }
-        for name, (given, found) in checked.items()
+        for name, (given, estimate) in checked.items()
     }
     run.record(given_cameras=figures)
 
 
-def find_contradictions(given: Calibration, found: Calibration) -> list[Contradiction]:
-    """Return the properties of a given camera that the photos contradict; empty where they agree or do not say.
-
-    Args:
-        given: what the user gave, for these photos.
-        found: what the photos say, with standard deviations.
-    """
-    if EQUIRECTANGULAR in (given.projection, found.projection) or not found.identifiable:
+def find_contradictions(given: Calibration, estimated: Calibration) -> list[Contradiction]:
+    """Return the properties of a given camera that the photos contradict; empty where they do not determine it."""
+    if EQUIRECTANGULAR in (given.projection, estimated.projection) or not estimated.identifiable:
         return []
-    return [*_curve_contradictions(given, found), *_center_contradictions(given, found)]
+    return [*_curve_contradictions(given, estimated), *_center_contradictions(given, estimated)]
 
 
-def _curve_contradictions(given: Calibration, found: Calibration) -> list[Contradiction]:
+def _curve_contradictions(given: Calibration, estimated: Calibration) -> list[Contradiction]:
     """Return at most one: focal lengths where these differ, else radii at the angle where they differ most."""
-    theta = np.linspace(INNER, OUTER, ANGLES) * min(corner_angle(given), corner_angle(found))
-    radii = radius_px(theta, given), radius_px(theta, found)
-    deviations = np.hypot(radius_deviation_px(theta, given), radius_deviation_px(theta, found))
+    theta = np.linspace(OPTIONS.inner, OPTIONS.outer, OPTIONS.angles) * min(
+        corner_angle(given), corner_angle(estimated)
+    )
+    radii = radius_px(theta, given), radius_px(theta, estimated)
+    deviations = np.hypot(radius_deviation_px(theta, given), radius_deviation_px(theta, estimated))
     difference = np.abs(radii[0] - radii[1])
-    clear = (difference > CONTRADICTING_SIGMAS * deviations) & (difference > LEAST_SHARE * radii[1])
+    clear = (difference > OPTIONS.sigmas * deviations) & (difference > OPTIONS.min_share * radii[1])
     if not clear.any():
         return []
-    focals = given.focal_px, found.focal_px
-    of_focal = float(np.hypot(given.spread.get("fx", 0.0), found.spread.get("fx", 0.0)))
-    same = given.projection == found.projection
-    if same and abs(focals[0] - focals[1]) > max(LEAST_SHARE * focals[1], CONTRADICTING_SIGMAS * of_focal):
+    focals = given.focal_px, estimated.focal_px
+    of_focal = float(np.hypot(given.spread.get("fx", 0.0), estimated.spread.get("fx", 0.0)))
+    same = given.projection == estimated.projection
+    if same and abs(focals[0] - focals[1]) > max(OPTIONS.min_share * focals[1], OPTIONS.sigmas * of_focal):
         return [Contradiction("focal length", *focals, of_focal)]
     worst = int(np.argmax(np.where(clear, difference / radii[1], 0.0)))
     what = f"radius of what is {np.degrees(theta[worst]):.0f} degrees off the axis"
     if not same:
-        what = f"a {given.projection} lens is given, and the photos show a {found.projection} one; {what}"
+        what = f"a {given.projection} lens is given, and the photos show a {estimated.projection} one; {what}"
     return [Contradiction(what, float(radii[0][worst]), float(radii[1][worst]), float(deviations[worst]))]
 
 
-def _center_contradictions(given: Calibration, found: Calibration) -> list[Contradiction]:
-    if "center" in found.held:
+def _center_contradictions(given: Calibration, estimated: Calibration) -> list[Contradiction]:
+    if "center" in estimated.held:
         return []
-    least, answers = LEAST_SHARE * max(found.width, found.height), []
+    least, contradictions = OPTIONS.min_share * max(estimated.width, estimated.height), []
     for name, axis, what in (("cx", 0, CENTERS[0]), ("cy", 1, CENTERS[1])):
-        values = float(given.K[axis, 2]), float(found.K[axis, 2])
-        deviation = float(np.hypot(given.spread.get(name, 0.0), found.spread.get(name, 0.0)))
-        if name in found.spread and abs(values[0] - values[1]) > max(least, CONTRADICTING_SIGMAS * deviation):
-            answers.append(Contradiction(what, *values, deviation))
-    return answers
+        values = float(given.K[axis, 2]), float(estimated.K[axis, 2])
+        deviation = float(np.hypot(given.spread.get(name, 0.0), estimated.spread.get(name, 0.0)))
+        if name in estimated.spread and abs(values[0] - values[1]) > max(least, OPTIONS.sigmas * deviation):
+            contradictions.append(Contradiction(what, *values, deviation))
+    return contradictions
 
 
-# Compare the focal lengths that EXIF claims with those that the photos determine.
-#
-# EXIF knows nothing of what was done to a photo later: a crop leaves the focal in pixels as it was, while the claim
-# shrinks with the longer side.
-
-TOLERANCE = 0.08
-"""Share of the focal by which a claim may be off: the 35 mm equivalent is rounded to a millimeter, counts along the
-width or along the diagonal (4 % for photos of 4 : 3), and lenses breathe. Chosen by hand; not measured on its own."""
-EXIF_SIGMAS = 3.0
-"""Standard deviations of the focal that the difference must exceed, too. Chosen by hand."""
+# Checks of focal lengths in EXIF. A later crop leaves the focal in pixels as it was, while the claim shrinks with the
+# longer side.
 
 
 @dataclass(frozen=True, slots=True)
 class FocalClaim:
-    """What EXIF says of a camera, and what its photos say."""
+    """Focal length of a camera in EXIF, and from its photos."""
 
     claimed_px: float
     """Median over its photos."""
@@ -267,11 +260,11 @@ class FocalClaim:
     def is_contradicted(self) -> bool:
         """Whether the photos exclude the claim."""
         off = abs(self.found_px - self.claimed_px)
-        return off > TOLERANCE * self.found_px and off > EXIF_SIGMAS * self.deviation_px
+        return off > OPTIONS.exif_tolerance * self.found_px and off > OPTIONS.exif_sigmas * self.deviation_px
 
     @property
     def text(self) -> str:
-        """Both focals, and what may have happened to the photos."""
+        """Both focals, and a likely cause."""
         deviation = f" +- {self.deviation_px:.3g}" if self.deviation_px > 0.0 else ""
         longer = self.found_px > self.claimed_px
         reason = "they were cropped or zoomed" if longer else "they were joined, or taken through another lens"
@@ -286,51 +279,39 @@ class FocalClaim:
 
 
 def focal_claim(images: Iterable[MatchedImage], found_px: float, deviation_px: float) -> FocalClaim | None:
-    """Return the claim about a camera; None where EXIF says nothing.
-
-    Args:
-        images: its photos.
-        found_px: focal length that the photos determine.
-        deviation_px: its standard deviation.
-    """
+    """Return the claim of EXIF about a camera with this focal and standard deviation; None without EXIF."""
     claims = [image.exif_focal_px * shown_share(image) for image in images if image.exif_focal_px]
     return FocalClaim(float(np.median(claims)), len(claims), found_px, deviation_px) if claims else None
 
 
 def shown_share(image: MatchedImage) -> float:
-    """Return the longer side of the picture inside its bars over that of the photo, to which EXIF's focal refers."""
+    """Return the longer side of the picture inside its bars over that of the photo, as in the focal of EXIF."""
     return max(image.shown[2:]) / max(image.width, image.height) if image.shown else 1.0
 
 
-def report_claims(found: Mapping[str, FocalClaim | None], run: RunContext) -> None:
-    """Say which claims the photos contradict, and record all in the manifest; nothing where EXIF says nothing.
-
-    Args:
-        found: by name of the camera.
-        run: the run.
-    """
-    known = {name: claim for name, claim in found.items() if claim is not None}
-    if not known:
+def report_claims(claims: Mapping[str, FocalClaim | None], run: RunContext) -> None:
+    """Announce the claims that the photos contradict, and record all, by name of the camera."""
+    stated = {name: claim for name, claim in claims.items() if claim is not None}
+    if not stated:
         return
-    for name, claim in known.items():
+    for name, claim in stated.items():
         if claim.is_contradicted:
             run.progress.say(f"the photos {name}: {claim.text}")
-    run.record(exif_focals={name: claim.to_dict() for name, claim in known.items()})
+    run.record(exif_focals={name: claim.to_dict() for name, claim in stated.items()})
 
 
-# From what is known of cameras to rules of the last adjustment, and what the photos then say of this knowledge.
+# Rules of the last adjustment, and checks after it.
 
 
 def camera_rules(
     model: Reconstruction, names: Mapping[str, str], intrinsics: Intrinsics, camera_model: str
 ) -> dict[int, CameraRule]:
-    """Return what the user laid down about the cameras of a model, by camera id; empty for nothing.
+    """Return the rules of the user about the cameras of a model, by camera id; empty for none.
 
     Args:
-        model: as mapping left it.
         names: camera of each photo, by photo name.
-        intrinsics: cameras before mapping, with those that the user gave.
-        camera_model: COLMAP's name of the model that all end with; "auto" for the one that the photos support.
+        intrinsics: cameras before mapping.
+        camera_model: COLMAP's name of the model of all cameras; "auto" for the one that the photos support.
     """
     rules = {}
     for image in posed_images(model):
@@ -347,26 +328,14 @@ def camera_rules(
 def given_and_found(
     adjusted: Adjustment, names: Mapping[str, str], intrinsics: Intrinsics
 ) -> dict[str, tuple[Calibration, Calibration | None]]:
-    """Return the cameras of a model that the user gave, with what the photos say of them, by name.
-
-    Args:
-        adjusted: the model after its last adjustment.
-        names: camera of each photo, by photo name.
-        intrinsics: cameras before mapping.
-    """
+    """Return the given cameras of an adjusted model, and its own, by name; `names` has the camera of each photo."""
     ids = {names[image.name]: image.camera_id for image in posed_images(adjusted.model)}
     known = {name: intrinsics.cameras[name] for name in ids if name in intrinsics.cameras}
     return {name: (camera, adjusted.estimates.get(ids[name])) for name, camera in known.items() if camera.is_given}
 
 
 def refined_claims(scene: Scene, intrinsics: Intrinsics, matches: MatchGraph) -> dict[str, FocalClaim | None]:
-    """Return what EXIF claims about cameras that only the last adjustment determined, by name; None for nothing.
-
-    Args:
-        scene: with the cameras after their last adjustment.
-        intrinsics: cameras before mapping; of those that pairs determined, or the user gave, the claim is known.
-        matches: all photos.
-    """
+    """Return the claims of EXIF about cameras that only the last adjustment determined, by name."""
     known = {name for name, camera in intrinsics.cameras.items() if camera.identifiable}
     photos: dict[str, list[MatchedImage]] = {name: [] for name in scene.cameras}
     for image in matches.images.values():

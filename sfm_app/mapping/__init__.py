@@ -1,9 +1,9 @@
 """From relative poses to a COLMAP model: all steps between calibration and the last bundle adjustment.
 
-`mapping_passes` is the table of contents: map every group of photos, learn cameras from the model, map again where that
-helps. `initial_pairs` ranks pairs to start from, `mapping_runs` runs COLMAP's two mappers, and `support` scores their
-models by the matches they explain. `model_split` cuts joins that more matches contradict than support, `second_look`
-adds finer features (`added_matches`) for unregistered photos, and `unregistered` says why photos have no pose.
+`passes` is the table of contents: map every group of photos, learn cameras from the model, map again where that helps.
+`attempt` maps one group and scores the model, `hypotheses` are rivals where the evidence is weak, `parts` maps large
+groups, `look_alikes` finds merged places, and `split_and_merge` cuts models. `feature_retry` adds finer features for
+unregistered photos, and `incremental` adds photos to an earlier model.
 """
 
 from sfm_app.mapping.feature_retry import MappedScene, retry_lost_photos

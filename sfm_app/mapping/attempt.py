@@ -1,6 +1,5 @@
 """One attempt to map a group: pairs to start from, COLMAP's mappers, and how well a model explains its matches."""
 
-import contextlib
 import logging
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,16 +25,52 @@ from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, PoseGraph
 from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import PERSPECTIVE
 
-# Pairs of photos that a mapping can start from, best first.
+logger = logging.getLogger("sfm_app")
 
-DISSENT_WEIGHT = 0.1
-"""Weight of a seed whose pair contradicts the camera matrix that other pairs agree on."""
-PLANAR_WEIGHT = 0.5
-"""Weight of a seed whose points lie on a plane, or whose camera moved along its axis: its pose is less certain."""
-FORWARD = 0.95
-"""Share of the translation along the camera's axis above which the motion counts as forward."""
-GRID = 8
-"""Number of cells across and down a photo, for its coverage: spread points make a better start than a cluster."""
+INCREMENTAL_FOLDER, GLOBAL_FOLDER = "incremental", "global"
+
+
+@dataclass(frozen=True, slots=True)
+class MappingOptions:
+    """When mapping starts, ends, and counts as good."""
+
+    dissent_weight: float = 0.1
+    """Weight of a seed that contradicts the camera matrix of the other pairs. Chosen by hand."""
+    planar_weight: float = 0.5
+    """Weight of a seed on a plane or of a forward motion: its pose is less certain. Chosen by hand."""
+    forward: float = 0.95
+    """Share of the translation along the axis of the camera that makes a motion forward. Chosen by hand."""
+    grid: int = 8
+    """Cells across and down a photo for the coverage of a seed. Chosen by hand."""
+    loose_factor: float = 2.0
+    """Largest error of an explained match, in inlier thresholds. Chosen by hand."""
+    saturation: float = 100.0
+    """Number of matches at which the support of a pair reaches half of its limit. Chosen by hand."""
+    many_photos: int = 60
+    """Size of a set from which few unregistered photos do not justify another mapping. Chosen by hand."""
+    few_lost: float = 0.05
+    """Share of unregistered photos that is few there. Chosen by hand."""
+    enough_share: float = 0.9
+    """Share of the photos of a group that ends the search for a better seed. Chosen by hand."""
+    confirmed_share: float = 0.5
+    """The same when two seeds place equally many photos. Chosen by hand."""
+    min_photos: int = 3
+    """Least photos for learning a camera, for further groups, and for a scale in the global mapper."""
+    equal_tolerance: float = 0.01
+    """Relative difference of supports below which models count as equal. Chosen by hand."""
+    max_contradicted_share: float = 0.01
+    """Share of the inliers of F that may contradict a complete model. Chosen by hand."""
+    max_focal_deviation: float = 0.01
+    """Relative standard deviation of a focal up to which mapping holds it fixed. Chosen by hand."""
+    fully_mapped_photos: int = 250
+    """Photos up to which mapping uses all pairs. Chosen by hand."""
+    mapped_partners: int = 16
+    """Partners of each photo above. Chosen by hand."""
+    max_dropped: float = 0.05
+    """Share of dropped pairs up to which the mappers run one after the other. Chosen by hand."""
+
+
+MAPPING = MappingOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,32 +87,21 @@ def rank_seeds(
 ) -> list[Candidate]:
     """Return candidates for the first pair, best first: many well-spread points, wide angles, consistent with K.
 
-    Args:
-        matches: keypoints and raw matches.
-        graph: relative poses.
-        intrinsics: cameras from pairs.
-        photos: ids of the group; both photos of a candidate belong to it.
-        min_angle_deg: smallest median triangulation angle, degrees.
+    Candidates have a median triangulation angle of at least `min_angle_deg` degrees.
     """
-    members, found = set(photos), []
+    members, candidates = set(photos), []
     for pair, pose in graph.poses.items():
         if members.issuperset(pair) and pose.kind != "rotation" and pose.angle_deg >= min_angle_deg:
             cameras = [intrinsics.camera(matches.images[photo]) for photo in pair]
-            worth = coverage(matches, pair, pose) * agreement(pair, cameras)
-            worth *= PLANAR_WEIGHT if pose.kind == "planar" or abs(pose.t[2]) > FORWARD else 1.0
-            score = pose.inlier_count * min(pose.angle_deg / GOOD_ANGLE_DEG, 1.0) * pose.in_front**4 * worth
-            found.append(Candidate(pair, pose, score))
-    return sorted(found, key=lambda candidate: (-candidate.score, candidate.pair))
+            weight = coverage(matches, pair, pose) * agreement(pair, cameras)
+            weight *= MAPPING.planar_weight if pose.kind == "planar" or abs(pose.t[2]) > MAPPING.forward else 1.0
+            score = pose.inlier_count * min(pose.angle_deg / GOOD_ANGLE_DEG, 1.0) * pose.in_front**4 * weight
+            candidates.append(Candidate(pair, pose, score))
+    return sorted(candidates, key=lambda candidate: (-candidate.score, candidate.pair))
 
 
 def triangulate_seed(matches: MatchGraph, candidate: Candidate, intrinsics: Intrinsics) -> TwoViewSeed:
-    """Return the pose and triangulated points of a candidate.
-
-    Args:
-        matches: keypoints and raw matches.
-        candidate: pair and pose.
-        intrinsics: cameras from pairs.
-    """
+    """Return the pose and triangulated points of a candidate."""
     pose, cameras = candidate.pose, [intrinsics.camera(matches.images[photo]) for photo in candidate.pair]
     points = matches.points(candidate.pair)
     if any(camera.projection != PERSPECTIVE for camera in cameras):
@@ -88,43 +112,27 @@ def triangulate_seed(matches: MatchGraph, candidate: Candidate, intrinsics: Intr
 
 
 def agreement(pair: PairId, cameras: Sequence[Calibration]) -> float:
-    """Return the weight of a pair: 1 unless it contradicts the camera that other pairs agree on.
-
-    Args:
-        pair: ids of two photos.
-        cameras: cameras of the two photos.
-    """
+    """Return the weight of a pair: 1 unless it contradicts the camera that other pairs agree on."""
     first, second = cameras
     unknown = first is not second or not first.key_pairs
-    return 1.0 if unknown or pair in first.key_pairs else DISSENT_WEIGHT
+    return 1.0 if unknown or pair in first.key_pairs else MAPPING.dissent_weight
 
 
 def coverage(matches: MatchGraph, pair: PairId, pose: RelativePose) -> float:
-    """Return the share of cells with an inlier, of those that the inliers could fill; geometric mean of both photos.
-
-    Args:
-        matches: keypoints and raw matches.
-        pair: ids of two photos.
-        pose: relative pose of the pair, with its inliers.
-    """
+    """Return the share of cells with an inlier, of those that the inliers could fill; geometric mean of both photos."""
     shares = []
     for photo, x in zip(pair, matches.points(pair), strict=True):
         image = matches.images[photo]
-        cells = (x[pose.inliers] / [image.width, image.height] * GRID).astype(np.int64).clip(0, GRID - 1)
-        filled = len(np.unique(cells[:, 0] * GRID + cells[:, 1]))
-        shares.append(filled / min(GRID * GRID, max(pose.inlier_count, 1)))
+        cells = (
+            (x[pose.inliers] / [image.width, image.height] * MAPPING.grid).astype(np.int64).clip(0, MAPPING.grid - 1)
+        )
+        filled = len(np.unique(cells[:, 0] * MAPPING.grid + cells[:, 1]))
+        shares.append(filled / min(MAPPING.grid * MAPPING.grid, max(pose.inlier_count, 1)))
     return float(np.sqrt(shares[0] * shares[1]))
 
 
-# Score how well a model explains the matches, independently of how the model was made.
-#
-# For every pair of posed photos, the raw matches are counted that lie on the epipolar lines of the model, in front
-# of both cameras. Points, tracks and reprojection errors depend on the mapper; this count does not.
-
-LOOSE_FACTOR = 2.0
-"""Largest error of an explained match, in inlier thresholds: models are not adjusted to each pair."""
-SATURATION = 100.0
-"""Number of matches at which the support of a pair reaches half of its limit; beyond it, more matches add little."""
+# Support of a model: raw matches on its epipolar lines, in front of both cameras. Unlike points, tracks and
+# reprojection errors, this count does not depend on the mapper.
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,43 +150,31 @@ class PairSupport:
 def explained_pairs(
     model: Reconstruction, matches: MatchGraph, views: ViewGraph, max_error_px: float
 ) -> dict[PairId, PairSupport]:
-    """Return how well a model explains every pair of its photos.
-
-    Args:
-        model: COLMAP's reconstruction.
-        matches: keypoints and raw matches.
-        views: fundamental matrices.
-        max_error_px: largest Sampson distance of an inlier.
-    """
-    found = {}
-    for pair, seen in _placed_pairs(model, matches):
-        right = seen.inlier_mask(LOOSE_FACTOR * max_error_px)
+    """Return how well a model explains every pair of its photos."""
+    explained = {}
+    for pair, posed in _posed_pairs(model, matches):
+        fits_model = posed.inlier_mask(MAPPING.loose_factor * max_error_px)
         fit = views.fits.get(pair)
-        wrong = int(np.count_nonzero(fit.inliers & ~right)) if fit else 0
-        found[pair] = PairSupport(int(np.count_nonzero(right)), fit.inlier_count if fit else 0, wrong)
-    return found
+        contradicted = int(np.count_nonzero(fit.inliers & ~fits_model)) if fit else 0
+        explained[pair] = PairSupport(int(np.count_nonzero(fits_model)), fit.inlier_count if fit else 0, contradicted)
+    return explained
 
 
 def model_poses(
     model: Reconstruction, matches: MatchGraph, max_error_px: float, least: int
 ) -> dict[PairId, RelativePose]:
-    """Return the relative poses of a model for all pairs of its photos with enough explained matches.
-
-    Args:
-        model, matches, max_error_px: as in `explained_pairs`.
-        least: smallest number of explained matches of a pair.
-    """
-    found = {}
-    for pair, seen in _placed_pairs(model, matches):
-        right = seen.inlier_mask(max_error_px)
-        if np.count_nonzero(right) >= least:
-            angle_deg = float(np.median(ray_angles_deg(seen.lines[right], seen.R)))
-            found[pair] = RelativePose(seen.R, seen.t, right, angle_deg=angle_deg, in_front=1.0, kind="calibrated")
-    return found
+    """Return the relative poses of a model for the pairs of its photos with at least `least` explained matches."""
+    poses = {}
+    for pair, posed in _posed_pairs(model, matches):
+        inliers = posed.inlier_mask(max_error_px)
+        if np.count_nonzero(inliers) >= least:
+            angle_deg = float(np.median(ray_angles_deg(posed.lines[inliers], posed.R)))
+            poses[pair] = RelativePose(posed.R, posed.t, inliers, angle_deg=angle_deg, in_front=1.0, kind="calibrated")
+    return poses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _PlacedPair:
+class _PosedPair:
     """The raw matches of two posed photos."""
 
     lines: FloatArray
@@ -193,7 +189,7 @@ class _PlacedPair:
         return np.asarray((distances <= max_error_px) & is_in_front(self.lines, self.R, self.t), bool)
 
 
-def _placed_pairs(model: Reconstruction, matches: MatchGraph) -> Iterator[tuple[PairId, _PlacedPair]]:
+def _posed_pairs(model: Reconstruction, matches: MatchGraph) -> Iterator[tuple[PairId, _PosedPair]]:
     placed = placed_views(model, matches.keypoints)
     for pair, rows in matches.matches.items():
         if pair[0] not in placed or pair[1] not in placed:
@@ -202,7 +198,7 @@ def _placed_pairs(model: Reconstruction, matches: MatchGraph) -> Iterator[tuple[
         R = second.R @ first.R.T
         t = second.t - R @ first.t
         lines = np.hstack([first.lines[rows[:, 0]], second.lines[rows[:, 1]]])
-        yield pair, _PlacedPair(lines, R, t / max(float(np.linalg.norm(t)), 1e-300))
+        yield pair, _PosedPair(lines, R, t / max(float(np.linalg.norm(t)), 1e-300))
 
 
 def support(explained: Mapping[PairId, PairSupport]) -> float:
@@ -211,43 +207,23 @@ def support(explained: Mapping[PairId, PairSupport]) -> float:
 
 
 def saturate(matches: Sequence[int]) -> FloatArray:
-    """Return what the matches of pairs count in a score, (N,): each further match of a pair counts less.
-
-    Args:
-        matches: of each pair.
-    """
+    """Return the weight (N,) of the matches of each pair in a score: each further match counts less."""
     counts = np.array(matches, np.float64)
-    return np.asarray(counts / (1.0 + counts / SATURATION))
+    return np.asarray(counts / (1.0 + counts / MAPPING.saturation))
 
 
-# Reasons why photos have no pose.
-
-MANY, FEW_LOST = 60, 0.05
-"""In sets of at least this many photos, a smaller share of unregistered ones is not worth another reconstruction."""
+# Unregistered photos.
 
 
-def are_worth_another_try(lost: int, photos: int) -> bool:
-    """Return whether photos without a place justify mapping all of them once more.
-
-    Args:
-        lost: photos without a place.
-        photos: photos of the set.
-    """
-    return lost > 0 and (photos < MANY or lost >= FEW_LOST * photos)
+def are_many_unregistered(lost: int, photos: int) -> bool:
+    """Return whether unregistered photos justify another mapping of all photos."""
+    return lost > 0 and (photos < MAPPING.many_photos or lost >= MAPPING.few_lost * photos)
 
 
 def unregistered_reasons(
     posed: set[int], others: Sequence[Sequence[int]], matches: MatchGraph, views: ViewGraph, graph: PoseGraph
 ) -> dict[str, str]:
-    """Return why each photo is missing in the main model, by name.
-
-    Args:
-        posed: photos of the main model.
-        others: photos of each of the other models.
-        matches: all photos.
-        views: fundamental matrices.
-        graph: consistent relative poses, and why others were dropped.
-    """
+    """Return why each photo is missing in the main model, by name; `others` are the photos of the other models."""
     reasons = {}
     for photo, image in matches.images.items():
         if photo not in posed:
@@ -281,39 +257,11 @@ def _edges(photo: int, views: ViewGraph) -> Iterator[tuple[int, int]]:
 
 
 def photo_names(photos: Sequence[int], matches: MatchGraph) -> list[str]:
-    """Return the names of photos.
-
-    Args:
-        photos: ids.
-        matches: knows the names.
-    """
+    """Return the names of photos."""
     return [matches.images[photo].name for photo in photos]
 
 
 # COLMAP's two mappers on one group of photos, side by side, and the choice of the better model.
-
-logger = logging.getLogger("sfm_app")
-
-ENOUGH_SHARE = 0.9
-"""A model with this share of the photos of its group ends the search for a better seed."""
-CONFIRMED_SHARE = 0.5
-"""This share is enough when two seeds agree on how many photos can be placed."""
-MIN_PHOTOS = 3
-"""Smallest number of photos from which a camera is learned, and in a group that is mapped besides the main one."""
-MIN_GLOBAL_PHOTOS = 3
-"""Smallest number of photos for the global mapper: the positions of two photos do not determine a scale."""
-EQUAL_TOLERANCE = 0.01
-"""Models whose supports differ by less than this share count as equal; the one with most photos and points is taken."""
-MAX_CONTRADICTED_SHARE = 0.01
-"""Share of the inliers of fundamental matrices that may contradict a complete model before others are tried."""
-MAX_FOCAL_DEVIATION = 0.01
-"""Relative standard deviation of a focal up to which mapping holds it fixed."""
-MOST_FULLY_MAPPED, MAPPED_PARTNERS = 250, 16
-"""Photos up to which mapping uses all pairs, and partners of each photo above. Chosen by hand."""
-MOST_DROPPED = 0.05
-"""Share of the pairs of a group that the pose graph may have dropped where the incremental mapper is given time to do
-without the other one. It decides when that begins, and nothing else. Chosen by hand."""
-INCREMENTAL_FOLDER, GLOBAL_FOLDER = "incremental", "global"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -344,7 +292,7 @@ class Attempt:
 
     @property
     def support(self) -> float:
-        """Score of the model, see `support.support`."""
+        """Score of the model, see `support`."""
         return support(self.explained)
 
 
@@ -378,224 +326,221 @@ class StopSignal:
 def pairs_to_map(graph: PoseGraph) -> PoseGraph:
     """Return the pose graph with as many pairs as mapping needs; all of them in small sets.
 
-    Tracks join along a few pairs of each photo. COLMAP follows all pairs of every point again and again.
-
-    Args:
-        graph: relative poses.
+    Tracks join along a few pairs of each photo. COLMAP follows all pairs of every point repeatedly.
     """
     photos = {photo for pair in graph.poses for photo in pair}
-    if len(photos) <= MOST_FULLY_MAPPED:
+    if len(photos) <= MAPPING.fully_mapped_photos:
         return graph
     counts = {pair: pose.inlier_count for pair, pose in graph.poses.items()}
-    chosen = choose_by_rank(counts, 0, MAPPED_PARTNERS)
+    chosen = choose_by_rank(counts, 0, MAPPING.mapped_partners)
     return replace(graph, poses={pair: pose for pair, pose in graph.poses.items() if pair in chosen})
 
 
+@dataclass(frozen=True, slots=True)
+class ColmapMappers:
+    """COLMAP's mappers and the score of their models; tests pass others."""
+
+    copy_database: Callable[..., object] = copy_database
+    model_from_seed: Callable[..., Reconstruction] = model_from_seed
+    map_incrementally: Callable[..., Reconstruction | None] = map_incrementally
+    map_globally: Callable[..., Reconstruction | None] = map_globally
+    explained_pairs: Callable[..., dict[PairId, PairSupport]] = explained_pairs
+
+
+COLMAP = ColmapMappers()
+
+
 def map_group(
-    group: Group, run: RunContext, is_settled: Callable[[Attempt], bool] = lambda _: False
+    group: Group,
+    run: RunContext,
+    is_sufficient: Callable[[Attempt], bool] = lambda _: False,
+    colmap: ColmapMappers = COLMAP,
 ) -> list[MappingResult]:
     """Return the results of the mappers on a group.
 
     The incremental mapper from the best seed and the global mapper run side by side, or one after the other where the
-    first will probably do. Where neither places most photos, the next seeds are tried. The results do not depend on
-    which mapper ends first: a complete, uncontradicted incremental model discards the global one, whether or not that
-    is finished.
-
-    Args:
-        group: a connected group of photos, with their matches and poses.
-        run: the run.
-        is_settled: whether an incremental model says enough, although it is incomplete or contradicted.
+    first probably suffices. Where neither places most photos, the next seeds are tried. The results do not depend on
+    which mapper ends first: a complete, consistent incremental model discards the global one. `is_sufficient` accepts
+    an incremental model although it is incomplete or contradicted.
     """
-    options = run.settings.scene
-    at_once = options.mapper != "incremental" and len(group.photos) >= MIN_GLOBAL_PHOTOS
+    options, mapper = run.settings.scene, _GroupMapper(group, run, colmap)
+    with_global = options.mapper != "incremental" and len(group.photos) >= MAPPING.min_photos
     seeds = rank_seeds(group.matches, group.graph, group.intrinsics, group.photos, options.min_seed_angle_deg)
-    seeds = seeds[: options.max_init_pairs] if options.mapper != "global" or not at_once else []
-    if at_once:
-        copy_database(run.workspace.database, run.workspace.root / GLOBAL_FOLDER)
-    with _attempt_runner(group, run) as made:
-        found = made(lambda token: _run_first_round(group, seeds[:1], at_once, run, is_settled, token))
+    seeds = seeds[: options.max_init_pairs] if options.mapper != "global" or not with_global else []
+    if with_global:
+        colmap.copy_database(run.workspace.database, run.workspace.root / GLOBAL_FOLDER)
+    with translate_errors("mapping photos"):
+        results = mapper.run_maker(lambda token: mapper.first_round(seeds[:1], with_global, is_sufficient, token))
         for seed in seeds[1:]:
-            if _can_stop(found, len(group.photos)):
+            if _has_placed_enough(results, len(group.photos)):
                 break
-            found += made(partial(_attempt_from_seed, group, seed, run))
-        best = best_attempt(found)
+            results += mapper.run_maker(partial(mapper.from_seed, seed))
+        best = best_attempt(results)
         if best is not None and best.mapper == "global" and best.photos < len(group.photos):
-            found += made(partial(_attempt_completion, group, best, run))
-    return found
+            results += mapper.run_maker(partial(mapper.completion, best))
+    return results
 
 
 def complete_attempt(group: Group, attempt: Attempt, run: RunContext) -> list[MappingResult]:
-    """Continue a model photo by photo, with the photos that it lacks.
-
-    Args:
-        group: a connected group of photos, with their matches and poses.
-        attempt: its model so far.
-        run: the run.
-    """
-    with _attempt_runner(group, run) as made:
-        return made(partial(_attempt_completion, group, attempt, run))
+    """Continue a model photo by photo, with the missing photos of its group."""
+    mapper = _GroupMapper(group, run, COLMAP)
+    with translate_errors("mapping photos"):
+        return mapper.run_maker(partial(mapper.completion, attempt))
 
 
-def best_attempt(found: Sequence[MappingResult]) -> Attempt | None:
+class _GroupMapper:
+    """Attempts to map a group."""
+
+    def __init__(self, group: Group, run: RunContext, colmap: ColmapMappers) -> None:
+        self.group, self.run, self.colmap = group, run, colmap
+
+    def run_maker(self, make: Maker) -> list[MappingResult]:
+        """Make attempts in a thread that Ctrl-C can stop."""
+        results: list[MappingResult] = []
+        self.run.progress.start("mapping", max(len(self.group.photos) - 2, 1))
+        try:
+            run_interruptible(lambda token: results.extend(make(token)), lambda: None)
+        finally:
+            self.run.progress.finish()
+        return results
+
+    def first_round(
+        self,
+        seeds: Sequence[Candidate],
+        with_global: bool,
+        is_sufficient: Callable[[Attempt], bool],
+        token: CancellationToken,
+    ) -> list[MappingResult]:
+        stop = StopSignal(token)
+
+        def map_from_seed(seed: Candidate) -> MappingResult:
+            (attempt,) = self.from_seed(seed, token)
+            stop.needless = isinstance(attempt, Attempt) and (
+                _is_complete_and_consistent(attempt, len(self.group.photos)) or is_sufficient(attempt)
+            )
+            return attempt
+
+        threads = 1 if seeds and likely_needs_one_mapper(self.group) else min(self.run.workers, 2)
+        with ThreadPoolExecutor(threads, thread_name_prefix="mapper") as pool:
+            incremental = [pool.submit(map_from_seed, seed) for seed in seeds]
+            global_results = [pool.submit(self.all_at_once, stop)] if with_global else []
+            results = [future.result() for future in (*incremental, *global_results)]
+        if stop.needless:
+            results[1:] = [NoModel("global", "all at once: not needed") for _ in global_results]
+        return results
+
+    def all_at_once(self, stop: StopSignal) -> MappingResult:
+        names, scratch = photo_names(self.group.photos, self.group.matches), self.run.workspace.root / GLOBAL_FOLDER
+        photos, seed = self.run.workspace.photos, self.run.seed
+        try:
+            model = None if stop.is_cancelled else self.colmap.map_globally(photos, names, scratch, seed, stop)
+        except BackendError as err:  # another mapper may do better
+            logger.info("the global mapper failed: %s", err)
+            return NoModel("global", f"all at once: failed, {err}")
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
+        return self._judge("global", "all at once", model)
+
+    def from_seed(self, seed: Candidate, token: CancellationToken) -> list[MappingResult]:
+        group = self.group
+        how = f"from {' + '.join(photo_names(seed.pair, group.matches))}"
+        rows = group.matches.matches[seed.pair][seed.pose.inliers]
+        try:
+            points = triangulate_seed(group.matches, seed, group.intrinsics)
+        except FAILURES as err:
+            return [NoModel("incremental", f"{how}: no points, {error_reason(err)}")]
+        start = self.colmap.model_from_seed(self.run.workspace.database, seed.pair, rows, points)
+        return [self._judge("incremental", how, self._grow(start, token))]
+
+    def completion(self, best: Attempt, token: CancellationToken) -> list[MappingResult]:
+        """Continue a model photo by photo, with its missing photos."""
+        return [self._judge("incremental", "missing photos added one by one", self._grow(best.model, token))]
+
+    def _grow(self, start: Reconstruction, token: CancellationToken) -> Reconstruction | None:
+        group, run, place = self.group, self.run, self.run.workspace
+        cameras = {k: group.intrinsics.camera(group.matches.images[k]) for k in group.photos}
+        kept = {start.images[k].camera_id for k, camera in cameras.items() if camera.is_kept and start.exists_image(k)}
+        options = incremental_options(run.seed, known=all(map(is_focal_accurate, cameras.values())), kept=kept)
+        scratch = place.root / INCREMENTAL_FOLDER
+        return self.colmap.map_incrementally(
+            place.database, place.photos, start, scratch, options, run.progress.advance, token
+        )
+
+    def _judge(self, mapper: str, how: str, model: Reconstruction | None) -> MappingResult:
+        matches, views = self.group.matches, self.group.views
+        return judge_model(matches, views, mapper, how, model, self.run, self.colmap.explained_pairs)
+
+
+def best_attempt(results: Sequence[MappingResult]) -> Attempt | None:
     """Return the attempt with the largest support; among equal ones, the one with most photos and points."""
-    models = [attempt for attempt in found if isinstance(attempt, Attempt)]
+    models = [attempt for attempt in results if isinstance(attempt, Attempt)]
     most = max((attempt.support for attempt in models), default=0.0)
-    equal = [attempt for attempt in models if attempt.support >= (1.0 - EQUAL_TOLERANCE) * most]
+    equal = [attempt for attempt in models if attempt.support >= (1.0 - MAPPING.equal_tolerance) * most]
     return max(equal, key=lambda attempt: (attempt.photos, attempt.model.num_points3D()), default=None)
 
 
-def choice_reason(best: Attempt, found: Sequence[MappingResult], photos: int) -> str:
-    """Return why an attempt was chosen among several, in a few words.
-
-    Args:
-        best: the chosen attempt.
-        found: all attempts.
-        photos: number of photos in the group.
-    """
-    if _is_flawless(best, photos):
-        return f"it places all {photos} photos and next to nothing contradicts it"
-    others = [attempt for attempt in found if isinstance(attempt, Attempt) and attempt is not best]
-    if len(found) == 1:
-        return "it explains enough to need no other way"
+def choice_reason(best: Attempt, results: Sequence[MappingResult], photos: int) -> str:
+    """Return why an attempt was chosen among several for a group of `photos` photos."""
+    if _is_complete_and_consistent(best, photos):
+        return f"it registers all {photos} photos, and almost no match contradicts it"
+    others = [attempt for attempt in results if isinstance(attempt, Attempt) and attempt is not best]
+    if len(results) == 1:
+        return "it explains enough; no other model was needed"
     if not others:
-        return "nothing else gave a model"
+        return "no other attempt gave a model"
     rival = max(others, key=lambda attempt: attempt.support)
     counts = [sum(pair.matches for pair in attempt.explained.values()) for attempt in (best, rival)]
-    return f"it explains {counts[0]} matches with {best.photos} photos, the next best {counts[1]} with {rival.photos}"
+    return f"it explains {counts[0]} matches with {best.photos} photos, the second best {counts[1]} with {rival.photos}"
 
 
-def _is_flawless(attempt: Attempt, photos: int) -> bool:
+def _is_complete_and_consistent(attempt: Attempt, photos: int) -> bool:
     """Return whether a model holds all photos, and hardly any inliers contradict it."""
     inliers = sum(pair.inliers for pair in attempt.explained.values())
     against = sum(pair.contradicted for pair in attempt.explained.values())
-    return attempt.photos == photos and against <= MAX_CONTRADICTED_SHARE * inliers
+    return attempt.photos == photos and against <= MAPPING.max_contradicted_share * inliers
 
 
-@contextlib.contextmanager
-def _attempt_runner(group: Group, run: RunContext) -> Iterator[Callable[[Maker], list[MappingResult]]]:
-    """Provide a function that makes attempts in a thread that Ctrl-C can stop."""
-
-    def run_maker(make: Maker) -> list[MappingResult]:
-        found: list[MappingResult] = []
-        run.progress.start("mapping", max(len(group.photos) - 2, 1))
-        try:
-            run_interruptible(lambda token: found.extend(make(token)), lambda: None)
-        finally:
-            run.progress.finish()
-        return found
-
-    with translate_errors("mapping photos"):
-        yield run_maker
-
-
-def _run_first_round(
-    group: Group, seeds: Sequence[Candidate], at_once: bool, run: RunContext, is_settled: Callable[[Attempt], bool],
-    token: CancellationToken,
-) -> list[MappingResult]:  # fmt: skip
-    stop = StopSignal(token)
-
-    def map_from_seed(seed: Candidate) -> MappingResult:
-        (attempt,) = _attempt_from_seed(group, seed, run, token)
-        stop.needless = isinstance(attempt, Attempt) and (
-            _is_flawless(attempt, len(group.photos)) or is_settled(attempt)
-        )
-        return attempt
-
-    at_a_time = 1 if seeds and _is_easy(group) else min(run.workers, 2)
-    with ThreadPoolExecutor(at_a_time, thread_name_prefix="mapper") as pool:
-        grown = [pool.submit(map_from_seed, seed) for seed in seeds]
-        placed = [pool.submit(_attempt_globally, group, run, stop)] if at_once else []
-        found = [future.result() for future in (*grown, *placed)]
-    if stop.needless:
-        found[1:] = [NoModel("global", "all at once: not needed") for _ in placed]
-    return found
-
-
-def _is_easy(group: Group) -> bool:
+def likely_needs_one_mapper(group: Group) -> bool:
     """Return whether cameras are well known, and hardly any pair contradicts the others."""
     inside = set(group.photos)
-    kept = sum(inside.issuperset(pair) for pair in group.graph.poses)
+    posed = sum(inside.issuperset(pair) for pair in group.graph.poses)
     dropped = sum(inside.issuperset(pair) for pair in group.graph.dropped)
-    known = all(is_well_known(group.intrinsics.camera(group.matches.images[photo])) for photo in group.photos)
-    return known and dropped <= MOST_DROPPED * (kept + dropped)
+    known = all(is_focal_accurate(group.intrinsics.camera(group.matches.images[photo])) for photo in group.photos)
+    return known and dropped <= MAPPING.max_dropped * (posed + dropped)
 
 
-def _can_stop(found: Sequence[MappingResult], photos: int) -> bool:
+def _has_placed_enough(results: Sequence[MappingResult], photos: int) -> bool:
     """Return whether another seed is unlikely to place more photos."""
-    counts = [attempt.photos for attempt in found if isinstance(attempt, Attempt)]
-    most = max(counts, default=0)
-    return most >= ENOUGH_SHARE * photos or (counts.count(most) > 1 and most >= CONFIRMED_SHARE * photos)
+    counts = [attempt.photos for attempt in results if isinstance(attempt, Attempt)]
+    largest = max(counts, default=0)
+    return largest >= MAPPING.enough_share * photos or (
+        counts.count(largest) > 1 and largest >= MAPPING.confirmed_share * photos
+    )
 
 
-def _attempt_globally(group: Group, run: RunContext, stop: StopSignal) -> MappingResult:
-    names, scratch = photo_names(group.photos, group.matches), run.workspace.root / GLOBAL_FOLDER
-    try:
-        model = None if stop.is_cancelled else map_globally(run.workspace.photos, names, scratch, run.seed, stop)
-    except BackendError as err:  # another mapper may do better
-        logger.info("the global mapper failed: %s", err)
-        return NoModel("global", f"all at once: failed, {err}")
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
-    return _judge_model(group, "global", "all at once", model, run)
-
-
-def _attempt_from_seed(group: Group, seed: Candidate, run: RunContext, token: CancellationToken) -> list[MappingResult]:
-    how = f"from {' + '.join(photo_names(seed.pair, group.matches))}"
-    rows = group.matches.matches[seed.pair][seed.pose.inliers]
-    try:
-        points = triangulate_seed(group.matches, seed, group.intrinsics)
-    except FAILURES as err:
-        return [NoModel("incremental", f"{how}: no points, {error_reason(err)}")]
-    start = model_from_seed(run.workspace.database, seed.pair, rows, points)
-    return [_judge_model(group, "incremental", how, _grow(group, start, run, token), run)]
-
-
-def _attempt_completion(group: Group, best: Attempt, run: RunContext, token: CancellationToken) -> list[MappingResult]:
-    """Continue the global mapper's model photo by photo, with the photos that it left out."""
-    model = _grow(group, best.model, run, token)
-    return [_judge_model(group, "incremental", "what was left out, photo by photo", model, run)]
-
-
-def _grow(group: Group, start: Reconstruction, run: RunContext, token: CancellationToken) -> Reconstruction | None:
-    place, cameras = run.workspace, {k: group.intrinsics.camera(group.matches.images[k]) for k in group.photos}
-    kept = {start.images[k].camera_id for k, camera in cameras.items() if camera.is_kept and start.exists_image(k)}
-    return map_incrementally(
-        place.database, place.photos, start, place.root / INCREMENTAL_FOLDER,
-        incremental_options(run.seed, known=all(map(is_well_known, cameras.values())), kept=kept),
-        run.progress.advance, token,
-    )  # fmt: skip
-
-
-def is_well_known(camera: Calibration) -> bool:
-    """Return whether a focal is known so well that the first few photos of a mapping cannot improve it."""
+def is_focal_accurate(camera: Calibration) -> bool:
+    """Return whether a focal is known so well that the first photos of a mapping cannot improve it."""
     spread = 0.0 if camera.is_kept else camera.spread.get("fx", np.inf)
-    return camera.identifiable and spread <= MAX_FOCAL_DEVIATION * camera.K[0, 0]
+    return camera.identifiable and spread <= MAPPING.max_focal_deviation * camera.K[0, 0]
 
 
 def judge_model(
-    matches: MatchGraph, views: ViewGraph, made: tuple[str, str], model: Reconstruction | None, run: RunContext
+    matches: MatchGraph,
+    views: ViewGraph,
+    mapper: str,
+    how: str,
+    model: Reconstruction | None,
+    run: RunContext,
+    explain: Callable[..., dict[PairId, PairSupport]] = explained_pairs,
 ) -> MappingResult:
-    """Count the matches that a model explains.
-
-    Args:
-        matches: keypoints and raw matches.
-        views: fundamental matrices.
-        made: name of the mapper, and how it was used.
-        model: COLMAP's reconstruction, if there is one.
-        run: the run.
-    """
-    mapper, how = made
+    """Count the matches that a model explains."""
     placed = model.num_reg_images() if model is not None else 0
     note = f"{how}: {placed} photos"
     if model is None or placed < 2 or model.num_points3D() < run.settings.scene.min_points:
         return NoModel(mapper, note)
     try:
-        explained = explained_pairs(model, matches, views, run.settings.epipolar.max_error_px)
+        explained = explain(model, matches, views, run.settings.epipolar.max_error_px)
     except FAILURES as err:
         logger.info("a model could not be judged", exc_info=err)
-        return NoModel(mapper, f"{note}, that could not be judged: {error_reason(err)}")
+        return NoModel(mapper, f"{note}, but it could not be scored: {error_reason(err)}")
     return Attempt(mapper, model, explained, note)
-
-
-def _judge_model(group: Group, mapper: str, how: str, model: Reconstruction | None, run: RunContext) -> MappingResult:
-    return judge_model(group.matches, group.views, (mapper, how), model, run)

@@ -1,12 +1,11 @@
-"""A second look at unregistered photos: finer features for them and likely neighbors, then another reconstruction.
+"""Finer features for unregistered photos and their likely neighbors, then another reconstruction.
 
-On plain objects and over wide baselines the usual features find little. Features adapted to their surroundings (affine
-shape, domain-size pooling), a lower contrast threshold and a looser ratio test find more there. For all photos they
-would cost too much, and where all photos are registered they add nothing.
+On plain objects and over wide baselines the usual features are few. Affine shape, domain-size pooling, a lower contrast
+threshold and a looser ratio test give more there. For all photos they would cost too much.
 """
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +18,7 @@ from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.errors import ClusterError, SfmError
 from sfm_app.estimation.calibrating import find_intrinsics
 from sfm_app.estimation.fitting import fit_pairs, to_view_graph
-from sfm_app.mapping.attempt import Attempt, NoModel, are_worth_another_try, best_attempt, judge_model, photo_names
+from sfm_app.mapping.attempt import Attempt, NoModel, are_many_unregistered, best_attempt, judge_model, photo_names
 from sfm_app.mapping.passes import Outcome, reconstruct
 from sfm_app.matching.features import fill_database
 from sfm_app.numerical import Json
@@ -29,51 +28,61 @@ from sfm_app.runtime.workspace import SubWorkspace
 from sfm_app.types import Intrinsics, MatchGraph, PairId, ViewGraph
 from sfm_app.types.arrays import FloatArray
 
-# Merge matches of two kinds of features of the same photos.
-
 Rows = NDArray[np.uint32]
 
-SAME_PX = 0.5
-"""Keypoints nearer than this count as one, so that tracks continue across kinds; about the noise of SIFT."""
+
+@dataclass(frozen=True, slots=True)
+class RetryOptions:
+    """Finer features for unregistered photos."""
+
+    same_px: float = 0.5
+    """Keypoints nearer than this count as one; about the noise of SIFT. Chosen by hand."""
+    max_ratio: float = 0.85
+    """Largest ratio of the distances to the best and the second best descriptor. Chosen on dinoSparseRing."""
+    all_pairs: int = 30
+    """Up to this number of photos, unregistered ones are matched with all others. Chosen by hand."""
+    neighbors: int = 8
+    """Photos with most raw matches that each is matched with in larger sets. Chosen by hand."""
+    in_order: int = 2
+    """Photos before and after it by name that each is matched with there. Chosen by hand."""
+
+
+OPTIONS = RetryOptions()
 
 
 def add_matches(
     matches: MatchGraph, keypoints: Mapping[int, FloatArray], added: Mapping[PairId, Rows]
 ) -> tuple[MatchGraph, tuple[PairId, ...]]:
-    """Add keypoints and matches of another kind.
+    """Add keypoints and matches of another kind; return the merged graph, and the pairs with more matches.
 
     Existing keypoints keep their positions and indices. An added match enters only if neither of its keypoints has a
     match in the other photo yet.
 
     Args:
-        matches: existing keypoints and matches.
         keypoints: (N, 2) pixels of the added keypoints, by photo.
         added: (M, 2) indices of added keypoints, by pair.
-
-    Returns:
-        The merged match graph, and the pairs that have gained matches.
     """
-    every, numbers = dict(matches.keypoints), {}
-    for photo, found in keypoints.items():
-        every[photo], numbers[photo] = _merge_keypoints(matches.keypoints[photo], found)
-    rows, changed = dict(matches.matches), []
-    for pair, new in added.items():
-        known = rows.get(pair, np.zeros((0, 2), np.uint32))
-        renamed = np.column_stack([numbers[photo][new[:, side]] for side, photo in enumerate(pair)])
-        together = _drop_repeats(np.vstack([known, renamed.astype(np.uint32)]))
-        if len(together) > len(known):
-            rows[pair] = together
-            changed.append(pair)
-    return replace(matches, keypoints=every, matches=dict(sorted(rows.items()))), tuple(sorted(changed))
+    all_keypoints, numbers = dict(matches.keypoints), {}
+    for photo, x in keypoints.items():
+        all_keypoints[photo], numbers[photo] = _merge_keypoints(matches.keypoints[photo], x)
+    rows, enriched = dict(matches.matches), []
+    for pair, new_rows in added.items():
+        known_rows = rows.get(pair, np.zeros((0, 2), np.uint32))
+        renamed = np.column_stack([numbers[photo][new_rows[:, side]] for side, photo in enumerate(pair)])
+        merged = _drop_repeats(np.vstack([known_rows, renamed.astype(np.uint32)]))
+        if len(merged) > len(known_rows):
+            rows[pair] = merged
+            enriched.append(pair)
+    return replace(matches, keypoints=all_keypoints, matches=dict(sorted(rows.items()))), tuple(sorted(enriched))
 
 
-def _merge_keypoints(known: FloatArray, found: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+def _merge_keypoints(known: FloatArray, added: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
     """Return all keypoints of a photo, and the index of each added one among them."""
-    numbers = len(known) + np.arange(len(found))
-    if len(known) and len(found):
-        away, nearest = cKDTree(known).query(found)
-        numbers = np.where(away <= SAME_PX, nearest, numbers)
-    return np.vstack([known.reshape(-1, 2), found]), numbers.astype(np.int64)
+    numbers = len(known) + np.arange(len(added))
+    if len(known) and len(added):
+        distances, nearest = cKDTree(known).query(added)
+        numbers = np.where(distances <= OPTIONS.same_px, nearest, numbers)
+    return np.vstack([known.reshape(-1, 2), added]), numbers.astype(np.int64)
 
 
 def _drop_repeats(rows: Rows) -> Rows:
@@ -83,20 +92,11 @@ def _drop_repeats(rows: Rows) -> Rows:
 
 
 FOLDER, FEATURES = "second_look", "features"
-LOOSE_RATIO = 0.85
-"""Largest ratio of the distances to the best and the second best descriptor. Chosen on dinoSparseRing: of its weakest
-links 19, 22, 31 and 43 matches are right at 0.8 (of 33, 30, 39, 51), and 26, 29, 45 and 55 at 0.85 (of 58, 52, 81, 77):
-9 + 6 photos in two models become 15 in one."""
-ALL_PAIRS = 30
-"""Up to this number of photos, unregistered ones are matched with all others."""
-NEIGHBORS, IN_ORDER = 8, 2
-"""In larger sets, each is matched with this number of photos with most raw matches, and with this number before and
-after it by name."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedScene:
-    """Models, and the matches, geometry and cameras they were made from."""
+    """Models with their matches, geometry and cameras."""
 
     outcome: Outcome
     matches: MatchGraph
@@ -106,115 +106,126 @@ class MappedScene:
     """Run whose workspace holds the database of these matches."""
 
 
-def retry_lost_photos(first: MappedScene) -> MappedScene:
-    """Look again at photos missing in the main model, and return the new result if it registers more of them.
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """Steps of mapping; tests pass others."""
 
-    If the attempt fails, the first result is kept.
+    fill_database: Callable[..., object] = fill_database
+    find_intrinsics: Callable[..., tuple[Intrinsics, object]] = find_intrinsics
+    reconstruct: Callable[..., Outcome] = reconstruct
+
+
+STEPS = Steps()
+
+
+def retry_lost_photos(first: MappedScene, steps: Steps = STEPS) -> MappedScene:
+    """Map again with finer features for unregistered photos, and return the result that registers more of them.
+
+    If the attempt fails, the first result stays.
     """
     run, lost = first.run, lost_photos(first)
     if not lost or run.settings.matching.features == SIFT_DSP or not run.settings.scene.second_look:
         return first
     pairs = candidate_pairs(lost, first.matches)
-    seen = sorted({photo for pair in pairs for photo in pair})
-    without = "1 photo has no place" if len(lost) == 1 else f"{len(lost)} photos have no place"
-    run.progress.say(f"{without}: finer features are sought in {len(seen)}")
+    photos = sorted({photo for pair in pairs for photo in pair})
+    count = "1 photo is" if len(lost) == 1 else f"{len(lost)} photos are"
+    run.progress.say(f"{count} unregistered; extracting finer features in {len(photos)} photos")
     report: dict[str, Json] = {"photos": photo_names(lost, first.matches), "pairs": len(pairs)}
     try:
-        second = _retry_pairs(first, pairs, report)
+        second = _retry_pairs(first, pairs, report, steps)
     except ClusterError:  # the same command would give another scene on a cluster that stays
         raise
     except SfmError as err:  # the first result is not lost with it
         report["failed"], second = str(err), None
-    placed = [_placed_count(one.outcome) for one in (first, second) if one is not None]
-    taken = second is not None and _is_better(second, first)
-    run.record(second_look=report | {"placed": placed, "taken": taken})
-    return second if second is not None and taken else first
+    counts = [_placed_count(one.outcome) for one in (first, second) if one is not None]
+    accepted = second is not None and _places_and_explains_more(second, first)
+    run.record(second_look=report | {"placed": counts, "taken": accepted})
+    return second if second is not None and accepted else first
 
 
-def lost_photos(found: MappedScene) -> list[int]:
+def lost_photos(scene: MappedScene) -> list[int]:
     """Return the photos missing in the main model; none where their share of a large set is too small."""
-    models, images = found.outcome.models, found.matches.images
-    placed = set(posed_photo_ids(models[0].model)) if models else set()
-    lost = sorted(images.keys() - placed)
-    return lost if are_worth_another_try(len(lost), len(images)) else []
+    models, images = scene.outcome.models, scene.matches.images
+    registered = set(posed_photo_ids(models[0].model)) if models else set()
+    lost = sorted(images.keys() - registered)
+    return lost if are_many_unregistered(len(lost), len(images)) else []
 
 
 def candidate_pairs(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
-    """Return pairs of lost photos with each other and with their likely neighbors.
-
-    Args:
-        lost: ids of unregistered photos.
-        matches: raw matches of all photos.
-    """
-    every = sorted(matches.images)
-    if len(every) <= ALL_PAIRS:
-        return [(a, b) for k, a in enumerate(every) for b in every[k + 1 :] if a in lost or b in lost]
-    matched: dict[int, Counter[int]] = {photo: Counter() for photo in every}
+    """Return pairs of lost photos with each other and with their likely neighbors."""
+    photos = sorted(matches.images)
+    if len(photos) <= OPTIONS.all_pairs:
+        return [(a, b) for k, a in enumerate(photos) for b in photos[k + 1 :] if a in lost or b in lost]
+    matched: dict[int, Counter[int]] = {photo: Counter() for photo in photos}
     for (a, b), rows in matches.matches.items():
         matched[a][b], matched[b][a] = len(rows), len(rows)
-    by_name = sorted(every, key=lambda photo: matches.images[photo].name)
+    by_name = sorted(photos, key=lambda photo: matches.images[photo].name)
     place = {photo: k for k, photo in enumerate(by_name)}
     pairs = set()
     for photo in lost:
-        around = by_name[max(0, place[photo] - IN_ORDER) : place[photo] + IN_ORDER + 1]
-        likely = sorted(matched[photo], key=lambda other: (-matched[photo][other], other))[:NEIGHBORS]
-        pairs |= {(min(photo, other), max(photo, other)) for other in (*around, *likely) if other != photo}
+        in_order = by_name[max(0, place[photo] - OPTIONS.in_order) : place[photo] + OPTIONS.in_order + 1]
+        likely = sorted(matched[photo], key=lambda other: (-matched[photo][other], other))[: OPTIONS.neighbors]
+        pairs |= {(min(photo, other), max(photo, other)) for other in (*in_order, *likely) if other != photo}
     return sorted(pairs)
 
 
-def _retry_pairs(first: MappedScene, pairs: Sequence[PairId], report: dict[str, Json]) -> MappedScene | None:
-    """Run all steps from features to models once more; return None if none of it is of use."""
+def _retry_pairs(
+    first: MappedScene, pairs: Sequence[PairId], report: dict[str, Json], steps: Steps
+) -> MappedScene | None:
+    """Run all steps from features to models once more; return None if there is no new geometry."""
     run = _side_run(first.run)
     finer = replace(run, workspace=SubWorkspace(run.workspace, FEATURES))
-    with translate_errors("looking for finer features"):
+    with translate_errors("extracting finer features"):
         if not finer.workspace.database.exists():
             write_match_graph(finer.workspace.database, replace(first.matches, keypoints={}, matches={}))
-    fill_database(run.plugins.feature_method(SIFT_DSP), finer, pairs)
+    steps.fill_database(run.plugins.feature_method(SIFT_DSP), finer, pairs)
     with translate_errors("adding matches"):
-        matches, changed = add_matches(first.matches, *read_features(finer.workspace.database))
-        report["pairs_with_more_matches"] = len(changed)
-        if not changed:
+        matches, enriched = add_matches(first.matches, *read_features(finer.workspace.database))
+        report["pairs_with_more_matches"] = len(enriched)
+        if not enriched:
             return None
-    fitted = to_view_graph(fit_pairs(matches, changed, run, first.views.lenses))
+    fitted = to_view_graph(fit_pairs(matches, enriched, run, first.views.lenses))
     if not fitted.fits:  # such as of a photo of something else
         return None
-    asked = set(changed)
-    kept = {pair: fit for pair, fit in first.views.fits.items() if pair not in asked}
-    refused = {pair: why for pair, why in first.views.rejected.items() if pair not in asked}
+    fitted_pairs = set(enriched)
+    fits = {pair: fit for pair, fit in first.views.fits.items() if pair not in fitted_pairs}
+    rejected = {pair: why for pair, why in first.views.rejected.items() if pair not in fitted_pairs}
     views = ViewGraph(
-        dict(sorted((kept | dict(fitted.fits)).items())), refused | dict(fitted.rejected), first.views.lenses
+        dict(sorted((fits | dict(fitted.fits)).items())), rejected | dict(fitted.rejected), first.views.lenses
     )
     report["pairs_with_geometry"] = [len(first.views.fits), len(views.fits)]
-    intrinsics = first.intrinsics if _is_mostly_calibrated(first) else find_intrinsics(matches, views, run)[0]
-    return MappedScene(reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
+    intrinsics = first.intrinsics if _is_mostly_calibrated(first) else steps.find_intrinsics(matches, views, run)[0]
+    return MappedScene(steps.reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
 
 
-def _is_mostly_calibrated(found: MappedScene) -> bool:
+def _is_mostly_calibrated(scene: MappedScene) -> bool:
     """Return whether pairs determine the cameras of at least half of the photos; more pairs then change little."""
-    images = found.matches.images.values()
-    return 2 * sum(found.intrinsics.camera(image).is_estimated for image in images) >= len(images)
+    images = scene.matches.images.values()
+    return 2 * sum(scene.intrinsics.camera(image).is_estimated for image in images) >= len(images)
 
 
 def _side_run(run: RunContext) -> RunContext:
     """Return the run with a separate workspace folder, in which a killed run is resumed."""
     place = SubWorkspace(run.workspace, FOLDER)
-    loose = run.settings.matching.model_copy(update={"max_ratio": max(LOOSE_RATIO, run.settings.matching.max_ratio)})
+    loose = run.settings.matching.model_copy(
+        update={"max_ratio": max(OPTIONS.max_ratio, run.settings.matching.max_ratio)}
+    )
     settings = run.settings.model_copy(update={"matching": loose})
     return replace(run, workspace=place, settings=settings, statistics={})
 
 
 def _placed_count(outcome: Outcome) -> int:
-    return outcome.models[0].photos if outcome.models else 0
+    return outcome.main.photos if outcome.main else 0
 
 
-def _is_better(second: MappedScene, first: MappedScene) -> bool:
-    """Return whether the second main model places more photos, and explains more of all matches, old and new."""
+def _places_and_explains_more(second: MappedScene, first: MappedScene) -> bool:
+    """Return whether the second main model places more photos, and explains more of all matches."""
     if not second.outcome.models or _placed_count(second.outcome) <= _placed_count(first.outcome):
         return False
-    models = [_judge(second, found.outcome) for found in (first, second) if found.outcome.models]
+    models = [_judge(second, scene.outcome) for scene in (first, second) if scene.outcome.models]
     return best_attempt(models) is models[-1]
 
 
-def _judge(found: MappedScene, outcome: Outcome) -> Attempt | NoModel:
+def _judge(scene: MappedScene, outcome: Outcome) -> Attempt | NoModel:
     main = outcome.models[0]
-    return judge_model(found.matches, found.views, (main.mapper, main.note), main.model, found.run)
+    return judge_model(scene.matches, scene.views, main.mapper, main.note, main.model, scene.run)

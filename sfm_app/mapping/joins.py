@@ -16,24 +16,47 @@ from sfm_app.posegraph.rotations import DisjointGroups, average_rotations, conne
 from sfm_app.types import MatchGraph, PairId, ViewGraph
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-# Similarities between models of parts, from the photos and points that both hold.
-#
-# One photo in both models tells all of a similarity: the rotation and the position of its camera, and by the
-# distances of its points the scale. The similarity with which most of the shared photos agree is refined on their
-# points. A photo that one of the parts has misplaced, as among look-alikes, does not agree.
+# Joins. One photo in both models determines a similarity: rotation and position by its camera, scale by the distances
+# of its points. The similarity with which most shared photos agree is refined on their points.
 
-LEAST_PHOTOS, LEAST_POINTS = 3, 12
-"""Smallest number of shared photos that agree, and of points that these see in both models. Chosen by hand."""
-LEAST_OF_PHOTO = 4
-"""Smallest number of shared points by which a photo tells the scale."""
-AGREEMENT_DEG, AGREEMENT_SHIFT = 3.0, 0.1
-"""Shared photos agree with a similarity up to this angle, and this shift as a share of the distance of their points.
-Chosen by hand: misplaced photos are off by far more, parts that bend by far less."""
-MOST_FITTED = 400
-"""Most points that a similarity is fitted to. Chosen by hand for speed."""
-LOOSE_FACTOR, MOST_CHECKED = 6.0, 150
-"""Largest error of an explained match across a join, in inlier thresholds: parts bend, and are adjusted together only
-later. Most pairs across a join that are checked, those with most inliers. Chosen by hand."""
+
+@dataclass(frozen=True, slots=True)
+class JoinOptions:
+    """Similarities between fragments, and their errors."""
+
+    min_photos: int = 3
+    """Least shared photos that agree. Chosen by hand."""
+    min_points: int = 12
+    """Least points of these in both models. Chosen by hand."""
+    min_photo_points: int = 4
+    """Least shared points that determine the scale of a photo. Chosen by hand."""
+    agreement_deg: float = 3.0
+    """Largest angle of shared photos that agree with a similarity. Chosen by hand."""
+    agreement_shift: float = 0.1
+    """Largest shift of these, as a share of the distance of their points. Chosen by hand."""
+    max_fitted: int = 400
+    """Most points that a similarity is fitted to. Chosen by hand for speed."""
+    loose_factor: float = 6.0
+    """Largest error of an explained match across a join, in inlier thresholds: parts bend. Chosen by hand."""
+    max_checked: int = 150
+    """Most pairs across a join that are checked, those with most inliers. Chosen by hand."""
+    max_deg: float = 8.0
+    """Angle of a join to the common frame above which it contradicts the others. Chosen by hand."""
+    max_scale: float = 0.15
+    """The same for the logarithm of its scale. Chosen by hand."""
+    max_shift: float = 0.2
+    """The same for its shift, as a share of the radius of the smaller fragment. Chosen by hand."""
+    rounds: int = 40
+    """Rounds of reweighting towards the least sum of errors. Chosen by hand."""
+    min_error: float = 1e-4
+    """Error below which a join gets no more weight. Chosen by hand."""
+    same_deg: float = 5.0
+    """Largest angle of a photo to its pose in the merged model for its points to count. Chosen by hand."""
+    same_shift: float = 0.25
+    """Largest shift of it, as a share of the median distance of its points. Chosen by hand."""
+
+
+OPTIONS = JoinOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,34 +109,29 @@ class Join:
 
 
 def find_join(first: int, second: int, fragments: Sequence[Fragment]) -> Join | None:
-    """Return the similarity between two fragments; None where they share too little, or do not agree.
-
-    Args:
-        first, second: numbers of fragments.
-        fragments: all of them.
-    """
+    """Return the similarity between two fragments; None where they share too little, or do not agree."""
     a, b = fragments[first].placed, fragments[second].placed
     photos, rows_a, rows_b = np.intersect1d(a.photos, b.photos, return_indices=True)
-    if len(photos) < LEAST_PHOTOS:
+    if len(photos) < OPTIONS.min_photos:
         return None
     shared = _SharedPhotos(a, b, photos, rows_a, rows_b)
     agreeing, similarity = shared.best_hypothesis()
-    if np.count_nonzero(agreeing) < LEAST_PHOTOS:
+    if np.count_nonzero(agreeing) < OPTIONS.min_photos:
         return None
     points = np.flatnonzero(agreeing[shared.photo])
-    if len(points) < LEAST_POINTS:
+    if len(points) < OPTIONS.min_points:
         return None
     refined = shared.refine(points, similarity)
-    now = shared.agreement(refined)[0]
-    if np.count_nonzero(now) >= np.count_nonzero(agreeing):
-        similarity, agreeing = refined, now
+    agreeing_now = shared.agreement(refined)[0]
+    if np.count_nonzero(agreeing_now) >= np.count_nonzero(agreeing):
+        similarity, agreeing = refined, agreeing_now
     _, angles, shifts = shared.agreement(similarity)
-    seen = np.flatnonzero(agreeing[shared.photo])
-    points_seen = len(np.unique(shared.rows_a[seen]))
+    observations = np.flatnonzero(agreeing[shared.photo])
+    point_count = len(np.unique(shared.rows_a[observations]))
     deviations = float(np.median(angles[agreeing])), float(np.median(shifts[agreeing]))
     middle = shared.cb[agreeing].mean(axis=0)[None]
     count = int(np.count_nonzero(agreeing))
-    return Join(first, second, similarity, count, len(photos), points_seen, *deviations, middle)
+    return Join(first, second, similarity, count, len(photos), point_count, *deviations, middle)
 
 
 class _SharedPhotos:
@@ -143,43 +161,38 @@ class _SharedPhotos:
 
     def _medians(self, values: FloatArray) -> FloatArray:
         """Return (N,) medians by photo of one value for each observation; NaN for photos with few of them."""
-        found = np.full(len(self.ca), np.nan)
-        for number in range(len(found)):
-            seen = self.photo == number
-            if np.count_nonzero(seen) >= LEAST_OF_PHOTO:
-                found[number] = np.median(values[seen])
-        return found
+        medians = np.full(len(self.ca), np.nan)
+        for number in range(len(medians)):
+            of_photo = self.photo == number
+            if np.count_nonzero(of_photo) >= OPTIONS.min_photo_points:
+                medians[number] = np.median(values[of_photo])
+        return medians
 
     def best_hypothesis(self) -> tuple[NDArray[np.bool_], Similarity]:
-        """Return which photos agree with the similarity of that photo with which most agree, and this similarity."""
+        """Return a mask of the agreeing photos for the best similarity of a single photo, and this similarity."""
         best, score = (np.zeros(len(self.ca), np.bool_), Similarity(1.0, np.eye(3), np.zeros(3))), (0, 0.0)
         for number in np.flatnonzero(np.isfinite(self.scale)):
             R, scale = self.Ra[number].T @ self.Rb[number], float(self.scale[number])
-            tried = Similarity(scale, R, self.ca[number] - scale * R @ self.cb[number])
-            agreeing, _, shifts = self.agreement(tried)
-            found = int(np.count_nonzero(agreeing)), -float(shifts[agreeing].sum())
-            if found > score:
-                best, score = (agreeing, tried), found
+            candidate = Similarity(scale, R, self.ca[number] - scale * R @ self.cb[number])
+            agreeing, _, shifts = self.agreement(candidate)
+            rank = int(np.count_nonzero(agreeing)), -float(shifts[agreeing].sum())
+            if rank > score:
+                best, score = (agreeing, candidate), rank
         return best
 
     def agreement(self, similarity: Similarity) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
         """Return (n,) which photos agree, their angles in degrees, and their shifts by the distance of their points."""
-        turned = np.einsum("nij,kj->nik", self.Rb, similarity.R)
-        traces = np.einsum("nij,nij->n", self.Ra, turned)
+        rotated = np.einsum("nij,kj->nik", self.Rb, similarity.R)
+        traces = np.einsum("nij,nij->n", self.Ra, rotated)
         angles = np.degrees(np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0)))
         shifts = np.linalg.norm(similarity(self.cb) - self.ca, axis=1) / self.distance
-        return (angles <= AGREEMENT_DEG) & (shifts <= AGREEMENT_SHIFT), angles, shifts
+        return (angles <= OPTIONS.agreement_deg) & (shifts <= OPTIONS.agreement_shift), angles, shifts
 
     def refine(self, points: IndexArray, similarity: Similarity) -> Similarity:
-        """Fit a similarity to shared points.
-
-        Args:
-            points: numbers of shared observations.
-            similarity: the result where they do not determine one.
-        """
+        """Fit a similarity to shared points; return the given one where they do not determine any."""
         _, once = np.unique(self.rows_a[points], return_index=True)
         chosen = points[np.sort(once)]
-        chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), MOST_FITTED)).astype(np.int64)]
+        chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), OPTIONS.max_fitted)).astype(np.int64)]
         try:
             return robust_similarity(self.Xb[chosen], self.Xa[chosen])
         except FAILURES:  # on a line
@@ -194,13 +207,7 @@ def _observation_keys(model: PlacedPhotos, photos: IndexArray) -> tuple[IndexArr
 
 
 class AcrossJoins:
-    """Matches of photos that only one of two fragments holds: they bear out a join, or contradict it.
-
-    Args:
-        matches: keypoints and raw matches.
-        views: fundamental matrices.
-        max_error_px: largest Sampson distance of an inlier.
-    """
+    """Matches across joins, of photos that only one of two fragments holds: they support a join, or contradict it."""
 
     def __init__(self, matches: MatchGraph, views: ViewGraph, max_error_px: float) -> None:
         self.matches, self.views, self.max_error_px = matches, views, max_error_px
@@ -212,11 +219,7 @@ class AcrossJoins:
     def count(self, join: Join, fragments: Sequence[Fragment]) -> tuple[int, int]:
         """Return how many matches across a join it explains, and how many inliers it contradicts.
 
-        The shared photos are not asked: they made the join.
-
-        Args:
-            join: of two fragments.
-            fragments: all of them.
+        Shared photos do not count: they made the join.
         """
         a, b = fragments[join.first].placed, fragments[join.second].placed
         explained = contradicted = 0
@@ -227,45 +230,36 @@ class AcrossJoins:
             x_a, x_b = self.matches.keypoints[photo_a][rows[:, 0]], self.matches.keypoints[photo_b][rows[:, 1]]
             lines = np.hstack([a.bearings(photo_a, x_a), b.bearings(photo_b, x_b)])
             at_a, at_b = np.searchsorted(a.photos, photo_a), np.searchsorted(b.photos, photo_b)
-            turned = b.R[at_b] @ join.similarity.R.T
-            t = turned @ (a.centers[at_a] - join.similarity(b.centers[at_b][None])[0])
-            R, t = turned @ a.R[at_a].T, t / max(float(np.linalg.norm(t)), 1e-300)
-            near = pose_distances(lines, R, t) <= LOOSE_FACTOR * self.max_error_px
-            right = near & is_in_front(lines, R, t)
-            explained += int(np.count_nonzero(right))
-            contradicted += int(np.count_nonzero(self.views.fits[pair].inliers & ~right))
+            R_b = b.R[at_b] @ join.similarity.R.T
+            t = R_b @ (a.centers[at_a] - join.similarity(b.centers[at_b][None])[0])
+            R, t = R_b @ a.R[at_a].T, t / max(float(np.linalg.norm(t)), 1e-300)
+            within = pose_distances(lines, R, t) <= OPTIONS.loose_factor * self.max_error_px
+            explained_matches = within & is_in_front(lines, R, t)
+            explained += int(np.count_nonzero(explained_matches))
+            contradicted += int(np.count_nonzero(self.views.fits[pair].inliers & ~explained_matches))
         return explained, contradicted
 
     def _pairs(self, a: PlacedPhotos, b: PlacedPhotos) -> list[PairId]:
-        """Return the pairs with most inliers between photos that only one model holds, the first model's first."""
+        """Return the pairs with most inliers between photos that only one model holds, the first model first."""
         here, there = set(a.photos.tolist()), set(b.photos.tolist())
         alone = there - here
-        found = [
+        ranked = [
             (-self.views.fits[min(i, j), max(i, j)].inlier_count, i, j)
             for i in sorted(here - there)
             for j in self.partners.get(i, ())
             if j in alone
         ]
-        return [(i, j) for _, i, j in sorted(found)[:MOST_CHECKED]]
+        return [(i, j) for _, i, j in sorted(ranked)[: OPTIONS.max_checked]]
 
 
-# A common frame for all fragments from their joins, and which joins contradict the others.
-#
-# Around a loop of joins the similarities must multiply to the identity. All loops are asked at once, as in the
-# averaging of rotations: the frames that minimize the errors of all joins are found robustly, rotations first, then
-# the logarithms of the scales, then the shifts. A join that is off by more than bending parts explain is dropped,
-# the worst one first, and the frames are found again: chains do not drift where a loop closes them.
-
-MOST_DEG, MOST_SCALE, MOST_SHIFT = 8.0, 0.15, 0.2
-"""Errors of a join above which it contradicts the others: its angle, the logarithm of its scale, and its shift as a
-share of the radius of the smaller fragment. Chosen by hand: parts that bend stay below, look-alikes do not."""
-ROUNDS, LEAST_ERROR = 40, 1e-4
-"""Rounds of reweighting towards the least sum of errors, and error below which a join gets no more weight."""
+# Alignment. The frames minimize the errors of all joins robustly, as in rotation averaging: rotations first, then the
+# logarithms of the scales, then the shifts. A join that is off by more than bending parts explain is dropped, the worst
+# one first, and the frames are estimated again: chains do not drift where a loop closes them.
 
 
 @dataclass(frozen=True, slots=True)
 class JoinError:
-    """How far a similarity is from what others say."""
+    """Difference of a similarity from the one that others imply."""
 
     off_deg: float
     scale: float
@@ -276,7 +270,7 @@ class JoinError:
     @property
     def excess(self) -> float:
         """The largest of the three errors, as a multiple of its limit."""
-        return max(self.off_deg / MOST_DEG, abs(self.scale) / MOST_SCALE, self.shift / MOST_SHIFT)
+        return max(self.off_deg / OPTIONS.max_deg, abs(self.scale) / OPTIONS.max_scale, self.shift / OPTIONS.max_shift)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -292,27 +286,22 @@ class Alignment:
 
 
 def align_fragments(fragments: Sequence[Fragment], joins: Sequence[Join]) -> Alignment:
-    """Find a common frame for the fragments that joins connect, without joins that contradict the others.
-
-    Args:
-        fragments: models of parts.
-        joins: similarities between two of them.
-    """
+    """Find a common frame for the fragments that joins connect, without joins that contradict the others."""
     radii = [fragment.radius for fragment in fragments]
-    left = list(joins)
+    remaining = list(joins)
     dropped: list[tuple[Join, JoinError]] = []
     while True:
-        frames = _synchronize(left, len(fragments))
-        errors = [join_error(join, frames, radii) for join in left]
+        frames = _synchronize(remaining, len(fragments))
+        errors = [join_error(join, frames, radii) for join in remaining]
         # a single loop is equally far off in all of its joins: the one with least evidence goes
-        ranked = sorted(range(len(left)), key=lambda k: (-errors[k].excess / left[k].weight, k))
+        ranked = sorted(range(len(remaining)), key=lambda k: (-errors[k].excess / remaining[k].weight, k))
         worst = next((k for k in ranked if errors[k].excess > 1.0), None)
         if worst is None:
             break
-        dropped.append((left.pop(worst), errors[worst]))
-    main = _main_group(fragments, left)
-    kept = tuple(zip(left, errors, strict=True))
-    return Alignment({number: frames[number] for number in sorted(main)}, kept, tuple(dropped))
+        dropped.append((remaining.pop(worst), errors[worst]))
+    main = _main_group(fragments, remaining)
+    accepted = tuple(zip(remaining, errors, strict=True))
+    return Alignment({number: frames[number] for number in sorted(main)}, accepted, tuple(dropped))
 
 
 def _main_group(fragments: Sequence[Fragment], joins: Sequence[Join]) -> set[int]:
@@ -326,24 +315,15 @@ def _main_group(fragments: Sequence[Fragment], joins: Sequence[Join]) -> set[int
 
 
 def join_error(join: Join, frames: Mapping[int, Similarity], radii: Sequence[float]) -> JoinError:
-    """Return how far a join is from the frames of its fragments.
-
-    Args:
-        join: of two fragments.
-        frames: of all fragments.
-        radii: of all fragments, in their own units.
-    """
+    """Return the difference of a join from the frames of its fragments; radii are in units of each fragment."""
     expected = frames[join.first].inverse().compose(frames[join.second])
     return difference(join, expected, radii)
 
 
 def difference(join: Join, expected: Similarity, radii: Sequence[float]) -> JoinError:
-    """Return how far a join is from another similarity between its fragments.
+    """Return the difference of a join from another similarity, from the second fragment into the first.
 
-    Args:
-        join: of two fragments.
-        expected: from the second fragment into the first.
-        radii: of all fragments, in their own units.
+    The radii are in units of each fragment.
     """
     cosine = (np.trace(expected.R.T @ join.similarity.R) - 1.0) / 2.0
     smaller = min(radii[join.first], expected.scale * radii[join.second])
@@ -361,8 +341,8 @@ def _synchronize(joins: Sequence[Join], count: int) -> dict[int, Similarity]:
         return frames
     pairs = [(join.first, join.second) for join in joins]
     weights = {pair: join.weight for pair, join in zip(pairs, joins, strict=True)}
-    turned = {pair: join.similarity.R.T for pair, join in zip(pairs, joins, strict=True)}
-    rotations = {number: R.T for number, R in average_rotations(turned, weights)[0].items()}
+    relative = {pair: join.similarity.R.T for pair, join in zip(pairs, joins, strict=True)}
+    rotations = {number: R.T for number, R in average_rotations(relative, weights)[0].items()}
     strengths = np.array([join.weight for join in joins])
     edges = np.array(pairs, np.int64)
     logs = np.log([join.similarity.scale for join in joins])[:, None]
@@ -387,9 +367,8 @@ def _robust_potentials(
     The first fragment of each group has 0.
 
     Args:
-        count: fragments.
         edges: (J, 2) numbers of fragments.
-        steps: (J, k) wanted differences, second less first.
+        steps: (J, k) differences, second less first.
         strengths: (J,) weights.
         sizes: (J,) units in which errors are measured.
     """
@@ -402,11 +381,11 @@ def _robust_potentials(
     A[np.arange(len(edges)), edges[:, 1]] += 1.0
     A[np.arange(len(edges)), edges[:, 0]] -= 1.0
     values, weights = np.zeros((count, steps.shape[1])), strengths.copy()
-    for _ in range(ROUNDS):
+    for _ in range(OPTIONS.rounds):
         root = np.sqrt(weights)[:, None]
         values[free] = np.linalg.lstsq(root * A[:, free], root * steps, rcond=None)[0]
         errors = np.linalg.norm(A @ values - steps, axis=1) / sizes
-        weights = strengths / np.maximum(errors, LEAST_ERROR)
+        weights = strengths / np.maximum(errors, OPTIONS.min_error)
     return values
 
 
@@ -414,59 +393,50 @@ def loop_errors(fragments: Sequence[Fragment], joins: Sequence[Join]) -> list[tu
     """Return the error around each loop that a join closes, with the fragments of the loop.
 
     The strongest joins form a tree. Each other join closes one loop with it.
-
-    Args:
-        fragments: models of parts.
-        joins: similarities between two of them.
     """
-    groups, near = DisjointGroups(range(len(fragments))), dict[int, list[tuple[int, Similarity]]]()
+    groups, neighbors = DisjointGroups(range(len(fragments))), dict[int, list[tuple[int, Similarity]]]()
     radii = [fragment.radius for fragment in fragments]
-    found, closing = [], []
+    loops, closing = [], []
     for join in sorted(joins, key=lambda join: (-join.weight, join.first, join.second)):
         if groups.join(join.first, join.second):
-            near.setdefault(join.first, []).append((join.second, join.similarity))
-            near.setdefault(join.second, []).append((join.first, join.similarity.inverse()))
+            neighbors.setdefault(join.first, []).append((join.second, join.similarity))
+            neighbors.setdefault(join.second, []).append((join.first, join.similarity.inverse()))
         else:
             closing.append(join)
     for join in closing:
-        way, similarity = _way(near, join.first, join.second)
-        found.append((way, difference(join, similarity, radii)))
-    return found
+        path, similarity = _path(neighbors, join.first, join.second)
+        loops.append((path, difference(join, similarity, radii)))
+    return loops
 
 
-def _way(
-    near: Mapping[int, Sequence[tuple[int, Similarity]]], start: int, end: int
+def _path(
+    neighbors: Mapping[int, Sequence[tuple[int, Similarity]]], start: int, end: int
 ) -> tuple[tuple[int, ...], Similarity]:
-    """Return the fragments on the way along the tree, and the similarity from the end's frame into the start's."""
+    """Return the fragments on the path along the tree, and the similarity from the frame of the end into that of the
+    start.
+    """
     waiting: list[tuple[tuple[int, ...], Similarity]] = [((start,), Similarity(1.0, np.eye(3), np.zeros(3)))]
     while waiting:
-        way, so_far = waiting.pop()
-        if way[-1] == end:
-            return way, so_far
-        waiting += [((*way, other), so_far.compose(step)) for other, step in near[way[-1]] if other not in way[-2:-1]]
+        path, so_far = waiting.pop()
+        if path[-1] == end:
+            return path, so_far
+        waiting += [
+            ((*path, other), so_far.compose(step)) for other, step in neighbors[path[-1]] if other not in path[-2:-1]
+        ]
     raise ValueError("no joins lead from one fragment to the other")
-
-
-SAME_DEG, SAME_SHIFT = 5.0, 0.25
-"""Angle, and shift as a share of the median distance of a photo's points, up to which a fragment has a photo where the
-merged model has it; else its points do not count as seen by that photo. Chosen by hand."""
 
 
 def merge_fragments(fragments: Sequence[Fragment], frames: Mapping[int, Similarity]) -> PlacedPhotos:
     """Return the photos and points of all fragments that have a frame.
 
-    A photo has the pose that the part has found which owns it, else that of the largest fragment with it.
-
-    Args:
-        fragments: models of parts.
-        frames: from the frame of a fragment into the common one, by its number.
+    The part that owns a photo determines its pose, else the largest fragment with it.
     """
-    moved = {number: _move(fragments[number].placed, frame) for number, frame in sorted(frames.items())}
-    photos, R, centers, source = _choose_poses(fragments, moved)
+    models = {number: _move(fragments[number].placed, frame) for number, frame in sorted(frames.items())}
+    photos, R, centers, source = _choose_poses(fragments, models)
     cameras = {
-        photo: moved[number].cameras[photo] for photo, number in zip(photos.tolist(), source.tolist(), strict=True)
+        photo: models[number].cameras[photo] for photo, number in zip(photos.tolist(), source.tolist(), strict=True)
     }
-    tracks = [_sound_observations(model, photos, R, centers) for model in moved.values()]
+    tracks = [_sound_observations(model, photos, R, centers) for model in models.values()]
     X, point, photo, keypoint = _merge_tracks(tracks)
     return PlacedPhotos(photos, R, centers, X, point, photo, keypoint, cameras)
 
@@ -479,21 +449,21 @@ def _move(model: PlacedPhotos, frame: Similarity) -> PlacedPhotos:
 
 
 def _choose_poses(
-    fragments: Sequence[Fragment], moved: Mapping[int, PlacedPhotos]
+    fragments: Sequence[Fragment], models: Mapping[int, PlacedPhotos]
 ) -> tuple[IndexArray, FloatArray, FloatArray, IndexArray]:
     """Return ids of all photos, their rotations and centers, and the fragments that these are from."""
-    found: dict[int, tuple[tuple[bool, int, int], int, int]] = {}
-    for number, model in moved.items():
+    best: dict[int, tuple[tuple[bool, int, int], int, int]] = {}
+    for number, model in models.items():
         for row, photo in enumerate(model.photos.tolist()):
             rank = photo in fragments[number].own, len(model.photos), -number
-            if photo not in found or rank > found[photo][0]:
-                found[photo] = rank, number, row
-    photos = sorted(found)
-    chosen = [found[photo][1:] for photo in photos]
+            if photo not in best or rank > best[photo][0]:
+                best[photo] = rank, number, row
+    photos = sorted(best)
+    chosen = [best[photo][1:] for photo in photos]
     return (
         np.array(photos, np.int64),
-        np.array([moved[number].R[row] for number, row in chosen]).reshape(-1, 3, 3),
-        np.array([moved[number].centers[row] for number, row in chosen]).reshape(-1, 3),
+        np.array([models[number].R[row] for number, row in chosen]).reshape(-1, 3, 3),
+        np.array([models[number].centers[row] for number, row in chosen]).reshape(-1, 3),
         np.array([number for number, _ in chosen], np.int64),
     )
 
@@ -506,11 +476,11 @@ def _sound_observations(
     traces = np.einsum("nij,nij->n", model.R, R[rows])
     angles = np.degrees(np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0)))
     at = np.searchsorted(model.photos, model.photo)
-    away = np.linalg.norm(model.X[model.point] - model.centers[at], axis=1)
-    usual = float(np.median(away)) if len(away) else 1.0
-    shifts = np.linalg.norm(model.centers - centers[rows], axis=1) / max(usual, 1e-300)
-    kept = ((angles <= SAME_DEG) & (shifts <= SAME_SHIFT))[at]
-    return model.X, model.point[kept], model.photo[kept], model.keypoint[kept]
+    distances = np.linalg.norm(model.X[model.point] - model.centers[at], axis=1)
+    median_distance = float(np.median(distances)) if len(distances) else 1.0
+    shifts = np.linalg.norm(model.centers - centers[rows], axis=1) / max(median_distance, 1e-300)
+    is_sound = ((angles <= OPTIONS.same_deg) & (shifts <= OPTIONS.same_shift))[at]
+    return model.X, model.point[is_sound], model.photo[is_sound], model.keypoint[is_sound]
 
 
 def _merge_tracks(
@@ -518,10 +488,8 @@ def _merge_tracks(
 ) -> tuple[FloatArray, IndexArray, IndexArray, IndexArray]:
     """Return points (P, 3), and of each observation the point, the photo and the keypoint, in order of points.
 
-    Tracks with a keypoint in common become one; of several keypoints of one photo in it, one stays.
-
-    Args:
-        tracks: of each model, the points, and of each observation the row of the point, the photo and the keypoint.
+    Tracks with a keypoint in common become one; of several keypoints of one photo in it, one stays. The input has, for
+    each model, the points, and for each observation the row of the point, the photo and the keypoint.
     """
     starts = np.cumsum([0, *(len(X) for X, *_ in tracks)])
     X = np.concatenate([X for X, *_ in tracks] or [np.zeros((0, 3))])
@@ -542,7 +510,7 @@ def _merge_tracks(
     first = np.ones(len(owner), bool)
     first[1:] = (owner[1:] != owner[:-1]) | (photo[1:] != photo[:-1])
     owner, photo, keypoint = owner[first], photo[first], keypoint[first]
-    long = np.bincount(owner, minlength=len(mean)) >= 2
-    kept = long[owner]
-    rows = np.cumsum(long) - 1
-    return mean[long], rows[owner[kept]], photo[kept], keypoint[kept]
+    has_views = np.bincount(owner, minlength=len(mean)) >= 2
+    is_long = has_views[owner]
+    rows = np.cumsum(has_views) - 1
+    return mean[has_views], rows[owner[is_long]], photo[is_long], keypoint[is_long]

@@ -1,7 +1,7 @@
 """Pairs of look-alikes that hold one place of a model on top of another.
 
-Photos of two places that a model has in one are strangers: they should share most of what they see, and share nothing.
-Strangers belong on different sides. The pairs that hold the sides together, the least cut between them, are wrong.
+Photos of two places that a model merges should overlap, but share nothing. Such photos belong on different sides. The
+pairs that hold the sides together, the least cut between them, are wrong.
 """
 
 import logging
@@ -17,84 +17,66 @@ from sfm_app.colmap.backend import Camera, Reconstruction, all_points, translate
 from sfm_app.colmap.model import focal_px, posed_images
 from sfm_app.errors import BackendError
 from sfm_app.mapping.attempt import Attempt, PairSupport, photo_names, saturate
-from sfm_app.mapping.split_and_merge import LEAST_MATCHES
+from sfm_app.mapping.split_and_merge import OPTIONS as SPLIT
 from sfm_app.numerical import FAILURES, Json
 from sfm_app.posegraph.graph import LOOKS_ALIKE
-from sfm_app.posegraph.look_alikes import (
-    CELLS,
-    LEAST_CELLS,
-    MIN_CELL_POINTS,
-    cell_numbers,
-    group_doubted_pairs,
-    is_matched_again,
-    is_well_inside,
-)
+from sfm_app.posegraph.look_alikes import OPTIONS as LOOK_ALIKES
+from sfm_app.posegraph.look_alikes import cell_numbers, group_doubted_pairs, is_matched_again, is_well_inside
 from sfm_app.posegraph.rotations import find_cut
 from sfm_app.types import LookAlikes, MatchGraph, PairId, PoseGraph, ViewGraph
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
-# Look-alikes that were recognized: hide their matches from mapping, and report them.
+# Recognized look-alikes: their matches are hidden from mapping, and reported.
 
-LEAST_IN_ORDER = 30
-"""Number of photos below which their order is no evidence: temple16 is numbered in two arcs."""
-JUMP, MOST_JUMPS = 5.0, 0.1
-"""Length of a jump, in median steps; with a larger share of jumps the photos count as unordered. Not chosen on any set;
-the usual order of castle-P19, fountain-P11, Herz-Jesus-P8, kitti51 and oats23 has no jump."""
+
+@dataclass(frozen=True, slots=True)
+class JumpOptions:
+    """Jumps in the order of photos."""
+
+    min_photos: int = 30
+    """Number of photos below which their order is no evidence. Chosen by hand."""
+    jump: float = 5.0
+    """Length of a jump, in median steps. Chosen by hand."""
+    max_share: float = 0.1
+    """Share of jumps above which photos count as unordered. Chosen by hand."""
+
+
+JUMPS = JumpOptions()
 
 
 def drop_look_alikes(matches: MatchGraph, views: ViewGraph, graph: PoseGraph) -> tuple[MatchGraph, ViewGraph]:
     """Return matches and fundamental matrices without those of look-alikes.
 
     Pairs of look-alikes are evidence neither for a model nor against it.
-
-    Args:
-        matches: keypoints and raw matches.
-        views: fundamental matrices.
-        graph: knows the pairs of look-alikes.
     """
-    gone = {pair for join in graph.look_alikes for pair in join.pairs}
-    if not gone:
+    dropped = {pair for join in graph.look_alikes for pair in join.pairs}
+    if not dropped:
         return matches, views
-    kept = {pair: rows for pair, rows in matches.matches.items() if pair not in gone}
-    fits = {pair: fit for pair, fit in views.fits.items() if pair not in gone}
-    return replace(matches, matches=kept), replace(views, fits=fits)
+    rows_of = {pair: rows for pair, rows in matches.matches.items() if pair not in dropped}
+    fits = {pair: fit for pair, fit in views.fits.items() if pair not in dropped}
+    return replace(matches, matches=rows_of), replace(views, fits=fits)
 
 
 def with_earlier_look_alikes(graph: PoseGraph, earlier: PoseGraph) -> PoseGraph:
-    """Return a pose graph with the look-alikes of an earlier pass added to its own.
-
-    Args:
-        graph: pose graph of this pass.
-        earlier: pose graph of the pass before it.
-    """
+    """Add the look-alikes of the graph of an earlier pass to a pose graph."""
     dropped = {pair: earlier.dropped[pair] for join in earlier.look_alikes for pair in join.pairs}
     return replace(graph, dropped=dropped | dict(graph.dropped), look_alikes=earlier.look_alikes + graph.look_alikes)
 
 
 def with_false_joins(graph: PoseGraph, joins: Sequence[LookAlikes]) -> PoseGraph:
-    """Return a pose graph without the pairs of look-alikes that a model showed.
-
-    Args:
-        graph: pose graph of the pass that made the model.
-        joins: pairs that hold one place on top of another.
-    """
-    gone = {pair for join in joins for pair in join.pairs}
-    kept = {pair: pose for pair, pose in graph.poses.items() if pair not in gone}
+    """Return a pose graph without the pairs that merge two places of its model."""
+    dropped = {pair for join in joins for pair in join.pairs}
+    poses = {pair: pose for pair, pose in graph.poses.items() if pair not in dropped}
     return replace(
         graph,
-        poses=kept,
-        dropped=dict(graph.dropped) | dict.fromkeys(sorted(gone), LOOKS_ALIKE),
+        poses=poses,
+        dropped=dict(graph.dropped) | dict.fromkeys(sorted(dropped), LOOKS_ALIKE),
         look_alikes=(*graph.look_alikes, *joins),
     )
 
 
 def look_alike_entries(joins: Sequence[LookAlikes], matches: MatchGraph) -> list[dict[str, Json]]:
-    """Return the recognized look-alikes, for the manifest.
-
-    Args:
-        joins: pairs of look-alikes, grouped by the places that they confuse.
-        matches: knows the photos' names.
-    """
+    """Return the recognized look-alikes as plain values for the manifest."""
     return [
         {
             "pairs": len(join.pairs),
@@ -111,21 +93,20 @@ def jumps(model: Reconstruction) -> list[list[str]]:
     Empty where many steps are long, because the photos are then unordered. A jump is no proof: videos may be cut, too.
     """
     with translate_errors("reading poses"):
-        placed = sorted((image.name, image.projection_center()) for image in posed_images(model))
-    if len(placed) < LEAST_IN_ORDER:
+        centers_by_name = sorted((image.name, image.projection_center()) for image in posed_images(model))
+    if len(centers_by_name) < JUMPS.min_photos:
         return []
-    steps = np.linalg.norm(np.diff([center for _, center in placed], axis=0), axis=1)
-    long = np.flatnonzero(steps > JUMP * np.median(steps))
-    return [[placed[k][0], placed[k + 1][0]] for k in long] if len(long) <= MOST_JUMPS * len(steps) else []
+    steps = np.linalg.norm(np.diff([center for _, center in centers_by_name], axis=0), axis=1)
+    long = np.flatnonzero(steps > JUMPS.jump * np.median(steps))
+    return (
+        [[centers_by_name[k][0], centers_by_name[k + 1][0]] for k in long]
+        if len(long) <= JUMPS.max_share * len(steps)
+        else []
+    )
 
 
 def sides(pairs: Sequence[PairId], matches: MatchGraph) -> tuple[list[int], list[int]]:
-    """Return the photos at either place: each pair, those with most matches first, puts its photos on opposite sides.
-
-    Args:
-        pairs: look-alikes; at least one.
-        matches: raw matches of these pairs.
-    """
+    """Return the photos at either place: each pair, the strongest first, puts its photos on opposite sides."""
     counts = {pair: len(matches.matches[pair]) for pair in pairs}
     here: set[int] = set()
     there: set[int] = set()
@@ -143,37 +124,52 @@ def sides(pairs: Sequence[PairId], matches: MatchGraph) -> tuple[list[int], list
     return sorted(here), sorted(there)
 
 
-# Photos that see the same place if their model is right, and what they have in common.
-#
-# A street that a look-alike holds on top of another one fits all matches that were found. What gives it away is
-# what was not found: photos of both streets stand at the same place, look the same way, and share no point (Zach et
-# al. 2010, Heinly et al. 2014 look for such missing matches between pairs of photos).
-
-CANDIDATES = 40
-"""Photos nearby with which a photo may meet. Chosen by hand."""
-MOST_TURN_DEG = 45.0
-"""Largest angle between the mean viewing rays of photos that are compared. Chosen by hand."""
-LEAST_WITNESSES = 3
-"""Photos that have to see a point before another one is expected to: two may agree by chance."""
-LEAST_DISTANCE = 1e-12
-"""Distances are at least this, so that they divide."""
-BEHIND = 1.1
-"""Points farther away than what a photo sees in a cell, by this factor, may be hidden. Chosen by hand."""
+# Expected overlaps. A street on top of another one fits all matches. Missing matches reveal it: photos of both streets
+# stand at the same place, look the same way, and share no point (Zach et al. 2010, Heinly et al. 2014).
 
 
 @dataclass(frozen=True, slots=True)
-class Meeting:
+class OverlapOptions:
+    """Expected overlaps of photos, and false joins; docs/algorithms.md, Overlaid places."""
+
+    candidates: int = 40
+    """Photos nearby that a photo is compared with. Chosen by hand."""
+    max_angle_deg: float = 45.0
+    """Largest angle between the mean viewing rays of compared photos. Chosen by hand."""
+    min_witnesses: int = 3
+    """Photos with a point before another one is expected to have it: two may agree by chance. By definition."""
+    behind: float = 1.1
+    """Points farther away than others in a cell, by this factor, may be hidden. Chosen by hand."""
+    max_shared: float = 0.1
+    """Share of the expected cells up to which photos do not overlap. Chosen by hand."""
+    pulling_share: float = 0.7
+    """Share of the expected cells from which photos are on one side. Chosen by hand."""
+    min_pairs: int = 10
+    """Non-overlapping pairs that prove a false join. Chosen by hand."""
+    min_photos: int = 3
+    """Photos on either side of a false join. Chosen by hand."""
+    max_passes: int = 3
+    """Times that photos are mapped again without more look-alikes. Chosen by hand."""
+    min_missing: float = 0.5
+    """Share of the expected cells across a false join that must be missing. Chosen by hand."""
+
+
+OVERLAPS = OverlapOptions()
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedOverlap:
     """Two photos that see the same place if the model is right."""
 
     expected: int
     """Cells of either photo in which points of the other one should be seen."""
     shared: int
-    """Of these, cells in which a point of both is."""
+    """Cells of these with a point of both."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
-    """A posed photo and the points that it sees."""
+class PosedPhotoPoints:
+    """A posed photo and its points."""
 
     camera: Camera
     focal_px: float
@@ -183,199 +179,177 @@ class Sight:
     rows: IndexArray
     """(N,) numbers of its points, ascending."""
     reach: FloatArray
-    """By cell, how far away what it sees there is; -1 where it sees nothing."""
-    firm: IndexArray
-    """(M,) numbers of the points that others see, too."""
+    """By cell, median distance of its points; -1 without points."""
+    witnessed: IndexArray
+    """(M,) numbers of its points with enough witnesses."""
     rays: FloatArray
     """(M, 3) from its center to them, of length 1."""
     distances: FloatArray
     """(M,) from its center to them."""
 
 
-def find_meetings(model: Reconstruction) -> dict[PairId, Meeting]:
-    """Return by pair what photos that stand side by side and look the same way have in common.
-
-    Args:
-        model: with poses and points.
-    """
+def find_expected_overlaps(model: Reconstruction) -> dict[PairId, ExpectedOverlap]:
+    """Return by pair the overlap of photos that stand side by side and look the same way."""
     with translate_errors("reading points"):
-        points, sights = _read_sights(model)
-        found: dict[PairId, list[int]] = {}
-        for photo, other in _neighbors(sights):
-            expected, shared = _compare(sights[photo], sights[other], points)
-            if expected >= LEAST_CELLS:
-                sums = found.setdefault((min(photo, other), max(photo, other)), [0, 0])
+        points, photos = _read_posed_photos(model)
+        counts: dict[PairId, list[int]] = {}
+        for photo, other in _neighbors(photos):
+            expected, shared = _compare(photos[photo], photos[other], points)
+            if expected >= LOOK_ALIKES.min_cells:
+                sums = counts.setdefault((min(photo, other), max(photo, other)), [0, 0])
                 sums[0] += expected
                 sums[1] += shared
-    return {pair: Meeting(*sums) for pair, sums in sorted(found.items())}
+    return {pair: ExpectedOverlap(*sums) for pair, sums in sorted(counts.items())}
 
 
-def _read_sights(model: Reconstruction) -> tuple[FloatArray, dict[int, Sight]]:
-    """Return the points (P, 3) of a model, and by id its posed photos that see points which others see, too."""
+def _read_posed_photos(model: Reconstruction) -> tuple[FloatArray, dict[int, PosedPhotoPoints]]:
+    """Return the points (P, 3) of a model, and by id its posed photos with points of enough witnesses."""
     stored = sorted(all_points(model), key=lambda item: item[0])
     points = np.array([point.xyz for _, point in stored], np.float64).reshape(-1, 3)
-    often = np.array([point.track.length() >= LEAST_WITNESSES for _, point in stored], np.bool_)
-    keys, found = np.array([key for key, _ in stored], np.int64), {}
+    often = np.array([point.track.length() >= OVERLAPS.min_witnesses for _, point in stored], np.bool_)
+    keys, photos = np.array([key for key, _ in stored], np.int64), {}
     for image in posed_images(model):
-        seen = image.get_observation_points2D()
-        rows, first = np.unique(np.searchsorted(keys, [one.point3D_id for one in seen]), return_index=True)
+        observations = image.get_observation_points2D()
+        rows, first = np.unique(np.searchsorted(keys, [one.point3D_id for one in observations]), return_index=True)
         if often[rows].any():
-            x = np.array([one.xy for one in seen], np.float64)[first]
-            found[image.image_id] = _look(model, image.image_id, (rows, x), points, often[rows])
-    return points, found
+            x = np.array([one.xy for one in observations], np.float64)[first]
+            photos[image.image_id] = _posed_photo_points(model, image.image_id, rows, x, points, often[rows])
+    return points, photos
 
 
-def _look(
-    model: Reconstruction, photo: int, seen: tuple[IndexArray, FloatArray], points: FloatArray, often: BoolArray
-) -> Sight:
-    """Return what a photo sees: rows of points (N,) at pixels (N, 2), of which others often see some, too."""
+def _posed_photo_points(
+    model: Reconstruction, photo: int, rows: IndexArray, x: FloatArray, points: FloatArray, often: BoolArray
+) -> PosedPhotoPoints:
+    """Return a photo with its points: rows (N,) at pixels x (N, 2), and a mask of those with enough witnesses."""
     image = model.images[photo]
-    camera, (rows, x) = model.cameras[image.camera_id], seen
+    camera = model.cameras[image.camera_id]
     center = np.asarray(image.projection_center(), np.float64)
     rays = points[rows] - center
-    distances = np.maximum(np.linalg.norm(rays, axis=1), LEAST_DISTANCE)
+    distances = np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
     cells = cell_numbers(x, camera.width, camera.height)
-    reach = np.full((CELLS + 1) ** 2, -1.0)
+    reach = np.full((LOOK_ALIKES.cells + 1) ** 2, -1.0)
     for cell in np.unique(cells):
         reach[cell] = np.median(distances[cells == cell])
-    return Sight(
+    return PosedPhotoPoints(
         camera, focal_px(model, photo), np.asarray(image.cam_from_world().matrix()), center, rows, reach,
         rows[often], (rays / distances[:, None])[often], distances[often],
     )  # fmt: skip
 
 
-def _neighbors(sights: Mapping[int, Sight]) -> Iterator[PairId]:
+def _neighbors(posed: Mapping[int, PosedPhotoPoints]) -> Iterator[PairId]:
     """Yield photos with others nearby that look the same way; some of these where there are many."""
-    if not sights:
+    if not posed:
         return
-    photos, seers = list(sights), list(sights.values())
-    tree = KDTree(np.array([sight.center for sight in seers]))
-    directions = np.array([sight.rays.mean(axis=0) for sight in seers])
-    directions /= np.maximum(np.linalg.norm(directions, axis=1), LEAST_DISTANCE)[:, None]
-    for number, sight in enumerate(seers):
-        near = np.array(sorted(tree.query_ball_point(sight.center, float(np.median(sight.distances)))), np.int64)
-        near = near[(directions[near] @ directions[number] > np.cos(np.radians(MOST_TURN_DEG))) & (near != number)]
-        chosen = near[np.unique(np.linspace(0, len(near) - 1, min(CANDIDATES, len(near))).astype(np.int64))]
+    photos, posed_photos = list(posed), list(posed.values())
+    tree = KDTree(np.array([here.center for here in posed_photos]))
+    directions = np.array([here.rays.mean(axis=0) for here in posed_photos])
+    directions /= np.maximum(np.linalg.norm(directions, axis=1), 1e-12)[:, None]
+    for number, here in enumerate(posed_photos):
+        nearby = np.array(sorted(tree.query_ball_point(here.center, float(np.median(here.distances)))), np.int64)
+        nearby = nearby[
+            (directions[nearby] @ directions[number] > np.cos(np.radians(OVERLAPS.max_angle_deg))) & (nearby != number)
+        ]
+        chosen = nearby[
+            np.unique(np.linspace(0, len(nearby) - 1, min(OVERLAPS.candidates, len(nearby))).astype(np.int64))
+        ]
         yield from ((photos[number], photos[other]) for other in chosen)
 
 
-def _compare(here: Sight, there: Sight, points: FloatArray) -> tuple[int, int]:
-    """Count the cells of a photo in which it should see points of another one, and those in which it does."""
-    away = points[here.firm] - there.center
-    lengths = np.maximum(np.linalg.norm(away, axis=1), LEAST_DISTANCE)
-    smaller = lengths / here.distances * here.focal_px / there.focal_px
-    again = is_matched_again(smaller, (here.rays * away).sum(axis=1) / lengths)
-    rows, lengths = here.firm[again], lengths[again]
+def _compare(here: PosedPhotoPoints, there: PosedPhotoPoints, points: FloatArray) -> tuple[int, int]:
+    """Count the cells of a photo that should show points of another one, and those of them that do."""
+    rays = points[here.witnessed] - there.center
+    lengths = np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
+    size_ratios = lengths / here.distances * here.focal_px / there.focal_px
+    is_matched = is_matched_again(size_ratios, (here.rays * rays).sum(axis=1) / lengths)
+    rows, lengths = here.witnessed[is_matched], lengths[is_matched]
     inside = points[rows] @ there.pose[:, :3].T + there.pose[:, 3]
     x = np.asarray(there.camera.img_from_cam(inside), np.float64).reshape(-1, 2)
-    shown = is_well_inside(x, there.camera.width, there.camera.height)
-    rows, cells = rows[shown], cell_numbers(x[shown], there.camera.width, there.camera.height)
-    open_ = lengths[shown] < BEHIND * there.reach[cells]
-    rows, cells = rows[open_], cells[open_]
+    is_inside = is_well_inside(x, there.camera.width, there.camera.height)
+    rows, cells = rows[is_inside], cell_numbers(x[is_inside], there.camera.width, there.camera.height)
+    is_visible = lengths[is_inside] < OVERLAPS.behind * there.reach[cells]
+    rows, cells = rows[is_visible], cells[is_visible]
     expected, counts = np.unique(cells, return_counts=True)
-    expected = expected[counts >= MIN_CELL_POINTS]
-    hit = cells[np.isin(rows, there.rows, assume_unique=True)]
-    return len(expected), int(np.count_nonzero(np.isin(expected, hit)))
+    expected = expected[counts >= LOOK_ALIKES.min_cell_points]
+    shared = cells[np.isin(rows, there.rows, assume_unique=True)]
+    return len(expected), int(np.count_nonzero(np.isin(expected, shared)))
 
 
 logger = logging.getLogger("sfm_app")
 
-STRANGE_SHARE = 0.1
-"""Photos that meet are strangers if they share at most this part of the cells that they should. docs/algorithms.md,
-Overlaid places."""
-PULLING_SHARE = 0.7
-"""Share of the cells that they should share from which photos that meet are on one side. Chosen by hand: photos of one
-place share more in 9 of 10 pairs of a video and in nearly all others, those of a house in two streets 0 to 0.65."""
-LEAST_STRANGERS, LEAST_PHOTOS_OF_JOIN = 10, 3
-"""Pairs of strangers, and photos on either side, that prove a wrong join. Chosen by hand."""
-MOST_FALSE_JOINS = 3
-"""Times that photos are mapped again without more look-alikes. Chosen by hand."""
-LEAST_MISSING = 0.5
-"""Least share of the cells that photos on either side of a false join should share, but do not. Chosen by hand: 0.88
-for a house in two streets of a rendered town. Of 17 right models, no meeting of two photos misses more than 0.75."""
-
 
 def judge_places(models: Iterable[Attempt]) -> tuple[list[LookAlikes], int]:
-    """Return the false joins of models, and how many pairs of photos are strangers in them.
-
-    Args:
-        models: with the matches that they explain.
-    """
-    joins, strangers = list[LookAlikes](), 0
+    """Return the false joins of models, and their number of non-overlapping pairs."""
+    joins, non_overlapping = list[LookAlikes](), 0
     for attempt in models:
         try:
-            meetings = find_meetings(attempt.model)
-            joins += find_false_joins(meetings, attempt.explained)
+            overlaps = find_expected_overlaps(attempt.model)
+            joins += find_false_joins(overlaps, attempt.explained)
         except (*FAILURES, BackendError) as err:  # the model itself is there
-            logger.info("places of the model %s were not judged", attempt.note, exc_info=err)
+            logger.info("the places of model %s could not be checked", attempt.note, exc_info=err)
             continue
-        strangers += len(find_strangers(meetings, attempt.explained))
-    return joins, strangers
+        non_overlapping += len(find_non_overlapping(overlaps, attempt.explained))
+    return joins, non_overlapping
 
 
-def find_strangers(
-    meetings: Mapping[PairId, Meeting], explained: Mapping[PairId, PairSupport]
-) -> dict[PairId, Meeting]:
-    """Return the pairs of photos that should share most of what they see, and share next to nothing.
-
-    Args:
-        meetings: pairs of photos that see the same place in the model.
-        explained: matches of each pair that the model explains.
-    """
+def find_non_overlapping(
+    overlaps: Mapping[PairId, ExpectedOverlap], explained: Mapping[PairId, PairSupport]
+) -> dict[PairId, ExpectedOverlap]:
+    """Return the pairs of photos that should overlap, and share next to nothing."""
     return {
-        pair: one for pair, one in meetings.items()
-        if one.shared <= STRANGE_SHARE * one.expected and not _holds(explained.get(pair))
+        pair: one for pair, one in overlaps.items()
+        if one.shared <= OVERLAPS.max_shared * one.expected and not _is_significant(explained.get(pair))
     }  # fmt: skip
 
 
-def find_false_joins(meetings: Mapping[PairId, Meeting], explained: Mapping[PairId, PairSupport]) -> list[LookAlikes]:
-    """Return the pairs that hold strangers together, those of each false join for themselves.
-
-    Args:
-        meetings, explained: as in `find_strangers`.
-    """
-    strangers, found = find_strangers(meetings, explained), list[LookAlikes]()
-    holding = {pair: one.matches for pair, one in explained.items() if _holds(one)}
-    strengths = dict(zip(holding, saturate(list(holding.values())).tolist(), strict=True))
-    photos, left = sorted(set(chain(*holding, *meetings))), dict(strangers)
-    while len(left) >= LEAST_STRANGERS:
-        sides = _take_sides(left, meetings)
-        apart = {pair for pair, one in meetings.items() if sides[pair[0]] != sides[pair[1]] and _pull(one) < 0}
-        here = _divide({photo: sides[photo] for photo in chain(*apart)}, photos, strengths)
-        across = {pair: one for pair, one in meetings.items() if {here.get(photo) for photo in pair} == {True, False}}
+def find_false_joins(
+    overlaps: Mapping[PairId, ExpectedOverlap], explained: Mapping[PairId, PairSupport]
+) -> list[LookAlikes]:
+    """Return the pairs that hold non-overlapping photos together, those of each false join for themselves."""
+    non_overlapping, joins = find_non_overlapping(overlaps, explained), list[LookAlikes]()
+    significant = {pair: one.matches for pair, one in explained.items() if _is_significant(one)}
+    strengths = dict(zip(significant, saturate(list(significant.values())).tolist(), strict=True))
+    photos, remaining = sorted(set(chain(*significant, *overlaps))), dict(non_overlapping)
+    while len(remaining) >= OVERLAPS.min_pairs:
+        sides = _assign_sides(remaining, overlaps)
+        apart = {pair for pair, one in overlaps.items() if sides[pair[0]] != sides[pair[1]] and _affinity(one) < 0}
+        here = _cut_sides({photo: sides[photo] for photo in chain(*apart)}, photos, strengths)
+        across = {pair: one for pair, one in overlaps.items() if {here.get(photo) for photo in pair} == {True, False}}
         missing = _missing_share(across.values())
-        if len(across.keys() & strangers.keys()) >= LEAST_STRANGERS and missing >= LEAST_MISSING:
+        if len(across.keys() & non_overlapping.keys()) >= OVERLAPS.min_pairs and missing >= OVERLAPS.min_missing:
             pairs = {pair for pair in strengths if here[pair[0]] != here[pair[1]]}
             strengths = {pair: strength for pair, strength in strengths.items() if pair not in pairs}
-            found += [LookAlikes(join, missing) for join in group_doubted_pairs(pairs, strengths)]
-        left = {(a, b): one for (a, b), one in left.items() if sides[a] == sides[b]}
-    return found
+            joins += [LookAlikes(join, missing) for join in group_doubted_pairs(pairs, strengths)]
+        remaining = {(a, b): one for (a, b), one in remaining.items() if sides[a] == sides[b]}
+    return joins
 
 
-def _missing_share(meetings: Collection[Meeting]) -> float:
-    expected = sum(one.expected for one in meetings)
-    return 1.0 - sum(one.shared for one in meetings) / max(expected, 1)
+def _missing_share(overlaps: Collection[ExpectedOverlap]) -> float:
+    expected = sum(one.expected for one in overlaps)
+    return 1.0 - sum(one.shared for one in overlaps) / max(expected, 1)
 
 
-def _holds(found: PairSupport | None) -> bool:
-    return found is not None and found.matches >= LEAST_MATCHES
+def _is_significant(pair: PairSupport | None) -> bool:
+    return pair is not None and pair.matches >= SPLIT.min_matches
 
 
-def _pull(meeting: Meeting) -> float:
+def _affinity(overlap: ExpectedOverlap) -> float:
     """Return how many cells speak for one place, less those that speak for two."""
-    return meeting.shared - PULLING_SHARE * meeting.expected
+    return overlap.shared - OVERLAPS.pulling_share * overlap.expected
 
 
-def _take_sides(strangers: Mapping[PairId, Meeting], meetings: Mapping[PairId, Meeting]) -> dict[int, int]:
-    """Return the side, 1 or -1, of all photos that meet others: the strangest pair first, then what is most certain.
+def _assign_sides(
+    non_overlapping: Mapping[PairId, ExpectedOverlap], overlaps: Mapping[PairId, ExpectedOverlap]
+) -> dict[int, int]:
+    """Return the side, 1 or -1, of all photos with overlaps: the surest non-overlapping pair first, then the surest
+    photo.
 
-    Those who share what they should pull a photo to their side, the others push it to the other one.
+    Photos with the expected overlap pull a photo to their side, others push it to the opposite one.
     """
-    pulls: dict[int, dict[int, float]] = {photo: {} for photo in chain(*meetings)}
-    for (a, b), one in meetings.items():
-        pulls[a][b] = pulls[b][a] = _pull(one)
-    seed = min(strangers, key=lambda pair: (-strangers[pair].expected, pair))
-    sides, votes = dict[int, int](), dict.fromkeys(sorted(pulls), 0.0)
+    affinities: dict[int, dict[int, float]] = {photo: {} for photo in chain(*overlaps)}
+    for (a, b), one in overlaps.items():
+        affinities[a][b] = affinities[b][a] = _affinity(one)
+    seed = min(non_overlapping, key=lambda pair: (-non_overlapping[pair].expected, pair))
+    sides, votes = dict[int, int](), dict.fromkeys(sorted(affinities), 0.0)
     waiting = [(-np.inf, seed[0], np.inf), (-np.inf, seed[1], -np.inf), *((0.0, photo, 0.0) for photo in votes)]
     heapify(waiting)
     while waiting:
@@ -383,18 +357,18 @@ def _take_sides(strangers: Mapping[PairId, Meeting], meetings: Mapping[PairId, M
         if photo in sides or (np.isfinite(vote) and vote != votes[photo]):
             continue
         sides[photo] = 1 if vote >= 0 else -1
-        for other, pull in pulls[photo].items():
+        for other, affinity in affinities[photo].items():
             if other not in sides:
-                votes[other] += sides[photo] * pull
+                votes[other] += sides[photo] * affinity
                 heappush(waiting, (-abs(votes[other]), other, votes[other]))
     return sides
 
 
-def _divide(sides: Mapping[int, int], photos: Sequence[int], strengths: Mapping[PairId, float]) -> dict[int, bool]:
+def _cut_sides(sides: Mapping[int, int], photos: Sequence[int], strengths: Mapping[PairId, float]) -> dict[int, bool]:
     """Return for each photo on which side of the least cut it is; empty where there is nothing to cut."""
     number = {photo: k for k, photo in enumerate(photos)}
     ends = [np.array([number[one] for one, side in sides.items() if side == which], np.int64) for which in (1, -1)]
-    if min(map(len, ends)) < LEAST_PHOTOS_OF_JOIN:
+    if min(map(len, ends)) < OVERLAPS.min_photos:
         return {}
     edges = np.array([[number[photo] for photo in pair] for pair in strengths], np.int64).reshape(-1, 2)
     here, weight = find_cut(len(photos), edges, np.array(list(strengths.values())), (ends[0], ends[1]))

@@ -24,31 +24,38 @@ from sfm_app.settings import Settings
 from sfm_app.tasks import Task
 from sfm_app.types import Intrinsics, LookAlikes, MatchedImage, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
 
-# Divide a large group of photos into parts along the thin places of its pose graph.
-#
-# A group is divided in two again and again. From a photo at its rim, one side grows by the photo whose links lead
-# into it most; of all sizes that it passes through, the cut with the smallest weight in proportion to both sides is
-# taken (normalized cut, Shi and Malik 2000; growth as in METIS, Karypis and Kumar 1998), and photos at the cut
-# change sides where that lowers its weight. Neighboring parts then share the photos with most inliers across the
+# Cuts. A group is repeatedly divided in two. From a photo at its rim, one side grows by the photo with most links into
+# it; the smallest normalized cut on the way is taken (Shi and Malik 2000; growth as in METIS, Karypis and Kumar 1998).
+# Photos change sides where that lowers its weight. Neighboring parts then share the photos with most inliers across the
 # cut.
 
 Links = Mapping[int, Mapping[int, float]]
 """Weight of the pairs of each photo, by the other photo."""
 
-SATURATION_INLIERS = 100.0
-"""Number of inliers above which the weight of a pair hardly grows. Chosen by hand."""
-DOUBTFUL_WEIGHT = 0.1
-"""Weight factor of pairs that may be look-alikes: a cut may well pass there. Chosen by hand."""
-LARGEST, SMALLEST = 1.3, 0.25
-"""Largest part, and smallest, as shares of the wanted size. Chosen by hand."""
-LEAST_SIDE = 1.0 / 3.0
-"""Smallest side of a cut, as a share of what is cut. Chosen by hand."""
-MOST_SWAPS = 8
-"""Most rounds in which photos change sides. Chosen by hand."""
-SHARED_PHOTOS = 10
-"""Photos that each of two neighboring parts gets from the other one. Chosen by hand."""
-LEAST_ACROSS = 3
-"""Smallest number of pairs between two parts that makes them neighbors. Chosen by hand."""
+
+@dataclass(frozen=True, slots=True)
+class CutOptions:
+    """How a group is cut into parts."""
+
+    saturation_inliers: float = 100.0
+    """Number of inliers above which the weight of a pair hardly grows. Chosen by hand."""
+    doubtful_weight: float = 0.1
+    """Weight factor of pairs that may be look-alikes: a cut may well pass there. Chosen by hand."""
+    largest: float = 1.3
+    """Largest part, as a share of the chosen size. Chosen by hand."""
+    smallest: float = 0.25
+    """Smallest part, as a share of the chosen size. Chosen by hand."""
+    min_side: float = 1.0 / 3.0
+    """Smallest side of a cut, as a share of the photos. Chosen by hand."""
+    max_swaps: int = 8
+    """Most rounds in which photos change sides. Chosen by hand."""
+    shared_photos: int = 10
+    """Photos that each of two neighboring parts gets from the other one. Chosen by hand."""
+    min_across: int = 3
+    """Least pairs between two parts that makes them neighbors. Chosen by hand."""
+
+
+OPTIONS = CutOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,36 +69,25 @@ class Part:
 
 
 def cut_group(graph: PoseGraph, photos: Sequence[int], size: int) -> tuple[Part, ...]:
-    """Divide connected photos into overlapping parts, each connected; the same parts for the same graph.
-
-    Args:
-        graph: relative poses; its doubtful pairs count little.
-        photos: ids of the group.
-        size: wanted number of photos of a part.
-    """
+    """Divide connected photos into overlapping parts of about `size` photos, each connected."""
     links = link_weights(graph, photos)
-    owned = [sorted(part) for part in _join_small(_divide(links, size), links, SMALLEST * size)]
+    owned = [sorted(part) for part in _join_small(_divide(links, size), links, OPTIONS.smallest * size)]
     owned.sort(key=lambda part: part[0])
     return tuple(
         Part(tuple(own), tuple(sorted((*own, *more))))
-        for own, more in zip(owned, _borrowed_photos(owned, links), strict=True)
+        for own, more in zip(owned, _shared_photos(owned, links), strict=True)
     )
 
 
 def link_weights(graph: PoseGraph, photos: Collection[int]) -> dict[int, dict[int, float]]:
-    """Return the weight of every pair within some photos, by both of them.
-
-    Args:
-        graph: relative poses.
-        photos: ids.
-    """
+    """Return the weight of every pair within some photos, by both of them."""
     doubtful = {pair for join in graph.doubtful for pair in join.pairs}
     links: dict[int, dict[int, float]] = {photo: {} for photo in sorted(photos)}
     for pair, pose in graph.poses.items():
         a, b = pair
         if a in links and b in links:
-            weight = pose.inlier_count / (1.0 + pose.inlier_count / SATURATION_INLIERS)
-            links[a][b] = links[b][a] = weight * (DOUBTFUL_WEIGHT if pair in doubtful else 1.0)
+            weight = pose.inlier_count / (1.0 + pose.inlier_count / OPTIONS.saturation_inliers)
+            links[a][b] = links[b][a] = weight * (OPTIONS.doubtful_weight if pair in doubtful else 1.0)
     return links
 
 
@@ -99,7 +95,7 @@ def _divide(links: Links, size: int) -> list[set[int]]:
     waiting, parts = _components(set(links), links), []
     while waiting:
         photos = waiting.pop()
-        if len(photos) <= LARGEST * size:
+        if len(photos) <= OPTIONS.largest * size:
             parts.append(photos)
         else:
             waiting += _bisect(photos, links)
@@ -111,7 +107,7 @@ def _bisect(photos: set[int], links: Links) -> tuple[set[int], set[int]]:
     end = _farthest_photo(min(photos), photos, links)
     starts = (_farthest_photo(end, photos, links), end)
     cuts = [_best_growth(start, photos, links) for start in starts]
-    side = min(cuts, key=lambda found: found[0])[1]
+    side = min(cuts, key=lambda cut: cut[0])[1]
     side = _swap_sides(side, photos, links)
     # islands go over to the other side, to which they are linked
     side = max(_components(side, links), key=_rank)
@@ -130,12 +126,12 @@ def _components(photos: set[int], links: Links) -> list[set[int]]:
 
 def _farthest_photo(start: int, photos: set[int], links: Links) -> int:
     """Return the photo that takes most links to reach; of several, the one with the smallest id."""
-    seen, rim = {start}, [start]
+    reached, rim = {start}, [start]
     while True:
-        beyond = sorted({b for a in rim for b in links[a] if b in photos} - seen)
+        beyond = sorted({b for a in rim for b in links[a] if b in photos} - reached)
         if not beyond:
             return min(rim)
-        seen.update(beyond)
+        reached.update(beyond)
         rim = beyond
 
 
@@ -146,7 +142,7 @@ def _best_growth(start: int, photos: set[int], links: Links) -> tuple[float, set
     waiting, order, grown = [(0.0, start)], list[int](), set[int]()
     cut = volume = 0.0
     best = float("inf"), 0
-    least = max(1, int(LEAST_SIDE * len(photos)))
+    least = max(1, int(OPTIONS.min_side * len(photos)))
     while len(order) < len(photos) - least:
         _, photo = heappop(waiting)
         if photo in grown:
@@ -165,10 +161,10 @@ def _best_growth(start: int, photos: set[int], links: Links) -> tuple[float, set
 
 
 def _swap_sides(side: set[int], photos: set[int], links: Links) -> set[int]:
-    """Return a side after its photos, and those of the other one, have moved to where most of their links lead."""
-    side, least = set(side), int(LEAST_SIDE * len(photos))
-    for _ in range(MOST_SWAPS):
-        moved = 0
+    """Return a side after photos of both sides have moved to where most of their links lead."""
+    side, least = set(side), int(OPTIONS.min_side * len(photos))
+    for _ in range(OPTIONS.max_swaps):
+        swaps = 0
         for photo in sorted(photos):
             here = photo in side
             across = sum(w for b, w in links[photo].items() if b in photos and (b in side) != here)
@@ -176,8 +172,8 @@ def _swap_sides(side: set[int], photos: set[int], links: Links) -> set[int]:
             size = len(side) if here else len(photos) - len(side)
             if across > within and size > least:
                 side ^= {photo}
-                moved += 1
-        if not moved:
+                swaps += 1
+        if not swaps:
             break
     return side
 
@@ -187,16 +183,16 @@ def _join_small(parts: list[set[int]], links: Links, least: float) -> list[set[i
     parts = sorted(parts, key=_rank)
     while len(parts) > 1 and len(parts[0]) < least:
         small, *others = parts
-        worth = [sum(w for a in sorted(small) for b, w in links[a].items() if b in other) for other in others]
-        best = max(range(len(others)), key=lambda k: worth[k])
-        if worth[best] == 0.0:  # a component of its own
+        weights = [sum(w for a in sorted(small) for b, w in links[a].items() if b in other) for other in others]
+        best = max(range(len(others)), key=lambda k: weights[k])
+        if weights[best] == 0.0:  # a component of its own
             return parts
         others[best] = others[best] | small
         parts = sorted(others, key=_rank)
     return parts
 
 
-def _borrowed_photos(parts: Sequence[Sequence[int]], links: Links) -> list[set[int]]:
+def _shared_photos(parts: Sequence[Sequence[int]], links: Links) -> list[set[int]]:
     """Return the photos that each part gets from its neighbors."""
     owner = {photo: number for number, part in enumerate(parts) for photo in part}
     across: dict[tuple[int, int], list[PairId]] = {}
@@ -204,70 +200,57 @@ def _borrowed_photos(parts: Sequence[Sequence[int]], links: Links) -> list[set[i
         for b in links[a]:
             if owner[a] != owner[b]:
                 across.setdefault((owner[a], owner[b]), []).append((a, b))
-    more: list[set[int]] = [set() for _ in parts]
+    shared: list[set[int]] = [set() for _ in parts]
     for (here, _), pairs in sorted(across.items()):
-        if len(pairs) >= LEAST_ACROSS:
-            more[here] |= _best_across(pairs, links)
-    return more
+        if len(pairs) >= OPTIONS.min_across:
+            shared[here] |= _best_across(pairs, links)
+    return shared
 
 
 def _best_across(pairs: Sequence[PairId], links: Links) -> set[int]:
     """Return the photos of the other part with most links to this one, spread over the photos that they link to.
 
-    Args:
-        pairs: links across the cut, the photo of this part first.
-        links: weights.
+    In `pairs`, the photo of this part comes first.
     """
-    seen: dict[int, list[int]] = {}
+    partners: dict[int, list[int]] = {}
     for a, b in pairs:
-        seen.setdefault(b, []).append(a)
-    chosen, known = set[int](), dict.fromkeys([a for a, _ in pairs], 0.0)
+        partners.setdefault(b, []).append(a)
+    chosen, linked = set[int](), dict.fromkeys([a for a, _ in pairs], 0.0)
 
-    def worth(photo: int) -> float:
-        return sum(links[photo][a] / (1.0 + known[a] / SATURATION_INLIERS) for a in seen[photo])
+    def gain(photo: int) -> float:
+        return sum(links[photo][a] / (1.0 + linked[a] / OPTIONS.saturation_inliers) for a in partners[photo])
 
-    while len(chosen) < SHARED_PHOTOS and len(chosen) < len(seen):
-        best = max((photo for photo in sorted(seen) if photo not in chosen), key=worth)
+    while len(chosen) < OPTIONS.shared_photos and len(chosen) < len(partners):
+        best = max((photo for photo in sorted(partners) if photo not in chosen), key=gain)
         chosen.add(best)
-        for a in seen[best]:
-            known[a] += links[best][a]
+        for a in partners[best]:
+            linked[a] += links[best][a]
     return chosen
 
 
-# The inputs of one part as a file, so that any process, here or elsewhere, can map it.
+# The inputs of one part as a file, so that any process can map it.
 
 INPUTS, RESULT = "inputs.npz", "result.json"
-"""Files in the folder of a part: what it is mapped from, and what became of it."""
+"""Files in the folder of a part: its inputs and its result."""
 Arrays = dict[str, NDArray[Any]]
 
 
 def pairs_of_parts(pairs: Iterable[PairId], parts: Sequence[Sequence[int]]) -> list[list[PairId]]:
-    """Return the pairs within each part, in their order; one look at each pair, however many parts there are.
-
-    Args:
-        pairs: of photos.
-        parts: ids of their photos; parts may share photos.
-    """
+    """Return the pairs within each part, in their order; parts may share photos."""
     members: dict[int, set[int]] = {}
     for number, photos in enumerate(parts):
         for photo in photos:
             members.setdefault(photo, set()).add(number)
-    found: list[list[PairId]] = [[] for _ in parts]
+    pairs_by_part: list[list[PairId]] = [[] for _ in parts]
     nowhere: set[int] = set()
     for a, b in pairs:
         for number in members.get(a, nowhere) & members.get(b, nowhere):
-            found[number].append((a, b))
-    return found
+            pairs_by_part[number].append((a, b))
+    return pairs_by_part
 
 
 def part_of_group(group: Group, photos: Sequence[int], pairs: Sequence[PairId]) -> Group:
-    """Return what concerns some photos of a group.
-
-    Args:
-        group: photos with their matches, geometry and cameras.
-        photos: ids of the part.
-        pairs: those with matches, within the part.
-    """
+    """Return the data of some photos of a group; `pairs` are those with matches among them."""
     matches, fits, poses = group.matches, group.views.fits, group.graph.poses
     images = {photo: matches.images[photo] for photo in photos}
     names = {image.name: group.intrinsics.camera_name(image) for image in images.values()}
@@ -287,24 +270,19 @@ def part_of_group(group: Group, photos: Sequence[int], pairs: Sequence[PairId]) 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartInputs:
-    """What a part is mapped from."""
+    """Inputs for mapping a part."""
 
     part: Group
     """Photos, matches, geometry, relative poses and cameras."""
     mapped: frozenset[PairId]
     """Pairs of the pose graph that mapping follows."""
     settings: Settings
-    asked: bool
-    """Whether everything is mapped anew where a false join is found, so that no other mapper is needed then."""
+    stop_at_false_joins: bool
+    """Whether a false join ends the mapping of the part, because all parts are then mapped again."""
 
 
 def write_inputs(path: Path, inputs: PartInputs) -> None:
-    """Write the inputs of a part, as a whole.
-
-    Args:
-        path: file to write.
-        inputs: of the part.
-    """
+    """Write the inputs of a part atomically."""
     part = inputs.part
     known = {
         "photos": list(part.photos),
@@ -312,7 +290,7 @@ def write_inputs(path: Path, inputs: PartInputs) -> None:
         "images": [asdict(replace(image, gps=None, shown=None)) for image in part.matches.images.values()],
         "intrinsics": part.intrinsics.to_dict(),
         "settings": inputs.settings.model_dump(mode="json"),
-        "asked": inputs.asked,
+        "asked": inputs.stop_at_false_joins,
     }
     arrays = _match_arrays(part.matches) | _pose_arrays(part.graph)
     arrays |= {f"view_{name}": array for name, array in part.views.to_arrays().items()}
@@ -339,7 +317,7 @@ def read_inputs(path: Path) -> PartInputs:
 
 
 PlainJoin = tuple[list[list[int]], float]
-"""Pairs of a false join, and the share that is missing across it, as JSON has them."""
+"""Pairs of a false join, and the missing share across it, as in JSON."""
 
 
 def joins_to_plain(joins: Sequence[LookAlikes]) -> list[PlainJoin]:
@@ -407,7 +385,6 @@ logger = logging.getLogger("sfm_app")
 
 FOLDER, STOP = "parts", "stop"
 """Folder of the parts, and the file in it that stops them all."""
-POLL_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -422,36 +399,33 @@ class PartTask:
 
 @dataclass(frozen=True, slots=True)
 class PartResult:
-    """What became of a part."""
+    """Models of a part."""
 
     models: tuple[str, ...]
     """Folders of its models, the largest first; none where it was not mapped."""
     mapper: str
     tried: tuple[str, ...]
-    """Notes on all attempts, for people; the reason of a failure."""
+    """Notes on all attempts, or the reason of a failure."""
     false_joins: tuple[LookAlikes, ...] = ()
-    """Pairs that hold one place of the part on top of another."""
+    """Pairs that merge two places of the part."""
 
 
 def map_parts(
-    group: Group, parts: Sequence[Part], mapped: PoseGraph, run: RunContext, *, asked: bool
+    group: Group, parts: Sequence[Part], mapped: PoseGraph, run: RunContext, *, stop_at_false_joins: bool
 ) -> list[PartResult]:
     """Map parts, as many at once as there are workers; one that fails is a result without models.
 
     Parts that a killed run has finished are not mapped again.
 
     Args:
-        group: connected photos, with their matches, geometry and cameras.
-        parts: of its photos.
         mapped: the pose graph with the pairs that mapping follows.
-        run: the run.
-        asked: whether false joins within parts end the pass.
+        stop_at_false_joins: whether false joins within parts end the pass.
     """
     place = run.workspace.root / FOLDER
     (place / STOP).unlink(missing_ok=True)
     within = pairs_of_parts(group.matches.matches, [part.photos for part in parts])
     members = (part_of_group(group, part.photos, pairs) for part, pairs in zip(parts, within, strict=True))
-    tasks = [_prepare_part(one, mapped, place, run, asked=asked) for one in members]
+    tasks = [_prepare_part(one, mapped, place, run, stop_at_false_joins=stop_at_false_joins) for one in members]
     try:
         return run.map(Task(map_part), tasks, f"mapping {len(parts)} parts")
     except BaseException:  # also Ctrl-C: the processes end when they see the file
@@ -459,11 +433,13 @@ def map_parts(
         raise
 
 
-def _prepare_part(members: Group, mapped: PoseGraph, place: Path, run: RunContext, *, asked: bool) -> PartTask:
-    """Write the inputs of a part, in a folder that is called after what they are."""
+def _prepare_part(
+    members: Group, mapped: PoseGraph, place: Path, run: RunContext, *, stop_at_false_joins: bool
+) -> PartTask:
+    """Write the inputs of a part into a folder named by their digest."""
     beside = place / INPUTS
     followed = frozenset(pair for pair in members.graph.poses if pair in mapped.poses)
-    write_inputs(beside, PartInputs(members, followed, run.settings, asked))
+    write_inputs(beside, PartInputs(members, followed, run.settings, stop_at_false_joins))
     folder = place / digest_file(beside)[:16]
     folder.mkdir(exist_ok=True)
     replace_file(beside, folder / INPUTS)
@@ -471,29 +447,25 @@ def _prepare_part(members: Group, mapped: PoseGraph, place: Path, run: RunContex
 
 
 def map_part(task: PartTask) -> PartResult:
-    """Map one part in a process of its own, and wait for it. Depends on nothing but the task.
-
-    Args:
-        task: names the folder of the part.
-    """
+    """Map one part in a separate process, and wait for it. Depends on nothing but the task."""
     folder = Path(task.folder)
     if not (folder / RESULT).exists():
         work: MappingTask = {"scratch": task.folder, "photos": task.photos, "seed": 0}
         try:
             with start_worker("sfm_app.mapping.part_process", work) as process:
-                while not process.has_ended(POLL_S):
+                while not process.has_ended(0.2):
                     if (folder.parent / STOP).exists():
                         return PartResult((), "", ("stopped",))
                 process.check("mapping a part")
         except BackendError as err:  # its photos are left to the other parts
             logger.info("a part was not mapped", exc_info=err)
             return PartResult((), "", (f"failed: {err}",))
-    known = json.loads((folder / RESULT).read_text(encoding="utf-8"))
+    result = json.loads((folder / RESULT).read_text(encoding="utf-8"))
     return PartResult(
-        tuple(str(folder / name) for name in known["models"]),
-        known["mapper"],
-        tuple(known["tried"]),
-        joins_from_plain(known["false_joins"]),
+        tuple(str(folder / name) for name in result["models"]),
+        result["mapper"],
+        tuple(result["tried"]),
+        joins_from_plain(result["false_joins"]),
     )
 
 

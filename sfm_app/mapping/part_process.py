@@ -11,7 +11,7 @@ from sfm_app.colmap.database import write_calibrations, write_match_graph, write
 from sfm_app.colmap.model import posed_photo_ids, submodel
 from sfm_app.colmap.worker_process import MappingTask, serve
 from sfm_app.files import replace_atomically
-from sfm_app.mapping.attempt import ENOUGH_SHARE, Attempt, Group, best_attempt, map_group
+from sfm_app.mapping.attempt import MAPPING, Attempt, Group, best_attempt, map_group
 from sfm_app.mapping.look_alikes import judge_places
 from sfm_app.mapping.part_mapping import INPUTS, RESULT, joins_to_plain, read_inputs
 from sfm_app.mapping.split_and_merge import sound_parts
@@ -21,33 +21,32 @@ from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import SubWorkspace, Workspace
 from sfm_app.types import PairId
 
-LEAST_PHOTOS = 3
-"""Smallest model that is worth joining: of two photos, nothing tells the scale."""
-
 
 def work(task: MappingTask) -> None:
-    """Map the part in the folder of the task, and write its models and what was tried beside its inputs."""
+    """Map the part in the folder of the task, and write its models and notes beside its inputs."""
     folder, photos = Path(task["scratch"]), Path(task["photos"])
-    given = read_inputs(folder / INPUTS)
+    inputs = read_inputs(folder / INPUTS)
     judge = cache(lambda attempt: judge_places([attempt])[0])
-    enough = ENOUGH_SHARE * len(given.part.photos)
+    enough = MAPPING.enough_share * len(inputs.part.photos)
     # a worker that was cut off from a cluster may still be at the same part
     with tempfile.TemporaryDirectory(dir=folder, prefix="mapping-") as own, make_executor(1) as executor:
         place = SubWorkspace(Workspace(photos.parent), relpath(own, photos.parent))
-        _write_database(place, given.part, given.mapped)
-        run = RunContext(given.settings, place, load_plugins(installed=False), executor, workers=1)
-        found = map_group(given.part, run, lambda one: given.asked and one.photos >= enough and bool(judge(one)))
+        _write_database(place, inputs.part, inputs.mapped)
+        run = RunContext(inputs.settings, place, load_plugins(installed=False), executor, workers=1)
+        attempts = map_group(
+            inputs.part, run, lambda one: inputs.stop_at_false_joins and one.photos >= enough and bool(judge(one))
+        )
     if (folder / RESULT).exists():
         return
-    best = best_attempt(found)
-    known = {
+    best = best_attempt(attempts)
+    result = {
         "models": [] if best is None else _write_models(best, folder),
         "mapper": "" if best is None else best.mapper,
-        "tried": [one.note for one in found],
+        "tried": [one.note for one in attempts],
         "false_joins": [] if best is None else joins_to_plain(judge(best)),
     }
     with replace_atomically(folder / RESULT) as path:
-        path.write_text(json.dumps(known), encoding="utf-8", newline="\n")
+        path.write_text(json.dumps(result), encoding="utf-8", newline="\n")
 
 
 def _write_database(place: Workspace, part: Group, mapped: frozenset[PairId]) -> None:
@@ -61,9 +60,8 @@ def _write_database(place: Workspace, part: Group, mapped: frozenset[PairId]) ->
 
 def _write_models(best: Attempt, folder: Path) -> list[str]:
     """Write the pieces of a model that its own matches do not contradict, and return the names of their folders."""
-    pieces = [
-        photos for photos in sound_parts(best.explained, posed_photo_ids(best.model)) if len(photos) >= LEAST_PHOTOS
-    ]
+    parts = sound_parts(best.explained, posed_photo_ids(best.model))
+    pieces = [photos for photos in parts if len(photos) >= 3]  # nothing determines the scale of two photos
     names = []
     for number, photos in enumerate(pieces):
         names.append(f"model-{number}")

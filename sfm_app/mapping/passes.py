@@ -1,6 +1,6 @@
 """Map every group of photos, learn cameras from the model, and map again where that may help."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,13 +9,12 @@ from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
 from sfm_app.colmap.model import cameras_by_photo, posed_photo_ids
 from sfm_app.mapping.attempt import (
-    ENOUGH_SHARE,
-    MIN_PHOTOS,
+    MAPPING,
     Attempt,
     Group,
     MappingResult,
     NoModel,
-    are_worth_another_try,
+    are_many_unregistered,
     best_attempt,
     choice_reason,
     map_group,
@@ -24,36 +23,44 @@ from sfm_app.mapping.attempt import (
     photo_names,
 )
 from sfm_app.mapping.hypotheses import (
-    can_have_own_cameras,
+    camera_per_photo_explains_more,
     guessed_intrinsics,
-    has_many_unplaced,
-    is_as_good,
-    is_better,
+    is_focal_doubtful,
+    is_shared_camera_doubtful,
     map_baseline,
     rival_reason,
+    two_cameras_suffice,
     with_camera_per_photo,
     with_two_cameras,
 )
 from sfm_app.mapping.look_alikes import (
-    MOST_FALSE_JOINS,
+    OVERLAPS,
     drop_look_alikes,
     judge_places,
     with_earlier_look_alikes,
     with_false_joins,
 )
-from sfm_app.mapping.parts import is_convincing, map_in_parts, part_size
-from sfm_app.mapping.split_and_merge import join_models, split_attempt
+from sfm_app.mapping.parts import map_in_parts, part_size, parts_suffice
+from sfm_app.mapping.split_and_merge import merge_into_main, split_attempt
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
 from sfm_app.runtime.context import RunContext
+from sfm_app.settings import SceneSettings
 from sfm_app.types import Calibration, Intrinsics, LookAlikes, MatchGraph, PoseGraph, ViewGraph
 
-MOST_PASSES = 4
-"""Largest number of passes over all pairs. On dinoSparseRing with learned features the second finds a focal of 3272
-(true 3318), and the third places all photos with it."""
-OTHER_FOCALS = (0.6, 2.4, 4.8)
-"""Guesses of the focal besides the usual one, in longer sides: steps of a factor of two over the range of cameras."""
-FOCAL_TOLERANCE = 0.01
-"""Relative change of a focal in mapping above which another pass over the pairs is worth it."""
+
+@dataclass(frozen=True, slots=True)
+class PassOptions:
+    """When mapping is repeated."""
+
+    max_passes: int = 4
+    """Largest number of passes over all pairs; dinoSparseRing needs three. Measured."""
+    other_focals: tuple[float, ...] = (0.6, 2.4, 4.8)
+    """Guesses of the focal besides the usual one, in longer sides: steps of a factor of two. Chosen by hand."""
+    focal_tolerance: float = 0.01
+    """Relative change of a focal in mapping above which another pass is worth it. Chosen by hand."""
+
+
+OPTIONS = PassOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,14 +73,14 @@ class Outcome:
     intrinsics: Intrinsics
     """Cameras that the models were mapped with."""
     tried: tuple[str, ...]
-    """Notes on all attempts, for people."""
+    """Notes on all attempts."""
     reason: str = ""
     """Why the attempt behind the main model was chosen."""
     cuts: tuple[str, ...] = ()
     """Names of the photos of each part of a model that was cut because matches contradict the join."""
     passes: int = 1
-    thin: str = ""
-    """Why a rival was tried; empty where the evidence was good."""
+    rival_reason: str = ""
+    """Why a rival was tried, if so."""
     one_camera_each: str = ""
     """Result of trying a camera for each photo: "taken", "left" (rejected), or "two" where two cameras explain as much;
     empty if it was not tried."""
@@ -89,285 +96,304 @@ class Outcome:
         return self.models[0].support if self.models else 0.0
 
 
-def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Outcome:
+@dataclass(frozen=True, slots=True)
+class Mappers:
+    """Functions that map a group and judge its model; tests pass others."""
+
+    part_size: Callable[[int, SceneSettings], int] = part_size
+    map_group: Callable[[Group, RunContext], list[MappingResult]] = map_group
+    map_in_parts: Callable[..., tuple[list[MappingResult], tuple[LookAlikes, ...]]] = map_in_parts
+    map_baseline: Callable[..., Attempt | NoModel] = map_baseline
+    judge_places: Callable[[Iterable[Attempt]], tuple[list[LookAlikes], int]] = judge_places
+
+
+MAPPERS = Mappers()
+
+
+def reconstruct(
+    matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext, mappers: Mappers = MAPPERS
+) -> Outcome:
     """Return models of all connected groups of photos; none where no pair grows into a model.
 
-    Where the evidence for a model is weak, a rival is mapped, and the model that explains more is kept. Where cameras
-    were guesses, or photos of the main group are missing, a second pass starts from the cameras that mapping found,
-    which correct relative poses that were wrong before. Passes are repeated as long as they improve the model.
-
-    Args:
-        matches: keypoints and raw matches.
-        views: fundamental matrices.
-        intrinsics: cameras from pairs.
-        run: the run.
+    Where the evidence for a model is weak, a rival is mapped, and the model that explains more stays. Where cameras
+    were guesses, or photos of the main group are missing, a second pass starts from the cameras of the model, which
+    correct relative poses. Passes are repeated as long as they improve the model.
     """
-    with translate_errors("entering photos"):
-        write_match_graph(run.workspace.database, matches)
-    best = _drop_false_joins(_run_pass(matches, views, intrinsics, run), matches, views, run)
-    matches, views = drop_look_alikes(matches, views, best.graph)
-    best = try_rival(best, matches, views, intrinsics, run)
-    best = _try_other_focals(best, matches, views, intrinsics, run)
-    best = _try_camera_per_photo(best, matches, views, intrinsics, run)
-    for number in range(2, MOST_PASSES + 1):
-        if not best.models or not is_pass_worthwhile(best, best.intrinsics, matches):
-            break
-        learned = learned_intrinsics(best.models[0], best.intrinsics, matches)
-        again = _run_pass(matches, views, learned, run)
-        if again.support <= best.support:
-            _write_graph(best.graph, best.intrinsics, matches, run)
-            break
-        graph, tried = with_earlier_look_alikes(again.graph, best.graph), best.tried + again.tried
-        best = replace(
-            again, passes=number, thin=best.thin, graph=graph, tried=tried, one_camera_each=best.one_camera_each
-        )
+    return Passes(run, mappers).reconstruct(matches, views, intrinsics)
+
+
+class Passes:
+    """Passes over all pairs of a run."""
+
+    def __init__(self, run: RunContext, mappers: Mappers = MAPPERS) -> None:
+        self.run, self.mappers = run, mappers
+
+    def reconstruct(self, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics) -> Outcome:
+        """Return models of all connected groups of photos, see `reconstruct`."""
+        with translate_errors("entering photos"):
+            write_match_graph(self.run.workspace.database, matches)
+        best = self._drop_false_joins(self.run_pass(matches, views, intrinsics), matches, views)
         matches, views = drop_look_alikes(matches, views, best.graph)
-    return _with_joined_models(best, matches, views, run)
+        best = self._try_rival(best, matches, views, intrinsics)
+        best = self._try_other_focals(best, matches, views, intrinsics)
+        best = self._try_camera_per_photo(best, matches, views, intrinsics)
+        for number in range(2, OPTIONS.max_passes + 1):
+            if not best.models or not needs_another_pass(best, best.intrinsics, matches):
+                break
+            learned = learned_intrinsics(best.models[0], best.intrinsics, matches)
+            again = self.run_pass(matches, views, learned)
+            if again.support <= best.support:
+                self._write_graph(best.graph, best.intrinsics, matches)
+                break
+            graph, tried = with_earlier_look_alikes(again.graph, best.graph), best.tried + again.tried
+            best = replace(
+                again,
+                passes=number,
+                rival_reason=best.rival_reason,
+                graph=graph,
+                tried=tried,
+                one_camera_each=best.one_camera_each,
+            )
+            matches, views = drop_look_alikes(matches, views, best.graph)
+        return self.merge_models(best, matches, views)
 
+    def _drop_false_joins(self, outcome: Outcome, matches: MatchGraph, views: ViewGraph) -> Outcome:
+        """Map again without pairs that merge two places, and return the outcome with fewer non-overlapping pairs.
 
-def _drop_false_joins(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: RunContext) -> Outcome:
-    """Map again without pairs that hold one place on top of another, and return the outcome with fewer strangers.
+        Where other pairs do not hold the photos together instead, as by day and by night, the joins stay, and are
+        doubtful.
+        """
+        joins, non_overlapping = self.mappers.judge_places(outcome.models)
+        for _ in range(OVERLAPS.max_passes):
+            if not joins:
+                return outcome
+            self.run.progress.say("two different places are merged in the model; remapping without the ambiguous pairs")
+            marked = with_false_joins(outcome.graph, joins)
+            again = self.run_pass(*drop_look_alikes(matches, views, marked), outcome.intrinsics)
+            joins_now, non_overlapping_now = self.mappers.judge_places(again.models)
+            tried = (*outcome.tried, *again.tried)
+            holds_together = (
+                again.main is not None and again.main.photos >= MAPPING.enough_share * outcome.models[0].photos
+            )
+            if not holds_together or 2 * non_overlapping_now > non_overlapping:
+                self._write_graph(outcome.graph, outcome.intrinsics, matches)
+                outcome = replace(outcome, tried=tried)
+                break
+            outcome = replace(again, graph=with_earlier_look_alikes(again.graph, marked), tried=tried)
+            joins, non_overlapping = joins_now, non_overlapping_now
+        return replace(outcome, graph=replace(outcome.graph, doubtful=(*outcome.graph.doubtful, *joins)))
 
-    Where other pairs do not hold the photos together instead, as by day and by night, the joins stay, and are doubtful.
-    """
-    joins, strangers = judge_places(outcome.models)
-    for _ in range(MOST_FALSE_JOINS):
-        if not joins:
+    def _try_rival(self, outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics) -> Outcome:
+        """Map a rival where the evidence is weak, and return the outcome with the model that explains more."""
+        main = outcome.main
+        reason = rival_reason(main, intrinsics, matches, views)
+        if not reason:
             return outcome
-        run.progress.say("the model has two places in one: mapping again without the look-alikes that join them")
-        marked = with_false_joins(outcome.graph, joins)
-        again = _run_pass(*drop_look_alikes(matches, views, marked), outcome.intrinsics, run)
-        joins_left, strangers_left = judge_places(again.models)
-        tried = (*outcome.tried, *again.tried)
-        kept = again.main is not None and again.main.photos >= ENOUGH_SHARE * outcome.models[0].photos
-        if not kept or 2 * strangers_left > strangers:
-            _write_graph(outcome.graph, outcome.intrinsics, matches, run)
-            outcome = replace(outcome, tried=tried)
-            break
-        outcome = replace(again, graph=with_earlier_look_alikes(again.graph, marked), tried=tried)
-        joins, strangers = joins_left, strangers_left
-    return replace(outcome, graph=replace(outcome.graph, doubtful=(*outcome.graph.doubtful, *joins)))
+        self.run.progress.say(f"also trying COLMAP's default pipeline (reason: {reason})")
+        rival = self.mappers.map_baseline(matches, views, intrinsics, self.run)
+        outcome = replace(outcome, rival_reason=reason, tried=(*outcome.tried, rival.note))
+        both = [attempt for attempt in (main, rival) if attempt is not None]
+        if isinstance(rival, NoModel) or best_attempt(both) is not rival:
+            return outcome
+        parts = split_attempt(rival)
+        taken = {photo for part in parts for photo in posed_photo_ids(part.model)}
+        others = [model for model in outcome.models if taken.isdisjoint(posed_photo_ids(model.model))]
+        models = sorted((*parts, *others), key=lambda attempt: (-attempt.photos, -attempt.support))
+        graph = self._update_graph(models, outcome.graph, matches)
+        self._write_graph(graph, intrinsics, matches)
+        return replace(
+            outcome, models=tuple(models), graph=graph, reason=choice_reason(rival, both, len(matches.images))
+        )
 
-
-def try_rival(
-    outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
-) -> Outcome:
-    """Map a rival where the evidence is weak, and return the outcome with the model that explains more.
-
-    Args:
-        outcome: models from relative poses.
-        matches, views, intrinsics, run: as in `reconstruct`.
-    """
-    main = outcome.main
-    thin = rival_reason(main, intrinsics, matches, views)
-    if not thin:
+    def _try_other_focals(
+        self, outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics
+    ) -> Outcome:
+        """Map with other guesses of the focal where many photos are unregistered, and return the best outcome."""
+        main = outcome.main
+        if not is_focal_doubtful(main, intrinsics, views):
+            return outcome
+        self.run.progress.say(
+            "many photos are unregistered and the focal length is a guess; trying other focal lengths"
+        )
+        for focal in OPTIONS.other_focals:
+            other = self.run_pass(matches, views, guessed_intrinsics(intrinsics, focal))
+            tried = (*outcome.tried, *(f"{note} (focal {focal:g} longer sides)" for note in other.tried))
+            outcome = replace(
+                other if other.support > outcome.support else outcome, rival_reason=outcome.rival_reason, tried=tried
+            )
+        if outcome.graph is not other.graph:
+            self._write_graph(outcome.graph, outcome.intrinsics, matches)
         return outcome
-    run.progress.say(f"COLMAP's own way is tried beside ours: {thin}")
-    rival = map_baseline(matches, views, intrinsics, run)
-    outcome = replace(outcome, thin=thin, tried=(*outcome.tried, rival.note))
-    both = [attempt for attempt in (main, rival) if attempt is not None]
-    if isinstance(rival, NoModel) or best_attempt(both) is not rival:
-        return outcome
-    parts = split_attempt(rival)
-    taken = {photo for part in parts for photo in posed_photo_ids(part.model)}
-    others = [model for model in outcome.models if taken.isdisjoint(posed_photo_ids(model.model))]
-    models = sorted((*parts, *others), key=lambda attempt: (-attempt.photos, -attempt.support))
-    graph = _update_graph(models, outcome.graph, matches, run)
-    _write_graph(graph, intrinsics, matches, run)
-    return replace(outcome, models=tuple(models), graph=graph, reason=choice_reason(rival, both, len(matches.images)))
+
+    def _try_camera_per_photo(
+        self, outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics
+    ) -> Outcome:
+        """Map with a camera for each photo where shared ones explain too little, and return the better outcome."""
+        main = outcome.main
+        if main is None or not is_shared_camera_doubtful(main, intrinsics, views, self.run.settings):
+            return outcome
+        each = with_camera_per_photo(main, intrinsics, matches)
+        if each is None:
+            return outcome
+        self.run.progress.say("a shared camera does not fit; trying one camera per photo")
+        own = self.run_pass(matches, views, each)
+        own = self._try_rival(own, matches, views, each)
+        tried = (*outcome.tried, *(f"{note} (a camera for each photo)" for note in own.tried))
+        if not camera_per_photo_explains_more(own.main, main):
+            self._write_graph(outcome.graph, outcome.intrinsics, matches)
+            return replace(outcome, tried=tried, one_camera_each="left")
+        return self._try_two_cameras(
+            replace(own, rival_reason=outcome.rival_reason, tried=tried, one_camera_each="taken"), matches, views, each
+        )
+
+    def _try_two_cameras(self, own: Outcome, matches: MatchGraph, views: ViewGraph, each: Intrinsics) -> Outcome:
+        """Map with two cameras instead of one for each photo, and return their outcome if they explain as much."""
+        between = with_two_cameras(own.models[0], each, matches)
+        if between is None:
+            return own
+        two = self.run_pass(matches, views, between)
+        tried = (*own.tried, *(f"{note} (two cameras)" for note in two.tried))
+        if two_cameras_suffice(two.main, own.models[0]):
+            return replace(two, rival_reason=own.rival_reason, tried=tried, one_camera_each="two")
+        self._write_graph(own.graph, own.intrinsics, matches)
+        return replace(own, tried=tried)
+
+    def merge_models(self, outcome: Outcome, matches: MatchGraph, views: ViewGraph) -> Outcome:
+        """Return the outcome with models joined where they share points."""
+        if len(outcome.models) < 2:
+            return outcome
+        models = merge_into_main(outcome.models, matches, views, self.run)
+        if len(models) == len(outcome.models):
+            return outcome
+        self.run.progress.say(f"merged models: {models[0].note}")
+        graph = self._update_graph(models[:1], outcome.graph, matches)
+        self._write_graph(graph, outcome.intrinsics, matches)
+        tried = (*outcome.tried, models[0].note)
+        return replace(outcome, models=models, graph=graph, tried=tried, reason=models[0].note)
+
+    def run_pass(
+        self, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, chances: int = OVERLAPS.max_passes
+    ) -> Outcome:
+        """Map all groups from new relative poses, again up to `chances` times where parts merge two places."""
+        epipolar = self.run.settings.epipolar
+        options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, self.run.seed)
+        graph = build_pose_graph(matches, views, intrinsics, options, self.run.map)
+        self._write_graph(graph, intrinsics, matches)
+        matches, views = drop_look_alikes(matches, views, graph)
+        models: list[Attempt] = []
+        reasons: dict[str, str] = {}
+        tried: list[str] = []
+        cuts: list[str] = []
+        for number, photos in enumerate(graph.groups):
+            if number and len(photos) < MAPPING.min_photos:
+                continue
+            attempts, joins = self.map_by_size(
+                Group(photos, matches, views, graph, intrinsics), stop_at_false_joins=chances > 0
+            )
+            if joins:
+                return self._run_pass_without(joins, graph, intrinsics, matches, views, chances - 1)
+            tried += [attempt.note for attempt in attempts]
+            best = best_attempt(attempts)
+            if best is not None:
+                reasons[best.note] = choice_reason(best, attempts, len(photos))
+                parts = split_attempt(best)
+                models += parts
+                cuts += [
+                    ", ".join(photo_names(sorted(posed_photo_ids(part.model)), matches))
+                    for part in parts
+                    if len(parts) > 1
+                ]
+        models.sort(key=lambda attempt: (-attempt.photos, -attempt.support))
+        reason = reasons[models[0].note] if models else ""
+        return Outcome(tuple(models), graph, intrinsics, tuple(tried), reason, tuple(cuts))
+
+    def _run_pass_without(
+        self,
+        joins: Sequence[LookAlikes],
+        graph: PoseGraph,
+        intrinsics: Intrinsics,
+        matches: MatchGraph,
+        views: ViewGraph,
+        chances: int,
+    ) -> Outcome:
+        """Run a pass without the false joins of parts, before any part is joined to others.
+
+        True pairs of the same corner come back with new relative poses. Where they do not hold most photos together,
+        the joins stay, and are doubtful.
+        """
+        self.run.progress.say("two different places are merged in a part; remapping without the ambiguous pairs")
+        marked = with_false_joins(graph, joins)
+        again = self.run_pass(*drop_look_alikes(matches, views, marked), intrinsics, chances)
+        if again.main is not None and again.main.photos >= MAPPING.enough_share * len(graph.groups[0]):
+            return replace(again, graph=with_earlier_look_alikes(again.graph, marked))
+        first = self.run_pass(matches, views, intrinsics, 0)
+        return replace(first, graph=replace(first.graph, doubtful=(*first.graph.doubtful, *joins)))
+
+    def map_by_size(
+        self, group: Group, *, stop_at_false_joins: bool
+    ) -> tuple[list[MappingResult], tuple[LookAlikes, ...]]:
+        """Map a large group in parts, and a small one, or one that parts do not explain, as a whole.
+
+        Return false joins within parts instead if they stop the mapping.
+        """
+        if not self.mappers.part_size(len(group.photos), self.run.settings.scene):
+            return self.mappers.map_group(group, self.run), ()
+        attempts, joins = self.mappers.map_in_parts(
+            group, pairs_to_map(group.graph), self.run, stop_at_false_joins=stop_at_false_joins
+        )
+        if joins or parts_suffice(attempts, len(group.photos)):
+            return attempts, joins
+        return [*attempts, *self.mappers.map_group(group, self.run)], ()
+
+    def _update_graph(self, models: Sequence[Attempt], graph: PoseGraph, matches: MatchGraph) -> PoseGraph:
+        """Return the pose graph with relative poses from models that were not mapped from it.
+
+        Later steps complete the tracks of these models along its pairs.
+        """
+        epipolar = self.run.settings.epipolar
+        for attempt in models:
+            poses = model_poses(attempt.model, matches, epipolar.max_error_px, epipolar.min_inliers)
+            graph = with_model(graph, set(posed_photo_ids(attempt.model)), poses)
+        return graph
+
+    def _write_graph(self, graph: PoseGraph, intrinsics: Intrinsics, matches: MatchGraph) -> None:
+        with translate_errors("writing relative poses"):
+            write_calibrations(self.run.workspace.database, matches, intrinsics)
+            write_pose_graph(self.run.workspace.database, matches, pairs_to_map(graph))
 
 
-def _try_other_focals(
-    outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
-) -> Outcome:
-    """Map with other guesses of the focal where many photos are unregistered, and return the best outcome."""
-    main = outcome.main
-    if not has_many_unplaced(main, intrinsics, views):
-        return outcome
-    run.progress.say("many photos have no place, and the focal length is a guess: other guesses are tried")
-    for focal in OTHER_FOCALS:
-        other = _run_pass(matches, views, guessed_intrinsics(intrinsics, focal), run)
-        tried = (*outcome.tried, *(f"{note} (focal {focal:g} longer sides)" for note in other.tried))
-        outcome = replace(other if other.support > outcome.support else outcome, thin=outcome.thin, tried=tried)
-    if outcome.graph is not other.graph:
-        _write_graph(outcome.graph, outcome.intrinsics, matches, run)
-    return outcome
+def needs_another_pass(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:
+    """Return whether another pass with the cameras of the model may improve it.
 
-
-def _try_camera_per_photo(
-    outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
-) -> Outcome:
-    """Map with a camera for each photo where shared ones explain too little, and return the better outcome."""
-    main = outcome.main
-    if main is None or not can_have_own_cameras(main, intrinsics, views, run.settings):
-        return outcome
-    each = with_camera_per_photo(main, intrinsics, matches)
-    if each is None:
-        return outcome
-    run.progress.say("one camera for all photos of a size does not explain them: one for each is tried")
-    own = _run_pass(matches, views, each, run)
-    own = try_rival(own, matches, views, each, run)
-    tried = (*outcome.tried, *(f"{note} (a camera for each photo)" for note in own.tried))
-    if not is_better(own.main, main):
-        _write_graph(outcome.graph, outcome.intrinsics, matches, run)
-        return replace(outcome, tried=tried, one_camera_each="left")
-    return _try_two_cameras(
-        replace(own, thin=outcome.thin, tried=tried, one_camera_each="taken"), matches, views, each, run
-    )
-
-
-def _try_two_cameras(own: Outcome, matches: MatchGraph, views: ViewGraph, each: Intrinsics, run: RunContext) -> Outcome:
-    """Map with two cameras instead of one for each photo, and return their outcome if they explain as much."""
-    between = with_two_cameras(own.models[0], each, matches)
-    if between is None:
-        return own
-    two = _run_pass(matches, views, between, run)
-    tried = (*own.tried, *(f"{note} (two cameras)" for note in two.tried))
-    if is_as_good(two.main, own.models[0]):
-        return replace(two, thin=own.thin, tried=tried, one_camera_each="two")
-    _write_graph(own.graph, own.intrinsics, matches, run)
-    return replace(own, tried=tried)
-
-
-def _with_joined_models(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: RunContext) -> Outcome:
-    """Return the outcome with models joined where they share points."""
-    if len(outcome.models) < 2:
-        return outcome
-    models = join_models(outcome.models, matches, views, run)
-    if len(models) == len(outcome.models):
-        return outcome
-    run.progress.say(f"models were joined: {models[0].note}")
-    graph = _update_graph(models[:1], outcome.graph, matches, run)
-    _write_graph(graph, outcome.intrinsics, matches, run)
-    tried = (*outcome.tried, models[0].note)
-    return replace(outcome, models=models, graph=graph, tried=tried, reason=models[0].note)
-
-
-def is_pass_worthwhile(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:
-    """Return whether another pass with the cameras that mapping found may improve the model.
-
-    That is so if these cameras differ from those of the last pass, or if photos of the main group are missing.
-
-    Args:
-        outcome: outcome of the last pass; has a model.
-        intrinsics: cameras that it was mapped with.
-        matches: all photos.
+    That is so if they differ from the cameras of the last pass, or if photos of the main group are missing.
     """
     main = outcome.models[0]
     placed = posed_photo_ids(main.model)
-    if len(placed) < MIN_PHOTOS:
+    if len(placed) < MAPPING.min_photos:
         return False
     learned = learned_intrinsics(main, intrinsics, matches)
     used = {intrinsics.camera_name(matches.images[photo]) for photo in placed}
-    news = any(_has_changed(intrinsics.cameras[name], learned.cameras[name]) for name in used)
+    is_focal_new = any(_has_new_focal(intrinsics.cameras[name], learned.cameras[name]) for name in used)
     anywhere = {photo for model in outcome.models for photo in posed_photo_ids(model.model)}
     group = set(outcome.graph.connected_photos(placed[0]))
-    return news or are_worth_another_try(len(group - anywhere), len(group))
+    return is_focal_new or are_many_unregistered(len(group - anywhere), len(group))
 
 
 def learned_intrinsics(model: Attempt, intrinsics: Intrinsics, matches: MatchGraph) -> Intrinsics:
-    """Return the cameras with those of a model's photos replaced by what mapping found.
-
-    Args:
-        model: gives the cameras of its photos.
-        intrinsics: cameras before mapping, of all photos.
-        matches: all photos.
-    """
+    """Replace the cameras of the photos of a model by its own."""
     with translate_errors("reading cameras"):
-        found = cameras_by_photo(model.model)
+        learned = cameras_by_photo(model.model)
     cameras = dict(intrinsics.cameras)
-    for photo, camera in found.items():
+    for photo, camera in learned.items():
         name = intrinsics.camera_name(matches.images[photo])
-        before = intrinsics.cameras[name]
-        if before.is_kept:
+        earlier = intrinsics.cameras[name]
+        if earlier.is_kept:
             continue
         # mapping holds a lens with all terms as it was given
-        lens = before if before.distortion else replace(before, radial=camera.radial, fisheye=camera.fisheye)
+        lens = earlier if earlier.distortion else replace(earlier, radial=camera.radial, fisheye=camera.fisheye)
         cameras[name] = replace(lens, K=camera.K, identifiable=True, reason="", method="mapping")
     return replace(intrinsics, cameras=cameras)
 
 
-def _has_changed(before: Calibration, after: Calibration) -> bool:
-    return not before.is_estimated or abs(float(np.log(after.focal_px / before.focal_px))) > FOCAL_TOLERANCE
-
-
-def _run_pass(
-    matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext, chances: int = MOST_FALSE_JOINS
-) -> Outcome:
-    """Map all groups from new relative poses, again up to `chances` times where parts have two places in one."""
-    epipolar = run.settings.epipolar
-    options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, run.seed)
-    graph = build_pose_graph(matches, views, intrinsics, options, run.map)
-    _write_graph(graph, intrinsics, matches, run)
-    matches, views = drop_look_alikes(matches, views, graph)
-    models: list[Attempt] = []
-    reasons: dict[str, str] = {}
-    tried: list[str] = []
-    cuts: list[str] = []
-    for number, photos in enumerate(graph.groups):
-        if number and len(photos) < MIN_PHOTOS:
-            continue
-        found, joins = _map_by_size(Group(photos, matches, views, graph, intrinsics), run, asked=chances > 0)
-        if joins:
-            return _run_pass_without(joins, graph, intrinsics, (matches, views), run, chances - 1)
-        tried += [attempt.note for attempt in found]
-        best = best_attempt(found)
-        if best is not None:
-            reasons[best.note] = choice_reason(best, found, len(photos))
-            parts = split_attempt(best)
-            models += parts
-            cuts += [
-                ", ".join(photo_names(sorted(posed_photo_ids(part.model)), matches)) for part in parts if len(parts) > 1
-            ]
-    models.sort(key=lambda attempt: (-attempt.photos, -attempt.support))
-    reason = reasons[models[0].note] if models else ""
-    return Outcome(tuple(models), graph, intrinsics, tuple(tried), reason, tuple(cuts))
-
-
-def _run_pass_without(
-    joins: Sequence[LookAlikes], graph: PoseGraph, intrinsics: Intrinsics, pairs: tuple[MatchGraph, ViewGraph],
-    run: RunContext, chances: int,
-) -> Outcome:  # fmt: skip
-    """Run a pass without the false joins that parts have shown, before any is joined to others.
-
-    The true pairs of the same corner had contradicted them, and come back with new relative poses. Where they do not
-    hold most photos together, the joins stay, and are doubtful.
-    """
-    run.progress.say("parts have two places in one: mapping again without the look-alikes that join them")
-    marked = with_false_joins(graph, joins)
-    again = _run_pass(*drop_look_alikes(*pairs, marked), intrinsics, run, chances)
-    if again.main is not None and again.main.photos >= ENOUGH_SHARE * len(graph.groups[0]):
-        return replace(again, graph=with_earlier_look_alikes(again.graph, marked))
-    first = _run_pass(*pairs, intrinsics, run, 0)
-    return replace(first, graph=replace(first.graph, doubtful=(*first.graph.doubtful, *joins)))
-
-
-def _map_by_size(group: Group, run: RunContext, *, asked: bool) -> tuple[list[MappingResult], tuple[LookAlikes, ...]]:
-    """Map a large group in parts, and a small one, or one that parts do not explain, as a whole.
-
-    Parts that are asked may show false joins instead.
-    """
-    if not part_size(len(group.photos), run.settings.scene):
-        return map_group(group, run), ()
-    found, joins = map_in_parts(group, pairs_to_map(group.graph), run, asked=asked)
-    if joins or is_convincing(found, len(group.photos)):
-        return found, joins
-    return [*found, *map_group(group, run)], ()
-
-
-def _update_graph(models: Sequence[Attempt], graph: PoseGraph, matches: MatchGraph, run: RunContext) -> PoseGraph:
-    """Return the pose graph with relative poses from models that were not mapped from it.
-
-    Later steps complete the tracks of these models along its pairs.
-    """
-    epipolar = run.settings.epipolar
-    for attempt in models:
-        poses = model_poses(attempt.model, matches, epipolar.max_error_px, epipolar.min_inliers)
-        graph = with_model(graph, set(posed_photo_ids(attempt.model)), poses)
-    return graph
-
-
-def _write_graph(graph: PoseGraph, intrinsics: Intrinsics, matches: MatchGraph, run: RunContext) -> None:
-    with translate_errors("writing relative poses"):
-        write_calibrations(run.workspace.database, matches, intrinsics)
-        write_pose_graph(run.workspace.database, matches, pairs_to_map(graph))
+def _has_new_focal(before: Calibration, after: Calibration) -> bool:
+    return not before.is_estimated or abs(float(np.log(after.focal_px / before.focal_px))) > OPTIONS.focal_tolerance

@@ -2,7 +2,7 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from pathlib import Path
 
@@ -14,20 +14,30 @@ from sfm_app.colmap.bundle import adjust_or_keep
 from sfm_app.colmap.joined_model import merge_models
 from sfm_app.colmap.model import points_by_keypoint, posed_images, posed_photo_ids, submodel
 from sfm_app.geometry.poses import robust_similarity
-from sfm_app.mapping.attempt import MIN_PHOTOS, Attempt, NoModel, PairSupport, judge_model
+from sfm_app.mapping.attempt import MAPPING, Attempt, NoModel, PairSupport, judge_model
 from sfm_app.numerical import FAILURES
 from sfm_app.posegraph.rotations import DisjointGroups
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import MatchGraph, PairId, ViewGraph
 from sfm_app.types.arrays import FloatArray
 
-# Divide a model where its joins contradict the evidence.
-#
-# Facades that look alike join places that are apart. Such a join rests on few matches and leaves many others
-# unexplained: those of pairs that see the true layout.
+# Cuts. A false join of similar facades rests on few matches, and leaves many others unexplained: those of pairs that
+# see the true layout.
 
-LEAST_MATCHES = 16
-"""Smallest number of matches with which a pair can join two parts."""
+
+@dataclass(frozen=True, slots=True)
+class SplitOptions:
+    """When models are cut or merged, and when a scale is loose."""
+
+    min_matches: int = 16
+    """Least matches with which a pair can join two parts. Chosen by hand."""
+    min_shared: int = 8
+    """Least shared points for a merge: three determine a similarity. Chosen by hand."""
+    min_common_points: int = 5
+    """Points of two placed photos and the next one, below which the scale between them is undetermined. Measured."""
+
+
+OPTIONS = SplitOptions()
 
 
 def sound_parts(explained: Mapping[PairId, PairSupport], photos: Iterable[int]) -> list[tuple[int, ...]]:
@@ -35,43 +45,39 @@ def sound_parts(explained: Mapping[PairId, PairSupport], photos: Iterable[int]) 
 
     Pairs are taken strongest first; two parts become one when the matches between them that the model explains
     outnumber the inliers of fundamental matrices between them that it does not.
-
-    Args:
-        explained: explained and contradicting matches of each pair.
-        photos: ids of the photos to divide.
     """
     groups = DisjointGroups(photos)
-    worth = {pair: found.matches - found.contradicted for pair, found in explained.items()}
-    between = _joins(worth)
-    for a, b in sorted(worth, key=lambda pair: (-worth[pair], pair)):
+    weights = {pair: pair_support.matches - pair_support.contradicted for pair, pair_support in explained.items()}
+    between = _joins(weights)
+    for a, b in sorted(weights, key=lambda pair: (-weights[pair], pair)):
         first, second = groups.name[a], groups.name[b]
-        if first == second or worth[a, b] < LEAST_MATCHES or between[first][second] <= 0:
+        if first == second or weights[a, b] < OPTIONS.min_matches or between[first][second] <= 0:
             continue
         groups.join(a, b)
-        kept = groups.name[a]
-        gone = second if kept == first else first
-        _merge_joins(between, kept, gone)
+        larger = groups.name[a]
+        smaller = second if larger == first else first
+        _merge_joins(between, larger, smaller)
     parts = [tuple(sorted(members)) for members in groups.members.values()]
     return sorted(parts, key=lambda members: (-len(members), members))
 
 
-def _joins(worth: Mapping[PairId, int]) -> defaultdict[int, Counter[int]]:
-    """Return for every photo the worth of its significant pairs by the other photo."""
-    found: defaultdict[int, Counter[int]] = defaultdict(Counter)
-    for (a, b), value in worth.items():
-        if abs(value) >= LEAST_MATCHES:
-            found[a][b] += value
-            found[b][a] += value
-    return found
+def _joins(weights: Mapping[PairId, int]) -> defaultdict[int, Counter[int]]:
+    """Return by photo the weight of its significant pairs, by the other photo."""
+    joins: defaultdict[int, Counter[int]] = defaultdict(Counter)
+    for (a, b), value in weights.items():
+        if abs(value) >= OPTIONS.min_matches:
+            joins[a][b] += value
+            joins[b][a] += value
+    return joins
 
 
-def _merge_joins(between: defaultdict[int, Counter[int]], kept: int, gone: int) -> None:
-    """Add the joins of a part that has become one with another."""
-    for other, value in between.pop(gone).items():
-        if other != kept:
-            between[kept][other] += value
-            between[other][kept] += value
-        del between[other][gone]
+def _merge_joins(between: defaultdict[int, Counter[int]], larger: int, smaller: int) -> None:
+    """Add the joins of a part that is now one with another."""
+    for other, value in between.pop(smaller).items():
+        if other != larger:
+            between[larger][other] += value
+            between[other][larger] += value
+        del between[other][smaller]
 
 
 def split_attempt(attempt: Attempt) -> list[Attempt]:
@@ -82,43 +88,31 @@ def split_attempt(attempt: Attempt) -> list[Attempt]:
     parts = sound_parts(attempt.explained, posed_photo_ids(attempt.model))
     if len(parts) == 1:
         return [attempt]
-    kept = [part for number, part in enumerate(parts) if len(part) >= (2 if number == 0 else MIN_PHOTOS)]
+    large = [part for number, part in enumerate(parts) if len(part) >= (2 if number == 0 else MAPPING.min_photos)]
     with translate_errors("dividing a model"):
-        return [_part(attempt, part) for part in kept]
+        return [_part(attempt, part) for part in large]
 
 
 def _part(attempt: Attempt, photos: Sequence[int]) -> Attempt:
     members = set(photos)
-    explained = {pair: found for pair, found in attempt.explained.items() if members.issuperset(pair)}
+    explained = {pair: pair_support for pair, pair_support in attempt.explained.items() if members.issuperset(pair)}
     return replace(attempt, model=submodel(attempt.model, photos), explained=explained)
 
 
-# Join models that see the same points by a similarity.
-#
-# Mapping ends where the next photo shares too little with the photos before it. Two models that grew from either
-# end may still share points: matches between their photos that both models have triangulated. Three such points
-# determine the similarity between the models; the others, and the pairs between the models, verify it.
-
-LEAST_SHARED = 8
-"""Smallest number of shared points for a join: three determine a similarity, twice as many may be wrong."""
+# Merges. Mapping ends where the next photo shares too little with the photos before it. Two models that grew from
+# either end may still share triangulated points. Three of them determine the similarity between the models; the
+# others, and the pairs between the models, verify it.
 
 
-def join_models(
+def merge_into_main(
     models: tuple[Attempt, ...], matches: MatchGraph, views: ViewGraph, run: RunContext
 ) -> tuple[Attempt, ...]:
-    """Join to the first model all others that can be joined; the rest stay unchanged.
-
-    Args:
-        models: the main model first; no two hold the same photo.
-        matches: keypoints and raw matches.
-        views: fundamental matrices; their inliers are the points that models may share.
-        run: the run.
-    """
+    """Join to the main model, the first, all others that fit; the rest stay unchanged. No two hold one photo."""
     main, others = models[0], list(models[1:])
     waiting = list(others)
     while waiting:
         other = waiting.pop(0)
-        together = _join_pair(main, other, matches, views, run)
+        together = _merge_pair(main, other, matches, views, run)
         if together is not None:
             main = together
             others.remove(other)
@@ -126,12 +120,12 @@ def join_models(
     return (main, *others)
 
 
-def _join_pair(
+def _merge_pair(
     first: Attempt, second: Attempt, matches: MatchGraph, views: ViewGraph, run: RunContext
 ) -> Attempt | None:
-    """Join both models; return None where they share too few points, or matches contradict the join."""
+    """Join both models; return None where they share too few points, or matches contradict the merge."""
     shared = shared_points(first.model, second.model, matches, views)
-    if len(shared) < LEAST_SHARED:
+    if len(shared) < OPTIONS.min_shared:
         return None
     try:
         similarity = robust_similarity(shared[:, 3:], shared[:, :3])
@@ -142,35 +136,29 @@ def _join_pair(
         model = merge_models(database, first.model, second.model, similarity)
     model = adjust_or_keep(model, database).model
     how = f"{first.photos} and {second.photos} photos joined by {len(shared)} points"
-    found = judge_model(matches, views, (first.mapper, how), model, run)
+    attempt = judge_model(matches, views, first.mapper, how, model, run)
     if (
-        isinstance(found, NoModel)
-        or found.photos < first.photos + second.photos
-        or found.support <= first.support + second.support
+        isinstance(attempt, NoModel)
+        or attempt.photos < first.photos + second.photos
+        or attempt.support <= first.support + second.support
     ):
         return None
-    one = len(sound_parts(found.explained, posed_photo_ids(found.model))) == 1
-    return replace(found, note=how) if one else None
+    is_whole = len(sound_parts(attempt.explained, posed_photo_ids(attempt.model))) == 1
+    return replace(attempt, note=how) if is_whole else None
 
 
 def shared_points(first: Reconstruction, second: Reconstruction, matches: MatchGraph, views: ViewGraph) -> FloatArray:
-    """Return (N, 6) points that both models hold, in the frame of the first and of the second; each only once.
-
-    Args:
-        first, second: models that share no photo.
-        matches: keypoints and raw matches.
-        views: fundamental matrices; only their inliers are used.
-    """
+    """Return (N, 6) points that both models hold, in the frame of the first and of the second; each only once."""
     here, there = points_by_keypoint(first), points_by_keypoint(second)
-    found = {}
+    points = {}
     for a, b in _pairs_between(views, {photo for photo, _ in here}, {photo for photo, _ in there}):
         pair = min(a, b), max(a, b)
         for row in matches.matches[pair][views.fits[pair].inliers]:
             row_of = dict(zip(pair, map(int, row), strict=True))
             one, other = here.get((a, row_of[a])), there.get((b, row_of[b]))
             if one is not None and other is not None:
-                found[one[0]] = np.concatenate([one[1], other[1]])
-    return np.array([found[key] for key in sorted(found)]).reshape(-1, 6)
+                points[one[0]] = np.concatenate([one[1], other[1]])
+    return np.array([points[key] for key in sorted(points)]).reshape(-1, 6)
 
 
 def _pairs_between(views: ViewGraph, here: set[int], there: set[int]) -> Iterator[tuple[int, int]]:
@@ -182,16 +170,8 @@ def _pairs_between(views: ViewGraph, here: set[int], there: set[int]) -> Iterato
             yield b, a
 
 
-# Find parts of a model whose scale depends on a few points.
-#
-# Two photos do not determine the distance between them. The relative scale of a third photo comes from points that
-# all three see. Where a part shares hardly any of them with the rest, its points may fit well and its scale still
-# be wrong.
-
-MIN_SHARED_POINTS = 5
-"""Number of points seen by two placed photos and the next one, below which the scale between them is undetermined: a
-pose takes three, two more contradict a wrong one. Of the photo sets only temple16 with every second photo (0; its
-centers are a third off) and dinoSparseRing (2) have fewer; right models of castle-P19 and temple16 have 8."""
+# Loose scales. The relative scale of a third photo comes from points that all three see. Where a part shares hardly any
+# of them with the rest, its points may fit well and its scale still be wrong.
 
 
 def weakly_joined_parts(model: Reconstruction) -> list[list[str]]:
@@ -203,10 +183,10 @@ def weakly_joined_parts(model: Reconstruction) -> list[list[str]]:
         names = {image.image_id: image.name for image in posed_images(model)}
         tracks = [{element.image_id for element in point.track.elements} for _, point in all_points(model)]
     photos = sorted(names)
-    seen = _visibility_matrix(tracks, photos)
+    visibility = _visibility_matrix(tracks, photos)
     parts: list[list[str]] = [[]]
-    for photo, known in _joining_order(seen):
-        if known < MIN_SHARED_POINTS:
+    for photo, known in _joining_order(visibility):
+        if known < OPTIONS.min_common_points:
             parts.append([])
         parts[-1].append(names[photos[photo]])
     return [sorted(part) for part in parts[1:]]
@@ -220,43 +200,41 @@ def _visibility_matrix(tracks: list[set[int]], photos: list[int]) -> csr_array:
     return csr_array((np.ones(len(columns), np.int32), columns, ends), shape=(len(tracks), len(photos)))
 
 
-def _joining_order(seen: csr_array) -> list[tuple[int, int]]:
+def _joining_order(visibility: csr_array) -> list[tuple[int, int]]:
     """Return the photos from the third on in joining order, each with its number of shared points."""
-    points, photos = seen.shape
+    points, photos = visibility.shape
     if photos < 3 or points == 0:
         return []
-    growth = _Growth(seen)
+    growth = _Growth(visibility)
     for photo in growth.best_pair():
         growth.join(photo)
     joined = []
-    while growth.left:
+    while growth.remaining:
         count, photo = heappop(growth.waiting)
-        if photo in growth.left and -count == growth.known[photo]:
+        if photo in growth.remaining and -count == growth.known[photo]:
             joined.append((photo, -count))
             growth.join(photo)
     return joined
 
 
 class _Growth:
-    """Photos that have joined a model, and what the others see of it.
-
-    Args:
-        seen: (P, N) with 1 where a point is seen by a photo.
+    """Photos that have joined a model, and the points of the others in it; `seen` (P, N) is 1 where a photo sees a
+    point.
     """
 
-    def __init__(self, seen: csr_array) -> None:
-        self.seen, self.by_photo = seen, seen.T.tocsr()
-        points, photos = seen.shape
+    def __init__(self, visibility: csr_array) -> None:
+        self.visibility, self.by_photo = visibility, visibility.T.tocsr()
+        points, photos = visibility.shape
         self.views = np.zeros(points, np.int64)
         self.known = np.zeros(photos, np.int64)
         """Points seen by a photo and by two that have joined."""
-        self.left = set(range(photos))
+        self.remaining = set(range(photos))
         self.waiting = [(0, photo) for photo in range(photos)]
         """Heap of photos by their number of known points; entries that have changed are out of date."""
 
     def best_pair(self) -> tuple[int, int]:
         """Return the two photos that share most points."""
-        together = csr_array(triu(self.by_photo @ self.seen, k=1)).tocoo()
+        together = csr_array(triu(self.by_photo @ self.visibility, k=1)).tocoo()
         i, j = together.coords
         best = np.lexsort((j, i, -together.data))[:1]
         return (int(i[best[0]]), int(j[best[0]])) if len(best) else (0, 1)
@@ -265,8 +243,8 @@ class _Growth:
         """Add a photo."""
         own = self.by_photo.indices[self.by_photo.indptr[photo] : self.by_photo.indptr[photo + 1]]
         self.views[own] += 1
-        now = self.seen[own[self.views[own] == 2]]  # the points that have just become known
-        for other, more in zip(*np.unique(now.indices, return_counts=True), strict=True):
+        newly_known = self.visibility[own[self.views[own] == 2]]  # the points that have just become known
+        for other, more in zip(*np.unique(newly_known.indices, return_counts=True), strict=True):
             self.known[other] += more
             heappush(self.waiting, (-int(self.known[other]), int(other)))
-        self.left.discard(photo)
+        self.remaining.discard(photo)

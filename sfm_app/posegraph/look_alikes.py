@@ -1,14 +1,14 @@
 """Detection of equal things in different places, before mapping.
 
 Photos of two equal cans on a table have a relative pose as good as any, and its rotation may agree with the other
-pairs. The path between the cans distinguishes them: along the pairs that share most of their content (`coverage`), the
+pairs. The path between the cans distinguishes them: along the pairs that share most of their content (`coverages`), the
 points of the first can leave the view, and those of the second are new ones. Therefore
 
 1. the pairs of the backbone join matches into tracks;
 2. a pair with many matches on such tracks, but hardly any with both ends on the same track, contradicts the backbone:
    it closes a loop, or joins look-alikes;
 3. such pairs between the same two places are judged together: if they were one place, the surroundings of the things
-   would have matches, too (`missing`). In a loop they have.
+   would have matches, too. In a loop they have.
 
 Zach et al. 2010 and Heinly et al. 2014 test for missing matches; Wilson and Snavely 2013 and Yan et al. 2017 test how
 tracks and paths of photos are connected. Both are needed: a wide baseline misses many matches, and a loop loses its
@@ -30,21 +30,55 @@ from sfm_app.posegraph.rotations import DisjointGroups, average_rotations
 from sfm_app.types import Calibration, LookAlikes, MatchGraph, PairId, RelativePose
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-# The share of their content that two photos have in common, and the backbone of pairs that have most of it.
-#
-# Neighbors on a walk share most of what the rest of the set knows about either of them. Photos of equal things in
-# different places share only the things, however many matches these give, and nothing around them.
+# Coverage and backbone. Neighbors on a walk share most of the content that the set knows of either. Photos of equal
+# things in different places share only the things, however many matches these give, and nothing around them.
 
-CELLS = 12
-"""Cells along the longer side of a photo. 16 give the same on oats23 and books21; with 24 one wrong pair enters the
-backbone of oats23, and nothing is found there. docs/algorithms.md, Look-alikes."""
-MIN_OTHER_PHOTOS = 2
-"""A keypoint is known to the set if it has partners in this many photos besides that of the pair. Chosen by hand;
-halved and doubled by `benchmarks.sensitivity`."""
-BACKBONE_SHARE = 0.9
-"""A pair belongs to the backbone if its coverage is at least this share of that of the weakest pair on the best path
-between its photos. On oats23 and books21 equal things in different places reach 0.84 at most. docs/algorithms.md,
-Look-alikes."""
+
+@dataclass(frozen=True, slots=True)
+class LookAlikeOptions:
+    """Detection of look-alikes; docs/algorithms.md, Look-alikes, has the measurements."""
+
+    min_other_photos: int = 2
+    """Photos besides those of the pair in which a known keypoint has partners. Chosen by hand."""
+    backbone_share: float = 0.9
+    """Least coverage of a backbone pair, as a share of that of the weakest pair on the best path. Measured."""
+    min_tracked: int = 30
+    """Least matches with both ends on tracks for a pair to be tested. Chosen by hand."""
+    min_tracked_nearby: int = 15
+    """The same for a pair beside known look-alikes. Chosen by hand."""
+    same_track_share: float = 0.02
+    """Share of tracked matches on the same track up to which a pair contradicts the backbone. Measured."""
+    confirmed_share: float = 0.1
+    """Share of tracked matches on the same track that confirms a pair. Chosen by hand."""
+    low_percentile: float = 25.0
+    """Percentile, over photos, of the missing share of expected cells that the limits concern. Measured."""
+    max_missing: float = 0.2
+    """Missing share above which pairs join look-alikes. Measured."""
+    max_missing_same_rotation: float = 0.3
+    """The same where the rotation of the pairs agrees with the path between them. Measured."""
+    same_rotation_deg: float = 3.0
+    """Largest median angle of such agreement. Measured."""
+    min_cells: int = 15
+    """Least expected cells of a photo for missing cells to be evidence. Chosen by hand."""
+    min_photos: int = 3
+    """Least number of such photos of a join. Chosen by hand."""
+    max_view_change_deg: float = 20.0
+    """Largest change of viewing angle at which a point is matched again. Measured."""
+    max_scale: float = 1.5
+    """Largest change of scale at which a point is matched again. Measured."""
+    border: float = 0.05
+    """Share of width and height: points that project this near the border may be outside. Chosen by hand."""
+    wide_rad: float = 0.2
+    """Radians; depths from wider angles get no more weight. Chosen by hand."""
+    min_common_points: int = 8
+    """Least points that two pairs of a photo must share for a relative scale. Chosen by hand."""
+    min_cell_points: int = 2
+    """A cell with fewer expected points expects no match. Chosen by hand."""
+    cells: int = 12
+    """Cells along the longer side of a photo. Measured."""
+
+
+OPTIONS = LookAlikeOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,57 +87,47 @@ class Visibility:
 
     rows: Mapping[PairId, IndexArray]
     """By pair, (N, 2) keypoints of its inliers in photo 1 and photo 2."""
-    seen: Mapping[int, IndexArray]
+    partners: Mapping[int, IndexArray]
     """By photo, (K,) number of other photos in which each keypoint has a partner."""
     cells: Mapping[int, IndexArray]
     """By photo, (K,) number of the cell of each keypoint."""
 
 
 def compute_visibility(matches: MatchGraph, poses: Mapping[PairId, RelativePose]) -> Visibility:
-    """Collect the inliers of all pairs, their counts by keypoint, and the cells of all keypoints.
-
-    Args:
-        matches: keypoints and raw matches.
-        poses: relative poses by pair, with their inliers.
-    """
+    """Collect the inliers of all pairs, their counts by keypoint, and the cells of all keypoints."""
     rows = {pair: matches.matches[pair][pose.inliers].astype(np.int64) for pair, pose in poses.items()}
     photos = sorted({photo for pair in poses for photo in pair})
-    seen = {photo: np.zeros(len(matches.keypoints[photo]), np.int64) for photo in photos}
-    for pair, found in rows.items():
-        for photo, column in zip(pair, found.T, strict=True):
-            seen[photo][np.unique(column)] += 1
+    partners = {photo: np.zeros(len(matches.keypoints[photo]), np.int64) for photo in photos}
+    for pair, inliers in rows.items():
+        for photo, column in zip(pair, inliers.T, strict=True):
+            partners[photo][np.unique(column)] += 1
     images = matches.images
     cells = {
         photo: cell_numbers(matches.keypoints[photo], images[photo].width, images[photo].height) for photo in photos
     }
-    return Visibility(rows, seen, cells)
+    return Visibility(rows, partners, cells)
 
 
 def cell_numbers(x: NDArray[np.float64], width: int, height: int) -> IndexArray:
-    """Return the numbers (N,) of the cells of a photo in which pixels lie, less than (`CELLS` + 1) squared.
-
-    Args:
-        x: (N, 2) pixels inside the photo.
-        width, height: of the photo.
-    """
-    columns, lines = (x // (max(width, height) / CELLS)).astype(np.int64).T
-    return np.asarray(lines * (CELLS + 1) + columns, np.int64)
+    """Return the numbers (N,) of the cells of pixels (N, 2) inside a photo, less than (`cells` + 1) squared."""
+    columns, lines = (x // (max(width, height) / OPTIONS.cells)).astype(np.int64).T
+    return np.asarray(lines * (OPTIONS.cells + 1) + columns, np.int64)
 
 
-def coverages(sight: Visibility) -> dict[PairId, float]:
+def coverages(visibility: Visibility) -> dict[PairId, float]:
     """Return by pair the share of the known cells that it covers, mean over its two photos, 0 to 1."""
-    found = {}
-    for pair, rows in sight.rows.items():
+    covered_shares = {}
+    for pair, rows in visibility.rows.items():
         shares = []
         for photo, column in zip(pair, rows.T, strict=True):
-            seen, cells = sight.seen[photo], sight.cells[photo]
-            hit = np.zeros(len(seen), np.bool_)
+            partners, cells = visibility.partners[photo], visibility.cells[photo]
+            hit = np.zeros(len(partners), np.bool_)
             hit[column] = True
             covered = np.unique(cells[hit])
-            known = np.unique(cells[hit | (seen >= MIN_OTHER_PHOTOS)])
+            known = np.unique(cells[hit | (partners >= OPTIONS.min_other_photos)])
             shares.append(len(covered) / len(known))
-        found[pair] = float(np.mean(shares))
-    return found
+        covered_shares[pair] = float(np.mean(shares))
+    return covered_shares
 
 
 def backbone(covered: Mapping[PairId, float]) -> set[PairId]:
@@ -118,42 +142,23 @@ def backbone(covered: Mapping[PairId, float]) -> set[PairId]:
         partners[b].append(a)
     groups, chosen = DisjointGroups(partners), set()
     for a, b in sorted(covered, key=lambda pair: (-covered[pair], pair)):
-        moved = groups.join(a, b)
-        inside = set(moved)
-        for photo in moved:
+        joining = groups.join(a, b)
+        inside = set(joining)
+        for photo in joining:
             across = (
                 other for other in partners[photo] if other not in inside and groups.name[other] == groups.name[a]
             )
             joined = ((min(photo, other), max(photo, other)) for other in across)
-            chosen |= {pair for pair in joined if covered[pair] >= BACKBONE_SHARE * covered[a, b]}
+            chosen |= {pair for pair in joined if covered[pair] >= OPTIONS.backbone_share * covered[a, b]}
     return chosen
 
 
-# Missing matches: the points that two photos would share if their relative pose were right.
-#
-# The points of a photo have depths from other pairs. In the scale of the pair in question, they project into its
-# other photo, or outside. If the photos are close to each other, points that project inside must have matches there
-# (Zach et al. 2010, Heinly et al. 2014). One pair alone may miss many, since matching fails in places; all pairs of
-# a photo that claim the same join miss few together.
+# Missing matches. The points of a photo have depths from other pairs. In the scale of the pair in question, they
+# project into its other photo, or outside. If the photos are close to each other, points that project inside must
+# have matches there (Zach et al. 2010, Heinly et al. 2014). One pair alone may miss many, since matching fails in
+# places; all pairs of a photo that claim the same join miss few together.
 
-Cameras = Mapping[int, Calibration]
-Poses = Mapping[PairId, RelativePose]
 Scales = dict[int, float]
-
-MOST_DEG, MOST_SCALE = 20.0, 1.5
-"""Largest change of viewing angle, and of scale, at which a point is matched again. 30 degrees and 2 give the same on
-oats23 and books21. docs/algorithms.md, Look-alikes."""
-BORDER = 0.05
-"""Share of width and height: points that project this near the border may be outside. Chosen by hand; halved and
-doubled by `benchmarks.sensitivity`."""
-WIDE_RAD = 0.2
-"""Depths from wider angles get no more weight. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-MIN_COMMON_POINTS = 8
-"""Least number of points that two pairs of a photo must share to determine their relative scale. Chosen by hand; halved
-and doubled by `benchmarks.sensitivity`."""
-MIN_CELL_POINTS = 2
-"""A cell of a photo with fewer expected points expects no match. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,17 +174,16 @@ class PairDepths:
 
 
 class Depths:
-    """Depths of keypoints in the scale of any pair of their photo.
+    """Depths of keypoints in the scale of any pair of their photo."""
 
-    Args:
-        matches: keypoints.
-        cameras: by photo.
-        poses: relative poses.
-        sight: their inliers.
-    """
-
-    def __init__(self, matches: MatchGraph, cameras: Cameras, poses: Poses, sight: Visibility) -> None:
-        self.matches, self.cameras, self.poses, self.sight = matches, cameras, poses, sight
+    def __init__(
+        self,
+        matches: MatchGraph,
+        cameras: Mapping[int, Calibration],
+        poses: Mapping[PairId, RelativePose],
+        visibility: Visibility,
+    ) -> None:
+        self.matches, self.cameras, self.poses, self.visibility = matches, cameras, poses, visibility
         self.lines: dict[int, FloatArray] = {}
         self.known: dict[tuple[int, int], PairDepths] = {}
 
@@ -190,43 +194,37 @@ class Depths:
         return self.lines[photo]
 
     def pair_depths(self, photo: int, other: int) -> PairDepths:
-        """Return the depths of a photo's points from one pair.
-
-        Args:
-            photo: the photo, as named in `poses`.
-            other: the other photo of the pair; the two have a pose, in either order.
-        """
+        """Return the depths of the points of a photo from its pair with another one."""
         if (photo, other) in self.known:
             return self.known[photo, other]
         pair = (min(photo, other), max(photo, other))
-        pose, rows = self.poses[pair], self.sight.rows[pair]
+        pose, rows = self.poses[pair], self.visibility.rows[pair]
         used = np.hstack([self.keypoint_bearings(one)[column] for one, column in zip(pair, rows.T, strict=True)])
-        found, front = depths(used, pose.R, pose.t), np.ones(len(rows), np.bool_)
-        for one in found:
+        pair_of_depths, front = depths(used, pose.R, pose.t), np.ones(len(rows), np.bool_)
+        for one in pair_of_depths:
             front &= one > 0
         h1, h2 = used[:, FIRST] @ pose.R.T, used[:, SECOND]
         lengths = np.linalg.norm(h1, axis=1) * np.linalg.norm(h2, axis=1)
         sines = np.linalg.norm(np.cross(h1, h2), axis=1) / lengths
-        weights = np.minimum(sines, WIDE_RAD) ** 2 + 1e-6
+        weights = np.minimum(sines, OPTIONS.wide_rad) ** 2 + 1e-6
         for end, names in enumerate((pair, pair[::-1])):
-            self.known[names] = PairDepths(rows[front, end], np.log(found[end][front]), weights[front])
+            self.known[names] = PairDepths(rows[front, end], np.log(pair_of_depths[end][front]), weights[front])
         return self.known[photo, other]
 
     def merge_depths(self, photo: int, trusted: Iterable[int], doubted: Iterable[int]) -> tuple[FloatArray, Scales]:
         """Return (K,) logarithms of depths from trusted pairs, NaN if there is none, and the log scale of each pair.
 
-        Args:
-            photo: whose keypoints.
-            trusted: photos whose pairs with it determine the depths.
-            doubted: photos whose pairs with it only get a scale.
+        Pairs with `doubted` photos only get a scale.
         """
         total = np.zeros((2, len(self.matches.keypoints[photo])))
         scales: Scales = {}
         known = {other: self.pair_depths(photo, other) for other in trusted}
         waiting = sorted(known, key=lambda other: (-float(known[other].weights.sum()), other))
         while waiting:
-            other = next((one for one in waiting if _count_common(known[one], total) >= MIN_COMMON_POINTS), waiting[0])
-            if scales and _count_common(known[other], total) < MIN_COMMON_POINTS:
+            other = next(
+                (one for one in waiting if _count_common(known[one], total) >= OPTIONS.min_common_points), waiting[0]
+            )
+            if scales and _count_common(known[other], total) < OPTIONS.min_common_points:
                 break
             waiting.remove(other)
             end = known[other]
@@ -235,7 +233,7 @@ class Depths:
             np.add.at(total[1], end.rows, end.weights)
         for other in doubted:
             end = self.pair_depths(photo, other)
-            if _count_common(end, total) >= MIN_COMMON_POINTS:
+            if _count_common(end, total) >= OPTIONS.min_common_points:
                 scales[other] = _log_scale(end, total)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(total[1] > 0, total[0] / total[1], np.nan), scales
@@ -244,68 +242,61 @@ class Depths:
         """Return the points of a photo that the other one must show if their pair is right.
 
         Args:
-            photo: whose points.
-            other: photo that should show them.
             points: (N,) keypoints.
             logs: (N,) logarithms of their depths in the scale of the pair.
         """
         R, t = _directed_pose(self.poses, photo, other)
         rays_here = self.keypoint_bearings(photo)[points, FIRST]
         z = np.exp(logs)
-        turned = rays_here @ R.T
-        there = turned * z[:, None] + t
+        rotated = rays_here @ R.T
+        there = rotated * z[:, None] + t
         image, here, camera = self.matches.images[other], self.cameras[photo], self.cameras[other]
         with np.errstate(invalid="ignore", divide="ignore"):
             x = project(there, camera)
-            smaller = depths_along(there, camera) / z * here.K[0, 0] / camera.K[0, 0]
-            cosines = (turned * there).sum(1) / np.linalg.norm(turned, axis=1) / np.linalg.norm(there, axis=1)
-        expected = is_well_inside(x, image.width, image.height) & is_matched_again(smaller, cosines)
+            size_ratios = depths_along(there, camera) / z * here.K[0, 0] / camera.K[0, 0]
+            cosines = (rotated * there).sum(1) / np.linalg.norm(rotated, axis=1) / np.linalg.norm(there, axis=1)
+        expected = is_well_inside(x, image.width, image.height) & is_matched_again(size_ratios, cosines)
         return np.asarray(points[expected], np.int64)
 
 
 def is_well_inside(x: FloatArray, width: int, height: int) -> NDArray[np.bool_]:
-    """Return (N,) whether pixels lie in a photo, and not at its border.
-
-    Args:
-        x: (N, 2) pixels; NaN where a point cannot be seen.
-        width, height: of the photo.
-    """
+    """Return a mask (N,) of the pixels (N, 2) inside a photo and off its border; NaN is outside."""
     size = np.array([width, height], np.float64)
-    return np.asarray(((x > BORDER * size) & (x < (1.0 - BORDER) * size)).all(axis=1))
+    return np.asarray(((x > OPTIONS.border * size) & (x < (1.0 - OPTIONS.border) * size)).all(axis=1))
 
 
-def is_matched_again(smaller: FloatArray, cosines: FloatArray) -> NDArray[np.bool_]:
-    """Return (N,) whether points look so much alike in two photos that matching finds them.
+def is_matched_again(size_ratios: FloatArray, cosines: FloatArray) -> NDArray[np.bool_]:
+    """Return a mask (N,) of the points that look enough alike in two photos for matching.
 
     Args:
-        smaller: (N,) their size in the first photo over that in the second.
-        cosines: (N,) of the angles between their two viewing rays.
+        smaller: (N,) size in the first photo over that in the second.
+        cosines: (N,) of the angles between the two viewing rays.
     """
-    alike = (smaller < MOST_SCALE) & (smaller > 1.0 / MOST_SCALE) & (cosines > np.cos(np.radians(MOST_DEG)))
+    alike = (
+        (size_ratios < OPTIONS.max_scale)
+        & (size_ratios > 1.0 / OPTIONS.max_scale)
+        & (cosines > np.cos(np.radians(OPTIONS.max_view_change_deg)))
+    )
     return np.asarray(alike, np.bool_)
 
 
 def count_missing_cells(photo: int, joined: Iterable[int], trusted: Iterable[int], places: Depths) -> tuple[int, int]:
-    """Count the cells of a photo that other photos should show if pairs are right, and those of them without a match.
+    """Count the cells of a photo that the photos `joined` should show, and those of them without a match.
 
-    Args:
-        photo: whose cells.
-        joined: photos of the pairs in question with it.
-        trusted: photos whose pairs with it are trusted.
-        places: depths and poses.
+    The depths are those of the pairs with the photos `trusted`.
     """
-    sight, others = places.sight, sorted(joined)
+    visibility, others = places.visibility, sorted(joined)
     logs, scales = places.merge_depths(photo, sorted(trusted), others)
     points = np.flatnonzero(~np.isnan(logs))
-    wanted, hit = np.zeros(len(logs), np.bool_), np.zeros(len(logs), np.bool_)
+    expected, matched = np.zeros(len(logs), np.bool_), np.zeros(len(logs), np.bool_)
     for other in others:
         pair = (min(photo, other), max(photo, other))
-        hit[sight.rows[pair][:, pair.index(photo)]] = True
+        matched[visibility.rows[pair][:, pair.index(photo)]] = True
         if other in scales:
-            wanted[places.expected_points(photo, other, points, logs[points] + scales[other])] = True
-    cells, counts = np.unique(sight.cells[photo][wanted], return_counts=True)
-    cells = cells[counts >= MIN_CELL_POINTS]
-    return len(cells), int(np.count_nonzero(~np.isin(cells, sight.cells[photo][hit])))
+            expected[places.expected_points(photo, other, points, logs[points] + scales[other])] = True
+    cells, counts = np.unique(visibility.cells[photo][expected], return_counts=True)
+    cells = cells[counts >= OPTIONS.min_cell_points]
+    return len(cells), int(np.count_nonzero(~np.isin(cells, visibility.cells[photo][matched])))
 
 
 def _directed_pose(poses: Mapping[PairId, RelativePose], photo: int, other: int) -> tuple[FloatArray, FloatArray]:
@@ -326,27 +317,7 @@ def _log_scale(end: PairDepths, total: FloatArray) -> float:
 
 
 ALIKE, LOOP, EITHER = "alike", "loop", "either"
-LEAST_TRACKED, FEW_TRACKED = 30, 15
-"""Least number of matches with both ends on tracks for a pair to be tested, and for one beside known look-alikes.
-docs/algorithms.md, Look-alikes. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-SAME_TRACK_SHARE = 0.02
-"""A pair with at most this share of its tracked matches on the same track contradicts the backbone. On oats23 and
-books21 look-alikes have 0; no pair of kitti51, castle-P19, temple16 and five more sets is below 0.07; where kitchen1000
-closes a loop, some have 0. docs/algorithms.md, Look-alikes."""
-CONFIRMED_SHARE = 0.1
-"""A pair with at least this share of its tracked matches on the same track is confirmed. Chosen by hand; halved and
-doubled by `benchmarks.sensitivity`."""
-LOW_PERCENTILE, MAX_MISSING, MAX_MISSING_SAME_TURN = 25.0, 0.2, 0.3
-"""Contradicting pairs join look-alikes if this percentile, over the photos, of the share of expected cells that are
-missing exceeds the limit; the second limit is for pairs whose rotation agrees with the path between them. It is 0.30 on
-oats23, 0.28 on books21; 0.12 where the video kitchen1000 (every 15th) closes a loop. Shares over all photos do not
-separate them: 0.37, 0.33, 0.25. docs/algorithms.md, Look-alikes."""
-SAME_TURN_DEG = 3.0
-"""Largest median angle between the rotations of such pairs and of the path at which they agree: 1 degree for that loop,
-9 on oats23 and 58 on books21. docs/algorithms.md, Look-alikes."""
-LEAST_CELLS, LEAST_PHOTOS = 15, 3
-"""Least number of expected cells of a photo, and of such photos of a join, for missing cells to be evidence. Chosen by
-hand; halved and doubled by `benchmarks.sensitivity`."""
+"""Verdicts on a join."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -357,118 +328,98 @@ class FeatureTracks:
     """By photo, (K,) number of the track of each keypoint; -1 if no pair of the backbone has it."""
 
     def count_agreement(self, pair: PairId, rows: IndexArray) -> tuple[int, int]:
-        """Count the matches of a pair that have both ends on the same track, and those with both ends on any.
-
-        Args:
-            pair: two photos.
-            rows: (N, 2) keypoints that match, one column for each photo.
-        """
+        """Count the matches `rows` (N, 2) of a pair with both ends on one track, and those with both ends on any."""
         first, second = (self.names[photo][column] for photo, column in zip(pair, rows.T, strict=True))
         tracked = (first >= 0) & (second >= 0)
         return int(np.count_nonzero(tracked & (first == second))), int(np.count_nonzero(tracked))
 
-    def is_contradicted_by(self, pair: PairId, rows: IndexArray, least: int = LEAST_TRACKED) -> bool:
-        """Return whether a pair joins points that the backbone keeps on different tracks.
-
-        Args:
-            pair: two photos.
-            rows: (N, 2) keypoints that match, one column for each photo.
-            least: with fewer tracked matches the answer is no.
-        """
+    def is_contradicted_by(self, pair: PairId, rows: IndexArray, least: int = OPTIONS.min_tracked) -> bool:
+        """Return whether a pair joins points on different tracks; no with fewer than `least` tracked matches."""
         same, tracked = self.count_agreement(pair, rows)
-        return tracked >= least and same <= SAME_TRACK_SHARE * tracked
+        return tracked >= least and same <= OPTIONS.same_track_share * tracked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LookAlikeVerdict:
-    """Look-alikes that were found, and joins that may be."""
+    """Joins of look-alikes, and doubtful joins."""
 
     joins: tuple[LookAlikes, ...]
-    """Every join of look-alikes."""
     doubtful: tuple[LookAlikes, ...]
-    """Joins that may be look-alikes or loops: their rotation disagrees with the path, but few matches are missing."""
+    """Look-alikes or loops: their rotation disagrees with the path, but few matches are missing."""
     tracks: FeatureTracks
 
     def is_look_alike(self, pair: PairId, rows: IndexArray) -> bool:
-        """Return whether a pair that was estimated later joins look-alikes, too.
-
-        Args:
-            pair: two photos.
-            rows: (N, 2) keypoints that match, one column for each photo.
-        """
-        return bool(self.joins) and self.tracks.is_contradicted_by(pair, rows, FEW_TRACKED)
+        """Return whether a pair that was estimated later joins look-alikes, too, by its matches (N, 2)."""
+        return bool(self.joins) and self.tracks.is_contradicted_by(pair, rows, OPTIONS.min_tracked_nearby)
 
 
 def find_look_alikes(
     matches: MatchGraph, poses: Mapping[PairId, RelativePose], cameras: Mapping[int, Calibration]
 ) -> LookAlikeVerdict:
-    """Find the pairs that match look-alikes as if they were one thing.
-
-    Args:
-        matches: keypoints and raw matches.
-        poses: relative poses of all pairs that may be right.
-        cameras: by photo.
-    """
-    sight = compute_visibility(matches, poses)
-    best = backbone(coverages(sight))
-    tracks = _build_tracks(sight, best)
-    doubted = [pair for pair, rows in sight.rows.items() if pair not in best and tracks.is_contradicted_by(pair, rows)]
+    """Find the pairs that match look-alikes as if they were one thing, among poses that may be right."""
+    visibility = compute_visibility(matches, poses)
+    best = backbone(coverages(visibility))
+    tracks = _build_tracks(visibility, best)
+    rows_of = visibility.rows
+    doubted = [pair for pair, rows in rows_of.items() if pair not in best and tracks.is_contradicted_by(pair, rows)]
     if not doubted:
         return LookAlikeVerdict((), (), tracks)
-    trusted = best | {pair for pair, rows in sight.rows.items() if _is_confirmed(*tracks.count_agreement(pair, rows))}
-    places = Depths(matches, cameras, poses, sight)
-    turns = _photo_rotations(trusted, poses)
-    friends = _partners(trusted)
-    judged = [_judge_join(join, friends, turns, places) for join in group_doubted_pairs(doubted, trusted)]
+    trusted = best | {pair for pair, rows in rows_of.items() if _is_confirmed(*tracks.count_agreement(pair, rows))}
+    places = Depths(matches, cameras, poses, visibility)
+    rotations = _photo_rotations(trusted, poses)
+    partners = _partners(trusted)
+    judged = [_judge_join(join, partners, rotations, places) for join in group_doubted_pairs(doubted, trusted)]
     joins = [join for join, verdict in judged if verdict == ALIKE]
     doubtful = tuple(join for join, verdict in judged if verdict == EITHER)
-    left = poses.keys() - best - {pair for join in joins for pair in join.pairs}
-    weak = sorted(pair for pair in left if tracks.is_contradicted_by(pair, sight.rows[pair], FEW_TRACKED))
-    close = {frozenset(pair) for pair in trusted}
-    for number, join in enumerate(joins):
-        also = [pair for pair in weak if any(_has_same_ends(pair, other, close) for other in join.pairs)]
-        weak = [pair for pair in weak if pair not in also]
-        joins[number] = replace(join, pairs=tuple(sorted((*join.pairs, *also))))
-    return LookAlikeVerdict(tuple(joins), doubtful, tracks)
+    others = poses.keys() - best - {pair for join in joins for pair in join.pairs}
+    weak = sorted(pair for pair in others if tracks.is_contradicted_by(pair, rows_of[pair], OPTIONS.min_tracked_nearby))
+    complete = tuple(_add_weak_pairs(join, weak, trusted) for join in joins)
+    return LookAlikeVerdict(complete, doubtful, tracks)
 
 
-def _build_tracks(sight: Visibility, pairs: Iterable[PairId]) -> FeatureTracks:
+def _build_tracks(visibility: Visibility, pairs: Iterable[PairId]) -> FeatureTracks:
     """Join the keypoints of pairs into tracks."""
     starts, count = {}, 0
-    for photo, seen in sight.seen.items():
-        starts[photo], count = count, count + len(seen)
-    ends = [sight.rows[pair] + [starts[photo] for photo in pair] for pair in sorted(pairs)]
+    for photo, keypoints in visibility.partners.items():
+        starts[photo], count = count, count + len(keypoints)
+    ends = [visibility.rows[pair] + [starts[photo] for photo in pair] for pair in sorted(pairs)]
     first, second = np.concatenate(ends).T if ends else np.zeros((2, 0), np.int64)
     graph = coo_array((np.ones(len(first), np.bool_), (first, second)), shape=(count, count))
     names = connected_components(graph, directed=False)[1].astype(np.int64)
     joined = np.zeros(count, np.bool_)
     joined[first] = joined[second] = True
     names[~joined] = -1
-    return FeatureTracks({photo: names[start : start + len(sight.seen[photo])] for photo, start in starts.items()})
+    return FeatureTracks(
+        {photo: names[start : start + len(visibility.partners[photo])] for photo, start in starts.items()}
+    )
 
 
 def group_doubted_pairs(doubted: Iterable[PairId], trusted: Iterable[PairId]) -> list[tuple[PairId, ...]]:
     """Group doubted pairs that join the same two places.
 
     At both ends, their photos are the same or joined by a trusted pair.
-
-    Args:
-        doubted: pairs to group.
-        trusted: pairs whose two photos count as one place.
     """
-    near = _partners(trusted)
-    waiting, found = dict.fromkeys(sorted(doubted)), []
+    neighbors = _partners(trusted)
+    waiting, groups = dict.fromkeys(sorted(doubted)), []
     while waiting:
         join = [next(iter(waiting))]
         del waiting[join[0]]
         for a, b in join:
-            ends = ((c, d) for c in sorted({a, *near.get(a, ())}) for d in sorted({b, *near.get(b, ())}))
-            beside = [pair for c, d in ends if (pair := (min(c, d), max(c, d))) in waiting]
-            for pair in beside:
+            ends = ((c, d) for c in sorted({a, *neighbors.get(a, ())}) for d in sorted({b, *neighbors.get(b, ())}))
+            adjacent = [pair for c, d in ends if (pair := (min(c, d), max(c, d))) in waiting]
+            for pair in adjacent:
                 waiting.pop(pair, None)
-            join += dict.fromkeys(beside)
-        found.append(tuple(sorted(join)))
-    return found
+            join += dict.fromkeys(adjacent)
+        groups.append(tuple(sorted(join)))
+    return groups
+
+
+def _add_weak_pairs(join: LookAlikes, weak: list[PairId], trusted: Iterable[PairId]) -> LookAlikes:
+    """Move the weak pairs between the two places of a join from the list into the join."""
+    close = {frozenset(pair) for pair in trusted}
+    also = [pair for pair in weak if any(_has_same_ends(pair, other, close) for other in join.pairs)]
+    weak[:] = [pair for pair in weak if pair not in also]
+    return replace(join, pairs=tuple(sorted((*join.pairs, *also))))
 
 
 def _has_same_ends(pair: PairId, other: PairId, close: set[frozenset[int]]) -> bool:
@@ -480,33 +431,35 @@ def _has_same_ends(pair: PairId, other: PairId, close: set[frozenset[int]]) -> b
 
 
 def _is_confirmed(same: int, tracked: int) -> bool:
-    return tracked > 0 and same >= CONFIRMED_SHARE * tracked
+    return tracked > 0 and same >= OPTIONS.confirmed_share * tracked
 
 
 def _partners(pairs: Iterable[PairId]) -> dict[int, set[int]]:
     """Return the other photos of the pairs of each photo."""
-    found: dict[int, set[int]] = {}
+    partners: dict[int, set[int]] = {}
     for a, b in pairs:
-        found.setdefault(a, set()).add(b)
-        found.setdefault(b, set()).add(a)
-    return found
+        partners.setdefault(a, set()).add(b)
+        partners.setdefault(b, set()).add(a)
+    return partners
 
 
 def _judge_join(
-    join: tuple[PairId, ...], friends: Mapping[int, set[int]], turns: Mapping[int, FloatArray], places: Depths
+    join: tuple[PairId, ...], partners: Mapping[int, set[int]], rotations: Mapping[int, FloatArray], places: Depths
 ) -> tuple[LookAlikes, str]:
-    """Judge whether a join is of look-alikes, a loop, or either; return it with its share of missing cells."""
+    """Judge a join; return it with its share of missing cells, and the verdict."""
     claimed = _partners(join)
     counts = [
-        count_missing_cells(photo, claimed[photo], friends[photo], places)
+        count_missing_cells(photo, claimed[photo], partners[photo], places)
         for photo in sorted(claimed)
-        if photo in friends
+        if photo in partners
     ]
     expected, missing = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
-    shares = [lacking / wanted for wanted, lacking in counts if wanted >= LEAST_CELLS]
-    same_turn = _rotation_gap_deg(join, turns, places) <= SAME_TURN_DEG
-    limit = MAX_MISSING_SAME_TURN if same_turn else MAX_MISSING
-    alike = len(shares) >= LEAST_PHOTOS and float(np.percentile(shares, LOW_PERCENTILE)) > limit
+    shares = [
+        missing_here / expected_here for expected_here, missing_here in counts if expected_here >= OPTIONS.min_cells
+    ]
+    same_turn = _rotation_gap_deg(join, rotations, places) <= OPTIONS.same_rotation_deg
+    limit = OPTIONS.max_missing_same_rotation if same_turn else OPTIONS.max_missing
+    alike = len(shares) >= OPTIONS.min_photos and float(np.percentile(shares, OPTIONS.low_percentile)) > limit
     verdict = ALIKE if alike else LOOP if same_turn else EITHER
     return LookAlikes(join, missing / max(expected, 1)), verdict
 
@@ -518,9 +471,11 @@ def _photo_rotations(trusted: Iterable[PairId], poses: Mapping[PairId, RelativeP
     return average_rotations({pair: pose.R for pair, pose in known.items()}, weights)[0]
 
 
-def _rotation_gap_deg(join: tuple[PairId, ...], turns: Mapping[int, FloatArray], places: Depths) -> float:
+def _rotation_gap_deg(join: tuple[PairId, ...], rotations: Mapping[int, FloatArray], places: Depths) -> float:
     """Return the median angle between the rotations of pairs and those along the trusted ones."""
-    left = [places.poses[a, b].R.T @ turns[b] @ turns[a].T for a, b in join if a in turns and b in turns]
-    if not left:
+    products = [
+        places.poses[a, b].R.T @ rotations[b] @ rotations[a].T for a, b in join if a in rotations and b in rotations
+    ]
+    if not products:
         return float("inf")
-    return float(np.degrees(np.median(Rotation.from_matrix(np.array(left)).magnitude())))
+    return float(np.degrees(np.median(Rotation.from_matrix(np.array(products)).magnitude())))

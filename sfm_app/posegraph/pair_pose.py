@@ -1,6 +1,7 @@
 """The relative pose of one pair of photos from F and two cameras, and the kind of the pair."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -27,29 +28,50 @@ from sfm_app.types import Calibration, EpipolarFit, RelativePose
 from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import PERSPECTIVE
 
-# Initial relative poses of a fit, where F does not determine how far the camera has turned.
-#
-# With a long lens, matches determine the directions of the epipolar lines, but hardly where they meet: the rotation
-# of E = K2' F K1 is then due to noise, and a fit that starts there ends in a wrong local minimum. But the lines of
-# both views determine everything except that turn, if camera 2 looks at what camera 1 looked at. So several turns
-# are tried.
+# Initial poses. With a long lens, matches determine the directions of epipolar lines, but hardly where they meet: the
+# rotation of E = K2' F K1 is noise, and a fit from there ends in a wrong local minimum. The lines determine all but
+# the turn of a camera that looks at the same scene, so several turns are tried.
 
-LEAST_PLANAR = 8
-"""Least number of matches: a homography has eight parameters, a match determines two, and half should be redundant.
-Counted."""
-TURNS_DEG = (-55.0, -30.0, -12.0, 12.0, 30.0, 55.0)
-"""Turns about the scene. On the 30 pairs of a long-lens orbit (dinoSparseRing, K given) these lead to the best pose
-that 24 turns from -60 to 60 lead to; the choice rests on that set alone, and only adds starts elsewhere.
-docs/algorithms.md, From K to relative poses."""
+
+@dataclass(frozen=True, slots=True)
+class PoseOptions:
+    """Thresholds for the pose of a pair; docs/algorithms.md, From K to relative poses."""
+
+    turns_deg: tuple[float, ...] = (-55.0, -30.0, -12.0, 12.0, 30.0, 55.0)
+    """Turns about the scene that initial poses try. Chosen on a long-lens orbit; more turns give the same pose
+    there."""
+    planar_matches: int = 8
+    """Least matches for a homography: twice the number that its eight parameters need."""
+    clear_share: float = 0.95
+    """A pair is planar, or a rotation, if this share of its inliers fits that. Chosen by hand."""
+    sample_size: int = 200
+    """Points that decide between the four poses of an essential matrix. Chosen by hand."""
+    min_inliers: int = 8
+    """Least number of inliers that determine a pose. Chosen by hand."""
+    min_in_front: float = 0.9
+    """Least share of inliers in front of both cameras for a pose from another start than F. Chosen by hand."""
+    min_improvement: float = 0.01
+    """Relative decrease of the cost that such a pose needs. Chosen by hand."""
+    screened: int = 60
+    """Inliers to which other starts are fitted first. Chosen by hand."""
+    promising: float = 1.2
+    """Largest ratio of their cost there to the best one, for a fit to all inliers. Chosen by hand."""
+    same_pose: float = 0.01
+    """Largest difference of the elements of R and t of equal poses. Chosen by hand."""
+    rotation_deg: float = 5.0
+    """Median angle of rays above which no rotation is tested. Chosen by hand."""
+    min_cosine_ahead: float = 0.5
+    """Least cosine to the optical axis of unit rays in tests for planes: z = 1 stretches the noise. Chosen by hand."""
+    reweighted_fits: int = 2
+    """Fits of E to rays with weights from the fit before. Chosen by hand."""
+
+
+OPTIONS = PoseOptions()
 
 
 def planar_starts(used: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield up to four R and t that explain the matches if their points lie on one plane.
-
-    Args:
-        used: (N, 4) inliers as points of the plane z = 1, view 1 and view 2.
-    """
-    if len(used) < LEAST_PLANAR:
+    """Yield up to four R and t that explain inliers (N, 4), points of the plane z = 1 in both views, by one plane."""
+    if len(used) < OPTIONS.planar_matches:
         return
     try:
         H, _ = cv2.findHomography(used[:, :2], used[:, 2:], 0)
@@ -65,7 +87,7 @@ def planar_starts(used: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
 
 
 def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield R and t of a camera that has turned about the middle of the scene, for every turn of `TURNS_DEG`.
+    """Yield R and t of a camera that turned about the middle of the scene, for every turn of the options.
 
     Args:
         used: (N, 4) inliers as points of the plane z = 1, view 1 and view 2.
@@ -82,7 +104,7 @@ def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray,
         return
     roll = np.arctan2(-g2[1], -g2[0]) - np.arctan2(g1[1], g1[0])
     K = cross_matrix(np.append(g1 / lengths[0], 0.0))
-    angles = np.radians(TURNS_DEG)[:, None, None]
+    angles = np.radians(OPTIONS.turns_deg)[:, None, None]
     upright = np.array([[np.cos(roll), -np.sin(roll), 0.0], [np.sin(roll), np.cos(roll), 0.0], [0.0, 0.0, 1.0]])
     turns = upright @ (np.eye(3) + np.sin(angles) * K + (1.0 - np.cos(angles)) * (K @ K))  # Rodrigues
     steps = lengths[1] / lengths[0] * second - turns @ first  # the middle of the scene stays in the middle
@@ -91,34 +113,26 @@ def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray,
             yield R, t / length
 
 
-# The five degrees of freedom of a relative pose, fitted to matches with known cameras.
-#
-# F has seven parameters, a relative pose five: with K known, the other two no longer fit noise, mismatches that
-# happen to lie right, and repeated structure. On real photos that alone halves the error of the direction of
-# translation.
+# Refinement. F has seven parameters, a relative pose five: with K known, the other two no longer fit noise.
 
 SIGMAS_PX = (0.5, 0.2)
-"""Scales of the Cauchy loss, used one after the other. Keypoints are good to about 0.2 px; with a wider scale the
-mismatches that a second structure explains pull the pose to a compromise between both. docs/algorithms.md, From K to
-relative poses."""
+"""Scales of the Cauchy loss, one after the other: keypoints are accurate to about 0.2 px. Measured;
+docs/algorithms.md, From K to relative poses."""
 STEPS = 12
-"""Largest number of steps at each scale. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+"""Largest number of steps at each scale. Chosen by hand."""
 DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e6)
-"""Damping of the Levenberg-Marquardt steps. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+"""Damping of the Levenberg-Marquardt steps. Chosen by hand."""
 GAIN = 1e-6
-"""Relative decrease of the cost below which they end. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
+"""Relative decrease of the cost below which they end. Chosen by hand."""
 _DIFFERENCE_STEP = 1e-6
-"""Step of the parameters for finite differences. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+"""Step of the parameters for finite differences. Chosen by hand."""
 
 
 def refine_pose(lines: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Refine the pose (R, t) by robust least squares of Sampson distances (Levenberg-Marquardt).
+    """Refine R (3, 3) and t (3,) by robust least squares of Sampson distances (Levenberg-Marquardt).
 
     Args:
-        lines: (N, 18) matches as bearing vectors with derivatives (`geometry.lenses.bearings`), view 1 and view 2.
-        R: (3, 3) rotation of view 2 from view 1.
-        t: (3,) direction of its translation.
+        lines: (N, 18) matches as bearing vectors with derivatives (`camera.bearings`), view 1 and view 2.
     """
     pose = np.concatenate([R.ravel(), t / np.linalg.norm(t)])
     for sigma in SIGMAS_PX:
@@ -127,13 +141,7 @@ def refine_pose(lines: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatA
 
 
 def pose_distances(lines: FloatArray, R: FloatArray, t: FloatArray) -> FloatArray:
-    """Return the Sampson distances (N,) of matches to a relative pose, in pixels, >= 0.
-
-    Args:
-        lines: (N, 18) matches as bearing vectors with derivatives (`geometry.lenses.bearings`), view 1 and view 2.
-        R: (3, 3) rotation of view 2 from view 1.
-        t: (3,) unit vector along its translation.
-    """
+    """Return the Sampson distances (N,) in pixels, >= 0, of matches `lines` (N, 18) to a pose with |t| = 1."""
     pose = np.concatenate([R.ravel(), t])
     return np.abs(_distances(lines, pose))
 
@@ -157,11 +165,11 @@ def _distance(line: FloatArray, E: FloatArray) -> float:
 
 @kernel
 def _distances(lines: FloatArray, pose: FloatArray) -> FloatArray:
-    E, found = np.empty((3, 3)), np.empty(lines.shape[0])
+    E, distances = np.empty((3, 3)), np.empty(lines.shape[0])
     write_essential(pose, E)
     for i in range(lines.shape[0]):
-        found[i] = _distance(lines[i], E)
-    return found
+        distances[i] = _distance(lines[i], E)
+    return distances
 
 
 @kernel
@@ -200,17 +208,17 @@ def _descend(lines: FloatArray, pose: FloatArray, sigma: float) -> FloatArray:
     cost, damping = _cost(lines, pose, sigma), DAMPING.first
     for _ in range(STEPS):
         A, b = _system(lines, pose, sigma)
-        before, found = cost, False
-        while damping < DAMPING.most and not found:
+        before, improved = cost, False
+        while damping < DAMPING.most and not improved:
             step = _solve(A, b, damping)
             trial = retract(pose, step)
             lower = _cost(lines, trial, sigma)
             if lower < cost:
-                pose, cost, found = trial, lower, True
+                pose, cost, improved = trial, lower, True
                 damping = max(DECREASE * damping, DAMPING.least)
             else:
                 damping *= INCREASE
-        if not found or before - cost < GAIN * before:
+        if not improved or before - cost < GAIN * before:
             break
     return pose
 
@@ -242,38 +250,12 @@ def _solve(A: FloatArray, b: FloatArray, damping: float) -> FloatArray:
 Pose = tuple[FloatArray, FloatArray]
 """R (3, 3) and t (3,)."""
 
-CLEAR_SHARE = 0.95
-"""A pair is planar, or a rotation, if this share of its inliers fits that. docs/algorithms.md, From K to relative
-poses. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-SAMPLE_SIZE = 200
-"""Number of points that decide between the four poses of an essential matrix. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-MIN_INLIERS = 8
-"""Least number of inliers that determine the pose of a pair. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-MIN_IN_FRONT, MIN_IMPROVEMENT = 0.9, 0.01
-"""A pose from a start other than that of F needs this share of its inliers in front of both cameras, and a cost lower
-by this share. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-SCREENED, PROMISING, SAME_POSE = 60, 1.2, 0.01
-"""Inliers to which other starts are fitted first, and the largest ratio of their cost there to that of the best pose
-for a start to be fitted to all: a pose that is better on all inliers is not a fifth worse on sixty of them. Third, the
-largest difference of R and t of starts that led to one pose. Chosen by hand; not measured on their own."""
-ROTATION_DEG = 5.0
-"""Median angle of rays above which no rotation is tried. Chosen by hand; not measured on its own."""
-LEAST_AHEAD = 0.5
-"""Least cosine of the angle to the optical axis of rays of length 1 in tests for planes: the plane z = 1 stretches the
-noise of wider ones. Rays of a perspective camera end on that plane and are all used. Chosen by hand; not measured on
-its own."""
-REWEIGHTED_FITS = 2
-"""Fits of E to rays with weights from the fit before. Chosen by hand; not measured on its own."""
-
 
 class Pair:
     """The matches of a pair as bearing vectors of its cameras.
 
     Args:
         points: x1, x2, each (M, 2) pixels: all matches of the pair.
-        cameras: of photo 1 and photo 2.
         max_error_px: largest Sampson distance of an inlier.
     """
 
@@ -288,12 +270,12 @@ class Pair:
     def initial_pose(self, fit: EpipolarFit) -> Pose:
         """Return R and t from F and the cameras, before refinement."""
         inliers, E = self.lines[fit.inliers], self.essential_matrix(fit)
-        chosen = inliers[np.linspace(0, len(inliers) - 1, min(len(inliers), SAMPLE_SIZE)).astype(np.int64)]
+        chosen = inliers[np.linspace(0, len(inliers) - 1, min(len(inliers), OPTIONS.sample_size)).astype(np.int64)]
         poses = decompose_essential(nearest_essential(E))
         return max(poses, key=lambda pose: int(np.count_nonzero(is_in_front(chosen, *pose))))
 
     def essential_matrix(self, fit: EpipolarFit) -> FloatArray:
-        """Return E from F and the cameras, with singular values that are unequal because of noise."""
+        """Return E from F and the cameras, with singular values that noise makes unequal."""
         first, second = self.cameras
         if any(camera.projection != PERSPECTIVE for camera in self.cameras):
             return _essential_of_rays(self.lines[fit.inliers])
@@ -303,14 +285,7 @@ class Pair:
         return second.K.T @ fit.F @ first.K
 
     def pose(self, R: FloatArray, t: FloatArray, inliers: NDArray[np.bool_], *, guided: bool = False) -> RelativePose:
-        """Return a pose with the statistics of its inliers.
-
-        Args:
-            R: (3, 3) rotation of view 2 from view 1.
-            t: (3,) unit vector along its translation.
-            inliers: (M,) which matches agree with the pose.
-            guided: whether the rotation came from other pairs.
-        """
+        """Return a pose with the statistics of its inliers, a mask (M,)."""
         used = self.lines[inliers]
         front = is_in_front(used, R, t)
         angle_deg = float(np.median(ray_angles_deg(used[front], R))) if front.any() else 0.0
@@ -323,88 +298,72 @@ class Pair:
         )  # fmt: skip
 
     def inliers(self, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:
-        """Return (M,) which matches lie within the threshold of a pose.
-
-        Args:
-            R: (3, 3) rotation of view 2 from view 1.
-            t: (3,) unit vector along its translation.
-        """
+        """Return a mask (M,) of the matches within the threshold of a pose with |t| = 1."""
         return pose_distances(self.lines, R, t) <= self.max_error_px
 
     def kind(self, used: FloatArray, R: FloatArray, t: FloatArray, angle_deg: float) -> str:
-        """Return the kind of a pose by its inliers, see `RelativePose.kind`.
-
-        Args:
-            used: (N, 18) inliers as bearing vectors, view 1 and view 2.
-            R: (3, 3) rotation of view 2 from view 1.
-            t: (3,) unit vector along its translation.
-            angle_deg: median angle between the two rays of a match.
-        """
+        """Return `RelativePose.kind` by the inliers `used` (N, 18) and their median triangulation angle."""
         within = OFF_PLANE * self.max_error_px
-        if angle_deg < ROTATION_DEG and np.mean(rotation_residuals(used, R) <= within) >= CLEAR_SHARE:
+        if angle_deg < OPTIONS.rotation_deg and np.mean(rotation_residuals(used, R) <= within) >= OPTIONS.clear_share:
             return "rotation"
         ahead, unit = points_ahead(used), pixels_per_radian(self.lines.reshape(-1, 9))
-        if len(ahead) < (1.0 - CLEAR_SHARE) * len(used):
+        if len(ahead) < (1.0 - OPTIONS.clear_share) * len(used):
             return "calibrated"
         H = dominant_homography(np.asfortranarray(ahead), cross_matrix(t) @ R, self.max_error_px / unit)
         on_plane = np.count_nonzero(transfer_distance(H, ahead) <= within / unit)
-        return "planar" if on_plane >= CLEAR_SHARE * len(used) else "calibrated"
+        return "planar" if on_plane >= OPTIONS.clear_share * len(used) else "calibrated"
 
 
 def estimate_pose(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
     """Estimate the relative pose of a fundamental matrix; None if too few matches agree with it.
 
-    If a camera is a guess, E is wrong by as much as the guess, and the inliers of F are kept.
-
-    Args:
-        pair: matches and cameras.
-        fit: the fundamental matrix and its inliers.
+    If a camera is a guess, E is wrong by as much as the guess, and the inliers of F stay.
     """
     R, t = pair.initial_pose(fit)
     if not pair.trusted:
         return pair.pose(R, t, fit.inliers)
     R, t = _refine_best_start(pair, fit, (R, t))
     inliers = pair.inliers(R, t)
-    return pair.pose(R, t, inliers) if np.count_nonzero(inliers) >= MIN_INLIERS else None
+    return pair.pose(R, t, inliers) if np.count_nonzero(inliers) >= OPTIONS.min_inliers else None
 
 
 def _refine_best_start(pair: Pair, fit: EpipolarFit, start: Pose) -> Pose:
     """Return the refined pose that the inliers of F fit best, of those with the points in front of both cameras.
 
-    The pose from F itself is kept unless another one is clearly better and loses no inliers: of the two poses that a
-    plane allows, the wrong one loses the matches off the plane.
+    Another start than F must be clearly better and lose no inliers: of the two poses that a plane allows, the wrong one
+    loses the matches off the plane.
     """
     used = pair.lines[fit.inliers]
     best = refine_pose(used, *start)
     if not len(used):
         return best
     lowest, most = _pose_cost(used, *best), int(np.count_nonzero(pair.inliers(*best)))
-    if is_in_front(used, *best).mean() < MIN_IN_FRONT:
+    if is_in_front(used, *best).mean() < OPTIONS.min_in_front:
         lowest, most = np.inf, 0
     ahead = points_ahead(used)
     planar = planar_starts(ahead) if fit.degeneracy == "planar" else ()
-    few = used[np.linspace(0, len(used) - 1, min(len(used), SCREENED)).astype(np.int64)]
+    few = used[np.linspace(0, len(used) - 1, min(len(used), OPTIONS.screened)).astype(np.int64)]
     promising, tried = np.inf, [best]
     for other in (best, *turned_starts(ahead, pair.essential_matrix(fit)), *planar):
         R, t = refine_pose(few, *other)
-        promising = min(promising, PROMISING * _pose_cost(few, R, t))
+        promising = min(promising, OPTIONS.promising * _pose_cost(few, R, t))
         if lowest < np.inf and (_pose_cost(few, R, t) > promising or _is_known((R, t), tried)):
             continue
         tried.append((R, t))
         R, t = refine_pose(used, R, t)
         cost, count = _pose_cost(used, R, t), int(np.count_nonzero(pair.inliers(R, t)))
-        if cost < (1.0 - MIN_IMPROVEMENT) * lowest and count >= most:
+        if cost < (1.0 - OPTIONS.min_improvement) * lowest and count >= most:
             t = t if np.mean(is_in_front(used, R, t)) >= 0.5 else -t
-            if is_in_front(used, R, t).mean() >= MIN_IN_FRONT:
+            if is_in_front(used, R, t).mean() >= OPTIONS.min_in_front:
                 best, lowest, most = (R, t), cost, count
     return best
 
 
-def _is_known(found: Pose, tried: Sequence[Pose]) -> bool:
-    """Return whether a start led to a pose that was tried; t and -t have the same epipolar lines."""
-    R, t = found
-    off = (max(np.abs(R - A).max(), min(np.abs(t - b).max(), np.abs(t + b).max())) for A, b in tried)
-    return bool(min(off) < SAME_POSE)
+def _is_known(pose: Pose, tried: Sequence[Pose]) -> bool:
+    """Return whether a pose was tried; t and -t have the same epipolar lines."""
+    R, t = pose
+    differences = (max(np.abs(R - A).max(), min(np.abs(t - b).max(), np.abs(t + b).max())) for A, b in tried)
+    return bool(min(differences) < OPTIONS.same_pose)
 
 
 def _pose_cost(used: FloatArray, R: FloatArray, t: FloatArray) -> float:
@@ -413,42 +372,27 @@ def _pose_cost(used: FloatArray, R: FloatArray, t: FloatArray) -> float:
 
 
 def is_in_front(used: FloatArray, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:
-    """Return (N,) whether each point is in front of both cameras.
-
-    Args:
-        used: (N, 18) matches as bearing vectors, view 1 and view 2.
-        R: (3, 3) rotation of view 2 from view 1.
-        t: (3,) translation.
-    """
+    """Return a mask (N,) of the matches `used` (N, 18) whose points lie in front of both cameras."""
     first, second = depths(used, R, t)
     return (first > 0) & (second > 0)
 
 
 def ray_angles_deg(used: FloatArray, R: FloatArray) -> FloatArray:
-    """Return (N,) degrees between the two rays of each match: the triangulation angles if t fits.
-
-    Args:
-        used: (N, 18) matches as bearing vectors, view 1 and view 2.
-        R: (3, 3) rotation of view 2 from view 1.
-    """
+    """Return (N,) degrees between the two rays of each match (N, 18): the triangulation angles if t fits."""
     h1, h2 = used[:, FIRST] @ R.T, used[:, SECOND]
     sine = np.linalg.norm(np.cross(h1, h2), axis=1)
     return np.asarray(np.degrees(np.arctan2(sine, (h1 * h2).sum(axis=1))), np.float64)
 
 
 def points_ahead(used: FloatArray) -> FloatArray:
-    """Return (M, 4) points of the planes z = 1 of view 1 and view 2, of the matches that both views see far ahead.
-
-    Args:
-        used: (N, 18) matches as bearing vectors, view 1 and view 2.
-    """
-    ahead = (used[:, 2] > LEAST_AHEAD) & (used[:, 11] > LEAST_AHEAD)
+    """Return (M, 4) points of the planes z = 1 of both views, of the matches (N, 18) far ahead in both."""
+    ahead = (used[:, 2] > OPTIONS.min_cosine_ahead) & (used[:, 11] > OPTIONS.min_cosine_ahead)
     return np.hstack([used[ahead, 0:2] / used[ahead, 2:3], used[ahead, 9:11] / used[ahead, 11:12]])
 
 
 def _essential_of_rays(used: FloatArray) -> FloatArray:
     """Return E (3, 3) of inliers (N, 18), by eight points with errors in pixels."""
     E = fit_rays(used[:, FIRST], used[:, SECOND])
-    for _ in range(REWEIGHTED_FITS):
+    for _ in range(OPTIONS.reweighted_fits):
         E = fit_rays(used[:, FIRST], used[:, SECOND], gradients(E, used) ** -2.0)
     return E

@@ -20,8 +20,6 @@ from sfm_app.jit import kernel
 from sfm_app.types import PairId
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
-# Groups of photos that pairs connect.
-
 
 class DisjointGroups:
     """Photos in groups that are joined one by one; the smaller of two groups is added to the larger.
@@ -35,95 +33,97 @@ class DisjointGroups:
         self.name = {photo: photo for photo in self.members}
 
     def join(self, a: int, b: int) -> list[int]:
-        """Join the groups of two photos, and return the photos that changed their group; none if it was the same.
-
-        Args:
-            a, b: photos.
-        """
-        kept, gone = self.name[a], self.name[b]
-        if kept == gone:
+        """Join the groups of two photos, and return the photos that change their group; none if it is the same."""
+        larger, smaller = self.name[a], self.name[b]
+        if larger == smaller:
             return []
-        if len(self.members[kept]) < len(self.members[gone]):
-            kept, gone = gone, kept
-        moved = self.members.pop(gone)
-        self.members[kept] += moved
-        self.name |= dict.fromkeys(moved, kept)
-        return moved
+        if len(self.members[larger]) < len(self.members[smaller]):
+            larger, smaller = smaller, larger
+        photos = self.members.pop(smaller)
+        self.members[larger] += photos
+        self.name |= dict.fromkeys(photos, larger)
+        return photos
 
 
 def connected_groups(pairs: Iterable[PairId], photos: Iterable[int] = ()) -> list[set[int]]:
-    """Group the photos that pairs connect, the largest group first.
-
-    Args:
-        pairs: connections between two photos.
-        photos: form groups of their own if no pair connects them.
-    """
-    known = list(pairs)
-    groups = DisjointGroups([*photos, *(photo for pair in known for photo in pair)])
-    for a, b in known:
+    """Group the photos that pairs connect, the largest first; `photos` without a pair form groups of their own."""
+    edges = list(pairs)
+    groups = DisjointGroups([*photos, *(photo for pair in edges for photo in pair)])
+    for a, b in edges:
         groups.join(a, b)
     return sorted(map(set, groups.members.values()), key=lambda group: (-len(group), min(group)))
 
 
-# Undo folds: parts of a graph that a few wrong pairs hold in a wrong place, against more right ones.
-#
-# Averaging begins along a tree, and a tree that passes through a look-alike puts a whole street where it is not.
-# The pairs that join the street to its true place then contradict the rotations, all by the same turn. It costs
-# less to let them have their way, and to turn the street by it, if the pairs that have to give way for this weigh
-# less: those of the least cut between the two ends (Ford and Fulkerson 1956).
+# Corrections of a fold. Averaging begins along a tree, and a tree through a look-alike misplaces a whole street. The
+# pairs of its true place then contradict the rotations, all by the same turn. The street is turned if these pairs
+# weigh more than the least cut between the two ends (Ford and Fulkerson 1956).
 
-CONTRADICTS_DEG, SAME_DEG = 10.0, 5.0
-"""Angle from which a pair contradicts the rotations, and up to which two pairs do so by the same turn. Chosen by hand:
-right pairs of a town are off by less than 5 degrees."""
-LEAST_PAIRS = 3
-"""Contradicting pairs that have to agree on a turn. Chosen by hand."""
-UNIT = 1000.0
-"""Flows are whole numbers of weights divided by this many parts of the largest weight. Chosen by hand."""
+
+@dataclass(frozen=True, slots=True)
+class CorrectionOptions:
+    """When a part of the photos is turned."""
+
+    contradicts_deg: float = 10.0
+    """Angle from which a pair contradicts the rotations. Chosen by hand: right pairs are below 5 degrees."""
+    same_deg: float = 5.0
+    """Angle up to which two pairs ask for the same turn. Chosen by hand."""
+    min_pairs: int = 3
+    """Contradicting pairs that have to agree on a turn. Chosen by hand."""
+    unit: float = 1000.0
+    """Flows are whole numbers of the largest weight over this. Chosen by hand."""
+    max_turns: int = 20
+    """Most parts of a graph that turn. Chosen by hand."""
+
+
+CORRECTIONS = CorrectionOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Turn:
-    """A part of the photos, and how it has to turn to satisfy pairs that contradict its place."""
+class RotationCorrection:
+    """A rotation of a part of the photos that satisfies pairs which contradict its place."""
 
     photos: BoolArray
-    """(count,) that turn."""
-    by: FloatArray
+    """(count,) mask of the part."""
+    R: FloatArray
     """(3, 3) applied to their rotations from the right."""
     gain: float
-    """Weight of the pairs that are satisfied, less that of the pairs that give way."""
+    """Weight of the satisfied pairs, less that of the pairs across the cut."""
 
 
-def find_turns(count: int, edges: IndexArray, left: FloatArray, strengths: FloatArray) -> Iterator[Turn]:
-    """Yield turns that satisfy more than they break, those of the strongest contradictions first.
+def find_corrections(
+    count: int, edges: IndexArray, residuals: FloatArray, strengths: FloatArray
+) -> Iterator[RotationCorrection]:
+    """Yield corrections that satisfy more than they break, those of the strongest contradictions first.
 
     Args:
-        count: photos.
-        edges: (E, 2) numbers of photos.
-        left: (E, 3) rotation vectors of R_j' R_ij R_i.
+        edges: (E, 2) numbers of photos below `count`.
+        residuals: (E, 3) rotation vectors of R_j' R_ij R_i.
         strengths: (E,) weights.
     """
-    held = np.degrees(np.linalg.norm(left, axis=1)) <= CONTRADICTS_DEG
-    open_, turns = ~held, Rotation.from_rotvec(left)
-    while open_.any():
-        seed = int(np.argmax(np.where(open_, strengths, -1.0)))
-        alike, reverse = (open_ & _is_small(turns * way) for way in (turns[seed].inv(), turns[seed]))
+    explained = np.degrees(np.linalg.norm(residuals, axis=1)) <= CORRECTIONS.contradicts_deg
+    unexplained, turns = ~explained, Rotation.from_rotvec(residuals)
+    while unexplained.any():
+        seed = int(np.argmax(np.where(unexplained, strengths, -1.0)))
+        alike, reverse = (unexplained & _is_small(turns * turn) for turn in (turns[seed].inv(), turns[seed]))
         group = _find_linked(count, edges, alike | reverse, seed)
-        open_ &= ~group
-        if np.count_nonzero(group) < LEAST_PAIRS:
+        unexplained &= ~group
+        if np.count_nonzero(group) < CORRECTIONS.min_pairs:
             continue
         ends = np.where((reverse & ~alike)[:, None], edges[:, ::-1], edges)[group]
-        side, given = find_cut(count, edges[held], strengths[held], (np.unique(ends[:, 0]), np.unique(ends[:, 1])))
-        gain = float(strengths[group].sum()) - given
+        side, cut_weight = find_cut(
+            count, edges[explained], strengths[explained], (np.unique(ends[:, 0]), np.unique(ends[:, 1]))
+        )
+        gain = float(strengths[group].sum()) - cut_weight
         if gain > 0.0:
-            yield Turn(~side, turns[seed].as_matrix(), gain)
+            yield RotationCorrection(~side, turns[seed].as_matrix(), gain)
 
 
 def _is_small(turns: Rotation) -> BoolArray:
-    return np.asarray(np.degrees(turns.magnitude()) < SAME_DEG, np.bool_)
+    return np.asarray(np.degrees(turns.magnitude()) < CORRECTIONS.same_deg, np.bool_)
 
 
 def _find_linked(count: int, edges: IndexArray, chosen: BoolArray, seed: int) -> BoolArray:
-    """Return (E,) which of the chosen pairs hang together with one of them by shared photos."""
+    """Return a mask (E,) of the chosen pairs that shared photos connect with the pair `seed`."""
     i, j = edges[chosen].T
     _, part = connected_components(sparse.coo_array((np.ones(len(i)), (i, j)), shape=(count, count)), directed=False)
     return np.asarray(chosen & (part[edges[:, 0]] == part[edges[seed, 0]]), np.bool_)
@@ -132,23 +132,22 @@ def _find_linked(count: int, edges: IndexArray, chosen: BoolArray, seed: int) ->
 def find_cut(
     count: int, edges: IndexArray, strengths: FloatArray, ends: tuple[IndexArray, IndexArray]
 ) -> tuple[BoolArray, float]:
-    """Return which photos stay on the side of the first ends, and the weight of the pairs across; inf without a cut.
+    """Return a mask of the photos on the side of the first ends, and the weight of the pairs across; inf without a cut.
 
     Args:
-        count: photos.
-        edges: (E, 2) of the pairs that hold.
-        strengths: (E,) their weights.
+        edges: (E, 2) numbers of photos below `count`.
+        strengths: (E,) weights.
         ends: (K,) photos that must be on the one side, and (L,) on the other.
     """
     if np.intersect1d(*ends).size or not len(edges):
         return np.zeros(count, np.bool_), float("inf")
-    unit = max(float(strengths.max()) / UNIT, 1e-300)
+    unit = max(float(strengths.max()) / CORRECTIONS.unit, 1e-300)
     capacity = _make_network(count, edges, np.maximum(1, np.round(strengths / unit)).astype(np.int64), ends)
-    found = maximum_flow(capacity, count, count + 1)
-    residual = sparse.csr_array((capacity - found.flow) > 0)
+    maximum = maximum_flow(capacity, count, count + 1)
+    residual = sparse.csr_array((capacity - maximum.flow) > 0)
     reached = np.zeros(count + 2, np.bool_)
     reached[breadth_first_order(residual, count, return_predecessors=False)] = True
-    return reached[:count], float(found.flow_value) * unit
+    return reached[:count], float(maximum.flow_value) * unit
 
 
 def _make_network(
@@ -163,28 +162,33 @@ def _make_network(
     return sparse.coo_array((values, (rows, columns)), shape=(count + 2, count + 2)).tocsr()
 
 
-LOOP_DEG = 5.0
-"""The three rotations of a loop agree if the angle of their product is smaller. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-SCALE_DEG = 3.0
-"""Scale of the robust sum of squares (Geman and McClure). docs/algorithms.md, From K to relative poses. Chosen by hand;
-halved and doubled by `benchmarks.sensitivity`."""
-SUM_ROUNDS, SQUARE_ROUNDS = 15, 50
-"""Rounds of the sum of angles, and of the robust sum of squares after it. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
-LEAST_ANGLE, LEAST_STEP = 1e-3, 1e-7
-"""In radians: smaller angles get no more weight; smaller steps end the search. Chosen by hand; halved and doubled by
-`benchmarks.sensitivity`."""
+@dataclass(frozen=True, slots=True)
+class AveragingOptions:
+    """Rotation averaging; docs/algorithms.md, From K to relative poses."""
 
-MOST_TURNS = 20
-"""Most parts of a graph that turn. Chosen by hand."""
-LOOP_BLOCK = 100_000
-"""Loops that are checked at once, to bound the memory. Chosen by hand."""
-DENSE_PHOTOS = 400
-"""Most photos for which a dense system is solved; conjugate gradients cost less for more. Counted."""
-STEP_PRECISION, MOST_ITERATIONS = 1e-6, 2000
-"""Relative precision of one step by conjugate gradients, and most iterations: the next rounds correct what is left.
-Chosen by hand; not measured on their own."""
+    loop_deg: float = 5.0
+    """The rotations of a loop agree if the angle of their product is smaller. Chosen by hand."""
+    scale_deg: float = 3.0
+    """Scale of the robust sum of squares (Geman and McClure). Chosen by hand."""
+    sum_rounds: int = 15
+    """Rounds of the sum of angles. Chosen by hand."""
+    square_rounds: int = 50
+    """Rounds of the robust sum of squares after it. Chosen by hand."""
+    min_angle: float = 1e-3
+    """Radians; smaller angles get no more weight. Chosen by hand."""
+    min_step: float = 1e-7
+    """Radians; smaller steps end the search. Chosen by hand."""
+    loop_block: int = 100_000
+    """Loops that are checked at once, to bound the memory. Chosen by hand."""
+    dense_photos: int = 400
+    """Most photos for which a dense system costs less than conjugate gradients. Counted."""
+    step_precision: float = 1e-6
+    """Relative precision of one step by conjugate gradients. Chosen by hand."""
+    max_iterations: int = 2000
+    """Most iterations of one step: the next rounds correct the rest. Chosen by hand."""
+
+
+AVERAGING = AveragingOptions()
 
 
 def average_rotations(
@@ -207,8 +211,8 @@ def average_rotations(
     turns, strengths = np.array(list(relative.values())), np.array([weights[pair] for pair in relative])
     support = strengths * loop_support(edges, turns, strengths)
     rotations = _propagate_along_tree(len(photos), edges, turns, support)
-    rotations = _descend(rotations, edges, turns, strengths, SUM_ROUNDS)
-    rotations = _undo_folds(rotations, edges, turns, strengths)
+    rotations = _descend(rotations, edges, turns, strengths, AVERAGING.sum_rounds)
+    rotations = _apply_corrections(rotations, edges, turns, strengths)
     angles = np.degrees(np.linalg.norm(_residuals(rotations, edges, turns), axis=1))
     return dict(zip(photos, rotations, strict=True)), dict(zip(relative, angles.tolist(), strict=True))
 
@@ -217,56 +221,59 @@ def _descend(
     rotations: FloatArray, edges: IndexArray, turns: FloatArray, strengths: FloatArray, sum_rounds: int
 ) -> FloatArray:
     """Return the rotations (I, 3, 3) that minimize the angles of pairs near given ones."""
-    for done in range(sum_rounds + SQUARE_ROUNDS):
-        left = _residuals(rotations, edges, turns)
-        angles = np.linalg.norm(left, axis=1)
+    for done in range(sum_rounds + AVERAGING.square_rounds):
+        residuals = _residuals(rotations, edges, turns)
+        angles = np.linalg.norm(residuals, axis=1)
         if done < sum_rounds:
-            factors = strengths / np.maximum(angles, LEAST_ANGLE)
+            factors = strengths / np.maximum(angles, AVERAGING.min_angle)
         else:
-            factors = strengths / (1.0 + (angles / np.radians(SCALE_DEG)) ** 2) ** 2
-        steps = _solve_steps(len(rotations), edges, left, factors)
+            factors = strengths / (1.0 + (angles / np.radians(AVERAGING.scale_deg)) ** 2) ** 2
+        steps = _solve_steps(len(rotations), edges, residuals, factors)
         rotations = rotations @ Rotation.from_rotvec(steps).as_matrix()
-        if done > sum_rounds and np.abs(steps).max() < LEAST_STEP:
+        if done > sum_rounds and np.abs(steps).max() < AVERAGING.min_step:
             break
     return rotations
 
 
-def _undo_folds(rotations: FloatArray, edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> FloatArray:
-    """Return the rotations after parts of the graph have turned to where most pairs want them."""
-    for _ in range(MOST_TURNS):
-        left = _residuals(rotations, edges, turns)
-        for turn in find_turns(len(rotations), edges, left, strengths):
-            turned = np.where(turn.photos[:, None, None], rotations @ turn.by, rotations)
-            if _robust_cost(_residuals(turned, edges, turns), strengths) < _robust_cost(left, strengths):
-                rotations = _descend(turned, edges, turns, strengths, 0)
+def _apply_corrections(
+    rotations: FloatArray, edges: IndexArray, turns: FloatArray, strengths: FloatArray
+) -> FloatArray:
+    """Return the rotations after corrections that lower the robust cost."""
+    for _ in range(CORRECTIONS.max_turns):
+        residuals = _residuals(rotations, edges, turns)
+        for correction in find_corrections(len(rotations), edges, residuals, strengths):
+            corrected = np.where(correction.photos[:, None, None], rotations @ correction.R, rotations)
+            if _robust_cost(_residuals(corrected, edges, turns), strengths) < _robust_cost(residuals, strengths):
+                rotations = _descend(corrected, edges, turns, strengths, 0)
                 break
         else:
             break
     return rotations
 
 
-def _robust_cost(left: FloatArray, strengths: FloatArray) -> float:
+def _robust_cost(residuals: FloatArray, strengths: FloatArray) -> float:
     """Return the sum of squares that the last rounds minimize."""
-    squares = (np.linalg.norm(left, axis=1) / np.radians(SCALE_DEG)) ** 2
+    squares = (np.linalg.norm(residuals, axis=1) / np.radians(AVERAGING.scale_deg)) ** 2
     return float(np.sum(strengths * squares / (1.0 + squares)))
 
 
 def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> FloatArray:
     """Return (E,), in (0, 1], the share of the loops of three through each pair that agree; 1 if there is no loop.
 
+    A loop weighs as much as the weaker of the two other pairs in it.
+
     Args:
         edges: (E, 2) numbers of photos, the smaller first.
         turns: (E, 3, 3) rotation of photo 2 from photo 1.
-        strengths: (E,) weights; a loop weighs as much as the weaker of the two other pairs in it.
     """
     loops, agree = check_loops(edges, turns)
-    found = np.zeros((2, len(edges)))
-    for one, others in ((0, (1, 2)), (1, (0, 2)), (2, (0, 1))):
+    sums = np.zeros((2, len(edges)))
+    for column, others in ((0, (1, 2)), (1, (0, 2)), (2, (0, 1))):
         weight = np.minimum(*(strengths[loops[:, other]] for other in others))
-        np.add.at(found[0], loops[:, one], weight * agree)
-        np.add.at(found[1], loops[:, one], weight)
+        np.add.at(sums[0], loops[:, column], weight * agree)
+        np.add.at(sums[1], loops[:, column], weight)
     least = np.median(strengths) * 0.1
-    return np.asarray((found[0] + least) / (found[1] + least), np.float64)
+    return np.asarray((sums[0] + least) / (sums[1] + least), np.float64)
 
 
 def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArray[np.bool_]]:
@@ -280,10 +287,12 @@ def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArr
     starts = np.searchsorted(edges[order, 0], np.arange(edges.max(initial=0) + 2))
     loops = order[_find_loops(edges[order], starts)] if len(edges) else np.zeros((0, 3), np.int64)
     agree = np.zeros(len(loops), np.bool_)
-    for start in range(0, len(loops), LOOP_BLOCK):
-        first, second, across = (turns[column] for column in loops[start : start + LOOP_BLOCK].T)
-        around = np.einsum("nji,njk,nkl->nil", across, second, first)
-        agree[start : start + LOOP_BLOCK] = np.degrees(Rotation.from_matrix(around).magnitude()) < LOOP_DEG
+    for start in range(0, len(loops), AVERAGING.loop_block):
+        first, second, across = (turns[column] for column in loops[start : start + AVERAGING.loop_block].T)
+        products = np.einsum("nji,njk,nkl->nil", across, second, first)
+        agree[start : start + AVERAGING.loop_block] = (
+            np.degrees(Rotation.from_matrix(products).magnitude()) < AVERAGING.loop_deg
+        )
     return loops, agree
 
 
@@ -295,38 +304,38 @@ def _find_loops(edges: IndexArray, starts: IndexArray) -> IndexArray:
         edges: (E, 2) sorted, the smaller photo first; E > 0.
         starts: first edge from each photo, and from one after the last.
     """
-    found, count = np.empty((len(edges), 3), np.int64), 0
+    loops, count = np.empty((len(edges), 3), np.int64), 0
     for k in range(len(edges)):
         a, b = edges[k]
         i, j = k + 1, starts[b]
         while i < starts[a + 1] and j < starts[b + 1]:
             if edges[i, 1] == edges[j, 1]:
-                if count == len(found):
-                    found = np.concatenate((found, np.empty_like(found)))
-                found[count, 0], found[count, 1], found[count, 2] = k, j, i
+                if count == len(loops):
+                    loops = np.concatenate((loops, np.empty_like(loops)))
+                loops[count, 0], loops[count, 1], loops[count, 2] = k, j, i
                 count += 1
             if edges[i, 1] <= edges[j, 1]:
                 i += 1
             else:
                 j += 1
-    return found[:count].copy()
+    return loops[:count].copy()
 
 
 def _propagate_along_tree(count: int, edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> FloatArray:
     """Return (count, 3, 3) rotations along the strongest edges, from the first photo of every group on."""
-    groups, near = DisjointGroups(range(count)), [[] for _ in range(count)]  # type: ignore[var-annotated]
+    groups, neighbors = DisjointGroups(range(count)), [[] for _ in range(count)]  # type: ignore[var-annotated]
     for k in np.argsort(-strengths, kind="stable"):
         a, b = edges[k].tolist()
         if groups.join(a, b):
-            near[a].append((b, turns[k]))
-            near[b].append((a, turns[k].T))
+            neighbors[a].append((b, turns[k]))
+            neighbors[b].append((a, turns[k].T))
     rotations, placed = np.tile(np.eye(3), (count, 1, 1)), set[int]()
     for root in range(count):
         waiting = [] if root in placed else [root]
         placed.add(root)
         while waiting:
             a = waiting.pop()
-            for b, turn in near[a]:
+            for b, turn in neighbors[a]:
                 if b not in placed:
                     rotations[b] = turn @ rotations[a]
                     placed.add(b)
@@ -336,22 +345,24 @@ def _propagate_along_tree(count: int, edges: IndexArray, turns: FloatArray, stre
 
 def _residuals(rotations: FloatArray, edges: IndexArray, turns: FloatArray) -> FloatArray:
     """Return the rotation vectors (E, 3) of R_j' R_ij R_i."""
-    around = np.einsum("nji,njk,nkl->nil", rotations[edges[:, 1]], turns, rotations[edges[:, 0]])
-    return np.asarray(Rotation.from_matrix(around).as_rotvec(), np.float64)
+    products = np.einsum("nji,njk,nkl->nil", rotations[edges[:, 1]], turns, rotations[edges[:, 0]])
+    return np.asarray(Rotation.from_matrix(products).as_rotvec(), np.float64)
 
 
-def _solve_steps(count: int, edges: IndexArray, left: FloatArray, factors: FloatArray) -> FloatArray:
+def _solve_steps(count: int, edges: IndexArray, residuals: FloatArray, factors: FloatArray) -> FloatArray:
     """Fit steps (count, 3) by weighted least squares of step_j - step_i = left; the free turn of each group stays 0."""
     i, j = edges.T
     b = np.zeros((count, 3))
-    np.add.at(b, j, factors[:, None] * left)
-    np.add.at(b, i, -factors[:, None] * left)
+    np.add.at(b, j, factors[:, None] * residuals)
+    np.add.at(b, i, -factors[:, None] * residuals)
     rows, columns = np.concatenate([i, j, i, j]), np.concatenate([i, j, j, i])
     values = np.concatenate([factors, factors, -factors, -factors])
     L = sparse.coo_array((values, (rows, columns)), shape=(count, count)).tocsr()
     L = sparse.csr_array(L + sparse.diags_array(np.full(count, 1e-9 * factors.max())))
-    if count <= DENSE_PHOTOS:
+    if count <= AVERAGING.dense_photos:
         return np.asarray(np.linalg.solve(L.toarray(), b), np.float64)
     inverse = sparse.diags_array(1.0 / L.diagonal())
-    solved = [cg(L, column, rtol=STEP_PRECISION, maxiter=MOST_ITERATIONS, M=inverse)[0] for column in b.T]
+    solved = [
+        cg(L, column, rtol=AVERAGING.step_precision, maxiter=AVERAGING.max_iterations, M=inverse)[0] for column in b.T
+    ]
     return np.column_stack(solved)

@@ -165,7 +165,7 @@ def mapping_figures(outcome: Outcome) -> dict[str, Json]:
         "tried": list(outcome.tried),
         "passes": outcome.passes,
         "one_camera_each": outcome.one_camera_each,
-        "rival_tried_because": outcome.thin,
+        "rival_tried_because": outcome.rival_reason,
         "explained_matches": sum(pair.matches for pair in main.explained.values()),
         "contradicted_matches": sum(pair.contradicted for pair in main.explained.values()),
         "cut_apart": list(outcome.cuts),

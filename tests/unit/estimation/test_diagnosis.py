@@ -66,13 +66,11 @@ def turned(moved, kinds, photos=4, noise=0.4):
 )
 def test_photos_that_no_pair_connects(matches, views, cause, says):
     found = diagnose_scene(matches, views, MatchSettings())
-
     assert (found.cause, says in found.message) == (cause, True)
 
 
 def test_features_are_counted_in_the_photo_as_it_was_searched():
     large = MatchGraph({1: MatchedImage(1, "1.jpg", "one", 6400, 4800)}, {1: np.zeros((3000, 2))}, {})
-
     assert diagnose_scene(large, NOTHING_MATCHED, MatchSettings()).cause != "texture"
     assert diagnose_scene(large, NOTHING_MATCHED, MatchSettings(max_image_size_px=6400)).cause == "texture"
 
@@ -89,9 +87,7 @@ def test_features_are_counted_in_the_photo_as_it_was_searched():
 def test_pairs_vote_with_their_inliers(kinds, cause, says):
     fits = {(1, key): fit(count, kind) for key, (kind, count) in enumerate(kinds.items(), start=2)}
     views = ViewGraph(fits, {(2, 3): Rejected("too few inliers")})
-
     found = diagnose_scene(photos((900,) * 5), views, MatchSettings())
-
     assert (found.cause, says in found.message) == (cause, True)
 
 
@@ -100,7 +96,6 @@ MOSTLY_TURNED = ["rotation", "planar", "rotation", "", "rotation", ""]
 
 def test_a_panorama_is_one_although_pairs_are_misjudged():
     matches, views = turned((0.0, 0.0, 0.0), MOSTLY_TURNED)
-
     assert diagnose_scene(matches, views, MatchSettings()).cause == "rotation"
     assert diagnose_depth(matches, views, [1, 2, 3, 4], EpipolarSettings(), camera_known=True).cause == "rotation"
 
@@ -108,7 +103,6 @@ def test_a_panorama_is_one_although_pairs_are_misjudged():
 @pytest.mark.parametrize("moved", [(0.2, 0.0, 0.0), (0.4, 0.0, 0.0)])
 def test_a_few_pairs_with_parallax_hold_depth_whatever_the_others_say(moved):
     matches, views = turned(moved, MOSTLY_TURNED)
-
     assert diagnose_depth(matches, views, [1, 2, 3, 4], EpipolarSettings(), camera_known=False) is None
 
 
@@ -124,9 +118,7 @@ def test_a_few_pairs_with_parallax_hold_depth_whatever_the_others_say(moved):
 )
 def test_a_model_needs_depth_or_a_plane_and_its_camera(kind, count, camera_known, cause):
     matches, views = turned((0.4, 0.0, 0.0), [kind] * 6)
-
     found = diagnose_depth(matches, views, range(1, count + 1), EpipolarSettings(), camera_known=camera_known)
-
     assert (found.cause if found else None) == cause
 
 
@@ -136,6 +128,5 @@ def test_a_model_that_no_pair_supports_is_not_judged():
 
 def test_a_diagnosis_ends_the_run_with_exit_code_4():
     error = diagnose_scene(photos((0, 0)), NOTHING_MATCHED, MatchSettings()).error("two seeds tried")
-
     assert isinstance(error, ReconstructionError) and error.exit_code == 4
     assert str(error).endswith("; two seeds tried") and error.hint == HINTS["texture"]

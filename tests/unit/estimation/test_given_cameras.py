@@ -1,4 +1,4 @@
-"""Cameras that the user gave: which photos they took, at which size, and whether the photos contradict them."""
+"""Cameras of the user and focal lengths of EXIF, and their checks."""
 
 from dataclasses import replace
 
@@ -7,9 +7,22 @@ import pytest
 
 from sfm_app.camera.models import camera_matrix
 from sfm_app.errors import InputError
-from sfm_app.estimation.given_cameras import assign_cameras, find_contradictions, fit_to_photos
+from sfm_app.estimation.given_cameras import (
+    FocalClaim,
+    assign_cameras,
+    find_contradictions,
+    fit_to_photos,
+    focal_claim,
+    refined_claims,
+    report_claims,
+)
 from sfm_app.photos.probe import split_by_given_camera
-from sfm_app.types import Calibration, GivenCameras, MatchedImage, MatchGraph, Photo
+from sfm_app.plugins import load_plugins
+from sfm_app.progress import SilentProgress
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.workspace import Workspace
+from sfm_app.settings import Settings
+from sfm_app.types import Calibration, CameraModel, GivenCameras, Intrinsics, MatchedImage, MatchGraph, Photo, Scene
 
 
 def camera(focal=900.0, size=(1000, 800), center=(510.0, 390.0), **values):
@@ -28,14 +41,13 @@ def assigned(images, cameras, camera_of=None, *, keep=False):
 def test_a_single_camera_is_that_of_all_photos_of_its_shape():
     images = [photo(1, "a"), photo(2, "half", (500, 400)), photo(3, "square", (800, 800))]
     found = assigned(images, {"1": camera(spread={"fx": 4.0, "k1": 0.01})})
-
     assert list(found.cameras) == ["a", "half"]
     assert found.cameras["a"].K.tolist() == camera().K.tolist()
     half = found.cameras["half"]
     assert (half.K[0, 0], half.K[0, 2], half.K[1, 2], half.width) == (450.0, 255.0, 195.0, 500)
     assert half.spread == {"fx": 2.0, "k1": 0.01}
-    assert "half is scaled: from 1000 x 800 to 500 x 400 pixels" in found.notes[0]
-    assert "square have no given camera" in found.notes[1] and "cropped" in found.notes[1]
+    assert "half: from 1000 x 800 to 500 x 400 pixels" in found.notes[0]
+    assert "no given camera for the photos square" in found.notes[1] and "cropped" in found.notes[1]
 
 
 def test_sizes_are_rounded_to_whole_pixels():
@@ -46,7 +58,6 @@ def test_sizes_are_rounded_to_whole_pixels():
 
 def test_the_picture_inside_bars_may_be_what_the_camera_took():
     found, _ = fit_to_photos(camera(size=(1000, 500)), photo(size=(1000, 800), shown=(0, 150, 1000, 500)))
-
     assert (found.K[0, 2], found.K[1, 2], found.height) == (510.0, 540.0, 800)
 
 
@@ -62,7 +73,6 @@ def test_keep_marks_the_camera():
 
 def test_names_of_photos_and_groups_come_before_sizes():
     cameras = {"a": camera(800.0), "b": camera(900.0)}
-
     assert assigned([photo(1, "a"), photo(2, "b")], cameras).cameras["b"].K[0, 0] == 900.0
     assert assigned([photo(1, "x")], cameras, {"1.jpg": "b"}).cameras["x"].K[0, 0] == 900.0
     assert assigned([photo(1, "x")], {"1.jpg": camera(700.0), "b": camera()}).cameras["x"].K[0, 0] == 700.0
@@ -70,7 +80,6 @@ def test_names_of_photos_and_groups_come_before_sizes():
 
 def test_sizes_decide_among_several_cameras_where_only_one_fits():
     cameras = {"p": camera(800.0, (640, 480), (320.0, 240.0)), "q": camera(900.0)}
-
     assert assigned([photo(1, "x", (1000, 800))], cameras).cameras["x"].K[0, 0] == 900.0
     assert assigned([photo(1, "x", (320, 240))], cameras).cameras["x"].K[0, 0] == 400.0
     with pytest.raises(InputError, match="2 cameras of the file fit them, and none is named 'x'"):
@@ -78,7 +87,7 @@ def test_sizes_decide_among_several_cameras_where_only_one_fits():
 
 
 def test_a_file_that_fits_no_photo_is_an_error_and_panoramas_need_none():
-    with pytest.raises(InputError, match="fits no photo: the photos a have no given camera"):
+    with pytest.raises(InputError, match="fits no photo: no given camera for the photos a"):
         assigned([photo(size=(800, 800))], {"1": camera()})
     assert not assigned([photo(projection="equirectangular")], {"1": camera()}).cameras
 
@@ -86,7 +95,6 @@ def test_a_file_that_fits_no_photo_is_an_error_and_panoramas_need_none():
 def test_photos_of_one_group_with_different_cameras_are_divided():
     photos = [Photo(f"{k}.jpg", 10, 8, "10x8") for k in range(4)]
     given = GivenCameras({"p": camera(), "q": camera()}, {"0.jpg": "p", "1.jpg": "q", "2.jpg": "p"})
-
     groups = [one.group for one in split_by_given_camera(photos, given)]
     assert groups == ["10x8 by p", "10x8 by q", "10x8 by p", "10x8"]
     assert [one.group for one in split_by_given_camera(photos[::2], given)] == ["10x8", "10x8"]
@@ -103,7 +111,6 @@ def found(focal, deviation=5.0, **values):
 )
 def test_a_focal_is_contradicted_beyond_three_deviations_and_a_percent(focal, deviation, contradicted):
     said = find_contradictions(camera(), found(focal, deviation))
-
     assert [one.what for one in said] == (["focal length"] if contradicted else [])
     if contradicted:
         assert said[0].text == f"focal length: given 900 px, the photos say {focal:.0f} +- {deviation:.3g} px"
@@ -115,7 +122,6 @@ def test_the_deviation_of_the_given_camera_counts():
 
 def test_a_center_is_contradicted_where_the_photos_determine_it():
     moved = camera(center=(560.0, 390.0))
-
     [said] = find_contradictions(moved, found(900.0))
     assert (said.what, said.given_px, said.found_px) == ("optical center, across", 560.0, 510.0)
     assert find_contradictions(moved, found(900.0, held=("center",))) == []
@@ -141,3 +147,65 @@ def test_wide_lenses_are_compared_by_their_curves():
     assert said.what.endswith("degrees off the axis") and said.given_px < said.found_px
     [said] = find_contradictions(camera(400.0), replace(equidistant, spread={"fx": 1.0}))
     assert said.given_px > 1.1 * said.found_px and "the photos show a fisheye one" in said.text
+
+
+def exif_photo(key, focal=None, **values):
+    return MatchedImage(key, f"{key}.jpg", "a", 1000, 800, focal, **values)
+
+
+def test_a_claim_is_the_median_of_the_photos_inside_their_bars():
+    claim = focal_claim(
+        [exif_photo(1, 1200.0), exif_photo(2, 1210.0), exif_photo(3), exif_photo(4, 9000.0)], 1850.0, 20.0
+    )
+    assert (claim.claimed_px, claim.photos) == (1210.0, 3)
+    assert focal_claim([exif_photo(1)], 1850.0, 20.0) is None
+    assert focal_claim([exif_photo(1, 1200.0, shown=(0, 0, 500, 800))], 9.0, 9.0).claimed_px == 960.0
+
+
+@pytest.mark.parametrize(
+    ("claimed", "deviation", "contradicted"),
+    [(1200.0, 20.0, True), (1720.0, 2.0, False), (1200.0, 300.0, False), (2900.0, 20.0, True)],
+)
+def test_a_claim_may_be_rounded_and_photos_may_be_unsure(claimed, deviation, contradicted):
+    assert FocalClaim(claimed, 3, 1850.0, deviation).is_contradicted == contradicted
+
+
+def test_the_text_has_both_numbers_and_what_happened():
+    assert FocalClaim(1200.0, 3, 1850.0, 20.0).text == (
+        "EXIF says 1200 px, the photos say 1850 +- 20: they were cropped or zoomed"
+    )
+    assert "through another lens" in FocalClaim(1850.0, 3, 1200.0, 20.0).text
+
+
+class Said(SilentProgress):
+    """Progress that keeps what is said."""
+
+    def __init__(self):
+        self.lines = []
+
+    def say(self, text):
+        self.lines.append(text)
+
+
+def test_only_contradicted_claims_are_said_and_all_are_recorded(tmp_path):
+    run = RunContext(Settings(), Workspace(tmp_path), load_plugins(), None, 1, Said())
+    report_claims({"a": FocalClaim(1200.0, 3, 1850.0, 20.0), "b": FocalClaim(900.0, 2, 905.0, 5.0), "c": None}, run)
+
+    assert run.progress.lines == [
+        "the photos a: EXIF says 1200 px, the photos say 1850 +- 20: they were cropped or zoomed"
+    ]
+    recorded = run.statistics["exif_focals"]
+    assert [recorded[name]["contradicted"] for name in ("a", "b")] == [True, False] and "c" not in recorded
+    silent = replace(run, statistics={})
+    report_claims({"c": None}, silent)
+    assert silent.statistics == {}
+
+
+def test_bundle_adjustment_judges_claims_that_pairs_could_not_judge():
+    K = camera_matrix(1850.0, 1850.0, 500.0, 400.0)
+    refined = CameraModel("OPENCV", (1850.0, 1850.0, 500.0, 400.0, 0, 0, 0, 0), K, 1000, 800, {"fx": 10.0})
+    scene = Scene(None, {"1.jpg": np.eye(3, 4)}, {}, {"a": refined}, 9, 9, 0.3, {"1.jpg": "a"})
+    matches = MatchGraph({1: exif_photo(1, 1200.0), 2: exif_photo(2, 99.0)}, {}, {})
+    unknown = Calibration(K, 1000, 800, "exif", False, "an orbit")
+    assert refined_claims(scene, Intrinsics({"a": unknown}), matches)["a"].claimed_px == 1200.0
+    assert refined_claims(scene, Intrinsics({"a": replace(unknown, identifiable=True)}), matches) == {}

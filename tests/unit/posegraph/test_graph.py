@@ -1,3 +1,4 @@
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -7,7 +8,15 @@ from scipy.spatial.transform import Rotation
 from sfm_app.camera.models import camera_matrix
 from sfm_app.geometry.epipolar import eight_point, sampson_distance
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
-from sfm_app.posegraph.graph import BEHIND, CONTRADICTS, NOT_COMPUTABLE, TOO_FEW, average_pair_rotations
+from sfm_app.posegraph.graph import (
+    BEHIND,
+    CONTRADICTS,
+    NOT_COMPUTABLE,
+    TOO_FEW,
+    average_pair_rotations,
+    guided_pose,
+    sample_direction,
+)
 from sfm_app.posegraph.rotations import connected_groups
 from sfm_app.types import (
     Calibration,
@@ -108,9 +117,7 @@ SIX = (1, 2, 3, 4, 5, 6)
 
 def test_photos_of_one_place_hang_together():
     photos = Photos([SIX])
-
     graph = photos.graph()
-
     assert list(graph.poses) == list(combinations(SIX, 2)) and graph.dropped == {}
     assert graph.groups == (SIX,)
     rotations = average_pair_rotations(graph.poses)[0]
@@ -123,9 +130,7 @@ def test_a_pair_that_saw_another_place_contradicts_the_others():
     photos = Photos([SIX])
     photos.elsewhere((2, 5), 40.0)
     photos.elsewhere((1, 3), 3.0)  # too near to the others to contradict them
-
     graph = photos.graph()
-
     assert graph.dropped == {(2, 5): CONTRADICTS}
     assert (2, 5) not in graph.poses and (1, 3) in graph.poses
     assert graph.groups == (SIX,)
@@ -183,9 +188,7 @@ def test_where_cameras_are_guesses_pairs_keep_the_inliers_of_F():
     photos = Photos([SIX])
     photos.spoil((1, 5), 40)
     photos.rejected[1, 5] = Rejected("too few inliers")
-
     graph = photos.graph(method="guess", identifiable=False)
-
     assert {pose.kind for pose in graph.poses.values()} == {"uncalibrated"}
     fits = photos.views.fits
     assert all(np.array_equal(pose.inliers, fits[pair].inliers) for pair, pose in graph.poses.items())
@@ -195,7 +198,6 @@ def test_where_cameras_are_guesses_pairs_keep_the_inliers_of_F():
 def test_guessed_cameras_bend_all_pairs_and_none_is_blamed_for_it():
     """With three times the focal, right pairs are up to 17 degrees from their photos' rotations, half of them 4.5."""
     graph = Photos([SIX]).graph(K=camera_matrix(3000.0, 3000.0, 500.0, 375.0), method="guess", identifiable=False)
-
     assert graph.dropped == {}
     photos = Photos([SIX])
     photos.elsewhere((2, 5), 40.0)
@@ -238,7 +240,6 @@ def test_results_do_not_depend_on_the_order_in_which_pairs_are_done():
 @pytest.mark.parametrize("order", [1, -1])
 def test_photos_that_hang_together(order):
     pairs = [(1, 2), (3, 4), (5, 6), (2, 3), (8, 9)][::order]
-
     assert connected_groups(pairs) == [{1, 2, 3, 4}, {5, 6}, {8, 9}]
     assert connected_groups(pairs, range(1, 8)) == [{1, 2, 3, 4}, {5, 6}, {8, 9}, {7}]
     assert connected_groups([]) == []
@@ -250,9 +251,7 @@ def test_a_pair_whose_inliers_lie_in_one_point_has_no_pose_and_the_others_have_t
     photos.match((1, 2), np.random.default_rng(0).uniform(0, 700, (40, 2)), np.full((40, 2), 300.0))
     fits = {**views.fits, (1, 2): EpipolarFit(np.diag([1.0, 1.0, 0.0]), np.ones(40, bool), np.ones(40), 1, 0.1)}
     bent = Intrinsics({"one": Calibration(K, 1000, 750, "zero-curves", True, radial=-1e-3)})
-
     graph = build_pose_graph(photos.matches, ViewGraph(fits, views.rejected), bent, OPTIONS, in_turn)
-
     assert graph.dropped == {(1, 2): NOT_COMPUTABLE}
     assert sorted(graph.poses) == [(1, 3), (2, 3)] and graph.groups == ((1, 2, 3),)
 
@@ -283,3 +282,85 @@ def test_a_graph_takes_over_the_poses_of_a_model():
     assert list(after.poses) == [(1, 2), (1, 3), (3, 4)] and after.poses[1, 2].R[0, 0] == -1
     assert after.dropped == {(2, 3): CONTRADICTS}
     assert after.groups == ((1, 2, 3, 4),)
+
+
+LEAST = 16
+
+
+def off(views, degrees):
+    return Rotation.from_euler("xyz", [0.4 * degrees, 0.9 * degrees, 0.1 * degrees], degrees=True).as_matrix() @ views.R
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_with_the_rotation_known_a_fifth_of_right_matches_is_enough(two_views, seed):
+    views = two_views(seed, right=60, false=240)
+    pose = guided_pose(views.pair(), off(views, 0.5), LEAST, seed)
+    assert pose.guided and pose.kind == "calibrated"
+    assert 0.001 < views.errors_deg(pose.R, pose.t).max() < 0.6
+    assert pose.inliers[:60].mean() > 0.95 and pose.inliers[60:].mean() < 0.1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_with_a_wrong_rotation_nothing_is_believed(two_views, seed):
+    views = two_views(seed, right=60, false=240)
+    assert guided_pose(views.pair(), off(views, 20.0), LEAST, seed) is None
+
+
+@pytest.mark.parametrize(("degrees", "believed"), [(1.5, True), (2.5, False), (4.0, False)])
+def test_a_pose_that_leaves_the_rotation_it_was_given_is_not_believed(two_views, degrees, believed):
+    """All matches are right, and the fit finds the true pose each time."""
+    views = two_views()
+    assert (guided_pose(views.pair(), off(views, degrees), LEAST, 0) is not None) == believed
+
+
+@pytest.mark.parametrize(("reversed_matches", "believed"), [(0, True), (6, True), (20, False)])
+def test_a_pose_with_matches_behind_the_cameras_is_not_believed(two_views, reversed_matches, believed):
+    """In a shift along x, a match the wrong way round lies on its epipolar line, behind the cameras."""
+    views = two_views(R=np.eye(3), t=np.array([1.0, 0.0, 0.0]))
+    x1, x2 = views.x1.copy(), views.x2.copy()
+    x1[:reversed_matches], x2[:reversed_matches] = views.x2[:reversed_matches], views.x1[:reversed_matches]
+    pose = guided_pose(replace(views, x1=x1, x2=x2).pair(), np.eye(3), LEAST, 0)
+    assert (pose is not None) == believed
+
+
+def test_a_step_too_short_to_be_seen_gives_no_direction(two_views):
+    """Its points lie before both cameras, but a turn alone explains them, too."""
+    short, long = (two_views(t=step * two_views().t, noise_px=0.05) for step in (0.01, 0.2))
+    assert guided_pose(short.pair(), short.R, LEAST, 0) is None
+    assert guided_pose(long.pair(), long.R, LEAST, 0) is not None
+
+
+def test_matches_of_nothing_are_not_believed(two_views):
+    views = two_views(right=0, false=200)
+    assert [guided_pose(views.pair(), views.R, LEAST, seed) for seed in range(5)] == [None] * 5
+
+
+def test_a_turn_has_no_direction_to_find(two_views):
+    views = two_views(scene="turn", false=50)
+    assert guided_pose(views.pair(), views.R, LEAST, 0) is None
+
+
+def test_too_few_matches_are_not_looked_at(two_views):
+    assert guided_pose(two_views(right=15).pair(), two_views().R, LEAST, 0) is None
+    assert guided_pose(two_views(right=16).pair(), two_views().R, LEAST, 0).inlier_count == 16
+
+
+def test_the_direction_points_to_where_the_matches_lie_before_both_cameras(two_views):
+    for sign in (1.0, -1.0):
+        t = sign * two_views().t * [1, 1, 0.2]
+        views = two_views(t=t / np.linalg.norm(t), noise_px=0.1)
+        found = sample_direction(views.pair(), views.R, np.random.default_rng(0))
+        assert views.errors_deg(views.R, found)[1] < 3.0
+
+
+def test_the_same_seed_finds_the_same_pose(two_views):
+    views = two_views(right=60, false=240)
+    first, second = (guided_pose(views.pair(), views.R, LEAST, 3) for _ in range(2))
+    assert first.t.tobytes() == second.t.tobytes() and first.R.tobytes() == second.R.tobytes()
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_few_and_wild_matches_never_raise(two_views, seed):
+    """Whatever is near the sampled direction may be gone once the pose is fitted."""
+    views = two_views(seed, right=0, false=16, noise_px=0.0)
+    guided_pose(views.pair(), views.R, 2, seed)

@@ -80,9 +80,7 @@ def told_apart(scene):
 def test_two_equal_boxes_at_the_ends_of_a_walk_are_told_apart(seed):
     scene = walk(seed, twice=True)
     false = scene.poses.keys() - scene.true_pairs
-
     found, dropped = told_apart(scene)
-
     assert len(false) > 20 and len(dropped - false) <= 1
     assert len(false - dropped) <= 0.2 * len(false)  # what is left has few matches
     assert len(found.joins) == 1 and 0.35 < found.joins[0].missing < 0.7
@@ -91,7 +89,6 @@ def test_two_equal_boxes_at_the_ends_of_a_walk_are_told_apart(seed):
 @pytest.mark.parametrize("seed", range(3))
 def test_boxes_that_differ_join_nothing(seed):
     scene = walk(seed, twice=False)
-
     assert len(scene.true_pairs) == len(scene.poses) > 100
     found, _ = told_apart(scene)
     assert found.joins == found.doubtful == ()
@@ -101,7 +98,6 @@ def test_boxes_that_differ_join_nothing(seed):
 def test_an_orbit_stays_closed(farther):
     scene = orbit(0, farther=farther)
     across = [(a, b) for a, b in scene.poses if b - a > 12]
-
     assert len(across) >= 2
     assert told_apart(scene)[0].joins == ()
 
@@ -109,9 +105,7 @@ def test_an_orbit_stays_closed(farther):
 def test_the_two_sides_of_a_can_are_told_apart_by_the_room_behind_it():
     scene = can(0)
     false = scene.poses.keys() - scene.true_pairs
-
     _, dropped = told_apart(scene)
-
     assert len(false) > 80 and dropped <= false
     assert len(false - dropped) <= 0.2 * len(false)
 
@@ -137,15 +131,12 @@ def test_a_pair_that_is_found_later_is_asked_as_well():
     scene = walk(0, twice=True)
     found, dropped = told_apart(scene)
     true, false = max(scene.true_pairs, key=lambda pair: len(scene.matches.matches[pair])), max(dropped)
-
     rows = {pair: scene.matches.matches[pair][scene.poses[pair].inliers] for pair in (true, false)}
-
     assert found.is_look_alike(false, rows[false]) and not found.is_look_alike(true, rows[true])
 
 
 def test_doubted_pairs_between_the_same_places_are_one_join():
     trusted = [(1, 2), (2, 3), (2, 30), (11, 12), (21, 22)]
-
     assert group_doubted_pairs([(1, 11), (2, 12), (3, 21), (12, 30)], trusted) == [
         ((1, 11), (2, 12), (12, 30)),
         ((3, 21),),
@@ -154,13 +145,11 @@ def test_doubted_pairs_between_the_same_places_are_one_join():
 
 def test_the_backbone_holds_what_no_better_way_leads_round():
     covered = {(1, 2): 0.9, (2, 3): 0.8, (1, 3): 0.73, (3, 4): 0.4, (1, 4): 0.35}
-
     assert backbone(covered) == {(1, 2), (2, 3), (1, 3), (3, 4)}
 
 
 def test_nothing_is_found_among_no_pairs():
     scene = walk(0, twice=True)
-
     assert find_look_alikes(scene.matches, {}, scene.cameras).joins == ()
 
 

@@ -12,14 +12,14 @@ from sfm_app.mapping import hypotheses
 from sfm_app.mapping import passes as module
 from sfm_app.mapping.attempt import Attempt, NoModel, PairSupport, explained_pairs
 from sfm_app.mapping.hypotheses import (
-    MIN_PHOTOS,
-    can_have_own_cameras,
-    is_as_good,
-    is_better,
+    OPTIONS,
+    camera_per_photo_explains_more,
+    is_shared_camera_doubtful,
+    two_cameras_suffice,
     with_camera_per_photo,
     with_two_cameras,
 )
-from sfm_app.mapping.passes import reconstruct
+from sfm_app.mapping.passes import Mappers, reconstruct
 from sfm_app.settings import Settings
 from sfm_app.types import ViewGraph
 
@@ -49,7 +49,7 @@ def views(number):
         (6, 6, 1, AUTO, False),
         (4, 6, 0, AUTO, True),
         (5, 6, 0, AUTO, False),
-        (MIN_PHOTOS - 1, MIN_PHOTOS - 1, 2, AUTO, False),
+        (OPTIONS.min_photos - 1, OPTIONS.min_photos - 1, 2, AUTO, False),
         (101, 101, 2, AUTO, False),
         (6, 6, 2, Settings.from_mapping({"photos": {"cameras": "single"}}), False),
     ],
@@ -58,19 +58,18 @@ def test_it_is_asked_where_one_camera_does_not_explain_photos_that_nobody_groupe
     cameras, placed, number, contradicted, settings, asked
 ):
     guess = cameras(method="guess", identifiable=False)
-    assert can_have_own_cameras(attempt(photos(placed), contradicted), guess, views(number), settings) is asked
+    assert is_shared_camera_doubtful(attempt(photos(placed), contradicted), guess, views(number), settings) is asked
 
 
 def test_it_is_asked_of_photos_of_a_plane_whose_pairs_are_all_degenerate(cameras):
     none = ViewGraph({}, {})
     guess = cameras(method="guess", identifiable=False)
-
-    assert can_have_own_cameras(attempt(photos(6), 2), guess, none, AUTO)
-    assert not can_have_own_cameras(attempt(photos(MIN_PHOTOS - 1), 2), guess, none, AUTO)
+    assert is_shared_camera_doubtful(attempt(photos(6), 2), guess, none, AUTO)
+    assert not is_shared_camera_doubtful(attempt(photos(OPTIONS.min_photos - 1), 2), guess, none, AUTO)
 
 
 def test_without_a_model_it_is_not_asked(cameras):
-    assert not can_have_own_cameras(None, cameras(), views(6), AUTO)
+    assert not is_shared_camera_doubtful(None, cameras(), views(6), AUTO)
 
 
 def test_every_photo_gets_a_guess_of_its_own_that_begins_where_mapping_ended(synthetic, cameras):
@@ -105,7 +104,7 @@ def test_a_camera_that_pairs_determine_is_not_divided(synthetic, cameras):
     ],
 )
 def test_it_is_taken_where_it_explains_more_and_contradictions_go(own, better):
-    assert is_better(own, attempt(photos(6), 10)) is better
+    assert camera_per_photo_explains_more(own, attempt(photos(6), 10)) is better
 
 
 def each_of(synthetic, cameras, focals):
@@ -119,9 +118,7 @@ def each_of(synthetic, cameras, focals):
 def test_photos_of_two_focals_get_two_cameras(synthetic, cameras, monkeypatch):
     model, each, found = each_of(synthetic, cameras, [1000.0, 1300.0, 1010.0, 1310.0, 990.0, 1290.0])
     monkeypatch.setattr(hypotheses, "cameras_by_photo", lambda _: found)
-
     two = with_two_cameras(model, each, synthetic.matches)
-
     names = {photo: two.camera_name(synthetic.matches.images[photo]) for photo in range(1, 7)}
     assert len(two.cameras) == 2 and names[1] == names[3] == names[5] != names[2] == names[4] == names[6]
     assert [two.cameras[names[photo]].focal_px for photo in (1, 2)] == pytest.approx([1000.0, 1300.0])
@@ -131,7 +128,6 @@ def test_photos_of_two_focals_get_two_cameras(synthetic, cameras, monkeypatch):
 def test_a_single_photo_of_another_focal_is_no_second_camera(synthetic, cameras, monkeypatch):
     model, each, found = each_of(synthetic, cameras, [1000.0, 1005.0, 1010.0, 1310.0, 990.0, 1001.0])
     monkeypatch.setattr(hypotheses, "cameras_by_photo", lambda _: found)
-
     assert with_two_cameras(model, each, synthetic.matches) is None
 
 
@@ -147,7 +143,7 @@ def test_a_single_photo_of_another_focal_is_no_second_camera(synthetic, cameras,
     ],
 )
 def test_two_cameras_are_taken_where_they_explain_as_much(two, as_good):
-    assert is_as_good(two, attempt(photos(6), 0, 1000, 1000)) is as_good
+    assert two_cameras_suffice(two, attempt(photos(6), 0, 1000, 1000)) is as_good
 
 
 @pytest.fixture
@@ -169,11 +165,10 @@ def zoom(monkeypatch, synthetic):
                 }
             return [Attempt("incremental", model, explained, f"{len(names)} cameras")]
 
-        monkeypatch.setattr(module, "map_group", attempts)
-        monkeypatch.setattr(module, "map_baseline", lambda *_: NoModel("colmap", "no rival"))
+        mappers = Mappers(map_group=attempts, map_baseline=lambda *_: NoModel("colmap", "no rival"))
         monkeypatch.setattr(module, "with_two_cameras", lambda *_: None)
-        monkeypatch.setattr(module, "MOST_PASSES", 1)
-        return asked
+        monkeypatch.setattr(module, "OPTIONS", replace(module.OPTIONS, max_passes=1))
+        return asked, mappers
 
     return make
 
@@ -184,21 +179,17 @@ def cameras_in(path):
 
 
 def test_photos_of_a_zoom_are_mapped_with_a_camera_each(synthetic, run, cameras, zoom):
-    asked = zoom(right=True)
-
-    found = reconstruct(synthetic.matches, synthetic.views, cameras(method="guess", identifiable=False), run())
-
+    asked, mappers = zoom(right=True)
+    found = reconstruct(synthetic.matches, synthetic.views, cameras(method="guess", identifiable=False), run(), mappers)
     assert asked == [1, 6]
     assert len(found.intrinsics.cameras) == 6 and cameras_in(run().workspace.database) == 6
     assert found.tried[-2:] == ("6 cameras (a camera for each photo)", "no rival (a camera for each photo)")
 
 
 def test_photos_of_one_camera_keep_it_and_so_does_the_database(synthetic, run, cameras, zoom, monkeypatch):
-    monkeypatch.setattr(module, "can_have_own_cameras", lambda *_: True)
-    asked = zoom(right=False)
+    monkeypatch.setattr(module, "is_shared_camera_doubtful", lambda *_: True)
+    asked, mappers = zoom(right=False)
     guess = cameras(method="guess", identifiable=False)
-
-    found = reconstruct(synthetic.matches, synthetic.views, guess, run())
-
+    found = reconstruct(synthetic.matches, synthetic.views, guess, run(), mappers)
     assert asked == [1, 6]
     assert found.intrinsics is guess and cameras_in(run().workspace.database) == 1

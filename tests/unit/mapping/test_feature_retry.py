@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sfm_app.api import open_run
 from sfm_app.colmap.database import write_keypoints, write_matches
@@ -11,12 +13,18 @@ from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.errors import BackendError, ClusterError
 from sfm_app.mapping import feature_retry as module
 from sfm_app.mapping.attempt import Attempt, explained_pairs
-from sfm_app.mapping.feature_retry import LOOSE_RATIO, MappedScene, candidate_pairs, lost_photos, retry_lost_photos
+from sfm_app.mapping.feature_retry import (
+    OPTIONS,
+    MappedScene,
+    Steps,
+    add_matches,
+    candidate_pairs,
+    lost_photos,
+    retry_lost_photos,
+)
 from sfm_app.mapping.passes import Outcome
 from sfm_app.settings import Settings
 from sfm_app.types import MatchedImage, MatchGraph, PoseGraph, ViewGraph
-
-pytestmark = pytest.mark.slow
 
 LOST = 6
 
@@ -45,7 +53,7 @@ def first(synthetic, cameras, tmp_path):
 
 
 @pytest.fixture
-def finer(monkeypatch, synthetic):
+def finer(synthetic):
     """Lets finer features be those that COLMAP has made; what is asked for is noted. `places` of six find a place.
 
     Matches are wrong where their second features come in another `order`.
@@ -68,19 +76,18 @@ def finer(monkeypatch, synthetic):
             asked.append((matches, views, intrinsics))
             return outcome_of(synthetic, matches, views, places)
 
-        monkeypatch.setattr(module, "fill_database", fill_database)
-        monkeypatch.setattr(module, "reconstruct", reconstruct)
-        return asked
+        return asked, Steps(fill_database, reconstruct=reconstruct)
 
     return make
 
 
+@pytest.mark.slow
 def test_a_lost_photo_finds_its_place_by_finer_features(first, finer):
-    asked = finer()
+    asked, steps = finer()
 
-    found = retry_lost_photos(first)
+    found = retry_lost_photos(first, steps)
 
-    assert asked[0] == ("sift-dsp", [(k, LOST) for k in range(1, LOST)], LOOSE_RATIO)
+    assert asked[0] == ("sift-dsp", [(k, LOST) for k in range(1, LOST)], OPTIONS.max_ratio)
     matches, views, intrinsics = asked[1]
     assert intrinsics is first.intrinsics  # it was known
     assert all((k, LOST) in views.fits and len(matches.matches[k, LOST]) >= 100 for k in range(1, LOST))
@@ -91,57 +98,56 @@ def test_a_lost_photo_finds_its_place_by_finer_features(first, finer):
     assert (said["placed"], said["taken"], said["pairs_with_geometry"]) == ([5, 6], True, [10, 15])
 
 
-def test_cameras_that_were_not_known_are_found_anew(first, finer, cameras, monkeypatch):
-    asked, anew = finer(), cameras(focal=1200.0)
-    monkeypatch.setattr(module, "find_intrinsics", lambda *_: (anew, ()))
-
-    retry_lost_photos(replace(first, intrinsics=cameras(method="guess", identifiable=False)))
-
+@pytest.mark.slow
+def test_cameras_that_were_not_known_are_found_anew(first, finer, cameras):
+    (asked, steps), anew = finer(), cameras(focal=1200.0)
+    steps = replace(steps, find_intrinsics=lambda *_: (anew, ()))
+    retry_lost_photos(replace(first, intrinsics=cameras(method="guess", identifiable=False)), steps)
     assert asked[1][2] is anew
 
 
+@pytest.mark.slow
 def test_what_was_found_first_stays_where_no_more_photos_find_a_place(first, finer):
-    finer(places=5)
-
-    assert retry_lost_photos(first) is first
+    _, steps = finer(places=5)
+    assert retry_lost_photos(first, steps) is first
     assert first.run.statistics["second_look"]["taken"] is False
 
 
+@pytest.mark.slow
 def test_nothing_is_mapped_again_where_no_lost_photo_shows_the_same_scene(first, finer):
-    asked = finer(order=slice(None, None, -1))
-
-    assert retry_lost_photos(first) is first
+    asked, steps = finer(order=slice(None, None, -1))
+    assert retry_lost_photos(first, steps) is first
     assert len(asked) == 1
     assert (first.run.statistics["second_look"]["placed"], first.run.statistics["second_look"]["taken"]) == ([5], False)
 
 
+@pytest.mark.slow
 def test_a_second_look_that_fails_costs_nothing(first, finer):
-    finer(failing=BackendError("the disk is full"))
-
-    assert retry_lost_photos(first) is first
+    _, steps = finer(failing=BackendError("the disk is full"))
+    assert retry_lost_photos(first, steps) is first
     assert first.run.statistics["second_look"]["failed"] == "the disk is full"
 
 
+@pytest.mark.slow
 def test_a_second_look_whose_cluster_is_gone_is_not_skipped(first, finer):
-    finer(failing=ClusterError("the scheduler is gone"))
-
+    _, steps = finer(failing=ClusterError("the scheduler is gone"))
     with pytest.raises(ClusterError, match="scheduler"):
-        retry_lost_photos(first)
+        retry_lost_photos(first, steps)
 
 
+@pytest.mark.slow
 def test_nobody_looks_twice_where_all_photos_have_a_place(first, finer, synthetic):
-    asked = finer()
+    asked, steps = finer()
     whole = replace(first, outcome=outcome_of(synthetic, first.matches, first.views, 6))
+    assert retry_lost_photos(whole, steps) is whole and asked == [] and "second_look" not in first.run.statistics
 
-    assert retry_lost_photos(whole) is whole and asked == [] and "second_look" not in first.run.statistics
 
-
+@pytest.mark.slow
 @pytest.mark.parametrize("chosen", [{"scene": {"second_look": False}}, {"matching": {"features": "sift-dsp"}}])
 def test_nobody_looks_twice_where_that_is_not_wanted(first, finer, chosen):
-    asked = finer()
+    asked, steps = finer()
     unasked = replace(first, run=replace(first.run, settings=Settings.from_mapping(chosen)))
-
-    assert retry_lost_photos(unasked) is unasked and asked == []
+    assert retry_lost_photos(unasked, steps) is unasked and asked == []
 
 
 def photos(count, matches=()):
@@ -150,23 +156,71 @@ def photos(count, matches=()):
     return MatchGraph(images, {}, rows)
 
 
+@pytest.mark.slow
 def test_in_small_sets_a_lost_photo_is_matched_with_all_others():
     assert candidate_pairs([2], photos(4)) == [(1, 2), (2, 3), (2, 4)]
 
 
+@pytest.mark.slow
 def test_in_large_sets_it_is_matched_with_its_neighbors():
     graph = photos(100, [((50, k), 100 + k) for k in range(80, 100)] + [((10, 50), 500)])
-
     found = candidate_pairs([50], graph)
-
     near = {(48, 50), (49, 50), (50, 51), (50, 52)}
     likely = {(10, 50)} | {(50, k) for k in range(93, 100)}
     assert found == sorted(near | likely)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "lost", "seen"), [(59, 1, 1), (100, 4, 0), (100, 5, 5)])
 def test_few_lost_photos_of_many_are_left(monkeypatch, count, lost, seen):
     monkeypatch.setattr(module, "posed_photo_ids", lambda _: range(1, count - lost + 1))
     outcome = Outcome((Attempt("incremental", object(), {}, ""),), PoseGraph({}, {}, ()), None, ())
-
     assert len(lost_photos(MappedScene(outcome, photos(count), ViewGraph({}, {}), None, None))) == seen
+
+
+GRID = np.array([[10.0 * k, 5.0] for k in range(4)])
+
+
+def graph(known=()):
+    rows = {(1, 2): np.array(known, np.uint32)} if len(known) else {}
+    return MatchGraph({}, {1: GRID, 2: GRID + 1.0, 3: np.zeros((0, 2))}, rows)
+
+
+def test_keypoints_in_one_place_are_one_and_others_are_appended():
+    found = {1: np.array([[10.3, 5.0], [14.0, 5.0]]), 2: np.array([[1.0, 6.0], [90.0, 9.0]])}
+    merged, changed = add_matches(graph(known=[[0, 3]]), found, {(1, 2): np.array([[0, 0], [1, 1]], np.uint32)})
+    np.testing.assert_array_equal(merged.keypoints[1], np.vstack([GRID, found[1]]))
+    np.testing.assert_array_equal(merged.matches[1, 2], [[0, 3], [1, 0], [5, 5]])
+    assert changed == ((1, 2),)
+
+
+def test_a_keypoint_that_has_a_match_gets_no_other():
+    found = {1: GRID, 2: GRID + 1.0}
+    merged, changed = add_matches(graph(known=[[0, 3]]), found, {(1, 2): np.array([[0, 1], [2, 3]], np.uint32)})
+    np.testing.assert_array_equal(merged.matches[1, 2], [[0, 3]])
+    assert changed == ()
+
+
+def test_a_pair_and_a_photo_without_anything_get_what_was_found():
+    found = {1: GRID, 3: GRID}
+    merged, changed = add_matches(graph(), found, {(1, 3): np.array([[3, 1]], np.uint32)})
+    np.testing.assert_array_equal(merged.matches[1, 3], [[3, 1]])
+    assert changed == ((1, 3),) and len(merged.keypoints[3]) == 4
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_matches_stay_one_to_one_and_lie_where_they_were_found(seed):
+    rng = np.random.default_rng(seed)
+    known = np.column_stack([rng.permutation(4)[:2], rng.permutation(4)[:2]])
+    found = {photo: rng.uniform(0, 40, (6, 2)) for photo in (1, 2)}
+    found[1][:2] = GRID[:2] + 0.2
+    added = np.column_stack([rng.permutation(6), rng.permutation(6)]).astype(np.uint32)
+
+    merged, _ = add_matches(graph(known=known), found, {(1, 2): added})
+    rows = merged.matches[1, 2]
+
+    np.testing.assert_array_equal(rows[:2], known)
+    assert all(len(np.unique(column)) == len(rows) for column in rows.T)
+    every = np.hstack([found[1][added[:, 0]], found[2][added[:, 1]]])
+    for row in np.hstack(merged.points((1, 2)))[2:]:
+        assert np.abs(every - row).max(axis=1).min() <= 0.5

@@ -11,10 +11,10 @@ from sfm_app.colmap.model import poses_and_points
 from sfm_app.errors import BackendError, ClusterError
 from sfm_app.geometry.poses import umeyama
 from sfm_app.mapping import parts
-from sfm_app.mapping import passes as mapping_passes
 from sfm_app.mapping.attempt import Attempt, Group, NoModel, PairSupport, best_attempt
 from sfm_app.mapping.part_mapping import FOLDER, PartResult, PartTask, map_part
-from sfm_app.mapping.parts import is_convincing, map_in_parts, part_size
+from sfm_app.mapping.parts import map_in_parts, part_size, parts_suffice
+from sfm_app.mapping.passes import Mappers, Passes
 from sfm_app.plugins import load_plugins
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.runtime.context import RunContext
@@ -46,7 +46,7 @@ def group(town):
 def start(group, tmp_path):
     """Maps the group in parts with some workers, in a folder of its own."""
 
-    def run_with(workers=2, *, whole=False, group=group, asked=True):
+    def run_with(workers=2, *, whole=False, group=group, stop_at_false_joins=True):
         place = Workspace(tmp_path / f"of-{workers}")
         place.photos.mkdir(parents=True)
         write_match_graph(place.database, group.matches)
@@ -55,7 +55,7 @@ def start(group, tmp_path):
         settings = Settings.from_mapping({"scene": {"part_photos": PART}})
         with make_executor(workers) as executor:
             run = RunContext(settings, place, load_plugins(installed=False), executor, workers)
-            found = map_in_parts(group, group.graph, run, asked=asked)
+            found = map_in_parts(group, group.graph, run, stop_at_false_joins=stop_at_false_joins)
             return found if whole else (found[0], run)
 
     return run_with
@@ -76,7 +76,7 @@ def test_parts_become_one_exact_model_with_all_photos_whatever_the_workers(town,
     true = town.centers[np.array(photos) - 1]
     away = np.linalg.norm(umeyama(centers, true)(centers) - true, axis=1)
     assert 0.0005 < np.median(away) < 0.1 and away.max() < 0.5
-    assert is_convincing(found, len(group.photos))
+    assert parts_suffice(found, len(group.photos))
     (figures,) = run.statistics["parts"]
     assert len(figures["parts"]) >= 3 and len(figures["joins"]) >= len(figures["parts"]) - 1
     assert not figures["dropped_joins"] and not figures["left_out"]
@@ -128,11 +128,9 @@ def test_where_no_part_is_mapped_the_reason_is_told(group, start, monkeypatch):
     failed = PartResult((), "", ("failed: no memory",))
     monkeypatch.setattr(parts, "map_parts", lambda *_, **__: [failed] * 9)
     monkeypatch.setattr(parts, "cut_group", lambda *_: [parts.Part((k,), (k,)) for k in range(1, 10)])
-
     (found,) = start()[0]
-
-    assert isinstance(found, NoModel) and found.note == "in 9 parts: none was mapped; failed: no memory"
-    assert not is_convincing([found], PHOTOS)
+    assert isinstance(found, NoModel) and found.note == "in 9 parts: no part has a model; failed: no memory"
+    assert not parts_suffice([found], PHOTOS)
 
 
 @pytest.mark.parametrize(("error", "passes"), [(ClusterError("gone"), True), (BackendError("failed"), False)])
@@ -151,7 +149,6 @@ def test_a_cluster_that_is_gone_ends_the_run_and_other_failures_leave_the_whole(
 
 def test_the_size_of_parts_is_that_of_the_settings_or_usual_for_large_groups():
     auto, own = SceneSettings(), SceneSettings(part_photos=60)
-
     assert [part_size(count, auto) for count in (3, 400, 401, 9000)] == [0, 0, 150, 150]
     assert [part_size(count, own) for count in (90, 91, 1000)] == [0, 60, 60]
     assert part_size(100, SceneSettings(part_photos=1)) == 20
@@ -176,22 +173,22 @@ def attempt(photos, contradicted=0, mapper="parts", matches=100):
     ([attempt(200)], True), ([attempt(195)], True), ([attempt(180)], False), ([attempt(200, 6)], False), ([], False),
 ])  # fmt: skip
 def test_a_model_of_parts_convinces_with_nearly_all_photos_and_few_contradictions(found, good):
-    assert is_convincing(found, 200) is good
+    assert parts_suffice(found, 200) is good
 
 
 @pytest.mark.parametrize(("of_parts", "taken"), [(attempt(200), "parts"), (attempt(100, matches=50), "whole")])
-def test_the_whole_is_mapped_where_parts_do_not_explain_it(group, start, monkeypatch, of_parts, taken):
+def test_the_whole_is_mapped_where_parts_do_not_explain_it(group, of_parts, taken):
     whole = []
 
     def map_whole(*_):
         whole.append(attempt(190, mapper="whole"))
         return whole
 
-    monkeypatch.setattr(mapping_passes, "map_group", map_whole)
-    monkeypatch.setattr(mapping_passes, "map_in_parts", lambda *_, **__: ([of_parts], ()))
-    monkeypatch.setattr(mapping_passes, "part_size", lambda *_: 100)
+    mappers = Mappers(lambda *_: 100, map_whole, lambda *_, **__: ([of_parts], ()))
 
-    found, joins = mapping_passes._map_by_size(replace(group, photos=tuple(range(200))), _run(), asked=True)
+    found, joins = Passes(_run(), mappers).map_by_size(
+        replace(group, photos=tuple(range(200))), stop_at_false_joins=True
+    )
 
     assert best_attempt(found).mapper == taken and joins == ()
     assert len(whole) == (taken == "whole")
@@ -202,22 +199,23 @@ def test_parts_with_false_joins_are_not_joined_unless_nobody_asks(start, monkeyp
     results = [PartResult((), "", ("failed",), (one,)) for one in (join, more, join)]
     monkeypatch.setattr(parts, "map_parts", lambda *_, **__: results)
     monkeypatch.setattr(parts, "cut_group", lambda *_: [parts.Part((k,), (k,)) for k in (1, 2, 3)])
-
     assert start(1, whole=True) == ([], (join, LookAlikes(((5, 6),), 0.7)))
-    found, joins = start(2, whole=True, asked=False)
-    assert joins == () and [one.note for one in found] == ["in 3 parts: none was mapped; failed"]
+    found, joins = start(2, whole=True, stop_at_false_joins=False)
+    assert joins == () and [one.note for one in found] == ["in 3 parts: no part has a model; failed"]
 
 
 @pytest.mark.parametrize("asked", [True, False])
-def test_false_joins_of_parts_go_up_and_nothing_else_is_mapped(group, monkeypatch, asked):
+def test_false_joins_of_parts_go_up_and_nothing_else_is_mapped(group, asked):
     join = LookAlikes(((1, 2),), 0.9)
-    monkeypatch.setattr(mapping_passes, "map_group", lambda *_: pytest.fail("the whole was mapped"))
-    monkeypatch.setattr(
-        mapping_passes, "map_in_parts", lambda *_, asked: ([], (join,)) if asked else ([attempt(200)], ())
-    )
-    monkeypatch.setattr(mapping_passes, "part_size", lambda *_: 100)
 
-    found, joins = mapping_passes._map_by_size(replace(group, photos=tuple(range(200))), _run(), asked=asked)
+    def in_parts(*_, stop_at_false_joins):
+        return ([], (join,)) if stop_at_false_joins else ([attempt(200)], ())
+
+    mappers = Mappers(lambda *_: 100, lambda *_: pytest.fail("the whole was mapped"), in_parts)
+
+    found, joins = Passes(_run(), mappers).map_by_size(
+        replace(group, photos=tuple(range(200))), stop_at_false_joins=asked
+    )
 
     assert joins == ((join,) if asked else ()) and len(found) == (0 if asked else 1)
 
@@ -233,6 +231,5 @@ def test_a_task_is_small_and_travels(tmp_path):
     import pickle
 
     task = PartTask(str(tmp_path), str(tmp_path / "photos"))
-
     assert len(pickle.dumps((map_part, task))) < 1000
     assert pickle.loads(pickle.dumps((map_part, task))) == (map_part, task)  # noqa: S301

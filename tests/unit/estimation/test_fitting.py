@@ -96,7 +96,6 @@ def test_a_given_fisheye_takes_the_place_of_the_one_that_is_found_and_is_checked
 @pytest.mark.slow
 def test_a_given_perspective_camera_is_used_and_contradicted_where_the_lens_is_a_fisheye(run):
     matches, wrong = photos_through(WIDE), given(run, PLAIN)
-
     assert find_lenses(matches, wrong) == {}
     [said] = [one for one in run.statistics["given_cameras"]["960x640"]["contradicted"] if "fisheye" in one["what"]]
     assert said["given_px"] > 1.5 * said["found_px"]
@@ -107,9 +106,7 @@ def test_a_given_perspective_camera_is_checked_by_the_calibrator(run):
     matches = photos_through(PLAIN, 6, away=14.0)
     wrong = given(run, replace(PLAIN, K=PLAIN.K * [[1.2], [1.2], [1.0]]))
     views = view_graph.make(matches, wrong)
-
     intrinsics, cameras = find_intrinsics(matches, views, wrong)
-
     assert [(camera.name, camera.found.method) for camera in cameras] == [("960x640", "given")]
     assert intrinsics.main.focal_px == pytest.approx(1080.0)
     [said] = run.statistics["given_cameras"]["960x640"]["contradicted"][:1]
@@ -121,15 +118,13 @@ def test_the_name_of_a_model_says_whether_the_lens_is_wide(run):
     matches = photos_through(WIDE)
     perspective = replace(run, settings=Settings.from_mapping({"scene": {"camera_model": "OPENCV"}}))
     fisheye = replace(run, settings=Settings.from_mapping({"scene": {"camera_model": "RADIAL_FISHEYE"}}))
-
     assert find_lenses(matches, perspective) == {}
     assert find_lenses(photos_through(PLAIN, away=14.0), fisheye)["960x640"].projection == "fisheye"
 
 
 def test_only_panoramas_can_be_panoramas(run):
     panoramic = replace(run, settings=Settings.from_mapping({"scene": {"camera_model": "EQUIRECTANGULAR"}}))
-
-    with pytest.raises(ConfigError, match=r"5 photos are no panoramas, such as 1\.jpg"):
+    with pytest.raises(ConfigError, match=r"5 photos are not panoramas, such as 1\.jpg"):
         find_lenses(photos_through(PLAIN), panoramic)
 
 
@@ -138,7 +133,6 @@ def test_four_terms_describe_every_lens_of_the_family(exponent):
     lens = Fisheye(480.0 / float(Fisheye(1.0, exponent).radius(np.radians(87.0))), exponent, (481.0, 322.0))
     estimate = LensEstimate(lens, tuple(map(tuple, (np.eye(4) * 1e-8).tolist())), 0.9, 0.4, 12, SIZE)
     camera = to_calibration(estimate, SIZE)
-
     theta = np.linspace(0.0, np.radians(87.0), 100)
     assert np.abs(camera.focal_px * fisheye_radius(theta, camera) - lens.radius(theta)).max() < 0.05
     assert camera.identifiable and "174 degrees" in describe_lens(camera)

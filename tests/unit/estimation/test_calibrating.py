@@ -1,10 +1,13 @@
-"""Through a barrel or pincushion lens, pairs get back the inliers that straight epipolar lines have lost."""
+"""Samples of pairs, and inliers through a lens."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from benchmarks.lenses.distortion import calibrate, photograph
-from sfm_app.estimation.calibrating import choose_inliers_again
+from sfm_app.estimation import calibrating as module
+from sfm_app.estimation.calibrating import sample_pairs, select_inliers_through_lens
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
@@ -13,7 +16,41 @@ from sfm_app.selfcal import CalibratedCamera
 from sfm_app.settings import Settings
 from sfm_app.stages import view_graph
 from sfm_app.synthetic.cameras import Lens
-from sfm_app.types import Calibration
+from sfm_app.types import Calibration, EpipolarFit, ViewGraph
+
+
+def row_of_photos(photos, reach, degenerate=()):
+    """Photos in a row; each is paired with those within reach, and shares less with those further away."""
+    pairs = [(a, b) for a in range(photos) for b in range(a + 1, min(a + reach + 1, photos))]
+    fits = {}
+    for a, b in pairs:
+        inliers, kind = np.arange(200) < 200 - 5 * (b - a), "planar" if (a, b) in degenerate else ""
+        fits[a, b] = EpipolarFit(np.eye(3), inliers, np.ones(200), 1, 0.3, kind)
+    return ViewGraph(fits, {})
+
+
+def test_all_pairs_of_a_small_set_are_asked():
+    views = row_of_photos(20, 10)
+    assert sample_pairs(views, 20) is views
+
+
+def test_every_photo_of_a_large_set_is_asked_with_near_and_far_partners(monkeypatch):
+    monkeypatch.setattr(module, "OPTIONS", replace(module.OPTIONS, all_pairs=300))
+    views = row_of_photos(200, 20)
+    found = sample_pairs(views, 200)
+    counts = np.bincount(np.array(list(found.fits)).ravel(), minlength=200)
+    assert counts.min() >= module.OPTIONS.pairs_per_photo
+    assert 400 <= len(found.fits) <= 800 < len(views.fits)
+    gaps = [b - a for a, b in found.fits]
+    assert min(gaps) == 1 and np.mean(np.array(gaps) > 10) > 0.2
+
+
+def test_pairs_that_determine_no_matrix_are_not_asked(monkeypatch):
+    monkeypatch.setattr(module, "OPTIONS", replace(module.OPTIONS, all_pairs=300))
+    flat = {(a, a + 1) for a in range(199)}
+    found = sample_pairs(row_of_photos(200, 20, degenerate=flat), 200)
+    assert flat.isdisjoint(found.fits)
+
 
 PHOTOS = (1, 2, 3, 4)
 
@@ -40,8 +77,7 @@ def inliers_of(views):
 
 def test_the_right_lens_gives_inliers_back(bent):
     matches, views, K, run = bent
-    again = choose_inliers_again(matches, views, camera(K, 0.2), run)
-
+    again = select_inliers_through_lens(matches, views, camera(K, 0.2), run)
     right = sum(int(np.count_nonzero(rows[:, 0] == rows[:, 1])) for rows in matches.matches.values())
     assert inliers_of(views) < 0.85 * right
     assert 0.97 * right < inliers_of(again) < 1.03 * right
@@ -51,12 +87,12 @@ def test_the_right_lens_gives_inliers_back(bent):
 @pytest.mark.parametrize(("radial", "identifiable"), [(0.0, True), (0.01, True), (0.2, False)])
 def test_without_a_known_lens_nothing_changes(bent, radial, identifiable):
     matches, views, K, run = bent
-    assert choose_inliers_again(matches, views, camera(K, radial, identifiable=identifiable), run) is views
+    assert select_inliers_through_lens(matches, views, camera(K, radial, identifiable=identifiable), run) is views
 
 
 def test_a_wrong_lens_takes_no_inliers_away(bent):
     matches, views, K, run = bent
-    again = choose_inliers_again(matches, views, camera(K, -0.3), run)
+    again = select_inliers_through_lens(matches, views, camera(K, -0.3), run)
     for pair, fit in views.fits.items():
         assert again.fits[pair].inlier_count >= 0.7 * fit.inlier_count
 

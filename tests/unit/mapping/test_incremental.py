@@ -8,9 +8,8 @@ import pytest
 
 from sfm_app.colmap.database import write_match_graph
 from sfm_app.colmap.model import posed_photo_ids, submodel
-from sfm_app.mapping import incremental as module
 from sfm_app.mapping.attempt import Attempt, explained_pairs, model_poses
-from sfm_app.mapping.incremental import map_new_photos
+from sfm_app.mapping.incremental import Steps, map_new_photos
 from sfm_app.mapping.passes import Outcome
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.types import LookAlikes, PoseGraph, RelativePose
@@ -19,10 +18,10 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def grow(synthetic, cameras, run, tmp_path, monkeypatch):
+def grow(synthetic, cameras, run, tmp_path):
     """Maps with an earlier model of some photos; the whole set would be mapped as the given model."""
 
-    def make(model, known, whole=None):
+    def make(model, known, whole=None, **steps):
         place = SimpleNamespace(database=tmp_path / "earlier.db", sparse=tmp_path / "earlier")
         place.sparse.mkdir()
         (tmp_path / "photos").mkdir()  # COLMAP requires it
@@ -31,9 +30,7 @@ def grow(synthetic, cameras, run, tmp_path, monkeypatch):
         names = frozenset(synthetic.matches.images[photo].name for photo in known)
         figures, context = {}, run(min_points=10)
         context.record = lambda **more: figures.update(more)
-        monkeypatch.setattr(module, "replace", lambda one, **more: one if one is context else replace(one, **more))
         found = cameras()
-        monkeypatch.setattr(module, "find_intrinsics", lambda *_: (found, ()))
 
         def reconstruct(matches, views, intrinsics, _):
             if not whole:
@@ -42,16 +39,15 @@ def grow(synthetic, cameras, run, tmp_path, monkeypatch):
             attempt = Attempt("incremental", whole, explained, "all again")
             return Outcome((attempt,), PoseGraph({}, {}, ()), intrinsics, ("all again",))
 
-        monkeypatch.setattr(module, "reconstruct", reconstruct)
         earlier = SimpleNamespace(place=place, known=names)
-        return map_new_photos(synthetic.matches, synthetic.views, found, context, earlier), figures
+        fakes = Steps(lambda *_: found, reconstruct, **steps)
+        return map_new_photos(synthetic.matches, synthetic.views, found, context, earlier, fakes), figures
 
     return make
 
 
 def test_new_photos_join_the_model_and_nothing_is_mapped_again(grow, synthetic):
     found, figures = grow(submodel(synthetic.model, [1, 2, 3, 4]), (1, 2, 3, 4))
-
     main = found.outcome.models[0]
     assert posed_photo_ids(main.model) == [1, 2, 3, 4, 5, 6]
     assert main.mapper == "grown" and figures["mapped_again_because"] == "" and figures["grown_from"] == 4
@@ -64,12 +60,11 @@ def test_new_photos_join_the_model_and_nothing_is_mapped_again(grow, synthetic):
 
 def test_photos_that_left_leave_the_model(grow, synthetic):
     found, figures = grow(synthetic.copy(), (1, 2, 3, 4, 5))
-
     assert figures["mapped_again_because"] == ""
     assert len(posed_photo_ids(found.outcome.models[0].model)) == 6  # the sixth was replaced, and is placed anew
 
 
-def test_a_known_photo_whose_pairs_were_dropped_leaves_and_keeps_no_other_from_its_place(grow, synthetic, monkeypatch):
+def test_a_known_photo_whose_pairs_were_dropped_leaves_and_keeps_no_other_from_its_place(grow, synthetic):
     build = build_pose_graph
 
     def without_the_first(*inputs):
@@ -77,11 +72,15 @@ def test_a_known_photo_whose_pairs_were_dropped_leaves_and_keeps_no_other_from_i
         poses = {pair: pose for pair, pose in graph.poses.items() if 1 not in pair}
         return replace(graph, poses=poses, groups=((2, 3, 4, 5, 6),))
 
-    monkeypatch.setattr(module, "build_pose_graph", without_the_first)
-    found, _ = grow(submodel(synthetic.model, [1, 2, 3, 4]), (1, 2, 3, 4), whole=submodel(synthetic.model, [1, 2]))
+    found, _ = grow(
+        submodel(synthetic.model, [1, 2, 3, 4]),
+        (1, 2, 3, 4),
+        whole=submodel(synthetic.model, [1, 2]),
+        build_pose_graph=without_the_first,
+    )
 
     assert posed_photo_ids(found.outcome.models[0].model) == [2, 3, 4, 5, 6]
-    assert found.outcome.reason == "3 photos were known, and 2 of 2 others found their place"
+    assert found.outcome.reason == "3 photos were known, and 2 of 2 others were registered"
 
 
 def test_a_wrong_earlier_model_is_mapped_again(grow, synthetic):
@@ -90,43 +89,38 @@ def test_a_wrong_earlier_model_is_mapped_again(grow, synthetic):
         frames = [wrong.frames[wrong.images[key].frame_id] for key in (photo, other)]
         poses = [frame.rig_from_world for frame in frames]
         frames[0].rig_from_world, frames[1].rig_from_world = poses[1], poses[0]
-
     found, figures = grow(wrong, (1, 2, 3, 4), whole=synthetic.copy())
-
     assert figures["mapped_again_because"]
     assert found.outcome.models[0].note == "all again"
 
 
 def test_a_model_of_few_of_the_photos_is_no_start(grow, synthetic):
     found, figures = grow(submodel(synthetic.model, [1, 2]), (1, 2), whole=synthetic.copy())
-
     assert "only 2 of 6 photos" in figures["mapped_again_because"]
     assert found.outcome.models[0].photos == 6
 
 
-def test_the_grown_model_stays_where_all_again_explains_less(grow, synthetic, monkeypatch):
-    monkeypatch.setattr(module, "rival_reason", lambda *_: "a doubt")
-
+def test_the_grown_model_stays_where_all_again_explains_less(grow, synthetic):
     found, figures = grow(
-        submodel(synthetic.model, [1, 2, 3, 4]), (1, 2, 3, 4), whole=submodel(synthetic.model, [1, 2, 3])
+        submodel(synthetic.model, [1, 2, 3, 4]),
+        (1, 2, 3, 4),
+        whole=submodel(synthetic.model, [1, 2, 3]),
+        rival_reason=lambda *_: "a doubt",
     )
-
     assert figures["mapped_again_because"] == "a doubt"
     assert found.outcome.models[0].mapper == "grown" and found.outcome.models[0].photos == 6
     assert found.outcome.tried[0] == "all again"
 
 
 @pytest.mark.parametrize(("left", "mapper"), [((1, 2, 3), "incremental"), ((), "grown")])
-def test_a_grown_model_with_two_places_in_one_stays_only_where_nothing_else_is_found(
-    grow, synthetic, monkeypatch, left, mapper
-):
-    monkeypatch.setattr(module, "judge_places", lambda _: ([LookAlikes(((1, 6),), 0.9)], 12))
-
+def test_a_grown_model_with_two_places_in_one_stays_only_where_nothing_else_is_found(grow, synthetic, left, mapper):
     found, figures = grow(
-        submodel(synthetic.model, [1, 2, 3, 4]), (1, 2, 3, 4), whole=left and submodel(synthetic.model, left)
+        submodel(synthetic.model, [1, 2, 3, 4]),
+        (1, 2, 3, 4),
+        whole=left and submodel(synthetic.model, left),
+        judge_places=lambda _: ([LookAlikes(((1, 6),), 0.9)], 12),
     )
-
-    assert figures["mapped_again_because"] == "the model has two places in one"
+    assert figures["mapped_again_because"] == "two different places are merged in the model"
     assert found.outcome.models[0].mapper == mapper
 
 

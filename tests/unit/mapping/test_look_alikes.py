@@ -1,0 +1,283 @@
+"""Look-alikes in models of photos that walk along walls, with real cameras of COLMAP."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.mapping.attempt import Attempt, PairSupport
+from sfm_app.mapping.look_alikes import (
+    OVERLAPS,
+    ExpectedOverlap,
+    drop_look_alikes,
+    find_expected_overlaps,
+    find_false_joins,
+    find_non_overlapping,
+    judge_places,
+    jumps,
+    look_alike_entries,
+    sides,
+    with_earlier_look_alikes,
+)
+from sfm_app.types import EpipolarFit, LookAlikes, MatchedImage, MatchGraph, PoseGraph, ViewGraph
+
+COUNTS = {(1, 2): 90, (1, 11): 80, (2, 12): 70, (2, 11): 20, (11, 12): 90}
+JOIN = LookAlikes(((1, 11), (2, 11), (2, 12)), 0.3456)
+
+
+@pytest.fixture
+def matches():
+    photos = {photo for pair in COUNTS for photo in pair}
+    return MatchGraph(
+        {photo: MatchedImage(photo, f"{photo}.jpg", "camera", 100, 80) for photo in photos},
+        {photo: np.zeros((90, 2)) for photo in photos},
+        {pair: np.zeros((count, 2), np.uint32) for pair, count in COUNTS.items()},
+    )
+
+
+def graph(*joins, dropped=None):
+    return PoseGraph({}, dropped or {}, (), joins)
+
+
+def test_matches_of_look_alikes_do_not_speak(matches):
+    fit = EpipolarFit(np.eye(3), np.ones(1, bool), np.ones(1), 1, 0.1)
+    views = ViewGraph({(1, 2): fit, (1, 11): fit}, {})
+    kept, seen = drop_look_alikes(matches, views, graph(JOIN))
+    assert set(kept.matches) == {(1, 2), (11, 12)} and set(seen.fits) == {(1, 2)}
+    assert drop_look_alikes(matches, views, graph()) == (matches, views)
+
+
+def test_a_second_pass_knows_what_the_first_told_apart():
+    later = LookAlikes(((3, 4),), 0.5)
+    first = graph(JOIN, dropped=dict.fromkeys(JOIN.pairs, "alike") | {(7, 8): "else"})
+    found = with_earlier_look_alikes(graph(later, dropped={(3, 4): "alike"}), first)
+    assert found.look_alikes == (JOIN, later)
+    assert found.dropped == dict.fromkeys((*JOIN.pairs, (3, 4)), "alike")
+
+
+def test_the_photos_of_a_join_fall_into_two_places(matches):
+    assert sides(JOIN.pairs, matches) == ([1, 2], [11, 12])
+    assert look_alike_entries([JOIN], matches) == [
+        {"pairs": 3, "between": [["1.jpg", "2.jpg"], ["11.jpg", "12.jpg"]], "missing": 0.346}
+    ]
+
+
+def model(places):
+    def image(number, x):
+        return SimpleNamespace(
+            image_id=number, name=f"{number:02d}.jpg", has_pose=True, projection_center=lambda: np.array([x, 0.0, 0.0])
+        )
+
+    return SimpleNamespace(images={number: image(number, x) for number, x in enumerate(places)})
+
+
+def test_a_walk_that_jumps_is_named_where_it_does():
+    steady = np.arange(36) + np.tile([0.0, 0.1], 18)
+    assert jumps(model(steady)) == []
+    assert jumps(model([*steady[:7], *(steady[7:] + 12.0)])) == [["06.jpg", "07.jpg"]]
+    assert jumps(model([*steady[:7], *(steady[7:] + 2.0)])) == []
+
+
+def test_photos_in_no_order_do_not_jump():
+    rng = np.random.default_rng(0)
+    assert jumps(model(rng.permutation(40).astype(float))) == []
+    assert jumps(model(np.where(np.arange(40) % 4 == 3, 100.0, 0.0) + np.arange(40))) == []
+    assert jumps(model([*range(14), *range(50, 64)])) == [], "too few"
+
+
+WIDTH, HEIGHT, FOCAL, AWAY = 600, 450, 500.0, 5.0
+
+
+class Walls:
+    """Photos at x, y = 0, z = 0 that look at walls at z = `AWAY`; every walk sees the points of its own."""
+
+    def __init__(self):
+        self.model = pycolmap.Reconstruction()
+        self.tracks = {}
+        self.points = np.empty((0, 3))
+
+    def add_points(self, low, high, seed, per_meter=120, away=AWAY):
+        """Add points of a wall, and return their numbers."""
+        count = round(per_meter * (high - low))
+        x, y = np.random.default_rng(seed).uniform([[low], [-2]], [[high], [2]], (2, count))
+        self.points = np.vstack([self.points, np.column_stack([x, y, np.full(count, away)])])
+        return np.arange(len(self.points) - count, len(self.points))
+
+    def add_walk(self, photos, places, known, shift=0.0, zoom=1.0):
+        """Add photos with these ids at these places, which see the points that are known to them."""
+        camera, focal = min(photos), zoom * FOCAL
+        self.model.add_camera_with_trivial_rig(
+            pycolmap.Camera(model="SIMPLE_PINHOLE", width=WIDTH, height=HEIGHT,
+                            params=[focal, WIDTH / 2, HEIGHT / 2], camera_id=camera)
+        )  # fmt: skip
+        for photo, place in zip(photos, places, strict=True):
+            seen = self.points[known] - [place, shift, 0.0]
+            x = focal * seen[:, :2] / seen[:, 2:] + [WIDTH / 2, HEIGHT / 2]
+            inside = ((x > 0) & (x < [WIDTH, HEIGHT])).all(axis=1)
+            image = pycolmap.Image(image_id=photo, name=f"{photo:03d}.jpg", camera_id=camera)
+            image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in x[inside]])
+            self.model.add_image_with_trivial_frame(
+                image, pycolmap.Rigid3d(pycolmap.Rotation3d(np.eye(3)), -np.array([place, shift, 0.0]))
+            )
+            for row, number in enumerate(np.asarray(known)[inside]):
+                self.tracks.setdefault(int(number), []).append((photo, row))
+
+    def finish(self):
+        """Return the model, and the matches that it explains."""
+        common = {}
+        for number, ends in sorted(self.tracks.items()):
+            track = pycolmap.Track()
+            for photo, row in ends:
+                track.add_element(photo, row)
+            self.model.add_point3D(self.points[number], track, np.zeros(3, np.uint8))
+            for k, (photo, _) in enumerate(ends):
+                for other, _ in ends[k + 1 :]:
+                    pair = (min(photo, other), max(photo, other))
+                    common[pair] = common.get(pair, 0) + 1
+        return self.model, {pair: PairSupport(count, count, 0) for pair, count in common.items()}
+
+
+@pytest.fixture
+def walls():
+    return Walls()
+
+
+@pytest.mark.slow
+def test_photos_of_one_wall_share_what_they_should(walls):
+    wall = walls.add_points(0, 12, seed=1)
+    walls.add_walk(range(1, 13), np.linspace(3, 9, 12), wall)
+    found = find_expected_overlaps(walls.finish()[0])
+    assert {(1, 2), (5, 6), (11, 12)} <= found.keys()
+    assert all(meeting.shared == meeting.expected for meeting in found.values())
+    assert 2 * 12 * 6 < found[5, 6].expected <= 2 * 12 * 9
+
+
+@pytest.mark.slow
+def test_photos_of_two_walls_in_one_place_share_nothing(walls):
+    walls.add_walk(range(1, 7), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=1))
+    walls.add_walk(range(11, 17), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=2))
+    found = find_expected_overlaps(walls.finish()[0])
+    across = [meeting for (a, b), meeting in found.items() if (a < 10) != (b < 10)]
+    assert len(across) >= 6
+    assert all(meeting.shared == 0 < meeting.expected for meeting in across)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("behind", "sides"), [(0.3, 2), (1.5, 1)])
+def test_a_photo_expects_nothing_behind_what_it_sees(walls, behind, sides):
+    """Those who see the far wall should see the near one, too, and not the other way round."""
+    walls.add_walk(range(1, 7), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=1))
+    walls.add_walk(range(11, 17), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=2, away=AWAY + behind))
+    found = find_expected_overlaps(walls.finish()[0])
+    assert (sides - 1) * 12 * 9 < found[3, 13].expected <= sides * 12 * 9
+
+
+@pytest.mark.slow
+def test_a_photo_with_another_focal_length_need_not_match(walls):
+    walls.add_walk(range(1, 7), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=1))
+    walls.add_walk(range(11, 17), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=2), zoom=1.6)
+    assert all((a < 10) == (b < 10) for a, b in find_expected_overlaps(walls.finish()[0]))
+
+
+@pytest.mark.slow
+def test_points_of_two_photos_prove_nothing(walls):
+    walls.add_walk((1, 2), (3, 3.5), walls.add_points(0, 9, seed=1))
+    walls.add_walk((11, 12), (3, 3.5), walls.add_points(0, 9, seed=2))
+    assert find_expected_overlaps(walls.finish()[0]) == {}
+
+
+@pytest.mark.slow
+def test_photos_far_apart_do_not_meet(walls):
+    walls.add_walk(range(1, 7), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=1))
+    walls.add_walk(range(11, 17), np.linspace(30, 33, 6), walls.add_points(27, 36, seed=2))
+    assert all((a < 10) == (b < 10) for a, b in find_expected_overlaps(walls.finish()[0]))
+
+
+@pytest.mark.slow
+def test_a_model_without_points_has_no_meetings():
+    assert find_expected_overlaps(pycolmap.Reconstruction()) == {}
+
+
+def two_streets(walls, length=24, alike=(10.0, 14.0)):
+    """Two walks along different walls in one place; both see the same house in the middle."""
+    low, high = alike
+    house = walls.add_points(low, high, seed=0)
+    for first, seed in ((1, 1), (101, 2)):
+        own = np.concatenate([walls.add_points(0, low, seed), walls.add_points(high, length, seed + 10)])
+        places = np.arange(3, length - 3, 0.5)
+        walls.add_walk(range(first, first + len(places)), places, np.concatenate([own, house]))
+    return walls.finish()
+
+
+@pytest.mark.slow
+def test_a_house_in_two_streets_is_found_and_nothing_else(walls):
+    model, explained = two_streets(walls)
+    joins, non_overlapping = judge_places([Attempt("incremental", model, explained, "")])
+    across = {pair for pair, found in explained.items() if pair[0] < 100 < pair[1] and found.matches >= 16}
+    assert len(joins) == 1
+    assert set(joins[0].pairs) == across
+    assert 0.5 < joins[0].missing < 1.0
+    assert non_overlapping >= 40
+
+
+@pytest.mark.slow
+def test_one_street_that_is_walked_twice_is_no_false_join(walls):
+    wall = walls.add_points(0, 24, seed=1)
+    places = np.arange(3, 21, 0.5)
+    walls.add_walk(range(1, 1 + len(places)), places, wall)
+    walls.add_walk(range(101, 101 + len(places)), places + 0.2, wall, shift=0.3)
+    model, explained = walls.finish()
+    assert judge_places([Attempt("incremental", model, explained, "")]) == ([], 0)
+
+
+@pytest.mark.slow
+def test_a_loop_whose_ends_were_hardly_matched_stays():
+    """A quarter of the photos that should share much share nothing: matching failed, the rest bears the loop out."""
+    explained = {(a, 100 + b): PairSupport(200, 200, 0) for a in range(12) for b in range(12) if (a + b) % 4}
+    explained |= {(a + side, a + 1 + side): PairSupport(500, 500, 0) for a in range(11) for side in (0, 100)}
+    overlaps = {(a, 100 + b): ExpectedOverlap(60, 0 if (a + b) % 4 == 0 else 50) for a in range(12) for b in range(12)}
+    beside = [(a + side, b + side) for a in range(12) for b in range(a + 1, min(a + 5, 12)) for side in (0, 100)]
+    overlaps |= dict.fromkeys(beside, ExpectedOverlap(60, 58))
+    assert len(find_non_overlapping(overlaps, explained)) >= OVERLAPS.min_pairs
+    assert find_false_joins(overlaps, explained) == []
+
+
+@pytest.mark.slow
+def test_photos_whose_matches_hold_are_no_strangers():
+    overlaps = {(1, 2): ExpectedOverlap(50, 0), (1, 3): ExpectedOverlap(50, 0), (2, 3): ExpectedOverlap(50, 20)}
+    found = find_non_overlapping(overlaps, {(1, 2): PairSupport(40, 40, 0), (1, 3): PairSupport(5, 5, 0)})
+    assert set(found) == {(1, 3)}
+
+
+@pytest.mark.slow
+def test_a_few_strangers_prove_nothing():
+    pairs = [(a, a + 100) for a in range(OVERLAPS.min_pairs - 1)]
+    explained = {(0, 100): PairSupport(300, 300, 0)} | {
+        (a + side, a + 1 + side): PairSupport(500, 500, 0) for a in range(20) for side in (0, 100)
+    }
+    assert find_false_joins({pair: ExpectedOverlap(60, 0) for pair in pairs}, explained) == []
+
+
+@pytest.mark.slow
+def test_two_false_joins_are_told_apart():
+    """Two pairs of streets, each pair on one place, far from each other."""
+    overlaps, explained = {}, {}
+    for base in (0, 1000):
+        for a in range(20):
+            for side in (0, 100):
+                explained[base + side + a, base + side + a + 1] = PairSupport(500, 500, 0)
+                overlaps[base + side + a, base + side + a + 1] = ExpectedOverlap(60, 57)
+            for b in range(20):
+                alike = 8 <= a <= 10 and 8 <= b <= 10
+                overlaps[base + a, base + 100 + b] = ExpectedOverlap(60, 30 if alike else 0)
+                if alike:
+                    explained[base + a, base + 100 + b] = PairSupport(300, 300, 0)
+    explained[20, 1000] = PairSupport(200, 200, 0)
+    overlaps[5, 5000] = ExpectedOverlap(40, 20)  # a photo that no pair holds
+
+    found = find_false_joins(overlaps, explained)
+
+    assert len(found) == 2
+    for join, base in zip(sorted(found, key=lambda one: one.pairs), (0, 1000), strict=True):
+        assert set(join.pairs) == {(base + a, base + 100 + b) for a in (8, 9, 10) for b in (8, 9, 10)}

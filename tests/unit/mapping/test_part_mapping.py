@@ -1,0 +1,159 @@
+"""Cuts of a group into parts, and the files of a part."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sfm_app.mapping.attempt import Group
+from sfm_app.mapping.part_mapping import (
+    OPTIONS,
+    PartInputs,
+    cut_group,
+    joins_from_plain,
+    joins_to_plain,
+    link_weights,
+    pairs_of_parts,
+    part_of_group,
+    read_inputs,
+    write_inputs,
+)
+from sfm_app.posegraph.rotations import connected_groups
+from sfm_app.settings import Settings
+from sfm_app.types import Calibration, Intrinsics, LookAlikes, PoseGraph, RelativePose
+from tests.unit.mapping.conftest import K
+
+
+def pose(inliers):
+    return RelativePose(np.eye(3), np.array([1.0, 0.0, 0.0]), np.arange(inliers) >= 0, 5.0, 1.0)
+
+
+def graph_of(counts, doubtful=()):
+    """Pairs with their inliers."""
+    photos = sorted({photo for pair in counts for photo in pair})
+    joins = (LookAlikes(tuple(doubtful), 0.5),) if doubtful else ()
+    return PoseGraph({pair: pose(n) for pair, n in sorted(counts.items())}, {}, (tuple(photos),), (), joins)
+
+
+def row(photos, reach, inliers=100, start=0):
+    return {(start + a, start + b): inliers for a in range(photos) for b in range(a + 1, min(a + reach + 1, photos))}
+
+
+def clusters(count, size, bridge=20):
+    """Dense clusters in a ring, each joined to the next by a few weak pairs."""
+    found = {}
+    for k in range(count):
+        found |= row(size, 12, start=k * size)
+        after = (k + 1) % count * size
+        for a, b in ((k * size + size - 1 - n, after + n) for n in range(4)):
+            found[min(a, b), max(a, b)] = bridge
+    return found
+
+
+def is_connected(photos, graph):
+    members = set(photos)
+    return len(connected_groups([pair for pair in graph.poses if members.issuperset(pair)], photos)) == 1
+
+
+@pytest.mark.parametrize(("photos", "reach", "size"), [(300, 10, 60), (1000, 5, 150), (130, 30, 40)])
+def test_parts_hold_every_photo_once_are_connected_balanced_and_overlap(photos, reach, size):
+    graph = graph_of(row(photos, reach))
+
+    parts = cut_group(graph, range(photos), size)
+
+    assert sorted(photo for part in parts for photo in part.own) == list(range(photos))
+    assert all(OPTIONS.smallest * size <= len(part.own) <= OPTIONS.largest * size for part in parts)
+    assert 0.75 * photos / size <= len(parts) <= 3.0 * photos / size
+    assert all(is_connected(part.own, graph) and is_connected(part.photos, graph) for part in parts)
+    for part in parts:
+        assert set(part.own) < set(part.photos)
+        others = [len(set(part.photos) & set(other.photos)) for other in parts if other is not part]
+        assert max(others) >= min(2 * OPTIONS.shared_photos, 2 * reach)
+
+
+def test_a_cut_passes_through_the_thin_places():
+    graph = graph_of(clusters(6, 50))
+    parts = cut_group(graph, range(300), 50)
+    assert [part.own for part in parts] == [tuple(range(50 * k, 50 * k + 50)) for k in range(6)]
+    assert all(len(part.photos) == 58 for part in parts)  # four from either side
+
+
+def test_doubtful_pairs_hold_nothing_together():
+    counts = row(80, 8) | row(80, 8, start=80) | {(k, 80 + k): 100 for k in range(0, 80, 2)}
+    firm = {(k, 80 + k): 60 for k in range(76, 80)}
+    graph = graph_of(counts | firm, doubtful=[pair for pair in counts if pair[1] - pair[0] == 80])
+    parts = cut_group(graph, range(160), 80)
+    assert [part.own for part in parts] == [tuple(range(80)), tuple(range(80, 160))]
+    assert link_weights(graph, range(160))[0][80] == pytest.approx(0.1 * link_weights(graph, range(160))[0][1])
+
+
+def test_a_small_group_is_one_part_and_the_same_graph_gives_the_same_parts():
+    graph = graph_of(row(60, 10))
+    assert [part.photos for part in cut_group(graph, range(60), 60)] == [tuple(range(60))]
+    assert cut_group(graph, range(60), 20) == cut_group(graph_of(row(60, 10)), range(59, -1, -1), 20)
+
+
+def test_a_photo_that_nothing_connects_is_a_part_of_its_own():
+    parts = cut_group(graph_of(row(50, 10)), range(51), 60)
+    assert [part.own for part in parts] == [tuple(range(50)), (50,)]
+
+
+def group_of(street):
+    matches, views = street.graphs()
+    poses = {
+        pair: RelativePose(np.eye(3), np.array([0.6, 0.0, 0.8]), fit.inliers, 3.25, 0.9, "planar", sum(pair) % 2 == 0)
+        for pair, fit in views.fits.items()
+    }
+    lens = Calibration(K, 1200, 900, "zero-curves", True, spread={"fx": 1.5}, key_pairs=((1, 2),))
+    other = Calibration(K, 640, 480, "guess", False)
+    intrinsics = Intrinsics({"one": lens, "two": other}, {"040.jpg": "two"})
+    return Group(tuple(matches.images), matches, views, PoseGraph(poses, {}, ()), intrinsics)
+
+
+def test_a_part_of_a_group_has_what_concerns_its_photos(street):
+    group = group_of(street)
+    pairs, _ = pairs_of_parts(group.matches.matches, [(3, 4, 5), (5, 6)])
+    part = part_of_group(group, (3, 4, 5), pairs)
+    assert list(part.matches.images) == list(part.matches.keypoints) == [3, 4, 5]
+    assert list(part.matches.matches) == list(part.views.fits) == list(part.graph.poses) == [(3, 4), (3, 5), (4, 5)]
+    assert part.graph.groups == ((3, 4, 5),) and list(part.intrinsics.cameras) == ["one"]
+
+
+def test_pairs_belong_to_every_part_that_has_both_photos():
+    pairs = [(1, 2), (2, 3), (3, 4), (1, 4), (4, 5)]
+    assert pairs_of_parts(pairs, [(1, 2, 3), (2, 3, 4), (9,)]) == [[(1, 2), (2, 3)], [(2, 3), (3, 4)], []]
+
+
+def test_inputs_are_read_back_as_they_were(street, tmp_path):
+    group = group_of(street)
+    (pairs,) = pairs_of_parts(group.matches.matches, [range(21, 41)])
+    part = part_of_group(group, range(21, 41), pairs)
+    settings = Settings.from_mapping({"seed": 7, "scene": {"part_photos": 33}})
+
+    write_inputs(
+        tmp_path / "a.npz", PartInputs(part, frozenset([(21, 22), (21, 23)]), settings, stop_at_false_joins=True)
+    )
+    write_inputs(
+        tmp_path / "b.npz", PartInputs(part, frozenset([(21, 23), (21, 22)]), settings, stop_at_false_joins=True)
+    )
+    again = read_inputs(tmp_path / "a.npz")
+    found = again.part
+
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    assert again.mapped == {(21, 22), (21, 23)} and again.settings == settings and again.stop_at_false_joins
+    assert found.photos == part.photos and found.matches.images == part.matches.images
+    assert list(found.matches.matches) == list(part.matches.matches)
+    assert all(np.array_equal(found.matches.matches[pair], rows) for pair, rows in part.matches.matches.items())
+    assert all(np.array_equal(found.matches.keypoints[photo], x) for photo, x in part.matches.keypoints.items())
+    assert all(np.array_equal(found.views.fits[pair].F, fit.F) for pair, fit in part.views.fits.items())
+    for pair, pose in part.graph.poses.items():
+        read = found.graph.poses[pair]
+        assert np.array_equal(read.R, pose.R) and np.array_equal(read.t, pose.t)
+        assert np.array_equal(read.inliers, pose.inliers)
+        assert (read.angle_deg, read.in_front, read.kind, read.guided) == (3.25, 0.9, "planar", sum(pair) % 2 == 0)
+    assert found.intrinsics.to_dict() == part.intrinsics.to_dict()
+
+
+def test_false_joins_travel_as_plain_values():
+    joins = (LookAlikes(((1, 2), (3, 4)), 0.875), LookAlikes(((5, 6),), 0.5))
+    assert joins_from_plain(json.loads(json.dumps(joins_to_plain(joins)))) == joins
