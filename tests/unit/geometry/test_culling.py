@@ -49,3 +49,9 @@ def test_the_border_of_a_photo_is_that_of_its_corners():
 
     assert np.degrees(border_angle(K, 80, 60)) == pytest.approx(np.degrees(np.arctan(0.5)), abs=1.0)
     assert border_angle(K, 80, 60) > np.arctan(0.5)
+
+
+def test_the_morton_order_keeps_near_points_together():
+    points = np.random.default_rng(4).uniform(-3, 5, (2000, 3))
+    steps = np.linalg.norm(np.diff(points[morton_order(points)], axis=0), axis=1)
+    assert np.median(steps) < 0.15 * np.median(np.linalg.norm(np.diff(points, axis=0), axis=1))
