@@ -95,7 +95,8 @@ def _rank(index: int, others: Sequence[int], views: Sequence[View], count: int) 
     weights: dict[int, FloatArray] = {}
     for number in map(int, others):
         other = views[number]
-        if not _is_same_place(view, other):
+        angles = triangulation_angles_deg(view.center, other.center, view.points)
+        if angles.max(initial=0.0) >= 1e-6:  # parts of one wide photo have the same center up to rounding
             shared = np.isin(view.point_ids, other.point_ids, assume_unique=True)
             weights[number] = np.where(shared, point_weights(view, other, view.points), 0.0)
     value, chosen = np.ones(len(view.point_ids)), list[int]()
@@ -108,11 +109,6 @@ def _rank(index: int, others: Sequence[int], views: Sequence[View], count: int) 
         chosen.append(best)
         value *= 1.0 - 0.5 * weight
     return chosen
-
-
-def _is_same_place(view: View, other: View) -> bool:
-    """Return whether two views have the same center up to rounding: both are parts of one wide photo."""
-    return bool(triangulation_angles_deg(view.center, other.center, view.points).max(initial=0.0) < 1e-6)
 
 
 def point_weights(view: View, other: View, points: FloatArray) -> FloatArray:
