@@ -103,8 +103,8 @@ def make_depth_maps_on_cpu(task: DepthTask, steps: Steps = STEPS) -> list[Reject
     rejected = task.map(Task(_match, Shared(inputs), 0), everything, "matching depths")
     if options.levels == AS_NEEDED:
         shares = task.map(Task(_open_share, Shared(inputs)), everything, "measuring gaps in depth maps")
-        shares = [share for share in shares if share is not None]
-        if shares and float(np.mean(shares)) >= OPTIONS.most_open:
+        known = [share for share in shares if share is not None]
+        if known and float(np.mean(known)) >= OPTIONS.most_open:
             inputs = replace(inputs, levels=halve_views(task.views, 2))
     shared = Shared(inputs)
     for level in range(1, len(inputs.levels)):
@@ -115,9 +115,9 @@ def make_depth_maps_on_cpu(task: DepthTask, steps: Steps = STEPS) -> list[Reject
     confirmed = iter(task.map(confirm, [index for index in everything if usable[index]], "confirming depths"))
     rejected = [next(confirmed) if reason is None else reason for reason in rejected]
     if len(inputs.levels) > 1:
-        known = [index for index in everything if rejected[index] is None]
-        task.map(Task(_propose, shared), known, "fitting planes to plain areas")
-        task.map(Task(_fill_plain_areas, shared), known, "filling plain areas")
+        confirmed_views = [index for index in everything if rejected[index] is None]
+        task.map(Task(_propose, shared), confirmed_views, "fitting planes to plain areas")
+        task.map(Task(_fill_plain_areas, shared), confirmed_views, "filling plain areas")
     return rejected
 
 

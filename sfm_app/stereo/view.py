@@ -51,6 +51,11 @@ class View:
         """(3, 4) projection matrix K [R | t]."""
         return self.K @ np.column_stack([self.R, self.t])
 
+    def projection_into(self, other: "View") -> FloatArray:
+        """Return P (3, 4): the pixel (x, y) at depth z has the homogeneous pixel P (x z, y z, z, 1) in another view."""
+        relative = other.R @ self.R.T
+        return other.K @ np.column_stack([relative @ np.linalg.inv(self.K), other.t - relative @ self.t])
+
     def halve(self, level: int) -> "View":
         """Return the view of the photo halved `level` >= 1 times; depths are at pixel centers."""
         width, height = (max(1, side >> level) for side in (self.width, self.height))
