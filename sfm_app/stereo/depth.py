@@ -195,11 +195,8 @@ def _count_maps(
 ) -> NDArray[np.uint8]:
     """Count the maps whose depth lies between two limits, relative to the depth of the point in the other view."""
     count = np.zeros(depth.shape, np.uint8)
-    K_inv = np.linalg.inv(view.K)
     for other, other_depth in others:
-        relative = other.R @ view.R.T
-        P = other.K @ np.column_stack([relative @ K_inv, other.t - relative @ view.t])
-        _count(depth, other_depth, P, limits, view.sample_px, count)
+        _count(depth, other_depth, view.projection_into(other), limits, view.sample_px, count)
     return count
 
 

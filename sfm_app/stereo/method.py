@@ -24,31 +24,21 @@ Kind = Literal["photometric", "geometric", "proposed"]
 
 
 class DepthStore(Protocol):
-    """Reads photos and keeps maps; a map appears complete or not at all."""
+    """Reads photos and keeps maps; a map appears complete or not at all.
+
+    Estimates are photometric, maps are geometric; a proposal has depths in plain areas, 0 elsewhere.
+    """
 
     def photo(self, view: View, /) -> GrayImage:
         """Return the photo without distortion, (H, W), at the size of the view."""
 
-    def has(self, view: View, kind: Kind, /) -> bool:
-        """Return whether a map exists."""
-
-    def read_estimate(self, view: View, /) -> DepthEstimate:
-        """Return the photometric map."""
-
-    def read_depth(self, view: View, kind: Kind = "photometric", /) -> DepthArray:
-        """Return the depths of a map."""
-
-    def read_maps(self, view: View, /) -> DepthMap:
-        """Return the geometric maps."""
-
-    def write_proposal(self, view: View, depth: DepthArray, /) -> None:
-        """Keep the depths proposed for plain areas, 0 elsewhere."""
-
-    def write_estimate(self, view: View, estimate: DepthEstimate, /) -> None:
-        """Keep the photometric map."""
-
-    def write_maps(self, view: View, maps: DepthMap, /) -> None:
-        """Keep the geometric maps."""
+    def has(self, view: View, kind: Kind, /) -> bool: ...
+    def read_estimate(self, view: View, /) -> DepthEstimate: ...
+    def read_depth(self, view: View, kind: Kind = "photometric", /) -> DepthArray: ...
+    def read_maps(self, view: View, /) -> DepthMap: ...
+    def write_estimate(self, view: View, estimate: DepthEstimate, /) -> None: ...
+    def write_maps(self, view: View, maps: DepthMap, /) -> None: ...
+    def write_proposal(self, view: View, depth: DepthArray, /) -> None: ...
 
 
 class ParallelMap(Protocol):
@@ -111,8 +101,11 @@ def make_depth_maps_on_cpu(task: DepthTask, steps: Steps = STEPS) -> list[Reject
     everything, options = range(len(task.views)), task.options
     inputs = _Inputs(halve_views(task.views, max(options.levels, 1)), task.ranked, options, task.store, steps)
     rejected = task.map(Task(_match, Shared(inputs), 0), everything, "matching depths")
-    if options.levels == AS_NEEDED and _needs_coarser(task, inputs):
-        inputs = replace(inputs, levels=halve_views(task.views, 2))
+    if options.levels == AS_NEEDED:
+        shares = task.map(Task(_open_share, Shared(inputs)), everything, "measuring gaps in depth maps")
+        known = [share for share in shares if share is not None]
+        if known and float(np.mean(known)) >= OPTIONS.most_open:
+            inputs = replace(inputs, levels=halve_views(task.views, 2))
     shared = Shared(inputs)
     for level in range(1, len(inputs.levels)):
         coarse = task.map(Task(_match, shared, level), everything, "matching depths in smaller photos")
@@ -122,17 +115,10 @@ def make_depth_maps_on_cpu(task: DepthTask, steps: Steps = STEPS) -> list[Reject
     confirmed = iter(task.map(confirm, [index for index in everything if usable[index]], "confirming depths"))
     rejected = [next(confirmed) if reason is None else reason for reason in rejected]
     if len(inputs.levels) > 1:
-        known = [index for index in everything if rejected[index] is None]
-        task.map(Task(_propose, shared), known, "fitting planes to plain areas")
-        task.map(Task(_fill_plain_areas, shared), known, "filling plain areas")
+        confirmed_views = [index for index in everything if rejected[index] is None]
+        task.map(Task(_propose, shared), confirmed_views, "fitting planes to plain areas")
+        task.map(Task(_fill_plain_areas, shared), confirmed_views, "filling plain areas")
     return rejected
-
-
-def _needs_coarser(task: DepthTask, inputs: _Inputs) -> bool:
-    """Return whether the mean share of pixels without a sure depth calls for a coarser level."""
-    shares = task.map(Task(_open_share, Shared(inputs)), range(len(task.views)), "measuring gaps in depth maps")
-    known = [share for share in shares if share is not None]
-    return bool(known) and float(np.mean(known)) >= OPTIONS.most_open
 
 
 def _open_share(inputs: Shared[_Inputs], index: int) -> float | None:
@@ -238,8 +224,7 @@ class LevelOptions:
     """When a coarser level is needed, and how its depths are transferred."""
 
     most_open: float = 0.08
-    """Mean share of pixels without a sure depth from which a coarser level is needed. Chosen on six real sets that gain
-    (0.11 to 0.39), and on eight sets and rendered scenes that do not (0.01 to 0.06)."""
+    """Mean share of pixels without a sure depth that calls for a coarser level; sets that gain have 0.11 to 0.39."""
     black: int = 25
     """Gray level below which a pixel belongs to an empty background. Chosen on temple16."""
     most_slant: float = 0.1

@@ -76,12 +76,10 @@ def improve_planes(
     height, width = (max(photo.shape[side] for _, photo in others) for side in (0, 1))
     stack = np.zeros((len(others), height, width), np.uint32)
     projections, sizes = np.empty((len(others), 3, 4)), np.empty((len(others), 2), np.int64)
-    K_inv = np.linalg.inv(view.K)
     for k, (other, photo) in enumerate(others):
         stack[k, : photo.shape[0] - 1, : photo.shape[1] - 1] = _pack_squares(photo)
         sizes[k] = photo.shape
-        relative = other.R @ view.R.T
-        projections[k] = other.K @ np.column_stack([relative @ K_inv, other.t - relative @ view.t])
+        projections[k] = view.projection_into(other)
     near = np.exp(-0.5 * (STEPS[:, None] ** 2 + STEPS**2) / OPTIONS.sigma_px**2)
     alike = np.exp(-np.arange(256) / OPTIONS.falloff_gray)
     cost = np.full(image.shape, NO_MATCH, np.float32)

@@ -25,11 +25,9 @@ class PlainAreaOptions:
     speck_px: int = 5
     """Side of the square for majority voting, because noise correlates by chance in places."""
     min_share: float = 0.03
-    """Least confirmed share of a wall. Other photos confirm a twelfth or more of a wall, but at most a hundredth of a
-    sky."""
+    """Least confirmed share of a wall; other photos confirm a twelfth or more of it, but a hundredth of a sky."""
     far_share: float = 0.02
-    """Distance from the nearest sure depth, in longer sides of the photo, over which semi-global matching extends
-    depths. Chosen on `garden` and `ornament`, where it is a hundredth, with `corner` left out."""
+    """Distance in longer sides over which matching extends sure depths; `garden` and `ornament` have a hundredth."""
     least_far_px: int = 100
     """Fewest pixels beyond this distance that distinguish a wall from a sky. Chosen by hand."""
     blur_px: float = 1.5

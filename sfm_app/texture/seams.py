@@ -236,42 +236,18 @@ def _gaps(
         head_photo[at], place[at] = photo_of[heads[rows]], np.arange(len(rows))
         fan = mesh.faces_at(at)
         near = fan[sightings.is_usable(photo, fan)]
-        corners = head_photo[mesh.faces[near]], place[mesh.faces[near]]
-        gaps[rows] = _photo_gaps(photo, near, corners, sightings, gains, len(rows))
+        head, node = head_photo[mesh.faces[near]], place[mesh.faces[near]]
+        view = sightings.find(head, np.where(head == NONE, NONE, near[:, None]))
+        both = (view != NONE) & (sightings.score[view] > 0)
+        own = sightings.colors[sightings.find(photo, near)] / gains[photo]
+        difference = sightings.colors[view] / gains[head] - own[:, None]
+        count = np.bincount(node[both], minlength=len(rows))
+        for channel in range(3):
+            total = np.bincount(node[both], difference[..., channel][both], len(rows))
+            gaps[rows, channel] = np.divide(total, count, out=np.full(len(rows), np.nan), where=count > 0)
         head_photo[at] = NONE
     known = np.isfinite(gaps[:, 0])
     return others[known], heads[known], gaps[known]
-
-
-def _photo_gaps(
-    photo: int,
-    near: IndexArray,
-    corners: tuple[IndexArray, IndexArray],
-    sightings: Sightings,
-    gains: FloatArray,
-    size: int,
-) -> FloatArray:
-    """Return (size, 3) mean color of other photos at vertices minus the color of one photo; NaN where unknown.
-
-    Args:
-        photo: number of the one photo.
-        near: (M,) triangles with usable views in it.
-        corners: (M, 3) the other photo at each corner, -1 for none; and (M, 3) number of the vertex.
-        sightings: views of triangles in photos.
-        gains: (P, 3) of the photos.
-        size: number of vertices.
-    """
-    head, place = corners
-    row = sightings.find(head, np.where(head == NONE, NONE, near[:, None]))
-    both = (row != NONE) & (sightings.score[row] > 0)
-    own = sightings.colors[sightings.find(photo, near)] / gains[photo]
-    difference = sightings.colors[row] / gains[head] - own[:, None]
-    count = np.bincount(place[both], minlength=size)
-    gaps = np.full((size, 3), np.nan)
-    for channel in range(3):
-        total = np.bincount(place[both], difference[..., channel][both], size)
-        np.divide(total, count, out=gaps[:, channel], where=count > 0)
-    return gaps
 
 
 def _seam_pairs(blend: Blend, size: int) -> tuple[IndexArray, IndexArray]:

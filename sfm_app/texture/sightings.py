@@ -1,7 +1,7 @@
 """Sightings: the triangles in each photo, with score and color, in lists by photo and by triangle."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import cv2
@@ -290,10 +290,6 @@ class Sightings:
         counts = np.diff(np.concatenate([[0], np.cumsum(rows)])[self.starts])
         face = (np.cumsum(selected) - 1)[self.face[rows]].astype(np.int32)
         return make_sightings(counts, face, self.score[rows], self.colors[rows], int(selected.sum()))
-
-    def with_score(self, score: NDArray[np.float32]) -> "Sightings":
-        """Return the same views with other scores."""
-        return replace(self, score=score)
 
 
 def list_sightings(face_views: Sequence[FaceView | None], triangles: int) -> Sightings:

@@ -42,7 +42,9 @@ def choose_photos(sightings: Sightings, mesh: Facets) -> IntArray:
     size = _relative_size(mesh)[:, None]
     cost = (OPTIONS.price_of_detail * size * np.minimum(loss, OPTIONS.max_loss)).astype(np.float32)
     price = _edge_prices(mesh)
-    back = _reverse_edge_indices(mesh.neighbors)
+    # (T, 3) the column of each triangle in its neighbor's row of `neighbors`
+    own = np.arange(triangles)[:, None, None]
+    back = np.asarray(np.argmax(mesh.neighbors[mesh.neighbors] == own, axis=2), np.int32)
     same = np.full((triangles, 3, candidates), NONE, np.int8)
     _match_labels(labels, mesh.neighbors, same)
     chosen = np.full(triangles, NONE, np.int32)
@@ -70,12 +72,6 @@ def _edge_prices(mesh: Facets) -> NDArray[np.float32]:
     corners = mesh.vertices[mesh.faces]
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     return np.asarray(lengths / max(mesh.spacing, 1e-300), np.float32)
-
-
-def _reverse_edge_indices(neighbors: IntArray) -> IntArray:
-    """Return (T, 3) the column of each triangle in its neighbor's row of `neighbors`."""
-    own = np.arange(len(neighbors))[:, None, None]
-    return np.asarray(np.argmax(neighbors[neighbors] == own, axis=2), np.int32)
 
 
 @kernel

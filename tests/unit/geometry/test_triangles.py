@@ -152,3 +152,9 @@ def test_a_texture_without_area_still_has_unit_tangents(uv):
 
 def test_angles_of_triangles():
     np.testing.assert_allclose(np.degrees(corner_angles(TANGENT_SQUARE[FACES])), [[45, 90, 45], [45, 45, 90]])
+
+
+def test_the_morton_order_keeps_near_points_together():
+    points = np.random.default_rng(4).uniform(-3, 5, (2000, 3))
+    steps = np.linalg.norm(np.diff(points[morton_order(points)], axis=0), axis=1)
+    assert np.median(steps) < 0.15 * np.median(np.linalg.norm(np.diff(points, axis=0), axis=1))

@@ -63,17 +63,12 @@ def test_wrong_depths_are_dropped(plane, views, matched):
 
 
 @slow
-def test_two_photos_confirm_each_other(plane, views, matched):
+def test_two_photos_confirm_each_other_and_the_same_input_gives_the_same_bytes(plane, views, matched):
     maps = confirm_depths(views[1], plane.photo(views[1]), matched[1], others(views, matched, 1)[:1], 2, 0.01)
+    again = match_depths(views[1], [views[j] for j in rank_neighbors(views, 3)[1]], plane.photo, 3, 0.01)
 
     assert isinstance(maps, DepthMap)
     assert np.mean(maps.depth > 0) > 0.4
-
-
-@slow
-def test_same_input_gives_the_same_bytes(plane, views, matched):
-    again = match_depths(views[1], [views[j] for j in rank_neighbors(views, 3)[1]], plane.photo, 3, 0.01)
-
     assert again.depth.tobytes() == matched[1].depth.tobytes()
     assert again.confidence.tobytes() == matched[1].confidence.tobytes()
 
@@ -148,11 +143,7 @@ def test_weights_are_squared_parallaxes_of_inverse_depths():
     depth, _ = merge_hypotheses(pixels(5.0, 5.04), pixels(30, 10), 0.01)
 
     np.testing.assert_allclose(depth[0, 0], 10 / (9 / 5.0 + 1 / 5.04), rtol=1e-6)
-
-
-def test_no_hypothesis_gives_no_depth():
     depth, support = merge_hypotheses(pixels(0, 0), pixels(0, 0), 0.01)
-
     assert depth[0, 0] == support[0, 0] == 0
 
 
@@ -180,11 +171,8 @@ def test_true_depths_are_confirmed_and_wrong_ones_are_not(plane, make_view):
     assert not agreeing[80:110, 100:140].any()
     assert np.all(agreeing[30:70, 60:180] == 2)
     assert agreeing.max() == 2
-
-
-def test_a_depth_behind_the_other_camera_is_not_confirmed(plane, make_view):
-    view, ahead = make_view((0, 0, 0)), make_view((0, 0, 9))
-    assert not count_confirming_maps(view, plane.depth(view), [(ahead, np.abs(plane.depth(ahead)))], 0.01).any()
+    ahead = make_view((0, 0, 9))  # the plane is behind it
+    assert not count_confirming_maps(view, depth, [(ahead, np.abs(plane.depth(ahead)))], 0.01).any()
 
 
 def test_deeper_maps_are_counted(plane, make_view):

@@ -5,20 +5,22 @@ from functools import cache
 
 import numpy as np
 
-from sfm_app.texture import PhotoView
+from sfm_app.meshing.ray_casting import Occluders
+from sfm_app.settings import TextureSettings
+from sfm_app.texture import PhotoView, texture_surface
+from sfm_app.texture.facets import facets
 from sfm_app.texture.sightings import make_sightings
 from sfm_app.types import Surface
 
 HALF = np.array([1.0, 0.7, 0.8])
-BACKGROUND = 25
 
 
-def sightings(worth, colors=None):
-    """What photos see, from (P, T) worths, 0 where a photo does not see a triangle, and (P, T, 3) colors."""
-    photo, face = np.nonzero(worth)
-    shown = np.zeros((len(face), 3), np.uint8) if colors is None else colors[photo, face]
-    counts = np.bincount(photo, minlength=len(worth))
-    return make_sightings(counts, face.astype(np.int32), worth[photo, face].astype(np.float32), shown, worth.shape[1])
+def sightings(score, colors=None):
+    """Sightings from (P, T) scores, 0 for hidden triangles, and (P, T, 3) colors."""
+    photo, face = np.nonzero(score)
+    color = np.zeros((len(face), 3), np.uint8) if colors is None else colors[photo, face]
+    counts = np.bincount(photo, minlength=len(score))
+    return make_sightings(counts, face.astype(np.int32), score[photo, face].astype(np.float32), color, score.shape[1])
 
 
 def paint_at(points):
@@ -48,7 +50,7 @@ def box(steps=12):
 
 
 def around(count=9, size=(320, 240), height=1.6, k1=-0.05):
-    """Photos from a circle above the box: its bottom is never seen."""
+    """Photos from a circle above the box: its bottom is hidden."""
     views = []
     for angle in 2 * np.pi * np.arange(count) / count:
         center = np.array([4.0 * np.cos(angle), height, 4.0 * np.sin(angle)])
@@ -63,7 +65,7 @@ def around(count=9, size=(320, 240), height=1.6, k1=-0.05):
 
 @cache
 def photograph(view):
-    """(height, width, 3) uint8: each pixel's ray through the lens, met with the box."""
+    """(height, width, 3) uint8: each pixel's ray through the lens, intersected with the box."""
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     fx, fy, cx, cy, k1, k2, _, _ = view.lens
     distorted = np.column_stack([(x.ravel() - cx) / fx, (y.ravel() - cy) / fy])
@@ -71,25 +73,25 @@ def photograph(view):
     for _ in range(30):
         r2 = np.sum(plane**2, axis=1, keepdims=True)
         plane = distorted / (1 + k1 * r2 + k2 * r2**2)
-    ways = np.column_stack([plane, np.ones(len(plane))]) @ view.cam_from_world[:, :3]
-    near, far = (-HALF - view.center) / ways, (HALF - view.center) / ways
+    rays = np.column_stack([plane, np.ones(len(plane))]) @ view.cam_from_world[:, :3]
+    near, far = (-HALF - view.center) / rays, (HALF - view.center) / rays
     enter, leave = np.minimum(near, far).max(axis=1), np.maximum(near, far).min(axis=1)
-    photo = np.full((len(ways), 3), float(BACKGROUND))
+    photo = np.full((len(rays), 3), 25.0)
     hit = enter < leave
-    photo[hit] = paint_at(view.center + enter[hit, None] * ways[hit])
+    photo[hit] = paint_at(view.center + enter[hit, None] * rays[hit])
     return np.round(photo).astype(np.uint8).reshape(view.height, view.width, 3)
 
 
 @dataclass
 class Album:
-    """Photos for the texture, and what it keeps, as the program has them in files."""
+    """A store in memory: photos, masks, and kept arrays."""
 
     exposure: dict[str, float] = field(default_factory=dict)
     passers_by: dict[str, tuple[slice, slice]] = field(default_factory=dict)
     masks: dict[str, np.ndarray] = field(default_factory=dict)
     lost: tuple[str, ...] = ()
     kept: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
-    asked: list[str] = field(default_factory=list)
+    read: list[str] = field(default_factory=list)
 
     def recall(self, name):
         return self.kept.get(name)
@@ -101,7 +103,7 @@ class Album:
         return self.masks.get(view.name)
 
     def photo(self, view):
-        self.asked.append(view.name)
+        self.read.append(view.name)
         if view.name in self.lost:
             raise FileNotFoundError(2, "No such file or directory")
         photo = photograph(view).astype(float)
@@ -111,26 +113,39 @@ class Album:
 
 
 def one_by_one(function, items, label):
-    """The simplest way to run work for each photo."""
+    """Run work for each item in turn."""
     return [function(item) for item in items]
 
 
+def textured(album, surface, views, spread=one_by_one, **options):
+    """The textured model of a surface, and its figures."""
+    hidden = Occluders(surface.vertices, surface.faces).is_hidden
+    return texture_surface(surface, views, album, hidden, TextureSettings(**options), spread)
+
+
+def assert_same_texture(one, other):
+    for ours, theirs in zip(one.texture.pages, other.texture.pages, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    np.testing.assert_array_equal(one.texture.uv, other.texture.uv)
+    np.testing.assert_array_equal(one.surface.colors, other.surface.colors)
+
+
 def on_surface(model, count=4000, seed=0, among=None):
-    """Random points of a textured surface: their triangles, their places (N, 3), and the texture's colors there."""
+    """Random points (N, 3) of a textured surface, and the texture's colors there."""
     rng = np.random.default_rng(seed)
     faces = rng.choice(np.arange(len(model.surface.faces)) if among is None else np.flatnonzero(among), count)
     parts = rng.dirichlet([1.0, 1.0, 1.0], count)
     points = np.einsum("nk,nkc->nc", parts, model.surface.vertices[model.surface.faces[faces]])
-    places = np.einsum("nk,nkc->nc", parts, model.texture.uv[faces].astype(float))
+    uv = np.einsum("nk,nkc->nc", parts, model.texture.uv[faces].astype(float))
     colors = np.empty((count, 3))
     for number, page in enumerate(model.texture.pages):
         here = model.texture.page[faces] == number
-        colors[here] = read_page(page, places[here])
-    return faces, points, colors
+        colors[here] = read_page(page, uv[here])
+    return points, colors
 
 
 def read_page(page, uv):
-    """Bilinear, as viewers do it."""
+    """Bilinear colors, as in viewers."""
     size = np.array([page.shape[1], page.shape[0]])
     at = np.clip(uv * size - 0.5, 0, size - 1)
     low = np.floor(at).astype(int)
@@ -140,3 +155,12 @@ def read_page(page, uv):
     upper = (1 - a) * values[low[:, 1], low[:, 0]] + a * values[low[:, 1], high[:, 0]]
     lower = (1 - a) * values[high[:, 1], low[:, 0]] + a * values[high[:, 1], high[:, 0]]
     return (1 - b) * upper + b * lower
+
+
+def strip(squares_along=4):
+    """A flat band of unit squares, two triangles each."""
+    x = np.arange(squares_along + 1.0)
+    vertices = np.concatenate([np.column_stack([x, 0 * x, 0 * x]), np.column_stack([x, 0 * x + 1, 0 * x])])
+    k, n = np.arange(squares_along), squares_along + 1
+    faces = np.concatenate([np.column_stack([k, k + 1, k + 1 + n]), np.column_stack([k, k + 1 + n, k + n])])
+    return facets(Surface(vertices, faces.astype(np.int64), np.zeros((2 * n, 3), np.uint8)))

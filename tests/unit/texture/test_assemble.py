@@ -6,12 +6,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from painted_box import HALF, Album, around, box, on_surface, one_by_one, paint_at
+from painted_box import HALF, Album, around, assert_same_texture, box, on_surface, paint_at
+from painted_box import textured as textured_surface
 
-from sfm_app.meshing.ray_casting import Occluders
-from sfm_app.settings import TextureSettings
-from sfm_app.texture import charts, texture_surface
-from sfm_app.types import Model
+from sfm_app.texture import charts
 
 pytestmark = pytest.mark.slow
 
@@ -19,18 +17,17 @@ VIEWS = around()
 BOX = box()
 
 
-def textured(album, surface=BOX, views=VIEWS, spread=one_by_one, **options) -> tuple[Model, dict]:
-    hidden = Occluders(surface.vertices, surface.faces).is_hidden
-    return texture_surface(surface, views, album, hidden, TextureSettings(**options), spread)
+def textured(album, surface=BOX, views=VIEWS, **options):
+    return textured_surface(album, surface, views, **options)
 
 
-def seen_part(model):
-    """Triangles that do not lie in the box's bottom."""
+def visible_part(model):
+    """Triangles outside the box's bottom."""
     return model.surface.vertices[model.surface.faces][:, :, 1].max(axis=1) > -HALF[1] + 1e-6
 
 
 def errors(model):
-    _, points, colors = on_surface(model, among=seen_part(model))
+    points, colors = on_surface(model, among=visible_part(model))
     return np.abs(colors - paint_at(points)).max(axis=1)
 
 
@@ -47,16 +44,16 @@ def test_every_point_has_its_color(plain):
     assert 200 < figures["unseen_triangles"] < 400  # the bottom has 288; its neighbors may be seen too obliquely
     assert figures["strange_views_of_triangles"] == 0
     assert np.abs(np.array(list(figures["gains"].values())) - 1.0).max() < 0.01
+    assert_vertices_have_their_color(model)
 
 
-def test_vertices_get_the_photos_colors(plain):
-    model, _ = plain
+def assert_vertices_have_their_color(model):
     above = model.surface.vertices[:, 1] > -0.99 * HALF[1]
     wrong = np.abs(model.surface.colors[above] - paint_at(model.surface.vertices[above])).max(axis=1)
     assert np.quantile(wrong, 0.95) < 6.0
 
 
-def test_pages_are_as_large_as_what_the_photos_show(plain):
+def test_charts_cover_a_good_part_of_the_pages(plain):
     model, figures = plain
     texture = model.texture
     assert figures["scale"] == 1.0
@@ -65,54 +62,41 @@ def test_pages_are_as_large_as_what_the_photos_show(plain):
     assert texture.uv.max() <= 1
     size = np.array(texture.pages[0].shape[1::-1])
     a, b, c = (texture.uv[:, k] * size for k in range(3))
-    covered = _areas(a, b, c).sum()
+    covered = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]).sum() / 2
     assert 0.3 < covered / size.prod() < 1.0
 
 
-def _areas(a, b, c):
-    return np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
-
-
-def test_a_darker_photo_is_found_and_leaves_no_seam():
+def test_a_darker_photo_leaves_no_seam():
     dark = VIEWS[2].name
     model, figures = textured(Album(exposure={dark: 0.7}))
     gains = figures["gains"]
     ratio = np.array(gains[dark]) / np.mean([gains[view.name] for view in VIEWS if view.name != dark], axis=0)
     np.testing.assert_allclose(ratio, 0.7, atol=0.01)
-    _, points, colors = on_surface(model, among=seen_part(model))
+    points, colors = on_surface(model, among=visible_part(model))
     factor = np.median(colors / paint_at(points))  # the common exposure is free
     assert np.quantile(np.abs(colors / factor - paint_at(points)).max(axis=1), 0.99) < 7.0
 
 
+CROSSING = (slice(70, 150), slice(120, 170))
+PASSER_BY = {VIEWS[4].name: CROSSING}
+
+
 def test_a_passer_by_is_absent():
-    crossing = {VIEWS[4].name: (slice(70, 150), slice(120, 170))}
-    model, figures = textured(Album(passers_by=crossing))
+    model, figures = textured(Album(passers_by=PASSER_BY))
     assert figures["strange_views_of_triangles"] > 30
     wrong = errors(model)
     assert np.quantile(wrong, 0.99) < 8.0
     assert wrong.max() < 60.0  # magenta is some 120 away
 
 
-def test_two_photos_alone_keep_what_they_disagree_on():
-    """Nobody can say which of two is right, but the texture must exist."""
-    pair = VIEWS[4:6]
-    crossing = {VIEWS[4].name: (slice(70, 150), slice(120, 170))}
-    model, figures = textured(Album(passers_by=crossing), views=pair)
-    assert figures["strange_views_of_triangles"] == 0
-    assert model.texture is not None
-
-
-CROSSING = (slice(70, 150), slice(120, 170))
-
-
 def masked_crossing(view):
-    """All but the passer-by, and but a line across the photo that is thinner than a triangle."""
+    """All pixels but the passer-by and a line across the photo, thinner than a triangle."""
     used = np.ones((view.height, view.width), bool)
     used[CROSSING] = used[100, :] = False
     return used
 
 
-def test_a_photo_is_used_for_the_triangles_that_show_nothing_masked():
+def test_triangles_with_masked_pixels_are_not_painted():
     view = VIEWS[4]
     used = masked_crossing(view)
     near = cv2.erode(used.view(np.uint8), np.ones((7, 7), np.uint8)) > 0
@@ -128,24 +112,23 @@ def test_a_photo_is_used_for_the_triangles_that_show_nothing_masked():
     assert 0.5 * len(clear) < clear.sum() <= len(kept.faces) < 0.9 * len(clear)
 
 
-def test_what_lies_under_a_mask_does_not_change_a_byte():
-    """Two photos cannot say which of them is right where they disagree, a mask can."""
-    pair, crossing = VIEWS[4:6], {VIEWS[4].name: CROSSING}
-    masks = {VIEWS[4].name: masked_crossing(VIEWS[4])}
+def test_masked_pixels_do_not_change_a_byte():
+    """Two photos alone do not show which of them is right where they disagree; a mask does."""
+    pair, masks = VIEWS[4:6], {VIEWS[4].name: masked_crossing(VIEWS[4])}
 
-    without, _ = textured(Album(passers_by=crossing), views=pair)
-    model, figures = textured(Album(passers_by=crossing, masks=masks), views=pair)
+    without, alone = textured(Album(passers_by=PASSER_BY), views=pair)
+    model, figures = textured(Album(passers_by=PASSER_BY, masks=masks), views=pair)
     expected, same = textured(Album(masks=masks), views=pair)
 
+    assert alone["strange_views_of_triangles"] == 0
     assert figures == same
-    np.testing.assert_array_equal(model.texture.pages[0], expected.texture.pages[0])
-    np.testing.assert_array_equal(model.surface.colors, expected.surface.colors)
+    assert_same_texture(model, expected)
     assert not np.array_equal(without.texture.pages[0], expected.texture.pages[0])
 
 
-def test_unseen_triangles_look_like_what_is_around_them(plain):
+def test_unseen_triangles_have_the_colors_around_them(plain):
     model, _ = plain
-    _, _, colors = on_surface(model, among=~seen_part(model))
+    _, colors = on_surface(model, among=~visible_part(model))
     rim = model.surface.colors[np.isclose(model.surface.vertices[:, 1], -HALF[1])]
     assert colors.min() > rim.min() - 3
     assert colors.max() < rim.max() + 3
@@ -157,7 +140,7 @@ def test_unseen_triangles_can_be_cut(plain):
     assert len(model.surface.faces) == len(BOX.faces) - figures["unseen_triangles"]
     assert len(model.texture.uv) == len(model.texture.page) == len(model.surface.faces)
     assert np.unique(model.surface.faces).tolist() == list(range(len(model.surface.vertices)))
-    assert seen_part(model).all()
+    assert visible_part(model).all()
     assert np.quantile(errors(model), 0.99) < 6.0
 
 
@@ -177,30 +160,27 @@ def test_threads_do_not_change_a_byte(plain):
 
     model, figures = textured(Album(), spread=last_first)
     assert figures == plain[1]
-    for ours, theirs in zip(model.texture.pages, plain[0].texture.pages, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
-    np.testing.assert_array_equal(model.texture.uv, plain[0].texture.uv)
+    assert_same_texture(model, plain[0])
 
 
-def test_a_photo_that_is_gone_is_counted():
-    gone = VIEWS[0].name
-    model, figures = textured(Album(lost=(gone,)))
-    assert figures["rejected"] == {gone: "cannot be read: No such file or directory"}
+def test_a_missing_photo_is_counted():
+    missing = VIEWS[0].name
+    model, figures = textured(Album(lost=(missing,)))
+    assert figures["rejected"] == {missing: "cannot be read: No such file or directory"}
     assert np.quantile(errors(model), 0.99) < 8.0
 
 
-def test_without_any_photo_the_old_colors_remain():
+def test_without_any_photo_the_previous_colors_stay():
     lost = tuple(view.name for view in VIEWS)
     model, figures = textured(Album(lost=lost))
     assert figures["unseen_triangles"] == len(BOX.faces)
-    _, _, colors = on_surface(model)
+    _, colors = on_surface(model)
     np.testing.assert_allclose(colors, 77.0, atol=0.5)
 
 
 def test_an_occluder_leaves_no_print():
     """A board between one camera and the box: the box must not show the board's color."""
-    views = VIEWS
-    board_at = views[4].center * 0.6
+    board_at = VIEWS[4].center * 0.6
     side = np.cross(board_at, [0.0, 1.0, 0.0])
     side *= 0.25 / np.linalg.norm(side)
     up = np.array([0.0, 0.25, 0.0])
@@ -210,11 +190,11 @@ def test_an_occluder_leaves_no_print():
         BOX, vertices=np.concatenate([BOX.vertices, corners]), faces=faces,
         colors=np.concatenate([BOX.colors, np.zeros((4, 3), np.uint8)]),
     )  # fmt: skip
-    x, y = _pixels(views[4], corners).T
+    x, y = _pixels(VIEWS[4], corners).T
     rectangle = (slice(int(y.min()), int(y.max()) + 1), slice(int(x.min()), int(x.max()) + 1))
-    model, _ = textured(Album(passers_by={views[4].name: rectangle}), surface=surface, views=views[3:6])
-    among = np.concatenate([seen_part(replace(model, surface=BOX)), np.zeros(4, bool)])
-    _, points, colors = on_surface(model, among=among & (surface.vertices[faces].mean(axis=1) @ views[4].center > 0.5))
+    model, _ = textured(Album(passers_by={VIEWS[4].name: rectangle}), surface=surface, views=VIEWS[3:6])
+    among = np.concatenate([visible_part(replace(model, surface=BOX)), np.zeros(4, bool)])
+    points, colors = on_surface(model, among=among & (surface.vertices[faces].mean(axis=1) @ VIEWS[4].center > 0.5))
     assert np.quantile(np.abs(colors - paint_at(points)).max(axis=1), 0.97) < 12.0
 
 
@@ -224,27 +204,19 @@ def _pixels(view, points):
     return plane * np.array(view.lens[:2]) + np.array(view.lens[2:4])
 
 
-def test_in_blocks_every_point_has_its_color_too(plain, monkeypatch):
-    monkeypatch.setattr(charts, "TRIANGLES", 600)
-    model, figures = textured(Album())
+def test_blocks_have_the_same_colors_and_are_painted_once(plain, monkeypatch):
+    monkeypatch.setattr(charts, "OPTIONS", replace(charts.OPTIONS, block_triangles=600))
+    album = Album()
+    model, figures = textured(album)
 
     assert len(model.texture.pages) == len(figures["pages"]) == 3
     assert figures["strange_views_of_triangles"] == plain[1]["strange_views_of_triangles"]
     assert np.quantile(errors(model), 0.99) < 6.0
-    above = model.surface.vertices[:, 1] > -0.99 * HALF[1]
-    wrong = np.abs(model.surface.colors[above] - paint_at(model.surface.vertices[above])).max(axis=1)
-    assert np.quantile(wrong, 0.95) < 6.0
-
-
-def test_a_finished_block_is_not_painted_again(monkeypatch):
-    monkeypatch.setattr(charts, "TRIANGLES", 600)
-    album = Album()
-    first, _ = textured(album)
+    assert_vertices_have_their_color(model)
     assert {"block0", "block1", "block2"} <= set(album.kept)
-    album.asked.clear()
+    album.read.clear()
 
     again, _ = textured(album)
 
-    assert album.asked == []
-    for ours, theirs in zip(again.texture.pages, first.texture.pages, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
+    assert album.read == []
+    assert_same_texture(again, model)

@@ -12,7 +12,7 @@ from sfm_app.frame.scale import move_model
 from sfm_app.geometry.poses import Similarity
 from sfm_app.meshing.ray_casting import NearestNormals
 from sfm_app.runtime.parallel import make_executor, ordered_map
-from sfm_app.texture import bake_normals, normal_map
+from sfm_app.texture import bake_normals
 from sfm_app.types import Model, Surface, Texture
 
 HEIGHT, WAVES = 0.008, 25.0
@@ -51,14 +51,14 @@ def fine(count=240, shift=0.0, turned=False):
 
 
 def chart(flat, degrees, middle, mirrored):
-    """Places in the texture, 150 texels to a unit, turned about the middle of the chart."""
-    way = (flat - 0.5 * (flat.min(axis=(0, 1)) + flat.max(axis=(0, 1)))) * [1, 1 if mirrored else -1]  # y goes down
+    """Texture coordinates, 150 texels to a unit, rotated about the middle of the chart."""
+    offset = (flat - 0.5 * (flat.min(axis=(0, 1)) + flat.max(axis=(0, 1)))) * [1, 1 if mirrored else -1]  # y goes down
     cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return way @ np.array([[cosine, sine], [-sine, cosine]]) * 150 / SIDE + middle
+    return offset @ np.array([[cosine, sine], [-sine, cosine]]) * 150 / SIDE + middle
 
 
 def light(bend=0.0):
-    """18 triangles on two pages: three rows in charts that lie differently, one of them mirrored."""
+    """18 triangles on two pages: three rows in rotated charts, one of them mirrored."""
     flat, faces = grid(3)
     middle_y = flat[faces].mean(axis=1)[:, 1]
     uv, page = np.empty((len(faces), 3, 2)), (middle_y > 2 / 3).astype(np.int32)
@@ -72,12 +72,12 @@ def light(bend=0.0):
     return Model(surface, Texture(uv.astype(np.float32), page, (np.full((SIDE, SIDE, 3), 90, np.uint8),) * 2))
 
 
-def baked(model, find, spread=one_by_one):
-    return bake_normals(model, find, spread)
+def baked(model, find):
+    return bake_normals(model, find, one_by_one)
 
 
 def errors_deg(model, *, mapped=True, truth=true_normals):
-    """Angles between what a viewer shades with and the truth, over all parts of the model's GLB."""
+    """Angles between a viewer's shading normals and the truth, over all parts of the model's GLB."""
     rng, found = np.random.default_rng(0), []
     for part in read_lit(write_glb(model, "m")["m.glb"]):
         face = rng.integers(0, len(part.faces), 3000)
@@ -88,7 +88,7 @@ def errors_deg(model, *, mapped=True, truth=true_normals):
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.02])
-def test_a_viewer_shades_a_light_surface_as_if_it_were_fine(bend):
+def test_a_viewer_shades_a_light_surface_like_the_fine_one(bend):
     model, share = baked(light(bend), fine().find)
 
     for part in errors_deg(model):
@@ -119,7 +119,7 @@ def test_another_frame_of_the_export_shows_the_same():
     ],
     ids=["near", "far", "opposite", "nothing"],
 )
-def test_a_fine_surface_that_is_far_away_or_faces_elsewhere_says_nothing(find, least, most):
+def test_a_distant_or_reversed_fine_surface_has_no_effect(find, least, most):
     model, share = baked(light(), find)
 
     assert least <= share <= most
@@ -127,7 +127,7 @@ def test_a_fine_surface_that_is_far_away_or_faces_elsewhere_says_nothing(find, l
     assert flat == [most == 0.0] * 2
 
 
-def test_triangles_that_no_photo_sees_stay_flat():
+def test_triangles_without_a_photo_stay_flat():
     model = light()
     uv = model.texture.uv.copy()
     unseen = np.flatnonzero(model.texture.page == 1)
@@ -141,17 +141,14 @@ def test_triangles_that_no_photo_sees_stay_flat():
     assert (second == FLAT).all()
 
 
-def test_any_number_of_workers_gives_the_same_bytes(monkeypatch):
-    monkeypatch.setattr(normal_map, "BAND", 20 * SIDE)  # several parts
-    found = []
+def test_any_number_of_workers_gives_the_same_bytes():
+    whole, _ = baked(light(), fine().find)
     for workers in (1, 2):
         with make_executor(workers) as executor:
-            model, _ = baked(light(), fine().find, lambda work, parts, _: list(ordered_map(executor, work, parts, 4)))
-        found.append(b"".join(one.tobytes() for one in model.texture.normal_maps))
-    monkeypatch.undo()
-    at_once, _ = baked(light(), fine().find)
-
-    assert found[0] == found[1] == b"".join(one.tobytes() for one in at_once.texture.normal_maps)
+            model, _ = bake_normals(
+                light(), fine().find, lambda work, parts, _: list(ordered_map(executor, work, parts, 4)), band=20 * SIDE
+            )
+        np.testing.assert_array_equal(model.texture.normal_maps, whole.texture.normal_maps)
 
 
 def test_maps_have_half_the_side_of_odd_pages_and_a_model_without_a_texture_stays():

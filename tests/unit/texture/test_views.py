@@ -1,12 +1,14 @@
-"""Texture through all lenses: the kernel projects as bundle adjustment does, and shows nothing that a lens cannot."""
+"""Views for texturing: projection through all lenses, sizes, sampling, panoramas."""
 
 import numpy as np
 import pytest
+from painted_box import around
 
 from sfm_app.camera.projection import FISHEYE, PERSPECTIVE, project_points
+from sfm_app.errors import ReconstructionError
 from sfm_app.photos.panoramas import panorama_parts
 from sfm_app.stages.texture import photo_views
-from sfm_app.texture.views import part_view, photo_view, project
+from sfm_app.texture.views import part_view, photo_view, project, sample
 from sfm_app.types import CameraModel, Scene
 
 SIZE = 640, 480
@@ -20,12 +22,6 @@ PLACES = {"OPENCV": range(8), "FULL_OPENCV": range(12), "OPENCV_FISHEYE": (0, 1,
           "THIN_PRISM_FISHEYE": range(12)}  # fmt: skip
 
 
-def view_of(model, pose=None):
-    params, _ = LENSES[model]
-    camera = CameraModel(model, params, np.eye(3), *SIZE)
-    return photo_view("a.jpg", camera, np.eye(3, 4) if pose is None else pose)
-
-
 @pytest.mark.parametrize("model", LENSES)
 def test_projection_is_that_of_bundle_adjustment(model):
     params, family = LENSES[model]
@@ -37,25 +33,21 @@ def test_projection_is_that_of_bundle_adjustment(model):
     R *= np.sign(np.linalg.det(R))
     pose = np.column_stack([R, [0.1, -0.2, 0.3]])
 
-    row = view_of(model, pose).row
+    view = photo_view("a.jpg", CameraModel(model, params, np.eye(3), *SIZE), pose)
+    row = view.row
     found = np.array([project(row, *((point - pose[:, 3]) @ R)) for point in points])
 
     expected = project_points(points, np.tile(full, (200, 1)), np.full(200, family)).x
     np.testing.assert_allclose(found[:, :2], expected, atol=1e-8)
     assert (found[:, 2] > 0.0).all()
-
-
-@pytest.mark.parametrize("model", LENSES)
-def test_a_scaled_view_sees_the_same_in_another_size(model):
-    view = view_of(model)
     half = view.with_size(SIZE[0] // 2, SIZE[1] // 2)
+    smaller = np.array([project(half.row, *((point - pose[:, 3]) @ R)) for point in points])
+    np.testing.assert_allclose(2.0 * smaller[:, :2], expected, atol=1e-8)
+    behind = np.array([1e-3, 0.0, -1.0]) - pose[:, 3]
+    assert project(row, *(behind @ R)) == (0.0, 0.0, 0.0)
 
-    np.testing.assert_allclose(
-        2.0 * np.array(project(half.row, 0.3, 0.2, 1.1)[:2]), project(view.row, 0.3, 0.2, 1.1)[:2]
-    )
 
-
-def test_a_fisheye_shows_what_lies_at_its_side_and_nothing_beyond_its_corner():
+def test_a_fisheye_shows_its_side_and_nothing_beyond_its_corner():
     params = (180.0, 180.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0)  # the corner is at 127 degrees
     row = photo_view("a", CameraModel("OPENCV_FISHEYE", params, np.eye(3), *SIZE), np.eye(3, 4)).row
 
@@ -66,7 +58,7 @@ def test_a_fisheye_shows_what_lies_at_its_side_and_nothing_beyond_its_corner():
     assert project(row, 0.0, 0.0, 1.0)[:2] == (320.0, 240.0)
 
 
-def test_a_lens_that_folds_inside_the_photo_shows_nothing_beyond_the_fold():
+def test_a_lens_shows_nothing_beyond_its_fold():
     params = (300.0, 300.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0)  # r / (1 + r^2) folds at r = 1
     row = photo_view("a", CameraModel("FULL_OPENCV", params, np.eye(3), *SIZE), np.eye(3, 4)).row
 
@@ -74,7 +66,7 @@ def test_a_lens_that_folds_inside_the_photo_shows_nothing_beyond_the_fold():
     assert project(row, 1.1, 0.0, 1.0)[2] == 0.0
 
 
-def test_a_panorama_is_painted_through_views_that_show_all_of_it():
+def test_views_cover_a_whole_panorama():
     pose = np.column_stack([np.diag([-1.0, 1.0, -1.0]), [0.5, 0.0, 0.0]])
     panorama = CameraModel("EQUIRECTANGULAR", (640.0, 320.0), np.eye(3), 640, 320)
     scene = Scene(None, {"sub/a.jpg": pose}, {}, {"c": panorama}, 1, 1, 0.1, {"sub/a.jpg": "c"})
@@ -93,10 +85,38 @@ def test_a_panorama_is_painted_through_views_that_show_all_of_it():
     assert (depths > 0.0).all()
 
 
-def test_a_part_view_looks_where_its_part_looks():
+def test_a_part_view_has_the_rays_of_its_part():
     part = panorama_parts((640, 320))[1]
     view = part_view("a.2", "a", part, np.eye(3, 4))
 
     u, v, _ = project(view.row, *(part.rays()[30, 40] * 5.0))
 
     assert (u, v) == pytest.approx((40.5, 30.5), abs=1e-9) and view.source == "a"
+
+
+def test_other_camera_models_are_refused():
+    camera = CameraModel("FISHEYE", (1.0,) * 8, np.eye(3), 10, 10)
+    with pytest.raises(ReconstructionError, match="texturing does not support the camera model FISHEYE"):
+        photo_view("a", camera, np.eye(3, 4))
+
+
+def test_sampling_is_linear_between_pixel_centers():
+    y, x = np.mgrid[:5, :7]
+    photo = np.stack([10 * x, 20 * y, x + y], axis=2).astype(np.uint8)
+    assert sample(photo, 2.75, 3.25, 0) == pytest.approx(22.5)
+    assert sample(photo, 2.75, 3.25, 1) == pytest.approx(55.0)
+    assert sample(photo, -4.0, 99.0, 0) == 0.0
+
+
+@pytest.mark.parametrize("k1", [-0.2, 0.0, 0.1])
+def test_the_widest_angle_bounds_the_visible_rays(k1):
+    view = around(1, k1=k1)[0]
+    rays = np.random.default_rng(0).normal(size=(4000, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    inside = [
+        angle
+        for ray, angle in zip(rays, np.arccos(rays @ view.axis), strict=True)
+        for u, v, depth in [project(view.row, *(view.center + ray))]
+        if depth > 0 and 0 <= u <= view.width and 0 <= v <= view.height
+    ]
+    assert max(inside) <= view.widest_angle < max(inside) + np.radians(8)
