@@ -391,8 +391,8 @@ def _with_suffix(place: Path, suffix: str) -> Path:
     if given == suffix:
         return place
     plugins = load_plugins()
-    exporters = [*plugins.exporters.values(), *plugins.scene_exporters.values()]
-    if given and given in {exporter.ending for exporter in exporters}:
+    endings = {part.ending for part in plugins.exporters.values()}
+    if given and given in endings | {part.ending for part in plugins.scene_exporters.values()}:
         raise ConfigError(f"{place.name} does not end in .{suffix}", hint=f"name it {place.stem}.{suffix}")
     return Path(f"{place}.{suffix}")
 

@@ -1,3 +1,5 @@
+"""Atomic writes, hashes, and arrays from files."""
+
 import zipfile
 from pathlib import PureWindowsPath
 
@@ -5,7 +7,18 @@ import numpy as np
 import pytest
 
 from sfm_app import files
-from sfm_app.files import MOST_BYTES, digest_files, fingerprint, is_below, load_arrays
+from sfm_app.files import MOST_BYTES, digest_files, fingerprint, is_below, load_arrays, replace_atomically
+
+
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
+    target = tmp_path / "x.txt"
+    target.write_text("old")
+    with pytest.raises(RuntimeError), replace_atomically(target) as path:
+        path.write_text("half")
+        raise RuntimeError
+
+    assert target.read_text() == "old"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["x.txt"]
 
 
 def test_arrays_come_back(tmp_path):
