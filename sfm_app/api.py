@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from sfm_app.errors import ConfigError, InputError, SfmError
 from sfm_app.files import replace_atomically, save_files
 from sfm_app.formats.exporters import CLOUD
-from sfm_app.frame.sighted_points import Distance
 from sfm_app.fundamental.points import check_points
 from sfm_app.plugins import load_plugins
 from sfm_app.progress import Callback, Progress, as_progress
@@ -25,6 +24,10 @@ from sfm_app.runtime.workspace import Workspace
 from sfm_app.selfcal.wide_lens import LensEstimate, find_lens
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Intrinsics, Rejected, Scene, SceneArrays
+
+if TYPE_CHECKING:
+    from sfm_app.engine.stage import Products
+    from sfm_app.frame.sighted_points import Distance
 
 PathLike = str | os.PathLike[str]
 
@@ -108,10 +111,6 @@ def open_run(out: Path, settings: Settings, progress: Progress | Callback | None
 
 # Runs from photos to a mesh, or to a camera.
 
-if TYPE_CHECKING:
-    from sfm_app.engine.stage import Products
-    from sfm_app.runtime.context import RunContext
-
 
 def reconstruct(
     photos: PathLike, out: PathLike, settings: Settings | None = None, *,
@@ -143,9 +142,9 @@ def reconstruct(
 
     with open_run(Path(out), settings or Settings(), progress) as run:
         run.plugins.depth_method(run.settings.depth.method)  # fail now, not halfway through the work
-        wanted = (pipeline.INTRINSICS, pipeline.SCENE, pipeline.FILES)
+        targets = (pipeline.INTRINSICS, pipeline.SCENE, pipeline.FILES)
         try:
-            products = pipeline.run_stages(Path(photos), run, first, last, wanted)
+            products = pipeline.run_stages(Path(photos), run, first, last, targets)
         except SfmError as err:
             if written := finish_report(run, err):
                 run.progress.say(f"report of the unfinished run: {written}")
@@ -183,7 +182,7 @@ def read_run(out: PathLike) -> Run:
         return _as_run(run, Products(run), done[-1], report if report.exists() else None)
 
 
-def _as_run(run: "RunContext", products: "Products", last: str, report: Path | None) -> Run:
+def _as_run(run: RunContext, products: "Products", last: str, report: Path | None) -> Run:
     """Return the products of a run up to the stage `last`."""
     from sfm_app import pipeline
 
@@ -233,8 +232,8 @@ def calibrate_photos(
         tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch,
         open_run(Path(out or scratch), settings or Settings(), progress) as run,
     ):
-        wanted = (pipeline.MATCH_GRAPH, pipeline.VIEW_GRAPH, pipeline.INTRINSICS)
-        products = pipeline.run_stages(Path(photos), run, last=pipeline.INTRINSICS.name, wanted=wanted)
+        targets = (pipeline.MATCH_GRAPH, pipeline.VIEW_GRAPH, pipeline.INTRINSICS)
+        products = pipeline.run_stages(Path(photos), run, last=pipeline.INTRINSICS.name, targets=targets)
         intrinsics = products[pipeline.INTRINSICS]
         if figure is not None:
             draw_intrinsics(Path(figure), products[pipeline.MATCH_GRAPH], products[pipeline.VIEW_GRAPH], intrinsics)
@@ -406,7 +405,7 @@ def _naming_target(place: Path) -> Iterator[None]:
         raise InputError(f"cannot write {place}: {err.strerror or err}", hint="name another place with -o") from err
 
 
-def measure_distance(out: PathLike, a: ArrayLike, b: ArrayLike) -> Distance:
+def measure_distance(out: PathLike, a: ArrayLike, b: ArrayLike) -> "Distance":
     """Return the distance between two places of a finished run, with its standard deviation.
 
     Args:

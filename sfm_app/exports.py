@@ -271,10 +271,10 @@ class StoredPhotos:
         with translate_errors(f"undistorting {name}"):
             maps, place = self._maps.camera_maps(camera_id), self._run.workspace.photos
             views = render_views(name, self._lenses[camera_id], place, self._mask_dir, maps)
-            for image, (pixels, shown) in zip(self._names[name], views, strict=True):
+            for image, (pixels, mask) in zip(self._names[name], views, strict=True):
                 save_picture(folder / IMAGES / image, pixels)
                 if self._has_masks:
-                    save_mask(folder / MASKS, image, shrink_mask(shown))
+                    save_mask(folder / MASKS, image, shrink_mask(mask))
 
     def write_colmap(self, folder: Path, *, text: bool = False) -> None:
         """Write COLMAP's model into a new folder."""
@@ -320,24 +320,24 @@ def fill_folder(target: Path, about: Callable[[], Mapping[str, object]]) -> Iter
     """
     check_replaceable(target)
     target.parent.mkdir(parents=True, exist_ok=True)
-    beside = target.with_name(f".{target.name}.unfinished")
-    shutil.rmtree(beside, ignore_errors=True)
-    beside.mkdir()
+    draft = target.with_name(f".{target.name}.unfinished")
+    shutil.rmtree(draft, ignore_errors=True)
+    draft.mkdir()
     try:
-        yield beside
-        with replace_atomically(beside / RECORD) as path:
-            path.write_text(json_text({**about(), "files": _list_files(beside)}), encoding="utf-8", newline="\n")
+        yield draft
+        with replace_atomically(draft / RECORD) as path:
+            path.write_text(json_text({**about(), "files": _list_files(draft)}), encoding="utf-8", newline="\n")
         check_replaceable(target)  # it may have changed
         if target.exists():
             old = target.with_name(f".{target.name}.old")
             shutil.rmtree(old, ignore_errors=True)
             move(target, old)
-            move(beside, target)
+            move(draft, target)
             shutil.rmtree(old, ignore_errors=True)
         else:
-            move(beside, target)
+            move(draft, target)
     finally:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(draft, ignore_errors=True)
 
 
 def check_replaceable(target: Path) -> None:

@@ -96,8 +96,8 @@ class Serializer:
         if len(data) <= OPTIONS.small_bytes:
             return Serialized(data)
         path = self.folder / f"value-{secrets.token_hex(8)}.pickle"
-        with replace_atomically(path) as beside:
-            beside.write_bytes(data)
+        with replace_atomically(path) as draft:
+            draft.write_bytes(data)
         return Serialized(b"", str(path), hashlib.blake2b(data).hexdigest())
 
     def share(self, value: Shared[Any]) -> tuple[str, str]:
@@ -105,7 +105,7 @@ class Serializer:
         known = self._shared.get(id(value))
         if known is None:
             path = self.folder / f"shared-{secrets.token_hex(8)}.pickle"
-            with replace_atomically(path) as beside, beside.open("wb") as file:
+            with replace_atomically(path) as draft, draft.open("wb") as file:
                 _Pickler(file, self).dump(value.value)
             # holding the value keeps its id unique
             known = self._shared[id(value)] = value, path, _digest(path)
@@ -584,7 +584,7 @@ def _close(client: Any) -> None:
 
 
 def _quiet() -> None:
-    """Silence Dask's own messages; this program reports errors in one line."""
+    """Keep Dask's own messages off the terminal; this program reports errors in one line."""
     known = [name for name in logging.root.manager.loggerDict if name.startswith("distributed.")]
     for name in ("distributed", "tornado", "asyncio", *known):
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
@@ -626,7 +626,7 @@ class ClusterExecutor(RemoteExecutor):
         super().__init__(max_workers=workers, thread_name_prefix="sfm")
         self.cluster, self.workers = cluster, workers
 
-    def resized(self, workers: int) -> "ClusterExecutor":
+    def with_threads(self, workers: int) -> "ClusterExecutor":
         """Return an executor of the same cluster with another number of threads."""
         return ClusterExecutor(self.cluster, workers)
 

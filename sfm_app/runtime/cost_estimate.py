@@ -8,7 +8,6 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from sfm_app.retrieval import expected_pairs
 from sfm_app.settings import MeshSettings, Settings
 from sfm_app.types import Photo
 
@@ -114,6 +113,8 @@ def block_workers(workers: int, limit_mb: float, options: MeshSettings) -> int:
 
 def make_plan(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb: float = math.inf) -> Plan:
     """Estimate the costs of all stages after the photos stage; a small memory limit means a small cache of fusion."""
+    from sfm_app.retrieval import expected_pairs  # loads OpenCV and SciPy
+
     sizes = [(photo.width, photo.height) for photo in photos]
     count, pairs = len(sizes), expected_pairs(len(sizes), settings.matching)
     largest, whole_mp = max(map(math.prod, sizes), default=0) / 1e6, sum(map(math.prod, sizes)) / 1e6
