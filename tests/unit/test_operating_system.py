@@ -45,13 +45,11 @@ from sfm_app.operating_system import (
 )
 def test_every_system_has_its_own(platform, has, misses):
     found = find_abilities(platform, {})
-
     assert has in found and misses not in found
 
 
 def test_the_environment_takes_abilities_away():
     found = find_abilities("linux", {VARIABLE: "links, process groups,"})
-
     assert set(Ability) - found == {Ability.LINKS, Ability.GROUPS}
     assert find_abilities("linux", {VARIABLE: ",".join(Ability)}) == frozenset()
 
@@ -64,7 +62,6 @@ def test_a_misspelled_ability_is_refused():
 def test_missing_abilities_have_names(without):
     before = missing_abilities()
     without(Ability.LINKS)
-
     assert lacks(Ability.LINKS) and set(missing_abilities()) == {*before, "links"}
 
 
@@ -81,7 +78,6 @@ def photo(tmp_path):
 @pytest.mark.skipif(os.name == "nt" or lacks(Ability.LINKS), reason="Windows asks for a right")
 def test_a_link_leads_to_the_file(photo, tmp_path):
     link_or_copy(tmp_path / "place", "photo.jpg", photo)
-
     assert is_link(tmp_path / "place") and (tmp_path / "place").resolve() == photo.resolve()
 
 
@@ -103,7 +99,6 @@ def test_an_existing_link_is_not_written_through(photo, tmp_path, without, taken
     without(*taken)
     (tmp_path / "other.jpg").write_bytes(b"another")
     (tmp_path / "place").symlink_to("other.jpg")
-
     with pytest.raises(FileExistsError):
         link_or_copy(tmp_path / "place", photo, photo)
     assert (tmp_path / "other.jpg").read_bytes() == b"another"
@@ -113,21 +108,18 @@ def test_an_existing_link_is_not_written_through(photo, tmp_path, without, taken
 def test_bytes_are_shared_where_they_can_be(photo, tmp_path, without, taken, names):
     without(*taken)
     share_bytes(photo, tmp_path / "other")
-
     assert (tmp_path / "other").read_bytes() == b"light" and photo.stat().st_nlink == names
 
 
 def test_bytes_are_copied_where_sharing_is_refused(photo, tmp_path, monkeypatch):
     monkeypatch.setattr(os, "link", refuse)
     share_bytes(photo, tmp_path / "other")
-
     assert (tmp_path / "other").read_bytes() == b"light" and photo.stat().st_nlink == 1
 
 
 def test_a_junction_is_a_link(photo, monkeypatch):
     monkeypatch.setattr(stat, "IO_REPARSE_TAG_MOUNT_POINT", 0xA0000003, raising=False)
     found = SimpleNamespace(st_mode=stat.S_IFDIR, st_reparse_tag=0xA0000003)
-
     assert is_link(SimpleNamespace(lstat=lambda: found))
     assert not is_link(photo) and not is_link(photo.parent / "nothing")
 
@@ -137,7 +129,6 @@ def test_moves_wait_for_a_file_that_is_open(photo, tmp_path, without, monkeypatc
     without(Ability.OPEN_FILES)
     slept = block_moves(monkeypatch, times=3)
     act(photo, tmp_path / "new")
-
     assert (tmp_path / "new").read_bytes() == b"light" and not photo.exists()
     assert slept == list(operating_system.WAITS_S[:3])
 
@@ -145,7 +136,6 @@ def test_moves_wait_for_a_file_that_is_open(photo, tmp_path, without, monkeypatc
 def test_a_file_that_is_never_free_is_an_error(photo, tmp_path, without, monkeypatch):
     without(Ability.OPEN_FILES)
     slept = block_moves(monkeypatch, times=100)
-
     with pytest.raises(PermissionError):
         replace_file(photo, tmp_path / "new")
     assert slept == list(operating_system.WAITS_S) and photo.exists()
@@ -154,7 +144,6 @@ def test_a_file_that_is_never_free_is_an_error(photo, tmp_path, without, monkeyp
 def test_elsewhere_a_refusal_is_final(photo, tmp_path, monkeypatch):
     monkeypatch.setattr("sfm_app.operating_system.HERE", frozenset(Ability))
     slept = block_moves(monkeypatch, times=1)
-
     with pytest.raises(PermissionError):
         replace_file(photo, tmp_path / "new")
     assert slept == []
@@ -189,7 +178,6 @@ PILLOW = Path(PIL.__file__).parent
 def test_libraries_in_wheels_are_found_unless_there_are_none(without):
     assert [hasattr(library, "TIFFOpen") for library in find_in_wheel(PILLOW, "pillow", "libtiff")] == [True]
     assert list(find_in_wheel(PILLOW, "pillow", "libnothing")) == []
-
     without(Ability.WHEEL_LIBRARIES)
     assert list(find_in_wheel(PILLOW, "pillow", "libtiff")) == []
 
@@ -237,7 +225,6 @@ def test_times_of_children_are_not_counted_twice(monkeypatch):
     monkeypatch.setattr("sfm_app.operating_system.HERE", frozenset(Ability))
     times = ChildTimes()
     times.look([psutil.Process()])
-
     assert times.seconds() == 0.0
     assert cpu_seconds() == pytest.approx(sum(os.times()[:4]), abs=0.1)
 
@@ -248,7 +235,6 @@ def test_a_child_that_is_gone_is_no_error(without):
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
         gone = psutil.Process(process.pid)
     times.look([gone])
-
     assert times.seconds() == 0.0
 
 
@@ -270,5 +256,4 @@ def test_time_passes():
     until = time.process_time() + 0.05
     while time.process_time() < until:
         pass
-
     assert 0.03 <= cpu_seconds() - start < 1.0

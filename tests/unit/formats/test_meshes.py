@@ -41,7 +41,6 @@ def test_cameras_are_dotted_lines_behind_the_points(cloud):
     vertex = rows(cloud)["vertex"]["data"]
     count = len(cloud.surface.vertices)
     painted = np.stack([vertex[key] for key in ("red", "green", "blue")], axis=1) == CAMERA_COLOR
-
     assert len(vertex) == count + 8 * DOTS * len(cloud.cameras)
     assert painted.all(axis=1)[count:].all()
     assert set(rows(cloud)) == {"vertex"}
@@ -107,7 +106,6 @@ def test_normal_maps_are_beside_the_pages_and_the_model_is_lit(lit_ball):
 
 def test_without_a_texture_vertices_carry_the_colors(ball):
     files = write_obj(ball, "model")
-
     v = np.array(lines(files, "v"), float)
     assert list(files) == ["model.obj"]
     np.testing.assert_allclose(255 * v[:, 3:], ball.surface.colors, atol=0.02)
@@ -115,7 +113,6 @@ def test_without_a_texture_vertices_carry_the_colors(ball):
 
 def test_points_and_cameras(cloud):
     files = write_obj(cloud, "model")
-
     assert len(lines(files, "p")) == len(cloud.surface.vertices)
     assert len(lines(files, "l")) == 8 * len(cloud.cameras)
     assert np.array(lines(files, "l"), int).max() == len(lines(files, "v"))
@@ -124,9 +121,7 @@ def test_points_and_cameras(cloud):
 @pytest.mark.parametrize("size", [1e-3, 1.0, 250.0, 1e7])
 def test_coordinates_are_as_exact_as_the_model_is_large(ball, size):
     surface = Surface(size * ball.surface.vertices, ball.surface.faces, ball.surface.colors)
-
     v = np.array(lines(write_obj(Model(surface), "model"), "v"), float)[:, :3]
-
     error = np.abs(v - surface.vertices).max() / size
     assert error < 10.0**-DIGITS
     assert size >= 1e7 or error > 0
@@ -149,7 +144,6 @@ def test_trimesh_and_open3d_show_both_pages(textured_ball, tmp_path):
 def test_a_ball_of_a_meter_is_closed_and_of_a_thousand_millimeters(ball):
     (data,) = write_stl(ball, "model").values()
     mesh = trimesh.load(io.BytesIO(data), file_type="stl")
-
     assert len(data) == 84 + 50 * len(ball.surface.faces) and not data.startswith(b"solid")
     assert mesh.is_watertight and mesh.volume > 0  # inside out, it would be below
     np.testing.assert_allclose(mesh.extents, 2000.0, rtol=1e-3)
@@ -159,7 +153,6 @@ def test_a_ball_of_a_meter_is_closed_and_of_a_thousand_millimeters(ball):
 def test_what_is_up_in_the_model_is_up_in_the_printer(ball):
     rows = np.frombuffer(write_stl(ball, "model")["model.stl"], "(3,)<f4,(3,3)<f4,<u2", offset=84)
     x, y, z = ball.surface.vertices[ball.surface.faces].transpose(2, 0, 1)
-
     np.testing.assert_allclose(rows["f1"], 1000 * np.stack([x, -z, y], axis=-1), atol=1e-3)
     np.testing.assert_allclose(np.linalg.norm(rows["f0"], axis=1), 1, atol=1e-6)
 

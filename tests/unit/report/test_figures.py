@@ -46,10 +46,8 @@ def prepared(panel):
 @pytest.mark.parametrize(("name", "start"), [("a.png", b"\x89PNG"), ("b.SVG", b"<?xml"), ("c.pdf", b"%PDF")])
 def test_the_suffix_names_the_format_and_the_bytes_do_not_change(panel, tmp_path, name, start):
     places = [tmp_path / folder / name for folder in ("one", "two")]
-
     for place in places:
         draw_calibration(place, [panel])
-
     first, second = (place.read_bytes() for place in places)
     assert first.startswith(start)
     assert first == second
@@ -59,7 +57,6 @@ def test_the_suffix_names_the_format_and_the_bytes_do_not_change(panel, tmp_path
 def test_other_suffixes_are_refused_by_name(tmp_path, name):
     with pytest.raises(ConfigError, match=re.escape(f"figure {name}: cannot write")) as caught:
         check_figure(tmp_path / name)
-
     assert ".png" in caught.value.hint
 
 
@@ -81,9 +78,7 @@ def test_votes_are_unanimous_at_the_camera_and_nowhere_higher(panel, make):
 @pytest.mark.parametrize("make", [focal_plane, center_plane])
 def test_curves_pass_through_the_camera(panel, make):
     plane = make(panel.camera, prepared(panel))
-
     there = plane.curves(np.array([plane.estimate[0]]))[:, 0]
-
     # a pair may have a second real root there, and the curve may be the other one
     assert np.mean(np.abs(there - plane.estimate[1]) < 0.5) >= 0.7
 
@@ -91,9 +86,7 @@ def test_curves_pass_through_the_camera(panel, make):
 def test_a_guess_is_drawn_without_pairs(panel, tmp_path):
     guess = replace(panel.camera, identifiable=False, method="guess", reason="no pairs", spread={})
     nothing = CameraPairs.from_Fs(np.zeros((0, 3, 3)), panel.pairs.size)
-
     draw_calibration(tmp_path / "guess.svg", [Panel("one", guess, nothing)])
-
     assert "no pair of photos is from this camera alone" in (tmp_path / "guess.svg").read_text()
 
 
@@ -101,7 +94,6 @@ def test_a_guess_is_drawn_without_pairs(panel, tmp_path):
 def test_of_many_cameras_the_first_are_drawn(panel, tmp_path):
     for count in (1, OPTIONS.most_cameras + 1):
         draw_calibration(tmp_path / f"{count}.svg", [panel._replace(name=f"camera-{k}") for k in range(count)])
-
     text = (tmp_path / f"{OPTIONS.most_cameras + 1}.svg").read_text()
     assert f"camera-{OPTIONS.most_cameras - 1}, one of {OPTIONS.most_cameras + 1}" in text
     assert f"camera-{OPTIONS.most_cameras}," not in text
@@ -110,7 +102,6 @@ def test_of_many_cameras_the_first_are_drawn(panel, tmp_path):
 
 def test_the_words_leave_no_line_empty(panel):
     lines = calibration_text(panel.camera).splitlines()
-
     assert lines[0] == "Known: the photos agree on this camera."
     assert "± 4:" in lines[1]
     assert all(lines)
@@ -126,9 +117,7 @@ SAYS = {
 @pytest.mark.slow
 def test_every_projection_is_drawn_with_what_it_has(camera, make_pairs, tmp_path):
     pairs = make_pairs(camera)
-
     draw_calibration(tmp_path / "figure.svg", [Panel("one", camera, pairs)])
-
     text = "".join(re.findall(r"<!-- (.*?) -->", (tmp_path / "figure.svg").read_text()))
     assert all(one in text for one in SAYS[camera.projection])
     assert ("square pixels" in text) == (camera.projection == "perspective")
@@ -155,9 +144,7 @@ def test_the_band_of_a_found_lens_is_that_of_its_covariance():
     lens = Fisheye(480.0 / np.radians(60.0), 0.0, (480.0, 320.0))
     covariance = np.diag([1e-3, 0.01, 0.5, 0.5]) ** 2
     estimate = LensEstimate(lens, tuple(map(tuple, covariance.tolist())), 0.9, 0.4, 12, (960, 640))
-
     curve = lens_curve(to_calibration(estimate, (960, 640)))
-
     true = estimate.radius_deviation_px(np.radians(curve.theta_deg))
     assert np.abs(curve.deviation_px - true).max() < 0.05 * true.max()
     assert curve.deviation_px[-1] == pytest.approx(true[-1], rel=0.01)
@@ -165,7 +152,6 @@ def test_the_band_of_a_found_lens_is_that_of_its_covariance():
 
 def test_the_residuals_are_the_noise_along_the_epipolar_lines(camera, make_pairs):
     residuals = epipolar_residuals(make_pairs(camera, noise_px=0.25), camera)
-
     assert np.std(residuals.distances_px) == pytest.approx(0.25, rel=0.05)
     assert np.sum(residuals.along**2, axis=(0, 2)) == pytest.approx(np.ones(len(residuals.distances_px)))
     assert residuals.repeats == 5.0
@@ -173,7 +159,6 @@ def test_the_residuals_are_the_noise_along_the_epipolar_lines(camera, make_pairs
 
 def test_noise_is_not_taken_for_a_lens(camera, make_pairs):
     grid = residual_grid(epipolar_residuals(make_pairs(camera), camera), (camera.width, camera.height))
-
     assert np.mean(grid.clear) < 0.02
     assert 0.1 < np.nanmedian(grid.size_px) < 0.17
     assert np.nanmax(np.abs(grid.shift_px)) < 0.25
@@ -200,9 +185,7 @@ def test_an_error_of_the_lens_model_appears_in_its_cells(camera, make_pairs):
 
 def test_without_pairs_all_cells_are_empty(camera):
     nothing = CameraPairs.from_Fs(np.zeros((0, 3, 3)), (camera.width, camera.height))
-
     grid = residual_grid(epipolar_residuals(nothing, camera), (camera.width, camera.height))
-
     assert np.isnan(grid.size_px).all() and not grid.clear.any()
 
 

@@ -29,7 +29,6 @@ from sfm_app.types import Calibration, CameraModel
 
 def test_three_js_comes_from_an_installed_package_and_ends_before_the_page_that_it_was_in():
     script = three_script()
-
     assert 500_000 < len(script) < 2_000_000
     assert "WebGLRenderer" in script and "GLTFLoader" in script
     assert "B64GLTF" not in script and "</script" not in script.lower()
@@ -40,7 +39,6 @@ def test_three_js_comes_from_an_installed_package_and_ends_before_the_page_that_
 )
 def test_no_text_ends_the_data_of_the_script(text):
     data = str(script_data({"name": text}))
-
     assert "<" not in data and "\u2028" not in data
     assert json.loads(data) == {"name": text}
 
@@ -48,7 +46,6 @@ def test_no_text_ends_the_data_of_the_script(text):
 @pytest.mark.parametrize("count", [1, 20, 200, 5000])
 def test_pictures_of_any_number_of_photos_stay_small(count):
     side = picture_side(count)
-
     assert SMALLEST_PX <= side <= LARGEST_PX
     assert count * side * side * 3 / 4 < max(1.4 * ALL_PIXELS, count * SMALLEST_PX**2)
 
@@ -70,13 +67,11 @@ def test_a_value_has_its_deviation_only_where_it_is_known():
 def test_settings_that_were_changed_are_listed_with_their_defaults():
     given = Settings.from_mapping({"seed": 3, "mesh": {"faces": 1000}}).model_dump()
     contents = SimpleNamespace(manifest={"settings": given})
-
     assert changed_settings(contents) == [("mesh.faces", "1000", str(Settings().mesh.faces)), ("seed", "3", "0")]
 
 
 def test_nothing_is_claimed_of_a_run_without_a_stage():
     contents = SimpleNamespace(scene=None, intrinsics=None, stages={}, counts=lambda _: {})
-
     assert glance(contents) == []
 
 
@@ -144,9 +139,7 @@ def test_a_large_texture_is_shrunk_and_keeps_its_colors(textured_ball):
 def test_normal_maps_are_shrunk_with_their_pages(lit_ball):
     large = np.full((LIGHT_PAGE_PX, 2 * LIGHT_PAGE_PX, 3), (128, 128, 255), np.uint8)
     small = lit_ball.texture.normal_maps[1]
-
     maps = lighten(replace(lit_ball, texture=replace(lit_ball.texture, normal_maps=(large, small)))).texture.normal_maps
-
     assert maps[0].shape == (LIGHT_PAGE_PX // 4, LIGHT_PAGE_PX // 2, 3) and (maps[0] == (128, 128, 255)).all()
     assert maps[1] is small
 
@@ -179,7 +172,6 @@ def test_parameters_that_move_together_are_named_the_strongest_first():
 def test_the_last_adjustment_counts_and_terms_that_are_zero_do_not():
     params = (900.0, 800.0, 320.0, 240.0, -0.1, 0.0, 1e-4, -1e-4)
     table = correlation_table(PAIRS, adjusted(("aspect", "k1"), params, fx_fy=0.4, fx_k1=-0.3, k1_p1=0.2, fx_k2=0.9))
-
     assert table.source == "after the last adjustment"
     assert list(table.names) == ["fx", "fy", "cx", "cy", "k1", "p1", "p2"]
     assert list(table.texts) == ["no strong correlation; the strongest is fx with fy, 0.40"]
@@ -188,13 +180,11 @@ def test_the_last_adjustment_counts_and_terms_that_are_zero_do_not():
 def test_a_long_list_is_cut_and_counted():
     strong = {f"{a}_{b}": 0.7 for a, b in (("fx", "fy"), ("fx", "cx"), ("fx", "cy"), ("fy", "cx"), ("cx", "cy"))}
     table = correlation_table(PAIRS, adjusted(("aspect",), (900.0, 900.0, 320.0, 240.0, 0, 0, 0, 0), **strong))
-
     assert len(table.texts) == 4 and table.texts[-1] == "and 2 more pairs of parameters"
 
 
 def test_nothing_is_said_where_nothing_is_known():
     guess = Calibration(np.eye(3), 640, 480, "guess", False, correlations=PAIRS.correlations)
-
     assert correlation_table(guess, None) is None
     assert correlation_table(guess, adjusted((), (0.0,) * 8, fx_k1=0.9)) is None
 

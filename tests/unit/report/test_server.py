@@ -74,7 +74,6 @@ def test_levels_have_every_point_once_with_its_color():
 def test_the_first_level_is_spread_over_the_scene():
     found = point_levels(surface(100_000))
     x = unpack(found.pack(0), found.counts[0])[0][:, 0]
-
     assert abs(x.mean() / 100_000 - 0.5) < 0.02 and x.min() < 100 and x.max() > 99_900
 
 
@@ -94,7 +93,6 @@ def test_the_page_its_model_and_its_points_have_addresses(resources):
 @pytest.mark.parametrize(("kind", "side"), [("pictures", SMALL_PX), ("photos", LARGE_PX)])
 def test_photos_have_a_small_and_a_large_picture(resources, kind, side):
     found = resources.find(f"/{kind}/0")
-
     assert found.kind == JPEG and Image.open(io.BytesIO(found.content)).size == (side, side // 2)
     assert resources.find(f"/{kind}/1") is None
 
@@ -115,7 +113,6 @@ def test_nothing_else_has_an_address(resources, address):
 def test_a_lighter_model_is_made_once_and_only_for_a_large_model(resources):
     made = []
     resources.make_light = lambda contents: made.append(contents) or b"light"
-
     assert resources.find("/light.glb") is None and made == []
     resources.most_bytes = 10
     assert [resources.find("/light.glb").content for _ in range(2)] == [b"light"] * 2 and len(made) == 1
@@ -175,7 +172,6 @@ def test_files_are_sent_whole_and_heads_without_a_body(server, resources):
 )
 def test_other_hosts_are_refused(server, host):
     answer, body = ask(server, Host=host.format(port=server.port))
-
     assert answer.status == 403 and b"only for the machine" in body
 
 
@@ -193,7 +189,6 @@ def test_two_hosts_in_one_request_are_refused(server):
 )
 def test_files_that_the_page_does_not_load_are_not_there(server, address):
     answer, body = ask(server, address)
-
     assert answer.status == 404 and b"secret" not in body
 
 

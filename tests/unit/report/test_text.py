@@ -27,7 +27,6 @@ def camera(fx=500.0, fy=500.0, cx=500.0, cy=400.0, **values):
 
 def test_the_field_of_view_counts_from_the_optical_center():
     across, down = field_of_view_deg(camera(cx=0.0))
-
     assert across == pytest.approx(np.degrees(np.arctan(2.0)))
     assert down == pytest.approx(2 * np.degrees(np.arctan(0.8)))
 
@@ -71,13 +70,11 @@ def test_the_center_is_relative_to_the_middle(cx, cy, says):
 
 def test_a_guess_says_what_it_is_and_why():
     text = verdict(camera(identifiable=False, method="exif", reason="an orbit"))
-
     assert text == "Not known: these photos do not determine the camera: an orbit. Its values are from EXIF."
 
 
 def test_lens_and_assumptions_are_empty_without_content():
     plain, bent = camera(), camera(radial=-0.12, spread={"k1": 0.004}, held=("center", "aspect"))
-
     assert (lens_text(plain), held_text(plain)) == ("", "")
     assert lens_text(bent) == "The lens bends lines outwards (barrel), k1 -0.120 +- 0.004."
     assert held_text(bent).endswith("optical center near the middle of the photo, square pixels.")
@@ -123,7 +120,6 @@ def test_people_read_how_many_photos_are_placed_how_and_how_sure_the_camera_is()
 
 def test_parts_and_their_wrong_joins_are_describe():
     text, _ = describe(mapper="parts", parts=[{"dropped_joins": [{}, {}]}, {"dropped_joins": []}])
-
     assert "mapped in parts, then joined: it explains more\n" in text
     assert text.count("rejected joins between parts, which other joins or matches contradict: 2") == 1
     assert "joins between parts" not in describe(parts=[{"dropped_joins": []}])[0]
@@ -144,13 +140,11 @@ def test_other_models_and_cuts_are_named():
 
 def test_a_model_that_many_matches_contradict_comes_with_a_warning():
     text, _ = describe(contradicted_matches=300)
-
     assert "beware: 25 % of the matches between these photos contradict the model" in text
 
 
 def test_the_result_of_the_feature_retry_is_named():
     result = {"photos": ["x.jpg", "y.jpg"], "pairs": 9, "placed": [3, 5], "taken": True}
-
     text, summary = describe(second_look=result)
     assert "retried 2 unplaced photos with finer features: 5 photos placed instead of 3\n" in text
     assert summary["second_look"]["pairs"] == 9
@@ -161,13 +155,11 @@ def test_the_result_of_the_feature_retry_is_named():
 
 def test_meters_are_named():
     text, _ = describe(orientation=COUNTS["orientation"] | {"unit": "meter"})
-
     assert "in meters by GPS" in text
 
 
 def test_a_model_that_may_stand_the_wrong_way_up_comes_with_a_remedy():
     unsure = COUNTS["orientation"] | {"up_sign_odds": 2.3, "up_axis_odds": 900.0, "photos_turned_deg": 270}
-
     assert "beware: the model may stand upside down (odds 2.3 to 1 against)" in describe(orientation=unsure)[0]
     assert "run again with --set scene.photo_rotation_deg=90" in describe(orientation=unsure)[0]
     lying = describe(orientation=unsure | {"up_sign_odds": 70.0, "up_axis_odds": 1.5, "photos_turned_deg": 0})[0]
@@ -189,7 +181,6 @@ def test_a_failed_adjustment_is_named():
 
 def test_a_model_that_could_not_be_turned_upright_says_so():
     text, _ = describe(orientation={"failed": "it has no points", "unit": "that of mapping", "gps": "not used"})
-
     assert "the frame is that of mapping, neither upright nor in meters: it has no points" in text
     unsure, _ = describe(orientation=COUNTS["orientation"] | {"up_deviation_deg": None})
     assert "upright by vanishing lines, with unknown accuracy" in unsure
@@ -231,7 +222,6 @@ def test_a_camera_for_each_photo_is_named_where_it_was_tried():
 def test_a_compensated_shutter_is_named_with_its_deviation():
     shutter = {"readout_ms": 20.94, "deviation_ms": 1.6, "interval_ms": 33.3, "compensated": True}
     text, summary = describe(shutter=shutter)
-
     assert "rolling shutter: readout 20.9 +- 1.6 ms of 33 ms per frame; poses are of middle" in text
     assert summary["shutter"] == shutter
 
@@ -239,7 +229,6 @@ def test_a_compensated_shutter_is_named_with_its_deviation():
 def test_why_a_shutter_is_not_compensated_is_said():
     result = {"readout_ms": -0.12, "deviation_ms": 0.31, "interval_ms": 33.3, "compensated": False}
     text, _ = describe(shutter=result | {"because": "none is seen"})
-
     assert "rolling shutter, not compensated: none is seen (-0.1 +- 0.3 ms)\n" in text
     assert "readout" not in text
     assert "shutter" not in describe()[0]
@@ -247,6 +236,5 @@ def test_why_a_shutter_is_not_compensated_is_said():
 
 def test_why_a_shutter_is_not_measured_is_said():
     text, summary = describe(shutter={"compensated": False, "because": "nobody has the time"})
-
     assert "rolling shutter, not compensated: nobody has the time\n" in text
     assert summary["shutter"]["because"] == "nobody has the time"

@@ -255,7 +255,6 @@ def test_a_worker_with_other_versions_or_another_folder_does_not_fit(tmp_path):
     fitting = Probe(tuple(worker_versions().items()), str(tmp_path), "probe")
     older = Probe((*fitting.versions, ("numpy", "1.0")), str(tmp_path), "probe")
     elsewhere = Probe(fitting.versions, str(tmp_path / "missing" / "folder"), "probe")
-
     assert find_misfit(fitting) == ""
     assert f"numpy {np.__version__} instead of 1.0" in find_misfit(older)
     assert "cannot be used there" in find_misfit(elsewhere)
