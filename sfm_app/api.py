@@ -224,7 +224,7 @@ def calibrate_photos(
         True
     """
     from sfm_app import pipeline  # loads COLMAP
-    from sfm_app.report import check_figure, draw_intrinsics
+    from sfm_app.report.figures import check_figure, draw_intrinsics
 
     if figure is not None:
         check_figure(Path(figure))  # fail before minutes of work
