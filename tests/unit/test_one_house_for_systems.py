@@ -8,7 +8,7 @@ import pytest
 import sfm_app
 
 PACKAGE = Path(sfm_app.__file__).parent
-HOUSE = "operating_system.py"
+HOUSE = "operating_system"
 MODULES = {
     *("fcntl", "grp", "msvcrt", "nt", "posix", "pty", "pwd", "resource", "signal", "termios", "tty", "winreg"),
     *("ctypes", "multiprocessing"),
