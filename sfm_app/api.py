@@ -468,7 +468,7 @@ def estimate_fundamental(
     return load_plugins().estimator(method).fit(*check_points(x1, x2), options, seed)
 
 
-def calibrate_fundamentals(
+def calibrate_fundamentals(  # noqa: PLR0913 - public interface, keywords only
     Fs: ArrayLike, size: tuple[int, int], method: str = "zero-curves", *,
     weights: ArrayLike | None = None, matches: Sequence[ArrayLike] = (), photos: Sequence[tuple[int, int]] = (),
     seed: int = 0, settings: Settings | None = None,
