@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from sfm_app.errors import ConfigError, InputError, SfmError
 from sfm_app.files import replace_atomically, save_files
 from sfm_app.formats.exporters import CLOUD
-from sfm_app.frame.sighted_points import Distance
 from sfm_app.fundamental.points import check_points
 from sfm_app.plugins import load_plugins
 from sfm_app.progress import Callback, Progress, as_progress
@@ -26,21 +25,23 @@ from sfm_app.selfcal.wide_lens import LensEstimate, find_lens
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Intrinsics, Rejected, Scene, SceneArrays
 
-# A finished run in Python: its products, its scene as arrays, and how a notebook shows it.
+if TYPE_CHECKING:
+    from sfm_app.engine.stage import Products
+    from sfm_app.frame.sighted_points import Distance
 
 PathLike = str | os.PathLike[str]
 
 
 @dataclass(frozen=True, eq=False)
 class RunScene(Scene):
-    """The sparse reconstruction of a run: summary, cameras, poses; points and tracks once they are asked for."""
+    """The sparse reconstruction of a run: summary, cameras, poses; points and tracks on demand."""
 
     out: Path = Path()
     """Output folder of the run."""
 
     @cached_property
     def arrays(self) -> SceneArrays:
-        """Poses, cameras, points and tracks in the frame of exported files; InputError where the files are gone."""
+        """Poses, cameras, points and tracks in the frame of exported files; InputError if the files are gone."""
         from sfm_app.exports import stored_arrays  # loads COLMAP
 
         with open_run(self.out, Settings(), None) as run:
@@ -48,12 +49,7 @@ class RunScene(Scene):
 
     @classmethod
     def from_scene(cls, scene: Scene, out: Path) -> "RunScene":
-        """Return a scene with the folder that its arrays are read from.
-
-        Args:
-            scene: product of the stage.
-            out: output folder of the run.
-        """
+        """Return a scene with the output folder of its arrays."""
         return cls(**{field.name: getattr(scene, field.name) for field in fields(Scene)}, out=out)
 
 
@@ -63,17 +59,17 @@ class Run:
 
     out: Path
     calibration: Intrinsics | None
-    """K per camera group as found before bundle adjustment; None when the run stopped earlier."""
+    """K per camera group before bundle adjustment; None if the run stopped earlier."""
     scene: RunScene | None
-    """The sparse reconstruction with the refined cameras; None when the run stopped earlier."""
+    """Sparse reconstruction with the refined cameras; None if the run stopped earlier."""
     model_dir: Path | None
     """COLMAP's sparse model."""
     mesh_path: Path | None
-    """model.glb; model.ply lies beside it."""
+    """model.glb, beside model.ply."""
     manifest: dict[str, Any]
-    """manifest.json, with the stages up to the one where the run stopped."""
+    """manifest.json, with the stages up to the last one."""
     report_path: Path | None = None
-    """report.html; None where `report` is off in the settings."""
+    """report.html; None if `report` is off in the settings."""
 
     def __repr__(self) -> str:
         placed = len(self.scene.registered) if self.scene else 0
@@ -81,7 +77,7 @@ class Run:
         return f"Run({str(self.out)!r}: {placed} photos placed, {made.name if made else 'no model'})"
 
     def picture(self) -> NDArray[np.uint8] | None:
-        """Return a picture (H, W, 4) RGBA of the model, or of its points; None where no photo has a place."""
+        """Return a picture (H, W, 4) RGBA of the model, or of its points; None if no photo is placed."""
         from sfm_app.report.contents import read_scene
         from sfm_app.report.notebook import model_cutout
 
@@ -89,7 +85,7 @@ class Run:
             return model_cutout(read_scene(run))
 
     def _repr_html_(self) -> str:
-        """Return a picture of the model and a table of what was found, for notebooks."""
+        """Return a picture of the model and the figures at a glance, for notebooks."""
         from sfm_app.report.contents import read_contents
         from sfm_app.report.notebook import run_html
 
@@ -102,24 +98,18 @@ def open_run(out: Path, settings: Settings, progress: Progress | Callback | None
     """Provide a run with its workers, which stop when the block ends.
 
     Args:
-        out: output folder.
-        settings: of the run.
         progress: display of progress, or a function that is called with every `Step`; None for silence.
     """
     plugins = load_plugins(installed=settings.plugins)
-    plugins.estimator(settings.epipolar.estimator)  # unknown names are refused before any work is done
+    plugins.estimator(settings.epipolar.estimator)  # an unknown name is an error before any work
     plugins.calibrator(settings.calibration.calibrator)
     plugins.feature_method(settings.matching.features)
-    place, shown = Workspace(out), as_progress(progress)
-    with open_executor(settings, place.cluster_files, shown) as (executor, workers):
-        yield RunContext(settings, place, plugins, executor, workers, shown)
+    place, display = Workspace(out), as_progress(progress)
+    with open_executor(settings, place.cluster_files, display) as (executor, workers):
+        yield RunContext(settings, place, plugins, executor, workers, display)
 
 
-# Whole runs: from photos to a mesh, or to a camera, and finished ones read again.
-
-if TYPE_CHECKING:
-    from sfm_app.engine.stage import Products
-    from sfm_app.runtime.context import RunContext
+# Runs from photos to a mesh, or to a camera.
 
 
 def reconstruct(
@@ -134,12 +124,12 @@ def reconstruct(
         photos: folder with photos of one place, or a video; nothing about the camera needs to be known.
         out: output folder; created if it does not exist.
         settings: None for the defaults.
-        first: redo everything from this stage on.
-        last: stop after this stage.
+        first: stage from which on all stages run again.
+        last: last stage to run.
         progress: display of progress, or a function that is called with every `Step`; silent by default.
 
     Raises:
-        SfmError: see `sfm_app.errors`; its message and hint say what went wrong and what to do.
+        SfmError: see `sfm_app.errors`; its message names the error, its hint a remedy.
 
     Examples:
         >>> import sfm_app
@@ -152,18 +142,18 @@ def reconstruct(
 
     with open_run(Path(out), settings or Settings(), progress) as run:
         run.plugins.depth_method(run.settings.depth.method)  # fail now, not halfway through the work
-        wanted = (pipeline.INTRINSICS, pipeline.SCENE, pipeline.FILES)
+        targets = (pipeline.INTRINSICS, pipeline.SCENE, pipeline.FILES)
         try:
-            products = pipeline.run_stages(Path(photos), run, first, last, wanted)
+            products = pipeline.run_stages(Path(photos), run, first, last, targets)
         except SfmError as err:
             if written := finish_report(run, err):
-                run.progress.say(f"what was found until then: {written}")
+                run.progress.say(f"report of the unfinished run: {written}")
             raise
         return _as_run(run, products, last, finish_report(run))
 
 
 def read_run(out: PathLike) -> Run:
-    """Read a finished run again, up to where it has come; nothing is computed.
+    """Read the results of a run; nothing is computed.
 
     Args:
         out: its output folder.
@@ -192,15 +182,8 @@ def read_run(out: PathLike) -> Run:
         return _as_run(run, Products(run), done[-1], report if report.exists() else None)
 
 
-def _as_run(run: "RunContext", products: "Products", last: str, report: Path | None) -> Run:
-    """Return the products of a run up to a stage.
-
-    Args:
-        run: with its output folder.
-        products: of its stages.
-        last: name of the stage where it stopped.
-        report: its report; None where there is none.
-    """
+def _as_run(run: RunContext, products: "Products", last: str, report: Path | None) -> Run:
+    """Return the products of a run up to the stage `last`."""
     from sfm_app import pipeline
 
     manifest: dict[str, Any] = run.workspace.manifest.read()
@@ -228,7 +211,7 @@ def calibrate_photos(
         photos: folder with photos, or a video.
         settings: None for the defaults.
         out: folder that keeps features and matches for a later run; None for a temporary one.
-        figure: PNG, SVG or PDF file to draw the pairs' votes, the lens and the residuals into; None for no figure.
+        figure: PNG, SVG or PDF file for the pairs' votes, the lens and the residuals; None for no figure.
         progress: display of progress, or a function that is called with every `Step`; silent by default.
 
     Raises:
@@ -236,12 +219,12 @@ def calibrate_photos(
 
     Examples:
         >>> import sfm_app
-        >>> found = sfm_app.calibrate_photos("photos", out="out", figure="camera.png")
-        >>> found.identifiable
+        >>> cameras = sfm_app.calibrate_photos("photos", out="out", figure="camera.png")
+        >>> cameras.identifiable
         True
     """
     from sfm_app import pipeline  # loads COLMAP
-    from sfm_app.report import check_figure, draw_intrinsics
+    from sfm_app.report.figures import check_figure, draw_intrinsics
 
     if figure is not None:
         check_figure(Path(figure))  # fail before minutes of work
@@ -249,23 +232,23 @@ def calibrate_photos(
         tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch,
         open_run(Path(out or scratch), settings or Settings(), progress) as run,
     ):
-        wanted = (pipeline.MATCH_GRAPH, pipeline.VIEW_GRAPH, pipeline.INTRINSICS)
-        products = pipeline.run_stages(Path(photos), run, last=pipeline.INTRINSICS.name, wanted=wanted)
-        found = products[pipeline.INTRINSICS]
+        targets = (pipeline.MATCH_GRAPH, pipeline.VIEW_GRAPH, pipeline.INTRINSICS)
+        products = pipeline.run_stages(Path(photos), run, last=pipeline.INTRINSICS.name, targets=targets)
+        intrinsics = products[pipeline.INTRINSICS]
         if figure is not None:
-            draw_intrinsics(Path(figure), products[pipeline.MATCH_GRAPH], products[pipeline.VIEW_GRAPH], found)
-    return found
+            draw_intrinsics(Path(figure), products[pipeline.MATCH_GRAPH], products[pipeline.VIEW_GRAPH], intrinsics)
+    return intrinsics
 
 
-# What is done with a finished run: its report, exports for other programs, and distances in it.
+# Reports, exports and distances of a finished run.
 
 
 def write_report(out: PathLike, compare: PathLike | None = None) -> Path:
-    """Write OUT/report.html again, from what a run has left; nothing is computed again.
+    """Write OUT/report.html again from the products of a run; nothing is recomputed.
 
     Args:
         out: output folder of the run.
-        compare: that of another run, to be set beside it; None for none.
+        compare: output folder of another run for comparison.
 
     Raises:
         InputError: a folder holds no run.
@@ -292,8 +275,8 @@ def view_run(
 
     Args:
         out: output folder of the run, which may have stopped at any stage.
-        port: to listen on; 0 for any that is free.
-        started: called with the address of the page once it can be opened.
+        port: to listen on; 0 for any free port.
+        started: called with the address when the page can be opened.
         progress: display of progress, or a function that is called with every `Step`; silent by default.
 
     Raises:
@@ -323,12 +306,11 @@ def export_model(
         points: export the points and cameras of the sparse reconstruction instead of the model.
 
     Returns:
-        The files, the one to open first, then those that it refers to.
+        The files: first the one to open, then its parts.
 
     Raises:
-        ConfigError: no format has that name, a package that it needs is missing, or the suffix of `target` belongs to
-            another one.
-        InputError: the run has not made the model yet, or the target cannot be written.
+        ConfigError: the format is unknown, needs a missing package, or does not fit the suffix of `target`.
+        InputError: the run has no model yet, or the target cannot be written.
 
     Examples:
         >>> import sfm_app
@@ -340,17 +322,17 @@ def export_model(
 
     plugins = load_plugins()
     place = Path(target) if target is not None else Path(out)
-    named = place.suffix.removeprefix(".").lower() if target is not None and not place.is_dir() else ""
-    exporter = plugins.exporter(file_format or named)
-    if place.is_dir():  # a format with the suffix of another one leaves that one's file alone
+    suffix = place.suffix.removeprefix(".").lower() if target is not None and not place.is_dir() else ""
+    exporter = plugins.exporter(file_format or suffix)
+    if place.is_dir():  # a format with the suffix of another one gets a file of its own
         place /= ("points" if points else "model") + (f"-{exporter.name}" if exporter.suffix else "")
     place = _with_suffix(place, exporter.ending)
     with open_run(Path(out), Settings(), None) as run:
         model = stored_model(run, points=points)
     files = exporter.write(model, place.stem)
-    named_so = dict(zip([place.name, *list(files)[1:]], files.values(), strict=True))
-    with _saying_where(place):
-        return save_files(named_so, place.parent)
+    renamed = dict(zip([place.name, *list(files)[1:]], files.values(), strict=True))
+    with _naming_target(place):
+        return save_files(renamed, place.parent)
 
 
 def export_scene(
@@ -361,18 +343,17 @@ def export_scene(
     Args:
         out: output folder of the run.
         file_format: "colmap", "splat", "nerfstudio", "cameras", or another that `sfm-app plugins` lists.
-        target: file or folder to write; None for OUT/cameras.json, OUT/cloud.laz, OUT/export/colmap, ... A folder that
-            an earlier export has written is replaced.
+        target: file or folder to write; None for OUT/cameras.json, OUT/cloud.laz, OUT/export/colmap, ... An export
+            replaces the folder of an earlier one.
         progress: display of progress, or a function that is called with every `Step`; silent by default.
 
     Returns:
         The file or the folder.
 
     Raises:
-        ConfigError: no format has that name, a package that it needs is missing, or the suffix of `target` belongs to
-            another one.
-        InputError: the run has not made what the format needs, its photos are gone, or the target cannot be written
-            or holds files that no export has written.
+        ConfigError: the format is unknown, needs a missing package, or does not fit the suffix of `target`.
+        InputError: the run lacks data for the format, its photos are gone, or the target cannot be written or holds
+            files that no export has written.
 
     Examples:
         >>> import sfm_app
@@ -394,29 +375,29 @@ def export_scene(
             check_cloud(run)
         if not exporter.file:
             folder = place if target is not None else place / "export" / exporter.name
-            with _saying_where(folder), fill_folder(folder, lambda: scene.record_entries(exporter.name)) as path:
+            with _naming_target(folder), fill_folder(folder, lambda: scene.record_entries(exporter.name)) as path:
                 exporter.write(scene, path)
             return folder
         file = _with_suffix(place / exporter.file if place.is_dir() else place, exporter.ending)
-        with _saying_where(file), replace_atomically(file) as path:
+        with _naming_target(file), replace_atomically(file) as path:
             exporter.write(scene, path)
         return file
 
 
 def _with_suffix(place: Path, suffix: str) -> Path:
-    """Return the file with the suffix of its format; ConfigError where it has that of another one."""
-    named = place.suffix.removeprefix(".").lower()
-    if named == suffix:
+    """Return the file with the suffix of its format; ConfigError if it has that of another format."""
+    given = place.suffix.removeprefix(".").lower()
+    if given == suffix:
         return place
     plugins = load_plugins()
-    known = {part.ending for part in plugins.exporters.values()}
-    if named and named in known | {part.ending for part in plugins.scene_exporters.values()}:
+    endings = {part.ending for part in plugins.exporters.values()}
+    if given and given in endings | {part.ending for part in plugins.scene_exporters.values()}:
         raise ConfigError(f"{place.name} does not end in .{suffix}", hint=f"name it {place.stem}.{suffix}")
     return Path(f"{place}.{suffix}")
 
 
 @contextmanager
-def _saying_where(place: Path) -> Iterator[None]:
+def _naming_target(place: Path) -> Iterator[None]:
     """Turn errors of the file system into one that names the target of an export."""
     try:
         yield
@@ -424,7 +405,7 @@ def _saying_where(place: Path) -> Iterator[None]:
         raise InputError(f"cannot write {place}: {err.strerror or err}", hint="name another place with -o") from err
 
 
-def measure_distance(out: PathLike, a: ArrayLike, b: ArrayLike) -> Distance:
+def measure_distance(out: PathLike, a: ArrayLike, b: ArrayLike) -> "Distance":
     """Return the distance between two places of a finished run, with its standard deviation.
 
     Args:
@@ -487,7 +468,7 @@ def estimate_fundamental(
     return load_plugins().estimator(method).fit(*check_points(x1, x2), options, seed)
 
 
-def calibrate_fundamentals(
+def calibrate_fundamentals(  # noqa: PLR0913 - public interface, keywords only
     Fs: ArrayLike, size: tuple[int, int], method: str = "zero-curves", *,
     weights: ArrayLike | None = None, matches: Sequence[ArrayLike] = (), photos: Sequence[tuple[int, int]] = (),
     seed: int = 0, settings: Settings | None = None,
@@ -517,25 +498,25 @@ def calibrate_fundamentals(
         >>> camera.identifiable, f"{camera.K[0, 0] / tracks.K[0, 0, 0]:.2f} times the true focal length"
         (True, '1.00 times the true focal length')
     """
-    found = [np.asarray(pair, np.float64) for pair in matches]
-    pairs = replace(CameraPairs.from_Fs(Fs, size, weights), photos=tuple(photos), inliers=tuple(found))
+    inliers = tuple(np.asarray(pair, np.float64) for pair in matches)
+    pairs = replace(CameraPairs.from_Fs(Fs, size, weights), photos=tuple(photos), inliers=inliers)
     return load_plugins().calibrator(method).calibrate(pairs, (settings or Settings()).calibration, seed)
 
 
 def estimate_lens(matches: Sequence[ArrayLike], size: tuple[int, int], seed: int = 0) -> LensEstimate | None:
     """Find the focal, projection and center of wide-angle and fisheye photos from the raw matches of their pairs.
 
-    It knows perspective, stereographic, equidistant and equisolid lenses and all between, with fields of view up to
-    more than 180 degrees. `is_fisheye` says whether any of them explains more than a perspective lens.
+    Lenses may be perspective, stereographic, equidistant, equisolid or between, with fields of view above 180 degrees.
+    `is_fisheye` tells whether a wide lens explains more than a perspective lens.
 
     Args:
-        matches: per pair of photos (N, 4) x1, y1, x2, y2 in pixels; half of them may be wrong. At most 16 pairs with 60
-            matches or more are used.
+        matches: per pair of photos (N, 4) x1, y1, x2, y2 in pixels; half of them may be wrong. The estimate uses at
+            most 16 pairs of 60 matches or more.
         size: (width, height) of all photos in pixels.
         seed: same seed, same result.
 
     Returns:
-        The lens in pixels with its covariance; None where fewer than three pairs agree on one.
+        The lens in pixels with its covariance; None if fewer than three pairs agree.
 
     Raises:
         ValueError: shapes are wrong or values are not finite.
@@ -548,7 +529,7 @@ def estimate_lens(matches: Sequence[ArrayLike], size: tuple[int, int], seed: int
         >>> sfm_app.estimate_lens(matches, tracks.size).is_fisheye
         False
     """
-    found = [np.asarray(pair, np.float64) for pair in matches]
-    if any(pair.ndim != 2 or pair.shape[1] != 4 or not np.isfinite(pair).all() for pair in found) or min(size) < 1:
+    arrays = [np.asarray(pair, np.float64) for pair in matches]
+    if any(pair.ndim != 2 or pair.shape[1] != 4 or not np.isfinite(pair).all() for pair in arrays) or min(size) < 1:
         raise ValueError("matches must be finite arrays of shape (N, 4), and size positive")
-    return find_lens(found, size, seed)
+    return find_lens(arrays, size, seed)

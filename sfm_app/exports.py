@@ -1,4 +1,7 @@
-"""Export finished runs: their cameras, points, photos and surface in the frame of the export."""
+"""Export finished runs: cameras, points, photos and surface in the frame of the export.
+
+Only this module moves poses, points and vertices into that frame.
+"""
 
 import json
 import shutil
@@ -41,21 +44,12 @@ from sfm_app.types import Model, Scene, SceneArrays
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
 from sfm_app.wording import list_names
 
-# What a finished run has to export, read from its output folder; nothing is computed.
-#
-# Everything that leaves here is in the frame of the export: poses, points and vertices are moved in this module
-# only.
-
 COLORS, NORMALS = ("red", "green", "blue"), ("nx", "ny", "nz")
 """Fields of the dense cloud."""
 
 
 def stored_frame(run: RunContext) -> MetricFrame:
-    """Return the frame of a run's exports; that of its model where nothing is known of its size.
-
-    Args:
-        run: the finished run.
-    """
+    """Return the frame of a run's exports; without a known scale, that of its model."""
     if run.workspace.manifest.record(SCALE.name) is not None:
         return Products(run)[SCALE]
     known = run.workspace.manifest.record(SCENE.name) is not None
@@ -73,10 +67,8 @@ def check_finished(run: RunContext, stages: Sequence[Stage[object]], what: str, 
     """Check that stages of a run are finished.
 
     Args:
-        run: the run.
-        stages: what the export needs.
-        what: what is exported, for the message.
-        otherwise: what the user can do without them; for the hint.
+        what: the exported data, for the message.
+        otherwise: an alternative, for the hint.
 
     Raises:
         InputError: there is no run, or a stage is missing (the message names it).
@@ -93,10 +85,6 @@ def check_finished(run: RunContext, stages: Sequence[Stage[object]], what: str, 
 def stored_model(run: RunContext, *, points: bool = False) -> Model:
     """Read the finished model, or the points and cameras, of a run.
 
-    Args:
-        run: the finished run.
-        points: whether to read the points and cameras instead of the textured surface.
-
     Raises:
         InputError: a stage has not run yet, or its files are missing or damaged.
     """
@@ -111,11 +99,8 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
 def stored_scene(run: RunContext) -> tuple[Scene, Reconstruction]:
     """Read cameras and poses, and COLMAP's model with the points.
 
-    Args:
-        run: the finished run.
-
     Raises:
-        InputError: the scene has not been made yet, or its files are missing or damaged.
+        InputError: the scene does not exist yet, or its files are missing or damaged.
     """
     check_finished(run, [SCENE], "cameras and points")
     scene = Products(run)[SCENE]
@@ -127,26 +112,19 @@ def stored_scene(run: RunContext) -> tuple[Scene, Reconstruction]:
 def stored_arrays(run: RunContext) -> SceneArrays:
     """Read poses, cameras, points and tracks as plain arrays, in the frame of exports.
 
-    Args:
-        run: the finished run.
-
     Raises:
-        InputError: the scene has not been made yet, or its files are missing or damaged.
+        InputError: the scene does not exist yet, or its files are missing or damaged.
     """
     _, model = stored_scene(run)
     return model_arrays(model, metric=stored_frame(run).is_metric)
 
 
 def stored_distance(run: RunContext, ends: NDArray[np.float64]) -> Distance:
-    """Return the distance between two places in the frame of exports.
-
-    Args:
-        run: the finished run.
-        ends: (2, 3) the places.
+    """Return the distance between two places, (2, 3) in the frame of exports.
 
     Raises:
         ValueError: both are the same.
-        InputError: the scene has not been made yet, or its files are missing or damaged.
+        InputError: the scene does not exist yet, or its files are missing or damaged.
     """
     check_finished(run, [SCENE], "camera poses")
     frame = stored_frame(run)
@@ -159,11 +137,8 @@ def stored_distance(run: RunContext, ends: NDArray[np.float64]) -> Distance:
 def check_cloud(run: RunContext) -> Path:
     """Return the file of the dense cloud.
 
-    Args:
-        run: the finished run.
-
     Raises:
-        InputError: the depth maps have not been fused yet, or the file is gone.
+        InputError: the depth maps are not fused yet, or the file is gone.
     """
     check_finished(run, [MESH], "dense cloud", "`--points` exports the sparse points")
     file = run.workspace.surface / FUSED
@@ -173,13 +148,10 @@ def check_cloud(run: RunContext) -> Path:
 
 
 def stored_cloud(run: RunContext) -> PointCloud:
-    """Read the points that the depth maps agree on.
-
-    Args:
-        run: the finished run.
+    """Read the dense cloud.
 
     Raises:
-        InputError: the depth maps have not been fused yet, or the file of the points is gone or damaged.
+        InputError: the depth maps are not fused yet, or the file is gone or damaged.
     """
     file = check_cloud(run)
     with check_undamaged(MESH, run):
@@ -200,26 +172,23 @@ def _columns(records: NDArray[np.void], names: Sequence[str]) -> NDArray[np.floa
     return np.stack([records[name] for name in names], axis=1).astype(np.float64)
 
 
-# A finished run as formats for scenes see it: `FinishedScene` and `PerspectiveScene` of `formats.exporters`.
+# A finished run as the input of scene formats.
 
 IMAGES, MASKS = "images", "masks"
 
 
 class StoredScene:
-    """The scene of a finished run.
-
-    Args:
-        run: the finished run.
+    """The scene of a finished run, a `FinishedScene`.
 
     Raises:
-        InputError: the scene has not been made yet, or its files are missing or damaged.
+        InputError: the scene does not exist yet, or its files are missing or damaged.
     """
 
     def __init__(self, run: RunContext) -> None:
         self._run = run
         self.scene, self._model = stored_scene(run)
         self.images = dict[str, str]()
-        """Photo by name of the file that shows it, of all photos written so far."""
+        """Photo by name of its file, of all photos written so far."""
 
     def points(self) -> PointCloud:
         """Return the sparse points."""
@@ -230,21 +199,13 @@ class StoredScene:
         return stored_cloud(self._run)
 
     def perspective(self, *, centered: bool = False) -> "StoredPhotos":
-        """Return the undistorted photos.
-
-        Args:
-            centered: whether the optical center of every photo is in its middle.
-        """
-        found = StoredPhotos(self.scene, self._model, self._run, centered=centered)
-        self.images |= {photo.image: photo.photo for photo in found.photos}
-        return found
+        """Return the undistorted photos; `centered` puts the optical center in the middle."""
+        views = StoredPhotos(self.scene, self._model, self._run, centered=centered)
+        self.images |= {view.image: view.photo for view in views.photos}
+        return views
 
     def record_entries(self, file_format: str) -> dict[str, object]:
-        """Return what the record of a folder says.
-
-        Args:
-            file_format: name of the format.
-        """
+        """Return the entries of a folder's record."""
         return {
             "made_by": "sfm_app",
             "format": file_format,
@@ -258,13 +219,7 @@ class StoredScene:
 
 
 class StoredPhotos:
-    """The undistorted photos of a finished run.
-
-    Args:
-        scene: poses.
-        model: COLMAP's model of the photos.
-        run: has photos and masks.
-        centered: whether the optical center of every photo is in its middle.
+    """The undistorted photos of a finished run, a `PerspectiveScene`.
 
     Raises:
         InputError: photos are gone.
@@ -279,10 +234,11 @@ class StoredPhotos:
 
     @cached_property
     def photos(self) -> tuple[PerspectivePhoto, ...]:
-        """All of them, by name of the photo."""
-        masked = self._has_masks
-        found = perspective_photos(self._model, self._lenses, self._names)
-        return tuple(_with_mask(photo) for photo in found) if masked else found
+        """All photos, by name."""
+        views = perspective_photos(self._model, self._lenses, self._names)
+        if not self._has_masks:
+            return views
+        return tuple(replace(view, mask=mask_path(Path(), view.image).name) for view in views)
 
     @property
     def _mask_dir(self) -> Path | None:
@@ -290,14 +246,11 @@ class StoredPhotos:
 
     @property
     def _has_masks(self) -> bool:
-        """Whether photos have masks: the user's, or of what views of a wide lens show beyond the photo."""
+        """Whether photos have masks: the user's, or of the parts of wide views outside of the photo."""
         return self._mask_dir is not None or any(len(lens.views) > 1 for lens in self._lenses.values())
 
     def write_photos(self, folder: Path) -> None:
-        """Write images/, and masks/ where photos have masks.
-
-        Args:
-            folder: where they go.
+        """Write images/, and masks/ if photos have masks.
 
         Raises:
             InputError: photos are gone.
@@ -309,7 +262,7 @@ class StoredPhotos:
             raise InputError(f"the photo {list_names(gone, 1)} is gone", hint=hint)
         write = partial(self._write_photo, folder)
         by_camera = sorted(self._camera_of, key=lambda name: (self._camera_of[name], name))
-        with self._run.with_workers(self._run.workers) as run:  # none of them writes on after an interrupt
+        with self._run.with_workers(self._run.workers) as run:  # an interrupt ends them
             run.map(write, by_camera, "undistorting photos at full size")
 
     def _write_photo(self, folder: Path, name: str) -> None:
@@ -317,22 +270,17 @@ class StoredPhotos:
         with translate_errors(f"undistorting {name}"):
             maps, place = self._maps.camera_maps(camera_id), self._run.workspace.photos
             views = render_views(name, self._lenses[camera_id], place, self._mask_dir, maps)
-            for image, (pixels, shown) in zip(self._names[name], views, strict=True):
+            for image, (pixels, mask) in zip(self._names[name], views, strict=True):
                 save_picture(folder / IMAGES / image, pixels)
                 if self._has_masks:
-                    save_mask(folder / MASKS, image, shrink_mask(shown))
+                    save_mask(folder / MASKS, image, shrink_mask(mask))
 
     def write_colmap(self, folder: Path, *, text: bool = False) -> None:
-        """Write COLMAP's model.
-
-        Args:
-            folder: created.
-            text: whether as text instead of binary.
-        """
+        """Write COLMAP's model into a new folder."""
         write_view_model(self._model, self._lenses, self._names, folder, text=text)
 
     def write_bundle(self, file: Path) -> None:
-        """Write Bundler's file; the photos lie in images/ beside it."""
+        """Write Bundler's file; the photos are in images/ beside it."""
         scratch = file.with_name(".model")
         try:
             self.write_colmap(scratch)
@@ -342,12 +290,7 @@ class StoredPhotos:
 
 
 def view_names(cameras: dict[str, int], lenses: dict[int, WideLens]) -> ViewNames:
-    """Return the names of the files of the views of each photo: plain, without folders, and all different.
-
-    Args:
-        cameras: id of the camera by name of the photo.
-        lenses: views by id of the camera.
-    """
+    """Return the file names of the views of each photo: plain, without folders, and all different."""
     photos = sorted(cameras)
     counts = [len(lenses[cameras[name]].views) for name in photos]
     stems = [str(PurePosixPath(name).with_suffix("")) for name in photos]
@@ -356,56 +299,48 @@ def view_names(cameras: dict[str, int], lenses: dict[int, WideLens]) -> ViewName
     return {photo: [f"{next(plain)}.jpg" for _ in range(count)] for photo, count in zip(photos, counts, strict=True)}
 
 
-def _with_mask(photo: PerspectivePhoto) -> PerspectivePhoto:
-    """Return the photo with the name of its mask."""
-    return replace(photo, mask=mask_path(Path(), photo.image).name)
-
-
-# Where exports go: a file or a folder, as a whole or not at all, and never over what no export has written.
+# Target folders: written as a whole or not at all, and never over files that no export has written.
 
 RECORD = "export.json"
-"""In a folder that an export has written: its format, its files, and which photo each picture shows."""
+"""In the folder of an export: its format, its files, and the photo of each picture."""
 ELSEWHERE = "name another place with -o"
 
 
 @contextmanager
 def fill_folder(target: Path, about: Callable[[], Mapping[str, object]]) -> Iterator[Path]:
-    """Provide an empty folder beside `target`, which takes its place once the block ends without an error.
+    """Provide an empty folder beside `target`, which replaces it when the block ends without an error.
 
     Args:
-        target: folder; what an earlier export has written there is replaced.
-        about: what the record says besides the files; called at the end.
+        target: folder; it may hold files of an earlier export.
+        about: returns the entries of the record besides the files; called at the end.
 
     Raises:
-        InputError: the target is something else, or holds files that no export has written.
+        InputError: the target is no folder, or holds files that no export has written.
     """
     check_replaceable(target)
     target.parent.mkdir(parents=True, exist_ok=True)
-    beside = target.with_name(f".{target.name}.unfinished")
-    shutil.rmtree(beside, ignore_errors=True)
-    beside.mkdir()
+    draft = target.with_name(f".{target.name}.unfinished")
+    shutil.rmtree(draft, ignore_errors=True)
+    draft.mkdir()
     try:
-        yield beside
-        with replace_atomically(beside / RECORD) as path:
-            path.write_text(json_text({**about(), "files": _list_files(beside)}), encoding="utf-8", newline="\n")
-        check_replaceable(target)  # it may have been filled meanwhile
+        yield draft
+        with replace_atomically(draft / RECORD) as path:
+            path.write_text(json_text({**about(), "files": _list_files(draft)}), encoding="utf-8", newline="\n")
+        check_replaceable(target)  # it may have changed
         if target.exists():
             old = target.with_name(f".{target.name}.old")
             shutil.rmtree(old, ignore_errors=True)
             move(target, old)
-            move(beside, target)
+            move(draft, target)
             shutil.rmtree(old, ignore_errors=True)
         else:
-            move(beside, target)
+            move(draft, target)
     finally:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(draft, ignore_errors=True)
 
 
 def check_replaceable(target: Path) -> None:
-    """Check that nothing is lost where a folder is written.
-
-    Args:
-        target: the folder; it may be missing.
+    """Check that a folder, which may be missing, holds only files of an export.
 
     Raises:
         InputError: it is no folder, or it holds files that no export has written.
@@ -425,7 +360,7 @@ def _list_files(folder: Path) -> list[str]:
 
 
 def _recorded_files(folder: Path) -> list[str]:
-    """Return the files that the record of an export lists; none where there is no sound record."""
+    """Return the files in the record of an export; none without a valid record."""
     try:
         known = json.loads((folder / RECORD).read_text(encoding="utf-8"))["files"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):

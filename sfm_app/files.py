@@ -25,12 +25,12 @@ UNFINISHED = "unfinished.txt"
 def replace_atomically(target: Path) -> Iterator[Path]:
     """Provide a path beside `target`, which replaces it when the block ends without an error."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    beside = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")  # machines share process ids
+    draft = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")  # machines share process ids
     try:
-        yield beside
-        replace_file(beside, target)
+        yield draft
+        replace_file(draft, target)
     finally:
-        beside.unlink(missing_ok=True)
+        draft.unlink(missing_ok=True)
 
 
 def resume_or_clear(folder: Path, made_from: str) -> bool:
@@ -64,8 +64,8 @@ def save_files(files: Mapping[str, bytes], folder: Path) -> tuple[Path, ...]:
     """Write files by name, each atomically, the first one last because it refers to the others."""
     paths = tuple(folder / name for name in files)
     for path, data in reversed(list(zip(paths, files.values(), strict=True))):
-        with replace_atomically(path) as beside:
-            beside.write_bytes(data)
+        with replace_atomically(path) as draft:
+            draft.write_bytes(data)
     return paths
 
 

@@ -230,7 +230,7 @@ class ChildTimes:
         self._seconds = dict[tuple[int, float], float]()
 
     def look(self, processes: Iterable[psutil.Process]) -> None:
-        """Record the CPU seconds of these processes."""
+        """Note the CPU seconds of these processes."""
         for process in processes if lacks(Ability.CHILD_TIMES) else ():
             with contextlib.suppress(psutil.Error):  # it has ended
                 times = process.cpu_times()
@@ -247,7 +247,7 @@ def cpu_seconds() -> float:
 
 
 def yield_to_others(niceness: int) -> None:
-    """Lower the priority of this process; Windows has only one lower priority."""
+    """Give this process a lower priority; Windows has only one."""
     if hasattr(os, "nice"):
         os.nice(niceness)
     else:
@@ -354,7 +354,7 @@ def ignore_interrupts() -> None:
 
 @contextlib.contextmanager
 def heed_requests_to_end() -> Iterator[None]:
-    """Treat SIGTERM (`kill`, `docker stop`) like Ctrl-C; in the main thread."""
+    """Let SIGTERM (`kill`, `docker stop`) act like Ctrl-C; in the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -366,7 +366,7 @@ def heed_requests_to_end() -> Iterator[None]:
 
 
 def keep_handler() -> None:
-    """Restore our SIGTERM handler after a library changed it: COLMAP's prints stack traces."""
+    """Set our SIGTERM handler again after a library changed it: COLMAP's prints stack traces."""
     with contextlib.suppress(ValueError):  # only the main thread can
         signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
 

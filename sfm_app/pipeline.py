@@ -116,14 +116,14 @@ STAGES, NAMES = PIPELINE.stages, PIPELINE.names
 
 
 def run_stages(
-    photo_dir: Path, run: RunContext, first: str = "", last: str = "files", wanted: Sequence[Stage[object]] = ()
+    photo_dir: Path, run: RunContext, first: str = "", last: str = "files", targets: Sequence[Stage[object]] = ()
 ) -> Products:
     """Turn a folder of photos, or a video, into products.
 
     Args:
         first: stage from which on all stages run again; empty for none.
         last: last stage to run.
-        wanted: stages whose products are loaded before returning.
+        targets: stages whose products are loaded before returning.
     """
     options, place = run.settings.photos, run.workspace
     place.check_no_overlap(photo_dir)
@@ -135,4 +135,4 @@ def run_stages(
         run = replace(run, control_points=read_control_points(Path(run.settings.scale.control_points)))
     source = read_source(photo_dir, place.root, options, partial(ordered_map, run.executor, ahead=4 * run.workers))
     source.check_settings(run.settings)
-    return PIPELINE.run(source, run, first, last, wanted)
+    return PIPELINE.run(source, run, first, last, targets)

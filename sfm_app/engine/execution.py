@@ -145,14 +145,14 @@ class Pipeline:
         return self.stages[: self.names.index(last) + 1]
 
     def run(
-        self, source: Source, run: RunContext, first: str = "", last: str = "", wanted: Sequence[Stage[object]] = ()
+        self, source: Source, run: RunContext, first: str = "", last: str = "", targets: Sequence[Stage[object]] = ()
     ) -> Products:
         """Run the stages that are not up to date, and those with damaged files.
 
         Args:
             first: stage from which on all stages run again.
             last: last stage to run; empty for all.
-            wanted: stages whose products are loaded before returning.
+            targets: stages whose products are loaded before returning.
 
         Raises:
             SfmError: see errors.py; finished stages stay valid.
@@ -166,13 +166,13 @@ class Pipeline:
             run.workspace.manifest.check_format()
             for _ in self.stages:
                 try:
-                    return _Execution(self, source, run, first).execute(stages, wanted)
+                    return _Execution(self, source, run, first).execute(stages, targets)
                 except DamagedProductError as err:
                     logger.info("%s", err, exc_info=err)
                     run.progress.stage(err.stage, "damaged: running again")
                     self.forget(err.stage, run)
                     first = ""
-            return _Execution(self, source, run, first).execute(stages, wanted)
+            return _Execution(self, source, run, first).execute(stages, targets)
 
     def forget(self, name: str, run: RunContext) -> None:
         """Remove a stage and its dependents from the manifest; of the photos stage, none needs the files."""
@@ -198,8 +198,8 @@ class _Execution:
     def __post_init__(self) -> None:
         self.products = Products(self.run, self.source)
 
-    def execute(self, stages: Sequence[Stage[object]], wanted: Sequence[Stage[object]]) -> Products:
-        """Run these stages unless they are up to date, and load the products of the `wanted` ones."""
+    def execute(self, stages: Sequence[Stage[object]], targets: Sequence[Stage[object]]) -> Products:
+        """Run these stages unless they are up to date, and load the products of the `targets` ones."""
         photos, later = self.pipeline.photos, stages[1:]
         again = self.stage_rerun_reason(photos, (self.source.fingerprint,))
         self.run_stage(photos, again, self.run)
@@ -217,7 +217,7 @@ class _Execution:
             for stage in later:
                 self.run_stage(stage, reasons[stage.name], run)
                 forget_earlier(run, if_finished=True)
-        for stage in wanted:
+        for stage in targets:
             if stage in stages:
                 self.products[stage]
         return self.products

@@ -1,10 +1,10 @@
 """File formats for models and whole scenes, offered like plug-ins."""
 
-from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
+from importlib import import_module
+from typing import Any
 
-from sfm_app.formats.exporters import CLOUD, Exporter, FinishedScene, SceneExporter, missing_package
+from sfm_app.formats.exporters import CLOUD, Exporter, SceneExporter, missing_package
 from sfm_app.formats.gltf import write_glb
 from sfm_app.formats.meshes import write_cloud_ply, write_obj, write_ply, write_stl
 from sfm_app.formats.scenes import (
@@ -16,37 +16,19 @@ from sfm_app.formats.scenes import (
     write_opencv,
     write_splat,
 )
-from sfm_app.types import Model
 
 
-def write_draco(model: Model, name: str) -> Mapping[str, bytes]:
-    """Load the Draco module and write a model."""
-    from sfm_app.formats import draco
+def _load_later(module: str, function: str) -> Any:
+    """Return a writer whose module is imported when it writes, since few exports need it."""
 
-    return draco.write_draco(model, name)
+    def write(*arguments: Any) -> Any:
+        return getattr(import_module(f"sfm_app.formats.{module}"), function)(*arguments)
 
-
-def write_usd(model: Model, name: str) -> Mapping[str, bytes]:
-    """Load the USD module and write a model."""
-    from sfm_app.formats import usd
-
-    return usd.write_usd(model, name)
+    return write
 
 
-def write_usdz(model: Model, name: str) -> Mapping[str, bytes]:
-    """Load the USD module and write a model as a package."""
-    from sfm_app.formats import usd
-
-    return usd.write_usdz(model, name)
-
-
-def write_laz(scene: FinishedScene, target: Path) -> None:
-    """Load the LAZ module and write the dense cloud."""
-    from sfm_app.formats import laz
-
-    laz.write_laz(scene, target)
-
-
+_draco, _laz = _load_later("draco", "write_draco"), _load_later("laz", "write_laz")
+_usd, _usdz = _load_later("usd", "write_usd"), _load_later("usd", "write_usdz")
 _no_usd = partial(missing_package, "usd-core", "pxr")
 _no_draco = partial(missing_package, "DracoPy", "DracoPy")
 _no_laz = partial(missing_package, "laspy[lazrs]", "lazrs")
@@ -58,9 +40,9 @@ _MODELS = (
     Exporter(
         "stl", write_stl, "binary STL in millimeters, z up, no colors; programs for 3D printers", holds_points=False
     ),
-    Exporter("draco", write_draco, "GLB compressed by Draco, a quarter of the size; web viewers", "glb", _no_draco),
-    Exporter("usdz", write_usdz, "USD and its texture in one file; Apple's Quick Look, Blender", unavailable=_no_usd),
-    Exporter("usd", write_usd, "binary USD with JPEG pages; Blender, Houdini, Omniverse", unavailable=_no_usd),
+    Exporter("draco", _draco, "GLB compressed by Draco, a quarter of the size; web viewers", "glb", _no_draco),
+    Exporter("usdz", _usdz, "USD and its texture in one file; Apple's Quick Look, Blender", unavailable=_no_usd),
+    Exporter("usd", _usd, "binary USD with JPEG pages; Blender, Houdini, Omniverse", unavailable=_no_usd),
 )
 _SCENES = (
     SceneExporter("colmap", write_colmap, "folder images/, sparse/0: undistorted photos, COLMAP's binary model"),
@@ -75,7 +57,14 @@ _SCENES = (
     ),
     SceneExporter("opencv", write_opencv, "folder with a YAML file per camera, with its photos' poses, for OpenCV"),
     SceneExporter("cloud-ply", write_cloud_ply, "the dense cloud as PLY; CloudCompare, MeshLab", "cloud.ply", CLOUD),
-    SceneExporter("laz", write_laz, "the dense cloud as compressed LAS; PDAL, QGIS", "cloud.laz", CLOUD, _no_laz),
+    SceneExporter(
+        "laz",
+        _load_later("laz", "write_laz"),
+        "the dense cloud as compressed LAS; PDAL, QGIS",
+        "cloud.laz",
+        CLOUD,
+        _no_laz,
+    ),
 )
 EXPORTERS = {exporter.name: exporter for exporter in _MODELS}
 """Formats for models by name."""

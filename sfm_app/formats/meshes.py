@@ -115,7 +115,7 @@ def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
     """
     check(model)
     texture = model.texture if len(model.surface.faces) else None
-    beside = re.sub(r"\s", "_", name)  # many readers end file names at a blank
+    stem = re.sub(r"\s", "_", name)  # many readers end file names at a blank
     text = ["# sfm_app\n", *_vertex_lines(model, with_colors=texture is None)]
     files: dict[str, bytes] = {}
     if texture is None:
@@ -124,11 +124,11 @@ def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
             text.append(format_rows("f %d//%d %d//%d %d//%d\n", np.repeat(corners, 2, axis=1)))
     else:
         used = pages_in_use(texture.page)
-        pages = {page: f"{beside}_{page}.jpg" for page in used}
-        text += [f"mtllib {beside}.mtl\n", *_textured_lines(model, texture, used)]
-        maps = {page: f"{beside}_{page}_normals.{NORMAL_SUFFIX}" for page in used if texture.normal_maps}
+        pages = {page: f"{stem}_{page}.jpg" for page in used}
+        text += [f"mtllib {stem}.mtl\n", *_textured_lines(model, texture, used)]
+        maps = {page: f"{stem}_{page}_normals.{NORMAL_SUFFIX}" for page in used if texture.normal_maps}
         materials = (_material(page, file, maps.get(page, "")) for page, file in pages.items())
-        files[f"{beside}.mtl"] = "\n".join(materials).encode()
+        files[f"{stem}.mtl"] = "\n".join(materials).encode()
         files |= {file: jpeg(texture.pages[page]) for page, file in pages.items()}
         files |= {file: normal_picture(texture.normal_maps[page]) for page, file in maps.items()}
     return {f"{name}.obj": "".join(text).encode(), **files}

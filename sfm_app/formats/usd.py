@@ -61,8 +61,8 @@ def page_files(model: Model, name: str) -> dict[int, str]:
     """Return the files of the pages of texture by their numbers; empty without a texture."""
     if model.texture is None or not len(model.surface.faces):
         return {}
-    beside = re.sub(r"\s", "_", name)
-    return {page: f"{beside}_{page}.jpg" for page in pages_in_use(model.texture.page)}
+    stem = re.sub(r"\s", "_", name)
+    return {page: f"{stem}_{page}.jpg" for page in pages_in_use(model.texture.page)}
 
 
 def normal_file(picture: str) -> str:

@@ -480,12 +480,12 @@ def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
     from matplotlib.figure import Figure
 
     check_figure(path)
-    shown = panels[: OPTIONS.most_cameras]
-    heights = [sum(panel.heights_in) for panel in shown]
+    drawn = panels[: OPTIONS.most_cameras]
+    heights = [sum(panel.heights_in) for panel in drawn]
     with rc_context({"font.size": 9, "svg.hashsalt": "sfm-app"}):
         figure = Figure(figsize=(12.5, sum(heights)), layout="constrained")
-        parts = figure.subfigures(len(shown), 1, squeeze=False, height_ratios=heights)[:, 0]
-        for part, panel in zip(parts, shown, strict=True):
+        parts = figure.subfigures(len(drawn), 1, squeeze=False, height_ratios=heights)[:, 0]
+        for part, panel in zip(parts, drawn, strict=True):
             many = f"Camera {panel.name}, one of {len(panels)}.\n" if len(panels) > 1 else ""
             texts = filter(None, (calibration_text(panel.camera), pairs_text(len(panel.pairs.Fs))))
             part.suptitle(many + "\n".join(texts), fontsize=10.5, x=0.02, ha="left")

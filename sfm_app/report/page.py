@@ -60,7 +60,7 @@ def three_script() -> str:
 
 
 def finish_report(run: RunContext, problem: SfmError | None = None) -> Path | None:
-    """Record how a run ended, and write its report; a failure here does not end the run.
+    """Note how a run ended, and write its report; a failure here does not end the run.
 
     Args:
         problem: the error that ended the run; None if it finished.
@@ -98,8 +98,8 @@ def write_report(run: RunContext, beside_run: RunContext | None = None) -> Path:
     """
     contents, other = read_run(run), read_run(beside_run) if beside_run is not None else None
     path = run.workspace.root / REPORT
-    with replace_atomically(path) as beside:
-        beside.write_text(render_page(contents, embed_parts(contents), other), encoding="utf-8", newline="\n")
+    with replace_atomically(path) as draft:
+        draft.write_text(render_page(contents, embed_parts(contents), other), encoding="utf-8", newline="\n")
     return path
 
 

@@ -18,7 +18,6 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from importlib.metadata import PackageNotFoundError, entry_points, version
@@ -27,7 +26,7 @@ from pathlib import Path
 from typing import IO, Any, TypeVar
 
 from sfm_app.errors import BackendError, ClusterError, ConfigError
-from sfm_app.files import replace_atomically
+from sfm_app.files import digest_file, replace_atomically
 from sfm_app.operating_system import cpu_seconds, end_group, end_own_group, group_options, watch_parent
 from sfm_app.runtime.parallel import RemoteExecutor
 from sfm_app.settings import LOCAL_ADDRESS, ClusterSettings
@@ -77,8 +76,8 @@ class Serialized:
     """Of the file."""
 
 
-class Serializer:
-    """Serializes values for other processes; each shared value becomes one file.
+class Serializer(contextlib.AbstractContextManager["Serializer"]):
+    """Serializes values for other processes; each shared value becomes one file until the end of the block.
 
     Args:
         folder: all processes read and write it under this path.
@@ -88,6 +87,14 @@ class Serializer:
         self.folder = folder
         self._shared: dict[int, tuple[Shared[Any], Path, str]] = {}
 
+    def __enter__(self) -> "Serializer":
+        self.folder.mkdir(parents=True, exist_ok=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for _, path, _ in self._shared.values():
+            path.unlink(missing_ok=True)
+
     def serialize(self, value: object) -> Serialized:
         """Return a value as bytes, or as a file if it is large."""
         buffer = io.BytesIO()
@@ -96,8 +103,8 @@ class Serializer:
         if len(data) <= OPTIONS.small_bytes:
             return Serialized(data)
         path = self.folder / f"value-{secrets.token_hex(8)}.pickle"
-        with replace_atomically(path) as beside:
-            beside.write_bytes(data)
+        with replace_atomically(path) as draft:
+            draft.write_bytes(data)
         return Serialized(b"", str(path), hashlib.blake2b(data).hexdigest())
 
     def share(self, value: Shared[Any]) -> tuple[str, str]:
@@ -105,27 +112,11 @@ class Serializer:
         known = self._shared.get(id(value))
         if known is None:
             path = self.folder / f"shared-{secrets.token_hex(8)}.pickle"
-            with replace_atomically(path) as beside, beside.open("wb") as file:
+            with replace_atomically(path) as draft, draft.open("wb") as file:
                 _Pickler(file, self).dump(value.value)
             # holding the value keeps its id unique
-            known = self._shared[id(value)] = value, path, _digest(path)
+            known = self._shared[id(value)] = value, path, digest_file(path)
         return str(known[1]), known[2]
-
-    def remove_shared(self) -> None:
-        """Remove the files of shared values."""
-        for _, path, _ in self._shared.values():
-            path.unlink(missing_ok=True)
-
-
-@contextmanager
-def open_serializer(folder: Path) -> Iterator[Serializer]:
-    """Provide a serializer on a folder, which may be missing; its shared files are removed at the end."""
-    folder.mkdir(parents=True, exist_ok=True)
-    serializer = Serializer(folder)
-    try:
-        yield serializer
-    finally:
-        serializer.remove_shared()
 
 
 def deserialize(message: Serialized, *, remove: bool = False) -> Any:
@@ -167,15 +158,10 @@ def _read_shared(path: str, digest: str) -> Shared[Any]:
 
 
 def _load(path: str, digest: str) -> Any:
-    if _digest(Path(path)) != digest:
+    if digest_file(Path(path)) != digest:
         raise OSError(f"{path} is not the file that was sent")
     with Path(path).open("rb") as file:
         return _Unpickler(file).load()
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "blake2b").hexdigest()
 
 
 # Versions that have to agree on all machines, so that the same seed gives the same bytes.
@@ -191,21 +177,19 @@ PROCESSOR = "processor"
 
 @cache
 def worker_versions() -> dict[str, str]:
-    """Return the versions of Python, program, plug-ins and libraries, and the kind of processor."""
-    plugins = {point.dist.name: point.dist.version for point in entry_points(group="sfm_app") if point.dist}
+    """Return versions of Python, plug-ins and libraries, a hash of the program, and the kind of processor."""
+    import llvmlite.binding  # numba's: the kind for which kernels are compiled
+
+    plugins = {point.dist.name for point in entry_points(group="sfm_app") if point.dist} - {"sfm-app"}
+    digest, root = hashlib.blake2b(digest_size=6), Path(__file__).parents[1]
+    for path in sorted(root.rglob("*.py")):  # two checkouts of one version may differ
+        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
     return {
         "python": ".".join(platform.python_version_tuple()[:2]),
-        **{name: _version(name) for name in LIBRARIES},
-        **{name: number for name, number in sorted(plugins.items()) if name != "sfm-app"},
-        "the program's files": _digest_program(),
-        PROCESSOR: _processor(),
+        **{name: _version(name) for name in (*LIBRARIES, *sorted(plugins))},
+        "the program's files": digest.hexdigest(),
+        PROCESSOR: str(llvmlite.binding.get_host_cpu_name()),
     }
-
-
-def differences(ours: Mapping[str, str], theirs: Mapping[str, str]) -> list[str]:
-    """Return the differing versions, such as "numpy 2.1 instead of 2.0"; processors may differ."""
-    names = [name for name in {**ours, **theirs} if name != PROCESSOR and ours.get(name) != theirs.get(name)]
-    return [f"{name} {theirs.get(name, 'missing')} instead of {ours.get(name, 'none')}" for name in names]
 
 
 def _version(name: str) -> str:
@@ -215,18 +199,10 @@ def _version(name: str) -> str:
         return "missing"
 
 
-def _digest_program() -> str:
-    """Return a hash of the package's source files: two checkouts of one version may differ."""
-    digest, root = hashlib.blake2b(digest_size=6), Path(__file__).parents[1]
-    for path in sorted(root.rglob("*.py")):
-        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
-    return digest.hexdigest()
-
-
-def _processor() -> str:
-    import llvmlite.binding  # numba's: the kind for which kernels are compiled
-
-    return str(llvmlite.binding.get_host_cpu_name())
+def differences(ours: Mapping[str, str], theirs: Mapping[str, str]) -> list[str]:
+    """Return the differing versions, such as "numpy 2.1 instead of 2.0"; processors may differ."""
+    names = [name for name in {**ours, **theirs} if name != PROCESSOR and ours.get(name) != theirs.get(name)]
+    return [f"{name} {theirs.get(name, 'missing')} instead of {ours.get(name, 'none')}" for name in names]
 
 
 # The work of a worker: check the versions, apply a task to some items, reply.
@@ -584,7 +560,7 @@ def _close(client: Any) -> None:
 
 
 def _quiet() -> None:
-    """Silence Dask's own messages; this program reports errors in one line."""
+    """Keep Dask's own messages off the terminal; this program reports errors in one line."""
     known = [name for name in logging.root.manager.loggerDict if name.startswith("distributed.")]
     for name in ("distributed", "tornado", "asyncio", *known):
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
@@ -626,7 +602,7 @@ class ClusterExecutor(RemoteExecutor):
         super().__init__(max_workers=workers, thread_name_prefix="sfm")
         self.cluster, self.workers = cluster, workers
 
-    def resized(self, workers: int) -> "ClusterExecutor":
+    def with_threads(self, workers: int) -> "ClusterExecutor":
         """Return an executor of the same cluster with another number of threads."""
         return ClusterExecutor(self.cluster, workers)
 
@@ -649,7 +625,7 @@ class ClusterExecutor(RemoteExecutor):
         Raises:
             ClusterError: the scheduler is gone, or an item ends each worker that tries it.
         """
-        with open_serializer(self.cluster.folder) as serializer:
+        with Serializer(self.cluster.folder) as serializer:
             yield from _Spreading(self, task, serializer).results(iter(items))
 
     def count_in_flight(self) -> int:

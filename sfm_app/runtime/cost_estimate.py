@@ -8,7 +8,6 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from sfm_app.retrieval import expected_pairs
 from sfm_app.settings import MeshSettings, Settings
 from sfm_app.types import Photo
 
@@ -114,9 +113,11 @@ def block_workers(workers: int, limit_mb: float, options: MeshSettings) -> int:
 
 def make_plan(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb: float = math.inf) -> Plan:
     """Estimate the costs of all stages after the photos stage; a small memory limit means a small cache of fusion."""
+    from sfm_app.retrieval import expected_pairs  # loads OpenCV and SciPy
+
     sizes = [(photo.width, photo.height) for photo in photos]
     count, pairs = len(sizes), expected_pairs(len(sizes), settings.matching)
-    largest = max((width * height for width, height in sizes), default=0) / 1e6
+    largest, whole_mp = max(map(math.prod, sizes), default=0) / 1e6, sum(map(math.prod, sizes)) / 1e6
     searched = [_megapixels(size, settings.matching.max_image_size_px) for size in sizes]
     mapped = [_megapixels(size, settings.depth.max_image_size_px) for size in sizes]
     features = sum(min(settings.matching.max_features, OPTIONS.features_per_mp * one) for one in searched) / max(
@@ -141,13 +142,12 @@ def make_plan(photos: Iterable[Photo], settings: Settings, workers: int, limit_m
             "view_graph": 0.04 * pairs * features / 8192,
             "intrinsics": 0.03 * pairs,
             "scene": 2.0 * count,
-            "scale": 1.0
-            + (0.2 * sum(width * height for width, height in sizes) / 1e6 if settings.scale.markers else 0.0),
+            "scale": 1.0 + (0.2 * whole_mp if settings.scale.markers else 0.0),
             "depth_maps": OPTIONS.depth_seconds_per_mp * sum(mapped) * settings.depth.neighbors,
             "mesh": 5
             + (1.6 if dense <= FUSED_AT_ONCE_MP else 2.7) * dense
             + OPTIONS.refine_seconds_per_mp * sum(refined) / workers,
-            "texture": 0.1 * sum(width * height for width, height in sizes) / 1e6,
+            "texture": 0.1 * whole_mp,
             "files": 1.0,
         },
         memory_mb={

@@ -19,7 +19,7 @@ Result = TypeVar("Result")
 class RemoteExecutor(ThreadPoolExecutor):
     """Threads of this process, and workers elsewhere for tasks, such as `runtime.cluster.ClusterExecutor`."""
 
-    def resized(self, workers: int) -> "RemoteExecutor":
+    def with_threads(self, workers: int) -> "RemoteExecutor":
         """Return an executor with the same workers elsewhere and another number of threads."""
         raise NotImplementedError
 
@@ -48,7 +48,7 @@ def make_executor(workers: int, like: Executor | None = None) -> Executor:
         like: an executor with workers elsewhere; the new one shares them.
     """
     if isinstance(like, RemoteExecutor):
-        return like.resized(workers)
+        return like.with_threads(workers)
     return ThreadPoolExecutor(max_workers=workers, thread_name_prefix="sfm")
 
 

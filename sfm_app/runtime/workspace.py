@@ -91,9 +91,9 @@ class Manifest:
             InputError: there is no run, or another version of the program made it.
         """
         if not self.read():
-            beside = self.root.resolve()
-            beside = beside.with_name(f"{beside.name}-model")  # where a run without -o writes
-            guess = f"\nis it {beside}?" if (beside / MANIFEST).exists() else ""
+            default = self.root.resolve()
+            default = default.with_name(f"{default.name}-model")  # where a run without -o writes
+            guess = f"\nis it {default}?" if (default / MANIFEST).exists() else ""
             raise InputError(
                 f"{self.root} holds no run", hint=f"name the folder that `sfm-app run PHOTOS -o OUT` wrote{guess}"
             )
@@ -127,7 +127,7 @@ class Manifest:
         self.write({"format": FORMAT, **head, "stages": stages})
 
     def note_problem(self, problem: Mapping[str, Any]) -> None:
-        """Record the error of a run until a stage is finished again; an empty problem removes the entry."""
+        """Note the error of a run until a stage is finished again; an empty problem removes the entry."""
         manifest = self.read()
         if problem != manifest.get(PROBLEM, {}):
             rest = {key: value for key, value in manifest.items() if key != PROBLEM}

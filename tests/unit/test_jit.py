@@ -100,14 +100,12 @@ def test_kernels_are_compiled_while_the_block_lasts(cold):
 def test_compiled_kernels_are_not_compiled_again(cold):
     cold.parent.mkdir()
     cold.touch()
-
     with warming_up([].append, cold):
         assert not compilers()
 
 
 def test_the_process_starts_no_other(cold, monkeypatch):
     monkeypatch.setenv(PARENT, "1")
-
     with warming_up([].append, cold):
         assert not compilers()
 

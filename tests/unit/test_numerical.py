@@ -32,7 +32,6 @@ BUGS = {
 def test_a_bug_of_ours_is_no_failed_computation(case):
     with pytest.raises((ValueError, IndexError)) as caught, translate_errors("adjusting"):
         BUGS[case]()
-
     assert not isinstance(caught.value, FAILURES)
 
 
@@ -60,7 +59,6 @@ def test_what_pycolmap_raises_is_colmaps_and_other_bugs_stay_what_they_are(tmp_p
 
 def test_json_has_no_infinity_and_no_nan():
     given = {"a": np.nan, "b": [1.0, np.inf, (-np.inf, "x")], "c": {"d": np.float64("nan"), "e": True, "f": None}}
-
     assert json.loads(json_text(given), parse_constant=pytest.fail) == {
         "a": None, "b": [1.0, None, [None, "x"]], "c": {"d": None, "e": True, "f": None},
     }  # fmt: skip
@@ -70,16 +68,13 @@ def test_json_has_no_infinity_and_no_nan():
 def test_a_record_with_what_is_no_number_is_a_record(tmp_path):
     manifest = Manifest(tmp_path)
     manifest.finish("scene", StageRecord("abc", 1.0, {"up_deviation_deg": np.inf, "odds": np.nan}), {})
-
     assert manifest.record("scene").counts == {"up_deviation_deg": None, "odds": None}
     assert "NaN" not in manifest.path.read_text() and "Infinity" not in manifest.path.read_text()
 
 
 def test_a_calibration_comes_back_without_what_is_no_number():
     given = Calibration(np.eye(3), 640, 480, "zero-curves", True, spread={"fx": np.inf, "fy": 2.0})
-
     found = Calibration.from_dict(json.loads(json_text(given.to_dict())))
-
     assert found.spread == {"fy": 2.0} and np.array_equal(found.K, np.eye(3))
 
 

@@ -70,10 +70,8 @@ def fail():
 def test_the_photos_are_checked_after_all_tasks_of_a_failed_stage_have_ended(two_workers, source):
     written = []
     source.check = lambda _: written.append((two_workers.workspace.dense / "map.bin").exists())
-
     with pytest.raises(ReconstructionError, match="no photo has a neighbor"):
         pipeline(fail).run(source, two_workers)
-
     assert written == [False, True]  # after the photos, and after the failed depth maps
 
 
@@ -92,7 +90,6 @@ def test_files_written_after_the_output_folder_was_removed_do_not_stop_the_next_
 def test_a_failed_stage_leaves_the_workers_of_the_run(two_workers, source):
     with pytest.raises(ReconstructionError):
         pipeline(fail).run(source, two_workers)
-
     assert two_workers.map(str, range(3), "numbers") == ["0", "1", "2"]
 
 
@@ -105,7 +102,6 @@ def test_memory_of_other_processes_counts():
         pass
     with measure_usage() as used:
         subprocess.run([sys.executable, "-c", HOLD], check=True)
-
     assert alone.peak_mb > 10
     assert 200 <= used.peak_mb - alone.peak_mb < 350
 
@@ -140,14 +136,12 @@ def test_cpu_seconds_of_children_count_once(without, taken):
     without(*taken)
     with measure_usage(every_s=0.1) as used:
         subprocess.run([sys.executable, "-c", "import time\nwhile time.process_time() < 1.0: pass"], check=True)
-
     assert 0.75 < used.cpu_seconds < 1.8  # the looks themselves take some, too
 
 
 def test_a_failure_is_measured_too():
     with pytest.raises(ValueError, match="no"), measure_usage() as used:
         raise ValueError("no")
-
     assert used.seconds > 0
 
 
@@ -167,6 +161,5 @@ def test_the_log_has_the_traceback_of_an_error(run):
     run.workspace.create()
     with pytest.raises(IndexError), log_to_file(run):
         raise IndexError("a bug of ours")
-
     text = run.workspace.log.read_text(encoding="utf-8")
     assert "the run ended here" in text and "Traceback" in text and "IndexError: a bug of ours" in text

@@ -48,7 +48,6 @@ def there(run):
 
 def test_files_of_stages_that_grow_are_moved_and_nothing_is_finished_any_more(moved):
     earlier = find_earlier(STAGES, NOW, "", moved)
-
     assert earlier.stages == ("match_graph", "view_graph", "scene")
     assert (earlier.known, earlier.new, earlier.gone) == ({"a.jpg"}, {"c.jpg"}, {"b.jpg"})
     assert there(moved) == {"match_graph.txt", "view_graph.txt", "scene.txt"}
@@ -66,7 +65,6 @@ def test_other_settings_end_what_can_be_gone_on_from(moved):
 
 def test_other_versions_end_it_too(moved, monkeypatch):
     monkeypatch.setattr("sfm_app.engine.stage.versions", lambda: {"numpy": "1.0"})
-
     assert find_earlier(STAGES, NOW, "", moved) is None
 
 
@@ -85,7 +83,6 @@ def test_damaged_files_are_not_gone_on_from(moved, name, left):
     find_earlier(STAGES, NOW, "", moved)
     file = moved.workspace.root / ".earlier" / f"{name}.txt"
     file.write_text(file.read_text()[::-1])  # of the same size
-
     assert find_earlier(STAGES, NOW, "", moved).stages == left
 
 
@@ -93,7 +90,6 @@ def test_files_that_were_not_moved_when_the_run_was_killed_are_moved_by_the_next
     root = moved.workspace.root
     (root / ".earlier" / "match_graph.txt").write_bytes((root / "match_graph.txt").read_bytes())
     (root / "match_graph.txt").write_text("the new one has begun")
-
     assert find_earlier(STAGES, NOW, "", moved).stages == ("match_graph", "view_graph", "scene")
     assert (root / "match_graph.txt").read_text() == "the new one has begun"
 
@@ -103,7 +99,6 @@ def test_a_finished_run_is_not_touched_by_what_lies_beside_it(run):
     listed = run.workspace.manifest.read()
     set_aside(STAGES, run)
     run.workspace.manifest.write(listed)  # killed before the run was taken from the manifest, and photos put back
-
     assert find_earlier(STAGES, BEFORE, "", run) is None
     assert (run.workspace.root / "scene.txt").exists() and run.workspace.manifest.read() == listed
 
@@ -113,7 +108,6 @@ def test_the_earlier_run_that_got_further_is_kept(moved):
     finish(moved, STAGES[0], photos=NOW, text="later")
     set_aside(STAGES, moved)
     assert find_earlier(STAGES, NOW, "", moved).gone == {"b.jpg"}
-
     finish(moved, *STAGES, photos=NOW, text="later")
     set_aside(STAGES, moved)
     assert find_earlier(STAGES, NOW, "", moved).gone == frozenset()
@@ -124,7 +118,6 @@ def test_it_is_removed_once_everything_that_it_has_is_done(moved):
     finish(moved, *STAGES[:2], text="later")
     forget_earlier(moved, if_finished=True)
     assert there(moved)
-
     finish(moved, STAGES[2], text="later")
     forget_earlier(moved, if_finished=True)
     assert not (moved.workspace.root / ".earlier").exists()
@@ -133,5 +126,4 @@ def test_it_is_removed_once_everything_that_it_has_is_done(moved):
 def test_resuming_never_mixes_a_grown_run_with_a_fresh_one(moved):
     one = find_earlier(STAGES, NOW, "", moved)
     fewer = find_earlier(STAGES, NOW, "scene", moved)
-
     assert one.fingerprint != fewer.fingerprint

@@ -42,7 +42,6 @@ def test_a_stage_that_was_never_done_needs_no_reason(run):
 def test_settings_of_other_stages_change_nothing(run):
     finished(run)
     set_to(run, mesh={"faces": 1000}, photos={"keep_low_quality": True}, workers=2)
-
     assert why(run) is None
 
 
@@ -55,7 +54,6 @@ def test_a_setting_that_changed_is_named_with_both_values(run):
 def test_other_contents_of_a_calibration_file_are_a_change(run):
     stage = replace(STAGE, settings=(GIVEN_CAMERAS,))
     one, other = (replace(run, given=GivenCameras(digest=digest)) for digest in ("x", "y"))
-
     assert stage_fingerprint(stage, [], one) != stage_fingerprint(stage, [], other)
     assert settings_and_versions(stage, one)["settings"] == {GIVEN_CAMERAS: "x"}
 
@@ -63,7 +61,6 @@ def test_other_contents_of_a_calibration_file_are_a_change(run):
 def test_no_more_than_three_are_named(run):
     finished(run)
     said = why(set_to(run, quality="high", photos={"cameras": "each"}, seed=1, matching={"max_ratio": 0.7}))
-
     assert said.count("->") == 3 and said.endswith("and 3 more")
 
 

@@ -85,9 +85,7 @@ def test_colmap_reads_photos_without_distortion(make_run, frame, name, kinds):
 
 def test_an_off_center_photo_keeps_nearly_all_of_its_picture_in_splat(make_run):
     run = make_run("pinhole")
-
     folder = sfm_app.export_scene(run.out, "splat")
-
     (camera,) = pycolmap.Reconstruction(folder / "sparse" / "0").cameras.values()
     assert 0.85 < camera.width / 240 < 1.0 and 0.85 < camera.height / 160 < 1.0  # a crop would keep 0.83
 
@@ -135,9 +133,7 @@ def test_transforms_json_projects_points_as_its_documentation_says(make_run, fra
 @pytest.mark.parametrize("name", ["colmap", "nerfstudio"])
 def test_masks_go_along(make_run, name):
     run = make_run("pinhole", masks=True)
-
     folder = sfm_app.export_scene(run.out, name)
-
     masks = sorted(path.name for path in (folder / "masks").iterdir())
     assert masks == sorted(f"{path.name}.png" for path in (folder / "images").iterdir())
     used = np.asarray(Image.open(folder / "masks" / masks[0])) > 0
@@ -171,9 +167,7 @@ def test_opencv_projects_where_the_camera_does(make_run, frame, kind):
 
 def test_opencv_cameras_are_read_by_our_own_reader(make_run):
     run = make_run("lens")
-
     given = read_given_cameras(sfm_app.export_scene(run.out, "opencv") / "c_1.yaml")
-
     (camera,) = given.cameras.values()
     np.testing.assert_allclose(camera.K, run.model.cameras[1].calibration_matrix(), rtol=1e-12)
 
@@ -181,19 +175,15 @@ def test_opencv_cameras_are_read_by_our_own_reader(make_run):
 @pytest.mark.parametrize("kind", ["panorama", "prism"])
 def test_cameras_that_opencv_does_not_know_are_named(make_run, kind):
     run = make_run(kind)
-
     with pytest.raises(sfm_app.InputError, match="camera c 1 is left out: OpenCV") as caught:
         sfm_app.export_scene(run.out, "opencv")
-
     assert "--format cameras" in caught.value.hint
     assert not (run.out / "export" / "opencv").exists()
 
 
 def test_the_other_cameras_are_written_for_opencv(make_run):
     run = make_run("lens", "panorama")
-
     folder = sfm_app.export_scene(run.out, "opencv")
-
     assert [path.name for path in folder.glob("*.yaml")] == ["c_1.yaml"]
 
 
@@ -290,9 +280,7 @@ def test_bundler_sees_points_where_the_photos_do(make_run, frame, kinds):
 
 def test_a_folder_is_the_same_every_time(make_run):
     run = make_run("fisheye", masks=True)
-
     one, two = (sfm_app.export_scene(run.out, "splat", run.out / name) for name in ("one", "two"))
-
     files = sorted(path.relative_to(one) for path in one.rglob("*") if path.is_file())
     assert len(files) > 20
     assert all((one / name).read_bytes() == (two / name).read_bytes() for name in files)

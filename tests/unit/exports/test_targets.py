@@ -1,8 +1,10 @@
-"""Where exports go, what they refuse, and what an interrupted one leaves."""
+"""Targets of exports, refusals, interrupted exports, and model files from Python and the command line."""
 
 import json
 
+import numpy as np
 import pytest
+import trimesh
 from click.testing import CliRunner
 
 import sfm_app
@@ -11,7 +13,10 @@ from sfm_app.cli import main
 from sfm_app.formats import EXPORTERS, SCENE_EXPORTERS
 from sfm_app.formats.exporters import SceneExporter
 from sfm_app.formats.scenes import plain_names
+from sfm_app.frame.scale import MetricFrame
+from sfm_app.pipeline import NAMES, SCALE, STAGES
 from sfm_app.plugins import hookimpl, load_plugins
+from sfm_app.runtime.workspace import StageRecord, Workspace
 
 
 def call(*arguments):
@@ -32,9 +37,7 @@ def test_help_and_unknown_formats_and_plugins_name_all_formats(make_run):
 
 def test_a_folder_tells_how_many_files_it_has(make_run):
     run = make_run("pinhole")
-
     people, scripts = call(run.out, "--format", "colmap", "-q"), call(run.out, "--format", "colmap", "--json")
-
     assert people.exit_code == scripts.exit_code == 0, people.stderr + scripts.stderr
     assert people.stdout.startswith(f"{run.out / 'export' / 'colmap'}  9 files, ")
     assert json.loads(scripts.stdout) == [str(run.out / "export" / "colmap")]
@@ -46,7 +49,6 @@ def test_a_folder_tells_how_many_files_it_has(make_run):
 )
 def test_the_suffix_says_which_format(make_run, tmp_path, target, written):
     result = call(make_run().out, "-o", tmp_path / target)
-
     assert result.exit_code == 0, result.stderr
     assert (tmp_path / written).stat().st_size > 100
 
@@ -61,16 +63,13 @@ def test_the_suffix_says_which_format(make_run, tmp_path, target, written):
 )
 def test_contradictions_end_with_exit_code_2(make_run, arguments, says):
     result = call(make_run().out, *arguments)
-
     assert (result.exit_code, says in result.stderr) == (2, True), result.stderr
 
 
 @pytest.mark.parametrize("name", ["cloud-ply", "laz"])
 def test_a_run_until_the_scene_has_no_dense_cloud(make_run, name):
     run = make_run(until="scene")
-
     result = call(run.out, "--format", name)
-
     assert (result.exit_code, "no dense cloud yet: stage `mesh` is missing" in result.stderr) == (3, True)
     assert not list(run.out.glob("cloud*"))
 
@@ -78,7 +77,6 @@ def test_a_run_until_the_scene_has_no_dense_cloud(make_run, name):
 @pytest.mark.parametrize("name", SCENE_EXPORTERS)
 def test_a_folder_without_a_run_is_left_alone(tmp_path, name):
     result = call(tmp_path, "--format", name)
-
     assert (result.exit_code, "holds no run" in result.stderr) == (3, True)
     assert list(tmp_path.iterdir()) == []
 
@@ -118,7 +116,6 @@ def test_what_no_export_has_written_is_refused(make_run, tmp_path, kind):
 
 def test_an_empty_folder_is_filled(make_run, tmp_path):
     (tmp_path / "target").mkdir()
-
     assert len(list(sfm_app.export_scene(make_run("pinhole").out, "splat", tmp_path / "target").iterdir())) == 3
 
 
@@ -148,9 +145,7 @@ def test_an_interrupted_export_leaves_the_folder_as_it_was(make_run, monkeypatch
 def test_photos_that_are_gone_are_named(make_run):
     run = make_run("pinhole")
     (run.place.photos / "sub_a-b_c.png").unlink()
-
     result = call(run.out, "--format", "colmap")
-
     assert (result.exit_code, "the photo sub_a-b_c.png is gone" in result.stderr) == (3, True)
     assert "put them back" in result.stderr
 
@@ -170,9 +165,7 @@ def test_a_cloud_that_was_cut_off_or_removed_is_no_crash(make_run):
 @pytest.mark.parametrize("name", ["laz", "usdz", "usd", "draco"])
 def test_a_missing_package_is_named_with_how_to_install_it(make_run, monkeypatch, name):
     monkeypatch.setattr("sfm_app.formats.exporters.find_spec", lambda _: None)
-
     result = call(make_run().out, "--format", name)
-
     assert (result.exit_code, "is not installed" in result.stderr) == (2, True)
     assert "hint: pip install 'sfm-app[export]'" in result.stderr
 
@@ -200,8 +193,131 @@ def test_a_name_belongs_to_one_format_only():
 
 def test_names_are_plain_and_all_different():
     names = ["a/b c", "a_b c", "A/B.C", "ä", "", "-x", "a/b c_2"]
-
     found = plain_names(names)
-
     assert found == ["a_b_c", "a_b_c_2", "A_B_C_3", "_", "__2", "-x", "a_b_c_2_2"]
     assert len({name.lower() for name in found}) == len(names)
+
+
+LAST = STAGES[-1].takes[-1]
+"""The stage whose product the files of the model hold."""
+
+
+@pytest.fixture
+def finished(textured_ball, tmp_path):
+    """What a run leaves that has only its files to write."""
+    place = Workspace(tmp_path / "out")
+    place.texture.mkdir(parents=True)
+    surface, texture = textured_ball.surface, textured_ball.texture
+    np.savez(
+        place.root / LAST.files[0],
+        vertices=surface.vertices, faces=surface.faces, colors=surface.colors,
+        uv=texture.uv, page=texture.page, page0=texture.pages[0], page1=texture.pages[1],
+    )  # fmt: skip
+    place.scale.write_text(json.dumps(MetricFrame().to_dict()))
+    for stage in NAMES[:-1]:
+        digest = (SCALE if stage == SCALE.name else LAST).digest(place)
+        place.manifest.finish(stage, StageRecord("", 0.0, digest=digest), {})
+    return place.root
+
+
+@pytest.mark.parametrize("name", EXPORTERS)
+def test_the_file_is_what_the_run_would_have_written(textured_ball, finished, name):
+    paths = sfm_app.export_model(finished, name)
+    stem = "model-draco" if name == "draco" else "model"
+    assert paths[0] == finished / f"{stem}.{EXPORTERS[name].ending}"
+    assert {path.name: path.read_bytes() for path in paths} == EXPORTERS[name].write(textured_ball, stem)
+
+
+@pytest.mark.parametrize(
+    ("file_format", "target", "path"),
+    [
+        ("", "statue.obj", "statue.obj"),
+        ("", "statue.GLB", "statue.GLB"),
+        ("ply", "statue", "statue.ply"),
+        ("ply", "statue v1.2", "statue v1.2.ply"),
+        ("ply", "new/folder/statue.ply", "new/folder/statue.ply"),
+        ("ply", ".", "model.ply"),
+    ],
+)
+def test_the_target_is_named_as_people_name_files(finished, tmp_path, file_format, target, path):
+    found = sfm_app.export_model(finished, file_format, tmp_path / target)
+    assert found[0] == tmp_path / path
+    assert len(trimesh.load(found[0], force="mesh").faces) == 320
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (("--format", "3mf"), 2, "no file format is named '3mf'"),
+        (("-o", "model.3mf"), 2, "no file format is named '3mf'"),
+        (("-o", "model.ply", "--format", "glb"), 2, "model.ply does not end in .glb"),
+        ((), 2, "no format is given"),
+    ],
+)
+def test_formats_that_are_not_there_end_with_exit_code_2(finished, arguments, code, says):
+    result = call(finished, *arguments)
+    assert (result.exit_code, says in result.stderr) == (code, True), result.stderr
+    assert "obj" in result.stderr or "glb" in result.stderr
+
+
+def test_a_run_without_a_mesh_says_what_is_missing_and_what_to_do(tmp_path):
+    place = Workspace(tmp_path / "out")
+    place.manifest.finish("scene", StageRecord("", 0.0), {})
+    result = call(place.root, "--format", "obj")
+    assert result.exit_code == 3
+    assert f"holds no model yet: stage `{LAST.name}` is missing" in result.stderr
+    assert f"sfm-app run PHOTOS -o {place.root}" in result.stderr and "--points" in result.stderr
+
+
+def test_a_run_without_a_scene_has_no_points_either(tmp_path):
+    place = Workspace(tmp_path / "out")
+    place.manifest.finish("photos", StageRecord("", 0.0), {})
+    result = call(place.root, "--format", "ply", "--points")
+    assert result.exit_code == 3
+    assert "no points yet: stage `scene` is missing" in result.stderr and "--points" not in result.stderr
+
+
+@pytest.mark.parametrize("place", [".", "nowhere"])
+def test_a_folder_that_is_no_run_is_refused(tmp_path, place):
+    result = call(tmp_path / place, "--format", "ply")
+    assert (result.exit_code, "holds no run" in result.stderr) == (3, True)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_surface_that_has_gone_is_missed_by_name(finished):
+    (finished / LAST.files[0]).unlink()
+    result = call(finished, "--format", "ply")
+    assert (result.exit_code, LAST.files[0] in result.stderr) == (3, True)
+
+
+@pytest.mark.parametrize("left", [0, 100, -1])
+def test_a_surface_that_was_cut_off_is_no_crash(finished, left):
+    stored = finished / LAST.files[0]
+    stored.write_bytes(stored.read_bytes()[:left])
+    result = call(finished, "--format", "ply")
+    assert (result.exit_code, "are damaged" in result.stderr) == (3, True)
+    assert "resumes where it stopped" in result.stderr
+
+
+def test_a_model_without_a_texture_has_the_colors_of_its_vertices(ball, finished):
+    np.savez(
+        finished / LAST.files[0], vertices=ball.surface.vertices, faces=ball.surface.faces, colors=ball.surface.colors
+    )
+    place = Workspace(finished)
+    place.manifest.finish(LAST.name, StageRecord("", 0.0, digest=LAST.digest(place)), {})
+    (path,) = sfm_app.export_model(finished, "glb")
+    assert path.read_bytes() == EXPORTERS["glb"].write(ball, "model")["model.glb"]
+
+
+def test_sizes_are_told_to_people_and_paths_to_scripts(finished):
+    people, scripts = call(finished, "--format", "obj"), call(finished, "--format", "obj", "--json")
+    size_kb = (finished / "model.obj").stat().st_size / 1e3
+    assert people.stdout.splitlines()[0] == f"{finished / 'model.obj'}  {size_kb:.0f} kB"
+    assert json.loads(scripts.stdout)[0] == str(finished / "model.obj")
+
+
+def test_a_target_that_cannot_be_written_is_named(finished, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    result = call(finished, "-o", tmp_path / "file" / "model.glb")
+    assert (result.exit_code, "cannot write" in result.stderr) == (3, True)
+    assert str(tmp_path / "file") in result.stderr

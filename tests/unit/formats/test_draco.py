@@ -78,5 +78,4 @@ def test_colors_of_vertices_keep_sixteen_bits(ball, tmp_path):
 @pytest.mark.parametrize("kind", ["cloud"])
 def test_points_are_those_of_a_plain_file(request, kind):
     model = request.getfixturevalue(kind)
-
     assert write_draco(model, "points") == write_glb(model, "points")

@@ -118,6 +118,5 @@ def test_a_camera_shows_points_where_the_photo_does(cloud, tmp_path):
 def test_colors_without_a_texture_are_linear(ball, tmp_path):
     stage = open_stage(write_usd(ball, "ball"), tmp_path)
     colors = np.array(UsdGeom.Mesh(stage.GetPrimAtPath("/model/surface")).GetDisplayColorPrimvar().Get())
-
     shown = np.where(colors <= 0.0031308, 12.92 * colors, 1.055 * colors ** (1 / 2.4) - 0.055)
     np.testing.assert_allclose(255 * shown, ball.surface.colors, atol=0.01)

@@ -29,10 +29,10 @@ def camera(request):
 
 
 @pytest.fixture
-def seen():
+def make_pairs():
     """Makes the exact pairs of photos by a camera, with noise and an error of the lens (N, 2) -> (N, 2) in pixels."""
 
-    def make(camera, noise_px=0.2, lacks=np.zeros_like, photos=6, points=800):
+    def make(camera, noise_px=0.2, lens_error=np.zeros_like, photos=6, points=800):
         rng = np.random.default_rng(0)
         X = rng.normal(size=(points, 3)) * [4.0, 3.0, 2.0] + [0.0, 0.0, 7.0]
         turns = [Rotation.from_rotvec(rng.normal(0.0, 0.15, 3)).as_matrix() for _ in range(photos)]
@@ -40,7 +40,7 @@ def seen():
         exact = [project((X - c) @ R.T, camera) for R, c in zip(turns, centers, strict=True)]
         with np.errstate(invalid="ignore"):
             inside = [((x > 0) & (x < (camera.width, camera.height))).all(axis=1) for x in exact]
-        x = [one + lacks(one) + rng.normal(0.0, noise_px, one.shape) for one in exact]
+        x = [one + lens_error(one) + rng.normal(0.0, noise_px, one.shape) for one in exact]
         Fs, matches, pairs = [], [], [(a, b) for a in range(photos) for b in range(a + 1, photos)]
         back = np.linalg.inv(camera.K) if camera.projection == "perspective" else np.eye(3)
         for a, b in pairs:

@@ -31,7 +31,6 @@ def shown(monkeypatch):
 def test_points_are_drawn_where_the_photo_in_the_middle_shows_them(shown):
     rng = np.random.default_rng(0)
     picture = notebook.model_picture(shown(rng.uniform(-1, 1, (500, 3)) * [1, 0.5, 1] + [0, 1, 0]))
-
     assert picture.shape == (480, 640, 3)
     assert 200 < (picture[..., 0] < 100).sum() < 2100  # most of 500 squares of four pixels
     rows, columns = np.nonzero(picture[..., 0] < 100)

@@ -19,12 +19,12 @@ from sfm_app.runtime.cluster import (
     PROCESSOR,
     Cluster,
     Probe,
+    Serializer,
     describe_item,
     deserialize,
     differences,
     find_misfit,
     local_workers,
-    open_serializer,
     picklable,
     worker_versions,
 )
@@ -207,7 +207,7 @@ class Trap:
 
 @pytest.mark.parametrize("size", [10, OPTIONS.small_bytes])
 def test_values_arrive_whatever_their_size(tmp_path, size):
-    with open_serializer(tmp_path) as serializer:
+    with Serializer(tmp_path) as serializer:
         value = serializer.serialize([np.arange(size), Path("here")])
         values, path = deserialize(value)
     np.testing.assert_array_equal(values, np.arange(size))
@@ -217,7 +217,7 @@ def test_values_arrive_whatever_their_size(tmp_path, size):
 
 def test_a_file_that_was_exchanged_is_not_unpickled(tmp_path):
     sprung = tmp_path / "sprung"
-    with open_serializer(tmp_path / "values") as serializer:
+    with Serializer(tmp_path / "values") as serializer:
         value = serializer.serialize(np.arange(OPTIONS.small_bytes))
         Path(value.path).write_bytes(pickle.dumps(Trap(sprung)))
         with pytest.raises(OSError, match="not the file that was sent"):
@@ -229,7 +229,7 @@ def test_a_file_that_was_exchanged_is_not_unpickled(tmp_path):
 
 def test_a_shared_file_that_was_exchanged_is_not_unpickled(tmp_path):
     sprung = tmp_path / "sprung"
-    with open_serializer(tmp_path / "values") as serializer:
+    with Serializer(tmp_path / "values") as serializer:
         value = serializer.serialize([Shared(np.arange(10))])
         (file,) = (tmp_path / "values").iterdir()
         assert deserialize(serializer.serialize([Shared(5)]))[0].value == 5
@@ -241,7 +241,7 @@ def test_a_shared_file_that_was_exchanged_is_not_unpickled(tmp_path):
 
 def test_a_shared_value_is_written_once_and_read_once(tmp_path):
     shared = Shared(list(range(1000)))
-    with open_serializer(tmp_path) as serializer:
+    with Serializer(tmp_path) as serializer:
         values = [serializer.serialize((shared, number)) for number in range(3)]
         assert len(list(tmp_path.iterdir())) == 1
         (first, _), (second, number) = deserialize(values[0]), deserialize(values[1])
@@ -255,7 +255,6 @@ def test_a_worker_with_other_versions_or_another_folder_does_not_fit(tmp_path):
     fitting = Probe(tuple(worker_versions().items()), str(tmp_path), "probe")
     older = Probe((*fitting.versions, ("numpy", "1.0")), str(tmp_path), "probe")
     elsewhere = Probe(fitting.versions, str(tmp_path / "missing" / "folder"), "probe")
-
     assert find_misfit(fitting) == ""
     assert f"numpy {np.__version__} instead of 1.0" in find_misfit(older)
     assert "cannot be used there" in find_misfit(elsewhere)

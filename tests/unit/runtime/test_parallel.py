@@ -23,7 +23,6 @@ def test_no_more_than_ahead_items_are_under_way():
     with make_executor(2) as executor:
         results = ordered_map(executor, begun.append, range(100), ahead=4)
         next(results)
-
         assert len(begun) <= 4
         results.close()
     assert len(begun) <= 5

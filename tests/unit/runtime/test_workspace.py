@@ -10,7 +10,6 @@ from sfm_app.runtime.workspace import LOCK, Manifest, StageRecord, Workspace, mo
 
 def test_a_file_in_place_of_the_folder_is_an_input_error(tmp_path):
     (tmp_path / "out").write_text("in the way")
-
     with pytest.raises(InputError, match="cannot write to"):
         Workspace(tmp_path / "out").create()
 
@@ -35,7 +34,6 @@ def test_what_a_run_wrote_after_its_folder_was_removed_is_not_foreign_to_the_nex
     (place.dense / "images").mkdir(parents=True)  # no lock, as after `rm -r out`
     with pytest.raises(InputError, match="was removed during"):
         place.check_exists()
-
     place.create()
 
 
@@ -74,7 +72,6 @@ def test_a_lock_that_somebody_removed_is_not_brought_back(tmp_path):
     place.create()
     with place.hold_lock():
         (place.root / LOCK).unlink()
-
     assert not (place.root / LOCK).exists()
 
 
@@ -95,7 +92,6 @@ def is_current(manifest, stage, print_of_inputs):
 def test_a_finished_stage_is_current_until_its_inputs_change(manifest):
     (manifest.root / "a.txt").write_text("1234")
     finish(manifest)
-
     assert is_current(manifest, "photos", "abc")
     assert not is_current(manifest, "photos", "other")
     assert not is_current(manifest, "match_graph", "abc")
@@ -117,7 +113,6 @@ def test_a_stage_whose_file_changed_is_not_current(manifest, damage):
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"stages": {"photos": 3}}', '{"stages": {"photos": {"odd": 1}}}'])
 def test_a_broken_manifest_counts_as_none(manifest, text):
     (manifest.root / "manifest.json").write_text(text)
-
     assert manifest.record("photos") is None
 
 
@@ -126,7 +121,6 @@ def test_forgotten_stages_leave_the_others(manifest):
     for name in ("photos", "intrinsics", "scene"):
         finish(manifest, name)
     manifest.forget(("intrinsics", "scene", "mesh"))
-
     assert manifest.record("scene") is None and manifest.record("intrinsics") is None
     assert manifest.record("photos") is not None
     assert json.loads((manifest.root / "manifest.json").read_text())["program"] == "test"
@@ -136,7 +130,6 @@ def test_the_database_may_grow_but_not_vanish(manifest):
     (manifest.root / "database.db").write_text("1234")
     finish(manifest, files=("database.db",))
     (manifest.root / "database.db").write_text("123456")
-
     assert is_current(manifest, "photos", "abc")
     (manifest.root / "database.db").unlink()
     assert not is_current(manifest, "photos", "abc")
@@ -148,7 +141,6 @@ def test_a_run_of_another_version_is_refused_in_one_line(manifest, version):
     manifest.check_format()
     known = json.loads(manifest.path.read_text())
     manifest.path.write_text(json.dumps({**known, "format": version, "program": "sfm-app"}))
-
     with pytest.raises(InputError, match="made by another version") as err:
         manifest.check_format()
     assert "-o" in err.value.hint and "\n" not in str(err.value)

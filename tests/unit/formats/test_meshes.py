@@ -1,4 +1,4 @@
-"""OBJ files, read line by line and by other programs."""
+"""PLY, OBJ and STL files, read back by other programs."""
 
 import io
 
@@ -7,9 +7,57 @@ import pytest
 import trimesh
 from PIL import Image
 
-from sfm_app.formats.meshes import DIGITS, write_obj
+from sfm_app.errors import ReconstructionError
+from sfm_app.formats.frusta import CAMERA_COLOR, DOTS
+from sfm_app.formats.meshes import DIGITS, write_obj, write_ply, write_stl
 from sfm_app.meshing.ray_casting import load_open3d
 from sfm_app.types import Model, Surface
+
+
+def rows(model):
+    (data,) = write_ply(model, "model").values()
+    return trimesh.load(io.BytesIO(data), file_type="ply", process=False).metadata["_ply_raw"]
+
+
+def test_a_surface_has_places_normals_and_the_colors_of_the_photos(ball):
+    vertex = rows(ball)["vertex"]["data"]
+
+    places, normals, colors = (
+        np.stack([vertex[key] for key in keys], axis=1)
+        for keys in (("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"))
+    )
+    np.testing.assert_allclose(places, ball.surface.vertices, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+    assert np.sum(normals * places, axis=1).min() > 0.98
+    np.testing.assert_array_equal(colors, ball.surface.colors)
+    assert set(rows(ball)) == {"vertex", "face"}
+
+
+def test_the_texture_leaves_the_bytes_alone(ball, textured_ball):
+    assert write_ply(ball, "model") == write_ply(textured_ball, "model")
+
+
+def test_cameras_are_dotted_lines_behind_the_points(cloud):
+    vertex = rows(cloud)["vertex"]["data"]
+    count = len(cloud.surface.vertices)
+    painted = np.stack([vertex[key] for key in ("red", "green", "blue")], axis=1) == CAMERA_COLOR
+    assert len(vertex) == count + 8 * DOTS * len(cloud.cameras)
+    assert painted.all(axis=1)[count:].all()
+    assert set(rows(cloud)) == {"vertex"}
+
+
+def test_open3d_reads_surface_and_points(ball, cloud, tmp_path):
+    o3d = load_open3d()
+    for model in (ball, cloud):
+        (tmp_path / "model.ply").write_bytes(write_ply(model, "model")["model.ply"])
+        mesh = o3d.io.read_triangle_mesh(str(tmp_path / "model.ply"))
+        points = o3d.io.read_point_cloud(str(tmp_path / "model.ply"))
+
+        np.testing.assert_array_equal(np.asarray(mesh.triangles), model.surface.faces)
+        assert mesh.has_vertex_normals() == bool(len(model.surface.faces))
+        count = len(model.surface.vertices)
+        np.testing.assert_allclose(np.asarray(points.points)[:count], model.surface.vertices, atol=1e-6)
+        np.testing.assert_allclose(255 * np.asarray(points.colors)[:count], model.surface.colors, atol=0.01)
 
 
 def lines(files, start):
@@ -58,7 +106,6 @@ def test_normal_maps_are_beside_the_pages_and_the_model_is_lit(lit_ball):
 
 def test_without_a_texture_vertices_carry_the_colors(ball):
     files = write_obj(ball, "model")
-
     v = np.array(lines(files, "v"), float)
     assert list(files) == ["model.obj"]
     np.testing.assert_allclose(255 * v[:, 3:], ball.surface.colors, atol=0.02)
@@ -66,7 +113,6 @@ def test_without_a_texture_vertices_carry_the_colors(ball):
 
 def test_points_and_cameras(cloud):
     files = write_obj(cloud, "model")
-
     assert len(lines(files, "p")) == len(cloud.surface.vertices)
     assert len(lines(files, "l")) == 8 * len(cloud.cameras)
     assert np.array(lines(files, "l"), int).max() == len(lines(files, "v"))
@@ -75,9 +121,7 @@ def test_points_and_cameras(cloud):
 @pytest.mark.parametrize("size", [1e-3, 1.0, 250.0, 1e7])
 def test_coordinates_are_as_exact_as_the_model_is_large(ball, size):
     surface = Surface(size * ball.surface.vertices, ball.surface.faces, ball.surface.colors)
-
     v = np.array(lines(write_obj(Model(surface), "model"), "v"), float)[:, :3]
-
     error = np.abs(v - surface.vertices).max() / size
     assert error < 10.0**-DIGITS
     assert size >= 1e7 or error > 0
@@ -95,3 +139,24 @@ def test_trimesh_and_open3d_show_both_pages(textured_ball, tmp_path):
     np.testing.assert_allclose(colors, [(30, 60, 200), (200, 40, 30)], atol=4)
     assert sum(len(part.mesh.triangles) for part in model.meshes) == len(textured_ball.surface.faces)
     assert sum(material.albedo_img is not None for material in model.materials) == 2
+
+
+def test_a_ball_of_a_meter_is_closed_and_of_a_thousand_millimeters(ball):
+    (data,) = write_stl(ball, "model").values()
+    mesh = trimesh.load(io.BytesIO(data), file_type="stl")
+    assert len(data) == 84 + 50 * len(ball.surface.faces) and not data.startswith(b"solid")
+    assert mesh.is_watertight and mesh.volume > 0  # inside out, it would be below
+    np.testing.assert_allclose(mesh.extents, 2000.0, rtol=1e-3)
+    assert np.sum(mesh.face_normals * mesh.triangles_center, axis=1).min() > 950
+
+
+def test_what_is_up_in_the_model_is_up_in_the_printer(ball):
+    rows = np.frombuffer(write_stl(ball, "model")["model.stl"], "(3,)<f4,(3,3)<f4,<u2", offset=84)
+    x, y, z = ball.surface.vertices[ball.surface.faces].transpose(2, 0, 1)
+    np.testing.assert_allclose(rows["f1"], 1000 * np.stack([x, -z, y], axis=-1), atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(rows["f0"], axis=1), 1, atol=1e-6)
+
+
+def test_points_have_no_stl(cloud):
+    with pytest.raises(ReconstructionError, match="triangles only"):
+        write_stl(cloud, "model")

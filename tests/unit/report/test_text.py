@@ -1,9 +1,91 @@
+"""Results in sentences."""
+
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from sfm_app.report.text import scene_lines, scene_summary
-from sfm_app.types import CameraModel, Scene
+from sfm_app.camera.bearings import field_of_view_deg
+from sfm_app.camera.models import camera_matrix
+from sfm_app.report.text import (
+    center_text,
+    field_text,
+    focal_text,
+    held_text,
+    lens_text,
+    scene_lines,
+    scene_summary,
+    verdict,
+)
+from sfm_app.types import Calibration, CameraModel, Scene
+
+
+def camera(fx=500.0, fy=500.0, cx=500.0, cy=400.0, **values):
+    values = {"method": "zero-curves", "identifiable": True} | values
+    return Calibration(camera_matrix(fx, fy, cx, cy), 1000, 800, **values)
+
+
+def test_the_field_of_view_counts_from_the_optical_center():
+    across, down = field_of_view_deg(camera(cx=0.0))
+    assert across == pytest.approx(np.degrees(np.arctan(2.0)))
+    assert down == pytest.approx(2 * np.degrees(np.arctan(0.8)))
+
+
+def test_the_focal_says_how_sure_it_is_and_how_wide_it_sees():
+    assert focal_text(camera(spread={"fx": 2.4})) == (
+        "Focal length 500 px +- 2: the camera sees 90 degrees from left to right, 77 from top to bottom."
+    )
+    assert "pixels are 1.250 times as high as wide" in focal_text(camera(fx=625.0))
+    assert "pixels" not in focal_text(camera(fx=501.0, held=("aspect",)))
+
+
+def test_wide_lenses_say_what_they_see():
+    wide = camera(fx=400.0, fy=400.0, projection="fisheye", fisheye=(0.0, 0.0, 0.0, 0.0))
+    narrow = camera(fx=900.0, fy=900.0, projection="fisheye", fisheye=(0.0, 0.0, 0.0, 0.0))
+    panorama = camera(projection="equirectangular")
+
+    assert focal_text(wide) == (
+        "Focal length 400 px: a fisheye that sees 143 degrees from left to right, 115 from top to bottom."
+    )
+    assert field_text(narrow) == "sees 64 degrees from left to right, 51 from top to bottom"
+    assert focal_text(panorama) == "360-degree panoramas, 1000 x 800 px." and center_text(panorama) == ""
+    assert verdict(camera(method="given")).startswith("Given: ")
+
+
+def test_distortion_widens_the_field():
+    assert "sees 98 degrees" in field_text(camera(radial=-0.1))
+
+
+@pytest.mark.parametrize(
+    ("cx", "cy", "says"),
+    [
+        (500.2, 399.8, "in the middle of the photo."),
+        (492.0, 404.0, "8 px left of and 4 px below the middle of the photo."),
+        (508.0, 396.0, "8 px right of and 4 px above the middle of the photo."),
+    ],
+)
+def test_the_center_is_relative_to_the_middle(cx, cy, says):
+    assert center_text(camera(cx=cx, cy=cy)) == f"Optical center {says}"
+
+
+def test_a_guess_says_what_it_is_and_why():
+    text = verdict(camera(identifiable=False, method="exif", reason="an orbit"))
+    assert text == "Not known: these photos do not determine the camera: an orbit. Its values are from EXIF."
+
+
+def test_lens_and_assumptions_are_empty_without_content():
+    plain, bent = camera(), camera(radial=-0.12, spread={"k1": 0.004}, held=("center", "aspect"))
+    assert (lens_text(plain), held_text(plain)) == ("", "")
+    assert lens_text(bent) == "The lens bends lines outwards (barrel), k1 -0.120 +- 0.004."
+    assert held_text(bent).endswith("optical center near the middle of the photo, square pixels.")
+    assert held_text(camera(held=("center",), identifiable=False)) == ""
+    assert lens_text(camera(radial=-0.003, held=("k1",))) == ""
+
+
+def test_a_distortion_within_its_deviation_has_no_direction():
+    assert lens_text(camera(radial=0.002, spread={"k1": 0.004})) == "The lens hardly bends lines, k1 0.002 +- 0.004."
+    assert "pincushion" in lens_text(camera(radial=0.009, spread={"k1": 0.004}))
+
 
 K = np.array([[900.0, 0, 320], [0, 901.0, 240], [0, 0, 1]])
 PLACED = {f"{number}.jpg": np.eye(3, 4) for number in range(5)}
@@ -38,7 +120,6 @@ def test_people_read_how_many_photos_are_placed_how_and_how_sure_the_camera_is()
 
 def test_parts_and_their_wrong_joins_are_describe():
     text, _ = describe(mapper="parts", parts=[{"dropped_joins": [{}, {}]}, {"dropped_joins": []}])
-
     assert "mapped in parts, then joined: it explains more\n" in text
     assert text.count("rejected joins between parts, which other joins or matches contradict: 2") == 1
     assert "joins between parts" not in describe(parts=[{"dropped_joins": []}])[0]
@@ -59,13 +140,11 @@ def test_other_models_and_cuts_are_named():
 
 def test_a_model_that_many_matches_contradict_comes_with_a_warning():
     text, _ = describe(contradicted_matches=300)
-
     assert "beware: 25 % of the matches between these photos contradict the model" in text
 
 
-def test_what_finer_features_brought_is_said():
+def test_the_result_of_the_feature_retry_is_named():
     result = {"photos": ["x.jpg", "y.jpg"], "pairs": 9, "placed": [3, 5], "taken": True}
-
     text, summary = describe(second_look=result)
     assert "retried 2 unplaced photos with finer features: 5 photos placed instead of 3\n" in text
     assert summary["second_look"]["pairs"] == 9
@@ -76,13 +155,11 @@ def test_what_finer_features_brought_is_said():
 
 def test_meters_are_named():
     text, _ = describe(orientation=COUNTS["orientation"] | {"unit": "meter"})
-
     assert "in meters by GPS" in text
 
 
 def test_a_model_that_may_stand_the_wrong_way_up_comes_with_a_remedy():
     unsure = COUNTS["orientation"] | {"up_sign_odds": 2.3, "up_axis_odds": 900.0, "photos_turned_deg": 270}
-
     assert "beware: the model may stand upside down (odds 2.3 to 1 against)" in describe(orientation=unsure)[0]
     assert "run again with --set scene.photo_rotation_deg=90" in describe(orientation=unsure)[0]
     lying = describe(orientation=unsure | {"up_sign_odds": 70.0, "up_axis_odds": 1.5, "photos_turned_deg": 0})[0]
@@ -90,7 +167,7 @@ def test_a_model_that_may_stand_the_wrong_way_up_comes_with_a_remedy():
     assert "beware" not in describe(orientation=unsure | {"up_sign_odds": 70.0})[0]
 
 
-def test_what_the_last_adjustment_could_not_do_is_said():
+def test_a_failed_adjustment_is_named():
     text, summary = describe(
         adjustment={"failed": "only 3 of 900 points remain", "failed_in_other_models": {"2": "no"}, "cameras_held": ["one"]}
     )
@@ -104,13 +181,12 @@ def test_what_the_last_adjustment_could_not_do_is_said():
 
 def test_a_model_that_could_not_be_turned_upright_says_so():
     text, _ = describe(orientation={"failed": "it has no points", "unit": "that of mapping", "gps": "not used"})
-
     assert "the frame is that of mapping, neither upright nor in meters: it has no points" in text
     unsure, _ = describe(orientation=COUNTS["orientation"] | {"up_deviation_deg": None})
     assert "upright by vanishing lines, with unknown accuracy" in unsure
 
 
-def test_look_alikes_are_named_and_so_is_what_may_be():
+def test_look_alikes_and_possible_look_alikes_are_named():
     first, last = ["a.jpg", "b.jpg"], [f"z{n}.jpg" for n in range(5)]
     join = {"pairs": 12, "between": [first, last], "missing": 0.374}
 
@@ -146,7 +222,6 @@ def test_a_camera_for_each_photo_is_named_where_it_was_tried():
 def test_a_compensated_shutter_is_named_with_its_deviation():
     shutter = {"readout_ms": 20.94, "deviation_ms": 1.6, "interval_ms": 33.3, "compensated": True}
     text, summary = describe(shutter=shutter)
-
     assert "rolling shutter: readout 20.9 +- 1.6 ms of 33 ms per frame; poses are of middle" in text
     assert summary["shutter"] == shutter
 
@@ -154,7 +229,6 @@ def test_a_compensated_shutter_is_named_with_its_deviation():
 def test_why_a_shutter_is_not_compensated_is_said():
     result = {"readout_ms": -0.12, "deviation_ms": 0.31, "interval_ms": 33.3, "compensated": False}
     text, _ = describe(shutter=result | {"because": "none is seen"})
-
     assert "rolling shutter, not compensated: none is seen (-0.1 +- 0.3 ms)\n" in text
     assert "readout" not in text
     assert "shutter" not in describe()[0]
@@ -162,6 +236,5 @@ def test_why_a_shutter_is_not_compensated_is_said():
 
 def test_why_a_shutter_is_not_measured_is_said():
     text, summary = describe(shutter={"compensated": False, "because": "nobody has the time"})
-
     assert "rolling shutter, not compensated: nobody has the time\n" in text
     assert summary["shutter"]["because"] == "nobody has the time"

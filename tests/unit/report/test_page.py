@@ -13,6 +13,8 @@ from sfm_app.report.findings import (
     LARGEST_PX,
     SMALLEST_PX,
     changed_settings,
+    correlation_table,
+    correlation_text,
     glance,
     picture_side,
     unknown_cameras,
@@ -27,7 +29,6 @@ from sfm_app.types import Calibration, CameraModel
 
 def test_three_js_comes_from_an_installed_package_and_ends_before_the_page_that_it_was_in():
     script = three_script()
-
     assert 500_000 < len(script) < 2_000_000
     assert "WebGLRenderer" in script and "GLTFLoader" in script
     assert "B64GLTF" not in script and "</script" not in script.lower()
@@ -37,16 +38,14 @@ def test_three_js_comes_from_an_installed_package_and_ends_before_the_page_that_
     "text", ["</script><script>alert(1)</script>", "<!--", "a\u2028b", "<img src=x onerror=alert(1)>"]
 )
 def test_no_text_ends_the_data_of_the_script(text):
-    found = str(script_data({"name": text}))
-
-    assert "<" not in found and "\u2028" not in found
-    assert json.loads(found) == {"name": text}
+    data = str(script_data({"name": text}))
+    assert "<" not in data and "\u2028" not in data
+    assert json.loads(data) == {"name": text}
 
 
 @pytest.mark.parametrize("count", [1, 20, 200, 5000])
 def test_pictures_of_any_number_of_photos_stay_small(count):
     side = picture_side(count)
-
     assert SMALLEST_PX <= side <= LARGEST_PX
     assert count * side * side * 3 / 4 < max(1.4 * ALL_PIXELS, count * SMALLEST_PX**2)
 
@@ -68,13 +67,11 @@ def test_a_value_has_its_deviation_only_where_it_is_known():
 def test_settings_that_were_changed_are_listed_with_their_defaults():
     given = Settings.from_mapping({"seed": 3, "mesh": {"faces": 1000}}).model_dump()
     contents = SimpleNamespace(manifest={"settings": given})
-
     assert changed_settings(contents) == [("mesh.faces", "1000", str(Settings().mesh.faces)), ("seed", "3", "0")]
 
 
 def test_nothing_is_claimed_of_a_run_without_a_stage():
     contents = SimpleNamespace(scene=None, intrinsics=None, stages={}, counts=lambda _: {})
-
     assert glance(contents) == []
 
 
@@ -89,11 +86,11 @@ def test_a_camera_that_pairs_do_not_determine_comes_with_what_to_do(after):
         adjusted = SimpleNamespace(cameras={"b": CameraModel("PINHOLE", (), K, 640, 480, {"fx": 2.47})})
     contents = SimpleNamespace(intrinsics=SimpleNamespace(cameras={"a": known, "b": camera}), scene=adjusted)
 
-    [said] = unknown_cameras(contents)
+    [text] = unknown_cameras(contents)
 
-    assert said.startswith("Pairs of photos do not determine the camera b: an orbit. A focal of 768 px is a guess")
-    assert ("gives 675.1 ± 2.5 px" in said) == (after is not None)
-    assert "What to do: add photos" in said
+    assert text.startswith("Pairs of photos do not determine the camera b: an orbit. A focal of 768 px is a guess")
+    assert ("gives 675.1 ± 2.5 px" in text) == (after is not None)
+    assert "What to do: add photos" in text
 
 
 def test_a_camera_of_no_placed_photo_is_passed_over():
@@ -101,14 +98,14 @@ def test_a_camera_of_no_placed_photo_is_passed_over():
     camera = Calibration(K, 640, 480, "guess", identifiable=False, reason="an orbit")
     cameras = {"b": CameraModel("PINHOLE", (), K, 640, 480)}
 
-    def said_with(found):
+    def warnings_with(found):
         scene = SimpleNamespace(cameras=found)
         return unknown_cameras(
             SimpleNamespace(intrinsics=SimpleNamespace(cameras={"a": camera, "b": camera}), scene=scene)
         )
 
-    assert [text.split(":")[0][-1] for text in said_with(cameras)] == ["b"]
-    assert len(said_with({})) == 2
+    assert [text.split(":")[0][-1] for text in warnings_with(cameras)] == ["b"]
+    assert len(warnings_with({})) == 2
 
 
 @pytest.mark.parametrize(("unusable", "more"), [(0, ""), (2, "and 2 unusable")])
@@ -142,8 +139,55 @@ def test_a_large_texture_is_shrunk_and_keeps_its_colors(textured_ball):
 def test_normal_maps_are_shrunk_with_their_pages(lit_ball):
     large = np.full((LIGHT_PAGE_PX, 2 * LIGHT_PAGE_PX, 3), (128, 128, 255), np.uint8)
     small = lit_ball.texture.normal_maps[1]
-
     maps = lighten(replace(lit_ball, texture=replace(lit_ball.texture, normal_maps=(large, small)))).texture.normal_maps
-
     assert maps[0].shape == (LIGHT_PAGE_PX // 4, LIGHT_PAGE_PX // 2, 3) and (maps[0] == (128, 128, 255)).all()
     assert maps[1] is small
+
+
+PAIRS = Calibration(
+    np.eye(3), 640, 480, "zero-curves", True, held=("aspect",),
+    correlations={"fx fy": 0.99, "fx cx": 0.1, "fx cy": -0.2, "fx k1": 0.94, "cx cy": 0.0, "cx k1": 0.3,
+                  "cy k1": -0.61},
+)  # fmt: skip
+
+
+def adjusted(determined, params, **correlations):
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+    values = {key.replace("_", " "): value for key, value in correlations.items()}
+    return CameraModel("OPENCV", params, np.eye(3), 640, 480, dict.fromkeys(names, 1.0), determined, values)
+
+
+def test_parameters_that_move_together_are_named_the_strongest_first():
+    table = correlation_table(PAIRS, None)
+
+    assert table.source == "from pairs of photos"
+    assert list(table.names) == ["focal", "cx", "cy", "k1"]
+    assert table.rows[3] == [0.94, 0.3, -0.61, None] and table.rows[1] == [0.1, None, None, None]
+    assert list(table.texts) == [
+        "focal and k1 move together: 0.94",
+        "cy and k1 move against each other: \N{MINUS SIGN}0.61",
+    ]
+
+
+def test_the_last_adjustment_counts_and_terms_that_are_zero_do_not():
+    params = (900.0, 800.0, 320.0, 240.0, -0.1, 0.0, 1e-4, -1e-4)
+    table = correlation_table(PAIRS, adjusted(("aspect", "k1"), params, fx_fy=0.4, fx_k1=-0.3, k1_p1=0.2, fx_k2=0.9))
+    assert table.source == "after the last adjustment"
+    assert list(table.names) == ["fx", "fy", "cx", "cy", "k1", "p1", "p2"]
+    assert list(table.texts) == ["no strong correlation; the strongest is fx with fy, 0.40"]
+
+
+def test_a_long_list_is_cut_and_counted():
+    strong = {f"{a}_{b}": 0.7 for a, b in (("fx", "fy"), ("fx", "cx"), ("fx", "cy"), ("fy", "cx"), ("cx", "cy"))}
+    table = correlation_table(PAIRS, adjusted(("aspect",), (900.0, 900.0, 320.0, 240.0, 0, 0, 0, 0), **strong))
+    assert len(table.texts) == 4 and table.texts[-1] == "and 2 more pairs of parameters"
+
+
+def test_nothing_is_said_where_nothing_is_known():
+    guess = Calibration(np.eye(3), 640, 480, "guess", False, correlations=PAIRS.correlations)
+    assert correlation_table(guess, None) is None
+    assert correlation_table(guess, adjusted((), (0.0,) * 8, fx_k1=0.9)) is None
+
+
+def test_a_correlation_has_two_digits_and_no_negative_zero():
+    assert [correlation_text(value) for value in (-0.001, 0.996, -0.5)] == ["0.00", "1.00", "\N{MINUS SIGN}0.50"]

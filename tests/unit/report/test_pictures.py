@@ -68,8 +68,6 @@ def test_colors_are_even_in_disparity_and_single_wrong_depths_do_not_matter():
 @pytest.mark.parametrize("count", [0, 1, MOST_SHOWN, 1000])
 def test_photos_are_spread_over_the_set(count):
     names = [f"{k:04}" for k in range(count)]
-
     found = spread_names(names, MOST_SHOWN)
-
     assert len(found) == len(set(found)) == min(count, MOST_SHOWN)
     assert not count or (found[0], found[-1]) == (names[0], names[-1])

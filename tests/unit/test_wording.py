@@ -1,10 +1,10 @@
-"""Lengths and points as people write them."""
+"""Lengths, points and lists of names as text."""
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.wording import format_length, parse_length, parse_point
+from sfm_app.wording import format_length, list_names, parse_length, parse_point
 
 
 @pytest.mark.parametrize(
@@ -16,7 +16,7 @@ def test_lengths_are_read(text, meters):
 
 
 @pytest.mark.parametrize("text", ["", "m", "50", "1.2.3m", "-1m", "0", "nan", "inf", "1 parsec", "1m 20", "1e400"])
-def test_what_is_no_length_says_what_one_looks_like(text):
+def test_a_malformed_length_is_refused_with_an_example(text):
     with pytest.raises(ValueError, match="is no length"):
         parse_length(text)
 
@@ -31,6 +31,13 @@ def test_points_are_read():
 
 
 @pytest.mark.parametrize("text", ["", "1,2", "1,2,3,4", "1,2,x", "1,nan,2", "1 2 3"])
-def test_what_is_no_point_says_what_one_looks_like(text):
+def test_a_malformed_point_is_refused_with_an_example(text):
     with pytest.raises(ValueError, match="is no point"):
         parse_point(text)
+
+
+@pytest.mark.parametrize(
+    ("count", "text"), [(0, ""), (1, "a"), (2, "a, b"), (3, "a, b and 1 more"), (5, "a, b and 3 more")]
+)
+def test_the_first_few_are_named(count, text):
+    assert list_names("abcde"[:count], 2) == text

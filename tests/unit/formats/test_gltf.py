@@ -141,7 +141,6 @@ def test_a_normal_map_makes_a_material_lit_and_comes_with_its_frames(lit_ball):
 
 def test_cameras_beside_a_lit_model_stay_unlit(lit_ball, cloud):
     tree, _ = taken_apart(glb_of(replace(lit_ball, cameras=cloud.cameras)))
-
     assert tree["extensionsUsed"] == ["KHR_materials_unlit"]
     assert ["extensions" in one for one in tree["materials"]] == [False, False, True]
 
@@ -161,9 +160,7 @@ def test_corners_keep_their_place_in_the_texture(textured_ball):
 def test_a_page_that_nothing_lies_on_is_left_out(textured_ball):
     texture = textured_ball.texture
     spare = replace(texture, page=texture.page * 2, pages=(texture.pages[0], texture.pages[0], texture.pages[1]))
-
     tree, _ = taken_apart(glb_of(replace(textured_ball, texture=spare)))
-
     assert [image["name"] for image in tree["images"]] == ["page 0", "page 2"]
 
 
@@ -171,9 +168,7 @@ def test_only_corners_on_borders_of_charts_are_split():
     faces = np.array([[0, 1, 2], [2, 1, 3], [3, 1, 4]])
     places = np.random.default_rng(0).random((6, 2)).astype(np.float32)
     uv = places[np.array([[0, 1, 2], [2, 1, 3], [3, 5, 4]])]  # vertex 1 has two places
-
     old, place, new = split_corners(faces, uv)
-
     assert old.tolist() in ([0, 1, 1, 2, 3, 4],)
     np.testing.assert_array_equal(old[new], faces)
     np.testing.assert_array_equal(place[new], uv)
@@ -184,9 +179,7 @@ def test_indices_are_as_small_as_fits(vertices, kind):
     rng = np.random.default_rng(0)
     faces = np.arange(vertices + (-vertices) % 3).reshape(-1, 3) % vertices
     surface = Surface(rng.random((vertices, 3)), faces, np.zeros((vertices, 3), np.uint8))
-
     tree, buffer = taken_apart(glb_of(Model(surface)))
-
     number = tree["meshes"][0]["primitives"][0]["indices"]
     assert tree["accessors"][number]["componentType"] == kind
     assert array(tree, buffer, number).max() == vertices - 1
@@ -195,7 +188,6 @@ def test_indices_are_as_small_as_fits(vertices, kind):
 def test_linear_colors_come_back_as_the_srgb_they_were():
     every = np.arange(256, dtype=np.uint8)
     light = linear_colors(np.column_stack([every, every, every]))
-
     np.testing.assert_allclose(light[[0, 10, 128, 188, 255], 0], [0, 0.003035, 0.215861, 0.502886, 1], atol=1e-6)
     back = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     np.testing.assert_array_equal(np.round(255 * back[:, 1]), every)
@@ -204,9 +196,7 @@ def test_linear_colors_come_back_as_the_srgb_they_were():
 def test_a_triangle_without_area_still_has_a_unit_normal():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, -1], [5, 5, 5]])
     surface = Surface(vertices, np.array([[0, 1, 2], [3, 3, 3]]), np.full((4, 3), 128, np.uint8))
-
     tree, buffer = taken_apart(glb_of(Model(surface)))
-
     normals = array(tree, buffer, tree["meshes"][0]["primitives"][0]["attributes"]["NORMAL"])
     np.testing.assert_allclose(normals, np.tile([0.0, 1, 0], (4, 1)), atol=1e-6)
 
@@ -214,7 +204,6 @@ def test_a_triangle_without_area_still_has_a_unit_normal():
 def test_points_and_cameras(cloud):
     tree, buffer = taken_apart(glb_of(cloud))
     points, frusta = (mesh["primitives"][0] for mesh in tree["meshes"])
-
     assert (points["mode"], "indices" in points, frusta["mode"]) == (0, False, 1)
     np.testing.assert_allclose(array(tree, buffer, points["attributes"]["POSITION"]), cloud.surface.vertices, atol=1e-6)
     assert len(array(tree, buffer, frusta["indices"])) == 2 * 8 * len(cloud.cameras)
@@ -240,14 +229,12 @@ def test_cameras_of_gltf_stand_where_the_photos_were_taken(cloud):
 
 def test_trimesh_shows_the_texture(textured_ball):
     scene = trimesh.load_scene(io.BytesIO(glb_of(textured_ball)), file_type="glb", process=False)
-
     seen = [part.visual.to_color().vertex_colors[:, :3].mean(axis=0) for part in scene.geometry.values()]
     np.testing.assert_allclose(seen, [(200, 40, 30), (30, 60, 200)], atol=4)
 
 
 def test_trimesh_takes_vertex_colors_where_it_skips_materials(ball):
     mesh = trimesh.load(io.BytesIO(glb_of(ball)), file_type="glb", force="mesh", process=False, skip_materials=True)
-
     expected = linear_colors(ball.surface.colors) * 255
     np.testing.assert_allclose(mesh.visual.vertex_colors[:, :3], expected, atol=1)
 
@@ -255,9 +242,7 @@ def test_trimesh_takes_vertex_colors_where_it_skips_materials(ball):
 def test_open3d_reads_all_kinds(model, tmp_path):
     path = tmp_path / "model.glb"
     path.write_bytes(glb_of(model))
-
     read = load_open3d().io.read_triangle_model(str(path))
-
     assert sum(len(part.mesh.triangles) for part in read.meshes) == len(model.surface.faces)
     pictures = [material.albedo_img for material in read.materials if material.albedo_img is not None]
     assert len(pictures) == (len(model.texture.pages) if model.texture else 0)
@@ -266,16 +251,12 @@ def test_open3d_reads_all_kinds(model, tmp_path):
 def test_colors_of_neighboring_charts_stay_apart():
     page = np.zeros((64, 64, 3), np.uint8)
     page[:, ::2], page[:, 1::2] = (220, 30, 30), (30, 30, 220)
-
     back = np.asarray(Image.open(io.BytesIO(jpeg(page)))).astype(float)
-
     assert 0 < np.abs(back - page).mean() < 6
 
 
 def test_a_page_of_noise_is_written_too():
     page = np.random.default_rng(0).integers(0, 255, (200, 300, 3), np.uint8)
-
     data = jpeg(page)
-
     assert len(data) > page.shape[0] * page.shape[1]  # more than Pillow expects
     assert np.abs(np.asarray(Image.open(io.BytesIO(data))).astype(int) - page).mean() < 10

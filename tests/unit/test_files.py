@@ -1,3 +1,5 @@
+"""Atomic writes, hashes, and arrays from files."""
+
 import zipfile
 from pathlib import PureWindowsPath
 
@@ -5,21 +7,28 @@ import numpy as np
 import pytest
 
 from sfm_app import files
-from sfm_app.files import MOST_BYTES, digest_files, fingerprint, is_below, load_arrays
+from sfm_app.files import MOST_BYTES, digest_files, fingerprint, is_below, load_arrays, replace_atomically
+
+
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
+    target = tmp_path / "x.txt"
+    target.write_text("old")
+    with pytest.raises(RuntimeError), replace_atomically(target) as path:
+        path.write_text("half")
+        raise RuntimeError
+    assert target.read_text() == "old"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["x.txt"]
 
 
 def test_arrays_come_back(tmp_path):
     np.savez_compressed(tmp_path / "x.npz", a=np.arange(5), b=np.array(["x", "yz"]), c=np.zeros(10_000_000, bool))
-
     found = load_arrays(tmp_path / "x.npz")
-
     assert sorted(found) == ["a", "b", "c"]
     assert found["a"].tolist() == list(range(5)) and found["b"].tolist() == ["x", "yz"]
 
 
 def test_objects_are_refused(tmp_path):
     np.savez(tmp_path / "x.npz", a=np.array([{"an": "object"}], object))
-
     with pytest.raises(ValueError, match="allow_pickle"):
         load_arrays(tmp_path / "x.npz")
 
@@ -91,5 +100,4 @@ def test_fingerprints_ignore_order_of_keys_only():
 )
 def test_drives_and_roots_of_windows_lead_out_of_the_folder(monkeypatch, name, below):
     monkeypatch.setattr(files, "PurePath", PureWindowsPath)
-
     assert is_below(name) == below

@@ -51,7 +51,6 @@ def test_a_group_ends_when_the_one_that_started_it_is_killed(without, taken):
         members = [psutil.Process(int(number)) for number in parent.stdout.readline().split()]
         assert len(members) == 2 and all(runs(member) for member in members)
         parent.kill()
-
     assert all(ends(member) for member in members)
 
 
@@ -88,7 +87,6 @@ def test_a_process_without_a_group_ends_itself_last(without, monkeypatch):
     monkeypatch.setattr(operating_system.os, "_exit", lambda code: killed.append(f"exit {code}"))
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
         end_own_group()
-
     assert killed == [child.pid, os.getpid(), "exit 1"]
 
 
@@ -96,7 +94,6 @@ def test_ctrl_c_does_not_reach_a_group(without, monkeypatch):
     assert lacks(Ability.GROUPS) or group_options() == {"start_new_session": True}
     without(Ability.GROUPS)
     monkeypatch.setattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0x200, raising=False)
-
     assert group_options() == {"creationflags": 0x200}
 
 
@@ -152,7 +149,6 @@ def test_a_process_that_a_library_ends_cleans_nothing_up_while_its_threads_work(
     done = subprocess.run(
         [sys.executable, "-c", LIBRARY_EXITS.format(first)], capture_output=True, text=True, check=False
     )
-
     assert (done.returncode, done.stdout.strip()) == (7, said)
 
 
@@ -160,9 +156,7 @@ def test_without_exit_handlers_the_c_library_is_left_alone(without, monkeypatch)
     asked = []
     monkeypatch.setattr(operating_system.ctypes, "CDLL", asked.append)
     without(Ability.EXIT_HANDLERS)
-
     end_at_exit()
-
     assert asked == []
 
 

@@ -1,0 +1,225 @@
+"""`sfm-app view`: point levels, resources of the page, and the server."""
+
+import http.client
+import io
+import os
+import signal
+import sys
+from threading import Thread
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sfm_app.errors import ConfigError
+from sfm_app.progress import SilentProgress
+from sfm_app.report import server as serving
+from sfm_app.report.server import (
+    BYTES,
+    GLB,
+    HTML,
+    JPEG,
+    LARGE_PX,
+    LOOPBACK,
+    SMALL_PX,
+    RunResources,
+    open_server,
+    point_levels,
+    serve_run,
+)
+from sfm_app.types import Model, Surface
+
+PAGE = b"<!DOCTYPE html><title>a page</title>"
+
+
+@pytest.fixture
+def resources(tmp_path):
+    """A page, a model, 30 points and two photos, the second of which is gone."""
+    root = tmp_path / "out"
+    (root / "photos").mkdir(parents=True)
+    (tmp_path / "secret.txt").write_text("secret", encoding="utf-8")
+    (root / "model.glb").write_bytes(b"glTF" * 1000)
+    Image.new("RGB", (3000, 1500), (200, 30, 30)).save(root / "photos" / "a b.jpg")
+    points = Surface(np.zeros((30, 3)), np.zeros((0, 3), np.int64), np.zeros((30, 3), np.uint8))
+    workspace = SimpleNamespace(root=root, photos=root / "photos")
+    contents = SimpleNamespace(run=SimpleNamespace(workspace=workspace), stages={"files": {}}, counts=lambda _: {})
+    made = RunResources(contents, ["a b.jpg", "gone.jpg"], Model(points))
+    made.__dict__["page"] = PAGE
+    return made
+
+
+def surface(count):
+    places = np.column_stack([np.arange(count), np.zeros(count), np.ones(count)]).astype(float)
+    colors = np.column_stack([np.arange(count) % 251, np.zeros(count), np.full(count, 7)]).astype(np.uint8)
+    return Surface(places, np.zeros((0, 3), np.int64), colors)
+
+
+def unpack(data, count):
+    return np.frombuffer(data, "<f4", 3 * count).reshape(-1, 3), np.frombuffer(data, np.uint8, offset=12 * count)
+
+
+def test_levels_have_every_point_once_with_its_color():
+    found = point_levels(surface(150), first=20)
+
+    assert found.counts == [20, 40, 80, 10]
+    parts = [unpack(found.pack(level), count) for level, count in enumerate(found.counts)]
+    x = np.concatenate([places[:, 0] for places, _ in parts])
+    colors = np.concatenate([colors.reshape(-1, 3) for _, colors in parts])
+    np.testing.assert_array_equal(np.sort(x), np.arange(150))
+    np.testing.assert_array_equal(colors[:, 0], x % 251)
+    assert (colors[:, 2] == 7).all()
+
+
+def test_the_first_level_is_spread_over_the_scene():
+    found = point_levels(surface(100_000))
+    x = unpack(found.pack(0), found.counts[0])[0][:, 0]
+    assert abs(x.mean() / 100_000 - 0.5) < 0.02 and x.min() < 100 and x.max() > 99_900
+
+
+def test_a_level_that_is_not_there_is_an_error_and_no_points_are_no_levels():
+    assert point_levels(surface(0)).counts == []
+    for level in (-1, 1):
+        with pytest.raises(IndexError, match="no level"):
+            point_levels(surface(5)).pack(level)
+
+
+def test_the_page_its_model_and_its_points_have_addresses(resources):
+    assert resources.find("/").kind == HTML and resources.find("/?x=1").content == resources.page
+    assert (resources.find("/model.glb").kind, resources.find("/model.glb").content.name) == (GLB, "model.glb")
+    assert resources.find("/points/0").kind == BYTES and len(resources.find("/points/0").content) == 30 * 15
+
+
+@pytest.mark.parametrize(("kind", "side"), [("pictures", SMALL_PX), ("photos", LARGE_PX)])
+def test_photos_have_a_small_and_a_large_picture(resources, kind, side):
+    found = resources.find(f"/{kind}/0")
+    assert found.kind == JPEG and Image.open(io.BytesIO(found.content)).size == (side, side // 2)
+    assert resources.find(f"/{kind}/1") is None
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "", "/../secret.txt", "/photos/../../secret.txt", "/photos/a%20b.jpg", "/photos/a b.jpg", "/photos/2",
+        "/photos/-1",
+        "/photos/0/../0", "/points/1", "/points/9999999999", "/manifest.json", "/secret.txt", "//model.glb",
+        "/%2e%2e/secret.txt", "http://127.0.0.1/", "/photos/\u0660",
+    ],
+)  # fmt: skip
+def test_nothing_else_has_an_address(resources, address):
+    assert resources.find(address) is None
+
+
+def test_a_lighter_model_is_made_once_and_only_for_a_large_model(resources):
+    made = []
+    resources.make_light = lambda contents: made.append(contents) or b"light"
+    assert resources.find("/light.glb") is None and made == []
+    resources.most_bytes = 10
+    assert [resources.find("/light.glb").content for _ in range(2)] == [b"light"] * 2 and len(made) == 1
+
+
+def test_a_lighter_model_that_fails_has_no_address(resources):
+    def fail(contents):
+        raise ValueError("no texture")
+
+    resources.most_bytes, resources.make_light = 10, fail
+
+    assert resources.find("/light.glb") is None
+
+
+@pytest.fixture
+def server(resources):
+    """A server that runs until the test ends."""
+    with open_server(resources) as found:
+        thread = Thread(target=found.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        yield found
+        found.shutdown()
+        thread.join()
+
+
+def ask(server, address="/", method="GET", **headers):
+    """Send one request, with its path as it is, and return the answer and its body."""
+    connection = http.client.HTTPConnection(LOOPBACK, server.port, timeout=20)
+    connection.putrequest(method, address, skip_host="Host" in headers)
+    for name, value in headers.items():
+        connection.putheader(name, value)
+    connection.endheaders()
+    answer = connection.getresponse()
+    body = answer.read()
+    connection.close()
+    return answer, body
+
+
+def test_a_browser_of_this_machine_gets_the_page(server, resources):
+    assert server.address == f"http://127.0.0.1:{server.port}/" and server.server_address[0] == LOOPBACK
+    for host in (f"127.0.0.1:{server.port}", f"localhost:{server.port}"):
+        answer, body = ask(server, Host=host)
+        assert (answer.status, body) == (200, resources.page)
+        assert answer.headers["Content-Type"] == "text/html; charset=utf-8"
+        assert answer.headers["Cross-Origin-Resource-Policy"] == "same-origin"
+
+
+def test_files_are_sent_whole_and_heads_without_a_body(server, resources):
+    answer, body = ask(server, "/model.glb")
+    assert (answer.status, body) == (200, b"glTF" * 1000)
+    answer, body = ask(server, "/model.glb", "HEAD")
+    assert (answer.headers["Content-Length"], body) == ("4000", b"")
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:{port}", "127.0.0.1:1", "127.0.0.1", "[::1]:{port}", ""]
+)
+def test_other_hosts_are_refused(server, host):
+    answer, body = ask(server, Host=host.format(port=server.port))
+    assert answer.status == 403 and b"only for the machine" in body
+
+
+def test_two_hosts_in_one_request_are_refused(server):
+    connection = http.client.HTTPConnection(LOOPBACK, server.port, timeout=20)
+    connection.putrequest("GET", "/")  # with its own host
+    connection.putheader("Host", "evil.example")
+    connection.endheaders()
+    assert connection.getresponse().status == 403
+    connection.close()
+
+
+@pytest.mark.parametrize(
+    "address", ["/../secret.txt", "/photos/../../secret.txt", "/..%2fsecret.txt", "/manifest.json"]
+)
+def test_files_that_the_page_does_not_load_are_not_there(server, address):
+    answer, body = ask(server, address)
+    assert answer.status == 404 and b"secret" not in body
+
+
+def test_nothing_can_be_sent_to_it(server):
+    assert ask(server, "/", "POST")[0].status == 501
+
+
+def test_a_port_that_is_taken_is_an_error_that_says_so(server, resources):
+    with pytest.raises(ConfigError, match=f"port {server.port} is taken") as caught:
+        open_server(resources, server.port)
+    assert "free one" in caught.value.hint
+    with pytest.raises(ConfigError, match="port 70000 cannot be used"):
+        open_server(resources, 70_000)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are another thing there")
+def test_ctrl_c_ends_it(resources, monkeypatch):
+    monkeypatch.setattr(serving, "read_resources", lambda _: resources)
+    answers = []
+
+    def browse(address):
+        port = int(address.rstrip("/").rpartition(":")[2])
+        answers.append(ask(SimpleNamespace(port=port))[0].status)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        serve_run(
+            SimpleNamespace(progress=SilentProgress()), 0, lambda address: Thread(target=browse, args=[address]).start()
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+    assert answers == [200]

@@ -1,0 +1,259 @@
+"""Abilities of systems, links and open files, libraries of wheels, cores, memory and time."""
+
+import os
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import PIL
+import psutil
+import pytest
+
+from sfm_app import operating_system
+from sfm_app.operating_system import (
+    VARIABLE,
+    Ability,
+    ChildTimes,
+    cpu_seconds,
+    find_abilities,
+    find_in_wheel,
+    free_memory_mb,
+    is_link,
+    lacks,
+    link_or_copy,
+    machine_memory_mb,
+    missing_abilities,
+    move,
+    replace_file,
+    share_bytes,
+    usable_cores,
+    yield_to_others,
+)
+
+
+@pytest.mark.parametrize(
+    ("platform", "has", "misses"),
+    [
+        ("linux", Ability.CONTAINERS, None),
+        ("darwin", Ability.GROUPS, Ability.CORES),
+        ("win32", Ability.LINKS, Ability.CLOSED_INPUT),
+        ("freebsd14", Ability.CLOSED_INPUT, Ability.CONTAINERS),
+    ],
+)
+def test_every_system_has_its_own(platform, has, misses):
+    found = find_abilities(platform, {})
+    assert has in found and misses not in found
+
+
+def test_the_environment_takes_abilities_away():
+    found = find_abilities("linux", {VARIABLE: "links, process groups,"})
+    assert set(Ability) - found == {Ability.LINKS, Ability.GROUPS}
+    assert find_abilities("linux", {VARIABLE: ",".join(Ability)}) == frozenset()
+
+
+def test_a_misspelled_ability_is_refused():
+    with pytest.raises(ValueError, match="lnks"):
+        find_abilities("linux", {VARIABLE: "lnks"})
+
+
+def test_missing_abilities_have_names(without):
+    before = missing_abilities()
+    without(Ability.LINKS)
+    assert lacks(Ability.LINKS) and set(missing_abilities()) == {*before, "links"}
+
+
+NO_LINKS = [None, Ability.LINKS]
+
+
+@pytest.fixture
+def photo(tmp_path):
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(b"light")
+    return path
+
+
+@pytest.mark.skipif(os.name == "nt" or lacks(Ability.LINKS), reason="Windows asks for a right")
+def test_a_link_leads_to_the_file(photo, tmp_path):
+    link_or_copy(tmp_path / "place", "photo.jpg", photo)
+    assert is_link(tmp_path / "place") and (tmp_path / "place").resolve() == photo.resolve()
+
+
+@pytest.mark.parametrize("refused", [True, False])
+def test_without_links_the_bytes_are_copied_and_the_photo_is_safe(photo, tmp_path, without, monkeypatch, refused):
+    if refused:  # the system knows links, but not here
+        monkeypatch.setattr("pathlib.Path.symlink_to", refuse)
+    else:
+        without(Ability.LINKS)
+    link_or_copy(tmp_path / "place", photo, photo)
+
+    assert not is_link(tmp_path / "place") and (tmp_path / "place").read_bytes() == b"light"
+    (tmp_path / "place").write_bytes(b"dark")
+    assert photo.read_bytes() == b"light"
+
+
+@pytest.mark.parametrize("taken", [(), (Ability.LINKS,)])
+def test_an_existing_link_is_not_written_through(photo, tmp_path, without, taken):
+    without(*taken)
+    (tmp_path / "other.jpg").write_bytes(b"another")
+    (tmp_path / "place").symlink_to("other.jpg")
+    with pytest.raises(FileExistsError):
+        link_or_copy(tmp_path / "place", photo, photo)
+    assert (tmp_path / "other.jpg").read_bytes() == b"another"
+
+
+@pytest.mark.parametrize(("taken", "names"), [((), 1 if lacks(Ability.HARD_LINKS) else 2), ((Ability.HARD_LINKS,), 1)])
+def test_bytes_are_shared_where_they_can_be(photo, tmp_path, without, taken, names):
+    without(*taken)
+    share_bytes(photo, tmp_path / "other")
+    assert (tmp_path / "other").read_bytes() == b"light" and photo.stat().st_nlink == names
+
+
+def test_bytes_are_copied_where_sharing_is_refused(photo, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "link", refuse)
+    share_bytes(photo, tmp_path / "other")
+    assert (tmp_path / "other").read_bytes() == b"light" and photo.stat().st_nlink == 1
+
+
+def test_a_junction_is_a_link(photo, monkeypatch):
+    monkeypatch.setattr(stat, "IO_REPARSE_TAG_MOUNT_POINT", 0xA0000003, raising=False)
+    found = SimpleNamespace(st_mode=stat.S_IFDIR, st_reparse_tag=0xA0000003)
+    assert is_link(SimpleNamespace(lstat=lambda: found))
+    assert not is_link(photo) and not is_link(photo.parent / "nothing")
+
+
+@pytest.mark.parametrize("act", [replace_file, move])
+def test_moves_wait_for_a_file_that_is_open(photo, tmp_path, without, monkeypatch, act):
+    without(Ability.OPEN_FILES)
+    slept = block_moves(monkeypatch, times=3)
+    act(photo, tmp_path / "new")
+    assert (tmp_path / "new").read_bytes() == b"light" and not photo.exists()
+    assert slept == list(operating_system.WAITS_S[:3])
+
+
+def test_a_file_that_is_never_free_is_an_error(photo, tmp_path, without, monkeypatch):
+    without(Ability.OPEN_FILES)
+    slept = block_moves(monkeypatch, times=100)
+    with pytest.raises(PermissionError):
+        replace_file(photo, tmp_path / "new")
+    assert slept == list(operating_system.WAITS_S) and photo.exists()
+
+
+def test_elsewhere_a_refusal_is_final(photo, tmp_path, monkeypatch):
+    monkeypatch.setattr("sfm_app.operating_system.HERE", frozenset(Ability))
+    slept = block_moves(monkeypatch, times=1)
+    with pytest.raises(PermissionError):
+        replace_file(photo, tmp_path / "new")
+    assert slept == []
+
+
+def refuse(*_arguments, **_options):
+    raise OSError("no links here")
+
+
+def block_moves(monkeypatch, times):
+    """Refuse so many attempts to move a file, and return the list of the seconds that were waited."""
+    slept, refused = [], []
+    monkeypatch.setattr(operating_system.time, "sleep", slept.append)
+    for name, real in (("replace", os.replace), ("rename", os.rename)):
+
+        def attempt(path, target, real=real):
+            if len(refused) < times:
+                refused.append(path)
+                raise PermissionError("another program looks at it")
+            real(path, target)
+
+        monkeypatch.setattr(f"pathlib.Path.{name}", attempt)
+    return slept
+
+
+PILLOW = Path(PIL.__file__).parent
+
+
+@pytest.mark.skipif(
+    not any(find_in_wheel(PILLOW, "pillow", "libtiff")), reason="this Pillow has no libraries of its own"
+)
+def test_libraries_in_wheels_are_found_unless_there_are_none(without):
+    assert [hasattr(library, "TIFFOpen") for library in find_in_wheel(PILLOW, "pillow", "libtiff")] == [True]
+    assert list(find_in_wheel(PILLOW, "pillow", "libnothing")) == []
+    without(Ability.WHEEL_LIBRARIES)
+    assert list(find_in_wheel(PILLOW, "pillow", "libtiff")) == []
+
+
+BUSY = "import time\nwhile time.process_time() < 0.5: pass\nprint(flush=True); input()"
+
+
+def test_cores_are_those_that_may_be_used(without, monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _process: {3, 5, 7}, raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    monkeypatch.setattr("sfm_app.operating_system.HERE", frozenset(Ability))
+    assert usable_cores() == 3
+
+    without(Ability.CORES)
+    assert usable_cores() == 8
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    assert usable_cores() == 1
+
+
+@pytest.mark.parametrize(("limit", "megabytes"), [("512000000\n", 512.0), ("max\n", None), (None, None)])
+def test_a_container_has_less_memory(tmp_path, without, monkeypatch, limit, megabytes):
+    file, whole = tmp_path / "memory.max", psutil.virtual_memory().total / 1e6
+    monkeypatch.setattr(operating_system, "CONTAINER_LIMIT", file)
+    monkeypatch.setattr("sfm_app.operating_system.HERE", frozenset(Ability))
+    if limit:
+        file.write_text(limit)
+
+    assert machine_memory_mb() == (megabytes or whole) and 0 < free_memory_mb() <= (megabytes or whole)
+    without(Ability.CONTAINERS)
+    assert machine_memory_mb() == whole
+
+
+def test_times_of_children_are_looked_at_where_nobody_adds_them_up(without):
+    without(Ability.CHILD_TIMES)
+    times, before = ChildTimes(), cpu_seconds()
+    with subprocess.Popen([sys.executable, "-c", BUSY], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as busy:
+        busy.stdout.readline()
+        times.look([psutil.Process(busy.pid)])
+        times.look([psutil.Process(busy.pid)])  # twice is not more
+    assert 0.45 <= times.seconds() < 0.9
+    assert cpu_seconds() - before < 0.4
+
+
+def test_times_of_children_are_not_counted_twice(monkeypatch):
+    monkeypatch.setattr("sfm_app.operating_system.HERE", frozenset(Ability))
+    times = ChildTimes()
+    times.look([psutil.Process()])
+    assert times.seconds() == 0.0
+    assert cpu_seconds() == pytest.approx(sum(os.times()[:4]), abs=0.1)
+
+
+def test_a_child_that_is_gone_is_no_error(without):
+    without(Ability.CHILD_TIMES)
+    times = ChildTimes()
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        gone = psutil.Process(process.pid)
+    times.look([gone])
+    assert times.seconds() == 0.0
+
+
+def test_other_processes_come_first(monkeypatch):
+    values = []
+    monkeypatch.setattr(os, "nice", values.append, raising=False)
+    yield_to_others(10)
+    assert values == [10]
+
+    monkeypatch.delattr(os, "nice")
+    monkeypatch.setattr(psutil, "BELOW_NORMAL_PRIORITY_CLASS", 16384, raising=False)
+    monkeypatch.setattr(psutil.Process, "nice", lambda _process, value: values.append(value))
+    yield_to_others(10)
+    assert values == [10, 16384]
+
+
+def test_time_passes():
+    start = cpu_seconds()
+    until = time.process_time() + 0.05
+    while time.process_time() < until:
+        pass
+    assert 0.03 <= cpu_seconds() - start < 1.0
