@@ -22,7 +22,7 @@ from sfm_app.colmap.dense import (
 )
 from sfm_app.colmap.features import find_and_match
 from sfm_app.colmap.surface import FUSED, fuse, open_points, positions
-from sfm_app.photos import save_mask
+from sfm_app.photos.masks import save_mask
 from sfm_app.progress import SilentProgress
 from sfm_app.settings import MatchSettings
 from sfm_app.stereo import DepthEstimate, DepthMap

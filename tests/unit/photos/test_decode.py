@@ -9,8 +9,7 @@ import pytest
 from PIL import Image, features
 
 from sfm_app.operating_system import Ability, find_in_wheel
-from sfm_app.photos import UnreadableError, read_picture, upright_image
-from sfm_app.photos.decode import FORMATS, _install_handler
+from sfm_app.photos.decode import FORMATS, UnreadableError, _install_handler, read_picture, upright_image
 
 LIBTIFF = list(find_in_wheel(Path(PIL.__file__).parent, "pillow", "libtiff"))
 

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from sfm_app.errors import InputError
-from sfm_app.photos import list_files, resolve_file
+from sfm_app.photos.files import list_files, resolve_file
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sfm_app.errors import InputError
-from sfm_app.photos import fill_masked, find_mask, lay_out_mask, list_masks, read_mask, unused_masks
+from sfm_app.photos.masks import fill_masked, find_mask, lay_out_mask, list_masks, read_mask, unused_masks
 from sfm_app.types import Photo, UnusablePhoto
 
 USED = np.zeros((40, 60), bool)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from sfm_app.errors import ConfigError, InputError
-from sfm_app.photos import read_source
+from sfm_app.photos.source import read_source
 from sfm_app.settings import PhotoSettings, Settings
 from sfm_app.types import Photo, PhotoSet
 

@@ -6,7 +6,9 @@ import pytest
 from PIL import Image
 
 from sfm_app.operating_system import Ability, lacks
-from sfm_app.photos import UnreadableError, assign_names, group_by_camera, is_laid_out, lay_out
+from sfm_app.photos.decode import UnreadableError
+from sfm_app.photos.probe import group_by_camera
+from sfm_app.photos.source import assign_names, is_laid_out, lay_out
 from sfm_app.types import Photo
 
 PIXELS = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)

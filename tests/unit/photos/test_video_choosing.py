@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.photos import CornerTracker, TrackedFrame, select_keyframes
+from sfm_app.photos.video import CornerTracker, TrackedFrame, select_keyframes
 
 pytestmark = pytest.mark.slow
 

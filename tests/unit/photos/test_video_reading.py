@@ -7,7 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm_app.photos import UnreadableError, is_video, open_video, read_head, video
+from sfm_app.photos import video
+from sfm_app.photos.decode import UnreadableError
+from sfm_app.photos.files import is_video, read_head
+from sfm_app.photos.video import open_video
 
 pytestmark = pytest.mark.slow
 
@@ -114,7 +117,8 @@ def test_a_file_without_its_index_is_damaged(tmp_path):
 def test_ffmpeg_is_silent(tmp_path):
     """In a process of its own: FFmpeg learns how much to say when it is first used."""
     paths = [write(tmp_path / name, code) for name, code in (("a.avi", "MJPG"), ("a.mkv", "MJPG"), ("a.mp4", "mp4v"))]
-    script = "import sys, pathlib, contextlib; from sfm_app.photos import open_video, UnreadableError\n"
+    script = "import sys, pathlib, contextlib; from sfm_app.photos.decode import UnreadableError\n"
+    script += "from sfm_app.photos.video import open_video\n"
     script += "for name in sys.argv[1:]:\n"
     script += " with contextlib.suppress(UnreadableError), open_video(pathlib.Path(name)) as found:\n"
     script += "  print(len(list(found.small_frames())))"

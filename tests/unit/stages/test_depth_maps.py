@@ -12,7 +12,7 @@ from sfm_app.colmap.dense import MASKED, DenseStore, read_depth, read_views
 from sfm_app.errors import ConfigError, ReconstructionError
 from sfm_app.files import UNFINISHED
 from sfm_app.meshing.visibility import SKY
-from sfm_app.photos import save_mask
+from sfm_app.photos.masks import save_mask
 from sfm_app.plugins import DepthMethod, hookimpl, load_plugins
 from sfm_app.progress import SilentProgress
 from sfm_app.settings import DepthSettings, Settings

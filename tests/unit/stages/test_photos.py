@@ -7,7 +7,8 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from sfm_app.errors import InputError
-from sfm_app.photos import read_photo, read_source
+from sfm_app.photos.probe import read_photo
+from sfm_app.photos.source import read_source
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor

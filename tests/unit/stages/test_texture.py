@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfm_app.photos import save_mask
+from sfm_app.photos.masks import save_mask
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import texture

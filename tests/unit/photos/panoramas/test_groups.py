@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfm_app.photos import group_by_camera
+from sfm_app.photos.probe import group_by_camera
 from sfm_app.types import Photo
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfm_app.photos import drop_duplicates
+from sfm_app.photos.selection import drop_duplicates
 from sfm_app.photos.selection import measure_photo as look
 from sfm_app.types import Photo
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw, ImageFilter
 
-from sfm_app.photos import drop_unusable
-from sfm_app.photos.selection import measure_photo
+from sfm_app.photos.selection import drop_unusable, measure_photo
 from sfm_app.types import Photo
 
 SIZE = (1024, 768)
