@@ -1,4 +1,4 @@
-"""Formats, pixel depths and damage."""
+"""Formats, pixel depths, damage, and the focal length of EXIF."""
 
 import zlib
 from pathlib import Path
@@ -7,9 +7,11 @@ import numpy as np
 import PIL
 import pytest
 from PIL import Image, features
+from PIL.ExifTags import IFD
+from PIL.TiffImagePlugin import IFDRational
 
 from sfm_app.operating_system import Ability, find_in_wheel
-from sfm_app.photos.decode import FORMATS, UnreadableError, _install_handler, read_picture, upright_image
+from sfm_app.photos.decode import FORMATS, UnreadableError, _install_handler, focal_px, read_picture, upright_image
 
 LIBTIFF = list(find_in_wheel(Path(PIL.__file__).parent, "pillow", "libtiff"))
 
@@ -179,3 +181,49 @@ def test_without_a_libtiff_that_can_be_asked_a_file_that_breaks_off_is_still_a_d
         read_picture(tmp_path / "cut.tif")
     assert read_picture(tmp_path / "whole.tif").image.size == (128, 96)
     _install_handler.cache_clear()
+
+
+TAGS = {"MM": 0x920A, "EQUIVALENT": 0xA405, "WIDTH": 0xA002, "HEIGHT": 0xA003, "RESOLUTION": 0xA20E, "UNIT": 0xA210}
+
+
+def claimed(longer_side, **tags):
+    exif = Image.Exif()
+    exif.get_ifd(IFD.Exif).update({TAGS[name]: value for name, value in tags.items()})
+    return focal_px(exif, longer_side)
+
+
+SENSOR = {"MM": 20.0, "WIDTH": 6000, "HEIGHT": 4000, "RESOLUTION": IFDRational(6000, 24), "UNIT": 4}
+"""6000 px on 24 mm."""
+
+
+def test_the_equivalent_counts_along_the_longer_side():
+    assert claimed(3600, EQUIVALENT=28) == pytest.approx(2800.0)
+
+
+def test_without_an_equivalent_the_resolution_of_the_sensor_counts():
+    assert claimed(6000, **SENSOR) == pytest.approx(5000.0)
+    assert claimed(1500, **SENSOR) == pytest.approx(1250.0)
+    inches = SENSOR | {"RESOLUTION": 6000 / (24 / 25.4), "UNIT": 2}
+    assert claimed(6000, **inches) == pytest.approx(5000.0)
+    del inches["UNIT"]
+    assert claimed(6000, **inches) == pytest.approx(5000.0)
+    assert claimed(6000, **SENSOR, EQUIVALENT=0) == pytest.approx(5000.0)
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {},
+        {"EQUIVALENT": 1},
+        {"EQUIVALENT": 60000},
+        {"EQUIVALENT": "wide"},
+        SENSOR | {"UNIT": 9},
+        SENSOR | {"UNIT": "inch"},
+        SENSOR | {"RESOLUTION": IFDRational(6000, 0)},
+        SENSOR | {"WIDTH": 0, "HEIGHT": 0},
+        SENSOR | {"MM": None},
+        {name: value for name, value in SENSOR.items() if name != "WIDTH"},
+    ],
+)
+def test_what_is_missing_or_implausible_claims_nothing(tags):
+    assert claimed(6000, **tags) is None

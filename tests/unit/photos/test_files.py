@@ -5,7 +5,7 @@ import os
 import pytest
 
 from sfm_app.errors import InputError
-from sfm_app.photos.files import list_files, resolve_file
+from sfm_app.photos.files import is_video, list_files, resolve_file
 
 
 @pytest.fixture
@@ -94,3 +94,15 @@ def test_a_list_that_cannot_be_read(folder, out, tmp_path, content):
 
     with pytest.raises(InputError, match=r"cannot read .*list\.txt"):
         list_files(folder, out, tmp_path / "list.txt")
+
+
+HEADS = {
+    "heic": b"\0\0\0\x18ftypheic", "avif": b"\0\0\0\x18ftypavif", "raw": b"\0\0\0\x18ftypcrx ",
+    "sound": b"RIFF\0\0\0\0WAVE",
+    "webp": b"RIFF\0\0\0\0WEBP", "jpeg": b"\xff\xd8\xff\xe0", "G": b"G" + bytes(399), "empty": b"",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", HEADS)
+def test_photos_and_sound_are_no_videos(kind):
+    assert not is_video(HEADS[kind].ljust(400, b"\0") if HEADS[kind] else b"")

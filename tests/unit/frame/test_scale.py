@@ -1,9 +1,13 @@
-"""Evidence that agrees is averaged; what contradicts is named; the deviation covers the truth."""
+"""Agreement of evidence of the scale; the frame of exported files."""
+
+import json
 
 import numpy as np
 import pytest
 
-from sfm_app.frame.scale import ScaleEvidence, agree
+from sfm_app.frame.scale import MetricFrame, ScaleEvidence, agree, move_model
+from sfm_app.geometry.poses import Similarity
+from sfm_app.synthetic.cameras import axis_rotation
 
 
 def pieces(scales, deviation=0.01):
@@ -47,3 +51,39 @@ def test_scatter_that_is_larger_than_claimed_makes_the_deviation_larger():
 
     assert calm.deviation == pytest.approx(0.01 / np.sqrt(2), rel=0.01)
     assert 2 * calm.deviation < wild.deviation < 6 * calm.deviation
+
+
+FRAME = MetricFrame(
+    Similarity(3.5, axis_rotation(np.array([2.0, 6.0, 3.0]) / 7.0, 40.0), np.array([1.0, -2.0, 0.5])),
+    0.001,
+    "marker aruco-4x4 3",
+    (ScaleEvidence("marker aruco-4x4 3", 3.5, 0.001, 4),),
+    ("marker aruco-4x4 5 contradicts the 3 others",),
+    "EPSG:32632",
+    (500_000.0, 4_649_000.0, 320.0),
+)
+
+
+def test_it_is_read_back_as_it_was_written():
+    again = MetricFrame.from_dict(json.loads(json.dumps(FRAME.to_dict())))
+    assert again.to_dict() == FRAME.to_dict()
+    assert again.is_metric and again.changes
+
+
+def test_a_frame_that_changes_nothing_still_says_so_when_read_back():
+    again = MetricFrame.from_dict(json.loads(json.dumps(MetricFrame().to_dict())))
+    assert not again.changes and not again.is_metric
+
+
+def test_moved_cameras_see_moved_points_where_they_saw_them(textured_ball):
+    moved = move_model(textured_ball, FRAME.from_model)
+    for before, after in zip(textured_ball.cameras, moved.cameras, strict=True):
+        old, new = (
+            points @ pose[:, :3].T + pose[:, 3]
+            for points, pose in (
+                (textured_ball.surface.vertices, before.cam_from_world),
+                (moved.surface.vertices, after.cam_from_world),
+            )
+        )
+        assert np.allclose(new, 3.5 * old, atol=1e-9)
+    assert np.array_equal(moved.surface.faces, textured_ball.surface.faces)

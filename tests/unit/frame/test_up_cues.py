@@ -1,3 +1,5 @@
+"""Hypotheses of roll, cues of the scene, and the choice by their odds."""
+
 from dataclasses import replace
 
 import numpy as np

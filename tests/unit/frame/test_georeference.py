@@ -1,3 +1,5 @@
+"""Scale, heading and place from GPS positions."""
+
 from dataclasses import replace
 
 import numpy as np

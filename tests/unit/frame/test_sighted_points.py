@@ -1,9 +1,13 @@
-"""Points marked in several photos: exact, with a covariance that covers the error, and without wrong marks."""
+"""Points marked in several photos: exact, with a covariance that covers the error, without wrong marks."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from sfm_app.frame.sighted_points import Sight, SightedPoint, locate_point
+from sfm_app.frame.sighted_points import Sight, SightedPoint, layout_scale, locate_point, unrotate_pixels
+from sfm_app.types import Photo
 
 FOCAL = 1000.0
 
@@ -65,3 +69,22 @@ def test_a_point_behind_its_cameras_is_none():
     ]
 
     assert isinstance(locate_point(sights), str)
+
+
+def test_marks_are_of_the_file_at_its_full_size(tmp_path):
+    Image.new("RGB", (120, 80)).save(tmp_path / "a.jpg")
+    small = Photo("a.jpg", 60, 40, "one camera", needs_copy=True)
+    assert layout_scale(small, tmp_path) == 0.5
+    assert layout_scale(replace(small, needs_copy=False), tmp_path) == 1.0
+    assert layout_scale(replace(small, name="gone.jpg"), tmp_path) == 1.0
+
+
+@pytest.mark.parametrize("turn", [0, 90, 180, 270])
+def test_pixels_of_the_upright_photo_are_found_as_it_is_laid_out(turn):
+    laid_out = np.zeros((40, 60), np.uint8)
+    laid_out[11, 47] = 255
+    upright = np.asarray(Image.fromarray(laid_out).rotate(-turn, expand=True))
+    row, column = np.argwhere(upright)[0]
+    photo = Photo("a.jpg", 60, 40, "one camera", turn_deg=turn)
+
+    assert unrotate_pixels(photo, np.array([[column + 0.5, row + 0.5]])).tolist() == [[47.5, 11.5]]
