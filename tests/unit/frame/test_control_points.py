@@ -21,7 +21,6 @@ def read(tmp_path, text):
 
 def test_marks_with_one_name_are_of_one_point(tmp_path):
     found = read(tmp_path, CRS + "1 2 3 100.5 200 a.jpg left\n1 2 3 110 210 b.jpg left\n4 5 6 1 2 a.jpg right\n")
-
     assert [point.name for point in found.points] == ["left", "right"]
     assert found.points[0].position == (1.0, 2.0, 3.0)
     assert found.points[0].marks == {"a.jpg": (100.5, 200.0), "b.jpg": (110.0, 210.0)}
@@ -138,7 +137,6 @@ def test_too_few_points_and_points_on_a_line_give_a_reason():
     rng = np.random.default_rng(4)
     given, located, _ = survey(rng, 5)
     assert "3 are needed" in fit_control_points(given, dict(list(located.items())[:2]))
-
     on_line = {name: SightedPoint(k * np.ones(3), np.eye(3) * 1e-8, 0.3, (), ()) for k, name in enumerate(located)}
     assert "on a line" in fit_control_points(given, on_line)
 

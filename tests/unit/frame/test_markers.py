@@ -79,7 +79,6 @@ def test_the_outline_alone_is_half_a_pixel_too_small():
 
 def test_another_pattern_is_refused():
     photo, true = photograph(90, np.random.default_rng(1))
-
     assert fit_pattern(photo, draw_pattern(FAMILY, NUMBER), true) is not None
     others = [k for k in range(40) if k != NUMBER]
     assert [k for k in others if fit_pattern(photo, draw_pattern(FAMILY, k), true) is not None] == []
@@ -87,9 +86,7 @@ def test_another_pattern_is_refused():
 
 def test_edges_lie_between_a_light_and_a_dark_cell():
     pattern = np.array([[0, 0, 0], [0, 255, 0], [0, 0, 0]], np.uint8)
-
     light, dark = edge_sides(pattern)
-
     assert len(light) == len(dark) == 3 * (12 + 4)
     assert np.allclose(np.abs(dark - light).sum(axis=1), 1)
     inside = (np.floor(light) == 1).all(axis=1)
@@ -117,7 +114,6 @@ def drawn(path, paper="a4"):
 def test_all_markers_of_a_page_are_found_at_their_size(tmp_path, family):
     count = write_marker_page(tmp_path / "page.svg", 0.05, family, first=3)
     found = find_markers(drawn(tmp_path / "page.svg"), (family,))
-
     assert sorted(marker.number for marker in found) == list(range(3, 3 + count))
     for marker in found:
         sides = np.linalg.norm(marker.corners - np.roll(marker.corners, 1, axis=0), axis=1)

@@ -16,7 +16,6 @@ def pieces(scales, deviation=0.01):
 
 def test_one_is_taken_as_it_is():
     found = agree(pieces([2.0]))
-
     assert (found.scale, found.deviation) == pytest.approx((2.0, 0.01))
     assert found.contradictions == ()
 
@@ -31,7 +30,6 @@ def test_the_deviation_of_the_mean_covers_the_truth():
 
 def test_a_wrong_one_among_three_is_named_and_left_out():
     found = agree(pieces([2.0, 2.01, 2.5]))
-
     assert found.scale == pytest.approx(2.005, rel=1e-3)
     assert [one.name for one in found.used] == ["marker 0", "marker 1"]
     assert found.contradictions == ("marker 2 contradicts the 2 others: by it, the model is 25 % larger",)
@@ -40,7 +38,6 @@ def test_a_wrong_one_among_three_is_named_and_left_out():
 def test_two_that_contradict_are_named_and_the_deviation_covers_half_of_the_difference():
     exact, vague = ScaleEvidence("marker 1", 2.0, 0.001), ScaleEvidence("GPS", 2.4, 0.02)
     found = agree([vague, exact])
-
     assert found.scale == 2.0
     assert found.deviation == pytest.approx(np.log(1.2) / 2)
     assert found.contradictions == ("GPS contradicts marker 1: by it, the model is 20 % larger",)
@@ -48,7 +45,6 @@ def test_two_that_contradict_are_named_and_the_deviation_covers_half_of_the_diff
 
 def test_scatter_that_is_larger_than_claimed_makes_the_deviation_larger():
     calm, wild = agree(pieces([2.0, 2.001])), agree(pieces([2.0, 2.1]))
-
     assert calm.deviation == pytest.approx(0.01 / np.sqrt(2), rel=0.01)
     assert 2 * calm.deviation < wild.deviation < 6 * calm.deviation
 

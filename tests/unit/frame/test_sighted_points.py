@@ -58,7 +58,6 @@ def test_fewer_than_two_photos_place_no_point(count):
 def test_parallel_rays_place_no_point():
     ray = np.array([0.0, 0.0, 1.0])
     sights = [Sight(f"{k}.jpg", np.array([0.01 * k, 0.0, 0.0]), ray, FOCAL) for k in range(3)]
-
     assert "parallel" in locate_point(sights)
 
 
@@ -67,7 +66,6 @@ def test_a_point_behind_its_cameras_is_none():
         Sight(f"{k}.jpg", np.array([x, 0.0, 0.0]), np.array([x, 0.0, 1.0]) / np.hypot(x, 1), FOCAL)
         for k, x in enumerate((-1.0, 1.0))
     ]
-
     assert isinstance(locate_point(sights), str)
 
 
@@ -86,5 +84,4 @@ def test_pixels_of_the_upright_photo_are_found_as_it_is_laid_out(turn):
     upright = np.asarray(Image.fromarray(laid_out).rotate(-turn, expand=True))
     row, column = np.argwhere(upright)[0]
     photo = Photo("a.jpg", 60, 40, "one camera", turn_deg=turn)
-
     assert unrotate_pixels(photo, np.array([[column + 0.5, row + 0.5]])).tolist() == [[47.5, 11.5]]

@@ -131,18 +131,14 @@ def test_no_single_cue_turns_photos_that_are_held_upright(build_house):
 def test_without_scenery_cameras_are_held_upright(build_house):
     house = build_house((1.0, -2.0, 0.5, 1.5), sweep_deg=90.0)
     nothing = Scenery(np.zeros((0, 3)), np.zeros(0), (np.zeros(0, np.int64),) * 4, (None,) * 4)
-
     standing = select_roll(roll_hypotheses(house.rotations, house.centers), house.rotations, house.centers, nothing)
-
     assert standing.roll.turn_deg == 0 and not any(standing.evidence.values())
     assert standing.sign_log_odds == pytest.approx(ROLL_OPTIONS.turn_costs[2])
 
 
 def test_opposite_turns_have_opposite_directions(build_house):
     house = build_house((1.0, 88.0, 0.5, 31.0, -1.0, 2.0))
-
     rolls = roll_hypotheses(house.rotations, house.centers)
-
     assert [roll.turn_deg for roll in rolls] == [0, 90, 180, 270]
     for roll, opposite in zip(rolls[:2], rolls[2:], strict=True):
         assert roll.up == pytest.approx(-opposite.up)
@@ -153,9 +149,7 @@ def test_three_steps_along_a_wall_are_level(build_house, turn_deg):
     """Nothing but the walk tells which of the two verticals it is."""
     house = build_house((turn_deg + 1.0, turn_deg - 2.0, turn_deg + 0.5), sweep_deg=15.0, lines=(0, 0))
     nothing = Scenery(np.zeros((0, 3)), np.zeros(0), (np.zeros(0, np.int64),) * 3, (None,) * 3)
-
     standing = select_roll(roll_hypotheses(house.rotations, house.centers), house.rotations, house.centers, nothing)
-
     assert abs(standing.roll.up @ house.up) > 0.98
     assert 0.2 < standing.axis_log_odds < 8
 
@@ -175,7 +169,6 @@ def test_the_border_of_a_black_background_is_no_ledge():
     upright = look_at(np.array([0, 0, 5.0]), np.zeros(3))[:, :3]
     below = 80 + ledge_rows(3) / 3
     gray, black = (stripes(np.concatenate([np.full(60, level), below])) for level in (30.0, 0.0))
-
     assert slope_asymmetry(UP, [upright], [gray]) < -0.3 < 0.3 < slope_asymmetry(UP, [upright], [black])
 
 
@@ -205,7 +198,6 @@ def test_light_from_above_and_from_below(side):
 def test_what_no_photo_sees_says_nothing():
     points, brightness = terrain(UP)
     unseen = fit_surfaces(points, brightness, [np.zeros(0, np.int64)], np.array([[0.0, 6.0, 0.0]]))
-
     assert len(unseen.normals) == 0
     assert mean_upward_normal(UP, unseen) == brightness_normal_correlation(UP, unseen) == 0.0
 
@@ -225,7 +217,6 @@ def test_low_is_near_on_the_ground_and_not_on_a_distant_thing():
 
 def test_nats_grow_with_the_cue_and_with_the_points_and_end():
     cue = Cue(0.1, 0.1, noise=4.0)
-
     assert cue.nats(0.05, 10**9) == pytest.approx(1.0) and cue.nats(-0.05, 10**9) == pytest.approx(-1.0)
     assert 0.1 < cue.nats(0.05, 100) < 0.25
     assert cue.nats(5.0, 100) == OPTIONS.max_nats

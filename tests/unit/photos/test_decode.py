@@ -23,14 +23,12 @@ LOSSLESS = {"PNG": {}, "TIFF": {"compression": "tiff_lzw"}, "BMP": {}, "WEBP": {
 @pytest.mark.parametrize("kind", LOSSLESS)
 def test_formats(tmp_path, kind):
     Image.fromarray(COLORS).save(tmp_path / "x", kind, **LOSSLESS[kind])
-
     assert np.array_equal(np.asarray(upright_image(read_picture(tmp_path / "x"))), COLORS)
 
 
 @pytest.mark.parametrize("options", [{"progressive": True}, {"optimize": True}, {"subsampling": 0}])
 def test_jpeg(tmp_path, options):
     Image.fromarray(COLORS).save(tmp_path / "x.jpg", quality=98, **options)
-
     seen = np.asarray(upright_image(read_picture(tmp_path / "x.jpg")), int)
     assert 0 < np.abs(seen - COLORS).mean() < 3
 
@@ -38,7 +36,6 @@ def test_jpeg(tmp_path, options):
 @pytest.mark.skipif(not features.check("avif"), reason="this Pillow has no AVIF")
 def test_avif(tmp_path):
     Image.fromarray(COLORS).save(tmp_path / "x.avif", quality=95)
-
     assert np.abs(np.asarray(upright_image(read_picture(tmp_path / "x.avif")), int) - COLORS).mean() < 5
 
 
@@ -57,7 +54,6 @@ def test_heic_names_the_extra_where_it_is_not(tmp_path, monkeypatch):
     monkeypatch.setattr("sfm_app.photos.decode.formats", lambda: FORMATS)
     path = tmp_path / "IMG_0001.HEIC"
     path.write_bytes(b"\x00\x00\x00\x18ftypheic\x00\x00\x00\x00mif1heic" + bytes(50))
-
     with pytest.raises(UnreadableError, match=r"sfm-app\[heic\]"):
         read_picture(path)
 
@@ -65,20 +61,17 @@ def test_heic_names_the_extra_where_it_is_not(tmp_path, monkeypatch):
 @pytest.mark.parametrize("kind", ["PNG", "TIFF"])
 def test_sixteen_bits_become_eight(tmp_path, kind):
     Image.fromarray(BARS.astype(np.uint16) * 257).save(tmp_path / "x", kind)
-
     assert np.array_equal(np.asarray(upright_image(read_picture(tmp_path / "x"))), BARS)
 
 
 def test_dark_sixteen_bits_are_not_made_bright(tmp_path):
     dark = BARS.astype(np.uint16) * 10
     Image.fromarray(dark).save(tmp_path / "x.png")
-
     assert np.array_equal(np.asarray(upright_image(read_picture(tmp_path / "x.png"))), dark // 257)
 
 
 def test_floating_point_fills_the_range(tmp_path):
     Image.fromarray(BARS.astype(np.float32) / 100 - 1).save(tmp_path / "x.tif")
-
     seen = np.asarray(upright_image(read_picture(tmp_path / "x.tif")), int)
     assert seen.min() == 0 and seen.max() == 255
     assert np.abs(seen - BARS.astype(int) * 255 / 248).max() <= 1
@@ -87,7 +80,6 @@ def test_floating_point_fills_the_range(tmp_path):
 def test_what_is_transparent_is_white(tmp_path):
     clear = np.dstack([COLORS, np.where(BARS < 128, 0, 255).astype(np.uint8)])
     Image.fromarray(clear).save(tmp_path / "x.png")
-
     seen = np.asarray(upright_image(read_picture(tmp_path / "x.png")))
     assert (seen[:, :16] == 255).all()
     assert np.array_equal(seen[:, 16:], COLORS[:, 16:])
@@ -108,7 +100,6 @@ def test_of_many_pictures_the_first(tmp_path, kind):
 @pytest.mark.parametrize("content", [b"", b"GIF89a, or so it says", b"%PDF-1.7", b"\x00" * 5000])
 def test_what_is_no_photo(tmp_path, content):
     (tmp_path / "x.jpg").write_bytes(content)
-
     with pytest.raises(UnreadableError, match="not a photo" if content else "empty"):
         read_picture(tmp_path / "x.jpg")
 
@@ -120,7 +111,6 @@ def test_what_is_cut_off(tmp_path, kind, share):
     Image.fromarray(noise).save(tmp_path / "x", kind)
     whole = (tmp_path / "x").read_bytes()
     (tmp_path / "x").write_bytes(whole[: int(share * len(whole))])
-
     with pytest.raises(UnreadableError, match=r"truncated or damaged|not a photo"):
         read_picture(tmp_path / "x")
 

@@ -58,9 +58,7 @@ def laid_out(found, photos, masks, tmp_path):
 def test_masks_are_named_as_colmap_names_them(photos, masks, name, there, expected):
     for mask in there:
         Image.fromarray(GRAY).save(masks / mask, "PNG")
-
     found = find_mask(photo(name), photos, masks)
-
     assert found == replace(photo(name), mask=expected)
     assert unused_masks(list_masks(masks, photos, photos / "out"), [found]) == sorted(set(there) - {expected})
 
@@ -92,9 +90,7 @@ KINDS = {
 @pytest.mark.parametrize("kind", KINDS)
 def test_black_and_transparent_is_masked_and_all_else_is_used(photos, masks, tmp_path, kind):
     KINDS[kind]().save(masks / "a.jpg.png")
-
     found = find_mask(photo(), photos, masks)
-
     np.testing.assert_array_equal(laid_out(found, photos, masks, tmp_path), USED)
     with Image.open(tmp_path / "laid out" / "a.jpg.png") as image:
         assert (image.mode, sorted(set(image.tobytes()))) == ("L", [0, 255])
@@ -107,9 +103,7 @@ def test_a_photo_without_a_mask_is_used_whole(photos, masks, tmp_path):
 def test_masks_go_by_the_name_of_the_photo_in_the_run(photos, masks, tmp_path):
     Image.fromarray(GRAY).save(masks / "a.webp.png")
     found = find_mask(photo("a.webp"), photos, masks)
-
     seen = laid_out(replace(found, name="a.webp.jpg", original="a.webp"), photos, masks, tmp_path)
-
     np.testing.assert_array_equal(seen, USED)
 
 
@@ -117,9 +111,7 @@ def test_masks_go_by_the_name_of_the_photo_in_the_run(photos, masks, tmp_path):
 def test_masks_of_another_size_are_brought_to_that_of_the_photo(photos, masks, tmp_path, times):
     Image.fromarray(GRAY).save(masks / "a.jpg.png")
     size = round(60 * times), round(40 * times)
-
     seen = laid_out(find_mask(photo("a.jpg", *size), photos, masks), photos, masks, tmp_path)
-
     y, x = np.mgrid[: size[1], : size[0]] + 0.5
     np.testing.assert_array_equal(seen, USED[(y / times).astype(int), (x / times).astype(int)])
 
@@ -127,7 +119,6 @@ def test_masks_of_another_size_are_brought_to_that_of_the_photo(photos, masks, t
 @pytest.mark.parametrize("size", [(61, 41), (120, 81), (600, 399), (29, 20)])
 def test_a_pixel_more_or_less_is_the_same_shape(photos, masks, size):
     Image.fromarray(GRAY).save(masks / "a.jpg.png")
-
     assert find_mask(photo("a.jpg", *size), photos, masks).mask == "a.jpg.png"
 
 
@@ -153,7 +144,6 @@ def test_masks_of_photos_that_exif_turns(photos, masks, tmp_path, orientation, d
 def test_a_mask_of_another_shape_is_refused(photos, masks):
     Image.fromarray(GRAY).save(photos / "a.jpg")
     Image.fromarray(GRAY).save(masks / "a.jpg.png")
-
     for size in ((60, 50), (40, 60), (600, 380)):
         words = f"the mask a.jpg.png cannot be used: it has 60 x 40 pixels, its photo {size[0]} x {size[1]}"
         with pytest.raises(InputError, match=words):
@@ -162,7 +152,6 @@ def test_a_mask_of_another_shape_is_refused(photos, masks):
 
 def test_nothing_is_left_of_a_photo_whose_mask_is_black(photos, masks):
     Image.fromarray(0 * GRAY).save(masks / "a.jpg.png")
-
     assert find_mask(photo(), photos, masks) == UnusablePhoto("a.jpg", "its mask a.jpg.png is all black")
 
 
@@ -205,9 +194,7 @@ def test_photos_and_output_inside_the_folder_of_masks_are_no_masks(tmp_path):
     for name in ("photos/a.jpg", "out/masks/a.jpg.png", "a.jpg.png", ".DS_Store"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"x")
-
     names = list_masks(tmp_path, tmp_path / "photos", tmp_path / "out")
-
     assert names == [".DS_Store", "a.jpg.png"]
     assert unused_masks(names, [photo()]) == ["a.jpg.png"]
 

@@ -50,7 +50,6 @@ def test_a_panorama_is_recognized_by_its_pixels(rendered, tmp_path):
 @pytest.mark.parametrize("turn_deg", [90, 200])
 def test_its_heading_does_not_matter(rendered, turn_deg):
     pixels = np.roll(np.asarray(rendered), turn_deg * 512 // 360, axis=1)
-
     assert looks_like_panorama(Image.fromarray(pixels))
 
 
@@ -69,14 +68,12 @@ def test_parts_and_mirrored_pictures_are_none(rendered):
 def test_photos_twice_as_wide_as_high_are_none(seed):
     rng = np.random.default_rng(seed)
     coarse = Image.fromarray(rng.integers(0, 255, (20, 40, 3), np.uint8))
-
     assert not looks_like_panorama(coarse.resize((800, 400), Image.Resampling.BICUBIC))
 
 
 def test_metadata_decides_where_it_is(rendered, tmp_path):
     whole = {"ProjectionType": "equirectangular", "FullPanoWidthPixels": 512, "CroppedAreaImageWidthPixels": 512}
     gray = Image.new("RGB", (512, 256), "gray")
-
     assert asked(saved(tmp_path, gray, **whole))
     assert read_panorama_entries(saved(tmp_path, gray, **whole).image) == {k: str(v) for k, v in whole.items()}
 
@@ -119,9 +116,7 @@ def panorama(width=WIDTH):
 
 def test_painted_parts_show_their_directions_all_round():
     whole = panorama()
-
     parts = panorama_parts((WIDTH, WIDTH // 2))
-
     assert len(parts) == 6
     for part in parts:
         wrong = np.abs(show_part(whole, part).astype(int) - colors_of(part.rays()))
@@ -131,7 +126,6 @@ def test_painted_parts_show_their_directions_all_round():
 def test_masks_of_parts_are_those_of_their_pixels():
     used = np.ones((WIDTH // 2, WIDTH), np.bool_)
     used[:, : WIDTH // 2] = False  # the left half
-
     for part in panorama_parts((WIDTH, WIDTH // 2)):
         rays = part.rays()
         clear = np.abs(rays[..., 0]) > 0.02
@@ -168,7 +162,6 @@ def test_sampling_goes_around_the_border_of_a_panorama():
     photo = np.zeros((20, 40, 3), np.uint8)
     photo[:, -1] = photo[:, 0] = 200
     at = np.array([[[0.0, 10.0], [40.0, 10.0], [20.0, 10.0]]])
-
     assert resample(photo, at, (40, 20), wraps=True)[0, :, 0].tolist() == pytest.approx([230, 230, 0], abs=12)
     assert resample(photo, at, (40, 20))[0, 0, 0] > 190
 
@@ -176,6 +169,5 @@ def test_sampling_goes_around_the_border_of_a_panorama():
 def test_shrinking_averages_and_never_enlarges():
     photo = np.zeros((10, 20, 3), np.uint8)
     photo[:, ::2] = 200
-
     assert shrink(photo, 0.5).shape == (5, 10, 3) and (shrink(photo, 0.5) == 100).all()
     assert shrink(photo, 1.5) is photo

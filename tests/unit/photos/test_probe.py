@@ -119,9 +119,7 @@ def panoramas(kinds, size=(800, 400)):
 @pytest.mark.parametrize("cameras", ["auto", "single", "each"])
 def test_panoramas_always_share_one_camera(cameras):
     given = [*panoramas(["equirectangular"] * 2), Photo("x.jpg", 600, 400, "a")]
-
     first, second, other = (photo.group for photo in group_by_camera(given, cameras))
-
     assert first == second == "800x400 equirectangular" and other != first
 
 
@@ -138,7 +136,6 @@ def test_panoramas_always_share_one_camera(cameras):
 )
 def test_most_photos_of_a_size_decide_about_the_others(kinds, size, around):
     found = [photo.projection for photo in group_by_camera(panoramas(kinds, size), "auto")]
-
     assert found.count("equirectangular") == around
 
 

@@ -61,26 +61,22 @@ def test_the_largest_of_each_picture_stays(change):
 @pytest.mark.parametrize("shift", [4, 10, 20])
 def test_a_step_to_the_side_is_another_photo(shift):
     kept, _ = drop_duplicates([glance("a", boxes()), glance("b", boxes(0, shift))])
-
     assert len(kept) == 2
 
 
 def test_a_bright_and_a_dark_exposure_are_two_photos():
     dark = boxes().point(lambda gray: gray // 2)
-
     assert len(drop_duplicates([glance("a", boxes()), glance("b", dark)])[0]) == 2
 
 
 def test_blank_pictures_say_nothing():
     blank = Image.new("RGB", (320, 240), "gray")
-
     assert len(drop_duplicates([glance(name, blank) for name in "abc"])[0]) == 3
     assert drop_duplicates([]) == ([], [])
 
 
 def test_all_copies_of_one_go_to_one():
     kept, copies = drop_duplicates([glance(name, boxes()) for name in ("c", "a", "b")])
-
     assert names(kept) == ["c"]
     assert {photo.reason for photo in copies} == {"the same picture as c"}
 
@@ -89,7 +85,6 @@ def test_of_copies_the_one_with_a_mask_stays():
     """Else what somebody has masked would be used from its copy."""
     large, small = glance("a.jpg", boxes()), glance("b.jpg", boxes().resize((160, 120), Image.Resampling.LANCZOS))
     masked = replace(small, photo=replace(small.photo, mask="b.jpg.png"))
-
     assert names(drop_duplicates([large, small])[0]) == ["a.jpg"]
     assert names(drop_duplicates([large, masked])[0]) == ["b.jpg"]
 
@@ -190,9 +185,7 @@ def test_a_photo_is_the_same_after_json():
 
 def test_statistics_come_back_as_they_were(stats, tmp_path):
     write_stats(tmp_path / "stats.npz", stats, DIGESTS, OPTIONS)
-
     found = read_stats(tmp_path / "stats.npz", DIGESTS, OPTIONS)
-
     assert list(found) == list(stats)
     for name, one in found.items():
         assert (one.photo, one.blur, one.flat) == (stats[name].photo, stats[name].blur, stats[name].flat)
@@ -203,30 +196,25 @@ def test_a_real_photo_has_a_thumbnail_of_whole_gray_levels(tmp_path):
     rng = np.random.default_rng(0)
     Image.fromarray(rng.integers(0, 256, (90, 120, 3), np.uint8)).save(tmp_path / "a.jpg")
     read = read_photo(tmp_path, "a.jpg", options=OPTIONS)
-
     write_stats(tmp_path / "stats.npz", {"a.jpg": read}, DIGESTS, OPTIONS)
-
     again = read_stats(tmp_path / "stats.npz", DIGESTS, OPTIONS)["a.jpg"]
     assert again.photo == read.photo and np.array_equal(again.thumbnail, read.thumbnail)
 
 
 def test_only_files_with_the_same_bytes_are_known(stats, tmp_path):
     write_stats(tmp_path / "stats.npz", stats, DIGESTS, OPTIONS)
-
     assert list(read_stats(tmp_path / "stats.npz", {"a.jpg": "1", "sub/b.jpg": "3"}, OPTIONS)) == ["a.jpg"]
     assert read_stats(tmp_path / "stats.npz", {"c.jpg": "1"}, OPTIONS) == {}
 
 
 def test_photos_whose_bytes_are_not_known_are_left_out(stats, tmp_path):
     write_stats(tmp_path / "stats.npz", stats, {"a.jpg": "1"}, OPTIONS)
-
     assert list(read_stats(tmp_path / "stats.npz", DIGESTS, OPTIONS)) == ["a.jpg"]
 
 
 @pytest.mark.parametrize(("change", "known"), [({"max_megapixels": 3.0}, 0), ({"masks": "masks"}, 2)])
 def test_only_settings_that_decide_how_files_are_read_matter(change, known, stats, tmp_path):
     write_stats(tmp_path / "stats.npz", stats, DIGESTS, OPTIONS)
-
     assert len(read_stats(tmp_path / "stats.npz", DIGESTS, OPTIONS.model_copy(update=change))) == known
 
 

@@ -63,7 +63,6 @@ def test_photos_that_change_under_a_run_are_seen(folder, tmp_path, change, says)
 def test_a_video_has_no_list_of_photos(folder, tmp_path):
     photos = source_of(folder, tmp_path / "out")
     listed = Settings.from_mapping({"photos": {"images": "list.txt"}})
-
     photos.check_settings(listed)
     replace(photos, video=True).check_settings(Settings())
     with pytest.raises(ConfigError, match="--images"):
@@ -125,7 +124,6 @@ def test_what_has_lost_nothing_becomes_png():
 
 def test_no_two_photos_get_one_name():
     found = named("a.webp", "a.webp.jpg", "x\n.jpg", "x\r.jpg", "x_.jpg", "in/a.webp")
-
     assert len(set(found)) == len(found)
     assert (found[1], found[4]) == ("a.webp.jpg", "x_.jpg")
 
@@ -139,7 +137,6 @@ def test_names_differ_by_more_than_capitals():
 
 def test_what_it_was_called_is_kept():
     (photo,) = assign_names([Photo("a.webp", 60, 40, "g")])
-
     assert (photo.name, photo.path) == ("a.webp.jpg", "a.webp")
 
 
@@ -147,9 +144,7 @@ def test_what_it_was_called_is_kept():
 def test_a_turned_photo_is_laid_out_as_the_sensor_lay(tmp_path, turn):
     upright = np.rot90(PIXELS, -turn // 90)
     Image.fromarray(np.ascontiguousarray(upright)).save(tmp_path / "x.png")
-
     lay_out(Photo("x.png", 60, 40, "g", needs_copy=True, lossy=False, turn_deg=turn), tmp_path, tmp_path / "target")
-
     with Image.open(tmp_path / "target" / "x.png") as seen:
         assert np.array_equal(np.asarray(seen), PIXELS)
 
@@ -178,7 +173,6 @@ def test_a_link_to_another_photo_is_not_the_photo(tmp_path):
         Image.fromarray(PIXELS).save(tmp_path / name)
     (tmp_path / "target").mkdir()
     (tmp_path / "target" / "x.png").symlink_to(tmp_path / "y.png")
-
     assert not is_laid_out(Photo("x.png", 60, 40, "g"), tmp_path, tmp_path / "target")
 
 
@@ -200,9 +194,7 @@ def test_colmap_reads_and_writes_what_is_laid_out(tmp_path, kind):
 
 def test_large_photos_are_scaled_down(tmp_path):
     Image.fromarray(PIXELS).save(tmp_path / "x.png")
-
     lay_out(Photo("x.png", 30, 20, "g", needs_copy=True, lossy=False), tmp_path, tmp_path / "target")
-
     with Image.open(tmp_path / "target" / "x.png") as seen:
         assert seen.size == (30, 20)
 
@@ -210,7 +202,6 @@ def test_large_photos_are_scaled_down(tmp_path):
 def test_a_file_that_went_away_or_led_out(tmp_path):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "x.jpg").symlink_to(tmp_path / "y.jpg")
-
     for name, reason in (("x.jpg", "a link out of the folder"), ("z.jpg", "not there")):
         with pytest.raises(UnreadableError, match=reason):
             lay_out(Photo(name, 60, 40, "g"), tmp_path / "photos", tmp_path / "target")

@@ -100,10 +100,8 @@ def cut(path):
 def test_what_comes_before_the_damage_is_read(tmp_path, name, code):
     path = write(tmp_path / name, code)
     cut(path)
-
     with open_video(path) as found:
         frames = len(list(found.small_frames()))
-
     assert 5 <= frames <= 20
     assert found.is_cut_short
 
@@ -111,7 +109,6 @@ def test_what_comes_before_the_damage_is_read(tmp_path, name, code):
 def test_a_file_without_its_index_is_damaged(tmp_path):
     path = write(tmp_path / "a.mp4", "mp4v")
     cut(path)
-
     with pytest.raises(UnreadableError, match="damaged"), open_video(path):
         pass
 
@@ -137,7 +134,6 @@ def test_ffmpeg_is_silent(tmp_path):
 def test_a_name_is_but_a_name(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "plain.avi").rename(tmp_path / name)
-
     with open_video((tmp_path / name).relative_to(tmp_path)) as found:
         assert len(list(found.small_frames())) == COUNT
 
@@ -165,7 +161,6 @@ def test_lists_of_other_files_are_not_followed(tmp_path, monkeypatch, kind, endi
 
 def test_nothing_but_regular_files_is_opened(tmp_path):
     os.mkfifo(tmp_path / "pipe.mp4")
-
     assert not is_video(read_head(tmp_path / "pipe.mp4"))
     assert not is_video(read_head(tmp_path))
     assert not is_video(read_head(tmp_path / "nothing.mp4"))
@@ -175,10 +170,8 @@ def test_other_users_of_opencv_notice_nothing(tmp_path, monkeypatch):
     monkeypatch.setenv("OPENCV_FFMPEG_CAPTURE_OPTIONS", "rtsp_transport;tcp")
     monkeypatch.delenv("OPENCV_FFMPEG_LOGLEVEL", raising=False)
     before = dict(os.environ), cv2.utils.logging.getLogLevel()
-
     with open_video(write(tmp_path / "a.avi")) as found:
         next(found.small_frames())
-
     assert (dict(os.environ), cv2.utils.logging.getLogLevel()) == before
 
 
@@ -224,9 +217,7 @@ def chosen_from(frames, most=100):
 @pytest.mark.parametrize("speed_px", [0.7, 2.5, 5.0])
 def test_frames_are_one_step_apart(wall, speed_px):
     places = np.arange(0, 60 + 100 * speed_px, speed_px)
-
     gaps = np.diff(places[chosen_from(film(wall, places))])
-
     assert gaps.min() >= 0.5 * STEP_PX - speed_px
     assert gaps.max() <= 1.5 * STEP_PX + speed_px
     assert 0.9 * STEP_PX < gaps.mean() < 1.1 * STEP_PX
@@ -237,9 +228,7 @@ def test_frames_are_one_step_apart(wall, speed_px):
 )
 def test_a_blurred_frame_is_not_chosen_beside_a_sharp_one(wall, speed_px, blurred):
     places = np.arange(0, 300, speed_px)
-
     chosen = chosen_from(film(wall, places, blurred))
-
     assert not set(chosen) & set(blurred)
     assert len(chosen) >= 0.9 * 300 / max(STEP_PX, 2 * speed_px)
 
@@ -247,9 +236,7 @@ def test_a_blurred_frame_is_not_chosen_beside_a_sharp_one(wall, speed_px, blurre
 def test_where_all_is_blurred_the_overlap_is_kept(wall):
     places = np.arange(0, 400, 4.0)
     blurred = range(30, 75)
-
     chosen = chosen_from(film(wall, places, blurred))
-
     assert any(k in blurred for k in chosen)
     assert np.diff(places[chosen]).max() < 2.5 * STEP_PX
 
@@ -257,17 +244,14 @@ def test_where_all_is_blurred_the_overlap_is_kept(wall):
 @pytest.mark.parametrize("noise", [0.0, 10.0])
 def test_a_camera_that_stands_gives_one_frame(wall, noise):
     shaking = 300 + np.random.default_rng(3).uniform(-2.0, 2.0, 150)
-
     assert len(chosen_from(film(wall, shaking, range(40, 60), noise))) == 1
 
 
 def test_a_rest_adds_nothing(wall):
     ways = np.arange(0, 200, 4.0), np.arange(200, 400, 4.0)
     rest = np.full(120, 200.0)
-
     without = chosen_from(film(wall, np.concatenate(ways)))
     resting = chosen_from(film(wall, np.concatenate([ways[0], rest, ways[1]]), noise=3.0))
-
     assert abs(len(resting) - len(without)) <= 1
     assert sum(len(ways[0]) <= k < len(ways[0]) + len(rest) for k in resting) <= 1
 
@@ -289,9 +273,7 @@ def test_no_more_than_wanted_and_evenly(slide, most):
 
 def test_every_shot_of_a_cut_video_is_seen(wall):
     shots = np.repeat([0.0, 700.0, 1400.0], 20)
-
     chosen = chosen_from(film(wall, shots))
-
     assert [k // 20 for k in chosen] == [0, 1, 2]
 
 
@@ -301,9 +283,7 @@ def test_where_every_frame_shows_something_else_all_are_taken(wall):
 
 def test_forward_and_back_counts_both_ways(wall):
     there = np.arange(0, 240, 3.0)
-
     chosen = chosen_from(film(wall, np.concatenate([there, there[::-1]])))
-
     assert 2 * 240 / STEP_PX - 3 <= len(chosen) <= 2 * 240 / STEP_PX + 1
 
 
@@ -311,16 +291,13 @@ def test_forward_and_back_counts_both_ways(wall):
 def test_an_empty_picture_shows_nothing_to_follow(value):
     follower = CornerTracker()
     looks = [follower.track(k, np.full((VIEW_HEIGHT, VIEW_WIDTH), value, np.uint8)) for k in range(5)]
-
     assert not follower.has_texture
     assert [look.path_steps for look in looks] == [0.0] * 5
 
 
 def test_the_same_frames_give_the_same_choice(wall):
     places = np.arange(0, 150, 3.0)
-
     first, second = (looks_at(film(wall, places, noise=4.0)) for _ in range(2))
-
     assert first == second
     assert select_keyframes(first, 9) == select_keyframes(second, 9)
 

@@ -93,7 +93,6 @@ def kill_at(scene, name, **options):
 
 def test_the_manifest_says_what_was_done(scene):
     counts = run_stage(scene, Method(reject=("2.png",)), method="auto")
-
     assert counts == {
         "method": "ours", "method_reason": "installed and able to run here", "depth_maps": 2,
         "rejected": {"too dark": 1}, "coverage": {"1.png": 0.5, "3.png": 0.5}, "sky": 0.0,
@@ -112,7 +111,6 @@ def upside_down(scene):
 
 def test_depths_in_the_sky_are_removed(upside_down):
     counts = run_stage(upside_down, Method())
-
     depth = read_depth(upside_down.dense_dir, read_views(upside_down.dense_dir)[0], "geometric")
     assert counts["sky"] == pytest.approx(30 / 60, abs=0.07)  # but for the rim of a column that COLMAP leaves black
     assert (depth[:26] == 3).all()
@@ -122,7 +120,6 @@ def test_depths_in_the_sky_are_removed(upside_down):
 
 def test_depths_in_the_sky_stay_where_that_is_asked_for(upside_down):
     counts = run_stage(upside_down, Method(), drop_sky=False)
-
     depth = read_depth(upside_down.dense_dir, read_views(upside_down.dense_dir)[0], "geometric")
     assert "sky" not in counts
     assert (depth[:30] == 3).all()
@@ -149,9 +146,7 @@ def test_a_killed_run_keeps_what_it_made(scene):
     kill_at(scene, "3.png")
     assert (scene.dense_dir / UNFINISHED).exists()
     method = Method()
-
     run_stage(scene, method)
-
     assert method.asked == ["3.png"]
     assert not (scene.dense_dir / UNFINISHED).exists()
 
@@ -159,9 +154,7 @@ def test_a_killed_run_keeps_what_it_made(scene):
 def test_a_finished_stage_is_done_anew_when_it_is_run_again(scene):
     run_stage(scene, Method())
     method = Method()
-
     run_stage(scene, method)
-
     assert method.asked == ["1.png", "2.png", "3.png"]
 
 

@@ -33,5 +33,4 @@ def test_the_manifest_says_how_large_the_files_are_and_how_good_the_pictures(tex
 
 def test_without_a_texture_it_says_nothing_about_pictures(ball, run):
     export.make(ball, MetricFrame(), run)
-
     assert list(run.statistics) == ["bytes"]

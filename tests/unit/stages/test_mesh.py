@@ -113,7 +113,6 @@ def test_a_closed_thing_seen_all_round_is_closed(ball):
 def test_normals_point_outward_and_colors_are_those_of_the_photos(ball):
     surface, _ = ball
     normals = vertex_normals(surface.vertices, surface.faces)
-
     assert np.sum(normals * surface.vertices, axis=1).min() > 0.5
     np.testing.assert_array_equal(np.median(surface.colors, axis=0), [200, 90, 40])
 
@@ -166,7 +165,6 @@ def test_maps_that_agree_on_nothing_give_an_error_that_says_so(dense, tmp_path):
 
 def test_without_depth_maps_there_is_no_surface(dense, tmp_path):
     shutil.copytree(dense / "sparse", tmp_path / "dense" / "sparse")
-
     with pytest.raises(ReconstructionError, match="no photo has a depth map"):
         made(tmp_path / "dense")
 
@@ -240,9 +238,7 @@ def test_a_ball_that_is_too_small_grows_to_what_the_photos_show(dense, ball, tmp
     place, radius = copied(dense, tmp_path), 1.008
     for view in read_views(place):
         cv2.imwrite(str(place / "images" / view.name), marbled(view, radius))
-
     found, _ = made(place, max_image_size_px=1600, block_points=block_points)
-
     assert np.median(np.linalg.norm(ball[0].vertices, axis=1)) == pytest.approx(1.0, abs=0.002)
     assert np.median(np.linalg.norm(found.vertices, axis=1)) == pytest.approx(radius, abs=0.004)
 

@@ -150,9 +150,7 @@ def test_exif_focal_is_read_as_a_hint_in_pixels(folder, run):
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA405] = 27
     Image.fromarray(PIXELS).save(folder / "e.jpg", exif=exif)
-
     photo = next(photo for photo in make(folder, run).photos if photo.name == "e.jpg")
-
     assert photo.exif_focal_px == pytest.approx(27 / 36 * 128)
 
 
@@ -180,9 +178,7 @@ def read_gps(folder, run):
 
 def test_gps_is_read_as_a_hint(folder, run):
     with_gps(folder)
-
     gps = read_gps(folder, run)
-
     assert gps.latitude_deg == pytest.approx(-(33 + 51 / 60 + 24.5 / 3600), abs=1e-6)
     assert gps.longitude_deg == pytest.approx(151 + 12 / 60 + 54.25 / 3600, abs=1e-6)
     assert gps.altitude_m == pytest.approx(7.5)
@@ -195,7 +191,6 @@ def test_gps_is_read_as_a_hint(folder, run):
 )
 def test_altitude_is_optional(folder, run, entries, altitude_m):
     with_gps(folder, **entries)
-
     assert read_gps(folder, run).altitude_m == altitude_m
 
 
@@ -215,16 +210,13 @@ def test_altitude_is_optional(folder, run, entries, altitude_m):
 )
 def test_a_position_that_cannot_be_true_is_none(folder, run, entries):
     with_gps(folder, **entries)
-
     assert read_gps(folder, run) is None
 
 
 def test_photos_too_large_for_the_memory_are_scaled_down_and_say_so(folder, run):
     run = replace(run, settings=Settings.from_mapping({"max_memory_gb": 1}))
     Image.fromarray(np.tile(PIXELS, (20, 14, 1))).save(folder / "large.jpg", quality=50)
-
     photo = next(photo for photo in make(folder, run).photos if photo.name == "large.jpg")
-
     assert 1.9e6 < photo.width * photo.height <= 2e6
     assert photo.notes == (f"scaled down from 1792 x 1920 to {photo.width} x {photo.height} pixels",)
 
@@ -235,7 +227,6 @@ def test_the_output_folder_inside_the_photos_is_not_read(folder, tmp_path):
     Image.fromarray(PIXELS).save(folder / "out" / "model.png")
     with make_executor(1) as executor:
         found = make(folder, RunContext(Settings(), workspace, load_plugins(installed=False), executor, 1))
-
     assert [photo.name for photo in found.photos] == ["a.jpg", "b.png"]
 
 
@@ -281,9 +272,7 @@ def test_a_folder_of_very_many_files_may_be_another_than_meant(folder, run, monk
     said = []
     monkeypatch.setattr(photos, "MANY_FILES", limit)
     monkeypatch.setattr(run.progress, "say", said.append)
-
     make(folder, run)
-
     assert [line[: len(told[0])] for line in said] == told if told else said == []
 
 

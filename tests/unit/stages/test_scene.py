@@ -188,10 +188,8 @@ def test_a_model_that_cannot_be_adjusted_is_kept_and_the_run_says_so(synthetic, 
 def test_without_a_model_the_error_says_what_was_seen_and_what_may_help(synthetic, run, mapped):
     mapped(outcome(tried=("all at once: 0 photos",)))
     matches, views = inputs(synthetic[1])
-
     with pytest.raises(ReconstructionError, match=r"1 pairs with 20 to 20 inliers\); all at once: 0 photos") as caught:
         scene.make(matches, views, outcome().intrinsics, run)
-
     assert "overlap" in caught.value.hint
     assert not run.workspace.sparse.exists() and run.statistics == {}
 

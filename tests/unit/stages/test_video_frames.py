@@ -93,20 +93,17 @@ def test_a_killed_run_does_not_choose_again(clip, run):
 )
 def test_a_marker_that_cannot_be_read_counts_as_none(clip, run, text):
     run.workspace.frames_marker.write_text(text)
-
     assert len(frames_of(clip, run)) >= 9
 
 
 def test_other_inputs_choose_anew(clip, tmp_path, run):
     killed(clip, run)
-
     assert len(frames_of(write(clip, range(0, 40, 4)), run.with_fingerprint("another"))) <= 6
 
 
 def test_the_times_of_the_frames_are_those_of_the_video(clip, run):
     with video_frames(clip, run) as times_s:
         numbers = {path.name: int(path.stem.rpartition("_")[2]) for path in run.workspace.frames.iterdir()}
-
     assert times_s.keys() == numbers.keys()
     for name, number in numbers.items():
         assert times_s[name] == pytest.approx(number / 30, abs=0.002)
@@ -115,9 +112,7 @@ def test_the_times_of_the_frames_are_those_of_the_video(clip, run):
 def test_a_video_that_is_cut_off_says_so(clip, run):
     data = clip.read_bytes()
     clip.write_bytes(data[: len(data) * 7 // 10])
-
     names = frames_of(clip, run)
-
     assert 5 <= len(names) <= 8
     assert "cut off" in run.statistics["video"]["notes"][0]
 

@@ -35,7 +35,6 @@ def build(tmp_path):
 
 def test_time_stamps_are_taken_out_and_counted(build):
     graph, counts = build(match_graph())
-
     assert counts["stationary"] == 80
     assert graph.fits[1, 2].inliers[:120].all() and not graph.fits[1, 2].inliers[120:].any()
     assert graph.rejected[1, 3].reason == ONLY_A_LOGO
@@ -43,7 +42,6 @@ def test_time_stamps_are_taken_out_and_counted(build):
 
 def test_nothing_is_stationary_in_photos_of_different_size(build):
     _, counts = build(match_graph(widths=(640, 800, 800)))
-
     assert counts["stationary"] == 0
 
 
