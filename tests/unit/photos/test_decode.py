@@ -20,23 +20,27 @@ COLORS = np.stack([BARS, BARS[:, ::-1], 255 - BARS // 2], axis=-1)
 LOSSLESS = {"PNG": {}, "TIFF": {"compression": "tiff_lzw"}, "BMP": {}, "WEBP": {"lossless": True}}
 
 
+def decoded(path):
+    return np.asarray(upright_image(read_picture(path)), int)
+
+
 @pytest.mark.parametrize("kind", LOSSLESS)
 def test_formats(tmp_path, kind):
     Image.fromarray(COLORS).save(tmp_path / "x", kind, **LOSSLESS[kind])
-    assert np.array_equal(np.asarray(upright_image(read_picture(tmp_path / "x"))), COLORS)
+    assert np.array_equal(decoded(tmp_path / "x"), COLORS)
 
 
 @pytest.mark.parametrize("options", [{"progressive": True}, {"optimize": True}, {"subsampling": 0}])
 def test_jpeg(tmp_path, options):
     Image.fromarray(COLORS).save(tmp_path / "x.jpg", quality=98, **options)
-    seen = np.asarray(upright_image(read_picture(tmp_path / "x.jpg")), int)
+    seen = decoded(tmp_path / "x.jpg")
     assert 0 < np.abs(seen - COLORS).mean() < 3
 
 
 @pytest.mark.skipif(not features.check("avif"), reason="this Pillow has no AVIF")
 def test_avif(tmp_path):
     Image.fromarray(COLORS).save(tmp_path / "x.avif", quality=95)
-    assert np.abs(np.asarray(upright_image(read_picture(tmp_path / "x.avif")), int) - COLORS).mean() < 5
+    assert np.abs(decoded(tmp_path / "x.avif") - COLORS).mean() < 5
 
 
 def test_heic_is_read_where_the_extra_is_there(tmp_path):
@@ -45,7 +49,7 @@ def test_heic_is_read_where_the_extra_is_there(tmp_path):
     cut = (tmp_path / "x.heic").read_bytes()[:-60]
     (tmp_path / "cut.heic").write_bytes(cut)
 
-    assert np.abs(np.asarray(upright_image(read_picture(tmp_path / "x.heic")), int) - COLORS).mean() < 5
+    assert np.abs(decoded(tmp_path / "x.heic") - COLORS).mean() < 5
     with pytest.raises(UnreadableError, match=r"^truncated or damaged$"):
         read_picture(tmp_path / "cut.heic")
 
@@ -59,20 +63,16 @@ def test_heic_names_the_extra_where_it_is_not(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["PNG", "TIFF"])
-def test_sixteen_bits_become_eight(tmp_path, kind):
-    Image.fromarray(BARS.astype(np.uint16) * 257).save(tmp_path / "x", kind)
-    assert np.array_equal(np.asarray(upright_image(read_picture(tmp_path / "x"))), BARS)
-
-
-def test_dark_sixteen_bits_are_not_made_bright(tmp_path):
-    dark = BARS.astype(np.uint16) * 10
-    Image.fromarray(dark).save(tmp_path / "x.png")
-    assert np.array_equal(np.asarray(upright_image(read_picture(tmp_path / "x.png"))), dark // 257)
+@pytest.mark.parametrize("factor", [257, 10])
+def test_sixteen_bits_become_eight_and_dark_ones_stay_dark(tmp_path, kind, factor):
+    deep = BARS.astype(np.uint16) * factor
+    Image.fromarray(deep).save(tmp_path / "x", kind)
+    assert np.array_equal(decoded(tmp_path / "x"), deep // 257)
 
 
 def test_floating_point_fills_the_range(tmp_path):
     Image.fromarray(BARS.astype(np.float32) / 100 - 1).save(tmp_path / "x.tif")
-    seen = np.asarray(upright_image(read_picture(tmp_path / "x.tif")), int)
+    seen = decoded(tmp_path / "x.tif")
     assert seen.min() == 0 and seen.max() == 255
     assert np.abs(seen - BARS.astype(int) * 255 / 248).max() <= 1
 
@@ -80,7 +80,7 @@ def test_floating_point_fills_the_range(tmp_path):
 def test_what_is_transparent_is_white(tmp_path):
     clear = np.dstack([COLORS, np.where(BARS < 128, 0, 255).astype(np.uint8)])
     Image.fromarray(clear).save(tmp_path / "x.png")
-    seen = np.asarray(upright_image(read_picture(tmp_path / "x.png")))
+    seen = decoded(tmp_path / "x.png")
     assert (seen[:, :16] == 255).all()
     assert np.array_equal(seen[:, 16:], COLORS[:, 16:])
 
@@ -202,18 +202,9 @@ def test_without_an_equivalent_the_resolution_of_the_sensor_counts():
 
 @pytest.mark.parametrize(
     "tags",
-    [
-        {},
-        {"EQUIVALENT": 1},
-        {"EQUIVALENT": 60000},
-        {"EQUIVALENT": "wide"},
-        SENSOR | {"UNIT": 9},
-        SENSOR | {"UNIT": "inch"},
-        SENSOR | {"RESOLUTION": IFDRational(6000, 0)},
-        SENSOR | {"WIDTH": 0, "HEIGHT": 0},
-        SENSOR | {"MM": None},
-        {name: value for name, value in SENSOR.items() if name != "WIDTH"},
-    ],
-)
-def test_what_is_missing_or_implausible_claims_nothing(tags):
+    [{}, {"EQUIVALENT": 1}, {"EQUIVALENT": 60000}, {"EQUIVALENT": "wide"}, SENSOR | {"UNIT": 9}, SENSOR | {"MM": None},
+     SENSOR | {"UNIT": "inch"}, SENSOR | {"RESOLUTION": IFDRational(6000, 0)}, SENSOR | {"WIDTH": 0, "HEIGHT": 0},
+     {name: value for name, value in SENSOR.items() if name != "WIDTH"}],
+)  # fmt: skip
+def test_a_missing_or_implausible_focal_length_is_none(tags):
     assert claimed(6000, **tags) is None

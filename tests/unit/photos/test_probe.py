@@ -33,6 +33,10 @@ def photo(name="a.jpg", shown=None, size=(600, 400), group=""):
     return Photo(name, *size, group, shown=shown)
 
 
+def unified(*frames):
+    return [one.shown for one in unify_frames([photo(shown=frame) for frame in frames])]
+
+
 @pytest.mark.parametrize("color", [(0, 0, 0), (255, 255, 255), (20, 40, 60)])
 @pytest.mark.parametrize("frame", [(0, 50, 600, 300), (80, 0, 440, 400), (0, 0, 600, 310), (0, 0, 450, 400),
                                    (30, 20, 500, 350)])  # fmt: skip
@@ -72,20 +76,16 @@ def test_a_sky_of_one_color_above_a_level_horizon_is_no_bar():
 
 
 def test_frames_that_nearly_agree_become_one():
-    frames = [(0, 50, 600, 300), (0, 51, 600, 299), (0, 50, 600, 301), (0, 90, 600, 220)]
-    found = [one.shown for one in unify_frames([photo(shown=frame) for frame in frames])]
+    found = unified((0, 50, 600, 300), (0, 51, 600, 299), (0, 50, 600, 301), (0, 90, 600, 220))
     assert found == [(0, 50, 600, 300)] * 3 + [(0, 90, 600, 220)]
 
 
 def test_bars_that_are_not_seen_are_those_of_the_others():
-    shown = [(0, 50, 600, 300), (0, 50, 600, 300), None]
-    assert [one.shown for one in unify_frames([photo(shown=frame) for frame in shown])] == [(0, 50, 600, 300)] * 3
-    few = [(0, 50, 600, 300), None, None]  # a wall before an empty ground, perhaps
-    assert [one.shown for one in unify_frames([photo(shown=frame) for frame in few])] == [None] * 3
-    half = [(0, 50, 600, 300), None]
-    assert [one.shown for one in unify_frames([photo(shown=frame) for frame in half])] == [(0, 50, 600, 300)] * 2
-    mixed = [(0, 50, 600, 300), (0, 90, 600, 220), None]
-    assert [one.shown for one in unify_frames([photo(shown=frame) for frame in mixed])] == mixed
+    wide, narrow = (0, 50, 600, 300), (0, 90, 600, 220)
+    assert unified(wide, wide, None) == [wide] * 3
+    assert unified(wide, None, None) == [None] * 3  # a wall in front of a plain background, perhaps
+    assert unified(wide, None) == [wide] * 2
+    assert unified(wide, narrow, None) == [wide, narrow, None]
 
 
 def test_pictures_of_other_sizes_are_of_other_groups():
@@ -149,13 +149,8 @@ def test_most_photos_of_a_size_decide_about_the_others(kinds, size, around):
     ],
 )
 def test_groups(cameras, expected):
-    photos = [
-        Photo("in/a", 60, 40, "X"),
-        Photo("b", 60, 40, "X"),
-        Photo("in/c", 60, 40, "Y"),
-        Photo("in/d", 40, 60, "X"),
-    ]
-
+    sizes = {"in/a": (60, 40, "X"), "b": (60, 40, "X"), "in/c": (60, 40, "Y"), "in/d": (40, 60, "X")}
+    photos = [Photo(name, *size) for name, size in sizes.items()]
     assert [photo.group for photo in group_by_camera(photos, cameras)] == expected
 
 
