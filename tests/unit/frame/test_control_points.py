@@ -142,15 +142,9 @@ def test_too_few_points_and_points_on_a_line_give_a_reason():
 
 
 def test_longitude_and_latitude_become_meters():
-    given = ControlPoints(
-        (
-            ControlPoint("a", (8.0, 47.0, 400.0), {}),
-            ControlPoint("b", (8.001, 47.0, 400.0), {}),
-            ControlPoint("c", (8.0, 47.001, 400.0), {}),
-        ),
-        "EPSG:4326",
-        geographic=True,
-    )
+    positions = {"a": (8.0, 47.0, 400.0), "b": (8.001, 47.0, 400.0), "c": (8.0, 47.001, 400.0)}
+    points = tuple(ControlPoint(name, position, {}) for name, position in positions.items())
+    given = ControlPoints(points, "EPSG:4326", geographic=True)
     places = {"a": (0, 0, 0), "b": (0.76057, 0, 0), "c": (0, 0, -1.11177)}
     located = {name: SightedPoint(np.array(at, float), np.eye(3) * 1e-9, 0.3, (), ()) for name, at in places.items()}
     found = fit_control_points(given, located)

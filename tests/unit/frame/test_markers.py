@@ -66,8 +66,7 @@ def test_a_side_is_exact_through_blur_and_tone_curve(side, limit):
 
 def test_the_outline_alone_is_half_a_pixel_too_small():
     """Why all edges are used: what OpenCV finds by itself, in the same photos."""
-    rng, ratios = np.random.default_rng(5), []
-    options = cv2.aruco.DetectorParameters()
+    rng, ratios, options = np.random.default_rng(5), [], cv2.aruco.DetectorParameters()
     options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11), options)
     for _ in range(8):

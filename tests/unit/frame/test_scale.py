@@ -60,26 +60,17 @@ FRAME = MetricFrame(
 )
 
 
-def test_it_is_read_back_as_it_was_written():
-    again = MetricFrame.from_dict(json.loads(json.dumps(FRAME.to_dict())))
-    assert again.to_dict() == FRAME.to_dict()
-    assert again.is_metric and again.changes
-
-
-def test_a_frame_that_changes_nothing_still_says_so_when_read_back():
-    again = MetricFrame.from_dict(json.loads(json.dumps(MetricFrame().to_dict())))
-    assert not again.changes and not again.is_metric
+@pytest.mark.parametrize("frame", [FRAME, MetricFrame()])
+def test_a_frame_is_read_back_as_it_was_written(frame):
+    again = MetricFrame.from_dict(json.loads(json.dumps(frame.to_dict())))
+    assert again.to_dict() == frame.to_dict()
+    assert again.is_metric == again.changes == (frame is FRAME)
 
 
 def test_moved_cameras_see_moved_points_where_they_saw_them(textured_ball):
     moved = move_model(textured_ball, FRAME.from_model)
     for before, after in zip(textured_ball.cameras, moved.cameras, strict=True):
-        old, new = (
-            points @ pose[:, :3].T + pose[:, 3]
-            for points, pose in (
-                (textured_ball.surface.vertices, before.cam_from_world),
-                (moved.surface.vertices, after.cam_from_world),
-            )
-        )
+        old = textured_ball.surface.vertices @ before.cam_from_world[:, :3].T + before.cam_from_world[:, 3]
+        new = moved.surface.vertices @ after.cam_from_world[:, :3].T + after.cam_from_world[:, 3]
         assert np.allclose(new, 3.5 * old, atol=1e-9)
     assert np.array_equal(moved.surface.faces, textured_ball.surface.faces)

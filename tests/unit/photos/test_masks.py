@@ -96,11 +96,8 @@ def test_black_and_transparent_is_masked_and_all_else_is_used(photos, masks, tmp
         assert (image.mode, sorted(set(image.tobytes()))) == ("L", [0, 255])
 
 
-def test_a_photo_without_a_mask_is_used_whole(photos, masks, tmp_path):
+def test_without_a_mask_all_is_used_and_masks_go_by_the_name_of_the_photo_in_the_run(photos, masks, tmp_path):
     assert laid_out(find_mask(photo(), photos, masks), photos, masks, tmp_path).all()
-
-
-def test_masks_go_by_the_name_of_the_photo_in_the_run(photos, masks, tmp_path):
     Image.fromarray(GRAY).save(masks / "a.webp.png")
     found = find_mask(photo("a.webp"), photos, masks)
     seen = laid_out(replace(found, name="a.webp.jpg", original="a.webp"), photos, masks, tmp_path)
@@ -182,12 +179,13 @@ def test_a_mask_that_cannot_be_read_is_refused_by_name(photos, masks, case):
 def test_masks_need_a_folder_of_their_own(photos, tmp_path):
     (tmp_path / "file").write_text("x")
 
-    with pytest.raises(InputError, match="no such folder of masks"):
-        list_masks(tmp_path / "nowhere", photos, tmp_path / "out")
-    with pytest.raises(InputError, match="not a folder of masks"):
-        list_masks(tmp_path / "file", photos, tmp_path / "out")
-    with pytest.raises(InputError, match="the masks lie among the photos"):
-        list_masks(photos / ".." / "photos", photos, tmp_path / "out")
+    for masks, says in (
+        (tmp_path / "nowhere", "no such folder of masks"),
+        (tmp_path / "file", "not a folder of masks"),
+        (photos / ".." / "photos", "the masks lie among the photos"),
+    ):
+        with pytest.raises(InputError, match=says):
+            list_masks(masks, photos, tmp_path / "out")
 
 
 def test_photos_and_output_inside_the_folder_of_masks_are_no_masks(tmp_path):

@@ -37,36 +37,25 @@ def names(photos):
     return [photo.name for photo in photos]
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda image: image,
-        lambda image: saved(image, quality=60),
-        lambda image: image.resize((160, 120), Image.Resampling.LANCZOS),
-        lambda image: image.convert("L"),
-    ],
-)
-def test_the_largest_of_each_picture_stays(change):
-    kept, copies = drop_duplicates([glance("copy.jpg", change(boxes())), glance("b.jpg", boxes(1))])
-    assert names(kept) == ["copy.jpg", "b.jpg"] and not copies
+def small(image):
+    return image.resize((160, 120), Image.Resampling.LANCZOS)
 
-    bigger = boxes().resize((640, 480), Image.Resampling.LANCZOS)
-    kept, copies = drop_duplicates(
-        [glance("copy.jpg", change(boxes())), glance("b.jpg", boxes(1)), glance("c", bigger)]
-    )
+
+@pytest.mark.parametrize("change", [Image.Image.copy, lambda i: saved(i, quality=60), small, lambda i: i.convert("L")])
+def test_the_largest_of_each_picture_stays(change):
+    photos = [glance("copy.jpg", change(boxes())), glance("b.jpg", boxes(1))]
+    kept, copies = drop_duplicates(photos)
+    assert names(kept) == ["copy.jpg", "b.jpg"] and not copies
+    kept, copies = drop_duplicates([*photos, glance("c", boxes().resize((640, 480), Image.Resampling.LANCZOS))])
     assert names(kept) == ["b.jpg", "c"]
     assert [(photo.name, photo.reason) for photo in copies] == [("copy.jpg", "the same picture as c")]
 
 
 @pytest.mark.parametrize("shift", [4, 10, 20])
-def test_a_step_to_the_side_is_another_photo(shift):
-    kept, _ = drop_duplicates([glance("a", boxes()), glance("b", boxes(0, shift))])
-    assert len(kept) == 2
-
-
-def test_a_bright_and_a_dark_exposure_are_two_photos():
+def test_a_step_to_the_side_and_another_exposure_are_other_photos(shift):
     dark = boxes().point(lambda gray: gray // 2)
-    assert len(drop_duplicates([glance("a", boxes()), glance("b", dark)])[0]) == 2
+    for other in (boxes(0, shift), dark):
+        assert len(drop_duplicates([glance("a", boxes()), glance("b", other)])[0]) == 2
 
 
 def test_blank_pictures_say_nothing():
@@ -83,9 +72,9 @@ def test_all_copies_of_one_go_to_one():
 
 def test_of_copies_the_one_with_a_mask_stays():
     """Else what somebody has masked would be used from its copy."""
-    large, small = glance("a.jpg", boxes()), glance("b.jpg", boxes().resize((160, 120), Image.Resampling.LANCZOS))
-    masked = replace(small, photo=replace(small.photo, mask="b.jpg.png"))
-    assert names(drop_duplicates([large, small])[0]) == ["a.jpg"]
+    large, copy = glance("a.jpg", boxes()), glance("b.jpg", small(boxes()))
+    masked = replace(copy, photo=replace(copy.photo, mask="b.jpg.png"))
+    assert names(drop_duplicates([large, copy])[0]) == ["a.jpg"]
     assert names(drop_duplicates([large, masked])[0]) == ["b.jpg"]
 
 
@@ -141,25 +130,22 @@ def test_a_photo_that_is_a_little_blurred_stays(spoil):
     assert left_out(*SHARP, spoil(sensor_photo(9))) == {}
 
 
-def test_where_all_are_blurred_all_stay():
-    assert left_out(*(image.filter(ImageFilter.GaussianBlur(14)) for image in SHARP)) == {}
-
-
-def test_a_dark_photo_is_not_a_blurred_one():
-    assert left_out(*SHARP, sensor_photo(9).point(lambda level: level // 100)) == {}
-
-
 def test_a_screenshot_of_another_size_is_left_out():
     assert left_out(*SHARP, sensor_photo(5), window((720, 1280))) == {5: "a screenshot or drawing, of another size"}
 
 
-def test_what_has_the_size_of_the_photos_stays_whichever_way_it_was_held():
-    assert left_out(*SHARP, window(SIZE)) == {}
-    assert left_out(*SHARP, window(SIZE[::-1])) == {}
+KEPT = {
+    "blurred photos alone": lambda: [image.filter(ImageFilter.GaussianBlur(14)) for image in SHARP],
+    "a dark photo": lambda: [*SHARP, sensor_photo(9).point(lambda level: level // 100)],
+    "a screenshot of the size of the photos": lambda: [*SHARP, window(SIZE)],
+    "a screenshot of their size on end": lambda: [*SHARP, window(SIZE[::-1])],
+    "drawings alone": lambda: [window((720, 1280)), window((640, 900)), window((500, 700))],
+}
 
 
-def test_drawings_alone_stay():
-    assert left_out(window((720, 1280)), window((640, 900)), window((500, 700))) == {}
+@pytest.mark.parametrize("kind", KEPT)
+def test_photos_that_may_be_of_use_stay(kind):
+    assert left_out(*KEPT[kind]()) == {}
 
 
 OPTIONS = PhotoSettings()
