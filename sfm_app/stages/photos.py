@@ -111,7 +111,7 @@ def choose_frames(source: Path, run: RunContext) -> FrameChoice:
         "seconds": round(video.seconds, 2),
         "looked_at": sampled,
         "chosen": len(choice.frames),
-        "left_out": choice.left_out | ({"black": video.black} if video.black else {}),
+        "left_out": choice.rejected | ({"black": video.black} if video.black else {}),
         "notes": notes,
     }
     return FrameChoice(run.fingerprint, choice.frames, tuple(times_s[frame] for frame in choice.frames), counts)

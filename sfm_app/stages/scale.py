@@ -91,10 +91,10 @@ def _control_evidence(
     if isinstance(fit, str):
         problems.append(fit)
         return None
-    for name, miss in fit.wrong.items():
+    for name, miss in fit.outliers.items():
         problems.append(f"ground control point '{name}' contradicts the others: it is {miss:.3g} m off, and left out")
-    evidence.append(ScaleEvidence(f"{len(fit.used)} ground control points", fit.from_model.scale, fit.deviation))
-    run.record(control_points={"used": list(fit.used), "wrong": dict(fit.wrong), "rms_m": fit.rms_m})
+    evidence.append(ScaleEvidence(f"{len(fit.inliers)} ground control points", fit.from_model.scale, fit.deviation))
+    run.record(control_points={"used": list(fit.inliers), "wrong": dict(fit.outliers), "rms_m": fit.rms_m})
     return fit
 
 

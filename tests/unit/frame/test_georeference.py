@@ -42,7 +42,7 @@ def test_scale_heading_and_place(seed):
 
     found = georeference(centers, positions, up)
 
-    assert found and (found.photos, found.of) == (12, 12)
+    assert found and (found.inliers, found.positions) == (12, 12)
     assert found.enu_from_world.scale == pytest.approx(METRES, rel=4 * found.scale_deviation)
     assert 0.005 < found.scale_deviation < 0.03
     assert 1.5 < found.rms_m < 6
@@ -58,10 +58,8 @@ def test_a_third_of_the_positions_may_be_wrong():
     for k in (0, 5, 6, 11):
         positions[k] = replace(positions[k], latitude_deg=positions[k].latitude_deg + 0.002 * (k - 5.5))
     positions[3] = None
-
     found = georeference(centers, positions, up)
-
-    assert found and (found.photos, found.of) == (7, 11)
+    assert found and (found.inliers, found.positions) == (7, 11)
     assert found.enu_from_world.scale == pytest.approx(METRES, rel=0.06)
 
 

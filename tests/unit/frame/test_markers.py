@@ -56,7 +56,6 @@ def test_a_side_is_exact_through_blur_and_tone_curve(side, limit):
     for _ in range(8):
         photo, true = photograph(side, rng)
         (found,) = find_markers(photo, (FAMILY,))
-
         assert found.number == NUMBER
         ratios.append(side_px(found.corners) / side_px(true) - 1)
         errors.append(np.abs(found.corners - true).max())

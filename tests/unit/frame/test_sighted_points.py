@@ -31,9 +31,8 @@ def test_rays_meet_in_the_point_within_its_covariance():
     for _ in range(60):
         point = rng.normal(size=3)
         found = locate_point(looks(point, rng))
-
         assert isinstance(found, SightedPoint)
-        assert found.left_out == ()
+        assert found.outliers == ()
         off = found.place - point
         normalized.append(off @ np.linalg.inv(found.covariance) @ off / 3)
     assert 0.6 < np.mean(normalized) < 1.9
@@ -44,9 +43,8 @@ def test_wrong_marks_are_left_out_and_named():
     for _ in range(20):
         point = rng.normal(size=3)
         found = locate_point(looks(point, rng, wrong=(1, 4)))
-
         assert isinstance(found, SightedPoint)
-        assert found.left_out == ("1.jpg", "4.jpg")
+        assert found.outliers == ("1.jpg", "4.jpg")
         assert np.linalg.norm(found.place - point) < 0.01
 
 

@@ -112,9 +112,7 @@ def test_photos_on_their_side_of_a_walk_around_something(build_house, turn_deg):
     house = build_house((1.0, -2.0, 0.5, 1.5, -1.0, 2.0), sweep_deg=120.0)
     floor = np.random.default_rng(3).uniform([-4, 0, -4], [4, 0, 4], (300, 3)) @ house.turned.T
     R, shown = turned_by(turn_deg, house.rotations, scenery_of(np.concatenate([house.points, floor]), 6))
-
     standing = choose(R, house.centers, shown)
-
     assert standing.roll.turn_deg == turn_deg
     assert standing.roll.up @ house.up > np.cos(np.radians(20))
     assert standing.evidence["tops are bright"] == standing.evidence["sky is above"] == 0.0
@@ -178,7 +176,6 @@ def test_the_border_of_a_black_background_is_no_ledge():
 def test_the_sky_is_even_and_bright():
     picture = stripes(np.repeat([200.0, 90.0], [40, 60]))
     picture[40:] = np.random.default_rng(1).integers(20, 160, picture[40:].shape)
-
     assert 0.7 < sky_asymmetry(UP, UPRIGHT, [picture]) <= 1
     assert sky_asymmetry(-UP, UPRIGHT, [picture]) == pytest.approx(-sky_asymmetry(UP, UPRIGHT, [picture]))
     assert sky_asymmetry(UP, UPRIGHT, [255 - picture]) < 0.1, "even and dark is a shadow"
@@ -190,7 +187,6 @@ def test_light_from_above_and_from_below(side):
     points, brightness = terrain(side * UP)
     seen = [np.arange(len(points))], np.array([[0.0, 6.0, 0.0]])
     above = fit_surfaces(points, brightness, *seen)
-
     assert 0.15 < side * brightness_normal_correlation(UP, above) < 0.8
     assert brightness_normal_correlation(-UP, above) == pytest.approx(-brightness_normal_correlation(UP, above))
     assert 0.5 < mean_upward_normal(UP, above) < 0.9
@@ -212,7 +208,6 @@ def test_low_is_near_on_the_ground_and_not_on_a_distant_thing():
     ground = rng.uniform([-4, 0, -9], [4, 0, 6], (500, 3))
     far = rng.uniform([-0.01, 0.99, -0.01], [0.01, 1.01, 0.01], (500, 3))
     tilted = far + 0.5 * np.outer(far[:, 1] - 1.0, [0, 0, -1])
-
     assert 0.5 < depth_height_correlation(UP, *places, ground, [np.arange(500)]) < 1
     assert 0 < depth_height_correlation(UP, *places, tilted, [np.arange(500)]) < 0.05
     assert depth_height_correlation(UP, *places, ground, [np.arange(5)]) == 0.0

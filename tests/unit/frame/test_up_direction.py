@@ -75,9 +75,7 @@ def test_single_photos_that_are_turned_or_wild_are_outvoted(build_house):
     rolls[1] += 90
     rolls[4] += 35
     scene = build_house(rolls)
-
     upright = found_up(scene)
-
     assert error_deg(upright.up, scene.up) < 0.2
     assert error_deg(upright.roll.up, scene.up) < 4
     mean = np.mean([-R[1] for R in scene.rotations], axis=0)
@@ -97,9 +95,7 @@ def test_what_is_near_is_down(build_house, turn_deg):
 @pytest.mark.parametrize("turn_deg", [0, 90, 180, 270])
 def test_who_knows_how_the_photos_are_turned_is_believed(build_house, turn_deg):
     scene = build_house(HAND_HELD, sweep_deg=90.0)
-
     upright = found_up(scene, turn_deg=turn_deg)
-
     assert upright.roll.turn_deg == turn_deg
     assert upright.selection.sign_log_odds == upright.selection.axis_log_odds == np.inf
     # what has to be turned clockwise to be upright has its top on the left
@@ -112,9 +108,7 @@ def test_cameras_that_nobody_held_level_stand_on_the_ground(build_house):
     rng = np.random.default_rng(3)
     floor = rng.uniform([-4, -0.01, -4], [4, 0.01, 4], (300, 3)) @ scene.turned.T
     standing = np.concatenate([scene.points, floor])
-
     upright = found_up(scene, concatenate_segments([]), standing)
-
     assert upright.method == GROUND
     assert error_deg(upright.up, scene.up) < 1
 
@@ -141,9 +135,7 @@ def test_a_wall_of_points_is_a_front_too(build_house):
     rng = np.random.default_rng(4)
     flat = rng.uniform([-3, 0, -0.01], [3, 3, 0.01], (300, 3))
     wall = flat @ np.array([[np.cos(0.2), 0, -np.sin(0.2)], [0, 1, 0], [np.sin(0.2), 0, np.cos(0.2)]]) @ scene.turned.T
-
     towards, found_by = viewer_direction(found_up(scene, concatenate_segments([])), scene.rotations, wall)
-
     assert found_by == WALL
     assert error_deg(towards, scene.front) == pytest.approx(np.degrees(0.2), abs=3)
 
@@ -152,7 +144,6 @@ def test_the_viewer_sees_the_scene_upright_centered_and_of_size_one(build_house)
     scene = build_house(HAND_HELD)
     seen = viewer_frame(scene.up, scene.front, scene.points)
     metric = viewer_frame(scene.up, scene.front, scene.points, meters=2.5)
-
     assert np.allclose(seen.R @ scene.up, [0, 1, 0]) and np.allclose(seen.R @ scene.front, [0, 0, 1])
     assert np.linalg.det(seen.R) == pytest.approx(1)
     assert np.allclose(np.median(scene.points @ seen.R.T * seen.scale + seen.t, axis=0), 0, atol=0.2)
@@ -165,9 +156,7 @@ def test_neither_where_points_crowd_nor_far_ones_move_the_middle_of_the_scene():
     even, crowd = rng.uniform(-1, 1, (4000, 3)), rng.uniform([0.5, -1, -1], [1, 1, 1], (2500, 3))
     far = np.tile([400.0, 0.0, 0.0], (60, 1))
     seen = viewer_frame(np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), np.concatenate([even, crowd, far]))
-
     middle = seen(np.zeros((1, 3)))[0] / seen.scale
-
     assert -0.25 < middle[0] < -0.1  # the median lies at 0.47
     assert np.abs(middle[1:]).max() < 0.05
 

@@ -48,7 +48,6 @@ def test_heic_is_read_where_the_extra_is_there(tmp_path):
     Image.fromarray(COLORS).save(tmp_path / "x.heic", quality=95)
     cut = (tmp_path / "x.heic").read_bytes()[:-60]
     (tmp_path / "cut.heic").write_bytes(cut)
-
     assert np.abs(decoded(tmp_path / "x.heic") - COLORS).mean() < 5
     with pytest.raises(UnreadableError, match=r"^truncated or damaged$"):
         read_picture(tmp_path / "cut.heic")
@@ -91,7 +90,6 @@ def test_of_many_pictures_the_first(tmp_path, kind):
     third = Image.fromarray(255 - COLORS)
     options = {"lossless": True} if kind == "WEBP" else {}
     first.save(tmp_path / "x", kind, save_all=True, append_images=[second, third], **options)
-
     picture = read_picture(tmp_path / "x")
     assert picture.frames == 3
     assert np.array_equal(np.asarray(upright_image(picture)), COLORS)
@@ -121,7 +119,6 @@ def test_a_bomb_is_refused_before_it_goes_off(tmp_path):
     data[16:24] = (60_000).to_bytes(4, "big") * 2  # width and height
     data[29:33] = zlib.crc32(bytes(data[12:29])).to_bytes(4, "big")
     (tmp_path / "x.png").write_bytes(data)
-
     with pytest.raises(UnreadableError, match="too many pixels"):
         read_picture(tmp_path / "x.png")
 
@@ -133,7 +130,6 @@ def test_damaged_exif_does_no_harm(tmp_path):
     data = (tmp_path / "x.jpg").read_bytes()
     at = data.index(b"Exif\0\0") + 6
     (tmp_path / "x.jpg").write_bytes(data[:at] + b"\xff" * 20 + data[at + 20 :])
-
     picture = read_picture(tmp_path / "x.jpg")
     assert dict(picture.exif) == {}
     assert picture.image.size == (32, 24)

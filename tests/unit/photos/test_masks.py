@@ -132,9 +132,7 @@ def test_masks_of_photos_that_exif_turns(photos, masks, tmp_path, orientation, d
     if (orientation, drawn) == (3, "as filed"):
         pixels = upright  # nothing tells a mask upside down from one that is not: as seen
     Image.fromarray(np.ascontiguousarray(np.where(pixels, np.uint8(9), np.uint8(0)))).save(masks / "a.png", **tags)
-
     found = find_mask(photo("a.jpg", *upright.shape[::-1]), photos, masks)
-
     np.testing.assert_array_equal(laid_out(found, photos, masks, tmp_path), upright)
 
 
@@ -170,7 +168,6 @@ def test_a_mask_that_cannot_be_read_is_refused_by_name(photos, masks, case):
     if case == "cut off":
         Image.fromarray(np.random.default_rng(0).integers(0, 255, (40, 60), np.uint8)).save(place)
     make(place)
-
     with pytest.raises(InputError, match=f"the mask a.jpg.png cannot be used: {reason}") as caught:
         find_mask(photo(), photos, masks)
     assert "sub/a.jpg.png" in caught.value.hint
@@ -178,7 +175,6 @@ def test_a_mask_that_cannot_be_read_is_refused_by_name(photos, masks, case):
 
 def test_masks_need_a_folder_of_their_own(photos, tmp_path):
     (tmp_path / "file").write_text("x")
-
     for masks, says in (
         (tmp_path / "nowhere", "no such folder of masks"),
         (tmp_path / "file", "not a folder of masks"),

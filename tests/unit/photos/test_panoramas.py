@@ -125,9 +125,7 @@ def test_masks_of_parts_are_those_of_their_pixels():
 @pytest.mark.parametrize("view", range(12))
 def test_feature_views_show_their_directions(view):
     views = PanoramaViews.cover((WIDTH, WIDTH // 2), 1000)
-
     shown = views.render(panorama(), view)
-
     pixels = np.array([[0.5, 0.5], [views.side_px / 2, views.side_px / 2], [views.side_px - 0.5, 0.5]])
     plain = np.column_stack([(pixels - views.side_px / 2) / views.focal_px, np.ones(3)])
     column, row = pixels.astype(int).T
@@ -138,9 +136,7 @@ def test_feature_views_show_their_directions(view):
 def test_every_direction_belongs_to_one_feature_view():
     views = PanoramaViews.cover((WIDTH, WIDTH // 2), 1000)
     pixels = np.random.default_rng(0).uniform(0.0, views.side_px, (4000, 2))
-
     own = [views.is_nearest(pixels, view) for view in range(12)]
-
     # a view of 90 degrees is a fifth of the sphere of which a twelfth is its own
     assert all(0.3 < share.mean() < 0.7 for share in own)
     at = np.concatenate([views.to_panorama(pixels[mine], view) for view, mine in enumerate(own)])

@@ -38,7 +38,6 @@ def test_only_photos_that_are_used_matter_to_later_stages(folder, tmp_path):
     before = source_of(folder, tmp_path / "out")
     (folder / "notes.txt").write_text("something else")
     after = source_of(folder, tmp_path / "out")
-
     assert after.fingerprint != before.fingerprint and after.content_hash(used) == before.content_hash(used)
     assert after.content_hash(photos(folder, "a.jpg", "b.jpg", group="other")) == before.content_hash(used)
     assert after.content_hash(photos(folder, "a.jpg")) != before.content_hash(used)
@@ -55,7 +54,6 @@ def test_photos_that_change_under_a_run_are_seen(folder, tmp_path, change, says)
         (folder / "a.jpg").unlink()
     else:
         os.utime(folder / "a.jpg", ns=(1, 1))
-
     with pytest.raises(InputError, match=says):
         source.check(used)
 
@@ -81,14 +79,7 @@ def test_a_photo_is_the_same_if_bytes_size_group_and_mask_are(folder, tmp_path):
 
     before = hash_of(used)
     assert hash_of(replace(used, notes=("read without color",))) == before
-    changes = {
-        "width": 61,
-        "group": "another",
-        "mask": "b.png",
-        "turn_deg": 90,
-        "name": "_a.jpg",
-        "shown": (1, 1, 9, 9),
-    }
+    changes = {"width": 61, "group": "two", "mask": "b.png", "turn_deg": 90, "name": "_a.jpg", "shown": (1, 1, 9, 9)}
     assert len({hash_of(replace(used, **{key: value})) for key, value in changes.items()} - {before}) == len(changes)
     assert hash_of(used, masks=tmp_path / "masks") != before
     (folder / "a.jpg").write_text("a better photo of the same name")
@@ -114,30 +105,23 @@ def test_names_stay_where_they_can(path):
     [("a.webp", "a.webp.jpg"), ("b", "b.jpg"), ("line\nbreak.jpg", "line_break.jpg"), ("\x1b[2Jx.png", "_[2Jx.png"),
      ("\udcff.jpg", "_.jpg"), ("e\u202egpj.jpg", "e_gpj.jpg")],
 )  # fmt: skip
-def test_names_that_colmap_or_a_terminal_cannot_have(path, stored):
-    assert named(path) == [stored]
+def test_names_that_colmap_or_a_terminal_cannot_have_are_replaced_and_the_original_is_kept(path, stored):
+    (photo,) = assign_names([Photo(path, 60, 40, "g")])
+    assert (photo.name, photo.path) == (stored, path)
 
 
-def test_what_has_lost_nothing_becomes_png():
+def test_lossless_photos_become_png():
     assert named("a.tif", "b.bmp", lossy=False) == ["a.tif.png", "b.bmp.png"]
 
 
-def test_no_two_photos_get_one_name():
+def test_names_are_unique_and_differ_by_more_than_capitals():
     found = named("a.webp", "a.webp.jpg", "x\n.jpg", "x\r.jpg", "x_.jpg", "in/a.webp")
     assert len(set(found)) == len(found)
     assert (found[1], found[4]) == ("a.webp.jpg", "x_.jpg")
-
-
-def test_names_differ_by_more_than_capitals():
     assert named("a.jpg", "A.JPG", "_A.JPG", "b.webp", "B.WEBP.jpg") == [
         "a.jpg", "__A.JPG", "_A.JPG", "_b.webp.jpg", "B.WEBP.jpg",
     ]  # fmt: skip
     assert named("in/a.jpg", "In/a.jpg") == ["in/a.jpg", "In/_a.jpg"]
-
-
-def test_what_it_was_called_is_kept():
-    (photo,) = assign_names([Photo("a.webp", 60, 40, "g")])
-    assert (photo.name, photo.path) == ("a.webp.jpg", "a.webp")
 
 
 @pytest.mark.parametrize("turn", [90, 180, 270])

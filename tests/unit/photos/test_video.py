@@ -49,7 +49,6 @@ CONTAINERS = [
 @pytest.mark.parametrize(("name", "code"), CONTAINERS)
 def test_frames_keep_their_numbers(tmp_path, name, code):
     path = write(tmp_path / name, code)
-
     assert is_video(read_head(path))
     with open_video(path) as found:
         small = list(found.small_frames())
@@ -83,10 +82,8 @@ def test_phones_that_were_turned_give_upright_frames(tmp_path):
     matrix = data.index(b"tkhd") + 4 + 40
     data[matrix : matrix + 36] = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, HEIGHT << 16, 0, 1 << 30)
     (tmp_path / "a.mp4").write_bytes(data)
-
     with open_video(tmp_path / "a.mp4") as found:
         _, picture = next(found.small_frames())
-
     assert picture.shape == (WIDTH, HEIGHT)
     assert picture[:20].mean() < 0.6 * picture[-20:].mean()  # what was left is up
 
@@ -151,7 +148,6 @@ def test_lists_of_other_files_are_not_followed(tmp_path, monkeypatch, kind, endi
     write(tmp_path / "a.ts", "mp4v")
     path = tmp_path / f"x.{kind if ending == 'list' else ending}"
     path.write_text(LISTS[kind].format("a.ts"))
-
     with pytest.raises(UnreadableError, match="not a video"), open_video(path):
         pass
     monkeypatch.setattr(video, "is_video", bool)  # and FFmpeg would not, either
@@ -259,14 +255,12 @@ def test_a_rest_adds_nothing(wall):
 @pytest.mark.parametrize("most", [2, 5, 17])
 def test_no_more_than_wanted_and_evenly(slide, most):
     places = np.arange(0, 600, 3.0)
-
     choice = select_keyframes(slide, most)
     gaps = np.diff(places[list(choice.frames)])
-
     assert len(choice.frames) == most
     assert gaps.max() < 600 / (most - 1) + STEP_PX + 3
     assert gaps.min() > 0.5 * 600 / (most - 1) - STEP_PX
-    assert choice.left_out["more than max_frames"] == pytest.approx(
+    assert choice.rejected["more than max_frames"] == pytest.approx(
         len(select_keyframes(slide, 2000).frames) - most, abs=most
     )
 
@@ -306,14 +300,12 @@ def test_the_same_frames_give_the_same_choice(wall):
 def test_any_looks_give_a_choice_in_order(steps, most):
     way = np.maximum(0.0, np.cumsum([step for _, step in steps]) - steps[0][1])
     looks = [TrackedFrame(3 * k, sharp, float(at)) for k, ((sharp, _), at) in enumerate(zip(steps, way, strict=True))]
-
     choice = select_keyframes(looks, most)
-
     assert 1 <= len(choice.frames) <= most
     assert list(choice.frames) == sorted(set(choice.frames))
     assert set(choice.frames) <= {look.frame for look in looks}
-    assert len(choice.frames) + sum(choice.left_out.values()) == len(looks)
-    assert min(choice.left_out.values(), default=1) > 0
+    assert len(choice.frames) + sum(choice.rejected.values()) == len(looks)
+    assert min(choice.rejected.values(), default=1) > 0
 
 
 def test_no_looks_no_frames():

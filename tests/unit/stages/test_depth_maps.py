@@ -109,20 +109,18 @@ def upside_down(scene):
     return scene
 
 
-def test_depths_in_the_sky_are_removed(upside_down):
-    counts = run_stage(upside_down, Method())
-    depth = read_depth(upside_down.dense_dir, read_views(upside_down.dense_dir)[0], "geometric")
+def first_depth(scene):
+    return read_depth(scene.dense_dir, read_views(scene.dense_dir)[0], "geometric")
+
+
+def test_depths_in_the_sky_are_removed_unless_they_shall_stay(upside_down):
+    assert "sky" not in run_stage(upside_down, Method(), drop_sky=False)
+    assert (first_depth(upside_down)[:30] == 3).all()
+    counts, depth = run_stage(upside_down, Method(), "again"), first_depth(upside_down)
     assert counts["sky"] == pytest.approx(30 / 60, abs=0.07)  # but for the rim of a column that COLMAP leaves black
     assert (depth[:26] == 3).all()
     assert not (depth[28:, :74] > 0).any()
     assert np.mean(depth == SKY) == pytest.approx(counts["sky"], abs=0.02)
-
-
-def test_depths_in_the_sky_stay_where_that_is_asked_for(upside_down):
-    counts = run_stage(upside_down, Method(), drop_sky=False)
-    depth = read_depth(upside_down.dense_dir, read_views(upside_down.dense_dir)[0], "geometric")
-    assert "sky" not in counts
-    assert (depth[:30] == 3).all()
 
 
 def test_a_run_that_is_killed_while_it_removes_the_sky_finds_the_same_sky(upside_down, monkeypatch):
@@ -142,20 +140,14 @@ def test_a_run_that_is_killed_while_it_removes_the_sky_finds_the_same_sky(upside
         np.testing.assert_array_equal(read_depth(upside_down.dense_dir, view, "geometric"), before)
 
 
-def test_a_killed_run_keeps_what_it_made(scene):
+def test_a_killed_run_keeps_its_maps_and_a_finished_one_is_repeated(scene):
     kill_at(scene, "3.png")
     assert (scene.dense_dir / UNFINISHED).exists()
-    method = Method()
-    run_stage(scene, method)
-    assert method.asked == ["3.png"]
-    assert not (scene.dense_dir / UNFINISHED).exists()
-
-
-def test_a_finished_stage_is_done_anew_when_it_is_run_again(scene):
-    run_stage(scene, Method())
-    method = Method()
-    run_stage(scene, method)
-    assert method.asked == ["1.png", "2.png", "3.png"]
+    for asked in (["3.png"], ["1.png", "2.png", "3.png"]):
+        method = Method()
+        run_stage(scene, method)
+        assert method.asked == asked
+        assert not (scene.dense_dir / UNFINISHED).exists()
 
 
 @pytest.mark.parametrize("change", ["inputs", "model"])
@@ -166,9 +158,7 @@ def test_nothing_is_kept_that_was_made_from_something_else(scene, change):
         model.cameras[1].params = [71, 71, 40, 30]
         model.write(scene.model_dir)
     method = Method()
-
     run_stage(scene, method, fingerprint="others" if change == "inputs" else "")
-
     assert method.asked == ["1.png", "2.png", "3.png"]
 
 
@@ -182,8 +172,7 @@ def test_what_is_masked_has_no_depth_whatever_method_made_it(scene, tmp_path):
 
     counts = run_stage(scene, Method(), mask_dir=tmp_path / "masks")
 
-    view = read_views(scene.dense_dir)[0]
-    depth = read_depth(scene.dense_dir, view, "geometric")
+    depth = first_depth(scene)
     assert (depth[:, :40] == MASKED).all()
     assert (depth[:30, 43:] == 3).all()
     assert counts["coverage"]["1.png"] == pytest.approx(0.25, abs=0.03)
@@ -194,9 +183,7 @@ def test_estimates_are_removed_at_the_end(scene):
     kill_at(scene, "1.png")
     leftover = scene.dense_dir / "stereo" / "depth_maps" / "1.png.photometric.bin"
     leftover.write_bytes(b"estimate")
-
     run_stage(scene, Method())
-
     assert not leftover.exists()
     views = read_views(scene.dense_dir)
     assert all(DenseStore(scene.dense_dir).has(view, "geometric") for view in views)

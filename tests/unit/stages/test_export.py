@@ -1,3 +1,5 @@
+"""Files of the finished model."""
+
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest

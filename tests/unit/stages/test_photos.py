@@ -44,10 +44,6 @@ def folder(tmp_path):
     return place
 
 
-def reasons(photo_set):
-    return {photo.name: photo.reason for photo in photo_set.unusable}
-
-
 def source_of(folder, run):
     return read_source(folder, run.workspace.root, run.settings.photos, map)
 
@@ -73,14 +69,10 @@ def test_every_file_is_used_or_has_a_reason(folder, run):
     found = make(folder, run)
 
     assert [photo.name for photo in found.photos] == ["a.jpg", "b.png", "sub dir/ü b.jpg"]
-    assert reasons(found) == {
-        ".hidden.jpg": "hidden",
-        "notes.txt": "not a photo",
-        "empty.jpg": "empty",
-        "cut.jpg": "truncated or damaged",
-        "tiny.png": "smaller than 64 px",
-        "copy.png": "the same picture as b.png",
-    }
+    assert {photo.name: photo.reason for photo in found.unusable} == {
+        ".hidden.jpg": "hidden", "notes.txt": "not a photo", "empty.jpg": "empty", "cut.jpg": "truncated or damaged",
+        "tiny.png": "smaller than 64 px", "copy.png": "the same picture as b.png",
+    }  # fmt: skip
     assert load(folder, run) == found
     assert np.array_equal(np.asarray(Image.open(run.workspace.photos / "b.png")), pixels(2))
 
@@ -125,14 +117,9 @@ def test_photos_of_one_size_share_a_camera_unless_exif_tells_them_apart(folder, 
     exif = Image.Exif()
     exif[0x0110] = "Box Brownie"
     Image.fromarray(PIXELS).save(folder / "d.jpg", exif=exif)
-
     groups = make(folder, run).groups
-
-    assert [[photo.name for photo in members] for members in groups.values()] == [
-        ["a.jpg", "b.png"],
-        ["c.jpg"],
-        ["d.jpg"],
-    ]
+    names = [[photo.name for photo in members] for members in groups.values()]
+    assert names == [["a.jpg", "b.png"], ["c.jpg"], ["d.jpg"]]
 
 
 def test_bars_around_a_picture_are_seen_and_read_back(folder, run):
@@ -157,14 +144,7 @@ def test_exif_focal_is_read_as_a_hint_in_pixels(folder, run):
 def with_gps(folder, **entries):
     """A photo whose EXIF has these GPS entries on top of sound ones; None takes one away."""
     tags = {"lat_ref": 1, "lat": 2, "lon_ref": 3, "lon": 4, "alt_ref": 5, "alt": 6}
-    sound = {
-        "lat_ref": "S",
-        "lat": (33.0, 51.0, 24.5),
-        "lon_ref": "E",
-        "lon": (151.0, 12.0, 54.25),
-        "alt_ref": b"\x00",
-        "alt": 7.5,
-    }
+    sound = dict(zip(tags, ("S", (33.0, 51.0, 24.5), "E", (151.0, 12.0, 54.25), b"\x00", 7.5), strict=True))
     exif = Image.Exif()
     exif.get_ifd(0x8825).update({tags[name]: value for name, value in (sound | entries).items() if value is not None})
     Image.fromarray(PIXELS).save(folder / "where.jpg", exif=exif)
@@ -196,18 +176,10 @@ def test_altitude_is_optional(folder, run, entries, altitude_m):
 
 @pytest.mark.parametrize(
     "entries",
-    [
-        {"lat": None},
-        {"lon_ref": None},
-        {"lat_ref": "X"},
-        {"lat": (91.0, 0.0, 0.0)},
-        {"lon": (180.0, 30.0, 0.0)},
-        {"lat": (33.0, 75.0, 0.0)},
-        {"lat": (33.0, 51.0)},
-        {"lat": (IFDRational(33, 0), 51.0, 0.0)},
-        {"lat": (0.0, 0.0, 0.0), "lon": (0.0, 0.0, 0.0)},
-    ],
-)
+    [{"lat": None}, {"lon_ref": None}, {"lat_ref": "X"}, {"lat": (91.0, 0.0, 0.0)}, {"lon": (180.0, 30.0, 0.0)},
+     {"lat": (33.0, 75.0, 0.0)}, {"lat": (33.0, 51.0)}, {"lat": (IFDRational(33, 0), 51.0, 0.0)},
+     {"lat": (0.0, 0.0, 0.0), "lon": (0.0, 0.0, 0.0)}],
+)  # fmt: skip
 def test_a_position_that_cannot_be_true_is_none(folder, run, entries):
     with_gps(folder, **entries)
     assert read_gps(folder, run) is None
@@ -247,22 +219,20 @@ def test_photos_that_came_later_are_read_and_known_ones_are_not_decoded_again(fo
 
 
 @pytest.mark.parametrize(
-    ("names", "says"),
+    ("files", "photos", "says"),
     [
-        ((), "no usable photo in .*: the folder is empty"),
-        (("notes.txt", "more.txt"), "no usable photo in .*: 2 not a photo"),
-        (("one.jpg",), "only one usable photo"),
+        ((), (), "no usable photo in .*: the folder is empty"),
+        (("notes.txt", "more.txt"), (), "no usable photo in .*: 2 not a photo"),
+        ((), ("one.jpg",), "only one usable photo in .*: it has no other file"),
     ],
 )
-def test_too_few_photos(tmp_path, run, names, says):
+def test_too_few_photos(tmp_path, run, files, photos, says):
     folder = tmp_path / "few"
     folder.mkdir()
-    for name in names:
-        if name.endswith(".jpg"):
-            Image.fromarray(PIXELS).save(folder / name)
-        else:
-            (folder / name).write_text("text")
-
+    for name in files:
+        (folder / name).write_text("text")
+    for name in photos:
+        Image.fromarray(PIXELS).save(folder / name)
     with pytest.raises(InputError, match=says):
         make(folder, run)
 

@@ -1,3 +1,5 @@
+"""Pairs with a time stamp, with failures, and of a killed run."""
+
 import numpy as np
 import pytest
 
@@ -80,10 +82,8 @@ def test_parts_come_back_as_they_were(build, tmp_path):
     found = {pair: (fit, 3) for pair, fit in graph.fits.items()} | {
         pair: (no, 0) for pair, no in graph.rejected.items()
     }
-
     fitting.write_part(tmp_path / "part.npz", found)
     again = fitting.read_part(tmp_path / "part.npz", list(found))
-
     assert [count for _, count in again.values()] == [3, 0]
     arrays = [fitting.to_view_graph(parts).to_arrays() for parts in (found, again)]
     assert all(np.array_equal(arrays[0][name], arrays[1][name]) for name in arrays[0])
