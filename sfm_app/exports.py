@@ -37,7 +37,7 @@ from sfm_app.frame.sighted_points import Distance, PosedPhotos, measure_distance
 from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import json_text
 from sfm_app.operating_system import is_link, move
-from sfm_app.photos import mask_path, save_mask
+from sfm_app.photos.masks import mask_path, save_mask
 from sfm_app.pipeline import MESH, SCALE, SCENE, TEXTURE
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Model, Scene, SceneArrays

@@ -10,7 +10,7 @@ from sfm_app.engine.execution import Pipeline
 from sfm_app.engine.stage import Products, Stage
 from sfm_app.frame.control_points import read_control_points
 from sfm_app.frame.scale import MetricFrame
-from sfm_app.photos import read_source
+from sfm_app.photos.source import read_source
 from sfm_app.runtime.context import CONTROL_POINTS, GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.stages import depth_maps, export, intrinsics, match_graph, mesh, photos, scale, scene, texture, view_graph

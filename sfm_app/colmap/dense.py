@@ -15,7 +15,7 @@ from sfm_app.colmap.backend import all_images, check_written, pycolmap, translat
 from sfm_app.colmap.worker_process import UndistortTask, run_worker
 from sfm_app.files import digest_files, is_below
 from sfm_app.operating_system import replace_file
-from sfm_app.photos import mask_path, read_mask, save_mask
+from sfm_app.photos.masks import mask_path, read_mask, save_mask
 from sfm_app.progress import Progress
 from sfm_app.settings import MOST_LEVELS
 from sfm_app.stereo import DepthEstimate, DepthMap, Kind, View

@@ -15,7 +15,7 @@ from sfm_app.colmap.bundle import camera_family, read_camera
 from sfm_app.colmap.dense import MASKS, shrink_mask
 from sfm_app.colmap.tasks import JPEG_QUALITY
 from sfm_app.files import replace_atomically
-from sfm_app.photos import read_mask, save_mask
+from sfm_app.photos.masks import read_mask, save_mask
 from sfm_app.photos.panoramas import resample, shrink
 from sfm_app.types.arrays import BoolArray, FloatArray
 

@@ -26,7 +26,7 @@ from sfm_app.errors import BackendError, ConfigError, DamagedProductError, Input
 from sfm_app.files import fingerprint
 from sfm_app.jit import warming_up
 from sfm_app.operating_system import ChildTimes, cpu_seconds
-from sfm_app.photos import Source
+from sfm_app.photos.source import Source
 from sfm_app.runtime.context import Earlier, RunContext
 from sfm_app.runtime.cost_estimate import choose_plan
 from sfm_app.runtime.parallel import cpu_seconds_elsewhere

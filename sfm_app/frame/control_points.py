@@ -115,9 +115,9 @@ class ControlFit:
     deviation: float
     """Relative standard deviation of the scale."""
     rms_m: float
-    """Root mean square distance of the used points."""
-    used: tuple[str, ...]
-    wrong: Mapping[str, float]
+    """Root mean square distance of the inliers."""
+    inliers: tuple[str, ...]
+    outliers: Mapping[str, float]
     """Distance of each rejected point from the fit, in meters."""
 
 

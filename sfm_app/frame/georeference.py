@@ -49,9 +49,9 @@ class Georeference:
     """To meters east, north and up of `origin`."""
     origin: GpsPosition
     """Position of (0, 0, 0); without altitude, heights are relative to the cameras' median height."""
-    photos: int
+    inliers: int
     """Number of distinct positions that agree."""
-    of: int
+    positions: int
     """Number of distinct positions."""
     rms_m: float
     """Root mean square horizontal residual of the agreeing positions."""

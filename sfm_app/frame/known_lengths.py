@@ -71,7 +71,7 @@ def control_places(
         located[point.name] = place
         problems += [
             f"ground control point '{point.name}': its mark in {photo} contradicts the others, and is left out"
-            for photo in place.left_out
+            for photo in place.outliers
         ]
     return located
 

@@ -53,8 +53,6 @@ class MarkerOptions:
     max_rms_cells: float = 0.25
     """Largest scatter of the edges about the pattern, in cells. Chosen by hand: noise and blur reach a tenth, another
     pattern a half."""
-    min_sigma_px: float = 0.01
-    """Least standard deviation of a corner, in pixels. Chosen by hand."""
     edge_bias_px: float = 0.05
     """Standard deviation of the remaining bias of a side's length: 0.014 to 0.1 for markers of 30 to 45 pixels and blur
     of 0.5 to 1.5, less for larger ones; on rendered photos, as in the unit tests."""
@@ -72,24 +70,14 @@ OPTIONS = MarkerOptions()
 # side and above and below, which separate this shift from the size.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FittedMarker:
-    """The pattern of a marker, fitted to a photo."""
+def fit_pattern(gray: NDArray[np.uint8], pattern: NDArray[np.uint8], corners: FloatArray) -> FloatArray | None:
+    """Return the corners (4, 2) of a pattern in a photo (H, W), by all edges of the pattern.
 
-    corners: FloatArray
-    """(4, 2) in pixels, clockwise from the pattern's own top left; pixel centers at +0.5."""
-    sigma_px: float
-    """Standard deviation of a corner, from the scatter of the edges."""
-
-
-def fit_pattern(gray: NDArray[np.uint8], pattern: NDArray[np.uint8], corners: FloatArray) -> FittedMarker | None:
-    """Fit the edges of a pattern to a photo (H, W), beginning with corners that are exact to a pixel or two.
-
-    Return None if too few edges are visible, or if they belong to another pattern.
+    None if too few edges are visible or agree with the pattern.
 
     Args:
         pattern: (N, N) cells of the marker with its dark border, 0 or 255; its surroundings are light.
-        corners: (4, 2) in pixels, clockwise from the pattern's own top left; pixel centers at +0.5.
+        corners: (4, 2) exact to a pixel or two, clockwise from the pattern's own top left; pixel centers at +0.5.
     """
     light, dark = edge_sides(pattern)
     middle, cells = (light + dark) / 2, float(len(pattern))
@@ -112,8 +100,7 @@ def fit_pattern(gray: NDArray[np.uint8], pattern: NDArray[np.uint8], corners: Fl
     cell_px = np.sqrt(cv2.contourArea(corners.astype(np.float32))) / cells
     if edges < OPTIONS.min_share * len(middle) or rms > OPTIONS.max_rms_cells * cell_px:
         return None
-    # a corner has the deviation of its two sides, each measured by a share of the edges
-    return FittedMarker(corners, max(float(rms * np.sqrt(UNKNOWNS / edges)), OPTIONS.min_sigma_px))
+    return corners
 
 
 def edge_sides(pattern: NDArray[np.uint8]) -> tuple[FloatArray, FloatArray]:
@@ -206,7 +193,6 @@ class DetectedMarker:
     number: int
     corners: FloatArray
     """(4, 2) in pixels, clockwise from the marker's own top left; pixel centers at +0.5."""
-    sigma_px: float
 
     @property
     def name(self) -> str:
@@ -236,7 +222,7 @@ def find_markers(gray: NDArray[np.uint8], families: Sequence[str]) -> list[Detec
             pattern = draw_pattern(family, int(number))
             fitted = fit_pattern(gray, pattern, np.asarray(outline, np.float64).reshape(4, 2) + 0.5)
             if fitted is not None:
-                markers.append(DetectedMarker(family, int(number), fitted.corners, fitted.sigma_px))
+                markers.append(DetectedMarker(family, int(number), fitted))
     return markers
 
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from sfm_app.geometry.poses import Similarity
 from sfm_app.types import Frustum, Model
-from sfm_app.wording import format_length
 
 GPS = "GPS of the photos"
 CONTRADICTION = 4.0
@@ -89,11 +88,6 @@ def _contradiction(one: ScaleEvidence, against: ScaleEvidence, name: str) -> str
     return (
         f"{one.name} contradicts {name}: by it, the model is {abs(share):.2g} % {'larger' if share > 0 else 'smaller'}"
     )
-
-
-def deviation_text(scale: float, deviation: float) -> str:
-    """Return a scale in meters per unit of the model, and its relative deviation, for people."""
-    return f"a unit of the model is {format_length(scale)} +- {100 * deviation:.2g} %"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

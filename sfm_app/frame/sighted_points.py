@@ -64,10 +64,8 @@ class SightedPoint:
     """(3,)."""
     covariance: FloatArray
     """(3, 3), in squared units of the model."""
-    residual_px: float
-    """Root mean square distance of the marks from it."""
     photos: tuple[str, ...]
-    left_out: tuple[str, ...]
+    outliers: tuple[str, ...]
     """Photos whose mark contradicts the others."""
 
 
@@ -96,7 +94,6 @@ def locate_point(sights: Sequence[Sight]) -> SightedPoint | str:
     return SightedPoint(
         place,
         np.asarray(sigma**2 * np.linalg.inv(information), np.float64),
-        float(np.sqrt(np.mean(residuals**2))),
         tuple(one.photo for one, inlier in zip(sights, inliers, strict=True) if inlier),
         tuple(one.photo for one, inlier in zip(sights, inliers, strict=True) if not inlier),
     )

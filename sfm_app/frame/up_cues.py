@@ -3,7 +3,7 @@
 Each cue is a number that is positive if `up` is up; all of them change sign with `up`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -228,14 +228,14 @@ def small_picture(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def fit_surfaces(
-    points: FloatArray, brightness: FloatArray, seen: Sequence[NDArray[np.int64]], centers: FloatArray
+    points: FloatArray, brightness: FloatArray, visible: Sequence[NDArray[np.int64]], centers: FloatArray
 ) -> Surfaces:
     """Fit a plane to the neighbors of each point, and keep flat patches.
 
     Args:
         points: (P, 3).
         brightness: (P,) 0 to 255.
-        seen: per photo, the indices of its visible points.
+        visible: per photo, the indices of its visible points.
         centers: (N, 3) of the cameras.
     """
     from scipy.spatial import cKDTree
@@ -247,8 +247,8 @@ def fit_surfaces(
     near = near - near.mean(axis=1, keepdims=True)
     variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
     towards = np.zeros_like(points)
-    for visible, center in zip(seen, centers, strict=True):
-        towards[visible] += normalize(center - points[visible])
+    for rows, center in zip(visible, centers, strict=True):
+        towards[rows] += normalize(center - points[rows])
     normals = axes[:, :, 0]
     normals = normals * np.where((normals * towards).sum(axis=1) < 0, -1.0, 1.0)[:, None]
     gray = np.log(10.0 + brightness)
@@ -262,7 +262,7 @@ def depth_height_correlation(
     rotations: FloatArray,
     centers: FloatArray,
     points: FloatArray,
-    seen: Sequence[NDArray[np.int64]],
+    visible: Sequence[NDArray[np.int64]],
 ) -> float:
     """Return the mean correlation of log depth with height in the photo, in [-1, 1].
 
@@ -273,11 +273,11 @@ def depth_height_correlation(
         rotations: (N, 3, 3) of cam_from_world.
         centers: (N, 3) of the cameras.
         points: (P, 3) in the world.
-        seen: per photo, the indices of its visible points.
+        visible: per photo, the indices of its visible points.
     """
     correlations = []
-    for R, center, visible in zip(rotations, centers, seen, strict=True):
-        local = np.einsum("ij,nj->ni", R, points[visible] - center)
+    for R, center, rows in zip(rotations, centers, visible, strict=True):
+        local = np.einsum("ij,nj->ni", R, points[rows] - center)
         local = local[local[:, 2] > 0]
         if len(local) < CUE_OPTIONS.min_points:
             continue
@@ -287,7 +287,7 @@ def depth_height_correlation(
         depth, height = depth - depth.mean(), height - height.mean()
         spread = (depth.std() + CUE_OPTIONS.depth_spread) * height.std()
         correlations.append(float((depth * height).mean() / spread) if spread > 0 else 0.0)
-    return float(np.mean(correlations)) if correlations else 0.0
+    return _mean(correlations)
 
 
 def mean_upward_normal(up: FloatArray, surfaces: Surfaces) -> float:
@@ -319,14 +319,11 @@ def slope_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[ND
         pictures: per photo (H, W) gray, in the orientation of the sensor; None if there is none.
     """
     shares = []
-    for R, picture in zip(rotations, pictures, strict=True):
-        if picture is None or min(picture.shape) < 3:
-            continue
-        gray = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), CUE_OPTIONS.blur_px)
+    for R, gray in _blurred(rotations, pictures, CUE_OPTIONS.blur_px):
         slope = _slope(np.sqrt(gray), R @ up)[~_black_background(gray)[1:-1, 1:-1]]
         power = (slope**2).sum()
         shares.append(float((slope * np.abs(slope)).sum() / power) if power > 0 else 0.0)
-    return float(np.mean(shares)) if shares else 0.0
+    return _mean(shares)
 
 
 def sky_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
@@ -335,12 +332,9 @@ def sky_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDAr
     Arguments are those of `slope_asymmetry`.
     """
     differences = []
-    for R, picture in zip(rotations, pictures, strict=True):
-        if picture is None or min(picture.shape) < 3:
-            continue
-        gray = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), CUE_OPTIONS.sky_blur_px)
-        steep = np.hypot(_slope(gray, np.array([1.0, 0.0])), _slope(gray, np.array([0.0, 1.0])))
-        gray = gray[1:-1, 1:-1]
+    for R, blurred in _blurred(rotations, pictures, CUE_OPTIONS.sky_blur_px):
+        steep = np.hypot(_slope(blurred, np.array([1.0, 0.0])), _slope(blurred, np.array([0.0, 1.0])))
+        gray = blurred[1:-1, 1:-1]
         even = (steep < CUE_OPTIONS.max_sky_slope) & (gray > max(float(np.median(gray)), CUE_OPTIONS.min_sky))
         y, x = np.mgrid[: gray.shape[0], : gray.shape[1]] - 0.5 * (np.array(gray.shape)[:, None, None] - 1)
         axis = R @ up
@@ -348,13 +342,26 @@ def sky_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDAr
         border = 0.5 * np.abs(height).max()
         above, below = even[height > border], even[height < -border]
         differences.append(float(above.mean() - below.mean()) if above.size and below.size else 0.0)
-    return float(np.mean(differences)) if differences else 0.0
+    return _mean(differences)
+
+
+def _blurred(
+    rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None], blur_px: float
+) -> Iterator[tuple[FloatArray, NDArray[np.float32]]]:
+    """Yield the rotation and the blurred gray levels of each photo that has a picture."""
+    for R, picture in zip(rotations, pictures, strict=True):
+        if picture is not None and min(picture.shape) >= 3:
+            yield R, np.asarray(cv2.GaussianBlur(picture.astype(np.float32), (0, 0), blur_px), np.float32)
+
+
+def _mean(values: list[float]) -> float:
+    return float(np.mean(values)) if values else 0.0
 
 
 def _black_background(gray: NDArray[np.float32]) -> NDArray[np.bool_]:
-    broad, border = (
-        np.ones((width, width), np.uint8) for width in (CUE_OPTIONS.black_px, 2 * CUE_OPTIONS.border_px + 1)
-    )
+    """Return the pixels (H, W) of an unlit background and its border."""
+    widths = CUE_OPTIONS.black_px, 2 * CUE_OPTIONS.border_px + 1
+    broad, border = (np.ones((width, width), np.uint8) for width in widths)
     black = cv2.morphologyEx((gray < CUE_OPTIONS.black).astype(np.uint8), cv2.MORPH_OPEN, broad)
     return np.asarray(cv2.dilate(black, border) > 0)
 

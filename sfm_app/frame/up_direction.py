@@ -162,7 +162,7 @@ class Scenery:
     """(P, 3)"""
     brightness: FloatArray
     """(P,) 0 to 255."""
-    seen: tuple[NDArray[np.int64], ...]
+    visible: tuple[NDArray[np.int64], ...]
     """Per photo, the indices of its visible points."""
     pictures: tuple[NDArray[np.uint8] | None, ...]
     """Per photo its `small_picture`, or None."""
@@ -189,7 +189,7 @@ def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArra
         rotations: (N, 3, 3) cam_from_world of the photos.
         centers: (N, 3) camera centers.
     """
-    surfaces = fit_surfaces(scenery.points, scenery.brightness, scenery.seen, centers)
+    surfaces = fit_surfaces(scenery.points, scenery.brightness, scenery.visible, centers)
     ledges = [slope_asymmetry(roll.up, rotations, scenery.pictures) for roll in rolls[:2]]
     upright, lying = (
         float(np.logaddexp(-roll.cost, -opposite.cost)) for roll, opposite in zip(rolls[:2], rolls[2:], strict=True)
@@ -199,7 +199,7 @@ def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArra
     chosen = 0 if gap >= 0 else 1
     up, down = rolls[chosen], rolls[chosen + 2]
     values = {
-        "low is near": depth_height_correlation(up.up, rotations, centers, scenery.points, scenery.seen),
+        "low is near": depth_height_correlation(up.up, rotations, centers, scenery.points, scenery.visible),
         "tops are seen": mean_upward_normal(up.up, surfaces),
         "tops are bright": brightness_normal_correlation(up.up, surfaces),
         "ledges are lit": ledges[chosen],

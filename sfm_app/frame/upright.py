@@ -204,7 +204,7 @@ def _georeference_entry(viewer: Similarity, gps: Georeference | NoGeoreference) 
     east, north, _ = -enu_from_model.R[:, 2]
     return {
         "unit": "meter",
-        "gps": f"{gps.photos} of {gps.of} positions agree",
+        "gps": f"{gps.inliers} of {gps.positions} positions agree",
         "georeference": {
             "latitude_deg": round(origin.latitude_deg, 8),
             "longitude_deg": round(origin.longitude_deg, 8),

@@ -101,8 +101,6 @@ class VanishingDirection:
     """Standard deviation by the jackknife over photos; inf with a single photo."""
     share: float
     """Length of its segments, as a share of all."""
-    contrast: float
-    """Ratio of its support to the 90th percentile of those far from it."""
 
 
 def segment_planes(first: FloatArray, second: FloatArray, photo: int, scale_px: float) -> Segments:
@@ -277,7 +275,7 @@ def _verify_direction(
     total = matrices.sum(axis=0)
     without = [smallest_eigenvector(total - matrix, direction) for matrix in matrices if matrix.any()]
     deviation_deg = _jackknife(axis_angle_deg(np.reshape(without, (-1, 3)), direction))
-    return VanishingDirection(direction, deviation_deg, share, contrast)
+    return VanishingDirection(direction, deviation_deg, share)
 
 
 def _jackknife(moves: FloatArray) -> float:

@@ -172,9 +172,9 @@ def drop_duplicates(stats: Sequence[PhotoStats]) -> tuple[list[Photo], list[Unus
     similar = _similar_rows(small, OPTIONS.max_difference * np.maximum(contrast, OPTIONS.min_contrast))
     for k in order:
         others = [j for j in similar[k] if j in originals] if contrast[k] >= OPTIONS.min_contrast else []
-        off = np.sqrt(np.mean((small[others] - small[k]) ** 2, axis=1)) / max(contrast[k], OPTIONS.min_contrast)
-        if off.min(initial=np.inf) < OPTIONS.max_difference:
-            original_of[k] = others[int(off.argmin())]
+        rms = np.sqrt(np.mean((small[others] - small[k]) ** 2, axis=1)) / max(contrast[k], OPTIONS.min_contrast)
+        if rms.min(initial=np.inf) < OPTIONS.max_difference:
+            original_of[k] = others[int(rms.argmin())]
         else:
             originals.add(k)
     copies = [
@@ -189,8 +189,8 @@ def _similar_rows(small: NDArray[np.float32], limits: NDArray[np.floating]) -> l
     squares, similar = np.einsum("nd,nd->n", exact, exact), []
     for start in range(0, len(exact), OPTIONS.block_rows):
         part = slice(start, start + OPTIONS.block_rows)
-        apart = squares[part, None] + squares - 2.0 * exact[part] @ exact.T
-        close = apart < (1.01 * limits[part, None]) ** 2 * exact.shape[1] + 1e-3
+        distances = squares[part, None] + squares - 2.0 * exact[part] @ exact.T
+        close = distances < (1.01 * limits[part, None]) ** 2 * exact.shape[1] + 1e-3
         similar += [np.flatnonzero(row).tolist() for row in close]
     return similar
 

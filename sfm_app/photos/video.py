@@ -261,7 +261,7 @@ class Choice:
     """Chosen frames in ascending order, and why the others were not chosen."""
 
     frames: tuple[int, ...]
-    left_out: dict[str, int]
+    rejected: dict[str, int]
     """Number of frames by reason; each measured frame is either chosen or counted once."""
 
 

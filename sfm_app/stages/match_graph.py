@@ -18,11 +18,8 @@ from sfm_app.types import MatchGraph, PhotoSet
 def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
     """Find features and match pairs of photos, without geometric verification.
 
-    Features and matches that a killed run has found in the same photos are reused, and those of photos that an earlier
-    run has seen.
-
-    Raises:
-        ReconstructionError: no two photos have matches.
+    Features and matches of a killed run, and of the same photos in an earlier run, are reused. Raise a
+    ReconstructionError if no two photos have matches.
     """
     place, options = run.workspace, run.settings.matching
     marker = place.database_marker
@@ -61,10 +58,9 @@ def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
 
 
 def load(photos: PhotoSet, run: RunContext) -> MatchGraph:
-    """Read the match graph back from the database.
+    """Read the match graph of these photos from the database.
 
-    Raises:
-        ValueError: the database is damaged; COLMAP would end the program on it.
+    Raise a ValueError if it is damaged: COLMAP would end the program on it.
     """
     if not is_sound(run.workspace.database):
         raise ValueError(f"{run.workspace.database} is damaged")

@@ -13,30 +13,13 @@ from typing import Any
 from sfm_app.errors import InputError
 from sfm_app.files import digest_files, is_below, replace_atomically
 from sfm_app.operating_system import is_link
-from sfm_app.photos import (
-    MASK_HINT,
-    CornerTracker,
-    PhotoStats,
-    Source,
-    UnreadableError,
-    assign_names,
-    drop_duplicates,
-    drop_unusable,
-    find_mask,
-    group_by_camera,
-    is_laid_out,
-    lay_out,
-    lay_out_mask,
-    list_files,
-    mask_path,
-    open_video,
-    read_photo,
-    read_stats,
-    select_keyframes,
-    split_by_given_camera,
-    unused_masks,
-    write_stats,
-)
+from sfm_app.photos.decode import UnreadableError
+from sfm_app.photos.files import list_files
+from sfm_app.photos.masks import MASK_HINT, find_mask, lay_out_mask, mask_path, unused_masks
+from sfm_app.photos.probe import group_by_camera, read_photo, split_by_given_camera
+from sfm_app.photos.selection import PhotoStats, drop_duplicates, drop_unusable, read_stats, write_stats
+from sfm_app.photos.source import Source, assign_names, is_laid_out, lay_out
+from sfm_app.photos.video import CornerTracker, open_video, select_keyframes
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import largest_photo_megapixels
@@ -128,7 +111,7 @@ def choose_frames(source: Path, run: RunContext) -> FrameChoice:
         "seconds": round(video.seconds, 2),
         "looked_at": sampled,
         "chosen": len(choice.frames),
-        "left_out": choice.left_out | ({"black": video.black} if video.black else {}),
+        "left_out": choice.rejected | ({"black": video.black} if video.black else {}),
         "notes": notes,
     }
     return FrameChoice(run.fingerprint, choice.frames, tuple(times_s[frame] for frame in choice.frames), counts)

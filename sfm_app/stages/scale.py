@@ -10,10 +10,10 @@ from sfm_app.colmap.model import sparse_model
 from sfm_app.files import digest_files, replace_atomically
 from sfm_app.frame.control_points import ControlFit, fit_control_points
 from sfm_app.frame.known_lengths import control_places, distance_evidence, marker_evidence
-from sfm_app.frame.scale import GPS, MetricFrame, ScaleEvidence, agree, move_model
+from sfm_app.frame.scale import GPS, IDENTITY, MetricFrame, ScaleEvidence, agree, move_model
 from sfm_app.frame.sighted_points import PosedPhotos
 from sfm_app.geometry.poses import Similarity
-from sfm_app.numerical import json_text
+from sfm_app.numerical import Json, json_text
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.types import PhotoSet, Scene
@@ -23,9 +23,9 @@ POINTS = "points"
 
 
 def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
-    """Find how large the scene is, and where, from all that is known of it; write its points and cameras in that frame.
+    """Find size and place of the scene from all evidence, and write its points and cameras in that frame.
 
-    Nothing that is missing or contradictory ends the run: it is recorded, and the unit stays what it was.
+    Missing or contradictory evidence is recorded and never ends the run; without any, the unit stays arbitrary.
     """
     frame = find_frame(photos, scene, run)
     with replace_atomically(run.workspace.scale) as path:
@@ -51,7 +51,7 @@ def read_frame(place: Workspace) -> MetricFrame:
 
 
 def find_frame(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
-    """Return the frame that the evidence supports, and record the evidence."""
+    """Return the frame by all evidence, and record the evidence."""
     options, evidence, problems = run.settings.scale, list[ScaleEvidence](), list[str]()
     if scene.gps_deviation is not None:
         evidence.append(ScaleEvidence(GPS, 1.0, max(scene.gps_deviation, 1e-4), len(scene.registered)))
@@ -70,45 +70,38 @@ def find_frame(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
         scale=frame.from_model.scale,
         deviation_percent=None if frame.deviation is None else round(100 * frame.deviation, 4),
         source=frame.source,
-        evidence=[
-            {
-                "name": one.name,
-                "scale": one.scale,
-                "deviation_percent": round(100 * one.deviation, 4),
-                "photos": one.photos,
-            }
-            for one in evidence
-        ],
+        evidence=[_evidence_entry(one) for one in evidence],
         contradictions=list(frame.contradictions),
         problems=problems,
     )
     return frame
 
 
+def _evidence_entry(one: ScaleEvidence) -> dict[str, Json]:
+    percent = round(100 * one.deviation, 4)
+    return {"name": one.name, "scale": one.scale, "deviation_percent": percent, "photos": one.photos}
+
+
 def _control_evidence(
     photos: PhotoSet, posed: PosedPhotos, run: RunContext, evidence: list[ScaleEvidence], problems: list[str]
 ) -> ControlFit | None:
-    """Return the fit to ground control points, and add what it tells to the evidence and the problems."""
+    """Return the fit to ground control points, and add to the evidence and the problems."""
     located = control_places(photos, posed, run.control_points, problems)
-    found = fit_control_points(run.control_points, located)
-    if isinstance(found, str):
-        problems.append(found)
+    fit = fit_control_points(run.control_points, located)
+    if isinstance(fit, str):
+        problems.append(fit)
         return None
-    for name, miss in found.wrong.items():
+    for name, miss in fit.outliers.items():
         problems.append(f"ground control point '{name}' contradicts the others: it is {miss:.3g} m off, and left out")
-    name = f"{len(found.used)} ground control points"
-    evidence.append(ScaleEvidence(name, found.from_model.scale, found.deviation, 0))
-    run.record(control_points={"used": list(found.used), "wrong": dict(found.wrong), "rms_m": found.rms_m})
-    return found
+    evidence.append(ScaleEvidence(f"{len(fit.inliers)} ground control points", fit.from_model.scale, fit.deviation))
+    run.record(control_points={"used": list(fit.inliers), "wrong": dict(fit.outliers), "rms_m": fit.rms_m})
+    return fit
 
 
 def shape_deviation(scene: Scene) -> float:
-    """Return the relative standard deviation of the proportions of a scene, by which places in it differ in scale.
-
-    A focal length that is off by a share bends depths against widths by about as much.
-    """
-    known = (one.deviations.get("fx", 0.0) / one.K[0, 0] for one in scene.cameras.values())
-    return float(max((share for share in known if np.isfinite(share)), default=0.0))
+    """Return the relative standard deviation of the proportions of a scene: the largest one of a focal length."""
+    shares = (one.deviations.get("fx", 0.0) / one.K[0, 0] for one in scene.cameras.values())
+    return float(max((share for share in shares if np.isfinite(share)), default=0.0))
 
 
 def _agreed_frame(evidence: Sequence[ScaleEvidence], control: ControlFit | None, shape: float) -> MetricFrame:
@@ -116,21 +109,16 @@ def _agreed_frame(evidence: Sequence[ScaleEvidence], control: ControlFit | None,
     if not evidence:
         return MetricFrame()
     agreed = agree(evidence, shape)
+    similarity = IDENTITY if agreed.scale == 1.0 else Similarity(agreed.scale, np.eye(3), np.zeros(3))
     source = ", ".join(one.name for one in agreed.used)
-    frame = MetricFrame(
-        Similarity(agreed.scale, np.eye(3), np.zeros(3)),
-        agreed.deviation,
-        source,
-        tuple(evidence),
-        agreed.contradictions,
-    )
+    frame = MetricFrame(similarity, agreed.deviation, source, tuple(evidence), agreed.contradictions)
     if control is None:
-        return frame if agreed.scale != 1.0 else replace(frame, from_model=MetricFrame().from_model)
-    apart = abs(float(np.log(agreed.scale / control.from_model.scale)))
+        return frame
+    difference = abs(float(np.log(agreed.scale / control.from_model.scale)))
     return replace(
         frame,
         from_model=control.from_model,
-        deviation=max(float(np.hypot(control.deviation, shape)), apart),
+        deviation=max(float(np.hypot(control.deviation, shape)), difference),
         crs=control.crs,
         offset=control.offset,
     )

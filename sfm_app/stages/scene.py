@@ -29,34 +29,32 @@ from sfm_app.types import Intrinsics, MatchGraph, Scene, ViewGraph
 
 
 def make(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Scene:
-    """Map the photos and adjust everything; later stages use the largest model, the others are kept beside it.
+    """Map the photos and adjust everything; later stages use the largest model, the others are written beside it.
 
-    Where an earlier run has a model of most photos, the new ones are placed in that.
-
-    Raises:
-        ReconstructionError: no pair of photos grows into a model; the message says why.
+    If an earlier model covers most photos, the new ones are registered in it. Raise a ReconstructionError if no pair
+    of photos grows into a model.
     """
-    aside = mapping_run(run)
+    inner = mapping_run(run)
     if run.earlier is not None:
-        first = map_new_photos(matches, views, intrinsics, aside, run.earlier)
+        mapped = map_new_photos(matches, views, intrinsics, inner, run.earlier)
     else:
-        first = MappedScene(reconstruct(matches, views, intrinsics, aside), matches, views, intrinsics, aside)
+        mapped = MappedScene(reconstruct(matches, views, intrinsics, inner), matches, views, intrinsics, inner)
     try:
-        scene = _finish_scene(retry_lost_photos(first), run)
-    except ReconstructionError:  # after any other end, such as Ctrl-C or a full disk, the same command resumes there
-        shutil.rmtree(aside.workspace.root, ignore_errors=True)
+        scene = _finish_scene(retry_lost_photos(mapped), run)
+    except ReconstructionError:  # after other errors, such as Ctrl-C or a full disk, the same command resumes there
+        shutil.rmtree(inner.workspace.root, ignore_errors=True)
         raise
-    shutil.rmtree(aside.workspace.root, ignore_errors=True)
+    shutil.rmtree(inner.workspace.root, ignore_errors=True)
     return scene
 
 
 def load(run: RunContext) -> Scene:
     """Read the model and scene.json back."""
     place = run.workspace
-    known = json.loads(place.scene.read_text(encoding="utf-8"))
+    values = json.loads(place.scene.read_text(encoding="utf-8"))
     with translate_errors("reading the sparse model"):
-        scene = read_scene(place.sparse, known["camera_of"], known["unregistered"], known["cameras"])
-    return replace(scene, gps_deviation=known.get("gps_deviation"))
+        scene = read_scene(place.sparse, values["camera_of"], values["unregistered"], values["cameras"])
+    return replace(scene, gps_deviation=values.get("gps_deviation"))
 
 
 def digest(place: Workspace) -> str:
@@ -65,50 +63,56 @@ def digest(place: Workspace) -> str:
 
 
 def mapping_run(run: RunContext) -> RunContext:
-    """Return the run in an inner folder, where mapping has its own database and a killed run can resume."""
+    """Return the run in an inner folder, with a database of its own, where a killed run can resume."""
     place = SubWorkspace(run.workspace, MAPPING)
     if not resume_or_clear(place.root, run.fingerprint):
         mark_unfinished(place.root, run.fingerprint)
     return replace(run, workspace=place)
 
 
-def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
-    """Adjust the models, orient them upright, write them and record their figures.
-
-    Raises:
-        ReconstructionError: no model has depth.
-    """
-    matches, views, intrinsics = found.matches, found.views, found.intrinsics
-    outcome = _drop_models_without_depth(found.outcome, matches, views, intrinsics, run)
-    looks = submit_cue_extraction([attempt.model for attempt in outcome.models], matches, run)
-    names = {image.name: outcome.intrinsics.camera_name(image) for image in matches.images.values()}
-    wanted, database = run.settings.scene.camera_model, found.run.workspace.database
-    laid_down = [camera_rules(attempt.model, names, intrinsics, wanted) for attempt in outcome.models]
+def _adjust_models(
+    outcome: Outcome, mapped: MappedScene, names: Mapping[str, str], run: RunContext
+) -> tuple[list[Adjustment], dict[str, Json]]:
+    """Return the adjusted models, and the manifest's entry about the rolling shutter of the first, if it has one."""
+    database = mapped.run.workspace.database
+    rules = [
+        camera_rules(attempt.model, names, mapped.intrinsics, run.settings.scene.camera_model)
+        for attempt in outcome.models
+    ]
     with run.step("adjusting all cameras"):
         adjusted = [
-            adjust_or_keep(attempt.model, database, rules, families_known=attempt.mapper == GROWN)
-            for attempt, rules in zip(outcome.models, laid_down, strict=True)
+            adjust_or_keep(attempt.model, database, rule, families_known=attempt.mapper == GROWN)
+            for attempt, rule in zip(outcome.models, rules, strict=True)
         ]
     followed = [
-        follow_shutter(one, matches, database, run.progress, rules)
-        for one, rules in zip(adjusted, laid_down, strict=True)
+        follow_shutter(one, mapped.matches, database, run.progress, rule)
+        for one, rule in zip(adjusted, rules, strict=True)
     ]
-    adjusted, readout = [straight for straight, _ in followed], followed[0][1]
-    models = [found.model for found in adjusted]
+    readout = followed[0][1]
+    return [one for one, _ in followed], {} if readout is None else {"shutter": readout.to_dict()}
+
+
+def _finish_scene(mapped: MappedScene, run: RunContext) -> Scene:
+    """Adjust the models, orient them, write them and record their figures."""
+    matches, views, intrinsics = mapped.matches, mapped.views, mapped.intrinsics
+    outcome = _drop_models_without_depth(mapped, run)
+    cues = submit_cue_extraction([attempt.model for attempt in outcome.models], matches, run)
+    names = {image.name: outcome.intrinsics.camera_name(image) for image in matches.images.values()}
+    adjusted, shutter = _adjust_models(outcome, mapped, names, run)
+    models = [one.model for one in adjusted]
     with translate_errors("reading colors"):
         for model in models:
             color_points(model, run.workspace.photos, run.workers)
     turn_deg = None if run.settings.scene.photo_rotation_deg == "auto" else run.settings.scene.photo_rotation_deg
-    orientations = [orient_or_keep(model, matches, looks, turn_deg) for model in models]
+    orientations = [orient_or_keep(model, matches, cues, turn_deg) for model in models]
     write_models(models, run)
     members = [posed_photo_ids(model) for model in models]
     reasons = unregistered_reasons(set(members[0]), members[1:], matches, views, outcome.graph)
     scene = read_scene(run.workspace.sparse, names, reasons, refined_cameras(adjusted[0], names))
     scene = replace(scene, gps_deviation=gps_deviation(orientations[0]))
     write_scene(scene, run)
-    if readout is not None:
-        run.record(shutter=readout.to_dict())
     run.record(
+        **shutter,
         registered=len(scene.registered),
         of=len(matches.images),
         unregistered=dict(scene.unregistered),
@@ -130,28 +134,23 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     return scene
 
 
-def _drop_models_without_depth(
-    outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
-) -> Outcome:
-    """Drop the models of photos without parallax: their shape is arbitrary.
-
-    Raises:
-        ReconstructionError: no model is left; the message says why.
-    """
-    kept, doubts = [], []
+def _drop_models_without_depth(mapped: MappedScene, run: RunContext) -> Outcome:
+    """Drop models of photos without parallax, whose shape is arbitrary; raise a ReconstructionError if none is left."""
+    matches, views, outcome = mapped.matches, mapped.views, mapped.outcome
+    models, diagnoses = [], []
     for attempt in outcome.models:
-        placed = set(posed_photo_ids(attempt.model))
-        known = all(intrinsics.camera(matches.images[photo]).method != "guess" for photo in placed)
-        doubt = diagnose_depth(matches, views, placed, run.settings.epipolar, camera_known=known)
-        if doubt:
-            doubts.append(doubt)
+        posed = set(posed_photo_ids(attempt.model))
+        known = all(mapped.intrinsics.camera(matches.images[photo]).method != "guess" for photo in posed)
+        diagnosis = diagnose_depth(matches, views, posed, run.settings.epipolar, camera_known=known)
+        if diagnosis:
+            diagnoses.append(diagnosis)
         else:
-            kept.append(attempt)
-    if doubts and not kept:
-        raise doubts[0].error()
-    if not kept:
+            models.append(attempt)
+    if diagnoses and not models:
+        raise diagnoses[0].error()
+    if not models:
         raise diagnose_scene(matches, views, run.settings.matching).error("; ".join(outcome.tried))
-    return replace(outcome, models=tuple(kept))
+    return replace(outcome, models=tuple(models))
 
 
 def mapping_figures(outcome: Outcome) -> dict[str, Json]:
@@ -176,31 +175,30 @@ def mapping_figures(outcome: Outcome) -> dict[str, Json]:
 
 
 def _adjustment_problems(adjusted: Sequence[Adjustment], names: Mapping[str, str]) -> dict[str, Json]:
-    """Return the manifest's entries about problems of the last adjustment; empty for none."""
+    """Return the manifest's entries about problems of the last adjustment; empty without any."""
     main, others = adjusted[0], adjusted[1:]
     cameras = {image.camera_id: names[image.name] for image in posed_images(main.model)}
-    found: dict[str, Json] = {
+    problems: dict[str, Json] = {
         "failed": main.failure,
         "failed_in_other_models": {str(number): one.failure for number, one in enumerate(others, 1) if one.failure},
         "cameras_held": [cameras[camera_id] for camera_id in main.held],
         "points_left_open": main.open_points,
     }
-    return {key: value for key, value in found.items() if value}
+    return {key: value for key, value in problems.items() if value}
 
 
 def _lens_choices(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, Json]:
-    """Return the manifest's entries about the camera models: the chosen one of each camera, and its rivals."""
-    cameras = {names[image.name]: image.camera_id for image in posed_images(adjusted.model)}
-    found: dict[str, Json] = {
-        name: adjusted.lenses[camera_id].to_dict()
-        for name, camera_id in cameras.items()
-        if camera_id in adjusted.lenses
-    }
-    return found
+    """Return the manifest's entries about each camera's chosen model and its rivals."""
+    cameras = _camera_ids(adjusted, names)
+    return {name: adjusted.lenses[key].to_dict() for name, key in cameras.items() if key in adjusted.lenses}
+
+
+def _camera_ids(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, int]:
+    return {names[image.name]: image.camera_id for image in posed_images(adjusted.model)}
 
 
 def write_models(models: list[Reconstruction], run: RunContext) -> None:
-    """Write the main model to OUT/sparse and the others to OUT/other_models/1, 2, ..., each as a whole."""
+    """Write the main model, the first, to OUT/sparse and the others to OUT/other_models/1, 2, ..., each atomically."""
     place = run.workspace
     shutil.rmtree(place.other_models, ignore_errors=True)
     for number, model in enumerate(models[1:], start=1):
@@ -221,25 +219,24 @@ def write_model(model: Reconstruction, target: Path) -> None:
 
 
 def refined_cameras(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, RefinedCamera]:
-    """Return deviations, determined parameters and correlations of the refined cameras, by name of the camera."""
-    cameras = {names[image.name]: image.camera_id for image in posed_images(adjusted.model)}
+    """Return deviations, determined parameters and correlations of the refined cameras, by name."""
     return {
         name: {
             "deviations": adjusted.deviations[camera_id],
             "determined": adjusted.determined[camera_id],
             "correlations": adjusted.correlations.get(camera_id, {}),
         }
-        for name, camera_id in cameras.items()
+        for name, camera_id in _camera_ids(adjusted, names).items()
     }
 
 
 def write_scene(scene: Scene, run: RunContext) -> None:
-    """Write scene.json: what COLMAP's model does not hold."""
-    known = {
+    """Write scene.json, the values that COLMAP's model does not hold."""
+    values = {
         "cameras": {name: camera.to_dict() for name, camera in scene.cameras.items()},
         "camera_of": dict(scene.camera_of),
         "unregistered": dict(scene.unregistered),
         "gps_deviation": scene.gps_deviation,
     }
     with replace_atomically(run.workspace.scene) as path:
-        path.write_text(json_text(known), encoding="utf-8", newline="\n")
+        path.write_text(json_text(values), encoding="utf-8", newline="\n")

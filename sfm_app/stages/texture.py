@@ -12,7 +12,7 @@ from PIL import Image
 
 from sfm_app.files import digest_files, fingerprint, load_arrays, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.meshing.ray_casting import NearestNormals, Occluders
-from sfm_app.photos import fill_masked, read_mask
+from sfm_app.photos.masks import fill_masked, read_mask
 from sfm_app.photos.panoramas import mask_part, panorama_parts, show_part
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
@@ -20,30 +20,25 @@ from sfm_app.texture import PhotoView, bake_normals, part_view, photo_view, text
 from sfm_app.types import Model, Scene, Surface, Texture
 
 TEXTURE = "texture.npz"
-PANORAMA = "EQUIRECTANGULAR"
-"""COLMAP's name of the camera model of panoramas."""
 NORMALS = "normals"
-"""Name of a normal map in the file, before its page."""
+"""Prefix of normal maps in the file, before the number of the page."""
 PARTS = "parts"
-"""Folder beside it while the texture is made: the finished work on each photo."""
+"""Folder of the finished work on each photo, while the texture is made."""
 
 
 def make(scene: Scene, surface: Surface, run: RunContext) -> Model:
-    """Paint the surface with the photos at full size.
-
-    A killed run can resume.
-    """
+    """Paint the surface with the photos at full size; a killed run can resume."""
     views, parts = photo_views(scene), run.workspace.texture / PARTS
     cameras = [(view.name, view.row.tolist(), view.width, view.height) for view in views]
     made_from = fingerprint(run.fingerprint, cameras, surface_digest(surface))
     if not resume_or_clear(parts, made_from):
         mark_unfinished(parts, made_from)
-    hidden = Occluders(surface.vertices, surface.faces).is_hidden
+    is_hidden = Occluders(surface.vertices, surface.faces).is_hidden
     store = FileStore(run.workspace.photos, parts, run.mask_dir)
     options = run.settings.texture
-    if not run.settings.mesh.trim:  # who wants a closed surface wants no borders
+    if not run.settings.mesh.trim:  # a closed surface has no borders
         options = options.model_copy(update={"trim_borders": False})
-    model, figures = texture_surface(surface, views, store, hidden, options, run.map)
+    model, figures = texture_surface(surface, views, store, is_hidden, options, run.map)
     run.record(**figures)
     model = _add_normal_map(model, run) if run.settings.texture.normal_map else model
     save_texture(model, run)
@@ -52,11 +47,11 @@ def make(scene: Scene, surface: Surface, run: RunContext) -> Model:
 
 
 def _add_normal_map(model: Model, run: RunContext) -> Model:
-    """Return the model with the detail of the fine surface, as the mesh stage has kept it."""
+    """Return the model with normal maps of the fine surface, which the mesh stage keeps."""
     fine = load_arrays(run.workspace.fine_surface)
-    found, share = bake_normals(model, NearestNormals(fine["vertices"], fine["faces"]).find, run.map)
+    detailed, share = bake_normals(model, NearestNormals(fine["vertices"], fine["faces"]).find, run.map)
     run.record(normal_map_share=round(share, 4))
-    return found
+    return detailed
 
 
 class FileStore:
@@ -66,25 +61,25 @@ class FileStore:
         self.photo_dir, self.folder, self.mask_dir = photo_dir, folder, mask_dir
 
     def photo(self, view: PhotoView) -> NDArray[np.uint8]:
-        """Return (height, width, 3) RGB of a view, without what is masked."""
+        """Return the RGB picture (H, W, 3) of a view, without masked colors."""
         return read_photo(self.photo_dir, view, self.usable_pixels(view))
 
     def usable_pixels(self, view: PhotoView) -> NDArray[np.bool_] | None:
-        """Return a (height, width) mask of the pixels that may be used; None where no masks are given."""
+        """Return the usable pixels (H, W) of a view; None without masks."""
         if self.mask_dir is None:
             return None
         used = read_mask(self.mask_dir, view.source)
         return used if view.part is None else mask_part(used, view.part)
 
     def recall(self, name: str) -> dict[str, NDArray[np.generic]] | None:
-        """Return the arrays that were kept under a name, if they are there and sound."""
+        """Return the arrays of a file; None if it is missing or damaged."""
         try:
             return load_arrays(self._path(name))
-        except Exception:  # missing, or damaged: decoders raise all kinds of errors
+        except Exception:  # decoders of damaged bytes raise anything
             return None
 
     def keep(self, name: str, arrays: Mapping[str, NDArray[np.generic]]) -> None:
-        """Keep arrays in a file, written atomically."""
+        """Write arrays to a file, atomically."""
         with replace_atomically(self._path(name)) as path:
             np.savez(path, allow_pickle=False, **arrays)
 
@@ -94,31 +89,27 @@ class FileStore:
 
 def surface_digest(surface: Surface) -> str:
     """Return a hash of vertices, triangles and colors."""
-    found = blake2b()
-    for part in (surface.vertices, surface.faces, surface.colors):
-        found.update(part.tobytes())
-    return found.hexdigest()
+    hasher = blake2b()
+    for array in (surface.vertices, surface.faces, surface.colors):
+        hasher.update(array.tobytes())
+    return hasher.hexdigest()
 
 
 def photo_views(scene: Scene) -> list[PhotoView]:
-    """Return the views of the registered photos for texturing; a panorama has several."""
-    found = list[PhotoView]()
+    """Return the views of the registered photos; a panorama has several."""
+    photos = list[PhotoView]()
     for name, pose in scene.cam_from_world.items():
         camera = scene.cameras[scene.camera_of[name]]
-        if camera.model != PANORAMA:
-            found.append(photo_view(name, camera, pose))
+        if camera.model != "EQUIRECTANGULAR":
+            photos.append(photo_view(name, camera, pose))
             continue
-        views = panorama_parts((camera.width, camera.height))
-        found += [part_view(f"{name}.{number + 1}", name, view, pose) for number, view in enumerate(views)]
-    return found
+        parts = panorama_parts((camera.width, camera.height))
+        photos += [part_view(f"{name}.{number}", name, part, pose) for number, part in enumerate(parts, 1)]
+    return photos
 
 
 def read_photo(photo_dir: Path, view: PhotoView, used: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
-    """Return (height, width, 3) RGB of a photo at the size of the view; it is scaled down by averaging.
-
-    Args:
-        used: (H, W) pixels of the view that may be seen; None for all.
-    """
+    """Return the RGB picture (H, W, 3) of a view, scaled down by averaging; unused pixels are filled."""
     with Image.open(photo_dir / view.source) as image:
         photo = np.asarray(image.convert("RGB"))
     if view.part is not None:
@@ -126,8 +117,7 @@ def read_photo(photo_dir: Path, view: PhotoView, used: NDArray[np.bool_] | None 
     if used is not None:
         photo = fill_masked(photo, used)
     if photo.shape[1::-1] != (view.width, view.height):
-        shown = Image.fromarray(photo).resize((view.width, view.height), Image.Resampling.BOX)
-        photo = np.asarray(shown)
+        photo = np.asarray(Image.fromarray(photo).resize((view.width, view.height), Image.Resampling.BOX))
     return photo
 
 
@@ -164,8 +154,8 @@ def read_texture(place: Workspace) -> Model:
 
 
 def _list_numbered(stored: Mapping[str, NDArray[Any]], kind: str) -> tuple[NDArray[Any], ...]:
-    """Return the arrays whose names are a kind and a number, from 0 on."""
-    found = list[NDArray[Any]]()
-    while (array := stored.get(f"{kind}{len(found)}")) is not None:
-        found.append(array)
-    return tuple(found)
+    """Return the arrays named by a kind and a number from 0 on."""
+    arrays = list[NDArray[Any]]()
+    while (array := stored.get(f"{kind}{len(arrays)}")) is not None:
+        arrays.append(array)
+    return tuple(arrays)

@@ -19,29 +19,26 @@ LENS_SETTINGS = ("calibration.lens", "calibration.keep", "scene.camera_model", "
 
 
 def make(matches: MatchGraph, run: RunContext) -> ViewGraph:
-    """Find wide lenses, fit every pair on its own, and count why pairs were rejected.
+    """Find wide lenses, fit every pair on its own, and count the reasons of rejected pairs.
 
-    Of photos that an earlier run has seen, its fits and lenses stay.
-
-    Raises:
-        ReconstructionError: no pair has a usable epipolar geometry.
+    Fits and lenses of an earlier run stay. Raise a ReconstructionError if no pair has a usable epipolar geometry.
     """
-    before = None if run.earlier is None else load(replace(run, workspace=run.earlier.place))
-    if run.earlier is None or before is None:
+    if run.earlier is None:
         lenses, known = find_lenses(matches, run), {}
     else:
-        lenses = find_lenses(matches, run, known_lenses(matches, before, run.earlier))
-        known = known_fits(matches, before, find_same_matches(matches, run.earlier).pairs, lenses)
+        earlier = load(replace(run, workspace=run.earlier.place))
+        lenses = find_lenses(matches, run, known_lenses(matches, earlier, run.earlier))
+        known = known_fits(matches, earlier, find_same_matches(matches, run.earlier).pairs, lenses)
         run.record(known_pairs=len(known))
     fitted = fit_pairs(matches, [pair for pair in matches.matches if pair not in known], run, lenses)
-    found = {pair: known[pair] if pair in known else fitted[pair] for pair in matches.matches}
-    graph = to_view_graph(found, lenses)
+    fits = {pair: known[pair] if pair in known else fitted[pair] for pair in matches.matches}
+    graph = to_view_graph(fits, lenses)
     run.record(
         kept=len(graph.fits),
         rejected=graph.reasons,
         degenerate=sum(bool(fit.degeneracy) for fit in graph.fits.values()),
         inliers=sum(fit.inlier_count for fit in graph.fits.values()),
-        stationary=sum(count for _, count in found.values()),
+        stationary=sum(count for _, count in fits.values()),
     )
     if not graph.fits:
         raise diagnose_scene(matches, graph, run.settings.matching).error()

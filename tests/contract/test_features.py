@@ -8,7 +8,7 @@ from sfm_app.api import open_run
 from sfm_app.colmap.database import create_database, read_match_graph
 from sfm_app.geometry.epipolar import cross_matrix, sampson_distance
 from sfm_app.matching.features import fill_database
-from sfm_app.photos import save_mask
+from sfm_app.photos.masks import save_mask
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings
 from sfm_app.types import Photo, PhotoSet

@@ -10,8 +10,8 @@ import signal
 import sys
 from pathlib import Path
 
-from sfm_app.photos import PhotoStats
 from sfm_app.photos.probe import read_photo
+from sfm_app.photos.selection import PhotoStats
 from sfm_app.settings import PhotoSettings
 
 

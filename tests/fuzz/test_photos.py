@@ -14,7 +14,9 @@ import pytest
 from PIL import Image, features
 
 from sfm_app.api import open_run
-from sfm_app.photos import PhotoStats, read_photo, read_source
+from sfm_app.photos.probe import read_photo
+from sfm_app.photos.selection import PhotoStats
+from sfm_app.photos.source import read_source
 from sfm_app.settings import PhotoSettings, Settings
 from sfm_app.stages import match_graph
 from sfm_app.stages import photos as photo_stage

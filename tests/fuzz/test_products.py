@@ -11,7 +11,7 @@ import pytest
 from sfm_app.engine.stage import Products, rerun_reason
 from sfm_app.errors import SfmError
 from sfm_app.exports import stored_model
-from sfm_app.photos import read_source
+from sfm_app.photos.source import read_source
 from sfm_app.pipeline import NAMES, STAGES
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext

@@ -6,7 +6,7 @@ import pytest
 
 from sfm_app.colmap.dense import read_views, undistort
 from sfm_app.colmap.perspective import LargerViews
-from sfm_app.photos import save_mask
+from sfm_app.photos.masks import save_mask
 from sfm_app.progress import SilentProgress
 from tests.unit.colmap.test_wide_views import CAMERAS, NAMES, SIZE, colors_of, fill, make_place
 

@@ -7,7 +7,7 @@ import pytest
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.dense import has_masks, read_color, read_views, used_pixels
 from sfm_app.colmap.wide_views import split_wide_photos, view_name, write_model, write_views
-from sfm_app.photos import save_mask
+from sfm_app.photos.masks import save_mask
 from sfm_app.stereo import rank_neighbors
 
 SIZE = 480, 320

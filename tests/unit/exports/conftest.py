@@ -11,7 +11,7 @@ from sfm_app.colmap.surface import write_points
 from sfm_app.formats.meshes import COLOR, NORMAL, PLACE
 from sfm_app.frame.scale import MetricFrame
 from sfm_app.numerical import json_text
-from sfm_app.photos import save_mask
+from sfm_app.photos.masks import save_mask
 from sfm_app.pipeline import MESH, NAMES, SCALE, SCENE
 from sfm_app.runtime.workspace import StageRecord, Workspace
 

@@ -1,4 +1,4 @@
-"""Formats, pixel depths and damage."""
+"""Formats, pixel depths, damage, and the focal length of EXIF."""
 
 import zlib
 from pathlib import Path
@@ -7,10 +7,11 @@ import numpy as np
 import PIL
 import pytest
 from PIL import Image, features
+from PIL.ExifTags import IFD
+from PIL.TiffImagePlugin import IFDRational
 
 from sfm_app.operating_system import Ability, find_in_wheel
-from sfm_app.photos import UnreadableError, read_picture, upright_image
-from sfm_app.photos.decode import FORMATS, _install_handler
+from sfm_app.photos.decode import FORMATS, UnreadableError, _install_handler, focal_px, read_picture, upright_image
 
 LIBTIFF = list(find_in_wheel(Path(PIL.__file__).parent, "pillow", "libtiff"))
 
@@ -19,26 +20,27 @@ COLORS = np.stack([BARS, BARS[:, ::-1], 255 - BARS // 2], axis=-1)
 LOSSLESS = {"PNG": {}, "TIFF": {"compression": "tiff_lzw"}, "BMP": {}, "WEBP": {"lossless": True}}
 
 
+def decoded(path):
+    return np.asarray(upright_image(read_picture(path)), int)
+
+
 @pytest.mark.parametrize("kind", LOSSLESS)
 def test_formats(tmp_path, kind):
     Image.fromarray(COLORS).save(tmp_path / "x", kind, **LOSSLESS[kind])
-
-    assert np.array_equal(np.asarray(upright_image(read_picture(tmp_path / "x"))), COLORS)
+    assert np.array_equal(decoded(tmp_path / "x"), COLORS)
 
 
 @pytest.mark.parametrize("options", [{"progressive": True}, {"optimize": True}, {"subsampling": 0}])
 def test_jpeg(tmp_path, options):
     Image.fromarray(COLORS).save(tmp_path / "x.jpg", quality=98, **options)
-
-    seen = np.asarray(upright_image(read_picture(tmp_path / "x.jpg")), int)
+    seen = decoded(tmp_path / "x.jpg")
     assert 0 < np.abs(seen - COLORS).mean() < 3
 
 
 @pytest.mark.skipif(not features.check("avif"), reason="this Pillow has no AVIF")
 def test_avif(tmp_path):
     Image.fromarray(COLORS).save(tmp_path / "x.avif", quality=95)
-
-    assert np.abs(np.asarray(upright_image(read_picture(tmp_path / "x.avif")), int) - COLORS).mean() < 5
+    assert np.abs(decoded(tmp_path / "x.avif") - COLORS).mean() < 5
 
 
 def test_heic_is_read_where_the_extra_is_there(tmp_path):
@@ -46,8 +48,7 @@ def test_heic_is_read_where_the_extra_is_there(tmp_path):
     Image.fromarray(COLORS).save(tmp_path / "x.heic", quality=95)
     cut = (tmp_path / "x.heic").read_bytes()[:-60]
     (tmp_path / "cut.heic").write_bytes(cut)
-
-    assert np.abs(np.asarray(upright_image(read_picture(tmp_path / "x.heic")), int) - COLORS).mean() < 5
+    assert np.abs(decoded(tmp_path / "x.heic") - COLORS).mean() < 5
     with pytest.raises(UnreadableError, match=r"^truncated or damaged$"):
         read_picture(tmp_path / "cut.heic")
 
@@ -56,29 +57,21 @@ def test_heic_names_the_extra_where_it_is_not(tmp_path, monkeypatch):
     monkeypatch.setattr("sfm_app.photos.decode.formats", lambda: FORMATS)
     path = tmp_path / "IMG_0001.HEIC"
     path.write_bytes(b"\x00\x00\x00\x18ftypheic\x00\x00\x00\x00mif1heic" + bytes(50))
-
     with pytest.raises(UnreadableError, match=r"sfm-app\[heic\]"):
         read_picture(path)
 
 
 @pytest.mark.parametrize("kind", ["PNG", "TIFF"])
-def test_sixteen_bits_become_eight(tmp_path, kind):
-    Image.fromarray(BARS.astype(np.uint16) * 257).save(tmp_path / "x", kind)
-
-    assert np.array_equal(np.asarray(upright_image(read_picture(tmp_path / "x"))), BARS)
-
-
-def test_dark_sixteen_bits_are_not_made_bright(tmp_path):
-    dark = BARS.astype(np.uint16) * 10
-    Image.fromarray(dark).save(tmp_path / "x.png")
-
-    assert np.array_equal(np.asarray(upright_image(read_picture(tmp_path / "x.png"))), dark // 257)
+@pytest.mark.parametrize("factor", [257, 10])
+def test_sixteen_bits_become_eight_and_dark_ones_stay_dark(tmp_path, kind, factor):
+    deep = BARS.astype(np.uint16) * factor
+    Image.fromarray(deep).save(tmp_path / "x", kind)
+    assert np.array_equal(decoded(tmp_path / "x"), deep // 257)
 
 
 def test_floating_point_fills_the_range(tmp_path):
     Image.fromarray(BARS.astype(np.float32) / 100 - 1).save(tmp_path / "x.tif")
-
-    seen = np.asarray(upright_image(read_picture(tmp_path / "x.tif")), int)
+    seen = decoded(tmp_path / "x.tif")
     assert seen.min() == 0 and seen.max() == 255
     assert np.abs(seen - BARS.astype(int) * 255 / 248).max() <= 1
 
@@ -86,8 +79,7 @@ def test_floating_point_fills_the_range(tmp_path):
 def test_what_is_transparent_is_white(tmp_path):
     clear = np.dstack([COLORS, np.where(BARS < 128, 0, 255).astype(np.uint8)])
     Image.fromarray(clear).save(tmp_path / "x.png")
-
-    seen = np.asarray(upright_image(read_picture(tmp_path / "x.png")))
+    seen = decoded(tmp_path / "x.png")
     assert (seen[:, :16] == 255).all()
     assert np.array_equal(seen[:, 16:], COLORS[:, 16:])
 
@@ -98,7 +90,6 @@ def test_of_many_pictures_the_first(tmp_path, kind):
     third = Image.fromarray(255 - COLORS)
     options = {"lossless": True} if kind == "WEBP" else {}
     first.save(tmp_path / "x", kind, save_all=True, append_images=[second, third], **options)
-
     picture = read_picture(tmp_path / "x")
     assert picture.frames == 3
     assert np.array_equal(np.asarray(upright_image(picture)), COLORS)
@@ -107,7 +98,6 @@ def test_of_many_pictures_the_first(tmp_path, kind):
 @pytest.mark.parametrize("content", [b"", b"GIF89a, or so it says", b"%PDF-1.7", b"\x00" * 5000])
 def test_what_is_no_photo(tmp_path, content):
     (tmp_path / "x.jpg").write_bytes(content)
-
     with pytest.raises(UnreadableError, match="not a photo" if content else "empty"):
         read_picture(tmp_path / "x.jpg")
 
@@ -119,7 +109,6 @@ def test_what_is_cut_off(tmp_path, kind, share):
     Image.fromarray(noise).save(tmp_path / "x", kind)
     whole = (tmp_path / "x").read_bytes()
     (tmp_path / "x").write_bytes(whole[: int(share * len(whole))])
-
     with pytest.raises(UnreadableError, match=r"truncated or damaged|not a photo"):
         read_picture(tmp_path / "x")
 
@@ -130,7 +119,6 @@ def test_a_bomb_is_refused_before_it_goes_off(tmp_path):
     data[16:24] = (60_000).to_bytes(4, "big") * 2  # width and height
     data[29:33] = zlib.crc32(bytes(data[12:29])).to_bytes(4, "big")
     (tmp_path / "x.png").write_bytes(data)
-
     with pytest.raises(UnreadableError, match="too many pixels"):
         read_picture(tmp_path / "x.png")
 
@@ -142,7 +130,6 @@ def test_damaged_exif_does_no_harm(tmp_path):
     data = (tmp_path / "x.jpg").read_bytes()
     at = data.index(b"Exif\0\0") + 6
     (tmp_path / "x.jpg").write_bytes(data[:at] + b"\xff" * 20 + data[at + 20 :])
-
     picture = read_picture(tmp_path / "x.jpg")
     assert dict(picture.exif) == {}
     assert picture.image.size == (32, 24)
@@ -180,3 +167,40 @@ def test_without_a_libtiff_that_can_be_asked_a_file_that_breaks_off_is_still_a_d
         read_picture(tmp_path / "cut.tif")
     assert read_picture(tmp_path / "whole.tif").image.size == (128, 96)
     _install_handler.cache_clear()
+
+
+TAGS = {"MM": 0x920A, "EQUIVALENT": 0xA405, "WIDTH": 0xA002, "HEIGHT": 0xA003, "RESOLUTION": 0xA20E, "UNIT": 0xA210}
+
+
+def claimed(longer_side, **tags):
+    exif = Image.Exif()
+    exif.get_ifd(IFD.Exif).update({TAGS[name]: value for name, value in tags.items()})
+    return focal_px(exif, longer_side)
+
+
+SENSOR = {"MM": 20.0, "WIDTH": 6000, "HEIGHT": 4000, "RESOLUTION": IFDRational(6000, 24), "UNIT": 4}
+"""6000 px on 24 mm."""
+
+
+def test_the_equivalent_counts_along_the_longer_side():
+    assert claimed(3600, EQUIVALENT=28) == pytest.approx(2800.0)
+
+
+def test_without_an_equivalent_the_resolution_of_the_sensor_counts():
+    assert claimed(6000, **SENSOR) == pytest.approx(5000.0)
+    assert claimed(1500, **SENSOR) == pytest.approx(1250.0)
+    inches = SENSOR | {"RESOLUTION": 6000 / (24 / 25.4), "UNIT": 2}
+    assert claimed(6000, **inches) == pytest.approx(5000.0)
+    del inches["UNIT"]
+    assert claimed(6000, **inches) == pytest.approx(5000.0)
+    assert claimed(6000, **SENSOR, EQUIVALENT=0) == pytest.approx(5000.0)
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [{}, {"EQUIVALENT": 1}, {"EQUIVALENT": 60000}, {"EQUIVALENT": "wide"}, SENSOR | {"UNIT": 9}, SENSOR | {"MM": None},
+     SENSOR | {"UNIT": "inch"}, SENSOR | {"RESOLUTION": IFDRational(6000, 0)}, SENSOR | {"WIDTH": 0, "HEIGHT": 0},
+     {name: value for name, value in SENSOR.items() if name != "WIDTH"}],
+)  # fmt: skip
+def test_a_missing_or_implausible_focal_length_is_none(tags):
+    assert claimed(6000, **tags) is None

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from sfm_app.errors import InputError
-from sfm_app.photos import list_files, resolve_file
+from sfm_app.photos.files import is_video, list_files, resolve_file
 
 
 @pytest.fixture
@@ -36,7 +36,6 @@ def test_hidden_files_and_folders_are_named_and_not_opened(folder, out):
     (folder / ".DS_Store").write_bytes(b"x")
     (folder / ".git").mkdir()
     (folder / ".git" / "index").write_bytes(b"x")
-
     assert reasons(folder, out) == {".DS_Store": "hidden", ".git": "hidden"}
 
 
@@ -65,23 +64,19 @@ def test_links_are_followed_inside_the_folder_only(folder, out, tmp_path):
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes on this system")
 def test_a_pipe_is_not_waited_for(folder, out):
     os.mkfifo(folder / "pipe.jpg")
-
     assert reasons(folder, out) == {"pipe.jpg": "not a file"}
 
 
 def test_the_output_folder_is_left_out(folder):
     (folder / "out").mkdir()
     (folder / "out" / "page.jpg").write_bytes(b"x")
-
     assert list_files(folder, folder / "out") == ["a.jpg", "b.jpg", "inner/a.jpg"]
 
 
 def test_a_list_names_the_photos(folder, out, tmp_path):
     names = tmp_path / "list.txt"
     names.write_text("\ufeffinner/a.jpg\r\n\nb.jpg\nb.jpg\nmissing.jpg\n../secret.jpg\n/etc/passwd\n", "utf-8")
-
     found = {name: resolve_file(folder, name) for name in list_files(folder, out, names)}
-
     assert [name for name, place in found.items() if not isinstance(place, str)] == ["b.jpg", "inner/a.jpg"]
     assert found["missing.jpg"] == "not there"
     assert found["../secret.jpg"] == found["/etc/passwd"] == "outside the folder"
@@ -91,6 +86,17 @@ def test_a_list_names_the_photos(folder, out, tmp_path):
 def test_a_list_that_cannot_be_read(folder, out, tmp_path, content):
     if content is not None:
         (tmp_path / "list.txt").write_bytes(content)
-
     with pytest.raises(InputError, match=r"cannot read .*list\.txt"):
         list_files(folder, out, tmp_path / "list.txt")
+
+
+HEADS = {
+    "heic": b"\0\0\0\x18ftypheic", "avif": b"\0\0\0\x18ftypavif", "raw": b"\0\0\0\x18ftypcrx ",
+    "sound": b"RIFF\0\0\0\0WAVE",
+    "webp": b"RIFF\0\0\0\0WEBP", "jpeg": b"\xff\xd8\xff\xe0", "G": b"G" + bytes(399), "empty": b"",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", HEADS)
+def test_photos_and_sound_are_no_videos(kind):
+    assert not is_video(HEADS[kind].ljust(400, b"\0") if HEADS[kind] else b"")

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sfm_app.errors import InputError
-from sfm_app.photos import fill_masked, find_mask, lay_out_mask, list_masks, read_mask, unused_masks
+from sfm_app.photos.masks import fill_masked, find_mask, lay_out_mask, list_masks, read_mask, unused_masks
 from sfm_app.types import Photo, UnusablePhoto
 
 USED = np.zeros((40, 60), bool)
@@ -58,9 +58,7 @@ def laid_out(found, photos, masks, tmp_path):
 def test_masks_are_named_as_colmap_names_them(photos, masks, name, there, expected):
     for mask in there:
         Image.fromarray(GRAY).save(masks / mask, "PNG")
-
     found = find_mask(photo(name), photos, masks)
-
     assert found == replace(photo(name), mask=expected)
     assert unused_masks(list_masks(masks, photos, photos / "out"), [found]) == sorted(set(there) - {expected})
 
@@ -92,24 +90,17 @@ KINDS = {
 @pytest.mark.parametrize("kind", KINDS)
 def test_black_and_transparent_is_masked_and_all_else_is_used(photos, masks, tmp_path, kind):
     KINDS[kind]().save(masks / "a.jpg.png")
-
     found = find_mask(photo(), photos, masks)
-
     np.testing.assert_array_equal(laid_out(found, photos, masks, tmp_path), USED)
     with Image.open(tmp_path / "laid out" / "a.jpg.png") as image:
         assert (image.mode, sorted(set(image.tobytes()))) == ("L", [0, 255])
 
 
-def test_a_photo_without_a_mask_is_used_whole(photos, masks, tmp_path):
+def test_without_a_mask_all_is_used_and_masks_go_by_the_name_of_the_photo_in_the_run(photos, masks, tmp_path):
     assert laid_out(find_mask(photo(), photos, masks), photos, masks, tmp_path).all()
-
-
-def test_masks_go_by_the_name_of_the_photo_in_the_run(photos, masks, tmp_path):
     Image.fromarray(GRAY).save(masks / "a.webp.png")
     found = find_mask(photo("a.webp"), photos, masks)
-
     seen = laid_out(replace(found, name="a.webp.jpg", original="a.webp"), photos, masks, tmp_path)
-
     np.testing.assert_array_equal(seen, USED)
 
 
@@ -117,9 +108,7 @@ def test_masks_go_by_the_name_of_the_photo_in_the_run(photos, masks, tmp_path):
 def test_masks_of_another_size_are_brought_to_that_of_the_photo(photos, masks, tmp_path, times):
     Image.fromarray(GRAY).save(masks / "a.jpg.png")
     size = round(60 * times), round(40 * times)
-
     seen = laid_out(find_mask(photo("a.jpg", *size), photos, masks), photos, masks, tmp_path)
-
     y, x = np.mgrid[: size[1], : size[0]] + 0.5
     np.testing.assert_array_equal(seen, USED[(y / times).astype(int), (x / times).astype(int)])
 
@@ -127,7 +116,6 @@ def test_masks_of_another_size_are_brought_to_that_of_the_photo(photos, masks, t
 @pytest.mark.parametrize("size", [(61, 41), (120, 81), (600, 399), (29, 20)])
 def test_a_pixel_more_or_less_is_the_same_shape(photos, masks, size):
     Image.fromarray(GRAY).save(masks / "a.jpg.png")
-
     assert find_mask(photo("a.jpg", *size), photos, masks).mask == "a.jpg.png"
 
 
@@ -144,16 +132,13 @@ def test_masks_of_photos_that_exif_turns(photos, masks, tmp_path, orientation, d
     if (orientation, drawn) == (3, "as filed"):
         pixels = upright  # nothing tells a mask upside down from one that is not: as seen
     Image.fromarray(np.ascontiguousarray(np.where(pixels, np.uint8(9), np.uint8(0)))).save(masks / "a.png", **tags)
-
     found = find_mask(photo("a.jpg", *upright.shape[::-1]), photos, masks)
-
     np.testing.assert_array_equal(laid_out(found, photos, masks, tmp_path), upright)
 
 
 def test_a_mask_of_another_shape_is_refused(photos, masks):
     Image.fromarray(GRAY).save(photos / "a.jpg")
     Image.fromarray(GRAY).save(masks / "a.jpg.png")
-
     for size in ((60, 50), (40, 60), (600, 380)):
         words = f"the mask a.jpg.png cannot be used: it has 60 x 40 pixels, its photo {size[0]} x {size[1]}"
         with pytest.raises(InputError, match=words):
@@ -162,7 +147,6 @@ def test_a_mask_of_another_shape_is_refused(photos, masks):
 
 def test_nothing_is_left_of_a_photo_whose_mask_is_black(photos, masks):
     Image.fromarray(0 * GRAY).save(masks / "a.jpg.png")
-
     assert find_mask(photo(), photos, masks) == UnusablePhoto("a.jpg", "its mask a.jpg.png is all black")
 
 
@@ -184,7 +168,6 @@ def test_a_mask_that_cannot_be_read_is_refused_by_name(photos, masks, case):
     if case == "cut off":
         Image.fromarray(np.random.default_rng(0).integers(0, 255, (40, 60), np.uint8)).save(place)
     make(place)
-
     with pytest.raises(InputError, match=f"the mask a.jpg.png cannot be used: {reason}") as caught:
         find_mask(photo(), photos, masks)
     assert "sub/a.jpg.png" in caught.value.hint
@@ -192,22 +175,20 @@ def test_a_mask_that_cannot_be_read_is_refused_by_name(photos, masks, case):
 
 def test_masks_need_a_folder_of_their_own(photos, tmp_path):
     (tmp_path / "file").write_text("x")
-
-    with pytest.raises(InputError, match="no such folder of masks"):
-        list_masks(tmp_path / "nowhere", photos, tmp_path / "out")
-    with pytest.raises(InputError, match="not a folder of masks"):
-        list_masks(tmp_path / "file", photos, tmp_path / "out")
-    with pytest.raises(InputError, match="the masks lie among the photos"):
-        list_masks(photos / ".." / "photos", photos, tmp_path / "out")
+    for masks, says in (
+        (tmp_path / "nowhere", "no such folder of masks"),
+        (tmp_path / "file", "not a folder of masks"),
+        (photos / ".." / "photos", "the masks lie among the photos"),
+    ):
+        with pytest.raises(InputError, match=says):
+            list_masks(masks, photos, tmp_path / "out")
 
 
 def test_photos_and_output_inside_the_folder_of_masks_are_no_masks(tmp_path):
     for name in ("photos/a.jpg", "out/masks/a.jpg.png", "a.jpg.png", ".DS_Store"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"x")
-
     names = list_masks(tmp_path, tmp_path / "photos", tmp_path / "out")
-
     assert names == [".DS_Store", "a.jpg.png"]
     assert unused_masks(names, [photo()]) == ["a.jpg.png"]
 

@@ -12,7 +12,7 @@ from sfm_app.colmap.dense import MASKED, DenseStore, read_depth, read_views
 from sfm_app.errors import ConfigError, ReconstructionError
 from sfm_app.files import UNFINISHED
 from sfm_app.meshing.visibility import SKY
-from sfm_app.photos import save_mask
+from sfm_app.photos.masks import save_mask
 from sfm_app.plugins import DepthMethod, hookimpl, load_plugins
 from sfm_app.progress import SilentProgress
 from sfm_app.settings import DepthSettings, Settings
@@ -93,7 +93,6 @@ def kill_at(scene, name, **options):
 
 def test_the_manifest_says_what_was_done(scene):
     counts = run_stage(scene, Method(reject=("2.png",)), method="auto")
-
     assert counts == {
         "method": "ours", "method_reason": "installed and able to run here", "depth_maps": 2,
         "rejected": {"too dark": 1}, "coverage": {"1.png": 0.5, "3.png": 0.5}, "sky": 0.0,
@@ -110,22 +109,18 @@ def upside_down(scene):
     return scene
 
 
-def test_depths_in_the_sky_are_removed(upside_down):
-    counts = run_stage(upside_down, Method())
+def first_depth(scene):
+    return read_depth(scene.dense_dir, read_views(scene.dense_dir)[0], "geometric")
 
-    depth = read_depth(upside_down.dense_dir, read_views(upside_down.dense_dir)[0], "geometric")
+
+def test_depths_in_the_sky_are_removed_unless_they_shall_stay(upside_down):
+    assert "sky" not in run_stage(upside_down, Method(), drop_sky=False)
+    assert (first_depth(upside_down)[:30] == 3).all()
+    counts, depth = run_stage(upside_down, Method(), "again"), first_depth(upside_down)
     assert counts["sky"] == pytest.approx(30 / 60, abs=0.07)  # but for the rim of a column that COLMAP leaves black
     assert (depth[:26] == 3).all()
     assert not (depth[28:, :74] > 0).any()
     assert np.mean(depth == SKY) == pytest.approx(counts["sky"], abs=0.02)
-
-
-def test_depths_in_the_sky_stay_where_that_is_asked_for(upside_down):
-    counts = run_stage(upside_down, Method(), drop_sky=False)
-
-    depth = read_depth(upside_down.dense_dir, read_views(upside_down.dense_dir)[0], "geometric")
-    assert "sky" not in counts
-    assert (depth[:30] == 3).all()
 
 
 def test_a_run_that_is_killed_while_it_removes_the_sky_finds_the_same_sky(upside_down, monkeypatch):
@@ -145,24 +140,14 @@ def test_a_run_that_is_killed_while_it_removes_the_sky_finds_the_same_sky(upside
         np.testing.assert_array_equal(read_depth(upside_down.dense_dir, view, "geometric"), before)
 
 
-def test_a_killed_run_keeps_what_it_made(scene):
+def test_a_killed_run_keeps_its_maps_and_a_finished_one_is_repeated(scene):
     kill_at(scene, "3.png")
     assert (scene.dense_dir / UNFINISHED).exists()
-    method = Method()
-
-    run_stage(scene, method)
-
-    assert method.asked == ["3.png"]
-    assert not (scene.dense_dir / UNFINISHED).exists()
-
-
-def test_a_finished_stage_is_done_anew_when_it_is_run_again(scene):
-    run_stage(scene, Method())
-    method = Method()
-
-    run_stage(scene, method)
-
-    assert method.asked == ["1.png", "2.png", "3.png"]
+    for asked in (["3.png"], ["1.png", "2.png", "3.png"]):
+        method = Method()
+        run_stage(scene, method)
+        assert method.asked == asked
+        assert not (scene.dense_dir / UNFINISHED).exists()
 
 
 @pytest.mark.parametrize("change", ["inputs", "model"])
@@ -173,9 +158,7 @@ def test_nothing_is_kept_that_was_made_from_something_else(scene, change):
         model.cameras[1].params = [71, 71, 40, 30]
         model.write(scene.model_dir)
     method = Method()
-
     run_stage(scene, method, fingerprint="others" if change == "inputs" else "")
-
     assert method.asked == ["1.png", "2.png", "3.png"]
 
 
@@ -189,8 +172,7 @@ def test_what_is_masked_has_no_depth_whatever_method_made_it(scene, tmp_path):
 
     counts = run_stage(scene, Method(), mask_dir=tmp_path / "masks")
 
-    view = read_views(scene.dense_dir)[0]
-    depth = read_depth(scene.dense_dir, view, "geometric")
+    depth = first_depth(scene)
     assert (depth[:, :40] == MASKED).all()
     assert (depth[:30, 43:] == 3).all()
     assert counts["coverage"]["1.png"] == pytest.approx(0.25, abs=0.03)
@@ -201,9 +183,7 @@ def test_estimates_are_removed_at_the_end(scene):
     kill_at(scene, "1.png")
     leftover = scene.dense_dir / "stereo" / "depth_maps" / "1.png.photometric.bin"
     leftover.write_bytes(b"estimate")
-
     run_stage(scene, Method())
-
     assert not leftover.exists()
     views = read_views(scene.dense_dir)
     assert all(DenseStore(scene.dense_dir).has(view, "geometric") for view in views)

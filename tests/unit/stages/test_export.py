@@ -1,3 +1,5 @@
+"""Files of the finished model."""
+
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -33,5 +35,4 @@ def test_the_manifest_says_how_large_the_files_are_and_how_good_the_pictures(tex
 
 def test_without_a_texture_it_says_nothing_about_pictures(ball, run):
     export.make(ball, MetricFrame(), run)
-
     assert list(run.statistics) == ["bytes"]

@@ -98,13 +98,23 @@ def ball(dense):
     return made(dense)
 
 
+def copied(dense, target):
+    for name in ("dense", "surface"):
+        shutil.copytree(dense.parent / name, target / name)
+    return target / "dense"
+
+
+def assert_closed(surface):
+    """Two triangles at each edge, and the Euler characteristic of a sphere."""
+    edges, edge_of = unique_edges(surface.faces)
+    assert np.array_equal(np.bincount(edge_of.ravel()), np.full(len(edges), 2))
+    assert len(surface.vertices) - len(edges) + len(surface.faces) == 2
+
+
 def test_a_closed_thing_seen_all_round_is_closed(ball):
     surface, counts = ball
     corners = surface.vertices[surface.faces]
-    edges, edge_of = unique_edges(surface.faces)
-
-    assert np.array_equal(np.bincount(edge_of.ravel()), np.full(len(edges), 2))
-    assert len(surface.vertices) - len(edges) + len(surface.faces) == 2
+    assert_closed(surface)
     assert np.sum(np.linalg.det(corners)) / 6 == pytest.approx(4 / 3 * np.pi, rel=0.02)
     assert np.percentile(np.abs(np.linalg.norm(surface.vertices, axis=1) - 1), 95) < 0.01
     assert counts["triangles"] == len(surface.faces) < 0.6 * counts["raw_triangles"]
@@ -113,17 +123,14 @@ def test_a_closed_thing_seen_all_round_is_closed(ball):
 def test_normals_point_outward_and_colors_are_those_of_the_photos(ball):
     surface, _ = ball
     normals = vertex_normals(surface.vertices, surface.faces)
-
     assert np.sum(normals * surface.vertices, axis=1).min() > 0.5
     np.testing.assert_array_equal(np.median(surface.colors, axis=0), [200, 90, 40])
 
 
 def test_fewer_faces_do_not_fuse_again_and_one_worker_gives_the_same_bytes(dense, ball):
     stamp = (dense.parent / "surface" / "fused.ply").stat().st_mtime_ns
-
     few, _ = made(dense, faces=500)
     again, _ = made(dense, workers=1)
-
     assert (dense.parent / "surface" / "fused.ply").stat().st_mtime_ns == stamp
     assert 400 < len(few.faces) <= 500
     for name in ("vertices", "faces", "colors"):
@@ -166,22 +173,17 @@ def test_maps_that_agree_on_nothing_give_an_error_that_says_so(dense, tmp_path):
 
 def test_without_depth_maps_there_is_no_surface(dense, tmp_path):
     shutil.copytree(dense / "sparse", tmp_path / "dense" / "sparse")
-
     with pytest.raises(ReconstructionError, match="no photo has a depth map"):
         made(tmp_path / "dense")
 
 
 def test_a_ball_in_blocks_is_the_ball(dense, ball, tmp_path):
-    for name in ("dense", "surface"):
-        shutil.copytree(dense.parent / name, tmp_path / name)
+    place = copied(dense, tmp_path)
+    found, counts = made(place, block_points=8000)
+    again, _ = made(place, workers=1, block_points=8000)
 
-    found, counts = made(tmp_path / "dense", block_points=8000)
-    again, _ = made(tmp_path / "dense", workers=1, block_points=8000)
-
-    edges, edge_of = unique_edges(found.faces)
     assert counts["blocks"] >= 4
-    assert np.array_equal(np.bincount(edge_of.ravel()), np.full(len(edges), 2))
-    assert len(found.vertices) - len(edges) + len(found.faces) == 2
+    assert_closed(found)
     assert np.percentile(np.abs(np.linalg.norm(found.vertices, axis=1) - 1), 95) < 0.01
     assert 0.5 * len(ball[0].faces) < len(found.faces) < 2.0 * len(ball[0].faces)
     normals = vertex_normals(found.vertices, found.faces)
@@ -190,21 +192,12 @@ def test_a_ball_in_blocks_is_the_ball(dense, ball, tmp_path):
     np.testing.assert_array_equal(again.vertices, found.vertices)
 
 
-def copied(dense, target):
-    for name in ("dense", "surface"):
-        shutil.copytree(dense.parent / name, target / name)
-    return target / "dense"
-
-
 @pytest.mark.parametrize("block_points", [4_000_000, FEW_BLOCKS])
 def test_refined_with_photos_that_show_nothing_a_ball_stays_a_ball(dense, tmp_path, block_points):
     place = copied(dense, tmp_path)
-
     found, counts = made(place, max_image_size_px=1600, block_points=block_points)
     again, _ = made(place, workers=1, max_image_size_px=1600, block_points=block_points)
-
-    edges, edge_of = unique_edges(found.faces)
-    assert np.array_equal(np.bincount(edge_of.ravel()), np.full(len(edges), 2))
+    assert_closed(found)
     assert np.percentile(np.abs(np.linalg.norm(found.vertices, axis=1) - 1), 95) < 0.015
     assert ("blocks" in counts) == (block_points == FEW_BLOCKS) == ("refined_triangles" not in counts)
     np.testing.assert_array_equal(again.vertices, found.vertices)
@@ -240,17 +233,13 @@ def test_a_ball_that_is_too_small_grows_to_what_the_photos_show(dense, ball, tmp
     place, radius = copied(dense, tmp_path), 1.008
     for view in read_views(place):
         cv2.imwrite(str(place / "images" / view.name), marbled(view, radius))
-
     found, _ = made(place, max_image_size_px=1600, block_points=block_points)
-
     assert np.median(np.linalg.norm(ball[0].vertices, axis=1)) == pytest.approx(1.0, abs=0.002)
     assert np.median(np.linalg.norm(found.vertices, axis=1)) == pytest.approx(radius, abs=0.004)
 
 
 def test_a_run_that_was_killed_makes_the_missing_blocks_only(dense, ball, tmp_path, monkeypatch):
-    for name in ("dense", "surface"):
-        shutil.copytree(dense.parent / name, tmp_path / name)
-    done, whole = [], blocks.mesh_block
+    place, done, whole = copied(dense, tmp_path), [], blocks.mesh_block
 
     def stop_at_third(task):
         if len(done) == 2:
@@ -264,10 +253,10 @@ def test_a_run_that_was_killed_makes_the_missing_blocks_only(dense, ball, tmp_pa
 
     monkeypatch.setattr(blocks, "mesh_block", stop_at_third)
     with pytest.raises(KeyboardInterrupt):
-        made(tmp_path / "dense", workers=1, block_points=8000)
+        made(place, workers=1, block_points=8000)
     done.clear()
     monkeypatch.setattr(blocks, "mesh_block", count)
-    found, _ = made(tmp_path / "dense", workers=1, block_points=8000)
+    found, _ = made(place, workers=1, block_points=8000)
 
     assert done[:2] == [True, True]
     assert not any(done[2:])

@@ -7,7 +7,8 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from sfm_app.errors import InputError
-from sfm_app.photos import read_photo, read_source
+from sfm_app.photos.probe import read_photo
+from sfm_app.photos.source import read_source
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
@@ -43,10 +44,6 @@ def folder(tmp_path):
     return place
 
 
-def reasons(photo_set):
-    return {photo.name: photo.reason for photo in photo_set.unusable}
-
-
 def source_of(folder, run):
     return read_source(folder, run.workspace.root, run.settings.photos, map)
 
@@ -72,14 +69,10 @@ def test_every_file_is_used_or_has_a_reason(folder, run):
     found = make(folder, run)
 
     assert [photo.name for photo in found.photos] == ["a.jpg", "b.png", "sub dir/ü b.jpg"]
-    assert reasons(found) == {
-        ".hidden.jpg": "hidden",
-        "notes.txt": "not a photo",
-        "empty.jpg": "empty",
-        "cut.jpg": "truncated or damaged",
-        "tiny.png": "smaller than 64 px",
-        "copy.png": "the same picture as b.png",
-    }
+    assert {photo.name: photo.reason for photo in found.unusable} == {
+        ".hidden.jpg": "hidden", "notes.txt": "not a photo", "empty.jpg": "empty", "cut.jpg": "truncated or damaged",
+        "tiny.png": "smaller than 64 px", "copy.png": "the same picture as b.png",
+    }  # fmt: skip
     assert load(folder, run) == found
     assert np.array_equal(np.asarray(Image.open(run.workspace.photos / "b.png")), pixels(2))
 
@@ -124,14 +117,9 @@ def test_photos_of_one_size_share_a_camera_unless_exif_tells_them_apart(folder, 
     exif = Image.Exif()
     exif[0x0110] = "Box Brownie"
     Image.fromarray(PIXELS).save(folder / "d.jpg", exif=exif)
-
     groups = make(folder, run).groups
-
-    assert [[photo.name for photo in members] for members in groups.values()] == [
-        ["a.jpg", "b.png"],
-        ["c.jpg"],
-        ["d.jpg"],
-    ]
+    names = [[photo.name for photo in members] for members in groups.values()]
+    assert names == [["a.jpg", "b.png"], ["c.jpg"], ["d.jpg"]]
 
 
 def test_bars_around_a_picture_are_seen_and_read_back(folder, run):
@@ -149,23 +137,14 @@ def test_exif_focal_is_read_as_a_hint_in_pixels(folder, run):
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA405] = 27
     Image.fromarray(PIXELS).save(folder / "e.jpg", exif=exif)
-
     photo = next(photo for photo in make(folder, run).photos if photo.name == "e.jpg")
-
     assert photo.exif_focal_px == pytest.approx(27 / 36 * 128)
 
 
 def with_gps(folder, **entries):
     """A photo whose EXIF has these GPS entries on top of sound ones; None takes one away."""
     tags = {"lat_ref": 1, "lat": 2, "lon_ref": 3, "lon": 4, "alt_ref": 5, "alt": 6}
-    sound = {
-        "lat_ref": "S",
-        "lat": (33.0, 51.0, 24.5),
-        "lon_ref": "E",
-        "lon": (151.0, 12.0, 54.25),
-        "alt_ref": b"\x00",
-        "alt": 7.5,
-    }
+    sound = dict(zip(tags, ("S", (33.0, 51.0, 24.5), "E", (151.0, 12.0, 54.25), b"\x00", 7.5), strict=True))
     exif = Image.Exif()
     exif.get_ifd(0x8825).update({tags[name]: value for name, value in (sound | entries).items() if value is not None})
     Image.fromarray(PIXELS).save(folder / "where.jpg", exif=exif)
@@ -179,9 +158,7 @@ def read_gps(folder, run):
 
 def test_gps_is_read_as_a_hint(folder, run):
     with_gps(folder)
-
     gps = read_gps(folder, run)
-
     assert gps.latitude_deg == pytest.approx(-(33 + 51 / 60 + 24.5 / 3600), abs=1e-6)
     assert gps.longitude_deg == pytest.approx(151 + 12 / 60 + 54.25 / 3600, abs=1e-6)
     assert gps.altitude_m == pytest.approx(7.5)
@@ -194,36 +171,24 @@ def test_gps_is_read_as_a_hint(folder, run):
 )
 def test_altitude_is_optional(folder, run, entries, altitude_m):
     with_gps(folder, **entries)
-
     assert read_gps(folder, run).altitude_m == altitude_m
 
 
 @pytest.mark.parametrize(
     "entries",
-    [
-        {"lat": None},
-        {"lon_ref": None},
-        {"lat_ref": "X"},
-        {"lat": (91.0, 0.0, 0.0)},
-        {"lon": (180.0, 30.0, 0.0)},
-        {"lat": (33.0, 75.0, 0.0)},
-        {"lat": (33.0, 51.0)},
-        {"lat": (IFDRational(33, 0), 51.0, 0.0)},
-        {"lat": (0.0, 0.0, 0.0), "lon": (0.0, 0.0, 0.0)},
-    ],
-)
+    [{"lat": None}, {"lon_ref": None}, {"lat_ref": "X"}, {"lat": (91.0, 0.0, 0.0)}, {"lon": (180.0, 30.0, 0.0)},
+     {"lat": (33.0, 75.0, 0.0)}, {"lat": (33.0, 51.0)}, {"lat": (IFDRational(33, 0), 51.0, 0.0)},
+     {"lat": (0.0, 0.0, 0.0), "lon": (0.0, 0.0, 0.0)}],
+)  # fmt: skip
 def test_a_position_that_cannot_be_true_is_none(folder, run, entries):
     with_gps(folder, **entries)
-
     assert read_gps(folder, run) is None
 
 
 def test_photos_too_large_for_the_memory_are_scaled_down_and_say_so(folder, run):
     run = replace(run, settings=Settings.from_mapping({"max_memory_gb": 1}))
     Image.fromarray(np.tile(PIXELS, (20, 14, 1))).save(folder / "large.jpg", quality=50)
-
     photo = next(photo for photo in make(folder, run).photos if photo.name == "large.jpg")
-
     assert 1.9e6 < photo.width * photo.height <= 2e6
     assert photo.notes == (f"scaled down from 1792 x 1920 to {photo.width} x {photo.height} pixels",)
 
@@ -234,7 +199,6 @@ def test_the_output_folder_inside_the_photos_is_not_read(folder, tmp_path):
     Image.fromarray(PIXELS).save(folder / "out" / "model.png")
     with make_executor(1) as executor:
         found = make(folder, RunContext(Settings(), workspace, load_plugins(installed=False), executor, 1))
-
     assert [photo.name for photo in found.photos] == ["a.jpg", "b.png"]
 
 
@@ -255,22 +219,20 @@ def test_photos_that_came_later_are_read_and_known_ones_are_not_decoded_again(fo
 
 
 @pytest.mark.parametrize(
-    ("names", "says"),
+    ("files", "photos", "says"),
     [
-        ((), "no usable photo in .*: the folder is empty"),
-        (("notes.txt", "more.txt"), "no usable photo in .*: 2 not a photo"),
-        (("one.jpg",), "only one usable photo"),
+        ((), (), "no usable photo in .*: the folder is empty"),
+        (("notes.txt", "more.txt"), (), "no usable photo in .*: 2 not a photo"),
+        ((), ("one.jpg",), "only one usable photo in .*: it has no other file"),
     ],
 )
-def test_too_few_photos(tmp_path, run, names, says):
+def test_too_few_photos(tmp_path, run, files, photos, says):
     folder = tmp_path / "few"
     folder.mkdir()
-    for name in names:
-        if name.endswith(".jpg"):
-            Image.fromarray(PIXELS).save(folder / name)
-        else:
-            (folder / name).write_text("text")
-
+    for name in files:
+        (folder / name).write_text("text")
+    for name in photos:
+        Image.fromarray(PIXELS).save(folder / name)
     with pytest.raises(InputError, match=says):
         make(folder, run)
 
@@ -280,9 +242,7 @@ def test_a_folder_of_very_many_files_may_be_another_than_meant(folder, run, monk
     said = []
     monkeypatch.setattr(photos, "MANY_FILES", limit)
     monkeypatch.setattr(run.progress, "say", said.append)
-
     make(folder, run)
-
     assert [line[: len(told[0])] for line in said] == told if told else said == []
 
 

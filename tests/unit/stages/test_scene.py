@@ -1,3 +1,5 @@
+"""The scene: adjusted models, their files and figures."""
+
 import json
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -33,7 +35,7 @@ from sfm_app.types import (
     RelativePose,
     Scene,
     ViewGraph,
-)  # fmt: skip
+)
 
 pytestmark = pytest.mark.slow
 
@@ -81,12 +83,8 @@ def attempt(model, explained=None):
 
 def outcome(*attempts, graph=None, **others):
     cameras = Intrinsics({"one": Calibration(camera_matrix(1280, 1280, 512, 384), 1024, 768, "zero-curves", True)})
-    return Outcome(
-        attempts,
-        graph or PoseGraph({}, {}, ()),
-        cameras,
-        **{"tried": ("a", "b"), "reason": "it explains more", **others},
-    )
+    words = {"tried": ("a", "b"), "reason": "it explains more"}
+    return Outcome(attempts, graph or PoseGraph({}, {}, ()), cameras, **words | others)
 
 
 def pose(kind, guided=False):
@@ -188,41 +186,27 @@ def test_a_model_that_cannot_be_adjusted_is_kept_and_the_run_says_so(synthetic, 
 def test_without_a_model_the_error_says_what_was_seen_and_what_may_help(synthetic, run, mapped):
     mapped(outcome(tried=("all at once: 0 photos",)))
     matches, views = inputs(synthetic[1])
-
     with pytest.raises(ReconstructionError, match=r"1 pairs with 20 to 20 inliers\); all at once: 0 photos") as caught:
         scene.make(matches, views, outcome().intrinsics, run)
-
     assert "overlap" in caught.value.hint
     assert not run.workspace.sparse.exists() and run.statistics == {}
 
 
 def test_how_it_was_made_counts_pairs_and_matches():
     kinds = ["calibrated", "planar", "calibrated", "rotation"]
-    poses = {
-        pair: pose(kind, guided=kind == "planar")
-        for pair, kind in zip(combinations(range(4), 2), kinds, strict=False)
-    }  # fmt: skip
+    pairs = zip(combinations(range(4), 2), kinds, strict=False)
+    poses = {pair: pose(kind, guided=kind == "planar") for pair, kind in pairs}
     dropped = {(1, 3): "contradicts other pairs", (2, 3): "contradicts other pairs", (1, 2): "points behind a camera"}
     explained = {(0, 1): PairSupport(50, 40, 3), (0, 2): PairSupport(60, 50, 4)}
-    model = SimpleNamespace(num_reg_images=lambda: 4)
+    made = attempt(SimpleNamespace(num_reg_images=lambda: 4), explained)
 
-    found = scene.mapping_figures(
-        outcome(attempt(model, explained), graph=PoseGraph(poses, dropped, ()), cuts=("c, d",), passes=2)
-    )
-
-    assert found == {
-        "mapper": "global",
-        "mapper_reason": "it explains more",
-        "tried": ["a", "b"],
-        "passes": 2,
-        "one_camera_each": "",
-        "rival_tried_because": "",
-        "explained_matches": 110,
-        "contradicted_matches": 7,
+    assert scene.mapping_figures(outcome(made, graph=PoseGraph(poses, dropped, ()), cuts=("c, d",), passes=2)) == {
+        "mapper": "global", "mapper_reason": "it explains more", "tried": ["a", "b"], "passes": 2,
+        "one_camera_each": "", "rival_tried_because": "", "explained_matches": 110, "contradicted_matches": 7,
         "cut_apart": ["c, d"],
         "pairs": {"calibrated": 2, "planar": 1, "rotation": 1, "found with the help of others": 1},
         "pairs_dropped": {"contradicts other pairs": 2, "points behind a camera": 1},
-    }
+    }  # fmt: skip
 
 
 def files(folder):

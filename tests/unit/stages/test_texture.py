@@ -1,3 +1,5 @@
+"""Textures in files, photos at the size of their views, and a killed run."""
+
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -5,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfm_app.photos import save_mask
+from sfm_app.photos.masks import save_mask
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import texture
@@ -17,50 +19,45 @@ POSE = np.eye(3, 4)
 SURFACE = Surface(np.eye(3), np.array([[0, 1, 2]]), np.full((3, 3), 9, np.uint8))
 
 
+VIEW = PhotoView("a.png", (50.0, 50.0, 30.0, 20.0, 0, 0, 0, 0), np.eye(3, 4), 60, 40)
+
+
+def run_of(place, fingerprint="", **settings):
+    """A run that records nothing."""
+    return SimpleNamespace(
+        workspace=Workspace(place), settings=Settings.from_mapping(settings), fingerprint=fingerprint, map=None,
+        record=dict, mask_dir=None,
+    )  # fmt: skip
+
+
 def stored(model, place):
     save_texture(model, SimpleNamespace(workspace=Workspace(place)))
     return read_texture(Workspace(place))
 
 
-def test_a_model_comes_back_with_all_its_pages(tmp_path):
+def test_a_model_comes_back_with_its_pages_and_normal_maps_if_it_has_any(tmp_path):
     rng = np.random.default_rng(1)
-    pages = tuple(rng.integers(0, 255, (4 + k, 6, 3), np.uint8) for k in range(11))
+    pages, maps = (tuple(rng.integers(0, 255, (side + k, 6, 3), np.uint8) for k in range(11)) for side in (6, 3))
     texture = Texture(rng.random((1, 3, 2)).astype(np.float32), np.array([10], np.int32), pages)
 
-    found = stored(Model(SURFACE, texture), tmp_path)
+    assert stored(Model(SURFACE), tmp_path).texture is None
+    assert stored(Model(SURFACE, texture), tmp_path).texture.normal_maps == ()
+    found = stored(Model(SURFACE, replace(texture, normal_maps=maps)), tmp_path)
 
     np.testing.assert_array_equal(found.surface.vertices, SURFACE.vertices)
     np.testing.assert_array_equal(found.texture.uv, texture.uv)
     assert found.texture.page.tolist() == [10]
-    for ours, theirs in zip(found.texture.pages, pages, strict=True):
+    assert len(found.texture.pages) == len(found.texture.normal_maps) == 11
+    for ours, theirs in zip((*found.texture.pages, *found.texture.normal_maps), (*pages, *maps), strict=True):
         np.testing.assert_array_equal(ours, theirs)
-
-
-def test_normal_maps_come_back_with_their_pages(tmp_path):
-    rng = np.random.default_rng(1)
-    pages, maps = (tuple(rng.integers(0, 255, (side, side, 3), np.uint8) for _ in range(11)) for side in (6, 3))
-    texture = Texture(rng.random((1, 3, 2)).astype(np.float32), np.array([10], np.int32), pages)
-
-    assert stored(Model(SURFACE, texture), tmp_path).texture.normal_maps == ()
-    found = stored(Model(SURFACE, replace(texture, normal_maps=maps)), tmp_path).texture
-
-    assert len(found.pages) == len(found.normal_maps) == 11
-    for ours, theirs in zip((*found.pages, *found.normal_maps), (*pages, *maps), strict=True):
-        np.testing.assert_array_equal(ours, theirs)
-
-
-def test_a_model_without_a_texture_comes_back(tmp_path):
-    assert stored(Model(SURFACE), tmp_path).texture is None
 
 
 def test_photos_are_rgb_and_of_the_view_s_size(tmp_path):
     gray = np.zeros((40, 60), np.uint8)
     gray[:, 30:] = 200
     Image.fromarray(gray).save(tmp_path / "a.png")
-    view = PhotoView("a.png", (50.0, 50.0, 30.0, 20.0, 0, 0, 0, 0), np.eye(3, 4), 60, 40)
-
-    np.testing.assert_array_equal(read_photo(tmp_path, view), np.repeat(gray[:, :, None], 3, axis=2))
-    small = read_photo(tmp_path, view.with_size(20, 10))
+    np.testing.assert_array_equal(read_photo(tmp_path, VIEW), np.repeat(gray[:, :, None], 3, axis=2))
+    small = read_photo(tmp_path, VIEW.with_size(20, 10))
     assert small.shape == (10, 20, 3)
     assert (small[:, :10] == 0).all()
     assert (small[:, 10:] == 200).all()
@@ -73,14 +70,13 @@ def test_nothing_is_seen_of_what_is_masked_at_any_size(tmp_path, scale):
     photo[~used] = (255, 0, 255)
     Image.fromarray(photo).save(tmp_path / "a.png")
     save_mask(tmp_path / "masks", "a.png", used)
-    view = PhotoView("a.png", (50.0, 50.0, 30.0, 20.0, 0, 0, 0, 0), np.eye(3, 4), 60, 40)
     files = FileStore(tmp_path, tmp_path / "parts", tmp_path / "masks")
 
-    seen = files.photo(view.with_size(round(60 * scale), round(40 * scale)))
+    seen = files.photo(VIEW.with_size(round(60 * scale), round(40 * scale)))
 
-    np.testing.assert_array_equal(files.usable_pixels(view), used)
+    np.testing.assert_array_equal(files.usable_pixels(VIEW), used)
     assert (seen == (20, 120, 90)).all()
-    assert FileStore(tmp_path, tmp_path / "parts").usable_pixels(view) is None
+    assert FileStore(tmp_path, tmp_path / "parts").usable_pixels(VIEW) is None
 
 
 def test_arrays_come_back_by_name_and_damaged_ones_count_as_none(tmp_path):
@@ -106,7 +102,6 @@ def test_the_digest_of_a_surface_is_that_of_all_its_parts():
         replace(SURFACE, faces=np.array([[0, 2, 1]])),
         replace(SURFACE, colors=np.full((3, 3), 8, np.uint8)),
     ]
-
     assert surface_digest(same) == surface_digest(SURFACE)
     assert len({surface_digest(surface) for surface in (SURFACE, *others)}) == 4
 
@@ -126,11 +121,7 @@ def test_nothing_is_used_that_was_found_with_something_else(tmp_path, monkeypatc
     def run_stage(fingerprint="", focal=50.0, surface=SURFACE):
         camera = CameraModel("OPENCV", (focal, 50.0, 30.0, 20.0, 0, 0, 0, 0), np.eye(3), 60, 40)
         scene = SimpleNamespace(cameras={"one": camera}, camera_of={"a.png": "one"}, cam_from_world={"a.png": POSE})
-        run = SimpleNamespace(
-            workspace=Workspace(tmp_path), settings=Settings(), fingerprint=fingerprint, map=None, record=dict,
-            mask_dir=None,
-        )  # fmt: skip
-        texture.make(scene, surface, run)
+        texture.make(scene, surface, run_of(tmp_path, fingerprint))
 
     monkeypatch.setattr(texture, "texture_surface", texture_surface)
     with pytest.raises(KeyboardInterrupt):
@@ -153,9 +144,6 @@ def test_borders_of_a_surface_that_shall_be_closed_are_not_cut(tmp_path, monkeyp
         return Model(surface), {}
 
     monkeypatch.setattr(texture, "texture_surface", texture_surface)
-    settings = Settings.from_mapping({"mesh": {"trim": not closed}, "texture": {"trim_borders": asked}})
-    run = SimpleNamespace(
-        workspace=Workspace(tmp_path), settings=settings, fingerprint="", map=None, record=dict, mask_dir=None
-    )
+    run = run_of(tmp_path, mesh={"trim": not closed}, texture={"trim_borders": asked})
     texture.make(SimpleNamespace(cameras={}, camera_of={}, cam_from_world={}), SURFACE, run)
     assert found == [trimmed]

@@ -1,3 +1,5 @@
+"""Pairs with a time stamp, with failures, and of a killed run."""
+
 import numpy as np
 import pytest
 
@@ -35,7 +37,6 @@ def build(tmp_path):
 
 def test_time_stamps_are_taken_out_and_counted(build):
     graph, counts = build(match_graph())
-
     assert counts["stationary"] == 80
     assert graph.fits[1, 2].inliers[:120].all() and not graph.fits[1, 2].inliers[120:].any()
     assert graph.rejected[1, 3].reason == ONLY_A_LOGO
@@ -43,7 +44,6 @@ def test_time_stamps_are_taken_out_and_counted(build):
 
 def test_nothing_is_stationary_in_photos_of_different_size(build):
     _, counts = build(match_graph(widths=(640, 800, 800)))
-
     assert counts["stationary"] == 0
 
 
@@ -82,10 +82,8 @@ def test_parts_come_back_as_they_were(build, tmp_path):
     found = {pair: (fit, 3) for pair, fit in graph.fits.items()} | {
         pair: (no, 0) for pair, no in graph.rejected.items()
     }
-
     fitting.write_part(tmp_path / "part.npz", found)
     again = fitting.read_part(tmp_path / "part.npz", list(found))
-
     assert [count for _, count in again.values()] == [3, 0]
     arrays = [fitting.to_view_graph(parts).to_arrays() for parts in (found, again)]
     assert all(np.array_equal(arrays[0][name], arrays[1][name]) for name in arrays[0])

@@ -1,3 +1,5 @@
+"""Hypotheses of roll, cues of the scene, and the choice by their odds."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +23,7 @@ from sfm_app.synthetic.render import GAMMA, cast_rays, prepare, render_scene
 
 UP = np.array([0.0, 1.0, 0.0])
 VIEW_AXIS = np.array([0.0, 0.0, 1.0])
+UPRIGHT = [look_at(np.array([0, 0, 5.0]), np.zeros(3))[:, :3]]
 
 
 def stripes(rows):
@@ -50,6 +53,15 @@ def turned_by(turn_deg, rotations, scenery):
     turn = axis_rotation(VIEW_AXIS, -turn_deg)
     pictures = tuple(None if p is None else np.ascontiguousarray(np.rot90(p, turn_deg // 90)) for p in scenery.pictures)
     return turn @ rotations, replace(scenery, pictures=pictures)
+
+
+def scenery_of(points, photos):
+    """Points that all photos see, all of one gray; no pictures."""
+    return Scenery(points, np.full(len(points), 100.0), (np.arange(len(points)),) * photos, (None,) * photos)
+
+
+def choose(rotations, centers, scenery):
+    return select_roll(roll_hypotheses(rotations, centers), rotations, centers, scenery)
 
 
 @pytest.fixture(scope="module", params=["corner", "facade"])
@@ -82,7 +94,7 @@ def test_rendered_photos_stand_upright_whichever_way_they_were_held(rendered, tu
     rotations, centers, scenery = rendered
     R, shown = turned_by(turn_deg, rotations, scenery)
 
-    standing = select_roll(roll_hypotheses(R, centers), R, centers, shown)
+    standing = choose(R, centers, shown)
 
     assert standing.roll.turn_deg == turn_deg
     assert standing.roll.up @ UP > np.cos(np.radians(20))
@@ -99,12 +111,8 @@ def test_photos_on_their_side_of_a_walk_around_something(build_house, turn_deg):
     """The axis is plain from the walk; the floor tells which side is down."""
     house = build_house((1.0, -2.0, 0.5, 1.5, -1.0, 2.0), sweep_deg=120.0)
     floor = np.random.default_rng(3).uniform([-4, 0, -4], [4, 0, 4], (300, 3)) @ house.turned.T
-    points = np.concatenate([house.points, floor])
-    scenery = Scenery(points, np.full(len(points), 100.0), (np.arange(len(points)),) * 6, (None,) * 6)
-    R, shown = turned_by(turn_deg, house.rotations, scenery)
-
-    standing = select_roll(roll_hypotheses(R, house.centers), R, house.centers, shown)
-
+    R, shown = turned_by(turn_deg, house.rotations, scenery_of(np.concatenate([house.points, floor]), 6))
+    standing = choose(R, house.centers, shown)
     assert standing.roll.turn_deg == turn_deg
     assert standing.roll.up @ house.up > np.cos(np.radians(20))
     assert standing.evidence["tops are bright"] == standing.evidence["sky is above"] == 0.0
@@ -114,9 +122,8 @@ def test_no_single_cue_turns_photos_that_are_held_upright(build_house):
     """A ceiling and no floor: what is high is near, and nothing else is known."""
     house = build_house((1.0, -2.0, 0.5, 1.5, -1.0, 2.0))
     ceiling = np.random.default_rng(3).uniform([-4, 4, -4], [4, 4, 9], (900, 3)) @ house.turned.T
-    scenery = Scenery(ceiling, np.full(900, 100.0), (np.arange(900),) * 6, (None,) * 6)
 
-    standing = select_roll(roll_hypotheses(house.rotations, house.centers), house.rotations, house.centers, scenery)
+    standing = choose(house.rotations, house.centers, scenery_of(ceiling, 6))
 
     assert standing.roll.turn_deg == 0 and standing.roll.up @ house.up > 0.9
     assert (
@@ -128,19 +135,14 @@ def test_no_single_cue_turns_photos_that_are_held_upright(build_house):
 
 def test_without_scenery_cameras_are_held_upright(build_house):
     house = build_house((1.0, -2.0, 0.5, 1.5), sweep_deg=90.0)
-    nothing = Scenery(np.zeros((0, 3)), np.zeros(0), (np.zeros(0, np.int64),) * 4, (None,) * 4)
-
-    standing = select_roll(roll_hypotheses(house.rotations, house.centers), house.rotations, house.centers, nothing)
-
+    standing = choose(house.rotations, house.centers, scenery_of(np.zeros((0, 3)), 4))
     assert standing.roll.turn_deg == 0 and not any(standing.evidence.values())
     assert standing.sign_log_odds == pytest.approx(ROLL_OPTIONS.turn_costs[2])
 
 
 def test_opposite_turns_have_opposite_directions(build_house):
     house = build_house((1.0, 88.0, 0.5, 31.0, -1.0, 2.0))
-
     rolls = roll_hypotheses(house.rotations, house.centers)
-
     assert [roll.turn_deg for roll in rolls] == [0, 90, 180, 270]
     for roll, opposite in zip(rolls[:2], rolls[2:], strict=True):
         assert roll.up == pytest.approx(-opposite.up)
@@ -148,62 +150,53 @@ def test_opposite_turns_have_opposite_directions(build_house):
 
 @pytest.mark.parametrize("turn_deg", [0, 90])
 def test_three_steps_along_a_wall_are_level(build_house, turn_deg):
-    """Nothing but the walk tells which of the two verticals it is."""
+    """Nothing but the walk distinguishes the two verticals."""
     house = build_house((turn_deg + 1.0, turn_deg - 2.0, turn_deg + 0.5), sweep_deg=15.0, lines=(0, 0))
-    nothing = Scenery(np.zeros((0, 3)), np.zeros(0), (np.zeros(0, np.int64),) * 3, (None,) * 3)
-
-    standing = select_roll(roll_hypotheses(house.rotations, house.centers), house.rotations, house.centers, nothing)
-
+    standing = choose(house.rotations, house.centers, scenery_of(np.zeros((0, 3)), 3))
     assert abs(standing.roll.up @ house.up) > 0.98
     assert 0.2 < standing.axis_log_odds < 8
 
 
 def test_ledges_are_lit_from_above():
-    upright, sideways = look_at(np.array([0, 0, 5.0]), np.zeros(3))[:, :3], stripes(ledge_rows()).T
-    found = slope_asymmetry(UP, [upright], [stripes(ledge_rows())])
-
+    picture = stripes(ledge_rows())
+    found = slope_asymmetry(UP, UPRIGHT, [picture])
     assert 0.4 < found < 1
-    assert slope_asymmetry(-UP, [upright], [stripes(ledge_rows())]) == pytest.approx(-found)
-    assert slope_asymmetry(UP, [upright], [stripes(ledge_rows()[::-1])]) == pytest.approx(-found, abs=0.05)
-    assert abs(slope_asymmetry(UP, [upright], [sideways])) < 0.1
-    assert slope_asymmetry(UP, [upright], [None]) == 0.0
+    assert slope_asymmetry(-UP, UPRIGHT, [picture]) == pytest.approx(-found)
+    assert slope_asymmetry(UP, UPRIGHT, [stripes(ledge_rows()[::-1])]) == pytest.approx(-found, abs=0.05)
+    assert abs(slope_asymmetry(UP, UPRIGHT, [picture.T])) < 0.1
+    assert slope_asymmetry(UP, UPRIGHT, [None]) == 0.0
 
 
 def test_the_border_of_a_black_background_is_no_ledge():
-    upright = look_at(np.array([0, 0, 5.0]), np.zeros(3))[:, :3]
     below = 80 + ledge_rows(3) / 3
     gray, black = (stripes(np.concatenate([np.full(60, level), below])) for level in (30.0, 0.0))
-
-    assert slope_asymmetry(UP, [upright], [gray]) < -0.3 < 0.3 < slope_asymmetry(UP, [upright], [black])
+    assert slope_asymmetry(UP, UPRIGHT, [gray]) < -0.3 < 0.3 < slope_asymmetry(UP, UPRIGHT, [black])
 
 
 def test_the_sky_is_even_and_bright():
-    upright = look_at(np.array([0, 0, 5.0]), np.zeros(3))[:, :3]
     picture = stripes(np.repeat([200.0, 90.0], [40, 60]))
     picture[40:] = np.random.default_rng(1).integers(20, 160, picture[40:].shape)
-
-    assert 0.7 < sky_asymmetry(UP, [upright], [picture]) <= 1
-    assert sky_asymmetry(-UP, [upright], [picture]) == pytest.approx(-sky_asymmetry(UP, [upright], [picture]))
-    assert sky_asymmetry(UP, [upright], [255 - picture]) < 0.1, "even and dark is a shadow"
-    assert abs(sky_asymmetry(UP, [upright], [np.full((90, 120), 230, np.uint8)])) < 0.1, "and even all over is a wall"
+    assert 0.7 < sky_asymmetry(UP, UPRIGHT, [picture]) <= 1
+    assert sky_asymmetry(-UP, UPRIGHT, [picture]) == pytest.approx(-sky_asymmetry(UP, UPRIGHT, [picture]))
+    assert sky_asymmetry(UP, UPRIGHT, [255 - picture]) < 0.1, "even and dark is a shadow"
+    assert abs(sky_asymmetry(UP, UPRIGHT, [np.full((90, 120), 230, np.uint8)])) < 0.1, "and even all over is a wall"
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_light_from_above_and_from_below(side):
     points, brightness = terrain(side * UP)
-    above = fit_surfaces(points, brightness, [np.arange(len(points))], np.array([[0.0, 6.0, 0.0]]))
-
+    seen = [np.arange(len(points))], np.array([[0.0, 6.0, 0.0]])
+    above = fit_surfaces(points, brightness, *seen)
     assert 0.15 < side * brightness_normal_correlation(UP, above) < 0.8
     assert brightness_normal_correlation(-UP, above) == pytest.approx(-brightness_normal_correlation(UP, above))
     assert 0.5 < mean_upward_normal(UP, above) < 0.9
-    plain = fit_surfaces(points, np.full(len(points), 77.7), [np.arange(len(points))], np.array([[0.0, 6.0, 0.0]]))
+    plain = fit_surfaces(points, np.full(len(points), 77.7), *seen)
     assert brightness_normal_correlation(UP, plain) == 0.0
 
 
 def test_what_no_photo_sees_says_nothing():
     points, brightness = terrain(UP)
     unseen = fit_surfaces(points, brightness, [np.zeros(0, np.int64)], np.array([[0.0, 6.0, 0.0]]))
-
     assert len(unseen.normals) == 0
     assert mean_upward_normal(UP, unseen) == brightness_normal_correlation(UP, unseen) == 0.0
 
@@ -215,7 +208,6 @@ def test_low_is_near_on_the_ground_and_not_on_a_distant_thing():
     ground = rng.uniform([-4, 0, -9], [4, 0, 6], (500, 3))
     far = rng.uniform([-0.01, 0.99, -0.01], [0.01, 1.01, 0.01], (500, 3))
     tilted = far + 0.5 * np.outer(far[:, 1] - 1.0, [0, 0, -1])
-
     assert 0.5 < depth_height_correlation(UP, *places, ground, [np.arange(500)]) < 1
     assert 0 < depth_height_correlation(UP, *places, tilted, [np.arange(500)]) < 0.05
     assert depth_height_correlation(UP, *places, ground, [np.arange(5)]) == 0.0
@@ -223,7 +215,6 @@ def test_low_is_near_on_the_ground_and_not_on_a_distant_thing():
 
 def test_nats_grow_with_the_cue_and_with_the_points_and_end():
     cue = Cue(0.1, 0.1, noise=4.0)
-
     assert cue.nats(0.05, 10**9) == pytest.approx(1.0) and cue.nats(-0.05, 10**9) == pytest.approx(-1.0)
     assert 0.1 < cue.nats(0.05, 100) < 0.25
     assert cue.nats(5.0, 100) == OPTIONS.max_nats
@@ -231,11 +222,10 @@ def test_nats_grow_with_the_cue_and_with_the_points_and_end():
 
 
 def test_odds_are_rounded_and_end():
-    assert odds(0.0) == 1.0
-    assert odds(np.log(123.4)) == 120.0
+    assert (odds(0.0), odds(np.log(123.4))) == (1.0, 120.0)
     assert 1e6 < odds(np.inf) < 1.3e6
 
 
-def test_a_small_picture_keeps_its_shape():
-    assert small_picture(np.zeros((1000, 1500), np.uint8)).shape == (171, 256)
-    assert small_picture(np.zeros((40, 90), np.uint8)).shape == (40, 90)
+@pytest.mark.parametrize(("size", "small"), [((1000, 1500), (171, 256)), ((40, 90), (40, 90))])
+def test_a_small_picture_keeps_its_shape(size, small):
+    assert small_picture(np.zeros(size, np.uint8)).shape == small

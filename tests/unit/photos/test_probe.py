@@ -1,4 +1,4 @@
-"""Bars of one color around pictures, and which photos share a camera by them."""
+"""Bars around pictures, and photos that share a camera."""
 
 import io
 
@@ -31,6 +31,10 @@ def as_jpeg(picture, quality=80):
 
 def photo(name="a.jpg", shown=None, size=(600, 400), group=""):
     return Photo(name, *size, group, shown=shown)
+
+
+def unified(*frames):
+    return [one.shown for one in unify_frames([photo(shown=frame) for frame in frames])]
 
 
 @pytest.mark.parametrize("color", [(0, 0, 0), (255, 255, 255), (20, 40, 60)])
@@ -72,20 +76,16 @@ def test_a_sky_of_one_color_above_a_level_horizon_is_no_bar():
 
 
 def test_frames_that_nearly_agree_become_one():
-    frames = [(0, 50, 600, 300), (0, 51, 600, 299), (0, 50, 600, 301), (0, 90, 600, 220)]
-    found = [one.shown for one in unify_frames([photo(shown=frame) for frame in frames])]
+    found = unified((0, 50, 600, 300), (0, 51, 600, 299), (0, 50, 600, 301), (0, 90, 600, 220))
     assert found == [(0, 50, 600, 300)] * 3 + [(0, 90, 600, 220)]
 
 
 def test_bars_that_are_not_seen_are_those_of_the_others():
-    shown = [(0, 50, 600, 300), (0, 50, 600, 300), None]
-    assert [one.shown for one in unify_frames([photo(shown=frame) for frame in shown])] == [(0, 50, 600, 300)] * 3
-    few = [(0, 50, 600, 300), None, None]  # a wall before an empty ground, perhaps
-    assert [one.shown for one in unify_frames([photo(shown=frame) for frame in few])] == [None] * 3
-    half = [(0, 50, 600, 300), None]
-    assert [one.shown for one in unify_frames([photo(shown=frame) for frame in half])] == [(0, 50, 600, 300)] * 2
-    mixed = [(0, 50, 600, 300), (0, 90, 600, 220), None]
-    assert [one.shown for one in unify_frames([photo(shown=frame) for frame in mixed])] == mixed
+    wide, narrow = (0, 50, 600, 300), (0, 90, 600, 220)
+    assert unified(wide, wide, None) == [wide] * 3
+    assert unified(wide, None, None) == [None] * 3  # a wall in front of a plain background, perhaps
+    assert unified(wide, None) == [wide] * 2
+    assert unified(wide, narrow, None) == [wide, narrow, None]
 
 
 def test_pictures_of_other_sizes_are_of_other_groups():
@@ -110,3 +110,58 @@ def test_bars_turn_with_a_photo_that_is_turned():
     assert (turned.width, turned.height, turned.turn_deg) == (600, 400, 90)
     # its right becomes the top
     assert turned.shown == (10, 50, 580, 300)
+
+
+def panoramas(kinds, size=(800, 400)):
+    return [Photo(f"{place}.jpg", *size, f"maker {place}", projection=kind) for place, kind in enumerate(kinds)]
+
+
+@pytest.mark.parametrize("cameras", ["auto", "single", "each"])
+def test_panoramas_always_share_one_camera(cameras):
+    given = [*panoramas(["equirectangular"] * 2), Photo("x.jpg", 600, 400, "a")]
+    first, second, other = (photo.group for photo in group_by_camera(given, cameras))
+    assert first == second == "800x400 equirectangular" and other != first
+
+
+@pytest.mark.parametrize(
+    ("kinds", "size", "around"),
+    [
+        (["equirectangular"] * 3 + ["perspective"], (800, 400), 4),
+        (["equirectangular"] + ["perspective"] * 3, (800, 400), 1),
+        (["equirectangular"] * 2 + ["perspective"] * 2, (800, 400), 2),
+        (["perspective"] * 4, (800, 400), 0),
+        (["equirectangular"] * 3 + ["perspective"], (800, 402), 3),
+    ],
+    ids=["most", "few", "half", "none", "nearly twice as wide"],
+)
+def test_most_photos_of_a_size_decide_about_the_others(kinds, size, around):
+    found = [photo.projection for photo in group_by_camera(panoramas(kinds, size), "auto")]
+    assert found.count("equirectangular") == around
+
+
+@pytest.mark.parametrize(
+    ("cameras", "expected"),
+    [
+        ("auto", ["60x40 X", "60x40 X", "60x40 Y", "60x40 X"]),
+        ("single", ["60x40", "60x40", "60x40", "60x40"]),
+        ("folder", ["60x40 in", "60x40 .", "60x40 in", "60x40 in"]),
+        ("each", ["60x40 in/a", "60x40 b", "60x40 in/c", "40x60 in/d"]),
+    ],
+)
+def test_groups(cameras, expected):
+    sizes = {"in/a": (60, 40, "X"), "b": (60, 40, "X"), "in/c": (60, 40, "Y"), "in/d": (40, 60, "X")}
+    photos = [Photo(name, *size) for name, size in sizes.items()]
+    assert [photo.group for photo in group_by_camera(photos, cameras)] == expected
+
+
+def laid(sizes):
+    """Sizes and turns of photos of these sizes, laid out."""
+    photos = [Photo(f"{number}.jpg", *size, "") for number, size in enumerate(sizes)]
+    return [(photo.width, photo.height, photo.turn_deg, photo.needs_copy) for photo in group_by_camera(photos, "auto")]
+
+
+def test_photos_on_end_lie_as_most_of_their_camera():
+    assert laid([(60, 40), (40, 60)]) == [(60, 40, 0, False), (60, 40, 90, True)]
+    assert laid([(60, 40), (40, 60), (40, 60)]) == [(40, 60, 90, True), (40, 60, 0, False), (40, 60, 0, False)]
+    assert laid([(40, 60), (40, 60)]) == [(40, 60, 0, False)] * 2
+    assert laid([(60, 40), (40, 50)]) == [(60, 40, 0, False), (40, 50, 0, False)]

@@ -1,9 +1,13 @@
-"""Evidence that agrees is averaged; what contradicts is named; the deviation covers the truth."""
+"""Agreement of evidence of the scale; the frame of exported files."""
+
+import json
 
 import numpy as np
 import pytest
 
-from sfm_app.frame.scale import ScaleEvidence, agree
+from sfm_app.frame.scale import MetricFrame, ScaleEvidence, agree, move_model
+from sfm_app.geometry.poses import Similarity
+from sfm_app.synthetic.cameras import axis_rotation
 
 
 def pieces(scales, deviation=0.01):
@@ -12,7 +16,6 @@ def pieces(scales, deviation=0.01):
 
 def test_one_is_taken_as_it_is():
     found = agree(pieces([2.0]))
-
     assert (found.scale, found.deviation) == pytest.approx((2.0, 0.01))
     assert found.contradictions == ()
 
@@ -27,7 +30,6 @@ def test_the_deviation_of_the_mean_covers_the_truth():
 
 def test_a_wrong_one_among_three_is_named_and_left_out():
     found = agree(pieces([2.0, 2.01, 2.5]))
-
     assert found.scale == pytest.approx(2.005, rel=1e-3)
     assert [one.name for one in found.used] == ["marker 0", "marker 1"]
     assert found.contradictions == ("marker 2 contradicts the 2 others: by it, the model is 25 % larger",)
@@ -36,7 +38,6 @@ def test_a_wrong_one_among_three_is_named_and_left_out():
 def test_two_that_contradict_are_named_and_the_deviation_covers_half_of_the_difference():
     exact, vague = ScaleEvidence("marker 1", 2.0, 0.001), ScaleEvidence("GPS", 2.4, 0.02)
     found = agree([vague, exact])
-
     assert found.scale == 2.0
     assert found.deviation == pytest.approx(np.log(1.2) / 2)
     assert found.contradictions == ("GPS contradicts marker 1: by it, the model is 20 % larger",)
@@ -44,6 +45,32 @@ def test_two_that_contradict_are_named_and_the_deviation_covers_half_of_the_diff
 
 def test_scatter_that_is_larger_than_claimed_makes_the_deviation_larger():
     calm, wild = agree(pieces([2.0, 2.001])), agree(pieces([2.0, 2.1]))
-
     assert calm.deviation == pytest.approx(0.01 / np.sqrt(2), rel=0.01)
     assert 2 * calm.deviation < wild.deviation < 6 * calm.deviation
+
+
+FRAME = MetricFrame(
+    Similarity(3.5, axis_rotation(np.array([2.0, 6.0, 3.0]) / 7.0, 40.0), np.array([1.0, -2.0, 0.5])),
+    0.001,
+    "marker aruco-4x4 3",
+    (ScaleEvidence("marker aruco-4x4 3", 3.5, 0.001, 4),),
+    ("marker aruco-4x4 5 contradicts the 3 others",),
+    "EPSG:32632",
+    (500_000.0, 4_649_000.0, 320.0),
+)
+
+
+@pytest.mark.parametrize("frame", [FRAME, MetricFrame()])
+def test_a_frame_is_read_back_as_it_was_written(frame):
+    again = MetricFrame.from_dict(json.loads(json.dumps(frame.to_dict())))
+    assert again.to_dict() == frame.to_dict()
+    assert again.is_metric == again.changes == (frame is FRAME)
+
+
+def test_moved_cameras_see_moved_points_where_they_saw_them(textured_ball):
+    moved = move_model(textured_ball, FRAME.from_model)
+    for before, after in zip(textured_ball.cameras, moved.cameras, strict=True):
+        old = textured_ball.surface.vertices @ before.cam_from_world[:, :3].T + before.cam_from_world[:, 3]
+        new = moved.surface.vertices @ after.cam_from_world[:, :3].T + after.cam_from_world[:, 3]
+        assert np.allclose(new, 3.5 * old, atol=1e-9)
+    assert np.array_equal(moved.surface.faces, textured_ball.surface.faces)

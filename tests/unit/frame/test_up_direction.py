@@ -1,3 +1,5 @@
+"""The up direction by lines, ground or roll, and the frame of viewers."""
+
 import numpy as np
 import pytest
 
@@ -38,9 +40,7 @@ def found_up(scene, segments=None, points=None, turn_deg=None):
 @pytest.mark.parametrize("seed", range(3))
 def test_vertical_edges_say_where_up_is_better_than_the_cameras(build_house, seed):
     scene = build_house(HAND_HELD, aim_y=3.5, seed=seed)
-
     upright = found_up(scene)
-
     assert upright.method == LINES
     assert error_deg(upright.up, scene.up) < 0.1 < 0.3 < error_deg(upright.roll.up, scene.up) < 12
     assert upright.angle_to_roll_deg == pytest.approx(error_deg(upright.roll.up, upright.up), abs=1e-6)
@@ -49,9 +49,7 @@ def test_vertical_edges_say_where_up_is_better_than_the_cameras(build_house, see
 
 def test_without_lines_it_is_the_direction_that_the_cameras_are_level_to(build_house):
     scene = build_house(HAND_HELD, sweep_deg=120.0)
-
     upright = found_up(scene, concatenate_segments([]))
-
     assert upright.method == ROLL
     assert error_deg(upright.up, scene.up) < 2 < upright.deviation_deg * 3
     assert 0.5 < upright.roll.spread_deg < 3
@@ -59,7 +57,6 @@ def test_without_lines_it_is_the_direction_that_the_cameras_are_level_to(build_h
 
 def test_clutter_does_not_pass_for_vertical_edges(build_house):
     scene = build_house(HAND_HELD, lines=(0, 0), clutter=400)
-
     assert found_up(scene).method == ROLL
 
 
@@ -67,9 +64,7 @@ def test_clutter_does_not_pass_for_vertical_edges(build_house):
 def test_a_set_that_is_turned_as_a_whole(build_house, turn_deg):
     upright_set = build_house(HAND_HELD, sweep_deg=90.0)
     turned = build_house([roll + turn_deg for roll in HAND_HELD], sweep_deg=90.0)
-
     found = found_up(turned)
-
     assert found_up(upright_set).roll.turn_deg == 0
     assert found.roll.turn_deg in (90, 270)
     assert axis_angle_deg(found.up, turned.up) < 0.2
@@ -80,9 +75,7 @@ def test_single_photos_that_are_turned_or_wild_are_outvoted(build_house):
     rolls[1] += 90
     rolls[4] += 35
     scene = build_house(rolls)
-
     upright = found_up(scene)
-
     assert error_deg(upright.up, scene.up) < 0.2
     assert error_deg(upright.roll.up, scene.up) < 4
     mean = np.mean([-R[1] for R in scene.rotations], axis=0)
@@ -93,7 +86,6 @@ def test_single_photos_that_are_turned_or_wild_are_outvoted(build_house):
 def test_what_is_near_is_down(build_house, turn_deg):
     scene = build_house([roll + turn_deg for roll in HAND_HELD], sweep_deg=90.0)
     floor = np.random.default_rng(3).uniform([-4, 0, -4], [4, 0, 4], (300, 3)) @ scene.turned.T
-
     for ground, up in ((floor, scene.up), (floor + 4.0 * scene.up, -scene.up)):
         upright = found_up(scene, concatenate_segments([]), np.concatenate([scene.points, ground]))
         assert error_deg(upright.up, up) < 8
@@ -103,13 +95,9 @@ def test_what_is_near_is_down(build_house, turn_deg):
 @pytest.mark.parametrize("turn_deg", [0, 90, 180, 270])
 def test_who_knows_how_the_photos_are_turned_is_believed(build_house, turn_deg):
     scene = build_house(HAND_HELD, sweep_deg=90.0)
-
     upright = found_up(scene, turn_deg=turn_deg)
-
-    assert (
-        upright.roll.turn_deg == turn_deg
-        and min(upright.selection.sign_log_odds, upright.selection.axis_log_odds) == np.inf
-    )
+    assert upright.roll.turn_deg == turn_deg
+    assert upright.selection.sign_log_odds == upright.selection.axis_log_odds == np.inf
     # what has to be turned clockwise to be upright has its top on the left
     top = {0: [0, -1], 90: [-1, 0], 180: [0, 1], 270: [1, 0]}[turn_deg]
     assert (scene.rotations @ upright.up)[:, :2].mean(axis=0) == pytest.approx(top, abs=0.15)
@@ -120,9 +108,7 @@ def test_cameras_that_nobody_held_level_stand_on_the_ground(build_house):
     rng = np.random.default_rng(3)
     floor = rng.uniform([-4, -0.01, -4], [4, 0.01, 4], (300, 3)) @ scene.turned.T
     standing = np.concatenate([scene.points, floor])
-
     upright = found_up(scene, concatenate_segments([]), standing)
-
     assert upright.method == GROUND
     assert error_deg(upright.up, scene.up) < 1
 
@@ -131,9 +117,7 @@ def test_cameras_that_nobody_held_level_stand_on_the_ground(build_house):
 def test_the_front_faces_the_viewer(build_house, level_deg):
     scene = build_house(HAND_HELD, level_deg=level_deg)
     upright = found_up(scene)
-
     towards, found_by = viewer_direction(upright, scene.rotations, scene.points)
-
     assert found_by == LINES
     assert error_deg(towards, scene.front) == pytest.approx(abs(level_deg), abs=0.3)
     assert abs(towards @ upright.up) < 1e-9
@@ -141,9 +125,7 @@ def test_the_front_faces_the_viewer(build_house, level_deg):
 
 def test_a_view_across_a_corner_stays_one(build_house):
     scene = build_house(HAND_HELD, level_deg=44.0)
-
     towards, found_by = viewer_direction(found_up(scene), scene.rotations, scene.points)
-
     assert found_by == CAMERAS
     assert error_deg(towards, scene.front) < 6
 
@@ -153,9 +135,7 @@ def test_a_wall_of_points_is_a_front_too(build_house):
     rng = np.random.default_rng(4)
     flat = rng.uniform([-3, 0, -0.01], [3, 3, 0.01], (300, 3))
     wall = flat @ np.array([[np.cos(0.2), 0, -np.sin(0.2)], [0, 1, 0], [np.sin(0.2), 0, np.cos(0.2)]]) @ scene.turned.T
-
     towards, found_by = viewer_direction(found_up(scene, concatenate_segments([])), scene.rotations, wall)
-
     assert found_by == WALL
     assert error_deg(towards, scene.front) == pytest.approx(np.degrees(0.2), abs=3)
 
@@ -164,7 +144,6 @@ def test_the_viewer_sees_the_scene_upright_centered_and_of_size_one(build_house)
     scene = build_house(HAND_HELD)
     seen = viewer_frame(scene.up, scene.front, scene.points)
     metric = viewer_frame(scene.up, scene.front, scene.points, meters=2.5)
-
     assert np.allclose(seen.R @ scene.up, [0, 1, 0]) and np.allclose(seen.R @ scene.front, [0, 0, 1])
     assert np.linalg.det(seen.R) == pytest.approx(1)
     assert np.allclose(np.median(scene.points @ seen.R.T * seen.scale + seen.t, axis=0), 0, atol=0.2)
@@ -177,16 +156,13 @@ def test_neither_where_points_crowd_nor_far_ones_move_the_middle_of_the_scene():
     even, crowd = rng.uniform(-1, 1, (4000, 3)), rng.uniform([0.5, -1, -1], [1, 1, 1], (2500, 3))
     far = np.tile([400.0, 0.0, 0.0], (60, 1))
     seen = viewer_frame(np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), np.concatenate([even, crowd, far]))
-
     middle = seen(np.zeros((1, 3)))[0] / seen.scale
-
     assert -0.25 < middle[0] < -0.1  # the median lies at 0.47
     assert np.abs(middle[1:]).max() < 0.05
 
 
 def test_no_plane_where_points_fill_space():
     cloud = np.random.default_rng(0).normal(size=(2000, 3))
-
     assert dominant_plane(cloud, np.array([0.0, 1.0, 0.0]), (0.0, 20.0)) is None
     assert dominant_plane(cloud[:5], np.array([0.0, 1.0, 0.0]), (0.0, 90.0)) is None
 
@@ -195,6 +171,22 @@ def test_a_few_segments_are_no_direction(build_house):
     scene = build_house(HAND_HELD)
     few = np.zeros(len(scene.segments), bool)
     few[:11] = True
-
     assert find_vanishing_direction(scene.up, scene.segments.take(few)) is None
     assert find_vanishing_direction(scene.up, scene.segments).share == pytest.approx(0.4, abs=0.15)
+
+
+@pytest.mark.parametrize("seed", [0, 3, 12, 18])
+def test_points_without_noise_give_a_plane_without_deviation(seed):
+    rng = np.random.default_rng(seed)
+    across, slope = rng.uniform(-3, 3, (60, 2)), rng.uniform(-0.1, 0.1, 2)
+    points = np.column_stack([across[:, 0], 1.5 + across @ slope, across[:, 1]])
+    plane = dominant_plane(points, np.array([0.0, 1.0, 0.0]), (0.0, 20.0))
+    assert plane.share == 1.0 and 0.0 <= plane.deviation_deg < 1e-6
+    assert plane.normal == pytest.approx(np.array([-slope[0], 1.0, -slope[1]]) / np.hypot(1.0, np.hypot(*slope)))
+
+
+@pytest.mark.parametrize(
+    "points", [np.zeros((0, 3)), np.zeros((40, 3)), np.linspace(0.0, 1.0, 40)[:, None] * [0.0, 1.0, 0.0]]
+)
+def test_no_points_one_place_and_a_line_have_no_plane(points):
+    assert dominant_plane(points, np.array([0.0, 1.0, 0.0]), (0.0, 20.0)) is None

@@ -1,3 +1,5 @@
+"""Scale, heading and place from GPS positions."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -27,9 +29,7 @@ def walk(count, radius_m, noise_m, seed=0, altitude_noise_m=None):
 
 def test_meters_on_the_ellipsoid_and_back():
     here = GpsPosition(60.0, 179.9999, 100.0)
-
     enu = enu_m([GpsPosition(60.0, -179.9999, 90.0), GpsPosition(60.001, 179.9999, None)], here)
-
     assert enu[0] == pytest.approx([0.0002 * 55800.0, 0, -10], abs=0.02), "a degree of longitude at 60 N is 55.80 km"
     assert enu[1] == pytest.approx([0, 111.41, 0], abs=0.02), "a degree of latitude at 60 N is 111.41 km"
     there = position_from_enu(enu[0], here)
@@ -42,7 +42,7 @@ def test_scale_heading_and_place(seed):
 
     found = georeference(centers, positions, up)
 
-    assert found and (found.photos, found.of) == (12, 12)
+    assert found and (found.inliers, found.positions) == (12, 12)
     assert found.enu_from_world.scale == pytest.approx(METRES, rel=4 * found.scale_deviation)
     assert 0.005 < found.scale_deviation < 0.03
     assert 1.5 < found.rms_m < 6
@@ -58,16 +58,13 @@ def test_a_third_of_the_positions_may_be_wrong():
     for k in (0, 5, 6, 11):
         positions[k] = replace(positions[k], latitude_deg=positions[k].latitude_deg + 0.002 * (k - 5.5))
     positions[3] = None
-
     found = georeference(centers, positions, up)
-
-    assert found and (found.photos, found.of) == (7, 11)
+    assert found and (found.inliers, found.positions) == (7, 11)
     assert found.enu_from_world.scale == pytest.approx(METRES, rel=0.06)
 
 
 def test_three_exact_positions_are_enough_two_are_not():
     centers, positions, up, _ = walk(3, 60.0, 0.02)
-
     assert georeference(centers, positions, up).enu_from_world.scale == pytest.approx(METRES, rel=0.005)
     two = georeference(centers, [positions[0], positions[1], positions[1]], up)
     assert not two and "2 different positions" in two.reason
@@ -75,31 +72,25 @@ def test_three_exact_positions_are_enough_two_are_not():
 
 def test_no_positions():
     found = georeference(np.zeros((4, 3)), [None] * 4, np.array([0.0, 1.0, 0.0]))
-
     assert not found and found.reason == "the photos have no positions"
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_photos_from_one_spot_have_no_scale(seed):
     centers, positions, up, _ = walk(12, 1.5, 4.0, seed)
-
     found = georeference(centers, positions, up)
-
     assert not found and "do not determine a scale" in found.reason
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_positions_of_other_photos_do_not_agree(seed):
     centers, positions, up, _ = walk(12, 60.0, 3.0, seed)
-
     swapped = [positions[k] for k in np.random.default_rng(seed).permutation(12)]
-
     assert not georeference(centers, swapped, up)
 
 
 def test_a_mirrored_walk_does_not_agree():
     centers, positions, up, _ = walk(12, 60.0, 3.0)
-
     assert not georeference(centers, positions, -up), "upside down, the walk turns the other way"
 
 
@@ -122,5 +113,4 @@ def test_a_drone_says_where_up_is_when_its_cameras_do_not():
 def test_cameras_too_near_each_other_for_numbers_have_no_place(up_is_sure):
     centers, positions, up, _ = walk(12, 60.0, 3.0)
     positions = [replace(position, altitude_m=180.0 + k) for k, position in enumerate(positions)]
-
     assert not georeference(1e-200 * centers, positions, up, up_is_sure=up_is_sure)

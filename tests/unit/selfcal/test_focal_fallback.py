@@ -21,7 +21,6 @@ def fallen_back(*focals):
 
 def test_exif_comes_before_a_guess():
     found = fallen_back(None, 900.0, 910.0, 5000.0)
-
     assert (found.method, found.focal_px) == ("exif", 910.0)
     assert found.K[:2, 2].tolist() == [500.0, 400.0]
     assert (found.identifiable, found.reason, found.spread) == (False, "an orbit", {})
@@ -29,6 +28,5 @@ def test_exif_comes_before_a_guess():
 
 def test_without_exif_the_focal_is_the_usual_guess():
     found = fallen_back(None, None)
-
     assert found.method == "guess"
     assert found.focal_px == pytest.approx(1200)

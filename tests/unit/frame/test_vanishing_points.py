@@ -1,3 +1,5 @@
+"""Line segments in photos."""
+
 import cv2
 import numpy as np
 import pytest
