@@ -27,7 +27,7 @@ from sfm_app.colmap.dense import (
 from sfm_app.colmap.features import SiftSettings, find_and_match
 from sfm_app.colmap.surface import FUSED, fuse, open_points, poisson_surface, positions, simplify
 from sfm_app.errors import BackendError
-from sfm_app.photos import save_mask
+from sfm_app.photos.masks import save_mask
 from sfm_app.progress import SilentProgress
 from sfm_app.settings import MatchSettings
 from sfm_app.stereo import DepthEstimate, DepthMap

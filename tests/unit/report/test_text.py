@@ -169,7 +169,11 @@ def test_a_model_that_may_stand_the_wrong_way_up_comes_with_a_remedy():
 
 def test_a_failed_adjustment_is_named():
     text, summary = describe(
-        adjustment={"failed": "only 3 of 900 points remain", "failed_in_other_models": {"2": "no"}, "cameras_held": ["one"]}
+        adjustment={
+            "failed": "only 3 of 900 points remain",
+            "failed_in_other_models": {"2": "no"},
+            "cameras_held": ["one"],
+        }
     )
 
     assert "beware: the last adjustment failed (only 3 of 900 points remain); cameras and poses are those of" in text
