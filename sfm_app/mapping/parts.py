@@ -7,7 +7,7 @@ from itertools import combinations
 from pathlib import Path
 
 from sfm_app.colmap.backend import run_in_daemon_thread, translate_errors
-from sfm_app.colmap.joined_model import read_placed, adjust_joined, write_placed
+from sfm_app.colmap.joined_model import adjust_joined, read_placed, write_placed
 from sfm_app.errors import BackendError
 from sfm_app.mapping.attempt import (
     Attempt,
