@@ -92,14 +92,10 @@ def test_a_model_that_may_stand_the_wrong_way_up_comes_with_a_remedy():
 
 def test_what_the_last_adjustment_could_not_do_is_said():
     text, summary = told(
-        adjustment={
-            "failed": "only 3 of 900 points remain",
-            "failed_in_other_models": {"2": "no"},
-            "cameras_held": ["one"],
-        }
+        adjustment={"failed": "only 3 of 900 points remain", "failed_in_other_models": {"2": "no"}, "cameras_held": ["one"]}
     )
 
-    assert "the last adjustment failed (only 3 of 900 points remain); cameras and poses are as mapping left" in text
+    assert "beware: the last adjustment failed (only 3 of 900 points remain); cameras and poses are as mapping left" in text
     assert "the last adjustment of other_models/2 failed (no)" in text
     assert "do not determine camera one; it stayed" in text
     assert summary["adjustment"]["cameras_held"] == ["one"]

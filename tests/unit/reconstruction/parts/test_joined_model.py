@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.joined_model import adjust_joined, read_placed, write_placed
+from sfm_app.colmap.joined_model import read_placed, adjust_joined, write_placed
 from sfm_app.colmap.model import poses_and_points
 from sfm_app.geometry.poses import umeyama
 
