@@ -307,9 +307,10 @@ def couple_cameras(observed: Any, groups: Any, poses: int, damping: float, rows:
 
 @kernel
 def eliminate_from_cameras(
-    photo: Any, point: Any, A: Any, camera_of: Any, starts: Any, sums: Any, poses: int, rows: FloatArray
-) -> None:
-    """Subtract the parts of all points from the rows of the cameras, in place; arguments as in `couple_cameras`."""
+    photo: IndexArray, point: IndexArray, A: FloatArray, camera_of: IndexArray, starts: IndexArray, sums: FloatArray,
+    poses: int, rows: FloatArray,
+) -> None:  # fmt: skip
+    """Remove the parts of all points from the rows of the cameras, in place; arguments as in `couple_cameras`."""
     for k in range(len(photo)):
         column = POSE * photo[k]
         for g in range(starts[point[k]], starts[point[k] + 1]):

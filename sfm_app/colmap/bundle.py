@@ -57,7 +57,7 @@ from sfm_app.types.camera import named_correlations
 
 # COLMAP's models as the arrays of our bundle adjustment, and back.
 
-PLACES = {name: (k,) for k, name in enumerate((*TWO_FOCALS, *TERMS["perspective"]))}
+PLACES: dict[str, tuple[int, ...]] = {name: (k,) for k, name in enumerate((*TWO_FOCALS, *TERMS["perspective"]))}
 PLACES |= {name: (k,) for k, name in enumerate((*TWO_FOCALS, *TERMS["fisheye"]))} | {"f": (FX, FY), "k": (K1,)}
 """Indices in `Bundle.params` by COLMAP's names of parameters."""
 FILE_MODELS = {

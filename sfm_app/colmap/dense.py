@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from math import ceil
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -148,10 +147,11 @@ def read_color(dense_dir: Path, view: View) -> NDArray[np.uint8]:
     return np.asarray(_decode(dense_dir, view.name, cv2.IMREAD_COLOR_RGB), np.uint8)
 
 
-def _decode(dense_dir: Path, name: str, flags: int) -> Any:
+def _decode(dense_dir: Path, name: str, flags: int) -> NDArray[np.uint8] | None:
     """Return an undistorted photo; None if the file is no photo."""
     # imdecode, because OpenCV does not open names beyond ASCII on every system
-    return cv2.imdecode(np.fromfile(dense_dir / "images" / name, np.uint8), flags)
+    image = cv2.imdecode(np.fromfile(dense_dir / "images" / name, np.uint8), flags)
+    return None if image is None else np.asarray(image, np.uint8)
 
 
 def map_file(dense_dir: Path, view: View) -> Path:
@@ -325,4 +325,4 @@ def read_photo_and_depth(dense_dir: Path, name: str) -> tuple[NDArray[np.uint8],
     with translate_errors(f"reading the depth map of {name}"):
         stored = pycolmap.DepthMap()
         stored.read(dense_dir / "stereo" / DEPTHS / f"{name}.geometric.bin")
-    return np.asarray(image, np.uint8), np.array(stored.to_array(), np.float32)
+    return image, np.array(stored.to_array(), np.float32)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,9 +25,9 @@ UNDISTORTED_PHOTOS = {"COLMAP": "images", "PMVS": "pmvs/visualize"}
 """Folder of the undistorted photos, by layout."""
 
 
-def work(task: Any) -> None:
+def work(task: Mapping[str, object]) -> None:
     """Do the task that its entry `do` names."""
-    TASKS[task["do"]](task)
+    TASKS[str(task["do"])](task)
 
 
 def find_and_match(task: FeatureTask) -> None:
