@@ -134,7 +134,7 @@ def fit_control_points(given: ControlPoints, located: Mapping[str, SightedPoint]
     try:
         used = agreeing_points(places, targets)
     except FAILURES:
-        return "the ground control points lie on a line: they do not determine which way is up"
+        return "the ground control points lie on a line: they do not determine the up direction"
     fit = umeyama(places[used], targets[used])
     distances = np.linalg.norm(fit(places) - targets, axis=1)
     rms = float(np.sqrt(np.mean(distances[used] ** 2)))

@@ -104,13 +104,13 @@ def resolve_file(folder: Path, name: str) -> Path | str:
         real = place.resolve()
         exists = real.exists()
     except RuntimeError:  # a cycle of links
-        return "a link that leads nowhere"
+        return "a broken link"
     except (OSError, ValueError) as err:  # lists may hold invalid names; folders may be inaccessible
         return f"not readable: {getattr(err, 'strerror', 'no name').lower()}"
     if not real.is_relative_to(root):
         return "a link out of the folder" if is_link(place) else "outside the folder"
     if not exists:
-        return "a link that leads nowhere" if is_link(place) else "not there"
+        return "a broken link" if is_link(place) else "missing"
     if real.is_dir():
         return "a link to a folder" if is_link(place) else "a folder"
     return real if real.is_file() else "not a file"  # reading a pipe would never end

@@ -91,7 +91,7 @@ class Serializer(contextlib.AbstractContextManager["Serializer"]):
         self.folder.mkdir(parents=True, exist_ok=True)
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *error: object) -> None:
         for _, path, _ in self._shared.values():
             path.unlink(missing_ok=True)
 

@@ -157,7 +157,7 @@ BAD = {
     "a folder": (lambda place: place.mkdir(), "a folder"),
     "a pipe": (os.mkfifo, "not a file"),
     "a link out": (lambda place: place.symlink_to("/etc/passwd"), "a link out of the folder"),
-    "a broken link": (lambda place: place.symlink_to("nothing.png"), "a link that leads nowhere"),
+    "a broken link": (lambda place: place.symlink_to("nothing.png"), "a broken link"),
 }
 
 

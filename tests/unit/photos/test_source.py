@@ -186,6 +186,6 @@ def test_large_photos_are_scaled_down(tmp_path):
 def test_a_file_that_went_away_or_led_out(tmp_path):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "x.jpg").symlink_to(tmp_path / "y.jpg")
-    for name, reason in (("x.jpg", "a link out of the folder"), ("z.jpg", "not there")):
+    for name, reason in (("x.jpg", "a link out of the folder"), ("z.jpg", "missing")):
         with pytest.raises(UnreadableError, match=reason):
             lay_out(Photo(name, 60, 40, "g"), tmp_path / "photos", tmp_path / "target")
