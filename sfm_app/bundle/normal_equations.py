@@ -535,7 +535,8 @@ def cost(bundle: Bundle, scale_px: float) -> float:
 
 def loss(r: FloatArray, usable: NDArray[np.bool_], scale_px: float) -> float:
     """Return half the sum of the loss of `reduce` over residuals (N, 2), in squared pixels; `lost_px` counts for lost
-    ones."""
+    ones.
+    """
     with np.errstate(all="ignore"):
         squares = np.where(usable, np.einsum("ni,ni->n", r, r), REDUCTION.lost_px**2)
     return float(scale_px**2 * np.sum(np.sqrt(1.0 + squares / scale_px**2) - 1.0))

@@ -518,7 +518,8 @@ def _follow_path(model: ShutterBundle, problem: _Problem) -> ShutterBundle:
 
 def _expected_offsets(model: ShutterBundle, problem: _Problem, shake: FloatArray) -> FloatArray:
     """Return standard deviations (I, 6) of the offsets; constant during a step, else offsets would enlarge the
-    readout."""
+    readout.
+    """
     times = problem.rows.times
     path = path_velocities(model.bundle.R, model.bundle.t, times)
     readout = max(abs(model.readout), OPTIONS.least_readout * float(np.median(np.diff(np.sort(times)))))

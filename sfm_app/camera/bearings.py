@@ -72,7 +72,8 @@ def fold_radius(terms: FloatArray, projection: str) -> float:
 
 def undistort(points: FloatArray, terms: FloatArray, projection: str) -> FloatArray:
     """Return points (N, 2) before distortion, in focal lengths from the optical center; those beyond the fold lie on
-    it."""
+    it.
+    """
     fold = fold_radius(terms, projection)
     w = _undistort_radius(points, terms, projection, fold)
     if not _shift(w, terms, projection).any():

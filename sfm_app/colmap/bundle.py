@@ -92,7 +92,8 @@ def read_camera(camera: pycolmap.Camera) -> FloatArray:
 
 def write_camera(camera: pycolmap.Camera, params: FloatArray, family: int) -> None:
     """Change a camera in place to the smallest of FILE_MODELS that holds parameters (12,); a panorama stays as it
-    is."""
+    is.
+    """
     if family == PANORAMA:
         return
     name = file_model(params, family)

@@ -83,7 +83,8 @@ def test_every_name_on_the_page_is_in_the_code(name):
 @pytest.mark.parametrize(
     "name",
     [
-        "fundamental.loop.serch", "fundamental.lop.search", "fundamental.loop.search(nobody)", "fundamental.points.Matches.nothing",
+        "fundamental.loop.serch", "fundamental.lop.search", "fundamental.loop.search(nobody)",
+        "fundamental.points.Matches.nothing",
         "lev-ransac-thesi", "nothing", "fundamental.loop.Best.f.x",
     ],
 )  # fmt: skip
