@@ -46,15 +46,11 @@ class View:
         """(M,) depths of the sparse points."""
         return np.asarray(self.points @ self.R[2] + self.t[2])
 
-    @property
-    def projection(self) -> FloatArray:
-        """(3, 4) projection matrix K [R | t]."""
-        return self.K @ np.column_stack([self.R, self.t])
-
     def projection_into(self, other: "View") -> FloatArray:
         """Return P (3, 4): the pixel (x, y) at depth z has the homogeneous pixel P (x z, y z, z, 1) in another view."""
         relative = other.R @ self.R.T
-        return other.K @ np.column_stack([relative @ np.linalg.inv(self.K), other.t - relative @ self.t])
+        pose = np.column_stack([relative @ np.linalg.inv(self.K), other.t - relative @ self.t])
+        return np.asarray(other.K @ pose, np.float64)
 
     def halve(self, level: int) -> "View":
         """Return the view of the photo halved `level` >= 1 times; depths are at pixel centers."""
