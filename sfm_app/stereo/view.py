@@ -46,6 +46,11 @@ class View:
         """(M,) depths of the sparse points."""
         return np.asarray(self.points @ self.R[2] + self.t[2])
 
+    @property
+    def projection(self) -> FloatArray:
+        """(3, 4) projection matrix K [R | t]."""
+        return np.asarray(self.K @ np.column_stack([self.R, self.t]))
+
     def projection_into(self, other: "View") -> FloatArray:
         """Return P (3, 4): the pixel (x, y) at depth z has the homogeneous pixel P (x z, y z, z, 1) in another view."""
         relative = other.R @ self.R.T
