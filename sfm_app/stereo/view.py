@@ -54,7 +54,8 @@ class View:
     def projection_into(self, other: "View") -> FloatArray:
         """Return P (3, 4): the pixel (x, y) at depth z has the homogeneous pixel P (x z, y z, z, 1) in another view."""
         relative = other.R @ self.R.T
-        return other.K @ np.column_stack([relative @ np.linalg.inv(self.K), other.t - relative @ self.t])
+        pose = np.column_stack([relative @ np.linalg.inv(self.K), other.t - relative @ self.t])
+        return np.asarray(other.K @ pose, np.float64)
 
     def halve(self, level: int) -> "View":
         """Return the view of the photo halved `level` >= 1 times; depths are at pixel centers."""
