@@ -142,8 +142,12 @@ def turn_camera(R: FloatArray, turn_deg: int) -> FloatArray:
 
 def _world_segments(model: Reconstruction, cues: Mapping[int, PhotoCues]) -> Segments:
     """Return the line segments of a model's photos in the world."""
+    parts = []
     with translate_errors("computing viewing rays of line segments"):
-        return concatenate_segments([_to_world(model, photo, one.lines) for photo, one in cues.items()])
+        for photo, cue in cues.items():
+            first, second = (viewing_rays(model, photo, cue.lines[:, ends]) for ends in (slice(0, 2), slice(2, 4)))
+            parts.append(segment_planes(first, second, photo, focal_px(model, photo)))
+        return concatenate_segments(parts)
 
 
 def _scenery(model: Reconstruction, cues: Mapping[int, PhotoCues]) -> Scenery:
@@ -165,11 +169,6 @@ def extract_cues(path: Path, turn_deg: int = 0) -> PhotoCues:
         return PhotoCues(np.zeros((0, 4)), None)
     gray = np.asarray(picture, np.uint8)
     return PhotoCues(line_segments(gray), np.rot90(small_picture(gray), -turn_deg // 90))
-
-
-def _to_world(model: Reconstruction, image_id: int, lines: FloatArray) -> Segments:
-    first, second = (viewing_rays(model, image_id, lines[:, ends]) for ends in (slice(0, 2), slice(2, 4)))
-    return segment_planes(first, second, image_id, focal_px(model, image_id))
 
 
 def _orientation_entry(upright: UpEstimate, front: str) -> dict[str, Json]:
