@@ -7,7 +7,6 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from sfm_app.bundle.lens_parts import PARTS
 from sfm_app.bundle.normal_equations import Bundle
@@ -118,6 +117,8 @@ def _compensate(
 
 def _spread_inverse_depths(x: FloatArray, tracked: NDArray[np.int64], inverse: FloatArray) -> FloatArray:
     """Return inverse depths (N,) of all keypoints; untracked ones take the mean of their five nearest tracked ones."""
+    from scipy.spatial import cKDTree
+
     count = min(5, len(tracked))
     _, near = cKDTree(x[tracked]).query(x, k=np.arange(1, count + 1))
     spread = np.asarray(inverse[near].mean(axis=1), np.float64)

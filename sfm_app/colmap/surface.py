@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import translate_errors
@@ -119,6 +118,8 @@ def simplify(surface: Surface, most: int, max_error: float, scratch: Path, threa
         scratch: folder for two temporary files.
         threads: the surface is the same for any number.
     """
+    import trimesh
+
     fine, coarse = scratch / "fine.ply", scratch / "coarse.ply"
     trimesh.Trimesh(surface.vertices, surface.faces, process=False).export(fine)
     task: SimplifyTask = {
@@ -150,6 +151,8 @@ def _mean_colors(surface: Surface, vertices: NDArray[np.float64], threads: int) 
 
 
 def _read(path: Path) -> Surface:
+    import trimesh
+
     mesh = trimesh.load(path, process=False)
     if not isinstance(mesh, trimesh.Trimesh):  # a file without triangles
         return Surface(np.empty((0, 3)), np.empty((0, 3), np.int64), np.empty((0, 3), np.uint8))

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from sfm_app.geometry.poses import axis_angle_deg, component_along, normalize, perpendicular_basis, smallest_eigenvector
 from sfm_app.types.arrays import FloatArray
@@ -181,6 +180,8 @@ def fit_orthogonal_frame(up: FloatArray, level: FloatArray, segments: Segments) 
     rotation by w changes the residual n'd of a segment along d by n'(w x d). `up` and `level` are perpendicular unit
     vectors (3,).
     """
+    from scipy.spatial.transform import Rotation
+
     frame = np.stack([up, level, np.cross(up, level)])
     for width_deg in OPTIONS.widths_deg:
         for _ in range(10):

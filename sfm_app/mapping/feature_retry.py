@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import read_features, write_match_graph
@@ -78,6 +77,8 @@ def add_matches(
 
 def _merge_keypoints(known: FloatArray, added: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
     """Return all keypoints of a photo, and the index of each added one among them."""
+    from scipy.spatial import cKDTree
+
     numbers = len(known) + np.arange(len(added))
     if len(known) and len(added):
         distances, nearest = cKDTree(known).query(added)

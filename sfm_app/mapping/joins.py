@@ -5,8 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from sfm_app.colmap.joined_model import PlacedPhotos
 from sfm_app.geometry.poses import Similarity, robust_similarity
@@ -491,6 +489,9 @@ def _merge_tracks(
     Tracks with a keypoint in common become one; of several keypoints of one photo in it, one stays. The input has, for
     each model, the points, and for each observation the row of the point, the photo and the keypoint.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     starts = np.cumsum([0, *(len(X) for X, *_ in tracks)])
     X = np.concatenate([X for X, *_ in tracks] or [np.zeros((0, 3))])
     point = np.concatenate([rows + start for (_, rows, *_), start in zip(tracks, starts, strict=False)])

@@ -11,7 +11,6 @@ from heapq import heapify, heappop, heappush
 from itertools import chain
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from sfm_app.colmap.backend import Camera, Reconstruction, all_points, translate_errors
 from sfm_app.colmap.model import focal_px, posed_images
@@ -238,6 +237,8 @@ def _posed_photo_points(
 
 def _neighbors(posed: Mapping[int, PosedPhotoPoints]) -> Iterator[PairId]:
     """Yield photos with others nearby that look the same way; some of these where there are many."""
+    from scipy.spatial import KDTree
+
     if not posed:
         return
     photos, posed_photos = list(posed), list(posed.values())

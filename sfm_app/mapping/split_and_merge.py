@@ -5,9 +5,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import csr_array, triu
 
 from sfm_app.colmap.backend import Reconstruction, all_points, translate_errors
 from sfm_app.colmap.bundle import adjust_or_keep
@@ -20,6 +20,10 @@ from sfm_app.posegraph.rotations import DisjointGroups
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import MatchGraph, PairId, ViewGraph
 from sfm_app.types.arrays import FloatArray
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
 
 # Cuts. A false join of similar facades rests on few matches, and leaves many others unexplained: those of pairs that
 # see the true layout.
@@ -192,15 +196,17 @@ def weakly_joined_parts(model: Reconstruction) -> list[list[str]]:
     return [sorted(part) for part in parts[1:]]
 
 
-def _visibility_matrix(tracks: list[set[int]], photos: list[int]) -> csr_array:
+def _visibility_matrix(tracks: list[set[int]], photos: list[int]) -> "csr_array":
     """Return the matrix (N, P) with 1 where a point is seen by a photo."""
+    from scipy.sparse import csr_array
+
     place = {photo: k for k, photo in enumerate(photos)}
     columns = [place[photo] for track in tracks for photo in sorted(track)]
     ends = np.cumsum([0, *map(len, tracks)])
     return csr_array((np.ones(len(columns), np.int32), columns, ends), shape=(len(tracks), len(photos)))
 
 
-def _joining_order(visibility: csr_array) -> list[tuple[int, int]]:
+def _joining_order(visibility: "csr_array") -> list[tuple[int, int]]:
     """Return the photos from the third on in joining order, each with its number of shared points."""
     points, photos = visibility.shape
     if photos < 3 or points == 0:
@@ -222,7 +228,7 @@ class _Growth:
     point.
     """
 
-    def __init__(self, visibility: csr_array) -> None:
+    def __init__(self, visibility: "csr_array") -> None:
         self.visibility, self.by_photo = visibility, visibility.T.tocsr()
         points, photos = visibility.shape
         self.views = np.zeros(points, np.int64)
@@ -234,6 +240,8 @@ class _Growth:
 
     def best_pair(self) -> tuple[int, int]:
         """Return the two photos that share most points."""
+        from scipy.sparse import csr_array, triu
+
         together = csr_array(triu(self.by_photo @ self.visibility, k=1)).tocoo()
         i, j = together.coords
         best = np.lexsort((j, i, -together.data))[:1]

@@ -8,7 +8,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sfm_app.geometry.epipolar import FIRST, SECOND
 from sfm_app.numerical import FAILURES
@@ -57,6 +56,8 @@ GUIDED = GuidedOptions()
 
 def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> RelativePose | None:
     """Estimate the pose of a pair with a known rotation R (3, 3); None if its matches do not confirm it."""
+    from scipy.spatial.transform import Rotation
+
     if len(pair.lines) < min_inliers:
         return None
     t = sample_direction(pair, R, np.random.default_rng(seed))

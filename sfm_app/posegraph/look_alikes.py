@@ -20,9 +20,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial.transform import Rotation
 
 from sfm_app.camera.bearings import bearings, depths_along, project
 from sfm_app.geometry.epipolar import FIRST, SECOND, depths
@@ -379,6 +376,9 @@ def find_look_alikes(
 
 def _build_tracks(visibility: Visibility, pairs: Iterable[PairId]) -> FeatureTracks:
     """Join the keypoints of pairs into tracks."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     starts, count = {}, 0
     for photo, keypoints in visibility.partners.items():
         starts[photo], count = count, count + len(keypoints)
@@ -473,6 +473,8 @@ def _photo_rotations(trusted: Iterable[PairId], poses: Mapping[PairId, RelativeP
 
 def _rotation_gap_deg(join: tuple[PairId, ...], rotations: Mapping[int, FloatArray], places: Depths) -> float:
     """Return the median angle between the rotations of pairs and those along the trusted ones."""
+    from scipy.spatial.transform import Rotation
+
     products = [
         places.poses[a, b].R.T @ rotations[b] @ rotations[a].T for a, b in join if a in rotations and b in rotations
     ]

@@ -8,17 +8,18 @@ which many wrong pairs do not move far, then a robust sum of squares, which they
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
-from scipy.sparse.linalg import cg
-from scipy.spatial.transform import Rotation
 
 from sfm_app.jit import kernel
 from sfm_app.types import PairId
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
+
+if TYPE_CHECKING:
+    from scipy import sparse
+    from scipy.spatial.transform import Rotation
 
 
 class DisjointGroups:
@@ -100,6 +101,8 @@ def find_corrections(
         residuals: (E, 3) rotation vectors of R_j' R_ij R_i.
         strengths: (E,) weights.
     """
+    from scipy.spatial.transform import Rotation
+
     explained = np.degrees(np.linalg.norm(residuals, axis=1)) <= CORRECTIONS.contradicts_deg
     unexplained, turns = ~explained, Rotation.from_rotvec(residuals)
     while unexplained.any():
@@ -118,12 +121,15 @@ def find_corrections(
             yield RotationCorrection(~side, turns[seed].as_matrix(), gain)
 
 
-def _is_small(turns: Rotation) -> BoolArray:
+def _is_small(turns: "Rotation") -> BoolArray:
     return np.asarray(np.degrees(turns.magnitude()) < CORRECTIONS.same_deg, np.bool_)
 
 
 def _find_linked(count: int, edges: IndexArray, chosen: BoolArray, seed: int) -> BoolArray:
     """Return a mask (E,) of the chosen pairs that shared photos connect with the pair `seed`."""
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+
     i, j = edges[chosen].T
     _, part = connected_components(sparse.coo_array((np.ones(len(i)), (i, j)), shape=(count, count)), directed=False)
     return np.asarray(chosen & (part[edges[:, 0]] == part[edges[seed, 0]]), np.bool_)
@@ -139,6 +145,9 @@ def find_cut(
         strengths: (E,) weights.
         ends: (K,) photos that must be on the one side, and (L,) on the other.
     """
+    from scipy import sparse
+    from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
     if np.intersect1d(*ends).size or not len(edges):
         return np.zeros(count, np.bool_), float("inf")
     unit = max(float(strengths.max()) / CORRECTIONS.unit, 1e-300)
@@ -152,8 +161,10 @@ def find_cut(
 
 def _make_network(
     count: int, edges: IndexArray, whole: IndexArray, ends: tuple[IndexArray, IndexArray]
-) -> sparse.csr_array:
+) -> "sparse.csr_array":
     """Return capacities between photos, and from a source to the first ends and from the second ends to a sink."""
+    from scipy import sparse
+
     first, second = ends
     most = np.full(len(first) + len(second), min(int(whole.sum()) + 1, np.iinfo(np.int32).max // 4))
     rows = np.concatenate([edges[:, 0], edges[:, 1], np.full(len(first), count), second])
@@ -221,6 +232,8 @@ def _descend(
     rotations: FloatArray, edges: IndexArray, turns: FloatArray, strengths: FloatArray, sum_rounds: int
 ) -> FloatArray:
     """Return the rotations (I, 3, 3) that minimize the angles of pairs near given ones."""
+    from scipy.spatial.transform import Rotation
+
     for done in range(sum_rounds + AVERAGING.square_rounds):
         residuals = _residuals(rotations, edges, turns)
         angles = np.linalg.norm(residuals, axis=1)
@@ -283,6 +296,8 @@ def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArr
         edges: (E, 2) numbers of photos, the smaller first.
         turns: (E, 3, 3) rotation of photo 2 from photo 1.
     """
+    from scipy.spatial.transform import Rotation
+
     order = np.lexsort(edges.T[::-1])
     starts = np.searchsorted(edges[order, 0], np.arange(edges.max(initial=0) + 2))
     loops = order[_find_loops(edges[order], starts)] if len(edges) else np.zeros((0, 3), np.int64)
@@ -345,12 +360,17 @@ def _propagate_along_tree(count: int, edges: IndexArray, turns: FloatArray, stre
 
 def _residuals(rotations: FloatArray, edges: IndexArray, turns: FloatArray) -> FloatArray:
     """Return the rotation vectors (E, 3) of R_j' R_ij R_i."""
+    from scipy.spatial.transform import Rotation
+
     products = np.einsum("nji,njk,nkl->nil", rotations[edges[:, 1]], turns, rotations[edges[:, 0]])
     return np.asarray(Rotation.from_matrix(products).as_rotvec(), np.float64)
 
 
 def _solve_steps(count: int, edges: IndexArray, residuals: FloatArray, factors: FloatArray) -> FloatArray:
     """Fit steps (count, 3) by weighted least squares of step_j - step_i = left; the free turn of each group stays 0."""
+    from scipy import sparse
+    from scipy.sparse.linalg import cg
+
     i, j = edges.T
     b = np.zeros((count, 3))
     np.add.at(b, j, factors[:, None] * residuals)
