@@ -19,10 +19,11 @@ from benchmarks.surface.photos import placed_photos
 from benchmarks.surface.sets import RENDERED, finished_model, surface_set
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import Camera
-from sfm_app.synthetic.render import SUPERSAMPLING, orbited_pose, prepare_model, render_model, render_shape
+from sfm_app.synthetic.render import orbited_pose, prepare_model, render_model, render_shape
 from sfm_app.types.surface import Model
 
 Pixels = NDArray[np.uint8]
+SUPERSAMPLING = 2
 SIZE = (900, 600)
 """Width and height of a picture."""
 DIVIDER_PX, QUALITY = 3, 85
