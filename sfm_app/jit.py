@@ -42,13 +42,14 @@ def kernel(function: Function) -> Function:
 def summing_kernel(function: Function) -> Function:
     """Compile a kernel whose sums may be vectorized: several times faster, the same bytes on one kind of processor.
 
-    Nothing else is relaxed: there are no assumptions about infinities or NaN, and no approximate division.
+    Nothing else is relaxed: there are no assumptions about infinities or NaN, and no approximate division. It is inlined
+    into the kernels that call it: a copy of its own would be vectorized in another order in the process that compiles it.
     """
-    return _compile(function, fastmath={"reassoc", "nsz"})
+    return _compile(function, fastmath={"reassoc", "nsz"}, forceinline=True)
 
 
-def _compile(function: Function, *, fastmath: bool | set[str]) -> Function:
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": fastmath, "no_cfunc_wrapper": True}
+def _compile(function: Function, **options: Any) -> Function:
+    options |= {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
     before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(CACHE)
     try:
         return cast(Function, numba.njit(cache=True, **options)(function))
