@@ -1,6 +1,7 @@
 """The site has all pages, all public names, commands and settings, and asks nothing of other hosts."""
 
 import importlib.util
+import json
 import re
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import pytest
 
 import sfm_app
 from sfm_app.cli import main
+from sfm_app.runtime.workspace import CHECKSUM, StageRecord
 from sfm_app.settings import Section, Settings
 from tests.docs.pages import ROOT
 
@@ -173,3 +175,29 @@ def test_docstrings_are_on_the_pages(site):
     assert 'id="sfm_app.estimate_fundamental"' in text
     assert "many of which may be wrong" in text
     assert 'href="results.html#sfm_app.EpipolarFit"' in text
+
+
+PAGE = (ROOT / "docs" / "reference" / "output-files.md").read_text(encoding="utf-8")
+NAMED = {
+    name.rstrip("/")
+    for row in re.findall(r"^\| (`[^|]+) \|", PAGE, re.MULTILINE)
+    for name in re.findall(r"`([^`]+)`", row)
+}
+
+
+def test_every_entry_of_a_record_is_listed():
+    assert {*StageRecord.__dataclass_fields__, CHECKSUM} <= NAMED
+
+
+@pytest.mark.slow
+def test_every_file_of_a_run_is_listed(finished):
+    left = {path.name for path in (finished / "out").iterdir() if not path.name.startswith(".")}
+    assert {"model.glb", "report.html", "manifest.json"} <= left
+    assert left <= NAMED
+
+
+@pytest.mark.slow
+def test_every_entry_of_the_manifest_is_listed(finished):
+    manifest = json.loads((finished / "out" / "manifest.json").read_text(encoding="utf-8"))
+    assert set(manifest) <= NAMED
+    assert all(set(record) <= NAMED for record in manifest["stages"].values())

@@ -12,10 +12,9 @@ from PIL import Image
 from benchmarks.synthetic.scenes import poster
 from benchmarks.synthetic.walks import orbit
 from sfm_app.api import Run
-from sfm_app.camera.models import camera_matrix
 from sfm_app.cli.commands import SCENES as TEXTS
 from sfm_app.cli.output import fold_lines
-from sfm_app.demo import SCENES, DemoScene, camera_of, demo_lines, draw, evaluate, render_photos
+from sfm_app.demo import SCENES, DemoScene, demo_lines, draw, evaluate, render_photos
 from sfm_app.errors import InputError
 from sfm_app.progress import SilentProgress
 from sfm_app.settings import Settings
@@ -92,15 +91,6 @@ def test_the_truth_says_which_photos_a_killed_demo_has_begun(tmp_path):
 
     assert len(json.loads((tmp_path / "truth.json").read_text(encoding="utf-8"))) > 0
     assert len(render(tmp_path, "one").cam_from_world) == 3
-
-
-def test_a_fisheye_is_drawn_with_its_lens():
-    K = camera_matrix(366.0, 366.0, 480.0, 320.0)
-    wide = camera_of(CameraModel("OPENCV_FISHEYE", (366.0, 366.0, 480.0, 320.0, 0.01, 0, 0, 0), K, 960, 640))
-    plain = camera_of(CameraModel("OPENCV", (366.0, 366.0, 480.0, 320.0, 0.01, 0, 0, 0), K, 960, 640))
-
-    assert wide.lens.projection == "equidistant" and wide.lens.radial == (0.01, 0.0, 0.0, 0.0)
-    assert plain.lens.projection == "perspective"
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -240,23 +240,6 @@ def test_what_a_notebook_shows_is_of_one_run_of_it(path):
     assert places == []
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_links_of_a_notebook_lead_somewhere(path):
-    links = [link for cell in cells(path, "markdown") for link in re.findall(r"\]\(([^)\s]+)\)", cell["source"])]
-    assert links
-    assert [link for link in links if not (path.parent / link.partition("#")[0]).exists()] == []
-
-
-def test_every_example_is_on_the_page_and_in_a_test():
-    page, tests = ((EXAMPLES / "README.md").read_text(encoding="utf-8"), Path(__file__).read_text(encoding="utf-8"))
-    links = set(re.findall(r"\]\(([^)\s]+)\)", page))
-    scripts = sorted(EXAMPLES.glob("*.py"))
-    assert len(scripts) == 4 and len(NOTEBOOKS) == 3
-    assert {path.relative_to(EXAMPLES).as_posix() for path in (*scripts, *NOTEBOOKS)} < links
-    assert all(f'("{path.name}"' in tests for path in scripts)
-    assert all(f'execute("{path.stem}"' in tests for path in NOTEBOOKS)
-
-
 @pytest.fixture
 def installed_template(tmp_path):
     """The template, copied and installed as pip does it, without a network: module and metadata side by side."""

@@ -1,6 +1,5 @@
 """Workflows, image, issue forms and versions agree with the project."""
 
-import json
 import re
 import tomllib
 from pathlib import Path
@@ -96,26 +95,3 @@ def test_compose_starts_every_role_with_the_kernels_of_the_image():
     )
     assert len(entries) == 2
     assert {entry[0] for entry in entries} == {own[0]}
-
-
-def test_issue_forms_ask_for_what_helps():
-    forms = {
-        path.stem: path.read_text(encoding="utf-8") for path in (ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml")
-    }
-    assert "`sfm-app doctor`" in forms["bug"] and "OUT/log.txt" in forms["bug"]
-    assert "OUT/report.html" in forms["poor-model"]
-    for name in ("bug", "poor-model"):
-        form = yaml.safe_load(forms[name])
-        assert {"name", "description", "body"} <= set(form)
-        ids = [part["id"] for part in form["body"]]
-        assert len(ids) == len(set(ids)) > 2
-
-
-def test_hooks_and_devcontainer_name_what_is_there():
-    container = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text(encoding="utf-8"))
-    assert container["postCreateCommand"].endswith(" && make .venv/.installed")
-    (local,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))["repos"]
-    lint = MAKEFILE.split("\nlint:")[1].split("\n\n")[0]
-    for hook in local["hooks"]:
-        tool = hook["entry"].split()[0].removeprefix(".venv/bin/")
-        assert f"$(BIN)/{tool}" in lint

@@ -3,14 +3,25 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.cameras.bars import BARS, lower_bound, upper_bound, verdict
-from benchmarks.cameras.methods import methods, rotate_methods
-from benchmarks.cameras.report import DEVIATIONS, compare_bytes, medians, page
-from benchmarks.cameras.score import Model, TruePhoto, accuracy, camera_errors, stated_deviations, times, true_photos
-from benchmarks.common.metrics import area_under_recall, pose_errors_deg, position_rms_percent
+from benchmarks.cameras.bars import lower_bound, upper_bound, verdict
+from benchmarks.cameras.report import DEVIATIONS, medians, page
+from benchmarks.cameras.score import Model, TruePhoto, accuracy, camera_errors, stated_deviations, true_photos
+from benchmarks.common.metrics import (
+    CAP_PX,
+    LOST_DEG,
+    area_under_recall,
+    fundamental_pose_error_deg,
+    mean_sampson_px,
+    pose_errors_deg,
+    position_rms_percent,
+    summary_px,
+)
 from benchmarks.common.photo_sets import steps
+from benchmarks.common.timing import take_turns
 from sfm_app.camera.models import camera_matrix
+from sfm_app.geometry.epipolar import fundamental_from_pose
 from sfm_app.synthetic.cameras import axis_rotation
+from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
 K = camera_matrix(1000.0, 1010.0, 400.0, 300.0)
 TURN = axis_rotation(np.array([0.6, 0.0, 0.8]), 50.0)
@@ -81,19 +92,6 @@ def test_every_photo_is_compared_with_its_own_camera():
     assert (row["e_focal %"], row["e_OC %"], row["e_OC_w %"]) == (25.0, 5.0, 6.25)
 
 
-def test_nothing_found_scores_nothing():
-    row = accuracy([], truth(), 4)
-
-    assert (row["registered"], row["models"], row["AUC@5"], row["e_focal %"], row["center rms %"]) == (
-        0,
-        0,
-        0,
-        None,
-        None,
-    )
-    assert accuracy([], {}, 7)["of"] == 7
-
-
 def test_each_of_several_models_is_judged_by_its_own_photos():
     halves = [Model({name: POSES[name] for name in pair}, {}, 1, 1, 0.1) for pair in ("ab", "cd")]
 
@@ -143,23 +141,6 @@ def test_of_several_cameras_the_worst_deviation_counts(tmp_path):
     assert stated_deviations(tmp_path, left_behind(tmp_path, {}), truth()) == {"worst in sd": None}
 
 
-def test_steps_of_both_sides_meet_in_the_same_columns():
-    ours = times({"match_graph": 5.0, "view_graph": 1.0, "scene": 2.0}, complete=True)
-    stock = times({"features": 3.0, "match_and_verify": 2.5, "map": 1.0}, complete=True)
-
-    assert (ours["features + matches"], ours["view graph"], ours["map + BA"], ours["total"]) == (5.0, 1.0, 2.0, 8.0)
-    assert (stock["features + matches"], stock["map + BA"], stock["total"]) == (5.5, 1.0, 6.5)
-    assert times({"match_graph": 5.0}, complete=False)["total"] is None
-
-
-def test_methods_take_turns_and_other_settings_are_methods():
-    these = methods({"scene.max_init_pairs=2": {"scene": {"max_init_pairs": 2}}})
-
-    assert [method.name for method in these] == ["sfm-app", "sfm-app, scene.max_init_pairs=2", "incremental", "global"]
-    assert rotate_methods(these, 6)[0].name == "incremental"
-    assert [method.kind for method in methods({}, ours_only=True)] == ["sfm-app"]
-
-
 def test_bars_are_met_up_to_the_bound_and_misses_are_named():
     bars = (lower_bound("AUC@1", 0.8), upper_bound("rms", 0.1), upper_bound("px", "incremental"))
     others = {"incremental": {"px": 0.4}}
@@ -189,23 +170,61 @@ def test_ratios_are_taken_within_a_repetition_and_the_median_counts():
     assert "| merton1 | sfm-app | 3/3 |" in page("", rows) and "in 3 sd" in DEVIATIONS
 
 
-def test_a_run_that_failed_has_no_time():
-    failed, done = medians([*runs("sfm-app", (None,)), *runs("incremental", (10.0,))])
-
-    assert (failed["total"], failed["/ incremental"], done["/ incremental"]) == (None, None, 1.0)
-
-
-def test_equal_bytes_are_told_from_unequal_ones():
-    first, second = {"cameras.bin": "1", "images.bin": "2"}, {"cameras.bin": "1", "images.bin": "3"}
-
-    assert compare_bytes([first, first]) == "yes"
-    assert compare_bytes([first, second]) == "no: images.bin"
-    assert compare_bytes([first]) is None
+CAMERAS = (camera_matrix(700, 720, 250, 260), camera_matrix(900, 900, 300, 200))
+T = np.array([0.6, 0.0, -0.8])
+R = axis_rotation(np.array([0.0, 0.8, 0.6]), 20.0)
 
 
-def test_bars_stand_on_sets_and_columns_that_there_are():
-    measured = accuracy([Model(POSES, dict.fromkeys(POSES, K), 5, 9, 0.3)], truth(), 4)
-    known = {*measured, "worst in sd", "/ incremental"}
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_true_matrix_has_no_pose_error(sign):
+    F = sign * 3.7 * fundamental_from_pose(*CAMERAS, R, T)
 
-    assert all(bar.column in known for bars in BARS.values() for bar in bars)
-    assert {kind for title in BARS for kind, _ in steps(title.partition(" ")[2])} == {"crop", "scale", "window"}
+    assert fundamental_pose_error_deg(F, CAMERAS, R, T) < 1e-5
+    assert fundamental_pose_error_deg(F, CAMERAS, R, -5 * T) < 1e-5, "neither sign nor length of t is in F"
+
+
+@pytest.mark.parametrize("off_deg", [1.0, 7.0])
+def test_the_pose_error_is_the_larger_of_rotation_and_translation(off_deg):
+    turned = axis_rotation(T, off_deg) @ R
+    moved = axis_rotation(np.array([0.0, 1.0, 0.0]), 2 * off_deg) @ T
+
+    assert fundamental_pose_error_deg(fundamental_from_pose(*CAMERAS, turned, T), CAMERAS, R, T) == pytest.approx(
+        off_deg
+    )
+    both = fundamental_from_pose(*CAMERAS, turned, moved)
+    assert fundamental_pose_error_deg(both, CAMERAS, R, T) == pytest.approx(2 * off_deg)
+
+
+def test_no_matrix_is_lost():
+    assert fundamental_pose_error_deg(None, CAMERAS, R, T) == LOST_DEG
+    assert mean_sampson_px(None, np.zeros((1, 2)), np.zeros((1, 2))) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("errors", "area"),
+    [([0.0, 0.0], 1.0), ([180.0] * 3, 0.0), ([5.0], 0.75), ([5.0, 180.0], 0.375), ([2.0, 6.0], 0.75)],
+)
+def test_area_under_recall(errors, area):
+    # recall rises linearly from error to error
+    assert area_under_recall(np.array(errors), 10) == pytest.approx(area)
+
+
+def test_failures_are_counted_and_capped():
+    found = summary_px(np.array([0.1, 0.3, 80.0, np.inf]))
+
+    assert found == {"mean px": 0.2, "capped mean px": (0.4 + 2 * CAP_PX) / 4, "failures": 2}
+    assert summary_px(np.array([np.inf]))["mean px"] == CAP_PX
+
+
+def test_methods_take_turns_after_a_warm_up_and_bad_matrices_are_no_answer():
+    calls = []
+    answers = {"good": np.eye(3), "nan": np.full((3, 3), np.nan), "stack": np.ones((9, 3)), "none": None}
+
+    def named(name):
+        return lambda *arguments: calls.append((name, arguments[2])) or (answers[name], 7)
+
+    pairs = [make_pair(PairOptions(points=8), seed) for seed in range(2)]
+    attempts = take_turns({name: named(name) for name in answers}, pairs, seed=40)
+
+    assert calls == [(name, seed) for seed in (40, 40, 41) for name in answers]
+    assert [[attempt.F is None for attempt in tries] for tries in attempts.values()] == [[False] * 2] + [[True] * 2] * 3

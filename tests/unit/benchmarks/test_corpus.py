@@ -10,15 +10,15 @@ import pytest
 from PIL import Image
 
 import sfm_app
-from benchmarks.cameras.methods import group_by_size, methods, split_into_folders
+from benchmarks.cameras.methods import methods
 from benchmarks.cameras.score import Model, TruePhoto
 from benchmarks.common.photo_sets import photo_set, steps, stride
 from benchmarks.common.processes import run_command
 from benchmarks.corpus import command as corpus
 from benchmarks.corpus import kept_runs, tuning_sets
-from benchmarks.corpus.bars import deficits, demands, required_bars, unreported_fold
+from benchmarks.corpus.bars import demands, unreported_fold
 from benchmarks.corpus.report import corpus_page
-from benchmarks.corpus.score import Doubt, claimed_errors, fold_lines, parameter_counts, parameter_errors, walk_figures
+from benchmarks.corpus.score import Doubt, claimed_errors, parameter_counts, parameter_errors, walk_figures
 from benchmarks.corpus.trajectory import offset_errors, order_scores
 from benchmarks.corpus.tuning_sets import GROUPS, groups_table, seen_sets, unseen_rows
 from sfm_app.camera.models import camera_matrix
@@ -85,10 +85,7 @@ def left_behind(folder, before, after):
 
 
 def test_errors_are_counted_in_what_is_stated(tmp_path):
-    before, after = (
-        camera_matrix(1020.0, 1000.0, 408.0, 300.0),
-        camera_matrix(1050.0, 1005.0, 400.0, 302.0),
-    )
+    before, after = (camera_matrix(1020.0, 1000.0, 408.0, 300.0), camera_matrix(1050.0, 1005.0, 400.0, 302.0))
     truth = left_behind(tmp_path, before, (after, {"fx": 10.0, "fy": 10.0, "cx": 1.0, "cy": 1.0}))
 
     rows = parameter_errors(tmp_path, truth, Doubt(2.0, 0.5))
@@ -131,25 +128,6 @@ def test_a_fold_counts_unless_it_is_said_or_cut_into_honest_parts():
     assert [unreported_fold("oats23", row) for row in (silent, said, parts, sure)] == [1, 0, 0, 1]
     assert unreported_fold("oats23", {}) is None and unreported_fold("castle-P19", silent) is None
     assert parts["axis of the worst part"] == pytest.approx(1.0)
-
-
-def test_what_runs_say_today_is_no_word_of_folds():
-    lines = [
-        "scene       23 of 23 photos placed, 900 points, mean reprojection error 0.6 px",
-        "            mapped all at once: it places all 23 photos and next to nothing contradicts it",
-        "            11 % of the matches contradict the cameras",
-    ]
-    assert fold_lines(lines) == []
-    assert fold_lines(["  photos of look-alikes: a, b"]) == ["photos of look-alikes: a, b"]
-
-
-def test_worse_than_stock_is_said_by_how_much():
-    stock = {"registered": 24, "AUC@1": None, "AUC@5": 0.79}
-
-    assert deficits({"registered": 18, "AUC@5": 0.5}, stock) == "registered 18, stock 24; AUC@5 0.5, stock 0.79"
-    assert deficits({"registered": 24, "AUC@5": 0.79}, stock) == ""
-    assert deficits({"registered": 24, "AUC@5": 0.785}, stock, 0.01) == "" != deficits({"registered": 24}, stock, 0.01)
-    assert deficits({"registered": 23, "AUC@5": 0.9}, stock, 0.01) == "registered 23, stock 24"
 
 
 def run_row(**figures):
@@ -211,29 +189,6 @@ def test_every_so_many_photos_are_taken(tmp_path):
     assert (stride(""), stride("every:3"), steps("every:5+scale:2,2")) == (1, 3, [("scale", (2.0, 2.0))])
     with pytest.raises(ValueError):
         stride("every:0")
-
-
-def test_sets_are_found_and_the_smallest_come_first(tmp_path):
-    for name, count in (("kitchen1000", 12), ("merton1", 3), ("castle-P19", 4)):
-        photos_in(tmp_path / name / "images", count)
-    (tmp_path / "pairs").mkdir()
-
-    titles = corpus.default_titles(tmp_path)
-
-    assert titles[:3] == ["merton1", "castle-P19", "kitchen1000 every:5"]
-    assert "castle-P19 crop:460,200" in titles and not any("fountain" in title for title in titles)
-    assert all(required_bars(title) for title in ("kitchen1000 every:5", "reichstag10 pad:9,9", "oats23", "castle-P19"))
-
-
-def test_stock_gets_a_folder_for_each_size(tmp_path):
-    photos_in(tmp_path / "set", 2)
-    Image.new("RGB", (30, 40)).save(tmp_path / "set" / "0009.png")
-
-    into = split_into_folders(group_by_size(tmp_path / "set"), tmp_path / "by-size")
-
-    assert sorted(str(path.relative_to(into)) for path in into.rglob("*.png")) == [
-        "30x40/0009.png", "40x30/0000.png", "40x30/0001.png",
-    ]  # fmt: skip
 
 
 def test_what_takes_too_long_is_ended_with_all_that_it_started(tmp_path):

@@ -1,17 +1,12 @@
-import json
-
 import numpy as np
 import pytest
 from PIL import Image
 
 from benchmarks.cameras.bars import lower_bound, upper_bound
-from benchmarks.common.results import document, problems
 from benchmarks.surface.bars import BARS, bar_rows
 from benchmarks.surface.measure import cost
-from benchmarks.surface.photos import Likeness, likeness, photo_scores, psnr_db, subsample
-from benchmarks.surface.pictures import BYTES, WIDTHS_PX, save_page
+from benchmarks.surface.photos import likeness, psnr_db
 from benchmarks.surface.rendered.truth import seen_places, truth_scores
-from benchmarks.surface.report import page
 from benchmarks.surface.sets import REAL, RENDERED, SCANNED, SurfaceSet, first_photos, surface_set
 from benchmarks.surface.sparse_poisson import points_ply
 from benchmarks.surface.worker import StageCost
@@ -130,21 +125,6 @@ def test_likeness_counts_covered_pixels_alone():
     assert np.isnan(likeness(Picture(photo, covered), photo).psnr_db), "40 pixels say nothing"
 
 
-def test_the_worst_photo_stands_beside_the_mean():
-    row = photo_scores(
-        {"a": Likeness(0.9, 0.9, 0.95, 25.0), "b": Likeness(0.5, 0.7, 0.65, 21.0), "c": Likeness(0.1, 0.5, 0.2, np.nan)}
-    )
-    assert (row["coverage %"], row["worst coverage %"], row["coverage of not black %"]) == (50.0, 10.0, 60.0)
-    assert (row["PSNR dB"], row["worst PSNR dB"], row["not black %"]) == (23.0, 21.0, 70.0)
-    assert photo_scores({"c": Likeness(0.0, 0.0, 0.0, np.nan)})["PSNR dB"] is None
-
-
-def test_photos_to_leave_out_are_spread_evenly():
-    names = [f"{k}" for k in range(11)]
-    assert subsample(names, 1) == ["5"] and subsample(names, 3) == ["2", "5", "8"]
-    assert subsample(names, 11) == subsample(names, 20) == names
-
-
 def test_cost_is_that_of_all_stages_but_the_files():
     said = {
         "scene": StageCost("", 50.0, 900), "depth_maps": StageCost("", 10.0, 500), "mesh": StageCost("", 7.5, 700),
@@ -171,20 +151,6 @@ def test_every_set_has_its_bars_and_they_are_judged_both_ways():
     assert [row["met"] for row in late if "seconds" in row["asked"]] == ["**no**"]
 
 
-def test_the_page_and_the_document_hold_what_was_measured(tmp_path):
-    rows = [
-        {"photos": "statue", "method": "sfm-app", "failed": "", "placed": 22, "accuracy %": 95.0, "completeness %": 91,
-         "seconds together": 80.0, "s of mesh": 20.0, "MB mesh": 900},
-        {"photos": "kermit11", "method": "sfm-app", "failed": "mesh: no surface", "seconds together": None},
-    ]  # fmt: skip
-    parts = [{"photos": "pond first 3", "failed": "", "seconds per photo": 4.25, "s of texture": 7.75}]
-    text = page("About.", rows, parts, {"statue": "surface-statue.png"})
-    assert "| pond first 3 | 4.25 | 7.75 |" in text
-    assert "| statue | accuracy % at least 90 | 95 | yes |" in text and "mesh: no surface" in text
-    assert "![statue](surface-statue.png)" in text and "surface-kermit11.png" not in text
-    assert not problems(json.loads(json.dumps(document("surface", "About.", {}, {}, rows))))
-
-
 def test_sets_are_rendered_scenes_or_folders_and_parts_are_the_same_files(tmp_path):
     images = tmp_path / "data" / "pond" / "images"
     images.mkdir(parents=True)
@@ -201,21 +167,6 @@ def test_sets_are_rendered_scenes_or_folders_and_parts_are_the_same_files(tmp_pa
     )
     with pytest.raises(ValueError, match="'lake' is neither"):
         surface_set("lake", tmp_path / "data", tmp_path)
-
-
-def test_pages_of_pictures_stay_small_and_keep_their_colors(tmp_path):
-    noise = np.random.default_rng(0).integers(0, 256, (700, 2000, 3)).astype(np.uint8)
-    plain = np.zeros((900, 2000, 3), np.uint8)
-    plain[:, :1000], plain[:, 1000:] = (200, 40, 90), (30, 160, 220)
-    plain[800:, :200] = 255
-    save_page(noise, tmp_path / "noise.png")
-    save_page(plain, tmp_path / "plain.png")
-    with Image.open(tmp_path / "noise.png") as narrow, Image.open(tmp_path / "plain.png") as wide:
-        assert narrow.width < wide.width == WIDTHS_PX[0] and wide.height == 720
-        assert wide.convert("RGB").getpixel((10, 10)) == (200, 40, 90)
-        assert wide.convert("RGB").getpixel((1500, 700)) == (30, 160, 220)
-        assert wide.convert("RGB").getpixel((10, 700)) == (255, 255, 255)
-    assert (tmp_path / "plain.png").stat().st_size <= BYTES
 
 
 def test_points_are_written_as_colmap_reads_them(tmp_path):

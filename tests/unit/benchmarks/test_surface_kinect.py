@@ -16,7 +16,6 @@ from benchmarks.surface.depth_camera.kinect import (
     within_reach,
 )
 from benchmarks.surface.depth_camera.scan import PATCH, Scan, align
-from benchmarks.surface.report import page
 from benchmarks.surface.sets import SCANNED, surface_set
 from sfm_app.geometry.poses import Similarity
 from sfm_app.synthetic.cameras import Camera, axis_rotation, camera_center, look_at
@@ -266,9 +265,3 @@ def test_a_scanned_set_is_every_fifth_photo_and_has_its_bars(tmp_path):
     assert set(SCANNED) <= set(BARS)
     judged = bar_rows([{"photos": "kitchen1000", "accuracy 3 cm %": 80.0, "completeness 5 cm %": 69.9}])
     assert [row["met"] for row in judged] == ["yes", "**no**"]
-
-
-def test_the_page_has_a_row_for_each_alignment():
-    row = {"photos": "kitchen1000", "failed": "", "accuracy 3 cm %": 71.0, "ICP: accuracy 3 cm %": 83.0}
-    text = page("About.", [row], [], {})
-    assert "| kitchen1000 | cameras | 71 |" in text and "| kitchen1000 | cameras, then ICP | 83 |" in text

@@ -12,7 +12,6 @@ from benchmarks.synthetic.trouble import (
     PHOTOS,
     apply_motion_blur,
     cam_from_thing,
-    fade_colors,
     moving_thing,
     repeated_things,
     troubled_folder,
@@ -20,7 +19,6 @@ from benchmarks.synthetic.trouble import (
     with_zoom,
     write_troubled_folder,
 )
-from sfm_app.errors import InputError
 from sfm_app.synthetic.cameras import Views, camera_center, make_camera, pixel_rays
 from sfm_app.synthetic.shapes import Body
 
@@ -157,17 +155,6 @@ def test_what_moves_is_seen_elsewhere_and_the_rest_stays(tmp_path):
 
 
 @pytest.mark.slow
-def test_faded_scenes_show_less(tmp_path):
-    plan = small(plan_with("plane"), photos=1)
-    plan = replace(plan, spoiling=replace(plan.spoiling, blur_px={}, defocus_px={}, thing=None))
-    pale = replace(plan, scene=fade_colors(plan.scene, 0.1))
-
-    rich, poor = (written(p, tmp_path / str(k))["view_00.jpg"] for k, p in enumerate((plan, pale)))
-
-    assert np.abs(np.diff(poor, axis=1)).mean() < 0.6 * np.abs(np.diff(rich, axis=1)).mean()
-
-
-@pytest.mark.slow
 def test_the_folder_is_rendered_alike_twice_and_a_thing_stands_on_its_foot(tmp_path):
     plan = small(plan_with("motion blur"))
     write_troubled_folder(tmp_path / "a", plan)
@@ -178,10 +165,3 @@ def test_the_folder_is_rendered_alike_twice_and_a_thing_stands_on_its_foot(tmp_p
     assert len(list((tmp_path / "a").iterdir())) == 2
     bodies = moving_thing(np.random.default_rng(1))
     assert all(isinstance(body, Body) for body in bodies) and min(b.shape.vertices[:, 1].min() for b in bodies) == 0.0
-
-
-@pytest.mark.slow
-def test_a_folder_that_cannot_be_written_is_said(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot write photos"):
-        write_troubled_folder(tmp_path / "file", small(plans()[0], photos=1))

@@ -78,11 +78,3 @@ def test_only_a_scene_or_a_reason_why_there_is_none_is_expected(code, fails):
 
     assert (met(rows)[0] == "no") is fails
     assert ("unexpected ValueError" in trouble.page(rows)) is fails
-
-
-def test_every_trouble_has_a_line_of_its_own():
-    rows = [folder_row(), folder_row(2, troubles="zoom", wrong=1), folder_row(3, troubles="none")]
-
-    found = {row["trouble"]: (row["folders"], row["K wrong"]) for row in trouble.trouble_rows(rows)}
-
-    assert found == {"all": (3, 1), "none": (1, 0), "plane": (1, 0), "zoom": (2, 1)}

@@ -95,10 +95,3 @@ def test_normals_that_look_at_no_camera_count(cloud, ball):
     vertices = ball.surface.vertices
     assert viewers.facing_share(vertices, vertices, cloud.cameras) == pytest.approx(0.6, abs=0.15)
     assert viewers.facing_share(vertices, vertices, ()) == 0
-
-
-def test_a_page_has_both_tables_and_the_pictures_that_were_drawn(tmp_path):
-    rows = [viewers.check_model(subject(viewers.sample_model(), tmp_path), SILENT)]
-
-    assert viewers.markdown(rows).count("| sample |") == 2 and ".png" not in viewers.markdown(rows)
-    assert viewers.markdown(rows, ["sample"]).endswith("\n\n![sample](viewers-sample.png)\n")

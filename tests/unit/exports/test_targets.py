@@ -44,8 +44,7 @@ def test_a_folder_tells_how_many_files_it_has(make_run):
 
 
 @pytest.mark.parametrize(
-    ("target", "written"),
-    [("c.json", "c.json"), ("cloud.laz", "cloud.laz"), ("new/CLOUD.LAZ", "new/CLOUD.LAZ")],
+    ("target", "written"), [("c.json", "c.json"), ("cloud.laz", "cloud.laz"), ("new/CLOUD.LAZ", "new/CLOUD.LAZ")]
 )
 def test_the_suffix_says_which_format(make_run, tmp_path, target, written):
     result = call(make_run().out, "-o", tmp_path / target)

@@ -1,14 +1,17 @@
 """The parts of the chapter 5 benchmark that do not take minutes."""
 
+import json
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
 import pytest
 
+from benchmarks.common.results import RESULTS, document, problems
+from benchmarks.thesis.chapter4 import claims
 from benchmarks.thesis.chapter5 import contests, setups, sweep_claims, tables
 from benchmarks.thesis.chapter5.bounds import full_bound, gap, reduced_bound
-from benchmarks.thesis.chapter5.command import ORDERED_PARTS, PARTS, TEST_LIMITS, parse_test_limit
+from benchmarks.thesis.chapter5.command import TEST_LIMITS, parse_test_limit
 from benchmarks.thesis.chapter5.contests import (
     CAP_PERCENT,
     NON_ROBUST,
@@ -17,7 +20,6 @@ from benchmarks.thesis.chapter5.contests import (
     answered_K,
     e_center,
     e_focal,
-    run_contest,
     summary,
 )
 from benchmarks.thesis.chapter5.fits import Fit, fit_to_all, robust_fits, with_outlying_fits
@@ -31,9 +33,9 @@ from benchmarks.thesis.chapter5.sequences import (
 )
 from benchmarks.thesis.chapter5.setups import Trial
 from benchmarks.thesis.chapter5.slices import SCALES, focal_slice
-from benchmarks.thesis.chapter5.sweep_claims import CLAIMS, CurveClaim, check_levels, judge_claims
-from benchmarks.thesis.chapter5.sweeps import FIGURES
+from benchmarks.thesis.chapter5.sweep_claims import CurveClaim, check_levels, judge_claims
 from benchmarks.thesis.chapter5.zero_curve_plots import SIGMA, support
+from benchmarks.thesis.corners import load_corners
 from sfm_app.camera.models import camera_matrix
 from sfm_app.geometry.epipolar import sampson_distance
 from sfm_app.selfcal.thesis.constraint_forms import essential
@@ -113,12 +115,6 @@ def test_a_seed_keeps_its_clean_matrices_over_all_levels(experiment):
         assert np.array_equal(trial.K, first.K)
 
 
-def test_the_longer_focal_is_the_last_frames(tracks):
-    trials = list(setups.focal_deviation(0))
-    assert [round(trial.x) for trial in trials] == [0, 10, 20, 30, 40, 50]
-    assert all(np.array_equal(trial.K, tracks.K[0]) for trial in trials[:2])
-
-
 def test_raw_matches_replace_as_many_matrices_as_asked(tracks):
     spoilt = dict(pair_matches(tracks, dict.fromkeys(tracks.pairs, 0.2), seed=1))
     sequence = ImageSequence("none", tracks.size, tracks.K, spoilt, {})
@@ -163,16 +159,6 @@ def two_levels(seed, tracks):
         yield Trial(x + 0 * seed, fits, tracks.size, tracks.K[0])
 
 
-def test_a_contest_has_a_row_per_method_and_level_and_its_own_number_of_tests(tracks):
-    with ThreadPoolExecutor(1) as pool:
-        rows = run_contest(partial(two_levels, tracks=tracks), {NON_ROBUST: 2, "kruppa": 1}, 0, pool, "two levels")
-
-    assert [(row["method"], row["x"], row["tests"]) for row in rows] == [
-        (NON_ROBUST, 0.0, 2), (NON_ROBUST, 1.0, 2), ("kruppa", 0.0, 1), ("kruppa", 1.0, 1),
-    ]  # fmt: skip
-    assert all(row["e_focal"] < 0.1 and row["answered"] == 1.0 for row in rows), "the matrices are exact"
-
-
 @pytest.mark.parametrize(
     ("said", "own", "others", "expected"),
     [
@@ -189,19 +175,6 @@ def test_a_contest_has_a_row_per_method_and_level_and_its_own_number_of_tests(tr
 )
 def test_sentences_are_judged(said, own, others, expected):
     assert check_levels(said, own, others) == expected
-
-
-def test_an_unknown_kind_of_sentence_is_no_claim():
-    with pytest.raises(ValueError, match="no such kind"):
-        check_levels(CurveClaim("", "", "better", "a"), [1.0])
-
-
-def test_every_sentence_is_about_a_plot_that_shows_its_methods():
-    plots = {plot.part: plot for several in FIGURES.values() for plot in several}
-    for said in CLAIMS:
-        assert {said.method, *said.others} <= set(plots[said.part].methods), said.says
-        assert said.column == plots[said.part].column, said.says
-        assert hasattr(setups, plots[said.part].experiment)
 
 
 def test_claims_take_their_levels_and_say_what_is_missing():
@@ -269,11 +242,6 @@ def test_support_is_highest_where_curves_meet():
     assert scores[0, 10] == pytest.approx(2 + np.exp(-1.5 / SIGMA))
 
 
-def test_every_figure_of_the_issue_is_drawn():
-    asked = {f"5.{n}" for n in (1, 2, 3, 5, 6, 9, 10, 11, 12, *range(14, 23))} | {"5.7-5.8", "tables"}
-    assert asked <= set(PARTS) == set(ORDERED_PARTS) and ORDERED_PARTS[0] == "5.1" and ORDERED_PARTS[-1] == "tables"
-
-
 def test_slow_methods_have_fewer_tests(tmp_path, tracks, monkeypatch):
     monkeypatch.setattr(setups, "two_levels", partial(two_levels, tracks=tracks), raising=False)
     setups.two_levels.__name__ = "two_levels"
@@ -285,3 +253,78 @@ def test_slow_methods_have_fewer_tests(tmp_path, tracks, monkeypatch):
     assert {row["method"]: row["tests"] for row in rows} == {NON_ROBUST: 2, "kruppa": 1}
     assert lab.test_limits_text == "at most 1 of `kruppa`"
     assert parse_test_limit("kruppa=3") == ("kruppa", 3) and dict(TEST_LIMITS).keys() <= set(contests.METHODS)
+
+
+ROWS = [{"method": "a", "outliers": 0.1, "ms": 1.5}, {"method": "a", "outliers": 0.7, "ms": None}]
+
+
+def test_a_document_says_all_that_is_promised():
+    found = document("task", "about", {"seed": 0}, {"pairs": 2}, ROWS)
+
+    assert problems(found) == []
+    assert {"numpy", "numba", "pycolmap"} <= set(found["versions"])
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"rows": []}, "there are no rows"),
+        ({"rows": [{"ms": 1}]}, "row 0 names no method"),
+        ({"rows": [{"method": "a", "ms": [1]}]}, "row 0 holds more than text and numbers"),
+        ({"versions": None}, "versions is not dict"),
+        ({"extra": 1}, "unknown key extra"),
+    ],
+)
+def test_a_wrong_document_is_told(change, problem):
+    assert problems(document("task", "about", {}, {}, ROWS) | change) == [problem]
+
+
+def test_published_results_follow_the_schema():
+    names = ("fundamental-*", "cameras*", "chapter?", "viewers", "corpus*", "trouble*")
+    published = [path for name in names for path in RESULTS.glob(f"{name}.json")]
+
+    assert {path.name: problems(json.loads(path.read_text("utf-8"))) for path in published} == {
+        path.name: [] for path in published
+    }
+
+
+def swept(**times):
+    """Rows in which an estimator takes so many ms at 10 % and 70 %; its error is a tenth of that."""
+    return [
+        {"method": name, "outliers": level, claims.TIME: ms, claims.ERROR: ms / 10, claims.TRIALS: ms}
+        for name, both in times.items()
+        for level, ms in zip((0.1, 0.7), both, strict=True)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("ransac", "verdict"), [((10, 100), "holds"), ((2, 100), "holds in part"), ((2, 4), "does not hold")]
+)
+def test_a_claim_is_judged_level_by_level(ransac, verdict):
+    rows = swept(**{"ransac": ransac, "lev-ransac-thesis": (2, 4)})
+    found = {claim.says: claim for claim in claims.claims_of_sweep(rows)}
+
+    assert found["LEV-RANSAC is over three times as fast as RANSAC"].verdict == verdict
+    assert found["LEV-RANSAC is faster than all others"].verdict == "not measured"
+    assert "msac" in found["LEV-RANSAC is faster than all others"].numbers
+
+
+def test_steady_means_hardly_growing_while_the_other_does():
+    def verdict(lev, ransac):
+        rows = swept(**{"ransac": ransac, "lev-ransac-thesis": lev})
+        return next(c.verdict for c in claims.claims_of_sweep(rows) if "is steady" in c.says)
+
+    assert verdict((2, 4), (2, 400)) == "holds"
+    assert verdict((2, 4), (2, 6)) == "holds in part"
+    assert verdict((2, 40), (2, 60)) == "does not hold"
+
+
+def test_corners_are_paired_by_the_points_they_show(tmp_path):
+    (tmp_path / "001.corners").write_text("1 2\n3 4\n5 6\n")
+    (tmp_path / "002.corners").write_text("10 20\n30 40\n")
+    (tmp_path / "nview-corners").write_text("2 0 *\n0 * 1\n* 1 1\n1 1 *\n")
+
+    x1, x2 = load_corners(tmp_path, 1, 2)
+
+    assert x1.tolist() == [[5, 6], [3, 4]] and x2.tolist() == [[10, 20], [30, 40]]
