@@ -136,12 +136,7 @@ def is_parameters(cell):
 
 
 def execute(name, **changed):
-    """Run the code of a notebook in one namespace, and return it; what a cell ends with is shown as Jupyter would.
-
-    Args:
-        name: of the file, without suffix.
-        changed: in place of the values in the cell with the parameters.
-    """
+    """Run a notebook in one namespace, with other parameters, and return it; show what a cell ends with as Jupyter."""
     path, names = EXAMPLES / "notebooks" / f"{name}.ipynb", {"__name__": "__main__"}
     for number, cell in enumerate(cells(path, "code")):
         tree = ast.parse(cell["source"])

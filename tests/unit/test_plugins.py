@@ -41,22 +41,17 @@ def test_an_unknown_name_lists_the_known_ones():
     assert "lev-ransac" in caught.value.hint
 
 
-def test_a_clash_of_names_is_refused():
-    @hookimpl
-    def clash():
-        return [Estimator("msac", never)]
-
-    with pytest.raises(PluginError, match="two plug-ins offer 'msac'"):
-        load_plugins([plugin(sfm_estimators=clash)], installed=False)
+@hookimpl
+def clash():
+    return [Estimator("msac", never)]
 
 
-def test_a_misspelt_hook_is_refused():
-    @hookimpl
-    def sfm_estimator():
-        return []
-
-    with pytest.raises(PluginError, match="sfm_estimator"):
-        load_plugins([plugin(sfm_estimator=sfm_estimator)], installed=False)
+@pytest.mark.parametrize(
+    ("hook", "says"), [("sfm_estimators", "two plug-ins offer 'msac'"), ("sfm_estimator", "sfm_estimator")]
+)
+def test_a_clash_of_names_and_a_misspelt_hook_are_refused(hook, says):
+    with pytest.raises(PluginError, match=says):
+        load_plugins([plugin(**{hook: clash})], installed=False)
 
 
 @pytest.fixture

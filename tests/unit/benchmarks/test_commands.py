@@ -1,6 +1,5 @@
 """Every benchmark is a command: `python -m benchmarks.SUBJECT`."""
 
-import argparse
 import importlib
 import os
 import re
@@ -16,7 +15,7 @@ import benchmarks
 from benchmarks.anywhere import wheels
 from benchmarks.anywhere.dockerfile import read_stages
 from benchmarks.anywhere.pythons import find_pythons, minor_versions
-from benchmarks.common.command_line import add_rendered, add_seeds, ensure_single_thread
+from benchmarks.common.command_line import ensure_single_thread
 from benchmarks.common.processes import environment, module_command
 from benchmarks.hundred.command import cpu_s, held_mb
 from benchmarks.sensitivity.constants import ROOMS, Constant, constants, install, is_compiled, scale
@@ -27,6 +26,7 @@ SHARED = (
     "benchmarks.common",
     "benchmarks.surface.depth_camera",
     "benchmarks.surface.rendered",
+    "benchmarks.synthetic",
     "benchmarks.thesis",
 )
 """Packages that are no command."""
@@ -69,22 +69,6 @@ def test_a_worker_is_found_from_anywhere_and_brings_nothing_but_itself(worker, t
     done = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False)
 
     assert done.stdout.strip() == "set()", done.stderr
-
-
-def test_shared_options_keep_the_defaults_of_their_command():
-    rendered, drawn = argparse.ArgumentParser(), argparse.ArgumentParser()
-    add_rendered(rendered, ["statue", "facade"])
-    add_seeds(drawn, 5, "lens-models")
-
-    every, one = (rendered.parse_args(["--cache", "c", *line]) for line in ([], ["--scenes", "facade", "--ours-only"]))
-    few = drawn.parse_args(["--first-seed", "7"])
-
-    assert (every.cache, every.scenes, every.seed, every.ours_only) == (Path("c"), ["statue", "facade"], 0, False)
-    assert (one.scenes, one.ours_only) == (["facade"], True)
-    assert (few.seeds, few.first_seed, few.name) == (5, 7, "lens-models")
-    assert every.results == few.results == PACKAGE / "results"
-    with pytest.raises(SystemExit):
-        rendered.parse_args(["--cache", "c", "--scenes", "corner"])
 
 
 def test_a_command_starts_anew_as_it_was_called(monkeypatch):

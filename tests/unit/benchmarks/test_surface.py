@@ -2,15 +2,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.cameras.bars import lower_bound, upper_bound
-from benchmarks.surface.bars import BARS, bar_rows
 from benchmarks.surface.measure import cost
 from benchmarks.surface.photos import likeness, psnr_db
 from benchmarks.surface.rendered.truth import seen_places, truth_scores
-from benchmarks.surface.sets import REAL, RENDERED, SCANNED, SurfaceSet, first_photos, surface_set
+from benchmarks.surface.sets import SurfaceSet, first_photos, surface_set
 from benchmarks.surface.sparse_poisson import points_ply
 from benchmarks.surface.worker import StageCost
-from benchmarks.synthetic.scenes import WALKS
 from sfm_app.geometry.poses import Similarity
 from sfm_app.synthetic.cameras import Views, axis_rotation, look_at, make_camera
 from sfm_app.synthetic.photo_folder import Truth
@@ -137,18 +134,6 @@ def test_cost_is_that_of_all_stages_but_the_files():
     assert row["MB mesh"] == 700 and row["s of files"] == 1.0 and row["failed"] == ""
     stopped = cost({"scene": StageCost("", 50.0, 900), "depth_maps": StageCost("depth_maps: no", None, 100)})
     assert stopped["failed"] == "depth_maps: no" and stopped["seconds together"] is None
-
-
-def test_every_set_has_its_bars_and_they_are_judged_both_ways():
-    assert set(BARS) == {*RENDERED, *REAL, *SCANNED} and set(RENDERED) <= set(WALKS)
-    assert BARS["statue"] == (lower_bound("accuracy %", 90.0), lower_bound("completeness %", 85.0))
-    assert upper_bound("seconds together", 90.0) in BARS["fountain-P11"]
-    assert lower_bound("worst coverage %", 75.0) in BARS["Herz-Jesus-P8"]
-    assert lower_bound("worst coverage %", 50.0) in BARS["castle-P19"]
-    rows = bar_rows([{"photos": "statue", "accuracy %": 90.0, "completeness %": 84.9}, {"photos": "corner"}])
-    assert [row["met"] for row in rows] == ["yes", "**no**", "not measured", "not measured"]
-    late = bar_rows([{"photos": "fountain-P11", "seconds together": 90.1}])
-    assert [row["met"] for row in late if "seconds" in row["asked"]] == ["**no**"]
 
 
 def test_sets_are_rendered_scenes_or_folders_and_parts_are_the_same_files(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.synthetic.detail_scenes import HIGH, WIDTH, carving, pebbles, relief, straight, tree, tube
 from benchmarks.synthetic.houses import DEPTH_M
-from benchmarks.synthetic.scenes import PLASTER, SCENES, build_scene, corner, scene_views
+from benchmarks.synthetic.scenes import PLASTER, build_scene, corner, scene_views
 from benchmarks.synthetic.town import (
     BLOCK_M,
     COPIES,
@@ -24,17 +24,10 @@ from benchmarks.synthetic.town import (
     town_views,
     walk_town,
 )
-from sfm_app.errors import ConfigError
 from sfm_app.synthetic.cameras import Camera, camera_center, look_at, make_camera, pixel_rays
 from sfm_app.synthetic.render import GAMMA, cast_rays, prepare, ray_caster, render_scene
 from sfm_app.synthetic.shapes import SyntheticScene
 from tests.unit.synthetic.test_shapes import signed_volume
-
-
-@pytest.mark.slow
-def test_a_poster_is_flat_and_all_scenes_have_their_names():
-    assert np.ptp(build_scene("poster").vertices[:, 2]) < 0.2
-    assert [build_scene(name).name for name in SCENES] == list(SCENES)
 
 
 @pytest.mark.parametrize("name", ["courtyard", "heap"])
@@ -47,31 +40,6 @@ def test_scenes_are_sound_and_not_planar(name):
     assert faces.min() == 0 and faces.max() == len(vertices) - 1
     assert np.isfinite(vertices).all() and 20_000 < len(vertices) < 200_000
     assert spread[2] / spread[0] > 0.2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["statue", "facade", "corner"])
-def test_photos_look_at_their_scene_from_outside_of_it(name):
-    scene, views = build_scene(name), scene_views(name)
-    caster = ray_caster(scene.vertices, scene.faces)
-    assert scene.name == name and 12 <= len(views.cameras) <= 24
-    for photo, pose in views.cam_from_world.items():
-        camera = views.cameras[photo]
-        assert 1000 <= max(camera.width, camera.height) <= 1200
-        coarse = type(camera)(np.diag([0.05, 0.05, 1.0]) @ camera.K, camera.width // 20, camera.height // 20)
-        hits = cast_rays(caster, camera_center(pose), pixel_rays(coarse) @ pose[:, :3])
-        depth = hits["t_hit"][np.isfinite(hits["t_hit"])]
-        assert 0.35 < np.isfinite(hits["t_hit"]).mean() <= 1.0, "the scene fills a good part of every photo"
-        assert depth.min() > 0.5, "nobody stands in a wall"
-
-
-@pytest.mark.slow
-def test_the_statue_is_seen_all_round_and_the_facade_from_the_street():
-    eyes = np.array([camera_center(pose) for pose in scene_views("statue").cam_from_world.values()])
-    around = np.sort(np.degrees(np.arctan2(eyes[:, 0], eyes[:, 2])))
-    assert max(np.diff(around).max(), 360 - np.ptp(around)) < 25
-    along = np.array([camera_center(pose) for pose in scene_views("facade").cam_from_world.values()])
-    assert np.ptp(along[:, 0]) > 7 and along[:, 2].min() > 5 and np.all(np.diff(along[:, 0]) > 0)
 
 
 @pytest.mark.slow
@@ -93,6 +61,27 @@ def test_the_plain_wall_is_plain_but_not_even():
     assert 0.05 < steps[plain] < 1.5 < 3.0 < steps[plain + 1]
 
 
+SCENE_PHOTOS = [
+    ("statue", (0.0, 0.65)), ("facade", (0.0, 0.65)), ("corner", (0.0, 0.65)), ("ornament", (0.0, 0.5)),
+    ("railing", (0.05, 0.6)), ("garden", (0.05, 0.6)),
+]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "sky"), SCENE_PHOTOS)
+def test_photos_look_at_their_scene_from_outside_of_it_and_see_as_much_sky_as_they_should(name, sky):
+    scene, views = build_scene(name), scene_views(name)
+    caster = ray_caster(scene.vertices, scene.faces)
+    assert scene.name == name and 12 <= len(views.cameras) <= 24
+    for photo, pose in views.cam_from_world.items():
+        camera = views.cameras[photo]
+        assert 1000 <= max(camera.width, camera.height) <= 1200
+        coarse = Camera(np.diag([0.05, 0.05, 1.0]) @ camera.K, camera.width // 20, camera.height // 20)
+        hits = cast_rays(caster, camera_center(pose), pixel_rays(coarse) @ pose[:, :3])["t_hit"]
+        assert sky[0] <= np.mean(~np.isfinite(hits)) <= sky[1]
+        assert hits.min() > 0.5, "nobody stands in a wall or a tree"
+
+
 SIZE = 4.0
 """Approximate size of these scenes."""
 
@@ -106,17 +95,6 @@ def test_a_tube_is_closed_and_has_the_volume_of_a_cylinder(end):
     edges = np.concatenate([shape.faces[:, [0, 1]], shape.faces[:, [1, 2]], shape.faces[:, [2, 0]]])
     assert {tuple(edge) for edge in edges} == {tuple(edge[::-1]) for edge in edges}
     assert np.linalg.norm(shape.normals, axis=1) == pytest.approx(1.0)
-
-
-@pytest.mark.slow
-def test_a_bent_tube_keeps_its_radius():
-    angle = np.linspace(0.0, 4.0, 80)
-    line = np.column_stack([np.cos(angle), np.sin(angle), 0.2 * angle, np.full(80, 0.03)])
-
-    rings = tube(line, segments=12).vertices[:-2].reshape(80, 12, 3)
-
-    assert np.linalg.norm(rings - line[:, None, :3], axis=2) == pytest.approx(0.03)
-    assert np.linalg.norm(np.diff(rings, axis=0), axis=2).max() < 0.09, "it is not twisted"
 
 
 @pytest.mark.slow
@@ -164,20 +142,6 @@ def test_a_tree_forks_down_to_twigs():
     starts = {tuple(line[0, :3].round(9)) for line in lines[1:]}
     assert starts <= {tuple(line[-1, :3].round(9)) for line in lines}
     assert all(np.array_equal(a, b) for a, b in zip(lines, tree((0.0, 0.0, 0.0), 2.0, seed=4), strict=True))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "sky"), [("ornament", (0.0, 0.5)), ("railing", (0.05, 0.6)), ("garden", (0.05, 0.6))])
-def test_photos_look_at_their_scene_and_see_as_much_sky_as_they_should(name, sky):
-    scene, views = build_scene(name), scene_views(name)
-    caster = ray_caster(scene.vertices, scene.faces)
-    assert scene.name == name and 14 <= len(views.cameras) <= 18
-    for photo, pose in views.cam_from_world.items():
-        camera = views.cameras[photo]
-        coarse = Camera(np.diag([0.05, 0.05, 1.0]) @ camera.K, camera.width // 20, camera.height // 20)
-        hits = cast_rays(caster, camera_center(pose), pixel_rays(coarse) @ pose[:, :3])["t_hit"]
-        assert sky[0] <= np.mean(~np.isfinite(hits)) <= sky[1]
-        assert hits.min() > 1.0, "nobody stands in a tree"
 
 
 PLACES = [
@@ -308,10 +272,3 @@ def test_every_photo_sees_many_things_and_shares_them_with_the_next(small_town):
         x = (points @ pose[:, :3].T + pose[:, 3]) @ camera.K.T
         inside = (x[:, 2] > 0) & np.all((x[:, :2] > 0) & (x[:, :2] < x[:, 2:] * (camera.width, camera.height)), axis=1)
         assert inside.mean() > 0.25
-
-
-def test_impossible_towns_are_refused():
-    with pytest.raises(ConfigError, match="photos, step_m or look_alikes"):
-        TownPhotos(look_alikes=2.0)
-    with pytest.raises(ConfigError, match="blocks or look_alikes"):
-        town(0)

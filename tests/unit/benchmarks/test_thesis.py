@@ -26,7 +26,6 @@ from benchmarks.thesis.chapter5.fits import Fit, fit_to_all, robust_fits, with_o
 from benchmarks.thesis.chapter5.lab import Lab
 from benchmarks.thesis.chapter5.panels import Panel, minimum_x, panel_rows
 from benchmarks.thesis.chapter5.sequences import (
-    ImageSequence,
     camera_matrix_from_projection,
     corner_sequence,
     fundamental_from_projections,
@@ -113,15 +112,6 @@ def test_a_seed_keeps_its_clean_matrices_over_all_levels(experiment):
         same = [name for name in first.fits if trial.fits[name] is first.fits[name]]
         assert len(same) >= (8 if experiment is setups.matching_outliers else 10 - trial.x)
         assert np.array_equal(trial.K, first.K)
-
-
-def test_raw_matches_replace_as_many_matrices_as_asked(tracks):
-    spoilt = dict(pair_matches(tracks, dict.fromkeys(tracks.pairs, 0.2), seed=1))
-    sequence = ImageSequence("none", tracks.size, tracks.K, spoilt, {})
-
-    counts = [sum(len(fit.matches) == 200 for fit in t.fits.values()) for t in setups.raw_pairs(sequence, 0)]
-
-    assert counts == [0, 3, 6, 9, 10]
 
 
 def test_errors_are_those_of_section_5_5_3():

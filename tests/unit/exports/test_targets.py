@@ -73,13 +73,6 @@ def test_a_run_until_the_scene_has_no_dense_cloud(make_run, name):
     assert not list(run.out.glob("cloud*"))
 
 
-@pytest.mark.parametrize("name", SCENE_EXPORTERS)
-def test_a_folder_without_a_run_is_left_alone(tmp_path, name):
-    result = call(tmp_path, "--format", name)
-    assert (result.exit_code, "holds no run" in result.stderr) == (3, True)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_an_export_replaces_an_earlier_one_and_nothing_else(make_run):
     run = make_run("pinhole")
     folder = sfm_app.export_scene(run.out, "colmap")
@@ -169,25 +162,19 @@ def test_a_missing_package_is_named_with_how_to_install_it(make_run, monkeypatch
     assert "hint: pip install 'sfm-app[export]'" in result.stderr
 
 
-def test_a_plug_in_may_bring_a_format_for_scenes(make_run, tmp_path):
-    class Plugin:
-        @hookimpl
-        def sfm_scene_exporters(self):
-            return [SceneExporter("centers", lambda scene, target: target.write_text(str(len(scene.scene.registered))))]
+class Plugin:
+    def __init__(self, name):
+        self.name = name
 
-    found = load_plugins([Plugin()], installed=False)
-
-    assert list(found.scene_exporters) == [*SCENE_EXPORTERS, "centers"]
+    @hookimpl
+    def sfm_scene_exporters(self):
+        return [SceneExporter(self.name, lambda *_: None)]
 
 
-def test_a_name_belongs_to_one_format_only():
-    class Plugin:
-        @hookimpl
-        def sfm_scene_exporters(self):
-            return [SceneExporter("ply", lambda *_: None)]
-
+def test_a_plug_in_may_bring_a_format_for_scenes_under_a_name_of_its_own():
+    assert list(load_plugins([Plugin("centers")], installed=False).scene_exporters) == [*SCENE_EXPORTERS, "centers"]
     with pytest.raises(sfm_app.PluginError, match="two plug-ins offer 'ply'"):
-        load_plugins([Plugin()], installed=False)
+        load_plugins([Plugin("ply")], installed=False)
 
 
 def test_names_are_plain_and_all_different():
@@ -277,8 +264,9 @@ def test_a_run_without_a_scene_has_no_points_either(tmp_path):
 
 
 @pytest.mark.parametrize("place", [".", "nowhere"])
-def test_a_folder_that_is_no_run_is_refused(tmp_path, place):
-    result = call(tmp_path / place, "--format", "ply")
+@pytest.mark.parametrize("name", [*SCENE_EXPORTERS, "ply"])
+def test_a_folder_that_is_no_run_is_refused_and_left_alone(tmp_path, name, place):
+    result = call(tmp_path / place, "--format", name)
     assert (result.exit_code, "holds no run" in result.stderr) == (3, True)
     assert list(tmp_path.iterdir()) == []
 

@@ -4,7 +4,6 @@ import json
 import struct
 
 import numpy as np
-import pytest
 import trimesh
 
 from sfm_app.formats.draco import DRACO, write_draco
@@ -75,7 +74,5 @@ def test_colors_of_vertices_keep_sixteen_bits(ball, tmp_path):
     np.testing.assert_allclose(np.asarray(color["data"])[at] / 65535, linear_colors(ball.surface.colors), atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["cloud"])
-def test_points_are_those_of_a_plain_file(request, kind):
-    model = request.getfixturevalue(kind)
-    assert write_draco(model, "points") == write_glb(model, "points")
+def test_points_are_those_of_a_plain_file(cloud):
+    assert write_draco(cloud, "points") == write_glb(cloud, "points")
