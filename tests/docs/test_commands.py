@@ -117,24 +117,17 @@ def test_what_cannot_be_typed_is_found(words, says):
         check_ours(words)
 
 
-pytestmark = pytest.mark.slow
-
 COMMANDS = (
-    ("run photos -o out", "model.glb"),
-    ("run photos -o out --until scene --json", '"photos"'),
-    ("calibrate photos -o out --figure camera.png", "px"),
-    ("export out --format obj", "model.obj"),
-    ("export out --format colmap", "colmap"),
-    ("export out --format splat", "splat"),
-    ("export out --points -o scene.ply", "scene.ply"),
-    ("measure out 0,0,0 1,0,0", "+-"),
-    ("report out", "report.html"),
-    ("markers 50mm -o markers.pdf", "markers.pdf"),
-    ("config --set depth.neighbors=6", "neighbors = 6"),
-    ("plugins", "lev-ransac"),
-)
+    ("run photos -o out", "model.glb"), ("run photos -o out --until scene --json", '"photos"'),
+    ("calibrate photos -o out --figure camera.png", "px"), ("export out --format obj", "model.obj"),
+    ("export out --format colmap", "colmap"), ("export out --format splat", "splat"),
+    ("export out --points -o scene.ply", "scene.ply"), ("measure out 0,0,0 1,0,0", "+-"),
+    ("report out", "report.html"), ("markers 50mm -o markers.pdf", "markers.pdf"),
+    ("config --set depth.neighbors=6", "neighbors = 6"), ("plugins", "lev-ransac"),
+)  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("typed", "says"), COMMANDS, ids=[typed for typed, _ in COMMANDS])
 def test_it_does_what_the_page_says(typed, says, beside_a_run):
     done = CliRunner().invoke(main, typed.split())

@@ -28,14 +28,9 @@ linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits 
 SECONDS, MEGABYTES = 5, 1500
 PER_FORMAT = 100
 FORMATS = {
-    "jpg": ("JPEG", {}),
-    "progressive.jpg": ("JPEG", {"progressive": True}),
-    "png": ("PNG", {}),
-    "tif": ("TIFF", {"compression": "tiff_lzw"}),
-    "raw.tif": ("TIFF", {}),
-    "webp": ("WEBP", {}),
-    "bmp": ("BMP", {}),
-}
+    "jpg": ("JPEG", {}), "progressive.jpg": ("JPEG", {"progressive": True}), "png": ("PNG", {}),
+    "tif": ("TIFF", {"compression": "tiff_lzw"}), "raw.tif": ("TIFF", {}), "webp": ("WEBP", {}), "bmp": ("BMP", {}),
+}  # fmt: skip
 
 
 def picture():
@@ -188,15 +183,8 @@ def test_colmap_survives_the_damaged_photos_that_we_accept(tmp_path):
     """COLMAP decodes them once more, in ways of its own."""
     names = accepted(tmp_path / "photos")
     flags = (
-        "--keep-low-quality",
-        "--set",
-        "matching.max_features=100",
-        "-q",
-        "--workers",
-        "2",
-        "--until",
-        "match_graph",
-    )
+        "--keep-low-quality", "--set", "matching.max_features=100", "-q", "--workers", "2", "--until", "match_graph",
+    )  # fmt: skip
     command = [sys.executable, "-m", "sfm_app", "run", str(tmp_path / "photos"), "-o", str(tmp_path / "out"), *flags]
 
     process = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)

@@ -21,24 +21,14 @@ from sfm_app.settings import Settings
 from .mutations import ANYTHING, damaged, text_values
 
 OWNERS = {
-    "photos.json": "photos",
-    "database.db": "match_graph",
-    "view_graph.npz": "view_graph",
-    "calibration.json": "intrinsics",
-    "sparse/cameras.bin": "scene",
-    "sparse/frames.bin": "scene",
-    "sparse/images.bin": "scene",
-    "sparse/points3D.bin": "scene",
-    "sparse/rigs.bin": "scene",
-    "scene.json": "scene",
-    "dense/sparse/images.bin": "depth_maps",
-    "dense/images/view_01.jpg": "depth_maps",
+    "photos.json": "photos", "database.db": "match_graph", "view_graph.npz": "view_graph",
+    "calibration.json": "intrinsics", "sparse/cameras.bin": "scene", "sparse/frames.bin": "scene",
+    "sparse/images.bin": "scene", "sparse/points3D.bin": "scene", "sparse/rigs.bin": "scene", "scene.json": "scene",
+    "dense/sparse/images.bin": "depth_maps", "dense/images/view_01.jpg": "depth_maps",
     "dense/stereo/depth_maps/view_01.jpg.geometric.bin": "depth_maps",
-    "dense/stereo/normal_maps/view_01.jpg.geometric.bin": "depth_maps",
-    "surface/surface.npz": "mesh",
-    "texture/texture.npz": "texture",
-    "model.glb": "files",
-}
+    "dense/stereo/normal_maps/view_01.jpg.geometric.bin": "depth_maps", "surface/surface.npz": "mesh",
+    "texture/texture.npz": "texture", "model.glb": "files",
+}  # fmt: skip
 """Files and whose they are."""
 READ_BY_US = (
     "photos.json", "view_graph.npz", "calibration.json", "scene.json", "surface/surface.npz", "texture/texture.npz"
@@ -171,17 +161,12 @@ def decide(made, run):
 
 
 HEALED = [
-    ("model.glb", ()),
-    ("texture/texture.npz", ("--from", "files")),
-    ("surface/surface.npz", ("--from", "texture")),
+    ("model.glb", ()), ("texture/texture.npz", ("--from", "files")), ("surface/surface.npz", ("--from", "texture")),
     ("dense/stereo/depth_maps/view_02.jpg.geometric.bin", ("--from", "mesh")),
-    ("surface/fused.ply", ("--from", "mesh")),
-    ("sparse/points3D.bin", ()),
-    ("sparse/frames.bin", ("--until", "scene")),
-    ("view_graph.npz", ("--from", "scene", "--until", "scene")),
-    ("calibration.json", ("--until", "scene")),
-    ("manifest.json", ("--until", "intrinsics")),
-]
+    ("surface/fused.ply", ("--from", "mesh")), ("sparse/points3D.bin", ()),
+    ("sparse/frames.bin", ("--until", "scene")), ("view_graph.npz", ("--from", "scene", "--until", "scene")),
+    ("calibration.json", ("--until", "scene")), ("manifest.json", ("--until", "intrinsics")),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("file", "flags"), HEALED)

@@ -87,16 +87,10 @@ def test_the_ear_at_the_network_hears(tmp_path):
 
 
 NAMES = (
-    "';drop table images;--\".jpg",
-    "%s%n{0}{name}.jpg",
-    "a\nb\r.jpg",
-    "\x1b[31m\x1b]0;title\x07.jpg",
-    "[red]bold[/].jpg",
-    "<script>alert(1)</script>.jpg",
-    "-o --help.jpg",
-    "$(touch x)`touch x`.jpg",
+    "';drop table images;--\".jpg", "%s%n{0}{name}.jpg", "a\nb\r.jpg", "\x1b[31m\x1b]0;title\x07.jpg",
+    "[red]bold[/].jpg", "<script>alert(1)</script>.jpg", "-o --help.jpg", "$(touch x)`touch x`.jpg",
     "\u202egpj.exe.jpg",
-)
+)  # fmt: skip
 
 
 @pytest.fixture

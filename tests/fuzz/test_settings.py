@@ -35,26 +35,16 @@ def test_damaged_settings_are_read_or_refused(tmp_path):
 
 
 STRANGE = {
-    "lists in lists": "a=" + "[" * 8_000 + "]" * 8_000,
-    "tables in tables": "a=" + "{a=" * 6_000 + "1" + "}" * 6_000,
-    "a long path": ".".join(["a"] * 6_000) + "=1",
-    "a long header": "[" + ".".join(["a"] * 6_000) + "]",
-    "a long number": "seed=" + "9" * 19_000,
-    "a long number in hex": "seed=0x" + "f" * 19_000,
-    "a long fraction": "[mesh]\nmax_gap=" + "9" * 19_000 + ".0",
-    "a million digits": "seed=" + "9" * 1_000_000,
-    "a long word": 'quality="' + "x" * 19_000 + '"',
-    "a long name": "x" * 19_000 + "=1",
-    "many names": "\n".join(f"k{k}=1" for k in range(2_000)),
-    "a date": "seed=2024-01-01",
-    "not a number": "[mesh]\nmax_gap=nan",
-    "a list for a table": "photos=[1]",
-    "a table for a number": "[depth.neighbors]\nx=1",
-    "tables of a list": "[[depth]]\nneighbors=1",
-    "an unknown table": "[x.y.z]\na=1",
-    "an escape": '"\\u001b[2J"="\\u001b[2J"',
-    "twice": "seed=1\nseed=2",
-}
+    "lists in lists": "a=" + "[" * 8_000 + "]" * 8_000, "tables in tables": "a=" + "{a=" * 6_000 + "1" + "}" * 6_000,
+    "a long path": ".".join(["a"] * 6_000) + "=1", "a long header": "[" + ".".join(["a"] * 6_000) + "]",
+    "a long number": "seed=" + "9" * 19_000, "a long number in hex": "seed=0x" + "f" * 19_000,
+    "a long fraction": "[mesh]\nmax_gap=" + "9" * 19_000 + ".0", "a million digits": "seed=" + "9" * 1_000_000,
+    "a long word": 'quality="' + "x" * 19_000 + '"', "a long name": "x" * 19_000 + "=1",
+    "many names": "\n".join(f"k{k}=1" for k in range(2_000)), "a date": "seed=2024-01-01",
+    "not a number": "[mesh]\nmax_gap=nan", "a list for a table": "photos=[1]",
+    "a table for a number": "[depth.neighbors]\nx=1", "tables of a list": "[[depth]]\nneighbors=1",
+    "an unknown table": "[x.y.z]\na=1", "an escape": '"\\u001b[2J"="\\u001b[2J"', "twice": "seed=1\nseed=2",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", STRANGE)

@@ -56,17 +56,13 @@ def test_models_and_their_numbers_are_those_of_colmap():
 @pytest.mark.parametrize(
     ("model", "params"),
     [
-        ("SIMPLE_PINHOLE", [900.0, 510.0, 390.0]),
-        ("PINHOLE", [900.0, 910.0, 510.0, 390.0]),
-        ("SIMPLE_RADIAL", [900.0, 510.0, 390.0, -0.1]),
-        ("RADIAL", [900.0, 510.0, 390.0, -0.1, 0.02]),
-        ("OPENCV", OPENCV),
-        ("FULL_OPENCV", [*OPENCV, 0.01, 0.02, -0.01, 0.01]),
-        ("SIMPLE_RADIAL_FISHEYE", [400.0, 510.0, 390.0, -0.02]),
-        ("OPENCV_FISHEYE", FISHEYE),
+        ("SIMPLE_PINHOLE", [900.0, 510.0, 390.0]), ("PINHOLE", [900.0, 910.0, 510.0, 390.0]),
+        ("SIMPLE_RADIAL", [900.0, 510.0, 390.0, -0.1]), ("RADIAL", [900.0, 510.0, 390.0, -0.1, 0.02]),
+        ("OPENCV", OPENCV), ("FULL_OPENCV", [*OPENCV, 0.01, 0.02, -0.01, 0.01]),
+        ("SIMPLE_RADIAL_FISHEYE", [400.0, 510.0, 390.0, -0.02]), ("OPENCV_FISHEYE", FISHEYE),
         ("THIN_PRISM_FISHEYE", [400.0, 400.0, 510.0, 390.0, -0.02, 0.01, 0.001, -0.002, 0.01, 0.02, 0.001, -0.001]),
     ],
-)
+)  # fmt: skip
 def test_colmap_text_and_binary(tmp_path, model, params):
     text = f"# Camera list\n7 {model} {WIDTH} {HEIGHT} {' '.join(map(str, params))}\n"
     number = next(number for number, name in MODEL_IDS.items() if name == model)

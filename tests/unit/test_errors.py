@@ -30,13 +30,10 @@ def test_exit_codes_are_distinct_and_drawn_in_the_tree():
 
 
 OURS = {
-    "no inverse": lambda: np.linalg.inv(np.zeros((2, 2))),
-    "not positive": lambda: np.linalg.cholesky(-np.eye(3)),
-    "not positive, many": lambda: np.linalg.cholesky(np.zeros((4, 3, 3))),
-    "division": lambda: 1.0 / (len([]) * 1.0),
-    "the power of nothing": lambda: 0.0**-2.0,
-    "overflow": lambda: 10.0**400,
-}
+    "no inverse": lambda: np.linalg.inv(np.zeros((2, 2))), "not positive": lambda: np.linalg.cholesky(-np.eye(3)),
+    "not positive, many": lambda: np.linalg.cholesky(np.zeros((4, 3, 3))), "division": lambda: 1.0 / (len([]) * 1.0),
+    "the power of nothing": lambda: 0.0**-2.0, "overflow": lambda: 10.0**400,
+}  # fmt: skip
 BUGS = {
     "the quantile of nothing": lambda: np.quantile(np.zeros(0), 0.5),
     "the largest of nothing": lambda: np.ptp(np.zeros(0)),

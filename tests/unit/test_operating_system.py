@@ -259,8 +259,6 @@ def test_other_processes_come_first(monkeypatch):
     assert values == [10, 16384]
 
 
-pytestmark = pytest.mark.slow
-
 WAYS = [(), (Ability.GROUPS,), (Ability.CLOSED_INPUT,), (Ability.GROUPS, Ability.CLOSED_INPUT)]
 SLEEP = "import time; time.sleep(600)"
 WORKER = f"""
@@ -281,6 +279,7 @@ time.sleep(600)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("taken", WAYS, ids=lambda taken: "+".join(taken) or "all")
 def test_a_group_ends_when_the_one_that_started_it_is_killed(without, taken):
     without(*taken)
@@ -291,6 +290,7 @@ def test_a_group_ends_when_the_one_that_started_it_is_killed(without, taken):
     assert all(ends(member) for member in members)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("taken", WAYS[:2], ids=lambda taken: "+".join(taken) or "all")
 def test_a_group_is_ended_as_a_whole(without, taken):
     without(*taken)
@@ -305,6 +305,7 @@ def test_a_group_is_ended_as_a_whole(without, taken):
     end_group(worker, 0.0)  # what has ended stays so
 
 
+@pytest.mark.slow
 def test_who_watches_a_process_that_is_gone_ends_at_once(without):
     without(Ability.CLOSED_INPUT)
     with subprocess.Popen([sys.executable, "-c", "pass"]) as gone:
@@ -337,17 +338,11 @@ def test_ctrl_c_does_not_reach_a_group(without, monkeypatch):
 @pytest.mark.parametrize(
     ("code", "name", "run_out"),
     [
-        (0, "", False),
-        (1, "", False),
-        (-6, "SIGABRT", False),
-        (-9, "SIGKILL", True),
-        (-64, "SIGRTMAX", False),
-        (-99, "signal 99", False),
-        (0xC0000005, "access violation", False),
-        (0xC0000017, "no memory", True),
+        (0, "", False), (1, "", False), (-6, "SIGABRT", False), (-9, "SIGKILL", True), (-64, "SIGRTMAX", False),
+        (-99, "signal 99", False), (0xC0000005, "access violation", False), (0xC0000017, "no memory", True),
         (0xC0001234, "fault 0xc0001234", False),
     ],
-)
+)  # fmt: skip
 def test_exit_codes_say_what_happened(code, name, run_out):
     assert (crash_name(code), has_run_out(code)) == (name, run_out)
 
@@ -380,6 +375,7 @@ library.exit(7)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(lacks(Ability.EXIT_HANDLERS), reason="the C library has no on_exit")
 @pytest.mark.parametrize(("first", "said"), [("", "cleaning up"), ("end_at_exit()", "")])
 def test_a_process_that_a_library_ends_cleans_nothing_up_while_its_threads_work(first, said):
@@ -397,6 +393,7 @@ def test_without_exit_handlers_the_c_library_is_left_alone(without, monkeypatch)
     assert asked == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are another thing there")
 def test_a_request_to_end_prints_no_stack():
     """COLMAP has a handler of its own, which does."""

@@ -69,12 +69,9 @@ def test_a_function_is_called_with_every_step():
     progress.say("7 photos")
 
     assert steps == [
-        Step("scene", "as asked", 0, 0),
-        Step("scene", "mapping", 0, 2),
-        Step("scene", "mapping", 1, 2),
-        Step("scene", "mapping", 2, 2),
-        Step("scene", "7 photos", 0, 0),
-    ]
+        Step("scene", "as asked", 0, 0), Step("scene", "mapping", 0, 2), Step("scene", "mapping", 1, 2),
+        Step("scene", "mapping", 2, 2), Step("scene", "7 photos", 0, 0),
+    ]  # fmt: skip
 
 
 def test_an_exception_of_the_function_ends_the_work():

@@ -96,22 +96,14 @@ def test_no_other_module_asks_which_system_this_is():
 @pytest.mark.parametrize(
     ("text", "word"),
     [
-        ("import fcntl", "fcntl"),
-        ("from signal import SIGTERM", "signal"),
-        ("import os\nos.killpg(1, 9)", "killpg"),
-        ("from os import link", "link"),
-        ("os.name == 'nt'", "name"),
-        ("path.replace(other)", "replace"),
-        ("os.replace(path, other)", "replace"),
-        ("Popen(command, start_new_session=True)", "start_new_session"),
-        ("Path('/proc/meminfo')", "/proc"),
-        ("os.open(path, os.O_DIRECTORY)", "O_DIRECTORY"),
-        ("text.replace('a', 'b')", None),
-        ("replace(photo, name=name)", None),
-        ("'''The text of /proc.'''", None),
+        ("import fcntl", "fcntl"), ("from signal import SIGTERM", "signal"), ("import os\nos.killpg(1, 9)", "killpg"),
+        ("from os import link", "link"), ("os.name == 'nt'", "name"), ("path.replace(other)", "replace"),
+        ("os.replace(path, other)", "replace"), ("Popen(command, start_new_session=True)", "start_new_session"),
+        ("Path('/proc/meminfo')", "/proc"), ("os.open(path, os.O_DIRECTORY)", "O_DIRECTORY"),
+        ("text.replace('a', 'b')", None), ("replace(photo, name=name)", None), ("'''The text of /proc.'''", None),
         ("photo.name", None),
     ],
-)
+)  # fmt: skip
 def test_names_that_differ_between_systems_are_found(text, word):
     assert [found for found, _ in offences(text)] == ([word] if word else [])
 
@@ -147,15 +139,10 @@ def test_texts_have_one_encoding_and_one_end_of_lines():
 @pytest.mark.parametrize(
     ("text", "count"),
     [
-        ("open(path)", 1),
-        ("path.open('w')", 1),
-        ("run(command, text=True)", 1),
-        ("path.read_text()", 1),
-        ("path.open('rb')", 0),
-        ("Image.open(path)", 0),
-        ("run(command)", 0),
+        ("open(path)", 1), ("path.open('w')", 1), ("run(command, text=True)", 1), ("path.read_text()", 1),
+        ("path.open('rb')", 0), ("Image.open(path)", 0), ("run(command)", 0),
     ],
-)
+)  # fmt: skip
 def test_calls_that_open_texts_are_found(text, count):
     assert len(list(text_calls(text))) == count
 
@@ -222,17 +209,13 @@ def test_every_module_of_a_method_names_its_equation_or_paper():
 @pytest.mark.parametrize(
     ("text", "names"),
     [
-        ("BARE = 3.0", ["BARE"]),
-        ("A, _B = 1, 2.5", ["A, _B"]),
-        ('MUTE = 3.0\n"""Thresholds."""', ["MUTE"]),
-        ("TABLE = {7: 160.0}", ["TABLE"]),
-        ("SCALED: float = 2 * np.log(50)", ["SCALED"]),
+        ("BARE = 3.0", ["BARE"]), ("A, _B = 1, 2.5", ["A, _B"]), ('MUTE = 3.0\n"""Thresholds."""', ["MUTE"]),
+        ("TABLE = {7: 160.0}", ["TABLE"]), ("SCALED: float = 2 * np.log(50)", ["SCALED"]),
         ('PAPER = 2.5\n"""Of LMedS (Rousseeuw and Leroy 1987)."""', []),
         ('class LoopOptions:\n    a: float = 1.0\n    """By hand."""\n    b: int = 2\n    c: int', ["LoopOptions.b"]),
         ('class LoopOptions:\n    """Thesis 4.4."""\n    a: float = 1.0', []),
-        ("class Other:\n    a: float = 1.0", []),
-        ("X, Y = range(2)\nWORD = 'seven'\nlower = 3", []),
+        ("class Other:\n    a: float = 1.0", []), ("X, Y = range(2)\nWORD = 'seven'\nlower = 3", []),
     ],
-)
+)  # fmt: skip
 def test_constants_without_a_source_are_found(text, names):
     assert silent(text) == names

@@ -22,13 +22,9 @@ from benchmarks.sensitivity.constants import ROOMS, Constant, constants, install
 
 PACKAGE = Path(benchmarks.__file__).parent
 SHARED = (
-    "benchmarks",
-    "benchmarks.common",
-    "benchmarks.surface.depth_camera",
-    "benchmarks.surface.rendered",
-    "benchmarks.synthetic",
-    "benchmarks.thesis",
-)
+    "benchmarks", "benchmarks.common", "benchmarks.surface.depth_camera", "benchmarks.surface.rendered",
+    "benchmarks.synthetic", "benchmarks.thesis",
+)  # fmt: skip
 """Packages that are no command."""
 
 
@@ -193,18 +189,11 @@ class Limits(NamedTuple):
 @pytest.mark.parametrize(
     ("value", "halved", "doubled"),
     [
-        (3.0, 1.5, 6.0),
-        (0.2, 0.1, 0.4),
-        (0.9, 0.95, 0.8),
-        (1, 1, 2),
-        (5, 2, 10),
-        ((0.2, "name"), (0.1, "name"), (0.4, "name")),
-        ({"a": 2}, {"a": 1}, {"a": 4}),
-        (Limits(0.25, 8), Limits(0.125, 4), Limits(0.5, 16)),
-        (True, True, True),
-        (None, None, None),
+        (3.0, 1.5, 6.0), (0.2, 0.1, 0.4), (0.9, 0.95, 0.8), (1, 1, 2), (5, 2, 10),
+        ((0.2, "name"), (0.1, "name"), (0.4, "name")), ({"a": 2}, {"a": 1}, {"a": 4}),
+        (Limits(0.25, 8), Limits(0.125, 4), Limits(0.5, 16)), (True, True, True), (None, None, None),
     ],
-)
+)  # fmt: skip
 def test_numbers_are_scaled_and_stay_what_they_are(value, halved, doubled):
     assert scale(value, 0.5) == pytest.approx(halved)
     assert scale(value, 2.0) == pytest.approx(doubled)

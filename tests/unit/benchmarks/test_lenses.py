@@ -46,9 +46,7 @@ def test_stock_is_told_the_lens_of_the_folder():
     assert "equidistant" in page([{"method": "sfm-app", "projection": "equidistant"}])
 
 
-pytestmark = pytest.mark.slow
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2, 5])
 def test_the_model_of_a_perspective_lens_is_found(seed):
     row = measure("plain", seed, hold_out=False)
@@ -57,6 +55,7 @@ def test_the_model_of_a_perspective_lens_is_found(seed):
     assert 0.0 < row["focal %"] < 0.1 and row["lost"] > 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 4, 8])
 def test_a_fisheye_stays_one_and_its_radius_is_accurate(seed):
     row = measure("fisheye", seed, hold_out=False)
@@ -65,12 +64,14 @@ def test_a_fisheye_stays_one_and_its_radius_is_accurate(seed):
     assert 0.0 < row["radius %"] < 0.1
 
 
+@pytest.mark.slow
 def test_no_other_model_explains_held_out_observations_clearly_better():
     row = measure("plain", 2, hold_out=True)
 
     assert row["chosen"] == "RADIAL" and 0.0 <= row["below"] < np.log(STRONG)
 
 
+@pytest.mark.slow
 def test_cases_are_the_same_each_time_and_differ_from_seed_to_seed():
     first, again, other = (perspective_case("plain", seed) for seed in (3, 3, 4))
 

@@ -23,17 +23,10 @@ def spotted(x, y, size=(800, 600)):
 @pytest.mark.parametrize(
     "change",
     [
-        "",
-        "crop:46,20",
-        "scale:0.75,0.5",
-        "window:200,150,512,400",
-        "crop:46,20+scale:0.5,1",
-        "pad:500,500",
-        "corner:400,900",
-        "fill:500,420",
-        "crop:100,0+pad:300,600+scale:2,1",
+        "", "crop:46,20", "scale:0.75,0.5", "window:200,150,512,400", "crop:46,20+scale:0.5,1", "pad:500,500",
+        "corner:400,900", "fill:500,420", "crop:100,0+pad:300,600+scale:2,1",
     ],
-)
+)  # fmt: skip
 def test_photo_and_camera_change_alike(change):
     todo = photo_sets.steps(change)
     spot = np.array([520.0, 312.0, 1.0])

@@ -217,14 +217,11 @@ def test_the_file_is_what_the_run_would_have_written(textured_ball, finished, na
 @pytest.mark.parametrize(
     ("file_format", "target", "path"),
     [
-        ("", "statue.obj", "statue.obj"),
-        ("", "statue.GLB", "statue.GLB"),
-        ("ply", "statue", "statue.ply"),
-        ("ply", "statue v1.2", "statue v1.2.ply"),
-        ("ply", "new/folder/statue.ply", "new/folder/statue.ply"),
+        ("", "statue.obj", "statue.obj"), ("", "statue.GLB", "statue.GLB"), ("ply", "statue", "statue.ply"),
+        ("ply", "statue v1.2", "statue v1.2.ply"), ("ply", "new/folder/statue.ply", "new/folder/statue.ply"),
         ("ply", ".", "model.ply"),
     ],
-)
+)  # fmt: skip
 def test_the_target_is_named_as_people_name_files(finished, tmp_path, file_format, target, path):
     found = sfm_app.export_model(finished, file_format, tmp_path / target)
     assert found[0] == tmp_path / path
