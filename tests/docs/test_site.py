@@ -104,9 +104,7 @@ def test_a_second_time_nothing_is_written(laid_out, tools):
     target, names = laid_out
     before = {name: (target / name).stat().st_mtime_ns for name in names}
     (target / "left over.md").write_text("of an earlier build")
-
     assert tools[1].lay_out(target, tools[0].GENERATORS) == names
-
     assert {name: (target / name).stat().st_mtime_ns for name in names} == before
     assert not (target / "left over.md").exists()
 
@@ -116,9 +114,7 @@ def test_links_are_moved_and_code_is_not(tools):
     text = (
         "[a](../../benchmarks/README.md#rules) `[b](../../x.md)` [c](../../examples) [d](https://github.com/x) [e](#f)"
     )
-
     moved = tools[1].relink(text, page, [ROOT / "benchmarks" / "README.md"], set())
-
     assert moved == "[a](../benchmarks/README.md#rules) `[b](../../x.md)` c [d](https://github.com/x) [e](#f)"
 
 

@@ -175,9 +175,7 @@ def test_a_run_on_damaged_files_ends_with_the_bytes_of_a_sound_one(kept, file, f
     whole = path.read_bytes()
     middle = len(whole) // 2
     path.write_bytes(whole[:middle] + bytes(byte ^ 0xFF for byte in whole[middle : middle + 40]) + whole[middle + 40 :])
-
     result = kept.run(*flags)
-
     assert result.exit_code == 0, result.output
     if path.name != "manifest.json":
         assert path.read_bytes() == whole
@@ -215,14 +213,12 @@ def forge(made, run, change):
 @pytest.mark.parametrize("needs_copy", [True, False])
 def test_a_forged_name_never_leads_out_of_the_output_folder(kept, run, name, needs_copy):
     forge(kept, run, lambda v: v["photos"][0].update(name=name.format(place=kept.place), needs_copy=needs_copy))
-
     assert isinstance(load(kept, run, "photos"), SfmError)
 
 
 @pytest.mark.parametrize("original", ["../secret.jpg", "{place}/secret.jpg"])
 def test_a_forged_photo_never_comes_from_outside(kept, run, original):
     forge(kept, run, lambda v: v["photos"][0].update(name="x.jpg", original=original.format(place=kept.place)))
-
     assert isinstance(load(kept, run, "photos"), SfmError)
     assert not (kept.out / "photos" / "x.jpg").exists()
 
@@ -230,7 +226,6 @@ def test_a_forged_photo_never_comes_from_outside(kept, run, original):
 def test_a_forged_folder_is_not_read(kept, run):
     forge(kept, run, lambda v: v.update(folder=str(kept.place)))
     (kept.out / "photos" / "view_00.jpg").unlink()
-
     assert load(kept, run, "photos").folder == kept.photos
     assert (kept.out / "photos" / "view_00.jpg").resolve() == (kept.photos / "view_00.jpg").resolve()
 
@@ -240,9 +235,7 @@ def test_a_link_among_the_photos_that_leads_elsewhere_is_replaced(kept, run, tar
     link = kept.out / "photos" / "view_00.jpg"
     link.unlink()
     link.symlink_to(kept.place / target)
-
     load(kept, run, "photos")
-
     assert link.resolve() == (kept.photos / "view_00.jpg").resolve()
     assert not (kept.place / "new.jpg").exists()
 
@@ -253,9 +246,7 @@ def test_links_out_of_the_output_folder_are_refused(kept, name):
     (kept.out / name).unlink(missing_ok=True)
     (kept.out / name).symlink_to(kept.photos)
     before = kept.outside()
-
     result = kept.run()
-
     assert (result.exit_code, "is a link" in result.stderr) == (3, True)
     assert kept.outside() == before
 

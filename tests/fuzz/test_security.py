@@ -69,9 +69,7 @@ def test_the_check_would_find_it(source):
 def test_a_run_never_asks_for_the_network(photos, tmp_path):
     out, script = tmp_path / "out", Path(__file__).with_name("offline.py")
     command = [sys.executable, str(script), "run", str(photos), "-o", str(out), *QUICK, "--until", "scene"]
-
     process = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-
     assert process.returncode == 0, process.stderr
     assert (out / "sparse").is_dir()
 
@@ -80,9 +78,7 @@ def test_the_ear_at_the_network_hears(tmp_path):
     script = Path(__file__).with_name("offline.py")
     ear = f"import runpy; sys.addaudithook(runpy.run_path({str(script)!r})['listen'])"
     code = f"import socket, sys; {ear}; socket.getaddrinfo('localhost', 80)"
-
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
-
     assert process.returncode == 99 and "socket.getaddrinfo" in process.stderr
 
 

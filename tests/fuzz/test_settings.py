@@ -51,10 +51,8 @@ STRANGE = {
 def test_strange_settings_are_refused(tmp_path, case):
     path = tmp_path / "run.toml"
     path.write_text(STRANGE[case])
-
     assert isinstance(read(path), ConfigError)
     result = CliRunner().invoke(main, ["config", "--config", str(path)])
-
     assert result.exit_code == 2 and "error: " in result.stderr
     assert all(line.isprintable() for line in result.stderr.splitlines())
 
@@ -73,7 +71,6 @@ def test_strange_assignments_are_refused(case):
 def test_a_file_as_large_as_may_be_is_read(tmp_path):
     text = Settings(seed=5).to_toml()
     (tmp_path / "run.toml").write_text(text + "#" * (MOST_TOML_BYTES - len(text)))
-
     assert Settings.from_toml(tmp_path / "run.toml").seed == 5
 
 
@@ -86,9 +83,7 @@ def test_strange_names_in_a_list_are_left_out(tmp_path, line):
     folder.mkdir()
     (tmp_path / "secret.jpg").write_bytes(b"secret")
     (tmp_path / "list.txt").write_text(f"{line}\n")
-
     (name,) = list_files(folder, tmp_path / "out", tmp_path / "list.txt")
-
     assert isinstance(resolve_file(folder, name), str)
 
 

@@ -50,7 +50,6 @@ def test_photos_are_rendered_once(tmp_path):
     truth = render(tmp_path, "one")
     before = changes(tmp_path)
     again = render(tmp_path, "one")
-
     assert sorted(before) == sorted(truth.cam_from_world) == ["view_00.jpg", "view_01.jpg", "view_02.jpg"]
     assert changes(tmp_path) == before
     assert np.array_equal(again.vertices, truth.vertices) and np.array_equal(again.K, truth.K)
@@ -62,7 +61,6 @@ def test_what_is_missing_is_rendered(tmp_path):
     before = changes(tmp_path)
     (tmp_path / "photos" / "view_01.jpg").unlink()
     render(tmp_path, "one")
-
     assert {name for name, when in changes(tmp_path).items() if when != before[name]} == {"view_01.jpg"}
     assert {path.name: path.read_bytes() for path in (tmp_path / "photos").iterdir()} == bytes_of_all
 
@@ -81,7 +79,6 @@ def test_photos_of_another_scene_are_left_alone(tmp_path, other):
 def test_the_truth_says_which_photos_a_killed_demo_has_begun(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         render(tmp_path, "one", Stopping())
-
     assert len(json.loads((tmp_path / "truth.json").read_text(encoding="utf-8"))) > 0
     assert len(render(tmp_path, "one").cam_from_world) == 3
 
@@ -89,7 +86,6 @@ def test_the_truth_says_which_photos_a_killed_demo_has_begun(tmp_path):
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_has_the_photos_of_its_text(name):
     views = SCENES[name].views()
-
     assert tuple(SCENES) == tuple(TEXTS)
     assert f", {len(views.cam_from_world)} photos " in TEXTS[name]
     assert len({camera.K.tobytes() for camera in views.cameras.values()}) == 1
@@ -144,7 +140,6 @@ def test_a_surface_partly_beside_the_truth_is_less_accurate(rendered, scene, mod
     lifted = model.surface.vertices + np.array([0.0, 0.02 * np.linalg.norm(np.ptp(truth.vertices, axis=0)), 0.0])
     beside = replace(model, surface=replace(model.surface, vertices=lifted), texture=None)
     result = evaluate(Run(tmp_path, None, scene, None, None, {}), scene, beside, truth, (1.0, 2.0), tmp_path)
-
     # walls slide along themselves, the ground rises
     assert 5.0 < result.surface_accuracy_percent < 90.0
     assert result.pages_px == []
@@ -154,7 +149,6 @@ def test_a_surface_partly_beside_the_truth_is_less_accurate(rendered, scene, mod
 def test_the_picture_shows_a_photo_and_the_textured_model(rendered, scene, model, tmp_path):
     (tmp_path / "photos").symlink_to(rendered[0])
     draw(model, scene, tmp_path)
-
     picture = np.asarray(Image.open(tmp_path / "model.png"))
     photo = np.asarray(Image.open(rendered[0] / sorted(scene.cam_from_world)[3]))
     assert picture.shape == (640, 960, 3)

@@ -55,7 +55,6 @@ def test_an_error_of_ours_is_not_called_colmaps(case):
         translate_errors("adjusting"),
     ):
         OURS[case]()
-
     assert isinstance(caught.value.__cause__, FAILURES) and "bug" in caught.value.hint
     copy = pickle.loads(pickle.dumps(caught.value))  # noqa: S301 - our own bytes
     assert (str(copy), copy.exit_code) == (str(caught.value), 7)

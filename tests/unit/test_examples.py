@@ -47,7 +47,6 @@ def folder_run(rendered, tmp_path_factory):
 @pytest.mark.slow
 def test_one_estimator():
     done = call("one_estimator.py")
-
     assert done.returncode == 0, done.stderr
     assert "identifiable: True" in done.stdout
 
@@ -55,7 +54,6 @@ def test_one_estimator():
 @pytest.mark.slow
 def test_reconstruct_folder(folder_run):
     out, done = folder_run
-
     assert done.returncode == 0, done.stderr
     assert "7 photos placed" in done.stdout
     assert (out / "model.glb").exists()
@@ -64,7 +62,6 @@ def test_reconstruct_folder(folder_run):
 @pytest.mark.slow
 def test_export_model(folder_run, tmp_path):
     done = call("export_model.py", folder_run[0], tmp_path / "files")
-
     assert done.returncode == 0, done.stderr
     names = {path.name for path in (tmp_path / "files").iterdir()}
     assert {"model.obj", "model.mtl", "points.ply"} < names and any(name.endswith(".jpg") for name in names)
@@ -117,10 +114,8 @@ def test_batch_goes_on_after_a_failure_and_does_nothing_again(begun_batch):
 def test_batch_stops_at_a_wrong_option_and_where_there_is_nothing(begun_batch):
     folders, out = begun_batch
     before = (out / "table.csv").read_bytes()
-
     wrong = call("batch_folders.py", folders, out, "--quality", "best")
     nothing = call("batch_folders.py", folders / "good", out)
-
     assert wrong.returncode == 1 and "'best' is not one of" in wrong.stderr and not wrong.stdout
     assert nothing.returncode == 2 and "holds no folders of photos" in nothing.stderr
     assert (out / "table.csv").read_bytes() == before
@@ -171,7 +166,6 @@ def no_screen():
 @pytest.mark.slow
 def test_calibrate_folder(work, rendered, capsys):
     names = execute("calibrate_folder", WORK=str(work), QUALITY="draft", **RENDERED)
-
     assert (work / PHOTOS / "view_06.jpg").read_bytes() == (rendered[0] / "view_06.jpg").read_bytes()
     camera, deviation = names["camera"], names["camera"].spread["fx"]
     assert camera.identifiable and 0.1 < deviation < 10
@@ -188,7 +182,6 @@ def test_calibrate_folder(work, rendered, capsys):
 @pytest.mark.slow
 def test_photos_to_splats_with_photos_of_ones_own(work, rendered, capsys):
     names = execute("photos_to_splats", PHOTOS=str(rendered[0]), WORK=str(work), QUALITY="draft")
-
     assert names["folder"] == work / "out" / "export" / "splat"
     assert len(list((names["folder"] / "images").iterdir())) == 7
     said = capsys.readouterr().out
@@ -258,12 +251,10 @@ def test_the_template_keeps_the_contract_of_estimators(installed_template):
     chosen = f"test_sfm_app_example or (example-msac and ({CONTRACT}))"
     options = ["-q", "-c", "pyproject.toml", "--rootdir", ".", "-p", "no:cacheprovider", "-p", "no:xdist", "-k", chosen]
     environment = {**os.environ, "PYTHONPATH": paths}
-
     done = subprocess.run(
         [sys.executable, "-m", "pytest", *options, *tests], cwd=ROOT, env=environment, capture_output=True, text=True,
         check=False,
     )  # fmt: skip
-
     assert done.returncode == 0, done.stdout + done.stderr
     assert (
         int(re.search(r"(\d+) passed", done.stdout)[1]) >= 20

@@ -41,7 +41,6 @@ def test_a_bomb_is_refused_before_it_goes_off(tmp_path):
     ):
         for _ in range(MOST_BYTES // len(chunk) + 1):
             member.write(chunk)
-
     with pytest.raises(ValueError, match="inflates to 10"):
         load_arrays(tmp_path / "x.npz")
 

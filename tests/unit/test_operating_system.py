@@ -73,9 +73,6 @@ def test_missing_abilities_have_names(without):
     assert lacks(Ability.LINKS) and set(missing_abilities()) == {*before, "links"}
 
 
-NO_LINKS = [None, Ability.LINKS]
-
-
 @pytest.fixture
 def photo(tmp_path):
     path = tmp_path / "photo.jpg"
@@ -96,7 +93,6 @@ def test_without_links_the_bytes_are_copied_and_the_photo_is_safe(photo, tmp_pat
     else:
         without(Ability.LINKS)
     link_or_copy(tmp_path / "place", photo, photo)
-
     assert not is_link(tmp_path / "place") and (tmp_path / "place").read_bytes() == b"light"
     (tmp_path / "place").write_bytes(b"dark")
     assert photo.read_bytes() == b"light"
@@ -198,7 +194,6 @@ def test_cores_are_those_that_may_be_used(without, monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
     monkeypatch.setattr("sfm_app.operating_system.HERE", frozenset(Ability))
     assert usable_cores() == 3
-
     without(Ability.CORES)
     assert usable_cores() == 8
     monkeypatch.setattr(os, "cpu_count", lambda: None)
@@ -212,7 +207,6 @@ def test_a_container_has_less_memory(tmp_path, without, monkeypatch, limit, mega
     monkeypatch.setattr("sfm_app.operating_system.HERE", frozenset(Ability))
     if limit:
         file.write_text(limit)
-
     assert machine_memory_mb() == (megabytes or whole) and 0 < free_memory_mb() <= (megabytes or whole)
     without(Ability.CONTAINERS)
     assert machine_memory_mb() == whole
@@ -251,7 +245,6 @@ def test_other_processes_come_first(monkeypatch):
     monkeypatch.setattr(os, "nice", values.append, raising=False)
     yield_to_others(10)
     assert values == [10]
-
     monkeypatch.delattr(os, "nice")
     monkeypatch.setattr(psutil, "BELOW_NORMAL_PRIORITY_CLASS", 16384, raising=False)
     monkeypatch.setattr(psutil.Process, "nice", lambda _process, value: values.append(value))
@@ -300,7 +293,6 @@ def test_a_group_is_ended_as_a_whole(without, taken):
     ) as worker:
         child = psutil.Process(int(worker.stdout.readline()))
         end_group(worker, 10.0)
-
     assert worker.returncode != 0 and ends(child)
     end_group(worker, 0.0)  # what has ended stays so
 
@@ -314,7 +306,6 @@ def test_who_watches_a_process_that_is_gone_ends_at_once(without):
         f"import os, time; from sfm_app.operating_system import watch_parent\n"
         f"watch_parent({gone.pid}, lambda: os._exit(7)); time.sleep(60)"
     )
-
     assert subprocess.run([sys.executable, "-c", code], check=False, stdin=subprocess.DEVNULL).returncode == 7
 
 

@@ -148,7 +148,6 @@ def test_no_link_is_dead():
 def test_every_picture_of_the_results_is_on_a_page():
     results = ROOT / "benchmarks" / "results"
     shown = {(page.parent / link).resolve() for page in MARKDOWN for link in links(page)}
-
     assert [path.name for path in sorted(results.glob("*.png")) if path.resolve() not in shown] == []
     assert {path.suffix for path in results.iterdir()} <= {".json", ".md", ".png"}
 
@@ -169,9 +168,7 @@ def test_the_printed_estimator_works(tmp_path, monkeypatch):
     module = __import__(entry)
     monkeypatch.delitem(sys.modules, entry)
     pair = make_pair(PairOptions(points=300, outliers=0.2), 1)
-
     found = load_plugins([module], installed=False).estimator("my-magsac").fit(pair.x1, pair.x2, EpipolarSettings(), 0)
-
     assert found.inliers[pair.is_inlier].mean() > 0.5
     assert found.inliers[~pair.is_inlier].mean() < 0.1
 
@@ -218,10 +215,8 @@ def installed(tmp_path, monkeypatch):
 
 def test_the_printed_calibrator_works(installed):
     rng, size = np.random.default_rng(0), (1000, 750)
-
     found = sfm_app.calibrate_fundamentals(fundamentals(rng, 12, 1100.0, size), size, method="my-focal")
     of_noise = sfm_app.calibrate_fundamentals(rng.normal(size=(12, 3, 3)), size, method="my-focal")
-
     assert (found.identifiable, found.method, found.reason) == (True, "my-focal", "")
     np.testing.assert_allclose(np.diag(found.K)[:2], 1100, rtol=0.03)
     assert found.evidence["median_ratio"] < 0.01

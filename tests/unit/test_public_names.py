@@ -30,10 +30,8 @@ def test_an_estimator_refuses_bad_input_clearly():
 
 def test_a_method_that_does_not_exist_is_refused_before_any_work(tmp_path):
     settings = sfm_app.Settings.from_mapping({"depth": {"method": "guess"}})
-
     with pytest.raises(sfm_app.ConfigError, match="no depth method is named 'guess'"):
         sfm_app.reconstruct(tmp_path, tmp_path / "out", settings)
-
     assert not (tmp_path / "out").exists()
 
 
@@ -42,9 +40,7 @@ def test_the_import_leaves_out_what_an_estimator_does_not_need():
     heavy = {"cv2", "open3d", "pycolmap", "trimesh", "matplotlib", "PIL", "rich"}
     heavy |= {"scipy.optimize", "scipy.sparse", "scipy.spatial"}
     lists = "import sys, sfm_app; sfm_app.estimate_fundamental; print(*sys.modules)"
-
     done = subprocess.run([sys.executable, "-c", lists], capture_output=True, text=True, check=True)
-
     assert "sfm_app.fundamental.estimate" in done.stdout.split()
     assert heavy.isdisjoint(done.stdout.split())
 
@@ -53,9 +49,7 @@ def test_the_import_leaves_out_what_an_estimator_does_not_need():
 def test_the_processes_of_colmap_do_not_load_the_estimators():
     heavy = {"numba", "sfm_app.api", "sfm_app.plugins", "sfm_app.fundamental"}
     lists = "import sys, sfm_app.colmap.tasks, sfm_app.colmap.features; print(*sys.modules)"
-
     done = subprocess.run([sys.executable, "-c", lists], capture_output=True, text=True, check=True)
-
     assert "pycolmap" in done.stdout.split()
     assert heavy.isdisjoint(done.stdout.split())
 
@@ -67,7 +61,6 @@ def test_a_function_is_called_with_every_step():
     for _ in track(progress, range(2), "mapping", 2):
         pass
     progress.say("7 photos")
-
     assert steps == [
         Step("scene", "as asked", 0, 0), Step("scene", "mapping", 0, 2), Step("scene", "mapping", 1, 2),
         Step("scene", "mapping", 2, 2), Step("scene", "7 photos", 0, 0),
@@ -95,14 +88,12 @@ def test_toml_round_trip(tmp_path):
     path = tmp_path / "run.toml"
     changed = Settings.from_mapping({"seed": 7, "quality": "draft", "depth": {"neighbors": 9}})
     path.write_text(changed.to_toml(), encoding="utf-8")
-
     assert Settings.from_toml(path) == changed
     assert changed != Settings()
 
 
 def test_every_setting_has_help_in_the_toml():
     lines = Settings().to_toml().splitlines()
-
     for above, line in pairwise(lines):
         if "=" in line and not line.startswith("#"):
             assert above.startswith("# ") and len(above) > 10, line
@@ -123,7 +114,6 @@ def test_every_setting_has_help_in_the_toml():
 def test_wrong_values_are_refused(values, says, hint):
     with pytest.raises(ConfigError) as caught:
         Settings.from_mapping(values, where="run.toml")
-
     assert str(caught.value).startswith("run.toml: ")
     assert says in str(caught.value)
     assert hint in caught.value.hint
@@ -145,7 +135,6 @@ def test_presets_are_valid_and_explicit_values_win():
 def test_a_file_that_is_not_toml_is_named(tmp_path):
     path = tmp_path / "run.toml"
     path.write_bytes(b"\xff\xfe= [")
-
     with pytest.raises(ConfigError, match=r"run\.toml is not a TOML file"):
         Settings.from_toml(path)
     with pytest.raises(ConfigError, match="cannot read"):

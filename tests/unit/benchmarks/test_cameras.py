@@ -48,7 +48,6 @@ POSES = {name: pose(center, 10.0 * n) for n, (name, center) in enumerate(CORNERS
 
 def test_a_similarity_changes_no_score():
     found = moved(POSES, 3.5, TURN, np.array([4.0, -7.0, 1.0]))
-
     assert position_rms_percent(found, POSES) == pytest.approx(0.0, abs=1e-10)
     assert np.all(pose_errors_deg(found, POSES) < 1e-5)
 
@@ -56,7 +55,6 @@ def test_a_similarity_changes_no_score():
 def test_a_mirrored_world_is_no_similarity():
     mirrored = {name: pose((x, y, 0.5 * x * y + z)) for name, (x, y, z) in {**CORNERS, "e": (1, 2, 1)}.items()}
     world = {name: pose((-x, y, 0.5 * x * y + z)) for name, (x, y, z) in {**CORNERS, "e": (1, 2, 1)}.items()}
-
     assert position_rms_percent(mirrored, world) > 5
 
 
@@ -64,7 +62,6 @@ def test_rms_is_counted_in_mean_distances_from_the_mean():
     # up and down in turn is what no similarity of a square takes back, but for a little by shrinking it
     up = {"a": 0.1, "b": 0.1, "c": -0.1, "d": -0.1}
     lifted = {name: pose((x, y, up[name])) for name, (x, y, _) in CORNERS.items()}
-
     assert position_rms_percent(lifted, POSES) == pytest.approx(100 * np.sqrt(0.01 / 4.01))
     assert position_rms_percent({name: POSES[name] for name in "ab"}, POSES) is None
 
@@ -72,7 +69,6 @@ def test_rms_is_counted_in_mean_distances_from_the_mean():
 def test_a_photo_left_out_costs_all_its_pairs():
     found = {name: POSES[name] for name in "abc"}
     errors = pose_errors_deg(found, POSES)
-
     assert sorted(errors.round(4).tolist()) == [0.0] * 3 + [180.0] * 3
     assert area_under_recall(errors, 1) == pytest.approx(0.5, abs=1e-4)
     row = accuracy([Model(found, dict.fromkeys(found, K), 5, 9, 0.3)], truth(), 4)
@@ -86,17 +82,13 @@ def truth():
 def test_every_photo_is_compared_with_its_own_camera():
     far = {"a": K, "b": camera_matrix(2000.0, 2020.0, 500.0, 300.0)}
     known = {name: TruePhoto(true, POSES[name], 800) for name, true in far.items()}
-
     row = camera_errors({"a": K, "b": K, "nobody": K}, known)
-
     assert (row["e_focal %"], row["e_OC %"], row["e_OC_w %"]) == (25.0, 5.0, 6.25)
 
 
 def test_each_of_several_models_is_judged_by_its_own_photos():
     halves = [Model({name: POSES[name] for name in pair}, {}, 1, 1, 0.1) for pair in ("ab", "cd")]
-
     row = accuracy(halves, truth(), 4)
-
     assert row["models"] == 2
     assert row["AUC@5 of each model"] == "1.00, 1.00"
     assert row["AUC@5"] == pytest.approx(1 / 6, abs=1e-4)
@@ -105,9 +97,7 @@ def test_each_of_several_models_is_judged_by_its_own_photos():
 def test_truth_changes_with_the_photos(tmp_path):
     entry = {"file": "a.jpg", "width": 800, "height": 600, "K": K.tolist(), "R": np.eye(3).tolist(), "t": [1, 2, 3]}
     (tmp_path / "cameras.json").write_text(json.dumps({"images": [entry]}))
-
     photo = true_photos(tmp_path / "cameras.json", steps("window:100,50,512,512+scale:2,1"))["a"]
-
     assert photo.K.tolist() == [[2000, 0, 600], [0, 1010, 250], [0, 0, 1]]
     assert photo.width == 800
     assert true_photos(tmp_path / "missing.json", []) == {}
@@ -127,16 +117,13 @@ def left_behind(folder, deviations):
 
 def test_errors_are_counted_in_the_deviations_of_the_camera_that_took_the_photo(tmp_path):
     model = left_behind(tmp_path, {"wide": {"fx": 2.0, "fy": 3.0, "cx": 0.25}})
-
     row = stated_deviations(tmp_path, model, truth())
-
     assert (row["fx in sd"], row["fy in sd"], row["cx in sd"], row["worst in sd"]) == (2.0, 0.0, 4.0, 4.0)
     assert "cy in sd" not in row and row["sd cx px"] == 0.25
 
 
 def test_of_several_cameras_the_worst_deviation_counts(tmp_path):
     model = left_behind(tmp_path, {"wide": {"f": 4.0}, "long": {"f": 10.0, "k1": 0.1}})
-
     assert stated_deviations(tmp_path, model, truth()) == {"sd f px": 10.0, "f in sd": 5.0, "worst in sd": 5.0}
     assert stated_deviations(tmp_path, left_behind(tmp_path, {}), truth()) == {"worst in sd": None}
 
@@ -144,7 +131,6 @@ def test_of_several_cameras_the_worst_deviation_counts(tmp_path):
 def test_bars_are_met_up_to_the_bound_and_misses_are_named():
     bars = (lower_bound("AUC@1", 0.8), upper_bound("rms", 0.1), upper_bound("px", "incremental"))
     others = {"incremental": {"px": 0.4}}
-
     assert verdict({"AUC@1": 0.8, "rms": 0.1, "px": 0.4}, others, bars) == "yes"
     assert verdict({"AUC@1": 0.7, "rms": 0.1, "px": 0.41}, others, bars) == (
         "no: AUC@1 0.7, at least 0.8; px 0.41, at most 0.4"
@@ -163,7 +149,6 @@ def runs(method, totals, **figures):
 def test_ratios_are_taken_within_a_repetition_and_the_median_counts():
     rows = medians([*runs("incremental", (10.0, 20.0, 10.0)), *runs("sfm-app", (9.0, 10.0, 30.0), **{"AUC@5": 0.9})])
     ours = next(row for row in rows if row["method"] == "sfm-app")
-
     assert (ours["/ incremental"], ours["total"], ours["fastest"], ours["slowest"]) == (0.9, 10.0, 9.0, 30.0)
     assert (ours["repetitions"], ours["placed"], ours["bar met"]) == (3, "3/3", "yes")
     assert [row["bar met"] for row in rows if row["method"] == "incremental"] == [""]
@@ -178,7 +163,6 @@ R = axis_rotation(np.array([0.0, 0.8, 0.6]), 20.0)
 @pytest.mark.parametrize("sign", [1, -1])
 def test_the_true_matrix_has_no_pose_error(sign):
     F = sign * 3.7 * fundamental_from_pose(*CAMERAS, R, T)
-
     assert fundamental_pose_error_deg(F, CAMERAS, R, T) < 1e-5
     assert fundamental_pose_error_deg(F, CAMERAS, R, -5 * T) < 1e-5, "neither sign nor length of t is in F"
 
@@ -187,7 +171,6 @@ def test_the_true_matrix_has_no_pose_error(sign):
 def test_the_pose_error_is_the_larger_of_rotation_and_translation(off_deg):
     turned = axis_rotation(T, off_deg) @ R
     moved = axis_rotation(np.array([0.0, 1.0, 0.0]), 2 * off_deg) @ T
-
     assert fundamental_pose_error_deg(fundamental_from_pose(*CAMERAS, turned, T), CAMERAS, R, T) == pytest.approx(
         off_deg
     )
@@ -211,7 +194,6 @@ def test_area_under_recall(errors, area):
 
 def test_failures_are_counted_and_capped():
     found = summary_px(np.array([0.1, 0.3, 80.0, np.inf]))
-
     assert found == {"mean px": 0.2, "capped mean px": (0.4 + 2 * CAP_PX) / 4, "failures": 2}
     assert summary_px(np.array([np.inf]))["mean px"] == CAP_PX
 

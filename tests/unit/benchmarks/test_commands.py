@@ -39,7 +39,6 @@ COMMANDS = [name for name in packages() if name not in SHARED]
 
 def test_every_folder_is_a_command_or_shared():
     found = {name for name, folder in packages().items() if (folder / "__main__.py").exists()}
-
     assert found == set(COMMANDS)
     assert {path.parent for path in PACKAGE.rglob("*.py") if "node_modules" not in path.parts} == set(
         packages().values()
@@ -51,7 +50,6 @@ def test_the_help_shows_the_command(name, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["__main__.py", "--help"])
     with pytest.raises(SystemExit) as ended:
         runpy.run_module(name, run_name="__main__")
-
     shown = capsys.readouterr().out
     assert ended.value.code == 0
     assert shown.startswith(f"usage: python -m {name} ")
@@ -63,7 +61,6 @@ def test_a_worker_is_found_from_anywhere_and_brings_nothing_but_itself(worker, t
     code = f"import sys, {worker}; print({{'numpy', 'sfm_app', 'pycolmap'}} & set(sys.modules))"
     command = [*module_command(worker)[:-2], "-c", code]
     done = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False)
-
     assert done.stdout.strip() == "set()", done.stderr
 
 
@@ -73,7 +70,6 @@ def test_a_command_starts_anew_as_it_was_called(monkeypatch):
     monkeypatch.setattr(sys, "orig_argv", ["python", "-X", "dev", "-m", "benchmarks.fundamental", "--seed", "1"])
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
     ensure_single_thread()
-
     ((path, command, given),) = calls
     assert path == sys.executable == command[0]
     assert command[1:] == ["-X", "dev", "-m", "benchmarks.fundamental", "--seed", "1"]
@@ -153,7 +149,6 @@ def held_by(*arguments):
 def test_memory_is_that_of_a_process_and_of_its_children():
     alone = held_by(HOLDS.format(mb=200))
     together = held_by(PARENT, HOLDS.format(mb=200))
-
     assert 190 < alone < 260
     assert 45 < together - alone < 90
 
@@ -162,7 +157,6 @@ def test_memory_is_that_of_a_process_and_of_its_children():
 def test_a_process_that_has_ended_holds_nothing():
     with subprocess.Popen([sys.executable, "-c", ""]) as process:
         process.wait()
-
         assert held_mb(process.pid) == 0
 
 
@@ -174,7 +168,6 @@ def test_cpu_seconds_are_those_of_children_at_work_too():
         process.stdout.readline()
         during = cpu_s(os.getpid())
         process.communicate(b"end")
-
     assert 0.45 < during - before < 2.0
     assert 0.45 < cpu_s(os.getpid()) - before < 2.0
 

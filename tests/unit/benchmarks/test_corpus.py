@@ -39,7 +39,6 @@ def walk(places):
 
 def test_a_walk_that_leads_onwards_and_one_that_is_folded():
     onwards, back = order_scores(walk(np.arange(20.0))), order_scores(walk([*range(10), *range(10)]))
-
     assert onwards.axis == pytest.approx(1.0) and onwards.distance > 0.99 and onwards.jumps == 0
     assert back.axis < 0.6 and back.distance < 0.4 and back.jumps == 1
     assert order_scores(walk([0.0, 1.0])) is None
@@ -105,9 +104,7 @@ def test_errors_are_counted_in_what_is_stated(tmp_path):
 
 def test_a_guess_claims_nothing_before_and_a_wide_deviation_nothing_after(tmp_path):
     truth = left_behind(tmp_path, None, (camera_matrix(1400.0, 1400.0, 400.0, 300.0), {"fx": 200.0, "fy": 200.0}))
-
     rows = parameter_errors(tmp_path, truth, Doubt(0.0, 0.0))
-
     assert {row["when"] for row in rows} == {"after"}
     assert parameter_counts(rows)["focals called identifiable"] == 0
     assert claimed_errors(rows) == {"claimed focal %": 0.0, "claimed center %": 0.0, "focal of 3 % or 3 sd": 0.667}
@@ -124,7 +121,6 @@ def test_a_fold_counts_unless_it_is_said_or_cut_into_honest_parts():
     said = walk_figures([model(two_ways)], ["photos 003 and 013 may be folded onto one place"])
     parts = walk_figures([model(range(10)), model(range(8))], [])
     sure = walk_figures([model(two_ways)], ["look-alikes separated, 20 pairs of photos"])
-
     assert [unreported_fold("oats23", row) for row in (silent, said, parts, sure)] == [1, 0, 0, 1]
     assert unreported_fold("oats23", {}) is None and unreported_fold("castle-P19", silent) is None
     assert parts["axis of the worst part"] == pytest.approx(1.0)
@@ -144,7 +140,6 @@ def stated_row(in_sd, identifiable="no", error=0.1):
 
 def test_one_parameter_of_twenty_may_be_off_and_no_exception_passes():
     fine = [stated_row(1.0)] * 19 + [stated_row(4.0)]
-
     assert [demand.met for demand in demands([run_row()], fine)] == [True] * 5
     broken = demands(
         [run_row(**{"exit code": 1, "bar met": "no: x", "clearly behind stock": "AUC@5"})],
@@ -156,7 +151,6 @@ def test_one_parameter_of_twenty_may_be_off_and_no_exception_passes():
 
 def test_sets_that_constants_have_seen_are_left_out():
     rows = [run_row(photos="kitti51"), run_row(photos="castle-P19 crop:460,200"), run_row(photos="merton1")]
-
     assert [row["photos"] for row in unseen_rows(rows, seen_sets())] == ["kitti51"]
     ransac = next(row for row in groups_table(rows) if row["stand in"] == "ransac")
     assert ransac["bars met on sets not seen"] == "2 of 2"
@@ -180,9 +174,7 @@ def photos_in(folder, count, size=(40, 30)):
 
 def test_every_so_many_photos_are_taken(tmp_path):
     photos_in(tmp_path / "data" / "video" / "images", 12)
-
     found = photo_set(tmp_path / "data", "video", "crop:10,0+every:5", tmp_path / "cache")
-
     assert sorted(path.stem for path in found.folder.glob("*.png")) == ["0000", "0005", "0010"]
     with Image.open(found.folder / "0005.png") as image:
         assert image.size == (30, 30)
@@ -195,7 +187,6 @@ def test_what_takes_too_long_is_ended_with_all_that_it_started(tmp_path):
     alive = tmp_path / "alive"
     child = f"import time, pathlib; time.sleep(2); pathlib.Path({str(alive)!r}).touch()"
     parent = f"import subprocess, sys, time; subprocess.Popen([sys.executable, '-c', {child!r}]); time.sleep(60)"
-
     assert run_command([sys.executable, "-c", parent], 1.0)[0] is None
     time.sleep(2)
     assert not alive.exists()
@@ -234,9 +225,7 @@ def test_finished_runs_are_kept_until_program_settings_or_photos_change(tmp_path
 
 def test_a_set_that_cannot_be_read_is_no_end_of_the_others(tmp_path, monkeypatch, capsys):
     args = options(tmp_path, sets=["gone", "gone crop:1,1"], results=tmp_path, name="corpus")
-
     rows = [row for row, _ in corpus.run_all(args, methods({}, ours_only=True))]
-
     assert [row["photos"] for row in rows] == ["gone", "gone crop:1,1"]
     assert all(row["failed"].startswith("benchmark: FileNotFoundError") for row in rows)
     assert len(re.findall(r"^\[\d/2\] gone", capsys.readouterr().err, re.MULTILINE)) == 2

@@ -57,7 +57,6 @@ def written(plan, folder):
 @pytest.mark.slow
 def test_a_seed_is_a_folder():
     again = troubled_folder(17)
-
     assert (again.troubles, again.options) == (plans()[17].troubles, plans()[17].options)
     for name, pose in again.views.cam_from_world.items():
         assert np.array_equal(pose, plans()[17].views.cam_from_world[name])
@@ -68,7 +67,6 @@ def test_a_seed_is_a_folder():
 @pytest.mark.slow
 def test_every_trouble_comes_up_and_few_at_a_time():
     met = {kind for plan in plans() for kind in plan.troubles}
-
     assert met == set(KINDS)
     assert all(len(plan.troubles) <= 6 for plan in plans())
     assert 1 <= sum(not plan.troubles for plan in plans()) <= 12
@@ -105,7 +103,6 @@ def test_a_lens_pushes_the_farthest_corner_by_what_is_asked_and_zooming_keeps_th
     camera = with_distortion(make_camera(640, 480, 1.0, center=(0.4, 0.55)), -0.08)
     corner = np.array([640.0, 0.0])
     seen = (corner - camera.K[:2, 2]) / camera.K[0, 0]
-
     assert camera.radial * (seen @ seen) == pytest.approx(-0.08)
     assert with_zoom(camera, 2.0).radial == pytest.approx(4 * camera.radial)
     assert with_zoom(camera, 2.0).K[1, 1] == 2 * camera.K[1, 1] and with_zoom(camera, 2.0).K[0, 2] == camera.K[0, 2]
@@ -115,7 +112,6 @@ def test_a_lens_pushes_the_farthest_corner_by_what_is_asked_and_zooming_keeps_th
 def test_motion_blur_smears_along_its_direction_and_keeps_the_light():
     image = np.zeros((31, 31, 3))
     image[15, 15] = 1.0
-
     level = apply_motion_blur(image, 8.0, 0.0)[..., 0]
     rows, columns = np.mgrid[:31, :31] - 15
     assert level.sum() == pytest.approx(1.0)
@@ -159,7 +155,6 @@ def test_the_folder_is_rendered_alike_twice_and_a_thing_stands_on_its_foot(tmp_p
     plan = small(plan_with("motion blur"))
     write_troubled_folder(tmp_path / "a", plan)
     write_troubled_folder(tmp_path / "b", plan)
-
     for path in (tmp_path / "a").iterdir():
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
     assert len(list((tmp_path / "a").iterdir())) == 2

@@ -39,7 +39,6 @@ def test_in_an_orbit_all_axes_meet_at_one_distance(photos, sweep_deg):
     views = orbit(make_camera(96, 64), photos, sweep_deg, distance=4.0, aim=tuple(aim))
     poses = np.array(list(views.cam_from_world.values()))
     centers = np.array([camera_center(pose) for pose in poses])
-
     assert len(poses) == photos and miss_of_axes(views).max() < 1e-9
     assert np.allclose(np.linalg.norm(centers - aim, axis=1), 4.0) and np.allclose(centers[:, 1], 1.0)
     assert np.allclose(poses[:, 1, :3], [0, -1, 0]), "upright"
@@ -51,7 +50,6 @@ def test_a_panorama_is_taken_from_one_spot():
     views = panorama(make_camera(96, 64), photos=5, step_deg=10.0, center=(1.0, 2.0, 3.0))
     poses = list(views.cam_from_world.values())
     turned = [np.degrees(np.arccos(np.clip(a[2, :3] @ b[2, :3], -1, 1))) for a, b in combinations(poses, 2)]
-
     assert np.allclose([camera_center(pose) for pose in poses], [1.0, 2.0, 3.0])
     assert 9.0 < min(turned) < 12.0 and 38.0 < max(turned) < 42.0
 
@@ -80,9 +78,7 @@ def turn_deg(a, b):
 
 def test_a_walk_without_shaking_goes_straight_on_at_its_speed():
     path = walk(WalkOptions(seconds=2.0, speed=1.4, shake=0.0, heading_deg=90.0))
-
     first, last = path.poses(np.array([0.0, 2.0]))
-
     assert camera_center(last) - camera_center(first) == pytest.approx([2.8, 0.0, 0.0], abs=1e-9)
     assert turn_deg(first, last) == pytest.approx(0.0, abs=1e-5)
 
@@ -90,17 +86,13 @@ def test_a_walk_without_shaking_goes_straight_on_at_its_speed():
 def test_the_fastest_turn_is_as_fast_as_asked():
     path = walk(WalkOptions(seconds=4.0, swing_deg_s=60.0, shake=0.0))
     poses = path.poses(np.linspace(0.0, 4.0, 401))
-
     rates = [turn_deg(a, b) / 0.01 for a, b in itertools.pairwise(poses)]
-
     assert 59.0 < max(rates) < 61.0
 
 
 def test_the_middle_row_is_seen_from_the_pose_of_the_frame():
     path = walk(WalkOptions(swing_deg_s=60.0))
-
     rows = row_poses(path, 1.0, 0.03, 481)
-
     assert rows[240] == pytest.approx(path.poses(np.array([1.0]))[0], abs=1e-12)
     assert rows[0] == pytest.approx(path.poses(np.array([1.0 - 0.015 * 480 / 481]))[0], abs=1e-12)
 
@@ -109,9 +101,7 @@ def test_a_point_is_seen_from_the_pose_of_its_own_row():
     path, readout = walk(WalkOptions(swing_deg_s=90.0)), 0.03
     (middle,) = path.poses(np.array([1.0]))
     points = (np.random.default_rng(0).uniform([-1, -1, 4], [1, 1, 7], (50, 3)) - middle[:, 3]) @ middle[:, :3]
-
     x = project_through_shutter(CAMERA, path, 1.0, readout, points)
-
     inside = np.all((x > 0) & (x < (640, 480)), axis=1)
     assert np.count_nonzero(inside) > 10
     for point, (column, row) in zip(points[inside], x[inside], strict=True):
@@ -124,9 +114,7 @@ def test_a_point_is_seen_from_the_pose_of_its_own_row():
 
 def test_points_behind_the_camera_are_nowhere():
     path = walk(WalkOptions(shake=0.0))
-
     x = project_through_shutter(CAMERA, path, 0.0, 0.02, np.array([[0.0, 1.5, 5.0], [0.0, 1.5, -5.0]]))
-
     assert np.isnan(x[0]).all() and np.isfinite(x[1]).all()
 
 
@@ -136,7 +124,6 @@ def test_each_motion_has_its_own_epipolar_geometry(seed):
     pair, moving = scene.pair, scene.is_moving
     to_scene = sampson_distance(pair.F, pair.exact_x1, pair.exact_x2)
     to_object = sampson_distance(scene.moving_F, pair.exact_x1, pair.exact_x2)
-
     assert to_scene[~moving].max() < 1e-8 and to_object[moving].max() < 1e-8
     assert np.median(to_scene[moving]) >= LEAST_DEPARTURE_PX
     assert np.median(to_object[~moving]) > 1.0
@@ -149,7 +136,6 @@ def test_each_motion_has_its_own_epipolar_geometry(seed):
 def test_shares_are_those_asked_for_and_rows_are_mixed(moving, outliers):
     scene = make_two_motions(PairOptions(outliers=outliers), moving, seed=3)
     wrong = ~scene.pair.is_inlier & ~scene.is_moving
-
     assert len(scene.pair.x1) == 1200
     assert np.count_nonzero(scene.is_moving) == round(1200 * moving)
     assert np.count_nonzero(wrong) == round(1200 * outliers)
@@ -160,7 +146,6 @@ def test_shares_are_those_asked_for_and_rows_are_mixed(moving, outliers):
 def test_the_object_has_the_same_noise_and_is_a_cluster():
     scene = make_two_motions(PairOptions(sigma_px=0.8), 0.4, seed=5)
     pair, moving = scene.pair, scene.is_moving
-
     for noise in (pair.x1 - pair.exact_x1, pair.x2 - pair.exact_x2):
         assert 0.74 < noise[moving].std() < 0.86 and 0.74 < noise[~moving].std() < 0.86
     assert pair.exact_x1[moving].std(axis=0).max() < 0.8 * pair.exact_x1[~moving].std(axis=0).min()
@@ -174,7 +159,6 @@ def test_the_still_scene_must_dominate(moving, outliers):
 
 def test_no_keypoint_has_two_matches_in_a_photo_and_some_matches_are_wrong():
     town = make_town_graph(TownOptions(photos=40, neighbors=8, look_alikes=0.02), 0)
-
     assert all(len(np.unique(rows[:, side])) == len(rows) for rows in town.matches.matches.values() for side in (0, 1))
     right = np.concatenate([fit.inliers for pair, fit in town.views.fits.items() if pair not in town.look_alikes])
     assert 0.65 < right.mean() < 0.85

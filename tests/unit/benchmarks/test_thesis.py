@@ -33,7 +33,6 @@ from benchmarks.thesis.chapter5.sequences import (
 from benchmarks.thesis.chapter5.setups import Trial
 from benchmarks.thesis.chapter5.slices import SCALES, focal_slice
 from benchmarks.thesis.chapter5.sweep_claims import CurveClaim, check_levels, judge_claims
-from benchmarks.thesis.chapter5.zero_curve_plots import SIGMA, support
 from benchmarks.thesis.corners import load_corners
 from sfm_app.camera.models import camera_matrix
 from sfm_app.geometry.epipolar import sampson_distance
@@ -53,7 +52,6 @@ def tracks():
 def test_a_projection_matrix_falls_apart_into_K_and_the_rest():
     R = axis_rotation(np.array([0.6, 0.0, 0.8]), 160.0)
     P = -3.0 * K @ np.column_stack([R, [0.3, -2.0, 5.0]])
-
     assert np.allclose(camera_matrix_from_projection(P), K)
 
 
@@ -62,7 +60,6 @@ def test_the_fundamental_matrix_of_two_cameras_joins_their_images():
     P2 = K @ np.column_stack([axis_rotation(np.array([0.0, 1.0, 0.0]), 10.0), [1.0, 0.2, 0.1]])
     X = np.random.default_rng(0).uniform([-1, -1, 4, 1], [1, 1, 6, 1], (20, 4))
     x1, x2 = ((X @ P.T)[:, :2] / (X @ P.T)[:, 2:] for P in (P1, P2))
-
     assert sampson_distance(fundamental_from_projections(P1, P2), x1, x2).max() < 1e-9
     assert sampson_distance(fundamental_from_projections(P2, P1), x1, x2).max() > 1.0, "the direction matters"
 
@@ -106,7 +103,6 @@ def test_outliers_spoil_a_fit_to_all_and_no_robust_one(tracks):
 def test_a_seed_keeps_its_clean_matrices_over_all_levels(experiment):
     trials = list(experiment(3))
     first = trials[0]
-
     assert [trial.x for trial in trials] == sorted({trial.x for trial in trials})
     for trial in trials:
         same = [name for name in first.fits if trial.fits[name] is first.fits[name]]
@@ -126,7 +122,6 @@ def calibration(method, identifiable, **evidence):
 
 def test_doubt_is_an_answer_of_the_program_alone():
     told = {"fx_px": 1.0, "fy_px": 2.0, "cx_px": 3.0, "cy_px": 4.0}
-
     assert answered_K(PRODUCTION, calibration("guess", False, **told)) is None
     assert answered_K(NON_ROBUST, calibration("guess", False, **told)).tolist() == [[1, 0, 3], [0, 2, 4], [0, 0, 1]]
     assert answered_K(NON_ROBUST, calibration("guess", False)) is None
@@ -136,7 +131,6 @@ def test_doubt_is_an_answer_of_the_program_alone():
 def test_a_summary_says_how_many_answered_and_caps_the_rest():
     far = camera_matrix(9e6, 900.0, 250.0, 200.0)
     found = summary("m", 2.0, [Attempt("m", 2.0, A, K, ms) for A, ms in ((K, 1.0), (far, 3.0), (None, 8.0))])
-
     assert (found["tests"], found["answered"], found["ms"]) == (3, pytest.approx(2 / 3), 3.0)
     assert (found["e_focal"], found["e_focal median"], found["e_OC"]) == (CAP_PERCENT / 2, CAP_PERCENT / 2, 0.0)
     nothing = summary("m", 2.0, [Attempt("m", 2.0, None, K, 1.0)])
@@ -186,7 +180,6 @@ def table_row(sequence, method, e, answered=1.0):
 def test_the_printed_means_are_those_of_the_thesis():
     rows = [table_row(name, method, 2.0) for name in tables.PRINTED_E_FOCAL for method in contests.METHODS]
     found = {row["method"]: row for row in tables.means(rows)}
-
     assert found[contests.ZERO_CURVES]["thesis"] == pytest.approx(15.82, abs=0.005)
     assert found["the best of the thesis's on each"]["thesis"] == pytest.approx(7.5, abs=0.005)
     assert found[PRODUCTION]["thesis"] is None and found[PRODUCTION]["here"] == pytest.approx(2.0)
@@ -211,7 +204,6 @@ def test_bounds_hold_and_the_reduced_one_ignores_the_error_of_F(tracks):
     true_K, rng = tracks.K[0], np.random.default_rng(3)
     change = true_K @ np.diag([1.1, 1.1, 1.0]) - true_K
     noisy = F + 1e-4 * rng.normal(size=(3, 3))
-
     for rough in (F, noisy):
         assert float(gap(essential(rough, true_K + change))) <= full_bound(F, rough, true_K, change)
     assert reduced_bound(F, true_K, change) == pytest.approx(full_bound(F, F, true_K, change))
@@ -224,14 +216,6 @@ def test_the_objective_of_exact_matrices_is_lowest_at_the_true_focal(tracks):
     assert len(panel_rows([panel])) == len(SCALES)
 
 
-def test_support_is_highest_where_curves_meet():
-    x = np.linspace(-1.0, 1.0, 21)
-    scores = support(np.array([1 + x, 1 - x, 1 + 0.5 * x, np.full(21, 2.5)]))
-
-    assert scores.argmax(axis=1)[:3].tolist() == [10, 10, 10]
-    assert scores[0, 10] == pytest.approx(2 + np.exp(-1.5 / SIGMA))
-
-
 def test_slow_methods_have_fewer_tests(tmp_path, tracks, monkeypatch):
     monkeypatch.setattr(setups, "two_levels", partial(two_levels, tracks=tracks), raising=False)
     setups.two_levels.__name__ = "two_levels"
@@ -239,7 +223,6 @@ def test_slow_methods_have_fewer_tests(tmp_path, tracks, monkeypatch):
         lab = Lab(tmp_path, tmp_path, tmp_path, [NON_ROBUST, "kruppa"], 2, 1, {"kruppa": 1}, 0, pool)
         rows = lab.run_contest(setups.two_levels)
         assert lab.run_contest(setups.two_levels) is rows, "an experiment is run once"
-
     assert {row["method"]: row["tests"] for row in rows} == {NON_ROBUST: 2, "kruppa": 1}
     assert lab.test_limits_text == "at most 1 of `kruppa`"
     assert parse_test_limit("kruppa=3") == ("kruppa", 3) and dict(TEST_LIMITS).keys() <= set(contests.METHODS)
@@ -250,7 +233,6 @@ ROWS = [{"method": "a", "outliers": 0.1, "ms": 1.5}, {"method": "a", "outliers":
 
 def test_a_document_says_all_that_is_promised():
     found = document("task", "about", {"seed": 0}, {"pairs": 2}, ROWS)
-
     assert problems(found) == []
     assert {"numpy", "numba", "pycolmap"} <= set(found["versions"])
     assert json.loads(json.dumps(found, allow_nan=False)) == found
@@ -273,7 +255,6 @@ def test_a_wrong_document_is_told(change, problem):
 def test_published_results_follow_the_schema():
     names = ("fundamental-*", "cameras*", "chapter?", "viewers", "corpus*", "trouble*")
     published = [path for name in names for path in RESULTS.glob(f"{name}.json")]
-
     assert {path.name: problems(json.loads(path.read_text("utf-8"))) for path in published} == {
         path.name: [] for path in published
     }
@@ -294,7 +275,6 @@ def swept(**times):
 def test_a_claim_is_judged_level_by_level(ransac, verdict):
     rows = swept(**{"ransac": ransac, "lev-ransac-thesis": (2, 4)})
     found = {claim.says: claim for claim in claims.claims_of_sweep(rows)}
-
     assert found["LEV-RANSAC is over three times as fast as RANSAC"].verdict == verdict
     assert found["LEV-RANSAC is faster than all others"].verdict == "not measured"
     assert "msac" in found["LEV-RANSAC is faster than all others"].numbers
@@ -314,7 +294,5 @@ def test_corners_are_paired_by_the_points_they_show(tmp_path):
     (tmp_path / "001.corners").write_text("1 2\n3 4\n5 6\n")
     (tmp_path / "002.corners").write_text("10 20\n30 40\n")
     (tmp_path / "nview-corners").write_text("2 0 *\n0 * 1\n* 1 1\n1 1 *\n")
-
     x1, x2 = load_corners(tmp_path, 1, 2)
-
     assert x1.tolist() == [[5, 6], [3, 4]] and x2.tolist() == [[10, 20], [30, 40]]

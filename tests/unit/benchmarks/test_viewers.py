@@ -26,7 +26,6 @@ def subject(model, place):
 
 def test_the_sample_is_as_it_should_be(tmp_path):
     row = viewers.check_model(subject(viewers.sample_model(), tmp_path), SILENT)
-
     assert row["ok"] == "yes"
     assert (row["Open3D"], row["trimesh"]) == ("5120 triangles + 2 pages", "5120 triangles")
     assert (row["open edges"], row["outward"], row["off center"]) == (0, 1.0, pytest.approx(0, abs=0.02))
@@ -48,7 +47,6 @@ STANDING = {
 )  # fmt: skip
 def test_a_model_stands_upright_when_people_would_turn_its_photos_alike(tmp_path, run, found, ok):
     stands = replace(subject(viewers.sample_model(), tmp_path), orientation=STANDING | found, run=run)
-
     assert viewers.check_model(stands, SILENT)["ok"] == ok
 
 
@@ -84,7 +82,6 @@ def test_what_is_wrong_with_a_surface_is_named(tmp_path, model, fault):
 )
 def test_what_viewers_do_not_like_is_named(tmp_path, part, value, fault):
     seen = {**SILENT, part: {**SILENT[part], **value}}
-
     assert viewers.check_model(subject(viewers.sample_model(), tmp_path), seen)["ok"] == fault
 
 

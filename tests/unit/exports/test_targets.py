@@ -27,7 +27,6 @@ def test_help_and_unknown_formats_and_plugins_name_all_formats(make_run):
     shown = CliRunner().invoke(main, ["export", "--help"]).stdout
     refused = call(make_run().out, "--format", "3mf")
     listed = CliRunner().invoke(main, ["plugins"]).stdout
-
     assert refused.exit_code == 2 and "no file format is named '3mf'" in refused.stderr
     for name, part in {**EXPORTERS, **SCENE_EXPORTERS}.items():
         assert f"\n  {name} " in shown and part.summary[:20] in shown
@@ -78,11 +77,9 @@ def test_an_export_replaces_an_earlier_one_and_nothing_else(make_run):
     folder = sfm_app.export_scene(run.out, "colmap")
     sfm_app.export_scene(run.out, "nerfstudio", folder)
     assert (folder / "transforms.json").exists() and not (folder / "sparse").exists()
-
     (folder / "sparse_pc.splat").write_text("hours of training")
     with pytest.raises(sfm_app.InputError, match=r"holds files that no export has written, such as sparse_pc\.splat"):
         sfm_app.export_scene(run.out, "colmap", folder)
-
     assert (folder / "transforms.json").exists()
     assert sorted(path.name for path in folder.parent.iterdir()) == ["colmap"]
 
@@ -99,10 +96,8 @@ def test_what_no_export_has_written_is_refused(make_run, tmp_path, kind):
         target.mkdir()
         (target / "export.json").write_text("[" * 100_000)
         (target / "mine.txt").write_text("mine")
-
     with pytest.raises(sfm_app.InputError) as caught:
         sfm_app.export_scene(run.out, "colmap", target)
-
     assert caught.value.hint == "name another place with -o"
 
 
@@ -149,7 +144,6 @@ def test_a_cloud_that_was_cut_off_or_removed_is_no_crash(make_run):
     cut = call(run.out, "--format", "laz")
     file.unlink()
     gone = call(run.out, "--format", "cloud-ply")
-
     assert (cut.exit_code, "are damaged" in cut.stderr) == (3, True), cut.stderr
     assert (gone.exit_code, "--from mesh" in gone.stderr) == (3, True), gone.stderr
 

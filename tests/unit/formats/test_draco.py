@@ -32,7 +32,6 @@ def corners(parts, values):
 def test_the_textured_model_is_the_same_as_without_compression(textured_ball, tmp_path):
     data = write_draco(textured_ball, "model")["model.glb"]
     small, plain = read(data, tmp_path), read(write_glb(textured_ball, "model")["model.glb"], tmp_path)
-
     places = [corners(parts, lambda part: np.asarray(part.visual.uv)) for parts in (small, plain)]
     np.testing.assert_allclose(places[0][:, :3], places[1][:, :3], atol=1e-6)  # 2 units in 20 bits
     np.testing.assert_allclose(places[0][:, 3:], places[1][:, 3:], atol=2e-5)
@@ -44,7 +43,6 @@ def test_the_textured_model_is_the_same_as_without_compression(textured_ball, tm
 
 def test_what_the_file_says_of_its_attributes_is_what_draco_decodes_to(textured_ball):
     found = tree(write_draco(textured_ball, "model")["model.glb"])
-
     assert DRACO in found["extensionsRequired"] and DRACO in found["extensionsUsed"]
     for primitive in found["meshes"][0]["primitives"]:
         assert set(primitive["extensions"][DRACO]["attributes"]) == set(primitive["attributes"])

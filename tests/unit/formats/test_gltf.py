@@ -60,7 +60,6 @@ def test_views_follow_each_other_and_every_accessor_is_used_once(model):
         for p in primitives
         for number in [*p["attributes"].values(), *([p["indices"]] if "indices" in p else [])]
     ]
-
     assert sorted(used) == list(range(len(tree["accessors"])))
     end = 0
     for view in tree["bufferViews"]:
@@ -71,7 +70,6 @@ def test_views_follow_each_other_and_every_accessor_is_used_once(model):
 
 def test_numbers_are_what_the_tree_says_of_them(model):
     tree, buffer = taken_apart(glb_of(model))
-
     for primitive in (p for mesh in tree["meshes"] for p in mesh["primitives"]):
         entry = tree["accessors"][primitive["attributes"]["POSITION"]]
         places = array(tree, buffer, primitive["attributes"]["POSITION"])
@@ -89,7 +87,6 @@ def test_numbers_are_what_the_tree_says_of_them(model):
 @pytest.mark.parametrize("name", ["ball", "textured_ball", "cloud"])
 def test_every_material_shows_colors_as_they_are_from_both_sides(name, request):
     tree, _ = taken_apart(glb_of(request.getfixturevalue(name)))
-
     assert tree["asset"] == {"version": "2.0", "generator": "sfm_app"}
     assert tree["extensionsUsed"] == ["KHR_materials_unlit"]
     assert "extensionsRequired" not in tree
@@ -102,7 +99,6 @@ def test_every_material_shows_colors_as_they_are_from_both_sides(name, request):
 def test_each_page_is_a_jpeg_and_a_primitive_of_its_own(textured_ball):
     tree, buffer = taken_apart(glb_of(textured_ball))
     primitives = tree["meshes"][0]["primitives"]
-
     assert len(primitives) == len(tree["images"]) == 2
     for primitive, page in zip(primitives, textured_ball.texture.pages, strict=True):
         base = tree["materials"][primitive["material"]]["pbrMetallicRoughness"]["baseColorTexture"]
@@ -148,7 +144,6 @@ def test_cameras_beside_a_lit_model_stay_unlit(lit_ball, cloud):
 def test_corners_keep_their_place_in_the_texture(textured_ball):
     surface, texture = textured_ball.surface, textured_ball.texture
     tree, buffer = taken_apart(glb_of(textured_ball))
-
     for page, primitive in enumerate(tree["meshes"][0]["primitives"]):
         here = texture.page == page
         corners = array(tree, buffer, primitive["indices"]).reshape(-1, 3)
@@ -213,7 +208,6 @@ def test_points_and_cameras(cloud):
 def test_cameras_of_gltf_stand_where_the_photos_were_taken(cloud):
     tree, _ = taken_apart(glb_of(cloud))
     nodes = [node for node in tree["nodes"] if "camera" in node]
-
     assert [node["name"] for node in nodes] == [camera.name for camera in cloud.cameras]
     for node, camera in zip(nodes, cloud.cameras, strict=True):
         world_from_gltf = np.array(node["matrix"]).reshape(4, 4).T

@@ -22,7 +22,6 @@ def rows(model):
 
 def test_a_surface_has_places_normals_and_the_colors_of_the_photos(ball):
     vertex = rows(ball)["vertex"]["data"]
-
     places, normals, colors = (
         np.stack([vertex[key] for key in keys], axis=1)
         for keys in (("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"))
@@ -53,7 +52,6 @@ def test_open3d_reads_surface_and_points(ball, cloud, tmp_path):
         (tmp_path / "model.ply").write_bytes(write_ply(model, "model")["model.ply"])
         mesh = o3d.io.read_triangle_mesh(str(tmp_path / "model.ply"))
         points = o3d.io.read_point_cloud(str(tmp_path / "model.ply"))
-
         np.testing.assert_array_equal(np.asarray(mesh.triangles), model.surface.faces)
         assert mesh.has_vertex_normals() == bool(len(model.surface.faces))
         count = len(model.surface.vertices)
@@ -69,7 +67,6 @@ def lines(files, start):
 def test_every_corner_has_its_vertex_its_place_in_the_texture_and_its_normal(textured_ball):
     surface, texture = textured_ball.surface, textured_ball.texture
     files = write_obj(textured_ball, "model")
-
     v, vt, vn = (np.array(lines(files, key), float) for key in ("v", "vt", "vn"))
     corners = np.array([[corner.split("/") for corner in face] for face in lines(files, "f")], int) - 1
     order = np.concatenate([np.flatnonzero(texture.page == page) for page in (0, 1)])
@@ -81,7 +78,6 @@ def test_every_corner_has_its_vertex_its_place_in_the_texture_and_its_normal(tex
 
 def test_the_materials_name_the_pages_beside_them(textured_ball):
     files = write_obj(textured_ball, "my model")
-
     assert list(files) == ["my model.obj", "my_model.mtl", "my_model_0.jpg", "my_model_1.jpg"]
     assert lines(files, "mtllib") == [["my_model.mtl"]]
     assert lines(files, "usemtl") == [["page_0"], ["page_1"]]
@@ -93,7 +89,6 @@ def test_the_materials_name_the_pages_beside_them(textured_ball):
 
 def test_normal_maps_are_beside_the_pages_and_the_model_is_lit(lit_ball):
     files = write_obj(lit_ball, "ball")
-
     assert list(files) == [
         "ball.obj", "ball.mtl", "ball_0.jpg", "ball_1.jpg", "ball_0_normals.jpg", "ball_1_normals.jpg",
     ]  # fmt: skip
@@ -132,10 +127,8 @@ def test_trimesh_and_open3d_show_both_pages(textured_ball, tmp_path):
     for name, data in write_obj(textured_ball, "my model").items():
         (tmp_path / name).write_bytes(data)
     path = tmp_path / "my model.obj"
-
     parts = trimesh.load_scene(path, process=False).geometry.values()
     model = load_open3d().io.read_triangle_model(str(path))
-
     colors = sorted(tuple(part.visual.to_color().vertex_colors[:, :3].mean(axis=0)) for part in parts)
     np.testing.assert_allclose(colors, [(30, 60, 200), (200, 40, 30)], atol=4)
     assert sum(len(part.mesh.triangles) for part in model.meshes) == len(textured_ball.surface.faces)
@@ -168,7 +161,6 @@ def test_corners_project_to_the_corners_of_the_photo(cloud):
         corners = frustum_corners(camera, 0.4)
         R, t = camera.cam_from_world[:, :3], camera.cam_from_world[:, 3]
         seen = (corners @ R.T + t) @ camera.K.T
-
         np.testing.assert_allclose(seen[0], 0, atol=1e-9)
         np.testing.assert_allclose(seen[1:, 2], 0.4)
         expected = [(0, 0), (640, 0), (640, 480), (0, 480)]
@@ -185,7 +177,6 @@ def test_each_camera_is_a_pyramid_of_eight_edges(cloud):
 def test_dots_lie_on_the_edges(cloud):
     corners, lines = camera_lines(cloud)
     dots, colors = camera_dots(cloud)
-
     assert len(dots) == len(colors)
     away = [
         np.linalg.norm(np.cross(dots - corners[a], dots - corners[b]), axis=1) / np.linalg.norm(corners[a] - corners[b])
