@@ -6,17 +6,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import walks
 from benchmarks.synthetic.matches import LEAST_DEPARTURE_PX, TownOptions, make_town_graph, make_two_motions
-from benchmarks.synthetic.walks import (
-    WalkOptions,
-    WallWalkOptions,
-    orbit,
-    panorama,
-    project_through_shutter,
-    row_poses,
-    walk,
-    wall_walk,
-)
 from sfm_app.errors import ConfigError
 from sfm_app.geometry.epipolar import sampson_distance
 from sfm_app.synthetic.cameras import camera_center, make_camera
@@ -36,7 +27,7 @@ def miss_of_axes(views):
 @pytest.mark.parametrize(("photos", "sweep_deg"), [(12, 80.0), (8, 360.0)])
 def test_in_an_orbit_all_axes_meet_at_one_distance(photos, sweep_deg):
     aim = np.array([0.5, 1.0, -0.3])
-    views = orbit(make_camera(96, 64), photos, sweep_deg, distance=4.0, aim=tuple(aim))
+    views = walks.orbit(make_camera(96, 64), photos, sweep_deg, distance=4.0, aim=tuple(aim))
     poses = np.array(list(views.cam_from_world.values()))
     centers = np.array([camera_center(pose) for pose in poses])
     assert len(poses) == photos and miss_of_axes(views).max() < 1e-9
@@ -47,7 +38,7 @@ def test_in_an_orbit_all_axes_meet_at_one_distance(photos, sweep_deg):
 
 
 def test_a_panorama_is_taken_from_one_spot():
-    views = panorama(make_camera(96, 64), photos=5, step_deg=10.0, center=(1.0, 2.0, 3.0))
+    views = walks.panorama(make_camera(96, 64), photos=5, step_deg=10.0, center=(1.0, 2.0, 3.0))
     poses = list(views.cam_from_world.values())
     turned = [np.degrees(np.arccos(np.clip(a[2, :3] @ b[2, :3], -1, 1))) for a, b in combinations(poses, 2)]
     assert np.allclose([camera_center(pose) for pose in poses], [1.0, 2.0, 3.0])
@@ -56,17 +47,17 @@ def test_a_panorama_is_taken_from_one_spot():
 
 @pytest.mark.slow
 def test_a_walk_past_a_wall_turns_its_head():
-    views = wall_walk(make_camera(120, 80), WallWalkOptions(photos=8, length=6.0), seed=1)
+    views = walks.wall_walk(make_camera(120, 80), walks.WallWalkOptions(photos=8, length=6.0), seed=1)
     poses = np.array(list(views.cam_from_world.values()))
     eyes = np.array([camera_center(pose) for pose in poses])
     assert np.allclose(np.diff(eyes[:, 0]), 6.0 / 7) and np.all((eyes[:, 2] > 5) & (eyes[:, 2] < 7))
     ways = poses[:, 2, :3]
     angles = np.degrees(np.arccos(np.clip(ways @ ways.T, -1, 1)))
     assert np.all(ways[:, 2] < -0.7) and 10 < angles.max() < 80, "parallel axes would leave the focal undetermined"
-    other = wall_walk(make_camera(120, 80), WallWalkOptions(photos=8, length=6.0), seed=2)
+    other = walks.wall_walk(make_camera(120, 80), walks.WallWalkOptions(photos=8, length=6.0), seed=2)
     assert not np.allclose(poses, np.array(list(other.cam_from_world.values())))
     with pytest.raises(ConfigError, match="photos, length or roll_deg"):
-        WallWalkOptions(photos=1)
+        walks.WallWalkOptions(photos=1)
 
 
 CAMERA = make_camera(640, 480)
@@ -77,44 +68,44 @@ def turn_deg(a, b):
 
 
 def test_a_walk_without_shaking_goes_straight_on_at_its_speed():
-    path = walk(WalkOptions(seconds=2.0, speed=1.4, shake=0.0, heading_deg=90.0))
+    path = walks.walk(walks.WalkOptions(seconds=2.0, speed=1.4, shake=0.0, heading_deg=90.0))
     first, last = path.poses(np.array([0.0, 2.0]))
     assert camera_center(last) - camera_center(first) == pytest.approx([2.8, 0.0, 0.0], abs=1e-9)
     assert turn_deg(first, last) == pytest.approx(0.0, abs=1e-5)
 
 
 def test_the_fastest_turn_is_as_fast_as_asked():
-    path = walk(WalkOptions(seconds=4.0, swing_deg_s=60.0, shake=0.0))
+    path = walks.walk(walks.WalkOptions(seconds=4.0, swing_deg_s=60.0, shake=0.0))
     poses = path.poses(np.linspace(0.0, 4.0, 401))
     rates = [turn_deg(a, b) / 0.01 for a, b in itertools.pairwise(poses)]
     assert 59.0 < max(rates) < 61.0
 
 
 def test_the_middle_row_is_seen_from_the_pose_of_the_frame():
-    path = walk(WalkOptions(swing_deg_s=60.0))
-    rows = row_poses(path, 1.0, 0.03, 481)
+    path = walks.walk(walks.WalkOptions(swing_deg_s=60.0))
+    rows = walks.row_poses(path, 1.0, 0.03, 481)
     assert rows[240] == pytest.approx(path.poses(np.array([1.0]))[0], abs=1e-12)
     assert rows[0] == pytest.approx(path.poses(np.array([1.0 - 0.015 * 480 / 481]))[0], abs=1e-12)
 
 
 def test_a_point_is_seen_from_the_pose_of_its_own_row():
-    path, readout = walk(WalkOptions(swing_deg_s=90.0)), 0.03
+    path, readout = walks.walk(walks.WalkOptions(swing_deg_s=90.0)), 0.03
     (middle,) = path.poses(np.array([1.0]))
     points = (np.random.default_rng(0).uniform([-1, -1, 4], [1, 1, 7], (50, 3)) - middle[:, 3]) @ middle[:, :3]
-    x = project_through_shutter(CAMERA, path, 1.0, readout, points)
+    x = walks.project_through_shutter(CAMERA, path, 1.0, readout, points)
     inside = np.all((x > 0) & (x < (640, 480)), axis=1)
     assert np.count_nonzero(inside) > 10
     for point, (column, row) in zip(points[inside], x[inside], strict=True):
         (pose,) = path.poses(np.array([1.0 + readout * (row / 480 - 0.5)]))
         seen = CAMERA.K @ (pose[:, :3] @ point + pose[:, 3])
         assert seen[:2] / seen[2] == pytest.approx([column, row], abs=1e-4)
-    still = project_through_shutter(CAMERA, path, 1.0, 0.0, points)
+    still = walks.project_through_shutter(CAMERA, path, 1.0, 0.0, points)
     assert 1.0 < np.median(np.linalg.norm(x - still, axis=1)) < 20.0
 
 
 def test_points_behind_the_camera_are_nowhere():
-    path = walk(WalkOptions(shake=0.0))
-    x = project_through_shutter(CAMERA, path, 0.0, 0.02, np.array([[0.0, 1.5, 5.0], [0.0, 1.5, -5.0]]))
+    path = walks.walk(walks.WalkOptions(shake=0.0))
+    x = walks.project_through_shutter(CAMERA, path, 0.0, 0.02, np.array([[0.0, 1.5, 5.0], [0.0, 1.5, -5.0]]))
     assert np.isnan(x[0]).all() and np.isfinite(x[1]).all()
 
 
