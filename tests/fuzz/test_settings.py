@@ -55,17 +55,10 @@ def test_strange_settings_are_refused(tmp_path, case):
     result = CliRunner().invoke(main, ["config", "--config", str(path)])
     assert result.exit_code == 2 and "error: " in result.stderr
     assert all(line.isprintable() for line in result.stderr.splitlines())
-
-
-@pytest.mark.parametrize("case", [case for case in STRANGE if len(STRANGE[case]) < MOST_TOML_BYTES])
-def test_strange_assignments_are_refused(case):
-    name, _, value = STRANGE[case].partition("=")
-    try:
-        settings = parse_assignment(f"{name}={value}")
-        Settings.from_mapping(settings)
-    except ConfigError:
-        return
-    raise AssertionError(case)
+    if len(STRANGE[case]) < MOST_TOML_BYTES:
+        name, _, value = STRANGE[case].partition("=")
+        with pytest.raises(ConfigError):
+            Settings.from_mapping(parse_assignment(f"{name}={value}"))
 
 
 def test_a_file_as_large_as_may_be_is_read(tmp_path):

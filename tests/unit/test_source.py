@@ -136,17 +136,6 @@ def test_texts_have_one_encoding_and_one_end_of_lines():
     assert found == [("colmap/perspective.py", "write_text")]  # COLMAP's own
 
 
-@pytest.mark.parametrize(
-    ("text", "count"),
-    [
-        ("open(path)", 1), ("path.open('w')", 1), ("run(command, text=True)", 1), ("path.read_text()", 1),
-        ("path.open('rb')", 0), ("Image.open(path)", 0), ("run(command)", 0),
-    ],
-)  # fmt: skip
-def test_calls_that_open_texts_are_found(text, count):
-    assert len(list(text_calls(text))) == count
-
-
 def test_processes_are_spawned():
     nodes = ast.walk(ast.parse((PACKAGE / "synthetic" / "photo_folder.py").read_text(encoding="utf-8")))
     calls = [node for node in nodes if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "get_context"]
@@ -204,18 +193,3 @@ def test_every_module_of_a_method_names_its_equation_or_paper():
     modules = texts(*METHODS)
     assert len(modules) > 20
     assert [name for name, text in modules.items() if not POINTER.search(header(text))] == []
-
-
-@pytest.mark.parametrize(
-    ("text", "names"),
-    [
-        ("BARE = 3.0", ["BARE"]), ("A, _B = 1, 2.5", ["A, _B"]), ('MUTE = 3.0\n"""Thresholds."""', ["MUTE"]),
-        ("TABLE = {7: 160.0}", ["TABLE"]), ("SCALED: float = 2 * np.log(50)", ["SCALED"]),
-        ('PAPER = 2.5\n"""Of LMedS (Rousseeuw and Leroy 1987)."""', []),
-        ('class LoopOptions:\n    a: float = 1.0\n    """By hand."""\n    b: int = 2\n    c: int', ["LoopOptions.b"]),
-        ('class LoopOptions:\n    """Thesis 4.4."""\n    a: float = 1.0', []),
-        ("class Other:\n    a: float = 1.0", []), ("X, Y = range(2)\nWORD = 'seven'\nlower = 3", []),
-    ],
-)  # fmt: skip
-def test_constants_without_a_source_are_found(text, names):
-    assert silent(text) == names

@@ -12,9 +12,7 @@ from typing import NamedTuple
 import pytest
 
 import benchmarks
-from benchmarks.anywhere import wheels
 from benchmarks.anywhere.dockerfile import read_stages
-from benchmarks.anywhere.pythons import find_pythons, minor_versions
 from benchmarks.common.command_line import ensure_single_thread
 from benchmarks.common.processes import environment, module_command
 from benchmarks.hundred.command import cpu_s, held_mb
@@ -108,25 +106,6 @@ def test_a_step_that_is_not_understood_is_an_error(line, tmp_path):
     path.write_text(f"FROM debian:trixie-slim\n{line}\n")
     with pytest.raises(ValueError, match="not understood"):
         read_stages(path)
-
-
-def test_a_python_that_does_not_start_is_missing(tmp_path):
-    broken = tmp_path / "python"
-    broken.write_text("#!/bin/sh\nexit 127\n")
-    broken.chmod(0o755)
-    assert find_pythons([str(broken), str(tmp_path / "none"), sys.executable]) == {
-        f"{sys.version_info.major}.{sys.version_info.minor}": sys.executable
-    }
-    assert minor_versions() == ["3.11", "3.12", "3.13"]
-
-
-def test_what_is_needed_depends_on_the_platform():
-    found = {}
-    for system, processor in (("linux", "x86_64"), ("darwin", "arm64")):
-        found[system] = {"sfm-app": set()}
-        wheels.needed("sfm-app", wheels.markers("3.12", system, processor), found[system])
-    assert {"open3d-cpu", "numpy", "contourpy"} <= set(found["linux"]) and "open3d" not in found["linux"]
-    assert {"open3d", "numpy", "dash"} <= set(found["darwin"]) and "open3d-cpu" not in found["darwin"]
 
 
 HOLDS = "import sys; held = bytearray({mb}_000_000); print(flush=True); sys.stdin.read()"

@@ -1,11 +1,9 @@
 import numpy as np
 import pytest
-from PIL import Image
 
 from benchmarks.surface.measure import cost
 from benchmarks.surface.photos import likeness, psnr_db
 from benchmarks.surface.rendered.truth import seen_places, truth_scores
-from benchmarks.surface.sets import SurfaceSet, first_photos, surface_set
 from benchmarks.surface.sparse_poisson import points_ply
 from benchmarks.surface.worker import StageCost
 from sfm_app.geometry.poses import Similarity
@@ -134,24 +132,6 @@ def test_cost_is_that_of_all_stages_but_the_files():
     assert row["MB mesh"] == 700 and row["s of files"] == 1.0 and row["failed"] == ""
     stopped = cost({"scene": StageCost("", 50.0, 900), "depth_maps": StageCost("depth_maps: no", None, 100)})
     assert stopped["failed"] == "depth_maps: no" and stopped["seconds together"] is None
-
-
-def test_sets_are_rendered_scenes_or_folders_and_parts_are_the_same_files(tmp_path):
-    images = tmp_path / "data" / "pond" / "images"
-    images.mkdir(parents=True)
-    for k in range(4):
-        Image.new("RGB", (8, 8)).save(images / f"{k}.png")
-    whole = surface_set("pond", tmp_path / "data", tmp_path)
-    assert whole.count == 4 and whole.truth is None
-    part = first_photos(whole, 3, tmp_path / "cache")
-    assert [path.name for path in sorted(part.photos.iterdir())] == ["0.png", "1.png", "2.png"]
-    assert (
-        isinstance(part, SurfaceSet)
-        and part.count == 3
-        and all(path.samefile(images / path.name) for path in part.photos.iterdir())
-    )
-    with pytest.raises(ValueError, match="'lake' is neither"):
-        surface_set("lake", tmp_path / "data", tmp_path)
 
 
 def test_points_are_written_as_colmap_reads_them(tmp_path):

@@ -46,19 +46,6 @@ def test_cameras_are_dotted_lines_behind_the_points(cloud):
     assert set(rows(cloud)) == {"vertex"}
 
 
-def test_open3d_reads_surface_and_points(ball, cloud, tmp_path):
-    o3d = load_open3d()
-    for model in (ball, cloud):
-        (tmp_path / "model.ply").write_bytes(write_ply(model, "model")["model.ply"])
-        mesh = o3d.io.read_triangle_mesh(str(tmp_path / "model.ply"))
-        points = o3d.io.read_point_cloud(str(tmp_path / "model.ply"))
-        np.testing.assert_array_equal(np.asarray(mesh.triangles), model.surface.faces)
-        assert mesh.has_vertex_normals() == bool(len(model.surface.faces))
-        count = len(model.surface.vertices)
-        np.testing.assert_allclose(np.asarray(points.points)[:count], model.surface.vertices, atol=1e-6)
-        np.testing.assert_allclose(255 * np.asarray(points.colors)[:count], model.surface.colors, atol=0.01)
-
-
 def lines(files, start):
     text = next(iter(files.values())).decode()
     return [line.split()[1:] for line in text.splitlines() if line.split()[0] == start]
