@@ -143,16 +143,12 @@ def test_no_page_asks_other_hosts(site):
 
 
 @pytest.mark.slow
-def test_the_search_knows_the_pages(site):
+def test_the_search_knows_the_pages_and_docstrings_are_on_them(site):
     index = (site / "searchindex.js").read_text(encoding="utf-8")
     assert all(
         word in index for word in ("how-to/turntable", "reference/estimators", "estimate_fundamental", "turntabl")
     )
     assert (site / "search.html").exists()
-
-
-@pytest.mark.slow
-def test_docstrings_are_on_the_pages(site):
     text = (site / "reference" / "estimators.html").read_text(encoding="utf-8")
     assert 'id="sfm_app.estimate_fundamental"' in text
     assert "many of which may be wrong" in text
@@ -172,14 +168,10 @@ def test_every_entry_of_a_record_is_listed():
 
 
 @pytest.mark.slow
-def test_every_file_of_a_run_is_listed(finished):
+def test_every_file_of_a_run_and_every_entry_of_its_manifest_are_listed(finished):
     left = {path.name for path in (finished / "out").iterdir() if not path.name.startswith(".")}
     assert {"model.glb", "report.html", "manifest.json"} <= left
     assert left <= NAMED
-
-
-@pytest.mark.slow
-def test_every_entry_of_the_manifest_is_listed(finished):
     manifest = json.loads((finished / "out" / "manifest.json").read_text(encoding="utf-8"))
     assert set(manifest) <= NAMED
     assert all(set(record) <= NAMED for record in manifest["stages"].values())

@@ -2,7 +2,6 @@
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -132,17 +131,6 @@ def test_the_result_is_compared_with_the_truth(rendered, scene, model, tmp_path)
     assert re.search(r"found  fx .* 1 % off\n", text)
     assert "took        2 s, and 1 s to render the photos" in text
     assert max(len(line) for line in fold_lines(text.splitlines()) if str(tmp_path) not in line) <= 80
-
-
-@pytest.mark.slow
-def test_a_surface_partly_beside_the_truth_is_less_accurate(rendered, scene, model, tmp_path):
-    truth = rendered[1]
-    lifted = model.surface.vertices + np.array([0.0, 0.02 * np.linalg.norm(np.ptp(truth.vertices, axis=0)), 0.0])
-    beside = replace(model, surface=replace(model.surface, vertices=lifted), texture=None)
-    result = evaluate(Run(tmp_path, None, scene, None, None, {}), scene, beside, truth, (1.0, 2.0), tmp_path)
-    # walls slide along themselves, the ground rises
-    assert 5.0 < result.surface_accuracy_percent < 90.0
-    assert result.pages_px == []
 
 
 @pytest.mark.slow

@@ -37,23 +37,6 @@ def test_photo_and_camera_change_alike(change):
     assert center == pytest.approx((photo_sets.changed_camera(K, todo, (800, 600)) @ direction)[:2], abs=0.05)
 
 
-@pytest.mark.parametrize("size", [(800, 600), (600, 800), (333, 1000)])
-@pytest.mark.parametrize("kind", photo_sets.ONE_SIZE)
-def test_photos_of_any_size_are_brought_to_one(kind, size):
-    todo = photo_sets.steps(f"{kind}:500,420")
-    photo = photo_sets.changed_photo(Image.new("RGB", size, (255, 255, 255)), todo)
-    shown = np.argwhere(np.asarray(photo.convert("L")) > 128)
-    (top, left), (bottom, right) = shown.min(axis=0), shown.max(axis=0) + 1
-    assert photo.size == (500, 420)
-    if kind == "fill":
-        assert (left, top, right, bottom) == (0, 0, 500, 420)
-    else:
-        assert (right - left) / (bottom - top) == pytest.approx(size[0] / size[1], abs=0.01)
-        assert (right - left == 500) != (bottom - top == 420)
-        assert (left, top) == (0, 0) or kind == "pad"
-        assert max(abs(left + right - 500), abs(top + bottom - 420)) <= 1 or kind == "corner"
-
-
 def test_who_took_photos_that_were_brought_to_one_size_is_not_told(tmp_path):
     (tmp_path / "set" / "images").mkdir(parents=True)
     spotted(0, 0, (80, 60)).save(tmp_path / "set" / "images" / "a.png")

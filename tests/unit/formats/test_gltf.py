@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from sfm_app.formats.draco import DRACO, write_draco
 from sfm_app.formats.exporters import jpeg, split_corners
 from sfm_app.formats.gltf import linear_colors, write_glb
 from sfm_app.meshing.ray_casting import load_open3d
@@ -254,3 +255,62 @@ def test_a_page_of_noise_is_written_too():
     data = jpeg(page)
     assert len(data) > page.shape[0] * page.shape[1]  # more than Pillow expects
     assert np.abs(np.asarray(Image.open(io.BytesIO(data))).astype(int) - page).mean() < 10
+
+
+def read(data, folder):
+    (folder / "model.glb").write_bytes(data)
+    return list(trimesh.load_scene(folder / "model.glb", process=False).geometry.values())
+
+
+def corners(parts, values):
+    """Rows of values at all corners of triangles, behind the places of the corners, sorted."""
+    rows = [
+        np.hstack([part.vertices, values(part)])[part.faces].reshape(-1, 3 + values(part).shape[1]) for part in parts
+    ]
+    found = np.concatenate(rows)
+    return found[np.lexsort(np.round(found[:, ::-1], 4).T)]
+
+
+def test_the_textured_model_is_the_same_as_without_compression(textured_ball, tmp_path):
+    data = write_draco(textured_ball, "model")["model.glb"]
+    small, plain = read(data, tmp_path), read(write_glb(textured_ball, "model")["model.glb"], tmp_path)
+    places = [corners(parts, lambda part: np.asarray(part.visual.uv)) for parts in (small, plain)]
+    np.testing.assert_allclose(places[0][:, :3], places[1][:, :3], atol=1e-6)  # 2 units in 20 bits
+    np.testing.assert_allclose(places[0][:, 3:], places[1][:, 3:], atol=2e-5)
+    for one, other in zip(small, plain, strict=True):
+        pages = [np.asarray(part.visual.material.baseColorTexture) for part in (one, other)]
+        np.testing.assert_array_equal(*pages)
+    assert len(data) < 0.7 * len(write_glb(textured_ball, "model")["model.glb"])
+
+
+def test_what_the_file_says_of_its_attributes_is_what_draco_decodes_to(textured_ball):
+    found, _ = taken_apart(write_draco(textured_ball, "model")["model.glb"])
+    assert DRACO in found["extensionsRequired"] and DRACO in found["extensionsUsed"]
+    for primitive in found["meshes"][0]["primitives"]:
+        assert set(primitive["extensions"][DRACO]["attributes"]) == set(primitive["attributes"])
+        accessors = [found["accessors"][number] for number in primitive["attributes"].values()]
+        assert len({entry["count"] for entry in accessors}) == 1
+        assert all("bufferView" not in entry for entry in accessors)
+        low, high = (found["accessors"][primitive["attributes"]["POSITION"]][key] for key in ("min", "max"))
+        assert np.all(np.array(low) >= -1.00001) and np.all(np.array(high) <= 1.00001)
+
+
+def test_colors_of_vertices_keep_sixteen_bits(ball, tmp_path):
+    import DracoPy
+
+    found, buffer = taken_apart(write_draco(ball, "model")["model.glb"])
+    (primitive,) = found["meshes"][0]["primitives"]
+    view = found["bufferViews"][primitive["extensions"][DRACO]["bufferView"]]
+    decoded = DracoPy.decode(buffer[view["byteOffset"] : view["byteOffset"] + view["byteLength"]])
+
+    color = next(
+        a for a in decoded.attributes if a["unique_id"] == primitive["extensions"][DRACO]["attributes"]["COLOR_0"]
+    )
+    accessor = found["accessors"][primitive["attributes"]["COLOR_0"]]
+    assert accessor["normalized"] is True and accessor["componentType"] == 5123
+    at = np.linalg.norm(ball.surface.vertices[:, None] - np.asarray(decoded.points)[None], axis=2).argmin(axis=1)
+    np.testing.assert_allclose(np.asarray(color["data"])[at] / 65535, linear_colors(ball.surface.colors), atol=1e-5)
+
+
+def test_points_are_those_of_a_plain_file(cloud):
+    assert write_draco(cloud, "points") == write_glb(cloud, "points")
