@@ -43,11 +43,8 @@ def laid_out(tools, tmp_path_factory):
 
 
 def test_every_public_name_is_on_a_page():
-    shown = set(
-        re.findall(
-            r"auto(?:function|class|exception|data):: (?:sfm_app\.)?([A-Za-z_]+)(?:\(\))?$", REFERENCE, re.MULTILINE
-        )
-    )
+    directive = r"auto(?:function|class|exception|data):: (?:sfm_app\.)?([A-Za-z_]+)(?:\(\))?$"
+    shown = set(re.findall(directive, REFERENCE, re.MULTILINE))
     assert set(sfm_app.__all__) <= shown
 
 
@@ -111,11 +108,9 @@ def test_a_second_time_nothing_is_written(laid_out, tools):
 
 def test_links_are_moved_and_code_is_not(tools):
     page = DOCS / "how-to" / "video.md"
-    text = (
-        "[a](../../benchmarks/README.md#rules) `[b](../../x.md)` [c](../../examples) [d](https://github.com/x) [e](#f)"
-    )
+    text = "[a](../../benchmarks/README.md#rules) `[b](../../x.md)` [c](../../examples) [d](https://a.org/x) [e](#f)"
     moved = tools[1].relink(text, page, [ROOT / "benchmarks" / "README.md"], set())
-    assert moved == "[a](../benchmarks/README.md#rules) `[b](../../x.md)` c [d](https://github.com/x) [e](#f)"
+    assert moved == "[a](../benchmarks/README.md#rules) `[b](../../x.md)` c [d](https://a.org/x) [e](#f)"
 
 
 @pytest.fixture(scope="module")
@@ -145,9 +140,8 @@ def test_no_page_asks_other_hosts(site):
 @pytest.mark.slow
 def test_the_search_knows_the_pages_and_docstrings_are_on_them(site):
     index = (site / "searchindex.js").read_text(encoding="utf-8")
-    assert all(
-        word in index for word in ("how-to/turntable", "reference/estimators", "estimate_fundamental", "turntabl")
-    )
+    words = ("how-to/turntable", "reference/estimators", "estimate_fundamental", "turntabl")
+    assert all(word in index for word in words)
     assert (site / "search.html").exists()
     text = (site / "reference" / "estimators.html").read_text(encoding="utf-8")
     assert 'id="sfm_app.estimate_fundamental"' in text
@@ -156,11 +150,8 @@ def test_the_search_knows_the_pages_and_docstrings_are_on_them(site):
 
 
 PAGE = (ROOT / "docs" / "reference" / "output-files.md").read_text(encoding="utf-8")
-NAMED = {
-    name.rstrip("/")
-    for row in re.findall(r"^\| (`[^|]+) \|", PAGE, re.MULTILINE)
-    for name in re.findall(r"`([^`]+)`", row)
-}
+ROWS = re.findall(r"^\| (`[^|]+) \|", PAGE, re.MULTILINE)
+NAMED = {name.rstrip("/") for row in ROWS for name in re.findall(r"`([^`]+)`", row)}
 
 
 def test_every_entry_of_a_record_is_listed():

@@ -202,9 +202,8 @@ def test_compare_estimators(tmp_path, no_screen, capsys):
 
     said = capsys.readouterr().out
     assert names["methods"] == methods[:2] and "left out: no estimator is named 'not-installed'" in said
-    assert (
-        set(names["errors"]) == set(names["seconds"]) == {(name, share) for name in methods[:2] for share in (0.2, 0.5)}
-    )
+    pairs = {(name, share) for name in methods[:2] for share in (0.2, 0.5)}
+    assert set(names["errors"]) == set(names["seconds"]) == pairs
     for share in (0.2, 0.5):
         ours, thesis = (np.median(names["errors"][name, share]) for name in methods[:2])
         assert 0.01 < ours < 0.4 and ours < thesis < 1.0
@@ -256,6 +255,5 @@ def test_the_template_keeps_the_contract_of_estimators(installed_template):
         check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
-    assert (
-        int(re.search(r"(\d+) passed", done.stdout)[1]) >= 20
-    )  # 15 of the contract, one on Linux only, and 6 of its own
+    # 15 of the contract, one on Linux only, and 6 of its own
+    assert int(re.search(r"(\d+) passed", done.stdout)[1]) >= 20

@@ -115,8 +115,7 @@ def test_all_stages_are_compiled(tmp_path):
         "import pathlib, sys; from sfm_app import jit; jit.WARM = pathlib.Path(sys.argv[1]) / 'cache' / 'warm'; "
         "from sfm_app import warm_up; warm_up.main()"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=False, timeout=HANGS_S
-    )
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=HANGS_S)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "model" / "model.glb").exists() and (tmp_path / "cache" / "warm").exists()

@@ -335,9 +335,8 @@ library.exit(7)
 @pytest.mark.skipif(lacks(Ability.EXIT_HANDLERS), reason="the C library has no on_exit")
 @pytest.mark.parametrize(("first", "said"), [("", "cleaning up"), ("end_at_exit()", "")])
 def test_a_process_that_a_library_ends_cleans_nothing_up_while_its_threads_work(first, said):
-    done = subprocess.run(
-        [sys.executable, "-c", LIBRARY_EXITS.format(first)], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-c", LIBRARY_EXITS.format(first)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (7, said)
 
 

@@ -78,9 +78,8 @@ def test_the_image_copies_what_it_may_and_runs_as_nobody_special():
     build, last = read_stages(ROOT / "docker" / "Dockerfile")
     allowed = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
     steps = [step for stage in (build, last) for step in stage.steps]
-    copied = {
-        word for step in steps if step.keyword == "COPY" and not step.option("from") for word in step.words()[:-1]
-    }
+    from_here = (step for step in steps if step.keyword == "COPY" and not step.option("from"))
+    copied = {word for step in from_here for word in step.words()[:-1]}
     assert copied == allowed
     assert all((ROOT / name).exists() for name in copied)
     (user,) = (step.text for step in last.steps if step.keyword == "USER")
@@ -90,8 +89,7 @@ def test_the_image_copies_what_it_may_and_runs_as_nobody_special():
 def test_compose_starts_every_role_with_the_kernels_of_the_image():
     services = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text(encoding="utf-8"))["services"]
     entries = [service["entrypoint"] for service in services.values() if "entrypoint" in service]
-    (own,) = (
-        step.words() for step in read_stages(ROOT / "docker" / "Dockerfile")[-1].steps if step.keyword == "ENTRYPOINT"
-    )
+    steps = read_stages(ROOT / "docker" / "Dockerfile")[-1].steps
+    (own,) = (step.words() for step in steps if step.keyword == "ENTRYPOINT")
     assert len(entries) == 2
     assert {entry[0] for entry in entries} == {own[0]}

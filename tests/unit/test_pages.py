@@ -113,11 +113,8 @@ def test_modules_that_are_named_exist(page):
 
 SKIPPED = {".venv", "node_modules", ".git", "build", "dist", "demo", "_build", ".pytest_cache"}
 LINK = re.compile(r"!?\[[^\]]*\]\(([^()\s]+(?:\([^()\s]*\)[^()\s]*)*)(?: \"[^\"]*\")?\)")
-MARKDOWN = [
-    path
-    for path in sorted(ROOT.rglob("*.md"))
-    if not SKIPPED & set(path.relative_to(ROOT).parts) and not path.is_symlink()
-]
+FILES = sorted(path for path in ROOT.rglob("*.md") if not path.is_symlink())
+MARKDOWN = [path for path in FILES if not SKIPPED & set(path.relative_to(ROOT).parts)]
 
 
 def links(page):

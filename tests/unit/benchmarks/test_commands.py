@@ -38,9 +38,8 @@ COMMANDS = [name for name in packages() if name not in SHARED]
 def test_every_folder_is_a_command_or_shared():
     found = {name for name, folder in packages().items() if (folder / "__main__.py").exists()}
     assert found == set(COMMANDS)
-    assert {path.parent for path in PACKAGE.rglob("*.py") if "node_modules" not in path.parts} == set(
-        packages().values()
-    )
+    folders = {path.parent for path in PACKAGE.rglob("*.py") if "node_modules" not in path.parts}
+    assert folders == set(packages().values())
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -69,13 +69,8 @@ def test_an_offset_camera_is_fitted_and_what_is_off_remains():
 
 
 def left_behind(folder, before, after):
-    cameras = {
-        "a": {
-            "identifiable": before is not None,
-            "K": (K if before is None else before).tolist(),
-            "spread": {"fx": 10.0, "fy": 10.0},
-        }
-    }
+    told = {"identifiable": before is not None, "K": (K if before is None else before).tolist()}
+    cameras = {"a": told | {"spread": {"fx": 10.0, "fy": 10.0}}}
     refined = {"a": {"K": after[0].tolist(), "deviations": after[1], "determined": []}}
     camera_of = {"p.png": "a", "q.png": "a"}
     for name, found in (("calibration", cameras), ("scene", refined)):
@@ -141,10 +136,8 @@ def stated_row(in_sd, identifiable="no", error=0.1):
 def test_one_parameter_of_twenty_may_be_off_and_no_exception_passes():
     fine = [stated_row(1.0)] * 19 + [stated_row(4.0)]
     assert [demand.met for demand in demands([run_row()], fine)] == [True] * 5
-    broken = demands(
-        [run_row(**{"exit code": 1, "bar met": "no: x", "clearly behind stock": "AUC@5"})],
-        [*fine[1:], stated_row(9.0, "yes", 16.0)],
-    )
+    bad = run_row(**{"exit code": 1, "bar met": "no: x", "clearly behind stock": "AUC@5"})
+    broken = demands([bad], [*fine[1:], stated_row(9.0, "yes", 16.0)])
     assert [demand.met for demand in broken] == [False] * 5
     assert not demands([run_row(**{"exit code": None})], fine)[0].met
 

@@ -78,10 +78,8 @@ def test_errors_are_counted_in_stated_deviations():
 
 
 def test_of_several_cameras_the_median_and_the_worst_count():
-    truth = {
-        name: photo_sets.TrueCamera(camera_matrix(f, f, 400.0, 300.0))
-        for name, f in zip("abc", (500, 1000, 800), strict=True)
-    }
+    focals = zip("abc", (500, 1000, 800), strict=True)
+    truth = {name: photo_sets.TrueCamera(camera_matrix(f, f, 400.0, 300.0)) for name, f in focals}
     cameras = {name: found(camera_matrix(800.0, 800.0, 400.0, 300.0), identifiable=name == "a") for name in "abc"}
     row = selfcal_score.row("set", MethodResult("zero-curves", cameras, 0.1, 3), truth)
     assert (row["known"], row["e_focal %"], row["worst e_focal %"]) == ("1/3", 20.0, 60.0)

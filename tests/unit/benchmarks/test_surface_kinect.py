@@ -26,9 +26,7 @@ SIZE = np.array([1.7, 1.2, 1.5])
 """Of the room, in meters."""
 WORLD = Similarity(0.4, axis_rotation(np.array([0.6, 0.0, 0.8]), 40.0), np.array([3.0, -1.0, 2.0]))
 """From the truth to the frame of the reconstruction."""
-DEPTH_CAMERA = Camera(
-    np.array([[FOCAL_PX, 0.0, WIDTH / 2], [0.0, FOCAL_PX, HEIGHT / 2], [0.0, 0.0, 1.0]]), WIDTH, HEIGHT
-)
+DEPTH_CAMERA = Camera(np.array([[FOCAL_PX, 0, WIDTH / 2], [0, FOCAL_PX, HEIGHT / 2], [0, 0, 1.0]]), WIDTH, HEIGHT)
 
 
 def cell_means(points):
@@ -212,9 +210,7 @@ def test_cameras_that_are_turned_about_what_they_see_are_told(pivot):
     rng = np.random.default_rng(5)
     turned = {}
     for name, P in depth.items():
-        R = axis_rotation(np.array([1.0, 0.0, 0.0]), rng.normal()) @ axis_rotation(
-            np.array([0.0, 1.0, 0.0]), rng.normal()
-        )
+        R = axis_rotation(np.eye(3)[0], rng.normal()) @ axis_rotation(np.eye(3)[1], rng.normal())
         # the point ahead stays where it is in the picture
         t = R @ (P[:, 3] - [0.0, 0.0, pivot]) + [0.0, 0.0, pivot]
         turned[name] = np.column_stack([R @ P[:, :3], t + 0.001 * rng.normal(size=3)])

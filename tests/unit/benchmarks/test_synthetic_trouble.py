@@ -136,12 +136,8 @@ def test_what_moves_is_seen_elsewhere_and_the_rest_stays(tmp_path):
     R, t = plan.views.cam_from_world[name][:, :3], plan.views.cam_from_world[name][:, 3]
     ahead = camera_center(plan.views.cam_from_world[name]) + 1.5 * R[2] - 0.4 * np.array([0.0, 1.0, 0.0])
     still = replace(plan, spoiling=replace(plan.spoiling, thing=None, blur_px={}, defocus_px={}))
-    moving = replace(
-        plan,
-        spoiling=replace(
-            plan.spoiling, thing_at={name: np.column_stack([np.eye(3), ahead])}, blur_px={}, defocus_px={}
-        ),
-    )
+    spoiling = replace(still.spoiling, thing=plan.spoiling.thing, thing_at={name: np.column_stack([np.eye(3), ahead])})
+    moving = replace(plan, spoiling=spoiling)
 
     without, there = written(still, tmp_path / "a")[name], written(moving, tmp_path / "b")[name]
 

@@ -244,9 +244,7 @@ def test_a_wrong_document_is_told(change, problem):
 def test_published_results_follow_the_schema():
     names = ("fundamental-*", "cameras*", "chapter?", "viewers", "corpus*", "trouble*")
     published = [path for name in names for path in RESULTS.glob(f"{name}.json")]
-    assert {path.name: problems(json.loads(path.read_text("utf-8"))) for path in published} == {
-        path.name: [] for path in published
-    }
+    assert {path.name: said for path in published if (said := problems(json.loads(path.read_text("utf-8"))))} == {}
 
 
 def swept(**times):

@@ -278,9 +278,8 @@ def test_a_surface_that_was_cut_off_is_no_crash(finished, left):
 
 
 def test_a_model_without_a_texture_has_the_colors_of_its_vertices(ball, finished):
-    np.savez(
-        finished / LAST.files[0], vertices=ball.surface.vertices, faces=ball.surface.faces, colors=ball.surface.colors
-    )
+    surface = ball.surface
+    np.savez(finished / LAST.files[0], vertices=surface.vertices, faces=surface.faces, colors=surface.colors)
     place = Workspace(finished)
     place.manifest.finish(LAST.name, StageRecord("", 0.0, digest=LAST.digest(place)), {})
     (path,) = sfm_app.export_model(finished, "glb")

@@ -56,11 +56,8 @@ def model(request):
 def test_views_follow_each_other_and_every_accessor_is_used_once(model):
     tree, buffer = taken_apart(glb_of(model))
     primitives = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]
-    used = [
-        number
-        for p in primitives
-        for number in [*p["attributes"].values(), *([p["indices"]] if "indices" in p else [])]
-    ]
+    used = [number for p in primitives for number in p["attributes"].values()]
+    used += [p["indices"] for p in primitives if "indices" in p]
     assert sorted(used) == list(range(len(tree["accessors"])))
     end = 0
     for view in tree["bufferViews"]:
@@ -303,9 +300,8 @@ def test_colors_of_vertices_keep_sixteen_bits(ball, tmp_path):
     view = found["bufferViews"][primitive["extensions"][DRACO]["bufferView"]]
     decoded = DracoPy.decode(buffer[view["byteOffset"] : view["byteOffset"] + view["byteLength"]])
 
-    color = next(
-        a for a in decoded.attributes if a["unique_id"] == primitive["extensions"][DRACO]["attributes"]["COLOR_0"]
-    )
+    number = primitive["extensions"][DRACO]["attributes"]["COLOR_0"]
+    color = next(attribute for attribute in decoded.attributes if attribute["unique_id"] == number)
     accessor = found["accessors"][primitive["attributes"]["COLOR_0"]]
     assert accessor["normalized"] is True and accessor["componentType"] == 5123
     at = np.linalg.norm(ball.surface.vertices[:, None] - np.asarray(decoded.points)[None], axis=2).argmin(axis=1)
