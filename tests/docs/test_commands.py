@@ -1,4 +1,4 @@
-"""Every command on a page can be typed: its options exist, its files are there, its settings are allowed."""
+"""Every command on a page can be typed; those of the tutorial and the how-to pages are run."""
 
 import importlib.util
 import re

@@ -1,4 +1,4 @@
-"""Every block of Python on a page runs as it stands, in a folder with photos/ and a finished run out/."""
+"""Blocks of Python on pages run beside photos/ and a finished run out/; examples in docstrings are true."""
 
 import doctest
 import inspect
@@ -11,7 +11,7 @@ from sfm_app.synthetic.correspondences import PairOptions, TrackOptions, make_pa
 from tests.docs.pages import PAGES, ROOT, blocks
 
 ELSEWHERE = {ROOT / "docs" / "plugins.md"}
-"""Its modules are installed and tried by tests/unit/test_plugins_page.py."""
+"""Its modules are installed and tried by tests/unit/test_pages.py."""
 ALL = [block for page in PAGES for block in blocks(page) if block.language in ("python", "py")]
 RUN = [block for block in ALL if not block.compiled_only and block.page not in ELSEWHERE]
 

@@ -1,4 +1,4 @@
-"""The site has all pages, all public names, commands and settings, and asks nothing of other hosts."""
+"""The site has all pages, names, commands, settings and files of a run, and asks nothing of other hosts."""
 
 import importlib.util
 import json

@@ -23,9 +23,9 @@ CODE_OR_NETWORK = {
     "socket", "ssl", "http", "urllib", "ftplib", "smtplib", "requests", "httpx", "aiohttp",
 }  # fmt: skip
 UNPICKLES_WHAT_IT_SENT = Path(sfm_app.__file__).parent / "runtime/cluster.py"
-"""Checks hashes that come with the messages of a cluster; tests/unit/runtime/test_parcels.py."""
+"""Checks hashes that come with the messages of a cluster."""
 SERVES_THIS_MACHINE = Path(sfm_app.__file__).parent / "report/server.py"
-"""Listens on 127.0.0.1 only; tests/unit/report/view/test_serving.py."""
+"""Listens on 127.0.0.1 only."""
 KNOWN = {UNPICKLES_WHAT_IT_SENT: ["imports pickle"], SERVES_THIS_MACHINE: ["imports http", "imports http.server"]}
 RUNS_TEXT = {"eval", "exec", "compile", "__import__", "breakpoint", "os.system", "os.popen", "os.startfile"}
 

@@ -1,4 +1,4 @@
-"""Values that are no numbers, and whose error it is that ends something."""
+"""Errors cross processes and have exit codes; what is no number, and whose error it is that ends something."""
 
 import json
 import pickle

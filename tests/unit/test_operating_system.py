@@ -1,4 +1,4 @@
-"""Abilities of systems, links and open files, libraries of wheels, cores, memory and time."""
+"""Abilities of systems, links and open files, libraries of wheels, cores, memory, time, and how processes end."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""Progress told to a function."""
+"""Names of the package, progress told to a function, and settings."""
 
 import subprocess
 import sys

@@ -84,11 +84,6 @@ def test_more_photos_see_less():
     assert 4000 > counts[0] > counts[1] > counts[2] > counts[3] == 0
 
 
-def test_an_empty_mesh_has_no_scores():
-    truth = truth_of(sheet(0.0))
-    assert set(scores(truth, np.zeros((0, 3)), np.zeros((0, 3), np.int64)).values()) == {None}
-
-
 def test_psnr_does_not_mind_exposure_but_noise():
     rng = np.random.default_rng(0)
     scene = rng.uniform(60, 180, (20_000, 3))

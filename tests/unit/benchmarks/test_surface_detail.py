@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.surface.rendered import detail
-from benchmarks.surface.rendered.detail import creases, detail_scores
+from benchmarks.surface.rendered.detail import detail_scores
 from benchmarks.synthetic.detail_scenes import straight, tube
 from sfm_app.synthetic.cameras import Views, look_at, make_camera
 from sfm_app.synthetic.compare import scene_size
@@ -58,14 +58,6 @@ def test_a_smaller_block_has_rounded_edges(truth):
     found = scores(truth, FLOOR, smaller, BAR)
     assert 100 * 0.004 * np.sqrt(2) == pytest.approx(found["edges: median %"], rel=0.1)
     assert found["edges within 0.1 %"] < 10.0 and found["accuracy 0.1 %"] < 100.0
-
-
-def test_a_box_has_twelve_creases_and_a_floor_none():
-    ends, normals = creases(BLOCK.vertices, BLOCK.faces)
-    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum()
-    assert length == pytest.approx(4 * (0.8 + 0.6 + 0.6))
-    assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0)
-    assert len(creases(FLOOR.vertices, FLOOR.faces)[0]) == 0
 
 
 def test_an_empty_mesh_has_no_figures(truth):

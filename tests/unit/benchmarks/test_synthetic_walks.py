@@ -1,4 +1,4 @@
-"""Walks, orbits and panoramas, and a camera that moves while its rows are read."""
+"""Walks, orbits, panoramas, a camera that moves while its rows are read, and matches without pictures."""
 
 import itertools
 from itertools import combinations

@@ -1,4 +1,4 @@
-"""GLB files, taken apart by the rules of glTF 2.0 and read back by other programs."""
+"""GLB files, plain and compressed, taken apart by the rules of glTF 2.0 and read back by other programs."""
 
 import io
 import json

@@ -1,4 +1,4 @@
-"""PLY, OBJ and STL files, read back by other programs."""
+"""PLY, OBJ and STL files, read back by other programs, and cameras drawn into them."""
 
 import io
 from dataclasses import replace
