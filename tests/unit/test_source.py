@@ -35,10 +35,7 @@ NAMES = {
 OPTIONS = {"start_new_session", "preexec_fn", "process_group", "creationflags", "pass_fds", "universal_newlines"}
 """Options of `subprocess` that differ between systems."""
 PLACES = ("/proc", "/sys/", "/dev/", "/etc/", "/var/", "/usr/")
-METHODS = ("fundamental", "selfcal")
 YEAR = r"\b(?:18|19|20)\d\d\b"
-POINTER = re.compile(rf"[Tt]hesis|\bEq\. |{YEAR}|\b[Oo]urs\b")
-"""The thesis, an equation of it, a paper, or that the method is ours."""
 SOURCE = re.compile(
     rf"[Tt]hesis|\bEq\. |{YEAR}|docs/algorithms\.md|benchmarks[/.]|"
     r"\b[Bb]y hand|\b[Cc]hosen on\b|\bCOLMAP\b|\b[Bb]y definition\b|\bCounted\b|double precision"
@@ -181,15 +178,3 @@ def test_pages_and_commands_that_constants_refer_to_exist():
         for command in re.findall(r"\bpython -m (benchmarks(?:\.\w+)+)", about):
             place = ROOT / command.replace(".", "/")
             assert (place / "__main__.py").is_file() or place.with_suffix(".py").is_file(), f"{name}: {command}"
-
-
-def header(text):
-    """The docstring of a module, and the comments above its sections."""
-    comments = re.findall(r"^# .*", text, re.MULTILINE)
-    return "\n".join([ast.get_docstring(ast.parse(text)) or "", *comments])
-
-
-def test_every_module_of_a_method_names_its_equation_or_paper():
-    modules = texts(*METHODS)
-    assert len(modules) > 20
-    assert [name for name, text in modules.items() if not POINTER.search(header(text))] == []
