@@ -164,7 +164,7 @@ HEALED = [
     ("model.glb", ()), ("texture/texture.npz", ("--from", "files")), ("surface/surface.npz", ("--from", "texture")),
     ("dense/stereo/depth_maps/view_02.jpg.geometric.bin", ("--from", "mesh")),
     ("surface/fused.ply", ("--from", "mesh")), ("sparse/points3D.bin", ()),
-    ("sparse/frames.bin", ("--until", "scene")), ("view_graph.npz", ("--from", "scene", "--until", "scene")),
+    ("view_graph.npz", ("--from", "scene", "--until", "scene")),
     ("calibration.json", ("--until", "scene")), ("manifest.json", ("--until", "intrinsics")),
 ]  # fmt: skip
 
@@ -240,7 +240,7 @@ def test_a_link_among_the_photos_that_leads_elsewhere_is_replaced(kept, run, tar
     assert not (kept.place / "new.jpg").exists()
 
 
-@pytest.mark.parametrize("name", ["sparse", "dense", "database.db", "log.txt", ".lock", "dense/sparse"])
+@pytest.mark.parametrize("name", ["sparse", "database.db", "log.txt", ".lock", "dense/sparse"])
 def test_links_out_of_the_output_folder_are_refused(kept, name):
     shutil.rmtree(kept.out / name, ignore_errors=True)
     (kept.out / name).unlink(missing_ok=True)
