@@ -1,4 +1,4 @@
-"""Every command on a page can be typed: its options exist, its files are there, its settings are allowed."""
+"""Every command on a page can be typed; those of the tutorial and the how-to pages are run."""
 
 import importlib.util
 import re
@@ -6,6 +6,7 @@ import tomllib
 
 import click
 import pytest
+from click.testing import CliRunner
 
 from sfm_app.cli import main, options
 from sfm_app.colmap import backend
@@ -114,3 +115,21 @@ def test_there_are_many():
 def test_what_cannot_be_typed_is_found(words, says):
     with pytest.raises((click.UsageError, AssertionError, options.ConfigError), match=says):
         check_ours(words)
+
+
+COMMANDS = (
+    ("run photos -o out", "model.glb"), ("run photos -o out --until scene --json", '"photos"'),
+    ("calibrate photos -o out --figure camera.png", "px"), ("export out --format obj", "model.obj"),
+    ("export out --format colmap", "colmap"), ("export out --format splat", "splat"),
+    ("export out --points -o scene.ply", "scene.ply"), ("measure out 0,0,0 1,0,0", "+-"),
+    ("report out", "report.html"), ("markers 50mm -o markers.pdf", "markers.pdf"),
+    ("config --set depth.neighbors=6", "neighbors = 6"), ("plugins", "lev-ransac"),
+)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("typed", "says"), COMMANDS, ids=[typed for typed, _ in COMMANDS])
+def test_it_does_what_the_page_says(typed, says, beside_a_run):
+    done = CliRunner().invoke(main, typed.split())
+    assert done.exit_code == 0, done.output
+    assert says in done.output

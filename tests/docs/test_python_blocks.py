@@ -1,4 +1,7 @@
-"""Every block of Python on a page runs as it stands, in a folder with photos/ and a finished run out/."""
+"""Blocks of Python on pages run beside photos/ and a finished run out/; examples in docstrings are true."""
+
+import doctest
+import inspect
 
 import numpy as np
 import pytest
@@ -8,7 +11,7 @@ from sfm_app.synthetic.correspondences import PairOptions, TrackOptions, make_pa
 from tests.docs.pages import PAGES, ROOT, blocks
 
 ELSEWHERE = {ROOT / "docs" / "plugins.md"}
-"""Its modules are installed and tried by tests/unit/test_plugins_page.py."""
+"""Its modules are installed and tried by tests/unit/test_pages.py."""
 ALL = [block for page in PAGES for block in blocks(page) if block.language in ("python", "py")]
 RUN = [block for block in ALL if not block.compiled_only and block.page not in ELSEWHERE]
 
@@ -39,3 +42,32 @@ def test_it_runs(block, names, beside_a_run, capsys):
 def test_few_are_only_compiled():
     assert len(RUN) >= 5
     assert sum(block.compiled_only for block in ALL) <= 3
+
+
+NAMES = sorted(set(sfm_app.__all__) - {"__version__"})
+FINDER = doctest.DocTestFinder(exclude_empty=True)
+
+
+def examples(name):
+    """The examples of a public name; those of a class include its methods'."""
+    thing = getattr(sfm_app, name)
+    return [test for test in FINDER.find(thing, name, globs={}) if test.examples]
+
+
+WITH = [name for name in NAMES if examples(name)]
+
+
+def test_every_function_has_an_example():
+    functions = {name for name in NAMES if inspect.isfunction(getattr(sfm_app, name))}
+    assert len(functions) >= 11
+    assert functions <= set(WITH)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WITH)
+def test_examples_are_true(name, beside_a_run):
+    runner = doctest.DocTestRunner(optionflags=doctest.IGNORE_EXCEPTION_DETAIL)
+    told = []
+    for test in examples(name):
+        runner.run(test, out=told.append)
+    assert runner.failures == 0, "".join(told)

@@ -1,6 +1,7 @@
-"""The site has all pages, all public names, commands and settings, and asks nothing of other hosts."""
+"""The site has all pages, names, commands, settings and files of a run, and asks nothing of other hosts."""
 
 import importlib.util
+import json
 import re
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import pytest
 
 import sfm_app
 from sfm_app.cli import main
+from sfm_app.runtime.workspace import CHECKSUM, StageRecord
 from sfm_app.settings import Section, Settings
 from tests.docs.pages import ROOT
 
@@ -18,8 +20,6 @@ REFERENCE = "\n".join(path.read_text(encoding="utf-8") for path in sorted((DOCS 
 HAS_SPHINX = all(importlib.util.find_spec(name) is not None for name in ("sphinx", "myst_parser", "furo"))
 LOADED = re.compile(r"<(?:script|img|iframe|source|link)\b[^>]*\b(?:src|href)=\"([^\"]+)\"")
 """What a browser fetches by itself; links that people click are no matter."""
-LARGEST_PICTURE = 200_000
-"""Bytes of a picture in docs/pictures."""
 
 
 @pytest.fixture(scope="module")
@@ -43,11 +43,8 @@ def laid_out(tools, tmp_path_factory):
 
 
 def test_every_public_name_is_on_a_page():
-    shown = set(
-        re.findall(
-            r"auto(?:function|class|exception|data):: (?:sfm_app\.)?([A-Za-z_]+)(?:\(\))?$", REFERENCE, re.MULTILINE
-        )
-    )
+    directive = r"auto(?:function|class|exception|data):: (?:sfm_app\.)?([A-Za-z_]+)(?:\(\))?$"
+    shown = set(re.findall(directive, REFERENCE, re.MULTILINE))
     assert set(sfm_app.__all__) <= shown
 
 
@@ -84,11 +81,6 @@ def test_exit_codes_are_in_order_and_each_has_a_meaning(tools):
     assert all(meaning.strip() for _, meaning in rows)
 
 
-def test_methods_of_installed_plug_ins_are_left_out(tools):
-    assert "`lev-ransac`" in tools[0].methods()
-    assert "poselib" not in tools[0].methods()
-
-
 def test_every_place_for_generated_text_is_filled(laid_out):
     target, names = laid_out
     pages = [target / name for name in names if name.suffix == ".md"]
@@ -109,29 +101,16 @@ def test_a_second_time_nothing_is_written(laid_out, tools):
     target, names = laid_out
     before = {name: (target / name).stat().st_mtime_ns for name in names}
     (target / "left over.md").write_text("of an earlier build")
-
     assert tools[1].lay_out(target, tools[0].GENERATORS) == names
-
     assert {name: (target / name).stat().st_mtime_ns for name in names} == before
     assert not (target / "left over.md").exists()
 
 
 def test_links_are_moved_and_code_is_not(tools):
     page = DOCS / "how-to" / "video.md"
-    text = (
-        "[a](../../benchmarks/README.md#rules) `[b](../../x.md)` [c](../../examples) [d](https://github.com/x) [e](#f)"
-    )
-
+    text = "[a](../../benchmarks/README.md#rules) `[b](../../x.md)` [c](../../examples) [d](https://a.org/x) [e](#f)"
     moved = tools[1].relink(text, page, [ROOT / "benchmarks" / "README.md"], set())
-
-    assert moved == "[a](../benchmarks/README.md#rules) `[b](../../x.md)` c [d](https://github.com/x) [e](#f)"
-
-
-def test_pictures_are_small_and_used():
-    text = "\n".join(path.read_text(encoding="utf-8") for path in (*DOCS.rglob("*.md"), ROOT / "README.md"))
-    for path in (DOCS / "pictures").iterdir():
-        assert path.stat().st_size <= LARGEST_PICTURE, path.name
-        assert f"pictures/{path.name}" in text, path.name
+    assert moved == "[a](../benchmarks/README.md#rules) `[b](../../x.md)` c [d](https://a.org/x) [e](#f)"
 
 
 @pytest.fixture(scope="module")
@@ -159,17 +138,31 @@ def test_no_page_asks_other_hosts(site):
 
 
 @pytest.mark.slow
-def test_the_search_knows_the_pages(site):
+def test_the_search_knows_the_pages_and_docstrings_are_on_them(site):
     index = (site / "searchindex.js").read_text(encoding="utf-8")
-    assert all(
-        word in index for word in ("how-to/turntable", "reference/estimators", "estimate_fundamental", "turntabl")
-    )
+    words = ("how-to/turntable", "reference/estimators", "estimate_fundamental", "turntabl")
+    assert all(word in index for word in words)
     assert (site / "search.html").exists()
-
-
-@pytest.mark.slow
-def test_docstrings_are_on_the_pages(site):
     text = (site / "reference" / "estimators.html").read_text(encoding="utf-8")
     assert 'id="sfm_app.estimate_fundamental"' in text
     assert "many of which may be wrong" in text
     assert 'href="results.html#sfm_app.EpipolarFit"' in text
+
+
+PAGE = (ROOT / "docs" / "reference" / "output-files.md").read_text(encoding="utf-8")
+ROWS = re.findall(r"^\| (`[^|]+) \|", PAGE, re.MULTILINE)
+NAMED = {name.rstrip("/") for row in ROWS for name in re.findall(r"`([^`]+)`", row)}
+
+
+def test_every_entry_of_a_record_is_listed():
+    assert {*StageRecord.__dataclass_fields__, CHECKSUM} <= NAMED
+
+
+@pytest.mark.slow
+def test_every_file_of_a_run_and_every_entry_of_its_manifest_are_listed(finished):
+    left = {path.name for path in (finished / "out").iterdir() if not path.name.startswith(".")}
+    assert {"model.glb", "report.html", "manifest.json"} <= left
+    assert left <= NAMED
+    manifest = json.loads((finished / "out" / "manifest.json").read_text(encoding="utf-8"))
+    assert set(manifest) <= NAMED
+    assert all(set(record) <= NAMED for record in manifest["stages"].values())

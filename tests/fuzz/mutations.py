@@ -67,16 +67,8 @@ def extreme_number(data: bytearray, rng: np.random.Generator) -> bytes:
 
 
 ANYTHING: tuple[Damage, ...] = (
-    flip_bits,
-    flip_bits_of_the_head,
-    replace_run,
-    cut,
-    remove_run,
-    insert,
-    swap_halves,
-    repeat_run,
-    extreme_number,
-)
+    flip_bits, flip_bits_of_the_head, replace_run, cut, remove_run, insert, swap_halves, repeat_run, extreme_number,
+)  # fmt: skip
 
 
 def jpeg_segments(data: bytearray, rng: np.random.Generator) -> bytes:

@@ -28,14 +28,9 @@ linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits 
 SECONDS, MEGABYTES = 5, 1500
 PER_FORMAT = 100
 FORMATS = {
-    "jpg": ("JPEG", {}),
-    "progressive.jpg": ("JPEG", {"progressive": True}),
-    "png": ("PNG", {}),
-    "tif": ("TIFF", {"compression": "tiff_lzw"}),
-    "raw.tif": ("TIFF", {}),
-    "webp": ("WEBP", {}),
-    "bmp": ("BMP", {}),
-}
+    "jpg": ("JPEG", {}), "progressive.jpg": ("JPEG", {"progressive": True}), "png": ("PNG", {}),
+    "tif": ("TIFF", {"compression": "tiff_lzw"}), "raw.tif": ("TIFF", {}), "webp": ("WEBP", {}), "bmp": ("BMP", {}),
+}  # fmt: skip
 
 
 def picture():
@@ -82,9 +77,7 @@ def test_every_damaged_file_is_a_photo_or_has_a_reason(tmp_path, kind):
     for seed, data, how in mutants(kind, range(PER_FORMAT)):
         made[f"{seed:04d}.{kind}"] = how
         (tmp_path / f"{seed:04d}.{kind}").write_bytes(data)
-
     found, megabytes = read_all(tmp_path)
-
     assert found.keys() == made.keys()
     assert megabytes < 700  # a head may claim 178 million pixels, as photos may have them
     assert all(reason.isprintable() and len(reason) < 100 for reason in found.values())
@@ -162,9 +155,7 @@ def test_bombs_are_refused_or_cost_little(tmp_path):
 def test_of_very_many_pictures_the_first_is_used(tmp_path):
     (tmp_path / "x.tif").write_bytes(tiff(101))
     (tmp_path / "y.tif").write_bytes(tiff(100))
-
     notes = [read_photo(tmp_path, name, options=PhotoSettings()).photo.notes for name in ("x.tif", "y.tif")]
-
     assert notes == [("the first of more than 100 pictures",), ("the first of its 100 pictures",)]
 
 
@@ -188,19 +179,10 @@ def test_colmap_survives_the_damaged_photos_that_we_accept(tmp_path):
     """COLMAP decodes them once more, in ways of its own."""
     names = accepted(tmp_path / "photos")
     flags = (
-        "--keep-low-quality",
-        "--set",
-        "matching.max_features=100",
-        "-q",
-        "--workers",
-        "2",
-        "--until",
-        "match_graph",
-    )
+        "--keep-low-quality", "--set", "matching.max_features=100", "-q", "--workers", "2", "--until", "match_graph",
+    )  # fmt: skip
     command = [sys.executable, "-m", "sfm_app", "run", str(tmp_path / "photos"), "-o", str(tmp_path / "out"), *flags]
-
     process = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-
     assert process.returncode == 0, process.stderr
     assert process.stderr == ""  # not even Pillow's warnings about EXIF
     stages = json.loads((tmp_path / "out" / "manifest.json").read_text())["stages"]
@@ -227,8 +209,6 @@ def test_photos_that_colmap_cannot_read_have_no_keypoints(photos, tmp_path, chan
         path = run.workspace.photos / "view_02.jpg"
         path.unlink()
         change(path)
-
         found = match_graph.make(photo_set, run)
-
     assert [image.name for image in found.images.values() if not len(found.keypoints[image.id])] == [path.name]
     assert run.statistics["keypoints"][path.name] == 0

@@ -23,9 +23,9 @@ CODE_OR_NETWORK = {
     "socket", "ssl", "http", "urllib", "ftplib", "smtplib", "requests", "httpx", "aiohttp",
 }  # fmt: skip
 UNPICKLES_WHAT_IT_SENT = Path(sfm_app.__file__).parent / "runtime/cluster.py"
-"""Checks hashes that come with the messages of a cluster; tests/unit/runtime/test_parcels.py."""
+"""Checks hashes that come with the messages of a cluster."""
 SERVES_THIS_MACHINE = Path(sfm_app.__file__).parent / "report/server.py"
-"""Listens on 127.0.0.1 only; tests/unit/report/view/test_serving.py."""
+"""Listens on 127.0.0.1 only."""
 KNOWN = {UNPICKLES_WHAT_IT_SENT: ["imports pickle"], SERVES_THIS_MACHINE: ["imports http", "imports http.server"]}
 RUNS_TEXT = {"eval", "exec", "compile", "__import__", "breakpoint", "os.system", "os.popen", "os.startfile"}
 
@@ -69,9 +69,7 @@ def test_the_check_would_find_it(source):
 def test_a_run_never_asks_for_the_network(photos, tmp_path):
     out, script = tmp_path / "out", Path(__file__).with_name("offline.py")
     command = [sys.executable, str(script), "run", str(photos), "-o", str(out), *QUICK, "--until", "scene"]
-
     process = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-
     assert process.returncode == 0, process.stderr
     assert (out / "sparse").is_dir()
 
@@ -80,23 +78,15 @@ def test_the_ear_at_the_network_hears(tmp_path):
     script = Path(__file__).with_name("offline.py")
     ear = f"import runpy; sys.addaudithook(runpy.run_path({str(script)!r})['listen'])"
     code = f"import socket, sys; {ear}; socket.getaddrinfo('localhost', 80)"
-
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
-
     assert process.returncode == 99 and "socket.getaddrinfo" in process.stderr
 
 
 NAMES = (
-    "';drop table images;--\".jpg",
-    "%s%n{0}{name}.jpg",
-    "a\nb\r.jpg",
-    "\x1b[31m\x1b]0;title\x07.jpg",
-    "[red]bold[/].jpg",
-    "<script>alert(1)</script>.jpg",
-    "-o --help.jpg",
-    "$(touch x)`touch x`.jpg",
+    "';drop table images;--\".jpg", "%s%n{0}{name}.jpg", "a\nb\r.jpg", "\x1b[31m\x1b]0;title\x07.jpg",
+    "[red]bold[/].jpg", "<script>alert(1)</script>.jpg", "-o --help.jpg", "$(touch x)`touch x`.jpg",
     "\u202egpj.exe.jpg",
-)
+)  # fmt: skip
 
 
 @pytest.fixture

@@ -35,55 +35,35 @@ def test_damaged_settings_are_read_or_refused(tmp_path):
 
 
 STRANGE = {
-    "lists in lists": "a=" + "[" * 8_000 + "]" * 8_000,
-    "tables in tables": "a=" + "{a=" * 6_000 + "1" + "}" * 6_000,
-    "a long path": ".".join(["a"] * 6_000) + "=1",
-    "a long header": "[" + ".".join(["a"] * 6_000) + "]",
-    "a long number": "seed=" + "9" * 19_000,
-    "a long number in hex": "seed=0x" + "f" * 19_000,
-    "a long fraction": "[mesh]\nmax_gap=" + "9" * 19_000 + ".0",
-    "a million digits": "seed=" + "9" * 1_000_000,
-    "a long word": 'quality="' + "x" * 19_000 + '"',
-    "a long name": "x" * 19_000 + "=1",
-    "many names": "\n".join(f"k{k}=1" for k in range(2_000)),
-    "a date": "seed=2024-01-01",
-    "not a number": "[mesh]\nmax_gap=nan",
-    "a list for a table": "photos=[1]",
-    "a table for a number": "[depth.neighbors]\nx=1",
-    "tables of a list": "[[depth]]\nneighbors=1",
-    "an unknown table": "[x.y.z]\na=1",
-    "an escape": '"\\u001b[2J"="\\u001b[2J"',
-    "twice": "seed=1\nseed=2",
-}
+    "lists in lists": "a=" + "[" * 8_000 + "]" * 8_000, "tables in tables": "a=" + "{a=" * 6_000 + "1" + "}" * 6_000,
+    "a long path": ".".join(["a"] * 6_000) + "=1", "a long header": "[" + ".".join(["a"] * 6_000) + "]",
+    "a long number": "seed=" + "9" * 19_000, "a long number in hex": "seed=0x" + "f" * 19_000,
+    "a long fraction": "[mesh]\nmax_gap=" + "9" * 19_000 + ".0", "a million digits": "seed=" + "9" * 1_000_000,
+    "a long word": 'quality="' + "x" * 19_000 + '"', "a long name": "x" * 19_000 + "=1",
+    "many names": "\n".join(f"k{k}=1" for k in range(2_000)), "a date": "seed=2024-01-01",
+    "not a number": "[mesh]\nmax_gap=nan", "a list for a table": "photos=[1]",
+    "a table for a number": "[depth.neighbors]\nx=1", "tables of a list": "[[depth]]\nneighbors=1",
+    "an unknown table": "[x.y.z]\na=1", "an escape": '"\\u001b[2J"="\\u001b[2J"', "twice": "seed=1\nseed=2",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", STRANGE)
 def test_strange_settings_are_refused(tmp_path, case):
     path = tmp_path / "run.toml"
     path.write_text(STRANGE[case])
-
     assert isinstance(read(path), ConfigError)
     result = CliRunner().invoke(main, ["config", "--config", str(path)])
-
     assert result.exit_code == 2 and "error: " in result.stderr
     assert all(line.isprintable() for line in result.stderr.splitlines())
-
-
-@pytest.mark.parametrize("case", [case for case in STRANGE if len(STRANGE[case]) < MOST_TOML_BYTES])
-def test_strange_assignments_are_refused(case):
-    name, _, value = STRANGE[case].partition("=")
-    try:
-        settings = parse_assignment(f"{name}={value}")
-        Settings.from_mapping(settings)
-    except ConfigError:
-        return
-    raise AssertionError(case)
+    if len(STRANGE[case]) < MOST_TOML_BYTES:
+        name, _, value = STRANGE[case].partition("=")
+        with pytest.raises(ConfigError):
+            Settings.from_mapping(parse_assignment(f"{name}={value}"))
 
 
 def test_a_file_as_large_as_may_be_is_read(tmp_path):
     text = Settings(seed=5).to_toml()
     (tmp_path / "run.toml").write_text(text + "#" * (MOST_TOML_BYTES - len(text)))
-
     assert Settings.from_toml(tmp_path / "run.toml").seed == 5
 
 
@@ -96,9 +76,7 @@ def test_strange_names_in_a_list_are_left_out(tmp_path, line):
     folder.mkdir()
     (tmp_path / "secret.jpg").write_bytes(b"secret")
     (tmp_path / "list.txt").write_text(f"{line}\n")
-
     (name,) = list_files(folder, tmp_path / "out", tmp_path / "list.txt")
-
     assert isinstance(resolve_file(folder, name), str)
 
 

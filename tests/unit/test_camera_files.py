@@ -56,22 +56,17 @@ def test_models_and_their_numbers_are_those_of_colmap():
 @pytest.mark.parametrize(
     ("model", "params"),
     [
-        ("SIMPLE_PINHOLE", [900.0, 510.0, 390.0]),
-        ("PINHOLE", [900.0, 910.0, 510.0, 390.0]),
-        ("SIMPLE_RADIAL", [900.0, 510.0, 390.0, -0.1]),
-        ("RADIAL", [900.0, 510.0, 390.0, -0.1, 0.02]),
-        ("OPENCV", OPENCV),
-        ("FULL_OPENCV", [*OPENCV, 0.01, 0.02, -0.01, 0.01]),
-        ("SIMPLE_RADIAL_FISHEYE", [400.0, 510.0, 390.0, -0.02]),
-        ("OPENCV_FISHEYE", FISHEYE),
+        ("SIMPLE_PINHOLE", [900.0, 510.0, 390.0]), ("PINHOLE", [900.0, 910.0, 510.0, 390.0]),
+        ("SIMPLE_RADIAL", [900.0, 510.0, 390.0, -0.1]), ("RADIAL", [900.0, 510.0, 390.0, -0.1, 0.02]),
+        ("OPENCV", OPENCV), ("FULL_OPENCV", [*OPENCV, 0.01, 0.02, -0.01, 0.01]),
+        ("SIMPLE_RADIAL_FISHEYE", [400.0, 510.0, 390.0, -0.02]), ("OPENCV_FISHEYE", FISHEYE),
         ("THIN_PRISM_FISHEYE", [400.0, 400.0, 510.0, 390.0, -0.02, 0.01, 0.001, -0.002, 0.01, 0.02, 0.001, -0.001]),
     ],
-)
+)  # fmt: skip
 def test_colmap_text_and_binary(tmp_path, model, params):
     text = f"# Camera list\n7 {model} {WIDTH} {HEIGHT} {' '.join(map(str, params))}\n"
     number = next(number for number, name in MODEL_IDS.items() if name == model)
     data = struct.pack(f"<QIiQQ{len(params)}d", 1, 7, number, WIDTH, HEIGHT, *params)
-
     for camera in (only(tmp_path / "cameras.txt", text), only(tmp_path / "cameras.bin", data)):
         assert (camera.width, camera.height) == (WIDTH, HEIGHT)
         assert same_rays(camera, model, params)
@@ -85,9 +80,7 @@ def test_a_folder_of_colmap_says_which_photo_has_which_camera(tmp_path, binary):
     for camera in model.cameras.values():
         camera.params = [900.0 + camera.camera_id, *camera.params[1:]]
     (model.write_binary if binary else model.write_text)(tmp_path)
-
     found = read_given_cameras(tmp_path)
-
     assert {name: camera.K[0, 0] for name, camera in found.cameras.items()} == {"1": 901.0, "2": 902.0}
     assert found.camera_of == {image.name: str(image.camera_id) for image in model.images.values()}
     assert len(found.digest) > 10 and "COLMAP" in found.source
@@ -107,7 +100,6 @@ def test_a_folder_of_colmap_says_which_photo_has_which_camera(tmp_path, binary):
 )  # fmt: skip
 def test_json_of_opencv_counts_pixels_from_their_centers(tmp_path, values):
     camera = only(tmp_path / "cameras.json", json.dumps(values))
-
     assert (camera.width, camera.height) == (WIDTH, HEIGHT)
     assert same_rays(camera, "OPENCV", OPENCV)
 
@@ -115,7 +107,6 @@ def test_json_of_opencv_counts_pixels_from_their_centers(tmp_path, values):
 def test_a_size_may_be_missing_and_a_fisheye_needs_to_be_called_one(tmp_path):
     values = {"mtx": [[400, 0, 509.5], [0, 410, 389.5], [0, 0, 1]], "dist": FISHEYE[4:], "model": "fisheye"}
     camera = only(tmp_path / "fisheye.json", json.dumps(values))
-
     assert (camera.width, camera.height, camera.projection) == (0, 0, "fisheye")
     assert same_rays(camera, "OPENCV_FISHEYE", FISHEYE)
     assert only(tmp_path / "plain.json", json.dumps(values | {"model": "pinhole"})).projection == "perspective"
@@ -130,7 +121,6 @@ def test_what_opencv_writes_itself(tmp_path, suffix):
     storage.write("camera_matrix", np.array(K))
     storage.write("distortion_coefficients", np.array([*OPENCV[4:], 0.0]))
     storage.release()
-
     assert same_rays(only(path, path.read_bytes()), "OPENCV", OPENCV)
 
 
@@ -147,13 +137,11 @@ def test_what_opencv_writes_itself(tmp_path, suffix):
 )  # fmt: skip
 def test_opensfm_measures_in_longer_sides_from_the_middle(tmp_path, kind, terms, model, params):
     values = {"v2 some phone 1000 800": {"projection_type": kind, "width": WIDTH, "height": HEIGHT, **terms}}
-
     assert same_rays(only(tmp_path / "camera_models.json", json.dumps(values)), model, params)
 
 
 def test_a_panorama_of_opensfm(tmp_path):
     values = {"a": {"projection_type": "spherical", "width": 1000, "height": 500}}
-
     camera = only(tmp_path / "cameras.json", json.dumps(values))
     assert (camera.projection, camera.width, camera.height) == ("equirectangular", 1000, 500)
 
@@ -173,7 +161,6 @@ GUESS = Calibration(np.diag([1200.0, 1200.0, 1.0]), 1000, 750, "guess", False, "
 def test_a_run_gives_the_cameras_that_its_photos_determined(tmp_path):
     known = Intrinsics({"one": KNOWN, "two": GUESS}, {"a.jpg": "one", "b.jpg": "two"})
     (tmp_path / "calibration.json").write_text(json.dumps(known.to_dict()))
-
     for found in (read_given_cameras(tmp_path), read_given_cameras(tmp_path / "calibration.json")):
         assert list(found.cameras) == ["one"] and found.camera_of == {"a.jpg": "one"}
         assert np.array_equal(found.cameras["one"].K, KNOWN.K) and found.cameras["one"].radial == KNOWN.radial
@@ -185,15 +172,12 @@ def test_refined_cameras_of_a_run_come_first(tmp_path):
     scene = {"cameras": {"one": refined.to_dict()}, "camera_of": {"a.jpg": "one"}, "unregistered": {}}
     (tmp_path / "calibration.json").write_text(json.dumps(Intrinsics({"one": KNOWN}).to_dict()))
     (tmp_path / "scene.json").write_text(json.dumps(scene))
-
     camera = read_given_cameras(tmp_path).cameras["one"]
-
     assert same_rays(camera, "OPENCV", OPENCV) and camera.spread == {"fx": 1.5}
 
 
 def test_what_calibrate_prints_as_json_is_read(tmp_path):
     printed = {"1000x750": {"field_of_view_deg": [58.1, 45.2], **KNOWN.to_dict(), "key_pairs": [["a.jpg", "b.jpg"]]}}
-
     assert only(tmp_path / "printed.json", json.dumps(printed)).radial == KNOWN.radial
 
 
@@ -260,7 +244,6 @@ def test_bytes_of_any_kind_end_in_cameras_or_in_one_error(tmp_path_factory, data
 def test_what_is_no_calibration_says_why_and_which_forms_are_known(tmp_path, data, says):
     with pytest.raises(InputError) as caught:
         given(tmp_path / "cameras", data)
-
     assert says in str(caught.value)
     assert "cameras.txt" in caught.value.hint and "OpenSfM" in caught.value.hint
 
@@ -275,6 +258,5 @@ def test_missing_files_and_folders_without_cameras_are_named(tmp_path):
 def test_models_go_to_the_smallest_form_that_holds_them():
     plain = calibration_from_model("FULL_OPENCV", [900, 900, 500, 400, -0.1, *[0.0] * 7], (WIDTH, HEIGHT))
     fisheye = calibration_from_model("THIN_PRISM_FISHEYE", [400, 400, 500, 400, 0.1, *[0.0] * 7], (WIDTH, HEIGHT))
-
     assert (plain.radial, plain.distortion) == (-0.1, ())
     assert (fisheye.fisheye, fisheye.distortion) == ((0.1, 0.0, 0.0, 0.0), ())

@@ -47,7 +47,6 @@ def folder_run(rendered, tmp_path_factory):
 @pytest.mark.slow
 def test_one_estimator():
     done = call("one_estimator.py")
-
     assert done.returncode == 0, done.stderr
     assert "identifiable: True" in done.stdout
 
@@ -55,7 +54,6 @@ def test_one_estimator():
 @pytest.mark.slow
 def test_reconstruct_folder(folder_run):
     out, done = folder_run
-
     assert done.returncode == 0, done.stderr
     assert "7 photos placed" in done.stdout
     assert (out / "model.glb").exists()
@@ -64,7 +62,6 @@ def test_reconstruct_folder(folder_run):
 @pytest.mark.slow
 def test_export_model(folder_run, tmp_path):
     done = call("export_model.py", folder_run[0], tmp_path / "files")
-
     assert done.returncode == 0, done.stderr
     names = {path.name for path in (tmp_path / "files").iterdir()}
     assert {"model.obj", "model.mtl", "points.ply"} < names and any(name.endswith(".jpg") for name in names)
@@ -117,10 +114,8 @@ def test_batch_goes_on_after_a_failure_and_does_nothing_again(begun_batch):
 def test_batch_stops_at_a_wrong_option_and_where_there_is_nothing(begun_batch):
     folders, out = begun_batch
     before = (out / "table.csv").read_bytes()
-
     wrong = call("batch_folders.py", folders, out, "--quality", "best")
     nothing = call("batch_folders.py", folders / "good", out)
-
     assert wrong.returncode == 1 and "'best' is not one of" in wrong.stderr and not wrong.stdout
     assert nothing.returncode == 2 and "holds no folders of photos" in nothing.stderr
     assert (out / "table.csv").read_bytes() == before
@@ -136,12 +131,7 @@ def is_parameters(cell):
 
 
 def execute(name, **changed):
-    """Run the code of a notebook in one namespace, and return it; what a cell ends with is shown as Jupyter would.
-
-    Args:
-        name: of the file, without suffix.
-        changed: in place of the values in the cell with the parameters.
-    """
+    """Run a notebook in one namespace, with other parameters, and return it; show what a cell ends with as Jupyter."""
     path, names = EXAMPLES / "notebooks" / f"{name}.ipynb", {"__name__": "__main__"}
     for number, cell in enumerate(cells(path, "code")):
         tree = ast.parse(cell["source"])
@@ -176,7 +166,6 @@ def no_screen():
 @pytest.mark.slow
 def test_calibrate_folder(work, rendered, capsys):
     names = execute("calibrate_folder", WORK=str(work), QUALITY="draft", **RENDERED)
-
     assert (work / PHOTOS / "view_06.jpg").read_bytes() == (rendered[0] / "view_06.jpg").read_bytes()
     camera, deviation = names["camera"], names["camera"].spread["fx"]
     assert camera.identifiable and 0.1 < deviation < 10
@@ -193,7 +182,6 @@ def test_calibrate_folder(work, rendered, capsys):
 @pytest.mark.slow
 def test_photos_to_splats_with_photos_of_ones_own(work, rendered, capsys):
     names = execute("photos_to_splats", PHOTOS=str(rendered[0]), WORK=str(work), QUALITY="draft")
-
     assert names["folder"] == work / "out" / "export" / "splat"
     assert len(list((names["folder"] / "images").iterdir())) == 7
     said = capsys.readouterr().out
@@ -214,9 +202,8 @@ def test_compare_estimators(tmp_path, no_screen, capsys):
 
     said = capsys.readouterr().out
     assert names["methods"] == methods[:2] and "left out: no estimator is named 'not-installed'" in said
-    assert (
-        set(names["errors"]) == set(names["seconds"]) == {(name, share) for name in methods[:2] for share in (0.2, 0.5)}
-    )
+    pairs = {(name, share) for name in methods[:2] for share in (0.2, 0.5)}
+    assert set(names["errors"]) == set(names["seconds"]) == pairs
     for share in (0.2, 0.5):
         ours, thesis = (np.median(names["errors"][name, share]) for name in methods[:2])
         assert 0.01 < ours < 0.4 and ours < thesis < 1.0
@@ -238,23 +225,6 @@ def test_what_a_notebook_shows_is_of_one_run_of_it(path):
         assert output["output_type"] != "error" and output.get("name") != "stderr"
     places = re.findall(r"(?<![\w.:/])/(?:tmp|home|root|work|usr|Users|opt)\b|[A-Z]:\\\\", json.dumps(outputs))
     assert places == []
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_links_of_a_notebook_lead_somewhere(path):
-    links = [link for cell in cells(path, "markdown") for link in re.findall(r"\]\(([^)\s]+)\)", cell["source"])]
-    assert links
-    assert [link for link in links if not (path.parent / link.partition("#")[0]).exists()] == []
-
-
-def test_every_example_is_on_the_page_and_in_a_test():
-    page, tests = ((EXAMPLES / "README.md").read_text(encoding="utf-8"), Path(__file__).read_text(encoding="utf-8"))
-    links = set(re.findall(r"\]\(([^)\s]+)\)", page))
-    scripts = sorted(EXAMPLES.glob("*.py"))
-    assert len(scripts) == 4 and len(NOTEBOOKS) == 3
-    assert {path.relative_to(EXAMPLES).as_posix() for path in (*scripts, *NOTEBOOKS)} < links
-    assert all(f'("{path.name}"' in tests for path in scripts)
-    assert all(f'execute("{path.stem}"' in tests for path in NOTEBOOKS)
 
 
 @pytest.fixture
@@ -280,13 +250,10 @@ def test_the_template_keeps_the_contract_of_estimators(installed_template):
     chosen = f"test_sfm_app_example or (example-msac and ({CONTRACT}))"
     options = ["-q", "-c", "pyproject.toml", "--rootdir", ".", "-p", "no:cacheprovider", "-p", "no:xdist", "-k", chosen]
     environment = {**os.environ, "PYTHONPATH": paths}
-
     done = subprocess.run(
         [sys.executable, "-m", "pytest", *options, *tests], cwd=ROOT, env=environment, capture_output=True, text=True,
         check=False,
     )  # fmt: skip
-
     assert done.returncode == 0, done.stdout + done.stderr
-    assert (
-        int(re.search(r"(\d+) passed", done.stdout)[1]) >= 20
-    )  # 15 of the contract, one on Linux only, and 6 of its own
+    # 15 of the contract, one on Linux only, and 6 of its own
+    assert int(re.search(r"(\d+) passed", done.stdout)[1]) >= 20

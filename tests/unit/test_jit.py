@@ -60,7 +60,6 @@ def test_kernels_are_cached_in_a_folder_of_this_version(tmp_path):
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     command = [sys.executable, "-c", "import module"]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-
     assert (done.stdout.strip(), done.returncode) == ("42", 0), done.stderr
     assert [path.name for path in (tmp_path / "cache").iterdir()] == [f"kernels-{version('sfm-app')}"]
     assert len(list(tmp_path.rglob("module.twice*.nbi"))) == 1
@@ -93,7 +92,6 @@ def test_kernels_are_compiled_while_the_block_lasts(cold):
         (process,) = compilers()
         folder = Path(process.cmdline()[-1])
         assert folder.is_dir()
-
     assert not compilers() and not folder.exists()
 
 
@@ -117,9 +115,7 @@ def test_all_stages_are_compiled(tmp_path):
         "import pathlib, sys; from sfm_app import jit; jit.WARM = pathlib.Path(sys.argv[1]) / 'cache' / 'warm'; "
         "from sfm_app import warm_up; warm_up.main()"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=False, timeout=HANGS_S
-    )
-
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=HANGS_S)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "model" / "model.glb").exists() and (tmp_path / "cache" / "warm").exists()

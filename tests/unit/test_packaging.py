@@ -1,6 +1,5 @@
 """Workflows, image, issue forms and versions agree with the project."""
 
-import json
 import re
 import tomllib
 from pathlib import Path
@@ -79,9 +78,8 @@ def test_the_image_copies_what_it_may_and_runs_as_nobody_special():
     build, last = read_stages(ROOT / "docker" / "Dockerfile")
     allowed = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
     steps = [step for stage in (build, last) for step in stage.steps]
-    copied = {
-        word for step in steps if step.keyword == "COPY" and not step.option("from") for word in step.words()[:-1]
-    }
+    from_here = (step for step in steps if step.keyword == "COPY" and not step.option("from"))
+    copied = {word for step in from_here for word in step.words()[:-1]}
     assert copied == allowed
     assert all((ROOT / name).exists() for name in copied)
     (user,) = (step.text for step in last.steps if step.keyword == "USER")
@@ -91,31 +89,7 @@ def test_the_image_copies_what_it_may_and_runs_as_nobody_special():
 def test_compose_starts_every_role_with_the_kernels_of_the_image():
     services = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text(encoding="utf-8"))["services"]
     entries = [service["entrypoint"] for service in services.values() if "entrypoint" in service]
-    (own,) = (
-        step.words() for step in read_stages(ROOT / "docker" / "Dockerfile")[-1].steps if step.keyword == "ENTRYPOINT"
-    )
+    steps = read_stages(ROOT / "docker" / "Dockerfile")[-1].steps
+    (own,) = (step.words() for step in steps if step.keyword == "ENTRYPOINT")
     assert len(entries) == 2
     assert {entry[0] for entry in entries} == {own[0]}
-
-
-def test_issue_forms_ask_for_what_helps():
-    forms = {
-        path.stem: path.read_text(encoding="utf-8") for path in (ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml")
-    }
-    assert "`sfm-app doctor`" in forms["bug"] and "OUT/log.txt" in forms["bug"]
-    assert "OUT/report.html" in forms["poor-model"]
-    for name in ("bug", "poor-model"):
-        form = yaml.safe_load(forms[name])
-        assert {"name", "description", "body"} <= set(form)
-        ids = [part["id"] for part in form["body"]]
-        assert len(ids) == len(set(ids)) > 2
-
-
-def test_hooks_and_devcontainer_name_what_is_there():
-    container = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text(encoding="utf-8"))
-    assert container["postCreateCommand"].endswith(" && make .venv/.installed")
-    (local,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))["repos"]
-    lint = MAKEFILE.split("\nlint:")[1].split("\n\n")[0]
-    for hook in local["hooks"]:
-        tool = hook["entry"].split()[0].removeprefix(".venv/bin/")
-        assert f"$(BIN)/{tool}" in lint

@@ -26,7 +26,6 @@ def sfm_estimators():
 
 def test_built_ins_are_there_and_lead_the_listing():
     found = load_plugins([plugin(sfm_estimators=sfm_estimators)], installed=False)
-
     assert next(iter(found.estimators)) == "lev-ransac"
     assert {"lev-ransac", "lev-ransac-thesis", "never"} <= set(found.estimators)
     assert {"zero-curves", "zero-curves-thesis"} <= set(found.calibrators)
@@ -37,26 +36,20 @@ def test_built_ins_are_there_and_lead_the_listing():
 def test_an_unknown_name_lists_the_known_ones():
     with pytest.raises(ConfigError, match="no estimator is named 'lev'") as caught:
         load_plugins(installed=False).estimator("lev")
-
     assert "lev-ransac" in caught.value.hint
 
 
-def test_a_clash_of_names_is_refused():
-    @hookimpl
-    def clash():
-        return [Estimator("msac", never)]
-
-    with pytest.raises(PluginError, match="two plug-ins offer 'msac'"):
-        load_plugins([plugin(sfm_estimators=clash)], installed=False)
+@hookimpl
+def clash():
+    return [Estimator("msac", never)]
 
 
-def test_a_misspelt_hook_is_refused():
-    @hookimpl
-    def sfm_estimator():
-        return []
-
-    with pytest.raises(PluginError, match="sfm_estimator"):
-        load_plugins([plugin(sfm_estimator=sfm_estimator)], installed=False)
+@pytest.mark.parametrize(
+    ("hook", "says"), [("sfm_estimators", "two plug-ins offer 'msac'"), ("sfm_estimator", "sfm_estimator")]
+)
+def test_a_clash_of_names_and_a_misspelt_hook_are_refused(hook, says):
+    with pytest.raises(PluginError, match=says):
+        load_plugins([plugin(**{hook: clash})], installed=False)
 
 
 @pytest.fixture
@@ -77,7 +70,6 @@ def test_installed_packages_are_searched_once_per_process(installed):
     assert load_plugins() is load_plugins()
     assert load_plugins().estimator("never").fit is never
     assert len(installed) == 1
-
     installed_plugins.cache_clear()
     assert "never" in load_plugins().estimators
     assert len(installed) == 2
@@ -85,7 +77,6 @@ def test_installed_packages_are_searched_once_per_process(installed):
 
 def test_given_modules_and_no_installed_ones_are_not_kept(installed):
     extra = plugin()
-
     assert "never" not in load_plugins(installed=False).estimators
     assert load_plugins([extra]) is not load_plugins([extra])
     assert "never" in load_plugins([extra]).estimators

@@ -35,10 +35,7 @@ NAMES = {
 OPTIONS = {"start_new_session", "preexec_fn", "process_group", "creationflags", "pass_fds", "universal_newlines"}
 """Options of `subprocess` that differ between systems."""
 PLACES = ("/proc", "/sys/", "/dev/", "/etc/", "/var/", "/usr/")
-METHODS = ("fundamental", "selfcal")
 YEAR = r"\b(?:18|19|20)\d\d\b"
-POINTER = re.compile(rf"[Tt]hesis|\bEq\. |{YEAR}|\b[Oo]urs\b")
-"""The thesis, an equation of it, a paper, or that the method is ours."""
 SOURCE = re.compile(
     rf"[Tt]hesis|\bEq\. |{YEAR}|docs/algorithms\.md|benchmarks[/.]|"
     r"\b[Bb]y hand|\b[Cc]hosen on\b|\bCOLMAP\b|\b[Bb]y definition\b|\bCounted\b|double precision"
@@ -96,22 +93,14 @@ def test_no_other_module_asks_which_system_this_is():
 @pytest.mark.parametrize(
     ("text", "word"),
     [
-        ("import fcntl", "fcntl"),
-        ("from signal import SIGTERM", "signal"),
-        ("import os\nos.killpg(1, 9)", "killpg"),
-        ("from os import link", "link"),
-        ("os.name == 'nt'", "name"),
-        ("path.replace(other)", "replace"),
-        ("os.replace(path, other)", "replace"),
-        ("Popen(command, start_new_session=True)", "start_new_session"),
-        ("Path('/proc/meminfo')", "/proc"),
-        ("os.open(path, os.O_DIRECTORY)", "O_DIRECTORY"),
-        ("text.replace('a', 'b')", None),
-        ("replace(photo, name=name)", None),
-        ("'''The text of /proc.'''", None),
+        ("import fcntl", "fcntl"), ("from signal import SIGTERM", "signal"), ("import os\nos.killpg(1, 9)", "killpg"),
+        ("from os import link", "link"), ("os.name == 'nt'", "name"), ("path.replace(other)", "replace"),
+        ("os.replace(path, other)", "replace"), ("Popen(command, start_new_session=True)", "start_new_session"),
+        ("Path('/proc/meminfo')", "/proc"), ("os.open(path, os.O_DIRECTORY)", "O_DIRECTORY"),
+        ("text.replace('a', 'b')", None), ("replace(photo, name=name)", None), ("'''The text of /proc.'''", None),
         ("photo.name", None),
     ],
-)
+)  # fmt: skip
 def test_names_that_differ_between_systems_are_found(text, word):
     assert [found for found, _ in offences(text)] == ([word] if word else [])
 
@@ -142,22 +131,6 @@ def test_texts_have_one_encoding_and_one_end_of_lines():
         if "encoding" not in words or (called == "write_text" and "newline" not in words)
     ]
     assert found == [("colmap/perspective.py", "write_text")]  # COLMAP's own
-
-
-@pytest.mark.parametrize(
-    ("text", "count"),
-    [
-        ("open(path)", 1),
-        ("path.open('w')", 1),
-        ("run(command, text=True)", 1),
-        ("path.read_text()", 1),
-        ("path.open('rb')", 0),
-        ("Image.open(path)", 0),
-        ("run(command)", 0),
-    ],
-)
-def test_calls_that_open_texts_are_found(text, count):
-    assert len(list(text_calls(text))) == count
 
 
 def test_processes_are_spawned():
@@ -205,73 +178,3 @@ def test_pages_and_commands_that_constants_refer_to_exist():
         for command in re.findall(r"\bpython -m (benchmarks(?:\.\w+)+)", about):
             place = ROOT / command.replace(".", "/")
             assert (place / "__main__.py").is_file() or place.with_suffix(".py").is_file(), f"{name}: {command}"
-
-
-def header(text):
-    """The docstring of a module, and the comments above its sections."""
-    comments = re.findall(r"^# .*", text, re.MULTILINE)
-    return "\n".join([ast.get_docstring(ast.parse(text)) or "", *comments])
-
-
-def test_every_module_of_a_method_names_its_equation_or_paper():
-    modules = texts(*METHODS)
-    assert len(modules) > 20
-    assert [name for name, text in modules.items() if not POINTER.search(header(text))] == []
-
-
-@pytest.mark.parametrize(
-    ("text", "names"),
-    [
-        ("BARE = 3.0", ["BARE"]),
-        ("A, _B = 1, 2.5", ["A, _B"]),
-        ('MUTE = 3.0\n"""Thresholds."""', ["MUTE"]),
-        ("TABLE = {7: 160.0}", ["TABLE"]),
-        ("SCALED: float = 2 * np.log(50)", ["SCALED"]),
-        ('PAPER = 2.5\n"""Of LMedS (Rousseeuw and Leroy 1987)."""', []),
-        ('class LoopOptions:\n    a: float = 1.0\n    """By hand."""\n    b: int = 2\n    c: int', ["LoopOptions.b"]),
-        ('class LoopOptions:\n    """Thesis 4.4."""\n    a: float = 1.0', []),
-        ("class Other:\n    a: float = 1.0", []),
-        ("X, Y = range(2)\nWORD = 'seven'\nlower = 3", []),
-    ],
-)
-def test_constants_without_a_source_are_found(text, names):
-    assert silent(text) == names
-
-
-def test_the_factor_of_the_median_deviation_stands_in_one_place():
-    def holds(text):
-        return any(isinstance(node, ast.Constant) and node.value == 1.4826 for node in ast.walk(ast.parse(text)))
-
-    assert [name for name, text in texts().items() if holds(text)] == ["numerical.py"]
-
-
-CODE = '''"""A module."""
-import p.b
-from p import c
-
-A, B = 1, 2
-C = (1.0, -2.0 * 3)
-NAME, YES = "x", True
-D: float = 4.0
-
-
-def f(self, x, *, y=1):
-    """Return a number."""
-    from p import d
-    if x and y:
-        return [z for z in d if z]
-    def g(a): return a
-    return g(c)
-'''
-
-
-def test_the_figures_of_a_known_tree():
-    tree = ast.parse(CODE)
-    functions = list(size.functions_in(tree))
-    assert [(node.name, len(size.parameters_of(node))) for node in functions] == [("f", 2), ("g", 1)]
-    assert [size.complexity(node) for node in functions] == [4, 1]
-    assert size.count_numbers(tree) == 4
-    trees = {"p.a": tree, "p.c": ast.parse("from p import d"), "p.d": ast.parse("import os"), "p.b": ast.parse("")}
-    assert (size.longest_chain(trees), size.longest_chain(trees, lazy=False)) == (3, 3)
-    assert list(size.imported("p.a", tree, trees, lazy=True)) == ["p.c", "p.d"]
-    assert list(size.imported("p.a", tree, trees, lazy=False)) == ["p.c"]

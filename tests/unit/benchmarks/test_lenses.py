@@ -1,9 +1,10 @@
-"""The benchmark of lenses measures what it says."""
+"""The benchmark of lenses measures what it says, and finds the right model in a few bundles."""
 
 import numpy as np
 import pytest
 
 from benchmarks.lenses.command import methods_for, page
+from benchmarks.lenses.models import STRONG, fisheye_case, measure, perspective_case
 from benchmarks.lenses.radius import projection_of, radius_error_percent
 from sfm_app.synthetic.cameras import Lens, make_camera, make_wide_camera
 from sfm_app.synthetic.photo_folder import Truth
@@ -43,3 +44,35 @@ def test_stock_is_told_the_lens_of_the_folder():
     told = methods_for(truth)[-1].settings["camera_params"]
     assert [float(value) for value in told.split(",")][:2] == [camera.K[0, 0]] * 2
     assert "equidistant" in page([{"method": "sfm-app", "projection": "equidistant"}])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2, 5])
+def test_the_model_of_a_perspective_lens_is_found(seed):
+    row = measure("plain", seed, hold_out=False)
+    assert row["right"] == 1 and row["needless"] == 0 and row["file"] == "OPENCV"
+    assert 0.0 < row["focal %"] < 0.1 and row["lost"] > 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 4, 8])
+def test_a_fisheye_stays_one_and_its_radius_is_accurate(seed):
+    row = measure("fisheye", seed, hold_out=False)
+    assert row["file"] == "OPENCV_FISHEYE" and "prism" not in row["free"]
+    assert 0.0 < row["radius %"] < 0.1
+
+
+@pytest.mark.slow
+def test_no_other_model_explains_held_out_observations_clearly_better():
+    row = measure("plain", 2, hold_out=True)
+    assert row["chosen"] == "RADIAL" and 0.0 <= row["below"] < np.log(STRONG)
+
+
+@pytest.mark.slow
+def test_cases_are_the_same_each_time_and_differ_from_seed_to_seed():
+    first, again, other = (perspective_case("plain", seed) for seed in (3, 3, 4))
+    assert (first.drawn.X == again.drawn.X).all() and first.start.params.tolist() == again.start.params.tolist()
+    assert not (first.drawn.X == other.drawn.X).all()
+    assert {fisheye_case("fisheye", seed).lens.split()[0] for seed in (0, 3, 6)} == {
+        "equidistant", "equisolid", "stereographic"
+    }  # fmt: skip

@@ -1,21 +1,11 @@
-import json
-
 import numpy as np
 import pytest
-from PIL import Image
 
-from benchmarks.cameras.bars import lower_bound, upper_bound
-from benchmarks.common.results import document, problems
-from benchmarks.surface.bars import BARS, bar_rows
 from benchmarks.surface.measure import cost
-from benchmarks.surface.photos import Likeness, likeness, photo_scores, psnr_db, subsample
-from benchmarks.surface.pictures import BYTES, WIDTHS_PX, save_page
+from benchmarks.surface.photos import likeness, psnr_db
 from benchmarks.surface.rendered.truth import seen_places, truth_scores
-from benchmarks.surface.report import page
-from benchmarks.surface.sets import REAL, RENDERED, SCANNED, SurfaceSet, first_photos, surface_set
 from benchmarks.surface.sparse_poisson import points_ply
 from benchmarks.surface.worker import StageCost
-from benchmarks.synthetic.scenes import WALKS
 from sfm_app.geometry.poses import Similarity
 from sfm_app.synthetic.cameras import Views, axis_rotation, look_at, make_camera
 from sfm_app.synthetic.photo_folder import Truth
@@ -94,11 +84,6 @@ def test_more_photos_see_less():
     assert 4000 > counts[0] > counts[1] > counts[2] > counts[3] == 0
 
 
-def test_an_empty_mesh_has_no_scores():
-    truth = truth_of(sheet(0.0))
-    assert set(scores(truth, np.zeros((0, 3)), np.zeros((0, 3), np.int64)).values()) == {None}
-
-
 def test_psnr_does_not_mind_exposure_but_noise():
     rng = np.random.default_rng(0)
     scene = rng.uniform(60, 180, (20_000, 3))
@@ -107,9 +92,8 @@ def test_psnr_does_not_mind_exposure_but_noise():
         noisy = photo + rng.normal(scale=noise, size=scene.shape)
         # gains and offsets take out the exposure but not the noise; rounding adds 1/12 twice
         expected = 20 * np.log10(255 / np.sqrt(noise**2 + 1 / 6))
-        assert psnr_db(np.round(scene).astype(np.uint8), np.round(noisy).astype(np.uint8)) == pytest.approx(
-            expected, abs=0.15
-        )
+        psnr = psnr_db(np.round(scene).astype(np.uint8), np.round(noisy).astype(np.uint8))
+        assert psnr == pytest.approx(expected, abs=0.15)
     flat = np.full((100, 3), 90, np.uint8)
     assert psnr_db(flat, flat + np.uint8(7)) > 80, "one color fits another"
 
@@ -120,29 +104,10 @@ def test_likeness_counts_covered_pixels_alone():
     covered = np.zeros((40, 60), bool)
     covered[:, 30:] = True
     found = likeness(Picture(photo * covered[..., None], covered), photo)
-    assert (
-        found.coverage == 0.5
-        and found.coverage_not_black == 0.75
-        and found.not_black == pytest.approx(2 / 3)
-        and found.psnr_db > 80
-    )
+    assert (found.coverage, found.coverage_not_black) == (0.5, 0.75)
+    assert found.not_black == pytest.approx(2 / 3) and found.psnr_db > 80
     covered[:, :59] = False
     assert np.isnan(likeness(Picture(photo, covered), photo).psnr_db), "40 pixels say nothing"
-
-
-def test_the_worst_photo_stands_beside_the_mean():
-    row = photo_scores(
-        {"a": Likeness(0.9, 0.9, 0.95, 25.0), "b": Likeness(0.5, 0.7, 0.65, 21.0), "c": Likeness(0.1, 0.5, 0.2, np.nan)}
-    )
-    assert (row["coverage %"], row["worst coverage %"], row["coverage of not black %"]) == (50.0, 10.0, 60.0)
-    assert (row["PSNR dB"], row["worst PSNR dB"], row["not black %"]) == (23.0, 21.0, 70.0)
-    assert photo_scores({"c": Likeness(0.0, 0.0, 0.0, np.nan)})["PSNR dB"] is None
-
-
-def test_photos_to_leave_out_are_spread_evenly():
-    names = [f"{k}" for k in range(11)]
-    assert subsample(names, 1) == ["5"] and subsample(names, 3) == ["2", "5", "8"]
-    assert subsample(names, 11) == subsample(names, 20) == names
 
 
 def test_cost_is_that_of_all_stages_but_the_files():
@@ -157,65 +122,6 @@ def test_cost_is_that_of_all_stages_but_the_files():
     assert row["MB mesh"] == 700 and row["s of files"] == 1.0 and row["failed"] == ""
     stopped = cost({"scene": StageCost("", 50.0, 900), "depth_maps": StageCost("depth_maps: no", None, 100)})
     assert stopped["failed"] == "depth_maps: no" and stopped["seconds together"] is None
-
-
-def test_every_set_has_its_bars_and_they_are_judged_both_ways():
-    assert set(BARS) == {*RENDERED, *REAL, *SCANNED} and set(RENDERED) <= set(WALKS)
-    assert BARS["statue"] == (lower_bound("accuracy %", 90.0), lower_bound("completeness %", 85.0))
-    assert upper_bound("seconds together", 90.0) in BARS["fountain-P11"]
-    assert lower_bound("worst coverage %", 75.0) in BARS["Herz-Jesus-P8"]
-    assert lower_bound("worst coverage %", 50.0) in BARS["castle-P19"]
-    rows = bar_rows([{"photos": "statue", "accuracy %": 90.0, "completeness %": 84.9}, {"photos": "corner"}])
-    assert [row["met"] for row in rows] == ["yes", "**no**", "not measured", "not measured"]
-    late = bar_rows([{"photos": "fountain-P11", "seconds together": 90.1}])
-    assert [row["met"] for row in late if "seconds" in row["asked"]] == ["**no**"]
-
-
-def test_the_page_and_the_document_hold_what_was_measured(tmp_path):
-    rows = [
-        {"photos": "statue", "method": "sfm-app", "failed": "", "placed": 22, "accuracy %": 95.0, "completeness %": 91,
-         "seconds together": 80.0, "s of mesh": 20.0, "MB mesh": 900},
-        {"photos": "kermit11", "method": "sfm-app", "failed": "mesh: no surface", "seconds together": None},
-    ]  # fmt: skip
-    parts = [{"photos": "pond first 3", "failed": "", "seconds per photo": 4.25, "s of texture": 7.75}]
-    text = page("About.", rows, parts, {"statue": "surface-statue.png"})
-    assert "| pond first 3 | 4.25 | 7.75 |" in text
-    assert "| statue | accuracy % at least 90 | 95 | yes |" in text and "mesh: no surface" in text
-    assert "![statue](surface-statue.png)" in text and "surface-kermit11.png" not in text
-    assert not problems(json.loads(json.dumps(document("surface", "About.", {}, {}, rows))))
-
-
-def test_sets_are_rendered_scenes_or_folders_and_parts_are_the_same_files(tmp_path):
-    images = tmp_path / "data" / "pond" / "images"
-    images.mkdir(parents=True)
-    for k in range(4):
-        Image.new("RGB", (8, 8)).save(images / f"{k}.png")
-    whole = surface_set("pond", tmp_path / "data", tmp_path)
-    assert whole.count == 4 and whole.truth is None
-    part = first_photos(whole, 3, tmp_path / "cache")
-    assert [path.name for path in sorted(part.photos.iterdir())] == ["0.png", "1.png", "2.png"]
-    assert (
-        isinstance(part, SurfaceSet)
-        and part.count == 3
-        and all(path.samefile(images / path.name) for path in part.photos.iterdir())
-    )
-    with pytest.raises(ValueError, match="'lake' is neither"):
-        surface_set("lake", tmp_path / "data", tmp_path)
-
-
-def test_pages_of_pictures_stay_small_and_keep_their_colors(tmp_path):
-    noise = np.random.default_rng(0).integers(0, 256, (700, 2000, 3)).astype(np.uint8)
-    plain = np.zeros((900, 2000, 3), np.uint8)
-    plain[:, :1000], plain[:, 1000:] = (200, 40, 90), (30, 160, 220)
-    plain[800:, :200] = 255
-    save_page(noise, tmp_path / "noise.png")
-    save_page(plain, tmp_path / "plain.png")
-    with Image.open(tmp_path / "noise.png") as narrow, Image.open(tmp_path / "plain.png") as wide:
-        assert narrow.width < wide.width == WIDTHS_PX[0] and wide.height == 720
-        assert wide.convert("RGB").getpixel((10, 10)) == (200, 40, 90)
-        assert wide.convert("RGB").getpixel((1500, 700)) == (30, 160, 220)
-        assert wide.convert("RGB").getpixel((10, 700)) == (255, 255, 255)
-    assert (tmp_path / "plain.png").stat().st_size <= BYTES
 
 
 def test_points_are_written_as_colmap_reads_them(tmp_path):

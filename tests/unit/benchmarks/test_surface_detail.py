@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.surface.rendered import detail
-from benchmarks.surface.rendered.detail import creases, detail_scores
+from benchmarks.surface.rendered.detail import detail_scores
 from benchmarks.synthetic.detail_scenes import straight, tube
 from sfm_app.synthetic.cameras import Views, look_at, make_camera
 from sfm_app.synthetic.compare import scene_size
@@ -40,7 +40,6 @@ def scores(truth, *shapes):
 
 def test_the_truth_has_all_its_detail(truth):
     found = scores(truth, FLOOR, BLOCK, BAR)
-
     assert found["accuracy 0.05 %"] == found["completeness 0.05 %"] == found["F 0.05 %"] == 100.0
     assert (found["flakes %"], found["thin things %"], found["edges within 0.1 %"]) == (0.0, 100.0, 100.0)
     assert found["edges: median %"] < 1e-3 and found["ground at a low angle %"] == 100.0
@@ -48,9 +47,7 @@ def test_the_truth_has_all_its_detail(truth):
 
 def test_a_missing_rod_a_missing_floor_and_a_flake_are_seen(truth):
     flake = box(0.5, 0.01, 0.5).move((0.0, 1.5, 0.0))
-
     found = scores(truth, BLOCK, flake)
-
     assert found["thin things %"] < 30.0 and found["ground at a low angle %"] < 15.0
     assert 10.0 < found["flakes %"] < 50.0 and found["completeness 0.4 %"] < 70.0
 
@@ -58,20 +55,9 @@ def test_a_missing_rod_a_missing_floor_and_a_flake_are_seen(truth):
 def test_a_smaller_block_has_rounded_edges(truth):
     off = 0.004 * scene_size(truth)
     smaller = box(0.8 - 2 * off, 0.6 - off, 0.6 - 2 * off).move((0.0, 0.05, 0.0))
-
     found = scores(truth, FLOOR, smaller, BAR)
-
     assert 100 * 0.004 * np.sqrt(2) == pytest.approx(found["edges: median %"], rel=0.1)
     assert found["edges within 0.1 %"] < 10.0 and found["accuracy 0.1 %"] < 100.0
-
-
-def test_a_box_has_twelve_creases_and_a_floor_none():
-    ends, normals = creases(BLOCK.vertices, BLOCK.faces)
-
-    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum()
-    assert length == pytest.approx(4 * (0.8 + 0.6 + 0.6))
-    assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0)
-    assert len(creases(FLOOR.vertices, FLOOR.faces)[0]) == 0
 
 
 def test_an_empty_mesh_has_no_figures(truth):

@@ -16,7 +16,6 @@ from benchmarks.surface.depth_camera.kinect import (
     within_reach,
 )
 from benchmarks.surface.depth_camera.scan import PATCH, Scan, align
-from benchmarks.surface.report import page
 from benchmarks.surface.sets import SCANNED, surface_set
 from sfm_app.geometry.poses import Similarity
 from sfm_app.synthetic.cameras import Camera, axis_rotation, camera_center, look_at
@@ -27,9 +26,7 @@ SIZE = np.array([1.7, 1.2, 1.5])
 """Of the room, in meters."""
 WORLD = Similarity(0.4, axis_rotation(np.array([0.6, 0.0, 0.8]), 40.0), np.array([3.0, -1.0, 2.0]))
 """From the truth to the frame of the reconstruction."""
-DEPTH_CAMERA = Camera(
-    np.array([[FOCAL_PX, 0.0, WIDTH / 2], [0.0, FOCAL_PX, HEIGHT / 2], [0.0, 0.0, 1.0]]), WIDTH, HEIGHT
-)
+DEPTH_CAMERA = Camera(np.array([[FOCAL_PX, 0, WIDTH / 2], [0, FOCAL_PX, HEIGHT / 2], [0, 0, 1.0]]), WIDTH, HEIGHT)
 
 
 def cell_means(points):
@@ -57,16 +54,6 @@ def test_distances_from_a_plane_are_those_from_its_middle(noise, height):
     assert np.median(found) == pytest.approx(abs(height), abs=0.0015 + 0.1 * noise)
     assert np.quantile(np.abs(found - abs(height)), 0.9) < 0.002 + 0.4 * noise
     assert np.nanmedian(scan.roughness) < 0.5 * CELL + noise
-
-
-def test_the_nearest_point_errs_either_way():
-    rng = np.random.default_rng(0)
-    flat = np.column_stack([rng.uniform(-0.2, 0.2, (2000, 2)), np.full(2000, 0.03)])
-    (thin, R), (band, _) = plane_scan(0.0, rng), plane_scan(0.012, rng)
-    near = flat @ R.T
-    near[:, :] -= 0.025 * R[:, 2]
-    assert 0.007 < np.median(thin.point_distances(near)) < 0.012, "5 mm from the plane, but not from its points"
-    assert 0.004 < np.median(band.point_distances(flat @ R.T)) < 0.018, "3 cm from the middle, but not from the face"
 
 
 def test_distances_from_a_sphere_and_beyond_the_edge_of_a_plane():
@@ -223,9 +210,7 @@ def test_cameras_that_are_turned_about_what_they_see_are_told(pivot):
     rng = np.random.default_rng(5)
     turned = {}
     for name, P in depth.items():
-        R = axis_rotation(np.array([1.0, 0.0, 0.0]), rng.normal()) @ axis_rotation(
-            np.array([0.0, 1.0, 0.0]), rng.normal()
-        )
+        R = axis_rotation(np.eye(3)[0], rng.normal()) @ axis_rotation(np.eye(3)[1], rng.normal())
         # the point ahead stays where it is in the picture
         t = R @ (P[:, 3] - [0.0, 0.0, pivot]) + [0.0, 0.0, pivot]
         turned[name] = np.column_stack([R @ P[:, :3], t + 0.001 * rng.normal(size=3)])
@@ -266,9 +251,3 @@ def test_a_scanned_set_is_every_fifth_photo_and_has_its_bars(tmp_path):
     assert set(SCANNED) <= set(BARS)
     judged = bar_rows([{"photos": "kitchen1000", "accuracy 3 cm %": 80.0, "completeness 5 cm %": 69.9}])
     assert [row["met"] for row in judged] == ["yes", "**no**"]
-
-
-def test_the_page_has_a_row_for_each_alignment():
-    row = {"photos": "kitchen1000", "failed": "", "accuracy 3 cm %": 71.0, "ICP: accuracy 3 cm %": 83.0}
-    text = page("About.", [row], [], {})
-    assert "| kitchen1000 | cameras | 71 |" in text and "| kitchen1000 | cameras, then ICP | 83 |" in text

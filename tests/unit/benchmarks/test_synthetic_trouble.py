@@ -12,7 +12,6 @@ from benchmarks.synthetic.trouble import (
     PHOTOS,
     apply_motion_blur,
     cam_from_thing,
-    fade_colors,
     moving_thing,
     repeated_things,
     troubled_folder,
@@ -20,7 +19,6 @@ from benchmarks.synthetic.trouble import (
     with_zoom,
     write_troubled_folder,
 )
-from sfm_app.errors import InputError
 from sfm_app.synthetic.cameras import Views, camera_center, make_camera, pixel_rays
 from sfm_app.synthetic.shapes import Body
 
@@ -28,7 +26,7 @@ from sfm_app.synthetic.shapes import Body
 @cache
 def plans():
     """As they are asked for first: every worker collects this module, and one runs it."""
-    return [troubled_folder(seed) for seed in range(120)]
+    return [troubled_folder(seed) for seed in range(60)]
 
 
 def plan_with(*troubles):
@@ -59,7 +57,6 @@ def written(plan, folder):
 @pytest.mark.slow
 def test_a_seed_is_a_folder():
     again = troubled_folder(17)
-
     assert (again.troubles, again.options) == (plans()[17].troubles, plans()[17].options)
     for name, pose in again.views.cam_from_world.items():
         assert np.array_equal(pose, plans()[17].views.cam_from_world[name])
@@ -70,10 +67,9 @@ def test_a_seed_is_a_folder():
 @pytest.mark.slow
 def test_every_trouble_comes_up_and_few_at_a_time():
     met = {kind for plan in plans() for kind in plan.troubles}
-
     assert met == set(KINDS)
     assert all(len(plan.troubles) <= 6 for plan in plans())
-    assert 1 <= sum(not plan.troubles for plan in plans()) <= 12
+    assert 1 <= sum(not plan.troubles for plan in plans()) <= 6
     assert all(PHOTOS[0] <= len(plan.views.cameras) <= PHOTOS[1] for plan in plans())
 
 
@@ -107,7 +103,6 @@ def test_a_lens_pushes_the_farthest_corner_by_what_is_asked_and_zooming_keeps_th
     camera = with_distortion(make_camera(640, 480, 1.0, center=(0.4, 0.55)), -0.08)
     corner = np.array([640.0, 0.0])
     seen = (corner - camera.K[:2, 2]) / camera.K[0, 0]
-
     assert camera.radial * (seen @ seen) == pytest.approx(-0.08)
     assert with_zoom(camera, 2.0).radial == pytest.approx(4 * camera.radial)
     assert with_zoom(camera, 2.0).K[1, 1] == 2 * camera.K[1, 1] and with_zoom(camera, 2.0).K[0, 2] == camera.K[0, 2]
@@ -117,7 +112,6 @@ def test_a_lens_pushes_the_farthest_corner_by_what_is_asked_and_zooming_keeps_th
 def test_motion_blur_smears_along_its_direction_and_keeps_the_light():
     image = np.zeros((31, 31, 3))
     image[15, 15] = 1.0
-
     level = apply_motion_blur(image, 8.0, 0.0)[..., 0]
     rows, columns = np.mgrid[:31, :31] - 15
     assert level.sum() == pytest.approx(1.0)
@@ -142,12 +136,8 @@ def test_what_moves_is_seen_elsewhere_and_the_rest_stays(tmp_path):
     R, t = plan.views.cam_from_world[name][:, :3], plan.views.cam_from_world[name][:, 3]
     ahead = camera_center(plan.views.cam_from_world[name]) + 1.5 * R[2] - 0.4 * np.array([0.0, 1.0, 0.0])
     still = replace(plan, spoiling=replace(plan.spoiling, thing=None, blur_px={}, defocus_px={}))
-    moving = replace(
-        plan,
-        spoiling=replace(
-            plan.spoiling, thing_at={name: np.column_stack([np.eye(3), ahead])}, blur_px={}, defocus_px={}
-        ),
-    )
+    spoiling = replace(still.spoiling, thing=plan.spoiling.thing, thing_at={name: np.column_stack([np.eye(3), ahead])})
+    moving = replace(plan, spoiling=spoiling)
 
     without, there = written(still, tmp_path / "a")[name], written(moving, tmp_path / "b")[name]
 
@@ -157,31 +147,12 @@ def test_what_moves_is_seen_elsewhere_and_the_rest_stays(tmp_path):
 
 
 @pytest.mark.slow
-def test_faded_scenes_show_less(tmp_path):
-    plan = small(plan_with("plane"), photos=1)
-    plan = replace(plan, spoiling=replace(plan.spoiling, blur_px={}, defocus_px={}, thing=None))
-    pale = replace(plan, scene=fade_colors(plan.scene, 0.1))
-
-    rich, poor = (written(p, tmp_path / str(k))["view_00.jpg"] for k, p in enumerate((plan, pale)))
-
-    assert np.abs(np.diff(poor, axis=1)).mean() < 0.6 * np.abs(np.diff(rich, axis=1)).mean()
-
-
-@pytest.mark.slow
 def test_the_folder_is_rendered_alike_twice_and_a_thing_stands_on_its_foot(tmp_path):
     plan = small(plan_with("motion blur"))
     write_troubled_folder(tmp_path / "a", plan)
     write_troubled_folder(tmp_path / "b", plan)
-
     for path in (tmp_path / "a").iterdir():
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
     assert len(list((tmp_path / "a").iterdir())) == 2
     bodies = moving_thing(np.random.default_rng(1))
     assert all(isinstance(body, Body) for body in bodies) and min(b.shape.vertices[:, 1].min() for b in bodies) == 0.0
-
-
-@pytest.mark.slow
-def test_a_folder_that_cannot_be_written_is_said(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot write photos"):
-        write_troubled_folder(tmp_path / "file", small(plans()[0], photos=1))

@@ -1,4 +1,4 @@
-"""Walks, orbits and panoramas, and a camera that moves while its rows are read."""
+"""Walks, orbits, panoramas, a camera that moves while its rows are read, and matches without pictures."""
 
 import itertools
 from itertools import combinations
@@ -6,19 +6,12 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from benchmarks.synthetic.walks import (
-    WalkOptions,
-    WallWalkOptions,
-    orbit,
-    panorama,
-    project_through_shutter,
-    row_poses,
-    walk,
-    wall_walk,
-)
+from benchmarks.synthetic import walks
+from benchmarks.synthetic.matches import LEAST_DEPARTURE_PX, TownOptions, make_town_graph, make_two_motions
 from sfm_app.errors import ConfigError
-from sfm_app.geometry.epipolar import fundamental_from_pose
-from sfm_app.synthetic.cameras import arc, camera_center, make_camera
+from sfm_app.geometry.epipolar import sampson_distance
+from sfm_app.synthetic.cameras import camera_center, make_camera
+from sfm_app.synthetic.correspondences import PairOptions
 
 
 def miss_of_axes(views):
@@ -34,10 +27,9 @@ def miss_of_axes(views):
 @pytest.mark.parametrize(("photos", "sweep_deg"), [(12, 80.0), (8, 360.0)])
 def test_in_an_orbit_all_axes_meet_at_one_distance(photos, sweep_deg):
     aim = np.array([0.5, 1.0, -0.3])
-    views = orbit(make_camera(96, 64), photos, sweep_deg, distance=4.0, aim=tuple(aim))
+    views = walks.orbit(make_camera(96, 64), photos, sweep_deg, distance=4.0, aim=tuple(aim))
     poses = np.array(list(views.cam_from_world.values()))
     centers = np.array([camera_center(pose) for pose in poses])
-
     assert len(poses) == photos and miss_of_axes(views).max() < 1e-9
     assert np.allclose(np.linalg.norm(centers - aim, axis=1), 4.0) and np.allclose(centers[:, 1], 1.0)
     assert np.allclose(poses[:, 1, :3], [0, -1, 0]), "upright"
@@ -45,55 +37,27 @@ def test_in_an_orbit_all_axes_meet_at_one_distance(photos, sweep_deg):
     assert np.allclose(steps, 8.0 * np.sin(np.radians(sweep_deg / photos / 2)))
 
 
-def test_an_orbit_leaves_the_focal_undetermined():
-    """A wrong focal makes every pair essential as well; on an arc it does not."""
-    K = make_camera(96, 64, center=(0.5, 0.5)).K
-    wrong = K.copy()
-    wrong[0, 0] *= 1.3
-    wrong[1, 1] *= 1.3
-
-    def ratio(views):
-        poses = list(views.cam_from_world.values())
-        found = []
-        for first, second in combinations(poses[:5], 2):
-            R = second[:, :3] @ first[:, :3].T
-            F = fundamental_from_pose(K, K, R, second[:, 3] - R @ first[:, 3])
-            s = np.linalg.svd(wrong.T @ F @ wrong, compute_uv=False)
-            found.append(s[1] / s[0])
-        return min(found)
-
-    camera = make_camera(96, 64, center=(0.5, 0.5))
-    assert ratio(orbit(camera)) > 1 - 1e-9 > 0.99 > ratio(arc(camera))
-
-
-@pytest.mark.parametrize("wrong", [{"photos": 1}, {"sweep_deg": 400.0}, {"distance": 0.0}])
-def test_impossible_orbits_are_refused(wrong):
-    with pytest.raises(ConfigError, match="orbit"):
-        orbit(make_camera(96, 64), **wrong)
-
-
 def test_a_panorama_is_taken_from_one_spot():
-    views = panorama(make_camera(96, 64), photos=5, step_deg=10.0, center=(1.0, 2.0, 3.0))
+    views = walks.panorama(make_camera(96, 64), photos=5, step_deg=10.0, center=(1.0, 2.0, 3.0))
     poses = list(views.cam_from_world.values())
     turned = [np.degrees(np.arccos(np.clip(a[2, :3] @ b[2, :3], -1, 1))) for a, b in combinations(poses, 2)]
-
     assert np.allclose([camera_center(pose) for pose in poses], [1.0, 2.0, 3.0])
     assert 9.0 < min(turned) < 12.0 and 38.0 < max(turned) < 42.0
 
 
 @pytest.mark.slow
 def test_a_walk_past_a_wall_turns_its_head():
-    views = wall_walk(make_camera(120, 80), WallWalkOptions(photos=8, length=6.0), seed=1)
+    views = walks.wall_walk(make_camera(120, 80), walks.WallWalkOptions(photos=8, length=6.0), seed=1)
     poses = np.array(list(views.cam_from_world.values()))
     eyes = np.array([camera_center(pose) for pose in poses])
     assert np.allclose(np.diff(eyes[:, 0]), 6.0 / 7) and np.all((eyes[:, 2] > 5) & (eyes[:, 2] < 7))
     ways = poses[:, 2, :3]
     angles = np.degrees(np.arccos(np.clip(ways @ ways.T, -1, 1)))
     assert np.all(ways[:, 2] < -0.7) and 10 < angles.max() < 80, "parallel axes would leave the focal undetermined"
-    other = wall_walk(make_camera(120, 80), WallWalkOptions(photos=8, length=6.0), seed=2)
+    other = walks.wall_walk(make_camera(120, 80), walks.WallWalkOptions(photos=8, length=6.0), seed=2)
     assert not np.allclose(poses, np.array(list(other.cam_from_world.values())))
     with pytest.raises(ConfigError, match="photos, length or roll_deg"):
-        WallWalkOptions(photos=1)
+        walks.WallWalkOptions(photos=1)
 
 
 CAMERA = make_camera(640, 480)
@@ -104,76 +68,88 @@ def turn_deg(a, b):
 
 
 def test_a_walk_without_shaking_goes_straight_on_at_its_speed():
-    path = walk(WalkOptions(seconds=2.0, speed=1.4, shake=0.0, heading_deg=90.0))
-
+    path = walks.walk(walks.WalkOptions(seconds=2.0, speed=1.4, shake=0.0, heading_deg=90.0))
     first, last = path.poses(np.array([0.0, 2.0]))
-
     assert camera_center(last) - camera_center(first) == pytest.approx([2.8, 0.0, 0.0], abs=1e-9)
     assert turn_deg(first, last) == pytest.approx(0.0, abs=1e-5)
 
 
 def test_the_fastest_turn_is_as_fast_as_asked():
-    path = walk(WalkOptions(seconds=4.0, swing_deg_s=60.0, shake=0.0))
+    path = walks.walk(walks.WalkOptions(seconds=4.0, swing_deg_s=60.0, shake=0.0))
     poses = path.poses(np.linspace(0.0, 4.0, 401))
-
     rates = [turn_deg(a, b) / 0.01 for a, b in itertools.pairwise(poses)]
-
     assert 59.0 < max(rates) < 61.0
 
 
-def test_a_hand_shakes_by_centimeters_and_degrees():
-    smooth, shaken = (walk(WalkOptions(shake=shake)).poses(np.linspace(0.0, 4.0, 81)) for shake in (0.0, 1.0))
-
-    off = [np.linalg.norm(camera_center(a) - camera_center(b)) for a, b in zip(smooth, shaken, strict=True)]
-    turned = [turn_deg(a, b) for a, b in zip(smooth, shaken, strict=True)]
-
-    assert 0.01 < np.median(off) < 0.1
-    assert 0.5 < np.median(turned) < 5.0
-
-
-def test_the_seed_determines_the_phases():
-    times = np.array([0.3, 1.7])
-    first, again, other = (walk(WalkOptions(), seed).poses(times) for seed in (1, 1, 2))
-
-    assert np.array_equal(first, again)
-    assert not np.allclose(first, other, atol=1e-3)
-
-
 def test_the_middle_row_is_seen_from_the_pose_of_the_frame():
-    path = walk(WalkOptions(swing_deg_s=60.0))
-
-    rows = row_poses(path, 1.0, 0.03, 481)
-
+    path = walks.walk(walks.WalkOptions(swing_deg_s=60.0))
+    rows = walks.row_poses(path, 1.0, 0.03, 481)
     assert rows[240] == pytest.approx(path.poses(np.array([1.0]))[0], abs=1e-12)
     assert rows[0] == pytest.approx(path.poses(np.array([1.0 - 0.015 * 480 / 481]))[0], abs=1e-12)
 
 
 def test_a_point_is_seen_from_the_pose_of_its_own_row():
-    path, readout = walk(WalkOptions(swing_deg_s=90.0)), 0.03
+    path, readout = walks.walk(walks.WalkOptions(swing_deg_s=90.0)), 0.03
     (middle,) = path.poses(np.array([1.0]))
     points = (np.random.default_rng(0).uniform([-1, -1, 4], [1, 1, 7], (50, 3)) - middle[:, 3]) @ middle[:, :3]
-
-    x = project_through_shutter(CAMERA, path, 1.0, readout, points)
-
+    x = walks.project_through_shutter(CAMERA, path, 1.0, readout, points)
     inside = np.all((x > 0) & (x < (640, 480)), axis=1)
     assert np.count_nonzero(inside) > 10
     for point, (column, row) in zip(points[inside], x[inside], strict=True):
         (pose,) = path.poses(np.array([1.0 + readout * (row / 480 - 0.5)]))
         seen = CAMERA.K @ (pose[:, :3] @ point + pose[:, 3])
         assert seen[:2] / seen[2] == pytest.approx([column, row], abs=1e-4)
-    still = project_through_shutter(CAMERA, path, 1.0, 0.0, points)
+    still = walks.project_through_shutter(CAMERA, path, 1.0, 0.0, points)
     assert 1.0 < np.median(np.linalg.norm(x - still, axis=1)) < 20.0
 
 
 def test_points_behind_the_camera_are_nowhere():
-    path = walk(WalkOptions(shake=0.0))
-
-    x = project_through_shutter(CAMERA, path, 0.0, 0.02, np.array([[0.0, 1.5, 5.0], [0.0, 1.5, -5.0]]))
-
+    path = walks.walk(walks.WalkOptions(shake=0.0))
+    x = walks.project_through_shutter(CAMERA, path, 0.0, 0.02, np.array([[0.0, 1.5, 5.0], [0.0, 1.5, -5.0]]))
     assert np.isnan(x[0]).all() and np.isfinite(x[1]).all()
 
 
-@pytest.mark.parametrize("wrong", [{"seconds": 0.0}, {"speed": -1.0}, {"swing_period_s": 0.0}, {"shake": -0.1}])
-def test_what_is_out_of_range_is_refused(wrong):
-    with pytest.raises(ConfigError, match=next(iter(wrong))):
-        WalkOptions(**wrong)
+@pytest.mark.parametrize("seed", range(8))
+def test_each_motion_has_its_own_epipolar_geometry(seed):
+    scene = make_two_motions(PairOptions(points=300, outliers=0.1), 0.3, seed)
+    pair, moving = scene.pair, scene.is_moving
+    to_scene = sampson_distance(pair.F, pair.exact_x1, pair.exact_x2)
+    to_object = sampson_distance(scene.moving_F, pair.exact_x1, pair.exact_x2)
+    assert to_scene[~moving].max() < 1e-8 and to_object[moving].max() < 1e-8
+    assert np.median(to_scene[moving]) >= LEAST_DEPARTURE_PX
+    assert np.median(to_object[~moving]) > 1.0
+    assert np.linalg.norm(scene.moving_F) == pytest.approx(1.0)
+    for x in (pair.exact_x1, pair.exact_x2):
+        assert x.min() >= 0 and x.max() <= 512
+
+
+@pytest.mark.parametrize(("moving", "outliers"), [(0.1, 0.0), (0.25, 0.2), (0.4, 0.1)])
+def test_shares_are_those_asked_for_and_rows_are_mixed(moving, outliers):
+    scene = make_two_motions(PairOptions(outliers=outliers), moving, seed=3)
+    wrong = ~scene.pair.is_inlier & ~scene.is_moving
+    assert len(scene.pair.x1) == 1200
+    assert np.count_nonzero(scene.is_moving) == round(1200 * moving)
+    assert np.count_nonzero(wrong) == round(1200 * outliers)
+    assert not scene.pair.is_inlier[scene.is_moving].any()
+    assert abs(scene.is_moving[:600].mean() - moving) < 0.06
+
+
+def test_the_object_has_the_same_noise_and_is_a_cluster():
+    scene = make_two_motions(PairOptions(sigma_px=0.8), 0.4, seed=5)
+    pair, moving = scene.pair, scene.is_moving
+    for noise in (pair.x1 - pair.exact_x1, pair.x2 - pair.exact_x2):
+        assert 0.74 < noise[moving].std() < 0.86 and 0.74 < noise[~moving].std() < 0.86
+    assert pair.exact_x1[moving].std(axis=0).max() < 0.8 * pair.exact_x1[~moving].std(axis=0).min()
+
+
+@pytest.mark.parametrize(("moving", "outliers"), [(0.0, 0.1), (0.5, 0.0), (0.4, 0.2), (1.0, 0.0)])
+def test_the_still_scene_must_dominate(moving, outliers):
+    with pytest.raises(ConfigError, match="share above 0 and below"):
+        make_two_motions(PairOptions(outliers=outliers), moving, seed=0)
+
+
+def test_no_keypoint_has_two_matches_in_a_photo_and_some_matches_are_wrong():
+    town = make_town_graph(TownOptions(photos=40, neighbors=8, look_alikes=0.02), 0)
+    assert all(len(np.unique(rows[:, side])) == len(rows) for rows in town.matches.matches.values() for side in (0, 1))
+    right = np.concatenate([fit.inliers for pair, fit in town.views.fits.items() if pair not in town.look_alikes])
+    assert 0.65 < right.mean() < 0.85

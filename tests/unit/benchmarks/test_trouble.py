@@ -24,9 +24,7 @@ def left_behind(folder, *, identifiable, sd):
 
 def test_each_photo_is_held_against_the_camera_that_took_it(tmp_path):
     left_behind(tmp_path, identifiable=True, sd=1.0)
-
     found = trouble.known_cameras(tmp_path, PHOTOS, "before")
-
     assert (found["known"], found["wrong"]) == ("2/2", 1)
     assert found["focal %"] == pytest.approx(100 * (1 - 600 / 660), abs=0.01)
 
@@ -66,7 +64,6 @@ def met(rows):
 def test_one_wrong_camera_in_a_hundred_folders_passes_and_two_do_not():
     fine = [folder_row(seed) for seed in range(98)]
     one, two = folder_row(98, wrong=1), folder_row(99, wrong=1, **{"wrong after": 1})
-
     assert met([*fine, one, folder_row(99)]) == ["yes"] * 4
     assert met([*fine, one, two]) == ["yes", "no", "yes", "yes"]
     assert trouble.demands([*fine, one, two])[1]["seeds"] == "98, 99"
@@ -75,14 +72,5 @@ def test_one_wrong_camera_in_a_hundred_folders_passes_and_two_do_not():
 @pytest.mark.parametrize(("code", "fails"), [(0, False), (4, False), (1, True), (5, True), (None, True)])
 def test_only_a_scene_or_a_reason_why_there_is_none_is_expected(code, fails):
     rows = [folder_row(**{"exit code": code, "last": "error: unexpected ValueError: x"})]
-
     assert (met(rows)[0] == "no") is fails
     assert ("unexpected ValueError" in trouble.page(rows)) is fails
-
-
-def test_every_trouble_has_a_line_of_its_own():
-    rows = [folder_row(), folder_row(2, troubles="zoom", wrong=1), folder_row(3, troubles="none")]
-
-    found = {row["trouble"]: (row["folders"], row["K wrong"]) for row in trouble.trouble_rows(rows)}
-
-    assert found == {"all": (3, 1), "none": (1, 0), "plane": (1, 0), "zoom": (2, 1)}

@@ -88,10 +88,8 @@ def make_run(tmp_path):
         place.sparse.mkdir(parents=True)
         model.write(place.sparse)
         write_photos(model, place.photos)
-        cameras = {
-            f"c {image.camera_id}": {"deviations": {"fx": 0.25}, "determined": ["center"]}
-            for image in model.images.values()
-        }
+        known = {"deviations": {"fx": 0.25}, "determined": ["center"]}
+        cameras = {f"c {image.camera_id}": known for image in model.images.values()}
         camera_of = {image.name: f"c {image.camera_id}" for image in model.images.values()}
         known = {"cameras": cameras, "camera_of": camera_of, "unregistered": {"lost.jpg": "no overlap"}}
         place.scene.write_text(json_text(known), encoding="utf-8")
@@ -108,9 +106,8 @@ def make_run(tmp_path):
             cloud[key] = rng.uniform(-3.0, 5.0, points)
         cloud["nx"], cloud["red"], cloud["blue"] = 1.0, 250, rng.integers(0, 256, points)
         write_points(cloud, place.surface / "fused.ply")
-        np.savez(
-            place.surface / "surface.npz", vertices=np.eye(3), faces=np.array([[0, 1, 2]]), colors=np.zeros((3, 3))
-        )
+        corners, faces = np.eye(3), np.array([[0, 1, 2]])
+        np.savez(place.surface / "surface.npz", vertices=corners, faces=faces, colors=np.zeros((3, 3)))
         place.scale.write_text(json_text(MetricFrame().to_dict()), encoding="utf-8")
         for name in NAMES[: NAMES.index(until) + 1]:
             stage = {"scene": SCENE, "scale": SCALE, "mesh": MESH}.get(name)

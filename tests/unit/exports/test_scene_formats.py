@@ -111,9 +111,8 @@ def test_transforms_json_projects_points_as_its_documentation_says(make_run, fra
         assert np.linalg.det(world_from_cam[:3, :3]) == pytest.approx(1.0)
         at = (frame(truth) - world_from_cam[:3, 3]) @ world_from_cam[:3, :3]  # x right, y up, z back
         ahead = at[:, 2] < -0.2 * frame.scale
-        x = np.column_stack(
-            [lens["cx"] - lens["fl_x"] * at[:, 0] / at[:, 2], lens["cy"] + lens["fl_y"] * at[:, 1] / at[:, 2]]
-        )
+        focal, center = np.array([-lens["fl_x"], lens["fl_y"]]), (lens["cx"], lens["cy"])
+        x = center + focal * at[:, :2] / at[:, 2:]
         inside = ahead & (x > 2).all(axis=1) & (x < [lens["w"] - 2, lens["h"] - 2]).all(axis=1)
         seen += inside.sum()
         K = np.array([[lens["fl_x"], 0, lens["cx"]], [0, lens["fl_y"], lens["cy"]], [0, 0, 1]])
@@ -221,15 +220,11 @@ def test_the_dense_cloud_is_read_from_ply_and_from_laz(make_run, frame):
     laz = laspy.read(sfm_app.export_scene(run.out, "laz"))
 
     np.testing.assert_allclose(plain.vertices, points, rtol=RELATIVE, atol=1e-6 * frame.scale)
-    np.testing.assert_array_equal(
-        plain.colors[:, :3], np.stack([run.cloud[c] for c in ("red", "green", "blue")], axis=1)
-    )
+    colors = np.stack([run.cloud[c] for c in ("red", "green", "blue")], axis=1)
+    np.testing.assert_array_equal(plain.colors[:, :3], colors)
     raw = plain.metadata["_ply_raw"]["vertex"]["data"]
-    np.testing.assert_allclose(
-        np.stack([raw[c] for c in ("nx", "ny", "nz")], axis=-1).reshape(-1, 3),
-        np.tile(frame.R[:, 0], (400, 1)),
-        atol=1e-6,
-    )
+    normals = np.stack([raw[c] for c in ("nx", "ny", "nz")], axis=-1).reshape(-1, 3)
+    np.testing.assert_allclose(normals, np.tile(frame.R[:, 0], (400, 1)), atol=1e-6)
     assert 1e-10 < laz.header.scales[0] / np.ptp(points, axis=0).max() < 1e-8
     np.testing.assert_allclose(laz.xyz, points, rtol=0, atol=0.51 * laz.header.scales[0])
     assert (laz.header.version, laz.header.point_count) == ("1.2", 400)
@@ -260,12 +255,8 @@ def test_bundler_sees_points_where_the_photos_do(make_run, frame, kinds):
 
     assert (folder / "bundle.out").read_text().startswith("# Bundle file v0.3\n")
     assert len(views) == len(photos) and all((folder / photo).exists() for photo in photos)
-    assert sorted(path.name for path in folder.iterdir() if path.name != "masks") == [
-        "bundle.out",
-        "export.json",
-        "images",
-        "list.txt",
-    ]
+    written = {path.name for path in folder.iterdir()} - {"masks"}
+    assert written == {"bundle.out", "export.json", "images", "list.txt"}
     truth = np.array(list(places(run.model, frame).values()))
     errors = []
     for X, _, sightings in points:

@@ -27,7 +27,6 @@ def test_help_and_unknown_formats_and_plugins_name_all_formats(make_run):
     shown = CliRunner().invoke(main, ["export", "--help"]).stdout
     refused = call(make_run().out, "--format", "3mf")
     listed = CliRunner().invoke(main, ["plugins"]).stdout
-
     assert refused.exit_code == 2 and "no file format is named '3mf'" in refused.stderr
     for name, part in {**EXPORTERS, **SCENE_EXPORTERS}.items():
         assert f"\n  {name} " in shown and part.summary[:20] in shown
@@ -36,21 +35,17 @@ def test_help_and_unknown_formats_and_plugins_name_all_formats(make_run):
 
 
 def test_a_folder_tells_how_many_files_it_has(make_run):
-    run = make_run("pinhole")
-    people, scripts = call(run.out, "--format", "colmap", "-q"), call(run.out, "--format", "colmap", "--json")
-    assert people.exit_code == scripts.exit_code == 0, people.stderr + scripts.stderr
-    assert people.stdout.startswith(f"{run.out / 'export' / 'colmap'}  9 files, ")
-    assert json.loads(scripts.stdout) == [str(run.out / "export" / "colmap")]
+    out = make_run("pinhole").out
+    people, scripts = (call(out, "--format", "colmap", flag) for flag in ("-q", "--json"))
+    assert people.stdout.startswith(f"{out / 'export' / 'colmap'}  9 files, "), people.stderr
+    assert json.loads(scripts.stdout) == [str(out / "export" / "colmap")], scripts.stderr
 
 
-@pytest.mark.parametrize(
-    ("target", "written"),
-    [("c.json", "c.json"), ("cloud.laz", "cloud.laz"), ("new/CLOUD.LAZ", "new/CLOUD.LAZ")],
-)
-def test_the_suffix_says_which_format(make_run, tmp_path, target, written):
+@pytest.mark.parametrize("target", ["c.json", "cloud.laz", "new/CLOUD.LAZ"])
+def test_the_suffix_says_which_format(make_run, tmp_path, target):
     result = call(make_run().out, "-o", tmp_path / target)
     assert result.exit_code == 0, result.stderr
-    assert (tmp_path / written).stat().st_size > 100
+    assert (tmp_path / target).stat().st_size > 100
 
 
 @pytest.mark.parametrize(
@@ -74,23 +69,14 @@ def test_a_run_until_the_scene_has_no_dense_cloud(make_run, name):
     assert not list(run.out.glob("cloud*"))
 
 
-@pytest.mark.parametrize("name", SCENE_EXPORTERS)
-def test_a_folder_without_a_run_is_left_alone(tmp_path, name):
-    result = call(tmp_path, "--format", name)
-    assert (result.exit_code, "holds no run" in result.stderr) == (3, True)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_an_export_replaces_an_earlier_one_and_nothing_else(make_run):
     run = make_run("pinhole")
     folder = sfm_app.export_scene(run.out, "colmap")
     sfm_app.export_scene(run.out, "nerfstudio", folder)
     assert (folder / "transforms.json").exists() and not (folder / "sparse").exists()
-
     (folder / "sparse_pc.splat").write_text("hours of training")
     with pytest.raises(sfm_app.InputError, match=r"holds files that no export has written, such as sparse_pc\.splat"):
         sfm_app.export_scene(run.out, "colmap", folder)
-
     assert (folder / "transforms.json").exists()
     assert sorted(path.name for path in folder.parent.iterdir()) == ["colmap"]
 
@@ -107,10 +93,8 @@ def test_what_no_export_has_written_is_refused(make_run, tmp_path, kind):
         target.mkdir()
         (target / "export.json").write_text("[" * 100_000)
         (target / "mine.txt").write_text("mine")
-
     with pytest.raises(sfm_app.InputError) as caught:
         sfm_app.export_scene(run.out, "colmap", target)
-
     assert caught.value.hint == "name another place with -o"
 
 
@@ -157,7 +141,6 @@ def test_a_cloud_that_was_cut_off_or_removed_is_no_crash(make_run):
     cut = call(run.out, "--format", "laz")
     file.unlink()
     gone = call(run.out, "--format", "cloud-ply")
-
     assert (cut.exit_code, "are damaged" in cut.stderr) == (3, True), cut.stderr
     assert (gone.exit_code, "--from mesh" in gone.stderr) == (3, True), gone.stderr
 
@@ -170,25 +153,19 @@ def test_a_missing_package_is_named_with_how_to_install_it(make_run, monkeypatch
     assert "hint: pip install 'sfm-app[export]'" in result.stderr
 
 
-def test_a_plug_in_may_bring_a_format_for_scenes(make_run, tmp_path):
-    class Plugin:
-        @hookimpl
-        def sfm_scene_exporters(self):
-            return [SceneExporter("centers", lambda scene, target: target.write_text(str(len(scene.scene.registered))))]
+class Plugin:
+    def __init__(self, name):
+        self.name = name
 
-    found = load_plugins([Plugin()], installed=False)
-
-    assert list(found.scene_exporters) == [*SCENE_EXPORTERS, "centers"]
+    @hookimpl
+    def sfm_scene_exporters(self):
+        return [SceneExporter(self.name, lambda *_: None)]
 
 
-def test_a_name_belongs_to_one_format_only():
-    class Plugin:
-        @hookimpl
-        def sfm_scene_exporters(self):
-            return [SceneExporter("ply", lambda *_: None)]
-
+def test_a_plug_in_may_bring_a_format_for_scenes_under_a_name_of_its_own():
+    assert list(load_plugins([Plugin("centers")], installed=False).scene_exporters) == [*SCENE_EXPORTERS, "centers"]
     with pytest.raises(sfm_app.PluginError, match="two plug-ins offer 'ply'"):
-        load_plugins([Plugin()], installed=False)
+        load_plugins([Plugin("ply")], installed=False)
 
 
 def test_names_are_plain_and_all_different():
@@ -231,14 +208,11 @@ def test_the_file_is_what_the_run_would_have_written(textured_ball, finished, na
 @pytest.mark.parametrize(
     ("file_format", "target", "path"),
     [
-        ("", "statue.obj", "statue.obj"),
-        ("", "statue.GLB", "statue.GLB"),
-        ("ply", "statue", "statue.ply"),
-        ("ply", "statue v1.2", "statue v1.2.ply"),
-        ("ply", "new/folder/statue.ply", "new/folder/statue.ply"),
+        ("", "statue.obj", "statue.obj"), ("", "statue.GLB", "statue.GLB"), ("ply", "statue", "statue.ply"),
+        ("ply", "statue v1.2", "statue v1.2.ply"), ("ply", "new/folder/statue.ply", "new/folder/statue.ply"),
         ("ply", ".", "model.ply"),
     ],
-)
+)  # fmt: skip
 def test_the_target_is_named_as_people_name_files(finished, tmp_path, file_format, target, path):
     found = sfm_app.export_model(finished, file_format, tmp_path / target)
     assert found[0] == tmp_path / path
@@ -278,8 +252,9 @@ def test_a_run_without_a_scene_has_no_points_either(tmp_path):
 
 
 @pytest.mark.parametrize("place", [".", "nowhere"])
-def test_a_folder_that_is_no_run_is_refused(tmp_path, place):
-    result = call(tmp_path / place, "--format", "ply")
+@pytest.mark.parametrize("name", [*SCENE_EXPORTERS, "ply"])
+def test_a_folder_that_is_no_run_is_refused_and_left_alone(tmp_path, name, place):
+    result = call(tmp_path / place, "--format", name)
     assert (result.exit_code, "holds no run" in result.stderr) == (3, True)
     assert list(tmp_path.iterdir()) == []
 
@@ -300,9 +275,8 @@ def test_a_surface_that_was_cut_off_is_no_crash(finished, left):
 
 
 def test_a_model_without_a_texture_has_the_colors_of_its_vertices(ball, finished):
-    np.savez(
-        finished / LAST.files[0], vertices=ball.surface.vertices, faces=ball.surface.faces, colors=ball.surface.colors
-    )
+    surface = ball.surface
+    np.savez(finished / LAST.files[0], vertices=surface.vertices, faces=surface.faces, colors=surface.colors)
     place = Workspace(finished)
     place.manifest.finish(LAST.name, StageRecord("", 0.0, digest=LAST.digest(place)), {})
     (path,) = sfm_app.export_model(finished, "glb")

@@ -1,4 +1,4 @@
-"""GLB files, taken apart by the rules of glTF 2.0 and read back by other programs."""
+"""GLB files, plain and compressed, taken apart by the rules of glTF 2.0 and read back by other programs."""
 
 import io
 import json
@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from sfm_app.formats.draco import DRACO, write_draco
 from sfm_app.formats.exporters import jpeg, split_corners
 from sfm_app.formats.gltf import linear_colors, write_glb
 from sfm_app.meshing.ray_casting import load_open3d
@@ -55,12 +56,8 @@ def model(request):
 def test_views_follow_each_other_and_every_accessor_is_used_once(model):
     tree, buffer = taken_apart(glb_of(model))
     primitives = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]
-    used = [
-        number
-        for p in primitives
-        for number in [*p["attributes"].values(), *([p["indices"]] if "indices" in p else [])]
-    ]
-
+    used = [number for p in primitives for number in p["attributes"].values()]
+    used += [p["indices"] for p in primitives if "indices" in p]
     assert sorted(used) == list(range(len(tree["accessors"])))
     end = 0
     for view in tree["bufferViews"]:
@@ -71,7 +68,6 @@ def test_views_follow_each_other_and_every_accessor_is_used_once(model):
 
 def test_numbers_are_what_the_tree_says_of_them(model):
     tree, buffer = taken_apart(glb_of(model))
-
     for primitive in (p for mesh in tree["meshes"] for p in mesh["primitives"]):
         entry = tree["accessors"][primitive["attributes"]["POSITION"]]
         places = array(tree, buffer, primitive["attributes"]["POSITION"])
@@ -89,7 +85,6 @@ def test_numbers_are_what_the_tree_says_of_them(model):
 @pytest.mark.parametrize("name", ["ball", "textured_ball", "cloud"])
 def test_every_material_shows_colors_as_they_are_from_both_sides(name, request):
     tree, _ = taken_apart(glb_of(request.getfixturevalue(name)))
-
     assert tree["asset"] == {"version": "2.0", "generator": "sfm_app"}
     assert tree["extensionsUsed"] == ["KHR_materials_unlit"]
     assert "extensionsRequired" not in tree
@@ -102,7 +97,6 @@ def test_every_material_shows_colors_as_they_are_from_both_sides(name, request):
 def test_each_page_is_a_jpeg_and_a_primitive_of_its_own(textured_ball):
     tree, buffer = taken_apart(glb_of(textured_ball))
     primitives = tree["meshes"][0]["primitives"]
-
     assert len(primitives) == len(tree["images"]) == 2
     for primitive, page in zip(primitives, textured_ball.texture.pages, strict=True):
         base = tree["materials"][primitive["material"]]["pbrMetallicRoughness"]["baseColorTexture"]
@@ -148,7 +142,6 @@ def test_cameras_beside_a_lit_model_stay_unlit(lit_ball, cloud):
 def test_corners_keep_their_place_in_the_texture(textured_ball):
     surface, texture = textured_ball.surface, textured_ball.texture
     tree, buffer = taken_apart(glb_of(textured_ball))
-
     for page, primitive in enumerate(tree["meshes"][0]["primitives"]):
         here = texture.page == page
         corners = array(tree, buffer, primitive["indices"]).reshape(-1, 3)
@@ -213,7 +206,6 @@ def test_points_and_cameras(cloud):
 def test_cameras_of_gltf_stand_where_the_photos_were_taken(cloud):
     tree, _ = taken_apart(glb_of(cloud))
     nodes = [node for node in tree["nodes"] if "camera" in node]
-
     assert [node["name"] for node in nodes] == [camera.name for camera in cloud.cameras]
     for node, camera in zip(nodes, cloud.cameras, strict=True):
         world_from_gltf = np.array(node["matrix"]).reshape(4, 4).T
@@ -260,3 +252,61 @@ def test_a_page_of_noise_is_written_too():
     data = jpeg(page)
     assert len(data) > page.shape[0] * page.shape[1]  # more than Pillow expects
     assert np.abs(np.asarray(Image.open(io.BytesIO(data))).astype(int) - page).mean() < 10
+
+
+def read(data, folder):
+    (folder / "model.glb").write_bytes(data)
+    return list(trimesh.load_scene(folder / "model.glb", process=False).geometry.values())
+
+
+def corners(parts, values):
+    """Rows of values at all corners of triangles, behind the places of the corners, sorted."""
+    rows = [
+        np.hstack([part.vertices, values(part)])[part.faces].reshape(-1, 3 + values(part).shape[1]) for part in parts
+    ]
+    found = np.concatenate(rows)
+    return found[np.lexsort(np.round(found[:, ::-1], 4).T)]
+
+
+def test_the_textured_model_is_the_same_as_without_compression(textured_ball, tmp_path):
+    data = write_draco(textured_ball, "model")["model.glb"]
+    small, plain = read(data, tmp_path), read(write_glb(textured_ball, "model")["model.glb"], tmp_path)
+    places = [corners(parts, lambda part: np.asarray(part.visual.uv)) for parts in (small, plain)]
+    np.testing.assert_allclose(places[0][:, :3], places[1][:, :3], atol=1e-6)  # 2 units in 20 bits
+    np.testing.assert_allclose(places[0][:, 3:], places[1][:, 3:], atol=2e-5)
+    for one, other in zip(small, plain, strict=True):
+        pages = [np.asarray(part.visual.material.baseColorTexture) for part in (one, other)]
+        np.testing.assert_array_equal(*pages)
+    assert len(data) < 0.7 * len(write_glb(textured_ball, "model")["model.glb"])
+
+
+def test_what_the_file_says_of_its_attributes_is_what_draco_decodes_to(textured_ball):
+    found, _ = taken_apart(write_draco(textured_ball, "model")["model.glb"])
+    assert DRACO in found["extensionsRequired"] and DRACO in found["extensionsUsed"]
+    for primitive in found["meshes"][0]["primitives"]:
+        assert set(primitive["extensions"][DRACO]["attributes"]) == set(primitive["attributes"])
+        accessors = [found["accessors"][number] for number in primitive["attributes"].values()]
+        assert len({entry["count"] for entry in accessors}) == 1
+        assert all("bufferView" not in entry for entry in accessors)
+        low, high = (found["accessors"][primitive["attributes"]["POSITION"]][key] for key in ("min", "max"))
+        assert np.all(np.array(low) >= -1.00001) and np.all(np.array(high) <= 1.00001)
+
+
+def test_colors_of_vertices_keep_sixteen_bits(ball, tmp_path):
+    import DracoPy
+
+    found, buffer = taken_apart(write_draco(ball, "model")["model.glb"])
+    (primitive,) = found["meshes"][0]["primitives"]
+    view = found["bufferViews"][primitive["extensions"][DRACO]["bufferView"]]
+    decoded = DracoPy.decode(buffer[view["byteOffset"] : view["byteOffset"] + view["byteLength"]])
+
+    number = primitive["extensions"][DRACO]["attributes"]["COLOR_0"]
+    color = next(attribute for attribute in decoded.attributes if attribute["unique_id"] == number)
+    accessor = found["accessors"][primitive["attributes"]["COLOR_0"]]
+    assert accessor["normalized"] is True and accessor["componentType"] == 5123
+    at = np.linalg.norm(ball.surface.vertices[:, None] - np.asarray(decoded.points)[None], axis=2).argmin(axis=1)
+    np.testing.assert_allclose(np.asarray(color["data"])[at] / 65535, linear_colors(ball.surface.colors), atol=1e-5)
+
+
+def test_points_are_those_of_a_plain_file(cloud):
+    assert write_draco(cloud, "points") == write_glb(cloud, "points")

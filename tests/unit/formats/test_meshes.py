@@ -1,6 +1,7 @@
-"""PLY, OBJ and STL files, read back by other programs."""
+"""PLY, OBJ and STL files, read back by other programs, and cameras drawn into them."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import trimesh
 from PIL import Image
 
 from sfm_app.errors import ReconstructionError
-from sfm_app.formats.frusta import CAMERA_COLOR, DOTS
+from sfm_app.formats.frusta import CAMERA_COLOR, DOTS, camera_dots, camera_lines, frustum_corners, frustum_depth
 from sfm_app.formats.meshes import DIGITS, write_obj, write_ply, write_stl
 from sfm_app.meshing.ray_casting import load_open3d
 from sfm_app.types import Model, Surface
@@ -21,7 +22,6 @@ def rows(model):
 
 def test_a_surface_has_places_normals_and_the_colors_of_the_photos(ball):
     vertex = rows(ball)["vertex"]["data"]
-
     places, normals, colors = (
         np.stack([vertex[key] for key in keys], axis=1)
         for keys in (("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"))
@@ -46,20 +46,6 @@ def test_cameras_are_dotted_lines_behind_the_points(cloud):
     assert set(rows(cloud)) == {"vertex"}
 
 
-def test_open3d_reads_surface_and_points(ball, cloud, tmp_path):
-    o3d = load_open3d()
-    for model in (ball, cloud):
-        (tmp_path / "model.ply").write_bytes(write_ply(model, "model")["model.ply"])
-        mesh = o3d.io.read_triangle_mesh(str(tmp_path / "model.ply"))
-        points = o3d.io.read_point_cloud(str(tmp_path / "model.ply"))
-
-        np.testing.assert_array_equal(np.asarray(mesh.triangles), model.surface.faces)
-        assert mesh.has_vertex_normals() == bool(len(model.surface.faces))
-        count = len(model.surface.vertices)
-        np.testing.assert_allclose(np.asarray(points.points)[:count], model.surface.vertices, atol=1e-6)
-        np.testing.assert_allclose(255 * np.asarray(points.colors)[:count], model.surface.colors, atol=0.01)
-
-
 def lines(files, start):
     text = next(iter(files.values())).decode()
     return [line.split()[1:] for line in text.splitlines() if line.split()[0] == start]
@@ -68,7 +54,6 @@ def lines(files, start):
 def test_every_corner_has_its_vertex_its_place_in_the_texture_and_its_normal(textured_ball):
     surface, texture = textured_ball.surface, textured_ball.texture
     files = write_obj(textured_ball, "model")
-
     v, vt, vn = (np.array(lines(files, key), float) for key in ("v", "vt", "vn"))
     corners = np.array([[corner.split("/") for corner in face] for face in lines(files, "f")], int) - 1
     order = np.concatenate([np.flatnonzero(texture.page == page) for page in (0, 1)])
@@ -80,7 +65,6 @@ def test_every_corner_has_its_vertex_its_place_in_the_texture_and_its_normal(tex
 
 def test_the_materials_name_the_pages_beside_them(textured_ball):
     files = write_obj(textured_ball, "my model")
-
     assert list(files) == ["my model.obj", "my_model.mtl", "my_model_0.jpg", "my_model_1.jpg"]
     assert lines(files, "mtllib") == [["my_model.mtl"]]
     assert lines(files, "usemtl") == [["page_0"], ["page_1"]]
@@ -92,7 +76,6 @@ def test_the_materials_name_the_pages_beside_them(textured_ball):
 
 def test_normal_maps_are_beside_the_pages_and_the_model_is_lit(lit_ball):
     files = write_obj(lit_ball, "ball")
-
     assert list(files) == [
         "ball.obj", "ball.mtl", "ball_0.jpg", "ball_1.jpg", "ball_0_normals.jpg", "ball_1_normals.jpg",
     ]  # fmt: skip
@@ -131,10 +114,8 @@ def test_trimesh_and_open3d_show_both_pages(textured_ball, tmp_path):
     for name, data in write_obj(textured_ball, "my model").items():
         (tmp_path / name).write_bytes(data)
     path = tmp_path / "my model.obj"
-
     parts = trimesh.load_scene(path, process=False).geometry.values()
     model = load_open3d().io.read_triangle_model(str(path))
-
     colors = sorted(tuple(part.visual.to_color().vertex_colors[:, :3].mean(axis=0)) for part in parts)
     np.testing.assert_allclose(colors, [(30, 60, 200), (200, 40, 30)], atol=4)
     assert sum(len(part.mesh.triangles) for part in model.meshes) == len(textured_ball.surface.faces)
@@ -160,3 +141,58 @@ def test_what_is_up_in_the_model_is_up_in_the_printer(ball):
 def test_points_have_no_stl(cloud):
     with pytest.raises(ReconstructionError, match="triangles only"):
         write_stl(cloud, "model")
+
+
+def test_corners_project_to_the_corners_of_the_photo(cloud):
+    for camera in cloud.cameras:
+        corners = frustum_corners(camera, 0.4)
+        R, t = camera.cam_from_world[:, :3], camera.cam_from_world[:, 3]
+        seen = (corners @ R.T + t) @ camera.K.T
+        np.testing.assert_allclose(seen[0], 0, atol=1e-9)
+        np.testing.assert_allclose(seen[1:, 2], 0.4)
+        expected = [(0, 0), (640, 0), (640, 480), (0, 480)]
+        np.testing.assert_allclose(seen[1:, :2] / seen[1:, 2:], expected, atol=1e-6)
+
+
+def test_each_camera_is_a_pyramid_of_eight_edges(cloud):
+    corners, lines = camera_lines(cloud)
+    assert corners.shape == (15, 3) and lines.shape == (24, 2)
+    np.testing.assert_array_equal(np.bincount(lines.ravel()).reshape(3, 5), [[4, 3, 3, 3, 3]] * 3)
+    np.testing.assert_array_equal(lines // 5, np.repeat(np.arange(3), 8)[:, None] * [1, 1])
+
+
+def test_dots_lie_on_the_edges(cloud):
+    corners, lines = camera_lines(cloud)
+    dots, colors = camera_dots(cloud)
+    assert len(dots) == len(colors)
+    away = [
+        np.linalg.norm(np.cross(dots - corners[a], dots - corners[b]), axis=1) / np.linalg.norm(corners[a] - corners[b])
+        for a, b in lines
+    ]
+    assert np.min(away, axis=0).max() < 1e-9
+
+
+@pytest.mark.parametrize(("step", "depth"), [(1e-6, 0.0312), (0.5, 1 / 6), (100.0, 18.0)])
+def test_frusta_are_seen_and_do_not_hide_the_scene(step, depth):
+    """A third of a step, but 1 % to 10 % of the scene, of size 1.8 sqrt(3), or of the walk where that is longer."""
+    points = np.random.default_rng(0).uniform(-1, 1, (500, 3))
+    centers = step * np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    assert frustum_depth(centers, points) == pytest.approx(depth, rel=0.05)
+
+
+def test_cameras_along_the_streets_of_a_town_do_not_hide_each_other():
+    walk = 0.6 * np.column_stack([np.arange(1000), np.zeros((1000, 2))])
+    still = np.zeros((1000, 3))
+    assert frustum_depth(walk, 0.2 * walk) == pytest.approx(0.2)
+    assert 0.0 < frustum_depth(still, walk) == pytest.approx(0.9 * 600 / 3000, rel=0.01)
+
+
+def test_without_cameras_there_is_nothing(ball):
+    assert [len(part) for part in (*camera_lines(ball), *camera_dots(ball))] == [0, 0, 0, 0]
+
+
+def test_one_camera_at_one_point_has_a_size(cloud):
+    point = Surface(np.zeros((1, 3)), cloud.surface.faces, cloud.surface.colors[:1])
+    still = replace(cloud.cameras[0], cam_from_world=np.eye(3, 4))
+    corners, _ = camera_lines(replace(cloud, surface=point, cameras=(still,)))
+    assert np.isfinite(corners).all() and np.ptp(corners, axis=0).min() > 0

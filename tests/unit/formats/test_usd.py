@@ -30,7 +30,6 @@ def bounds(stage):
 def test_a_stage_stands_upright_in_meters_and_has_the_model_s_bounds(textured_ball, write, tmp_path):
     stage = open_stage(write(textured_ball, "a ball"), tmp_path)
     vertices = textured_ball.surface.vertices
-
     assert UsdGeom.GetStageUpAxis(stage) == "Y" and UsdGeom.GetStageMetersPerUnit(stage) == 1.0
     np.testing.assert_allclose(bounds(stage), [vertices.min(axis=0), vertices.max(axis=0)], rtol=1e-6, atol=1e-7)
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/model/surface"))
@@ -67,7 +66,6 @@ def test_every_triangle_has_the_picture_and_the_place_of_its_texture(textured_ba
 @pytest.mark.parametrize("write", [write_usd, write_usdz])
 def test_a_normal_map_is_read_raw_and_counts_from_minus_1_to_1(lit_ball, write, tmp_path):
     stage = open_stage(write(lit_ball, "ball"), tmp_path)
-
     for number, relief in enumerate(lit_ball.texture.normal_maps):
         shader = UsdShade.Material(stage.GetPrimAtPath(f"/model/materials/page_{number}")).ComputeSurfaceSource()[0]
         picture = UsdShade.Shader(shader.GetInput("normal").GetConnectedSource()[0].GetPrim())
@@ -82,7 +80,6 @@ def test_a_normal_map_is_read_raw_and_counts_from_minus_1_to_1(lit_ball, write, 
 
 def test_files_in_a_package_are_plain_and_aligned(textured_ball):
     data = write_usdz(textured_ball, "ball")["ball.usdz"]
-
     with zipfile.ZipFile(io.BytesIO(data)) as package:
         assert package.testzip() is None
         entries = package.infolist()

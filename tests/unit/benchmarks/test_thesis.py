@@ -1,14 +1,17 @@
-"""The parts of the chapter 5 benchmark that do not take minutes."""
+"""Benchmarks of chapters 4 and 5, as far as they take no minutes, and the documents that all benchmarks write."""
 
+import json
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
 import pytest
 
-from benchmarks.thesis.chapter5 import contests, setups, sweep_claims, tables
+from benchmarks.common.results import RESULTS, document, problems
+from benchmarks.thesis.chapter4 import claims
+from benchmarks.thesis.chapter5 import contests, setups, tables
 from benchmarks.thesis.chapter5.bounds import full_bound, gap, reduced_bound
-from benchmarks.thesis.chapter5.command import ORDERED_PARTS, PARTS, TEST_LIMITS, parse_test_limit
+from benchmarks.thesis.chapter5.command import TEST_LIMITS, parse_test_limit
 from benchmarks.thesis.chapter5.contests import (
     CAP_PERCENT,
     NON_ROBUST,
@@ -17,23 +20,20 @@ from benchmarks.thesis.chapter5.contests import (
     answered_K,
     e_center,
     e_focal,
-    run_contest,
     summary,
 )
 from benchmarks.thesis.chapter5.fits import Fit, fit_to_all, robust_fits, with_outlying_fits
 from benchmarks.thesis.chapter5.lab import Lab
 from benchmarks.thesis.chapter5.panels import Panel, minimum_x, panel_rows
 from benchmarks.thesis.chapter5.sequences import (
-    ImageSequence,
     camera_matrix_from_projection,
     corner_sequence,
     fundamental_from_projections,
 )
 from benchmarks.thesis.chapter5.setups import Trial
 from benchmarks.thesis.chapter5.slices import SCALES, focal_slice
-from benchmarks.thesis.chapter5.sweep_claims import CLAIMS, CurveClaim, check_levels, judge_claims
-from benchmarks.thesis.chapter5.sweeps import FIGURES
-from benchmarks.thesis.chapter5.zero_curve_plots import SIGMA, support
+from benchmarks.thesis.chapter5.sweep_claims import CurveClaim, check_levels
+from benchmarks.thesis.corners import load_corners
 from sfm_app.camera.models import camera_matrix
 from sfm_app.geometry.epipolar import sampson_distance
 from sfm_app.selfcal.thesis.constraint_forms import essential
@@ -52,7 +52,6 @@ def tracks():
 def test_a_projection_matrix_falls_apart_into_K_and_the_rest():
     R = axis_rotation(np.array([0.6, 0.0, 0.8]), 160.0)
     P = -3.0 * K @ np.column_stack([R, [0.3, -2.0, 5.0]])
-
     assert np.allclose(camera_matrix_from_projection(P), K)
 
 
@@ -61,7 +60,6 @@ def test_the_fundamental_matrix_of_two_cameras_joins_their_images():
     P2 = K @ np.column_stack([axis_rotation(np.array([0.0, 1.0, 0.0]), 10.0), [1.0, 0.2, 0.1]])
     X = np.random.default_rng(0).uniform([-1, -1, 4, 1], [1, 1, 6, 1], (20, 4))
     x1, x2 = ((X @ P.T)[:, :2] / (X @ P.T)[:, 2:] for P in (P1, P2))
-
     assert sampson_distance(fundamental_from_projections(P1, P2), x1, x2).max() < 1e-9
     assert sampson_distance(fundamental_from_projections(P2, P1), x1, x2).max() > 1.0, "the direction matters"
 
@@ -105,27 +103,11 @@ def test_outliers_spoil_a_fit_to_all_and_no_robust_one(tracks):
 def test_a_seed_keeps_its_clean_matrices_over_all_levels(experiment):
     trials = list(experiment(3))
     first = trials[0]
-
     assert [trial.x for trial in trials] == sorted({trial.x for trial in trials})
     for trial in trials:
         same = [name for name in first.fits if trial.fits[name] is first.fits[name]]
         assert len(same) >= (8 if experiment is setups.matching_outliers else 10 - trial.x)
         assert np.array_equal(trial.K, first.K)
-
-
-def test_the_longer_focal_is_the_last_frames(tracks):
-    trials = list(setups.focal_deviation(0))
-    assert [round(trial.x) for trial in trials] == [0, 10, 20, 30, 40, 50]
-    assert all(np.array_equal(trial.K, tracks.K[0]) for trial in trials[:2])
-
-
-def test_raw_matches_replace_as_many_matrices_as_asked(tracks):
-    spoilt = dict(pair_matches(tracks, dict.fromkeys(tracks.pairs, 0.2), seed=1))
-    sequence = ImageSequence("none", tracks.size, tracks.K, spoilt, {})
-
-    counts = [sum(len(fit.matches) == 200 for fit in t.fits.values()) for t in setups.raw_pairs(sequence, 0)]
-
-    assert counts == [0, 3, 6, 9, 10]
 
 
 def test_errors_are_those_of_section_5_5_3():
@@ -140,7 +122,6 @@ def calibration(method, identifiable, **evidence):
 
 def test_doubt_is_an_answer_of_the_program_alone():
     told = {"fx_px": 1.0, "fy_px": 2.0, "cx_px": 3.0, "cy_px": 4.0}
-
     assert answered_K(PRODUCTION, calibration("guess", False, **told)) is None
     assert answered_K(NON_ROBUST, calibration("guess", False, **told)).tolist() == [[1, 0, 3], [0, 2, 4], [0, 0, 1]]
     assert answered_K(NON_ROBUST, calibration("guess", False)) is None
@@ -150,7 +131,6 @@ def test_doubt_is_an_answer_of_the_program_alone():
 def test_a_summary_says_how_many_answered_and_caps_the_rest():
     far = camera_matrix(9e6, 900.0, 250.0, 200.0)
     found = summary("m", 2.0, [Attempt("m", 2.0, A, K, ms) for A, ms in ((K, 1.0), (far, 3.0), (None, 8.0))])
-
     assert (found["tests"], found["answered"], found["ms"]) == (3, pytest.approx(2 / 3), 3.0)
     assert (found["e_focal"], found["e_focal median"], found["e_OC"]) == (CAP_PERCENT / 2, CAP_PERCENT / 2, 0.0)
     nothing = summary("m", 2.0, [Attempt("m", 2.0, None, K, 1.0)])
@@ -161,16 +141,6 @@ def two_levels(seed, tracks):
     fits = {pair: Fit(view.F, np.hstack([view.x1, view.x2])) for pair, view in tracks.pairs.items()}
     for x in (0.0, 1.0):
         yield Trial(x + 0 * seed, fits, tracks.size, tracks.K[0])
-
-
-def test_a_contest_has_a_row_per_method_and_level_and_its_own_number_of_tests(tracks):
-    with ThreadPoolExecutor(1) as pool:
-        rows = run_contest(partial(two_levels, tracks=tracks), {NON_ROBUST: 2, "kruppa": 1}, 0, pool, "two levels")
-
-    assert [(row["method"], row["x"], row["tests"]) for row in rows] == [
-        (NON_ROBUST, 0.0, 2), (NON_ROBUST, 1.0, 2), ("kruppa", 0.0, 1), ("kruppa", 1.0, 1),
-    ]  # fmt: skip
-    assert all(row["e_focal"] < 0.1 and row["answered"] == 1.0 for row in rows), "the matrices are exact"
 
 
 @pytest.mark.parametrize(
@@ -191,30 +161,6 @@ def test_sentences_are_judged(said, own, others, expected):
     assert check_levels(said, own, others) == expected
 
 
-def test_an_unknown_kind_of_sentence_is_no_claim():
-    with pytest.raises(ValueError, match="no such kind"):
-        check_levels(CurveClaim("", "", "better", "a"), [1.0])
-
-
-def test_every_sentence_is_about_a_plot_that_shows_its_methods():
-    plots = {plot.part: plot for several in FIGURES.values() for plot in several}
-    for said in CLAIMS:
-        assert {said.method, *said.others} <= set(plots[said.part].methods), said.says
-        assert said.column == plots[said.part].column, said.says
-        assert hasattr(setups, plots[said.part].experiment)
-
-
-def test_claims_take_their_levels_and_say_what_is_missing():
-    rows = [
-        {"method": name, "x": x, "e_focal": x + k} for k, name in enumerate(sweep_claims.BUT_RMS) for x in (0, 1, 2)
-    ]
-    found = judge_claims({"5.10b": rows})
-    assert [claim.verdict for claim in found] == ["holds"] and found[0].numbers.startswith(
-        "at 1, 2: perturbation 1, 2 %"
-    )
-    assert judge_claims({"5.6b": rows})[0].verdict == "not measured"
-
-
 def table_row(sequence, method, e, answered=1.0):
     given = {"e_focal": e, "e_OC": e, "e_focal median": e, "answered": answered, "method": method, "tests": 1}
     return {"sequence": sequence, **tables.with_printed_errors(sequence, given)}
@@ -223,7 +169,6 @@ def table_row(sequence, method, e, answered=1.0):
 def test_the_printed_means_are_those_of_the_thesis():
     rows = [table_row(name, method, 2.0) for name in tables.PRINTED_E_FOCAL for method in contests.METHODS]
     found = {row["method"]: row for row in tables.means(rows)}
-
     assert found[contests.ZERO_CURVES]["thesis"] == pytest.approx(15.82, abs=0.005)
     assert found["the best of the thesis's on each"]["thesis"] == pytest.approx(7.5, abs=0.005)
     assert found[PRODUCTION]["thesis"] is None and found[PRODUCTION]["here"] == pytest.approx(2.0)
@@ -248,7 +193,6 @@ def test_bounds_hold_and_the_reduced_one_ignores_the_error_of_F(tracks):
     true_K, rng = tracks.K[0], np.random.default_rng(3)
     change = true_K @ np.diag([1.1, 1.1, 1.0]) - true_K
     noisy = F + 1e-4 * rng.normal(size=(3, 3))
-
     for rough in (F, noisy):
         assert float(gap(essential(rough, true_K + change))) <= full_bound(F, rough, true_K, change)
     assert reduced_bound(F, true_K, change) == pytest.approx(full_bound(F, F, true_K, change))
@@ -261,19 +205,6 @@ def test_the_objective_of_exact_matrices_is_lowest_at_the_true_focal(tracks):
     assert len(panel_rows([panel])) == len(SCALES)
 
 
-def test_support_is_highest_where_curves_meet():
-    x = np.linspace(-1.0, 1.0, 21)
-    scores = support(np.array([1 + x, 1 - x, 1 + 0.5 * x, np.full(21, 2.5)]))
-
-    assert scores.argmax(axis=1)[:3].tolist() == [10, 10, 10]
-    assert scores[0, 10] == pytest.approx(2 + np.exp(-1.5 / SIGMA))
-
-
-def test_every_figure_of_the_issue_is_drawn():
-    asked = {f"5.{n}" for n in (1, 2, 3, 5, 6, 9, 10, 11, 12, *range(14, 23))} | {"5.7-5.8", "tables"}
-    assert asked <= set(PARTS) == set(ORDERED_PARTS) and ORDERED_PARTS[0] == "5.1" and ORDERED_PARTS[-1] == "tables"
-
-
 def test_slow_methods_have_fewer_tests(tmp_path, tracks, monkeypatch):
     monkeypatch.setattr(setups, "two_levels", partial(two_levels, tracks=tracks), raising=False)
     setups.two_levels.__name__ = "two_levels"
@@ -281,7 +212,54 @@ def test_slow_methods_have_fewer_tests(tmp_path, tracks, monkeypatch):
         lab = Lab(tmp_path, tmp_path, tmp_path, [NON_ROBUST, "kruppa"], 2, 1, {"kruppa": 1}, 0, pool)
         rows = lab.run_contest(setups.two_levels)
         assert lab.run_contest(setups.two_levels) is rows, "an experiment is run once"
-
     assert {row["method"]: row["tests"] for row in rows} == {NON_ROBUST: 2, "kruppa": 1}
     assert lab.test_limits_text == "at most 1 of `kruppa`"
     assert parse_test_limit("kruppa=3") == ("kruppa", 3) and dict(TEST_LIMITS).keys() <= set(contests.METHODS)
+
+
+ROWS = [{"method": "a", "outliers": 0.1, "ms": 1.5}, {"method": "a", "outliers": 0.7, "ms": None}]
+
+
+def test_a_document_says_all_that_is_promised():
+    found = document("task", "about", {"seed": 0}, {"pairs": 2}, ROWS)
+    assert problems(found) == []
+    assert {"numpy", "numba", "pycolmap"} <= set(found["versions"])
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert problems(found | {"rows": []}) == ["there are no rows"]
+    assert problems(found | {"rows": [{"ms": 1}]}) == ["row 0 names no method"]
+    assert problems(found | {"rows": [{"method": "a", "ms": [1]}]}) == ["row 0 holds more than text and numbers"]
+    assert sorted(problems(found | {"versions": None, "extra": 1})) == ["unknown key extra", "versions is not dict"]
+
+
+def test_published_results_follow_the_schema():
+    names = ("fundamental-*", "cameras*", "chapter?", "viewers", "corpus*", "trouble*")
+    published = [path for name in names for path in RESULTS.glob(f"{name}.json")]
+    assert {path.name: said for path in published if (said := problems(json.loads(path.read_text("utf-8"))))} == {}
+
+
+def swept(**times):
+    """Rows in which an estimator takes so many ms at 10 % and 70 %; its error is a tenth of that."""
+    return [
+        {"method": name, "outliers": level, claims.TIME: ms, claims.ERROR: ms / 10, claims.TRIALS: ms}
+        for name, both in times.items()
+        for level, ms in zip((0.1, 0.7), both, strict=True)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("ransac", "verdict"), [((10, 100), "holds"), ((2, 100), "holds in part"), ((2, 4), "does not hold")]
+)
+def test_a_claim_is_judged_level_by_level(ransac, verdict):
+    rows = swept(**{"ransac": ransac, "lev-ransac-thesis": (2, 4)})
+    found = {claim.says: claim for claim in claims.claims_of_sweep(rows)}
+    assert found["LEV-RANSAC is over three times as fast as RANSAC"].verdict == verdict
+    assert found["LEV-RANSAC is faster than all others"].verdict == "not measured"
+    assert "msac" in found["LEV-RANSAC is faster than all others"].numbers
+
+
+def test_corners_are_paired_by_the_points_they_show(tmp_path):
+    (tmp_path / "001.corners").write_text("1 2\n3 4\n5 6\n")
+    (tmp_path / "002.corners").write_text("10 20\n30 40\n")
+    (tmp_path / "nview-corners").write_text("2 0 *\n0 * 1\n* 1 1\n1 1 *\n")
+    x1, x2 = load_corners(tmp_path, 1, 2)
+    assert x1.tolist() == [[5, 6], [3, 4]] and x2.tolist() == [[10, 20], [30, 40]]
