@@ -88,6 +88,7 @@ def test_what_is_near_is_down(build_house, turn_deg):
     floor = np.random.default_rng(3).uniform([-4, 0, -4], [4, 0, 4], (300, 3)) @ scene.turned.T
     for ground, up in ((floor, scene.up), (floor + 4.0 * scene.up, -scene.up)):
         upright = found_up(scene, concatenate_segments([]), np.concatenate([scene.points, ground]))
+        assert upright.method == ROLL  # a sure roll needs no ground
         assert error_deg(upright.up, up) < 8
         assert 3 < upright.selection.sign_log_odds < 7
 
