@@ -334,12 +334,7 @@ def test_noise_is_rejected(fit, values, seed):
     assert isinstance(found, Rejected)
 
 
-EDGES = {
-    "min_inliers": (8, 10_000),
-    "max_trials": (1, 10),
-    "confidence": (0.5, 0.999999),
-    "max_error_px": (0.1, 50.0),
-}
+EDGES = {"min_inliers": (8, 10_000), "max_trials": (1, 10), "confidence": (0.5, 0.999999), "max_error_px": (0.1, 50.0)}
 
 
 @pytest.mark.parametrize("edge", [(key, value) for key, values in EDGES.items() for value in values], ids=str)

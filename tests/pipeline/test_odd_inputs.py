@@ -276,17 +276,6 @@ def test_what_lies_in_the_output_folder_never_stops_a_run(folder, tmp_path, dist
     assert json.loads(result.stdout)["photos"]["usable"] == 2
 
 
-def test_photos_that_are_gone_from_the_output_are_laid_out_again(folder, tmp_path):
-    assert call("run", folder, "-o", tmp_path / "out", "--until", "photos").exit_code == 0
-    for path in (tmp_path / "out" / "photos").iterdir():
-        path.unlink()
-
-    call("run", folder, "-o", tmp_path / "out", "--until", "match_graph")
-
-    assert sorted(path.name for path in (tmp_path / "out" / "photos").iterdir()) == ["a.jpg", "b.png"]
-    assert all(path.exists() for path in (tmp_path / "out" / "photos").iterdir())
-
-
 COMMANDS = {
     "a missing folder": (["{here}/nowhere", "-o", "{here}/out"], 3, "no such folder"),
     "a photo as the folder": (["{photos}/a.jpg", "-o", "{here}/out"], 3, "not a folder"),

@@ -192,16 +192,6 @@ def test_scores_are_the_shares_of_the_photos_in_what_is_left(bundle):
     assert np.allclose(bundle.score(give, left_over), expected, atol=1e-12)
 
 
-def test_a_bundle_of_nothing_leaves_the_damping():
-    none = np.empty(0, np.int64)
-    empty = Linearized(none, none, none, np.zeros((0, 2, 18)), np.zeros((0, 2, 3)), (2, 1, 0))
-
-    S, rows = eliminate_points(empty, DAMPING)
-
-    assert np.array_equal(S.toarray(), DAMPING * np.eye(12))
-    assert np.array_equal(rows, DAMPING * np.eye(24)[12:])
-
-
 def observations(tracks):
     pairs = [(photo, point) for point, photos in enumerate(tracks) for photo in photos]
     return np.array(pairs, np.int64).reshape(-1, 2).T

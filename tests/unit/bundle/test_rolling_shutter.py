@@ -15,7 +15,6 @@ from sfm_app.bundle.rolling_shutter import (
     apply_shutter_step,
     estimate_readout,
     linearize,
-    local_fit_weights,
     move_to_middle_row,
     path_velocities,
     project_rows,
@@ -167,15 +166,6 @@ def test_where_poses_jump_about_the_path_goes_through_their_middle():
     assert off[best] < 0.5 * off[0]
 
 
-def test_weights_differentiate_polynomials_up_to_their_degree():
-    offsets = np.array([[-0.3, -0.1, 0.0, 0.25, 0.4]])
-    value, slope = local_fit_weights(offsets, 3)
-
-    for power in range(4):
-        assert value[0] @ offsets[0] ** power == pytest.approx(float(power == 0), abs=1e-12)
-        assert slope[0] @ offsets[0] ** power == pytest.approx(float(power == 1), abs=1e-12)
-
-
 SCALE_PX = 0.5
 
 
@@ -223,15 +213,6 @@ def test_steps_lead_to_where_only_the_noise_is_left(model):
     assert shutter_cost(model, SCALE_PX) < 0.1 * before
     assert 0.2 < step.noise_px < 0.35
     assert np.abs(step.views).max() < 1e-3
-
-
-def test_a_known_readout_stays(model):
-    nothing = np.zeros(model.unknowns)
-
-    step = solve_step(linearize(model, nothing, nothing, SCALE_PX, held=True))
-
-    assert step.views[-1] == 0.0 and step.deviation == 0.0
-    assert apply_shutter_step(model, step, 1.0).readout == 0.02
 
 
 def test_priors_hold_what_they_are_sure_of(model):

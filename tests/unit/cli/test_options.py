@@ -17,7 +17,6 @@ from sfm_app.cli.options import (
     setting_value,
     settings_from_flags,
 )
-from sfm_app.errors import ConfigError
 from sfm_app.frame.markers import FAMILIES, PAGES_MM
 from sfm_app.pipeline import NAMES
 from sfm_app.plugins import load_plugins
@@ -91,11 +90,6 @@ def test_no_flag_changes_nothing():
 def test_run_has_every_flag():
     shared = set(PARAMETERS) - {"photos", "out", "first", "last", "as_json", "quiet"}
     assert shared == {flag.parameter for flag in SETTING_FLAGS} | {"config", "no_plugins", "assignments", "verbose"}
-
-
-def test_values_out_of_range_are_refused_by_the_settings():
-    with pytest.raises(ConfigError, match=r"'photos\.max_frames'"):
-        settings_from_flags(flags(max_frames=1))
 
 
 def test_choices_are_those_of_the_modules_that_the_help_does_not_import():

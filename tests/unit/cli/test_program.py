@@ -121,12 +121,6 @@ def test_every_command_has_a_summary_and_a_help_that_fit(name):
     check_text(call("--help").stdout)
 
 
-def test_the_module_runs_as_a_program():
-    done = subprocess.run([sys.executable, "-m", "sfm_app", "--version"], capture_output=True, text=True, check=True)
-
-    assert done.stdout.startswith("sfm-app, version ")
-
-
 @pytest.mark.parametrize("shell", commands.SHELLS)
 def test_a_script_for_each_shell_calls_the_program(monkeypatch, shell):
     monkeypatch.setattr(BashComplete, "_check_version", lambda *_: None)  # starts bash
@@ -230,59 +224,12 @@ def test_wrong_settings_end_with_exit_code_2_before_any_work(folder, tmp_path, f
     assert not (tmp_path / "out").exists()
 
 
-def test_a_figure_that_cannot_be_written_is_refused_before_any_work(folder, tmp_path):
-    result = call("calibrate", folder, "--figure", tmp_path / "curves.jpg", "-q")
-
-    assert result.exit_code == 2
-    assert "cannot write '.jpg'" in result.stderr
-    assert ".svg" in result.stderr
-
-
 # --- photos and output folders ---
 
 
 def write_photos(folder, *names):
     for name in names:
         Image.effect_noise((128, 96), 60).convert("RGB").save(folder / name)
-
-
-def write_nothing(folder): ...
-
-
-def write_text_files(folder):
-    for name in ("a.txt", "b.md"):
-        (folder / name).write_text("not a photo")
-
-
-def write_one_photo(folder):
-    write_photos(folder, "a.jpg")
-
-
-def write_truncated_photos(folder):
-    write_photos(folder, "a.jpg", "b.jpg")
-    for name in ("a.jpg", "b.jpg"):
-        (folder / name).write_bytes((folder / name).read_bytes()[:1000])
-
-
-@pytest.mark.parametrize(
-    ("write", "text"),
-    [
-        (write_nothing, "the folder is empty"),
-        (write_text_files, "2 not a photo"),
-        (write_one_photo, "only one usable photo"),
-        (write_truncated_photos, "2 truncated or damaged"),
-    ],
-)
-def test_unusable_folders_end_with_one_line_and_exit_code_3(folder, tmp_path, write, text):
-    write(folder)
-
-    result = call("run", folder, "-o", tmp_path / "out", "-q")
-
-    assert result.exit_code == 3
-    assert text in result.stderr
-    error, hint = result.stderr.strip().splitlines()
-    assert error.startswith("error: ") and hint.startswith("hint: ")
-    assert result.stdout == ""
 
 
 def test_a_missing_folder_ends_with_exit_code_3_and_a_similar_name_is_offered(tmp_path):
@@ -344,15 +291,6 @@ def test_a_calibration_that_cannot_be_read_ends_with_exit_code_3_before_any_work
 
     assert (result.exit_code, "cannot read the calibration file" in result.stderr) == (3, True)
     assert "cameras.txt" in result.stderr and not (tmp_path / "out").exists()
-
-
-@pytest.mark.slow
-def test_photos_of_different_places_end_with_exit_code_4(unrelated, tmp_path):
-    result = call("run", unrelated, "-o", tmp_path / "out", "-q")
-
-    assert result.exit_code == 4, result.stderr
-    assert len(result.stderr.strip().splitlines()) == 2
-    assert "Traceback" not in result.output
 
 
 # --- errors ---

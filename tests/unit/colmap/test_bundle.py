@@ -81,20 +81,6 @@ def test_the_camera_with_most_photos_does_not_free_one_of_a_single_photo(mapped)
 
 
 @pytest.mark.slow
-def test_the_same_model_gives_the_same_bytes_and_stays_as_it_was(mapped, tmp_path):
-    model, database = mapped()
-    before = model.cameras[1].params.copy()
-
-    for name in ("first", "second"):
-        (tmp_path / name).mkdir()
-        adjust(model, database).model.write(tmp_path / name)
-
-    for file in ("cameras.bin", "images.bin", "points3D.bin"):
-        assert (tmp_path / "first" / file).read_bytes() == (tmp_path / "second" / file).read_bytes()
-    assert np.array_equal(model.cameras[1].params, before)
-
-
-@pytest.mark.slow
 def test_the_covariance_of_the_cameras_is_that_of_colmap(mapped):
     model, _ = mapped(cameras=2, photos=4)
     for camera in model.cameras.values():

@@ -9,7 +9,6 @@ import trimesh
 from PIL import Image
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.database import create_database, read_match_graph
 from sfm_app.colmap.dense import (
     MASKED,
     DenseStore,
@@ -24,14 +23,12 @@ from sfm_app.colmap.dense import (
     write_fusion_views,
     write_maps,
 )
-from sfm_app.colmap.features import SiftSettings, find_and_match
 from sfm_app.colmap.surface import FUSED, fuse, open_points, poisson_surface, positions, simplify
 from sfm_app.errors import BackendError
 from sfm_app.photos.masks import save_mask
 from sfm_app.progress import SilentProgress
-from sfm_app.settings import MatchSettings
 from sfm_app.stereo import DepthEstimate, DepthMap
-from sfm_app.types import Photo, PhotoSet, Surface
+from sfm_app.types import Surface
 
 NORMAL = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
 DISTANCE = 5.0
@@ -298,26 +295,6 @@ def dense(place, tmp_path):
     for view in views:
         MaskUndistorter(root / "sparse", root / "masks", tmp_path)(view)
     return tmp_path, {view.name: view for view in views}
-
-
-@pytest.mark.slow
-def test_no_keypoint_lies_in_what_is_masked(place, tmp_path):
-    """The photos are in the database before features are looked for, as in every run."""
-    root, used = place
-    photos = PhotoSet(root / "photos", tuple(Photo(name, *SIZE, "g") for name in NAMES))
-    found = {}
-    for masks in (None, root / "masks"):
-        database = tmp_path / f"{masks is None}.db"
-        create_database(database, photos)
-        find_and_match(database, SiftSettings(root / "photos", masks, MatchSettings()), NAMES, 1, SilentProgress())
-        graph = read_match_graph(database, photos)
-        found[masks] = {graph.images[key].name: np.floor(at).astype(int) for key, at in graph.keypoints.items()}
-
-    for name in NAMES:
-        whole, kept = (used[name][at[:, 1], at[:, 0]] for at in (found[None][name], found[root / "masks"][name]))
-        assert kept.all()
-        assert len(kept) == np.count_nonzero(whole) > 20
-    assert len(found[None]["1.png"]) > 1.5 * len(found[root / "masks"]["1.png"])
 
 
 def test_masks_are_undistorted_as_photos_are(place, dense):

@@ -175,10 +175,6 @@ def find(place, database, **options):
     return {graph.images[key].name: at for key, at in graph.keypoints.items()}
 
 
-def as_set(keypoints):
-    return {tuple(row) for row in keypoints.tolist()}
-
-
 @pytest.mark.slow
 def test_only_photos_that_show_little_are_enlarged(place, tmp_path):
     own = find(place, tmp_path / "own.db", enlarge_below=0)
@@ -203,12 +199,3 @@ def test_what_a_killed_run_has_found_stays(place, tmp_path):
     assert first.keys() == again.keys() == {RICH, POOR, EMPTY}
     for name, keypoints in first.items():
         np.testing.assert_array_equal(again[name], keypoints)
-
-
-@pytest.mark.slow
-def test_a_photo_has_no_more_features_than_asked_for(place, tmp_path):
-    own = find(place, tmp_path / "own.db", enlarge_below=0)
-    cut = find(place, tmp_path / "cut.db", enlarge_below=0, max_features=100)
-    assert len(own[RICH]) > 150
-    assert len(cut[RICH]) == 100
-    assert {tuple(row) for row in cut[RICH].tolist()} <= {tuple(row) for row in own[RICH].tolist()}

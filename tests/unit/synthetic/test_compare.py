@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import strategies as st
 
 from sfm_app.errors import NumericalError
 from sfm_app.geometry.poses import Similarity
@@ -19,8 +18,6 @@ from sfm_app.synthetic.compare import (
     surface_error,
 )
 from sfm_app.synthetic.photo_folder import Truth
-
-SEEDS = st.integers(0, 2**32 - 1)
 
 
 def random_similarity(rng):

@@ -15,10 +15,7 @@ from sfm_app.synthetic.shapes import (
     assemble,
     ball,
     box,
-    bricks,
     carve,
-    cells,
-    ground,
     lattice,
     mixture,
     octaves,
@@ -65,34 +62,6 @@ def test_normals_are_unit_and_point_as_the_triangles(shape):
 
     assert np.allclose(np.linalg.norm(shape.normals, axis=1), 1.0)
     assert np.einsum("nc,nkc->nk", face_normals, shape.normals[shape.faces]).min() > 0.5
-
-
-def test_moving_turns_normals_and_keeps_texture_places():
-    still = ball(1.0, segments=32)
-    moved = still.move((1.0, 2.0, 3.0), turn_deg=90.0)
-
-    assert np.array_equal(moved.texture, still.texture)
-    assert np.allclose(moved.vertices.mean(axis=0) - still.vertices.mean(axis=0), [1.0, 2.0, 3.0])
-    assert np.allclose(moved.normals[:, 2], -still.normals[:, 0]), "turning takes +x to -z"
-
-
-def test_flutes_cut_into_a_column():
-    column = revolve(np.array([[1.0, 0.0], [1.0, 2.0]]), segments=200, flutes=(20, 0.1))
-    radius = np.hypot(column.vertices[:, 0], column.vertices[:, 2])
-    assert radius.max() == pytest.approx(1.0, abs=1e-6) and radius.min() == pytest.approx(0.9, abs=1e-3)
-
-
-def test_bumps_make_a_ball_uneven():
-    radius = np.linalg.norm(ball(2.0, bumps=0.1, seed=1).vertices, axis=1)
-    assert 0.1 < radius.std() / 2.0 / 0.1 < 3.0
-    assert not np.array_equal(ball(2.0, bumps=0.1, seed=1).vertices, ball(2.0, bumps=0.1, seed=2).vertices)
-
-
-def test_ground_faces_up_and_is_uneven():
-    floor = ground((-1.0, 1.0), (-2.0, 2.0), unevenness=0.05)
-    assert floor.normals[:, 1].min() > 0.8
-    assert 0.02 < np.ptp(floor.vertices[:, 1]) < 0.2
-    assert np.allclose(np.ptp(floor.vertices[:, [0, 2]], axis=0), [2.0, 4.0])
 
 
 def egg(points):
@@ -158,15 +127,6 @@ UP = (0.0, 1.0, 0.0)
 PLACES = st.floats(-100, 100)
 
 
-def test_lattice_values_are_uniform_and_unrelated():
-    values = np.array([lattice(i, j, -i, 5) for i in range(-40, 40) for j in range(50)])
-    neighbors = np.array([lattice(i + 1, j, -i - 1, 5) for i in range(-40, 40) for j in range(50)])
-
-    assert values.min() >= 0 and values.max() < 1
-    assert np.allclose(np.quantile(values, [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.03)
-    assert abs(np.corrcoef(values, neighbors)[0, 1]) < 0.05
-
-
 @given(x=PLACES, y=PLACES, z=PLACES)
 @settings(deadline=None)  # the first call compiles
 def test_noise_is_bounded_and_continuous(x, y, z):
@@ -183,27 +143,6 @@ def test_detail_below_a_pixel_is_left_out():
 
     assert not coarse.any()
     assert 0.1 < medium.std() < fine.std() < 1.0
-
-
-def test_octaves_fade_out_without_a_jump():
-    p = (0.3, 1.7, -0.4)
-    sizes = np.linspace(0.01, 1.1, 4000)
-    values = np.array([octaves(p, 1.0, 0.7, footprint, 1) for footprint in sizes])
-    assert np.abs(np.diff(values)).max() < 0.05
-
-
-def test_bricks_are_laid_in_running_bond():
-    center, name = bricks(1.0, 0.5, 0)
-    assert center == pytest.approx(0.5) and bricks(1.9, 0.9, 0)[1] == name
-    assert bricks(0.0, 0.5, 0)[0] == pytest.approx(0.0), "a joint between two bricks of row 0"
-    assert bricks(0.0, 1.5, 0)[0] == pytest.approx(0.5), "the middle of a brick of row 1"
-    assert bricks(2.5, 0.5, 0)[1] != name
-
-
-def test_cells_have_borders_and_names():
-    found = np.array([cells(x, y, 2) for x in np.linspace(0, 8, 80) for y in np.linspace(0, 8, 80)])
-    assert found[:, 0].min() >= 0 and found[:, 0].min() < 0.02 and 0.2 < found[:, 0].max() < 1.0
-    assert 40 < len(np.unique(found[:, 1])) < 130, "about one name per unit square"
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
