@@ -161,19 +161,23 @@ class Killed(BaseException):
     """What no program catches."""
 
 
-@pytest.mark.parametrize("where", ["match_graph", "view_graph", "intrinsics", "scene"])
-def test_a_run_that_was_killed_goes_on_from_the_earlier_one(first, folder, monkeypatch, where):
-    photos, out = folder
-    add(photos, first, 5, 6)
-    name = {"match_graph": "wants_all_pairs", "view_graph": "fit_pairs", "intrinsics": "_summary",
-            "scene": "_finish_scene"}[where]  # fmt: skip
+def killed_in(monkeypatch, function, *arguments):
+    """A run that ends in a function of a stage."""
 
     def fail(*_, **__):
         raise Killed
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(f"sfm_app.stages.{where}.{name}", fail)
-        reconstruct(photos, out)
+        patch.setattr(f"sfm_app.stages.{function}", fail)
+        reconstruct(*arguments)
+
+
+@pytest.mark.parametrize(("where", "name"), [("match_graph", "wants_all_pairs"), ("intrinsics", "_summary")])
+def test_a_run_that_was_killed_goes_on_from_the_earlier_one(first, folder, monkeypatch, where, name):
+    photos, out = folder
+    add(photos, first, 5, 6)
+    killed_in(monkeypatch, f"{where}.{name}", photos, out)
+
     run = reconstruct(photos, out)
 
     assert counts(run, "scene")["mapper"] == "grown" and set(run.scene.registered) == set(first.names)
@@ -183,13 +187,7 @@ def test_a_run_that_was_killed_goes_on_from_the_earlier_one(first, folder, monke
 def test_photos_that_change_again_in_a_killed_run_are_told_from_the_finished_one(first, folder, monkeypatch):
     photos, out = folder
     add(photos, first, 5)
-
-    def fail(*_, **__):
-        raise Killed
-
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr("sfm_app.stages.scene._finish_scene", fail)
-        reconstruct(photos, out)
+    killed_in(monkeypatch, "scene._finish_scene", photos, out)
     add(photos, first, 6)
     (photos / first.names[0]).unlink()
     run = reconstruct(photos, out)

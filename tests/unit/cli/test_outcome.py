@@ -20,6 +20,7 @@ from sfm_app.demo import DemoResult, demo_lines
 from sfm_app.report.text import contradiction_lines, intrinsics_lines, intrinsics_summary, refined_text
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, CameraModel, Intrinsics, Scene
+from tests.unit.cli.test_terminal import LONG, check_text
 
 K = camera_matrix(500.0, 510.0, 480.0, 410.0)
 KNOWN = Calibration(
@@ -29,14 +30,8 @@ KNOWN = Calibration(
 )  # fmt: skip
 GUESS = Calibration(K, 1000, 800, "guess", False, "an orbit", held=("center",))
 REFINED = CameraModel("OPENCV", (501.0, 510.0, 480.0, 410.0, 0, 0, 0, 0), K, 1000, 800, {"fx": 0.754})
-SCALE = {
-    "unit": "meter",
-    "deviation_percent": 0.12,
-    "source": "marker a 1, marker a 2",
-    "contradictions": ["marker a 3 contradicts the 2 others"],
-    "problems": [],
-}
-LONG = "the photos contradict it: " + ", ".join(f"photo_{k:03}.jpg" for k in range(40))
+SCALE = {"unit": "meter", "deviation_percent": 0.12, "source": "marker a 1, marker a 2",
+         "contradictions": ["marker a 3 contradicts the 2 others"], "problems": []}  # fmt: skip
 
 
 def manifest(counts):
@@ -78,22 +73,12 @@ def long_run(finished):
     return replace(finished, calibration=guess, scene=scene, manifest=manifest(counts))
 
 
-def check_text(text, path=""):
-    """Check that no line is longer than 80 columns, but for a path, and that nothing is colored."""
-    assert "\x1b" not in text and text.strip()
-    assert [line for line in text.splitlines() if len(line) > 80 and not (path and path in line)] == []
-
-
 @pytest.mark.parametrize("lines_of", [run_lines, partial(outcome_lines, seconds=0.7)], ids=["all", "outcome"])
 @pytest.mark.parametrize("until", ["photos", "camera", "scene", "mesh"])
 def test_the_result_fits_into_80_columns(capsys, long_run, lines_of, until):
-    less = {
-        "photos": {"mesh_path": None, "scene": None, "calibration": None},
-        "camera": {"mesh_path": None, "scene": None},
-        "scene": {"mesh_path": None},
-        "mesh": {},
-    }
-    print_text(lines_of(replace(long_run, **less[until])))
+    products = ("calibration", "scene", "mesh_path")
+    missing = products[["photos", "camera", "scene", "mesh"].index(until) :]
+    print_text(lines_of(replace(long_run, **dict.fromkeys(missing))))
 
     check_text(capsys.readouterr().out, str(long_run.out))
 
@@ -108,9 +93,6 @@ def test_the_result_of_a_demo_fits_into_80_columns(capsys, scene):
     text = capsys.readouterr().out
     check_text(text)
     assert len(text.splitlines()) <= 7
-
-
-# --- the few lines that a user needs ---
 
 
 def test_the_outcome_is_result_accuracy_warnings_and_files(finished):
@@ -180,9 +162,6 @@ def test_a_run_of_some_stages_has_its_own_headline(finished):
     assert outcome_lines(replace(earlier, scene=everything), 250.0)[0] == "Cameras and points of all 2 photos."
     assert outcome_lines(replace(earlier, scene=None), 250.0)[0] == "The camera of 4 photos."
     assert outcome_lines(replace(earlier, scene=None, calibration=None), 250.0)[0] == "4 usable photos."
-
-
-# --- all figures ---
 
 
 def test_every_parameter_stands_beside_its_deviation():
@@ -257,10 +236,8 @@ def test_json_has_every_figure_of_a_camera():
     camera = json.loads(json.dumps(intrinsics_summary(Intrinsics({"one": KNOWN}))))["one"]
 
     assert camera["field_of_view_deg"] == pytest.approx([93.27, 78.07], abs=0.01)
-    changed = ("field_of_view_deg", "key_pairs")
-    assert {k: v for k, v in camera.items() if k not in changed} == {
-        k: v for k, v in KNOWN.to_dict().items() if k not in changed
-    }
+    changed = dict.fromkeys(("field_of_view_deg", "key_pairs"))
+    assert camera | changed == KNOWN.to_dict() | changed
     assert (camera["radial"], camera["spread"]["k1"], camera["held"]) == (-0.05, 0.01, ["aspect"])
     assert (camera["identifiable"], camera["reason"], camera["key_pairs"][0]) == (True, "", ["1", "2"])
 
@@ -270,10 +247,8 @@ def test_refined_cameras_stand_with_their_deviations(tmp_path):
     camera = CameraModel("OPENCV", (500.0, 510.0, 480.0, 410.0, -0.05, 0, 0, 0), K, 1000, 800, deviations, ("center",))
     run = Run(tmp_path, None, Scene(tmp_path, {}, {}, {"one": camera}, 10, 20, 0.3), None, None, {})
 
-    assert any(
-        line.strip() == "camera refined: fx 500.0 +- 0.8  fy 510.0 +- 1.5  cx 480.0 +- 2.0  cy 410.0 +- 2.5 px"
-        for line in run_lines(run)
-    )
+    line = "camera refined: fx 500.0 +- 0.8  fy 510.0 +- 1.5  cx 480.0 +- 2.0  cy 410.0 +- 2.5 px"
+    assert line in map(str.strip, run_lines(run))
     summary = json.loads(json.dumps(run_summary(run)))["scene"]["cameras"]["one"]
     assert summary["deviations"] == deviations and summary["determined"] == ["center"]
     assert summary["K"] == K.tolist() and summary["params"][4] == -0.05
@@ -283,19 +258,11 @@ def test_model_files_stand_with_their_sizes_the_one_to_open_first(tmp_path):
     sizes = {"model.ply": 2_340_000, "model.glb": 4_000, "points.ply": 10, "points.glb": 20}
     for name in ("model.ply", "model.glb", "points.glb"):
         (tmp_path / name).write_bytes(bytes(sizes[name]))
+    points, models = ({name: sizes[name] for name in sizes if name[0] == first} for first in "pm")
     counts = {
-        "scale": {
-            "bytes": {name: sizes[name] for name in ("points.ply", "points.glb")},
-            "unit": "arbitrary",
-            "contradictions": [],
-            "problems": [],
-        },
+        "scale": {"bytes": points, "unit": "arbitrary", "contradictions": [], "problems": []},
         "mesh": {"triangles": 7},
-        "files": {
-            "bytes": {name: sizes[name] for name in ("model.ply", "model.glb")},
-            "pages_px": [[4096, 2048], [512, 512]],
-            "jpeg_quality": 90,
-        },
+        "files": {"bytes": models, "pages_px": [[4096, 2048], [512, 512]], "jpeg_quality": 90},
     }
     scene = Scene(tmp_path, {}, {}, {}, 10, 20, 0.3)
     run = Run(tmp_path, None, scene, None, tmp_path / "model.glb", manifest(counts))
@@ -305,14 +272,9 @@ def test_model_files_stand_with_their_sizes_the_one_to_open_first(tmp_path):
     assert lines[start + 1 : start + 3] == [f"{tmp_path}/model.glb  4 kB", f"{tmp_path}/model.ply  2.3 MB"]
     assert lines[start - 2] == f"points and cameras: {tmp_path}/points.glb  20 bytes"
     assert lines[-1] == "seconds     scale 60.0, mesh 60.0, files 60.0; total 180.0"
-    summary = run_summary(run)
-    assert [summary[part]["files"] for part in ("scene", "mesh")] == [
-        [f"{tmp_path}/points.glb"],
-        [f"{tmp_path}/model.glb", f"{tmp_path}/model.ply"],
-    ]
+    scene, mesh = (run_summary(run)[part]["files"] for part in ("scene", "mesh"))
+    assert scene == [f"{tmp_path}/points.glb"] and mesh == [f"{tmp_path}/model.glb", f"{tmp_path}/model.ply"]
 
-
-# --- next commands ---
 
 PHOTOS, OUT = Path("my photos"), Path("out")
 MODEL = Run(OUT, None, None, None, OUT / "model.glb", {})
