@@ -146,16 +146,15 @@ def test_estimates_come_and_go(workspace):
 def test_a_map_appears_complete_or_not_at_all(workspace, monkeypatch):
     dense, views = workspace
     store, view = DenseStore(dense), replace(views[0], name="killed.png")
-    monkeypatch.setattr("pathlib.Path.replace", interrupt)
 
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pathlib.Path.replace", interrupt)
     with pytest.raises(KeyboardInterrupt):
         store.write_maps(view, DepthMap(np.ones((90, 120), np.float32), np.ones((90, 120, 3), np.float32)))
 
     assert not store.has(view, "geometric")
-
-
-def interrupt(*_):
-    raise KeyboardInterrupt
 
 
 @pytest.mark.slow
@@ -167,7 +166,7 @@ def test_the_box_cuts_the_points(workspace):
 
 
 @pytest.mark.slow
-def test_the_surface_has_the_shape_of_the_points(workspace):
+def test_the_surface_has_the_shape_of_the_points_whatever_came_before(workspace):
     dense, _ = workspace
     fuse(dense, 3, BOX, dense / FUSED)
 
@@ -178,6 +177,10 @@ def test_the_surface_has_the_shape_of_the_points(workspace):
     assert np.percentile(np.abs(surface.vertices[inside] @ NORMAL - DISTANCE), 90) < 0.02
     assert surface.colors.shape == surface.vertices.shape
     assert not (dense / "poisson.ply").exists()
+    poisson_surface(dense, 2)
+    again = poisson_surface(dense, 6)
+    np.testing.assert_array_equal(again.vertices, surface.vertices)
+    np.testing.assert_array_equal(again.faces, surface.faces)
 
 
 def wavy(size: int) -> Surface:
@@ -189,17 +192,6 @@ def wavy(size: int) -> Surface:
     vertices = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     colors = np.broadcast_to(np.uint8([200, 100, 50]), vertices.shape)
     return Surface(vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]), colors)
-
-
-@pytest.mark.slow
-def test_a_surface_does_not_depend_on_those_before_it(workspace):
-    dense, _ = workspace
-    fuse(dense, 3, BOX, dense / FUSED)
-
-    before, _, after = (poisson_surface(dense, depth) for depth in (6, 2, 6))
-
-    np.testing.assert_array_equal(after.vertices, before.vertices)
-    np.testing.assert_array_equal(after.faces, before.faces)
 
 
 @pytest.mark.slow
