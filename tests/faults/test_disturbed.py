@@ -13,12 +13,7 @@ STEPS = 15
 """Steps between the first file that appears and the last."""
 KILLED = [f"{when}:{step}" for when in ("before", "after") for step in range(STEPS + 1)]
 KILLED += [f"{what}:{ms}" for what in ("features", "matching", "undistorting") for ms in (0, 60, 400)]
-INTERRUPTED = [
-    "features:10",
-    "matching:10",
-    "undistorting:0",
-    *[f"before:{step * STEPS / 10}" for step in range(1, 10)],
-]
+INTERRUPTED = ["features:10", "matching:10", "undistorting:0", *(f"before:{1.5 * tenth}" for tenth in range(1, 10))]
 SAYS = {
     "out-gone": "out was removed",
     "out-closed": "cannot write to",

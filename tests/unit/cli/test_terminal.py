@@ -10,17 +10,6 @@ import pytest
 from rich.console import Console
 
 from sfm_app.cli import output
-from sfm_app.cli.output import (
-    STAGE_TITLES,
-    file_lines,
-    fold_lines,
-    open_browser,
-    print_lines,
-    print_text,
-    size_text,
-    table,
-    terminal_width,
-)
 from sfm_app.cli.terminal import Terminal, per_minute
 from sfm_app.pipeline import NAMES
 
@@ -54,7 +43,7 @@ def shown(clock):
 
 
 def test_every_stage_has_a_title_in_order():
-    assert tuple(STAGE_TITLES) == NAMES
+    assert tuple(output.STAGE_TITLES) == NAMES
 
 
 def test_a_short_stage_is_one_line_with_its_seconds(shown):
@@ -228,13 +217,13 @@ def test_the_display_checks_for_silence_by_itself(clock):
     ],
 )
 def test_long_lines_continue_below_their_text(line, folded):
-    assert fold_lines([line], 9) == folded
+    assert output.fold_lines([line], 9) == folded
 
 
 def test_folding_keeps_every_word(capsys):
     lines = [f"label       {LONG}", LONG, f"  {LONG}", "A sentence that ends here.  " + LONG]
-    folded = fold_lines(lines)
-    print_text(lines)
+    folded = output.fold_lines(lines)
+    output.print_text(lines)
 
     assert capsys.readouterr().out.splitlines() == folded
     assert max(map(len, folded)) <= 80 and len(folded) > 3 * len(lines)
@@ -247,14 +236,14 @@ def test_folding_keeps_every_word(capsys):
 def test_the_width_is_that_of_the_terminal_within_bounds(monkeypatch, columns, expected):
     monkeypatch.setenv("COLUMNS", str(columns))
 
-    assert terminal_width(Screen()) == expected
-    assert terminal_width(io.StringIO()) is None
+    assert output.terminal_width(Screen()) == expected
+    assert output.terminal_width(io.StringIO()) is None
 
 
 def test_unprintable_characters_are_escaped(capsys):
-    print_lines(["a\x1b[2Jb\n", "é"])
+    output.print_lines(["a\x1b[2Jb\n", "é"])
     assert capsys.readouterr().out == "a\\x1b[2Jb\\n\né\n"
-    print_lines([])
+    output.print_lines([])
     assert capsys.readouterr().out == ""
 
 
@@ -263,15 +252,15 @@ def test_files_stand_with_their_sizes(tmp_path):
     for name in ("a", "b"):
         (tmp_path / "some of them" / name).write_bytes(bytes(700))
 
-    assert file_lines([tmp_path / "some of them"]) == [f"{tmp_path}/some of them  2 files, 1 kB"]
-    assert table({"a": "one", "long": "two"}) == ["a     one", "long  two"]
+    assert output.file_lines([tmp_path / "some of them"]) == [f"{tmp_path}/some of them  2 files, 1 kB"]
+    assert output.table({"a": "one", "long": "two"}) == ["a     one", "long  two"]
 
 
 @pytest.mark.parametrize(
     ("size", "text"), [(0, "0 bytes"), (999, "999 bytes"), (355_764, "356 kB"), (15_133_688, "15.1 MB")]
 )
 def test_sizes_have_a_unit(size, text):
-    assert size_text(size) == text
+    assert output.size_text(size) == text
 
 
 @pytest.fixture
@@ -285,7 +274,7 @@ def open_page(monkeypatch):
             monkeypatch.delenv(name, raising=False)
         for name, value in variables.items():
             monkeypatch.setenv(name, value)
-        return open_browser("http://127.0.0.1:1/")
+        return output.open_browser("http://127.0.0.1:1/")
 
     return call
 

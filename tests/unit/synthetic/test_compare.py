@@ -126,11 +126,8 @@ def test_coverage_tells_half_a_surface_from_a_whole_one(plane_truth):
 def test_the_scene_is_what_the_photos_see(photos, plane_truth):
     truth = photos[1]
     hidden = np.array([[50.0, 0, 50], [51, 0, 50], [50, 0, 51]])
-    behind = replace(
-        truth,
-        vertices=np.concatenate([truth.vertices, hidden]),
-        faces=np.concatenate([truth.faces, np.array([[0, 1, 2]]) + len(truth.vertices)]),
-    )
+    faces = np.concatenate([truth.faces, np.array([[0, 1, 2]]) + len(truth.vertices)])
+    behind = replace(truth, vertices=np.concatenate([truth.vertices, hidden]), faces=faces)
     assert scene_size(behind) == scene_size(truth)
     assert 4.0 < scene_size(plane_truth) <= 32**0.5 + 1e-3
     assert np.abs(seen_points(plane_truth)[:, 1]).max() < 1e-5

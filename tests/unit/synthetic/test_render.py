@@ -5,17 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm_app.synthetic import render
 from sfm_app.synthetic.cameras import Camera, camera_center, look_at, make_camera, pixel_rays
-from sfm_app.synthetic.render import (
-    cast_rays,
-    comparison_image,
-    orbited_pose,
-    prepare,
-    ray_caster,
-    render_model,
-    render_scene,
-    render_shape,
-)
 from sfm_app.synthetic.shapes import Body, Material, SyntheticScene, box
 from sfm_app.types import Surface
 from sfm_app.types.surface import Model, Texture
@@ -25,17 +16,17 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def prepared(still_life):
-    return prepare(still_life)
+    return render.prepare(still_life)
 
 
 def test_two_views_show_the_same_surface_in_the_right_pixels(prepared, still_life, four_views):
     """What view 1 shows at a pixel, view 2 shows where the truth projects it to: half a pixel off would be noticed."""
     camera = make_camera(240, 160)
     poses = list(four_views.cam_from_world.values())[1:3]
-    first, second = (render_scene(prepared, camera, pose, supersampling=3) for pose in poses)
+    first, second = (render.render_scene(prepared, camera, pose, supersampling=3) for pose in poses)
     directions = pixel_rays(camera) @ poses[0][:, :3]
-    caster = ray_caster(still_life.vertices, still_life.faces)
-    hits = cast_rays(caster, camera_center(poses[0]), directions)
+    caster = render.ray_caster(still_life.vertices, still_life.faces)
+    hits = render.cast_rays(caster, camera_center(poses[0]), directions)
     hit = np.isfinite(hits["t_hit"])
     points = camera_center(poses[0]) + directions[hit] * hits["t_hit"][hit, None]
     h = (points @ poses[1][:, :3].T + poses[1][:, 3]) @ camera.K.T
@@ -60,11 +51,11 @@ def test_a_pixel_is_seen_through_its_center():
     """A wall whose edges lie at x = 10.25 and 30.75, y = 4.25 and 15.75 pixels covers whole pixels by their centers."""
     white = Material(pattern="stone", base=(230, 230, 230), second=(230, 230, 230), joint=(230, 230, 230))
     wall = box(20.5, 11.5, 1.0, spacing=50.0).move((-4.5, -15.75 + 15.0, -20.5))
-    scene = prepare(SyntheticScene("wall", (Body(wall, white),), to_light=(0.0, 0.0, 1.0)))
+    scene = render.prepare(SyntheticScene("wall", (Body(wall, white),), to_light=(0.0, 0.0, 1.0)))
     camera = Camera(np.array([[20.0, 0, 25.0], [0, 20.0, 15.0], [0, 0, 1]]), 50, 30)
     pose = look_at(np.zeros(3), np.array([0.0, 0.0, -1.0]))  # the front of the wall is 20 units away
 
-    image = render_scene(scene, camera, pose, supersampling=1)
+    image = render.render_scene(scene, camera, pose, supersampling=1)
 
     rows, columns = np.nonzero(image[..., 0] > image[..., 2])  # sunlight is warm, the sky is blue
     assert (columns.min(), columns.max(), rows.min(), rows.max()) == (10, 30, 4, 15)
@@ -77,8 +68,8 @@ def test_the_sun_casts_a_shadow_away_from_it(prepared, still_life):
     shaded = ball - sun * ball[1] / sun[1]  # where the shadow of the ball's middle falls
     above = look_at(np.array([0.0, 9.0, 0.1]), np.zeros(3))
     camera = make_camera(150, 150)
-    empty = prepare(replace(still_life, bodies=still_life.bodies[:1]))
-    ratio = (render_scene(prepared, camera, above) / render_scene(empty, camera, above)).mean(axis=2)
+    empty = render.prepare(replace(still_life, bodies=still_life.bodies[:1]))
+    ratio = (render.render_scene(prepared, camera, above) / render.render_scene(empty, camera, above)).mean(axis=2)
 
     def darkened(point):
         h = camera.K @ (above[:, :3] @ point + above[:, 3])
@@ -95,11 +86,11 @@ def test_rows_are_seen_from_poses_of_their_own(prepared, four_views):
     first, second, *_ = four_views.cam_from_world.values()
     halves = np.concatenate([np.repeat(first[None], 20, axis=0), np.repeat(second[None], 20, axis=0)])
 
-    image = render_scene(prepared, camera, halves)
+    image = render.render_scene(prepared, camera, halves)
 
-    assert image[:20] == pytest.approx(render_scene(prepared, camera, first)[:20], abs=0.01)
-    assert image[20:] == pytest.approx(render_scene(prepared, camera, second)[20:], abs=0.01)
-    assert np.abs(image[20:] - render_scene(prepared, camera, first)[20:]).mean() > 0.02
+    assert image[:20] == pytest.approx(render.render_scene(prepared, camera, first)[:20], abs=0.01)
+    assert image[20:] == pytest.approx(render.render_scene(prepared, camera, second)[20:], abs=0.01)
+    assert np.abs(image[20:] - render.render_scene(prepared, camera, first)[20:]).mean() > 0.02
 
 
 CAMERA = Camera(np.array([[20.0, 0, 20.0], [0, 20.0, 10.0], [0, 0, 1]]), 40, 20)
@@ -122,7 +113,7 @@ def textured(page, *, pages=1):
 
 
 def test_a_model_without_texture_has_the_colors_of_its_vertices():
-    picture = render_model(Model(square()), CAMERA, STRAIGHT)
+    picture = render.render_model(Model(square()), CAMERA, STRAIGHT)
     assert np.array_equal(picture.covered, np.arange(40)[None, :].repeat(20, axis=0) >= 20)
     share = (np.arange(20) + 0.5) / 20
     assert np.allclose(picture.colors[:, 20:, 0], np.round(250 * (1 - share))[:, None], atol=1)
@@ -134,7 +125,7 @@ def test_a_model_without_texture_has_the_colors_of_its_vertices():
 def test_a_page_of_the_size_of_its_pixels_is_shown_texel_by_texel(pages):
     """One texel per pixel: half a texel off, or an upside-down page, would be noticed."""
     page = np.random.default_rng(0).integers(0, 256, (20, 20, 3)).astype(np.uint8)
-    picture = render_model(textured(page, pages=pages), CAMERA, STRAIGHT)
+    picture = render.render_model(textured(page, pages=pages), CAMERA, STRAIGHT)
     assert np.abs(picture.colors[:, 20:].astype(int) - page).max() <= 2
     assert np.abs(picture.colors[:, 20:].astype(int) - np.roll(page, 1, axis=1)).mean() > 40
 
@@ -142,14 +133,14 @@ def test_a_page_of_the_size_of_its_pixels_is_shown_texel_by_texel(pages):
 def test_texels_are_mixed_between_their_centers_and_repeated_at_the_border():
     page = np.zeros((1, 2, 3), np.uint8)
     page[0, 1] = 200
-    row = render_model(textured(page), CAMERA, STRAIGHT).colors[10, 20:, 0].astype(float)
+    row = render.render_model(textured(page), CAMERA, STRAIGHT).colors[10, 20:, 0].astype(float)
     expected = 200 * np.clip(2 * (np.arange(20) + 0.5) / 20 - 0.5, 0, 1)
     assert np.allclose(row, expected, atol=4), "the centers of the two texels lie at 1/4 and 3/4"
 
 
 def test_the_bare_shape_is_gray_outside_and_reddish_inside():
-    outside = render_shape(Model(square()), CAMERA, STRAIGHT)
-    inside = render_shape(Model(square(FACES[:, ::-1])), CAMERA, STRAIGHT)
+    outside = render.render_shape(Model(square()), CAMERA, STRAIGHT)
+    inside = render.render_shape(Model(square(FACES[:, ::-1])), CAMERA, STRAIGHT)
     assert np.array_equal(outside.covered, inside.covered)
     gray, red = outside.colors[outside.covered], inside.colors[inside.covered]
     assert np.all(gray[:, 0] == gray[:, 1]) and np.all(gray[:, 0] == gray[:, 2])
@@ -161,7 +152,7 @@ def test_a_face_is_brighter_the_more_it_faces_the_lamp():
     levels = []
     for tilt in (-0.5, 0.0, 0.5):
         tilted = SQUARE + np.array([0.0, 0.0, 1.0]) * (tilt * (SQUARE[:, :1] + SQUARE[:, 1:2]))
-        picture = render_shape(Model(square(vertices=tilted)), CAMERA, STRAIGHT)
+        picture = render.render_shape(Model(square(vertices=tilted)), CAMERA, STRAIGHT)
         levels.append(picture.colors[picture.covered].mean())
     assert 205 * 0.25 < levels[2] < levels[1] - 40 and levels[1] + 20 < levels[0] < 206
 
@@ -169,7 +160,7 @@ def test_a_face_is_brighter_the_more_it_faces_the_lamp():
 def test_a_model_without_triangles_is_not_seen():
     empty = Model(Surface(np.zeros((3, 3)), np.zeros((0, 3), np.int64), np.zeros((3, 3), np.uint8)))
     camera = make_camera(20, 16)
-    for picture in (render_model(empty, camera, STRAIGHT), render_shape(empty, camera, STRAIGHT)):
+    for picture in (render.render_model(empty, camera, STRAIGHT), render.render_shape(empty, camera, STRAIGHT)):
         assert picture.colors.shape == (16, 20, 3) and not picture.covered.any()
         assert np.all(picture.with_background() == 255)
 
@@ -177,7 +168,7 @@ def test_a_model_without_triangles_is_not_seen():
 def test_beside_a_photo_stand_the_model_from_its_camera_from_aside_and_its_bare_shape():
     camera = Camera(np.array([[20.0, 0, 40.0], [0, 20.0, 20.0], [0, 0, 1]]), 80, 40)
     photo = np.full((80, 160, 3), (10, 200, 30), np.uint8)
-    page = comparison_image(photo, textured(np.full((8, 8, 3), (200, 40, 30), np.uint8)), camera, STRAIGHT)
+    page = render.comparison_image(photo, textured(np.full((8, 8, 3), (200, 40, 30), np.uint8)), camera, STRAIGHT)
     views = {"photo": page[:40, :80], "model": page[:40, 80:], "aside": page[40:, :80], "shape": page[40:, 80:]}
     seen = {name: np.any(view != 255, axis=2) for name, view in views.items()}
 
@@ -195,7 +186,7 @@ def test_beside_a_photo_stand_the_model_from_its_camera_from_aside_and_its_bare_
 def test_walking_around_keeps_height_distance_and_what_is_in_the_middle(angle_deg):
     surface = Surface(np.random.default_rng(0).normal(size=(99, 3)), FACES, RED_TO_BLUE)
     pose = look_at(np.array([1.0, 2.0, 6.0]), np.zeros(3))
-    walked = orbited_pose(pose, surface, angle_deg)
+    walked = render.orbited_pose(pose, surface, angle_deg)
     depth = np.median(surface.vertices @ pose[2, :3] + pose[2, 3])
     middle = pose[:, :3].T @ (np.array([0.0, 0.0, depth]) - pose[:, 3])
 
