@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from sfm_app.bundle.lens_evidence import estimate_lenses
 from sfm_app.bundle.lens_parts import PERSPECTIVE_PARTS, LensPriors
@@ -26,8 +25,7 @@ def seen(*true, photos=8, noise_px=0.3, seed=0, points=600):
     rng = np.random.default_rng(seed)
     depth = 3.0 * true[0][0] / 900.0
     X = rng.uniform(-1, 1, (points, 3))
-    turns = [(0.5 * k, 0.2 * (-1) ** k, 0.3 * k - 1.0) for k in range(photos * len(true))]  # about z, x, y
-    R = Rotation.from_euler("ZXY", turns).as_matrix()
+    R = np.array([turn(0.3 * k - 1.0, 0.2 * (-1) ** k, 0.5 * k) for k in range(photos * len(true))])
     t = np.tile([0.0, 0.0, depth], (len(R), 1)) + rng.uniform(-0.1, 0.1, (len(R), 3))
     photo, point = (index.ravel() for index in np.meshgrid(range(len(R)), range(points), indexing="ij"))
     camera = np.repeat(np.arange(len(true)), photos)
@@ -40,6 +38,12 @@ def seen(*true, photos=8, noise_px=0.3, seed=0, points=600):
     x += rng.normal(scale=noise_px, size=x.shape)
     places = (np.cumsum(kept) - 1)[point[inside]]
     return replace(bundle, X=X[kept], photo=photo[inside], point=places, x=x[inside])
+
+
+def turn(pan, tilt, roll):
+    (a, b, c), (p, q, r) = np.cos([pan, tilt, roll]), np.sin([pan, tilt, roll])
+    about_z, about_x = [[c, -r, 0], [r, c, 0], [0, 0, 1]], [[1, 0, 0], [0, b, -q], [0, q, b]]
+    return np.array(about_z) @ np.array(about_x) @ np.array([[a, 0, p], [0, 1, 0], [-p, 0, a]])
 
 
 def starting_at(bundle, *params):
