@@ -51,7 +51,6 @@ def test_a_killed_run_ends_with_the_same_bytes(undisturbed, tmp_path, point):
 def test_an_interrupted_run_says_how_to_go_on_and_does_so(undisturbed, refused, tmp_path, point):
     interrupted = undisturbed.run(tmp_path / "out", "interrupt", moment(undisturbed, point))
     undisturbed.finish(tmp_path / "out")
-
     refused(interrupted, 130)
     assert "run the same command again to resume" in interrupted.stderr
 
@@ -61,7 +60,6 @@ def test_an_interrupted_run_says_how_to_go_on_and_does_so(undisturbed, refused, 
 )
 def test_what_changes_under_a_run_is_one_line_and_the_next_run_is_right(undisturbed, refused, tmp_path, what, share):
     folder, out = undisturbed.copied(tmp_path), tmp_path / "out"
-
     disturbed = folder.run(out, what, f"after:{folder.moment(share)}")
     if what == "out-closed":
         for path in (out, *(below for below in out.rglob("*") if not below.is_symlink())):
@@ -69,7 +67,6 @@ def test_what_changes_under_a_run_is_one_line_and_the_next_run_is_right(undistur
     for path in undisturbed.photos.iterdir():  # all is well again
         (folder.photos / path.name).write_bytes(path.read_bytes())
     folder.finish(out)
-
     refused(disturbed, 3)
     assert SAYS[what] in disturbed.stderr
 
@@ -98,9 +95,7 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_room(
 ):
     """A limit on the size of files stands for the disk: whoever writes past it gets the same error."""
     finished(stage, tmp_path / "out")
-
     full = undisturbed.run(tmp_path / "out", moment=f"full:{limit}")
     undisturbed.finish(tmp_path / "out")
-
     refused(full, 3)
     assert "the disk is full" in full.stderr

@@ -55,9 +55,7 @@ def test_a_given_camera_is_kept_or_refined_and_checked(rendered, tmp_path):
 
 def test_the_named_model_is_the_last_one(rendered, tmp_path):
     photos, truth = rendered
-
     done = run(photos, tmp_path / "out", scene={"camera_model": "RADIAL"})
-
     [lens] = done.manifest["stages"]["scene"]["counts"]["lenses"].values()
     [camera] = done.scene.cameras.values()
     assert (lens["model"], lens["file"]) == ("RADIAL", "OPENCV")

@@ -53,10 +53,8 @@ def used_share(out, name):
 def test_masks_are_counted_and_every_photo_has_one(folder, masks, tmp_path):
     mask().save(masks / "other.jpg.png")
     (masks / "notes.txt").write_text("by hand")
-
     result = read(folder, tmp_path / "out", "--json")
     told = read(folder, tmp_path / "out").stdout
-
     assert json.loads(result.stdout)["masks"] == {"photos": 1, "unused": ["notes.txt", "other.jpg.png"]}
     assert "masks       1 of 3 photos\n            unused: notes.txt, other.jpg.png\n" in told
     assert [used_share(tmp_path / "out", name) for name in ("a.jpg", "b.png", "sub/a.jpg")] == [1.0, 1.0, 0.5]
@@ -64,9 +62,7 @@ def test_masks_are_counted_and_every_photo_has_one(folder, masks, tmp_path):
 
 def test_masks_beside_the_photos_in_a_folder_of_their_own_are_no_photos(folder, masks, tmp_path):
     masks.rename(folder / "masks")
-
     result = call("run", folder, "-o", tmp_path / "out", "--masks", folder / "masks", "--until", "photos", "--json")
-
     found = json.loads(result.stdout)
     assert (found["photos"]["usable"], found["photos"]["unusable"]) == (3, {})
     assert found["masks"] == {"photos": 1, "unused": []}
@@ -74,9 +70,7 @@ def test_masks_beside_the_photos_in_a_folder_of_their_own_are_no_photos(folder, 
 
 def test_a_photo_whose_mask_is_black_is_left_out_with_the_reason(folder, masks, tmp_path):
     Image.new("L", SIZE).save(masks / "a.png")
-
     found = json.loads(read(folder, tmp_path / "out", "--json").stdout)
-
     assert found["photos"]["unusable"] == {"a.jpg": "its mask a.png is all black"}
     assert not (tmp_path / "out" / "masks" / "a.jpg.png").exists()
 
@@ -103,9 +97,7 @@ def test_masks_that_are_gone_from_the_output_are_laid_out_again(folder, tmp_path
     read(folder, tmp_path / "out")
     for path in (tmp_path / "out" / "masks").rglob("*.png"):
         path.unlink()
-
     call("run", folder, "-o", tmp_path / "out", "--masks", folder.with_name("masks"), "--until", "match_graph")
-
     assert [used_share(tmp_path / "out", name) for name in ("a.jpg", "b.png", "sub/a.jpg")] == [1.0, 1.0, 0.5]
     (found,) = np.nonzero([at[:, 0].min() < 64 for at in keypoints(tmp_path / "out").values()])
     assert found.tolist() == [0, 1]
@@ -144,9 +136,7 @@ def test_every_refusal_is_one_line_and_a_hint(folder, masks, tmp_path, case):
     (tmp_path / "out" / "masks").mkdir()
     (tmp_path / "out" / "masks" / "mine.png").write_bytes(b"x")
     make(masks)
-
     result = read(folder, tmp_path / "out")
-
     assert result.exit_code == 3, result.output
     assert words in result.stderr and "Traceback" not in result.output
     assert result.stderr.count("\n") == 2 and "hint: " in result.stderr

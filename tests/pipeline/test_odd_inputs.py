@@ -215,7 +215,6 @@ def test_a_file_that_may_not_be_read(folder, tmp_path, as_ordinary_user):
     picture(3).save(folder / "x.jpg")
     (folder / "x.jpg").chmod(0)
     result = as_ordinary_user("-m", "sfm_app", "run", folder, "-o", tmp_path / "out", "--until", "photos", "--json")
-
     assert json.loads(result.stdout)["photos"]["unusable"] == {"x.jpg": "not readable: permission denied"}
 
 
@@ -245,9 +244,7 @@ def test_what_lies_in_the_output_folder_never_stops_a_run(folder, tmp_path, case
     command = ("run", folder, "-o", tmp_path / "out", "--until", "photos", "--json")
     assert call(*command).exit_code == 0
     DISTURBED[case](tmp_path / "out")
-
     result = call(*command)
-
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["photos"]["usable"] == 2
 

@@ -11,7 +11,6 @@ from sfm_app.bundle.normal_equations import POSE, apply_step, best_step, project
 from sfm_app.bundle.rolling_shutter import (
     FITS,
     ShutterBundle,
-    add_points,
     apply_shutter_step,
     estimate_readout,
     linearize,
@@ -34,9 +33,7 @@ def seen(film):
 
 def test_without_motion_it_is_the_projection_of_a_global_shutter(seen):
     bundle, share, motion = seen
-
     found, plain = project_rows(bundle, share, 0.0 * motion), project(bundle)
-
     assert found.x == pytest.approx(plain[0], abs=1e-9)
     for ours, theirs in zip((found.by_camera, found.by_pose, found.by_point), plain[1:], strict=True):
         assert ours == pytest.approx(theirs, abs=1e-9)
@@ -63,9 +60,7 @@ def test_derivatives_by_pose_and_motion_are_those_of_the_projection(seen, place)
 def test_derivatives_by_point_are_those_of_the_projection(seen, place):
     bundle, share, motion = seen
     found = project_rows(bundle, share, motion)
-
     moved = project_rows(replace(bundle, X=bundle.X + STEP * np.eye(3)[place]), share, motion)
-
     by_point = (moved.x - found.x) / STEP
     assert by_point == pytest.approx(found.by_point[:, :, place], abs=1e-3 * np.abs(found.by_point).max())
 
@@ -74,7 +69,6 @@ def test_points_return_to_the_time_of_the_middle_row():
     rng = np.random.default_rng(2)
     points, share, motion = rng.uniform([-2, -1, 3], [2, 1, 8], (20, 3)), rng.uniform(-0.5, 0.5, 20), rng.normal(size=6)
     still = move_to_middle_row(points, np.zeros(20), 0.03 * motion)
-
     assert still == pytest.approx(points)
     assert np.abs(move_to_middle_row(points, share, 0.03 * motion) - points).max() > 0.01
 
@@ -119,9 +113,7 @@ def true_velocities(path, times):
 def test_a_turn_and_a_move_at_constant_speed_are_found_exactly():
     times = np.sort(np.random.default_rng(0).uniform(0.0, 3.0, 12))
     path = walk(WalkOptions(seconds=3.0, shake=0.0, heading_deg=90.0, look_deg=0.0))
-
     found = velocities(path.poses(times), times)
-
     for values in found.values:
         assert values == pytest.approx(np.tile([0, 0, 0, -1.4, 0, 0], (12, 1)), abs=1e-6)
 
@@ -129,9 +121,7 @@ def test_a_turn_and_a_move_at_constant_speed_are_found_exactly():
 def test_velocities_are_those_of_the_camera_as_accurately_as_said():
     times = 0.1 * np.arange(30)
     path = walk(WalkOptions(seconds=3.0, swing_deg_s=60.0))
-
     found, true = velocities(path.poses(times), times), true_velocities(path, times)
-
     best = found.select_most_predictive()
     off = found.select(best) - true
     assert [FITS[fit] for fit in best] == [(5, 3), (5, 3)]
@@ -145,9 +135,7 @@ def test_the_order_of_the_photos_does_not_matter():
     times = 0.1 * np.arange(15)
     poses = walk(WalkOptions()).poses(times)
     mixed = np.random.default_rng(3).permutation(15)
-
     there, here = velocities(poses[mixed], times[mixed]), velocities(poses, times)
-
     assert there.values == pytest.approx(here.values[:, mixed], abs=1e-12)
     assert there.deviations() == pytest.approx(here.deviations()[mixed], abs=1e-12)
 
@@ -158,9 +146,7 @@ def test_where_poses_jump_about_the_path_goes_through_their_middle():
     jumping = poses.copy()
     jumping[:, :, 3] += np.random.default_rng(0).normal(scale=0.05, size=(40, 3))
     found, moves = velocities(jumping, times), slice(3, 6)
-
     best = found.select_most_predictive()[1]
-
     off = np.abs(found.values - velocities(poses, times).values)[:, :, moves].mean(axis=(1, 2))
     assert FITS[best] in ((7, 1), (9, 1))
     assert off[best] < 0.5 * off[0]
@@ -175,27 +161,6 @@ def model(film):
     rng = np.random.default_rng(4)
     velocity, offsets = rng.normal(scale=0.5, size=(9, 6)), rng.normal(scale=1e-3, size=(9, 6))
     return ShutterBundle(found.bundle, found.rows.share, 0.02, velocity, offsets)
-
-
-def test_points_are_eliminated_as_by_dense_algebra():
-    rng = np.random.default_rng(0)
-    point, n = np.array([0, 0, 0, 1, 1, 1, 1]), 6
-    columns = np.array([[0, 1, 5], [2, 3, 5], [0, 1, 5], [0, 1, 5], [2, 3, 5], [2, 3, 5], [0, 1, 5]])
-    r, by_view, by_point = rng.normal(size=(7, 2)), rng.normal(size=(7, 2, 3)), rng.normal(size=(7, 2, 3))
-    for one in range(2):
-        Q = np.linalg.qr(by_point[point == one].reshape(-1, 3))[0]
-        by_point[point == one] = Q.reshape(-1, 2, 3)
-    J, Jp = np.zeros((14, n)), np.zeros((14, 6))
-    for k in range(7):
-        J[2 * k : 2 * k + 2, columns[k]] = by_view[k]
-        Jp[2 * k : 2 * k + 2, 3 * point[k] : 3 * point[k] + 3] = by_point[k]
-    half, g = np.zeros((n, n)), np.zeros(n)
-
-    add_points((np.arange(7), np.array([0, 3, 7])), columns, r, by_view, by_point, half, g)
-
-    left = np.eye(14) - Jp @ Jp.T
-    assert half + half.T - np.diag(np.diag(half)) == pytest.approx(J.T @ left @ J)
-    assert g == pytest.approx(J.T @ left @ r.ravel())
 
 
 def test_steps_lead_to_where_only_the_noise_is_left(model):
@@ -219,10 +184,8 @@ def test_priors_hold_what_they_are_sure_of(model):
     precision = np.zeros(model.unknowns)
     offsets = slice(POSE * 9, 2 * POSE * 9)
     precision[offsets] = 1e12
-
     free = solve_step(linearize(model, 0.0 * precision, 0.0 * precision, SCALE_PX, held=False))
     held = solve_step(linearize(model, precision, 0.0 * precision, SCALE_PX, held=False))
-
     assert np.abs(free.views[offsets]).max() > 1e-4
     assert np.abs(held.views[offsets]).max() < 1e-6
     assert held.deviation < free.deviation
@@ -254,7 +217,6 @@ def measure(film, **how):
 )
 def test_the_readout_is_found_as_accurately_as_said(film, readout_s, speed, swing_deg_s):
     found = measure(film(readout_s, frames=20, speed=speed, swing_deg_s=swing_deg_s))
-
     assert found.readout == pytest.approx(readout_s, rel=0.15)
     assert abs(found.readout - readout_s) < 2.0 * found.deviation
     assert 0.005 * abs(readout_s) < found.deviation < abs(readout_s) / 3.0
@@ -264,7 +226,6 @@ def test_the_readout_is_found_as_accurately_as_said(film, readout_s, speed, swin
 @pytest.mark.parametrize("seed", range(2))
 def test_a_global_shutter_has_no_readout(film, seed):
     found = measure(film(0.0, frames=20, swing_deg_s=30.0, seed=seed))
-
     assert abs(found.readout) < found.deviation
     assert 1e-5 < found.deviation < 0.003
 
@@ -273,7 +234,6 @@ def test_a_global_shutter_has_no_readout(film, seed):
 def test_straight_on_with_parallel_views_tells_nothing(film):
     """A shutter that sees such a walk shears the scene, and nothing contradicts it."""
     found = measure(film(0.03, frames=20, shake=0.0))
-
     assert found.deviation > 0.01
 
 
@@ -281,9 +241,7 @@ def test_straight_on_with_parallel_views_tells_nothing(film):
 def test_poses_are_those_of_the_middle_rows(film):
     bent = film(0.03, frames=20, swing_deg_s=60.0)
     true, ignored = bent.bundle, ignore_shutter(bent.bundle)
-
     found = estimate_readout(ignored, bent.rows, priors(ignored), ALL, SCALE_PX)
-
     errors = [np.median(turn_errors_deg(one.R, true.R)) for one in (ignored, found.bundle)]
     assert errors[0] > 0.2
     assert errors[1] < 0.25 * errors[0]
@@ -299,7 +257,6 @@ def turn_errors_deg(R, S):
 @pytest.mark.slow
 def test_a_known_readout_is_kept(film):
     found = measure(film(0.02, frames=12, swing_deg_s=60.0), known=0.02)
-
     assert found.readout == 0.02 and found.deviation == 0.0
 
 
@@ -307,9 +264,7 @@ def test_a_known_readout_is_kept(film):
 def test_an_earlier_estimate_shortens_the_way(film):
     walk = film(0.02, frames=12, swing_deg_s=60.0)
     first = measure(walk)
-
     again = estimate_readout(first.bundle, walk.rows, priors(first.bundle), ALL, SCALE_PX, first)
-
     assert again.readout == pytest.approx(first.readout, abs=0.3 * first.deviation)
 
 
@@ -319,7 +274,5 @@ def test_points_far_off_do_not_stop_it(film):
     away = np.zeros_like(walk.bundle.X)
     away[:5] = 1e9
     bundle = apply_step(walk.bundle, walk.bundle.params, np.zeros((12, 6)), away)
-
     found = estimate_readout(bundle, walk.rows, priors(bundle), ALL, SCALE_PX)
-
     assert found.readout == pytest.approx(0.02, rel=0.15)

@@ -63,9 +63,7 @@ def test_undistortion_inverts_the_projection_of_bundle_adjustment(projection):
     points = np.random.default_rng(0).uniform([-0.8, -0.8, 1.0], [0.8, 0.8, 1.2], (200, 3))
     params = np.tile([1.0, 1.0, 0.0, 0.0, *TERMS], (200, 1))
     x = project_points(points, params, np.full(200, FAMILIES[projection])).x
-
     w = bearings.undistort(x, TERMS, projection)
-
     side = np.hypot(points[:, 0], points[:, 1])
     length = np.arctan2(side, points[:, 2]) if projection == "fisheye" else side / points[:, 2]
     assert np.abs(w - points[:, :2] * (length / side)[:, None]).max() < 1e-9
@@ -74,7 +72,6 @@ def test_undistortion_inverts_the_projection_of_bundle_adjustment(projection):
 def test_points_beyond_the_fold_lie_on_it():
     terms = np.array([-0.3, *[0.0] * 7])
     fold = bearings.fold_radius(terms, "perspective")
-
     assert 0.95 < fold / np.sqrt(1.0 / 0.9) <= 1.0
     w = bearings.undistort(np.array([[0.5, 0.0], [5.0, 0.0]]), terms, "perspective")
     assert w[1, 0] == pytest.approx(fold, rel=1e-6)
@@ -89,7 +86,6 @@ def test_steps_end_where_more_of_them_change_nothing(projection, shifted, monkey
     monkeypatch.setattr(bearings, "OPTIONS", bearings.UndistortionOptions(precision=0.0))
     exact = bearings.undistort(points, terms, projection)
     monkeypatch.undo()
-
     assert np.abs(bearings.undistort(points, terms, projection) - exact).max() <= 1e-14
 
 
@@ -113,15 +109,12 @@ def model(name, *params):
 def test_the_curve_is_that_of_the_rays(camera):
     x = np.column_stack([np.linspace(500.0, 990.0, 40), np.full(40, 400.0)])
     rays = bearings.bearings(x, camera)[:, bearings.RAY]
-
     radius = bearings.radius_px(np.arctan2(rays[:, 0], rays[:, 2]), camera)
-
     assert np.abs(radius - (x[:, 0] - 500.0)).max() < 1e-6
 
 
 def test_a_lens_shows_nothing_behind_its_fold_or_behind_itself():
     barrel = model("SIMPLE_RADIAL", 500.0, 500.0, 400.0, -0.2)
-
     assert np.isnan(bearings.radius_px(np.array([1.5, 1.6, 2.0]), barrel)).all()
     assert np.isfinite(bearings.radius_px(np.array([2.0]), model("SIMPLE_FISHEYE", 200.0, 500.0, 400.0))).all()
     assert bearings.radius_px(np.array([np.pi]), PANORAMA) == pytest.approx([500.0])
@@ -147,7 +140,6 @@ def test_the_corner_is_the_farthest_one():
 def test_deviations_of_focal_and_k1_add_up():
     camera = Calibration(camera_matrix(500.0, 500.0, 500.0, 400.0), *SIZE, "x", True, spread={"fx": 5.0, "k1": 0.01})
     theta = np.array([np.pi / 4])
-
     assert bearings.radius_deviation_px(theta, camera) == pytest.approx([np.hypot(5.0, 5.0)])
     assert bearings.radius_deviation_px(theta, model("SIMPLE_PINHOLE", 500.0, 500.0, 400.0)) == pytest.approx([0.0])
 

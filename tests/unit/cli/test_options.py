@@ -48,7 +48,6 @@ def help_page():
 @every_flag
 def test_the_help_is_that_of_the_setting(flag, help_page):
     text = PARAMETERS[flag.parameter].help
-
     assert text.lower().startswith(f"{setting_field(flag.setting).description.lower()}.")
     assert default_text(flag.setting) in text
     assert range_text(flag.setting) in text
@@ -77,7 +76,6 @@ def test_defaults_and_ranges_are_written_as_click_does():
 def test_a_flag_changes_its_setting_and_no_other(flag):
     value = VALUES[flag.parameter]
     changed = settings_from_flags(flags(**{flag.parameter: value}))
-
     assert setting_value(changed, flag.setting) == value != setting_value(Settings(), flag.setting)
     assert changed == Settings.from_mapping(flag.to_mapping(value))
 

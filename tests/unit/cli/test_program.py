@@ -56,7 +56,6 @@ def loaded_by(*arguments, **environment):
 )
 def test_commands_without_photos_import_little(arguments, text):
     loaded, stdout = loaded_by(*arguments)
-
     assert loaded == ("['pycolmap']" if arguments == ("config",) else "[]")
     assert text in stdout
 
@@ -66,7 +65,6 @@ def test_commands_without_photos_import_little(arguments, text):
 def test_completion_imports_little(words, completed):
     count = str(len(words.split()) - 1)
     loaded, stdout = loaded_by(_SFM_APP_COMPLETE="bash_complete", COMP_WORDS=words, COMP_CWORD=count)
-
     assert (loaded, stdout.split()) == ("[]", [f"plain,{completed}"])
 
 
@@ -79,7 +77,6 @@ def test_the_list_of_commands_imports_none():
 
 def test_without_arguments_it_lists_the_first_commands():
     result = call()
-
     lines = result.stdout.splitlines()
     assert result.exit_code == 0 and result.stderr == ""
     assert len(lines) <= 12 and max(map(len, lines)) <= 80
@@ -89,7 +86,6 @@ def test_without_arguments_it_lists_the_first_commands():
 def test_help_has_every_command():
     text = call("--help").stdout
     listed = [line.split()[0] for line in text.split("Make a model:")[1].splitlines() if line.startswith("  ")]
-
     assert listed == main.list_commands(click.Context(main)) == list(SUMMARIES)
     functions = {name for name, value in vars(commands).items() if isinstance(value, click.Command)}
     assert functions == set(SUMMARIES)
@@ -99,7 +95,6 @@ def test_help_has_every_command():
 def test_every_command_has_a_summary_and_a_help_that_fit(name):
     command = main.get_command(click.Context(main), name)
     result = call(name, "--help")
-
     assert command is getattr(commands, name) and command.name == name
     assert 15 < len(SUMMARIES[name]) <= 62 and SUMMARIES[name].endswith(".")
     assert result.exit_code == 0
@@ -111,7 +106,6 @@ def test_every_command_has_a_summary_and_a_help_that_fit(name):
 def test_a_script_for_each_shell_calls_the_program(monkeypatch, shell):
     monkeypatch.setattr(BashComplete, "_check_version", lambda *_: None)  # starts bash
     result = call("completion", shell)
-
     assert result.exit_code == 0 and f"_SFM_APP_COMPLETE={shell}_complete" in result.stdout
     assert "sfm-app" in result.stdout
     assert call("completion", "tcsh").exit_code == 2
@@ -122,7 +116,6 @@ def test_config_prints_toml_that_loads(tmp_path):
     result = call("config", *flags)
     path = tmp_path / "run.toml"
     path.write_text(result.stdout, encoding="utf-8")
-
     loaded = Settings.from_toml(path)
     assert (loaded.quality, loaded.mesh.max_gap_triangles, loaded.epipolar.estimator) == ("high", 3.0, "msac")
     assert loaded.mesh.faces == 5000
@@ -133,7 +126,6 @@ def test_config_prints_toml_that_loads(tmp_path):
 def test_plugins_and_doctor_answer():
     listing = call("plugins").stdout
     state = json.loads(call("doctor", "--json").stdout)
-
     assert "lev-ransac-thesis" in listing and "zero-curves-thesis" in listing and "glb" in listing
     assert "depth methods:\n" in listing
     assert state["ray casting (Open3D)"].startswith("works")
@@ -145,7 +137,6 @@ def test_output_without_the_letters_of_a_name_gets_their_numbers(tmp_path):
     command = [sys.executable, "-m", "sfm_app", "markers", "50mm", "-o", str(tmp_path / "\u5199.pdf")]
     environment = {**os.environ, "PYTHONIOENCODING": "cp1252"}
     done = subprocess.run(command, env=environment, capture_output=True, check=False)
-
     assert done.returncode == 0, done.stderr
     assert rb"\u5199.pdf" in done.stdout
 
@@ -168,7 +159,6 @@ def folder(tmp_path):
 )
 def test_mistyped_commands_are_explained(folder, words, text):
     result = call(*(word.format(folder=folder) for word in words))
-
     assert result.exit_code == 2
     assert text.format(folder=folder) in result.stderr
 
@@ -195,14 +185,12 @@ def test_wrong_commands_are_answered_in_80_columns(tmp_path, monkeypatch, argume
 )
 def test_wrong_settings_end_with_exit_code_2_before_any_work(folder, tmp_path, flags, text):
     result = call("run", folder, "-o", tmp_path / "out", *flags)
-
     assert result.exit_code == 2 and text in result.stderr
     assert not (tmp_path / "out").exists()
 
 
 def test_a_figure_that_cannot_be_written_is_refused_before_any_work(folder, tmp_path):
     result = call("calibrate", folder, "--figure", tmp_path / "curves.jpg", "-q")
-
     assert result.exit_code == 2 and "cannot write '.jpg'" in result.stderr and ".svg" in result.stderr
 
 
@@ -214,9 +202,7 @@ def write_photos(folder, *names):
 def test_a_missing_folder_ends_with_exit_code_3_and_a_similar_name_is_offered(tmp_path):
     (tmp_path / "Regal 2019 (für Oma)").mkdir()
     (tmp_path / "wheels").mkdir()
-
     similar, other = (call("run", tmp_path / name, "-o", tmp_path / "out", "-q") for name in ("Regal 2019", "fox"))
-
     assert similar.exit_code == other.exit_code == 3 and "no such folder" in other.stderr
     assert similar.stderr.endswith(f"\nis it {tmp_path / 'Regal 2019 (für Oma)'}?\n")
     assert other.stderr.count("\n") == 2 and "is it" not in other.stderr
@@ -226,7 +212,6 @@ def test_for_a_folder_of_photos_the_run_beside_it_is_offered(folder, tmp_path):
     before = call("report", folder).stderr
     (tmp_path / "photos-model").mkdir()
     (tmp_path / "photos-model" / "manifest.json").write_text("{}")
-
     assert "holds no run" in before and "is it" not in before
     assert call("report", folder).stderr.endswith(f"\nis it {folder.resolve()}-model?\n")
 
@@ -237,18 +222,14 @@ def test_a_run_without_an_output_folder_writes_beside_the_photos(folder, tmp_pat
     monkeypatch.chdir(tmp_path / here)
     folders = []
     monkeypatch.setattr("sfm_app.reconstruct", lambda _, place, *__, **___: folders.append(place))
-
     call("run", folder, "-q")
-
     assert [str(path) for path in folders] == [out.format(tmp_path.resolve())]
 
 
 def test_an_output_folder_that_is_a_file(folder, tmp_path):
     write_photos(folder, "a.jpg", "b.jpg")
     (tmp_path / "model.glb").write_text("mine")
-
     on_file, in_file = (call("run", folder, "-o", tmp_path / "model.glb" / name, "-q") for name in ("", "out"))
-
     assert (on_file.exit_code, "model.glb: it is a file" in on_file.stderr) == (3, True)
     assert (in_file.exit_code, "cannot write to" in in_file.stderr) == (3, True)
     assert (tmp_path / "model.glb").read_text() == "mine"
@@ -259,15 +240,12 @@ def test_a_read_only_output_folder_ends_with_exit_code_3(folder, tmp_path, as_or
     write_photos(folder, "a.jpg", "b.jpg")
     out = tmp_path / "locked"
     out.mkdir(mode=0o500)
-
     result = as_ordinary_user("-m", "sfm_app", "run", folder, "-o", out, "-q")
-
     assert (result.returncode, "cannot write to" in result.stderr) == (3, True)
 
 
 def test_a_calibration_that_cannot_be_read_ends_with_exit_code_3_before_any_work(folder, tmp_path):
     result = call("run", folder, "-o", tmp_path / "out", "--calibration", tmp_path / "nowhere.json")
-
     assert (result.exit_code, "cannot read the calibration file" in result.stderr) == (3, True)
     assert "cameras.txt" in result.stderr and not (tmp_path / "out").exists()
 
@@ -301,14 +279,12 @@ def stderr_of_fail(stream, *arguments):
 
 def test_errors_are_one_line_each_in_a_pipe():
     text = stderr_of_fail(io.StringIO(), LONG, f"{LONG}\nsecond", 3)
-
     assert text.splitlines() == [f"error: {LONG}", f"hint: {LONG}", "second"]
 
 
 def test_errors_fit_on_a_terminal(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     text = stderr_of_fail(Screen(), f"\x1b[31m{LONG}", LONG, 3)
-
     check_text(text)
     assert len(re.findall(r"^(error|hint): ", text, re.MULTILINE)) == 2
 
@@ -317,5 +293,4 @@ def test_errors_fit_on_a_terminal(monkeypatch):
 def test_a_warning_of_python_reaches_no_terminal():
     code = "import warnings; from sfm_app.cli import main; main([], standalone_mode=False); warnings.warn('root of -1')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-
     assert "sfm-app run PHOTOS" in done.stdout and done.stderr == ""

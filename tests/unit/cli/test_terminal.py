@@ -75,7 +75,6 @@ def test_the_title_of_a_long_stage_is_printed_after_five_seconds_and_its_seconds
     clock[0] = 5.0
     display.check_silence()
     assert paper.getvalue().split() == ["4/10", "camera", "matrix"] and "\n" not in paper.getvalue()
-
     display.finish_stage(7.0)
     assert paper.getvalue().split() == ["4/10", "camera", "matrix", "7.0", "s"] and paper.getvalue().endswith("s\n")
 
@@ -111,7 +110,6 @@ def test_a_note_stands_below_the_title_in_80_columns(shown):
     display.stage("photos")
     display.say("11 photos, 55 pairs: about 2 minutes, more for hard photos; up to 1.6 GB with 2 workers [of 2]")
     display.finish_stage(1.0)
-
     title, first, second, end = paper.getvalue().splitlines()
     assert title.strip() == "1/10 reading photos" and end.strip() == "1.0 s"
     assert (first[:7], second[:7]) == ("      1", "      w") and max(map(len, (first, second))) <= 80
@@ -123,7 +121,6 @@ def test_names_cannot_move_the_cursor(shown):
     display.stage("photos", "again: \x1b[2J")
     display.say("left out: a\x1b[2Jb\n")
     display.finish_stage(1.0)
-
     assert "\x1b" not in paper.getvalue() and "left out: a\\x1b[2Jb\\n" in paper.getvalue()
 
 
@@ -137,7 +134,6 @@ def test_bars_fit_into_the_terminal(monkeypatch, columns):
         display.advance(4_999)
         Console(width=columns, file=paper).print(display.bars.get_renderable())
         display.finish_stage(12.0, 10)
-
     assert paper.getvalue().count("\n") == 1 and len(paper.getvalue().rstrip()) <= columns
     assert "depth maps" in screen.getvalue() and "12.0 s" in screen.getvalue()
 
@@ -170,7 +166,6 @@ def output_of(monkeypatch):
 @pytest.mark.parametrize("variables", [{}, {"FORCE_COLOR": "1"}])
 def test_a_pipe_gets_no_codes(output_of, variables):
     text = output_of(io.StringIO(), **variables)
-
     assert "\x1b" not in text and "reading photos" in text and "12.0 s" in text
     assert max(map(len, text.splitlines())) <= 80
 
@@ -224,7 +219,6 @@ def test_folding_keeps_every_word(capsys):
     lines = [f"label       {LONG}", LONG, f"  {LONG}", "A sentence that ends here.  " + LONG]
     folded = output.fold_lines(lines)
     output.print_text(lines)
-
     assert capsys.readouterr().out.splitlines() == folded
     assert max(map(len, folded)) <= 80 and len(folded) > 3 * len(lines)
     assert " ".join(folded).split() == " ".join(lines).split()
@@ -235,7 +229,6 @@ def test_folding_keeps_every_word(capsys):
 @pytest.mark.parametrize(("columns", "expected"), [(120, 100), (70, 70), (20, 40)])
 def test_the_width_is_that_of_the_terminal_within_bounds(monkeypatch, columns, expected):
     monkeypatch.setenv("COLUMNS", str(columns))
-
     assert output.terminal_width(Screen()) == expected
     assert output.terminal_width(io.StringIO()) is None
 
@@ -251,7 +244,6 @@ def test_files_stand_with_their_sizes(tmp_path):
     (tmp_path / "some of them").mkdir()
     for name in ("a", "b"):
         (tmp_path / "some of them" / name).write_bytes(bytes(700))
-
     assert output.file_lines([tmp_path / "some of them"]) == [f"{tmp_path}/some of them  2 files, 1 kB"]
     assert output.table({"a": "one", "long": "two"}) == ["a     one", "long  two"]
 
@@ -286,7 +278,6 @@ def open_page(monkeypatch):
 )  # fmt: skip
 def test_no_text_browser_takes_over_the_terminal(open_page, platform, variables, opens):
     pages = []
-
     assert open_page(lambda address: pages.append(address) or True, platform, **variables) is opens
     assert len(pages) == opens
 
@@ -302,7 +293,6 @@ def test_a_machine_without_a_browser_is_no_error(open_page):
 def test_a_browser_that_blocks_does_not_block_the_program(open_page, monkeypatch):
     closed = threading.Event()
     monkeypatch.setattr(output, "BROWSER_WAIT_S", 0.05)
-
     assert open_page(lambda _: closed.wait(60), BROWSER="viewer %s") is True
     assert not closed.is_set()
     closed.set()

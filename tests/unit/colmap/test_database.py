@@ -56,9 +56,7 @@ def stored(tmp_path):
 
 def test_photos_are_numbered_by_name_and_share_cameras_by_group(stored):
     path, photos, keypoints, _ = stored
-
     graph = read_match_graph(path, photos)
-
     assert [image.name for image in graph.images.values()] == ["a.png", "b.png", "c.png"]
     assert [image.group for image in graph.images.values()] == ["one", "one", "two"]
     assert list(graph.matches) == [(1, 2)]
@@ -144,9 +142,7 @@ def rows_of(path):
 
 def test_only_a_k_that_is_known_counts_as_prior_knowledge(stored):
     path, photos, _, _ = stored
-
     write_calibrations(path, read_match_graph(path, photos), Intrinsics({"one": calibration(), "two": TWO}))
-
     one, same, two = cameras_of(path)
     assert (one.model.name, list(one.params), one.has_prior_focal_length) == (SQUARE_PIXELS, [130, 66, 41, 0], True)
     assert one.camera_id == same.camera_id
@@ -171,9 +167,7 @@ def test_pixels_are_square_where_the_photos_ask_for_nothing_else(found, model):
 def test_the_lens_is_handed_on(stored, aspect, place):
     path, photos, _, _ = stored
     found = calibration(aspect=aspect, radial=-0.2)
-
     write_calibrations(path, read_match_graph(path, photos), Intrinsics({"one": found, "two": TWO}))
-
     camera = cameras_of(path)[0]
     assert camera.params[place] == -0.2 and not np.any(camera.params[place + 1 :])
     assert camera.mean_focal_length() == pytest.approx(np.mean([130, 130 * aspect]))
@@ -206,9 +200,7 @@ def test_a_group_can_be_of_several_cameras_and_of_one_again(stored, tmp_path):
 def test_cameras_are_those_of_a_fresh_database(stored):
     path, photos, _, _ = stored
     fresh = rows_of(path)
-
     write_calibrations(path, read_match_graph(path, photos), Intrinsics({"two": TWO, "one": calibration()}))
-
     found = rows_of(path)
     assert set(found) == set(fresh)
     assert [table for table in found if found[table] != fresh[table]] == ["cameras"]
@@ -276,9 +268,7 @@ def test_known_photos_keep_ids_keypoints_and_matches(earlier, tmp_path):
 )
 def test_photos_that_left_or_are_replaced_are_forgotten_with_their_pairs(earlier, tmp_path, photos, known, pair):
     path, groups = tmp_path / "database.db", {"b": "one", "c": "one", "d": "two", "e": "two"}
-
     grow_database(path, earlier, photo_set(tmp_path, **{name: groups[name] for name in photos}), set(known.values()))
-
     keypoints, matches = read_features(path)
     assert photo_names(path) == {**known, 4: f"{photos[-1]}.jpg"}, "a new photo gets an id that no photo had"
     assert keypoints.keys() == known.keys() and matches.keys() == {pair}
@@ -289,7 +279,6 @@ def test_new_panoramas_have_their_camera(earlier, tmp_path):
         tmp_path, (*photo_set(tmp_path, b="one").photos, Photo("p.jpg", 200, 100, "p", projection=EQUIRECTANGULAR))
     )
     grow_database(tmp_path / "database.db", earlier, wide, {"b.jpg"})
-
     with open_database(tmp_path / "database.db") as database:
         image = database.read_image(4)
         assert database.read_camera(image.camera_id).model.name == "EQUIRECTANGULAR"
@@ -303,7 +292,6 @@ def test_matches_of_features_that_came_out_otherwise_are_dropped(earlier, tmp_pa
         moved = np.array(database.read_keypoints(3))
         moved[4, 0] += 0.5
         database.update_keypoints(3, moved)
-
     assert forget_changed_matches(path, earlier) == {"d.jpg"}
     assert read_features(path)[1].keys() == {(1, 2)}
 
@@ -327,9 +315,7 @@ def made(tmp_path_factory):
 
 def test_known_photos_have_their_poses_points_and_refined_camera(made):
     place, model, counts = made
-
     part = model_in_database(place / "database.db", place / "sparse", {1, 2, 4}, counts)
-
     assert posed_photo_ids(part) == [1, 2, 4] and len(part.images) == 5
     for photo in (1, 2, 4):
         pose, true = (one.images[photo].cam_from_world().matrix() for one in (part, model))
@@ -343,9 +329,7 @@ def test_known_photos_have_their_poses_points_and_refined_camera(made):
 def test_keypoints_that_only_the_earlier_run_had_are_left_out(made):
     place, model, counts = made
     fewer = counts | {1: 10}
-
     part = model_in_database(place / "database.db", place / "sparse", set(counts), fewer)
-
     used = {element.point2D_idx for point in part.points3D.values() for element in point.track.elements
             if element.image_id == 1}  # fmt: skip
     assert used and max(used) < 10

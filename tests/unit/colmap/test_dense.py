@@ -76,7 +76,6 @@ def workspace(tmp_path_factory):
 @pytest.mark.slow
 def test_views_are_those_of_the_model(workspace):
     dense, views = workspace
-
     assert [view.name for view in views] == ["1.png", "2.png", "3.png"]
     np.testing.assert_allclose(views[0].center, [-0.4, 0.04, 0], atol=1e-12)
     np.testing.assert_allclose(views[0].K, [[110, 0, 63], [0, 105, 41], [0, 0, 1]])
@@ -110,9 +109,7 @@ def test_maps_come_back_as_they_were(workspace):
     maps = DepthMap(rng.uniform(1, 2, (90, 120)).astype(np.float32), rng.normal(size=(90, 120, 3)).astype(np.float32))
     store = DenseStore(dense)
     assert not store.has(view, "geometric")
-
     write_maps(dense, view, maps)
-
     np.testing.assert_array_equal(read_depth(dense, view, "geometric"), maps.depth)
     assert (store.has(view, "geometric"), store.has(view, "photometric")) == (True, False)
 
@@ -160,7 +157,6 @@ def test_a_map_appears_complete_or_not_at_all(workspace, monkeypatch):
 @pytest.mark.slow
 def test_the_box_cuts_the_points(workspace):
     dense, _ = workspace
-
     fuse(dense, 2, np.array([[0.0, -50, -50], [50, 50, 50]]), dense / FUSED)
     assert positions(open_points(dense / FUSED))[:, 0].min() >= 0
 
@@ -197,9 +193,7 @@ def wavy(size: int) -> Surface:
 @pytest.mark.slow
 def test_simplification_spares_what_is_curved_and_keeps_borders_and_colors(tmp_path):
     fine = wavy(40)
-
     found = simplify(fine, len(fine.faces) // 5, 0.0, tmp_path)
-
     assert 0.15 * len(fine.faces) < len(found.faces) <= 0.2 * len(fine.faces)
     middles = found.vertices[found.faces].mean(axis=1)[:, 0]
     assert np.count_nonzero(middles > 0.5) > 10 * np.count_nonzero(middles < 0.5)
@@ -214,11 +208,9 @@ def test_simplification_spares_what_is_curved_and_keeps_borders_and_colors(tmp_p
 @pytest.mark.parametrize("max_error", [3e-3, 1e-2])
 def test_simplification_by_error_stops_where_it_would_move_the_surface(tmp_path, max_error):
     fine = wavy(40)
-
     found = simplify(fine, len(fine.faces), max_error, tmp_path)
     fewer = simplify(fine, len(found.faces) // 2, max_error, tmp_path)
     threaded = simplify(fine, len(found.faces) // 2, max_error, tmp_path, threads=2)
-
     closest = trimesh.proximity.closest_point_naive(trimesh.Trimesh(found.vertices, found.faces), fine.vertices)[1]
     assert 0.05 * max_error < closest.max() < 2 * max_error
     assert 20 < len(found.faces) < 0.5 * len(fine.faces)
@@ -233,9 +225,7 @@ def test_points_in_one_spot_give_a_surface_without_triangles(tmp_path):
     header += "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
     header += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
     (tmp_path / FUSED).write_text(header + "1 1 1 0 0 1 9 9 9\n" * 120)
-
     surface = poisson_surface(tmp_path, 2)
-
     assert (surface.vertices.shape, surface.faces.shape, surface.colors.shape) == ((0, 3), (0, 3), (0, 3))
 
 
@@ -313,12 +303,10 @@ def test_without_masks_all_is_used(place, tmp_path):
     undistort(root / "sparse", root / "photos", tmp_path, 120, 1, SilentProgress())
     view = read_views(tmp_path)[0]
     depth = np.full((view.height, view.width), 3.0, np.float32)
-
     assert used_pixels(tmp_path, view) is None
     DenseStore(tmp_path).write_estimate(view, DepthEstimate(depth, depth / 4))
     write_maps(tmp_path, view, DepthMap(depth, np.zeros((*depth.shape, 3), np.float32)))
     mask_depths(tmp_path, view)
-
     assert (DenseStore(tmp_path).read_estimate(view).depth == 3).all()
     assert (read_depth(tmp_path, view, "geometric") == 3).all()
 

@@ -102,9 +102,7 @@ def test_chunks_give_what_colmap_gives_for_all_at_once(made, tmp_path):
 def test_a_process_of_its_own_matches_the_same(made, tmp_path):
     inputs, pairs = inputs_of(made, made / "whole.db", tmp_path / "matches"), [(1, 2), (4, 1), (3, 5)]
     counted = Counted()
-
     here, apart = match_chunk(inputs, pairs), match_chunk_apart(inputs, ProcessGroup(), counted, pairs)
-
     assert (here.count, apart.count) == (3, 0)
     assert here.in_force == apart.in_force
     assert rows_of(here.path) == rows_of(apart.path)
@@ -116,10 +114,8 @@ def test_a_process_that_is_stopped_leaves_nothing(made, tmp_path):
     inputs, group = inputs_of(made, made / "whole.db", tmp_path / "matches"), ProcessGroup()
     before = sorted(path.name for path in inputs.folder.iterdir())
     group.stop()
-
     with pytest.raises(BackendError, match="killed"):
         match_chunk_apart(inputs, group, SilentProgress(), [(1, 2)])
-
     assert sorted(path.name for path in inputs.folder.iterdir()) == before
 
 
@@ -181,7 +177,6 @@ def test_only_photos_that_show_little_are_enlarged(place, tmp_path):
     enlarged = find(place, tmp_path / "enlarged.db", enlarge_below=100_000)
     between = (len(own[POOR]) + len(own[RICH])) // 2
     found = find(place, tmp_path / "between.db", enlarge_below=between)
-
     assert 20 < len(own[POOR]) < 0.5 * len(own[RICH])
     assert len(enlarged[POOR]) > len(own[POOR])
     assert len(enlarged[RICH]) > len(own[RICH])

@@ -45,10 +45,8 @@ def test_rays_of_a_lens_meet_the_points_that_the_photo_shows(synthetic):
     seen = [point for point in model.images[key].points2D if point.has_point3D()]
     center = -poses[key][:, :3].T @ poses[key][:, 3]
     truth = np.array([model.points3D[point.point3D_id].xyz for point in seen]) - center
-
     rays = viewing_rays(model, key, np.array([point.xy for point in seen]))
     sine = np.linalg.norm(np.cross(rays, truth), axis=1) / np.linalg.norm(rays, axis=1) / np.linalg.norm(truth, axis=1)
-
     assert 0.1 < np.sqrt(np.mean((sine * focal_px(model, key)) ** 2)) < 0.8, "the noise of 0.3 px"
     assert ((rays * truth).sum(axis=1) > 0).all()
 
@@ -81,9 +79,7 @@ def test_cameras_are_read_with_their_first_radial_term(synthetic, name, params, 
     for camera in model.cameras.values():
         camera.model = getattr(pycolmap.CameraModelId, name)
         camera.params = params
-
     found = cameras_by_photo(model)
-
     assert sorted(found) == [1, 3]
     for K, radial, _ in found.values():
         assert (K[0, 0], K[1, 1], K[0, 2], K[1, 2], radial) == (*focals, 510.0, 390.0, -0.1)
@@ -91,11 +87,9 @@ def test_cameras_are_read_with_their_first_radial_term(synthetic, name, params, 
 
 def test_a_part_of_a_model_can_be_adjusted_and_the_whole_stays(synthetic):
     model, database = synthetic(photos=6)
-
     part = submodel(model, (1, 3, 4))
     adjusted = adjust(part, database)
     found = adjusted.model
-
     assert posed_photo_ids(found) == sorted(found.images) == [1, 3, 4] and posed_photo_ids(model) == [1, 2, 3, 4, 5, 6]
     assert all(point.track.length() >= 2 for point in found.points3D.values())
     assert found.num_points3D() > 350
@@ -104,7 +98,6 @@ def test_a_part_of_a_model_can_be_adjusted_and_the_whole_stays(synthetic):
 
 def test_camera_parameters_of_both_models():
     K = np.array([[800.0, 0, 310], [0, 1250.0, 240], [0, 0, 1]])
-
     assert camera_params(K, TWO_FOCALS, -0.1) == [800, 1250, 310, 240, -0.1, 0, 0, 0]
     assert camera_params(K, SQUARE_PIXELS) == [1000, 310, 240, 0]
 
@@ -122,7 +115,6 @@ def test_what_colmap_raises_becomes_one_of_ours():
 
 def test_options_become_plain_values():
     options = json_options(pycolmap.FeatureMatchingOptions().todict())
-
     assert options["sift"]["max_ratio"] == 0.8
     assert isinstance(options["type"], str)
 

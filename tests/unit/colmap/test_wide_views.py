@@ -111,7 +111,6 @@ def test_points_are_seen_where_they_project(tmp_path, kind):
 def test_views_from_one_place_are_not_matched_with_each_other(tmp_path):
     make_place(tmp_path, "panorama")
     _, views = fill(tmp_path)
-
     for view, ranked in zip(views, rank_neighbors(views, 8), strict=True):
         photo = view.name.rsplit(".", 2)[0]
         assert all(views[other].name.rsplit(".", 2)[0] != photo for other in ranked)
@@ -147,14 +146,12 @@ def test_ordinary_lenses_are_left_to_colmap(tmp_path):
     camera.model = pycolmap.CameraModelId.OPENCV
     camera.params = [500.0, 500.0, 240.0, 160.0, -0.1, 0.02, 0.0, 0.0]
     model.write(tmp_path / "sparse")
-
     assert split_wide_photos(tmp_path / "sparse", 1000) is None
 
 
 def test_large_views_are_scaled_down_without_aliasing(tmp_path):
     make_place(tmp_path, "fisheye")
     lenses, views = fill(tmp_path, largest=120)
-
     assert max(max(view.width, view.height) for view in views) == 120
     assert all(view.K[0, 0] < 120.0 for view in views) and len(lenses[1].views) == 4
 
@@ -177,7 +174,6 @@ def errors(gray, K, R, used):
 def test_photos_of_a_plain_lens_keep_their_names(plain, side):
     place, views = plain
     found = LargerViews(place / "sparse", place / "photos", None, [views["c.png"], views["a.png"]], side)
-
     assert found.photos == ["a.png", "c.png"]
     for photo in found.photos:
         ((name, K, gray, used),) = found.render(photo)
@@ -190,7 +186,6 @@ def test_views_of_a_fisheye_are_those_of_the_workspace(tmp_path):
     make_place(tmp_path, "fisheye")
     _, views = fill(tmp_path)
     found = LargerViews(tmp_path / "sparse", tmp_path / "photos", None, views[1:], 120)
-
     rendered = {name: rest for photo in found.photos for name, *rest in found.render(photo)}
     assert found.photos == sorted(NAMES) and sorted(rendered) == sorted(view.name for view in views[1:])
     for view in views[1:]:
@@ -202,10 +197,8 @@ def test_views_of_a_fisheye_are_those_of_the_workspace(tmp_path):
 def test_masked_pixels_are_not_used(plain):
     place, views = plain
     mask_left(place, 200)
-
     larger = LargerViews(place / "sparse", place / "photos", place / "masks", [views["a.png"]], 480)
     ((_, _, gray, used),) = larger.render("a.png")
-
     share = np.mean(used, axis=0)
     assert gray.shape == used.shape
     assert share[:150].max() == 0.0 and share[-200:].min() > 0.9

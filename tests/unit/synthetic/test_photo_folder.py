@@ -38,7 +38,6 @@ class Counter:
 
 def test_the_folder_holds_photos_and_nothing_else(photos):
     folder, truth = photos
-
     assert sorted(path.name for path in folder.iterdir()) == sorted(truth.cam_from_world)
     for path in folder.iterdir():
         with Image.open(path) as image:
@@ -52,7 +51,6 @@ def test_the_same_seed_gives_the_same_bytes(photos, still_life, four_views, tmp_
     progress = Counter()
     write_photo_folder(tmp_path / "again", still_life, four_views, PhotoOptions(seed=3), progress)
     write_photo_folder(tmp_path / "other", still_life, four_views, PhotoOptions(seed=4))
-
     for path in folder.iterdir():
         assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes()
         assert (tmp_path / "other" / path.name).read_bytes() != path.read_bytes()
@@ -99,7 +97,6 @@ def test_truth_file_says_x_is_K_RX_plus_t(photos, tmp_path):
     first = json.loads((tmp_path / "truth.json").read_text())["images"][0]
     X = np.array([0.1, 1.3, 0.2])
     h = np.array(first["K"]) @ (np.array(first["R"]) @ X + np.array(first["t"]))
-
     assert first["file"] == "view_00.jpg" and (first["width"], first["height"]) == (120, 80)
     assert h[2] > 0 and 0 < h[0] / h[2] < 120 and 0 < h[1] / h[2] < 80, "the ball is in the photo"
     assert np.allclose(truth.centers["view_00.jpg"], -np.array(first["R"]).T @ first["t"])

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfm_app.synthetic import shapes
-from sfm_app.synthetic.scenes import bust_field
 
 VASE = np.array([[0.0, 0.0], [0.3, 0.0], [0.2, 0.5], [0.4, 1.0], [0.0, 1.0]])
 
@@ -46,7 +45,6 @@ def test_normals_are_unit_and_point_as_the_triangles(shape):
     a, b, c = (shape.vertices[shape.faces[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
     face_normals = cross / np.linalg.norm(cross, axis=1, keepdims=True)
-
     assert np.allclose(np.linalg.norm(shape.normals, axis=1), 1.0)
     assert np.einsum("nc,nkc->nk", face_normals, shape.normals[shape.faces]).min() > 0.5
 
@@ -76,39 +74,6 @@ def test_a_carved_body_is_closed():
     assert {tuple(edge) for edge in edges} == {tuple(edge[::-1]) for edge in edges}
 
 
-@pytest.mark.slow
-def test_an_assembled_body_has_one_texture_that_runs_on():
-    parts = [shapes.box(1.0, 1.0, 1.0).move((x, 0.0, 0.0), turn_deg=90.0) for x in (0.0, 2.0)]
-    both = shapes.assemble(parts)
-    assert np.array_equal(both.texture, both.vertices) and len(both.vertices) == 2 * len(parts[0].vertices)
-    assert signed_volume(both) == pytest.approx(2.0)
-    assert np.array_equal(both.normals[: len(parts[0].normals)], parts[0].normals)
-
-
-@pytest.mark.slow
-def test_waves_have_unit_variance_and_a_seed():
-    points = np.random.default_rng(0).uniform(-20, 20, (20_000, 3))
-    assert shapes.waves(points, 1).std() == pytest.approx(1.0, abs=0.05) and abs(shapes.waves(points, 1).mean()) < 0.05
-    assert abs(np.corrcoef(shapes.waves(points, 1), shapes.waves(points, 2))[0, 1]) < 0.05
-    near = shapes.waves(points + 1e-5, 1)
-    assert 0 < np.abs(near - shapes.waves(points, 1)).max() < 1e-2
-
-
-@pytest.mark.slow
-def test_the_bust_has_a_face_at_the_front_only():
-    """The nose stands out towards +z by some centimeters; hair and cloth are rough, the face is smooth."""
-
-    def depth(x, y, side):
-        z = np.linspace(0.6, 0.0, 1201)
-        inside = bust_field(np.column_stack([np.full_like(z, x), np.full_like(z, y), side * z])) > 0
-        return z[inside.argmax()]
-
-    nose, cheek = depth(0.0, 0.83, 1.0), np.mean([depth(x, 0.83, 1.0) for x in (-0.06, 0.06)])
-    assert 0.02 < nose - cheek < 0.12
-    assert bust_field(np.array([[0.0, 0.3, 0.0], [0.0, 0.9, 0.0], [0.0, 0.6, 0.0]])).min() > 0
-    assert bust_field(np.array([[0.7, 0.3, 0.0], [0.0, 1.3, 0.0], [0.3, 0.9, 0.0]])).max() < 0
-
-
 POINTS = np.random.default_rng(0).uniform(-3, 3, (400, 3))
 UP = (0.0, 1.0, 0.0)
 PLACES = st.floats(-100, 100)
@@ -126,7 +91,6 @@ def test_detail_below_a_pixel_is_left_out():
     coarse = np.array([shapes.octaves(tuple(p), 1.0, 0.7, 2.0, 1) for p in POINTS])
     medium = np.array([shapes.octaves(tuple(p), 1.0, 0.7, 0.2, 1) for p in POINTS])
     fine = np.array([shapes.octaves(tuple(p), 1.0, 0.7, 0.002, 1) for p in POINTS])
-
     assert not coarse.any()
     assert 0.1 < medium.std() < fine.std() < 1.0
 
