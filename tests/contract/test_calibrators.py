@@ -75,14 +75,11 @@ def run(calibrate, Fs, seed=0, weights=None, size=SIZE):
 
 
 def is_well_formed(found):
-    assert isinstance(found, Calibration)
-    assert (found.K.shape, found.K.dtype) == ((3, 3), np.float64)
+    assert isinstance(found, Calibration) and (found.K.shape, found.K.dtype) == ((3, 3), np.float64)
     assert np.all(np.isfinite(found.K)) and found.K[0, 0] > 0 and found.K[1, 1] > 0
     np.testing.assert_array_equal(found.K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1])
-    assert (found.width, found.height) == SIZE
-    assert found.identifiable == (found.reason == "")
-    assert found.method in (*CALIBRATORS, "guess", "estimate")
-    assert np.isfinite(found.radial)
+    assert (found.width, found.height) == SIZE and found.identifiable == (found.reason == "")
+    assert found.method in (*CALIBRATORS, "guess", "estimate") and np.isfinite(found.radial)
     assert set(found.spread) <= {"fx", "fy", "cx", "cy", "k1"}
     assert set(found.held) <= {"center", "aspect", "k1"}
     assert all(np.isfinite(value) and value >= 0 for value in found.spread.values())
@@ -95,8 +92,7 @@ def test_finds_the_camera(calibrate, seed):
     found = run(calibrate, fundamentals(6, seed))
     assert is_well_formed(found) and found.identifiable, found.reason
     error = np.abs(found.K - K)
-    assert 0 < error[[0, 1], [0, 1]].max() < 0.05 * 1100
-    assert 0 < error[:2, 2].max() < 0.05 * 1000
+    assert 0 < error[[0, 1], [0, 1]].max() < 0.05 * 1100 and 0 < error[:2, 2].max() < 0.05 * 1000
     assert 0 < found.evidence["support"] <= 1
 
 
@@ -115,8 +111,7 @@ def test_every_form_of_the_constraint_finds_the_camera(name, form):
 def test_no_form_of_the_constraint_invents_a_camera(case, form):
     options = OPTIONS.model_copy(update={"constraint_form": form})
     found = CALIBRATORS["huang-faugeras"].calibrate(CameraPairs.from_Fs(UNDETERMINED[case], SIZE), options, 0)
-    assert is_well_formed(found)
-    assert (found.identifiable, found.method) == (False, "guess")
+    assert is_well_formed(found) and (found.identifiable, found.method) == (False, "guess")
 
 
 @pytest.mark.parametrize("name", CALIBRATORS)
@@ -269,8 +264,7 @@ def test_finds_the_camera_with_matches(calibrate, seed):
     found = calibrate(matched(seed), OPTIONS, 0)
     assert is_well_formed(found) and found.identifiable, found.reason
     error = np.abs(found.K - [[1100, 0, 500], [0, 1100, 375], [0, 0, 1]])
-    assert 0 < error[[0, 1], [0, 1]].max() < 0.05 * 1100
-    assert 0 < error[:2, 2].max() < 50
+    assert 0 < error[[0, 1], [0, 1]].max() < 0.05 * 1100 and 0 < error[:2, 2].max() < 50
     assert set(found.key_pairs) <= set(matched(seed).photos)
 
 

@@ -79,12 +79,10 @@ def homography_pair(kind, seed, sigma_px):
 
 def is_well_formed(found, count):
     assert isinstance(found, EpipolarFit) and found.F.shape == (3, 3)
-    assert np.linalg.norm(found.F) == pytest.approx(1)
-    assert np.linalg.svd(found.F, compute_uv=False)[2] < 1e-12
+    assert np.linalg.norm(found.F) == pytest.approx(1) and np.linalg.svd(found.F, compute_uv=False)[2] < 1e-12
     assert (found.inliers.shape, found.inliers.dtype) == ((count,), np.bool_)
     assert found.priors.shape == (count,) and found.priors.min() >= 0 and found.priors.max() == 1
-    assert found.trials >= 1
-    assert found.degeneracy in ("", "collinear", "planar", "rotation")
+    assert found.trials >= 1 and found.degeneracy in ("", "collinear", "planar", "rotation")
     return True
 
 
@@ -99,8 +97,7 @@ def test_finds_the_truth_and_the_injected_noise(name, fit, accuracy_px, outliers
     assert 0.40 < noise < (1.3 if rough else 0.65)
     assert 0 < np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2)) < accuracy_px
     assert found.inliers[pair.is_inlier].mean() > (0.85 if rough else 0.95)
-    assert found.inliers[~pair.is_inlier].sum() < 0.1 * 400
-    assert found.degeneracy == ""
+    assert found.inliers[~pair.is_inlier].sum() < 0.1 * 400 and found.degeneracy == ""
 
 
 def test_evidence_is_that_of_the_returned_matrix(fit):
@@ -224,8 +221,7 @@ def test_ten_thousand_matches(fit, accuracy_px):
     found = fit(pair.x1, pair.x2, OPTIONS, 0)
     assert is_well_formed(found, 10_000)
     assert 0 < np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2)) < accuracy_px
-    assert found.inliers[pair.is_inlier].mean() > 0.9
-    assert found.inliers[~pair.is_inlier].mean() < 0.05
+    assert found.inliers[pair.is_inlier].mean() > 0.9 and found.inliers[~pair.is_inlier].mean() < 0.05
 
 
 def peak_bytes():
@@ -248,8 +244,7 @@ def test_memory_is_linear_in_the_matches(fit):
 def test_exact_matches_give_the_exact_answer(fit, outliers):
     pair = make_pair(PairOptions(outliers=outliers, **{**SCENE, "sigma_px": 0.0}), 3)
     found = fit(pair.x1, pair.x2, OPTIONS, 0)
-    assert is_well_formed(found, 400)
-    assert found.inliers[pair.is_inlier].all()
+    assert is_well_formed(found, 400) and found.inliers[pair.is_inlier].all()
     distance = sampson_distance(found.F, pair.x1, pair.x2)
     assert distance[pair.is_inlier].max() < 1e-2  # OpenCV computes in single precision
 
@@ -260,8 +255,7 @@ def test_tiny_huge_and_distant_images(fit, accuracy_px, scale, shift):
     found = fit(pair.x1 * scale + shift, pair.x2 * scale - shift, options(max_error_px=2.0 * scale), 0)
     assert is_well_formed(found, 400)
     error = np.median(sampson_distance(found.F, pair.exact_x1 * scale + shift, pair.exact_x2 * scale - shift))
-    assert 0 < error < accuracy_px * scale
-    assert found.inliers[pair.is_inlier].mean() > 0.85
+    assert 0 < error < accuracy_px * scale and found.inliers[pair.is_inlier].mean() > 0.85
     assert found.inliers[~pair.is_inlier].mean() < 0.1
 
 
@@ -269,8 +263,7 @@ def test_one_match_far_away_is_an_outlier(fit):
     pair = make_pair(PairOptions(outliers=0.1, **SCENE), 3)
     pair.x1[0], pair.x2[1] = (1e5, 0.0), (0.0, -1e5)
     found = fit(pair.x1, pair.x2, OPTIONS, 0)
-    assert found.inliers[2:][pair.is_inlier[2:]].mean() > 0.85
-    assert not found.inliers[:2].any()
+    assert found.inliers[2:][pair.is_inlier[2:]].mean() > 0.85 and not found.inliers[:2].any()
 
 
 def test_absurd_matches_do_not_hide_the_scene():
@@ -279,8 +272,7 @@ def test_absurd_matches_do_not_hide_the_scene():
     kept[:3] = False
     pair.x1[0], pair.x2[1], pair.x1[2] = (1e10, 0.0), (0.0, -1e12), (-1e15, 1e15)
     found = ESTIMATORS["lev-ransac"].fit(pair.x1, pair.x2, OPTIONS, 0)
-    assert found.inliers[kept].mean() > 0.97
-    assert not found.inliers[:3].any()
+    assert found.inliers[kept].mean() > 0.97 and not found.inliers[:3].any()
     assert found.degeneracy == ""
     assert 0 < np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2)) < 0.2
 

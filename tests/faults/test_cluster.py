@@ -48,8 +48,7 @@ def test_a_worker_that_is_killed_changes_no_byte(undisturbed, tmp_path, stage):
         _, said = run.communicate(timeout=LONG_S)
 
     assert (run.returncode, said) == (0, "")
-    assert undisturbed.result(out) == undisturbed.result(undisturbed.out)
-    assert left_over(out) == []
+    assert undisturbed.result(out) == undisturbed.result(undisturbed.out) and left_over(out) == []
     assert [process for process in below if process.is_running() and process.status() != psutil.STATUS_ZOMBIE] == []
 
 
@@ -74,8 +73,7 @@ def test_an_interrupted_run_ends_its_workers_and_goes_on(undisturbed, refused, t
         _, said = run.communicate(timeout=LONG_S)
     refused(subprocess.CompletedProcess((), run.returncode, "", said), 130)
     _, alive = psutil.wait_procs(below, timeout=10)
-    assert alive == []
-    assert left_over(out) == []
+    assert alive == [] and left_over(out) == []
     undisturbed.finish(out)
 
 

@@ -103,8 +103,7 @@ def test_portrait_and_landscape_are_one_camera(upright_photos, tmp_path, told):
     done = run(tmp_path / "photos", tmp_path / "out", quality="draft")
     [found] = done.calibration.cameras.values()
 
-    assert len(done.scene.registered) == 8
-    assert found.K[0, 0] == pytest.approx(truth.camera.K[0, 0], rel=0.02)
+    assert len(done.scene.registered) == 8 and found.K[0, 0] == pytest.approx(truth.camera.K[0, 0], rel=0.02)
     assert done.manifest["stages"]["scene"]["counts"]["orientation"]["photos_turned_deg"] == 0
     ups = [pose[:, :3].T @ upright(name, told) for name, pose in done.scene.cam_from_world.items()]
     assert np.array(ups)[:, 1].min() > np.cos(np.radians(25))

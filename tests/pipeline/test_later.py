@@ -78,8 +78,7 @@ def test_new_photos_are_placed_in_the_model_that_is_there(first, folder, monkeyp
 
     run = reconstruct(photos, out)
 
-    assert set(run.scene.registered) == set(first.names)
-    assert largest_error(run, first.truth) < 0.01
+    assert set(run.scene.registered) == set(first.names) and largest_error(run, first.truth) < 0.01
     assert counts(run, "match_graph")["known_photos"] == FIRST and counts(run, "match_graph")["new_photos"] == 2
     assert counts(run, "view_graph")["known_pairs"] == FIRST * (FIRST - 1) // 2
     assert next(iter(counts(run, "intrinsics")["cameras"].values()))["method"] == "earlier run"
@@ -107,8 +106,7 @@ def test_photos_that_are_taken_away_leave(first, folder):
     photos, out = folder
     (photos / first.names[0]).unlink()
     run = reconstruct(photos, out)
-    assert set(run.scene.registered) == set(first.names[1:FIRST])
-    assert largest_error(run, first.truth) < 0.01
+    assert set(run.scene.registered) == set(first.names[1:FIRST]) and largest_error(run, first.truth) < 0.01
     assert counts(run, "match_graph")["gone_photos"] == 1
     assert set(photo_names(out / "database.db").values()) == set(first.names[1:FIRST])
     assert first.names[0] not in json.dumps(json.loads((out / "scene.json").read_text()))

@@ -86,8 +86,7 @@ def test_what_is_changed_in_a_mask_is_seen(folder, masks, tmp_path):
 
     Image.new("L", SIZE, 1).save(masks / "sub" / "a.jpg.png")
     read(folder, tmp_path / "out")
-    assert stamp() != before
-    assert used_share(tmp_path / "out", "sub/a.jpg") == 1.0
+    assert stamp() != before and used_share(tmp_path / "out", "sub/a.jpg") == 1.0
 
     call("run", folder, "-o", tmp_path / "out", "--until", "photos")
     assert not (tmp_path / "out" / "masks").exists()
@@ -182,18 +181,15 @@ def test_nobody_is_left_of_whom_masks_cover(disturbed, tmp_path):
     run = sfm_app.reconstruct(disturbed / "photos", out, settings)
     sfm_app.reconstruct(disturbed / "photos", plain, Settings.from_mapping(QUICK), last="match_graph")
 
-    assert tuple(run.manifest["stages"]) == NAMES
-    assert len(run.scene.registered) == 4
+    assert tuple(run.manifest["stages"]) == NAMES and len(run.scene.registered) == 4
     assert sum(map(on_somebody, keypoints(plain).values())) > 200
     assert sum(map(on_somebody, keypoints(out).values())) == 0
     for view in read_views(out / "dense"):
         depth = read_depth(out / "dense", view, "geometric")
         middle = depth[depth.shape[0] // 2 : depth.shape[0] * 3 // 4, view.width * 45 // 100 : view.width * 53 // 100]
-        assert (middle < 0).all()
-        assert (depth > 0).mean() > 0.3
+        assert (middle < 0).all() and (depth > 0).mean() > 0.3
     model = read_texture(Workspace(out))
-    assert len(model.surface.faces) > 2000
-    assert magenta(model.surface.colors).max() < 25
+    assert len(model.surface.faces) > 2000 and magenta(model.surface.colors).max() < 25
     assert max(magenta(page).max() for page in model.texture.pages) < 25  # 15 in the photos without her
 
 

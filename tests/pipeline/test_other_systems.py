@@ -54,8 +54,7 @@ def test_every_file_has_the_same_bytes(runs):
 @pytest.mark.skipif(lacks(Ability.LINKS) or os.name == "nt", reason="this system has no links")
 def test_photos_are_links_and_copies(runs):
     usual, bare = ([path.is_symlink() for path in sorted((out / "photos").iterdir())] for out in runs[:2])
-    assert all(usual) and len(usual) == 7
-    assert not any(bare) and len(bare) == 7
+    assert all(usual) and len(usual) == 7 and not any(bare) and len(bare) == 7
 
 
 def test_stages_have_the_same_results(runs):
@@ -99,8 +98,7 @@ def test_no_text_is_read_or_written_as_this_machine_is_set(runs):
 def test_windows_could_have_every_name(runs):
     names = [path.relative_to(runs[1]).as_posix() for path in runs[1].rglob("*")]
     assert [name for name in names if any(RESERVED.search(part) for part in name.split("/"))] == []
-    assert len({name.casefold() for name in names}) == len(names)
-    assert max(map(len, names)) < 100
+    assert len({name.casefold() for name in names}) == len(names) and max(map(len, names)) < 100
 
 
 def test_a_run_goes_on_from_copies(runs, rendered):

@@ -75,8 +75,7 @@ def to_utm(place):
 
 def assert_scale(found, true, within):
     error = abs(np.log(found["scale"] / true))
-    assert error < within
-    assert error < 3 * found["deviation"]
+    assert error < within and error < 3 * found["deviation"]
     assert found["deviation"] < 5 * within
 
 
@@ -96,8 +95,7 @@ def marks_file(measured, path, places, wrong=None):
 
 def test_two_markers_give_the_size(measured):
     found = read_scale(measured.out)
-    assert found["unit"] == "meter"
-    assert len(found["evidence"]) == 2
+    assert found["unit"] == "meter" and len(found["evidence"]) == 2
     assert_scale(found, true_similarity(measured).scale, within=0.002)
 
 
@@ -118,8 +116,7 @@ def test_a_distance_is_measured_in_meters(measured):
     scale = read_scale(measured.out)["scale"]
     a, b = (scale * to_world.inverse()(np.array(place)) for place in ((-0.7, 0.9, 0.7), (0.8, 0.6, 0.9)))
     found = sfm_app.measure_distance(measured.out, a, b)
-    assert found.metric
-    assert found.value == pytest.approx(np.linalg.norm([1.5, -0.3, 0.2]), rel=0.002)
+    assert found.metric and found.value == pytest.approx(np.linalg.norm([1.5, -0.3, 0.2]), rel=0.002)
     assert 0.0005 < found.deviation < 0.05
 
 
@@ -130,8 +127,7 @@ def test_a_finished_run_gives_arrays_in_meters(measured):
     assert found.metric
     true = np.array([camera_center(measured.truth.cam_from_world[name]) for name in found.photos])
     assert umeyama(found.centers, true).scale == pytest.approx(1.0, abs=0.002)
-    assert len(found.points) == run.scene.points
-    assert "meters" in run._repr_html_()
+    assert len(found.points) == run.scene.points and "meters" in run._repr_html_()
 
 
 def test_only_what_depends_on_the_size_is_done_again(measured, monkeypatch):
@@ -147,8 +143,7 @@ def test_a_distance_that_contradicts_the_markers_is_named(measured):
     true = true_similarity(measured).scale
     again(measured, markers=f"{SIDE_M}m", distances=[["0,0,0", "0.2,0,0", f"{0.2 * true * 1.1}m"]])
     found = read_scale(measured.out)
-    assert len(found["contradictions"]) == 1
-    assert "the distance of" in found["contradictions"][0]
+    assert len(found["contradictions"]) == 1 and "the distance of" in found["contradictions"][0]
     assert "10 % larger" in found["contradictions"][0] or "9.9 % larger" in found["contradictions"][0]
     assert found["scale"] == pytest.approx(true, rel=0.002)
 

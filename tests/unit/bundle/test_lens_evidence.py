@@ -82,8 +82,7 @@ def test_a_part_is_freed_where_the_photos_ask_for_it(change, parts):
     for place, value in change.items():
         true[place] = value
     found = answer(seen(true))
-    assert freed(found) == parts
-    assert np.all(np.abs(found.params[0, :8] - true) < 3 * found.deviations[0, :8])
+    assert freed(found) == parts and np.all(np.abs(found.params[0, :8] - true) < 3 * found.deviations[0, :8])
 
 
 def test_one_step_finds_a_camera_that_is_a_little_off():
@@ -91,8 +90,7 @@ def test_one_step_finds_a_camera_that_is_a_little_off():
     bundle = starting_at(seen(true), [894.0, 894.0, 490.0, 404.0, -0.09, 0.0, 0.0, 0.0])
     found = answer(bundle)
     assert found.params[0, :8] == pytest.approx(true, abs=1.5)
-    assert found.params[0, 4] == pytest.approx(-0.1, abs=0.004)
-    assert found.step > 1
+    assert found.params[0, 4] == pytest.approx(-0.1, abs=0.004) and found.step > 1
     assert answer(starting_at(bundle, found.params[0])).step < found.step / 3
 
 
@@ -118,8 +116,7 @@ def test_what_is_not_determined_stays_where_it_is_and_may_be_off():
     true = [30000.0, 30000.0, 506.0, 395.0, 0.0, 0.0, 0.0, 0.0]
     bundle = starting_at(seen(true, noise_px=1.0), [30000.0, 30000.0, 498.0, 401.0, 0.0, 0.0, 0.0, 0.0])
     found = answer(bundle)
-    assert found.params[0, 2:4].tolist() == [498.0, 401.0]
-    assert not found.determined[0, NAMES.index("center")]
+    assert found.params[0, 2:4].tolist() == [498.0, 401.0] and not found.determined[0, NAMES.index("center")]
     # three photo sets of ten are cropped, by 15 % of the longer side; whether this one is, rounding may say a little
     # about: with eight seeds the deviations were between 40 and 150 pixels
     assert (found.deviations[0, 2:4] > 3.0 * np.abs(found.params[0, 2:4] - true[2:4])).all()
@@ -134,8 +131,7 @@ def test_photos_that_pull_in_different_directions_widen_the_deviations():
         bundle = seen(*([focal, focal, *true[2:]] for focal in focals), photos=1)
         one = replace(bundle, params=padded(true), family=bundle.family[:1], camera=np.zeros_like(bundle.camera))
         stated.append(answer(one).deviations[0, 0] / 900.0)
-    assert stated[0] < 0.004
-    assert 0.01 < stated[1] < 0.1
+    assert stated[0] < 0.004 and 0.01 < stated[1] < 0.1
 
 
 def test_what_photos_ask_of_the_cameras_adds_up():
@@ -149,8 +145,7 @@ def test_a_camera_of_few_photos_is_asked_for_focal_and_k1_only():
     bundle = seen(list(PLAIN), other, photos=5)
     bundle = starting_at(bundle, list(PLAIN), [702.0, 702.0, 500.0, 400.0, -0.1, 0.0, 0.0, 0.0])
     found = answer(bundle, True, False)
-    assert found.params[1, 2:4].tolist() == [500.0, 400.0]
-    assert not found.params[1, 5:].any()
+    assert found.params[1, 2:4].tolist() == [500.0, 400.0] and not found.params[1, 5:].any()
     assert freed(found, 1) <= {"k1"}
 
 
@@ -171,5 +166,4 @@ def test_a_bundle_that_says_nothing_leaves_cameras_as_unsure_as_they_were_before
     bundle = seen(list(PLAIN), photos=1, points=3)
     found = answer(bundle)
     assert found.params[0, :8] == pytest.approx(PLAIN, abs=1)
-    assert 0.5 * 900 < found.deviations[0, 0] < 1.5 * 900
-    assert not found.determined.any()
+    assert 0.5 * 900 < found.deviations[0, 0] < 1.5 * 900 and not found.determined.any()

@@ -80,16 +80,14 @@ def test_whatever_is_seen_the_answer_is_numbers(scene):
     for numbers in (found.H, found.g, found.pose_step, found.pose_response, found.point_step):
         assert np.isfinite(numbers).all()
     assert all(np.isfinite(steps).all() for steps in found.back_substitute(np.ones_like(CAMERA)))
-    assert 0 < found.noise_px < 1
-    assert np.linalg.eigvalsh(found.H).min() >= -1e-9 * np.abs(found.H).max()
+    assert 0 < found.noise_px < 1 and np.linalg.eigvalsh(found.H).min() >= -1e-9 * np.abs(found.H).max()
     assert np.isfinite(cost(bundle, SCALE_PX))
 
 
 def test_a_point_at_infinity_still_says_how_the_cameras_are_turned_and_keeps_its_depth():
     far = np.vstack([box(), [[1e11, 0, 1e12]]])
     near, both = reduce(bundle_of(box(), *ring(6)), SCALE_PX), reduce(bundle_of(far, *walk(6)), SCALE_PX)
-    assert (near.open_points, near.lost) == (0, 0)
-    assert (both.open_points, both.lost) == (1, 0)
+    assert (near.open_points, near.lost) == (0, 0) and (both.open_points, both.lost) == (1, 0)
     ray = far[-1] / np.linalg.norm(far[-1])
     assert abs(both.point_step[-3:] @ ray) < 1e-3 * np.linalg.norm(far[-1])
 

@@ -148,8 +148,7 @@ def test_where_poses_jump_about_the_path_goes_through_their_middle():
     found, moves = velocities(jumping, times), slice(3, 6)
     best = found.select_most_predictive()[1]
     off = np.abs(found.values - velocities(poses, times).values)[:, :, moves].mean(axis=(1, 2))
-    assert FITS[best] in ((7, 1), (9, 1))
-    assert off[best] < 0.5 * off[0]
+    assert FITS[best] in ((7, 1), (9, 1)) and off[best] < 0.5 * off[0]
 
 
 SCALE_PX = 0.5
@@ -175,8 +174,7 @@ def test_steps_lead_to_where_only_the_noise_is_left(model):
         step = solve_step(linearize(model, precision, pull, SCALE_PX, held=True))
         model = apply_shutter_step(model, step, 1.0)
 
-    assert shutter_cost(model, SCALE_PX) < 0.1 * before
-    assert 0.2 < step.noise_px < 0.35
+    assert shutter_cost(model, SCALE_PX) < 0.1 * before and 0.2 < step.noise_px < 0.35
     assert np.abs(step.views).max() < 1e-3
 
 
@@ -186,8 +184,7 @@ def test_priors_hold_what_they_are_sure_of(model):
     precision[offsets] = 1e12
     free = solve_step(linearize(model, 0.0 * precision, 0.0 * precision, SCALE_PX, held=False))
     held = solve_step(linearize(model, precision, 0.0 * precision, SCALE_PX, held=False))
-    assert np.abs(free.views[offsets]).max() > 1e-4
-    assert np.abs(held.views[offsets]).max() < 1e-6
+    assert np.abs(free.views[offsets]).max() > 1e-4 and np.abs(held.views[offsets]).max() < 1e-6
     assert held.deviation < free.deviation
 
 
@@ -226,8 +223,7 @@ def test_the_readout_is_found_as_accurately_as_said(film, readout_s, speed, swin
 @pytest.mark.parametrize("seed", range(2))
 def test_a_global_shutter_has_no_readout(film, seed):
     found = measure(film(0.0, frames=20, swing_deg_s=30.0, seed=seed))
-    assert abs(found.readout) < found.deviation
-    assert 1e-5 < found.deviation < 0.003
+    assert abs(found.readout) < found.deviation and 1e-5 < found.deviation < 0.003
 
 
 @pytest.mark.slow
@@ -243,8 +239,7 @@ def test_poses_are_those_of_the_middle_rows(film):
     true, ignored = bent.bundle, ignore_shutter(bent.bundle)
     found = estimate_readout(ignored, bent.rows, priors(ignored), ALL, SCALE_PX)
     errors = [np.median(turn_errors_deg(one.R, true.R)) for one in (ignored, found.bundle)]
-    assert errors[0] > 0.2
-    assert errors[1] < 0.25 * errors[0]
+    assert errors[0] > 0.2 and errors[1] < 0.25 * errors[0]
 
 
 def turn_errors_deg(R, S):

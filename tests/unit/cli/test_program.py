@@ -56,8 +56,7 @@ def loaded_by(*arguments, **environment):
 )
 def test_commands_without_photos_import_little(arguments, text):
     loaded, stdout = loaded_by(*arguments)
-    assert loaded == ("['pycolmap']" if arguments == ("config",) else "[]")
-    assert text in stdout
+    assert loaded == ("['pycolmap']" if arguments == ("config",) else "[]") and text in stdout
 
 
 @pytest.mark.slow
@@ -78,8 +77,7 @@ def test_the_list_of_commands_imports_none():
 def test_without_arguments_it_lists_the_first_commands():
     result = call()
     lines = result.stdout.splitlines()
-    assert result.exit_code == 0 and result.stderr == ""
-    assert len(lines) <= 12 and max(map(len, lines)) <= 80
+    assert result.exit_code == 0 and result.stderr == "" and len(lines) <= 12 and max(map(len, lines)) <= 80
     assert [line.split()[1] for line in lines if line.startswith("  sfm-app")] == ["run", "demo", "doctor"]
 
 
@@ -96,8 +94,7 @@ def test_every_command_has_a_summary_and_a_help_that_fit(name):
     command = main.get_command(click.Context(main), name)
     result = call(name, "--help")
     assert command is getattr(commands, name) and command.name == name
-    assert 15 < len(SUMMARIES[name]) <= 62 and SUMMARIES[name].endswith(".")
-    assert result.exit_code == 0
+    assert 15 < len(SUMMARIES[name]) <= 62 and SUMMARIES[name].endswith(".") and result.exit_code == 0
     check_text(result.stdout)
     check_text(call("--help").stdout)
 
@@ -107,8 +104,7 @@ def test_a_script_for_each_shell_calls_the_program(monkeypatch, shell):
     monkeypatch.setattr(BashComplete, "_check_version", lambda *_: None)  # starts bash
     result = call("completion", shell)
     assert result.exit_code == 0 and f"_SFM_APP_COMPLETE={shell}_complete" in result.stdout
-    assert "sfm-app" in result.stdout
-    assert call("completion", "tcsh").exit_code == 2
+    assert "sfm-app" in result.stdout and call("completion", "tcsh").exit_code == 2
 
 
 def test_config_prints_toml_that_loads(tmp_path):
@@ -127,8 +123,7 @@ def test_plugins_and_doctor_answer():
     listing = call("plugins").stdout
     state = json.loads(call("doctor", "--json").stdout)
     assert "lev-ransac-thesis" in listing and "zero-curves-thesis" in listing and "glb" in listing
-    assert "depth methods:\n" in listing
-    assert state["ray casting (Open3D)"].startswith("works")
+    assert "depth methods:\n" in listing and state["ray casting (Open3D)"].startswith("works")
     assert "pycolmap" in state
 
 
@@ -159,8 +154,7 @@ def folder(tmp_path):
 )
 def test_mistyped_commands_are_explained(folder, words, text):
     result = call(*(word.format(folder=folder) for word in words))
-    assert result.exit_code == 2
-    assert text.format(folder=folder) in result.stderr
+    assert result.exit_code == 2 and text.format(folder=folder) in result.stderr
 
 
 def test_only_a_folder_that_exists_is_suggested_for_a_run(tmp_path):
@@ -185,8 +179,7 @@ def test_wrong_commands_are_answered_in_80_columns(tmp_path, monkeypatch, argume
 )
 def test_wrong_settings_end_with_exit_code_2_before_any_work(folder, tmp_path, flags, text):
     result = call("run", folder, "-o", tmp_path / "out", *flags)
-    assert result.exit_code == 2 and text in result.stderr
-    assert not (tmp_path / "out").exists()
+    assert result.exit_code == 2 and text in result.stderr and not (tmp_path / "out").exists()
 
 
 def test_a_figure_that_cannot_be_written_is_refused_before_any_work(folder, tmp_path):

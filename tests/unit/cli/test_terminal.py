@@ -176,8 +176,7 @@ def test_quiet_prints_nothing(output_of):
 
 def test_a_terminal_without_colors_gets_none(output_of):
     styles = r"\x1b\[[0-9;]*m"
-    assert re.search(styles, output_of(Screen()))
-    assert not re.search(styles, output_of(Screen(), NO_COLOR="1"))
+    assert re.search(styles, output_of(Screen())) and not re.search(styles, output_of(Screen(), NO_COLOR="1"))
 
 
 def test_a_dumb_terminal_gets_lines(output_of):
@@ -221,16 +220,14 @@ def test_folding_keeps_every_word(capsys):
     output.print_text(lines)
     assert capsys.readouterr().out.splitlines() == folded
     assert max(map(len, folded)) <= 80 and len(folded) > 3 * len(lines)
-    assert " ".join(folded).split() == " ".join(lines).split()
-    assert folded[1].startswith(12 * " " + "photo_")
+    assert " ".join(folded).split() == " ".join(lines).split() and folded[1].startswith(12 * " " + "photo_")
     assert folded[-1].startswith("photo_")  # too far to the right for a label
 
 
 @pytest.mark.parametrize(("columns", "expected"), [(120, 100), (70, 70), (20, 40)])
 def test_the_width_is_that_of_the_terminal_within_bounds(monkeypatch, columns, expected):
     monkeypatch.setenv("COLUMNS", str(columns))
-    assert output.terminal_width(Screen()) == expected
-    assert output.terminal_width(io.StringIO()) is None
+    assert output.terminal_width(Screen()) == expected and output.terminal_width(io.StringIO()) is None
 
 
 def test_unprintable_characters_are_escaped(capsys):
@@ -286,13 +283,11 @@ def test_a_machine_without_a_browser_is_no_error(open_page):
     def fail(_):
         raise webbrowser.Error("none")
 
-    assert open_page(fail, DISPLAY=":0") is False
-    assert open_page(lambda _: False, DISPLAY=":0") is False
+    assert open_page(fail, DISPLAY=":0") is False and open_page(lambda _: False, DISPLAY=":0") is False
 
 
 def test_a_browser_that_blocks_does_not_block_the_program(open_page, monkeypatch):
     closed = threading.Event()
     monkeypatch.setattr(output, "BROWSER_WAIT_S", 0.05)
-    assert open_page(lambda _: closed.wait(60), BROWSER="viewer %s") is True
-    assert not closed.is_set()
+    assert open_page(lambda _: closed.wait(60), BROWSER="viewer %s") is True and not closed.is_set()
     closed.set()

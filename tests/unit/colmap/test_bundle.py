@@ -27,29 +27,27 @@ from sfm_app.estimation.given_cameras import find_contradictions
 from sfm_app.numerical import json_text
 from sfm_app.types.camera import KEPT
 
+pytestmark = pytest.mark.slow
+
 SIZE = (1000, 800)
 PLAIN = [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0]
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("radial", [0.0, -0.08])
 def test_focal_center_and_lens_are_found_as_far_off_as_stated(mapped, radial):
     true = [900.0, 900.0, 530.0, 380.0, radial, 0.0, 0.0, 0.0]
     found = adjust(*mapped(true, start=(880.0, 500.0, 400.0, radial)))
     camera, deviations = found.model.cameras[1], found.deviations[1]
 
-    assert "center" in found.determined[1]
-    assert camera.params[:2] == pytest.approx([900, 900], rel=0.002)
+    assert "center" in found.determined[1] and camera.params[:2] == pytest.approx([900, 900], rel=0.002)
     assert camera.params[2:4] == pytest.approx([530, 380], abs=3)
     assert camera.params[4] == pytest.approx(radial, abs=0.01)
     for name, value, truth in zip(NAMES, camera.params, true, strict=True):
         assert abs(value - truth) < 3 * deviations[name]
-    assert 0.1 < deviations["cx"] < 6
-    assert 0.2 < found.model.compute_mean_reprojection_error() < 0.5
+    assert 0.1 < deviations["cx"] < 6 and 0.2 < found.model.compute_mean_reprojection_error() < 0.5
 
 
-@pytest.mark.slow
 def test_squeezed_photos_have_two_focals_others_one(mapped):
     squeezed = [900.0, 1200.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0]
     square = adjust(*mapped(noise_px=1.0)).model.cameras[1].params
@@ -61,7 +59,6 @@ def test_squeezed_photos_have_two_focals_others_one(mapped):
     assert found[:2] == pytest.approx([900, 1200], rel=0.003)
 
 
-@pytest.mark.slow
 def test_the_camera_with_most_photos_does_not_free_one_of_a_single_photo(mapped):
     model, database = mapped(photos=5, cameras=2, start=(890.0, 500.0, 400.0, 0.0))
     lone, *others = sorted(image_id for image_id in model.reg_image_ids() if model.images[image_id].camera_id == 2)
@@ -78,7 +75,6 @@ def test_the_camera_with_most_photos_does_not_free_one_of_a_single_photo(mapped)
         assert found.model.cameras[key].mean_focal_length() == pytest.approx(900, rel=tolerance)
 
 
-@pytest.mark.slow
 def test_the_covariance_of_the_cameras_is_that_of_colmap(mapped):
     model, _ = mapped(cameras=2, photos=4)
     for camera in model.cameras.values():
@@ -165,7 +161,6 @@ def mixed(synthetic):
     return model, database
 
 
-@pytest.mark.slow
 def test_cameras_of_three_families_are_adjusted_together_and_named_with_their_rivals(mixed):
     before = mixed[0].compute_num_observations()
 
@@ -191,7 +186,6 @@ def test_cameras_of_three_families_are_adjusted_together_and_named_with_their_ri
     assert json_text({str(key): record.to_dict() for key, record in lenses.items()})
 
 
-@pytest.mark.slow
 def test_other_families_are_not_tried_where_that_is_settled(mixed, monkeypatch):
     monkeypatch.setattr("sfm_app.colmap.bundle.best_families", None)
     found = adjust(*mixed, families_known=True)
@@ -201,7 +195,6 @@ def test_other_families_are_not_tried_where_that_is_settled(mixed, monkeypatch):
         adjust(*mixed)
 
 
-@pytest.mark.slow
 def test_panoramas_alone_are_adjusted_and_keep_their_camera(synthetic):
     model, database = synthetic(photos=6)
     rng = np.random.default_rng(1)
@@ -220,7 +213,6 @@ def test_panoramas_alone_are_adjusted_and_keep_their_camera(synthetic):
     assert max(moved) < 0.1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("most", [250, 8])
 def test_a_narrow_lens_taken_for_a_fisheye_becomes_perspective(mapped, monkeypatch, most):
     monkeypatch.setattr(bundle, "OPTIONS", bundle.AdjustmentOptions(most_compared=most))
@@ -231,8 +223,7 @@ def test_a_narrow_lens_taken_for_a_fisheye_becomes_perspective(mapped, monkeypat
 
     found = adjust(model, database)
 
-    assert 8 < found.model.num_reg_images() == before
-    assert found.model.cameras[1].model.name == "OPENCV"
+    assert 8 < found.model.num_reg_images() == before and found.model.cameras[1].model.name == "OPENCV"
     assert found.model.cameras[1].params[:2] == pytest.approx([900.0, 900.0], rel=0.005)
     assert 0.25 < found.model.compute_mean_reprojection_error() < 0.6
     assert any("FISHEYE" in one.model for one in found.lenses[1].rivals)
@@ -246,7 +237,6 @@ def given(params, model="OPENCV", *, keep):
     return CameraRule(given=replace(camera, method=KEPT) if keep else camera)
 
 
-@pytest.mark.slow
 def test_a_kept_camera_stays_to_the_last_bit_and_its_photos_say_whether_it_is_right(mapped):
     model, database = mapped(TRUE, start=(893.0, 503.0, 396.0, 0.0))
     rule = given(TRUE, keep=True)
@@ -259,7 +249,6 @@ def test_a_kept_camera_stays_to_the_last_bit_and_its_photos_say_whether_it_is_ri
     assert find_contradictions(rule.given, found.estimates[1]) == []
 
 
-@pytest.mark.slow
 def test_a_given_camera_is_refined_and_contradicted_where_it_is_wrong(mapped):
     wrong = [970.0, 970.0, *TRUE[2:]]
     model, database = mapped(TRUE, start=(893.0, 503.0, 396.0, 0.0))
@@ -270,18 +259,15 @@ def test_a_given_camera_is_refined_and_contradicted_where_it_is_wrong(mapped):
     assert said.what == "focal length" and said.found_px == pytest.approx(900.0, rel=0.005)
 
 
-@pytest.mark.slow
 def test_what_photos_do_not_determine_stays_as_it_was_given(mapped):
     """A rational term that no other camera has, and which a narrow view does not show."""
     true = [4500.0, 4500.0, 500.0, 400.0, -0.1, 0.02, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0]
     model, database = mapped([*true[:4], 0, 0, 0, 0], start=(4480.0, 500.0, 400.0, 0.0))
     plain = read_camera(adjust(model, database).model.cameras[1])
     found = read_camera(adjust(model, database, {1: given(true, "FULL_OPENCV", keep=False)}).model.cameras[1])
-    assert (plain[K3], found[K3]) == (0.0, 0.5)
-    assert abs(plain[K2]) < 0.01 < 0.015 < found[K2] < 0.025
+    assert (plain[K3], found[K3]) == (0.0, 0.5) and abs(plain[K2]) < 0.01 < 0.015 < found[K2] < 0.025
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "free"),
     [("PINHOLE", ("aspect",)), ("RADIAL", ("k1", "k2")), ("OPENCV", ("aspect", "k1", "k2", "p1 p2"))],
@@ -296,7 +282,6 @@ def test_the_model_that_the_user_names_is_the_one_that_is_fitted(mapped, name, f
     assert params[FX] == pytest.approx(900.0, rel=0.06 if "k1" not in free else 0.006)
 
 
-@pytest.mark.slow
 def test_a_perspective_lens_becomes_the_fisheye_that_the_user_names(mapped):
     model, database = mapped(TRUE, start=(893.0, 500.0, 400.0, -0.08))
     found = adjust(model, database, {1: CameraRule(model="RADIAL_FISHEYE")})
@@ -304,8 +289,7 @@ def test_a_perspective_lens_becomes_the_fisheye_that_the_user_names(mapped):
     assert camera.model.name == "OPENCV_FISHEYE" and camera_family(camera) == FISHEYE
     assert found.lenses[1].chosen.model == "RADIAL_FISHEYE"
     assert 0.25 < found.model.compute_mean_reprojection_error() < 0.6
-    assert camera.params[0] == pytest.approx(900.0, rel=0.01)
-    assert np.count_nonzero(camera.params[6:]) == 0
+    assert camera.params[0] == pytest.approx(900.0, rel=0.01) and np.count_nonzero(camera.params[6:]) == 0
 
 
 def away(model, share, place):
@@ -325,7 +309,6 @@ ASTRAY = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", ASTRAY)
 def test_points_that_have_gone_astray_do_not_end_it_and_the_camera_is_found(mapped, case):
     model, database = mapped()
@@ -337,7 +320,6 @@ def test_points_that_have_gone_astray_do_not_end_it_and_the_camera_is_found(mapp
     assert all(np.isfinite(point.xyz).all() for point in found.model.points3D.values())
 
 
-@pytest.mark.slow
 def test_a_photo_that_no_pair_in_the_database_connects_stays_in_the_model(mapped):
     model, database = mapped(photos=6)
     with open_database(database) as known:
@@ -348,7 +330,6 @@ def test_a_photo_that_no_pair_in_the_database_connects_stays_in_the_model(mapped
     assert abs(found.model.cameras[1].params[0] - 900) < 3 * found.deviations[1]["fx"]
 
 
-@pytest.mark.slow
 def test_photos_from_one_place_leave_numbers_or_the_model_as_it_was(mapped):
     model, database = mapped()
     for image in model.images.values():
@@ -361,7 +342,6 @@ def test_photos_from_one_place_leave_numbers_or_the_model_as_it_was(mapped):
     assert all(np.isfinite(list(values.values())).all() for values in found.deviations.values())
 
 
-@pytest.mark.slow
 def test_a_model_that_loses_its_points_stays_as_mapping_left_it(mapped):
     model, database = mapped()
     for key, image in model.images.items():
@@ -378,14 +358,12 @@ def test_a_model_that_loses_its_points_stays_as_mapping_left_it(mapped):
     assert (found.deviations, found.determined) == ({1: {}}, {1: ()})
 
 
-@pytest.mark.slow
 def test_a_camera_without_a_focal_length_stays_as_mapping_left_it(mapped):
     model, database = mapped(start=(np.nan, 500.0, 400.0, 0.0))
     found = adjust_or_keep(model, database)
     assert found.failure == "a camera has no focal length" and found.model is model
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("error", "expected"),
     [(np.linalg.LinAlgError("Singular matrix"), None), (ZeroDivisionError("division by zero"), None),

@@ -190,8 +190,7 @@ def test_a_group_can_be_of_several_cameras_and_of_one_again(stored, tmp_path):
 
     assert focals == [130, 99, 120]
     assert [camera.camera_id for camera in cameras_of(path)] == [1, 2, 3]  # by first photo, whatever the order of names
-    assert rows_of(path) == apart
-    assert len(apart["cameras"]) == len(apart["rigs"]) == len(apart["frames"]) == 3
+    assert rows_of(path) == apart and len(apart["cameras"]) == len(apart["rigs"]) == len(apart["frames"]) == 3
     write_calibrations(path, graph, whole)
     assert rows_of(path) == before
     assert len(before["cameras"]) == len(before["rigs"]) == 2 and len(before["frames"]) == 3
@@ -221,8 +220,7 @@ def test_a_seed_of_photos_of_two_cameras_becomes_a_model(stored):
     posed = {image.image_id: image for image in model.images.values() if image.has_pose}
     assert sorted(posed) == [1, 2]
     assert [model.cameras[posed[key].camera_id].params[0] for key in (1, 2)] == [130, 99]
-    assert np.allclose(posed[2].cam_from_world().translation, [-1, 0, 0])
-    assert model.num_points3D() == 12
+    assert np.allclose(posed[2].cam_from_world().translation, [-1, 0, 0]) and model.num_points3D() == 12
 
 
 def photo_set(place, **groups):
@@ -259,8 +257,7 @@ def test_known_photos_keep_ids_keypoints_and_matches(earlier, tmp_path):
     assert not [file.name for file in tmp_path.iterdir() if file.name.startswith(".") or "wal" in file.name]
     with open_database(path) as database:
         cameras = {photo: database.read_image(photo).camera_id for photo in (1, 2, 3, 4)}
-        assert cameras[1] == cameras[2] != cameras[3] == cameras[4]
-        assert database.num_cameras() == 2
+        assert cameras[1] == cameras[2] != cameras[3] == cameras[4] and database.num_cameras() == 2
 
 
 @pytest.mark.parametrize(
@@ -292,8 +289,7 @@ def test_matches_of_features_that_came_out_otherwise_are_dropped(earlier, tmp_pa
         moved = np.array(database.read_keypoints(3))
         moved[4, 0] += 0.5
         database.update_keypoints(3, moved)
-    assert forget_changed_matches(path, earlier) == {"d.jpg"}
-    assert read_features(path)[1].keys() == {(1, 2)}
+    assert forget_changed_matches(path, earlier) == {"d.jpg"} and read_features(path)[1].keys() == {(1, 2)}
 
 
 @pytest.fixture(scope="module")
@@ -332,5 +328,4 @@ def test_keypoints_that_only_the_earlier_run_had_are_left_out(made):
     part = model_in_database(place / "database.db", place / "sparse", set(counts), fewer)
     used = {element.point2D_idx for point in part.points3D.values() for element in point.track.elements
             if element.image_id == 1}  # fmt: skip
-    assert used and max(used) < 10
-    assert part.num_points3D() <= model.num_points3D()
+    assert used and max(used) < 10 and part.num_points3D() <= model.num_points3D()

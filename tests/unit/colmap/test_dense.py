@@ -30,6 +30,8 @@ from sfm_app.progress import SilentProgress
 from sfm_app.stereo import DepthEstimate, DepthMap
 from sfm_app.types import Surface
 
+pytestmark = pytest.mark.slow
+
 NORMAL = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
 DISTANCE = 5.0
 BOX = np.array([[-50.0] * 3, [50.0] * 3])
@@ -73,7 +75,6 @@ def workspace(tmp_path_factory):
     return place / "dense", views
 
 
-@pytest.mark.slow
 def test_views_are_those_of_the_model(workspace):
     dense, views = workspace
     assert [view.name for view in views] == ["1.png", "2.png", "3.png"]
@@ -84,7 +85,6 @@ def test_views_are_those_of_the_model(workspace):
     np.testing.assert_allclose(views[1].points @ NORMAL, DISTANCE, atol=1e-9)
 
 
-@pytest.mark.slow
 def test_fused_points_lie_on_the_plane_and_face_the_cameras(workspace):
     dense, _ = workspace
 
@@ -101,7 +101,6 @@ def test_fused_points_lie_on_the_plane_and_face_the_cameras(workspace):
     np.testing.assert_allclose(normals, np.broadcast_to(-NORMAL, normals.shape), atol=1e-3)
 
 
-@pytest.mark.slow
 def test_maps_come_back_as_they_were(workspace):
     dense, views = workspace
     rng = np.random.default_rng(0)
@@ -114,7 +113,6 @@ def test_maps_come_back_as_they_were(workspace):
     assert (store.has(view, "geometric"), store.has(view, "photometric")) == (True, False)
 
 
-@pytest.mark.slow
 def test_estimates_come_and_go(workspace):
     dense, views = workspace
     store, depth = DenseStore(dense), np.full((90, 120), 3.0, np.float32)
@@ -134,12 +132,10 @@ def test_estimates_come_and_go(workspace):
 
     drop_estimates(dense, views)
 
-    assert not store.has(views[0], "photometric")
-    assert not list(dense.rglob("*.photometric*"))
+    assert not store.has(views[0], "photometric") and not list(dense.rglob("*.photometric*"))
     assert store.has(views[0], "geometric")
 
 
-@pytest.mark.slow
 def test_a_map_appears_complete_or_not_at_all(workspace, monkeypatch):
     dense, views = workspace
     store, view = DenseStore(dense), replace(views[0], name="killed.png")
@@ -154,14 +150,12 @@ def test_a_map_appears_complete_or_not_at_all(workspace, monkeypatch):
     assert not store.has(view, "geometric")
 
 
-@pytest.mark.slow
 def test_the_box_cuts_the_points(workspace):
     dense, _ = workspace
     fuse(dense, 2, np.array([[0.0, -50, -50], [50, 50, 50]]), dense / FUSED)
     assert positions(open_points(dense / FUSED))[:, 0].min() >= 0
 
 
-@pytest.mark.slow
 def test_the_surface_has_the_shape_of_the_points_whatever_came_before(workspace):
     dense, _ = workspace
     fuse(dense, 3, BOX, dense / FUSED)
@@ -171,8 +165,7 @@ def test_the_surface_has_the_shape_of_the_points_whatever_came_before(workspace)
     inside = np.all(np.abs(surface.vertices[:, :2]) < 1, axis=1) & (np.abs(surface.vertices @ NORMAL - DISTANCE) < 0.3)
     assert np.count_nonzero(inside) > 100
     assert np.percentile(np.abs(surface.vertices[inside] @ NORMAL - DISTANCE), 90) < 0.02
-    assert surface.colors.shape == surface.vertices.shape
-    assert not (dense / "poisson.ply").exists()
+    assert surface.colors.shape == surface.vertices.shape and not (dense / "poisson.ply").exists()
     poisson_surface(dense, 2)
     again = poisson_surface(dense, 6)
     np.testing.assert_array_equal(again.vertices, surface.vertices)
@@ -190,7 +183,6 @@ def wavy(size: int) -> Surface:
     return Surface(vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]), colors)
 
 
-@pytest.mark.slow
 def test_simplification_spares_what_is_curved_and_keeps_borders_and_colors(tmp_path):
     fine = wavy(40)
     found = simplify(fine, len(fine.faces) // 5, 0.0, tmp_path)
@@ -200,11 +192,9 @@ def test_simplification_spares_what_is_curved_and_keeps_borders_and_colors(tmp_p
     np.testing.assert_allclose(
         [found.vertices.min(axis=0)[:2], found.vertices.max(axis=0)[:2]], [[0, 0], [1, 1]], atol=0.01
     )
-    assert np.all(np.abs(found.colors.astype(int) - [200, 100, 50]) <= 1)
-    assert not list(tmp_path.iterdir())
+    assert np.all(np.abs(found.colors.astype(int) - [200, 100, 50]) <= 1) and not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("max_error", [3e-3, 1e-2])
 def test_simplification_by_error_stops_where_it_would_move_the_surface(tmp_path, max_error):
     fine = wavy(40)
@@ -212,14 +202,12 @@ def test_simplification_by_error_stops_where_it_would_move_the_surface(tmp_path,
     fewer = simplify(fine, len(found.faces) // 2, max_error, tmp_path)
     threaded = simplify(fine, len(found.faces) // 2, max_error, tmp_path, threads=2)
     closest = trimesh.proximity.closest_point_naive(trimesh.Trimesh(found.vertices, found.faces), fine.vertices)[1]
-    assert 0.05 * max_error < closest.max() < 2 * max_error
-    assert 20 < len(found.faces) < 0.5 * len(fine.faces)
+    assert 0.05 * max_error < closest.max() < 2 * max_error and 20 < len(found.faces) < 0.5 * len(fine.faces)
     assert 0.7 * len(found.faces) // 2 < len(fewer.faces) <= len(found.faces) // 2
     np.testing.assert_array_equal(threaded.vertices, fewer.vertices)
     np.testing.assert_array_equal(threaded.faces, fewer.faces)
 
 
-@pytest.mark.slow
 def test_points_in_one_spot_give_a_surface_without_triangles(tmp_path):
     header = "ply\nformat ascii 1.0\nelement vertex 120\n"
     header += "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
@@ -229,7 +217,6 @@ def test_points_in_one_spot_give_a_surface_without_triangles(tmp_path):
     assert (surface.vertices.shape, surface.faces.shape, surface.colors.shape) == ((0, 3), (0, 3), (0, 3))
 
 
-@pytest.mark.slow
 def test_missing_inputs_are_backend_errors(tmp_path, workspace):
     with pytest.raises(BackendError, match="undistorting photos"):
         undistort(tmp_path / "none", tmp_path, tmp_path / "dense", 100, 1, SilentProgress())
@@ -347,5 +334,4 @@ def test_nothing_is_fused_from_what_is_masked(dense):
 
     at = (points @ view.R.T + view.t) @ view.K.T
     col, row = np.rint(at[:, :2] / at[:, 2:]).astype(int).T
-    assert len(points) == np.count_nonzero(used)
-    assert used[row, col].all()
+    assert len(points) == np.count_nonzero(used) and used[row, col].all()

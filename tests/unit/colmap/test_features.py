@@ -85,8 +85,7 @@ def test_chunks_give_what_colmap_gives_for_all_at_once(made, tmp_path):
     for chunk in reversed(chunks(list(names.values()), 20, 1)):
         found = find_in_chunk(inputs, chunk)
         enter_rows(database, found.path, FEATURES)
-        assert found.count == len(chunk)
-        assert not found.path.exists()
+        assert found.count == len(chunk) and not found.path.exists()
     assert photos_without_features(database) == {}
 
     inputs, pairs = inputs_of(made, database, tmp_path / "matches"), exhaustive_pairs(sorted(names))
@@ -103,10 +102,8 @@ def test_a_process_of_its_own_matches_the_same(made, tmp_path):
     inputs, pairs = inputs_of(made, made / "whole.db", tmp_path / "matches"), [(1, 2), (4, 1), (3, 5)]
     counted = Counted()
     here, apart = match_chunk(inputs, pairs), match_chunk_apart(inputs, ProcessGroup(), counted, pairs)
-    assert (here.count, apart.count) == (3, 0)
-    assert here.in_force == apart.in_force
-    assert rows_of(here.path) == rows_of(apart.path)
-    assert len(rows_of(apart.path)) == 3
+    assert (here.count, apart.count) == (3, 0) and here.in_force == apart.in_force
+    assert rows_of(here.path) == rows_of(apart.path) and len(rows_of(apart.path)) == 3
     assert counted.steps == 3
 
 
@@ -133,8 +130,7 @@ def test_every_pair_is_listed_once(count):
 def test_chunks_keep_all_workers_busy():
     assert [len(part) for part in chunks(range(11), 8, 2)] == [6, 5]
     assert [len(part) for part in chunks(range(100), 8, 2)] == [8] * 12 + [4]
-    assert [len(part) for part in chunks(range(90), 40, 2)] == [23, 23, 23, 21]
-    assert chunks([], 8, 2) == []
+    assert [len(part) for part in chunks(range(90), 40, 2)] == [23, 23, 23, 21] and chunks([], 8, 2) == []
 
 
 SIZE = 320, 240
@@ -177,8 +173,7 @@ def test_only_photos_that_show_little_are_enlarged(place, tmp_path):
     enlarged = find(place, tmp_path / "enlarged.db", enlarge_below=100_000)
     between = (len(own[POOR]) + len(own[RICH])) // 2
     found = find(place, tmp_path / "between.db", enlarge_below=between)
-    assert 20 < len(own[POOR]) < 0.5 * len(own[RICH])
-    assert len(enlarged[POOR]) > len(own[POOR])
+    assert 20 < len(own[POOR]) < 0.5 * len(own[RICH]) and len(enlarged[POOR]) > len(own[POOR])
     assert len(enlarged[RICH]) > len(own[RICH])
     np.testing.assert_array_equal(found[RICH], own[RICH])
     np.testing.assert_array_equal(found[POOR], enlarged[POOR])

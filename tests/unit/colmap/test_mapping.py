@@ -129,5 +129,4 @@ def test_options_are_ours_for_both_mappers():
 
 def test_of_several_models_the_one_with_most_photos_counts():
     models = {key: SimpleNamespace(num_reg_images=lambda count=count: count) for key, count in ((0, 2), (1, 5), (2, 3))}
-    assert largest_model(models) is models[1]
-    assert largest_model({}) is None
+    assert largest_model(models) is models[1] and largest_model({}) is None

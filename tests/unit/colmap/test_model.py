@@ -91,8 +91,7 @@ def test_a_part_of_a_model_can_be_adjusted_and_the_whole_stays(synthetic):
     adjusted = adjust(part, database)
     found = adjusted.model
     assert posed_photo_ids(found) == sorted(found.images) == [1, 3, 4] and posed_photo_ids(model) == [1, 2, 3, 4, 5, 6]
-    assert all(point.track.length() >= 2 for point in found.points3D.values())
-    assert found.num_points3D() > 350
+    assert all(point.track.length() >= 2 for point in found.points3D.values()) and found.num_points3D() > 350
     assert all(0 < deviations["fx"] < 20 for deviations in adjusted.deviations.values())
 
 
@@ -115,8 +114,7 @@ def test_what_colmap_raises_becomes_one_of_ours():
 
 def test_options_become_plain_values():
     options = json_options(pycolmap.FeatureMatchingOptions().todict())
-    assert options["sift"]["max_ratio"] == 0.8
-    assert isinstance(options["type"], str)
+    assert options["sift"]["max_ratio"] == 0.8 and isinstance(options["type"], str)
 
 
 def test_points_and_cameras_of_a_model_on_disk(synthetic, tmp_path):
@@ -174,7 +172,5 @@ def test_a_model_without_points_has_empty_arrays(synthetic):
     for key in list(model.points3D):
         model.delete_point3D(key)
     found = model_arrays(model, metric=False)
-    assert found.points.shape == (0, 3) and not found.metric
-    assert found.track_pixels.shape == (0, 2)
-    assert found.track_points.shape == (0,)
-    assert found.errors_px == pytest.approx([])
+    assert found.points.shape == (0, 3) and not found.metric and found.track_pixels.shape == (0, 2)
+    assert found.track_points.shape == (0,) and found.errors_px == pytest.approx([])

@@ -84,8 +84,7 @@ def test_views_show_the_directions_of_the_photo(tmp_path, kind, count):
         rays = rays_of((view.height, view.width), view.K, view.R)
         used = used_pixels(tmp_path / "dense", view)
         used = np.ones(rays.shape[:2], bool) if used is None else used
-        assert (kind == "panorama") == used.all()
-        assert 0.4 < used.mean() <= 1.0
+        assert (kind == "panorama") == used.all() and 0.4 < used.mean() <= 1.0
         wrong = np.abs(read_color(tmp_path / "dense", view).astype(int) - colors_of(rays))[used]
         assert np.mean(wrong) < 2.0 and np.quantile(wrong, 0.999) < 12
 
@@ -96,8 +95,7 @@ def test_points_are_seen_where_they_project(tmp_path, kind):
     _, views = fill(tmp_path)
 
     found = pycolmap.Reconstruction(tmp_path / "dense" / "sparse")
-    assert found.num_points3D() == model.num_points3D()
-    assert found.num_images() == len(views)
+    assert found.num_points3D() == model.num_points3D() and found.num_images() == len(views)
     # overlaps show some points twice
     assert model.compute_num_observations() <= found.compute_num_observations() < 1.6 * model.compute_num_observations()
     errors = [
@@ -177,8 +175,7 @@ def test_photos_of_a_plain_lens_keep_their_names(plain, side):
     assert found.photos == ["a.png", "c.png"]
     for photo in found.photos:
         ((name, K, gray, used),) = found.render(photo)
-        assert name == photo and max(gray.shape) <= side
-        assert max(gray.shape) > 0.9 * min(side, SIZE[0])
+        assert name == photo and max(gray.shape) <= side and max(gray.shape) > 0.9 * min(side, SIZE[0])
         assert used.mean() > 0.98 and np.quantile(errors(gray, K, views[photo].R, used), 0.999) < 6
 
 
@@ -190,8 +187,7 @@ def test_views_of_a_fisheye_are_those_of_the_workspace(tmp_path):
     assert found.photos == sorted(NAMES) and sorted(rendered) == sorted(view.name for view in views[1:])
     for view in views[1:]:
         K, gray, used = rendered[view.name]
-        assert max(gray.shape) <= 120
-        assert np.quantile(errors(gray, K, view.R, used), 0.99) < 12
+        assert max(gray.shape) <= 120 and np.quantile(errors(gray, K, view.R, used), 0.99) < 12
 
 
 def test_masked_pixels_are_not_used(plain):
@@ -200,5 +196,4 @@ def test_masked_pixels_are_not_used(plain):
     larger = LargerViews(place / "sparse", place / "photos", place / "masks", [views["a.png"]], 480)
     ((_, _, gray, used),) = larger.render("a.png")
     share = np.mean(used, axis=0)
-    assert gray.shape == used.shape
-    assert share[:150].max() == 0.0 and share[-200:].min() > 0.9
+    assert gray.shape == used.shape and share[:150].max() == 0.0 and share[-200:].min() > 0.9

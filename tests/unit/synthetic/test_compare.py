@@ -127,8 +127,7 @@ def test_the_scene_is_what_the_photos_see(photos, plane_truth):
     hidden = np.array([[50.0, 0, 50], [51, 0, 50], [50, 0, 51]])
     faces = np.concatenate([truth.faces, np.array([[0, 1, 2]]) + len(truth.vertices)])
     behind = replace(truth, vertices=np.concatenate([truth.vertices, hidden]), faces=faces)
-    assert scene_size(behind) == scene_size(truth)
-    assert 4.0 < scene_size(plane_truth) <= 32**0.5 + 1e-3
+    assert scene_size(behind) == scene_size(truth) and 4.0 < scene_size(plane_truth) <= 32**0.5 + 1e-3
     assert np.abs(seen_points(plane_truth)[:, 1]).max() < 1e-5
 
 

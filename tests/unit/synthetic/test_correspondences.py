@@ -31,8 +31,7 @@ def depths(pair):
 def test_exact_points_satisfy_the_true_epipolar_geometry(seed):
     pair = make_pair(PairOptions(points=50), seed)
     assert epipolar_distance(pair.F, pair.exact_x1, pair.exact_x2).max() < 1e-8
-    assert np.linalg.norm(pair.F) == pytest.approx(1.0)
-    assert np.linalg.svd(pair.F, compute_uv=False)[2] < 1e-12
+    assert np.linalg.norm(pair.F) == pytest.approx(1.0) and np.linalg.svd(pair.F, compute_uv=False)[2] < 1e-12
     assert depths(pair).min() > 0, "every point lies in front of both cameras"
     for x in (pair.exact_x1, pair.exact_x2):
         assert x.min() >= 0 and x.max() <= 512
@@ -58,8 +57,7 @@ def test_points_behind_a_camera_are_not_matches(seed):
 def test_noise_is_the_injected_noise(sigma_px):
     pair = make_pair(PairOptions(sigma_px=sigma_px, outliers=0.25), seed=4)
     for noise in (pair.x1 - pair.exact_x1, (pair.x2 - pair.exact_x2)[pair.is_inlier]):
-        assert 0.93 * sigma_px < noise.std() < 1.07 * sigma_px
-        assert abs(noise.mean()) < 0.1 * sigma_px
+        assert 0.93 * sigma_px < noise.std() < 1.07 * sigma_px and abs(noise.mean()) < 0.1 * sigma_px
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.1, 0.5, 0.7])
@@ -106,16 +104,14 @@ def test_the_true_camera_makes_every_fundamental_matrix_essential(seed):
     fx, fy, cx, cy = tracks.K[0][[0, 1, 0, 1], [0, 1, 2, 2]]
     assert len(tracks.pairs) == 10 and tracks.corrupted == () and tracks.size == (512, 512)
     assert all(singular_ratio(F, tracks.K[0]) > 1 - 1e-9 for F in tracks.F)
-    assert 500 <= fx <= 1000 and 0.8 <= fy / fx <= 1.2
-    assert 0.4 <= cx / 512 <= 0.6 and 0.4 <= cy / 512 <= 0.6
+    assert 500 <= fx <= 1000 and 0.8 <= fy / fx <= 1.2 and 0.4 <= cx / 512 <= 0.6 and 0.4 <= cy / 512 <= 0.6
 
 
 def test_tracks_are_projections_of_their_points():
     tracks = make_tracks(TrackOptions(sigma_px=0.0), seed=2)
     for K, R, t, x in zip(tracks.K, tracks.R, tracks.t, tracks.x, strict=True):
         h = (tracks.X @ R.T + t) @ K.T
-        assert h[:, 2].min() > 0
-        assert np.allclose(h[:, :2] / h[:, 2:], x)
+        assert h[:, 2].min() > 0 and np.allclose(h[:, :2] / h[:, 2:], x)
         assert x.min() >= 0 and x.max() <= 512
     pair = tracks.pairs[1, 3]
     assert np.array_equal(pair.x1, tracks.x[1]) and np.array_equal(pair.x2, tracks.x[3])

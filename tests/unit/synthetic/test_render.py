@@ -56,8 +56,7 @@ def test_a_pixel_is_seen_through_its_center():
     pose = look_at(np.zeros(3), np.array([0.0, 0.0, -1.0]))  # the front of the wall is 20 units away
     image = render.render_scene(scene, camera, pose, supersampling=1)
     rows, columns = np.nonzero(image[..., 0] > image[..., 2])  # sunlight is warm, the sky is blue
-    assert (columns.min(), columns.max(), rows.min(), rows.max()) == (10, 30, 4, 15)
-    assert len(rows) == 21 * 12
+    assert (columns.min(), columns.max(), rows.min(), rows.max()) == (10, 30, 4, 15) and len(rows) == 21 * 12
 
 
 def test_the_sun_casts_a_shadow_away_from_it(prepared, still_life):
@@ -152,8 +151,7 @@ def test_beside_a_photo_stand_the_model_from_its_camera_from_aside_and_its_bare_
     views = {"photo": page[:40, :80], "model": page[:40, 80:], "aside": page[40:, :80], "shape": page[40:, 80:]}
     seen = {name: np.any(view != 255, axis=2) for name, view in views.items()}
 
-    assert page.shape == (80, 160, 3) and page.dtype == np.uint8
-    assert np.all(views["photo"] == [10, 200, 30])
+    assert page.shape == (80, 160, 3) and page.dtype == np.uint8 and np.all(views["photo"] == [10, 200, 30])
     assert np.all(views["model"][10:30, 40:60] == [200, 40, 30]) and seen["model"].sum() == 20 * 20
     # its right edge has come nearer: 20 cos 25 / (1 - sin 25) = 31 px from the left one, and 35 px high instead of 20
     assert 700 < np.all(views["aside"] == [200, 40, 30], axis=2).sum() <= seen["aside"].sum() < 950

@@ -82,8 +82,7 @@ PLACES = st.floats(-100, 100)
 @given(x=PLACES, y=PLACES, z=PLACES)
 def test_noise_is_bounded_and_continuous(x, y, z):
     here, near = shapes.value_noise(x, y, z, 3), shapes.value_noise(x + 1e-6, y - 1e-6, z + 1e-6, 3)
-    assert -1 <= here < 1
-    assert abs(here - near) < 1e-4
+    assert -1 <= here < 1 and abs(here - near) < 1e-4
     assert shapes.value_noise(4.0, -2.0, 7.0, 9) == pytest.approx(2 * shapes.lattice(4, -2, 7, 9) - 1)
 
 
@@ -91,8 +90,7 @@ def test_detail_below_a_pixel_is_left_out():
     coarse = np.array([shapes.octaves(tuple(p), 1.0, 0.7, 2.0, 1) for p in POINTS])
     medium = np.array([shapes.octaves(tuple(p), 1.0, 0.7, 0.2, 1) for p in POINTS])
     fine = np.array([shapes.octaves(tuple(p), 1.0, 0.7, 0.002, 1) for p in POINTS])
-    assert not coarse.any()
-    assert 0.1 < medium.std() < fine.std() < 1.0
+    assert not coarse.any() and 0.1 < medium.std() < fine.std() < 1.0
 
 
 @pytest.mark.parametrize("pattern", shapes.PATTERNS)
@@ -105,8 +103,7 @@ def test_patterns_mix_within_range_and_vary(pattern):
 
     assert mixed[:, :2].min() >= 0 and mixed[:, :2].max() <= 1
     assert mixed[:, 2].min() > 0 and 0.7 < mixed[:, 2].mean() < 1.3
-    assert mixed[:, 0].std() > 0.05 and mixed[:, 2].std() > 0.05
-    assert np.array_equal(mixed, again)
+    assert mixed[:, 0].std() > 0.05 and mixed[:, 2].std() > 0.05 and np.array_equal(mixed, again)
     assert not np.allclose(mixed[:, 2], elsewhere[:, 2]), "two bodies of one material differ"
     assert row[:4].tolist() == [shapes.PATTERNS.index(pattern), 0.3, 0.5, 100]
     assert row[4:7] == pytest.approx((np.array([200, 10, 10]) / 255) ** 2.2), "colors are linear"
