@@ -1,15 +1,16 @@
 """Projection through a rolling shutter, velocities of a path, and the readout of synthetic walks."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from benchmarks.synthetic.walks import WalkOptions, project_through_shutter, walk
+from benchmarks.synthetic.walks import Trajectory, WalkOptions, project_through_shutter, walk
 from sfm_app.bundle.lens_parts import LensPriors
-from sfm_app.bundle.normal_equations import POSE, apply_step, best_step, project, reduce
+from sfm_app.bundle.normal_equations import POSE, Bundle, apply_step, best_step, project, reduce
 from sfm_app.bundle.rolling_shutter import (
     FITS,
+    Rows,
     ShutterBundle,
     apply_shutter_step,
     estimate_readout,
@@ -20,12 +21,52 @@ from sfm_app.bundle.rolling_shutter import (
     shutter_cost,
     solve_step,
 )
+from sfm_app.camera.projection import CAMERA, PERSPECTIVE
+from sfm_app.synthetic.cameras import Camera, make_camera
+
+INTERVAL_S, POINTS, DEPTHS, NOISE_PX = 0.1, 500, (2.0, 8.0), 0.3
+
+
+@dataclass(frozen=True)
+class Film:
+    """Frames of a walk as a bundle with true poses, points and camera."""
+
+    bundle: Bundle
+    rows: Rows
+    camera: Camera
+    path: Trajectory
+
+
+def film(readout_s, *, frames=14, seed=0, **how):
+    """The frames of a walk, with a shutter of some readout in seconds."""
+    rng = np.random.default_rng([seed, 5])
+    camera, times = make_camera(1280, 720, focal_widths=0.8, center=(0.5, 0.5)), INTERVAL_S * np.arange(frames)
+    path = walk(WalkOptions(seconds=float(times[-1]), **how), seed)
+    poses = path.poses(times)
+    depths = rng.uniform(*DEPTHS, (POINTS, 1))
+    rays = np.column_stack([rng.uniform([0, 0], [1280, 720], (POINTS, 2)), np.ones(POINTS)])
+    of = poses[rng.integers(frames, size=POINTS)]
+    X = np.einsum("nji,nj->ni", of[:, :, :3], depths * (rays @ np.linalg.inv(camera.K).T) - of[:, :, 3])
+    seen = [project_through_shutter(camera, path, float(time), readout_s, X) for time in times]
+    shown = [np.flatnonzero(np.all((x > 0) & (x < (1280, 720)), axis=1)) for x in seen]
+    counts = np.bincount(np.concatenate(shown), minlength=POINTS)
+    shown = [points[counts[points] >= 3] for points in shown]
+    x = np.concatenate([one[points] for one, points in zip(seen, shown, strict=True)])
+    params = np.zeros((1, CAMERA))
+    params[0, :4] = camera.K[0, 0], camera.K[1, 1], 640.0, 360.0
+    bundle = Bundle(
+        params, np.zeros(frames, np.int64), poses[:, :, :3], poses[:, :, 3], X,
+        np.repeat(np.arange(frames), [len(points) for points in shown]), np.concatenate(shown),
+        x + rng.normal(scale=NOISE_PX, size=x.shape), np.array([PERSPECTIVE]),
+    )  # fmt: skip
+    return Film(bundle, Rows(times, bundle.x[:, 1] / 720 - 0.5), camera, path)
+
 
 STEP = 1e-6
 
 
 @pytest.fixture(scope="module")
-def seen(film):
+def seen():
     found = film(0.02, frames=10, swing_deg_s=60.0)
     motion = np.random.default_rng(1).normal(scale=0.003, size=(10, 6))
     return found.bundle, found.rows.share, motion
@@ -73,7 +114,7 @@ def test_points_return_to_the_time_of_the_middle_row():
     assert np.abs(move_to_middle_row(points, share, 0.03 * motion) - points).max() > 0.01
 
 
-def test_keypoints_of_a_moving_camera_come_to_where_the_middle_pose_sees_them(film):
+def test_keypoints_of_a_moving_camera_come_to_where_the_middle_pose_sees_them():
     """At 60 degrees per second and 20 ms the rows are up to 10 pixels apart; a fiftieth of a pixel remains."""
     found = film(0.02, frames=10, swing_deg_s=60.0, shake=0.0)
     frame, path = 5, found.path
@@ -155,7 +196,7 @@ SCALE_PX = 0.5
 
 
 @pytest.fixture(scope="module")
-def model(film):
+def model():
     found = film(0.02, frames=9, swing_deg_s=60.0)
     rng = np.random.default_rng(4)
     velocity, offsets = rng.normal(scale=0.5, size=(9, 6)), rng.normal(scale=1e-3, size=(9, 6))
@@ -203,16 +244,16 @@ def ignore_shutter(bundle):
     return bundle
 
 
-def measure(film, **how):
-    bundle = ignore_shutter(film.bundle)
-    return estimate_readout(bundle, film.rows, priors(bundle), ALL, SCALE_PX, **how)
+def measure(frames, **how):
+    bundle = ignore_shutter(frames.bundle)
+    return estimate_readout(bundle, frames.rows, priors(bundle), ALL, SCALE_PX, **how)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("readout_s", "speed", "swing_deg_s"), [(0.01, 1.4, 30.0), (0.03, 1.4, 0.0), (-0.02, 0.7, 90.0)]
 )
-def test_the_readout_is_found_as_accurately_as_said(film, readout_s, speed, swing_deg_s):
+def test_the_readout_is_found_as_accurately_as_said(readout_s, speed, swing_deg_s):
     found = measure(film(readout_s, frames=20, speed=speed, swing_deg_s=swing_deg_s))
     assert found.readout == pytest.approx(readout_s, rel=0.15)
     assert abs(found.readout - readout_s) < 2.0 * found.deviation
@@ -221,20 +262,20 @@ def test_the_readout_is_found_as_accurately_as_said(film, readout_s, speed, swin
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
-def test_a_global_shutter_has_no_readout(film, seed):
+def test_a_global_shutter_has_no_readout(seed):
     found = measure(film(0.0, frames=20, swing_deg_s=30.0, seed=seed))
     assert abs(found.readout) < found.deviation and 1e-5 < found.deviation < 0.003
 
 
 @pytest.mark.slow
-def test_straight_on_with_parallel_views_tells_nothing(film):
+def test_straight_on_with_parallel_views_tells_nothing():
     """A shutter that sees such a walk shears the scene, and nothing contradicts it."""
     found = measure(film(0.03, frames=20, shake=0.0))
     assert found.deviation > 0.01
 
 
 @pytest.mark.slow
-def test_poses_are_those_of_the_middle_rows(film):
+def test_poses_are_those_of_the_middle_rows():
     bent = film(0.03, frames=20, swing_deg_s=60.0)
     true, ignored = bent.bundle, ignore_shutter(bent.bundle)
     found = estimate_readout(ignored, bent.rows, priors(ignored), ALL, SCALE_PX)
@@ -250,13 +291,13 @@ def turn_errors_deg(R, S):
 
 
 @pytest.mark.slow
-def test_a_known_readout_is_kept(film):
+def test_a_known_readout_is_kept():
     found = measure(film(0.02, frames=12, swing_deg_s=60.0), known=0.02)
     assert found.readout == 0.02 and found.deviation == 0.0
 
 
 @pytest.mark.slow
-def test_an_earlier_estimate_shortens_the_way(film):
+def test_an_earlier_estimate_shortens_the_way():
     walk = film(0.02, frames=12, swing_deg_s=60.0)
     first = measure(walk)
     again = estimate_readout(first.bundle, walk.rows, priors(first.bundle), ALL, SCALE_PX, first)
@@ -264,7 +305,7 @@ def test_an_earlier_estimate_shortens_the_way(film):
 
 
 @pytest.mark.slow
-def test_points_far_off_do_not_stop_it(film):
+def test_points_far_off_do_not_stop_it():
     walk = film(0.02, frames=12, swing_deg_s=60.0)
     away = np.zeros_like(walk.bundle.X)
     away[:5] = 1e9
