@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import trimesh
 from hypothesis import settings
-from PIL import Image
 
 from benchmarks.synthetic.walks import orbit
 from sfm_app import operating_system
@@ -66,20 +65,6 @@ def rendered(tmp_path_factory):
     views = arc(make_camera(480, 320), ArcOptions(photos=7, sweep_deg=50.0))
     save_truth(write_photo_folder(place / "photos", courtyard(), views), place)
     return place / "photos", load_truth(place)
-
-
-@pytest.fixture(scope="session")
-def unrelated(tmp_path_factory) -> Path:
-    """Make two textured photos of different places, with nothing in common."""
-    place = tmp_path_factory.mktemp("unrelated")
-    for seed in (1, 2):
-        rng = np.random.default_rng(seed)
-        coarse = Image.fromarray(rng.integers(0, 255, (40, 60, 3), np.uint8)).resize(
-            (480, 320), Image.Resampling.BICUBIC
-        )
-        fine = rng.normal(0, 12, (320, 480, 3))
-        Image.fromarray(np.clip(np.asarray(coarse) + fine, 0, 255).astype(np.uint8)).save(place / f"{seed}.jpg")
-    return place
 
 
 @pytest.fixture(scope="session")

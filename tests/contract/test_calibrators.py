@@ -75,16 +75,11 @@ def run(calibrate, Fs, seed=0, weights=None, size=SIZE):
 
 
 def is_well_formed(found):
-    assert isinstance(found, Calibration)
-    assert (found.K.shape, found.K.dtype) == ((3, 3), np.float64)
-    assert np.all(np.isfinite(found.K))
-    assert found.K[0, 0] > 0
-    assert found.K[1, 1] > 0
+    assert isinstance(found, Calibration) and (found.K.shape, found.K.dtype) == ((3, 3), np.float64)
+    assert np.all(np.isfinite(found.K)) and found.K[0, 0] > 0 and found.K[1, 1] > 0
     np.testing.assert_array_equal(found.K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1])
-    assert (found.width, found.height) == SIZE
-    assert found.identifiable == (found.reason == "")
-    assert found.method in (*CALIBRATORS, "guess", "estimate")
-    assert np.isfinite(found.radial)
+    assert (found.width, found.height) == SIZE and found.identifiable == (found.reason == "")
+    assert found.method in (*CALIBRATORS, "guess", "estimate") and np.isfinite(found.radial)
     assert set(found.spread) <= {"fx", "fy", "cx", "cy", "k1"}
     assert set(found.held) <= {"center", "aspect", "k1"}
     assert all(np.isfinite(value) and value >= 0 for value in found.spread.values())
@@ -92,14 +87,12 @@ def is_well_formed(found):
     return True
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_finds_the_camera(calibrate, seed):
     found = run(calibrate, fundamentals(6, seed))
-    assert is_well_formed(found)
-    assert found.identifiable, found.reason
+    assert is_well_formed(found) and found.identifiable, found.reason
     error = np.abs(found.K - K)
-    assert 0 < error[[0, 1], [0, 1]].max() < 0.05 * 1100
-    assert 0 < error[:2, 2].max() < 0.05 * 1000
+    assert 0 < error[[0, 1], [0, 1]].max() < 0.05 * 1100 and 0 < error[:2, 2].max() < 0.05 * 1000
     assert 0 < found.evidence["support"] <= 1
 
 
@@ -108,8 +101,7 @@ def test_finds_the_camera(calibrate, seed):
 def test_every_form_of_the_constraint_finds_the_camera(name, form):
     options = OPTIONS.model_copy(update={"constraint_form": form})
     found = CALIBRATORS[name].calibrate(CameraPairs.from_Fs(fundamentals(5, 0), SIZE), options, 0)
-    assert is_well_formed(found)
-    assert found.identifiable, found.reason
+    assert is_well_formed(found) and found.identifiable, found.reason
     np.testing.assert_allclose(found.K, K, rtol=0.02, atol=15)
     assert np.abs(found.K - K).max() > 0
 
@@ -119,8 +111,7 @@ def test_every_form_of_the_constraint_finds_the_camera(name, form):
 def test_no_form_of_the_constraint_invents_a_camera(case, form):
     options = OPTIONS.model_copy(update={"constraint_form": form})
     found = CALIBRATORS["huang-faugeras"].calibrate(CameraPairs.from_Fs(UNDETERMINED[case], SIZE), options, 0)
-    assert is_well_formed(found)
-    assert (found.identifiable, found.method) == (False, "guess")
+    assert is_well_formed(found) and (found.identifiable, found.method) == (False, "guess")
 
 
 @pytest.mark.parametrize("name", CALIBRATORS)
@@ -138,10 +129,8 @@ def test_some_wrong_pairs_do_no_harm(name):
 @pytest.mark.parametrize("case", UNDETERMINED)
 def test_undetermined_cameras_are_guesses_with_a_reason(calibrate, case):
     found = run(calibrate, UNDETERMINED[case])
-    assert is_well_formed(found)
-    assert not found.identifiable
-    assert 0 < len(found.reason) < 120
-    assert found.method == "guess"
+    assert is_well_formed(found) and not found.identifiable
+    assert 0 < len(found.reason) < 120 and found.method == "guess"
     np.testing.assert_array_equal(found.K, GUESS)
 
 
@@ -185,33 +174,23 @@ def test_scale_sign_order_and_direction_do_not_matter(calibrate):
 def test_pairs_without_weight_do_not_count(calibrate):
     Fs = np.concatenate([fundamentals(6, 3), random_fundamentals(5, 3)])
     weights = np.concatenate([np.full(15, 0.8), np.zeros(5)])
-    np.testing.assert_array_equal(
-        run(calibrate, Fs, weights=weights).K, run(calibrate, Fs[:15], weights=weights[:15]).K
-    )
+    all_pairs, used = run(calibrate, Fs, weights=weights), run(calibrate, Fs[:15], weights=weights[:15])
+    np.testing.assert_array_equal(all_pairs.K, used.K)
 
 
-def test_input_is_left_alone(calibrate):
-    Fs, weights = fundamentals(4, 0), np.linspace(0.1, 1, 6)
+@pytest.mark.parametrize("Fs", [fundamentals(5, 1), UNDETERMINED["one pair"]], ids=["found", "guess"])
+def test_input_is_left_alone_and_answers_of_threads_repeat_and_cross_process_borders(calibrate, Fs):
+    weights = np.linspace(0.1, 1, len(Fs))
     before = Fs.copy(), weights.copy()
-    run(calibrate, Fs, weights=weights)
+    with ThreadPoolExecutor(4) as pool:
+        runs = list(pool.map(lambda _: pickle.dumps(run(calibrate, Fs, seed=3, weights=weights)), range(6)))
+    assert len(set(runs)) == 1
     np.testing.assert_array_equal(Fs, before[0])
     np.testing.assert_array_equal(weights, before[1])
-
-
-def test_products_cross_process_borders(calibrate):
-    for Fs in (fundamentals(5, 1), UNDETERMINED["one pair"]):
-        found = run(calibrate, Fs)
-        copy = pickle.loads(pickle.dumps(found))  # noqa: S301 - our own bytes
-        np.testing.assert_array_equal(copy.K, found.K)
-        assert (copy.identifiable, copy.reason, copy.evidence) == (found.identifiable, found.reason, found.evidence)
+    found, copy = run(calibrate, Fs, seed=3, weights=weights), pickle.loads(runs[0])  # noqa: S301 - our own bytes
+    np.testing.assert_array_equal(copy.K, found.K)
+    assert (copy.identifiable, copy.reason, copy.evidence) == (found.identifiable, found.reason, found.evidence)
     assert pickle.loads(pickle.dumps(calibrate)) is calibrate  # noqa: S301
-
-
-def test_ten_runs_in_threads_give_the_same_bytes(calibrate):
-    Fs = fundamentals(5, 4)
-    with ThreadPoolExecutor(4) as pool:
-        runs = list(pool.map(lambda _: pickle.dumps(run(calibrate, Fs, seed=3)), range(10)))
-    assert len(set(runs)) == 1
 
 
 TRACKS = TrackOptions(
@@ -283,11 +262,9 @@ HOSTILE = {
 @pytest.mark.parametrize("seed", range(2))
 def test_finds_the_camera_with_matches(calibrate, seed):
     found = calibrate(matched(seed), OPTIONS, 0)
-    assert is_well_formed(found)
-    assert found.identifiable, found.reason
+    assert is_well_formed(found) and found.identifiable, found.reason
     error = np.abs(found.K - [[1100, 0, 500], [0, 1100, 375], [0, 0, 1]])
-    assert 0 < error[[0, 1], [0, 1]].max() < 0.05 * 1100
-    assert 0 < error[:2, 2].max() < 50
+    assert 0 < error[[0, 1], [0, 1]].max() < 0.05 * 1100 and 0 < error[:2, 2].max() < 50
     assert set(found.key_pairs) <= set(matched(seed).photos)
 
 

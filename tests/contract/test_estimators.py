@@ -78,21 +78,16 @@ def homography_pair(kind, seed, sigma_px):
 
 
 def is_well_formed(found, count):
-    assert isinstance(found, EpipolarFit)
-    assert found.F.shape == (3, 3)
-    assert np.linalg.norm(found.F) == pytest.approx(1)
-    assert np.linalg.svd(found.F, compute_uv=False)[2] < 1e-12
+    assert isinstance(found, EpipolarFit) and found.F.shape == (3, 3)
+    assert np.linalg.norm(found.F) == pytest.approx(1) and np.linalg.svd(found.F, compute_uv=False)[2] < 1e-12
     assert (found.inliers.shape, found.inliers.dtype) == ((count,), np.bool_)
-    assert found.priors.shape == (count,)
-    assert found.priors.min() >= 0
-    assert found.priors.max() == 1
-    assert found.trials >= 1
-    assert found.degeneracy in ("", "collinear", "planar", "rotation")
+    assert found.priors.shape == (count,) and found.priors.min() >= 0 and found.priors.max() == 1
+    assert found.trials >= 1 and found.degeneracy in ("", "collinear", "planar", "rotation")
     return True
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.3])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_finds_the_truth_and_the_injected_noise(name, fit, accuracy_px, outliers, seed):
     pair = make_pair(PairOptions(outliers=outliers, **SCENE), seed)
     found = fit(pair.x1, pair.x2, OPTIONS, seed)
@@ -102,8 +97,7 @@ def test_finds_the_truth_and_the_injected_noise(name, fit, accuracy_px, outliers
     assert 0.40 < noise < (1.3 if rough else 0.65)
     assert 0 < np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2)) < accuracy_px
     assert found.inliers[pair.is_inlier].mean() > (0.85 if rough else 0.95)
-    assert found.inliers[~pair.is_inlier].sum() < 0.1 * 400
-    assert found.degeneracy == ""
+    assert found.inliers[~pair.is_inlier].sum() < 0.1 * 400 and found.degeneracy == ""
 
 
 def test_evidence_is_that_of_the_returned_matrix(fit):
@@ -122,14 +116,11 @@ def test_matches_without_geometry_are_rejected_with_a_reason(fit, case):
         assert found.degeneracy == "collinear"
         return
     assert isinstance(found, Rejected), found
-    assert found.reason
-    assert len(found.reason) < 60
+    assert 0 < len(found.reason) < 60
 
 
 def with_value(value):
-    x = CLOUD.copy()
-    x[3, 1] = value
-    return x
+    return np.where(np.arange(200).reshape(100, 2) == 7, value, CLOUD)
 
 
 REFUSED = [
@@ -151,23 +142,22 @@ def test_invalid_points_are_refused(fit, bad, message):
 def test_any_integer_is_a_seed(fit):
     pair = make_pair(PairOptions(**SCENE), 3)
     for seed in (-1, 2**70):
-        assert pickle.dumps(fit(pair.x1, pair.x2, OPTIONS, seed)) == pickle.dumps(
-            fit(pair.x1, pair.x2, OPTIONS, seed % 2**64)
-        )
+        found, same = (fit(pair.x1, pair.x2, OPTIONS, one) for one in (seed, seed % 2**64))
+        assert pickle.dumps(found) == pickle.dumps(same)
 
 
 @pytest.mark.parametrize("count", [8, 16, 20])
 def test_few_exact_matches_give_an_answer_or_a_reason(fit, count):
     pair = make_pair(PairOptions(**{**SCENE, "points": count, "sigma_px": 0.0}), 2)
-    found = fit(pair.x1, pair.x2, OPTIONS.model_copy(update={"min_inliers": 8}), 0)
+    found = fit(pair.x1, pair.x2, options(min_inliers=8), 0)
     assert isinstance(found, Rejected) or (found.inliers.all() and found.rms_px < 1e-3)
     assert count < 16 or isinstance(found, EpipolarFit)
 
 
 def test_fewest_inliers_are_a_setting(fit):
     pair = make_pair(PairOptions(**SCENE), 1)
-    assert fit(pair.x1, pair.x2, OPTIONS.model_copy(update={"min_inliers": 380}), 0)
-    assert not fit(pair.x1, pair.x2, OPTIONS.model_copy(update={"min_inliers": 401}), 0)
+    assert fit(pair.x1, pair.x2, options(min_inliers=380), 0)
+    assert not fit(pair.x1, pair.x2, options(min_inliers=401), 0)
 
 
 def test_layout_and_type_of_the_arrays_do_not_matter(fit):
@@ -196,21 +186,15 @@ def test_layout_and_type_of_the_arrays_do_not_matter(fit):
         assert pickle.dumps(fit(a, b, OPTIONS, 0)) == expected, view
 
 
-def test_products_cross_process_borders(fit):
-    pair = make_pair(PairOptions(**SCENE), 6)
-    for found in (fit(pair.x1, pair.x2, OPTIONS, 0), fit(CLOUD[:5], CLOUD[:5], OPTIONS, 0)):
-        copy = pickle.loads(pickle.dumps(found))  # noqa: S301 - our own bytes
-        assert type(copy) is type(found)
-        assert bool(copy) == bool(found)
-    fit_again = pickle.loads(pickle.dumps(fit))  # noqa: S301
-    assert fit_again is fit
-
-
-def test_ten_runs_in_threads_give_the_same_bytes(fit):
+def test_runs_in_threads_give_the_same_bytes_which_cross_process_borders(fit):
     pair = make_pair(PairOptions(outliers=0.3, **SCENE), 8)
     with ThreadPoolExecutor(4) as pool:
-        runs = list(pool.map(lambda _: pickle.dumps(fit(pair.x1, pair.x2, OPTIONS, 3)), range(10)))
+        runs = list(pool.map(lambda _: pickle.dumps(fit(pair.x1, pair.x2, OPTIONS, 3)), range(6)))
     assert len(set(runs)) == 1
+    for found in (fit(pair.x1, pair.x2, OPTIONS, 3), fit(CLOUD[:5], CLOUD[:5], OPTIONS, 0)):
+        copy = pickle.loads(pickle.dumps(found))  # noqa: S301 - our own bytes
+        assert type(copy) is type(found) and bool(copy) == bool(found)
+    assert pickle.loads(pickle.dumps(fit)) is fit  # noqa: S301
 
 
 def test_a_repeated_match_counts_once_and_gets_one_verdict(fit):
@@ -237,8 +221,7 @@ def test_ten_thousand_matches(fit, accuracy_px):
     found = fit(pair.x1, pair.x2, OPTIONS, 0)
     assert is_well_formed(found, 10_000)
     assert 0 < np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2)) < accuracy_px
-    assert found.inliers[pair.is_inlier].mean() > 0.9
-    assert found.inliers[~pair.is_inlier].mean() < 0.05
+    assert found.inliers[pair.is_inlier].mean() > 0.9 and found.inliers[~pair.is_inlier].mean() < 0.05
 
 
 def peak_bytes():
@@ -261,11 +244,9 @@ def test_memory_is_linear_in_the_matches(fit):
 def test_exact_matches_give_the_exact_answer(fit, outliers):
     pair = make_pair(PairOptions(outliers=outliers, **{**SCENE, "sigma_px": 0.0}), 3)
     found = fit(pair.x1, pair.x2, OPTIONS, 0)
-    assert is_well_formed(found, 400)
-    assert found.inliers[pair.is_inlier].all()
-    assert (
-        sampson_distance(found.F, pair.x1, pair.x2)[pair.is_inlier].max() < 1e-2
-    )  # OpenCV computes in single precision
+    assert is_well_formed(found, 400) and found.inliers[pair.is_inlier].all()
+    distance = sampson_distance(found.F, pair.x1, pair.x2)
+    assert distance[pair.is_inlier].max() < 1e-2  # OpenCV computes in single precision
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(0.1, 0.0), (10.0, 0.0), (1.0, 1e6)])
@@ -274,8 +255,7 @@ def test_tiny_huge_and_distant_images(fit, accuracy_px, scale, shift):
     found = fit(pair.x1 * scale + shift, pair.x2 * scale - shift, options(max_error_px=2.0 * scale), 0)
     assert is_well_formed(found, 400)
     error = np.median(sampson_distance(found.F, pair.exact_x1 * scale + shift, pair.exact_x2 * scale - shift))
-    assert 0 < error < accuracy_px * scale
-    assert found.inliers[pair.is_inlier].mean() > 0.85
+    assert 0 < error < accuracy_px * scale and found.inliers[pair.is_inlier].mean() > 0.85
     assert found.inliers[~pair.is_inlier].mean() < 0.1
 
 
@@ -283,8 +263,7 @@ def test_one_match_far_away_is_an_outlier(fit):
     pair = make_pair(PairOptions(outliers=0.1, **SCENE), 3)
     pair.x1[0], pair.x2[1] = (1e5, 0.0), (0.0, -1e5)
     found = fit(pair.x1, pair.x2, OPTIONS, 0)
-    assert found.inliers[2:][pair.is_inlier[2:]].mean() > 0.85
-    assert not found.inliers[:2].any()
+    assert found.inliers[2:][pair.is_inlier[2:]].mean() > 0.85 and not found.inliers[:2].any()
 
 
 def test_absurd_matches_do_not_hide_the_scene():
@@ -293,8 +272,7 @@ def test_absurd_matches_do_not_hide_the_scene():
     kept[:3] = False
     pair.x1[0], pair.x2[1], pair.x1[2] = (1e10, 0.0), (0.0, -1e12), (-1e15, 1e15)
     found = ESTIMATORS["lev-ransac"].fit(pair.x1, pair.x2, OPTIONS, 0)
-    assert found.inliers[kept].mean() > 0.97
-    assert not found.inliers[:3].any()
+    assert found.inliers[kept].mean() > 0.97 and not found.inliers[:3].any()
     assert found.degeneracy == ""
     assert 0 < np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2)) < 0.2
 
@@ -314,7 +292,7 @@ def test_equal_views_are_no_epipolar_geometry(fit, move):
 
 @pytest.mark.parametrize("sigma_px", [0.0, 0.5])
 @pytest.mark.parametrize("kind", ["rotation", "planar"])
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(5))
 def test_matches_of_one_homography_are_flagged(fit, kind, sigma_px, seed):
     found = fit(*homography_pair(kind, seed, sigma_px), OPTIONS, seed)
     assert found.degeneracy == kind if found else sigma_px == 0
@@ -334,12 +312,7 @@ def test_noise_is_rejected(fit, values, seed):
     assert isinstance(found, Rejected)
 
 
-EDGES = {
-    "min_inliers": (8, 10_000),
-    "max_trials": (1, 10),
-    "confidence": (0.5, 0.999999),
-    "max_error_px": (0.1, 50.0),
-}
+EDGES = {"min_inliers": (8, 10_000), "max_trials": (1, 10), "confidence": (0.5, 0.999999), "max_error_px": (0.1, 50.0)}
 
 
 @pytest.mark.parametrize("edge", [(key, value) for key, values in EDGES.items() for value in values], ids=str)
@@ -353,8 +326,7 @@ def test_options_at_their_edges(fit, accuracy_px, edge):
         assert isinstance(found, EpipolarFit)
     if found:
         assert is_well_formed(found, 400)
-        assert found.inlier_count >= changed.min_inliers
-        assert found.trials <= changed.max_trials
+        assert found.inlier_count >= changed.min_inliers and found.trials <= changed.max_trials
         assert found.rms_px <= changed.max_error_px
         error = np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2))
         # one sample is rarely clean, and what it gives is then only better than chance

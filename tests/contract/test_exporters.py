@@ -42,7 +42,6 @@ def as_model(name, places):
 
 def test_the_first_file_is_the_one_to_open_and_all_lie_in_one_folder(name, write, model):
     files = write(model, "a model.v2")
-
     assert next(iter(files)) == f"a model.v2.{EXPORTERS[name].ending}"
     assert all(isinstance(data, bytes) and data for data in files.values())
     assert all("/" not in file and "\\" not in file for file in files)
@@ -56,9 +55,7 @@ def test_same_model_same_bytes_in_any_thread_and_the_model_is_left_alone(write, 
     before = copy.deepcopy(model)
     with ThreadPoolExecutor(4) as pool:
         made = list(pool.map(lambda _: write(model, "model"), range(6)))
-
-    assert all(files == made[0] for files in made)
-    assert made[0] == write(before, "model")
+    assert all(files == made[0] for files in made) and made[0] == write(before, "model")
 
 
 def test_the_shape_survives(name, write, model, tmp_path):
@@ -86,7 +83,6 @@ def test_the_shape_survives(name, write, model, tmp_path):
 )
 def test_what_no_file_can_hold_is_refused(write, vertices):
     colors = np.zeros((len(vertices), 3), np.uint8)
-
     with pytest.raises(ReconstructionError) as caught:
         write(Model(Surface(vertices, np.zeros((0, 3), np.int64), colors)), "model")
     assert caught.value.hint
@@ -94,13 +90,11 @@ def test_what_no_file_can_hold_is_refused(write, vertices):
 
 def test_one_point_and_one_camera_are_enough(name, write, cloud):
     one = Surface(cloud.surface.vertices[:1], cloud.surface.faces, cloud.surface.colors[:1])
-
     if not EXPORTERS[name].holds_points:
         with pytest.raises(ReconstructionError, match="triangles only"):
             write(Model(one), "model")
         return
-    assert write(Model(one), "model")
-    assert write(Model(one, cameras=cloud.cameras[:1]), "model")
+    assert write(Model(one), "model") and write(Model(one, cameras=cloud.cameras[:1]), "model")
 
 
 def test_a_texture_without_triangles_is_no_texture(name, write, ball, textured_ball):
@@ -108,5 +102,4 @@ def test_a_texture_without_triangles_is_no_texture(name, write, ball, textured_b
         pytest.skip(f"{name} holds triangles only")
     points = replace(ball.surface, faces=np.zeros((0, 3), np.int64))
     none = replace(textured_ball.texture, uv=np.zeros((0, 3, 2), np.float32), page=np.zeros(0, np.int32))
-
     assert write(Model(points, none), "model") == write(Model(points), "model")

@@ -69,8 +69,7 @@ def test_most_matches_of_neighbors_are_right(place, graph):
         t = poses[1][:, 3] - R @ poses[0][:, 3]
         F = np.linalg.inv(K).T @ cross_matrix(t) @ R @ np.linalg.inv(K)
         distances = sampson_distance(F, *graph.points(pair))
-        assert 40 <= len(distances) <= len(graph.keypoints[pair[0]])
-        assert np.mean(distances < 1.5) > 0.7
+        assert 40 <= len(distances) <= len(graph.keypoints[pair[0]]) and np.mean(distances < 1.5) > 0.7
         assert 0.0 < np.median(distances) < 0.6  # half a pixel aside, and it would be more
 
 
@@ -80,12 +79,10 @@ def test_only_the_given_pairs_are_matched(graph):
 
 def test_keypoints_lie_in_their_photo_and_are_matched_once(graph):
     for points in graph.keypoints.values():
-        assert points.shape[1:] == (2,)
-        assert (points >= 0).all() and (points <= (480, 320)).all()
+        assert points.shape[1:] == (2,) and (points >= 0).all() and (points <= (480, 320)).all()
     for (first, second), rows in graph.matches.items():
         for column, photo in zip(rows.T, (first, second), strict=True):
-            assert len(np.unique(column)) == len(column)
-            assert column.max() < len(graph.keypoints[photo])
+            assert len(np.unique(column)) == len(column) and column.max() < len(graph.keypoints[photo])
 
 
 def test_a_white_photo_has_nothing(graph):

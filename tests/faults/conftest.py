@@ -19,6 +19,13 @@ if "SFM_APP_FAULTS" not in os.environ:  # a quarter of a run, thirty times
     QUICK += ["--set", "report=false", "--set", "matching.enlarge_below=100"]
 
 
+def cases(all_of_them, always):
+    """Parameters of which `make test` tries some, and `make faults` all."""
+    mark = pytest.mark.skipif("SFM_APP_FAULTS" not in os.environ, reason="`make faults` tries all of them")
+    values = [(one, one if isinstance(one, tuple) else (one,)) for one in all_of_them]
+    return [pytest.param(*each, marks=() if one in always else mark) for one, each in values]
+
+
 @dataclass(frozen=True)
 class Folder:
     """Photos, and the files of an undisturbed run."""
@@ -41,6 +48,12 @@ class Folder:
         script = Path(__file__).with_name("disturbed.py")
         return self.start(script, what, moment, "run", self.photos, "-o", out, *QUICK)
 
+    def finish(self, out: Path) -> None:
+        """Run again, and check that all is as in the undisturbed run."""
+        again = self.run(out)
+        assert again.returncode == 0, again.stderr
+        assert self.result(out) == self.result(self.out)
+
     def copied(self, place: Path) -> "Folder":
         """The same photos in a place where they may be spoilt."""
         shutil.copytree(self.photos, place / "photos")
@@ -56,7 +69,7 @@ def undisturbed(tmp_path_factory, as_ordinary_user):
     if sys.platform == "win32":
         pytest.skip("Windows has neither SIGKILL nor limits of processes")
     place = tmp_path_factory.mktemp("faults")
-    views = arc(make_camera(480, 360), ArcOptions(photos=5, sweep_deg=40.0))
+    views = arc(make_camera(400, 300), ArcOptions(photos=4, sweep_deg=32.0))
     write_photo_folder(place / "photos", courtyard(), views, PhotoOptions(supersampling=1))
     folder = Folder(place / "photos", place / "out", as_ordinary_user)
     done = folder.run(place / "out")

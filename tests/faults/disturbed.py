@@ -24,22 +24,6 @@ from sfm_app.colmap import worker_process
 APPEARED = itertools.count(1)
 
 
-def die() -> None:
-    """Nobody is asked."""
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def photo(arguments: list[str]) -> Path:
-    """One of the photos."""
-    return sorted(Path(arguments[1]).iterdir())[2]
-
-
-def change(path: Path) -> None:
-    """Cut a photo in half."""
-    data = path.read_bytes()
-    path.write_bytes(data[: len(data) // 2])
-
-
 def close(out: Path) -> None:
     """Let nobody write to a folder."""
     for path in (out, *(below for below in out.rglob("*") if not below.is_symlink())):
@@ -77,14 +61,14 @@ def in_process(label: str, milliseconds: float, disturb: Callable[[], None]) -> 
 
 def prepare(what: str, moment: str, arguments: list[str]) -> None:
     """Have it happen."""
-    out = Path(arguments[arguments.index("-o") + 1])
+    photo, out = sorted(Path(arguments[1]).iterdir())[2], Path(arguments[arguments.index("-o") + 1])
     disturb = {
-        "kill": die,
+        "kill": lambda: os.kill(os.getpid(), signal.SIGKILL),
         "interrupt": lambda: os.kill(os.getpid(), signal.SIGINT),
         "out-gone": lambda: shutil.rmtree(out, ignore_errors=True),
         "out-closed": lambda: close(out),
-        "photo-gone": lambda: photo(arguments).unlink(),
-        "photo-changed": lambda: change(photo(arguments)),
+        "photo-gone": photo.unlink,
+        "photo-changed": lambda: os.truncate(photo, photo.stat().st_size // 2),
     }[what]
     when, _, amount = moment.partition(":")
     if when == "full":

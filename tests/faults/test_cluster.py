@@ -1,7 +1,6 @@
 """A cluster that loses a worker or its scheduler: the same bytes in the end, and one line where nothing can go on."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -10,15 +9,13 @@ import time
 import psutil
 import pytest
 
-from .conftest import QUICK
+from .conftest import QUICK, cases
 
 STAGES = ("photos", "match_graph", "view_graph", "scene", "depth_maps", "mesh", "texture")
-ALWAYS = {"depth_maps"}
 LONG_S = 900
 """A run that takes longer hangs: on a busy machine, one has taken 200 s."""
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")]
-needs_time = pytest.mark.skipif("SFM_APP_FAULTS" not in os.environ, reason="`make faults` tries all of them")
 
 
 def start(folder, out, address):
@@ -34,33 +31,24 @@ def wait_for(run, out, text):
         time.sleep(0.02)
 
 
-def workers(run):
-    """The processes of a run that do tasks: Dask's nannies start them."""
-    below = psutil.Process(run.pid).children(recursive=True)
-    return [process for process in below if "spawn_main" in " ".join(process.cmdline())]
-
-
 def left_over(out):
     """Files of a run that only its cluster needs."""
     return [path.name for path in out.iterdir() if path.name in (".cluster", ".sift_rows")]
 
 
-@pytest.mark.parametrize("stage", [pytest.param(s, marks=() if s in ALWAYS else needs_time) for s in STAGES])
+@pytest.mark.parametrize("stage", cases(STAGES, {"depth_maps"}))
 def test_a_worker_that_is_killed_changes_no_byte(undisturbed, tmp_path, stage):
     out = tmp_path / "out"
     with start(undisturbed, out, "local:2") as run:
         wait_for(run, out, f"{stage} begins")
         time.sleep(0.3)
         below = psutil.Process(run.pid).children(recursive=True)
-        killed = workers(run)
-        if killed:
-            killed[0].kill()
+        # the processes that do tasks: Dask's nannies start them
+        next(process for process in below if "spawn_main" in " ".join(process.cmdline())).kill()
         _, said = run.communicate(timeout=LONG_S)
 
-    assert killed
     assert (run.returncode, said) == (0, "")
-    assert undisturbed.result(out) == undisturbed.result(undisturbed.out)
-    assert left_over(out) == []
+    assert undisturbed.result(out) == undisturbed.result(undisturbed.out) and left_over(out) == []
     assert [process for process in below if process.is_running() and process.status() != psutil.STATUS_ZOMBIE] == []
 
 
@@ -85,12 +73,8 @@ def test_an_interrupted_run_ends_its_workers_and_goes_on(undisturbed, refused, t
         _, said = run.communicate(timeout=LONG_S)
     refused(subprocess.CompletedProcess((), run.returncode, "", said), 130)
     _, alive = psutil.wait_procs(below, timeout=10)
-    assert alive == []
-    assert left_over(out) == []
-    again = undisturbed.run(out)
-
-    assert again.returncode == 0, again.stderr
-    assert undisturbed.result(out) == undisturbed.result(undisturbed.out)
+    assert alive == [] and left_over(out) == []
+    undisturbed.finish(out)
 
 
 @pytest.fixture
@@ -120,7 +104,7 @@ def scheduler(tmp_path):
         process.wait()
 
 
-@pytest.mark.parametrize("stage", [pytest.param(s, marks=() if s in ALWAYS else needs_time) for s in STAGES[1:]])
+@pytest.mark.parametrize("stage", cases(STAGES[1:], {"depth_maps"}))
 def test_a_scheduler_that_is_gone_is_one_line_and_the_run_goes_on_elsewhere(
     undisturbed, refused, scheduler, tmp_path, stage
 ):
@@ -134,8 +118,5 @@ def test_a_scheduler_that_is_gone_is_one_line_and_the_run_goes_on_elsewhere(
     if stage not in ("scene", "texture"):  # nothing in them has to travel
         refused(lost, 8)
         assert "the scheduler of the cluster" in said
-    again = undisturbed.run(out)
-
-    assert again.returncode == 0, again.stderr
-    assert undisturbed.result(out) == undisturbed.result(undisturbed.out)
+    undisturbed.finish(out)
     assert left_over(out) == []

@@ -78,8 +78,7 @@ def test_new_photos_are_placed_in_the_model_that_is_there(first, folder, monkeyp
 
     run = reconstruct(photos, out)
 
-    assert set(run.scene.registered) == set(first.names)
-    assert largest_error(run, first.truth) < 0.01
+    assert set(run.scene.registered) == set(first.names) and largest_error(run, first.truth) < 0.01
     assert counts(run, "match_graph")["known_photos"] == FIRST and counts(run, "match_graph")["new_photos"] == 2
     assert counts(run, "view_graph")["known_pairs"] == FIRST * (FIRST - 1) // 2
     assert next(iter(counts(run, "intrinsics")["cameras"].values()))["method"] == "earlier run"
@@ -100,18 +99,14 @@ def test_the_same_history_gives_the_same_bytes(first, folder, tmp_path):
         run = reconstruct(photos, place, Settings.from_mapping(NO_REPORT | {"workers": workers}))
         files = [*sorted((place / "sparse").iterdir()), place / "view_graph.npz", place / "scene.json"]
         results.append(([path.read_bytes() for path in files], run.scene.cam_from_world.keys()))
-
     assert results[0] == results[1]
 
 
 def test_photos_that_are_taken_away_leave(first, folder):
     photos, out = folder
     (photos / first.names[0]).unlink()
-
     run = reconstruct(photos, out)
-
-    assert set(run.scene.registered) == set(first.names[1:FIRST])
-    assert largest_error(run, first.truth) < 0.01
+    assert set(run.scene.registered) == set(first.names[1:FIRST]) and largest_error(run, first.truth) < 0.01
     assert counts(run, "match_graph")["gone_photos"] == 1
     assert set(photo_names(out / "database.db").values()) == set(first.names[1:FIRST])
     assert first.names[0] not in json.dumps(json.loads((out / "scene.json").read_text()))
@@ -139,9 +134,7 @@ def test_a_replaced_photo_is_a_new_one_and_a_renamed_one_too(first, folder):
 def test_nothing_is_gone_on_from_with_other_settings(first, folder):
     photos, out = folder
     add(photos, first, 5, 6)
-
     run = reconstruct(photos, out, Settings.from_mapping(NO_REPORT | {"seed": 4}))
-
     assert "known_photos" in counts(run, "match_graph")  # features do not depend on the seed
     assert "known_pairs" not in counts(run, "view_graph") and "kept_cameras" not in counts(run, "intrinsics")
     assert counts(run, "scene")["mapper"] != "grown" and set(run.scene.registered) == set(first.names)
@@ -150,9 +143,7 @@ def test_nothing_is_gone_on_from_with_other_settings(first, folder):
 def test_all_is_done_afresh_where_that_is_asked_for(first, folder):
     photos, out = folder
     add(photos, first, 5, 6)
-
     run = reconstruct(photos, out, first="match_graph")
-
     assert "known_photos" not in counts(run, "match_graph") and counts(run, "scene")["mapper"] != "grown"
     assert set(photo_names(out / "database.db").items()) == set(enumerate(first.names, start=1))
 
@@ -161,21 +152,23 @@ class Killed(BaseException):
     """What no program catches."""
 
 
-@pytest.mark.parametrize("where", ["match_graph", "view_graph", "intrinsics", "scene"])
-def test_a_run_that_was_killed_goes_on_from_the_earlier_one(first, folder, monkeypatch, where):
-    photos, out = folder
-    add(photos, first, 5, 6)
-    name = {"match_graph": "wants_all_pairs", "view_graph": "fit_pairs", "intrinsics": "_summary",
-            "scene": "_finish_scene"}[where]  # fmt: skip
+def killed_in(monkeypatch, function, *arguments):
+    """A run that ends in a function of a stage."""
 
     def fail(*_, **__):
         raise Killed
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(f"sfm_app.stages.{where}.{name}", fail)
-        reconstruct(photos, out)
-    run = reconstruct(photos, out)
+        patch.setattr(f"sfm_app.stages.{function}", fail)
+        reconstruct(*arguments)
 
+
+@pytest.mark.parametrize(("where", "name"), [("match_graph", "wants_all_pairs"), ("intrinsics", "_summary")])
+def test_a_run_that_was_killed_goes_on_from_the_earlier_one(first, folder, monkeypatch, where, name):
+    photos, out = folder
+    add(photos, first, 5, 6)
+    killed_in(monkeypatch, f"{where}.{name}", photos, out)
+    run = reconstruct(photos, out)
     assert counts(run, "scene")["mapper"] == "grown" and set(run.scene.registered) == set(first.names)
     assert not (out / ".earlier").exists()
 
@@ -183,17 +176,10 @@ def test_a_run_that_was_killed_goes_on_from_the_earlier_one(first, folder, monke
 def test_photos_that_change_again_in_a_killed_run_are_told_from_the_finished_one(first, folder, monkeypatch):
     photos, out = folder
     add(photos, first, 5)
-
-    def fail(*_, **__):
-        raise Killed
-
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr("sfm_app.stages.scene._finish_scene", fail)
-        reconstruct(photos, out)
+    killed_in(monkeypatch, "scene._finish_scene", photos, out)
     add(photos, first, 6)
     (photos / first.names[0]).unlink()
     run = reconstruct(photos, out)
-
     assert set(run.scene.registered) == set(first.names[1:])
     assert counts(run, "match_graph")["known_photos"] == FIRST - 1
     assert counts(run, "scene")["mapper"] == "grown"
@@ -203,8 +189,6 @@ def test_a_damaged_earlier_model_is_not_gone_on_from(first, folder):
     photos, out = folder
     add(photos, first, 5, 6)
     (out / "sparse" / "points3D.bin").write_bytes(b"\0" * 100)
-
     run = reconstruct(photos, out)
-
     assert counts(run, "scene")["mapper"] != "grown" and set(run.scene.registered) == set(first.names)
     assert counts(run, "view_graph")["known_pairs"] == FIRST * (FIRST - 1) // 2

@@ -75,8 +75,7 @@ def to_utm(place):
 
 def assert_scale(found, true, within):
     error = abs(np.log(found["scale"] / true))
-    assert error < within
-    assert error < 3 * found["deviation"]
+    assert error < within and error < 3 * found["deviation"]
     assert found["deviation"] < 5 * within
 
 
@@ -96,8 +95,7 @@ def marks_file(measured, path, places, wrong=None):
 
 def test_two_markers_give_the_size(measured):
     found = read_scale(measured.out)
-    assert found["unit"] == "meter"
-    assert len(found["evidence"]) == 2
+    assert found["unit"] == "meter" and len(found["evidence"]) == 2
     assert_scale(found, true_similarity(measured).scale, within=0.002)
 
 
@@ -108,7 +106,6 @@ def test_points_are_written_in_meters_and_the_model_on_disk_is_kept(measured):
     own = np.array([point.xyz for point in pycolmap.Reconstruction(measured.out / "sparse").points3D.values()])
     at_a_point = KDTree(scale * own).query(written)[0] < 1e-5
     assert 0.7 < at_a_point.mean() < 1.0  # the others are corners of the drawn cameras
-
     (again_written,) = sfm_app.export_model(measured.out, target=measured.place / "again.ply", points=True)
     assert np.allclose(np.sort(trimesh.load(again_written).vertices, axis=0), np.sort(written, axis=0), atol=1e-5)
 
@@ -119,9 +116,7 @@ def test_a_distance_is_measured_in_meters(measured):
     scale = read_scale(measured.out)["scale"]
     a, b = (scale * to_world.inverse()(np.array(place)) for place in ((-0.7, 0.9, 0.7), (0.8, 0.6, 0.9)))
     found = sfm_app.measure_distance(measured.out, a, b)
-
-    assert found.metric
-    assert found.value == pytest.approx(np.linalg.norm([1.5, -0.3, 0.2]), rel=0.002)
+    assert found.metric and found.value == pytest.approx(np.linalg.norm([1.5, -0.3, 0.2]), rel=0.002)
     assert 0.0005 < found.deviation < 0.05
 
 
@@ -129,19 +124,16 @@ def test_a_finished_run_gives_arrays_in_meters(measured):
     again(measured, markers=f"{SIDE_M}m")
     run = sfm_app.read_run(measured.out)
     found = run.scene.arrays
-
     assert found.metric
     true = np.array([camera_center(measured.truth.cam_from_world[name]) for name in found.photos])
     assert umeyama(found.centers, true).scale == pytest.approx(1.0, abs=0.002)
-    assert len(found.points) == run.scene.points
-    assert "meters" in run._repr_html_()
+    assert len(found.points) == run.scene.points and "meters" in run._repr_html_()
 
 
 def test_only_what_depends_on_the_size_is_done_again(measured, monkeypatch):
     before = (measured.out / "manifest.json").read_text()
     monkeypatch.setattr(scene_stage, "make", None)  # nothing is mapped again
     again(measured, distances=[["0,0,0", "1,0,0", "2m"]])
-
     earlier, later = (json.loads(text)["stages"] for text in (before, (measured.out / "manifest.json").read_text()))
     assert {name for name in later if later[name] != earlier[name]} == {"scale"}
     assert read_scale(measured.out)["scale"] == pytest.approx(2.0)
@@ -151,9 +143,7 @@ def test_a_distance_that_contradicts_the_markers_is_named(measured):
     true = true_similarity(measured).scale
     again(measured, markers=f"{SIDE_M}m", distances=[["0,0,0", "0.2,0,0", f"{0.2 * true * 1.1}m"]])
     found = read_scale(measured.out)
-
-    assert len(found["contradictions"]) == 1
-    assert "the distance of" in found["contradictions"][0]
+    assert len(found["contradictions"]) == 1 and "the distance of" in found["contradictions"][0]
     assert "10 % larger" in found["contradictions"][0] or "9.9 % larger" in found["contradictions"][0]
     assert found["scale"] == pytest.approx(true, rel=0.002)
 
@@ -162,7 +152,6 @@ def test_control_points_give_size_and_place(measured, tmp_path):
     run = again(measured, control_points=str(marks_file(measured, tmp_path / "gcp_list.txt", GROUND[:5])))
     found = read_scale(measured.out)
     assert_scale(found, true_similarity(measured).scale, within=0.005)
-
     assert found["crs"] == "EPSG:32632"
     frame = Similarity(found["scale"], np.array(found["R"]), np.array(found["t"]))
     for name, pose in run.scene.cam_from_world.items():
@@ -175,7 +164,6 @@ def test_a_wrong_control_point_is_named_and_left_out(measured, tmp_path):
     path = marks_file(measured, tmp_path / "gcp_list.txt", GROUND, wrong={1: (0.1, -0.05, 0.2)})
     run = again(measured, control_points=str(path))
     counts = run.manifest["stages"]["scale"]["counts"]
-
     assert set(counts["control_points"]["wrong"]) == {"p1"}
     assert counts["control_points"]["wrong"]["p1"] == pytest.approx(0.23, abs=0.03)
     assert any("'p1' contradicts the others" in text for text in counts["problems"])

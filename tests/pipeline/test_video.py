@@ -51,8 +51,7 @@ def test_a_video_becomes_cameras_and_points(clip, tmp_path):
     found = json.loads(result.stdout)
     chosen = [int(path.stem.removeprefix("clip_")) for path in sorted((tmp_path / "out" / "frames").iterdir())]
     assert found["video"]["frames"] == FRAMES
-    assert found["video"]["chosen"] == found["photos"]["usable"] == len(chosen)
-    assert 6 <= len(chosen) <= 12
+    assert found["video"]["chosen"] == found["photos"]["usable"] == len(chosen) and 6 <= len(chosen) <= 12
     assert not [number for number in chosen if number % 7 == 3]
     assert len(set(chosen) & set(range(FRAMES - 4, FRAMES))) <= 1
     assert found["scene"]["registered"] == len(chosen)

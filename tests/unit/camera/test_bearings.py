@@ -3,22 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.camera import bearings as module
-from sfm_app.camera.bearings import (
-    RAY,
-    bearings,
-    corner_angle,
-    depths_along,
-    field_of_view_deg,
-    fold_angle,
-    fold_radius,
-    pixels_per_radian,
-    project,
-    radial_factor,
-    radius_deviation_px,
-    radius_px,
-    undistort,
-)
+from sfm_app.camera import bearings
 from sfm_app.camera.models import calibration_from_model, camera_matrix, panorama_matrix, rays
 from sfm_app.camera.projection import project_points
 from sfm_app.types import Calibration
@@ -35,41 +20,38 @@ STEP = 1e-4
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_a_bearing_is_seen_at_its_pixel(name: str) -> None:
-    lines = bearings(PIXELS, CAMERAS[name])
+    lines = bearings.bearings(PIXELS, CAMERAS[name])
     for length in (0.1, 7.0):
-        assert np.abs(project(length * lines[:, :3], CAMERAS[name]) - PIXELS).max() < 1e-9
-        assert np.allclose(depths_along(length * lines[:, :3], CAMERAS[name]), length)
+        assert np.abs(bearings.project(length * lines[:, :3], CAMERAS[name]) - PIXELS).max() < 1e-9
+        assert np.allclose(bearings.depths_along(length * lines[:, :3], CAMERAS[name]), length)
 
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_derivatives_agree_with_differences(name: str) -> None:
-    lines = bearings(PIXELS, CAMERAS[name])
+    lines = bearings.bearings(PIXELS, CAMERAS[name])
     for axis, columns in enumerate((slice(3, 6), slice(6, 9))):
-        moved = bearings(PIXELS + STEP * np.eye(2)[axis], CAMERAS[name])
+        moved = bearings.bearings(PIXELS + STEP * np.eye(2)[axis], CAMERAS[name])
         assert np.abs((moved - lines)[:, :3] / STEP - lines[:, columns]).max() < 1e-6
 
 
 def test_a_fisheye_looks_backwards() -> None:
     wide = Calibration(K, 800, 600, "test", True, projection="fisheye", fisheye=(0.0, 0.0, 0.0, 0.0))
     behind = np.array([[np.sin(1.9), 0.0, np.cos(1.9)]])
-    assert np.allclose(project(behind, wide), [[400.0 + 200.0 * 1.9, 300.0]])
-    assert np.allclose(bearings(project(behind, wide), wide)[:, :3], behind)
+    assert np.allclose(bearings.project(behind, wide), [[400.0 + 200.0 * 1.9, 300.0]])
+    assert np.allclose(bearings.bearings(bearings.project(behind, wide), wide)[:, :3], behind)
 
 
 def test_a_lens_that_folds_shows_nothing_beyond_its_fold() -> None:
     folding = Calibration(K, 800, 600, "test", True, projection="fisheye", fisheye=(-0.2, 0.0, 0.0, 0.0))
-    fold = fold_angle(folding)
+    fold = bearings.fold_angle(folding)
     assert 1.1 < fold < np.sqrt(1.0 / 0.6)
     for theta, seen in ((fold - 0.05, True), (fold + 0.05, False)):
-        assert np.isfinite(project(np.array([[np.sin(theta), 0.0, np.cos(theta)]]), folding)).all() == seen
+        assert np.isfinite(bearings.project(np.array([[np.sin(theta), 0.0, np.cos(theta)]]), folding)).all() == seen
 
 
-def test_a_perspective_camera_sees_nothing_behind_it() -> None:
-    assert np.isnan(project(np.array([[0.1, 0.2, -1.0]]), CAMERAS["perspective"])).all()
-
-
-def test_the_scale_of_a_perspective_camera_is_its_mean_focal() -> None:
-    assert pixels_per_radian(bearings(PIXELS, CAMERAS["perspective"])) == pytest.approx(205.0)
+def test_a_perspective_camera_sees_nothing_behind_it_and_its_scale_is_its_mean_focal() -> None:
+    assert np.isnan(bearings.project(np.array([[0.1, 0.2, -1.0]]), CAMERAS["perspective"])).all()
+    assert bearings.pixels_per_radian(bearings.bearings(PIXELS, CAMERAS["perspective"])) == pytest.approx(205.0)
 
 
 TERMS = np.array([-0.1, 0.02, 0.001, -0.002, 0.01, 0.02, -0.001, 0.001])
@@ -81,9 +63,7 @@ def test_undistortion_inverts_the_projection_of_bundle_adjustment(projection):
     points = np.random.default_rng(0).uniform([-0.8, -0.8, 1.0], [0.8, 0.8, 1.2], (200, 3))
     params = np.tile([1.0, 1.0, 0.0, 0.0, *TERMS], (200, 1))
     x = project_points(points, params, np.full(200, FAMILIES[projection])).x
-
-    w = undistort(x, TERMS, projection)
-
+    w = bearings.undistort(x, TERMS, projection)
     side = np.hypot(points[:, 0], points[:, 1])
     length = np.arctan2(side, points[:, 2]) if projection == "fisheye" else side / points[:, 2]
     assert np.abs(w - points[:, :2] * (length / side)[:, None]).max() < 1e-9
@@ -91,12 +71,11 @@ def test_undistortion_inverts_the_projection_of_bundle_adjustment(projection):
 
 def test_points_beyond_the_fold_lie_on_it():
     terms = np.array([-0.3, *[0.0] * 7])
-    fold = fold_radius(terms, "perspective")
-
+    fold = bearings.fold_radius(terms, "perspective")
     assert 0.95 < fold / np.sqrt(1.0 / 0.9) <= 1.0
-    w = undistort(np.array([[0.5, 0.0], [5.0, 0.0]]), terms, "perspective")
+    w = bearings.undistort(np.array([[0.5, 0.0], [5.0, 0.0]]), terms, "perspective")
     assert w[1, 0] == pytest.approx(fold, rel=1e-6)
-    assert w[0, 0] * float(radial_factor(w[:1, 0], terms, "perspective")[0]) == pytest.approx(0.5)
+    assert w[0, 0] * float(bearings.radial_factor(w[:1, 0], terms, "perspective")[0]) == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("projection", FAMILIES)
@@ -104,11 +83,10 @@ def test_points_beyond_the_fold_lie_on_it():
 def test_steps_end_where_more_of_them_change_nothing(projection, shifted, monkeypatch):
     terms = TERMS * ([1.0] * 8 if shifted else [1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
     points = np.random.default_rng(1).uniform(-1.5, 1.5, (500, 2))
-    monkeypatch.setattr(module, "OPTIONS", module.UndistortionOptions(precision=0.0))
-    exact = undistort(points, terms, projection)
+    monkeypatch.setattr(bearings, "OPTIONS", bearings.UndistortionOptions(precision=0.0))
+    exact = bearings.undistort(points, terms, projection)
     monkeypatch.undo()
-
-    assert np.abs(undistort(points, terms, projection) - exact).max() <= 1e-14
+    assert np.abs(bearings.undistort(points, terms, projection) - exact).max() <= 1e-14
 
 
 SIZE = (1000, 800)
@@ -130,43 +108,40 @@ def model(name, *params):
 )
 def test_the_curve_is_that_of_the_rays(camera):
     x = np.column_stack([np.linspace(500.0, 990.0, 40), np.full(40, 400.0)])
-    rays = bearings(x, camera)[:, RAY]
-
-    radius = radius_px(np.arctan2(rays[:, 0], rays[:, 2]), camera)
-
+    rays = bearings.bearings(x, camera)[:, bearings.RAY]
+    radius = bearings.radius_px(np.arctan2(rays[:, 0], rays[:, 2]), camera)
     assert np.abs(radius - (x[:, 0] - 500.0)).max() < 1e-6
 
 
 def test_a_lens_shows_nothing_behind_its_fold_or_behind_itself():
     barrel = model("SIMPLE_RADIAL", 500.0, 500.0, 400.0, -0.2)
-
-    assert np.isnan(radius_px(np.array([1.5, 1.6, 2.0]), barrel)).all()
-    assert np.isfinite(radius_px(np.array([2.0]), model("SIMPLE_FISHEYE", 200.0, 500.0, 400.0))).all()
-    assert radius_px(np.array([np.pi]), PANORAMA) == pytest.approx([500.0])
+    assert np.isnan(bearings.radius_px(np.array([1.5, 1.6, 2.0]), barrel)).all()
+    assert np.isfinite(bearings.radius_px(np.array([2.0]), model("SIMPLE_FISHEYE", 200.0, 500.0, 400.0))).all()
+    assert bearings.radius_px(np.array([np.pi]), PANORAMA) == pytest.approx([500.0])
 
 
 def test_the_field_counts_what_the_lens_shows():
-    assert field_of_view_deg(model("SIMPLE_PINHOLE", 500.0, 500.0, 400.0))[0] == pytest.approx(90.0)
-    assert field_of_view_deg(model("SIMPLE_FISHEYE", 500.0 / np.radians(60.0), 500.0, 400.0)) == pytest.approx(
-        (120.0, 96.0)
-    )
-    assert field_of_view_deg(model("SIMPLE_RADIAL", 500.0, 500.0, 400.0, -0.1))[0] > 95.0
-    assert field_of_view_deg(PANORAMA) == (360.0, 180.0)
+    assert bearings.field_of_view_deg(model("SIMPLE_PINHOLE", 500.0, 500.0, 400.0))[0] == pytest.approx(90.0)
+    fisheye = model("SIMPLE_FISHEYE", 500.0 / np.radians(60.0), 500.0, 400.0)
+    assert bearings.field_of_view_deg(fisheye) == pytest.approx((120.0, 96.0))
+    assert bearings.field_of_view_deg(model("SIMPLE_RADIAL", 500.0, 500.0, 400.0, -0.1))[0] > 95.0
+    assert bearings.field_of_view_deg(PANORAMA) == (360.0, 180.0)
     beside = Calibration(camera_matrix(500.0, 500.0, -100.0, 400.0), *SIZE, "given", True)
-    assert field_of_view_deg(beside)[0] == pytest.approx(np.degrees(np.arctan(2.2) - np.arctan(0.2)))
+    assert bearings.field_of_view_deg(beside)[0] == pytest.approx(np.degrees(np.arctan(2.2) - np.arctan(0.2)))
 
 
 def test_the_corner_is_the_farthest_one():
-    assert corner_angle(model("SIMPLE_PINHOLE", 500.0, 500.0, 400.0)) == pytest.approx(np.arctan(np.hypot(1.0, 0.8)))
-    assert corner_angle(model("SIMPLE_FISHEYE", 500.0, 0.0, 0.0)) == pytest.approx(np.hypot(2.0, 1.6))
+    assert bearings.corner_angle(model("SIMPLE_PINHOLE", 500.0, 500.0, 400.0)) == pytest.approx(
+        np.arctan(np.hypot(1.0, 0.8))
+    )
+    assert bearings.corner_angle(model("SIMPLE_FISHEYE", 500.0, 0.0, 0.0)) == pytest.approx(np.hypot(2.0, 1.6))
 
 
 def test_deviations_of_focal_and_k1_add_up():
     camera = Calibration(camera_matrix(500.0, 500.0, 500.0, 400.0), *SIZE, "x", True, spread={"fx": 5.0, "k1": 0.01})
     theta = np.array([np.pi / 4])
-
-    assert radius_deviation_px(theta, camera) == pytest.approx([np.hypot(5.0, 5.0)])
-    assert radius_deviation_px(theta, model("SIMPLE_PINHOLE", 500.0, 500.0, 400.0)) == pytest.approx([0.0])
+    assert bearings.radius_deviation_px(theta, camera) == pytest.approx([np.hypot(5.0, 5.0)])
+    assert bearings.radius_deviation_px(theta, model("SIMPLE_PINHOLE", 500.0, 500.0, 400.0)) == pytest.approx([0.0])
 
 
 RAY_K = camera_matrix(900.0, 850.0, 480.0, 330.0)
@@ -184,5 +159,4 @@ def test_rays_come_back_through_the_lens(radial):
 def test_what_lies_beyond_the_fold_of_a_lens_lies_on_it():
     x = np.column_stack([np.linspace(480, 960, 50), np.full(50, 330.0)])  # up to 0.53; r - r^3 never exceeds 0.385
     found = rays(x, RAY_K, -1.0)[:, 0]
-    assert np.all(np.diff(found[:30]) > 0)
-    assert found[-1] == pytest.approx(3**-0.5)
+    assert np.all(np.diff(found[:30]) > 0) and found[-1] == pytest.approx(3**-0.5)

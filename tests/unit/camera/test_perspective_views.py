@@ -50,8 +50,7 @@ def test_every_ray_is_in_one_of_few_views(rays, count):
     half = np.radians(0.5 * OPTIONS.most_field_deg + OPTIONS.overlap_deg)
     for view in views:
         np.testing.assert_allclose(view.R @ view.R.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(view.R) == pytest.approx(1.0)
-        assert view.K[0, 0] == view.K[1, 1] == 200.0
+        assert np.linalg.det(view.R) == pytest.approx(1.0) and view.K[0, 0] == view.K[1, 1] == 200.0
         assert max(view.width, view.height) < 2.0 * 200.0 * np.tan(half) * 1.35  # corners of a part reach farther
 
 

@@ -20,6 +20,7 @@ from sfm_app.demo import DemoResult, demo_lines
 from sfm_app.report.text import contradiction_lines, intrinsics_lines, intrinsics_summary, refined_text
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, CameraModel, Intrinsics, Scene
+from tests.unit.cli.test_terminal import LONG, check_text
 
 K = camera_matrix(500.0, 510.0, 480.0, 410.0)
 KNOWN = Calibration(
@@ -29,14 +30,8 @@ KNOWN = Calibration(
 )  # fmt: skip
 GUESS = Calibration(K, 1000, 800, "guess", False, "an orbit", held=("center",))
 REFINED = CameraModel("OPENCV", (501.0, 510.0, 480.0, 410.0, 0, 0, 0, 0), K, 1000, 800, {"fx": 0.754})
-SCALE = {
-    "unit": "meter",
-    "deviation_percent": 0.12,
-    "source": "marker a 1, marker a 2",
-    "contradictions": ["marker a 3 contradicts the 2 others"],
-    "problems": [],
-}
-LONG = "the photos contradict it: " + ", ".join(f"photo_{k:03}.jpg" for k in range(40))
+SCALE = {"unit": "meter", "deviation_percent": 0.12, "source": "marker a 1, marker a 2",
+         "contradictions": ["marker a 3 contradicts the 2 others"], "problems": []}  # fmt: skip
 
 
 def manifest(counts):
@@ -78,23 +73,12 @@ def long_run(finished):
     return replace(finished, calibration=guess, scene=scene, manifest=manifest(counts))
 
 
-def check_text(text, path=""):
-    """Check that no line is longer than 80 columns, but for a path, and that nothing is colored."""
-    assert "\x1b" not in text and text.strip()
-    assert [line for line in text.splitlines() if len(line) > 80 and not (path and path in line)] == []
-
-
 @pytest.mark.parametrize("lines_of", [run_lines, partial(outcome_lines, seconds=0.7)], ids=["all", "outcome"])
 @pytest.mark.parametrize("until", ["photos", "camera", "scene", "mesh"])
 def test_the_result_fits_into_80_columns(capsys, long_run, lines_of, until):
-    less = {
-        "photos": {"mesh_path": None, "scene": None, "calibration": None},
-        "camera": {"mesh_path": None, "scene": None},
-        "scene": {"mesh_path": None},
-        "mesh": {},
-    }
-    print_text(lines_of(replace(long_run, **less[until])))
-
+    products = ("calibration", "scene", "mesh_path")
+    missing = products[["photos", "camera", "scene", "mesh"].index(until) :]
+    print_text(lines_of(replace(long_run, **dict.fromkeys(missing))))
     check_text(capsys.readouterr().out, str(long_run.out))
 
 
@@ -104,13 +88,9 @@ def test_the_result_of_a_demo_fits_into_80_columns(capsys, scene):
     files = ["demo/model/report.html", "demo/model/model.glb", "demo/model/model.ply", f"demo-{scene}/model.png"]
     errors = (10.012, 0.005, 0.03, 0.017, 0.022, 99.5, 96.2)
     print_text(demo_lines(DemoResult(20, 19, truth, truth, truth, *errors, 199_999, [], 50.0, 130.0, files)))
-
     text = capsys.readouterr().out
     check_text(text)
     assert len(text.splitlines()) <= 7
-
-
-# --- the few lines that a user needs ---
 
 
 def test_the_outcome_is_result_accuracy_warnings_and_files(finished):
@@ -135,32 +115,26 @@ def test_stages_of_earlier_runs_are_told_apart(finished):
 def test_only_the_first_missing_photos_are_named(finished):
     scene = replace(finished.scene, unregistered={f"{k:02}.jpg": "no match" for k in range(40)})
     lines = outcome_lines(replace(finished, scene=scene), 250.0)
-
     assert sum("not placed" in line for line in lines) == 2
-    assert any(line.strip() == "and 38 more photos; -v prints them" for line in lines)
-    assert len(lines) < 20
+    assert any(line.strip() == "and 38 more photos; -v prints them" for line in lines) and len(lines) < 20
 
 
 @pytest.mark.parametrize(("mapped", "text"), [(True, "all photos together do"), (False, "this is a guess: an orbit")])
 def test_a_camera_that_pairs_do_not_determine_is_marked(finished, mapped, text):
     run = replace(finished, calibration=Intrinsics({"one": GUESS}), scene=finished.scene if mapped else None)
-
     [line] = [line.strip() for line in outcome_lines(run, 250.0) if "pairs of photos" in line]
-
     assert line == f"pairs of photos do not determine it; {text}"
 
 
 def test_a_camera_of_missing_photos_is_not_shown(finished):
     guess = Calibration(K, 640, 480, "guess", False, "0 usable pairs")
     text = "\n".join(outcome_lines(replace(finished, calibration=Intrinsics({"two": guess, "one": KNOWN})), 250.0))
-
     assert "camera      focal 501.0" in text and "0 usable pairs" not in text
 
 
 def test_only_the_first_cameras_are_shown(finished):
     cameras = Intrinsics({f"camera {k}": KNOWN for k in range(5)})
     lines = outcome_lines(replace(finished, calibration=cameras, scene=None), 250.0)
-
     assert sum(line.startswith("camera      camera ") for line in lines) == 3
     assert "            and 2 more cameras" in lines
 
@@ -169,7 +143,6 @@ def test_an_unknown_scale_names_the_remedy(finished):
     stages = {**finished.manifest["stages"], "scale": {"counts": {**SCALE, "unit": ""}, "seconds": 1.0}}
     lines = outcome_lines(replace(finished, manifest={"stages": stages}), 250.0)
     [size] = [line for line in lines if line.startswith("size")]
-
     assert "measure it in the report" in size and len(size) <= 80
 
 
@@ -182,12 +155,8 @@ def test_a_run_of_some_stages_has_its_own_headline(finished):
     assert outcome_lines(replace(earlier, scene=None, calibration=None), 250.0)[0] == "4 usable photos."
 
 
-# --- all figures ---
-
-
 def test_every_parameter_stands_beside_its_deviation():
     first, *others = intrinsics_lines(Intrinsics({"one": KNOWN}, photos={1: "a.jpg", 2: "b.jpg", 3: "c.jpg"}))
-
     assert first == "camera      fx 500.0 +- 1.2  fy 510.0 +- 2.0  cx 480.0 +- 3.0  cy 410.0 +- 4.0 px"
     assert [line.strip() for line in others] == [
         "sees 93 degrees from left to right, 78 from top to bottom",
@@ -201,16 +170,13 @@ def test_fisheyes_and_panoramas_have_their_field_of_view():
     wide = camera_matrix(500.0 / np.radians(60.0), 500.0 / np.radians(60.0), 500.0, 400.0)
     fisheye = Calibration(wide, 1000, 800, "lens", True, projection="fisheye", fisheye=(0.0, 0.0, 0.0, 0.0))
     panorama = Calibration(panorama_matrix((1000, 500)), 1000, 500, "panorama", True, projection="equirectangular")
-
     lines = [line.strip() for line in intrinsics_lines(Intrinsics({"one": fisheye, "two": panorama}))]
-
     assert lines[1] == "a fisheye that sees 120 degrees from left to right, 96 from top to bottom"
     assert lines[2:] == ["camera      two: 360-degree panoramas, 1000 x 500 px"]
 
 
 def test_a_given_camera_is_marked():
     lines = intrinsics_lines(Intrinsics({"one": replace(KNOWN, method="kept"), "two": replace(KNOWN, method="given")}))
-
     assert [line.strip() for line in lines if "as given" in line] == ["as given, and kept", "as given, to be refined"]
 
 
@@ -219,7 +185,6 @@ def test_refined_cameras_have_their_field_of_view():
     fisheye = CameraModel("OPENCV_FISHEYE", (focal, focal, 500, 400, 0, 0, 0, 0), K, 1000, 800, {"fx": 1.0})
     panorama = CameraModel("EQUIRECTANGULAR", (1000.0, 500.0), K, 1000, 500)
     plain = CameraModel("OPENCV", (500, 510, 480, 410, 0, 0, 0, 0), K, 1000, 800)
-
     assert refined_text(fisheye).endswith("; a fisheye that sees 120 degrees from left to right, 96 from top to bottom")
     assert refined_text(panorama) == "360-degree panoramas, 1000 x 500 px"
     assert refined_text(plain) == "fx 500.0  fy 510.0  cx 480.0  cy 410.0 px"
@@ -227,7 +192,6 @@ def test_refined_cameras_have_their_field_of_view():
 
 def test_a_warning_of_a_contradicted_camera_has_both_numbers():
     counts = {"given_cameras": {"a": {"contradicted": [{"text": "focal length: given 9 px, the photos say 8 px"}]}}}
-
     assert contradiction_lines(counts) == [
         "beware: the photos contradict the given camera a: focal length: given 9 px, the photos say 8 px"
     ]
@@ -239,7 +203,6 @@ def test_a_warning_of_a_contradicted_camera_has_both_numbers():
 
 def test_a_guess_is_marked_right_after_its_figures():
     lines = intrinsics_lines(Intrinsics({"one": GUESS, "two": KNOWN}))
-
     assert lines[0].startswith("camera      one: fx 500.0  fy 510.0")
     assert lines[1].strip() == "these photos do not determine it (an orbit): a guess"
     assert sum(line.startswith("camera ") for line in lines) == 2
@@ -248,19 +211,14 @@ def test_a_guess_is_marked_right_after_its_figures():
 def test_each_of_several_cameras_names_its_photos():
     cameras = {**{f"{key}.jpg": "one" for key in range(6)}, "z.jpg": "one #2"}
     lines = [line.strip() for line in intrinsics_lines(Intrinsics({"one": KNOWN, "one #2": KNOWN}, cameras))]
-
-    assert "took 0.jpg, 1.jpg, 2.jpg, 3.jpg and 2 more" in lines
-    assert "took z.jpg" in lines
+    assert "took 0.jpg, 1.jpg, 2.jpg, 3.jpg and 2 more" in lines and "took z.jpg" in lines
 
 
 def test_json_has_every_figure_of_a_camera():
     camera = json.loads(json.dumps(intrinsics_summary(Intrinsics({"one": KNOWN}))))["one"]
-
     assert camera["field_of_view_deg"] == pytest.approx([93.27, 78.07], abs=0.01)
-    changed = ("field_of_view_deg", "key_pairs")
-    assert {k: v for k, v in camera.items() if k not in changed} == {
-        k: v for k, v in KNOWN.to_dict().items() if k not in changed
-    }
+    changed = dict.fromkeys(("field_of_view_deg", "key_pairs"))
+    assert camera | changed == KNOWN.to_dict() | changed
     assert (camera["radial"], camera["spread"]["k1"], camera["held"]) == (-0.05, 0.01, ["aspect"])
     assert (camera["identifiable"], camera["reason"], camera["key_pairs"][0]) == (True, "", ["1", "2"])
 
@@ -269,11 +227,8 @@ def test_refined_cameras_stand_with_their_deviations(tmp_path):
     deviations = {"fx": 0.75, "fy": 1.5, "cx": 2.0, "cy": 2.5, "k1": 0.01}
     camera = CameraModel("OPENCV", (500.0, 510.0, 480.0, 410.0, -0.05, 0, 0, 0), K, 1000, 800, deviations, ("center",))
     run = Run(tmp_path, None, Scene(tmp_path, {}, {}, {"one": camera}, 10, 20, 0.3), None, None, {})
-
-    assert any(
-        line.strip() == "camera refined: fx 500.0 +- 0.8  fy 510.0 +- 1.5  cx 480.0 +- 2.0  cy 410.0 +- 2.5 px"
-        for line in run_lines(run)
-    )
+    line = "camera refined: fx 500.0 +- 0.8  fy 510.0 +- 1.5  cx 480.0 +- 2.0  cy 410.0 +- 2.5 px"
+    assert line in map(str.strip, run_lines(run))
     summary = json.loads(json.dumps(run_summary(run)))["scene"]["cameras"]["one"]
     assert summary["deviations"] == deviations and summary["determined"] == ["center"]
     assert summary["K"] == K.tolist() and summary["params"][4] == -0.05
@@ -283,19 +238,11 @@ def test_model_files_stand_with_their_sizes_the_one_to_open_first(tmp_path):
     sizes = {"model.ply": 2_340_000, "model.glb": 4_000, "points.ply": 10, "points.glb": 20}
     for name in ("model.ply", "model.glb", "points.glb"):
         (tmp_path / name).write_bytes(bytes(sizes[name]))
+    points, models = ({name: sizes[name] for name in sizes if name[0] == first} for first in "pm")
     counts = {
-        "scale": {
-            "bytes": {name: sizes[name] for name in ("points.ply", "points.glb")},
-            "unit": "arbitrary",
-            "contradictions": [],
-            "problems": [],
-        },
+        "scale": {"bytes": points, "unit": "arbitrary", "contradictions": [], "problems": []},
         "mesh": {"triangles": 7},
-        "files": {
-            "bytes": {name: sizes[name] for name in ("model.ply", "model.glb")},
-            "pages_px": [[4096, 2048], [512, 512]],
-            "jpeg_quality": 90,
-        },
+        "files": {"bytes": models, "pages_px": [[4096, 2048], [512, 512]], "jpeg_quality": 90},
     }
     scene = Scene(tmp_path, {}, {}, {}, 10, 20, 0.3)
     run = Run(tmp_path, None, scene, None, tmp_path / "model.glb", manifest(counts))
@@ -305,14 +252,9 @@ def test_model_files_stand_with_their_sizes_the_one_to_open_first(tmp_path):
     assert lines[start + 1 : start + 3] == [f"{tmp_path}/model.glb  4 kB", f"{tmp_path}/model.ply  2.3 MB"]
     assert lines[start - 2] == f"points and cameras: {tmp_path}/points.glb  20 bytes"
     assert lines[-1] == "seconds     scale 60.0, mesh 60.0, files 60.0; total 180.0"
-    summary = run_summary(run)
-    assert [summary[part]["files"] for part in ("scene", "mesh")] == [
-        [f"{tmp_path}/points.glb"],
-        [f"{tmp_path}/model.glb", f"{tmp_path}/model.ply"],
-    ]
+    scene, mesh = (run_summary(run)[part]["files"] for part in ("scene", "mesh"))
+    assert scene == [f"{tmp_path}/points.glb"] and mesh == [f"{tmp_path}/model.glb", f"{tmp_path}/model.ply"]
 
-
-# --- next commands ---
 
 PHOTOS, OUT = Path("my photos"), Path("out")
 MODEL = Run(OUT, None, None, None, OUT / "model.glb", {})
@@ -320,19 +262,16 @@ MODEL = Run(OUT, None, None, None, OUT / "model.glb", {})
 
 def test_next_commands_can_be_copied():
     lines = run_steps(MODEL, PHOTOS, None, Settings())
-
     assert lines[0].startswith("next        sfm-app view out")
     assert lines[1].startswith("            sfm-app run 'my photos' --quality high")
     assert lines[2].startswith("            sfm-app export out --format obj")
-    assert len(lines) == 3 and max(map(len, lines)) <= 80
-    assert len({line.rindex("  ") for line in lines}) == 1
+    assert len(lines) == 3 and max(map(len, lines)) <= 80 and len({line.rindex("  ") for line in lines}) == 1
     assert "sfm-app run 'my photos' -o out --quality high" in "\n".join(run_steps(MODEL, PHOTOS, OUT, Settings()))
     assert {"--quality", "-o"} <= {flag for parameter in commands.run.params for flag in parameter.opts}
 
 
 def test_long_commands_have_their_purpose_below():
     lines = run_steps(MODEL, Path("a" * 60), None, Settings())
-
     assert len(lines) == 6 and all(line.startswith("              ") for line in lines[1::2])
     assert not any(line.startswith("              ") for line in lines[::2])
 
@@ -347,7 +286,6 @@ def test_the_next_commands_depend_on_the_run():
 @pytest.mark.parametrize(("scene", "other"), [("courtyard", "statue"), ("statue", "fisheye")])
 def test_after_a_demo_come_another_one_and_own_photos(scene, other):
     lines = demo_steps(MODEL, scene)
-
     assert "sfm-app view out" in lines[0] and f"sfm-app demo --scene {other}" in lines[1]
     assert "sfm-app run PHOTOS" in lines[2] and max(map(len, lines)) <= 80
 
@@ -359,6 +297,5 @@ def test_next_commands_are_printed_on_a_terminal_only(monkeypatch, finished, fla
     monkeypatch.setattr("sfm_app.reconstruct", lambda *_, **__: finished)
     monkeypatch.setattr(commands, "sys", SimpleNamespace(stdout=SimpleNamespace(isatty=lambda: terminal)))
     result = CliRunner().invoke(main, ["run", "photos", "-o", "out", *flags])
-
     assert result.exit_code == 0 and result.stdout.startswith("A model of 2 of 4 photos")
     assert ("\nnext        sfm-app view" in result.stdout) is printed

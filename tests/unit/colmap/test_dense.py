@@ -9,7 +9,6 @@ import trimesh
 from PIL import Image
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.database import create_database, read_match_graph
 from sfm_app.colmap.dense import (
     MASKED,
     DenseStore,
@@ -24,14 +23,14 @@ from sfm_app.colmap.dense import (
     write_fusion_views,
     write_maps,
 )
-from sfm_app.colmap.features import SiftSettings, find_and_match
 from sfm_app.colmap.surface import FUSED, fuse, open_points, poisson_surface, positions, simplify
 from sfm_app.errors import BackendError
 from sfm_app.photos.masks import save_mask
 from sfm_app.progress import SilentProgress
-from sfm_app.settings import MatchSettings
 from sfm_app.stereo import DepthEstimate, DepthMap
-from sfm_app.types import Photo, PhotoSet, Surface
+from sfm_app.types import Surface
+
+pytestmark = pytest.mark.slow
 
 NORMAL = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
 DISTANCE = 5.0
@@ -76,10 +75,8 @@ def workspace(tmp_path_factory):
     return place / "dense", views
 
 
-@pytest.mark.slow
 def test_views_are_those_of_the_model(workspace):
     dense, views = workspace
-
     assert [view.name for view in views] == ["1.png", "2.png", "3.png"]
     np.testing.assert_allclose(views[0].center, [-0.4, 0.04, 0], atol=1e-12)
     np.testing.assert_allclose(views[0].K, [[110, 0, 63], [0, 105, 41], [0, 0, 1]])
@@ -88,7 +85,6 @@ def test_views_are_those_of_the_model(workspace):
     np.testing.assert_allclose(views[1].points @ NORMAL, DISTANCE, atol=1e-9)
 
 
-@pytest.mark.slow
 def test_fused_points_lie_on_the_plane_and_face_the_cameras(workspace):
     dense, _ = workspace
 
@@ -105,7 +101,6 @@ def test_fused_points_lie_on_the_plane_and_face_the_cameras(workspace):
     np.testing.assert_allclose(normals, np.broadcast_to(-NORMAL, normals.shape), atol=1e-3)
 
 
-@pytest.mark.slow
 def test_maps_come_back_as_they_were(workspace):
     dense, views = workspace
     rng = np.random.default_rng(0)
@@ -113,14 +108,11 @@ def test_maps_come_back_as_they_were(workspace):
     maps = DepthMap(rng.uniform(1, 2, (90, 120)).astype(np.float32), rng.normal(size=(90, 120, 3)).astype(np.float32))
     store = DenseStore(dense)
     assert not store.has(view, "geometric")
-
     write_maps(dense, view, maps)
-
     np.testing.assert_array_equal(read_depth(dense, view, "geometric"), maps.depth)
     assert (store.has(view, "geometric"), store.has(view, "photometric")) == (True, False)
 
 
-@pytest.mark.slow
 def test_estimates_come_and_go(workspace):
     dense, views = workspace
     store, depth = DenseStore(dense), np.full((90, 120), 3.0, np.float32)
@@ -140,37 +132,31 @@ def test_estimates_come_and_go(workspace):
 
     drop_estimates(dense, views)
 
-    assert not store.has(views[0], "photometric")
-    assert not list(dense.rglob("*.photometric*"))
+    assert not store.has(views[0], "photometric") and not list(dense.rglob("*.photometric*"))
     assert store.has(views[0], "geometric")
 
 
-@pytest.mark.slow
 def test_a_map_appears_complete_or_not_at_all(workspace, monkeypatch):
     dense, views = workspace
     store, view = DenseStore(dense), replace(views[0], name="killed.png")
-    monkeypatch.setattr("pathlib.Path.replace", interrupt)
 
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pathlib.Path.replace", interrupt)
     with pytest.raises(KeyboardInterrupt):
         store.write_maps(view, DepthMap(np.ones((90, 120), np.float32), np.ones((90, 120, 3), np.float32)))
 
     assert not store.has(view, "geometric")
 
 
-def interrupt(*_):
-    raise KeyboardInterrupt
-
-
-@pytest.mark.slow
 def test_the_box_cuts_the_points(workspace):
     dense, _ = workspace
-
     fuse(dense, 2, np.array([[0.0, -50, -50], [50, 50, 50]]), dense / FUSED)
     assert positions(open_points(dense / FUSED))[:, 0].min() >= 0
 
 
-@pytest.mark.slow
-def test_the_surface_has_the_shape_of_the_points(workspace):
+def test_the_surface_has_the_shape_of_the_points_whatever_came_before(workspace):
     dense, _ = workspace
     fuse(dense, 3, BOX, dense / FUSED)
 
@@ -179,8 +165,11 @@ def test_the_surface_has_the_shape_of_the_points(workspace):
     inside = np.all(np.abs(surface.vertices[:, :2]) < 1, axis=1) & (np.abs(surface.vertices @ NORMAL - DISTANCE) < 0.3)
     assert np.count_nonzero(inside) > 100
     assert np.percentile(np.abs(surface.vertices[inside] @ NORMAL - DISTANCE), 90) < 0.02
-    assert surface.colors.shape == surface.vertices.shape
-    assert not (dense / "poisson.ply").exists()
+    assert surface.colors.shape == surface.vertices.shape and not (dense / "poisson.ply").exists()
+    poisson_surface(dense, 2)
+    again = poisson_surface(dense, 6)
+    np.testing.assert_array_equal(again.vertices, surface.vertices)
+    np.testing.assert_array_equal(again.faces, surface.faces)
 
 
 def wavy(size: int) -> Surface:
@@ -194,63 +183,40 @@ def wavy(size: int) -> Surface:
     return Surface(vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]), colors)
 
 
-@pytest.mark.slow
-def test_a_surface_does_not_depend_on_those_before_it(workspace):
-    dense, _ = workspace
-    fuse(dense, 3, BOX, dense / FUSED)
-
-    before, _, after = (poisson_surface(dense, depth) for depth in (6, 2, 6))
-
-    np.testing.assert_array_equal(after.vertices, before.vertices)
-    np.testing.assert_array_equal(after.faces, before.faces)
-
-
-@pytest.mark.slow
 def test_simplification_spares_what_is_curved_and_keeps_borders_and_colors(tmp_path):
     fine = wavy(40)
-
     found = simplify(fine, len(fine.faces) // 5, 0.0, tmp_path)
-
     assert 0.15 * len(fine.faces) < len(found.faces) <= 0.2 * len(fine.faces)
     middles = found.vertices[found.faces].mean(axis=1)[:, 0]
     assert np.count_nonzero(middles > 0.5) > 10 * np.count_nonzero(middles < 0.5)
     np.testing.assert_allclose(
         [found.vertices.min(axis=0)[:2], found.vertices.max(axis=0)[:2]], [[0, 0], [1, 1]], atol=0.01
     )
-    assert np.all(np.abs(found.colors.astype(int) - [200, 100, 50]) <= 1)
-    assert not list(tmp_path.iterdir())
+    assert np.all(np.abs(found.colors.astype(int) - [200, 100, 50]) <= 1) and not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("max_error", [3e-3, 1e-2])
 def test_simplification_by_error_stops_where_it_would_move_the_surface(tmp_path, max_error):
     fine = wavy(40)
-
     found = simplify(fine, len(fine.faces), max_error, tmp_path)
     fewer = simplify(fine, len(found.faces) // 2, max_error, tmp_path)
     threaded = simplify(fine, len(found.faces) // 2, max_error, tmp_path, threads=2)
-
     closest = trimesh.proximity.closest_point_naive(trimesh.Trimesh(found.vertices, found.faces), fine.vertices)[1]
-    assert 0.05 * max_error < closest.max() < 2 * max_error
-    assert 20 < len(found.faces) < 0.5 * len(fine.faces)
+    assert 0.05 * max_error < closest.max() < 2 * max_error and 20 < len(found.faces) < 0.5 * len(fine.faces)
     assert 0.7 * len(found.faces) // 2 < len(fewer.faces) <= len(found.faces) // 2
     np.testing.assert_array_equal(threaded.vertices, fewer.vertices)
     np.testing.assert_array_equal(threaded.faces, fewer.faces)
 
 
-@pytest.mark.slow
 def test_points_in_one_spot_give_a_surface_without_triangles(tmp_path):
     header = "ply\nformat ascii 1.0\nelement vertex 120\n"
     header += "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
     header += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
     (tmp_path / FUSED).write_text(header + "1 1 1 0 0 1 9 9 9\n" * 120)
-
     surface = poisson_surface(tmp_path, 2)
-
     assert (surface.vertices.shape, surface.faces.shape, surface.colors.shape) == ((0, 3), (0, 3), (0, 3))
 
 
-@pytest.mark.slow
 def test_missing_inputs_are_backend_errors(tmp_path, workspace):
     with pytest.raises(BackendError, match="undistorting photos"):
         undistort(tmp_path / "none", tmp_path, tmp_path / "dense", 100, 1, SilentProgress())
@@ -300,26 +266,6 @@ def dense(place, tmp_path):
     return tmp_path, {view.name: view for view in views}
 
 
-@pytest.mark.slow
-def test_no_keypoint_lies_in_what_is_masked(place, tmp_path):
-    """The photos are in the database before features are looked for, as in every run."""
-    root, used = place
-    photos = PhotoSet(root / "photos", tuple(Photo(name, *SIZE, "g") for name in NAMES))
-    found = {}
-    for masks in (None, root / "masks"):
-        database = tmp_path / f"{masks is None}.db"
-        create_database(database, photos)
-        find_and_match(database, SiftSettings(root / "photos", masks, MatchSettings()), NAMES, 1, SilentProgress())
-        graph = read_match_graph(database, photos)
-        found[masks] = {graph.images[key].name: np.floor(at).astype(int) for key, at in graph.keypoints.items()}
-
-    for name in NAMES:
-        whole, kept = (used[name][at[:, 1], at[:, 0]] for at in (found[None][name], found[root / "masks"][name]))
-        assert kept.all()
-        assert len(kept) == np.count_nonzero(whole) > 20
-    assert len(found[None]["1.png"]) > 1.5 * len(found[root / "masks"]["1.png"])
-
-
 def test_masks_are_undistorted_as_photos_are(place, dense):
     root, used = place
     model = pycolmap.Reconstruction(root / "sparse")
@@ -344,12 +290,10 @@ def test_without_masks_all_is_used(place, tmp_path):
     undistort(root / "sparse", root / "photos", tmp_path, 120, 1, SilentProgress())
     view = read_views(tmp_path)[0]
     depth = np.full((view.height, view.width), 3.0, np.float32)
-
     assert used_pixels(tmp_path, view) is None
     DenseStore(tmp_path).write_estimate(view, DepthEstimate(depth, depth / 4))
     write_maps(tmp_path, view, DepthMap(depth, np.zeros((*depth.shape, 3), np.float32)))
     mask_depths(tmp_path, view)
-
     assert (DenseStore(tmp_path).read_estimate(view).depth == 3).all()
     assert (read_depth(tmp_path, view, "geometric") == 3).all()
 
@@ -390,5 +334,4 @@ def test_nothing_is_fused_from_what_is_masked(dense):
 
     at = (points @ view.R.T + view.t) @ view.K.T
     col, row = np.rint(at[:, :2] / at[:, 2:]).astype(int).T
-    assert len(points) == np.count_nonzero(used)
-    assert used[row, col].all()
+    assert len(points) == np.count_nonzero(used) and used[row, col].all()

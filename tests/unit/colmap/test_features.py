@@ -85,8 +85,7 @@ def test_chunks_give_what_colmap_gives_for_all_at_once(made, tmp_path):
     for chunk in reversed(chunks(list(names.values()), 20, 1)):
         found = find_in_chunk(inputs, chunk)
         enter_rows(database, found.path, FEATURES)
-        assert found.count == len(chunk)
-        assert not found.path.exists()
+        assert found.count == len(chunk) and not found.path.exists()
     assert photos_without_features(database) == {}
 
     inputs, pairs = inputs_of(made, database, tmp_path / "matches"), exhaustive_pairs(sorted(names))
@@ -102,13 +101,9 @@ def test_chunks_give_what_colmap_gives_for_all_at_once(made, tmp_path):
 def test_a_process_of_its_own_matches_the_same(made, tmp_path):
     inputs, pairs = inputs_of(made, made / "whole.db", tmp_path / "matches"), [(1, 2), (4, 1), (3, 5)]
     counted = Counted()
-
     here, apart = match_chunk(inputs, pairs), match_chunk_apart(inputs, ProcessGroup(), counted, pairs)
-
-    assert (here.count, apart.count) == (3, 0)
-    assert here.in_force == apart.in_force
-    assert rows_of(here.path) == rows_of(apart.path)
-    assert len(rows_of(apart.path)) == 3
+    assert (here.count, apart.count) == (3, 0) and here.in_force == apart.in_force
+    assert rows_of(here.path) == rows_of(apart.path) and len(rows_of(apart.path)) == 3
     assert counted.steps == 3
 
 
@@ -116,10 +111,8 @@ def test_a_process_that_is_stopped_leaves_nothing(made, tmp_path):
     inputs, group = inputs_of(made, made / "whole.db", tmp_path / "matches"), ProcessGroup()
     before = sorted(path.name for path in inputs.folder.iterdir())
     group.stop()
-
     with pytest.raises(BackendError, match="killed"):
         match_chunk_apart(inputs, group, SilentProgress(), [(1, 2)])
-
     assert sorted(path.name for path in inputs.folder.iterdir()) == before
 
 
@@ -137,8 +130,7 @@ def test_every_pair_is_listed_once(count):
 def test_chunks_keep_all_workers_busy():
     assert [len(part) for part in chunks(range(11), 8, 2)] == [6, 5]
     assert [len(part) for part in chunks(range(100), 8, 2)] == [8] * 12 + [4]
-    assert [len(part) for part in chunks(range(90), 40, 2)] == [23, 23, 23, 21]
-    assert chunks([], 8, 2) == []
+    assert [len(part) for part in chunks(range(90), 40, 2)] == [23, 23, 23, 21] and chunks([], 8, 2) == []
 
 
 SIZE = 320, 240
@@ -175,19 +167,13 @@ def find(place, database, **options):
     return {graph.images[key].name: at for key, at in graph.keypoints.items()}
 
 
-def as_set(keypoints):
-    return {tuple(row) for row in keypoints.tolist()}
-
-
 @pytest.mark.slow
 def test_only_photos_that_show_little_are_enlarged(place, tmp_path):
     own = find(place, tmp_path / "own.db", enlarge_below=0)
     enlarged = find(place, tmp_path / "enlarged.db", enlarge_below=100_000)
     between = (len(own[POOR]) + len(own[RICH])) // 2
     found = find(place, tmp_path / "between.db", enlarge_below=between)
-
-    assert 20 < len(own[POOR]) < 0.5 * len(own[RICH])
-    assert len(enlarged[POOR]) > len(own[POOR])
+    assert 20 < len(own[POOR]) < 0.5 * len(own[RICH]) and len(enlarged[POOR]) > len(own[POOR])
     assert len(enlarged[RICH]) > len(own[RICH])
     np.testing.assert_array_equal(found[RICH], own[RICH])
     np.testing.assert_array_equal(found[POOR], enlarged[POOR])
@@ -203,12 +189,3 @@ def test_what_a_killed_run_has_found_stays(place, tmp_path):
     assert first.keys() == again.keys() == {RICH, POOR, EMPTY}
     for name, keypoints in first.items():
         np.testing.assert_array_equal(again[name], keypoints)
-
-
-@pytest.mark.slow
-def test_a_photo_has_no_more_features_than_asked_for(place, tmp_path):
-    own = find(place, tmp_path / "own.db", enlarge_below=0)
-    cut = find(place, tmp_path / "cut.db", enlarge_below=0, max_features=100)
-    assert len(own[RICH]) > 150
-    assert len(cut[RICH]) == 100
-    assert {tuple(row) for row in cut[RICH].tolist()} <= {tuple(row) for row in own[RICH].tolist()}

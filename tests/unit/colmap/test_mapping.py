@@ -19,14 +19,9 @@ TWO_FOCALS = ("OPENCV", [900.0, 800, 500, 400, 0, 0, 0, 0])
 NEVER, CANCELLED = SimpleNamespace(is_cancelled=False), SimpleNamespace(is_cancelled=True)
 
 
+# calibration knows more than the first few photos say, and four terms run wild
 @pytest.mark.parametrize(
-    ("cameras", "sought"),
-    [
-        ([UNKNOWN, UNKNOWN], True),
-        ([KNOWN], False),  # calibration knows more than the first few photos say
-        ([TWO_FOCALS], False),  # four terms run wild
-        ([UNKNOWN, KNOWN], False),
-    ],
+    ("cameras", "sought"), [([UNKNOWN] * 2, True), ([KNOWN], False), ([TWO_FOCALS], False), ([UNKNOWN, KNOWN], False)]
 )
 def test_mapping_seeks_the_lens_only_where_nothing_is_known_about_it(tmp_path, monkeypatch, cameras, sought):
     start = pycolmap.Reconstruction()
@@ -36,29 +31,17 @@ def test_mapping_seeks_the_lens_only_where_nothing_is_known_about_it(tmp_path, m
     seen = []
 
     def grow(database, photos, found, options, **_):
-        seen.append(options.ba_refine_extra_params)
+        seen.append((options.ba_refine_extra_params, options.constant_cameras))
         return {0: start}
 
     monkeypatch.setattr(mapping.pycolmap, "incremental_mapping", grow)
     place = tmp_path / "database.db", tmp_path, start, tmp_path / "scratch"
 
-    found = mapping.map_incrementally(*place, mapping.incremental_options(0), lambda: None, NEVER)
-
-    assert found is start
-    assert seen == [sought]
-
-
-def test_kept_cameras_are_constant_for_colmap(tmp_path, monkeypatch):
-    seen = []
-    monkeypatch.setattr(
-        mapping.pycolmap, "incremental_mapping", lambda *given, **_: seen.append(given[3].constant_cameras) or {}
-    )
-    place = tmp_path / "database.db", tmp_path, pycolmap.Reconstruction(), tmp_path / "scratch"
-
     for kept in ({2, 3}, ()):
-        mapping.map_incrementally(*place, mapping.incremental_options(0, kept=kept), lambda: None, NEVER)
+        found = mapping.map_incrementally(*place, mapping.incremental_options(0, kept=kept), lambda: None, NEVER)
+        assert found is start
 
-    assert seen == [{2, 3}, set()]
+    assert seen == [(sought, {2, 3}), (sought, set())], "kept cameras are constant for COLMAP"
 
 
 @pytest.fixture(scope="module")
@@ -116,33 +99,26 @@ def test_all_photos_at_once_give_the_true_model_the_same_bytes_twice(synthetic, 
 def test_only_the_photos_asked_for_are_placed_and_of_none_comes_nothing(synthetic):
     place, true = synthetic
     names = sorted(image.name for image in true.images.values())[:3]
-
     model = mapped_globally(place, names)
-
     assert sorted(image.name for image in model.images.values() if image.has_pose) == names
     assert mapped_globally(place, ["no such photo"]) is None
 
 
 def test_a_cancelled_token_stops_the_mapper(synthetic):
     place, true = synthetic
-
     assert mapped_globally(place, [image.name for image in true.images.values()], CANCELLED) is None
-
     assert [path.name for path in place.iterdir()] == ["database.db"]
 
 
 def test_what_colmap_raises_in_its_process_is_raised_here(tmp_path):
     (tmp_path / "database.db").write_bytes(b"no database at all")
-
     with pytest.raises(BackendError, match=r"all photos at once: .*No registered database factory"):
         mapped_globally(tmp_path, ["any"])
-
     assert [path.name for path in tmp_path.iterdir()] == ["database.db"]
 
 
 def test_options_are_ours_for_both_mappers():
     incremental, at_once = mapping.incremental_options(7), global_options(7, ["a", "b"])
-
     assert (incremental.num_threads, incremental.mapper.num_threads, incremental.multiple_models) == (1, 1, False)
     assert (at_once.num_threads, at_once.mapper.num_threads, list(at_once.image_names)) == (1, 1, ["a", "b"])
     assert not at_once.decompose_relative_pose  # ours are better than what COLMAP makes of F
@@ -153,6 +129,4 @@ def test_options_are_ours_for_both_mappers():
 
 def test_of_several_models_the_one_with_most_photos_counts():
     models = {key: SimpleNamespace(num_reg_images=lambda count=count: count) for key, count in ((0, 2), (1, 5), (2, 3))}
-
-    assert largest_model(models) is models[1]
-    assert largest_model({}) is None
+    assert largest_model(models) is models[1] and largest_model({}) is None

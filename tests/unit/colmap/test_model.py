@@ -23,7 +23,7 @@ from sfm_app.geometry.poses import Similarity
 
 
 def test_a_model_moves_as_a_whole(synthetic):
-    model, _ = synthetic([900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0])
+    model, _ = synthetic()
     error = model.compute_mean_reprojection_error()
     poses, points = poses_and_points(model)
     similarity = Similarity(7.0, np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), np.array([30.0, -5, 2]))
@@ -45,10 +45,8 @@ def test_rays_of_a_lens_meet_the_points_that_the_photo_shows(synthetic):
     seen = [point for point in model.images[key].points2D if point.has_point3D()]
     center = -poses[key][:, :3].T @ poses[key][:, 3]
     truth = np.array([model.points3D[point.point3D_id].xyz for point in seen]) - center
-
     rays = viewing_rays(model, key, np.array([point.xy for point in seen]))
     sine = np.linalg.norm(np.cross(rays, truth), axis=1) / np.linalg.norm(rays, axis=1) / np.linalg.norm(truth, axis=1)
-
     assert 0.1 < np.sqrt(np.mean((sine * focal_px(model, key)) ** 2)) < 0.8, "the noise of 0.3 px"
     assert ((rays * truth).sum(axis=1) > 0).all()
 
@@ -76,35 +74,29 @@ def test_placed_views_see_the_points_where_they_are(synthetic):
      ("OPENCV", [900.0, 850.0, 510.0, 390.0, -0.1, 0.02, 0.0, 0.0], (900, 850))],
 )  # fmt: skip
 def test_cameras_are_read_with_their_first_radial_term(synthetic, name, params, focals):
-    model, _ = synthetic([900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=3)
+    model, _ = synthetic(photos=3)
     model.deregister_frame(model.images[2].frame_id)
     for camera in model.cameras.values():
         camera.model = getattr(pycolmap.CameraModelId, name)
         camera.params = params
-
     found = cameras_by_photo(model)
-
     assert sorted(found) == [1, 3]
     for K, radial, _ in found.values():
         assert (K[0, 0], K[1, 1], K[0, 2], K[1, 2], radial) == (*focals, 510.0, 390.0, -0.1)
 
 
 def test_a_part_of_a_model_can_be_adjusted_and_the_whole_stays(synthetic):
-    model, database = synthetic([900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=6)
-
+    model, database = synthetic(photos=6)
     part = submodel(model, (1, 3, 4))
     adjusted = adjust(part, database)
     found = adjusted.model
-
     assert posed_photo_ids(found) == sorted(found.images) == [1, 3, 4] and posed_photo_ids(model) == [1, 2, 3, 4, 5, 6]
-    assert all(point.track.length() >= 2 for point in found.points3D.values())
-    assert found.num_points3D() > 350
+    assert all(point.track.length() >= 2 for point in found.points3D.values()) and found.num_points3D() > 350
     assert all(0 < deviations["fx"] < 20 for deviations in adjusted.deviations.values())
 
 
 def test_camera_parameters_of_both_models():
     K = np.array([[800.0, 0, 310], [0, 1250.0, 240], [0, 0, 1]])
-
     assert camera_params(K, TWO_FOCALS, -0.1) == [800, 1250, 310, 240, -0.1, 0, 0, 0]
     assert camera_params(K, SQUARE_PIXELS) == [1000, 310, 240, 0]
 
@@ -122,9 +114,7 @@ def test_what_colmap_raises_becomes_one_of_ours():
 
 def test_options_become_plain_values():
     options = json_options(pycolmap.FeatureMatchingOptions().todict())
-
-    assert options["sift"]["max_ratio"] == 0.8
-    assert isinstance(options["type"], str)
+    assert options["sift"]["max_ratio"] == 0.8 and isinstance(options["type"], str)
 
 
 def test_points_and_cameras_of_a_model_on_disk(synthetic, tmp_path):
@@ -150,7 +140,8 @@ def test_points_of_two_photos_count_where_three_photos_see_the_scene(synthetic, 
     for place in (points.mean(axis=0), points.max(axis=0) + 1.0, points.mean(axis=0) - [0, 0, 1e3]):
         track = pycolmap.Track()
         for image in (1, 2):
-            track.add_element(image, free_keypoint(model, image))
+            points2D = model.images[image].points2D
+            track.add_element(image, next(i for i, one in enumerate(points2D) if not one.has_point3D()))
         model.add_point3D(place, track, np.zeros(3, np.uint8))
     model.write(tmp_path)
 
@@ -159,13 +150,7 @@ def test_points_of_two_photos_count_where_three_photos_see_the_scene(synthetic, 
     assert len(found.surface.vertices) == before + 1
 
 
-def free_keypoint(model, image_id):
-    """A new keypoint of a photo, that no point has yet."""
-    image = model.images[image_id]
-    return next(i for i, point in enumerate(image.points2D) if not point.has_point3D())
-
-
-def test_points_fall_on_the_pixels_of_their_tracks(synthetic):
+def test_points_fall_on_the_pixels_of_their_tracks_and_photos_look_from_their_centers(synthetic):
     model, _ = synthetic(noise_px=0.0)
     found = model_arrays(model, metric=True)
 
@@ -177,15 +162,9 @@ def test_points_fall_on_the_pixels_of_their_tracks(synthetic):
     seen = np.einsum("mij,mj->mi", R, found.points[found.track_points]) + t
     x = np.einsum("mij,mj->mi", found.K[found.track_photos], seen)
     assert np.allclose(x[:, :2] / x[:, 2:], found.track_pixels, atol=1e-6)
-
-
-def test_photos_look_from_their_centers(synthetic):
-    model, _ = synthetic()
-    found = model_arrays(model, metric=False)
     true = {image.name: image.projection_center() for image in model.images.values()}
     assert np.allclose(found.centers, [true[name] for name in found.photos])
-    assert found.sizes.tolist() == [[1000, 800]] * 8
-    assert not found.metric
+    assert found.sizes.tolist() == [[1000, 800]] * 8 and found.metric
 
 
 def test_a_model_without_points_has_empty_arrays(synthetic):
@@ -193,7 +172,5 @@ def test_a_model_without_points_has_empty_arrays(synthetic):
     for key in list(model.points3D):
         model.delete_point3D(key)
     found = model_arrays(model, metric=False)
-    assert found.points.shape == (0, 3)
-    assert found.track_pixels.shape == (0, 2)
-    assert found.track_points.shape == (0,)
-    assert found.errors_px == pytest.approx([])
+    assert found.points.shape == (0, 3) and not found.metric and found.track_pixels.shape == (0, 2)
+    assert found.track_points.shape == (0,) and found.errors_px == pytest.approx([])

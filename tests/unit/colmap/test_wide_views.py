@@ -1,21 +1,23 @@
-"""Photos of wide lenses in the dense workspace: what each view shows, and what it must not show."""
+"""Views of the dense workspace show the directions of their photos: of wide lenses, of plain ones, and larger."""
 
 import cv2
 import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.dense import has_masks, read_color, read_views, used_pixels
+from sfm_app.colmap.dense import has_masks, read_color, read_views, undistort, used_pixels
+from sfm_app.colmap.perspective import LargerViews
 from sfm_app.colmap.wide_views import split_wide_photos, view_name, write_model, write_views
 from sfm_app.photos.masks import save_mask
+from sfm_app.progress import SilentProgress
 from sfm_app.stereo import rank_neighbors
 
 SIZE = 480, 320
-FISHEYE = ("OPENCV_FISHEYE", [175.0, 176.0, 241.0, 158.0, 0.02, -0.003, 0.0, 0.0])
 CAMERAS = {
-    "fisheye": FISHEYE,
+    "fisheye": ("OPENCV_FISHEYE", [175.0, 176.0, 241.0, 158.0, 0.02, -0.003, 0.0, 0.0]),
     "thin prism": ("THIN_PRISM_FISHEYE", [175.0, 176.0, 241.0, 158.0, 0.02, -0.003, 2e-3, 1e-3, 0, 0, 1e-3, 0]),
     "panorama": ("EQUIRECTANGULAR", [480.0, 240.0]),
+    "plain": ("OPENCV", [420.0, 415.0, 241.0, 158.0, 0.05, -0.01, 0.0, 0.0]),
     "strong barrel": ("OPENCV", [260.0, 260.0, 240.0, 160.0, -0.2, 0.025, 0.0, 0.0]),
 }
 NAMES = ("a.png", "sub/b.png", "c.png")
@@ -24,6 +26,12 @@ NAMES = ("a.png", "sub/b.png", "c.png")
 def colors_of(rays):
     """Colors (..., 3) of rays of any length: each channel is an axis."""
     return np.round(127.5 + 120.0 * rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.uint8)
+
+
+def rays_of(shape, K, R):
+    """Rays (H, W, 3) of the pixel centers, in the world."""
+    y, x = np.mgrid[: shape[0], : shape[1]] + 0.5
+    return np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(K).T @ R
 
 
 def make_place(root, kind):
@@ -73,12 +81,10 @@ def test_views_show_the_directions_of_the_photo(tmp_path, kind, count):
 
     assert len(views) == 3 * count
     for view in views:
-        x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
-        rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(view.K).T @ view.R
+        rays = rays_of((view.height, view.width), view.K, view.R)
         used = used_pixels(tmp_path / "dense", view)
-        used = np.ones(x.shape, bool) if used is None else used
-        assert (kind == "panorama") == used.all()
-        assert 0.4 < used.mean() <= 1.0
+        used = np.ones(rays.shape[:2], bool) if used is None else used
+        assert (kind == "panorama") == used.all() and 0.4 < used.mean() <= 1.0
         wrong = np.abs(read_color(tmp_path / "dense", view).astype(int) - colors_of(rays))[used]
         assert np.mean(wrong) < 2.0 and np.quantile(wrong, 0.999) < 12
 
@@ -89,8 +95,7 @@ def test_points_are_seen_where_they_project(tmp_path, kind):
     _, views = fill(tmp_path)
 
     found = pycolmap.Reconstruction(tmp_path / "dense" / "sparse")
-    assert found.num_points3D() == model.num_points3D()
-    assert found.num_images() == len(views)
+    assert found.num_points3D() == model.num_points3D() and found.num_images() == len(views)
     # overlaps show some points twice
     assert model.compute_num_observations() <= found.compute_num_observations() < 1.6 * model.compute_num_observations()
     errors = [
@@ -104,19 +109,22 @@ def test_points_are_seen_where_they_project(tmp_path, kind):
 def test_views_from_one_place_are_not_matched_with_each_other(tmp_path):
     make_place(tmp_path, "panorama")
     _, views = fill(tmp_path)
-
     for view, ranked in zip(views, rank_neighbors(views, 8), strict=True):
         photo = view.name.rsplit(".", 2)[0]
         assert all(views[other].name.rsplit(".", 2)[0] != photo for other in ranked)
     assert sum(map(len, rank_neighbors(views, 8))) > len(views)
 
 
+def mask_left(root, columns):
+    used = np.ones(SIZE[::-1], bool)
+    used[:, :columns] = False
+    for name in NAMES:
+        save_mask(root / "masks", name, used)
+
+
 def test_masked_pixels_are_masked_in_every_view(tmp_path):
     make_place(tmp_path, "fisheye")
-    for name in NAMES:
-        used = np.ones(SIZE[::-1], bool)
-        used[:, : SIZE[0] // 2] = False
-        save_mask(tmp_path / "masks", name, used)
+    mask_left(tmp_path, SIZE[0] // 2)
     lenses, views = fill(tmp_path, tmp_path / "masks")
 
     assert has_masks(tmp_path / "dense")
@@ -136,13 +144,56 @@ def test_ordinary_lenses_are_left_to_colmap(tmp_path):
     camera.model = pycolmap.CameraModelId.OPENCV
     camera.params = [500.0, 500.0, 240.0, 160.0, -0.1, 0.02, 0.0, 0.0]
     model.write(tmp_path / "sparse")
-
     assert split_wide_photos(tmp_path / "sparse", 1000) is None
 
 
 def test_large_views_are_scaled_down_without_aliasing(tmp_path):
     make_place(tmp_path, "fisheye")
     lenses, views = fill(tmp_path, largest=120)
-
     assert max(max(view.width, view.height) for view in views) == 120
     assert all(view.K[0, 0] < 120.0 for view in views) and len(lenses[1].views) == 4
+
+
+@pytest.fixture
+def plain(tmp_path):
+    """Photos of a lens that one view is enough for."""
+    make_place(tmp_path, "plain")
+    undistort(tmp_path / "sparse", tmp_path / "photos", tmp_path / "dense", 300, 1, SilentProgress())
+    return tmp_path, {view.name: view for view in read_views(tmp_path / "dense")}
+
+
+def errors(gray, K, R, used):
+    """How far gray levels are from those of the directions."""
+    expected = cv2.cvtColor(colors_of(rays_of(gray.shape, K, R)), cv2.COLOR_RGB2GRAY)
+    return np.abs(gray.astype(int) - expected)[used]
+
+
+@pytest.mark.parametrize("side", [240, 2000])
+def test_photos_of_a_plain_lens_keep_their_names(plain, side):
+    place, views = plain
+    found = LargerViews(place / "sparse", place / "photos", None, [views["c.png"], views["a.png"]], side)
+    assert found.photos == ["a.png", "c.png"]
+    for photo in found.photos:
+        ((name, K, gray, used),) = found.render(photo)
+        assert name == photo and max(gray.shape) <= side and max(gray.shape) > 0.9 * min(side, SIZE[0])
+        assert used.mean() > 0.98 and np.quantile(errors(gray, K, views[photo].R, used), 0.999) < 6
+
+
+def test_views_of_a_fisheye_are_those_of_the_workspace(tmp_path):
+    make_place(tmp_path, "fisheye")
+    _, views = fill(tmp_path)
+    found = LargerViews(tmp_path / "sparse", tmp_path / "photos", None, views[1:], 120)
+    rendered = {name: rest for photo in found.photos for name, *rest in found.render(photo)}
+    assert found.photos == sorted(NAMES) and sorted(rendered) == sorted(view.name for view in views[1:])
+    for view in views[1:]:
+        K, gray, used = rendered[view.name]
+        assert max(gray.shape) <= 120 and np.quantile(errors(gray, K, view.R, used), 0.99) < 12
+
+
+def test_masked_pixels_are_not_used(plain):
+    place, views = plain
+    mask_left(place, 200)
+    larger = LargerViews(place / "sparse", place / "photos", place / "masks", [views["a.png"]], 480)
+    ((_, _, gray, used),) = larger.render("a.png")
+    share = np.mean(used, axis=0)
+    assert gray.shape == used.shape and share[:150].max() == 0.0 and share[-200:].min() > 0.9

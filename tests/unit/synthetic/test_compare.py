@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import strategies as st
 
 from sfm_app.errors import NumericalError
 from sfm_app.geometry.poses import Similarity
@@ -19,8 +18,6 @@ from sfm_app.synthetic.compare import (
     surface_error,
 )
 from sfm_app.synthetic.photo_folder import Truth
-
-SEEDS = st.integers(0, 2**32 - 1)
 
 
 def random_similarity(rng):
@@ -57,7 +54,6 @@ def test_with_several_cameras_K_is_judged_by_its_photo(photos):
     truth = photos[1]
     tele = make_camera(120, 80, focal_widths=2.1, center=(0.5, 0.5))
     mixed = replace(truth, cameras={**truth.cameras, "view_02.jpg": tele})
-
     assert focal_error_percent(tele.K, mixed, "view_02.jpg") == center_error_percent(tele.K, mixed, "view_02.jpg") == 0
     assert focal_error_percent(tele.K, mixed, "view_00.jpg") == pytest.approx(100.0)
     with pytest.raises(ValueError, match="several cameras"):
@@ -129,13 +125,9 @@ def test_coverage_tells_half_a_surface_from_a_whole_one(plane_truth):
 def test_the_scene_is_what_the_photos_see(photos, plane_truth):
     truth = photos[1]
     hidden = np.array([[50.0, 0, 50], [51, 0, 50], [50, 0, 51]])
-    behind = replace(
-        truth,
-        vertices=np.concatenate([truth.vertices, hidden]),
-        faces=np.concatenate([truth.faces, np.array([[0, 1, 2]]) + len(truth.vertices)]),
-    )
-    assert scene_size(behind) == scene_size(truth)
-    assert 4.0 < scene_size(plane_truth) <= 32**0.5 + 1e-3
+    faces = np.concatenate([truth.faces, np.array([[0, 1, 2]]) + len(truth.vertices)])
+    behind = replace(truth, vertices=np.concatenate([truth.vertices, hidden]), faces=faces)
+    assert scene_size(behind) == scene_size(truth) and 4.0 < scene_size(plane_truth) <= 32**0.5 + 1e-3
     assert np.abs(seen_points(plane_truth)[:, 1]).max() < 1e-5
 
 

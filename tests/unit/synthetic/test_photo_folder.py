@@ -38,7 +38,6 @@ class Counter:
 
 def test_the_folder_holds_photos_and_nothing_else(photos):
     folder, truth = photos
-
     assert sorted(path.name for path in folder.iterdir()) == sorted(truth.cam_from_world)
     for path in folder.iterdir():
         with Image.open(path) as image:
@@ -52,7 +51,6 @@ def test_the_same_seed_gives_the_same_bytes(photos, still_life, four_views, tmp_
     progress = Counter()
     write_photo_folder(tmp_path / "again", still_life, four_views, PhotoOptions(seed=3), progress)
     write_photo_folder(tmp_path / "other", still_life, four_views, PhotoOptions(seed=4))
-
     for path in folder.iterdir():
         assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes()
         assert (tmp_path / "other" / path.name).read_bytes() != path.read_bytes()
@@ -99,7 +97,6 @@ def test_truth_file_says_x_is_K_RX_plus_t(photos, tmp_path):
     first = json.loads((tmp_path / "truth.json").read_text())["images"][0]
     X = np.array([0.1, 1.3, 0.2])
     h = np.array(first["K"]) @ (np.array(first["R"]) @ X + np.array(first["t"]))
-
     assert first["file"] == "view_00.jpg" and (first["width"], first["height"]) == (120, 80)
     assert h[2] > 0 and 0 < h[0] / h[2] < 120 and 0 < h[1] / h[2] < 80, "the ball is in the photo"
     assert np.allclose(truth.centers["view_00.jpg"], -np.array(first["R"]).T @ first["t"])
@@ -108,9 +105,8 @@ def test_truth_file_says_x_is_K_RX_plus_t(photos, tmp_path):
 def test_every_photo_is_taken_with_its_own_camera(photos, still_life, four_views, tmp_path):
     folder, truth = photos
     tele = make_camera(120, 80, focal_widths=1.6)
-    mixed = write_photo_folder(
-        tmp_path, still_life, four_views.with_camera(tele, ["view_01.jpg"]), PhotoOptions(seed=3)
-    )
+    views = four_views.with_camera(tele, ["view_01.jpg"])
+    mixed = write_photo_folder(tmp_path, still_life, views, PhotoOptions(seed=3))
 
     for name in truth.cam_from_world:
         same = (tmp_path / name).read_bytes() == (folder / name).read_bytes()
@@ -134,10 +130,8 @@ def test_blur_spreads_an_edge_as_far_as_asked():
     edge = np.zeros((40, 80, 3))
     edge[:, 40:] = 1.0
     rng = np.random.default_rng(0)
-    linear = [
-        (develop(edge, PhotoOptions(noise=0.0, blur_px=blur), rng)[20, :, 0] / 255.0) ** 2.2 for blur in (0.0, 0.5, 2.0)
-    ]
-    weights = [np.diff(profile) for profile in linear]
+    blurred = [develop(edge, PhotoOptions(noise=0.0, blur_px=blur), rng) for blur in (0.0, 0.5, 2.0)]
+    weights = [np.diff((photo[20, :, 0] / 255.0) ** 2.2) for photo in blurred]
     spread = [np.sqrt((w * (np.arange(79) - 39) ** 2).sum() / w.sum()) for w in weights]
     assert spread[0] == 0.0 and 0.4 < spread[1] < 0.6 and 1.8 < spread[2] < 2.2
 
@@ -150,12 +144,9 @@ def test_exposures_differ_by_as_much_as_asked():
     assert abs(stops.mean()) < 0.1 and stops.std() == pytest.approx(0.5, rel=0.15)
 
 
-def test_wrong_options_are_named():
+def test_wrong_options_and_a_file_in_place_of_the_folder_are_refused(still_life, four_views, photos, tmp_path):
     with pytest.raises(ConfigError, match="supersampling, quality"):
         PhotoOptions(supersampling=0, quality=100)
-
-
-def test_a_file_in_place_of_the_folder_is_an_input_error(still_life, four_views, photos, tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("")
     with pytest.raises(InputError, match="cannot write photos"):

@@ -4,29 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.synthetic.scenes import bust_field
-from sfm_app.synthetic.shapes import (
-    PATTERNS,
-    Material,
-    arch,
-    assemble,
-    ball,
-    box,
-    bricks,
-    carve,
-    cells,
-    ground,
-    lattice,
-    mixture,
-    octaves,
-    revolve,
-    torus,
-    value_noise,
-    waves,
-)
+from sfm_app.synthetic import shapes
 
 VASE = np.array([[0.0, 0.0], [0.3, 0.0], [0.2, 0.5], [0.4, 1.0], [0.0, 1.0]])
 
@@ -43,13 +24,13 @@ def cone(bottom, top, height):
 @pytest.mark.parametrize(
     ("shape", "volume"),
     [
-        (box(1.0, 2.0, 3.0), 6.0),
-        (box(1.0, 2.0, 3.0).move((5.0, -1.0, 2.0), turn_deg=20.0, tilt_deg=50.0), 6.0),
-        (ball(0.5), math.pi / 6),
-        (torus(1.0, 0.2), 2 * math.pi**2 * 0.04),
-        (revolve(VASE, segments=200), cone(0.3, 0.2, 0.5) + cone(0.2, 0.4, 0.5)),
-        (revolve(VASE, segments=200, sharp=True), cone(0.3, 0.2, 0.5) + cone(0.2, 0.4, 0.5)),
-        (arch(1.0, 0.5, 0.4), math.pi / 2 * (1.5**2 - 1.0**2) * 0.4),  # its open feet lie in y = 0
+        (shapes.box(1.0, 2.0, 3.0), 6.0),
+        (shapes.box(1.0, 2.0, 3.0).move((5.0, -1.0, 2.0), turn_deg=20.0, tilt_deg=50.0), 6.0),
+        (shapes.ball(0.5), math.pi / 6),
+        (shapes.torus(1.0, 0.2), 2 * math.pi**2 * 0.04),
+        (shapes.revolve(VASE, segments=200), cone(0.3, 0.2, 0.5) + cone(0.2, 0.4, 0.5)),
+        (shapes.revolve(VASE, segments=200, sharp=True), cone(0.3, 0.2, 0.5) + cone(0.2, 0.4, 0.5)),
+        (shapes.arch(1.0, 0.5, 0.4), math.pi / 2 * (1.5**2 - 1.0**2) * 0.4),  # its open feet lie in y = 0
     ],
     ids=["box", "moved box", "ball", "torus", "vase", "sharp vase", "arch"],
 )
@@ -57,42 +38,15 @@ def test_triangles_enclose_the_right_volume_from_outside(shape, volume):
     assert signed_volume(shape) == pytest.approx(volume, rel=0.02)
 
 
-@pytest.mark.parametrize("shape", [box(1.0, 1.0, 1.0), ball(1.0), torus(1.0, 0.2), revolve(VASE, sharp=True)])
+@pytest.mark.parametrize(
+    "shape", [shapes.box(1.0, 1.0, 1.0), shapes.ball(1.0), shapes.torus(1.0, 0.2), shapes.revolve(VASE, sharp=True)]
+)
 def test_normals_are_unit_and_point_as_the_triangles(shape):
     a, b, c = (shape.vertices[shape.faces[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
     face_normals = cross / np.linalg.norm(cross, axis=1, keepdims=True)
-
     assert np.allclose(np.linalg.norm(shape.normals, axis=1), 1.0)
     assert np.einsum("nc,nkc->nk", face_normals, shape.normals[shape.faces]).min() > 0.5
-
-
-def test_moving_turns_normals_and_keeps_texture_places():
-    still = ball(1.0, segments=32)
-    moved = still.move((1.0, 2.0, 3.0), turn_deg=90.0)
-
-    assert np.array_equal(moved.texture, still.texture)
-    assert np.allclose(moved.vertices.mean(axis=0) - still.vertices.mean(axis=0), [1.0, 2.0, 3.0])
-    assert np.allclose(moved.normals[:, 2], -still.normals[:, 0]), "turning takes +x to -z"
-
-
-def test_flutes_cut_into_a_column():
-    column = revolve(np.array([[1.0, 0.0], [1.0, 2.0]]), segments=200, flutes=(20, 0.1))
-    radius = np.hypot(column.vertices[:, 0], column.vertices[:, 2])
-    assert radius.max() == pytest.approx(1.0, abs=1e-6) and radius.min() == pytest.approx(0.9, abs=1e-3)
-
-
-def test_bumps_make_a_ball_uneven():
-    radius = np.linalg.norm(ball(2.0, bumps=0.1, seed=1).vertices, axis=1)
-    assert 0.1 < radius.std() / 2.0 / 0.1 < 3.0
-    assert not np.array_equal(ball(2.0, bumps=0.1, seed=1).vertices, ball(2.0, bumps=0.1, seed=2).vertices)
-
-
-def test_ground_faces_up_and_is_uneven():
-    floor = ground((-1.0, 1.0), (-2.0, 2.0), unevenness=0.05)
-    assert floor.normals[:, 1].min() > 0.8
-    assert 0.02 < np.ptp(floor.vertices[:, 1]) < 0.2
-    assert np.allclose(np.ptp(floor.vertices[:, [0, 2]], axis=0), [2.0, 4.0])
 
 
 def egg(points):
@@ -102,7 +56,7 @@ def egg(points):
 
 @pytest.mark.slow
 def test_a_carved_body_is_what_its_field_says():
-    shape = carve(egg, (-1.1, 1.1), reach=0.8)
+    shape = shapes.carve(egg, (-1.1, 1.1), reach=0.8)
     assert signed_volume(shape) == pytest.approx(4 / 3 * np.pi * 0.5 * 0.25, rel=0.02)
     sides = shape.vertices[np.hypot(shape.vertices[:, 0], shape.vertices[:, 2]) > 0]
     assert np.abs(egg(sides)).max() < 0.02, "every vertex lies on it"
@@ -112,7 +66,7 @@ def test_a_carved_body_is_what_its_field_says():
 
 @pytest.mark.slow
 def test_a_carved_body_is_closed():
-    shape = carve(egg, (-1.1, 1.1), reach=0.8, rows=40, segments=24)
+    shape = shapes.carve(egg, (-1.1, 1.1), reach=0.8, rows=40, segments=24)
     _, whole = np.unique(np.round(shape.vertices, 9), axis=0, return_inverse=True)
     faces = whole.ravel()[shape.faces]
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -120,112 +74,46 @@ def test_a_carved_body_is_closed():
     assert {tuple(edge) for edge in edges} == {tuple(edge[::-1]) for edge in edges}
 
 
-@pytest.mark.slow
-def test_an_assembled_body_has_one_texture_that_runs_on():
-    parts = [box(1.0, 1.0, 1.0).move((x, 0.0, 0.0), turn_deg=90.0) for x in (0.0, 2.0)]
-    both = assemble(parts)
-    assert np.array_equal(both.texture, both.vertices) and len(both.vertices) == 2 * len(parts[0].vertices)
-    assert signed_volume(both) == pytest.approx(2.0)
-    assert np.array_equal(both.normals[: len(parts[0].normals)], parts[0].normals)
-
-
-@pytest.mark.slow
-def test_waves_have_unit_variance_and_a_seed():
-    points = np.random.default_rng(0).uniform(-20, 20, (20_000, 3))
-    assert waves(points, 1).std() == pytest.approx(1.0, abs=0.05) and abs(waves(points, 1).mean()) < 0.05
-    assert abs(np.corrcoef(waves(points, 1), waves(points, 2))[0, 1]) < 0.05
-    near = waves(points + 1e-5, 1)
-    assert 0 < np.abs(near - waves(points, 1)).max() < 1e-2
-
-
-@pytest.mark.slow
-def test_the_bust_has_a_face_at_the_front_only():
-    """The nose stands out towards +z by some centimeters; hair and cloth are rough, the face is smooth."""
-
-    def depth(x, y, side):
-        z = np.linspace(0.6, 0.0, 1201)
-        inside = bust_field(np.column_stack([np.full_like(z, x), np.full_like(z, y), side * z])) > 0
-        return z[inside.argmax()]
-
-    nose, cheek = depth(0.0, 0.83, 1.0), np.mean([depth(x, 0.83, 1.0) for x in (-0.06, 0.06)])
-    assert 0.02 < nose - cheek < 0.12
-    assert bust_field(np.array([[0.0, 0.3, 0.0], [0.0, 0.9, 0.0], [0.0, 0.6, 0.0]])).min() > 0
-    assert bust_field(np.array([[0.7, 0.3, 0.0], [0.0, 1.3, 0.0], [0.3, 0.9, 0.0]])).max() < 0
-
-
 POINTS = np.random.default_rng(0).uniform(-3, 3, (400, 3))
 UP = (0.0, 1.0, 0.0)
 PLACES = st.floats(-100, 100)
 
 
-def test_lattice_values_are_uniform_and_unrelated():
-    values = np.array([lattice(i, j, -i, 5) for i in range(-40, 40) for j in range(50)])
-    neighbors = np.array([lattice(i + 1, j, -i - 1, 5) for i in range(-40, 40) for j in range(50)])
-
-    assert values.min() >= 0 and values.max() < 1
-    assert np.allclose(np.quantile(values, [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.03)
-    assert abs(np.corrcoef(values, neighbors)[0, 1]) < 0.05
-
-
 @given(x=PLACES, y=PLACES, z=PLACES)
-@settings(deadline=None)  # the first call compiles
 def test_noise_is_bounded_and_continuous(x, y, z):
-    here, near = value_noise(x, y, z, 3), value_noise(x + 1e-6, y - 1e-6, z + 1e-6, 3)
-    assert -1 <= here < 1
-    assert abs(here - near) < 1e-4
-    assert value_noise(4.0, -2.0, 7.0, 9) == pytest.approx(2 * lattice(4, -2, 7, 9) - 1)
+    here, near = shapes.value_noise(x, y, z, 3), shapes.value_noise(x + 1e-6, y - 1e-6, z + 1e-6, 3)
+    assert -1 <= here < 1 and abs(here - near) < 1e-4
+    assert shapes.value_noise(4.0, -2.0, 7.0, 9) == pytest.approx(2 * shapes.lattice(4, -2, 7, 9) - 1)
 
 
 def test_detail_below_a_pixel_is_left_out():
-    coarse = np.array([octaves(tuple(p), 1.0, 0.7, 2.0, 1) for p in POINTS])
-    medium = np.array([octaves(tuple(p), 1.0, 0.7, 0.2, 1) for p in POINTS])
-    fine = np.array([octaves(tuple(p), 1.0, 0.7, 0.002, 1) for p in POINTS])
-
-    assert not coarse.any()
-    assert 0.1 < medium.std() < fine.std() < 1.0
+    coarse = np.array([shapes.octaves(tuple(p), 1.0, 0.7, 2.0, 1) for p in POINTS])
+    medium = np.array([shapes.octaves(tuple(p), 1.0, 0.7, 0.2, 1) for p in POINTS])
+    fine = np.array([shapes.octaves(tuple(p), 1.0, 0.7, 0.002, 1) for p in POINTS])
+    assert not coarse.any() and 0.1 < medium.std() < fine.std() < 1.0
 
 
-def test_octaves_fade_out_without_a_jump():
-    p = (0.3, 1.7, -0.4)
-    sizes = np.linspace(0.01, 1.1, 4000)
-    values = np.array([octaves(p, 1.0, 0.7, footprint, 1) for footprint in sizes])
-    assert np.abs(np.diff(values)).max() < 0.05
-
-
-def test_bricks_are_laid_in_running_bond():
-    center, name = bricks(1.0, 0.5, 0)
-    assert center == pytest.approx(0.5) and bricks(1.9, 0.9, 0)[1] == name
-    assert bricks(0.0, 0.5, 0)[0] == pytest.approx(0.0), "a joint between two bricks of row 0"
-    assert bricks(0.0, 1.5, 0)[0] == pytest.approx(0.5), "the middle of a brick of row 1"
-    assert bricks(2.5, 0.5, 0)[1] != name
-
-
-def test_cells_have_borders_and_names():
-    found = np.array([cells(x, y, 2) for x in np.linspace(0, 8, 80) for y in np.linspace(0, 8, 80)])
-    assert found[:, 0].min() >= 0 and found[:, 0].min() < 0.02 and 0.2 < found[:, 0].max() < 1.0
-    assert 40 < len(np.unique(found[:, 1])) < 130, "about one name per unit square"
-
-
-@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("pattern", shapes.PATTERNS)
 def test_patterns_mix_within_range_and_vary(pattern):
-    row = Material(pattern=pattern, base=(200, 10, 10), second=(10, 200, 10)).row(seed=100)
-    other = Material(pattern=pattern, base=(200, 10, 10), second=(10, 200, 10)).row(seed=200)
-    mixed = np.array([mixture(row, tuple(p), UP, 0.005) for p in POINTS])
-    again = np.array([mixture(row, tuple(p), UP, 0.005) for p in POINTS])
-    elsewhere = np.array([mixture(other, tuple(p), UP, 0.005) for p in POINTS])
+    row = shapes.Material(pattern=pattern, base=(200, 10, 10), second=(10, 200, 10)).row(seed=100)
+    other = shapes.Material(pattern=pattern, base=(200, 10, 10), second=(10, 200, 10)).row(seed=200)
+    mixed = np.array([shapes.mixture(row, tuple(p), UP, 0.005) for p in POINTS])
+    again = np.array([shapes.mixture(row, tuple(p), UP, 0.005) for p in POINTS])
+    elsewhere = np.array([shapes.mixture(other, tuple(p), UP, 0.005) for p in POINTS])
 
     assert mixed[:, :2].min() >= 0 and mixed[:, :2].max() <= 1
     assert mixed[:, 2].min() > 0 and 0.7 < mixed[:, 2].mean() < 1.3
-    assert mixed[:, 0].std() > 0.05 and mixed[:, 2].std() > 0.05
-    assert np.array_equal(mixed, again)
+    assert mixed[:, 0].std() > 0.05 and mixed[:, 2].std() > 0.05 and np.array_equal(mixed, again)
     assert not np.allclose(mixed[:, 2], elsewhere[:, 2]), "two bodies of one material differ"
-    assert row[:4].tolist() == [PATTERNS.index(pattern), 0.3, 0.5, 100]
+    assert row[:4].tolist() == [shapes.PATTERNS.index(pattern), 0.3, 0.5, 100]
     assert row[4:7] == pytest.approx((np.array([200, 10, 10]) / 255) ** 2.2), "colors are linear"
 
 
 def test_masonry_turns_with_its_body():
     """The normal is that in the scene, the position that on the body: a turned house keeps its bricks."""
-    row = Material(pattern="masonry", base=(150, 76, 56), second=(188, 116, 84), scale=0.2).row(7)
-    found = np.array([[mixture(row, tuple(p), n, 0.01) for p in POINTS] for n in ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))])
+    row = shapes.Material(pattern="masonry", base=(150, 76, 56), second=(188, 116, 84), scale=0.2).row(7)
+    found = np.array(
+        [[shapes.mixture(row, tuple(p), n, 0.01) for p in POINTS] for n in ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))]
+    )
     assert np.array_equal(found[0], found[1])
     assert 0.02 < (found[0][:, 1] > 0.5).mean() < 0.5, "joints between bricks"
