@@ -102,7 +102,6 @@ def _text_images(text: str) -> Iterator[tuple[str, str]]:
 
 
 def _binary_images(data: bytes) -> Iterator[tuple[str, str]]:
-    """Yield photos and the ids of their cameras from images.bin."""
     reader = _Reader(data)
     (count,) = reader.take("<Q")
     for _ in range(int(count)):
@@ -156,10 +155,7 @@ def is_opencv_camera(values: Mapping[str, Any]) -> bool:
 
 
 def opencv_camera(values: Mapping[str, Any]) -> Calibration:
-    """Return the camera of OpenCV's values.
-
-    Args:
-        values: camera matrix, and optionally distortion coefficients, size, and whether the lens is a fisheye.
+    """Return the camera of OpenCV's values: a camera matrix, and optionally distortion, size, and the kind of lens.
 
     Raises:
         ValueError: they are no camera, or a coefficient is not supported.
@@ -231,7 +227,6 @@ def _size(values: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _value(values: Mapping[str, Any], names: Sequence[str]) -> Any:
-    """Return the value of the first of these names; None without any."""
     plain = {str(key).lower().replace("_", "").replace(" ", ""): value for key, value in values.items()}
     return next((plain[name] for name in names if plain.get(name) is not None), None)
 
@@ -324,10 +319,7 @@ def is_run_camera(values: Mapping[str, Any]) -> bool:
 
 
 def run_camera(values: Mapping[str, Any]) -> Calibration | None:
-    """Return a camera of a run, as given by the user; None if its photos did not determine it.
-
-    Args:
-        values: a `Calibration`, or a `CameraModel` after bundle adjustment, as plain values.
+    """Return a camera of a run, a `Calibration` or `CameraModel` as plain values; None if photos did not determine it.
 
     Raises:
         ValueError: they are no camera.
@@ -443,7 +435,6 @@ _BY_NAME: tuple[tuple[str, Callable[..., bool], Callable[..., Calibration | None
 def _read_by_name(
     values: Mapping[str, Any], read: Callable[..., Calibration | None]
 ) -> Iterator[tuple[str, Calibration]]:
-    """Yield the cameras by name; an error names its camera."""
     for name, entry in values.items():
         try:
             camera = read(entry)

@@ -139,7 +139,6 @@ def render_photos(
 
 
 def _is_of(truth: Truth, views: Views) -> bool:
-    """Return whether the truth is that of these views."""
     poses = views.cam_from_world
     return truth.cam_from_world.keys() == poses.keys() and all(
         np.allclose(truth.cam_from_world[name], pose)

@@ -64,11 +64,7 @@ def export_frame(run: RunContext) -> Similarity | None:
 
 
 def check_finished(run: RunContext, stages: Sequence[Stage[object]], what: str, otherwise: str = "") -> None:
-    """Check that stages of a run are finished.
-
-    Args:
-        what: the exported data, for the message.
-        otherwise: an alternative, for the hint.
+    """Check that stages of a run are finished; messages say `what` is exported, and hints what `otherwise`.
 
     Raises:
         InputError: there is no run, or a stage is missing (the message names it).
@@ -168,7 +164,6 @@ def stored_cloud(run: RunContext) -> PointCloud:
 
 
 def _columns(records: NDArray[np.void], names: Sequence[str]) -> NDArray[np.float64]:
-    """Return fields of records as the columns of an array."""
     return np.stack([records[name] for name in names], axis=1).astype(np.float64)
 
 
@@ -310,9 +305,7 @@ ELSEWHERE = "name another place with -o"
 def fill_folder(target: Path, about: Callable[[], Mapping[str, object]]) -> Iterator[Path]:
     """Provide an empty folder beside `target`, which replaces it when the block ends without an error.
 
-    Args:
-        target: folder; it may hold files of an earlier export.
-        about: returns the entries of the record besides the files; called at the end.
+    The target may be an earlier export; `about` returns the entries of the record besides the files, at the end.
 
     Raises:
         InputError: the target is no folder, or holds files that no export has written.

@@ -168,12 +168,7 @@ def _insist(act: Callable[[Path], object], target: Path) -> None:
 
 
 def find_in_wheel(package: Path, project: str, name: str) -> Iterator[ctypes.CDLL]:
-    """Yield the libraries whose names start with `name` in the wheel of a package.
-
-    Args:
-        package: folder of the installed package.
-        project: its name in the registry.
-    """
+    """Yield the libraries whose names start with `name` in the wheel of a package; the registry has it as `project`."""
     if lacks(Ability.WHEEL_LIBRARIES):
         return
     for folder in (package.parent / f"{project}.libs", package / ".dylibs"):  # Linux, macOS
@@ -310,9 +305,7 @@ def _kill_tree(root: psutil.Process) -> None:
 def watch_parent(parent: int, then: Callable[[], object]) -> None:
     """Call a function in a thread when the process that started this one has ended, for any reason.
 
-    Args:
-        parent: its number. It is not asked for here: on Windows, a virtual environment adds a process between.
-        then: ends this process.
+    The caller knows the parent's number: on Windows, a virtual environment adds a process between.
     """
 
     def watch() -> None:

@@ -95,7 +95,6 @@ class LensChoice:
     model: str
     """COLMAP's name of the smallest camera model with these parts."""
     free: tuple[str, ...]
-    """Names of the freed parts."""
     log_evidence: float
     """Log-probability up to a constant that all models of a camera share."""
 
@@ -131,10 +130,6 @@ def estimate_lenses(params: FloatArray, reduced: ReducedSystem, priors: LensPrio
     Deviations are root mean squares about these cameras, over all choices of freed parts. They are at least those of
     the sandwich estimator with photos as clusters, which grows where photos contradict each other. Choices whose lens
     folds inside the photo are barred; if all do, the step is shortened.
-
-    Args:
-        params: (C, 12) cameras as in `Bundle`.
-        reduced: the cost about these cameras.
     """
     barred = np.zeros(len(params), np.bool_)
     while True:
@@ -216,7 +211,6 @@ def _posterior(
 
 
 def _find_determined(covariance: FloatArray, precision: FloatArray, priors: LensPriors) -> BoolArray:
-    """Return (C, 7) as in `LensEstimate`."""
     narrower = np.sqrt(np.diag(covariance)).reshape(precision.shape) < OPTIONS.undetermined_share * precision**-0.5
     rows = [
         [row[list(part.places)].all() for part in PARTS[int(kind)]]
@@ -279,7 +273,6 @@ def _mean_squares(
 
 
 def _camera_blocks(squares: FloatArray) -> FloatArray:
-    """Return (C, 12, 12), the blocks of single cameras of a matrix (12C, 12C)."""
     count = len(squares) // CAMERA
     blocks = np.einsum("iaib->iab", squares.reshape(count, CAMERA, count, CAMERA))
     return np.array(blocks, np.float64)
@@ -329,11 +322,8 @@ def suggests_other_family(params: FloatArray, family: int, reach: float, best: L
     """Return whether a camera is worth trying as one of the other family.
 
     A perspective lens is, if it needs many terms, would fold, or puts the outermost points far inwards. A fisheye is,
-    if a perspective lens can show its narrow view.
-
-    Args:
-        reach: radius of the outermost observations, in focal lengths.
-        folding: whether a more probable lens folds inside the photo.
+    if a perspective lens can show its narrow view. `reach` is the radius of the outermost observations, in focal
+    lengths; `folding` tells whether a more probable lens folds inside the photo.
     """
     if family == PANORAMA:
         return False
@@ -346,10 +336,7 @@ def suggests_other_family(params: FloatArray, family: int, reach: float, best: L
 def convert_lens(params: FloatArray, family: int, reach: float) -> FloatArray | None:
     """Return the camera (12,) of the other family that shows rays at nearly the same radius; None if there is none.
 
-    Center and aspect are kept, and tangential terms are dropped.
-
-    Args:
-        reach: radius up to which the two agree, in focal lengths.
+    Both agree up to the radius `reach` in focal lengths. Center and aspect are kept, and tangential terms are dropped.
     """
     for share in np.linspace(1.0, OPTIONS.least_reach, 9):
         angle = angle_limit(params, family, float(share * reach))
@@ -374,7 +361,6 @@ def convert_lens(params: FloatArray, family: int, reach: float) -> FloatArray | 
 def family_evidence(cost_px2: float, noise_px: float, best: LensChoice) -> float:
     """Return the log-probability of a bundle with one of its cameras as it is, comparable between families.
 
-    Args:
-        noise_px: the same for all candidates.
+    The noise is the same for all candidates.
     """
     return best.log_evidence - evidence_weight(noise_px) * cost_px2

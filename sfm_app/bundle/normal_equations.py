@@ -50,12 +50,7 @@ REDUCTION = ReductionOptions()
 def whiten_points(by_point: FloatArray, point: NDArray[np.int64], points: int) -> tuple[FloatArray, NDArray[np.int64]]:
     """Return W (P, 3, 3) that makes derivatives by W^-T X orthonormal over the observations of a point, and its rank.
 
-    Along undetermined directions, W is 0.
-
-    Args:
-        by_point: (N, 2, 3) weighted derivatives of the observations by their points.
-        point: (N,) row of the point of each observation.
-        points: P.
+    Along undetermined directions, W is 0. The derivatives (N, 2, 3) are weighted; `point` has their rows (N,).
     """
     H = np.zeros((points, 3, 3))
     products = np.einsum("nki,nkj->nij", by_point, by_point)
@@ -81,11 +76,7 @@ def whiten_points(by_point: FloatArray, point: NDArray[np.int64], points: int) -
 
 
 def free_pose_columns(R: FloatArray, t: FloatArray) -> NDArray[np.int64]:
-    """Return the free pose columns when the gauge is fixed: the first photo, and one coordinate of the farthest one.
-
-    Args:
-        R, t: (I, 3, 3) and (I, 3) camera from world.
-    """
+    """Return the free pose columns when the gauge is fixed: the first photo, and one coordinate of the farthest one."""
     centers = -np.einsum("nji,nj->ni", R, t)
     far = int(np.argmax(np.linalg.norm(centers - centers[0], axis=1)))
     relative = R[far] @ (centers[0] - centers[far])
@@ -99,10 +90,6 @@ def elimination_width(photo: NDArray[np.int64], point: NDArray[np.int64]) -> flo
     Photos that share a point are tied. In a street few are, wherever it leads; in a room all are. A factorization costs
     the square of this width for each photo, and the steps of conjugate gradients grow with the length of a street. The
     order is that of Cuthill and McKee: no elimination in it fills more, and orders by nested dissection fill less.
-
-    Args:
-        photo: (N,) row of the photo of each observation.
-        point: (N,) row of the point.
     """
     if not len(photo):
         return 0.0
@@ -123,11 +110,9 @@ class Linearized:
     """Weighted derivatives of all observations; the derivatives by a point are orthonormal over its observations."""
 
     photo: IndexArray
-    """(N,) row of the photo of each observation."""
     camera: IndexArray
-    """(N,) row of its camera."""
     point: IndexArray
-    """(N,) row of its point."""
+    """(N,) rows of the photo, the camera and the point of each observation."""
     by_view: FloatArray
     """(N, 2, 18) derivatives by pose and camera."""
     by_point: FloatArray
@@ -166,9 +151,7 @@ class Linearized:
     def score(self, response: FloatArray, residue: FloatArray) -> FloatArray:
         """Return the scores (I, 12C) of the cameras' parameters, with poses and points eliminated.
 
-        Args:
-            response: (6I, 12C) decrease of the best change of the poses per change of the cameras.
-            residue: (N, 2) residuals after poses and points.
+        The response is as `ReducedSystem.pose_response`; the residuals (N, 2) are those after poses and points.
         """
         scores = np.zeros((response.shape[1], self.counts[0]))
         observed = self.photo, self.camera, self.point, self.by_view, self.by_point
@@ -306,7 +289,7 @@ def couple_cameras(observed: Any, groups: Any, poses: int, damping: float, rows:
 
 
 @kernel
-def eliminate_from_cameras(
+def eliminate_from_cameras(  # noqa: PLR0913 -- a kernel
     photo: IndexArray, point: IndexArray, A: FloatArray, camera_of: IndexArray, starts: IndexArray, sums: FloatArray,
     poses: int, rows: FloatArray,
 ) -> None:  # fmt: skip
@@ -369,15 +352,13 @@ class Bundle:
     camera: NDArray[np.int64]
     """(I,) row of the camera of each photo."""
     R: FloatArray
-    """(I, 3, 3) rotations, camera from world."""
     t: FloatArray
-    """(I, 3) translations, camera from world."""
+    """(I, 3, 3) rotations and (I, 3) translations, camera from world."""
     X: FloatArray
     """(P, 3) points."""
     photo: NDArray[np.int64]
-    """(N,) row of the photo of each observation."""
     point: NDArray[np.int64]
-    """(N,) row of the point of each observation."""
+    """(N,) rows of the photo and the point of each observation."""
     x: FloatArray
     """(N, 2) observed positions, in pixels."""
     family: NDArray[np.int64]
@@ -450,10 +431,8 @@ def residuals(bundle: Bundle, predicted: FloatArray) -> FloatArray:
 def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
     """Eliminate points, then poses (Schur complement), in the Gauss-Newton approximation.
 
-    The covariance of the cameras is noise^2 H^-1. It is accurate where poses and points minimize the cost.
-
-    Args:
-        scale_px: s of the loss s^2 (sqrt(1 + |r|^2 / s^2) - 1), which is COLMAP's SOFT_L1.
+    The covariance of the cameras is noise^2 H^-1. It is accurate where poses and points minimize the cost. The loss is
+    COLMAP's SOFT_L1, s^2 (sqrt(1 + |r|^2 / s^2) - 1), with s = `scale_px`.
     """
     r, by_view, by_point, used = _linearize(bundle, scale_px)
     whiten, rank = whiten_points(by_point, bundle.point, len(bundle.X))
@@ -500,12 +479,9 @@ def _unwhiten(whiten: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def apply_step(bundle: Bundle, params: FloatArray, poses: FloatArray, points: FloatArray) -> Bundle:
-    """Return the bundle with new cameras, and with changed poses and points.
+    """Return the bundle with new cameras (C, 12), changed poses (I, 6), and points shifted by (P, 3).
 
-    Args:
-        params: (C, 12) the new cameras.
-        poses: (I, 6) changes: a rotation vector in the camera's axes, and a shift of t.
-        points: (P, 3) shifts.
+    The change of a pose is a rotation vector in the camera's axes, and a shift of t.
     """
     R = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ bundle.R
     return replace(bundle, params=params, R=R, t=bundle.t + poses[:, 3:], X=bundle.X + points)
@@ -535,7 +511,8 @@ def cost(bundle: Bundle, scale_px: float) -> float:
 
 def loss(r: FloatArray, usable: NDArray[np.bool_], scale_px: float) -> float:
     """Return half the sum of the loss of `reduce` over residuals (N, 2), in squared pixels; `lost_px` counts for lost
-    ones."""
+    ones.
+    """
     with np.errstate(all="ignore"):
         squares = np.where(usable, np.einsum("ni,ni->n", r, r), REDUCTION.lost_px**2)
     return float(scale_px**2 * np.sum(np.sqrt(1.0 + squares / scale_px**2) - 1.0))
@@ -544,11 +521,7 @@ def loss(r: FloatArray, usable: NDArray[np.bool_], scale_px: float) -> float:
 def usable_mask(bundle: Bundle, r: FloatArray, depth: FloatArray | None = None) -> NDArray[np.bool_]:
     """Return the mask (N,) of observations of points in front of their camera, with residuals below `lost_px`.
 
-    A panorama also sees points behind it.
-
-    Args:
-        r: (N, 2) residuals in pixels.
-        depth: (N,) of the points before their cameras; from the poses if None.
+    A panorama also sees points behind it. Without depths (N,) before the cameras, they come from the poses.
     """
     with np.errstate(all="ignore"):
         if depth is None:
@@ -579,12 +552,7 @@ def _linearize(bundle: Bundle, scale_px: float) -> tuple[FloatArray, FloatArray,
 def weigh(
     r: FloatArray, by_view: FloatArray, by_point: FloatArray, usable: NDArray[np.bool_], scale_px: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Return weighted residuals, weighted derivatives, and the mask (N,) of used ones; the others are 0.
-
-    Args:
-        r: (N, 2) residuals in pixels.
-        by_view, by_point: (N, 2, k) and (N, 2, 3) derivatives of the projections.
-    """
+    """Return weighted residuals (N, 2), derivatives (N, 2, k) and (N, 2, 3), and the mask (N,) of used ones, else 0."""
     with np.errstate(all="ignore"):
         largest = np.maximum(np.abs(by_view).max(axis=(1, 2), initial=0.0), np.abs(by_point).max(axis=(1, 2)))
         used = usable & (largest < REDUCTION.max_derivative)

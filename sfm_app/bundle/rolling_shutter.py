@@ -46,22 +46,16 @@ class RowProjection(NamedTuple):
     depth: FloatArray
     """(N,) of the points before the camera, at the moment of their row."""
     by_camera: FloatArray
-    """(N, 2, 12)"""
     by_pose: FloatArray
-    """(N, 2, 6) as of `normal_equations.project`."""
     by_motion: FloatArray
-    """(N, 2, 6)"""
     by_point: FloatArray
-    """(N, 2, 3)"""
+    """(N, 2, k) derivatives by camera (12), pose (6) as of `normal_equations.project`, motion (6) and point (3)."""
 
 
 def project_rows(bundle: Bundle, share: FloatArray, motion: FloatArray) -> RowProjection:
-    """Project the points of all observations, each from the pose at the time of its row.
+    """Project the points of all observations, each from the pose at the time of its row (N,).
 
-    Args:
-        bundle: with the poses of the middle rows.
-        share: (N,) row of each observation.
-        motion: (I, 6) velocity of each photo as in `PathVelocities`, times the readout.
+    `motion` (I, 6) is the velocity of each photo, as in `PathVelocities`, times the readout; poses are of middle rows.
     """
     rows, R = bundle.camera[bundle.photo], bundle.R[bundle.photo]
     points = np.einsum("nij,nj->ni", R, bundle.X[bundle.point])
@@ -77,13 +71,7 @@ def project_rows(bundle: Bundle, share: FloatArray, motion: FloatArray) -> RowPr
 
 
 def move_to_middle_row(points: FloatArray, share: FloatArray, motion: FloatArray) -> FloatArray:
-    """Return points (N, 3) of a camera's frame at the time of its middle row.
-
-    Args:
-        points: (N, 3) in the camera's frame at the time of their own rows.
-        share: (N,) these rows.
-        motion: (6,) of the photo, as in `project_rows`.
-    """
+    """Return points (N, 3) of a camera's frame at the times of their rows (N,) as they are at its middle row."""
     moved = share[:, None] * motion
     return np.asarray(Rotation.from_rotvec(moved[:, :3]).inv().apply(points) - moved[:, 3:], np.float64)
 
@@ -128,12 +116,7 @@ class PathVelocities:
 
 
 def path_velocities(R: FloatArray, t: FloatArray, times: FloatArray) -> PathVelocities:
-    """Return velocities of photos.
-
-    Args:
-        R, t: (I, 3, 3) and (I, 3) camera from world, I >= 9.
-        times: (I,) of the photos, distinct.
-    """
+    """Return velocities of photos, nine or more, at distinct times; poses are camera from world."""
     order = np.argsort(times)
     back = np.argsort(order)
     fits = [_fit_windows(R[order], t[order], times[order], *fit) for fit in FITS]
@@ -160,12 +143,7 @@ def _fit_windows(
 
 
 def local_fit_weights(offsets: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
-    """Return weights (I, k) that give the value and the derivative at 0 of a polynomial fit.
-
-    Args:
-        offsets: (I, k) distinct times of the fitted values.
-        degree: below k.
-    """
+    """Return weights (I, k) of the value and the derivative at 0 of a polynomial fit to k distinct times."""
     unit = np.abs(offsets).max(axis=1)
     powers = (offsets / unit[:, None])[:, :, None] ** np.arange(degree + 1)
     solution = np.linalg.pinv(powers)
@@ -229,7 +207,6 @@ class ShutterSystem:
     photo: IndexArray
     point: IndexArray
     free: IndexArray
-    """Unknowns that change."""
     offsets: slice
     """Which unknowns are offsets."""
     redundancy: int
@@ -257,10 +234,8 @@ def linearize(
 ) -> ShutterSystem:
     """Eliminate the points (Schur complement), in the Gauss-Newton approximation.
 
-    Args:
-        precision: (n,) of the priors on the unknowns, in 1 / px^2 like the squared derivatives.
-        pull: (n,) precisions times distances to the prior means.
-        held: whether the readout is known.
+    `precision` (n,) is of the priors on the unknowns, in 1 / px^2; `pull` (n,) is precisions times distances to their
+    means; `held` tells whether the readout is known.
     """
     bundle, n = model.bundle, model.unknowns
     r, by_view, by_point = _weighted_derivatives(model, scale_px)
@@ -459,7 +434,6 @@ class ReadoutEstimate:
     shake: FloatArray
     """(2,) size of the offsets of turns and moves, in deviations of the path's velocities times readout."""
     noise_px: float
-    """Standard deviation of a coordinate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -486,7 +460,6 @@ def estimate_readout(
     Args:
         bundle: adjusted as if a global shutter had taken its photos; nine or more.
         freed: (C, 7) parts of the cameras with the wide prior.
-        scale_px: as of `normal_equations.reduce`.
         start: an earlier estimate for the same photos, whose readout and shake are the start.
         known: the readout, if only poses and points are to be adjusted.
     """
@@ -511,14 +484,14 @@ def estimate_readout(
 
 
 def _follow_path(model: ShutterBundle, problem: _Problem) -> ShutterBundle:
-    """Return the model with the velocities of its path."""
     path = path_velocities(model.bundle.R, model.bundle.t, problem.rows.times)
     return replace(model, velocity=path.select(problem.fits))
 
 
 def _expected_offsets(model: ShutterBundle, problem: _Problem, shake: FloatArray) -> FloatArray:
     """Return standard deviations (I, 6) of the offsets; constant during a step, else offsets would enlarge the
-    readout."""
+    readout.
+    """
     times = problem.rows.times
     path = path_velocities(model.bundle.R, model.bundle.t, times)
     readout = max(abs(model.readout), OPTIONS.least_readout * float(np.median(np.diff(np.sort(times)))))
@@ -526,12 +499,7 @@ def _expected_offsets(model: ShutterBundle, problem: _Problem, shake: FloatArray
 
 
 def _update_shake(offsets: FloatArray, variances: FloatArray, shake: FloatArray) -> FloatArray:
-    """Return the size of offsets (2,) from the offsets that the photos determine.
-
-    Args:
-        offsets, variances: (I, 6) in expected deviations, and their squares.
-        shake: (2,) present size.
-    """
+    """Return the size of offsets (2,) from those that the photos determine; (I, 6) are in expected deviations."""
     measured = np.sum(1.0 - np.minimum(variances, 1.0).reshape(-1, 2, 3), axis=(0, 2))
     squares = np.sum(offsets.reshape(-1, 2, 3) ** 2, axis=(0, 2))
     factor = np.sqrt(squares / np.maximum(measured, OPTIONS.least_measured))

@@ -47,13 +47,7 @@ OPTIONS = UndistortionOptions()
 
 
 def radial_factor(r: FloatArray, terms: FloatArray, projection: str) -> FloatArray:
-    """Return (N,) ratios of the distorted to the undistorted radius.
-
-    Args:
-        r: (N,) undistorted radius in focal lengths; for a fisheye the angle to the axis.
-        terms: (8,) as in `Calibration.distortion`.
-        projection: "perspective" or "fisheye".
-    """
+    """Return (N,) ratios of the distorted to the undistorted radius in focal lengths; of a fisheye, to the angle."""
     k1, k2, _, _, k3, k4, k5, k6 = terms
     s = r * r
     if projection == FISHEYE:
@@ -72,7 +66,8 @@ def fold_radius(terms: FloatArray, projection: str) -> float:
 
 def undistort(points: FloatArray, terms: FloatArray, projection: str) -> FloatArray:
     """Return points (N, 2) before distortion, in focal lengths from the optical center; those beyond the fold lie on
-    it."""
+    it.
+    """
     fold = fold_radius(terms, projection)
     w = _undistort_radius(points, terms, projection, fold)
     if not _shift(w, terms, projection).any():

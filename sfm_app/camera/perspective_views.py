@@ -44,11 +44,7 @@ class PerspectiveView:
     height: int
 
     def locate(self, project: Callable[[FloatArray], FloatArray]) -> NDArray[np.float32]:
-        """Return the pixels (height, width, 2) of the photo that the view shows.
-
-        Args:
-            project: takes rays (N, 3) of the photo's frame and returns their pixels (N, 2).
-        """
+        """Return the pixels (height, width, 2) of the photo that the view shows; `project` takes rays (N, 3)."""
         pixels = np.empty((self.height, self.width, 2), np.float32)
         strip = 256  # rows that are projected at once, so that memory stays small
         for top in range(0, self.height, strip):
@@ -65,11 +61,9 @@ class PerspectiveView:
 
 
 def cover_rays(rays: FloatArray, focal_px: float, most_px: int) -> list[PerspectiveView]:
-    """Return perspective views that together show all rays of a photo, with sides of at most `most_px`.
+    """Return perspective views that together show all rays (N, 3) of a photo; rays are dense over its field.
 
-    Args:
-        rays: (N, 3) unit vectors, dense over the field of the photo.
-        focal_px: focal length of the views in pixels; smaller where a view would become too large.
+    Sides have at most `most_px`; the focal length is smaller where a view would become too large.
     """
     axes = _axes(rays)
     nearest = np.argmax(rays @ axes[:, 2].T, axis=1)

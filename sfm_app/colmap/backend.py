@@ -167,12 +167,7 @@ def has_running_call() -> bool:
 
 
 def run_interruptible(call: Callable[[pycolmap.CancellationToken], None], poll: Callable[[], None]) -> None:
-    """Run a long COLMAP call in a thread, so that Ctrl-C stops it.
-
-    Args:
-        call: ends early once its token is cancelled.
-        poll: called twice a second, to show progress.
-    """
+    """Run a long COLMAP call in a thread, so that Ctrl-C cancels its token; `poll` is called twice a second."""
     token = pycolmap.CancellationToken()
     with ThreadPoolExecutor(1, thread_name_prefix="colmap") as thread:
         future = thread.submit(call, token)

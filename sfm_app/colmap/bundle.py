@@ -92,7 +92,8 @@ def read_camera(camera: pycolmap.Camera) -> FloatArray:
 
 def write_camera(camera: pycolmap.Camera, params: FloatArray, family: int) -> None:
     """Change a camera in place to the smallest of FILE_MODELS that holds parameters (12,); a panorama stays as it
-    is."""
+    is.
+    """
     if family == PANORAMA:
         return
     name = file_model(params, family)
@@ -111,11 +112,7 @@ def file_model(params: FloatArray, family: int) -> str:
 
 
 def read_bundle(model: pycolmap.Reconstruction, rules: Rules = NO_RULES) -> tuple[list[int], Bundle]:
-    """Return the ids of the cameras in use, and the model as arrays.
-
-    Args:
-        rules: of some cameras, by id; those that are kept are fixed.
-    """
+    """Return the ids of the cameras in use, and the model as arrays; cameras that rules keep are fixed."""
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
     ids, points = sorted(photos_per_camera(model)), sorted(model.points3D)
     cameras = [model.cameras[camera_id] for camera_id in ids]
@@ -223,7 +220,6 @@ class Rounds:
     """Before the last step."""
     lenses: LensEstimate
     noise_px: float
-    """As in `ReducedSystem`."""
     open_points: int
     """Points that their rays did not determine when the rounds began."""
 
@@ -233,9 +229,7 @@ def adjust_in_rounds(
 ) -> Rounds:
     """Refine cameras, poses, points and tracks of a model in place, until they no longer change.
 
-    Args:
-        model: with cameras of FILE_MODELS.
-        graph: of all matches; None to keep the tracks.
+    The cameras are of FILE_MODELS; without a graph of all matches, the tracks stay.
 
     Raises:
         NumericalError: the adjustment diverges.
@@ -260,11 +254,7 @@ def adjust_in_rounds(
 
 
 def solve(model: pycolmap.Reconstruction, refined: Collection[int] = ()) -> None:
-    """Adjust poses and points in place, on one thread: the order of sums over several threads is not fixed.
-
-    Args:
-        refined: ids of the cameras whose focal is adjusted, too.
-    """
+    """Adjust poses, points and the focals of `refined` cameras in place, on one thread: sums over several vary."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
@@ -379,11 +369,7 @@ class Families:
 def best_families(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules = NO_RULES) -> Families:
     """Choose the family of every camera that suggests the other one, by the evidence of its observations.
 
-    Both families are adjusted to the same tracks.
-
-    Args:
-        model: adjusted; not changed.
-        rules: by camera id; a camera with a required family is not tried as another.
+    Both families are adjusted to the same tracks; `model` stays. Rules may require a camera's family.
     """
     rivals = {}
     for row, camera_id in enumerate(rounds.ids):
@@ -422,7 +408,6 @@ def _spread_photos(model: pycolmap.Reconstruction, camera_id: int) -> list[int] 
 
 
 def _with_camera(model: pycolmap.Reconstruction, camera: pycolmap.Camera) -> pycolmap.Reconstruction:
-    """Return a copy of a model with another lens for one camera."""
     copy = pycolmap.Reconstruction(model)
     own = copy.cameras[camera.camera_id]
     own.model, own.params = camera.model, camera.params.tolist()
@@ -448,11 +433,7 @@ def _compare(
 def record_lenses(
     model: pycolmap.Reconstruction, rounds: Rounds, others: Mapping[int, LensChoice]
 ) -> dict[int, LensRecord]:
-    """Return the chosen model of each camera and its rivals, by camera id.
-
-    Args:
-        others: rivals of the other family, from `best_families`.
-    """
+    """Return the chosen model of each camera and its rivals, by camera id; `others` are rivals of the other family."""
     records = {}
     for row, camera_id in enumerate(rounds.ids):
         best, *rest = rounds.lenses.ranking[row]
@@ -502,14 +483,11 @@ def adjust(
 
     In each round, poses and points are eliminated, and the likelihood of the cameras is weighed against their priors.
     The cameras make the resulting step. Poses and points follow linearly; after a long step COLMAP's solver refines
-    them. Then tracks are completed and filtered.
-
-    Args:
-        model: result of mapping; not changed.
-        families_known: whether an earlier adjustment has chosen between fisheye and perspective lenses.
+    them. Then tracks are completed and filtered. The given model is not changed; with `families_known`, an earlier
+    adjustment has chosen between fisheye and perspective lenses.
 
     Raises:
-        NumericalError: the adjustment diverges; the given model is unchanged.
+        NumericalError: the adjustment diverges.
     """
     model = pycolmap.Reconstruction(model)
     for camera in all_cameras(model):
@@ -596,9 +574,6 @@ def apply_rules(model: pycolmap.Reconstruction, rules: Rules) -> None:
     """Give cameras the user's values or model, in place, and adjust poses and points to them.
 
     Mapping may have changed a camera that is kept, and may have used another model.
-
-    Args:
-        model: as mapping left it, with cameras of FILE_MODELS.
     """
     changed = False
     for camera_id, rule in rules.items():

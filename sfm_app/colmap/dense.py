@@ -88,10 +88,7 @@ def _erode(used: BoolArray, reach: int) -> BoolArray:
 def undistort(
     model_dir: Path, photo_dir: Path, dense_dir: Path, max_side_px: int, workers: int, progress: Progress
 ) -> None:
-    """Write undistorted photos and the matching model into a dense workspace, which is created if it is missing.
-
-    Args:
-        max_side_px: longest side of an undistorted photo; larger photos are scaled down.
+    """Write undistorted photos and the matching model into a dense workspace; larger photos are scaled down.
 
     Raises:
         BackendError: COLMAP cannot read the model or the photos, or cannot write.

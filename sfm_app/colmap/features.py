@@ -58,11 +58,7 @@ def find_and_match(
 ) -> dict[str, Json]:
     """Find features of photos and match pairs in a worker process; existing features and matches stay.
 
-    Args:
-        pairs: ids of photos; None for every photo with every other.
-
-    Returns:
-        The effective options, for the manifest.
+    Without pairs, every photo is matched with every other. The result is the effective options, for the manifest.
 
     Raises:
         BackendError: COLMAP failed.
@@ -91,11 +87,7 @@ def feature_task(
 
 
 def do_feature_task(task: FeatureTask, progress: Progress, report: Callable[..., None]) -> None:
-    """Find features of photos, and match pairs of photos.
-
-    Args:
-        report: called with the effective options, as `extraction` or `matching`.
-    """
+    """Find features of photos, or match pairs; report the effective options as `extraction` or `matching`."""
     database, photo_dir, names = Path(task["database"]), Path(task["photos"]), task["names"]
     options = MatchSettings.model_validate(task["options"])
     masks = Path(task["masks"]) if task["masks"] else None
@@ -172,11 +164,7 @@ def extract_as_needed(
     enough: int,
     token: pycolmap.CancellationToken,
 ) -> None:
-    """Find SIFT features of photos that have none yet, and enter them; `token` ends the work early. Ours.
-
-    Args:
-        enough: number of features below which a photo is enlarged.
-    """
+    """Enter SIFT features of photos that have none; those with fewer than `enough` are enlarged. Ours."""
     with open_database(database) as before:
         ids = {image.name: image.image_id for image in before.read_all_images()}
         new = [name for name in names if not before.exists_keypoints(ids[name])]
@@ -233,10 +221,7 @@ def extract_panoramas(
 ) -> None:
     """Find SIFT features of panoramas that have none yet. Ours.
 
-    Of too many features, those of the largest scale remain, as in COLMAP.
-
-    Args:
-        extraction: COLMAP's options; the largest size is that of one view.
+    Of too many features, those of the largest scale remain, as in COLMAP, whose largest size is that of one view.
     """
     with open_database(database) as reader:
         images = {image.name: image.image_id for image in reader.read_all_images()}
@@ -297,11 +282,7 @@ def match(
     pairs: Sequence[PairId] | None,
     progress: Progress,
 ) -> dict[str, Json]:
-    """Match pairs of photos, and return the effective options.
-
-    Args:
-        pairs: ids of the photos of each pair; None for every photo with every other.
-    """
+    """Match pairs of photos, None for every photo with every other, and return the effective options."""
     matching = pycolmap.FeatureMatchingOptions()
     matching.skip_geometric_verification = True
     matching.num_threads = workers
@@ -430,10 +411,7 @@ class Part:
 
 
 def write_snapshot(database: Path, target: Path, without: Sequence[str]) -> None:
-    """Copy a database that nobody is writing to, atomically, into one that can be read over a network.
-
-    Args:
-        without: tables that stay empty.
+    """Copy a database that nobody writes to, atomically, for reading over a network; tables `without` stay empty.
 
     Raises:
         BackendError: the database cannot be read, or the copy not written.
@@ -459,10 +437,7 @@ def find_in_chunk(inputs: SiftInputs, names: Sequence[str]) -> Part:
 
 
 def match_chunk(inputs: SiftInputs, pairs: Sequence[PairId], progress: Progress | None = None) -> Part:
-    """Match some pairs, and leave their rows in a file.
-
-    Args:
-        pairs: ids of photos; COLMAP matches the photos of a pair in this order.
+    """Match pairs of photos by their ids, in this order, and leave their rows in a file.
 
     Raises:
         BackendError: COLMAP failed.
@@ -518,11 +493,7 @@ def count_features(database: Path) -> list[int]:
 
 
 def exhaustive_pairs(photos: Sequence[int]) -> list[PairId]:
-    """Return all pairs of photos as COLMAP's exhaustive matching takes them; in some, the larger id comes first.
-
-    Args:
-        photos: ids, ascending.
-    """
+    """Return all pairs of ascending ids as COLMAP's exhaustive matching takes them; in some, the larger comes first."""
     pairs, block = [], 50  # photos of a block, COLMAP's default
     for first, a in enumerate(photos):
         for second, b in enumerate(photos[first + 1 :], first + 1):

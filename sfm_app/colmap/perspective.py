@@ -27,11 +27,7 @@ ViewNames = Mapping[str, Sequence[str]]
 
 
 def full_size_lenses(model: pycolmap.Reconstruction, *, centered: bool) -> dict[int, WideLens]:
-    """Return the views of every camera at full size, by its id.
-
-    Args:
-        centered: whether every view has square pixels and its optical center in the middle.
-    """
+    """Return the views of every camera at full size, by id; `centered` ones have square pixels and a central axis."""
     with translate_errors("undistorting the cameras"):
         lenses = perspective_lenses(model, 65_000)  # pixels: what JPEG can hold, rounded down
     if not centered:
@@ -140,11 +136,7 @@ LargerView = tuple[str, NDArray[np.float64], NDArray[np.uint8], NDArray[np.bool_
 
 
 class LargerViews:
-    """Undistorts the photos of a dense workspace again, at another size.
-
-    Args:
-        views: of the dense workspace; photos without any are left out.
-        max_side_px: longest side of a view; none is larger than its photo.
+    """Undistorts the photos of a dense workspace again, at another size, but no larger than the photo.
 
     Raises:
         BackendError: COLMAP cannot read the model.
@@ -207,8 +199,7 @@ def _resize(view: View, R: NDArray[np.float64], focal_px: float, max_side_px: in
 def write_bundle(model_dir: Path, photo_dir: Path, file: Path, workers: int, progress: Progress) -> None:
     """Write the cameras, poses and points of a model for Bundler; COLMAP also writes photos, which are thrown away.
 
-    Args:
-        model_dir: COLMAP's model, with one focal per camera and optical centers in the middle.
+    The model has one focal per camera, and optical centers in the middle.
 
     Raises:
         BackendError: COLMAP cannot read the model or the photos, or cannot write.

@@ -34,12 +34,9 @@ def measure_readout(
     adjusted: Adjustment, keypoints: Keypoints, times: Mapping[int, float],
     start: ReadoutEstimate | None = None, *, known: float | None = None,
 ) -> ReadoutEstimate:  # fmt: skip
-    """Estimate the readout of the shutter from a model and uncompensated keypoints.
+    """Estimate the readout of the shutter from a model and uncompensated keypoints, at distinct times.
 
-    Args:
-        adjusted: a model of photos of perspective or fisheye cameras, five or more.
-        times: distinct, by photo id.
-        start, known: as of `estimate_readout`.
+    The model has five or more photos, and no panorama; `start` and `known` are as of `estimate_readout`.
     """
     model = adjusted.model
     ids, bundle = read_bundle(model)
@@ -62,11 +59,7 @@ def measure_readout(
 def straighten_model(
     model: pycolmap.Reconstruction, estimate: ReadoutEstimate, keypoints: Keypoints
 ) -> pycolmap.Reconstruction:
-    """Return a copy of a model with the estimated poses, points and cameras, and with its keypoints compensated.
-
-    Args:
-        keypoints: uncompensated.
-    """
+    """Return a copy of a model with the estimate's poses, points and cameras, and with compensated keypoints."""
     model = pycolmap.Reconstruction(model)
     ids, _ = read_bundle(model)
     write_bundle(model, ids, estimate.bundle)
@@ -79,11 +72,7 @@ def straighten_model(
 
 
 def row_shares(x: FloatArray, camera: pycolmap.Camera) -> FloatArray:
-    """Return the shares (N,) of the rows of keypoints (N, 2); rows are read along the shorter side of the sensor.
-
-    Args:
-        camera: of the photo, which may stand upright.
-    """
+    """Return the shares (N,) of the rows of keypoints (N, 2); rows are read along the shorter side of the sensor."""
     upright = camera.height > camera.width
     return np.asarray(x[:, 0] / camera.width - 0.5 if upright else x[:, 1] / camera.height - 0.5, np.float64)
 

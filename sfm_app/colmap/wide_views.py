@@ -111,8 +111,7 @@ def render_views(
 ) -> Iterator[tuple[NDArray[np.uint8], BoolArray]]:
     """Yield each view of a photo, (H, W, 3) BGR, and the mask (H, W) of pixels that it shows and nothing masks.
 
-    Args:
-        maps: (H, W, 2) pixels of the photo that each view shows, -1 where it shows none; empty if not known.
+    `maps` (H, W, 2) are the pixels of the photo that each view shows, -1 where it shows none; empty if not known.
     """
     photo = np.asarray(cv2.imdecode(np.fromfile(photo_dir / name, np.uint8), cv2.IMREAD_COLOR), np.uint8)
     used = None if mask_dir is None else read_mask(mask_dir, name)

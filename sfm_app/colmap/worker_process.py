@@ -55,7 +55,6 @@ class MatchTask(TypedDict):
     features: str
     photos: str
     options: dict[str, Any]
-    """Dump of `MatchSettings`."""
     sift: dict[str, SiftOption]
     folder: str
     pairs: list[list[int]]
@@ -221,10 +220,7 @@ class ProcessGroup:
 
 
 def run_worker(task: Mapping[str, object], doing: str, progress: Progress | None = None) -> dict[str, Json]:
-    """Run one of COLMAP's tasks in a process, and return its results.
-
-    Args:
-        doing: description of the work, for error messages.
+    """Run one of COLMAP's tasks in a process, and return its results; error messages say what it was `doing`.
 
     Raises:
         BackendError: COLMAP failed.

@@ -26,11 +26,7 @@ UNSAFE = re.compile(r"[^A-Za-z0-9-]+")
 
 
 def plain_names(names: Sequence[str]) -> list[str]:
-    """Return a name of letters, digits, - and _ for each name, all different even where case does not count.
-
-    Args:
-        names: of photos with their folders, without suffix, or of cameras.
-    """
+    """Return a name of letters, digits, - and _ for each name, all different even where case does not count."""
     used, unique = set[str](), []
     for name in names:
         plain = stem = UNSAFE.sub("_", name).strip("_") or "_"

@@ -32,11 +32,7 @@ FILM_MM = 36.0
 def write_usd(model: Model, name: str) -> Mapping[str, bytes]:
     """Write triangles with a texture or a color per vertex, or points; and the cameras, if any.
 
-    Args:
-        name: of the files, without suffix.
-
-    Returns:
-        The stage in USD's binary form, a JPEG per page of texture, and its normal map, if any.
+    The files are the stage in USD's binary form, a JPEG per page of texture, and the normal map, if any.
 
     Raises:
         ReconstructionError: the model is empty or not finite.
@@ -154,7 +150,6 @@ def add_texture(stage: "Usd.Stage", mesh: "UsdGeom.Mesh", texture: Texture, page
 
 
 def _page_material(stage: "Usd.Stage", path: str, file: str) -> "UsdShade.Material":  # type: ignore[name-defined]  # noqa: F821
-    """Add a rough material with a picture as its color."""
     from pxr import Sdf, UsdShade
 
     types = Sdf.ValueTypeNames

@@ -96,12 +96,7 @@ class ResidualGrid:
 
 
 def epipolar_residuals(pairs: CameraPairs, camera: Calibration) -> EpipolarResiduals:
-    """Return the residuals of all inliers.
-
-    Args:
-        pairs: of this camera; their matrices are of pixels for a perspective camera, else of rays.
-        camera: any projection.
-    """
+    """Return the residuals of all inliers; matrices of a perspective camera are of pixels, others of rays."""
     x, along, distances = [np.zeros((2, 0, 2))], [np.zeros((2, 0, 2))], [np.zeros(0)]
     matched = ((F, np.asarray(x, np.float64)) for F, x in zip(pairs.Fs, pairs.inliers, strict=False) if len(x))
     for F, match in matched:
@@ -243,7 +238,6 @@ def center_plane(camera: Calibration, pairs: Pairs) -> ParameterPlane:
 
 
 def _draw_plane(axes: "Axes", plane: ParameterPlane, camera: Calibration, pairs: Pairs) -> None:
-    """Draw votes, curves and K in one plane."""
     shades = vote_shares(plane, camera, pairs)
     axes.imshow(shades, extent=plane.extent, origin="lower", cmap="inferno", vmin=0, vmax=1, interpolation="bilinear")
     _draw_curves(axes, plane, plane.extent, OPTIONS.curve_samples)
@@ -333,15 +327,11 @@ class LensCurve(NamedTuple):
     """A lens and an ideal one for comparison."""
 
     theta_deg: FloatArray
-    """(N,) angles to the optical axis, up to the farthest corner."""
     radius_px: FloatArray
-    """(N,)"""
     ideal_px: FloatArray
-    """(N,)"""
     deviation_px: FloatArray
-    """(N,) standard deviations of the radius."""
+    """(N,) each: angles to the optical axis up to the farthest corner, radii, ideal radii, deviations of the radii."""
     ideal: str
-    """Name of the ideal lens."""
 
 
 def lens_curve(camera: Calibration) -> LensCurve:
@@ -383,7 +373,6 @@ def _draw_curve(axes: "Axes", curve: LensCurve, camera: Calibration) -> None:
 
 
 def _draw_difference(axes: "Axes", curve: LensCurve) -> None:
-    """Draw the difference between lens and ideal lens, with its band."""
     off = curve.radius_px - curve.ideal_px
     band = OPTIONS.band_deviations * curve.deviation_px
     low, high = off - band, off + band
@@ -470,12 +459,7 @@ def draw_intrinsics(path: Path, matches: MatchGraph, views: ViewGraph, intrinsic
 
 
 def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
-    """Draw cameras into a file; the same calibration gives the same bytes.
-
-    Args:
-        path: its suffix names the format, see `check_figure`; its folder may be missing.
-        panels: only the first `OPTIONS.most_cameras` are drawn.
-    """
+    """Draw at most `OPTIONS.most_cameras` cameras into a file; the same calibration gives the same bytes."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -519,7 +503,6 @@ def weightiest(pairs: CameraPairs, most: int) -> CameraPairs:
 
 
 def _draw_camera(part: "SubFigure", panel: Panel) -> None:
-    """Draw all rows of one camera."""
     panel = panel._replace(pairs=weightiest(panel.pairs, OPTIONS.most_pairs))
     rows = part.subfigures(len(panel.heights_in), 1, squeeze=False, height_ratios=panel.heights_in)[:, 0]
     if panel.is_perspective:

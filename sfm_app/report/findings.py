@@ -53,12 +53,7 @@ def correlation_table(before: Calibration, after: CameraModel | None) -> Correla
     """Return the correlations after the last adjustment, else those from pairs; None if neither is known.
 
     Lens terms of value 0 are omitted, and the second focal of square pixels. An undetermined center stays in the table:
-    its
-    error causes an error of the focal.
-
-    Args:
-        before: the camera from pairs of photos.
-        after: the camera of the last adjustment.
+    its error causes an error of the focal.
     """
     if after is not None and after.correlations:
         values = dict(zip(PARAMETERS.get(after.model, ()), after.params, strict=False))
@@ -177,7 +172,6 @@ def _facts(contents: RunContents) -> Iterator[Fact]:
 
 
 def _photo_facts(contents: RunContents) -> Iterator[Fact]:
-    """Yield the number of photos, and the focal length of the first camera."""
     scene, intrinsics, photos = contents.scene, contents.intrinsics, contents.counts("photos")
     if scene is not None:
         count, unusable = len(scene.registered) + len(scene.unregistered), len(photos.get("unusable", ()))
@@ -196,7 +190,6 @@ def _photo_facts(contents: RunContents) -> Iterator[Fact]:
 
 
 def _unit_fact(contents: RunContents) -> Fact:
-    """Return the unit of the model, and its accuracy."""
     if not contents.is_metric:
         return Fact("unit", "arbitrary", "unknown scale")
     frame = contents.frame
@@ -274,7 +267,6 @@ def camera_tables(contents: RunContents) -> list[CameraTable]:
 
 
 def _lens_rows(after: Any) -> list[tuple[str, str, str]]:
-    """Return the lens terms that have a deviation."""
     names = [name for name in after.deviations if name not in PLACES_IN_K]
     first = len(after.params) - len(names)
     return [
@@ -376,12 +368,7 @@ class PhotoRow:
 
 
 def photo_rows(contents: RunContents, figures: ModelFigures | None, pictures: Mapping[str, str]) -> list[PhotoRow]:
-    """Return the rows of all photos by name, unusable files last.
-
-    Args:
-        figures: of the model, if any.
-        pictures: addresses of small pictures by photo; some may be missing.
-    """
+    """Return the rows of all photos by name, unusable files last; `pictures` are addresses of some by photo."""
     if contents.photos is None:
         return []
     photos = contents.photos.photos
@@ -406,7 +393,6 @@ def photo_rows(contents: RunContents, figures: ModelFigures | None, pictures: Ma
 
 
 def _state(photo: Photo, contents: RunContents) -> tuple[str, str]:
-    """Return whether a photo is placed, and the reason if not."""
     scene = contents.scene
     if scene is None:
         return USABLE, ""

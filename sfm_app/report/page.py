@@ -62,11 +62,7 @@ def three_script() -> str:
 def finish_report(run: RunContext, problem: SfmError | None = None) -> Path | None:
     """Note how a run ended, and write its report; a failure here does not end the run.
 
-    Args:
-        problem: the error that ended the run; None if it finished.
-
-    Returns:
-        The report; None if no run has begun in the folder, or another run is using it.
+    The result is None if no run has begun in the folder, or another run is using it.
     """
     place = run.workspace
     if not (place.root / LOCK).exists():
@@ -88,10 +84,7 @@ def finish_report(run: RunContext, problem: SfmError | None = None) -> Path | No
 
 
 def write_report(run: RunContext, beside_run: RunContext | None = None) -> Path:
-    """Write OUT/report.html from the products of the finished stages, and return its path.
-
-    Args:
-        beside_run: another run to compare it with.
+    """Write OUT/report.html from the products of the finished stages, beside another run, and return its path.
 
     Raises:
         InputError: a folder holds no run.
@@ -104,7 +97,6 @@ def write_report(run: RunContext, beside_run: RunContext | None = None) -> Path:
 
 
 def _is_up_to_date(place: Workspace) -> bool:
-    """Return whether the report was written after the last change of the manifest."""
     report, manifest = place.root / REPORT, place.manifest.path
     return report.exists() and manifest.exists() and report.stat().st_mtime_ns >= manifest.stat().st_mtime_ns
 

@@ -238,7 +238,6 @@ class DepthPicture:
 
     name: str
     text: str
-    """Caption, and text for screen readers."""
     address: str
     """JPEG as a data address: the photo at the left, depths at the right."""
     size: tuple[int, int]
@@ -292,10 +291,8 @@ def _draw(dense: Path, name: str, share: float) -> DepthPicture | None:
 def depth_colors(depth: FloatArray) -> tuple[ByteArray, tuple[float, float]]:
     """Return the colors (H, W, 3) RGB of depths, yellow near and violet far, and the depths at both ends.
 
-    Colors are even in 1 / depth, as disparities are: otherwise the near half of a scene has one color.
-
-    Args:
-        depth: (H, W), <= 0 or not finite for unknown depths.
+    Colors are even in 1 / depth, as disparities are: otherwise the near half of a scene has one color. Unknown depths
+    are <= 0 or not finite.
 
     Raises:
         ValueError: no pixel has a depth.

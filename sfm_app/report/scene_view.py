@@ -54,11 +54,7 @@ def view_points(contents: RunContents) -> Model | None:
 
 
 def view_frame(contents: RunContents, points: Model, photos: Sequence[str]) -> dict[str, Json]:
-    """Return the data of the 3D view besides model and points: cameras, and the scene's place and size.
-
-    Args:
-        photos: names of the photos in the order of the page's rows.
-    """
+    """Return the data of the 3D view besides model and points: cameras, and the scene's place and size."""
     rows = {name: number for number, name in enumerate(photos)}
     middle, size = _bounds(points)
     return {

@@ -156,7 +156,6 @@ class RunResources:
         return Resource(JPEG, jpeg) if jpeg else None
 
     def _is_large(self) -> bool:
-        """Return whether the page shows a lighter model first."""
         model = model_file(self.contents)
         return model is not None and model.stat().st_size > self.most_bytes
 
@@ -299,11 +298,7 @@ def open_server(resources: RunResources, port: int = 0) -> ViewServer:
 
 
 def serve_run(run: RunContext, port: int, started: Callable[[str], None]) -> None:
-    """Serve the page of a run until Ctrl-C.
-
-    Args:
-        port: 0 for any free port.
-        started: called with the address when the page can be opened.
+    """Serve the page of a run until Ctrl-C; `started` is called with its address. Port 0 is any free one.
 
     Raises:
         InputError: the folder holds no run.

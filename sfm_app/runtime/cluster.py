@@ -77,11 +77,7 @@ class Serialized:
 
 
 class Serializer(contextlib.AbstractContextManager["Serializer"]):
-    """Serializes values for other processes; each shared value becomes one file until the end of the block.
-
-    Args:
-        folder: all processes read and write it under this path.
-    """
+    """Serializes values for processes that share a folder; each shared value is one file until the block ends."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -323,13 +319,7 @@ def local_workers(address: str) -> int:
 
 
 class Cluster:
-    """The workers of a cluster, seen from the coordinating process.
-
-    Args:
-        client: Dask's client.
-        folder: for large values, in the output folder.
-        limit: most workers at once; 0 for all. Those of this machine share its memory.
-    """
+    """The workers of a cluster, seen from the coordinating process: at most `limit` at once, or all for 0."""
 
     def __init__(self, client: Any, folder: Path, settings: ClusterSettings, limit: int = 0) -> None:
         self.client, self.folder, self.settings, self.limit = client, folder, settings, limit
@@ -428,9 +418,6 @@ class Cluster:
     def wait(self, future: Any, what: str) -> Reply | None:
         """Return the reply of a call; None if each worker that tried it ended.
 
-        Args:
-            what: name of the task, for messages.
-
         Raises:
             ClusterError: the scheduler is gone, or it has had no workers for too long.
         """
@@ -480,9 +467,6 @@ class Cluster:
 @contextlib.contextmanager
 def connect(settings: ClusterSettings, folder: Path) -> Iterator[Cluster]:
     """Provide the cluster of an address; a cluster on this machine ends with the block.
-
-    Args:
-        folder: for large values, in the output folder.
 
     Raises:
         ConfigError: Dask is not installed.
@@ -585,18 +569,12 @@ def run_local_workers(scheduler: str, count: str, scratch: str, parent: str) -> 
 
 @dataclass(slots=True, eq=False)
 class _Flight:
-    """Items sent to a worker."""
-
     items: list[Any]
     future: Any = field(default=None)
 
 
 class ClusterExecutor(RemoteExecutor):
-    """Threads of this process, and a cluster for tasks.
-
-    Args:
-        workers: number of threads; on this machine, also the most tasks at once.
-    """
+    """Threads of this process, and a cluster for tasks; on this machine, `workers` is also the most tasks at once."""
 
     def __init__(self, cluster: Cluster, workers: int) -> None:
         super().__init__(max_workers=workers, thread_name_prefix="sfm")
@@ -615,12 +593,9 @@ class ClusterExecutor(RemoteExecutor):
         return self.cluster.cpu_seconds
 
     def spread(self, task: Task[Result], items: Iterable[Any]) -> Iterator[Result]:
-        """Yield the results of a task in the order of the items.
+        """Yield the results of a task in the order of the items, which are drawn only as they are needed.
 
         Another worker repeats a call whose worker is lost. This process repeats items that fail with a machine error.
-
-        Args:
-            items: drawn only as they are needed.
 
         Raises:
             ClusterError: the scheduler is gone, or an item ends each worker that tries it.
@@ -635,8 +610,6 @@ class ClusterExecutor(RemoteExecutor):
 
 
 class _Spreading:
-    """One task applied to all items."""
-
     def __init__(self, executor: ClusterExecutor, task: Task[Any], serializer: Serializer) -> None:
         self.executor, self.cluster, self.task, self.serializer = executor, executor.cluster, task, serializer
         self.probe = self.cluster.probe()
@@ -667,7 +640,6 @@ class _Spreading:
         return _Flight(items, self.cluster.submit(call, next(self._keys)))
 
     def _land(self, flight: _Flight) -> Iterator[Any]:
-        """Yield the results of one call."""
         reply = self._wait(flight)
         if reply is None:  # calls that waited on the lost workers count as lost, too: find the one to blame
             for item in flight.items:

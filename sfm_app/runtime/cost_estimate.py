@@ -57,9 +57,8 @@ class Plan:
     pairs: int
     workers: int
     core_seconds: Mapping[str, float]
-    """By stage."""
     memory_mb: Mapping[str, float]
-    """Peak memory by stage."""
+    """Both by stage; the memory is the peak."""
 
     def minutes(self, stages: Iterable[str]) -> float:
         """Return how many minutes these stages take."""

@@ -177,7 +177,6 @@ class Workspace:
         self.photos = root / "photos"
         """Upright photos that COLMAP can read: links if it can read the file itself, else copies."""
         self.frames = root / "frames"
-        """Chosen frames of a video."""
         self.frames_marker = root / "frames.unfinished.json"
         """Chosen frames and fingerprint of the inputs, until the frames are read."""
         self.masks = root / "masks"
@@ -185,7 +184,6 @@ class Workspace:
         self.database = root / DATABASE
         """COLMAP's database: photos, keypoints and matches."""
         self.photo_set = root / PHOTO_SET
-        """Data of the photos."""
         self.photo_stats = root / PHOTO_STATS
         """Measurements of every photo: a run that knows a file by its bytes does not decode it again."""
         self.view_graph = root / VIEW_GRAPH
@@ -207,7 +205,6 @@ class Workspace:
         self.fine_surface = self.surface / FINE
         """Surface before simplification, for a normal map."""
         self.texture = root / "texture"
-        """The surface with its texture."""
         self.database_marker = root / f"database.{UNFINISHED}"
         """Fingerprint of the inputs while the database is filled."""
         self.feature_parts = root / FEATURES
@@ -342,11 +339,7 @@ class Workspace:
 
 
 class SubWorkspace(Workspace):
-    """A folder inside the output folder, for another hypothesis about the same photos.
-
-    Args:
-        of: the run's workspace, with photos and masks.
-    """
+    """A folder inside a run's output folder, for another hypothesis about the same photos."""
 
     def __init__(self, of: Workspace, name: str) -> None:
         super().__init__(of.root / name)

@@ -43,10 +43,7 @@ class Lens:
         return self.radial[0] if self.radial else 0.0
 
     def rays(self, points: FloatArray) -> FloatArray:
-        """Return (N, 3) directions, z = 1 with "perspective", else of length 1; NaN for points without ray.
-
-        Args:
-            points: (N, 2) on the normalized image plane.
+        """Return directions (N, 3) of image points (N, 2), z = 1 with "perspective", else of length 1; NaN without ray.
 
         Raises:
             ConfigError: the distortion folds within these points, so that one of them has several rays.
@@ -64,11 +61,7 @@ class Lens:
         return np.column_stack([plain * scale[:, None], np.cos(theta)])
 
     def project(self, rays: FloatArray) -> FloatArray:
-        """Return (N, 2) points of the normalized image plane.
-
-        Args:
-            rays: (N, 3) of any length; in front of the camera with "perspective".
-        """
+        """Return image points (N, 2) of rays (N, 3) of any length; with "perspective", in front of the camera."""
         side = np.hypot(rays[:, 0], rays[:, 1])
         if self.projection == "equirectangular":
             level = np.hypot(rays[:, 0], rays[:, 2])
@@ -302,10 +295,6 @@ def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Vie
 def look_at(center: FloatArray, aim: FloatArray, roll_deg: float = 0.0) -> FloatArray:
     """Return (3, 4) cam_from_world of a camera that looks at a point, world y up.
 
-    Args:
-        center, aim: (3,) center of projection, and the point in the middle of the view.
-        roll_deg: rotation about the optical axis.
-
     Raises:
         ValueError: the camera looks straight up or down, so that its roll is undefined.
     """
@@ -332,13 +321,9 @@ def axis_rotation(axis: FloatArray, angle_deg: float) -> FloatArray:
 
 
 def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> FloatArray:
-    """Return viewing directions in the camera frame, row by row.
+    """Return viewing directions (height * width, 3) in the camera frame, row by row; NaN outside the image circle.
 
-    Args:
-        offset_px: position of the ray in each pixel; (0.5, 0.5) is the center.
-
-    Returns:
-        (height * width, 3), z = 1 with a perspective lens, else of length 1; NaN outside the image circle.
+    They have z = 1 with a perspective lens, else length 1. An offset of (0.5, 0.5) is the center of a pixel.
 
     Raises:
         ConfigError: the radial distortion folds within the photo, so that a pixel has no unique ray.

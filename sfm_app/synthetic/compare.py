@@ -46,11 +46,6 @@ def surface_error(
     diagonal of the bounding box of the true surface that the photos see. The median ignores missing parts: see
     `surface_coverage`.
 
-    Args:
-        vertices, faces: (V, 3) in the reconstruction's frame, and (T, 3) vertex indices.
-        centers: camera center (3,) by photo name in the frame of `vertices`; at least 3 photos of the truth.
-        samples: points drawn evenly from the surface (fixed seed).
-
     Raises:
         ValueError: fewer than 3 common photos, or the surface has no area.
         NumericalError: the camera centers lie on a line.

@@ -79,7 +79,6 @@ class TrackOptions:
     outliers: float = 0.3
     """Share of wrong matches in the corrupted pairs, in [0, 1)."""
     outlier_range_px: float = 256.0
-    """As in `PairOptions`."""
     other_focal: float = 1.0
     """Focal length of the last camera over that of the others; 1: all cameras share K. In [0.2, 5]."""
     width: int = 512
@@ -119,9 +118,8 @@ class TwoViews:
     """Matches of two views and their ground truth."""
 
     x1: FloatArray
-    """(N, 2) pixels."""
     x2: FloatArray
-    """(N, 2) pixels; row k matches row k of x1."""
+    """(N, 2) pixels; row k of x2 matches row k of x1."""
     is_inlier: NDArray[np.bool_]
     """(N,): False where x2 was displaced. An outlier may still lie near its epipolar line by chance."""
     F: FloatArray
@@ -129,13 +127,11 @@ class TwoViews:
     K1: FloatArray
     K2: FloatArray
     R: FloatArray
-    """(3, 3) rotation of cam2_from_cam1."""
     t: FloatArray
-    """(3,) translation of cam2_from_cam1."""
+    """(3, 3) rotation and (3,) translation of cam2_from_cam1."""
     exact_x1: FloatArray
-    """(N, 2) pixels before noise and outliers."""
     exact_x2: FloatArray
-    """(N, 2) pixels before noise and outliers."""
+    """(N, 2) pixels of both photos before noise and outliers."""
 
     @property
     def K(self) -> FloatArray:
@@ -154,9 +150,8 @@ class Tracks:
     K: FloatArray
     """(C, 3, 3) camera matrix per camera; all equal unless the last one has another focal length."""
     R: FloatArray
-    """(C, 3, 3) rotation of cam_from_world."""
     t: FloatArray
-    """(C, 3) translation of cam_from_world."""
+    """(C, 3, 3) rotations and (C, 3) translations of cam_from_world."""
     X: FloatArray
     """(N, 3) points in the world."""
     x: FloatArray
@@ -219,13 +214,7 @@ def pair_matches(
     tracks: Tracks, outliers: Mapping[tuple[int, int], float] | None = None, outlier_range_px: float = 256.0,
     seed: int = 0,
 ) -> Iterator[tuple[tuple[int, int], FloatArray]]:  # fmt: skip
-    """Yield the matches of every pair of cameras, with outliers in chosen pairs.
-
-    Args:
-        outliers: share of wrong matches, in [0, 1), per pair; no pair by default.
-
-    Yields:
-        Pair (i, j) in the order of `tracks.pairs`, and (N, 4) x1, y1, x2, y2 in pixels.
+    """Yield each pair of cameras and its matches (N, 4) x1, y1, x2, y2 in pixels; chosen pairs have shares of outliers.
 
     Raises:
         ConfigError: a share is out of range or a pair is not in the tracks.

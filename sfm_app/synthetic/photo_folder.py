@@ -43,7 +43,6 @@ class PhotoOptions:
     exposure_ev: float = 0.0
     """Standard deviation of the exposure from photo to photo, in stops, 0..3."""
     seed: int = 0
-    """Same seed, same noise."""
 
     def __post_init__(self) -> None:
         check_ranges(
@@ -62,7 +61,6 @@ class Truth:
     """Ground truth of a rendered photo folder."""
 
     cameras: Mapping[str, Camera]
-    """By photo name."""
     cam_from_world: Mapping[str, FloatArray]
     """By photo name: (3, 4) [R | t]."""
     vertices: FloatArray
@@ -119,10 +117,8 @@ def add_missing_photos(
 ) -> Truth:  # fmt: skip
     """Render the missing photos of a folder in parallel processes; the bytes are those of `write_photo_folder`.
 
-    Other photos of the folder must be of the same scene, views and options, which is not checked.
-
-    Args:
-        processes: >= 1; with 1, this process renders. A script with more needs a `__main__` guard.
+    Other photos of the folder must be of the same scene, views and options, which is not checked. A script with more
+    than one process needs a `__main__` guard.
 
     Raises:
         InputError: the folder cannot be written.

@@ -61,14 +61,9 @@ def prepare(scene: SyntheticScene) -> PreparedScene:
 def render_scene(
     scene: PreparedScene, camera: Camera, cam_from_world: FloatArray, supersampling: int = 2
 ) -> FloatArray:
-    """Render the image of a camera, before blur, noise and gamma.
+    """Return the image (height, width, 3) of a camera in linear RGB, about 0..1, before blur, noise and gamma.
 
-    Args:
-        cam_from_world: (3, 4) pose; with a rolling shutter (height, 3, 4), one for each row.
-        supersampling: rays per pixel in x and in y, >= 1; each has its own shadow ray.
-
-    Returns:
-        (height, width, 3) linear RGB, about 0..1.
+    With a rolling shutter, each row has a pose: (height, 3, 4). Each ray of supersampling has its own shadow ray.
     """
     total = np.zeros((camera.height * camera.width, 3))
     offsets = (np.arange(supersampling) + 0.5) / supersampling
@@ -109,12 +104,7 @@ def ray_caster(vertices: FloatArray, faces: NDArray[np.int64]) -> Any:
 
 
 def cast_rays(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[str, NDArray[Any]]:
-    """Return the first hits of rays, by Open3D's names; t_hit is inf for rays that hit nothing.
-
-    Args:
-        origin: (3,), or (N, 3) one per ray.
-        directions: (N, 3) of any length, which is the unit of t_hit.
-    """
+    """Return the first hits of rays, by Open3D's names; t_hit, in lengths of the directions, is inf without a hit."""
     rays = np.empty((len(directions), 6), dtype=np.float32)
     rays[:, :3] = origin
     rays[:, 3:] = directions
@@ -273,16 +263,7 @@ def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: F
 
 
 def comparison_image(photo: Colors, model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Colors:
-    """Return a photo and the model from its camera; below, the model and its untextured shape from the side.
-
-    Args:
-        photo: (h, w, 3) RGB; resized to the camera's size.
-        camera: intrinsics and distortion, and the size of each of the four pictures.
-        cam_from_world: (3, 4) pose.
-
-    Returns:
-        (2 height, 2 width, 3) RGB.
-    """
+    """Return a photo and the model from its camera, RGB; below, the model and its untextured shape from the side."""
     prepared = model if isinstance(model, PreparedModel) else prepare_model(model)
     size = camera.width, camera.height
     fine = Camera(np.diag([2, 2, 1.0]) @ camera.K, 2 * size[0], 2 * size[1], camera.lens)
