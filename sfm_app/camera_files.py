@@ -1,4 +1,7 @@
-"""Read the cameras that a user knows, from the files of several programs."""
+"""Read the cameras that a user knows, from the files of several programs.
+
+The functions for one program raise ValueError where a file is damaged, or a camera is not supported.
+"""
 
 import json
 import struct
@@ -34,11 +37,7 @@ DAMAGED = "its bytes are not those of a COLMAP model"
 
 
 def read_colmap_text(text: str) -> dict[str, Calibration]:
-    """Return the cameras of a cameras.txt by their ids.
-
-    Raises:
-        ValueError: a line is no camera.
-    """
+    """Return the cameras of a cameras.txt by their ids."""
     cameras = {}
     for line in (line.strip() for line in text.splitlines()):
         if not line or line.startswith("#"):
@@ -55,11 +54,7 @@ def read_colmap_text(text: str) -> dict[str, Calibration]:
 
 
 def read_colmap_binary(data: bytes) -> dict[str, Calibration]:
-    """Return the cameras of a cameras.bin by their ids.
-
-    Raises:
-        ValueError: the bytes are damaged, or a camera is not supported.
-    """
+    """Return the cameras of a cameras.bin by their ids."""
     cameras, reader = {}, _Reader(data)
     (count,) = reader.take("<Q")
     if count > 1_000_000:
@@ -75,12 +70,7 @@ def read_colmap_binary(data: bytes) -> dict[str, Calibration]:
 
 
 def read_colmap_folder(folder: Path) -> tuple[dict[str, Calibration], dict[str, str]]:
-    """Return the cameras of a folder with one of `CAMERA_FILES`, by their ids, and the id by photo if there are images.
-
-    Raises:
-        OSError: a file cannot be read.
-        ValueError: a file is damaged, or a camera is not supported.
-    """
+    """Return the cameras of a folder with one of `CAMERA_FILES`, by their ids, and the id by photo if known."""
     if (folder / "cameras.bin").is_file():
         images = folder / "images.bin"
         known = dict(_binary_images(images.read_bytes())) if images.is_file() else {}
@@ -155,11 +145,7 @@ def is_opencv_camera(values: Mapping[str, Any]) -> bool:
 
 
 def opencv_camera(values: Mapping[str, Any]) -> Calibration:
-    """Return the camera of OpenCV's values: a camera matrix, and optionally distortion, size, and the kind of lens.
-
-    Raises:
-        ValueError: they are no camera, or a coefficient is not supported.
-    """
+    """Return the camera of OpenCV's values: a camera matrix, and optionally distortion, size, and the kind of lens."""
     K = _numbers(_value(values, MATRIX), "the camera matrix")
     if K.size != 9:
         raise ValueError(f"the camera matrix has {K.size} values instead of 3 x 3")
@@ -176,11 +162,7 @@ def opencv_camera(values: Mapping[str, Any]) -> Calibration:
 
 
 def read_file_storage(text: str) -> dict[str, Any]:
-    """Return the entries of OpenCV's YAML or XML: numbers, texts, lists and matrices.
-
-    Raises:
-        ValueError: OpenCV cannot read it.
-    """
+    """Return the entries of OpenCV's YAML or XML: numbers, texts, lists and matrices."""
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
@@ -260,17 +242,8 @@ MODELS = {
 PANORAMAS = ("spherical", "equirectangular")
 
 
-def is_opensfm_camera(values: Mapping[str, Any]) -> bool:
-    """Return whether the values name a projection type, as OpenSfM's do."""
-    return "projection_type" in values
-
-
 def opensfm_camera(values: Mapping[str, Any]) -> Calibration:
-    """Return the camera of OpenSfM's values, one entry of its file.
-
-    Raises:
-        ValueError: its projection type is not supported, or they are no camera.
-    """
+    """Return the camera of OpenSfM's values, one entry of its file."""
     kind = str(values["projection_type"]).lower()
     width, height = (int(values.get(name, 0)) for name in ("width", "height"))
     if width <= 0 or height <= 0:
@@ -297,33 +270,13 @@ def opensfm_camera(values: Mapping[str, Any]) -> Calibration:
 FIELDS = {field.name for field in fields(Calibration)}
 
 
-def is_run_file(values: Mapping[str, Any]) -> bool:
-    """Return whether the values are those of calibration.json or scene.json."""
-    return "cameras" in values and "camera_of" in values
-
-
-def run_file_cameras(values: Mapping[str, Any]) -> tuple[dict[str, Calibration], dict[str, str]]:
-    """Return the known cameras of calibration.json or scene.json, and the camera of each photo.
-
-    Raises:
-        ValueError: the values are no cameras.
-    """
-    entries = {str(name): run_camera(entry) for name, entry in values["cameras"].items()}
-    cameras = {name: camera for name, camera in entries.items() if camera is not None}
-    return cameras, {str(photo): str(name) for photo, name in values["camera_of"].items()}
-
-
 def is_run_camera(values: Mapping[str, Any]) -> bool:
     """Return whether the values are those of one camera of a run."""
     return "K" in values and ("identifiable" in values or "params" in values)
 
 
 def run_camera(values: Mapping[str, Any]) -> Calibration | None:
-    """Return a camera of a run, a `Calibration` or `CameraModel` as plain values; None if photos did not determine it.
-
-    Raises:
-        ValueError: they are no camera.
-    """
+    """Return a camera of a run, a `Calibration` or `CameraModel` as plain values; None if it is a guess."""
     if "params" in values:
         size = int(values["width"]), int(values["height"])
         camera = calibration_from_model(str(values["model"]), values["params"], size)
@@ -411,8 +364,10 @@ def _read_json(text: str) -> tuple[str, Cameras]:
         raise ValueError(f"it is not valid JSON: {err}") from None
     if not isinstance(values, Mapping):
         raise ValueError("its JSON is not an object")
-    if is_run_file(values):
-        return "sfm-app", run_file_cameras(values)
+    if "cameras" in values and "camera_of" in values:  # calibration.json or scene.json
+        entries = {str(name): run_camera(entry) for name, entry in values["cameras"].items()}
+        known = {name: camera for name, camera in entries.items() if camera is not None}
+        return "sfm-app", (known, {str(photo): str(name) for photo, name in values["camera_of"].items()})
     if is_run_camera(values):
         camera = run_camera(values)
         return "sfm-app", ({"": camera} if camera is not None else {}, {})
@@ -426,7 +381,7 @@ def _read_json(text: str) -> tuple[str, Cameras]:
 
 _BY_NAME: tuple[tuple[str, Callable[..., bool], Callable[..., Calibration | None]], ...] = (
     ("sfm-app", is_run_camera, run_camera),
-    ("OpenSfM", is_opensfm_camera, opensfm_camera),
+    ("OpenSfM", lambda values: "projection_type" in values, opensfm_camera),
     ("OpenCV", is_opencv_camera, opencv_camera),
 )
 """Forms of JSON with cameras by name: the test and the reader of an entry."""

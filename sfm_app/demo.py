@@ -92,11 +92,7 @@ class DemoResult:
 
 
 def run_demo(out: Path, scene: str, settings: Settings, progress: Progress) -> tuple[Run, DemoResult]:
-    """Render OUT/photos, reconstruct them into OUT/model, compare, and draw OUT/model.png.
-
-    Raises:
-        SfmError: see `sfm_app.errors`.
-    """
+    """Render OUT/photos, reconstruct them into OUT/model, compare, and draw OUT/model.png."""
     start = time.perf_counter()
     truth = render_photos(out, scene, settings, progress)
     rendered = time.perf_counter()
@@ -116,11 +112,7 @@ def run_demo(out: Path, scene: str, settings: Settings, progress: Progress) -> t
 def render_photos(
     out: Path, scene: str, settings: Settings, progress: Progress, scenes: Mapping[str, DemoScene] = SCENES
 ) -> Truth:
-    """Return the ground truth of the photos in OUT/photos after rendering the missing ones.
-
-    Raises:
-        InputError: the folder has photos of another scene.
-    """
+    """Return the truth of the photos in OUT/photos, after rendering the missing ones; InputError for other photos."""
     demo = scenes[scene]
     views, photos = demo.views(), out / "photos"
     files = {path.name for path in photos.glob("*.jpg")}

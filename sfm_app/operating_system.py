@@ -1,6 +1,7 @@
 """Differences between operating systems; no other module asks which system this is.
 
-Each function has a fallback for macOS, Windows, and drives and containers with fewer abilities than Linux.
+Each function has a fallback for macOS, Windows, and drives and containers with fewer abilities than Linux;
+OSError where the system refuses.
 """
 
 import contextlib
@@ -95,9 +96,6 @@ def link_or_copy(place: Path, target: Path | str, source: Path) -> None:
     """Make a link with the text `target` to the file `source`, or a copy if links are not possible.
 
     A copy is no hard link: a program that writes to it must not change the user's file.
-
-    Raises:
-        OSError: neither is possible, or the path exists.
     """
     if not lacks(Ability.LINKS):
         try:
@@ -113,11 +111,7 @@ def link_or_copy(place: Path, target: Path | str, source: Path) -> None:
 
 
 def share_bytes(source: Path, target: Path) -> None:
-    """Make a file with the bytes of another, as a hard link if possible; neither is written to later.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Make a file with the bytes of another, as a hard link if possible; neither is written to later."""
     if not lacks(Ability.HARD_LINKS):
         with contextlib.suppress(OSError):
             os.link(source, target)
@@ -135,20 +129,12 @@ def is_link(path: Path) -> bool:
 
 
 def replace_file(source: Path, target: Path) -> None:
-    """Replace a file by another one on the same drive, atomically.
-
-    Raises:
-        OSError: the system refuses.
-    """
+    """Replace a file by another one on the same drive, atomically."""
     _insist(source.replace, target)
 
 
 def move(source: Path, target: Path) -> None:
-    """Move a file or a folder on the same drive to a path where nothing is.
-
-    Raises:
-        OSError: the system refuses.
-    """
+    """Move a file or a folder on the same drive to a path where nothing is."""
     _insist(source.rename, target)
 
 

@@ -186,12 +186,15 @@ def _estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors, fr
     moved, held = _apply_step(params, step.reshape(params.shape), priors.sides)
     moved[zero] = priors.usual[zero]
     moved[priors.fixed], held[priors.fixed], deviations[priors.fixed] = params[priors.fixed], False, 0.0
-    prior, undetermined = _prior_deviations(params, priors), priors.parameter_mask(priors.estimated) & ~changing
+    prior = priors.precision(np.ones((len(params), COUNT), np.bool_)) ** -0.5
+    prior[:, [FX, FY]] = FOCAL_SPREAD * params[:, [FX, FY]]
+    undetermined = priors.parameter_mask(priors.estimated) & ~changing
     deviations[held] = np.maximum(deviations[held], prior[held])
     # photos make no part less certain than its prior: a larger deviation is rounding, where nearly all of H cancels
     deviations[undetermined] = np.minimum(deviations, np.hypot(prior, offsets))[undetermined]
     determined[held] = False
-    own_squares = _camera_blocks(mean_squares) * (~held & ~priors.fixed)[:, None, None]
+    blocks = np.einsum("iaib->iab", mean_squares.reshape(2 * params.shape))
+    own_squares = blocks * (~held & ~priors.fixed)[:, None, None]
     return LensEstimate(
         np.where(held[:, None], params, moved), deviations, own_squares, free & determined, determined,
         float(np.max(largest.reshape(params.shape)[~held & ~priors.fixed], initial=0.0)), held, (), held,
@@ -272,12 +275,6 @@ def _mean_squares(
     return squares
 
 
-def _camera_blocks(squares: FloatArray) -> FloatArray:
-    count = len(squares) // CAMERA
-    blocks = np.einsum("iaib->iab", squares.reshape(count, CAMERA, count, CAMERA))
-    return np.array(blocks, np.float64)
-
-
 def _logarithm_jacobian(params: FloatArray) -> sparse.csr_array:
     """Return (12C, 12C) derivatives of the parameters by those with log f and log fy/fx in place of fx and fy."""
     T = sparse.eye_array(params.size, format="lil")
@@ -301,13 +298,6 @@ def _apply_step(params: FloatArray, step: FloatArray, sides: FloatArray) -> tupl
     low, high = OPTIONS.focals
     is_plausible = np.isfinite(moved).all(axis=1) & np.all((focals > low) & (focals < high), axis=1)
     return moved, ~is_plausible | (np.abs(step[:, LOG_FOCAL]) > OPTIONS.longest_step)
-
-
-def _prior_deviations(params: FloatArray, priors: LensPriors) -> FloatArray:
-    """Return (C, 12) standard deviations of cameras that the photos do not determine."""
-    deviations = priors.precision(np.ones((len(params), COUNT), np.bool_)) ** -0.5
-    deviations[:, [FX, FY]] = FOCAL_SPREAD * params[:, [FX, FY]]
-    return np.asarray(deviations, np.float64)
 
 
 def _shorten_step(before: FloatArray, after: FloatArray, camera: int, priors: LensPriors) -> FloatArray:

@@ -434,7 +434,11 @@ def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
     The covariance of the cameras is noise^2 H^-1. It is accurate where poses and points minimize the cost. The loss is
     COLMAP's SOFT_L1, s^2 (sqrt(1 + |r|^2 / s^2) - 1), with s = `scale_px`.
     """
-    r, by_view, by_point, used = _linearize(bundle, scale_px)
+    with np.errstate(all="ignore"):
+        predicted, by_camera, by_pose, by_point = project(bundle)
+        r, by_view = residuals(bundle, predicted), np.concatenate([by_pose, by_camera], 2)
+    # points behind their camera, or in its principal plane, would distort everything near them
+    r, by_view, by_point, used = weigh(r, by_view, by_point, usable_mask(bundle, r), scale_px)
     whiten, rank = whiten_points(by_point, bundle.point, len(bundle.X))
     by_point = np.einsum("nki,nji->nkj", by_point, whiten[bundle.point])
     counts = len(bundle.R), len(bundle.params), len(bundle.X)
@@ -535,18 +539,6 @@ def lost_points(bundle: Bundle) -> NDArray[np.bool_]:
     with np.errstate(all="ignore"):
         r = residuals(bundle, predict(bundle))
     return np.bincount(bundle.point[~usable_mask(bundle, r)], minlength=len(bundle.X)) > 0
-
-
-def _linearize(bundle: Bundle, scale_px: float) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Return weighted residuals (N, 2), derivatives by view (N, 2, 18) and point (N, 2, 3), and the mask (N,) of used
-    ones.
-
-    The others are 0: points behind their camera, or in its principal plane, would distort everything near them.
-    """
-    with np.errstate(all="ignore"):
-        predicted, by_camera, by_pose, by_point = project(bundle)
-        r, by_view = residuals(bundle, predicted), np.concatenate([by_pose, by_camera], 2)
-    return weigh(r, by_view, by_point, usable_mask(bundle, r), scale_px)
 
 
 def weigh(

@@ -171,12 +171,6 @@ class ShutterBundle:
     offsets: FloatArray
     """(I, 6) motion during the readout beyond that of the path."""
 
-    @classmethod
-    def motionless(cls, bundle: Bundle, share: FloatArray, readout: float) -> "ShutterBundle":
-        """Return a bundle whose photos do not move."""
-        still = np.zeros((len(bundle.R), VELOCITY))
-        return cls(bundle, share, readout, still, still)
-
     @property
     def motion(self) -> FloatArray:
         """(I, 6) of each photo during the readout."""
@@ -466,7 +460,9 @@ def estimate_readout(
     fits = path_velocities(bundle.R, bundle.t, rows.times).select_most_predictive()
     problem = _Problem(rows, fits, priors, priors.precision(freed), scale_px, known is not None)
     readout, shake = (start.readout, start.shake) if start else (0.0, np.ones(2))
-    model = _follow_path(ShutterBundle.motionless(bundle, rows.share, readout if known is None else known), problem)
+    still = np.zeros((len(bundle.R), VELOCITY))
+    model = ShutterBundle(bundle, rows.share, readout if known is None else known, still, still)
+    model = _follow_path(model, problem)
     noise_px = REDUCTION.usual_noise_px
     for _ in range(OPTIONS.steps):
         expected = _expected_offsets(model, problem, shake)

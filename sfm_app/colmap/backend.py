@@ -209,10 +209,9 @@ def run_with_progress(
 
 def json_options(options: Mapping[object, object]) -> dict[str, Json]:
     """Return COLMAP's options as JSON values; the manifest records all of them."""
-    return {str(key): _json_value(value) for key, value in options.items()}
-
-
-def _json_value(value: object) -> Json:
-    if isinstance(value, dict):
-        return json_options(value)
-    return value if isinstance(value, bool | int | float | str) else str(value)
+    return {
+        str(key): json_options(value)
+        if isinstance(value, dict)
+        else (value if isinstance(value, bool | int | float | str) else str(value))
+        for key, value in options.items()
+    }

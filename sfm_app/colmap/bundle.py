@@ -514,11 +514,7 @@ def adjust(
 def adjust_or_keep(
     model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RULES, *, families_known: bool = False
 ) -> Adjustment:
-    """Adjust a model; where that fails numerically, return the given model with the reason.
-
-    Raises:
-        BackendError: COLMAP failed.
-    """
+    """Adjust a model; where that fails numerically, return the given model with the reason."""
     try:
         with translate_errors("adjusting the bundle"):
             return adjust(model, database, rules, families_known=families_known)

@@ -88,11 +88,7 @@ def _erode(used: BoolArray, reach: int) -> BoolArray:
 def undistort(
     model_dir: Path, photo_dir: Path, dense_dir: Path, max_side_px: int, workers: int, progress: Progress
 ) -> None:
-    """Write undistorted photos and the matching model into a dense workspace; larger photos are scaled down.
-
-    Raises:
-        BackendError: COLMAP cannot read the model or the photos, or cannot write.
-    """
+    """Write undistorted photos and the matching model into a dense workspace; larger photos are scaled down."""
     (dense_dir / "images").mkdir(parents=True, exist_ok=True)
     task: UndistortTask = {
         "do": "undistort",

@@ -59,9 +59,6 @@ def find_and_match(
     """Find features of photos and match pairs in a worker process; existing features and matches stay.
 
     Without pairs, every photo is matched with every other. The result is the effective options, for the manifest.
-
-    Raises:
-        BackendError: COLMAP failed.
     """
     with start_worker(TASKS, feature_task(database, settings, names, workers, pairs)) as process:
         options = relay(process, progress)
@@ -411,11 +408,7 @@ class Part:
 
 
 def write_snapshot(database: Path, target: Path, without: Sequence[str]) -> None:
-    """Copy a database that nobody writes to, atomically, for reading over a network; tables `without` stay empty.
-
-    Raises:
-        BackendError: the database cannot be read, or the copy not written.
-    """
+    """Copy a database that nobody writes to, atomically, for reading over a network; tables `without` stay empty."""
     with translate_errors("copying the database"), replace_atomically(target) as beside:
         with contextlib.closing(sqlite3.connect(database)) as source:
             source.execute("VACUUM INTO ?", (str(beside),))
@@ -426,22 +419,14 @@ def write_snapshot(database: Path, target: Path, without: Sequence[str]) -> None
 
 
 def find_in_chunk(inputs: SiftInputs, names: Sequence[str]) -> Part:
-    """Find features of some photos, and leave their rows in a file.
-
-    Raises:
-        BackendError: COLMAP failed.
-    """
+    """Find features of some photos, and leave their rows in a file."""
     with _scratch_copy(inputs) as database:
         in_force = _find_and_match_here(database, inputs.settings, names, (), SilentProgress())
         return Part(_leave_rows(database, FEATURES, inputs.folder), len(names), in_force)
 
 
 def match_chunk(inputs: SiftInputs, pairs: Sequence[PairId], progress: Progress | None = None) -> Part:
-    """Match pairs of photos by their ids, in this order, and leave their rows in a file.
-
-    Raises:
-        BackendError: COLMAP failed.
-    """
+    """Match pairs of photos by their ids, in this order, and leave their rows in a file."""
     photos = sorted({photo for pair in pairs for photo in pair})
     with _MATCHING, _scratch_copy(inputs) as database:
         _copy_rows(database, inputs.features, FEATURES, photos)
@@ -450,11 +435,7 @@ def match_chunk(inputs: SiftInputs, pairs: Sequence[PairId], progress: Progress 
 
 
 def match_chunk_apart(inputs: SiftInputs, group: ProcessGroup, progress: Progress, pairs: Sequence[PairId]) -> Part:
-    """Match some pairs in a process of its own, as `match_chunk` does.
-
-    Raises:
-        BackendError: COLMAP failed, or the group has ended.
-    """
+    """Match some pairs in a process of its own, as `match_chunk` does."""
     task: MatchTask = {
         "do": "match_chunk", "snapshot": str(inputs.snapshot), "features": str(inputs.features),
         "photos": str(inputs.settings.photos), "options": inputs.settings.options.model_dump(),
@@ -465,11 +446,7 @@ def match_chunk_apart(inputs: SiftInputs, group: ProcessGroup, progress: Progres
 
 
 def enter_rows(database: Path, part: Path, tables: Sequence[str]) -> None:
-    """Enter the tables of a worker's file into the run's database, and remove the file.
-
-    Raises:
-        BackendError: the rows cannot be read or entered.
-    """
+    """Enter the tables of a worker's file into the run's database, and remove the file."""
     with translate_errors("entering the features and matches of workers"):
         _copy_rows(database, part, tables)
     part.unlink()

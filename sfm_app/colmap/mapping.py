@@ -54,9 +54,6 @@ def map_globally(
     """Find the poses of all these photos at once (GLOMAP: rotations, positions, adjustment); None if it gave no model.
 
     COLMAP has no way to stop this, so it runs in a separate process. The folder, from `copy_database`, is removed.
-
-    Raises:
-        BackendError: COLMAP failed.
     """
     task: GlobalMappingTask = {
         "do": "map_globally",

@@ -267,9 +267,6 @@ def sparse_model(model_dir: Path) -> Model:
     No third photo confirms points that only two photos see. Wrong points among these are far away, and would shrink the
     scene to a dot in a viewer. So points outside the bounding box of the confirmed points are left out, if a hundred or
     more are confirmed.
-
-    Raises:
-        BackendError: it cannot be read.
     """
     model = read_model(model_dir)
     points = finite_points(model)
@@ -349,11 +346,7 @@ class ModelFigures:
 
 
 def model_figures(model_dir: Path) -> ModelFigures:
-    """Return the figures of a model on disk.
-
-    Raises:
-        BackendError: it cannot be read.
-    """
+    """Return the figures of a model on disk."""
     with translate_errors("reading the sparse model"):
         model = pycolmap.Reconstruction(model_dir)
         xyz = {key: np.asarray(point.xyz) for key, point in model.points3D.items()}

@@ -136,11 +136,7 @@ LargerView = tuple[str, NDArray[np.float64], NDArray[np.uint8], NDArray[np.bool_
 
 
 class LargerViews:
-    """Undistorts the photos of a dense workspace again, at another size, but no larger than the photo.
-
-    Raises:
-        BackendError: COLMAP cannot read the model.
-    """
+    """Undistorts the photos of a dense workspace again, at another size, but no larger than the photo."""
 
     def __init__(
         self, model_dir: Path, photo_dir: Path, mask_dir: Path | None, views: Sequence[View], max_side_px: int
@@ -173,11 +169,7 @@ class LargerViews:
         return sorted(self._camera, key=lambda photo: (self._camera[photo], photo))
 
     def render(self, photo: str) -> Iterator[LargerView]:
-        """Yield the views of a photo.
-
-        Raises:
-            BackendError: the photo cannot be read.
-        """
+        """Yield the views of a photo."""
         camera_id, names = self._camera[photo], self._numbers[photo]
         lens, maps = self._lenses[camera_id], self._maps.camera_maps(camera_id)
         with translate_errors(f"reading {photo}"):
@@ -200,9 +192,6 @@ def write_bundle(model_dir: Path, photo_dir: Path, file: Path, workers: int, pro
     """Write the cameras, poses and points of a model for Bundler; COLMAP also writes photos, which are thrown away.
 
     The model has one focal per camera, and optical centers in the middle.
-
-    Raises:
-        BackendError: COLMAP cannot read the model or the photos, or cannot write.
     """
     scratch = file.with_name(".pmvs")
     try:

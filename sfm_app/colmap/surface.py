@@ -32,11 +32,7 @@ def fuse(dense_dir: Path, min_views: int, box: NDArray[np.float64], target: Path
 
 
 def open_points(path: Path) -> NDArray[np.void]:
-    """Return the records (N,) of COLMAP's points, with fields x, y, z, nx, ..., mapped from the file.
-
-    Raises:
-        BackendError: it is no binary PLY file of points.
-    """
+    """Return the records (N,) of COLMAP's points, with fields x, y, z, nx, ..., mapped from the file."""
     with translate_errors(f"reading {path.name}"), path.open("rb") as file:
         count, fields = -1, list[tuple[str, str]]()
         while (words := file.readline().split()) != [b"end_header"]:

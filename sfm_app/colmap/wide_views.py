@@ -94,11 +94,7 @@ def write_model(model_dir: Path, lenses: Mapping[int, WideLens], dense_dir: Path
 
 
 def write_views(name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | None, dense_dir: Path) -> None:
-    """Write the views of a photo, and masks of views with pixels that it does not show or that are masked.
-
-    Raises:
-        BackendError: the photo cannot be read, or the views cannot be written.
-    """
+    """Write the views of a photo, and masks of views with pixels that it does not show or that are masked."""
     with translate_errors(f"reading {name}"):
         for number, (pixels, shown) in enumerate(render_views(name, lens, photo_dir, mask_dir)):
             save_picture(dense_dir / "images" / view_name(name, number), pixels)

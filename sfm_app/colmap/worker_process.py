@@ -193,11 +193,7 @@ class ProcessGroup:
         self._running, self._lock, self._has_ended = set[WorkerProcess](), threading.Lock(), False
 
     def run(self, task: Mapping[str, object], doing: str, progress: Progress) -> dict[str, Json]:
-        """Run a task to its end or that of the group, as `run_worker` does.
-
-        Raises:
-            BackendError: COLMAP failed, or the group has ended.
-        """
+        """Run a task to its end or that of the group, as `run_worker` does."""
         with start_worker(TASKS, task) as process:
             with self._lock:
                 self._running.add(process)
@@ -220,11 +216,7 @@ class ProcessGroup:
 
 
 def run_worker(task: Mapping[str, object], doing: str, progress: Progress | None = None) -> dict[str, Json]:
-    """Run one of COLMAP's tasks in a process, and return its results; error messages say what it was `doing`.
-
-    Raises:
-        BackendError: COLMAP failed.
-    """
+    """Run one of COLMAP's tasks in a process, and return its results; error messages say what it was `doing`."""
     with start_worker(TASKS, task) as process:
         results = relay(process, progress or SilentProgress())
         process.check(doing)

@@ -144,9 +144,6 @@ class Pipeline:
         """Run the stages that are not up to date, and those with damaged files, up to `last`; from `first` on, all run.
 
         The products of `targets` are loaded before returning.
-
-        Raises:
-            SfmError: see errors.py; finished stages stay valid.
         """
         for name in filter(None, (first, last)):
             if name not in self.names:

@@ -77,11 +77,7 @@ class Products:
 
 @contextmanager
 def check_undamaged(stage: Stage[object], run: RunContext) -> Iterator[None]:
-    """Check the files of a stage, and turn errors of reading them in the block into one that names the stage.
-
-    Raises:
-        DamagedProductError: the files have changed, or cannot be read.
-    """
+    """Check the files of a stage, and turn errors of reading them in the block into one that names the stage."""
     try:
         record = run.workspace.manifest.record(stage.name)
         if record is None or record.digest != stage.digest(run.workspace):

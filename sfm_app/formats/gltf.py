@@ -87,11 +87,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
-    """Write triangles with a texture or a color per vertex, or else points; and the cameras, if any.
-
-    Raises:
-        ReconstructionError: the model is empty or not finite.
-    """
+    """Write triangles with a texture or a color per vertex, or else points; and the cameras, if any."""
     check(model)
     texture = model.texture if len(model.surface.faces) else None
     is_lit = texture is not None and bool(texture.normal_maps)

@@ -30,9 +30,6 @@ def write_ply(model: Model, name: str) -> Mapping[str, bytes]:
 
     Cameras are dots: readers differ on files with points and edges, but all show colored points in the same way. PLY
     has no common way to store a texture, or cameras beside a surface: both are left out.
-
-    Raises:
-        ReconstructionError: the model is empty or not finite.
     """
     check(model)
     surface = model.surface
@@ -102,9 +99,6 @@ def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
     """Write triangles with normals and a texture or a color per vertex, or else points; and cameras, if any, as lines.
 
     The files are the OBJ and, with a texture, the MTL, a JPEG per page, and the normal map, if any.
-
-    Raises:
-        ReconstructionError: the model is empty or not finite.
     """
     check(model)
     texture = model.texture if len(model.surface.faces) else None

@@ -66,17 +66,15 @@ def write_cameras(scene: FinishedScene, target: Path) -> None:
     }
     content = {
         "conventions": CONVENTIONS,
-        "cameras": {name: camera_entry(camera) for name, camera in result.cameras.items()},
+        "cameras": {
+            name: camera.to_dict() | {"parameters": list(PARAMETERS.get(camera.model, ()))}
+            for name, camera in result.cameras.items()
+        },
         "camera_of": dict(result.camera_of),
         "photos": photos,
         "unregistered": dict(result.unregistered),
     }
     target.write_text(json_text(content), encoding="utf-8", newline="\n")
-
-
-def camera_entry(camera: CameraModel) -> dict[str, Any]:
-    """Return a camera as plain values, with the names of its parameters."""
-    return camera.to_dict() | {"parameters": list(PARAMETERS.get(camera.model, ()))}
 
 
 # COLMAP's folder layout of undistorted photos, which Gaussian-splatting trainers read, and Bundler's files.

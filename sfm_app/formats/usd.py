@@ -33,21 +33,17 @@ def write_usd(model: Model, name: str) -> Mapping[str, bytes]:
     """Write triangles with a texture or a color per vertex, or points; and the cameras, if any.
 
     The files are the stage in USD's binary form, a JPEG per page of texture, and the normal map, if any.
-
-    Raises:
-        ReconstructionError: the model is empty or not finite.
     """
     check(model)
     pages = page_files(model, name)
-    return {f"{name}.usd": stage_bytes(model, pages), **_pictures(model, pages)}
+    with tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch:
+        path = Path(scratch) / "model.usdc"
+        _write_stage(path, model, pages)
+        return {f"{name}.usd": path.read_bytes(), **_pictures(model, pages)}
 
 
 def write_usdz(model: Model, name: str) -> Mapping[str, bytes]:
-    """Write the files of `write_usd` into one uncompressed package.
-
-    Raises:
-        ReconstructionError: the model is empty or not finite.
-    """
+    """Write the files of `write_usd` into one uncompressed package."""
     check(model)
     stage, *pages = write_usd(model, "model").items()
     return {f"{name}.usdz": pack({"model.usdc": stage[1], **dict(pages)})}
@@ -85,14 +81,6 @@ def pack(files: Mapping[str, bytes]) -> bytes:
             entry.extra = (0x1986).to_bytes(2, "little") + gap.to_bytes(2, "little") + bytes(gap)  # as USD's packer
             package.writestr(entry, data)
     return stream.getvalue()
-
-
-def stage_bytes(model: Model, pages: Mapping[int, str]) -> bytes:
-    """Return a stage in USD's binary form; `pages` are files by number of the page."""
-    with tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch:
-        path = Path(scratch) / "model.usdc"
-        _write_stage(path, model, pages)
-        return path.read_bytes()
 
 
 def _write_stage(path: Path, model: Model, pages: Mapping[int, str]) -> None:

@@ -84,15 +84,12 @@ def finish_report(run: RunContext, problem: SfmError | None = None) -> Path | No
 
 
 def write_report(run: RunContext, beside_run: RunContext | None = None) -> Path:
-    """Write OUT/report.html from the products of the finished stages, beside another run, and return its path.
-
-    Raises:
-        InputError: a folder holds no run.
-    """
+    """Write OUT/report.html from the products of the finished stages, beside another run, and return its path."""
     contents, other = read_run(run), read_run(beside_run) if beside_run is not None else None
-    path = run.workspace.root / REPORT
+    path, view = run.workspace.root / REPORT, embedded_view(contents, photo_names(contents))
+    parts = LargeParts(embedded_pictures(contents), view, is_served=False)
     with replace_atomically(path) as draft:
-        draft.write_text(render_page(contents, embed_parts(contents), other), encoding="utf-8", newline="\n")
+        draft.write_text(render_page(contents, parts, other), encoding="utf-8", newline="\n")
     return path
 
 
@@ -111,11 +108,6 @@ class LargeParts:
     """Data of the 3D view; None if no photo is placed."""
     is_served: bool
     """Whether the page loads them from its server; else they are in the page."""
-
-
-def embed_parts(contents: RunContents) -> LargeParts:
-    """Return the large parts as data in the page."""
-    return LargeParts(embedded_pictures(contents), embedded_view(contents, photo_names(contents)), is_served=False)
 
 
 def read_run(run: RunContext) -> RunContents:

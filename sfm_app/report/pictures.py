@@ -275,7 +275,8 @@ def _draw(dense: Path, name: str, share: float) -> DepthPicture | None:
     """Return one photo beside its depths; None if a file is missing or damaged."""
     try:
         photo, depth = read_photo_and_depth(dense, name)
-        size = _shrunk_size(depth.shape[1], depth.shape[0])
+        scale = min(1.0, SIDE_PX / max(depth.shape))
+        size = max(1, round(depth.shape[1] * scale)), max(1, round(depth.shape[0] * scale))
         small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
         nearest = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.float64)
         colors, (near, far) = depth_colors(nearest)
@@ -306,9 +307,3 @@ def depth_colors(depth: FloatArray) -> tuple[ByteArray, tuple[float, float]]:
     level = np.clip((inverse - 1.0 / far) / span, 0.0, 1.0)
     colors = cv2.applyColorMap(np.round(255.0 * level).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]
     return np.where(known[..., None], colors, np.array(UNKNOWN, np.uint8)).astype(np.uint8), (near, far)
-
-
-def _shrunk_size(width: int, height: int) -> tuple[int, int]:
-    """Return width and height at most SIDE_PX long, in the same ratio."""
-    scale = min(1.0, SIDE_PX / max(width, height))
-    return max(1, round(width * scale)), max(1, round(height * scale))

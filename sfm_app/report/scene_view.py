@@ -15,7 +15,6 @@ from sfm_app.colmap.model import sparse_model
 from sfm_app.formats.frusta import center, frustum_depth, scene_size
 from sfm_app.formats.gltf import FLIP, write_glb
 from sfm_app.frame.scale import move_model
-from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import Json
 from sfm_app.report.contents import UNREADABLE, RunContents
 from sfm_app.stages import texture
@@ -56,14 +55,14 @@ def view_points(contents: RunContents) -> Model | None:
 def view_frame(contents: RunContents, points: Model, photos: Sequence[str]) -> dict[str, Json]:
     """Return the data of the 3D view besides model and points: cameras, and the scene's place and size."""
     rows = {name: number for number, name in enumerate(photos)}
-    middle, size = _bounds(points)
+    (middle, size), similarity = _bounds(points), contents.frame.from_model
     return {
         "cameras": [_camera(camera, rows.get(camera.name)) for camera in points.cameras],
         "middle": middle,
         "size": size,
         "depth": frustum_depth(np.array([center(camera) for camera in points.cameras]), points.surface.vertices),
         "unit": "m" if contents.is_metric else "",
-        "fromModel": _plain_similarity(contents.frame.from_model),
+        "fromModel": {"scale": similarity.scale, "R": similarity.R.ravel().tolist(), "t": similarity.t.tolist()},
     }
 
 
@@ -139,11 +138,6 @@ def _camera(camera: Frustum, row: int | None) -> dict[str, Any]:
         "across": float(camera.width / (2 * camera.K[0, 0])),
         "down": float(camera.height / (2 * camera.K[1, 1])),
     }
-
-
-def _plain_similarity(similarity: Similarity) -> dict[str, Json]:
-    """Return scale, rotation by rows and translation; `--scale` takes points in the model's frame."""
-    return {"scale": similarity.scale, "R": similarity.R.ravel().tolist(), "t": similarity.t.tolist()}
 
 
 def _base64(data: bytes) -> str:

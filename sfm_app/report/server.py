@@ -174,11 +174,7 @@ class RunResources:
 
 
 def read_resources(run: RunContext) -> RunResources:
-    """Return the resources of a run, with its page rendered.
-
-    Raises:
-        InputError: the folder holds no run.
-    """
+    """Return the resources of a run, with its page rendered."""
     contents = read_run(run)
     resources = RunResources(contents, photo_names(contents), view_points(contents))
     _ = resources.page
@@ -298,12 +294,7 @@ def open_server(resources: RunResources, port: int = 0) -> ViewServer:
 
 
 def serve_run(run: RunContext, port: int, started: Callable[[str], None]) -> None:
-    """Serve the page of a run until Ctrl-C; `started` is called with its address. Port 0 is any free one.
-
-    Raises:
-        InputError: the folder holds no run.
-        ConfigError: the port cannot be used.
-    """
+    """Serve the page of a run until Ctrl-C; `started` is called with its address. Port 0 is any free one."""
     run.progress.say("preparing the page")
     with open_server(read_resources(run), port) as server:
         try:

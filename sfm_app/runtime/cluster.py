@@ -2,6 +2,7 @@
 
 ``python -m sfm_app.runtime.cluster SCHEDULER COUNT FOLDER PARENT`` starts workers on this machine, one process of one
 thread each, in a process group of their own: Ctrl-C does not reach it, and it ends with its parent.
+ClusterError: no scheduler answers, it is gone, has no workers or unfit ones, or an item ends each worker that tries it.
 """
 
 import contextlib
@@ -253,8 +254,11 @@ def answer(call: Call) -> Reply:
         from distributed import get_worker
 
         return Reply(unfit=reason, worker=str(get_worker().address))
+    import cv2
+
     start, spent = time.perf_counter(), cpu_seconds()
-    _use_one_thread()
+    if cv2.getNumThreads() != 1:  # a machine has a worker for each core
+        cv2.setNumThreads(1)
     results: list[Any] = []
     error: Exception | None = None
     is_machine_error = False
@@ -299,14 +303,6 @@ def picklable(err: Exception) -> Exception:
     return RuntimeError(f"{type(err).__name__}: {err}")
 
 
-def _use_one_thread() -> None:
-    """Let OpenCV use one thread, since a machine has a worker for each core."""
-    import cv2
-
-    if cv2.getNumThreads() != 1:
-        cv2.setNumThreads(1)
-
-
 # The connection: to a running cluster, or to processes of this machine that end with the run.
 
 RESUME_HINT = "start it again, and the same command resumes; or leave --cluster out"
@@ -334,11 +330,7 @@ class Cluster:
         return str(self.settings.address)
 
     def threads(self) -> int:
-        """Return how many tasks can run at once; at least 1.
-
-        Raises:
-            ClusterError: the scheduler is gone.
-        """
+        """Return how many tasks can run at once; at least 1."""
         return max(1, self._count_threads())
 
     def _count_threads(self) -> int:
@@ -354,11 +346,7 @@ class Cluster:
         return self._threads
 
     def probe(self) -> Probe:
-        """Return the requirements of this run, after checking all present workers.
-
-        Raises:
-            ClusterError: a worker has other versions, or does not see the output folder.
-        """
+        """Return the requirements of this run, after checking all present workers."""
         if self._probe is None:
             self.folder.mkdir(parents=True, exist_ok=True)
             name = f"probe-{secrets.token_hex(8)}.txt"
@@ -370,11 +358,7 @@ class Cluster:
         return self._probe
 
     def check_versions(self) -> list[str]:
-        """Return the other kinds of processors among the workers.
-
-        Raises:
-            ClusterError: a worker has other versions.
-        """
+        """Return the other kinds of processors among the workers."""
         ours = worker_versions()
         others = self.ask_all(worker_versions)
         wrong = {worker: differences(ours, theirs) for worker, theirs in others.items()}
@@ -442,11 +426,6 @@ class Cluster:
             self.cpu_seconds += reply.cpu_seconds
             return reply  # type: ignore[no-any-return]
 
-    def leave_out(self, address: str) -> None:
-        """Remove an unfit worker."""
-        with contextlib.suppress(Exception):  # it may be gone already
-            self.client.retire_workers([address], close_workers=True)
-
     def make_loss_error(self) -> ClusterError:
         """Return the error that says that the scheduler is gone."""
         return ClusterError(f"the scheduler of the cluster ({self.address}) is gone", hint=RESUME_HINT)
@@ -466,12 +445,7 @@ class Cluster:
 
 @contextlib.contextmanager
 def connect(settings: ClusterSettings, folder: Path) -> Iterator[Cluster]:
-    """Provide the cluster of an address; a cluster on this machine ends with the block.
-
-    Raises:
-        ConfigError: Dask is not installed.
-        ClusterError: no scheduler answers, or it has no workers.
-    """
+    """Provide the cluster of an address; a cluster on this machine ends with the block."""
     count = local_workers(settings.address)
     try:
         import distributed
@@ -596,9 +570,6 @@ class ClusterExecutor(RemoteExecutor):
         """Yield the results of a task in the order of the items, which are drawn only as they are needed.
 
         Another worker repeats a call whose worker is lost. This process repeats items that fail with a machine error.
-
-        Raises:
-            ClusterError: the scheduler is gone, or an item ends each worker that tries it.
         """
         with Serializer(self.cluster.folder) as serializer:
             yield from _Spreading(self, task, serializer).results(iter(items))
@@ -633,7 +604,8 @@ class _Spreading:
                 yield from self._land(flights[0])
                 flights.popleft()
         finally:
-            self._cancel(flights)
+            with contextlib.suppress(Exception):  # the scheduler may be gone
+                self.cluster.client.cancel([flight.future for flight in flights], force=True)
 
     def _send(self, items: list[Any]) -> _Flight:
         call = Call(self.probe, self.function, self.serializer.serialize(items))
@@ -646,7 +618,9 @@ class _Spreading:
                 yield from self._land_alone(item)
             return
         done = deserialize(reply.results, remove=True) if reply.results is not None else []
-        self._adapt(reply, len(done))
+        if done:
+            best = OPTIONS.call_s * len(done) / max(reply.seconds, 1e-6)
+            self._size = max(1, min(OPTIONS.most_items, int(best), 2 * self._size))
         yield from done
         rest = flight.items[len(done) :]
         if reply.error is not None and reply.is_machine_error:
@@ -679,19 +653,9 @@ class _Spreading:
             if reply is None or not reply.unfit:
                 return reply
             logger.info("the program removes a worker: %s", reply.unfit)
-            self.cluster.leave_out(reply.worker)
+            with contextlib.suppress(Exception):  # it may be gone already
+                self.cluster.client.retire_workers([reply.worker], close_workers=True)
             flight.future = self._send(flight.items).future
-
-    def _adapt(self, reply: Reply, done: int) -> None:
-        """Choose the number of items per call from the duration of the last one."""
-        if done:
-            best = OPTIONS.call_s * done / max(reply.seconds, 1e-6)
-            self._size = max(1, min(OPTIONS.most_items, int(best), 2 * self._size))
-
-    def _cancel(self, flights: Iterable[_Flight]) -> None:
-        futures = [flight.future for flight in flights]
-        with contextlib.suppress(Exception):  # the scheduler may be gone
-            self.cluster.client.cancel(futures, force=True)
 
 
 def describe_item(item: object) -> str:

@@ -86,9 +86,6 @@ def ordered_map(
 
     If the caller stops early or an item fails, calls that have not begun are canceled. Only a `Task` leaves this
     process, and a cluster chooses its own number in flight.
-
-    Raises:
-        ClusterError: the cluster is gone, or a task ends each worker that tries it.
     """
     if isinstance(executor, RemoteExecutor) and isinstance(function, Task):
         yield from executor.spread(function, items)

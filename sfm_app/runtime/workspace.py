@@ -72,11 +72,7 @@ class Manifest:
         return manifest if isinstance(manifest, dict) and isinstance(manifest.get("stages", {}), dict) else {}
 
     def check_format(self) -> None:
-        """Check that this program can read the files of the run.
-
-        Raises:
-            InputError: another version of the program wrote them.
-        """
+        """Check that this program can read the files of the run; InputError if another version wrote them."""
         manifest = self.read()
         if manifest.get("stages") and manifest.get("program") == PROGRAM and manifest.get("format") != FORMAT:
             raise InputError(
@@ -85,11 +81,7 @@ class Manifest:
             )
 
     def check_begun(self) -> None:
-        """Check that the folder holds a run that this program can read.
-
-        Raises:
-            InputError: there is no run, or another version of the program made it.
-        """
+        """Check that the folder holds a run that this program can read; InputError if not."""
         if not self.read():
             default = self.root.resolve()
             default = default.with_name(f"{default.name}-model")  # where a run without -o writes
@@ -224,11 +216,7 @@ class Workspace:
         return Workspace(self.root / EARLIER)
 
     def create(self) -> None:
-        """Make the folder and check that it is writable.
-
-        Raises:
-            InputError: it is not, or it holds files that a run would overwrite, or links that it would write through.
-        """
+        """Make the folder; InputError if it is not writable, or has files or links that a run would overwrite."""
         known = any((self.root / name).exists() for name in (LOCK, MANIFEST))
         foreign = [] if known else [name for name in OUTPUT_NAMES if (self.root / name).exists()]
         if foreign:
@@ -264,11 +252,7 @@ class Workspace:
                 yield from (below for below in path.rglob("*") if is_link(below))
 
     def check_no_overlap(self, photos: Path, what: str = "photos") -> None:
-        """Check that a run would not overwrite its photos or masks (`what`).
-
-        Raises:
-            InputError: it would.
-        """
+        """Check that a run would not overwrite its photos or masks (`what`); InputError if it would."""
         folder, out = photos.resolve(), self.root.resolve()
         if folder == out:
             raise InputError(
@@ -282,11 +266,7 @@ class Workspace:
 
     @contextlib.contextmanager
     def hold_lock(self) -> Iterator[None]:
-        """Hold the lock that keeps other runs out; the system releases it when this process ends.
-
-        Raises:
-            InputError: another run holds it.
-        """
+        """Hold the lock that keeps other runs out (InputError) until the block, or this process, ends."""
         holder = self.root / HOLDER
         lock = FileLock(self.root / LOCK, timeout=0)
         try:
@@ -320,9 +300,6 @@ class Workspace:
         """Check that the folder still exists during a run, and is writable.
 
         A removed folder with new files of this run is marked as made by a run: otherwise the next run would refuse it.
-
-        Raises:
-            InputError: it was removed, or is not writable.
         """
         if not (self.root / LOCK).exists():
             names = {path.name for path in self.root.iterdir()} if self.root.is_dir() else set()

@@ -1,4 +1,7 @@
-"""Cameras with any lens, their poses along a photographer's path, and the rays of their pixels."""
+"""Cameras with any lens, their poses along a photographer's path, and the rays of their pixels.
+
+ConfigError for values out of range, and for a distortion that folds within the photo.
+"""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -21,9 +24,6 @@ class Lens:
     A ray at the angle theta to the optical axis has the radius r = tan(theta), 2 tan(theta / 2), theta, or
     2 sin(theta / 2), by projection. Then x_d = x (1 + k1 r^2 + k2 r^4 + ...), plus the tangential terms of COLMAP's
     OPENCV. An equirectangular photo has longitude and latitude instead, and no such terms.
-
-    Raises:
-        ConfigError: the projection is unknown.
     """
 
     projection: str = "perspective"
@@ -43,11 +43,7 @@ class Lens:
         return self.radial[0] if self.radial else 0.0
 
     def rays(self, points: FloatArray) -> FloatArray:
-        """Return directions (N, 3) of image points (N, 2), z = 1 with "perspective", else of length 1; NaN without ray.
-
-        Raises:
-            ConfigError: the distortion folds within these points, so that one of them has several rays.
-        """
+        """Return directions (N, 3) of image points (N, 2), z = 1 with "perspective", else of length 1; NaN without."""
         if self.projection == "equirectangular":
             longitude, latitude = points.T
             level = np.cos(latitude)
@@ -172,11 +168,7 @@ class Views:
         return cls(dict.fromkeys(named, camera), named)
 
     def with_camera(self, camera: Camera, photos: Collection[str]) -> "Views":
-        """Return the views with another camera for some photos.
-
-        Raises:
-            ConfigError: a photo is not among the views.
-        """
+        """Return the views with another camera for some photos."""
         if unknown := sorted(set(photos) - set(self.cameras)):
             raise ConfigError(f"synthetic cameras: no such photo: {', '.join(unknown)}")
         return replace(self, cameras={**self.cameras, **dict.fromkeys(sorted(photos), camera)})
@@ -187,9 +179,6 @@ class ArcOptions:
     """A hand-held walk around the front of a scene: distance, height, aim and roll vary from photo to photo.
 
     They vary because a circle around a point that all photos look at (an orbit) leaves the focal length undetermined.
-
-    Raises:
-        ConfigError: a value is out of range.
     """
 
     photos: int = 12
@@ -236,9 +225,6 @@ def make_camera(
         focal_widths: fx as a share of the width, > 0.
         center: optical center as shares of width and height.
         aspect, radial: fy / fx, > 0; k1 of a perspective lens.
-
-    Raises:
-        ConfigError: a value is out of range.
     """
     if min(width, height) < 16 or not (0 < focal_widths < math.inf and 0 < aspect < math.inf):
         raise ConfigError("synthetic camera: size, focal_widths or aspect is out of range")
@@ -256,9 +242,6 @@ def make_wide_camera(
         width, height: pixels, >= 16.
         field_deg: from one end of the longer side to the other, in degrees, (0, 360); below 180 with "perspective".
         center: optical center as shares of width and height.
-
-    Raises:
-        ConfigError: a value is out of range.
     """
     limit = 180.0 if lens.projection == "perspective" else 360.0
     if min(width, height) < 16 or not 0 < field_deg < limit:
@@ -324,9 +307,6 @@ def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> F
     """Return viewing directions (height * width, 3) in the camera frame, row by row; NaN outside the image circle.
 
     They have z = 1 with a perspective lens, else length 1. An offset of (0.5, 0.5) is the center of a pixel.
-
-    Raises:
-        ConfigError: the radial distortion folds within the photo, so that a pixel has no unique ray.
     """
     x, y = np.meshgrid(np.arange(camera.width) + offset_px[0], np.arange(camera.height) + offset_px[1])
     x = (x.ravel() - camera.K[0, 2]) / camera.K[0, 0]

@@ -28,11 +28,7 @@ def focal_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
 
 
 def center_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
-    """Return e_OC of thesis section 5.5.3: mean error of the optical center's x and y in percent of the truth.
-
-    Raises:
-        ValueError: the photos have several cameras, and `photo` names none of them.
-    """
+    """Return e_OC of thesis section 5.5.3: mean error of the optical center's x and y in percent of the truth."""
     true = truth.cameras[photo].K if photo else truth.K
     return float(50.0 * sum(abs(K[i, 2] / true[i, 2] - 1.0) for i in (0, 1)))
 
@@ -97,12 +93,7 @@ def seen_points(truth: Truth) -> FloatArray:
 
 
 def align_centers(centers: Mapping[str, FloatArray], truth: Truth) -> Similarity:
-    """Return the similarity from estimated camera centers (3,), by photo, to the true ones, robust to wrong poses.
-
-    Raises:
-        ValueError: fewer than 3 common photos.
-        NumericalError: the centers lie on a line.
-    """
+    """Return the similarity from estimated camera centers (3,), by photo, to the true ones, robust to wrong poses."""
     true_centers = truth.centers
     names = sorted(set(centers) & set(true_centers))
     if len(names) < 3:
@@ -113,11 +104,7 @@ def align_centers(centers: Mapping[str, FloatArray], truth: Truth) -> Similarity
 
 
 def sample_surface(vertices: FloatArray, faces: IndexArray, count: int, seed: int = 0) -> FloatArray:
-    """Return (count, 3) points drawn uniformly by area from triangles (T, 3) of vertices (V, 3).
-
-    Raises:
-        ValueError: the surface has no area.
-    """
+    """Return (count, 3) points drawn uniformly by area from triangles (T, 3) of vertices (V, 3)."""
     return sample_triangles(vertices, faces, count, seed)[0]
 
 

@@ -1,4 +1,7 @@
-"""Correspondences with known truth: the image pairs of thesis section 4.8 and the five-view tracks of section 5.5.3."""
+"""Correspondences with known truth: the image pairs of thesis section 4.8 and the five-view tracks of section 5.5.3.
+
+ConfigError for options out of range, or without a convergent setup of cameras.
+"""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -24,11 +27,7 @@ MAX_SETUPS = 10_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairOptions:
-    """A random image pair; the defaults are those of thesis section 4.8.
-
-    Raises:
-        ConfigError: values are out of range; the message names all of them.
-    """
+    """A random image pair; the defaults are those of thesis section 4.8."""
 
     points: int = 1200
     """Matches, >= 8."""
@@ -62,11 +61,7 @@ class PairOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackOptions:
-    """Tracks through several cameras of one K; the defaults are those of thesis section 5.5.3.
-
-    Raises:
-        ConfigError: values are out of range; the message names all of them.
-    """
+    """Tracks through several cameras of one K; the defaults are those of thesis section 5.5.3."""
 
     cameras: int = 5
     """>= 2."""
@@ -169,9 +164,6 @@ def make_pair(options: PairOptions, seed: int, max_setups: int = MAX_SETUPS) -> 
     """Return a random convergent camera pair and its matches, as in thesis section 4.8.
 
     Both images get Gaussian noise; then a uniform value is added in image 2 to the outliers, which are random rows.
-
-    Raises:
-        ConfigError: the options leave no convergent setup.
     """
     rng = np.random.default_rng([seed, 408])
     K = camera_matrix(options.focal_px, options.focal_px, options.width / 2, options.height / 2)
@@ -194,9 +186,6 @@ def make_tracks(options: TrackOptions, seed: int, max_setups: int = MAX_SETUPS) 
     """Draw cameras of one random K around a common pose, and points that all of them see, as in thesis 5.5.3.
 
     The orientations are perturbed like the locations, since cameras that only shift leave K undetermined.
-
-    Raises:
-        ConfigError: the options leave no convergent setup.
     """
     rng = np.random.default_rng([seed, 553])
     size = (options.width, options.height)
@@ -214,11 +203,7 @@ def pair_matches(
     tracks: Tracks, outliers: Mapping[tuple[int, int], float] | None = None, outlier_range_px: float = 256.0,
     seed: int = 0,
 ) -> Iterator[tuple[tuple[int, int], FloatArray]]:  # fmt: skip
-    """Yield each pair of cameras and its matches (N, 4) x1, y1, x2, y2 in pixels; chosen pairs have shares of outliers.
-
-    Raises:
-        ConfigError: a share is out of range or a pair is not in the tracks.
-    """
+    """Yield each pair of cameras and its matches (N, 4) x1, y1, x2, y2 in pixels; some have shares of outliers."""
     shares = outliers or {}
     check_ranges(
         "synthetic correspondences",

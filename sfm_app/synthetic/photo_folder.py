@@ -1,4 +1,4 @@
-"""Render photo folders with ground truth."""
+"""Render photo folders with ground truth; InputError for a folder that cannot be read or written."""
 
 import json
 from collections.abc import Mapping
@@ -26,11 +26,7 @@ TRUTH_FILE, SURFACE_FILE = "truth.json", "surface.ply"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhotoOptions:
-    """Image quality of rendered photos.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
+    """Image quality of rendered photos."""
 
     supersampling: int = 2
     """Rays per pixel in x and in y, 1..8."""
@@ -70,11 +66,7 @@ class Truth:
 
     @property
     def camera(self) -> Camera:
-        """The camera of all photos.
-
-        Raises:
-            ValueError: there are several.
-        """
+        """The camera of all photos; ValueError if there are several."""
         first, *others = self.cameras.values()
         if any(_camera_values(camera) != _camera_values(first) for camera in others):
             raise ValueError("the photos were taken with several cameras")
@@ -95,11 +87,7 @@ def write_photo_folder(
     folder: Path, scene: SyntheticScene, views: Views, options: PhotoOptions | None = None,
     progress: Progress | None = None,
 ) -> Truth:  # fmt: skip
-    """Render one JPEG without EXIF per view into a folder; `save_truth` writes the truth elsewhere.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
+    """Render one JPEG without EXIF per view into a folder; `save_truth` writes the truth elsewhere."""
     work = _FolderWork(folder, prepare(scene), views, options or PhotoOptions())
     numbers = range(len(views.cam_from_world))
     try:
@@ -119,9 +107,6 @@ def add_missing_photos(
 
     Other photos of the folder must be of the same scene, views and options, which is not checked. A script with more
     than one process needs a `__main__` guard.
-
-    Raises:
-        InputError: the folder cannot be written.
     """
     missing = [k for k, name in enumerate(views.cam_from_world) if not (folder / name).exists()]
     arguments, shown = (folder, scene, views, options or PhotoOptions()), progress or SilentProgress()
@@ -209,11 +194,7 @@ def save_truth(truth: Truth, folder: Path) -> None:
 
 
 def load_truth(folder: Path) -> Truth:
-    """Read the files that `save_truth` wrote.
-
-    Raises:
-        InputError: the files are missing or malformed.
-    """
+    """Read the files that `save_truth` wrote."""
     try:
         text: dict[str, Any] = json.loads((folder / TRUTH_FILE).read_text(encoding="utf-8"))
         images = text["images"]
