@@ -22,7 +22,6 @@ from sfm_app.types import Calibration, GivenCameras
 from sfm_app.types.camera import GIVEN, PROJECTIONS
 
 # Cameras of COLMAP's models on disk: cameras.txt and cameras.bin, and which photo has which camera.
-#
 # COLMAP itself ends the process on some damaged models.
 
 CAMERA_FILES = ("cameras.bin", "cameras.txt")
@@ -128,7 +127,6 @@ class _Reader:
 
 
 # Cameras as OpenCV writes them: camera matrix and distortion coefficients in JSON, YAML or XML.
-#
 # OpenCV counts pixels from the center of the first one, which is (0.5, 0.5) here.
 
 MATRIX = ("cameramatrix", "k", "mtx", "intrinsicmatrix")
@@ -227,7 +225,6 @@ def _numbers(value: Any, what: str) -> NDArray[np.float64]:
 
 
 # Cameras as OpenSfM writes them into camera_models.json, and OpenDroneMap into cameras.json.
-#
 # Lengths are in units of the longer side, and the center counts from the middle of the photo.
 
 MODELS = {
@@ -264,7 +261,6 @@ def opensfm_camera(values: Mapping[str, Any]) -> Calibration:
 
 
 # Cameras of earlier runs: calibration.json, scene.json, and what `sfm-app calibrate --json` prints.
-#
 # Only cameras that the photos of that run determined are used; the others are guesses.
 
 FIELDS = {field.name for field in fields(Calibration)}

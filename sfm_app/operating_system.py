@@ -296,20 +296,16 @@ def watch_parent(parent: int, then: Callable[[], object]) -> None:
 
     def watch() -> None:
         if lacks(Ability.CLOSED_INPUT):
-            _wait_for_end(parent)
+            with contextlib.suppress(psutil.Error):
+                process = psutil.Process(parent)
+                while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
+                    time.sleep(0.2)
         else:
             while os.read(0, 1):
                 pass
         then()
 
     threading.Thread(target=watch, name="parent", daemon=True).start()
-
-
-def _wait_for_end(number: int) -> None:
-    with contextlib.suppress(psutil.Error):
-        process = psutil.Process(number)
-        while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
-            time.sleep(0.2)
 
 
 def end_at_exit() -> None:

@@ -63,22 +63,18 @@ class LensOptions:
     sweeps: int = 5
     """Most sweeps over all cameras in the choice of free parts. Chosen by hand."""
     longest_step: float = 1.0
-    """Longest step of log f: a camera that moves further after mapping is not determined by its photos. Chosen by
-    hand."""
+    """Longest step of log f: photos do not determine a camera that moves further after mapping. Chosen by hand."""
     focals: tuple[float, float] = (0.05, 100.0)
-    """Range of focals in longer sides, views of 169 to 0.5 degrees; outside it, an estimate has diverged. Chosen by
-    hand."""
+    """Range of focals in longer sides, views of 169 to 0.5 degrees; others have diverged. Chosen by hand."""
     zero_precision: float = 1e6
-    """Factor on the precision of a part that is set to its usual value, so that the others adapt to it. Chosen by
-    hand."""
+    """Factor on the precision of a part at its usual value, so that the others adapt to it. Chosen by hand."""
     clamps: int = 8
     """Most halvings of a step that makes a lens fold inside the photo. Chosen by hand."""
     squeeze: float = 0.8
     """Share of the undistorted radius below which a perspective lens is tried as a fisheye, at the outermost
     observations. An equidistant lens has 0.6 at 120 degrees and 0.76 at 95 degrees. Chosen by hand."""
     narrow_angle: float = float(np.radians(65.0))
-    """Largest angle to the optical axis, in radians, up to which a fisheye is tried as a perspective lens. Chosen by
-    hand."""
+    """Largest angle to the optical axis, in radians, of a fisheye to try as a perspective lens. Chosen by hand."""
     samples: int = 200
     """Radii at which a lens is fitted to another. Chosen by hand."""
     least_reach: float = 0.2
@@ -108,8 +104,7 @@ class LensEstimate:
     deviations: FloatArray
     """(C, 12) their standard deviations."""
     mean_squares: FloatArray
-    """(C, 12, 12) mean squares and products of the errors of `params`, over all choices of freed parts. 0 for cameras
-    that are fixed or diverged."""
+    """(C, 12, 12) mean squares and products of the errors of `params` over all choices; 0 for fixed or diverged ones."""
     free: BoolArray
     """(C, 7) parts with the wide prior, in the order of PARTS."""
     determined: BoolArray

@@ -50,8 +50,7 @@ LOG_FOCAL, LOG_ASPECT = FX, FY
 FOCAL_SPREAD = 0.7
 """Prior standard deviation of log f about the value from mapping: hardly a constraint. Chosen by hand."""
 ABSENT = 1e-4
-"""Narrow prior of the terms of `Part.exact`, as a share of the radius of the corner: a tenth of a pixel. They are then
-set to 0. Chosen by hand."""
+"""Narrow prior of the terms of `Part.exact`, which become 0, as a share of the corner's radius. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +68,7 @@ class Part:
     """Whether an undetermined part keeps its value; otherwise it moves to its usual value. Mapping starts from a
     calibrated center and aspect, but estimates distortion without a prior."""
     powers: tuple[int, ...] = ()
-    """Powers of the radius in the terms. Deviations then state a share of the radius at the corner of the photo;
-    without powers, those of the parameters."""
+    """Powers of the radius in the terms, whose deviations are then shares of the radius at the corner of the photo."""
     needs: tuple[str, ...] = ()
     """Parts that are freed before this one."""
     exact: bool = False
@@ -88,8 +86,7 @@ PERSPECTIVE_PARTS = (
     Part("k3", (K3,), ABSENT, 0.03, 0.1, powers=(6,), needs=("k1", "k2"), exact=True),
     Part("k4 k5 k6", (K4, K5, K6), ABSENT, 0.05, 0.05, powers=(2, 4, 6), needs=("k1", "k2", "k3"), exact=True),
 )
-"""The priors of center, aspect and k1 are those of `selfcal.priors`; the others: docs/algorithms.md, Bundle adjustment.
-Chosen by hand."""
+"""Center, aspect and k1 as in `selfcal.priors`; others: docs/algorithms.md, Bundle adjustment. Chosen by hand."""
 FISHEYE_PARTS = (
     _CENTER,
     _ASPECT,

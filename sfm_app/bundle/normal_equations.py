@@ -36,8 +36,7 @@ class ReductionOptions:
     usual_noise_px: float = 0.25
     """Prior noise of a keypoint coordinate: the usual noise of SIFT. Chosen by hand."""
     usual_count: float = 4.0
-    """Weight of the prior noise as a number of measurements. It matters where there are hardly more observations than
-    unknowns. Chosen by hand."""
+    """Weight of the prior noise as a number of measurements; it matters with few observations. Chosen by hand."""
     lost_px: float = 1e4
     """Residual above which an observation is lost, i.e. not used; a lost observation costs as much. Chosen by hand."""
     max_derivative: float = 1e60
@@ -391,8 +390,7 @@ class ReducedSystem:
     scores: FloatArray
     """(I, 12C) contributions of each photo to g, with poses and points eliminated; they add up to g."""
     open_points: int
-    """Number of undetermined points: at infinity, or seen from one position only. They do not move along undetermined
-    directions."""
+    """Number of undetermined points: at infinity, or seen from one position only."""
 
     def back_substitute(self, cameras: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the best changes of poses (I, 6) and points (P, 3) for a given change of the cameras (C, 12)."""
@@ -514,9 +512,7 @@ def cost(bundle: Bundle, scale_px: float) -> float:
 
 
 def loss(r: FloatArray, usable: NDArray[np.bool_], scale_px: float) -> float:
-    """Return half the sum of the loss of `reduce` over residuals (N, 2), in squared pixels; `lost_px` counts for lost
-    ones.
-    """
+    """Return half the sum of the loss of `reduce` over residuals (N, 2) in px^2; lost ones count `lost_px`."""
     with np.errstate(all="ignore"):
         squares = np.where(usable, np.einsum("ni,ni->n", r, r), REDUCTION.lost_px**2)
     return float(scale_px**2 * np.sum(np.sqrt(1.0 + squares / scale_px**2) - 1.0))

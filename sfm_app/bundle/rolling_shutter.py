@@ -33,7 +33,6 @@ from sfm_app.types.arrays import FloatArray, IndexArray
 
 # Projection of points into photos whose rows are read one after the other. Ours; to first order in the motion of
 # the camera, the model is that of Hedborg et al. 2012.
-#
 # While a photo is read, its camera keeps its velocity. A row is given by its share: from -1/2, the first row, to 1/2,
 # the last row. The pose of a photo is that of its middle row.
 
@@ -77,14 +76,12 @@ def move_to_middle_row(points: FloatArray, share: FloatArray, motion: FloatArray
 
 
 # How a camera moves at the moment of each photo, from the poses of the photos before and after it. Ours.
-#
 # Polynomials are fitted to the poses of some consecutive photos, and differentiated (Savitzky and Golay 1964, with
 # uneven steps). Cross-validation chooses the degree and the number of photos: where photos follow each other faster
 # than a hand shakes, the path goes through all poses, else through their middle.
 
 FITS = ((5, 3), (3, 1), (7, 3), (9, 3), (5, 1), (7, 1), (9, 1))
-"""Photos in a window and degree of the polynomial. Even degrees give the slopes of the odd ones below them. Chosen by
-hand."""
+"""Photos in a window and degree of the polynomial; even degrees give the slopes of odd ones. Chosen by hand."""
 VELOCITY = 6
 """Numbers of a velocity: a rotation vector, and the motion of a point at rest. By definition."""
 
@@ -151,7 +148,6 @@ def local_fit_weights(offsets: FloatArray, degree: int) -> tuple[FloatArray, Flo
 
 
 # Normal equations of a bundle behind a rolling shutter: poses, motions, cameras and the readout, points eliminated.
-#
 # Unlike in `normal_equations`, a dense matrix is filled point by point: with the motions there are twice as many
 # unknowns to a photo, for which sparse products take ten times as long.
 
@@ -389,8 +385,7 @@ class ReadoutOptions:
     halvings: int = 3
     """Most halvings of a step that raises the cost. Chosen by hand."""
     least_readout: float = 1e-5
-    """Least readout for the expected size of offsets, as a share of the time between two photos: a precision of offsets
-    must be finite. Chosen by hand."""
+    """Least readout for the size of offsets, which is not 0, as a share of the time between photos. Chosen by hand."""
     shake: tuple[float, float] = (0.2, 5.0)
     """Range of the size of offsets, in deviations of the path's velocities times readout. Above it, offsets of all
     photos together bend the scene, and no readout is found (`python -m benchmarks.videos.shutter`)."""
@@ -485,9 +480,7 @@ def _follow_path(model: ShutterBundle, problem: _Problem) -> ShutterBundle:
 
 
 def _expected_offsets(model: ShutterBundle, problem: _Problem, shake: FloatArray) -> FloatArray:
-    """Return standard deviations (I, 6) of the offsets; constant during a step, else offsets would enlarge the
-    readout.
-    """
+    """Return standard deviations (I, 6) of the offsets; changing ones would enlarge the readout."""
     times = problem.rows.times
     path = path_velocities(model.bundle.R, model.bundle.t, times)
     readout = max(abs(model.readout), OPTIONS.least_readout * float(np.median(np.diff(np.sort(times)))))

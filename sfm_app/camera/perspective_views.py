@@ -19,14 +19,11 @@ class ViewOptions:
     """Sizes of perspective views."""
 
     most_field_deg: float = 95.0
-    """Largest angle along one side of a view, without its overlap. At its border, such a view shows things 2.2 times as
-    large as at its center. Chosen by hand."""
+    """Largest side of a view without its overlap; its border shows things 2.2 times as large. Chosen by hand."""
     overlap_deg: float = 4.0
-    """Angle by which a view reaches beyond its own part of the photo, so that windows and triangles at the border are
-    whole in one of the views. Chosen by hand."""
+    """Angle beyond the view's own part: windows and triangles at the border are whole in one view. Chosen by hand."""
     cube_field_deg: float = 300.0
-    """Horizontal field above which a photo is a panorama, with views through the faces of a cube. No lens lies between
-    a fisheye and a panorama. Chosen by hand."""
+    """Horizontal field above which a photo is a panorama, with views through the faces of a cube. Chosen by hand."""
 
 
 OPTIONS = ViewOptions()

@@ -91,9 +91,7 @@ def read_camera(camera: pycolmap.Camera) -> FloatArray:
 
 
 def write_camera(camera: pycolmap.Camera, params: FloatArray, family: int) -> None:
-    """Change a camera in place to the smallest of FILE_MODELS that holds parameters (12,); a panorama stays as it
-    is.
-    """
+    """Change a camera in place to the smallest of FILE_MODELS with these parameters (12,), unless it is a panorama."""
     if family == PANORAMA:
         return
     name = file_model(params, family)
@@ -189,8 +187,7 @@ class AdjustmentOptions:
     settled_step: float = 0.2
     """Step of the cameras, in standard deviations, below which the rounds end. Chosen by hand."""
     min_point_share: float = 0.1
-    """Smallest share of the points after an adjustment; one that drops more has diverged and is rejected. Chosen by
-    hand."""
+    """Smallest share of the points after an adjustment; one that drops more has diverged. Chosen by hand."""
     long_step: float = 1.0
     """Step of the cameras, in standard deviations, above which COLMAP's solver refines poses and points: the linear
     step is then too inaccurate. Chosen by hand."""
@@ -199,8 +196,7 @@ class AdjustmentOptions:
     all see the same, a factorization grows with the cube of the photos; along streets it is five times as fast.
     Measured on photos of a room and of a town."""
     outermost: float = 0.999
-    """Share of the observations within the radius up to which a lens is converted: the rest may be wrong. Chosen by
-    hand."""
+    """Share of the observations within the radius for the conversion of a lens. Chosen by hand."""
     most_compared: int = 250
     """Photos of a camera on which its families are compared, at even steps among all. Chosen by hand."""
     runners_up: int = 3

@@ -147,7 +147,6 @@ def _extract(
 
 
 # Features of photos at their own size, and of enlarged ones where these are few.
-#
 # COLMAP doubles the size of every photo before it looks for features. That takes three quarters of the time, and gives
 # the finest features, which are also the least exact ones. Photos with many features do as well without.
 

@@ -90,12 +90,18 @@ def make_view_model(
     cameras = add_view_cameras(view_model, lenses)
     tracks = {point: pycolmap.Track() for point in sorted(model.points3D)}
     for image in sorted(posed_images(model), key=lambda image: image.name):
-        points, rays = tracked_rays(model, image)
+        tracked = [point for point in image.points2D if point.has_point3D()]
+        pixels = np.array([point.xy for point in tracked], np.float64).reshape(-1, 2)
+        rays = np.asarray(model.cameras[image.camera_id].cam_ray_from_img(pixels), np.float64).reshape(-1, 3)
         for number, view in enumerate(lenses[image.camera_id].views):
-            x, shown = project_rays(rays, view)
+            projected = rays @ view.R.T @ view.K.T
+            with np.errstate(divide="ignore", invalid="ignore"):
+                x = projected[:, :2] / projected[:, 2:]
+            inside = np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1)
+            shown = np.flatnonzero((projected[:, 2] > 0.0) & inside)
             image_id = view_model.num_images() + 1
             for index, row in enumerate(shown):
-                tracks[points[row]].add_element(image_id, index)
+                tracks[tracked[row].point3D_id].add_element(image_id, index)
             camera_id = cameras[image.camera_id, number]
             added = pycolmap.Image(
                 name=names[image.name][number], keypoints=x[shown], camera_id=camera_id, image_id=image_id
@@ -108,22 +114,6 @@ def make_view_model(
             view_model.add_point3D_with_id(point_id, pycolmap.Point3D(xyz=old.xyz, color=old.color, track=track))
     view_model.update_point_3d_errors()
     return view_model
-
-
-def tracked_rays(model: pycolmap.Reconstruction, image: pycolmap.Image) -> tuple[list[int], FloatArray]:
-    """Return the ids of the points of a photo, and the rays (N, 3) of their keypoints in its frame."""
-    tracked = [point for point in image.points2D if point.has_point3D()]
-    x = np.array([point.xy for point in tracked], np.float64).reshape(-1, 2)
-    rays = np.asarray(model.cameras[image.camera_id].cam_ray_from_img(x), np.float64).reshape(-1, 3)
-    return [point.point3D_id for point in tracked], rays
-
-
-def project_rays(rays: FloatArray, view: PerspectiveView) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Return the pixels in a view (N, 2) of rays (N, 3) of the photo's frame, and the rows inside of the view."""
-    projected = rays @ view.R.T @ view.K.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        x = projected[:, :2] / projected[:, 2:]
-    return x, np.flatnonzero((projected[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1))
 
 
 def all_points(model: pycolmap.Reconstruction) -> PointCloud:

@@ -95,7 +95,11 @@ def _compensate(
     share = row_shares(x, camera)
     rays = viewing_rays(model, image.image_id, x) @ R.T
     rays /= np.linalg.norm(rays, axis=1)[:, None]
-    inverse = _spread_inverse_depths(x, tracked, 1.0 / np.linalg.norm(xyz @ R.T + t, axis=1))
+    known = 1.0 / np.linalg.norm(xyz @ R.T + t, axis=1)
+    # untracked keypoints take the mean of their five nearest tracked ones
+    _, near = cKDTree(x[tracked]).query(x, k=np.arange(1, min(5, len(tracked)) + 1))
+    inverse = np.asarray(known[near].mean(axis=1), np.float64)
+    inverse[tracked] = known
     middle = move_to_middle_row(rays / inverse[:, None], share, motion)
     place = int(bundle.camera[row])
     params, family = np.tile(bundle.params[place], (len(x), 1)), np.full(len(x), bundle.family[place])
@@ -103,12 +107,3 @@ def _compensate(
         moved = image_points(middle, params, family)
     shown = np.isfinite(moved).all(axis=1, keepdims=True)
     return np.where(shown, moved, x)
-
-
-def _spread_inverse_depths(x: FloatArray, tracked: NDArray[np.int64], inverse: FloatArray) -> FloatArray:
-    """Return inverse depths (N,) of all keypoints; untracked ones take the mean of their five nearest tracked ones."""
-    count = min(5, len(tracked))
-    _, near = cKDTree(x[tracked]).query(x, k=np.arange(1, count + 1))
-    spread = np.asarray(inverse[near].mean(axis=1), np.float64)
-    spread[tracked] = inverse
-    return spread

@@ -234,7 +234,10 @@ class _Execution:
         self.pipeline.forget(stage.name, run)
         run.progress.stage(stage.name, f"again: {again}" if again else "")
         logger.info("%s begins%s", stage.name, f" again: {again}" if again else "")
-        run = self.stage_context(stage, run)
+        inputs, earlier = self.fingerprints[stage.name], self.earlier
+        if earlier is not None and stage.name in earlier.stages:
+            run, inputs = replace(run, earlier=earlier), fingerprint(inputs, earlier.fingerprint)
+        run = run.with_fingerprint(inputs)
         with measure_usage(partial(cpu_seconds_elsewhere, run.executor)) as used:
             product = self.make_product(stage, run)
         self.products.keep(stage, product)
@@ -248,13 +251,6 @@ class _Execution:
         place.manifest.finish(stage.name, record, manifest_head(run))
         logger.info("%s took %.2f s, %.2f s of CPU and %d MB", stage.name, seconds, used.cpu_seconds, used.peak_mb)
         run.progress.finish_stage(seconds, len(self.products[self.pipeline.photos].photos))
-
-    def stage_context(self, stage: Stage[object], run: RunContext) -> RunContext:
-        """Return the run for a stage, with the earlier run, and the fingerprint by which it resumes."""
-        inputs, earlier = self.fingerprints[stage.name], self.earlier
-        if earlier is None or stage.name not in earlier.stages:
-            return run.with_fingerprint(inputs)
-        return replace(run.with_fingerprint(fingerprint(inputs, earlier.fingerprint)), earlier=earlier)
 
     def make_product(self, stage: Stage[Product], run: RunContext) -> Product:
         """Return the product of a stage, after checking that photos and output folder did not change."""

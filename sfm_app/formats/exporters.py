@@ -137,8 +137,7 @@ def check(model: Model) -> None:
 
 
 JPEG_QUALITY = 90
-"""Quality of texture pages on libjpeg's scale: lower values show blocks, higher ones make much larger files.
-By hand."""
+"""Quality of texture pages on libjpeg's scale: less shows blocks, more makes much larger files. By hand."""
 NORMAL_QUALITY, NORMAL_SUFFIX, NORMAL_TYPE = 92, "jpg", "image/jpeg"
 """Quality and type of normal maps: shading is 1.7 degrees off on average (benchmarks/surface/normal_map.py)."""
 

@@ -120,7 +120,6 @@ def _write_folder(scene: FinishedScene, target: Path, *, text: bool = False, cen
 
 
 # The folder that nerfstudio trains from: transforms.json, photos, masks and the sparse points.
-#
 # Its cameras look along -z with y up. Its points and poses share a frame, which is that of the model; nerfstudio
 # turns and scales both as it loads them. Every photo has a mask, or none has.
 
@@ -160,7 +159,6 @@ def frame(photo: PerspectivePhoto) -> dict[str, Any]:
 
 
 # Cameras as OpenCV's YAML, one file per camera, with the poses of its photos.
-#
 # OpenCV counts pixels from the center of the first one, which is (0.5, 0.5) here.
 
 

@@ -62,7 +62,6 @@ class FigureOptions:
 OPTIONS = FigureOptions()
 
 # Residuals of matches over the photo, through the calibrated lens and before bundle adjustment.
-#
 # The signed Sampson distance of a match is linear in the errors of its two pixels: d = a1 . v1 + a2 . v2, with a1 and
 # a2 the gradient of the epipolar constraint by the pixels of the two photos, of length 1 together. If all photos share
 # a camera, the part of v that does not depend on the match is the error of the lens model. All matches together
@@ -168,7 +167,6 @@ def _matrix_of_rays(F: FloatArray, lines: FloatArray, camera: Calibration) -> Fl
 
 
 # Planes of two intrinsics: the votes of all pairs of photos, and their zero curves (thesis Figure 5.13).
-#
 # Left: the plane of the two focals, with the optical center at its estimate. Right: the plane of the optical
 # center, with the focals at their estimates. Many pairs agree at bright places.
 
@@ -471,8 +469,10 @@ def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
         parts = figure.subfigures(len(drawn), 1, squeeze=False, height_ratios=heights)[:, 0]
         for part, panel in zip(parts, drawn, strict=True):
             many = f"Camera {panel.name}, one of {len(panels)}.\n" if len(panels) > 1 else ""
-            texts = filter(None, (calibration_text(panel.camera), pairs_text(len(panel.pairs.Fs))))
-            part.suptitle(many + "\n".join(texts), fontsize=10.5, x=0.02, ha="left")
+            text, count, most = calibration_text(panel.camera), len(panel.pairs.Fs), OPTIONS.most_pairs
+            if count > most:
+                text += f"\nThe figure shows the {most} pairs of most weight, of {count}."
+            part.suptitle(many + text, fontsize=10.5, x=0.02, ha="left")
             _draw_camera(part, panel)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=130, metadata=SUFFIXES[path.suffix.lower()])
@@ -482,12 +482,6 @@ def calibration_text(camera: Calibration) -> str:
     """Return a calibration in words, one line per property."""
     texts = (verdict(camera), focal_text(camera), center_text(camera), lens_text(camera), held_text(camera))
     return "\n".join(fill(text, 150) for text in texts if text).replace("+-", "±")
-
-
-def pairs_text(count: int) -> str:
-    """Return how many of the pairs are drawn; empty for all."""
-    most = OPTIONS.most_pairs
-    return f"The figure shows the {most} pairs of most weight, of {count}." if count > most else ""
 
 
 def weightiest(pairs: CameraPairs, most: int) -> CameraPairs:

@@ -453,7 +453,9 @@ def connect(settings: ClusterSettings, folder: Path) -> Iterator[Cluster]:
         raise ConfigError(
             "a cluster needs Dask, which is not installed", hint="pip install 'sfm-app[cluster]'"
         ) from None
-    _quiet()
+    known = [name for name in logging.root.manager.loggerDict if name.startswith("distributed.")]
+    for name in ("distributed", "tornado", "asyncio", *known):  # this program reports errors in one line
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     import dask
 
     with contextlib.ExitStack() as stack:
@@ -515,13 +517,6 @@ def _start_workers(address: str, count: int) -> Iterator[None]:
 def _close(client: Any) -> None:
     with contextlib.suppress(Exception):
         client.close(timeout=OPTIONS.closing_s)
-
-
-def _quiet() -> None:
-    """Keep Dask's own messages off the terminal; this program reports errors in one line."""
-    known = [name for name in logging.root.manager.loggerDict if name.startswith("distributed.")]
-    for name in ("distributed", "tornado", "asyncio", *known):
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
 
 def run_local_workers(scheduler: str, count: str, scratch: str, parent: str) -> None:

@@ -14,8 +14,7 @@ from sfm_app.types import Photo
 SHARE_OF_MACHINE = 0.8
 """Share of the machine's memory that a run may use without a limit. By hand."""
 FUSED_AT_ONCE_MP = 75.0
-"""Megapixels of depth maps that are fused at once; more are fused in blocks. 150 MP double the memory and save no time
-(1000 photos of a town)."""
+"""Megapixels of depth maps that are fused at once; 150 double the memory and save no time."""
 MAPS_MB_PER_MP = 28
 """Memory in MB per megapixel of depth maps. Measured."""
 REFINED_AT_ONCE_MP = 100.0

@@ -50,8 +50,7 @@ class StageRecord:
     cpu_seconds: float | None = None
     """Of the program and its processes, on all cores; None if not measured."""
     photos: Mapping[str, str] = field(default_factory=dict)
-    """Hash of each photo by name, in the record of the first stage after the photos: by it, a later run finds added and
-    removed photos."""
+    """Hash of each photo by name, in the record of the first stage after the photos."""
 
 
 class Manifest:

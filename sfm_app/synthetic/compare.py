@@ -85,7 +85,13 @@ def seen_points(truth: Truth) -> FloatArray:
     caster = ray_caster(truth.vertices, truth.faces)
     parts = []
     for name, pose in truth.cam_from_world.items():
-        directions = pixel_rays(_coarse_camera(truth.cameras[name])) @ pose[:, :3]
+        camera = truth.cameras[name]
+        shrink = 96 / max(camera.width, camera.height)
+        K, size = (
+            np.diag([shrink, shrink, 1.0]) @ camera.K,
+            (round(camera.width * shrink), round(camera.height * shrink)),
+        )
+        directions = pixel_rays(Camera(K, *size, camera.lens)) @ pose[:, :3]
         depth = cast_rays(caster, camera_center(pose), directions)["t_hit"].astype(np.float64)
         hit = np.isfinite(depth)
         parts.append(camera_center(pose) + directions[hit] * depth[hit, None])
@@ -137,9 +143,3 @@ def _distances_to_truth(
     """Return (samples,) distances from uniform samples of a reconstructed surface to the true one, in scene sizes."""
     points = sample_surface(align_centers(centers, truth)(vertices), faces, samples)
     return surface_distances(points, truth.vertices, truth.faces) / scene_size(truth)
-
-
-def _coarse_camera(camera: Camera) -> Camera:
-    shrink = 96 / max(camera.width, camera.height)
-    K = np.diag([shrink, shrink, 1.0]) @ camera.K
-    return Camera(K, round(camera.width * shrink), round(camera.height * shrink), camera.lens)

@@ -240,7 +240,11 @@ def render_rays(model: Model | PreparedModel, origin: FloatArray, directions: Fl
     uv = hits["primitive_uvs"].reshape(*shape, 2).astype(np.float64)
     weights = np.concatenate([1.0 - uv.sum(axis=-1, keepdims=True), uv], axis=-1)
     surface, texture = prepared.model.surface, prepared.model.texture
-    colors = _vertex_colors(surface, face, weights) if texture is None else _texture_colors(texture, face, weights)
+    if texture is None:
+        corners = surface.colors[surface.faces[face]].astype(np.float64)
+        colors = np.asarray(np.round(np.einsum("hwk,hwkc->hwc", weights, corners)))
+    else:
+        colors = _texture_colors(texture, face, weights)
     return Picture(np.where(covered[..., None], colors, 0).astype(np.uint8), covered)
 
 
@@ -286,11 +290,6 @@ def orbited_pose(pose: FloatArray, surface: Surface, angle_deg: float) -> FloatA
     cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
     turned = R @ np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
     return np.column_stack([turned, R @ middle + t - turned @ middle])
-
-
-def _vertex_colors(surface: Surface, face: NDArray[np.int64], weights: FloatArray) -> FloatArray:
-    corners = surface.colors[surface.faces[face]].astype(np.float64)
-    return np.asarray(np.round(np.einsum("hwk,hwkc->hwc", weights, corners)))
 
 
 def _texture_colors(texture: Texture, face: NDArray[np.int64], weights: FloatArray) -> Colors:
