@@ -310,7 +310,6 @@ def _list_files(folder: Path) -> list[str]:
 
 
 def _recorded_files(folder: Path) -> list[str]:
-    """Return the files in the record of an export; none without a valid record."""
     try:
         known = json.loads((folder / RECORD).read_text(encoding="utf-8"))["files"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):

@@ -248,7 +248,6 @@ FAULTS: Mapping[int, str] = {
     0xC0000374: "damaged heap",
     0xC0000409: "aborted",
 }
-"""Exit codes of Windows."""
 
 
 def group_options() -> dict[str, Any]:

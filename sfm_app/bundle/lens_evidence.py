@@ -104,7 +104,7 @@ class LensEstimate:
     deviations: FloatArray
     """(C, 12) their standard deviations."""
     mean_squares: FloatArray
-    """(C, 12, 12) mean squares and products of the errors of `params` over all choices; 0 for fixed or diverged ones."""
+    """(C, 12, 12) mean squares and products of the errors of `params` over all choices; 0 if fixed or diverged."""
     free: BoolArray
     """(C, 7) parts with the wide prior, in the order of PARTS."""
     determined: BoolArray
@@ -243,7 +243,6 @@ def _choose(
 
 
 def _rank(family: int, choices: BoolArray, log_evidence: FloatArray) -> tuple[LensChoice, ...]:
-    """Return the best choice of every model, best first."""
     best: dict[str, LensChoice] = {}
     for k in np.argsort(-log_evidence, kind="stable"):
         free = part_names(family, choices[k])

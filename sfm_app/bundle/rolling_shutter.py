@@ -212,7 +212,6 @@ class ShutterStep:
     points: FloatArray
     """(P, 3)"""
     noise_px: float
-    """Standard deviation of a coordinate."""
     deviation: float
     """Standard deviation of the readout."""
     offset_variances: FloatArray

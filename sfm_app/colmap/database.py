@@ -36,7 +36,6 @@ WIDE_MODELS = {FISHEYE: "OPENCV_FISHEYE", EQUIRECTANGULAR: "EQUIRECTANGULAR"}
 KINDS = {
     "calibrated": "CALIBRATED", "uncalibrated": "UNCALIBRATED", "planar": "PLANAR", "rotation": "PANORAMIC"
 }  # fmt: skip
-"""COLMAP's names for the kinds of relative poses."""
 
 
 @contextlib.contextmanager

@@ -182,7 +182,6 @@ def _enter_rich(
     enough: int,
     token: pycolmap.CancellationToken,
 ) -> set[str]:
-    """Enter the features of photos that have enough at their own size, and return their names."""
     own = copy.deepcopy(extraction)
     own.sift.first_octave = 0
     with tempfile.TemporaryDirectory(prefix="sfm-app-features-") as folder:
@@ -336,7 +335,6 @@ def _match_listed(
     folder: Path,
     progress: Progress,
 ) -> None:
-    """Match pairs of photos by name; the folder gets a list of them."""
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = folder / "pairs.txt"
     pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="ascii", newline="\n")
@@ -481,7 +479,6 @@ def exhaustive_pairs(photos: Sequence[int]) -> list[PairId]:
 def _find_and_match_here(
     database: Path, settings: SiftSettings, names: Sequence[str], pairs: Sequence[PairId], progress: Progress
 ) -> dict[str, Json]:
-    """Find and match on one thread of this process, and return COLMAP's options."""
     in_force: dict[str, Json] = {}
     with translate_errors("matching photos" if pairs else "finding features"):
         do_feature_task(feature_task(database, settings, names, 1, pairs), progress, in_force.update)
@@ -490,13 +487,11 @@ def _find_and_match_here(
 
 @contextlib.contextmanager
 def _scratch_copy(inputs: SiftInputs) -> Iterator[Path]:
-    """Provide a copy of the snapshot on a disk of this machine."""
     with tempfile.TemporaryDirectory(prefix="sfm-app-sift-", dir=inputs.scratch) as scratch:
         yield Path(shutil.copyfile(inputs.snapshot, Path(scratch) / inputs.snapshot.name))
 
 
 def _leave_rows(database: Path, tables: Sequence[str], folder: Path) -> Path:
-    """Write some tables into a file of a folder, and return its path."""
     target = folder / f"rows-{secrets.token_hex(8)}.db"
     rows = database.with_name("rows.db")
     with contextlib.closing(sqlite3.connect(database, isolation_level=None)) as source:

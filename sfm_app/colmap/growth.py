@@ -70,7 +70,6 @@ def _copy_rows(path: Path, earlier: Path, photos: Collection[int]) -> None:
 
 @contextlib.contextmanager
 def _connection(path: Path) -> Iterator[sqlite3.Connection]:
-    """Provide a connection whose changes are written at the end."""
     with contextlib.closing(sqlite3.connect(path)) as connection, connection:
         yield connection
 

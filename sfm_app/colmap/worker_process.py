@@ -22,7 +22,6 @@ from sfm_app.operating_system import crash_name, end_at_exit, has_run_out, ignor
 from sfm_app.progress import Progress, SilentProgress
 
 TASKS = "sfm_app.colmap.tasks"
-"""Module of the processes that do the tasks below."""
 REPORT_FD = 3
 """File descriptor for messages of a worker process to its parent."""
 

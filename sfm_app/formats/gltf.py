@@ -136,7 +136,6 @@ def add_page_material(glb: Glb, texture: Texture, page: int) -> int:
 
 
 def _add_picture(glb: Glb, name: str, kind: str, data: bytes) -> int:
-    """Add an image and its texture, and return the number of the texture."""
     image = glb.add("images", {"name": name, "mimeType": kind, "bufferView": glb.add_view(data)})
     return glb.add("textures", {"sampler": 0, "source": image})
 

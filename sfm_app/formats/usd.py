@@ -44,7 +44,6 @@ def write_usd(model: Model, name: str) -> Mapping[str, bytes]:
 
 def write_usdz(model: Model, name: str) -> Mapping[str, bytes]:
     """Write the files of `write_usd` into one uncompressed package."""
-    check(model)
     stage, *pages = write_usd(model, "model").items()
     return {f"{name}.usdz": pack({"model.usdc": stage[1], **dict(pages)})}
 

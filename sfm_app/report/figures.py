@@ -353,7 +353,6 @@ def draw_lens_panels(part: "SubFigure", camera: Calibration, pairs: CameraPairs)
 
 
 def _draw_curve(axes: "Axes", curve: LensCurve, camera: Calibration) -> None:
-    """Draw the radius over the angle; a fisheye has other textbook projections beside it."""
     theta = np.radians(curve.theta_deg)
     if camera.projection == FISHEYE:
         for name, style, radius in (
@@ -387,7 +386,6 @@ def _draw_difference(axes: "Axes", curve: LensCurve) -> None:
 
 
 def _draw_residuals(part: "SubFigure", axes: "Axes", camera: Calibration, pairs: CameraPairs) -> None:
-    """Draw the size of the residuals as colors, and their mean by cell as arrows."""
     size = camera.width, camera.height
     extent = (0.0, float(size[0]), float(size[1]), 0.0)
     axes.set(xlim=extent[:2], ylim=extent[2:], aspect="equal", facecolor="#e8e8e8")

@@ -42,11 +42,9 @@ class CorrelationTable:
     source: str
     """Estimate with these correlations."""
     names: Sequence[str]
-    """(n,) of the parameters."""
     rows: Sequence[Sequence[float | None]]
     """(n, n), the lower triangle; None elsewhere, and for unknown values."""
     texts: Sequence[str]
-    """The table in sentences."""
 
 
 def correlation_table(before: Calibration, after: CameraModel | None) -> CorrelationTable | None:
@@ -68,7 +66,6 @@ def correlation_table(before: Calibration, after: CameraModel | None) -> Correla
 
 
 def _table(source: str, names: Sequence[str], values: Mapping[str, float]) -> CorrelationTable | None:
-    """Return the table of some parameters; None if there are fewer than two."""
     if len(names) < 2:
         return None
     labels = ["focal" if name == "fx" and "fy" not in names else name for name in names]
@@ -80,7 +77,6 @@ def _table(source: str, names: Sequence[str], values: Mapping[str, float]) -> Co
 
 
 def _sentences(names: Sequence[str], rows: Sequence[Sequence[float | None]]) -> list[str]:
-    """Return the dependent pairs of parameters in words, the most dependent first."""
     pairs = [(value, names[j], names[i]) for j, i in combinations(range(len(names)), 2) if (value := rows[i][j])]
     pairs.sort(key=lambda pair: -abs(pair[0]))
     strong = [pair for pair in pairs if abs(pair[0]) >= 0.5]  # a quarter of the variance is common. By hand
@@ -111,7 +107,6 @@ REMEDY = (
 )
 """For a camera that pairs of photos do not determine."""
 PLACES_IN_K = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
-"""Places of the parameters in K."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +141,6 @@ class StageRow:
     cpu_seconds: float
     peak_mb: float
     share: float
-    """Of the seconds of the run."""
 
 
 def glance(contents: RunContents) -> list[Fact]:
@@ -294,7 +288,6 @@ class Comparison:
     """Two runs side by side."""
 
     other: str
-    """Name of the other run."""
     rows: Sequence[tuple[str, str, str]]
     """Name, value in this run, value in the other run."""
 

@@ -43,7 +43,6 @@ ASSETS = Path(__file__).parent / "assets"
 
 BEGIN, END, OWN_PART = "<script>", "</script>", "var camera,controls,scene"
 NEEDED = ("THREE={}", "THREE.GLTFLoader=GLTFLoader")
-"""Text of the script that the page needs."""
 
 
 @cache
@@ -150,7 +149,6 @@ def render_page(contents: RunContents, parts: LargeParts, other: RunContents | N
 
 
 def _read_model(contents: RunContents) -> ModelFigures | None:
-    """Return the figures of COLMAP's model; None if there is none, or it cannot be read."""
     if contents.scene is None:
         return None
     try:

@@ -138,7 +138,6 @@ def _draw_above(contents: RunContents, figures: ModelFigures | None) -> PageFigu
 
 
 def _strongest_pairs(contents: RunContents, centers: Mapping[str, FloatArray]) -> list[tuple[str, ...]]:
-    """Return the placed pairs of photos with most inliers, by name."""
     views, matches = contents.views, contents.matches
     if views is None or matches is None:
         return []
@@ -272,7 +271,6 @@ def spread_names(names: Sequence[str], most: int) -> list[str]:
 
 
 def _draw(dense: Path, name: str, share: float) -> DepthPicture | None:
-    """Return one photo beside its depths; None if a file is missing or damaged."""
     try:
         photo, depth = read_photo_and_depth(dense, name)
         scale = min(1.0, SIDE_PX / max(depth.shape))

@@ -79,7 +79,6 @@ def light_model(contents: RunContents) -> bytes:
 
 
 def _model_bytes(contents: RunContents) -> bytes:
-    """Return the finished model as GLB, lighter if it is large; empty if there is none."""
     path = model_file(contents)
     if path is None:
         return b""
@@ -109,14 +108,12 @@ def _shrink(page: NDArray[np.uint8], most: int) -> NDArray[np.uint8]:
 
 
 def _sample(points: Model) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return places and colors of at most 60 000 points, drawn with a fixed seed."""
     places, colors = points.surface.vertices, points.surface.colors
     chosen = np.sort(np.random.default_rng(0).permutation(len(places))[:60_000])
     return places[chosen], np.ascontiguousarray(colors[chosen])
 
 
 def _bounds(points: Model) -> tuple[list[float], float]:
-    """Return the middle of the points and the size of the scene; without points, of the cameras."""
     places = points.surface.vertices
     if not len(places):
         places = np.array([center(camera) for camera in points.cameras]).reshape(-1, 3)

@@ -77,7 +77,6 @@ SMALL_PX, LARGE_PX = 320, 2400
 """Longer sides of the pictures in the table, and of those opened by a click. By hand."""
 HTML, JPEG, GLB, BYTES = "text/html; charset=utf-8", "image/jpeg", "model/gltf-binary", "application/octet-stream"
 NUMBERED = re.compile(r"/(pictures|photos|points)/([0-9]{1,9})")
-"""Addresses of numbered resources."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +84,7 @@ class Resource:
     """Answer to a request."""
 
     kind: str
-    """Its media type."""
     content: bytes | Path
-    """Bytes, or a file."""
 
 
 @dataclass
@@ -135,7 +132,6 @@ class RunResources:
         return self._find_numbered(numbered[1], int(numbered[2])) if numbered else None
 
     def _find_light(self) -> Resource | None:
-        """Return the lighter model; None if it is not needed or fails."""
         if not self._is_large():
             return None
         try:

@@ -133,7 +133,6 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
 
 
 def _property_texts(camera: Calibration, photos: Mapping[int, str]) -> Iterator[str]:
-    """Yield the properties of a camera; `photos` are names by id."""
     if not camera.identifiable:
         source = SOURCES.get(camera.method, camera.method)
         yield f"these photos do not determine it ({camera.reason}): {source}"
@@ -149,7 +148,6 @@ def _property_texts(camera: Calibration, photos: Mapping[int, str]) -> Iterator[
 
 
 def _camera_text(camera: Calibration) -> str:
-    """Return K with its deviations; panoramas have no K."""
     if camera.projection == EQUIRECTANGULAR:
         return f"{field_text(camera)}, {camera.width} x {camera.height} px"
     return k_text(camera.K, camera.spread)

@@ -74,7 +74,6 @@ class Serialized:
     path: str = ""
     """File that has the value instead; empty where `data` has it."""
     digest: str = ""
-    """Of the file."""
 
 
 class Serializer(contextlib.AbstractContextManager["Serializer"]):
@@ -216,7 +215,6 @@ class Probe:
 
     versions: tuple[tuple[str, str], ...]
     folder: str
-    """For large values, in the output folder."""
     name: str
     """File in it that the coordinator wrote."""
 
@@ -242,7 +240,6 @@ class Reply:
     unfit: str = ""
     """Why the worker cannot be used; empty if it can."""
     worker: str = ""
-    """Address of an unfit worker."""
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     """Of the worker and its finished child processes."""

@@ -178,11 +178,9 @@ def choose_plan(
 
 
 def _refine_mb(megapixels: float) -> float:
-    """Return the memory in MB of the surface's refinement with photos of so many megapixels."""
     return OPTIONS.refine_mb + megapixels + OPTIONS.refine_mb_per_mp * min(megapixels, REFINED_AT_ONCE_MP)
 
 
 def _megapixels(size: tuple[int, int], longest: int) -> float:
-    """Return the megapixels of a photo after it is scaled down to a longest side."""
     scale = min(1.0, longest / max(size))
     return size[0] * size[1] * scale**2 / 1e6

@@ -178,7 +178,6 @@ class Workspace:
         self.photo_stats = root / PHOTO_STATS
         """Measurements of every photo: a run that knows a file by its bytes does not decode it again."""
         self.view_graph = root / VIEW_GRAPH
-        """Fundamental matrices."""
         self.calibration = root / CALIBRATION
         """Cameras calibrated from pairs."""
         self.scene = root / SCENE

@@ -67,7 +67,6 @@ class Lens:
         return plain * self._factor(np.hypot(*plain.T))[:, None] + self._shift(plain)
 
     def _radius(self, theta: FloatArray) -> FloatArray:
-        """Return the radius before distortion of a ray at an angle to the optical axis."""
         if self.projection == "perspective":
             return np.asarray(np.tan(theta))
         if self.projection == "stereographic":
@@ -75,7 +74,6 @@ class Lens:
         return theta if self.projection == "equidistant" else np.asarray(2.0 * np.sin(theta / 2.0))
 
     def _angle(self, radius: FloatArray) -> FloatArray:
-        """Return the angle to the optical axis; NaN beyond the ray that looks backwards."""
         if self.projection == "stereographic":
             return np.asarray(2.0 * np.arctan(radius / 2.0))
         if self.projection == "equidistant":
@@ -91,7 +89,6 @@ class Lens:
         return total
 
     def _shift(self, plain: FloatArray) -> FloatArray:
-        """Return (N, 2) the tangential terms."""
         (p1, p2), (x, y) = self.tangential, plain.T
         square = x * x + y * y
         return np.column_stack(
@@ -99,7 +96,6 @@ class Lens:
         )
 
     def _undistort(self, points: FloatArray) -> FloatArray:
-        """Return (N, 2) points without the radial and tangential terms."""
         if not any(self.tangential):
             return self._undistort_radius(points)
         plain = points

@@ -141,7 +141,6 @@ class Tracks:
     pairs: Mapping[tuple[int, int], TwoViews]
     """Matches per pair of cameras (i, j), i < j; the noise of a point is the same in all pairs."""
     corrupted: tuple[tuple[int, int], ...]
-    """Pairs with outliers."""
     K: FloatArray
     """(C, 3, 3) camera matrix per camera; all equal unless the last one has another focal length."""
     R: FloatArray
@@ -152,7 +151,6 @@ class Tracks:
     x: FloatArray
     """(C, N, 2) pixels with noise, without outliers."""
     size: tuple[int, int]
-    """Width and height in pixels."""
 
     @property
     def F(self) -> FloatArray:

@@ -133,8 +133,6 @@ def add_missing_photos(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FolderWork:
-    """The scene, views and options of a folder."""
-
     folder: Path
     prepared: PreparedScene
     views: Views
