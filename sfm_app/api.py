@@ -324,7 +324,6 @@ def export_scene(
     """Write cameras, poses, points and photos of a finished run for another program; no mesh is needed.
 
     Args:
-        out: output folder of the run.
         file_format: "colmap", "splat", "nerfstudio", "cameras", or another that `sfm-app plugins` lists.
         target: file or folder to write; None for OUT/cameras.json, OUT/cloud.laz, OUT/export/colmap, ... An export
             replaces the folder of an earlier one.
@@ -388,7 +387,6 @@ def measure_distance(out: PathLike, a: ArrayLike, b: ArrayLike) -> "Distance":
     """Return the distance between two places of a finished run, with its standard deviation.
 
     Args:
-        out: output folder of the run.
         a, b: (3,) x, y, z in the frame of its exported files, such as OUT/model.glb.
 
     Raises:

@@ -63,11 +63,7 @@ WINDOWS = frozenset({Ability.LINKS, Ability.HARD_LINKS})
 
 
 def find_abilities(platform: str, environment: Mapping[str, str]) -> frozenset[Ability]:
-    """Return the abilities of `sys.platform`, less those that the environment takes away.
-
-    Raises:
-        ValueError: the variable names no ability.
-    """
+    """Return the abilities of `sys.platform`, less those that the environment names; ValueError for an unknown name."""
     usual = WINDOWS if platform == "win32" else LINUX if platform.startswith("linux") else MACOS
     named = [name.strip() for name in environment.get(VARIABLE, "").split(",") if name.strip()]
     return usual - {Ability(name) for name in named}

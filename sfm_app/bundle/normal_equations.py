@@ -211,8 +211,7 @@ def couple_poses(observed: Any, order: Any, pattern: Any, damping: float, blocks
 
     Args:
         observed: observations in the order of points, then photos: (N,) photo, (N,) point, (N, 2, 6) derivatives by
-        pose,
-            and their products (N, 3, 6) with the derivatives by point.
+        pose, and their products (N, 3, 6) with the derivatives by point.
         order: these observations by photo; starts of the photos in this order, and of the points in that above.
         pattern: first block of each photo, and the other photo of each block, ascending.
         blocks: (B, 6, 6), zeros at first.
