@@ -37,7 +37,6 @@ class RunScene(Scene):
     """The sparse reconstruction of a run: summary, cameras, poses; points and tracks on demand."""
 
     out: Path = Path()
-    """Output folder of the run."""
 
     @cached_property
     def arrays(self) -> SceneArrays:
@@ -85,7 +84,6 @@ class Run:
             return model_cutout(read_scene(run))
 
     def _repr_html_(self) -> str:
-        """Return a picture of the model and the figures at a glance, for notebooks."""
         from sfm_app.report.contents import read_contents
         from sfm_app.report.notebook import run_html
 
@@ -95,11 +93,7 @@ class Run:
 
 @contextmanager
 def open_run(out: Path, settings: Settings, progress: Progress | Callback | None) -> Iterator[RunContext]:
-    """Provide a run with its workers, which stop when the block ends.
-
-    Args:
-        progress: display of progress, or a function that is called with every `Step`; None for silence.
-    """
+    """Provide a run with its workers, which stop when the block ends; without `progress`, it is silent."""
     plugins = load_plugins(installed=settings.plugins)
     plugins.estimator(settings.epipolar.estimator)  # an unknown name is an error before any work
     plugins.calibrator(settings.calibration.calibrator)
@@ -123,7 +117,6 @@ def reconstruct(
     Args:
         photos: folder with photos of one place, or a video; nothing about the camera needs to be known.
         out: output folder; created if it does not exist.
-        settings: None for the defaults.
         first: stage from which on all stages run again.
         last: last stage to run.
         progress: display of progress, or a function that is called with every `Step`; silent by default.
@@ -155,9 +148,6 @@ def reconstruct(
 def read_run(out: PathLike) -> Run:
     """Read the results of a run; nothing is computed.
 
-    Args:
-        out: its output folder.
-
     Raises:
         InputError: it holds no run, or its files are damaged.
 
@@ -183,7 +173,6 @@ def read_run(out: PathLike) -> Run:
 
 
 def _as_run(run: RunContext, products: "Products", last: str, report: Path | None) -> Run:
-    """Return the products of a run up to the stage `last`."""
     from sfm_app import pipeline
 
     manifest: dict[str, Any] = run.workspace.manifest.read()
@@ -208,11 +197,8 @@ def calibrate_photos(
     """Find the camera matrix of a folder of photos, or of a video, without reconstructing the scene.
 
     Args:
-        photos: folder with photos, or a video.
-        settings: None for the defaults.
         out: folder that keeps features and matches for a later run; None for a temporary one.
         figure: PNG, SVG or PDF file for the pairs' votes, the lens and the residuals; None for no figure.
-        progress: display of progress, or a function that is called with every `Step`; silent by default.
 
     Raises:
         SfmError: see `sfm_app.errors`.
@@ -247,7 +233,6 @@ def write_report(out: PathLike, compare: PathLike | None = None) -> Path:
     """Write OUT/report.html again from the products of a run; nothing is recomputed.
 
     Args:
-        out: output folder of the run.
         compare: output folder of another run for comparison.
 
     Raises:
@@ -277,7 +262,6 @@ def view_run(
         out: output folder of the run, which may have stopped at any stage.
         port: to listen on; 0 for any free port.
         started: called with the address when the page can be opened.
-        progress: display of progress, or a function that is called with every `Step`; silent by default.
 
     Raises:
         InputError: the folder holds no run.
@@ -299,7 +283,6 @@ def export_model(
     """Write the model of a finished run in another format, or to another place; nothing is recomputed.
 
     Args:
-        out: output folder of the run.
         file_format: "ply", "glb", "obj", "stl", "draco", "usdz", "usd", or another that `sfm-app plugins` lists; empty
             for the suffix of `target`.
         target: file to write; None for OUT/model.FORMAT, OUT/points.FORMAT, OUT/model-draco.glb, ...
@@ -341,14 +324,9 @@ def export_scene(
     """Write cameras, poses, points and photos of a finished run for another program; no mesh is needed.
 
     Args:
-        out: output folder of the run.
         file_format: "colmap", "splat", "nerfstudio", "cameras", or another that `sfm-app plugins` lists.
         target: file or folder to write; None for OUT/cameras.json, OUT/cloud.laz, OUT/export/colmap, ... An export
             replaces the folder of an earlier one.
-        progress: display of progress, or a function that is called with every `Step`; silent by default.
-
-    Returns:
-        The file or the folder.
 
     Raises:
         ConfigError: the format is unknown, needs a missing package, or does not fit the suffix of `target`.
@@ -409,9 +387,7 @@ def measure_distance(out: PathLike, a: ArrayLike, b: ArrayLike) -> "Distance":
     """Return the distance between two places of a finished run, with its standard deviation.
 
     Args:
-        out: output folder of the run.
-        a: (3,) x, y, z in the frame of its exported files, such as OUT/model.glb.
-        b: the other place.
+        a, b: (3,) x, y, z in the frame of its exported files, such as OUT/model.glb.
 
     Raises:
         ValueError: a place is not three finite numbers, or both are the same.
@@ -444,7 +420,6 @@ def estimate_fundamental(
         x1: (N, 2) pixels in photo 1.
         x2: (N, 2) pixels in photo 2; row i matches row i of x1.
         method: name of an estimator; `sfm-app plugins` lists them.
-        seed: same seed, same result.
         settings: their table `epipolar` holds the threshold and the limits.
 
     Returns:
@@ -483,7 +458,6 @@ def calibrate_fundamentals(  # noqa: PLR0913 - public interface, keywords only
         matches: per matrix (N, 4) x1, y1, x2, y2 in pixels, the matches behind it; they reveal the lens distortion and
             the accuracy of each matrix.
         photos: per matrix the ids of its two photos.
-        seed: same seed, same result.
         settings: their table `calibration` holds the limits.
 
     Raises:
@@ -513,7 +487,6 @@ def estimate_lens(matches: Sequence[ArrayLike], size: tuple[int, int], seed: int
         matches: per pair of photos (N, 4) x1, y1, x2, y2 in pixels; half of them may be wrong. The estimate uses at
             most 16 pairs of 60 matches or more.
         size: (width, height) of all photos in pixels.
-        seed: same seed, same result.
 
     Returns:
         The lens in pixels with its covariance; None if fewer than three pairs agree.

@@ -1,4 +1,7 @@
-"""Read the cameras that a user knows, from the files of several programs."""
+"""Read the cameras that a user knows, from the files of several programs.
+
+The functions for one program raise ValueError where a file is damaged, or a camera is not supported.
+"""
 
 import json
 import struct
@@ -19,7 +22,6 @@ from sfm_app.types import Calibration, GivenCameras
 from sfm_app.types.camera import GIVEN, PROJECTIONS
 
 # Cameras of COLMAP's models on disk: cameras.txt and cameras.bin, and which photo has which camera.
-#
 # COLMAP itself ends the process on some damaged models.
 
 CAMERA_FILES = ("cameras.bin", "cameras.txt")
@@ -34,11 +36,7 @@ DAMAGED = "its bytes are not those of a COLMAP model"
 
 
 def read_colmap_text(text: str) -> dict[str, Calibration]:
-    """Return the cameras of a cameras.txt by their ids.
-
-    Raises:
-        ValueError: a line is no camera.
-    """
+    """Return the cameras of a cameras.txt by their ids."""
     cameras = {}
     for line in (line.strip() for line in text.splitlines()):
         if not line or line.startswith("#"):
@@ -55,11 +53,7 @@ def read_colmap_text(text: str) -> dict[str, Calibration]:
 
 
 def read_colmap_binary(data: bytes) -> dict[str, Calibration]:
-    """Return the cameras of a cameras.bin by their ids.
-
-    Raises:
-        ValueError: the bytes are damaged, or a camera is not supported.
-    """
+    """Return the cameras of a cameras.bin by their ids."""
     cameras, reader = {}, _Reader(data)
     (count,) = reader.take("<Q")
     if count > 1_000_000:
@@ -75,12 +69,7 @@ def read_colmap_binary(data: bytes) -> dict[str, Calibration]:
 
 
 def read_colmap_folder(folder: Path) -> tuple[dict[str, Calibration], dict[str, str]]:
-    """Return the cameras of a folder with one of `CAMERA_FILES`, by their ids, and the id by photo if there are images.
-
-    Raises:
-        OSError: a file cannot be read.
-        ValueError: a file is damaged, or a camera is not supported.
-    """
+    """Return the cameras of a folder with one of `CAMERA_FILES`, by their ids, and the id by photo if known."""
     if (folder / "cameras.bin").is_file():
         images = folder / "images.bin"
         known = dict(_binary_images(images.read_bytes())) if images.is_file() else {}
@@ -102,7 +91,6 @@ def _text_images(text: str) -> Iterator[tuple[str, str]]:
 
 
 def _binary_images(data: bytes) -> Iterator[tuple[str, str]]:
-    """Yield photos and the ids of their cameras from images.bin."""
     reader = _Reader(data)
     (count,) = reader.take("<Q")
     for _ in range(int(count)):
@@ -139,7 +127,6 @@ class _Reader:
 
 
 # Cameras as OpenCV writes them: camera matrix and distortion coefficients in JSON, YAML or XML.
-#
 # OpenCV counts pixels from the center of the first one, which is (0.5, 0.5) here.
 
 MATRIX = ("cameramatrix", "k", "mtx", "intrinsicmatrix")
@@ -156,14 +143,7 @@ def is_opencv_camera(values: Mapping[str, Any]) -> bool:
 
 
 def opencv_camera(values: Mapping[str, Any]) -> Calibration:
-    """Return the camera of OpenCV's values.
-
-    Args:
-        values: camera matrix, and optionally distortion coefficients, size, and whether the lens is a fisheye.
-
-    Raises:
-        ValueError: they are no camera, or a coefficient is not supported.
-    """
+    """Return the camera of OpenCV's values: a camera matrix, and optionally distortion, size, and the kind of lens."""
     K = _numbers(_value(values, MATRIX), "the camera matrix")
     if K.size != 9:
         raise ValueError(f"the camera matrix has {K.size} values instead of 3 x 3")
@@ -180,11 +160,7 @@ def opencv_camera(values: Mapping[str, Any]) -> Calibration:
 
 
 def read_file_storage(text: str) -> dict[str, Any]:
-    """Return the entries of OpenCV's YAML or XML: numbers, texts, lists and matrices.
-
-    Raises:
-        ValueError: OpenCV cannot read it.
-    """
+    """Return the entries of OpenCV's YAML or XML: numbers, texts, lists and matrices."""
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
@@ -231,7 +207,6 @@ def _size(values: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _value(values: Mapping[str, Any], names: Sequence[str]) -> Any:
-    """Return the value of the first of these names; None without any."""
     plain = {str(key).lower().replace("_", "").replace(" ", ""): value for key, value in values.items()}
     return next((plain[name] for name in names if plain.get(name) is not None), None)
 
@@ -250,7 +225,6 @@ def _numbers(value: Any, what: str) -> NDArray[np.float64]:
 
 
 # Cameras as OpenSfM writes them into camera_models.json, and OpenDroneMap into cameras.json.
-#
 # Lengths are in units of the longer side, and the center counts from the middle of the photo.
 
 MODELS = {
@@ -265,17 +239,8 @@ MODELS = {
 PANORAMAS = ("spherical", "equirectangular")
 
 
-def is_opensfm_camera(values: Mapping[str, Any]) -> bool:
-    """Return whether the values name a projection type, as OpenSfM's do."""
-    return "projection_type" in values
-
-
 def opensfm_camera(values: Mapping[str, Any]) -> Calibration:
-    """Return the camera of OpenSfM's values, one entry of its file.
-
-    Raises:
-        ValueError: its projection type is not supported, or they are no camera.
-    """
+    """Return the camera of OpenSfM's values, one entry of its file."""
     kind = str(values["projection_type"]).lower()
     width, height = (int(values.get(name, 0)) for name in ("width", "height"))
     if width <= 0 or height <= 0:
@@ -296,26 +261,9 @@ def opensfm_camera(values: Mapping[str, Any]) -> Calibration:
 
 
 # Cameras of earlier runs: calibration.json, scene.json, and what `sfm-app calibrate --json` prints.
-#
 # Only cameras that the photos of that run determined are used; the others are guesses.
 
 FIELDS = {field.name for field in fields(Calibration)}
-
-
-def is_run_file(values: Mapping[str, Any]) -> bool:
-    """Return whether the values are those of calibration.json or scene.json."""
-    return "cameras" in values and "camera_of" in values
-
-
-def run_file_cameras(values: Mapping[str, Any]) -> tuple[dict[str, Calibration], dict[str, str]]:
-    """Return the known cameras of calibration.json or scene.json, and the camera of each photo.
-
-    Raises:
-        ValueError: the values are no cameras.
-    """
-    entries = {str(name): run_camera(entry) for name, entry in values["cameras"].items()}
-    cameras = {name: camera for name, camera in entries.items() if camera is not None}
-    return cameras, {str(photo): str(name) for photo, name in values["camera_of"].items()}
 
 
 def is_run_camera(values: Mapping[str, Any]) -> bool:
@@ -324,14 +272,7 @@ def is_run_camera(values: Mapping[str, Any]) -> bool:
 
 
 def run_camera(values: Mapping[str, Any]) -> Calibration | None:
-    """Return a camera of a run, as given by the user; None if its photos did not determine it.
-
-    Args:
-        values: a `Calibration`, or a `CameraModel` after bundle adjustment, as plain values.
-
-    Raises:
-        ValueError: they are no camera.
-    """
+    """Return a camera of a run, a `Calibration` or `CameraModel` as plain values; None if it is a guess."""
     if "params" in values:
         size = int(values["width"]), int(values["height"])
         camera = calibration_from_model(str(values["model"]), values["params"], size)
@@ -419,8 +360,10 @@ def _read_json(text: str) -> tuple[str, Cameras]:
         raise ValueError(f"it is not valid JSON: {err}") from None
     if not isinstance(values, Mapping):
         raise ValueError("its JSON is not an object")
-    if is_run_file(values):
-        return "sfm-app", run_file_cameras(values)
+    if "cameras" in values and "camera_of" in values:  # calibration.json or scene.json
+        entries = {str(name): run_camera(entry) for name, entry in values["cameras"].items()}
+        known = {name: camera for name, camera in entries.items() if camera is not None}
+        return "sfm-app", (known, {str(photo): str(name) for photo, name in values["camera_of"].items()})
     if is_run_camera(values):
         camera = run_camera(values)
         return "sfm-app", ({"": camera} if camera is not None else {}, {})
@@ -434,7 +377,7 @@ def _read_json(text: str) -> tuple[str, Cameras]:
 
 _BY_NAME: tuple[tuple[str, Callable[..., bool], Callable[..., Calibration | None]], ...] = (
     ("sfm-app", is_run_camera, run_camera),
-    ("OpenSfM", is_opensfm_camera, opensfm_camera),
+    ("OpenSfM", lambda values: "projection_type" in values, opensfm_camera),
     ("OpenCV", is_opencv_camera, opencv_camera),
 )
 """Forms of JSON with cameras by name: the test and the reader of an entry."""
@@ -443,7 +386,6 @@ _BY_NAME: tuple[tuple[str, Callable[..., bool], Callable[..., Calibration | None
 def _read_by_name(
     values: Mapping[str, Any], read: Callable[..., Calibration | None]
 ) -> Iterator[tuple[str, Calibration]]:
-    """Yield the cameras by name; an error names its camera."""
     for name, entry in values.items():
         try:
             camera = read(entry)

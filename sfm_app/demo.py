@@ -46,15 +46,13 @@ class DemoScene(NamedTuple):
     views: Callable[[], Views]
 
 
-def fisheye_views() -> Views:
-    """Return views of an equidistant fisheye of 180 degrees from corner to corner, close to the court."""
-    return arc(make_wide_camera(*SIZE, 150.0, Lens("equidistant")), ArcOptions(distance=(2.4, 3.6)))
-
-
 SCENES: Mapping[str, DemoScene] = MappingProxyType({
     "courtyard": DemoScene(courtyard, lambda: arc(make_camera(*SIZE))),
     "statue": DemoScene(statue, lambda: statue_views(make_camera(*SIZE[::-1], focal_widths=1.35), photos=18)),
-    "fisheye": DemoScene(courtyard, fisheye_views),
+    "fisheye": DemoScene(  # 180 degrees from corner to corner, close to the court
+        courtyard,
+        lambda: arc(make_wide_camera(*SIZE, 150.0, Lens("equidistant")), ArcOptions(distance=(2.4, 3.6))),
+    ),
 })  # fmt: skip
 """By name. Each takes less than four minutes on two cores."""
 
@@ -92,11 +90,7 @@ class DemoResult:
 
 
 def run_demo(out: Path, scene: str, settings: Settings, progress: Progress) -> tuple[Run, DemoResult]:
-    """Render OUT/photos, reconstruct them into OUT/model, compare, and draw OUT/model.png.
-
-    Raises:
-        SfmError: see `sfm_app.errors`.
-    """
+    """Render OUT/photos, reconstruct them into OUT/model, compare, and draw OUT/model.png."""
     start = time.perf_counter()
     truth = render_photos(out, scene, settings, progress)
     rendered = time.perf_counter()
@@ -116,11 +110,7 @@ def run_demo(out: Path, scene: str, settings: Settings, progress: Progress) -> t
 def render_photos(
     out: Path, scene: str, settings: Settings, progress: Progress, scenes: Mapping[str, DemoScene] = SCENES
 ) -> Truth:
-    """Return the ground truth of the photos in OUT/photos after rendering the missing ones.
-
-    Raises:
-        InputError: the folder has photos of another scene.
-    """
+    """Return the truth of the photos in OUT/photos, after rendering the missing ones; InputError for other photos."""
     demo = scenes[scene]
     views, photos = demo.views(), out / "photos"
     files = {path.name for path in photos.glob("*.jpg")}
@@ -139,7 +129,6 @@ def render_photos(
 
 
 def _is_of(truth: Truth, views: Views) -> bool:
-    """Return whether the truth is that of these views."""
     poses = views.cam_from_world
     return truth.cam_from_world.keys() == poses.keys() and all(
         np.allclose(truth.cam_from_world[name], pose)

@@ -1,6 +1,7 @@
 """Export finished runs: cameras, points, photos and surface in the frame of the export.
 
-Only this module moves poses, points and vertices into that frame.
+Only this module moves poses, points and vertices into that frame. InputError where stages have not run, or their files
+or photos are missing or damaged, and where a target holds files that no export has written.
 """
 
 import json
@@ -64,11 +65,7 @@ def export_frame(run: RunContext) -> Similarity | None:
 
 
 def check_finished(run: RunContext, stages: Sequence[Stage[object]], what: str, otherwise: str = "") -> None:
-    """Check that stages of a run are finished.
-
-    Args:
-        what: the exported data, for the message.
-        otherwise: an alternative, for the hint.
+    """Check that stages of a run are finished; messages say `what` is exported, and hints what `otherwise`.
 
     Raises:
         InputError: there is no run, or a stage is missing (the message names it).
@@ -83,11 +80,7 @@ def check_finished(run: RunContext, stages: Sequence[Stage[object]], what: str, 
 
 
 def stored_model(run: RunContext, *, points: bool = False) -> Model:
-    """Read the finished model, or the points and cameras, of a run.
-
-    Raises:
-        InputError: a stage has not run yet, or its files are missing or damaged.
-    """
+    """Read the finished model, or the points and cameras, of a run."""
     if not points:
         check_finished(run, [TEXTURE], "model", "`--points` exports the points and cameras")
         return move_model(Products(run)[TEXTURE], stored_frame(run).from_model)
@@ -97,11 +90,7 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
 
 
 def stored_scene(run: RunContext) -> tuple[Scene, Reconstruction]:
-    """Read cameras and poses, and COLMAP's model with the points.
-
-    Raises:
-        InputError: the scene does not exist yet, or its files are missing or damaged.
-    """
+    """Read cameras and poses, and COLMAP's model with the points."""
     check_finished(run, [SCENE], "cameras and points")
     scene = Products(run)[SCENE]
     model = read_model(scene.model_dir, export_frame(run))
@@ -110,22 +99,13 @@ def stored_scene(run: RunContext) -> tuple[Scene, Reconstruction]:
 
 
 def stored_arrays(run: RunContext) -> SceneArrays:
-    """Read poses, cameras, points and tracks as plain arrays, in the frame of exports.
-
-    Raises:
-        InputError: the scene does not exist yet, or its files are missing or damaged.
-    """
+    """Read poses, cameras, points and tracks as plain arrays, in the frame of exports."""
     _, model = stored_scene(run)
     return model_arrays(model, metric=stored_frame(run).is_metric)
 
 
 def stored_distance(run: RunContext, ends: NDArray[np.float64]) -> Distance:
-    """Return the distance between two places, (2, 3) in the frame of exports.
-
-    Raises:
-        ValueError: both are the same.
-        InputError: the scene does not exist yet, or its files are missing or damaged.
-    """
+    """Return the distance between two places, (2, 3) in the frame of exports; ValueError if both are the same."""
     check_finished(run, [SCENE], "camera poses")
     frame = stored_frame(run)
     a, b = frame.from_model.inverse()(ends)
@@ -135,11 +115,7 @@ def stored_distance(run: RunContext, ends: NDArray[np.float64]) -> Distance:
 
 
 def check_cloud(run: RunContext) -> Path:
-    """Return the file of the dense cloud.
-
-    Raises:
-        InputError: the depth maps are not fused yet, or the file is gone.
-    """
+    """Return the file of the dense cloud."""
     check_finished(run, [MESH], "dense cloud", "`--points` exports the sparse points")
     file = run.workspace.surface / FUSED
     if not file.exists():
@@ -148,11 +124,7 @@ def check_cloud(run: RunContext) -> Path:
 
 
 def stored_cloud(run: RunContext) -> PointCloud:
-    """Read the dense cloud.
-
-    Raises:
-        InputError: the depth maps are not fused yet, or the file is gone or damaged.
-    """
+    """Read the dense cloud."""
     file = check_cloud(run)
     with check_undamaged(MESH, run):
         records = open_points(file)
@@ -168,7 +140,6 @@ def stored_cloud(run: RunContext) -> PointCloud:
 
 
 def _columns(records: NDArray[np.void], names: Sequence[str]) -> NDArray[np.float64]:
-    """Return fields of records as the columns of an array."""
     return np.stack([records[name] for name in names], axis=1).astype(np.float64)
 
 
@@ -178,11 +149,7 @@ IMAGES, MASKS = "images", "masks"
 
 
 class StoredScene:
-    """The scene of a finished run, a `FinishedScene`.
-
-    Raises:
-        InputError: the scene does not exist yet, or its files are missing or damaged.
-    """
+    """The scene of a finished run, a `FinishedScene`."""
 
     def __init__(self, run: RunContext) -> None:
         self._run = run
@@ -219,11 +186,7 @@ class StoredScene:
 
 
 class StoredPhotos:
-    """The undistorted photos of a finished run, a `PerspectiveScene`.
-
-    Raises:
-        InputError: photos are gone.
-    """
+    """The undistorted photos of a finished run, a `PerspectiveScene`."""
 
     def __init__(self, scene: Scene, model: Reconstruction, run: RunContext, *, centered: bool) -> None:
         self._model, self._run = model, run
@@ -250,11 +213,7 @@ class StoredPhotos:
         return self._mask_dir is not None or any(len(lens.views) > 1 for lens in self._lenses.values())
 
     def write_photos(self, folder: Path) -> None:
-        """Write images/, and masks/ if photos have masks.
-
-        Raises:
-            InputError: photos are gone.
-        """
+        """Write images/, and masks/ if photos have masks."""
         place = self._run.workspace.photos
         gone = [name for name in self._camera_of if not (place / name).exists()]
         if gone:
@@ -310,12 +269,7 @@ ELSEWHERE = "name another place with -o"
 def fill_folder(target: Path, about: Callable[[], Mapping[str, object]]) -> Iterator[Path]:
     """Provide an empty folder beside `target`, which replaces it when the block ends without an error.
 
-    Args:
-        target: folder; it may hold files of an earlier export.
-        about: returns the entries of the record besides the files; called at the end.
-
-    Raises:
-        InputError: the target is no folder, or holds files that no export has written.
+    The target may be an earlier export; `about` returns the entries of the record besides the files, at the end.
     """
     check_replaceable(target)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -340,11 +294,7 @@ def fill_folder(target: Path, about: Callable[[], Mapping[str, object]]) -> Iter
 
 
 def check_replaceable(target: Path) -> None:
-    """Check that a folder, which may be missing, holds only files of an export.
-
-    Raises:
-        InputError: it is no folder, or it holds files that no export has written.
-    """
+    """Check that a folder, which may be missing, holds only files of an export; InputError if not."""
     if is_link(target) or (target.exists() and not target.is_dir()):
         raise InputError(f"{target} is no folder", hint=ELSEWHERE)
     if not target.exists():
@@ -360,7 +310,6 @@ def _list_files(folder: Path) -> list[str]:
 
 
 def _recorded_files(folder: Path) -> list[str]:
-    """Return the files in the record of an export; none without a valid record."""
     try:
         known = json.loads((folder / RECORD).read_text(encoding="utf-8"))["files"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):

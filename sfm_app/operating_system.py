@@ -1,6 +1,7 @@
 """Differences between operating systems; no other module asks which system this is.
 
-Each function has a fallback for macOS, Windows, and drives and containers with fewer abilities than Linux.
+Each function has a fallback for macOS, Windows, and drives and containers with fewer abilities than Linux;
+OSError where the system refuses.
 """
 
 import contextlib
@@ -62,11 +63,7 @@ WINDOWS = frozenset({Ability.LINKS, Ability.HARD_LINKS})
 
 
 def find_abilities(platform: str, environment: Mapping[str, str]) -> frozenset[Ability]:
-    """Return the abilities of `sys.platform`, less those that the environment takes away.
-
-    Raises:
-        ValueError: the variable names no ability.
-    """
+    """Return the abilities of `sys.platform`, less those that the environment names; ValueError for an unknown name."""
     usual = WINDOWS if platform == "win32" else LINUX if platform.startswith("linux") else MACOS
     named = [name.strip() for name in environment.get(VARIABLE, "").split(",") if name.strip()]
     return usual - {Ability(name) for name in named}
@@ -95,9 +92,6 @@ def link_or_copy(place: Path, target: Path | str, source: Path) -> None:
     """Make a link with the text `target` to the file `source`, or a copy if links are not possible.
 
     A copy is no hard link: a program that writes to it must not change the user's file.
-
-    Raises:
-        OSError: neither is possible, or the path exists.
     """
     if not lacks(Ability.LINKS):
         try:
@@ -113,11 +107,7 @@ def link_or_copy(place: Path, target: Path | str, source: Path) -> None:
 
 
 def share_bytes(source: Path, target: Path) -> None:
-    """Make a file with the bytes of another, as a hard link if possible; neither is written to later.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Make a file with the bytes of another, as a hard link if possible; neither is written to later."""
     if not lacks(Ability.HARD_LINKS):
         with contextlib.suppress(OSError):
             os.link(source, target)
@@ -135,20 +125,12 @@ def is_link(path: Path) -> bool:
 
 
 def replace_file(source: Path, target: Path) -> None:
-    """Replace a file by another one on the same drive, atomically.
-
-    Raises:
-        OSError: the system refuses.
-    """
+    """Replace a file by another one on the same drive, atomically."""
     _insist(source.replace, target)
 
 
 def move(source: Path, target: Path) -> None:
-    """Move a file or a folder on the same drive to a path where nothing is.
-
-    Raises:
-        OSError: the system refuses.
-    """
+    """Move a file or a folder on the same drive to a path where nothing is."""
     _insist(source.rename, target)
 
 
@@ -168,12 +150,7 @@ def _insist(act: Callable[[Path], object], target: Path) -> None:
 
 
 def find_in_wheel(package: Path, project: str, name: str) -> Iterator[ctypes.CDLL]:
-    """Yield the libraries whose names start with `name` in the wheel of a package.
-
-    Args:
-        package: folder of the installed package.
-        project: its name in the registry.
-    """
+    """Yield the libraries whose names start with `name` in the wheel of a package; the registry has it as `project`."""
     if lacks(Ability.WHEEL_LIBRARIES):
         return
     for folder in (package.parent / f"{project}.libs", package / ".dylibs"):  # Linux, macOS
@@ -267,7 +244,6 @@ FAULTS: Mapping[int, str] = {
     0xC0000374: "damaged heap",
     0xC0000409: "aborted",
 }
-"""Exit codes of Windows."""
 
 
 def group_options() -> dict[str, Any]:
@@ -310,27 +286,21 @@ def _kill_tree(root: psutil.Process) -> None:
 def watch_parent(parent: int, then: Callable[[], object]) -> None:
     """Call a function in a thread when the process that started this one has ended, for any reason.
 
-    Args:
-        parent: its number. It is not asked for here: on Windows, a virtual environment adds a process between.
-        then: ends this process.
+    The caller knows the parent's number: on Windows, a virtual environment adds a process between.
     """
 
     def watch() -> None:
         if lacks(Ability.CLOSED_INPUT):
-            _wait_for_end(parent)
+            with contextlib.suppress(psutil.Error):
+                process = psutil.Process(parent)
+                while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
+                    time.sleep(0.2)
         else:
             while os.read(0, 1):
                 pass
         then()
 
     threading.Thread(target=watch, name="parent", daemon=True).start()
-
-
-def _wait_for_end(number: int) -> None:
-    with contextlib.suppress(psutil.Error):
-        process = psutil.Process(number)
-        while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
-            time.sleep(0.2)
 
 
 def end_at_exit() -> None:

@@ -118,13 +118,7 @@ STAGES, NAMES = PIPELINE.stages, PIPELINE.names
 def run_stages(
     photo_dir: Path, run: RunContext, first: str = "", last: str = "files", targets: Sequence[Stage[object]] = ()
 ) -> Products:
-    """Turn a folder of photos, or a video, into products.
-
-    Args:
-        first: stage from which on all stages run again; empty for none.
-        last: last stage to run.
-        targets: stages whose products are loaded before returning.
-    """
+    """Turn a folder of photos, or a video, into products; the rest as in `Pipeline.run`."""
     options, place = run.settings.photos, run.workspace
     place.check_no_overlap(photo_dir)
     if options.masks:

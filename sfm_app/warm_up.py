@@ -18,7 +18,6 @@ from sfm_app.jit import PARENT, WARM
 from sfm_app.operating_system import end_own_group, watch_parent, yield_to_others
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import look_at
-from sfm_app.types.arrays import FloatArray
 
 WIDTH, HEIGHT, FOCAL = 480, 360, 520.0
 """Size and focal length of the photos in pixels: small, and mapped with certainty. Chosen by hand."""
@@ -38,12 +37,17 @@ def write_photos(folder: Path) -> None:
     corners = np.array([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]])
     walls = [(np.roll(corners, turn, axis=1), _noise(rng)) for turn in range(3)]
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    sides = np.array([[0, 0], [SIDE, 0], [SIDE, SIDE], [0, SIDE]], np.float32)
     folder.mkdir(parents=True)
     for number, angle in enumerate(np.linspace(0.35, 1.2, 6)):
         center = np.array([4.0 * np.sin(angle), 1.6 + 0.2 * (number % 2), 4.0 * np.cos(angle)])
-        photo = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        P, photo = K @ look_at(center, np.full(3, 0.7)), np.zeros((HEIGHT, WIDTH, 3), np.uint8)
         for wall, picture in walls:
-            _paste(photo, picture, K @ look_at(center, np.full(3, 0.7)), wall)
+            pixels = np.column_stack([wall, np.ones(4)]) @ P.T
+            H = cv2.getPerspectiveTransform(sides, np.asarray(pixels[:, :2] / pixels[:, 2:], np.float32))
+            cv2.warpPerspective(
+                picture, H, (WIDTH, HEIGHT), dst=photo, flags=cv2.INTER_AREA, borderMode=cv2.BORDER_TRANSPARENT
+            )
         cv2.imwrite(str(folder / f"{number}.png"), photo)
 
 
@@ -53,14 +57,6 @@ def _noise(rng: np.random.Generator) -> NDArray[np.uint8]:
         cv2.resize(rng.normal(size=(n, n, 3)), (SIDE, SIDE), interpolation=cv2.INTER_CUBIC) for n in (10, 40, 160)
     ]
     return np.asarray(np.clip(128 + 40 * sum(layers), 0, 255), np.uint8)
-
-
-def _paste(photo: NDArray[np.uint8], picture: NDArray[np.uint8], P: FloatArray, wall: FloatArray) -> None:
-    """Paint a wall, given by its four corners (4, 3), into a photo with the projection matrix P."""
-    pixels = np.column_stack([wall, np.ones(4)]) @ P.T
-    corners = np.array([[0, 0], [SIDE, 0], [SIDE, SIDE], [0, SIDE]], np.float32)
-    H = cv2.getPerspectiveTransform(corners, np.asarray(pixels[:, :2] / pixels[:, 2:], np.float32))
-    cv2.warpPerspective(picture, H, (WIDTH, HEIGHT), dst=photo, flags=cv2.INTER_AREA, borderMode=cv2.BORDER_TRANSPARENT)
 
 
 def _end(folder: Path) -> None:

@@ -10,9 +10,9 @@ evidence is compared (`family_evidence`).
 """
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import sparse
 
 from sfm_app.bundle.lens_parts import (
     COUNT,
@@ -45,10 +45,6 @@ from sfm_app.camera.projection import (
 from sfm_app.geometry.least_squares import cavity, inverse_of_positive, posteriors
 from sfm_app.types.arrays import BoolArray, FloatArray
 
-if TYPE_CHECKING:
-    from scipy import sparse
-
-
 MISFIT = 4.0
 """Ratio of the errors of cameras to those that independent noise explains: lens models are inexact, and errors of
 neighboring observations are correlated. Chosen on photo sets with known cameras (docs/algorithms.md, Bundle
@@ -67,22 +63,18 @@ class LensOptions:
     sweeps: int = 5
     """Most sweeps over all cameras in the choice of free parts. Chosen by hand."""
     longest_step: float = 1.0
-    """Longest step of log f: a camera that moves further after mapping is not determined by its photos. Chosen by
-    hand."""
+    """Longest step of log f: photos do not determine a camera that moves further after mapping. Chosen by hand."""
     focals: tuple[float, float] = (0.05, 100.0)
-    """Range of focals in longer sides, views of 169 to 0.5 degrees; outside it, an estimate has diverged. Chosen by
-    hand."""
+    """Range of focals in longer sides, views of 169 to 0.5 degrees; others have diverged. Chosen by hand."""
     zero_precision: float = 1e6
-    """Factor on the precision of a part that is set to its usual value, so that the others adapt to it. Chosen by
-    hand."""
+    """Factor on the precision of a part at its usual value, so that the others adapt to it. Chosen by hand."""
     clamps: int = 8
     """Most halvings of a step that makes a lens fold inside the photo. Chosen by hand."""
     squeeze: float = 0.8
     """Share of the undistorted radius below which a perspective lens is tried as a fisheye, at the outermost
     observations. An equidistant lens has 0.6 at 120 degrees and 0.76 at 95 degrees. Chosen by hand."""
     narrow_angle: float = float(np.radians(65.0))
-    """Largest angle to the optical axis, in radians, up to which a fisheye is tried as a perspective lens. Chosen by
-    hand."""
+    """Largest angle to the optical axis, in radians, of a fisheye to try as a perspective lens. Chosen by hand."""
     samples: int = 200
     """Radii at which a lens is fitted to another. Chosen by hand."""
     least_reach: float = 0.2
@@ -99,7 +91,6 @@ class LensChoice:
     model: str
     """COLMAP's name of the smallest camera model with these parts."""
     free: tuple[str, ...]
-    """Names of the freed parts."""
     log_evidence: float
     """Log-probability up to a constant that all models of a camera share."""
 
@@ -113,8 +104,7 @@ class LensEstimate:
     deviations: FloatArray
     """(C, 12) their standard deviations."""
     mean_squares: FloatArray
-    """(C, 12, 12) mean squares and products of the errors of `params`, over all choices of freed parts. 0 for cameras
-    that are fixed or diverged."""
+    """(C, 12, 12) mean squares and products of the errors of `params` over all choices; 0 if fixed or diverged."""
     free: BoolArray
     """(C, 7) parts with the wide prior, in the order of PARTS."""
     determined: BoolArray
@@ -135,10 +125,6 @@ def estimate_lenses(params: FloatArray, reduced: ReducedSystem, priors: LensPrio
     Deviations are root mean squares about these cameras, over all choices of freed parts. They are at least those of
     the sandwich estimator with photos as clusters, which grows where photos contradict each other. Choices whose lens
     folds inside the photo are barred; if all do, the step is shortened.
-
-    Args:
-        params: (C, 12) cameras as in `Bundle`.
-        reduced: the cost about these cameras.
     """
     barred = np.zeros(len(params), np.bool_)
     while True:
@@ -195,12 +181,15 @@ def _estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors, fr
     moved, held = _apply_step(params, step.reshape(params.shape), priors.sides)
     moved[zero] = priors.usual[zero]
     moved[priors.fixed], held[priors.fixed], deviations[priors.fixed] = params[priors.fixed], False, 0.0
-    prior, undetermined = _prior_deviations(params, priors), priors.parameter_mask(priors.estimated) & ~changing
+    prior = priors.precision(np.ones((len(params), COUNT), np.bool_)) ** -0.5
+    prior[:, [FX, FY]] = FOCAL_SPREAD * params[:, [FX, FY]]
+    undetermined = priors.parameter_mask(priors.estimated) & ~changing
     deviations[held] = np.maximum(deviations[held], prior[held])
     # photos make no part less certain than its prior: a larger deviation is rounding, where nearly all of H cancels
     deviations[undetermined] = np.minimum(deviations, np.hypot(prior, offsets))[undetermined]
     determined[held] = False
-    own_squares = _camera_blocks(mean_squares) * (~held & ~priors.fixed)[:, None, None]
+    blocks = np.einsum("iaib->iab", mean_squares.reshape(2 * params.shape))
+    own_squares = blocks * (~held & ~priors.fixed)[:, None, None]
     return LensEstimate(
         np.where(held[:, None], params, moved), deviations, own_squares, free & determined, determined,
         float(np.max(largest.reshape(params.shape)[~held & ~priors.fixed], initial=0.0)), held, (), held,
@@ -220,7 +209,6 @@ def _posterior(
 
 
 def _find_determined(covariance: FloatArray, precision: FloatArray, priors: LensPriors) -> BoolArray:
-    """Return (C, 7) as in `LensEstimate`."""
     narrower = np.sqrt(np.diag(covariance)).reshape(precision.shape) < OPTIONS.undetermined_share * precision**-0.5
     rows = [
         [row[list(part.places)].all() for part in PARTS[int(kind)]]
@@ -255,7 +243,6 @@ def _choose(
 
 
 def _rank(family: int, choices: BoolArray, log_evidence: FloatArray) -> tuple[LensChoice, ...]:
-    """Return the best choice of every model, best first."""
     best: dict[str, LensChoice] = {}
     for k in np.argsort(-log_evidence, kind="stable"):
         free = part_names(family, choices[k])
@@ -282,17 +269,8 @@ def _mean_squares(
     return squares
 
 
-def _camera_blocks(squares: FloatArray) -> FloatArray:
-    """Return (C, 12, 12), the blocks of single cameras of a matrix (12C, 12C)."""
-    count = len(squares) // CAMERA
-    blocks = np.einsum("iaib->iab", squares.reshape(count, CAMERA, count, CAMERA))
-    return np.array(blocks, np.float64)
-
-
-def _logarithm_jacobian(params: FloatArray) -> "sparse.csr_array":
+def _logarithm_jacobian(params: FloatArray) -> sparse.csr_array:
     """Return (12C, 12C) derivatives of the parameters by those with log f and log fy/fx in place of fx and fy."""
-    from scipy import sparse
-
     T = sparse.eye_array(params.size, format="lil")
     for camera, values in enumerate(params):
         x, y = CAMERA * camera + FX, CAMERA * camera + FY
@@ -316,13 +294,6 @@ def _apply_step(params: FloatArray, step: FloatArray, sides: FloatArray) -> tupl
     return moved, ~is_plausible | (np.abs(step[:, LOG_FOCAL]) > OPTIONS.longest_step)
 
 
-def _prior_deviations(params: FloatArray, priors: LensPriors) -> FloatArray:
-    """Return (C, 12) standard deviations of cameras that the photos do not determine."""
-    deviations = priors.precision(np.ones((len(params), COUNT), np.bool_)) ** -0.5
-    deviations[:, [FX, FY]] = FOCAL_SPREAD * params[:, [FX, FY]]
-    return np.asarray(deviations, np.float64)
-
-
 def _shorten_step(before: FloatArray, after: FloatArray, camera: int, priors: LensPriors) -> FloatArray:
     """Return a camera (12,) between two that does not fold; the second where the first folds, too."""
     if priors.folds(camera, before):
@@ -335,11 +306,8 @@ def suggests_other_family(params: FloatArray, family: int, reach: float, best: L
     """Return whether a camera is worth trying as one of the other family.
 
     A perspective lens is, if it needs many terms, would fold, or puts the outermost points far inwards. A fisheye is,
-    if a perspective lens can show its narrow view.
-
-    Args:
-        reach: radius of the outermost observations, in focal lengths.
-        folding: whether a more probable lens folds inside the photo.
+    if a perspective lens can show its narrow view. `reach` is the radius of the outermost observations, in focal
+    lengths; `folding` tells whether a more probable lens folds inside the photo.
     """
     if family == PANORAMA:
         return False
@@ -352,10 +320,7 @@ def suggests_other_family(params: FloatArray, family: int, reach: float, best: L
 def convert_lens(params: FloatArray, family: int, reach: float) -> FloatArray | None:
     """Return the camera (12,) of the other family that shows rays at nearly the same radius; None if there is none.
 
-    Center and aspect are kept, and tangential terms are dropped.
-
-    Args:
-        reach: radius up to which the two agree, in focal lengths.
+    Both agree up to the radius `reach` in focal lengths. Center and aspect are kept, and tangential terms are dropped.
     """
     for share in np.linspace(1.0, OPTIONS.least_reach, 9):
         angle = angle_limit(params, family, float(share * reach))
@@ -380,7 +345,6 @@ def convert_lens(params: FloatArray, family: int, reach: float) -> FloatArray | 
 def family_evidence(cost_px2: float, noise_px: float, best: LensChoice) -> float:
     """Return the log-probability of a bundle with one of its cameras as it is, comparable between families.
 
-    Args:
-        noise_px: the same for all candidates.
+    The noise is the same for all candidates.
     """
     return best.log_evidence - evidence_weight(noise_px) * cost_px2

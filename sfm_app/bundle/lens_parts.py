@@ -50,8 +50,7 @@ LOG_FOCAL, LOG_ASPECT = FX, FY
 FOCAL_SPREAD = 0.7
 """Prior standard deviation of log f about the value from mapping: hardly a constraint. Chosen by hand."""
 ABSENT = 1e-4
-"""Narrow prior of the terms of `Part.exact`, as a share of the radius of the corner: a tenth of a pixel. They are then
-set to 0. Chosen by hand."""
+"""Narrow prior of the terms of `Part.exact`, which become 0, as a share of the corner's radius. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +68,7 @@ class Part:
     """Whether an undetermined part keeps its value; otherwise it moves to its usual value. Mapping starts from a
     calibrated center and aspect, but estimates distortion without a prior."""
     powers: tuple[int, ...] = ()
-    """Powers of the radius in the terms. Deviations then state a share of the radius at the corner of the photo;
-    without powers, those of the parameters."""
+    """Powers of the radius in the terms, whose deviations are then shares of the radius at the corner of the photo."""
     needs: tuple[str, ...] = ()
     """Parts that are freed before this one."""
     exact: bool = False
@@ -88,8 +86,7 @@ PERSPECTIVE_PARTS = (
     Part("k3", (K3,), ABSENT, 0.03, 0.1, powers=(6,), needs=("k1", "k2"), exact=True),
     Part("k4 k5 k6", (K4, K5, K6), ABSENT, 0.05, 0.05, powers=(2, 4, 6), needs=("k1", "k2", "k3"), exact=True),
 )
-"""The priors of center, aspect and k1 are those of `selfcal.priors`; the others: docs/algorithms.md, Bundle adjustment.
-Chosen by hand."""
+"""Center, aspect and k1 as in `selfcal.priors`; others: docs/algorithms.md, Bundle adjustment. Chosen by hand."""
 FISHEYE_PARTS = (
     _CENTER,
     _ASPECT,
@@ -160,11 +157,7 @@ class LensPriors:
     def from_cameras(
         cls, params: FloatArray, family: IndexArray, sizes: FloatArray, estimated: BoolArray
     ) -> "LensPriors":
-        """Return the priors before any evidence.
-
-        Args:
-            params: (C, 12) cameras as in `Bundle`.
-        """
+        """Return the priors of cameras (C, 12), as in `Bundle`, before any evidence."""
         reach = np.hypot(*sizes.T) / (2.0 * np.sqrt(params[:, FX] * params[:, FY]))
         reach = np.where(family == FISHEYE, np.minimum(reach, SEEN_ANGLE), reach)
         choices = []
@@ -181,11 +174,7 @@ class LensPriors:
         return np.asarray(self.sizes.max(axis=1), np.float64)
 
     def drop_lens(self, camera: int, free: BoolArray) -> "LensPriors":
-        """Return the priors without the choices for a camera that have the radial terms of one choice.
-
-        Args:
-            free: (7,) the barred choice.
-        """
+        """Return the priors without the choices for a camera that have the radial terms of a barred one (7,)."""
         radial = [k for k, part in enumerate(PARTS[int(self.family[camera])]) if part.name.startswith("k")]
         differs = np.any(self.choices[camera][:, radial] != free[radial], axis=1)
         choices = list(self.choices)
@@ -258,11 +247,7 @@ def consistent_choices(family: int) -> BoolArray:
 
 
 def step_cameras(params: FloatArray, step: FloatArray) -> FloatArray:
-    """Return cameras (C, 12) after a step.
-
-    Args:
-        step: (C, 12), with log sqrt(fx fy) and log fy/fx in place of fx and fy.
-    """
+    """Return cameras (C, 12) after a step (C, 12), with log sqrt(fx fy) and log fy/fx in place of fx and fy."""
     result = params + step
     result[:, FX] = params[:, FX] * np.exp(step[:, LOG_FOCAL] - 0.5 * step[:, LOG_ASPECT])
     result[:, FY] = params[:, FY] * np.exp(step[:, LOG_FOCAL] + 0.5 * step[:, LOG_ASPECT])
@@ -323,13 +308,9 @@ def params_of_calibration(camera: Calibration) -> FloatArray:
 def calibration_from_params(
     params: FloatArray, family: int, size: tuple[int, int], deviations: FloatArray, determined: tuple[str, ...]
 ) -> Calibration:
-    """Return parameters of `Bundle` as a calibration by bundle adjustment.
+    """Return parameters (12,) of `Bundle`, with deviations (12,), as a calibration by bundle adjustment.
 
-    Args:
-        params: (12,) of a perspective camera or a fisheye.
-        size: (width, height) in pixels.
-        deviations: (12,) standard deviations.
-        determined: names of the parts that the photos determine.
+    The camera is no panorama; `determined` names the parts that the photos determine.
     """
     K = camera_matrix(*(float(params[k]) for k in (FX, FY, CX, CY)))
     spread = {name: float(deviations[k]) for name, k in (("fx", FX), ("fy", FY), ("cx", CX), ("cy", CY), ("k1", K1))}
@@ -351,11 +332,6 @@ def fit_to_model(params: FloatArray, parts: BoolArray, family: int) -> FloatArra
 
 
 def choices_of_model(parts: BoolArray, choices: BoolArray) -> BoolArray:
-    """Return the choices (K, 7) that make exactly a model, with and without a free center.
-
-    Args:
-        parts: (7,) of the model, besides its center.
-        choices: (M, 7) all consistent choices.
-    """
+    """Return those of all consistent choices (M, 7) that have exactly these parts (7,) besides the center."""
     center = np.array([part.name == "center" for part in PARTS[PERSPECTIVE]], np.bool_)
     return choices[np.all(choices[:, ~center] == parts[~center], axis=1)]

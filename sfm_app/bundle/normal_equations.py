@@ -6,19 +6,19 @@ photos that share a point.
 """
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.spatial.transform import Rotation
 
 from sfm_app.camera.projection import CAMERA, PANORAMA, image_points, project_points, wrap_residuals
 from sfm_app.geometry.least_squares import project_to_psd, solve_positive, solve_sparse_positive
 from sfm_app.jit import kernel
 from sfm_app.types.arrays import FloatArray, IndexArray
-
-if TYPE_CHECKING:
-    from scipy import sparse
-
 
 POSE = 6
 """Number of parameters of a pose. By definition."""
@@ -36,8 +36,7 @@ class ReductionOptions:
     usual_noise_px: float = 0.25
     """Prior noise of a keypoint coordinate: the usual noise of SIFT. Chosen by hand."""
     usual_count: float = 4.0
-    """Weight of the prior noise as a number of measurements. It matters where there are hardly more observations than
-    unknowns. Chosen by hand."""
+    """Weight of the prior noise as a number of measurements; it matters with few observations. Chosen by hand."""
     lost_px: float = 1e4
     """Residual above which an observation is lost, i.e. not used; a lost observation costs as much. Chosen by hand."""
     max_derivative: float = 1e60
@@ -50,12 +49,7 @@ REDUCTION = ReductionOptions()
 def whiten_points(by_point: FloatArray, point: NDArray[np.int64], points: int) -> tuple[FloatArray, NDArray[np.int64]]:
     """Return W (P, 3, 3) that makes derivatives by W^-T X orthonormal over the observations of a point, and its rank.
 
-    Along undetermined directions, W is 0.
-
-    Args:
-        by_point: (N, 2, 3) weighted derivatives of the observations by their points.
-        point: (N,) row of the point of each observation.
-        points: P.
+    Along undetermined directions, W is 0. The derivatives (N, 2, 3) are weighted; `point` has their rows (N,).
     """
     H = np.zeros((points, 3, 3))
     products = np.einsum("nki,nkj->nij", by_point, by_point)
@@ -81,11 +75,7 @@ def whiten_points(by_point: FloatArray, point: NDArray[np.int64], points: int) -
 
 
 def free_pose_columns(R: FloatArray, t: FloatArray) -> NDArray[np.int64]:
-    """Return the free pose columns when the gauge is fixed: the first photo, and one coordinate of the farthest one.
-
-    Args:
-        R, t: (I, 3, 3) and (I, 3) camera from world.
-    """
+    """Return the free pose columns when the gauge is fixed: the first photo, and one coordinate of the farthest one."""
     centers = -np.einsum("nji,nj->ni", R, t)
     far = int(np.argmax(np.linalg.norm(centers - centers[0], axis=1)))
     relative = R[far] @ (centers[0] - centers[far])
@@ -99,14 +89,7 @@ def elimination_width(photo: NDArray[np.int64], point: NDArray[np.int64]) -> flo
     Photos that share a point are tied. In a street few are, wherever it leads; in a room all are. A factorization costs
     the square of this width for each photo, and the steps of conjugate gradients grow with the length of a street. The
     order is that of Cuthill and McKee: no elimination in it fills more, and orders by nested dissection fill less.
-
-    Args:
-        photo: (N,) row of the photo of each observation.
-        point: (N,) row of the point.
     """
-    from scipy.sparse import coo_array, csr_array
-    from scipy.sparse.csgraph import reverse_cuthill_mckee
-
     if not len(photo):
         return 0.0
     shape = int(point.max()) + 1, int(photo.max()) + 1
@@ -126,11 +109,9 @@ class Linearized:
     """Weighted derivatives of all observations; the derivatives by a point are orthonormal over its observations."""
 
     photo: IndexArray
-    """(N,) row of the photo of each observation."""
     camera: IndexArray
-    """(N,) row of its camera."""
     point: IndexArray
-    """(N,) row of its point."""
+    """(N,) rows of the photo, the camera and the point of each observation."""
     by_view: FloatArray
     """(N, 2, 18) derivatives by pose and camera."""
     by_point: FloatArray
@@ -169,9 +150,7 @@ class Linearized:
     def score(self, response: FloatArray, residue: FloatArray) -> FloatArray:
         """Return the scores (I, 12C) of the cameras' parameters, with poses and points eliminated.
 
-        Args:
-            response: (6I, 12C) decrease of the best change of the poses per change of the cameras.
-            residue: (N, 2) residuals after poses and points.
+        The response is as `ReducedSystem.pose_response`; the residuals (N, 2) are those after poses and points.
         """
         scores = np.zeros((response.shape[1], self.counts[0]))
         observed = self.photo, self.camera, self.point, self.by_view, self.by_point
@@ -179,10 +158,8 @@ class Linearized:
         return scores.T
 
 
-def eliminate_points(observed: Linearized, damping: float) -> "tuple[sparse.csr_array, FloatArray]":
+def eliminate_points(observed: Linearized, damping: float) -> tuple[sparse.csr_array, FloatArray]:
     """Return the matrix (6I, 6I) of the poses, and the rows (12C, 6I + 12C) of the cameras, after the points."""
-    from scipy import sparse
-
     photos, cameras, points = observed.counts
     A = np.einsum("nki,nkj->nij", observed.by_point, observed.by_view)
     order = np.lexsort((observed.photo, observed.point))
@@ -213,10 +190,8 @@ def eliminate_points(observed: Linearized, damping: float) -> "tuple[sparse.csr_
     return S, rows
 
 
-def _pairs_of_photos(observed: Linearized) -> "sparse.csr_array":
+def _pairs_of_photos(observed: Linearized) -> sparse.csr_array:
     """Return a matrix (I, I) with an entry for each photo and each pair that shares a point, columns ascending."""
-    from scipy import sparse
-
     photos, _, points = observed.counts
     ones = np.ones(len(observed.photo), np.int32)
     visible = sparse.csr_array((ones, (observed.photo, observed.point)), shape=(photos, points))
@@ -236,8 +211,7 @@ def couple_poses(observed: Any, order: Any, pattern: Any, damping: float, blocks
 
     Args:
         observed: observations in the order of points, then photos: (N,) photo, (N,) point, (N, 2, 6) derivatives by
-        pose,
-            and their products (N, 3, 6) with the derivatives by point.
+        pose, and their products (N, 3, 6) with the derivatives by point.
         order: these observations by photo; starts of the photos in this order, and of the points in that above.
         pattern: first block of each photo, and the other photo of each block, ascending.
         blocks: (B, 6, 6), zeros at first.
@@ -313,7 +287,7 @@ def couple_cameras(observed: Any, groups: Any, poses: int, damping: float, rows:
 
 
 @kernel
-def eliminate_from_cameras(
+def eliminate_from_cameras(  # noqa: PLR0913 -- a kernel
     photo: IndexArray, point: IndexArray, A: FloatArray, camera_of: IndexArray, starts: IndexArray, sums: FloatArray,
     poses: int, rows: FloatArray,
 ) -> None:  # fmt: skip
@@ -376,15 +350,13 @@ class Bundle:
     camera: NDArray[np.int64]
     """(I,) row of the camera of each photo."""
     R: FloatArray
-    """(I, 3, 3) rotations, camera from world."""
     t: FloatArray
-    """(I, 3) translations, camera from world."""
+    """(I, 3, 3) rotations and (I, 3) translations, camera from world."""
     X: FloatArray
     """(P, 3) points."""
     photo: NDArray[np.int64]
-    """(N,) row of the photo of each observation."""
     point: NDArray[np.int64]
-    """(N,) row of the point of each observation."""
+    """(N,) rows of the photo and the point of each observation."""
     x: FloatArray
     """(N, 2) observed positions, in pixels."""
     family: NDArray[np.int64]
@@ -417,8 +389,7 @@ class ReducedSystem:
     scores: FloatArray
     """(I, 12C) contributions of each photo to g, with poses and points eliminated; they add up to g."""
     open_points: int
-    """Number of undetermined points: at infinity, or seen from one position only. They do not move along undetermined
-    directions."""
+    """Number of undetermined points: at infinity, or seen from one position only."""
 
     def back_substitute(self, cameras: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the best changes of poses (I, 6) and points (P, 3) for a given change of the cameras (C, 12)."""
@@ -457,14 +428,14 @@ def residuals(bundle: Bundle, predicted: FloatArray) -> FloatArray:
 def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
     """Eliminate points, then poses (Schur complement), in the Gauss-Newton approximation.
 
-    The covariance of the cameras is noise^2 H^-1. It is accurate where poses and points minimize the cost.
-
-    Args:
-        scale_px: s of the loss s^2 (sqrt(1 + |r|^2 / s^2) - 1), which is COLMAP's SOFT_L1.
+    The covariance of the cameras is noise^2 H^-1. It is accurate where poses and points minimize the cost. The loss is
+    COLMAP's SOFT_L1, s^2 (sqrt(1 + |r|^2 / s^2) - 1), with s = `scale_px`.
     """
-    from scipy import sparse
-
-    r, by_view, by_point, used = _linearize(bundle, scale_px)
+    with np.errstate(all="ignore"):
+        predicted, by_camera, by_pose, by_point = project(bundle)
+        r, by_view = residuals(bundle, predicted), np.concatenate([by_pose, by_camera], 2)
+    # points behind their camera, or in its principal plane, would distort everything near them
+    r, by_view, by_point, used = weigh(r, by_view, by_point, usable_mask(bundle, r), scale_px)
     whiten, rank = whiten_points(by_point, bundle.point, len(bundle.X))
     by_point = np.einsum("nki,nji->nkj", by_point, whiten[bundle.point])
     counts = len(bundle.R), len(bundle.params), len(bundle.X)
@@ -509,15 +480,10 @@ def _unwhiten(whiten: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def apply_step(bundle: Bundle, params: FloatArray, poses: FloatArray, points: FloatArray) -> Bundle:
-    """Return the bundle with new cameras, and with changed poses and points.
+    """Return the bundle with new cameras (C, 12), changed poses (I, 6), and points shifted by (P, 3).
 
-    Args:
-        params: (C, 12) the new cameras.
-        poses: (I, 6) changes: a rotation vector in the camera's axes, and a shift of t.
-        points: (P, 3) shifts.
+    The change of a pose is a rotation vector in the camera's axes, and a shift of t.
     """
-    from scipy.spatial.transform import Rotation
-
     R = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ bundle.R
     return replace(bundle, params=params, R=R, t=bundle.t + poses[:, 3:], X=bundle.X + points)
 
@@ -545,9 +511,7 @@ def cost(bundle: Bundle, scale_px: float) -> float:
 
 
 def loss(r: FloatArray, usable: NDArray[np.bool_], scale_px: float) -> float:
-    """Return half the sum of the loss of `reduce` over residuals (N, 2), in squared pixels; `lost_px` counts for lost
-    ones.
-    """
+    """Return half the sum of the loss of `reduce` over residuals (N, 2) in px^2; lost ones count `lost_px`."""
     with np.errstate(all="ignore"):
         squares = np.where(usable, np.einsum("ni,ni->n", r, r), REDUCTION.lost_px**2)
     return float(scale_px**2 * np.sum(np.sqrt(1.0 + squares / scale_px**2) - 1.0))
@@ -556,11 +520,7 @@ def loss(r: FloatArray, usable: NDArray[np.bool_], scale_px: float) -> float:
 def usable_mask(bundle: Bundle, r: FloatArray, depth: FloatArray | None = None) -> NDArray[np.bool_]:
     """Return the mask (N,) of observations of points in front of their camera, with residuals below `lost_px`.
 
-    A panorama also sees points behind it.
-
-    Args:
-        r: (N, 2) residuals in pixels.
-        depth: (N,) of the points before their cameras; from the poses if None.
+    A panorama also sees points behind it. Without depths (N,) before the cameras, they come from the poses.
     """
     with np.errstate(all="ignore"):
         if depth is None:
@@ -576,27 +536,10 @@ def lost_points(bundle: Bundle) -> NDArray[np.bool_]:
     return np.bincount(bundle.point[~usable_mask(bundle, r)], minlength=len(bundle.X)) > 0
 
 
-def _linearize(bundle: Bundle, scale_px: float) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Return weighted residuals (N, 2), derivatives by view (N, 2, 18) and point (N, 2, 3), and the mask (N,) of used
-    ones.
-
-    The others are 0: points behind their camera, or in its principal plane, would distort everything near them.
-    """
-    with np.errstate(all="ignore"):
-        predicted, by_camera, by_pose, by_point = project(bundle)
-        r, by_view = residuals(bundle, predicted), np.concatenate([by_pose, by_camera], 2)
-    return weigh(r, by_view, by_point, usable_mask(bundle, r), scale_px)
-
-
 def weigh(
     r: FloatArray, by_view: FloatArray, by_point: FloatArray, usable: NDArray[np.bool_], scale_px: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Return weighted residuals, weighted derivatives, and the mask (N,) of used ones; the others are 0.
-
-    Args:
-        r: (N, 2) residuals in pixels.
-        by_view, by_point: (N, 2, k) and (N, 2, 3) derivatives of the projections.
-    """
+    """Return weighted residuals (N, 2), derivatives (N, 2, k) and (N, 2, 3), and the mask (N,) of used ones, else 0."""
     with np.errstate(all="ignore"):
         largest = np.maximum(np.abs(by_view).max(axis=(1, 2), initial=0.0), np.abs(by_point).max(axis=(1, 2)))
         used = usable & (largest < REDUCTION.max_derivative)

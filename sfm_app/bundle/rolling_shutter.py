@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from sfm_app.bundle.lens_evidence import MISFIT
 from sfm_app.bundle.lens_parts import LOG_ASPECT, LOG_FOCAL, LensPriors, step_cameras
@@ -32,7 +33,6 @@ from sfm_app.types.arrays import FloatArray, IndexArray
 
 # Projection of points into photos whose rows are read one after the other. Ours; to first order in the motion of
 # the camera, the model is that of Hedborg et al. 2012.
-#
 # While a photo is read, its camera keeps its velocity. A row is given by its share: from -1/2, the first row, to 1/2,
 # the last row. The pose of a photo is that of its middle row.
 
@@ -45,25 +45,17 @@ class RowProjection(NamedTuple):
     depth: FloatArray
     """(N,) of the points before the camera, at the moment of their row."""
     by_camera: FloatArray
-    """(N, 2, 12)"""
     by_pose: FloatArray
-    """(N, 2, 6) as of `normal_equations.project`."""
     by_motion: FloatArray
-    """(N, 2, 6)"""
     by_point: FloatArray
-    """(N, 2, 3)"""
+    """(N, 2, k) derivatives by camera (12), pose (6) as of `normal_equations.project`, motion (6) and point (3)."""
 
 
 def project_rows(bundle: Bundle, share: FloatArray, motion: FloatArray) -> RowProjection:
-    """Project the points of all observations, each from the pose at the time of its row.
+    """Project the points of all observations, each from the pose at the time of its row (N,).
 
-    Args:
-        bundle: with the poses of the middle rows.
-        share: (N,) row of each observation.
-        motion: (I, 6) velocity of each photo as in `PathVelocities`, times the readout.
+    `motion` (I, 6) is the velocity of each photo, as in `PathVelocities`, times the readout; poses are of middle rows.
     """
-    from scipy.spatial.transform import Rotation
-
     rows, R = bundle.camera[bundle.photo], bundle.R[bundle.photo]
     points = np.einsum("nij,nj->ni", R, bundle.X[bundle.point])
     middle, moves = points + bundle.t[bundle.photo], share[:, None] * motion[bundle.photo]
@@ -78,28 +70,18 @@ def project_rows(bundle: Bundle, share: FloatArray, motion: FloatArray) -> RowPr
 
 
 def move_to_middle_row(points: FloatArray, share: FloatArray, motion: FloatArray) -> FloatArray:
-    """Return points (N, 3) of a camera's frame at the time of its middle row.
-
-    Args:
-        points: (N, 3) in the camera's frame at the time of their own rows.
-        share: (N,) these rows.
-        motion: (6,) of the photo, as in `project_rows`.
-    """
-    from scipy.spatial.transform import Rotation
-
+    """Return points (N, 3) of a camera's frame at the times of their rows (N,) as they are at its middle row."""
     moved = share[:, None] * motion
     return np.asarray(Rotation.from_rotvec(moved[:, :3]).inv().apply(points) - moved[:, 3:], np.float64)
 
 
 # How a camera moves at the moment of each photo, from the poses of the photos before and after it. Ours.
-#
 # Polynomials are fitted to the poses of some consecutive photos, and differentiated (Savitzky and Golay 1964, with
 # uneven steps). Cross-validation chooses the degree and the number of photos: where photos follow each other faster
 # than a hand shakes, the path goes through all poses, else through their middle.
 
 FITS = ((5, 3), (3, 1), (7, 3), (9, 3), (5, 1), (7, 1), (9, 1))
-"""Photos in a window and degree of the polynomial. Even degrees give the slopes of the odd ones below them. Chosen by
-hand."""
+"""Photos in a window and degree of the polynomial; even degrees give the slopes of odd ones. Chosen by hand."""
 VELOCITY = 6
 """Numbers of a velocity: a rotation vector, and the motion of a point at rest. By definition."""
 
@@ -131,12 +113,7 @@ class PathVelocities:
 
 
 def path_velocities(R: FloatArray, t: FloatArray, times: FloatArray) -> PathVelocities:
-    """Return velocities of photos.
-
-    Args:
-        R, t: (I, 3, 3) and (I, 3) camera from world, I >= 9.
-        times: (I,) of the photos, distinct.
-    """
+    """Return velocities of photos, nine or more, at distinct times; poses are camera from world."""
     order = np.argsort(times)
     back = np.argsort(order)
     fits = [_fit_windows(R[order], t[order], times[order], *fit) for fit in FITS]
@@ -148,8 +125,6 @@ def _fit_windows(
     R: FloatArray, t: FloatArray, times: FloatArray, count: int, degree: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return velocities (I, 6) of photos sorted by time, and the errors (I, 6) of left-out poses."""
-    from scipy.spatial.transform import Rotation
-
     places = np.arange(len(times))
     first = np.clip(places - count // 2, 0, len(times) - count)
     window = first[:, None] + np.arange(count)
@@ -165,12 +140,7 @@ def _fit_windows(
 
 
 def local_fit_weights(offsets: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
-    """Return weights (I, k) that give the value and the derivative at 0 of a polynomial fit.
-
-    Args:
-        offsets: (I, k) distinct times of the fitted values.
-        degree: below k.
-    """
+    """Return weights (I, k) of the value and the derivative at 0 of a polynomial fit to k distinct times."""
     unit = np.abs(offsets).max(axis=1)
     powers = (offsets / unit[:, None])[:, :, None] ** np.arange(degree + 1)
     solution = np.linalg.pinv(powers)
@@ -178,7 +148,6 @@ def local_fit_weights(offsets: FloatArray, degree: int) -> tuple[FloatArray, Flo
 
 
 # Normal equations of a bundle behind a rolling shutter: poses, motions, cameras and the readout, points eliminated.
-#
 # Unlike in `normal_equations`, a dense matrix is filled point by point: with the motions there are twice as many
 # unknowns to a photo, for which sparse products take ten times as long.
 
@@ -197,12 +166,6 @@ class ShutterBundle:
     """(I, 6) of the path, as in `PathVelocities`."""
     offsets: FloatArray
     """(I, 6) motion during the readout beyond that of the path."""
-
-    @classmethod
-    def motionless(cls, bundle: Bundle, share: FloatArray, readout: float) -> "ShutterBundle":
-        """Return a bundle whose photos do not move."""
-        still = np.zeros((len(bundle.R), VELOCITY))
-        return cls(bundle, share, readout, still, still)
 
     @property
     def motion(self) -> FloatArray:
@@ -234,7 +197,6 @@ class ShutterSystem:
     photo: IndexArray
     point: IndexArray
     free: IndexArray
-    """Unknowns that change."""
     offsets: slice
     """Which unknowns are offsets."""
     redundancy: int
@@ -250,7 +212,6 @@ class ShutterStep:
     points: FloatArray
     """(P, 3)"""
     noise_px: float
-    """Standard deviation of a coordinate."""
     deviation: float
     """Standard deviation of the readout."""
     offset_variances: FloatArray
@@ -262,10 +223,8 @@ def linearize(
 ) -> ShutterSystem:
     """Eliminate the points (Schur complement), in the Gauss-Newton approximation.
 
-    Args:
-        precision: (n,) of the priors on the unknowns, in 1 / px^2 like the squared derivatives.
-        pull: (n,) precisions times distances to the prior means.
-        held: whether the readout is known.
+    `precision` (n,) is of the priors on the unknowns, in 1 / px^2; `pull` (n,) is precisions times distances to their
+    means; `held` tells whether the readout is known.
     """
     bundle, n = model.bundle, model.unknowns
     r, by_view, by_point = _weighted_derivatives(model, scale_px)
@@ -425,8 +384,7 @@ class ReadoutOptions:
     halvings: int = 3
     """Most halvings of a step that raises the cost. Chosen by hand."""
     least_readout: float = 1e-5
-    """Least readout for the expected size of offsets, as a share of the time between two photos: a precision of offsets
-    must be finite. Chosen by hand."""
+    """Least readout for the size of offsets, which is not 0, as a share of the time between photos. Chosen by hand."""
     shake: tuple[float, float] = (0.2, 5.0)
     """Range of the size of offsets, in deviations of the path's velocities times readout. Above it, offsets of all
     photos together bend the scene, and no readout is found (`python -m benchmarks.videos.shutter`)."""
@@ -464,7 +422,6 @@ class ReadoutEstimate:
     shake: FloatArray
     """(2,) size of the offsets of turns and moves, in deviations of the path's velocities times readout."""
     noise_px: float
-    """Standard deviation of a coordinate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -491,14 +448,15 @@ def estimate_readout(
     Args:
         bundle: adjusted as if a global shutter had taken its photos; nine or more.
         freed: (C, 7) parts of the cameras with the wide prior.
-        scale_px: as of `normal_equations.reduce`.
         start: an earlier estimate for the same photos, whose readout and shake are the start.
         known: the readout, if only poses and points are to be adjusted.
     """
     fits = path_velocities(bundle.R, bundle.t, rows.times).select_most_predictive()
     problem = _Problem(rows, fits, priors, priors.precision(freed), scale_px, known is not None)
     readout, shake = (start.readout, start.shake) if start else (0.0, np.ones(2))
-    model = _follow_path(ShutterBundle.motionless(bundle, rows.share, readout if known is None else known), problem)
+    still = np.zeros((len(bundle.R), VELOCITY))
+    model = ShutterBundle(bundle, rows.share, readout if known is None else known, still, still)
+    model = _follow_path(model, problem)
     noise_px = REDUCTION.usual_noise_px
     for _ in range(OPTIONS.steps):
         expected = _expected_offsets(model, problem, shake)
@@ -516,15 +474,12 @@ def estimate_readout(
 
 
 def _follow_path(model: ShutterBundle, problem: _Problem) -> ShutterBundle:
-    """Return the model with the velocities of its path."""
     path = path_velocities(model.bundle.R, model.bundle.t, problem.rows.times)
     return replace(model, velocity=path.select(problem.fits))
 
 
 def _expected_offsets(model: ShutterBundle, problem: _Problem, shake: FloatArray) -> FloatArray:
-    """Return standard deviations (I, 6) of the offsets; constant during a step, else offsets would enlarge the
-    readout.
-    """
+    """Return standard deviations (I, 6) of the offsets; changing ones would enlarge the readout."""
     times = problem.rows.times
     path = path_velocities(model.bundle.R, model.bundle.t, times)
     readout = max(abs(model.readout), OPTIONS.least_readout * float(np.median(np.diff(np.sort(times)))))
@@ -532,12 +487,7 @@ def _expected_offsets(model: ShutterBundle, problem: _Problem, shake: FloatArray
 
 
 def _update_shake(offsets: FloatArray, variances: FloatArray, shake: FloatArray) -> FloatArray:
-    """Return the size of offsets (2,) from the offsets that the photos determine.
-
-    Args:
-        offsets, variances: (I, 6) in expected deviations, and their squares.
-        shake: (2,) present size.
-    """
+    """Return the size of offsets (2,) from those that the photos determine; (I, 6) are in expected deviations."""
     measured = np.sum(1.0 - np.minimum(variances, 1.0).reshape(-1, 2, 3), axis=(0, 2))
     squares = np.sum(offsets.reshape(-1, 2, 3) ** 2, axis=(0, 2))
     factor = np.sqrt(squares / np.maximum(measured, OPTIONS.least_measured))

@@ -13,7 +13,6 @@ from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, Calibration
 
 # Undistortion of lenses with all terms.
-#
 # A point w of the plane before distortion, in focal lengths, is x / z of a perspective lens; of a fisheye it has
 # the length theta. It becomes w times a radial factor of |w|, plus tangential terms (Brown 1971) and those of a
 # thin prism (Weng et al. 1992).
@@ -26,15 +25,13 @@ class UndistortionOptions:
     radius_steps: int = 30
     """Most steps of Newton's method for the radius. Chosen by hand."""
     shift_steps: int = 50
-    """Most steps by which the terms that are not radial are taken out. Counted: each step multiplies the error by about
-    twice the radius times p1, 0.01 at most."""
+    """Most steps for the terms that are not radial. Counted: each multiplies the error by 0.01 at most."""
     precision: float = 1e-13
     """Change in focal lengths below which steps end. Chosen by hand."""
     least_slope: float = 0.05
     """Least slope of the distorted radius: below it, the lens is near its fold. Chosen by hand."""
     largest_radius: float = 12.0
-    """Radius in focal lengths up to which a fold is sought: 85 degrees of a perspective lens, more than any fisheye.
-    Chosen by hand."""
+    """Radius in focal lengths up to which a fold is sought: 85 degrees of a perspective lens. Chosen by hand."""
     radii: int = 2048
     """Number of radii at which a fold is sought. Chosen by hand."""
     angle_steps: int = 20
@@ -47,13 +44,7 @@ OPTIONS = UndistortionOptions()
 
 
 def radial_factor(r: FloatArray, terms: FloatArray, projection: str) -> FloatArray:
-    """Return (N,) ratios of the distorted to the undistorted radius.
-
-    Args:
-        r: (N,) undistorted radius in focal lengths; for a fisheye the angle to the axis.
-        terms: (8,) as in `Calibration.distortion`.
-        projection: "perspective" or "fisheye".
-    """
+    """Return (N,) ratios of the distorted to the undistorted radius in focal lengths; of a fisheye, to the angle."""
     k1, k2, _, _, k3, k4, k5, k6 = terms
     s = r * r
     if projection == FISHEYE:
@@ -71,9 +62,7 @@ def fold_radius(terms: FloatArray, projection: str) -> float:
 
 
 def undistort(points: FloatArray, terms: FloatArray, projection: str) -> FloatArray:
-    """Return points (N, 2) before distortion, in focal lengths from the optical center; those beyond the fold lie on
-    it.
-    """
+    """Return points (N, 2) before distortion, in focal lengths from the center; those beyond the fold lie on it."""
     fold = fold_radius(terms, projection)
     w = _undistort_radius(points, terms, projection, fold)
     if not _shift(w, terms, projection).any():
@@ -248,12 +237,10 @@ def _slope(theta: FloatArray, terms: tuple[float, ...]) -> FloatArray:
 
 
 # The curve of a lens: the radius in the photo over the angle to the optical axis, and the field of view.
-#
 # The curve counts from the optical center, with the geometric mean of both focals and radial terms only.
 
 SHARES = (0.25, 0.5, 0.75, 1.0)
-"""Shares of the corner's angle at which the evidence of a wide lens has the deviation of the radius, which is smooth.
-Chosen by hand."""
+"""Shares of the corner's angle with the deviation of the radius, in the evidence of a wide lens. Chosen by hand."""
 
 
 def radius_px(theta: FloatArray, camera: Calibration) -> FloatArray:

@@ -22,22 +22,13 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.floa
 
 
 def guessed_camera_matrix(size: tuple[int, int], focal_px: float | None = None) -> NDArray[np.float64]:
-    """Return the (3, 3) matrix of a camera with square pixels, a centered principal point and a given or guessed focal.
-
-    Args:
-        size: (width, height) in pixels.
-        focal_px: guessed if None.
-    """
+    """Return the (3, 3) matrix of a camera with square pixels, a central principal point, and a focal or a guess."""
     focal = GUESSED_FOCAL * max(size) if focal_px is None else focal_px
     return camera_matrix(focal, focal, size[0] / 2, size[1] / 2)
 
 
 def panorama_matrix(size: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the (3, 3) matrix with the scale of an equirectangular photo at its center, in pixels per radian.
-
-    Args:
-        size: (width, height) in pixels, 360 and 180 degrees.
-    """
+    """Return the (3, 3) matrix with the scale of an equirectangular photo at its center, in pixels per radian."""
     return camera_matrix(size[0] / (2.0 * np.pi), size[1] / np.pi, size[0] / 2, size[1] / 2)
 
 
@@ -46,10 +37,6 @@ def rays(x: NDArray[np.float64], K: NDArray[np.float64], radial: float = 0.0) ->
 
     Uses Newton's method from the distorted radius. A barrel lens folds where r (1 + radial r^2) stops growing with r;
     pixels beyond the fold are mapped to it.
-
-    Args:
-        K: (3, 3) camera matrix without skew.
-        radial: k1 of COLMAP's SIMPLE_RADIAL.
     """
     distorted = (x - K[:2, 2]) / np.diag(K)[:2]
     if radial == 0.0:
@@ -95,9 +82,7 @@ def projection_of_model(model: str) -> str:
 def calibration_from_model(model: str, params: Sequence[float], size: tuple[int, int]) -> Calibration:
     """Return the camera with a model and parameters of COLMAP, as given by the user.
 
-    Args:
-        params: in COLMAP's order; lengths in pixels.
-        size: (width, height) of the photos in pixels; 0, 0 where unknown.
+    Lengths are in pixels; the size of the photos is (0, 0) where unknown.
 
     Raises:
         ValueError: the model is not supported, or the parameters are no camera.

@@ -19,14 +19,11 @@ class ViewOptions:
     """Sizes of perspective views."""
 
     most_field_deg: float = 95.0
-    """Largest angle along one side of a view, without its overlap. At its border, such a view shows things 2.2 times as
-    large as at its center. Chosen by hand."""
+    """Largest side of a view without its overlap; its border shows things 2.2 times as large. Chosen by hand."""
     overlap_deg: float = 4.0
-    """Angle by which a view reaches beyond its own part of the photo, so that windows and triangles at the border are
-    whole in one of the views. Chosen by hand."""
+    """Angle beyond the view's own part: windows and triangles at the border are whole in one view. Chosen by hand."""
     cube_field_deg: float = 300.0
-    """Horizontal field above which a photo is a panorama, with views through the faces of a cube. No lens lies between
-    a fisheye and a panorama. Chosen by hand."""
+    """Horizontal field above which a photo is a panorama, with views through the faces of a cube. Chosen by hand."""
 
 
 OPTIONS = ViewOptions()
@@ -44,11 +41,7 @@ class PerspectiveView:
     height: int
 
     def locate(self, project: Callable[[FloatArray], FloatArray]) -> NDArray[np.float32]:
-        """Return the pixels (height, width, 2) of the photo that the view shows.
-
-        Args:
-            project: takes rays (N, 3) of the photo's frame and returns their pixels (N, 2).
-        """
+        """Return the pixels (height, width, 2) of the photo that the view shows; `project` takes rays (N, 3)."""
         pixels = np.empty((self.height, self.width, 2), np.float32)
         strip = 256  # rows that are projected at once, so that memory stays small
         for top in range(0, self.height, strip):
@@ -65,11 +58,9 @@ class PerspectiveView:
 
 
 def cover_rays(rays: FloatArray, focal_px: float, most_px: int) -> list[PerspectiveView]:
-    """Return perspective views that together show all rays of a photo, with sides of at most `most_px`.
+    """Return perspective views that together show all rays (N, 3) of a photo; rays are dense over its field.
 
-    Args:
-        rays: (N, 3) unit vectors, dense over the field of the photo.
-        focal_px: focal length of the views in pixels; smaller where a view would become too large.
+    Sides have at most `most_px`; the focal length is smaller where a view would become too large.
     """
     axes = _axes(rays)
     nearest = np.argmax(rays @ axes[:, 2].T, axis=1)

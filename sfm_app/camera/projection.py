@@ -38,12 +38,7 @@ class Projected(NamedTuple):
 
 
 def project_points(points: FloatArray, params: FloatArray, family: IndexArray) -> Projected:
-    """Project points (N, 3) of the cameras' frames; infinite, NaN or meaningless where a camera cannot see them.
-
-    Args:
-        params: (N, 12) camera of each point.
-        family: (N,) of this camera.
-    """
+    """Project points (N, 3), each in the frame of its camera (N, 12); meaningless where the camera cannot see them."""
     kinds = np.unique(family)
     if len(kinds) == 1:
         return _PROJECTIONS[kinds[0]](points, params)
@@ -79,22 +74,13 @@ def wrap_residuals(r: FloatArray, params: FloatArray, family: IndexArray) -> Flo
 
 
 def radius_at(angle: FloatArray, params: FloatArray, family: int) -> FloatArray:
-    """Return the radius (N,), in focal lengths, of rays at angles (N,) to the optical axis, without tangential terms.
-
-    Args:
-        angle: radians, >= 0; below a right angle for a perspective camera.
-        params: (12,) of a perspective camera or fisheye.
-    """
+    """Return radii (N,) in focal lengths of rays at angles (N,) >= 0 to the optical axis, without tangential terms."""
     r = np.tan(angle) if family == PERSPECTIVE else angle
     return np.asarray(r * _radial_factor(r * r, np.asarray(params)[None], family)[0], np.float64)
 
 
 def angle_limit(params: FloatArray, family: int, reach: float) -> float:
-    """Return the angle at which the radius of a lens reaches the corner of the photo; NaN if it folds before that.
-
-    Args:
-        reach: radius of the corner in focal lengths.
-    """
+    """Return the angle at which the radius reaches `reach` focal lengths; NaN if the lens folds before that."""
     angle, radius = _sampled_curve(params, family)
     ends = np.flatnonzero(radius >= reach)
     # a fisheye may end inside the photo, at a right angle

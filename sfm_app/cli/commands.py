@@ -77,7 +77,6 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: A
 
 
 def _default_folder(photos: Path) -> Path:
-    """Return the output folder beside the photos, relative to the current folder if it is inside."""
     folder, here = photos.with_name(f"{photos.name}-model"), Path.cwd()
     return folder.relative_to(here) if folder.is_relative_to(here) else folder
 

@@ -116,11 +116,7 @@ def setting_option(flag: SettingFlag) -> Callable[[Command], Command]:
 
 
 def complete_methods(*kinds: str) -> Complete:
-    """Return a shell completion of names of methods, those of plug-ins included.
-
-    Args:
-        kinds: attributes of `plugins.Plugins`.
-    """
+    """Return a shell completion of names of methods, by attributes of `plugins.Plugins`."""
 
     def complete(_ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
         from sfm_app.plugins import load_plugins

@@ -96,7 +96,6 @@ def run_lines(run: Run) -> list[str]:
 
 
 def _input_lines(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the photos, masks and pairs of a run."""
     if "video" in summary:
         yield from _video_lines(summary["video"])
     yield f"photos      {summary['photos']['usable']} usable"
@@ -109,12 +108,7 @@ def _input_lines(summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def outcome_lines(run: Run, seconds: float) -> list[str]:
-    """Return what a user needs of a run up to any stage: result, accuracy, warnings, files.
-
-    Args:
-        run: its manifest may have stages of earlier commands.
-        seconds: duration of this command.
-    """
+    """Return what a user needs of a run up to any stage: result, accuracy, warnings, files."""
     summary = run_summary(run)
     stage_seconds = sum(summary["seconds"].values())
     earlier = f", {duration_text(stage_seconds)} with earlier runs" if stage_seconds > REUSE_RATIO * seconds else ""
@@ -143,7 +137,6 @@ def _headline(run: Run) -> str:
 
 
 def _accuracy_lines(run: Run) -> Iterator[str]:
-    """Yield the reprojection error, the cameras and the unit of the model."""
     if run.scene is not None:
         yield f"accuracy    mean reprojection error {run.scene.mean_reprojection_px:.2g} px"
     yield from _camera_lines(run)
@@ -174,7 +167,6 @@ def _camera_lines(run: Run) -> Iterator[str]:
 
 
 def _missing_lines(run: Run, photos: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the photos that are not in the model, with the reason."""
     unusable = _photo_lines({**photos, "notes": {}})
     unregistered = run.scene.unregistered if run.scene is not None else {}
     texts = [*unusable, *(f"not placed: {name}: {reason}" for name, reason in unregistered.items())]
@@ -195,7 +187,6 @@ def _first_lines(label: str, texts: list[str], noun: str) -> Iterator[str]:
 
 
 def _file_lines(run: Run) -> Iterator[str]:
-    """Yield the files to open."""
     stage = "files" if run.mesh_path is not None else "scale"
     paths = [*([run.report_path] if run.report_path else []), *_model_files(run, stage)]
     for number, line in enumerate(file_lines(paths)):
@@ -203,7 +194,6 @@ def _file_lines(run: Run) -> Iterator[str]:
 
 
 def _video_lines(video: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the number of chosen frames, and the reasons against the others."""
     reasons = ", ".join(f"{count} {reason}" for reason, count in video["left_out"].items())
     others = f"; not chosen: {reasons}" if reasons else ""
     yield f"video       {video['frames']} frames, {video['chosen']} chosen{others}"
@@ -211,7 +201,6 @@ def _video_lines(video: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _photo_lines(photos: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the notes on usable photos, and the unusable photos by reason."""
     by_reason: dict[str, list[str]] = {}
     for name, reason in photos["unusable"].items():
         by_reason.setdefault(reason, []).append(name)
@@ -222,7 +211,6 @@ def _photo_lines(photos: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _mask_lines(masks: Mapping[str, Any], photos: int) -> Iterator[str]:
-    """Yield the number of masks, and the mask files without a usable photo."""
     yield f"masks       {masks['photos']} of {photos} photos"
     if masks["unused"]:
         yield f"{INDENT}unused: {_abbreviate_names(masks['unused'])}"
@@ -233,7 +221,6 @@ def _abbreviate_names(names: Sequence[str]) -> str:
 
 
 def _texture_text(mesh: Mapping[str, Any]) -> str:
-    """Return the size of the texture's pages and their JPEG quality; empty without a texture."""
     pages = " and ".join(f"{width} x {height}" for width, height in mesh.get("pages_px", ()))
     return f", texture {pages} px, JPEG quality {mesh['jpeg_quality']}" if pages else ""
 
@@ -255,13 +242,7 @@ def _model_files(run: Run, stage: str) -> list[Path]:
 
 
 def run_steps(run: Run, photos: Path, out: Path | None, settings: Settings) -> list[str]:
-    """Return the next commands after a run.
-
-    Args:
-        run: up to any stage.
-        photos, out: as on the command line.
-        settings: of the run.
-    """
+    """Return the next commands after a run; `photos` and `out` are as on the command line."""
     again = f"sfm-app run {shlex.quote(str(photos))}" + (f" -o {shlex.quote(str(out))}" if out is not None else "")
     if run.mesh_path is None:
         return _align_steps([(again, "continue to the model")])

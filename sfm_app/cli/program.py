@@ -59,7 +59,6 @@ WELCOME = (
     "",
     "sfm-app --help lists all commands, sfm-app run --help all options.",
 )
-"""Output without a command."""
 
 
 class Program(click.Group):

@@ -25,18 +25,12 @@ MINUTE_S, FAST = 60.0, 10.0
 LABEL_COLUMNS, BAR_COLUMNS, TITLE_COLUMNS = 32, 16, 38
 """Columns of a bar's label, of the bar, and of a stage's title in front of its seconds."""
 INDENT = " " * 6
-"""In front of the lines of a stage."""
 
 
 class Terminal:
     """Progress on stderr: a line per stage and a bar on a terminal, a few more lines elsewhere, nothing when quiet.
 
     On a terminal the bar moves as long as a stage runs. Elsewhere, `check_silence` prints the title of a long stage.
-
-    Args:
-        quiet: print nothing.
-        stream: output; stderr if None.
-        clock: seconds from any start.
     """
 
     def __init__(
@@ -85,12 +79,7 @@ class Terminal:
             self._remove_bar()
 
     def stage(self, name: str, note: str = "") -> None:
-        """Announce a stage; its title is printed once it ends or takes long, and is above the bar until then.
-
-        Args:
-            name: key of `STAGE_TITLES`, or any other title.
-            note: reason to skip or repeat the stage; may be empty.
-        """
+        """Announce a stage; its title is printed once it ends or takes long, and is above the bar until then."""
         with self.lock:
             self._print_title()
             names = list(STAGE_TITLES)

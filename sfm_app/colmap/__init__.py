@@ -1,1 +1,1 @@
-"""The only package that talks to COLMAP."""
+"""The only package that talks to COLMAP; BackendError where COLMAP fails, or cannot read or write a file."""

@@ -167,12 +167,7 @@ def has_running_call() -> bool:
 
 
 def run_interruptible(call: Callable[[pycolmap.CancellationToken], None], poll: Callable[[], None]) -> None:
-    """Run a long COLMAP call in a thread, so that Ctrl-C stops it.
-
-    Args:
-        call: ends early once its token is cancelled.
-        poll: called twice a second, to show progress.
-    """
+    """Run a long COLMAP call in a thread, so that Ctrl-C cancels its token; `poll` is called twice a second."""
     token = pycolmap.CancellationToken()
     with ThreadPoolExecutor(1, thread_name_prefix="colmap") as thread:
         future = thread.submit(call, token)
@@ -214,10 +209,9 @@ def run_with_progress(
 
 def json_options(options: Mapping[object, object]) -> dict[str, Json]:
     """Return COLMAP's options as JSON values; the manifest records all of them."""
-    return {str(key): _json_value(value) for key, value in options.items()}
-
-
-def _json_value(value: object) -> Json:
-    if isinstance(value, dict):
-        return json_options(value)
-    return value if isinstance(value, bool | int | float | str) else str(value)
+    return {
+        str(key): json_options(value)
+        if isinstance(value, dict)
+        else (value if isinstance(value, bool | int | float | str) else str(value))
+        for key, value in options.items()
+    }

@@ -91,9 +91,7 @@ def read_camera(camera: pycolmap.Camera) -> FloatArray:
 
 
 def write_camera(camera: pycolmap.Camera, params: FloatArray, family: int) -> None:
-    """Change a camera in place to the smallest of FILE_MODELS that holds parameters (12,); a panorama stays as it
-    is.
-    """
+    """Change a camera in place to the smallest of FILE_MODELS with these parameters (12,), unless it is a panorama."""
     if family == PANORAMA:
         return
     name = file_model(params, family)
@@ -112,11 +110,7 @@ def file_model(params: FloatArray, family: int) -> str:
 
 
 def read_bundle(model: pycolmap.Reconstruction, rules: Rules = NO_RULES) -> tuple[list[int], Bundle]:
-    """Return the ids of the cameras in use, and the model as arrays.
-
-    Args:
-        rules: of some cameras, by id; those that are kept are fixed.
-    """
+    """Return the ids of the cameras in use, and the model as arrays; cameras that rules keep are fixed."""
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
     ids, points = sorted(photos_per_camera(model)), sorted(model.points3D)
     cameras = [model.cameras[camera_id] for camera_id in ids]
@@ -193,8 +187,7 @@ class AdjustmentOptions:
     settled_step: float = 0.2
     """Step of the cameras, in standard deviations, below which the rounds end. Chosen by hand."""
     min_point_share: float = 0.1
-    """Smallest share of the points after an adjustment; one that drops more has diverged and is rejected. Chosen by
-    hand."""
+    """Smallest share of the points after an adjustment; one that drops more has diverged. Chosen by hand."""
     long_step: float = 1.0
     """Step of the cameras, in standard deviations, above which COLMAP's solver refines poses and points: the linear
     step is then too inaccurate. Chosen by hand."""
@@ -203,8 +196,7 @@ class AdjustmentOptions:
     all see the same, a factorization grows with the cube of the photos; along streets it is five times as fast.
     Measured on photos of a room and of a town."""
     outermost: float = 0.999
-    """Share of the observations within the radius up to which a lens is converted: the rest may be wrong. Chosen by
-    hand."""
+    """Share of the observations within the radius for the conversion of a lens. Chosen by hand."""
     most_compared: int = 250
     """Photos of a camera on which its families are compared, at even steps among all. Chosen by hand."""
     runners_up: int = 3
@@ -224,7 +216,6 @@ class Rounds:
     """Before the last step."""
     lenses: LensEstimate
     noise_px: float
-    """As in `ReducedSystem`."""
     open_points: int
     """Points that their rays did not determine when the rounds began."""
 
@@ -234,9 +225,7 @@ def adjust_in_rounds(
 ) -> Rounds:
     """Refine cameras, poses, points and tracks of a model in place, until they no longer change.
 
-    Args:
-        model: with cameras of FILE_MODELS.
-        graph: of all matches; None to keep the tracks.
+    The cameras are of FILE_MODELS; without a graph of all matches, the tracks stay.
 
     Raises:
         NumericalError: the adjustment diverges.
@@ -261,11 +250,7 @@ def adjust_in_rounds(
 
 
 def solve(model: pycolmap.Reconstruction, refined: Collection[int] = ()) -> None:
-    """Adjust poses and points in place, on one thread: the order of sums over several threads is not fixed.
-
-    Args:
-        refined: ids of the cameras whose focal is adjusted, too.
-    """
+    """Adjust poses, points and the focals of `refined` cameras in place, on one thread: sums over several vary."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
@@ -380,11 +365,7 @@ class Families:
 def best_families(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules = NO_RULES) -> Families:
     """Choose the family of every camera that suggests the other one, by the evidence of its observations.
 
-    Both families are adjusted to the same tracks.
-
-    Args:
-        model: adjusted; not changed.
-        rules: by camera id; a camera with a required family is not tried as another.
+    Both families are adjusted to the same tracks; `model` stays. Rules may require a camera's family.
     """
     rivals = {}
     for row, camera_id in enumerate(rounds.ids):
@@ -423,7 +404,6 @@ def _spread_photos(model: pycolmap.Reconstruction, camera_id: int) -> list[int] 
 
 
 def _with_camera(model: pycolmap.Reconstruction, camera: pycolmap.Camera) -> pycolmap.Reconstruction:
-    """Return a copy of a model with another lens for one camera."""
     copy = pycolmap.Reconstruction(model)
     own = copy.cameras[camera.camera_id]
     own.model, own.params = camera.model, camera.params.tolist()
@@ -449,11 +429,7 @@ def _compare(
 def record_lenses(
     model: pycolmap.Reconstruction, rounds: Rounds, others: Mapping[int, LensChoice]
 ) -> dict[int, LensRecord]:
-    """Return the chosen model of each camera and its rivals, by camera id.
-
-    Args:
-        others: rivals of the other family, from `best_families`.
-    """
+    """Return the chosen model of each camera and its rivals, by camera id; `others` are rivals of the other family."""
     records = {}
     for row, camera_id in enumerate(rounds.ids):
         best, *rest = rounds.lenses.ranking[row]
@@ -503,14 +479,11 @@ def adjust(
 
     In each round, poses and points are eliminated, and the likelihood of the cameras is weighed against their priors.
     The cameras make the resulting step. Poses and points follow linearly; after a long step COLMAP's solver refines
-    them. Then tracks are completed and filtered.
-
-    Args:
-        model: result of mapping; not changed.
-        families_known: whether an earlier adjustment has chosen between fisheye and perspective lenses.
+    them. Then tracks are completed and filtered. The given model is not changed; with `families_known`, an earlier
+    adjustment has chosen between fisheye and perspective lenses.
 
     Raises:
-        NumericalError: the adjustment diverges; the given model is unchanged.
+        NumericalError: the adjustment diverges.
     """
     model = pycolmap.Reconstruction(model)
     for camera in all_cameras(model):
@@ -537,11 +510,7 @@ def adjust(
 def adjust_or_keep(
     model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RULES, *, families_known: bool = False
 ) -> Adjustment:
-    """Adjust a model; where that fails numerically, return the given model with the reason.
-
-    Raises:
-        BackendError: COLMAP failed.
-    """
+    """Adjust a model; where that fails numerically, return the given model with the reason."""
     try:
         with translate_errors("adjusting the bundle"):
             return adjust(model, database, rules, families_known=families_known)
@@ -597,9 +566,6 @@ def apply_rules(model: pycolmap.Reconstruction, rules: Rules) -> None:
     """Give cameras the user's values or model, in place, and adjust poses and points to them.
 
     Mapping may have changed a camera that is kept, and may have used another model.
-
-    Args:
-        model: as mapping left it, with cameras of FILE_MODELS.
     """
     changed = False
     for camera_id, rule in rules.items():

@@ -36,7 +36,6 @@ WIDE_MODELS = {FISHEYE: "OPENCV_FISHEYE", EQUIRECTANGULAR: "EQUIRECTANGULAR"}
 KINDS = {
     "calibrated": "CALIBRATED", "uncalibrated": "UNCALIBRATED", "planar": "PLANAR", "rotation": "PANORAMIC"
 }  # fmt: skip
-"""COLMAP's names for the kinds of relative poses."""
 
 
 @contextlib.contextmanager
@@ -155,12 +154,7 @@ def _put_keypoints(database: pycolmap.Database, photo: int, keypoints: NDArray[n
 
 
 def write_matches(path: Path, pair: PairId, rows: NDArray[np.uint32]) -> None:
-    """Enter the matches of a pair that has none.
-
-    Args:
-        pair: ids, the smaller one first.
-        rows: (M, 2) keypoint indices.
-    """
+    """Enter the matches (M, 2) of a pair that has none; the smaller id comes first."""
     with open_database(path) as database:
         database.write_matches(*pair, np.ascontiguousarray(rows, np.uint32))
 

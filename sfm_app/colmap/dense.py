@@ -80,7 +80,6 @@ def shrink_mask(used: BoolArray) -> BoolArray:
 
 
 def _erode(used: BoolArray, reach: int) -> BoolArray:
-    """Return the mask without pixels within `reach` pixels of an unused one."""
     square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     return np.asarray(cv2.erode(used.view(np.uint8), square)) > 0
 
@@ -88,14 +87,7 @@ def _erode(used: BoolArray, reach: int) -> BoolArray:
 def undistort(
     model_dir: Path, photo_dir: Path, dense_dir: Path, max_side_px: int, workers: int, progress: Progress
 ) -> None:
-    """Write undistorted photos and the matching model into a dense workspace, which is created if it is missing.
-
-    Args:
-        max_side_px: longest side of an undistorted photo; larger photos are scaled down.
-
-    Raises:
-        BackendError: COLMAP cannot read the model or the photos, or cannot write.
-    """
+    """Write undistorted photos and the matching model into a dense workspace; larger photos are scaled down."""
     (dense_dir / "images").mkdir(parents=True, exist_ok=True)
     task: UndistortTask = {
         "do": "undistort",
@@ -148,7 +140,6 @@ def read_color(dense_dir: Path, view: View) -> NDArray[np.uint8]:
 
 
 def _decode(dense_dir: Path, name: str, flags: int) -> NDArray[np.uint8] | None:
-    """Return an undistorted photo; None if the file is no photo."""
     # imdecode, because OpenCV does not open names beyond ASCII on every system
     image = cv2.imdecode(np.fromfile(dense_dir / "images" / name, np.uint8), flags)
     return None if image is None else np.asarray(image, np.uint8)
@@ -295,7 +286,6 @@ def _map_path(dense_dir: Path, folder: str, view: View, kind: Kind = "geometric"
 
 
 def _resize(picture: NDArray[np.uint8], view: View) -> NDArray[np.uint8]:
-    """Return a picture (H, W) at the size of a smaller view, by averaging."""
     return np.asarray(cv2.resize(picture, (view.width, view.height), interpolation=cv2.INTER_AREA), np.uint8)
 
 

@@ -58,14 +58,7 @@ def find_and_match(
 ) -> dict[str, Json]:
     """Find features of photos and match pairs in a worker process; existing features and matches stay.
 
-    Args:
-        pairs: ids of photos; None for every photo with every other.
-
-    Returns:
-        The effective options, for the manifest.
-
-    Raises:
-        BackendError: COLMAP failed.
+    Without pairs, every photo is matched with every other. The result is the effective options, for the manifest.
     """
     with start_worker(TASKS, feature_task(database, settings, names, workers, pairs)) as process:
         options = relay(process, progress)
@@ -91,11 +84,7 @@ def feature_task(
 
 
 def do_feature_task(task: FeatureTask, progress: Progress, report: Callable[..., None]) -> None:
-    """Find features of photos, and match pairs of photos.
-
-    Args:
-        report: called with the effective options, as `extraction` or `matching`.
-    """
+    """Find features of photos, or match pairs; report the effective options as `extraction` or `matching`."""
     database, photo_dir, names = Path(task["database"]), Path(task["photos"]), task["names"]
     options = MatchSettings.model_validate(task["options"])
     masks = Path(task["masks"]) if task["masks"] else None
@@ -158,7 +147,6 @@ def _extract(
 
 
 # Features of photos at their own size, and of enlarged ones where these are few.
-#
 # COLMAP doubles the size of every photo before it looks for features. That takes three quarters of the time, and gives
 # the finest features, which are also the least exact ones. Photos with many features do as well without.
 
@@ -172,11 +160,7 @@ def extract_as_needed(
     enough: int,
     token: pycolmap.CancellationToken,
 ) -> None:
-    """Find SIFT features of photos that have none yet, and enter them; `token` ends the work early. Ours.
-
-    Args:
-        enough: number of features below which a photo is enlarged.
-    """
+    """Enter SIFT features of photos that have none; those with fewer than `enough` are enlarged. Ours."""
     with open_database(database) as before:
         ids = {image.name: image.image_id for image in before.read_all_images()}
         new = [name for name in names if not before.exists_keypoints(ids[name])]
@@ -198,7 +182,6 @@ def _enter_rich(
     enough: int,
     token: pycolmap.CancellationToken,
 ) -> set[str]:
-    """Enter the features of photos that have enough at their own size, and return their names."""
     own = copy.deepcopy(extraction)
     own.sift.first_octave = 0
     with tempfile.TemporaryDirectory(prefix="sfm-app-features-") as folder:
@@ -233,10 +216,7 @@ def extract_panoramas(
 ) -> None:
     """Find SIFT features of panoramas that have none yet. Ours.
 
-    Of too many features, those of the largest scale remain, as in COLMAP.
-
-    Args:
-        extraction: COLMAP's options; the largest size is that of one view.
+    Of too many features, those of the largest scale remain, as in COLMAP, whose largest size is that of one view.
     """
     with open_database(database) as reader:
         images = {image.name: image.image_id for image in reader.read_all_images()}
@@ -297,11 +277,7 @@ def match(
     pairs: Sequence[PairId] | None,
     progress: Progress,
 ) -> dict[str, Json]:
-    """Match pairs of photos, and return the effective options.
-
-    Args:
-        pairs: ids of the photos of each pair; None for every photo with every other.
-    """
+    """Match pairs of photos, None for every photo with every other, and return the effective options."""
     matching = pycolmap.FeatureMatchingOptions()
     matching.skip_geometric_verification = True
     matching.num_threads = workers
@@ -359,7 +335,6 @@ def _match_listed(
     folder: Path,
     progress: Progress,
 ) -> None:
-    """Match pairs of photos by name; the folder gets a list of them."""
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = folder / "pairs.txt"
     pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="ascii", newline="\n")
@@ -430,14 +405,7 @@ class Part:
 
 
 def write_snapshot(database: Path, target: Path, without: Sequence[str]) -> None:
-    """Copy a database that nobody is writing to, atomically, into one that can be read over a network.
-
-    Args:
-        without: tables that stay empty.
-
-    Raises:
-        BackendError: the database cannot be read, or the copy not written.
-    """
+    """Copy a database that nobody writes to, atomically, for reading over a network; tables `without` stay empty."""
     with translate_errors("copying the database"), replace_atomically(target) as beside:
         with contextlib.closing(sqlite3.connect(database)) as source:
             source.execute("VACUUM INTO ?", (str(beside),))
@@ -448,25 +416,14 @@ def write_snapshot(database: Path, target: Path, without: Sequence[str]) -> None
 
 
 def find_in_chunk(inputs: SiftInputs, names: Sequence[str]) -> Part:
-    """Find features of some photos, and leave their rows in a file.
-
-    Raises:
-        BackendError: COLMAP failed.
-    """
+    """Find features of some photos, and leave their rows in a file."""
     with _scratch_copy(inputs) as database:
         in_force = _find_and_match_here(database, inputs.settings, names, (), SilentProgress())
         return Part(_leave_rows(database, FEATURES, inputs.folder), len(names), in_force)
 
 
 def match_chunk(inputs: SiftInputs, pairs: Sequence[PairId], progress: Progress | None = None) -> Part:
-    """Match some pairs, and leave their rows in a file.
-
-    Args:
-        pairs: ids of photos; COLMAP matches the photos of a pair in this order.
-
-    Raises:
-        BackendError: COLMAP failed.
-    """
+    """Match pairs of photos by their ids, in this order, and leave their rows in a file."""
     photos = sorted({photo for pair in pairs for photo in pair})
     with _MATCHING, _scratch_copy(inputs) as database:
         _copy_rows(database, inputs.features, FEATURES, photos)
@@ -475,11 +432,7 @@ def match_chunk(inputs: SiftInputs, pairs: Sequence[PairId], progress: Progress 
 
 
 def match_chunk_apart(inputs: SiftInputs, group: ProcessGroup, progress: Progress, pairs: Sequence[PairId]) -> Part:
-    """Match some pairs in a process of its own, as `match_chunk` does.
-
-    Raises:
-        BackendError: COLMAP failed, or the group has ended.
-    """
+    """Match some pairs in a process of its own, as `match_chunk` does."""
     task: MatchTask = {
         "do": "match_chunk", "snapshot": str(inputs.snapshot), "features": str(inputs.features),
         "photos": str(inputs.settings.photos), "options": inputs.settings.options.model_dump(),
@@ -490,11 +443,7 @@ def match_chunk_apart(inputs: SiftInputs, group: ProcessGroup, progress: Progres
 
 
 def enter_rows(database: Path, part: Path, tables: Sequence[str]) -> None:
-    """Enter the tables of a worker's file into the run's database, and remove the file.
-
-    Raises:
-        BackendError: the rows cannot be read or entered.
-    """
+    """Enter the tables of a worker's file into the run's database, and remove the file."""
     with translate_errors("entering the features and matches of workers"):
         _copy_rows(database, part, tables)
     part.unlink()
@@ -518,11 +467,7 @@ def count_features(database: Path) -> list[int]:
 
 
 def exhaustive_pairs(photos: Sequence[int]) -> list[PairId]:
-    """Return all pairs of photos as COLMAP's exhaustive matching takes them; in some, the larger id comes first.
-
-    Args:
-        photos: ids, ascending.
-    """
+    """Return all pairs of ascending ids as COLMAP's exhaustive matching takes them; in some, the larger comes first."""
     pairs, block = [], 50  # photos of a block, COLMAP's default
     for first, a in enumerate(photos):
         for second, b in enumerate(photos[first + 1 :], first + 1):
@@ -534,7 +479,6 @@ def exhaustive_pairs(photos: Sequence[int]) -> list[PairId]:
 def _find_and_match_here(
     database: Path, settings: SiftSettings, names: Sequence[str], pairs: Sequence[PairId], progress: Progress
 ) -> dict[str, Json]:
-    """Find and match on one thread of this process, and return COLMAP's options."""
     in_force: dict[str, Json] = {}
     with translate_errors("matching photos" if pairs else "finding features"):
         do_feature_task(feature_task(database, settings, names, 1, pairs), progress, in_force.update)
@@ -543,13 +487,11 @@ def _find_and_match_here(
 
 @contextlib.contextmanager
 def _scratch_copy(inputs: SiftInputs) -> Iterator[Path]:
-    """Provide a copy of the snapshot on a disk of this machine."""
     with tempfile.TemporaryDirectory(prefix="sfm-app-sift-", dir=inputs.scratch) as scratch:
         yield Path(shutil.copyfile(inputs.snapshot, Path(scratch) / inputs.snapshot.name))
 
 
 def _leave_rows(database: Path, tables: Sequence[str], folder: Path) -> Path:
-    """Write some tables into a file of a folder, and return its path."""
     target = folder / f"rows-{secrets.token_hex(8)}.db"
     rows = database.with_name("rows.db")
     with contextlib.closing(sqlite3.connect(database, isolation_level=None)) as source:

@@ -25,12 +25,7 @@ LAST_ID = "SELECT seq FROM sqlite_sequence WHERE name = 'images'"
 
 
 def grow_database(path: Path, earlier: Path, photos: PhotoSet, known: Collection[str]) -> None:
-    """Make the database of these photos, with the features and matches of an earlier run.
-
-    Args:
-        earlier: not changed.
-        known: names of the photos that are the same in both.
-    """
+    """Make the database of these photos; the known ones have the features and matches of an earlier run."""
     with _connection(earlier) as connection:
         earlier_ids = dict(connection.execute("SELECT name, image_id FROM images"))
         last = max([0, *earlier_ids.values(), *(seq for (seq,) in connection.execute(LAST_ID))])
@@ -53,9 +48,6 @@ def forget_changed_matches(path: Path, earlier: Path) -> frozenset[str]:
     """Remove the matches of photos whose keypoints differ from those of an earlier run, and return their names.
 
     A method that finds features again may find others, and matches are rows of keypoints.
-
-    Args:
-        earlier: database that the matches come from.
     """
     query = "SELECT image_id, rows, cols, data FROM keypoints"
     with _connection(earlier) as before, _connection(path) as now:
@@ -69,7 +61,6 @@ def forget_changed_matches(path: Path, earlier: Path) -> frozenset[str]:
 
 
 def _copy_rows(path: Path, earlier: Path, photos: Collection[int]) -> None:
-    """Copy the rows of these photos, and of pairs of them."""
     known = frozenset(photos)
     with _connection(earlier) as source, _connection(path) as target:
         for read, write, photos_of in COPIES:
@@ -79,7 +70,6 @@ def _copy_rows(path: Path, earlier: Path, photos: Collection[int]) -> None:
 
 @contextlib.contextmanager
 def _connection(path: Path) -> Iterator[sqlite3.Connection]:
-    """Provide a connection whose changes are written at the end."""
     with contextlib.closing(sqlite3.connect(path)) as connection, connection:
         yield connection
 
@@ -89,13 +79,8 @@ def model_in_database(
 ) -> pycolmap.Reconstruction:
     """Return the part of an earlier model that some photos see, with the photos and cameras of a database.
 
-    Cameras get the parameters of the earlier model. Tracks lose photos that are not known, and keypoints that the
-    database lacks; points with fewer than two photos are left out.
-
-    Args:
-        database: known photos have the ids of the model.
-        photos: ids of the known photos.
-        keypoints: number of keypoints of each photo in the database.
+    Known photos have the ids of the model. Cameras get the parameters of the earlier model. Tracks lose photos that are
+    not known, and keypoints that the database lacks; points with fewer than two photos are left out.
     """
     before = pycolmap.Reconstruction(earlier)
     model = unposed_model(database)

@@ -26,11 +26,9 @@ class PlacedPhotos:
     X: FloatArray
     """(P, 3) points."""
     point: IndexArray
-    """(N,) row of the point of each observation, ascending."""
     photo: IndexArray
-    """(N,) id of the photo of each observation."""
     keypoint: IndexArray
-    """(N,) index of the keypoint of each observation."""
+    """(N,) each: row of the point of each observation, ascending; id of its photo; index of its keypoint."""
     cameras: Mapping[int, pycolmap.Camera]
     """Camera of each photo, by its id."""
 
@@ -94,10 +92,7 @@ def merge_models(
 ) -> pycolmap.Reconstruction:
     """Return one model with the photos and points of two models that share no photo.
 
-    Args:
-        first: gives the frame, and the parameters of cameras that are in both models; not changed.
-        second: not changed.
-        similarity: from the frame of the second model into that of the first.
+    The first gives the frame and the parameters of shared cameras; the similarity leads from the second into it.
     """
     other = pycolmap.Reconstruction(second)
     move(other, similarity)
@@ -115,11 +110,7 @@ def merge_models(
 
 
 def adjust_joined(model: pycolmap.Reconstruction, database: Path, refined: Sequence[int]) -> None:
-    """Adjust a joined model in place, and complete, merge and filter its tracks; the last adjustment follows.
-
-    Args:
-        refined: ids of the cameras whose focal is refined; the others are held fixed.
-    """
+    """Adjust a joined model and the focals of `refined` cameras in place, and complete, merge and filter its tracks."""
     drop_infinite_points(model)
     graph = find_correspondences(model, database)
     for _ in range(2):

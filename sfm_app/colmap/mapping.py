@@ -22,14 +22,9 @@ def map_incrementally(
     tick: Callable[[], None],
     token: pycolmap.CancellationToken,
 ) -> pycolmap.Reconstruction | None:
-    """Register photo by photo, beginning with those in `start`; return None when COLMAP gives no model.
+    """Register photo by photo, beginning with two or more in `start`; return None when COLMAP gives no model.
 
-    Args:
-        database: photos, keypoints, two-view geometries, K.
-        start: a reconstruction with at least two posed photos.
-        scratch: a folder that is emptied first and removed afterwards.
-        options: from `incremental_options`.
-        tick: called before every further photo.
+    The scratch folder is emptied first and removed afterwards; `tick` is called before every further photo.
     """
     shutil.rmtree(scratch, ignore_errors=True)
     for name in ("start", "grown"):
@@ -47,12 +42,7 @@ def map_incrementally(
 
 
 def copy_database(database: Path, scratch: Path) -> None:
-    """Copy the database for a mapper in a separate process: two mappers that open one file lock each other out.
-
-    Args:
-        database: photos, keypoints, matches, two-view geometries, K; must not be open anywhere.
-        scratch: a folder that is emptied first.
-    """
+    """Copy a closed database into an emptied folder for another process: mappers of one file lock each other out."""
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     shutil.copyfile(database, scratch / "database.db")
@@ -61,18 +51,9 @@ def copy_database(database: Path, scratch: Path) -> None:
 def map_globally(
     photo_dir: Path, names: Sequence[str], scratch: Path, seed: int, token: Cancellation
 ) -> pycolmap.Reconstruction | None:
-    """Find the poses of all these photos at once (GLOMAP: rotations, positions, adjustment).
+    """Find the poses of all these photos at once (GLOMAP: rotations, positions, adjustment); None if it gave no model.
 
-    COLMAP has no way to stop this, so it runs in a separate process.
-
-    Args:
-        scratch: a folder from `copy_database`; removed afterwards.
-
-    Returns:
-        The model; None if the mapper was stopped or gave none.
-
-    Raises:
-        BackendError: COLMAP failed.
+    COLMAP has no way to stop this, so it runs in a separate process. The folder, from `copy_database`, is removed.
     """
     task: GlobalMappingTask = {
         "do": "map_globally",
@@ -121,12 +102,8 @@ def incremental_options(
 ) -> pycolmap.IncrementalPipelineOptions:
     """Return COLMAP's defaults, except that two photos make a model and only the given model is extended.
 
-    Adjustments stop when they gain little: the last adjustment is ours.
-
-    Args:
-        known: whether the cameras are too well known for mapping to improve them; poses and points alone converge
-            in a few steps.
-        kept: ids of cameras that the user wants unchanged.
+    Adjustments stop when they gain little: the last adjustment is ours. With known cameras, poses and points alone
+    converge in a few steps. Cameras in `kept` do not change.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 2

@@ -24,11 +24,7 @@ def finite_mask(xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def unposed_model(database: Path, *, unconnected: bool = True) -> pycolmap.Reconstruction:
-    """Return a reconstruction of the photos, keypoints and cameras of a database, without poses and points.
-
-    Args:
-        unconnected: whether to include photos that no pair in the database connects.
-    """
+    """Return a database as a model without poses and points, with or without photos that no pair connects."""
     options = pycolmap.DatabaseCacheOptions()
     options.load_all_images = unconnected
     with open_database(database) as db:
@@ -48,12 +44,7 @@ def pose_photo(model: pycolmap.Reconstruction, photo: int, cam_from_world: pycol
 def model_from_seed(
     database: Path, pair: PairId, matches: NDArray[np.uint32], seed: TwoViewSeed
 ) -> pycolmap.Reconstruction:
-    """Return a reconstruction of two photos with our pose and our points.
-
-    Args:
-        matches: (N, 2) keypoint indices, one row per point of the seed.
-        seed: pose and points; only its usable points are added.
-    """
+    """Return a model of two photos with our pose and our usable points, one per row of the matches (N, 2)."""
     model = unposed_model(database, unconnected=False)
     for photo, R, t in ((pair[0], np.eye(3), np.zeros(3)), (pair[1], seed.R, seed.t)):
         pose_photo(model, photo, pycolmap.Rigid3d(pycolmap.Rotation3d(R), t))
@@ -70,19 +61,14 @@ class PlacedView:
     """A posed photo and the bearing vectors of its keypoints."""
 
     R: NDArray[np.float64]
-    """(3, 3) rotation, camera from world."""
     t: NDArray[np.float64]
-    """(3,) translation, camera from world."""
+    """(3, 3) rotation and (3,) translation, camera from world."""
     lines: NDArray[np.float64]
     """(N, 9) bearing vectors of keypoints, see `camera.bearings`."""
 
 
 def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray[np.float64]]) -> dict[int, PlacedView]:
-    """Return all photos of a model that have a pose, by id.
-
-    Args:
-        keypoints: (N, 2) pixels, by photo id.
-    """
+    """Return all photos of a model that have a pose, by id; keypoints are (N, 2) pixels."""
     views = {}
     for image in posed_images(model):
         camera, pose = model.cameras[image.camera_id], image.cam_from_world().matrix()
@@ -281,9 +267,6 @@ def sparse_model(model_dir: Path) -> Model:
     No third photo confirms points that only two photos see. Wrong points among these are far away, and would shrink the
     scene to a dot in a viewer. So points outside the bounding box of the confirmed points are left out, if a hundred or
     more are confirmed.
-
-    Raises:
-        BackendError: it cannot be read.
     """
     model = read_model(model_dir)
     points = finite_points(model)
@@ -315,13 +298,7 @@ class RefinedCamera(TypedDict, total=False):
 def read_scene(
     model_dir: Path, names: Mapping[str, str], unregistered: Mapping[str, str], refined: Mapping[str, RefinedCamera]
 ) -> Scene:
-    """Read a model on disk as the scene of later stages.
-
-    Args:
-        names: name of the camera of each photo.
-        unregistered: why a photo has no pose.
-        refined: deviations, determined parameters and correlations, by camera; may lack cameras.
-    """
+    """Read a model on disk as the scene of later stages; `unregistered` has the reason why a photo has no pose."""
     model = pycolmap.Reconstruction(model_dir)
     posed = posed_images(model)
     ids = {names[image.name]: image.camera_id for image in posed}
@@ -369,11 +346,7 @@ class ModelFigures:
 
 
 def model_figures(model_dir: Path) -> ModelFigures:
-    """Return the figures of a model on disk.
-
-    Raises:
-        BackendError: it cannot be read.
-    """
+    """Return the figures of a model on disk."""
     with translate_errors("reading the sparse model"):
         model = pycolmap.Reconstruction(model_dir)
         xyz = {key: np.asarray(point.xyz) for key, point in model.points3D.items()}

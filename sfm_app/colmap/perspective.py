@@ -27,11 +27,7 @@ ViewNames = Mapping[str, Sequence[str]]
 
 
 def full_size_lenses(model: pycolmap.Reconstruction, *, centered: bool) -> dict[int, WideLens]:
-    """Return the views of every camera at full size, by its id.
-
-    Args:
-        centered: whether every view has square pixels and its optical center in the middle.
-    """
+    """Return the views of every camera at full size, by id; `centered` ones have square pixels and a central axis."""
     with translate_errors("undistorting the cameras"):
         lenses = perspective_lenses(model, 65_000)  # pixels: what JPEG can hold, rounded down
     if not centered:
@@ -94,12 +90,18 @@ def make_view_model(
     cameras = add_view_cameras(view_model, lenses)
     tracks = {point: pycolmap.Track() for point in sorted(model.points3D)}
     for image in sorted(posed_images(model), key=lambda image: image.name):
-        points, rays = tracked_rays(model, image)
+        tracked = [point for point in image.points2D if point.has_point3D()]
+        pixels = np.array([point.xy for point in tracked], np.float64).reshape(-1, 2)
+        rays = np.asarray(model.cameras[image.camera_id].cam_ray_from_img(pixels), np.float64).reshape(-1, 3)
         for number, view in enumerate(lenses[image.camera_id].views):
-            x, shown = project_rays(rays, view)
+            projected = rays @ view.R.T @ view.K.T
+            with np.errstate(divide="ignore", invalid="ignore"):
+                x = projected[:, :2] / projected[:, 2:]
+            inside = np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1)
+            shown = np.flatnonzero((projected[:, 2] > 0.0) & inside)
             image_id = view_model.num_images() + 1
             for index, row in enumerate(shown):
-                tracks[points[row]].add_element(image_id, index)
+                tracks[tracked[row].point3D_id].add_element(image_id, index)
             camera_id = cameras[image.camera_id, number]
             added = pycolmap.Image(
                 name=names[image.name][number], keypoints=x[shown], camera_id=camera_id, image_id=image_id
@@ -114,22 +116,6 @@ def make_view_model(
     return view_model
 
 
-def tracked_rays(model: pycolmap.Reconstruction, image: pycolmap.Image) -> tuple[list[int], FloatArray]:
-    """Return the ids of the points of a photo, and the rays (N, 3) of their keypoints in its frame."""
-    tracked = [point for point in image.points2D if point.has_point3D()]
-    x = np.array([point.xy for point in tracked], np.float64).reshape(-1, 2)
-    rays = np.asarray(model.cameras[image.camera_id].cam_ray_from_img(x), np.float64).reshape(-1, 3)
-    return [point.point3D_id for point in tracked], rays
-
-
-def project_rays(rays: FloatArray, view: PerspectiveView) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Return the pixels in a view (N, 2) of rays (N, 3) of the photo's frame, and the rows inside of the view."""
-    projected = rays @ view.R.T @ view.K.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        x = projected[:, :2] / projected[:, 2:]
-    return x, np.flatnonzero((projected[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1))
-
-
 def all_points(model: pycolmap.Reconstruction) -> PointCloud:
     """Return the finite points of a model, in order of ids."""
     return PointCloud(*point_arrays(finite_points(model)))
@@ -140,15 +126,7 @@ LargerView = tuple[str, NDArray[np.float64], NDArray[np.uint8], NDArray[np.bool_
 
 
 class LargerViews:
-    """Undistorts the photos of a dense workspace again, at another size.
-
-    Args:
-        views: of the dense workspace; photos without any are left out.
-        max_side_px: longest side of a view; none is larger than its photo.
-
-    Raises:
-        BackendError: COLMAP cannot read the model.
-    """
+    """Undistorts the photos of a dense workspace again, at another size, but no larger than the photo."""
 
     def __init__(
         self, model_dir: Path, photo_dir: Path, mask_dir: Path | None, views: Sequence[View], max_side_px: int
@@ -181,11 +159,7 @@ class LargerViews:
         return sorted(self._camera, key=lambda photo: (self._camera[photo], photo))
 
     def render(self, photo: str) -> Iterator[LargerView]:
-        """Yield the views of a photo.
-
-        Raises:
-            BackendError: the photo cannot be read.
-        """
+        """Yield the views of a photo."""
         camera_id, names = self._camera[photo], self._numbers[photo]
         lens, maps = self._lenses[camera_id], self._maps.camera_maps(camera_id)
         with translate_errors(f"reading {photo}"):
@@ -207,11 +181,7 @@ def _resize(view: View, R: NDArray[np.float64], focal_px: float, max_side_px: in
 def write_bundle(model_dir: Path, photo_dir: Path, file: Path, workers: int, progress: Progress) -> None:
     """Write the cameras, poses and points of a model for Bundler; COLMAP also writes photos, which are thrown away.
 
-    Args:
-        model_dir: COLMAP's model, with one focal per camera and optical centers in the middle.
-
-    Raises:
-        BackendError: COLMAP cannot read the model or the photos, or cannot write.
+    The model has one focal per camera, and optical centers in the middle.
     """
     scratch = file.with_name(".pmvs")
     try:

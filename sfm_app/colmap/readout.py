@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from sfm_app.bundle.lens_parts import PARTS
 from sfm_app.bundle.normal_equations import Bundle
@@ -33,12 +34,9 @@ def measure_readout(
     adjusted: Adjustment, keypoints: Keypoints, times: Mapping[int, float],
     start: ReadoutEstimate | None = None, *, known: float | None = None,
 ) -> ReadoutEstimate:  # fmt: skip
-    """Estimate the readout of the shutter from a model and uncompensated keypoints.
+    """Estimate the readout of the shutter from a model and uncompensated keypoints, at distinct times.
 
-    Args:
-        adjusted: a model of photos of perspective or fisheye cameras, five or more.
-        times: distinct, by photo id.
-        start, known: as of `estimate_readout`.
+    The model has five or more photos, and no panorama; `start` and `known` are as of `estimate_readout`.
     """
     model = adjusted.model
     ids, bundle = read_bundle(model)
@@ -61,11 +59,7 @@ def measure_readout(
 def straighten_model(
     model: pycolmap.Reconstruction, estimate: ReadoutEstimate, keypoints: Keypoints
 ) -> pycolmap.Reconstruction:
-    """Return a copy of a model with the estimated poses, points and cameras, and with its keypoints compensated.
-
-    Args:
-        keypoints: uncompensated.
-    """
+    """Return a copy of a model with the estimate's poses, points and cameras, and with compensated keypoints."""
     model = pycolmap.Reconstruction(model)
     ids, _ = read_bundle(model)
     write_bundle(model, ids, estimate.bundle)
@@ -78,11 +72,7 @@ def straighten_model(
 
 
 def row_shares(x: FloatArray, camera: pycolmap.Camera) -> FloatArray:
-    """Return the shares (N,) of the rows of keypoints (N, 2); rows are read along the shorter side of the sensor.
-
-    Args:
-        camera: of the photo, which may stand upright.
-    """
+    """Return the shares (N,) of the rows of keypoints (N, 2); rows are read along the shorter side of the sensor."""
     upright = camera.height > camera.width
     return np.asarray(x[:, 0] / camera.width - 0.5 if upright else x[:, 1] / camera.height - 0.5, np.float64)
 
@@ -105,7 +95,11 @@ def _compensate(
     share = row_shares(x, camera)
     rays = viewing_rays(model, image.image_id, x) @ R.T
     rays /= np.linalg.norm(rays, axis=1)[:, None]
-    inverse = _spread_inverse_depths(x, tracked, 1.0 / np.linalg.norm(xyz @ R.T + t, axis=1))
+    known = 1.0 / np.linalg.norm(xyz @ R.T + t, axis=1)
+    # untracked keypoints take the mean of their five nearest tracked ones
+    _, near = cKDTree(x[tracked]).query(x, k=np.arange(1, min(5, len(tracked)) + 1))
+    inverse = np.asarray(known[near].mean(axis=1), np.float64)
+    inverse[tracked] = known
     middle = move_to_middle_row(rays / inverse[:, None], share, motion)
     place = int(bundle.camera[row])
     params, family = np.tile(bundle.params[place], (len(x), 1)), np.full(len(x), bundle.family[place])
@@ -113,14 +107,3 @@ def _compensate(
         moved = image_points(middle, params, family)
     shown = np.isfinite(moved).all(axis=1, keepdims=True)
     return np.where(shown, moved, x)
-
-
-def _spread_inverse_depths(x: FloatArray, tracked: NDArray[np.int64], inverse: FloatArray) -> FloatArray:
-    """Return inverse depths (N,) of all keypoints; untracked ones take the mean of their five nearest tracked ones."""
-    from scipy.spatial import cKDTree
-
-    count = min(5, len(tracked))
-    _, near = cKDTree(x[tracked]).query(x, k=np.arange(1, count + 1))
-    spread = np.asarray(inverse[near].mean(axis=1), np.float64)
-    spread[tracked] = inverse
-    return spread

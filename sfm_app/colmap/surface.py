@@ -14,12 +14,9 @@ FUSED = "fused.ply"
 
 
 def fuse(dense_dir: Path, min_views: int, box: NDArray[np.float64], target: Path, cache_gb: float = 0.0) -> None:
-    """Fuse the geometric maps of a dense workspace into the PLY file `target`.
+    """Fuse the geometric maps of a dense workspace, with points within a box (2, 3), into the PLY file `target`.
 
-    Args:
-        dense_dir: dense workspace; `dense.write_fusion_views` has listed the views with maps.
-        box: (2, 3) lowest and highest coordinates of points.
-        cache_gb: memory for depth and normal maps; with less, they are read more often. 0 holds all, in half the time.
+    The cache of maps has `cache_gb`: the less, the more often they are read. 0 holds all, in half the time.
     """
     task: FuseTask = {
         "do": "fuse",
@@ -34,11 +31,7 @@ def fuse(dense_dir: Path, min_views: int, box: NDArray[np.float64], target: Path
 
 
 def open_points(path: Path) -> NDArray[np.void]:
-    """Return the records (N,) of COLMAP's points, with fields x, y, z, nx, ..., mapped from the file.
-
-    Raises:
-        BackendError: it is no binary PLY file of points.
-    """
+    """Return the records (N,) of COLMAP's points, with fields x, y, z, nx, ..., mapped from the file."""
     with translate_errors(f"reading {path.name}"), path.open("rb") as file:
         count, fields = -1, list[tuple[str, str]]()
         while (words := file.readline().split()) != [b"end_header"]:
@@ -62,7 +55,6 @@ def write_points(records: NDArray[np.void], path: Path) -> None:
 
 
 def _header(fields: np.dtype[np.void], count: int) -> bytes:
-    """Return the header of a PLY file of points."""
     kinds = {"f": "float", "u": "uchar"}
     properties = [f"property {kinds[kind[0].kind]} {name}" for name, kind in (fields.fields or {}).items()]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header", ""]
@@ -86,11 +78,8 @@ def positions(records: NDArray[np.void]) -> NDArray[np.float64]:
 def poisson_surface(folder: Path, depth: int) -> Surface:
     """Return Poisson's closed surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points of a folder.
 
-    It has no colors of its own: all vertices have the same.
-
-    Args:
-        depth: depth of the octree, raised to 5, with which small surfaces become fine enough; the finest cell is the
-            largest extent of the points over 2^depth.
+    All vertices have the same color. The depth of the octree is raised to 5, with which small surfaces are fine enough;
+    the finest cell is the largest extent of the points over 2^depth.
     """
     path = folder / "poisson.ply"
     task: PoissonTask = {
@@ -106,17 +95,10 @@ def poisson_surface(folder: Path, depth: int) -> Surface:
 
 
 def simplify(surface: Surface, most: int, max_error: float, scratch: Path, threads: int = 1) -> Surface:
-    """Collapse edges, cheapest first by their quadric error (Garland and Heckbert, SIGGRAPH 1997).
+    """Collapse edges, cheapest first by their quadric error (Garland and Heckbert, SIGGRAPH 1997), of a manifold.
 
-    Each vertex has the mean color of the vertices that it replaces.
-
-    Args:
-        surface: a manifold; its borders are kept.
-        most: largest number of triangles, >= 1.
-        max_error: edges go on collapsing up to this root of the summed squared distances of a vertex from the planes it
-            replaces; 0: no further than to `most`.
-        scratch: folder for two temporary files.
-        threads: the surface is the same for any number.
+    Each vertex has the mean color of the vertices that it replaces; borders are kept. Edges collapse down to `most`
+    triangles, and further while the root of the summed squared distances from the replaced planes is `max_error`.
     """
     import trimesh
 

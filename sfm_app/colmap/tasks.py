@@ -123,11 +123,9 @@ def undistort(task: UndistortTask) -> None:
             num_threads=task["workers"], cancellation_token=token, output_type=task["output"],
         )  # fmt: skip
 
-    def count_finished() -> int:
-        return sum(path.is_file() for path in photos.rglob("*"))
-
+    total = pycolmap.Reconstruction(model_dir).num_reg_images()
     run_with_progress(
-        call, count_finished, "undistorting", pycolmap.Reconstruction(model_dir).num_reg_images(), ProgressReporter()
+        call, lambda: sum(map(Path.is_file, photos.rglob("*"))), "undistorting", total, ProgressReporter()
     )
     check_written(*(path for path in dense_dir.rglob("*") if path.is_file()))
 

@@ -94,11 +94,7 @@ def write_model(model_dir: Path, lenses: Mapping[int, WideLens], dense_dir: Path
 
 
 def write_views(name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | None, dense_dir: Path) -> None:
-    """Write the views of a photo, and masks of views with pixels that it does not show or that are masked.
-
-    Raises:
-        BackendError: the photo cannot be read, or the views cannot be written.
-    """
+    """Write the views of a photo, and masks of views with pixels that it does not show or that are masked."""
     with translate_errors(f"reading {name}"):
         for number, (pixels, shown) in enumerate(render_views(name, lens, photo_dir, mask_dir)):
             save_picture(dense_dir / "images" / view_name(name, number), pixels)
@@ -111,8 +107,7 @@ def render_views(
 ) -> Iterator[tuple[NDArray[np.uint8], BoolArray]]:
     """Yield each view of a photo, (H, W, 3) BGR, and the mask (H, W) of pixels that it shows and nothing masks.
 
-    Args:
-        maps: (H, W, 2) pixels of the photo that each view shows, -1 where it shows none; empty if not known.
+    `maps` (H, W, 2) are the pixels of the photo that each view shows, -1 where it shows none; empty if not known.
     """
     photo = np.asarray(cv2.imdecode(np.fromfile(photo_dir / name, np.uint8), cv2.IMREAD_COLOR), np.uint8)
     used = None if mask_dir is None else read_mask(mask_dir, name)

@@ -22,7 +22,6 @@ from sfm_app.operating_system import crash_name, end_at_exit, has_run_out, ignor
 from sfm_app.progress import Progress, SilentProgress
 
 TASKS = "sfm_app.colmap.tasks"
-"""Module of the processes that do the tasks below."""
 REPORT_FD = 3
 """File descriptor for messages of a worker process to its parent."""
 
@@ -55,7 +54,6 @@ class MatchTask(TypedDict):
     features: str
     photos: str
     options: dict[str, Any]
-    """Dump of `MatchSettings`."""
     sift: dict[str, SiftOption]
     folder: str
     pairs: list[list[int]]
@@ -194,11 +192,7 @@ class ProcessGroup:
         self._running, self._lock, self._has_ended = set[WorkerProcess](), threading.Lock(), False
 
     def run(self, task: Mapping[str, object], doing: str, progress: Progress) -> dict[str, Json]:
-        """Run a task to its end or that of the group, as `run_worker` does.
-
-        Raises:
-            BackendError: COLMAP failed, or the group has ended.
-        """
+        """Run a task to its end or that of the group, as `run_worker` does."""
         with start_worker(TASKS, task) as process:
             with self._lock:
                 self._running.add(process)
@@ -221,14 +215,7 @@ class ProcessGroup:
 
 
 def run_worker(task: Mapping[str, object], doing: str, progress: Progress | None = None) -> dict[str, Json]:
-    """Run one of COLMAP's tasks in a process, and return its results.
-
-    Args:
-        doing: description of the work, for error messages.
-
-    Raises:
-        BackendError: COLMAP failed.
-    """
+    """Run one of COLMAP's tasks in a process, and return its results; error messages say what it was `doing`."""
     with start_worker(TASKS, task) as process:
         results = relay(process, progress or SilentProgress())
         process.check(doing)

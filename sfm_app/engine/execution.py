@@ -35,7 +35,6 @@ from sfm_app.types import PhotoSet
 
 logger = logging.getLogger("sfm_app")
 LOGGERS = (logger, logging.getLogger("py.warnings"))
-"""Loggers of the program and of Python's warnings."""
 
 
 class LogFile(logging.FileHandler):
@@ -80,12 +79,7 @@ class Usage:
 
 @contextmanager
 def measure_usage(elsewhere: Callable[[], float] = float, every_s: float = 0.5) -> Iterator[Usage]:
-    """Measure the work within the block.
-
-    Args:
-        elsewhere: returns the CPU seconds so far of processes that this one does not wait for.
-        every_s: seconds between two measurements of the memory, which take some milliseconds.
-    """
+    """Measure the work within the block; `elsewhere` returns the CPU seconds of processes that are not its own."""
     used, ended, children = Usage(), threading.Event(), ChildTimes()
     start, cpu_start = time.perf_counter(), cpu_seconds() + elsewhere()
 
@@ -147,15 +141,9 @@ class Pipeline:
     def run(
         self, source: Source, run: RunContext, first: str = "", last: str = "", targets: Sequence[Stage[object]] = ()
     ) -> Products:
-        """Run the stages that are not up to date, and those with damaged files.
+        """Run the stages that are not up to date, and those with damaged files, up to `last`; from `first` on, all run.
 
-        Args:
-            first: stage from which on all stages run again.
-            last: last stage to run; empty for all.
-            targets: stages whose products are loaded before returning.
-
-        Raises:
-            SfmError: see errors.py; finished stages stay valid.
+        The products of `targets` are loaded before returning.
         """
         for name in filter(None, (first, last)):
             if name not in self.names:
@@ -182,8 +170,6 @@ class Pipeline:
 
 @dataclass(slots=True, eq=False)
 class _Execution:
-    """One pass through the stages."""
-
     pipeline: Pipeline
     source: Source
     run: RunContext
@@ -248,7 +234,10 @@ class _Execution:
         self.pipeline.forget(stage.name, run)
         run.progress.stage(stage.name, f"again: {again}" if again else "")
         logger.info("%s begins%s", stage.name, f" again: {again}" if again else "")
-        run = self.stage_context(stage, run)
+        inputs, earlier = self.fingerprints[stage.name], self.earlier
+        if earlier is not None and stage.name in earlier.stages:
+            run, inputs = replace(run, earlier=earlier), fingerprint(inputs, earlier.fingerprint)
+        run = run.with_fingerprint(inputs)
         with measure_usage(partial(cpu_seconds_elsewhere, run.executor)) as used:
             product = self.make_product(stage, run)
         self.products.keep(stage, product)
@@ -262,13 +251,6 @@ class _Execution:
         place.manifest.finish(stage.name, record, manifest_head(run))
         logger.info("%s took %.2f s, %.2f s of CPU and %d MB", stage.name, seconds, used.cpu_seconds, used.peak_mb)
         run.progress.finish_stage(seconds, len(self.products[self.pipeline.photos].photos))
-
-    def stage_context(self, stage: Stage[object], run: RunContext) -> RunContext:
-        """Return the run for a stage, with the earlier run, and the fingerprint by which it resumes."""
-        inputs, earlier = self.fingerprints[stage.name], self.earlier
-        if earlier is None or stage.name not in earlier.stages:
-            return run.with_fingerprint(inputs)
-        return replace(run.with_fingerprint(fingerprint(inputs, earlier.fingerprint)), earlier=earlier)
 
     def make_product(self, stage: Stage[Product], run: RunContext) -> Product:
         """Return the product of a stage, after checking that photos and output folder did not change."""
@@ -327,11 +309,7 @@ def _limit_workers(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> R
 
 
 def check_undisturbed(source: Source, photos: PhotoSet | None, run: RunContext, by: Exception | None = None) -> None:
-    """Check that photos and output folder did not change during a stage.
-
-    Args:
-        photos: the photos in use, if known.
-        by: the error of the stage, if it has failed.
+    """Check that photos and output folder did not change during a stage, which may have failed with an error.
 
     Raises:
         InputError: the output folder or a photo is missing or was replaced.

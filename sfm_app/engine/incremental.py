@@ -37,13 +37,7 @@ def set_aside(stages: Sequence[Stage[object]], run: RunContext) -> None:
 def find_earlier(
     stages: Sequence[Stage[object]], photos: Mapping[str, str], first: str, run: RunContext
 ) -> Earlier | None:
-    """Return the earlier run to resume from; if its files are not usable, remove them and return None.
-
-    Args:
-        stages: all stages after the photos, in order.
-        photos: hashes of this run's photos, by name.
-        first: stage from which on all stages run again; empty for none.
-    """
+    """Return the earlier run to resume from; if its files are not usable, remove them and return None."""
     place = run.workspace.earlier
     if not place.root.is_dir():
         return None

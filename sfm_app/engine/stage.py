@@ -46,11 +46,7 @@ class Stage(Generic[Product_co]):
 
 
 class Products:
-    """Products by stage; those of skipped stages are loaded on first use.
-
-    Args:
-        source: the user's photos or video; None if no product needs them.
-    """
+    """Products by stage; those of skipped stages are loaded on first use."""
 
     def __init__(self, run: RunContext, source: Source | None = None) -> None:
         self._run, self._source = run, source
@@ -81,11 +77,7 @@ class Products:
 
 @contextmanager
 def check_undamaged(stage: Stage[object], run: RunContext) -> Iterator[None]:
-    """Check the files of a stage, and turn errors of reading them in the block into one that names the stage.
-
-    Raises:
-        DamagedProductError: the files have changed, or cannot be read.
-    """
+    """Check the files of a stage, and turn errors of reading them in the block into one that names the stage."""
     try:
         record = run.workspace.manifest.record(stage.name)
         if record is None or record.digest != stage.digest(run.workspace):
@@ -133,7 +125,6 @@ def rerun_reason(stage: Stage[object], inputs: str, run: RunContext) -> str | No
 
 
 def _changes(before: Any, now: Mapping[str, Any], name: str = "") -> Iterator[str]:
-    """Yield changed values with their dotted names."""
     for key, new in now.items():
         old = before.get(key) if isinstance(before, Mapping) else None
         inner = f"{name}.{key}".removeprefix(".").removeprefix("settings.").removeprefix("versions.")

@@ -67,8 +67,6 @@ _SCENES = (
     ),
 )
 EXPORTERS = {exporter.name: exporter for exporter in _MODELS}
-"""Formats for models by name."""
 SCENE_EXPORTERS = {exporter.name: exporter for exporter in _SCENES}
-"""Formats for scenes by name."""
 
 __all__ = ["EXPORTERS", "SCENE_EXPORTERS"]

@@ -40,15 +40,7 @@ OPTIONS = DracoOptions()
 
 
 def write_draco(model: Model, name: str) -> Mapping[str, bytes]:
-    """Write compressed triangles with a texture or a color per vertex; points as in a plain GLB.
-
-    Args:
-        model: cameras beside triangles are left out.
-        name: of the file, without suffix; also of the node in it.
-
-    Raises:
-        ReconstructionError: the model is empty or not finite.
-    """
+    """Write compressed triangles with a texture or a color per vertex, without cameras; points as in a plain GLB."""
     check(model)
     if not len(model.surface.faces):
         return write_glb(model, name)

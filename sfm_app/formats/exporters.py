@@ -110,7 +110,6 @@ class SceneExporter:
     needs: str = SCENE
     """`SCENE` or `CLOUD`."""
     unavailable: Callable[[], str] = _no_reason
-    """Why this machine cannot write it; empty if it can."""
 
     @property
     def ending(self) -> str:
@@ -138,8 +137,7 @@ def check(model: Model) -> None:
 
 
 JPEG_QUALITY = 90
-"""Quality of texture pages on libjpeg's scale: lower values show blocks, higher ones make much larger files.
-By hand."""
+"""Quality of texture pages on libjpeg's scale: less shows blocks, more makes much larger files. By hand."""
 NORMAL_QUALITY, NORMAL_SUFFIX, NORMAL_TYPE = 92, "jpg", "image/jpeg"
 """Quality and type of normal maps: shading is 1.7 degrees off on average (benchmarks/surface/normal_map.py)."""
 
@@ -169,11 +167,7 @@ def _encode(page: NDArray[np.uint8], quality: int, *, optimize: bool) -> bytes:
 
 
 def split_corners(faces: IndexArray, uv: NDArray[np.float32]) -> tuple[IndexArray, NDArray[np.float32], IndexArray]:
-    """Divide vertices on chart borders, so that each vertex has one texture coordinate.
-
-    Args:
-        faces: (T, 3) vertex indices.
-        uv: (T, 3, C) texture coordinates of the corners, and other values per corner.
+    """Divide vertices on chart borders, so that each vertex has one texture coordinate, or C other values.
 
     Returns:
         Old vertex (N,) and texture coordinates (N, C) of each new vertex, sorted by old vertex; new faces (T, 3).

@@ -52,12 +52,7 @@ def frustum_corners(camera: Frustum, depth: float) -> FloatArray:
 
 
 def frustum_depth(centers: FloatArray, points: FloatArray) -> float:
-    """Return the depth of the frusta: a third of the median distance between neighboring cameras, within bounds.
-
-    Args:
-        centers: (C, 3) of the cameras.
-        points: (N, 3) of the scene.
-    """
+    """Return the depth of the frusta: a third of the median distance between neighboring cameras, within bounds."""
     from scipy.spatial import cKDTree
 
     size = max(scene_size(centers), scene_size(points)) or 1.0

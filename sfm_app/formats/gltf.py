@@ -53,12 +53,7 @@ class Glb:
         return view
 
     def add_vertices(self, values: NDArray[np.float32], *, bounds: bool = False) -> int:
-        """Add a vertex attribute and return the accessor's number.
-
-        Args:
-            values: (N, 2), (N, 3) or (N, 4).
-            bounds: whether to include lowest and highest values, which glTF requires for positions.
-        """
+        """Add a vertex attribute (N, 2..4) and return the accessor's number; glTF requires bounds for positions."""
         entry = self._accessor(values, VERTICES)
         if bounds:
             entry |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
@@ -92,14 +87,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
-    """Write triangles with a texture or a color per vertex, or else points; and the cameras, if any.
-
-    Args:
-        name: of the file, without suffix; also of the node in it.
-
-    Raises:
-        ReconstructionError: the model is empty or not finite.
-    """
+    """Write triangles with a texture or a color per vertex, or else points; and the cameras, if any."""
     check(model)
     texture = model.texture if len(model.surface.faces) else None
     is_lit = texture is not None and bool(texture.normal_maps)
@@ -148,7 +136,6 @@ def add_page_material(glb: Glb, texture: Texture, page: int) -> int:
 
 
 def _add_picture(glb: Glb, name: str, kind: str, data: bytes) -> int:
-    """Add an image and its texture, and return the number of the texture."""
     image = glb.add("images", {"name": name, "mimeType": kind, "bufferView": glb.add_view(data)})
     return glb.add("textures", {"sampler": 0, "source": image})
 
@@ -173,11 +160,7 @@ def add_geometry(glb: Glb, vertices: NDArray[np.float64], normals: NDArray[np.fl
 
 
 def add_unlit_material(glb: Glb, name: str, **base: Any) -> int:
-    """Add an unlit material and return its number; it is double-sided, because surfaces are open.
-
-    Args:
-        **base: color or texture, as in glTF's pbrMetallicRoughness.
-    """
+    """Add an unlit material and return its number; it is double-sided, because surfaces are open."""
     return glb.add("materials", _matte_material(name, **base) | {"extensions": {UNLIT: {}}})
 
 

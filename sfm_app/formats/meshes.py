@@ -30,12 +30,6 @@ def write_ply(model: Model, name: str) -> Mapping[str, bytes]:
 
     Cameras are dots: readers differ on files with points and edges, but all show colored points in the same way. PLY
     has no common way to store a texture, or cameras beside a surface: both are left out.
-
-    Args:
-        name: of the file, without suffix.
-
-    Raises:
-        ReconstructionError: the model is empty or not finite.
     """
     check(model)
     surface = model.surface
@@ -104,14 +98,7 @@ MATERIAL = "newmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum {light}\n"
 def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
     """Write triangles with normals and a texture or a color per vertex, or else points; and cameras, if any, as lines.
 
-    Args:
-        name: of the files, without suffix.
-
-    Returns:
-        The OBJ; if the model has a texture, also the MTL, a JPEG per page, and its normal map, if any.
-
-    Raises:
-        ReconstructionError: the model is empty or not finite.
+    The files are the OBJ and, with a texture, the MTL, a JPEG per page, and the normal map, if any.
     """
     check(model)
     texture = model.texture if len(model.surface.faces) else None
@@ -186,11 +173,7 @@ def decimals(vertices: NDArray[np.float64]) -> int:
 
 
 def write_stl(model: Model, name: str) -> Mapping[str, bytes]:
-    """Write the triangles of a model; STL has no colors.
-
-    Args:
-        model: its unit is taken for a meter, and its y axis, which points up, becomes z.
-        name: of the file, without suffix.
+    """Write the triangles of a model, without colors; its unit is taken for a meter, and y, which points up, becomes z.
 
     Raises:
         ReconstructionError: the model is not finite, or has no triangles.

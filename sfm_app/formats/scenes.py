@@ -26,11 +26,7 @@ UNSAFE = re.compile(r"[^A-Za-z0-9-]+")
 
 
 def plain_names(names: Sequence[str]) -> list[str]:
-    """Return a name of letters, digits, - and _ for each name, all different even where case does not count.
-
-    Args:
-        names: of photos with their folders, without suffix, or of cameras.
-    """
+    """Return a name of letters, digits, - and _ for each name, all different even where case does not count."""
     used, unique = set[str](), []
     for name in names:
         plain = stem = UNSAFE.sub("_", name).strip("_") or "_"
@@ -70,17 +66,15 @@ def write_cameras(scene: FinishedScene, target: Path) -> None:
     }
     content = {
         "conventions": CONVENTIONS,
-        "cameras": {name: camera_entry(camera) for name, camera in result.cameras.items()},
+        "cameras": {
+            name: camera.to_dict() | {"parameters": list(PARAMETERS.get(camera.model, ()))}
+            for name, camera in result.cameras.items()
+        },
         "camera_of": dict(result.camera_of),
         "photos": photos,
         "unregistered": dict(result.unregistered),
     }
     target.write_text(json_text(content), encoding="utf-8", newline="\n")
-
-
-def camera_entry(camera: CameraModel) -> dict[str, Any]:
-    """Return a camera as plain values, with the names of its parameters."""
-    return camera.to_dict() | {"parameters": list(PARAMETERS.get(camera.model, ()))}
 
 
 # COLMAP's folder layout of undistorted photos, which Gaussian-splatting trainers read, and Bundler's files.
@@ -126,7 +120,6 @@ def _write_folder(scene: FinishedScene, target: Path, *, text: bool = False, cen
 
 
 # The folder that nerfstudio trains from: transforms.json, photos, masks and the sparse points.
-#
 # Its cameras look along -z with y up. Its points and poses share a frame, which is that of the model; nerfstudio
 # turns and scales both as it loads them. Every photo has a mask, or none has.
 
@@ -166,7 +159,6 @@ def frame(photo: PerspectivePhoto) -> dict[str, Any]:
 
 
 # Cameras as OpenCV's YAML, one file per camera, with the poses of its photos.
-#
 # OpenCV counts pixels from the center of the first one, which is (0.5, 0.5) here.
 
 

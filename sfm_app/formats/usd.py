@@ -32,27 +32,18 @@ FILM_MM = 36.0
 def write_usd(model: Model, name: str) -> Mapping[str, bytes]:
     """Write triangles with a texture or a color per vertex, or points; and the cameras, if any.
 
-    Args:
-        name: of the files, without suffix.
-
-    Returns:
-        The stage in USD's binary form, a JPEG per page of texture, and its normal map, if any.
-
-    Raises:
-        ReconstructionError: the model is empty or not finite.
+    The files are the stage in USD's binary form, a JPEG per page of texture, and the normal map, if any.
     """
     check(model)
     pages = page_files(model, name)
-    return {f"{name}.usd": stage_bytes(model, pages), **_pictures(model, pages)}
+    with tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch:
+        path = Path(scratch) / "model.usdc"
+        _write_stage(path, model, pages)
+        return {f"{name}.usd": path.read_bytes(), **_pictures(model, pages)}
 
 
 def write_usdz(model: Model, name: str) -> Mapping[str, bytes]:
-    """Write the files of `write_usd` into one uncompressed package.
-
-    Raises:
-        ReconstructionError: the model is empty or not finite.
-    """
-    check(model)
+    """Write the files of `write_usd` into one uncompressed package."""
     stage, *pages = write_usd(model, "model").items()
     return {f"{name}.usdz": pack({"model.usdc": stage[1], **dict(pages)})}
 
@@ -89,14 +80,6 @@ def pack(files: Mapping[str, bytes]) -> bytes:
             entry.extra = (0x1986).to_bytes(2, "little") + gap.to_bytes(2, "little") + bytes(gap)  # as USD's packer
             package.writestr(entry, data)
     return stream.getvalue()
-
-
-def stage_bytes(model: Model, pages: Mapping[int, str]) -> bytes:
-    """Return a stage in USD's binary form; `pages` are files by number of the page."""
-    with tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch:
-        path = Path(scratch) / "model.usdc"
-        _write_stage(path, model, pages)
-        return path.read_bytes()
 
 
 def _write_stage(path: Path, model: Model, pages: Mapping[int, str]) -> None:
@@ -154,7 +137,6 @@ def add_texture(stage: "Usd.Stage", mesh: "UsdGeom.Mesh", texture: Texture, page
 
 
 def _page_material(stage: "Usd.Stage", path: str, file: str) -> "UsdShade.Material":  # type: ignore[name-defined]  # noqa: F821
-    """Add a rough material with a picture as its color."""
     from pxr import Sdf, UsdShade
 
     types = Sdf.ValueTypeNames

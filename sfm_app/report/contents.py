@@ -16,7 +16,6 @@ from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
 logger = logging.getLogger("sfm_app")
 
 UNREADABLE = (SfmError, OSError, ArithmeticError, ValueError, LookupError, TypeError)
-"""Errors of reading damaged files."""
 Product = TypeVar("Product")
 
 
@@ -26,7 +25,6 @@ class Problem(NamedTuple):
     message: str
     hint: str
     photos: Mapping[str, str]
-    """Reason by photo."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +94,6 @@ def read_scene(run: RunContext) -> RunContents:
 def _read(
     run: RunContext, manifest: Mapping[str, Any], module: ModuleType, load: Callable[[], Product | None]
 ) -> Product | None:
-    """Return the product of a stage; None if it has not run, or its files are damaged."""
     stage, done = module.__name__.rpartition(".")[2], manifest.get("stages", {})
     if stage not in done:
         return None

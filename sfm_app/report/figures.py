@@ -62,7 +62,6 @@ class FigureOptions:
 OPTIONS = FigureOptions()
 
 # Residuals of matches over the photo, through the calibrated lens and before bundle adjustment.
-#
 # The signed Sampson distance of a match is linear in the errors of its two pixels: d = a1 . v1 + a2 . v2, with a1 and
 # a2 the gradient of the epipolar constraint by the pixels of the two photos, of length 1 together. If all photos share
 # a camera, the part of v that does not depend on the match is the error of the lens model. All matches together
@@ -96,12 +95,7 @@ class ResidualGrid:
 
 
 def epipolar_residuals(pairs: CameraPairs, camera: Calibration) -> EpipolarResiduals:
-    """Return the residuals of all inliers.
-
-    Args:
-        pairs: of this camera; their matrices are of pixels for a perspective camera, else of rays.
-        camera: any projection.
-    """
+    """Return the residuals of all inliers; matrices of a perspective camera are of pixels, others of rays."""
     x, along, distances = [np.zeros((2, 0, 2))], [np.zeros((2, 0, 2))], [np.zeros(0)]
     matched = ((F, np.asarray(x, np.float64)) for F, x in zip(pairs.Fs, pairs.inliers, strict=False) if len(x))
     for F, match in matched:
@@ -173,7 +167,6 @@ def _matrix_of_rays(F: FloatArray, lines: FloatArray, camera: Calibration) -> Fl
 
 
 # Planes of two intrinsics: the votes of all pairs of photos, and their zero curves (thesis Figure 5.13).
-#
 # Left: the plane of the two focals, with the optical center at its estimate. Right: the plane of the optical
 # center, with the focals at their estimates. Many pairs agree at bright places.
 
@@ -243,7 +236,6 @@ def center_plane(camera: Calibration, pairs: Pairs) -> ParameterPlane:
 
 
 def _draw_plane(axes: "Axes", plane: ParameterPlane, camera: Calibration, pairs: Pairs) -> None:
-    """Draw votes, curves and K in one plane."""
     shades = vote_shares(plane, camera, pairs)
     axes.imshow(shades, extent=plane.extent, origin="lower", cmap="inferno", vmin=0, vmax=1, interpolation="bilinear")
     _draw_curves(axes, plane, plane.extent, OPTIONS.curve_samples)
@@ -333,15 +325,11 @@ class LensCurve(NamedTuple):
     """A lens and an ideal one for comparison."""
 
     theta_deg: FloatArray
-    """(N,) angles to the optical axis, up to the farthest corner."""
     radius_px: FloatArray
-    """(N,)"""
     ideal_px: FloatArray
-    """(N,)"""
     deviation_px: FloatArray
-    """(N,) standard deviations of the radius."""
+    """(N,) each: angles to the optical axis up to the farthest corner, radii, ideal radii, deviations of the radii."""
     ideal: str
-    """Name of the ideal lens."""
 
 
 def lens_curve(camera: Calibration) -> LensCurve:
@@ -365,7 +353,6 @@ def draw_lens_panels(part: "SubFigure", camera: Calibration, pairs: CameraPairs)
 
 
 def _draw_curve(axes: "Axes", curve: LensCurve, camera: Calibration) -> None:
-    """Draw the radius over the angle; a fisheye has other textbook projections beside it."""
     theta = np.radians(curve.theta_deg)
     if camera.projection == FISHEYE:
         for name, style, radius in (
@@ -383,7 +370,6 @@ def _draw_curve(axes: "Axes", curve: LensCurve, camera: Calibration) -> None:
 
 
 def _draw_difference(axes: "Axes", curve: LensCurve) -> None:
-    """Draw the difference between lens and ideal lens, with its band."""
     off = curve.radius_px - curve.ideal_px
     band = OPTIONS.band_deviations * curve.deviation_px
     low, high = off - band, off + band
@@ -400,7 +386,6 @@ def _draw_difference(axes: "Axes", curve: LensCurve) -> None:
 
 
 def _draw_residuals(part: "SubFigure", axes: "Axes", camera: Calibration, pairs: CameraPairs) -> None:
-    """Draw the size of the residuals as colors, and their mean by cell as arrows."""
     size = camera.width, camera.height
     extent = (0.0, float(size[0]), float(size[1]), 0.0)
     axes.set(xlim=extent[:2], ylim=extent[2:], aspect="equal", facecolor="#e8e8e8")
@@ -470,12 +455,7 @@ def draw_intrinsics(path: Path, matches: MatchGraph, views: ViewGraph, intrinsic
 
 
 def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
-    """Draw cameras into a file; the same calibration gives the same bytes.
-
-    Args:
-        path: its suffix names the format, see `check_figure`; its folder may be missing.
-        panels: only the first `OPTIONS.most_cameras` are drawn.
-    """
+    """Draw at most `OPTIONS.most_cameras` cameras into a file; the same calibration gives the same bytes."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -487,8 +467,10 @@ def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
         parts = figure.subfigures(len(drawn), 1, squeeze=False, height_ratios=heights)[:, 0]
         for part, panel in zip(parts, drawn, strict=True):
             many = f"Camera {panel.name}, one of {len(panels)}.\n" if len(panels) > 1 else ""
-            texts = filter(None, (calibration_text(panel.camera), pairs_text(len(panel.pairs.Fs))))
-            part.suptitle(many + "\n".join(texts), fontsize=10.5, x=0.02, ha="left")
+            text, count, most = calibration_text(panel.camera), len(panel.pairs.Fs), OPTIONS.most_pairs
+            if count > most:
+                text += f"\nThe figure shows the {most} pairs of most weight, of {count}."
+            part.suptitle(many + text, fontsize=10.5, x=0.02, ha="left")
             _draw_camera(part, panel)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=130, metadata=SUFFIXES[path.suffix.lower()])
@@ -498,12 +480,6 @@ def calibration_text(camera: Calibration) -> str:
     """Return a calibration in words, one line per property."""
     texts = (verdict(camera), focal_text(camera), center_text(camera), lens_text(camera), held_text(camera))
     return "\n".join(fill(text, 150) for text in texts if text).replace("+-", "±")
-
-
-def pairs_text(count: int) -> str:
-    """Return how many of the pairs are drawn; empty for all."""
-    most = OPTIONS.most_pairs
-    return f"The figure shows the {most} pairs of most weight, of {count}." if count > most else ""
 
 
 def weightiest(pairs: CameraPairs, most: int) -> CameraPairs:
@@ -519,7 +495,6 @@ def weightiest(pairs: CameraPairs, most: int) -> CameraPairs:
 
 
 def _draw_camera(part: "SubFigure", panel: Panel) -> None:
-    """Draw all rows of one camera."""
     panel = panel._replace(pairs=weightiest(panel.pairs, OPTIONS.most_pairs))
     rows = part.subfigures(len(panel.heights_in), 1, squeeze=False, height_ratios=panel.heights_in)[:, 0]
     if panel.is_perspective:

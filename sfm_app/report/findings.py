@@ -42,23 +42,16 @@ class CorrelationTable:
     source: str
     """Estimate with these correlations."""
     names: Sequence[str]
-    """(n,) of the parameters."""
     rows: Sequence[Sequence[float | None]]
     """(n, n), the lower triangle; None elsewhere, and for unknown values."""
     texts: Sequence[str]
-    """The table in sentences."""
 
 
 def correlation_table(before: Calibration, after: CameraModel | None) -> CorrelationTable | None:
     """Return the correlations after the last adjustment, else those from pairs; None if neither is known.
 
     Lens terms of value 0 are omitted, and the second focal of square pixels. An undetermined center stays in the table:
-    its
-    error causes an error of the focal.
-
-    Args:
-        before: the camera from pairs of photos.
-        after: the camera of the last adjustment.
+    its error causes an error of the focal.
     """
     if after is not None and after.correlations:
         values = dict(zip(PARAMETERS.get(after.model, ()), after.params, strict=False))
@@ -73,7 +66,6 @@ def correlation_table(before: Calibration, after: CameraModel | None) -> Correla
 
 
 def _table(source: str, names: Sequence[str], values: Mapping[str, float]) -> CorrelationTable | None:
-    """Return the table of some parameters; None if there are fewer than two."""
     if len(names) < 2:
         return None
     labels = ["focal" if name == "fx" and "fy" not in names else name for name in names]
@@ -85,7 +77,6 @@ def _table(source: str, names: Sequence[str], values: Mapping[str, float]) -> Co
 
 
 def _sentences(names: Sequence[str], rows: Sequence[Sequence[float | None]]) -> list[str]:
-    """Return the dependent pairs of parameters in words, the most dependent first."""
     pairs = [(value, names[j], names[i]) for j, i in combinations(range(len(names)), 2) if (value := rows[i][j])]
     pairs.sort(key=lambda pair: -abs(pair[0]))
     strong = [pair for pair in pairs if abs(pair[0]) >= 0.5]  # a quarter of the variance is common. By hand
@@ -116,7 +107,6 @@ REMEDY = (
 )
 """For a camera that pairs of photos do not determine."""
 PLACES_IN_K = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
-"""Places of the parameters in K."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +141,6 @@ class StageRow:
     cpu_seconds: float
     peak_mb: float
     share: float
-    """Of the seconds of the run."""
 
 
 def glance(contents: RunContents) -> list[Fact]:
@@ -177,7 +166,6 @@ def _facts(contents: RunContents) -> Iterator[Fact]:
 
 
 def _photo_facts(contents: RunContents) -> Iterator[Fact]:
-    """Yield the number of photos, and the focal length of the first camera."""
     scene, intrinsics, photos = contents.scene, contents.intrinsics, contents.counts("photos")
     if scene is not None:
         count, unusable = len(scene.registered) + len(scene.unregistered), len(photos.get("unusable", ()))
@@ -196,7 +184,6 @@ def _photo_facts(contents: RunContents) -> Iterator[Fact]:
 
 
 def _unit_fact(contents: RunContents) -> Fact:
-    """Return the unit of the model, and its accuracy."""
     if not contents.is_metric:
         return Fact("unit", "arbitrary", "unknown scale")
     frame = contents.frame
@@ -274,7 +261,6 @@ def camera_tables(contents: RunContents) -> list[CameraTable]:
 
 
 def _lens_rows(after: Any) -> list[tuple[str, str, str]]:
-    """Return the lens terms that have a deviation."""
     names = [name for name in after.deviations if name not in PLACES_IN_K]
     first = len(after.params) - len(names)
     return [
@@ -302,7 +288,6 @@ class Comparison:
     """Two runs side by side."""
 
     other: str
-    """Name of the other run."""
     rows: Sequence[tuple[str, str, str]]
     """Name, value in this run, value in the other run."""
 
@@ -376,12 +361,7 @@ class PhotoRow:
 
 
 def photo_rows(contents: RunContents, figures: ModelFigures | None, pictures: Mapping[str, str]) -> list[PhotoRow]:
-    """Return the rows of all photos by name, unusable files last.
-
-    Args:
-        figures: of the model, if any.
-        pictures: addresses of small pictures by photo; some may be missing.
-    """
+    """Return the rows of all photos by name, unusable files last; `pictures` are addresses of some by photo."""
     if contents.photos is None:
         return []
     photos = contents.photos.photos
@@ -406,7 +386,6 @@ def photo_rows(contents: RunContents, figures: ModelFigures | None, pictures: Ma
 
 
 def _state(photo: Photo, contents: RunContents) -> tuple[str, str]:
-    """Return whether a photo is placed, and the reason if not."""
     scene = contents.scene
     if scene is None:
         return USABLE, ""

@@ -67,7 +67,6 @@ def model_cutout(contents: RunContents) -> NDArray[np.uint8] | None:
 
 
 def _surface(contents: RunContents) -> Model | None:
-    """Return the textured surface in the frame of exported files; None if it is missing or damaged."""
     if "texture" not in contents.stages:
         return None
     try:

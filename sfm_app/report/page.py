@@ -43,7 +43,6 @@ ASSETS = Path(__file__).parent / "assets"
 
 BEGIN, END, OWN_PART = "<script>", "</script>", "var camera,controls,scene"
 NEEDED = ("THREE={}", "THREE.GLTFLoader=GLTFLoader")
-"""Text of the script that the page needs."""
 
 
 @cache
@@ -62,11 +61,7 @@ def three_script() -> str:
 def finish_report(run: RunContext, problem: SfmError | None = None) -> Path | None:
     """Note how a run ended, and write its report; a failure here does not end the run.
 
-    Args:
-        problem: the error that ended the run; None if it finished.
-
-    Returns:
-        The report; None if no run has begun in the folder, or another run is using it.
+    The result is None if no run has begun in the folder, or another run is using it.
     """
     place = run.workspace
     if not (place.root / LOCK).exists():
@@ -88,23 +83,16 @@ def finish_report(run: RunContext, problem: SfmError | None = None) -> Path | No
 
 
 def write_report(run: RunContext, beside_run: RunContext | None = None) -> Path:
-    """Write OUT/report.html from the products of the finished stages, and return its path.
-
-    Args:
-        beside_run: another run to compare it with.
-
-    Raises:
-        InputError: a folder holds no run.
-    """
+    """Write OUT/report.html from the products of the finished stages, beside another run, and return its path."""
     contents, other = read_run(run), read_run(beside_run) if beside_run is not None else None
-    path = run.workspace.root / REPORT
+    path, view = run.workspace.root / REPORT, embedded_view(contents, photo_names(contents))
+    parts = LargeParts(embedded_pictures(contents), view, is_served=False)
     with replace_atomically(path) as draft:
-        draft.write_text(render_page(contents, embed_parts(contents), other), encoding="utf-8", newline="\n")
+        draft.write_text(render_page(contents, parts, other), encoding="utf-8", newline="\n")
     return path
 
 
 def _is_up_to_date(place: Workspace) -> bool:
-    """Return whether the report was written after the last change of the manifest."""
     report, manifest = place.root / REPORT, place.manifest.path
     return report.exists() and manifest.exists() and report.stat().st_mtime_ns >= manifest.stat().st_mtime_ns
 
@@ -119,11 +107,6 @@ class LargeParts:
     """Data of the 3D view; None if no photo is placed."""
     is_served: bool
     """Whether the page loads them from its server; else they are in the page."""
-
-
-def embed_parts(contents: RunContents) -> LargeParts:
-    """Return the large parts as data in the page."""
-    return LargeParts(embedded_pictures(contents), embedded_view(contents, photo_names(contents)), is_served=False)
 
 
 def read_run(run: RunContext) -> RunContents:
@@ -166,7 +149,6 @@ def render_page(contents: RunContents, parts: LargeParts, other: RunContents | N
 
 
 def _read_model(contents: RunContents) -> ModelFigures | None:
-    """Return the figures of COLMAP's model; None if there is none, or it cannot be read."""
     if contents.scene is None:
         return None
     try:

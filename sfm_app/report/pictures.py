@@ -138,7 +138,6 @@ def _draw_above(contents: RunContents, figures: ModelFigures | None) -> PageFigu
 
 
 def _strongest_pairs(contents: RunContents, centers: Mapping[str, FloatArray]) -> list[tuple[str, ...]]:
-    """Return the placed pairs of photos with most inliers, by name."""
     views, matches = contents.views, contents.matches
     if views is None or matches is None:
         return []
@@ -238,7 +237,6 @@ class DepthPicture:
 
     name: str
     text: str
-    """Caption, and text for screen readers."""
     address: str
     """JPEG as a data address: the photo at the left, depths at the right."""
     size: tuple[int, int]
@@ -273,10 +271,10 @@ def spread_names(names: Sequence[str], most: int) -> list[str]:
 
 
 def _draw(dense: Path, name: str, share: float) -> DepthPicture | None:
-    """Return one photo beside its depths; None if a file is missing or damaged."""
     try:
         photo, depth = read_photo_and_depth(dense, name)
-        size = _shrunk_size(depth.shape[1], depth.shape[0])
+        scale = min(1.0, SIDE_PX / max(depth.shape))
+        size = max(1, round(depth.shape[1] * scale)), max(1, round(depth.shape[0] * scale))
         small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
         nearest = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.float64)
         colors, (near, far) = depth_colors(nearest)
@@ -292,10 +290,8 @@ def _draw(dense: Path, name: str, share: float) -> DepthPicture | None:
 def depth_colors(depth: FloatArray) -> tuple[ByteArray, tuple[float, float]]:
     """Return the colors (H, W, 3) RGB of depths, yellow near and violet far, and the depths at both ends.
 
-    Colors are even in 1 / depth, as disparities are: otherwise the near half of a scene has one color.
-
-    Args:
-        depth: (H, W), <= 0 or not finite for unknown depths.
+    Colors are even in 1 / depth, as disparities are: otherwise the near half of a scene has one color. Unknown depths
+    are <= 0 or not finite.
 
     Raises:
         ValueError: no pixel has a depth.
@@ -309,9 +305,3 @@ def depth_colors(depth: FloatArray) -> tuple[ByteArray, tuple[float, float]]:
     level = np.clip((inverse - 1.0 / far) / span, 0.0, 1.0)
     colors = cv2.applyColorMap(np.round(255.0 * level).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]
     return np.where(known[..., None], colors, np.array(UNKNOWN, np.uint8)).astype(np.uint8), (near, far)
-
-
-def _shrunk_size(width: int, height: int) -> tuple[int, int]:
-    """Return width and height at most SIDE_PX long, in the same ratio."""
-    scale = min(1.0, SIDE_PX / max(width, height))
-    return max(1, round(width * scale)), max(1, round(height * scale))

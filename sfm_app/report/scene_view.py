@@ -15,7 +15,6 @@ from sfm_app.colmap.model import sparse_model
 from sfm_app.formats.frusta import center, frustum_depth, scene_size
 from sfm_app.formats.gltf import FLIP, write_glb
 from sfm_app.frame.scale import move_model
-from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import Json
 from sfm_app.report.contents import UNREADABLE, RunContents
 from sfm_app.stages import texture
@@ -54,20 +53,16 @@ def view_points(contents: RunContents) -> Model | None:
 
 
 def view_frame(contents: RunContents, points: Model, photos: Sequence[str]) -> dict[str, Json]:
-    """Return the data of the 3D view besides model and points: cameras, and the scene's place and size.
-
-    Args:
-        photos: names of the photos in the order of the page's rows.
-    """
+    """Return the data of the 3D view besides model and points: cameras, and the scene's place and size."""
     rows = {name: number for number, name in enumerate(photos)}
-    middle, size = _bounds(points)
+    (middle, size), similarity = _bounds(points), contents.frame.from_model
     return {
         "cameras": [_camera(camera, rows.get(camera.name)) for camera in points.cameras],
         "middle": middle,
         "size": size,
         "depth": frustum_depth(np.array([center(camera) for camera in points.cameras]), points.surface.vertices),
         "unit": "m" if contents.is_metric else "",
-        "fromModel": _plain_similarity(contents.frame.from_model),
+        "fromModel": {"scale": similarity.scale, "R": similarity.R.ravel().tolist(), "t": similarity.t.tolist()},
     }
 
 
@@ -84,7 +79,6 @@ def light_model(contents: RunContents) -> bytes:
 
 
 def _model_bytes(contents: RunContents) -> bytes:
-    """Return the finished model as GLB, lighter if it is large; empty if there is none."""
     path = model_file(contents)
     if path is None:
         return b""
@@ -114,14 +108,12 @@ def _shrink(page: NDArray[np.uint8], most: int) -> NDArray[np.uint8]:
 
 
 def _sample(points: Model) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return places and colors of at most 60 000 points, drawn with a fixed seed."""
     places, colors = points.surface.vertices, points.surface.colors
     chosen = np.sort(np.random.default_rng(0).permutation(len(places))[:60_000])
     return places[chosen], np.ascontiguousarray(colors[chosen])
 
 
 def _bounds(points: Model) -> tuple[list[float], float]:
-    """Return the middle of the points and the size of the scene; without points, of the cameras."""
     places = points.surface.vertices
     if not len(places):
         places = np.array([center(camera) for camera in points.cameras]).reshape(-1, 3)
@@ -143,11 +135,6 @@ def _camera(camera: Frustum, row: int | None) -> dict[str, Any]:
         "across": float(camera.width / (2 * camera.K[0, 0])),
         "down": float(camera.height / (2 * camera.K[1, 1])),
     }
-
-
-def _plain_similarity(similarity: Similarity) -> dict[str, Json]:
-    """Return scale, rotation by rows and translation; `--scale` takes points in the model's frame."""
-    return {"scale": similarity.scale, "R": similarity.R.ravel().tolist(), "t": similarity.t.tolist()}
 
 
 def _base64(data: bytes) -> str:

@@ -77,7 +77,6 @@ SMALL_PX, LARGE_PX = 320, 2400
 """Longer sides of the pictures in the table, and of those opened by a click. By hand."""
 HTML, JPEG, GLB, BYTES = "text/html; charset=utf-8", "image/jpeg", "model/gltf-binary", "application/octet-stream"
 NUMBERED = re.compile(r"/(pictures|photos|points)/([0-9]{1,9})")
-"""Addresses of numbered resources."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +84,7 @@ class Resource:
     """Answer to a request."""
 
     kind: str
-    """Its media type."""
     content: bytes | Path
-    """Bytes, or a file."""
 
 
 @dataclass
@@ -135,7 +132,6 @@ class RunResources:
         return self._find_numbered(numbered[1], int(numbered[2])) if numbered else None
 
     def _find_light(self) -> Resource | None:
-        """Return the lighter model; None if it is not needed or fails."""
         if not self._is_large():
             return None
         try:
@@ -156,7 +152,6 @@ class RunResources:
         return Resource(JPEG, jpeg) if jpeg else None
 
     def _is_large(self) -> bool:
-        """Return whether the page shows a lighter model first."""
         model = model_file(self.contents)
         return model is not None and model.stat().st_size > self.most_bytes
 
@@ -175,11 +170,7 @@ class RunResources:
 
 
 def read_resources(run: RunContext) -> RunResources:
-    """Return the resources of a run, with its page rendered.
-
-    Raises:
-        InputError: the folder holds no run.
-    """
+    """Return the resources of a run, with its page rendered."""
     contents = read_run(run)
     resources = RunResources(contents, photo_names(contents), view_points(contents))
     _ = resources.page
@@ -299,16 +290,7 @@ def open_server(resources: RunResources, port: int = 0) -> ViewServer:
 
 
 def serve_run(run: RunContext, port: int, started: Callable[[str], None]) -> None:
-    """Serve the page of a run until Ctrl-C.
-
-    Args:
-        port: 0 for any free port.
-        started: called with the address when the page can be opened.
-
-    Raises:
-        InputError: the folder holds no run.
-        ConfigError: the port cannot be used.
-    """
+    """Serve the page of a run until Ctrl-C; `started` is called with its address. Port 0 is any free one."""
     run.progress.say("preparing the page")
     with open_server(read_resources(run), port) as server:
         try:

@@ -133,7 +133,6 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
 
 
 def _property_texts(camera: Calibration, photos: Mapping[int, str]) -> Iterator[str]:
-    """Yield the properties of a camera; `photos` are names by id."""
     if not camera.identifiable:
         source = SOURCES.get(camera.method, camera.method)
         yield f"these photos do not determine it ({camera.reason}): {source}"
@@ -149,7 +148,6 @@ def _property_texts(camera: Calibration, photos: Mapping[int, str]) -> Iterator[
 
 
 def _camera_text(camera: Calibration) -> str:
-    """Return K with its deviations; panoramas have no K."""
     if camera.projection == EQUIRECTANGULAR:
         return f"{field_text(camera)}, {camera.width} x {camera.height} px"
     return k_text(camera.K, camera.spread)
@@ -177,12 +175,7 @@ def contradiction_lines(counts: Mapping[str, Any]) -> list[str]:
 
 
 def k_text(K: Any, spread: Mapping[str, float] = MappingProxyType({})) -> str:
-    """Return focals and center in pixels, with their known standard deviations.
-
-    Args:
-        K: (3, 3) in pixels.
-        spread: standard deviations in pixels, by "fx", "fy", "cx", "cy"; any may be missing.
-    """
+    """Return focals and center of K (3, 3) in pixels, with those standard deviations that are known."""
     values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     parts = (
         f"{name} {value:.1f}" + (f" +- {spread[name]:.1f}" if name in spread else "") for name, value in values.items()
@@ -290,7 +283,6 @@ def _remark_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iter
 
 
 def _mapping_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the mapper and the hypotheses that it tried."""
     because = f": {counts['mapper_reason']}" if counts.get("mapper_reason") else ""
     yield f"mapped {MAPPERS[summary['mapper']]}{because}"
     for joins in (one["dropped_joins"] for one in counts.get("parts", ()) if one["dropped_joins"]):
@@ -309,7 +301,6 @@ def _mapping_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Ite
 
 
 def _shutter_lines(shutter: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the rolling shutter of a video."""
     if not shutter:
         return
     time = f"{shutter['readout_ms']:.1f} +- {shutter['deviation_ms']:.1f} ms" if "readout_ms" in shutter else ""
@@ -320,7 +311,6 @@ def _shutter_lines(shutter: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _adjustment_warnings(adjustment: Mapping[str, Any]) -> Iterator[str]:
-    """Yield warnings about the last bundle adjustment."""
     if adjustment.get("failed"):
         yield (
             f"beware: the last adjustment failed ({adjustment['failed']}); cameras and poses are those of mapping, "
@@ -333,7 +323,6 @@ def _adjustment_warnings(adjustment: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _doubt_lines(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Yield warnings about look-alikes, possible folds, and parts with weakly determined scale."""
     for join in summary.get("look_alikes", ()):
         here, there = (list_names(names, NAMES_SHOWN) for names in join["between"])
         yield (

@@ -2,6 +2,7 @@
 
 ``python -m sfm_app.runtime.cluster SCHEDULER COUNT FOLDER PARENT`` starts workers on this machine, one process of one
 thread each, in a process group of their own: Ctrl-C does not reach it, and it ends with its parent.
+ClusterError: no scheduler answers, it is gone, has no workers or unfit ones, or an item ends each worker that tries it.
 """
 
 import contextlib
@@ -73,15 +74,10 @@ class Serialized:
     path: str = ""
     """File that has the value instead; empty where `data` has it."""
     digest: str = ""
-    """Of the file."""
 
 
 class Serializer(contextlib.AbstractContextManager["Serializer"]):
-    """Serializes values for other processes; each shared value becomes one file until the end of the block.
-
-    Args:
-        folder: all processes read and write it under this path.
-    """
+    """Serializes values for processes that share a folder; each shared value is one file until the block ends."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -219,7 +215,6 @@ class Probe:
 
     versions: tuple[tuple[str, str], ...]
     folder: str
-    """For large values, in the output folder."""
     name: str
     """File in it that the coordinator wrote."""
 
@@ -245,7 +240,6 @@ class Reply:
     unfit: str = ""
     """Why the worker cannot be used; empty if it can."""
     worker: str = ""
-    """Address of an unfit worker."""
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     """Of the worker and its finished child processes."""
@@ -257,8 +251,11 @@ def answer(call: Call) -> Reply:
         from distributed import get_worker
 
         return Reply(unfit=reason, worker=str(get_worker().address))
+    import cv2
+
     start, spent = time.perf_counter(), cpu_seconds()
-    _use_one_thread()
+    if cv2.getNumThreads() != 1:  # a machine has a worker for each core
+        cv2.setNumThreads(1)
     results: list[Any] = []
     error: Exception | None = None
     is_machine_error = False
@@ -303,14 +300,6 @@ def picklable(err: Exception) -> Exception:
     return RuntimeError(f"{type(err).__name__}: {err}")
 
 
-def _use_one_thread() -> None:
-    """Let OpenCV use one thread, since a machine has a worker for each core."""
-    import cv2
-
-    if cv2.getNumThreads() != 1:
-        cv2.setNumThreads(1)
-
-
 # The connection: to a running cluster, or to processes of this machine that end with the run.
 
 RESUME_HINT = "start it again, and the same command resumes; or leave --cluster out"
@@ -323,13 +312,7 @@ def local_workers(address: str) -> int:
 
 
 class Cluster:
-    """The workers of a cluster, seen from the coordinating process.
-
-    Args:
-        client: Dask's client.
-        folder: for large values, in the output folder.
-        limit: most workers at once; 0 for all. Those of this machine share its memory.
-    """
+    """The workers of a cluster, seen from the coordinating process: at most `limit` at once, or all for 0."""
 
     def __init__(self, client: Any, folder: Path, settings: ClusterSettings, limit: int = 0) -> None:
         self.client, self.folder, self.settings, self.limit = client, folder, settings, limit
@@ -344,11 +327,7 @@ class Cluster:
         return str(self.settings.address)
 
     def threads(self) -> int:
-        """Return how many tasks can run at once; at least 1.
-
-        Raises:
-            ClusterError: the scheduler is gone.
-        """
+        """Return how many tasks can run at once; at least 1."""
         return max(1, self._count_threads())
 
     def _count_threads(self) -> int:
@@ -364,11 +343,7 @@ class Cluster:
         return self._threads
 
     def probe(self) -> Probe:
-        """Return the requirements of this run, after checking all present workers.
-
-        Raises:
-            ClusterError: a worker has other versions, or does not see the output folder.
-        """
+        """Return the requirements of this run, after checking all present workers."""
         if self._probe is None:
             self.folder.mkdir(parents=True, exist_ok=True)
             name = f"probe-{secrets.token_hex(8)}.txt"
@@ -380,11 +355,7 @@ class Cluster:
         return self._probe
 
     def check_versions(self) -> list[str]:
-        """Return the other kinds of processors among the workers.
-
-        Raises:
-            ClusterError: a worker has other versions.
-        """
+        """Return the other kinds of processors among the workers."""
         ours = worker_versions()
         others = self.ask_all(worker_versions)
         wrong = {worker: differences(ours, theirs) for worker, theirs in others.items()}
@@ -428,9 +399,6 @@ class Cluster:
     def wait(self, future: Any, what: str) -> Reply | None:
         """Return the reply of a call; None if each worker that tried it ended.
 
-        Args:
-            what: name of the task, for messages.
-
         Raises:
             ClusterError: the scheduler is gone, or it has had no workers for too long.
         """
@@ -455,11 +423,6 @@ class Cluster:
             self.cpu_seconds += reply.cpu_seconds
             return reply  # type: ignore[no-any-return]
 
-    def leave_out(self, address: str) -> None:
-        """Remove an unfit worker."""
-        with contextlib.suppress(Exception):  # it may be gone already
-            self.client.retire_workers([address], close_workers=True)
-
     def make_loss_error(self) -> ClusterError:
         """Return the error that says that the scheduler is gone."""
         return ClusterError(f"the scheduler of the cluster ({self.address}) is gone", hint=RESUME_HINT)
@@ -479,15 +442,7 @@ class Cluster:
 
 @contextlib.contextmanager
 def connect(settings: ClusterSettings, folder: Path) -> Iterator[Cluster]:
-    """Provide the cluster of an address; a cluster on this machine ends with the block.
-
-    Args:
-        folder: for large values, in the output folder.
-
-    Raises:
-        ConfigError: Dask is not installed.
-        ClusterError: no scheduler answers, or it has no workers.
-    """
+    """Provide the cluster of an address; a cluster on this machine ends with the block."""
     count = local_workers(settings.address)
     try:
         import distributed
@@ -495,7 +450,9 @@ def connect(settings: ClusterSettings, folder: Path) -> Iterator[Cluster]:
         raise ConfigError(
             "a cluster needs Dask, which is not installed", hint="pip install 'sfm-app[cluster]'"
         ) from None
-    _quiet()
+    known = [name for name in logging.root.manager.loggerDict if name.startswith("distributed.")]
+    for name in ("distributed", "tornado", "asyncio", *known):  # this program reports errors in one line
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     import dask
 
     with contextlib.ExitStack() as stack:
@@ -559,13 +516,6 @@ def _close(client: Any) -> None:
         client.close(timeout=OPTIONS.closing_s)
 
 
-def _quiet() -> None:
-    """Keep Dask's own messages off the terminal; this program reports errors in one line."""
-    known = [name for name in logging.root.manager.loggerDict if name.startswith("distributed.")]
-    for name in ("distributed", "tornado", "asyncio", *known):
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-
-
 def run_local_workers(scheduler: str, count: str, scratch: str, parent: str) -> None:
     """Run `count` workers until the process with the number `parent` ends; `scratch` is Dask's folder."""
     import dask
@@ -585,18 +535,12 @@ def run_local_workers(scheduler: str, count: str, scratch: str, parent: str) -> 
 
 @dataclass(slots=True, eq=False)
 class _Flight:
-    """Items sent to a worker."""
-
     items: list[Any]
     future: Any = field(default=None)
 
 
 class ClusterExecutor(RemoteExecutor):
-    """Threads of this process, and a cluster for tasks.
-
-    Args:
-        workers: number of threads; on this machine, also the most tasks at once.
-    """
+    """Threads of this process, and a cluster for tasks; on this machine, `workers` is also the most tasks at once."""
 
     def __init__(self, cluster: Cluster, workers: int) -> None:
         super().__init__(max_workers=workers, thread_name_prefix="sfm")
@@ -615,15 +559,9 @@ class ClusterExecutor(RemoteExecutor):
         return self.cluster.cpu_seconds
 
     def spread(self, task: Task[Result], items: Iterable[Any]) -> Iterator[Result]:
-        """Yield the results of a task in the order of the items.
+        """Yield the results of a task in the order of the items, which are drawn only as they are needed.
 
         Another worker repeats a call whose worker is lost. This process repeats items that fail with a machine error.
-
-        Args:
-            items: drawn only as they are needed.
-
-        Raises:
-            ClusterError: the scheduler is gone, or an item ends each worker that tries it.
         """
         with Serializer(self.cluster.folder) as serializer:
             yield from _Spreading(self, task, serializer).results(iter(items))
@@ -635,8 +573,6 @@ class ClusterExecutor(RemoteExecutor):
 
 
 class _Spreading:
-    """One task applied to all items."""
-
     def __init__(self, executor: ClusterExecutor, task: Task[Any], serializer: Serializer) -> None:
         self.executor, self.cluster, self.task, self.serializer = executor, executor.cluster, task, serializer
         self.probe = self.cluster.probe()
@@ -660,21 +596,23 @@ class _Spreading:
                 yield from self._land(flights[0])
                 flights.popleft()
         finally:
-            self._cancel(flights)
+            with contextlib.suppress(Exception):  # the scheduler may be gone
+                self.cluster.client.cancel([flight.future for flight in flights], force=True)
 
     def _send(self, items: list[Any]) -> _Flight:
         call = Call(self.probe, self.function, self.serializer.serialize(items))
         return _Flight(items, self.cluster.submit(call, next(self._keys)))
 
     def _land(self, flight: _Flight) -> Iterator[Any]:
-        """Yield the results of one call."""
         reply = self._wait(flight)
         if reply is None:  # calls that waited on the lost workers count as lost, too: find the one to blame
             for item in flight.items:
                 yield from self._land_alone(item)
             return
         done = deserialize(reply.results, remove=True) if reply.results is not None else []
-        self._adapt(reply, len(done))
+        if done:
+            best = OPTIONS.call_s * len(done) / max(reply.seconds, 1e-6)
+            self._size = max(1, min(OPTIONS.most_items, int(best), 2 * self._size))
         yield from done
         rest = flight.items[len(done) :]
         if reply.error is not None and reply.is_machine_error:
@@ -707,19 +645,9 @@ class _Spreading:
             if reply is None or not reply.unfit:
                 return reply
             logger.info("the program removes a worker: %s", reply.unfit)
-            self.cluster.leave_out(reply.worker)
+            with contextlib.suppress(Exception):  # it may be gone already
+                self.cluster.client.retire_workers([reply.worker], close_workers=True)
             flight.future = self._send(flight.items).future
-
-    def _adapt(self, reply: Reply, done: int) -> None:
-        """Choose the number of items per call from the duration of the last one."""
-        if done:
-            best = OPTIONS.call_s * done / max(reply.seconds, 1e-6)
-            self._size = max(1, min(OPTIONS.most_items, int(best), 2 * self._size))
-
-    def _cancel(self, flights: Iterable[_Flight]) -> None:
-        futures = [flight.future for flight in flights]
-        with contextlib.suppress(Exception):  # the scheduler may be gone
-            self.cluster.client.cancel(futures, force=True)
 
 
 def describe_item(item: object) -> str:

@@ -75,7 +75,6 @@ class RunContext:
     workers: int
     progress: Progress = field(default_factory=SilentProgress)
     fingerprint: str = ""
-    """Hash of everything that determines the stage's result."""
     given: GivenCameras = field(default_factory=GivenCameras)
     """Cameras from the user's calibration file."""
     control_points: ControlPoints = field(default_factory=ControlPoints)

@@ -14,8 +14,7 @@ from sfm_app.types import Photo
 SHARE_OF_MACHINE = 0.8
 """Share of the machine's memory that a run may use without a limit. By hand."""
 FUSED_AT_ONCE_MP = 75.0
-"""Megapixels of depth maps that are fused at once; more are fused in blocks. 150 MP double the memory and save no time
-(1000 photos of a town)."""
+"""Megapixels of depth maps that are fused at once; 150 double the memory and save no time."""
 MAPS_MB_PER_MP = 28
 """Memory in MB per megapixel of depth maps. Measured."""
 REFINED_AT_ONCE_MP = 100.0
@@ -57,9 +56,8 @@ class Plan:
     pairs: int
     workers: int
     core_seconds: Mapping[str, float]
-    """By stage."""
     memory_mb: Mapping[str, float]
-    """Peak memory by stage."""
+    """Both by stage; the memory is the peak."""
 
     def minutes(self, stages: Iterable[str]) -> float:
         """Return how many minutes these stages take."""
@@ -180,11 +178,9 @@ def choose_plan(
 
 
 def _refine_mb(megapixels: float) -> float:
-    """Return the memory in MB of the surface's refinement with photos of so many megapixels."""
     return OPTIONS.refine_mb + megapixels + OPTIONS.refine_mb_per_mp * min(megapixels, REFINED_AT_ONCE_MP)
 
 
 def _megapixels(size: tuple[int, int], longest: int) -> float:
-    """Return the megapixels of a photo after it is scaled down to a longest side."""
     scale = min(1.0, longest / max(size))
     return size[0] * size[1] * scale**2 / 1e6

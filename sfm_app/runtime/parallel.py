@@ -42,11 +42,7 @@ def worker_count(setting: int) -> int:
 
 
 def make_executor(workers: int, like: Executor | None = None) -> Executor:
-    """Make a thread pool: the heavy work (numba, OpenCV, COLMAP) releases the GIL, and nothing has to be pickled.
-
-    Args:
-        like: an executor with workers elsewhere; the new one shares them.
-    """
+    """Make a thread pool, which shares the workers elsewhere of `like`: numba, OpenCV and COLMAP release the GIL."""
     if isinstance(like, RemoteExecutor):
         return like.with_threads(workers)
     return ThreadPoolExecutor(max_workers=workers, thread_name_prefix="sfm")
@@ -54,10 +50,7 @@ def make_executor(workers: int, like: Executor | None = None) -> Executor:
 
 @contextmanager
 def open_executor(settings: Settings, folder: Path, progress: Progress) -> Iterator[tuple[Executor, int]]:
-    """Provide the executor of a run, and its number of workers; both end with the block.
-
-    Args:
-        folder: for large values sent to a cluster, in the output folder; removed at the end.
+    """Provide the executor of a run, and its number of workers; both end with the block, and `folder` is removed.
 
     Raises:
         ConfigError: Dask is not installed.
@@ -89,17 +82,10 @@ def open_executor(settings: Settings, folder: Path, progress: Progress) -> Itera
 def ordered_map(
     executor: Executor, function: Callable[[Item], Result], items: Iterable[Item], ahead: int
 ) -> Iterator[Result]:
-    """Yield results in the order of the items, with few of them in flight, so that memory stays bounded.
+    """Yield results in the order of the items, with at most `ahead` of them in flight, so that memory stays bounded.
 
-    If the caller stops early or an item fails, calls that have not begun are canceled.
-
-    Args:
-        function: only a `Task` leaves this process.
-        items: drawn only as they are needed.
-        ahead: most items in flight; at least 1. A cluster chooses its own number.
-
-    Raises:
-        ClusterError: the cluster is gone, or a task ends each worker that tries it.
+    If the caller stops early or an item fails, calls that have not begun are canceled. Only a `Task` leaves this
+    process, and a cluster chooses its own number in flight.
     """
     if isinstance(executor, RemoteExecutor) and isinstance(function, Task):
         yield from executor.spread(function, items)

@@ -50,8 +50,7 @@ class StageRecord:
     cpu_seconds: float | None = None
     """Of the program and its processes, on all cores; None if not measured."""
     photos: Mapping[str, str] = field(default_factory=dict)
-    """Hash of each photo by name, in the record of the first stage after the photos: by it, a later run finds added and
-    removed photos."""
+    """Hash of each photo by name, in the record of the first stage after the photos."""
 
 
 class Manifest:
@@ -72,11 +71,7 @@ class Manifest:
         return manifest if isinstance(manifest, dict) and isinstance(manifest.get("stages", {}), dict) else {}
 
     def check_format(self) -> None:
-        """Check that this program can read the files of the run.
-
-        Raises:
-            InputError: another version of the program wrote them.
-        """
+        """Check that this program can read the files of the run; InputError if another version wrote them."""
         manifest = self.read()
         if manifest.get("stages") and manifest.get("program") == PROGRAM and manifest.get("format") != FORMAT:
             raise InputError(
@@ -85,11 +80,7 @@ class Manifest:
             )
 
     def check_begun(self) -> None:
-        """Check that the folder holds a run that this program can read.
-
-        Raises:
-            InputError: there is no run, or another version of the program made it.
-        """
+        """Check that the folder holds a run that this program can read; InputError if not."""
         if not self.read():
             default = self.root.resolve()
             default = default.with_name(f"{default.name}-model")  # where a run without -o writes
@@ -177,7 +168,6 @@ class Workspace:
         self.photos = root / "photos"
         """Upright photos that COLMAP can read: links if it can read the file itself, else copies."""
         self.frames = root / "frames"
-        """Chosen frames of a video."""
         self.frames_marker = root / "frames.unfinished.json"
         """Chosen frames and fingerprint of the inputs, until the frames are read."""
         self.masks = root / "masks"
@@ -185,11 +175,9 @@ class Workspace:
         self.database = root / DATABASE
         """COLMAP's database: photos, keypoints and matches."""
         self.photo_set = root / PHOTO_SET
-        """Data of the photos."""
         self.photo_stats = root / PHOTO_STATS
         """Measurements of every photo: a run that knows a file by its bytes does not decode it again."""
         self.view_graph = root / VIEW_GRAPH
-        """Fundamental matrices."""
         self.calibration = root / CALIBRATION
         """Cameras calibrated from pairs."""
         self.scene = root / SCENE
@@ -207,7 +195,6 @@ class Workspace:
         self.fine_surface = self.surface / FINE
         """Surface before simplification, for a normal map."""
         self.texture = root / "texture"
-        """The surface with its texture."""
         self.database_marker = root / f"database.{UNFINISHED}"
         """Fingerprint of the inputs while the database is filled."""
         self.feature_parts = root / FEATURES
@@ -227,11 +214,7 @@ class Workspace:
         return Workspace(self.root / EARLIER)
 
     def create(self) -> None:
-        """Make the folder and check that it is writable.
-
-        Raises:
-            InputError: it is not, or it holds files that a run would overwrite, or links that it would write through.
-        """
+        """Make the folder; InputError if it is not writable, or has files or links that a run would overwrite."""
         known = any((self.root / name).exists() for name in (LOCK, MANIFEST))
         foreign = [] if known else [name for name in OUTPUT_NAMES if (self.root / name).exists()]
         if foreign:
@@ -267,11 +250,7 @@ class Workspace:
                 yield from (below for below in path.rglob("*") if is_link(below))
 
     def check_no_overlap(self, photos: Path, what: str = "photos") -> None:
-        """Check that a run would not overwrite its photos or masks (`what`).
-
-        Raises:
-            InputError: it would.
-        """
+        """Check that a run would not overwrite its photos or masks (`what`); InputError if it would."""
         folder, out = photos.resolve(), self.root.resolve()
         if folder == out:
             raise InputError(
@@ -285,11 +264,7 @@ class Workspace:
 
     @contextlib.contextmanager
     def hold_lock(self) -> Iterator[None]:
-        """Hold the lock that keeps other runs out; the system releases it when this process ends.
-
-        Raises:
-            InputError: another run holds it.
-        """
+        """Hold the lock that keeps other runs out (InputError) until the block, or this process, ends."""
         holder = self.root / HOLDER
         lock = FileLock(self.root / LOCK, timeout=0)
         try:
@@ -323,9 +298,6 @@ class Workspace:
         """Check that the folder still exists during a run, and is writable.
 
         A removed folder with new files of this run is marked as made by a run: otherwise the next run would refuse it.
-
-        Raises:
-            InputError: it was removed, or is not writable.
         """
         if not (self.root / LOCK).exists():
             names = {path.name for path in self.root.iterdir()} if self.root.is_dir() else set()
@@ -342,11 +314,7 @@ class Workspace:
 
 
 class SubWorkspace(Workspace):
-    """A folder inside the output folder, for another hypothesis about the same photos.
-
-    Args:
-        of: the run's workspace, with photos and masks.
-    """
+    """A folder inside a run's output folder, for another hypothesis about the same photos."""
 
     def __init__(self, of: Workspace, name: str) -> None:
         super().__init__(of.root / name)

@@ -1,4 +1,7 @@
-"""Cameras with any lens, their poses along a photographer's path, and the rays of their pixels."""
+"""Cameras with any lens, their poses along a photographer's path, and the rays of their pixels.
+
+ConfigError for values out of range, and for a distortion that folds within the photo.
+"""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -21,9 +24,6 @@ class Lens:
     A ray at the angle theta to the optical axis has the radius r = tan(theta), 2 tan(theta / 2), theta, or
     2 sin(theta / 2), by projection. Then x_d = x (1 + k1 r^2 + k2 r^4 + ...), plus the tangential terms of COLMAP's
     OPENCV. An equirectangular photo has longitude and latitude instead, and no such terms.
-
-    Raises:
-        ConfigError: the projection is unknown.
     """
 
     projection: str = "perspective"
@@ -43,14 +43,7 @@ class Lens:
         return self.radial[0] if self.radial else 0.0
 
     def rays(self, points: FloatArray) -> FloatArray:
-        """Return (N, 3) directions, z = 1 with "perspective", else of length 1; NaN for points without ray.
-
-        Args:
-            points: (N, 2) on the normalized image plane.
-
-        Raises:
-            ConfigError: the distortion folds within these points, so that one of them has several rays.
-        """
+        """Return directions (N, 3) of image points (N, 2), z = 1 with "perspective", else of length 1; NaN without."""
         if self.projection == "equirectangular":
             longitude, latitude = points.T
             level = np.cos(latitude)
@@ -64,11 +57,7 @@ class Lens:
         return np.column_stack([plain * scale[:, None], np.cos(theta)])
 
     def project(self, rays: FloatArray) -> FloatArray:
-        """Return (N, 2) points of the normalized image plane.
-
-        Args:
-            rays: (N, 3) of any length; in front of the camera with "perspective".
-        """
+        """Return image points (N, 2) of rays (N, 3) of any length; with "perspective", in front of the camera."""
         side = np.hypot(rays[:, 0], rays[:, 1])
         if self.projection == "equirectangular":
             level = np.hypot(rays[:, 0], rays[:, 2])
@@ -78,7 +67,6 @@ class Lens:
         return plain * self._factor(np.hypot(*plain.T))[:, None] + self._shift(plain)
 
     def _radius(self, theta: FloatArray) -> FloatArray:
-        """Return the radius before distortion of a ray at an angle to the optical axis."""
         if self.projection == "perspective":
             return np.asarray(np.tan(theta))
         if self.projection == "stereographic":
@@ -86,7 +74,6 @@ class Lens:
         return theta if self.projection == "equidistant" else np.asarray(2.0 * np.sin(theta / 2.0))
 
     def _angle(self, radius: FloatArray) -> FloatArray:
-        """Return the angle to the optical axis; NaN beyond the ray that looks backwards."""
         if self.projection == "stereographic":
             return np.asarray(2.0 * np.arctan(radius / 2.0))
         if self.projection == "equidistant":
@@ -102,7 +89,6 @@ class Lens:
         return total
 
     def _shift(self, plain: FloatArray) -> FloatArray:
-        """Return (N, 2) the tangential terms."""
         (p1, p2), (x, y) = self.tangential, plain.T
         square = x * x + y * y
         return np.column_stack(
@@ -110,7 +96,6 @@ class Lens:
         )
 
     def _undistort(self, points: FloatArray) -> FloatArray:
-        """Return (N, 2) points without the radial and tangential terms."""
         if not any(self.tangential):
             return self._undistort_radius(points)
         plain = points
@@ -179,11 +164,7 @@ class Views:
         return cls(dict.fromkeys(named, camera), named)
 
     def with_camera(self, camera: Camera, photos: Collection[str]) -> "Views":
-        """Return the views with another camera for some photos.
-
-        Raises:
-            ConfigError: a photo is not among the views.
-        """
+        """Return the views with another camera for some photos."""
         if unknown := sorted(set(photos) - set(self.cameras)):
             raise ConfigError(f"synthetic cameras: no such photo: {', '.join(unknown)}")
         return replace(self, cameras={**self.cameras, **dict.fromkeys(sorted(photos), camera)})
@@ -194,9 +175,6 @@ class ArcOptions:
     """A hand-held walk around the front of a scene: distance, height, aim and roll vary from photo to photo.
 
     They vary because a circle around a point that all photos look at (an orbit) leaves the focal length undetermined.
-
-    Raises:
-        ConfigError: a value is out of range.
     """
 
     photos: int = 12
@@ -243,9 +221,6 @@ def make_camera(
         focal_widths: fx as a share of the width, > 0.
         center: optical center as shares of width and height.
         aspect, radial: fy / fx, > 0; k1 of a perspective lens.
-
-    Raises:
-        ConfigError: a value is out of range.
     """
     if min(width, height) < 16 or not (0 < focal_widths < math.inf and 0 < aspect < math.inf):
         raise ConfigError("synthetic camera: size, focal_widths or aspect is out of range")
@@ -263,9 +238,6 @@ def make_wide_camera(
         width, height: pixels, >= 16.
         field_deg: from one end of the longer side to the other, in degrees, (0, 360); below 180 with "perspective".
         center: optical center as shares of width and height.
-
-    Raises:
-        ConfigError: a value is out of range.
     """
     limit = 180.0 if lens.projection == "perspective" else 360.0
     if min(width, height) < 16 or not 0 < field_deg < limit:
@@ -302,10 +274,6 @@ def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Vie
 def look_at(center: FloatArray, aim: FloatArray, roll_deg: float = 0.0) -> FloatArray:
     """Return (3, 4) cam_from_world of a camera that looks at a point, world y up.
 
-    Args:
-        center, aim: (3,) center of projection, and the point in the middle of the view.
-        roll_deg: rotation about the optical axis.
-
     Raises:
         ValueError: the camera looks straight up or down, so that its roll is undefined.
     """
@@ -332,16 +300,9 @@ def axis_rotation(axis: FloatArray, angle_deg: float) -> FloatArray:
 
 
 def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> FloatArray:
-    """Return viewing directions in the camera frame, row by row.
+    """Return viewing directions (height * width, 3) in the camera frame, row by row; NaN outside the image circle.
 
-    Args:
-        offset_px: position of the ray in each pixel; (0.5, 0.5) is the center.
-
-    Returns:
-        (height * width, 3), z = 1 with a perspective lens, else of length 1; NaN outside the image circle.
-
-    Raises:
-        ConfigError: the radial distortion folds within the photo, so that a pixel has no unique ray.
+    They have z = 1 with a perspective lens, else length 1. An offset of (0.5, 0.5) is the center of a pixel.
     """
     x, y = np.meshgrid(np.arange(camera.width) + offset_px[0], np.arange(camera.height) + offset_px[1])
     x = (x.ravel() - camera.K[0, 2]) / camera.K[0, 0]

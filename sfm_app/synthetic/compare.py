@@ -28,11 +28,7 @@ def focal_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
 
 
 def center_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
-    """Return e_OC of thesis section 5.5.3: mean error of the optical center's x and y in percent of the truth.
-
-    Raises:
-        ValueError: the photos have several cameras, and `photo` names none of them.
-    """
+    """Return e_OC of thesis section 5.5.3: mean error of the optical center's x and y in percent of the truth."""
     true = truth.cameras[photo].K if photo else truth.K
     return float(50.0 * sum(abs(K[i, 2] / true[i, 2] - 1.0) for i in (0, 1)))
 
@@ -45,11 +41,6 @@ def surface_error(
     The reconstruction is aligned with the truth by the similarity between the camera centers. The scene's size is the
     diagonal of the bounding box of the true surface that the photos see. The median ignores missing parts: see
     `surface_coverage`.
-
-    Args:
-        vertices, faces: (V, 3) in the reconstruction's frame, and (T, 3) vertex indices.
-        centers: camera center (3,) by photo name in the frame of `vertices`; at least 3 photos of the truth.
-        samples: points drawn evenly from the surface (fixed seed).
 
     Raises:
         ValueError: fewer than 3 common photos, or the surface has no area.
@@ -94,7 +85,13 @@ def seen_points(truth: Truth) -> FloatArray:
     caster = ray_caster(truth.vertices, truth.faces)
     parts = []
     for name, pose in truth.cam_from_world.items():
-        directions = pixel_rays(_coarse_camera(truth.cameras[name])) @ pose[:, :3]
+        camera = truth.cameras[name]
+        shrink = 96 / max(camera.width, camera.height)
+        K, size = (
+            np.diag([shrink, shrink, 1.0]) @ camera.K,
+            (round(camera.width * shrink), round(camera.height * shrink)),
+        )
+        directions = pixel_rays(Camera(K, *size, camera.lens)) @ pose[:, :3]
         depth = cast_rays(caster, camera_center(pose), directions)["t_hit"].astype(np.float64)
         hit = np.isfinite(depth)
         parts.append(camera_center(pose) + directions[hit] * depth[hit, None])
@@ -102,12 +99,7 @@ def seen_points(truth: Truth) -> FloatArray:
 
 
 def align_centers(centers: Mapping[str, FloatArray], truth: Truth) -> Similarity:
-    """Return the similarity from estimated camera centers (3,), by photo, to the true ones, robust to wrong poses.
-
-    Raises:
-        ValueError: fewer than 3 common photos.
-        NumericalError: the centers lie on a line.
-    """
+    """Return the similarity from estimated camera centers (3,), by photo, to the true ones, robust to wrong poses."""
     true_centers = truth.centers
     names = sorted(set(centers) & set(true_centers))
     if len(names) < 3:
@@ -118,11 +110,7 @@ def align_centers(centers: Mapping[str, FloatArray], truth: Truth) -> Similarity
 
 
 def sample_surface(vertices: FloatArray, faces: IndexArray, count: int, seed: int = 0) -> FloatArray:
-    """Return (count, 3) points drawn uniformly by area from triangles (T, 3) of vertices (V, 3).
-
-    Raises:
-        ValueError: the surface has no area.
-    """
+    """Return (count, 3) points drawn uniformly by area from triangles (T, 3) of vertices (V, 3)."""
     return sample_triangles(vertices, faces, count, seed)[0]
 
 
@@ -155,9 +143,3 @@ def _distances_to_truth(
     """Return (samples,) distances from uniform samples of a reconstructed surface to the true one, in scene sizes."""
     points = sample_surface(align_centers(centers, truth)(vertices), faces, samples)
     return surface_distances(points, truth.vertices, truth.faces) / scene_size(truth)
-
-
-def _coarse_camera(camera: Camera) -> Camera:
-    shrink = 96 / max(camera.width, camera.height)
-    K = np.diag([shrink, shrink, 1.0]) @ camera.K
-    return Camera(K, round(camera.width * shrink), round(camera.height * shrink), camera.lens)

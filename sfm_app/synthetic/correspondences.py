@@ -1,4 +1,7 @@
-"""Correspondences with known truth: the image pairs of thesis section 4.8 and the five-view tracks of section 5.5.3."""
+"""Correspondences with known truth: the image pairs of thesis section 4.8 and the five-view tracks of section 5.5.3.
+
+ConfigError for options out of range, or without a convergent setup of cameras.
+"""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -24,11 +27,7 @@ MAX_SETUPS = 10_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairOptions:
-    """A random image pair; the defaults are those of thesis section 4.8.
-
-    Raises:
-        ConfigError: values are out of range; the message names all of them.
-    """
+    """A random image pair; the defaults are those of thesis section 4.8."""
 
     points: int = 1200
     """Matches, >= 8."""
@@ -62,11 +61,7 @@ class PairOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackOptions:
-    """Tracks through several cameras of one K; the defaults are those of thesis section 5.5.3.
-
-    Raises:
-        ConfigError: values are out of range; the message names all of them.
-    """
+    """Tracks through several cameras of one K; the defaults are those of thesis section 5.5.3."""
 
     cameras: int = 5
     """>= 2."""
@@ -79,7 +74,6 @@ class TrackOptions:
     outliers: float = 0.3
     """Share of wrong matches in the corrupted pairs, in [0, 1)."""
     outlier_range_px: float = 256.0
-    """As in `PairOptions`."""
     other_focal: float = 1.0
     """Focal length of the last camera over that of the others; 1: all cameras share K. In [0.2, 5]."""
     width: int = 512
@@ -119,9 +113,8 @@ class TwoViews:
     """Matches of two views and their ground truth."""
 
     x1: FloatArray
-    """(N, 2) pixels."""
     x2: FloatArray
-    """(N, 2) pixels; row k matches row k of x1."""
+    """(N, 2) pixels; row k of x2 matches row k of x1."""
     is_inlier: NDArray[np.bool_]
     """(N,): False where x2 was displaced. An outlier may still lie near its epipolar line by chance."""
     F: FloatArray
@@ -129,13 +122,11 @@ class TwoViews:
     K1: FloatArray
     K2: FloatArray
     R: FloatArray
-    """(3, 3) rotation of cam2_from_cam1."""
     t: FloatArray
-    """(3,) translation of cam2_from_cam1."""
+    """(3, 3) rotation and (3,) translation of cam2_from_cam1."""
     exact_x1: FloatArray
-    """(N, 2) pixels before noise and outliers."""
     exact_x2: FloatArray
-    """(N, 2) pixels before noise and outliers."""
+    """(N, 2) pixels of both photos before noise and outliers."""
 
     @property
     def K(self) -> FloatArray:
@@ -150,19 +141,16 @@ class Tracks:
     pairs: Mapping[tuple[int, int], TwoViews]
     """Matches per pair of cameras (i, j), i < j; the noise of a point is the same in all pairs."""
     corrupted: tuple[tuple[int, int], ...]
-    """Pairs with outliers."""
     K: FloatArray
     """(C, 3, 3) camera matrix per camera; all equal unless the last one has another focal length."""
     R: FloatArray
-    """(C, 3, 3) rotation of cam_from_world."""
     t: FloatArray
-    """(C, 3) translation of cam_from_world."""
+    """(C, 3, 3) rotations and (C, 3) translations of cam_from_world."""
     X: FloatArray
     """(N, 3) points in the world."""
     x: FloatArray
     """(C, N, 2) pixels with noise, without outliers."""
     size: tuple[int, int]
-    """Width and height in pixels."""
 
     @property
     def F(self) -> FloatArray:
@@ -174,9 +162,6 @@ def make_pair(options: PairOptions, seed: int, max_setups: int = MAX_SETUPS) -> 
     """Return a random convergent camera pair and its matches, as in thesis section 4.8.
 
     Both images get Gaussian noise; then a uniform value is added in image 2 to the outliers, which are random rows.
-
-    Raises:
-        ConfigError: the options leave no convergent setup.
     """
     rng = np.random.default_rng([seed, 408])
     K = camera_matrix(options.focal_px, options.focal_px, options.width / 2, options.height / 2)
@@ -199,9 +184,6 @@ def make_tracks(options: TrackOptions, seed: int, max_setups: int = MAX_SETUPS) 
     """Draw cameras of one random K around a common pose, and points that all of them see, as in thesis 5.5.3.
 
     The orientations are perturbed like the locations, since cameras that only shift leave K undetermined.
-
-    Raises:
-        ConfigError: the options leave no convergent setup.
     """
     rng = np.random.default_rng([seed, 553])
     size = (options.width, options.height)
@@ -219,17 +201,7 @@ def pair_matches(
     tracks: Tracks, outliers: Mapping[tuple[int, int], float] | None = None, outlier_range_px: float = 256.0,
     seed: int = 0,
 ) -> Iterator[tuple[tuple[int, int], FloatArray]]:  # fmt: skip
-    """Yield the matches of every pair of cameras, with outliers in chosen pairs.
-
-    Args:
-        outliers: share of wrong matches, in [0, 1), per pair; no pair by default.
-
-    Yields:
-        Pair (i, j) in the order of `tracks.pairs`, and (N, 4) x1, y1, x2, y2 in pixels.
-
-    Raises:
-        ConfigError: a share is out of range or a pair is not in the tracks.
-    """
+    """Yield each pair of cameras and its matches (N, 4) x1, y1, x2, y2 in pixels; some have shares of outliers."""
     shares = outliers or {}
     check_ranges(
         "synthetic correspondences",

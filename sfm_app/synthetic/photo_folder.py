@@ -1,4 +1,4 @@
-"""Render photo folders with ground truth."""
+"""Render photo folders with ground truth; InputError for a folder that cannot be read or written."""
 
 import json
 from collections.abc import Mapping
@@ -26,11 +26,7 @@ TRUTH_FILE, SURFACE_FILE = "truth.json", "surface.ply"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhotoOptions:
-    """Image quality of rendered photos.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
+    """Image quality of rendered photos."""
 
     supersampling: int = 2
     """Rays per pixel in x and in y, 1..8."""
@@ -43,7 +39,6 @@ class PhotoOptions:
     exposure_ev: float = 0.0
     """Standard deviation of the exposure from photo to photo, in stops, 0..3."""
     seed: int = 0
-    """Same seed, same noise."""
 
     def __post_init__(self) -> None:
         check_ranges(
@@ -62,7 +57,6 @@ class Truth:
     """Ground truth of a rendered photo folder."""
 
     cameras: Mapping[str, Camera]
-    """By photo name."""
     cam_from_world: Mapping[str, FloatArray]
     """By photo name: (3, 4) [R | t]."""
     vertices: FloatArray
@@ -72,11 +66,7 @@ class Truth:
 
     @property
     def camera(self) -> Camera:
-        """The camera of all photos.
-
-        Raises:
-            ValueError: there are several.
-        """
+        """The camera of all photos; ValueError if there are several."""
         first, *others = self.cameras.values()
         if any(_camera_values(camera) != _camera_values(first) for camera in others):
             raise ValueError("the photos were taken with several cameras")
@@ -97,11 +87,7 @@ def write_photo_folder(
     folder: Path, scene: SyntheticScene, views: Views, options: PhotoOptions | None = None,
     progress: Progress | None = None,
 ) -> Truth:  # fmt: skip
-    """Render one JPEG without EXIF per view into a folder; `save_truth` writes the truth elsewhere.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
+    """Render one JPEG without EXIF per view into a folder; `save_truth` writes the truth elsewhere."""
     work = _FolderWork(folder, prepare(scene), views, options or PhotoOptions())
     numbers = range(len(views.cam_from_world))
     try:
@@ -119,13 +105,8 @@ def add_missing_photos(
 ) -> Truth:  # fmt: skip
     """Render the missing photos of a folder in parallel processes; the bytes are those of `write_photo_folder`.
 
-    Other photos of the folder must be of the same scene, views and options, which is not checked.
-
-    Args:
-        processes: >= 1; with 1, this process renders. A script with more needs a `__main__` guard.
-
-    Raises:
-        InputError: the folder cannot be written.
+    Other photos of the folder must be of the same scene, views and options, which is not checked. A script with more
+    than one process needs a `__main__` guard.
     """
     missing = [k for k, name in enumerate(views.cam_from_world) if not (folder / name).exists()]
     arguments, shown = (folder, scene, views, options or PhotoOptions()), progress or SilentProgress()
@@ -152,8 +133,6 @@ def add_missing_photos(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FolderWork:
-    """The scene, views and options of a folder."""
-
     folder: Path
     prepared: PreparedScene
     views: Views
@@ -213,11 +192,7 @@ def save_truth(truth: Truth, folder: Path) -> None:
 
 
 def load_truth(folder: Path) -> Truth:
-    """Read the files that `save_truth` wrote.
-
-    Raises:
-        InputError: the files are missing or malformed.
-    """
+    """Read the files that `save_truth` wrote."""
     try:
         text: dict[str, Any] = json.loads((folder / TRUTH_FILE).read_text(encoding="utf-8"))
         images = text["images"]

@@ -61,14 +61,9 @@ def prepare(scene: SyntheticScene) -> PreparedScene:
 def render_scene(
     scene: PreparedScene, camera: Camera, cam_from_world: FloatArray, supersampling: int = 2
 ) -> FloatArray:
-    """Render the image of a camera, before blur, noise and gamma.
+    """Return the image (height, width, 3) of a camera in linear RGB, about 0..1, before blur, noise and gamma.
 
-    Args:
-        cam_from_world: (3, 4) pose; with a rolling shutter (height, 3, 4), one for each row.
-        supersampling: rays per pixel in x and in y, >= 1; each has its own shadow ray.
-
-    Returns:
-        (height, width, 3) linear RGB, about 0..1.
+    With a rolling shutter, each row has a pose: (height, 3, 4). Each ray of supersampling has its own shadow ray.
     """
     total = np.zeros((camera.height * camera.width, 3))
     offsets = (np.arange(supersampling) + 0.5) / supersampling
@@ -109,12 +104,7 @@ def ray_caster(vertices: FloatArray, faces: NDArray[np.int64]) -> Any:
 
 
 def cast_rays(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[str, NDArray[Any]]:
-    """Return the first hits of rays, by Open3D's names; t_hit is inf for rays that hit nothing.
-
-    Args:
-        origin: (3,), or (N, 3) one per ray.
-        directions: (N, 3) of any length, which is the unit of t_hit.
-    """
+    """Return the first hits of rays, by Open3D's names; t_hit, in lengths of the directions, is inf without a hit."""
     rays = np.empty((len(directions), 6), dtype=np.float32)
     rays[:, :3] = origin
     rays[:, 3:] = directions
@@ -250,7 +240,11 @@ def render_rays(model: Model | PreparedModel, origin: FloatArray, directions: Fl
     uv = hits["primitive_uvs"].reshape(*shape, 2).astype(np.float64)
     weights = np.concatenate([1.0 - uv.sum(axis=-1, keepdims=True), uv], axis=-1)
     surface, texture = prepared.model.surface, prepared.model.texture
-    colors = _vertex_colors(surface, face, weights) if texture is None else _texture_colors(texture, face, weights)
+    if texture is None:
+        corners = surface.colors[surface.faces[face]].astype(np.float64)
+        colors = np.asarray(np.round(np.einsum("hwk,hwkc->hwc", weights, corners)))
+    else:
+        colors = _texture_colors(texture, face, weights)
     return Picture(np.where(covered[..., None], colors, 0).astype(np.uint8), covered)
 
 
@@ -273,16 +267,7 @@ def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: F
 
 
 def comparison_image(photo: Colors, model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Colors:
-    """Return a photo and the model from its camera; below, the model and its untextured shape from the side.
-
-    Args:
-        photo: (h, w, 3) RGB; resized to the camera's size.
-        camera: intrinsics and distortion, and the size of each of the four pictures.
-        cam_from_world: (3, 4) pose.
-
-    Returns:
-        (2 height, 2 width, 3) RGB.
-    """
+    """Return a photo and the model from its camera, RGB; below, the model and its untextured shape from the side."""
     prepared = model if isinstance(model, PreparedModel) else prepare_model(model)
     size = camera.width, camera.height
     fine = Camera(np.diag([2, 2, 1.0]) @ camera.K, 2 * size[0], 2 * size[1], camera.lens)
@@ -305,11 +290,6 @@ def orbited_pose(pose: FloatArray, surface: Surface, angle_deg: float) -> FloatA
     cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
     turned = R @ np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
     return np.column_stack([turned, R @ middle + t - turned @ middle])
-
-
-def _vertex_colors(surface: Surface, face: NDArray[np.int64], weights: FloatArray) -> FloatArray:
-    corners = surface.colors[surface.faces[face]].astype(np.float64)
-    return np.asarray(np.round(np.einsum("hwk,hwkc->hwc", weights, corners)))
 
 
 def _texture_colors(texture: Texture, face: NDArray[np.int64], weights: FloatArray) -> Colors:

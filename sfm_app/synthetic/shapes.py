@@ -114,12 +114,8 @@ def carve(
 ) -> Shape:  # fmt: skip
     """Return the outer surface of a body around the y axis, closed at the top and the bottom.
 
-    It keeps only the outermost radius in each direction, so undercuts are lost.
-
-    Args:
-        field: positive inside the body at points (N, 3).
-        height: lowest and highest sampled level.
-        reach: bound of the distance of the body from the axis.
+    It keeps only the outermost radius in each direction, so undercuts are lost. The field is positive inside the body
+    at points (N, 3), which is within `reach` of the axis.
     """
     angle = 2.0 * math.pi * np.arange(segments) / segments
     # turning from +x towards -z is right-handed about +y
@@ -322,7 +318,6 @@ def bricks(a: float, b: float, seed: int) -> tuple[float, float]:
 
 @kernel
 def _ramp(x: float, low: float, high: float) -> float:
-    """Return 0 below `low`, 1 above `high`, linear in between."""
     return min(1.0, max(0.0, (x - low) / (high - low)))
 
 
@@ -330,15 +325,10 @@ def _ramp(x: float, low: float, high: float) -> float:
 def tiles(
     kind: int, p: tuple[float, float, float], n: tuple[float, float, float], scale: float, seed: int
 ) -> tuple[float, float]:
-    """Return border distance and number as `cells` does, for the tile pattern of a kind.
+    """Return border distance and number as `cells` does, for the tile pattern of a kind at a point with a unit normal.
 
     Bricks on upright walls (1), slabs on the ground (2), leaves along the axis they face most (6), and bricks of bodies
     that may have been turned (8), whose walls run along x or z.
-
-    Args:
-        kind: 1, 2, 6 or 8, as above.
-        n: unit normal there.
-        scale: size of a tile, > 0.
     """
     if kind == 6:
         if abs(n[1]) >= max(abs(n[0]), abs(n[2])):
@@ -355,12 +345,9 @@ def tiles(
 
 @kernel
 def ceramic(p: tuple[float, float, float], scale: float) -> tuple[float, float]:
-    """Return the shares of the second color (glaze) and of the thin lines on Greek pottery.
+    """Return the shares of the second color (glaze) and of the thin lines on Greek pottery, with bands of one height.
 
     Bands follow the height, figures the angle about the y axis.
-
-    Args:
-        scale: height of a band, > 0.
     """
     band = p[1] / scale
     row = math.floor(band)
@@ -385,14 +372,7 @@ def ceramic(p: tuple[float, float, float], scale: float) -> tuple[float, float]:
 def mixture(
     row: NDArray[np.float64], p: tuple[float, float, float], n: tuple[float, float, float], footprint: float
 ) -> tuple[float, float, float]:
-    """Return share of the second color, share of the joint color, and brightness (about 1) at a point of a body.
-
-    Args:
-        row: from `Material.row()`.
-        p: position before `move`.
-        n: unit normal.
-        footprint: size of a pixel on the surface.
-    """
+    """Return shares of the second and the joint color, and brightness (about 1), at a point of a body before `move`."""
     kind, scale, contrast, seed = int(row[0]), row[1], row[2], int(row[3])
     fine = octaves(p, 0.4 * scale, 0.72, footprint, seed + 20)
     broad = octaves(p, 3.0 * scale, 0.5, max(footprint, 0.7 * scale), seed + 40)
