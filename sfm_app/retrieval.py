@@ -165,7 +165,6 @@ def _unit_vectors(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _order_key(image: MatchedImage) -> tuple[float, list[tuple[int, str]], int]:
-    """Return a key by time, then by name with numbers in their order."""
     parts = [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", image.name)]
     return (image.time_s if image.time_s is not None else 0.0), parts, image.id
 

@@ -125,7 +125,6 @@ def sample_pairs(views: ViewGraph, photos: int) -> ViewGraph:
 
 
 def _calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> list[CalibratedCamera]:
-    """Return the cameras of all photos without a wide lens, in pixels of whole photos."""
     options = run.settings.calibration
     calibrator = run.plugins.calibrator(options.calibrator)
     pairs = photo_pairs([image for image in matches.images.values() if image.group not in views.lenses], matches, views)
@@ -138,7 +137,6 @@ def _calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> list[C
 
 
 def _exif_claim(camera: CalibratedCamera, matches: MatchGraph) -> FocalClaim | None:
-    """Return the claim of EXIF about a camera that its photos determine."""
     calibration, images = camera.found, [matches.images[photo] for photo in camera.photos]
     if not calibration.identifiable or calibration.is_given or calibration.projection == EQUIRECTANGULAR:
         return None

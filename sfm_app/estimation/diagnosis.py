@@ -66,7 +66,6 @@ class Diagnosis:
 
     cause: Cause
     message: str
-    """One line."""
 
     @property
     def hint(self) -> str:
@@ -119,7 +118,6 @@ def diagnose_depth(
 
 
 def _count_parallax(pair: PairId, matches: MatchGraph, views: ViewGraph, options: EpipolarSettings) -> int:
-    """Return the inliers of a pair off its dominant plane; with a known lens all, since no plane is degenerate."""
     if any(matches.images[photo].group in views.lenses for photo in pair):
         return views.fits[pair].inlier_count
     return count_matches_off_plane(*matches.points(pair), views.fits[pair].F, options)

@@ -228,7 +228,6 @@ class MatchedPair:
 
 
 def _matched_pairs(matches: MatchGraph, pairs: Iterable[PairId]) -> Iterator[MatchedPair]:
-    """Yield the input of the fits of these pairs."""
     spreads: dict[int, FloatArray] = {}
     for pair in pairs:
         first, second = (matches.images[photo] for photo in pair)
@@ -336,7 +335,6 @@ def read_part(path: Path, pairs: Sequence[PairId]) -> dict[PairId, PairFit] | No
 
 
 def _stationary_matches(matched: MatchedPair, settings: Settings) -> BoolArray:
-    """Return a mask of the matches that are stationary in the picture; none if the photos differ in size."""
     first, second = matched.images
     if (first.width, first.height) != (second.width, second.height):
         return np.zeros(len(matched.points[0]), bool)

@@ -308,10 +308,8 @@ def camera_rules(
 ) -> dict[int, CameraRule]:
     """Return the rules of the user about the cameras of a model, by camera id; empty for none.
 
-    Args:
-        names: camera of each photo, by photo name.
-        intrinsics: cameras before mapping.
-        camera_model: COLMAP's name of the model of all cameras; "auto" for the one that the photos support.
+    `names` has the camera of each photo by photo name. `camera_model` is COLMAP's model of all cameras; "auto"
+    for the one that the photos support.
     """
     rules = {}
     for image in posed_images(model):

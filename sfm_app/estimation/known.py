@@ -79,7 +79,6 @@ def find_or_keep_intrinsics(
 
 
 def _assemble(cameras: list[CalibratedCamera], matches: MatchGraph) -> tuple[Intrinsics, Sequence[CalibratedCamera]]:
-    """Return the cameras as those of a run, the one with most photos first."""
     cameras = sorted(cameras, key=lambda one: (-len(one.photos), one.name))
     intrinsics = Intrinsics(
         cameras={camera.name: camera.found for camera in cameras},
@@ -148,12 +147,10 @@ def _pair_contradictions(
 
 
 def _is_zoom(one: Contradiction) -> bool:
-    """Return whether two cameras differ by more than focusing changes."""
     return one.what not in CENTERS and abs(one.given_px - one.found_px) > 0.05 * one.found_px  # chosen by hand
 
 
 def _part(matches: MatchGraph, views: ViewGraph, images: Mapping[int, MatchedImage]) -> tuple[MatchGraph, ViewGraph]:
-    """Return the matches and fundamental matrices among some photos."""
     keypoints = {photo: matches.keypoints[photo] for photo in images}
     rows = {pair: found for pair, found in matches.matches.items() if images.keys() >= set(pair)}
     fits = {pair: fit for pair, fit in views.fits.items() if images.keys() >= set(pair)}

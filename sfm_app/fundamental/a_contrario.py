@@ -18,9 +18,7 @@ docs/algorithms.md, All estimators. Chosen by hand; not measured on its own."""
 def model_false_alarms(squared: FloatArray, wrong: FloatArray, threshold: float) -> float:
     """Return the expected number of models with as much support among random matches of the same points.
 
-    Args:
-        squared: (N,) squared distances of the matches to the model.
-        wrong: (M,) those of mismatches, from `squared_mismatch_distances`.
+    From the squared distances (N,) of the matches, and those of mismatches, `squared_mismatch_distances`.
     """
     fractions = 1.0, 0.5, 0.25  # precise inliers are stronger evidence; docs/algorithms.md, All estimators
     alarms = []

@@ -59,7 +59,6 @@ def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> 
 
 @kernel
 def _homography(A: FloatArray, e2: FloatArray, v: FloatArray) -> FloatArray:
-    """Return A - e2 v'."""
     H = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -193,17 +192,11 @@ DEGENERACY = DegeneracyOptions()
 def find_degeneracy(
     points: FloatArray, F: FloatArray, inliers: BoolArray, wrong: FloatArray, threshold: float, centers: FloatArray
 ) -> str:
-    """Return the kind of degeneracy that leaves F undetermined.
+    """Return the kind of degeneracy that leaves F undetermined: "" where it is determined.
 
-    Args:
-        inliers: (N,) mask, at least 3 of them True.
-        wrong: (M,) squared distances of mismatches to F, from `squared_mismatch_distances`.
-        centers: (4,) the origin of `points` in a frame that both views share, in the same units.
-
-    Returns:
-        "collinear" where all matches lie on one line of a photo or at one point (up to a few that may be chance),
-            "rotation" where the camera only rotated, "planar" where all matches lie on one plane or too close to it, ""
-            where F is determined.
+    "collinear": all matches lie on one line of a photo or at one point, up to a few that may be chance; "rotation": the
+    camera only rotated; "planar": all matches lie on one plane or too close to it. At least 3 `inliers`; `wrong` are
+    `squared_mismatch_distances`; `centers` (4,) is the origin of `points` in a frame that both views share.
     """
     chance = accidental_share(wrong, threshold)
     for view in range(2):
@@ -253,8 +246,7 @@ def _dominant_line(x: FloatArray, y: FloatArray, width: float) -> tuple[float, f
 def is_rotation(H: FloatArray, points: FloatArray, centers: FloatArray) -> bool:
     """Return whether H = K R K^-1 for one focal length, with the center in the middle of the points of both views.
 
-    Args:
-        centers: (4,) the origin of `points` in a frame that both views share, in the same units.
+    `centers` (4,) is the origin of `points` in a frame that both views share, in the same units.
     """
     shifted = points + centers
     low, high = np.quantile(np.vstack([shifted[:, :2], shifted[:, 2:]]), DEGENERACY.extent_quantiles, axis=0)
@@ -441,7 +433,6 @@ def one_per_cell(points: FloatArray, size: tuple[int, int]) -> FloatArray:
 
 
 def _cells(points: FloatArray, size: tuple[int, int]) -> NDArray[np.int64]:
-    """Return (N,) the number of the cell of each point."""
     cells = WATERMARK.cells
     columns, rows = (points / size * cells).astype(np.int64).clip(0, cells - 1).T
     return np.asarray(cells * rows + columns)

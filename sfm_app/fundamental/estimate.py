@@ -85,16 +85,10 @@ def estimate_with(
 
 
 def assess_fundamental(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> EpipolarFit | Rejected:
-    """Return the fit of a given fundamental matrix to matches, with `trials` 1, or the reason of its rejection.
-
-    Args:
-        x1: (N, 2) pixels.
-        x2: (N, 2) pixels, row by row the partners of x1.
-        F: (3, 3) of any scale, x2' F x1 = 0 in pixels.
-        options: threshold and smallest number of inliers.
+    """Return the fit of a given F (3, 3) of any scale to matches, with `trials` 1, or the reason of its rejection.
 
     Raises:
-        ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
+        ValueError: the points are not valid (see `check_points`), or F is not (3, 3).
     """
     first, second = check_points(x1, x2)
     matches = prepare(first, second, seed=0)

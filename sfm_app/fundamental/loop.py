@@ -80,13 +80,9 @@ class SamplingPlan(NamedTuple):
     """How samples are drawn and models computed from them."""
 
     sample_size: int
-    """7 or 8."""
     oriented: bool
-    """Whether models that put a sampled point behind a camera are dropped."""
     batch: int
-    """Samples between two checks for a better model."""
     guided_share: float
-    """Share of the samples drawn by the priors."""
     priors: FloatArray
     """(N,) running sum of the priors p(v_i)."""
     rest_share: float
@@ -182,7 +178,6 @@ class BestModel:
         self.to_beat, self.samples = np.full(2, math.inf), np.zeros((2, 9))
 
     def __bool__(self) -> bool:
-        """Return whether there is a model yet."""
         return self._lowest < math.inf
 
     def inlier_share(self) -> float:
@@ -283,7 +278,6 @@ class _Loop:
         self._update_limits()
 
     def run(self) -> Hypothesis | None:
-        """Continue until the samples are used up, the priors have converged, or patience has run out."""
         while self.trials < self.limit:
             better = self._draw()
             if self._update_priors(better) or self._is_patience_over():

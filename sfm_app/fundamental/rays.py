@@ -126,7 +126,6 @@ def _search(lines: FloatArray, options: EpipolarSettings, rng: np.random.Generat
 
 
 def _draw(rng: np.random.Generator, chances: FloatArray | None, count: int) -> IndexArray:
-    """Return (OPTIONS.batch, 5) samples, a share of them by the priors once there are any."""
     keys = rng.random((OPTIONS.batch, count))
     if chances is not None:  # the smallest of exponential times are a weighted sample without replacement
         guided = int(OPTIONS.guided_share * OPTIONS.batch)

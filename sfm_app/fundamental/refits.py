@@ -62,7 +62,6 @@ def _normalize(U: FloatArray, k: int) -> float:
 
 @kernel
 def _orthogonalize(U: FloatArray) -> None:
-    """Make the second column perpendicular to the first, a unit vector."""
     dot = U[0, 0] * U[0, 1] + U[1, 0] * U[1, 1] + U[2, 0] * U[2, 1]
     for i in range(3):
         U[i, 1] -= dot * U[i, 0]
@@ -142,12 +141,9 @@ def refine_sampson(
     most_steps: int = 20,
     tolerance: float = _COST_TOLERANCE,
 ) -> FloatArray:
-    """Move F towards a minimum of sum_i r_i^2 / (1 + r_i^2 / c^2) (Geman and McClure 1987).
+    """Move F towards a minimum of sum_i r_i^2 / (1 + r_i^2 / c^2) (Geman and McClure 1987); c is `scale`.
 
-    `scale` is c; inf for least squares. The steps end at a relative decrease of the cost below `tolerance`.
-
-    Returns:
-        (3, 3), rank 2, its largest singular value 1.
+    The steps end at a relative decrease of the cost below `tolerance`. F has rank 2, its largest singular value 1.
     """
     weighing = Weighting(softness=float(scale**-2))
     return _reweighted_least_squares(points, *factorize(F), weighing, most_steps, tolerance, np.empty((10, 10)))
@@ -158,10 +154,7 @@ def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach
 
     Among the matches within `reach` > 1 thresholds, signed distances of inliers are Gaussian about 0, with a sigma of
     at most one threshold, those of outliers uniform. The weight of a match is the probability that it is an inlier. F
-    must be near enough for its inliers to determine sigma.
-
-    Returns:
-        (3, 3), rank 2, its largest singular value 1.
+    must be near enough for its inliers to determine sigma. It gets rank 2 and the largest singular value 1.
     """
     U, s, V = factorize(F)
     squared = squared_distances(points, compose(U, s, V))

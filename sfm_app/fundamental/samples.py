@@ -98,9 +98,8 @@ CONVERGED = 0.05
 def required_trials(success: float, confidence: float, log_missed: float = 0.0) -> float:
     """Return how many samples reach a success with probability `confidence` (thesis 3.19); inf if none can succeed.
 
-    Args:
-        success: probability that one sample is clean, share^m, and that its model passes the test.
-        log_missed: logarithm of the probability that all earlier samples failed; they are not counted again.
+    `success` is the probability that one sample is clean and its model passes the test, `log_missed` the logarithm of
+    the probability that all earlier samples failed.
     """
     remaining = math.log1p(-confidence) - log_missed
     if remaining >= 0:

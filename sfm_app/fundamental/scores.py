@@ -54,11 +54,7 @@ def msac_linear(_points: FloatArray, threshold: float, _best: FloatArray | None)
 
 
 def lmeds(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return the median of the squared distances as a `Loss` (Rousseeuw 1984; thesis 4.4.1).
-
-    Args:
-        threshold: largest distance of an inlier; used only to count inliers.
-    """
+    """Return the median of the squared distances as a `Loss` (Rousseeuw 1984; thesis 4.4.1)."""
     return Loss(LMEDS, threshold * threshold, np.inf, np.inf)
 
 
@@ -100,7 +96,6 @@ def fill_squared_distances(points: FloatArray, f: FloatArray, start: int, square
 
 @kernel
 def _cost(loss: Loss, squared: float) -> float:
-    """Return the penalty of one match."""
     if loss.kind == GEMAN_MCCLURE:
         return 1.0 - 1.0 / (1.0 + loss.precision * squared)
     if not squared <= loss.reach:
@@ -168,7 +163,6 @@ def _check_pretest(pretest: PreTest, done: int, inliers: int) -> bool:
 
 @kernel
 def _sum_costs(squared: FloatArray, loss: Loss) -> tuple[int, float]:
-    """Return the number of inliers, and the sum of the penalties of the matches."""
     total, inliers = 0.0, 0
     for i in range(squared.shape[0]):
         inliers += squared[i] <= loss.limit

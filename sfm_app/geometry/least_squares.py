@@ -251,14 +251,7 @@ def binary_choices(count: int) -> BoolArray:
 def cavity(
     covariance: FloatArray, step: FloatArray, precision: FloatArray, away: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return H (n, n) and g (n,), the evidence about a camera without its own prior: posterior less prior.
-
-    Args:
-        covariance: (n, n) of this camera in the posterior of all cameras.
-        step: (n,) mean of the same.
-        precision: (n,) of its prior.
-        away: (n,) to its prior's mean.
-    """
+    """Return H (n, n) and g (n,), the evidence about a camera without its own prior: posterior less prior."""
     marginal = inverses_of_positive(covariance)
     return marginal - np.diag(precision), marginal @ step - precision * away
 

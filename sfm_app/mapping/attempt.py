@@ -175,8 +175,6 @@ def model_poses(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PosedPair:
-    """The raw matches of two posed photos."""
-
     lines: FloatArray
     """(M, 18) matches as bearing vectors of view 1 and of view 2."""
     R: FloatArray
@@ -389,13 +387,10 @@ def complete_attempt(group: Group, attempt: Attempt, run: RunContext) -> list[Ma
 
 
 class _GroupMapper:
-    """Attempts to map a group."""
-
     def __init__(self, group: Group, run: RunContext, colmap: ColmapMappers) -> None:
         self.group, self.run, self.colmap = group, run, colmap
 
     def run_maker(self, make: Maker) -> list[MappingResult]:
-        """Make attempts in a thread that Ctrl-C can stop."""
         results: list[MappingResult] = []
         self.run.progress.start("mapping", max(len(self.group.photos) - 2, 1))
         try:
@@ -453,7 +448,6 @@ class _GroupMapper:
         return [self._judge("incremental", how, self._grow(start, token))]
 
     def completion(self, best: Attempt, token: CancellationToken) -> list[MappingResult]:
-        """Continue a model photo by photo, with its missing photos."""
         return [self._judge("incremental", "missing photos added one by one", self._grow(best.model, token))]
 
     def _grow(self, start: Reconstruction, token: CancellationToken) -> Reconstruction | None:
@@ -494,7 +488,6 @@ def choice_reason(best: Attempt, results: Sequence[MappingResult], photos: int) 
 
 
 def _is_complete_and_consistent(attempt: Attempt, photos: int) -> bool:
-    """Return whether a model holds all photos, and hardly any inliers contradict it."""
     inliers = sum(pair.inliers for pair in attempt.explained.values())
     against = sum(pair.contradicted for pair in attempt.explained.values())
     return attempt.photos == photos and against <= MAPPING.max_contradicted_share * inliers
@@ -510,7 +503,6 @@ def likely_needs_one_mapper(group: Group) -> bool:
 
 
 def _has_placed_enough(results: Sequence[MappingResult], photos: int) -> bool:
-    """Return whether another seed is unlikely to place more photos."""
     counts = [attempt.photos for attempt in results if isinstance(attempt, Attempt)]
     largest = max(counts, default=0)
     return largest >= MAPPING.enough_share * photos or (

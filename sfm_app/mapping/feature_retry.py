@@ -52,14 +52,10 @@ OPTIONS = RetryOptions()
 def add_matches(
     matches: MatchGraph, keypoints: Mapping[int, FloatArray], added: Mapping[PairId, Rows]
 ) -> tuple[MatchGraph, tuple[PairId, ...]]:
-    """Add keypoints and matches of another kind; return the merged graph, and the pairs with more matches.
+    """Add keypoints and matches (M, 2) of another kind; return the merged graph, and the pairs with more matches.
 
-    Existing keypoints keep their positions and indices. An added match enters only if neither of its keypoints has a
-    match in the other photo yet.
-
-    Args:
-        keypoints: (N, 2) pixels of the added keypoints, by photo.
-        added: (M, 2) indices of added keypoints, by pair.
+    Existing keypoints keep their positions and indices. An added match, in indices of added keypoints, enters only if
+    neither of its keypoints has a match in the other photo yet.
     """
     all_keypoints, numbers = dict(matches.keypoints), {}
     for photo, x in keypoints.items():
@@ -206,7 +202,6 @@ def _is_mostly_calibrated(scene: MappedScene) -> bool:
 
 
 def _side_run(run: RunContext) -> RunContext:
-    """Return the run with a separate workspace folder, in which a killed run is resumed."""
     place = SubWorkspace(run.workspace, FOLDER)
     loose = run.settings.matching.model_copy(
         update={"max_ratio": max(OPTIONS.max_ratio, run.settings.matching.max_ratio)}
@@ -220,7 +215,6 @@ def _placed_count(outcome: Outcome) -> int:
 
 
 def _places_and_explains_more(second: MappedScene, first: MappedScene) -> bool:
-    """Return whether the second main model places more photos, and explains more of all matches."""
     if not second.outcome.models or _placed_count(second.outcome) <= _placed_count(first.outcome):
         return False
     models = [_judge(second, scene.outcome) for scene in (first, second) if scene.outcome.models]

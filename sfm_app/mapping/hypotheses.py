@@ -225,7 +225,6 @@ def camera_per_photo_explains_more(own: Attempt | None, shared: Attempt) -> bool
 
 
 def _contradicted_share(model: Attempt) -> float:
-    """Return the share of the inliers of fundamental matrices that contradict a model."""
     inliers = sum(pair.inliers for pair in model.explained.values())
     return sum(pair.contradicted for pair in model.explained.values()) / max(inliers, 1)
 

@@ -68,8 +68,6 @@ STEPS = Steps()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Inputs:
-    """Evidence and run of a scene."""
-
     matches: MatchGraph
     views: ViewGraph
     intrinsics: Intrinsics
@@ -170,7 +168,6 @@ def _write_graph(graph: PoseGraph, inputs: _Inputs) -> None:
 
 
 def _place(start: Reconstruction, group: Group, run: RunContext) -> Reconstruction | None:
-    """Return the earlier model with the photos of its group that COLMAP can place, one after the other."""
     placed = posed_photo_ids(start)
     unplaced = len(set(group.photos).difference(placed))
     if not unplaced:
@@ -199,7 +196,6 @@ def _extend(start: Reconstruction, group: Group, run: RunContext, token: Cancell
 
 
 def _map_others(graph: PoseGraph, taken: Collection[int], inputs: _Inputs) -> list[Attempt]:
-    """Return models of the groups of photos that no pair connects with the earlier model."""
     models = []
     for photos in graph.groups:
         if len(photos) >= MAPPING.min_photos and not set(photos).intersection(taken):

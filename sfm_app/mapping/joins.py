@@ -84,7 +84,6 @@ class Join:
     similarity: Similarity
     """From the frame of the second fragment into that of the first."""
     photos: int
-    """Shared photos that agree."""
     shared: int
     """Photos that both hold."""
     points: int
@@ -133,8 +132,6 @@ def find_join(first: int, second: int, fragments: Sequence[Fragment]) -> Join | 
 
 
 class _SharedPhotos:
-    """Photos in two models, with the points that both triangulated from the same keypoints."""
-
     def __init__(
         self, a: PlacedPhotos, b: PlacedPhotos, photos: IndexArray, rows_a: IndexArray, rows_b: IndexArray
     ) -> None:
@@ -303,7 +300,6 @@ def align_fragments(fragments: Sequence[Fragment], joins: Sequence[Join]) -> Ali
 
 
 def _main_group(fragments: Sequence[Fragment], joins: Sequence[Join]) -> set[int]:
-    """Return the joined fragments that have most photos together."""
     groups = connected_groups([(join.first, join.second) for join in joins], range(len(fragments)))
 
     def count_photos(group: set[int]) -> int:
@@ -360,15 +356,9 @@ def _synchronize(joins: Sequence[Join], count: int) -> dict[int, Similarity]:
 def _robust_potentials(
     count: int, edges: NDArray[np.int64], steps: FloatArray, strengths: FloatArray, sizes: FloatArray
 ) -> FloatArray:
-    """Return (count, k) values whose differences have the least sum of weighted distances to steps.
+    """Return (count, k) values whose differences along edges (J, 2) have the least sum of weighted distances to steps.
 
-    The first fragment of each group has 0.
-
-    Args:
-        edges: (J, 2) numbers of fragments.
-        steps: (J, k) differences, second less first.
-        strengths: (J,) weights.
-        sizes: (J,) units in which errors are measured.
+    `steps` (J, k) are second less first; errors are in `sizes` (J,). The first fragment of each group has 0.
     """
     groups = DisjointGroups(range(count))
     for a, b in edges.tolist():
@@ -449,7 +439,6 @@ def _move(model: PlacedPhotos, frame: Similarity) -> PlacedPhotos:
 def _choose_poses(
     fragments: Sequence[Fragment], models: Mapping[int, PlacedPhotos]
 ) -> tuple[IndexArray, FloatArray, FloatArray, IndexArray]:
-    """Return ids of all photos, their rotations and centers, and the fragments that these are from."""
     best: dict[int, tuple[tuple[bool, int, int], int, int]] = {}
     for number, model in models.items():
         for row, photo in enumerate(model.photos.tolist()):

@@ -236,7 +236,6 @@ def _posed_photo_points(
 
 
 def _neighbors(posed: Mapping[int, PosedPhotoPoints]) -> Iterator[PairId]:
-    """Yield photos with others nearby that look the same way; some of these where there are many."""
     from scipy.spatial import KDTree
 
     if not posed:

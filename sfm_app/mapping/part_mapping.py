@@ -103,7 +103,6 @@ def _divide(links: Links, size: int) -> list[set[int]]:
 
 
 def _bisect(photos: set[int], links: Links) -> tuple[set[int], set[int]]:
-    """Divide connected photos into two connected sides."""
     end = _farthest_photo(min(photos), photos, links)
     starts = (_farthest_photo(end, photos, links), end)
     cuts = [_best_growth(start, photos, links) for start in starts]
@@ -415,11 +414,8 @@ def map_parts(
 ) -> list[PartResult]:
     """Map parts, as many at once as there are workers; one that fails is a result without models.
 
-    Parts that a killed run has finished are not mapped again.
-
-    Args:
-        mapped: the pose graph with the pairs that mapping follows.
-        stop_at_false_joins: whether false joins within parts end the pass.
+    Parts that a killed run has finished are not mapped again. `mapped` has the pairs that mapping follows;
+    `stop_at_false_joins` ends the pass at false joins within parts.
     """
     place = run.workspace.root / FOLDER
     (place / STOP).unlink(missing_ok=True)

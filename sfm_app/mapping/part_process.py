@@ -59,7 +59,6 @@ def _write_database(place: Workspace, part: Group, mapped: frozenset[PairId]) ->
 
 
 def _write_models(best: Attempt, folder: Path) -> list[str]:
-    """Write the pieces of a model that its own matches do not contradict, and return the names of their folders."""
     parts = sound_parts(best.explained, posed_photo_ids(best.model))
     pieces = [photos for photos in parts if len(photos) >= 3]  # nothing determines the scale of two photos
     names = []

@@ -163,7 +163,6 @@ def join_parts(group: Group, parts: Sequence[Part], results: Sequence[PartResult
 
 
 def _merge(group: Group, joined: JoinedParts, run: RunContext) -> list[MappingResult]:
-    """Return the model of all joined fragments, adjusted together."""
     count = len(joined.parts)
     if not joined.fragments:
         reasons = sorted({note for result in joined.results for note in result.tried})

@@ -73,7 +73,6 @@ class Outcome:
     intrinsics: Intrinsics
     """Cameras that the models were mapped with."""
     tried: tuple[str, ...]
-    """Notes on all attempts."""
     reason: str = ""
     """Why the attempt behind the main model was chosen."""
     cuts: tuple[str, ...] = ()
@@ -158,7 +157,7 @@ class Passes:
         return self.merge_models(best, matches, views)
 
     def _drop_false_joins(self, outcome: Outcome, matches: MatchGraph, views: ViewGraph) -> Outcome:
-        """Map again without pairs that merge two places, and return the outcome with fewer non-overlapping pairs.
+        """Map again without pairs that merge two places.
 
         Where other pairs do not hold the photos together instead, as by day and by night, the joins stay, and are
         doubtful.
@@ -208,7 +207,6 @@ class Passes:
     def _try_other_focals(
         self, outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics
     ) -> Outcome:
-        """Map with other guesses of the focal where many photos are unregistered, and return the best outcome."""
         main = outcome.main
         if not is_focal_doubtful(main, intrinsics, views):
             return outcome
@@ -228,7 +226,6 @@ class Passes:
     def _try_camera_per_photo(
         self, outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics
     ) -> Outcome:
-        """Map with a camera for each photo where shared ones explain too little, and return the better outcome."""
         main = outcome.main
         if main is None or not is_shared_camera_doubtful(main, intrinsics, views, self.run.settings):
             return outcome
@@ -247,7 +244,6 @@ class Passes:
         )
 
     def _try_two_cameras(self, own: Outcome, matches: MatchGraph, views: ViewGraph, each: Intrinsics) -> Outcome:
-        """Map with two cameras instead of one for each photo, and return their outcome if they explain as much."""
         between = with_two_cameras(own.models[0], each, matches)
         if between is None:
             return own

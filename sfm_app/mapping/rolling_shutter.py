@@ -156,14 +156,12 @@ def _compensate(
 
 
 def _has_converged(before: ReadoutEstimate | None, after: ReadoutEstimate) -> bool:
-    """Return whether the readout has not changed since the round before."""
     return before is not None and abs(after.readout - before.readout) <= OPTIONS.converged * after.deviation
 
 
 def _reason_to_refuse(
     adjusted: Adjustment, compensated: Adjustment, estimate: ReadoutEstimate, frames: FrameTimes
 ) -> str:
-    """Return why the compensated model is rejected; empty where it is accepted."""
     if OPTIONS.significance * estimate.deviation >= frames.interval:
         return "the motion of the camera does not determine it"
     if abs(estimate.readout) < OPTIONS.significance * estimate.deviation:

@@ -127,7 +127,6 @@ def merge_into_main(
 def _merge_pair(
     first: Attempt, second: Attempt, matches: MatchGraph, views: ViewGraph, run: RunContext
 ) -> Attempt | None:
-    """Join both models; return None where they share too few points, or matches contradict the merge."""
     shared = shared_points(first.model, second.model, matches, views)
     if len(shared) < OPTIONS.min_shared:
         return None
@@ -166,7 +165,6 @@ def shared_points(first: Reconstruction, second: Reconstruction, matches: MatchG
 
 
 def _pairs_between(views: ViewGraph, here: set[int], there: set[int]) -> Iterator[tuple[int, int]]:
-    """Yield pairs with geometry between two sets of photos, the photo of the first set first."""
     for a, b in views.fits:
         if a in here and b in there:
             yield a, b
@@ -239,7 +237,6 @@ class _Growth:
         """Heap of photos by their number of known points; entries that have changed are out of date."""
 
     def best_pair(self) -> tuple[int, int]:
-        """Return the two photos that share most points."""
         from scipy.sparse import csr_array, triu
 
         together = csr_array(triu(self.by_photo @ self.visibility, k=1)).tocoo()
@@ -248,7 +245,6 @@ class _Growth:
         return (int(i[best[0]]), int(j[best[0]])) if len(best) else (0, 1)
 
     def join(self, photo: int) -> None:
-        """Add a photo."""
         own = self.by_photo.indices[self.by_photo.indptr[photo] : self.by_photo.indptr[photo + 1]]
         self.views[own] += 1
         newly_known = self.visibility[own[self.views[own] == 2]]  # the points that have just become known

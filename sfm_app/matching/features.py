@@ -85,7 +85,6 @@ class _PhotoFile:
 def _find_and_save(
     method: FeatureMethod, options: MatchSettings, folders: _Folders, photo: _PhotoFile
 ) -> tuple[int, NDArray[np.float32]]:
-    """Write the features of one photo to its part, and return its id and its keypoints."""
     pixels = read_pixels(folders.photos / photo.name)
     features, to_photo, size = _find_in_photo(method, photo.name, pixels, options, panorama=photo.panorama)
     keypoints = features.keypoints * to_photo
@@ -156,7 +155,6 @@ def _call_find(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], opti
 
 
 def _check_features(method: FeatureMethod, name: str, size: tuple[int, int], features: Features) -> Features:
-    """Return the features after checking that they are valid for a picture of this size."""
     points = np.asarray(features.keypoints, np.float64)
     if features.size != size:
         raise _method_error(method, f"report a size of {features.size} for {name} instead of {size}")
@@ -168,7 +166,6 @@ def _check_features(method: FeatureMethod, name: str, size: tuple[int, int], fea
 
 
 def _method_error(method: FeatureMethod, what: str) -> PluginError:
-    """Return the error of a feature method, of which `what` says what it did."""
     return PluginError(f"the features '{method.name}' {what}", hint="choose others with --features")
 
 
@@ -301,8 +298,6 @@ def match_in_chunks(sift: Mapping[str, SiftOption], pairs: Sequence[PairId] | No
 
 
 class _PairCounter(SilentProgress):
-    """Progress of several processes on one bar."""
-
     def __init__(self, progress: Progress) -> None:
         self._progress, self._lock = progress, Lock()
 
@@ -330,7 +325,6 @@ def _do_in_chunks(
     sift: Mapping[str, SiftOption],
     run: RunContext,
 ) -> dict[str, Json]:
-    """Let workers do chunks, and enter their rows in order."""
     place, label = run.workspace, "matching" if tables is MATCHES else "features"
     folder, in_force = place.sift_rows, dict[str, Json]()
     shutil.rmtree(folder, ignore_errors=True)
@@ -350,7 +344,6 @@ def _do_in_chunks(
 
 
 def _write_inputs(folder: Path, sift: Mapping[str, SiftOption], run: RunContext, *, with_features: bool) -> SiftInputs:
-    """Write the snapshots that workers read."""
     place, folder = run.workspace, folder.absolute()
     folder.mkdir(parents=True)
     inputs = SiftInputs(
@@ -434,7 +427,6 @@ def all_pairs(photos: Sequence[int] | Mapping[int, str]) -> list[PairId]:
 
 
 def _match(method: FeatureMethod, pairs: Sequence[PairId], run: RunContext) -> None:
-    """Write the matches of every pair into the database, also where there are none."""
     options, database = run.settings.matching, run.workspace.database
     reader = FeatureReader(run.workspace.feature_parts, max(CHUNKS.photos_in_memory, 2 * run.workers))
     match = Task(_read_and_match, method, options, Shared(reader))

@@ -98,7 +98,6 @@ def first_pairs(
 def _similar_pairs(
     photos: Sequence[int], read: ReadDescriptors, count: int, run: RunContext, choosers: Collection[int] | None
 ) -> set[PairId]:
-    """Return pairs of similar photos, some for each photo."""
     largest = run.map(read, photos, "largest features")
     pooled = pool_descriptors(largest, OPTIONS.pooled)
     if not len(pooled):

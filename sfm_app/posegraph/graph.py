@@ -195,8 +195,6 @@ def build_pose_graph(
 
 
 class _PoseEstimator:
-    """Relative poses of pairs, from their fits or from the rotations of their photos."""
-
     def __init__(self, matches: MatchGraph, intrinsics: Intrinsics, options: PoseGraphOptions) -> None:
         self.matches, self.intrinsics, self.options = matches, intrinsics, options
         self.rotations: Mapping[int, FloatArray] = {}
@@ -243,7 +241,6 @@ def with_model(graph: PoseGraph, photos: Collection[int], poses: Mapping[PairId,
 def _pairs_without_pose(
     pairs: Iterable[PairId], poses: Mapping[PairId, RelativePose], known: Collection[PairId]
 ) -> list[PairId]:
-    """Return the pairs without a pose whose photos other pairs connect, unless known pairs have both."""
     known_photos = {photo for pair in known for photo in pair}
     pairs = [pair for pair in pairs if not known_photos.issuperset(pair)]
     group = {photo: number for number, photos in enumerate(_groups(poses)) for photo in photos}

@@ -238,9 +238,7 @@ class Depths:
     def expected_points(self, photo: int, other: int, points: IndexArray, logs: FloatArray) -> IndexArray:
         """Return the points of a photo that the other one must show if their pair is right.
 
-        Args:
-            points: (N,) keypoints.
-            logs: (N,) logarithms of their depths in the scale of the pair.
+        `points` (N,) are keypoints, `logs` (N,) logarithms of their depths in the scale of the pair.
         """
         R, t = _directed_pose(self.poses, photo, other)
         rays_here = self.keypoint_bearings(photo)[points, FIRST]
@@ -265,9 +263,7 @@ def is_well_inside(x: FloatArray, width: int, height: int) -> NDArray[np.bool_]:
 def is_matched_again(size_ratios: FloatArray, cosines: FloatArray) -> NDArray[np.bool_]:
     """Return a mask (N,) of the points that look enough alike in two photos for matching.
 
-    Args:
-        smaller: (N,) size in the first photo over that in the second.
-        cosines: (N,) of the angles between the two viewing rays.
+    From the ratios (N,) of their sizes and the cosines (N,) of the angles between the two viewing rays.
     """
     alike = (
         (size_ratios < OPTIONS.max_scale)
@@ -375,7 +371,6 @@ def find_look_alikes(
 
 
 def _build_tracks(visibility: Visibility, pairs: Iterable[PairId]) -> FeatureTracks:
-    """Join the keypoints of pairs into tracks."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -435,7 +430,6 @@ def _is_confirmed(same: int, tracked: int) -> bool:
 
 
 def _partners(pairs: Iterable[PairId]) -> dict[int, set[int]]:
-    """Return the other photos of the pairs of each photo."""
     partners: dict[int, set[int]] = {}
     for a, b in pairs:
         partners.setdefault(a, set()).add(b)
@@ -446,7 +440,6 @@ def _partners(pairs: Iterable[PairId]) -> dict[int, set[int]]:
 def _judge_join(
     join: tuple[PairId, ...], partners: Mapping[int, set[int]], rotations: Mapping[int, FloatArray], places: Depths
 ) -> tuple[LookAlikes, str]:
-    """Judge a join; return it with its share of missing cells, and the verdict."""
     claimed = _partners(join)
     counts = [
         count_missing_cells(photo, claimed[photo], partners[photo], places)

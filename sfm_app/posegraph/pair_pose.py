@@ -89,9 +89,8 @@ def planar_starts(used: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
 def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Yield R and t of a camera that turned about the middle of the scene, for every turn of the options.
 
-    Args:
-        used: (N, 4) inliers as points of the plane z = 1, view 1 and view 2.
-        E: (3, 3) of any scale; only the directions of its epipolar lines through the middle are used.
+    `used` (N, 4) are inliers as points of the plane z = 1. Of E, only the directions of its epipolar lines through the
+    middle are used.
     """
     if not len(used):  # panoramas that look away from each other
         return
@@ -131,8 +130,7 @@ _DIFFERENCE_STEP = 1e-6
 def refine_pose(lines: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Refine R (3, 3) and t (3,) by robust least squares of Sampson distances (Levenberg-Marquardt).
 
-    Args:
-        lines: (N, 18) matches as bearing vectors with derivatives (`camera.bearings`), view 1 and view 2.
+    `lines` (N, 18) are matches as bearing vectors with derivatives (`camera.bearings`).
     """
     pose = np.concatenate([R.ravel(), t / np.linalg.norm(t)])
     for sigma in SIGMAS_PX:
@@ -225,7 +223,6 @@ def _descend(lines: FloatArray, pose: FloatArray, sigma: float) -> FloatArray:
 
 @kernel
 def _solve(A: FloatArray, b: FloatArray, damping: float) -> FloatArray:
-    """Solve the damped system by Cholesky's decomposition."""
     L, x = np.zeros((POSE_DOF, POSE_DOF)), np.empty(POSE_DOF)
     for i in range(POSE_DOF):
         for j in range(i + 1):
@@ -252,12 +249,7 @@ Pose = tuple[FloatArray, FloatArray]
 
 
 class Pair:
-    """The matches of a pair as bearing vectors of its cameras.
-
-    Args:
-        points: x1, x2, each (M, 2) pixels: all matches of the pair.
-        max_error_px: largest Sampson distance of an inlier.
-    """
+    """All matches of a pair, (M, 2) pixels each, as bearing vectors of its cameras; `max_error_px` of an inlier."""
 
     def __init__(
         self, points: tuple[FloatArray, FloatArray], cameras: Sequence[Calibration], max_error_px: float
@@ -367,7 +359,6 @@ def _is_known(pose: Pose, tried: Sequence[Pose]) -> bool:
 
 
 def _pose_cost(used: FloatArray, R: FloatArray, t: FloatArray) -> float:
-    """Return the cost that `refine_pose` minimizes at its last scale."""
     return float(np.sum(np.log1p((pose_distances(used, R, t) / SIGMAS_PX[-1]) ** 2)))
 
 

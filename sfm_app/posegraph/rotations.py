@@ -23,11 +23,7 @@ if TYPE_CHECKING:
 
 
 class DisjointGroups:
-    """Photos in groups that are joined one by one; the smaller of two groups is added to the larger.
-
-    Args:
-        photos: each starts as a group of its own.
-    """
+    """Photos in groups that are joined one by one; the smaller of two groups is added to the larger."""
 
     def __init__(self, photos: Iterable[int]) -> None:
         self.members = {photo: [photo] for photo in photos}
@@ -96,10 +92,7 @@ def find_corrections(
 ) -> Iterator[RotationCorrection]:
     """Yield corrections that satisfy more than they break, those of the strongest contradictions first.
 
-    Args:
-        edges: (E, 2) numbers of photos below `count`.
-        residuals: (E, 3) rotation vectors of R_j' R_ij R_i.
-        strengths: (E,) weights.
+    Of edges (E, 2), numbers of photos below `count`, with residuals (E, 3), rotation vectors of R_j' R_ij R_i.
     """
     from scipy.spatial.transform import Rotation
 
@@ -140,10 +133,7 @@ def find_cut(
 ) -> tuple[BoolArray, float]:
     """Return a mask of the photos on the side of the first ends, and the weight of the pairs across; inf without a cut.
 
-    Args:
-        edges: (E, 2) numbers of photos below `count`.
-        strengths: (E,) weights.
-        ends: (K,) photos that must be on the one side, and (L,) on the other.
+    `edges` (E, 2) are numbers of photos below `count`; `ends` (K,) and (L,) must be on different sides.
     """
     from scipy import sparse
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
@@ -205,14 +195,10 @@ AVERAGING = AveragingOptions()
 def average_rotations(
     relative: Mapping[PairId, FloatArray], weights: Mapping[PairId, float]
 ) -> tuple[dict[int, FloatArray], dict[PairId, float]]:
-    """Estimate the rotations of all photos, and the angle of each pair to them.
+    """Estimate the rotations of all photos (3, 3), and the angle of each pair to them in degrees.
 
-    Args:
-        relative: by pair (3, 3), the rotation of photo 2 from photo 1.
-        weights: by pair, > 0.
-
-    Returns:
-        By photo, (3, 3) from the world, whose axes are those of the first photo of each group; by pair, degrees.
+    `relative` has the rotation (3, 3) of photo 2 from photo 1. The axes of the world are those of the first photo of
+    each group.
     """
     if not relative:
         return {}, {}
@@ -251,7 +237,6 @@ def _descend(
 def _apply_corrections(
     rotations: FloatArray, edges: IndexArray, turns: FloatArray, strengths: FloatArray
 ) -> FloatArray:
-    """Return the rotations after corrections that lower the robust cost."""
     for _ in range(CORRECTIONS.max_turns):
         residuals = _residuals(rotations, edges, turns)
         for correction in find_corrections(len(rotations), edges, residuals, strengths):
@@ -273,11 +258,7 @@ def _robust_cost(residuals: FloatArray, strengths: FloatArray) -> float:
 def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> FloatArray:
     """Return (E,), in (0, 1], the share of the loops of three through each pair that agree; 1 if there is no loop.
 
-    A loop weighs as much as the weaker of the two other pairs in it.
-
-    Args:
-        edges: (E, 2) numbers of photos, the smaller first.
-        turns: (E, 3, 3) rotation of photo 2 from photo 1.
+    A loop weighs as much as the weaker of the two other pairs in it. Edges and turns as in `check_loops`.
     """
     loops, agree = check_loops(edges, turns)
     sums = np.zeros((2, len(edges)))
@@ -292,9 +273,7 @@ def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) ->
 def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArray[np.bool_]]:
     """Return (L, 3) numbers of the edges of every loop of three photos, and (L,) whether their rotations agree.
 
-    Args:
-        edges: (E, 2) numbers of photos, the smaller first.
-        turns: (E, 3, 3) rotation of photo 2 from photo 1.
+    Edges (E, 2) have the smaller photo first; turns (E, 3, 3) are of photo 2 from photo 1.
     """
     from scipy.spatial.transform import Rotation
 
@@ -315,9 +294,7 @@ def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArr
 def _find_loops(edges: IndexArray, starts: IndexArray) -> IndexArray:
     """Return (L, 3) numbers of the edges a-b, b-c and a-c of every three photos a < b < c that are all connected.
 
-    Args:
-        edges: (E, 2) sorted, the smaller photo first; E > 0.
-        starts: first edge from each photo, and from one after the last.
+    The edges (E, 2) are sorted, the smaller photo first; `starts` has the first edge from each photo, and the end.
     """
     loops, count = np.empty((len(edges), 3), np.int64), 0
     for k in range(len(edges)):

@@ -88,12 +88,7 @@ def distances(
 ) -> FloatArray:
     """Return (M,) signed Sampson distances, in the units of the matches.
 
-    Args:
-        matches: (M, 4) of all pairs, one after the other.
-        ends: (P + 1,) first match of each pair, and the end of the last.
-        thetas: (C, 5) parameters of the cameras.
-        cameras: (P, 2) camera of view 1 and of view 2.
-        poses: (P, 12), see `write_essential`.
+    Pair k has the matches ends[k] to ends[k + 1] - 1, and its pose is poses[k] (12,), see `write_essential`.
     """
     E, first, second = np.empty((3, 3)), np.empty(5), np.empty(5)
     p, q = np.empty(7), np.empty(7)
@@ -127,11 +122,9 @@ def pair_costs(
 def pair_systems(
     matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray, sigma: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return Gauss-Newton systems of all pairs in their fifteen parameters; arguments as `distances`.
+    """Return the Gauss-Newton systems (P, 15, 15) and (P, 15) of all pairs over camera 1, camera 2 and pose.
 
-    Returns:
-        (P, 15, 15) approximate Hessians of the costs and (P, 15) negative gradients, over camera 1, camera 2 and pose.
-        Where both views are of one camera, all of its entries are in the first five rows and columns.
+    Where both views are of one camera, all of its entries are in the first five rows and columns.
     """
     A, b = np.zeros((len(poses), PAIR, PAIR)), np.zeros((len(poses), PAIR))
     # derivatives are finite differences: index 0 is unchanged, 1 to 5 have one parameter moved
@@ -189,10 +182,7 @@ def _write_rays(x: float, y: float, lenses: FloatArray, rays: FloatArray) -> Non
 def _write_derivatives(rays: FloatArray, Es: FloatArray, sigma: float, shared: bool, J: FloatArray) -> float:
     """Return the distance r of one match in sigma, and write dr over the fifteen parameters into `J` (15,).
 
-    Args:
-        rays: (2, 6, 7) from `_write_rays`, per view.
-        Es: (6, 3, 3) from `_write_poses`.
-        shared: both views are of one camera: both rays move with its first five parameters, and J[5:10] stays.
+    For `shared`, both views are of one camera: both rays move with its first five parameters, and J[5:10] stays.
     """
     r = _distance(rays[0, 0], rays[1, 0], Es[0]) / sigma
     for j in range(CAMERA):
@@ -217,7 +207,6 @@ def _is_finite(r: float, J: FloatArray) -> bool:
 
 @kernel
 def _mirror(A: FloatArray) -> None:
-    """Copy the lower triangle to the upper one."""
     for i in range(PAIR):
         for j in range(i):
             A[j, i] = A[i, j]
@@ -276,15 +265,10 @@ class Information:
 
 
 class Matches:
-    """Inliers of all pairs, concatenated.
+    """Inliers of all pairs, concatenated, at most `most` of a pair.
 
-    Args:
-        inliers: per pair (N, 4), from the middle of each photo, in longer sides of the largest photo.
-        cameras: (P, 2) numbers of the cameras, from 0.
-        photos: (P, 2) numbers of the photos.
-        unit_px: length of that unit, in pixels.
-        most: most matches of one pair, evenly chosen.
-        count: number of cameras.
+    `inliers` (N, 4) are from the middle of each photo, in longer sides of the largest photo: `unit_px`. `cameras` and
+    `photos` (P, 2) are numbers; there are `count` cameras.
     """
 
     def __init__(

@@ -118,12 +118,9 @@ class Fit:
 
 
 def fit_cameras(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], priors: CameraPriors) -> Fit:
-    """Fit the cameras from all starts, then with non-square pixels, and return the best fit.
+    """Fit the cameras from all starts (C, 5), the most likely first, then with non-square pixels; return the best fit.
 
-    Args:
-        matches: inliers, from the middle of each photo.
-        Fs: (P, 3, 3) in the same frame and units; initialize the poses.
-        starts: (C, 5) each, initial cameras, the most likely first.
+    The F's (P, 3, 3), in the frame and units of the matches, initialize the poses.
     """
     few = matches.subsample(FITTING.few_matches)
     best = _select_best([_fit_from_start(few, Fs, thetas, priors, square=True) for thetas in starts])
@@ -236,9 +233,7 @@ PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1")
 def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> FloatArray:
     """Return the (5C, 5C) covariance of all parameters over all choices of free ones, plus the model error.
 
-    Args:
-        sides: (C,) longer sides of the photos.
-        resampled: widen it where leaving photos out moves the cameras further than it predicts.
+    `resampled` widens it where leaving photos out moves the cameras further than it predicts.
     """
     total = fit.evidence.covariance(fit.free)
     if resampled:
@@ -259,11 +254,7 @@ class Uncertainty(NamedTuple):
 
 
 def camera_uncertainty(theta: FloatArray, cov: FloatArray, unit_px: float) -> Uncertainty:
-    """Return the standard deviations of fx, fy, cx, cy in pixels and of k1, and their correlations.
-
-    Args:
-        cov: (5, 5) covariance of theta (5,).
-    """
+    """Return the standard deviations of fx, fy, cx, cy in pixels and of k1, and their correlations."""
     focal, squared = float(np.exp(theta[LOG_FOCAL])) * unit_px, float(np.exp(2.0 * theta[LOG_FOCAL]))
     half = float(np.exp(0.5 * theta[LOG_ASPECT]))
     # rows: how fx, fy, cx, cy, k1 change with log f, u, v, log a, kappa

@@ -92,12 +92,7 @@ CONSENSUS = ConsensusOptions()
 
 
 class Consensus:
-    """The function that the right K maximizes.
-
-    Args:
-        center_sigma: standard deviation of the prior on (u, v) about (0, 0), in units of the pairs; may be inf.
-        weights: (P,) weights; those of the pairs for None.
-    """
+    """The function that the right K maximizes; `center_sigma` of the prior on (u, v) about (0, 0) may be inf."""
 
     def __init__(self, pairs: Pairs, center_sigma: float, weights: FloatArray | None = None) -> None:
         self.pairs = pairs
@@ -474,9 +469,7 @@ def uncertainty_reason(log_focal_spread: float, *, one_of_many: bool = False) ->
 def rejection_reason(theta: FloatArray, log_focal_spread: float, size: tuple[int, int]) -> str:
     """Return why an answer that the pairs agree on is rejected; empty where it is accepted.
 
-    Args:
-        theta: log f, u, v, ... in longer sides from the middle.
-        size: (width, height) of the photo, in any unit.
+    `theta` is log f, u, v, ... in longer sides from the middle.
     """
     focal, (low, high) = float(np.exp(theta[LOG_FOCAL])), CONSENSUS.focal_range
     if not low * CONSENSUS.edge < focal < high / CONSENSUS.edge:

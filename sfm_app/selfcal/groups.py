@@ -76,13 +76,7 @@ def log_focal_grid() -> FloatArray:
 
 
 class VoteTables:
-    """Votes of pairs for any two cameras of their photos.
-
-    Args:
-        Fs: (P, 3, 3) in one unit from the middle of each photo.
-        members: (P, 2) cameras.
-        weights: (P,).
-    """
+    """Votes of pairs for any two cameras of their photos; F's are in one unit from the middle of each photo."""
 
     def __init__(self, Fs: FloatArray, members: IndexArray, weights: FloatArray) -> None:
         ready = prepare(CameraPairs.from_Fs(Fs, (1, 1), weights), unit_px=1.0, origin_px=(0.0, 0.0))
@@ -127,15 +121,10 @@ def _minor(x: float, y: float, w: float, k: FloatArray) -> float:
 
 
 class FocalGrid:
-    """Votes of pairs for the focals of their two photos, on a common grid.
+    """Votes of undistorted pairs for the focals of their two photos, on a common grid.
 
-    Ours: the consensus of thesis 5.8.4 on the focals alone.
-
-    Args:
-        tables: undistorted pairs.
-        rows: (P,) indices of the pairs that vote.
-        theta: (5,) camera with the center and aspect of all photos.
-        members: (P, 2) photos, counted from 0.
+    Ours: the consensus of thesis 5.8.4 on the focals alone. `rows` (P,) vote; `theta` (5,) has the center and aspect of
+    all photos; `members` (P, 2) are photos, counted from 0.
     """
 
     def __init__(self, tables: VoteTables, rows: IndexArray, theta: FloatArray, members: IndexArray) -> None:
@@ -197,11 +186,8 @@ def best_places(own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> 
     """Choose a grid index for every camera so that the sum over cameras and over pairs of cameras is large.
 
     Damped max-sum message passing (Pearl 1988; exact on trees), then coordinate ascent. Ascent also starts from the
-    best index of each camera by itself, which messages on loops do not always outdo.
-
-    Args:
-        own: (C, G) value of each camera by itself.
-        between: (G, G) value of two cameras i < j together, by (i, j).
+    best index of each camera by itself, which messages on loops do not always outdo. `own` (C, G) has the values of
+    cameras by themselves, `between` (G, G) those of two cameras i < j.
     """
     tables = {(i, j): table for (i, j), table in between.items()} | {(j, i): t.T for (i, j), t in between.items()}
     messages = {edge: np.zeros(own.shape[1]) for edge in tables}
@@ -276,7 +262,6 @@ class _Joint:
     tables: VoteTables
     """Of the undistorted pairs."""
     photos: list[PairId]
-    """The two photos of each pair."""
     unit_px: float
     motion: str
     """A critical motion of most pairs, which leaves all focals open; empty for none."""
@@ -287,10 +272,7 @@ def calibrate_cameras(
 ) -> list[Calibration]:
     """Return one calibration per camera, in their order; each is identifiable, an estimate, or a guess with the reason.
 
-    Args:
-        pairs: all pairs, within and between cameras, with inliers; their size is not used.
-        members: (P, 2) number of the camera of view 1 and of view 2.
-        method: name that goes into the calibrations.
+    `pairs` have inliers; their size is not used. `members` (P, 2) are the cameras of both views.
     """
     unit = float(max(max(camera.size) for camera in cameras))
     rows, Fs, matches = _convert_to_units(cameras, pairs, members, unit)
@@ -316,7 +298,6 @@ def calibrate_cameras(
 
 
 def _judge_camera(index: int, camera: CameraGroup, joint: _Joint, method: str) -> Calibration:
-    """Return the calibration of one camera, or a guess and the reason."""
     fit, unit = joint.fit, joint.unit_px
     theta = fit.state.thetas[index]
     block = slice(CAMERA * index, CAMERA * (index + 1))
@@ -391,7 +372,6 @@ def _initial_parameters(camera: CameraGroup, side: float, unit: float) -> FloatA
 
 
 def _find_focals(thetas: FloatArray, unknown: BoolArray, tables: VoteTables, priors: CameraPriors) -> FloatArray:
-    """Return the cameras with the unknown focals on which most pairs agree."""
     trials = np.repeat(thetas[:, None], GROUPS.focals, axis=1)
     trials[unknown, :, LOG_FOCAL] = log_focal_grid() + np.log(priors.sides[unknown])[:, None]
     usual = trials[..., LOG_FOCAL] - np.log(priors.sides)[:, None] - PRIORS.usual_log_focal

@@ -54,15 +54,10 @@ SPLIT = FocalSplitOptions()
 def split_by_focal(
     tables: VoteTables, photos: Sequence[PairId], starts: Sequence[FloatArray]
 ) -> tuple[FloatArray, dict[int, int]]:
-    """Find cameras that share all but the focal, and which photo is of which.
+    """Find cameras (C, 5) that share all but the focal, and the number of the camera of each photo; one if all agree.
 
-    Args:
-        tables: undistorted pairs, in longer sides from the middle of the photo; its members are not used.
-        photos: the two photos of each pair.
-        starts: (5,) each, candidate cameras.
-
-    Returns:
-        (C, 5) cameras, and the number of the camera by photo; one camera where the photos agree.
+    The tables are of undistorted pairs, in longer sides from the middle of the photo; their members are not used. The
+    starts (5,) are candidate cameras.
     """
     everyone = sorted({photo for pair in photos for photo in pair})
     pairs = _PairVotes(tables, photos)
@@ -90,8 +85,6 @@ def peak_cameras(consensus: Consensus) -> list[FloatArray]:
 
 
 class _PairVotes:
-    """Votes of pairs of photos for cameras."""
-
     def __init__(self, tables: VoteTables, photos: Sequence[PairId]) -> None:
         self.tables, self.photos = tables, photos
         self.pairs_of: dict[int, list[int]] = {}
@@ -174,7 +167,6 @@ class _PairVotes:
         return float(np.sum(self.tables.weights[touched]))
 
     def total(self, cameras: FloatArray, labels: dict[int, int]) -> float:
-        """Return the sum of the votes of all pairs."""
         return float(
             sum(
                 self.votes(k, cameras[labels[first]][None], cameras[labels[second]][None])[0, 0]
@@ -228,7 +220,6 @@ class _Voting(NamedTuple):
     rows: IndexArray
     """(P,) of all pairs."""
     photos: list[int]
-    """All photos that have pairs."""
     members: IndexArray
     """(P, 2) their places in `photos`."""
 
@@ -254,7 +245,6 @@ class TwoCameras(NamedTuple):
     deviations: float
     """The gain in its standard deviations, pairs taken as independent."""
     smaller_count: int
-    """Photos of the smaller camera."""
 
     @property
     def is_possible(self) -> bool:
@@ -342,12 +332,10 @@ class _Division:
         return float(np.sum(self.votes[rows, places[cameras[:, 0]], places[cameras[:, 1]]]))
 
     def pair_votes(self, places: IndexArray, labels: IndexArray) -> FloatArray:
-        """Return (P,) votes of the pairs for a division."""
         first, second = places[labels][self.members].T
         return np.asarray(self.votes[self.rows, first, second], np.float64)
 
     def total(self, places: IndexArray, labels: IndexArray) -> float:
-        """Return the sum of the votes for a division."""
         return float(np.sum(self.pair_votes(places, labels)))
 
     def refine(self, places: IndexArray, labels: IndexArray) -> tuple[IndexArray, IndexArray]:

@@ -71,11 +71,8 @@ def calibrate_photo_set(
 ) -> list[CalibratedCamera]:  # fmt: skip
     """Return every camera of a set of photos, the one with most photos first.
 
-    Args:
-        pairs: all pairs that are not degenerate.
-        calibrate: finds one camera from its own pairs.
-        together: also use the pairs between cameras.
-        split: with `together`, also split groups whose photos disagree.
+    `calibrate` finds one camera from its own pairs. `together` also uses the pairs between cameras; `split` then also
+    splits groups whose photos disagree.
     """
     groups: dict[str, list[int]] = {}
     for photo, group in pairs.groups.items():
@@ -95,7 +92,6 @@ def calibrate_photo_set(
 def _calibrate_alone(
     calibrate: CalibrateFunction, own: CameraPairs, options: CalibrationSettings, seed: int
 ) -> Calibration:
-    """Return the calibration from the pairs of one camera; a guess where the computation fails."""
     try:
         return calibrate(own, options, seed)
     except FAILURES as err:
@@ -108,7 +104,6 @@ def _calibrate_alone(
 def _calibrate_jointly(
     cameras: list[CalibratedCamera], pairs: PhotoPairs, options: CalibrationSettings, seed: int, *, split: bool
 ) -> list[CalibratedCamera]:
-    """Return the cameras calibrated from all pairs; unchanged where the computation fails."""
     try:
         return (
             _split_and_calibrate(cameras, pairs, options, seed)
@@ -218,7 +213,6 @@ def _names(camera: CalibratedCamera, pairs: PhotoPairs) -> Iterator[str]:
 
 
 def _split_by_photo(camera: CalibratedCamera, family: int, pairs: PhotoPairs) -> list[CalibratedCamera]:
-    """Return an uncalibrated camera for each photo of a group."""
     nothing, names = guess_calibration(pairs.sizes[camera.photos[0]], "", {}), _names(camera, pairs)
     return [CalibratedCamera(next(names), (photo,), nothing, family) for photo in sorted(camera.photos)]
 

@@ -81,12 +81,9 @@ class CameraPriors:
     """Whether distortion is estimated."""
 
     def prior(self, free: BoolArray, thetas: FloatArray, held: BoolArray | None = None) -> Prior:
-        """Return the prior for a choice of freed parts.
+        """Return the prior for a choice (C, 4) of freed parts, and of parts `held` at their usual values.
 
-        Args:
-            free: (C, 4) the freed parts.
-            thetas: (C, 5) parameters of the cameras; they convert k1 to kappa.
-            held: (C, 4) the parts that stay at their usual values; none if None.
+        The parameters (C, 5) convert k1 to kappa.
         """
         mean, deviation = np.zeros((len(self.sides), CAMERA)), np.empty((len(self.sides), CAMERA))
         hinted = ~free[:, FOCAL] & np.isfinite(self.hints)
@@ -194,10 +191,7 @@ class Evidence:
     ) -> tuple[BoolArray, Posteriors]:
         """Return all choices (K, C, 4) for one camera, and its posterior under each.
 
-        Args:
-            free: (C, 4) the choices for all cameras.
-            step: (5C,) mean step of the posterior under `free`.
-            covariance: (5C, 5C) of the same posterior.
+        `step` (5C,) and `covariance` are of the posterior under the choices `free` (C, 4) for all cameras.
         """
         block = slice(CAMERA * camera, CAMERA * (camera + 1))
         prior, trials = self.priors.prior(free, self.thetas), self.choices(free, camera)

@@ -206,14 +206,9 @@ def _rays_and_slopes(lens: Lens | Equirectangular, points: FloatArray) -> FloatA
 
 
 def search_rays(lines: FloatArray, samples: IndexArray, threshold: float) -> tuple[float, FloatArray]:
-    """Return the support of the best F, in matches, and F (3, 3).
+    """Return the support of the best F, in matches, and F (3, 3); lines (N, 18) are from `bearings_through`.
 
-    A match counts 1 - d^2 / threshold^2, or nothing beyond the threshold.
-
-    Args:
-        lines: (N, 18) matches, from `bearings_through`.
-        samples: (S, 8) rows of them.
-        threshold: largest distance of an inlier, in the unit of the photo.
+    A match counts 1 - d^2 / threshold^2, or nothing beyond the threshold. `samples` (S, 8) are rows.
     """
     p, q = lines[:, FIRST], lines[:, SECOND]
     Fs = fit_rays(p[samples], q[samples])
@@ -271,7 +266,6 @@ class RefinedLens(NamedTuple):
     covariance: FloatArray
     """(4, 4) of its parameters."""
     sigma: float
-    """Standard deviation of a distance."""
 
 
 class System(NamedTuple):
@@ -288,15 +282,11 @@ class System(NamedTuple):
 
 
 def refine_lens(start: Lens, pairs: Sequence[Pair], sigma: float) -> RefinedLens:
-    """Return the lens of the family of `start` with the least robust cost, with its covariance.
+    """Return the lens of the family of `start` with the least robust cost, with its covariance, in longer sides.
 
     As `adjustment` for lenses with one radial term: distances are Sampson's (thesis 4.2) in the photos, downweighted by
     the cost of Geman and McClure (1987), and the pose of every pair is eliminated. The covariance is the sandwich with
     pairs as clusters, times the squared misfit, for matches that share keypoints (`redundancy`).
-
-    Args:
-        start: in longer sides of the photos, the center in the middle.
-        sigma: first standard deviation of a distance, in longer sides.
     """
     matches = [x for x, _ in pairs]
     poses = tuple(_pose_of(F) for _, F in pairs)
@@ -362,13 +352,11 @@ def _step(state: State, systems: list[System], damping: float) -> State:
 
 
 def _systems(matches: Sequence[FloatArray], state: State, sigma: float) -> list[System]:
-    """Return the normal equations of every pair, with derivatives by finite differences."""
     lenses = [state.lens, *(state.lens_at(state.parameters + STEP * axis) for axis in np.eye(LENS))]
     return [_system(x, lenses, pose, sigma) for x, pose in zip(matches, state.poses, strict=True)]
 
 
 def _system(x: FloatArray, lenses: list[Lens], pose: FloatArray, sigma: float) -> System:
-    """Return the normal equations of a pair, for a lens and the lenses a step away from it."""
     (lens, *steps), E = lenses, _essential(pose)
     pair = bearings_through(lens, x)
     r = signed_distances(E, pair)
@@ -432,9 +420,7 @@ class LensEstimate:
     perspective_support: float
     """The same with a perspective lens, whatever its focal."""
     pairs: int
-    """Number of pairs that voted."""
     size: tuple[int, int]
-    """(width, height) of the photos."""
     log_odds: float = np.inf
     """Robust cost of the best perspective lens with one radial term minus its own, without the pair that favors it
     most: repeated structure can make a pair favor any lens."""
@@ -459,13 +445,7 @@ class LensEstimate:
 
 
 def find_lens(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 0) -> LensEstimate | None:
-    """Find the lens of photos of one size from the raw matches of their pairs; None where too few pairs have matches.
-
-    Args:
-        matches: per pair (N, 4) x1, y1, x2, y2 in pixels, wrong ones included.
-        size: (width, height) of the photos.
-        seed: of the samples.
-    """
+    """Find the lens of photos of one size from the raw matches (N, 4) px of their pairs; None for too few."""
     side = float(max(size))
     pairs = _sample(matches, size, np.random.default_rng(seed), SEARCH.most_pairs, SEARCH.most_matches)
     if pairs is None:
@@ -559,9 +539,7 @@ def _first_look(
 def _log_odds(refined: RefinedLens, rival: RadialLens, pairs: _SampledPairs, Fs: Sequence[FloatArray]) -> float:
     """Return by how much less a lens costs than a perspective rival, without the pair in which it gains most.
 
-    Args:
-        rival: first lens; it starts with the matrices of the lens, and with its own.
-        Fs: fundamental matrices that suit the lens.
+    The rival starts with the matrices of the lens, `Fs`, and with its own.
     """
     starts = Fs, [F for _, F in pairs.search(rival)]
     rivals = (refine_lens(rival, pairs.with_matrices(start), pairs.threshold).state for start in starts)

@@ -80,15 +80,9 @@ ZERO_CURVES = ZeroCurveOptions()
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Find the K that most pairs agree on, and the lens.
+    """Find the K that most pairs agree on, and the lens; an estimate or a guess where the pairs do not determine K.
 
-    Args:
-        pairs: without inliers no lens is found, and the standard deviations come from resampling the pairs.
-        options: `center_sigma` of the prior on the optical center, and whether to look for a lens.
-        seed: of that resampling.
-
-    Returns:
-        K with ``identifiable=True``, or an estimate or a guess and the reason why the pairs do not determine K.
+    Without inliers no lens is found, and the standard deviations come from resampling the pairs.
 
     Raises:
         ValueError: malformed input, see `selfcal.pairs.prepare`.
@@ -176,7 +170,6 @@ class _Adjustment:
 
     @property
     def vote_share(self) -> float:
-        """Votes for the camera over those for the peak."""
         thetas = np.array([self.fit.state.thetas[0, :KAPPA], self.peak.theta])
         at_fit, at_peak = self.consensus.evaluate(thetas, ZERO_CURVES.votes_sigma)
         return float(at_fit / at_peak) if at_peak > 0 else 0.0
@@ -189,7 +182,6 @@ class _Adjustment:
 
     @property
     def agreeing_pairs(self) -> IndexArray:
-        """Usable pairs that come near the peak."""
         return np.flatnonzero(self.consensus.ratios(self.peak.theta) < ZERO_CURVES.agreeing_ratio)
 
 
