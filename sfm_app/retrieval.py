@@ -151,17 +151,11 @@ def pairs_nearby(images: Sequence[MatchedImage], count: int) -> set[PairId]:
     located = [(image.id, image.gps) for image in images if image.gps is not None]
     if len(located) < 2:
         return set()
-    angles = np.radians([(gps.latitude_deg, gps.longitude_deg) for _, gps in located])
-    positions = _unit_vectors(angles)
+    north, east = np.radians([(gps.latitude_deg, gps.longitude_deg) for _, gps in located]).T
+    positions = np.column_stack([np.cos(north) * np.cos(east), np.cos(north) * np.sin(east), np.sin(north)])
     nearest = np.atleast_2d(cKDTree(positions).query(positions, k=min(count + 1, len(located)))[1]).tolist()
     ids = [photo for photo, _ in located]
     return {_pair(ids[row], ids[k]) for row, others in enumerate(nearest) for k in others if k != row}
-
-
-def _unit_vectors(angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N, 3) unit vectors of latitudes and longitudes in radians."""
-    north, east = angles.T
-    return np.column_stack([np.cos(north) * np.cos(east), np.cos(north) * np.sin(east), np.sin(north)])
 
 
 def _order_key(image: MatchedImage) -> tuple[float, list[tuple[int, str]], int]:

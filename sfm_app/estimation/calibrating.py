@@ -101,13 +101,15 @@ def find_intrinsics(
         if selected is sample:
             break
         cameras = _calibrate(matches, selected, run)
-    cameras += cameras_with_lens(matches, views)
+    images = matches.images.values()
+    for group, lens in views.lenses.items():  # they precede the fundamental matrices
+        cameras.append(CalibratedCamera(group, tuple(image.id for image in images if image.group == group), lens))
     report_claims({camera.name: _exif_claim(camera, matches) for camera in cameras}, run)
     cameras = sorted(_take_given_cameras(cameras, matches, run), key=lambda one: (-len(one.photos), one.name))
     intrinsics = Intrinsics(
         cameras={camera.name: explain_failure(camera, views) for camera in cameras},
         camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
-        photos={image.id: image.name for image in matches.images.values()},
+        photos={image.id: image.name for image in images},
     )
     return intrinsics, cameras
 
@@ -164,14 +166,6 @@ def _take_given_cameras(
             result.append(CalibratedCamera(group, photos, own))
     report_checks(checked, run)
     return result
-
-
-def cameras_with_lens(matches: MatchGraph, views: ViewGraph) -> list[CalibratedCamera]:
-    """Return the cameras with a wide lens, which precede the fundamental matrices."""
-    return [
-        CalibratedCamera(group, tuple(photo for photo, one in matches.images.items() if one.group == group), lens)
-        for group, lens in views.lenses.items()
-    ]
 
 
 def explain_failure(camera: CalibratedCamera, views: ViewGraph) -> Calibration:

@@ -71,7 +71,12 @@ def find_lenses(
         InputError: the calibration file fits no photo.
         ConfigError: the user states panoramas, and some photos are none.
     """
-    _check_panoramas(matches, run)
+    others = [image.name for image in matches.images.values() if image.projection != EQUIRECTANGULAR]
+    if run.settings.scene.camera_model == "EQUIRECTANGULAR" and others:
+        raise ConfigError(
+            f"{len(others)} photos are not panoramas, such as {others[0]}",
+            hint="omit --camera-model EQUIRECTANGULAR; panoramas are detected automatically",
+        )
     given = assign_cameras(matches, run.given, keep=run.settings.calibration.keep)
     if given.notes:
         run.record(given_camera_notes=list(given.notes))
@@ -84,8 +89,10 @@ def find_lenses(
     for group, images in groups.items():
         given_camera = given.cameras.get(group)
         if given_camera is not None:
-            checked[group] = given_camera, _lens_of_matches(given_camera, images, matches, run)
-            lens = given_camera if given_camera.projection == FISHEYE else None
+            is_wide = given_camera.projection == FISHEYE
+            searched = run.settings.calibration.lens
+            checked[group] = given_camera, _search_lens(images, matches, run, is_wide=is_wide) if searched else None
+            lens = given_camera if is_wide else None
         else:
             lens = known_lenses[group] if group in known_lenses else _find_lens(images, matches, run)
         if lens is not None:
@@ -117,27 +124,9 @@ def _find_lens(images: Sequence[MatchedImage], matches: MatchGraph, run: RunCont
 
 def panorama(size: tuple[int, int]) -> Calibration:
     """Return the camera of panoramas of (width, height) pixels."""
+    spread = dict.fromkeys(("fx", "fy", "cx", "cy"), 0.0)
     K = panorama_matrix(size)
-    return Calibration(
-        K,
-        *size,
-        PANORAMA,
-        identifiable=True,
-        projection=EQUIRECTANGULAR,
-        spread=dict.fromkeys(("fx", "fy", "cx", "cy"), 0.0),
-    )
-
-
-def _lens_of_matches(
-    known: Calibration, images: Sequence[MatchedImage], matches: MatchGraph, run: RunContext
-) -> Calibration | None:
-    """Return the lens that the matches of a group with a given camera show; None where they show none.
-
-    For a given perspective camera, they show one only where the lens is a fisheye.
-    """
-    if not run.settings.calibration.lens:
-        return None
-    return _search_lens(images, matches, run, is_wide=known.projection == FISHEYE)
+    return Calibration(K, *size, PANORAMA, identifiable=True, projection=EQUIRECTANGULAR, spread=spread)
 
 
 def _search_lens(
@@ -157,16 +146,6 @@ def _search_lens(
         logger.info("the lens of a group could not be estimated", exc_info=err)
         return None
     return to_calibration(estimate, size) if estimate is not None and (is_wide or estimate.is_fisheye) else None
-
-
-def _check_panoramas(matches: MatchGraph, run: RunContext) -> None:
-    """Check that all photos are panoramas if the user states so."""
-    others = [image.name for image in matches.images.values() if image.projection != EQUIRECTANGULAR]
-    if run.settings.scene.camera_model == "EQUIRECTANGULAR" and others:
-        raise ConfigError(
-            f"{len(others)} photos are not panoramas, such as {others[0]}",
-            hint="omit --camera-model EQUIRECTANGULAR; panoramas are detected automatically",
-        )
 
 
 def to_calibration(estimate: LensEstimate, size: tuple[int, int]) -> Calibration:

@@ -75,15 +75,11 @@ def find_or_keep_intrinsics(
             return find_intrinsics(matches, views, run)
         cameras += new
     run.record(kept_cameras=sorted(known))
-    return _assemble(cameras, matches)
-
-
-def _assemble(cameras: list[CalibratedCamera], matches: MatchGraph) -> tuple[Intrinsics, Sequence[CalibratedCamera]]:
     cameras = sorted(cameras, key=lambda one: (-len(one.photos), one.name))
     intrinsics = Intrinsics(
         cameras={camera.name: camera.found for camera in cameras},
         camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
-        photos={image.id: image.name for image in matches.images.values()},
+        photos={image.id: image.name for image in images},
     )
     return intrinsics, cameras
 
@@ -143,11 +139,12 @@ def _pair_contradictions(
     calibrator = run.plugins.calibrator(options.calibrator)
     own = calibrate_photo_set(pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=False)
     cameras = [to_whole_photo(mine, new[0]).found for mine in own]
-    return [one for estimated in cameras for one in find_contradictions(camera, estimated) if _is_zoom(one)]
-
-
-def _is_zoom(one: Contradiction) -> bool:
-    return one.what not in CENTERS and abs(one.given_px - one.found_px) > 0.05 * one.found_px  # chosen by hand
+    differences = [one for estimated in cameras for one in find_contradictions(camera, estimated)]
+    # focusing changes less; chosen by hand
+    return [
+        one for one in differences
+        if one.what not in CENTERS and abs(one.given_px - one.found_px) > 0.05 * one.found_px
+    ]  # fmt: skip
 
 
 def _part(matches: MatchGraph, views: ViewGraph, images: Mapping[int, MatchedImage]) -> tuple[MatchGraph, ViewGraph]:

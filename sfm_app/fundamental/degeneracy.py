@@ -367,11 +367,8 @@ def find_stationary(x1: FloatArray, x2: FloatArray, unit_px: float = 1.0) -> Boo
 
     The displacements of a scene are spread along a curve or over an area around 0: between one and four units there are
     at least three times as many as below one. Matches are stationary where the peak holds no fewer than that ring, and
-    where the scene loses few matches: video frames in which all move by a few pixels keep theirs.
-
-    Args:
-        x1, x2: (N, 2) pixels in two photos of the same size.
-        unit_px: generous noise of the keypoints; more than 1 where they were detected in a smaller image.
+    where the scene loses few matches: video frames in which all move by a few pixels keep theirs. `unit_px` is a
+    generous noise of the keypoints; more than 1 where they were detected in a smaller image.
     """
     squared = np.square(x2 - x1).sum(axis=1) / unit_px**2
     peak, stationary, within_ring = (
@@ -401,15 +398,8 @@ def fit_moving(
     """Estimate the epipolar geometry of the moving matches; the stationary ones are no inliers and have prior 0.
 
     Where the camera moved without rotation, distant objects stay in place, too. Widespread stationary matches that
-    agree with the geometry of the others belong to the scene, and all matches are fitted together.
-
-    Args:
-        points: x1, x2, each (N, 2) pixels.
-        stationary: (N,) mask from `find_stationary`.
-        wide: `is_widespread` of these.
-
-    Returns:
-        A fit whose inliers and priors are (N,), or the kind of stationary matches if the moving ones have no fit.
+    agree with the geometry of the others belong to the scene, and all matches are fitted together. Where the moving
+    ones have no fit, the reason is the kind of stationary matches. `wide` is `is_widespread` of these.
     """
     x1, x2 = points
     moving = fit(x1[~stationary], x2[~stationary], options, seed)

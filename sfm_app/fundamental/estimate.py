@@ -59,18 +59,12 @@ def estimate_with(
 ) -> EpipolarFit | Rejected:
     """Run an external search and assess its F as for the built-in estimators; for plug-ins.
 
-    Args:
-        search: gets the distinct matches, at least `options.min_inliers`, as contiguous (M, 2) pixels about the middle
-            of each view, in an order that depends on the seed. Its F may have any scale; it is brought to rank 2.
-            Inliers, priors, degeneracy and the test against chance are computed from this F. It should not raise on
-            data.
-        x1: (N, 2) pixels.
-        x2: (N, 2) pixels, row by row the partners of x1.
-        options: threshold, confidence, largest number of samples, smallest number of inliers.
-        seed: same seed, same bytes, if `search` is deterministic.
+    The search gets the distinct matches, at least `options.min_inliers`, as contiguous (M, 2) pixels about the middle
+    of each view, in an order that depends on the seed. It should not raise on data. Its F may have any scale, and is
+    brought to rank 2. Inliers, priors, degeneracy and the test against chance are computed from this F.
 
     Raises:
-        ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
+        ValueError: the points are not valid (see `check_points`), or F is not (3, 3).
     """
     first, second = check_points(x1, x2)
     matches = prepare(first, second, seed)

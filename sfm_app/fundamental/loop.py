@@ -107,13 +107,8 @@ def draw_until_better(  # noqa: PLR0913
     Lines 4 to 6 of Algorithm 1. Samples drawn without the priors compete only among themselves: a second motion would
     never win against samples that the priors have made nearly perfect.
 
-    Args:
-        points: N >= the sample size; repeated to (2 N, 4) for a pre-test with a random start, so that any N consecutive
-            rows hold all matches.
-        pretests: by the kind of the sample: `GUIDED`, `UNGUIDED`.
-        to_beat: (2,) smallest penalty so far of each kind; lowered.
-        limit: largest number of samples.
-        best: (2, 9) set to the better models.
+    For a pre-test with a random start, the points are repeated to (2 N, 4), so that any N consecutive rows hold all
+    matches. `to_beat` (2,), the smallest penalties so far, is lowered, and `best` (2, 9) set to the better models.
     """
     count = draws.priors.shape[0]
     sample = np.empty(draws.sample_size, dtype=np.int64)

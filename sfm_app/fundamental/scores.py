@@ -113,11 +113,8 @@ def _cost(loss: Loss, squared: float) -> float:
 def penalty(points: FloatArray, start: int, f: FloatArray, loss: Loss, to_beat: float, pretest: PreTest) -> float:
     """Return the penalty of all matches, or inf as soon as f cannot stay below `to_beat` or fails the pre-test.
 
-    Args:
-        points: in random order; repeated to (2 N, 4) for a pre-test with a random start.
-        start: the match to begin with.
-        to_beat: best penalty so far; inf for a full count.
-        pretest: how many inliers f must have after each part of the matches; not applied to the median.
+    It begins with the match `start`. The points are in random order, repeated to (2 N, 4) for a pre-test with a random
+    start. The median has no pre-test.
     """
     if loss.kind == LMEDS:
         return _median_of_squares(points, f, to_beat)

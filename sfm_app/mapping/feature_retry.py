@@ -170,7 +170,14 @@ def _retry_pairs(
     first: MappedScene, pairs: Sequence[PairId], report: dict[str, Json], steps: Steps
 ) -> MappedScene | None:
     """Run all steps from features to models once more; return None if there is no new geometry."""
-    run = _side_run(first.run)
+    matching = first.run.settings.matching
+    looser = matching.model_copy(update={"max_ratio": max(OPTIONS.max_ratio, matching.max_ratio)})
+    run = replace(
+        first.run,
+        workspace=SubWorkspace(first.run.workspace, FOLDER),  # a killed run is resumed there
+        settings=first.run.settings.model_copy(update={"matching": looser}),
+        statistics={},
+    )
     finer = replace(run, workspace=SubWorkspace(run.workspace, FEATURES))
     with translate_errors("extracting finer features"):
         if not finer.workspace.database.exists():
@@ -191,23 +198,11 @@ def _retry_pairs(
         dict(sorted((fits | dict(fitted.fits)).items())), rejected | dict(fitted.rejected), first.views.lenses
     )
     report["pairs_with_geometry"] = [len(first.views.fits), len(views.fits)]
-    intrinsics = first.intrinsics if _is_mostly_calibrated(first) else steps.find_intrinsics(matches, views, run)[0]
+    # where pairs determine the cameras of half of the photos, more pairs change little
+    estimated = [first.intrinsics.camera(image).is_estimated for image in first.matches.images.values()]
+    is_calibrated = 2 * sum(estimated) >= len(estimated)
+    intrinsics = first.intrinsics if is_calibrated else steps.find_intrinsics(matches, views, run)[0]
     return MappedScene(steps.reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
-
-
-def _is_mostly_calibrated(scene: MappedScene) -> bool:
-    """Return whether pairs determine the cameras of at least half of the photos; more pairs then change little."""
-    images = scene.matches.images.values()
-    return 2 * sum(scene.intrinsics.camera(image).is_estimated for image in images) >= len(images)
-
-
-def _side_run(run: RunContext) -> RunContext:
-    place = SubWorkspace(run.workspace, FOLDER)
-    loose = run.settings.matching.model_copy(
-        update={"max_ratio": max(OPTIONS.max_ratio, run.settings.matching.max_ratio)}
-    )
-    settings = run.settings.model_copy(update={"matching": loose})
-    return replace(run, workspace=place, settings=settings, statistics={})
 
 
 def _placed_count(outcome: Outcome) -> int:

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain, count
 
 import numpy as np
 
@@ -122,23 +123,12 @@ def guessed_intrinsics(intrinsics: Intrinsics, sides: float = GUESSED_FOCAL) -> 
     With a perspective camera, COLMAP cannot place photos of a fisheye lens.
     """
     cameras = {
-        name: _guess_by_sides(camera, sides)
-        if camera.projection == PERSPECTIVE and not has_stated_focal(camera)
+        name: _guess(camera, sides * max(camera.width, camera.height), camera.reason)
+        if camera.projection == PERSPECTIVE and camera.method != "exif" and not camera.is_given
         else camera
         for name, camera in intrinsics.cameras.items()
     }
     return replace(intrinsics, cameras=cameras)
-
-
-def has_stated_focal(camera: Calibration) -> bool:
-    """Return whether the focal comes from EXIF or from the user."""
-    return camera.method == "exif" or camera.is_given
-
-
-def _guess_by_sides(camera: Calibration, sides: float) -> Calibration:
-    size = camera.width, camera.height
-    K = guessed_camera_matrix(size, sides * max(size))
-    return Calibration(K, *size, "guess", identifiable=False, reason=camera.reason)
 
 
 # A camera per photo, for a zoom or several devices. Photos of one size share a camera until their pairs contradict
@@ -179,9 +169,10 @@ def with_camera_per_photo(model: Attempt, shared: Intrinsics, matches: MatchGrap
     cameras, camera_of = dict(shared.cameras), dict(shared.camera_of)
     for name in divided:
         camera = cameras.pop(name)
+        focal_px, reason = focal_of.get(name, camera.focal_px), "its photos may each be of another camera"
         names = _free_names(name, {*shared.cameras, *cameras})
         for image, own in zip(sorted(members[name], key=lambda image: image.name), names, strict=False):
-            cameras[own], camera_of[image.name] = _guess_of_photo(camera, focal_of.get(name)), own
+            cameras[own], camera_of[image.name] = _guess(camera, focal_px, reason), own
     return replace(shared, cameras=cameras, camera_of=camera_of)
 
 
@@ -239,16 +230,10 @@ def _split_at_gap(focals: Mapping[str, float]) -> list[list[str]]:
 
 
 def _free_names(name: str, taken: Collection[str]) -> Iterable[str]:
-    """Yield the name itself, then numbered variants of it that are not taken."""
-    yield name
-    number = 2
-    while True:
-        if (other := f"{name} #{number}") not in taken:
-            yield other
-        number += 1
+    """Return the name itself, then numbered variants of it that are not taken."""
+    return chain([name], (other for number in count(2) if (other := f"{name} #{number}") not in taken))
 
 
-def _guess_of_photo(camera: Calibration, focal_px: float | None) -> Calibration:
+def _guess(camera: Calibration, focal_px: float, reason: str) -> Calibration:
     size = camera.width, camera.height
-    K = guessed_camera_matrix(size, camera.focal_px if focal_px is None else focal_px)
-    return Calibration(K, *size, "guess", identifiable=False, reason="its photos may each be of another camera")
+    return Calibration(guessed_camera_matrix(size, focal_px), *size, "guess", identifiable=False, reason=reason)

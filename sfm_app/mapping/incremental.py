@@ -37,7 +37,7 @@ from sfm_app.mapping.split_and_merge import split_attempt
 from sfm_app.matching.pairs import find_same_matches
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.runtime.context import Earlier, RunContext
-from sfm_app.types import Intrinsics, LookAlikes, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
+from sfm_app.types import Intrinsics, LookAlikes, MatchGraph, PoseGraph, ViewGraph
 
 logger = logging.getLogger("sfm_app")
 
@@ -114,7 +114,8 @@ def _grow(inputs: _Inputs, earlier: Earlier) -> tuple[Outcome | None, str]:
         return None, f"the earlier model holds only {len(placed)} of {len(matches.images)} photos"
     epipolar = run.settings.epipolar
     known = model_poses(start, matches, epipolar.max_error_px, epipolar.min_inliers)
-    graph = _pose_graph(inputs, known)
+    options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, run.seed)
+    graph = inputs.steps.build_pose_graph(matches, views, inputs.intrinsics, options, run.map, known)
     _write_graph(graph, inputs)
     matches, views = drop_look_alikes(matches, views, graph)
     connected = max(graph.groups, key=lambda photos: len(set(photos).intersection(placed)), default=())
@@ -151,13 +152,6 @@ def _doubt(attempt: Attempt, placed: Collection[int], before: float, inputs: _In
     if inputs.steps.judge_places([attempt])[0]:
         return TWO_PLACES
     return inputs.steps.rival_reason(attempt, inputs.intrinsics, inputs.matches, inputs.views)
-
-
-def _pose_graph(inputs: _Inputs, known: dict[PairId, RelativePose]) -> PoseGraph:
-    """Return the pose graph: pairs that the earlier model explains have its poses, all others are estimated."""
-    epipolar, run = inputs.run.settings.epipolar, inputs.run
-    options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, run.seed)
-    return inputs.steps.build_pose_graph(inputs.matches, inputs.views, inputs.intrinsics, options, run.map, known)
 
 
 def _write_graph(graph: PoseGraph, inputs: _Inputs) -> None:

@@ -287,7 +287,8 @@ def align_fragments(fragments: Sequence[Fragment], joins: Sequence[Join]) -> Ali
     dropped: list[tuple[Join, JoinError]] = []
     while True:
         frames = _synchronize(remaining, len(fragments))
-        errors = [join_error(join, frames, radii) for join in remaining]
+        implied = [frames[join.first].inverse().compose(frames[join.second]) for join in remaining]
+        errors = [difference(join, one, radii) for join, one in zip(remaining, implied, strict=True)]
         # a single loop is equally far off in all of its joins: the one with least evidence goes
         ranked = sorted(range(len(remaining)), key=lambda k: (-errors[k].excess / remaining[k].weight, k))
         worst = next((k for k in ranked if errors[k].excess > 1.0), None)
@@ -306,12 +307,6 @@ def _main_group(fragments: Sequence[Fragment], joins: Sequence[Join]) -> set[int
         return len({photo for number in group for photo in fragments[number].placed.photos.tolist()})
 
     return max(groups, key=lambda group: (count_photos(group), -min(group)), default=set())
-
-
-def join_error(join: Join, frames: Mapping[int, Similarity], radii: Sequence[float]) -> JoinError:
-    """Return the difference of a join from the frames of its fragments; radii are in units of each fragment."""
-    expected = frames[join.first].inverse().compose(frames[join.second])
-    return difference(join, expected, radii)
 
 
 def difference(join: Join, expected: Similarity, radii: Sequence[float]) -> JoinError:

@@ -150,13 +150,10 @@ def _compensate(
             return [*rounds, (adjusted, estimate)]
         current = adjust_or_keep(straighten_model(current.model, estimate, keypoints), database, rules)
         rounds.append((current, estimate))
-        if current.failure or _has_converged(before, estimate):
+        changed = OPTIONS.converged * estimate.deviation
+        if current.failure or (before is not None and abs(estimate.readout - before.readout) <= changed):
             break
     return rounds
-
-
-def _has_converged(before: ReadoutEstimate | None, after: ReadoutEstimate) -> bool:
-    return before is not None and abs(after.readout - before.readout) <= OPTIONS.converged * after.deviation
 
 
 def _reason_to_refuse(

@@ -94,7 +94,10 @@ def _find_and_save(
         unmasked = mask[row, column]
         features, keypoints = features.select(unmasked), keypoints[unmasked]
     rows = np.arange(min(len(keypoints), options.max_features))
-    _save(features.select(rows), part_path(photo.id, folders.parts))
+    features = features.select(rows)
+    values = {f"value_{name}": value for name, value in features.values.items()}
+    with replace_atomically(part_path(photo.id, folders.parts)) as beside:
+        np.savez(beside, allow_pickle=False, size=np.array(features.size), keypoints=features.keypoints, **values)
     return photo.id, keypoints[rows].astype(np.float32)
 
 
@@ -172,12 +175,6 @@ def _method_error(method: FeatureMethod, what: str) -> PluginError:
 def part_path(photo: int, folder: Path) -> Path:
     """Return the file that keeps the features of a photo until all are matched."""
     return folder / f"{photo:06d}.npz"
-
-
-def _save(features: Features, path: Path) -> None:
-    values = {f"value_{name}": value for name, value in features.values.items()}
-    with replace_atomically(path) as beside:
-        np.savez(beside, allow_pickle=False, size=np.array(features.size), keypoints=features.keypoints, **values)
 
 
 def load_features(photo: int, folder: Path) -> Features:

@@ -90,7 +90,10 @@ def first_pairs(
     photos, count = sorted(images), options.neighbors
     steps: Sequence[int] = OPTIONS.steps
     if options.pairs == "sequence":
-        count, steps = max(1, round((1 - OPTIONS.sequence_share) * count)), sequence_steps(count)
+        # half of the neighbors are adjacent, the others at doubling distances
+        near = max(2, round(OPTIONS.sequence_share * count / 2))
+        steps = (*range(1, near + 1), *(near * 2**k for k in range(1, 4)))
+        count = max(1, round((1 - OPTIONS.sequence_share) * count))
     chosen = pairs_in_order(list(images.values()), steps) | pairs_nearby(list(images.values()), OPTIONS.nearest_by_gps)
     return sorted(chosen | _similar_pairs(photos, read, count, run, choosers))
 
@@ -113,12 +116,6 @@ def _similar_pairs(
     scores = {pair: count for part in parts for pair, count in part.items()}
     sure = choose_by_rank(scores, 1, max(1, round(OPTIONS.sure_share * count)), choosers)
     return sure | choose_by_rank(scores, round(OPTIONS.preview_share * OPTIONS.preview_features), count, choosers)
-
-
-def sequence_steps(count: int) -> tuple[int, ...]:
-    """Return the steps to the neighbors in a sequence: half of them adjacent, the others at doubling distances."""
-    near = max(2, round(OPTIONS.sequence_share * count / 2))
-    return (*range(1, near + 1), *(near * 2**k for k in range(1, 4)))
 
 
 def second_pairs(

@@ -240,7 +240,8 @@ class Depths:
 
         `points` (N,) are keypoints, `logs` (N,) logarithms of their depths in the scale of the pair.
         """
-        R, t = _directed_pose(self.poses, photo, other)
+        pose = self.poses[min(photo, other), max(photo, other)]
+        R, t = (pose.R, pose.t) if photo < other else (pose.R.T, -pose.R.T @ pose.t)
         rays_here = self.keypoint_bearings(photo)[points, FIRST]
         z = np.exp(logs)
         rotated = rays_here @ R.T
@@ -290,13 +291,6 @@ def count_missing_cells(photo: int, joined: Iterable[int], trusted: Iterable[int
     cells, counts = np.unique(visibility.cells[photo][expected], return_counts=True)
     cells = cells[counts >= OPTIONS.min_cell_points]
     return len(cells), int(np.count_nonzero(~np.isin(cells, visibility.cells[photo][matched])))
-
-
-def _directed_pose(poses: Mapping[PairId, RelativePose], photo: int, other: int) -> tuple[FloatArray, FloatArray]:
-    if photo < other:
-        return poses[photo, other].R, poses[photo, other].t
-    pose = poses[other, photo]
-    return pose.R.T, -pose.R.T @ pose.t
 
 
 def _count_common(end: PairDepths, total: FloatArray) -> int:
@@ -359,7 +353,9 @@ def find_look_alikes(
         return LookAlikeVerdict((), (), tracks)
     trusted = best | {pair for pair, rows in rows_of.items() if _is_confirmed(*tracks.count_agreement(pair, rows))}
     places = Depths(matches, cameras, poses, visibility)
-    rotations = _photo_rotations(trusted, poses)
+    along = {pair: poses[pair] for pair in sorted(trusted)}
+    weights = {pair: float(pose.inlier_count) for pair, pose in along.items()}
+    rotations, _ = average_rotations({pair: pose.R for pair, pose in along.items()}, weights)
     partners = _partners(trusted)
     judged = [_judge_join(join, partners, rotations, places) for join in group_doubted_pairs(doubted, trusted)]
     joins = [join for join, verdict in judged if verdict == ALIKE]
@@ -455,13 +451,6 @@ def _judge_join(
     alike = len(shares) >= OPTIONS.min_photos and float(np.percentile(shares, OPTIONS.low_percentile)) > limit
     verdict = ALIKE if alike else LOOP if same_turn else EITHER
     return LookAlikes(join, missing / max(expected, 1)), verdict
-
-
-def _photo_rotations(trusted: Iterable[PairId], poses: Mapping[PairId, RelativePose]) -> dict[int, FloatArray]:
-    """Return the rotations of photos along the trusted pairs."""
-    known = {pair: poses[pair] for pair in sorted(trusted)}
-    weights = {pair: float(pose.inlier_count) for pair, pose in known.items()}
-    return average_rotations({pair: pose.R for pair, pose in known.items()}, weights)[0]
 
 
 def _rotation_gap_deg(join: tuple[PairId, ...], rotations: Mapping[int, FloatArray], places: Depths) -> float:

@@ -268,11 +268,13 @@ class Pair:
 
     def essential_matrix(self, fit: EpipolarFit) -> FloatArray:
         """Return E from F and the cameras, with singular values that noise makes unequal."""
-        first, second = self.cameras
-        if any(camera.projection != PERSPECTIVE for camera in self.cameras):
-            return _essential_of_rays(self.lines[fit.inliers])
+        (first, second), inliers = self.cameras, self.lines[fit.inliers]
+        if any(camera.projection != PERSPECTIVE for camera in self.cameras):  # by eight points with errors in pixels
+            E = fit_rays(inliers[:, FIRST], inliers[:, SECOND])
+            for _ in range(OPTIONS.reweighted_fits):
+                E = fit_rays(inliers[:, FIRST], inliers[:, SECOND], gradients(E, inliers) ** -2.0)
+            return E
         if first.is_bent or second.is_bent:  # F does not model distortion
-            inliers = self.lines[fit.inliers]
             return eight_point(inliers[:, :2], inliers[:, 9:11])
         return second.K.T @ fit.F @ first.K
 
@@ -379,11 +381,3 @@ def points_ahead(used: FloatArray) -> FloatArray:
     """Return (M, 4) points of the planes z = 1 of both views, of the matches (N, 18) far ahead in both."""
     ahead = (used[:, 2] > OPTIONS.min_cosine_ahead) & (used[:, 11] > OPTIONS.min_cosine_ahead)
     return np.hstack([used[ahead, 0:2] / used[ahead, 2:3], used[ahead, 9:11] / used[ahead, 11:12]])
-
-
-def _essential_of_rays(used: FloatArray) -> FloatArray:
-    """Return E (3, 3) of inliers (N, 18), by eight points with errors in pixels."""
-    E = fit_rays(used[:, FIRST], used[:, SECOND])
-    for _ in range(OPTIONS.reweighted_fits):
-        E = fit_rays(used[:, FIRST], used[:, SECOND], gradients(E, used) ** -2.0)
-    return E

@@ -452,23 +452,16 @@ def _take_step(
     cost = float(factors @ matches.costs(state)) + prior.cost(state.thetas)
 
     def attempt(damping: float) -> State | None:
-        trial = _solve_step(matches, state, prior, system, damping)
+        # cameras from all pairs and the prior, then each pose from its pair
+        reduced = _eliminate_poses(*system, damping)
+        H, g = matches.assemble(Information(reduced.hessians, reduced.gradients, np.empty(0)), factors)
+        H += np.diag(prior.precision.ravel())
+        g += (prior.precision * (prior.mean - state.thetas)).ravel()
+        step = solve_each(H + damping * np.diag(np.diag(H)), g[:, None]).reshape(-1, CAMERA)
+        pose_steps = reduced.pose_steps(step[matches.cameras].reshape(-1, 2 * CAMERA))
+        poses = np.array([retract(*moved) for moved in zip(state.poses, pose_steps, strict=True)]).reshape(-1, 12)
+        trial = replace(state, thetas=state.thetas + step, poses=poses)
         return trial if float(factors @ matches.costs(trial)) + prior.cost(trial.thetas) <= cost else None
 
     better, damping = damped_step(attempt, damping, DAMPING)
     return better or state, damping
-
-
-def _solve_step(
-    matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
-) -> State:
-    """Return the state after one damped step: cameras from all pairs and the prior, then each pose from its pair."""
-    reduced = _eliminate_poses(*system, damping)
-    information = Information(reduced.hessians, reduced.gradients, np.empty(0))
-    H, g = matches.assemble(information, matches.trust * state.weights / state.scale)
-    H += np.diag(prior.precision.ravel())
-    g += (prior.precision * (prior.mean - state.thetas)).ravel()
-    step = solve_each(H + damping * np.diag(np.diag(H)), g[:, None]).reshape(-1, CAMERA)
-    pose_steps = reduced.pose_steps(step[matches.cameras].reshape(-1, 2 * CAMERA))
-    poses = np.array([retract(pose, step) for pose, step in zip(state.poses, pose_steps, strict=True)]).reshape(-1, 12)
-    return replace(state, thetas=state.thetas + step, poses=poses)

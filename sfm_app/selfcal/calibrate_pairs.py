@@ -7,7 +7,7 @@ key pairs are a wish of thesis chapter 6; the degenerate motions are those of th
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -179,8 +179,8 @@ def undistorted_fundamentals(fit: Fit) -> FloatArray:
         x = fit.matches.pair_matches(pair)
         views = (undistort_points(x[:, :2], thetas[first]), undistort_points(x[:, 2:], thetas[second]))
         inverses = [np.linalg.inv(intrinsic_matrix(thetas[camera])) for camera in (first, second)]
-        E = _essential_matrix(fit.state.poses[pair])
-        start = inverses[1].T @ E @ inverses[0]
+        R, t = fit.state.poses[pair, :9].reshape(3, 3), fit.state.poses[pair, 9:]
+        start = inverses[1].T @ np.cross(t, R, axisb=0, axisc=0) @ inverses[0]
         refit = refine_sampson(np.asfortranarray(np.hstack(views)), start, scale=ROBUST_SCALE * fit.state.sigma)
         Fs[pair] = refit if np.isfinite(refit).all() and refit.any() else start
     return Fs
@@ -220,11 +220,6 @@ def _estimate_poses(few: Matches, Fs: FloatArray, thetas: FloatArray) -> FloatAr
     return poses
 
 
-def _essential_matrix(pose: FloatArray) -> FloatArray:
-    R, t = pose[:9].reshape(3, 3), pose[9:]
-    return np.asarray(np.cross(t, R, axisb=0, axisc=0), np.float64)
-
-
 # Uncertainty.
 
 PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1")
@@ -246,15 +241,8 @@ def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> Float
     return np.asarray(total + np.diag(floor.ravel() ** 2), np.float64)
 
 
-class Uncertainty(NamedTuple):
-    """Standard deviations of the parameters of a camera, and their correlations; as in `Calibration`."""
-
-    spread: dict[str, float]
-    correlations: dict[str, float]
-
-
-def camera_uncertainty(theta: FloatArray, cov: FloatArray, unit_px: float) -> Uncertainty:
-    """Return the standard deviations of fx, fy, cx, cy in pixels and of k1, and their correlations."""
+def camera_uncertainty(theta: FloatArray, cov: FloatArray, unit_px: float) -> dict[str, Any]:
+    """Return `spread` and `correlations` of a `Calibration`: those of fx, fy, cx, cy in pixels and of k1."""
     focal, squared = float(np.exp(theta[LOG_FOCAL])) * unit_px, float(np.exp(2.0 * theta[LOG_FOCAL]))
     half = float(np.exp(0.5 * theta[LOG_ASPECT]))
     # rows: how fx, fy, cx, cy, k1 change with log f, u, v, log a, kappa
@@ -265,9 +253,8 @@ def camera_uncertainty(theta: FloatArray, cov: FloatArray, unit_px: float) -> Un
     slopes[4, [LOG_FOCAL, KAPPA]] = 2.0 * theta[KAPPA] * squared, squared
     in_px = slopes @ cov @ slopes.T
     deviations = np.sqrt(np.maximum(np.diag(in_px), 0.0))
-    return Uncertainty(
-        dict(zip(PARAMETER_NAMES, deviations.tolist(), strict=True)), named_correlations(PARAMETER_NAMES, in_px)
-    )
+    spread = dict(zip(PARAMETER_NAMES, deviations.tolist(), strict=True))
+    return {"spread": spread, "correlations": named_correlations(PARAMETER_NAMES, in_px)}
 
 
 def key_pairs(fit: Fit, photos: tuple[PairId, ...]) -> tuple[PairId, ...]:

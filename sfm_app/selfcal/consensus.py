@@ -100,10 +100,6 @@ class Consensus:
         self.weights = pairs.weights if weights is None else weights
         self._packed = pairs.packed_rows
 
-    def with_weights(self, weights: FloatArray) -> "Consensus":
-        """Return the consensus of the same pairs with other weights (P,)."""
-        return Consensus(self.pairs, self.center_sigma, weights)
-
     def evaluate(self, thetas: FloatArray, sigma: float) -> FloatArray:
         """Return (N,) supports plus log-priors at (N, 4) thetas; sigma is the width of a vote, in r."""
         return np.asarray(_values(self._packed, self.weights, self.center_sigma, thetas, sigma))
@@ -355,7 +351,8 @@ def resample_peak(consensus: Consensus, theta: FloatArray, free: Sequence[int], 
     thetas = []
     for _ in range(CONSENSUS.resamples):
         drawn = weights * rng.exponential(size=len(weights))
-        resampled = consensus.with_weights(drawn * (np.sum(weights) / np.sum(drawn)))
+        drawn *= np.sum(weights) / np.sum(drawn)
+        resampled = Consensus(consensus.pairs, consensus.center_sigma, drawn)
         thetas.append(resampled.climb(theta, free, (max(sigma, CONSENSUS.stable_sigma),))[0])
     return np.array(thetas)
 

@@ -25,6 +25,8 @@ from sfm_app.selfcal.calibrate_pairs import (
 )
 from sfm_app.selfcal.consensus import CONSENSUS, rejection_reason, uncertainty_reason
 from sfm_app.selfcal.pairs import (
+    CENTER_U,
+    CENTER_V,
     LOG_FOCAL,
     calibration_from_parameters,
     downgrade_to_estimate,
@@ -162,11 +164,6 @@ class FocalGrid:
         return votes
 
 
-def subsample_pairs(count: int) -> IndexArray:
-    """Return the indices of the pairs that vote on a `FocalGrid`, evenly chosen out of `count`."""
-    return np.linspace(0, count - 1, min(count, GROUPS.most_pairs)).astype(np.int64)
-
-
 # The choice of focals: one grid index for every camera.
 
 
@@ -246,11 +243,6 @@ class CameraGroup:
     divided: bool = False
     """Whether it was split from photos of one size: then each of its photos must support it."""
 
-    @property
-    def is_whole(self) -> bool:
-        """Whether it was calibrated from all of its own pairs and no others."""
-        return self.family < 0 and not self.divided
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Joint:
@@ -281,7 +273,14 @@ def calibrate_cameras(
     hints = np.array([camera.hint_px for camera in cameras]) / unit
     families = np.array([camera.family for camera in cameras], np.int64)
     priors = TiedPriors(sides, hints, options.center_sigma, options.lens, families)
-    thetas = np.array([_initial_parameters(camera, side, unit) for camera, side in zip(cameras, sides, strict=True)])
+    thetas = np.array(
+        [
+            [PRIORS.usual_log_focal + np.log(side), 0.0, 0.0, 0.0, 0.0]
+            if camera.start is None
+            else parameters_from_calibration(camera.start, unit)
+            for camera, side in zip(cameras, sides, strict=True)
+        ]
+    )
     unknown = np.array([camera.start is None for camera in cameras])
     if unknown.any():
         thetas = _find_focals(thetas, unknown, VoteTables(Fs, members, weights), priors)
@@ -319,17 +318,23 @@ def _judge_camera(index: int, camera: CameraGroup, joint: _Joint, method: str) -
     elif not camera.known and margin < CONSENSUS.min_margin:
         reason = "the pairs fit other focals as well or better"
     # a motion that leaves the focal open is the reason only where the deviation is small
-    elif not camera.is_whole and not (camera.divided and uncertain):
+    elif (camera.family >= 0 or camera.divided) and not (camera.divided and uncertain):
         reason = joint.motion
-    reason = reason or rejection_reason(_convert_to_sides(theta, max(camera.size) / unit), spread, camera.size)
+    side = max(camera.size) / unit
+    in_sides = np.array([theta[LOG_FOCAL] - np.log(side), theta[CENTER_U] / side, theta[CENTER_V] / side])
+    reason = reason or rejection_reason(in_sides, spread, camera.size)
     if reason:
         guess = guess_calibration(camera.size, reason, evidence)
-        # it contains the mean of the family: a better start for mapping than the usual focal
-        return replace(guess, K=_family_camera_matrix(theta, camera.size, unit)) if camera.family >= 0 else guess
+        if camera.family < 0:
+            return guess
+        # its focal contains the mean of the family: a better start for mapping than the usual one
+        low, high = np.array(CONSENSUS.focal_range) * max(camera.size)
+        focal_px = float(np.clip(np.exp(theta[LOG_FOCAL]) * unit, low, high))
+        return replace(guess, K=guessed_camera_matrix(camera.size, focal_px))
     calibration = downgrade_to_estimate(
         replace(
             calibration_from_parameters(theta, camera.size, method, unit),
-            **camera_uncertainty(theta, joint.covariance[block, block], unit)._asdict(),
+            **camera_uncertainty(theta, joint.covariance[block, block], unit),
             evidence=evidence,
             held=fit.held_names(index),
         ),
@@ -340,11 +345,6 @@ def _judge_camera(index: int, camera: CameraGroup, joint: _Joint, method: str) -
         if least < GROUPS.fair_share or support < GROUPS.least_support:
             return downgrade_to_estimate(calibration, "some of its photos do not support it")
     return calibration
-
-
-def _convert_to_sides(theta: FloatArray, side: float) -> FloatArray:
-    focal, u, v, aspect, kappa = theta - np.array([np.log(side), 0.0, 0.0, 0.0, 0.0])
-    return np.array([focal, u / side, v / side, aspect, kappa])
 
 
 def _convert_to_units(
@@ -365,12 +365,6 @@ def _convert_to_units(
     return ready.indices, Fs, Matches(inliers, used, photos, unit, count=len(cameras))
 
 
-def _initial_parameters(camera: CameraGroup, side: float, unit: float) -> FloatArray:
-    if camera.start is not None:
-        return parameters_from_calibration(camera.start, unit)
-    return np.array([PRIORS.usual_log_focal + np.log(side), 0.0, 0.0, 0.0, 0.0])
-
-
 def _find_focals(thetas: FloatArray, unknown: BoolArray, tables: VoteTables, priors: CameraPriors) -> FloatArray:
     trials = np.repeat(thetas[:, None], GROUPS.focals, axis=1)
     trials[unknown, :, LOG_FOCAL] = log_focal_grid() + np.log(priors.sides[unknown])[:, None]
@@ -386,13 +380,6 @@ def _find_focals(thetas: FloatArray, unknown: BoolArray, tables: VoteTables, pri
     chosen = thetas.copy()
     chosen[:, LOG_FOCAL] = trials[np.arange(len(thetas)), _consensus_places(own, votes), LOG_FOCAL]
     return chosen
-
-
-def _family_camera_matrix(theta: FloatArray, size: tuple[int, int], unit: float) -> FloatArray:
-    """Return the usual camera matrix with the most likely focal, although it is uncertain."""
-    side = max(size)
-    low, high = np.array(CONSENSUS.focal_range) * side
-    return guessed_camera_matrix(size, float(np.clip(np.exp(theta[LOG_FOCAL]) * unit, low, high)))
 
 
 def _margin(index: int, thetas: FloatArray, tables: VoteTables) -> tuple[float, float]:

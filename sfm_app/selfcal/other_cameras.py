@@ -9,10 +9,9 @@ from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.selfcal.consensus import Consensus, find_peak
-from sfm_app.selfcal.groups import GROUPS, FocalGrid, VoteTables, subsample_pairs
+from sfm_app.selfcal.groups import GROUPS, FocalGrid, VoteTables
 from sfm_app.selfcal.pairs import LOG_FOCAL
 from sfm_app.types import PairId
 from sfm_app.types.arrays import FloatArray, IndexArray
@@ -64,7 +63,9 @@ def split_by_focal(
     _, theta, core = max((pairs.find_core(theta, everyone) for theta in starts), key=lambda core: core[0])
     one = theta[None]
     steps = [focal for photo in everyone if photo not in core for focal in pairs.find_other_focal(photo, theta, core)]
-    focals = _cluster_medians(steps)
+    ordered: FloatArray = np.sort(np.array(steps))
+    cuts = np.flatnonzero(np.diff(ordered) > SPLIT.other_focal) + 1
+    focals = [float(np.median(run)) for run in np.split(ordered, cuts) if len(run)]
     if not focals:
         return one, dict.fromkeys(everyone, 0)
     cameras = np.repeat(one, 1 + len(focals), axis=0)
@@ -175,13 +176,6 @@ class _PairVotes:
         )
 
 
-def _cluster_medians(steps: Sequence[float]) -> list[float]:
-    """Return the medians of clusters of values; gaps above `SPLIT.other_focal` separate clusters."""
-    ordered: NDArray[np.float64] = np.sort(np.array(steps))
-    cuts = np.flatnonzero(np.diff(ordered) > SPLIT.other_focal) + 1
-    return [float(np.median(run)) for run in np.split(ordered, cuts) if len(run)]
-
-
 # Two cameras, decided from all pairs jointly.
 #
 # A minority that agrees on another focal cannot be found one photo at a time: its pairs give some votes to any focal,
@@ -214,21 +208,13 @@ class TwoCameraOptions:
 TWO_CAMERAS = TwoCameraOptions()
 
 
-class _Voting(NamedTuple):
-    """The pairs that vote on a grid of focals."""
-
-    rows: IndexArray
-    """(P,) of all pairs."""
-    photos: list[int]
-    members: IndexArray
-    """(P, 2) their places in `photos`."""
-
-
-def _voting_pairs(photos: Sequence[PairId]) -> _Voting:
-    rows, everyone = subsample_pairs(len(photos)), sorted({photo for pair in photos for photo in pair})
+def _voting_pairs(photos: Sequence[PairId]) -> tuple[IndexArray, list[int], IndexArray]:
+    """Return the rows (P,) of the pairs that vote on a grid of focals, all photos, and (P, 2) their places in these."""
+    rows = np.linspace(0, len(photos) - 1, min(len(photos), GROUPS.most_pairs)).astype(np.int64)
+    everyone = sorted({photo for pair in photos for photo in pair})
     place = {photo: k for k, photo in enumerate(everyone)}
     members = np.array([[place[first], place[second]] for first, second in photos], np.int64).reshape(-1, 2)
-    return _Voting(rows, everyone, members[rows])
+    return rows, everyone, members[rows]
 
 
 class TwoCameras(NamedTuple):
@@ -280,7 +266,7 @@ def divide_photos(tables: VoteTables, photos: Sequence[PairId], starts: Sequence
         return None
     if np.count_nonzero(labels) > len(labels) / 2:
         places, labels = places[::-1], 1 - labels
-    gains = division.pair_votes(places, labels) - grid.votes[:, usual, usual]
+    gains = grid.pair_votes(places[labels]) - grid.votes[:, usual, usual]
     smaller = labels[members].astype(bool)
     theta = np.repeat(np.asarray(starts[best], np.float64)[None], 2, axis=0)
     theta[:, LOG_FOCAL] = grid.grid[places]
@@ -299,8 +285,7 @@ class _Division:
     """Assignment of a number of photos to two cameras, by the votes of pairs on a grid."""
 
     def __init__(self, grid: FocalGrid, photos: int) -> None:
-        self.votes, self.members, self.photos = grid.votes, grid.members, photos
-        self.rows = np.arange(len(grid.votes))
+        self.grid, self.votes, self.members, self.photos = grid, grid.votes, grid.members, photos
         self.pairs_of = [np.flatnonzero((grid.members == photo).any(axis=1)) for photo in range(photos)]
 
     def starts(self, usual: int, other: int) -> tuple[IndexArray, IndexArray]:
@@ -331,12 +316,8 @@ class _Division:
         cameras[self.members[rows] == photo] = camera
         return float(np.sum(self.votes[rows, places[cameras[:, 0]], places[cameras[:, 1]]]))
 
-    def pair_votes(self, places: IndexArray, labels: IndexArray) -> FloatArray:
-        first, second = places[labels][self.members].T
-        return np.asarray(self.votes[self.rows, first, second], np.float64)
-
     def total(self, places: IndexArray, labels: IndexArray) -> float:
-        return float(np.sum(self.pair_votes(places, labels)))
+        return float(np.sum(self.grid.pair_votes(places[labels])))
 
     def refine(self, places: IndexArray, labels: IndexArray) -> tuple[IndexArray, IndexArray]:
         """Move both focals to where they win most votes, and every photo to its camera, until nothing changes."""

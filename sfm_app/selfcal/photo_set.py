@@ -84,7 +84,14 @@ def calibrate_photo_set(
         for name, members in groups.items()
     ]
     if together:
-        cameras = _calibrate_jointly(cameras, pairs, options, seed, split=split)
+        try:
+            cameras = (
+                _split_and_calibrate(cameras, pairs, options, seed)
+                if split
+                else _calibrate_from_all_pairs(cameras, pairs, options)
+            )
+        except FAILURES as err:
+            logger.info("joint calibration of the cameras failed", exc_info=err)
     cameras = [replace(camera, found=_fall_back_to_guess(camera, pairs)) for camera in cameras]
     return sorted(cameras, key=lambda camera: (-len(camera.photos), camera.name))
 
@@ -99,20 +106,6 @@ def _calibrate_alone(
         return guess_calibration(
             own.size, f"the computation failed: {error_reason(err)}", {"pairs": float(len(own.Fs))}
         )
-
-
-def _calibrate_jointly(
-    cameras: list[CalibratedCamera], pairs: PhotoPairs, options: CalibrationSettings, seed: int, *, split: bool
-) -> list[CalibratedCamera]:
-    try:
-        return (
-            _split_and_calibrate(cameras, pairs, options, seed)
-            if split
-            else _calibrate_from_all_pairs(cameras, pairs, options)
-        )
-    except FAILURES as err:
-        logger.info("joint calibration of the cameras failed", exc_info=err)
-        return cameras
 
 
 def _split_and_calibrate(

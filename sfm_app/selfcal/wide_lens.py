@@ -289,7 +289,8 @@ def refine_lens(start: Lens, pairs: Sequence[Pair], sigma: float) -> RefinedLens
     pairs as clusters, times the squared misfit, for matches that share keypoints (`redundancy`).
     """
     matches = [x for x, _ in pairs]
-    poses = tuple(_pose_of(F) for _, F in pairs)
+    # any of the four poses of an essential matrix gives the same distances
+    poses = tuple(np.concatenate([R.ravel(), t]) for R, t in (decompose_essential(F)[0] for _, F in pairs))
     shape = start.exponent if isinstance(start, Fisheye) else start.radial
     state = State(np.array([np.log(start.focal), shape, *start.center]), poses, type(start))
     for _ in range(REFINEMENT.noise_rounds):
@@ -395,12 +396,6 @@ def _distances(matches: Sequence[FloatArray], state: State) -> list[FloatArray]:
     return [signed_distances(_essential(pose), bearings_through(lens, x)) for x, pose in pairs]
 
 
-def _pose_of(F: FloatArray) -> FloatArray:
-    """Return a pose (12,) of the essential matrix nearest to F (3, 3); any of the four gives the same distances."""
-    R, t = decompose_essential(F)[0]
-    return np.concatenate([R.ravel(), t])
-
-
 def _essential(pose: FloatArray) -> FloatArray:
     E = np.empty((3, 3))
     write_essential(pose, E)
@@ -459,7 +454,8 @@ def find_lens(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 
         return None
     refined = refine_lens(best, selected.with_matrices(Fs), pairs.threshold)
     (log_focal, exponent, u, v), unit = refined.state.parameters, np.array([1.0, 1.0, side, side])
-    rival = _radial_rival(best, size)
+    radial = _fit_radial(best, 0.5 * float(np.hypot(*size)) / side)
+    rival = RadialLens(radial[0], max(radial[1], SEARCH.least_radial)) if radial is not None else None
     return LensEstimate(
         lens=Fisheye(
             float(np.exp(log_focal)) * side, float(exponent),
@@ -546,12 +542,6 @@ def _log_odds(refined: RefinedLens, rival: RadialLens, pairs: _SampledPairs, Fs:
     costs = min((pair_costs(pairs.matches, state, refined.sigma) for state in rivals), key=np.sum)
     gains = costs - pair_costs(pairs.matches, refined.state, refined.sigma)
     return float(np.sum(gains) - np.max(gains))
-
-
-def _radial_rival(lens: Fisheye, size: tuple[int, int]) -> RadialLens | None:
-    """Return the perspective lens with one radial term nearest to a fisheye, in longer sides; None for none."""
-    radial = _fit_radial(lens, 0.5 * float(np.hypot(*size)) / max(size))
-    return RadialLens(radial[0], max(radial[1], SEARCH.least_radial)) if radial is not None else None
 
 
 def _fit_radial(lens: Fisheye, reach: float) -> tuple[float, float, float] | None:
