@@ -82,7 +82,7 @@ def fit_to_photos(camera: Calibration, image: MatchedImage) -> tuple[Calibration
     is_turned = camera.width * size[0] == camera.height * size[1]
     return None, (
         f"the file's camera took photos of {camera.width} x {camera.height} pixels, these have {size[0]} x {size[1]}: "
-        f"they were {'is_turned' if is_turned else 'cropped, or are from another camera'}"
+        f"they were {'turned' if is_turned else 'cropped, or are from another camera'}"
     )
 
 

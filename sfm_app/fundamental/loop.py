@@ -279,7 +279,12 @@ class _Loop:
                 break
         if not self.best:
             return None
-        self._recover()
+        if self.recipe.recover is not None:
+            pretest = NO_PRETEST if self.test.pretest.random_start else self.test.pretest
+            F = self.best.f.reshape(3, 3)
+            recovered = self.recipe.recover(self.points, F, self.threshold, self.best.loss, pretest, self.state)
+            if recovered is not None:
+                self.best.replace_if_better(recovered)
         return Hypothesis(self.best.f.reshape(3, 3), self.trials)
 
     def _draw(self) -> bool:
@@ -338,12 +343,3 @@ class _Loop:
             self.draws = self.draws._replace(guided_share=0.0, rest_share=0.0)
         self.patience = math.ceil(min(patience, self.options.max_trials))
         return self.patience <= self.idle
-
-    def _recover(self) -> None:
-        if self.recipe.recover is None:
-            return
-        pretest = NO_PRETEST if self.test.pretest.random_start else self.test.pretest
-        F = self.best.f.reshape(3, 3)
-        recovered = self.recipe.recover(self.points, F, self.threshold, self.best.loss, pretest, self.state)
-        if recovered is not None:
-            self.best.replace_if_better(recovered)

@@ -236,7 +236,7 @@ def unregistered_reasons(
 
 
 def _reason(photo: int, posed: set[int], views: ViewGraph, graph: PoseGraph) -> str:
-    edges = dict(_edges(photo, views))
+    edges = {pair[pair[0] == photo]: fit.inlier_count for pair, fit in views.fits.items() if photo in pair}
     to_posed = {other: count for other, count in edges.items() if other in posed}
     if to_posed:
         nearest = max(to_posed, key=lambda other: (to_posed[other], -other))
@@ -246,12 +246,6 @@ def _reason(photo: int, posed: set[int], views: ViewGraph, graph: PoseGraph) -> 
     return (
         "shares inliers only with photos that have no place either" if edges else "shares no scene with any other photo"
     )
-
-
-def _edges(photo: int, views: ViewGraph) -> Iterator[tuple[int, int]]:
-    for pair, fit in views.fits.items():
-        if photo in pair:
-            yield pair[pair[0] == photo], fit.inlier_count
 
 
 def photo_names(photos: Sequence[int], matches: MatchGraph) -> list[str]:

@@ -52,7 +52,12 @@ def sound_parts(explained: Mapping[PairId, PairSupport], photos: Iterable[int]) 
     """
     groups = DisjointGroups(photos)
     weights = {pair: pair_support.matches - pair_support.contradicted for pair, pair_support in explained.items()}
-    between = _joins(weights)
+    # by photo, the weight of its significant pairs with the others
+    between: defaultdict[int, Counter[int]] = defaultdict(Counter)
+    for (a, b), value in weights.items():
+        if abs(value) >= OPTIONS.min_matches:
+            between[a][b] += value
+            between[b][a] += value
     for a, b in sorted(weights, key=lambda pair: (-weights[pair], pair)):
         first, second = groups.name[a], groups.name[b]
         if first == second or weights[a, b] < OPTIONS.min_matches or between[first][second] <= 0:
@@ -60,28 +65,13 @@ def sound_parts(explained: Mapping[PairId, PairSupport], photos: Iterable[int]) 
         groups.join(a, b)
         larger = groups.name[a]
         smaller = second if larger == first else first
-        _merge_joins(between, larger, smaller)
+        for other, value in between.pop(smaller).items():
+            if other != larger:
+                between[larger][other] += value
+                between[other][larger] += value
+            del between[other][smaller]
     parts = [tuple(sorted(members)) for members in groups.members.values()]
     return sorted(parts, key=lambda members: (-len(members), members))
-
-
-def _joins(weights: Mapping[PairId, int]) -> defaultdict[int, Counter[int]]:
-    """Return by photo the weight of its significant pairs, by the other photo."""
-    joins: defaultdict[int, Counter[int]] = defaultdict(Counter)
-    for (a, b), value in weights.items():
-        if abs(value) >= OPTIONS.min_matches:
-            joins[a][b] += value
-            joins[b][a] += value
-    return joins
-
-
-def _merge_joins(between: defaultdict[int, Counter[int]], larger: int, smaller: int) -> None:
-    """Add the joins of a part that is now one with another."""
-    for other, value in between.pop(smaller).items():
-        if other != larger:
-            between[larger][other] += value
-            between[other][larger] += value
-        del between[other][smaller]
 
 
 def split_attempt(attempt: Attempt) -> list[Attempt]:
@@ -181,27 +171,22 @@ def weakly_joined_parts(model: Reconstruction) -> list[list[str]]:
 
     Photos join one by one: next is the one that sees most points which at least two joined photos see.
     """
+    from scipy.sparse import csr_array
+
     with translate_errors("reading points"):
         names = {image.image_id: image.name for image in posed_images(model)}
         tracks = [{element.image_id for element in point.track.elements} for _, point in all_points(model)]
     photos = sorted(names)
-    visibility = _visibility_matrix(tracks, photos)
+    place = {photo: k for k, photo in enumerate(photos)}
+    columns = [place[photo] for track in tracks for photo in sorted(track)]
+    ends = np.cumsum([0, *map(len, tracks)])
+    visibility = csr_array((np.ones(len(columns), np.int32), columns, ends), shape=(len(tracks), len(photos)))
     parts: list[list[str]] = [[]]
     for photo, known in _joining_order(visibility):
         if known < OPTIONS.min_common_points:
             parts.append([])
         parts[-1].append(names[photos[photo]])
     return [sorted(part) for part in parts[1:]]
-
-
-def _visibility_matrix(tracks: list[set[int]], photos: list[int]) -> "csr_array":
-    """Return the matrix (N, P) with 1 where a point is seen by a photo."""
-    from scipy.sparse import csr_array
-
-    place = {photo: k for k, photo in enumerate(photos)}
-    columns = [place[photo] for track in tracks for photo in sorted(track)]
-    ends = np.cumsum([0, *map(len, tracks)])
-    return csr_array((np.ones(len(columns), np.int32), columns, ends), shape=(len(tracks), len(photos)))
 
 
 def _joining_order(visibility: "csr_array") -> list[tuple[int, int]]:

@@ -113,9 +113,8 @@ def _find_in_photo(
         scale = options.max_image_size_px / longer
         size = max(1, round(width * scale)), max(1, round(height * scale))
         pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
-    size = pixels.shape[1], pixels.shape[0]
-    features = _check_features(method, name, size, _call_find(method, name, pixels, options))
-    return features, np.array([width / size[0], height / size[1]]), (width, height)
+    features = _find_and_check(method, name, pixels, options)
+    return features, np.array([width / features.size[0], height / features.size[1]]), (width, height)
 
 
 def _find_in_views(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings) -> Features:
@@ -124,8 +123,7 @@ def _find_in_views(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], 
     views = PanoramaViews.cover(size, options.max_image_size_px)
     pixels, parts, ranks = views.shrink(pixels), [], []
     for view in range(len(views.rotations)):
-        picture = views.render(pixels, view)
-        features = _check_features(method, name, (views.side_px,) * 2, _call_find(method, name, picture, options))
+        features = _find_and_check(method, name, views.render(pixels, view), options)
         own = np.flatnonzero(views.is_nearest(features.keypoints, view))
         keypoints = views.to_panorama(features.keypoints[own], view)
         parts.append(Features(size, keypoints, features.select(own).values))
@@ -148,16 +146,14 @@ def read_pixels(path: Path) -> NDArray[np.uint8]:
     return np.asarray(pixels, np.uint8)
 
 
-def _call_find(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings) -> Features:
+def _find_and_check(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings) -> Features:
     if method.find is None:
         raise PluginError(f"the features '{method.name}' have no `find`")
     try:
-        return method.find(pixels, options)
+        features = method.find(pixels, options)
     except Exception as err:  # a plug-in may raise anything
         raise _method_error(method, f"failed on {name}: {type(err).__name__}: {err}") from err
-
-
-def _check_features(method: FeatureMethod, name: str, size: tuple[int, int], features: Features) -> Features:
+    size = pixels.shape[1], pixels.shape[0]
     points = np.asarray(features.keypoints, np.float64)
     if features.size != size:
         raise _method_error(method, f"report a size of {features.size} for {name} instead of {size}")

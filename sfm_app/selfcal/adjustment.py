@@ -17,7 +17,6 @@ thesis (5.23) and (5.24) in Algorithm 3.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -402,30 +401,14 @@ def _weigh_pairs(state: State, system: tuple[FloatArray, FloatArray]) -> State:
     return replace(state, weights=(1.0 + gains / (ADJUSTMENT.conflict * scale)) ** -2, scale=scale)
 
 
-class ReducedSystem(NamedTuple):
-    """Normal equations of P pairs reduced to their cameras, and the terms for back substitution of the poses."""
-
-    hessians: FloatArray
-    """(P, 10, 10) U - W V^-1 W'."""
-    gradients: FloatArray
-    """(P, 10) b_cameras - W V^-1 b_pose."""
-    pose_by_cameras: FloatArray
-    """(P, 5, 10) V^-1 W': its product with the cameras' step is subtracted from the pose's step."""
-    pose_alone: FloatArray
-    """(P, 5) V^-1 b_pose: the pose's step if the cameras do not move."""
-
-    def pose_steps(self, camera_steps: FloatArray) -> FloatArray:
-        """Return (P, 5) steps of the poses by back substitution of the steps (P, 10) of the cameras."""
-        return np.asarray(self.pose_alone - (self.pose_by_cameras @ camera_steps[..., None])[..., 0], np.float64)
-
-
-def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> ReducedSystem:
+def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> tuple[FloatArray, ...]:
     """Eliminate the poses from the systems of all pairs (`pair_systems`) by the Schur complement::
 
         A = | U   W |     (U - W V^-1 W') d_cameras = b_cameras - W V^-1 b_pose
             | W'  V |
 
-    The damping of V is relative to its diagonal.
+    The damping of V is relative to its diagonal. Return the reduced Hessians (P, 10, 10) and gradients (P, 10), and
+    for back substitution V^-1 W' (P, 5, 10) and V^-1 b_pose (P, 5).
     """
     n = 2 * CAMERA
     V = A[:, n:, n:].copy()
@@ -436,12 +419,7 @@ def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> ReducedSys
     solved = np.linalg.solve(V, np.concatenate([A[:, n:, :n], b[:, n:, None]], axis=2))
     pose_by_cameras, pose_alone = np.split(solved, [n], axis=2)
     W = A[:, :n, n:]
-    return ReducedSystem(
-        hessians=A[:, :n, :n] - W @ pose_by_cameras,
-        gradients=b[:, :n] - (W @ pose_alone)[..., 0],
-        pose_by_cameras=pose_by_cameras,
-        pose_alone=pose_alone[..., 0],
-    )
+    return A[:, :n, :n] - W @ pose_by_cameras, b[:, :n] - (W @ pose_alone)[..., 0], pose_by_cameras, pose_alone[..., 0]
 
 
 def _take_step(
@@ -453,12 +431,13 @@ def _take_step(
 
     def attempt(damping: float) -> State | None:
         # cameras from all pairs and the prior, then each pose from its pair
-        reduced = _eliminate_poses(*system, damping)
-        H, g = matches.assemble(Information(reduced.hessians, reduced.gradients, np.empty(0)), factors)
+        hessians, gradients, pose_by_cameras, pose_alone = _eliminate_poses(*system, damping)
+        H, g = matches.assemble(Information(hessians, gradients, np.empty(0)), factors)
         H += np.diag(prior.precision.ravel())
         g += (prior.precision * (prior.mean - state.thetas)).ravel()
         step = solve_each(H + damping * np.diag(np.diag(H)), g[:, None]).reshape(-1, CAMERA)
-        pose_steps = reduced.pose_steps(step[matches.cameras].reshape(-1, 2 * CAMERA))
+        of_pairs = step[matches.cameras].reshape(-1, 2 * CAMERA)
+        pose_steps = pose_alone - (pose_by_cameras @ of_pairs[..., None])[..., 0]
         poses = np.array([retract(*moved) for moved in zip(state.poses, pose_steps, strict=True)]).reshape(-1, 12)
         trial = replace(state, thetas=state.thetas + step, poses=poses)
         return trial if float(factors @ matches.costs(trial)) + prior.cost(trial.thetas) <= cost else None

@@ -396,7 +396,10 @@ def cross_validate(
     rows, everyone, members = _voting_pairs(photos)
     if len(everyone) < PER_PHOTO.least_photos:
         return Prediction(1.0, 1.0, 0.0, is_camera_per_photo=False)
-    few, each = _number_cameras([labels.get(photo, 0) for photo in everyone]), np.arange(len(everyone))
+    few = np.unique([labels.get(photo, 0) for photo in everyone], return_inverse=True)[1].astype(np.int64)
+    if (np.max(few) + 1) * PER_PHOTO.least_photos_each > len(few):
+        few = np.zeros_like(few)
+    each = np.arange(len(everyone))
     least = PER_PHOTO.least_gain if np.max(few) == 0 else PER_PHOTO.least_gain_over_several
     weight = float(np.sum(tables.weights[rows]))
     grids = [FocalGrid(tables, rows, theta, members) for theta in (*starts, np.zeros(5))]
@@ -418,9 +421,3 @@ def cross_validate(
     return Prediction(
         float(np.sum(held)) / weight, float(np.sum(own)) / weight, deviations, is_camera_per_photo=clearly
     )
-
-
-def _number_cameras(labels: Sequence[int]) -> IndexArray:
-    """Return (N,) cameras counted from 0; one for all where each would have too few photos."""
-    cameras = np.unique(labels, return_inverse=True)[1].astype(np.int64)
-    return cameras if (np.max(cameras) + 1) * PER_PHOTO.least_photos_each <= len(cameras) else np.zeros_like(cameras)

@@ -424,12 +424,8 @@ class LensEstimate:
     def is_fisheye(self) -> bool:
         """Whether a fisheye explains clearly more than any perspective lens, and no radial term could replace it."""
         clear = self.support - self.perspective_support > SEARCH.clear_gain and self.log_odds > 0.0
-        return clear and self.departure_px() > SEARCH.largest_departure_px
-
-    def departure_px(self) -> float:
-        """Return the departure of the best perspective lens with one radial term, in pixels; inf if none can."""
         radial = _fit_radial(self.lens, 0.5 * float(np.hypot(*self.size)))
-        return radial[2] if radial is not None else float("inf")
+        return clear and (radial is None or radial[2] > SEARCH.largest_departure_px)
 
     def radius_deviation_px(self, theta: FloatArray) -> FloatArray:
         """Return (N,) standard deviations of the radius at angles (N,) to the optical axis, in pixels."""
