@@ -128,24 +128,22 @@ def _choose_name(group: str, images: Sequence[MatchedImage], given: GivenCameras
 
 @dataclass(frozen=True, slots=True)
 class CheckOptions:
-    """When photos contradict a stated camera."""
+    """When photos contradict a stated camera. Chosen by hand."""
 
     sigmas: float = 3.0
-    """Standard deviations that a difference must exceed. Chosen by hand."""
+    """Standard deviations that a difference must exceed."""
     min_share: float = 0.01
-    """Share of the radius, or of the longer side for the center, that it must exceed: focusing changes less. Chosen
-    by hand."""
+    """Share of the radius, or of the longer side for the center, that it must exceed: focusing changes less."""
     inner: float = 0.3
-    """Smallest compared angle, as a share of that of the corner: a focal compensates distortion there. Chosen by
-    hand."""
+    """Smallest compared angle, as a share of that of the corner: a focal compensates distortion there."""
     outer: float = 0.8
-    """Largest compared angle: the corners hold few matches. Chosen by hand."""
+    """Largest compared angle: the corners hold few matches."""
     angles: int = 20
-    """Number of compared angles. Chosen by hand."""
+    """Number of compared angles."""
     exif_tolerance: float = 0.08
-    """Share of the focal by which EXIF may be off: rounding, the diagonal, and breathing lenses. Chosen by hand."""
+    """Share of the focal by which EXIF may be off: rounding, the diagonal, and breathing lenses."""
     exif_sigmas: float = 3.0
-    """Standard deviations of the focal that the difference to EXIF must exceed, too. Chosen by hand."""
+    """Standard deviations of the focal that the difference to EXIF must exceed, too."""
 
 
 OPTIONS = CheckOptions()

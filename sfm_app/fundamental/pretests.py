@@ -137,20 +137,20 @@ MODELS_PER_SAMPLE = {7: 2.45, 8: 1.0}
 
 @dataclass(frozen=True, slots=True)
 class SprtOptions:
-    """First guesses and limits of the sequential test."""
+    """First guesses and limits of the sequential test. Chosen by hand."""
 
     first_epsilon: float = 0.1
-    """First epsilon: few inliers (docs/algorithms.md, Fundamental matrices). Chosen by hand."""
+    """First epsilon: few inliers (docs/algorithms.md, Fundamental matrices)."""
     first_delta: float = 0.01
-    """First delta: few chance inliers near epipolar lines (docs/algorithms.md, Fundamental matrices). By hand."""
+    """First delta: few chance inliers near epipolar lines (docs/algorithms.md, Fundamental matrices)."""
     most_epsilon: float = 0.999
-    """Largest epsilon: beyond it the logarithm of 1 - epsilon is useless. Chosen by hand."""
+    """Largest epsilon: beyond it the logarithm of 1 - epsilon is useless."""
     prior_weight: float = 100.0
-    """Weight of the first delta, in checked matches. Chosen by hand."""
+    """Weight of the first delta, in checked matches."""
     delta_tolerance: float = 0.05
-    """Relative change of delta that calls for a new test (docs/algorithms.md, Fundamental matrices). Chosen by hand."""
+    """Relative change of delta that calls for a new test (docs/algorithms.md, Fundamental matrices)."""
     review: int = 100
-    """Largest number of trials between two updates of delta. Chosen by hand."""
+    """Largest number of trials between two updates of delta."""
 
 
 SPRT = SprtOptions()

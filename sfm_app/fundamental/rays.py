@@ -32,24 +32,21 @@ from sfm_app.types.arrays import FloatArray, IndexArray
 
 @dataclass(frozen=True, slots=True)
 class RayOptions:
-    """Samples, scores and the test for a rotation; none was measured on its own."""
+    """Samples, scores and the test for a rotation; none was measured on its own. Chosen by hand."""
 
     batch: int = 32
-    """Samples solved at once. Chosen by hand."""
     guided_share: float = 0.5
-    """Share of the samples drawn by the priors. Chosen by hand."""
+    """Share of the samples drawn by the priors."""
     least_trials: int = 128
-    """Fewest samples. Chosen by hand."""
     most_trials: int = 4096
-    """Most samples. Chosen by hand."""
     most_scored: int = 500
-    """Matches that samples are scored on. Chosen by hand."""
+    """Matches that samples are scored on."""
     mismatches: int = 8
-    """Shifts of the partners that measure chance. Chosen by hand."""
+    """Shifts of the partners that measure chance."""
     clear_share: float = 0.95
-    """Share of the inliers that a rotation explains, as in `posegraph.pair_pose`. Chosen by hand."""
+    """Share of the inliers that a rotation explains, as in `posegraph.pair_pose`."""
     rotation_factor: float = 2.0
-    """Thresholds within which it explains them, as in `posegraph.pair_pose`. Chosen by hand."""
+    """Thresholds within which it explains them, as in `posegraph.pair_pose`."""
 
 
 OPTIONS = RayOptions()

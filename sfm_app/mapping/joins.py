@@ -20,38 +20,38 @@ from sfm_app.types.arrays import FloatArray, IndexArray
 
 @dataclass(frozen=True, slots=True)
 class JoinOptions:
-    """Similarities between fragments, and their errors."""
+    """Similarities between fragments, and their errors. Chosen by hand."""
 
     min_photos: int = 3
-    """Least shared photos that agree. Chosen by hand."""
+    """Least shared photos that agree."""
     min_points: int = 12
-    """Least points of these in both models. Chosen by hand."""
+    """Least points of these in both models."""
     min_photo_points: int = 4
-    """Least shared points that determine the scale of a photo. Chosen by hand."""
+    """Least shared points that determine the scale of a photo."""
     agreement_deg: float = 3.0
-    """Largest angle of shared photos that agree with a similarity. Chosen by hand."""
+    """Largest angle of shared photos that agree with a similarity."""
     agreement_shift: float = 0.1
-    """Largest shift of these, as a share of the distance of their points. Chosen by hand."""
+    """Largest shift of these, as a share of the distance of their points."""
     max_fitted: int = 400
     """Most points that a similarity is fitted to. Chosen by hand for speed."""
     loose_factor: float = 6.0
-    """Largest error of an explained match across a join, in inlier thresholds: parts bend. Chosen by hand."""
+    """Largest error of an explained match across a join, in inlier thresholds: parts bend."""
     max_checked: int = 150
-    """Most pairs across a join that are checked, those with most inliers. Chosen by hand."""
+    """Most pairs across a join that are checked, those with most inliers."""
     max_deg: float = 8.0
-    """Angle of a join to the common frame above which it contradicts the others. Chosen by hand."""
+    """Angle of a join to the common frame above which it contradicts the others."""
     max_scale: float = 0.15
-    """The same for the logarithm of its scale. Chosen by hand."""
+    """The same for the logarithm of its scale."""
     max_shift: float = 0.2
-    """The same for its shift, as a share of the radius of the smaller fragment. Chosen by hand."""
+    """The same for its shift, as a share of the radius of the smaller fragment."""
     rounds: int = 40
-    """Rounds of reweighting towards the least sum of errors. Chosen by hand."""
+    """Rounds of reweighting towards the least sum of errors."""
     min_error: float = 1e-4
-    """Error below which a join gets no more weight. Chosen by hand."""
+    """Error below which a join gets no more weight."""
     same_deg: float = 5.0
-    """Largest angle of a photo to its pose in the merged model for its points to count. Chosen by hand."""
+    """Largest angle of a photo to its pose in the merged model for its points to count."""
     same_shift: float = 0.25
-    """Largest shift of it, as a share of the median distance of its points. Chosen by hand."""
+    """Largest shift of it, as a share of the median distance of its points."""
 
 
 OPTIONS = JoinOptions()

@@ -30,14 +30,14 @@ from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 @dataclass(frozen=True, slots=True)
 class JumpOptions:
-    """Jumps in the order of photos."""
+    """Jumps in the order of photos. Chosen by hand."""
 
     min_photos: int = 30
-    """Number of photos below which their order is no evidence. Chosen by hand."""
+    """Number of photos below which their order is no evidence."""
     jump: float = 5.0
-    """Length of a jump, in median steps. Chosen by hand."""
+    """Length of a jump, in median steps."""
     max_share: float = 0.1
-    """Share of jumps above which photos count as unordered. Chosen by hand."""
+    """Share of jumps above which photos count as unordered."""
 
 
 JUMPS = JumpOptions()

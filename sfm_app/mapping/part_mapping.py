@@ -35,24 +35,24 @@ Links = Mapping[int, Mapping[int, float]]
 
 @dataclass(frozen=True, slots=True)
 class CutOptions:
-    """How a group is cut into parts."""
+    """How a group is cut into parts. Chosen by hand."""
 
     saturation_inliers: float = 100.0
-    """Number of inliers above which the weight of a pair hardly grows. Chosen by hand."""
+    """Number of inliers above which the weight of a pair hardly grows."""
     doubtful_weight: float = 0.1
-    """Weight factor of pairs that may be look-alikes: a cut may well pass there. Chosen by hand."""
+    """Weight factor of pairs that may be look-alikes: a cut may well pass there."""
     largest: float = 1.3
-    """Largest part, as a share of the chosen size. Chosen by hand."""
+    """Largest part, as a share of the chosen size."""
     smallest: float = 0.25
-    """Smallest part, as a share of the chosen size. Chosen by hand."""
+    """Smallest part, as a share of the chosen size."""
     min_side: float = 1.0 / 3.0
-    """Smallest side of a cut, as a share of the photos. Chosen by hand."""
+    """Smallest side of a cut, as a share of the photos."""
     max_swaps: int = 8
-    """Most rounds in which photos change sides. Chosen by hand."""
+    """Most rounds in which photos change sides."""
     shared_photos: int = 10
-    """Photos that each of two neighboring parts gets from the other one. Chosen by hand."""
+    """Photos that each of two neighboring parts gets from the other one."""
     min_across: int = 3
-    """Least pairs between two parts that makes them neighbors. Chosen by hand."""
+    """Least pairs between two parts that makes them neighbors."""
 
 
 OPTIONS = CutOptions()

@@ -45,18 +45,18 @@ MAPPER = "parts"
 
 @dataclass(frozen=True, slots=True)
 class PartOptions:
-    """When groups are mapped in parts."""
+    """When groups are mapped in parts. Chosen by hand."""
 
     max_whole: int = 400
-    """Photos up to which a group is mapped as a whole. Chosen by hand."""
+    """Photos up to which a group is mapped as a whole."""
     usual_size: int = 150
-    """Photos of a part above. Chosen by hand."""
+    """Photos of a part above."""
     min_size: int = 20
-    """Smallest part that a user can choose: smaller ones consist of shared photos. Chosen by hand."""
+    """Smallest part that a user can choose: smaller ones consist of shared photos."""
     max_contradicted: float = 0.05
-    """Share of contradicting inliers of F above which the whole is mapped, too. Chosen by hand."""
+    """Share of contradicting inliers of F above which the whole is mapped, too."""
     min_matches: int = 16
-    """Matches across a join below which these decide nothing, as of a pair. Chosen by hand."""
+    """Matches across a join below which these decide nothing, as of a pair."""
 
 
 OPTIONS = PartOptions()

@@ -58,18 +58,18 @@ def connected_groups(pairs: Iterable[PairId], photos: Iterable[int] = ()) -> lis
 
 @dataclass(frozen=True, slots=True)
 class CorrectionOptions:
-    """When a part of the photos is turned."""
+    """When a part of the photos is turned. Chosen by hand."""
 
     contradicts_deg: float = 10.0
     """Angle from which a pair contradicts the rotations. Chosen by hand: right pairs are below 5 degrees."""
     same_deg: float = 5.0
-    """Angle up to which two pairs ask for the same turn. Chosen by hand."""
+    """Angle up to which two pairs ask for the same turn."""
     min_pairs: int = 3
-    """Contradicting pairs that have to agree on a turn. Chosen by hand."""
+    """Contradicting pairs that have to agree on a turn."""
     unit: float = 1000.0
-    """Flows are whole numbers of the largest weight over this. Chosen by hand."""
+    """Flows are whole numbers of the largest weight over this."""
     max_turns: int = 20
-    """Most parts of a graph that turn. Chosen by hand."""
+    """Most parts of a graph that turn."""
 
 
 CORRECTIONS = CorrectionOptions()

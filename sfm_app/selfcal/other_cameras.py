@@ -25,26 +25,26 @@ from sfm_app.types.arrays import FloatArray, IndexArray
 
 @dataclass(frozen=True, slots=True)
 class FocalSplitOptions:
-    """Division by focal. Section 6 of Self-calibration in docs/algorithms.md."""
+    """Division by focal. Section 6 of Self-calibration in docs/algorithms.md. Chosen by hand."""
 
     sigma: float = 0.03
-    """Width of the votes, in r: focals 3 % apart still agree, those 10 % apart do not; by hand."""
+    """Width of the votes, in r: focals 3 % apart still agree, those 10 % apart do not."""
     fair_share: float = 0.5
-    """Share of its possible votes that a photo needs to belong to a peak, or to have another focal; by hand."""
+    """Share of its possible votes that a photo needs to belong to a peak, or to have another focal."""
     other_focal: float = 0.05
-    """Difference in log f from which on it is another camera; by hand."""
+    """Difference in log f from which on it is another camera."""
     least_focal_gain: float = 0.25
-    """Least gain of another focal over that of the peak, as a share of a photo's votes. Section 6; by hand."""
+    """Least gain of another focal over that of the peak, as a share of a photo's votes. Section 6."""
     least_split_gain: float = 0.25
-    """Least gain of a split, as a share of the votes of the photos of all other cameras together; by hand."""
+    """Least gain of a split, as a share of the votes of the photos of all other cameras together."""
     focal_reach: float = 1.1
-    """Range in log f for a photo, up to three times longer or shorter; by hand."""
+    """Range in log f for a photo, up to three times longer or shorter."""
     trials: int = 111
-    """Focals in that range; by hand."""
+    """Focals in that range."""
     most_peaks: int = 4
-    """Peaks of the consensus that serve as starts; by hand."""
+    """Peaks of the consensus that serve as starts."""
     rounds: int = 10
-    """Most rounds of assigning photos to cameras; by hand."""
+    """Most rounds of assigning photos to cameras."""
 
 
 SPLIT = FocalSplitOptions()
