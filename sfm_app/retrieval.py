@@ -192,10 +192,7 @@ DescriptorArray = NDArray[np.uint8]
 
 
 def count_preview_matches(first: DescriptorArray, others: Sequence[DescriptorArray]) -> list[int]:
-    """Count the features of a photo and of each other photo that are each other's nearest, and clearly so.
-
-    Descriptors are (N, 128), those of the largest features.
-    """
+    """Count the descriptors (N, 128) of a photo and of others that are each other's nearest, and clearly so."""
     if not others or not len(first):
         return [0] * len(others)
     a, b = first.astype(np.float32), np.concatenate(others).astype(np.float32)

@@ -115,10 +115,7 @@ def find_intrinsics(
 
 
 def sample_pairs(views: ViewGraph, photos: int) -> ViewGraph:
-    """Return the view graph with as many pairs as cameras need; all of them in small sets.
-
-    Each photo keeps some pairs: those with most inliers, and others of any number, which have more parallax.
-    """
+    """Return the view graph with as many pairs as cameras need: of each photo those with most inliers, and others."""
     counts = {pair: fit.inlier_count for pair, fit in views.fits.items() if not fit.degeneracy}
     if len(counts) <= OPTIONS.all_pairs:
         return views
@@ -148,10 +145,7 @@ def _exif_claim(camera: CalibratedCamera, matches: MatchGraph) -> FocalClaim | N
 def _take_given_cameras(
     cameras: Sequence[CalibratedCamera], matches: MatchGraph, run: RunContext
 ) -> list[CalibratedCamera]:
-    """Replace calibrated cameras by those that the user gave, after a check.
-
-    Given cameras with a wide lens were checked before the fundamental matrices.
-    """
+    """Replace calibrated cameras by those that the user gave; those with a wide lens were checked before."""
     given = assign_cameras(matches, run.given, keep=run.settings.calibration.keep).cameras
     result, checked = [], {}
     for camera in cameras:

@@ -132,10 +132,7 @@ def panorama(size: tuple[int, int]) -> Calibration:
 def _search_lens(
     images: Sequence[MatchedImage], matches: MatchGraph, run: RunContext, *, is_wide: bool
 ) -> Calibration | None:
-    """Return the lens that the raw matches of a group show; None where there is none, or a perspective one is enough.
-
-    For a lens known to be wide, a perspective one is not tested.
-    """
+    """Return the lens that raw matches show; None without one. Unless `is_wide`, a perspective lens may be enough."""
     size, ids = (images[0].width, images[0].height), {image.id for image in images}
     pairs = [np.hstack(matches.points(pair)) for pair in matches.matches if ids.issuperset(pair)]
     try:
@@ -241,10 +238,7 @@ def _fit_or_raise(
 
 
 def ray_estimator(images: Sequence[MatchedImage], lenses: Mapping[str, Calibration]) -> FitFundamentalLike | None:
-    """Return an estimator by bearing vectors for a pair of photos; None where neither has a wide lens.
-
-    The other camera of a pair is the usual guess.
-    """
+    """Return an estimator by bearing vectors for a pair; None without a wide lens. The other camera is a guess."""
     if not any(image.group in lenses for image in images):
         return None
     sizes = [(image.width, image.height) for image in images]

@@ -16,10 +16,7 @@ docs/algorithms.md, All estimators. Chosen by hand; not measured on its own."""
 
 
 def model_false_alarms(squared: FloatArray, wrong: FloatArray, threshold: float) -> float:
-    """Return the expected number of models with as much support among random matches of the same points.
-
-    From the squared distances (N,) of the matches, and those of mismatches, `squared_mismatch_distances`.
-    """
+    """Return the expected number of models with as much support in random matches, from squared distances."""
     fractions = 1.0, 0.5, 0.25  # precise inliers are stronger evidence; docs/algorithms.md, All estimators
     alarms = []
     for fraction in fractions:
@@ -60,10 +57,7 @@ def _shifted_distances(points: FloatArray, f: FloatArray, shifts: int) -> FloatA
 
 
 def accidental_share(wrong: FloatArray, threshold: float) -> float:
-    """Return the probability that a wrong match agrees with a model, in (0, 1), from squared mismatch distances (M,).
-
-    Measured, not modeled: it includes the extent of the photos, clusters of points and the epipoles.
-    """
+    """Return the measured probability that a wrong match agrees with a model, from squared mismatch distances (M,)."""
     return (int(np.count_nonzero(wrong <= threshold * threshold)) + 1.0) / (len(wrong) + 2.0)
 
 

@@ -244,10 +244,7 @@ def _dominant_line(x: FloatArray, y: FloatArray, width: float) -> tuple[float, f
 
 
 def is_rotation(H: FloatArray, points: FloatArray, centers: FloatArray) -> bool:
-    """Return whether H = K R K^-1 for one focal length, with the center in the middle of the points of both views.
-
-    `centers` (4,) is the origin of `points` in a frame that both views share, in the same units.
-    """
+    """Return whether H = K R K^-1 for one focal and a middle center; `centers` (4,) as in `find_degeneracy`."""
     shifted = points + centers
     low, high = np.quantile(np.vstack([shifted[:, :2], shifted[:, 2:]]), DEGENERACY.extent_quantiles, axis=0)
     middle, side = (low + high) / 2, float((high - low).max())
@@ -272,10 +269,7 @@ def _translation(t: FloatArray) -> FloatArray:
 def recover_epipole(
     points: FloatArray, F: FloatArray, threshold: float, loss: Loss, pretest: PreTest, state: RandomState
 ) -> FloatArray | None:
-    """Estimate the best model with the dominant plane of F's inliers; None without a plane and two matches off it.
-
-    `points` are in random order; `pretest` has no random start.
-    """
+    """Estimate the best model with the dominant plane of F's inliers; None without a plane and two matches off it."""
     inliers = squared_distances(points, np.ascontiguousarray(F).reshape(9)) <= threshold * threshold
     if np.count_nonzero(inliers) < 8:
         return None

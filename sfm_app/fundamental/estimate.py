@@ -35,11 +35,7 @@ CHANCE = "inliers no better than chance"
 def fit_by_recipe(
     x1: ArrayLike, x2: ArrayLike, options: EpipolarSettings, seed: int, recipe: Recipe
 ) -> EpipolarFit | Rejected:
-    """Estimate one fundamental matrix from matches, many of which may be wrong: x1, x2 (N, 2) pixels, row by row.
-
-    Raises:
-        ValueError: the points are not as above (see `check_points`).
-    """
+    """Estimate F from matches x1, x2 (N, 2) in pixels, many of which may be wrong; ValueError as `check_points`."""
     first, second = check_points(x1, x2)
     matches = prepare(first, second, seed)
     if len(matches.points) < options.min_inliers:
@@ -79,11 +75,7 @@ def estimate_with(
 
 
 def assess_fundamental(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> EpipolarFit | Rejected:
-    """Return the fit of a given F (3, 3) of any scale to matches, with `trials` 1, or the reason of its rejection.
-
-    Raises:
-        ValueError: the points are not valid (see `check_points`), or F is not (3, 3).
-    """
+    """Return the fit of a given F (3, 3), or the reason of its rejection; ValueError as `estimate_with`."""
     first, second = check_points(x1, x2)
     matches = prepare(first, second, seed=0)
     if len(matches.points) < options.min_inliers:
@@ -92,11 +84,7 @@ def assess_fundamental(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: Epip
 
 
 def count_matches_off_plane(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> int:
-    """Count the distinct inliers of F, at least 3, with parallax: those off the plane that holds most of them.
-
-    Raises:
-        ValueError: the points are not (N, 2) pixels (see `check_points`), or F is not (3, 3).
-    """
+    """Count the distinct inliers of F off the plane that holds most of them; ValueError as `estimate_with`."""
     matches = prepare(*check_points(x1, x2), seed=0)
     threshold = options.max_error_px / matches.unit_px
     in_frame = _to_frame(F, matches.unit_px, matches.center)

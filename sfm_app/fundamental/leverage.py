@@ -91,10 +91,7 @@ def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
 
 @kernel
 def priors(distances: FloatArray, sigma: float) -> FloatArray:
-    """Return p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels).
-
-    With a sigma of 0, p is 1 for the smallest distance and 0 for all others.
-    """
+    """Return p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels)."""
     least, probable = np.inf, np.empty(distances.shape[0])
     for i in range(distances.shape[0]):
         least = min(least, distances[i])

@@ -133,10 +133,7 @@ def draw_until_better(  # noqa: PLR0913
 
 @kernel
 def draw_sample(draws: SamplingPlan, state: RandomState, sample: IndexArray) -> int:
-    """Draw one sample (m,) by the priors, from the rest, or uniformly, as a random number chooses; return its kind.
-
-    Samples are uniform, too, while there are no priors, and where too few matches hold nearly all the weight.
-    """
+    """Draw one sample (m,) by the priors, from the rest, or uniformly; return its kind. Uniform if others fail."""
     guided = draws.guided_share
     guided_or_rest = guided + draws.rest_share if draws.rest[-1] >= draws.sample_size else guided
     lot = uniform(state) if 0.0 < guided < 1.0 else 0.0

@@ -192,10 +192,7 @@ class SequentialTest:
 
 @lru_cache(maxsize=1024)  # called repeatedly with the same share
 def _exponent(hit: float, miss: float, share: float) -> float:
-    """Return the h > 0 with E[ratio^h] = 1 where `share` of the matches are inliers; h = 1 for share = epsilon.
-
-    Returns 0 if the ratio does not decrease on average: such a model is certain to be rejected in the end.
-    """
+    """Return the h > 0 with E[ratio^h] = 1, `share` of the matches inliers; 0 if the ratio does not decrease."""
     if share * hit + (1 - share) * miss >= 0:
         return 0.0
     low, high = 0.0, 1.0

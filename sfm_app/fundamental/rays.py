@@ -53,10 +53,7 @@ OPTIONS = RayOptions()
 
 
 def fit_lev_ransac_rays(lines: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
-    """Estimate the essential matrix of a pair with known lenses from matches, many of which may be wrong.
-
-    Where a focal length is a guess, E is of little worth, but its inliers are not.
-    """
+    """Estimate E of a pair with known lenses from matches, many of which may be wrong."""
     _, first = np.unique(np.hstack([lines[:, FIRST], lines[:, SECOND]]).round(9), axis=0, return_index=True)
     rng = np.random.default_rng(seed)
     distinct = lines[rng.permutation(np.sort(first))]

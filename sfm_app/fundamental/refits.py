@@ -171,10 +171,7 @@ def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach
 
 
 def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """Apply the 8-point algorithm (thesis 4.3.2) on well-scaled matches; returns (3, 3) of rank 2.
-
-    `weights` (N,) >= 0, at least eight of them positive, multiply the squared algebraic errors.
-    """
+    """Apply the 8-point algorithm (thesis 4.3.2) with weights (N,) >= 0, eight of them > 0; (3, 3) of rank 2."""
     U, s, V = factorize(fit_algebraic(points, weights))
     return compose(U, s, V).reshape(3, 3)
 
@@ -481,10 +478,7 @@ REFITS: dict[str, Refit] = {
 
 
 def choose_refit(name: str, own: Refit) -> Refit:
-    """Return the estimator's own fit, followed by the named one in `REFITS` to its inliers unless the name is "auto".
-
-    The own fit always comes first: its inliers are better than those of the best sample.
-    """
+    """Return the estimator's own fit, followed by the named one in `REFITS` to its inliers unless "auto"."""
     if name == "auto":
         return own
     return lambda points, F, threshold: REFITS[name](points, own(points, F, threshold), threshold)

@@ -110,8 +110,5 @@ def required_trials(success: float, confidence: float, log_missed: float = 0.0) 
 
 
 def has_converged(before: NDArray[np.float64], after: NDArray[np.float64], limit: float = CONVERGED) -> bool:
-    """Return whether the priors (N,), normalized to sum 1, changed by less than `limit` in sum (thesis 4.18).
-
-    The printed sum grows with the number of matches; for probabilities that sum to 1 it lies in [0, 2].
-    """
+    """Return whether the priors (N,), of sum 1, changed by less than `limit` in sum, in [0, 2] (thesis 4.18)."""
     return bool(np.abs(after / after.sum() - before / before.sum()).sum() < limit)

@@ -234,11 +234,7 @@ def outlier_window(points: FloatArray) -> float:
 
 
 def inlier_share(squared: FloatArray, sigma: float, width: float) -> float:
-    """Estimate gamma = p(v) of the mixture by expectation maximization, within [1 / N, 1 - 1 / N], for given sigma and
-    w.
-
-    A share of 0 or 1 would make some of the distances, `squared` (N,), impossible.
-    """
+    """Estimate gamma = p(v) by expectation maximization for given sigma and w, within [1 / N, 1 - 1 / N]."""
     inlier = np.exp(-squared / (2 * sigma * sigma)) / (sigma * math.sqrt(2 * math.pi))
     least = 1 / max(len(squared), 2)
     gamma = 0.5

@@ -28,10 +28,7 @@ def design_row(point: FloatArray, row: FloatArray) -> None:
 
 @kernel
 def gather(points: FloatArray, weights: FloatArray, start: int, block: FloatArray) -> tuple[int, int]:
-    """Copy the next matches of positive weight to the columns of `block` (5, LANES): x1, y1, x2, y2, sqrt(weight).
-
-    Returns the number of columns, and the row of `points` to continue at.
-    """
+    """Copy the next matches of weight > 0 to `block` (5, LANES), with sqrt(weight); return their number and next row."""
     filled, i = 0, start
     while i < points.shape[0] and filled < LANES:
         if weights[i] > 0.0:

@@ -131,10 +131,7 @@ def solve_each(S: FloatArray, B: FloatArray) -> FloatArray:
 
 
 def project_to_psd(S: FloatArray, before: FloatArray) -> FloatArray:
-    """Return the nearest positive semidefinite matrix (n, n): eigenvalues that rounding made negative become 0.
-
-    `before` (n,) is the diagonal before the elimination that left S; rounding is relative to it.
-    """
+    """Return the nearest positive semidefinite matrix (n, n); `before` (n,) is the diagonal before elimination."""
     scale = np.sqrt(np.where(before > 0.0, before, 1.0))
     pairs = scale[:, None] * scale
     values, vectors = np.linalg.eigh(S / pairs)
@@ -257,10 +254,7 @@ def cavity(
 
 
 def posteriors(H: FloatArray, g: FloatArray, priors: NormalPriors) -> Posteriors:
-    """Return the posterior and the evidence of each of K choices.
-
-    H, (n, n) or (K, n, n), is the Hessian of the negative log-likelihood; g, (n,) or (K, n), its negative gradient.
-    """
+    """Return the posteriors of K choices, from Hessians (n, n) or (K, n, n) and negative gradients (n,) or (K, n)."""
     precision, away, log_odds = priors
     covariances = inverses_of_positive(H + precision[:, :, None] * np.eye(precision.shape[1]))
     pull = g + precision * away

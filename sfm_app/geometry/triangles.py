@@ -51,10 +51,7 @@ def unique_edges(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
 
 @kernel
 def _number_edges(faces: IndexArray, size: int, edges: IndexArray, edge_of: IndexArray) -> int:
-    """Fill in every edge once, in order, and the number of each one per triangle; return how many there are.
-
-    Edges are sorted by the higher vertex and then by the lower one, in as many buckets as there are vertices.
-    """
+    """Fill in every edge once, by the higher vertex, then the lower, and their numbers; return how many there are."""
     sides = 3 * len(faces)
     low, high = np.empty(sides, np.int64), np.empty(sides, np.int64)
     for f in range(len(faces)):
@@ -241,10 +238,7 @@ class Clusters:
     """(C,) of the balls, which contain all corners of their members."""
 
     def find_in_cone(self, apex: FloatArray, axis: FloatArray, half_angle: float) -> IndexArray:
-        """Return (M,) the members, ascending, of all clusters that reach into a cone; it misses none inside.
-
-        `half_angle` is in radians, up to pi.
-        """
+        """Return (M,) the members, ascending, of all clusters that reach into a cone of a half angle in radians."""
         slack = 1e-6  # bounds rounding: radians, and share of a radius or distance
         direction = self.centers - apex
         distance = np.linalg.norm(direction, axis=1)

@@ -85,10 +85,7 @@ class Candidate:
 def rank_seeds(
     matches: MatchGraph, graph: PoseGraph, intrinsics: Intrinsics, photos: Sequence[int], min_angle_deg: float
 ) -> list[Candidate]:
-    """Return candidates for the first pair, best first: many well-spread points, wide angles, consistent with K.
-
-    Candidates have a median triangulation angle of at least `min_angle_deg` degrees.
-    """
+    """Return candidates for the first pair, best first: many spread points, wide angles, consistent with K."""
     members, candidates = set(photos), []
     for pair, pose in graph.poses.items():
         if members.issuperset(pair) and pose.kind != "rotation" and pose.angle_deg >= min_angle_deg:
@@ -316,10 +313,7 @@ class StopSignal:
 
 
 def pairs_to_map(graph: PoseGraph) -> PoseGraph:
-    """Return the pose graph with as many pairs as mapping needs; all of them in small sets.
-
-    Tracks join along a few pairs of each photo. COLMAP follows all pairs of every point repeatedly.
-    """
+    """Return the pose graph with as many pairs as mapping needs: COLMAP follows all pairs of every point repeatedly."""
     photos = {photo for pair in graph.poses for photo in pair}
     if len(photos) <= MAPPING.fully_mapped_photos:
         return graph

@@ -116,10 +116,7 @@ STEPS = Steps()
 
 
 def retry_lost_photos(first: MappedScene, steps: Steps = STEPS) -> MappedScene:
-    """Map again with finer features for unregistered photos, and return the result that registers more of them.
-
-    If the attempt fails, the first result stays.
-    """
+    """Map again with finer features for unregistered photos; return the result that registers more of them."""
     run, lost = first.run, lost_photos(first)
     if not lost or run.settings.matching.features == SIFT_DSP or not run.settings.scene.second_look:
         return first

@@ -103,10 +103,7 @@ def map_baseline(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, 
 
 
 def is_focal_doubtful(model: Attempt | None, intrinsics: Intrinsics, views: ViewGraph) -> bool:
-    """Return whether a wrong guess of the focal may be why photos that match others are unregistered.
-
-    This is not so where any camera is known. With many photos, a pass costs more than it promises.
-    """
+    """Return whether a wrong guess of the focal may be why photos that match others are unregistered."""
     connected = photos_with_geometry(views.fits)
     known = any(camera.is_estimated or camera.method == "exif" for camera in intrinsics.cameras.values())
     placed = model.photos if model is not None else 0
@@ -118,10 +115,7 @@ def is_focal_doubtful(model: Attempt | None, intrinsics: Intrinsics, views: View
 
 
 def guessed_intrinsics(intrinsics: Intrinsics, sides: float = GUESSED_FOCAL) -> Intrinsics:
-    """Replace every perspective camera by a guess of `sides` longer sides, except those with a stated focal.
-
-    With a perspective camera, COLMAP cannot place photos of a fisheye lens.
-    """
+    """Replace every perspective camera without a stated focal by a guess of `sides` longer sides."""
     cameras = {
         name: _guess(camera, sides * max(camera.width, camera.height), camera.reason)
         if camera.projection == PERSPECTIVE and camera.method != "exif" and not camera.is_given
@@ -139,10 +133,7 @@ def guessed_intrinsics(intrinsics: Intrinsics, sides: float = GUESSED_FOCAL) -> 
 def is_shared_camera_doubtful(
     model: Attempt | None, intrinsics: Intrinsics, views: ViewGraph, settings: Settings
 ) -> bool:
-    """Return whether photos of one size may have a camera each: the model is contradicted, or lacks many photos.
-
-    A user's choice of which photos share a camera stays.
-    """
+    """Return whether photos of one size may have a camera each: the model is contradicted, or lacks many photos."""
     if model is None or settings.photos.cameras != "auto":
         return False
     if (
@@ -153,10 +144,7 @@ def is_shared_camera_doubtful(
 
 
 def with_camera_per_photo(model: Attempt, shared: Intrinsics, matches: MatchGraph) -> Intrinsics | None:
-    """Give each photo its own camera where pairs do not determine the shared one; return None if there is none such.
-
-    The focal of a new camera is the one that mapping found for the shared camera, as a guess.
-    """
+    """Give each photo its own camera where pairs do not determine the shared one; None if there is none such."""
     focals = {photo: float(K[0, 0] * K[1, 1]) ** 0.5 for photo, (K, *_) in cameras_by_photo(model.model).items()}
     placed = posed_photo_ids(model.model)
     focal_of = {shared.camera_name(matches.images[photo]): focals[photo] for photo in placed if photo in focals}
@@ -177,10 +165,7 @@ def with_camera_per_photo(model: Attempt, shared: Intrinsics, matches: MatchGrap
 
 
 def with_two_cameras(model: Attempt, each: Intrinsics, matches: MatchGraph) -> Intrinsics | None:
-    """Replace the cameras of photos of one size by two; return None if no size can be divided.
-
-    For each size, the focals of the model are divided at their widest gap.
-    """
+    """Replace the cameras of photos of one size by two, divided at the widest gap of focals; None if none can be."""
     of_size: dict[tuple[int, int], dict[str, float]] = {}
     for photo, (K, *_) in cameras_by_photo(model.model).items():
         name = each.camera_name(matches.images[photo])

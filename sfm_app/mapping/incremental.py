@@ -138,10 +138,7 @@ def _grow(inputs: _Inputs, earlier: Earlier) -> tuple[Outcome | None, str]:
 
 
 def _doubt(attempt: Attempt, placed: Collection[int], before: float, inputs: _Inputs) -> str:
-    """Return why a grown model is unreliable; empty where nothing speaks against it.
-
-    It began with the photos `placed`, and had the support `before` among these.
-    """
+    """Return why a model grown from photos `placed`, with the support `before`, is unreliable; empty if it is not."""
     parts = split_attempt(attempt)
     if len(parts) != 1 or parts[0].photos != attempt.photos:
         return "matches contradict the joins of its parts"

@@ -212,10 +212,7 @@ class AcrossJoins:
             self.partners.setdefault(b, []).append(a)
 
     def count(self, join: Join, fragments: Sequence[Fragment]) -> tuple[int, int]:
-        """Return how many matches across a join it explains, and how many inliers it contradicts.
-
-        Shared photos do not count: they made the join.
-        """
+        """Return how many matches a join explains, and how many inliers it contradicts, without shared photos."""
         a, b = fragments[join.first].placed, fragments[join.second].placed
         explained = contradicted = 0
         for photo_a, photo_b in self._pairs(a, b):
@@ -310,10 +307,7 @@ def _main_group(fragments: Sequence[Fragment], joins: Sequence[Join]) -> set[int
 
 
 def difference(join: Join, expected: Similarity, radii: Sequence[float]) -> JoinError:
-    """Return the difference of a join from another similarity, from the second fragment into the first.
-
-    The radii are in units of each fragment.
-    """
+    """Return the difference of a join from another similarity; radii are in units of each fragment."""
     cosine = (np.trace(expected.R.T @ join.similarity.R) - 1.0) / 2.0
     smaller = min(radii[join.first], expected.scale * radii[join.second])
     return JoinError(
@@ -351,10 +345,7 @@ def _synchronize(joins: Sequence[Join], count: int) -> dict[int, Similarity]:
 def _robust_potentials(
     count: int, edges: NDArray[np.int64], steps: FloatArray, strengths: FloatArray, sizes: FloatArray
 ) -> FloatArray:
-    """Return (count, k) values whose differences along edges (J, 2) have the least sum of weighted distances to steps.
-
-    `steps` (J, k) are second less first; errors are in `sizes` (J,). The first fragment of each group has 0.
-    """
+    """Return (count, k) values with the least distances to steps (J, k), second less first, along edges (J, 2)."""
     groups = DisjointGroups(range(count))
     for a, b in edges.tolist():
         groups.join(a, b)
@@ -373,10 +364,7 @@ def _robust_potentials(
 
 
 def loop_errors(fragments: Sequence[Fragment], joins: Sequence[Join]) -> list[tuple[tuple[int, ...], JoinError]]:
-    """Return the error around each loop that a join closes, with the fragments of the loop.
-
-    The strongest joins form a tree. Each other join closes one loop with it.
-    """
+    """Return the error around each loop that a join closes with the tree of the strongest, and its fragments."""
     groups, neighbors = DisjointGroups(range(len(fragments))), dict[int, list[tuple[int, Similarity]]]()
     radii = [fragment.radius for fragment in fragments]
     loops, closing = [], []
@@ -410,10 +398,7 @@ def _path(
 
 
 def merge_fragments(fragments: Sequence[Fragment], frames: Mapping[int, Similarity]) -> PlacedPhotos:
-    """Return the photos and points of all fragments that have a frame.
-
-    The part that owns a photo determines its pose, else the largest fragment with it.
-    """
+    """Return all photos and points with a frame; the owner of a photo determines its pose, or the largest fragment."""
     models = {number: _move(fragments[number].placed, frame) for number, frame in sorted(frames.items())}
     photos, R, centers, source = _choose_poses(fragments, models)
     cameras = {

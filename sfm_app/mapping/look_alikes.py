@@ -44,10 +44,7 @@ JUMPS = JumpOptions()
 
 
 def drop_look_alikes(matches: MatchGraph, views: ViewGraph, graph: PoseGraph) -> tuple[MatchGraph, ViewGraph]:
-    """Return matches and fundamental matrices without those of look-alikes.
-
-    Pairs of look-alikes are evidence neither for a model nor against it.
-    """
+    """Return matches and F's without those of look-alikes, which are evidence neither for a model nor against it."""
     dropped = {pair for join in graph.look_alikes for pair in join.pairs}
     if not dropped:
         return matches, views
@@ -87,10 +84,7 @@ def look_alike_entries(joins: Sequence[LookAlikes], matches: MatchGraph) -> list
 
 
 def jumps(model: Reconstruction) -> list[list[str]]:
-    """Return successive photos, by name, that are much farther apart than others: a video may be folded there.
-
-    Empty where many steps are long, because the photos are then unordered. A jump is no proof: videos may be cut, too.
-    """
+    """Return successive photos, by name, that are much farther apart than others; empty if many steps are long."""
     with translate_errors("reading poses"):
         centers_by_name = sorted((image.name, image.projection_center()) for image in posed_images(model))
     if len(centers_by_name) < JUMPS.min_photos:

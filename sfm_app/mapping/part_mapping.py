@@ -207,10 +207,7 @@ def _shared_photos(parts: Sequence[Sequence[int]], links: Links) -> list[set[int
 
 
 def _best_across(pairs: Sequence[PairId], links: Links) -> set[int]:
-    """Return the photos of the other part with most links to this one, spread over the photos that they link to.
-
-    In `pairs`, the photo of this part comes first.
-    """
+    """Return other photos with most links to this part, spread over its photos, which come first in `pairs`."""
     partners: dict[int, list[int]] = {}
     for a, b in pairs:
         partners.setdefault(b, []).append(a)

@@ -328,10 +328,7 @@ class Passes:
     def map_by_size(
         self, group: Group, *, stop_at_false_joins: bool
     ) -> tuple[list[MappingResult], tuple[LookAlikes, ...]]:
-        """Map a large group in parts, and a small one, or one that parts do not explain, as a whole.
-
-        Return false joins within parts instead if they stop the mapping.
-        """
+        """Map a large group in parts, others as a whole; or return the false joins that stop the mapping."""
         if not self.mappers.part_size(len(group.photos), self.run.settings.scene):
             return self.mappers.map_group(group, self.run), ()
         attempts, joins = self.mappers.map_in_parts(
@@ -342,10 +339,7 @@ class Passes:
         return [*attempts, *self.mappers.map_group(group, self.run)], ()
 
     def _update_graph(self, models: Sequence[Attempt], graph: PoseGraph, matches: MatchGraph) -> PoseGraph:
-        """Return the pose graph with relative poses from models that were not mapped from it.
-
-        Later steps complete the tracks of these models along its pairs.
-        """
+        """Return the pose graph with poses from other models, whose tracks later steps complete along its pairs."""
         epipolar = self.run.settings.epipolar
         for attempt in models:
             poses = model_poses(attempt.model, matches, epipolar.max_error_px, epipolar.min_inliers)

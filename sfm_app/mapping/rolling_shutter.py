@@ -54,10 +54,7 @@ class FrameTimes:
 
 
 def frame_times(images: Sequence[MatchedImage]) -> FrameTimes | None:
-    """Return the times of the photos of a model; None where they are not known to be frames of one video.
-
-    The names of frames end with their numbers in the video.
-    """
+    """Return the times of photos named by number; None where they are not known to be frames of one video."""
     numbers = _frame_numbers(images)
     times = {image.id: image.time_s for image in images if image.time_s is not None}
     if numbers is None or len(times) < len(images) or len(images) < OPTIONS.min_frames:

@@ -75,10 +75,7 @@ def sound_parts(explained: Mapping[PairId, PairSupport], photos: Iterable[int]) 
 
 
 def split_attempt(attempt: Attempt) -> list[Attempt]:
-    """Divide a model where more matches contradict than support its joins; return it unchanged if it has one part.
-
-    Single photos are left out, and so are small parts beside the largest one.
-    """
+    """Divide a model where more matches contradict than support its joins; small parts are left out."""
     parts = sound_parts(attempt.explained, posed_photo_ids(attempt.model))
     if len(parts) == 1:
         return [attempt]

@@ -49,11 +49,7 @@ from sfm_app.types import Features, PairId
 
 
 def find_features(method: FeatureMethod, names: Mapping[int, str], run: RunContext) -> None:
-    """Write the features of every photo without a part to its part, and its keypoints to the database.
-
-    Raises:
-        PluginError: the method raises, or returns invalid results.
-    """
+    """Write the features of photos without a part, and keypoints to the database; PluginError if invalid."""
     place, panoramas = run.workspace, panorama_names(run.workspace.database)
     folders = _Folders(place.photos, run.mask_dir, place.feature_parts)
     find = Task(_find_and_save, method, run.settings.matching, folders)
@@ -134,11 +130,7 @@ def _find_in_views(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], 
 
 
 def read_pixels(path: Path) -> NDArray[np.uint8]:
-    """Return (H, W, 3) RGB of a photo in the workspace.
-
-    Raises:
-        InputError: it can no longer be read.
-    """
+    """Return (H, W, 3) RGB of a photo in the workspace; InputError if it can no longer be read."""
     data = np.fromfile(path, np.uint8)
     pixels = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     if pixels is None:
@@ -186,10 +178,7 @@ def load_features(photo: int, folder: Path) -> Features:
 
 
 def cut_pairs(pairs: Sequence[PairId], size: int) -> list[list[PairId]]:
-    """Return all pairs in chunks of `size` > 0, the last of which may be smaller.
-
-    The order of the pairs and that within a pair do not change the chunks.
-    """
+    """Return all pairs in chunks of `size` > 0, the last perhaps smaller, whatever the order of the pairs."""
     names = sorted({photo for pair in pairs for photo in pair})
     number = {name: k for k, name in enumerate(names)}
     remaining: list[dict[int, PairId]] = [{} for _ in names]
@@ -250,12 +239,7 @@ Item = TypeVar("Item")
 
 
 def find_in_chunks(sift: Mapping[str, SiftOption], names: Sequence[str], run: RunContext) -> dict[str, Json]:
-    """Find features of photos on a cluster, except those in the database; return the options in force.
-
-    Raises:
-        BackendError: COLMAP failed.
-        ClusterError: the cluster is gone.
-    """
+    """Find features of photos that have none on a cluster; return the options in force. Errors as `match_in_chunks`."""
     chosen = set(names)
     missing = [name for name in photos_without_features(run.workspace.database).values() if name in chosen]
     parts = chunks(missing, CHUNKS.most_photos, run.spread)

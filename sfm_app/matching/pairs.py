@@ -82,10 +82,7 @@ OPTIONS = PairChoiceOptions()
 def first_pairs(
     images: Mapping[int, MatchedImage], read: ReadDescriptors, run: RunContext, choosers: Collection[int] | None = None
 ) -> list[PairId]:
-    """Choose pairs by what the photos show, and by name, time and GPS; `read` is called in several threads.
-
-    `choosers` are the photos that need partners, None for all.
-    """
+    """Choose pairs by content, name, time and GPS; `read` is called in threads. Only `choosers` need partners."""
     options = run.settings.matching
     photos, count = sorted(images), options.neighbors
     steps: Sequence[int] = OPTIONS.steps

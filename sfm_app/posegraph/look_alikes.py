@@ -209,10 +209,7 @@ class Depths:
         return self.known[photo, other]
 
     def merge_depths(self, photo: int, trusted: Iterable[int], doubted: Iterable[int]) -> tuple[FloatArray, Scales]:
-        """Return (K,) logarithms of depths from trusted pairs, NaN if there is none, and the log scale of each pair.
-
-        Pairs with `doubted` photos only get a scale.
-        """
+        """Return (K,) log depths from trusted pairs, NaN for none, and the log scale of each, also doubted ones."""
         total = np.zeros((2, len(self.matches.keypoints[photo])))
         scales: Scales = {}
         known = {other: self.pair_depths(photo, other) for other in trusted}
@@ -236,10 +233,7 @@ class Depths:
             return np.where(total[1] > 0, total[0] / total[1], np.nan), scales
 
     def expected_points(self, photo: int, other: int, points: IndexArray, logs: FloatArray) -> IndexArray:
-        """Return the points of a photo that the other one must show if their pair is right.
-
-        `points` (N,) are keypoints, `logs` (N,) logarithms of their depths in the scale of the pair.
-        """
+        """Return the keypoints that another photo must show if their pair, with log depths (N,), is right."""
         pose = self.poses[min(photo, other), max(photo, other)]
         R, t = (pose.R, pose.t) if photo < other else (pose.R.T, -pose.R.T @ pose.t)
         rays_here = self.keypoint_bearings(photo)[points, FIRST]
@@ -262,10 +256,7 @@ def is_well_inside(x: FloatArray, width: int, height: int) -> NDArray[np.bool_]:
 
 
 def is_matched_again(size_ratios: FloatArray, cosines: FloatArray) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the points that look enough alike in two photos for matching.
-
-    From the ratios (N,) of their sizes and the cosines (N,) of the angles between the two viewing rays.
-    """
+    """Return a mask (N,) of the points that look alike in two photos, by ratios of sizes and cosines of rays."""
     alike = (
         (size_ratios < OPTIONS.max_scale)
         & (size_ratios > 1.0 / OPTIONS.max_scale)
@@ -275,10 +266,7 @@ def is_matched_again(size_ratios: FloatArray, cosines: FloatArray) -> NDArray[np
 
 
 def count_missing_cells(photo: int, joined: Iterable[int], trusted: Iterable[int], places: Depths) -> tuple[int, int]:
-    """Count the cells of a photo that the photos `joined` should show, and those of them without a match.
-
-    The depths are those of the pairs with the photos `trusted`.
-    """
+    """Count the cells that photos `joined` should show, by depths with `trusted` ones, and those without a match."""
     visibility, others = places.visibility, sorted(joined)
     logs, scales = places.merge_depths(photo, sorted(trusted), others)
     points = np.flatnonzero(~np.isnan(logs))
@@ -386,10 +374,7 @@ def _build_tracks(visibility: Visibility, pairs: Iterable[PairId]) -> FeatureTra
 
 
 def group_doubted_pairs(doubted: Iterable[PairId], trusted: Iterable[PairId]) -> list[tuple[PairId, ...]]:
-    """Group doubted pairs that join the same two places.
-
-    At both ends, their photos are the same or joined by a trusted pair.
-    """
+    """Group doubted pairs that join the same two places: their photos are the same or joined by a trusted pair."""
     neighbors = _partners(trusted)
     waiting, groups = dict.fromkeys(sorted(doubted)), []
     while waiting:

@@ -128,10 +128,7 @@ _DIFFERENCE_STEP = 1e-6
 
 
 def refine_pose(lines: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Refine R (3, 3) and t (3,) by robust least squares of Sampson distances (Levenberg-Marquardt).
-
-    `lines` (N, 18) are matches as bearing vectors with derivatives (`camera.bearings`).
-    """
+    """Refine R (3, 3) and t (3,) for bearing vectors (N, 18) by robust least squares of Sampson distances."""
     pose = np.concatenate([R.ravel(), t / np.linalg.norm(t)])
     for sigma in SIGMAS_PX:
         pose = _descend(lines, pose, sigma)
@@ -309,10 +306,7 @@ class Pair:
 
 
 def estimate_pose(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
-    """Estimate the relative pose of a fundamental matrix; None if too few matches agree with it.
-
-    If a camera is a guess, E is wrong by as much as the guess, and the inliers of F stay.
-    """
+    """Estimate the relative pose of F; None if too few matches agree. With a guessed camera, the inliers of F stay."""
     R, t = pair.initial_pose(fit)
     if not pair.trusted:
         return pair.pose(R, t, fit.inliers)

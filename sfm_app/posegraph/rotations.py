@@ -90,10 +90,7 @@ class RotationCorrection:
 def find_corrections(
     count: int, edges: IndexArray, residuals: FloatArray, strengths: FloatArray
 ) -> Iterator[RotationCorrection]:
-    """Yield corrections that satisfy more than they break, those of the strongest contradictions first.
-
-    Of edges (E, 2), numbers of photos below `count`, with residuals (E, 3), rotation vectors of R_j' R_ij R_i.
-    """
+    """Yield corrections that satisfy more than they break, strongest first; residuals (E, 3) are of R_j' R_ij R_i."""
     from scipy.spatial.transform import Rotation
 
     explained = np.degrees(np.linalg.norm(residuals, axis=1)) <= CORRECTIONS.contradicts_deg
@@ -131,10 +128,7 @@ def _find_linked(count: int, edges: IndexArray, chosen: BoolArray, seed: int) ->
 def find_cut(
     count: int, edges: IndexArray, strengths: FloatArray, ends: tuple[IndexArray, IndexArray]
 ) -> tuple[BoolArray, float]:
-    """Return a mask of the photos on the side of the first ends, and the weight of the pairs across; inf without a cut.
-
-    `edges` (E, 2) are numbers of photos below `count`; `ends` (K,) and (L,) must be on different sides.
-    """
+    """Return a mask of the photos on the side of the first ends, and the weight across; inf without a cut."""
     from scipy import sparse
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
@@ -256,10 +250,7 @@ def _robust_cost(residuals: FloatArray, strengths: FloatArray) -> float:
 
 
 def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> FloatArray:
-    """Return (E,), in (0, 1], the share of the loops of three through each pair that agree; 1 if there is no loop.
-
-    A loop weighs as much as the weaker of the two other pairs in it. Edges and turns as in `check_loops`.
-    """
+    """Return (E,), in (0, 1], the share of the loops through each pair that agree, by their weaker other pair."""
     loops, agree = check_loops(edges, turns)
     sums = np.zeros((2, len(edges)))
     for column, others in ((0, (1, 2)), (1, (0, 2)), (2, (0, 1))):
@@ -271,10 +262,7 @@ def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) ->
 
 
 def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArray[np.bool_]]:
-    """Return (L, 3) numbers of the edges of every loop of three photos, and (L,) whether their rotations agree.
-
-    Edges (E, 2) have the smaller photo first; turns (E, 3, 3) are of photo 2 from photo 1.
-    """
+    """Return (L, 3) edges of every loop of three photos, and whether it agrees; edges have the smaller photo first."""
     from scipy.spatial.transform import Rotation
 
     order = np.lexsort(edges.T[::-1])
@@ -292,10 +280,7 @@ def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArr
 
 @kernel
 def _find_loops(edges: IndexArray, starts: IndexArray) -> IndexArray:
-    """Return (L, 3) numbers of the edges a-b, b-c and a-c of every three photos a < b < c that are all connected.
-
-    The edges (E, 2) are sorted, the smaller photo first; `starts` has the first edge from each photo, and the end.
-    """
+    """Return (L, 3) sorted edges a-b, b-c and a-c of every triangle; `starts` has the first edge from each photo."""
     loops, count = np.empty((len(edges), 3), np.int64), 0
     for k in range(len(edges)):
         a, b = edges[k]

@@ -179,10 +179,7 @@ def _write_rays(x: float, y: float, lenses: FloatArray, rays: FloatArray) -> Non
 
 @kernel
 def _write_derivatives(rays: FloatArray, Es: FloatArray, sigma: float, shared: bool, J: FloatArray) -> float:
-    """Return the distance r of one match in sigma, and write dr over the fifteen parameters into `J` (15,).
-
-    For `shared`, both views are of one camera: both rays move with its first five parameters, and J[5:10] stays.
-    """
+    """Return the distance r of one match in sigma, and write its derivatives to `J` (15,); `shared` is one camera."""
     r = _distance(rays[0, 0], rays[1, 0], Es[0]) / sigma
     for j in range(CAMERA):
         if shared:

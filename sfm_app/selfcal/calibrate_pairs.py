@@ -226,10 +226,7 @@ PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1")
 
 
 def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> FloatArray:
-    """Return the (5C, 5C) covariance of all parameters over all choices of free ones, plus the model error.
-
-    `resampled` widens it where leaving photos out moves the cameras further than it predicts.
-    """
+    """Return the (5C, 5C) covariance over all choices, plus the model error; `resampled` widens it by the jackknife."""
     total = fit.evidence.covariance(fit.free)
     if resampled:
         deviations = np.sqrt(np.diag(total))

@@ -342,10 +342,7 @@ def best_rival(
 
 
 def resample_peak(consensus: Consensus, theta: FloatArray, free: Sequence[int], sigma: float, seed: int) -> FloatArray:
-    """Return the peak (B, 4) under randomly reweighted pairs: the Bayesian bootstrap (Rubin 1981).
-
-    Weights instead of draws, because three pairs drawn with replacement are often one pair three times.
-    """
+    """Return the peaks (B, 4) of the Bayesian bootstrap (Rubin 1981): few pairs drawn again would often be one."""
     rng = np.random.default_rng(seed)
     weights = consensus.weights
     thetas = []
@@ -455,19 +452,13 @@ def _examine(
 
 
 def uncertainty_reason(log_focal_spread: float, *, one_of_many: bool = False) -> str:
-    """Return why an accepted answer is only an estimate; empty where it is identifiable.
-
-    `one_of_many` asks for a smaller spread: every photo has its own focal.
-    """
+    """Return why an accepted answer is only an estimate; empty if identifiable. One of many needs a smaller spread."""
     vague = log_focal_spread > (CONSENSUS.identified_of_many if one_of_many else CONSENSUS.identified_log_focal_spread)
     return f"the focal is uncertain by {100 * log_focal_spread:.0f} %" if vague else ""
 
 
 def rejection_reason(theta: FloatArray, log_focal_spread: float, size: tuple[int, int]) -> str:
-    """Return why an answer that the pairs agree on is rejected; empty where it is accepted.
-
-    `theta` is log f, u, v, ... in longer sides from the middle.
-    """
+    """Return why an agreed answer, log f, u, v, ... in longer sides from the middle, is rejected; or nothing."""
     focal, (low, high) = float(np.exp(theta[LOG_FOCAL])), CONSENSUS.focal_range
     if not low * CONSENSUS.edge < focal < high / CONSENSUS.edge:
         return f"the focal is at the end of the range: {focal:.2f} times the longer side"

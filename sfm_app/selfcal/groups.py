@@ -93,10 +93,7 @@ class VoteTables:
 
 @kernel
 def _ratios(pair: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return (A, B) r = (s1 - s2) / (s1 + s2) of E = K2'F K1, for cameras (A, 5) and (B, 5), without distortion.
-
-    As `constraints.singular_value_ratio`, with two cameras.
-    """
+    """Return `constraints.singular_value_ratio` (A, B) for cameras (A, 5) and (B, 5) without distortion."""
     k1, k2, G = np.empty(5), np.empty(5), np.empty((3, 3))
     ratios = np.empty((len(first), len(second)))
     for i in range(len(first)):
@@ -262,10 +259,7 @@ class _Joint:
 def calibrate_cameras(
     cameras: Sequence[CameraGroup], pairs: CameraPairs, members: IndexArray, options: CalibrationSettings, method: str
 ) -> list[Calibration]:
-    """Return one calibration per camera, in their order; each is identifiable, an estimate, or a guess with the reason.
-
-    `pairs` have inliers; their size is not used. `members` (P, 2) are the cameras of both views.
-    """
+    """Return one calibration per camera, in their order; `members` (P, 2) are the cameras of both views."""
     unit = float(max(max(camera.size) for camera in cameras))
     rows, Fs, matches = _convert_to_units(cameras, pairs, members, unit)
     members, weights, photos = members[rows], pairs.weights[rows], [pairs.photos[k] for k in rows]

@@ -244,10 +244,7 @@ class TwoCameras(NamedTuple):
 
 
 def divide_photos(tables: VoteTables, photos: Sequence[PairId], starts: Sequence[FloatArray]) -> TwoCameras | None:
-    """Divide photos among two cameras that share all but the focal, by the votes of their pairs; None for no gain.
-
-    Arguments as `split_by_focal`; the starts give center and aspect.
-    """
+    """Divide photos among two cameras that share all but the focal, by the votes of their pairs; None for no gain."""
     rows, everyone, members = _voting_pairs(photos)
     grids = [FocalGrid(tables, rows, theta, members) for theta in starts]
     shared = [np.einsum("pgg->g", grid.votes) for grid in grids]
@@ -289,10 +286,7 @@ class _Division:
         self.pairs_of = [np.flatnonzero((grid.members == photo).any(axis=1)) for photo in range(photos)]
 
     def starts(self, usual: int, other: int) -> tuple[IndexArray, IndexArray]:
-        """Return two initial labelings (N,): all photos 0, and each photo as its pairs prefer.
-
-        The preference of a pair assumes that both of its photos change.
-        """
+        """Return two initial labelings (N,): all photos 0, and each as its pairs prefer if both photos change."""
         gains = self.votes[:, other, other] - self.votes[:, usual, usual]
         totals = np.array([np.sum(gains[rows]) for rows in self.pairs_of])
         return np.zeros(self.photos, np.int64), (totals > 0).astype(np.int64)

@@ -111,10 +111,7 @@ def _calibrate_alone(
 def _split_and_calibrate(
     whole: Sequence[CalibratedCamera], pairs: PhotoPairs, options: CalibrationSettings, seed: int
 ) -> list[CalibratedCamera]:
-    """Divide groups whose photos disagree, and calibrate all cameras from all pairs.
-
-    A group with two parts of the same focal stays whole.
-    """
+    """Divide groups whose photos disagree, and calibrate all; a group with two parts of one focal stays whole."""
     families = _mixed_padded_groups(whole, pairs, seed)
     parts = [
         _split_by_photo(camera, len(whole) + families[camera.name], pairs)
@@ -172,10 +169,7 @@ def _split_group(
 
 
 def _confirmed_labels(labels: Mapping[int, int], photos: Sequence[PairId]) -> dict[int, int]:
-    """Return the labels of photos that share a pair with another of their camera, or are its only photo.
-
-    A pair between two cameras does not show which of its photos belongs to which.
-    """
+    """Return the labels of photos that share a pair with another of their camera, or are its only photo."""
     count = Counter(labels.values())
     inside = {photo for pair in photos if labels[pair[0]] == labels[pair[1]] for photo in pair}
     return {photo: label for photo, label in labels.items() if photo in inside or count[label] == 1}

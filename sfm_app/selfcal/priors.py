@@ -81,10 +81,7 @@ class CameraPriors:
     """Whether distortion is estimated."""
 
     def prior(self, free: BoolArray, thetas: FloatArray, held: BoolArray | None = None) -> Prior:
-        """Return the prior for a choice (C, 4) of freed parts, and of parts `held` at their usual values.
-
-        The parameters (C, 5) convert k1 to kappa.
-        """
+        """Return the prior for freed parts (C, 4) and those `held` at usual values; thetas convert k1 to kappa."""
         mean, deviation = np.zeros((len(self.sides), CAMERA)), np.empty((len(self.sides), CAMERA))
         hinted = ~free[:, FOCAL] & np.isfinite(self.hints)
         with np.errstate(invalid="ignore"):
@@ -138,10 +135,7 @@ class Evidence:
         return fit + volume + self.priors.log_odds(free), step, covariance
 
     def choices(self, free: BoolArray, camera: int) -> BoolArray:
-        """Return (K, C, 4) all choices for one camera, those that free less first, beside the others' (C, 4).
-
-        Choices with hardly any redundant constraint are left out: three pairs fit almost any center.
-        """
+        """Return (K, C, 4) choices for one camera, less free first, without those of too little redundancy."""
         switches = binary_choices(free.shape[1])
         trials = np.repeat(free[None], len(switches), axis=0)
         trials[:, camera] = switches
@@ -149,10 +143,7 @@ class Evidence:
         return np.asarray(trials[allowed], np.bool_)
 
     def choose(self, free: BoolArray) -> BoolArray:
-        """Return the most probable choice (C, 4), from a first one.
-
-        Each camera in turn takes its best choice beside the present choices of the others, until none changes.
-        """
+        """Return the most probable choice (C, 4): each camera in turn takes its best one, until none changes."""
         while True:
             before = free
             for camera in range(len(free)):
@@ -174,10 +165,7 @@ class Evidence:
         return undetermined
 
     def covariance(self, free: BoolArray) -> FloatArray:
-        """Return (5C, 5C) mean squares of the cameras about `thetas`, over all choices for each camera.
-
-        A parameter that is nearly freed is nearly as uncertain as a freed one.
-        """
+        """Return (5C, 5C) mean squares of the cameras about `thetas`, over all choices for each camera."""
         _, step, covariance = self.posterior(free)
         total = covariance.copy()
         for camera in range(len(free)):

@@ -529,10 +529,7 @@ def _first_look(
 
 
 def _log_odds(refined: RefinedLens, rival: RadialLens, pairs: _SampledPairs, Fs: Sequence[FloatArray]) -> float:
-    """Return by how much less a lens costs than a perspective rival, without the pair in which it gains most.
-
-    The rival starts with the matrices of the lens, `Fs`, and with its own.
-    """
+    """Return by how much less a lens costs than a rival, which starts twice, without the pair that gains most."""
     starts = Fs, [F for _, F in pairs.search(rival)]
     rivals = (refine_lens(rival, pairs.with_matrices(start), pairs.threshold).state for start in starts)
     costs = min((pair_costs(pairs.matches, state, refined.sigma) for state in rivals), key=np.sum)
