@@ -168,11 +168,7 @@ def _pair(a: int, b: int) -> PairId:
 
 
 def describe_picture(pixels: NDArray[np.uint8], most: int) -> NDArray[np.uint8]:
-    """Return (N, 128) SIFT descriptors of an (H, W, 3) RGB picture, at most `most`, those of the largest features
-    first.
-
-    For photos whose own features are not SIFT.
-    """
+    """Return at most `most` SIFT descriptors (N, 128) of an (H, W, 3) RGB picture, the largest features first."""
     import cv2  # an estimate of the cost needs none of these libraries
 
     gray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
@@ -219,8 +215,7 @@ def _count_mutual(squares: NDArray[np.float32]) -> int:
 
 
 def rank_similar(words: Sequence[IndexArray], size: int, most: int) -> list[IndexArray]:
-    """Rank for each photo at most `most` photos with common words, from the words (N,) of each; the most similar come
-    first.
+    """Rank for each photo at most `most` photos with common words (N,), the most similar first.
 
     A word counts with the root of its frequency in the photo, since patterns repeat within photos (Jegou 2009), and
     less if it is in many photos. `size` is that of the vocabulary.

@@ -161,7 +161,6 @@ class Contradiction:
     given_px: float
     found_px: float
     deviation_px: float
-    """Standard deviation of the difference."""
 
     @property
     def text(self) -> str:

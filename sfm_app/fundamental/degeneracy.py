@@ -378,9 +378,7 @@ def find_stationary(x1: FloatArray, x2: FloatArray, unit_px: float = 1.0) -> Boo
 
 
 def is_widespread(points: FloatArray, keypoints: FloatArray, size: tuple[int, int]) -> bool:
-    """Return whether points (N, 2) cover a large part of a photo, compared with all its keypoints (M, 2); all in
-    pixels.
-    """
+    """Return whether points (N, 2) cover a large part of a photo, compared with all its keypoints (M, 2)."""
     occupied, with_keypoints = (len(np.unique(_cells(some, size))) for some in (points, keypoints))
     return occupied > WATERMARK.wide_share * with_keypoints
 

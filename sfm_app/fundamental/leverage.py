@@ -24,8 +24,7 @@ _LEAST_FREEDOM = 2.0**-52
 
 
 def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArray:
-    """Return the leverage h_ii of every match, in [0, 1], in a regression on the fitted matches and itself (thesis
-    3.11).
+    """Return the leverage h_ii of every match, in [0, 1], in a regression on the fitted and itself (thesis 3.11).
 
     For a fitted match (mask (N,)) this is the diagonal of the hat matrix. For any other match the textbook formula
     would exceed 1. Its leverage if it were fitted as well is g / (1 + g) with g = a_i' (A_in' A_in)^-1 a_i.

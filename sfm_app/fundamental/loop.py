@@ -37,9 +37,7 @@ class Recipe:
     """One estimator: sampler, solver, score, verifier, stopping rule, final fit."""
 
     score: Score
-    """The penalty to minimize."""
     finish: Refine
-    """The final fit, from the best model of the loop."""
     sample_size: int = SAMPLE_SIZE
     """7: all models through seven matches; 8: the linear model through eight."""
     validity: Validity | None = None
@@ -248,7 +246,6 @@ class _Loop:
     limit: int
     """Largest number of samples, by (3.19) and the settings."""
     warmup_trials: int
-    """Samples before the priors are first estimated."""
     patience: float
     """Samples without a better model after which the evidence for the best one is evaluated."""
 

@@ -208,8 +208,7 @@ def _exponent(hit: float, miss: float, share: float) -> float:
 
 
 def design(epsilon: float, delta: float, sample_size: int) -> SequentialTest:
-    """Return the fastest test for these probabilities: A = t_M C / m_S + 1 + log A; without 0 < delta < epsilon, no
-    test.
+    """Return the fastest test: A = t_M C / m_S + 1 + log A; without 0 < delta < epsilon, no test.
 
     A larger A wastes matches on bad models; a smaller one wastes samples, because good models are rejected.
     """

@@ -177,9 +177,7 @@ def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the (3, 3) matrix of norm 1 and any rank with the least algebraic error; `weights` as in
-    `fit_eight_point`.
-    """
+    """Return the (3, 3) matrix of norm 1 and any rank with the least algebraic error, weighted by (N,)."""
     _, vectors = np.linalg.eigh(weighted_gram(points, weights))
     return np.ascontiguousarray(vectors[:, 0]).reshape(3, 3)
 
@@ -333,9 +331,7 @@ def _project(gram: FloatArray, basis: FloatArray, normal: FloatArray, right: Flo
 
 @kernel
 def _solve(normal: FloatArray, right: FloatArray, damping: float, step: FloatArray) -> bool:
-    """Write the Cholesky solution of (normal + damping diag(normal)) step = right; False if it is not positive
-    definite.
-    """
+    """Write the Cholesky solution of (normal + damping diag(normal)) step = right; False if not positive definite."""
     lower = normal.copy()
     largest = 0.0
     for j in range(7):

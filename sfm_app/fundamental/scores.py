@@ -261,8 +261,7 @@ def residual_validity(points: FloatArray, f: FloatArray, _threshold: float) -> F
 
 
 def validity_from_residuals(residuals: FloatArray) -> FloatArray:
-    """Return p(v_i | r_i) of 4.10 to 4.15, in [0, 1], at least one of them > 0; all 1 where one bin holds all
-    residuals.
+    """Return p(v_i | r_i) of 4.10 to 4.15, in [0, 1], one > 0; all 1 where one bin holds all residuals.
 
     The bins are a hundredth of the median wide, and the last one holds all larger residuals: there p(0 <= r <= r_i) is
     1 and p(v) is 0, so that samples come from the better half of the matches only.

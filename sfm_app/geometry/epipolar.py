@@ -357,9 +357,7 @@ def fit_rays(p: FloatArray, q: FloatArray, weights: FloatArray | None = None) ->
 
 
 def depths(lines: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the depths (N,) in view 1 and (N,) in view 2, as multiples of the rays, at which the rays of matches are
-    closest.
-    """
+    """Return the depths (N,) in either view, as multiples of the rays, at which the rays of matches are closest."""
     h1, h2 = lines[:, FIRST] @ R.T, lines[:, SECOND]
     # least squares of d1 h1 + t = d2 h2
     a, b, c = (h1 * h1).sum(1), (h1 * h2).sum(1), (h2 * h2).sum(1)

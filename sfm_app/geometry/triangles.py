@@ -210,9 +210,7 @@ def _shared_corners(
 
 
 def _straighten(tangents: FloatArray, normals: FloatArray) -> FloatArray:
-    """Return unit vectors (N, 3) at right angles to unit normals, as close to tangents as can be; any where those have
-    none.
-    """
+    """Return unit vectors (N, 3) at right angles to unit normals, closest to tangents; any where these have none."""
     straight = tangents - (tangents * normals).sum(axis=1, keepdims=True) * normals
     length = np.linalg.norm(straight, axis=1)
     degenerate = length <= 1e-6 * np.linalg.norm(tangents, axis=1)

@@ -291,7 +291,6 @@ class NoModel:
 
     mapper: str
     note: str
-    """As in `Attempt`."""
 
 
 MappingResult: TypeAlias = Attempt | NoModel

@@ -62,7 +62,6 @@ class Fragment:
     """A model of a part, or a piece of one."""
 
     part: int
-    """Number of the part."""
     own: frozenset[int]
     """Photos that no other part owns."""
     placed: PlacedPhotos
@@ -272,7 +271,6 @@ class Alignment:
     frames: Mapping[int, Similarity]
     """From the frame of each fragment to the common one, for the largest group of joined fragments."""
     kept: tuple[tuple[Join, JoinError], ...]
-    """Joins with their errors."""
     dropped: tuple[tuple[Join, JoinError], ...]
     """Joins that contradict the others, with their errors when they were dropped."""
 
@@ -383,9 +381,7 @@ def loop_errors(fragments: Sequence[Fragment], joins: Sequence[Join]) -> list[tu
 def _path(
     neighbors: Mapping[int, Sequence[tuple[int, Similarity]]], start: int, end: int
 ) -> tuple[tuple[int, ...], Similarity]:
-    """Return the fragments on the path along the tree, and the similarity from the frame of the end into that of the
-    start.
-    """
+    """Return the fragments on the path along the tree, and the similarity from the frame of its end to its start."""
     waiting: list[tuple[tuple[int, ...], Similarity]] = [((start,), Similarity(1.0, np.eye(3), np.zeros(3)))]
     while waiting:
         path, so_far = waiting.pop()

@@ -269,7 +269,6 @@ class PartInputs:
     """Inputs for mapping a part."""
 
     part: Group
-    """Photos, matches, geometry, relative poses and cameras."""
     mapped: frozenset[PairId]
     """Pairs of the pose graph that mapping follows."""
     settings: Settings

@@ -79,7 +79,6 @@ class Outcome:
     """Names of the photos of each part of a model that was cut because matches contradict the join."""
     passes: int = 1
     rival_reason: str = ""
-    """Why a rival was tried, if so."""
     one_camera_each: str = ""
     """Result of trying a camera for each photo: "taken", "left" (rejected), or "two" where two cameras explain as much;
     empty if it was not tried."""

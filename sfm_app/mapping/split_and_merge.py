@@ -204,9 +204,7 @@ def _joining_order(visibility: "csr_array") -> list[tuple[int, int]]:
 
 
 class _Growth:
-    """Photos that have joined a model, and the points of the others in it; `seen` (P, N) is 1 where a photo sees a
-    point.
-    """
+    """Photos that have joined a model, and how many points the others share with it."""
 
     def __init__(self, visibility: "csr_array") -> None:
         self.visibility, self.by_photo = visibility, visibility.T.tocsr()

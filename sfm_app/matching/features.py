@@ -377,9 +377,7 @@ def find_all_features(method: FeatureMethod, run: RunContext, pairs: Sequence[Pa
 
 
 def match_pairs(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Json]:
-    """Match pairs of photos with known features, except those of a killed run; arguments and errors as in
-    `fill_database`.
-    """
+    """Match pairs of photos with known features, except those of a killed run; see `fill_database`."""
     place, options = run.workspace, run.settings.matching
     if pairs is not None and not pairs:
         return {}

@@ -238,7 +238,6 @@ class Peak(NamedTuple):
     """A local maximum of the consensus."""
 
     theta: FloatArray
-    """(4,) log f, u, v, log a."""
     value: float
     """Support plus log-prior there, at the sigma it was climbed with last."""
 

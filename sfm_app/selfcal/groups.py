@@ -249,7 +249,6 @@ class _Joint:
     covariance: FloatArray
     """(5C, 5C)."""
     tables: VoteTables
-    """Of the undistorted pairs."""
     photos: list[PairId]
     unit_px: float
     motion: str

@@ -374,9 +374,7 @@ class Prediction(NamedTuple):
     own: float
     """Share of the votes for a camera per photo."""
     deviations: float
-    """Difference of the votes in its standard deviations."""
     is_camera_per_photo: bool
-    """Whether every photo counts as one of its own camera."""
 
 
 def cross_validate(

@@ -78,7 +78,6 @@ class CameraPriors:
     center_sigma: float = WIDE[CENTER]
     """Wide prior on the center, in longer sides."""
     lens: bool = True
-    """Whether distortion is estimated."""
 
     def prior(self, free: BoolArray, thetas: FloatArray, held: BoolArray | None = None) -> Prior:
         """Return the prior for freed parts (C, 4) and those `held` at usual values; thetas convert k1 to kappa."""
@@ -113,7 +112,6 @@ class Evidence:
     """The negative log-likelihood of all pairs near `thetas`: -g'd + d'Hd / 2 for a step d of the cameras."""
 
     thetas: FloatArray
-    """(C, 5) parameters of the cameras."""
     H: FloatArray
     """(5C, 5C) Hessian of the negative log-likelihood."""
     g: FloatArray

@@ -171,7 +171,6 @@ class _Adjustment:
     consensus: Consensus
     """Of all usable pairs, undistorted."""
     peak: ConsensusPeak
-    """Of that consensus."""
 
     @property
     def vote_share(self) -> float:
