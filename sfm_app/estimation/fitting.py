@@ -175,9 +175,6 @@ def to_calibration(estimate: LensEstimate, size: tuple[int, int]) -> Calibration
     )  # fmt: skip
 
 
-# Fits of pairs.
-
-
 def fit_pairs(
     matches: MatchGraph, pairs: Sequence[PairId], run: RunContext, lenses: Mapping[str, Calibration]
 ) -> dict[PairId, PairFit]:
@@ -215,26 +212,20 @@ def _matched_pairs(matches: MatchGraph, pairs: Iterable[PairId]) -> Iterator[Mat
 def _fit_pair(
     estimator: Estimator, settings: Settings, lenses: Mapping[str, Calibration], matched: MatchedPair
 ) -> PairFit:
+    points, image = matched.points, matched.images[0]
     try:
-        return _fit_or_raise(estimator, settings, lenses, matched)
+        seed = int(np.random.SeedSequence([settings.seed, *matched.pair]).generate_state(1)[0])
+        stationary = _stationary_matches(matched, settings)
+        by_rays = ray_estimator(matched.images, lenses)
+        fit = by_rays or estimator.fit
+        if not stationary.any():
+            return fit(*points, settings.epipolar, seed), 0
+        wide = is_widespread(points[0][stationary], matched.spread, (image.width, image.height))
+        wide = wide and by_rays is None  # its test needs an F of pixels
+        return fit_moving(fit, points, stationary, wide, settings.epipolar, seed), int(np.count_nonzero(stationary))
     except FAILURES as err:
         logger.info("pair %s could not be fitted", matched.pair, exc_info=err)
         return Rejected("the computation failed"), 0
-
-
-def _fit_or_raise(
-    estimator: Estimator, settings: Settings, lenses: Mapping[str, Calibration], matched: MatchedPair
-) -> PairFit:
-    seed = int(np.random.SeedSequence([settings.seed, *matched.pair]).generate_state(1)[0])
-    points, stationary = matched.points, _stationary_matches(matched, settings)
-    by_rays = ray_estimator(matched.images, lenses)
-    fit = by_rays or estimator.fit
-    if not stationary.any():
-        return fit(*points, settings.epipolar, seed), 0
-    image = matched.images[0]
-    wide = is_widespread(points[0][stationary], matched.spread, (image.width, image.height))
-    wide = wide and by_rays is None  # its test needs an F of pixels
-    return fit_moving(fit, points, stationary, wide, settings.epipolar, seed), int(np.count_nonzero(stationary))
 
 
 def ray_estimator(images: Sequence[MatchedImage], lenses: Mapping[str, Calibration]) -> FitFundamentalLike | None:

@@ -89,8 +89,6 @@ def _search_sorted(cumulative: FloatArray, target: float) -> int:
     return low
 
 
-# Stopping rules.
-
 CONVERGED = 0.05
 """G of the thesis (4.7.4, Eq. 4.18): priors have converged when the sum of their changes is below this."""
 

@@ -207,9 +207,6 @@ def saturate(matches: Sequence[int]) -> FloatArray:
     return np.asarray(counts / (1.0 + counts / MAPPING.saturation))
 
 
-# Unregistered photos.
-
-
 def are_many_unregistered(lost: int, photos: int) -> bool:
     """Return whether unregistered photos justify another mapping of all photos."""
     return lost > 0 and (photos < MAPPING.many_photos or lost >= MAPPING.few_lost * photos)

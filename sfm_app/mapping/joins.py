@@ -1,7 +1,7 @@
 """One model of all fragments: each photo once, and tracks merged where they hold the same keypoint."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -290,18 +290,13 @@ def align_fragments(fragments: Sequence[Fragment], joins: Sequence[Join]) -> Ali
         if worst is None:
             break
         dropped.append((remaining.pop(worst), errors[worst]))
-    main = _main_group(fragments, remaining)
+    groups = connected_groups([(join.first, join.second) for join in remaining], range(len(fragments)))
+    photos = [set(fragment.placed.photos.tolist()) for fragment in fragments]
+    main = max(
+        groups, key=lambda group: (len(set[int]().union(*(photos[k] for k in group))), -min(group)), default=set()
+    )
     accepted = tuple(zip(remaining, errors, strict=True))
     return Alignment({number: frames[number] for number in sorted(main)}, accepted, tuple(dropped))
-
-
-def _main_group(fragments: Sequence[Fragment], joins: Sequence[Join]) -> set[int]:
-    groups = connected_groups([(join.first, join.second) for join in joins], range(len(fragments)))
-
-    def count_photos(group: set[int]) -> int:
-        return len({photo for number in group for photo in fragments[number].placed.photos.tolist()})
-
-    return max(groups, key=lambda group: (count_photos(group), -min(group)), default=set())
 
 
 def difference(join: Join, expected: Similarity, radii: Sequence[float]) -> JoinError:
@@ -395,7 +390,11 @@ def _path(
 
 def merge_fragments(fragments: Sequence[Fragment], frames: Mapping[int, Similarity]) -> PlacedPhotos:
     """Return all photos and points with a frame; the owner of a photo determines its pose, or the largest fragment."""
-    models = {number: _move(fragments[number].placed, frame) for number, frame in sorted(frames.items())}
+    models: dict[int, PlacedPhotos] = {}
+    for number, frame in sorted(frames.items()):
+        placed = fragments[number].placed
+        R = np.einsum("nij,kj->nik", placed.R, frame.R)
+        models[number] = replace(placed, R=R, centers=frame(placed.centers), X=frame(placed.X))
     photos, R, centers, source = _choose_poses(fragments, models)
     cameras = {
         photo: models[number].cameras[photo] for photo, number in zip(photos.tolist(), source.tolist(), strict=True)
@@ -403,13 +402,6 @@ def merge_fragments(fragments: Sequence[Fragment], frames: Mapping[int, Similari
     tracks = [_sound_observations(model, photos, R, centers) for model in models.values()]
     X, point, photo, keypoint = _merge_tracks(tracks)
     return PlacedPhotos(photos, R, centers, X, point, photo, keypoint, cameras)
-
-
-def _move(model: PlacedPhotos, frame: Similarity) -> PlacedPhotos:
-    R = np.einsum("nij,kj->nik", model.R, frame.R)
-    return PlacedPhotos(
-        model.photos, R, frame(model.centers), frame(model.X), model.point, model.photo, model.keypoint, model.cameras
-    )
 
 
 def _choose_poses(

@@ -71,7 +71,14 @@ class Part:
 def cut_group(graph: PoseGraph, photos: Sequence[int], size: int) -> tuple[Part, ...]:
     """Divide connected photos into overlapping parts of about `size` photos, each connected."""
     links = link_weights(graph, photos)
-    owned = [sorted(part) for part in _join_small(_divide(links, size), links, OPTIONS.smallest * size)]
+    waiting, parts = _components(set(links), links), []
+    while waiting:
+        part = waiting.pop()
+        if len(part) <= OPTIONS.largest * size:
+            parts.append(part)
+        else:
+            waiting += _bisect(part, links)
+    owned = [sorted(part) for part in _join_small(parts, links, OPTIONS.smallest * size)]
     owned.sort(key=lambda part: part[0])
     return tuple(
         Part(tuple(own), tuple(sorted((*own, *more))))
@@ -89,17 +96,6 @@ def link_weights(graph: PoseGraph, photos: Collection[int]) -> dict[int, dict[in
             weight = pose.inlier_count / (1.0 + pose.inlier_count / OPTIONS.saturation_inliers)
             links[a][b] = links[b][a] = weight * (OPTIONS.doubtful_weight if pair in doubtful else 1.0)
     return links
-
-
-def _divide(links: Links, size: int) -> list[set[int]]:
-    waiting, parts = _components(set(links), links), []
-    while waiting:
-        photos = waiting.pop()
-        if len(photos) <= OPTIONS.largest * size:
-            parts.append(photos)
-        else:
-            waiting += _bisect(photos, links)
-    return parts
 
 
 def _bisect(photos: set[int], links: Links) -> tuple[set[int], set[int]]:

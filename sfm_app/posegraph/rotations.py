@@ -19,7 +19,6 @@ from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 if TYPE_CHECKING:
     from scipy import sparse
-    from scipy.spatial.transform import Rotation
 
 
 class DisjointGroups:
@@ -97,7 +96,10 @@ def find_corrections(
     unexplained, turns = ~explained, Rotation.from_rotvec(residuals)
     while unexplained.any():
         seed = int(np.argmax(np.where(unexplained, strengths, -1.0)))
-        alike, reverse = (unexplained & _is_small(turns * turn) for turn in (turns[seed].inv(), turns[seed]))
+        alike, reverse = (
+            unexplained & (np.degrees((turns * turn).magnitude()) < CORRECTIONS.same_deg)
+            for turn in (turns[seed].inv(), turns[seed])
+        )
         group = _find_linked(count, edges, alike | reverse, seed)
         unexplained &= ~group
         if np.count_nonzero(group) < CORRECTIONS.min_pairs:
@@ -109,10 +111,6 @@ def find_corrections(
         gain = float(strengths[group].sum()) - cut_weight
         if gain > 0.0:
             yield RotationCorrection(~side, turns[seed].as_matrix(), gain)
-
-
-def _is_small(turns: "Rotation") -> BoolArray:
-    return np.asarray(np.degrees(turns.magnitude()) < CORRECTIONS.same_deg, np.bool_)
 
 
 def _find_linked(count: int, edges: IndexArray, chosen: BoolArray, seed: int) -> BoolArray:

@@ -220,8 +220,6 @@ def _estimate_poses(few: Matches, Fs: FloatArray, thetas: FloatArray) -> FloatAr
     return poses
 
 
-# Uncertainty.
-
 PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1")
 
 

@@ -74,9 +74,6 @@ def log_focal_grid() -> FloatArray:
     return np.log(np.geomspace(*CONSENSUS.focal_range, GROUPS.focals))
 
 
-# Votes.
-
-
 class VoteTables:
     """Votes of pairs for any two cameras of their photos; F's are in one unit from the middle of each photo."""
 
@@ -218,9 +215,6 @@ def _ascend_coordinates(places: IndexArray, own: FloatArray, tables: dict[tuple[
 def _total_gain(places: IndexArray, own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> float:
     shared = sum(float(table[places[i], places[j]]) for (i, j), table in between.items())
     return float(np.sum(own[np.arange(len(places)), places])) + shared
-
-
-# Calibration.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -202,9 +202,6 @@ def _rays_and_slopes(lens: Lens | Equirectangular, points: FloatArray) -> FloatA
     )
 
 
-# Search.
-
-
 def search_rays(lines: FloatArray, samples: IndexArray, threshold: float) -> tuple[float, FloatArray]:
     """Return the support of the best F, in matches, and F (3, 3); lines (N, 18) are from `bearings_through`.
 
@@ -229,9 +226,6 @@ def search_rays(lines: FloatArray, samples: IndexArray, threshold: float) -> tup
 
 def _supports(Fs: FloatArray, lines: FloatArray, threshold: float) -> FloatArray:
     return np.asarray(np.sum(1.0 - np.minimum(squared_distances(Fs, lines) / threshold**2, 1.0), axis=1), np.float64)
-
-
-# Refinement.
 
 
 Family = type[Fisheye] | type[RadialLens]
@@ -295,7 +289,8 @@ def refine_lens(start: Lens, pairs: Sequence[Pair], sigma: float) -> RefinedLens
     state = State(np.array([np.log(start.focal), shape, *start.center]), poses, type(start))
     for _ in range(REFINEMENT.noise_rounds):
         state = _adjust(matches, state, sigma)
-        sigma = _noise(matches, state)
+        distances = np.abs(np.concatenate(_distances(matches, state)))
+        sigma = max(MAD_TO_SIGMA * float(np.median(distances)), REFINEMENT.least_sigma)
     systems = _systems(matches, state, sigma)
     H = sum((system.H for system in systems), np.diag(_prior_precision()))
     inverse = inverse_of_positive(H)
@@ -382,12 +377,6 @@ def pair_costs(matches: Sequence[FloatArray], state: State, sigma: float) -> Flo
     """Return (P,) half the robust squared distances of each pair, in sigma^2."""
     squared = [(r / sigma) ** 2 for r in _distances(matches, state)]
     return np.array([0.5 * float(np.sum(d / (1.0 + d / ROBUST_SCALE**2))) for d in squared], np.float64)
-
-
-def _noise(matches: Sequence[FloatArray], state: State) -> float:
-    """Return the standard deviation of a distance, from the median of all."""
-    distances = np.abs(np.concatenate(_distances(matches, state)))
-    return max(MAD_TO_SIGMA * float(np.median(distances)), REFINEMENT.least_sigma)
 
 
 def _distances(matches: Sequence[FloatArray], state: State) -> list[FloatArray]:
