@@ -96,10 +96,7 @@ def choose_by_rank(
 def count_shared_keypoints(
     keypoints: Mapping[int, int], matches: Mapping[PairId, NDArray[np.uint32]], block: int = BLOCK
 ) -> dict[PairId, int]:
-    """Count, for pairs without matches (N, 2), the keypoints of third photos that match in both.
-
-    `keypoints` has their number by photo. They are counted for `block` photos at once.
-    """
+    """Count, for pairs without matches, the keypoints of third photos that match in both, a block at a time."""
     from scipy import sparse
 
     photos = sorted(keypoints)

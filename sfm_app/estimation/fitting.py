@@ -178,11 +178,7 @@ def to_calibration(estimate: LensEstimate, size: tuple[int, int]) -> Calibration
 def fit_pairs(
     matches: MatchGraph, pairs: Sequence[PairId], run: RunContext, lenses: Mapping[str, Calibration]
 ) -> dict[PairId, PairFit]:
-    """Fit every pair on its own, seeded by the seed of the run and the ids of the photos.
-
-    Finished pairs stay in `view_graph_parts` until the caller removes it, so that a killed run can resume. Pairs of
-    `lenses`, the wide lenses by camera group, are fitted by bearing vectors.
-    """
+    """Fit every pair, seeded by the run and the ids of its photos; those of wide lenses by bearing vectors."""
     estimator = run.plugins.estimator(run.settings.epipolar.estimator)
     fit_pair = Task(_fit_pair, estimator, run.settings, dict(lenses))
     return _fit_all(fit_pair, lambda missing: _matched_pairs(matches, missing), pairs, run)

@@ -62,10 +62,7 @@ def assign_cameras(matches: MatchGraph, given: GivenCameras, *, keep: bool) -> A
 
 
 def fit_to_photos(camera: Calibration, image: MatchedImage) -> tuple[Calibration | None, str]:
-    """Return a camera in pixels of a photo, and a note if it was scaled; None with the reason where it cannot be.
-
-    Photos of another shape were cropped, at an unknown place. A camera of width 0 fits any size.
-    """
+    """Return a camera in pixels of a photo, and a note if it was scaled; None with the reason where it cannot be."""
     size = image.width, image.height
     if camera.projection == EQUIRECTANGULAR:
         return None, "the file's camera is that of panoramas, which these photos are not"

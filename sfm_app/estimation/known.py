@@ -56,11 +56,7 @@ METHOD = "earlier run"
 def find_or_keep_intrinsics(
     matches: MatchGraph, views: ViewGraph, run: RunContext
 ) -> tuple[Intrinsics, Sequence[CalibratedCamera]]:
-    """Return the cameras of all photos: those that an earlier run has refined, and new ones of the other groups.
-
-    A camera stays where most photos of its group are known, the photos determined it, and the new photos do not
-    contradict it. Where a group was split, or the user gave cameras, all are estimated as in a first run.
-    """
+    """Return the cameras of all photos: refined ones of an earlier run that nothing contradicts, and new ones."""
     known = {} if run.earlier is None or run.given.source else known_cameras(matches, views, run, run.earlier)
     if not known:
         return find_intrinsics(matches, views, run)

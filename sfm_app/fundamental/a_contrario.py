@@ -34,7 +34,9 @@ def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> f
     """
     if inliers <= sample_size:
         return 1e300
-    logarithm = _log_choose(count, sample_size) + log_binomial_tail(count - sample_size, inliers - sample_size, chance)
+    rest = count - sample_size
+    choices = math.lgamma(count + 1) - math.lgamma(sample_size + 1) - math.lgamma(rest + 1)
+    logarithm = choices + log_binomial_tail(rest, inliers - sample_size, chance)
     return min(1e300, math.exp(min(logarithm, 700.0)))
 
 
@@ -72,7 +74,3 @@ def log_binomial_tail(count: int, least: int, chance: float) -> float:
     if share < 1:
         divergence += (1 - share) * math.log((1 - share) / (1 - chance))
     return -count * divergence
-
-
-def _log_choose(n: int, k: int) -> float:
-    return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)

@@ -115,10 +115,7 @@ def mad_sigma(distances: FloatArray) -> float:
 
 
 def prior_validity(points: FloatArray, f: FloatArray, threshold: float, *, sigma_from_inliers: bool) -> FloatArray:
-    """Return p(v_i) of every match from its influence on the model f, of norm 1 (thesis 4.7.2 and 4.7.3).
-
-    sigma is estimated from the Cook's distances of the inliers, or of all matches as in the thesis.
-    """
+    """Return p(v_i) from the influence on f (thesis 4.7.2, 4.7.3); sigma is of the inliers, or of all matches."""
     squared = squared_distances(points, f)
     fitted = squared <= threshold * threshold
     leverage = leverages(points, f, fitted)

@@ -95,10 +95,7 @@ class BailOut(FullVerification):
 
 
 class RandomizedTdd(FullVerification):
-    """T(d,d): the first d matches must all be inliers (Matas and Chum 2004, who find d = 1 best).
-
-    A clean model passes with probability share^d, so that more samples are needed.
-    """
+    """T(d,d): the first d matches must all be inliers (Matas and Chum 2004); clean models pass by share^d."""
 
     d = 1
 

@@ -141,10 +141,7 @@ def refine_sampson(
     most_steps: int = 20,
     tolerance: float = _COST_TOLERANCE,
 ) -> FloatArray:
-    """Move F towards a minimum of sum_i r_i^2 / (1 + r_i^2 / c^2) (Geman and McClure 1987); c is `scale`.
-
-    The steps end at a relative decrease of the cost below `tolerance`. F has rank 2, its largest singular value 1.
-    """
+    """Minimize sum_i r_i^2 / (1 + r_i^2 / c^2), c = `scale` (Geman and McClure 1987); rank 2, s1 = 1."""
     weighing = Weighting(softness=float(scale**-2))
     return _reweighted_least_squares(points, *factorize(F), weighing, most_steps, tolerance, np.empty((10, 10)))
 
@@ -288,10 +285,7 @@ def _normal_equations(  # noqa: PLR0913
 
 @kernel
 def _derivatives(block: FloatArray, count: int, f: FloatArray, rows: FloatArray) -> None:
-    """Write dr / dF (9 rows) and r (the last row) of the matches of a block, times sqrt(weight).
-
-    r = n / g with n = x2' F x1 and g the norm of its gradient: dr = dn / g - r dg / g.
-    """
+    """Write sqrt(weight) times dr / dF (9 rows) and r (the last): r = n / g, dr = dn / g - r dg / g, n = x2' F x1."""
     f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
     for n in range(count):
         x1, y1, x2, y2 = block[0, n], block[1, n], block[2, n], block[3, n]

@@ -190,11 +190,7 @@ class DampingRange(NamedTuple):
 def damped_step(
     attempt: Callable[[float], Trial | None], damping: float, limits: DampingRange
 ) -> tuple[Trial | None, float]:
-    """Find a step that lowers the cost, raising the damping until one does.
-
-    `attempt` takes a damping and returns the result of the step, or None if it does not lower the cost. Returns the
-    result or None, and the damping for the next step.
-    """
+    """Raise the damping until `attempt` gives a result; return it, or None, and the next damping."""
     while damping < limits.most:
         trial = attempt(damping)
         if trial is not None:

@@ -165,8 +165,10 @@ def corner_tangents(
     corners = vertices[faces]
     tangents, handed = _face_tangents(corners, uv.astype(np.float64))
     weighted = corner_angles(corners)[:, :, None] * tangents[:, None, :]
-    total = _group_sums(weighted.reshape(-1, 3), _shared_corners(faces, uv, page, handed))
-    straight = _straighten(total, normals[faces].reshape(-1, 3)).reshape(-1, 3, 3)
+    group = _shared_corners(faces, uv, page, handed)
+    size = int(group.max(initial=-1)) + 1
+    total = np.stack([np.bincount(group, column, size) for column in weighted.reshape(-1, 3).T], axis=1)
+    straight = _straighten(total[group], normals[faces].reshape(-1, 3)).reshape(-1, 3, 3)
     return np.concatenate([straight, np.repeat(handed, 3).reshape(-1, 3, 1)], axis=2).astype(np.float32)
 
 
@@ -175,13 +177,6 @@ def corner_angles(corners: FloatArray) -> FloatArray:
     sides = normalize(np.roll(corners, -1, axis=1) - corners)
     cosine = -(sides * np.roll(sides, 1, axis=1)).sum(axis=2)
     return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
-
-def _group_sums(values: FloatArray, group: NDArray[np.int64]) -> FloatArray:
-    """Return for each of N rows (N, 3) the sum over its group (N,)."""
-    size = int(group.max(initial=-1)) + 1
-    total = np.stack([np.bincount(group, column, size) for column in values.T], axis=1)
-    return np.asarray(total[group], np.float64)
 
 
 def _face_tangents(corners: FloatArray, places: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -52,11 +52,7 @@ OPTIONS = RetryOptions()
 def add_matches(
     matches: MatchGraph, keypoints: Mapping[int, FloatArray], added: Mapping[PairId, Rows]
 ) -> tuple[MatchGraph, tuple[PairId, ...]]:
-    """Add keypoints and matches (M, 2) of another kind; return the merged graph, and the pairs with more matches.
-
-    Existing keypoints keep their positions and indices. An added match, in indices of added keypoints, enters only if
-    neither of its keypoints has a match in the other photo yet.
-    """
+    """Add keypoints and matches whose ends have none in that pair; return the graph, and the pairs with more."""
     all_keypoints, numbers = dict(matches.keypoints), {}
     for photo, x in keypoints.items():
         all_keypoints[photo], numbers[photo] = _merge_keypoints(matches.keypoints[photo], x)

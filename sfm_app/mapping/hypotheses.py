@@ -79,11 +79,7 @@ def photos_with_geometry(fits: Mapping[PairId, EpipolarFit]) -> set[int]:
 
 
 def map_baseline(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Attempt | NoModel:
-    """Map all photos with COLMAP's default pipeline, and score the model like any other.
-
-    Its database loses pairs that are not among the matches, such as those of look-alikes. Of the cameras, only focals
-    from EXIF or from the user are used.
-    """
+    """Map the same matches with COLMAP's default pipeline and stated focals, and score the model like any other."""
     scratch = run.workspace.root / FOLDER
     models: list[Reconstruction | None] = []
     guess = guessed_intrinsics(intrinsics)

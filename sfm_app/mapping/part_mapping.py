@@ -404,11 +404,7 @@ class PartResult:
 def map_parts(
     group: Group, parts: Sequence[Part], mapped: PoseGraph, run: RunContext, *, stop_at_false_joins: bool
 ) -> list[PartResult]:
-    """Map parts, as many at once as there are workers; one that fails is a result without models.
-
-    Parts that a killed run has finished are not mapped again. `mapped` has the pairs that mapping follows;
-    `stop_at_false_joins` ends the pass at false joins within parts.
-    """
+    """Map parts side by side, except those that a killed run has finished; failed ones have no models."""
     place = run.workspace.root / FOLDER
     (place / STOP).unlink(missing_ok=True)
     within = pairs_of_parts(group.matches.matches, [part.photos for part in parts])

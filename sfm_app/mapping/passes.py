@@ -156,11 +156,7 @@ class Passes:
         return self.merge_models(best, matches, views)
 
     def _drop_false_joins(self, outcome: Outcome, matches: MatchGraph, views: ViewGraph) -> Outcome:
-        """Map again without pairs that merge two places.
-
-        Where other pairs do not hold the photos together instead, as by day and by night, the joins stay, and are
-        doubtful.
-        """
+        """Map again without pairs that merge two places; joins without which the photos fall apart are doubtful."""
         joins, non_overlapping = self.mappers.judge_places(outcome.models)
         for _ in range(OVERLAPS.max_passes):
             if not joins:
@@ -311,11 +307,7 @@ class Passes:
         views: ViewGraph,
         chances: int,
     ) -> Outcome:
-        """Run a pass without the false joins of parts, before any part is joined to others.
-
-        True pairs of the same corner come back with new relative poses. Where they do not hold most photos together,
-        the joins stay, and are doubtful.
-        """
+        """Run a pass without false joins of parts; joins without which the photos fall apart are doubtful."""
         self.run.progress.say("two different places are merged in a part; remapping without the ambiguous pairs")
         marked = with_false_joins(graph, joins)
         again = self.run_pass(*drop_look_alikes(matches, views, marked), intrinsics, chances)
@@ -352,10 +344,7 @@ class Passes:
 
 
 def needs_another_pass(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:
-    """Return whether another pass with the cameras of the model may improve it.
-
-    That is so if they differ from the cameras of the last pass, or if photos of the main group are missing.
-    """
+    """Return whether the cameras of the model differ from those of the pass, or main photos are missing."""
     main = outcome.models[0]
     placed = posed_photo_ids(main.model)
     if len(placed) < MAPPING.min_photos:

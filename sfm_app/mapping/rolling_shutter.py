@@ -134,10 +134,7 @@ def follow_shutter(
 def _compensate(
     adjusted: Adjustment, frames: FrameTimes, database: Path, rules: Rules
 ) -> Sequence[tuple[Adjustment, ReadoutEstimate]]:
-    """Return the adjusted models of all rounds with the readouts that they were compensated for.
-
-    The first round is the last one where the readout is smaller than its deviation; the model is then the given one.
-    """
+    """Return the adjusted models of all rounds with their readouts; an insignificant one has the given model."""
     rounds: list[tuple[Adjustment, ReadoutEstimate]] = []
     keypoints, current = read_keypoints(adjusted.model), adjusted
     estimate: ReadoutEstimate | None = None

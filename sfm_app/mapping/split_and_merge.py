@@ -164,10 +164,7 @@ def _pairs_between(views: ViewGraph, here: set[int], there: set[int]) -> Iterato
 
 
 def weakly_joined_parts(model: Reconstruction) -> list[list[str]]:
-    """Return the names of photos in parts whose scale against the first part depends on too few points.
-
-    Photos join one by one: next is the one that sees most points which at least two joined photos see.
-    """
+    """Return the names of photos in parts whose scale depends on too few points, as photos join by most points."""
     from scipy.sparse import csr_array
 
     with translate_errors("reading points"):

@@ -87,11 +87,7 @@ def planar_starts(used: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
 
 
 def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield R and t of a camera that turned about the middle of the scene, for every turn of the options.
-
-    `used` (N, 4) are inliers as points of the plane z = 1. Of E, only the directions of its epipolar lines through the
-    middle are used.
-    """
+    """Yield R and t of a camera that turned about the scene, by the directions of the lines of E in its middle."""
     if not len(used):  # panoramas that look away from each other
         return
     middles = np.median(used, axis=0)

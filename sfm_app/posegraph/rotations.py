@@ -187,11 +187,7 @@ AVERAGING = AveragingOptions()
 def average_rotations(
     relative: Mapping[PairId, FloatArray], weights: Mapping[PairId, float]
 ) -> tuple[dict[int, FloatArray], dict[PairId, float]]:
-    """Estimate the rotations of all photos (3, 3), and the angle of each pair to them in degrees.
-
-    `relative` has the rotation (3, 3) of photo 2 from photo 1. The axes of the world are those of the first photo of
-    each group.
-    """
+    """Estimate the rotations (3, 3) of all photos from those of pairs, and the angle of each pair in degrees."""
     if not relative:
         return {}, {}
     photos = sorted({photo for pair in relative for photo in pair})

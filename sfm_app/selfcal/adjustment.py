@@ -20,6 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
+from sfm_app.fundamental.solvers import mirror
 from sfm_app.geometry.least_squares import DampingRange, damped_step, solve_each
 from sfm_app.geometry.poses import POSE_DOF, retract, write_essential
 from sfm_app.jit import kernel
@@ -85,10 +86,7 @@ def _distance(p: FloatArray, q: FloatArray, E: FloatArray) -> float:
 def distances(
     matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray
 ) -> FloatArray:
-    """Return (M,) signed Sampson distances, in the units of the matches.
-
-    Pair k has the matches ends[k] to ends[k + 1] - 1, and its pose is poses[k] (12,), see `write_essential`.
-    """
+    """Return (M,) signed Sampson distances; pair k has the matches ends[k] to ends[k + 1] - 1."""
     E, first, second = np.empty((3, 3)), np.empty(5), np.empty(5)
     p, q = np.empty(7), np.empty(7)
     signed = np.empty(len(matches))
@@ -141,7 +139,7 @@ def pair_systems(
             r = _write_derivatives(rays, Es, sigma, shared, J)
             if _is_finite(r, J):
                 _add_match(A[k], b[k], J, r, (1.0 + r * r / ROBUST_SCALE**2) ** -2)
-        _mirror(A[k])
+        mirror(A[k])
     return A, b
 
 
@@ -199,13 +197,6 @@ def _is_finite(r: float, J: FloatArray) -> bool:
     for j in range(PAIR):
         total += abs(J[j])
     return bool(total < OVERFLOW_LIMIT)
-
-
-@kernel
-def _mirror(A: FloatArray) -> None:
-    for i in range(PAIR):
-        for j in range(i):
-            A[j, i] = A[i, j]
 
 
 @kernel
@@ -286,11 +277,7 @@ class Matches:
 
     @cached_property
     def redundancy(self) -> float:
-        """Number of matches per independent error, >= 1.
-
-        One keypoint in m photos gives m (m - 1) / 2 matches, but 2 m - 3 independent errors. The number of matches per
-        keypoint determines m.
-        """
+        """Matches per error, >= 1: one keypoint in m photos gives m (m - 1) / 2 matches, but 2 m - 3 errors."""
         if len(self.points) == 0:
             return 1.0
         photos = self.photos.repeat(np.diff(self.ends), axis=0)
@@ -323,10 +310,7 @@ class Matches:
         )
 
     def noise(self, state: State) -> float:
-        """Return the standard deviation of the distances in agreeing pairs, from their median.
-
-        A pose absorbs five of a pair's degrees of freedom: the distances of few matches are smaller than their errors.
-        """
+        """Return the standard deviation of distances in agreeing pairs; a pose absorbs five degrees of freedom."""
         counts = np.diff(self.ends)
         residuals = np.abs(distances(self.points, self.ends, state.thetas, self.cameras, state.poses))
         residuals *= np.repeat(np.sqrt(counts / np.maximum(counts - POSE_DOF, 1)), counts)

@@ -104,11 +104,7 @@ class Fit:
         return Evidence(self.state.thetas, H, g, float(np.sum(self.state.weights)), self.priors)
 
     def cost(self, sigma: float, scale: float) -> float:
-        """Return the negative log-probability that ranks fits from different starts, each pair's part bounded.
-
-        The deviation of a distance and the scale of the disagreement are the same for all fits: their own larger ones
-        would favor wrong fits.
-        """
+        """Return the negative log-probability that ranks fits by a common sigma and scale, each pair's part bounded."""
         state = reweight(self.matches, replace(self.state, sigma=sigma))
         gains = pair_information(self.matches, state).gains / (scale * self.matches.redundancy)
         H = replace(self, state=state).evidence.H + np.diag(self.prior.precision.ravel())
@@ -118,10 +114,7 @@ class Fit:
 
 
 def fit_cameras(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], priors: CameraPriors) -> Fit:
-    """Fit the cameras from all starts (C, 5), the most likely first, then with non-square pixels; return the best fit.
-
-    The F's (P, 3, 3), in the frame and units of the matches, initialize the poses.
-    """
+    """Fit the cameras from all starts (C, 5), likely ones first, then with any pixels; return the best fit."""
     few = matches.subsample(FITTING.few_matches)
     best = _select_best([_fit_from_start(few, Fs, thetas, priors, square=True) for thetas in starts])
     others = [_fit_from_start(few, Fs, thetas, priors, square=False) for thetas in (best.state.thetas, starts[0])]
@@ -264,11 +257,7 @@ def key_pairs(fit: Fit, photos: tuple[PairId, ...]) -> tuple[PairId, ...]:
 
 
 def critical_motion(fit: Fit) -> str:
-    """Return the critical motion of most pairs, for the user; empty where there is none.
-
-    Parallel axes, and axes that meet at one distance from both cameras (an isosceles triangle, as on an orbit), are the
-    two for which one pair does not constrain the focal (Sturm 1999).
-    """
+    """Return the motion of most pairs if it leaves the focal open: parallel axes or an orbit (Sturm 1999)."""
     R = fit.state.poses[:, :9].reshape(-1, 3, 3)
     if len(R) == 0:
         return ""

@@ -354,11 +354,7 @@ def resample_peak(consensus: Consensus, theta: FloatArray, free: Sequence[int], 
 
 
 def deviation(values: FloatArray, count: float, parameters: int) -> float:
-    """Return the standard deviation of an unknown over resampled peaks (B,), corrected for degrees of freedom.
-
-    A pair gives two constraints. With three pairs and three unknowns half of the scatter has gone into the fit, and the
-    resampled peaks scatter too little by the same share. `count` is the effective number of pairs.
-    """
+    """Return the standard deviation over resampled peaks (B,), corrected for the freedom of `count` pairs."""
     freedom = max(count - 0.5 * parameters, 0.5)
     return float(np.std(values, ddof=1) * np.sqrt(max(count, 1.0) / freedom))
 

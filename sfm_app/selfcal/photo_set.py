@@ -69,11 +69,7 @@ def calibrate_photo_set(
     pairs: PhotoPairs, calibrate: CalibrateFunction, options: CalibrationSettings, seed: int, *,
     together: bool, split: bool = True,
 ) -> list[CalibratedCamera]:  # fmt: skip
-    """Return every camera of a set of photos, the one with most photos first.
-
-    `calibrate` finds one camera from its own pairs. `together` also uses the pairs between cameras; `split` then also
-    splits groups whose photos disagree.
-    """
+    """Return all cameras, those of most photos first; `together` uses pairs between cameras, `split` divides groups."""
     groups: dict[str, list[int]] = {}
     for photo, group in pairs.groups.items():
         groups.setdefault(group, []).append(photo)

@@ -175,10 +175,7 @@ class Evidence:
     def camera_posteriors(
         self, free: BoolArray, camera: int, step: FloatArray, covariance: FloatArray
     ) -> tuple[BoolArray, Posteriors]:
-        """Return all choices (K, C, 4) for one camera, and its posterior under each.
-
-        `step` (5C,) and `covariance` are of the posterior under the choices `free` (C, 4) for all cameras.
-        """
+        """Return all choices (K, C, 4) for one camera, and its posteriors; `step` and `covariance` are of `free`."""
         block = slice(CAMERA * camera, CAMERA * (camera + 1))
         prior, trials = self.priors.prior(free, self.thetas), self.choices(free, camera)
         offset = prior.mean - self.thetas
@@ -197,10 +194,7 @@ class Evidence:
 
 
 def redundancy(free: BoolArray, pairs: float) -> float:
-    """Return the share of redundant constraints, in [0.1, 1], for freed parts (C, 4) and an effective number of pairs.
-
-    A pair gives two constraints. With fewer redundant ones, residuals underestimate the errors.
-    """
+    """Return the share of redundant constraints, in [0.1, 1], for freed parts (C, 4): a pair gives two."""
     unknowns = len(free) + 2 * np.count_nonzero(free[:, CENTER]) + np.count_nonzero(free[:, [ASPECT, LENS]])
     return max(1.0 - unknowns / max(2.0 * pairs, 1e-9), 0.1)
 

@@ -203,10 +203,7 @@ def _rays_and_slopes(lens: Lens | Equirectangular, points: FloatArray) -> FloatA
 
 
 def search_rays(lines: FloatArray, samples: IndexArray, threshold: float) -> tuple[float, FloatArray]:
-    """Return the support of the best F, in matches, and F (3, 3); lines (N, 18) are from `bearings_through`.
-
-    A match counts 1 - d^2 / threshold^2, or nothing beyond the threshold. `samples` (S, 8) are rows.
-    """
+    """Return the support of the best F by samples (S, 8), as in MSAC, and F, for bearing vectors (N, 18)."""
     p, q = lines[:, FIRST], lines[:, SECOND]
     Fs = fit_rays(p[samples], q[samples])
     supports = _supports(Fs, lines, threshold)
