@@ -168,7 +168,7 @@ def corner_tangents(
     group = _shared_corners(faces, uv, page, handed)
     size = int(group.max(initial=-1)) + 1
     total = np.stack([np.bincount(group, column, size) for column in weighted.reshape(-1, 3).T], axis=1)
-    straight = _straighten(total[group], normals[faces].reshape(-1, 3)).reshape(-1, 3, 3)
+    straight = _straighten(np.asarray(total[group], np.float64), normals[faces].reshape(-1, 3)).reshape(-1, 3, 3)
     return np.concatenate([straight, np.repeat(handed, 3).reshape(-1, 3, 1)], axis=2).astype(np.float32)
 
 
