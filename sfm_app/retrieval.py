@@ -96,10 +96,7 @@ def choose_by_rank(
 def count_shared_keypoints(
     keypoints: Mapping[int, int], matches: Mapping[PairId, NDArray[np.uint32]], block: int = BLOCK
 ) -> dict[PairId, int]:
-    """Count, for pairs without matches (N, 2), the keypoints of third photos that match in both.
-
-    `keypoints` has their number by photo. They are counted for `block` photos at once.
-    """
+    """Count, for pairs without matches, the keypoints of third photos that match in both, a block at a time."""
     from scipy import sparse
 
     photos = sorted(keypoints)
@@ -151,21 +148,14 @@ def pairs_nearby(images: Sequence[MatchedImage], count: int) -> set[PairId]:
     located = [(image.id, image.gps) for image in images if image.gps is not None]
     if len(located) < 2:
         return set()
-    angles = np.radians([(gps.latitude_deg, gps.longitude_deg) for _, gps in located])
-    positions = _unit_vectors(angles)
+    north, east = np.radians([(gps.latitude_deg, gps.longitude_deg) for _, gps in located]).T
+    positions = np.column_stack([np.cos(north) * np.cos(east), np.cos(north) * np.sin(east), np.sin(north)])
     nearest = np.atleast_2d(cKDTree(positions).query(positions, k=min(count + 1, len(located)))[1]).tolist()
     ids = [photo for photo, _ in located]
     return {_pair(ids[row], ids[k]) for row, others in enumerate(nearest) for k in others if k != row}
 
 
-def _unit_vectors(angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N, 3) unit vectors of latitudes and longitudes in radians."""
-    north, east = angles.T
-    return np.column_stack([np.cos(north) * np.cos(east), np.cos(north) * np.sin(east), np.sin(north)])
-
-
 def _order_key(image: MatchedImage) -> tuple[float, list[tuple[int, str]], int]:
-    """Return a key by time, then by name with numbers in their order."""
     parts = [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", image.name)]
     return (image.time_s if image.time_s is not None else 0.0), parts, image.id
 
@@ -175,11 +165,7 @@ def _pair(a: int, b: int) -> PairId:
 
 
 def describe_picture(pixels: NDArray[np.uint8], most: int) -> NDArray[np.uint8]:
-    """Return (N, 128) SIFT descriptors of an (H, W, 3) RGB picture, at most `most`, those of the largest features
-    first.
-
-    For photos whose own features are not SIFT.
-    """
+    """Return at most `most` SIFT descriptors (N, 128) of an (H, W, 3) RGB picture, the largest features first."""
     import cv2  # an estimate of the cost needs none of these libraries
 
     gray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
@@ -199,10 +185,7 @@ DescriptorArray = NDArray[np.uint8]
 
 
 def count_preview_matches(first: DescriptorArray, others: Sequence[DescriptorArray]) -> list[int]:
-    """Count the features of a photo and of each other photo that are each other's nearest, and clearly so.
-
-    Descriptors are (N, 128), those of the largest features.
-    """
+    """Count the descriptors (N, 128) of a photo and of others that are each other's nearest, and clearly so."""
     if not others or not len(first):
         return [0] * len(others)
     a, b = first.astype(np.float32), np.concatenate(others).astype(np.float32)
@@ -229,8 +212,7 @@ def _count_mutual(squares: NDArray[np.float32]) -> int:
 
 
 def rank_similar(words: Sequence[IndexArray], size: int, most: int) -> list[IndexArray]:
-    """Rank for each photo at most `most` photos with common words, from the words (N,) of each; the most similar come
-    first.
+    """Rank for each photo at most `most` photos with common words (N,), the most similar first.
 
     A word counts with the root of its frequency in the photo, since patterns repeat within photos (Jegou 2009), and
     less if it is in many photos. `size` is that of the vocabulary.

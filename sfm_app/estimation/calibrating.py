@@ -101,22 +101,21 @@ def find_intrinsics(
         if selected is sample:
             break
         cameras = _calibrate(matches, selected, run)
-    cameras += cameras_with_lens(matches, views)
+    images = matches.images.values()
+    for group, lens in views.lenses.items():  # they precede the fundamental matrices
+        cameras.append(CalibratedCamera(group, tuple(image.id for image in images if image.group == group), lens))
     report_claims({camera.name: _exif_claim(camera, matches) for camera in cameras}, run)
     cameras = sorted(_take_given_cameras(cameras, matches, run), key=lambda one: (-len(one.photos), one.name))
     intrinsics = Intrinsics(
         cameras={camera.name: explain_failure(camera, views) for camera in cameras},
         camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
-        photos={image.id: image.name for image in matches.images.values()},
+        photos={image.id: image.name for image in images},
     )
     return intrinsics, cameras
 
 
 def sample_pairs(views: ViewGraph, photos: int) -> ViewGraph:
-    """Return the view graph with as many pairs as cameras need; all of them in small sets.
-
-    Each photo keeps some pairs: those with most inliers, and others of any number, which have more parallax.
-    """
+    """Return the view graph with as many pairs as cameras need: of each photo those with most inliers, and others."""
     counts = {pair: fit.inlier_count for pair, fit in views.fits.items() if not fit.degeneracy}
     if len(counts) <= OPTIONS.all_pairs:
         return views
@@ -125,7 +124,6 @@ def sample_pairs(views: ViewGraph, photos: int) -> ViewGraph:
 
 
 def _calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> list[CalibratedCamera]:
-    """Return the cameras of all photos without a wide lens, in pixels of whole photos."""
     options = run.settings.calibration
     calibrator = run.plugins.calibrator(options.calibrator)
     pairs = photo_pairs([image for image in matches.images.values() if image.group not in views.lenses], matches, views)
@@ -138,7 +136,6 @@ def _calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> list[C
 
 
 def _exif_claim(camera: CalibratedCamera, matches: MatchGraph) -> FocalClaim | None:
-    """Return the claim of EXIF about a camera that its photos determine."""
     calibration, images = camera.found, [matches.images[photo] for photo in camera.photos]
     if not calibration.identifiable or calibration.is_given or calibration.projection == EQUIRECTANGULAR:
         return None
@@ -148,10 +145,7 @@ def _exif_claim(camera: CalibratedCamera, matches: MatchGraph) -> FocalClaim | N
 def _take_given_cameras(
     cameras: Sequence[CalibratedCamera], matches: MatchGraph, run: RunContext
 ) -> list[CalibratedCamera]:
-    """Replace calibrated cameras by those that the user gave, after a check.
-
-    Given cameras with a wide lens were checked before the fundamental matrices.
-    """
+    """Replace calibrated cameras by those that the user gave; those with a wide lens were checked before."""
     given = assign_cameras(matches, run.given, keep=run.settings.calibration.keep).cameras
     result, checked = [], {}
     for camera in cameras:
@@ -166,14 +160,6 @@ def _take_given_cameras(
             result.append(CalibratedCamera(group, photos, own))
     report_checks(checked, run)
     return result
-
-
-def cameras_with_lens(matches: MatchGraph, views: ViewGraph) -> list[CalibratedCamera]:
-    """Return the cameras with a wide lens, which precede the fundamental matrices."""
-    return [
-        CalibratedCamera(group, tuple(photo for photo, one in matches.images.items() if one.group == group), lens)
-        for group, lens in views.lenses.items()
-    ]
 
 
 def explain_failure(camera: CalibratedCamera, views: ViewGraph) -> Calibration:

@@ -66,7 +66,6 @@ class Diagnosis:
 
     cause: Cause
     message: str
-    """One line."""
 
     @property
     def hint(self) -> str:
@@ -110,19 +109,19 @@ def diagnose_depth(
     if kinds[""] >= kinds.total() / 2:
         return None
     determined = [pair for pair in _pairs_among(views, photos) if not views.fits[pair].degeneracy]
-    parallax = sum(_count_parallax(pair, matches, views, options) for pair in determined)
+    with_lens = {photo for photo, image in matches.images.items() if image.group in views.lenses}
+    # with a known lens, no plane is degenerate
+    parallax = sum(
+        count_matches_off_plane(*matches.points(pair), views.fits[pair].F, options)
+        if with_lens.isdisjoint(pair)
+        else views.fits[pair].inlier_count
+        for pair in determined
+    )
     if parallax >= OPTIONS.min_parallax * kinds.total():
         return None
     diagnosis = diagnose_fits(views, photos)
     by_plane = diagnosis.cause == "planar" and (camera_known or len(photos) >= OPTIONS.plane_photos)
     return None if by_plane else diagnosis
-
-
-def _count_parallax(pair: PairId, matches: MatchGraph, views: ViewGraph, options: EpipolarSettings) -> int:
-    """Return the inliers of a pair off its dominant plane; with a known lens all, since no plane is degenerate."""
-    if any(matches.images[photo].group in views.lenses for photo in pair):
-        return views.fits[pair].inlier_count
-    return count_matches_off_plane(*matches.points(pair), views.fits[pair].F, options)
 
 
 def inliers_by_degeneracy(views: ViewGraph, photos: Collection[int]) -> Counter[str]:

@@ -71,7 +71,12 @@ def find_lenses(
         InputError: the calibration file fits no photo.
         ConfigError: the user states panoramas, and some photos are none.
     """
-    _check_panoramas(matches, run)
+    others = [image.name for image in matches.images.values() if image.projection != EQUIRECTANGULAR]
+    if run.settings.scene.camera_model == "EQUIRECTANGULAR" and others:
+        raise ConfigError(
+            f"{len(others)} photos are not panoramas, such as {others[0]}",
+            hint="omit --camera-model EQUIRECTANGULAR; panoramas are detected automatically",
+        )
     given = assign_cameras(matches, run.given, keep=run.settings.calibration.keep)
     if given.notes:
         run.record(given_camera_notes=list(given.notes))
@@ -84,8 +89,10 @@ def find_lenses(
     for group, images in groups.items():
         given_camera = given.cameras.get(group)
         if given_camera is not None:
-            checked[group] = given_camera, _lens_of_matches(given_camera, images, matches, run)
-            lens = given_camera if given_camera.projection == FISHEYE else None
+            is_wide = given_camera.projection == FISHEYE
+            searched = run.settings.calibration.lens
+            checked[group] = given_camera, _search_lens(images, matches, run, is_wide=is_wide) if searched else None
+            lens = given_camera if is_wide else None
         else:
             lens = known_lenses[group] if group in known_lenses else _find_lens(images, matches, run)
         if lens is not None:
@@ -117,36 +124,15 @@ def _find_lens(images: Sequence[MatchedImage], matches: MatchGraph, run: RunCont
 
 def panorama(size: tuple[int, int]) -> Calibration:
     """Return the camera of panoramas of (width, height) pixels."""
+    spread = dict.fromkeys(("fx", "fy", "cx", "cy"), 0.0)
     K = panorama_matrix(size)
-    return Calibration(
-        K,
-        *size,
-        PANORAMA,
-        identifiable=True,
-        projection=EQUIRECTANGULAR,
-        spread=dict.fromkeys(("fx", "fy", "cx", "cy"), 0.0),
-    )
-
-
-def _lens_of_matches(
-    known: Calibration, images: Sequence[MatchedImage], matches: MatchGraph, run: RunContext
-) -> Calibration | None:
-    """Return the lens that the matches of a group with a given camera show; None where they show none.
-
-    For a given perspective camera, they show one only where the lens is a fisheye.
-    """
-    if not run.settings.calibration.lens:
-        return None
-    return _search_lens(images, matches, run, is_wide=known.projection == FISHEYE)
+    return Calibration(K, *size, PANORAMA, identifiable=True, projection=EQUIRECTANGULAR, spread=spread)
 
 
 def _search_lens(
     images: Sequence[MatchedImage], matches: MatchGraph, run: RunContext, *, is_wide: bool
 ) -> Calibration | None:
-    """Return the lens that the raw matches of a group show; None where there is none, or a perspective one is enough.
-
-    For a lens known to be wide, a perspective one is not tested.
-    """
+    """Return the lens that raw matches show; None without one. Unless `is_wide`, a perspective lens may be enough."""
     size, ids = (images[0].width, images[0].height), {image.id for image in images}
     pairs = [np.hstack(matches.points(pair)) for pair in matches.matches if ids.issuperset(pair)]
     try:
@@ -157,16 +143,6 @@ def _search_lens(
         logger.info("the lens of a group could not be estimated", exc_info=err)
         return None
     return to_calibration(estimate, size) if estimate is not None and (is_wide or estimate.is_fisheye) else None
-
-
-def _check_panoramas(matches: MatchGraph, run: RunContext) -> None:
-    """Check that all photos are panoramas if the user states so."""
-    others = [image.name for image in matches.images.values() if image.projection != EQUIRECTANGULAR]
-    if run.settings.scene.camera_model == "EQUIRECTANGULAR" and others:
-        raise ConfigError(
-            f"{len(others)} photos are not panoramas, such as {others[0]}",
-            hint="omit --camera-model EQUIRECTANGULAR; panoramas are detected automatically",
-        )
 
 
 def to_calibration(estimate: LensEstimate, size: tuple[int, int]) -> Calibration:
@@ -199,17 +175,10 @@ def to_calibration(estimate: LensEstimate, size: tuple[int, int]) -> Calibration
     )  # fmt: skip
 
 
-# Fits of pairs.
-
-
 def fit_pairs(
     matches: MatchGraph, pairs: Sequence[PairId], run: RunContext, lenses: Mapping[str, Calibration]
 ) -> dict[PairId, PairFit]:
-    """Fit every pair on its own, seeded by the seed of the run and the ids of the photos.
-
-    Finished pairs stay in `view_graph_parts` until the caller removes it, so that a killed run can resume. Pairs of
-    `lenses`, the wide lenses by camera group, are fitted by bearing vectors.
-    """
+    """Fit every pair, seeded by the run and the ids of its photos; those of wide lenses by bearing vectors."""
     estimator = run.plugins.estimator(run.settings.epipolar.estimator)
     fit_pair = Task(_fit_pair, estimator, run.settings, dict(lenses))
     return _fit_all(fit_pair, lambda missing: _matched_pairs(matches, missing), pairs, run)
@@ -228,7 +197,6 @@ class MatchedPair:
 
 
 def _matched_pairs(matches: MatchGraph, pairs: Iterable[PairId]) -> Iterator[MatchedPair]:
-    """Yield the input of the fits of these pairs."""
     spreads: dict[int, FloatArray] = {}
     for pair in pairs:
         first, second = (matches.images[photo] for photo in pair)
@@ -240,33 +208,24 @@ def _matched_pairs(matches: MatchGraph, pairs: Iterable[PairId]) -> Iterator[Mat
 def _fit_pair(
     estimator: Estimator, settings: Settings, lenses: Mapping[str, Calibration], matched: MatchedPair
 ) -> PairFit:
+    points, image = matched.points, matched.images[0]
     try:
-        return _fit_or_raise(estimator, settings, lenses, matched)
+        seed = int(np.random.SeedSequence([settings.seed, *matched.pair]).generate_state(1)[0])
+        stationary = _stationary_matches(matched, settings)
+        by_rays = ray_estimator(matched.images, lenses)
+        fit = by_rays or estimator.fit
+        if not stationary.any():
+            return fit(*points, settings.epipolar, seed), 0
+        wide = is_widespread(points[0][stationary], matched.spread, (image.width, image.height))
+        wide = wide and by_rays is None  # its test needs an F of pixels
+        return fit_moving(fit, points, stationary, wide, settings.epipolar, seed), int(np.count_nonzero(stationary))
     except FAILURES as err:
         logger.info("pair %s could not be fitted", matched.pair, exc_info=err)
         return Rejected("the computation failed"), 0
 
 
-def _fit_or_raise(
-    estimator: Estimator, settings: Settings, lenses: Mapping[str, Calibration], matched: MatchedPair
-) -> PairFit:
-    seed = int(np.random.SeedSequence([settings.seed, *matched.pair]).generate_state(1)[0])
-    points, stationary = matched.points, _stationary_matches(matched, settings)
-    by_rays = ray_estimator(matched.images, lenses)
-    fit = by_rays or estimator.fit
-    if not stationary.any():
-        return fit(*points, settings.epipolar, seed), 0
-    image = matched.images[0]
-    wide = is_widespread(points[0][stationary], matched.spread, (image.width, image.height))
-    wide = wide and by_rays is None  # its test needs an F of pixels
-    return fit_moving(fit, points, stationary, wide, settings.epipolar, seed), int(np.count_nonzero(stationary))
-
-
 def ray_estimator(images: Sequence[MatchedImage], lenses: Mapping[str, Calibration]) -> FitFundamentalLike | None:
-    """Return an estimator by bearing vectors for a pair of photos; None where neither has a wide lens.
-
-    The other camera of a pair is the usual guess.
-    """
+    """Return an estimator by bearing vectors for a pair; None without a wide lens. The other camera is a guess."""
     if not any(image.group in lenses for image in images):
         return None
     sizes = [(image.width, image.height) for image in images]
@@ -336,7 +295,6 @@ def read_part(path: Path, pairs: Sequence[PairId]) -> dict[PairId, PairFit] | No
 
 
 def _stationary_matches(matched: MatchedPair, settings: Settings) -> BoolArray:
-    """Return a mask of the matches that are stationary in the picture; none if the photos differ in size."""
     first, second = matched.images
     if (first.width, first.height) != (second.width, second.height):
         return np.zeros(len(matched.points[0]), bool)

@@ -62,10 +62,7 @@ def assign_cameras(matches: MatchGraph, given: GivenCameras, *, keep: bool) -> A
 
 
 def fit_to_photos(camera: Calibration, image: MatchedImage) -> tuple[Calibration | None, str]:
-    """Return a camera in pixels of a photo, and a note if it was scaled; None with the reason where it cannot be.
-
-    Photos of another shape were cropped, at an unknown place. A camera of width 0 fits any size.
-    """
+    """Return a camera in pixels of a photo, and a note if it was scaled; None with the reason where it cannot be."""
     size = image.width, image.height
     if camera.projection == EQUIRECTANGULAR:
         return None, "the file's camera is that of panoramas, which these photos are not"
@@ -82,7 +79,7 @@ def fit_to_photos(camera: Calibration, image: MatchedImage) -> tuple[Calibration
     is_turned = camera.width * size[0] == camera.height * size[1]
     return None, (
         f"the file's camera took photos of {camera.width} x {camera.height} pixels, these have {size[0]} x {size[1]}: "
-        f"they were {'is_turned' if is_turned else 'cropped, or are from another camera'}"
+        f"they were {'turned' if is_turned else 'cropped, or are from another camera'}"
     )
 
 
@@ -128,24 +125,22 @@ def _choose_name(group: str, images: Sequence[MatchedImage], given: GivenCameras
 
 @dataclass(frozen=True, slots=True)
 class CheckOptions:
-    """When photos contradict a stated camera."""
+    """When photos contradict a stated camera. Chosen by hand."""
 
     sigmas: float = 3.0
-    """Standard deviations that a difference must exceed. Chosen by hand."""
+    """Standard deviations that a difference must exceed."""
     min_share: float = 0.01
-    """Share of the radius, or of the longer side for the center, that it must exceed: focusing changes less. Chosen
-    by hand."""
+    """Share of the radius, or of the longer side for the center, that it must exceed: focusing changes less."""
     inner: float = 0.3
-    """Smallest compared angle, as a share of that of the corner: a focal compensates distortion there. Chosen by
-    hand."""
+    """Smallest compared angle, as a share of that of the corner: a focal compensates distortion there."""
     outer: float = 0.8
-    """Largest compared angle: the corners hold few matches. Chosen by hand."""
+    """Largest compared angle: the corners hold few matches."""
     angles: int = 20
-    """Number of compared angles. Chosen by hand."""
+    """Number of compared angles."""
     exif_tolerance: float = 0.08
-    """Share of the focal by which EXIF may be off: rounding, the diagonal, and breathing lenses. Chosen by hand."""
+    """Share of the focal by which EXIF may be off: rounding, the diagonal, and breathing lenses."""
     exif_sigmas: float = 3.0
-    """Standard deviations of the focal that the difference to EXIF must exceed, too. Chosen by hand."""
+    """Standard deviations of the focal that the difference to EXIF must exceed, too."""
 
 
 OPTIONS = CheckOptions()
@@ -163,7 +158,6 @@ class Contradiction:
     given_px: float
     found_px: float
     deviation_px: float
-    """Standard deviation of the difference."""
 
     @property
     def text(self) -> str:
@@ -308,10 +302,8 @@ def camera_rules(
 ) -> dict[int, CameraRule]:
     """Return the rules of the user about the cameras of a model, by camera id; empty for none.
 
-    Args:
-        names: camera of each photo, by photo name.
-        intrinsics: cameras before mapping.
-        camera_model: COLMAP's name of the model of all cameras; "auto" for the one that the photos support.
+    `names` has the camera of each photo by photo name. `camera_model` is COLMAP's model of all cameras; "auto"
+    for the one that the photos support.
     """
     rules = {}
     for image in posed_images(model):

@@ -56,11 +56,7 @@ METHOD = "earlier run"
 def find_or_keep_intrinsics(
     matches: MatchGraph, views: ViewGraph, run: RunContext
 ) -> tuple[Intrinsics, Sequence[CalibratedCamera]]:
-    """Return the cameras of all photos: those that an earlier run has refined, and new ones of the other groups.
-
-    A camera stays where most photos of its group are known, the photos determined it, and the new photos do not
-    contradict it. Where a group was split, or the user gave cameras, all are estimated as in a first run.
-    """
+    """Return the cameras of all photos: refined ones of an earlier run that nothing contradicts, and new ones."""
     known = {} if run.earlier is None or run.given.source else known_cameras(matches, views, run, run.earlier)
     if not known:
         return find_intrinsics(matches, views, run)
@@ -75,16 +71,11 @@ def find_or_keep_intrinsics(
             return find_intrinsics(matches, views, run)
         cameras += new
     run.record(kept_cameras=sorted(known))
-    return _assemble(cameras, matches)
-
-
-def _assemble(cameras: list[CalibratedCamera], matches: MatchGraph) -> tuple[Intrinsics, Sequence[CalibratedCamera]]:
-    """Return the cameras as those of a run, the one with most photos first."""
     cameras = sorted(cameras, key=lambda one: (-len(one.photos), one.name))
     intrinsics = Intrinsics(
         cameras={camera.name: camera.found for camera in cameras},
         camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
-        photos={image.id: image.name for image in matches.images.values()},
+        photos={image.id: image.name for image in images},
     )
     return intrinsics, cameras
 
@@ -144,16 +135,15 @@ def _pair_contradictions(
     calibrator = run.plugins.calibrator(options.calibrator)
     own = calibrate_photo_set(pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=False)
     cameras = [to_whole_photo(mine, new[0]).found for mine in own]
-    return [one for estimated in cameras for one in find_contradictions(camera, estimated) if _is_zoom(one)]
-
-
-def _is_zoom(one: Contradiction) -> bool:
-    """Return whether two cameras differ by more than focusing changes."""
-    return one.what not in CENTERS and abs(one.given_px - one.found_px) > 0.05 * one.found_px  # chosen by hand
+    differences = [one for estimated in cameras for one in find_contradictions(camera, estimated)]
+    # focusing changes less; chosen by hand
+    return [
+        one for one in differences
+        if one.what not in CENTERS and abs(one.given_px - one.found_px) > 0.05 * one.found_px
+    ]  # fmt: skip
 
 
 def _part(matches: MatchGraph, views: ViewGraph, images: Mapping[int, MatchedImage]) -> tuple[MatchGraph, ViewGraph]:
-    """Return the matches and fundamental matrices among some photos."""
     keypoints = {photo: matches.keypoints[photo] for photo in images}
     rows = {pair: found for pair, found in matches.matches.items() if images.keys() >= set(pair)}
     fits = {pair: fit for pair, fit in views.fits.items() if images.keys() >= set(pair)}

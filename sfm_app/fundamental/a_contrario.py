@@ -16,12 +16,7 @@ docs/algorithms.md, All estimators. Chosen by hand; not measured on its own."""
 
 
 def model_false_alarms(squared: FloatArray, wrong: FloatArray, threshold: float) -> float:
-    """Return the expected number of models with as much support among random matches of the same points.
-
-    Args:
-        squared: (N,) squared distances of the matches to the model.
-        wrong: (M,) those of mismatches, from `squared_mismatch_distances`.
-    """
+    """Return the expected number of models with as much support in random matches, from squared distances."""
     fractions = 1.0, 0.5, 0.25  # precise inliers are stronger evidence; docs/algorithms.md, All estimators
     alarms = []
     for fraction in fractions:
@@ -39,7 +34,9 @@ def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> f
     """
     if inliers <= sample_size:
         return 1e300
-    logarithm = _log_choose(count, sample_size) + log_binomial_tail(count - sample_size, inliers - sample_size, chance)
+    rest = count - sample_size
+    choices = math.lgamma(count + 1) - math.lgamma(sample_size + 1) - math.lgamma(rest + 1)
+    logarithm = choices + log_binomial_tail(rest, inliers - sample_size, chance)
     return min(1e300, math.exp(min(logarithm, 700.0)))
 
 
@@ -62,10 +59,7 @@ def _shifted_distances(points: FloatArray, f: FloatArray, shifts: int) -> FloatA
 
 
 def accidental_share(wrong: FloatArray, threshold: float) -> float:
-    """Return the probability that a wrong match agrees with a model, in (0, 1), from squared mismatch distances (M,).
-
-    Measured, not modeled: it includes the extent of the photos, clusters of points and the epipoles.
-    """
+    """Return the measured probability that a wrong match agrees with a model, from squared mismatch distances (M,)."""
     return (int(np.count_nonzero(wrong <= threshold * threshold)) + 1.0) / (len(wrong) + 2.0)
 
 
@@ -80,7 +74,3 @@ def log_binomial_tail(count: int, least: int, chance: float) -> float:
     if share < 1:
         divergence += (1 - share) * math.log((1 - share) / (1 - chance))
     return -count * divergence
-
-
-def _log_choose(n: int, k: int) -> float:
-    return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)

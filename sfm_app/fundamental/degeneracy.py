@@ -59,7 +59,6 @@ def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> 
 
 @kernel
 def _homography(A: FloatArray, e2: FloatArray, v: FloatArray) -> FloatArray:
-    """Return A - e2 v'."""
     H = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -193,17 +192,11 @@ DEGENERACY = DegeneracyOptions()
 def find_degeneracy(
     points: FloatArray, F: FloatArray, inliers: BoolArray, wrong: FloatArray, threshold: float, centers: FloatArray
 ) -> str:
-    """Return the kind of degeneracy that leaves F undetermined.
+    """Return the kind of degeneracy that leaves F undetermined: "" where it is determined.
 
-    Args:
-        inliers: (N,) mask, at least 3 of them True.
-        wrong: (M,) squared distances of mismatches to F, from `squared_mismatch_distances`.
-        centers: (4,) the origin of `points` in a frame that both views share, in the same units.
-
-    Returns:
-        "collinear" where all matches lie on one line of a photo or at one point (up to a few that may be chance),
-            "rotation" where the camera only rotated, "planar" where all matches lie on one plane or too close to it, ""
-            where F is determined.
+    "collinear": all matches lie on one line of a photo or at one point, up to a few that may be chance; "rotation": the
+    camera only rotated; "planar": all matches lie on one plane or too close to it. At least 3 `inliers`; `wrong` are
+    `squared_mismatch_distances`; `centers` (4,) is the origin of `points` in a frame that both views share.
     """
     chance = accidental_share(wrong, threshold)
     for view in range(2):
@@ -251,11 +244,7 @@ def _dominant_line(x: FloatArray, y: FloatArray, width: float) -> tuple[float, f
 
 
 def is_rotation(H: FloatArray, points: FloatArray, centers: FloatArray) -> bool:
-    """Return whether H = K R K^-1 for one focal length, with the center in the middle of the points of both views.
-
-    Args:
-        centers: (4,) the origin of `points` in a frame that both views share, in the same units.
-    """
+    """Return whether H = K R K^-1 for one focal and a middle center; `centers` (4,) as in `find_degeneracy`."""
     shifted = points + centers
     low, high = np.quantile(np.vstack([shifted[:, :2], shifted[:, 2:]]), DEGENERACY.extent_quantiles, axis=0)
     middle, side = (low + high) / 2, float((high - low).max())
@@ -280,10 +269,7 @@ def _translation(t: FloatArray) -> FloatArray:
 def recover_epipole(
     points: FloatArray, F: FloatArray, threshold: float, loss: Loss, pretest: PreTest, state: RandomState
 ) -> FloatArray | None:
-    """Estimate the best model with the dominant plane of F's inliers; None without a plane and two matches off it.
-
-    `points` are in random order; `pretest` has no random start.
-    """
+    """Estimate the best model with the dominant plane of F's inliers; None without a plane and two matches off it."""
     inliers = squared_distances(points, np.ascontiguousarray(F).reshape(9)) <= threshold * threshold
     if np.count_nonzero(inliers) < 8:
         return None
@@ -375,11 +361,8 @@ def find_stationary(x1: FloatArray, x2: FloatArray, unit_px: float = 1.0) -> Boo
 
     The displacements of a scene are spread along a curve or over an area around 0: between one and four units there are
     at least three times as many as below one. Matches are stationary where the peak holds no fewer than that ring, and
-    where the scene loses few matches: video frames in which all move by a few pixels keep theirs.
-
-    Args:
-        x1, x2: (N, 2) pixels in two photos of the same size.
-        unit_px: generous noise of the keypoints; more than 1 where they were detected in a smaller image.
+    where the scene loses few matches: video frames in which all move by a few pixels keep theirs. `unit_px` is a
+    generous noise of the keypoints; more than 1 where they were detected in a smaller image.
     """
     squared = np.square(x2 - x1).sum(axis=1) / unit_px**2
     peak, stationary, within_ring = (
@@ -395,9 +378,7 @@ def find_stationary(x1: FloatArray, x2: FloatArray, unit_px: float = 1.0) -> Boo
 
 
 def is_widespread(points: FloatArray, keypoints: FloatArray, size: tuple[int, int]) -> bool:
-    """Return whether points (N, 2) cover a large part of a photo, compared with all its keypoints (M, 2); all in
-    pixels.
-    """
+    """Return whether points (N, 2) cover a large part of a photo, compared with all its keypoints (M, 2)."""
     occupied, with_keypoints = (len(np.unique(_cells(some, size))) for some in (points, keypoints))
     return occupied > WATERMARK.wide_share * with_keypoints
 
@@ -409,15 +390,8 @@ def fit_moving(
     """Estimate the epipolar geometry of the moving matches; the stationary ones are no inliers and have prior 0.
 
     Where the camera moved without rotation, distant objects stay in place, too. Widespread stationary matches that
-    agree with the geometry of the others belong to the scene, and all matches are fitted together.
-
-    Args:
-        points: x1, x2, each (N, 2) pixels.
-        stationary: (N,) mask from `find_stationary`.
-        wide: `is_widespread` of these.
-
-    Returns:
-        A fit whose inliers and priors are (N,), or the kind of stationary matches if the moving ones have no fit.
+    agree with the geometry of the others belong to the scene, and all matches are fitted together. Where the moving
+    ones have no fit, the reason is the kind of stationary matches. `wide` is `is_widespread` of these.
     """
     x1, x2 = points
     moving = fit(x1[~stationary], x2[~stationary], options, seed)
@@ -441,7 +415,6 @@ def one_per_cell(points: FloatArray, size: tuple[int, int]) -> FloatArray:
 
 
 def _cells(points: FloatArray, size: tuple[int, int]) -> NDArray[np.int64]:
-    """Return (N,) the number of the cell of each point."""
     cells = WATERMARK.cells
     columns, rows = (points / size * cells).astype(np.int64).clip(0, cells - 1).T
     return np.asarray(cells * rows + columns)

@@ -35,11 +35,7 @@ CHANCE = "inliers no better than chance"
 def fit_by_recipe(
     x1: ArrayLike, x2: ArrayLike, options: EpipolarSettings, seed: int, recipe: Recipe
 ) -> EpipolarFit | Rejected:
-    """Estimate one fundamental matrix from matches, many of which may be wrong: x1, x2 (N, 2) pixels, row by row.
-
-    Raises:
-        ValueError: the points are not as above (see `check_points`).
-    """
+    """Estimate F from matches x1, x2 (N, 2) in pixels, many of which may be wrong; ValueError as `check_points`."""
     first, second = check_points(x1, x2)
     matches = prepare(first, second, seed)
     if len(matches.points) < options.min_inliers:
@@ -59,18 +55,12 @@ def estimate_with(
 ) -> EpipolarFit | Rejected:
     """Run an external search and assess its F as for the built-in estimators; for plug-ins.
 
-    Args:
-        search: gets the distinct matches, at least `options.min_inliers`, as contiguous (M, 2) pixels about the middle
-            of each view, in an order that depends on the seed. Its F may have any scale; it is brought to rank 2.
-            Inliers, priors, degeneracy and the test against chance are computed from this F. It should not raise on
-            data.
-        x1: (N, 2) pixels.
-        x2: (N, 2) pixels, row by row the partners of x1.
-        options: threshold, confidence, largest number of samples, smallest number of inliers.
-        seed: same seed, same bytes, if `search` is deterministic.
+    The search gets the distinct matches, at least `options.min_inliers`, as contiguous (M, 2) pixels about the middle
+    of each view, in an order that depends on the seed. It should not raise on data. Its F may have any scale, and is
+    brought to rank 2. Inliers, priors, degeneracy and the test against chance are computed from this F.
 
     Raises:
-        ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
+        ValueError: the points are not valid (see `check_points`), or F is not (3, 3).
     """
     first, second = check_points(x1, x2)
     matches = prepare(first, second, seed)
@@ -85,17 +75,7 @@ def estimate_with(
 
 
 def assess_fundamental(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> EpipolarFit | Rejected:
-    """Return the fit of a given fundamental matrix to matches, with `trials` 1, or the reason of its rejection.
-
-    Args:
-        x1: (N, 2) pixels.
-        x2: (N, 2) pixels, row by row the partners of x1.
-        F: (3, 3) of any scale, x2' F x1 = 0 in pixels.
-        options: threshold and smallest number of inliers.
-
-    Raises:
-        ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
-    """
+    """Return the fit of a given F (3, 3), or the reason of its rejection; ValueError as `estimate_with`."""
     first, second = check_points(x1, x2)
     matches = prepare(first, second, seed=0)
     if len(matches.points) < options.min_inliers:
@@ -104,11 +84,7 @@ def assess_fundamental(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: Epip
 
 
 def count_matches_off_plane(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> int:
-    """Count the distinct inliers of F, at least 3, with parallax: those off the plane that holds most of them.
-
-    Raises:
-        ValueError: the points are not (N, 2) pixels (see `check_points`), or F is not (3, 3).
-    """
+    """Count the distinct inliers of F off the plane that holds most of them; ValueError as `estimate_with`."""
     matches = prepare(*check_points(x1, x2), seed=0)
     threshold = options.max_error_px / matches.unit_px
     in_frame = _to_frame(F, matches.unit_px, matches.center)

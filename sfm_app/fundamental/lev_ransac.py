@@ -112,7 +112,6 @@ def _optimize_locally(points: FloatArray, F: FloatArray, threshold: float) -> Fl
 
 
 def _refit_by_likelihood(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """Return the maximum likelihood F of all matches within three thresholds; their noise is estimated, too."""
     return refine_mixture(points, F, threshold=threshold, reach=OPTIONS.final_reach, most_steps=OPTIONS.final_steps)
 
 

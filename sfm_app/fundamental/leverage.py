@@ -24,8 +24,7 @@ _LEAST_FREEDOM = 2.0**-52
 
 
 def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArray:
-    """Return the leverage h_ii of every match, in [0, 1], in a regression on the fitted matches and itself (thesis
-    3.11).
+    """Return the leverage h_ii of every match, in [0, 1], in a regression on the fitted and itself (thesis 3.11).
 
     For a fitted match (mask (N,)) this is the diagonal of the hat matrix. For any other match the textbook formula
     would exceed 1. Its leverage if it were fitted as well is g / (1 + g) with g = a_i' (A_in' A_in)^-1 a_i.
@@ -91,10 +90,7 @@ def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
 
 @kernel
 def priors(distances: FloatArray, sigma: float) -> FloatArray:
-    """Return p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels).
-
-    With a sigma of 0, p is 1 for the smallest distance and 0 for all others.
-    """
+    """Return p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels)."""
     least, probable = np.inf, np.empty(distances.shape[0])
     for i in range(distances.shape[0]):
         least = min(least, distances[i])
@@ -119,10 +115,7 @@ def mad_sigma(distances: FloatArray) -> float:
 
 
 def prior_validity(points: FloatArray, f: FloatArray, threshold: float, *, sigma_from_inliers: bool) -> FloatArray:
-    """Return p(v_i) of every match from its influence on the model f, of norm 1 (thesis 4.7.2 and 4.7.3).
-
-    sigma is estimated from the Cook's distances of the inliers, or of all matches as in the thesis.
-    """
+    """Return p(v_i) from the influence on f (thesis 4.7.2, 4.7.3); sigma is of the inliers, or of all matches."""
     squared = squared_distances(points, f)
     fitted = squared <= threshold * threshold
     leverage = leverages(points, f, fitted)

@@ -37,9 +37,7 @@ class Recipe:
     """One estimator: sampler, solver, score, verifier, stopping rule, final fit."""
 
     score: Score
-    """The penalty to minimize."""
     finish: Refine
-    """The final fit, from the best model of the loop."""
     sample_size: int = SAMPLE_SIZE
     """7: all models through seven matches; 8: the linear model through eight."""
     validity: Validity | None = None
@@ -80,13 +78,9 @@ class SamplingPlan(NamedTuple):
     """How samples are drawn and models computed from them."""
 
     sample_size: int
-    """7 or 8."""
     oriented: bool
-    """Whether models that put a sampled point behind a camera are dropped."""
     batch: int
-    """Samples between two checks for a better model."""
     guided_share: float
-    """Share of the samples drawn by the priors."""
     priors: FloatArray
     """(N,) running sum of the priors p(v_i)."""
     rest_share: float
@@ -111,13 +105,8 @@ def draw_until_better(  # noqa: PLR0913
     Lines 4 to 6 of Algorithm 1. Samples drawn without the priors compete only among themselves: a second motion would
     never win against samples that the priors have made nearly perfect.
 
-    Args:
-        points: N >= the sample size; repeated to (2 N, 4) for a pre-test with a random start, so that any N consecutive
-            rows hold all matches.
-        pretests: by the kind of the sample: `GUIDED`, `UNGUIDED`.
-        to_beat: (2,) smallest penalty so far of each kind; lowered.
-        limit: largest number of samples.
-        best: (2, 9) set to the better models.
+    For a pre-test with a random start, the points are repeated to (2 N, 4), so that any N consecutive rows hold all
+    matches. `to_beat` (2,), the smallest penalties so far, is lowered, and `best` (2, 9) set to the better models.
     """
     count = draws.priors.shape[0]
     sample = np.empty(draws.sample_size, dtype=np.int64)
@@ -142,10 +131,7 @@ def draw_until_better(  # noqa: PLR0913
 
 @kernel
 def draw_sample(draws: SamplingPlan, state: RandomState, sample: IndexArray) -> int:
-    """Draw one sample (m,) by the priors, from the rest, or uniformly, as a random number chooses; return its kind.
-
-    Samples are uniform, too, while there are no priors, and where too few matches hold nearly all the weight.
-    """
+    """Draw one sample (m,) by the priors, from the rest, or uniformly; return its kind. Uniform if others fail."""
     guided = draws.guided_share
     guided_or_rest = guided + draws.rest_share if draws.rest[-1] >= draws.sample_size else guided
     lot = uniform(state) if 0.0 < guided < 1.0 else 0.0
@@ -182,7 +168,6 @@ class BestModel:
         self.to_beat, self.samples = np.full(2, math.inf), np.zeros((2, 9))
 
     def __bool__(self) -> bool:
-        """Return whether there is a model yet."""
         return self._lowest < math.inf
 
     def inlier_share(self) -> float:
@@ -261,7 +246,6 @@ class _Loop:
     limit: int
     """Largest number of samples, by (3.19) and the settings."""
     warmup_trials: int
-    """Samples before the priors are first estimated."""
     patience: float
     """Samples without a better model after which the evidence for the best one is evaluated."""
 
@@ -283,14 +267,18 @@ class _Loop:
         self._update_limits()
 
     def run(self) -> Hypothesis | None:
-        """Continue until the samples are used up, the priors have converged, or patience has run out."""
         while self.trials < self.limit:
             better = self._draw()
             if self._update_priors(better) or self._is_patience_over():
                 break
         if not self.best:
             return None
-        self._recover()
+        if self.recipe.recover is not None:
+            pretest = NO_PRETEST if self.test.pretest.random_start else self.test.pretest
+            F = self.best.f.reshape(3, 3)
+            recovered = self.recipe.recover(self.points, F, self.threshold, self.best.loss, pretest, self.state)
+            if recovered is not None:
+                self.best.replace_if_better(recovered)
         return Hypothesis(self.best.f.reshape(3, 3), self.trials)
 
     def _draw(self) -> bool:
@@ -349,12 +337,3 @@ class _Loop:
             self.draws = self.draws._replace(guided_share=0.0, rest_share=0.0)
         self.patience = math.ceil(min(patience, self.options.max_trials))
         return self.patience <= self.idle
-
-    def _recover(self) -> None:
-        if self.recipe.recover is None:
-            return
-        pretest = NO_PRETEST if self.test.pretest.random_start else self.test.pretest
-        F = self.best.f.reshape(3, 3)
-        recovered = self.recipe.recover(self.points, F, self.threshold, self.best.loss, pretest, self.state)
-        if recovered is not None:
-            self.best.replace_if_better(recovered)

@@ -95,10 +95,7 @@ class BailOut(FullVerification):
 
 
 class RandomizedTdd(FullVerification):
-    """T(d,d): the first d matches must all be inliers (Matas and Chum 2004, who find d = 1 best).
-
-    A clean model passes with probability share^d, so that more samples are needed.
-    """
+    """T(d,d): the first d matches must all be inliers (Matas and Chum 2004); clean models pass by share^d."""
 
     d = 1
 
@@ -137,20 +134,20 @@ MODELS_PER_SAMPLE = {7: 2.45, 8: 1.0}
 
 @dataclass(frozen=True, slots=True)
 class SprtOptions:
-    """First guesses and limits of the sequential test."""
+    """First guesses and limits of the sequential test. Chosen by hand."""
 
     first_epsilon: float = 0.1
-    """First epsilon: few inliers (docs/algorithms.md, Fundamental matrices). Chosen by hand."""
+    """First epsilon: few inliers (docs/algorithms.md, Fundamental matrices)."""
     first_delta: float = 0.01
-    """First delta: few chance inliers near epipolar lines (docs/algorithms.md, Fundamental matrices). By hand."""
+    """First delta: few chance inliers near epipolar lines (docs/algorithms.md, Fundamental matrices)."""
     most_epsilon: float = 0.999
-    """Largest epsilon: beyond it the logarithm of 1 - epsilon is useless. Chosen by hand."""
+    """Largest epsilon: beyond it the logarithm of 1 - epsilon is useless."""
     prior_weight: float = 100.0
-    """Weight of the first delta, in checked matches. Chosen by hand."""
+    """Weight of the first delta, in checked matches."""
     delta_tolerance: float = 0.05
-    """Relative change of delta that calls for a new test (docs/algorithms.md, Fundamental matrices). Chosen by hand."""
+    """Relative change of delta that calls for a new test (docs/algorithms.md, Fundamental matrices)."""
     review: int = 100
-    """Largest number of trials between two updates of delta. Chosen by hand."""
+    """Largest number of trials between two updates of delta."""
 
 
 SPRT = SprtOptions()
@@ -192,10 +189,7 @@ class SequentialTest:
 
 @lru_cache(maxsize=1024)  # called repeatedly with the same share
 def _exponent(hit: float, miss: float, share: float) -> float:
-    """Return the h > 0 with E[ratio^h] = 1 where `share` of the matches are inliers; h = 1 for share = epsilon.
-
-    Returns 0 if the ratio does not decrease on average: such a model is certain to be rejected in the end.
-    """
+    """Return the h > 0 with E[ratio^h] = 1, `share` of the matches inliers; 0 if the ratio does not decrease."""
     if share * hit + (1 - share) * miss >= 0:
         return 0.0
     low, high = 0.0, 1.0
@@ -211,8 +205,7 @@ def _exponent(hit: float, miss: float, share: float) -> float:
 
 
 def design(epsilon: float, delta: float, sample_size: int) -> SequentialTest:
-    """Return the fastest test for these probabilities: A = t_M C / m_S + 1 + log A; without 0 < delta < epsilon, no
-    test.
+    """Return the fastest test: A = t_M C / m_S + 1 + log A; without 0 < delta < epsilon, no test.
 
     A larger A wastes matches on bad models; a smaller one wastes samples, because good models are rejected.
     """

@@ -32,34 +32,28 @@ from sfm_app.types.arrays import FloatArray, IndexArray
 
 @dataclass(frozen=True, slots=True)
 class RayOptions:
-    """Samples, scores and the test for a rotation; none was measured on its own."""
+    """Samples, scores and the test for a rotation; none was measured on its own. Chosen by hand."""
 
     batch: int = 32
-    """Samples solved at once. Chosen by hand."""
     guided_share: float = 0.5
-    """Share of the samples drawn by the priors. Chosen by hand."""
+    """Share of the samples drawn by the priors."""
     least_trials: int = 128
-    """Fewest samples. Chosen by hand."""
     most_trials: int = 4096
-    """Most samples. Chosen by hand."""
     most_scored: int = 500
-    """Matches that samples are scored on. Chosen by hand."""
+    """Matches that samples are scored on."""
     mismatches: int = 8
-    """Shifts of the partners that measure chance. Chosen by hand."""
+    """Shifts of the partners that measure chance."""
     clear_share: float = 0.95
-    """Share of the inliers that a rotation explains, as in `posegraph.pair_pose`. Chosen by hand."""
+    """Share of the inliers that a rotation explains, as in `posegraph.pair_pose`."""
     rotation_factor: float = 2.0
-    """Thresholds within which it explains them, as in `posegraph.pair_pose`. Chosen by hand."""
+    """Thresholds within which it explains them, as in `posegraph.pair_pose`."""
 
 
 OPTIONS = RayOptions()
 
 
 def fit_lev_ransac_rays(lines: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
-    """Estimate the essential matrix of a pair with known lenses from matches, many of which may be wrong.
-
-    Where a focal length is a guess, E is of little worth, but its inliers are not.
-    """
+    """Estimate E of a pair with known lenses from matches, many of which may be wrong."""
     _, first = np.unique(np.hstack([lines[:, FIRST], lines[:, SECOND]]).round(9), axis=0, return_index=True)
     rng = np.random.default_rng(seed)
     distinct = lines[rng.permutation(np.sort(first))]
@@ -126,7 +120,6 @@ def _search(lines: FloatArray, options: EpipolarSettings, rng: np.random.Generat
 
 
 def _draw(rng: np.random.Generator, chances: FloatArray | None, count: int) -> IndexArray:
-    """Return (OPTIONS.batch, 5) samples, a share of them by the priors once there are any."""
     keys = rng.random((OPTIONS.batch, count))
     if chances is not None:  # the smallest of exponential times are a weighted sample without replacement
         guided = int(OPTIONS.guided_share * OPTIONS.batch)

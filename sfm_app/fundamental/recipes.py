@@ -29,10 +29,7 @@ def _refit_to_median(points: FloatArray, F: FloatArray, _threshold: float) -> Fl
 
 
 def median_sigma(squared: FloatArray) -> float:
-    """Return the standard deviation of the inliers from the median of the squared distances (Rousseeuw and Leroy 1987).
-
-    The factor 1 + 5 / (n - p) compensates for the p = 7 matches that a minimal model meets exactly.
-    """
+    """Return sigma of the inliers from the median, with 1 + 5 / (n - 7) (Rousseeuw and Leroy 1987)."""
     return MAD_TO_SIGMA * (1 + 5 / max(len(squared) - 7, 1)) * math.sqrt(float(np.median(squared)))
 
 

@@ -62,7 +62,6 @@ def _normalize(U: FloatArray, k: int) -> float:
 
 @kernel
 def _orthogonalize(U: FloatArray) -> None:
-    """Make the second column perpendicular to the first, a unit vector."""
     dot = U[0, 0] * U[0, 1] + U[1, 0] * U[1, 1] + U[2, 0] * U[2, 1]
     for i in range(3):
         U[i, 1] -= dot * U[i, 0]
@@ -142,13 +141,7 @@ def refine_sampson(
     most_steps: int = 20,
     tolerance: float = _COST_TOLERANCE,
 ) -> FloatArray:
-    """Move F towards a minimum of sum_i r_i^2 / (1 + r_i^2 / c^2) (Geman and McClure 1987).
-
-    `scale` is c; inf for least squares. The steps end at a relative decrease of the cost below `tolerance`.
-
-    Returns:
-        (3, 3), rank 2, its largest singular value 1.
-    """
+    """Minimize sum_i r_i^2 / (1 + r_i^2 / c^2), c = `scale` (Geman and McClure 1987); rank 2, s1 = 1."""
     weighing = Weighting(softness=float(scale**-2))
     return _reweighted_least_squares(points, *factorize(F), weighing, most_steps, tolerance, np.empty((10, 10)))
 
@@ -158,10 +151,7 @@ def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach
 
     Among the matches within `reach` > 1 thresholds, signed distances of inliers are Gaussian about 0, with a sigma of
     at most one threshold, those of outliers uniform. The weight of a match is the probability that it is an inlier. F
-    must be near enough for its inliers to determine sigma.
-
-    Returns:
-        (3, 3), rank 2, its largest singular value 1.
+    must be near enough for its inliers to determine sigma. It gets rank 2 and the largest singular value 1.
     """
     U, s, V = factorize(F)
     squared = squared_distances(points, compose(U, s, V))
@@ -178,18 +168,13 @@ def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach
 
 
 def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """Apply the 8-point algorithm (thesis 4.3.2) on well-scaled matches; returns (3, 3) of rank 2.
-
-    `weights` (N,) >= 0, at least eight of them positive, multiply the squared algebraic errors.
-    """
+    """Apply the 8-point algorithm (thesis 4.3.2) with weights (N,) >= 0, eight of them > 0; (3, 3) of rank 2."""
     U, s, V = factorize(fit_algebraic(points, weights))
     return compose(U, s, V).reshape(3, 3)
 
 
 def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the (3, 3) matrix of norm 1 and any rank with the least algebraic error; `weights` as in
-    `fit_eight_point`.
-    """
+    """Return the (3, 3) matrix of norm 1 and any rank with the least algebraic error, weighted by (N,)."""
     _, vectors = np.linalg.eigh(weighted_gram(points, weights))
     return np.ascontiguousarray(vectors[:, 0]).reshape(3, 3)
 
@@ -300,10 +285,7 @@ def _normal_equations(  # noqa: PLR0913
 
 @kernel
 def _derivatives(block: FloatArray, count: int, f: FloatArray, rows: FloatArray) -> None:
-    """Write dr / dF (9 rows) and r (the last row) of the matches of a block, times sqrt(weight).
-
-    r = n / g with n = x2' F x1 and g the norm of its gradient: dr = dn / g - r dg / g.
-    """
+    """Write sqrt(weight) times dr / dF (9 rows) and r (the last): r = n / g, dr = dn / g - r dg / g, n = x2' F x1."""
     f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
     for n in range(count):
         x1, y1, x2, y2 = block[0, n], block[1, n], block[2, n], block[3, n]
@@ -343,9 +325,7 @@ def _project(gram: FloatArray, basis: FloatArray, normal: FloatArray, right: Flo
 
 @kernel
 def _solve(normal: FloatArray, right: FloatArray, damping: float, step: FloatArray) -> bool:
-    """Write the Cholesky solution of (normal + damping diag(normal)) step = right; False if it is not positive
-    definite.
-    """
+    """Write the Cholesky solution of (normal + damping diag(normal)) step = right; False if not positive definite."""
     lower = normal.copy()
     largest = 0.0
     for j in range(7):
@@ -488,10 +468,7 @@ REFITS: dict[str, Refit] = {
 
 
 def choose_refit(name: str, own: Refit) -> Refit:
-    """Return the estimator's own fit, followed by the named one in `REFITS` to its inliers unless the name is "auto".
-
-    The own fit always comes first: its inliers are better than those of the best sample.
-    """
+    """Return the estimator's own fit, followed by the named one in `REFITS` to its inliers unless "auto"."""
     if name == "auto":
         return own
     return lambda points, F, threshold: REFITS[name](points, own(points, F, threshold), threshold)

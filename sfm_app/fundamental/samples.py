@@ -89,8 +89,6 @@ def _search_sorted(cumulative: FloatArray, target: float) -> int:
     return low
 
 
-# Stopping rules.
-
 CONVERGED = 0.05
 """G of the thesis (4.7.4, Eq. 4.18): priors have converged when the sum of their changes is below this."""
 
@@ -98,9 +96,8 @@ CONVERGED = 0.05
 def required_trials(success: float, confidence: float, log_missed: float = 0.0) -> float:
     """Return how many samples reach a success with probability `confidence` (thesis 3.19); inf if none can succeed.
 
-    Args:
-        success: probability that one sample is clean, share^m, and that its model passes the test.
-        log_missed: logarithm of the probability that all earlier samples failed; they are not counted again.
+    `success` is the probability that one sample is clean and its model passes the test, `log_missed` the logarithm of
+    the probability that all earlier samples failed.
     """
     remaining = math.log1p(-confidence) - log_missed
     if remaining >= 0:
@@ -111,8 +108,5 @@ def required_trials(success: float, confidence: float, log_missed: float = 0.0) 
 
 
 def has_converged(before: NDArray[np.float64], after: NDArray[np.float64], limit: float = CONVERGED) -> bool:
-    """Return whether the priors (N,), normalized to sum 1, changed by less than `limit` in sum (thesis 4.18).
-
-    The printed sum grows with the number of matches; for probabilities that sum to 1 it lies in [0, 2].
-    """
+    """Return whether the priors (N,), of sum 1, changed by less than `limit` in sum, in [0, 2] (thesis 4.18)."""
     return bool(np.abs(after / after.sum() - before / before.sum()).sum() < limit)

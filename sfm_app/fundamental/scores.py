@@ -54,11 +54,7 @@ def msac_linear(_points: FloatArray, threshold: float, _best: FloatArray | None)
 
 
 def lmeds(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return the median of the squared distances as a `Loss` (Rousseeuw 1984; thesis 4.4.1).
-
-    Args:
-        threshold: largest distance of an inlier; used only to count inliers.
-    """
+    """Return the median of the squared distances as a `Loss` (Rousseeuw 1984; thesis 4.4.1)."""
     return Loss(LMEDS, threshold * threshold, np.inf, np.inf)
 
 
@@ -100,7 +96,6 @@ def fill_squared_distances(points: FloatArray, f: FloatArray, start: int, square
 
 @kernel
 def _cost(loss: Loss, squared: float) -> float:
-    """Return the penalty of one match."""
     if loss.kind == GEMAN_MCCLURE:
         return 1.0 - 1.0 / (1.0 + loss.precision * squared)
     if not squared <= loss.reach:
@@ -118,11 +113,8 @@ def _cost(loss: Loss, squared: float) -> float:
 def penalty(points: FloatArray, start: int, f: FloatArray, loss: Loss, to_beat: float, pretest: PreTest) -> float:
     """Return the penalty of all matches, or inf as soon as f cannot stay below `to_beat` or fails the pre-test.
 
-    Args:
-        points: in random order; repeated to (2 N, 4) for a pre-test with a random start.
-        start: the match to begin with.
-        to_beat: best penalty so far; inf for a full count.
-        pretest: how many inliers f must have after each part of the matches; not applied to the median.
+    It begins with the match `start`. The points are in random order, repeated to (2 N, 4) for a pre-test with a random
+    start. The median has no pre-test.
     """
     if loss.kind == LMEDS:
         return _median_of_squares(points, f, to_beat)
@@ -168,7 +160,6 @@ def _check_pretest(pretest: PreTest, done: int, inliers: int) -> bool:
 
 @kernel
 def _sum_costs(squared: FloatArray, loss: Loss) -> tuple[int, float]:
-    """Return the number of inliers, and the sum of the penalties of the matches."""
     total, inliers = 0.0, 0
     for i in range(squared.shape[0]):
         inliers += squared[i] <= loss.limit
@@ -243,11 +234,7 @@ def outlier_window(points: FloatArray) -> float:
 
 
 def inlier_share(squared: FloatArray, sigma: float, width: float) -> float:
-    """Estimate gamma = p(v) of the mixture by expectation maximization, within [1 / N, 1 - 1 / N], for given sigma and
-    w.
-
-    A share of 0 or 1 would make some of the distances, `squared` (N,), impossible.
-    """
+    """Estimate gamma = p(v) by expectation maximization for given sigma and w, within [1 / N, 1 - 1 / N]."""
     inlier = np.exp(-squared / (2 * sigma * sigma)) / (sigma * math.sqrt(2 * math.pi))
     least = 1 / max(len(squared), 2)
     gamma = 0.5
@@ -274,8 +261,7 @@ def residual_validity(points: FloatArray, f: FloatArray, _threshold: float) -> F
 
 
 def validity_from_residuals(residuals: FloatArray) -> FloatArray:
-    """Return p(v_i | r_i) of 4.10 to 4.15, in [0, 1], at least one of them > 0; all 1 where one bin holds all
-    residuals.
+    """Return p(v_i | r_i) of 4.10 to 4.15, in [0, 1], one > 0; all 1 where one bin holds all residuals.
 
     The bins are a hundredth of the median wide, and the last one holds all larger residuals: there p(0 <= r <= r_i) is
     1 and p(v) is 0, so that samples come from the better half of the matches only.

@@ -28,10 +28,7 @@ def design_row(point: FloatArray, row: FloatArray) -> None:
 
 @kernel
 def gather(points: FloatArray, weights: FloatArray, start: int, block: FloatArray) -> tuple[int, int]:
-    """Copy the next matches of positive weight to the columns of `block` (5, LANES): x1, y1, x2, y2, sqrt(weight).
-
-    Returns the number of columns, and the row of `points` to continue at.
-    """
+    """Copy the next matches of weight > 0, and its root, to `block` (5, LANES); return their number, the next row."""
     filled, i = 0, start
     while i < points.shape[0] and filled < LANES:
         if weights[i] > 0.0:
@@ -181,8 +178,7 @@ MOST_MODELS = 3
 
 @kernel
 def solve_sample(points: FloatArray, sample: IndexArray, models: FloatArray) -> int:
-    """Write to `models` (3, 9) all F of norm 1 through seven sampled matches, or the linear F of eight; return their
-    number.
+    """Write all F of norm 1 through seven matches, or the linear F of eight, to `models` (3, 9); return how many.
 
     Seven constraints leave F = a + z b. One more determines z: det F = 0, a cubic with one or three real roots, or an
     eighth match. The linear solution is then replaced by the nearest matrix of rank 2, which with noise no longer fits
@@ -307,9 +303,7 @@ def is_oriented(points: FloatArray, sample: IndexArray, f: FloatArray) -> bool:
 
 @kernel
 def real_cubic_roots(c0: float, c1: float, c2: float, c3: float, roots: FloatArray) -> int:
-    """Write the real roots of c0 + c1 z + c2 z^2 + c3 z^3 to `roots` (3,); return their number: 1 or 3, or 0 if c3 is
-    0.
-    """
+    """Write the real roots of c0 + c1 z + c2 z^2 + c3 z^3 to `roots` (3,); return their number; 0 if c3 is 0."""
     if c3 == 0.0:
         return 0
     a, b, c = c2 / c3, c1 / c3, c0 / c3
@@ -338,11 +332,7 @@ def real_cubic_roots(c0: float, c1: float, c2: float, c3: float, roots: FloatArr
 
 @kernel
 def _null_space(points: FloatArray, sample: IndexArray, basis: FloatArray) -> bool:
-    """Write two orthonormal vectors perpendicular to the first seven design rows; return False if the rows are
-    dependent.
-
-    Elimination with complete pivoting is as exact as Householder reflections, in half the time.
-    """
+    """Write two orthonormal vectors perpendicular to the first seven design rows; False if these are dependent."""
     rows, place = np.empty((SAMPLE_SIZE, 9)), np.empty(9, dtype=np.int64)
     for j in range(9):
         place[j] = j
@@ -448,9 +438,7 @@ for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
 
 
 def solve_five_point(p: FloatArray, q: FloatArray) -> FloatArray:
-    """Return (M, 3, 3) essential matrices, of norm 1, through samples of five matches: rays p of view 1 and q of view
-    2, (S, 5, 3).
-    """
+    """Return (M, 3, 3) essential matrices of norm 1 through samples of five rays p and q (S, 5, 3)."""
     rows = (q[..., :, None] * p[..., None, :]).reshape(len(p), RAY_SAMPLE_SIZE, 9)
     null = np.linalg.svd(rows)[2][:, RAY_SAMPLE_SIZE:].reshape(-1, 4, 3, 3)
     E = np.ascontiguousarray(null.transpose(0, 2, 3, 1))  # (S, 3, 3, 4): linear forms in x, y, z, 1

@@ -31,11 +31,7 @@ def homogeneous_pair(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArr
 
 
 def hartley_normalization(x: ArrayLike) -> FloatArray:
-    """Return the (3, 3) similarity that puts the centroid at 0 and the mean distance from it at sqrt(2).
-
-    Raises:
-        NumericalError: no points, or all of them coincide.
-    """
+    """Return the (3, 3) similarity to centroid 0 and mean distance sqrt(2); NumericalError if all points coincide."""
     points = to_homogeneous(x)[:, :2]
     if not len(points):
         raise NumericalError("no points to normalize")
@@ -77,11 +73,7 @@ def nearest_rank_two(F: ArrayLike) -> FloatArray:
 
 
 def to_unit_norm(F: ArrayLike) -> FloatArray:
-    """Return F with Frobenius norm 1 and its entry of largest magnitude positive.
-
-    Raises:
-        NumericalError: F is zero or not finite.
-    """
+    """Return F with norm 1 and its largest entry positive; NumericalError if it is zero or not finite."""
     matrix = np.asarray(F, dtype=np.float64)
     norm = float(np.linalg.norm(matrix))
     if not (np.isfinite(norm) and norm > 0):
@@ -120,11 +112,7 @@ def cross_matrix(v: ArrayLike) -> FloatArray:
 
 
 def fundamental_from_pose(K1: ArrayLike, K2: ArrayLike, R: ArrayLike, t: ArrayLike) -> FloatArray:
-    """Return F of two cameras with x1 ~ K1 X and x2 ~ K2 (R X + t) (HZ 9.12), Frobenius norm 1.
-
-    Raises:
-        NumericalError: t is zero: without a baseline there is no epipolar geometry.
-    """
+    """Return F, norm 1, of x1 ~ K1 X and x2 ~ K2 (R X + t) (HZ 9.12); NumericalError without a baseline."""
     K1, K2, R = (np.asarray(m, dtype=np.float64) for m in (K1, K2, R))
     return to_unit_norm(np.linalg.inv(K2).T @ cross_matrix(t) @ R @ np.linalg.inv(K1))
 
@@ -150,10 +138,7 @@ def algebraic_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray
 
 
 def symmetric_epipolar_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
-    """Return the root mean square of a match's distances to its two epipolar lines (HZ 11.10, thesis 4.1).
-
-    (N,) pixels; inf where an epipolar line vanishes.
-    """
+    """Return (N,) RMS px of the distances to both epipolar lines (HZ 11.10, thesis 4.1); inf where a line vanishes."""
     algebraic, line1, line2 = _constraint(F, x1, x2)
     to1 = _ratio(np.abs(algebraic), np.hypot(line1[:, 0], line1[:, 1]))
     to2 = _ratio(np.abs(algebraic), np.hypot(line2[:, 0], line2[:, 1]))
@@ -183,10 +168,7 @@ def reprojection_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatAr
 
 
 def nearest_exact_matches(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return the nearest matches with x2' F x1 = 0: optimal triangulation in the images (HZ 12.5).
-
-    Where several are equally near (both points on the epipoles of a bad match), one of them.
-    """
+    """Return the nearest matches with x2' F x1 = 0: optimal triangulation in the images (HZ 12.5); one of equals."""
     moves = _shortest_moves(F, x1, x2)
     return np.asarray(x1, dtype=np.float64) + moves[:, :2], np.asarray(x2, dtype=np.float64) + moves[:, 2:]
 
@@ -287,10 +269,7 @@ def essential_from_fundamental(F: FloatArray, K1: FloatArray, K2: FloatArray) ->
 
 
 def nearest_essential(E: FloatArray) -> FloatArray:
-    """Return the essential matrix nearest to E (3, 3), with singular values (1, 1, 0).
-
-    The nearest one in the Frobenius norm has the mean of the first two (HZ 11.7.3); its scale is then set to 1.
-    """
+    """Return the essential matrix nearest to E (HZ 11.7.3), scaled to the singular values (1, 1, 0)."""
     U, _, Vt = np.linalg.svd(E)
     nearest: FloatArray = U @ np.diag([1.0, 1.0, 0.0]) @ Vt
     return nearest
@@ -378,9 +357,7 @@ def fit_rays(p: FloatArray, q: FloatArray, weights: FloatArray | None = None) ->
 
 
 def depths(lines: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the depths (N,) in view 1 and (N,) in view 2, as multiples of the rays, at which the rays of matches are
-    closest.
-    """
+    """Return the depths (N,) in either view, as multiples of the rays, at which the rays of matches are closest."""
     h1, h2 = lines[:, FIRST] @ R.T, lines[:, SECOND]
     # least squares of d1 h1 + t = d2 h2
     a, b, c = (h1 * h1).sum(1), (h1 * h2).sum(1), (h2 * h2).sum(1)
@@ -390,10 +367,7 @@ def depths(lines: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray,
 
 
 def rotation_residuals(lines: FloatArray, R: FloatArray) -> FloatArray:
-    """Return residuals (N,), in pixels of view 2, of the rotation near R that explains most matches.
-
-    Rays are rotated onto their partners (Kabsch), with robust weights.
-    """
+    """Return residuals (N,), in px of view 2, of the rotation near R that explains most matches (robust Kabsch)."""
     h1, h2 = (_normalize(lines[:, view]) for view in (FIRST, SECOND))
     focal = pixels_per_radian(lines.reshape(-1, 9))
     for _ in range(10):

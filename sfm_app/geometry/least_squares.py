@@ -131,10 +131,7 @@ def solve_each(S: FloatArray, B: FloatArray) -> FloatArray:
 
 
 def project_to_psd(S: FloatArray, before: FloatArray) -> FloatArray:
-    """Return the nearest positive semidefinite matrix (n, n): eigenvalues that rounding made negative become 0.
-
-    `before` (n,) is the diagonal before the elimination that left S; rounding is relative to it.
-    """
+    """Return the nearest positive semidefinite matrix (n, n); `before` (n,) is the diagonal before elimination."""
     scale = np.sqrt(np.where(before > 0.0, before, 1.0))
     pairs = scale[:, None] * scale
     values, vectors = np.linalg.eigh(S / pairs)
@@ -193,11 +190,7 @@ class DampingRange(NamedTuple):
 def damped_step(
     attempt: Callable[[float], Trial | None], damping: float, limits: DampingRange
 ) -> tuple[Trial | None, float]:
-    """Find a step that lowers the cost, raising the damping until one does.
-
-    `attempt` takes a damping and returns the result of the step, or None if it does not lower the cost. Returns the
-    result or None, and the damping for the next step.
-    """
+    """Raise the damping until `attempt` gives a result; return it, or None, and the next damping."""
     while damping < limits.most:
         trial = attempt(damping)
         if trial is not None:
@@ -251,23 +244,13 @@ def binary_choices(count: int) -> BoolArray:
 def cavity(
     covariance: FloatArray, step: FloatArray, precision: FloatArray, away: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return H (n, n) and g (n,), the evidence about a camera without its own prior: posterior less prior.
-
-    Args:
-        covariance: (n, n) of this camera in the posterior of all cameras.
-        step: (n,) mean of the same.
-        precision: (n,) of its prior.
-        away: (n,) to its prior's mean.
-    """
+    """Return H (n, n) and g (n,), the evidence about a camera without its own prior: posterior less prior."""
     marginal = inverses_of_positive(covariance)
     return marginal - np.diag(precision), marginal @ step - precision * away
 
 
 def posteriors(H: FloatArray, g: FloatArray, priors: NormalPriors) -> Posteriors:
-    """Return the posterior and the evidence of each of K choices.
-
-    H, (n, n) or (K, n, n), is the Hessian of the negative log-likelihood; g, (n,) or (K, n), its negative gradient.
-    """
+    """Return the posteriors of K choices, from Hessians (n, n) or (K, n, n) and negative gradients (n,) or (K, n)."""
     precision, away, log_odds = priors
     covariances = inverses_of_positive(H + precision[:, :, None] * np.eye(precision.shape[1]))
     pull = g + precision * away

@@ -46,9 +46,7 @@ def perpendicular_basis(axis: FloatArray) -> FloatArray:
 
 
 def smallest_eigenvector(matrix: FloatArray, like: FloatArray) -> FloatArray:
-    """Return the eigenvector (3,) of the smallest eigenvalue of a symmetric (3, 3), with the sign of the direction
-    `like`.
-    """
+    """Return the eigenvector (3,) of the smallest eigenvalue of a symmetric matrix, with the sign of `like`."""
     vector: FloatArray = np.linalg.eigh(matrix)[1][:, 0]
     return vector if vector @ like >= 0 else -vector
 

@@ -51,10 +51,7 @@ def unique_edges(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
 
 @kernel
 def _number_edges(faces: IndexArray, size: int, edges: IndexArray, edge_of: IndexArray) -> int:
-    """Fill in every edge once, in order, and the number of each one per triangle; return how many there are.
-
-    Edges are sorted by the higher vertex and then by the lower one, in as many buckets as there are vertices.
-    """
+    """Fill in every edge once, by the higher vertex, then the lower, and their numbers; return how many there are."""
     sides = 3 * len(faces)
     low, high = np.empty(sides, np.int64), np.empty(sides, np.int64)
     for f in range(len(faces)):
@@ -168,8 +165,10 @@ def corner_tangents(
     corners = vertices[faces]
     tangents, handed = _face_tangents(corners, uv.astype(np.float64))
     weighted = corner_angles(corners)[:, :, None] * tangents[:, None, :]
-    total = _group_sums(weighted.reshape(-1, 3), _shared_corners(faces, uv, page, handed))
-    straight = _straighten(total, normals[faces].reshape(-1, 3)).reshape(-1, 3, 3)
+    group = _shared_corners(faces, uv, page, handed)
+    size = int(group.max(initial=-1)) + 1
+    total = np.stack([np.bincount(group, column, size) for column in weighted.reshape(-1, 3).T], axis=1)
+    straight = _straighten(np.asarray(total[group], np.float64), normals[faces].reshape(-1, 3)).reshape(-1, 3, 3)
     return np.concatenate([straight, np.repeat(handed, 3).reshape(-1, 3, 1)], axis=2).astype(np.float32)
 
 
@@ -178,13 +177,6 @@ def corner_angles(corners: FloatArray) -> FloatArray:
     sides = normalize(np.roll(corners, -1, axis=1) - corners)
     cosine = -(sides * np.roll(sides, 1, axis=1)).sum(axis=2)
     return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
-
-def _group_sums(values: FloatArray, group: NDArray[np.int64]) -> FloatArray:
-    """Return for each of N rows (N, 3) the sum over its group (N,)."""
-    size = int(group.max(initial=-1)) + 1
-    total = np.stack([np.bincount(group, column, size) for column in values.T], axis=1)
-    return np.asarray(total[group], np.float64)
 
 
 def _face_tangents(corners: FloatArray, places: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -213,9 +205,7 @@ def _shared_corners(
 
 
 def _straighten(tangents: FloatArray, normals: FloatArray) -> FloatArray:
-    """Return unit vectors (N, 3) at right angles to unit normals, as close to tangents as can be; any where those have
-    none.
-    """
+    """Return unit vectors (N, 3) at right angles to unit normals, closest to tangents; any where these have none."""
     straight = tangents - (tangents * normals).sum(axis=1, keepdims=True) * normals
     length = np.linalg.norm(straight, axis=1)
     degenerate = length <= 1e-6 * np.linalg.norm(tangents, axis=1)
@@ -241,10 +231,7 @@ class Clusters:
     """(C,) of the balls, which contain all corners of their members."""
 
     def find_in_cone(self, apex: FloatArray, axis: FloatArray, half_angle: float) -> IndexArray:
-        """Return (M,) the members, ascending, of all clusters that reach into a cone; it misses none inside.
-
-        `half_angle` is in radians, up to pi.
-        """
+        """Return (M,) the members, ascending, of all clusters that reach into a cone of a half angle in radians."""
         slack = 1e-6  # bounds rounding: radians, and share of a radius or distance
         direction = self.centers - apex
         distance = np.linalg.norm(direction, axis=1)

@@ -85,10 +85,7 @@ class Candidate:
 def rank_seeds(
     matches: MatchGraph, graph: PoseGraph, intrinsics: Intrinsics, photos: Sequence[int], min_angle_deg: float
 ) -> list[Candidate]:
-    """Return candidates for the first pair, best first: many well-spread points, wide angles, consistent with K.
-
-    Candidates have a median triangulation angle of at least `min_angle_deg` degrees.
-    """
+    """Return candidates for the first pair, best first: many spread points, wide angles, consistent with K."""
     members, candidates = set(photos), []
     for pair, pose in graph.poses.items():
         if members.issuperset(pair) and pose.kind != "rotation" and pose.angle_deg >= min_angle_deg:
@@ -175,8 +172,6 @@ def model_poses(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PosedPair:
-    """The raw matches of two posed photos."""
-
     lines: FloatArray
     """(M, 18) matches as bearing vectors of view 1 and of view 2."""
     R: FloatArray
@@ -212,9 +207,6 @@ def saturate(matches: Sequence[int]) -> FloatArray:
     return np.asarray(counts / (1.0 + counts / MAPPING.saturation))
 
 
-# Unregistered photos.
-
-
 def are_many_unregistered(lost: int, photos: int) -> bool:
     """Return whether unregistered photos justify another mapping of all photos."""
     return lost > 0 and (photos < MAPPING.many_photos or lost >= MAPPING.few_lost * photos)
@@ -238,7 +230,7 @@ def unregistered_reasons(
 
 
 def _reason(photo: int, posed: set[int], views: ViewGraph, graph: PoseGraph) -> str:
-    edges = dict(_edges(photo, views))
+    edges = {pair[pair[0] == photo]: fit.inlier_count for pair, fit in views.fits.items() if photo in pair}
     to_posed = {other: count for other, count in edges.items() if other in posed}
     if to_posed:
         nearest = max(to_posed, key=lambda other: (to_posed[other], -other))
@@ -248,12 +240,6 @@ def _reason(photo: int, posed: set[int], views: ViewGraph, graph: PoseGraph) -> 
     return (
         "shares inliers only with photos that have no place either" if edges else "shares no scene with any other photo"
     )
-
-
-def _edges(photo: int, views: ViewGraph) -> Iterator[tuple[int, int]]:
-    for pair, fit in views.fits.items():
-        if photo in pair:
-            yield pair[pair[0] == photo], fit.inlier_count
 
 
 def photo_names(photos: Sequence[int], matches: MatchGraph) -> list[str]:
@@ -302,7 +288,6 @@ class NoModel:
 
     mapper: str
     note: str
-    """As in `Attempt`."""
 
 
 MappingResult: TypeAlias = Attempt | NoModel
@@ -324,10 +309,7 @@ class StopSignal:
 
 
 def pairs_to_map(graph: PoseGraph) -> PoseGraph:
-    """Return the pose graph with as many pairs as mapping needs; all of them in small sets.
-
-    Tracks join along a few pairs of each photo. COLMAP follows all pairs of every point repeatedly.
-    """
+    """Return the pose graph with as many pairs as mapping needs: COLMAP follows all pairs of every point repeatedly."""
     photos = {photo for pair in graph.poses for photo in pair}
     if len(photos) <= MAPPING.fully_mapped_photos:
         return graph
@@ -389,13 +371,10 @@ def complete_attempt(group: Group, attempt: Attempt, run: RunContext) -> list[Ma
 
 
 class _GroupMapper:
-    """Attempts to map a group."""
-
     def __init__(self, group: Group, run: RunContext, colmap: ColmapMappers) -> None:
         self.group, self.run, self.colmap = group, run, colmap
 
     def run_maker(self, make: Maker) -> list[MappingResult]:
-        """Make attempts in a thread that Ctrl-C can stop."""
         results: list[MappingResult] = []
         self.run.progress.start("mapping", max(len(self.group.photos) - 2, 1))
         try:
@@ -453,7 +432,6 @@ class _GroupMapper:
         return [self._judge("incremental", how, self._grow(start, token))]
 
     def completion(self, best: Attempt, token: CancellationToken) -> list[MappingResult]:
-        """Continue a model photo by photo, with its missing photos."""
         return [self._judge("incremental", "missing photos added one by one", self._grow(best.model, token))]
 
     def _grow(self, start: Reconstruction, token: CancellationToken) -> Reconstruction | None:
@@ -494,7 +472,6 @@ def choice_reason(best: Attempt, results: Sequence[MappingResult], photos: int) 
 
 
 def _is_complete_and_consistent(attempt: Attempt, photos: int) -> bool:
-    """Return whether a model holds all photos, and hardly any inliers contradict it."""
     inliers = sum(pair.inliers for pair in attempt.explained.values())
     against = sum(pair.contradicted for pair in attempt.explained.values())
     return attempt.photos == photos and against <= MAPPING.max_contradicted_share * inliers
@@ -510,7 +487,6 @@ def likely_needs_one_mapper(group: Group) -> bool:
 
 
 def _has_placed_enough(results: Sequence[MappingResult], photos: int) -> bool:
-    """Return whether another seed is unlikely to place more photos."""
     counts = [attempt.photos for attempt in results if isinstance(attempt, Attempt)]
     largest = max(counts, default=0)
     return largest >= MAPPING.enough_share * photos or (

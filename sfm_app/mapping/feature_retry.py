@@ -52,15 +52,7 @@ OPTIONS = RetryOptions()
 def add_matches(
     matches: MatchGraph, keypoints: Mapping[int, FloatArray], added: Mapping[PairId, Rows]
 ) -> tuple[MatchGraph, tuple[PairId, ...]]:
-    """Add keypoints and matches of another kind; return the merged graph, and the pairs with more matches.
-
-    Existing keypoints keep their positions and indices. An added match enters only if neither of its keypoints has a
-    match in the other photo yet.
-
-    Args:
-        keypoints: (N, 2) pixels of the added keypoints, by photo.
-        added: (M, 2) indices of added keypoints, by pair.
-    """
+    """Add keypoints and matches whose ends have none in that pair; return the graph, and the pairs with more."""
     all_keypoints, numbers = dict(matches.keypoints), {}
     for photo, x in keypoints.items():
         all_keypoints[photo], numbers[photo] = _merge_keypoints(matches.keypoints[photo], x)
@@ -120,10 +112,7 @@ STEPS = Steps()
 
 
 def retry_lost_photos(first: MappedScene, steps: Steps = STEPS) -> MappedScene:
-    """Map again with finer features for unregistered photos, and return the result that registers more of them.
-
-    If the attempt fails, the first result stays.
-    """
+    """Map again with finer features for unregistered photos; return the result that registers more of them."""
     run, lost = first.run, lost_photos(first)
     if not lost or run.settings.matching.features == SIFT_DSP or not run.settings.scene.second_look:
         return first
@@ -174,7 +163,14 @@ def _retry_pairs(
     first: MappedScene, pairs: Sequence[PairId], report: dict[str, Json], steps: Steps
 ) -> MappedScene | None:
     """Run all steps from features to models once more; return None if there is no new geometry."""
-    run = _side_run(first.run)
+    matching = first.run.settings.matching
+    looser = matching.model_copy(update={"max_ratio": max(OPTIONS.max_ratio, matching.max_ratio)})
+    run = replace(
+        first.run,
+        workspace=SubWorkspace(first.run.workspace, FOLDER),  # a killed run is resumed there
+        settings=first.run.settings.model_copy(update={"matching": looser}),
+        statistics={},
+    )
     finer = replace(run, workspace=SubWorkspace(run.workspace, FEATURES))
     with translate_errors("extracting finer features"):
         if not finer.workspace.database.exists():
@@ -195,24 +191,11 @@ def _retry_pairs(
         dict(sorted((fits | dict(fitted.fits)).items())), rejected | dict(fitted.rejected), first.views.lenses
     )
     report["pairs_with_geometry"] = [len(first.views.fits), len(views.fits)]
-    intrinsics = first.intrinsics if _is_mostly_calibrated(first) else steps.find_intrinsics(matches, views, run)[0]
+    # where pairs determine the cameras of half of the photos, more pairs change little
+    estimated = [first.intrinsics.camera(image).is_estimated for image in first.matches.images.values()]
+    is_calibrated = 2 * sum(estimated) >= len(estimated)
+    intrinsics = first.intrinsics if is_calibrated else steps.find_intrinsics(matches, views, run)[0]
     return MappedScene(steps.reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
-
-
-def _is_mostly_calibrated(scene: MappedScene) -> bool:
-    """Return whether pairs determine the cameras of at least half of the photos; more pairs then change little."""
-    images = scene.matches.images.values()
-    return 2 * sum(scene.intrinsics.camera(image).is_estimated for image in images) >= len(images)
-
-
-def _side_run(run: RunContext) -> RunContext:
-    """Return the run with a separate workspace folder, in which a killed run is resumed."""
-    place = SubWorkspace(run.workspace, FOLDER)
-    loose = run.settings.matching.model_copy(
-        update={"max_ratio": max(OPTIONS.max_ratio, run.settings.matching.max_ratio)}
-    )
-    settings = run.settings.model_copy(update={"matching": loose})
-    return replace(run, workspace=place, settings=settings, statistics={})
 
 
 def _placed_count(outcome: Outcome) -> int:
@@ -220,7 +203,6 @@ def _placed_count(outcome: Outcome) -> int:
 
 
 def _places_and_explains_more(second: MappedScene, first: MappedScene) -> bool:
-    """Return whether the second main model places more photos, and explains more of all matches."""
     if not second.outcome.models or _placed_count(second.outcome) <= _placed_count(first.outcome):
         return False
     models = [_judge(second, scene.outcome) for scene in (first, second) if scene.outcome.models]

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain, count
 
 import numpy as np
 
@@ -78,11 +79,7 @@ def photos_with_geometry(fits: Mapping[PairId, EpipolarFit]) -> set[int]:
 
 
 def map_baseline(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Attempt | NoModel:
-    """Map all photos with COLMAP's default pipeline, and score the model like any other.
-
-    Its database loses pairs that are not among the matches, such as those of look-alikes. Of the cameras, only focals
-    from EXIF or from the user are used.
-    """
+    """Map the same matches with COLMAP's default pipeline and stated focals, and score the model like any other."""
     scratch = run.workspace.root / FOLDER
     models: list[Reconstruction | None] = []
     guess = guessed_intrinsics(intrinsics)
@@ -102,10 +99,7 @@ def map_baseline(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, 
 
 
 def is_focal_doubtful(model: Attempt | None, intrinsics: Intrinsics, views: ViewGraph) -> bool:
-    """Return whether a wrong guess of the focal may be why photos that match others are unregistered.
-
-    This is not so where any camera is known. With many photos, a pass costs more than it promises.
-    """
+    """Return whether a wrong guess of the focal may be why photos that match others are unregistered."""
     connected = photos_with_geometry(views.fits)
     known = any(camera.is_estimated or camera.method == "exif" for camera in intrinsics.cameras.values())
     placed = model.photos if model is not None else 0
@@ -117,28 +111,14 @@ def is_focal_doubtful(model: Attempt | None, intrinsics: Intrinsics, views: View
 
 
 def guessed_intrinsics(intrinsics: Intrinsics, sides: float = GUESSED_FOCAL) -> Intrinsics:
-    """Replace every perspective camera by a guess of `sides` longer sides, except those with a stated focal.
-
-    With a perspective camera, COLMAP cannot place photos of a fisheye lens.
-    """
+    """Replace every perspective camera without a stated focal by a guess of `sides` longer sides."""
     cameras = {
-        name: _guess_by_sides(camera, sides)
-        if camera.projection == PERSPECTIVE and not has_stated_focal(camera)
+        name: _guess(camera, sides * max(camera.width, camera.height), camera.reason)
+        if camera.projection == PERSPECTIVE and camera.method != "exif" and not camera.is_given
         else camera
         for name, camera in intrinsics.cameras.items()
     }
     return replace(intrinsics, cameras=cameras)
-
-
-def has_stated_focal(camera: Calibration) -> bool:
-    """Return whether the focal comes from EXIF or from the user."""
-    return camera.method == "exif" or camera.is_given
-
-
-def _guess_by_sides(camera: Calibration, sides: float) -> Calibration:
-    size = camera.width, camera.height
-    K = guessed_camera_matrix(size, sides * max(size))
-    return Calibration(K, *size, "guess", identifiable=False, reason=camera.reason)
 
 
 # A camera per photo, for a zoom or several devices. Photos of one size share a camera until their pairs contradict
@@ -149,10 +129,7 @@ def _guess_by_sides(camera: Calibration, sides: float) -> Calibration:
 def is_shared_camera_doubtful(
     model: Attempt | None, intrinsics: Intrinsics, views: ViewGraph, settings: Settings
 ) -> bool:
-    """Return whether photos of one size may have a camera each: the model is contradicted, or lacks many photos.
-
-    A user's choice of which photos share a camera stays.
-    """
+    """Return whether photos of one size may have a camera each: the model is contradicted, or lacks many photos."""
     if model is None or settings.photos.cameras != "auto":
         return False
     if (
@@ -163,10 +140,7 @@ def is_shared_camera_doubtful(
 
 
 def with_camera_per_photo(model: Attempt, shared: Intrinsics, matches: MatchGraph) -> Intrinsics | None:
-    """Give each photo its own camera where pairs do not determine the shared one; return None if there is none such.
-
-    The focal of a new camera is the one that mapping found for the shared camera, as a guess.
-    """
+    """Give each photo its own camera where pairs do not determine the shared one; None if there is none such."""
     focals = {photo: float(K[0, 0] * K[1, 1]) ** 0.5 for photo, (K, *_) in cameras_by_photo(model.model).items()}
     placed = posed_photo_ids(model.model)
     focal_of = {shared.camera_name(matches.images[photo]): focals[photo] for photo in placed if photo in focals}
@@ -179,17 +153,15 @@ def with_camera_per_photo(model: Attempt, shared: Intrinsics, matches: MatchGrap
     cameras, camera_of = dict(shared.cameras), dict(shared.camera_of)
     for name in divided:
         camera = cameras.pop(name)
+        focal_px, reason = focal_of.get(name, camera.focal_px), "its photos may each be of another camera"
         names = _free_names(name, {*shared.cameras, *cameras})
         for image, own in zip(sorted(members[name], key=lambda image: image.name), names, strict=False):
-            cameras[own], camera_of[image.name] = _guess_of_photo(camera, focal_of.get(name)), own
+            cameras[own], camera_of[image.name] = _guess(camera, focal_px, reason), own
     return replace(shared, cameras=cameras, camera_of=camera_of)
 
 
 def with_two_cameras(model: Attempt, each: Intrinsics, matches: MatchGraph) -> Intrinsics | None:
-    """Replace the cameras of photos of one size by two; return None if no size can be divided.
-
-    For each size, the focals of the model are divided at their widest gap.
-    """
+    """Replace the cameras of photos of one size by two, divided at the widest gap of focals; None if none can be."""
     of_size: dict[tuple[int, int], dict[str, float]] = {}
     for photo, (K, *_) in cameras_by_photo(model.model).items():
         name = each.camera_name(matches.images[photo])
@@ -225,7 +197,6 @@ def camera_per_photo_explains_more(own: Attempt | None, shared: Attempt) -> bool
 
 
 def _contradicted_share(model: Attempt) -> float:
-    """Return the share of the inliers of fundamental matrices that contradict a model."""
     inliers = sum(pair.inliers for pair in model.explained.values())
     return sum(pair.contradicted for pair in model.explained.values()) / max(inliers, 1)
 
@@ -240,16 +211,10 @@ def _split_at_gap(focals: Mapping[str, float]) -> list[list[str]]:
 
 
 def _free_names(name: str, taken: Collection[str]) -> Iterable[str]:
-    """Yield the name itself, then numbered variants of it that are not taken."""
-    yield name
-    number = 2
-    while True:
-        if (other := f"{name} #{number}") not in taken:
-            yield other
-        number += 1
+    """Return the name itself, then numbered variants of it that are not taken."""
+    return chain([name], (other for number in count(2) if (other := f"{name} #{number}") not in taken))
 
 
-def _guess_of_photo(camera: Calibration, focal_px: float | None) -> Calibration:
+def _guess(camera: Calibration, focal_px: float, reason: str) -> Calibration:
     size = camera.width, camera.height
-    K = guessed_camera_matrix(size, camera.focal_px if focal_px is None else focal_px)
-    return Calibration(K, *size, "guess", identifiable=False, reason="its photos may each be of another camera")
+    return Calibration(guessed_camera_matrix(size, focal_px), *size, "guess", identifiable=False, reason=reason)

@@ -37,7 +37,7 @@ from sfm_app.mapping.split_and_merge import split_attempt
 from sfm_app.matching.pairs import find_same_matches
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.runtime.context import Earlier, RunContext
-from sfm_app.types import Intrinsics, LookAlikes, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
+from sfm_app.types import Intrinsics, LookAlikes, MatchGraph, PoseGraph, ViewGraph
 
 logger = logging.getLogger("sfm_app")
 
@@ -68,8 +68,6 @@ STEPS = Steps()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Inputs:
-    """Evidence and run of a scene."""
-
     matches: MatchGraph
     views: ViewGraph
     intrinsics: Intrinsics
@@ -116,7 +114,8 @@ def _grow(inputs: _Inputs, earlier: Earlier) -> tuple[Outcome | None, str]:
         return None, f"the earlier model holds only {len(placed)} of {len(matches.images)} photos"
     epipolar = run.settings.epipolar
     known = model_poses(start, matches, epipolar.max_error_px, epipolar.min_inliers)
-    graph = _pose_graph(inputs, known)
+    options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, run.seed)
+    graph = inputs.steps.build_pose_graph(matches, views, inputs.intrinsics, options, run.map, known)
     _write_graph(graph, inputs)
     matches, views = drop_look_alikes(matches, views, graph)
     connected = max(graph.groups, key=lambda photos: len(set(photos).intersection(placed)), default=())
@@ -139,10 +138,7 @@ def _grow(inputs: _Inputs, earlier: Earlier) -> tuple[Outcome | None, str]:
 
 
 def _doubt(attempt: Attempt, placed: Collection[int], before: float, inputs: _Inputs) -> str:
-    """Return why a grown model is unreliable; empty where nothing speaks against it.
-
-    It began with the photos `placed`, and had the support `before` among these.
-    """
+    """Return why a model grown from photos `placed`, with the support `before`, is unreliable; empty if it is not."""
     parts = split_attempt(attempt)
     if len(parts) != 1 or parts[0].photos != attempt.photos:
         return "matches contradict the joins of its parts"
@@ -155,13 +151,6 @@ def _doubt(attempt: Attempt, placed: Collection[int], before: float, inputs: _In
     return inputs.steps.rival_reason(attempt, inputs.intrinsics, inputs.matches, inputs.views)
 
 
-def _pose_graph(inputs: _Inputs, known: dict[PairId, RelativePose]) -> PoseGraph:
-    """Return the pose graph: pairs that the earlier model explains have its poses, all others are estimated."""
-    epipolar, run = inputs.run.settings.epipolar, inputs.run
-    options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, run.seed)
-    return inputs.steps.build_pose_graph(inputs.matches, inputs.views, inputs.intrinsics, options, run.map, known)
-
-
 def _write_graph(graph: PoseGraph, inputs: _Inputs) -> None:
     database = inputs.run.workspace.database
     with translate_errors("writing relative poses"):
@@ -170,7 +159,6 @@ def _write_graph(graph: PoseGraph, inputs: _Inputs) -> None:
 
 
 def _place(start: Reconstruction, group: Group, run: RunContext) -> Reconstruction | None:
-    """Return the earlier model with the photos of its group that COLMAP can place, one after the other."""
     placed = posed_photo_ids(start)
     unplaced = len(set(group.photos).difference(placed))
     if not unplaced:
@@ -199,7 +187,6 @@ def _extend(start: Reconstruction, group: Group, run: RunContext, token: Cancell
 
 
 def _map_others(graph: PoseGraph, taken: Collection[int], inputs: _Inputs) -> list[Attempt]:
-    """Return models of the groups of photos that no pair connects with the earlier model."""
     models = []
     for photos in graph.groups:
         if len(photos) >= MAPPING.min_photos and not set(photos).intersection(taken):

@@ -1,7 +1,7 @@
 """One model of all fragments: each photo once, and tracks merged where they hold the same keypoint."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,38 +20,38 @@ from sfm_app.types.arrays import FloatArray, IndexArray
 
 @dataclass(frozen=True, slots=True)
 class JoinOptions:
-    """Similarities between fragments, and their errors."""
+    """Similarities between fragments, and their errors. Chosen by hand."""
 
     min_photos: int = 3
-    """Least shared photos that agree. Chosen by hand."""
+    """Least shared photos that agree."""
     min_points: int = 12
-    """Least points of these in both models. Chosen by hand."""
+    """Least points of these in both models."""
     min_photo_points: int = 4
-    """Least shared points that determine the scale of a photo. Chosen by hand."""
+    """Least shared points that determine the scale of a photo."""
     agreement_deg: float = 3.0
-    """Largest angle of shared photos that agree with a similarity. Chosen by hand."""
+    """Largest angle of shared photos that agree with a similarity."""
     agreement_shift: float = 0.1
-    """Largest shift of these, as a share of the distance of their points. Chosen by hand."""
+    """Largest shift of these, as a share of the distance of their points."""
     max_fitted: int = 400
     """Most points that a similarity is fitted to. Chosen by hand for speed."""
     loose_factor: float = 6.0
-    """Largest error of an explained match across a join, in inlier thresholds: parts bend. Chosen by hand."""
+    """Largest error of an explained match across a join, in inlier thresholds: parts bend."""
     max_checked: int = 150
-    """Most pairs across a join that are checked, those with most inliers. Chosen by hand."""
+    """Most pairs across a join that are checked, those with most inliers."""
     max_deg: float = 8.0
-    """Angle of a join to the common frame above which it contradicts the others. Chosen by hand."""
+    """Angle of a join to the common frame above which it contradicts the others."""
     max_scale: float = 0.15
-    """The same for the logarithm of its scale. Chosen by hand."""
+    """The same for the logarithm of its scale."""
     max_shift: float = 0.2
-    """The same for its shift, as a share of the radius of the smaller fragment. Chosen by hand."""
+    """The same for its shift, as a share of the radius of the smaller fragment."""
     rounds: int = 40
-    """Rounds of reweighting towards the least sum of errors. Chosen by hand."""
+    """Rounds of reweighting towards the least sum of errors."""
     min_error: float = 1e-4
-    """Error below which a join gets no more weight. Chosen by hand."""
+    """Error below which a join gets no more weight."""
     same_deg: float = 5.0
-    """Largest angle of a photo to its pose in the merged model for its points to count. Chosen by hand."""
+    """Largest angle of a photo to its pose in the merged model for its points to count."""
     same_shift: float = 0.25
-    """Largest shift of it, as a share of the median distance of its points. Chosen by hand."""
+    """Largest shift of it, as a share of the median distance of its points."""
 
 
 OPTIONS = JoinOptions()
@@ -62,7 +62,6 @@ class Fragment:
     """A model of a part, or a piece of one."""
 
     part: int
-    """Number of the part."""
     own: frozenset[int]
     """Photos that no other part owns."""
     placed: PlacedPhotos
@@ -84,7 +83,6 @@ class Join:
     similarity: Similarity
     """From the frame of the second fragment into that of the first."""
     photos: int
-    """Shared photos that agree."""
     shared: int
     """Photos that both hold."""
     points: int
@@ -133,8 +131,6 @@ def find_join(first: int, second: int, fragments: Sequence[Fragment]) -> Join | 
 
 
 class _SharedPhotos:
-    """Photos in two models, with the points that both triangulated from the same keypoints."""
-
     def __init__(
         self, a: PlacedPhotos, b: PlacedPhotos, photos: IndexArray, rows_a: IndexArray, rows_b: IndexArray
     ) -> None:
@@ -215,10 +211,7 @@ class AcrossJoins:
             self.partners.setdefault(b, []).append(a)
 
     def count(self, join: Join, fragments: Sequence[Fragment]) -> tuple[int, int]:
-        """Return how many matches across a join it explains, and how many inliers it contradicts.
-
-        Shared photos do not count: they made the join.
-        """
+        """Return how many matches a join explains, and how many inliers it contradicts, without shared photos."""
         a, b = fragments[join.first].placed, fragments[join.second].placed
         explained = contradicted = 0
         for photo_a, photo_b in self._pairs(a, b):
@@ -278,7 +271,6 @@ class Alignment:
     frames: Mapping[int, Similarity]
     """From the frame of each fragment to the common one, for the largest group of joined fragments."""
     kept: tuple[tuple[Join, JoinError], ...]
-    """Joins with their errors."""
     dropped: tuple[tuple[Join, JoinError], ...]
     """Joins that contradict the others, with their errors when they were dropped."""
 
@@ -290,39 +282,25 @@ def align_fragments(fragments: Sequence[Fragment], joins: Sequence[Join]) -> Ali
     dropped: list[tuple[Join, JoinError]] = []
     while True:
         frames = _synchronize(remaining, len(fragments))
-        errors = [join_error(join, frames, radii) for join in remaining]
+        implied = [frames[join.first].inverse().compose(frames[join.second]) for join in remaining]
+        errors = [difference(join, one, radii) for join, one in zip(remaining, implied, strict=True)]
         # a single loop is equally far off in all of its joins: the one with least evidence goes
         ranked = sorted(range(len(remaining)), key=lambda k: (-errors[k].excess / remaining[k].weight, k))
         worst = next((k for k in ranked if errors[k].excess > 1.0), None)
         if worst is None:
             break
         dropped.append((remaining.pop(worst), errors[worst]))
-    main = _main_group(fragments, remaining)
+    groups = connected_groups([(join.first, join.second) for join in remaining], range(len(fragments)))
+    photos = [set(fragment.placed.photos.tolist()) for fragment in fragments]
+    main = max(
+        groups, key=lambda group: (len(set[int]().union(*(photos[k] for k in group))), -min(group)), default=set()
+    )
     accepted = tuple(zip(remaining, errors, strict=True))
     return Alignment({number: frames[number] for number in sorted(main)}, accepted, tuple(dropped))
 
 
-def _main_group(fragments: Sequence[Fragment], joins: Sequence[Join]) -> set[int]:
-    """Return the joined fragments that have most photos together."""
-    groups = connected_groups([(join.first, join.second) for join in joins], range(len(fragments)))
-
-    def count_photos(group: set[int]) -> int:
-        return len({photo for number in group for photo in fragments[number].placed.photos.tolist()})
-
-    return max(groups, key=lambda group: (count_photos(group), -min(group)), default=set())
-
-
-def join_error(join: Join, frames: Mapping[int, Similarity], radii: Sequence[float]) -> JoinError:
-    """Return the difference of a join from the frames of its fragments; radii are in units of each fragment."""
-    expected = frames[join.first].inverse().compose(frames[join.second])
-    return difference(join, expected, radii)
-
-
 def difference(join: Join, expected: Similarity, radii: Sequence[float]) -> JoinError:
-    """Return the difference of a join from another similarity, from the second fragment into the first.
-
-    The radii are in units of each fragment.
-    """
+    """Return the difference of a join from another similarity; radii are in units of each fragment."""
     cosine = (np.trace(expected.R.T @ join.similarity.R) - 1.0) / 2.0
     smaller = min(radii[join.first], expected.scale * radii[join.second])
     return JoinError(
@@ -360,16 +338,7 @@ def _synchronize(joins: Sequence[Join], count: int) -> dict[int, Similarity]:
 def _robust_potentials(
     count: int, edges: NDArray[np.int64], steps: FloatArray, strengths: FloatArray, sizes: FloatArray
 ) -> FloatArray:
-    """Return (count, k) values whose differences have the least sum of weighted distances to steps.
-
-    The first fragment of each group has 0.
-
-    Args:
-        edges: (J, 2) numbers of fragments.
-        steps: (J, k) differences, second less first.
-        strengths: (J,) weights.
-        sizes: (J,) units in which errors are measured.
-    """
+    """Return (count, k) values with the least distances to steps (J, k), second less first, along edges (J, 2)."""
     groups = DisjointGroups(range(count))
     for a, b in edges.tolist():
         groups.join(a, b)
@@ -388,10 +357,7 @@ def _robust_potentials(
 
 
 def loop_errors(fragments: Sequence[Fragment], joins: Sequence[Join]) -> list[tuple[tuple[int, ...], JoinError]]:
-    """Return the error around each loop that a join closes, with the fragments of the loop.
-
-    The strongest joins form a tree. Each other join closes one loop with it.
-    """
+    """Return the error around each loop that a join closes with the tree of the strongest, and its fragments."""
     groups, neighbors = DisjointGroups(range(len(fragments))), dict[int, list[tuple[int, Similarity]]]()
     radii = [fragment.radius for fragment in fragments]
     loops, closing = [], []
@@ -410,9 +376,7 @@ def loop_errors(fragments: Sequence[Fragment], joins: Sequence[Join]) -> list[tu
 def _path(
     neighbors: Mapping[int, Sequence[tuple[int, Similarity]]], start: int, end: int
 ) -> tuple[tuple[int, ...], Similarity]:
-    """Return the fragments on the path along the tree, and the similarity from the frame of the end into that of the
-    start.
-    """
+    """Return the fragments on the path along the tree, and the similarity from the frame of its end to its start."""
     waiting: list[tuple[tuple[int, ...], Similarity]] = [((start,), Similarity(1.0, np.eye(3), np.zeros(3)))]
     while waiting:
         path, so_far = waiting.pop()
@@ -425,11 +389,12 @@ def _path(
 
 
 def merge_fragments(fragments: Sequence[Fragment], frames: Mapping[int, Similarity]) -> PlacedPhotos:
-    """Return the photos and points of all fragments that have a frame.
-
-    The part that owns a photo determines its pose, else the largest fragment with it.
-    """
-    models = {number: _move(fragments[number].placed, frame) for number, frame in sorted(frames.items())}
+    """Return all photos and points with a frame; the owner of a photo determines its pose, or the largest fragment."""
+    models: dict[int, PlacedPhotos] = {}
+    for number, frame in sorted(frames.items()):
+        placed = fragments[number].placed
+        R = np.einsum("nij,kj->nik", placed.R, frame.R)
+        models[number] = replace(placed, R=R, centers=frame(placed.centers), X=frame(placed.X))
     photos, R, centers, source = _choose_poses(fragments, models)
     cameras = {
         photo: models[number].cameras[photo] for photo, number in zip(photos.tolist(), source.tolist(), strict=True)
@@ -439,17 +404,9 @@ def merge_fragments(fragments: Sequence[Fragment], frames: Mapping[int, Similari
     return PlacedPhotos(photos, R, centers, X, point, photo, keypoint, cameras)
 
 
-def _move(model: PlacedPhotos, frame: Similarity) -> PlacedPhotos:
-    R = np.einsum("nij,kj->nik", model.R, frame.R)
-    return PlacedPhotos(
-        model.photos, R, frame(model.centers), frame(model.X), model.point, model.photo, model.keypoint, model.cameras
-    )
-
-
 def _choose_poses(
     fragments: Sequence[Fragment], models: Mapping[int, PlacedPhotos]
 ) -> tuple[IndexArray, FloatArray, FloatArray, IndexArray]:
-    """Return ids of all photos, their rotations and centers, and the fragments that these are from."""
     best: dict[int, tuple[tuple[bool, int, int], int, int]] = {}
     for number, model in models.items():
         for row, photo in enumerate(model.photos.tolist()):

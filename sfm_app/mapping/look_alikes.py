@@ -5,7 +5,7 @@ pairs that hold the sides together, the least cut between them, are wrong.
 """
 
 import logging
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush
 from itertools import chain
@@ -30,24 +30,21 @@ from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 @dataclass(frozen=True, slots=True)
 class JumpOptions:
-    """Jumps in the order of photos."""
+    """Jumps in the order of photos. Chosen by hand."""
 
     min_photos: int = 30
-    """Number of photos below which their order is no evidence. Chosen by hand."""
+    """Number of photos below which their order is no evidence."""
     jump: float = 5.0
-    """Length of a jump, in median steps. Chosen by hand."""
+    """Length of a jump, in median steps."""
     max_share: float = 0.1
-    """Share of jumps above which photos count as unordered. Chosen by hand."""
+    """Share of jumps above which photos count as unordered."""
 
 
 JUMPS = JumpOptions()
 
 
 def drop_look_alikes(matches: MatchGraph, views: ViewGraph, graph: PoseGraph) -> tuple[MatchGraph, ViewGraph]:
-    """Return matches and fundamental matrices without those of look-alikes.
-
-    Pairs of look-alikes are evidence neither for a model nor against it.
-    """
+    """Return matches and F's without those of look-alikes, which are evidence neither for a model nor against it."""
     dropped = {pair for join in graph.look_alikes for pair in join.pairs}
     if not dropped:
         return matches, views
@@ -87,10 +84,7 @@ def look_alike_entries(joins: Sequence[LookAlikes], matches: MatchGraph) -> list
 
 
 def jumps(model: Reconstruction) -> list[list[str]]:
-    """Return successive photos, by name, that are much farther apart than others: a video may be folded there.
-
-    Empty where many steps are long, because the photos are then unordered. A jump is no proof: videos may be cut, too.
-    """
+    """Return successive photos, by name, that are much farther apart than others; empty if many steps are long."""
     with translate_errors("reading poses"):
         centers_by_name = sorted((image.name, image.projection_center()) for image in posed_images(model))
     if len(centers_by_name) < JUMPS.min_photos:
@@ -236,7 +230,6 @@ def _posed_photo_points(
 
 
 def _neighbors(posed: Mapping[int, PosedPhotoPoints]) -> Iterator[PairId]:
-    """Yield photos with others nearby that look the same way; some of these where there are many."""
     from scipy.spatial import KDTree
 
     if not posed:
@@ -315,18 +308,14 @@ def find_false_joins(
         apart = {pair for pair, one in overlaps.items() if sides[pair[0]] != sides[pair[1]] and _affinity(one) < 0}
         here = _cut_sides({photo: sides[photo] for photo in chain(*apart)}, photos, strengths)
         across = {pair: one for pair, one in overlaps.items() if {here.get(photo) for photo in pair} == {True, False}}
-        missing = _missing_share(across.values())
+        expected, shared = (sum(getattr(one, name) for one in across.values()) for name in ("expected", "shared"))
+        missing = 1.0 - shared / max(expected, 1)
         if len(across.keys() & non_overlapping.keys()) >= OVERLAPS.min_pairs and missing >= OVERLAPS.min_missing:
             pairs = {pair for pair in strengths if here[pair[0]] != here[pair[1]]}
             strengths = {pair: strength for pair, strength in strengths.items() if pair not in pairs}
             joins += [LookAlikes(join, missing) for join in group_doubted_pairs(pairs, strengths)]
         remaining = {(a, b): one for (a, b), one in remaining.items() if sides[a] == sides[b]}
     return joins
-
-
-def _missing_share(overlaps: Collection[ExpectedOverlap]) -> float:
-    expected = sum(one.expected for one in overlaps)
-    return 1.0 - sum(one.shared for one in overlaps) / max(expected, 1)
 
 
 def _is_significant(pair: PairSupport | None) -> bool:
@@ -341,8 +330,7 @@ def _affinity(overlap: ExpectedOverlap) -> float:
 def _assign_sides(
     non_overlapping: Mapping[PairId, ExpectedOverlap], overlaps: Mapping[PairId, ExpectedOverlap]
 ) -> dict[int, int]:
-    """Return the side, 1 or -1, of all photos with overlaps: the surest non-overlapping pair first, then the surest
-    photo.
+    """Return the side, 1 or -1, of all photos with overlaps, the surest first.
 
     Photos with the expected overlap pull a photo to their side, others push it to the opposite one.
     """

@@ -35,24 +35,24 @@ Links = Mapping[int, Mapping[int, float]]
 
 @dataclass(frozen=True, slots=True)
 class CutOptions:
-    """How a group is cut into parts."""
+    """How a group is cut into parts. Chosen by hand."""
 
     saturation_inliers: float = 100.0
-    """Number of inliers above which the weight of a pair hardly grows. Chosen by hand."""
+    """Number of inliers above which the weight of a pair hardly grows."""
     doubtful_weight: float = 0.1
-    """Weight factor of pairs that may be look-alikes: a cut may well pass there. Chosen by hand."""
+    """Weight factor of pairs that may be look-alikes: a cut may well pass there."""
     largest: float = 1.3
-    """Largest part, as a share of the chosen size. Chosen by hand."""
+    """Largest part, as a share of the chosen size."""
     smallest: float = 0.25
-    """Smallest part, as a share of the chosen size. Chosen by hand."""
+    """Smallest part, as a share of the chosen size."""
     min_side: float = 1.0 / 3.0
-    """Smallest side of a cut, as a share of the photos. Chosen by hand."""
+    """Smallest side of a cut, as a share of the photos."""
     max_swaps: int = 8
-    """Most rounds in which photos change sides. Chosen by hand."""
+    """Most rounds in which photos change sides."""
     shared_photos: int = 10
-    """Photos that each of two neighboring parts gets from the other one. Chosen by hand."""
+    """Photos that each of two neighboring parts gets from the other one."""
     min_across: int = 3
-    """Least pairs between two parts that makes them neighbors. Chosen by hand."""
+    """Least pairs between two parts that makes them neighbors."""
 
 
 OPTIONS = CutOptions()
@@ -71,7 +71,14 @@ class Part:
 def cut_group(graph: PoseGraph, photos: Sequence[int], size: int) -> tuple[Part, ...]:
     """Divide connected photos into overlapping parts of about `size` photos, each connected."""
     links = link_weights(graph, photos)
-    owned = [sorted(part) for part in _join_small(_divide(links, size), links, OPTIONS.smallest * size)]
+    waiting, parts = _components(set(links), links), []
+    while waiting:
+        part = waiting.pop()
+        if len(part) <= OPTIONS.largest * size:
+            parts.append(part)
+        else:
+            waiting += _bisect(part, links)
+    owned = [sorted(part) for part in _join_small(parts, links, OPTIONS.smallest * size)]
     owned.sort(key=lambda part: part[0])
     return tuple(
         Part(tuple(own), tuple(sorted((*own, *more))))
@@ -91,19 +98,7 @@ def link_weights(graph: PoseGraph, photos: Collection[int]) -> dict[int, dict[in
     return links
 
 
-def _divide(links: Links, size: int) -> list[set[int]]:
-    waiting, parts = _components(set(links), links), []
-    while waiting:
-        photos = waiting.pop()
-        if len(photos) <= OPTIONS.largest * size:
-            parts.append(photos)
-        else:
-            waiting += _bisect(photos, links)
-    return parts
-
-
 def _bisect(photos: set[int], links: Links) -> tuple[set[int], set[int]]:
-    """Divide connected photos into two connected sides."""
     end = _farthest_photo(min(photos), photos, links)
     starts = (_farthest_photo(end, photos, links), end)
     cuts = [_best_growth(start, photos, links) for start in starts]
@@ -208,10 +203,7 @@ def _shared_photos(parts: Sequence[Sequence[int]], links: Links) -> list[set[int
 
 
 def _best_across(pairs: Sequence[PairId], links: Links) -> set[int]:
-    """Return the photos of the other part with most links to this one, spread over the photos that they link to.
-
-    In `pairs`, the photo of this part comes first.
-    """
+    """Return other photos with most links to this part, spread over its photos, which come first in `pairs`."""
     partners: dict[int, list[int]] = {}
     for a, b in pairs:
         partners.setdefault(b, []).append(a)
@@ -273,7 +265,6 @@ class PartInputs:
     """Inputs for mapping a part."""
 
     part: Group
-    """Photos, matches, geometry, relative poses and cameras."""
     mapped: frozenset[PairId]
     """Pairs of the pose graph that mapping follows."""
     settings: Settings
@@ -413,14 +404,7 @@ class PartResult:
 def map_parts(
     group: Group, parts: Sequence[Part], mapped: PoseGraph, run: RunContext, *, stop_at_false_joins: bool
 ) -> list[PartResult]:
-    """Map parts, as many at once as there are workers; one that fails is a result without models.
-
-    Parts that a killed run has finished are not mapped again.
-
-    Args:
-        mapped: the pose graph with the pairs that mapping follows.
-        stop_at_false_joins: whether false joins within parts end the pass.
-    """
+    """Map parts side by side, except those that a killed run has finished; failed ones have no models."""
     place = run.workspace.root / FOLDER
     (place / STOP).unlink(missing_ok=True)
     within = pairs_of_parts(group.matches.matches, [part.photos for part in parts])

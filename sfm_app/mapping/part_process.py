@@ -11,7 +11,7 @@ from sfm_app.colmap.database import write_calibrations, write_match_graph, write
 from sfm_app.colmap.model import posed_photo_ids, submodel
 from sfm_app.colmap.worker_process import MappingTask, serve
 from sfm_app.files import replace_atomically
-from sfm_app.mapping.attempt import MAPPING, Attempt, Group, best_attempt, map_group
+from sfm_app.mapping.attempt import MAPPING, Attempt, best_attempt, map_group
 from sfm_app.mapping.look_alikes import judge_places
 from sfm_app.mapping.part_mapping import INPUTS, RESULT, joins_to_plain, read_inputs
 from sfm_app.mapping.split_and_merge import sound_parts
@@ -19,7 +19,7 @@ from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import SubWorkspace, Workspace
-from sfm_app.types import PairId
+from sfm_app.types import PoseGraph
 
 
 def work(task: MappingTask) -> None:
@@ -31,7 +31,12 @@ def work(task: MappingTask) -> None:
     # a worker that was cut off from a cluster may still be at the same part
     with tempfile.TemporaryDirectory(dir=folder, prefix="mapping-") as own, make_executor(1) as executor:
         place = SubWorkspace(Workspace(photos.parent), relpath(own, photos.parent))
-        _write_database(place, inputs.part, inputs.mapped)
+        part, graph = inputs.part, inputs.part.graph
+        poses = {pair: pose for pair, pose in graph.poses.items() if pair in inputs.mapped}
+        with translate_errors("entering the photos of a part"):
+            write_match_graph(place.database, part.matches)
+            write_calibrations(place.database, part.matches, part.intrinsics)
+            write_pose_graph(place.database, part.matches, PoseGraph(poses, {}, graph.groups))
         run = RunContext(inputs.settings, place, load_plugins(installed=False), executor, workers=1)
         attempts = map_group(
             inputs.part, run, lambda one: inputs.stop_at_false_joins and one.photos >= enough and bool(judge(one))
@@ -49,17 +54,7 @@ def work(task: MappingTask) -> None:
         path.write_text(json.dumps(result), encoding="utf-8", newline="\n")
 
 
-def _write_database(place: Workspace, part: Group, mapped: frozenset[PairId]) -> None:
-    graph = part.graph
-    followed = type(graph)({pair: pose for pair, pose in graph.poses.items() if pair in mapped}, {}, graph.groups)
-    with translate_errors("entering the photos of a part"):
-        write_match_graph(place.database, part.matches)
-        write_calibrations(place.database, part.matches, part.intrinsics)
-        write_pose_graph(place.database, part.matches, followed)
-
-
 def _write_models(best: Attempt, folder: Path) -> list[str]:
-    """Write the pieces of a model that its own matches do not contradict, and return the names of their folders."""
     parts = sound_parts(best.explained, posed_photo_ids(best.model))
     pieces = [photos for photos in parts if len(photos) >= 3]  # nothing determines the scale of two photos
     names = []

@@ -36,7 +36,7 @@ from sfm_app.mapping.part_mapping import Part, PartResult, cut_group, map_parts,
 from sfm_app.numerical import FAILURES, Json, error_reason
 from sfm_app.runtime.context import RunContext
 from sfm_app.settings import SceneSettings
-from sfm_app.types import Calibration, LookAlikes, PairId, PoseGraph
+from sfm_app.types import LookAlikes, PairId, PoseGraph
 
 logger = logging.getLogger("sfm_app")
 
@@ -45,18 +45,18 @@ MAPPER = "parts"
 
 @dataclass(frozen=True, slots=True)
 class PartOptions:
-    """When groups are mapped in parts."""
+    """When groups are mapped in parts. Chosen by hand."""
 
     max_whole: int = 400
-    """Photos up to which a group is mapped as a whole. Chosen by hand."""
+    """Photos up to which a group is mapped as a whole."""
     usual_size: int = 150
-    """Photos of a part above. Chosen by hand."""
+    """Photos of a part above."""
     min_size: int = 20
-    """Smallest part that a user can choose: smaller ones consist of shared photos. Chosen by hand."""
+    """Smallest part that a user can choose: smaller ones consist of shared photos."""
     max_contradicted: float = 0.05
-    """Share of contradicting inliers of F above which the whole is mapped, too. Chosen by hand."""
+    """Share of contradicting inliers of F above which the whole is mapped, too."""
     min_matches: int = 16
-    """Matches across a join below which these decide nothing, as of a pair. Chosen by hand."""
+    """Matches across a join below which these decide nothing, as of a pair."""
 
 
 OPTIONS = PartOptions()
@@ -94,7 +94,9 @@ def map_in_parts(
     if len(parts) < 2:
         return [], ()
     photos = len(group.photos)
-    run.progress.say(f"mapping {photos} photos in {len(parts)} parts of {_range([len(p.photos) for p in parts])}")
+    sizes = sorted({len(part.photos) for part in parts})
+    size = f"{sizes[0]} to {sizes[-1]}" if len(sizes) > 1 else f"{sizes[0]}"
+    run.progress.say(f"mapping {photos} photos in {len(parts)} parts of {size}")
     try:
         results = map_parts(group, parts, mapped, run, stop_at_false_joins=stop_at_false_joins)
         joins = merge_false_joins([join for result in results for join in result.false_joins])
@@ -121,11 +123,6 @@ def merge_false_joins(joins: Sequence[LookAlikes]) -> tuple[LookAlikes, ...]:
         known.update(fresh)
         merged += [replace(join, pairs=fresh)] if fresh else []
     return tuple(merged)
-
-
-def _range(counts: Sequence[int]) -> str:
-    low, high = min(counts), max(counts)
-    return str(low) if low == high else f"{low} to {high}"
 
 
 def parts_suffice(attempts: Sequence[MappingResult], photos: int) -> bool:
@@ -163,16 +160,14 @@ def join_parts(group: Group, parts: Sequence[Part], results: Sequence[PartResult
 
 
 def _merge(group: Group, joined: JoinedParts, run: RunContext) -> list[MappingResult]:
-    """Return the model of all joined fragments, adjusted together."""
     count = len(joined.parts)
     if not joined.fragments:
         reasons = sorted({note for result in joined.results for note in result.tried})
         return [NoModel(MAPPER, f"in {count} parts: no part has a model; {'; '.join(reasons[:3])}")]
     merged = merge_fragments(joined.fragments, joined.alignment.frames)
     database = run.workspace.database
-    free = {
-        photo for photo in merged.photos.tolist() if not _is_fixed(group.intrinsics.camera(group.matches.images[photo]))
-    }
+    cameras = {photo: group.intrinsics.camera(group.matches.images[photo]) for photo in merged.photos.tolist()}
+    free = {photo for photo, camera in cameras.items() if not (camera.is_kept or is_focal_accurate(camera))}
     with translate_errors("joining parts"), run.step("adjusting all parts together"):
         model = write_placed(database, merged)
         refined = sorted({model.images[photo].camera_id for photo in free})
@@ -181,16 +176,22 @@ def _merge(group: Group, joined: JoinedParts, run: RunContext) -> list[MappingRe
     return [judge_model(group.matches, group.views, MAPPER, how, model, run)]
 
 
-def _is_fixed(camera: Calibration) -> bool:
-    return camera.is_kept or is_focal_accurate(camera)
-
-
 def part_figures(group: Group, joined: JoinedParts, attempts: Sequence[MappingResult]) -> dict[str, Json]:
     """Return the figures of the manifest about the parts of a group."""
     aligned = joined.alignment
     loops = loop_errors(joined.fragments, [join for join, _ in (*aligned.kept, *aligned.dropped)])
     return {
-        "parts": _part_entries(group, joined),
+        "parts": [
+            {
+                "photos": len(part.photos),
+                "own": len(part.own),
+                "first": photo_names(part.own[:1], group.matches)[0],
+                "placed": [len(one.placed.photos) for one in joined.fragments if one.part == number],
+                "mapper": result.mapper,
+                "tried": list(result.tried),
+            }
+            for number, (part, result) in enumerate(zip(joined.parts, joined.results, strict=True))
+        ],
         "joins": [_join_entry(join, joined, off) for join, off in aligned.kept],
         "dropped_joins": [
             *(_join_entry(join, joined, off) | {"because": "contradicts other joins"} for join, off in aligned.dropped),
@@ -200,21 +201,6 @@ def part_figures(group: Group, joined: JoinedParts, attempts: Sequence[MappingRe
         "left_out": [joined.fragments[k].part for k in range(len(joined.fragments)) if k not in aligned.frames],
         "models": [one.note for one in attempts if isinstance(one, Attempt)],
     }
-
-
-def _part_entries(group: Group, joined: JoinedParts) -> list[Json]:
-    placed = [(fragment.part, len(fragment.placed.photos)) for fragment in joined.fragments]
-    return [
-        {
-            "photos": len(part.photos),
-            "own": len(part.own),
-            "first": photo_names(part.own[:1], group.matches)[0],
-            "placed": [count for owner, count in placed if owner == number],
-            "mapper": result.mapper,
-            "tried": list(result.tried),
-        }
-        for number, (part, result) in enumerate(zip(joined.parts, joined.results, strict=True))
-    ]
 
 
 def _join_entry(join: Join, joined: JoinedParts, error: JoinError | None = None) -> dict[str, Json]:

@@ -73,14 +73,12 @@ class Outcome:
     intrinsics: Intrinsics
     """Cameras that the models were mapped with."""
     tried: tuple[str, ...]
-    """Notes on all attempts."""
     reason: str = ""
     """Why the attempt behind the main model was chosen."""
     cuts: tuple[str, ...] = ()
     """Names of the photos of each part of a model that was cut because matches contradict the join."""
     passes: int = 1
     rival_reason: str = ""
-    """Why a rival was tried, if so."""
     one_camera_each: str = ""
     """Result of trying a camera for each photo: "taken", "left" (rejected), or "two" where two cameras explain as much;
     empty if it was not tried."""
@@ -158,11 +156,7 @@ class Passes:
         return self.merge_models(best, matches, views)
 
     def _drop_false_joins(self, outcome: Outcome, matches: MatchGraph, views: ViewGraph) -> Outcome:
-        """Map again without pairs that merge two places, and return the outcome with fewer non-overlapping pairs.
-
-        Where other pairs do not hold the photos together instead, as by day and by night, the joins stay, and are
-        doubtful.
-        """
+        """Map again without pairs that merge two places; joins without which the photos fall apart are doubtful."""
         joins, non_overlapping = self.mappers.judge_places(outcome.models)
         for _ in range(OVERLAPS.max_passes):
             if not joins:
@@ -208,7 +202,6 @@ class Passes:
     def _try_other_focals(
         self, outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics
     ) -> Outcome:
-        """Map with other guesses of the focal where many photos are unregistered, and return the best outcome."""
         main = outcome.main
         if not is_focal_doubtful(main, intrinsics, views):
             return outcome
@@ -228,7 +221,6 @@ class Passes:
     def _try_camera_per_photo(
         self, outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics
     ) -> Outcome:
-        """Map with a camera for each photo where shared ones explain too little, and return the better outcome."""
         main = outcome.main
         if main is None or not is_shared_camera_doubtful(main, intrinsics, views, self.run.settings):
             return outcome
@@ -247,7 +239,6 @@ class Passes:
         )
 
     def _try_two_cameras(self, own: Outcome, matches: MatchGraph, views: ViewGraph, each: Intrinsics) -> Outcome:
-        """Map with two cameras instead of one for each photo, and return their outcome if they explain as much."""
         between = with_two_cameras(own.models[0], each, matches)
         if between is None:
             return own
@@ -316,11 +307,7 @@ class Passes:
         views: ViewGraph,
         chances: int,
     ) -> Outcome:
-        """Run a pass without the false joins of parts, before any part is joined to others.
-
-        True pairs of the same corner come back with new relative poses. Where they do not hold most photos together,
-        the joins stay, and are doubtful.
-        """
+        """Run a pass without false joins of parts; joins without which the photos fall apart are doubtful."""
         self.run.progress.say("two different places are merged in a part; remapping without the ambiguous pairs")
         marked = with_false_joins(graph, joins)
         again = self.run_pass(*drop_look_alikes(matches, views, marked), intrinsics, chances)
@@ -332,10 +319,7 @@ class Passes:
     def map_by_size(
         self, group: Group, *, stop_at_false_joins: bool
     ) -> tuple[list[MappingResult], tuple[LookAlikes, ...]]:
-        """Map a large group in parts, and a small one, or one that parts do not explain, as a whole.
-
-        Return false joins within parts instead if they stop the mapping.
-        """
+        """Map a large group in parts, others as a whole; or return the false joins that stop the mapping."""
         if not self.mappers.part_size(len(group.photos), self.run.settings.scene):
             return self.mappers.map_group(group, self.run), ()
         attempts, joins = self.mappers.map_in_parts(
@@ -346,10 +330,7 @@ class Passes:
         return [*attempts, *self.mappers.map_group(group, self.run)], ()
 
     def _update_graph(self, models: Sequence[Attempt], graph: PoseGraph, matches: MatchGraph) -> PoseGraph:
-        """Return the pose graph with relative poses from models that were not mapped from it.
-
-        Later steps complete the tracks of these models along its pairs.
-        """
+        """Return the pose graph with poses from other models, whose tracks later steps complete along its pairs."""
         epipolar = self.run.settings.epipolar
         for attempt in models:
             poses = model_poses(attempt.model, matches, epipolar.max_error_px, epipolar.min_inliers)
@@ -363,10 +344,7 @@ class Passes:
 
 
 def needs_another_pass(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:
-    """Return whether another pass with the cameras of the model may improve it.
-
-    That is so if they differ from the cameras of the last pass, or if photos of the main group are missing.
-    """
+    """Return whether the cameras of the model differ from those of the pass, or main photos are missing."""
     main = outcome.models[0]
     placed = posed_photo_ids(main.model)
     if len(placed) < MAPPING.min_photos:

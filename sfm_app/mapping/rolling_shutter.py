@@ -54,10 +54,7 @@ class FrameTimes:
 
 
 def frame_times(images: Sequence[MatchedImage]) -> FrameTimes | None:
-    """Return the times of the photos of a model; None where they are not known to be frames of one video.
-
-    The names of frames end with their numbers in the video.
-    """
+    """Return the times of photos named by number; None where they are not known to be frames of one video."""
     numbers = _frame_numbers(images)
     times = {image.id: image.time_s for image in images if image.time_s is not None}
     if numbers is None or len(times) < len(images) or len(images) < OPTIONS.min_frames:
@@ -137,10 +134,7 @@ def follow_shutter(
 def _compensate(
     adjusted: Adjustment, frames: FrameTimes, database: Path, rules: Rules
 ) -> Sequence[tuple[Adjustment, ReadoutEstimate]]:
-    """Return the adjusted models of all rounds with the readouts that they were compensated for.
-
-    The first round is the last one where the readout is smaller than its deviation; the model is then the given one.
-    """
+    """Return the adjusted models of all rounds with their readouts; an insignificant one has the given model."""
     rounds: list[tuple[Adjustment, ReadoutEstimate]] = []
     keypoints, current = read_keypoints(adjusted.model), adjusted
     estimate: ReadoutEstimate | None = None
@@ -150,20 +144,15 @@ def _compensate(
             return [*rounds, (adjusted, estimate)]
         current = adjust_or_keep(straighten_model(current.model, estimate, keypoints), database, rules)
         rounds.append((current, estimate))
-        if current.failure or _has_converged(before, estimate):
+        changed = OPTIONS.converged * estimate.deviation
+        if current.failure or (before is not None and abs(estimate.readout - before.readout) <= changed):
             break
     return rounds
-
-
-def _has_converged(before: ReadoutEstimate | None, after: ReadoutEstimate) -> bool:
-    """Return whether the readout has not changed since the round before."""
-    return before is not None and abs(after.readout - before.readout) <= OPTIONS.converged * after.deviation
 
 
 def _reason_to_refuse(
     adjusted: Adjustment, compensated: Adjustment, estimate: ReadoutEstimate, frames: FrameTimes
 ) -> str:
-    """Return why the compensated model is rejected; empty where it is accepted."""
     if OPTIONS.significance * estimate.deviation >= frames.interval:
         return "the motion of the camera does not determine it"
     if abs(estimate.readout) < OPTIONS.significance * estimate.deviation:

@@ -52,7 +52,12 @@ def sound_parts(explained: Mapping[PairId, PairSupport], photos: Iterable[int]) 
     """
     groups = DisjointGroups(photos)
     weights = {pair: pair_support.matches - pair_support.contradicted for pair, pair_support in explained.items()}
-    between = _joins(weights)
+    # by photo, the weight of its significant pairs with the others
+    between: defaultdict[int, Counter[int]] = defaultdict(Counter)
+    for (a, b), value in weights.items():
+        if abs(value) >= OPTIONS.min_matches:
+            between[a][b] += value
+            between[b][a] += value
     for a, b in sorted(weights, key=lambda pair: (-weights[pair], pair)):
         first, second = groups.name[a], groups.name[b]
         if first == second or weights[a, b] < OPTIONS.min_matches or between[first][second] <= 0:
@@ -60,35 +65,17 @@ def sound_parts(explained: Mapping[PairId, PairSupport], photos: Iterable[int]) 
         groups.join(a, b)
         larger = groups.name[a]
         smaller = second if larger == first else first
-        _merge_joins(between, larger, smaller)
+        for other, value in between.pop(smaller).items():
+            if other != larger:
+                between[larger][other] += value
+                between[other][larger] += value
+            del between[other][smaller]
     parts = [tuple(sorted(members)) for members in groups.members.values()]
     return sorted(parts, key=lambda members: (-len(members), members))
 
 
-def _joins(weights: Mapping[PairId, int]) -> defaultdict[int, Counter[int]]:
-    """Return by photo the weight of its significant pairs, by the other photo."""
-    joins: defaultdict[int, Counter[int]] = defaultdict(Counter)
-    for (a, b), value in weights.items():
-        if abs(value) >= OPTIONS.min_matches:
-            joins[a][b] += value
-            joins[b][a] += value
-    return joins
-
-
-def _merge_joins(between: defaultdict[int, Counter[int]], larger: int, smaller: int) -> None:
-    """Add the joins of a part that is now one with another."""
-    for other, value in between.pop(smaller).items():
-        if other != larger:
-            between[larger][other] += value
-            between[other][larger] += value
-        del between[other][smaller]
-
-
 def split_attempt(attempt: Attempt) -> list[Attempt]:
-    """Divide a model where more matches contradict than support its joins; return it unchanged if it has one part.
-
-    Single photos are left out, and so are small parts beside the largest one.
-    """
+    """Divide a model where more matches contradict than support its joins; small parts are left out."""
     parts = sound_parts(attempt.explained, posed_photo_ids(attempt.model))
     if len(parts) == 1:
         return [attempt]
@@ -127,7 +114,6 @@ def merge_into_main(
 def _merge_pair(
     first: Attempt, second: Attempt, matches: MatchGraph, views: ViewGraph, run: RunContext
 ) -> Attempt | None:
-    """Join both models; return None where they share too few points, or matches contradict the merge."""
     shared = shared_points(first.model, second.model, matches, views)
     if len(shared) < OPTIONS.min_shared:
         return None
@@ -166,7 +152,6 @@ def shared_points(first: Reconstruction, second: Reconstruction, matches: MatchG
 
 
 def _pairs_between(views: ViewGraph, here: set[int], there: set[int]) -> Iterator[tuple[int, int]]:
-    """Yield pairs with geometry between two sets of photos, the photo of the first set first."""
     for a, b in views.fits:
         if a in here and b in there:
             yield a, b
@@ -179,31 +164,23 @@ def _pairs_between(views: ViewGraph, here: set[int], there: set[int]) -> Iterato
 
 
 def weakly_joined_parts(model: Reconstruction) -> list[list[str]]:
-    """Return the names of photos in parts whose scale against the first part depends on too few points.
+    """Return the names of photos in parts whose scale depends on too few points, as photos join by most points."""
+    from scipy.sparse import csr_array
 
-    Photos join one by one: next is the one that sees most points which at least two joined photos see.
-    """
     with translate_errors("reading points"):
         names = {image.image_id: image.name for image in posed_images(model)}
         tracks = [{element.image_id for element in point.track.elements} for _, point in all_points(model)]
     photos = sorted(names)
-    visibility = _visibility_matrix(tracks, photos)
+    place = {photo: k for k, photo in enumerate(photos)}
+    columns = [place[photo] for track in tracks for photo in sorted(track)]
+    ends = np.cumsum([0, *map(len, tracks)])
+    visibility = csr_array((np.ones(len(columns), np.int32), columns, ends), shape=(len(tracks), len(photos)))
     parts: list[list[str]] = [[]]
     for photo, known in _joining_order(visibility):
         if known < OPTIONS.min_common_points:
             parts.append([])
         parts[-1].append(names[photos[photo]])
     return [sorted(part) for part in parts[1:]]
-
-
-def _visibility_matrix(tracks: list[set[int]], photos: list[int]) -> "csr_array":
-    """Return the matrix (N, P) with 1 where a point is seen by a photo."""
-    from scipy.sparse import csr_array
-
-    place = {photo: k for k, photo in enumerate(photos)}
-    columns = [place[photo] for track in tracks for photo in sorted(track)]
-    ends = np.cumsum([0, *map(len, tracks)])
-    return csr_array((np.ones(len(columns), np.int32), columns, ends), shape=(len(tracks), len(photos)))
 
 
 def _joining_order(visibility: "csr_array") -> list[tuple[int, int]]:
@@ -224,9 +201,7 @@ def _joining_order(visibility: "csr_array") -> list[tuple[int, int]]:
 
 
 class _Growth:
-    """Photos that have joined a model, and the points of the others in it; `seen` (P, N) is 1 where a photo sees a
-    point.
-    """
+    """Photos that have joined a model, and how many points the others share with it."""
 
     def __init__(self, visibility: "csr_array") -> None:
         self.visibility, self.by_photo = visibility, visibility.T.tocsr()
@@ -239,7 +214,6 @@ class _Growth:
         """Heap of photos by their number of known points; entries that have changed are out of date."""
 
     def best_pair(self) -> tuple[int, int]:
-        """Return the two photos that share most points."""
         from scipy.sparse import csr_array, triu
 
         together = csr_array(triu(self.by_photo @ self.visibility, k=1)).tocoo()
@@ -248,7 +222,6 @@ class _Growth:
         return (int(i[best[0]]), int(j[best[0]])) if len(best) else (0, 1)
 
     def join(self, photo: int) -> None:
-        """Add a photo."""
         own = self.by_photo.indices[self.by_photo.indptr[photo] : self.by_photo.indptr[photo + 1]]
         self.views[own] += 1
         newly_known = self.visibility[own[self.views[own] == 2]]  # the points that have just become known

@@ -49,11 +49,7 @@ from sfm_app.types import Features, PairId
 
 
 def find_features(method: FeatureMethod, names: Mapping[int, str], run: RunContext) -> None:
-    """Write the features of every photo without a part to its part, and its keypoints to the database.
-
-    Raises:
-        PluginError: the method raises, or returns invalid results.
-    """
+    """Write the features of photos without a part, and keypoints to the database; PluginError if invalid."""
     place, panoramas = run.workspace, panorama_names(run.workspace.database)
     folders = _Folders(place.photos, run.mask_dir, place.feature_parts)
     find = Task(_find_and_save, method, run.settings.matching, folders)
@@ -85,7 +81,6 @@ class _PhotoFile:
 def _find_and_save(
     method: FeatureMethod, options: MatchSettings, folders: _Folders, photo: _PhotoFile
 ) -> tuple[int, NDArray[np.float32]]:
-    """Write the features of one photo to its part, and return its id and its keypoints."""
     pixels = read_pixels(folders.photos / photo.name)
     features, to_photo, size = _find_in_photo(method, photo.name, pixels, options, panorama=photo.panorama)
     keypoints = features.keypoints * to_photo
@@ -95,7 +90,10 @@ def _find_and_save(
         unmasked = mask[row, column]
         features, keypoints = features.select(unmasked), keypoints[unmasked]
     rows = np.arange(min(len(keypoints), options.max_features))
-    _save(features.select(rows), part_path(photo.id, folders.parts))
+    features = features.select(rows)
+    values = {f"value_{name}": value for name, value in features.values.items()}
+    with replace_atomically(part_path(photo.id, folders.parts)) as beside:
+        np.savez(beside, allow_pickle=False, size=np.array(features.size), keypoints=features.keypoints, **values)
     return photo.id, keypoints[rows].astype(np.float32)
 
 
@@ -111,9 +109,8 @@ def _find_in_photo(
         scale = options.max_image_size_px / longer
         size = max(1, round(width * scale)), max(1, round(height * scale))
         pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
-    size = pixels.shape[1], pixels.shape[0]
-    features = _check_features(method, name, size, _call_find(method, name, pixels, options))
-    return features, np.array([width / size[0], height / size[1]]), (width, height)
+    features = _find_and_check(method, name, pixels, options)
+    return features, np.array([width / features.size[0], height / features.size[1]]), (width, height)
 
 
 def _find_in_views(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings) -> Features:
@@ -122,8 +119,7 @@ def _find_in_views(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], 
     views = PanoramaViews.cover(size, options.max_image_size_px)
     pixels, parts, ranks = views.shrink(pixels), [], []
     for view in range(len(views.rotations)):
-        picture = views.render(pixels, view)
-        features = _check_features(method, name, (views.side_px,) * 2, _call_find(method, name, picture, options))
+        features = _find_and_check(method, name, views.render(pixels, view), options)
         own = np.flatnonzero(views.is_nearest(features.keypoints, view))
         keypoints = views.to_panorama(features.keypoints[own], view)
         parts.append(Features(size, keypoints, features.select(own).values))
@@ -134,11 +130,7 @@ def _find_in_views(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], 
 
 
 def read_pixels(path: Path) -> NDArray[np.uint8]:
-    """Return (H, W, 3) RGB of a photo in the workspace.
-
-    Raises:
-        InputError: it can no longer be read.
-    """
+    """Return (H, W, 3) RGB of a photo in the workspace; InputError if it can no longer be read."""
     data = np.fromfile(path, np.uint8)
     pixels = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     if pixels is None:
@@ -146,17 +138,14 @@ def read_pixels(path: Path) -> NDArray[np.uint8]:
     return np.asarray(pixels, np.uint8)
 
 
-def _call_find(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings) -> Features:
+def _find_and_check(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings) -> Features:
     if method.find is None:
         raise PluginError(f"the features '{method.name}' have no `find`")
     try:
-        return method.find(pixels, options)
+        features = method.find(pixels, options)
     except Exception as err:  # a plug-in may raise anything
         raise _method_error(method, f"failed on {name}: {type(err).__name__}: {err}") from err
-
-
-def _check_features(method: FeatureMethod, name: str, size: tuple[int, int], features: Features) -> Features:
-    """Return the features after checking that they are valid for a picture of this size."""
+    size = pixels.shape[1], pixels.shape[0]
     points = np.asarray(features.keypoints, np.float64)
     if features.size != size:
         raise _method_error(method, f"report a size of {features.size} for {name} instead of {size}")
@@ -168,19 +157,12 @@ def _check_features(method: FeatureMethod, name: str, size: tuple[int, int], fea
 
 
 def _method_error(method: FeatureMethod, what: str) -> PluginError:
-    """Return the error of a feature method, of which `what` says what it did."""
     return PluginError(f"the features '{method.name}' {what}", hint="choose others with --features")
 
 
 def part_path(photo: int, folder: Path) -> Path:
     """Return the file that keeps the features of a photo until all are matched."""
     return folder / f"{photo:06d}.npz"
-
-
-def _save(features: Features, path: Path) -> None:
-    values = {f"value_{name}": value for name, value in features.values.items()}
-    with replace_atomically(path) as beside:
-        np.savez(beside, allow_pickle=False, size=np.array(features.size), keypoints=features.keypoints, **values)
 
 
 def load_features(photo: int, folder: Path) -> Features:
@@ -196,10 +178,7 @@ def load_features(photo: int, folder: Path) -> Features:
 
 
 def cut_pairs(pairs: Sequence[PairId], size: int) -> list[list[PairId]]:
-    """Return all pairs in chunks of `size` > 0, the last of which may be smaller.
-
-    The order of the pairs and that within a pair do not change the chunks.
-    """
+    """Return all pairs in chunks of `size` > 0, the last perhaps smaller, whatever the order of the pairs."""
     names = sorted({photo for pair in pairs for photo in pair})
     number = {name: k for k, name in enumerate(names)}
     remaining: list[dict[int, PairId]] = [{} for _ in names]
@@ -260,12 +239,7 @@ Item = TypeVar("Item")
 
 
 def find_in_chunks(sift: Mapping[str, SiftOption], names: Sequence[str], run: RunContext) -> dict[str, Json]:
-    """Find features of photos on a cluster, except those in the database; return the options in force.
-
-    Raises:
-        BackendError: COLMAP failed.
-        ClusterError: the cluster is gone.
-    """
+    """Find features of photos that have none on a cluster; return the options in force. Errors as `match_in_chunks`."""
     chosen = set(names)
     missing = [name for name in photos_without_features(run.workspace.database).values() if name in chosen]
     parts = chunks(missing, CHUNKS.most_photos, run.spread)
@@ -301,8 +275,6 @@ def match_in_chunks(sift: Mapping[str, SiftOption], pairs: Sequence[PairId] | No
 
 
 class _PairCounter(SilentProgress):
-    """Progress of several processes on one bar."""
-
     def __init__(self, progress: Progress) -> None:
         self._progress, self._lock = progress, Lock()
 
@@ -330,7 +302,6 @@ def _do_in_chunks(
     sift: Mapping[str, SiftOption],
     run: RunContext,
 ) -> dict[str, Json]:
-    """Let workers do chunks, and enter their rows in order."""
     place, label = run.workspace, "matching" if tables is MATCHES else "features"
     folder, in_force = place.sift_rows, dict[str, Json]()
     shutil.rmtree(folder, ignore_errors=True)
@@ -350,7 +321,6 @@ def _do_in_chunks(
 
 
 def _write_inputs(folder: Path, sift: Mapping[str, SiftOption], run: RunContext, *, with_features: bool) -> SiftInputs:
-    """Write the snapshots that workers read."""
     place, folder = run.workspace, folder.absolute()
     folder.mkdir(parents=True)
     inputs = SiftInputs(
@@ -407,9 +377,7 @@ def find_all_features(method: FeatureMethod, run: RunContext, pairs: Sequence[Pa
 
 
 def match_pairs(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Json]:
-    """Match pairs of photos with known features, except those of a killed run; arguments and errors as in
-    `fill_database`.
-    """
+    """Match pairs of photos with known features, except those of a killed run; see `fill_database`."""
     place, options = run.workspace, run.settings.matching
     if pairs is not None and not pairs:
         return {}
@@ -434,7 +402,6 @@ def all_pairs(photos: Sequence[int] | Mapping[int, str]) -> list[PairId]:
 
 
 def _match(method: FeatureMethod, pairs: Sequence[PairId], run: RunContext) -> None:
-    """Write the matches of every pair into the database, also where there are none."""
     options, database = run.settings.matching, run.workspace.database
     reader = FeatureReader(run.workspace.feature_parts, max(CHUNKS.photos_in_memory, 2 * run.workers))
     match = Task(_read_and_match, method, options, Shared(reader))

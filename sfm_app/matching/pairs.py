@@ -82,15 +82,15 @@ OPTIONS = PairChoiceOptions()
 def first_pairs(
     images: Mapping[int, MatchedImage], read: ReadDescriptors, run: RunContext, choosers: Collection[int] | None = None
 ) -> list[PairId]:
-    """Choose pairs by what the photos show, and by name, time and GPS; `read` is called in several threads.
-
-    `choosers` are the photos that need partners, None for all.
-    """
+    """Choose pairs by content, name, time and GPS; `read` is called in threads. Only `choosers` need partners."""
     options = run.settings.matching
     photos, count = sorted(images), options.neighbors
     steps: Sequence[int] = OPTIONS.steps
     if options.pairs == "sequence":
-        count, steps = max(1, round((1 - OPTIONS.sequence_share) * count)), sequence_steps(count)
+        # half of the neighbors are adjacent, the others at doubling distances
+        near = max(2, round(OPTIONS.sequence_share * count / 2))
+        steps = (*range(1, near + 1), *(near * 2**k for k in range(1, 4)))
+        count = max(1, round((1 - OPTIONS.sequence_share) * count))
     chosen = pairs_in_order(list(images.values()), steps) | pairs_nearby(list(images.values()), OPTIONS.nearest_by_gps)
     return sorted(chosen | _similar_pairs(photos, read, count, run, choosers))
 
@@ -98,7 +98,6 @@ def first_pairs(
 def _similar_pairs(
     photos: Sequence[int], read: ReadDescriptors, count: int, run: RunContext, choosers: Collection[int] | None
 ) -> set[PairId]:
-    """Return pairs of similar photos, some for each photo."""
     largest = run.map(read, photos, "largest features")
     pooled = pool_descriptors(largest, OPTIONS.pooled)
     if not len(pooled):
@@ -114,12 +113,6 @@ def _similar_pairs(
     scores = {pair: count for part in parts for pair, count in part.items()}
     sure = choose_by_rank(scores, 1, max(1, round(OPTIONS.sure_share * count)), choosers)
     return sure | choose_by_rank(scores, round(OPTIONS.preview_share * OPTIONS.preview_features), count, choosers)
-
-
-def sequence_steps(count: int) -> tuple[int, ...]:
-    """Return the steps to the neighbors in a sequence: half of them adjacent, the others at doubling distances."""
-    near = max(2, round(OPTIONS.sequence_share * count / 2))
-    return (*range(1, near + 1), *(near * 2**k for k in range(1, 4)))
 
 
 def second_pairs(

@@ -101,10 +101,7 @@ def refine_direction(pair: Pair, R: FloatArray, t: FloatArray) -> FloatArray:
 
 
 def sample_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> FloatArray | None:
-    """Estimate the direction of translation (3,) that most matches agree with, given R.
-
-    It is the best of the directions from samples of two matches each; None if no sample gives one.
-    """
+    """Estimate the direction of translation (3,) by samples of two matches, given R; None if no sample gives one."""
     normals = _epipolar_normals(pair, R)
     picks = rng.integers(len(normals), size=(GUIDED.samples, 2))
     directions = np.cross(normals[picks[:, 0]], normals[picks[:, 1]])
@@ -162,10 +159,7 @@ def build_pose_graph(
     matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, options: PoseGraphOptions, run_map: ParallelMap,
     known: Mapping[PairId, RelativePose] = NO_POSES,
 ) -> PoseGraph:  # fmt: skip
-    """Build the graph of relative poses, without contradicting pairs, and with rejected pairs that others recover.
-
-    Poses in `known` are those of a model, and not estimated again.
-    """
+    """Build the graph of relative poses without contradicting pairs; `known` poses are not estimated again."""
     estimator = _PoseEstimator(matches, intrinsics, options)
     fits = {pair: fit for pair, fit in views.fits.items() if pair not in known}
     estimates = dict(zip(fits, run_map(estimator.from_fit, list(fits.items()), "relative poses"), strict=True))
@@ -195,8 +189,6 @@ def build_pose_graph(
 
 
 class _PoseEstimator:
-    """Relative poses of pairs, from their fits or from the rotations of their photos."""
-
     def __init__(self, matches: MatchGraph, intrinsics: Intrinsics, options: PoseGraphOptions) -> None:
         self.matches, self.intrinsics, self.options = matches, intrinsics, options
         self.rotations: Mapping[int, FloatArray] = {}
@@ -243,7 +235,6 @@ def with_model(graph: PoseGraph, photos: Collection[int], poses: Mapping[PairId,
 def _pairs_without_pose(
     pairs: Iterable[PairId], poses: Mapping[PairId, RelativePose], known: Collection[PairId]
 ) -> list[PairId]:
-    """Return the pairs without a pose whose photos other pairs connect, unless known pairs have both."""
     known_photos = {photo for pair in known for photo in pair}
     pairs = [pair for pair in pairs if not known_photos.issuperset(pair)]
     group = {photo: number for number, photos in enumerate(_groups(poses)) for photo in photos}
@@ -263,10 +254,7 @@ def _contradicting_pairs(poses: Mapping[PairId, RelativePose], angles: Mapping[P
 def average_pair_rotations(
     poses: Mapping[PairId, RelativePose], flat: Collection[PairId] = ()
 ) -> tuple[dict[int, FloatArray], dict[PairId, float]]:
-    """Average the rotations of pairs, weighted by inliers, to those of photos; return these and the angle of each pair.
-
-    Pairs in `flat`, which do not determine F, get little weight.
-    """
+    """Average the rotations of pairs, of little weight if `flat`, to those of photos; return these and the angles."""
     weights = {
         pair: pose.inlier_count
         / (1.0 + pose.inlier_count / OPTIONS.saturation_inliers)
@@ -277,10 +265,7 @@ def average_pair_rotations(
 
 
 def _unconfirmed_pairs(poses: Mapping[PairId, RelativePose], firm: float) -> list[PairId]:
-    """Return the pairs with fewer than `firm` inliers that no loop of three photos confirms.
-
-    Such pairs may join look-alikes, with no other pair to contradict them.
-    """
+    """Return the pairs with fewer than `firm` inliers that no loop confirms: they may join look-alikes."""
     photos = sorted({photo for pair in poses for photo in pair})
     edges = np.searchsorted(photos, np.array(list(poses), np.int64).reshape(-1, 2))
     loops, agree = check_loops(edges, np.array([pose.R for pose in poses.values()]).reshape(-1, 3, 3))

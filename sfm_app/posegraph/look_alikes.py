@@ -209,10 +209,7 @@ class Depths:
         return self.known[photo, other]
 
     def merge_depths(self, photo: int, trusted: Iterable[int], doubted: Iterable[int]) -> tuple[FloatArray, Scales]:
-        """Return (K,) logarithms of depths from trusted pairs, NaN if there is none, and the log scale of each pair.
-
-        Pairs with `doubted` photos only get a scale.
-        """
+        """Return (K,) log depths from trusted pairs, NaN for none, and the log scale of each, also doubted ones."""
         total = np.zeros((2, len(self.matches.keypoints[photo])))
         scales: Scales = {}
         known = {other: self.pair_depths(photo, other) for other in trusted}
@@ -236,13 +233,9 @@ class Depths:
             return np.where(total[1] > 0, total[0] / total[1], np.nan), scales
 
     def expected_points(self, photo: int, other: int, points: IndexArray, logs: FloatArray) -> IndexArray:
-        """Return the points of a photo that the other one must show if their pair is right.
-
-        Args:
-            points: (N,) keypoints.
-            logs: (N,) logarithms of their depths in the scale of the pair.
-        """
-        R, t = _directed_pose(self.poses, photo, other)
+        """Return the keypoints that another photo must show if their pair, with log depths (N,), is right."""
+        pose = self.poses[min(photo, other), max(photo, other)]
+        R, t = (pose.R, pose.t) if photo < other else (pose.R.T, -pose.R.T @ pose.t)
         rays_here = self.keypoint_bearings(photo)[points, FIRST]
         z = np.exp(logs)
         rotated = rays_here @ R.T
@@ -263,12 +256,7 @@ def is_well_inside(x: FloatArray, width: int, height: int) -> NDArray[np.bool_]:
 
 
 def is_matched_again(size_ratios: FloatArray, cosines: FloatArray) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the points that look enough alike in two photos for matching.
-
-    Args:
-        smaller: (N,) size in the first photo over that in the second.
-        cosines: (N,) of the angles between the two viewing rays.
-    """
+    """Return a mask (N,) of the points that look alike in two photos, by ratios of sizes and cosines of rays."""
     alike = (
         (size_ratios < OPTIONS.max_scale)
         & (size_ratios > 1.0 / OPTIONS.max_scale)
@@ -278,10 +266,7 @@ def is_matched_again(size_ratios: FloatArray, cosines: FloatArray) -> NDArray[np
 
 
 def count_missing_cells(photo: int, joined: Iterable[int], trusted: Iterable[int], places: Depths) -> tuple[int, int]:
-    """Count the cells of a photo that the photos `joined` should show, and those of them without a match.
-
-    The depths are those of the pairs with the photos `trusted`.
-    """
+    """Count the cells that photos `joined` should show, by depths with `trusted` ones, and those without a match."""
     visibility, others = places.visibility, sorted(joined)
     logs, scales = places.merge_depths(photo, sorted(trusted), others)
     points = np.flatnonzero(~np.isnan(logs))
@@ -294,13 +279,6 @@ def count_missing_cells(photo: int, joined: Iterable[int], trusted: Iterable[int
     cells, counts = np.unique(visibility.cells[photo][expected], return_counts=True)
     cells = cells[counts >= OPTIONS.min_cell_points]
     return len(cells), int(np.count_nonzero(~np.isin(cells, visibility.cells[photo][matched])))
-
-
-def _directed_pose(poses: Mapping[PairId, RelativePose], photo: int, other: int) -> tuple[FloatArray, FloatArray]:
-    if photo < other:
-        return poses[photo, other].R, poses[photo, other].t
-    pose = poses[other, photo]
-    return pose.R.T, -pose.R.T @ pose.t
 
 
 def _count_common(end: PairDepths, total: FloatArray) -> int:
@@ -363,7 +341,9 @@ def find_look_alikes(
         return LookAlikeVerdict((), (), tracks)
     trusted = best | {pair for pair, rows in rows_of.items() if _is_confirmed(*tracks.count_agreement(pair, rows))}
     places = Depths(matches, cameras, poses, visibility)
-    rotations = _photo_rotations(trusted, poses)
+    along = {pair: poses[pair] for pair in sorted(trusted)}
+    weights = {pair: float(pose.inlier_count) for pair, pose in along.items()}
+    rotations, _ = average_rotations({pair: pose.R for pair, pose in along.items()}, weights)
     partners = _partners(trusted)
     judged = [_judge_join(join, partners, rotations, places) for join in group_doubted_pairs(doubted, trusted)]
     joins = [join for join, verdict in judged if verdict == ALIKE]
@@ -375,7 +355,6 @@ def find_look_alikes(
 
 
 def _build_tracks(visibility: Visibility, pairs: Iterable[PairId]) -> FeatureTracks:
-    """Join the keypoints of pairs into tracks."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -395,10 +374,7 @@ def _build_tracks(visibility: Visibility, pairs: Iterable[PairId]) -> FeatureTra
 
 
 def group_doubted_pairs(doubted: Iterable[PairId], trusted: Iterable[PairId]) -> list[tuple[PairId, ...]]:
-    """Group doubted pairs that join the same two places.
-
-    At both ends, their photos are the same or joined by a trusted pair.
-    """
+    """Group doubted pairs that join the same two places: their photos are the same or joined by a trusted pair."""
     neighbors = _partners(trusted)
     waiting, groups = dict.fromkeys(sorted(doubted)), []
     while waiting:
@@ -435,7 +411,6 @@ def _is_confirmed(same: int, tracked: int) -> bool:
 
 
 def _partners(pairs: Iterable[PairId]) -> dict[int, set[int]]:
-    """Return the other photos of the pairs of each photo."""
     partners: dict[int, set[int]] = {}
     for a, b in pairs:
         partners.setdefault(a, set()).add(b)
@@ -446,7 +421,6 @@ def _partners(pairs: Iterable[PairId]) -> dict[int, set[int]]:
 def _judge_join(
     join: tuple[PairId, ...], partners: Mapping[int, set[int]], rotations: Mapping[int, FloatArray], places: Depths
 ) -> tuple[LookAlikes, str]:
-    """Judge a join; return it with its share of missing cells, and the verdict."""
     claimed = _partners(join)
     counts = [
         count_missing_cells(photo, claimed[photo], partners[photo], places)
@@ -462,13 +436,6 @@ def _judge_join(
     alike = len(shares) >= OPTIONS.min_photos and float(np.percentile(shares, OPTIONS.low_percentile)) > limit
     verdict = ALIKE if alike else LOOP if same_turn else EITHER
     return LookAlikes(join, missing / max(expected, 1)), verdict
-
-
-def _photo_rotations(trusted: Iterable[PairId], poses: Mapping[PairId, RelativePose]) -> dict[int, FloatArray]:
-    """Return the rotations of photos along the trusted pairs."""
-    known = {pair: poses[pair] for pair in sorted(trusted)}
-    weights = {pair: float(pose.inlier_count) for pair, pose in known.items()}
-    return average_rotations({pair: pose.R for pair, pose in known.items()}, weights)[0]
 
 
 def _rotation_gap_deg(join: tuple[PairId, ...], rotations: Mapping[int, FloatArray], places: Depths) -> float:

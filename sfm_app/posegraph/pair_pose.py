@@ -87,12 +87,7 @@ def planar_starts(used: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
 
 
 def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield R and t of a camera that turned about the middle of the scene, for every turn of the options.
-
-    Args:
-        used: (N, 4) inliers as points of the plane z = 1, view 1 and view 2.
-        E: (3, 3) of any scale; only the directions of its epipolar lines through the middle are used.
-    """
+    """Yield R and t of a camera that turned about the scene, by the directions of the lines of E in its middle."""
     if not len(used):  # panoramas that look away from each other
         return
     middles = np.median(used, axis=0)
@@ -129,11 +124,7 @@ _DIFFERENCE_STEP = 1e-6
 
 
 def refine_pose(lines: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Refine R (3, 3) and t (3,) by robust least squares of Sampson distances (Levenberg-Marquardt).
-
-    Args:
-        lines: (N, 18) matches as bearing vectors with derivatives (`camera.bearings`), view 1 and view 2.
-    """
+    """Refine R (3, 3) and t (3,) for bearing vectors (N, 18) by robust least squares of Sampson distances."""
     pose = np.concatenate([R.ravel(), t / np.linalg.norm(t)])
     for sigma in SIGMAS_PX:
         pose = _descend(lines, pose, sigma)
@@ -225,7 +216,6 @@ def _descend(lines: FloatArray, pose: FloatArray, sigma: float) -> FloatArray:
 
 @kernel
 def _solve(A: FloatArray, b: FloatArray, damping: float) -> FloatArray:
-    """Solve the damped system by Cholesky's decomposition."""
     L, x = np.zeros((POSE_DOF, POSE_DOF)), np.empty(POSE_DOF)
     for i in range(POSE_DOF):
         for j in range(i + 1):
@@ -252,12 +242,7 @@ Pose = tuple[FloatArray, FloatArray]
 
 
 class Pair:
-    """The matches of a pair as bearing vectors of its cameras.
-
-    Args:
-        points: x1, x2, each (M, 2) pixels: all matches of the pair.
-        max_error_px: largest Sampson distance of an inlier.
-    """
+    """All matches of a pair, (M, 2) pixels each, as bearing vectors of its cameras; `max_error_px` of an inlier."""
 
     def __init__(
         self, points: tuple[FloatArray, FloatArray], cameras: Sequence[Calibration], max_error_px: float
@@ -276,11 +261,13 @@ class Pair:
 
     def essential_matrix(self, fit: EpipolarFit) -> FloatArray:
         """Return E from F and the cameras, with singular values that noise makes unequal."""
-        first, second = self.cameras
-        if any(camera.projection != PERSPECTIVE for camera in self.cameras):
-            return _essential_of_rays(self.lines[fit.inliers])
+        (first, second), inliers = self.cameras, self.lines[fit.inliers]
+        if any(camera.projection != PERSPECTIVE for camera in self.cameras):  # by eight points with errors in pixels
+            E = fit_rays(inliers[:, FIRST], inliers[:, SECOND])
+            for _ in range(OPTIONS.reweighted_fits):
+                E = fit_rays(inliers[:, FIRST], inliers[:, SECOND], gradients(E, inliers) ** -2.0)
+            return E
         if first.is_bent or second.is_bent:  # F does not model distortion
-            inliers = self.lines[fit.inliers]
             return eight_point(inliers[:, :2], inliers[:, 9:11])
         return second.K.T @ fit.F @ first.K
 
@@ -315,10 +302,7 @@ class Pair:
 
 
 def estimate_pose(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
-    """Estimate the relative pose of a fundamental matrix; None if too few matches agree with it.
-
-    If a camera is a guess, E is wrong by as much as the guess, and the inliers of F stay.
-    """
+    """Estimate the relative pose of F; None if too few matches agree. With a guessed camera, the inliers of F stay."""
     R, t = pair.initial_pose(fit)
     if not pair.trusted:
         return pair.pose(R, t, fit.inliers)
@@ -367,7 +351,6 @@ def _is_known(pose: Pose, tried: Sequence[Pose]) -> bool:
 
 
 def _pose_cost(used: FloatArray, R: FloatArray, t: FloatArray) -> float:
-    """Return the cost that `refine_pose` minimizes at its last scale."""
     return float(np.sum(np.log1p((pose_distances(used, R, t) / SIGMAS_PX[-1]) ** 2)))
 
 
@@ -388,11 +371,3 @@ def points_ahead(used: FloatArray) -> FloatArray:
     """Return (M, 4) points of the planes z = 1 of both views, of the matches (N, 18) far ahead in both."""
     ahead = (used[:, 2] > OPTIONS.min_cosine_ahead) & (used[:, 11] > OPTIONS.min_cosine_ahead)
     return np.hstack([used[ahead, 0:2] / used[ahead, 2:3], used[ahead, 9:11] / used[ahead, 11:12]])
-
-
-def _essential_of_rays(used: FloatArray) -> FloatArray:
-    """Return E (3, 3) of inliers (N, 18), by eight points with errors in pixels."""
-    E = fit_rays(used[:, FIRST], used[:, SECOND])
-    for _ in range(OPTIONS.reweighted_fits):
-        E = fit_rays(used[:, FIRST], used[:, SECOND], gradients(E, used) ** -2.0)
-    return E

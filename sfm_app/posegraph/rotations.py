@@ -19,15 +19,10 @@ from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 if TYPE_CHECKING:
     from scipy import sparse
-    from scipy.spatial.transform import Rotation
 
 
 class DisjointGroups:
-    """Photos in groups that are joined one by one; the smaller of two groups is added to the larger.
-
-    Args:
-        photos: each starts as a group of its own.
-    """
+    """Photos in groups that are joined one by one; the smaller of two groups is added to the larger."""
 
     def __init__(self, photos: Iterable[int]) -> None:
         self.members = {photo: [photo] for photo in photos}
@@ -62,18 +57,18 @@ def connected_groups(pairs: Iterable[PairId], photos: Iterable[int] = ()) -> lis
 
 @dataclass(frozen=True, slots=True)
 class CorrectionOptions:
-    """When a part of the photos is turned."""
+    """When a part of the photos is turned. Chosen by hand."""
 
     contradicts_deg: float = 10.0
     """Angle from which a pair contradicts the rotations. Chosen by hand: right pairs are below 5 degrees."""
     same_deg: float = 5.0
-    """Angle up to which two pairs ask for the same turn. Chosen by hand."""
+    """Angle up to which two pairs ask for the same turn."""
     min_pairs: int = 3
-    """Contradicting pairs that have to agree on a turn. Chosen by hand."""
+    """Contradicting pairs that have to agree on a turn."""
     unit: float = 1000.0
-    """Flows are whole numbers of the largest weight over this. Chosen by hand."""
+    """Flows are whole numbers of the largest weight over this."""
     max_turns: int = 20
-    """Most parts of a graph that turn. Chosen by hand."""
+    """Most parts of a graph that turn."""
 
 
 CORRECTIONS = CorrectionOptions()
@@ -94,20 +89,17 @@ class RotationCorrection:
 def find_corrections(
     count: int, edges: IndexArray, residuals: FloatArray, strengths: FloatArray
 ) -> Iterator[RotationCorrection]:
-    """Yield corrections that satisfy more than they break, those of the strongest contradictions first.
-
-    Args:
-        edges: (E, 2) numbers of photos below `count`.
-        residuals: (E, 3) rotation vectors of R_j' R_ij R_i.
-        strengths: (E,) weights.
-    """
+    """Yield corrections that satisfy more than they break, strongest first; residuals (E, 3) are of R_j' R_ij R_i."""
     from scipy.spatial.transform import Rotation
 
     explained = np.degrees(np.linalg.norm(residuals, axis=1)) <= CORRECTIONS.contradicts_deg
     unexplained, turns = ~explained, Rotation.from_rotvec(residuals)
     while unexplained.any():
         seed = int(np.argmax(np.where(unexplained, strengths, -1.0)))
-        alike, reverse = (unexplained & _is_small(turns * turn) for turn in (turns[seed].inv(), turns[seed]))
+        alike, reverse = (
+            unexplained & (np.degrees((turns * turn).magnitude()) < CORRECTIONS.same_deg)
+            for turn in (turns[seed].inv(), turns[seed])
+        )
         group = _find_linked(count, edges, alike | reverse, seed)
         unexplained &= ~group
         if np.count_nonzero(group) < CORRECTIONS.min_pairs:
@@ -119,10 +111,6 @@ def find_corrections(
         gain = float(strengths[group].sum()) - cut_weight
         if gain > 0.0:
             yield RotationCorrection(~side, turns[seed].as_matrix(), gain)
-
-
-def _is_small(turns: "Rotation") -> BoolArray:
-    return np.asarray(np.degrees(turns.magnitude()) < CORRECTIONS.same_deg, np.bool_)
 
 
 def _find_linked(count: int, edges: IndexArray, chosen: BoolArray, seed: int) -> BoolArray:
@@ -138,13 +126,7 @@ def _find_linked(count: int, edges: IndexArray, chosen: BoolArray, seed: int) ->
 def find_cut(
     count: int, edges: IndexArray, strengths: FloatArray, ends: tuple[IndexArray, IndexArray]
 ) -> tuple[BoolArray, float]:
-    """Return a mask of the photos on the side of the first ends, and the weight of the pairs across; inf without a cut.
-
-    Args:
-        edges: (E, 2) numbers of photos below `count`.
-        strengths: (E,) weights.
-        ends: (K,) photos that must be on the one side, and (L,) on the other.
-    """
+    """Return a mask of the photos on the side of the first ends, and the weight across; inf without a cut."""
     from scipy import sparse
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
@@ -205,15 +187,7 @@ AVERAGING = AveragingOptions()
 def average_rotations(
     relative: Mapping[PairId, FloatArray], weights: Mapping[PairId, float]
 ) -> tuple[dict[int, FloatArray], dict[PairId, float]]:
-    """Estimate the rotations of all photos, and the angle of each pair to them.
-
-    Args:
-        relative: by pair (3, 3), the rotation of photo 2 from photo 1.
-        weights: by pair, > 0.
-
-    Returns:
-        By photo, (3, 3) from the world, whose axes are those of the first photo of each group; by pair, degrees.
-    """
+    """Estimate the rotations (3, 3) of all photos from those of pairs, and the angle of each pair in degrees."""
     if not relative:
         return {}, {}
     photos = sorted({photo for pair in relative for photo in pair})
@@ -251,7 +225,6 @@ def _descend(
 def _apply_corrections(
     rotations: FloatArray, edges: IndexArray, turns: FloatArray, strengths: FloatArray
 ) -> FloatArray:
-    """Return the rotations after corrections that lower the robust cost."""
     for _ in range(CORRECTIONS.max_turns):
         residuals = _residuals(rotations, edges, turns)
         for correction in find_corrections(len(rotations), edges, residuals, strengths):
@@ -271,14 +244,7 @@ def _robust_cost(residuals: FloatArray, strengths: FloatArray) -> float:
 
 
 def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> FloatArray:
-    """Return (E,), in (0, 1], the share of the loops of three through each pair that agree; 1 if there is no loop.
-
-    A loop weighs as much as the weaker of the two other pairs in it.
-
-    Args:
-        edges: (E, 2) numbers of photos, the smaller first.
-        turns: (E, 3, 3) rotation of photo 2 from photo 1.
-    """
+    """Return (E,), in (0, 1], the share of the loops through each pair that agree, by their weaker other pair."""
     loops, agree = check_loops(edges, turns)
     sums = np.zeros((2, len(edges)))
     for column, others in ((0, (1, 2)), (1, (0, 2)), (2, (0, 1))):
@@ -290,12 +256,7 @@ def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) ->
 
 
 def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArray[np.bool_]]:
-    """Return (L, 3) numbers of the edges of every loop of three photos, and (L,) whether their rotations agree.
-
-    Args:
-        edges: (E, 2) numbers of photos, the smaller first.
-        turns: (E, 3, 3) rotation of photo 2 from photo 1.
-    """
+    """Return (L, 3) edges of every loop of three photos, and whether it agrees; edges have the smaller photo first."""
     from scipy.spatial.transform import Rotation
 
     order = np.lexsort(edges.T[::-1])
@@ -313,12 +274,7 @@ def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArr
 
 @kernel
 def _find_loops(edges: IndexArray, starts: IndexArray) -> IndexArray:
-    """Return (L, 3) numbers of the edges a-b, b-c and a-c of every three photos a < b < c that are all connected.
-
-    Args:
-        edges: (E, 2) sorted, the smaller photo first; E > 0.
-        starts: first edge from each photo, and from one after the last.
-    """
+    """Return (L, 3) sorted edges a-b, b-c and a-c of every triangle; `starts` has the first edge from each photo."""
     loops, count = np.empty((len(edges), 3), np.int64), 0
     for k in range(len(edges)):
         a, b = edges[k]

@@ -17,10 +17,10 @@ thesis (5.23) and (5.24) in Algorithm 3.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
+from sfm_app.fundamental.solvers import mirror
 from sfm_app.geometry.least_squares import DampingRange, damped_step, solve_each
 from sfm_app.geometry.poses import POSE_DOF, retract, write_essential
 from sfm_app.jit import kernel
@@ -86,15 +86,7 @@ def _distance(p: FloatArray, q: FloatArray, E: FloatArray) -> float:
 def distances(
     matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray
 ) -> FloatArray:
-    """Return (M,) signed Sampson distances, in the units of the matches.
-
-    Args:
-        matches: (M, 4) of all pairs, one after the other.
-        ends: (P + 1,) first match of each pair, and the end of the last.
-        thetas: (C, 5) parameters of the cameras.
-        cameras: (P, 2) camera of view 1 and of view 2.
-        poses: (P, 12), see `write_essential`.
-    """
+    """Return (M,) signed Sampson distances; pair k has the matches ends[k] to ends[k + 1] - 1."""
     E, first, second = np.empty((3, 3)), np.empty(5), np.empty(5)
     p, q = np.empty(7), np.empty(7)
     signed = np.empty(len(matches))
@@ -127,11 +119,9 @@ def pair_costs(
 def pair_systems(
     matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray, sigma: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return Gauss-Newton systems of all pairs in their fifteen parameters; arguments as `distances`.
+    """Return the Gauss-Newton systems (P, 15, 15) and (P, 15) of all pairs over camera 1, camera 2 and pose.
 
-    Returns:
-        (P, 15, 15) approximate Hessians of the costs and (P, 15) negative gradients, over camera 1, camera 2 and pose.
-        Where both views are of one camera, all of its entries are in the first five rows and columns.
+    Where both views are of one camera, all of its entries are in the first five rows and columns.
     """
     A, b = np.zeros((len(poses), PAIR, PAIR)), np.zeros((len(poses), PAIR))
     # derivatives are finite differences: index 0 is unchanged, 1 to 5 have one parameter moved
@@ -149,7 +139,7 @@ def pair_systems(
             r = _write_derivatives(rays, Es, sigma, shared, J)
             if _is_finite(r, J):
                 _add_match(A[k], b[k], J, r, (1.0 + r * r / ROBUST_SCALE**2) ** -2)
-        _mirror(A[k])
+        mirror(A[k])
     return A, b
 
 
@@ -187,13 +177,7 @@ def _write_rays(x: float, y: float, lenses: FloatArray, rays: FloatArray) -> Non
 
 @kernel
 def _write_derivatives(rays: FloatArray, Es: FloatArray, sigma: float, shared: bool, J: FloatArray) -> float:
-    """Return the distance r of one match in sigma, and write dr over the fifteen parameters into `J` (15,).
-
-    Args:
-        rays: (2, 6, 7) from `_write_rays`, per view.
-        Es: (6, 3, 3) from `_write_poses`.
-        shared: both views are of one camera: both rays move with its first five parameters, and J[5:10] stays.
-    """
+    """Return the distance r of one match in sigma, and write its derivatives to `J` (15,); `shared` is one camera."""
     r = _distance(rays[0, 0], rays[1, 0], Es[0]) / sigma
     for j in range(CAMERA):
         if shared:
@@ -213,14 +197,6 @@ def _is_finite(r: float, J: FloatArray) -> bool:
     for j in range(PAIR):
         total += abs(J[j])
     return bool(total < OVERFLOW_LIMIT)
-
-
-@kernel
-def _mirror(A: FloatArray) -> None:
-    """Copy the lower triangle to the upper one."""
-    for i in range(PAIR):
-        for j in range(i):
-            A[j, i] = A[i, j]
 
 
 @kernel
@@ -276,15 +252,10 @@ class Information:
 
 
 class Matches:
-    """Inliers of all pairs, concatenated.
+    """Inliers of all pairs, concatenated, at most `most` of a pair.
 
-    Args:
-        inliers: per pair (N, 4), from the middle of each photo, in longer sides of the largest photo.
-        cameras: (P, 2) numbers of the cameras, from 0.
-        photos: (P, 2) numbers of the photos.
-        unit_px: length of that unit, in pixels.
-        most: most matches of one pair, evenly chosen.
-        count: number of cameras.
+    `inliers` (N, 4) are from the middle of each photo, in longer sides of the largest photo: `unit_px`. `cameras` and
+    `photos` (P, 2) are numbers; there are `count` cameras.
     """
 
     def __init__(
@@ -306,11 +277,7 @@ class Matches:
 
     @cached_property
     def redundancy(self) -> float:
-        """Number of matches per independent error, >= 1.
-
-        One keypoint in m photos gives m (m - 1) / 2 matches, but 2 m - 3 independent errors. The number of matches per
-        keypoint determines m.
-        """
+        """Matches per error, >= 1: one keypoint in m photos gives m (m - 1) / 2 matches, but 2 m - 3 errors."""
         if len(self.points) == 0:
             return 1.0
         photos = self.photos.repeat(np.diff(self.ends), axis=0)
@@ -343,10 +310,7 @@ class Matches:
         )
 
     def noise(self, state: State) -> float:
-        """Return the standard deviation of the distances in agreeing pairs, from their median.
-
-        A pose absorbs five of a pair's degrees of freedom: the distances of few matches are smaller than their errors.
-        """
+        """Return the standard deviation of distances in agreeing pairs; a pose absorbs five degrees of freedom."""
         counts = np.diff(self.ends)
         residuals = np.abs(distances(self.points, self.ends, state.thetas, self.cameras, state.poses))
         residuals *= np.repeat(np.sqrt(counts / np.maximum(counts - POSE_DOF, 1)), counts)
@@ -418,30 +382,14 @@ def _weigh_pairs(state: State, system: tuple[FloatArray, FloatArray]) -> State:
     return replace(state, weights=(1.0 + gains / (ADJUSTMENT.conflict * scale)) ** -2, scale=scale)
 
 
-class ReducedSystem(NamedTuple):
-    """Normal equations of P pairs reduced to their cameras, and the terms for back substitution of the poses."""
-
-    hessians: FloatArray
-    """(P, 10, 10) U - W V^-1 W'."""
-    gradients: FloatArray
-    """(P, 10) b_cameras - W V^-1 b_pose."""
-    pose_by_cameras: FloatArray
-    """(P, 5, 10) V^-1 W': its product with the cameras' step is subtracted from the pose's step."""
-    pose_alone: FloatArray
-    """(P, 5) V^-1 b_pose: the pose's step if the cameras do not move."""
-
-    def pose_steps(self, camera_steps: FloatArray) -> FloatArray:
-        """Return (P, 5) steps of the poses by back substitution of the steps (P, 10) of the cameras."""
-        return np.asarray(self.pose_alone - (self.pose_by_cameras @ camera_steps[..., None])[..., 0], np.float64)
-
-
-def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> ReducedSystem:
+def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> tuple[FloatArray, ...]:
     """Eliminate the poses from the systems of all pairs (`pair_systems`) by the Schur complement::
 
         A = | U   W |     (U - W V^-1 W') d_cameras = b_cameras - W V^-1 b_pose
             | W'  V |
 
-    The damping of V is relative to its diagonal.
+    The damping of V is relative to its diagonal. Return the reduced Hessians (P, 10, 10) and gradients (P, 10), and
+    for back substitution V^-1 W' (P, 5, 10) and V^-1 b_pose (P, 5).
     """
     n = 2 * CAMERA
     V = A[:, n:, n:].copy()
@@ -452,12 +400,7 @@ def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> ReducedSys
     solved = np.linalg.solve(V, np.concatenate([A[:, n:, :n], b[:, n:, None]], axis=2))
     pose_by_cameras, pose_alone = np.split(solved, [n], axis=2)
     W = A[:, :n, n:]
-    return ReducedSystem(
-        hessians=A[:, :n, :n] - W @ pose_by_cameras,
-        gradients=b[:, :n] - (W @ pose_alone)[..., 0],
-        pose_by_cameras=pose_by_cameras,
-        pose_alone=pose_alone[..., 0],
-    )
+    return A[:, :n, :n] - W @ pose_by_cameras, b[:, :n] - (W @ pose_alone)[..., 0], pose_by_cameras, pose_alone[..., 0]
 
 
 def _take_step(
@@ -468,23 +411,17 @@ def _take_step(
     cost = float(factors @ matches.costs(state)) + prior.cost(state.thetas)
 
     def attempt(damping: float) -> State | None:
-        trial = _solve_step(matches, state, prior, system, damping)
+        # cameras from all pairs and the prior, then each pose from its pair
+        hessians, gradients, pose_by_cameras, pose_alone = _eliminate_poses(*system, damping)
+        H, g = matches.assemble(Information(hessians, gradients, np.empty(0)), factors)
+        H += np.diag(prior.precision.ravel())
+        g += (prior.precision * (prior.mean - state.thetas)).ravel()
+        step = solve_each(H + damping * np.diag(np.diag(H)), g[:, None]).reshape(-1, CAMERA)
+        of_pairs = step[matches.cameras].reshape(-1, 2 * CAMERA)
+        pose_steps = pose_alone - (pose_by_cameras @ of_pairs[..., None])[..., 0]
+        poses = np.array([retract(*moved) for moved in zip(state.poses, pose_steps, strict=True)]).reshape(-1, 12)
+        trial = replace(state, thetas=state.thetas + step, poses=poses)
         return trial if float(factors @ matches.costs(trial)) + prior.cost(trial.thetas) <= cost else None
 
     better, damping = damped_step(attempt, damping, DAMPING)
     return better or state, damping
-
-
-def _solve_step(
-    matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
-) -> State:
-    """Return the state after one damped step: cameras from all pairs and the prior, then each pose from its pair."""
-    reduced = _eliminate_poses(*system, damping)
-    information = Information(reduced.hessians, reduced.gradients, np.empty(0))
-    H, g = matches.assemble(information, matches.trust * state.weights / state.scale)
-    H += np.diag(prior.precision.ravel())
-    g += (prior.precision * (prior.mean - state.thetas)).ravel()
-    step = solve_each(H + damping * np.diag(np.diag(H)), g[:, None]).reshape(-1, CAMERA)
-    pose_steps = reduced.pose_steps(step[matches.cameras].reshape(-1, 2 * CAMERA))
-    poses = np.array([retract(pose, step) for pose, step in zip(state.poses, pose_steps, strict=True)]).reshape(-1, 12)
-    return replace(state, thetas=state.thetas + step, poses=poses)

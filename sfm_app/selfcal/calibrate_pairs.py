@@ -7,7 +7,7 @@ key pairs are a wish of thesis chapter 6; the degenerate motions are those of th
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -104,11 +104,7 @@ class Fit:
         return Evidence(self.state.thetas, H, g, float(np.sum(self.state.weights)), self.priors)
 
     def cost(self, sigma: float, scale: float) -> float:
-        """Return the negative log-probability that ranks fits from different starts, each pair's part bounded.
-
-        The deviation of a distance and the scale of the disagreement are the same for all fits: their own larger ones
-        would favor wrong fits.
-        """
+        """Return the negative log-probability that ranks fits by a common sigma and scale, each pair's part bounded."""
         state = reweight(self.matches, replace(self.state, sigma=sigma))
         gains = pair_information(self.matches, state).gains / (scale * self.matches.redundancy)
         H = replace(self, state=state).evidence.H + np.diag(self.prior.precision.ravel())
@@ -118,13 +114,7 @@ class Fit:
 
 
 def fit_cameras(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], priors: CameraPriors) -> Fit:
-    """Fit the cameras from all starts, then with non-square pixels, and return the best fit.
-
-    Args:
-        matches: inliers, from the middle of each photo.
-        Fs: (P, 3, 3) in the same frame and units; initialize the poses.
-        starts: (C, 5) each, initial cameras, the most likely first.
-    """
+    """Fit the cameras from all starts (C, 5), likely ones first, then with any pixels; return the best fit."""
     few = matches.subsample(FITTING.few_matches)
     best = _select_best([_fit_from_start(few, Fs, thetas, priors, square=True) for thetas in starts])
     others = [_fit_from_start(few, Fs, thetas, priors, square=False) for thetas in (best.state.thetas, starts[0])]
@@ -182,8 +172,8 @@ def undistorted_fundamentals(fit: Fit) -> FloatArray:
         x = fit.matches.pair_matches(pair)
         views = (undistort_points(x[:, :2], thetas[first]), undistort_points(x[:, 2:], thetas[second]))
         inverses = [np.linalg.inv(intrinsic_matrix(thetas[camera])) for camera in (first, second)]
-        E = _essential_matrix(fit.state.poses[pair])
-        start = inverses[1].T @ E @ inverses[0]
+        R, t = fit.state.poses[pair, :9].reshape(3, 3), fit.state.poses[pair, 9:]
+        start = inverses[1].T @ np.cross(t, R, axisb=0, axisc=0) @ inverses[0]
         refit = refine_sampson(np.asfortranarray(np.hstack(views)), start, scale=ROBUST_SCALE * fit.state.sigma)
         Fs[pair] = refit if np.isfinite(refit).all() and refit.any() else start
     return Fs
@@ -223,23 +213,11 @@ def _estimate_poses(few: Matches, Fs: FloatArray, thetas: FloatArray) -> FloatAr
     return poses
 
 
-def _essential_matrix(pose: FloatArray) -> FloatArray:
-    R, t = pose[:9].reshape(3, 3), pose[9:]
-    return np.asarray(np.cross(t, R, axisb=0, axisc=0), np.float64)
-
-
-# Uncertainty.
-
 PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1")
 
 
 def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> FloatArray:
-    """Return the (5C, 5C) covariance of all parameters over all choices of free ones, plus the model error.
-
-    Args:
-        sides: (C,) longer sides of the photos.
-        resampled: widen it where leaving photos out moves the cameras further than it predicts.
-    """
+    """Return the (5C, 5C) covariance over all choices, plus the model error; `resampled` widens it by the jackknife."""
     total = fit.evidence.covariance(fit.free)
     if resampled:
         deviations = np.sqrt(np.diag(total))
@@ -251,19 +229,8 @@ def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> Float
     return np.asarray(total + np.diag(floor.ravel() ** 2), np.float64)
 
 
-class Uncertainty(NamedTuple):
-    """Standard deviations of the parameters of a camera, and their correlations; as in `Calibration`."""
-
-    spread: dict[str, float]
-    correlations: dict[str, float]
-
-
-def camera_uncertainty(theta: FloatArray, cov: FloatArray, unit_px: float) -> Uncertainty:
-    """Return the standard deviations of fx, fy, cx, cy in pixels and of k1, and their correlations.
-
-    Args:
-        cov: (5, 5) covariance of theta (5,).
-    """
+def camera_uncertainty(theta: FloatArray, cov: FloatArray, unit_px: float) -> dict[str, Any]:
+    """Return `spread` and `correlations` of a `Calibration`: those of fx, fy, cx, cy in pixels and of k1."""
     focal, squared = float(np.exp(theta[LOG_FOCAL])) * unit_px, float(np.exp(2.0 * theta[LOG_FOCAL]))
     half = float(np.exp(0.5 * theta[LOG_ASPECT]))
     # rows: how fx, fy, cx, cy, k1 change with log f, u, v, log a, kappa
@@ -274,9 +241,8 @@ def camera_uncertainty(theta: FloatArray, cov: FloatArray, unit_px: float) -> Un
     slopes[4, [LOG_FOCAL, KAPPA]] = 2.0 * theta[KAPPA] * squared, squared
     in_px = slopes @ cov @ slopes.T
     deviations = np.sqrt(np.maximum(np.diag(in_px), 0.0))
-    return Uncertainty(
-        dict(zip(PARAMETER_NAMES, deviations.tolist(), strict=True)), named_correlations(PARAMETER_NAMES, in_px)
-    )
+    spread = dict(zip(PARAMETER_NAMES, deviations.tolist(), strict=True))
+    return {"spread": spread, "correlations": named_correlations(PARAMETER_NAMES, in_px)}
 
 
 def key_pairs(fit: Fit, photos: tuple[PairId, ...]) -> tuple[PairId, ...]:
@@ -291,11 +257,7 @@ def key_pairs(fit: Fit, photos: tuple[PairId, ...]) -> tuple[PairId, ...]:
 
 
 def critical_motion(fit: Fit) -> str:
-    """Return the critical motion of most pairs, for the user; empty where there is none.
-
-    Parallel axes, and axes that meet at one distance from both cameras (an isosceles triangle, as on an orbit), are the
-    two for which one pair does not constrain the focal (Sturm 1999).
-    """
+    """Return the motion of most pairs if it leaves the focal open: parallel axes or an orbit (Sturm 1999)."""
     R = fit.state.poses[:, :9].reshape(-1, 3, 3)
     if len(R) == 0:
         return ""

@@ -92,22 +92,13 @@ CONSENSUS = ConsensusOptions()
 
 
 class Consensus:
-    """The function that the right K maximizes.
-
-    Args:
-        center_sigma: standard deviation of the prior on (u, v) about (0, 0), in units of the pairs; may be inf.
-        weights: (P,) weights; those of the pairs for None.
-    """
+    """The function that the right K maximizes; `center_sigma` of the prior on (u, v) about (0, 0) may be inf."""
 
     def __init__(self, pairs: Pairs, center_sigma: float, weights: FloatArray | None = None) -> None:
         self.pairs = pairs
         self.center_sigma = center_sigma
         self.weights = pairs.weights if weights is None else weights
         self._packed = pairs.packed_rows
-
-    def with_weights(self, weights: FloatArray) -> "Consensus":
-        """Return the consensus of the same pairs with other weights (P,)."""
-        return Consensus(self.pairs, self.center_sigma, weights)
 
     def evaluate(self, thetas: FloatArray, sigma: float) -> FloatArray:
         """Return (N,) supports plus log-priors at (N, 4) thetas; sigma is the width of a vote, in r."""
@@ -247,7 +238,6 @@ class Peak(NamedTuple):
     """A local maximum of the consensus."""
 
     theta: FloatArray
-    """(4,) log f, u, v, log a."""
     value: float
     """Support plus log-prior there, at the sigma it was climbed with last."""
 
@@ -351,26 +341,20 @@ def best_rival(
 
 
 def resample_peak(consensus: Consensus, theta: FloatArray, free: Sequence[int], sigma: float, seed: int) -> FloatArray:
-    """Return the peak (B, 4) under randomly reweighted pairs: the Bayesian bootstrap (Rubin 1981).
-
-    Weights instead of draws, because three pairs drawn with replacement are often one pair three times.
-    """
+    """Return the peaks (B, 4) of the Bayesian bootstrap (Rubin 1981): few pairs drawn again would often be one."""
     rng = np.random.default_rng(seed)
     weights = consensus.weights
     thetas = []
     for _ in range(CONSENSUS.resamples):
         drawn = weights * rng.exponential(size=len(weights))
-        resampled = consensus.with_weights(drawn * (np.sum(weights) / np.sum(drawn)))
+        drawn *= np.sum(weights) / np.sum(drawn)
+        resampled = Consensus(consensus.pairs, consensus.center_sigma, drawn)
         thetas.append(resampled.climb(theta, free, (max(sigma, CONSENSUS.stable_sigma),))[0])
     return np.array(thetas)
 
 
 def deviation(values: FloatArray, count: float, parameters: int) -> float:
-    """Return the standard deviation of an unknown over resampled peaks (B,), corrected for degrees of freedom.
-
-    A pair gives two constraints. With three pairs and three unknowns half of the scatter has gone into the fit, and the
-    resampled peaks scatter too little by the same share. `count` is the effective number of pairs.
-    """
+    """Return the standard deviation over resampled peaks (B,), corrected for the freedom of `count` pairs."""
     freedom = max(count - 0.5 * parameters, 0.5)
     return float(np.std(values, ddof=1) * np.sqrt(max(count, 1.0) / freedom))
 
@@ -463,21 +447,13 @@ def _examine(
 
 
 def uncertainty_reason(log_focal_spread: float, *, one_of_many: bool = False) -> str:
-    """Return why an accepted answer is only an estimate; empty where it is identifiable.
-
-    `one_of_many` asks for a smaller spread: every photo has its own focal.
-    """
+    """Return why an accepted answer is only an estimate; empty if identifiable. One of many needs a smaller spread."""
     vague = log_focal_spread > (CONSENSUS.identified_of_many if one_of_many else CONSENSUS.identified_log_focal_spread)
     return f"the focal is uncertain by {100 * log_focal_spread:.0f} %" if vague else ""
 
 
 def rejection_reason(theta: FloatArray, log_focal_spread: float, size: tuple[int, int]) -> str:
-    """Return why an answer that the pairs agree on is rejected; empty where it is accepted.
-
-    Args:
-        theta: log f, u, v, ... in longer sides from the middle.
-        size: (width, height) of the photo, in any unit.
-    """
+    """Return why an agreed answer, log f, u, v, ... in longer sides from the middle, is rejected; or nothing."""
     focal, (low, high) = float(np.exp(theta[LOG_FOCAL])), CONSENSUS.focal_range
     if not low * CONSENSUS.edge < focal < high / CONSENSUS.edge:
         return f"the focal is at the end of the range: {focal:.2f} times the longer side"

@@ -54,8 +54,7 @@ def singular_value_ratio(pair: FloatArray, fx: float, fy: float, u: float, v: fl
 def focal_polynomials(pairs: Pairs, fx: FloatArray, center: tuple[float, float]) -> FloatArray:
     """Return thesis (5.27): a^2 - 4p as a quartic in fy^2, for swept fx (S,) and a fixed center (u, v).
 
-    Returns:
-        (P, S, 5) coefficients, lowest power first; all zero where the constraint holds for any fy.
+    Coefficients (P, S, 5), lowest power first; all zero where the constraint holds for any fy.
     """
     u, v = center
     C = np.array([[1.0, 0.0, u], [0.0, 1.0, v], [0.0, 0.0, 1.0]])
@@ -80,8 +79,7 @@ def focal_polynomials(pairs: Pairs, fx: FloatArray, center: tuple[float, float])
 def center_polynomials(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
     """Return thesis (5.28): a^2 - 4p as an octic in v, for swept u (S,) and fixed focals (fx, fy).
 
-    Returns:
-        (P, S, 9) coefficients, lowest power first; all zero where the constraint holds for any v.
+    Coefficients (P, S, 9), lowest power first; all zero where the constraint holds for any v.
     """
     x, y = focal[0] ** 2, focal[1] ** 2
     F = pairs.F[:, None, :, :]

@@ -25,6 +25,8 @@ from sfm_app.selfcal.calibrate_pairs import (
 )
 from sfm_app.selfcal.consensus import CONSENSUS, rejection_reason, uncertainty_reason
 from sfm_app.selfcal.pairs import (
+    CENTER_U,
+    CENTER_V,
     LOG_FOCAL,
     calibration_from_parameters,
     downgrade_to_estimate,
@@ -72,17 +74,8 @@ def log_focal_grid() -> FloatArray:
     return np.log(np.geomspace(*CONSENSUS.focal_range, GROUPS.focals))
 
 
-# Votes.
-
-
 class VoteTables:
-    """Votes of pairs for any two cameras of their photos.
-
-    Args:
-        Fs: (P, 3, 3) in one unit from the middle of each photo.
-        members: (P, 2) cameras.
-        weights: (P,).
-    """
+    """Votes of pairs for any two cameras of their photos; F's are in one unit from the middle of each photo."""
 
     def __init__(self, Fs: FloatArray, members: IndexArray, weights: FloatArray) -> None:
         ready = prepare(CameraPairs.from_Fs(Fs, (1, 1), weights), unit_px=1.0, origin_px=(0.0, 0.0))
@@ -97,10 +90,7 @@ class VoteTables:
 
 @kernel
 def _ratios(pair: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return (A, B) r = (s1 - s2) / (s1 + s2) of E = K2'F K1, for cameras (A, 5) and (B, 5), without distortion.
-
-    As `constraints.singular_value_ratio`, with two cameras.
-    """
+    """Return `constraints.singular_value_ratio` (A, B) for cameras (A, 5) and (B, 5) without distortion."""
     k1, k2, G = np.empty(5), np.empty(5), np.empty((3, 3))
     ratios = np.empty((len(first), len(second)))
     for i in range(len(first)):
@@ -127,15 +117,10 @@ def _minor(x: float, y: float, w: float, k: FloatArray) -> float:
 
 
 class FocalGrid:
-    """Votes of pairs for the focals of their two photos, on a common grid.
+    """Votes of undistorted pairs for the focals of their two photos, on a common grid.
 
-    Ours: the consensus of thesis 5.8.4 on the focals alone.
-
-    Args:
-        tables: undistorted pairs.
-        rows: (P,) indices of the pairs that vote.
-        theta: (5,) camera with the center and aspect of all photos.
-        members: (P, 2) photos, counted from 0.
+    Ours: the consensus of thesis 5.8.4 on the focals alone. `rows` (P,) vote; `theta` (5,) has the center and aspect of
+    all photos; `members` (P, 2) are photos, counted from 0.
     """
 
     def __init__(self, tables: VoteTables, rows: IndexArray, theta: FloatArray, members: IndexArray) -> None:
@@ -173,11 +158,6 @@ class FocalGrid:
         return votes
 
 
-def subsample_pairs(count: int) -> IndexArray:
-    """Return the indices of the pairs that vote on a `FocalGrid`, evenly chosen out of `count`."""
-    return np.linspace(0, count - 1, min(count, GROUPS.most_pairs)).astype(np.int64)
-
-
 # The choice of focals: one grid index for every camera.
 
 
@@ -197,11 +177,8 @@ def best_places(own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> 
     """Choose a grid index for every camera so that the sum over cameras and over pairs of cameras is large.
 
     Damped max-sum message passing (Pearl 1988; exact on trees), then coordinate ascent. Ascent also starts from the
-    best index of each camera by itself, which messages on loops do not always outdo.
-
-    Args:
-        own: (C, G) value of each camera by itself.
-        between: (G, G) value of two cameras i < j together, by (i, j).
+    best index of each camera by itself, which messages on loops do not always outdo. `own` (C, G) has the values of
+    cameras by themselves, `between` (G, G) those of two cameras i < j.
     """
     tables = {(i, j): table for (i, j), table in between.items()} | {(j, i): t.T for (i, j), t in between.items()}
     messages = {edge: np.zeros(own.shape[1]) for edge in tables}
@@ -240,9 +217,6 @@ def _total_gain(places: IndexArray, own: FloatArray, between: dict[tuple[int, in
     return float(np.sum(own[np.arange(len(places)), places])) + shared
 
 
-# Calibration.
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraGroup:
     """One camera of several."""
@@ -260,11 +234,6 @@ class CameraGroup:
     divided: bool = False
     """Whether it was split from photos of one size: then each of its photos must support it."""
 
-    @property
-    def is_whole(self) -> bool:
-        """Whether it was calibrated from all of its own pairs and no others."""
-        return self.family < 0 and not self.divided
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Joint:
@@ -274,9 +243,7 @@ class _Joint:
     covariance: FloatArray
     """(5C, 5C)."""
     tables: VoteTables
-    """Of the undistorted pairs."""
     photos: list[PairId]
-    """The two photos of each pair."""
     unit_px: float
     motion: str
     """A critical motion of most pairs, which leaves all focals open; empty for none."""
@@ -285,13 +252,7 @@ class _Joint:
 def calibrate_cameras(
     cameras: Sequence[CameraGroup], pairs: CameraPairs, members: IndexArray, options: CalibrationSettings, method: str
 ) -> list[Calibration]:
-    """Return one calibration per camera, in their order; each is identifiable, an estimate, or a guess with the reason.
-
-    Args:
-        pairs: all pairs, within and between cameras, with inliers; their size is not used.
-        members: (P, 2) number of the camera of view 1 and of view 2.
-        method: name that goes into the calibrations.
-    """
+    """Return one calibration per camera, in their order; `members` (P, 2) are the cameras of both views."""
     unit = float(max(max(camera.size) for camera in cameras))
     rows, Fs, matches = _convert_to_units(cameras, pairs, members, unit)
     members, weights, photos = members[rows], pairs.weights[rows], [pairs.photos[k] for k in rows]
@@ -299,7 +260,14 @@ def calibrate_cameras(
     hints = np.array([camera.hint_px for camera in cameras]) / unit
     families = np.array([camera.family for camera in cameras], np.int64)
     priors = TiedPriors(sides, hints, options.center_sigma, options.lens, families)
-    thetas = np.array([_initial_parameters(camera, side, unit) for camera, side in zip(cameras, sides, strict=True)])
+    thetas = np.array(
+        [
+            [PRIORS.usual_log_focal + np.log(side), 0.0, 0.0, 0.0, 0.0]
+            if camera.start is None
+            else parameters_from_calibration(camera.start, unit)
+            for camera, side in zip(cameras, sides, strict=True)
+        ]
+    )
     unknown = np.array([camera.start is None for camera in cameras])
     if unknown.any():
         thetas = _find_focals(thetas, unknown, VoteTables(Fs, members, weights), priors)
@@ -316,7 +284,6 @@ def calibrate_cameras(
 
 
 def _judge_camera(index: int, camera: CameraGroup, joint: _Joint, method: str) -> Calibration:
-    """Return the calibration of one camera, or a guess and the reason."""
     fit, unit = joint.fit, joint.unit_px
     theta = fit.state.thetas[index]
     block = slice(CAMERA * index, CAMERA * (index + 1))
@@ -338,17 +305,23 @@ def _judge_camera(index: int, camera: CameraGroup, joint: _Joint, method: str) -
     elif not camera.known and margin < CONSENSUS.min_margin:
         reason = "the pairs fit other focals as well or better"
     # a motion that leaves the focal open is the reason only where the deviation is small
-    elif not camera.is_whole and not (camera.divided and uncertain):
+    elif (camera.family >= 0 or camera.divided) and not (camera.divided and uncertain):
         reason = joint.motion
-    reason = reason or rejection_reason(_convert_to_sides(theta, max(camera.size) / unit), spread, camera.size)
+    side = max(camera.size) / unit
+    in_sides = np.array([theta[LOG_FOCAL] - np.log(side), theta[CENTER_U] / side, theta[CENTER_V] / side])
+    reason = reason or rejection_reason(in_sides, spread, camera.size)
     if reason:
         guess = guess_calibration(camera.size, reason, evidence)
-        # it contains the mean of the family: a better start for mapping than the usual focal
-        return replace(guess, K=_family_camera_matrix(theta, camera.size, unit)) if camera.family >= 0 else guess
+        if camera.family < 0:
+            return guess
+        # its focal contains the mean of the family: a better start for mapping than the usual one
+        low, high = np.array(CONSENSUS.focal_range) * max(camera.size)
+        focal_px = float(np.clip(np.exp(theta[LOG_FOCAL]) * unit, low, high))
+        return replace(guess, K=guessed_camera_matrix(camera.size, focal_px))
     calibration = downgrade_to_estimate(
         replace(
             calibration_from_parameters(theta, camera.size, method, unit),
-            **camera_uncertainty(theta, joint.covariance[block, block], unit)._asdict(),
+            **camera_uncertainty(theta, joint.covariance[block, block], unit),
             evidence=evidence,
             held=fit.held_names(index),
         ),
@@ -359,11 +332,6 @@ def _judge_camera(index: int, camera: CameraGroup, joint: _Joint, method: str) -
         if least < GROUPS.fair_share or support < GROUPS.least_support:
             return downgrade_to_estimate(calibration, "some of its photos do not support it")
     return calibration
-
-
-def _convert_to_sides(theta: FloatArray, side: float) -> FloatArray:
-    focal, u, v, aspect, kappa = theta - np.array([np.log(side), 0.0, 0.0, 0.0, 0.0])
-    return np.array([focal, u / side, v / side, aspect, kappa])
 
 
 def _convert_to_units(
@@ -384,14 +352,7 @@ def _convert_to_units(
     return ready.indices, Fs, Matches(inliers, used, photos, unit, count=len(cameras))
 
 
-def _initial_parameters(camera: CameraGroup, side: float, unit: float) -> FloatArray:
-    if camera.start is not None:
-        return parameters_from_calibration(camera.start, unit)
-    return np.array([PRIORS.usual_log_focal + np.log(side), 0.0, 0.0, 0.0, 0.0])
-
-
 def _find_focals(thetas: FloatArray, unknown: BoolArray, tables: VoteTables, priors: CameraPriors) -> FloatArray:
-    """Return the cameras with the unknown focals on which most pairs agree."""
     trials = np.repeat(thetas[:, None], GROUPS.focals, axis=1)
     trials[unknown, :, LOG_FOCAL] = log_focal_grid() + np.log(priors.sides[unknown])[:, None]
     usual = trials[..., LOG_FOCAL] - np.log(priors.sides)[:, None] - PRIORS.usual_log_focal
@@ -406,13 +367,6 @@ def _find_focals(thetas: FloatArray, unknown: BoolArray, tables: VoteTables, pri
     chosen = thetas.copy()
     chosen[:, LOG_FOCAL] = trials[np.arange(len(thetas)), _consensus_places(own, votes), LOG_FOCAL]
     return chosen
-
-
-def _family_camera_matrix(theta: FloatArray, size: tuple[int, int], unit: float) -> FloatArray:
-    """Return the usual camera matrix with the most likely focal, although it is uncertain."""
-    side = max(size)
-    low, high = np.array(CONSENSUS.focal_range) * side
-    return guessed_camera_matrix(size, float(np.clip(np.exp(theta[LOG_FOCAL]) * unit, low, high)))
 
 
 def _margin(index: int, thetas: FloatArray, tables: VoteTables) -> tuple[float, float]:

@@ -9,10 +9,9 @@ from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.selfcal.consensus import Consensus, find_peak
-from sfm_app.selfcal.groups import GROUPS, FocalGrid, VoteTables, subsample_pairs
+from sfm_app.selfcal.groups import GROUPS, FocalGrid, VoteTables
 from sfm_app.selfcal.pairs import LOG_FOCAL
 from sfm_app.types import PairId
 from sfm_app.types.arrays import FloatArray, IndexArray
@@ -26,26 +25,26 @@ from sfm_app.types.arrays import FloatArray, IndexArray
 
 @dataclass(frozen=True, slots=True)
 class FocalSplitOptions:
-    """Division by focal. Section 6 of Self-calibration in docs/algorithms.md."""
+    """Division by focal. Section 6 of Self-calibration in docs/algorithms.md. Chosen by hand."""
 
     sigma: float = 0.03
-    """Width of the votes, in r: focals 3 % apart still agree, those 10 % apart do not; by hand."""
+    """Width of the votes, in r: focals 3 % apart still agree, those 10 % apart do not."""
     fair_share: float = 0.5
-    """Share of its possible votes that a photo needs to belong to a peak, or to have another focal; by hand."""
+    """Share of its possible votes that a photo needs to belong to a peak, or to have another focal."""
     other_focal: float = 0.05
-    """Difference in log f from which on it is another camera; by hand."""
+    """Difference in log f from which on it is another camera."""
     least_focal_gain: float = 0.25
-    """Least gain of another focal over that of the peak, as a share of a photo's votes. Section 6; by hand."""
+    """Least gain of another focal over that of the peak, as a share of a photo's votes. Section 6."""
     least_split_gain: float = 0.25
-    """Least gain of a split, as a share of the votes of the photos of all other cameras together; by hand."""
+    """Least gain of a split, as a share of the votes of the photos of all other cameras together."""
     focal_reach: float = 1.1
-    """Range in log f for a photo, up to three times longer or shorter; by hand."""
+    """Range in log f for a photo, up to three times longer or shorter."""
     trials: int = 111
-    """Focals in that range; by hand."""
+    """Focals in that range."""
     most_peaks: int = 4
-    """Peaks of the consensus that serve as starts; by hand."""
+    """Peaks of the consensus that serve as starts."""
     rounds: int = 10
-    """Most rounds of assigning photos to cameras; by hand."""
+    """Most rounds of assigning photos to cameras."""
 
 
 SPLIT = FocalSplitOptions()
@@ -54,22 +53,19 @@ SPLIT = FocalSplitOptions()
 def split_by_focal(
     tables: VoteTables, photos: Sequence[PairId], starts: Sequence[FloatArray]
 ) -> tuple[FloatArray, dict[int, int]]:
-    """Find cameras that share all but the focal, and which photo is of which.
+    """Find cameras (C, 5) that share all but the focal, and the number of the camera of each photo; one if all agree.
 
-    Args:
-        tables: undistorted pairs, in longer sides from the middle of the photo; its members are not used.
-        photos: the two photos of each pair.
-        starts: (5,) each, candidate cameras.
-
-    Returns:
-        (C, 5) cameras, and the number of the camera by photo; one camera where the photos agree.
+    The tables are of undistorted pairs, in longer sides from the middle of the photo; their members are not used. The
+    starts (5,) are candidate cameras.
     """
     everyone = sorted({photo for pair in photos for photo in pair})
     pairs = _PairVotes(tables, photos)
     _, theta, core = max((pairs.find_core(theta, everyone) for theta in starts), key=lambda core: core[0])
     one = theta[None]
     steps = [focal for photo in everyone if photo not in core for focal in pairs.find_other_focal(photo, theta, core)]
-    focals = _cluster_medians(steps)
+    ordered: FloatArray = np.sort(np.array(steps))
+    cuts = np.flatnonzero(np.diff(ordered) > SPLIT.other_focal) + 1
+    focals = [float(np.median(run)) for run in np.split(ordered, cuts) if len(run)]
     if not focals:
         return one, dict.fromkeys(everyone, 0)
     cameras = np.repeat(one, 1 + len(focals), axis=0)
@@ -90,8 +86,6 @@ def peak_cameras(consensus: Consensus) -> list[FloatArray]:
 
 
 class _PairVotes:
-    """Votes of pairs of photos for cameras."""
-
     def __init__(self, tables: VoteTables, photos: Sequence[PairId]) -> None:
         self.tables, self.photos = tables, photos
         self.pairs_of: dict[int, list[int]] = {}
@@ -174,20 +168,12 @@ class _PairVotes:
         return float(np.sum(self.tables.weights[touched]))
 
     def total(self, cameras: FloatArray, labels: dict[int, int]) -> float:
-        """Return the sum of the votes of all pairs."""
         return float(
             sum(
                 self.votes(k, cameras[labels[first]][None], cameras[labels[second]][None])[0, 0]
                 for k, (first, second) in enumerate(self.photos)
             )
         )
-
-
-def _cluster_medians(steps: Sequence[float]) -> list[float]:
-    """Return the medians of clusters of values; gaps above `SPLIT.other_focal` separate clusters."""
-    ordered: NDArray[np.float64] = np.sort(np.array(steps))
-    cuts = np.flatnonzero(np.diff(ordered) > SPLIT.other_focal) + 1
-    return [float(np.median(run)) for run in np.split(ordered, cuts) if len(run)]
 
 
 # Two cameras, decided from all pairs jointly.
@@ -222,22 +208,13 @@ class TwoCameraOptions:
 TWO_CAMERAS = TwoCameraOptions()
 
 
-class _Voting(NamedTuple):
-    """The pairs that vote on a grid of focals."""
-
-    rows: IndexArray
-    """(P,) of all pairs."""
-    photos: list[int]
-    """All photos that have pairs."""
-    members: IndexArray
-    """(P, 2) their places in `photos`."""
-
-
-def _voting_pairs(photos: Sequence[PairId]) -> _Voting:
-    rows, everyone = subsample_pairs(len(photos)), sorted({photo for pair in photos for photo in pair})
+def _voting_pairs(photos: Sequence[PairId]) -> tuple[IndexArray, list[int], IndexArray]:
+    """Return the rows (P,) of the pairs that vote on a grid of focals, all photos, and (P, 2) their places in these."""
+    rows = np.linspace(0, len(photos) - 1, min(len(photos), GROUPS.most_pairs)).astype(np.int64)
+    everyone = sorted({photo for pair in photos for photo in pair})
     place = {photo: k for k, photo in enumerate(everyone)}
     members = np.array([[place[first], place[second]] for first, second in photos], np.int64).reshape(-1, 2)
-    return _Voting(rows, everyone, members[rows])
+    return rows, everyone, members[rows]
 
 
 class TwoCameras(NamedTuple):
@@ -254,7 +231,6 @@ class TwoCameras(NamedTuple):
     deviations: float
     """The gain in its standard deviations, pairs taken as independent."""
     smaller_count: int
-    """Photos of the smaller camera."""
 
     @property
     def is_possible(self) -> bool:
@@ -268,10 +244,7 @@ class TwoCameras(NamedTuple):
 
 
 def divide_photos(tables: VoteTables, photos: Sequence[PairId], starts: Sequence[FloatArray]) -> TwoCameras | None:
-    """Divide photos among two cameras that share all but the focal, by the votes of their pairs; None for no gain.
-
-    Arguments as `split_by_focal`; the starts give center and aspect.
-    """
+    """Divide photos among two cameras that share all but the focal, by the votes of their pairs; None for no gain."""
     rows, everyone, members = _voting_pairs(photos)
     grids = [FocalGrid(tables, rows, theta, members) for theta in starts]
     shared = [np.einsum("pgg->g", grid.votes) for grid in grids]
@@ -290,7 +263,7 @@ def divide_photos(tables: VoteTables, photos: Sequence[PairId], starts: Sequence
         return None
     if np.count_nonzero(labels) > len(labels) / 2:
         places, labels = places[::-1], 1 - labels
-    gains = division.pair_votes(places, labels) - grid.votes[:, usual, usual]
+    gains = grid.pair_votes(places[labels]) - grid.votes[:, usual, usual]
     smaller = labels[members].astype(bool)
     theta = np.repeat(np.asarray(starts[best], np.float64)[None], 2, axis=0)
     theta[:, LOG_FOCAL] = grid.grid[places]
@@ -309,15 +282,11 @@ class _Division:
     """Assignment of a number of photos to two cameras, by the votes of pairs on a grid."""
 
     def __init__(self, grid: FocalGrid, photos: int) -> None:
-        self.votes, self.members, self.photos = grid.votes, grid.members, photos
-        self.rows = np.arange(len(grid.votes))
+        self.grid, self.votes, self.members, self.photos = grid, grid.votes, grid.members, photos
         self.pairs_of = [np.flatnonzero((grid.members == photo).any(axis=1)) for photo in range(photos)]
 
     def starts(self, usual: int, other: int) -> tuple[IndexArray, IndexArray]:
-        """Return two initial labelings (N,): all photos 0, and each photo as its pairs prefer.
-
-        The preference of a pair assumes that both of its photos change.
-        """
+        """Return two initial labelings (N,): all photos 0, and each as its pairs prefer if both photos change."""
         gains = self.votes[:, other, other] - self.votes[:, usual, usual]
         totals = np.array([np.sum(gains[rows]) for rows in self.pairs_of])
         return np.zeros(self.photos, np.int64), (totals > 0).astype(np.int64)
@@ -341,14 +310,8 @@ class _Division:
         cameras[self.members[rows] == photo] = camera
         return float(np.sum(self.votes[rows, places[cameras[:, 0]], places[cameras[:, 1]]]))
 
-    def pair_votes(self, places: IndexArray, labels: IndexArray) -> FloatArray:
-        """Return (P,) votes of the pairs for a division."""
-        first, second = places[labels][self.members].T
-        return np.asarray(self.votes[self.rows, first, second], np.float64)
-
     def total(self, places: IndexArray, labels: IndexArray) -> float:
-        """Return the sum of the votes for a division."""
-        return float(np.sum(self.pair_votes(places, labels)))
+        return float(np.sum(self.grid.pair_votes(places[labels])))
 
     def refine(self, places: IndexArray, labels: IndexArray) -> tuple[IndexArray, IndexArray]:
         """Move both focals to where they win most votes, and every photo to its camera, until nothing changes."""
@@ -411,9 +374,7 @@ class Prediction(NamedTuple):
     own: float
     """Share of the votes for a camera per photo."""
     deviations: float
-    """Difference of the votes in its standard deviations."""
     is_camera_per_photo: bool
-    """Whether every photo counts as one of its own camera."""
 
 
 def cross_validate(
@@ -427,7 +388,10 @@ def cross_validate(
     rows, everyone, members = _voting_pairs(photos)
     if len(everyone) < PER_PHOTO.least_photos:
         return Prediction(1.0, 1.0, 0.0, is_camera_per_photo=False)
-    few, each = _number_cameras([labels.get(photo, 0) for photo in everyone]), np.arange(len(everyone))
+    few = np.unique([labels.get(photo, 0) for photo in everyone], return_inverse=True)[1].astype(np.int64)
+    if (np.max(few) + 1) * PER_PHOTO.least_photos_each > len(few):
+        few = np.zeros_like(few)
+    each = np.arange(len(everyone))
     least = PER_PHOTO.least_gain if np.max(few) == 0 else PER_PHOTO.least_gain_over_several
     weight = float(np.sum(tables.weights[rows]))
     grids = [FocalGrid(tables, rows, theta, members) for theta in (*starts, np.zeros(5))]
@@ -449,9 +413,3 @@ def cross_validate(
     return Prediction(
         float(np.sum(held)) / weight, float(np.sum(own)) / weight, deviations, is_camera_per_photo=clearly
     )
-
-
-def _number_cameras(labels: Sequence[int]) -> IndexArray:
-    """Return (N,) cameras counted from 0; one for all where each would have too few photos."""
-    cameras = np.unique(labels, return_inverse=True)[1].astype(np.int64)
-    return cameras if (np.max(cameras) + 1) * PER_PHOTO.least_photos_each <= len(cameras) else np.zeros_like(cameras)

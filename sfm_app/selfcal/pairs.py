@@ -169,10 +169,7 @@ def undistort_radius(radius: float, k1: float, guess: float) -> float:
 def write_ray(x: float, y: float, camera: FloatArray, guess: float, out: FloatArray) -> None:
     """Write the point (a, b) of the plane z = 1 that the pixel x, y sees, its derivatives, and r_u.
 
-    Args:
-        camera: (5,) fx, fy, u, v, k1.
-        guess: r_u of a similar camera; negative for none.
-        out: (7,) a, b, da/dx, da/dy, db/dx, db/dy, r_u.
+    `out` (7,) is a, b, da/dx, da/dy, db/dx, db/dy, r_u; `guess` is r_u of a similar camera, negative for none.
     """
     a, b = (x - camera[2]) / camera[0], (y - camera[3]) / camera[1]
     r2 = a * a + b * b

@@ -69,14 +69,7 @@ def calibrate_photo_set(
     pairs: PhotoPairs, calibrate: CalibrateFunction, options: CalibrationSettings, seed: int, *,
     together: bool, split: bool = True,
 ) -> list[CalibratedCamera]:  # fmt: skip
-    """Return every camera of a set of photos, the one with most photos first.
-
-    Args:
-        pairs: all pairs that are not degenerate.
-        calibrate: finds one camera from its own pairs.
-        together: also use the pairs between cameras.
-        split: with `together`, also split groups whose photos disagree.
-    """
+    """Return all cameras, those of most photos first; `together` uses pairs between cameras, `split` divides groups."""
     groups: dict[str, list[int]] = {}
     for photo, group in pairs.groups.items():
         groups.setdefault(group, []).append(photo)
@@ -87,7 +80,14 @@ def calibrate_photo_set(
         for name, members in groups.items()
     ]
     if together:
-        cameras = _calibrate_jointly(cameras, pairs, options, seed, split=split)
+        try:
+            cameras = (
+                _split_and_calibrate(cameras, pairs, options, seed)
+                if split
+                else _calibrate_from_all_pairs(cameras, pairs, options)
+            )
+        except FAILURES as err:
+            logger.info("joint calibration of the cameras failed", exc_info=err)
     cameras = [replace(camera, found=_fall_back_to_guess(camera, pairs)) for camera in cameras]
     return sorted(cameras, key=lambda camera: (-len(camera.photos), camera.name))
 
@@ -95,7 +95,6 @@ def calibrate_photo_set(
 def _calibrate_alone(
     calibrate: CalibrateFunction, own: CameraPairs, options: CalibrationSettings, seed: int
 ) -> Calibration:
-    """Return the calibration from the pairs of one camera; a guess where the computation fails."""
     try:
         return calibrate(own, options, seed)
     except FAILURES as err:
@@ -105,28 +104,10 @@ def _calibrate_alone(
         )
 
 
-def _calibrate_jointly(
-    cameras: list[CalibratedCamera], pairs: PhotoPairs, options: CalibrationSettings, seed: int, *, split: bool
-) -> list[CalibratedCamera]:
-    """Return the cameras calibrated from all pairs; unchanged where the computation fails."""
-    try:
-        return (
-            _split_and_calibrate(cameras, pairs, options, seed)
-            if split
-            else _calibrate_from_all_pairs(cameras, pairs, options)
-        )
-    except FAILURES as err:
-        logger.info("joint calibration of the cameras failed", exc_info=err)
-        return cameras
-
-
 def _split_and_calibrate(
     whole: Sequence[CalibratedCamera], pairs: PhotoPairs, options: CalibrationSettings, seed: int
 ) -> list[CalibratedCamera]:
-    """Divide groups whose photos disagree, and calibrate all cameras from all pairs.
-
-    A group with two parts of the same focal stays whole.
-    """
+    """Divide groups whose photos disagree, and calibrate all; a group with two parts of one focal stays whole."""
     families = _mixed_padded_groups(whole, pairs, seed)
     parts = [
         _split_by_photo(camera, len(whole) + families[camera.name], pairs)
@@ -184,10 +165,7 @@ def _split_group(
 
 
 def _confirmed_labels(labels: Mapping[int, int], photos: Sequence[PairId]) -> dict[int, int]:
-    """Return the labels of photos that share a pair with another of their camera, or are its only photo.
-
-    A pair between two cameras does not show which of its photos belongs to which.
-    """
+    """Return the labels of photos that share a pair with another of their camera, or are its only photo."""
     count = Counter(labels.values())
     inside = {photo for pair in photos if labels[pair[0]] == labels[pair[1]] for photo in pair}
     return {photo: label for photo, label in labels.items() if photo in inside or count[label] == 1}
@@ -218,7 +196,6 @@ def _names(camera: CalibratedCamera, pairs: PhotoPairs) -> Iterator[str]:
 
 
 def _split_by_photo(camera: CalibratedCamera, family: int, pairs: PhotoPairs) -> list[CalibratedCamera]:
-    """Return an uncalibrated camera for each photo of a group."""
     nothing, names = guess_calibration(pairs.sizes[camera.photos[0]], "", {}), _names(camera, pairs)
     return [CalibratedCamera(next(names), (photo,), nothing, family) for photo in sorted(camera.photos)]
 

@@ -78,16 +78,9 @@ class CameraPriors:
     center_sigma: float = WIDE[CENTER]
     """Wide prior on the center, in longer sides."""
     lens: bool = True
-    """Whether distortion is estimated."""
 
     def prior(self, free: BoolArray, thetas: FloatArray, held: BoolArray | None = None) -> Prior:
-        """Return the prior for a choice of freed parts.
-
-        Args:
-            free: (C, 4) the freed parts.
-            thetas: (C, 5) parameters of the cameras; they convert k1 to kappa.
-            held: (C, 4) the parts that stay at their usual values; none if None.
-        """
+        """Return the prior for freed parts (C, 4) and those `held` at usual values; thetas convert k1 to kappa."""
         mean, deviation = np.zeros((len(self.sides), CAMERA)), np.empty((len(self.sides), CAMERA))
         hinted = ~free[:, FOCAL] & np.isfinite(self.hints)
         with np.errstate(invalid="ignore"):
@@ -119,7 +112,6 @@ class Evidence:
     """The negative log-likelihood of all pairs near `thetas`: -g'd + d'Hd / 2 for a step d of the cameras."""
 
     thetas: FloatArray
-    """(C, 5) parameters of the cameras."""
     H: FloatArray
     """(5C, 5C) Hessian of the negative log-likelihood."""
     g: FloatArray
@@ -141,10 +133,7 @@ class Evidence:
         return fit + volume + self.priors.log_odds(free), step, covariance
 
     def choices(self, free: BoolArray, camera: int) -> BoolArray:
-        """Return (K, C, 4) all choices for one camera, those that free less first, beside the others' (C, 4).
-
-        Choices with hardly any redundant constraint are left out: three pairs fit almost any center.
-        """
+        """Return (K, C, 4) choices for one camera, less free first, without those of too little redundancy."""
         switches = binary_choices(free.shape[1])
         trials = np.repeat(free[None], len(switches), axis=0)
         trials[:, camera] = switches
@@ -152,10 +141,7 @@ class Evidence:
         return np.asarray(trials[allowed], np.bool_)
 
     def choose(self, free: BoolArray) -> BoolArray:
-        """Return the most probable choice (C, 4), from a first one.
-
-        Each camera in turn takes its best choice beside the present choices of the others, until none changes.
-        """
+        """Return the most probable choice (C, 4): each camera in turn takes its best one, until none changes."""
         while True:
             before = free
             for camera in range(len(free)):
@@ -177,10 +163,7 @@ class Evidence:
         return undetermined
 
     def covariance(self, free: BoolArray) -> FloatArray:
-        """Return (5C, 5C) mean squares of the cameras about `thetas`, over all choices for each camera.
-
-        A parameter that is nearly freed is nearly as uncertain as a freed one.
-        """
+        """Return (5C, 5C) mean squares of the cameras about `thetas`, over all choices for each camera."""
         _, step, covariance = self.posterior(free)
         total = covariance.copy()
         for camera in range(len(free)):
@@ -192,13 +175,7 @@ class Evidence:
     def camera_posteriors(
         self, free: BoolArray, camera: int, step: FloatArray, covariance: FloatArray
     ) -> tuple[BoolArray, Posteriors]:
-        """Return all choices (K, C, 4) for one camera, and its posterior under each.
-
-        Args:
-            free: (C, 4) the choices for all cameras.
-            step: (5C,) mean step of the posterior under `free`.
-            covariance: (5C, 5C) of the same posterior.
-        """
+        """Return all choices (K, C, 4) for one camera, and its posteriors; `step` and `covariance` are of `free`."""
         block = slice(CAMERA * camera, CAMERA * (camera + 1))
         prior, trials = self.priors.prior(free, self.thetas), self.choices(free, camera)
         offset = prior.mean - self.thetas
@@ -217,10 +194,7 @@ class Evidence:
 
 
 def redundancy(free: BoolArray, pairs: float) -> float:
-    """Return the share of redundant constraints, in [0.1, 1], for freed parts (C, 4) and an effective number of pairs.
-
-    A pair gives two constraints. With fewer redundant ones, residuals underestimate the errors.
-    """
+    """Return the share of redundant constraints, in [0.1, 1], for freed parts (C, 4): a pair gives two."""
     unknowns = len(free) + 2 * np.count_nonzero(free[:, CENTER]) + np.count_nonzero(free[:, [ASPECT, LENS]])
     return max(1.0 - unknowns / max(2.0 * pairs, 1e-9), 0.1)
 

@@ -202,19 +202,8 @@ def _rays_and_slopes(lens: Lens | Equirectangular, points: FloatArray) -> FloatA
     )
 
 
-# Search.
-
-
 def search_rays(lines: FloatArray, samples: IndexArray, threshold: float) -> tuple[float, FloatArray]:
-    """Return the support of the best F, in matches, and F (3, 3).
-
-    A match counts 1 - d^2 / threshold^2, or nothing beyond the threshold.
-
-    Args:
-        lines: (N, 18) matches, from `bearings_through`.
-        samples: (S, 8) rows of them.
-        threshold: largest distance of an inlier, in the unit of the photo.
-    """
+    """Return the support of the best F by samples (S, 8), as in MSAC, and F, for bearing vectors (N, 18)."""
     p, q = lines[:, FIRST], lines[:, SECOND]
     Fs = fit_rays(p[samples], q[samples])
     supports = _supports(Fs, lines, threshold)
@@ -234,9 +223,6 @@ def search_rays(lines: FloatArray, samples: IndexArray, threshold: float) -> tup
 
 def _supports(Fs: FloatArray, lines: FloatArray, threshold: float) -> FloatArray:
     return np.asarray(np.sum(1.0 - np.minimum(squared_distances(Fs, lines) / threshold**2, 1.0), axis=1), np.float64)
-
-
-# Refinement.
 
 
 Family = type[Fisheye] | type[RadialLens]
@@ -271,7 +257,6 @@ class RefinedLens(NamedTuple):
     covariance: FloatArray
     """(4, 4) of its parameters."""
     sigma: float
-    """Standard deviation of a distance."""
 
 
 class System(NamedTuple):
@@ -288,23 +273,21 @@ class System(NamedTuple):
 
 
 def refine_lens(start: Lens, pairs: Sequence[Pair], sigma: float) -> RefinedLens:
-    """Return the lens of the family of `start` with the least robust cost, with its covariance.
+    """Return the lens of the family of `start` with the least robust cost, with its covariance, in longer sides.
 
     As `adjustment` for lenses with one radial term: distances are Sampson's (thesis 4.2) in the photos, downweighted by
     the cost of Geman and McClure (1987), and the pose of every pair is eliminated. The covariance is the sandwich with
     pairs as clusters, times the squared misfit, for matches that share keypoints (`redundancy`).
-
-    Args:
-        start: in longer sides of the photos, the center in the middle.
-        sigma: first standard deviation of a distance, in longer sides.
     """
     matches = [x for x, _ in pairs]
-    poses = tuple(_pose_of(F) for _, F in pairs)
+    # any of the four poses of an essential matrix gives the same distances
+    poses = tuple(np.concatenate([R.ravel(), t]) for R, t in (decompose_essential(F)[0] for _, F in pairs))
     shape = start.exponent if isinstance(start, Fisheye) else start.radial
     state = State(np.array([np.log(start.focal), shape, *start.center]), poses, type(start))
     for _ in range(REFINEMENT.noise_rounds):
         state = _adjust(matches, state, sigma)
-        sigma = _noise(matches, state)
+        distances = np.abs(np.concatenate(_distances(matches, state)))
+        sigma = max(MAD_TO_SIGMA * float(np.median(distances)), REFINEMENT.least_sigma)
     systems = _systems(matches, state, sigma)
     H = sum((system.H for system in systems), np.diag(_prior_precision()))
     inverse = inverse_of_positive(H)
@@ -362,13 +345,11 @@ def _step(state: State, systems: list[System], damping: float) -> State:
 
 
 def _systems(matches: Sequence[FloatArray], state: State, sigma: float) -> list[System]:
-    """Return the normal equations of every pair, with derivatives by finite differences."""
     lenses = [state.lens, *(state.lens_at(state.parameters + STEP * axis) for axis in np.eye(LENS))]
     return [_system(x, lenses, pose, sigma) for x, pose in zip(matches, state.poses, strict=True)]
 
 
 def _system(x: FloatArray, lenses: list[Lens], pose: FloatArray, sigma: float) -> System:
-    """Return the normal equations of a pair, for a lens and the lenses a step away from it."""
     (lens, *steps), E = lenses, _essential(pose)
     pair = bearings_through(lens, x)
     r = signed_distances(E, pair)
@@ -395,22 +376,10 @@ def pair_costs(matches: Sequence[FloatArray], state: State, sigma: float) -> Flo
     return np.array([0.5 * float(np.sum(d / (1.0 + d / ROBUST_SCALE**2))) for d in squared], np.float64)
 
 
-def _noise(matches: Sequence[FloatArray], state: State) -> float:
-    """Return the standard deviation of a distance, from the median of all."""
-    distances = np.abs(np.concatenate(_distances(matches, state)))
-    return max(MAD_TO_SIGMA * float(np.median(distances)), REFINEMENT.least_sigma)
-
-
 def _distances(matches: Sequence[FloatArray], state: State) -> list[FloatArray]:
     lens = state.lens
     pairs = zip(matches, state.poses, strict=True)
     return [signed_distances(_essential(pose), bearings_through(lens, x)) for x, pose in pairs]
-
-
-def _pose_of(F: FloatArray) -> FloatArray:
-    """Return a pose (12,) of the essential matrix nearest to F (3, 3); any of the four gives the same distances."""
-    R, t = decompose_essential(F)[0]
-    return np.concatenate([R.ravel(), t])
 
 
 def _essential(pose: FloatArray) -> FloatArray:
@@ -432,9 +401,7 @@ class LensEstimate:
     perspective_support: float
     """The same with a perspective lens, whatever its focal."""
     pairs: int
-    """Number of pairs that voted."""
     size: tuple[int, int]
-    """(width, height) of the photos."""
     log_odds: float = np.inf
     """Robust cost of the best perspective lens with one radial term minus its own, without the pair that favors it
     most: repeated structure can make a pair favor any lens."""
@@ -443,12 +410,8 @@ class LensEstimate:
     def is_fisheye(self) -> bool:
         """Whether a fisheye explains clearly more than any perspective lens, and no radial term could replace it."""
         clear = self.support - self.perspective_support > SEARCH.clear_gain and self.log_odds > 0.0
-        return clear and self.departure_px() > SEARCH.largest_departure_px
-
-    def departure_px(self) -> float:
-        """Return the departure of the best perspective lens with one radial term, in pixels; inf if none can."""
         radial = _fit_radial(self.lens, 0.5 * float(np.hypot(*self.size)))
-        return radial[2] if radial is not None else float("inf")
+        return clear and (radial is None or radial[2] > SEARCH.largest_departure_px)
 
     def radius_deviation_px(self, theta: FloatArray) -> FloatArray:
         """Return (N,) standard deviations of the radius at angles (N,) to the optical axis, in pixels."""
@@ -459,13 +422,7 @@ class LensEstimate:
 
 
 def find_lens(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 0) -> LensEstimate | None:
-    """Find the lens of photos of one size from the raw matches of their pairs; None where too few pairs have matches.
-
-    Args:
-        matches: per pair (N, 4) x1, y1, x2, y2 in pixels, wrong ones included.
-        size: (width, height) of the photos.
-        seed: of the samples.
-    """
+    """Find the lens of photos of one size from the raw matches (N, 4) px of their pairs; None for too few."""
     side = float(max(size))
     pairs = _sample(matches, size, np.random.default_rng(seed), SEARCH.most_pairs, SEARCH.most_matches)
     if pairs is None:
@@ -479,7 +436,8 @@ def find_lens(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 
         return None
     refined = refine_lens(best, selected.with_matrices(Fs), pairs.threshold)
     (log_focal, exponent, u, v), unit = refined.state.parameters, np.array([1.0, 1.0, side, side])
-    rival = _radial_rival(best, size)
+    radial = _fit_radial(best, 0.5 * float(np.hypot(*size)) / side)
+    rival = RadialLens(radial[0], max(radial[1], SEARCH.least_radial)) if radial is not None else None
     return LensEstimate(
         lens=Fisheye(
             float(np.exp(log_focal)) * side, float(exponent),
@@ -557,23 +515,12 @@ def _first_look(
 
 
 def _log_odds(refined: RefinedLens, rival: RadialLens, pairs: _SampledPairs, Fs: Sequence[FloatArray]) -> float:
-    """Return by how much less a lens costs than a perspective rival, without the pair in which it gains most.
-
-    Args:
-        rival: first lens; it starts with the matrices of the lens, and with its own.
-        Fs: fundamental matrices that suit the lens.
-    """
+    """Return by how much less a lens costs than a rival, which starts twice, without the pair that gains most."""
     starts = Fs, [F for _, F in pairs.search(rival)]
     rivals = (refine_lens(rival, pairs.with_matrices(start), pairs.threshold).state for start in starts)
     costs = min((pair_costs(pairs.matches, state, refined.sigma) for state in rivals), key=np.sum)
     gains = costs - pair_costs(pairs.matches, refined.state, refined.sigma)
     return float(np.sum(gains) - np.max(gains))
-
-
-def _radial_rival(lens: Fisheye, size: tuple[int, int]) -> RadialLens | None:
-    """Return the perspective lens with one radial term nearest to a fisheye, in longer sides; None for none."""
-    radial = _fit_radial(lens, 0.5 * float(np.hypot(*size)) / max(size))
-    return RadialLens(radial[0], max(radial[1], SEARCH.least_radial)) if radial is not None else None
 
 
 def _fit_radial(lens: Fisheye, reach: float) -> tuple[float, float, float] | None:

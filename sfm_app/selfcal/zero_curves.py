@@ -80,15 +80,9 @@ ZERO_CURVES = ZeroCurveOptions()
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Find the K that most pairs agree on, and the lens.
+    """Find the K that most pairs agree on, and the lens; an estimate or a guess where the pairs do not determine K.
 
-    Args:
-        pairs: without inliers no lens is found, and the standard deviations come from resampling the pairs.
-        options: `center_sigma` of the prior on the optical center, and whether to look for a lens.
-        seed: of that resampling.
-
-    Returns:
-        K with ``identifiable=True``, or an estimate or a guess and the reason why the pairs do not determine K.
+    Without inliers no lens is found, and the standard deviations come from resampling the pairs.
 
     Raises:
         ValueError: malformed input, see `selfcal.pairs.prepare`.
@@ -138,8 +132,13 @@ def _calibrate_from_matches(
         adjusted = max(adjusted, _adjust(pairs, usable, priors, adjusted), key=lambda one: one.vote_share)
     fit, peak, weights = adjusted.fit, adjusted.peak, adjusted.consensus.pairs.weights
     theta, cov = fit.state.thetas[0], covariance(fit, np.ones(1), resampled=True)
-    evidence |= {**peak.evidence(weights), **_figures(fit, side, float(np.sqrt(cov[LOG_FOCAL, LOG_FOCAL])))}
-    evidence["votes_kept"] = adjusted.vote_share
+    evidence |= peak.evidence(weights) | {
+        "log_focal_spread": float(np.sqrt(cov[LOG_FOCAL, LOG_FOCAL])),
+        "noise_px": fit.state.sigma * side,
+        "conflict": fit.state.scale,
+        "weight": float(np.sum(fit.state.weights)),
+        "votes_kept": adjusted.vote_share,
+    }
     undetermined, conflict = peak.undetermined_reason(weights), _conflict_reason(adjusted)
     answer, spread = (peak.theta, 0.0) if conflict else (theta, evidence["log_focal_spread"])
     reason = undetermined and (critical_motion(fit) or undetermined)
@@ -152,7 +151,7 @@ def _calibrate_from_matches(
     photos = tuple(pairs.photos[k] for k in usable.indices[adjusted.rows]) if pairs.photos else ()
     calibration = replace(
         calibration_from_parameters(theta, pairs.size, METHOD),
-        **camera_uncertainty(theta, cov, side)._asdict(),
+        **camera_uncertainty(theta, cov, side),
         evidence=evidence,
         held=fit.held_names(0),
         key_pairs=key_pairs(fit, photos),
@@ -172,11 +171,9 @@ class _Adjustment:
     consensus: Consensus
     """Of all usable pairs, undistorted."""
     peak: ConsensusPeak
-    """Of that consensus."""
 
     @property
     def vote_share(self) -> float:
-        """Votes for the camera over those for the peak."""
         thetas = np.array([self.fit.state.thetas[0, :KAPPA], self.peak.theta])
         at_fit, at_peak = self.consensus.evaluate(thetas, ZERO_CURVES.votes_sigma)
         return float(at_fit / at_peak) if at_peak > 0 else 0.0
@@ -189,7 +186,6 @@ class _Adjustment:
 
     @property
     def agreeing_pairs(self) -> IndexArray:
-        """Usable pairs that come near the peak."""
         return np.flatnonzero(self.consensus.ratios(self.peak.theta) < ZERO_CURVES.agreeing_ratio)
 
 
@@ -237,15 +233,6 @@ def _convert_to_sides(pairs: CameraPairs, usable: Pairs) -> tuple[Matches, Float
         np.array([pairs.photos[k] for k in usable.indices]) if pairs.photos else np.arange(2 * count).reshape(-1, 2)
     )
     return Matches(inliers, np.zeros((count, 2), np.int64), photos, side), usable.F
-
-
-def _figures(fit: Fit, side: float, log_focal_spread: float) -> dict[str, float]:
-    return {
-        "log_focal_spread": log_focal_spread,
-        "noise_px": fit.state.sigma * side,
-        "conflict": fit.state.scale,
-        "weight": float(np.sum(fit.state.weights)),
-    }
 
 
 def _conflict_reason(adjusted: _Adjustment) -> str:

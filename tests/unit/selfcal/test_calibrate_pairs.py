@@ -212,7 +212,7 @@ def test_standard_deviations_are_those_of_repeated_photos(shots):
         made = shots(5, 40 + seed, k1=-0.1, center=(0.56, 0.46), points=90, noise_px=1.0)
         fit = fitted(made.pairs)
         theta = fit.state.thetas[0]
-        said = camera_uncertainty(theta, covariance(fit, np.ones(1)), SIDE).spread
+        said = camera_uncertainty(theta, covariance(fit, np.ones(1)), SIDE)["spread"]
         found = calibration_from_parameters(theta, (1000, 750), "mine")
         errors = [*(found.K - made.Ks[0])[[0, 1, 0, 1], [0, 1, 2, 2]], found.radial + 0.1]
         scores.append(np.array(errors) / [said[name] for name in ("fx", "fy", "cx", "cy", "k1")])
@@ -224,7 +224,7 @@ def test_standard_deviations_are_those_of_repeated_photos(shots):
 def test_spread_is_the_first_order_of_the_answer():
     theta = np.array([0.2, 0.03, -0.02, 0.1, -0.05])
     root = np.random.default_rng(0).normal(size=(5, 5)) * 1e-4
-    said, correlations = camera_uncertainty(theta, root @ root.T, SIDE)
+    said, correlations = camera_uncertainty(theta, root @ root.T, SIDE).values()
     drawn = theta + np.random.default_rng(1).normal(size=(4000, 5)) @ root.T
     answers = [calibration_from_parameters(one, (1000, 750), "mine") for one in drawn]
     values = np.array([[*a.K[[0, 1, 0, 1], [0, 1, 2, 2]], a.radial] for a in answers])

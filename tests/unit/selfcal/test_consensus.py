@@ -41,7 +41,7 @@ def truth(focal=1.0, u=0.0, v=0.0, aspect=1.0):
 
 
 def test_value_is_votes_plus_prior(consensus):
-    made = consensus().with_weights(np.linspace(0.1, 1, 15))
+    made = Consensus(consensus().pairs, 0.15, np.linspace(0.1, 1, 15))
     theta = truth(1.1, 0.06, -0.03, 1.1)
     expected = np.sum(made.weights * np.exp(-made.ratios(theta) / 0.02)) - 0.5 * (0.06**2 + 0.03**2) / 0.15**2
     np.testing.assert_allclose(made.evaluate(np.stack([theta, truth()]), 0.02)[0], expected)
