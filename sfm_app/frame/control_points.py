@@ -58,7 +58,6 @@ def read_control_points(path: Path) -> ControlPoints:
 
 
 def _read_marks(lines: list[str], geographic: bool) -> tuple[ControlPoint, ...]:
-    """Return the points of all lines after the first; raise a ValueError that names a malformed line."""
     names: dict[tuple[object, ...], str] = {}
     positions: dict[str, tuple[float, float, float]] = {}
     marks: dict[str, dict[str, tuple[float, float]]] = {}
@@ -89,8 +88,6 @@ def _read_mark(line: str, geographic: bool) -> tuple[tuple[float, float, float],
         raise ValueError("has a value out of range")
     return (east, north, up), (x, y), photo, words[6].strip() if len(words) > 6 else ""
 
-
-# The fit of the model to the points, without points that contradict the others.
 
 SIGNIFICANCE = 0.002
 """Probability of a false alarm at each step of the forward search. Chosen by hand; the unit tests count false alarms
@@ -154,12 +151,7 @@ def agreeing_points(places: FloatArray, targets: FloatArray) -> NDArray[np.bool_
     points from some step on are rejected if the fit without them is better than chance allows: by the F-test, with as
     many trials as there are ways to choose the rejected points.
 
-    Args:
-        places: (N, 3) in the model.
-        targets: (N, 3) in meters.
-
-    Raises:
-        ValueError: all points lie on a line.
+    `places` (N, 3) are in the model, `targets` (N, 3) in meters. A ValueError says that all points lie on a line.
     """
     first = robust_similarity(places, targets)
     if len(places) < 5:

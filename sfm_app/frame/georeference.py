@@ -29,13 +29,11 @@ class GpsOptions:
     significance: float = 1e-3
     """Largest probability that positions unrelated to the cameras fit as well."""
     max_scale_deviation: float = 0.1
-    """Largest relative standard deviation of the scale."""
     min_share: float = 0.6
     """Least share of the distinct positions that must agree."""
     max_up_deviation_deg: float = 2.0
     """Largest standard deviation with which up from GPS replaces up from the cameras' roll."""
     max_pairs: int = 500
-    """Largest number of samples of two positions."""
 
 
 OPTIONS = GpsOptions()
@@ -52,7 +50,6 @@ class Georeference:
     inliers: int
     """Number of distinct positions that agree."""
     positions: int
-    """Number of distinct positions."""
     rms_m: float
     """Root mean square horizontal residual of the agreeing positions."""
     scale_deviation: float
@@ -80,11 +77,7 @@ def georeference(
     are used: w = a z + b in complex numbers, by RANSAC over pairs, then least squares. An unsure up is replaced by that
     of the positions if they determine it well.
 
-    Args:
-        centers: (N, 3) camera centers.
-        positions: per photo, None for unknown.
-        up: (3,) unit vector in the world.
-        up_is_sure: whether `up` has more evidence than the cameras' roll.
+    `centers` are (N, 3), `up` is a unit vector (3,); a photo without a position has None.
     """
     known = [k for k, position in enumerate(positions) if position is not None]
     given = [position for position in positions if position is not None]
@@ -139,7 +132,6 @@ def _radii_m(origin: GpsPosition) -> tuple[float, float]:
 
 
 def _median_position(positions: Sequence[GpsPosition]) -> GpsPosition:
-    """Return the median position; its altitude is the median of the known ones."""
     first = positions[0].longitude_deg
     offset = np.median([(position.longitude_deg - first + 180.0) % 360.0 - 180.0 for position in positions])
     longitude = (first + float(offset) + 180.0) % 360.0 - 180.0

@@ -168,9 +168,6 @@ def _angle_cost(sine: FloatArray, deg: float) -> FloatArray:
     return np.asarray(0.5 * (np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0))) / deg) ** 2)
 
 
-# Cues of the scene and of the pictures.
-
-
 @dataclass(frozen=True, slots=True)
 class CueOptions:
     """Constants of the cues."""
@@ -188,7 +185,6 @@ class CueOptions:
     picture_px: int = 256
     """Longer side of the small pictures: wide enough for ledges and window sills, too small for texture."""
     blur_px: float = 2.0
-    """Blur before slopes are taken."""
     black: int = 20
     """Gray level of an unlit background, whose border is no ledge."""
     black_px: int = 15
@@ -200,7 +196,6 @@ class CueOptions:
     max_sky_slope: float = 1.5
     """Largest slope of sky, in gray levels per pixel."""
     sky_blur_px: float = 1.0
-    """Blur before the slopes of sky are taken."""
     min_sky: int = 40
     """Least gray level of sky."""
 
@@ -232,11 +227,7 @@ def fit_surfaces(
 ) -> Surfaces:
     """Fit a plane to the neighbors of each point, and keep flat patches.
 
-    Args:
-        points: (P, 3).
-        brightness: (P,) 0 to 255.
-        visible: per photo, the indices of its visible points.
-        centers: (N, 3) of the cameras.
+    `brightness` (P,) is 0 to 255, `centers` are those of the cameras; `visible` holds the points of each photo.
     """
     from scipy.spatial import cKDTree
 
@@ -268,12 +259,7 @@ def depth_height_correlation(
 
     The ground gets nearer towards the lower border; facades seen from the street lean away.
 
-    Args:
-        up: (3,) unit vector in the world.
-        rotations: (N, 3, 3) of cam_from_world.
-        centers: (N, 3) of the cameras.
-        points: (P, 3) in the world.
-        visible: per photo, the indices of its visible points.
+    `up` is a unit vector (3,), `rotations` (N, 3, 3) are cam_from_world, the rest is as in `fit_surfaces`.
     """
     correlations = []
     for R, center, rows in zip(rotations, centers, visible, strict=True):
@@ -313,10 +299,7 @@ def slope_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[ND
     Shadow under ledges, eaves and objects has a sharp border to the lit top above it, and skylines are brighter above;
     transitions back to light are gradual. Perpendicular to `up` it is 0 within 0.06.
 
-    Args:
-        up: (3,) unit vector in the world.
-        rotations: (N, 3, 3) of cam_from_world.
-        pictures: per photo (H, W) gray, in the orientation of the sensor; None if there is none.
+    `rotations` (N, 3, 3) are cam_from_world; the pictures (H, W) are gray, in the orientation of the sensor.
     """
     shares = []
     for R, gray in _blurred(rotations, pictures, CUE_OPTIONS.blur_px):
@@ -327,10 +310,7 @@ def slope_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[ND
 
 
 def sky_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
-    """Return the mean share of even, bright pixels near the upper border minus the lower, in [-1, 1].
-
-    Arguments are those of `slope_asymmetry`.
-    """
+    """Return the mean share of even, bright pixels near the upper border minus the lower, in [-1, 1]."""
     differences = []
     for R, blurred in _blurred(rotations, pictures, CUE_OPTIONS.sky_blur_px):
         steep = np.hypot(_slope(blurred, np.array([1.0, 0.0])), _slope(blurred, np.array([0.0, 1.0])))
@@ -359,7 +339,6 @@ def _mean(values: list[float]) -> float:
 
 
 def _black_background(gray: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return the pixels (H, W) of an unlit background and its border."""
     widths = CUE_OPTIONS.black_px, 2 * CUE_OPTIONS.border_px + 1
     broad, border = (np.ones((width, width), np.uint8) for width in widths)
     black = cv2.morphologyEx((gray < CUE_OPTIONS.black).astype(np.uint8), cv2.MORPH_OPEN, broad)

@@ -72,8 +72,6 @@ class UpOptions:
 
 OPTIONS = UpOptions()
 
-# The plane with most points of a scene, among planes of a given inclination.
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plane:
@@ -90,12 +88,7 @@ class Plane:
 def dominant_plane(points: FloatArray, axis: FloatArray, between_deg: tuple[float, float]) -> Plane | None:
     """Find the plane with most points whose normal is at a given angle to an axis; None without enough inliers.
 
-    RANSAC with a fixed seed, then least squares on the inliers.
-
-    Args:
-        points: (N, 3), of any scale.
-        axis: (3,) unit vector.
-        between_deg: least and largest angle between normal and axis, in [0, 90].
+    RANSAC with a fixed seed, then least squares on the inliers. `axis` is a unit vector (3,), angles are in [0, 90].
     """
     rng = np.random.default_rng(0)
     cloud = points[rng.permutation(len(points))[: OPTIONS.max_points]]
@@ -122,9 +115,6 @@ def _fit_plane(points: FloatArray, axis: FloatArray, share: float) -> Plane:
     # rounding may leave the least eigenvalue of coplanar points below zero
     deviation = np.degrees(np.arctan2(np.sqrt(max(small, 0.0) / len(points)), np.sqrt(max(middle, 1e-30))))
     return Plane(smallest_eigenvector(scatter, axis), share, float(deviation))
-
-
-# The choice between the hypotheses of roll.
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,10 +174,7 @@ class RollSelection:
 def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArray, scenery: Scenery) -> RollSelection:
     """Choose the vertical by roll and ledges, then its upper end by all cues.
 
-    Args:
-        rolls: estimates for photos turned by 0, 90, 180, 270 degrees; opposites share a vertical.
-        rotations: (N, 3, 3) cam_from_world of the photos.
-        centers: (N, 3) camera centers.
+    The rolls are those of photos turned by 0, 90, 180, 270 degrees; `rotations` (N, 3, 3) are cam_from_world.
     """
     surfaces = fit_surfaces(scenery.points, scenery.brightness, scenery.visible, centers)
     ledges = [slope_asymmetry(roll.up, rotations, scenery.pictures) for roll in rolls[:2]]
@@ -215,9 +202,6 @@ def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArra
 def odds(nats: float) -> float:
     """Return log odds as odds to one, with two digits."""
     return float(f"{np.exp(min(nats, OPTIONS.highest_nats)):.2g}")
-
-
-# The up direction, the side of the viewer, and the frame of both.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -255,11 +239,7 @@ def up_direction(
 ) -> UpEstimate:
     """Find up from vertical lines near the up direction of the cameras' roll, or else from the ground or the roll.
 
-    Args:
-        rotations: (N, 3, 3) cam_from_world of the photos, N >= 1.
-        centers: (N, 3) camera centers.
-        segments: lines in the photos; may be empty.
-        turn_deg: clockwise turn that makes the photos upright: 0, 90, 180 or 270; None if unknown.
+    `turn_deg` is the clockwise turn that makes the photos upright, None if unknown; `rotations` are cam_from_world.
     """
     rolls = roll_hypotheses(rotations, centers)
     if turn_deg is None:
@@ -288,10 +268,6 @@ def viewer_direction(upright: UpEstimate, rotations: FloatArray, points: FloatAr
     """Choose the horizontal direction (3,) to the viewer, and its source: `LINES`, `WALL` or `CAMERAS`.
 
     It points to the cameras, or exactly along a main direction of lines or walls near that.
-
-    Args:
-        rotations: (N, 3, 3) of cam_from_world.
-        points: (P, 3) in the world.
     """
     up = upright.up
     towards = normalize(perpendicular_component(-rotations[:, 2].mean(axis=0), up))
@@ -311,11 +287,8 @@ def viewer_direction(upright: UpEstimate, rotations: FloatArray, points: FloatAr
 def viewer_frame(up: FloatArray, towards: FloatArray, points: FloatArray, meters: float | None = None) -> Similarity:
     """Return the similarity into the frame of glTF viewers: y up, z to the viewer, the points around the origin.
 
-    Args:
-        up: (3,) unit vector in the world.
-        towards: (3,) perpendicular unit vector, see `viewer_direction`.
-        points: (P, 3) of the scene.
-        meters: per unit of the world; None for four of five points within 1 of the middle.
+    `up` and `towards` are perpendicular unit vectors (3,), `meters` those of a unit of the world; if None, four of five
+    points come within 1 of the middle.
     """
     R = np.stack([np.cross(up, towards), up, towards])
     # the median would follow the densest points, the bounding box the farthest few

@@ -79,13 +79,8 @@ def orient(
 ) -> dict[str, Json]:
     """Move the colored model into the frame of glTF viewers: y up, seen from +z, centered, of size 1 or in meters.
 
-    Return the orientation and its evidence for the manifest.
-
-    Args:
-        turn_deg: clockwise turn that makes the photos upright; None if unknown.
-
-    Raises:
-        NumericalError: the model has no finite points.
+    Return the orientation and its evidence for the manifest. `turn_deg` is the clockwise turn that makes the photos
+    upright, None if unknown. A NumericalError says that the model has no finite points.
     """
     with translate_errors("reading the model"):
         poses, points = poses_and_points(model)
@@ -141,7 +136,6 @@ def turn_camera(R: FloatArray, turn_deg: int) -> FloatArray:
 
 
 def _world_segments(model: Reconstruction, cues: Mapping[int, PhotoCues]) -> Segments:
-    """Return the line segments of a model's photos in the world."""
     parts = []
     with translate_errors("computing viewing rays of line segments"):
         for photo, cue in cues.items():
@@ -172,7 +166,6 @@ def extract_cues(path: Path, turn_deg: int = 0) -> PhotoCues:
 
 
 def _orientation_entry(upright: UpEstimate, front: str) -> dict[str, Json]:
-    """Return the up and front directions and their evidence, for the manifest."""
     selection = upright.selection
     return {
         "up": upright.method,
@@ -195,7 +188,6 @@ def gps_deviation(orientation: Mapping[str, Json]) -> float | None:
 
 
 def _georeference_entry(viewer: Similarity, gps: Georeference | NoGeoreference) -> dict[str, Json]:
-    """Return the unit and georeference of the model in the frame of the viewer, for the manifest."""
     if isinstance(gps, NoGeoreference):
         return {"unit": "about the size of the scene", "gps": f"not used: {gps.reason}"}
     enu_from_model = gps.enu_from_world.compose(viewer.inverse())

@@ -27,7 +27,6 @@ class LineOptions:
     search_deg: float = 28.0
     """Radius of the search for a direction."""
     step_deg: float = 2.0
-    """Its step."""
     widths_deg: tuple[float, ...] = (2.0, 1.0, 0.5)
     """Widths within which segments support a direction, from coarse to fine."""
     prior_deg: float = 25.0
@@ -103,11 +102,7 @@ class VanishingDirection:
 
 
 def segment_planes(first: FloatArray, second: FloatArray, photo: int, scale_px: float) -> Segments:
-    """Build the segments of one photo from the rays (N, 3), in the world, to their two ends.
-
-    Args:
-        scale_px: focal length in pixels, which converts angles into lengths.
-    """
+    """Build the segments of one photo with a focal length from the rays (N, 3), in the world, to their two ends."""
     a, b = normalize(first), normalize(second)
     cross = np.cross(a, b)
     lengths = scale_px * np.linalg.norm(cross, axis=1)
@@ -250,7 +245,6 @@ def _scatter_matrices(direction: FloatArray, segments: Segments, width_deg: floa
 
 
 def _sum_per_photo(segments: Segments, values: FloatArray) -> FloatArray:
-    """Sum values (N, ...) over the segments of each photo."""
     sums = np.zeros((int(segments.photos.max(initial=-1)) + 1, *values.shape[1:]))
     np.add.at(sums, segments.photos, values)
     return sums

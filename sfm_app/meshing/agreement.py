@@ -117,11 +117,7 @@ class Raster:
 def rasterize(vertices: FloatArray, faces: IndexArray, projection: FloatArray, size: tuple[int, int]) -> Raster:
     """Draw a surface into a photo without distortion, at pixel centers.
 
-    Args:
-        vertices: (V, 3) in the world.
-        faces: (T, 3), counterclockwise seen from outside.
-        projection: (3, 4) K [R | t].
-        size: height and width in pixels.
+    Faces (T, 3) are counterclockwise seen from outside; `size` is height and width in pixels.
     """
     nearness, face = np.zeros(size, np.float32), np.full(size, NOTHING, np.int32)
     _draw(project_vertices(vertices, projection), faces, nearness, face)
@@ -215,13 +211,7 @@ class Sight:
 
 
 def compare(vertices: FloatArray, faces: IndexArray, normals: Gray, here: Sight, others: Iterable[Sight]) -> Pull:
-    """Return the pull of the differences between a photo and others.
-
-    Args:
-        vertices: (V, 3).
-        faces: (T, 3).
-        normals: (T, 3) of the triangles, unit.
-    """
+    """Return the pull of the differences between a photo and others; the normals (T, 3) are those of the triangles."""
     pull, level, raster = Pull.zeros(len(vertices)), here.level, here.raster
     shape = raster.depth.shape
     g, h = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
@@ -244,11 +234,8 @@ def compare(vertices: FloatArray, faces: IndexArray, normals: Gray, here: Sight,
 def _look_through(surface: Any, homography: Any, eyes: Any, other: Any, views: Gray) -> None:
     """Fill `views` (H, W, 3): gray level of the other photo, its change per displacement, and 1 where visible, else 0.
 
-    Args:
-        surface: depth, face and normals of the triangles in the photo.
-        homography: H and p take pixel x at depth z to z H x + p of the other photo.
-        eyes: rays of the photo, and its center relative to that of the other.
-        other: the other photo, and the depths of the surface in it.
+    `homography` H and p take pixel x at depth z to z H x + p of the other photo. `eyes` are the rays of the photo, and
+    its center relative to that of the other. `other` has the image of the other, and the depths of the surface in it.
     """
     depth, face, normals = surface
     H, p = homography

@@ -68,10 +68,7 @@ def find_displacements(
     They minimize the sum of h d^2 - 2 g d over the vertices, plus the squared distances from the mean of the neighbors
     in units of `bend`; large distances, at creases, count less (Cauchy).
 
-    Args:
-        vertices, normals: (V, 3).
-        pull: g and h of the photos, (V,) each.
-        size: (V,) mean length of the edges at each vertex, > 0.
+    The pull of the photos is g and h, `size` the mean length of the edges at each vertex, (V,) each.
     """
     g, h = pull
     bend = np.zeros(len(vertices))

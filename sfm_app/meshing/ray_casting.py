@@ -26,13 +26,7 @@ PACKAGES = {
 
 @functools.cache
 def load_open3d() -> Any:
-    """Import Open3D, with little logging.
-
-    Call it inside the functions that need Open3D: the import takes more than a second.
-
-    Raises:
-        SfmError: the system lacks a library.
-    """
+    """Import Open3D, which takes more than a second; an SfmError names a library that the system lacks."""
     load_libusb()
     try:
         open3d = importlib.import_module("open3d")
@@ -73,9 +67,7 @@ class NearestNormals:
     def find(self, points: NDArray[np.float32], facing: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return (N, 3) unit normals, interpolated at the closest place; 0 where it is far away or faces elsewhere.
 
-        Args:
-            points: (N, 3).
-            facing: (N, 3) directions, from which a normal may differ by less than a right angle.
+        A normal may differ from its direction `facing` (N, 3) by less than a right angle.
         """
         if self._scene is None or not len(points):
             return np.zeros_like(points)
@@ -102,10 +94,7 @@ class Occluders:
     def is_hidden(self, center: NDArray[np.float64], slack: float, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return (N,) whether a triangle lies between a point and the camera.
 
-        Args:
-            center: (3,) of the camera.
-            slack: length of the start of each ray that is ignored, because the point's own triangles are there.
-            points: (N, 3).
+        The first `slack` of each ray is ignored, because the point's own triangles are there.
         """
         ray = center - points
         length = np.linalg.norm(ray, axis=1, keepdims=True)

@@ -70,10 +70,7 @@ def judge(points: FloatArray, normals: FloatArray, eye: DepthView, tolerance: fl
     tolerance. It is SEEN_THROUGH if its pixel shows the sky, or if all four surrounding depths lie well behind it. It
     is EMPTY if it faces the photo and no depth around it is known. Hidden and masked points give NO_EVIDENCE.
 
-    Args:
-        points: (N, 3) in the world.
-        normals: (N, 3) unit vectors.
-        tolerance: relative difference in depth.
+    The normals (N, 3) are unit vectors; the tolerance is a relative difference in depth.
     """
     verdict = np.zeros(len(points), np.uint8)
     _judge(points, normals, eye.projection, eye.center, eye.depth, np.array([eye.sample_px, tolerance]), verdict)
@@ -167,11 +164,7 @@ def sample_colors(
 ) -> Paint:
     """Sample colors of one photo at the points that it confirms; their weight is the area of a unit patch in pixels.
 
-    Args:
-        points: (N, 3).
-        normals: (N, 3) unit.
-        verdict: (N,) from `judge`.
-        image: (H, W, 3) the same field of view as the depth map, at any size.
+    The verdict (N,) comes from `judge`. The image (H, W, 3) has the field of view of the depth map, at any size.
     """
     paint = Paint.zeros(len(points))
     scale = np.array(image.shape[:2]) / eye.depth.shape

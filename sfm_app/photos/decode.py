@@ -32,8 +32,6 @@ LARGE_PHOTO_LOCK = Lock()
 SENSOR_UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """Length of EXIF's units of the sensor's resolution; 2, the inch, is the default. By definition."""
 
-# EXIF: hints about a photo that are never trusted.
-
 
 def orientation(exif: Image.Exif) -> int:
     """Return the EXIF orientation, 1 to 8; 1 (upright) if it is missing or invalid."""
@@ -170,9 +168,6 @@ def _install_handler() -> None:
         set_handler(ERROR_CALLBACK)
 
 
-# Pictures of files.
-
-
 class UnreadableError(Exception):
     """A file gives no picture; the message, for people, says why."""
 
@@ -204,7 +199,9 @@ def read_picture(path: Path) -> DecodedPhoto:
     """Decode a whole file; raise UnreadableError if it is damaged or no photo."""
     try:
         with Image.open(path, formats=formats()) as image:
-            _refuse_bombs(image, path)
+            pixels = image.width * image.height
+            if pixels > LARGE_PX and path.stat().st_size < 0.02 * pixels:  # real photos have more bytes per pixel
+                raise UnreadableError("too many pixels for a file of its size")
             frames = _frame_count(image)
             image.seek(0)
             with libtiff_errors() as errors:
@@ -236,13 +233,6 @@ def large_photo_lock(path: Path) -> Iterator[None]:
         pixels = 0
     with LARGE_PHOTO_LOCK if pixels > LARGE_PX / 2 else nullcontext():
         yield
-
-
-def _refuse_bombs(image: Image.Image, path: Path) -> None:
-    """Refuse decompression bombs below Pillow's own limit: real photos have more than 0.02 bytes per pixel."""
-    pixels = image.width * image.height
-    if pixels > LARGE_PX and path.stat().st_size < 0.02 * pixels:
-        raise UnreadableError("too many pixels for a file of its size")
 
 
 def _frame_count(image: Image.Image) -> int:

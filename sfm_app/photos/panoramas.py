@@ -137,19 +137,13 @@ def _covered_share(entries: dict[str, str], side: str) -> float:
         return 1.0
 
 
-# Resampling.
-
-
 def resample(
     photo: NDArray[np.uint8], at: NDArray[np.floating[Any]], size: tuple[int, int], wraps: bool = False
 ) -> NDArray[np.uint8]:
     """Return a photo (H, W, 3) at given positions by cubic interpolation; outside, the border is repeated.
 
-    Args:
-        photo: (h, w, 3), possibly scaled down.
-        at: (H, W, 2) pixels of the photo at its own size, centers at +0.5.
-        size: (width, height) at its own size.
-        wraps: whether the left border continues the right one, as in a panorama.
+    `at` (H, W, 2) are pixels of the photo at its own size (width, height), centers at +0.5; it may be scaled down. With
+    `wraps`, its left border continues the right one, as in a panorama.
     """
     height, width = photo.shape[:2]
     x, y = (
@@ -247,11 +241,8 @@ def _look_along(axis: FloatArray) -> FloatArray:
     return np.stack([right, np.cross(axis, right), axis])
 
 
-# Texture views: the faces of a cube, in the panorama's own resolution, from which surfaces are painted.
-
-
 def panorama_parts(size: tuple[int, int]) -> list[PerspectiveView]:
-    """Return the texture views of a panorama of (width, height) pixels."""
+    """Return the texture views of a panorama of (width, height): faces of a cube, in its own resolution."""
     x, y = np.meshgrid(np.linspace(0.0, size[0], OPTIONS.grid), np.linspace(0.0, size[1], OPTIONS.grid))
     rays = bearings(np.column_stack([x.ravel(), y.ravel()]), _camera(size))[:, RAY]
     return cover_rays(rays, size[0] / (2.0 * np.pi), size[0])

@@ -111,9 +111,6 @@ def _edge_slope(image: NDArray[np.float32], axis: int) -> float:
     return float(np.percentile(np.abs(np.diff(image, axis=axis)), OPTIONS.edge_percentile))
 
 
-# The statistics of all photos in a file, so that a photo is decoded once for all runs.
-
-
 def write_stats(
     path: Path, stats: Mapping[str, PhotoStats], digests: Mapping[str, str], options: PhotoSettings
 ) -> None:
@@ -195,11 +192,8 @@ def _similar_rows(small: NDArray[np.float32], limits: NDArray[np.floating]) -> l
     return similar
 
 
-# Unusable photos: blurred ones, and screenshots among photos. Some photos always remain.
-
-
 def drop_unusable(stats: Sequence[PhotoStats]) -> tuple[list[PhotoStats], list[UnusablePhoto]]:
-    """Return the usable and the unusable photos, both in the given order."""
+    """Return the usable photos, and the unusable ones: blurred photos, and screenshots among photos; in order."""
     median = float(np.median([one.blur for one in stats])) if stats else 0.0
     sizes = Counter(_size_key(one.photo) for one in stats)
     photographic = np.mean([one.flat < OPTIONS.flat_share for one in stats]) > 0.5 if stats else False

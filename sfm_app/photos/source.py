@@ -36,7 +36,6 @@ class Source:
     files: Mapping[str, str]
     """Hashes of the files by name; for a video, one hash under an empty name."""
     mask_dir: Path | None
-    """Folder of masks, if given."""
     masks: Mapping[str, str]
     """Hashes of the masks by name."""
     stamps: Mapping[Path, Stamp]
@@ -103,7 +102,6 @@ def digest(file: Path) -> str:
 
 
 def _stamp(path: Path) -> Stamp | None:
-    """Return size and time of a regular file; None if there is none."""
     try:
         stat = path.stat()
     except (OSError, ValueError):
@@ -149,7 +147,9 @@ def lay_out(photo: Photo, folder: Path, target: Path) -> None:
     if isinstance(source, str):
         raise UnreadableError(source)
     if not photo.needs_copy:
-        _link(source, place, relative=folder.parent.resolve() == target.parent.resolve())
+        # links to video frames are relative, since both move with the output folder
+        relative = folder.parent.resolve() == target.parent.resolve()
+        link_or_copy(place, os.path.relpath(source, place.parent.resolve()) if relative else source, source)
         return
     with large_photo_lock(source):
         _copy(photo, source, place)
@@ -171,8 +171,3 @@ def _copy(photo: Photo, source: Path, place: Path) -> None:
         copy.save(place, "JPEG", quality=95)
     else:
         copy.save(place, "PNG", compress_level=1)
-
-
-def _link(source: Path, place: Path, *, relative: bool) -> None:
-    """Link or copy a photo; links to video frames are relative, since both move with the output folder."""
-    link_or_copy(place, os.path.relpath(source, place.parent.resolve()) if relative else source, source)

@@ -45,10 +45,7 @@ SKIES = "skies.npz"
 def make(scene: Scene, run: RunContext) -> Path:
     """Make a depth and a normal map of every photo with neighbors in the dense workspace; a killed run can resume.
 
-    Raises:
-        ReconstructionError: no photo gets a depth map.
-        ConfigError: the chosen method cannot run here.
-        BackendError: COLMAP failed.
+    Raise a ReconstructionError if no photo gets a depth map, a ConfigError if the chosen method cannot run here.
     """
     dense_dir, options = run.workspace.dense, run.settings.depth
     method, reason = run.plugins.depth_method(options.method)
@@ -92,15 +89,10 @@ def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None
                 undistort_mask = MaskUndistorter(scene.model_dir, run.mask_dir, dense_dir)
                 run.map(Task(undistort_mask), read_views(dense_dir), "undistorting masks")
         else:
-            project_wide_photos(scene, lenses, dense_dir, run)
+            project = Task(_project_wide_photo, Shared(lenses), run.workspace.photos, run.mask_dir, dense_dir)
+            run.map(project, write_model(scene.model_dir, lenses, dense_dir), "projecting wide photos")
+            run.record(views_per_photo=max(len(lens.views) for lens in lenses.values()))
         mark_unfinished(dense_dir, made_from)
-
-
-def project_wide_photos(scene: Scene, lenses: Mapping[int, WideLens], dense_dir: Path, run: RunContext) -> None:
-    """Write several perspective views of each photo of a wide lens."""
-    project = Task(_project_wide_photo, Shared(lenses), run.workspace.photos, run.mask_dir, dense_dir)
-    run.map(project, write_model(scene.model_dir, lenses, dense_dir), "projecting wide photos")
-    run.record(views_per_photo=max(len(lens.views) for lens in lenses.values()))
 
 
 def _project_wide_photo(

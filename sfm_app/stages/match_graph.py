@@ -58,10 +58,7 @@ def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
 
 
 def load(photos: PhotoSet, run: RunContext) -> MatchGraph:
-    """Read the match graph of these photos from the database.
-
-    Raise a ValueError if it is damaged: COLMAP would end the program on it.
-    """
+    """Read the match graph of these photos; raise a ValueError if the database is damaged, which would end COLMAP."""
     if not is_sound(run.workspace.database):
         raise ValueError(f"{run.workspace.database} is damaged")
     with translate_errors("reading the database"):

@@ -32,8 +32,6 @@ MANY_FILES = 5000
 """Number of files above which the folder may be a wrong one, such as a home. Chosen by hand."""
 DAMAGED = "play it to see whether it is whole; save it as MP4 with H.264"
 
-# The chosen frames of a video, written to OUT/frames as a folder of photos.
-
 
 @dataclass(frozen=True, slots=True)
 class FrameChoice:
@@ -42,7 +40,6 @@ class FrameChoice:
     made_from: str
     """Fingerprint of the inputs."""
     frames: tuple[int, ...]
-    """Frame numbers."""
     times_s: tuple[float, ...]
     """Timestamps of the frames, in seconds."""
     counts: Mapping[str, Any]
@@ -85,7 +82,8 @@ def choose_frames(source: Path, run: RunContext) -> FrameChoice:
     try:
         with open_video(source) as video:
             tracker = CornerTracker()
-            pictures = track(run.progress, video.small_frames(), "tracking frames", video.sample_count)
+            samples = max(1, video.claimed // video.stride)
+            pictures = track(run.progress, video.small_frames(), "tracking frames", samples)
             tracked, times_s = [], {}
             for number, small in pictures:
                 tracked.append(tracker.track(number, small))
@@ -118,7 +116,6 @@ def choose_frames(source: Path, run: RunContext) -> FrameChoice:
 
 
 def _write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> None:
-    """Write the missing frames."""
     for incomplete in run.workspace.frames.glob(".*"):  # files of a killed run
         incomplete.unlink()
     places = {frame: run.workspace.frames / frame_name(source, frame) for frame in frames}
@@ -147,9 +144,6 @@ def frame_stem(source: Path) -> str:
     """Return the stem of a video's frames: short, printable and not hidden."""
     printable = "".join(c if c.isprintable() else "_" for c in source.stem)
     return printable.lstrip(".")[:40] or "frame"
-
-
-# The stage.
 
 
 def make(source: Source, run: RunContext) -> PhotoSet:
@@ -186,7 +180,6 @@ def digest(place: Workspace) -> str:
 def _read_photos(
     source: Source, folder: Path, names: Sequence[str], times_s: Mapping[str, float], run: RunContext
 ) -> PhotoSet:
-    """Read these files of a folder and lay the usable photos out for COLMAP."""
     options = limit_to_memory(run)
     contents = read_all(source, folder, names, options, run)
     unreadable = [photo for photo in contents if isinstance(photo, UnusablePhoto)]
@@ -266,7 +259,6 @@ def attach_masks(
 
 
 def _lay_out_masks(photo_set: PhotoSet, masks: Path, names: Sequence[str], run: RunContext) -> None:
-    """Put a mask of every photo into the workspace, and count them."""
     lay_out = Task(lay_out_mask, folder=photo_set.folder, masks=masks, target=run.workspace.masks)
     run.map(lay_out, photo_set.photos, "laying masks out")
     unused = unused_masks(list(names), photo_set.photos)
@@ -284,7 +276,6 @@ def lay_out_photo(photo: Photo, *, folder: Path, target: Path) -> None:
 
 
 def _save_photo_set(photos: PhotoSet, run: RunContext) -> None:
-    """Write photos.json, with hashes of the copies."""
     entries = [photo.to_dict() for photo in photos.photos]
     unusable = [asdict(photo) for photo in photos.unusable]
     copies = {photo.name: _copy_digest(photo, run) for photo in photos.photos}
@@ -301,7 +292,6 @@ def _copy_digest(photo: Photo, run: RunContext) -> str | None:
 
 
 def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoSet:
-    """Read photos.json back, and lay out missing photos."""
     photo_set = replace(read_photo_list(run.workspace), folder=folder, masks=masks)
     values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
     for photo in photo_set.photos:
@@ -316,7 +306,6 @@ def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoS
 
 
 def _too_few_message(folder: Path, usable: int, unusable: list[UnusablePhoto]) -> str:
-    """Return why there are not enough photos, in one line."""
     reasons = Counter("copies of another" if "same picture" in photo.reason else photo.reason for photo in unusable)
     counts = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
     number = "no usable photo" if usable == 0 else "only one usable photo"

@@ -93,7 +93,6 @@ def _adjust_models(
 
 
 def _finish_scene(mapped: MappedScene, run: RunContext) -> Scene:
-    """Adjust the models, orient them, write them and record their figures."""
     matches, views, intrinsics = mapped.matches, mapped.views, mapped.intrinsics
     outcome = _drop_models_without_depth(mapped, run)
     cues = submit_cue_extraction([attempt.model for attempt in outcome.models], matches, run)
@@ -188,7 +187,6 @@ def _adjustment_problems(adjusted: Sequence[Adjustment], names: Mapping[str, str
 
 
 def _lens_choices(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, Json]:
-    """Return the manifest's entries about each camera's chosen model and its rivals."""
     cameras = _camera_ids(adjusted, names)
     return {name: adjusted.lenses[key].to_dict() for name, key in cameras.items() if key in adjusted.lenses}
 

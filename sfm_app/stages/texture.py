@@ -154,7 +154,6 @@ def read_texture(place: Workspace) -> Model:
 
 
 def _list_numbered(stored: Mapping[str, NDArray[Any]], kind: str) -> tuple[NDArray[Any], ...]:
-    """Return the arrays named by a kind and a number from 0 on."""
     arrays = list[NDArray[Any]]()
     while (array := stored.get(f"{kind}{len(arrays)}")) is not None:
         arrays.append(array)

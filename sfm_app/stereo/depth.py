@@ -21,7 +21,7 @@ from sfm_app.stereo.plain_areas import enclosed_pixels, fill_planar_areas, plain
 from sfm_app.stereo.rectify import depths_from_disparities, disparities, rectify
 from sfm_app.stereo.view import DepthArray, GrayImage, View
 from sfm_app.types import Rejected
-from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.types.arrays import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,12 +74,7 @@ def match_depths(
 
     Semi-global matching with each neighbor gives depths; the merged depths initialize PatchMatch with all neighbors.
 
-    Args:
-        view: the photo.
-        candidates: possible neighbors, best first.
-        load: returns the gray photo of a view.
-        count: most neighbors.
-        tolerance: relative difference within which depths agree.
+    The best candidates come first. `load` returns the gray photo of a view; depths agree within a relative tolerance.
     """
     image = load(view)
     # gray values are sampled at pixel centers
@@ -107,14 +102,9 @@ def match_depths(
     planes = fit_planes(merged)
     planes[..., 0] = np.divide(1, merged, out=np.zeros_like(merged), where=merged > 0)
     cost = improve_planes(planes, centered, image, neighbors, sweeps=1)  # a second sweep improves 1 % of the pixels
-    cost[_clipped_mask(image)] = NO_MATCH
-    return _sample_planes(planes, cost, view.sample_px)
-
-
-def _clipped_mask(image: GrayImage) -> BoolArray:
-    """Mark pixels (H, W) whose 3 x 3 mean is nearly black or white."""
     mean = cv2.blur(image, (3, 3))
-    return np.asarray((mean <= OPTIONS.clipped_gray) | (mean >= 255 - OPTIONS.clipped_gray))
+    cost[(mean <= OPTIONS.clipped_gray) | (mean >= 255 - OPTIONS.clipped_gray)] = NO_MATCH
+    return _sample_planes(planes, cost, view.sample_px)
 
 
 def _sample_planes(planes: PlaneArray, cost: NDArray[np.float32], sample_px: float) -> DepthEstimate:
@@ -134,8 +124,7 @@ def merge_hypotheses(
     At each pixel, the largest-weight group of depths within the relative tolerance of one of them wins and is averaged.
     The weight of a depth is its squared parallax, which is inversely proportional to its variance.
 
-    Returns:
-        (H, W) depth, 0 where no neighbor has one, and (H, W) number of neighbors that agree with it.
+    Return (H, W) the depth, 0 where no neighbor has one, and (H, W) the number of neighbors that agree with it.
     """
     depth = np.zeros(depths.shape[1:], np.float32)
     support = np.zeros(depths.shape[1:], np.uint8)

@@ -68,7 +68,6 @@ def propose_planes(depth: DepthArray, image: GrayImage, tolerance: float) -> Dep
 
 
 def _propose_within(depth: DepthArray, area: BoolArray, tolerance: float, proposed: DepthArray) -> None:
-    """Write proposals for an area, in its bounding box."""
     unknown = area & (depth == 0)
     if not unknown.any():
         return
@@ -111,11 +110,7 @@ def agreed_proposals(
 ) -> DepthArray:
     """Add to the depths of a photo the proposals that enough other photos share and none contradicts.
 
-    Args:
-        view: the photo.
-        maps: (H, W) its depths and its proposals, 0 where there are none.
-        others: other photos with their depths and proposals.
-        tolerance: largest relative difference of depths that agree.
+    `maps` are the depths and the proposals (H, W) of the photo, 0 for none, as are those of the others.
     """
     depth, proposed = maps
     known_or_proposed = [(other, np.where(known > 0, known, plane)) for other, known, plane in others]

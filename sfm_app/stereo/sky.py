@@ -64,9 +64,6 @@ class SkyOptions:
 OPTIONS = SkyOptions()
 
 
-# Blank areas of a photo, each of which may be sky: even, without depths, and brighter than most surfaces.
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotoAreas:
     """A photo in cells, and its blank areas; number 0 is everything else."""
@@ -97,19 +94,15 @@ def blank_areas(photo: GrayImage, depth: DepthArray) -> PhotoAreas:
     blank = (known < OPTIONS.open_share) & (_to_cells(variation) <= OPTIONS.most_variation)
     labels = cv2.connectedComponents(blank.view(np.uint8), connectivity=4)[1]
     surfaces = known >= OPTIONS.known_share
-    labels = _keep_bright(labels, cells, np.sort(cells[surfaces]))
+    levels, mean_gray = np.sort(cells[surfaces]), _mean_gray(labels, cells)
+    bright = np.searchsorted(levels, mean_gray) >= max(1.0, OPTIONS.bright_rank * len(levels))
+    bright[0] = False
+    labels = np.asarray((np.cumsum(bright) * bright)[labels])
     size = np.bincount(labels.ravel())
     at_border = np.zeros(len(size), bool)
     at_border[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = True
     at_border[0] = False
     return PhotoAreas(labels.astype(np.uint16), surfaces, size, _mean_gray(labels, cells), at_border)
-
-
-def _keep_bright(labels: NDArray[np.int32], gray: NDArray[np.float32], surfaces: NDArray[np.float32]) -> IndexArray:
-    """Keep the areas brighter than most surfaces, numbered from 1. The surfaces' gray levels (S,) ascend."""
-    bright = np.searchsorted(surfaces, _mean_gray(labels, gray)) >= max(1.0, OPTIONS.bright_rank * len(surfaces))
-    bright[0] = False
-    return np.asarray((np.cumsum(bright) * bright)[labels])
 
 
 def _mean_gray(labels: NDArray[np.signedinteger], gray: NDArray[np.float32]) -> FloatArray:
@@ -185,12 +178,10 @@ def _find_cells(
 
 
 def find_skies(areas: Sequence[PhotoAreas], votes: Sequence[Votes]) -> list[BoolArray]:
-    """Return the sky cells (h, w) of each photo; none if the votes do not show that the scene has a sky.
-
-    A sky needs agreement among the votes, and votes from enough views.
-    """
+    """Return the sky cells (h, w) of each photo; none if the votes do not show that the scene has a sky."""
     large = [one.at_border & (one.size >= OPTIONS.least_share * one.labels.size) for one in areas]
     counts = sum((vote.counts[:, own].sum(axis=1) for vote, own in zip(votes, large, strict=True)), np.zeros(3))
+    # a sky needs agreement among the votes, and votes from enough views
     blank, other, nearer = counts
     if not blank or blank < OPTIONS.agreeing * (blank + other) or blank < OPTIONS.visible * (blank + other + nearer):
         return [np.zeros(one.labels.shape, bool) for one in areas]
@@ -206,9 +197,6 @@ def _sky_of(areas: PhotoAreas, votes: Votes, large: BoolArray) -> BoolArray:
     sky = far & (sure | (areas.gray >= areas.gray[sure].min() - OPTIONS.darker))
     sky[0] = False
     return np.asarray(sky[areas.labels])
-
-
-# The pixels of a sky, given its cells: up to the outlines of the objects before it.
 
 
 def sky_pixels(photo: GrayImage, cells: BoolArray) -> BoolArray:
@@ -257,6 +245,5 @@ def _find_narrow_rims(sky: BoolArray) -> BoolArray:
 
 
 def _widen(mask: BoolArray, pixels: int) -> BoolArray:
-    """Dilate a mask by a number of pixels."""
     side = 2 * pixels + 1
     return np.asarray(cv2.dilate(mask.view(np.uint8), np.ones((side, side), np.uint8)) > 0)

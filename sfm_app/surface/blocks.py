@@ -37,7 +37,6 @@ POINTS = "points"
 BLOCKS = "blocks"
 """Folder beside the surface while its blocks are made."""
 EVERYWHERE = np.array([[-np.inf] * 3, [np.inf] * 3])
-"""Infinite bounds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +108,6 @@ def sort_points(
 
 
 def _add(records: NDArray[np.void], numbers: NDArray[np.intp], folder: Path, count: int) -> None:
-    """Add records to the files of their blocks, in their order."""
     ends = np.cumsum(np.bincount(numbers, minlength=count))
     parts: Sequence[NDArray[np.void]] = np.split(records[np.argsort(numbers, kind="stable")], ends[:-1])
     for number, part in enumerate(parts):
@@ -138,7 +136,6 @@ class RecordCells:
 
 
 def _normals(records: NDArray[np.void]) -> FloatArray:
-    """Return the normals (N, 3) of records."""
     return np.stack([records[f"n{c}"] for c in "xyz"], axis=1).astype(np.float64)
 
 
@@ -278,12 +275,7 @@ def mesh_in_blocks(
 ) -> Surface:  # fmt: skip
     """Return the surface of all points, made block by block.
 
-    Args:
-        points: (N,) records of the fused points.
-        least: photos that have to confirm the average vertex of a part.
-
-    Raises:
-        ReconstructionError: there is no surface.
+    `least` photos have to confirm the average vertex of a part. A ReconstructionError says that there is no surface.
     """
     options = run.settings.mesh
     folder = run.workspace.surface / BLOCKS

@@ -45,9 +45,7 @@ class GainOptions:
     darkest: int = 8
     """Darker gray levels are nearly clipped and do not determine the gain."""
     brightest: int = 247
-    """Brighter gray levels are nearly clipped and do not determine the gain."""
     rounds: int = 15
-    """Rounds of reweighting."""
     prior: float = 0.01
     """Weight of "no gain", as a share of the mean weight of a photo: keeps undetermined gains at 1."""
 
@@ -108,10 +106,7 @@ def _measure_deviations(
     level: FloatArray,
     far: FloatArray,
 ) -> None:
-    """Write the largest deviations `far` over the channels from the median color of a triangle with views `here`.
-
-    `scale` (P, 3) are factors on the colors of each photo; `level` is a buffer.
-    """
+    """Write the largest deviations `far` of the views `here` from their median color; `level` is a buffer."""
     count = len(here)
     far[:count] = 0.0
     for channel in range(3):
@@ -148,7 +143,6 @@ def _deviations(
 
 @kernel
 def _average_neighbors(before: NDArray[np.float32], beside: IndexArray, after: NDArray[np.float32]) -> None:
-    """Average over each triangle and its visible neighbors."""
     for f in range(len(before)):
         total, count = before[f], 1
         for k in range(3):
@@ -235,7 +229,6 @@ def _disagreement(
 
 
 def _average_known(values: FloatArray, neighbors: IntArray) -> FloatArray:
-    """Return (T,) means of the known values of each triangle and its neighbors."""
     known = np.isfinite(values)
     total, count = np.where(known, values, 0.0), known.astype(np.float64)
     for beside in neighbors.T:

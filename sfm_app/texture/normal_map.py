@@ -36,12 +36,8 @@ def interpolate_frames(
 ) -> tuple[NDArray[np.float32], FloatArray]:
     """Return points (N, 3) and frames (N, 3, 3), of unit rows, of all texels with an owner, row by row.
 
-    Args:
-        owner: (h, W) triangle of each texel in rows of a page, -1 for none.
-        top: the first of these rows.
-        corners: (T, 3, 2) texels.
-        points: (T, 3, 3) corners in the scene.
-        frames: (T, 3, 3, 3) from `corner_frames`.
+    `owner` (h, W) is the triangle of each texel in rows of a page from `top` on, -1 for none. The corners (T, 3, 2) are
+    in texels, the points (T, 3, 3) in the scene; the frames (T, 3, 3, 3) come from `corner_frames`.
     """
     count, n, part = np.count_nonzero(owner != NONE), 0, np.empty(3)
     texel_points, texel_frames = np.empty((count, 3), np.float32), np.empty((count, 3, 3))
@@ -60,7 +56,6 @@ def interpolate_frames(
 
 @kernel
 def _set_frame(part: FloatArray, frames: FloatArray, frame: FloatArray) -> None:
-    """Set the interpolated frame (3, 3) of unit vectors."""
     for row in range(3):
         length = 0.0
         for axis in range(3):

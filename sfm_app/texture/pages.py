@@ -73,15 +73,7 @@ class Canvas:
 def owners(
     size: tuple[int, int], triangles: IndexArray, corners: FloatArray, spread: Spread = map, band: int = BAND
 ) -> IntArray:
-    """Return (H, W) the triangle of each texel of a page, -1 for none.
-
-    Args:
-        size: (width, height) of the page.
-        triangles: (N,) indices of the page's triangles.
-        corners: (T, 3, 2) texels.
-        spread: applies a function to parts of the page, possibly in parallel.
-        band: rows of a part.
-    """
+    """Return (H, W) the triangle of each texel of a page (W, H), -1 for none; corners (T, 3, 2) are in texels."""
     owner = np.full((size[1], size[0]), NONE, np.int32)
 
     def claim(top: int) -> None:
@@ -142,19 +134,11 @@ def paint(  # noqa: PLR0913
     owner: IntArray,
     total: IntArray,
 ) -> None:
-    """Add one photo to a page.
+    """Add one photo (height, width, 3) to a page, with its camera row at this size.
 
-    Args:
-        photo: (height, width, 3) RGB.
-        camera: (26,) lens and pose of the photo at this size.
-        brightness: (3,) factors, the inverse of the photo's gains.
-        triangles: (N,) indices of the page's triangles with a share of the photo.
-        corners: (T, 3, 2) texels.
-        points: (N, 3, 3) corners in the scene.
-        shares: (N, 3, 4) weight of the photo at each corner, and offsets of its channels in gray levels.
-        rims: (N, 3) whether no triangle is visible across the edge from corner k to k + 1.
-        owner: (H, W) of the page.
-        total: (H, W, 3) of the page.
+    `triangles` (N,) are those of the page with a share of the photo, `shares` (N, 3, 4) its weight at each corner and
+    the offsets of its channels in gray levels, `rims` (N, 3) edges from corner k to k + 1 without a visible triangle
+    across. The brightness is the inverse of the gains. Corners (T, 3, 2) are in texels, points (N, 3, 3) in the scene.
     """
     height, width = owner.shape
     part, least = np.empty(3), np.empty(3)
@@ -251,7 +235,6 @@ def _finish_page(page: Canvas) -> Page:
 
 @kernel
 def _round_levels(total: IntArray, rounded: NDArray[np.uint8]) -> None:
-    """Fill in the gray levels of weighted sums."""
     for y in range(total.shape[0]):
         for x in range(total.shape[1]):
             for channel in range(3):
@@ -293,7 +276,6 @@ def _average_blocks(page: NDArray[np.uint8], painted: BoolArray, means: NDArray[
 
 @kernel
 def _fill_gaps(coarse: NDArray[np.uint8], painted: BoolArray, page: NDArray[np.uint8]) -> None:
-    """Give texels without an owner the color of their block."""
     for y in range(page.shape[0]):
         for x in range(page.shape[1]):
             if not painted[y, x]:
@@ -301,9 +283,6 @@ def _fill_gaps(coarse: NDArray[np.uint8], painted: BoolArray, page: NDArray[np.u
                     page[y, x, channel] = coarse[
                         min(y // 2, coarse.shape[0] - 1), min(x // 2, coarse.shape[1] - 1), channel
                     ]
-
-
-# Checkpoints of the pages of a block.
 
 
 @dataclass(frozen=True, slots=True)
@@ -348,9 +327,6 @@ class Pages:
         self._store.keep(GROUP_NAME, {"block": np.array(self._block), "has": self.has, **totals})
         end = time.monotonic()
         self._due_s = end + max(CHECKPOINTS.every_s, (end - start) / CHECKPOINTS.most_time)
-
-
-# The plan of a texture, and its pages painted block by block.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -424,7 +400,6 @@ def _new_canvas(number: int, plan: TexturePlan, spread: ParallelMap) -> Canvas:
 
 
 def _blocks_of_photos(plan: TexturePlan) -> list[set[int]]:
-    """Return, for each photo, the blocks with its triangles."""
     block_sets = []
     for photo in range(plan.checked.sightings.photos):
         near = plan.mesh.faces_at(plan.blend.vertex[plan.blend.photo_rows(photo)])

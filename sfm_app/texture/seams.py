@@ -84,10 +84,7 @@ def blend_weights(chosen: IntArray, sightings: Sightings, mesh: Facets) -> Blend
 def _photo_weights(
     photo: int, own: IndexArray, chosen: IntArray, sightings: Sightings, mesh: Facets, degree: IndexArray
 ) -> tuple[IndexArray, FloatArray]:
-    """Return the vertices (N,) near the `own` triangles of a photo, ascending, and its share (N,) at each.
-
-    `degree` (V,) is the number of edges at each vertex.
-    """
+    """Return the vertices (N,) near the `own` triangles of a photo, ascending, and its share; degrees are (V,)."""
     at = distinct(mesh.faces[own].ravel(), len(mesh.vertices))
     for _ in range(OPTIONS.rings):
         at = distinct(mesh.faces[mesh.faces_at(at)].ravel(), len(mesh.vertices))
@@ -129,12 +126,7 @@ def solve_ties(
 ) -> FloatArray:
     """Solve (graph Laplacian + hold) x = right (N, 3) by conjugate gradients.
 
-    Args:
-        one: (E,) node at one end of each edge of the graph.
-        other: (E,) node at the other end.
-        weights: (E,) of the edges.
-        hold: added to the diagonal, > 0 somewhere in each connected part; a number or (N,).
-        right: (N, 3) right-hand sides.
+    `weights` (E,) are of the edges from `one` to `other`; `hold`, a number or (N,), is added to the diagonal.
     """
     from scipy.sparse import coo_matrix
 
@@ -152,10 +144,7 @@ def _solve(
     starts: NDArray[np.int32], others: NDArray[np.int32], weights: FloatArray, diagonal: FloatArray, right: FloatArray,
     x: FloatArray,
 ) -> None:  # fmt: skip
-    """Solve (diagonal - weights) x = right by conjugate gradients from x = 0, scaled by the diagonal.
-
-    At most 100 steps, until the norm of the preconditioned residual is 1 % of its initial value.
-    """
+    """Solve (diagonal - weights) x = right by at most 100 steps of conjugate gradients, scaled by the diagonal."""
     size, channels = len(right), 3
     residual, direction, product = right.copy(), np.empty_like(right), np.empty_like(right)
     tolerance, step = np.zeros(channels), np.zeros(channels)
@@ -216,12 +205,9 @@ def _multiply(
 def _gaps(
     blend: Blend, sightings: Sightings, gains: FloatArray, mesh: Facets
 ) -> tuple[IndexArray, IndexArray, FloatArray]:
-    """Find nodes where two photos meet at a vertex, and their color differences.
+    """Return (M,) nodes where photos meet, (M,) the heaviest node there, and (M, 3) its color minus that of the first.
 
     Colors are compared on triangles at the vertex with usable views of both photos; pairs without any are omitted.
-
-    Returns:
-        (M,) node, (M,) node of the largest weight at its vertex, and (M, 3) color of the latter minus the former.
     """
     others, heads = _seam_pairs(blend, len(mesh.vertices))
     photo_of = np.repeat(np.arange(sightings.photos), np.diff(blend.starts))
@@ -273,9 +259,6 @@ def _ties(blend: Blend, mesh: Facets) -> tuple[IndexArray, IndexArray]:
         start.append(ends[:, 0])
         end.append(ends[:, 1])
     return np.concatenate(start), np.concatenate(end)
-
-
-# Triangles without a photo: colors from the surrounding triangles, and a square of texels for each.
 
 
 def vertex_colors(mesh: Facets, painted: BoolArray, corner_colors: FloatArray) -> FloatArray:

@@ -84,11 +84,7 @@ class PhotoView:
 
 
 def photo_view(name: str, camera: CameraModel, cam_from_world: FloatArray) -> PhotoView:
-    """Return the view of a registered photo with the pose [R | t] (3, 4).
-
-    Raises:
-        ReconstructionError: the camera is of no model in `KINDS`; every run writes its cameras as one of these.
-    """
+    """Return the view of a photo with the pose [R | t] (3, 4); a ReconstructionError names an unknown camera model."""
     if camera.model not in KINDS:
         raise ReconstructionError(f"texturing does not support the camera model {camera.model}")
     kind, columns = KINDS[camera.model]

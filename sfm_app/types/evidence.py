@@ -129,13 +129,7 @@ class CameraPairs:
 
     @classmethod
     def from_Fs(cls, Fs: ArrayLike, size: tuple[int, int], weights: ArrayLike | None = None) -> "CameraPairs":
-        """Make pairs from matrices alone.
-
-        Args:
-            Fs: (P, 3, 3) in pixels, x2' F x1 = 0, any scale.
-            size: width and height of the photos in pixels.
-            weights: (P,) >= 0; None for equal weights.
-        """
+        """Make pairs from matrices (P, 3, 3) in pixels, x2' F x1 = 0, of any scale; without weights, all are equal."""
         matrices = np.asarray(Fs, np.float64)
         return cls(matrices, np.ones(len(matrices)) if weights is None else np.asarray(weights, np.float64), size)
 
@@ -163,10 +157,7 @@ class PhotoPairs:
     bars bring to one size may each be of another camera."""
 
     def with_origins(self, corners: Mapping[int, tuple[int, int]]) -> "PhotoPairs":
-        """Return the pairs with pixels counted from new origins (left, top), given by photo.
-
-        The sizes stay the same.
-        """
+        """Return the pairs with pixels counted from new origins (left, top) by photo; the sizes stay the same."""
         if not corners:
             return self
         at = np.array([[corners.get(photo, (0, 0)) for photo in pair] for pair in self.photos]).reshape(-1, 2, 2)
