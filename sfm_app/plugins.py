@@ -119,7 +119,6 @@ class FeatureMethod:
     match: MatchFeatures | None = None
     summary: str = ""
     unavailable: Callable[[], str] = _no_reason
-    """Reason why it cannot run on this machine; empty if it can."""
     sift: Mapping[str, bool | int | float] | None = None
     """In place of functions: options of COLMAP's SIFT extraction that differ from its defaults."""
 

@@ -112,17 +112,13 @@ class ControlFit:
     deviation: float
     """Relative standard deviation of the scale."""
     rms_m: float
-    """Root mean square distance of the inliers."""
     inliers: tuple[str, ...]
     outliers: Mapping[str, float]
     """Distance of each rejected point from the fit, in meters."""
 
 
 def fit_control_points(given: ControlPoints, located: Mapping[str, SightedPoint]) -> ControlFit | str:
-    """Fit the similarity from the model to its ground control points, given their places in the model by name.
-
-    Return the reason if the points do not determine one.
-    """
+    """Fit the similarity from the model to control points by their places in it; return the reason if there is none."""
     points = [point for point in given.points if point.name in located]
     if len(points) < 3:
         return f"{len(points)} of {len(given.points)} ground control points have a place in the model, 3 are needed"

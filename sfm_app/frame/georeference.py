@@ -30,7 +30,6 @@ class GpsOptions:
     """Largest probability that positions unrelated to the cameras fit as well."""
     max_scale_deviation: float = 0.1
     min_share: float = 0.6
-    """Least share of the distinct positions that must agree."""
     max_up_deviation_deg: float = 2.0
     """Largest standard deviation with which up from GPS replaces up from the cameras' roll."""
     max_pairs: int = 500

@@ -26,7 +26,6 @@ class ScaleEvidence:
     deviation: float
     """Relative standard deviation, > 0."""
     photos: int = 0
-    """Number of photos that show the object."""
 
 
 @dataclass(frozen=True, slots=True)

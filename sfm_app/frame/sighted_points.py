@@ -68,10 +68,7 @@ class SightedPoint:
 
 
 def locate_point(sights: Sequence[Sight]) -> SightedPoint | str:
-    """Place a point by its sights, one per photo: least squares of the residuals in pixels, without outliers.
-
-    Return the reason if they do not determine it.
-    """
+    """Place a point by its sights, one per photo, by least squares without outliers; return the reason if it fails."""
     if len(sights) < 2:
         return "it is marked in one photo with a pose, two are needed" if sights else "no photo with it has a pose"
     centers, rays = np.array([one.center for one in sights]), np.array([one.ray for one in sights])
@@ -98,10 +95,7 @@ def locate_point(sights: Sequence[Sight]) -> SightedPoint | str:
 
 
 def ray_information(place: FloatArray, centers: FloatArray, rays: FloatArray, focals: FloatArray) -> FloatArray:
-    """Return the information matrix (3, 3) of a point (3,) for marks with a standard deviation of one pixel.
-
-    The cameras' centers are (N, 3), the rays unit vectors (N, 3), the focal lengths (N,) pixels per radian.
-    """
+    """Return the information matrix (3, 3) of a point for marks with a deviation of one pixel, by unit rays."""
     weights = (focals / np.maximum(np.linalg.norm(place - centers, axis=1), 1e-300)) ** 2
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     return np.asarray((weights[:, None, None] * across).sum(axis=0))

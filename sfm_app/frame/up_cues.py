@@ -70,25 +70,18 @@ def roll_hypotheses(rotations: FloatArray, centers: FloatArray) -> tuple[Roll, .
     Roll alone does not distinguish portrait photos of a wall from landscape photos of the same wall lying on its side,
     so two weaker cues are added: people look nearly horizontally, and they walk rather than climb. Proposals of photos
     are refined by weighted least squares, and the cheapest is chosen. Opposite turns have opposite directions, unless
-    cameras look steeply down.
-
-    Args:
-        rotations: (N, 3, 3) cam_from_world, N >= 1; camera axes x right, y down, z forward.
-        centers: (N, 3) camera centers.
+    cameras look steeply down. The rotations (N, 3, 3) are cam_from_world, N >= 1.
     """
-    return tuple(
-        _best_hypothesis(turn, proposals, rotations, centers) for turn, proposals in enumerate(_proposals(rotations))
-    )
-
-
-def _best_hypothesis(turn: int, proposals: FloatArray, rotations: FloatArray, centers: FloatArray) -> Roll:
-    best, least = (proposals[0], ROLL_OPTIONS.rolls_deg[0]), np.inf
-    for proposal, roll_deg in product(proposals, ROLL_OPTIONS.rolls_deg):
-        for up in (proposal, _refine_up(proposal, rotations, roll_deg)):
-            cost = _cost(up, turn, rotations, roll_deg) + _climb_cost(up, centers)
-            if cost < least - 1e-9:
-                best, least = (up, roll_deg), cost
-    return Roll(best[0], 90 * turn, *_uncertainty(best[0], rotations, best[1]), least)
+    rolls = []
+    for turn, proposals in enumerate(_proposals(rotations)):
+        best, least = (proposals[0], ROLL_OPTIONS.rolls_deg[0]), np.inf
+        for proposal, roll_deg in product(proposals, ROLL_OPTIONS.rolls_deg):
+            for up in (proposal, _refine_up(proposal, rotations, roll_deg)):
+                cost = _cost(up, turn, rotations, roll_deg) + _climb_cost(up, centers)
+                if cost < least - 1e-9:
+                    best, least = (up, roll_deg), cost
+        rolls.append(Roll(best[0], 90 * turn, *_uncertainty(best[0], rotations, best[1]), least))
+    return tuple(rolls)
 
 
 def _up_axes(rotations: FloatArray) -> FloatArray:
@@ -190,7 +183,6 @@ class CueOptions:
     black_px: int = 15
     """Least width of that background."""
     border_px: int = 6
-    """Width of its border."""
     min_rms: float = 1e-6
     """RMS of differences of normals or log brightness below which they are rounding."""
     max_sky_slope: float = 1.5
@@ -282,10 +274,7 @@ def mean_upward_normal(up: FloatArray, surfaces: Surfaces) -> float:
 
 
 def brightness_normal_correlation(up: FloatArray, surfaces: Surfaces) -> float:
-    """Return the correlation of brightness with the normal's component along `up` (3,), in [-1, 1].
-
-    Both are relative to their neighborhood: light comes from above.
-    """
+    """Return the correlation of brightness with the normal's component along `up`, both relative to their vicinity."""
     if not len(surfaces.normals):
         return 0.0
     rise, shade = component_along(surfaces.normal_differences, up), surfaces.brightness_differences

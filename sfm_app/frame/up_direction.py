@@ -42,20 +42,17 @@ class UpOptions:
     """Constants of the up direction and of the frame of viewers."""
 
     samples: int = 1000
-    """Samples of three points for a plane."""
     max_points: int = 4000
     """Largest number of points that score a plane."""
     inlier_distance: float = 0.01
     """Largest distance of inliers from a plane, as a share of the scene's size."""
     min_share: float = 0.15
-    """Least share of inliers of a plane."""
     max_nats: float = 3.0
     """Largest evidence of one cue: each of them is wrong in one place of twenty (a vault, a stage, snow)."""
     ledge_nats: float = 10.0
     """Nats for an axis per unit of `slope_asymmetry`. The other cues are as large sideways: along a wall, depth,
     normals and light change from side to side."""
     max_ledge_nats: float = 4.0
-    """Their maximum."""
     highest_nats: float = 14.0
     """Odds above a million to one are not distinguished."""
     unsure_deg: float = 5.0
@@ -172,10 +169,7 @@ class RollSelection:
 
 
 def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArray, scenery: Scenery) -> RollSelection:
-    """Choose the vertical by roll and ledges, then its upper end by all cues.
-
-    The rolls are those of photos turned by 0, 90, 180, 270 degrees; `rotations` (N, 3, 3) are cam_from_world.
-    """
+    """Choose the vertical by roll and ledges, then its upper end by all cues; the rolls are in order of their turns."""
     surfaces = fit_surfaces(scenery.points, scenery.brightness, scenery.visible, centers)
     ledges = [slope_asymmetry(roll.up, rotations, scenery.pictures) for roll in rolls[:2]]
     upright, lying = (
@@ -265,10 +259,7 @@ def up_direction(
 
 
 def viewer_direction(upright: UpEstimate, rotations: FloatArray, points: FloatArray) -> tuple[FloatArray, str]:
-    """Choose the horizontal direction (3,) to the viewer, and its source: `LINES`, `WALL` or `CAMERAS`.
-
-    It points to the cameras, or exactly along a main direction of lines or walls near that.
-    """
+    """Choose the horizontal direction (3,) to the cameras, or of lines or walls near it, and name its source."""
     up = upright.up
     towards = normalize(perpendicular_component(-rotations[:, 2].mean(axis=0), up))
     if not towards.any():

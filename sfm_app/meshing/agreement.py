@@ -115,10 +115,7 @@ class Raster:
 
 
 def rasterize(vertices: FloatArray, faces: IndexArray, projection: FloatArray, size: tuple[int, int]) -> Raster:
-    """Draw a surface into a photo without distortion, at pixel centers.
-
-    Faces (T, 3) are counterclockwise seen from outside; `size` is height and width in pixels.
-    """
+    """Draw a surface, its triangles counterclockwise from outside, into a photo (height, width) at pixel centers."""
     nearness, face = np.zeros(size, np.float32), np.full(size, NOTHING, np.int32)
     _draw(project_vertices(vertices, projection), faces, nearness, face)
     with np.errstate(divide="ignore"):

@@ -38,9 +38,7 @@ def drop_islands(surface: Surface, min_share: float) -> Surface:
 
 
 def make_manifold(surface: Surface) -> Surface:
-    """Return the surface as an oriented manifold.
-
-    Every edge then has one triangle, or two that run along it in opposite directions; those at a vertex form one fan.
+    """Return the surface as an oriented manifold: at most two triangles at an edge, one fan at a vertex.
 
     Degenerate, non-finite and duplicate triangles are removed. Where more than two triangles share an edge, or two run
     along it in the same direction, the smallest are removed. Vertices where fans only touch are split.
@@ -137,10 +135,7 @@ class Support:
 
 
 def trim(surface: Surface, support: Support, max_gap_triangles: float, least: float) -> Surface:
-    """Keep the parts that photos confirm and do not see through, bridge small gaps, and smooth the border.
-
-    The limits are those of `bridge_gaps` and `drop_doubtful_parts`.
-    """
+    """Keep the parts that photos confirm and do not see through, bridge small gaps, and smooth the border."""
     sign, edges = np.where(support.is_supported, 1.0, -1.0), unique_edges(surface.faces)
     bridged = bridge_gaps(surface, sign, support.is_free, max_gap_triangles, edges)
     smooth = smooth_support(surface, bridged, TRIM.smoothing, edges)

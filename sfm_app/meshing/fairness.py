@@ -114,11 +114,7 @@ def _apply(
     starts: IndexArray, others: IndexArray, share: FloatArray, weight: FloatArray, d: FloatArray, scratch: FloatArray,
     out: FloatArray,
 ) -> None:  # fmt: skip
-    """Fill in L' W L d (V,); L d is the mean of the neighbors less the vertex.
-
-    `share` is one over the number of neighbors, `weight` the diagonal of W, 0 without neighbors; `scratch` and `out`
-    are overwritten; (V,) each.
-    """
+    """Fill in L' W L d, L d the mean of the neighbors less the vertex, by W's diagonal and one over their number."""
     for v in range(len(d)):
         out[v] = 0.0
         if weight[v] > 0.0:

@@ -57,10 +57,7 @@ def camera_name(exif: Image.Exif) -> str:
 
 
 def focal_px(exif: Image.Exif, longer_side: int) -> float | None:
-    """Return EXIF's focal length in pixels, for the longer side in pixels; None if it is implausible.
-
-    The 35 mm equivalent comes first, then the focal length in millimeters with the sensor's resolution.
-    """
+    """Return EXIF's focal length in pixels, by the 35 mm equivalent or else the sensor; None if it is implausible."""
     details = exif.get_ifd(IFD.Exif)
     for claim in (_equivalent_focal, _sensor_focal):
         try:
@@ -140,10 +137,7 @@ _thread_errors = threading.local()
 
 @contextmanager
 def libtiff_errors() -> Iterator[list[str]]:
-    """Provide a list that collects libtiff's errors while this thread decodes.
-
-    It stays empty if Pillow links libtiff statically, as on Windows; damage that libtiff survives is then not noticed.
-    """
+    """Collect libtiff's errors while this thread decodes; none if Pillow links it statically, as on Windows."""
     _install_handler()
     _thread_errors.errors = []
     try:

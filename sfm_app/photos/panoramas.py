@@ -60,10 +60,7 @@ OPTIONS = PanoramaOptions()
 
 
 def is_panorama(picture: DecodedPhoto, upright: Image.Image) -> bool:
-    """Return whether a photo is a full equirectangular panorama, by its metadata or else by its upright pixels.
-
-    Raise an UnreadableError for a panorama of another projection or of a part of the sphere.
-    """
+    """Return whether a photo is a full panorama; raise an UnreadableError for another projection or a part of one."""
     entries = read_panorama_entries(picture.image)
     kind = entries.get("ProjectionType", "").strip().lower()
     if not kind:
@@ -177,7 +174,6 @@ class PanoramaViews:
     size: tuple[int, int]
     """Width and height of the panorama in pixels."""
     side_px: int
-    """Side of each view."""
     rotations: FloatArray
     """(V, 3, 3) from the panorama's frame to that of each view; x right, y down, z forward."""
 

@@ -42,7 +42,6 @@ class SelectionOptions:
     min_sharpness_contrast: float = 4.0
     """Least contrast in gray levels at which sharpness is measured."""
     min_side_px: int = 200
-    """Least shorter side at which sharpness is measured."""
     max_difference: float = 0.015
     """Largest RMS difference between copies, as a share of the contrast. Moving the camera sideways by a thousandth of
     the width gives more; saving a picture again, smaller or as JPEG, gives less."""
@@ -128,10 +127,7 @@ def write_stats(
 
 
 def read_stats(path: Path, digests: Mapping[str, str], options: PhotoSettings) -> dict[str, PhotoStats]:
-    """Return the statistics of photos with unchanged digests, by path in the folder.
-
-    Empty if the file is missing, damaged, or of other settings or versions.
-    """
+    """Return the statistics of photos with unchanged digests; none of a damaged file or another version."""
     try:
         arrays = load_arrays(path)
         known = json.loads(str(arrays["known"]))

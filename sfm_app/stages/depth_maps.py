@@ -43,10 +43,7 @@ SKIES = "skies.npz"
 
 
 def make(scene: Scene, run: RunContext) -> Path:
-    """Make a depth and a normal map of every photo with neighbors in the dense workspace; a killed run can resume.
-
-    Raise a ReconstructionError if no photo gets a depth map, a ConfigError if the chosen method cannot run here.
-    """
+    """Make depth and normal maps in the dense workspace; raise a ReconstructionError if no photo gets one."""
     dense_dir, options = run.workspace.dense, run.settings.depth
     method, reason = run.plugins.depth_method(options.method)
     run.record(method=method.name, method_reason=reason)
@@ -137,10 +134,7 @@ def _drop_sky(dense_dir: Path, skies: Shared[Mapping[str, NDArray[np.bool_]]], p
 
 
 def record(dense_dir: Path, views: Sequence[View], rejections: Sequence[Rejected | None], run: RunContext) -> None:
-    """Record each photo's share of depths, and the reasons for missing depth maps; None stands for a depth map.
-
-    Raise a ReconstructionError if no view has a depth map.
-    """
+    """Record the photos' shares of depths and the reasons for missing maps; ReconstructionError if there is no map."""
     rejected = Counter(rejection.reason for rejection in rejections if rejection is not None)
     coverage = {
         view.name: round(float(np.mean(read_depth(dense_dir, view, "geometric") > 0)), 3)

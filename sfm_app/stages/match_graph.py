@@ -16,11 +16,7 @@ from sfm_app.types import MatchGraph, PhotoSet
 
 
 def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
-    """Find features and match pairs of photos, without geometric verification.
-
-    Features and matches of a killed run, and of the same photos in an earlier run, are reused. Raise a
-    ReconstructionError if no two photos have matches.
-    """
+    """Find features and match pairs that no earlier run has; raise a ReconstructionError if there are no matches."""
     place, options = run.workspace, run.settings.matching
     marker = place.database_marker
     if not (is_made_from(marker, run.fingerprint) and is_sound(place.database)):

@@ -38,7 +38,6 @@ class FrameChoice:
     """The chosen frames of a video."""
 
     made_from: str
-    """Fingerprint of the inputs."""
     frames: tuple[int, ...]
     times_s: tuple[float, ...]
     """Timestamps of the frames, in seconds."""
@@ -147,10 +146,7 @@ def frame_stem(source: Path) -> str:
 
 
 def make(source: Source, run: RunContext) -> PhotoSet:
-    """Read every file of a folder, or the frames of a video, and lay the usable photos out for COLMAP.
-
-    Raise an InputError if the source is missing, fewer than two photos are usable, or a mask is unusable.
-    """
+    """Read a folder or a video, and lay the usable photos out for COLMAP; raise an InputError if too few are."""
     if not source.video:
         return _read_photos(source, source.path, list(source.files), {}, run)
     folder = run.workspace.frames
@@ -180,7 +176,10 @@ def digest(place: Workspace) -> str:
 def _read_photos(
     source: Source, folder: Path, names: Sequence[str], times_s: Mapping[str, float], run: RunContext
 ) -> PhotoSet:
-    options = limit_to_memory(run)
+    options = run.settings.photos
+    if run.settings.max_memory_gb:
+        largest = min(options.max_megapixels, largest_photo_megapixels(run.memory_mb))
+        options = options.model_copy(update={"max_megapixels": largest})
     contents = read_all(source, folder, names, options, run)
     unreadable = [photo for photo in contents if isinstance(photo, UnusablePhoto)]
     stats, masked = attach_masks([one for one in contents if isinstance(one, PhotoStats)], folder, source, run)
@@ -223,15 +222,6 @@ def read_all(
     return [contents[name] for name in names]
 
 
-def limit_to_memory(run: RunContext) -> PhotoSettings:
-    """Return the photo settings, with `max_megapixels` reduced to the user's limit of memory."""
-    options = run.settings.photos
-    if not run.settings.max_memory_gb:
-        return options
-    largest = min(options.max_megapixels, largest_photo_megapixels(run.memory_mb))
-    return options.model_copy(update={"max_megapixels": largest})
-
-
 def select_photos(stats: list[PhotoStats], *, keep_low_quality: bool) -> tuple[list[Photo], list[UnusablePhoto]]:
     """Return the useful photos and the useless ones: blurred photos, screenshots and copies, unless these stay."""
     if keep_low_quality:
@@ -244,10 +234,7 @@ def select_photos(stats: list[PhotoStats], *, keep_low_quality: bool) -> tuple[l
 def attach_masks(
     stats: list[PhotoStats], folder: Path, source: Source, run: RunContext
 ) -> tuple[list[PhotoStats], list[UnusablePhoto]]:
-    """Return the photos with their masks, and the completely masked photos.
-
-    Raise an InputError if a mask cannot be used, or no photo has one.
-    """
+    """Return the photos with masks, and the completely masked ones; raise an InputError if a mask cannot be used."""
     masks = source.mask_dir
     if masks is None:
         return stats, []

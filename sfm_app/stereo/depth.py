@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from sfm_app.jit import kernel
 from sfm_app.stereo.patch_match import (
     NO_MATCH,
-    PlaneArray,
     fit_planes,
     improve_planes,
     plane_normals,
@@ -104,13 +103,8 @@ def match_depths(
     cost = improve_planes(planes, centered, image, neighbors, sweeps=1)  # a second sweep improves 1 % of the pixels
     mean = cv2.blur(image, (3, 3))
     cost[(mean <= OPTIONS.clipped_gray) | (mean >= 255 - OPTIONS.clipped_gray)] = NO_MATCH
-    return _sample_planes(planes, cost, view.sample_px)
-
-
-def _sample_planes(planes: PlaneArray, cost: NDArray[np.float32], sample_px: float) -> DepthEstimate:
-    """Sample depths and confidences at a view's position inside the pixel."""
-    shift = np.float32(sample_px - 0.5)
-    inverse = planes[..., 0] + shift * (planes[..., 1] + planes[..., 2])
+    # at the view's position inside the pixel
+    inverse = planes[..., 0] + np.float32(view.sample_px - 0.5) * (planes[..., 1] + planes[..., 2])
     known = (planes[..., 0] > 0) & (inverse > 0) & (cost < NO_MATCH)
     depth = np.divide(1, inverse, out=np.zeros_like(inverse), where=known)
     return DepthEstimate(depth, np.where(known, np.maximum(1 - cost, 0), np.float32(0)))
@@ -165,10 +159,7 @@ def _merge(
 def count_confirming_maps(
     view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], tolerance: float
 ) -> NDArray[np.uint8]:
-    """Count the other depth maps, (H, W), within a relative tolerance of each depth (H, W) of a view, 0 where unknown.
-
-    A map confirms a point if the point's depth in the other view is within the tolerance of the map's depth there.
-    """
+    """Count the other depth maps (H, W) that have a point's depth in their view, within a relative tolerance."""
     return _count_maps(view, depth, others, (1.0 - tolerance, 1.0 + tolerance))
 
 

@@ -56,11 +56,7 @@ OPTIONS = PlainAreaOptions()
 
 
 def enclosed_pixels(known: BoolArray) -> BoolArray:
-    """Mark pixels (H, W) with known pixels on at least three of their four sides, at any distance.
-
-    Depths may be interpolated, but not extrapolated: only this distinguishes a wall with few depths from a sky of the
-    same color beside it.
-    """
+    """Mark pixels with known ones on three of their four sides: depths may be interpolated, but not extrapolated."""
     share = cv2.blur(known.astype(np.float32), (OPTIONS.close_px, OPTIONS.close_px))
     dense = (share >= OPTIONS.least_share).view(np.uint8)
     sides = np.zeros(known.shape, np.uint8)

@@ -108,10 +108,7 @@ def agreed_proposals(
     others: Sequence[tuple[View, DepthArray, DepthArray]],
     tolerance: float,
 ) -> DepthArray:
-    """Add to the depths of a photo the proposals that enough other photos share and none contradicts.
-
-    `maps` are the depths and the proposals (H, W) of the photo, 0 for none, as are those of the others.
-    """
+    """Add to the depths of a photo the proposals (both in `maps`) that enough others share and none contradicts."""
     depth, proposed = maps
     known_or_proposed = [(other, np.where(known > 0, known, plane)) for other, known, plane in others]
     agreeing = count_confirming_maps(view, proposed, known_or_proposed, tolerance)

@@ -206,7 +206,11 @@ def sky_pixels(photo: GrayImage, cells: BoolArray) -> BoolArray:
     expected = cv2.resize(_continue_sky(photo, cells), photo.shape[::-1])
     smooth = cv2.GaussianBlur(photo.astype(np.float32), (3, 3), 0)  # a median would swallow wires
     sky = near_pixels(cells, photo.shape) & (np.abs(smooth - expected) <= OPTIONS.tolerance)
-    return _widen(sky, OPTIONS.blur_px) & ~_find_narrow_rims(sky)
+    objects, window = ~sky, np.ones((OPTIONS.narrow_px, OPTIONS.narrow_px), np.uint8)
+    broad = cv2.morphologyEx(objects.view(np.uint8), cv2.MORPH_OPEN, window) > 0
+    # narrow objects before the sky, such as branches, keep their depths with a rim
+    narrow = _widen(objects & ~_widen(broad, OPTIONS.bump_px), OPTIONS.rim_px)
+    return _widen(sky, OPTIONS.blur_px) & ~narrow
 
 
 def near_pixels(cells: BoolArray, shape: tuple[int, ...]) -> BoolArray:
@@ -234,14 +238,6 @@ def _continue_sky(photo: GrayImage, cells: BoolArray) -> NDArray[np.float32]:
 
 def _blur(values: FloatArray) -> FloatArray:
     return np.asarray(cv2.GaussianBlur(values, (0, 0), OPTIONS.reach * max(values.shape)), np.float64)
-
-
-def _find_narrow_rims(sky: BoolArray) -> BoolArray:
-    """Mark narrow objects before the sky, such as branches, with their rim."""
-    objects = ~sky
-    window = np.ones((OPTIONS.narrow_px, OPTIONS.narrow_px), np.uint8)
-    broad = cv2.morphologyEx(objects.view(np.uint8), cv2.MORPH_OPEN, window) > 0
-    return _widen(objects & ~_widen(broad, OPTIONS.bump_px), OPTIONS.rim_px)
 
 
 def _widen(mask: BoolArray, pixels: int) -> BoolArray:

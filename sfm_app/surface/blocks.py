@@ -145,10 +145,8 @@ def with_halo(bounds: FloatArray, cell: float) -> FloatArray:
 
 
 def span_surface(records: NDArray[np.void], bounds: FloatArray, cube: Cube, place: Path) -> tuple[Surface, int]:
-    """Return Poisson's surface of records (N,) within bounds (2, 3), and the number of triangles of all of it.
-
-    Two more points enlarge the cube of the octree until its cells have the size of `cube`.
-    """
+    """Return Poisson's surface of records (N,) within bounds (2, 3), and the number of triangles of all of it."""
+    # two more points enlarge the cube of the octree until its cells have the size of `cube`
     anchors = np.zeros(2, records.dtype)
     for axis, letter in enumerate("xyz"):
         anchors[letter] = cube.anchors[:, axis]
@@ -172,9 +170,7 @@ class SurfaceJudge:
     normals: NDArray[np.float64]
     """(V, 3)."""
     clusters: Clusters
-    """Clusters of the vertices."""
     dense_dir: Path
-    """Folder with undistorted photos and their maps."""
     tolerance: float
     """Relative difference in depth within which a photo confirms a vertex."""
 
@@ -235,9 +231,7 @@ class BlockTask:
     """Input of one block besides the files, for any process."""
 
     folder: Path
-    """Folder of its files."""
     points: BlockPoints
-    """Points of all blocks."""
     dense_dir: Path
     originals: Originals
     views: Sequence[View]
@@ -273,10 +267,7 @@ def mesh_in_blocks(
     dense_dir: Path, originals: Originals, views: Sequence[View], points: NDArray[np.void], least: float,
     run: RunContext,
 ) -> Surface:  # fmt: skip
-    """Return the surface of all points, made block by block.
-
-    `least` photos have to confirm the average vertex of a part. A ReconstructionError says that there is no surface.
-    """
+    """Return the surface of all points, block by block; `least` photos confirm the average vertex of a part."""
     options = run.settings.mesh
     folder = run.workspace.surface / BLOCKS
     made_from = fingerprint(run.fingerprint, len(points), options.model_dump())

@@ -37,7 +37,19 @@ def texture_surface(
     mesh = facets(surface)
 
     def score(photo: int) -> FaceView | Rejected:
-        return _score_photo(f"look{photo}", views[photo], mesh, store, hidden)
+        name, view = f"look{photo}", views[photo]
+        kept = store.recall(name)
+        if kept is not None and "face" in kept:
+            return FaceView(kept["face"], kept["worth"], kept["color"], float(kept["sharpness"]))
+        try:
+            picture, used = store.photo(view), store.usable_pixels(view)
+        except OSError as err:
+            return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
+        face_view = score_faces(view, picture, used, mesh, hidden)
+        sharpness = np.array(face_view.sharpness)
+        arrays = {"face": face_view.face, "worth": face_view.score, "color": face_view.color, "sharpness": sharpness}
+        store.keep(name, arrays)
+        return face_view
 
     face_views = spread(score, range(len(views)), "finding visible triangles")
     checked, trimmed = _check_views(face_views, mesh), 0
@@ -67,22 +79,6 @@ def texture_surface(
         },
         "rejected": {view.name: one.reason for view, one in zip(views, rejected, strict=True) if one is not None},
     }
-
-
-def _score_photo(name: str, view: PhotoView, mesh: Facets, store: Store, hidden: OcclusionTest) -> FaceView | Rejected:
-    kept = store.recall(name)
-    if kept is not None and "face" in kept:
-        return FaceView(kept["face"], kept["worth"], kept["color"], float(kept["sharpness"]))
-    try:
-        photo, used = store.photo(view), store.usable_pixels(view)
-    except OSError as err:
-        return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
-    face_view = score_faces(view, photo, used, mesh, hidden)
-    sharpness = np.array(face_view.sharpness)
-    store.keep(
-        name, {"face": face_view.face, "worth": face_view.score, "color": face_view.color, "sharpness": sharpness}
-    )
-    return face_view
 
 
 def _check_views(face_views: Sequence[FaceView | Rejected], mesh: Facets) -> CheckedViews:

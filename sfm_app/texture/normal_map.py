@@ -71,10 +71,7 @@ def _mix(part: FloatArray, values: FloatArray) -> float:
 
 @kernel
 def encode(owner: IntArray, frames: FloatArray, normals: NDArray[np.float32]) -> tuple[NDArray[np.uint8], int]:
-    """Return the texels (h, w, 3) of rows of a normal map, and their number with a normal of the fine surface.
-
-    Normals (N, 3) are in the scene, 0 where the frame's normal stays; the frames (N, 3, 3) are interpolated.
-    """
+    """Return the texels (h, w, 3) of rows of a normal map, and how many have a fine normal (N, 3), not 0."""
     texels = np.empty((*owner.shape, 3), np.uint8)
     n, own, one = 0, 0, np.empty(3)
     for y in range(owner.shape[0]):

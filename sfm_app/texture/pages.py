@@ -243,10 +243,7 @@ def _round_levels(total: IntArray, rounded: NDArray[np.uint8]) -> None:
 
 
 def fill_background(page: NDArray[np.uint8], painted: BoolArray) -> NDArray[np.uint8]:
-    """Fill unpainted texels of a page (H, W, 3) with the mean painted color of the smallest block around them.
-
-    The blocks are those of mipmaps, so a page downsampled by a viewer keeps its colors up to the rims of the charts.
-    """
+    """Fill unpainted texels with the mean painted color of the smallest block around them, as mipmaps have it."""
     if painted.all() or min(page.shape[:2]) < 2:
         return page
     shape = page.shape[0] // 2, page.shape[1] // 2

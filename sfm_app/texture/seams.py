@@ -124,10 +124,7 @@ def level_seams(blend: Blend, sightings: Sightings, gains: FloatArray, mesh: Fac
 def solve_ties(
     one: IndexArray, other: IndexArray, weights: FloatArray, hold: float | FloatArray, right: FloatArray
 ) -> FloatArray:
-    """Solve (graph Laplacian + hold) x = right (N, 3) by conjugate gradients.
-
-    `weights` (E,) are of the edges from `one` to `other`; `hold`, a number or (N,), is added to the diagonal.
-    """
+    """Solve (graph Laplacian of the edges + hold) x = right (N, 3) by conjugate gradients; hold is a number or (N,)."""
     from scipy.sparse import coo_matrix
 
     size = len(right)
@@ -301,10 +298,7 @@ def block_sizes(triangles: int) -> NDArray[np.int32]:
 
 
 def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int) -> IndexArray:
-    """Return (N, 3) page, x and y of the square of each triangle, row by row through the blocks.
-
-    `places` (B, 3) are page, left and top of each block, in texels; `sizes` (B, 2) come from `block_sizes`.
-    """
+    """Return (N, 3) page, x and y of the square of each triangle, row by row through blocks at (B, 3) page, x, y."""
     parts = [np.empty((0, 3), np.int64)]
     for number, ((page, left, top), (width, _)) in enumerate(zip(places, sizes, strict=True)):
         count = min(triangles - number * BLOCK * BLOCK, BLOCK * BLOCK)

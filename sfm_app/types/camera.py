@@ -154,10 +154,7 @@ def correlation_key(first: str, second: str) -> str:
 
 
 def named_correlations(names: Sequence[str], covariance: NDArray[np.float64]) -> dict[str, float]:
-    """Return the correlations of parameters by `correlation_key`, from their covariance (n, n), in order of the names.
-
-    Parameters without a finite variance > 0 are left out.
-    """
+    """Return the correlations of parameters with variances > 0, by `correlation_key`, from a covariance (n, n)."""
     variances = np.diag(covariance)
     known = [k for k in range(len(names)) if np.isfinite(variances[k]) and variances[k] > 0.0]
     correlations = {}

@@ -27,7 +27,6 @@ class EpipolarFit:
     priors: NDArray[np.float64]
     """(N,) in [0, 1] per match: its validity according to the estimator; p(v_i) of the thesis, largest value 1."""
     trials: int
-    """Number of minimal samples drawn."""
     rms_px: float
     """Root mean square Sampson distance of the inliers."""
     degeneracy: str = ""
