@@ -264,12 +264,7 @@ def _part_here(kind: str, name: str) -> Any:
     return built_in[name] if name in built_in else _look_up(getattr(installed_plugins(), kind), name, kind)
 
 
-class _NamedPart(Protocol):
-    @property
-    def name(self) -> str: ...
-
-
-Part = TypeVar("Part", bound=_NamedPart)
+Part = TypeVar("Part", Estimator, Calibrator, Exporter, SceneExporter, DepthMethod, FeatureMethod)
 
 
 def _index_by_name(results: Iterable[Iterable[Part]], others: Iterable[str] = ()) -> Mapping[str, Part]:

@@ -20,7 +20,6 @@ from sfm_app.types import ControlPoint, ControlPoints, GpsPosition
 from sfm_app.types.arrays import FloatArray
 
 # The file, OpenDroneMap's gcp_list.txt.
-#
 # The first line is the coordinate system: EPSG:32632, a proj string such as "+proj=utm +zone=32 +datum=WGS84", or
 # "WGS84 UTM 32N". Each other line is a mark in a photo: geo_x geo_y geo_z pixel_x pixel_y photo [name]. Marks with
 # the same name, or without names at the same position, belong to one point.
@@ -146,7 +145,6 @@ def agreeing_points(places: FloatArray, targets: FloatArray) -> NDArray[np.bool_
     A forward search (Atkinson and Riani 2000) begins with the four that agree best and adds the nearest one by one. The
     points from some step on are rejected if the fit without them is better than chance allows: by the F-test, with as
     many trials as there are ways to choose the rejected points.
-
     `places` (N, 3) are in the model, `targets` (N, 3) in meters. A ValueError says that all points lie on a line.
     """
     first = robust_similarity(places, targets)

@@ -63,7 +63,6 @@ class MarkerOptions:
 OPTIONS = MarkerOptions()
 
 # Corners, to a few hundredths of a pixel by all edges of the pattern.
-#
 # Detectors look for the outer contour. Blur and the camera's tone curve move every edge towards its dark side, so that
 # a contour is half a pixel too small: 1 % of a marker of 50 pixels. A pattern has edges with the dark side on either
 # side and above and below, which separate this shift from the size.

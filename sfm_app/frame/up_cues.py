@@ -16,7 +16,6 @@ from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.types.arrays import FloatArray
 
 # The up direction from how photographers hold cameras.
-#
 # Most hold them level: the x axes of the cameras are horizontal, and up is the direction most nearly perpendicular
 # to all of them. Some turn the camera by 90 degrees, for one photo or for all, and the file does not always record
 # it; some do not hold it level at all.
@@ -217,10 +216,7 @@ def small_picture(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def fit_surfaces(
     points: FloatArray, brightness: FloatArray, visible: Sequence[NDArray[np.int64]], centers: FloatArray
 ) -> Surfaces:
-    """Fit a plane to the neighbors of each point, and keep flat patches.
-
-    `brightness` (P,) is 0 to 255, `centers` are those of the cameras; `visible` holds the points of each photo.
-    """
+    """Fit a plane to the neighbors of each point, and keep flat patches; the brightness (P,) is 0 to 255."""
     from scipy.spatial import cKDTree
 
     if len(points) < CUE_OPTIONS.neighbors:
@@ -250,8 +246,6 @@ def depth_height_correlation(
     """Return the mean correlation of log depth with height in the photo, in [-1, 1].
 
     The ground gets nearer towards the lower border; facades seen from the street lean away.
-
-    `up` is a unit vector (3,), `rotations` (N, 3, 3) are cam_from_world, the rest is as in `fit_surfaces`.
     """
     correlations = []
     for R, center, rows in zip(rotations, centers, visible, strict=True):
@@ -287,7 +281,6 @@ def slope_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[ND
 
     Shadow under ledges, eaves and objects has a sharp border to the lit top above it, and skylines are brighter above;
     transitions back to light are gradual. Perpendicular to `up` it is 0 within 0.06.
-
     `rotations` (N, 3, 3) are cam_from_world; the pictures (H, W) are gray, in the orientation of the sensor.
     """
     shares = []

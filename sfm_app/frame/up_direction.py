@@ -231,10 +231,7 @@ class UpEstimate:
 def up_direction(
     rotations: FloatArray, centers: FloatArray, scenery: Scenery, segments: Segments, turn_deg: int | None = None
 ) -> UpEstimate:
-    """Find up from vertical lines near the up direction of the cameras' roll, or else from the ground or the roll.
-
-    `turn_deg` is the clockwise turn that makes the photos upright, None if unknown; `rotations` are cam_from_world.
-    """
+    """Find up from vertical lines near that of the cameras' roll, or else from the ground or the roll."""
     rolls = roll_hypotheses(rotations, centers)
     if turn_deg is None:
         selection = select_roll(rolls, rotations, centers, scenery)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
+from sfm_app.meshing.visibility import PosedPhoto
 from sfm_app.types.arrays import FloatArray, IndexArray
 
 Gray = NDArray[np.float32]
@@ -35,29 +36,13 @@ LEAST_FACING = 0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RefinePhoto:
-    """A posed photo without distortion, x ~ K (R X + t), pixel centers at +0.5."""
+class RefinePhoto(PosedPhoto):
+    """A posed photo and its gray levels."""
 
-    K: FloatArray
-    """(3, 3) camera matrix in pixels."""
-    R: FloatArray
-    """(3, 3) rotation of cam_from_world."""
-    t: FloatArray
-    """(3,) translation of cam_from_world."""
     gray: NDArray[np.uint8]
     """(H, W)."""
     masked: NDArray[np.bool_] | None = None
     """(H, W) masked pixels."""
-
-    @property
-    def center(self) -> FloatArray:
-        """(3,) center of projection in the world."""
-        return np.asarray(-self.R.T @ self.t)
-
-    @property
-    def focal_px(self) -> float:
-        """Pixels per unit of length at depth 1, the mean of both directions."""
-        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
 
     def size_at(self, share: float) -> tuple[int, int]:
         """Return height and width at a share of the full resolution."""

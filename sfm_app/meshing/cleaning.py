@@ -127,16 +127,12 @@ class Support:
         """(V,) whether more photos see through a vertex than confirm it."""
         return np.asarray(self.seen_through > self.confirmed)
 
-    @property
-    def is_supported(self) -> NDArray[np.bool_]:
-        """(V,) whether enough photos confirm a vertex among those with it in view."""
-        enough = self.confirmed >= TRIM.least_confirmed * (self.confirmed + self.empty)
-        return np.asarray((self.confirmed > 0) & ~self.is_free & enough)
-
 
 def trim(surface: Surface, support: Support, max_gap_triangles: float, least: float) -> Surface:
     """Keep the parts that photos confirm and do not see through, bridge small gaps, and smooth the border."""
-    sign, edges = np.where(support.is_supported, 1.0, -1.0), unique_edges(surface.faces)
+    enough = support.confirmed >= TRIM.least_confirmed * (support.confirmed + support.empty)
+    is_supported = (support.confirmed > 0) & ~support.is_free & enough
+    sign, edges = np.where(is_supported, 1.0, -1.0), unique_edges(surface.faces)
     bridged = bridge_gaps(surface, sign, support.is_free, max_gap_triangles, edges)
     smooth = smooth_support(surface, bridged, TRIM.smoothing, edges)
     whole = bridge_gaps(surface, smooth, support.is_free, max_gap_triangles, edges)

@@ -119,10 +119,7 @@ def choose_cell(sizes: Sequence[float], cells: PointCells, least: float = CELLS.
 
 
 def find_size(sizes: Sequence[float], points_per_cell: Callable[[float], float], points: float) -> float:
-    """Return the smallest side of cells with a mean number of points; between two sizes, it is a power of the side.
-
-    The allowed sizes are the finest first, each twice the one before.
-    """
+    """Return the smallest of the sizes, finest first, with enough points per cell; a power of the side in between."""
     cell, finer = 0.0, 0.0
     for cell in sizes:
         if (density := points_per_cell(cell)) >= points:

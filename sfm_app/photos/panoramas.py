@@ -20,7 +20,6 @@ from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import EQUIRECTANGULAR, Calibration
 
 # Recognition of equirectangular photos, whose columns are longitudes and whose rows are latitudes. Ours.
-#
 # Cameras and stitchers name the projection in the file (Google's Photo Sphere metadata, `GPano`). Without metadata, a
 # full panorama is twice as wide as high, its left and right borders continue each other, and its first and last row
 # each show one point: zenith and nadir.
@@ -162,7 +161,6 @@ def shrink(photo: NDArray[np.uint8], share: float) -> NDArray[np.uint8]:
 
 
 # Feature views: perspective views in which feature methods meet neither the stretched poles nor the cut borders.
-#
 # Their axes pass through the corners of an icosahedron. Each view owns the directions nearest to its axis, so that
 # no feature is found twice. Ours.
 

@@ -32,7 +32,6 @@ from sfm_app.types import Frame, GivenCameras, Photo, UnusablePhoto
 from sfm_app.types.camera import EQUIRECTANGULAR, PERSPECTIVE
 
 # Bars of one color around a picture, which services add to bring photos of any size to one size.
-#
 # The picture within the bars is the photo: its size distinguishes cameras, and the principal point usually lies near
 # its middle. A bar has one color and ends at a straight edge, along which the whole picture differs from it; a black
 # background or an overexposed sky does not end like that.

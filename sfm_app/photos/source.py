@@ -119,9 +119,6 @@ def _digests(folder: Path, names: Sequence[str], spread: ParallelMap) -> dict[st
     return dict(zip(names, spread(file_digest, names), strict=True))
 
 
-# Lay photos out for COLMAP: links to files that it can read, 8-bit copies of the others, in sensor orientation.
-
-
 def assign_names(photos: Iterable[Photo]) -> Iterator[Photo]:
     """Yield photos with unique printable names, also without case, and an extension that COLMAP writes."""
     photos = list(photos)
@@ -137,7 +134,7 @@ def assign_names(photos: Iterable[Photo]) -> Iterator[Photo]:
 
 
 def lay_out(photo: Photo, folder: Path, target: Path) -> None:
-    """Link or copy one photo to where COLMAP reads it; raise an UnreadableError if its file has changed."""
+    """Link a photo for COLMAP, or copy it in 8 bits in sensor orientation; UnreadableError if its file has changed."""
     place = target / photo.name
     if not (is_below(photo.name) and place.parent.resolve().is_relative_to(target.resolve())):
         raise UnreadableError("its name leads out of the folder")

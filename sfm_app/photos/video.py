@@ -23,8 +23,6 @@ BLURRED = 0.5
 MIN_CORNERS = 20
 """Motion is not estimated from fewer corners."""
 
-# Reading, frame by frame. FFmpeg opens one regular file, but no file or network address named in it.
-
 FFMPEG = {
     "OPENCV_FFMPEG_CAPTURE_OPTIONS": "protocol_whitelist;file|format_whitelist;mov,matroska,webm,avi,mpeg,mpegts",
     "OPENCV_FFMPEG_LOGLEVEL": "-8",

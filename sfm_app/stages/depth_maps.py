@@ -32,9 +32,10 @@ from sfm_app.meshing.visibility import SKY
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.stereo import DepthTask, View, rank_neighbors
-from sfm_app.stereo.sky import PhotoAreas, Votes, blank_areas, count_votes, find_skies, sky_pixels
+from sfm_app.stereo.sky import PhotoAreas, blank_areas, count_votes, find_skies, sky_pixels
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Rejected, Scene
+from sfm_app.types.arrays import FloatArray
 
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
 
@@ -120,7 +121,7 @@ def find_blank_areas(dense_dir: Path, view: View) -> PhotoAreas:
     return blank_areas(read_gray(dense_dir, view), read_depth(dense_dir, view, "geometric"))
 
 
-def _count_votes(photos: Shared[tuple[Sequence[PhotoAreas], Sequence[View]]], index: int) -> Votes:
+def _count_votes(photos: Shared[tuple[Sequence[PhotoAreas], Sequence[View]]], index: int) -> FloatArray:
     return count_votes(*photos.value, index)
 
 

@@ -197,8 +197,11 @@ def _read_photos(
     for place in (run.workspace.photos, run.workspace.masks):
         shutil.rmtree(place, ignore_errors=True)
     run.map(Task(lay_out_photo, folder=folder, target=run.workspace.photos), photo_set.photos, "laying photos out")
-    if photo_set.masks is not None:
-        _lay_out_masks(photo_set, photo_set.masks, list(source.masks), run)
+    if (masks := source.mask_dir) is not None:
+        lay_out = Task(lay_out_mask, folder=photo_set.folder, masks=masks, target=run.workspace.masks)
+        run.map(lay_out, photo_set.photos, "laying masks out")
+        unused = unused_masks(list(source.masks), photo_set.photos)
+        run.record(masks={"photos": sum(bool(photo.mask) for photo in photo_set.photos), "unused": unused})
     _save_photo_set(photo_set, run)
     run.record(usable=len(photos), cameras=len(photo_set.groups), unusable={p.name: p.reason for p in unusable})
     run.record(notes={photo.path: list(photo.notes) for photo in photos if photo.notes})
@@ -243,13 +246,6 @@ def attach_masks(
         raise InputError(f"none of the {len(source.masks)} files in {masks} is the mask of a photo", hint=MASK_HINT)
     used = [replace(one, photo=photo) for one, photo in zip(stats, photos, strict=True) if isinstance(photo, Photo)]
     return used, [photo for photo in photos if isinstance(photo, UnusablePhoto)]
-
-
-def _lay_out_masks(photo_set: PhotoSet, masks: Path, names: Sequence[str], run: RunContext) -> None:
-    lay_out = Task(lay_out_mask, folder=photo_set.folder, masks=masks, target=run.workspace.masks)
-    run.map(lay_out, photo_set.photos, "laying masks out")
-    unused = unused_masks(list(names), photo_set.photos)
-    run.record(masks={"photos": sum(bool(photo.mask) for photo in photo_set.photos), "unused": unused})
 
 
 def lay_out_photo(photo: Photo, *, folder: Path, target: Path) -> None:

@@ -208,7 +208,6 @@ def _fill_plain_areas(inputs: Shared[_Inputs], index: int) -> None:
 
 
 # Coarser depth maps fill gaps of finer ones.
-#
 # Noise hides the weak texture of plain surfaces at full size. In a photo of half the size, noise is half as strong and
 # the windows cover twice as much (Xu and Tao: Multi-scale geometric consistency guided multi-view stereo. CVPR 2019).
 

@@ -118,22 +118,8 @@ def _to_cells(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 # Blank areas at infinity: other photos show blank areas in the same directions.
-#
 # A plain wall moves against the background from photo to photo, a sky does not. Where a nearer object with a depth
 # occludes the sky, that photo has no vote.
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Votes:
-    """Votes of other photos in the directions of the blank areas of a photo."""
-
-    counts: FloatArray
-    """(3, A) over the cells of each area: a blank area; no depth, but not blank; a nearer surface with a depth."""
-
-    @property
-    def blank_share(self) -> FloatArray:
-        """(A,) share of votes for a blank area."""
-        return np.asarray(self.counts[0] / np.maximum(self.counts.sum(axis=0), 1))
 
 
 def spread_partners(views: Sequence[View], index: int) -> list[int]:
@@ -150,8 +136,8 @@ def spread_partners(views: Sequence[View], index: int) -> list[int]:
     return partners.tolist()
 
 
-def count_votes(areas: Sequence[PhotoAreas], views: Sequence[View], index: int) -> Votes:
-    """Count the votes of other photos in the directions of a photo's blank areas."""
+def count_votes(areas: Sequence[PhotoAreas], views: Sequence[View], index: int) -> FloatArray:
+    """Count the votes (3, A) of other photos for each blank area: as blank, as open, as behind a nearer surface."""
     own, view = areas[index], views[index]
     height, width = own.labels.shape
     y, x = np.nonzero(own.blank)
@@ -162,7 +148,7 @@ def count_votes(areas: Sequence[PhotoAreas], views: Sequence[View], index: int) 
         visible, cell = _find_cells(rays, views[number], areas[number].labels.shape)
         blank, known = areas[number].blank[cell], areas[number].known[cell]
         counts[:, visible] += np.stack([blank, ~blank & ~known, known])
-    return Votes(np.stack([np.bincount(own.labels[y, x], row, len(own.size)) for row in counts]))
+    return np.stack([np.bincount(own.labels[y, x], row, len(own.size)) for row in counts])
 
 
 def _find_cells(
@@ -177,10 +163,10 @@ def _find_cells(
     return visible, (row[visible], column[visible])
 
 
-def find_skies(areas: Sequence[PhotoAreas], votes: Sequence[Votes]) -> list[BoolArray]:
+def find_skies(areas: Sequence[PhotoAreas], votes: Sequence[FloatArray]) -> list[BoolArray]:
     """Return the sky cells (h, w) of each photo; none if the votes do not show that the scene has a sky."""
     large = [one.at_border & (one.size >= OPTIONS.least_share * one.labels.size) for one in areas]
-    counts = sum((vote.counts[:, own].sum(axis=1) for vote, own in zip(votes, large, strict=True)), np.zeros(3))
+    counts = sum((vote[:, own].sum(axis=1) for vote, own in zip(votes, large, strict=True)), np.zeros(3))
     # a sky needs agreement among the votes, and votes from enough views
     blank, other, nearer = counts
     if not blank or blank < OPTIONS.agreeing * (blank + other) or blank < OPTIONS.visible * (blank + other + nearer):
@@ -188,9 +174,9 @@ def find_skies(areas: Sequence[PhotoAreas], votes: Sequence[Votes]) -> list[Bool
     return [_sky_of(*one) for one in zip(areas, votes, large, strict=True)]
 
 
-def _sky_of(areas: PhotoAreas, votes: Votes, large: BoolArray) -> BoolArray:
+def _sky_of(areas: PhotoAreas, votes: FloatArray, large: BoolArray) -> BoolArray:
     """Return the sky cells of a photo: large areas at its border, and other areas as bright as these."""
-    far = votes.blank_share >= OPTIONS.least_visible
+    far = votes[0] / np.maximum(votes.sum(axis=0), 1) >= OPTIONS.least_visible
     sure = large & far
     if not sure.any():
         return np.zeros(areas.labels.shape, bool)

@@ -68,7 +68,6 @@ def median(values: FloatArray, count: int) -> float:
 
 
 # Outlier views, which do not show the surface: passers-by, cars, leaves, reflections.
-#
 # If at least three photos show a triangle, a color far from their median is not the surface's. A single triangle
 # may deviate by chance, but a person covers many triangles, so deviations are averaged over neighbors. After Sinha
 # et al. 2008 and Waechter et al. 2014 (section 3.1), with medians in place of their Gaussian.
@@ -176,10 +175,8 @@ def _keep_majority(starts: IndexArray, rows: IndexArray, outlier: BoolArray) -> 
                 outlier[row] = False
 
 
-# Borders without a surface: photos disagree about their color, since each shows another part of the background.
-#
-# Depth maps reach over the outlines of objects, by the same pixels in every photo, so that they agree with each
-# other. But behind the outline each photo shows another part of the background.
+# Borders without a surface: depth maps reach over the outlines of objects, by the same pixels in every photo, so that
+# they agree with each other. But behind the outline each photo shows another part of the background.
 
 
 def doubtful_border(sightings: Sightings, gains: FloatArray, neighbors: IntArray) -> BoolArray:
@@ -271,7 +268,6 @@ def _crumbs(cut: BoolArray, neighbors: IntArray) -> BoolArray:
 
 
 # Exposure and white balance of the photos, from triangles in several of them.
-#
 # Each photo multiplies every channel by a gain: log c[f, p] = log a[f] + g[p] + noise, for triangle f and photo p.
 # The colors a of the surface are eliminated, the gains g come from iteratively reweighted least squares (Cauchy),
 # so that shadows, highlights and passers-by have little weight.

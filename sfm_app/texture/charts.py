@@ -15,7 +15,6 @@ from sfm_app.texture.views import project
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 # Charts: connected triangles of one photo, laid out by their projection in that photo.
-#
 # The photo is the parametrization: nothing is stretched, and a texel is a pixel. Triangles that a photo sees do not
 # overlap in it, except at the rims of occluders; overlapping triangles get charts of their own.
 
@@ -210,7 +209,6 @@ def _is_usable(views: Views, photo: int, faces: IntArray) -> bool:
 
 
 # Packing of charts onto pages, as in Tetris (Levy et al., SIGGRAPH 2002, section 4).
-#
 # Each chart has a profile of its upper and lower side. It is placed on the horizon of the charts already on the
 # page, as close to the top as possible. Tall charts come first.
 

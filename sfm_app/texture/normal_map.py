@@ -25,7 +25,6 @@ FindNormals = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.fl
 """Returns the normals (N, 3) of the fine surface near points (N, 3), on the side of directions (N, 3); 0 for none."""
 
 # Texels of a normal map: the tangent frames at their points, and normals in these frames.
-#
 # Tangent, bitangent and normal are interpolated, each by itself, and then normalized, as three.js and Khronos'
 # viewer do. MikkTSpace normalizes none of them, and makes the bitangent from the interpolated two.
 
@@ -110,10 +109,7 @@ def _span(a: NDArray[np.floating], b: NDArray[np.floating], c: NDArray[np.floati
 
 
 def bake_normals(model: Model, find: FindNormals, spread: ParallelMap, band: int = BAND) -> tuple[Model, float]:
-    """Return a model with normal maps, and the share of chart texels with a normal of the fine surface.
-
-    The normals of the light surface stay elsewhere, and on triangles without a photo. `band` texels are baked at once.
-    """
+    """Return a model with normal maps, `band` texels at once, and the share of chart texels with a fine normal."""
     texture = model.texture
     if texture is None:
         return model, 0.0

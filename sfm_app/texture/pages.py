@@ -53,8 +53,6 @@ class Store(Protocol):
         """Keep arrays, by their names, under the name of a group, replacing it, complete or not at all."""
 
 
-# Painting of photos onto the texels of the pages.
-#
 # First every texel gets an owner: the triangle around it or, in the margin of a chart, the nearest one. Then each
 # photo adds its share to the texels of its triangles. The texel's point on the surface is projected through pose and
 # lens, and the photo is sampled there, so photos are resampled only once.

@@ -39,7 +39,6 @@ class SeamOptions:
 OPTIONS = SeamOptions()
 
 # Blending near seams: weights of the photos at the vertices, and offsets that remove color differences.
-#
 # The weight of a photo at a vertex starts as its share of the vertex's triangles. It is diffused over a few rings
 # of vertices with usable views. Where two photos meet at a vertex, slowly varying offsets make their colors equal
 # (Lempitsky & Ivanov 2007; Waechter et al. 2014, section 3.2).
@@ -89,7 +88,9 @@ def _photo_weights(
     for _ in range(OPTIONS.rings):
         at = distinct(mesh.faces[mesh.faces_at(at)].ravel(), len(mesh.vertices))
     near = mesh.faces_at(at)
-    allowed = np.isin(near, sightings.usable_faces(photo), assume_unique=True) | np.isin(chosen[near], (photo, NONE))
+    rows = sightings.rows(photo)
+    usable = sightings.face[rows][sightings.score[rows] > 0].astype(np.int64)
+    allowed = np.isin(near, usable, assume_unique=True) | np.isin(chosen[near], (photo, NONE))
     corners = np.searchsorted(at, mesh.faces[near][~allowed].ravel()).clip(max=max(len(at) - 1, 0))
     barred = np.zeros(len(at), np.bool_)
     barred[corners[at[corners] == mesh.faces[near][~allowed].ravel()]] = True
@@ -259,10 +260,7 @@ def _ties(blend: Blend, mesh: Facets) -> tuple[IndexArray, IndexArray]:
 
 
 def vertex_colors(mesh: Facets, painted: BoolArray, corner_colors: FloatArray) -> FloatArray:
-    """Compute colors (V, 3) in 0..255 of all vertices, diffused from painted triangles (T,) to the others.
-
-    `corner_colors` (S, 3, 3) are RGB at the corners of the painted triangles. Parts without any keep their colors.
-    """
+    """Compute colors (V, 3) in 0..255, diffused from painted triangles and their corners (S, 3, 3) to the others."""
     faces, size = mesh.faces[painted], len(mesh.vertices)
     count = np.bincount(faces.ravel(), minlength=size)
     sums = [np.bincount(faces.ravel(), corner_colors[..., channel].ravel(), size) for channel in range(3)]

@@ -105,10 +105,7 @@ def _pass_messages(
     messages: NDArray[np.float32],
     forward: bool,
 ) -> None:
-    """Pass messages once; messages[f, k] is the message from neighbor k of f about the labels of f.
-
-    `beside` has the neighbors, the column of each triangle in its neighbor's row, and the labels that both have.
-    """
+    """Pass messages once; messages[f, k] is the message from neighbor k of f about the labels of f."""
     neighbors, back, same = beside
     triangles, count = labels.shape
     belief, rest = np.empty(count), np.empty(count)

@@ -40,7 +40,7 @@ class EpipolarFit:
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """The reason why a pair has no usable epipolar geometry. Falsy, so that ``if fit:`` reads well."""
+    """The reason why a result is missing or unusable. Falsy, so that ``if fit:`` reads well."""
 
     reason: str
 
@@ -108,10 +108,7 @@ def _pair(row: NDArray[np.uint32]) -> PairId:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPairs:
-    """Fundamental matrices of pairs with the same camera, and data of each pair.
-
-    Nothing is checked here: a calibrator refuses malformed values with a ValueError, see `selfcal.pairs.prepare`.
-    """
+    """Fundamental matrices of pairs with the same camera, and data of each; `selfcal.pairs.prepare` checks them."""
 
     Fs: NDArray[np.float64]
     """(P, 3, 3) in pixels, x2' F x1 = 0, any scale."""
