@@ -99,7 +99,10 @@ def digest_files(root: Path, *names: str) -> str:
     """Return a hash of the names and bytes of files and all files in folders, except links; raise if one is missing."""
     digest = hashlib.blake2b(digest_size=16)
     for name in names:
-        for path in _files(root / name):
+        place = root / name
+        inside = (file for file in place.rglob("*") if file.is_file() and not is_link(file))
+        files = sorted(file for file in inside if not file.name.startswith(".")) if place.is_dir() else [place]
+        for path in files:
             digest.update(f"{path.relative_to(root).as_posix()!r} {digest_file(path)}\n".encode())
     return digest.hexdigest()
 
@@ -114,11 +117,3 @@ def is_below(name: str) -> bool:
     """Return whether a joined name stays below its folder, judging by the name alone."""
     path = PurePath(name)  # a drive of Windows is not absolute
     return bool(path.parts) and not path.anchor and ".." not in path.parts and "\0" not in name
-
-
-def _files(path: Path) -> Iterator[Path]:
-    if not path.is_dir():
-        yield path
-        return
-    files = (file for file in path.rglob("*") if file.is_file() and not is_link(file))
-    yield from sorted(file for file in files if not file.name.startswith("."))

@@ -169,7 +169,6 @@ class Pull:
     correlation: float = 0.0
     """Sum of the correlations over pixels."""
     pixels: float = 0.0
-    """Pixels that were compared."""
 
     @classmethod
     def zeros(cls, count: int) -> "Pull":

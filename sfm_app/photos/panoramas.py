@@ -217,7 +217,13 @@ def view_rotations() -> FloatArray:
     turns = 2.0 * math.pi / 5.0 * np.arange(5.0)
     rings = [_axes(turns + shift, tilt) for shift, tilt in ((0.0, latitude), (math.pi / 5.0, -latitude))]
     axes = np.concatenate([[[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]], *rings])
-    return np.stack([_look_along(axis) for axis in axes])
+    rotations = []
+    for axis in axes:  # upright, except at the poles
+        down = np.array([0.0, 0.0, 1.0]) if abs(axis[1]) > 0.9 else np.array([0.0, 1.0, 0.0])
+        right = np.cross(down, axis)
+        right /= np.linalg.norm(right)
+        rotations.append(np.stack([right, np.cross(axis, right), axis]))
+    return np.stack(rotations)
 
 
 def _axes(longitude: FloatArray, latitude: float) -> FloatArray:
@@ -225,14 +231,6 @@ def _axes(longitude: FloatArray, latitude: float) -> FloatArray:
     level = math.cos(latitude)
     down = np.full(len(longitude), math.sin(latitude))
     return np.column_stack([level * np.sin(longitude), down, level * np.cos(longitude)])
-
-
-def _look_along(axis: FloatArray) -> FloatArray:
-    """Return the (3, 3) rotation into the frame of a view along this axis, upright except at the poles."""
-    down = np.array([0.0, 0.0, 1.0]) if abs(axis[1]) > 0.9 else np.array([0.0, 1.0, 0.0])
-    right = np.cross(down, axis)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(axis, right), axis])
 
 
 def panorama_parts(size: tuple[int, int]) -> list[PerspectiveView]:

@@ -156,27 +156,16 @@ def _merge(
                     support[row, col] = members
 
 
-def count_confirming_maps(
-    view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], tolerance: float
+def count_maps(
+    view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], low: float, high: float = np.inf
 ) -> NDArray[np.uint8]:
-    """Count the other depth maps (H, W) that have a point's depth in their view, within a relative tolerance."""
-    return _count_maps(view, depth, others, (1.0 - tolerance, 1.0 + tolerance))
+    """Count the other depth maps, (H, W), with `low` to `high` times the depth that a point of a view has there.
 
-
-def count_deeper_maps(
-    view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], tolerance: float
-) -> NDArray[np.uint8]:
-    """Count the other depth maps, (H, W), deeper than each depth of a view by a relative tolerance: they contradict."""
-    return _count_maps(view, depth, others, (1.0 + tolerance, np.inf))
-
-
-def _count_maps(
-    view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], limits: tuple[float, float]
-) -> NDArray[np.uint8]:
-    """Count the maps whose depth lies between two limits, relative to the depth of the point in the other view."""
+    Around 1, they confirm the depth (H, W) of the view, 0 where unknown; beyond it, they contradict.
+    """
     count = np.zeros(depth.shape, np.uint8)
     for other, other_depth in others:
-        _count(depth, other_depth, view.projection_into(other), limits, view.sample_px, count)
+        _count(depth, other_depth, view.projection_into(other), (low, high), view.sample_px, count)
     return count
 
 
@@ -236,7 +225,7 @@ def confirm_depths(
     """
     if not others:
         return Rejected("no other depth map to compare with")
-    agreeing = count_confirming_maps(view, estimate.depth, others, tolerance)
+    agreeing = count_maps(view, estimate.depth, others, 1.0 - tolerance, 1.0 + tolerance)
     confidence = estimate.confidence
     least, more = (min(need, len(others)) for need in (min_agreeing, min_agreeing + 1))
     needed = np.where(confidence < OPTIONS.unsure_correlation, more, least)

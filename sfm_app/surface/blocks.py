@@ -98,21 +98,17 @@ def sort_points(
             (unfinished / str(number)).touch()
         for start in range(0, len(points), chunk):
             part = np.asarray(points[start : start + chunk])
-            _add(part, partition.find_blocks(positions(part)), unfinished, count)
+            numbers = partition.find_blocks(positions(part))
+            ends = np.cumsum(np.bincount(numbers, minlength=count))
+            for number, records in enumerate(np.split(part[np.argsort(numbers, kind="stable")], ends[:-1])):
+                with (unfinished / str(number)).open("ab") as file:
+                    file.write(records.tobytes())
         move(unfinished, place)
     blocks = BlockPoints(place, points.dtype, np.empty((count, 2, 3)))
     for number in range(count):
         own = positions(blocks.read(number))
         blocks.bounds[number] = own.min(axis=0, initial=np.inf), own.max(axis=0, initial=-np.inf)
     return blocks
-
-
-def _add(records: NDArray[np.void], numbers: NDArray[np.intp], folder: Path, count: int) -> None:
-    ends = np.cumsum(np.bincount(numbers, minlength=count))
-    parts: Sequence[NDArray[np.void]] = np.split(records[np.argsort(numbers, kind="stable")], ends[:-1])
-    for number, part in enumerate(parts):
-        with (folder / str(number)).open("ab") as file:
-            file.write(part.tobytes())
 
 
 @dataclass(frozen=True, slots=True)

@@ -198,7 +198,12 @@ def doubtful_border(sightings: Sightings, gains: FloatArray, neighbors: IntArray
         disagreement = _average_known(disagreement, neighbors)
     doubtful = disagreement > max(BORDERS.doubtful * middle, LEVELS)
     cut = _straighten(_grow_from_border(doubtful, neighbors), neighbors)
-    return cut | _crumbs(cut, neighbors)
+    # small connected parts beside the cut
+    part, count = components(np.where(cut, NONE, 0), neighbors)
+    beside_cut = ~cut & ((neighbors != NONE) & cut[neighbors]).any(axis=1)
+    crumb = np.bincount(part[~cut], minlength=count) < BORDERS.crumbs
+    crumb &= np.bincount(part[beside_cut], minlength=count) > 0
+    return cut | (~cut & crumb[part])
 
 
 @kernel
@@ -256,15 +261,6 @@ def _straighten(cut: BoolArray, neighbors: IntArray) -> BoolArray:
         is_open = beside | (neighbors == NONE)
         cut |= beside.any(axis=1) & (is_open.sum(axis=1) >= 2)
     return np.asarray(cut, np.bool_)
-
-
-def _crumbs(cut: BoolArray, neighbors: IntArray) -> BoolArray:
-    """Mark (T,) small connected parts beside the cut."""
-    part, count = components(np.where(cut, NONE, 0), neighbors)
-    beside_cut = ~cut & ((neighbors != NONE) & cut[neighbors]).any(axis=1)
-    crumb = np.bincount(part[~cut], minlength=count) < BORDERS.crumbs
-    crumb &= np.bincount(part[beside_cut], minlength=count) > 0
-    return np.asarray(~cut & crumb[part], np.bool_)
 
 
 # Exposure and white balance of the photos, from triangles in several of them.

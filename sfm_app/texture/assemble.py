@@ -14,7 +14,7 @@ from sfm_app.texture.charts import Charts, Layout, absorb_small_charts, block_of
 from sfm_app.texture.facets import NONE, Facets, IntArray, facets
 from sfm_app.texture.pages import CheckedViews, ParallelMap, Store, TexturePlan, fill_background, paint_blocks
 from sfm_app.texture.seams import SQUARE_CORNERS, Blend, blend_weights, level_seams, square_texels, vertex_colors
-from sfm_app.texture.sightings import FaceView, OcclusionTest, Sightings, list_sightings, score_faces, sharpness_factors
+from sfm_app.texture.sightings import FaceView, OcclusionTest, list_sightings, score_faces, sharpness_factors
 from sfm_app.texture.view_selection import choose_photos
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import Model, Rejected, Surface, Texture
@@ -125,21 +125,15 @@ def _plan(
     corners[drawn] += layout.shift[charts.chart_of_face[drawn]][:, None, :]
     page[drawn] = layout.page[charts.chart_of_face[drawn]]
     page[~drawn] = cells[:, 0]
-    allowed = _allowed_weight(blend, checked.sightings, chosen, mesh)
-    return TexturePlan(mesh, checked, chosen, charts, layout, corners, page, block_of_page, cells, blend, allowed)
-
-
-def _allowed_weight(blend: Blend, sightings: Sightings, chosen: IntArray, mesh: Facets) -> NDArray[np.float32]:
-    total = np.zeros(mesh.faces.shape, np.float32)
-    weight = np.zeros(len(mesh.vertices), np.float32)
-    for photo in range(sightings.photos):
+    allowed, weight = np.zeros(mesh.faces.shape, np.float32), np.zeros(len(mesh.vertices), np.float32)
+    for photo in range(checked.sightings.photos):
         part = blend.photo_rows(photo)
         near = mesh.faces_at(blend.vertex[part])
-        near = near[sightings.is_usable(photo, near) | (chosen[near] == photo)]
+        near = near[checked.sightings.is_usable(photo, near) | (chosen[near] == photo)]
         weight[blend.vertex[part]] = blend.weight[part]
-        total[near] += weight[mesh.faces[near]]
+        allowed[near] += weight[mesh.faces[near]]
         weight[blend.vertex[part]] = 0.0
-    return total
+    return TexturePlan(mesh, checked, chosen, charts, layout, corners, page, block_of_page, cells, blend, allowed)
 
 
 def _finish(plan: TexturePlan, finished: Sequence[tuple[NDArray[np.uint8], BoolArray]]) -> Model:

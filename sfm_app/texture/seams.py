@@ -96,17 +96,11 @@ def _photo_weights(
     barred[corners[at[corners] == mesh.faces[near][~allowed].ravel()]] = True
     count = np.bincount(np.searchsorted(at, mesh.faces[own].ravel()), minlength=len(at)).astype(np.float64)
     share = count / np.maximum(mesh.valence[at], 1.0)
-    edges = np.searchsorted(at, mesh.edges[mesh.edges_among(at)])
+    one, other = np.searchsorted(at, mesh.edges[mesh.edges_among(at)]).T
     for _ in range(OPTIONS.rings):
-        share = np.where(barred, 0.0, _spread(share, edges, degree[at]))
+        total = np.bincount(one, share[other], len(share)) + np.bincount(other, share[one], len(share))
+        share = np.where(barred, 0.0, 0.5 * share + 0.5 * total / degree[at])
     return at, share
-
-
-def _spread(share: FloatArray, edges: IndexArray, degree: IndexArray) -> FloatArray:
-    """Average each value with the mean of its neighboring vertices."""
-    one, other = edges[:, 0], edges[:, 1]
-    total = np.bincount(one, share[other], len(share)) + np.bincount(other, share[one], len(share))
-    return np.asarray(0.5 * share + 0.5 * total / degree, np.float64)
 
 
 def level_seams(blend: Blend, sightings: Sightings, gains: FloatArray, mesh: Facets) -> Blend:

@@ -139,7 +139,6 @@ class PhotoPairs:
     weights: NDArray[np.float64]
     """(P,) >= 0, weight of each F."""
     photos: tuple[PairId, ...]
-    """Per pair the ids of its two photos."""
     inliers: tuple[NDArray[np.float64], ...]
     """Per pair (N, 4) x1, y1, x2, y2 in pixels."""
     sizes: Mapping[int, tuple[int, int]]

@@ -90,7 +90,6 @@ class PhotoSet:
     photos: tuple[Photo, ...]
     unusable: tuple[UnusablePhoto, ...] = ()
     masks: Path | None = None
-    """Folder of masks; None where none is given."""
 
     @property
     def groups(self) -> dict[str, tuple[Photo, ...]]:
