@@ -42,7 +42,7 @@ HINT = "take more photos, a step apart, with more overlap; OUT/points.ply and OU
 
 
 def make(scene: Scene, dense_dir: Path, run: RunContext) -> Surface:
-    """Span a surface over the fused points, keep the confirmed parts, refine and simplify it; raise if none."""
+    """Span a surface over the fused points, confirm, refine and simplify it; raise a ReconstructionError if none."""
     place, options = run.workspace.surface, run.settings.mesh
     place.mkdir(exist_ok=True)
     run.workspace.fine_surface.unlink(missing_ok=True)
