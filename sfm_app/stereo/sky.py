@@ -148,7 +148,7 @@ def count_votes(areas: Sequence[PhotoAreas], views: Sequence[View], index: int) 
         visible, cell = _find_cells(rays, views[number], areas[number].labels.shape)
         blank, known = areas[number].blank[cell], areas[number].known[cell]
         counts[:, visible] += np.stack([blank, ~blank & ~known, known])
-    return np.stack([np.bincount(own.labels[y, x], row, len(own.size)) for row in counts])
+    return np.array([np.bincount(own.labels[y, x], row, len(own.size)) for row in counts], np.float64)
 
 
 def _find_cells(

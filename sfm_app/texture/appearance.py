@@ -203,7 +203,7 @@ def doubtful_border(sightings: Sightings, gains: FloatArray, neighbors: IntArray
     beside_cut = ~cut & ((neighbors != NONE) & cut[neighbors]).any(axis=1)
     crumb = np.bincount(part[~cut], minlength=count) < BORDERS.crumbs
     crumb &= np.bincount(part[beside_cut], minlength=count) > 0
-    return cut | (~cut & crumb[part])
+    return np.asarray(cut | (~cut & crumb[part]), np.bool_)
 
 
 @kernel
