@@ -46,9 +46,8 @@ def texture_surface(
         except OSError as err:
             return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
         face_view = score_faces(view, picture, used, mesh, hidden)
-        sharpness = np.array(face_view.sharpness)
-        arrays = {"face": face_view.face, "worth": face_view.score, "color": face_view.color, "sharpness": sharpness}
-        store.keep(name, arrays)
+        face, sharpness = face_view.face, np.array(face_view.sharpness)
+        store.keep(name, {"face": face, "worth": face_view.score, "color": face_view.color, "sharpness": sharpness})
         return face_view
 
     face_views = spread(score, range(len(views)), "finding visible triangles")
