@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from sfm_app.operating_system import is_link, replace_file
 
-# Atomic writes, and markers of folders that the run after a killed one may resume.
-
 UNFINISHED = "unfinished.txt"
 """Marker in a folder that a stage is filling: the fingerprint of the inputs."""
 
@@ -69,8 +67,6 @@ def save_files(files: Mapping[str, bytes], folder: Path) -> tuple[Path, ...]:
     return paths
 
 
-# Hashes, and arrays within limits, since files may be damaged.
-
 MOST_BYTES, MOST_INFLATED = 1_000_000_000, 200
 """Limits of arrays: bytes, and multiple of the file's size. A file that exceeds both is refused; deflate reaches 1000
 times with zeros. By hand."""
@@ -79,9 +75,8 @@ times with zeros. By hand."""
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of an .npz file; pickled objects, which could run code, are refused.
 
-    Raises:
-        OSError: it cannot be read.
-        ValueError: it is no such file, or exceeds the limits. Damaged files raise many other errors.
+    Raise an OSError if it cannot be read, a ValueError if it is no such file or exceeds the limits. Damaged files raise
+    many other errors.
     """
     # opened here, because NumPy leaves a damaged file open
     with path.open("rb") as file:
@@ -95,24 +90,19 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def digest_file(path: Path) -> str:
-    """Return a hash of the bytes of a file.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """Return a hash of the bytes of a file; raise an OSError if it cannot be read."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "blake2b").hexdigest()
 
 
 def digest_files(root: Path, *names: str) -> str:
-    """Return a hash of the names and bytes of files, and of all files in folders, except links.
-
-    Raises:
-        FileNotFoundError: one of them is missing.
-    """
+    """Return a hash of the names and bytes of files and all files in folders, except links; raise if one is missing."""
     digest = hashlib.blake2b(digest_size=16)
     for name in names:
-        for path in _files(root / name):
+        place = root / name
+        inside = (file for file in place.rglob("*") if file.is_file() and not is_link(file))
+        files = sorted(file for file in inside if not file.name.startswith(".")) if place.is_dir() else [place]
+        for path in files:
             digest.update(f"{path.relative_to(root).as_posix()!r} {digest_file(path)}\n".encode())
     return digest.hexdigest()
 
@@ -127,11 +117,3 @@ def is_below(name: str) -> bool:
     """Return whether a joined name stays below its folder, judging by the name alone."""
     path = PurePath(name)  # a drive of Windows is not absolute
     return bool(path.parts) and not path.anchor and ".." not in path.parts and "\0" not in name
-
-
-def _files(path: Path) -> Iterator[Path]:
-    if not path.is_dir():
-        yield path
-        return
-    files = (file for file in path.rglob("*") if file.is_file() and not is_link(file))
-    yield from sorted(file for file in files if not file.name.startswith("."))

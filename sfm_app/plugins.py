@@ -119,7 +119,6 @@ class FeatureMethod:
     match: MatchFeatures | None = None
     summary: str = ""
     unavailable: Callable[[], str] = _no_reason
-    """Reason why it cannot run on this machine; empty if it can."""
     sift: Mapping[str, bool | int | float] | None = None
     """In place of functions: options of COLMAP's SIFT extraction that differ from its defaults."""
 
@@ -199,11 +198,7 @@ class Plugins:
         return method
 
     def depth_method(self, name: str) -> tuple[DepthMethod, str]:
-        """Return a depth method, or with "auto" the best that runs here, and the reason of the choice.
-
-        Raises:
-            ConfigError: no method has this name, or it cannot run on this machine.
-        """
+        """Return a depth method, or with "auto" the best that runs here, and why; ConfigError as in `exporter`."""
         if name != AUTO:
             method = _look_up(self.depth_methods, name, "depth method")
             if reason := method.unavailable():
@@ -226,10 +221,8 @@ def load_plugins(modules: Sequence[ModuleType | object] = (), *, installed: bool
     """Register the built-ins, the given modules and, if `installed`, every installed plug-in.
 
     Without arguments the result is cached for the process: the search through all packages takes longer than an easy
-    pair. `installed_plugins.cache_clear()` resets it.
-
-    Raises:
-        PluginError: a hook is misspelt, a plug-in does not import, or two methods share a name.
+    pair. `installed_plugins.cache_clear()` resets it. Raise a PluginError if a hook is misspelt, a plug-in does not
+    import, or two methods share a name.
     """
     return installed_plugins() if installed and not modules else _load(modules, installed)
 
@@ -271,12 +264,7 @@ def _part_here(kind: str, name: str) -> Any:
     return built_in[name] if name in built_in else _look_up(getattr(installed_plugins(), kind), name, kind)
 
 
-class _NamedPart(Protocol):
-    @property
-    def name(self) -> str: ...
-
-
-Part = TypeVar("Part", bound=_NamedPart)
+Part = TypeVar("Part", Estimator, Calibrator, Exporter, SceneExporter, DepthMethod, FeatureMethod)
 
 
 def _index_by_name(results: Iterable[Iterable[Part]], others: Iterable[str] = ()) -> Mapping[str, Part]:

@@ -358,10 +358,7 @@ class Settings(Section):
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], where: str = "settings") -> "Settings":
-        """Check nested values on top of the preset that they name.
-
-        Raises:
-            ConfigError: a key is unknown, or a value has the wrong type or is out of range; lists the first few.
+        """Check nested values on top of the preset that they name; a ConfigError lists the first few wrong ones.
 
         Examples:
             >>> from sfm_app import Settings

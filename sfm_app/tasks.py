@@ -11,9 +11,8 @@ class Task(partial[Result]):
     """A function with some of its arguments that any worker can apply, on this machine or on another.
 
     A worker in another process needs pickles: the function is part of a module; its arguments are small, `Shared`, or
-    files
-    in the output folder; its result is returned or written there. Threads need no pickles. Other functions stay in the
-    process of the run.
+    files in the output folder; its result is returned or written there. Threads need no pickles. Other functions stay
+    in the process of the run.
     """
 
 

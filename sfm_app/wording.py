@@ -22,10 +22,7 @@ LENGTH = re.compile(r"\s*([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*([a-zA-Z'\"]*)\s*")
 def parse_length(text: str) -> float:
     """Return a length such as 1.25m, 50 mm or 3ft in meters.
 
-    A bare number is refused: 50 may mean millimeters.
-
-    Raises:
-        ValueError: it is no length, not positive, or of an unknown unit.
+    Raise a ValueError if it is no positive length. A bare number is refused: 50 may mean millimeters.
     """
     match = LENGTH.fullmatch(text)
     unit = match.group(2).lower() if match else ""
@@ -42,11 +39,7 @@ def parse_length(text: str) -> float:
 
 
 def parse_point(text: str) -> tuple[float, float, float]:
-    """Return a point such as 0.5,-1.25,3.
-
-    Raises:
-        ValueError: it is not three finite numbers.
-    """
+    """Return a point such as 0.5,-1.25,3; raise a ValueError if it is not three finite numbers."""
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:

@@ -20,7 +20,6 @@ from sfm_app.types import ControlPoint, ControlPoints, GpsPosition
 from sfm_app.types.arrays import FloatArray
 
 # The file, OpenDroneMap's gcp_list.txt.
-#
 # The first line is the coordinate system: EPSG:32632, a proj string such as "+proj=utm +zone=32 +datum=WGS84", or
 # "WGS84 UTM 32N". Each other line is a mark in a photo: geo_x geo_y geo_z pixel_x pixel_y photo [name]. Marks with
 # the same name, or without names at the same position, belong to one point.
@@ -58,7 +57,6 @@ def read_control_points(path: Path) -> ControlPoints:
 
 
 def _read_marks(lines: list[str], geographic: bool) -> tuple[ControlPoint, ...]:
-    """Return the points of all lines after the first; raise a ValueError that names a malformed line."""
     names: dict[tuple[object, ...], str] = {}
     positions: dict[str, tuple[float, float, float]] = {}
     marks: dict[str, dict[str, tuple[float, float]]] = {}
@@ -90,8 +88,6 @@ def _read_mark(line: str, geographic: bool) -> tuple[tuple[float, float, float],
     return (east, north, up), (x, y), photo, words[6].strip() if len(words) > 6 else ""
 
 
-# The fit of the model to the points, without points that contradict the others.
-
 SIGNIFICANCE = 0.002
 """Probability of a false alarm at each step of the forward search. Chosen by hand; the unit tests count false alarms
 and detected wrong points."""
@@ -115,17 +111,13 @@ class ControlFit:
     deviation: float
     """Relative standard deviation of the scale."""
     rms_m: float
-    """Root mean square distance of the inliers."""
     inliers: tuple[str, ...]
     outliers: Mapping[str, float]
     """Distance of each rejected point from the fit, in meters."""
 
 
 def fit_control_points(given: ControlPoints, located: Mapping[str, SightedPoint]) -> ControlFit | str:
-    """Fit the similarity from the model to its ground control points, given their places in the model by name.
-
-    Return the reason if the points do not determine one.
-    """
+    """Fit the similarity from the model to control points by their places in it; return the reason if there is none."""
     points = [point for point in given.points if point.name in located]
     if len(points) < 3:
         return f"{len(points)} of {len(given.points)} ground control points have a place in the model, 3 are needed"
@@ -153,13 +145,7 @@ def agreeing_points(places: FloatArray, targets: FloatArray) -> NDArray[np.bool_
     A forward search (Atkinson and Riani 2000) begins with the four that agree best and adds the nearest one by one. The
     points from some step on are rejected if the fit without them is better than chance allows: by the F-test, with as
     many trials as there are ways to choose the rejected points.
-
-    Args:
-        places: (N, 3) in the model.
-        targets: (N, 3) in meters.
-
-    Raises:
-        ValueError: all points lie on a line.
+    `places` (N, 3) are in the model, `targets` (N, 3) in meters. A ValueError says that all points lie on a line.
     """
     first = robust_similarity(places, targets)
     if len(places) < 5:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.poses import Similarity, perpendicular_basis, robust_similarity
 from sfm_app.numerical import FAILURES, MAD_TO_SIGMA
-from sfm_app.types import GpsPosition
+from sfm_app.types import GpsPosition, Rejected
 from sfm_app.types.arrays import FloatArray
 
 EQUATOR_M = 6378137.0
@@ -29,13 +29,10 @@ class GpsOptions:
     significance: float = 1e-3
     """Largest probability that positions unrelated to the cameras fit as well."""
     max_scale_deviation: float = 0.1
-    """Largest relative standard deviation of the scale."""
     min_share: float = 0.6
-    """Least share of the distinct positions that must agree."""
     max_up_deviation_deg: float = 2.0
     """Largest standard deviation with which up from GPS replaces up from the cameras' roll."""
     max_pairs: int = 500
-    """Largest number of samples of two positions."""
 
 
 OPTIONS = GpsOptions()
@@ -52,7 +49,6 @@ class Georeference:
     inliers: int
     """Number of distinct positions that agree."""
     positions: int
-    """Number of distinct positions."""
     rms_m: float
     """Root mean square horizontal residual of the agreeing positions."""
     scale_deviation: float
@@ -61,37 +57,21 @@ class Georeference:
     """Standard deviation of up if it comes from the positions and their altitudes; None if up was given."""
 
 
-@dataclass(frozen=True, slots=True)
-class NoGeoreference:
-    """Why the positions are not used; falsy."""
-
-    reason: str
-
-    def __bool__(self) -> bool:
-        return False
-
-
 def georeference(
     centers: FloatArray, positions: Sequence[GpsPosition | None], up: FloatArray, *, up_is_sure: bool = True
-) -> Georeference | NoGeoreference:
+) -> Georeference | Rejected:
     """Find scale, heading and place from the positions of the photos, if these agree with the cameras.
 
     GPS errs by 3 to 10 m horizontally and twice that in height. So up stays as given, and only horizontal positions
     are used: w = a z + b in complex numbers, by RANSAC over pairs, then least squares. An unsure up is replaced by that
     of the positions if they determine it well.
-
-    Args:
-        centers: (N, 3) camera centers.
-        positions: per photo, None for unknown.
-        up: (3,) unit vector in the world.
-        up_is_sure: whether `up` has more evidence than the cameras' roll.
     """
     known = [k for k, position in enumerate(positions) if position is not None]
     given = [position for position in positions if position is not None]
     if not given:
-        return NoGeoreference("the photos have no positions")
+        return Rejected("the photos have no positions")
     if len(set(given)) < MIN_POSITIONS:
-        return NoGeoreference(f"{len(set(given))} different positions, {MIN_POSITIONS} are needed")
+        return Rejected(f"{len(set(given))} different positions, {MIN_POSITIONS} are needed")
     origin = _median_position(given)
     enu, cameras = enu_m(given, origin), centers[known]
     level = _fit_on_ground(cameras, enu, up, origin)
@@ -103,10 +83,7 @@ def georeference(
 
 
 def enu_m(positions: Sequence[GpsPosition], origin: GpsPosition) -> FloatArray:
-    """Return (N, 3) meters east, north and up of an origin; up is 0 if either altitude is unknown.
-
-    First-order in the angles, with the ellipsoid's radii at the origin: the error is 1 m over 5 km.
-    """
+    """Return (N, 3) meters east, north and up of an origin, up 0 if an altitude is unknown; it is 1 m off at 5 km."""
     meridian, parallel = _radii_m(origin)
     longitude = [(position.longitude_deg - origin.longitude_deg + 180.0) % 360.0 - 180.0 for position in positions]
     east = parallel * np.radians(longitude)
@@ -139,7 +116,6 @@ def _radii_m(origin: GpsPosition) -> tuple[float, float]:
 
 
 def _median_position(positions: Sequence[GpsPosition]) -> GpsPosition:
-    """Return the median position; its altitude is the median of the known ones."""
     first = positions[0].longitude_deg
     offset = np.median([(position.longitude_deg - first + 180.0) % 360.0 - 180.0 for position in positions])
     longitude = (first + float(offset) + 180.0) % 360.0 - 180.0
@@ -150,7 +126,7 @@ def _median_position(positions: Sequence[GpsPosition]) -> GpsPosition:
 
 def _fit_on_ground(
     cameras: FloatArray, enu: FloatArray, up: FloatArray, origin: GpsPosition
-) -> Georeference | NoGeoreference:
+) -> Georeference | Rejected:
     axes = perpendicular_basis(up)
     z, w = _to_complex(cameras @ axes.T), _to_complex(enu)
     spread = float(MAD_TO_SIGMA * np.median(np.abs(w - (np.median(w.real) + 1j * np.median(w.imag)))))
@@ -160,14 +136,14 @@ def _fit_on_ground(
     places = np.unique(np.round(enu[:, :2], 2), axis=0)
     used = len(np.unique(np.round(enu[agreeing, :2], 2), axis=0))
     if used < max(MIN_POSITIONS, OPTIONS.min_share * len(places)):
-        return NoGeoreference(f"only {used} of {len(places)} GPS positions agree with the cameras within {limit:.0f} m")
+        return Rejected(f"only {used} of {len(places)} GPS positions agree with the cameras within {limit:.0f} m")
     rms = float(np.sqrt(np.mean(np.abs(a * z[agreeing] + b - w[agreeing]) ** 2)))
     extent = float(np.std(w[agreeing]))
     unexplained = min((rms / extent) ** 2, 1.0) if extent > 0 else 1.0
     deviation = np.sqrt(unexplained / max(1.0 - unexplained, 1e-12) / (2 * (used - 2)))
     # for positions unrelated to the cameras, `unexplained` has the distribution function u^(n-2): Beta(n - 2, 1)
     if unexplained ** (used - 2) > OPTIONS.significance or deviation > OPTIONS.max_scale_deviation:
-        return NoGeoreference(
+        return Rejected(
             f"{used} GPS positions with a spread of {extent:.0f} m and residuals of {rms:.1f} m "
             "do not determine a scale"
         )

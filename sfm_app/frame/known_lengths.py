@@ -1,6 +1,6 @@
 """Known lengths in a scene as evidence of its scale: distances, markers and ground control points."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from sfm_app.frame.sighted_points import (
 )
 from sfm_app.runtime.context import RunContext
 from sfm_app.tasks import Task
-from sfm_app.types import ControlPoints, Photo, PhotoSet
+from sfm_app.types import ControlPoints, PhotoSet
 from sfm_app.wording import format_length, list_names, parse_length, parse_point
 
 TAPE_DEVIATION = 0.002
@@ -63,7 +63,16 @@ def control_places(
     marked = {photo for point in given.points for photo in point.marks if photo in names}
     scales = {name: layout_scale(names[name], photos.folder) for name in sorted(marked)}
     for point in given.points:
-        sights = _mark_sights(point.name, point.marks, names, scales, posed, problems)
+        sights: list[Sight] = []
+        for name, mark in point.marks.items():
+            photo = names.get(name)
+            if photo is None or photo.name not in posed:
+                continue
+            pixel = unrotate_pixels(photo, scales[name] * np.array([mark]))
+            if not (0 <= pixel[0, 0] <= photo.width and 0 <= pixel[0, 1] <= photo.height):
+                problems.append(f"ground control point '{point.name}': its mark in {name} lies outside of the photo")
+                continue
+            sights += posed.sights(photo.name, pixel)
         place = locate_point(sights)
         if isinstance(place, str):
             problems.append(f"ground control point '{point.name}' is not used: {place}")
@@ -74,25 +83,3 @@ def control_places(
             for photo in place.outliers
         ]
     return located
-
-
-def _mark_sights(
-    point: str,
-    marks: Mapping[str, tuple[float, float]],
-    names: Mapping[str, Photo],
-    scales: Mapping[str, float],
-    posed: PosedPhotos,
-    problems: list[str],
-) -> list[Sight]:
-    """Return the rays of a point's marks in posed photos, and add marks outside of their photo to the problems."""
-    sights = []
-    for name, mark in marks.items():
-        photo = names.get(name)
-        if photo is None or photo.name not in posed:
-            continue
-        pixel = unrotate_pixels(photo, scales[name] * np.array([mark]))
-        if not (0 <= pixel[0, 0] <= photo.width and 0 <= pixel[0, 1] <= photo.height):
-            problems.append(f"ground control point '{point}': its mark in {name} lies outside of the photo")
-            continue
-        sights += posed.sights(photo.name, pixel)
-    return sights

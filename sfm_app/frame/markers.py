@@ -45,7 +45,6 @@ class MarkerOptions:
     steps: int = 21
     """Samples of a profile from the middle of a light cell to the middle of the dark one beside it."""
     rounds: int = 4
-    """Iterations of the fit."""
     min_share: float = 0.75
     """Least share of the pattern's edges that agree. Chosen by hand: other markers of a family reach two thirds."""
     min_contrast: float = 0.3
@@ -64,20 +63,16 @@ class MarkerOptions:
 OPTIONS = MarkerOptions()
 
 # Corners, to a few hundredths of a pixel by all edges of the pattern.
-#
 # Detectors look for the outer contour. Blur and the camera's tone curve move every edge towards its dark side, so that
 # a contour is half a pixel too small: 1 % of a marker of 50 pixels. A pattern has edges with the dark side on either
 # side and above and below, which separate this shift from the size.
 
 
 def fit_pattern(gray: NDArray[np.uint8], pattern: NDArray[np.uint8], corners: FloatArray) -> FloatArray | None:
-    """Return the corners (4, 2) of a pattern in a photo (H, W), by all edges of the pattern.
+    """Return the corners (4, 2) of a pattern in a photo (H, W), by all edges of the pattern; None if too few agree.
 
-    None if too few edges are visible or agree with the pattern.
-
-    Args:
-        pattern: (N, N) cells of the marker with its dark border, 0 or 255; its surroundings are light.
-        corners: (4, 2) exact to a pixel or two, clockwise from the pattern's own top left; pixel centers at +0.5.
+    The cells (N, N) with the dark border are 0 or 255. The given corners are exact to a pixel or two, clockwise from
+    the pattern's own top left, pixel centers at +0.5.
     """
     light, dark = edge_sides(pattern)
     middle, cells = (light + dark) / 2, float(len(pattern))
@@ -104,10 +99,7 @@ def fit_pattern(gray: NDArray[np.uint8], pattern: NDArray[np.uint8], corners: Fl
 
 
 def edge_sides(pattern: NDArray[np.uint8]) -> tuple[FloatArray, FloatArray]:
-    """Return points (E, 2) in the light and in the dark cells on both sides of each edge, x and y in cells.
-
-    The pattern (N, N) has values 0 and 255; its surroundings are light.
-    """
+    """Return points (E, 2), x and y in cells, in the light and the dark cells beside each edge of a pattern (N, N)."""
     lit = np.pad(pattern > 127, 1, constant_values=True)
     light, dark = [], []
     for row, column in np.argwhere(lit):
@@ -124,10 +116,7 @@ def edge_sides(pattern: NDArray[np.uint8]) -> tuple[FloatArray, FloatArray]:
 
 
 def _crossings(gray: NDArray[np.uint8], light: FloatArray, dark: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the points (E, 2) where profiles from light to dark cross their middle gray level, and the contrast (E,).
-
-    A profile without a crossing gives NaN.
-    """
+    """Return points (E, 2) where profiles cross their middle gray level, NaN without one, and the contrast (E,)."""
     along = np.linspace(0.0, 1.0, OPTIONS.steps)
     places = (light[:, None] + along[None, :, None] * (dark - light)[:, None]).astype(np.float32) - np.float32(0.5)
     levels = cv2.remap(gray, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -182,9 +171,6 @@ def _solve_robustly(J: FloatArray, r: FloatArray) -> tuple[FloatArray, int, floa
     return step, int(inliers.sum()), float(np.sqrt((errors[inliers] ** 2).sum() / freedom))
 
 
-# Detection.
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectedMarker:
     """A marker in one photo."""
@@ -237,13 +223,6 @@ def draw_pattern(family: str, number: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.aruco.generateImageMarker(dictionary, number, dictionary.markerSize + 2), np.uint8)
 
 
-def marker_count(family: str) -> int:
-    """Return the number of markers in a family."""
-    return len(load_dictionary(family).bytesList)
-
-
-# Pages to print.
-
 PAGES_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
 """Width and height of a sheet of paper, by its name."""
 
@@ -266,15 +245,9 @@ PAGE = PageOptions()
 def write_marker_page(
     path: Path, side_m: float, family: str = "apriltag-36h11", first: int = 0, paper: str = "a4"
 ) -> int:
-    """Write a page of markers to a PDF or SVG file, true to scale, and return their number.
+    """Write a page of markers, dark squares of `side_m` meters, to a PDF or SVG file, and return their number.
 
-    Args:
-        side_m: side of the dark square of each marker, in meters.
-        first: number of the first marker in its family.
-
-    Raises:
-        ConfigError: no marker of that size fits on the page, or a name is unknown.
-        InputError: the file cannot be written.
+    Raise a ConfigError if no marker fits on the page or a name is unknown, an InputError if the file cannot be written.
     """
     if path.suffix.lower() not in (".pdf", ".svg"):
         raise ConfigError(f"a page of markers is a PDF or SVG file, not {path.name}", hint="write -o markers.pdf")
@@ -284,7 +257,8 @@ def write_marker_page(
             hint=f"known: {', '.join(FAMILIES if family not in FAMILIES else PAGES_MM)}",
         )
     places = marker_places(side_m, len(draw_pattern(family, 0)), paper)
-    places = places[: max(min(PAGE.max_markers, marker_count(family) - first), 0)]
+    count = len(load_dictionary(family).bytesList)
+    places = places[: max(min(PAGE.max_markers, count - first), 0)]
     if not places:
         size = format_length(side_m)
         raise ConfigError(
@@ -341,10 +315,7 @@ def _draw(places: list[tuple[float, float]], side: float, family: str, first: in
 
 
 def _dark_bars(pattern: NDArray[np.uint8], x: float, y: float, side: float) -> list[FloatArray]:
-    """Return x and y of the dark bars of a marker, alternating, for `Axes.fill`.
-
-    Bars along rows and along columns cover each other's seams, which viewers would show as light lines.
-    """
+    """Return x and y of the dark bars, alternating, for `Axes.fill`; rows and columns cover each other's seams."""
     cells = len(pattern)
     bars = [(row, row + 1, *bar) for row in range(cells) for bar in _runs(pattern[row] < 128)]
     bars += [(*bar, column, column + 1) for column in range(cells) for bar in _runs(pattern[:, column] < 128)]
@@ -356,12 +327,9 @@ def _dark_bars(pattern: NDArray[np.uint8], x: float, y: float, side: float) -> l
 
 
 def _runs(dark: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return begin and end of each run of dark cells."""
     steps = np.diff(np.concatenate([[0], dark.astype(np.int8), [0]]))
     return list(zip(np.flatnonzero(steps > 0).tolist(), np.flatnonzero(steps < 0).tolist(), strict=True))
 
-
-# The scale of a model from printed markers of known size.
 
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 """Corners of a marker of side 1 about its middle, clockwise from its own top left."""
@@ -372,10 +340,7 @@ def marker_scales(
 ) -> tuple[list[ScaleEvidence], dict[str, str]]:
     """Return the scale by each marker, and the reason for each unusable marker by name.
 
-    Args:
-        markers: by photo.
-        rays: by photo, for each of its markers, the rays of the four corners.
-        side_m: side of each marker's dark square, in meters.
+    `rays` holds by photo, for each of its markers, the rays of the four corners. `side_m` is that of a dark square.
     """
     sights: dict[str, list[Sequence[Sight]]] = defaultdict(list)
     sizes: dict[str, list[float]] = defaultdict(list)
@@ -402,7 +367,6 @@ def side_px(corners: FloatArray) -> float:
 
 
 def _measure_marker(name: str, sights: Sequence[Sequence[Sight]], size_px: float, side_m: float) -> ScaleEvidence | str:
-    """Return the scale by one marker in several photos, or the reason why it gives none."""
     corners: list[SightedPoint] = []
     for k in range(4):
         point = locate_point([photo[k] for photo in sights])

@@ -26,7 +26,6 @@ class ScaleEvidence:
     deviation: float
     """Relative standard deviation, > 0."""
     photos: int = 0
-    """Number of photos that show the object."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +46,7 @@ def agree(evidence: Sequence[ScaleEvidence], shape: float = 0.0) -> AgreedScale:
     others remain. Of two contradicting scales, the more exact one counts, and the deviation covers half of the
     difference.
 
-    Args:
-        shape: relative deviation of the model's proportions, which more evidence does not reduce.
+    `shape` is the relative deviation of the model's proportions, which more evidence does not reduce.
     """
     used, contradictions = list(evidence), []
     while len(used) > 2:

@@ -29,9 +29,7 @@ class SightOptions:
     min_sigma_px: float = 0.1
     """Least standard deviation of a mark: two photos agree by chance. Chosen by hand."""
     max_pairs: int = 300
-    """Largest number of samples of two rays."""
     rounds: int = 6
-    """Iterations of the weights."""
     neighbors: int = 12
     """Nearest points of the sparse model whose photos are taken to see a place. Chosen by hand."""
     min_picked_sigma_px: float = 0.5
@@ -70,10 +68,7 @@ class SightedPoint:
 
 
 def locate_point(sights: Sequence[Sight]) -> SightedPoint | str:
-    """Place a point by its sights, one per photo: least squares of the residuals in pixels, without outliers.
-
-    Return the reason if they do not determine it.
-    """
+    """Place a point by its sights, one per photo, by least squares without outliers; return the reason if it fails."""
     if len(sights) < 2:
         return "it is marked in one photo with a pose, two are needed" if sights else "no photo with it has a pose"
     centers, rays = np.array([one.center for one in sights]), np.array([one.ray for one in sights])
@@ -100,13 +95,7 @@ def locate_point(sights: Sequence[Sight]) -> SightedPoint | str:
 
 
 def ray_information(place: FloatArray, centers: FloatArray, rays: FloatArray, focals: FloatArray) -> FloatArray:
-    """Return the information matrix (3, 3) of a point (3,) for marks with a standard deviation of one pixel.
-
-    Args:
-        centers: (N, 3) of the cameras.
-        rays: (N, 3) unit vectors.
-        focals: (N,) pixels per radian.
-    """
+    """Return the information matrix (3, 3) of a point for marks with a deviation of one pixel, by unit rays."""
     weights = (focals / np.maximum(np.linalg.norm(place - centers, axis=1), 1e-300)) ** 2
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     return np.asarray((weights[:, None, None] * across).sum(axis=0))
@@ -149,9 +138,6 @@ def _residuals_px(place: FloatArray, centers: FloatArray, rays: FloatArray, foca
     along = np.einsum("ni,ni->n", towards, rays)
     across = np.linalg.norm(np.cross(towards, rays), axis=1)
     return np.asarray(focals * np.arctan2(across, along))
-
-
-# Distances in a finished model, with deviations.
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,14 +188,9 @@ def place_covariance(place: FloatArray, model: Sightlines) -> FloatArray:
 def measure_distance(
     a: FloatArray, b: FloatArray, model: Sightlines, scale: float, deviation: float | None
 ) -> Distance:
-    """Return the distance between two places (3,) in the frame of the model.
+    """Return the distance between two places (3,) in the frame of the model; a ValueError says that they are the same.
 
-    Args:
-        scale: units of exported files per unit of the model.
-        deviation: relative, of the scale; None if the unit is arbitrary.
-
-    Raises:
-        ValueError: both places are the same.
+    `scale` is in units of exported files per unit of the model, with a relative `deviation`, None if arbitrary.
     """
     length = float(np.linalg.norm(b - a))
     if length == 0:
@@ -219,9 +200,6 @@ def measure_distance(
     value = scale * length
     spread = np.hypot(scale * np.sqrt(max(float(variance), 0.0)), value * (deviation or 0.0))
     return Distance(value, float(spread), deviation is not None)
-
-
-# Photos.
 
 
 class PosedPhotos:
@@ -238,7 +216,6 @@ class PosedPhotos:
         return tuple(self._ids)
 
     def __contains__(self, photo: str) -> bool:
-        """Return whether a photo has a pose."""
         return photo in self._ids
 
     def sights(self, photo: str, pixels: FloatArray) -> list[Sight]:

@@ -16,7 +16,6 @@ from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.types.arrays import FloatArray
 
 # The up direction from how photographers hold cameras.
-#
 # Most hold them level: the x axes of the cameras are horizontal, and up is the direction most nearly perpendicular
 # to all of them. Some turn the camera by 90 degrees, for one photo or for all, and the file does not always record
 # it; some do not hold it level at all.
@@ -70,25 +69,18 @@ def roll_hypotheses(rotations: FloatArray, centers: FloatArray) -> tuple[Roll, .
     Roll alone does not distinguish portrait photos of a wall from landscape photos of the same wall lying on its side,
     so two weaker cues are added: people look nearly horizontally, and they walk rather than climb. Proposals of photos
     are refined by weighted least squares, and the cheapest is chosen. Opposite turns have opposite directions, unless
-    cameras look steeply down.
-
-    Args:
-        rotations: (N, 3, 3) cam_from_world, N >= 1; camera axes x right, y down, z forward.
-        centers: (N, 3) camera centers.
+    cameras look steeply down. The rotations (N, 3, 3) are cam_from_world, N >= 1.
     """
-    return tuple(
-        _best_hypothesis(turn, proposals, rotations, centers) for turn, proposals in enumerate(_proposals(rotations))
-    )
-
-
-def _best_hypothesis(turn: int, proposals: FloatArray, rotations: FloatArray, centers: FloatArray) -> Roll:
-    best, least = (proposals[0], ROLL_OPTIONS.rolls_deg[0]), np.inf
-    for proposal, roll_deg in product(proposals, ROLL_OPTIONS.rolls_deg):
-        for up in (proposal, _refine_up(proposal, rotations, roll_deg)):
-            cost = _cost(up, turn, rotations, roll_deg) + _climb_cost(up, centers)
-            if cost < least - 1e-9:
-                best, least = (up, roll_deg), cost
-    return Roll(best[0], 90 * turn, *_uncertainty(best[0], rotations, best[1]), least)
+    rolls = []
+    for turn, proposals in enumerate(_proposals(rotations)):
+        best, least = (proposals[0], ROLL_OPTIONS.rolls_deg[0]), np.inf
+        for proposal, roll_deg in product(proposals, ROLL_OPTIONS.rolls_deg):
+            for up in (proposal, _refine_up(proposal, rotations, roll_deg)):
+                cost = _cost(up, turn, rotations, roll_deg) + _climb_cost(up, centers)
+                if cost < least - 1e-9:
+                    best, least = (up, roll_deg), cost
+        rolls.append(Roll(best[0], 90 * turn, *_uncertainty(best[0], rotations, best[1]), least))
+    return tuple(rolls)
 
 
 def _up_axes(rotations: FloatArray) -> FloatArray:
@@ -168,9 +160,6 @@ def _angle_cost(sine: FloatArray, deg: float) -> FloatArray:
     return np.asarray(0.5 * (np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0))) / deg) ** 2)
 
 
-# Cues of the scene and of the pictures.
-
-
 @dataclass(frozen=True, slots=True)
 class CueOptions:
     """Constants of the cues."""
@@ -188,19 +177,16 @@ class CueOptions:
     picture_px: int = 256
     """Longer side of the small pictures: wide enough for ledges and window sills, too small for texture."""
     blur_px: float = 2.0
-    """Blur before slopes are taken."""
     black: int = 20
     """Gray level of an unlit background, whose border is no ledge."""
     black_px: int = 15
     """Least width of that background."""
     border_px: int = 6
-    """Width of its border."""
     min_rms: float = 1e-6
     """RMS of differences of normals or log brightness below which they are rounding."""
     max_sky_slope: float = 1.5
     """Largest slope of sky, in gray levels per pixel."""
     sky_blur_px: float = 1.0
-    """Blur before the slopes of sky are taken."""
     min_sky: int = 40
     """Least gray level of sky."""
 
@@ -230,14 +216,7 @@ def small_picture(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def fit_surfaces(
     points: FloatArray, brightness: FloatArray, visible: Sequence[NDArray[np.int64]], centers: FloatArray
 ) -> Surfaces:
-    """Fit a plane to the neighbors of each point, and keep flat patches.
-
-    Args:
-        points: (P, 3).
-        brightness: (P,) 0 to 255.
-        visible: per photo, the indices of its visible points.
-        centers: (N, 3) of the cameras.
-    """
+    """Fit a plane to the neighbors of each point, and keep flat patches; the brightness (P,) is 0 to 255."""
     from scipy.spatial import cKDTree
 
     if len(points) < CUE_OPTIONS.neighbors:
@@ -267,13 +246,6 @@ def depth_height_correlation(
     """Return the mean correlation of log depth with height in the photo, in [-1, 1].
 
     The ground gets nearer towards the lower border; facades seen from the street lean away.
-
-    Args:
-        up: (3,) unit vector in the world.
-        rotations: (N, 3, 3) of cam_from_world.
-        centers: (N, 3) of the cameras.
-        points: (P, 3) in the world.
-        visible: per photo, the indices of its visible points.
     """
     correlations = []
     for R, center, rows in zip(rotations, centers, visible, strict=True):
@@ -296,10 +268,7 @@ def mean_upward_normal(up: FloatArray, surfaces: Surfaces) -> float:
 
 
 def brightness_normal_correlation(up: FloatArray, surfaces: Surfaces) -> float:
-    """Return the correlation of brightness with the normal's component along `up` (3,), in [-1, 1].
-
-    Both are relative to their neighborhood: light comes from above.
-    """
+    """Return the correlation of brightness with the normal's component along `up`, both relative to their vicinity."""
     if not len(surfaces.normals):
         return 0.0
     rise, shade = component_along(surfaces.normal_differences, up), surfaces.brightness_differences
@@ -312,11 +281,7 @@ def slope_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[ND
 
     Shadow under ledges, eaves and objects has a sharp border to the lit top above it, and skylines are brighter above;
     transitions back to light are gradual. Perpendicular to `up` it is 0 within 0.06.
-
-    Args:
-        up: (3,) unit vector in the world.
-        rotations: (N, 3, 3) of cam_from_world.
-        pictures: per photo (H, W) gray, in the orientation of the sensor; None if there is none.
+    `rotations` (N, 3, 3) are cam_from_world; the pictures (H, W) are gray, in the orientation of the sensor.
     """
     shares = []
     for R, gray in _blurred(rotations, pictures, CUE_OPTIONS.blur_px):
@@ -327,10 +292,7 @@ def slope_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[ND
 
 
 def sky_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
-    """Return the mean share of even, bright pixels near the upper border minus the lower, in [-1, 1].
-
-    Arguments are those of `slope_asymmetry`.
-    """
+    """Return the mean share of even, bright pixels near the upper border minus the lower, in [-1, 1]."""
     differences = []
     for R, blurred in _blurred(rotations, pictures, CUE_OPTIONS.sky_blur_px):
         steep = np.hypot(_slope(blurred, np.array([1.0, 0.0])), _slope(blurred, np.array([0.0, 1.0])))
@@ -359,7 +321,6 @@ def _mean(values: list[float]) -> float:
 
 
 def _black_background(gray: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return the pixels (H, W) of an unlit background and its border."""
     widths = CUE_OPTIONS.black_px, 2 * CUE_OPTIONS.border_px + 1
     broad, border = (np.ones((width, width), np.uint8) for width in widths)
     black = cv2.morphologyEx((gray < CUE_OPTIONS.black).astype(np.uint8), cv2.MORPH_OPEN, broad)

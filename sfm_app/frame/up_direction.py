@@ -42,20 +42,17 @@ class UpOptions:
     """Constants of the up direction and of the frame of viewers."""
 
     samples: int = 1000
-    """Samples of three points for a plane."""
     max_points: int = 4000
     """Largest number of points that score a plane."""
     inlier_distance: float = 0.01
     """Largest distance of inliers from a plane, as a share of the scene's size."""
     min_share: float = 0.15
-    """Least share of inliers of a plane."""
     max_nats: float = 3.0
     """Largest evidence of one cue: each of them is wrong in one place of twenty (a vault, a stage, snow)."""
     ledge_nats: float = 10.0
     """Nats for an axis per unit of `slope_asymmetry`. The other cues are as large sideways: along a wall, depth,
     normals and light change from side to side."""
     max_ledge_nats: float = 4.0
-    """Their maximum."""
     highest_nats: float = 14.0
     """Odds above a million to one are not distinguished."""
     unsure_deg: float = 5.0
@@ -71,8 +68,6 @@ class UpOptions:
 
 
 OPTIONS = UpOptions()
-
-# The plane with most points of a scene, among planes of a given inclination.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,12 +85,7 @@ class Plane:
 def dominant_plane(points: FloatArray, axis: FloatArray, between_deg: tuple[float, float]) -> Plane | None:
     """Find the plane with most points whose normal is at a given angle to an axis; None without enough inliers.
 
-    RANSAC with a fixed seed, then least squares on the inliers.
-
-    Args:
-        points: (N, 3), of any scale.
-        axis: (3,) unit vector.
-        between_deg: least and largest angle between normal and axis, in [0, 90].
+    RANSAC with a fixed seed, then least squares on the inliers. `axis` is a unit vector (3,), angles are in [0, 90].
     """
     rng = np.random.default_rng(0)
     cloud = points[rng.permutation(len(points))[: OPTIONS.max_points]]
@@ -122,9 +112,6 @@ def _fit_plane(points: FloatArray, axis: FloatArray, share: float) -> Plane:
     # rounding may leave the least eigenvalue of coplanar points below zero
     deviation = np.degrees(np.arctan2(np.sqrt(max(small, 0.0) / len(points)), np.sqrt(max(middle, 1e-30))))
     return Plane(smallest_eigenvector(scatter, axis), share, float(deviation))
-
-
-# The choice between the hypotheses of roll.
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,13 +169,7 @@ class RollSelection:
 
 
 def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArray, scenery: Scenery) -> RollSelection:
-    """Choose the vertical by roll and ledges, then its upper end by all cues.
-
-    Args:
-        rolls: estimates for photos turned by 0, 90, 180, 270 degrees; opposites share a vertical.
-        rotations: (N, 3, 3) cam_from_world of the photos.
-        centers: (N, 3) camera centers.
-    """
+    """Choose the vertical by roll and ledges, then its upper end by all cues; the rolls are in order of their turns."""
     surfaces = fit_surfaces(scenery.points, scenery.brightness, scenery.visible, centers)
     ledges = [slope_asymmetry(roll.up, rotations, scenery.pictures) for roll in rolls[:2]]
     upright, lying = (
@@ -215,9 +196,6 @@ def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArra
 def odds(nats: float) -> float:
     """Return log odds as odds to one, with two digits."""
     return float(f"{np.exp(min(nats, OPTIONS.highest_nats)):.2g}")
-
-
-# The up direction, the side of the viewer, and the frame of both.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -253,14 +231,7 @@ class UpEstimate:
 def up_direction(
     rotations: FloatArray, centers: FloatArray, scenery: Scenery, segments: Segments, turn_deg: int | None = None
 ) -> UpEstimate:
-    """Find up from vertical lines near the up direction of the cameras' roll, or else from the ground or the roll.
-
-    Args:
-        rotations: (N, 3, 3) cam_from_world of the photos, N >= 1.
-        centers: (N, 3) camera centers.
-        segments: lines in the photos; may be empty.
-        turn_deg: clockwise turn that makes the photos upright: 0, 90, 180 or 270; None if unknown.
-    """
+    """Find up from vertical lines near that of the cameras' roll, or else from the ground or the roll."""
     rolls = roll_hypotheses(rotations, centers)
     if turn_deg is None:
         selection = select_roll(rolls, rotations, centers, scenery)
@@ -285,14 +256,7 @@ def up_direction(
 
 
 def viewer_direction(upright: UpEstimate, rotations: FloatArray, points: FloatArray) -> tuple[FloatArray, str]:
-    """Choose the horizontal direction (3,) to the viewer, and its source: `LINES`, `WALL` or `CAMERAS`.
-
-    It points to the cameras, or exactly along a main direction of lines or walls near that.
-
-    Args:
-        rotations: (N, 3, 3) of cam_from_world.
-        points: (P, 3) in the world.
-    """
+    """Choose the horizontal direction (3,) to the cameras, or of lines or walls near it, and name its source."""
     up = upright.up
     towards = normalize(perpendicular_component(-rotations[:, 2].mean(axis=0), up))
     if not towards.any():
@@ -311,11 +275,8 @@ def viewer_direction(upright: UpEstimate, rotations: FloatArray, points: FloatAr
 def viewer_frame(up: FloatArray, towards: FloatArray, points: FloatArray, meters: float | None = None) -> Similarity:
     """Return the similarity into the frame of glTF viewers: y up, z to the viewer, the points around the origin.
 
-    Args:
-        up: (3,) unit vector in the world.
-        towards: (3,) perpendicular unit vector, see `viewer_direction`.
-        points: (P, 3) of the scene.
-        meters: per unit of the world; None for four of five points within 1 of the middle.
+    `up` and `towards` are perpendicular unit vectors (3,), `meters` those of a unit of the world; if None, four of five
+    points come within 1 of the middle.
     """
     R = np.stack([np.cross(up, towards), up, towards])
     # the median would follow the densest points, the bounding box the farthest few

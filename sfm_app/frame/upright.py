@@ -21,14 +21,14 @@ from sfm_app.colmap.model import (
     viewing_rays,
 )
 from sfm_app.errors import NumericalError
-from sfm_app.frame.georeference import Georeference, NoGeoreference, georeference, position_from_enu
+from sfm_app.frame.georeference import Georeference, georeference, position_from_enu
 from sfm_app.frame.up_cues import small_picture
 from sfm_app.frame.up_direction import LINES, Scenery, UpEstimate, odds, up_direction, viewer_direction, viewer_frame
 from sfm_app.frame.vanishing_points import Segments, concatenate_segments, line_segments, segment_planes
 from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import FAILURES, Json, error_reason
 from sfm_app.runtime.context import RunContext
-from sfm_app.types import GpsPosition, MatchGraph
+from sfm_app.types import GpsPosition, MatchGraph, Rejected
 from sfm_app.types.arrays import FloatArray
 
 logger = logging.getLogger("sfm_app")
@@ -79,13 +79,8 @@ def orient(
 ) -> dict[str, Json]:
     """Move the colored model into the frame of glTF viewers: y up, seen from +z, centered, of size 1 or in meters.
 
-    Return the orientation and its evidence for the manifest.
-
-    Args:
-        turn_deg: clockwise turn that makes the photos upright; None if unknown.
-
-    Raises:
-        NumericalError: the model has no finite points.
+    Return the orientation and its evidence for the manifest. `turn_deg` is the clockwise turn that makes the photos
+    upright, None if unknown. A NumericalError says that the model has no finite points.
     """
     with translate_errors("reading the model"):
         poses, points = poses_and_points(model)
@@ -118,15 +113,15 @@ def orient(
 
 def _georeference(
     centers: FloatArray, positions: Sequence[GpsPosition | None], upright: UpEstimate
-) -> Georeference | NoGeoreference:
+) -> Georeference | Rejected:
     try:
         gps = georeference(centers, positions, upright.up, up_is_sure=upright.method == LINES)
     except FAILURES as err:
         logger.info("the GPS positions cannot be used", exc_info=err)
-        return NoGeoreference(f"the computation failed: {error_reason(err)}")
+        return Rejected(f"the computation failed: {error_reason(err)}")
     if not isinstance(gps, Georeference) or is_sound(gps.enu_from_world):
         return gps
-    return NoGeoreference("the positions give no scale")
+    return Rejected("the positions give no scale")
 
 
 def is_sound(similarity: Similarity) -> bool:
@@ -141,7 +136,6 @@ def turn_camera(R: FloatArray, turn_deg: int) -> FloatArray:
 
 
 def _world_segments(model: Reconstruction, cues: Mapping[int, PhotoCues]) -> Segments:
-    """Return the line segments of a model's photos in the world."""
     parts = []
     with translate_errors("computing viewing rays of line segments"):
         for photo, cue in cues.items():
@@ -172,7 +166,6 @@ def extract_cues(path: Path, turn_deg: int = 0) -> PhotoCues:
 
 
 def _orientation_entry(upright: UpEstimate, front: str) -> dict[str, Json]:
-    """Return the up and front directions and their evidence, for the manifest."""
     selection = upright.selection
     return {
         "up": upright.method,
@@ -194,9 +187,8 @@ def gps_deviation(orientation: Mapping[str, Json]) -> float | None:
     return float(percent) / 100.0 if isinstance(percent, int | float) else None
 
 
-def _georeference_entry(viewer: Similarity, gps: Georeference | NoGeoreference) -> dict[str, Json]:
-    """Return the unit and georeference of the model in the frame of the viewer, for the manifest."""
-    if isinstance(gps, NoGeoreference):
+def _georeference_entry(viewer: Similarity, gps: Georeference | Rejected) -> dict[str, Json]:
+    if isinstance(gps, Rejected):
         return {"unit": "about the size of the scene", "gps": f"not used: {gps.reason}"}
     enu_from_model = gps.enu_from_world.compose(viewer.inverse())
     origin = position_from_enu(enu_from_model.t, gps.origin)

@@ -23,11 +23,9 @@ class LineOptions:
     min_length: float = 0.025
     """Least length of a segment, as a share of the photo's longer side."""
     max_segments: int = 400
-    """Largest number of segments of a photo; the longest stay."""
     search_deg: float = 28.0
     """Radius of the search for a direction."""
     step_deg: float = 2.0
-    """Its step."""
     widths_deg: tuple[float, ...] = (2.0, 1.0, 0.5)
     """Widths within which segments support a direction, from coarse to fine."""
     prior_deg: float = 25.0
@@ -39,7 +37,6 @@ class LineOptions:
     min_share: float = 0.05
     """Least share of the total length of a direction's segments."""
     min_segments: int = 12
-    """Their least number."""
     separation_deg: float = 8.0
     """Directions closer than this are the same."""
     min_sine: float = 0.05
@@ -50,10 +47,7 @@ OPTIONS = LineOptions()
 
 
 def line_segments(gray: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Find line segments in a gray photo (H, W) by LSD (von Gioi, Jakubowicz, Morel and Randall 2010).
-
-    They are (N, 4) x1, y1, x2, y2 in pixels of the photo, longest first.
-    """
+    """Find line segments (N, 4) x1, y1, x2, y2 in a gray photo, longest first, by LSD (von Gioi et al. 2010)."""
     longer = max(gray.shape)
     shrink = min(1.0, OPTIONS.longer_side_px / longer)
     size = (max(1, round(gray.shape[1] * shrink)), max(1, round(gray.shape[0] * shrink)))
@@ -103,11 +97,7 @@ class VanishingDirection:
 
 
 def segment_planes(first: FloatArray, second: FloatArray, photo: int, scale_px: float) -> Segments:
-    """Build the segments of one photo from the rays (N, 3), in the world, to their two ends.
-
-    Args:
-        scale_px: focal length in pixels, which converts angles into lengths.
-    """
+    """Build the segments of one photo with a focal length from the rays (N, 3), in the world, to their two ends."""
     a, b = normalize(first), normalize(second)
     cross = np.cross(a, b)
     lengths = scale_px * np.linalg.norm(cross, axis=1)
@@ -134,10 +124,7 @@ def _residuals_deg(direction: FloatArray, segments: Segments) -> FloatArray:
 
 
 def find_vanishing_direction(start: FloatArray, segments: Segments) -> VanishingDirection | None:
-    """Find the direction of most segments near a unit vector `start` (3,); None if none stands out.
-
-    The best direction of a grid is refined with Welsch weights of decreasing width.
-    """
+    """Find the direction of most segments near a unit vector (3,), from a grid refined with Welsch weights, or None."""
     if len(segments) < OPTIONS.min_segments or not segments.lengths.sum() > 0.0:
         return None
     grid = spherical_cap(start, OPTIONS.search_deg, OPTIONS.step_deg)
@@ -250,7 +237,6 @@ def _scatter_matrices(direction: FloatArray, segments: Segments, width_deg: floa
 
 
 def _sum_per_photo(segments: Segments, values: FloatArray) -> FloatArray:
-    """Sum values (N, ...) over the segments of each photo."""
     sums = np.zeros((int(segments.photos.max(initial=-1)) + 1, *values.shape[1:]))
     np.add.at(sums, segments.photos, values)
     return sums

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
+from sfm_app.meshing.visibility import PosedPhoto
 from sfm_app.types.arrays import FloatArray, IndexArray
 
 Gray = NDArray[np.float32]
@@ -35,29 +36,13 @@ LEAST_FACING = 0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RefinePhoto:
-    """A posed photo without distortion, x ~ K (R X + t), pixel centers at +0.5."""
+class RefinePhoto(PosedPhoto):
+    """A posed photo and its gray levels."""
 
-    K: FloatArray
-    """(3, 3) camera matrix in pixels."""
-    R: FloatArray
-    """(3, 3) rotation of cam_from_world."""
-    t: FloatArray
-    """(3,) translation of cam_from_world."""
     gray: NDArray[np.uint8]
     """(H, W)."""
     masked: NDArray[np.bool_] | None = None
     """(H, W) masked pixels."""
-
-    @property
-    def center(self) -> FloatArray:
-        """(3,) center of projection in the world."""
-        return np.asarray(-self.R.T @ self.t)
-
-    @property
-    def focal_px(self) -> float:
-        """Pixels per unit of length at depth 1, the mean of both directions."""
-        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
 
     def size_at(self, share: float) -> tuple[int, int]:
         """Return height and width at a share of the full resolution."""
@@ -115,14 +100,7 @@ class Raster:
 
 
 def rasterize(vertices: FloatArray, faces: IndexArray, projection: FloatArray, size: tuple[int, int]) -> Raster:
-    """Draw a surface into a photo without distortion, at pixel centers.
-
-    Args:
-        vertices: (V, 3) in the world.
-        faces: (T, 3), counterclockwise seen from outside.
-        projection: (3, 4) K [R | t].
-        size: height and width in pixels.
-    """
+    """Draw a surface, its triangles counterclockwise from outside, into a photo (height, width) at pixel centers."""
     nearness, face = np.zeros(size, np.float32), np.full(size, NOTHING, np.int32)
     _draw(project_vertices(vertices, projection), faces, nearness, face)
     with np.errstate(divide="ignore"):
@@ -191,7 +169,6 @@ class Pull:
     correlation: float = 0.0
     """Sum of the correlations over pixels."""
     pixels: float = 0.0
-    """Pixels that were compared."""
 
     @classmethod
     def zeros(cls, count: int) -> "Pull":
@@ -215,13 +192,7 @@ class Sight:
 
 
 def compare(vertices: FloatArray, faces: IndexArray, normals: Gray, here: Sight, others: Iterable[Sight]) -> Pull:
-    """Return the pull of the differences between a photo and others.
-
-    Args:
-        vertices: (V, 3).
-        faces: (T, 3).
-        normals: (T, 3) of the triangles, unit.
-    """
+    """Return the pull of the differences between a photo and others; the normals (T, 3) are those of the triangles."""
     pull, level, raster = Pull.zeros(len(vertices)), here.level, here.raster
     shape = raster.depth.shape
     g, h = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
@@ -244,11 +215,8 @@ def compare(vertices: FloatArray, faces: IndexArray, normals: Gray, here: Sight,
 def _look_through(surface: Any, homography: Any, eyes: Any, other: Any, views: Gray) -> None:
     """Fill `views` (H, W, 3): gray level of the other photo, its change per displacement, and 1 where visible, else 0.
 
-    Args:
-        surface: depth, face and normals of the triangles in the photo.
-        homography: H and p take pixel x at depth z to z H x + p of the other photo.
-        eyes: rays of the photo, and its center relative to that of the other.
-        other: the other photo, and the depths of the surface in it.
+    `homography` H and p take pixel x at depth z to z H x + p of the other photo. `eyes` are the rays of the photo, and
+    its center relative to that of the other. `other` has the image of the other, and the depths of the surface in it.
     """
     depth, face, normals = surface
     H, p = homography

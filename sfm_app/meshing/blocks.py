@@ -69,12 +69,7 @@ class Partition:
 
 
 def split_points(points: FloatArray, blocks: int) -> Partition:
-    """Divide space into boxes with about as many points each, across their longest sides.
-
-    Args:
-        points: (N, 3).
-        blocks: number of boxes, >= 1.
-    """
+    """Divide space into `blocks` >= 1 boxes with about as many points (N, 3) each, across their longest sides."""
     sample = points[:: max(1, len(points) // 2_000_000)]  # enough to place the planes
     boxes: list[FloatArray] = []
 
@@ -132,12 +127,8 @@ class Border:
 def weld(below: Surface, above: Surface, axis: int, at: float, cell: float, halo: float) -> tuple[Surface, int]:
     """Join two surfaces at a plane; return the surface, and the number of edges in the plane without counterpart.
 
-    Args:
-        below, above: each reaches beyond the plane.
-        axis: 0, 1 or 2, the normal of the plane.
-        at: coordinate of the plane.
-        cell: side of the finest cells of both.
-        halo: distance up to which the second surface is deformed.
+    Both reach beyond the plane, whose normal is axis 0, 1 or 2. The second is deformed up to the distance `halo` from
+    it; `cell` is the side of the finest cells of both.
     """
     first, one = cut_at_plane(below, axis, at, keep_below=True)
     second, other = cut_at_plane(above, axis, at, keep_below=False)
@@ -173,8 +164,7 @@ def close_cracks(surface: Surface, at_planes: NDArray[np.bool_]) -> Surface:
     Triangles that welding has folded are removed, and the holes of these are closed with larger ones. Vertices in one
     place, as planes that nearly touch have them, become one.
 
-    Args:
-        at_planes: (V,) vertices that may be at a crack.
+    `at_planes` (V,) marks vertices that may be at a crack.
     """
     mesh = make_manifold(Surface(surface.vertices, surface.faces, np.column_stack([surface.colors, at_planes])))
     for _ in range(WELD.rounds):
@@ -222,9 +212,8 @@ def _match(
 ) -> tuple[IndexArray, IndexArray, FloatArray, FloatArray]:
     """Find the place of each vertex of the second border on edges of the first that run in the opposite direction.
 
-    Returns:
-        (M,) the vertices that have a place, (M,) the edge of the first border, (M,) share of the way along it,
-        and (M, 3) the place.
+    Return (M,) the vertices that have a place, (M,) the edge of the first border, (M,) share of the way along it, and
+    (M, 3) the place.
     """
     from scipy.spatial import cKDTree
 
@@ -268,13 +257,8 @@ def _split_first(
 ) -> tuple[list[list[int]], IndexArray]:  # fmt: skip
     """Insert the moved vertices into the edges of the first border; two in the wrong order become one.
 
-    Args:
-        moving, edge, share: (M,) moved vertices, edges of the first border, and positions along these, in [0, 1].
-        vertices: (V, 3).
-        tolerance: distance within which a moved vertex becomes an end of the edge.
-
-    Returns:
-        Per edge its vertices in order, and (V,) the vertex that replaces each one.
+    `share` (M,) is the position of a moved vertex along its edge; within the tolerance, it becomes an end of the edge.
+    Return per edge its vertices in order, and (V,) the vertex that replaces each one.
     """
     same = np.arange(len(vertices))
     used, movable = set[int](), set(moving.tolist())
@@ -324,13 +308,8 @@ def _next_matched(start: int, follow: dict[int, int], matched: set[int]) -> int 
 def _split_second(ends: IndexArray, follow: dict[int, int], matched: set[int]) -> tuple[list[list[int]], int]:
     """Find the vertices of the first border, backwards, along each edge of the second one.
 
-    Args:
-        ends: (E, 2) vertices of the edges of the second border.
-        follow: next vertex of the first border after each one.
-        matched: vertices of the second border that lie on the first.
-
-    Returns:
-        Per edge its vertices in their order, and how many edges have no counterpart.
+    `follow` is the next vertex of the first border after each one, `matched` the vertices of the second that lie on it.
+    Return per edge its vertices in their order, and how many edges have no counterpart.
     """
     chains, open_edges = [], 0
     for start, end in ends.tolist():

@@ -38,9 +38,7 @@ def drop_islands(surface: Surface, min_share: float) -> Surface:
 
 
 def make_manifold(surface: Surface) -> Surface:
-    """Return the surface as an oriented manifold.
-
-    Every edge then has one triangle, or two that run along it in opposite directions; those at a vertex form one fan.
+    """Return the surface as an oriented manifold: at most two triangles at an edge, one fan at a vertex.
 
     Degenerate, non-finite and duplicate triangles are removed. Where more than two triangles share an edge, or two run
     along it in the same direction, the smallest are removed. Vertices where fans only touch are split.
@@ -129,22 +127,12 @@ class Support:
         """(V,) whether more photos see through a vertex than confirm it."""
         return np.asarray(self.seen_through > self.confirmed)
 
-    @property
-    def is_supported(self) -> NDArray[np.bool_]:
-        """(V,) whether enough photos confirm a vertex among those with it in view."""
-        enough = self.confirmed >= TRIM.least_confirmed * (self.confirmed + self.empty)
-        return np.asarray((self.confirmed > 0) & ~self.is_free & enough)
-
 
 def trim(surface: Surface, support: Support, max_gap_triangles: float, least: float) -> Surface:
-    """Keep the parts that photos confirm and do not see through, bridge small gaps, and smooth the border.
-
-    Args:
-        surface: closed, from Poisson reconstruction.
-        max_gap_triangles: as `max_width` of `bridge_gaps`.
-        least: as for `drop_doubtful_parts`.
-    """
-    sign, edges = np.where(support.is_supported, 1.0, -1.0), unique_edges(surface.faces)
+    """Keep the parts that photos confirm and do not see through, bridge small gaps, and smooth the border."""
+    enough = support.confirmed >= TRIM.least_confirmed * (support.confirmed + support.empty)
+    is_supported = (support.confirmed > 0) & ~support.is_free & enough
+    sign, edges = np.where(is_supported, 1.0, -1.0), unique_edges(surface.faces)
     bridged = bridge_gaps(surface, sign, support.is_free, max_gap_triangles, edges)
     smooth = smooth_support(surface, bridged, TRIM.smoothing, edges)
     whole = bridge_gaps(surface, smooth, support.is_free, max_gap_triangles, edges)
@@ -156,14 +144,8 @@ def bridge_gaps(
 ) -> FloatArray:
     """Add support to small unsupported patches that hardly any photo sees through.
 
-    Args:
-        max_width: largest width of a bridged patch, in edge lengths of its rim; its length is not limited.
-        support: (V,) positive where photos confirm the surface, negative where none does.
-        free: (V,) where photos see through the surface.
-        known: edges of the surface; None for finding them.
-
-    Returns:
-        (V,) support, 1 on bridged patches.
+    The support (V,) is positive where photos confirm the surface; `free` marks where they see through it. It becomes 1
+    on patches of at most `max_width`, in edge lengths of their rim; their length is not limited.
     """
     from scipy.sparse.csgraph import connected_components, dijkstra
 
@@ -192,13 +174,8 @@ def drop_doubtful_parts(
 ) -> FloatArray:
     """Remove the support of connected parts that too few photos confirm on average.
 
-    Examples are fragments around outlines: two or three photos agree by chance, and the gaps between are bridged.
-
-    Args:
-        support: (V,) positive where photos confirm the surface.
-        confirmed: (V,) photos that confirm each vertex.
-        least: smallest mean number of photos, >= 0.
-        known: edges of the surface; None for finding them.
+    Examples are fragments around outlines: two or three photos agree by chance, and the gaps between are bridged. The
+    mean number of photos that confirm a vertex, by their number (V,) at each, has to reach `least`.
     """
     from scipy.sparse.csgraph import connected_components
 
@@ -210,13 +187,7 @@ def drop_doubtful_parts(
 
 
 def smooth_support(surface: Surface, support: FloatArray, steps: int, known: Edges | None = None) -> FloatArray:
-    """Average the support over each vertex and its neighbors, (V,), to smooth the border.
-
-    Args:
-        support: (V,) positive where photos confirm the surface.
-        steps: iterations, >= 0.
-        known: edges of the surface; None for finding them.
-    """
+    """Average the support over each vertex and its neighbors, (V,), to smooth the border."""
     edges, _ = known or unique_edges(surface.faces)
     graph = _graph(edges, len(support))
     neighbors = np.maximum(np.bincount(edges.ravel(), minlength=len(support)), 1)
@@ -234,14 +205,7 @@ def _graph(edges: IndexArray, size: int, weights: FloatArray | None = None) -> A
 
 
 def cut(surface: Surface, support: FloatArray, known: Edges | None = None) -> Surface:
-    """Return the part of a surface where the support, linear along the edges, is positive.
-
-    Triangles on the border are split.
-
-    Args:
-        support: (V,).
-        known: edges of the surface; None for finding them.
-    """
+    """Return the part of a surface where the support (V,), linear along the edges, is positive; split its border."""
     edges, edge_of = known or unique_edges(surface.faces)
     support = np.where(support == 0, -1e-9, support)
     a, b = support[edges].T
@@ -259,10 +223,7 @@ def cut(surface: Surface, support: FloatArray, known: Edges | None = None) -> Su
 
 
 def _split(faces: IndexArray, middle: IndexArray, inside: NDArray[np.bool_]) -> IndexArray:
-    """Return triangles with all corners inside, and the inner parts of those with one or two.
-
-    `middle` (T, 3) holds the new vertices on the edges ab, bc, ca.
-    """
+    """Return triangles inside, and the inner parts of others; `middle` (T, 3) has the new vertices on ab, bc, ca."""
     parts = [faces[inside.all(axis=1)]]
     count = inside.sum(axis=1)
     for corner in range(3):

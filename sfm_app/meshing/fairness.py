@@ -68,10 +68,7 @@ def find_displacements(
     They minimize the sum of h d^2 - 2 g d over the vertices, plus the squared distances from the mean of the neighbors
     in units of `bend`; large distances, at creases, count less (Cauchy).
 
-    Args:
-        vertices, normals: (V, 3).
-        pull: g and h of the photos, (V,) each.
-        size: (V,) mean length of the edges at each vertex, > 0.
+    The pull of the photos is g and h, `size` the mean length of the edges at each vertex, (V,) each.
     """
     g, h = pull
     bend = np.zeros(len(vertices))
@@ -117,11 +114,7 @@ def _apply(
     starts: IndexArray, others: IndexArray, share: FloatArray, weight: FloatArray, d: FloatArray, scratch: FloatArray,
     out: FloatArray,
 ) -> None:  # fmt: skip
-    """Fill in L' W L d (V,); L d is the mean of the neighbors less the vertex.
-
-    `share` is one over the number of neighbors, `weight` the diagonal of W, 0 without neighbors; `scratch` and `out`
-    are overwritten; (V,) each.
-    """
+    """Fill in L' W L d, L d the mean of the neighbors less the vertex, by W's diagonal and one over their number."""
     for v in range(len(d)):
         out[v] = 0.0
         if weight[v] > 0.0:

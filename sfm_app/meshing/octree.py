@@ -87,12 +87,7 @@ def count_cells(points: FloatArray, cell: float) -> int:
 
 
 def count_bent(points: FloatArray, normals: FloatArray, cell: float) -> tuple[int, int]:
-    """Return in how many cells the normals differ, and how many have two points or more.
-
-    Args:
-        points: (N, 3).
-        normals: (N, 3) unit vectors.
-    """
+    """Return in how many cells the unit normals (N, 3) differ, and how many have two points or more."""
     _, own, count = np.unique(_number_cells(points, cell), return_inverse=True, return_counts=True)
     total = np.stack([np.bincount(own, component, len(count)) for component in normals.T], axis=1)
     bent = np.linalg.norm(total, axis=1) < CELLS.bent_cosine * count
@@ -100,7 +95,6 @@ def count_bent(points: FloatArray, normals: FloatArray, cell: float) -> tuple[in
 
 
 def _number_cells(points: FloatArray, cell: float) -> NDArray[np.int64]:
-    """Return (N,) a number for the cell of each point."""
     at = np.floor(points / cell).astype(np.int64)
     at -= at.min(axis=0, initial=0)
     return np.asarray((at[:, 0] << 42) + (at[:, 1] << 21) + at[:, 2])
@@ -109,11 +103,8 @@ def _number_cells(points: FloatArray, cell: float) -> NDArray[np.int64]:
 def choose_cell(sizes: Sequence[float], cells: PointCells, least: float = CELLS.least_points) -> float:
     """Return the side of Poisson's finest cells by the density of the points; smaller where surfaces are bent.
 
-    Thin things and ornaments are lost in cells of several points, walls are not.
-
-    Args:
-        sizes: allowed sides, the finest first, each twice the one before; not empty.
-        least: smallest mean number of points in an occupied cell, > 0.
+    Thin things and ornaments are lost in cells of several points, walls are not. The sizes are the finest first, each
+    twice the one before; `least` is the smallest mean number of points in an occupied cell.
     """
     density = cache(cells.points_per_cell)
     fine, coarse = (find_size(sizes, density, points) for points in (least, max(least, CELLS.most_points)))
@@ -128,12 +119,7 @@ def choose_cell(sizes: Sequence[float], cells: PointCells, least: float = CELLS.
 
 
 def find_size(sizes: Sequence[float], points_per_cell: Callable[[float], float], points: float) -> float:
-    """Return the smallest side of cells with a mean number of points; between two sizes, it is a power of the side.
-
-    Args:
-        sizes: allowed sides, the finest first, each twice the one before.
-        points: per occupied cell, > 0.
-    """
+    """Return the smallest of the sizes, finest first, with enough points per cell; a power of the side in between."""
     cell, finer = 0.0, 0.0
     for cell in sizes:
         if (density := points_per_cell(cell)) >= points:

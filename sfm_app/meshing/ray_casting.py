@@ -26,26 +26,17 @@ PACKAGES = {
 
 @functools.cache
 def load_open3d() -> Any:
-    """Import Open3D, with little logging.
-
-    Call it inside the functions that need Open3D: the import takes more than a second.
-
-    Raises:
-        SfmError: the system lacks a library.
-    """
+    """Import Open3D, which takes more than a second; an SfmError names a library that the system lacks."""
     load_libusb()
     try:
         open3d = importlib.import_module("open3d")
     except (ImportError, OSError) as err:
-        raise SfmError(f"Open3D cannot be loaded: {err}", hint=_hint(str(err))) from err
+        missing = re.search(r"(lib\S+\.so[.\d]*): cannot open", str(err))
+        packages = [PACKAGES[missing[1]]] if missing and missing[1] in PACKAGES else sorted(PACKAGES.values())
+        hint = f"on Debian and Ubuntu: apt-get install {' '.join(packages)}"
+        raise SfmError(f"Open3D cannot be loaded: {err}", hint=hint) from err
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     return open3d
-
-
-def _hint(message: str) -> str:
-    missing = re.search(r"(lib\S+\.so[.\d]*): cannot open", message)
-    packages = [PACKAGES[missing[1]]] if missing and missing[1] in PACKAGES else sorted(PACKAGES.values())
-    return f"on Debian and Ubuntu: apt-get install {' '.join(packages)}"
 
 
 REACH_EDGES = 4.0
@@ -71,12 +62,7 @@ class NearestNormals:
         self.find(vertices[:1], self._normals[:1])  # builds the tree, which only one thread may
 
     def find(self, points: NDArray[np.float32], facing: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return (N, 3) unit normals, interpolated at the closest place; 0 where it is far away or faces elsewhere.
-
-        Args:
-            points: (N, 3).
-            facing: (N, 3) directions, from which a normal may differ by less than a right angle.
-        """
+        """Return (N, 3) unit normals at the closest place; 0 where it is far or faces away from `facing` (N, 3)."""
         if self._scene is None or not len(points):
             return np.zeros_like(points)
         closest = self._scene.compute_closest_points(self._tensor(np.ascontiguousarray(points)), nthreads=1)
@@ -100,13 +86,7 @@ class Occluders:
         self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(faces.astype(np.uint32)))
 
     def is_hidden(self, center: NDArray[np.float64], slack: float, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return (N,) whether a triangle lies between a point and the camera.
-
-        Args:
-            center: (3,) of the camera.
-            slack: length of the start of each ray that is ignored, because the point's own triangles are there.
-            points: (N, 3).
-        """
+        """Return (N,) whether a triangle lies between a point and the camera, beyond the first `slack` of the ray."""
         ray = center - points
         length = np.linalg.norm(ray, axis=1, keepdims=True)
         start = points + ray * np.minimum(slack / np.maximum(length, 1e-300), 1.0)

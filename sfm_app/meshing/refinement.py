@@ -63,10 +63,7 @@ def refine(
 ) -> Refinement:
     """Move the vertices of a surface along their normals to where photos agree best; divide coarse triangles.
 
-    Args:
-        surface: triangles, counterclockwise seen from outside, with errors of some pixels.
-        partners: for each photo, numbers of the others for comparison.
-        most: triangles beyond which no edge is divided.
+    `partners` are numbers of the photos for comparison with each one; beyond `most` triangles no edge is divided.
     """
     correlations = list[float]()
     for share, iterations in OPTIONS.levels:
@@ -90,13 +87,7 @@ def _divide_surface(surface: Surface, photos: Sequence[RefinePhoto], share: floa
 
 
 def finest_pixels(vertices: FloatArray, photos: Sequence[RefinePhoto], share: float) -> FloatArray:
-    """Return (V,) the size of a pixel at each vertex in the closest photo with it in view, infinite without one.
-
-    Occlusion does not matter.
-
-    Args:
-        vertices: (V, 3).
-    """
+    """Return (V,) the size of a pixel at each vertex in the closest photo with it in view, even hidden, or infinity."""
     sizes = np.full(len(vertices), np.inf)
     for photo in photos:
         pixels = project_vertices(vertices, photo.projection(share))

@@ -23,8 +23,8 @@ THROUGH = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DepthView:
-    """A posed photo without distortion, and its depth map."""
+class PosedPhoto:
+    """A posed photo without distortion, x ~ K (R X + t), pixel centers at +0.5."""
 
     K: FloatArray
     """(3, 3) camera matrix in pixels."""
@@ -32,6 +32,22 @@ class DepthView:
     """(3, 3) rotation of cam_from_world."""
     t: FloatArray
     """(3,) translation of cam_from_world."""
+
+    @property
+    def center(self) -> FloatArray:
+        """(3,) center of projection in the world."""
+        return np.asarray(-self.R.T @ self.t)
+
+    @property
+    def focal_px(self) -> float:
+        """Pixels per unit of length at depth 1, the mean of both directions."""
+        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthView(PosedPhoto):
+    """A posed photo and its depth map."""
+
     depth: DepthArray
     """0 where unknown, SKY at the sky; negative, too, where the photo is masked."""
     sample_px: float
@@ -43,11 +59,6 @@ class DepthView:
         return np.asarray(self.K @ np.column_stack([self.R, self.t]))
 
     @property
-    def center(self) -> FloatArray:
-        """(3,) center of projection in the world."""
-        return np.asarray(-self.R.T @ self.t)
-
-    @property
     def axis(self) -> FloatArray:
         """(3,) unit viewing direction in the world."""
         return np.asarray(self.R[2])
@@ -57,11 +68,6 @@ class DepthView:
         """Upper bound in radians of the angle between the axis and the rays of the photo."""
         return border_angle(self.K, self.depth.shape[1], self.depth.shape[0])
 
-    @property
-    def focal_px(self) -> float:
-        """Pixels per unit of length at depth 1, the mean of both directions."""
-        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
-
 
 def judge(points: FloatArray, normals: FloatArray, eye: DepthView, tolerance: float) -> NDArray[np.uint8]:
     """Judge points on a surface: CONFIRMED, SEEN_THROUGH, EMPTY or NO_EVIDENCE.
@@ -70,10 +76,7 @@ def judge(points: FloatArray, normals: FloatArray, eye: DepthView, tolerance: fl
     tolerance. It is SEEN_THROUGH if its pixel shows the sky, or if all four surrounding depths lie well behind it. It
     is EMPTY if it faces the photo and no depth around it is known. Hidden and masked points give NO_EVIDENCE.
 
-    Args:
-        points: (N, 3) in the world.
-        normals: (N, 3) unit vectors.
-        tolerance: relative difference in depth.
+    The normals (N, 3) are unit vectors; the tolerance is a relative difference in depth.
     """
     verdict = np.zeros(len(points), np.uint8)
     _judge(points, normals, eye.projection, eye.center, eye.depth, np.array([eye.sample_px, tolerance]), verdict)
@@ -165,14 +168,7 @@ class Paint:
 def sample_colors(
     points: FloatArray, normals: FloatArray, verdict: NDArray[np.uint8], eye: DepthView, image: ColorImage
 ) -> Paint:
-    """Sample colors of one photo at the points that it confirms; their weight is the area of a unit patch in pixels.
-
-    Args:
-        points: (N, 3).
-        normals: (N, 3) unit.
-        verdict: (N,) from `judge`.
-        image: (H, W, 3) the same field of view as the depth map, at any size.
-    """
+    """Sample colors of one photo at the points that it confirms; their weight is the area of a unit patch in pixels."""
     paint = Paint.zeros(len(points))
     scale = np.array(image.shape[:2]) / eye.depth.shape
     projection = np.diag([scale[1], scale[0], 1.0]) @ eye.projection

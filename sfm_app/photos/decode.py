@@ -32,8 +32,6 @@ LARGE_PHOTO_LOCK = Lock()
 SENSOR_UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """Length of EXIF's units of the sensor's resolution; 2, the inch, is the default. By definition."""
 
-# EXIF: hints about a photo that are never trusted.
-
 
 def orientation(exif: Image.Exif) -> int:
     """Return the EXIF orientation, 1 to 8; 1 (upright) if it is missing or invalid."""
@@ -59,10 +57,7 @@ def camera_name(exif: Image.Exif) -> str:
 
 
 def focal_px(exif: Image.Exif, longer_side: int) -> float | None:
-    """Return EXIF's focal length in pixels, for the longer side in pixels; None if it is implausible.
-
-    The 35 mm equivalent comes first, then the focal length in millimeters with the sensor's resolution.
-    """
+    """Return EXIF's focal length in pixels, by the 35 mm equivalent or else the sensor; None if it is implausible."""
     details = exif.get_ifd(IFD.Exif)
     for claim in (_equivalent_focal, _sensor_focal):
         try:
@@ -142,10 +137,7 @@ _thread_errors = threading.local()
 
 @contextmanager
 def libtiff_errors() -> Iterator[list[str]]:
-    """Provide a list that collects libtiff's errors while this thread decodes.
-
-    It stays empty if Pillow links libtiff statically, as on Windows; damage that libtiff survives is then not noticed.
-    """
+    """Collect libtiff's errors while this thread decodes; none if Pillow links it statically, as on Windows."""
     _install_handler()
     _thread_errors.errors = []
     try:
@@ -168,9 +160,6 @@ def _install_handler() -> None:
         set_handler = library.TIFFSetErrorHandler
         set_handler.argtypes, set_handler.restype = [HANDLER], ctypes.c_void_p
         set_handler(ERROR_CALLBACK)
-
-
-# Pictures of files.
 
 
 class UnreadableError(Exception):
@@ -204,7 +193,9 @@ def read_picture(path: Path) -> DecodedPhoto:
     """Decode a whole file; raise UnreadableError if it is damaged or no photo."""
     try:
         with Image.open(path, formats=formats()) as image:
-            _refuse_bombs(image, path)
+            pixels = image.width * image.height
+            if pixels > LARGE_PX and path.stat().st_size < 0.02 * pixels:  # real photos have more bytes per pixel
+                raise UnreadableError("too many pixels for a file of its size")
             frames = _frame_count(image)
             image.seek(0)
             with libtiff_errors() as errors:
@@ -236,13 +227,6 @@ def large_photo_lock(path: Path) -> Iterator[None]:
         pixels = 0
     with LARGE_PHOTO_LOCK if pixels > LARGE_PX / 2 else nullcontext():
         yield
-
-
-def _refuse_bombs(image: Image.Image, path: Path) -> None:
-    """Refuse decompression bombs below Pillow's own limit: real photos have more than 0.02 bytes per pixel."""
-    pixels = image.width * image.height
-    if pixels > LARGE_PX and path.stat().st_size < 0.02 * pixels:
-        raise UnreadableError("too many pixels for a file of its size")
 
 
 def _frame_count(image: Image.Image) -> int:

@@ -46,11 +46,8 @@ def is_video(head: bytes) -> bool:
 
 
 def _has_packets(head: bytes, first: int, length: int) -> bool:
-    """Return whether the sync bytes of an MPEG transport stream are in place."""
     return len(head) == HEAD_BYTES and all(head[k] == 0x47 for k in range(first, HEAD_BYTES, length))
 
-
-# Nothing outside the folder of the photos is read.
 
 HINT = "name the folder that holds the photos"
 
@@ -61,11 +58,8 @@ def list_files(folder: Path, out: Path, listed_in: Path | None = None, closed: S
     Hidden folders and links to folders are not entered; each counts as one file. The output folder `out` and the
     folders `closed` are left out.
 
-    Args:
-        listed_in: text file with the names to return instead, one per line, relative to the folder.
-
-    Raises:
-        InputError: the folder does not exist or cannot be read.
+    `listed_in` is a text file with the names to return instead, one per line, relative to the folder. An InputError
+    says that the folder does not exist or cannot be read.
     """
     if not folder.is_dir():
         raise _bad_path_error(folder)
@@ -80,7 +74,6 @@ def list_files(folder: Path, out: Path, listed_in: Path | None = None, closed: S
 
 
 def _bad_path_error(path: Path) -> InputError:
-    """Return the error for a path that is neither a folder nor a video."""
     if not path.exists():
         kind = "file" if path.suffix.lower() in EXTENSIONS else "folder"
         siblings = path.parent.iterdir() if os.access(path.parent, os.R_OK) and path.parent.is_dir() else ()

@@ -25,10 +25,7 @@ MASK_HINT = "the mask of sub/a.jpg is sub/a.jpg.png or sub/a.png in the folder o
 
 
 def list_masks(masks: Path, photos: Path, out: Path) -> list[str]:
-    """Return the names of all files below the folder of masks, as `list_files` does, without photos and output.
-
-    Raise an InputError if the folder does not exist or is also the folder of the photos.
-    """
+    """Return the files below the folder of masks, as `list_files` does; raise an InputError if it cannot be used."""
     if not masks.is_dir():
         problem = "not a folder" if masks.exists() else "no such folder"
         raise InputError(f"{problem} of masks: {masks}", hint=MASK_HINT)
@@ -38,10 +35,7 @@ def list_masks(masks: Path, photos: Path, out: Path) -> list[str]:
 
 
 def find_mask(photo: Photo, folder: Path, masks: Path) -> Photo | UnusablePhoto:
-    """Return the photo with its mask, if it has one; an unusable photo if its mask is all black.
-
-    Raise an InputError if the mask cannot be used.
-    """
+    """Return the photo with its mask, if any, unusable if that is all black; InputError if the mask cannot be used."""
     names = f"{photo.path}{ENDING}", str(PurePosixPath(photo.path).with_suffix(ENDING))
     name = next((name for name in names if os.path.lexists(masks / name)), "")
     if not name:
@@ -59,10 +53,7 @@ def unused_masks(names: Sequence[str], photos: Sequence[Photo]) -> list[str]:
 
 
 def lay_out_mask(photo: Photo, folder: Path, masks: Path, target: Path) -> None:
-    """Write the mask of a photo in the orientation of the laid-out photo; all white if it has none.
-
-    COLMAP skips photos without a mask once it is given any masks. Errors are those of `find_mask`.
-    """
+    """Write the mask of a laid-out photo; all white without one, since COLMAP skips photos without a mask."""
     used = _load_fitted_mask(photo, folder, masks) if photo.mask else np.full((photo.height, photo.width), True)
     save_mask(target, photo.name, used)
 
@@ -86,10 +77,7 @@ def read_mask(target: Path, name: str) -> BoolArray:
 
 
 def fill_masked(pixels: NDArray[np.uint8], used: BoolArray) -> NDArray[np.uint8]:
-    """Return an RGB photo (H, W, 3) whose masked pixels take the color of the nearest usable pixel of (H, W).
-
-    This keeps masked colors out of interpolation and downscaling.
-    """
+    """Return an RGB photo whose masked pixels have the color of the nearest usable one, for interpolation."""
     if used.all() or not used.any():
         return pixels
     hidden = (~used).view(np.uint8)

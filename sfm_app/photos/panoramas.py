@@ -20,7 +20,6 @@ from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import EQUIRECTANGULAR, Calibration
 
 # Recognition of equirectangular photos, whose columns are longitudes and whose rows are latitudes. Ours.
-#
 # Cameras and stitchers name the projection in the file (Google's Photo Sphere metadata, `GPano`). Without metadata, a
 # full panorama is twice as wide as high, its left and right borders continue each other, and its first and last row
 # each show one point: zenith and nadir.
@@ -60,10 +59,7 @@ OPTIONS = PanoramaOptions()
 
 
 def is_panorama(picture: DecodedPhoto, upright: Image.Image) -> bool:
-    """Return whether a photo is a full equirectangular panorama, by its metadata or else by its upright pixels.
-
-    Raise an UnreadableError for a panorama of another projection or of a part of the sphere.
-    """
+    """Return whether a photo is a full panorama; raise an UnreadableError for another projection or a part of one."""
     entries = read_panorama_entries(picture.image)
     kind = entries.get("ProjectionType", "").strip().lower()
     if not kind:
@@ -137,19 +133,13 @@ def _covered_share(entries: dict[str, str], side: str) -> float:
         return 1.0
 
 
-# Resampling.
-
-
 def resample(
     photo: NDArray[np.uint8], at: NDArray[np.floating[Any]], size: tuple[int, int], wraps: bool = False
 ) -> NDArray[np.uint8]:
     """Return a photo (H, W, 3) at given positions by cubic interpolation; outside, the border is repeated.
 
-    Args:
-        photo: (h, w, 3), possibly scaled down.
-        at: (H, W, 2) pixels of the photo at its own size, centers at +0.5.
-        size: (width, height) at its own size.
-        wraps: whether the left border continues the right one, as in a panorama.
+    `at` (H, W, 2) are pixels of the photo at its own size (width, height), centers at +0.5; it may be scaled down. With
+    `wraps`, its left border continues the right one, as in a panorama.
     """
     height, width = photo.shape[:2]
     x, y = (
@@ -171,7 +161,6 @@ def shrink(photo: NDArray[np.uint8], share: float) -> NDArray[np.uint8]:
 
 
 # Feature views: perspective views in which feature methods meet neither the stretched poles nor the cut borders.
-#
 # Their axes pass through the corners of an icosahedron. Each view owns the directions nearest to its axis, so that
 # no feature is found twice. Ours.
 
@@ -183,7 +172,6 @@ class PanoramaViews:
     size: tuple[int, int]
     """Width and height of the panorama in pixels."""
     side_px: int
-    """Side of each view."""
     rotations: FloatArray
     """(V, 3, 3) from the panorama's frame to that of each view; x right, y down, z forward."""
 
@@ -229,7 +217,13 @@ def view_rotations() -> FloatArray:
     turns = 2.0 * math.pi / 5.0 * np.arange(5.0)
     rings = [_axes(turns + shift, tilt) for shift, tilt in ((0.0, latitude), (math.pi / 5.0, -latitude))]
     axes = np.concatenate([[[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]], *rings])
-    return np.stack([_look_along(axis) for axis in axes])
+    rotations = []
+    for axis in axes:  # upright, except at the poles
+        down = np.array([0.0, 0.0, 1.0]) if abs(axis[1]) > 0.9 else np.array([0.0, 1.0, 0.0])
+        right = np.cross(down, axis)
+        right /= np.linalg.norm(right)
+        rotations.append(np.stack([right, np.cross(axis, right), axis]))
+    return np.stack(rotations)
 
 
 def _axes(longitude: FloatArray, latitude: float) -> FloatArray:
@@ -239,19 +233,8 @@ def _axes(longitude: FloatArray, latitude: float) -> FloatArray:
     return np.column_stack([level * np.sin(longitude), down, level * np.cos(longitude)])
 
 
-def _look_along(axis: FloatArray) -> FloatArray:
-    """Return the (3, 3) rotation into the frame of a view along this axis, upright except at the poles."""
-    down = np.array([0.0, 0.0, 1.0]) if abs(axis[1]) > 0.9 else np.array([0.0, 1.0, 0.0])
-    right = np.cross(down, axis)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(axis, right), axis])
-
-
-# Texture views: the faces of a cube, in the panorama's own resolution, from which surfaces are painted.
-
-
 def panorama_parts(size: tuple[int, int]) -> list[PerspectiveView]:
-    """Return the texture views of a panorama of (width, height) pixels."""
+    """Return the texture views of a panorama of (width, height): faces of a cube, in its own resolution."""
     x, y = np.meshgrid(np.linspace(0.0, size[0], OPTIONS.grid), np.linspace(0.0, size[1], OPTIONS.grid))
     rays = bearings(np.column_stack([x.ravel(), y.ravel()]), _camera(size))[:, RAY]
     return cover_rays(rays, size[0] / (2.0 * np.pi), size[0])

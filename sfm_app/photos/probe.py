@@ -32,7 +32,6 @@ from sfm_app.types import Frame, GivenCameras, Photo, UnusablePhoto
 from sfm_app.types.camera import EQUIRECTANGULAR, PERSPECTIVE
 
 # Bars of one color around a picture, which services add to bring photos of any size to one size.
-#
 # The picture within the bars is the photo: its size distinguishes cameras, and the principal point usually lies near
 # its middle. A bar has one color and ends at a straight edge, along which the whole picture differs from it; a black
 # background or an overexposed sky does not end like that.
@@ -151,9 +150,6 @@ def _differing_share(line: NDArray[np.uint8], color: NDArray[np.int16], levels: 
     return float(np.mean(np.max(np.abs(line.astype(np.int16) - color), axis=1) > levels))
 
 
-# One file of the folder: a usable photo, or the reason why it is unusable.
-
-
 def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> PhotoStats | UnusablePhoto:
     """Decode one file to check that it is intact, and measure the statistics that are compared between photos."""
     place = resolve_file(folder, name)
@@ -175,7 +171,8 @@ def describe(name: str, picture: DecodedPhoto, options: PhotoSettings) -> PhotoS
     size = image.size[::-1] if orientation(exif) >= 5 and not turn else image.size
     if min(size) < options.min_side_px:
         return UnusablePhoto(name, f"smaller than {options.min_side_px} px")
-    width, height = scaled_size(size, options.max_megapixels * 1_000_000)
+    share = min(1.0, (options.max_megapixels * 1_000_000 / (size[0] * size[1])) ** 0.5)
+    width, height = max(1, int(size[0] * share)), max(1, int(size[1] * share))
     photo = Photo(
         name=name,
         width=width,
@@ -211,22 +208,12 @@ def _notes(frames: int, size: tuple[int, int], laid: tuple[int, int], *, panoram
 
 
 def _shown_frame(upright: Image.Image, photo: Photo) -> Frame | None:
-    """Return the frame of the picture within bars, in pixels of the laid-out photo."""
     laid = rotate_to_sensor(upright, photo.turn_deg)
     frame = shown_part(laid)
     if frame is None or laid.size == (photo.width, photo.height):
         return frame
     x, y = photo.width / laid.width, photo.height / laid.height
     return round(frame[0] * x), round(frame[1] * y), round(frame[2] * x), round(frame[3] * y)
-
-
-def scaled_size(size: tuple[int, int], most_px: float) -> tuple[int, int]:
-    """Return (width, height) reduced to at most `most_px` >= 1 pixels in all."""
-    share = min(1.0, (most_px / (size[0] * size[1])) ** 0.5)
-    return max(1, int(size[0] * share)), max(1, int(size[1] * share))
-
-
-# Camera groups.
 
 
 def group_by_camera(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:
@@ -236,9 +223,8 @@ def group_by_camera(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:
     orientation of their camera, and photos that still differ in size get different groups. Panoramas of one size form
     one group.
 
-    Args:
-        photos: their group is the camera named in EXIF.
-        cameras: "auto", by EXIF and the size within bars; "single", one for all; "folder", one each; "each", per photo.
+    Their groups are first the cameras named in EXIF. `cameras` is "auto", by EXIF and the size within bars; "single",
+    one for all; "folder", one each; or "each", one per photo.
     """
     photos = _complete_panoramas(photos)
     sizes = Counter((_camera_key(photo, cameras), photo.width, photo.height) for photo in photos)
@@ -253,10 +239,8 @@ def group_by_camera(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:
 
 
 def _complete_panoramas(photos: Sequence[Photo]) -> list[Photo]:
-    """Return the photos; those of a size of which most are panoramas are panoramas, too.
-
-    A panorama without metadata is recognized by its borders, which may be a blank wall.
-    """
+    """Return the photos; those of a size of which most are panoramas are panoramas, too."""
+    # without metadata, a panorama is recognized by its borders, which may be a blank wall
     counts = Counter((photo.width, photo.height) for photo in photos)
     panoramas = Counter((photo.width, photo.height) for photo in photos if photo.projection == EQUIRECTANGULAR)
     sizes = {size for size, count in panoramas.items() if count > counts[size] / 2 and size[0] == 2 * size[1]}

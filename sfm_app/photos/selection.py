@@ -42,7 +42,6 @@ class SelectionOptions:
     min_sharpness_contrast: float = 4.0
     """Least contrast in gray levels at which sharpness is measured."""
     min_side_px: int = 200
-    """Least shorter side at which sharpness is measured."""
     max_difference: float = 0.015
     """Largest RMS difference between copies, as a share of the contrast. Moving the camera sideways by a thousandth of
     the width gives more; saving a picture again, smaller or as JPEG, gives less."""
@@ -111,9 +110,6 @@ def _edge_slope(image: NDArray[np.float32], axis: int) -> float:
     return float(np.percentile(np.abs(np.diff(image, axis=axis)), OPTIONS.edge_percentile))
 
 
-# The statistics of all photos in a file, so that a photo is decoded once for all runs.
-
-
 def write_stats(
     path: Path, stats: Mapping[str, PhotoStats], digests: Mapping[str, str], options: PhotoSettings
 ) -> None:
@@ -131,10 +127,7 @@ def write_stats(
 
 
 def read_stats(path: Path, digests: Mapping[str, str], options: PhotoSettings) -> dict[str, PhotoStats]:
-    """Return the statistics of photos with unchanged digests, by path in the folder.
-
-    Empty if the file is missing, damaged, or of other settings or versions.
-    """
+    """Return the statistics of photos with unchanged digests; none of a damaged file or another version."""
     try:
         arrays = load_arrays(path)
         known = json.loads(str(arrays["known"]))
@@ -195,11 +188,8 @@ def _similar_rows(small: NDArray[np.float32], limits: NDArray[np.floating]) -> l
     return similar
 
 
-# Unusable photos: blurred ones, and screenshots among photos. Some photos always remain.
-
-
 def drop_unusable(stats: Sequence[PhotoStats]) -> tuple[list[PhotoStats], list[UnusablePhoto]]:
-    """Return the usable and the unusable photos, both in the given order."""
+    """Return the usable photos, and the unusable ones: blurred photos, and screenshots among photos; in order."""
     median = float(np.median([one.blur for one in stats])) if stats else 0.0
     sizes = Counter(_size_key(one.photo) for one in stats)
     photographic = np.mean([one.flat < OPTIONS.flat_share for one in stats]) > 0.5 if stats else False

@@ -36,7 +36,6 @@ class Source:
     files: Mapping[str, str]
     """Hashes of the files by name; for a video, one hash under an empty name."""
     mask_dir: Path | None
-    """Folder of masks, if given."""
     masks: Mapping[str, str]
     """Hashes of the masks by name."""
     stamps: Mapping[Path, Stamp]
@@ -103,7 +102,6 @@ def digest(file: Path) -> str:
 
 
 def _stamp(path: Path) -> Stamp | None:
-    """Return size and time of a regular file; None if there is none."""
     try:
         stat = path.stat()
     except (OSError, ValueError):
@@ -121,9 +119,6 @@ def _digests(folder: Path, names: Sequence[str], spread: ParallelMap) -> dict[st
     return dict(zip(names, spread(file_digest, names), strict=True))
 
 
-# Lay photos out for COLMAP: links to files that it can read, 8-bit copies of the others, in sensor orientation.
-
-
 def assign_names(photos: Iterable[Photo]) -> Iterator[Photo]:
     """Yield photos with unique printable names, also without case, and an extension that COLMAP writes."""
     photos = list(photos)
@@ -139,7 +134,7 @@ def assign_names(photos: Iterable[Photo]) -> Iterator[Photo]:
 
 
 def lay_out(photo: Photo, folder: Path, target: Path) -> None:
-    """Link or copy one photo to where COLMAP reads it; raise an UnreadableError if its file has changed."""
+    """Link a photo for COLMAP, or copy it in 8 bits in sensor orientation; UnreadableError if its file has changed."""
     place = target / photo.name
     if not (is_below(photo.name) and place.parent.resolve().is_relative_to(target.resolve())):
         raise UnreadableError("its name leads out of the folder")
@@ -149,7 +144,9 @@ def lay_out(photo: Photo, folder: Path, target: Path) -> None:
     if isinstance(source, str):
         raise UnreadableError(source)
     if not photo.needs_copy:
-        _link(source, place, relative=folder.parent.resolve() == target.parent.resolve())
+        # links to video frames are relative, since both move with the output folder
+        relative = folder.parent.resolve() == target.parent.resolve()
+        link_or_copy(place, os.path.relpath(source, place.parent.resolve()) if relative else source, source)
         return
     with large_photo_lock(source):
         _copy(photo, source, place)
@@ -171,8 +168,3 @@ def _copy(photo: Photo, source: Path, place: Path) -> None:
         copy.save(place, "JPEG", quality=95)
     else:
         copy.save(place, "PNG", compress_level=1)
-
-
-def _link(source: Path, place: Path, *, relative: bool) -> None:
-    """Link or copy a photo; links to video frames are relative, since both move with the output folder."""
-    link_or_copy(place, os.path.relpath(source, place.parent.resolve()) if relative else source, source)

@@ -23,8 +23,6 @@ BLURRED = 0.5
 MIN_CORNERS = 20
 """Motion is not estimated from fewer corners."""
 
-# Reading, frame by frame. FFmpeg opens one regular file, but no file or network address named in it.
-
 FFMPEG = {
     "OPENCV_FFMPEG_CAPTURE_OPTIONS": "protocol_whitelist;file|format_whitelist;mov,matroska,webm,avi,mpeg,mpegts",
     "OPENCV_FFMPEG_LOGLEVEL": "-8",
@@ -74,11 +72,6 @@ class Video:
         return max(1, round(self.rate / 30)) if self.rate <= 240 else 1
 
     @property
-    def sample_count(self) -> int:
-        """Approximate number of frames that will be sampled."""
-        return max(1, self.claimed // self.stride)
-
-    @property
     def is_cut_short(self) -> bool:
         """Whether the file ended before 95 % of its stated length; valid once all frames are read."""
         if not (self.rate and self.claimed):
@@ -101,7 +94,8 @@ class Video:
             if size is None:
                 shrink = min(1.0, 480 / max(picture.shape[:2]))
                 size = max(1, round(picture.shape[1] * shrink)), max(1, round(picture.shape[0] * shrink))
-            yield number, _to_gray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+            small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+            yield number, np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY) if small.ndim == 3 else small, np.uint8)
 
     def jpegs(self, numbers: Sequence[int]) -> Iterator[tuple[int, bytes]]:
         """Yield these frames at full size as JPEG, in ascending order; fewer if the file has changed."""
@@ -123,13 +117,8 @@ class Video:
             yield self.frames - 1
 
 
-def _to_gray(picture: NDArray[np.uint8]) -> Picture:
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.ndim == 3 else picture, np.uint8)
-
-
 @contextmanager
 def _environment(values: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables, and restore them afterwards."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:
@@ -140,9 +129,6 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-
-
-# Image motion and sharpness, frame by frame.
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +146,6 @@ class TrackingOptions:
     sharp_percentile: int = 80
     """Percentile of the recent sharpness that stands for a sharp frame, even if most are blurred."""
     corners: int = 200
-    """Largest number of corners."""
     forward_backward_px: float = 1.0
     """Largest forward-backward error of a tracked corner."""
     window_px: int = 15
@@ -177,7 +162,6 @@ class TrackedFrame:
     """Measurements of one frame."""
 
     frame: int
-    """Frame number."""
     sharpness: float
     """Variance of the Laplacian; comparable only between neighboring frames."""
     path_steps: float
@@ -253,9 +237,6 @@ def _optical_flow(
     return positions, found[:, 0] > 0
 
 
-# Choice of the frames that become photos: the sharpest one near each step of motion.
-
-
 @dataclass(frozen=True, slots=True)
 class Choice:
     """Chosen frames in ascending order, and why the others were not chosen."""
@@ -290,10 +271,7 @@ def sharpest_frames(path: FloatArray, sharpness: FloatArray, spacing: float) -> 
     """Return the sharpest frame near every multiple of a spacing >= 1, and all candidates.
 
     It lies within 0.25 steps of the multiple, or within 0.5 steps if the nearer frames are all blurred. A blurred frame
-    is chosen only 1.5 steps or more after the last one.
-
-    Args:
-        path, sharpness: (N,) accumulated motion in steps, (N,) sharpness.
+    is chosen only 1.5 steps or more after the last one. The path is the accumulated motion in steps.
     """
     chosen: list[int] = []
     candidates: set[int] = set()

@@ -32,9 +32,10 @@ from sfm_app.meshing.visibility import SKY
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.stereo import DepthTask, View, rank_neighbors
-from sfm_app.stereo.sky import PhotoAreas, Votes, blank_areas, count_votes, find_skies, sky_pixels
+from sfm_app.stereo.sky import PhotoAreas, blank_areas, count_votes, find_skies, sky_pixels
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Rejected, Scene
+from sfm_app.types.arrays import FloatArray
 
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
 
@@ -43,13 +44,7 @@ SKIES = "skies.npz"
 
 
 def make(scene: Scene, run: RunContext) -> Path:
-    """Make a depth and a normal map of every photo with neighbors in the dense workspace; a killed run can resume.
-
-    Raises:
-        ReconstructionError: no photo gets a depth map.
-        ConfigError: the chosen method cannot run here.
-        BackendError: COLMAP failed.
-    """
+    """Make depth and normal maps in the dense workspace; raise a ReconstructionError if no photo gets one."""
     dense_dir, options = run.workspace.dense, run.settings.depth
     method, reason = run.plugins.depth_method(options.method)
     run.record(method=method.name, method_reason=reason)
@@ -92,15 +87,10 @@ def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None
                 undistort_mask = MaskUndistorter(scene.model_dir, run.mask_dir, dense_dir)
                 run.map(Task(undistort_mask), read_views(dense_dir), "undistorting masks")
         else:
-            project_wide_photos(scene, lenses, dense_dir, run)
+            project = Task(_project_wide_photo, Shared(lenses), run.workspace.photos, run.mask_dir, dense_dir)
+            run.map(project, write_model(scene.model_dir, lenses, dense_dir), "projecting wide photos")
+            run.record(views_per_photo=max(len(lens.views) for lens in lenses.values()))
         mark_unfinished(dense_dir, made_from)
-
-
-def project_wide_photos(scene: Scene, lenses: Mapping[int, WideLens], dense_dir: Path, run: RunContext) -> None:
-    """Write several perspective views of each photo of a wide lens."""
-    project = Task(_project_wide_photo, Shared(lenses), run.workspace.photos, run.mask_dir, dense_dir)
-    run.map(project, write_model(scene.model_dir, lenses, dense_dir), "projecting wide photos")
-    run.record(views_per_photo=max(len(lens.views) for lens in lenses.values()))
 
 
 def _project_wide_photo(
@@ -131,7 +121,7 @@ def find_blank_areas(dense_dir: Path, view: View) -> PhotoAreas:
     return blank_areas(read_gray(dense_dir, view), read_depth(dense_dir, view, "geometric"))
 
 
-def _count_votes(photos: Shared[tuple[Sequence[PhotoAreas], Sequence[View]]], index: int) -> Votes:
+def _count_votes(photos: Shared[tuple[Sequence[PhotoAreas], Sequence[View]]], index: int) -> FloatArray:
     return count_votes(*photos.value, index)
 
 
@@ -145,10 +135,7 @@ def _drop_sky(dense_dir: Path, skies: Shared[Mapping[str, NDArray[np.bool_]]], p
 
 
 def record(dense_dir: Path, views: Sequence[View], rejections: Sequence[Rejected | None], run: RunContext) -> None:
-    """Record each photo's share of depths, and the reasons for missing depth maps; None stands for a depth map.
-
-    Raise a ReconstructionError if no view has a depth map.
-    """
+    """Record the photos' shares of depths and the reasons for missing maps; ReconstructionError if there is no map."""
     rejected = Counter(rejection.reason for rejection in rejections if rejection is not None)
     coverage = {
         view.name: round(float(np.mean(read_depth(dense_dir, view, "geometric") > 0)), 3)

@@ -16,11 +16,7 @@ from sfm_app.types import MatchGraph, PhotoSet
 
 
 def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
-    """Find features and match pairs of photos, without geometric verification.
-
-    Features and matches of a killed run, and of the same photos in an earlier run, are reused. Raise a
-    ReconstructionError if no two photos have matches.
-    """
+    """Find features and match pairs that no earlier run has; raise a ReconstructionError if there are no matches."""
     place, options = run.workspace, run.settings.matching
     marker = place.database_marker
     if not (is_made_from(marker, run.fingerprint) and is_sound(place.database)):
@@ -58,10 +54,7 @@ def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
 
 
 def load(photos: PhotoSet, run: RunContext) -> MatchGraph:
-    """Read the match graph of these photos from the database.
-
-    Raise a ValueError if it is damaged: COLMAP would end the program on it.
-    """
+    """Read the match graph of these photos; raise a ValueError if the database is damaged, which would end COLMAP."""
     if not is_sound(run.workspace.database):
         raise ValueError(f"{run.workspace.database} is damaged")
     with translate_errors("reading the database"):

@@ -42,12 +42,7 @@ HINT = "take more photos, a step apart, with more overlap; OUT/points.ply and OU
 
 
 def make(scene: Scene, dense_dir: Path, run: RunContext) -> Surface:
-    """Span a surface over the fused points, keep the confirmed parts, refine it by the photos, and simplify it.
-
-    Raises:
-        ReconstructionError: the depth maps do not give a surface.
-        BackendError: COLMAP failed.
-    """
+    """Span a surface over the fused points, confirm, refine and simplify it; raise a ReconstructionError if none."""
     place, options = run.workspace.surface, run.settings.mesh
     place.mkdir(exist_ok=True)
     run.workspace.fine_surface.unlink(missing_ok=True)
@@ -67,7 +62,6 @@ def make(scene: Scene, dense_dir: Path, run: RunContext) -> Surface:
 def _mesh_at_once(
     source: tuple[Path, Originals], views: list[View], points: NDArray[np.void], run: RunContext
 ) -> Surface:
-    """Return the surface of all fused points (N,), from the dense workspace and the original photos."""
     (dense_dir, originals), options = source, run.settings.mesh
     raw = _check_nonempty(_span(points, run), "the fused points span no surface")
     judges = SurfaceJudge.prepare(raw, dense_dir, run.settings.depth.consistency)
@@ -105,8 +99,6 @@ def _span(points: NDArray[np.void], run: RunContext) -> Surface:
 
 
 def _refine(surface: Surface, originals: Originals, views: list[View], run: RunContext) -> Surface:
-    """Return the surface with the detail of the photos."""
-
     def spread(ask: Callable[[int], Any], photos: Sequence[int]) -> Iterator[Any]:
         for answer in ordered_map(run.executor, ask, photos, ahead=2 * run.workers):
             run.progress.advance()
@@ -126,7 +118,6 @@ def _refine(surface: Surface, originals: Originals, views: list[View], run: RunC
 
 
 def _check_nonempty(surface: Surface, problem: str) -> Surface:
-    """Return the surface; raise a ReconstructionError if it has no triangles."""
     if not len(surface.faces):
         raise ReconstructionError(problem, hint=HINT)
     return surface

@@ -32,17 +32,13 @@ MANY_FILES = 5000
 """Number of files above which the folder may be a wrong one, such as a home. Chosen by hand."""
 DAMAGED = "play it to see whether it is whole; save it as MP4 with H.264"
 
-# The chosen frames of a video, written to OUT/frames as a folder of photos.
-
 
 @dataclass(frozen=True, slots=True)
 class FrameChoice:
     """The chosen frames of a video."""
 
     made_from: str
-    """Fingerprint of the inputs."""
     frames: tuple[int, ...]
-    """Frame numbers."""
     times_s: tuple[float, ...]
     """Timestamps of the frames, in seconds."""
     counts: Mapping[str, Any]
@@ -85,7 +81,8 @@ def choose_frames(source: Path, run: RunContext) -> FrameChoice:
     try:
         with open_video(source) as video:
             tracker = CornerTracker()
-            pictures = track(run.progress, video.small_frames(), "tracking frames", video.sample_count)
+            samples = max(1, video.claimed // video.stride)
+            pictures = track(run.progress, video.small_frames(), "tracking frames", samples)
             tracked, times_s = [], {}
             for number, small in pictures:
                 tracked.append(tracker.track(number, small))
@@ -118,7 +115,6 @@ def choose_frames(source: Path, run: RunContext) -> FrameChoice:
 
 
 def _write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> None:
-    """Write the missing frames."""
     for incomplete in run.workspace.frames.glob(".*"):  # files of a killed run
         incomplete.unlink()
     places = {frame: run.workspace.frames / frame_name(source, frame) for frame in frames}
@@ -149,14 +145,8 @@ def frame_stem(source: Path) -> str:
     return printable.lstrip(".")[:40] or "frame"
 
 
-# The stage.
-
-
 def make(source: Source, run: RunContext) -> PhotoSet:
-    """Read every file of a folder, or the frames of a video, and lay the usable photos out for COLMAP.
-
-    Raise an InputError if the source is missing, fewer than two photos are usable, or a mask is unusable.
-    """
+    """Read a folder or a video, and lay the usable photos out for COLMAP; raise an InputError if too few are."""
     if not source.video:
         return _read_photos(source, source.path, list(source.files), {}, run)
     folder = run.workspace.frames
@@ -186,8 +176,10 @@ def digest(place: Workspace) -> str:
 def _read_photos(
     source: Source, folder: Path, names: Sequence[str], times_s: Mapping[str, float], run: RunContext
 ) -> PhotoSet:
-    """Read these files of a folder and lay the usable photos out for COLMAP."""
-    options = limit_to_memory(run)
+    options = run.settings.photos
+    if run.settings.max_memory_gb:
+        largest = min(options.max_megapixels, largest_photo_megapixels(run.memory_mb))
+        options = options.model_copy(update={"max_megapixels": largest})
     contents = read_all(source, folder, names, options, run)
     unreadable = [photo for photo in contents if isinstance(photo, UnusablePhoto)]
     stats, masked = attach_masks([one for one in contents if isinstance(one, PhotoStats)], folder, source, run)
@@ -205,8 +197,11 @@ def _read_photos(
     for place in (run.workspace.photos, run.workspace.masks):
         shutil.rmtree(place, ignore_errors=True)
     run.map(Task(lay_out_photo, folder=folder, target=run.workspace.photos), photo_set.photos, "laying photos out")
-    if photo_set.masks is not None:
-        _lay_out_masks(photo_set, photo_set.masks, list(source.masks), run)
+    if (masks := source.mask_dir) is not None:
+        lay_out = Task(lay_out_mask, folder=photo_set.folder, masks=masks, target=run.workspace.masks)
+        run.map(lay_out, photo_set.photos, "laying masks out")
+        unused = unused_masks(list(source.masks), photo_set.photos)
+        run.record(masks={"photos": sum(bool(photo.mask) for photo in photo_set.photos), "unused": unused})
     _save_photo_set(photo_set, run)
     run.record(usable=len(photos), cameras=len(photo_set.groups), unusable={p.name: p.reason for p in unusable})
     run.record(notes={photo.path: list(photo.notes) for photo in photos if photo.notes})
@@ -230,15 +225,6 @@ def read_all(
     return [contents[name] for name in names]
 
 
-def limit_to_memory(run: RunContext) -> PhotoSettings:
-    """Return the photo settings, with `max_megapixels` reduced to the user's limit of memory."""
-    options = run.settings.photos
-    if not run.settings.max_memory_gb:
-        return options
-    largest = min(options.max_megapixels, largest_photo_megapixels(run.memory_mb))
-    return options.model_copy(update={"max_megapixels": largest})
-
-
 def select_photos(stats: list[PhotoStats], *, keep_low_quality: bool) -> tuple[list[Photo], list[UnusablePhoto]]:
     """Return the useful photos and the useless ones: blurred photos, screenshots and copies, unless these stay."""
     if keep_low_quality:
@@ -251,10 +237,7 @@ def select_photos(stats: list[PhotoStats], *, keep_low_quality: bool) -> tuple[l
 def attach_masks(
     stats: list[PhotoStats], folder: Path, source: Source, run: RunContext
 ) -> tuple[list[PhotoStats], list[UnusablePhoto]]:
-    """Return the photos with their masks, and the completely masked photos.
-
-    Raise an InputError if a mask cannot be used, or no photo has one.
-    """
+    """Return the photos with masks, and the completely masked ones; raise an InputError if a mask cannot be used."""
     masks = source.mask_dir
     if masks is None:
         return stats, []
@@ -263,14 +246,6 @@ def attach_masks(
         raise InputError(f"none of the {len(source.masks)} files in {masks} is the mask of a photo", hint=MASK_HINT)
     used = [replace(one, photo=photo) for one, photo in zip(stats, photos, strict=True) if isinstance(photo, Photo)]
     return used, [photo for photo in photos if isinstance(photo, UnusablePhoto)]
-
-
-def _lay_out_masks(photo_set: PhotoSet, masks: Path, names: Sequence[str], run: RunContext) -> None:
-    """Put a mask of every photo into the workspace, and count them."""
-    lay_out = Task(lay_out_mask, folder=photo_set.folder, masks=masks, target=run.workspace.masks)
-    run.map(lay_out, photo_set.photos, "laying masks out")
-    unused = unused_masks(list(names), photo_set.photos)
-    run.record(masks={"photos": sum(bool(photo.mask) for photo in photo_set.photos), "unused": unused})
 
 
 def lay_out_photo(photo: Photo, *, folder: Path, target: Path) -> None:
@@ -284,7 +259,6 @@ def lay_out_photo(photo: Photo, *, folder: Path, target: Path) -> None:
 
 
 def _save_photo_set(photos: PhotoSet, run: RunContext) -> None:
-    """Write photos.json, with hashes of the copies."""
     entries = [photo.to_dict() for photo in photos.photos]
     unusable = [asdict(photo) for photo in photos.unusable]
     copies = {photo.name: _copy_digest(photo, run) for photo in photos.photos}
@@ -301,7 +275,6 @@ def _copy_digest(photo: Photo, run: RunContext) -> str | None:
 
 
 def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoSet:
-    """Read photos.json back, and lay out missing photos."""
     photo_set = replace(read_photo_list(run.workspace), folder=folder, masks=masks)
     values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
     for photo in photo_set.photos:
@@ -316,7 +289,6 @@ def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoS
 
 
 def _too_few_message(folder: Path, usable: int, unusable: list[UnusablePhoto]) -> str:
-    """Return why there are not enough photos, in one line."""
     reasons = Counter("copies of another" if "same picture" in photo.reason else photo.reason for photo in unusable)
     counts = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
     number = "no usable photo" if usable == 0 else "only one usable photo"

@@ -13,7 +13,7 @@ from sfm_app.frame.known_lengths import control_places, distance_evidence, marke
 from sfm_app.frame.scale import GPS, IDENTITY, MetricFrame, ScaleEvidence, agree, move_model
 from sfm_app.frame.sighted_points import PosedPhotos
 from sfm_app.geometry.poses import Similarity
-from sfm_app.numerical import Json, json_text
+from sfm_app.numerical import json_text
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.types import PhotoSet, Scene
@@ -27,7 +27,39 @@ def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
 
     Missing or contradictory evidence is recorded and never ends the run; without any, the unit stays arbitrary.
     """
-    frame = find_frame(photos, scene, run)
+    options, evidence, problems = run.settings.scale, list[ScaleEvidence](), list[str]()
+    if scene.gps_deviation is not None:
+        evidence.append(ScaleEvidence(GPS, 1.0, max(scene.gps_deviation, 1e-4), len(scene.registered)))
+    control: ControlFit | None = None
+    if options.distances or options.markers or run.control_points:
+        posed = PosedPhotos(scene.model_dir)
+        if options.distances:
+            evidence += distance_evidence(options.distances, posed.sightlines())
+        if options.markers:
+            evidence += marker_evidence(posed, run, problems)
+        if run.control_points:
+            control = _control_evidence(photos, posed, run, evidence, problems)
+    # the proportions are as exact as the least exact focal length
+    shares = (one.deviations.get("fx", 0.0) / one.K[0, 0] for one in scene.cameras.values())
+    shape = float(max((share for share in shares if np.isfinite(share)), default=0.0))
+    frame = _agreed_frame(evidence, control, shape)
+    run.record(
+        unit="meter" if frame.is_metric else "arbitrary",
+        scale=frame.from_model.scale,
+        deviation_percent=None if frame.deviation is None else round(100 * frame.deviation, 4),
+        source=frame.source,
+        evidence=[
+            {
+                "name": one.name,
+                "scale": one.scale,
+                "deviation_percent": round(100 * one.deviation, 4),
+                "photos": one.photos,
+            }
+            for one in evidence
+        ],
+        contradictions=list(frame.contradictions),
+        problems=problems,
+    )
     with replace_atomically(run.workspace.scale) as path:
         path.write_text(json_text(frame.to_dict()), encoding="utf-8", newline="\n")
     points = sparse_model(run.workspace.sparse)
@@ -50,38 +82,6 @@ def read_frame(place: Workspace) -> MetricFrame:
     return MetricFrame.from_dict(json.loads(place.scale.read_text(encoding="utf-8")))
 
 
-def find_frame(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
-    """Return the frame by all evidence, and record the evidence."""
-    options, evidence, problems = run.settings.scale, list[ScaleEvidence](), list[str]()
-    if scene.gps_deviation is not None:
-        evidence.append(ScaleEvidence(GPS, 1.0, max(scene.gps_deviation, 1e-4), len(scene.registered)))
-    control: ControlFit | None = None
-    if options.distances or options.markers or run.control_points:
-        posed = PosedPhotos(scene.model_dir)
-        if options.distances:
-            evidence += distance_evidence(options.distances, posed.sightlines())
-        if options.markers:
-            evidence += marker_evidence(posed, run, problems)
-        if run.control_points:
-            control = _control_evidence(photos, posed, run, evidence, problems)
-    frame = _agreed_frame(evidence, control, shape_deviation(scene))
-    run.record(
-        unit="meter" if frame.is_metric else "arbitrary",
-        scale=frame.from_model.scale,
-        deviation_percent=None if frame.deviation is None else round(100 * frame.deviation, 4),
-        source=frame.source,
-        evidence=[_evidence_entry(one) for one in evidence],
-        contradictions=list(frame.contradictions),
-        problems=problems,
-    )
-    return frame
-
-
-def _evidence_entry(one: ScaleEvidence) -> dict[str, Json]:
-    percent = round(100 * one.deviation, 4)
-    return {"name": one.name, "scale": one.scale, "deviation_percent": percent, "photos": one.photos}
-
-
 def _control_evidence(
     photos: PhotoSet, posed: PosedPhotos, run: RunContext, evidence: list[ScaleEvidence], problems: list[str]
 ) -> ControlFit | None:
@@ -96,12 +96,6 @@ def _control_evidence(
     evidence.append(ScaleEvidence(f"{len(fit.inliers)} ground control points", fit.from_model.scale, fit.deviation))
     run.record(control_points={"used": list(fit.inliers), "wrong": dict(fit.outliers), "rms_m": fit.rms_m})
     return fit
-
-
-def shape_deviation(scene: Scene) -> float:
-    """Return the relative standard deviation of the proportions of a scene: the largest one of a focal length."""
-    shares = (one.deviations.get("fx", 0.0) / one.K[0, 0] for one in scene.cameras.values())
-    return float(max((share for share in shares if np.isfinite(share)), default=0.0))
 
 
 def _agreed_frame(evidence: Sequence[ScaleEvidence], control: ControlFit | None, shape: float) -> MetricFrame:

@@ -93,7 +93,6 @@ def _adjust_models(
 
 
 def _finish_scene(mapped: MappedScene, run: RunContext) -> Scene:
-    """Adjust the models, orient them, write them and record their figures."""
     matches, views, intrinsics = mapped.matches, mapped.views, mapped.intrinsics
     outcome = _drop_models_without_depth(mapped, run)
     cues = submit_cue_extraction([attempt.model for attempt in outcome.models], matches, run)
@@ -111,6 +110,7 @@ def _finish_scene(mapped: MappedScene, run: RunContext) -> Scene:
     scene = read_scene(run.workspace.sparse, names, reasons, refined_cameras(adjusted[0], names))
     scene = replace(scene, gps_deviation=gps_deviation(orientations[0]))
     write_scene(scene, run)
+    lenses = {name: adjusted[0].lenses.get(key) for name, key in _camera_ids(adjusted[0], names).items()}
     run.record(
         **shutter,
         registered=len(scene.registered),
@@ -122,7 +122,7 @@ def _finish_scene(mapped: MappedScene, run: RunContext) -> Scene:
         mean_reprojection_px=round(scene.mean_reprojection_px, 4),
         orientation=orientations[0],
         adjustment=_adjustment_problems(adjusted, names),
-        lenses=_lens_choices(adjusted[0], names),
+        lenses={name: lens.to_dict() for name, lens in lenses.items() if lens is not None},
         **mapping_figures(outcome),
         look_alikes=look_alike_entries(outcome.graph.look_alikes, matches),
         perhaps_look_alikes=look_alike_entries(outcome.graph.doubtful, matches),
@@ -185,12 +185,6 @@ def _adjustment_problems(adjusted: Sequence[Adjustment], names: Mapping[str, str
         "points_left_open": main.open_points,
     }
     return {key: value for key, value in problems.items() if value}
-
-
-def _lens_choices(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, Json]:
-    """Return the manifest's entries about each camera's chosen model and its rivals."""
-    cameras = _camera_ids(adjusted, names)
-    return {name: adjusted.lenses[key].to_dict() for name, key in cameras.items() if key in adjusted.lenses}
 
 
 def _camera_ids(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, int]:

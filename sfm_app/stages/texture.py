@@ -16,7 +16,9 @@ from sfm_app.photos.masks import fill_masked, read_mask
 from sfm_app.photos.panoramas import mask_part, panorama_parts, show_part
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
-from sfm_app.texture import PhotoView, bake_normals, part_view, photo_view, texture_surface
+from sfm_app.texture.assemble import texture_surface
+from sfm_app.texture.normal_map import bake_normals
+from sfm_app.texture.views import PhotoView, part_view, photo_view
 from sfm_app.types import Model, Scene, Surface, Texture
 
 TEXTURE = "texture.npz"
@@ -55,7 +57,7 @@ def _add_normal_map(model: Model, run: RunContext) -> Model:
 
 
 class FileStore:
-    """The `sfm_app.texture.Store` of a run: photos and masks of two folders, and arrays in files."""
+    """The `sfm_app.texture.pages.Store` of a run: photos and masks of two folders, and arrays in files."""
 
     def __init__(self, photo_dir: Path, folder: Path, mask_dir: Path | None = None) -> None:
         self.photo_dir, self.folder, self.mask_dir = photo_dir, folder, mask_dir
@@ -154,7 +156,6 @@ def read_texture(place: Workspace) -> Model:
 
 
 def _list_numbered(stored: Mapping[str, NDArray[Any]], kind: str) -> tuple[NDArray[Any], ...]:
-    """Return the arrays named by a kind and a number from 0 on."""
     arrays = list[NDArray[Any]]()
     while (array := stored.get(f"{kind}{len(arrays)}")) is not None:
         arrays.append(array)

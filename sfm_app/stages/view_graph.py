@@ -19,10 +19,7 @@ LENS_SETTINGS = ("calibration.lens", "calibration.keep", "scene.camera_model", "
 
 
 def make(matches: MatchGraph, run: RunContext) -> ViewGraph:
-    """Find wide lenses, fit every pair on its own, and count the reasons of rejected pairs.
-
-    Fits and lenses of an earlier run stay. Raise a ReconstructionError if no pair has a usable epipolar geometry.
-    """
+    """Find wide lenses and fit every new pair; raise a ReconstructionError if no pair has an epipolar geometry."""
     if run.earlier is None:
         lenses, known = find_lenses(matches, run), {}
     else:

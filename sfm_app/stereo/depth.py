@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from sfm_app.jit import kernel
 from sfm_app.stereo.patch_match import (
     NO_MATCH,
-    PlaneArray,
     fit_planes,
     improve_planes,
     plane_normals,
@@ -21,7 +20,7 @@ from sfm_app.stereo.plain_areas import enclosed_pixels, fill_planar_areas, plain
 from sfm_app.stereo.rectify import depths_from_disparities, disparities, rectify
 from sfm_app.stereo.view import DepthArray, GrayImage, View
 from sfm_app.types import Rejected
-from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.types.arrays import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,12 +73,7 @@ def match_depths(
 
     Semi-global matching with each neighbor gives depths; the merged depths initialize PatchMatch with all neighbors.
 
-    Args:
-        view: the photo.
-        candidates: possible neighbors, best first.
-        load: returns the gray photo of a view.
-        count: most neighbors.
-        tolerance: relative difference within which depths agree.
+    The best candidates come first. `load` returns the gray photo of a view; depths agree within a relative tolerance.
     """
     image = load(view)
     # gray values are sampled at pixel centers
@@ -107,20 +101,10 @@ def match_depths(
     planes = fit_planes(merged)
     planes[..., 0] = np.divide(1, merged, out=np.zeros_like(merged), where=merged > 0)
     cost = improve_planes(planes, centered, image, neighbors, sweeps=1)  # a second sweep improves 1 % of the pixels
-    cost[_clipped_mask(image)] = NO_MATCH
-    return _sample_planes(planes, cost, view.sample_px)
-
-
-def _clipped_mask(image: GrayImage) -> BoolArray:
-    """Mark pixels (H, W) whose 3 x 3 mean is nearly black or white."""
     mean = cv2.blur(image, (3, 3))
-    return np.asarray((mean <= OPTIONS.clipped_gray) | (mean >= 255 - OPTIONS.clipped_gray))
-
-
-def _sample_planes(planes: PlaneArray, cost: NDArray[np.float32], sample_px: float) -> DepthEstimate:
-    """Sample depths and confidences at a view's position inside the pixel."""
-    shift = np.float32(sample_px - 0.5)
-    inverse = planes[..., 0] + shift * (planes[..., 1] + planes[..., 2])
+    cost[(mean <= OPTIONS.clipped_gray) | (mean >= 255 - OPTIONS.clipped_gray)] = NO_MATCH
+    # at the view's position inside the pixel
+    inverse = planes[..., 0] + np.float32(view.sample_px - 0.5) * (planes[..., 1] + planes[..., 2])
     known = (planes[..., 0] > 0) & (inverse > 0) & (cost < NO_MATCH)
     depth = np.divide(1, inverse, out=np.zeros_like(inverse), where=known)
     return DepthEstimate(depth, np.where(known, np.maximum(1 - cost, 0), np.float32(0)))
@@ -134,8 +118,7 @@ def merge_hypotheses(
     At each pixel, the largest-weight group of depths within the relative tolerance of one of them wins and is averaged.
     The weight of a depth is its squared parallax, which is inversely proportional to its variance.
 
-    Returns:
-        (H, W) depth, 0 where no neighbor has one, and (H, W) number of neighbors that agree with it.
+    Return (H, W) the depth, 0 where no neighbor has one, and (H, W) the number of neighbors that agree with it.
     """
     depth = np.zeros(depths.shape[1:], np.float32)
     support = np.zeros(depths.shape[1:], np.uint8)
@@ -173,30 +156,16 @@ def _merge(
                     support[row, col] = members
 
 
-def count_confirming_maps(
-    view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], tolerance: float
+def count_maps(
+    view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], low: float, high: float = np.inf
 ) -> NDArray[np.uint8]:
-    """Count the other depth maps, (H, W), within a relative tolerance of each depth (H, W) of a view, 0 where unknown.
+    """Count the other depth maps, (H, W), with `low` to `high` times the depth that a point of a view has there.
 
-    A map confirms a point if the point's depth in the other view is within the tolerance of the map's depth there.
+    Around 1, they confirm the depth (H, W) of the view, 0 where unknown; beyond it, they contradict.
     """
-    return _count_maps(view, depth, others, (1.0 - tolerance, 1.0 + tolerance))
-
-
-def count_deeper_maps(
-    view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], tolerance: float
-) -> NDArray[np.uint8]:
-    """Count the other depth maps, (H, W), deeper than each depth of a view by a relative tolerance: they contradict."""
-    return _count_maps(view, depth, others, (1.0 + tolerance, np.inf))
-
-
-def _count_maps(
-    view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], limits: tuple[float, float]
-) -> NDArray[np.uint8]:
-    """Count the maps whose depth lies between two limits, relative to the depth of the point in the other view."""
     count = np.zeros(depth.shape, np.uint8)
     for other, other_depth in others:
-        _count(depth, other_depth, view.projection_into(other), limits, view.sample_px, count)
+        _count(depth, other_depth, view.projection_into(other), (low, high), view.sample_px, count)
     return count
 
 
@@ -256,7 +225,7 @@ def confirm_depths(
     """
     if not others:
         return Rejected("no other depth map to compare with")
-    agreeing = count_confirming_maps(view, estimate.depth, others, tolerance)
+    agreeing = count_maps(view, estimate.depth, others, 1.0 - tolerance, 1.0 + tolerance)
     confidence = estimate.confidence
     least, more = (min(need, len(others)) for need in (min_agreeing, min_agreeing + 1))
     needed = np.where(confidence < OPTIONS.unsure_correlation, more, least)

@@ -75,8 +75,6 @@ STEPS = Steps()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Inputs:
-    """The inputs of a worker."""
-
     levels: Sequence[Sequence[View]]
     """The views at full size, at half the size, and so on."""
     ranked: Sequence[Sequence[int]]
@@ -93,10 +91,7 @@ def make_depth_maps_on_cpu(task: DepthTask, steps: Steps = STEPS) -> list[Reject
     """Match every photo with its neighbors, then keep depths that the maps of other photos confirm.
 
     Both happen at every level; coarser levels fill gaps of finer ones. If the settings do not fix the number of levels,
-    a coarser level follows if many pixels need it.
-
-    Returns:
-        For every view the reason why it has no maps, or None.
+    a coarser level follows if many pixels need it. Return for every view the reason why it has no maps, or None.
     """
     everything, options = range(len(task.views)), task.options
     inputs = _Inputs(halve_views(task.views, max(options.levels, 1)), task.ranked, options, task.store, steps)
@@ -127,7 +122,6 @@ def _open_share(inputs: Shared[_Inputs], index: int) -> float | None:
 
 
 def _match(inputs: Shared[_Inputs], level: int, index: int) -> Rejected | None:
-    """Match a photo with its neighbors at one level."""
     task = inputs.value
     views, options = task.levels[level], task.options
     view = views[index]
@@ -214,7 +208,6 @@ def _fill_plain_areas(inputs: Shared[_Inputs], index: int) -> None:
 
 
 # Coarser depth maps fill gaps of finer ones.
-#
 # Noise hides the weak texture of plain surfaces at full size. In a photo of half the size, noise is half as strong and
 # the windows cover twice as much (Xu and Tao: Multi-scale geometric consistency guided multi-view stereo. CVPR 2019).
 

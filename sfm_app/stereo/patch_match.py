@@ -77,7 +77,9 @@ def improve_planes(
     stack = np.zeros((len(others), height, width), np.uint32)
     projections, sizes = np.empty((len(others), 3, 4)), np.empty((len(others), 2), np.int64)
     for k, (other, photo) in enumerate(others):
-        stack[k, : photo.shape[0] - 1, : photo.shape[1] - 1] = _pack_squares(photo)
+        wide = photo.astype(np.uint32)  # a pixel, its right neighbor, and the two below them, a byte each
+        packed = wide[:-1, :-1] | wide[:-1, 1:] << 8 | wide[1:, :-1] << 16 | wide[1:, 1:] << 24
+        stack[k, : photo.shape[0] - 1, : photo.shape[1] - 1] = packed
         sizes[k] = photo.shape
         projections[k] = view.projection_into(other)
     near = np.exp(-0.5 * (STEPS[:, None] ** 2 + STEPS**2) / OPTIONS.sigma_px**2)
@@ -86,13 +88,6 @@ def improve_planes(
     for sweep in range(sweeps):
         _sweep(sweep, image, (near, alike), (stack.ravel(), width, sizes, projections), planes, cost)
     return cost
-
-
-def _pack_squares(image: GrayImage) -> NDArray[np.uint32]:
-    """Return (H - 1, W - 1) numbers of four bytes: a pixel, its right neighbor, and the two below them."""
-    wide = image.astype(np.uint32)
-    packed = wide[:-1, :-1] | wide[:-1, 1:] << 8 | wide[1:, :-1] << 16 | wide[1:, 1:] << 24
-    return np.asarray(packed, np.uint32)
 
 
 @kernel
@@ -274,16 +269,12 @@ def _correlation(stack: NDArray[np.uint32], start: int, stride: int, affine: Any
     return float((mixed - one * mean) / np.sqrt(spread))
 
 
-# Planes through depth maps, and their normals.
-
-
 def fit_planes(depth: DepthArray) -> PlaneArray:
     """Fit a plane to the surroundings of every pixel, by least squares.
 
     A plane n'X = 1 has the inverse depth n'x at the ray x = K^-1 (u, v, 1), which is linear in n and in the noise.
 
-    Returns:
-        (H, W, 3) inverse depth at the pixel and its slopes per pixel; 0 where the depth is unknown or isolated.
+    Return (H, W, 3) inverse depth at the pixel and its slopes per pixel; 0 where the depth is unknown or isolated.
     """
     planes = np.zeros((*depth.shape, 3), np.float32)
     steps = np.arange(-RADIUS_PX, RADIUS_PX + 1)
@@ -363,8 +354,6 @@ def _slopes(
     gu, gv = (svv * qu - suv * qv) / det, (suu * qv - suv * qu) / det
     return (q - gu * su - gv * sv) / n, gu, gv
 
-
-# Depths of an object that spill over its outline onto the background.
 
 REACH_PX = BORDER + 1
 """A window centered this far from an outline still contains a pixel of it; on a textureless background that pixel

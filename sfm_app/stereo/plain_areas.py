@@ -56,11 +56,7 @@ OPTIONS = PlainAreaOptions()
 
 
 def enclosed_pixels(known: BoolArray) -> BoolArray:
-    """Mark pixels (H, W) with known pixels on at least three of their four sides, at any distance.
-
-    Depths may be interpolated, but not extrapolated: only this distinguishes a wall with few depths from a sky of the
-    same color beside it.
-    """
+    """Mark pixels with known ones on three of their four sides: depths may be interpolated, but not extrapolated."""
     share = cv2.blur(known.astype(np.float32), (OPTIONS.close_px, OPTIONS.close_px))
     dense = (share >= OPTIONS.least_share).view(np.uint8)
     sides = np.zeros(known.shape, np.uint8)
@@ -70,8 +66,6 @@ def enclosed_pixels(known: BoolArray) -> BoolArray:
     return np.asarray(sides >= OPTIONS.min_sides)
 
 
-# Plain walls and skies.
-#
 # Semi-global matching extends depths from the borders into both kinds of area in the same way in every photo, so
 # photos taken close to each other agree. They agree across a whole wall, but only along the rim of a sky.
 
@@ -101,7 +95,6 @@ def surfaceless_areas(confidence: NDArray[np.float32], confirmed: BoolArray) -> 
 
 
 # Areas of uniform color whose known depths lie on one plane are filled with that plane.
-#
 # Areas of one color cannot be matched: their depths are sparse and noisy. Flat objects are often painted uniformly,
 # so a plane is more accurate than depths of single pixels (Gallup, Frahm, Pollefeys: Piecewise planar and non-
 # planar stereo for urban scene reconstruction. CVPR 2010). Planes are not extrapolated beyond the known depths;

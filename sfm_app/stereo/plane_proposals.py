@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sfm_app.stereo.depth import DepthMap, count_confirming_maps, count_deeper_maps
+from sfm_app.stereo.depth import DepthMap, count_maps
 from sfm_app.stereo.patch_match import RADIUS_PX, fit_planes, plane_normals
 from sfm_app.stereo.plain_areas import OPTIONS as AREA_OPTIONS
 from sfm_app.stereo.plain_areas import consensus_plane, convex_hull, enclosed_pixels, uniform_areas
@@ -68,7 +68,6 @@ def propose_planes(depth: DepthArray, image: GrayImage, tolerance: float) -> Dep
 
 
 def _propose_within(depth: DepthArray, area: BoolArray, tolerance: float, proposed: DepthArray) -> None:
-    """Write proposals for an area, in its bounding box."""
     unknown = area & (depth == 0)
     if not unknown.any():
         return
@@ -109,20 +108,13 @@ def agreed_proposals(
     others: Sequence[tuple[View, DepthArray, DepthArray]],
     tolerance: float,
 ) -> DepthArray:
-    """Add to the depths of a photo the proposals that enough other photos share and none contradicts.
-
-    Args:
-        view: the photo.
-        maps: (H, W) its depths and its proposals, 0 where there are none.
-        others: other photos with their depths and proposals.
-        tolerance: largest relative difference of depths that agree.
-    """
+    """Add to the depths of a photo the proposals (both in `maps`) that enough others share and none contradicts."""
     depth, proposed = maps
     known_or_proposed = [(other, np.where(known > 0, known, plane)) for other, known, plane in others]
-    agreeing = count_confirming_maps(view, proposed, known_or_proposed, tolerance)
+    agreeing = count_maps(view, proposed, known_or_proposed, 1.0 - tolerance, 1.0 + tolerance)
     # a map that already contains proposals has the same meaning
     matched = [(other, np.where(plane > 0, np.float32(0), known)) for other, known, plane in others]
-    contradicting = count_deeper_maps(view, proposed, matched, OPTIONS.deeper * tolerance)
+    contradicting = count_maps(view, proposed, matched, 1.0 + OPTIONS.deeper * tolerance)
     agreed = (proposed > 0) & (agreeing >= OPTIONS.least_agreeing) & (contradicting == 0)
     return np.where((depth == 0) & agreed, proposed, depth)
 

@@ -151,11 +151,8 @@ def _triangulation_angles(reference: View, neighbor: View, rotation: FloatArray)
 
 
 def _angle_range(angles: FloatArray, room: float) -> tuple[float, float]:
-    """Return the largest and smallest triangulation angle to search; sparse points rarely reach the extremes.
-
-    The margin is larger at the near end, because close pavement has few features. `room` is the range of angles that
-    can be searched without downsampling the photos.
-    """
+    """Return the largest and smallest triangulation angle to search; `room` is the range that needs no downsampling."""
+    # sparse points rarely reach the extremes, least at the near end: close pavement has few features
     low, high = np.percentile(angles, [1, 99])
     margin = 0.15 * (high - low) + 0.02 * high
     far = max(low - margin, 0.25 * low)
@@ -184,9 +181,8 @@ def disparities(left: GrayImage, right: GrayImage, count: int) -> NDArray[np.flo
 
     The photos are rectified; `count` is a multiple of 16.
 
-    Returns:
-        (H, W) disparity of the left image in pixels; -1 where left and right disagree by more than a pixel, where a
-        second disparity is nearly as good, and on small specks.
+    Return (H, W) the disparity of the left image in pixels; -1 where left and right disagree by more than a pixel,
+    where a second disparity is nearly as good, and on small specks.
     """
     block_px = 3
     matcher = cv2.StereoSGBM.create(
@@ -211,9 +207,8 @@ def depths_from_disparities(
 ) -> tuple[DepthArray, DepthArray]:
     """Lift a disparity map (H, W) of the left canvas, < 0 where unknown, to depths of the reference.
 
-    Returns:
-        (H, W) depth of the reference's pixels, 0 where unknown or outside the neighbor, and (H, W) the parallax in
-        pixels, to which the relative accuracy of the depth is proportional.
+    Return (H, W) depths, 0 where unknown or outside the neighbor, and (H, W) the parallax in pixels, to which their
+    relative accuracy is proportional.
     """
     K_inv = np.linalg.inv(reference.K)
     to_rectified = rectification.rotation @ reference.R.T @ K_inv

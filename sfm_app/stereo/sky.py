@@ -64,9 +64,6 @@ class SkyOptions:
 OPTIONS = SkyOptions()
 
 
-# Blank areas of a photo, each of which may be sky: even, without depths, and brighter than most surfaces.
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotoAreas:
     """A photo in cells, and its blank areas; number 0 is everything else."""
@@ -97,19 +94,15 @@ def blank_areas(photo: GrayImage, depth: DepthArray) -> PhotoAreas:
     blank = (known < OPTIONS.open_share) & (_to_cells(variation) <= OPTIONS.most_variation)
     labels = cv2.connectedComponents(blank.view(np.uint8), connectivity=4)[1]
     surfaces = known >= OPTIONS.known_share
-    labels = _keep_bright(labels, cells, np.sort(cells[surfaces]))
+    levels, mean_gray = np.sort(cells[surfaces]), _mean_gray(labels, cells)
+    bright = np.searchsorted(levels, mean_gray) >= max(1.0, OPTIONS.bright_rank * len(levels))
+    bright[0] = False
+    labels = np.asarray((np.cumsum(bright) * bright)[labels])
     size = np.bincount(labels.ravel())
     at_border = np.zeros(len(size), bool)
     at_border[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = True
     at_border[0] = False
     return PhotoAreas(labels.astype(np.uint16), surfaces, size, _mean_gray(labels, cells), at_border)
-
-
-def _keep_bright(labels: NDArray[np.int32], gray: NDArray[np.float32], surfaces: NDArray[np.float32]) -> IndexArray:
-    """Keep the areas brighter than most surfaces, numbered from 1. The surfaces' gray levels (S,) ascend."""
-    bright = np.searchsorted(surfaces, _mean_gray(labels, gray)) >= max(1.0, OPTIONS.bright_rank * len(surfaces))
-    bright[0] = False
-    return np.asarray((np.cumsum(bright) * bright)[labels])
 
 
 def _mean_gray(labels: NDArray[np.signedinteger], gray: NDArray[np.float32]) -> FloatArray:
@@ -125,22 +118,8 @@ def _to_cells(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 # Blank areas at infinity: other photos show blank areas in the same directions.
-#
 # A plain wall moves against the background from photo to photo, a sky does not. Where a nearer object with a depth
 # occludes the sky, that photo has no vote.
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Votes:
-    """Votes of other photos in the directions of the blank areas of a photo."""
-
-    counts: FloatArray
-    """(3, A) over the cells of each area: a blank area; no depth, but not blank; a nearer surface with a depth."""
-
-    @property
-    def blank_share(self) -> FloatArray:
-        """(A,) share of votes for a blank area."""
-        return np.asarray(self.counts[0] / np.maximum(self.counts.sum(axis=0), 1))
 
 
 def spread_partners(views: Sequence[View], index: int) -> list[int]:
@@ -157,8 +136,8 @@ def spread_partners(views: Sequence[View], index: int) -> list[int]:
     return partners.tolist()
 
 
-def count_votes(areas: Sequence[PhotoAreas], views: Sequence[View], index: int) -> Votes:
-    """Count the votes of other photos in the directions of a photo's blank areas."""
+def count_votes(areas: Sequence[PhotoAreas], views: Sequence[View], index: int) -> FloatArray:
+    """Count the votes (3, A) of other photos for each blank area: as blank, as open, as behind a nearer surface."""
     own, view = areas[index], views[index]
     height, width = own.labels.shape
     y, x = np.nonzero(own.blank)
@@ -169,7 +148,7 @@ def count_votes(areas: Sequence[PhotoAreas], views: Sequence[View], index: int) 
         visible, cell = _find_cells(rays, views[number], areas[number].labels.shape)
         blank, known = areas[number].blank[cell], areas[number].known[cell]
         counts[:, visible] += np.stack([blank, ~blank & ~known, known])
-    return Votes(np.stack([np.bincount(own.labels[y, x], row, len(own.size)) for row in counts]))
+    return np.array([np.bincount(own.labels[y, x], row, len(own.size)) for row in counts], np.float64)
 
 
 def _find_cells(
@@ -184,31 +163,26 @@ def _find_cells(
     return visible, (row[visible], column[visible])
 
 
-def find_skies(areas: Sequence[PhotoAreas], votes: Sequence[Votes]) -> list[BoolArray]:
-    """Return the sky cells (h, w) of each photo; none if the votes do not show that the scene has a sky.
-
-    A sky needs agreement among the votes, and votes from enough views.
-    """
+def find_skies(areas: Sequence[PhotoAreas], votes: Sequence[FloatArray]) -> list[BoolArray]:
+    """Return the sky cells (h, w) of each photo; none if the votes do not show that the scene has a sky."""
     large = [one.at_border & (one.size >= OPTIONS.least_share * one.labels.size) for one in areas]
-    counts = sum((vote.counts[:, own].sum(axis=1) for vote, own in zip(votes, large, strict=True)), np.zeros(3))
+    counts = sum((vote[:, own].sum(axis=1) for vote, own in zip(votes, large, strict=True)), np.zeros(3))
+    # a sky needs agreement among the votes, and votes from enough views
     blank, other, nearer = counts
     if not blank or blank < OPTIONS.agreeing * (blank + other) or blank < OPTIONS.visible * (blank + other + nearer):
         return [np.zeros(one.labels.shape, bool) for one in areas]
     return [_sky_of(*one) for one in zip(areas, votes, large, strict=True)]
 
 
-def _sky_of(areas: PhotoAreas, votes: Votes, large: BoolArray) -> BoolArray:
+def _sky_of(areas: PhotoAreas, votes: FloatArray, large: BoolArray) -> BoolArray:
     """Return the sky cells of a photo: large areas at its border, and other areas as bright as these."""
-    far = votes.blank_share >= OPTIONS.least_visible
+    far = votes[0] / np.maximum(votes.sum(axis=0), 1) >= OPTIONS.least_visible
     sure = large & far
     if not sure.any():
         return np.zeros(areas.labels.shape, bool)
     sky = far & (sure | (areas.gray >= areas.gray[sure].min() - OPTIONS.darker))
     sky[0] = False
     return np.asarray(sky[areas.labels])
-
-
-# The pixels of a sky, given its cells: up to the outlines of the objects before it.
 
 
 def sky_pixels(photo: GrayImage, cells: BoolArray) -> BoolArray:
@@ -218,7 +192,11 @@ def sky_pixels(photo: GrayImage, cells: BoolArray) -> BoolArray:
     expected = cv2.resize(_continue_sky(photo, cells), photo.shape[::-1])
     smooth = cv2.GaussianBlur(photo.astype(np.float32), (3, 3), 0)  # a median would swallow wires
     sky = near_pixels(cells, photo.shape) & (np.abs(smooth - expected) <= OPTIONS.tolerance)
-    return _widen(sky, OPTIONS.blur_px) & ~_find_narrow_rims(sky)
+    objects, window = ~sky, np.ones((OPTIONS.narrow_px, OPTIONS.narrow_px), np.uint8)
+    broad = cv2.morphologyEx(objects.view(np.uint8), cv2.MORPH_OPEN, window) > 0
+    # narrow objects before the sky, such as branches, keep their depths with a rim
+    narrow = _widen(objects & ~_widen(broad, OPTIONS.bump_px), OPTIONS.rim_px)
+    return _widen(sky, OPTIONS.blur_px) & ~narrow
 
 
 def near_pixels(cells: BoolArray, shape: tuple[int, ...]) -> BoolArray:
@@ -248,15 +226,6 @@ def _blur(values: FloatArray) -> FloatArray:
     return np.asarray(cv2.GaussianBlur(values, (0, 0), OPTIONS.reach * max(values.shape)), np.float64)
 
 
-def _find_narrow_rims(sky: BoolArray) -> BoolArray:
-    """Mark narrow objects before the sky, such as branches, with their rim."""
-    objects = ~sky
-    window = np.ones((OPTIONS.narrow_px, OPTIONS.narrow_px), np.uint8)
-    broad = cv2.morphologyEx(objects.view(np.uint8), cv2.MORPH_OPEN, window) > 0
-    return _widen(objects & ~_widen(broad, OPTIONS.bump_px), OPTIONS.rim_px)
-
-
 def _widen(mask: BoolArray, pixels: int) -> BoolArray:
-    """Dilate a mask by a number of pixels."""
     side = 2 * pixels + 1
     return np.asarray(cv2.dilate(mask.view(np.uint8), np.ones((side, side), np.uint8)) > 0)

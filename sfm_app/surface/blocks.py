@@ -37,7 +37,6 @@ POINTS = "points"
 BLOCKS = "blocks"
 """Folder beside the surface while its blocks are made."""
 EVERYWHERE = np.array([[-np.inf] * 3, [np.inf] * 3])
-"""Infinite bounds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,22 +98,17 @@ def sort_points(
             (unfinished / str(number)).touch()
         for start in range(0, len(points), chunk):
             part = np.asarray(points[start : start + chunk])
-            _add(part, partition.find_blocks(positions(part)), unfinished, count)
+            numbers = partition.find_blocks(positions(part))
+            ends = np.cumsum(np.bincount(numbers, minlength=count))
+            for number, records in enumerate(np.split(part[np.argsort(numbers, kind="stable")], ends[:-1])):
+                with (unfinished / str(number)).open("ab") as file:
+                    file.write(records.tobytes())
         move(unfinished, place)
     blocks = BlockPoints(place, points.dtype, np.empty((count, 2, 3)))
     for number in range(count):
         own = positions(blocks.read(number))
         blocks.bounds[number] = own.min(axis=0, initial=np.inf), own.max(axis=0, initial=-np.inf)
     return blocks
-
-
-def _add(records: NDArray[np.void], numbers: NDArray[np.intp], folder: Path, count: int) -> None:
-    """Add records to the files of their blocks, in their order."""
-    ends = np.cumsum(np.bincount(numbers, minlength=count))
-    parts: Sequence[NDArray[np.void]] = np.split(records[np.argsort(numbers, kind="stable")], ends[:-1])
-    for number, part in enumerate(parts):
-        with (folder / str(number)).open("ab") as file:
-            file.write(part.tobytes())
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +132,6 @@ class RecordCells:
 
 
 def _normals(records: NDArray[np.void]) -> FloatArray:
-    """Return the normals (N, 3) of records."""
     return np.stack([records[f"n{c}"] for c in "xyz"], axis=1).astype(np.float64)
 
 
@@ -148,10 +141,8 @@ def with_halo(bounds: FloatArray, cell: float) -> FloatArray:
 
 
 def span_surface(records: NDArray[np.void], bounds: FloatArray, cube: Cube, place: Path) -> tuple[Surface, int]:
-    """Return Poisson's surface of records (N,) within bounds (2, 3), and the number of triangles of all of it.
-
-    Two more points enlarge the cube of the octree until its cells have the size of `cube`.
-    """
+    """Return Poisson's surface of records (N,) within bounds (2, 3), and the number of triangles of all of it."""
+    # two more points enlarge the cube of the octree until its cells have the size of `cube`
     anchors = np.zeros(2, records.dtype)
     for axis, letter in enumerate("xyz"):
         anchors[letter] = cube.anchors[:, axis]
@@ -175,9 +166,7 @@ class SurfaceJudge:
     normals: NDArray[np.float64]
     """(V, 3)."""
     clusters: Clusters
-    """Clusters of the vertices."""
     dense_dir: Path
-    """Folder with undistorted photos and their maps."""
     tolerance: float
     """Relative difference in depth within which a photo confirms a vertex."""
 
@@ -238,9 +227,7 @@ class BlockTask:
     """Input of one block besides the files, for any process."""
 
     folder: Path
-    """Folder of its files."""
     points: BlockPoints
-    """Points of all blocks."""
     dense_dir: Path
     originals: Originals
     views: Sequence[View]
@@ -276,15 +263,7 @@ def mesh_in_blocks(
     dense_dir: Path, originals: Originals, views: Sequence[View], points: NDArray[np.void], least: float,
     run: RunContext,
 ) -> Surface:  # fmt: skip
-    """Return the surface of all points, made block by block.
-
-    Args:
-        points: (N,) records of the fused points.
-        least: photos that have to confirm the average vertex of a part.
-
-    Raises:
-        ReconstructionError: there is no surface.
-    """
+    """Return the surface of all points, block by block; `least` photos confirm the average vertex of a part."""
     options = run.settings.mesh
     folder = run.workspace.surface / BLOCKS
     made_from = fingerprint(run.fingerprint, len(points), options.model_dump())

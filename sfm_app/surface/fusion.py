@@ -41,7 +41,6 @@ class FusionTask:
 
     dense_dir: Path
     folder: Path
-    """Folder of its files."""
     number: int
     views: Sequence[View]
     """Photos with depths in the block."""
@@ -50,7 +49,6 @@ class FusionTask:
     min_views: int
     """Photos that have to see a point."""
     memory_gb: float
-    """Memory for maps."""
 
     @property
     def path(self) -> Path:
@@ -108,9 +106,11 @@ def fuse_block(task: FusionTask) -> None:
         return
     # a worker that was cut off from a cluster may still be at the same block
     scratch = Path(tempfile.mkdtemp(dir=task.folder, prefix=f"{task.number}-"))
-    link_tree(task.dense_dir / "sparse", scratch / "sparse")
-    (scratch / "images").mkdir()
-    (scratch / "stereo").mkdir()
+    for folder in ("sparse", "images", "stereo"):
+        (scratch / folder).mkdir()
+    for path in sorted((task.dense_dir / "sparse").iterdir()):
+        if path.is_file():
+            share_bytes(path, scratch / "sparse" / path.name)
     for view in task.views:
         for file in (Path("images") / view.name, normals_file(Path(), view)):
             (scratch / file).parent.mkdir(parents=True, exist_ok=True)
@@ -135,7 +135,10 @@ def _cache_gb(views: Sequence[View], memory_gb: float) -> float:
 def sample_points(dense_dir: Path, view: View) -> FloatArray:
     """Return points (N, 3) of every `STRIDE`-th row and column of a map."""
     depth = read_depth(dense_dir, view, "geometric")[::STRIDE, ::STRIDE]
-    points = world_points(view, depth, STRIDE)
+    rows, columns = depth.shape
+    x, y = np.meshgrid(STRIDE * np.arange(columns) + view.sample_px, STRIDE * np.arange(rows) + view.sample_px)
+    rays = np.stack([x, y, np.ones_like(x)], axis=2) @ np.linalg.inv(view.K).T
+    points: FloatArray = (rays * depth[..., None] - view.t) @ view.R
     return points[depth > 0]
 
 
@@ -150,22 +153,6 @@ def is_near(view: View, depth: NDArray[np.float32], box: FloatArray) -> NDArray[
         place = ray * depth + np.float32(center)
         near &= (place >= np.float32(box[0, axis]) - beyond) & (place <= np.float32(box[1, axis]) + beyond)
     return near
-
-
-def world_points(view: View, depth: NDArray[np.float32], step: int) -> FloatArray:
-    """Return the points (H, W, 3) of the depths (H, W) of a photo."""
-    rows, columns = depth.shape
-    x, y = np.meshgrid(step * np.arange(columns) + view.sample_px, step * np.arange(rows) + view.sample_px)
-    rays = np.stack([x, y, np.ones_like(x)], axis=2) @ np.linalg.inv(view.K).T
-    return np.asarray((rays * depth[..., None] - view.t) @ view.R)
-
-
-def link_tree(source: Path, target: Path) -> None:
-    """Copy the files of a folder; they share their bytes where the system can."""
-    target.mkdir(parents=True)
-    for path in sorted(source.iterdir()):
-        if path.is_file():
-            share_bytes(path, target / path.name)
 
 
 def _stamp(dense_dir: Path, view: View) -> int:

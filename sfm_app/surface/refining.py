@@ -60,11 +60,7 @@ def refine_surface(
     surface: Surface, originals: Originals, views: Sequence[View], partners: Partners, options: MeshSettings,
     spread: Spread = map,
 ) -> Refinement:  # fmt: skip
-    """Return a surface with the detail of the photos.
-
-    Raises:
-        BackendError: a photo cannot be read.
-    """
+    """Return a surface with the detail of the photos; a BackendError says that a photo cannot be read."""
     photos = originals.read(views, options.max_image_size_px, spread)
     number = {view.name: k for k, view in enumerate(views)}
     chosen = [[number[name] for name in partners[view.name] if name in number][:PARTNERS] for view in views]

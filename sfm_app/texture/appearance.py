@@ -45,9 +45,7 @@ class GainOptions:
     darkest: int = 8
     """Darker gray levels are nearly clipped and do not determine the gain."""
     brightest: int = 247
-    """Brighter gray levels are nearly clipped and do not determine the gain."""
     rounds: int = 15
-    """Rounds of reweighting."""
     prior: float = 0.01
     """Weight of "no gain", as a share of the mean weight of a photo: keeps undetermined gains at 1."""
 
@@ -70,7 +68,6 @@ def median(values: FloatArray, count: int) -> float:
 
 
 # Outlier views, which do not show the surface: passers-by, cars, leaves, reflections.
-#
 # If at least three photos show a triangle, a color far from their median is not the surface's. A single triangle
 # may deviate by chance, but a person covers many triangles, so deviations are averaged over neighbors. After Sinha
 # et al. 2008 and Waechter et al. 2014 (section 3.1), with medians in place of their Gaussian.
@@ -108,10 +105,7 @@ def _measure_deviations(
     level: FloatArray,
     far: FloatArray,
 ) -> None:
-    """Write the largest deviations `far` over the channels from the median color of a triangle with views `here`.
-
-    `scale` (P, 3) are factors on the colors of each photo; `level` is a buffer.
-    """
+    """Write the largest deviations `far` of the views `here` from their median color; `level` is a buffer."""
     count = len(here)
     far[:count] = 0.0
     for channel in range(3):
@@ -148,7 +142,6 @@ def _deviations(
 
 @kernel
 def _average_neighbors(before: NDArray[np.float32], beside: IndexArray, after: NDArray[np.float32]) -> None:
-    """Average over each triangle and its visible neighbors."""
     for f in range(len(before)):
         total, count = before[f], 1
         for k in range(3):
@@ -182,10 +175,8 @@ def _keep_majority(starts: IndexArray, rows: IndexArray, outlier: BoolArray) -> 
                 outlier[row] = False
 
 
-# Borders without a surface: photos disagree about their color, since each shows another part of the background.
-#
-# Depth maps reach over the outlines of objects, by the same pixels in every photo, so that they agree with each
-# other. But behind the outline each photo shows another part of the background.
+# Borders without a surface: depth maps reach over the outlines of objects, by the same pixels in every photo, so that
+# they agree with each other. But behind the outline each photo shows another part of the background.
 
 
 def doubtful_border(sightings: Sightings, gains: FloatArray, neighbors: IntArray) -> BoolArray:
@@ -207,7 +198,12 @@ def doubtful_border(sightings: Sightings, gains: FloatArray, neighbors: IntArray
         disagreement = _average_known(disagreement, neighbors)
     doubtful = disagreement > max(BORDERS.doubtful * middle, LEVELS)
     cut = _straighten(_grow_from_border(doubtful, neighbors), neighbors)
-    return cut | _crumbs(cut, neighbors)
+    # small connected parts beside the cut
+    part, count = components(np.where(cut, NONE, 0), neighbors)
+    beside_cut = ~cut & ((neighbors != NONE) & cut[neighbors]).any(axis=1)
+    crumb = np.bincount(part[~cut], minlength=count) < BORDERS.crumbs
+    crumb &= np.bincount(part[beside_cut], minlength=count) > 0
+    return np.asarray(cut | (~cut & crumb[part]), np.bool_)
 
 
 @kernel
@@ -235,7 +231,6 @@ def _disagreement(
 
 
 def _average_known(values: FloatArray, neighbors: IntArray) -> FloatArray:
-    """Return (T,) means of the known values of each triangle and its neighbors."""
     known = np.isfinite(values)
     total, count = np.where(known, values, 0.0), known.astype(np.float64)
     for beside in neighbors.T:
@@ -268,17 +263,7 @@ def _straighten(cut: BoolArray, neighbors: IntArray) -> BoolArray:
     return np.asarray(cut, np.bool_)
 
 
-def _crumbs(cut: BoolArray, neighbors: IntArray) -> BoolArray:
-    """Mark (T,) small connected parts beside the cut."""
-    part, count = components(np.where(cut, NONE, 0), neighbors)
-    beside_cut = ~cut & ((neighbors != NONE) & cut[neighbors]).any(axis=1)
-    crumb = np.bincount(part[~cut], minlength=count) < BORDERS.crumbs
-    crumb &= np.bincount(part[beside_cut], minlength=count) > 0
-    return np.asarray(~cut & crumb[part], np.bool_)
-
-
 # Exposure and white balance of the photos, from triangles in several of them.
-#
 # Each photo multiplies every channel by a gain: log c[f, p] = log a[f] + g[p] + noise, for triangle f and photo p.
 # The colors a of the surface are eliminated, the gains g come from iteratively reweighted least squares (Cauchy),
 # so that shadows, highlights and passers-by have little weight.

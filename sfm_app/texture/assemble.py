@@ -14,7 +14,7 @@ from sfm_app.texture.charts import Charts, Layout, absorb_small_charts, block_of
 from sfm_app.texture.facets import NONE, Facets, IntArray, facets
 from sfm_app.texture.pages import CheckedViews, ParallelMap, Store, TexturePlan, fill_background, paint_blocks
 from sfm_app.texture.seams import SQUARE_CORNERS, Blend, blend_weights, level_seams, square_texels, vertex_colors
-from sfm_app.texture.sightings import FaceView, OcclusionTest, Sightings, list_sightings, score_faces, sharpness_factors
+from sfm_app.texture.sightings import FaceView, OcclusionTest, list_sightings, score_faces, sharpness_factors
 from sfm_app.texture.view_selection import choose_photos
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import Model, Rejected, Surface, Texture
@@ -37,7 +37,18 @@ def texture_surface(
     mesh = facets(surface)
 
     def score(photo: int) -> FaceView | Rejected:
-        return _score_photo(f"look{photo}", views[photo], mesh, store, hidden)
+        name, view = f"look{photo}", views[photo]
+        kept = store.recall(name)
+        if kept is not None and "face" in kept:
+            return FaceView(kept["face"], kept["worth"], kept["color"], float(kept["sharpness"]))
+        try:
+            picture, used = store.photo(view), store.usable_pixels(view)
+        except OSError as err:
+            return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
+        face_view = score_faces(view, picture, used, mesh, hidden)
+        face, sharpness = face_view.face, np.array(face_view.sharpness)
+        store.keep(name, {"face": face, "worth": face_view.score, "color": face_view.color, "sharpness": sharpness})
+        return face_view
 
     face_views = spread(score, range(len(views)), "finding visible triangles")
     checked, trimmed = _check_views(face_views, mesh), 0
@@ -67,22 +78,6 @@ def texture_surface(
         },
         "rejected": {view.name: one.reason for view, one in zip(views, rejected, strict=True) if one is not None},
     }
-
-
-def _score_photo(name: str, view: PhotoView, mesh: Facets, store: Store, hidden: OcclusionTest) -> FaceView | Rejected:
-    kept = store.recall(name)
-    if kept is not None and "face" in kept:
-        return FaceView(kept["face"], kept["worth"], kept["color"], float(kept["sharpness"]))
-    try:
-        photo, used = store.photo(view), store.usable_pixels(view)
-    except OSError as err:
-        return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
-    face_view = score_faces(view, photo, used, mesh, hidden)
-    sharpness = np.array(face_view.sharpness)
-    store.keep(
-        name, {"face": face_view.face, "worth": face_view.score, "color": face_view.color, "sharpness": sharpness}
-    )
-    return face_view
 
 
 def _check_views(face_views: Sequence[FaceView | Rejected], mesh: Facets) -> CheckedViews:
@@ -129,21 +124,15 @@ def _plan(
     corners[drawn] += layout.shift[charts.chart_of_face[drawn]][:, None, :]
     page[drawn] = layout.page[charts.chart_of_face[drawn]]
     page[~drawn] = cells[:, 0]
-    allowed = _allowed_weight(blend, checked.sightings, chosen, mesh)
-    return TexturePlan(mesh, checked, chosen, charts, layout, corners, page, block_of_page, cells, blend, allowed)
-
-
-def _allowed_weight(blend: Blend, sightings: Sightings, chosen: IntArray, mesh: Facets) -> NDArray[np.float32]:
-    total = np.zeros(mesh.faces.shape, np.float32)
-    weight = np.zeros(len(mesh.vertices), np.float32)
-    for photo in range(sightings.photos):
+    allowed, weight = np.zeros(mesh.faces.shape, np.float32), np.zeros(len(mesh.vertices), np.float32)
+    for photo in range(checked.sightings.photos):
         part = blend.photo_rows(photo)
         near = mesh.faces_at(blend.vertex[part])
-        near = near[sightings.is_usable(photo, near) | (chosen[near] == photo)]
+        near = near[checked.sightings.is_usable(photo, near) | (chosen[near] == photo)]
         weight[blend.vertex[part]] = blend.weight[part]
-        total[near] += weight[mesh.faces[near]]
+        allowed[near] += weight[mesh.faces[near]]
         weight[blend.vertex[part]] = 0.0
-    return total
+    return TexturePlan(mesh, checked, chosen, charts, layout, corners, page, block_of_page, cells, blend, allowed)
 
 
 def _finish(plan: TexturePlan, finished: Sequence[tuple[NDArray[np.uint8], BoolArray]]) -> Model:

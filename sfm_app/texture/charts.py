@@ -15,7 +15,6 @@ from sfm_app.texture.views import project
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 # Charts: connected triangles of one photo, laid out by their projection in that photo.
-#
 # The photo is the parametrization: nothing is stretched, and a texel is a pixel. Triangles that a photo sees do not
 # overlap in it, except at the rims of occluders; overlapping triangles get charts of their own.
 
@@ -37,7 +36,6 @@ class LayoutOptions:
     most_layers: int = 4
     """Layers of overlapping triangles that are separated; further ones share their pixels."""
     absorb_rounds: int = 3
-    """Most rounds of absorbing small charts."""
     fill: float = 0.7
     """Expected share of a page under charts."""
     scale_step: float = 0.95
@@ -198,7 +196,6 @@ def _list_border_photos(faces: IntArray, neighbors: IntArray, chosen: IntArray, 
 
 @kernel
 def _is_usable(views: Views, photo: int, faces: IntArray) -> bool:
-    """Return whether a photo shows the surface at all triangles."""
     starts, rows, photos, score = views
     for f in faces:
         usable = False
@@ -212,7 +209,6 @@ def _is_usable(views: Views, photo: int, faces: IntArray) -> bool:
 
 
 # Packing of charts onto pages, as in Tetris (Levy et al., SIGGRAPH 2002, section 4).
-#
 # Each chart has a profile of its upper and lower side. It is placed on the horizon of the charts already on the
 # page, as close to the top as possible. Tall charts come first.
 
@@ -234,19 +230,15 @@ class Layout:
 def pack(
     charts: Charts, blocks: IntArray, max_atlas_px: int, max_pages: int, largest_scale: float = 1.0
 ) -> tuple[Layout, IntArray]:
-    """Place charts and rectangles on few pages; reduce the scale of the charts if they do not fit.
+    """Place charts, in pixels of the photos, and rectangles (B, 2) in texels, which are never scaled, on few pages.
 
-    Args:
-        charts: their triangles in pixels of the photos.
-        blocks: (B, 2) widths and heights of rectangles in texels, which are never scaled.
-        max_atlas_px: longest side of a page.
-        max_pages: most pages, exceeded only if the charts do not fit at the least scale.
-        largest_scale: most texels per pixel of the photos.
-
-    Returns:
-        The layout of the charts, and (B, 3) page, x and y of the rectangles.
+    Charts that do not fit are reduced in scale, to the least one; then more pages are used. Return the layout of the
+    charts, and (B, 3) page, x and y of the rectangles.
     """
-    scale = min(largest_scale, float(np.sqrt(OPTIONS.fill * max_pages * max_atlas_px**2 / max(_area(charts), 1.0))))
+    a, b, c = (charts.corners[:, k] for k in range(3))
+    turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    area = float(np.sum(np.abs(turn[charts.chart_of_face != NONE])) / 2)
+    scale = min(largest_scale, float(np.sqrt(OPTIONS.fill * max_pages * max_atlas_px**2 / max(area, 1.0))))
     while True:
         packed = _try_to_pack(charts, blocks, scale, max_atlas_px, max_pages)
         if packed is not None:
@@ -255,13 +247,6 @@ def pack(
             scale *= OPTIONS.scale_step
         else:  # many small charts: their margins fill the pages
             max_pages += 1
-
-
-def _area(charts: Charts) -> float:
-    """Return the area of all charts in square pixels."""
-    a, b, c = (charts.corners[:, k] for k in range(3))
-    turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    return float(np.sum(np.abs(turn[charts.chart_of_face != NONE])) / 2)
 
 
 def _try_to_pack(
@@ -382,11 +367,8 @@ def _find_place(low: IndexArray, high: IndexArray, horizon: IndexArray, limit: i
     return best_x, best_y
 
 
-# Blocks of a large surface have their own pages, so that few pages are in memory while photos are painted.
-
-
 def block_of_faces(mesh: Facets) -> IntArray:
-    """Return the block of each triangle, (T,): equal parts of neighbors along the Morton curve."""
+    """Return the block of each triangle, (T,): equal parts along the Morton curve, painted one after the other."""
     count = len(mesh.faces)
     blocks = max(1, -(-count // OPTIONS.block_triangles))
     block_of = np.empty(count, np.int32)
@@ -397,10 +379,9 @@ def block_of_faces(mesh: Facets) -> IntArray:
 def lay_out(
     charts: Charts, block_of: IntArray, mesh: Facets, options: TextureSettings
 ) -> tuple[Layout, IndexArray, IntArray]:
-    """Give every block (T,) its own pages: place its charts and the squares of triangles without a chart.
+    """Give every block (T,) its own pages, for its charts and the squares of triangles without a chart.
 
-    Returns:
-        The layout; (U, 3) page, x and y of the squares; and (P,) block of each page.
+    Return the layout; (U, 3) page, x and y of the squares; and (P,) block of each page.
     """
     unseen = np.flatnonzero(charts.chart_of_face == NONE)
     faces = [np.flatnonzero(block_of == block) for block in range(int(block_of.max(initial=0)) + 1)]

@@ -27,7 +27,6 @@ class Facets:
     spacing: float
     """Median length of an edge."""
     clusters: Clusters
-    """The triangles in clusters of neighbors."""
     fan_starts: IndexArray
     """(V + 1,) The triangles at vertex v are fans[fan_starts[v]] to fans[fan_starts[v + 1] - 1]."""
     fans: IndexArray

@@ -25,7 +25,6 @@ FindNormals = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.fl
 """Returns the normals (N, 3) of the fine surface near points (N, 3), on the side of directions (N, 3); 0 for none."""
 
 # Texels of a normal map: the tangent frames at their points, and normals in these frames.
-#
 # Tangent, bitangent and normal are interpolated, each by itself, and then normalized, as three.js and Khronos'
 # viewer do. MikkTSpace normalizes none of them, and makes the bitangent from the interpolated two.
 
@@ -36,12 +35,8 @@ def interpolate_frames(
 ) -> tuple[NDArray[np.float32], FloatArray]:
     """Return points (N, 3) and frames (N, 3, 3), of unit rows, of all texels with an owner, row by row.
 
-    Args:
-        owner: (h, W) triangle of each texel in rows of a page, -1 for none.
-        top: the first of these rows.
-        corners: (T, 3, 2) texels.
-        points: (T, 3, 3) corners in the scene.
-        frames: (T, 3, 3, 3) from `corner_frames`.
+    `owner` (h, W) is the triangle of each texel in rows of a page from `top` on, -1 for none. The corners (T, 3, 2) are
+    in texels, the points (T, 3, 3) in the scene; the frames (T, 3, 3, 3) come from `corner_frames`.
     """
     count, n, part = np.count_nonzero(owner != NONE), 0, np.empty(3)
     texel_points, texel_frames = np.empty((count, 3), np.float32), np.empty((count, 3, 3))
@@ -60,7 +55,6 @@ def interpolate_frames(
 
 @kernel
 def _set_frame(part: FloatArray, frames: FloatArray, frame: FloatArray) -> None:
-    """Set the interpolated frame (3, 3) of unit vectors."""
     for row in range(3):
         length = 0.0
         for axis in range(3):
@@ -76,10 +70,7 @@ def _mix(part: FloatArray, values: FloatArray) -> float:
 
 @kernel
 def encode(owner: IntArray, frames: FloatArray, normals: NDArray[np.float32]) -> tuple[NDArray[np.uint8], int]:
-    """Return the texels (h, w, 3) of rows of a normal map, and their number with a normal of the fine surface.
-
-    Normals (N, 3) are in the scene, 0 where the frame's normal stays; the frames (N, 3, 3) are interpolated.
-    """
+    """Return the texels (h, w, 3) of rows of a normal map, and how many have a fine normal (N, 3), not 0."""
     texels = np.empty((*owner.shape, 3), np.uint8)
     n, own, one = 0, 0, np.empty(3)
     for y in range(owner.shape[0]):
@@ -118,10 +109,7 @@ def _span(a: NDArray[np.floating], b: NDArray[np.floating], c: NDArray[np.floati
 
 
 def bake_normals(model: Model, find: FindNormals, spread: ParallelMap, band: int = BAND) -> tuple[Model, float]:
-    """Return a model with normal maps, and the share of chart texels with a normal of the fine surface.
-
-    The normals of the light surface stay elsewhere, and on triangles without a photo. `band` texels are baked at once.
-    """
+    """Return a model with normal maps, `band` texels at once, and the share of chart texels with a fine normal."""
     texture = model.texture
     if texture is None:
         return model, 0.0

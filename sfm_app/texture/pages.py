@@ -53,8 +53,6 @@ class Store(Protocol):
         """Keep arrays, by their names, under the name of a group, replacing it, complete or not at all."""
 
 
-# Painting of photos onto the texels of the pages.
-#
 # First every texel gets an owner: the triangle around it or, in the margin of a chart, the nearest one. Then each
 # photo adds its share to the texels of its triangles. The texel's point on the surface is projected through pose and
 # lens, and the photo is sampled there, so photos are resampled only once.
@@ -73,15 +71,7 @@ class Canvas:
 def owners(
     size: tuple[int, int], triangles: IndexArray, corners: FloatArray, spread: Spread = map, band: int = BAND
 ) -> IntArray:
-    """Return (H, W) the triangle of each texel of a page, -1 for none.
-
-    Args:
-        size: (width, height) of the page.
-        triangles: (N,) indices of the page's triangles.
-        corners: (T, 3, 2) texels.
-        spread: applies a function to parts of the page, possibly in parallel.
-        band: rows of a part.
-    """
+    """Return (H, W) the triangle of each texel of a page (W, H), -1 for none; corners (T, 3, 2) are in texels."""
     owner = np.full((size[1], size[0]), NONE, np.int32)
 
     def claim(top: int) -> None:
@@ -142,19 +132,11 @@ def paint(  # noqa: PLR0913
     owner: IntArray,
     total: IntArray,
 ) -> None:
-    """Add one photo to a page.
+    """Add one photo (height, width, 3) to a page, with its camera row at this size.
 
-    Args:
-        photo: (height, width, 3) RGB.
-        camera: (26,) lens and pose of the photo at this size.
-        brightness: (3,) factors, the inverse of the photo's gains.
-        triangles: (N,) indices of the page's triangles with a share of the photo.
-        corners: (T, 3, 2) texels.
-        points: (N, 3, 3) corners in the scene.
-        shares: (N, 3, 4) weight of the photo at each corner, and offsets of its channels in gray levels.
-        rims: (N, 3) whether no triangle is visible across the edge from corner k to k + 1.
-        owner: (H, W) of the page.
-        total: (H, W, 3) of the page.
+    `triangles` (N,) are those of the page with a share of the photo, `shares` (N, 3, 4) its weight at each corner and
+    the offsets of its channels in gray levels, `rims` (N, 3) edges from corner k to k + 1 without a visible triangle
+    across. The brightness is the inverse of the gains. Corners (T, 3, 2) are in texels, points (N, 3, 3) in the scene.
     """
     height, width = owner.shape
     part, least = np.empty(3), np.empty(3)
@@ -251,7 +233,6 @@ def _finish_page(page: Canvas) -> Page:
 
 @kernel
 def _round_levels(total: IntArray, rounded: NDArray[np.uint8]) -> None:
-    """Fill in the gray levels of weighted sums."""
     for y in range(total.shape[0]):
         for x in range(total.shape[1]):
             for channel in range(3):
@@ -260,10 +241,7 @@ def _round_levels(total: IntArray, rounded: NDArray[np.uint8]) -> None:
 
 
 def fill_background(page: NDArray[np.uint8], painted: BoolArray) -> NDArray[np.uint8]:
-    """Fill unpainted texels of a page (H, W, 3) with the mean painted color of the smallest block around them.
-
-    The blocks are those of mipmaps, so a page downsampled by a viewer keeps its colors up to the rims of the charts.
-    """
+    """Fill unpainted texels with the mean painted color of the smallest block around them, as mipmaps have it."""
     if painted.all() or min(page.shape[:2]) < 2:
         return page
     shape = page.shape[0] // 2, page.shape[1] // 2
@@ -293,7 +271,6 @@ def _average_blocks(page: NDArray[np.uint8], painted: BoolArray, means: NDArray[
 
 @kernel
 def _fill_gaps(coarse: NDArray[np.uint8], painted: BoolArray, page: NDArray[np.uint8]) -> None:
-    """Give texels without an owner the color of their block."""
     for y in range(page.shape[0]):
         for x in range(page.shape[1]):
             if not painted[y, x]:
@@ -301,9 +278,6 @@ def _fill_gaps(coarse: NDArray[np.uint8], painted: BoolArray, page: NDArray[np.u
                     page[y, x, channel] = coarse[
                         min(y // 2, coarse.shape[0] - 1), min(x // 2, coarse.shape[1] - 1), channel
                     ]
-
-
-# Checkpoints of the pages of a block.
 
 
 @dataclass(frozen=True, slots=True)
@@ -348,9 +322,6 @@ class Pages:
         self._store.keep(GROUP_NAME, {"block": np.array(self._block), "has": self.has, **totals})
         end = time.monotonic()
         self._due_s = end + max(CHECKPOINTS.every_s, (end - start) / CHECKPOINTS.most_time)
-
-
-# The plan of a texture, and its pages painted block by block.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -424,7 +395,6 @@ def _new_canvas(number: int, plan: TexturePlan, spread: ParallelMap) -> Canvas:
 
 
 def _blocks_of_photos(plan: TexturePlan) -> list[set[int]]:
-    """Return, for each photo, the blocks with its triangles."""
     block_sets = []
     for photo in range(plan.checked.sightings.photos):
         near = plan.mesh.faces_at(plan.blend.vertex[plan.blend.photo_rows(photo)])

@@ -39,7 +39,6 @@ class SeamOptions:
 OPTIONS = SeamOptions()
 
 # Blending near seams: weights of the photos at the vertices, and offsets that remove color differences.
-#
 # The weight of a photo at a vertex starts as its share of the vertex's triangles. It is diffused over a few rings
 # of vertices with usable views. Where two photos meet at a vertex, slowly varying offsets make their colors equal
 # (Lempitsky & Ivanov 2007; Waechter et al. 2014, section 3.2).
@@ -84,31 +83,24 @@ def blend_weights(chosen: IntArray, sightings: Sightings, mesh: Facets) -> Blend
 def _photo_weights(
     photo: int, own: IndexArray, chosen: IntArray, sightings: Sightings, mesh: Facets, degree: IndexArray
 ) -> tuple[IndexArray, FloatArray]:
-    """Return the vertices (N,) near the `own` triangles of a photo, ascending, and its share (N,) at each.
-
-    `degree` (V,) is the number of edges at each vertex.
-    """
+    """Return the vertices (N,) near the `own` triangles of a photo, ascending, and its share; degrees are (V,)."""
     at = distinct(mesh.faces[own].ravel(), len(mesh.vertices))
     for _ in range(OPTIONS.rings):
         at = distinct(mesh.faces[mesh.faces_at(at)].ravel(), len(mesh.vertices))
     near = mesh.faces_at(at)
-    allowed = np.isin(near, sightings.usable_faces(photo), assume_unique=True) | np.isin(chosen[near], (photo, NONE))
+    rows = sightings.rows(photo)
+    usable = sightings.face[rows][sightings.score[rows] > 0].astype(np.int64)
+    allowed = np.isin(near, usable, assume_unique=True) | np.isin(chosen[near], (photo, NONE))
     corners = np.searchsorted(at, mesh.faces[near][~allowed].ravel()).clip(max=max(len(at) - 1, 0))
     barred = np.zeros(len(at), np.bool_)
     barred[corners[at[corners] == mesh.faces[near][~allowed].ravel()]] = True
     count = np.bincount(np.searchsorted(at, mesh.faces[own].ravel()), minlength=len(at)).astype(np.float64)
     share = count / np.maximum(mesh.valence[at], 1.0)
-    edges = np.searchsorted(at, mesh.edges[mesh.edges_among(at)])
+    one, other = np.searchsorted(at, mesh.edges[mesh.edges_among(at)]).T
     for _ in range(OPTIONS.rings):
-        share = np.where(barred, 0.0, _spread(share, edges, degree[at]))
+        total = np.bincount(one, share[other], len(share)) + np.bincount(other, share[one], len(share))
+        share = np.where(barred, 0.0, 0.5 * share + 0.5 * total / degree[at])
     return at, share
-
-
-def _spread(share: FloatArray, edges: IndexArray, degree: IndexArray) -> FloatArray:
-    """Average each value with the mean of its neighboring vertices."""
-    one, other = edges[:, 0], edges[:, 1]
-    total = np.bincount(one, share[other], len(share)) + np.bincount(other, share[one], len(share))
-    return np.asarray(0.5 * share + 0.5 * total / degree, np.float64)
 
 
 def level_seams(blend: Blend, sightings: Sightings, gains: FloatArray, mesh: Facets) -> Blend:
@@ -127,15 +119,7 @@ def level_seams(blend: Blend, sightings: Sightings, gains: FloatArray, mesh: Fac
 def solve_ties(
     one: IndexArray, other: IndexArray, weights: FloatArray, hold: float | FloatArray, right: FloatArray
 ) -> FloatArray:
-    """Solve (graph Laplacian + hold) x = right (N, 3) by conjugate gradients.
-
-    Args:
-        one: (E,) node at one end of each edge of the graph.
-        other: (E,) node at the other end.
-        weights: (E,) of the edges.
-        hold: added to the diagonal, > 0 somewhere in each connected part; a number or (N,).
-        right: (N, 3) right-hand sides.
-    """
+    """Solve (graph Laplacian of the edges + hold) x = right (N, 3) by conjugate gradients; hold is a number or (N,)."""
     from scipy.sparse import coo_matrix
 
     size = len(right)
@@ -152,10 +136,7 @@ def _solve(
     starts: NDArray[np.int32], others: NDArray[np.int32], weights: FloatArray, diagonal: FloatArray, right: FloatArray,
     x: FloatArray,
 ) -> None:  # fmt: skip
-    """Solve (diagonal - weights) x = right by conjugate gradients from x = 0, scaled by the diagonal.
-
-    At most 100 steps, until the norm of the preconditioned residual is 1 % of its initial value.
-    """
+    """Solve (diagonal - weights) x = right by at most 100 steps of conjugate gradients, scaled by the diagonal."""
     size, channels = len(right), 3
     residual, direction, product = right.copy(), np.empty_like(right), np.empty_like(right)
     tolerance, step = np.zeros(channels), np.zeros(channels)
@@ -216,12 +197,9 @@ def _multiply(
 def _gaps(
     blend: Blend, sightings: Sightings, gains: FloatArray, mesh: Facets
 ) -> tuple[IndexArray, IndexArray, FloatArray]:
-    """Find nodes where two photos meet at a vertex, and their color differences.
+    """Return (M,) nodes where photos meet, (M,) the heaviest node there, and (M, 3) its color minus that of the first.
 
     Colors are compared on triangles at the vertex with usable views of both photos; pairs without any are omitted.
-
-    Returns:
-        (M,) node, (M,) node of the largest weight at its vertex, and (M, 3) color of the latter minus the former.
     """
     others, heads = _seam_pairs(blend, len(mesh.vertices))
     photo_of = np.repeat(np.arange(sightings.photos), np.diff(blend.starts))
@@ -275,14 +253,8 @@ def _ties(blend: Blend, mesh: Facets) -> tuple[IndexArray, IndexArray]:
     return np.concatenate(start), np.concatenate(end)
 
 
-# Triangles without a photo: colors from the surrounding triangles, and a square of texels for each.
-
-
 def vertex_colors(mesh: Facets, painted: BoolArray, corner_colors: FloatArray) -> FloatArray:
-    """Compute colors (V, 3) in 0..255 of all vertices, diffused from painted triangles (T,) to the others.
-
-    `corner_colors` (S, 3, 3) are RGB at the corners of the painted triangles. Parts without any keep their colors.
-    """
+    """Compute colors (V, 3) in 0..255, diffused from painted triangles and their corners (S, 3, 3) to the others."""
     faces, size = mesh.faces[painted], len(mesh.vertices)
     count = np.bincount(faces.ravel(), minlength=size)
     sums = [np.bincount(faces.ravel(), corner_colors[..., channel].ravel(), size) for channel in range(3)]
@@ -318,10 +290,7 @@ def block_sizes(triangles: int) -> NDArray[np.int32]:
 
 
 def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int) -> IndexArray:
-    """Return (N, 3) page, x and y of the square of each triangle, row by row through the blocks.
-
-    `places` (B, 3) are page, left and top of each block, in texels; `sizes` (B, 2) come from `block_sizes`.
-    """
+    """Return (N, 3) page, x and y of the square of each triangle, row by row through blocks at (B, 3) page, x, y."""
     parts = [np.empty((0, 3), np.int64)]
     for number, ((page, left, top), (width, _)) in enumerate(zip(places, sizes, strict=True)):
         count = min(triangles - number * BLOCK * BLOCK, BLOCK * BLOCK)

@@ -279,11 +279,6 @@ class Sightings:
         row = self.find(photos, faces)
         return np.asarray((row != NONE) & (self.score[row] > 0)) if len(self.score) else np.zeros(row.shape, np.bool_)
 
-    def usable_faces(self, photo: int) -> IndexArray:
-        """Return (M,) the triangles with a usable view in a photo, ascending."""
-        rows = self.rows(photo)
-        return self.face[rows][self.score[rows] > 0].astype(np.int64)
-
     def select_triangles(self, selected: BoolArray) -> "Sightings":
         """Return the views of selected triangles (T,), renumbered."""
         rows = selected[self.face]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sfm_app.jit import kernel
 from sfm_app.texture.facets import NONE, Facets, IntArray
 from sfm_app.texture.sightings import Sightings
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import IndexArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,9 +39,13 @@ def choose_photos(sightings: Sightings, mesh: Facets) -> IntArray:
     labels, values = np.full((triangles, candidates), NONE, np.int32), np.zeros((triangles, candidates), np.float32)
     _keep_best(sightings.starts, sightings.face, sightings.score, labels, values)
     loss = np.log(np.maximum(values[:, :1], 1e-30) / np.maximum(values, 1e-30))
-    size = _relative_size(mesh)[:, None]
+    corners, spacing = mesh.vertices[mesh.faces], max(mesh.spacing, 1e-300)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    # square root of each triangle's area relative to an equilateral one with median edges
+    size = np.sqrt(0.5 * np.linalg.norm(across, axis=1) / (np.sqrt(3.0) / 4.0 * spacing**2))[:, None]
     cost = (OPTIONS.price_of_detail * size * np.minimum(loss, OPTIONS.max_loss)).astype(np.float32)
-    price = _edge_prices(mesh)
+    # (T, 3) lengths of the edges from corner k to k + 1, in median edge lengths
+    price = np.asarray(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2) / spacing, np.float32)
     # (T, 3) the column of each triangle in its neighbor's row of `neighbors`
     own = np.arange(triangles)[:, None, None]
     back = np.asarray(np.argmax(mesh.neighbors[mesh.neighbors] == own, axis=2), np.int32)
@@ -57,21 +61,6 @@ def choose_photos(sightings: Sightings, mesh: Facets) -> IntArray:
         if not _improve(labels, cost, mesh.neighbors, price, chosen):
             break
     return chosen
-
-
-def _relative_size(mesh: Facets) -> FloatArray:
-    """Return (T,) square root of each triangle's area relative to an equilateral one with median edges."""
-    corners = mesh.vertices[mesh.faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    equilateral = np.sqrt(3.0) / 4.0 * max(mesh.spacing, 1e-300) ** 2
-    return np.asarray(np.sqrt(0.5 * np.linalg.norm(across, axis=1) / equilateral), np.float64)
-
-
-def _edge_prices(mesh: Facets) -> NDArray[np.float32]:
-    """Return (T, 3) lengths of the edges from corner k to k + 1, in median edge lengths."""
-    corners = mesh.vertices[mesh.faces]
-    lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-    return np.asarray(lengths / max(mesh.spacing, 1e-300), np.float32)
 
 
 @kernel
@@ -116,10 +105,7 @@ def _pass_messages(
     messages: NDArray[np.float32],
     forward: bool,
 ) -> None:
-    """Pass messages once; messages[f, k] is the message from neighbor k of f about the labels of f.
-
-    `beside` has the neighbors, the column of each triangle in its neighbor's row, and the labels that both have.
-    """
+    """Pass messages once; messages[f, k] is the message from neighbor k of f about the labels of f."""
     neighbors, back, same = beside
     triangles, count = labels.shape
     belief, rest = np.empty(count), np.empty(count)

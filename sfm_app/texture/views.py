@@ -84,11 +84,7 @@ class PhotoView:
 
 
 def photo_view(name: str, camera: CameraModel, cam_from_world: FloatArray) -> PhotoView:
-    """Return the view of a registered photo with the pose [R | t] (3, 4).
-
-    Raises:
-        ReconstructionError: the camera is of no model in `KINDS`; every run writes its cameras as one of these.
-    """
+    """Return the view of a photo with the pose [R | t] (3, 4); a ReconstructionError names an unknown camera model."""
     if camera.model not in KINDS:
         raise ReconstructionError(f"texturing does not support the camera model {camera.model}")
     kind, columns = KINDS[camera.model]
@@ -135,10 +131,7 @@ def _largest_angle(camera: FloatArray, width: float, height: float) -> float:
 
 @kernel
 def project(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Project a world point through a camera row (26,): its pixel, and its depth or, for a fisheye, its distance.
-
-    All are 0 if the point is invisible: behind the camera, or outside the valid range of the distortion.
-    """
+    """Project a world point through a camera row: pixel, and depth or, of a fisheye, distance; 0 if invisible."""
     depth = camera[22] * x + camera[23] * y + camera[24] * z + camera[25]
     u = camera[14] * x + camera[15] * y + camera[16] * z + camera[17]
     v = camera[18] * x + camera[19] * y + camera[20] * z + camera[21]

@@ -154,12 +154,7 @@ def correlation_key(first: str, second: str) -> str:
 
 
 def named_correlations(names: Sequence[str], covariance: NDArray[np.float64]) -> dict[str, float]:
-    """Return the correlation of each pair of parameters, from -1 to 1, by `correlation_key` in order of the names.
-
-    Args:
-        names: (n,) of the parameters.
-        covariance: (n, n); parameters without a finite variance > 0 are left out.
-    """
+    """Return the correlations of parameters with variances > 0, by `correlation_key`, from a covariance (n, n)."""
     variances = np.diag(covariance)
     known = [k for k in range(len(names)) if np.isfinite(variances[k]) and variances[k] > 0.0]
     correlations = {}

@@ -27,7 +27,6 @@ class EpipolarFit:
     priors: NDArray[np.float64]
     """(N,) in [0, 1] per match: its validity according to the estimator; p(v_i) of the thesis, largest value 1."""
     trials: int
-    """Number of minimal samples drawn."""
     rms_px: float
     """Root mean square Sampson distance of the inliers."""
     degeneracy: str = ""
@@ -41,7 +40,7 @@ class EpipolarFit:
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """The reason why a pair has no usable epipolar geometry. Falsy, so that ``if fit:`` reads well."""
+    """The reason why a result is missing or unusable. Falsy, so that ``if fit:`` reads well."""
 
     reason: str
 
@@ -109,10 +108,7 @@ def _pair(row: NDArray[np.uint32]) -> PairId:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPairs:
-    """Fundamental matrices of pairs with the same camera, and data of each pair.
-
-    Nothing is checked here: a calibrator refuses malformed values with a ValueError, see `selfcal.pairs.prepare`.
-    """
+    """Fundamental matrices of pairs with the same camera, and data of each; `selfcal.pairs.prepare` checks them."""
 
     Fs: NDArray[np.float64]
     """(P, 3, 3) in pixels, x2' F x1 = 0, any scale."""
@@ -129,13 +125,7 @@ class CameraPairs:
 
     @classmethod
     def from_Fs(cls, Fs: ArrayLike, size: tuple[int, int], weights: ArrayLike | None = None) -> "CameraPairs":
-        """Make pairs from matrices alone.
-
-        Args:
-            Fs: (P, 3, 3) in pixels, x2' F x1 = 0, any scale.
-            size: width and height of the photos in pixels.
-            weights: (P,) >= 0; None for equal weights.
-        """
+        """Make pairs from matrices (P, 3, 3) in pixels, x2' F x1 = 0, of any scale; without weights, all are equal."""
         matrices = np.asarray(Fs, np.float64)
         return cls(matrices, np.ones(len(matrices)) if weights is None else np.asarray(weights, np.float64), size)
 
@@ -149,7 +139,6 @@ class PhotoPairs:
     weights: NDArray[np.float64]
     """(P,) >= 0, weight of each F."""
     photos: tuple[PairId, ...]
-    """Per pair the ids of its two photos."""
     inliers: tuple[NDArray[np.float64], ...]
     """Per pair (N, 4) x1, y1, x2, y2 in pixels."""
     sizes: Mapping[int, tuple[int, int]]
@@ -163,10 +152,7 @@ class PhotoPairs:
     bars bring to one size may each be of another camera."""
 
     def with_origins(self, corners: Mapping[int, tuple[int, int]]) -> "PhotoPairs":
-        """Return the pairs with pixels counted from new origins (left, top), given by photo.
-
-        The sizes stay the same.
-        """
+        """Return the pairs with pixels counted from new origins (left, top) by photo; the sizes stay the same."""
         if not corners:
             return self
         at = np.array([[corners.get(photo, (0, 0)) for photo in pair] for pair in self.photos]).reshape(-1, 2, 2)

@@ -33,7 +33,6 @@ class Photo:
     width: int
     """Width in pixels in the sensor's orientation, so that photos of one camera have one size."""
     height: int
-    """Height in pixels."""
     group: str
     """Photos of one group share one camera."""
     exif_focal_px: float | None = None
@@ -45,7 +44,6 @@ class Photo:
     original: str = ""
     """Path inside the folder; empty where it is the name."""
     lossy: bool = True
-    """Whether the file's format is lossy."""
     turn_deg: int = 0
     """Clockwise rotation that makes it upright: 0, 90, 180 or 270."""
     notes: tuple[str, ...] = ()
@@ -92,7 +90,6 @@ class PhotoSet:
     photos: tuple[Photo, ...]
     unusable: tuple[UnusablePhoto, ...] = ()
     masks: Path | None = None
-    """Folder of masks; None where none is given."""
 
     @property
     def groups(self) -> dict[str, tuple[Photo, ...]]:

@@ -115,7 +115,6 @@ class PerspectivePhoto:
     cam_from_world: NDArray[np.float64]
     """(3, 4) [R | t] in the frame of the export; x right, y down, z forward."""
     mask: str = ""
-    """Name of the file of its mask; empty where photos have none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

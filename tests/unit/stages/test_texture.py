@@ -12,7 +12,7 @@ from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import texture
 from sfm_app.stages.texture import FileStore, read_photo, read_texture, save_texture, surface_digest
-from sfm_app.texture import PhotoView
+from sfm_app.texture.views import PhotoView
 from sfm_app.types import CameraModel, Model, Surface, Texture
 
 POSE = np.eye(3, 4)

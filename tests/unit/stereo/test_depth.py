@@ -8,8 +8,7 @@ import pytest
 from sfm_app.stereo import DepthEstimate, DepthMap, confirm_depths, match_depths, rank_neighbors
 from sfm_app.stereo.depth import (
     OPTIONS,
-    count_confirming_maps,
-    count_deeper_maps,
+    count_maps,
     filter_speckles,
     merge_hypotheses,
 )
@@ -166,13 +165,13 @@ def test_true_depths_are_confirmed_and_wrong_ones_are_not(plane, make_view):
     depth[80:100, 100:140] *= 1.05
     depth[100:110, 100:140] = 0
 
-    agreeing = count_confirming_maps(view, depth, maps, 0.01)
+    agreeing = count_maps(view, depth, maps, 0.99, 1.01)
 
     assert not agreeing[80:110, 100:140].any()
     assert np.all(agreeing[30:70, 60:180] == 2)
     assert agreeing.max() == 2
     ahead = make_view((0, 0, 9))  # the plane is behind it
-    assert not count_confirming_maps(view, depth, [(ahead, np.abs(plane.depth(ahead)))], 0.01).any()
+    assert not count_maps(view, depth, [(ahead, np.abs(plane.depth(ahead)))], 0.99, 1.01).any()
 
 
 def test_deeper_maps_are_counted(plane, make_view):
@@ -182,11 +181,11 @@ def test_deeper_maps_are_counted(plane, make_view):
     depth[100:110, 100:140] *= 1.2
     depth[110:115] = 0
 
-    deeper = count_deeper_maps(view, depth, [(other, plane.depth(other))], 0.05)
+    deeper = count_maps(view, depth, [(other, plane.depth(other))], 1.05)
 
     assert deeper[80:100, 100:140].all()
     assert deeper.sum() == 20 * 40
-    assert not count_deeper_maps(view, depth, [(other, np.zeros_like(depth))], 0.05).any()
+    assert not count_maps(view, depth, [(other, np.zeros_like(depth))], 1.05).any()
 
 
 def test_specks_go_and_thin_objects_stay():

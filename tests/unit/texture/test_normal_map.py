@@ -12,7 +12,7 @@ from sfm_app.frame.scale import move_model
 from sfm_app.geometry.poses import Similarity
 from sfm_app.meshing.ray_casting import NearestNormals
 from sfm_app.runtime.parallel import make_executor, ordered_map
-from sfm_app.texture import bake_normals
+from sfm_app.texture.normal_map import bake_normals
 from sfm_app.types import Model, Surface, Texture
 
 HEIGHT, WAVES = 0.008, 25.0
