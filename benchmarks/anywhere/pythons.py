@@ -26,7 +26,7 @@ ABOUT = (
     "`make test-pythons`: the wheel in a new environment outside the tree, with constraints.txt; seconds to install "
     "(what pip has to fetch included), `doctor`, and unit tests that are not slow, from the unpacked sdist."
 )
-TESTS = ("camera_files", "cli", "formats", "geometry", "meshing", "photos", "ransac", "types", "test_public_names.py")
+TESTS = ("camera", "cli", "formats", "geometry", "meshing", "photos", "fundamental", "types", "test_public_names.py")
 """Of tests/unit: files, numbers, kernels, COLMAP, Open3D, OpenCV and the command line, in a minute. Chosen by hand."""
 PLUGINS = ("pytest", "pytest-xdist", "hypothesis", "laspy[lazrs]", "DracoPy", "usd-core", "pillow-heif")
 """What these tests need besides the program."""

@@ -30,11 +30,11 @@ class Group(NamedTuple):
 
 GROUPS: Mapping[str, Group] = {
     "fundamental matrices: scales, samples, stopping": Group(
-        ("ransac",), STRECHA, "synthetic pairs of thesis 4.8, pairs with two motions",
+        ("fundamental",), STRECHA, "synthetic pairs of thesis 4.8, pairs with two motions",
         "benchmarks/README.md, The parts alone; merton1 and temple16 were never tuned on",
     ),
     "chance, degeneracy, watermarks": Group(
-        ("ransac.verification.a_contrario", "ransac.degeneracy"), FIRST_EIGHT,
+        ("fundamental.a_contrario", "fundamental.degeneracy"), FIRST_EIGHT,
         "rendered planes, panoramas and logos", "docs/algorithms.md, All estimators: looked at on all real sets",
     ),
     "photos left out, bare photos": Group(

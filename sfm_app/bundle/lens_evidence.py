@@ -10,9 +10,9 @@ evidence is compared (`family_evidence`).
 """
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import sparse
 
 from sfm_app.bundle.lens_parts import (
     COUNT,
@@ -44,6 +44,10 @@ from sfm_app.camera.projection import (
 )
 from sfm_app.geometry.least_squares import cavity, inverse_of_positive, posteriors
 from sfm_app.types.arrays import BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from scipy import sparse
+
 
 MISFIT = 4.0
 """Ratio of the errors of cameras to those that independent noise explains: lens models are inexact, and errors of
@@ -269,8 +273,10 @@ def _mean_squares(
     return squares
 
 
-def _logarithm_jacobian(params: FloatArray) -> sparse.csr_array:
+def _logarithm_jacobian(params: FloatArray) -> "sparse.csr_array":
     """Return (12C, 12C) derivatives of the parameters by those with log f and log fy/fx in place of fx and fy."""
+    from scipy import sparse
+
     T = sparse.eye_array(params.size, format="lil")
     for camera, values in enumerate(params):
         x, y = CAMERA * camera + FX, CAMERA * camera + FY

@@ -6,19 +6,19 @@ photos that share a point.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import reverse_cuthill_mckee
-from scipy.spatial.transform import Rotation
 
 from sfm_app.camera.projection import CAMERA, PANORAMA, image_points, project_points, wrap_residuals
 from sfm_app.geometry.least_squares import project_to_psd, solve_positive, solve_sparse_positive
 from sfm_app.jit import kernel
 from sfm_app.types.arrays import FloatArray, IndexArray
+
+if TYPE_CHECKING:
+    from scipy import sparse
+
 
 POSE = 6
 """Number of parameters of a pose. By definition."""
@@ -90,6 +90,9 @@ def elimination_width(photo: NDArray[np.int64], point: NDArray[np.int64]) -> flo
     the square of this width for each photo, and the steps of conjugate gradients grow with the length of a street. The
     order is that of Cuthill and McKee: no elimination in it fills more, and orders by nested dissection fill less.
     """
+    from scipy.sparse import coo_array, csr_array
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
     if not len(photo):
         return 0.0
     shape = int(point.max()) + 1, int(photo.max()) + 1
@@ -158,8 +161,10 @@ class Linearized:
         return scores.T
 
 
-def eliminate_points(observed: Linearized, damping: float) -> tuple[sparse.csr_array, FloatArray]:
+def eliminate_points(observed: Linearized, damping: float) -> "tuple[sparse.csr_array, FloatArray]":
     """Return the matrix (6I, 6I) of the poses, and the rows (12C, 6I + 12C) of the cameras, after the points."""
+    from scipy import sparse
+
     photos, cameras, points = observed.counts
     A = np.einsum("nki,nkj->nij", observed.by_point, observed.by_view)
     order = np.lexsort((observed.photo, observed.point))
@@ -190,8 +195,10 @@ def eliminate_points(observed: Linearized, damping: float) -> tuple[sparse.csr_a
     return S, rows
 
 
-def _pairs_of_photos(observed: Linearized) -> sparse.csr_array:
+def _pairs_of_photos(observed: Linearized) -> "sparse.csr_array":
     """Return a matrix (I, I) with an entry for each photo and each pair that shares a point, columns ascending."""
+    from scipy import sparse
+
     photos, _, points = observed.counts
     ones = np.ones(len(observed.photo), np.int32)
     visible = sparse.csr_array((ones, (observed.photo, observed.point)), shape=(photos, points))
@@ -431,6 +438,8 @@ def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
     The covariance of the cameras is noise^2 H^-1. It is accurate where poses and points minimize the cost. The loss is
     COLMAP's SOFT_L1, s^2 (sqrt(1 + |r|^2 / s^2) - 1), with s = `scale_px`.
     """
+    from scipy import sparse
+
     with np.errstate(all="ignore"):
         predicted, by_camera, by_pose, by_point = project(bundle)
         r, by_view = residuals(bundle, predicted), np.concatenate([by_pose, by_camera], 2)
@@ -484,6 +493,8 @@ def apply_step(bundle: Bundle, params: FloatArray, poses: FloatArray, points: Fl
 
     The change of a pose is a rotation vector in the camera's axes, and a shift of t.
     """
+    from scipy.spatial.transform import Rotation
+
     R = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ bundle.R
     return replace(bundle, params=params, R=R, t=bundle.t + poses[:, 3:], X=bundle.X + points)
 

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from sfm_app.bundle.lens_evidence import MISFIT
 from sfm_app.bundle.lens_parts import LOG_ASPECT, LOG_FOCAL, LensPriors, step_cameras
@@ -56,6 +55,8 @@ def project_rows(bundle: Bundle, share: FloatArray, motion: FloatArray) -> RowPr
 
     `motion` (I, 6) is the velocity of each photo, as in `PathVelocities`, times the readout; poses are of middle rows.
     """
+    from scipy.spatial.transform import Rotation
+
     rows, R = bundle.camera[bundle.photo], bundle.R[bundle.photo]
     points = np.einsum("nij,nj->ni", R, bundle.X[bundle.point])
     middle, moves = points + bundle.t[bundle.photo], share[:, None] * motion[bundle.photo]
@@ -71,6 +72,8 @@ def project_rows(bundle: Bundle, share: FloatArray, motion: FloatArray) -> RowPr
 
 def move_to_middle_row(points: FloatArray, share: FloatArray, motion: FloatArray) -> FloatArray:
     """Return points (N, 3) of a camera's frame at the times of their rows (N,) as they are at its middle row."""
+    from scipy.spatial.transform import Rotation
+
     moved = share[:, None] * motion
     return np.asarray(Rotation.from_rotvec(moved[:, :3]).inv().apply(points) - moved[:, 3:], np.float64)
 
@@ -125,6 +128,8 @@ def _fit_windows(
     R: FloatArray, t: FloatArray, times: FloatArray, count: int, degree: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return velocities (I, 6) of photos sorted by time, and the errors (I, 6) of left-out poses."""
+    from scipy.spatial.transform import Rotation
+
     places = np.arange(len(times))
     first = np.clip(places - count // 2, 0, len(times) - count)
     window = first[:, None] + np.arange(count)

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from sfm_app.bundle.lens_parts import PARTS
 from sfm_app.bundle.normal_equations import Bundle
@@ -86,6 +85,8 @@ def _compensate(
     model: pycolmap.Reconstruction, image: pycolmap.Image, x: FloatArray, estimate: ReadoutEstimate, row: int
 ) -> FloatArray:
     """Return the compensated keypoints (N, 2) of a photo; unchanged if it sees no point."""
+    from scipy.spatial import cKDTree
+
     tracked = _tracked_rows(image)
     if not len(tracked):
         return x
