@@ -42,8 +42,8 @@ def kernel(function: Function) -> Function:
 def summing_kernel(function: Function) -> Function:
     """Compile a kernel whose sums may be vectorized: several times faster, the same bytes on one kind of processor.
 
-    Nothing else is relaxed: there are no assumptions about infinities or NaN, and no approximate division. It is inlined
-    into the kernels that call it: a copy of its own would be vectorized in another order in the process that compiles it.
+    Nothing else is relaxed: there are no assumptions about infinities or NaN, and no approximate division. It is
+    inlined into kernels that call it: otherwise the process that compiles it would add in another order.
     """
     return _compile(function, fastmath={"reassoc", "nsz"}, forceinline=True)
 
