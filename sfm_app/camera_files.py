@@ -360,10 +360,8 @@ def _read_json(text: str) -> tuple[str, Cameras]:
         raise ValueError(f"it is not valid JSON: {err}") from None
     if not isinstance(values, Mapping):
         raise ValueError("its JSON is not an object")
-    if "cameras" in values and "camera_of" in values:  # calibration.json or scene.json
-        entries = {str(name): run_camera(entry) for name, entry in values["cameras"].items()}
-        known = {name: camera for name, camera in entries.items() if camera is not None}
-        return "sfm-app", (known, {str(photo): str(name) for photo, name in values["camera_of"].items()})
+    if "cameras" in values and "camera_of" in values:
+        return "sfm-app", _read_run_file(values)
     if is_run_camera(values):
         camera = run_camera(values)
         return "sfm-app", ({"": camera} if camera is not None else {}, {})
@@ -373,6 +371,13 @@ def _read_json(text: str) -> tuple[str, Cameras]:
         if values and all(isinstance(entry, Mapping) and fits(entry) for entry in values.values()):
             return form, (dict(_read_by_name(values, read)), {})
     raise ValueError("its JSON is of no known form")
+
+
+def _read_run_file(values: Mapping[str, Any]) -> Cameras:
+    """Read calibration.json or scene.json of a run."""
+    entries = {str(name): run_camera(entry) for name, entry in values["cameras"].items()}
+    known = {name: camera for name, camera in entries.items() if camera is not None}
+    return known, {str(photo): str(name) for photo, name in values["camera_of"].items()}
 
 
 _BY_NAME: tuple[tuple[str, Callable[..., bool], Callable[..., Calibration | None]], ...] = (

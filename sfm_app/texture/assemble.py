@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -36,21 +37,9 @@ def texture_surface(
     """
     mesh = facets(surface)
 
-    def score(photo: int) -> FaceView | Rejected:
-        name, view = f"look{photo}", views[photo]
-        kept = store.recall(name)
-        if kept is not None and "face" in kept:
-            return FaceView(kept["face"], kept["worth"], kept["color"], float(kept["sharpness"]))
-        try:
-            picture, used = store.photo(view), store.usable_pixels(view)
-        except OSError as err:
-            return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
-        face_view = score_faces(view, picture, used, mesh, hidden)
-        face, sharpness = face_view.face, np.array(face_view.sharpness)
-        store.keep(name, {"face": face, "worth": face_view.score, "color": face_view.color, "sharpness": sharpness})
-        return face_view
-
-    face_views = spread(score, range(len(views)), "finding visible triangles")
+    face_views = spread(
+        partial(_score_photo, views, store, mesh, hidden), range(len(views)), "finding visible triangles"
+    )
     checked, trimmed = _check_views(face_views, mesh), 0
     if options.trim_borders:
         border = doubtful_border(checked.sightings, checked.gains, mesh.neighbors)
@@ -78,6 +67,23 @@ def texture_surface(
         },
         "rejected": {view.name: one.reason for view, one in zip(views, rejected, strict=True) if one is not None},
     }
+
+
+def _score_photo(
+    views: Sequence[PhotoView], store: Store, mesh: Facets, hidden: OcclusionTest, photo: int
+) -> FaceView | Rejected:
+    name, view = f"look{photo}", views[photo]
+    kept = store.recall(name)
+    if kept is not None and "face" in kept:
+        return FaceView(kept["face"], kept["worth"], kept["color"], float(kept["sharpness"]))
+    try:
+        picture, used = store.photo(view), store.usable_pixels(view)
+    except OSError as err:
+        return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
+    face_view = score_faces(view, picture, used, mesh, hidden)
+    face, sharpness = face_view.face, np.array(face_view.sharpness)
+    store.keep(name, {"face": face, "worth": face_view.score, "color": face_view.color, "sharpness": sharpness})
+    return face_view
 
 
 def _check_views(face_views: Sequence[FaceView | Rejected], mesh: Facets) -> CheckedViews:
