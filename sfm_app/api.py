@@ -289,7 +289,7 @@ def export_model(
         points: export the points and cameras of the sparse reconstruction instead of the model.
 
     Returns:
-        The files: first the one to open, then its parts.
+        The files, first the one to open, then its parts.
 
     Raises:
         ConfigError: the format is unknown, needs a missing package, or does not fit the suffix of `target`.

@@ -53,7 +53,7 @@ def _doubts_of_call(name, options):
 
 def test_no_module_runs_what_it_reads():
     found = {path: list(doubts(path.read_text(encoding="utf-8"))) for path in SOURCES}
-    assert len(found) > 300
+    assert len(found) > 200
     assert {path: said for path, said in found.items() if said} == KNOWN
 
 
