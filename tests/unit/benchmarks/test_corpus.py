@@ -145,7 +145,7 @@ def test_one_parameter_of_twenty_may_be_off_and_no_exception_passes():
 def test_sets_that_constants_have_seen_are_left_out():
     rows = [run_row(photos="kitti51"), run_row(photos="castle-P19 crop:460,200"), run_row(photos="merton1")]
     assert [row["photos"] for row in unseen_rows(rows, seen_sets())] == ["kitti51"]
-    ransac = next(row for row in groups_table(rows) if row["stand in"] == "ransac")
+    ransac = next(row for row in groups_table(rows) if row["stand in"] == "fundamental")
     assert ransac["bars met on sets not seen"] == "2 of 2"
     assert "Left out: " in corpus_page("", rows[1:], []) and "None of those above." in corpus_page("", rows[1:], [])
 
