@@ -28,7 +28,7 @@ PHOTOS = "photos_7_480_0.0"
 """Their folder."""
 MOST_BYTES = 200_000
 """Of a notebook with its outputs."""
-CONTRACT = "finds_the_truth or cross_process or ten_runs or memory_is_linear or random or is_left_alone"
+CONTRACT = "finds_the_truth or cross_process or memory_is_linear or random"
 """What of the contract is tried on the template: seconds of it; the whole takes three times as long."""
 
 
