@@ -188,9 +188,11 @@ def test_layout_and_type_of_the_arrays_do_not_matter(fit):
 
 def test_runs_in_threads_give_the_same_bytes_which_cross_process_borders(fit):
     pair = make_pair(PairOptions(outliers=0.3, **SCENE), 8)
+    matches = np.stack([pair.x1, pair.x2])
     with ThreadPoolExecutor(4) as pool:
         runs = list(pool.map(lambda _: pickle.dumps(fit(pair.x1, pair.x2, OPTIONS, 3)), range(6)))
     assert len(set(runs)) == 1
+    np.testing.assert_array_equal(np.stack([pair.x1, pair.x2]), matches)  # the input is left alone
     for found in (fit(pair.x1, pair.x2, OPTIONS, 3), fit(CLOUD[:5], CLOUD[:5], OPTIONS, 0)):
         copy = pickle.loads(pickle.dumps(found))  # noqa: S301 - our own bytes
         assert type(copy) is type(found) and bool(copy) == bool(found)
