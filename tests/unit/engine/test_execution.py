@@ -147,6 +147,7 @@ def test_a_failure_is_measured_too():
 
 def test_the_log_has_the_warnings_of_python(run):
     run.workspace.create()
+    logging.captureWarnings(capture=False)  # commands of earlier tests have turned it on
     logging.captureWarnings(capture=True)
     try:
         with log_to_file(run), warnings.catch_warnings(action="always"):
