@@ -48,15 +48,15 @@ GROUPS: Mapping[str, Group] = {
         ("posegraph",), WITH_TRUTH, "", "docs/algorithms.md, From K to relative poses",
     ),
     "mapping: seeds, choice of the model, joins, passes": Group(
-        ("reconstruction", "colmap.mapping", "colmap.tasks"), FIRST_EIGHT, "",
+        ("mapping", "colmap.mapping", "colmap.tasks"), FIRST_EIGHT, "",
         "docs/algorithms.md, Mapping; sets are not written down",
     ),
     "bundle adjustment: priors, misfit, settling": Group(
-        ("bundle_adjustment.normal_equations", "bundle_adjustment.lens_evidence", "colmap.bundle"), WITH_TRUTH, "",
+        ("bundle.normal_equations", "bundle.lens_evidence", "colmap.bundle"), WITH_TRUTH, "",
         "docs/algorithms.md, Bundle adjustment; rendered folders only checked it",
     ),
     "upright: cues, lines, roll": Group(
-        ("orientation",),
+        ("frame",),
         FIRST_EIGHT, "the rendered courtyard, statue, facade and corner", "frame/up_direction.py",
     ),
     "votes that a camera must keep, pairs that are listened to": Group(
@@ -64,34 +64,34 @@ GROUPS: Mapping[str, Group] = {
         "docs/algorithms.md, Wrong pairs in the majority; without fox50 the bound would be the same",
     ),
     "one camera, several, or each its own; letterbox": Group(
-        ("selfcal.cameras.camera_per_photo", "selfcal.adjustment.tied_priors", "photos.letterbox"),
+        ("selfcal.other_cameras", "selfcal.priors", "photos.probe"),
         ("reichstag10",), "120 random scenes of cameras",
         "docs/algorithms.md, Several cameras; the random scenes alone give the same thresholds",
     ),
     "when a focal counts as known: its deviation, its lead and the votes it wins": Group(
-        ("selfcal.consensus.consensus_peak",), (), "benchmarks.trouble, seeds 0 to 180, 1000 to 1035 and 2000 to 2139",
+        ("selfcal.consensus",), (), "benchmarks.trouble, seeds 0 to 180, 1000 to 1035 and 2000 to 2139",
         "consensus_peak.py; seeds 3000 to 3199 were run afterwards",
     ),
     "two cameras of one size": Group(
-        ("selfcal.cameras.two_cameras", "selfcal.cameras.focal_grid"), ("kitchen25",),
+        ("selfcal.other_cameras", "selfcal.groups"), ("kitchen25",),
         "120 random scenes; trouble.py, seeds 0 to 64",
         "docs/algorithms.md, Several cameras; the photo sets only checked it",
     ),
     "finer features, second look": Group(
-        ("reconstruction.second_look", "reconstruction.added_matches", "plugins"), ("dinoSparseRing",), "",
+        ("mapping.feature_retry", "built_in"), ("dinoSparseRing",), "",
         "docs/algorithms.md, Mapping; six other sets, thinned out, only checked it",
     ),
     "a camera for each photo in mapping, scale that hangs on few points": Group(
-        ("reconstruction.camera_per_photo", "reconstruction.weak_scale", "reconstruction.model_merge"),
+        ("mapping.hypotheses", "mapping.split_and_merge"),
         ("temple16", "dinoSparseRing", "castle-P19"), "trouble.py, seeds 0 to 180 and 1000 to 1031",
         "docs/algorithms.md, Mapping; the photo sets chose only when a scale is called open",
     ),
     "look-alikes": Group(
-        ("posegraph.coverage", "posegraph.look_alikes", "posegraph.missing"), ("oats23", "books21", "kitchen1000"), "",
+        ("posegraph.look_alikes",), ("oats23", "books21", "kitchen1000"), "",
         "docs/algorithms.md, Look-alikes; either of the first two finds the other, every 15th photo of the third",
     ),
     "starts of poses, pairs on a plane, passes, other focals": Group(
-        ("posegraph.starts", "posegraph.graph", "reconstruction.mapping_passes"), ("dinoSparseRing", "kitchen25"), "",
+        ("posegraph.pair_pose", "posegraph.graph", "mapping.passes"), ("dinoSparseRing", "kitchen25"), "",
         "docs/algorithms.md, From K to relative poses, Mapping; castle-P19, fountain-P11, temple16 as before",
     ),
     "depth, surface, texture (no figure of this table)": Group(

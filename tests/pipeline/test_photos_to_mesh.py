@@ -216,8 +216,7 @@ def test_a_run_killed_in_its_texture_ends_with_the_same_bytes(finished, rendered
     whole, out = finished[0], tmp_path / "out"
     parts = out / "texture" / PARTS
     shutil.copytree(whole.out, out, symlinks=True)
-    monkeypatch.setattr(pages, "CHECKPOINTS", pages.CheckpointOptions(every_s=-1.0))
-    monkeypatch.setattr(pages, "MOST_OF_THE_TIME", np.inf)
+    monkeypatch.setattr(pages, "CHECKPOINTS", pages.CheckpointOptions(every_s=-1.0, most_time=np.inf))
 
     killed_at(4, monkeypatch, FileStore, "keep", rendered[0], out, DRAFT, first="texture")
     looks = stamps(parts, "look*.npz")
