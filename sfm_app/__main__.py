@@ -1,5 +1,5 @@
 """``python -m sfm_app`` is ``sfm-app``."""
 
-from sfm_app.cli import main
+from sfm_app.cli.program import main
 
 main()

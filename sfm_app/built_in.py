@@ -11,7 +11,7 @@ from sfm_app.selfcal import CALIBRATORS, SEVERAL_CAMERAS
 from sfm_app.types import Rejected
 
 if TYPE_CHECKING:  # OpenCV, which stereo needs, takes longer to load than an estimator to run
-    from sfm_app.stereo import DepthTask
+    from sfm_app.stereo.view import DepthTask
 
 
 SIFT_DSP_SUMMARY = "COLMAP's SIFT, slower: affine shape, domain-size pooling, fainter features; for plain things"

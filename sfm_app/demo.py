@@ -13,12 +13,12 @@ from PIL import Image
 from sfm_app.api import Run, reconstruct
 from sfm_app.camera.models import calibration_from_model
 from sfm_app.errors import InputError
+from sfm_app.products import read_texture
 from sfm_app.progress import Progress
 from sfm_app.report.text import duration_text
 from sfm_app.runtime.parallel import worker_count
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
-from sfm_app.stages.texture import read_texture
 from sfm_app.synthetic.cameras import ArcOptions, Camera, Lens, Views, arc, camera_center, make_camera, make_wide_camera
 from sfm_app.synthetic.compare import (
     center_error_percent,

@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from sfm_app import products
 from sfm_app.camera_files import read_given_cameras
 from sfm_app.engine.execution import Pipeline
 from sfm_app.engine.stage import Products, Stage
@@ -23,7 +24,7 @@ PHOTOS: Stage[PhotoSet] = Stage(
     files=("photos.json", "photos", "frames", "masks"),
     make=lambda given, run: photos.make(given.source, run),
     load=lambda given, run: photos.load(given.source, run),
-    digest=photos.digest,
+    digest=products.hash_photos,
 )
 MATCH_GRAPH: Stage[MatchGraph] = Stage(
     name="match_graph",
@@ -31,8 +32,8 @@ MATCH_GRAPH: Stage[MatchGraph] = Stage(
     settings=("matching",),
     files=("database.db",),
     make=lambda given, run: match_graph.make(given[PHOTOS], run),
-    load=lambda given, run: match_graph.load(given[PHOTOS], run),
-    digest=match_graph.digest,
+    load=lambda given, run: products.read_matches(given[PHOTOS], run.workspace),
+    digest=products.hash_matches,
     grows=True,
 )
 VIEW_GRAPH: Stage[ViewGraph] = Stage(
@@ -41,8 +42,8 @@ VIEW_GRAPH: Stage[ViewGraph] = Stage(
     settings=("epipolar", *view_graph.LENS_SETTINGS, "seed"),
     files=("view_graph.npz",),
     make=lambda given, run: view_graph.make(given[MATCH_GRAPH], run),
-    load=lambda _, run: view_graph.load(run),
-    digest=view_graph.digest,
+    load=lambda _, run: products.read_view_graph(run.workspace),
+    digest=products.hash_view_graph,
     grows=True,
 )
 INTRINSICS: Stage[Intrinsics] = Stage(
@@ -51,8 +52,8 @@ INTRINSICS: Stage[Intrinsics] = Stage(
     settings=("calibration", "photos.cameras", GIVEN_CAMERAS, "seed"),
     files=("calibration.json",),
     make=lambda given, run: intrinsics.make(given[MATCH_GRAPH], given[VIEW_GRAPH], run),
-    load=lambda _, run: intrinsics.load(run),
-    digest=intrinsics.digest,
+    load=lambda _, run: products.read_intrinsics(run.workspace),
+    digest=products.hash_intrinsics,
     grows=True,
 )
 SCENE: Stage[Scene] = Stage(
@@ -61,8 +62,8 @@ SCENE: Stage[Scene] = Stage(
     settings=("scene", "epipolar", "seed"),
     files=("sparse", "scene.json"),
     make=lambda given, run: scene.make(given[MATCH_GRAPH], given[VIEW_GRAPH], given[INTRINSICS], run),
-    load=lambda _, run: scene.load(run),
-    digest=scene.digest,
+    load=lambda _, run: products.read_scene(run.workspace),
+    digest=products.hash_scene,
     grows=True,
 )
 SCALE: Stage[MetricFrame] = Stage(
@@ -71,8 +72,8 @@ SCALE: Stage[MetricFrame] = Stage(
     settings=("scale", CONTROL_POINTS),
     files=("scale.json",),
     make=lambda given, run: scale.make(given[PHOTOS], given[SCENE], run),
-    load=lambda _, run: scale.load(run),
-    digest=scale.digest,
+    load=lambda _, run: products.read_frame(run.workspace),
+    digest=products.hash_frame,
 )
 DEPTH_MAPS: Stage[Path] = Stage(
     name="depth_maps",
@@ -89,8 +90,8 @@ MESH: Stage[Surface] = Stage(
     settings=("mesh", "texture.normal_map"),
     files=("surface/surface.npz", "surface/fine.npz"),
     make=lambda given, run: mesh.make(given[SCENE], given[DEPTH_MAPS], run),
-    load=lambda _, run: mesh.load(run),
-    digest=mesh.digest,
+    load=lambda _, run: products.read_surface(run.workspace),
+    digest=products.hash_surface,
 )
 TEXTURE: Stage[Model] = Stage(
     name="texture",
@@ -98,8 +99,8 @@ TEXTURE: Stage[Model] = Stage(
     settings=("texture",),
     files=("texture/texture.npz",),
     make=lambda given, run: texture.make(given[SCENE], given[MESH], run),
-    load=lambda _, run: texture.load(run),
-    digest=texture.digest,
+    load=lambda _, run: products.read_texture(run.workspace),
+    digest=products.hash_texture,
 )
 FILES: Stage[tuple[Path, ...]] = Stage(
     name="files",

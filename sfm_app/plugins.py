@@ -22,7 +22,7 @@ from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Features, Rejec
 from sfm_app.types.arrays import FloatArray
 
 if TYPE_CHECKING:  # OpenCV, which stereo needs, takes longer to load than an estimator to run
-    from sfm_app.stereo import DepthTask
+    from sfm_app.stereo.view import DepthTask
 
 GROUP, BUILT_IN = "sfm_app", "sfm_app.built_in"
 """Entry points of plug-ins, and the module of the built-in methods."""

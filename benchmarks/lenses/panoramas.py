@@ -24,9 +24,9 @@ from benchmarks.surface.photos import placed_photos
 from benchmarks.synthetic.scenes import build_scene
 from sfm_app.api import reconstruct
 from sfm_app.colmap.backend import log_level, show_log
+from sfm_app.products import read_texture
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
-from sfm_app.stages.texture import read_texture
 from sfm_app.synthetic.cameras import Views, look_at, panorama_camera
 from sfm_app.synthetic.compare import surface_accuracy, surface_coverage
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder

@@ -9,8 +9,9 @@ from benchmarks.surface.photos import placed_photos
 from sfm_app.api import open_run
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.model import submodel
+from sfm_app.products import read_scene, read_surface
 from sfm_app.settings import Settings
-from sfm_app.stages import depth_maps, mesh, scene, texture
+from sfm_app.stages import depth_maps, mesh, texture
 from sfm_app.types import Model
 
 
@@ -38,11 +39,11 @@ def remake_without(
     submodel(pycolmap.Reconstruction(target / "sparse"), others).write(target / "sparse")
     with open_run(target, Settings.from_mapping(settings), None) as run:
         own = run.with_fingerprint(f"without {name}")
-        left = scene.load(own)
+        left = read_scene(own.workspace)
         if geometry_too:
             shutil.rmtree(target / "surface")
             surface = mesh.make(left, depth_maps.make(left, own), own)
         else:
-            surface = mesh.load(own)
+            surface = read_surface(own.workspace)
         (target / "texture").mkdir()
         return texture.make(left, surface, own)

@@ -36,9 +36,9 @@ from benchmarks.surface.worker import run_stages
 from sfm_app.files import load_arrays
 from sfm_app.geometry.poses import normalize
 from sfm_app.geometry.triangles import vertex_normals
+from sfm_app.products import read_frame
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import merge_nested
-from sfm_app.stages.scale import read_frame
 from sfm_app.synthetic.render import cast_rays, ray_caster
 
 FloatArray = NDArray[np.float64]

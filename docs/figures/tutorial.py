@@ -18,9 +18,9 @@ from PIL import Image
 
 import sfm_app
 from sfm_app.colmap.dense import read_photo_and_depth
+from sfm_app.products import read_texture
 from sfm_app.report.pictures import depth_colors
 from sfm_app.runtime.workspace import Workspace
-from sfm_app.stages.texture import read_texture
 from sfm_app.synthetic.cameras import Camera
 from sfm_app.synthetic.render import prepare_model, render_model, render_shape
 

@@ -1,6 +1,6 @@
 """Cameras from the normal equations of a bundle: free parts, estimates, deviations, and the family of a lens.
 
-Ours; the choice by marginal likelihood is that of `geometry.model_selection`. As for pairs (`selfcal.priors`), each
+Ours; the choice by marginal likelihood is that of `geometry.least_squares`. As for pairs (`selfcal.priors`), each
 part of a camera has a narrow prior about its usual value and a wide one. A part is freed where the evidence for the
 wide prior outweighs how rare such cameras are. Freed or not, the prior stays in the estimate, so undetermined parts
 stay near their usual values. A lens that would fold inside the photo is refused.

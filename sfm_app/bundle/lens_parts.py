@@ -1,6 +1,6 @@
 """Parts of a camera that bundle adjustment frees together, their priors, and the user's rules about a camera.
 
-Ours; the choice of free parts by marginal likelihood is that of `geometry.model_selection`. A part has a narrow prior
+Ours; the choice of free parts by marginal likelihood is that of `geometry.least_squares`. A part has a narrow prior
 about its usual value and a wide one.
 """
 
@@ -9,9 +9,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_app.camera.models import (
+    ASPECT,
+    CENTER,
+    FREE_SHARE,
+    LENS,
+    NARROW,
     PARAMETERS,
     TERMS,
     TWO_FOCALS,
+    WIDE,
     camera_matrix,
     distortion_terms,
     projection_of_model,
@@ -40,7 +46,6 @@ from sfm_app.camera.projection import (
     angle_limit,
 )
 from sfm_app.geometry.least_squares import NormalPriors, binary_choices
-from sfm_app.selfcal.priors import ASPECT, CENTER, FREE_SHARE, LENS, NARROW, WIDE
 from sfm_app.types import Calibration
 from sfm_app.types import camera as kinds
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
@@ -86,7 +91,7 @@ PERSPECTIVE_PARTS = (
     Part("k3", (K3,), ABSENT, 0.03, 0.1, powers=(6,), needs=("k1", "k2"), exact=True),
     Part("k4 k5 k6", (K4, K5, K6), ABSENT, 0.05, 0.05, powers=(2, 4, 6), needs=("k1", "k2", "k3"), exact=True),
 )
-"""Center, aspect and k1 as in `selfcal.priors`; others: docs/algorithms.md, Bundle adjustment. Chosen by hand."""
+"""Center, aspect and k1 as in `camera.models`; others: docs/algorithms.md, Bundle adjustment. Chosen by hand."""
 FISHEYE_PARTS = (
     _CENTER,
     _ASPECT,

@@ -64,7 +64,7 @@ def georeference(
 
     GPS errs by 3 to 10 m horizontally and twice that in height. So up stays as given, and only horizontal positions
     are used: w = a z + b in complex numbers, by RANSAC over pairs, then least squares. An unsure up is replaced by that
-    of the positions if they determine it well.
+    of the positions if they determine it well. Centers (N, 3) and `up` (3,) are in the frame of the reconstruction.
     """
     known = [k for k, position in enumerate(positions) if position is not None]
     given = [position for position in positions if position is not None]

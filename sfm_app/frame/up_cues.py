@@ -69,7 +69,7 @@ def roll_hypotheses(rotations: FloatArray, centers: FloatArray) -> tuple[Roll, .
     Roll alone does not distinguish portrait photos of a wall from landscape photos of the same wall lying on its side,
     so two weaker cues are added: people look nearly horizontally, and they walk rather than climb. Proposals of photos
     are refined by weighted least squares, and the cheapest is chosen. Opposite turns have opposite directions, unless
-    cameras look steeply down. The rotations (N, 3, 3) are cam_from_world, N >= 1.
+    cameras look steeply down. Rotations (N, 3, 3) are cam_from_world, centers (N, 3) in the world, N >= 1.
     """
     rolls = []
     for turn, proposals in enumerate(_proposals(rotations)):
@@ -216,7 +216,10 @@ def small_picture(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def fit_surfaces(
     points: FloatArray, brightness: FloatArray, visible: Sequence[NDArray[np.int64]], centers: FloatArray
 ) -> Surfaces:
-    """Fit a plane to the neighbors of each point, and keep flat patches; the brightness (P,) is 0 to 255."""
+    """Fit a plane to the neighbors of each of P points (P, 3) in the world, and keep flat patches.
+
+    The brightness (P,) is 0 to 255; `visible` has the rows of the points that each photo sees, `centers` (N, 3).
+    """
     from scipy.spatial import cKDTree
 
     if len(points) < CUE_OPTIONS.neighbors:
@@ -245,7 +248,8 @@ def depth_height_correlation(
 ) -> float:
     """Return the mean correlation of log depth with height in the photo, in [-1, 1].
 
-    The ground gets nearer towards the lower border; facades seen from the street lean away.
+    The ground gets nearer towards the lower border; facades seen from the street lean away. `up` (3,), centers (N, 3)
+    and points (P, 3) are in the world, rotations (N, 3, 3) cam_from_world; `visible` as in `fit_surfaces`.
     """
     correlations = []
     for R, center, rows in zip(rotations, centers, visible, strict=True):
@@ -292,7 +296,10 @@ def slope_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[ND
 
 
 def sky_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
-    """Return the mean share of even, bright pixels near the upper border minus the lower, in [-1, 1]."""
+    """Return the mean share of even, bright pixels near the upper border minus the lower, in [-1, 1].
+
+    Arguments as in `slope_asymmetry`.
+    """
     differences = []
     for R, blurred in _blurred(rotations, pictures, CUE_OPTIONS.sky_blur_px):
         steep = np.hypot(_slope(blurred, np.array([1.0, 0.0])), _slope(blurred, np.array([0.0, 1.0])))

@@ -30,9 +30,8 @@ from sfm_app.mapping.attempt import (
     support,
 )
 from sfm_app.mapping.feature_retry import MappedScene
-from sfm_app.mapping.hypotheses import rival_reason
 from sfm_app.mapping.look_alikes import drop_look_alikes, judge_places
-from sfm_app.mapping.passes import Outcome, reconstruct
+from sfm_app.mapping.passes import Outcome, reconstruct, rival_reason
 from sfm_app.mapping.split_and_merge import split_attempt
 from sfm_app.matching.pairs import find_same_matches
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph

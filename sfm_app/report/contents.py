@@ -3,14 +3,14 @@
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from types import ModuleType
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
+from sfm_app import products
 from sfm_app.errors import SfmError
 from sfm_app.frame.scale import MetricFrame
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.workspace import PROBLEM
-from sfm_app.stages import intrinsics, match_graph, photos, scale, scene, view_graph
+from sfm_app.runtime.workspace import PROBLEM, Workspace
 from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
 
 logger = logging.getLogger("sfm_app")
@@ -70,38 +70,45 @@ class RunContents:
 def read_contents(run: RunContext) -> RunContents:
     """Read the products of all finished stages."""
     manifest = run.workspace.manifest.read()
-    listed = _read(run, manifest, photos, lambda: photos.read_photo_list(run.workspace))
+    photos = _read(run, manifest, "photos", products.hash_photos, products.read_photo_list)
+    matches = None
+    if photos is not None:
+        matches = _read(run, manifest, "match_graph", products.hash_matches, partial(products.read_matches, photos))
     return RunContents(
         run,
         manifest,
-        listed,
-        _read(run, manifest, match_graph, lambda: match_graph.load(listed, run)) if listed is not None else None,
-        _read(run, manifest, view_graph, lambda: view_graph.load(run)),
-        _read(run, manifest, intrinsics, lambda: intrinsics.load(run)),
-        _read(run, manifest, scene, lambda: scene.load(run)),
-        _read(run, manifest, scale, lambda: scale.load(run)) or MetricFrame(),
+        photos,
+        matches,
+        _read(run, manifest, "view_graph", products.hash_view_graph, products.read_view_graph),
+        _read(run, manifest, "intrinsics", products.hash_intrinsics, products.read_intrinsics),
+        _read(run, manifest, "scene", products.hash_scene, products.read_scene),
+        _read(run, manifest, "scale", products.hash_frame, products.read_frame) or MetricFrame(),
     )
 
 
 def read_scene(run: RunContext) -> RunContents:
     """Read the scene and its frame only: matches of many photos take long to read."""
     manifest = run.workspace.manifest.read()
-    product = _read(run, manifest, scene, lambda: scene.load(run))
-    frame = _read(run, manifest, scale, lambda: scale.load(run)) or MetricFrame()
-    return RunContents(run, manifest, scene=product, frame=frame)
+    scene = _read(run, manifest, "scene", products.hash_scene, products.read_scene)
+    frame = _read(run, manifest, "scale", products.hash_frame, products.read_frame) or MetricFrame()
+    return RunContents(run, manifest, scene=scene, frame=frame)
 
 
 def _read(
-    run: RunContext, manifest: Mapping[str, Any], module: ModuleType, load: Callable[[], Product | None]
+    run: RunContext,
+    manifest: Mapping[str, Any],
+    stage: str,
+    digest: Callable[[Workspace], str],
+    read: Callable[[Workspace], Product],
 ) -> Product | None:
-    stage, done = module.__name__.rpartition(".")[2], manifest.get("stages", {})
+    done = manifest.get("stages", {})
     if stage not in done:
         return None
     try:
         # checked before reading, because COLMAP never ends on some damaged models
-        if done[stage]["digest"] != module.digest(run.workspace):
+        if done[stage]["digest"] != digest(run.workspace):
             raise ValueError(f"the files of stage {stage} have changed")
-        return load()
+        return read(run.workspace)
     except UNREADABLE as err:  # the page shows the other stages
         logger.info("the report leaves out stage %s", stage, exc_info=err)
         return None

@@ -19,8 +19,9 @@ from sfm_app.estimation.calibrating import camera_pairs
 from sfm_app.geometry.epipolar import FIRST, SECOND, fit_rays, gradients
 from sfm_app.geometry.least_squares import inverse_of_positive
 from sfm_app.report.text import center_text, focal_text, held_text, lens_text, verdict
+from sfm_app.selfcal.calibrate_pairs import undistort_pairs
 from sfm_app.selfcal.consensus import Consensus
-from sfm_app.selfcal.pairs import Pairs, prepare, undistort_pairs
+from sfm_app.selfcal.pairs import Pairs, prepare
 from sfm_app.selfcal.thesis.curves import center_curves, focal_curves
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchGraph, ViewGraph
 from sfm_app.types.arrays import FloatArray

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from sfm_app.camera.models import camera_matrix
 from sfm_app.formats.frusta import center, scene_size
 from sfm_app.frame.scale import move_model
+from sfm_app.products import read_texture
 from sfm_app.report.contents import UNREADABLE, RunContents
 from sfm_app.report.findings import glance
 from sfm_app.report.scene_view import view_points
-from sfm_app.stages import texture
 from sfm_app.synthetic.cameras import Camera
 from sfm_app.synthetic.render import orbited_pose, render_model
 from sfm_app.types import Frustum, Model
@@ -70,7 +70,7 @@ def _surface(contents: RunContents) -> Model | None:
     if "texture" not in contents.stages:
         return None
     try:
-        return move_model(texture.load(contents.run), contents.frame.from_model)
+        return move_model(read_texture(contents.run.workspace), contents.frame.from_model)
     except UNREADABLE:
         return None
 

@@ -16,8 +16,8 @@ from sfm_app.formats.frusta import center, frustum_depth, scene_size
 from sfm_app.formats.gltf import FLIP, write_glb
 from sfm_app.frame.scale import move_model
 from sfm_app.numerical import Json
+from sfm_app.products import read_texture
 from sfm_app.report.contents import UNREADABLE, RunContents
-from sfm_app.stages import texture
 from sfm_app.types import Frustum, Model
 
 logger = logging.getLogger("sfm_app")
@@ -74,7 +74,7 @@ def model_file(contents: RunContents) -> Path | None:
 
 def light_model(contents: RunContents) -> bytes:
     """Return the finished textured model as GLB with smaller pages of texture."""
-    model = move_model(texture.load(contents.run), contents.frame.from_model)
+    model = move_model(read_texture(contents.run.workspace), contents.frame.from_model)
     return write_glb(lighten(model), "model")["model.glb"]
 
 

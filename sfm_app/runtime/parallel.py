@@ -1,6 +1,7 @@
 """One concurrent.futures.Executor for all work, and its results in the order of the items."""
 
 import shutil
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -16,24 +17,24 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-class RemoteExecutor(ThreadPoolExecutor):
+class RemoteExecutor(ThreadPoolExecutor, ABC):
     """Threads of this process, and workers elsewhere for tasks, such as `runtime.cluster.ClusterExecutor`."""
 
+    @abstractmethod
     def with_threads(self, workers: int) -> "RemoteExecutor":
         """Return an executor with the same workers elsewhere and another number of threads."""
-        raise NotImplementedError
 
+    @abstractmethod
     def spread(self, task: Task[Result], items: Iterable[Any]) -> Iterator[Result]:
         """Yield the results of a task in the order of the items."""
-        raise NotImplementedError
 
+    @abstractmethod
     def threads_elsewhere(self) -> int:
         """Return how many tasks the workers elsewhere do at once."""
-        raise NotImplementedError
 
+    @abstractmethod
     def cpu_seconds_elsewhere(self) -> float:
         """Return the CPU seconds of all tasks finished elsewhere."""
-        raise NotImplementedError
 
 
 def worker_count(setting: int) -> int:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from sfm_app.camera.models import ASPECT
 from sfm_app.fundamental.refits import refine_sampson
 from sfm_app.geometry.epipolar import essential_from_fundamental, relative_pose
 from sfm_app.geometry.least_squares import lift_eigenvalues
@@ -27,9 +28,18 @@ from sfm_app.selfcal.adjustment import (
     reweight,
     subsample_rows,
 )
-from sfm_app.selfcal.pairs import CENTER_U, CENTER_V, KAPPA, LOG_ASPECT, LOG_FOCAL, undistort_points
-from sfm_app.selfcal.priors import ASPECT, NAMES, CameraPriors, Evidence
-from sfm_app.types import PairId
+from sfm_app.selfcal.pairs import (
+    CENTER_U,
+    CENTER_V,
+    KAPPA,
+    LOG_ASPECT,
+    LOG_FOCAL,
+    parameters_from_calibration,
+    sides_from_pixels,
+    undistort_points,
+)
+from sfm_app.selfcal.priors import NAMES, CameraPriors, Evidence
+from sfm_app.types import Calibration, CameraPairs, PairId
 from sfm_app.types.arrays import BoolArray, FloatArray
 from sfm_app.types.camera import named_correlations
 
@@ -177,6 +187,24 @@ def undistorted_fundamentals(fit: Fit) -> FloatArray:
         refit = refine_sampson(np.asfortranarray(np.hstack(views)), start, scale=ROBUST_SCALE * fit.state.sigma)
         Fs[pair] = refit if np.isfinite(refit).all() and refit.any() else start
     return Fs
+
+
+def undistort_pairs(pairs: CameraPairs, camera: Calibration) -> CameraPairs:
+    """Undistort the inliers and refit every F; return the pairs unchanged without a lens or without inliers."""
+    if camera.radial == 0.0 or not pairs.inliers:
+        return pairs
+    side, middle = float(max(pairs.size)), np.array(pairs.size) / 2
+    scale = 3.0 / side  # of the robust refit: 3 px
+    theta = parameters_from_calibration(camera, side)
+    to_sides = sides_from_pixels(pairs.size)
+    back = np.linalg.inv(to_sides)
+    Fs, inliers = np.empty_like(pairs.Fs), []
+    for k, matches in enumerate(pairs.inliers):
+        views = [undistort_points((np.asarray(matches)[:, i : i + 2] - middle) / side, theta) for i in (0, 2)]
+        points = np.asfortranarray(np.hstack(views))
+        Fs[k] = to_sides.T @ refine_sampson(points, back.T @ pairs.Fs[k] @ back, scale=scale) @ to_sides
+        inliers.append(points * side + np.tile(middle, 2))
+    return replace(pairs, Fs=Fs, inliers=tuple(inliers))
 
 
 def intrinsic_matrix(theta: FloatArray) -> FloatArray:

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfm_app.camera.models import camera_matrix, guessed_camera_matrix
-from sfm_app.fundamental.refits import refine_sampson
 from sfm_app.jit import kernel
 from sfm_app.types import Calibration, CameraPairs
 from sfm_app.types.arrays import FloatArray, IndexArray
@@ -235,24 +234,6 @@ def parameters_from_calibration(calibration: Calibration, unit_px: float) -> Flo
     return np.array(
         [np.log(focal), u, v, np.log(calibration.K[1, 1] / calibration.K[0, 0]), calibration.radial / focal**2]
     )
-
-
-def undistort_pairs(pairs: CameraPairs, camera: Calibration) -> CameraPairs:
-    """Undistort the inliers and refit every F; return the pairs unchanged without a lens or without inliers."""
-    if camera.radial == 0.0 or not pairs.inliers:
-        return pairs
-    side, middle = float(max(pairs.size)), np.array(pairs.size) / 2
-    scale = 3.0 / side  # of the robust refit: 3 px
-    theta = parameters_from_calibration(camera, side)
-    to_sides = sides_from_pixels(pairs.size)
-    back = np.linalg.inv(to_sides)
-    Fs, inliers = np.empty_like(pairs.Fs), []
-    for k, matches in enumerate(pairs.inliers):
-        views = [undistort_points((np.asarray(matches)[:, i : i + 2] - middle) / side, theta) for i in (0, 2)]
-        points = np.asfortranarray(np.hstack(views))
-        Fs[k] = to_sides.T @ refine_sampson(points, back.T @ pairs.Fs[k] @ back, scale=scale) @ to_sides
-        inliers.append(points * side + np.tile(middle, 2))
-    return replace(pairs, Fs=Fs, inliers=tuple(inliers))
 
 
 def sides_from_pixels(size: tuple[int, int]) -> FloatArray:

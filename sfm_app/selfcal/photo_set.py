@@ -13,6 +13,7 @@ import numpy as np
 
 from sfm_app.camera.models import guessed_camera_matrix
 from sfm_app.numerical import FAILURES, error_reason
+from sfm_app.selfcal.calibrate_pairs import undistort_pairs
 from sfm_app.selfcal.consensus import Consensus
 from sfm_app.selfcal.groups import CameraGroup, VoteTables, calibrate_cameras
 from sfm_app.selfcal.other_cameras import cross_validate, divide_photos, peak_cameras, split_by_focal
@@ -23,7 +24,6 @@ from sfm_app.selfcal.pairs import (
     guess_calibration,
     parameters_from_calibration,
     prepare,
-    undistort_pairs,
 )
 from sfm_app.selfcal.zero_curves import METHOD
 from sfm_app.settings import CalibrationSettings

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.camera.models import ASPECT, CENTER, FOCAL, FREE_SHARE, LENS, NARROW, WIDE
 from sfm_app.geometry.least_squares import (
     NormalPriors,
     Posteriors,
@@ -24,20 +25,10 @@ from sfm_app.selfcal.adjustment import CAMERA, Prior
 from sfm_app.selfcal.pairs import CENTER_U, KAPPA, LOG_ASPECT, LOG_FOCAL
 from sfm_app.types.arrays import BoolArray, FloatArray
 
-CENTER, ASPECT, LENS, FOCAL = range(4)
-"""Columns of `free`: the parts of a camera that may be freed from their usual values."""
 NAMES = ("center", "aspect", "k1", "focal")
 """Names of the parts in `Calibration.held`."""
-NARROW = {CENTER: 0.012, ASPECT: 0.002, LENS: 0.005}
-"""Standard deviations about the usual value: of the center in longer sides, of log fy/fx, of k1.
-docs/algorithms.md, Self-calibration, 3; by hand."""
-WIDE = {CENTER: 0.15, ASPECT: 0.25, LENS: 0.2}
-"""The same for freed parts. docs/algorithms.md, Self-calibration, 3; by hand."""
 COLUMNS = {CENTER: [CENTER_U, CENTER_U + 1], ASPECT: [LOG_ASPECT], LENS: [KAPPA]}
 """Columns of each part in the parameters of a camera, by definition in `pairs`."""
-FREE_SHARE = {CENTER: 0.3, ASPECT: 0.05, LENS: 0.5, FOCAL: 0.3}
-"""Share of photo sets in which the wide prior is the right one; for FOCAL, in which a claim is wrong.
-docs/algorithms.md, Self-calibration, 3; by hand."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm_app.camera.models import LENS
 from sfm_app.selfcal.adjustment import Matches
 from sfm_app.selfcal.calibrate_pairs import (
     Fit,
@@ -42,7 +43,7 @@ from sfm_app.selfcal.pairs import (
     prepare,
     sides_from_pixels,
 )
-from sfm_app.selfcal.priors import LENS, PRIORS, CameraPriors
+from sfm_app.selfcal.priors import PRIORS, CameraPriors
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
 from sfm_app.types.arrays import FloatArray, IndexArray

@@ -1,12 +1,8 @@
 """intrinsics: ViewGraph -> Intrinsics."""
 
-import json
-
 from sfm_app.estimation.known import find_or_keep_intrinsics
-from sfm_app.files import digest_files, replace_atomically
-from sfm_app.numerical import json_text
+from sfm_app.products import write_intrinsics
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.workspace import Workspace
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, ViewGraph
 
 
@@ -18,19 +14,8 @@ def make(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
         photos={camera.name: len(camera.photos) for camera in cameras},
         identifiable=sum(camera.found.identifiable for camera in cameras),
     )
-    with replace_atomically(run.workspace.calibration) as path:
-        path.write_text(json_text(intrinsics.to_dict()), encoding="utf-8", newline="\n")
+    write_intrinsics(intrinsics, run.workspace)
     return intrinsics
-
-
-def load(run: RunContext) -> Intrinsics:
-    """Read calibration.json back."""
-    return Intrinsics.from_dict(json.loads(run.workspace.calibration.read_text(encoding="utf-8")))
-
-
-def digest(place: Workspace) -> str:
-    """Return a hash of calibration.json."""
-    return digest_files(place.root, place.calibration.name)
 
 
 def _summary(camera: Calibration) -> dict[str, object]:

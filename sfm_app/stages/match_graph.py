@@ -3,15 +3,15 @@
 from dataclasses import replace
 
 from sfm_app.colmap.backend import translate_errors
-from sfm_app.colmap.database import create_database, digest_matches, is_sound, read_match_graph, remove_database
+from sfm_app.colmap.database import create_database, is_sound, remove_database
 from sfm_app.colmap.growth import forget_changed_matches, grow_database
 from sfm_app.estimation.diagnosis import NOTHING_MATCHED, diagnose_scene
 from sfm_app.files import is_made_from
 from sfm_app.matching.features import find_all_features, forget_features, match_pairs
 from sfm_app.matching.pairs import match_probable_pairs
+from sfm_app.products import read_matches
 from sfm_app.retrieval import wants_all_pairs
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.workspace import Workspace
 from sfm_app.types import MatchGraph, PhotoSet
 
 
@@ -38,9 +38,9 @@ def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
     if wants_all_pairs(len(photos.photos), options):
         in_force |= match_pairs(method, run)
     else:
-        in_force |= match_probable_pairs(method, lambda: load(photos, run), run)
+        in_force |= match_probable_pairs(method, lambda: read_matches(photos, place), run)
     forget_features(run)
-    graph = load(photos, run)
+    graph = read_matches(photos, place)
     run.record(
         keypoints={graph.images[key].name: len(points) for key, points in graph.keypoints.items()},
         pairs=len(graph.matches),
@@ -51,16 +51,3 @@ def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
     if not graph.matches:
         raise diagnose_scene(graph, NOTHING_MATCHED, options).error()
     return graph
-
-
-def load(photos: PhotoSet, run: RunContext) -> MatchGraph:
-    """Read the match graph of these photos; raise a ValueError if the database is damaged, which would end COLMAP."""
-    if not is_sound(run.workspace.database):
-        raise ValueError(f"{run.workspace.database} is damaged")
-    with translate_errors("reading the database"):
-        return read_match_graph(run.workspace.database, photos)
-
-
-def digest(place: Workspace) -> str:
-    """Return a hash of the photos, keypoints and matches in the database."""
-    return digest_matches(place.database)

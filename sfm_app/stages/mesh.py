@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from sfm_app.colmap.dense import map_file, read_views
 from sfm_app.colmap.surface import FUSED, open_points, positions
 from sfm_app.errors import ReconstructionError
-from sfm_app.files import digest_files, is_made_from, load_arrays, replace_atomically
+from sfm_app.files import digest_files, is_made_from
 from sfm_app.meshing.cleaning import drop_islands, make_manifold, trim
 from sfm_app.meshing.octree import CELLS, cell_sizes, choose_cell, cube_around
 from sfm_app.meshing.refinement import STEPS
+from sfm_app.products import write_surface
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_count
 from sfm_app.runtime.parallel import ordered_map
-from sfm_app.runtime.workspace import Workspace
 from sfm_app.stereo import View
 from sfm_app.surface.blocks import (
     EVERYWHERE,
@@ -35,7 +35,6 @@ from sfm_app.surface.refining import FineShape, Originals, rank_partners, refine
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Scene, Surface
 
-SURFACE = "surface.npz"
 FUSED_DIGEST = "fused.txt"
 """File with the hash of the fused points, by which a resumed run detects damage."""
 HINT = "take more photos, a step apart, with more overlap; OUT/points.ply and OUT/points.glb have the sparse points"
@@ -54,8 +53,7 @@ def make(scene: Scene, dense_dir: Path, run: RunContext) -> Surface:
     else:
         surface = _mesh_at_once((dense_dir, originals), views, points, run)
     run.record(vertices=len(surface.vertices), triangles=len(surface.faces))
-    with replace_atomically(place / SURFACE) as path:
-        np.savez(path, vertices=surface.vertices, faces=surface.faces, colors=surface.colors)
+    write_surface(surface, run.workspace)
     return surface
 
 
@@ -121,18 +119,6 @@ def _check_nonempty(surface: Surface, problem: str) -> Surface:
     if not len(surface.faces):
         raise ReconstructionError(problem, hint=HINT)
     return surface
-
-
-def load(run: RunContext) -> Surface:
-    """Read the surface back."""
-    stored = load_arrays(run.workspace.surface / SURFACE)
-    return Surface(stored["vertices"], stored["faces"], stored["colors"])
-
-
-def digest(place: Workspace) -> str:
-    """Return a hash of the surface, and of the fine surface if it is kept."""
-    fine = place.fine_surface
-    return digest_files(place.surface, SURFACE, *([fine.name] if fine.exists() else []))
 
 
 def _fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray[np.void]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sfm_app.errors import InputError
-from sfm_app.files import digest_files, is_below, replace_atomically
+from sfm_app.files import digest_files, replace_atomically
 from sfm_app.operating_system import is_link
 from sfm_app.photos.decode import UnreadableError
 from sfm_app.photos.files import list_files
@@ -20,10 +20,10 @@ from sfm_app.photos.probe import group_by_camera, read_photo, split_by_given_cam
 from sfm_app.photos.selection import PhotoStats, drop_duplicates, drop_unusable, read_stats, write_stats
 from sfm_app.photos.source import Source, assign_names, is_laid_out, lay_out
 from sfm_app.photos.video import CornerTracker, open_video, select_keyframes
+from sfm_app.products import read_copy_hashes, read_photo_list, write_photo_list
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import largest_photo_megapixels
-from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import PhotoSettings
 from sfm_app.tasks import Task
 from sfm_app.types import Photo, PhotoSet, UnusablePhoto
@@ -159,20 +159,6 @@ def load(source: Source, run: RunContext) -> PhotoSet:
     return _read_photo_set(run.workspace.frames if source.video else source.path, source.mask_dir, run)
 
 
-def read_photo_list(place: Workspace) -> PhotoSet:
-    """Read photos.json without the laid-out photos; raise a ValueError if it names a photo outside of the folder."""
-    values = json.loads(place.photo_set.read_text(encoding="utf-8"))
-    photos = tuple(Photo.from_dict(entry) for entry in values["photos"])
-    if not all(is_below(photo.name) for photo in photos):
-        raise ValueError(f"{place.photo_set} names photos outside of their folder")
-    return PhotoSet(place.photos, photos, tuple(UnusablePhoto(**photo) for photo in values["unusable"]))
-
-
-def digest(place: Workspace) -> str:
-    """Return a hash of photos.json, which holds hashes of the copies."""
-    return digest_files(place.root, place.photo_set.name)
-
-
 def _read_photos(
     source: Source, folder: Path, names: Sequence[str], times_s: Mapping[str, float], run: RunContext
 ) -> PhotoSet:
@@ -202,7 +188,8 @@ def _read_photos(
         run.map(lay_out, photo_set.photos, "laying masks out")
         unused = unused_masks(list(source.masks), photo_set.photos)
         run.record(masks={"photos": sum(bool(photo.mask) for photo in photo_set.photos), "unused": unused})
-    _save_photo_set(photo_set, run)
+    copies = {photo.name: _copy_digest(photo, run) for photo in photo_set.photos}
+    write_photo_list(photo_set, copies, run.workspace)
     run.record(usable=len(photos), cameras=len(photo_set.groups), unusable={p.name: p.reason for p in unusable})
     run.record(notes={photo.path: list(photo.notes) for photo in photos if photo.notes})
     run.record(gps=sum(photo.gps is not None for photo in photos))
@@ -258,15 +245,6 @@ def lay_out_photo(photo: Photo, *, folder: Path, target: Path) -> None:
         ) from err
 
 
-def _save_photo_set(photos: PhotoSet, run: RunContext) -> None:
-    entries = [photo.to_dict() for photo in photos.photos]
-    unusable = [asdict(photo) for photo in photos.unusable]
-    copies = {photo.name: _copy_digest(photo, run) for photo in photos.photos}
-    values = {"photos": entries, "unusable": unusable, "copies": copies}
-    with replace_atomically(run.workspace.photo_set) as path:
-        path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8", newline="\n")
-
-
 def _copy_digest(photo: Photo, run: RunContext) -> str | None:
     """Return a hash of the bytes of an 8-bit copy; None if the photo itself is laid out, or nothing."""
     place = run.workspace.photos / photo.name
@@ -276,9 +254,9 @@ def _copy_digest(photo: Photo, run: RunContext) -> str | None:
 
 def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoSet:
     photo_set = replace(read_photo_list(run.workspace), folder=folder, masks=masks)
-    values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
+    copies = read_copy_hashes(run.workspace)
     for photo in photo_set.photos:
-        copy = values["copies"].get(photo.name)
+        copy = copies.get(photo.name)
         if copy != _copy_digest(photo, run) or not (copy or is_laid_out(photo, folder, run.workspace.photos)):
             if folder == run.workspace.frames and not (folder / photo.path).exists():
                 raise FileNotFoundError(errno.ENOENT, "no such frame", str(folder / photo.path))

@@ -1,21 +1,18 @@
 """scale: PhotoSet and Scene -> MetricFrame, the frame of everything that is exported."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from sfm_app.colmap.model import sparse_model
-from sfm_app.files import digest_files, replace_atomically
 from sfm_app.frame.control_points import ControlFit, fit_control_points
 from sfm_app.frame.known_lengths import control_places, distance_evidence, marker_evidence
 from sfm_app.frame.scale import GPS, IDENTITY, MetricFrame, ScaleEvidence, agree, move_model
 from sfm_app.frame.sighted_points import PosedPhotos
 from sfm_app.geometry.poses import Similarity
-from sfm_app.numerical import json_text
+from sfm_app.products import write_frame
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.workspace import Workspace
 from sfm_app.types import PhotoSet, Scene
 
 POINTS = "points"
@@ -60,26 +57,10 @@ def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
         contradictions=list(frame.contradictions),
         problems=problems,
     )
-    with replace_atomically(run.workspace.scale) as path:
-        path.write_text(json_text(frame.to_dict()), encoding="utf-8", newline="\n")
+    write_frame(frame, run.workspace)
     points = sparse_model(run.workspace.sparse)
     run.write_model(move_model(points, frame.from_model) if frame.changes else points, POINTS)
     return frame
-
-
-def load(run: RunContext) -> MetricFrame:
-    """Read scale.json back."""
-    return read_frame(run.workspace)
-
-
-def digest(place: Workspace) -> str:
-    """Return a hash of scale.json."""
-    return digest_files(place.root, place.scale.name)
-
-
-def read_frame(place: Workspace) -> MetricFrame:
-    """Read scale.json of an output folder."""
-    return MetricFrame.from_dict(json.loads(place.scale.read_text(encoding="utf-8")))
 
 
 def _control_evidence(

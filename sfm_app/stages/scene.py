@@ -1,18 +1,16 @@
 """scene: ViewGraph and Intrinsics -> Scene."""
 
-import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
-from sfm_app.colmap.backend import Reconstruction, check_written, translate_errors
+from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.bundle import Adjustment, adjust_or_keep
 from sfm_app.colmap.model import RefinedCamera, color_points, posed_images, posed_photo_ids, read_scene
 from sfm_app.errors import ReconstructionError
 from sfm_app.estimation.diagnosis import diagnose_depth, diagnose_scene
 from sfm_app.estimation.given_cameras import camera_rules, given_and_found, refined_claims, report_checks, report_claims
-from sfm_app.files import digest_files, mark_unfinished, replace_atomically, resume_or_clear
+from sfm_app.files import mark_unfinished, resume_or_clear
 from sfm_app.frame.upright import gps_deviation, orient_or_keep, submit_cue_extraction
 from sfm_app.mapping.attempt import photo_names, unregistered_reasons
 from sfm_app.mapping.feature_retry import MappedScene, retry_lost_photos
@@ -21,10 +19,10 @@ from sfm_app.mapping.look_alikes import jumps, look_alike_entries
 from sfm_app.mapping.passes import Outcome, reconstruct
 from sfm_app.mapping.rolling_shutter import follow_shutter
 from sfm_app.mapping.split_and_merge import weakly_joined_parts
-from sfm_app.numerical import Json, json_text
-from sfm_app.operating_system import move
+from sfm_app.numerical import Json
+from sfm_app.products import write_scene, write_sparse_models
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.workspace import MAPPING, SubWorkspace, Workspace
+from sfm_app.runtime.workspace import MAPPING, SubWorkspace
 from sfm_app.types import Intrinsics, MatchGraph, Scene, ViewGraph
 
 
@@ -46,20 +44,6 @@ def make(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: Run
         raise
     shutil.rmtree(inner.workspace.root, ignore_errors=True)
     return scene
-
-
-def load(run: RunContext) -> Scene:
-    """Read the model and scene.json back."""
-    place = run.workspace
-    values = json.loads(place.scene.read_text(encoding="utf-8"))
-    with translate_errors("reading the sparse model"):
-        scene = read_scene(place.sparse, values["camera_of"], values["unregistered"], values["cameras"])
-    return replace(scene, gps_deviation=values.get("gps_deviation"))
-
-
-def digest(place: Workspace) -> str:
-    """Return a hash of the model and scene.json."""
-    return digest_files(place.root, place.sparse.name, place.scene.name)
 
 
 def mapping_run(run: RunContext) -> RunContext:
@@ -104,12 +88,12 @@ def _finish_scene(mapped: MappedScene, run: RunContext) -> Scene:
             color_points(model, run.workspace.photos, run.workers)
     turn_deg = None if run.settings.scene.photo_rotation_deg == "auto" else run.settings.scene.photo_rotation_deg
     orientations = [orient_or_keep(model, matches, cues, turn_deg) for model in models]
-    write_models(models, run)
+    write_sparse_models(models, run.workspace)
     members = [posed_photo_ids(model) for model in models]
     reasons = unregistered_reasons(set(members[0]), members[1:], matches, views, outcome.graph)
     scene = read_scene(run.workspace.sparse, names, reasons, refined_cameras(adjusted[0], names))
     scene = replace(scene, gps_deviation=gps_deviation(orientations[0]))
-    write_scene(scene, run)
+    write_scene(scene, run.workspace)
     lenses = {name: adjusted[0].lenses.get(key) for name, key in _camera_ids(adjusted[0], names).items()}
     run.record(
         **shutter,
@@ -191,27 +175,6 @@ def _camera_ids(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, int
     return {names[image.name]: image.camera_id for image in posed_images(adjusted.model)}
 
 
-def write_models(models: list[Reconstruction], run: RunContext) -> None:
-    """Write the main model, the first, to OUT/sparse and the others to OUT/other_models/1, 2, ..., each atomically."""
-    place = run.workspace
-    shutil.rmtree(place.other_models, ignore_errors=True)
-    for number, model in enumerate(models[1:], start=1):
-        write_model(model, place.other_models / str(number))
-    write_model(models[0], place.sparse)
-
-
-def write_model(model: Reconstruction, target: Path) -> None:
-    """Write a model into a folder beside the target, then replace the target with it."""
-    beside = target.with_name(f".{target.name}")
-    shutil.rmtree(beside, ignore_errors=True)
-    beside.mkdir(parents=True)
-    with translate_errors("writing the sparse model"):
-        model.write(beside)
-        check_written(*beside.iterdir())
-    shutil.rmtree(target, ignore_errors=True)
-    move(beside, target)
-
-
 def refined_cameras(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, RefinedCamera]:
     """Return deviations, determined parameters and correlations of the refined cameras, by name."""
     return {
@@ -222,15 +185,3 @@ def refined_cameras(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str,
         }
         for name, camera_id in _camera_ids(adjusted, names).items()
     }
-
-
-def write_scene(scene: Scene, run: RunContext) -> None:
-    """Write scene.json, the values that COLMAP's model does not hold."""
-    values = {
-        "cameras": {name: camera.to_dict() for name, camera in scene.cameras.items()},
-        "camera_of": dict(scene.camera_of),
-        "unregistered": dict(scene.unregistered),
-        "gps_deviation": scene.gps_deviation,
-    }
-    with replace_atomically(run.workspace.scene) as path:
-        path.write_text(json_text(values), encoding="utf-8", newline="\n")

@@ -4,26 +4,22 @@ import shutil
 from collections.abc import Mapping
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sfm_app.files import digest_files, fingerprint, load_arrays, mark_unfinished, replace_atomically, resume_or_clear
+from sfm_app.files import fingerprint, load_arrays, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.meshing.ray_casting import NearestNormals, Occluders
 from sfm_app.photos.masks import fill_masked, read_mask
 from sfm_app.photos.panoramas import mask_part, panorama_parts, show_part
+from sfm_app.products import write_texture
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.workspace import Workspace
 from sfm_app.texture.assemble import texture_surface
 from sfm_app.texture.normal_map import bake_normals
 from sfm_app.texture.views import PhotoView, part_view, photo_view
-from sfm_app.types import Model, Scene, Surface, Texture
+from sfm_app.types import Model, Scene, Surface
 
-TEXTURE = "texture.npz"
-NORMALS = "normals"
-"""Prefix of normal maps in the file, before the number of the page."""
 PARTS = "parts"
 """Folder of the finished work on each photo, while the texture is made."""
 
@@ -43,7 +39,7 @@ def make(scene: Scene, surface: Surface, run: RunContext) -> Model:
     model, figures = texture_surface(surface, views, store, is_hidden, options, run.map)
     run.record(**figures)
     model = _add_normal_map(model, run) if run.settings.texture.normal_map else model
-    save_texture(model, run)
+    write_texture(model, run.workspace)
     shutil.rmtree(parts)
     return model
 
@@ -121,42 +117,3 @@ def read_photo(photo_dir: Path, view: PhotoView, used: NDArray[np.bool_] | None 
     if photo.shape[1::-1] != (view.width, view.height):
         photo = np.asarray(Image.fromarray(photo).resize((view.width, view.height), Image.Resampling.BOX))
     return photo
-
-
-def save_texture(model: Model, run: RunContext) -> None:
-    """Write texture/texture.npz."""
-    surface, texture = model.surface, model.texture
-    stored: dict[str, Any] = {"vertices": surface.vertices, "faces": surface.faces, "colors": surface.colors}
-    if texture is not None:
-        stored |= {"uv": texture.uv, "page": texture.page}
-        stored |= {f"page{number}": page for number, page in enumerate(texture.pages)}
-        stored |= {f"{NORMALS}{number}": page for number, page in enumerate(texture.normal_maps)}
-    with replace_atomically(run.workspace.texture / TEXTURE) as path:
-        np.savez(path, **stored)
-
-
-def load(run: RunContext) -> Model:
-    """Read the surface with its texture back."""
-    return read_texture(run.workspace)
-
-
-def digest(place: Workspace) -> str:
-    """Return a hash of the surface with its texture."""
-    return digest_files(place.texture, TEXTURE)
-
-
-def read_texture(place: Workspace) -> Model:
-    """Read the surface with its texture from an output folder."""
-    stored = load_arrays(place.texture / TEXTURE)
-    surface = Surface(stored["vertices"], stored["faces"], stored["colors"])
-    if "uv" not in stored:
-        return Model(surface)
-    pages, normals = _list_numbered(stored, "page"), _list_numbered(stored, NORMALS)
-    return Model(surface, Texture(stored["uv"], stored["page"], pages, normals))
-
-
-def _list_numbered(stored: Mapping[str, NDArray[Any]], kind: str) -> tuple[NDArray[Any], ...]:
-    arrays = list[NDArray[Any]]()
-    while (array := stored.get(f"{kind}{len(arrays)}")) is not None:
-        arrays.append(array)
-    return tuple(arrays)

@@ -1,17 +1,13 @@
 """view_graph: MatchGraph -> ViewGraph."""
 
 import shutil
-from dataclasses import replace
-
-import numpy as np
 
 from sfm_app.estimation.diagnosis import diagnose_scene
 from sfm_app.estimation.fitting import find_lenses, fit_pairs, to_view_graph
 from sfm_app.estimation.known import known_fits, known_lenses
-from sfm_app.files import digest_files, load_arrays, replace_atomically
 from sfm_app.matching.pairs import find_same_matches
+from sfm_app.products import read_view_graph, write_view_graph
 from sfm_app.runtime.context import GIVEN_CAMERAS, RunContext
-from sfm_app.runtime.workspace import Workspace
 from sfm_app.types import MatchGraph, ViewGraph
 
 LENS_SETTINGS = ("calibration.lens", "calibration.keep", "scene.camera_model", "photos.cameras", GIVEN_CAMERAS)
@@ -23,7 +19,7 @@ def make(matches: MatchGraph, run: RunContext) -> ViewGraph:
     if run.earlier is None:
         lenses, known = find_lenses(matches, run), {}
     else:
-        earlier = load(replace(run, workspace=run.earlier.place))
+        earlier = read_view_graph(run.earlier.place)
         lenses = find_lenses(matches, run, known_lenses(matches, earlier, run.earlier))
         known = known_fits(matches, earlier, find_same_matches(matches, run.earlier).pairs, lenses)
         run.record(known_pairs=len(known))
@@ -39,17 +35,6 @@ def make(matches: MatchGraph, run: RunContext) -> ViewGraph:
     )
     if not graph.fits:
         raise diagnose_scene(matches, graph, run.settings.matching).error()
-    with replace_atomically(run.workspace.view_graph) as path:
-        np.savez_compressed(path, allow_pickle=False, **graph.to_arrays())
+    write_view_graph(graph, run.workspace)
     shutil.rmtree(run.workspace.view_graph_parts)
     return graph
-
-
-def load(run: RunContext) -> ViewGraph:
-    """Read view_graph.npz back."""
-    return ViewGraph.from_arrays(load_arrays(run.workspace.view_graph))
-
-
-def digest(place: Workspace) -> str:
-    """Return a hash of view_graph.npz."""
-    return digest_files(place.root, place.view_graph.name)

@@ -1,8 +1,8 @@
 """Depth maps on CPU: pure functions on arrays, and the interface of every depth-map method."""
 
-from sfm_app.stereo.depth import DepthEstimate, DepthMap, confirm_depths, match_depths
-from sfm_app.stereo.method import DepthStore, DepthTask, Kind, make_depth_maps_on_cpu
-from sfm_app.stereo.view import View, rank_neighbors, region
+from sfm_app.stereo.depth import confirm_depths, match_depths
+from sfm_app.stereo.method import make_depth_maps_on_cpu
+from sfm_app.stereo.view import DepthEstimate, DepthMap, DepthStore, DepthTask, Kind, View, rank_neighbors, region
 
 __all__ = [
     "DepthEstimate",

@@ -18,7 +18,7 @@ from sfm_app.stereo.patch_match import (
 )
 from sfm_app.stereo.plain_areas import enclosed_pixels, fill_planar_areas, plain_walls, surfaceless_areas
 from sfm_app.stereo.rectify import depths_from_disparities, disparities, rectify
-from sfm_app.stereo.view import DepthArray, GrayImage, View
+from sfm_app.stereo.view import DepthArray, DepthEstimate, DepthMap, GrayImage, View
 from sfm_app.types import Rejected
 from sfm_app.types.arrays import FloatArray
 
@@ -41,29 +41,6 @@ class DepthOptions:
 
 
 OPTIONS = DepthOptions()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DepthMap:
-    """Depths of one photo."""
-
-    depth: DepthArray
-    normals: NDArray[np.float32]
-    """(H, W, 3) unit, camera frame, towards the camera; 0 where the depth is 0."""
-
-    @classmethod
-    def unknown(cls, view: View) -> "DepthMap":
-        """Make a map without any depth."""
-        return cls(np.zeros((view.height, view.width), np.float32), np.zeros((view.height, view.width, 3), np.float32))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DepthEstimate:
-    """Depths of one photo before the check against other depth maps."""
-
-    depth: DepthArray
-    confidence: NDArray[np.float32]
-    """(H, W) in [0, 1]: mean correlation with the better half of the neighbors; 0 where the depth is 0."""
 
 
 def match_depths(

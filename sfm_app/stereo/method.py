@@ -1,64 +1,20 @@
-"""The interface of depth-map methods, and the method for every machine."""
+"""The depth-map method for every machine."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 
 from sfm_app.numerical import FAILURES, error_reason
 from sfm_app.settings import AS_NEEDED, DepthSettings
 from sfm_app.stereo.depth import OPTIONS as DEPTH_OPTIONS
-from sfm_app.stereo.depth import DepthEstimate, DepthMap, confirm_depths, match_depths
+from sfm_app.stereo.depth import confirm_depths, match_depths
 from sfm_app.stereo.plane_proposals import add_depths, agreed_proposals, propose_planes
 from sfm_app.stereo.sky import blank_areas, near_pixels
-from sfm_app.stereo.view import DepthArray, GrayImage, View
+from sfm_app.stereo.view import DepthArray, DepthEstimate, DepthMap, DepthStore, DepthTask, GrayImage, View
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Rejected
 from sfm_app.types.arrays import BoolArray
-
-Result = TypeVar("Result")
-Kind = Literal["photometric", "geometric", "proposed"]
-"""COLMAP's names for a depth map before and after the check against the other photos; and proposals for plain areas."""
-
-
-class DepthStore(Protocol):
-    """Reads photos and keeps maps; a map appears complete or not at all.
-
-    Estimates are photometric, maps are geometric; a proposal has depths in plain areas, 0 elsewhere.
-    """
-
-    def photo(self, view: View, /) -> GrayImage:
-        """Return the photo without distortion, (H, W), at the size of the view."""
-
-    def has(self, view: View, kind: Kind, /) -> bool: ...
-    def read_estimate(self, view: View, /) -> DepthEstimate: ...
-    def read_depth(self, view: View, kind: Kind = "photometric", /) -> DepthArray: ...
-    def read_maps(self, view: View, /) -> DepthMap: ...
-    def write_estimate(self, view: View, estimate: DepthEstimate, /) -> None: ...
-    def write_maps(self, view: View, maps: DepthMap, /) -> None: ...
-    def write_proposal(self, view: View, depth: DepthArray, /) -> None: ...
-
-
-class ParallelMap(Protocol):
-    """Applies a function to items in parallel and returns the results in order; a label names the progress."""
-
-    def __call__(self, function: Callable[[int], Result], items: Sequence[int], label: str, /) -> list[Result]: ...
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DepthTask:
-    """The input of a depth-map method. Existing maps come from the same inputs and settings and are reused."""
-
-    folder: Path
-    """COLMAP's dense workspace with the undistorted photos and their model."""
-    views: Sequence[View]
-    ranked: Sequence[Sequence[int]]
-    """For each view, the indices of its neighbors, best first."""
-    options: DepthSettings
-    store: DepthStore
-    map: ParallelMap
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,17 +1,23 @@
-"""Views of photos, and the neighbors that each is matched with."""
+"""Views of photos, their depth maps, the input of every depth-map method, and the neighbors of each view."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.settings import DepthSettings
 from sfm_app.types.arrays import FloatArray, IndexArray
 
 DepthArray = NDArray[np.float32]
 """(H, W) depth along the optical axis in scene units, 0 where unknown."""
 GrayImage = NDArray[np.uint8]
 """(H, W)."""
+Kind = Literal["photometric", "geometric", "proposed"]
+"""COLMAP's names for a depth map before and after the check against the other photos; and proposals for plain areas."""
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +68,67 @@ class View:
         width, height = (max(1, side >> level) for side in (self.width, self.height))
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return replace(self, K=scale @ self.K, width=width, height=height, sample_px=0.5, level=level)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthMap:
+    """Depths of one photo."""
+
+    depth: DepthArray
+    normals: NDArray[np.float32]
+    """(H, W, 3) unit, camera frame, towards the camera; 0 where the depth is 0."""
+
+    @classmethod
+    def unknown(cls, view: View) -> "DepthMap":
+        """Make a map without any depth."""
+        return cls(np.zeros((view.height, view.width), np.float32), np.zeros((view.height, view.width, 3), np.float32))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthEstimate:
+    """Depths of one photo before the check against other depth maps."""
+
+    depth: DepthArray
+    confidence: NDArray[np.float32]
+    """(H, W) in [0, 1]: mean correlation with the better half of the neighbors; 0 where the depth is 0."""
+
+
+class DepthStore(Protocol):
+    """Reads photos and keeps maps; a map appears complete or not at all.
+
+    Estimates are photometric, maps are geometric; a proposal has depths in plain areas, 0 elsewhere.
+    """
+
+    def photo(self, view: View, /) -> GrayImage:
+        """Return the photo without distortion, (H, W), at the size of the view."""
+
+    def has(self, view: View, kind: Kind, /) -> bool: ...
+    def read_estimate(self, view: View, /) -> DepthEstimate: ...
+    def read_depth(self, view: View, kind: Kind = "photometric", /) -> DepthArray: ...
+    def read_maps(self, view: View, /) -> DepthMap: ...
+    def write_estimate(self, view: View, estimate: DepthEstimate, /) -> None: ...
+    def write_maps(self, view: View, maps: DepthMap, /) -> None: ...
+    def write_proposal(self, view: View, depth: DepthArray, /) -> None: ...
+
+
+class ParallelMap(Protocol):
+    """Applies a function to items in parallel and returns the results in order; a label names the progress."""
+
+    def __call__(self, function: Callable[[int], Result], items: Sequence[int], label: str, /) -> list[Result]: ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthTask:
+    """The input of a depth-map method. Existing maps come from the same inputs and settings and are reused."""
+
+    folder: Path
+    """COLMAP's dense workspace with the undistorted photos and their model."""
+    views: Sequence[View]
+    ranked: Sequence[Sequence[int]]
+    """For each view, the indices of its neighbors, best first."""
+    options: DepthSettings
+    store: DepthStore
+    map: ParallelMap
 
 
 def region(views: Sequence[View], margin: float = 0.2) -> FloatArray:

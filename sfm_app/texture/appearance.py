@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.least_squares import solve_positive
 from sfm_app.jit import kernel
-from sfm_app.texture.facets import NONE, IntArray, components, ranges
-from sfm_app.texture.sightings import Sightings
+from sfm_app.texture.sightings import NONE, IntArray, Sightings, components, ranges
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 LEAST_VIEWS = 3

@@ -12,10 +12,19 @@ from sfm_app.geometry.triangles import select_faces, split_fans
 from sfm_app.settings import TextureSettings
 from sfm_app.texture.appearance import doubtful_border, outlier_mask, photo_gains
 from sfm_app.texture.charts import Charts, Layout, absorb_small_charts, block_of_faces, lay_out, make_charts
-from sfm_app.texture.facets import NONE, Facets, IntArray, facets
 from sfm_app.texture.pages import CheckedViews, ParallelMap, Store, TexturePlan, fill_background, paint_blocks
 from sfm_app.texture.seams import SQUARE_CORNERS, Blend, blend_weights, level_seams, square_texels, vertex_colors
-from sfm_app.texture.sightings import FaceView, OcclusionTest, list_sightings, score_faces, sharpness_factors
+from sfm_app.texture.sightings import (
+    NONE,
+    Facets,
+    FaceView,
+    IntArray,
+    OcclusionTest,
+    facets,
+    list_sightings,
+    score_faces,
+    sharpness_factors,
+)
 from sfm_app.texture.view_selection import choose_photos
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import Model, Rejected, Surface, Texture

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from sfm_app.geometry.triangles import morton_order
 from sfm_app.jit import kernel
 from sfm_app.settings import TextureSettings
-from sfm_app.texture.facets import NONE, Facets, IntArray, components
 from sfm_app.texture.seams import block_sizes, squares
-from sfm_app.texture.sightings import Sightings
+from sfm_app.texture.sightings import NONE, Facets, IntArray, Sightings, components
 from sfm_app.texture.views import project
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 

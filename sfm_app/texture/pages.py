@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.texture.charts import MARGIN, Charts, Layout
-from sfm_app.texture.facets import NONE, Facets, IntArray
 from sfm_app.texture.seams import Blend
-from sfm_app.texture.sightings import Sightings
+from sfm_app.texture.sightings import NONE, Facets, IntArray, Sightings
 from sfm_app.texture.views import PhotoView, project, sample
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 

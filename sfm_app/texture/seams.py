@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.texture.facets import NONE, Facets, IntArray, distinct
-from sfm_app.texture.sightings import Sightings
+from sfm_app.texture.sightings import NONE, Facets, IntArray, Sightings, distinct
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 SQUARE_CORNERS = np.array([[0.5, 0.5], [1.5, 0.5], [0.5, 1.5]])

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.texture.facets import NONE, Facets, IntArray
-from sfm_app.texture.sightings import Sightings
+from sfm_app.texture.sightings import NONE, Facets, IntArray, Sightings
 from sfm_app.types.arrays import IndexArray
 
 

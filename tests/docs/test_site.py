@@ -10,7 +10,7 @@ import click
 import pytest
 
 import sfm_app
-from sfm_app.cli import main
+from sfm_app.cli.program import main
 from sfm_app.runtime.workspace import CHECKSUM, StageRecord
 from sfm_app.settings import Section, Settings
 from tests.docs.pages import ROOT

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from sfm_app.cli import main
+from sfm_app.cli.program import main
 from sfm_app.colmap import worker_process
 
 APPEARED = itertools.count(1)

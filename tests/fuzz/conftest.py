@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from sfm_app.cli import main
+from sfm_app.cli.program import main
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
 from sfm_app.synthetic.scenes import courtyard

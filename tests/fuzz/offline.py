@@ -2,7 +2,7 @@
 
 import sys
 
-from sfm_app.cli import main
+from sfm_app.cli.program import main
 
 KNOCKS = ("socket.connect", "socket.getaddrinfo", "socket.gethostbyname", "socket.sendto", "urllib.Request")
 

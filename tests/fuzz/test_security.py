@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 import sfm_app
-from sfm_app.cli import main
+from sfm_app.cli.program import main
 
 from .conftest import QUICK
 

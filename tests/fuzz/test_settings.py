@@ -3,8 +3,8 @@
 import pytest
 from click.testing import CliRunner
 
-from sfm_app.cli import main
 from sfm_app.cli.options import parse_assignment
+from sfm_app.cli.program import main
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.photos.files import list_files, resolve_file
 from sfm_app.settings import MOST_TOML_BYTES, Settings

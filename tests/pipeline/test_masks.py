@@ -11,9 +11,9 @@ import sfm_app
 from sfm_app.colmap.database import read_match_graph
 from sfm_app.colmap.dense import read_depth, read_views
 from sfm_app.pipeline import NAMES
+from sfm_app.products import read_texture
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
-from sfm_app.stages.texture import read_texture
 from sfm_app.types import Photo, PhotoSet
 from tests.pipeline.test_odd_inputs import SIZE, call, picture
 

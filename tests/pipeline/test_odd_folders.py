@@ -11,7 +11,7 @@ from PIL import Image
 
 from benchmarks.synthetic.scenes import build_scene
 from benchmarks.synthetic.walks import panorama
-from sfm_app.cli import main
+from sfm_app.cli.program import main
 from sfm_app.synthetic import scenes
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
 from sfm_app.synthetic.compare import focal_error_percent

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from filelock import FileLock
 from PIL import Image, features
 
-from sfm_app.cli import main
+from sfm_app.cli.program import main
 from sfm_app.runtime.workspace import LOCK
 
 SIZE = (128, 96)

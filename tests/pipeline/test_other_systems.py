@@ -80,7 +80,7 @@ def test_exports_remove_nothing_that_is_open(runs, tmp_path):
     files = {"usdz": "x.usdz", "colmap": "colmap", "bundler": "bundler", "draco": "x.glb", "laz": "x.laz"}
     targets, notes = {name: tmp_path / file for name, file in files.items()}, tmp_path / "notes.txt"
     calls = [["export", str(runs[0]), "--format", name, "-o", str(target)] for name, target in targets.items()]
-    code = f"from sfm_app.cli import main\nfor call in 2 * {calls!r}:\n  main(call, standalone_mode=False)"
+    code = f"from sfm_app.cli.program import main\nfor call in 2 * {calls!r}:\n  main(call, standalone_mode=False)"
 
     known = {**os.environ, **rules_for(tmp_path, notes), "TMPDIR": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", code], env=known, capture_output=True, text=True, check=False)

@@ -17,15 +17,16 @@ from click.testing import CliRunner
 import sfm_app
 from benchmarks.surface.left_out import remake_without
 from benchmarks.surface.photos import placed_photos
-from sfm_app.cli import main
+from sfm_app.cli.program import main
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.dense import DenseStore
 from sfm_app.formats import EXPORTERS, SCENE_EXPORTERS
 from sfm_app.pipeline import NAMES
+from sfm_app.products import read_texture
 from sfm_app.runtime.workspace import LOCK, Workspace
 from sfm_app.settings import Settings, merge_nested
 from sfm_app.stages import texture
-from sfm_app.stages.texture import PARTS, FileStore, photo_views, read_texture
+from sfm_app.stages.texture import PARTS, FileStore, photo_views
 from sfm_app.synthetic.cameras import camera_center
 from sfm_app.synthetic.compare import center_error_percent, focal_error_percent, surface_error
 from sfm_app.texture import pages

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 import sfm_app
 from sfm_app.api import open_run
-from sfm_app.cli import main
+from sfm_app.cli.program import main
 from sfm_app.errors import InputError
 from sfm_app.report.page import REPORT
 from sfm_app.report.server import read_resources
@@ -146,7 +146,7 @@ def test_a_damaged_model_is_left_out_and_not_given_to_colmap(mapped, tmp_path, m
     shutil.copytree(mapped.out, out, symlinks=True)
     with (out / "sparse" / "points3D.bin").open("r+b") as file:
         file.write(b"\xff" * 64)
-    monkeypatch.setattr("sfm_app.stages.scene.load", lambda _: pytest.fail("COLMAP would hang"))
+    monkeypatch.setattr("sfm_app.products.read_scene", lambda _: pytest.fail("COLMAP would hang"))
     sfm_app.write_report(out)
     text, page = read(out)
     assert data_of(text)["view"] is None and [row["state"] for row in data_of(text)["photos"][:7]] == ["usable"] * 7

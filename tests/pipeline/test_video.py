@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from sfm_app.cli import main
+from sfm_app.cli.program import main
 from sfm_app.synthetic.cameras import look_at, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, develop
 from sfm_app.synthetic.render import prepare, render_scene

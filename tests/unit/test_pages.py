@@ -18,8 +18,8 @@ import pytest
 
 import sfm_app
 from sfm_app import errors, plugins
-from sfm_app.cli import main
 from sfm_app.cli.options import parse_assignment
+from sfm_app.cli.program import main
 from sfm_app.errors import SfmError
 from sfm_app.plugins import installed_plugins, load_plugins
 from sfm_app.settings import QUALITY_PRESETS, EpipolarSettings, MatchSettings, Settings

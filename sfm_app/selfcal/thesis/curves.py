@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.selfcal.constraints import center_polynomials, focal_polynomials
+from sfm_app.selfcal.consensus import center_polynomials, focal_polynomials
 from sfm_app.selfcal.pairs import Pairs
 from sfm_app.types.arrays import FloatArray
 

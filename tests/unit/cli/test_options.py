@@ -6,7 +6,7 @@ import click
 import pytest
 from click.shell_completion import ShellComplete
 
-from sfm_app.cli import commands, main
+from sfm_app.cli import commands
 from sfm_app.cli.commands import SCENES
 from sfm_app.cli.options import (
     SETTING_FLAGS,
@@ -17,6 +17,7 @@ from sfm_app.cli.options import (
     setting_value,
     settings_from_flags,
 )
+from sfm_app.cli.program import main
 from sfm_app.frame.markers import FAMILIES, PAGES_MM
 from sfm_app.pipeline import NAMES
 from sfm_app.plugins import load_plugins

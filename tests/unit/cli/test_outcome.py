@@ -12,10 +12,11 @@ from click.testing import CliRunner
 
 from sfm_app.api import Run
 from sfm_app.camera.models import camera_matrix, panorama_matrix
-from sfm_app.cli import commands, main
+from sfm_app.cli import commands
 from sfm_app.cli.commands import SCENES
 from sfm_app.cli.outcome import demo_steps, outcome_lines, run_lines, run_steps, run_summary
 from sfm_app.cli.output import print_text
+from sfm_app.cli.program import main
 from sfm_app.demo import DemoResult, demo_lines
 from sfm_app.report.text import contradiction_lines, intrinsics_lines, intrinsics_summary, refined_text
 from sfm_app.settings import Settings

@@ -14,8 +14,8 @@ from click.shell_completion import BashComplete
 from click.testing import CliRunner
 from PIL import Image
 
-from sfm_app.cli import commands, main
-from sfm_app.cli.program import SECTIONS, fail
+from sfm_app.cli import commands
+from sfm_app.cli.program import SECTIONS, fail, main
 from sfm_app.settings import Settings
 from tests.unit.cli.test_terminal import LONG, Screen, check_text
 
@@ -31,7 +31,7 @@ def call(*arguments):
 def loaded_by(*arguments, **environment):
     """The modules in `HEAVY` that a process imports, and its stdout."""
     code = (
-        "import sys; from sfm_app.cli import main\n"
+        "import sys; from sfm_app.cli.program import main\n"
         "try: main(prog_name='sfm-app')\n"
         f"finally: print([name for name in {HEAVY} if name in sys.modules], file=sys.stderr)"
     )
@@ -69,7 +69,7 @@ def test_completion_imports_little(words, completed):
 
 @pytest.mark.slow
 def test_the_list_of_commands_imports_none():
-    code = "import sys; from sfm_app.cli import main; main(['--help'], standalone_mode=False); "
+    code = "import sys; from sfm_app.cli.program import main; main(['--help'], standalone_mode=False); "
     code += "sys.exit('sfm_app.cli.commands' in sys.modules or 'pydantic' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
 
@@ -284,6 +284,8 @@ def test_errors_fit_on_a_terminal(monkeypatch):
 
 @pytest.mark.slow
 def test_a_warning_of_python_reaches_no_terminal():
-    code = "import warnings; from sfm_app.cli import main; main([], standalone_mode=False); warnings.warn('root of -1')"
+    code = (
+        "import warnings; from sfm_app.cli.program import main; main([], standalone_mode=False); warnings.warn('of -1')"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "sfm-app run PHOTOS" in done.stdout and done.stderr == ""

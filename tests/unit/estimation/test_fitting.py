@@ -11,6 +11,7 @@ from sfm_app.errors import ConfigError
 from sfm_app.estimation.calibrating import find_intrinsics
 from sfm_app.estimation.fitting import describe_lens, find_lenses, ray_estimator, to_calibration
 from sfm_app.plugins import load_plugins
+from sfm_app.products import read_view_graph
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
@@ -54,7 +55,7 @@ def test_a_fisheye_is_found_before_fundamental_matrices_and_becomes_the_camera(r
     intrinsics, _ = find_intrinsics(matches, views, run)
 
     assert run.statistics["lenses"] == {"960x640": "a fisheye with 204 degrees along the longer side"}
-    assert view_graph.load(run).lenses["960x640"].to_dict() == views.lenses["960x640"].to_dict()
+    assert read_view_graph(run.workspace).lenses["960x640"].to_dict() == views.lenses["960x640"].to_dict()
     camera = intrinsics.main
     assert (camera.projection, camera.method, camera.identifiable) == ("fisheye", "lens", True)
     theta = np.linspace(0.1, 1.6, 20)

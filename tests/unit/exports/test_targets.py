@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 import sfm_app
 from sfm_app import exports
-from sfm_app.cli import main
+from sfm_app.cli.program import main
 from sfm_app.formats import EXPORTERS, SCENE_EXPORTERS
 from sfm_app.formats.exporters import SceneExporter
 from sfm_app.formats.scenes import plain_names

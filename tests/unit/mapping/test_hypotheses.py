@@ -8,18 +8,19 @@ import pytest
 from sfm_app.camera.models import camera_matrix
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import MappedCamera
-from sfm_app.mapping import hypotheses
+from sfm_app.mapping import passes
 from sfm_app.mapping import passes as module
 from sfm_app.mapping.attempt import Attempt, NoModel, PairSupport, explained_pairs
-from sfm_app.mapping.hypotheses import (
+from sfm_app.mapping.passes import (
     OPTIONS,
+    Mappers,
     camera_per_photo_explains_more,
     is_shared_camera_doubtful,
+    reconstruct,
     two_cameras_suffice,
     with_camera_per_photo,
     with_two_cameras,
 )
-from sfm_app.mapping.passes import Mappers, reconstruct
 from sfm_app.settings import Settings
 from sfm_app.types import ViewGraph
 
@@ -117,7 +118,7 @@ def each_of(synthetic, cameras, focals):
 
 def test_photos_of_two_focals_get_two_cameras(synthetic, cameras, monkeypatch):
     model, each, found = each_of(synthetic, cameras, [1000.0, 1300.0, 1010.0, 1310.0, 990.0, 1290.0])
-    monkeypatch.setattr(hypotheses, "cameras_by_photo", lambda _: found)
+    monkeypatch.setattr(passes, "cameras_by_photo", lambda _: found)
     two = with_two_cameras(model, each, synthetic.matches)
     names = {photo: two.camera_name(synthetic.matches.images[photo]) for photo in range(1, 7)}
     assert len(two.cameras) == 2 and names[1] == names[3] == names[5] != names[2] == names[4] == names[6]
@@ -127,7 +128,7 @@ def test_photos_of_two_focals_get_two_cameras(synthetic, cameras, monkeypatch):
 
 def test_a_single_photo_of_another_focal_is_no_second_camera(synthetic, cameras, monkeypatch):
     model, each, found = each_of(synthetic, cameras, [1000.0, 1005.0, 1010.0, 1310.0, 990.0, 1001.0])
-    monkeypatch.setattr(hypotheses, "cameras_by_photo", lambda _: found)
+    monkeypatch.setattr(passes, "cameras_by_photo", lambda _: found)
     assert with_two_cameras(model, each, synthetic.matches) is None
 
 

@@ -10,11 +10,10 @@ from sfm_app.colmap.bundle import adjust
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.errors import BackendError
-from sfm_app.mapping import hypotheses
+from sfm_app.mapping import passes
 from sfm_app.mapping import passes as module
 from sfm_app.mapping.attempt import Attempt, NoModel, PairSupport, explained_pairs
-from sfm_app.mapping.hypotheses import guessed_intrinsics
-from sfm_app.mapping.passes import Mappers, Passes, learned_intrinsics, reconstruct
+from sfm_app.mapping.passes import Mappers, Passes, guessed_intrinsics, learned_intrinsics, reconstruct
 from sfm_app.mapping.split_and_merge import split_attempt
 from sfm_app.posegraph.graph import LOOKS_ALIKE
 from sfm_app.types import LookAlikes, PoseGraph
@@ -305,8 +304,8 @@ def test_a_rival_that_fails_costs_nothing(synthetic, run, cameras, mapped, monke
     def fail(*_):
         raise BackendError("COLMAP failed")
 
-    monkeypatch.setattr(hypotheses, "map_with_colmap_defaults", fail)
-    mapped.mappers = replace(mapped.mappers, map_baseline=hypotheses.map_baseline)
+    monkeypatch.setattr(passes, "map_with_colmap_defaults", fail)
+    mapped.mappers = replace(mapped.mappers, map_baseline=passes.map_baseline)
 
     found = mapped.outcome(cameras(method="guess", identifiable=False), run())
 

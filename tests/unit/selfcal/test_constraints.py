@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm_app.selfcal.constraints import center_polynomials, focal_polynomials, singular_value_ratio
+from sfm_app.selfcal.consensus import center_polynomials, focal_polynomials, singular_value_ratio
 from sfm_app.selfcal.pairs import prepare
 from sfm_app.types import CameraPairs
 

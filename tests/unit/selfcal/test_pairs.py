@@ -5,7 +5,8 @@ import pytest
 
 from sfm_app.geometry.epipolar import sampson_distance
 from sfm_app.selfcal import pair_weights
-from sfm_app.selfcal.pairs import LEAST_SLOPE, prepare, undistort_kernel, undistort_pairs, write_camera, write_ray
+from sfm_app.selfcal.calibrate_pairs import undistort_pairs
+from sfm_app.selfcal.pairs import LEAST_SLOPE, prepare, undistort_kernel, write_camera, write_ray
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import Calibration, CameraPairs
 

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm_app.camera.models import ASPECT, CENTER, FOCAL, LENS, WIDE
 from sfm_app.selfcal import priors
-from sfm_app.selfcal.priors import ASPECT, CENTER, FOCAL, LENS, PRIORS, CameraPriors, Evidence, redundancy
+from sfm_app.selfcal.priors import PRIORS, CameraPriors, Evidence, redundancy
 from sfm_app.selfcal.zero_curves import calibrate
 from sfm_app.settings import CalibrationSettings
 
@@ -132,7 +133,7 @@ def test_k1_is_held_in_focal_lengths():
     lens = CameraPriors(np.ones(1), NO_CLAIM)
     for log_focal in (-0.5, 0.0, 0.8):
         precision = lens.prior(freed(LENS), np.array([[log_focal, 0, 0, 0, 0]])).precision[0, 4]
-        assert precision**-0.5 * np.exp(2 * log_focal) == pytest.approx(priors.WIDE[LENS])
+        assert precision**-0.5 * np.exp(2 * log_focal) == pytest.approx(WIDE[LENS])
 
 
 @pytest.mark.parametrize("claim", [500.0, 850.0, 1180.0, 4000.0])

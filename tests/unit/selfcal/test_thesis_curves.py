@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm_app.selfcal.constraints import center_polynomials, focal_polynomials
+from sfm_app.selfcal.consensus import center_polynomials, focal_polynomials
 from sfm_app.selfcal.pairs import prepare
 from sfm_app.selfcal.thesis import curves
 from sfm_app.selfcal.thesis.curves import (

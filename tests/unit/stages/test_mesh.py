@@ -14,6 +14,7 @@ from sfm_app.colmap.surface import open_points, positions
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.triangles import areas, unique_edges, vertex_normals
 from sfm_app.plugins import load_plugins
+from sfm_app.products import SURFACE, hash_surface, read_surface
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
@@ -135,7 +136,7 @@ def test_fewer_faces_do_not_fuse_again_and_one_worker_gives_the_same_bytes(dense
     assert 400 < len(few.faces) <= 500
     for name in ("vertices", "faces", "colors"):
         np.testing.assert_array_equal(getattr(again, name), getattr(ball[0], name))
-        np.testing.assert_array_equal(getattr(mesh.load(run_in(dense)), name), getattr(again, name))
+        np.testing.assert_array_equal(getattr(read_surface(run_in(dense).workspace), name), getattr(again, name))
 
 
 def test_what_no_photo_sees_is_cut_off_or_kept_closed(dense, tmp_path):
@@ -291,13 +292,13 @@ def make_with_map(dense, workers=2, *, normal_map=True, **options):
 @pytest.mark.parametrize("block_points", [4_000_000, FEW_BLOCKS])
 def test_the_fine_surface_is_kept_for_a_normal_map_and_changes_nothing_else(dense, ball, tmp_path, block_points):
     place, options = copied(dense, tmp_path), {"faces": 500, "block_points": block_points}
-    light = (make_with_map(place, normal_map=False, **options).surface / mesh.SURFACE).read_bytes()
+    light = (make_with_map(place, normal_map=False, **options).surface / SURFACE).read_bytes()
     assert not Workspace(tmp_path).fine_surface.exists()
 
     kept = make_with_map(place, **options)
     fine = kept.fine_surface.read_bytes()
 
-    assert (kept.surface / mesh.SURFACE).read_bytes() == light
+    assert (kept.surface / SURFACE).read_bytes() == light
     stored = np.load(kept.fine_surface)
     vertices, faces = stored["vertices"].astype(float), stored["faces"].astype(int)
     assert np.percentile(np.abs(np.linalg.norm(vertices, axis=1) - 1), 95) < 0.01
@@ -308,6 +309,6 @@ def test_the_fine_surface_is_kept_for_a_normal_map_and_changes_nothing_else(dens
     assert np.mean(np.sum(outward * corners.mean(axis=1), axis=1) > 0) > 0.999
     assert make_with_map(place, workers=1, **options).fine_surface.read_bytes() == fine
 
-    whole = mesh.digest(kept)
+    whole = hash_surface(kept)
     kept.fine_surface.write_bytes(fine[:-1])
-    assert mesh.digest(kept) != whole
+    assert hash_surface(kept) != whole

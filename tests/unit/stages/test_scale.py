@@ -10,6 +10,7 @@ import trimesh
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.plugins import load_plugins
+from sfm_app.products import read_frame
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
@@ -49,6 +50,6 @@ def test_points_are_written_in_the_frame_of_exports_whatever_was_known_before(ru
     assert not frame.is_metric and len(points) > 200
     longer, moved = written(run, distances=[["0,0,0", "1,0,0", "3m"]])
     assert longer.from_model.scale == pytest.approx(3.0) and np.allclose(moved[:200], 3.0 * points[:200], atol=1e-5)
-    assert scale.load(run).from_model.scale == longer.from_model.scale
+    assert read_frame(run.workspace).from_model.scale == longer.from_model.scale
     written(run)
     assert [(run.workspace.root / name).read_bytes() for name in FILES] == first

@@ -19,6 +19,7 @@ from sfm_app.errors import ReconstructionError
 from sfm_app.mapping.attempt import Attempt, PairSupport
 from sfm_app.mapping.passes import Outcome
 from sfm_app.plugins import load_plugins
+from sfm_app.products import read_scene, write_scene, write_sparse_models
 from sfm_app.report.text import scene_lines
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import MAPPING, Workspace
@@ -122,7 +123,7 @@ def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthe
     assert run.statistics["pairs_dropped"] == {"contradicts other pairs": 1}
     assert posed_photo_ids(pycolmap.Reconstruction(run.workspace.other_models / "1")) == [5, 6, 7]
 
-    again = scene.load(run)
+    again = read_scene(run.workspace)
     assert again.unregistered == found.unregistered and again.points == found.points
     assert all(np.array_equal(again.cam_from_world[key], value) for key, value in found.cam_from_world.items())
 
@@ -139,7 +140,7 @@ def test_cameras_that_mapping_divided_are_read_back(synthetic, run, mapped):
     found = scene.make(matches, views, made.intrinsics, run)
 
     assert (found.camera_of[last], len(found.cameras)) == ("one #2", 2)
-    again = scene.load(run)
+    again = read_scene(run.workspace)
     assert again.camera_of == found.camera_of and again.cameras.keys() == found.cameras.keys()
 
 
@@ -220,7 +221,7 @@ def test_models_are_written_as_a_whole_and_nothing_of_an_earlier_run_is_left(syn
         folder.mkdir(parents=True)
         (folder / "old.bin").write_bytes(b"old")
 
-    scene.write_models(parts, run)
+    write_sparse_models(parts, place)
 
     written = files(place.sparse)
     assert "images.bin" in written and "old.bin" not in written
@@ -229,7 +230,7 @@ def test_models_are_written_as_a_whole_and_nothing_of_an_earlier_run_is_left(syn
     found = [place.sparse, place.other_models / "1", place.other_models / "2"]
     assert [posed_photo_ids(pycolmap.Reconstruction(folder)) for folder in found] == [[1, 2, 3, 4], [5, 6], [7, 8]]
 
-    scene.write_models(parts[1:2], run)
+    write_sparse_models(parts[1:2], place)
 
     assert posed_photo_ids(pycolmap.Reconstruction(place.sparse)) == [5, 6]
     assert not place.other_models.exists()
@@ -240,10 +241,7 @@ def test_what_the_model_does_not_hold_is_written_down(tmp_path):
     K = camera_matrix(800.0, 800.0, 320.0, 240.0)
     camera = CameraModel("OPENCV", (800.0,) * 8, K, 640, 480, {"fx": 1.5, "cx": 2.5}, ("center",))
 
-    scene.write_scene(
-        Scene(tmp_path, {}, {"b.jpg": "blurred"}, {"one": camera}, 10, 20, 0.3, {"a.jpg": "one"}),
-        SimpleNamespace(workspace=place),
-    )
+    write_scene(Scene(tmp_path, {}, {"b.jpg": "blurred"}, {"one": camera}, 10, 20, 0.3, {"a.jpg": "one"}), place)
 
     found = json.loads(place.scene.read_text())
     assert found["cameras"]["one"]["deviations"] == {"fx": 1.5, "cx": 2.5}

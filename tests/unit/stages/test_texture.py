@@ -8,10 +8,11 @@ import pytest
 from PIL import Image
 
 from sfm_app.photos.masks import save_mask
+from sfm_app.products import read_texture, write_texture
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import texture
-from sfm_app.stages.texture import FileStore, read_photo, read_texture, save_texture, surface_digest
+from sfm_app.stages.texture import FileStore, read_photo, surface_digest
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import CameraModel, Model, Surface, Texture
 
@@ -31,7 +32,7 @@ def run_of(place, fingerprint="", **settings):
 
 
 def stored(model, place):
-    save_texture(model, SimpleNamespace(workspace=Workspace(place)))
+    write_texture(model, Workspace(place))
     return read_texture(Workspace(place))
 
 

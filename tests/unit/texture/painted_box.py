@@ -8,8 +8,7 @@ import numpy as np
 from sfm_app.meshing.ray_casting import Occluders
 from sfm_app.settings import TextureSettings
 from sfm_app.texture.assemble import texture_surface
-from sfm_app.texture.facets import facets
-from sfm_app.texture.sightings import make_sightings
+from sfm_app.texture.sightings import facets, make_sightings
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import Surface
 

@@ -8,7 +8,7 @@ from painted_box import box, sightings
 
 from sfm_app.geometry.triangles import select_faces
 from sfm_app.texture.appearance import BORDERS, doubtful_border, median, outlier_mask, photo_gains
-from sfm_app.texture.facets import facets
+from sfm_app.texture.sightings import facets
 from sfm_app.types import Surface
 
 

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 from painted_box import box, sightings
 
 from sfm_app.texture.charts import MARGIN, Charts, absorb_small_charts, folds, pack
-from sfm_app.texture.facets import NONE, facets
 from sfm_app.texture.pages import owners
+from sfm_app.texture.sightings import NONE, facets
 
 
 def test_specks_go_over_to_their_neighbors():

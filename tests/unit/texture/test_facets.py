@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from painted_box import strip
 
-from sfm_app.texture.facets import NONE, components, distinct, facets
+from sfm_app.texture.sightings import NONE, components, distinct, facets
 from sfm_app.types import Surface
 
 

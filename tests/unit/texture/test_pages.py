@@ -9,8 +9,8 @@ from painted_box import Album, around, assert_same_texture, box
 from painted_box import textured as textured_surface
 
 from sfm_app.texture import pages
-from sfm_app.texture.facets import NONE
 from sfm_app.texture.pages import fill_background, owners
+from sfm_app.texture.sightings import NONE
 
 
 def test_texels_have_the_same_owners_in_bands():

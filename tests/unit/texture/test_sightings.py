@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from painted_box import sightings
 
-from sfm_app.texture.facets import NONE
-from sfm_app.texture.sightings import sharpness, sharpness_factors
+from sfm_app.texture.sightings import NONE, sharpness, sharpness_factors
 
 
 def test_blur_lowers_sharpness():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from painted_box import sightings, strip
 
-from sfm_app.texture.facets import NONE
+from sfm_app.texture.sightings import NONE
 from sfm_app.texture.view_selection import OPTIONS, choose_photos
 
 
