@@ -126,6 +126,13 @@ class CalibrationSettings(Section):
     )
 
 
+HypothesisName = Literal[
+    "false-joins", "colmap-defaults", "other-focals", "camera-per-photo", "two-cameras", "learned-cameras",
+    "merged-models", "finer-features",
+]  # fmt: skip
+"""Names of `mapping.hypotheses`."""
+
+
 class SceneSettings(Section):
     """Poses, sparse points and bundle adjustment."""
 
@@ -150,9 +157,7 @@ class SceneSettings(Section):
         "afterwards; 0: parts of 150 for more than 400 photos",
     )
     min_points: int = Field(30, ge=6, le=10000, description="a model with fewer points counts as failed")
-    second_look: bool = Field(
-        True, description="find finer features in unplaced photos and their neighbors, and map again"
-    )
+    without: tuple[HypothesisName, ...] = Field((), description="hypotheses about the photos that are not tried")
     photo_rotation_deg: Literal["auto", 0, 90, 180, 270] = Field(
         "auto", description="clockwise rotation that makes most photos upright, in degrees"
     )

@@ -31,7 +31,7 @@ from sfm_app.posegraph.graph import average_pair_rotations
 from sfm_app.runtime.parallel import make_executor, ordered_map, worker_count
 from sfm_app.selfcal import calibrate_photo_set
 from sfm_app.settings import Settings
-from sfm_app.types import Intrinsics, PoseGraph
+from sfm_app.types import Evidence, Intrinsics, PoseGraph
 
 COUNTS = (1000, 2500, 10_000)
 ABOUT = (
@@ -63,7 +63,8 @@ def measure(photos: int, seed: int) -> Row:
     start = time.perf_counter()
     intrinsics = calibrate_town(town, seed)
     calibrated = time.perf_counter()
-    graph = build_pose_graph(town.matches, town.views, intrinsics, PoseGraphOptions(1.5, 16, seed), run_map)
+    evidence = Evidence(town.matches, town.views, intrinsics)
+    graph = build_pose_graph(evidence, PoseGraphOptions(1.5, 16, seed), run_map)
     posed = time.perf_counter()
     parts = cut_group(graph, graph.groups[0], PARTS.usual_size)
     end = time.perf_counter()

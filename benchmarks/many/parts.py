@@ -32,12 +32,13 @@ from sfm_app.colmap.backend import Reconstruction
 from sfm_app.colmap.bundle import adjust_or_keep
 from sfm_app.colmap.model import poses_and_points
 from sfm_app.geometry.poses import robust_similarity, umeyama
-from sfm_app.mapping.passes import reconstruct
+from sfm_app.mapping import reconstruct
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor, worker_count
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
+from sfm_app.types import Evidence
 
 FloatArray = NDArray[np.float64]
 Pose = FloatArray
@@ -75,7 +76,7 @@ def measure_town(photos: int, part: int, seed: int, place: Path) -> Row:
     workers, before = worker_count(0), cpu_s()
     with make_executor(workers) as executor:
         run = RunContext(settings, Workspace(place), load_plugins(installed=False), executor, workers)
-        outcome = reconstruct(town.matches, town.views, intrinsics, run)
+        outcome = reconstruct(Evidence(town.matches, town.views, intrinsics), run)
         main = outcome.models[0]
         model = adjust_or_keep(main.model, run.workspace.database).model
     spent = cpu_s() - before

@@ -14,7 +14,7 @@ from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.settings import Settings
 from sfm_app.stages import intrinsics as intrinsics_stage
 from sfm_app.stages import view_graph as view_graph_stage
-from sfm_app.types import Intrinsics, MatchGraph, PoseGraph
+from sfm_app.types import Evidence, Intrinsics, MatchGraph, PoseGraph
 
 FloatArray = NDArray[np.float64]
 WORST_PERCENT = 50.0
@@ -48,7 +48,7 @@ def figures(problem: Problem, seed: int) -> dict[str, float]:
             return {"AUC@5": 0.0, "focal %": WORST_PERCENT}
         intrinsics = intrinsics_stage.make(matches, views, run.with_fingerprint("K"))
         options = PoseGraphOptions(settings.epipolar.max_error_px, settings.epipolar.min_inliers, seed)
-        graph = build_pose_graph(matches, views, intrinsics, options, run.map)
+        graph = build_pose_graph(Evidence(matches, views, intrinsics), options, run.map)
     return {
         "AUC@5": area_under_recall(pair_errors_deg(problem, graph), LIMIT_DEG),
         "focal %": float(np.mean(focal_errors_percent(problem, intrinsics))),

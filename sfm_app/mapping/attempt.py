@@ -21,7 +21,7 @@ from sfm_app.numerical import FAILURES, error_reason
 from sfm_app.posegraph.pair_pose import is_in_front, pose_distances, ray_angles_deg
 from sfm_app.retrieval import choose_by_rank
 from sfm_app.runtime.context import RunContext
-from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
+from sfm_app.types import Calibration, Evidence, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
 from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import PERSPECTIVE
 
@@ -82,25 +82,32 @@ class Candidate:
     score: float
 
 
-def rank_seeds(
-    matches: MatchGraph, graph: PoseGraph, intrinsics: Intrinsics, photos: Sequence[int], min_angle_deg: float
-) -> list[Candidate]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Group:
+    """A connected group of photos, the evidence about them, and their relative poses."""
+
+    photos: Sequence[int]
+    evidence: Evidence
+    graph: PoseGraph
+
+
+def rank_seeds(group: Group, min_angle_deg: float) -> list[Candidate]:
     """Return candidates for the first pair, best first: many spread points, wide angles, consistent with K."""
-    members, candidates = set(photos), []
-    for pair, pose in graph.poses.items():
+    members, candidates = set(group.photos), []
+    for pair, pose in group.graph.poses.items():
         if members.issuperset(pair) and pose.kind != "rotation" and pose.angle_deg >= min_angle_deg:
-            cameras = [intrinsics.camera(matches.images[photo]) for photo in pair]
-            weight = coverage(matches, pair, pose) * agreement(pair, cameras)
+            cameras = [group.evidence.camera(photo) for photo in pair]
+            weight = coverage(group.evidence.matches, pair, pose) * agreement(pair, cameras)
             weight *= MAPPING.planar_weight if pose.kind == "planar" or abs(pose.t[2]) > MAPPING.forward else 1.0
             score = pose.inlier_count * min(pose.angle_deg / GOOD_ANGLE_DEG, 1.0) * pose.in_front**4 * weight
             candidates.append(Candidate(pair, pose, score))
     return sorted(candidates, key=lambda candidate: (-candidate.score, candidate.pair))
 
 
-def triangulate_seed(matches: MatchGraph, candidate: Candidate, intrinsics: Intrinsics) -> TwoViewSeed:
+def triangulate_seed(candidate: Candidate, evidence: Evidence) -> TwoViewSeed:
     """Return the pose and triangulated points of a candidate."""
-    pose, cameras = candidate.pose, [intrinsics.camera(matches.images[photo]) for photo in candidate.pair]
-    points = matches.points(candidate.pair)
+    pose, cameras = candidate.pose, [evidence.camera(photo) for photo in candidate.pair]
+    points = evidence.matches.points(candidate.pair)
     if any(camera.projection != PERSPECTIVE for camera in cameras):
         lines = np.hstack([bearings(x[pose.inliers], camera) for x, camera in zip(points, cameras, strict=True)])
         return ray_seed(pose.R, pose.t, lines)
@@ -242,23 +249,7 @@ def _reason(photo: int, posed: set[int], views: ViewGraph, graph: PoseGraph) -> 
     )
 
 
-def photo_names(photos: Sequence[int], matches: MatchGraph) -> list[str]:
-    """Return the names of photos."""
-    return [matches.images[photo].name for photo in photos]
-
-
 # COLMAP's two mappers on one group of photos, side by side, and the choice of the better model.
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Group:
-    """A connected group of photos, with their matches, geometry and cameras."""
-
-    photos: Sequence[int]
-    matches: MatchGraph
-    views: ViewGraph
-    graph: PoseGraph
-    intrinsics: Intrinsics
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -347,7 +338,7 @@ def map_group(
     """
     options, mapper = run.settings.scene, _GroupMapper(group, run, colmap)
     with_global = options.mapper != "incremental" and len(group.photos) >= MAPPING.min_photos
-    seeds = rank_seeds(group.matches, group.graph, group.intrinsics, group.photos, options.min_seed_angle_deg)
+    seeds = rank_seeds(group, options.min_seed_angle_deg)
     seeds = seeds[: options.max_init_pairs] if options.mapper != "global" or not with_global else []
     if with_global:
         colmap.copy_database(run.workspace.database, run.workspace.root / GLOBAL_FOLDER)
@@ -409,7 +400,7 @@ class _GroupMapper:
         return results
 
     def all_at_once(self, stop: StopSignal) -> MappingResult:
-        names, scratch = photo_names(self.group.photos, self.group.matches), self.run.workspace.root / GLOBAL_FOLDER
+        names, scratch = self.group.evidence.matches.names(self.group.photos), self.run.workspace.root / GLOBAL_FOLDER
         photos, seed = self.run.workspace.photos, self.run.seed
         try:
             model = None if stop.is_cancelled else self.colmap.map_globally(photos, names, scratch, seed, stop)
@@ -421,11 +412,11 @@ class _GroupMapper:
         return self._judge("global", "all at once", model)
 
     def from_seed(self, seed: Candidate, token: CancellationToken) -> list[MappingResult]:
-        group = self.group
-        how = f"from {' + '.join(photo_names(seed.pair, group.matches))}"
-        rows = group.matches.matches[seed.pair][seed.pose.inliers]
+        evidence = self.group.evidence
+        how = f"from {' + '.join(evidence.matches.names(seed.pair))}"
+        rows = evidence.matches.matches[seed.pair][seed.pose.inliers]
         try:
-            points = triangulate_seed(group.matches, seed, group.intrinsics)
+            points = triangulate_seed(seed, evidence)
         except FAILURES as err:
             return [NoModel("incremental", f"{how}: no points, {error_reason(err)}")]
         start = self.colmap.model_from_seed(self.run.workspace.database, seed.pair, rows, points)
@@ -435,8 +426,8 @@ class _GroupMapper:
         return [self._judge("incremental", "missing photos added one by one", self._grow(best.model, token))]
 
     def _grow(self, start: Reconstruction, token: CancellationToken) -> Reconstruction | None:
-        group, run, place = self.group, self.run, self.run.workspace
-        cameras = {k: group.intrinsics.camera(group.matches.images[k]) for k in group.photos}
+        run, place = self.run, self.run.workspace
+        cameras = {k: self.group.evidence.camera(k) for k in self.group.photos}
         kept = {start.images[k].camera_id for k, camera in cameras.items() if camera.is_kept and start.exists_image(k)}
         options = incremental_options(run.seed, known=all(map(is_focal_accurate, cameras.values())), kept=kept)
         scratch = place.root / INCREMENTAL_FOLDER
@@ -445,8 +436,7 @@ class _GroupMapper:
         )
 
     def _judge(self, mapper: str, how: str, model: Reconstruction | None) -> MappingResult:
-        matches, views = self.group.matches, self.group.views
-        return judge_model(matches, views, mapper, how, model, self.run, self.colmap.explained_pairs)
+        return judge_model(self.group.evidence, mapper, how, model, self.run, self.colmap.explained_pairs)
 
 
 def best_attempt(results: Sequence[MappingResult]) -> Attempt | None:
@@ -482,7 +472,7 @@ def likely_needs_one_mapper(group: Group) -> bool:
     inside = set(group.photos)
     posed = sum(inside.issuperset(pair) for pair in group.graph.poses)
     dropped = sum(inside.issuperset(pair) for pair in group.graph.dropped)
-    known = all(is_focal_accurate(group.intrinsics.camera(group.matches.images[photo])) for photo in group.photos)
+    known = all(is_focal_accurate(group.evidence.camera(photo)) for photo in group.photos)
     return known and dropped <= MAPPING.max_dropped * (posed + dropped)
 
 
@@ -501,8 +491,7 @@ def is_focal_accurate(camera: Calibration) -> bool:
 
 
 def judge_model(
-    matches: MatchGraph,
-    views: ViewGraph,
+    evidence: Evidence,
     mapper: str,
     how: str,
     model: Reconstruction | None,
@@ -515,7 +504,7 @@ def judge_model(
     if model is None or placed < 2 or model.num_points3D() < run.settings.scene.min_points:
         return NoModel(mapper, note)
     try:
-        explained = explain(model, matches, views, run.settings.epipolar.max_error_px)
+        explained = explain(model, evidence.matches, evidence.views, run.settings.epipolar.max_error_px)
     except FAILURES as err:
         logger.info("a model could not be judged", exc_info=err)
         return NoModel(mapper, f"{note}, but it could not be scored: {error_reason(err)}")

@@ -1,11 +1,11 @@
-"""Finer features for unregistered photos and their likely neighbors, then another reconstruction.
+"""Finer features for unregistered photos and their likely neighbors.
 
 On plain objects and over wide baselines the usual features are few. Affine shape, domain-size pooling, a lower contrast
 threshold and a looser ratio test give more there. For all photos they would cost too much.
 """
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,17 +14,15 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import read_features, write_match_graph
 from sfm_app.colmap.model import posed_photo_ids
-from sfm_app.errors import ClusterError, SfmError
 from sfm_app.estimation.calibrating import find_intrinsics
 from sfm_app.estimation.fitting import fit_pairs, to_view_graph
-from sfm_app.mapping.attempt import Attempt, NoModel, are_many_unregistered, best_attempt, judge_model, photo_names
-from sfm_app.mapping.passes import Outcome, reconstruct
+from sfm_app.mapping.attempt import are_many_unregistered
+from sfm_app.mapping.passes import Outcome
 from sfm_app.matching.features import fill_database
-from sfm_app.numerical import Json
 from sfm_app.plugins import SIFT_DSP
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import SubWorkspace
-from sfm_app.types import Intrinsics, MatchGraph, PairId, ViewGraph
+from sfm_app.types import Evidence, Intrinsics, MatchGraph, PairId, ViewGraph
 from sfm_app.types.arrays import FloatArray
 
 Rows = NDArray[np.uint32]
@@ -84,61 +82,27 @@ def _drop_repeats(rows: Rows) -> Rows:
     return rows[first[0] & first[1]]
 
 
-FOLDER, FEATURES = "second_look", "features"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MappedScene:
-    """Models with their matches, geometry and cameras."""
-
-    outcome: Outcome
-    matches: MatchGraph
-    views: ViewGraph
-    intrinsics: Intrinsics
-    run: RunContext
-    """Run whose workspace holds the database of these matches."""
+FOLDER, FEATURES = "finer", "features"
 
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """Steps of mapping; tests pass others."""
+    """Steps of the search; tests pass others."""
 
     fill_database: Callable[..., object] = fill_database
     find_intrinsics: Callable[..., tuple[Intrinsics, object]] = find_intrinsics
-    reconstruct: Callable[..., Outcome] = reconstruct
 
 
 STEPS = Steps()
 
 
-def retry_lost_photos(first: MappedScene, steps: Steps = STEPS) -> MappedScene:
-    """Map again with finer features for unregistered photos; return the result that registers more of them."""
-    run, lost = first.run, lost_photos(first)
-    if not lost or run.settings.matching.features == SIFT_DSP or not run.settings.scene.second_look:
-        return first
-    pairs = candidate_pairs(lost, first.matches)
-    photos = sorted({photo for pair in pairs for photo in pair})
-    count = "1 photo is" if len(lost) == 1 else f"{len(lost)} photos are"
-    run.progress.say(f"{count} unregistered; extracting finer features in {len(photos)} photos")
-    report: dict[str, Json] = {"photos": photo_names(lost, first.matches), "pairs": len(pairs)}
-    try:
-        second = _retry_pairs(first, pairs, report, steps)
-    except ClusterError:  # the same command would give another scene on a cluster that stays
-        raise
-    except SfmError as err:  # the first result is not lost with it
-        report["failed"], second = str(err), None
-    counts = [_placed_count(one.outcome) for one in (first, second) if one is not None]
-    accepted = second is not None and _places_and_explains_more(second, first)
-    run.record(second_look=report | {"placed": counts, "taken": accepted})
-    return second if second is not None and accepted else first
-
-
-def lost_photos(scene: MappedScene) -> list[int]:
-    """Return the photos missing in the main model; none where their share of a large set is too small."""
-    models, images = scene.outcome.models, scene.matches.images
-    registered = set(posed_photo_ids(models[0].model)) if models else set()
-    lost = sorted(images.keys() - registered)
-    return lost if are_many_unregistered(len(lost), len(images)) else []
+def lost_photos(best: Outcome, run: RunContext) -> list[int]:
+    """Return the photos missing in the main model; none where their share is small, or features are the finest."""
+    if run.settings.matching.features == SIFT_DSP:
+        return []
+    registered = set(posed_photo_ids(best.main.model)) if best.main else set()
+    lost = sorted(best.evidence.matches.images.keys() - registered)
+    return lost if are_many_unregistered(len(lost), len(best.evidence.matches.images)) else []
 
 
 def candidate_pairs(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
@@ -159,16 +123,18 @@ def candidate_pairs(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
     return sorted(pairs)
 
 
-def _retry_pairs(
-    first: MappedScene, pairs: Sequence[PairId], report: dict[str, Json], steps: Steps
-) -> MappedScene | None:
-    """Run all steps from features to models once more; return None if there is no new geometry."""
-    matching = first.run.settings.matching
+def find_finer_evidence(best: Outcome, run: RunContext, steps: Steps = STEPS) -> tuple[Evidence, RunContext] | None:
+    """Find finer features in lost photos and their likely neighbors, then geometry and cameras.
+
+    Return the evidence, and a run in a folder of its own, where a killed run is resumed; None without new geometry.
+    """
+    first, matching = replace(best.evidence, intrinsics=best.calibrated), run.settings.matching
+    pairs = candidate_pairs(lost_photos(best, run), first.matches)
     looser = matching.model_copy(update={"max_ratio": max(OPTIONS.max_ratio, matching.max_ratio)})
     run = replace(
-        first.run,
-        workspace=SubWorkspace(first.run.workspace, FOLDER),  # a killed run is resumed there
-        settings=first.run.settings.model_copy(update={"matching": looser}),
+        run,
+        workspace=SubWorkspace(run.workspace, FOLDER),
+        settings=run.settings.model_copy(update={"matching": looser}),
         statistics={},
     )
     finer = replace(run, workspace=SubWorkspace(run.workspace, FEATURES))
@@ -178,37 +144,21 @@ def _retry_pairs(
     steps.fill_database(run.plugins.feature_method(SIFT_DSP), finer, pairs)
     with translate_errors("adding matches"):
         matches, enriched = add_matches(first.matches, *read_features(finer.workspace.database))
-        report["pairs_with_more_matches"] = len(enriched)
-        if not enriched:
-            return None
+    if not enriched:
+        return None
     fitted = to_view_graph(fit_pairs(matches, enriched, run, first.views.lenses))
     if not fitted.fits:  # such as of a photo of something else
         return None
-    fitted_pairs = set(enriched)
-    fits = {pair: fit for pair, fit in first.views.fits.items() if pair not in fitted_pairs}
-    rejected = {pair: why for pair, why in first.views.rejected.items() if pair not in fitted_pairs}
-    views = ViewGraph(
-        dict(sorted((fits | dict(fitted.fits)).items())), rejected | dict(fitted.rejected), first.views.lenses
-    )
-    report["pairs_with_geometry"] = [len(first.views.fits), len(views.fits)]
+    views = _with_fits(first.views, fitted, set(enriched))
     # where pairs determine the cameras of half of the photos, more pairs change little
-    estimated = [first.intrinsics.camera(image).is_estimated for image in first.matches.images.values()]
+    estimated = [first.camera(photo).is_estimated for photo in first.matches.images]
     is_calibrated = 2 * sum(estimated) >= len(estimated)
     intrinsics = first.intrinsics if is_calibrated else steps.find_intrinsics(matches, views, run)[0]
-    return MappedScene(steps.reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
+    return Evidence(matches, views, intrinsics), run
 
 
-def _placed_count(outcome: Outcome) -> int:
-    return outcome.main.photos if outcome.main else 0
-
-
-def _places_and_explains_more(second: MappedScene, first: MappedScene) -> bool:
-    if not second.outcome.models or _placed_count(second.outcome) <= _placed_count(first.outcome):
-        return False
-    models = [_judge(second, scene.outcome) for scene in (first, second) if scene.outcome.models]
-    return best_attempt(models) is models[-1]
-
-
-def _judge(scene: MappedScene, outcome: Outcome) -> Attempt | NoModel:
-    main = outcome.models[0]
-    return judge_model(scene.matches, scene.views, main.mapper, main.note, main.model, scene.run)
+def _with_fits(views: ViewGraph, fitted: ViewGraph, pairs: Collection[PairId]) -> ViewGraph:
+    """Return the view graph with new fits of some pairs."""
+    fits = {pair: fit for pair, fit in views.fits.items() if pair not in pairs} | dict(fitted.fits)
+    rejected = {pair: why for pair, why in views.rejected.items() if pair not in pairs} | dict(fitted.rejected)
+    return ViewGraph(dict(sorted(fits.items())), rejected, views.lenses)

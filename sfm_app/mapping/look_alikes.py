@@ -15,14 +15,14 @@ import numpy as np
 from sfm_app.colmap.backend import Camera, Reconstruction, all_points, translate_errors
 from sfm_app.colmap.model import focal_px, posed_images
 from sfm_app.errors import BackendError
-from sfm_app.mapping.attempt import Attempt, PairSupport, photo_names, saturate
+from sfm_app.mapping.attempt import Attempt, PairSupport, saturate
 from sfm_app.mapping.split_and_merge import OPTIONS as SPLIT
 from sfm_app.numerical import FAILURES, Json
 from sfm_app.posegraph.graph import LOOKS_ALIKE
 from sfm_app.posegraph.look_alikes import OPTIONS as LOOK_ALIKES
 from sfm_app.posegraph.look_alikes import cell_numbers, group_doubted_pairs, is_matched_again, is_well_inside
 from sfm_app.posegraph.rotations import find_cut
-from sfm_app.types import LookAlikes, MatchGraph, PairId, PoseGraph, ViewGraph
+from sfm_app.types import LookAlikes, MatchGraph, PairId, PoseGraph
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 # Recognized look-alikes: their matches are hidden from mapping, and reported.
@@ -43,14 +43,9 @@ class JumpOptions:
 JUMPS = JumpOptions()
 
 
-def drop_look_alikes(matches: MatchGraph, views: ViewGraph, graph: PoseGraph) -> tuple[MatchGraph, ViewGraph]:
-    """Return matches and F's without those of look-alikes, which are evidence neither for a model nor against it."""
-    dropped = {pair for join in graph.look_alikes for pair in join.pairs}
-    if not dropped:
-        return matches, views
-    rows_of = {pair: rows for pair, rows in matches.matches.items() if pair not in dropped}
-    fits = {pair: fit for pair, fit in views.fits.items() if pair not in dropped}
-    return replace(matches, matches=rows_of), replace(views, fits=fits)
+def joined_pairs(joins: Iterable[LookAlikes]) -> set[PairId]:
+    """Return the pairs of false joins."""
+    return {pair for join in joins for pair in join.pairs}
 
 
 def with_earlier_look_alikes(graph: PoseGraph, earlier: PoseGraph) -> PoseGraph:
@@ -76,7 +71,7 @@ def look_alike_entries(joins: Sequence[LookAlikes], matches: MatchGraph) -> list
     return [
         {
             "pairs": len(join.pairs),
-            "between": [photo_names(photos, matches) for photos in sides(join.pairs, matches)],
+            "between": [matches.names(photos) for photos in sides(join.pairs, matches)],
             "missing": round(join.missing, 3),
         }
         for join in joins

@@ -22,7 +22,17 @@ from sfm_app.posegraph.rotations import connected_groups
 from sfm_app.runtime.context import RunContext
 from sfm_app.settings import Settings
 from sfm_app.tasks import Task
-from sfm_app.types import Intrinsics, LookAlikes, MatchedImage, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
+from sfm_app.types import (
+    Evidence,
+    Intrinsics,
+    LookAlikes,
+    MatchedImage,
+    MatchGraph,
+    PairId,
+    PoseGraph,
+    RelativePose,
+    ViewGraph,
+)
 
 # Cuts. A group is repeatedly divided in two. From a photo at its rim, one side grows by the photo with most links into
 # it; the smallest normalized cut on the way is taken (Shi and Malik 2000; growth as in METIS, Karypis and Kumar 1998).
@@ -243,21 +253,22 @@ def pairs_of_parts(pairs: Iterable[PairId], parts: Sequence[Sequence[int]]) -> l
 
 def part_of_group(group: Group, photos: Sequence[int], pairs: Sequence[PairId]) -> Group:
     """Return the data of some photos of a group; `pairs` are those with matches among them."""
-    matches, fits, poses = group.matches, group.views.fits, group.graph.poses
+    evidence, poses = group.evidence, group.graph.poses
+    matches, fits = evidence.matches, evidence.views.fits
     images = {photo: matches.images[photo] for photo in photos}
-    names = {image.name: group.intrinsics.camera_name(image) for image in images.values()}
-    cameras = {name: camera for name, camera in group.intrinsics.cameras.items() if name in set(names.values())}
-    return Group(
-        tuple(photos),
+    names = {image.name: evidence.camera_name(photo) for photo, image in images.items()}
+    cameras = {name: camera for name, camera in evidence.intrinsics.cameras.items() if name in set(names.values())}
+    own = Evidence(
         MatchGraph(
             images,
             {photo: matches.keypoints[photo] for photo in photos},
             {pair: matches.matches[pair] for pair in pairs},
         ),
         ViewGraph({pair: fits[pair] for pair in pairs if pair in fits}, {}),
-        PoseGraph({pair: poses[pair] for pair in pairs if pair in poses}, {}, (tuple(photos),)),
         Intrinsics(cameras, names, {photo: image.name for photo, image in images.items()}),
     )
+    graph = PoseGraph({pair: poses[pair] for pair in pairs if pair in poses}, {}, (tuple(photos),))
+    return Group(tuple(photos), own, graph)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -274,17 +285,17 @@ class PartInputs:
 
 def write_inputs(path: Path, inputs: PartInputs) -> None:
     """Write the inputs of a part atomically."""
-    part = inputs.part
+    part, evidence = inputs.part, inputs.part.evidence
     known = {
         "photos": list(part.photos),
         # frames and times of photos do not matter to mapping
-        "images": [asdict(replace(image, gps=None, shown=None)) for image in part.matches.images.values()],
-        "intrinsics": part.intrinsics.to_dict(),
+        "images": [asdict(replace(image, gps=None, shown=None)) for image in evidence.matches.images.values()],
+        "intrinsics": evidence.intrinsics.to_dict(),
         "settings": inputs.settings.model_dump(mode="json"),
         "asked": inputs.stop_at_false_joins,
     }
-    arrays = _match_arrays(part.matches) | _pose_arrays(part.graph)
-    arrays |= {f"view_{name}": array for name, array in part.views.to_arrays().items()}
+    arrays = _match_arrays(evidence.matches) | _pose_arrays(part.graph)
+    arrays |= {f"view_{name}": array for name, array in evidence.views.to_arrays().items()}
     arrays |= {"mapped": np.array(sorted(inputs.mapped), np.int64).reshape(-1, 2), "known": np.array(json_text(known))}
     with replace_atomically(path) as beside, beside.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
@@ -298,10 +309,12 @@ def read_inputs(path: Path) -> PartInputs:
     views = {name.removeprefix("view_"): array for name, array in arrays.items() if name.startswith("view_")}
     part = Group(
         tuple(known["photos"]),
-        _matches_from_arrays(images, arrays),
-        ViewGraph.from_arrays(views),
+        Evidence(
+            _matches_from_arrays(images, arrays),
+            ViewGraph.from_arrays(views),
+            Intrinsics.from_dict(known["intrinsics"]),
+        ),
         PoseGraph(_poses_from_arrays(arrays), {}, (tuple(known["photos"]),)),
-        Intrinsics.from_dict(known["intrinsics"]),
     )
     mapped = frozenset((int(a), int(b)) for a, b in arrays["mapped"])
     return PartInputs(part, mapped, Settings.from_mapping(known["settings"]), known["asked"])
@@ -407,7 +420,7 @@ def map_parts(
     """Map parts side by side, except those that a killed run has finished; failed ones have no models."""
     place = run.workspace.root / FOLDER
     (place / STOP).unlink(missing_ok=True)
-    within = pairs_of_parts(group.matches.matches, [part.photos for part in parts])
+    within = pairs_of_parts(group.evidence.matches.matches, [part.photos for part in parts])
     members = (part_of_group(group, part.photos, pairs) for part, pairs in zip(parts, within, strict=True))
     tasks = [_prepare_part(one, mapped, place, run, stop_at_false_joins=stop_at_false_joins) for one in members]
     try:

@@ -34,9 +34,9 @@ def work(task: MappingTask) -> None:
         part, graph = inputs.part, inputs.part.graph
         poses = {pair: pose for pair, pose in graph.poses.items() if pair in inputs.mapped}
         with translate_errors("entering the photos of a part"):
-            write_match_graph(place.database, part.matches)
-            write_calibrations(place.database, part.matches, part.intrinsics)
-            write_pose_graph(place.database, part.matches, PoseGraph(poses, {}, graph.groups))
+            write_match_graph(place.database, part.evidence.matches)
+            write_calibrations(place.database, part.evidence.matches, part.evidence.intrinsics)
+            write_pose_graph(place.database, part.evidence.matches, PoseGraph(poses, {}, graph.groups))
         run = RunContext(inputs.settings, place, load_plugins(installed=False), executor, workers=1)
         attempts = map_group(
             inputs.part, run, lambda one: inputs.stop_at_false_joins and one.photos >= enough and bool(judge(one))

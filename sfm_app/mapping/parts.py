@@ -19,7 +19,6 @@ from sfm_app.mapping.attempt import (
     complete_attempt,
     is_focal_accurate,
     judge_model,
-    photo_names,
 )
 from sfm_app.mapping.joins import (
     AcrossJoins,
@@ -142,8 +141,9 @@ def join_parts(group: Group, parts: Sequence[Part], results: Sequence[PartResult
         for folder in result.models
     ]
     # pairs that the pose graph has dropped, as those of look-alikes, are evidence neither for a join nor against it
-    sound = {pair: fit for pair, fit in group.views.fits.items() if pair in group.graph.poses}
-    across = AcrossJoins(group.matches, replace(group.views, fits=sound), run.settings.epipolar.max_error_px)
+    sound = {pair: fit for pair, fit in group.evidence.views.fits.items() if pair in group.graph.poses}
+    views = replace(group.evidence.views, fits=sound)
+    across = AcrossJoins(group.evidence.matches, views, run.settings.epipolar.max_error_px)
     accepted: list[Join] = []
     refused: list[Join] = []
     for first, second in combinations(range(len(fragments)), 2):
@@ -166,14 +166,14 @@ def _merge(group: Group, joined: JoinedParts, run: RunContext) -> list[MappingRe
         return [NoModel(MAPPER, f"in {count} parts: no part has a model; {'; '.join(reasons[:3])}")]
     merged = merge_fragments(joined.fragments, joined.alignment.frames)
     database = run.workspace.database
-    cameras = {photo: group.intrinsics.camera(group.matches.images[photo]) for photo in merged.photos.tolist()}
+    cameras = {photo: group.evidence.camera(photo) for photo in merged.photos.tolist()}
     free = {photo for photo, camera in cameras.items() if not (camera.is_kept or is_focal_accurate(camera))}
     with translate_errors("joining parts"), run.step("adjusting all parts together"):
         model = write_placed(database, merged)
         refined = sorted({model.images[photo].camera_id for photo in free})
         run_in_daemon_thread(lambda: adjust_joined(model, database, refined))
     how = f"in {count} parts, {len(joined.alignment.kept)} joins"
-    return [judge_model(group.matches, group.views, MAPPER, how, model, run)]
+    return [judge_model(group.evidence, MAPPER, how, model, run)]
 
 
 def part_figures(group: Group, joined: JoinedParts, attempts: Sequence[MappingResult]) -> dict[str, Json]:
@@ -185,7 +185,7 @@ def part_figures(group: Group, joined: JoinedParts, attempts: Sequence[MappingRe
             {
                 "photos": len(part.photos),
                 "own": len(part.own),
-                "first": photo_names(part.own[:1], group.matches)[0],
+                "first": group.evidence.matches.names(part.own[:1])[0],
                 "placed": [len(one.placed.photos) for one in joined.fragments if one.part == number],
                 "mapper": result.mapper,
                 "tried": list(result.tried),

@@ -18,7 +18,7 @@ from sfm_app.mapping.attempt import MAPPING, Attempt, NoModel, PairSupport, judg
 from sfm_app.numerical import FAILURES
 from sfm_app.posegraph.rotations import DisjointGroups
 from sfm_app.runtime.context import RunContext
-from sfm_app.types import MatchGraph, PairId, ViewGraph
+from sfm_app.types import Evidence, MatchGraph, PairId, ViewGraph
 from sfm_app.types.arrays import FloatArray
 
 if TYPE_CHECKING:
@@ -95,15 +95,13 @@ def _part(attempt: Attempt, photos: Sequence[int]) -> Attempt:
 # others, and the pairs between the models, verify it.
 
 
-def merge_into_main(
-    models: tuple[Attempt, ...], matches: MatchGraph, views: ViewGraph, run: RunContext
-) -> tuple[Attempt, ...]:
+def merge_into_main(models: tuple[Attempt, ...], evidence: Evidence, run: RunContext) -> tuple[Attempt, ...]:
     """Join to the main model, the first, all others that fit; the rest stay unchanged. No two hold one photo."""
     main, others = models[0], list(models[1:])
     waiting = list(others)
     while waiting:
         other = waiting.pop(0)
-        together = _merge_pair(main, other, matches, views, run)
+        together = _merge_pair(main, other, evidence, run)
         if together is not None:
             main = together
             others.remove(other)
@@ -111,10 +109,8 @@ def merge_into_main(
     return (main, *others)
 
 
-def _merge_pair(
-    first: Attempt, second: Attempt, matches: MatchGraph, views: ViewGraph, run: RunContext
-) -> Attempt | None:
-    shared = shared_points(first.model, second.model, matches, views)
+def _merge_pair(first: Attempt, second: Attempt, evidence: Evidence, run: RunContext) -> Attempt | None:
+    shared = shared_points(first.model, second.model, evidence.matches, evidence.views)
     if len(shared) < OPTIONS.min_shared:
         return None
     try:
@@ -126,7 +122,7 @@ def _merge_pair(
         model = merge_models(database, first.model, second.model, similarity)
     model = adjust_or_keep(model, database).model
     how = f"{first.photos} and {second.photos} photos joined by {len(shared)} points"
-    attempt = judge_model(matches, views, first.mapper, how, model, run)
+    attempt = judge_model(evidence, first.mapper, how, model, run)
     if (
         isinstance(attempt, NoModel)
         or attempt.photos < first.photos + second.photos

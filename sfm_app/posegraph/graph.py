@@ -14,7 +14,7 @@ from sfm_app.numerical import FAILURES
 from sfm_app.posegraph.look_alikes import find_look_alikes
 from sfm_app.posegraph.pair_pose import Pair, estimate_pose, is_in_front, pose_distances, refine_pose
 from sfm_app.posegraph.rotations import average_rotations, check_loops, connected_groups
-from sfm_app.types import EpipolarFit, Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
+from sfm_app.types import EpipolarFit, Evidence, PairId, PoseGraph, RelativePose
 from sfm_app.types.arrays import FloatArray
 
 logger = logging.getLogger("sfm_app")
@@ -156,16 +156,16 @@ class PoseGraphOptions:
 
 
 def build_pose_graph(
-    matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, options: PoseGraphOptions, run_map: ParallelMap,
-    known: Mapping[PairId, RelativePose] = NO_POSES,
-) -> PoseGraph:  # fmt: skip
+    evidence: Evidence, options: PoseGraphOptions, run_map: ParallelMap, known: Mapping[PairId, RelativePose] = NO_POSES
+) -> PoseGraph:
     """Build the graph of relative poses without contradicting pairs; `known` poses are not estimated again."""
-    estimator = _PoseEstimator(matches, intrinsics, options)
+    matches, views = evidence.matches, evidence.views
+    estimator = _PoseEstimator(evidence, options)
     fits = {pair: fit for pair, fit in views.fits.items() if pair not in known}
     estimates = dict(zip(fits, run_map(estimator.from_fit, list(fits.items()), "relative poses"), strict=True))
     poses, dropped = _split_plausible(estimates, options.min_inliers)
     poses |= known
-    cameras = {photo: intrinsics.camera(image) for photo, image in matches.images.items()}
+    cameras = {photo: evidence.camera(photo) for photo in matches.images}
     look_alikes = find_look_alikes(matches, poses, cameras)
     _drop_pairs([pair for join in look_alikes.joins for pair in join.pairs], LOOKS_ALIKE, poses, dropped)
     estimator.rotations, angles = average_pair_rotations(
@@ -189,13 +189,13 @@ def build_pose_graph(
 
 
 class _PoseEstimator:
-    def __init__(self, matches: MatchGraph, intrinsics: Intrinsics, options: PoseGraphOptions) -> None:
-        self.matches, self.intrinsics, self.options = matches, intrinsics, options
+    def __init__(self, evidence: Evidence, options: PoseGraphOptions) -> None:
+        self.evidence, self.options = evidence, options
         self.rotations: Mapping[int, FloatArray] = {}
 
     def _pair(self, pair: PairId) -> Pair:
-        cameras = [self.intrinsics.camera(self.matches.images[photo]) for photo in pair]
-        return Pair(self.matches.points(pair), cameras, self.options.max_error_px)
+        cameras = [self.evidence.camera(photo) for photo in pair]
+        return Pair(self.evidence.matches.points(pair), cameras, self.options.max_error_px)
 
     def from_fit(self, item: tuple[PairId, EpipolarFit]) -> RelativePose | str | None:
         try:

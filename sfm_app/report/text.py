@@ -216,10 +216,15 @@ MAPPERS = {
     "parts": "in parts, then joined",
     "grown": "by adding the new photos to the earlier model",
 }
-CAMERA_PER_PHOTO_TEXTS = {
-    "taken": "a shared camera does not fit: each photo has its own (a zoom, or several devices)",
-    "two": "a shared camera does not fit, two cameras do",
-    "left": "a camera per photo was tried, too, and explains no more",
+HYPOTHESES = {
+    "false-joins": "leaving out the ambiguous pairs",
+    "colmap-defaults": "COLMAP's default pipeline",
+    "other-focals": "other focal lengths",
+    "camera-per-photo": "a camera for each photo (a zoom, or several devices)",
+    "two-cameras": "two cameras",
+    "learned-cameras": "mapping again with the cameras of the model",
+    "merged-models": "merging models",
+    "finer-features": "finer features for unplaced photos",
 }
 DOUBTS = ("look_alikes", "perhaps_look_alikes", "jumps", "weakly_joined")
 UNSURE_ODDS = 10.0
@@ -230,7 +235,7 @@ def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
     """Return the scene as plain values for --json; `counts` are figures of the stage."""
     keys = (
         "mapper", "mapper_reason", "pairs", "pairs_dropped", "cut_apart", "other_models", "adjustment", "orientation",
-        "second_look", "shutter",
+        "hypotheses", "shutter",
     )  # fmt: skip
     cameras = {name: {**camera.to_dict(), "K": camera.K.round(3).tolist()} for name, camera in scene.cameras.items()}
     return {
@@ -287,15 +292,12 @@ def _mapping_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Ite
     yield f"mapped {MAPPERS[summary['mapper']]}{because}"
     for joins in (one["dropped_joins"] for one in counts.get("parts", ()) if one["dropped_joins"]):
         yield f"rejected joins between parts, which other joins or matches contradict: {len(joins)}"
-    if counts.get("rival_tried_because"):
-        yield f"also tried COLMAP's default pipeline: {counts['rival_tried_because']}"
-    if counts.get("one_camera_each") in CAMERA_PER_PHOTO_TEXTS:
-        yield CAMERA_PER_PHOTO_TEXTS[counts["one_camera_each"]]
-    if retry := counts.get("second_look"):
-        before, after = retry["placed"][0], retry["placed"][-1]
-        result = f"{after} photos placed instead of {before}" if retry["taken"] else "no more photos placed"
-        failed = f" (it failed: {retry['failed']})" if retry.get("failed") else ""
-        yield f"retried {len(retry['photos'])} unplaced photos with finer features: {result}{failed}"
+    for trial in counts.get("hypotheses", ()):
+        if trial["name"] in HYPOTHESES:
+            before, after = trial["photos"]
+            gain = f"{after} photos instead of {before}" if after != before else "it explains more matches"
+            result = gain if trial["accepted"] else "it explains no more"
+            yield f"tried {HYPOTHESES[trial['name']]}, because {trial['reason']}: {result}"
     if dropped := sum(summary.get("pairs_dropped", {}).values()):
         yield f"rejected pairs of photos that contradict the others: {dropped}"
 

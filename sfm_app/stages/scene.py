@@ -12,18 +12,18 @@ from sfm_app.estimation.diagnosis import diagnose_depth, diagnose_scene
 from sfm_app.estimation.given_cameras import camera_rules, given_and_found, refined_claims, report_checks, report_claims
 from sfm_app.files import mark_unfinished, resume_or_clear
 from sfm_app.frame.upright import gps_deviation, orient_or_keep, submit_cue_extraction
-from sfm_app.mapping.attempt import photo_names, unregistered_reasons
-from sfm_app.mapping.feature_retry import MappedScene, retry_lost_photos
-from sfm_app.mapping.incremental import GROWN, map_new_photos
+from sfm_app.mapping.attempt import unregistered_reasons
+from sfm_app.mapping.hypotheses import reconstruct
 from sfm_app.mapping.look_alikes import jumps, look_alike_entries
-from sfm_app.mapping.passes import Outcome, reconstruct
+from sfm_app.mapping.new_photos import GROWN, map_new_photos
+from sfm_app.mapping.passes import Outcome
 from sfm_app.mapping.rolling_shutter import follow_shutter
 from sfm_app.mapping.split_and_merge import weakly_joined_parts
 from sfm_app.numerical import Json
 from sfm_app.products import write_scene, write_sparse_models
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import MAPPING, SubWorkspace
-from sfm_app.types import Intrinsics, MatchGraph, Scene, ViewGraph
+from sfm_app.types import Evidence, Intrinsics, MatchGraph, Scene, ViewGraph
 
 
 def make(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Scene:
@@ -32,13 +32,10 @@ def make(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: Run
     If an earlier model covers most photos, the new ones are registered in it. Raise a ReconstructionError if no pair
     of photos grows into a model.
     """
-    inner = mapping_run(run)
-    if run.earlier is not None:
-        mapped = map_new_photos(matches, views, intrinsics, inner, run.earlier)
-    else:
-        mapped = MappedScene(reconstruct(matches, views, intrinsics, inner), matches, views, intrinsics, inner)
+    inner, evidence = mapping_run(run), Evidence(matches, views, intrinsics)
+    outcome = reconstruct(evidence, inner) if run.earlier is None else map_new_photos(evidence, inner, run.earlier)
     try:
-        scene = _finish_scene(retry_lost_photos(mapped), run)
+        scene = _finish_scene(outcome, run)
     except ReconstructionError:  # after other errors, such as Ctrl-C or a full disk, the same command resumes there
         shutil.rmtree(inner.workspace.root, ignore_errors=True)
         raise
@@ -55,33 +52,30 @@ def mapping_run(run: RunContext) -> RunContext:
 
 
 def _adjust_models(
-    outcome: Outcome, mapped: MappedScene, names: Mapping[str, str], run: RunContext
+    outcome: Outcome, names: Mapping[str, str], run: RunContext
 ) -> tuple[list[Adjustment], dict[str, Json]]:
     """Return the adjusted models, and the manifest's entry about the rolling shutter of the first, if it has one."""
-    database = mapped.run.workspace.database
-    rules = [
-        camera_rules(attempt.model, names, mapped.intrinsics, run.settings.scene.camera_model)
-        for attempt in outcome.models
-    ]
+    database, family = outcome.run.workspace.database, run.settings.scene.camera_model
+    rules = [camera_rules(attempt.model, names, outcome.calibrated, family) for attempt in outcome.models]
     with run.step("adjusting all cameras"):
         adjusted = [
             adjust_or_keep(attempt.model, database, rule, families_known=attempt.mapper == GROWN)
             for attempt, rule in zip(outcome.models, rules, strict=True)
         ]
     followed = [
-        follow_shutter(one, mapped.matches, database, run.progress, rule)
+        follow_shutter(one, outcome.evidence.matches, database, run.progress, rule)
         for one, rule in zip(adjusted, rules, strict=True)
     ]
     readout = followed[0][1]
     return [one for one, _ in followed], {} if readout is None else {"shutter": readout.to_dict()}
 
 
-def _finish_scene(mapped: MappedScene, run: RunContext) -> Scene:
-    matches, views, intrinsics = mapped.matches, mapped.views, mapped.intrinsics
-    outcome = _drop_models_without_depth(mapped, run)
+def _finish_scene(outcome: Outcome, run: RunContext) -> Scene:
+    outcome = _drop_models_without_depth(outcome, run)
+    matches, views, intrinsics = outcome.evidence.matches, outcome.evidence.views, outcome.calibrated
     cues = submit_cue_extraction([attempt.model for attempt in outcome.models], matches, run)
-    names = {image.name: outcome.intrinsics.camera_name(image) for image in matches.images.values()}
-    adjusted, shutter = _adjust_models(outcome, mapped, names, run)
+    names = {image.name: outcome.evidence.camera_name(photo) for photo, image in matches.images.items()}
+    adjusted, shutter = _adjust_models(outcome, names, run)
     models = [one.model for one in adjusted]
     with translate_errors("reading colors"):
         for model in models:
@@ -100,7 +94,7 @@ def _finish_scene(mapped: MappedScene, run: RunContext) -> Scene:
         registered=len(scene.registered),
         of=len(matches.images),
         unregistered=dict(scene.unregistered),
-        other_models=[photo_names(photos, matches) for photos in members[1:]],
+        other_models=[matches.names(photos) for photos in members[1:]],
         points=scene.points,
         observations=scene.observations,
         mean_reprojection_px=round(scene.mean_reprojection_px, 4),
@@ -118,13 +112,13 @@ def _finish_scene(mapped: MappedScene, run: RunContext) -> Scene:
     return scene
 
 
-def _drop_models_without_depth(mapped: MappedScene, run: RunContext) -> Outcome:
+def _drop_models_without_depth(outcome: Outcome, run: RunContext) -> Outcome:
     """Drop models of photos without parallax, whose shape is arbitrary; raise a ReconstructionError if none is left."""
-    matches, views, outcome = mapped.matches, mapped.views, mapped.outcome
+    matches, views = outcome.evidence.matches, outcome.evidence.views
     models, diagnoses = [], []
     for attempt in outcome.models:
         posed = set(posed_photo_ids(attempt.model))
-        known = all(mapped.intrinsics.camera(matches.images[photo]).method != "guess" for photo in posed)
+        known = all(outcome.calibrated.camera(matches.images[photo]).method != "guess" for photo in posed)
         diagnosis = diagnose_depth(matches, views, posed, run.settings.epipolar, camera_known=known)
         if diagnosis:
             diagnoses.append(diagnosis)
@@ -133,7 +127,8 @@ def _drop_models_without_depth(mapped: MappedScene, run: RunContext) -> Outcome:
     if diagnoses and not models:
         raise diagnoses[0].error()
     if not models:
-        raise diagnose_scene(matches, views, run.settings.matching).error("; ".join(outcome.tried))
+        tried = "; ".join(note for trial in outcome.trials for note in trial.notes)
+        raise diagnose_scene(matches, views, run.settings.matching).error(tried)
     return replace(outcome, models=tuple(models))
 
 
@@ -145,10 +140,7 @@ def mapping_figures(outcome: Outcome) -> dict[str, Json]:
     return {
         "mapper": main.mapper,
         "mapper_reason": outcome.reason,
-        "tried": list(outcome.tried),
-        "passes": outcome.passes,
-        "one_camera_each": outcome.one_camera_each,
-        "rival_tried_because": outcome.rival_reason,
+        "hypotheses": [trial.to_dict() for trial in outcome.trials],
         "explained_matches": sum(pair.matches for pair in main.explained.values()),
         "contradicted_matches": sum(pair.contradicted for pair in main.explained.values()),
         "cut_apart": list(outcome.cuts),

@@ -12,6 +12,7 @@ from sfm_app.types.camera import Calibration, GivenCameras, Intrinsics
 from sfm_app.types.evidence import (
     CameraPairs,
     EpipolarFit,
+    Evidence,
     LookAlikes,
     PhotoPairs,
     PoseGraph,
@@ -40,6 +41,7 @@ __all__ = [
     "ControlPoint",
     "ControlPoints",
     "EpipolarFit",
+    "Evidence",
     "Features",
     "Frame",
     "Frustum",

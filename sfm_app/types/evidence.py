@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sfm_app.numerical import json_text
 from sfm_app.types.arrays import FloatArray
-from sfm_app.types.camera import Calibration
-from sfm_app.types.photos import PairId
+from sfm_app.types.camera import Calibration, Intrinsics
+from sfm_app.types.photos import MatchGraph, PairId
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -228,3 +228,28 @@ class PoseGraph:
     def connected_photos(self, photo: int) -> tuple[int, ...]:
         """Return the group of a photo; empty without one."""
         return next((group for group in self.groups if photo in group), ())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What mapping starts from: matches, their epipolar geometry, and cameras."""
+
+    matches: MatchGraph
+    views: ViewGraph
+    intrinsics: Intrinsics
+
+    def camera_name(self, photo: int) -> str:
+        """Return the name of the camera that took a photo."""
+        return self.intrinsics.camera_name(self.matches.images[photo])
+
+    def camera(self, photo: int) -> Calibration:
+        """Return the camera that took a photo."""
+        return self.intrinsics.camera(self.matches.images[photo])
+
+    def without(self, pairs: Collection[PairId]) -> "Evidence":
+        """Leave out pairs, which are then evidence neither for a model nor against it."""
+        if not pairs:
+            return self
+        rows = {pair: rows for pair, rows in self.matches.matches.items() if pair not in pairs}
+        fits = {pair: fit for pair, fit in self.views.fits.items() if pair not in pairs}
+        return replace(self, matches=replace(self.matches, matches=rows), views=replace(self.views, fits=fits))

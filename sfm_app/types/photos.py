@@ -1,6 +1,6 @@
 """Photos, their features and their raw matches."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -153,6 +153,10 @@ class MatchGraph:
     """Per image id: (N, 2) pixels."""
     matches: Mapping[PairId, NDArray[np.uint32]]
     """Per pair: (M, 2) keypoint indices in image 1 and image 2."""
+
+    def names(self, photos: Iterable[int]) -> list[str]:
+        """Return the names of photos."""
+        return [self.images[photo].name for photo in photos]
 
     def points(self, pair: PairId) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the matched points of one pair: x1, x2, each (M, 2) pixels."""

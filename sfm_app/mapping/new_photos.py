@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 from sfm_app.colmap.backend import CancellationToken, Reconstruction, run_interruptible, translate_errors
-from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
+from sfm_app.colmap.database import write_calibrations, write_match_graph
 from sfm_app.colmap.growth import model_in_database
 from sfm_app.colmap.mapping import incremental_options, map_incrementally
 from sfm_app.colmap.model import posed_photo_ids, submodel
@@ -26,17 +26,16 @@ from sfm_app.mapping.attempt import (
     judge_model,
     map_group,
     model_poses,
-    pairs_to_map,
     support,
 )
-from sfm_app.mapping.feature_retry import MappedScene
-from sfm_app.mapping.look_alikes import drop_look_alikes, judge_places
-from sfm_app.mapping.passes import Outcome, reconstruct, rival_reason
+from sfm_app.mapping.hypotheses import FINER_FEATURES, FIRST_LOOK, improve, reconstruct, rival_reason
+from sfm_app.mapping.look_alikes import joined_pairs, judge_places
+from sfm_app.mapping.passes import Mapper, Outcome, write_graph
 from sfm_app.mapping.split_and_merge import split_attempt
 from sfm_app.matching.pairs import find_same_matches
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.runtime.context import Earlier, RunContext
-from sfm_app.types import Intrinsics, LookAlikes, MatchGraph, PoseGraph, ViewGraph
+from sfm_app.types import Evidence, Intrinsics, LookAlikes, MatchGraph, PoseGraph, ViewGraph
 
 logger = logging.getLogger("sfm_app")
 
@@ -58,54 +57,42 @@ class Steps:
     find_cameras: Callable[[MatchGraph, ViewGraph, RunContext], Intrinsics] = find_cameras
     reconstruct: Callable[..., Outcome] = reconstruct
     build_pose_graph: Callable[..., PoseGraph] = build_pose_graph
-    rival_reason: Callable[..., str] = rival_reason
+    rival_reason: Callable[[Attempt, Evidence], str] = rival_reason
     judge_places: Callable[[Sequence[Attempt]], tuple[list[LookAlikes], int]] = judge_places
 
 
 STEPS = Steps()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Inputs:
-    matches: MatchGraph
-    views: ViewGraph
-    intrinsics: Intrinsics
-    run: RunContext
-    steps: Steps
-
-
-def map_new_photos(
-    matches: MatchGraph,
-    views: ViewGraph,
-    intrinsics: Intrinsics,
-    run: RunContext,
-    earlier: Earlier,
-    steps: Steps = STEPS,
-) -> MappedScene:
+def map_new_photos(evidence: Evidence, run: RunContext, earlier: Earlier, steps: Steps = STEPS) -> Outcome:
     """Return the earlier model with the new photos, or new models of all photos where these explain more."""
-    inputs = _Inputs(matches, views, intrinsics, run, steps)
-    grown, doubt = _grow(inputs, earlier)
+    best = _grown_or_whole(evidence, run, earlier, steps)
+    return improve(best, Mapper(run), [FINER_FEATURES])
+
+
+def _grown_or_whole(evidence: Evidence, run: RunContext, earlier: Earlier, steps: Steps) -> Outcome:
+    grown, doubt = _grow(evidence, run, earlier, steps)
     run.record(grown_from=0 if grown is None else len(earlier.known), mapped_again_because=doubt)
     if grown is not None and not doubt:
-        return MappedScene(grown, matches, views, intrinsics, run)
+        return grown
     run.progress.say(f"mapping all photos again (reason: {doubt})")
-    cameras = steps.find_cameras(matches, views, run)
-    whole = steps.reconstruct(matches, views, cameras, run)
+    cameras = steps.find_cameras(evidence.matches, evidence.views, run)
+    whole = steps.reconstruct(replace(evidence, intrinsics=cameras), run, hypotheses=FIRST_LOOK)
     both = [outcome.models[0] for outcome in (grown, whole) if outcome is not None and outcome.models]
     is_folded = doubt == TWO_PLACES and bool(whole.models)  # look-alikes explain more, and are wrong
     if grown is None or is_folded or best_attempt(both) is not grown.models[0]:
-        return MappedScene(whole, matches, views, cameras, run)
-    _write_graph(grown.graph, inputs)
-    return MappedScene(replace(grown, tried=(*whole.tried, *grown.tried)), matches, views, intrinsics, run)
+        return whole
+    write_graph(grown.graph, grown.evidence, run)
+    return replace(grown, trials=(*whole.trials, *grown.trials))
 
 
-def _grow(inputs: _Inputs, earlier: Earlier) -> tuple[Outcome | None, str]:
+def _grow(evidence: Evidence, run: RunContext, earlier: Earlier, steps: Steps) -> tuple[Outcome | None, str]:
     """Return the earlier model with the new photos, if there is one, and why it is unreliable, if so."""
-    matches, views, run = inputs.matches, inputs.views, inputs.run
+    matches = evidence.matches
     known_photos = find_same_matches(matches, earlier).photos
     with translate_errors("reading the earlier model"):
         write_match_graph(run.workspace.database, matches)
-        write_calibrations(run.workspace.database, matches, inputs.intrinsics)
+        write_calibrations(run.workspace.database, matches, evidence.intrinsics)
         counts = {photo: len(points) for photo, points in matches.keypoints.items()}
         start = model_in_database(run.workspace.database, earlier.place.sparse, known_photos, counts)
     placed = posed_photo_ids(start)
@@ -114,29 +101,28 @@ def _grow(inputs: _Inputs, earlier: Earlier) -> tuple[Outcome | None, str]:
     epipolar = run.settings.epipolar
     known = model_poses(start, matches, epipolar.max_error_px, epipolar.min_inliers)
     options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, run.seed)
-    graph = inputs.steps.build_pose_graph(matches, views, inputs.intrinsics, options, run.map, known)
-    _write_graph(graph, inputs)
-    matches, views = drop_look_alikes(matches, views, graph)
+    graph = steps.build_pose_graph(evidence, options, run.map, known)
+    write_graph(graph, evidence, run)
+    trusted = evidence.without(joined_pairs(graph.look_alikes))
     connected = max(graph.groups, key=lambda photos: len(set(photos).intersection(placed)), default=())
     unconnected = set(placed).difference(connected)
     if unconnected:  # COLMAP does not take photos without a pair in the database
         placed = [photo for photo in placed if photo not in unconnected]
         start = submodel(start, placed)
-    group = Group(connected, matches, views, graph, inputs.intrinsics)
-    before = support(explained_pairs(start, matches, views, epipolar.max_error_px))
-    model = _place(start, group, run)
+    before = support(explained_pairs(start, trusted.matches, trusted.views, epipolar.max_error_px))
+    model = _place(start, Group(connected, trusted, graph), run)
     how = f"{len(placed)} photos were known"
-    attempt = judge_model(matches, views, GROWN, how, model, run)
+    attempt = judge_model(trusted, GROWN, how, model, run)
     if not isinstance(attempt, Attempt):
         return None, f"the earlier model takes no new photos ({attempt.note})"
     now, unplaced = set(posed_photo_ids(attempt.model)), set(connected).difference(placed)
-    others = _map_others(graph, {*now, *connected}, replace(inputs, matches=matches, views=views))
+    others = _map_others(graph, {*now, *connected}, trusted, run)
     reason = f"{how}, and {len(unplaced & now)} of {len(unplaced)} others were registered"
-    outcome = Outcome((attempt, *others), graph, inputs.intrinsics, (attempt.note,), reason)
-    return outcome, _doubt(attempt, placed, before, replace(inputs, matches=matches, views=views))
+    outcome = Outcome((attempt, *others), graph, evidence, evidence.intrinsics, run, (attempt.note,), reason)
+    return outcome, _doubt(attempt, placed, before, trusted, steps)
 
 
-def _doubt(attempt: Attempt, placed: Collection[int], before: float, inputs: _Inputs) -> str:
+def _doubt(attempt: Attempt, placed: Collection[int], before: float, evidence: Evidence, steps: Steps) -> str:
     """Return why a model grown from photos `placed`, with the support `before`, is unreliable; empty if it is not."""
     parts = split_attempt(attempt)
     if len(parts) != 1 or parts[0].photos != attempt.photos:
@@ -145,16 +131,9 @@ def _doubt(attempt: Attempt, placed: Collection[int], before: float, inputs: _In
     after = support({pair: one for pair, one in attempt.explained.items() if inside.issuperset(pair)})
     if after < (1.0 - MAPPING.equal_tolerance) * before:
         return "the model explains fewer matches of the known photos than the earlier one"
-    if inputs.steps.judge_places([attempt])[0]:
+    if steps.judge_places((attempt,))[0]:
         return TWO_PLACES
-    return inputs.steps.rival_reason(attempt, inputs.intrinsics, inputs.matches, inputs.views)
-
-
-def _write_graph(graph: PoseGraph, inputs: _Inputs) -> None:
-    database = inputs.run.workspace.database
-    with translate_errors("writing relative poses"):
-        write_calibrations(database, inputs.matches, inputs.intrinsics)
-        write_pose_graph(database, inputs.matches, pairs_to_map(graph))
+    return steps.rival_reason(attempt, evidence)
 
 
 def _place(start: Reconstruction, group: Group, run: RunContext) -> Reconstruction | None:
@@ -176,7 +155,7 @@ def _place(start: Reconstruction, group: Group, run: RunContext) -> Reconstructi
 
 
 def _extend(start: Reconstruction, group: Group, run: RunContext, token: CancellationToken) -> Reconstruction | None:
-    cameras = {photo: group.intrinsics.camera(group.matches.images[photo]) for photo in group.photos}
+    cameras = {photo: group.evidence.camera(photo) for photo in group.photos}
     kept = {start.images[photo].camera_id for photo, camera in cameras.items() if camera.is_kept}
     place, is_known = run.workspace, all(is_focal_accurate(camera) for camera in cameras.values())
     return map_incrementally(
@@ -185,11 +164,10 @@ def _extend(start: Reconstruction, group: Group, run: RunContext, token: Cancell
     )  # fmt: skip
 
 
-def _map_others(graph: PoseGraph, taken: Collection[int], inputs: _Inputs) -> list[Attempt]:
+def _map_others(graph: PoseGraph, taken: Collection[int], evidence: Evidence, run: RunContext) -> list[Attempt]:
     models = []
     for photos in graph.groups:
         if len(photos) >= MAPPING.min_photos and not set(photos).intersection(taken):
-            group = Group(photos, inputs.matches, inputs.views, graph, inputs.intrinsics)
-            best = best_attempt(map_group(group, inputs.run))
+            best = best_attempt(map_group(Group(photos, evidence, graph), run))
             models += split_attempt(best) if best is not None else []
     return sorted(models, key=lambda attempt: (-attempt.photos, -attempt.support))

@@ -1,0 +1,460 @@
+"""Hypotheses about the photos that may explain more than the first pass, and the loop that tries them.
+
+A hypothesis has a reason to be tried, and maps other evidence: without false joins, with other cameras, with more
+features. The loop keeps an outcome that explains more.
+"""
+
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import chain, count
+
+import numpy as np
+
+from sfm_app.camera.models import guessed_camera_matrix
+from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.database import write_match_graph
+from sfm_app.colmap.model import cameras_by_photo, posed_photo_ids
+from sfm_app.errors import ClusterError, SfmError
+from sfm_app.mapping.attempt import (
+    MAPPING,
+    Attempt,
+    NoModel,
+    are_many_unregistered,
+    best_attempt,
+    choice_reason,
+    judge_model,
+)
+from sfm_app.mapping.feature_retry import find_finer_evidence, lost_photos
+from sfm_app.mapping.look_alikes import OVERLAPS, with_false_joins
+from sfm_app.mapping.passes import MAPPERS, Mapper, Mappers, Outcome, Trial, guess_again, guessed_intrinsics
+from sfm_app.mapping.split_and_merge import merge_into_main, split_attempt
+from sfm_app.runtime.context import RunContext
+from sfm_app.types import Calibration, Evidence, Intrinsics
+
+
+@dataclass(frozen=True, slots=True)
+class HypothesisOptions:
+    """When other hypotheses are tried, and accepted."""
+
+    other_focals: tuple[float, ...] = (0.6, 2.4, 4.8)
+    """Guesses of the focal besides the usual one, in longer sides: steps of a factor of two. Chosen by hand."""
+    max_passes: int = 3
+    """Most passes with the cameras of the model before; dinoSparseRing needs two. Measured."""
+    focal_tolerance: float = 0.01
+    """Relative change of a focal in mapping above which another pass is worth it. Chosen by hand."""
+    min_unregistered_share: float = 0.25
+    """Share of unregistered photos above which other focals are tried. Chosen by hand."""
+    max_photos_for_focals: int = 60
+    """Photos above which no other focals are tried. Chosen by hand."""
+    min_contradicted_share: float = 0.05
+    """Share of contradicting inliers of F above which a rival is tried; right models have 0.1 to 3 %. Measured."""
+    min_photos: int = 5
+    """With fewer photos, a camera per photo fits almost anything. Chosen by hand."""
+    max_photos: int = 100
+    """With more photos, a pass costs more than it promises. Chosen by hand."""
+    max_remaining_share: float = 0.5
+    """Share of the contradictions that may remain with a camera per photo. Chosen on `benchmarks.trouble`."""
+    share_tolerance: float = 0.002
+    """Largest increase of the contradicted share by two cameras instead of one per photo. Chosen by hand."""
+
+
+OPTIONS = HypothesisOptions()
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """Something that may explain the photos better."""
+
+    name: str
+    """In the manifest, and in the setting that switches it off."""
+    title: str
+    """What is tried; for people."""
+    reason: Callable[[Outcome, Mapper], str]
+    """Why it is worth trying, given the best outcome; empty where it is not."""
+    outcomes: Callable[[Outcome, Mapper], Iterator[Outcome]]
+    """Maps the evidence that it changes."""
+    is_better: Callable[[Outcome, Outcome, Mapper], bool]
+    """Whether an outcome of it replaces the best one."""
+    repeats: int = 1
+    """Most times that it is tried, as long as it is accepted."""
+
+
+def reconstruct(
+    evidence: Evidence, run: RunContext, mappers: Mappers = MAPPERS, hypotheses: Iterable[Hypothesis] | None = None
+) -> Outcome:
+    """Return models of all connected groups of photos; none where no pair grows into a model."""
+    with translate_errors("entering photos"):
+        write_match_graph(run.workspace.database, evidence.matches)
+    mapper, start = Mapper(run, mappers), time.monotonic()
+    first = mapper.map(evidence)
+    trial = Trial(
+        "first-pass", "", True, (0, first.photos), (0.0, first.support), time.monotonic() - start, first.notes
+    )
+    best = improve(replace(first, trials=(trial,)), mapper, HYPOTHESES if hypotheses is None else hypotheses)
+    doubtful = mapper.judge_places(best.models)[0]  # joins without which the photos fall apart
+    return replace(best, graph=replace(best.graph, doubtful=(*best.graph.doubtful, *doubtful)))
+
+
+def improve(best: Outcome, mapper: Mapper, hypotheses: Iterable[Hypothesis]) -> Outcome:
+    """Try hypotheses in turn, each as long as it is accepted; return the outcome that explains most."""
+    for hypothesis in hypotheses:
+        if hypothesis.name in mapper.run.settings.scene.without:
+            continue
+        for _ in range(hypothesis.repeats):
+            reason = hypothesis.reason(best, mapper)
+            if not reason:
+                break
+            best, accepted = _try(hypothesis, reason, best, mapper)
+            if not accepted:
+                break
+    return best
+
+
+def _try(hypothesis: Hypothesis, reason: str, best: Outcome, mapper: Mapper) -> tuple[Outcome, bool]:
+    """Return the best outcome with or without a hypothesis, and whether the hypothesis was accepted."""
+    mapper.run.progress.say(f"{reason}; trying {hypothesis.title}")
+    first, trials, start = best, list(best.trials), time.monotonic()
+    try:
+        for other in hypothesis.outcomes(best, mapper):
+            accepted = hypothesis.is_better(other, best, mapper)
+            trials.append(_trial(hypothesis, reason, best, other, time.monotonic() - start, accepted=accepted))
+            best, start = other if accepted else best, time.monotonic()
+    except ClusterError:  # the same command would give another scene on a cluster that stays
+        raise
+    except SfmError as err:  # the best outcome is not lost with it
+        seconds = time.monotonic() - start
+        trials.append(replace(_trial(hypothesis, reason, best, best, seconds, accepted=False), notes=(str(err),)))
+    mapper.write(best)
+    return replace(best, trials=tuple(trials)), best is not first
+
+
+def _trial(
+    hypothesis: Hypothesis, reason: str, best: Outcome, other: Outcome, seconds: float, *, accepted: bool
+) -> Trial:
+    photos = best.photos, other.photos
+    return Trial(hypothesis.name, reason, accepted, photos, (best.support, other.support), seconds, other.notes)
+
+
+def _explains_more(other: Outcome, best: Outcome, _: Mapper) -> bool:
+    return other.support > best.support
+
+
+# Two different places merged in one model: the pairs that hold them together are left out.
+
+
+def _false_joins_reason(best: Outcome, mapper: Mapper) -> str:
+    return "two different places are merged in the model" if mapper.judge_places(best.models)[0] else ""
+
+
+def _without_false_joins(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
+    marked = replace(best, graph=with_false_joins(best.graph, mapper.judge_places(best.models)[0]))
+    yield mapper.map(marked.trusted).with_earlier(marked)
+
+
+def _separates_places(other: Outcome, best: Outcome, mapper: Mapper) -> bool:
+    """Return whether most photos stay together, and half of the missing overlaps at most are left."""
+    if other.photos < MAPPING.enough_share * best.photos:
+        return False
+    return 2 * mapper.judge_places(other.models)[1] <= mapper.judge_places(best.models)[1]
+
+
+# A rival where the evidence for our model is weak.
+
+
+def rival_reason(model: Attempt | None, evidence: Evidence) -> str:
+    """Return why a rival is worth trying, given the main model; empty where the evidence is good."""
+    if model is None:
+        return "no photo is registered"
+    cameras = evidence.intrinsics.cameras
+    if not all(cameras[name].is_estimated for name in map(evidence.camera_name, evidence.matches.images)):
+        return "the pairs do not determine a camera"
+    connected = photos_with_geometry(evidence)
+    if are_many_unregistered(len(connected) - model.photos, len(connected)):
+        return f"unregistered photos with matches: {len(connected) - model.photos}"
+    share = _contradicted_share(model)
+    return f"{100 * share:.0f} % of the matches contradict the model" if share > OPTIONS.min_contradicted_share else ""
+
+
+def photos_with_geometry(evidence: Evidence) -> set[int]:
+    """Return the photos of pairs whose geometry is not degenerate."""
+    return {photo for pair, fit in evidence.views.fits.items() if not fit.degeneracy for photo in pair}
+
+
+def _map_rival(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
+    rival = mapper.mappers.map_rival(best.trusted, mapper.run)
+    if isinstance(rival, NoModel):
+        yield replace(best, models=(), notes=(rival.note,))
+        return
+    parts = split_attempt(rival)
+    taken = {photo for part in parts for photo in posed_photo_ids(part.model)}
+    others = [model for model in best.models if taken.isdisjoint(posed_photo_ids(model.model))]
+    models = tuple(sorted((*parts, *others), key=lambda attempt: (-attempt.photos, -attempt.support)))
+    both = [attempt for attempt in (best.main, rival) if attempt is not None]
+    reason = choice_reason(rival, both, len(best.evidence.matches.images))
+    graph = mapper.with_poses_of(models, best)
+    yield replace(best, models=models, graph=graph, notes=(rival.note,), reason=reason)
+
+
+def _is_best_attempt(other: Outcome, best: Outcome, _: Mapper) -> bool:
+    return other.main is not None and best_attempt([one for one in (best.main, other.main) if one]) is other.main
+
+
+# Other focals, where a wrong guess may be why photos that match others are unregistered.
+
+
+def _focal_reason(best: Outcome, _: Mapper) -> str:
+    evidence = best.evidence
+    known = any(camera.is_estimated or camera.method == "exif" for camera in evidence.intrinsics.cameras.values())
+    connected = len(photos_with_geometry(best.trusted))
+    if known or connected > OPTIONS.max_photos_for_focals:
+        return ""
+    is_doubtful = connected - best.photos > OPTIONS.min_unregistered_share * connected
+    return "many photos are unregistered and the focal length is a guess" if is_doubtful else ""
+
+
+def _with_other_focals(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
+    for focal in OPTIONS.other_focals:
+        guess = guessed_intrinsics(best.evidence.intrinsics, focal)
+        yield mapper.map(replace(best.trusted, intrinsics=guess)).with_earlier(best)
+
+
+# A camera per photo, for a zoom or several devices. Photos of one size share a camera until their pairs contradict
+# that. Pairs of a camera that moves forward or round one point never do. A model does: with one focal, it contradicts
+# matches that are right pair by pair.
+
+
+def _shared_camera_reason(best: Outcome, mapper: Mapper) -> str:
+    """Return why photos of one size may have a camera each: the model is contradicted, or lacks many photos."""
+    if best.main is None or mapper.run.settings.photos.cameras != "auto":
+        return ""
+    # pairs on a plane are not counted as fits
+    photos = max(best.photos, len(photos_with_geometry(best.trusted)))
+    if not OPTIONS.min_photos <= photos <= OPTIONS.max_photos or _camera_per_photo(best) is None:
+        return ""
+    is_contradicted = _contradicted_share(best.main) > MAPPING.max_contradicted_share
+    return "a shared camera does not fit" if is_contradicted or _focal_reason(best, mapper) else ""
+
+
+def _with_camera_per_photo(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
+    intrinsics = _camera_per_photo(best)
+    if intrinsics is not None:
+        own = mapper.map(replace(best.trusted, intrinsics=intrinsics)).with_earlier(best)
+        yield replace(improve(own, mapper, [RIVAL]), trials=best.trials)
+
+
+def _camera_per_photo(best: Outcome) -> Intrinsics | None:
+    """Give each photo its own camera where pairs do not determine the shared one; None if there is none such."""
+    if best.main is None:
+        return None
+    evidence, shared = best.evidence, best.evidence.intrinsics
+    focals = {photo: float(K[0, 0] * K[1, 1]) ** 0.5 for photo, (K, *_) in cameras_by_photo(best.main.model).items()}
+    focal_of = {evidence.camera_name(k): focals[k] for k in posed_photo_ids(best.main.model) if k in focals}
+    members: dict[str, list[str]] = {}
+    for photo, image in evidence.matches.images.items():
+        members.setdefault(evidence.camera_name(photo), []).append(image.name)
+    divided = [name for name, photos in members.items() if len(photos) > 1 and not shared.cameras[name].identifiable]
+    if not divided:
+        return None
+    cameras, camera_of = dict(shared.cameras), dict(shared.camera_of)
+    for name in divided:
+        camera = cameras.pop(name)
+        focal_px, reason = focal_of.get(name, camera.focal_px), "its photos may each be of another camera"
+        names = _free_names(name, {*shared.cameras, *cameras})
+        for photo_name, own in zip(sorted(members[name]), names, strict=False):
+            cameras[own], camera_of[photo_name] = guess_again(camera, focal_px, reason), own
+    return replace(shared, cameras=cameras, camera_of=camera_of)
+
+
+def _free_names(name: str, taken: Collection[str]) -> Iterable[str]:
+    """Return the name itself, then numbered variants of it that are not taken."""
+    return chain([name], (other for number in count(2) if (other := f"{name} #{number}") not in taken))
+
+
+def _camera_per_photo_explains_more(own: Outcome, shared: Outcome, _: Mapper) -> bool:
+    """Return whether a camera per photo explains more matches, and registers more photos or removes contradictions."""
+    if own.main is None or shared.main is None or own.photos < shared.photos or own.support <= shared.support:
+        return False
+    least = OPTIONS.max_remaining_share * _contradicted_share(shared.main)
+    return own.photos > shared.photos or _contradicted_share(own.main) <= least
+
+
+def _contradicted_share(model: Attempt) -> float:
+    inliers = sum(pair.inliers for pair in model.explained.values())
+    return sum(pair.contradicted for pair in model.explained.values()) / max(inliers, 1)
+
+
+# Two cameras instead of one per photo.
+
+
+def _two_cameras_reason(best: Outcome, _: Mapper) -> str:
+    last = best.trials[-1] if best.trials else None
+    if last is None or last.name != "camera-per-photo" or not last.accepted or _two_cameras(best) is None:
+        return ""
+    return "the focal lengths fall into two groups"
+
+
+def _with_two_cameras(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
+    intrinsics = _two_cameras(best)
+    if intrinsics is not None:
+        yield mapper.map(replace(best.trusted, intrinsics=intrinsics)).with_earlier(best)
+
+
+def _two_cameras(best: Outcome) -> Intrinsics | None:
+    """Replace the cameras of photos of one size by two, divided at the widest gap of focals; None if none can be."""
+    if best.main is None:
+        return None
+    evidence, each = best.evidence, best.evidence.intrinsics
+    of_size: dict[tuple[int, int], dict[str, float]] = {}
+    for photo, (K, *_) in cameras_by_photo(best.main.model).items():
+        name, camera = evidence.camera_name(photo), evidence.camera(photo)
+        if not camera.identifiable:
+            of_size.setdefault((camera.width, camera.height), {})[name] = float(K[0, 0] * K[1, 1]) ** 0.5
+    cameras = dict(each.cameras)
+    replacements: dict[str, str] = {}
+    for size, focals in of_size.items():
+        for group in _split_at_gap(focals):
+            K = guessed_camera_matrix(size, float(np.median([focals[name] for name in group])))
+            cameras[group[0]] = replace(cameras[group[0]], K=K, identifiable=True, reason="", method="mapping")
+            replacements |= dict.fromkeys(group[1:], group[0])
+    camera_of = {photo: replacements.get(name, name) for photo, name in each.camera_of.items()}
+    used = {name: camera for name, camera in cameras.items() if name not in replacements}
+    return replace(each, cameras=used, camera_of=camera_of) if replacements else None
+
+
+def _split_at_gap(focals: Mapping[str, float]) -> list[list[str]]:
+    """Return names in two parts, divided at the widest gap between focals; empty if a part has only one name."""
+    names = sorted(focals, key=lambda name: (focals[name], name))
+    if len(names) < OPTIONS.min_photos:
+        return []
+    gap = int(np.argmax(np.diff(np.log([focals[name] for name in names])))) + 1
+    return [names[:gap], names[gap:]] if 2 <= gap <= len(names) - 2 else []
+
+
+def _two_cameras_suffice(two: Outcome, own: Outcome, _: Mapper) -> bool:
+    """Return whether a model with two cameras explains the matches as well as one with a camera per photo."""
+    if two.main is None or own.main is None or two.photos < own.photos:
+        return False
+    explains_as_much = two.support >= (1.0 - MAPPING.equal_tolerance) * own.support
+    return explains_as_much and (
+        _contradicted_share(two.main) <= _contradicted_share(own.main) + OPTIONS.share_tolerance
+    )
+
+
+# The cameras of the model, which correct the relative poses.
+
+
+def _learning_reason(best: Outcome, _: Mapper) -> str:
+    """Return why the cameras of the model may help: they differ from those of its pass, or main photos are missing."""
+    if best.main is None:
+        return ""
+    evidence, placed = best.evidence, posed_photo_ids(best.main.model)
+    if len(placed) < MAPPING.min_photos:
+        return ""
+    learned = learned_intrinsics(best).cameras
+    before = evidence.intrinsics.cameras
+    if any(_has_new_focal(before[name], learned[name]) for name in set(map(evidence.camera_name, placed))):
+        return "mapping has changed a focal length"
+    anywhere = {photo for model in best.models for photo in posed_photo_ids(model.model)}
+    group = set(best.graph.connected_photos(placed[0]))
+    lost = len(group - anywhere)
+    return f"unregistered photos with matches: {lost}" if are_many_unregistered(lost, len(group)) else ""
+
+
+def _with_learned_cameras(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
+    yield mapper.map(replace(best.trusted, intrinsics=learned_intrinsics(best))).with_earlier(best)
+
+
+def learned_intrinsics(best: Outcome) -> Intrinsics:
+    """Replace the cameras of the photos of the main model by its own."""
+    intrinsics = best.evidence.intrinsics
+    if best.main is None:
+        return intrinsics
+    with translate_errors("reading cameras"):
+        learned = cameras_by_photo(best.main.model)
+    cameras = dict(intrinsics.cameras)
+    for photo, camera in learned.items():
+        name = best.evidence.camera_name(photo)
+        earlier = intrinsics.cameras[name]
+        if earlier.is_kept:
+            continue
+        # mapping holds a lens with all terms as it was given
+        lens = earlier if earlier.distortion else replace(earlier, radial=camera.radial, fisheye=camera.fisheye)
+        cameras[name] = replace(lens, K=camera.K, identifiable=True, reason="", method="mapping")
+    return replace(intrinsics, cameras=cameras)
+
+
+def _has_new_focal(before: Calibration, after: Calibration) -> bool:
+    return not before.is_estimated or abs(float(np.log(after.focal_px / before.focal_px))) > OPTIONS.focal_tolerance
+
+
+# Models that share points are merged.
+
+
+def _merge_reason(best: Outcome, _: Mapper) -> str:
+    return f"the photos form {len(best.models)} models" if len(best.models) > 1 else ""
+
+
+def _merged(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
+    models = merge_into_main(best.models, best.trusted, mapper.run)
+    if len(models) < len(best.models):
+        graph = mapper.with_poses_of(models[:1], best)
+        yield replace(best, models=models, graph=graph, notes=(models[0].note,), reason=models[0].note)
+
+
+def _has_fewer_models(other: Outcome, best: Outcome, _: Mapper) -> bool:
+    return len(other.models) < len(best.models)
+
+
+# Finer features, for photos that are unregistered.
+
+
+def _lost_reason(best: Outcome, mapper: Mapper) -> str:
+    lost = len(lost_photos(best, mapper.run))
+    return "" if lost == 0 else "1 photo is unregistered" if lost == 1 else f"{lost} photos are unregistered"
+
+
+def _with_finer_features(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
+    finer = find_finer_evidence(best, mapper.run)
+    if finer is not None:
+        yield replace(reconstruct(*finer, mapper.mappers, FIRST_LOOK), trials=best.trials)
+
+
+def _places_and_explains_more(second: Outcome, first: Outcome, _: Mapper) -> bool:
+    if second.photos <= first.photos:
+        return False
+    mains = [one for one in (first.main, second.main) if one is not None]
+    models = [judge_model(second.evidence, one.mapper, one.note, one.model, second.run) for one in mains]
+    return best_attempt(models) is models[-1]
+
+
+RIVAL = Hypothesis(
+    "colmap-defaults",
+    "COLMAP's default pipeline",
+    lambda best, _: rival_reason(best.main, best.trusted),
+    _map_rival,
+    _is_best_attempt,
+)
+FIRST_LOOK = (
+    Hypothesis(
+        "false-joins", "without the ambiguous pairs", _false_joins_reason, _without_false_joins, _separates_places,
+        repeats=OVERLAPS.max_passes,
+    ),
+    RIVAL,
+    Hypothesis("other-focals", "other focal lengths", _focal_reason, _with_other_focals, _explains_more),
+    Hypothesis(
+        "camera-per-photo", "one camera per photo", _shared_camera_reason, _with_camera_per_photo,
+        _camera_per_photo_explains_more,
+    ),
+    Hypothesis("two-cameras", "two cameras", _two_cameras_reason, _with_two_cameras, _two_cameras_suffice),
+    Hypothesis(
+        "learned-cameras", "the cameras of the model", _learning_reason, _with_learned_cameras, _explains_more,
+        repeats=OPTIONS.max_passes,
+    ),
+    Hypothesis("merged-models", "to merge them", _merge_reason, _merged, _has_fewer_models),
+)  # fmt: skip
+FINER_FEATURES = Hypothesis(
+    "finer-features", "finer features", _lost_reason, _with_finer_features, _places_and_explains_more
+)
+HYPOTHESES = (*FIRST_LOOK, FINER_FEATURES)
+"""In the order of their costs: cheap ones first."""
