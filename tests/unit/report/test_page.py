@@ -123,6 +123,7 @@ def test_photos_that_were_left_out_are_counted_beside_those_that_are_placed(unus
     assert (first.value, first.note) == ("1 of 2", more)
 
 
+@pytest.mark.slow
 def test_a_large_texture_is_shrunk_and_keeps_its_colors(textured_ball):
     large = np.full((3 * LIGHT_PAGE_PX, 2 * LIGHT_PAGE_PX, 3), (10, 120, 240), np.uint8)
     small = large[:64, :96]
