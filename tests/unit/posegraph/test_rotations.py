@@ -125,10 +125,6 @@ def test_a_chain_without_loops_is_multiplied_out():
     assert max(angles.values()) < 1e-5
 
 
-def test_nothing_comes_of_nothing():
-    assert average_rotations({}, {}) == ({}, {})
-
-
 @settings(deadline=None, max_examples=8)
 @given(seed=st.integers(0, 1000), axis=st.tuples(*[st.floats(-3, 3)] * 3), order=st.randoms(use_true_random=False))
 def test_neither_the_world_nor_the_order_of_pairs_matters(seed, axis, order):
