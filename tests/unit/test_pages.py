@@ -250,17 +250,6 @@ def test_every_name_on_the_page_is_in_the_code(name):
     assert exists(name)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "fundamental.loop.serch", "fundamental.lop.search", "fundamental.loop.search(nobody)",
-        "lev-ransac-thesi", "nothing", "fundamental.points.Matches.nothing", "fundamental.loop.Best.f.x",
-    ],
-)  # fmt: skip
-def test_what_is_not_in_the_code_is_found(name):
-    assert not exists(name)
-
-
 def test_the_hooks_are_printed_with_their_fields():
     printed = block("")
     for hook in (name for name in vars(plugins.Hooks) if name.startswith("sfm_")):
@@ -286,10 +275,6 @@ def test_every_equation_of_four_chapters_is_on_the_map():
         for first, last in re.findall(r"\d\.(\d+)(?: to \d\.(\d+))?", cell):
             listed += [(int(cell[0]), number) for number in range(int(first), int(last or first) + 1)]
     assert sorted(listed) == [(chapter, k) for chapter, last in LAST_EQUATIONS.items() for k in range(1, last + 1)]
-
-
-def test_every_algorithm_is_on_the_map():
-    assert re.findall(r"^\| Algorithm (\d) \|", MAP, re.MULTILINE) == ["1", "2", "3", "4"]
 
 
 def test_every_function_on_the_map_is_a_path():

@@ -12,13 +12,13 @@ from sfm_app.photos.masks import save_mask
 from sfm_app.progress import SilentProgress
 from sfm_app.stereo import rank_neighbors
 
-SIZE = 480, 320
+SIZE = 240, 160
 CAMERAS = {
-    "fisheye": ("OPENCV_FISHEYE", [175.0, 176.0, 241.0, 158.0, 0.02, -0.003, 0.0, 0.0]),
-    "thin prism": ("THIN_PRISM_FISHEYE", [175.0, 176.0, 241.0, 158.0, 0.02, -0.003, 2e-3, 1e-3, 0, 0, 1e-3, 0]),
-    "panorama": ("EQUIRECTANGULAR", [480.0, 240.0]),
-    "plain": ("OPENCV", [420.0, 415.0, 241.0, 158.0, 0.05, -0.01, 0.0, 0.0]),
-    "strong barrel": ("OPENCV", [260.0, 260.0, 240.0, 160.0, -0.2, 0.025, 0.0, 0.0]),
+    "fisheye": ("OPENCV_FISHEYE", [87.5, 88.0, 120.5, 79.0, 0.02, -0.003, 0.0, 0.0]),
+    "thin prism": ("THIN_PRISM_FISHEYE", [87.5, 88.0, 120.5, 79.0, 0.02, -0.003, 2e-3, 1e-3, 0, 0, 1e-3, 0]),
+    "panorama": ("EQUIRECTANGULAR", [240.0, 120.0]),
+    "plain": ("OPENCV", [210.0, 207.5, 120.5, 79.0, 0.05, -0.01, 0.0, 0.0]),
+    "strong barrel": ("OPENCV", [130.0, 130.0, 120.0, 80.0, -0.2, 0.025, 0.0, 0.0]),
 }
 NAMES = ("a.png", "sub/b.png", "c.png")
 
@@ -38,7 +38,7 @@ def make_place(root, kind):
     """Three photos whose colors are directions in the world, and their model with points all round."""
     rng = np.random.default_rng(0)
     name, params = CAMERAS[kind]
-    size = (480, 240) if kind == "panorama" else SIZE
+    size = (240, 120) if kind == "panorama" else SIZE
     camera = pycolmap.Camera(camera_id=1, model=name, width=size[0], height=size[1], params=params)
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera)
@@ -142,7 +142,7 @@ def test_ordinary_lenses_are_left_to_colmap(tmp_path):
     model = pycolmap.Reconstruction(tmp_path / "sparse")
     camera = model.cameras[1]
     camera.model = pycolmap.CameraModelId.OPENCV
-    camera.params = [500.0, 500.0, 240.0, 160.0, -0.1, 0.02, 0.0, 0.0]
+    camera.params = [250.0, 250.0, 120.0, 80.0, -0.1, 0.02, 0.0, 0.0]
     model.write(tmp_path / "sparse")
     assert split_wide_photos(tmp_path / "sparse", 1000) is None
 
@@ -158,7 +158,7 @@ def test_large_views_are_scaled_down_without_aliasing(tmp_path):
 def plain(tmp_path):
     """Photos of a lens that one view is enough for."""
     make_place(tmp_path, "plain")
-    undistort(tmp_path / "sparse", tmp_path / "photos", tmp_path / "dense", 300, 1, SilentProgress())
+    undistort(tmp_path / "sparse", tmp_path / "photos", tmp_path / "dense", 150, 1, SilentProgress())
     return tmp_path, {view.name: view for view in read_views(tmp_path / "dense")}
 
 
@@ -168,7 +168,7 @@ def errors(gray, K, R, used):
     return np.abs(gray.astype(int) - expected)[used]
 
 
-@pytest.mark.parametrize("side", [240, 2000])
+@pytest.mark.parametrize("side", [120, 2000])
 def test_photos_of_a_plain_lens_keep_their_names(plain, side):
     place, views = plain
     found = LargerViews(place / "sparse", place / "photos", None, [views["c.png"], views["a.png"]], side)
@@ -192,8 +192,8 @@ def test_views_of_a_fisheye_are_those_of_the_workspace(tmp_path):
 
 def test_masked_pixels_are_not_used(plain):
     place, views = plain
-    mask_left(place, 200)
-    larger = LargerViews(place / "sparse", place / "photos", place / "masks", [views["a.png"]], 480)
+    mask_left(place, 100)
+    larger = LargerViews(place / "sparse", place / "photos", place / "masks", [views["a.png"]], 240)
     ((_, _, gray, used),) = larger.render("a.png")
     share = np.mean(used, axis=0)
-    assert gray.shape == used.shape and share[:150].max() == 0.0 and share[-200:].min() > 0.9
+    assert gray.shape == used.shape and share[:75].max() == 0.0 and share[-100:].min() > 0.9

@@ -245,6 +245,7 @@ def read_bundle(file):
     return views, found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kinds", [("lens", "other"), ("fisheye",)], ids="+".join)
 def test_bundler_sees_points_where_the_photos_do(make_run, frame, kinds):
     run = make_run(*kinds)
@@ -269,6 +270,7 @@ def test_bundler_sees_points_where_the_photos_do(make_run, frame, kinds):
     assert len(errors) >= 200 and max(errors) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_folder_is_the_same_every_time(make_run):
     run = make_run("fisheye", masks=True)
     one, two = (sfm_app.export_scene(run.out, "splat", run.out / name) for name in ("one", "two"))

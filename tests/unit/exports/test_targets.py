@@ -243,14 +243,6 @@ def test_a_run_without_a_mesh_says_what_is_missing_and_what_to_do(tmp_path):
     assert f"sfm-app run PHOTOS -o {place.root}" in result.stderr and "--points" in result.stderr
 
 
-def test_a_run_without_a_scene_has_no_points_either(tmp_path):
-    place = Workspace(tmp_path / "out")
-    place.manifest.finish("photos", StageRecord("", 0.0), {})
-    result = call(place.root, "--format", "ply", "--points")
-    assert result.exit_code == 3
-    assert "no points yet: stage `scene` is missing" in result.stderr and "--points" not in result.stderr
-
-
 @pytest.mark.parametrize("place", [".", "nowhere"])
 @pytest.mark.parametrize("name", [*SCENE_EXPORTERS, "ply"])
 def test_a_folder_that_is_no_run_is_refused_and_left_alone(tmp_path, name, place):
