@@ -25,7 +25,7 @@ from sfm_app.mapping.attempt import (
     choice_reason,
     judge_model,
 )
-from sfm_app.mapping.feature_retry import find_finer_evidence, lost_photos
+from sfm_app.mapping.feature_retry import STEPS, Steps, find_finer_evidence, lost_photos
 from sfm_app.mapping.look_alikes import OVERLAPS, with_false_joins
 from sfm_app.mapping.passes import MAPPERS, Mapper, Mappers, Outcome, Trial, guess_again, guessed_intrinsics
 from sfm_app.mapping.split_and_merge import merge_into_main, split_attempt
@@ -92,8 +92,9 @@ def reconstruct(
         "first-pass", "", True, (0, first.photos), (0.0, first.support), time.monotonic() - start, first.notes
     )
     best = improve(replace(first, trials=(trial,)), mapper, HYPOTHESES if hypotheses is None else hypotheses)
-    doubtful = mapper.judge_places(best.models)[0]  # joins without which the photos fall apart
-    return replace(best, graph=replace(best.graph, doubtful=(*best.graph.doubtful, *doubtful)))
+    joins = mapper.judge_places(best.models)[0]  # without these the photos fall apart
+    doubtful = tuple(dict.fromkeys((*best.graph.doubtful, *joins)))  # finer features may have named them
+    return replace(best, graph=replace(best.graph, doubtful=doubtful))
 
 
 def improve(best: Outcome, mapper: Mapper, hypotheses: Iterable[Hypothesis]) -> Outcome:
@@ -114,7 +115,7 @@ def improve(best: Outcome, mapper: Mapper, hypotheses: Iterable[Hypothesis]) -> 
 def _try(hypothesis: Hypothesis, reason: str, best: Outcome, mapper: Mapper) -> tuple[Outcome, bool]:
     """Return the best outcome with or without a hypothesis, and whether the hypothesis was accepted."""
     mapper.run.progress.say(f"{reason}; trying {hypothesis.title}")
-    first, trials, start = best, list(best.trials), time.monotonic()
+    first, trials, failure, start = best, list(best.trials), "", time.monotonic()
     try:
         for other in hypothesis.outcomes(best, mapper):
             accepted = hypothesis.is_better(other, best, mapper)
@@ -123,8 +124,10 @@ def _try(hypothesis: Hypothesis, reason: str, best: Outcome, mapper: Mapper) -> 
     except ClusterError:  # the same command would give another scene on a cluster that stays
         raise
     except SfmError as err:  # the best outcome is not lost with it
-        seconds = time.monotonic() - start
-        trials.append(replace(_trial(hypothesis, reason, best, best, seconds, accepted=False), notes=(str(err),)))
+        failure = str(err)
+    if failure or len(trials) == len(first.trials):
+        trial = _trial(hypothesis, reason, best, best, time.monotonic() - start, accepted=False)
+        trials.append(replace(trial, notes=(), failure=failure))
     mapper.write(best)
     return replace(best, trials=tuple(trials)), best is not first
 
@@ -183,21 +186,22 @@ def photos_with_geometry(evidence: Evidence) -> set[int]:
 
 def _map_rival(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
     rival = mapper.mappers.map_rival(best.trusted, mapper.run)
-    if isinstance(rival, NoModel):
-        yield replace(best, models=(), notes=(rival.note,))
+    both = [attempt for attempt in (best.main, rival) if attempt is not None]
+    if isinstance(rival, NoModel) or best_attempt(both) is not rival:
+        models = () if isinstance(rival, NoModel) else (rival,)
+        yield replace(best, models=models, notes=(rival.note,), reason="")
         return
     parts = split_attempt(rival)
     taken = {photo for part in parts for photo in posed_photo_ids(part.model)}
     others = [model for model in best.models if taken.isdisjoint(posed_photo_ids(model.model))]
     models = tuple(sorted((*parts, *others), key=lambda attempt: (-attempt.photos, -attempt.support)))
-    both = [attempt for attempt in (best.main, rival) if attempt is not None]
     reason = choice_reason(rival, both, len(best.evidence.matches.images))
     graph = mapper.with_poses_of(models, best)
     yield replace(best, models=models, graph=graph, notes=(rival.note,), reason=reason)
 
 
-def _is_best_attempt(other: Outcome, best: Outcome, _: Mapper) -> bool:
-    return other.main is not None and best_attempt([one for one in (best.main, other.main) if one]) is other.main
+def _is_chosen(rival: Outcome, _best: Outcome, _: Mapper) -> bool:
+    return bool(rival.reason)
 
 
 # Other focals, where a wrong guess may be why photos that match others are unregistered.
@@ -240,7 +244,9 @@ def _with_camera_per_photo(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
     intrinsics = _camera_per_photo(best)
     if intrinsics is not None:
         own = mapper.map(replace(best.trusted, intrinsics=intrinsics)).with_earlier(best)
-        yield replace(improve(own, mapper, [RIVAL]), trials=best.trials)
+        better = improve(own, mapper, [RIVAL])
+        notes = chain(own.notes, *(trial.notes for trial in better.trials))
+        yield replace(better, notes=tuple(notes), trials=best.trials)
 
 
 def _camera_per_photo(best: Outcome) -> Intrinsics | None:
@@ -414,8 +420,8 @@ def _lost_reason(best: Outcome, mapper: Mapper) -> str:
     return "" if lost == 0 else "1 photo is unregistered" if lost == 1 else f"{lost} photos are unregistered"
 
 
-def _with_finer_features(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
-    finer = find_finer_evidence(best, mapper.run)
+def _with_finer_features(best: Outcome, mapper: Mapper, steps: Steps = STEPS) -> Iterator[Outcome]:
+    finer = find_finer_evidence(best, mapper.run, steps)
     if finer is not None:
         yield replace(reconstruct(*finer, mapper.mappers, FIRST_LOOK), trials=best.trials)
 
@@ -433,7 +439,7 @@ RIVAL = Hypothesis(
     "COLMAP's default pipeline",
     lambda best, _: rival_reason(best.main, best.trusted),
     _map_rival,
-    _is_best_attempt,
+    _is_chosen,
 )
 FIRST_LOOK = (
     Hypothesis(

@@ -55,7 +55,9 @@ class Trial:
     """Support of the main model before and with it."""
     seconds: float
     notes: tuple[str, ...] = ()
-    """How its models were made, or why it failed; for people."""
+    """How its models were made; for people."""
+    failure: str = ""
+    """Why it failed, for people; empty if it did not."""
 
     def to_dict(self) -> dict[str, Json]:
         """Return JSON values."""
@@ -185,7 +187,7 @@ class Mapper:
                 continue
             attempts, joins = self._map_by_size(Group(photos, trusted, graph), stop_at_false_joins=chances > 0)
             if joins:
-                return self._map_without(joins, replace(outcome, evidence=trusted), chances - 1)
+                return self._map_without(joins, outcome, chances - 1)
             notes += [attempt.note for attempt in attempts]
             best = best_attempt(attempts)
             if best is not None:
@@ -204,8 +206,8 @@ class Mapper:
         marked = replace(outcome, graph=with_false_joins(outcome.graph, joins))
         again = self.map(marked.trusted, chances)
         if again.main is not None and again.main.photos >= MAPPING.enough_share * len(outcome.graph.groups[0]):
-            return replace(again, graph=with_earlier_look_alikes(again.graph, marked.graph))
-        first = self.map(outcome.evidence, 0)
+            return again.with_earlier(marked)
+        first = self.map(outcome.trusted, 0).with_earlier(outcome)
         return replace(first, graph=replace(first.graph, doubtful=(*first.graph.doubtful, *joins)))
 
     def _map_by_size(

@@ -295,8 +295,9 @@ def _mapping_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Ite
     for trial in counts.get("hypotheses", ()):
         if trial["name"] in HYPOTHESES:
             before, after = trial["photos"]
-            gain = f"{after} photos instead of {before}" if after != before else "it explains more matches"
-            result = gain if trial["accepted"] else "it explains no more"
+            gain = f"{after} photos instead of {before}" if after != before else "it is better"
+            failed = f"it failed: {trial['failure']}" if trial["failure"] else "it is no better"
+            result = gain if trial["accepted"] else failed
             yield f"tried {HYPOTHESES[trial['name']]}, because {trial['reason']}: {result}"
     if dropped := sum(summary.get("pairs_dropped", {}).values()):
         yield f"rejected pairs of photos that contradict the others: {dropped}"
