@@ -20,7 +20,8 @@ from sfm_app.mapping.joins import Fragment
 from sfm_app.progress import SilentProgress
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
-from sfm_app.types import Calibration, EpipolarFit, Intrinsics, MatchedImage, MatchGraph, ViewGraph
+from sfm_app.types import Calibration, EpipolarFit, Evidence, Intrinsics, MatchedImage, MatchGraph, ViewGraph
+from tests.unit.mapping.fakes import Fakes
 
 FOCAL, WIDTH, HEIGHT = 1280.0, 1024, 768
 
@@ -33,6 +34,9 @@ class Synthetic:
     model: Any
     matches: MatchGraph
     views: ViewGraph
+
+    def evidence(self, intrinsics=None):
+        return Evidence(self.matches, self.views, intrinsics)
 
     def copy(self):
         """The true model, to be changed."""
@@ -108,6 +112,12 @@ def run(synthetic, tmp_path):
         )
 
     return make
+
+
+@pytest.fixture
+def mapped(synthetic):
+    """Mappers that find the models of a test."""
+    return Fakes(synthetic)
 
 
 PHOTOS, POINTS, REACH = 40, 600, 8.0

@@ -39,6 +39,7 @@ from sfm_app.posegraph.rotations import connected_groups
 from sfm_app.types import (
     Calibration,
     EpipolarFit,
+    Evidence,
     Intrinsics,
     MatchedImage,
     MatchGraph,
@@ -74,8 +75,9 @@ def seeded(matches, intrinsics):
     x1, x2 = matches.points((1, 2))
     fit = EpipolarFit(eight_point(x1, x2), np.ones(POINTS, bool), np.ones(POINTS), 10, 0.3)
     graph = PoseGraph({(1, 2): estimate_pose(Pair((x1, x2), cameras, 1.5), fit)}, {}, ())
-    [candidate] = rank_seeds(matches, graph, intrinsics, (1, 2), 2.0)
-    return triangulate_seed(matches, candidate, intrinsics)
+    evidence = Evidence(matches, ViewGraph({}, {}), intrinsics)
+    [candidate] = rank_seeds(Group((1, 2), evidence, graph), 2.0)
+    return triangulate_seed(candidate, evidence)
 
 
 def test_a_seed_is_made_from_what_the_photos_show_without_their_lens():
@@ -112,8 +114,8 @@ def order(poses, camera=None, members=(1, 2, 3, 4), keypoints=None, least_deg=2.
     images, usual = photos()
     rows = np.tile(np.arange(400, dtype=np.uint32)[:, None], 2)
     matches = MatchGraph(images, usual | (keypoints or {}), dict.fromkeys(poses, rows))
-    graph = PoseGraph(poses, {}, ())
-    found = rank_seeds(matches, graph, Intrinsics({"one": camera or known()}), members, least_deg)
+    evidence = Evidence(matches, ViewGraph({}, {}), Intrinsics({"one": camera or known()}))
+    found = rank_seeds(Group(members, evidence, PoseGraph(poses, {}, ())), least_deg)
     assert [candidate.score for candidate in found] == sorted((c.score for c in found), reverse=True)
     return [candidate.pair for candidate in found]
 
@@ -421,13 +423,8 @@ def try_out(run, cameras):
             for key in range(1, count)
         }
         matches = MatchGraph(images, keypoints, dict.fromkeys(poses, rows))
-        group = Group(
-            tuple(images),
-            matches,
-            ViewGraph({}, {}),
-            PoseGraph(poses, {}, ()),
-            cameras(spread={"fx": 1.0} if sure else {}),
-        )
+        evidence = Evidence(matches, ViewGraph({}, {}), cameras(spread={"fx": 1.0} if sure else {}))
+        group = Group(tuple(images), evidence, PoseGraph(poses, {}, ()))
         done, calls = {"global": threading.Event(), "incremental": threading.Event()}, []
 
         def finish(mapper, result):
@@ -493,8 +490,8 @@ def test_it_is_easy_with_known_cameras_and_few_contradictions(cameras, deviation
     graph = PoseGraph(dict.fromkeys(pairs[dropped:], pose), dict.fromkeys(pairs[:dropped], ""), ())
     known = cameras()
     sure = {name: replace(one, spread={"fx": deviation}) for name, one in known.cameras.items()}
-    group = Group(tuple(images), MatchGraph(images, {}, {}), ViewGraph({}, {}), graph, replace(known, cameras=sure))
-    assert likely_needs_one_mapper(group) is easy
+    evidence = Evidence(MatchGraph(images, {}, {}), ViewGraph({}, {}), replace(known, cameras=sure))
+    assert likely_needs_one_mapper(Group(tuple(images), evidence, graph)) is easy
 
 
 @pytest.mark.slow

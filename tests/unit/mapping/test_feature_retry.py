@@ -1,6 +1,8 @@
-"""The second look, with features and mappers that find what the test says; databases and geometries are real."""
+"""Finer features for unregistered photos; features and models are those of a test, databases and geometry are real."""
 
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,49 +13,42 @@ from sfm_app.api import open_run
 from sfm_app.colmap.database import write_keypoints, write_matches
 from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.errors import BackendError, ClusterError
-from sfm_app.mapping import feature_retry as module
 from sfm_app.mapping.attempt import Attempt, explained_pairs
 from sfm_app.mapping.feature_retry import (
     OPTIONS,
-    MappedScene,
     Steps,
     add_matches,
     candidate_pairs,
+    find_finer_evidence,
     lost_photos,
-    retry_lost_photos,
 )
 from sfm_app.mapping.passes import Outcome
 from sfm_app.settings import Settings
-from sfm_app.types import MatchedImage, MatchGraph, PoseGraph, ViewGraph
+from sfm_app.types import Evidence, MatchedImage, MatchGraph, ViewGraph
+from tests.unit.mapping.fakes import EMPTY, hypothesis, without
 
 LOST = 6
 
 
-def outcome_of(synthetic, matches, views, placed):
+def attempt_of(synthetic, evidence, placed):
     """A model that holds the first so many photos."""
-    model = synthetic.copy()
-    for photo in range(placed + 1, 7):
-        model.deregister_frame(model.images[photo].frame_id)
-    attempt = Attempt("incremental", model, explained_pairs(model, matches, views, 1.5), f"{placed} photos")
-    return Outcome((attempt,), PoseGraph({}, {}, ()), None, ())
+    model = without(synthetic.copy(), range(placed + 1, 7))
+    explained = explained_pairs(model, evidence.matches, evidence.views, 1.5)
+    return Attempt("incremental", model, explained, f"{placed} photos")
 
 
 @pytest.fixture
-def first(synthetic, cameras, tmp_path):
+def first(synthetic, cameras, mapped, tmp_path):
     """Five of six photos placed; nothing is known of the matches of the last."""
-    matches = replace(
-        synthetic.matches, matches={pair: rows for pair, rows in synthetic.matches.matches.items() if LOST not in pair}
-    )
-    views = ViewGraph({pair: fit for pair, fit in synthetic.views.fits.items() if LOST not in pair}, {})
+    evidence = synthetic.evidence(cameras()).without([pair for pair in synthetic.matches.matches if LOST in pair])
     with open_run(tmp_path / "out", Settings.from_mapping({"workers": 1}), None) as run:
         run.workspace.root.mkdir(parents=True)
-        yield MappedScene(
-            outcome_of(synthetic, matches, views, 5), matches, views, cameras(), run.with_fingerprint("these")
-        )
+        best = mapped.best(cameras(), run.with_fingerprint("these"), attempt_of(synthetic, evidence, 5))
+        yield replace(best, evidence=evidence)
 
 
 @pytest.fixture
-def finer(synthetic):
+def finer(synthetic, mapped):
     """Lets finer features be those that COLMAP has made; what is asked for is noted. `places` of six find a place.
 
     Matches are wrong where their second features come in another `order`.
@@ -72,82 +67,109 @@ def finer(synthetic):
                 rows = synthetic.matches.matches[pair]
                 write_matches(run.workspace.database, pair, np.stack([rows[:, 0], rows[order, 1]], axis=1))
 
-        def reconstruct(matches, views, intrinsics, run):
-            asked.append((matches, views, intrinsics))
-            return outcome_of(synthetic, matches, views, places)
+        mapped.mappers = replace(
+            mapped.mappers,
+            map_group=lambda group, _: [attempt_of(synthetic, group.evidence, places)],
+            judge_places=lambda _: ([], 0),
+        )
+        return asked, Steps(fill_database)
 
-        return asked, Steps(fill_database, reconstruct=reconstruct)
+    return make
+
+
+@pytest.fixture
+def retry(mapped):
+    """Tries finer features, from these steps, after an outcome."""
+    finer_features = hypothesis("finer-features")
+
+    def make(best, steps):
+        return mapped.improve(best, replace(finer_features, outcomes=partial(finer_features.outcomes, steps=steps)))
 
     return make
 
 
 @pytest.mark.slow
-def test_a_lost_photo_finds_its_place_by_finer_features(first, finer):
+def test_a_lost_photo_finds_its_place_by_finer_features(first, finer, retry):
     asked, steps = finer()
 
-    found = retry_lost_photos(first, steps)
+    found = retry(first, steps)
 
-    assert asked[0] == ("sift-dsp", [(k, LOST) for k in range(1, LOST)], OPTIONS.max_ratio)
-    matches, views, intrinsics = asked[1]
-    assert intrinsics is first.intrinsics  # it was known
-    assert all((k, LOST) in views.fits and len(matches.matches[k, LOST]) >= 100 for k in range(1, LOST))
-    assert all(views.fits[pair] is fit for pair, fit in first.views.fits.items())
-    assert posed_photo_ids(found.outcome.models[0].model) == [1, 2, 3, 4, 5, 6]
+    assert asked == [("sift-dsp", [(k, LOST) for k in range(1, LOST)], OPTIONS.max_ratio)]
+    assert posed_photo_ids(found.main.model) == [1, 2, 3, 4, 5, 6]
     assert found.run.workspace.database != first.run.workspace.database
-    said = first.run.statistics["second_look"]
-    assert (said["placed"], said["taken"], said["pairs_with_geometry"]) == ([5, 6], True, [10, 15])
+    assert found.calibrated is first.calibrated  # it was known
+    assert len(found.evidence.views.fits) == 15
+    (trial,) = found.trials
+    assert (trial.name, trial.accepted, trial.photos) == ("finer-features", True, (5, 6))
+    assert trial.reason == "1 photo is unregistered"
+
+
+@pytest.mark.slow
+def test_finer_features_add_matches_and_geometry(first, finer):
+    _, steps = finer()
+    evidence, run = find_finer_evidence(first, first.run, steps)
+    assert evidence.intrinsics is first.calibrated and run.workspace.root != first.run.workspace.root
+    views, rows = evidence.views, evidence.matches.matches
+    assert all((k, LOST) in views.fits and len(rows[k, LOST]) >= 100 for k in range(1, LOST))
+    assert all(views.fits[pair] is fit for pair, fit in first.evidence.views.fits.items())
 
 
 @pytest.mark.slow
 def test_cameras_that_were_not_known_are_found_anew(first, finer, cameras):
-    (asked, steps), anew = finer(), cameras(focal=1200.0)
+    (_, steps), anew = finer(), cameras(focal=1200.0)
     steps = replace(steps, find_intrinsics=lambda *_: (anew, ()))
-    retry_lost_photos(replace(first, intrinsics=cameras(method="guess", identifiable=False)), steps)
-    assert asked[1][2] is anew
+    guessed = replace(first, calibrated=cameras(method="guess", identifiable=False))
+    assert find_finer_evidence(guessed, first.run, steps)[0].intrinsics is anew
+
+
+def is_unchanged(found, first):
+    """Whether the best outcome is the first, and its only trial was rejected."""
+    (trial,) = found.trials
+    return found.models is first.models and found.run is first.run and not trial.accepted
 
 
 @pytest.mark.slow
-def test_what_was_found_first_stays_where_no_more_photos_find_a_place(first, finer):
+def test_what_was_found_first_stays_where_no_more_photos_find_a_place(first, finer, retry):
     _, steps = finer(places=5)
-    assert retry_lost_photos(first, steps) is first
-    assert first.run.statistics["second_look"]["taken"] is False
+    found = retry(first, steps)
+    assert is_unchanged(found, first) and found.trials[0].photos == (5, 5)
 
 
 @pytest.mark.slow
-def test_nothing_is_mapped_again_where_no_lost_photo_shows_the_same_scene(first, finer):
+def test_nothing_is_mapped_again_where_no_lost_photo_shows_the_same_scene(first, finer, retry):
     asked, steps = finer(order=slice(None, None, -1))
-    assert retry_lost_photos(first, steps) is first
-    assert len(asked) == 1
-    assert (first.run.statistics["second_look"]["placed"], first.run.statistics["second_look"]["taken"]) == ([5], False)
+    found = retry(first, steps)
+    assert is_unchanged(found, first) and len(asked) == 1
+    assert (found.trials[0].notes, found.trials[0].failure) == ((), "")
 
 
 @pytest.mark.slow
-def test_a_second_look_that_fails_costs_nothing(first, finer):
+def test_finer_features_that_fail_cost_nothing(first, finer, retry):
     _, steps = finer(failing=BackendError("the disk is full"))
-    assert retry_lost_photos(first, steps) is first
-    assert first.run.statistics["second_look"]["failed"] == "the disk is full"
+    found = retry(first, steps)
+    assert is_unchanged(found, first) and found.trials[0].failure == "the disk is full"
 
 
 @pytest.mark.slow
-def test_a_second_look_whose_cluster_is_gone_is_not_skipped(first, finer):
+def test_finer_features_whose_cluster_is_gone_are_not_skipped(first, finer, retry):
     _, steps = finer(failing=ClusterError("the scheduler is gone"))
     with pytest.raises(ClusterError, match="scheduler"):
-        retry_lost_photos(first, steps)
+        retry(first, steps)
 
 
 @pytest.mark.slow
-def test_nobody_looks_twice_where_all_photos_have_a_place(first, finer, synthetic):
+def test_no_finer_features_where_all_photos_have_a_place(first, finer, retry, synthetic):
     asked, steps = finer()
-    whole = replace(first, outcome=outcome_of(synthetic, first.matches, first.views, 6))
-    assert retry_lost_photos(whole, steps) is whole and asked == [] and "second_look" not in first.run.statistics
+    whole = replace(first, models=(attempt_of(synthetic, first.evidence, 6),))
+    assert retry(whole, steps) is whole and asked == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("chosen", [{"scene": {"second_look": False}}, {"matching": {"features": "sift-dsp"}}])
-def test_nobody_looks_twice_where_that_is_not_wanted(first, finer, chosen):
+@pytest.mark.parametrize("chosen", [{"scene": {"without": ["finer-features"]}}, {"matching": {"features": "sift-dsp"}}])
+def test_no_finer_features_where_they_are_not_wanted(first, finer, retry, chosen):
     asked, steps = finer()
     unasked = replace(first, run=replace(first.run, settings=Settings.from_mapping(chosen)))
-    assert retry_lost_photos(unasked, steps) is unasked and asked == []
+    assert retry(unasked, steps) is unasked and asked == []
 
 
 def photos(count, matches=()):
@@ -170,12 +192,12 @@ def test_in_large_sets_it_is_matched_with_its_neighbors():
     assert found == sorted(near | likely)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("count", "lost", "seen"), [(59, 1, 1), (100, 4, 0), (100, 5, 5)])
-def test_few_lost_photos_of_many_are_left(monkeypatch, count, lost, seen):
-    monkeypatch.setattr(module, "posed_photo_ids", lambda _: range(1, count - lost + 1))
-    outcome = Outcome((Attempt("incremental", object(), {}, ""),), PoseGraph({}, {}, ()), None, ())
-    assert len(lost_photos(MappedScene(outcome, photos(count), ViewGraph({}, {}), None, None))) == seen
+def test_few_lost_photos_of_many_are_left(count, lost, seen):
+    images = {k: SimpleNamespace(image_id=k, has_pose=k <= count - lost) for k in range(1, count + 1)}
+    models = (Attempt("incremental", SimpleNamespace(images=images), {}, ""),)
+    best = Outcome(models, EMPTY, Evidence(photos(count), ViewGraph({}, {}), None), None, None)
+    assert len(lost_photos(best, SimpleNamespace(settings=Settings()))) == seen
 
 
 GRID = np.array([[10.0 * k, 5.0] for k in range(4)])

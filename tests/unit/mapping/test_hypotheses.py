@@ -1,86 +1,343 @@
-"""A camera for each photo, as a rival; mappers find what the test says, models and database are real."""
+"""Hypotheses and the loop that tries them; mappers find the models of a test, models and database are real."""
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import get_args
 
 import pytest
 
-from sfm_app.camera.models import camera_matrix
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.bundle import adjust
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.model import MappedCamera
-from sfm_app.mapping import passes
-from sfm_app.mapping import passes as module
-from sfm_app.mapping.attempt import Attempt, NoModel, PairSupport, explained_pairs
-from sfm_app.mapping.passes import (
-    OPTIONS,
-    Mappers,
-    camera_per_photo_explains_more,
-    is_shared_camera_doubtful,
-    reconstruct,
-    two_cameras_suffice,
-    with_camera_per_photo,
-    with_two_cameras,
+from sfm_app.colmap.model import posed_photo_ids
+from sfm_app.errors import BackendError, ClusterError
+from sfm_app.mapping.attempt import Attempt, PairSupport
+from sfm_app.mapping.hypotheses import HYPOTHESES, OPTIONS, learned_intrinsics
+from sfm_app.mapping.passes import Mapper, Mappers, Outcome, Trial
+from sfm_app.posegraph.graph import LOOKS_ALIKE
+from sfm_app.settings import HypothesisName, Settings
+from sfm_app.types import Evidence, LookAlikes, MatchedImage, MatchGraph, PoseGraph, ViewGraph
+from tests.unit.mapping.fakes import (
+    EMPTY,
+    FOCAL,
+    TRUE,
+    focals_in,
+    geometries_in,
+    hypothesis,
+    trials_of,
+    with_camera,
+    without,
 )
-from sfm_app.settings import Settings
-from sfm_app.types import ViewGraph
 
 pytestmark = pytest.mark.slow
 
-FOCAL = 1280.0
-AUTO = Settings()
+GUESS = {"method": "guess", "identifiable": False}
+
+
+# The loop.
+
+
+def test_trials_tell_what_was_tried_and_what_it_gained(synthetic, run, cameras, mapped):
+    mapped(without(with_camera(synthetic.copy(), TRUE), [6]), with_camera(synthetic.copy(), TRUE))
+
+    found = mapped.outcome(cameras(**GUESS), run())
+
+    first, rival, learned = found.trials
+    assert (first.name, first.accepted, first.photos, first.notes) == ("first-pass", True, (0, 5), ("5 photos",))
+    assert (rival.name, rival.accepted, rival.photos, rival.notes) == ("colmap-defaults", False, (5, 0), ("no rival",))
+    assert rival.reason == "the pairs do not determine a camera"
+    assert (learned.name, learned.accepted, learned.photos) == ("learned-cameras", True, (5, 6))
+    assert learned.reason == "mapping has changed a focal length"
+    assert first.support[0] == 0.0 < first.support[1] == learned.support[0] < learned.support[1] == found.support
+    assert all(trial.failure == "" and 0.0 <= trial.seconds < 600.0 for trial in found.trials)
+
+
+def test_the_display_says_why_and_what_is_tried(synthetic, run, cameras, mapped):
+    mapped(without(with_camera(synthetic.copy(), TRUE), [6]), None)
+    lines, context = [], run()
+    context.progress = SimpleNamespace(say=lines.append)
+    mapped.outcome(cameras(), context)
+    assert lines[0] == "unregistered photos with matches: 1; trying COLMAP's default pipeline"
+
+
+def test_a_hypothesis_that_is_switched_off_is_not_tried(synthetic, run, cameras, mapped):
+    few = without(synthetic.copy(), [4, 5, 6])
+    seen = mapped(few)
+    asked = mapped.rival(with_camera(synthetic.copy(), TRUE))
+    off = ["colmap-defaults", "other-focals", "camera-per-photo", "learned-cameras"]
+    found = mapped.outcome(cameras(**GUESS), run(without=off))
+    assert len(seen) == 1 and asked == [] and found.main.model is few
+    assert trials_of(found) == [("first-pass", True, "3 photos")]
+
+
+@pytest.fixture
+def fails():
+    """Makes a hypothesis that maps nothing, and raises."""
+
+    def make(error):
+        def raise_error(*_):
+            raise error
+            yield
+
+        return replace(hypothesis("other-focals"), reason=lambda *_: "a doubt", outcomes=raise_error)
+
+    return make
+
+
+def test_a_hypothesis_that_fails_costs_nothing_and_is_named(synthetic, run, cameras, mapped, fails):
+    model = with_camera(synthetic.copy(), TRUE)
+    mapped(model)
+    found = mapped.outcome(cameras(), run(), hypotheses=[fails(BackendError("the disk is full"))])
+    assert found.main.model is model
+    trial = found.trials[-1]
+    assert (trial.name, trial.accepted, trial.photos, trial.notes) == ("other-focals", False, (6, 6), ())
+    assert trial.failure == trial.to_dict()["failure"] == "the disk is full"
+
+
+def test_a_hypothesis_whose_cluster_is_gone_is_not_skipped(synthetic, run, cameras, mapped, fails):
+    mapped(with_camera(synthetic.copy(), TRUE))
+    with pytest.raises(ClusterError, match="scheduler"):
+        mapped.outcome(cameras(), run(), hypotheses=[fails(ClusterError("the scheduler is gone"))])
+
+
+def test_every_hypothesis_can_be_switched_off():
+    assert tuple(one.name for one in HYPOTHESES) == get_args(HypothesisName)
+
+
+# False joins.
+
+
+def test_photos_are_mapped_again_without_a_false_join(synthetic, run, cameras, mapped):
+    true = with_camera(synthetic.copy(), TRUE)
+    seen = mapped(with_camera(synthetic.copy(), TRUE), true)
+    join = LookAlikes(((1, 4), (2, 4)), 0.9)
+    left = mapped.judge(([join], 20), ([], 0))
+
+    found = mapped.outcome(cameras(), run())
+
+    assert len(seen) == 2 and left == []
+    assert found.main.model is true
+    assert found.graph.look_alikes == (join,) and not found.graph.poses.keys() & set(join.pairs)
+    assert {found.graph.dropped[pair] for pair in join.pairs} == {LOOKS_ALIKE}
+    assert len(geometries_in(run().workspace.database)) == 13
+    assert found.evidence.matches.matches.keys() == synthetic.matches.matches.keys()
+    assert found.graph.doubtful == () and trials_of(found)[1:] == [("false-joins", True, "6 photos")]
+
+
+@pytest.mark.parametrize(("lost", "non_overlapping"), [([], 15), ([6], 0)])
+def test_a_false_join_without_a_better_rival_is_only_named(synthetic, run, cameras, mapped, lost, non_overlapping):
+    first = with_camera(synthetic.copy(), TRUE)
+    mapped(first, without(with_camera(synthetic.copy(), TRUE), lost))
+    join = LookAlikes(((1, 4), (2, 4)), 0.9)
+    mapped.judge(([join], 20), ([join], non_overlapping))
+    found = mapped.outcome(cameras(), run())
+    assert found.main.model is first
+    assert found.graph.look_alikes == () and found.graph.doubtful == (join,)
+    assert trials_of(found) == [("first-pass", True, "6 photos"), ("false-joins", False, f"{6 - len(lost)} photos")]
+    assert len(geometries_in(run().workspace.database)) == 15
+
+
+def test_false_joins_are_looked_for_a_few_times_only(synthetic, run, cameras, mapped):
+    models = [with_camera(synthetic.copy(), TRUE) for _ in range(4)]
+    mapped(*models)
+    joins = [LookAlikes((pair,), 0.9) for pair in ((1, 4), (2, 5), (3, 6), (1, 5))]
+    mapped.judge(*(([join], count) for join, count in zip(joins, (80, 40, 20, 10), strict=True)))
+    found = mapped.outcome(cameras(), run())
+    assert found.main.model is models[3]
+    assert set(found.graph.look_alikes) == set(joins[:3])
+    assert found.graph.doubtful == (joins[3],)
+
+
+def test_a_later_hypothesis_leaves_out_the_look_alikes_of_earlier_ones(synthetic, run, cameras, mapped):
+    last = with_camera(synthetic.copy(), TRUE)
+    mapped(*(without(with_camera(synthetic.copy(), TRUE), [6]) for _ in range(2)), last)
+    join, other = LookAlikes(((1, 4), (2, 4)), 0.9), LookAlikes(((3, 5),), 0.8)
+    mapped.judge(([join], 20), ([], 0), ([other], 12))
+
+    found = mapped.outcome(cameras(), run())
+
+    assert found.main.model is last and found.trials[-1].name == "learned-cameras"
+    assert found.graph.look_alikes == (join,) and not found.graph.poses.keys() & set(join.pairs)
+    assert len(geometries_in(run().workspace.database)) == 13
+    assert found.graph.doubtful == (other,)  # the last model is judged, too
+
+
+# A rival.
+
+
+def test_a_rival_that_explains_more_goes_on(synthetic, run, cameras, mapped):
+    mapped(without(with_camera(synthetic.copy(), TRUE), [6]), None)
+    asked = mapped.rival(with_camera(synthetic.copy(), TRUE))
+    found = mapped.outcome(cameras(), run())
+    assert len(asked) == 1 and found.trials[1].reason == "unregistered photos with matches: 1"
+    assert (found.main.mapper, found.photos) == ("colmap", 6)
+    assert trials_of(found)[1] == ("colmap-defaults", True, "the rival")
+    assert found.reason.startswith("it registers all 6 photos")
+
+
+def test_later_steps_know_the_pairs_of_a_rival_that_goes_on(synthetic, run, cameras, mapped):
+    """Its photos need not be in our pose graph: tracks could not be completed, and COLMAP raised."""
+    views = replace(synthetic.views, fits={pair: fit for pair, fit in synthetic.views.fits.items() if 6 not in pair})
+    mapped(without(with_camera(synthetic.copy(), TRUE), [5, 6]), None)
+    mapped.rival(with_camera(synthetic.copy(), TRUE))
+    made = run()
+    found = mapped.outcome(cameras(), made, views=views)
+    assert found.photos == 6 and {(k, 6) for k in range(1, 6)} <= found.graph.poses.keys()
+    assert len(geometries_in(made.workspace.database)) == 15
+    assert posed_photo_ids(adjust(found.main.model, made.workspace.database).model) == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_rival_that_explains_less_is_named_and_left(synthetic, run, cameras, mapped):
+    mapped(with_camera(synthetic.copy(), TRUE), None)
+    asked = mapped.rival(without(with_camera(synthetic.copy(), TRUE), [5, 6]))
+    found = mapped.outcome(cameras(**GUESS), run())
+    assert len(asked) == 1 and found.trials[1].reason == "the pairs do not determine a camera"
+    assert (found.main.mapper, found.photos) == ("incremental", 6)
+    assert trials_of(found)[1] == ("colmap-defaults", False, "the rival") and found.trials[1].photos == (6, 4)
+
+
+def test_a_rival_of_other_photos_does_not_win_by_our_own_model(synthetic, run, cameras, mapped):
+    first = without(with_camera(synthetic.copy(), TRUE), [5, 6])
+    mapped(first, None)
+    mapped.rival(without(with_camera(synthetic.copy(), TRUE), [1, 2, 3, 4]))
+    found = mapped.outcome(cameras(), run())
+    assert found.models[0].model is first and len(found.models) == 1
+    assert trials_of(found)[1] == ("colmap-defaults", False, "the rival")
+
+
+def test_good_evidence_needs_no_rival(synthetic, run, cameras, mapped):
+    mapped(with_camera(synthetic.copy(), TRUE))
+    asked = mapped.rival(synthetic.copy())
+    found = mapped.outcome(cameras(), run())
+    assert asked == [] and trials_of(found) == [("first-pass", True, "6 photos")] and found.photos == 6
+
+
+def test_a_rival_that_fails_costs_nothing(synthetic, run, cameras, mapped):
+    mapped(with_camera(synthetic.copy(), TRUE), None)
+    mapped.mappers = replace(mapped.mappers, map_rival=Mappers().map_rival)
+
+    found = mapped.outcome(cameras(**GUESS), run())  # COLMAP finds no folder of photos
+
+    assert found.photos == 6 and (found.trials[1].name, found.trials[1].accepted) == ("colmap-defaults", False)
+    assert found.trials[1].notes[0].startswith("COLMAP's default pipeline: failed")
+
+
+# Other focals.
+
+
+def test_where_a_guess_leaves_many_photos_out_other_focals_are_tried(synthetic, run, cameras, mapped):
+    few = without(synthetic.copy(), [4, 5, 6])
+    seen = mapped(few, few, with_camera(synthetic.copy(), TRUE), None, None)
+    found = mapped.outcome(cameras(**GUESS), run())
+    focals = [intrinsics.main.focal_px / 1024 for _, intrinsics in seen]
+    assert focals[1:4] == pytest.approx([0.6, 2.4, 4.8])
+    assert focals[4:] == pytest.approx([FOCAL / 1024])  # what the best of them has found is gone on with
+    assert found.photos == 6
+    assert trials_of(found)[2:5] == [
+        ("other-focals", False, "3 photos"), ("other-focals", True, "6 photos"), ("other-focals", False, "nothing"),
+    ]  # fmt: skip
+
+
+def test_no_other_focals_are_tried_where_one_is_known(synthetic, run, cameras, mapped):
+    seen = mapped(without(synthetic.copy(), [4, 5, 6]), None)
+    mapped.outcome(cameras(), run())
+    assert all(intrinsics.main.focal_px == pytest.approx(FOCAL, rel=0.01) for _, intrinsics in seen)
+
+
+def test_without_a_model_there_is_nothing_to_learn(synthetic, run, cameras, mapped):
+    seen = mapped(None, None, None, None)
+    found = mapped.outcome(cameras(**GUESS), run())
+    assert found.models == () and found.support == 0.0
+    assert trials_of(found)[:2] == [("first-pass", True, "nothing"), ("colmap-defaults", False, "no rival")]
+    assert len(seen) == 4 and len(found.trials) == 5  # the usual guess, and three others
+
+
+# A camera per photo.
 
 
 def attempt(model, contradicted, matches=100, inliers=100):
     return Attempt("incremental", model, {(1, 2): PairSupport(matches, inliers, contradicted)}, "")
 
 
+class FakeModel:
+    """A model of photos 1, 2, ... with these focals."""
+
+    def __init__(self, *focals):
+        self.cameras = {
+            k: pycolmap.Camera(model="SIMPLE_RADIAL", width=1024, height=768, params=[focal, 512.0, 384.0, 0.0])
+            for k, focal in enumerate(focals, start=1)
+        }
+        self.images = {k: SimpleNamespace(image_id=k, camera_id=k, has_pose=True) for k in self.cameras}
+
+    def num_reg_images(self):
+        return len(self.images)
+
+
 def photos(number):
-    return SimpleNamespace(num_reg_images=lambda: number)
+    return FakeModel(*[FOCAL] * number)
 
 
-def views(number):
+def best_of(*attempts, number=0, views=None, intrinsics=None):
+    images = {k: MatchedImage(k, f"{k}.jpg", "one", 1024, 768) for k in range(1, number + 1)}
+    evidence = Evidence(MatchGraph(images, {}, {}), views or ViewGraph({}, {}), intrinsics)
+    return Outcome(attempts, EMPTY, evidence, intrinsics, None)
+
+
+def chain(number):
     fit = SimpleNamespace(degeneracy="")
     return ViewGraph({(k, k + 1): fit for k in range(1, number)}, {})
 
 
+PER_PHOTO, TWO = hypothesis("camera-per-photo"), hypothesis("two-cameras")
+
+
+def is_asked(best, **settings):
+    return bool(PER_PHOTO.reason(best, Mapper(SimpleNamespace(settings=Settings.from_mapping(settings)))))
+
+
 @pytest.mark.parametrize(
-    ("placed", "number", "contradicted", "settings", "asked"),
+    ("placed", "number", "contradicted", "asked"),
     [
-        (6, 6, 2, AUTO, True),
-        (6, 6, 1, AUTO, False),
-        (4, 6, 0, AUTO, True),
-        (5, 6, 0, AUTO, False),
-        (OPTIONS.min_photos - 1, OPTIONS.min_photos - 1, 2, AUTO, False),
-        (101, 101, 2, AUTO, False),
-        (6, 6, 2, Settings.from_mapping({"photos": {"cameras": "single"}}), False),
+        (6, 6, 2, True),
+        (6, 6, 1, False),
+        (4, 6, 0, True),
+        (5, 6, 0, False),
+        (OPTIONS.min_photos - 1, OPTIONS.min_photos - 1, 2, False),
+        (101, 101, 2, False),
     ],
 )
 def test_it_is_asked_where_one_camera_does_not_explain_photos_that_nobody_grouped(
-    cameras, placed, number, contradicted, settings, asked
+    cameras, placed, number, contradicted, asked
 ):
-    guess = cameras(method="guess", identifiable=False)
-    assert is_shared_camera_doubtful(attempt(photos(placed), contradicted), guess, views(number), settings) is asked
+    best = best_of(
+        attempt(photos(placed), contradicted), number=number, views=chain(number), intrinsics=cameras(**GUESS)
+    )
+    assert is_asked(best) is asked
+    assert not is_asked(best, photos={"cameras": "single"})
 
 
 def test_it_is_asked_of_photos_of_a_plane_whose_pairs_are_all_degenerate(cameras):
-    none = ViewGraph({}, {})
-    guess = cameras(method="guess", identifiable=False)
-    assert is_shared_camera_doubtful(attempt(photos(6), 2), guess, none, AUTO)
-    assert not is_shared_camera_doubtful(attempt(photos(OPTIONS.min_photos - 1), 2), guess, none, AUTO)
+    few = OPTIONS.min_photos - 1
+    guess = cameras(**GUESS)
+    assert is_asked(best_of(attempt(photos(6), 2), number=6, intrinsics=guess))
+    assert not is_asked(best_of(attempt(photos(few), 2), number=few, intrinsics=guess))
 
 
 def test_without_a_model_it_is_not_asked(cameras):
-    assert not is_shared_camera_doubtful(None, cameras(), views(6), AUTO)
+    assert not is_asked(best_of(number=6, views=chain(6), intrinsics=cameras(**GUESS)))
 
 
-def test_every_photo_gets_a_guess_of_its_own_that_begins_where_mapping_ended(synthetic, cameras):
-    model = synthetic.copy()
-    model.cameras[1].params = [1111.0, 512.0, 384.0, 0.01]
+def test_a_camera_that_pairs_determine_is_not_divided(cameras):
+    assert not is_asked(best_of(attempt(photos(6), 2), number=6, views=chain(6), intrinsics=cameras()))
 
-    found = with_camera_per_photo(
-        attempt(model, 2), cameras(700.0, identifiable=False, method="guess"), synthetic.matches
-    )
 
+def test_every_photo_gets_a_guess_of_its_own_that_begins_where_mapping_ended(synthetic, run, cameras, mapped):
+    model = with_camera(synthetic.copy(), [1111.0, 512.0, 384.0, 0.01])
+    seen = mapped(None)
+
+    mapped.improve(mapped.best(cameras(700.0, **GUESS), run(), attempt(model, 2)), PER_PHOTO)
+
+    ((_, found),) = seen
     images = sorted(synthetic.matches.images.values(), key=lambda image: image.name)
     assert [found.camera_name(image) for image in images] == ["one", *(f"one #{k}" for k in range(2, 7))]
     assert sorted(found.cameras) == sorted(found.camera_of.values())
@@ -89,87 +346,44 @@ def test_every_photo_gets_a_guess_of_its_own_that_begins_where_mapping_ended(syn
     )
 
 
-def test_a_camera_that_pairs_determine_is_not_divided(synthetic, cameras):
-    assert with_camera_per_photo(attempt(synthetic.copy(), 2), cameras(), synthetic.matches) is None
-
-
 @pytest.mark.parametrize(
     ("own", "better"),
     [
-        (attempt(photos(6), 5, 110), True),
-        (attempt(photos(6), 6, 110), False),
-        (attempt(photos(6), 5, 100), False),
-        (attempt(photos(5), 5, 110), False),
-        (attempt(photos(7), 10, 110), True),
-        (None, False),
+        ([attempt(photos(6), 5, 110)], True),
+        ([attempt(photos(6), 6, 110)], False),
+        ([attempt(photos(6), 5, 100)], False),
+        ([attempt(photos(5), 5, 110)], False),
+        ([attempt(photos(7), 10, 110)], True),
+        ([], False),
     ],
 )
 def test_it_is_taken_where_it_explains_more_and_contradictions_go(own, better):
-    assert camera_per_photo_explains_more(own, attempt(photos(6), 10)) is better
-
-
-def each_of(synthetic, cameras, focals):
-    """A model whose photos have these focals, and its cameras."""
-    model = synthetic.copy()
-    each = with_camera_per_photo(attempt(model, 2), cameras(method="guess", identifiable=False), synthetic.matches)
-    found = {photo: MappedCamera(camera_matrix(focal, focal, 512, 384)) for photo, focal in enumerate(focals, start=1)}
-    return attempt(model, 0), each, found
-
-
-def test_photos_of_two_focals_get_two_cameras(synthetic, cameras, monkeypatch):
-    model, each, found = each_of(synthetic, cameras, [1000.0, 1300.0, 1010.0, 1310.0, 990.0, 1290.0])
-    monkeypatch.setattr(passes, "cameras_by_photo", lambda _: found)
-    two = with_two_cameras(model, each, synthetic.matches)
-    names = {photo: two.camera_name(synthetic.matches.images[photo]) for photo in range(1, 7)}
-    assert len(two.cameras) == 2 and names[1] == names[3] == names[5] != names[2] == names[4] == names[6]
-    assert [two.cameras[names[photo]].focal_px for photo in (1, 2)] == pytest.approx([1000.0, 1300.0])
-    assert all(camera.identifiable and camera.method == "mapping" for camera in two.cameras.values())
-
-
-def test_a_single_photo_of_another_focal_is_no_second_camera(synthetic, cameras, monkeypatch):
-    model, each, found = each_of(synthetic, cameras, [1000.0, 1005.0, 1010.0, 1310.0, 990.0, 1001.0])
-    monkeypatch.setattr(passes, "cameras_by_photo", lambda _: found)
-    assert with_two_cameras(model, each, synthetic.matches) is None
-
-
-@pytest.mark.parametrize(
-    ("two", "as_good"),
-    [
-        (attempt(photos(6), 0, 1000, 1000), True),
-        (attempt(photos(6), 2, 1000, 1000), True),
-        (attempt(photos(6), 3, 1000, 1000), False),
-        (attempt(photos(6), 0, 800, 1000), False),
-        (attempt(photos(5), 0, 1000, 1000), False),
-        (None, False),
-    ],
-)
-def test_two_cameras_are_taken_where_they_explain_as_much(two, as_good):
-    assert two_cameras_suffice(two, attempt(photos(6), 0, 1000, 1000)) is as_good
+    assert PER_PHOTO.is_better(best_of(*own), best_of(attempt(photos(6), 10)), None) is better
 
 
 @pytest.fixture
-def zoom(monkeypatch, synthetic):
+def zoom(synthetic, mapped):
     """Mapping, where one camera for all photos leaves matches that a camera for each explains, or does not."""
 
     def make(*, right):
         asked = []
 
         def attempts(group, run):
-            names = {group.intrinsics.camera_name(image) for image in group.matches.images.values()}
+            names = {group.evidence.camera_name(photo) for photo in group.evidence.matches.images}
             asked.append(len(names))
-            model = synthetic.copy()
-            explained = explained_pairs(model, synthetic.matches, synthetic.views, 1.5)
+            found = mapped.attempt(synthetic.copy())
             if (len(names) > 1) is not right:
-                explained = {
-                    pair: replace(found, matches=found.matches - 10, contradicted=10)
-                    for pair, found in explained.items()
-                }
-            return [Attempt("incremental", model, explained, f"{len(names)} cameras")]
+                found = replace(
+                    found,
+                    explained={
+                        pair: replace(one, matches=one.matches - 10, contradicted=10)
+                        for pair, one in found.explained.items()
+                    },
+                )
+            return [replace(found, note=f"{len(names)} cameras")]
 
-        mappers = Mappers(map_group=attempts, map_baseline=lambda *_: NoModel("colmap", "no rival"))
-        monkeypatch.setattr(module, "with_two_cameras", lambda *_: None)
-        monkeypatch.setattr(module, "OPTIONS", replace(module.OPTIONS, max_passes=1))
-        return asked, mappers
+        mapped.mappers = replace(mapped.mappers, map_group=attempts)
+        return asked
 
     return make
 
@@ -179,18 +393,187 @@ def cameras_in(path):
         return len(database.read_all_cameras())
 
 
-def test_photos_of_a_zoom_are_mapped_with_a_camera_each(synthetic, run, cameras, zoom):
-    asked, mappers = zoom(right=True)
-    found = reconstruct(synthetic.matches, synthetic.views, cameras(method="guess", identifiable=False), run(), mappers)
+def test_photos_of_a_zoom_are_mapped_with_a_camera_each(run, cameras, mapped, zoom):
+    asked = zoom(right=True)
+    found = mapped.outcome(cameras(**GUESS), run(), hypotheses=[PER_PHOTO])
     assert asked == [1, 6]
-    assert len(found.intrinsics.cameras) == 6 and cameras_in(run().workspace.database) == 6
-    assert found.tried[-2:] == ("6 cameras (a camera for each photo)", "no rival (a camera for each photo)")
+    assert len(found.evidence.intrinsics.cameras) == 6 and cameras_in(run().workspace.database) == 6
+    assert trials_of(found)[1:] == [("camera-per-photo", True, "6 cameras", "no rival")]
+    assert found.trials[1].reason == "a shared camera does not fit"
 
 
-def test_photos_of_one_camera_keep_it_and_so_does_the_database(synthetic, run, cameras, zoom, monkeypatch):
-    monkeypatch.setattr(module, "is_shared_camera_doubtful", lambda *_: True)
-    asked, mappers = zoom(right=False)
-    guess = cameras(method="guess", identifiable=False)
-    found = reconstruct(synthetic.matches, synthetic.views, guess, run(), mappers)
-    assert asked == [1, 6]
-    assert found.intrinsics is guess and cameras_in(run().workspace.database) == 1
+def test_photos_of_one_camera_keep_it_and_so_does_the_database(run, cameras, mapped, zoom):
+    asked, guess = zoom(right=False), cameras(**GUESS)
+    found = mapped.outcome(guess, run(), hypotheses=[replace(PER_PHOTO, reason=lambda *_: "a doubt")])
+    assert asked == [1, 6] and trials_of(found)[1][:2] == ("camera-per-photo", False)
+    assert found.evidence.intrinsics is guess and cameras_in(run().workspace.database) == 1
+
+
+# Two cameras.
+
+
+@pytest.fixture
+def after_camera_per_photo(synthetic, run, cameras, mapped):
+    """Makes an outcome with a camera per photo, whose photos have these focals."""
+
+    def make(focals, *, accepted=True):
+        each = mapped(None)
+        shared = mapped.best(cameras(**GUESS), run(), attempt(synthetic.copy(), 2))
+        mapped.improve(shared, PER_PHOTO)
+        trial = Trial(PER_PHOTO.name, "a doubt", accepted, (6, 6), (1.0, 2.0), 0.0)
+        return mapped.best(each[0][1], shared.run, attempt(FakeModel(*focals), 0), trials=(trial,))
+
+    return make
+
+
+def test_photos_of_two_focals_get_two_cameras(synthetic, mapped, after_camera_per_photo):
+    best = after_camera_per_photo([1000.0, 1300.0, 1010.0, 1310.0, 990.0, 1290.0])
+    seen = mapped(None)
+    mapped.improve(best, TWO)
+    ((_, two),) = seen
+    names = {photo: two.camera_name(synthetic.matches.images[photo]) for photo in range(1, 7)}
+    assert len(two.cameras) == 2 and names[1] == names[3] == names[5] != names[2] == names[4] == names[6]
+    assert [two.cameras[names[photo]].focal_px for photo in (1, 2)] == pytest.approx([1000.0, 1300.0])
+    assert all(camera.identifiable and camera.method == "mapping" for camera in two.cameras.values())
+
+
+def test_a_single_photo_of_another_focal_is_no_second_camera(after_camera_per_photo):
+    assert TWO.reason(after_camera_per_photo([1000.0, 1005.0, 1010.0, 1310.0, 990.0, 1001.0]), None) == ""
+
+
+def test_two_cameras_are_tried_only_where_a_camera_per_photo_is_better(after_camera_per_photo):
+    focals = [1000.0, 1300.0, 1010.0, 1310.0, 990.0, 1290.0]
+    assert TWO.reason(after_camera_per_photo(focals), None)
+    assert TWO.reason(after_camera_per_photo(focals, accepted=False), None) == ""
+
+
+@pytest.mark.parametrize(
+    ("two", "as_good"),
+    [
+        ([attempt(photos(6), 0, 1000, 1000)], True),
+        ([attempt(photos(6), 2, 1000, 1000)], True),
+        ([attempt(photos(6), 3, 1000, 1000)], False),
+        ([attempt(photos(6), 0, 800, 1000)], False),
+        ([attempt(photos(5), 0, 1000, 1000)], False),
+        ([], False),
+    ],
+)
+def test_two_cameras_are_taken_where_they_explain_as_much(two, as_good):
+    assert TWO.is_better(best_of(*two), best_of(attempt(photos(6), 0, 1000, 1000)), None) is as_good
+
+
+# The cameras of the model.
+
+
+def test_a_camera_that_was_known_and_stayed_is_not_looked_at_twice(synthetic, run, cameras, mapped):
+    seen = mapped(with_camera(synthetic.copy(), [FOCAL * 1.009, 512.0, 384.0, 0.01]))
+    found = mapped.outcome(cameras(), run())
+    assert len(seen) == 1 and trials_of(found) == [("first-pass", True, "6 photos")]
+
+
+@pytest.mark.parametrize("camera", [GUESS, {"focal": FOCAL * 1.011}, {"focal": FOCAL / 1.011}])
+def test_a_camera_that_was_a_guess_or_moved_is_mapped_with_again(synthetic, run, cameras, mapped, camera):
+    seen = mapped(without(with_camera(synthetic.copy(), TRUE), [6]), with_camera(synthetic.copy(), TRUE))
+    known = cameras(**camera)
+    found = mapped.outcome(known, run())
+    assert trials_of(found)[-1] == ("learned-cameras", True, "6 photos") and found.photos == 6
+    assert len(seen) == 2
+    learned = seen[1][1].main
+    assert (learned.focal_px, learned.identifiable, learned.method) == (FOCAL, True, "mapping")
+    assert found.evidence.intrinsics is seen[1][1] and found.calibrated is known
+    assert focals_in(run().workspace.database) == [FOCAL]
+    assert {pose.kind for pose in found.graph.poses.values()} == {"calibrated"}
+
+
+def test_cameras_are_learned_a_few_times_only(synthetic, run, cameras, mapped):
+    counts = [[4, 5, 6], [5, 6], [6], [], []]
+    focals = [FOCAL * 1.05**k for k in range(5)]
+    models = [
+        without(with_camera(synthetic.copy(), [focal, *TRUE[1:]]), lost)
+        for focal, lost in zip(focals, counts, strict=True)
+    ]
+    seen = mapped(*models)
+    found = mapped.outcome(cameras(), run(without=["colmap-defaults"]))
+    assert len(seen) == 1 + OPTIONS.max_passes and found.main.model is models[3]
+
+
+def test_a_second_pass_that_explains_less_is_thrown_away_with_all_that_it_wrote(synthetic, run, cameras, mapped):
+    guess = cameras(FOCAL * 1.1, **GUESS)
+    place = run().workspace
+    mapped(without(synthetic.copy(), [4, 5, 6]))
+    Mapper(run(), mapped.mappers).map(mapped.evidence(guess))
+    first = geometries_in(place.database)
+
+    seen = mapped(with_camera(synthetic.copy(), TRUE), without(with_camera(synthetic.copy(), TRUE), [5, 6]))
+    found = mapped.outcome(guess, run())
+
+    assert len(seen) == 2
+    assert trials_of(found)[-1] == ("learned-cameras", False, "4 photos")
+    assert found.photos == 6 and found.evidence.intrinsics is guess
+    assert focals_in(place.database) == [pytest.approx(FOCAL * 1.1)]
+    assert geometries_in(place.database) == first
+    assert {pose.kind for pose in found.graph.poses.values()} == {"uncalibrated"}
+
+
+def test_a_second_pass_that_finds_nothing_leaves_the_first(synthetic, run, cameras, mapped):
+    mapped(with_camera(synthetic.copy(), TRUE), None)
+    found = mapped.outcome(cameras(**GUESS), run())
+    assert found.photos == 6 and trials_of(found)[-1] == ("learned-cameras", False, "nothing")
+
+
+@pytest.fixture
+def mapped_as(synthetic):
+    """Makes the outcome of a pass with these cameras that found a model."""
+
+    def make(model, intrinsics, photos=6):
+        graph = PoseGraph({}, {}, (tuple(range(1, photos + 1)),))
+        models = (Attempt("global", model, {}, ""),)
+        return Outcome(models, graph, synthetic.evidence(intrinsics), intrinsics, None)
+
+    return make
+
+
+def worth(outcome):
+    return bool(hypothesis("learned-cameras").reason(outcome, None))
+
+
+def test_two_photos_teach_no_camera(synthetic, cameras, mapped_as):
+    guess = cameras(**GUESS)
+    assert not worth(mapped_as(without(synthetic.copy(), [3, 4, 5, 6]), guess))
+    assert worth(mapped_as(without(synthetic.copy(), [4, 5, 6]), guess))
+
+
+def test_photos_of_the_main_group_that_stayed_out_are_worth_another_pass(synthetic, cameras, mapped_as):
+    known = cameras(FOCAL)
+    assert not worth(mapped_as(with_camera(synthetic.copy(), TRUE), known))
+    assert worth(mapped_as(without(with_camera(synthetic.copy(), TRUE), [6]), known))
+    assert not worth(mapped_as(without(with_camera(synthetic.copy(), TRUE), [6]), known, photos=5))
+
+
+def test_what_is_learned_is_focal_center_and_lens(synthetic, cameras, mapped_as):
+    guess = cameras(FOCAL * 1.2, reason="an orbit", held=("center",), **GUESS)
+    model = with_camera(synthetic.copy(), [1300.0, 500.0, 390.0, -0.07])
+    found = learned_intrinsics(mapped_as(model, guess)).main
+    assert found.K.tolist() == [[1300.0, 0, 500.0], [0, 1300.0, 390.0], [0, 0, 1]]
+    assert (found.radial, found.reason, found.held) == (-0.07, "", ("center",))
+
+
+def test_of_given_cameras_nothing_is_learned_where_they_are_kept_and_all_terms_stay(synthetic, cameras, mapped_as):
+    terms = (-0.07, 0.02, 0.001, -0.002, 0.0, 0.0, 0.0, 0.0)
+    kept = cameras(FOCAL * 1.1, method="kept")
+    given = cameras(FOCAL * 1.1, method="given", radial=-0.07, distortion=terms)
+    model = with_camera(synthetic.copy(), [1300.0, 500.0, 390.0, -0.01])
+    assert learned_intrinsics(mapped_as(model, kept)).main is kept.main
+    found = learned_intrinsics(mapped_as(model, given)).main
+    assert (found.K[0, 0], found.distortion, found.radial) == (1300.0, terms, -0.07)
+
+
+def test_a_camera_of_no_photo_in_the_model_stays_what_it_was(synthetic, cameras, mapped_as):
+    two = cameras(900.0, **GUESS).main
+    intrinsics = replace(
+        cameras(FOCAL * 1.1), cameras={**cameras(FOCAL * 1.1).cameras, "two": two},
+        camera_of={synthetic.matches.images[6].name: "two"},
+    )  # fmt: skip
+    found = learned_intrinsics(mapped_as(without(with_camera(synthetic.copy(), TRUE), [6]), intrinsics))
+    assert found.cameras["two"] is two
+    assert found.cameras["one"].focal_px == FOCAL

@@ -10,17 +10,17 @@ from sfm_app.mapping.attempt import Attempt, PairSupport
 from sfm_app.mapping.look_alikes import (
     OVERLAPS,
     ExpectedOverlap,
-    drop_look_alikes,
     find_expected_overlaps,
     find_false_joins,
     find_non_overlapping,
+    joined_pairs,
     judge_places,
     jumps,
     look_alike_entries,
     sides,
     with_earlier_look_alikes,
 )
-from sfm_app.types import EpipolarFit, LookAlikes, MatchedImage, MatchGraph, PoseGraph, ViewGraph
+from sfm_app.types import EpipolarFit, Evidence, Intrinsics, LookAlikes, MatchedImage, MatchGraph, PoseGraph, ViewGraph
 
 COUNTS = {(1, 2): 90, (1, 11): 80, (2, 12): 70, (2, 11): 20, (11, 12): 90}
 JOIN = LookAlikes(((1, 11), (2, 11), (2, 12)), 0.3456)
@@ -43,9 +43,10 @@ def graph(*joins, dropped=None):
 def test_matches_of_look_alikes_do_not_speak(matches):
     fit = EpipolarFit(np.eye(3), np.ones(1, bool), np.ones(1), 1, 0.1)
     views = ViewGraph({(1, 2): fit, (1, 11): fit}, {})
-    kept, seen = drop_look_alikes(matches, views, graph(JOIN))
-    assert set(kept.matches) == {(1, 2), (11, 12)} and set(seen.fits) == {(1, 2)}
-    assert drop_look_alikes(matches, views, graph()) == (matches, views)
+    evidence = Evidence(matches, views, Intrinsics({}))
+    kept = evidence.without(joined_pairs(graph(JOIN).look_alikes))
+    assert set(kept.matches.matches) == {(1, 2), (11, 12)} and set(kept.views.fits) == {(1, 2)}
+    assert evidence.without(joined_pairs(graph().look_alikes)) is evidence
 
 
 def test_a_second_pass_knows_what_the_first_told_apart():

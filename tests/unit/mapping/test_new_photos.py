@@ -9,10 +9,11 @@ import pytest
 from sfm_app.colmap.database import write_match_graph
 from sfm_app.colmap.model import posed_photo_ids, submodel
 from sfm_app.mapping.attempt import Attempt, explained_pairs, model_poses
-from sfm_app.mapping.incremental import Steps, map_new_photos
-from sfm_app.mapping.passes import Outcome
+from sfm_app.mapping.new_photos import Steps, map_new_photos
+from sfm_app.mapping.passes import Outcome, Trial
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
-from sfm_app.types import LookAlikes, PoseGraph, RelativePose
+from sfm_app.types import LookAlikes, RelativePose
+from tests.unit.mapping.fakes import EMPTY, trials_of
 
 pytestmark = pytest.mark.slow
 
@@ -28,27 +29,28 @@ def grow(synthetic, cameras, run, tmp_path):
         model.write(place.sparse)
         write_match_graph(place.database, synthetic.matches)
         names = frozenset(synthetic.matches.images[photo].name for photo in known)
-        figures, context = {}, run(min_points=10)
+        figures, context = {}, run(min_points=10, without=["finer-features"])
         context.record = lambda **more: figures.update(more)
         found = cameras()
 
-        def reconstruct(matches, views, intrinsics, _):
-            if not whole:
-                return Outcome((), PoseGraph({}, {}, ()), intrinsics, ("nothing",))
-            explained = explained_pairs(whole, matches, views, 1.5)
-            attempt = Attempt("incremental", whole, explained, "all again")
-            return Outcome((attempt,), PoseGraph({}, {}, ()), intrinsics, ("all again",))
+        def reconstruct(evidence, run, *, hypotheses):
+            models = ()
+            if whole:
+                explained = explained_pairs(whole, evidence.matches, evidence.views, 1.5)
+                models = (Attempt("incremental", whole, explained, "all again"),)
+            trial = Trial("first-pass", "", True, (0, 6), (0.0, 9.0), 1.0, ("all again",))
+            return Outcome(models, EMPTY, evidence, evidence.intrinsics, run, trials=(trial,))
 
         earlier = SimpleNamespace(place=place, known=names)
         fakes = Steps(lambda *_: found, reconstruct, **steps)
-        return map_new_photos(synthetic.matches, synthetic.views, found, context, earlier, fakes), figures
+        return map_new_photos(synthetic.evidence(found), context, earlier, fakes), figures
 
     return make
 
 
 def test_new_photos_join_the_model_and_nothing_is_mapped_again(grow, synthetic):
     found, figures = grow(submodel(synthetic.model, [1, 2, 3, 4]), (1, 2, 3, 4))
-    main = found.outcome.models[0]
+    main = found.models[0]
     assert posed_photo_ids(main.model) == [1, 2, 3, 4, 5, 6]
     assert main.mapper == "grown" and figures["mapped_again_because"] == "" and figures["grown_from"] == 4
     assert sum(pair.matches for pair in main.explained.values()) > 0.95 * 15 * 100
@@ -61,7 +63,7 @@ def test_new_photos_join_the_model_and_nothing_is_mapped_again(grow, synthetic):
 def test_photos_that_left_leave_the_model(grow, synthetic):
     found, figures = grow(synthetic.copy(), (1, 2, 3, 4, 5))
     assert figures["mapped_again_because"] == ""
-    assert len(posed_photo_ids(found.outcome.models[0].model)) == 6  # the sixth was replaced, and is placed anew
+    assert len(posed_photo_ids(found.models[0].model)) == 6  # the sixth was replaced, and is placed anew
 
 
 def test_a_known_photo_whose_pairs_were_dropped_leaves_and_keeps_no_other_from_its_place(grow, synthetic):
@@ -79,8 +81,8 @@ def test_a_known_photo_whose_pairs_were_dropped_leaves_and_keeps_no_other_from_i
         build_pose_graph=without_the_first,
     )
 
-    assert posed_photo_ids(found.outcome.models[0].model) == [2, 3, 4, 5, 6]
-    assert found.outcome.reason == "3 photos were known, and 2 of 2 others were registered"
+    assert posed_photo_ids(found.models[0].model) == [2, 3, 4, 5, 6]
+    assert found.reason == "3 photos were known, and 2 of 2 others were registered"
 
 
 def test_a_wrong_earlier_model_is_mapped_again(grow, synthetic):
@@ -91,13 +93,13 @@ def test_a_wrong_earlier_model_is_mapped_again(grow, synthetic):
         frames[0].rig_from_world, frames[1].rig_from_world = poses[1], poses[0]
     found, figures = grow(wrong, (1, 2, 3, 4), whole=synthetic.copy())
     assert figures["mapped_again_because"]
-    assert found.outcome.models[0].note == "all again"
+    assert found.models[0].note == "all again"
 
 
 def test_a_model_of_few_of_the_photos_is_no_start(grow, synthetic):
     found, figures = grow(submodel(synthetic.model, [1, 2]), (1, 2), whole=synthetic.copy())
     assert "only 2 of 6 photos" in figures["mapped_again_because"]
-    assert found.outcome.models[0].photos == 6
+    assert found.models[0].photos == 6
 
 
 def test_the_grown_model_stays_where_all_again_explains_less(grow, synthetic):
@@ -108,8 +110,8 @@ def test_the_grown_model_stays_where_all_again_explains_less(grow, synthetic):
         rival_reason=lambda *_: "a doubt",
     )
     assert figures["mapped_again_because"] == "a doubt"
-    assert found.outcome.models[0].mapper == "grown" and found.outcome.models[0].photos == 6
-    assert found.outcome.tried[0] == "all again"
+    assert found.models[0].mapper == "grown" and found.models[0].photos == 6
+    assert trials_of(found) == [("first-pass", True, "all again")]
 
 
 @pytest.mark.parametrize(("left", "mapper"), [((1, 2, 3), "incremental"), ((), "grown")])
@@ -121,7 +123,7 @@ def test_a_grown_model_with_two_places_in_one_stays_only_where_nothing_else_is_f
         judge_places=lambda _: ([LookAlikes(((1, 6),), 0.9)], 12),
     )
     assert figures["mapped_again_because"] == "two different places are merged in the model"
-    assert found.outcome.models[0].mapper == mapper
+    assert found.models[0].mapper == mapper
 
 
 def test_known_pairs_are_not_estimated_again(synthetic, cameras):
@@ -132,9 +134,7 @@ def test_known_pairs_are_not_estimated_again(synthetic, cameras):
         asked.append((label, list(items)))
         return [function(item) for item in items]
 
-    graph = build_pose_graph(
-        synthetic.matches, synthetic.views, cameras(), PoseGraphOptions(1.5, 16, 0), run_map, known
-    )
+    graph = build_pose_graph(synthetic.evidence(cameras()), PoseGraphOptions(1.5, 16, 0), run_map, known)
 
     assert len(known) == 6 and all(graph.poses[pair] is pose for pair, pose in known.items())
     assert [pair for pair, _ in asked[0][1]] == [pair for pair in synthetic.views.fits if pair not in known]
@@ -149,7 +149,7 @@ def test_a_known_pose_that_the_others_contradict_is_dropped(synthetic, cameras):
     assert isinstance(known[1, 2], RelativePose)
 
     graph = build_pose_graph(
-        synthetic.matches, synthetic.views, cameras(), PoseGraphOptions(1.5, 16, 0),
+        synthetic.evidence(cameras()), PoseGraphOptions(1.5, 16, 0),
         lambda function, items, _: [function(item) for item in items], known,
     )  # fmt: skip
 

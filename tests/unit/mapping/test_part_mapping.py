@@ -20,7 +20,7 @@ from sfm_app.mapping.part_mapping import (
 )
 from sfm_app.posegraph.rotations import connected_groups
 from sfm_app.settings import Settings
-from sfm_app.types import Calibration, Intrinsics, LookAlikes, PoseGraph, RelativePose
+from sfm_app.types import Calibration, Evidence, Intrinsics, LookAlikes, PoseGraph, RelativePose
 from tests.unit.mapping.conftest import K
 
 
@@ -107,16 +107,17 @@ def group_of(street):
     lens = Calibration(K, 1200, 900, "zero-curves", True, spread={"fx": 1.5}, key_pairs=((1, 2),))
     other = Calibration(K, 640, 480, "guess", False)
     intrinsics = Intrinsics({"one": lens, "two": other}, {"040.jpg": "two"})
-    return Group(tuple(matches.images), matches, views, PoseGraph(poses, {}, ()), intrinsics)
+    return Group(tuple(matches.images), Evidence(matches, views, intrinsics), PoseGraph(poses, {}, ()))
 
 
 def test_a_part_of_a_group_has_what_concerns_its_photos(street):
     group = group_of(street)
-    pairs, _ = pairs_of_parts(group.matches.matches, [(3, 4, 5), (5, 6)])
+    pairs, _ = pairs_of_parts(group.evidence.matches.matches, [(3, 4, 5), (5, 6)])
     part = part_of_group(group, (3, 4, 5), pairs)
-    assert list(part.matches.images) == list(part.matches.keypoints) == [3, 4, 5]
-    assert list(part.matches.matches) == list(part.views.fits) == list(part.graph.poses) == [(3, 4), (3, 5), (4, 5)]
-    assert part.graph.groups == ((3, 4, 5),) and list(part.intrinsics.cameras) == ["one"]
+    own = part.evidence
+    assert list(own.matches.images) == list(own.matches.keypoints) == [3, 4, 5]
+    assert list(own.matches.matches) == list(own.views.fits) == list(part.graph.poses) == [(3, 4), (3, 5), (4, 5)]
+    assert part.graph.groups == ((3, 4, 5),) and list(own.intrinsics.cameras) == ["one"]
 
 
 def test_pairs_belong_to_every_part_that_has_both_photos():
@@ -126,7 +127,7 @@ def test_pairs_belong_to_every_part_that_has_both_photos():
 
 def test_inputs_are_read_back_as_they_were(street, tmp_path):
     group = group_of(street)
-    (pairs,) = pairs_of_parts(group.matches.matches, [range(21, 41)])
+    (pairs,) = pairs_of_parts(group.evidence.matches.matches, [range(21, 41)])
     part = part_of_group(group, range(21, 41), pairs)
     settings = Settings.from_mapping({"seed": 7, "scene": {"part_photos": 33}})
 
@@ -137,21 +138,21 @@ def test_inputs_are_read_back_as_they_were(street, tmp_path):
         tmp_path / "b.npz", PartInputs(part, frozenset([(21, 23), (21, 22)]), settings, stop_at_false_joins=True)
     )
     again = read_inputs(tmp_path / "a.npz")
-    found = again.part
+    found, read_back, given = again.part, again.part.evidence, part.evidence
 
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     assert again.mapped == {(21, 22), (21, 23)} and again.settings == settings and again.stop_at_false_joins
-    assert found.photos == part.photos and found.matches.images == part.matches.images
-    assert list(found.matches.matches) == list(part.matches.matches)
-    assert all(np.array_equal(found.matches.matches[pair], rows) for pair, rows in part.matches.matches.items())
-    assert all(np.array_equal(found.matches.keypoints[photo], x) for photo, x in part.matches.keypoints.items())
-    assert all(np.array_equal(found.views.fits[pair].F, fit.F) for pair, fit in part.views.fits.items())
+    assert found.photos == part.photos and read_back.matches.images == given.matches.images
+    assert list(read_back.matches.matches) == list(given.matches.matches)
+    assert all(np.array_equal(read_back.matches.matches[pair], rows) for pair, rows in given.matches.matches.items())
+    assert all(np.array_equal(read_back.matches.keypoints[photo], x) for photo, x in given.matches.keypoints.items())
+    assert all(np.array_equal(read_back.views.fits[pair].F, fit.F) for pair, fit in given.views.fits.items())
     for pair, pose in part.graph.poses.items():
         read = found.graph.poses[pair]
         assert np.array_equal(read.R, pose.R) and np.array_equal(read.t, pose.t)
         assert np.array_equal(read.inliers, pose.inliers)
         assert (read.angle_deg, read.in_front, read.kind, read.guided) == (3.25, 0.9, "planar", sum(pair) % 2 == 0)
-    assert found.intrinsics.to_dict() == part.intrinsics.to_dict()
+    assert read_back.intrinsics.to_dict() == given.intrinsics.to_dict()
 
 
 def test_false_joins_travel_as_plain_values():

@@ -1,7 +1,6 @@
 """Mapping in parts from end to end, on a walk through a town; and what happens where parts fail."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,14 +14,13 @@ from sfm_app.mapping import parts
 from sfm_app.mapping.attempt import Attempt, Group, NoModel, PairSupport, best_attempt
 from sfm_app.mapping.part_mapping import FOLDER, PartResult, PartTask, map_part
 from sfm_app.mapping.parts import map_in_parts, part_size, parts_suffice
-from sfm_app.mapping.passes import Mappers, Passes
 from sfm_app.plugins import load_plugins
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import SceneSettings, Settings
-from sfm_app.types import Calibration, EpipolarFit, Intrinsics, LookAlikes
+from sfm_app.types import Calibration, EpipolarFit, Evidence, Intrinsics, LookAlikes
 
 PHOTOS, PART = 90, 30
 
@@ -37,10 +35,9 @@ def group(town):
     width, height = TownOptions().size
     camera = Calibration(town.K, width, height, "zero-curves", True, spread={"fx": 1.0})
     intrinsics = Intrinsics({"camera": camera})
-    graph = build_pose_graph(
-        town.matches, town.views, intrinsics, PoseGraphOptions(1.5, 16, 0), lambda f, items, _: list(map(f, items))
-    )
-    return Group(graph.groups[0], town.matches, town.views, graph, intrinsics)
+    evidence = Evidence(town.matches, town.views, intrinsics)
+    graph = build_pose_graph(evidence, PoseGraphOptions(1.5, 16, 0), lambda f, items, _: list(map(f, items)))
+    return Group(graph.groups[0], evidence, graph)
 
 
 @pytest.fixture
@@ -50,9 +47,10 @@ def start(group, tmp_path):
     def run_with(workers=2, *, whole=False, group=group, stop_at_false_joins=True):
         place = Workspace(tmp_path / f"of-{workers}")
         place.photos.mkdir(parents=True)
-        write_match_graph(place.database, group.matches)
-        write_calibrations(place.database, group.matches, group.intrinsics)
-        write_pose_graph(place.database, group.matches, group.graph)
+        matches = group.evidence.matches
+        write_match_graph(place.database, matches)
+        write_calibrations(place.database, matches, group.evidence.intrinsics)
+        write_pose_graph(place.database, matches, group.graph)
         settings = Settings.from_mapping({"scene": {"part_photos": PART}})
         with make_executor(workers) as executor:
             run = RunContext(settings, place, load_plugins(installed=False), executor, workers)
@@ -109,16 +107,16 @@ def test_a_part_that_fails_is_left_to_the_others(start, monkeypatch):
 @pytest.mark.slow
 def test_pairs_that_the_pose_graph_has_dropped_do_not_refuse_a_join(group, start):
     rng = np.random.default_rng(2)
-    rows, fits = dict(group.matches.matches), dict(group.views.fits)
+    evidence = group.evidence
+    rows, fits = dict(evidence.matches.matches), dict(evidence.views.fits)
     for a, b in rng.permutation([(a, b) for a in range(1, 30) for b in range(60, PHOTOS) if (a, b) not in rows])[:200]:
-        count = min(300, *(len(group.matches.keypoints[photo]) for photo in (a, b)))
+        count = min(300, *(len(evidence.matches.keypoints[photo]) for photo in (a, b)))
         pair = int(a), int(b)
         rows[pair] = np.column_stack([np.arange(count)] * 2).astype(np.uint32)
         fits[pair] = EpipolarFit(rng.normal(size=(3, 3)), np.ones(count, bool), np.ones(count), 9, 0.1)
 
-    found, run = start(
-        group=replace(group, matches=replace(group.matches, matches=rows), views=replace(group.views, fits=fits))
-    )
+    more = replace(evidence, matches=replace(evidence.matches, matches=rows), views=replace(evidence.views, fits=fits))
+    found, run = start(group=replace(group, evidence=more))
 
     (figures,) = run.statistics["parts"]
     assert figures["dropped_joins"] == [] and len(figures["joins"]) >= len(figures["parts"]) - 1
@@ -157,12 +155,6 @@ def test_the_size_of_parts_is_that_of_the_settings_or_usual_for_large_groups():
     assert part_size(100, SceneSettings(part_photos=1)) == 20
 
 
-LARGE = Group(tuple(range(200)), None, None, SimpleNamespace(poses={}), None)
-
-
-SETTINGS = SimpleNamespace(settings=Settings())
-
-
 class _Model:
     def __init__(self, photos):
         self.photos = photos
@@ -185,22 +177,6 @@ def test_a_model_of_parts_convinces_with_nearly_all_photos_and_few_contradiction
     assert parts_suffice(found, 200) is good
 
 
-@pytest.mark.parametrize(("of_parts", "taken"), [(attempt(200), "parts"), (attempt(100, matches=50), "whole")])
-def test_the_whole_is_mapped_where_parts_do_not_explain_it(of_parts, taken):
-    whole = []
-
-    def map_whole(*_):
-        whole.append(attempt(190, mapper="whole"))
-        return whole
-
-    mappers = Mappers(lambda *_: 100, map_whole, lambda *_, **__: ([of_parts], ()))
-
-    found, joins = Passes(SETTINGS, mappers).map_by_size(LARGE, stop_at_false_joins=True)
-
-    assert best_attempt(found).mapper == taken and joins == ()
-    assert len(whole) == (taken == "whole")
-
-
 @pytest.mark.slow
 def test_parts_with_false_joins_are_not_joined_unless_nobody_asks(start, monkeypatch):
     join, more = LookAlikes(((1, 2), (3, 4)), 0.9), LookAlikes(((3, 4), (5, 6)), 0.7)
@@ -210,20 +186,6 @@ def test_parts_with_false_joins_are_not_joined_unless_nobody_asks(start, monkeyp
     assert start(1, whole=True) == ([], (join, LookAlikes(((5, 6),), 0.7)))
     found, joins = start(2, whole=True, stop_at_false_joins=False)
     assert joins == () and [one.note for one in found] == ["in 3 parts: no part has a model; failed"]
-
-
-@pytest.mark.parametrize("asked", [True, False])
-def test_false_joins_of_parts_go_up_and_nothing_else_is_mapped(asked):
-    join = LookAlikes(((1, 2),), 0.9)
-
-    def in_parts(*_, stop_at_false_joins):
-        return ([], (join,)) if stop_at_false_joins else ([attempt(200)], ())
-
-    mappers = Mappers(lambda *_: 100, lambda *_: pytest.fail("the whole was mapped"), in_parts)
-
-    found, joins = Passes(SETTINGS, mappers).map_by_size(LARGE, stop_at_false_joins=asked)
-
-    assert joins == ((join,) if asked else ()) and len(found) == (0 if asked else 1)
 
 
 def test_a_task_is_small_and_travels(tmp_path):

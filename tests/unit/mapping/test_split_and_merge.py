@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.colmap.database import write_match_graph
 from sfm_app.colmap.model import move, posed_photo_ids, poses_and_points, submodel
 from sfm_app.geometry.poses import Similarity, umeyama
-from sfm_app.mapping import passes
 from sfm_app.mapping.attempt import PairSupport, judge_model
 from sfm_app.mapping.split_and_merge import OPTIONS, merge_into_main, shared_points, sound_parts, weakly_joined_parts
 from sfm_app.types import ViewGraph
+from tests.unit.mapping.fakes import geometries_in, hypothesis, trials_of
 
 
 def explained_pairs_of(worths):
@@ -79,10 +78,7 @@ def halves(synthetic, run):
     """Photos 1 to 3, and 4 to 6 elsewhere."""
     first, second = submodel(synthetic.model, (1, 2, 3)), submodel(synthetic.model, (4, 5, 6))
     move(second, ELSEWHERE)
-    return tuple(
-        judge_model(synthetic.matches, synthetic.views, "incremental", "half", model, run())
-        for model in (first, second)
-    )
+    return tuple(judge_model(synthetic.evidence(), "incremental", "half", model, run()) for model in (first, second))
 
 
 def within(pair):
@@ -103,7 +99,7 @@ def test_points_that_both_know_are_found_once_with_both_their_places(synthetic, 
 
 @pytest.mark.slow
 def test_halves_become_one_model_as_exact_as_the_whole(synthetic, halves, run):
-    (found,) = merge_into_main(halves, synthetic.matches, synthetic.views, run())
+    (found,) = merge_into_main(halves, synthetic.evidence(), run())
     assert posed_photo_ids(found.model) == [1, 2, 3, 4, 5, 6]
     assert found.note.startswith("3 and 3 photos joined by ")
     true, got = centers(synthetic.model), centers(found.model)
@@ -116,7 +112,7 @@ def test_halves_become_one_model_as_exact_as_the_whole(synthetic, halves, run):
 def test_what_shares_too_few_points_stays_apart(synthetic, halves, run):
     views = ViewGraph({pair: fit for pair, fit in synthetic.views.fits.items() if within(pair)}, {})
     assert len(shared_points(halves[0].model, halves[1].model, synthetic.matches, views)) < OPTIONS.min_shared
-    assert merge_into_main(halves, synthetic.matches, views, run()) == halves
+    assert merge_into_main(halves, replace(synthetic.evidence(), views=views), run()) == halves
 
 
 @pytest.mark.slow
@@ -126,22 +122,26 @@ def test_matches_that_disagree_about_the_place_join_nothing(synthetic, halves, r
         pair: row if within(pair) else np.column_stack([row[:, 0], rng.permutation(row[:, 1])])
         for pair, row in synthetic.matches.matches.items()
     }
-    assert merge_into_main(halves, replace(synthetic.matches, matches=rows), synthetic.views, run()) == halves
+    matches = replace(synthetic.matches, matches=rows)
+    assert merge_into_main(halves, replace(synthetic.evidence(), matches=matches), run()) == halves
 
 
 @pytest.mark.slow
-def test_models_that_mapping_left_apart_are_joined_in_the_end(synthetic, halves, run, cameras):
-    made = passes.Outcome(halves, _graph(synthetic), cameras(), ("half", "half"))
-    context = run()
-    write_match_graph(context.workspace.database, synthetic.matches)
-    found = passes.Passes(context).merge_models(made, synthetic.matches, synthetic.views)
+def test_models_that_mapping_left_apart_are_joined_in_the_end(halves, run, cameras, mapped):
+    found = mapped.improve(mapped.best(cameras(), run(), *halves), hypothesis("merged-models"))
     assert [model.photos for model in found.models] == [6]
-    assert found.reason == found.tried[-1] == found.models[0].note
-    assert len(found.graph.poses) == 15
+    assert found.reason == found.models[0].note
+    assert trials_of(found) == [("merged-models", True, found.reason)]
+    assert len(found.graph.poses) == len(geometries_in(run().workspace.database)) == 15
 
 
-def _graph(synthetic):
-    return passes.PoseGraph({}, {}, tuple((photo,) for photo in synthetic.matches.images))
+@pytest.mark.slow
+def test_models_that_share_too_little_are_tried_and_stay_apart(synthetic, halves, run, cameras, mapped):
+    views = ViewGraph({pair: fit for pair, fit in synthetic.views.fits.items() if within(pair)}, {})
+    best = mapped.best(cameras(), run(), *halves)
+    best = replace(best, evidence=replace(best.evidence, views=views))
+    found = mapped.improve(best, hypothesis("merged-models"))
+    assert found.models == halves and trials_of(found) == [("merged-models", False)]
 
 
 def model(*tracks):

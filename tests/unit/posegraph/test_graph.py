@@ -21,6 +21,7 @@ from sfm_app.posegraph.rotations import connected_groups
 from sfm_app.types import (
     Calibration,
     EpipolarFit,
+    Evidence,
     Intrinsics,
     MatchedImage,
     MatchGraph,
@@ -109,7 +110,7 @@ class Photos:
         one = Calibration(
             **{"K": K, "width": 1000, "height": 750, "method": "zero-curves", "identifiable": True, **camera}
         )
-        return build_pose_graph(self.matches, self.views, Intrinsics({"one": one}), OPTIONS, run_map)
+        return build_pose_graph(Evidence(self.matches, self.views, Intrinsics({"one": one})), OPTIONS, run_map)
 
 
 SIX = (1, 2, 3, 4, 5, 6)
@@ -162,7 +163,7 @@ def test_a_pair_dropped_by_its_F_comes_back_when_its_matches_bear_the_others_out
     fits = photos_views | {(2, 5): EpipolarFit(F, inliers, np.ones(120), 10, 0.3)}
     one = Intrinsics({"one": Calibration(K, 1000, 750, "zero-curves", True)})
 
-    graph = build_pose_graph(photos.matches, ViewGraph(fits, {}), one, OPTIONS, in_turn)
+    graph = build_pose_graph(Evidence(photos.matches, ViewGraph(fits, {}), one), OPTIONS, in_turn)
 
     assert graph.dropped == {}
     assert graph.poses[2, 5].guided and graph.poses[2, 5].inliers[60:].mean() > 0.9
@@ -251,7 +252,7 @@ def test_a_pair_whose_inliers_lie_in_one_point_has_no_pose_and_the_others_have_t
     photos.match((1, 2), np.random.default_rng(0).uniform(0, 700, (40, 2)), np.full((40, 2), 300.0))
     fits = {**views.fits, (1, 2): EpipolarFit(np.diag([1.0, 1.0, 0.0]), np.ones(40, bool), np.ones(40), 1, 0.1)}
     bent = Intrinsics({"one": Calibration(K, 1000, 750, "zero-curves", True, radial=-1e-3)})
-    graph = build_pose_graph(photos.matches, ViewGraph(fits, views.rejected), bent, OPTIONS, in_turn)
+    graph = build_pose_graph(Evidence(photos.matches, ViewGraph(fits, views.rejected), bent), OPTIONS, in_turn)
     assert graph.dropped == {(1, 2): NOT_COMPUTABLE}
     assert sorted(graph.poses) == [(1, 3), (2, 3)] and graph.groups == ((1, 2, 3),)
 

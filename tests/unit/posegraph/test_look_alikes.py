@@ -9,7 +9,7 @@ from sfm_app.posegraph import look_alikes as module
 from sfm_app.posegraph.graph import LOOKS_ALIKE
 from sfm_app.posegraph.look_alikes import backbone, find_look_alikes, group_doubted_pairs
 from sfm_app.synthetic.cameras import look_at
-from sfm_app.types import EpipolarFit, Intrinsics, ViewGraph
+from sfm_app.types import EpipolarFit, Evidence, Intrinsics, ViewGraph
 
 
 def turn(degrees):
@@ -168,9 +168,7 @@ def test_the_pose_graph_does_without_look_alikes():
     intrinsics = Intrinsics({"camera": scene.cameras[1]}, dict.fromkeys(names.values(), "camera"), names)
 
     graph = build_pose_graph(
-        scene.matches,
-        ViewGraph(fits, {}),
-        intrinsics,
+        Evidence(scene.matches, ViewGraph(fits, {}), intrinsics),
         PoseGraphOptions(max_error_px=1.5, min_inliers=16, seed=0),
         lambda function, items, _: [function(item) for item in items],
     )

@@ -1,6 +1,7 @@
 """Results in sentences."""
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from sfm_app.camera.bearings import field_of_view_deg
 from sfm_app.camera.models import camera_matrix
 from sfm_app.report.text import (
+    HYPOTHESES,
     center_text,
     field_text,
     focal_text,
@@ -17,6 +19,7 @@ from sfm_app.report.text import (
     scene_summary,
     verdict,
 )
+from sfm_app.settings import HypothesisName
 from sfm_app.types import Calibration, CameraModel, Scene
 
 
@@ -143,14 +146,25 @@ def test_a_model_that_many_matches_contradict_comes_with_a_warning():
     assert "beware: 25 % of the matches between these photos contradict the model" in text
 
 
-def test_the_result_of_the_feature_retry_is_named():
-    result = {"photos": ["x.jpg", "y.jpg"], "pairs": 9, "placed": [3, 5], "taken": True}
-    text, summary = describe(second_look=result)
-    assert "retried 2 unplaced photos with finer features: 5 photos placed instead of 3\n" in text
-    assert summary["second_look"]["pairs"] == 9
-    failed = describe(second_look=result | {"photos": ["x.jpg"], "placed": [5], "taken": False, "failed": "no room"})[0]
-    assert "retried 1 unplaced photos with finer features: no more photos placed (it failed: no room)\n" in failed
-    assert "retried" not in describe()[0]
+def trial(name, reason, *, accepted=True, photos=(3, 5), failure=""):
+    return {"name": name, "reason": reason, "accepted": accepted, "photos": list(photos), "failure": failure}
+
+
+def test_the_result_of_finer_features_is_named():
+    tried = trial("finer-features", "2 photos are unregistered")
+    text, summary = describe(hypotheses=[tried])
+    start = "tried finer features for unplaced photos, because 2 photos are unregistered:"
+    assert f"{start} 5 photos instead of 3\n" in text
+    assert summary["hypotheses"] == [tried]
+    failed = tried | {"accepted": False, "photos": [5, 5], "failure": "no room"}
+    assert f"{start} it failed: no room\n" in describe(hypotheses=[failed])[0]
+    assert f"{start} it is no better\n" in describe(hypotheses=[tried | {"accepted": False}])[0]
+    assert "tried" not in describe(hypotheses=[trial("first-pass", "", photos=(0, 5))])[0]
+
+
+@pytest.mark.parametrize("name", get_args(HypothesisName))
+def test_every_hypothesis_has_words(name):
+    assert f"tried {HYPOTHESES[name]}, because of a doubt" in describe(hypotheses=[trial(name, "of a doubt")])[0]
 
 
 def test_meters_are_named():
@@ -217,10 +231,13 @@ def test_look_alikes_and_possible_look_alikes_are_named():
 
 
 def test_a_camera_for_each_photo_is_named_where_it_was_tried():
-    assert "each photo has its own (a zoom, or several devices)" in describe(one_camera_each="taken")[0]
-    assert "a shared camera does not fit, two cameras do" in describe(one_camera_each="two")[0]
-    assert "was tried, too, and explains no more" in describe(one_camera_each="left")[0]
-    assert "each" not in describe(one_camera_each="")[0]
+    tried = trial("camera-per-photo", "a shared camera does not fit", photos=(5, 5))
+    start = "a camera for each photo (a zoom, or several devices), because a shared camera does not fit:"
+    assert f"{start} it is better\n" in describe(hypotheses=[tried])[0]
+    assert f"{start} it is no better\n" in describe(hypotheses=[tried | {"accepted": False}])[0]
+    two = trial("two-cameras", "the focal lengths fall into two groups", photos=(5, 5))
+    assert "tried two cameras, because the focal lengths fall into two groups: it is" in describe(hypotheses=[two])[0]
+    assert "each" not in describe()[0]
 
 
 def test_a_compensated_shutter_is_named_with_its_deviation():

@@ -17,7 +17,7 @@ from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import posed_photo_ids, submodel
 from sfm_app.errors import ReconstructionError
 from sfm_app.mapping.attempt import Attempt, PairSupport
-from sfm_app.mapping.passes import Outcome
+from sfm_app.mapping.passes import Outcome, Trial
 from sfm_app.plugins import load_plugins
 from sfm_app.products import read_scene, write_scene, write_sparse_models
 from sfm_app.report.text import scene_lines
@@ -29,6 +29,7 @@ from sfm_app.types import (
     Calibration,
     CameraModel,
     EpipolarFit,
+    Evidence,
     Intrinsics,
     MatchedImage,
     MatchGraph,
@@ -60,7 +61,7 @@ def synthetic(tmp_path_factory):
 @pytest.fixture
 def run(synthetic, tmp_path):
     """A run in an empty folder."""
-    settings = Settings.from_mapping({"scene": {"second_look": False}})
+    settings = Settings.from_mapping({"scene": {"without": ["finer-features"]}})
     return RunContext(settings, Workspace(tmp_path), load_plugins(), ThreadPoolExecutor(1), 1)
 
 
@@ -69,9 +70,12 @@ def mapped(synthetic, monkeypatch):
     """Lets mapping find what the test says; the database that it has made is COLMAP's."""
 
     def find(made):
-        def reconstruct(matches, views, intrinsics, run):
+        def reconstruct(evidence, run):
             shutil.copyfile(synthetic[0], run.workspace.database)
-            return made
+            intrinsics = made.evidence.intrinsics
+            return replace(
+                made, evidence=replace(evidence, intrinsics=intrinsics), calibrated=evidence.intrinsics, run=run
+            )
 
         monkeypatch.setattr(scene, "reconstruct", reconstruct)
 
@@ -84,8 +88,12 @@ def attempt(model, explained=None):
 
 def outcome(*attempts, graph=None, **others):
     cameras = Intrinsics({"one": Calibration(camera_matrix(1280, 1280, 512, 384), 1024, 768, "zero-curves", True)})
-    words = {"tried": ("a", "b"), "reason": "it explains more"}
-    return Outcome(attempts, graph or PoseGraph({}, {}, ()), cameras, **words | others)
+    evidence, graph = Evidence(None, None, cameras), graph or PoseGraph({}, {}, ())
+    return Outcome(attempts, graph, evidence, cameras, None, **{"reason": "it explains more"} | others)
+
+
+def trial(*notes):
+    return Trial("first-pass", "", True, (0, 4), (0.0, 123.456), 7.89, notes)
 
 
 def pose(kind, guided=False):
@@ -108,7 +116,7 @@ def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthe
     matches, views = inputs(true)
     name = {key: image.name for key, image in matches.images.items()}
 
-    found = scene.make(matches, views, made.intrinsics, run)
+    found = scene.make(matches, views, made.calibrated, run)
 
     assert sorted(found.cam_from_world) == [name[key] for key in (1, 2, 3, 4)]
     assert found.cameras["one"].K[0, 0] == pytest.approx(1280, rel=0.003)
@@ -132,36 +140,32 @@ def test_cameras_that_mapping_divided_are_read_back(synthetic, run, mapped):
     true = synthetic[1]
     made = outcome(attempt(pycolmap.Reconstruction(true)))
     matches, views = inputs(true)
-    one = made.intrinsics.cameras["one"]
+    one = made.calibrated.cameras["one"]
     last = matches.images[8].name
     divided = Intrinsics({"one": one, "one #2": one}, {last: "one #2"})
-    mapped(replace(made, intrinsics=divided))
+    mapped(replace(made, evidence=replace(made.evidence, intrinsics=divided)))
 
-    found = scene.make(matches, views, made.intrinsics, run)
+    found = scene.make(matches, views, made.calibrated, run)
 
     assert (found.camera_of[last], len(found.cameras)) == ("one #2", 2)
     again = read_scene(run.workspace)
     assert again.camera_of == found.camera_of and again.cameras.keys() == found.cameras.keys()
 
 
-@pytest.mark.parametrize(("end", "stays"), [(KeyboardInterrupt(), True), (ReconstructionError("no depth"), False)])
-def test_what_a_second_look_found_stays_when_it_is_interrupted(run, monkeypatch, end, stays):
-    def retry_lost_photos(first):
-        (place / "found").mkdir()
-        raise end
+def test_what_mapping_found_stays_when_it_is_interrupted(run, monkeypatch):
+    def reconstruct(evidence, inner):
+        (inner.workspace.root / "found").mkdir()
+        raise KeyboardInterrupt
 
-    place = run.workspace.root / MAPPING
-    monkeypatch.setattr(scene, "reconstruct", lambda *_: None)
-    monkeypatch.setattr(scene, "retry_lost_photos", retry_lost_photos)
+    monkeypatch.setattr(scene, "reconstruct", reconstruct)
 
-    with pytest.raises(type(end)):
+    with pytest.raises(KeyboardInterrupt):
         scene.make(None, None, None, run)
 
-    assert (place / "found").exists() is stays
-    if stays:
-        assert (scene.mapping_run(run).workspace.root / "found").exists()
-        other = run.with_fingerprint("other photos")
-        assert not (scene.mapping_run(other).workspace.root / "found").exists()
+    assert (run.workspace.root / MAPPING / "found").exists()
+    assert (scene.mapping_run(run).workspace.root / "found").exists()
+    other = run.with_fingerprint("other photos")
+    assert not (scene.mapping_run(other).workspace.root / "found").exists()
 
 
 def test_a_model_that_cannot_be_adjusted_is_kept_and_the_run_says_so(synthetic, run, mapped, monkeypatch):
@@ -174,7 +178,7 @@ def test_a_model_that_cannot_be_adjusted_is_kept_and_the_run_says_so(synthetic, 
     monkeypatch.setattr(bundle, "reduce", failing)
     matches, views = inputs(true)
 
-    found = scene.make(matches, views, made.intrinsics, run)
+    found = scene.make(matches, views, made.calibrated, run)
 
     reason = "the computation failed while adjusting the bundle: Matrix is not positive definite"
     assert run.statistics["adjustment"] == {"failed": reason, "failed_in_other_models": {"1": reason}}
@@ -185,12 +189,13 @@ def test_a_model_that_cannot_be_adjusted_is_kept_and_the_run_says_so(synthetic, 
 
 
 def test_without_a_model_the_error_says_what_was_seen_and_what_may_help(synthetic, run, mapped):
-    mapped(outcome(tried=("all at once: 0 photos",)))
+    mapped(outcome(trials=(trial("all at once: 0 photos"),)))
     matches, views = inputs(synthetic[1])
     with pytest.raises(ReconstructionError, match=r"1 pairs with 20 to 20 inliers\); all at once: 0 photos") as caught:
-        scene.make(matches, views, outcome().intrinsics, run)
+        scene.make(matches, views, outcome().calibrated, run)
     assert "overlap" in caught.value.hint
     assert not run.workspace.sparse.exists() and run.statistics == {}
+    assert not (run.workspace.root / MAPPING).exists()
 
 
 def test_how_it_was_made_counts_pairs_and_matches():
@@ -201,10 +206,15 @@ def test_how_it_was_made_counts_pairs_and_matches():
     explained = {(0, 1): PairSupport(50, 40, 3), (0, 2): PairSupport(60, 50, 4)}
     made = attempt(SimpleNamespace(num_reg_images=lambda: 4), explained)
 
-    assert scene.mapping_figures(outcome(made, graph=PoseGraph(poses, dropped, ()), cuts=("c, d",), passes=2)) == {
-        "mapper": "global", "mapper_reason": "it explains more", "tried": ["a", "b"], "passes": 2,
-        "one_camera_each": "", "rival_tried_because": "", "explained_matches": 110, "contradicted_matches": 7,
-        "cut_apart": ["c, d"],
+    found = outcome(made, graph=PoseGraph(poses, dropped, ()), cuts=("c, d",), trials=(trial("a", "b"),))
+
+    assert scene.mapping_figures(found) == {
+        "mapper": "global", "mapper_reason": "it explains more",
+        "hypotheses": [{
+            "name": "first-pass", "reason": "", "accepted": True, "photos": (0, 4), "support": [0.0, 123.5],
+            "seconds": 7.9, "notes": ("a", "b"), "failure": "",
+        }],
+        "explained_matches": 110, "contradicted_matches": 7, "cut_apart": ["c, d"],
         "pairs": {"calibrated": 2, "planar": 1, "rotation": 1, "found with the help of others": 1},
         "pairs_dropped": {"contradicts other pairs": 2, "points behind a camera": 1},
     }  # fmt: skip
