@@ -47,7 +47,7 @@ GROUPS: Mapping[str, Group] = {
     "relative poses, loops, guided pairs": Group(
         ("posegraph",), WITH_TRUTH, "", "docs/algorithms.md, From K to relative poses",
     ),
-    "mapping: seeds, choice of the model, joins, passes": Group(
+    "mapping: seeds, choice of the model, joins, hypotheses": Group(
         ("mapping", "colmap.mapping", "colmap.tasks"), FIRST_EIGHT, "",
         "docs/algorithms.md, Mapping; sets are not written down",
     ),
@@ -77,12 +77,12 @@ GROUPS: Mapping[str, Group] = {
         "120 random scenes; trouble.py, seeds 0 to 64",
         "docs/algorithms.md, Several cameras; the photo sets only checked it",
     ),
-    "finer features, second look": Group(
+    "finer features": Group(
         ("mapping.feature_retry", "built_in"), ("dinoSparseRing",), "",
         "docs/algorithms.md, Mapping; six other sets, thinned out, only checked it",
     ),
     "a camera for each photo in mapping, scale that hangs on few points": Group(
-        ("mapping.passes", "mapping.split_and_merge"),
+        ("mapping.hypotheses", "mapping.split_and_merge"),
         ("temple16", "dinoSparseRing", "castle-P19"), "trouble.py, seeds 0 to 180 and 1000 to 1031",
         "docs/algorithms.md, Mapping; the photo sets chose only when a scale is called open",
     ),
@@ -91,7 +91,7 @@ GROUPS: Mapping[str, Group] = {
         "docs/algorithms.md, Look-alikes; either of the first two finds the other, every 15th photo of the third",
     ),
     "starts of poses, pairs on a plane, passes, other focals": Group(
-        ("posegraph.pair_pose", "posegraph.graph", "mapping.passes"), ("dinoSparseRing", "kitchen25"), "",
+        ("posegraph.pair_pose", "posegraph.graph", "mapping.hypotheses"), ("dinoSparseRing", "kitchen25"), "",
         "docs/algorithms.md, From K to relative poses, Mapping; castle-P19, fountain-P11, temple16 as before",
     ),
     "depth, surface, texture (no figure of this table)": Group(
