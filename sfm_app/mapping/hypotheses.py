@@ -186,10 +186,12 @@ def photos_with_geometry(evidence: Evidence) -> set[int]:
 
 def _map_rival(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
     rival = mapper.mappers.map_rival(best.trusted, mapper.run)
+    if isinstance(rival, NoModel):
+        yield replace(best, models=(), notes=(rival.note,), reason="")
+        return
     both = [attempt for attempt in (best.main, rival) if attempt is not None]
-    if isinstance(rival, NoModel) or best_attempt(both) is not rival:
-        models = () if isinstance(rival, NoModel) else (rival,)
-        yield replace(best, models=models, notes=(rival.note,), reason="")
+    if best_attempt(both) is not rival:
+        yield replace(best, models=(rival,), notes=(rival.note,), reason="")
         return
     parts = split_attempt(rival)
     taken = {photo for part in parts for photo in posed_photo_ids(part.model)}
@@ -201,6 +203,7 @@ def _map_rival(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
 
 
 def _is_chosen(rival: Outcome, _best: Outcome, _: Mapper) -> bool:
+    """Return whether the rival, as a whole, explains more; parts of it may have fewer photos than our model."""
     return bool(rival.reason)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from sfm_app.colmap.database import open_database, write_match_graph
-from sfm_app.mapping.attempt import Attempt, NoModel, explained_pairs
+from sfm_app.mapping.attempt import Attempt, NoModel, PairSupport, explained_pairs
 from sfm_app.mapping.hypotheses import FIRST_LOOK, HYPOTHESES, improve, reconstruct
 from sfm_app.mapping.passes import Mapper, Mappers, Outcome
 from sfm_app.types import Evidence, PoseGraph
@@ -46,6 +46,15 @@ def geometries_in(path):
 def trials_of(outcome):
     """Name, whether it was accepted, and notes of every trial."""
     return [(trial.name, trial.accepted, *trial.notes) for trial in outcome.trials]
+
+
+def joined(inside, between):
+    """What a model of photos 1 to 3 and 4 to 6 explains within and between these."""
+    pairs = {(a, b): inside for part in ((1, 2, 3), (4, 5, 6)) for a in part for b in part if a < b}
+    return pairs | {(3, 4): PairSupport(40, 30, 0), (2, 5): between, (1, 6): between}
+
+
+GOOD, AGAINST, FOR = PairSupport(100, 100, 0), PairSupport(5, 60, 55), PairSupport(30, 30, 0)
 
 
 class Fakes:

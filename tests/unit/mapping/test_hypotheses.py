@@ -18,12 +18,15 @@ from sfm_app.posegraph.graph import LOOKS_ALIKE
 from sfm_app.settings import HypothesisName, Settings
 from sfm_app.types import Evidence, LookAlikes, MatchedImage, MatchGraph, PoseGraph, ViewGraph
 from tests.unit.mapping.fakes import (
+    AGAINST,
     EMPTY,
     FOCAL,
+    GOOD,
     TRUE,
     focals_in,
     geometries_in,
     hypothesis,
+    joined,
     trials_of,
     with_camera,
     without,
@@ -203,6 +206,17 @@ def test_a_rival_of_other_photos_does_not_win_by_our_own_model(synthetic, run, c
     found = mapped.outcome(cameras(), run())
     assert found.models[0].model is first and len(found.models) == 1
     assert trials_of(found)[1] == ("colmap-defaults", False, "the rival")
+
+
+def test_a_rival_is_compared_as_a_whole_and_then_cut(synthetic, run, cameras, mapped):
+    rival = Attempt("colmap", synthetic.copy(), joined(GOOD, AGAINST), "the rival")
+    mapped.mappers = replace(mapped.mappers, map_rival=lambda *_: rival)
+    ours = Attempt("incremental", without(synthetic.copy(), [5, 6]), {(1, 2): GOOD, (2, 3): GOOD, (3, 4): GOOD}, "")
+
+    found = mapped.improve(mapped.best(cameras(**GUESS), run(), ours), hypothesis("colmap-defaults"))
+
+    assert ours.support >= found.support and trials_of(found) == [("colmap-defaults", True, "the rival")]
+    assert [posed_photo_ids(model.model) for model in found.models] == [[1, 2, 3], [4, 5, 6]]
 
 
 def test_good_evidence_needs_no_rival(synthetic, run, cameras, mapped):

@@ -5,11 +5,22 @@ from dataclasses import replace
 import pytest
 
 from sfm_app.colmap.model import posed_photo_ids
-from sfm_app.mapping.attempt import Attempt, NoModel, PairSupport
+from sfm_app.mapping.attempt import Attempt, NoModel
 from sfm_app.mapping.passes import Mapper, guessed_intrinsics
 from sfm_app.mapping.split_and_merge import split_attempt
 from sfm_app.types import LookAlikes
-from tests.unit.mapping.fakes import FOCAL, TRUE, focals_in, geometries_in, with_camera, without
+from tests.unit.mapping.fakes import (
+    AGAINST,
+    FOCAL,
+    FOR,
+    GOOD,
+    TRUE,
+    focals_in,
+    geometries_in,
+    joined,
+    with_camera,
+    without,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -77,15 +88,6 @@ def test_a_pass_writes_the_cameras_and_poses_that_it_maps_with(synthetic, run, c
 def test_the_usual_guess_replaces_no_given_camera(cameras):
     told = guessed_intrinsics(cameras(method="given")).main, guessed_intrinsics(cameras(method="zero-curves")).main
     assert [camera.method for camera in told] == ["given", "guess"]
-
-
-def joined(inside, between):
-    """What a model of photos 1 to 3 and 4 to 6 explains within and between these."""
-    pairs = {(a, b): inside for part in ((1, 2, 3), (4, 5, 6)) for a in part for b in part if a < b}
-    return pairs | {(3, 4): PairSupport(40, 30, 0), (2, 5): between, (1, 6): between}
-
-
-GOOD, AGAINST, FOR = PairSupport(100, 100, 0), PairSupport(5, 60, 55), PairSupport(30, 30, 0)
 
 
 def test_a_model_whose_join_is_contradicted_gives_its_parts(synthetic):
