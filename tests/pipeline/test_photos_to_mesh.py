@@ -220,10 +220,10 @@ def test_a_run_killed_in_its_texture_ends_with_the_same_bytes(finished, rendered
     monkeypatch.setattr(pages, "CHECKPOINTS", pages.CheckpointOptions(every_s=-1.0, most_time=np.inf))
 
     killed_at(4, monkeypatch, FileStore, "keep", rendered[0], out, DRAFT, first="texture")
-    looks = stamps(parts, "look*.npz")
+    looks = stamps(parts, "view*.npz")
     assert len(looks) == 3
     killed_at(len(whole.scene.registered), monkeypatch, FileStore, "keep", rendered[0], out, DRAFT)
-    assert stamps(parts, "look*.npz").items() > looks.items() and (parts / f"{pages.GROUP_NAME}.npz").exists()
+    assert stamps(parts, "view*.npz").items() > looks.items() and (parts / f"{pages.CHECKPOINT_NAME}.npz").exists()
     run = sfm_app.reconstruct(rendered[0], out, DRAFT)
 
     assert run.mesh_path.read_bytes() == whole.mesh_path.read_bytes() and not parts.exists()

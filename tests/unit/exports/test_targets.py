@@ -201,7 +201,7 @@ def finished(textured_ball, tmp_path):
 def test_the_file_is_what_the_run_would_have_written(textured_ball, finished, name):
     paths = sfm_app.export_model(finished, name)
     stem = "model-draco" if name == "draco" else "model"
-    assert paths[0] == finished / f"{stem}.{EXPORTERS[name].ending}"
+    assert paths[0] == finished / f"{stem}.{EXPORTERS[name].suffix}"
     assert {path.name: path.read_bytes() for path in paths} == EXPORTERS[name].write(textured_ball, stem)
 
 
