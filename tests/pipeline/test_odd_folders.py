@@ -18,7 +18,7 @@ from sfm_app.synthetic.compare import focal_error_percent
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
 
 CAMERA = make_camera(480, 360)
-QUICK = "--quality", "draft", "--set", "report=false"
+QUICK = "--quality", "draft", "--set", "report=false", "--set", "matching.max_image_size_px=360"
 FAST = PhotoOptions(supersampling=1)
 
 
