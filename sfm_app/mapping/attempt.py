@@ -51,7 +51,7 @@ class MappingOptions:
     few_lost: float = 0.05
     """Share of unregistered photos that is few there. Chosen by hand."""
     enough_share: float = 0.9
-    """Share of the photos of a group that counts as most of them, and ends the search for a better seed. Chosen by hand."""
+    """Share of the photos of a group that counts as most, and ends the search for a better seed. Chosen by hand."""
     confirmed_share: float = 0.5
     """The same when the two largest models, of any mapper, place equally many photos. Chosen by hand."""
     min_photos: int = 3

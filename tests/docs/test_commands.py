@@ -102,21 +102,6 @@ def test_there_are_many():
     assert sum(name_of(words[0]) == PROGRAM for _, words in ALL) > 50
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["run", "PHOTOS", "--out-folder", "OUT"], "No such option"),
-        (["run", "PHOTOS", "OUT"], "unexpected extra argument"),
-        (["run", "PHOTOS", "--quality", "best"], "not one of"),
-        (["run", "PHOTOS", "--set", "depth.neighbours=6"], "did you mean|unknown setting"),
-        (["ran", "PHOTOS"], "no command"),
-    ],
-)
-def test_what_cannot_be_typed_is_found(words, says):
-    with pytest.raises((click.UsageError, AssertionError, options.ConfigError), match=says):
-        check_ours(words)
-
-
 COMMANDS = (
     ("run photos -o out", "model.glb"), ("run photos -o out --until scene --json", '"photos"'),
     ("calibrate photos -o out --figure camera.png", "px"), ("export out --format obj", "model.obj"),

@@ -33,6 +33,7 @@ def test_objects_are_refused(tmp_path):
         load_arrays(tmp_path / "x.npz")
 
 
+@pytest.mark.slow
 def test_a_bomb_is_refused_before_it_goes_off(tmp_path):
     chunk = bytes(2**24)
     with (

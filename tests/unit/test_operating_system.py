@@ -177,6 +177,7 @@ def test_a_container_has_less_memory(tmp_path, without, monkeypatch, limit, mega
     assert system.machine_memory_mb() == whole
 
 
+@pytest.mark.slow
 def test_times_of_children_are_looked_at_where_nobody_adds_them_up(without):
     without(Ability.CHILD_TIMES)
     times, before = system.ChildTimes(), system.cpu_seconds()

@@ -18,7 +18,6 @@ import pytest
 
 import sfm_app
 from sfm_app import errors, plugins
-from sfm_app.cli.options import parse_assignment
 from sfm_app.cli.program import main
 from sfm_app.errors import SfmError
 from sfm_app.plugins import installed_plugins, load_plugins
@@ -51,24 +50,10 @@ def flags():
     return {flag for command in commands for parameter in command.params for flag in parameter.opts}
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_commands_that_are_printed_have_these_flags(page):
-    """In a span of code or a block, after `sfm-app`, up to the end of the command."""
-    calls = re.findall(r"sfm-app (?:[a-z]+ )[^`\n#|;&]*", read(page))
-    printed = {flag for call in calls for flag in re.findall(r"(?<!\S)--[a-z-]+", call)}
-    assert printed <= flags() | {"--help", "--version"}
-
-
 def test_flags_that_are_named_are_there():
     printed = {flag for page in FOR_USERS for flag in re.findall(r"`(--[a-z-]+)", read(page))}
     assert len(printed) > 10
     assert printed - NOT_OURS <= flags()
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_settings_that_are_printed_can_be_set(page):
-    for assignment in re.findall(r"--set ([a-z_]+\.[a-z_]+=[^\s`]+)", read(page)):
-        Settings.from_mapping(parse_assignment(assignment))
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -250,17 +235,6 @@ def test_every_name_on_the_page_is_in_the_code(name):
     assert exists(name)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "fundamental.loop.serch", "fundamental.lop.search", "fundamental.loop.search(nobody)",
-        "lev-ransac-thesi", "nothing", "fundamental.points.Matches.nothing", "fundamental.loop.Best.f.x",
-    ],
-)  # fmt: skip
-def test_what_is_not_in_the_code_is_found(name):
-    assert not exists(name)
-
-
 def test_the_hooks_are_printed_with_their_fields():
     printed = block("")
     for hook in (name for name in vars(plugins.Hooks) if name.startswith("sfm_")):
@@ -286,10 +260,6 @@ def test_every_equation_of_four_chapters_is_on_the_map():
         for first, last in re.findall(r"\d\.(\d+)(?: to \d\.(\d+))?", cell):
             listed += [(int(cell[0]), number) for number in range(int(first), int(last or first) + 1)]
     assert sorted(listed) == [(chapter, k) for chapter, last in LAST_EQUATIONS.items() for k in range(1, last + 1)]
-
-
-def test_every_algorithm_is_on_the_map():
-    assert re.findall(r"^\| Algorithm (\d) \|", MAP, re.MULTILINE) == ["1", "2", "3", "4"]
 
 
 def test_every_function_on_the_map_is_a_path():

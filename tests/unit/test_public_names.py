@@ -129,12 +129,3 @@ def test_presets_are_valid_and_explicit_values_win():
     assert Settings.from_mapping({"quality": "draft"}).depth.max_image_size_px == 640
     own = Settings.from_mapping({"quality": "draft", "depth": {"max_image_size_px": 700}})
     assert own.depth.max_image_size_px == 700
-
-
-def test_a_file_that_is_not_toml_is_named(tmp_path):
-    path = tmp_path / "run.toml"
-    path.write_bytes(b"\xff\xfe= [")
-    with pytest.raises(ConfigError, match=r"run\.toml is not a TOML file"):
-        Settings.from_toml(path)
-    with pytest.raises(ConfigError, match="cannot read"):
-        Settings.from_toml(tmp_path / "missing.toml")

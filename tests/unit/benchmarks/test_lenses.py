@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.lenses.command import methods_for, page
-from benchmarks.lenses.models import STRONG, fisheye_case, measure, perspective_case
+from benchmarks.lenses.models import measure
 from benchmarks.lenses.radius import projection_of, radius_error_percent
 from sfm_app.synthetic.cameras import Lens, make_camera, make_wide_camera
 from sfm_app.synthetic.photo_folder import Truth
@@ -60,19 +60,3 @@ def test_a_fisheye_stays_one_and_its_radius_is_accurate(seed):
     row = measure("fisheye", seed, hold_out=False)
     assert row["file"] == "OPENCV_FISHEYE" and "prism" not in row["free"]
     assert 0.0 < row["radius %"] < 0.1
-
-
-@pytest.mark.slow
-def test_no_other_model_explains_held_out_observations_clearly_better():
-    row = measure("plain", 2, hold_out=True)
-    assert row["chosen"] == "RADIAL" and 0.0 <= row["below"] < np.log(STRONG)
-
-
-@pytest.mark.slow
-def test_cases_are_the_same_each_time_and_differ_from_seed_to_seed():
-    first, again, other = (perspective_case("plain", seed) for seed in (3, 3, 4))
-    assert (first.drawn.X == again.drawn.X).all() and first.start.params.tolist() == again.start.params.tolist()
-    assert not (first.drawn.X == other.drawn.X).all()
-    assert {fisheye_case("fisheye", seed).lens.split()[0] for seed in (0, 3, 6)} == {
-        "equidistant", "equisolid", "stereographic"
-    }  # fmt: skip

@@ -138,15 +138,6 @@ def area_share(*names):
     return 100.0 * sum(area[name] for name in names) / sum(area.values())
 
 
-def test_the_walls_themselves_are_accurate_and_complete(truth):
-    walls = room()
-    found = scores(truth, *joined([walls[name] for name in walls if name != "ceiling"]))
-    assert found["accuracy 3 cm %"] > 99 and found["completeness 5 cm %"] == 100 and found["median cm"] < 0.3
-    assert found["median center cm"] < 0.01 and found["cameras apart cm"] == pytest.approx(3.16, abs=0.05)
-    assert found["ICP: cameras apart cm"] == pytest.approx(3.16, abs=0.25)
-    assert found["ICP: moved by cm"] < 0.2 and abs(found["ICP: scaled by %"]) < 0.1
-
-
 @pytest.mark.parametrize(
     ("moved", "accurate", "complete"), [(0.02, True, True), (0.04, False, True), (0.07, False, False)]
 )

@@ -161,27 +161,6 @@ def test_only_a_folder_that_exists_is_suggested_for_a_run(tmp_path):
     assert "sfm-app run" not in call(tmp_path / "nowhere").stderr.split("Error:")[1]
 
 
-@pytest.mark.parametrize("arguments", [["ran"], ["run"], ["measure", "x"], ["run", "nowhere"]])
-def test_wrong_commands_are_answered_in_80_columns(tmp_path, monkeypatch, arguments):
-    monkeypatch.chdir(tmp_path)
-    check_text(call(*arguments).stderr)
-
-
-@pytest.mark.parametrize(
-    ("flags", "text"),
-    [
-        (("--estimator", "lev"), "no estimator is named 'lev'"),
-        (("--calibrator", "zero"), "no calibrator is named 'zero'"),
-        (("--set", "epipolar.max_error_px"), "no '=' in it"),
-        (("--set", "epipolar.max_error_px=-1"), "greater than 0"),
-        (("--camera-model", "FOV"), "'FOV' is not one of 'auto', 'SIMPLE_PINHOLE'"),
-    ],
-)
-def test_wrong_settings_end_with_exit_code_2_before_any_work(folder, tmp_path, flags, text):
-    result = call("run", folder, "-o", tmp_path / "out", *flags)
-    assert result.exit_code == 2 and text in result.stderr and not (tmp_path / "out").exists()
-
-
 def test_a_figure_that_cannot_be_written_is_refused_before_any_work(folder, tmp_path):
     result = call("calibrate", folder, "--figure", tmp_path / "curves.jpg", "-q")
     assert result.exit_code == 2 and "cannot write '.jpg'" in result.stderr and ".svg" in result.stderr
@@ -217,15 +196,6 @@ def test_a_run_without_an_output_folder_writes_beside_the_photos(folder, tmp_pat
     monkeypatch.setattr("sfm_app.reconstruct", lambda _, place, *__, **___: folders.append(place))
     call("run", folder, "-q")
     assert [str(path) for path in folders] == [out.format(tmp_path.resolve())]
-
-
-def test_an_output_folder_that_is_a_file(folder, tmp_path):
-    write_photos(folder, "a.jpg", "b.jpg")
-    (tmp_path / "model.glb").write_text("mine")
-    on_file, in_file = (call("run", folder, "-o", tmp_path / "model.glb" / name, "-q") for name in ("", "out"))
-    assert (on_file.exit_code, "model.glb: it is a file" in on_file.stderr) == (3, True)
-    assert (in_file.exit_code, "cannot write to" in in_file.stderr) == (3, True)
-    assert (tmp_path / "model.glb").read_text() == "mine"
 
 
 @pytest.mark.slow

@@ -98,6 +98,7 @@ def test_chunks_give_what_colmap_gives_for_all_at_once(made, tmp_path):
     assert digest_matches(database) == digest_matches(made / "whole.db")
 
 
+@pytest.mark.slow
 def test_a_process_of_its_own_matches_the_same(made, tmp_path):
     inputs, pairs = inputs_of(made, made / "whole.db", tmp_path / "matches"), [(1, 2), (4, 1), (3, 5)]
     counted = Counted()

@@ -97,6 +97,7 @@ TRUE = ("cmd", "/c", "exit") if sys.platform == "win32" else ("true",)
 HOLD = "held = b'x' * 200_000_000; import time; time.sleep(1.2)"
 
 
+@pytest.mark.slow
 def test_memory_of_other_processes_counts():
     with measure_usage() as alone:
         pass
@@ -106,6 +107,7 @@ def test_memory_of_other_processes_counts():
     assert 200 <= used.peak_mb - alone.peak_mb < 350
 
 
+@pytest.mark.slow
 def test_memory_of_this_process_counts_once_while_it_starts_others():
     held = b"x" * 500_000_000  # a child that has not yet begun its program shares it
     before, sizes = resident_mb(ChildTimes()), []
@@ -118,6 +120,7 @@ def test_memory_of_this_process_counts_once_while_it_starts_others():
     assert max(sizes) < before + 200
 
 
+@pytest.mark.slow
 def test_cpu_seconds_do_not_count_waiting():
     with measure_usage() as idle:
         time.sleep(0.5)
@@ -131,6 +134,7 @@ def test_cpu_seconds_do_not_count_waiting():
     assert 0.45 <= busy.cpu_seconds < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("taken", [(), (Ability.CHILD_TIMES,)], ids=["system", "looks"])
 def test_cpu_seconds_of_children_count_once(without, taken):
     without(*taken)

@@ -15,8 +15,7 @@ from sfm_app.camera_files import read_given_cameras
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.formats.gltf import FLIP
 from sfm_app.geometry.poses import Similarity
-
-from .conftest import colors_of
+from tests.unit.colored_photos import colors_of
 
 EXACT_PX, RELATIVE = 1e-6, 1e-6
 MOVED = Similarity(3.5, cv2.Rodrigues(np.array([0.3, -0.2, 0.5]))[0], np.array([10.0, -2.0, 4.0]))
@@ -245,6 +244,7 @@ def read_bundle(file):
     return views, found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kinds", [("lens", "other"), ("fisheye",)], ids="+".join)
 def test_bundler_sees_points_where_the_photos_do(make_run, frame, kinds):
     run = make_run(*kinds)
@@ -269,6 +269,7 @@ def test_bundler_sees_points_where_the_photos_do(make_run, frame, kinds):
     assert len(errors) >= 200 and max(errors) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_folder_is_the_same_every_time(make_run):
     run = make_run("fisheye", masks=True)
     one, two = (sfm_app.export_scene(run.out, "splat", run.out / name) for name in ("one", "two"))

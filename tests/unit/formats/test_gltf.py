@@ -13,7 +13,6 @@ from PIL import Image
 from sfm_app.formats.draco import DRACO, write_draco
 from sfm_app.formats.exporters import jpeg, split_corners
 from sfm_app.formats.gltf import linear_colors, write_glb
-from sfm_app.meshing.ray_casting import load_open3d
 from sfm_app.types import Model, Surface
 
 COMPONENTS = {5123: np.uint16, 5125: np.uint32, 5126: np.float32}
@@ -219,25 +218,10 @@ def test_cameras_of_gltf_stand_where_the_photos_were_taken(cloud):
         assert np.tan(lens["yfov"] / 2) * lens["aspectRatio"] == pytest.approx(320 / 800)
 
 
-def test_trimesh_shows_the_texture(textured_ball):
-    scene = trimesh.load_scene(io.BytesIO(glb_of(textured_ball)), file_type="glb", process=False)
-    seen = [part.visual.to_color().vertex_colors[:, :3].mean(axis=0) for part in scene.geometry.values()]
-    np.testing.assert_allclose(seen, [(200, 40, 30), (30, 60, 200)], atol=4)
-
-
 def test_trimesh_takes_vertex_colors_where_it_skips_materials(ball):
     mesh = trimesh.load(io.BytesIO(glb_of(ball)), file_type="glb", force="mesh", process=False, skip_materials=True)
     expected = linear_colors(ball.surface.colors) * 255
     np.testing.assert_allclose(mesh.visual.vertex_colors[:, :3], expected, atol=1)
-
-
-def test_open3d_reads_all_kinds(model, tmp_path):
-    path = tmp_path / "model.glb"
-    path.write_bytes(glb_of(model))
-    read = load_open3d().io.read_triangle_model(str(path))
-    assert sum(len(part.mesh.triangles) for part in read.meshes) == len(model.surface.faces)
-    pictures = [material.albedo_img for material in read.materials if material.albedo_img is not None]
-    assert len(pictures) == (len(model.texture.pages) if model.texture else 0)
 
 
 def test_colors_of_neighboring_charts_stay_apart():

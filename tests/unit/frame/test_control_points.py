@@ -102,10 +102,10 @@ def test_five_points_give_the_place_and_the_size():
     assert found.crs == "EPSG:32632"
 
 
-@pytest.mark.parametrize("count", [4, 5, 12])
+@pytest.mark.parametrize("count", [4, 8])
 def test_the_deviation_of_the_scale_covers_its_error(count):
     rng, normalized = np.random.default_rng(1), []
-    for _ in range(150):
+    for _ in range(60):
         given, located, _ = survey(rng, count)
         found = fit_control_points(given, located)
         normalized.append(np.log(found.from_model.scale / TRUE.scale) / found.deviation)
@@ -113,22 +113,22 @@ def test_the_deviation_of_the_scale_covers_its_error(count):
     assert np.mean(np.abs(normalized) > 3) <= 0.02
 
 
-@pytest.mark.parametrize(("count", "wrong"), [(5, (2,)), (6, (0,)), (8, (1, 5)), (12, (0, 3, 7))])
+@pytest.mark.parametrize(("count", "wrong"), [(5, (2,)), (8, (1, 5)), (11, (0, 3, 7))])
 def test_wrong_points_are_named(count, wrong):
     rng, named, falsely = np.random.default_rng(2), 0, 0
-    for _ in range(100):
+    for _ in range(40):
         found = fit_control_points(*survey(rng, count, wrong=wrong, miss_m=0.5)[:2])
         named += set(found.outliers) >= {f"p{k}" for k in wrong}
         falsely += not set(found.outliers) <= {f"p{k}" for k in wrong}
-    assert named >= 95
-    assert falsely <= 3
+    assert named >= 38
+    assert falsely <= 1
 
 
-@pytest.mark.parametrize("count", [5, 6, 8, 15])
+@pytest.mark.parametrize("count", [5, 8, 12])
 def test_good_points_are_kept(count):
     rng = np.random.default_rng(3)
     kept = [agreeing_points(places, TRUE(places) + 0.01 * rng.normal(size=places.shape)).all()
-            for places in (rng.uniform(-1, 1, size=(count, 3)) for _ in range(200))]  # fmt: skip
+            for places in (rng.uniform(-1, 1, size=(count, 3)) for _ in range(50))]  # fmt: skip
     assert np.mean(kept) >= 0.98
 
 

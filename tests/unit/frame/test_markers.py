@@ -63,6 +63,7 @@ def test_a_side_is_exact_through_blur_and_tone_curve(side, limit):
     assert 1e-4 < np.max(errors) < 0.15
 
 
+@pytest.mark.slow
 def test_the_outline_alone_is_half_a_pixel_too_small():
     """Why all edges are used: what OpenCV finds by itself, in the same photos."""
     rng, ratios, options = np.random.default_rng(5), [], cv2.aruco.DetectorParameters()

@@ -52,13 +52,6 @@ def test_fewer_matches_than_a_sample():
     assert run_loop(replace(m, points=m.points[:6]), options(), 0, PLAIN) is None
 
 
-def test_same_seed_same_bits_and_another_seed_other_samples():
-    m = scene(0.4)
-    first, again, other = (run_loop(m, options(max_trials=50), seed, PLAIN) for seed in (1, 1, 2))
-    assert first.F.tobytes() == again.F.tobytes()
-    assert first.F.tobytes() != other.F.tobytes()
-
-
 def test_converged_priors_end_the_search():
     flat = replace(PLAIN, validity=always(np.ones(300)), stop_on_convergence=True)
     patient = replace(flat, stop_on_convergence=False)

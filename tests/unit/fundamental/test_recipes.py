@@ -1,7 +1,6 @@
 """The estimators as a whole: thesis, production, rays."""
 
 import math
-import pickle
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.synthetic.matches import make_two_motions
 from sfm_app.camera.bearings import bearings, project
-from sfm_app.fundamental import ESTIMATORS
 from sfm_app.fundamental.lev_ransac import fit_lev_ransac, search_patience
 from sfm_app.fundamental.loop import run_loop
 from sfm_app.fundamental.points import prepare
@@ -30,20 +28,6 @@ def trials_of(name, outliers, seeds=range(5)):
         pair = make_pair(PairOptions(points=600, outliers=outliers), seed)
         found.append(run_loop(prepare(pair.x1, pair.x2, seed), OPTIONS, seed, RECIPES[name][0]).trials)
     return np.array(found)
-
-
-def test_every_estimator_is_registered_with_a_line_about_it():
-    assert set(ESTIMATORS) == {
-        *("lev-ransac", "lev-ransac-thesis", "lev-ransac-sprt", "lev-ransac-tdd", "res-ransac"),
-        *("mlesac", "msac", "ransac", "ransac-sprt", "ransac-tdd", "lmeds"),
-    }
-    assert all(10 < len(about) < 120 for _, about in ESTIMATORS.values())
-
-
-def test_estimators_pickle_by_name():
-    fit = recipe_estimator("mlesac")
-    assert pickle.loads(pickle.dumps(fit)) is fit  # noqa: S301 - our own bytes
-    assert fit.__name__ == "mlesac"
 
 
 def test_tdd_needs_the_trials_that_its_test_costs():

@@ -185,14 +185,6 @@ def test_the_mixture_measures_the_noise():
     assert errors[1] > 2 * errors[0]
 
 
-def test_perfect_matches_stay_perfect():
-    pair, m, good = scene(3, points=200, sigma_px=0.0, outliers=0.3)
-    start = fit_eight_point(moved(m.points, 0.001, 3), good.astype(float))
-    F = m.to_pixels(refine_mixture(m.points, start, threshold=1.5 / m.unit_px, reach=3.0, most_steps=30))
-    assert sampson_distance(start, m.points[:, :2], m.points[:, 2:])[good].max() * m.unit_px > 0.01
-    assert sampson_distance(F, pair.x1, pair.x2)[pair.is_inlier].max() < 1e-3
-
-
 @pytest.mark.parametrize("count", [2, 6, 7, 8])
 @pytest.mark.parametrize("threshold", [1e-9, 0.1, 10.0])
 def test_few_matches_leave_a_matrix_of_rank_two(count, threshold):
@@ -354,13 +346,6 @@ def test_matches_that_do_not_determine_the_matrix_still_get_one(case, seed):
     assert gold_cost(points, F) <= gold_cost(points, nearest_rank_two(start))
 
 
-def test_ten_thousand_matches_and_the_same_bytes_twice():
-    _, m, start = gold_scene(2, points=10_000)
-    F = refine_reprojection(m.points, start)
-    assert F.tobytes() == refine_reprojection(m.points, start).tobytes()
-    assert gold_cost(m.points, F) < gold_cost(m.points, start)
-
-
 @pytest.mark.parametrize("F", [np.zeros((3, 3)), np.full((3, 3), np.nan)])
 def test_no_start_is_refused(F):
     with pytest.raises(NumericalError, match="zero or not finite"):
@@ -373,11 +358,6 @@ SCENE = PairOptions(points=300, sigma_px=0.7, outliers=0.3, width=1024, height=7
 
 def options(refit):
     return EpipolarSettings(max_error_px=2.0, max_trials=2000, refit=refit)
-
-
-def test_the_settings_offer_every_refit():
-    assert ["auto", *REFITS] == CHOICES
-    assert [options(name).refit for name in CHOICES] == CHOICES
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)

@@ -1,6 +1,7 @@
 """Mapping in parts from end to end, on a walk through a town; and what happens where parts fail."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -124,6 +125,7 @@ def test_pairs_that_the_pose_graph_has_dropped_do_not_refuse_a_join(group, start
     assert best_attempt(found).photos >= PHOTOS - 2
 
 
+@pytest.mark.slow
 def test_where_no_part_is_mapped_the_reason_is_told(group, start, monkeypatch):
     failed = PartResult((), "", ("failed: no memory",))
     monkeypatch.setattr(parts, "map_parts", lambda *_, **__: [failed] * 9)
@@ -133,6 +135,7 @@ def test_where_no_part_is_mapped_the_reason_is_told(group, start, monkeypatch):
     assert not parts_suffice([found], PHOTOS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("error", "passes"), [(ClusterError("gone"), True), (BackendError("failed"), False)])
 def test_a_cluster_that_is_gone_ends_the_run_and_other_failures_leave_the_whole(start, monkeypatch, error, passes):
     def fail(*_, **__):
@@ -152,6 +155,12 @@ def test_the_size_of_parts_is_that_of_the_settings_or_usual_for_large_groups():
     assert [part_size(count, auto) for count in (3, 400, 401, 9000)] == [0, 0, 150, 150]
     assert [part_size(count, own) for count in (90, 91, 1000)] == [0, 60, 60]
     assert part_size(100, SceneSettings(part_photos=1)) == 20
+
+
+LARGE = Group(tuple(range(200)), None, None, SimpleNamespace(poses={}), None)
+
+
+SETTINGS = SimpleNamespace(settings=Settings())
 
 
 class _Model:
@@ -177,7 +186,7 @@ def test_a_model_of_parts_convinces_with_nearly_all_photos_and_few_contradiction
 
 
 @pytest.mark.parametrize(("of_parts", "taken"), [(attempt(200), "parts"), (attempt(100, matches=50), "whole")])
-def test_the_whole_is_mapped_where_parts_do_not_explain_it(group, of_parts, taken):
+def test_the_whole_is_mapped_where_parts_do_not_explain_it(of_parts, taken):
     whole = []
 
     def map_whole(*_):
@@ -186,14 +195,13 @@ def test_the_whole_is_mapped_where_parts_do_not_explain_it(group, of_parts, take
 
     mappers = Mappers(lambda *_: 100, map_whole, lambda *_, **__: ([of_parts], ()))
 
-    found, joins = Passes(_run(), mappers).map_by_size(
-        replace(group, photos=tuple(range(200))), stop_at_false_joins=True
-    )
+    found, joins = Passes(SETTINGS, mappers).map_by_size(LARGE, stop_at_false_joins=True)
 
     assert best_attempt(found).mapper == taken and joins == ()
     assert len(whole) == (taken == "whole")
 
 
+@pytest.mark.slow
 def test_parts_with_false_joins_are_not_joined_unless_nobody_asks(start, monkeypatch):
     join, more = LookAlikes(((1, 2), (3, 4)), 0.9), LookAlikes(((3, 4), (5, 6)), 0.7)
     results = [PartResult((), "", ("failed",), (one,)) for one in (join, more, join)]
@@ -205,7 +213,7 @@ def test_parts_with_false_joins_are_not_joined_unless_nobody_asks(start, monkeyp
 
 
 @pytest.mark.parametrize("asked", [True, False])
-def test_false_joins_of_parts_go_up_and_nothing_else_is_mapped(group, asked):
+def test_false_joins_of_parts_go_up_and_nothing_else_is_mapped(asked):
     join = LookAlikes(((1, 2),), 0.9)
 
     def in_parts(*_, stop_at_false_joins):
@@ -213,18 +221,9 @@ def test_false_joins_of_parts_go_up_and_nothing_else_is_mapped(group, asked):
 
     mappers = Mappers(lambda *_: 100, lambda *_: pytest.fail("the whole was mapped"), in_parts)
 
-    found, joins = Passes(_run(), mappers).map_by_size(
-        replace(group, photos=tuple(range(200))), stop_at_false_joins=asked
-    )
+    found, joins = Passes(SETTINGS, mappers).map_by_size(LARGE, stop_at_false_joins=asked)
 
     assert joins == ((join,) if asked else ()) and len(found) == (0 if asked else 1)
-
-
-def _run():
-    class Run:
-        settings = Settings()
-
-    return Run()
 
 
 def test_a_task_is_small_and_travels(tmp_path):

@@ -194,13 +194,6 @@ def test_edges_are_halved_and_the_surface_stays_what_it_is(longest):
     assert len(after.faces) > len(before.faces) and len(edges) == 3 * len(after.faces) // 2
 
 
-def test_short_edges_stay():
-    before = closed_ball()
-    after = split_long_edges(before, np.full(len(before.vertices), 9.0))
-
-    assert np.array_equal(after.faces, before.faces) and np.array_equal(after.vertices, before.vertices)
-
-
 def test_only_where_it_is_asked_for():
     before = closed_ball()
     after = split_long_edges(before, np.where(before.vertices[:, 1] > 0, 0.1, np.inf))

@@ -1,6 +1,5 @@
 """Formats, pixel depths, damage, and the focal length of EXIF."""
 
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -95,13 +94,6 @@ def test_of_many_pictures_the_first(tmp_path, kind):
     assert np.array_equal(np.asarray(upright_image(picture)), COLORS)
 
 
-@pytest.mark.parametrize("content", [b"", b"GIF89a, or so it says", b"%PDF-1.7", b"\x00" * 5000])
-def test_what_is_no_photo(tmp_path, content):
-    (tmp_path / "x.jpg").write_bytes(content)
-    with pytest.raises(UnreadableError, match="not a photo" if content else "empty"):
-        read_picture(tmp_path / "x.jpg")
-
-
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "WEBP", "BMP"])
 @pytest.mark.parametrize("share", [0.3, 0.7])
 def test_what_is_cut_off(tmp_path, kind, share):
@@ -111,28 +103,6 @@ def test_what_is_cut_off(tmp_path, kind, share):
     (tmp_path / "x").write_bytes(whole[: int(share * len(whole))])
     with pytest.raises(UnreadableError, match=r"truncated or damaged|not a photo"):
         read_picture(tmp_path / "x")
-
-
-def test_a_bomb_is_refused_before_it_goes_off(tmp_path):
-    Image.fromarray(np.zeros((8, 8), np.uint8)).save(tmp_path / "x.png")
-    data = bytearray((tmp_path / "x.png").read_bytes())
-    data[16:24] = (60_000).to_bytes(4, "big") * 2  # width and height
-    data[29:33] = zlib.crc32(bytes(data[12:29])).to_bytes(4, "big")
-    (tmp_path / "x.png").write_bytes(data)
-    with pytest.raises(UnreadableError, match="too many pixels"):
-        read_picture(tmp_path / "x.png")
-
-
-def test_damaged_exif_does_no_harm(tmp_path):
-    exif = Image.Exif()
-    exif[0x0110] = "Box Brownie"
-    Image.fromarray(COLORS).save(tmp_path / "x.jpg", exif=exif)
-    data = (tmp_path / "x.jpg").read_bytes()
-    at = data.index(b"Exif\0\0") + 6
-    (tmp_path / "x.jpg").write_bytes(data[:at] + b"\xff" * 20 + data[at + 20 :])
-    picture = read_picture(tmp_path / "x.jpg")
-    assert dict(picture.exif) == {}
-    assert picture.image.size == (32, 24)
 
 
 @pytest.mark.parametrize("compression", ["group4", "jpeg"])

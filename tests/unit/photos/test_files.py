@@ -1,10 +1,7 @@
 """Every file is looked at or has a reason, and nothing outside the folder is opened."""
 
-import os
-
 import pytest
 
-from sfm_app.errors import InputError
 from sfm_app.photos.files import is_video, list_files, resolve_file
 
 
@@ -22,49 +19,9 @@ def out(tmp_path):
     return tmp_path / "out"
 
 
-def reasons(folder, out):
-    places = {name: resolve_file(folder, name) for name in list_files(folder, out)}
-    return {name: place for name, place in places.items() if isinstance(place, str)}
-
-
 def test_all_files_below_in_order(folder, out):
     assert list_files(folder, out) == ["a.jpg", "b.jpg", "inner/a.jpg"]
     assert resolve_file(folder, "inner/a.jpg") == (folder / "inner/a.jpg").resolve()
-
-
-def test_hidden_files_and_folders_are_named_and_not_opened(folder, out):
-    (folder / ".DS_Store").write_bytes(b"x")
-    (folder / ".git").mkdir()
-    (folder / ".git" / "index").write_bytes(b"x")
-    assert reasons(folder, out) == {".DS_Store": "hidden", ".git": "hidden"}
-
-
-def test_links_are_followed_inside_the_folder_only(folder, out, tmp_path):
-    secret = tmp_path / "secret.jpg"
-    secret.write_bytes(b"x")
-    (folder / "inside.jpg").symlink_to("inner/a.jpg")
-    (folder / "outside.jpg").symlink_to(secret)
-    (folder / "through.jpg").symlink_to("outside.jpg")
-    (folder / "gone.jpg").symlink_to("nowhere.jpg")
-    (folder / "ring.jpg").symlink_to("ring.jpg")
-    (folder / "rooms").symlink_to("inner")
-    (folder / "home").symlink_to(tmp_path)
-
-    assert resolve_file(folder, "inside.jpg") == (folder / "inner/a.jpg").resolve()
-    assert reasons(folder, out) == {
-        "outside.jpg": "a link out of the folder",
-        "through.jpg": "a link out of the folder",
-        "home": "a link out of the folder",
-        "gone.jpg": "a broken link",
-        "ring.jpg": "a broken link",
-        "rooms": "a link to a folder",
-    }
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes on this system")
-def test_a_pipe_is_not_waited_for(folder, out):
-    os.mkfifo(folder / "pipe.jpg")
-    assert reasons(folder, out) == {"pipe.jpg": "not a file"}
 
 
 def test_the_output_folder_is_left_out(folder):
@@ -80,14 +37,6 @@ def test_a_list_names_the_photos(folder, out, tmp_path):
     assert [name for name, place in found.items() if not isinstance(place, str)] == ["b.jpg", "inner/a.jpg"]
     assert found["missing.jpg"] == "missing"
     assert found["../secret.jpg"] == found["/etc/passwd"] == "outside the folder"
-
-
-@pytest.mark.parametrize("content", [None, b"\xff\xfe\x00b"])
-def test_a_list_that_cannot_be_read(folder, out, tmp_path, content):
-    if content is not None:
-        (tmp_path / "list.txt").write_bytes(content)
-    with pytest.raises(InputError, match=r"cannot read .*list\.txt"):
-        list_files(folder, out, tmp_path / "list.txt")
 
 
 HEADS = {

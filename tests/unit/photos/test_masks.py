@@ -1,6 +1,5 @@
 """Masks: which file is whose, what in it counts as masked, and that it lies on the photo as people see it."""
 
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from sfm_app.errors import InputError
 from sfm_app.photos.masks import fill_masked, find_mask, lay_out_mask, list_masks, read_mask, unused_masks
-from sfm_app.types import Photo, UnusablePhoto
+from sfm_app.types import Photo
 
 USED = np.zeros((40, 60), bool)
 USED[5:35, 20:50] = True
@@ -134,54 +132,6 @@ def test_masks_of_photos_that_exif_turns(photos, masks, tmp_path, orientation, d
     Image.fromarray(np.ascontiguousarray(np.where(pixels, np.uint8(9), np.uint8(0)))).save(masks / "a.png", **tags)
     found = find_mask(photo("a.jpg", *upright.shape[::-1]), photos, masks)
     np.testing.assert_array_equal(laid_out(found, photos, masks, tmp_path), upright)
-
-
-def test_a_mask_of_another_shape_is_refused(photos, masks):
-    Image.fromarray(GRAY).save(photos / "a.jpg")
-    Image.fromarray(GRAY).save(masks / "a.jpg.png")
-    for size in ((60, 50), (40, 60), (600, 380)):
-        words = f"the mask a.jpg.png cannot be used: it has 60 x 40 pixels, its photo {size[0]} x {size[1]}"
-        with pytest.raises(InputError, match=words):
-            find_mask(photo("a.jpg", *size), photos, masks)
-
-
-def test_nothing_is_left_of_a_photo_whose_mask_is_black(photos, masks):
-    Image.fromarray(0 * GRAY).save(masks / "a.jpg.png")
-    assert find_mask(photo(), photos, masks) == UnusablePhoto("a.jpg", "its mask a.jpg.png is all black")
-
-
-BAD = {
-    "empty": (lambda place: place.write_bytes(b""), "empty"),
-    "text": (lambda place: place.write_text("black"), "not a photo"),
-    "cut off": (lambda place: place.write_bytes(place.read_bytes()[:60]), "truncated or damaged"),
-    "a folder": (lambda place: place.mkdir(), "a folder"),
-    "a pipe": (os.mkfifo, "not a file"),
-    "a link out": (lambda place: place.symlink_to("/etc/passwd"), "a link out of the folder"),
-    "a broken link": (lambda place: place.symlink_to("nothing.png"), "a broken link"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_a_mask_that_cannot_be_read_is_refused_by_name(photos, masks, case):
-    make, reason = BAD[case]
-    place = masks / "a.jpg.png"
-    if case == "cut off":
-        Image.fromarray(np.random.default_rng(0).integers(0, 255, (40, 60), np.uint8)).save(place)
-    make(place)
-    with pytest.raises(InputError, match=f"the mask a.jpg.png cannot be used: {reason}") as caught:
-        find_mask(photo(), photos, masks)
-    assert "sub/a.jpg.png" in caught.value.hint
-
-
-def test_masks_need_a_folder_of_their_own(photos, tmp_path):
-    (tmp_path / "file").write_text("x")
-    for masks, says in (
-        (tmp_path / "nowhere", "no such folder of masks"),
-        (tmp_path / "file", "not a folder of masks"),
-        (photos / ".." / "photos", "the masks lie among the photos"),
-    ):
-        with pytest.raises(InputError, match=says):
-            list_masks(masks, photos, tmp_path / "out")
 
 
 def test_photos_and_output_inside_the_folder_of_masks_are_no_masks(tmp_path):

@@ -130,6 +130,7 @@ def test_a_photo_that_is_a_little_blurred_stays(spoil):
     assert left_out(*SHARP, spoil(sensor_photo(9))) == {}
 
 
+@pytest.mark.slow
 def test_a_screenshot_of_another_size_is_left_out():
     assert left_out(*SHARP, sensor_photo(5), window((720, 1280))) == {5: "a screenshot or drawing, of another size"}
 

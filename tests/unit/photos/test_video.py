@@ -103,13 +103,6 @@ def test_what_comes_before_the_damage_is_read(tmp_path, name, code):
     assert found.is_cut_short
 
 
-def test_a_file_without_its_index_is_damaged(tmp_path):
-    path = write(tmp_path / "a.mp4", "mp4v")
-    cut(path)
-    with pytest.raises(UnreadableError, match="damaged"), open_video(path):
-        pass
-
-
 def test_ffmpeg_is_silent(tmp_path):
     """In a process of its own: FFmpeg learns how much to say when it is first used."""
     paths = [write(tmp_path / name, code) for name, code in (("a.avi", "MJPG"), ("a.mkv", "MJPG"), ("a.mp4", "mp4v"))]
@@ -289,13 +282,6 @@ def test_an_empty_picture_shows_nothing_to_follow(value):
     assert [look.path_steps for look in looks] == [0.0] * 5
 
 
-def test_the_same_frames_give_the_same_choice(wall):
-    places = np.arange(0, 150, 3.0)
-    first, second = (looks_at(film(wall, places, noise=4.0)) for _ in range(2))
-    assert first == second
-    assert select_keyframes(first, 9) == select_keyframes(second, 9)
-
-
 @given(st.lists(st.tuples(st.floats(0, 1e5), st.floats(-0.9, 1.2)), min_size=1, max_size=60), st.integers(2, 20))
 def test_any_looks_give_a_choice_in_order(steps, most):
     way = np.maximum(0.0, np.cumsum([step for _, step in steps]) - steps[0][1])
@@ -306,7 +292,3 @@ def test_any_looks_give_a_choice_in_order(steps, most):
     assert set(choice.frames) <= {look.frame for look in looks}
     assert len(choice.frames) + sum(choice.rejected.values()) == len(looks)
     assert min(choice.rejected.values(), default=1) > 0
-
-
-def test_no_looks_no_frames():
-    assert select_keyframes([], 10).frames == ()

@@ -153,6 +153,7 @@ def test_nothing_is_found_among_no_pairs():
     assert find_look_alikes(scene.matches, {}, scene.cameras).joins == ()
 
 
+@pytest.mark.slow
 def test_the_pose_graph_does_without_look_alikes():
     scene = walk(0, twice=True)
     K = scene.cameras[1].K

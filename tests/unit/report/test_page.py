@@ -14,7 +14,6 @@ from sfm_app.report.findings import (
     SMALLEST_PX,
     changed_settings,
     correlation_table,
-    correlation_text,
     glance,
     picture_side,
     unknown_cameras,
@@ -123,6 +122,7 @@ def test_photos_that_were_left_out_are_counted_beside_those_that_are_placed(unus
     assert (first.value, first.note) == ("1 of 2", more)
 
 
+@pytest.mark.slow
 def test_a_large_texture_is_shrunk_and_keeps_its_colors(textured_ball):
     large = np.full((3 * LIGHT_PAGE_PX, 2 * LIGHT_PAGE_PX, 3), (10, 120, 240), np.uint8)
     small = large[:64, :96]
@@ -187,7 +187,3 @@ def test_nothing_is_said_where_nothing_is_known():
     guess = Calibration(np.eye(3), 640, 480, "guess", False, correlations=PAIRS.correlations)
     assert correlation_table(guess, None) is None
     assert correlation_table(guess, adjusted((), (0.0,) * 8, fx_k1=0.9)) is None
-
-
-def test_a_correlation_has_two_digits_and_no_negative_zero():
-    assert [correlation_text(value) for value in (-0.001, 0.996, -0.5)] == ["0.00", "1.00", "\N{MINUS SIGN}0.50"]

@@ -184,14 +184,6 @@ def test_two_hosts_in_one_request_are_refused(server):
     connection.close()
 
 
-@pytest.mark.parametrize(
-    "address", ["/../secret.txt", "/photos/../../secret.txt", "/..%2fsecret.txt", "/manifest.json"]
-)
-def test_files_that_the_page_does_not_load_are_not_there(server, address):
-    answer, body = ask(server, address)
-    assert answer.status == 404 and b"secret" not in body
-
-
 def test_nothing_can_be_sent_to_it(server):
     assert ask(server, "/", "POST")[0].status == 501
 

@@ -8,19 +8,6 @@ from sfm_app.runtime import workspace
 from sfm_app.runtime.workspace import LOCK, Manifest, StageRecord, Workspace, model_triangles
 
 
-def test_a_file_in_place_of_the_folder_is_an_input_error(tmp_path):
-    (tmp_path / "out").write_text("in the way")
-    with pytest.raises(InputError, match="cannot write to"):
-        Workspace(tmp_path / "out").create()
-
-
-@pytest.mark.parametrize("inside", ["photos", "photos/2024", "sparse", "dense/images", "other_models/1"])
-def test_photos_are_never_where_the_run_writes(tmp_path, inside):
-    with pytest.raises(InputError, match="keeps its own files") as caught:
-        Workspace(tmp_path).check_no_overlap(tmp_path / inside)
-    assert "-o" in caught.value.hint
-
-
 def test_photos_beside_what_the_run_writes_are_fine(tmp_path):
     Workspace(tmp_path).check_no_overlap(tmp_path / "my photos")
     Workspace(tmp_path / "photos" / "out").check_no_overlap(tmp_path / "photos")
@@ -108,12 +95,6 @@ def test_a_stage_whose_file_changed_is_not_current(manifest, damage):
         path.unlink()
 
     assert not is_current(manifest, "photos", "abc")
-
-
-@pytest.mark.parametrize("text", ["", "[]", "{", '{"stages": {"photos": 3}}', '{"stages": {"photos": {"odd": 1}}}'])
-def test_a_broken_manifest_counts_as_none(manifest, text):
-    (manifest.root / "manifest.json").write_text(text)
-    assert manifest.record("photos") is None
 
 
 def test_forgotten_stages_leave_the_others(manifest):

@@ -74,12 +74,6 @@ def test_close_focals_are_mostly_split(shots):
     assert right >= 7
 
 
-def test_the_scale_of_the_weights_does_not_matter(shots):
-    made = shots(8, 1, focal=[1000.0] * 4 + [1500.0] * 4, points=120)
-    assert groups(made, weights=np.full(len(made.pairs.Fs), 0.05))[1] == groups(made)[1]
-    assert set(groups(made)[1]) == {0, 1}
-
-
 def divided(made, Fs=None, kept=None, starts=(1.0,)):
     """The division of photos of 1000 x 750 pixels; `kept`: pairs that are there."""
     Fs = MIDDLE.T @ (made.pairs.Fs if Fs is None else Fs) @ MIDDLE

@@ -42,15 +42,6 @@ def test_parts_belong_to_the_matrix(views):
     np.testing.assert_allclose(np.linalg.norm(pairs.e2, axis=1), 1)
 
 
-@pytest.mark.parametrize("scale", [1e-200, -1.0, 1e200])
-def test_scale_does_not_matter(views, scale):
-    made = views(3)
-    plain = prepare(CameraPairs.from_Fs(made.Fs, made.size, made.weights), **FRAME)
-    scaled = prepare(CameraPairs.from_Fs(scale * made.Fs, made.size, made.weights), **FRAME)
-    np.testing.assert_allclose(np.abs(scaled.F), np.abs(plain.F), rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(scaled.product, plain.product)
-
-
 def test_pairs_without_weight_are_left_out_and_repeated_ones_count_once(views):
     made = views(3)
     np.testing.assert_array_equal(
@@ -63,32 +54,7 @@ def test_pairs_without_weight_are_left_out_and_repeated_ones_count_once(views):
     assert len(prepare(CameraPairs.from_Fs(near, made.size, made.weights), **FRAME)) == 3
 
 
-def test_no_pairs_are_fine():
-    assert len(prepare(CameraPairs.from_Fs([], (4, 3), []), **FRAME)) == 0
-
-
 F = np.eye(3)[None]
-
-
-@pytest.mark.parametrize(
-    ("Fs", "weights", "size", "message"),
-    [
-        (np.eye(3), [1.0], (4, 3), "shape"),
-        (np.ones((2, 3, 4)), [1.0, 1.0], (4, 3), "shape"),
-        (F, [1.0, 1.0], (4, 3), "one per fundamental matrix"),
-        (F, 1.0, (4, 3), "one per fundamental matrix"),
-        (np.full((1, 3, 3), np.nan), [1.0], (4, 3), "finite"),
-        (np.full((1, 3, 3), np.inf), [1.0], (4, 3), "finite"),
-        (F, [np.nan], (4, 3), "weights"),
-        (F, [-1.0], (4, 3), "weights"),
-        (np.zeros((1, 3, 3)), [1.0], (4, 3), "zero"),
-        (F, [1.0], (0, 3), "size"),
-        (F, [1.0], (4, np.nan), "size"),
-    ],
-)
-def test_malformed_input_is_refused(Fs, weights, size, message):
-    with pytest.raises(ValueError, match=message):
-        prepare(CameraPairs.from_Fs(Fs, size, weights), **FRAME)
 
 
 FOCAL, U, V, LOG_A = 1.1, 0.03, -0.02, 0.04

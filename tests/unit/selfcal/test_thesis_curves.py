@@ -171,13 +171,6 @@ def test_degeneracy_is_the_share_out_of_range():
     np.testing.assert_array_equal(usable_curves(curves, 3.0), curves[[0, 1, 3]])
 
 
-def test_no_pairs_no_curves():
-    pairs = in_widths(np.empty((0, 3, 3)))
-    assert focal_curves(pairs, np.ones(7), (0.5, 0.4)).shape == (0, 7)
-    assert center_curves(pairs, np.ones(7), (1.0, 1.0)).shape == (0, 7)
-    assert len(usable_curves(np.empty((0, 7)), 3.0)) == 0
-
-
 def lines_through(x0, y0, slopes):
     return np.array([y0 + slope * (X - x0) for slope in slopes])
 
@@ -202,12 +195,6 @@ def test_score_is_thesis_5_33_as_a_maximum():
     found = meeting_point(curves, 3.0, 0.3)
     assert (found.sample, found.value) == (j, curves[k, j])
     assert found.support == pytest.approx(rho[k, j] / 5)
-
-
-def test_one_curve_meets_nothing():
-    for count in (0, 1):
-        assert meeting_point(np.ones((count, 5)), 3.0, 0.1) is None
-    assert meeting_points(np.ones((1, 5)), np.linspace(0.5, 1, 5), (0.3, 3.0), 0.1) == []
 
 
 def test_samples_out_of_range_are_no_answer():
@@ -260,12 +247,6 @@ def test_finds_the_camera_to_a_sample_of_the_sweep(views, aspect, seed):
     assert np.abs(found.K[:2, 2] - made.K[:2, 2]).max() < 50
     assert 0.8 < found.evidence["focal_support"] < 1
     assert found.evidence["focal_curves"] <= found.evidence["pairs"] == 10
-
-
-def test_focal_and_center_in_x_are_samples_of_the_sweep(views):
-    found = run(views(5), OPTIONS.model_copy(update={"samples": 50}))
-    assert found.K[0, 0] / 60 == pytest.approx(round(found.K[0, 0] / 60))
-    assert found.K[0, 2] / 20 == pytest.approx(round(found.K[0, 2] / 20))
 
 
 def test_two_cameras_have_two_peaks(views):

@@ -1,12 +1,10 @@
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from sfm_app.errors import InputError
 from sfm_app.photos.probe import read_photo
 from sfm_app.photos.source import read_source
 from sfm_app.plugins import load_plugins
@@ -56,27 +54,6 @@ def load(folder, run):
     return photos.load(source_of(folder, run), run)
 
 
-def test_every_file_is_used_or_has_a_reason(folder, run):
-    (folder / "notes.txt").write_text("no photo")
-    (folder / "empty.jpg").write_bytes(b"")
-    (folder / "cut.jpg").write_bytes((folder / "a.jpg").read_bytes()[:2000])
-    Image.fromarray(PIXELS[:40, :40]).save(folder / "tiny.png")
-    (folder / ".hidden.jpg").write_bytes(b"x")
-    (folder / "copy.png").write_bytes((folder / "b.png").read_bytes())
-    (folder / "sub dir").mkdir()
-    Image.fromarray(PIXELS).save(folder / "sub dir" / "ü b.jpg")
-
-    found = make(folder, run)
-
-    assert [photo.name for photo in found.photos] == ["a.jpg", "b.png", "sub dir/ü b.jpg"]
-    assert {photo.name: photo.reason for photo in found.unusable} == {
-        ".hidden.jpg": "hidden", "notes.txt": "not a photo", "empty.jpg": "empty", "cut.jpg": "truncated or damaged",
-        "tiny.png": "smaller than 64 px", "copy.png": "the same picture as b.png",
-    }  # fmt: skip
-    assert load(folder, run) == found
-    assert np.array_equal(np.asarray(Image.open(run.workspace.photos / "b.png")), pixels(2))
-
-
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_camera_that_was_turned_keeps_its_layout_and_mirrors_are_undone(folder, run, orientation):
     exif = Image.Exif()
@@ -94,22 +71,6 @@ def test_a_camera_that_was_turned_keeps_its_layout_and_mirrors_are_undone(folder
     upright = {2: PIXELS[:, ::-1], 4: PIXELS[::-1], 5: PIXELS.swapaxes(0, 1), 7: np.rot90(PIXELS, 2).swapaxes(0, 1)}
     expected = np.rot90(upright.get(orientation, PIXELS), orientation in (5, 7))  # these two lie as the others then
     assert np.array_equal(np.asarray(seen), expected)
-
-
-@pytest.mark.parametrize("mode", ["RGBA", "P", "LA", "I;16", "1", "CMYK"])
-def test_odd_pixel_formats_become_eight_bit(folder, run, mode):
-    deep = Image.fromarray(PIXELS[..., 0].astype(np.uint16) * 256)
-    image = deep if mode == "I;16" else Image.fromarray(PIXELS).convert(mode)
-    name = "odd.jpg" if mode == "CMYK" else "odd.png"
-    image.save(folder / name)
-
-    make(folder, run)
-    seen = Image.open(run.workspace.photos / name)
-    seen.load()
-
-    assert seen.mode in ("RGB", "L")
-    dark, bright = np.asarray(seen.convert("L"))[:48].mean(), np.asarray(seen.convert("L"))[48:].mean()
-    assert bright > 2 * dark > 10
 
 
 def test_photos_of_one_size_share_a_camera_unless_exif_tells_them_apart(folder, run):
@@ -193,15 +154,6 @@ def test_photos_too_large_for_the_memory_are_scaled_down_and_say_so(folder, run)
     assert photo.notes == (f"scaled down from 1792 x 1920 to {photo.width} x {photo.height} pixels",)
 
 
-def test_the_output_folder_inside_the_photos_is_not_read(folder, tmp_path):
-    workspace = Workspace(folder / "out")
-    workspace.create()
-    Image.fromarray(PIXELS).save(folder / "out" / "model.png")
-    with make_executor(1) as executor:
-        found = make(folder, RunContext(Settings(), workspace, load_plugins(installed=False), executor, 1))
-    assert [photo.name for photo in found.photos] == ["a.jpg", "b.png"]
-
-
 def test_photos_that_came_later_are_read_and_known_ones_are_not_decoded_again(folder, run, monkeypatch):
     make(folder, run)
     Image.fromarray(pixels(3)).save(folder / "c.jpg")
@@ -218,25 +170,6 @@ def test_photos_that_came_later_are_read_and_known_ones_are_not_decoded_again(fo
     assert make(folder, run) == found
 
 
-@pytest.mark.parametrize(
-    ("files", "photos", "says"),
-    [
-        ((), (), "no usable photo in .*: the folder is empty"),
-        (("notes.txt", "more.txt"), (), "no usable photo in .*: 2 not a photo"),
-        ((), ("one.jpg",), "only one usable photo in .*: it has no other file"),
-    ],
-)
-def test_too_few_photos(tmp_path, run, files, photos, says):
-    folder = tmp_path / "few"
-    folder.mkdir()
-    for name in files:
-        (folder / name).write_text("text")
-    for name in photos:
-        Image.fromarray(PIXELS).save(folder / name)
-    with pytest.raises(InputError, match=says):
-        make(folder, run)
-
-
 @pytest.mark.parametrize(("limit", "told"), [(1, ["2 files: if this is not the folder"]), (2, [])])
 def test_a_folder_of_very_many_files_may_be_another_than_meant(folder, run, monkeypatch, limit, told):
     said = []
@@ -244,12 +177,3 @@ def test_a_folder_of_very_many_files_may_be_another_than_meant(folder, run, monk
     monkeypatch.setattr(run.progress, "say", said.append)
     make(folder, run)
     assert [line[: len(told[0])] for line in said] == told if told else said == []
-
-
-def test_a_missing_folder_or_a_file(tmp_path, run):
-    with pytest.raises(InputError, match="no such folder"):
-        make(tmp_path / "nowhere", run)
-    path = Path(tmp_path / "file.jpg")
-    path.write_bytes(b"x")
-    with pytest.raises(InputError, match="not a folder"):
-        make(path, run)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfm_app.errors import InputError
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
@@ -110,14 +109,6 @@ def test_a_video_that_is_cut_off_says_so(clip, run):
     names = frames_of(clip, run)
     assert 5 <= len(names) <= 8
     assert "cut off" in run.statistics["video"]["notes"][0]
-
-
-@pytest.mark.parametrize(
-    ("places", "says"), [([5] * 9, "does not move"), ([9], "does not move"), ([None] * 5, "interlaced")]
-)
-def test_a_video_that_shows_too_little_is_refused(tmp_path, run, places, says):
-    with pytest.raises(InputError, match=says):
-        frames_of(write(tmp_path / "still.avi", places), run)
 
 
 def test_frames_that_come_out_black_are_passed_over(tmp_path, run):

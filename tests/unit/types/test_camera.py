@@ -26,13 +26,6 @@ def test_every_field_of_a_calibration_survives():
             assert type(getattr(back, name)) is type(getattr(one, name))
 
 
-def test_files_from_before_there_were_correlations_are_read():
-    older = FOUND.to_dict()
-    del older["correlations"]
-
-    assert Calibration.from_dict(older).correlations == {}
-
-
 def test_distortion_is_written_only_where_there_is_any():
     terms = (-0.1, 0.02, 0.001, -0.002, 0.0, 0.0, 0.0, 0.0)
     one = replace(FOUND, distortion=terms, method="kept")
@@ -40,10 +33,6 @@ def test_distortion_is_written_only_where_there_is_any():
     assert "distortion" not in FOUND.to_dict()
     assert Calibration.from_dict(json.loads(json.dumps(one.to_dict()))).distortion == terms
     assert one.is_kept and one.is_given and one.is_bent and not FOUND.is_given
-
-
-def test_the_focal_is_the_geometric_mean_of_both_directions():
-    assert replace(FOUND, K=np.diag([5.0, 6.0, 1.0])).focal_px == np.sqrt(30)
 
 
 def test_cameras_keep_their_order_names_and_photos():
