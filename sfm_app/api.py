@@ -308,8 +308,8 @@ def export_model(
     suffix = place.suffix.removeprefix(".").lower() if target is not None and not place.is_dir() else ""
     exporter = plugins.exporter(file_format or suffix)
     if place.is_dir():  # a format with the suffix of another one gets a file of its own
-        place /= ("points" if points else "model") + (f"-{exporter.name}" if exporter.suffix else "")
-    place = _with_suffix(place, exporter.ending)
+        place /= ("points" if points else "model") + (f"-{exporter.name}" if exporter.name != exporter.suffix else "")
+    place = _with_suffix(place, exporter.suffix)
     with open_run(Path(out), Settings(), None) as run:
         model = stored_model(run, points=points)
     files = exporter.write(model, place.stem)
@@ -356,7 +356,7 @@ def export_scene(
             with _naming_target(folder), fill_folder(folder, lambda: scene.record_entries(exporter.name)) as path:
                 exporter.write(scene, path)
             return folder
-        file = _with_suffix(place / exporter.file if place.is_dir() else place, exporter.ending)
+        file = _with_suffix(place / exporter.file if place.is_dir() else place, exporter.suffix)
         with _naming_target(file), replace_atomically(file) as path:
             exporter.write(scene, path)
         return file
@@ -368,8 +368,8 @@ def _with_suffix(place: Path, suffix: str) -> Path:
     if given == suffix:
         return place
     plugins = load_plugins()
-    endings = {part.ending for part in plugins.exporters.values()}
-    if given and given in endings | {part.ending for part in plugins.scene_exporters.values()}:
+    suffixes = {part.suffix for part in plugins.exporters.values()}
+    if given and given in suffixes | {part.suffix for part in plugins.scene_exporters.values()}:
         raise ConfigError(f"{place.name} does not end in .{suffix}", hint=f"name it {place.stem}.{suffix}")
     return Path(f"{place}.{suffix}")
 

@@ -14,7 +14,7 @@ from sfm_app.frame.scale import MetricFrame
 from sfm_app.photos.source import read_source
 from sfm_app.runtime.context import CONTROL_POINTS, GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.parallel import ordered_map
-from sfm_app.stages import depth_maps, export, intrinsics, match_graph, mesh, photos, scale, scene, texture, view_graph
+from sfm_app.stages import depth_maps, files, intrinsics, match_graph, mesh, photos, scale, scene, texture, view_graph
 from sfm_app.types import Intrinsics, MatchGraph, Model, PhotoSet, Scene, Surface, ViewGraph
 
 PHOTOS: Stage[PhotoSet] = Stage(
@@ -107,9 +107,9 @@ FILES: Stage[tuple[Path, ...]] = Stage(
     takes=(SCALE, TEXTURE),
     settings=(),
     files=("model.ply", "model.glb"),
-    make=lambda given, run: export.make(given[TEXTURE], given[SCALE], run),
-    load=lambda _, run: export.load(run),
-    digest=export.digest,
+    make=lambda given, run: files.make(given[TEXTURE], given[SCALE], run),
+    load=lambda _, run: files.load(run),
+    digest=files.digest,
 )
 
 PIPELINE = Pipeline(PHOTOS, (MATCH_GRAPH, VIEW_GRAPH, INTRINSICS, SCENE, SCALE, DEPTH_MAPS, MESH, TEXTURE, FILES))

@@ -103,7 +103,9 @@ class CalibrationSettings(Section):
     """The camera matrix from the fundamental matrices."""
 
     calibrator: str = Field("zero-curves", description="name of the calibrator (see `sfm-app plugins`)")
-    samples: int = Field(100, ge=10, le=10000, description="samples along one zero curve")
+    samples: int = Field(
+        100, ge=10, le=10000, description="samples along one zero curve; only `zero-curves-thesis` uses it"
+    )
     constraint_form: ConstraintForm = Field(
         "huang-faugeras",
         description="constraint that the thesis's least-squares calibrators minimize: huang-faugeras (5.8), "

@@ -12,7 +12,7 @@ from sfm_app.fundamental.estimate import fit_by_recipe
 from sfm_app.fundamental.lev_ransac import PRODUCTION
 from sfm_app.fundamental.leverage import prior_validity
 from sfm_app.fundamental.loop import Recipe
-from sfm_app.fundamental.pretests import FullVerification, Sprt
+from sfm_app.fundamental.pretests import FullScoring, Sprt
 from sfm_app.fundamental.refits import refit_sampson
 from sfm_app.fundamental.scores import msac
 from sfm_app.settings import EpipolarSettings
@@ -34,8 +34,8 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "no local optimization": {"improve": None, "fine_score": None},
     "no plane and parallax": {"recover": None},
     "no orientation test": {"oriented": False},
-    "no bail-out": {"verifier": FullVerification},
-    "SPRT instead of bail-out": {"verifier": Sprt},
+    "no bail-out": {"pretest": FullScoring},
+    "SPRT instead of bail-out": {"pretest": Sprt},
     "least squares on the inliers last": {"finish": refit_sampson},
 }
 """Name of the missing part, and the fields of the recipe that switch it off."""

@@ -9,9 +9,9 @@ import click
 from pydantic.fields import FieldInfo
 
 from sfm_app import errors
-from sfm_app.cli import main
 from sfm_app.cli.commands import config, known_formats
 from sfm_app.cli.options import SETTING_FLAGS, range_text
+from sfm_app.cli.program import main
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import QUALITY_PRESETS, Section, Settings, merge_nested
 

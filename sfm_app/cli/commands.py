@@ -265,7 +265,7 @@ def choose_format(name: str, target: Path | None) -> str:
     formats = known_formats()
     suffix = target.suffix.removeprefix(".").lower() if target is not None else ""
     if not name and suffix:  # a format of that name has priority over others with that suffix
-        matches = [key for key, part in formats.items() if part.ending == suffix]
+        matches = [key for key, part in formats.items() if part.suffix == suffix]
         name = suffix if suffix in formats else next(iter(matches), suffix)
     if name in formats:
         return name

@@ -1,4 +1,7 @@
-"""File formats for models and whole scenes, offered like plug-ins."""
+"""File formats for models and whole scenes, offered like plug-ins.
+
+A new built-in format is a writing function in a module of this package, and a row of `_MODELS` or `_SCENES` below.
+"""
 
 from functools import partial
 from importlib import import_module
@@ -34,15 +37,19 @@ _no_draco = partial(missing_package, "DracoPy", "DracoPy")
 _no_laz = partial(missing_package, "laspy[lazrs]", "lazrs")
 
 _MODELS = (
-    Exporter("ply", write_ply, "binary PLY, colors and normals per vertex; MeshLab, CloudCompare, Blender"),
-    Exporter("glb", write_glb, "binary glTF 2.0, textured, all in one file; web viewers, game engines, Blender"),
-    Exporter("obj", write_obj, "Wavefront OBJ with MTL and JPEG pages, textured; everything else"),
+    Exporter("ply", write_ply, "ply", "binary PLY, colors and normals per vertex; MeshLab, CloudCompare, Blender"),
+    Exporter("glb", write_glb, "glb", "binary glTF 2.0, textured, all in one file; web viewers, game engines, Blender"),
+    Exporter("obj", write_obj, "obj", "Wavefront OBJ with MTL and JPEG pages, textured; everything else"),
     Exporter(
-        "stl", write_stl, "binary STL in millimeters, z up, no colors; programs for 3D printers", holds_points=False
+        "stl",
+        write_stl,
+        "stl",
+        "binary STL in millimeters, z up, no colors; programs for 3D printers",
+        holds_points=False,
     ),
-    Exporter("draco", _draco, "GLB compressed by Draco, a quarter of the size; web viewers", "glb", _no_draco),
-    Exporter("usdz", _usdz, "USD and its texture in one file; Apple's Quick Look, Blender", unavailable=_no_usd),
-    Exporter("usd", _usd, "binary USD with JPEG pages; Blender, Houdini, Omniverse", unavailable=_no_usd),
+    Exporter("draco", _draco, "glb", "GLB compressed by Draco, a quarter of the size; web viewers", _no_draco),
+    Exporter("usdz", _usdz, "usdz", "USD and its texture in one file; Apple's Quick Look, Blender", _no_usd),
+    Exporter("usd", _usd, "usd", "binary USD with JPEG pages; Blender, Houdini, Omniverse", _no_usd),
 )
 _SCENES = (
     SceneExporter("colmap", write_colmap, "folder images/, sparse/0: undistorted photos, COLMAP's binary model"),
@@ -57,14 +64,7 @@ _SCENES = (
     ),
     SceneExporter("opencv", write_opencv, "folder with a YAML file per camera, with its photos' poses, for OpenCV"),
     SceneExporter("cloud-ply", write_cloud_ply, "the dense cloud as PLY; CloudCompare, MeshLab", "cloud.ply", CLOUD),
-    SceneExporter(
-        "laz",
-        _load_later("laz", "write_laz"),
-        "the dense cloud as compressed LAS; PDAL, QGIS",
-        "cloud.laz",
-        CLOUD,
-        _no_laz,
-    ),
+    SceneExporter("laz", _laz, "the dense cloud as compressed LAS; PDAL, QGIS", "cloud.laz", CLOUD, _no_laz),
 )
 EXPORTERS = {exporter.name: exporter for exporter in _MODELS}
 SCENE_EXPORTERS = {exporter.name: exporter for exporter in _SCENES}

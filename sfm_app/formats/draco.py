@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.formats.exporters import check, pages_in_use, split_corners
+from sfm_app.formats.exporters import check_writable, pages_in_use, split_corners
 from sfm_app.formats.gltf import COMPONENTS, UNLIT, Glb, add_page_material, add_unlit_material, linear_colors, write_glb
 from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Model, Texture
@@ -41,7 +41,7 @@ OPTIONS = DracoOptions()
 
 def write_draco(model: Model, name: str) -> Mapping[str, bytes]:
     """Write compressed triangles with a texture or a color per vertex, without cameras; points as in a plain GLB."""
-    check(model)
+    check_writable(model)
     if not len(model.surface.faces):
         return write_glb(model, name)
     glb = Glb(extensionsUsed=[UNLIT, DRACO], extensionsRequired=[DRACO], scene=0)

@@ -41,18 +41,13 @@ class Exporter:
 
     name: str
     write: WriteModel
+    suffix: str
+    """Suffix, without dot, of the file to open."""
     summary: str = ""
-    suffix: str = ""
-    """Suffix, without dot, of the file to open; empty if it equals the name."""
     unavailable: Callable[[], str] = _no_reason
     """Why this machine cannot write it; empty if it can."""
     holds_points: bool = True
     """Whether it stores points and cameras, too."""
-
-    @property
-    def ending(self) -> str:
-        """Suffix, without dot, of the file to open."""
-        return self.suffix or self.name
 
 
 class PerspectiveScene(Protocol):
@@ -112,7 +107,7 @@ class SceneExporter:
     unavailable: Callable[[], str] = _no_reason
 
     @property
-    def ending(self) -> str:
+    def suffix(self) -> str:
         """Suffix of its file, without dot; empty for a folder."""
         return Path(self.file).suffix.removeprefix(".")
 
@@ -122,7 +117,7 @@ def missing_package(package: str, module: str) -> str:
     return "" if find_spec(module) else f"the package {package} is not installed"
 
 
-def check(model: Model) -> None:
+def check_writable(model: Model) -> None:
     """Check that a model can be written.
 
     Raises:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.formats.exporters import NORMAL_TYPE, check, jpeg, normal_picture, pages_in_use, split_corners
+from sfm_app.formats.exporters import NORMAL_TYPE, check_writable, jpeg, normal_picture, pages_in_use, split_corners
 from sfm_app.formats.frusta import CAMERA_COLOR, camera_lines, center, frustum_depth
 from sfm_app.geometry.triangles import corner_tangents, unit_normals
 from sfm_app.types import Frustum, Model, Texture
@@ -88,7 +88,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 
 def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
     """Write triangles with a texture or a color per vertex, or else points; and the cameras, if any."""
-    check(model)
+    check_writable(model)
     texture = model.texture if len(model.surface.faces) else None
     is_lit = texture is not None and bool(texture.normal_maps)
     glb = Glb(**({} if is_lit and not model.cameras else {"extensionsUsed": [UNLIT]}), scene=0)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.errors import ReconstructionError
-from sfm_app.formats.exporters import NORMAL_SUFFIX, FinishedScene, check, jpeg, normal_picture, pages_in_use
+from sfm_app.formats.exporters import NORMAL_SUFFIX, FinishedScene, check_writable, jpeg, normal_picture, pages_in_use
 from sfm_app.formats.frusta import append_cameras, camera_dots, scene_size
 from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Model, Texture
@@ -31,7 +31,7 @@ def write_ply(model: Model, name: str) -> Mapping[str, bytes]:
     Cameras are dots: readers differ on files with points and edges, but all show colored points in the same way. PLY
     has no common way to store a texture, or cameras beside a surface: both are left out.
     """
-    check(model)
+    check_writable(model)
     surface = model.surface
     if len(surface.faces):
         columns: Columns = [surface.vertices, unit_normals(surface), surface.colors]
@@ -100,7 +100,7 @@ def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
 
     The files are the OBJ and, with a texture, the MTL, a JPEG per page, and the normal map, if any.
     """
-    check(model)
+    check_writable(model)
     texture = model.texture if len(model.surface.faces) else None
     stem = re.sub(r"\s", "_", name)  # many readers end file names at a blank
     text = ["# sfm_app\n", *_vertex_lines(model, with_colors=texture is None)]
@@ -180,7 +180,7 @@ def write_stl(model: Model, name: str) -> Mapping[str, bytes]:
     """
     import trimesh  # slow to load, and few need it
 
-    check(model)
+    check_writable(model)
     surface = model.surface
     if not len(surface.faces):
         raise ReconstructionError("STL holds triangles only", hint="--format ply or glb for points and cameras")

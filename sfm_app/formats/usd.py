@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.formats.exporters import NORMAL_SUFFIX, check, jpeg, normal_picture, pages_in_use
+from sfm_app.formats.exporters import NORMAL_SUFFIX, check_writable, jpeg, normal_picture, pages_in_use
 from sfm_app.formats.frusta import center, frustum_depth
 from sfm_app.formats.gltf import FLIP, linear_colors
 from sfm_app.geometry.triangles import unit_normals
@@ -34,7 +34,7 @@ def write_usd(model: Model, name: str) -> Mapping[str, bytes]:
 
     The files are the stage in USD's binary form, a JPEG per page of texture, and the normal map, if any.
     """
-    check(model)
+    check_writable(model)
     pages = page_files(model, name)
     with tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch:
         path = Path(scratch) / "model.usdc"

@@ -1,9 +1,11 @@
 """Robust estimation of fundamental matrices (thesis, chapter 4).
 
-An estimator is a `loop.Recipe`: sampler, solver, score, pre-test, stopping rule and final fit. In the order of a run:
+An estimator is a `loop.Recipe`: size and priors of the samples, pre-test, score, stopping rules, local optimization and
+final fit. In the order of a run:
 
 1. `points` checks and scales the matches.
-2. `loop` draws `samples`, solves (`solvers`), tests (`pretests`) and scores (`scores`) until a stopping rule holds.
+2. `loop` draws `samples`; `solvers` compute models, which it pre-tests (`pretests`) and scores (`scores`) until a
+   stopping rule holds.
 3. `refits` computes the final F.
 4. `estimate` asks whether the support can be chance (`a_contrario`) and whether the matches determine F (`degeneracy`).
 
@@ -19,7 +21,7 @@ from collections.abc import Callable
 from sfm_app.fundamental.estimate import assess_fundamental, estimate_with
 from sfm_app.fundamental.lev_ransac import fit_lev_ransac
 from sfm_app.fundamental.points import check_points
-from sfm_app.fundamental.recipes import RECIPES, classical_estimator
+from sfm_app.fundamental.recipes import RECIPES, recipe_estimator
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
 from sfm_app.types.arrays import FloatArray
@@ -28,7 +30,7 @@ FitFundamentalLike = Callable[[FloatArray, FloatArray, EpipolarSettings, int], E
 
 ESTIMATORS: dict[str, tuple[FitFundamentalLike, str]] = {
     "lev-ransac": (fit_lev_ransac, "samples guided by Cook's distances, local optimization, robust refit; the default"),
-    **{name: (classical_estimator(name), about) for name, (_, about) in RECIPES.items()},
+    **{name: (recipe_estimator(name), about) for name, (_, about) in RECIPES.items()},
 }
 """By name: the estimator and one line about it."""
 

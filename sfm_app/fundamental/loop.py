@@ -1,4 +1,4 @@
-"""The loop of every estimator: draw, solve, test, score, refine, stop (thesis 4.4, Figure 3.7 and Algorithm 1)."""
+"""The loop of every estimator: draw, solve, pre-test, score, refine, stop (thesis 4.4, Figure 3.7 and Algorithm 1)."""
 
 import math
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_app.fundamental.points import Matches
-from sfm_app.fundamental.pretests import LENIENCE, NO_PRETEST, FullVerification, PreTest, Verifier
+from sfm_app.fundamental.pretests import LENIENCE, NO_PRETEST, AdaptivePreTest, FullScoring, PreTest
 from sfm_app.fundamental.samples import (
     SAMPLE_SIZE,
     RandomState,
@@ -34,7 +34,7 @@ Validity = Callable[[FloatArray, FloatArray, float], FloatArray]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recipe:
-    """One estimator: sampler, solver, score, verifier, stopping rule, final fit."""
+    """One estimator: score, final fit, samples and their priors, pre-test, stopping rules and local optimization."""
 
     score: Score
     finish: Refine
@@ -50,7 +50,7 @@ class Recipe:
     """Samples between two checks for a better model."""
     warmup_share: float = 0.0
     """Share of the trials before the first priors."""
-    verifier: Callable[[int, int], Verifier] = FullVerification
+    pretest: Callable[[int, int], AdaptivePreTest] = FullScoring
     """(number of matches, sample size) -> the pre-test of hypotheses."""
     assumed_share: float | None = None
     """Share of inliers for the number of trials (thesis 3.19); None: that of the best model."""
@@ -254,13 +254,13 @@ class _Loop:
     ) -> None:
         self.points, self.threshold = matches.points, options.max_error_px / matches.unit_px
         self.options, self.recipe, self.draw_until_better = options, recipe, draw
-        self.test = recipe.verifier(len(self.points), recipe.sample_size)
+        self.adaptive = recipe.pretest(len(self.points), recipe.sample_size)
         self.best, self.share = BestModel(self.points, self.threshold, recipe), recipe.assumed_share or 0.0
         self.priors, self.state = np.ones(len(self.points)), random_state(seed)
         no_rest = np.zeros(1)
         equal = np.cumsum(self.priors)
         self.draws = SamplingPlan(recipe.sample_size, recipe.oriented, recipe.batch, 0.0, equal, 0.0, no_rest)
-        random_start = self.test.pretest.random_start
+        random_start = self.adaptive.pretest.random_start
         self.circle = np.asfortranarray(np.vstack([self.points] * 2)) if random_start else self.points
         self.trials, self.idle, self.has_priors = 0, 0, False
         self.patience = recipe.least_trials if recipe.patience is not None else math.inf
@@ -274,7 +274,7 @@ class _Loop:
         if not self.best:
             return None
         if self.recipe.recover is not None:
-            pretest = NO_PRETEST if self.test.pretest.random_start else self.test.pretest
+            pretest = NO_PRETEST if self.adaptive.pretest.random_start else self.adaptive.pretest
             F = self.best.f.reshape(3, 3)
             recovered = self.recipe.recover(self.points, F, self.threshold, self.best.loss, pretest, self.state)
             if recovered is not None:
@@ -283,30 +283,30 @@ class _Loop:
 
     def _draw(self) -> bool:
         """Draw samples until a better model or the next decision; return whether the best model changed."""
-        most = min(self.limit - self.trials, self.test.review, self.patience - self.idle)
+        most = min(self.limit - self.trials, self.adaptive.review, self.patience - self.idle)
         if self.trials < self.warmup_trials:
             most = min(most, self.warmup_trials - self.trials)
         best, before = self.best, self.best.to_beat.copy()
-        pretests = self.test.pretest, self.test.lenient  # guided, unguided
+        pretests = self.adaptive.pretest, self.adaptive.lenient  # guided, unguided
         drawn = self.draw_until_better(
             self.circle, self.draws, best.loss, pretests, best.to_beat, int(most), self.state, best.samples
         )
         self.trials += drawn
         self.idle += drawn
-        self.test.learn(drawn)
+        self.adaptive.learn(drawn)
         improved = np.flatnonzero(best.to_beat < before).tolist()
         better = any([best.update(kind) for kind in improved])  # noqa: C419  update both kinds
         if better:
             share = best.inlier_share()
             self.idle, self.share = 0, self.recipe.assumed_share or max(self.share, share)
-            self.test.expect(share)
+            self.adaptive.expect(share)
             if self.recipe.patience is not None:
                 self.patience = self.recipe.least_trials
         self._update_limits()
         return better
 
     def _update_limits(self) -> None:
-        needed = max(self.test.required_trials(self.share, self.options.confidence), self.recipe.least_trials)
+        needed = max(self.adaptive.required_trials(self.share, self.options.confidence), self.recipe.least_trials)
         self.limit = math.ceil(min(self.options.max_trials, needed))
         self.warmup_trials = math.ceil(self.recipe.warmup_share * self.limit)
 

@@ -10,11 +10,11 @@ import numpy as np
 from sfm_app.fundamental.samples import required_trials
 from sfm_app.types.arrays import IndexArray
 
-# Every test is one list: how many of the first m matches must be inliers for the check of a hypothesis to continue.
+# Every pre-test is one list: how many of the first m matches must be inliers for the check of a hypothesis to continue.
 # Wald's likelihood ratio after m matches depends only on how many of them were inliers, so that its threshold is such
 # a list, too.
 #
-# Randomized tests begin at a new random match for every hypothesis. In a fixed order, outliers among the first
+# Randomized pre-tests begin at a new random match for every hypothesis. In a fixed order, outliers among the first
 # matches would reject every good model. The stopping rules assume errors that are independent between hypotheses.
 
 BLOCK = 64
@@ -26,10 +26,10 @@ LENIENCE = 0.5
 
 
 class PreTest(NamedTuple):
-    """A test and its statistics, as passed to kernels."""
+    """A pre-test and its statistics, as passed to kernels."""
 
     least_inliers: IndexArray
-    """Inliers that a hypothesis must have after each `stride` matches; empty for no test."""
+    """Inliers that a hypothesis must have after each `stride` matches; empty for no pre-test."""
     stride: int
     random_start: bool
     rejected: IndexArray
@@ -42,20 +42,20 @@ def make_pretest(least_inliers: IndexArray, stride: int, *, random_start: bool) 
 
 
 NO_PRETEST = make_pretest(np.zeros(0, dtype=np.int64), BLOCK, random_start=False)
-"""No test: every hypothesis is scored in full, or until it cannot win."""
+"""No pre-test: every hypothesis is scored in full, or until it cannot win."""
 
 
-class Verifier(Protocol):
-    """A test that adapts during a search, and the number of trials that allows for its errors."""
+class AdaptivePreTest(Protocol):
+    """A pre-test that adapts during a search, and the number of trials that allows for its errors."""
 
     pretest: PreTest
     lenient: PreTest
-    """Test of models from samples drawn without the priors."""
+    """Pre-test of models from samples drawn without the priors."""
     review: int
     """Largest number of trials between two calls of `learn`."""
 
     def learn(self, trials: int) -> None:
-        """Count samples that were drawn and tested."""
+        """Count samples that were drawn and pre-tested."""
 
     def expect(self, share: float) -> None:
         """Expect this share of inliers, that of the best model."""
@@ -64,8 +64,8 @@ class Verifier(Protocol):
         """Return how many samples, drawn ones included, give a clean one that passes with probability `confidence`."""
 
 
-class FullVerification:
-    """All hypotheses are scored on all matches."""
+class FullScoring:
+    """No pre-test: all hypotheses are scored on all matches."""
 
     review = 2**62
 
@@ -74,27 +74,27 @@ class FullVerification:
         self.pretest = self.lenient = NO_PRETEST
 
     def learn(self, trials: int) -> None:
-        """Do nothing: the test does not depend on the samples."""
+        """Do nothing: the pre-test does not depend on the samples."""
 
     def expect(self, share: float) -> None:
-        """Do nothing: the test does not depend on the share of inliers."""
+        """Do nothing: the pre-test does not depend on the share of inliers."""
 
     def required_trials(self, share: float, confidence: float) -> float:
         """Return how many samples give a clean one with this probability."""
         return required_trials(share**self.sample_size, confidence)
 
 
-class BailOut(FullVerification):
+class BailOut(FullScoring):
     """Reject a hypothesis once it has too few inliers to be the best one (Capel 2005); matches are in random order."""
 
     def expect(self, share: float) -> None:
-        """Make both tests for this share of inliers."""
+        """Make both pre-tests for this share of inliers."""
         least = bail_out_table(self.count, share)
         self.pretest = make_pretest(least, BLOCK, random_start=False)
         self.lenient = make_pretest((LENIENCE * least).astype(np.int64), BLOCK, random_start=False)
 
 
-class RandomizedTdd(FullVerification):
+class RandomizedTdd(FullScoring):
     """T(d,d): the first d matches must all be inliers (Matas and Chum 2004); clean models pass by share^d."""
 
     d = 1
@@ -222,7 +222,7 @@ def design(epsilon: float, delta: float, sample_size: int) -> SequentialTest:
 
 
 class Sprt:
-    """The test as a verifier, designed again when the estimate of epsilon or delta changes."""
+    """The test as an adaptive pre-test, designed again when the estimate of epsilon or delta changes."""
 
     review = SPRT.review
 

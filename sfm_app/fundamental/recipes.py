@@ -1,5 +1,6 @@
 """The estimators of thesis chapter 4, each described by the parts that differ from the defaults of `loop.Recipe`.
 
+The recipe of the program's own estimator is not in this table: it is `lev_ransac.PRODUCTION`.
 The threshold T is `max_error_px`; the thesis takes 1.96 px for a noise of 1 px.
 """
 
@@ -44,11 +45,11 @@ LEV_RANSAC = replace(
 RECIPES: Mapping[str, tuple[Recipe, str]] = {
     "lev-ransac-thesis": (LEV_RANSAC, "Algorithm 1 of the thesis to the letter"),
     "lev-ransac-sprt": (
-        replace(LEV_RANSAC, verifier=Sprt),
+        replace(LEV_RANSAC, pretest=Sprt),
         "lev-ransac-thesis with Wald's sequential test of hypotheses",
     ),
     "lev-ransac-tdd": (
-        replace(LEV_RANSAC, verifier=RandomizedTdd),
+        replace(LEV_RANSAC, pretest=RandomizedTdd),
         "lev-ransac-thesis with the T(1,1) test of hypotheses",
     ),
     "res-ransac": (
@@ -58,8 +59,8 @@ RECIPES: Mapping[str, tuple[Recipe, str]] = {
     "mlesac": (replace(RANSAC, score=mlesac), "likelihood of Gaussian inliers and uniform outliers"),
     "msac": (replace(RANSAC, score=msac), "uniform samples, truncated squared error"),
     "ransac": (RANSAC, "uniform samples, number of outliers"),
-    "ransac-sprt": (replace(RANSAC, verifier=Sprt), "ransac with Wald's sequential test of hypotheses"),
-    "ransac-tdd": (replace(RANSAC, verifier=RandomizedTdd), "ransac with the T(1,1) test of hypotheses"),
+    "ransac-sprt": (replace(RANSAC, pretest=Sprt), "ransac with Wald's sequential test of hypotheses"),
+    "ransac-tdd": (replace(RANSAC, pretest=RandomizedTdd), "ransac with the T(1,1) test of hypotheses"),
     "lmeds": (
         replace(RANSAC, score=lmeds, assumed_share=0.5, finish=_refit_to_median),
         "least median of squares, for up to half outliers",
@@ -69,7 +70,7 @@ RECIPES: Mapping[str, tuple[Recipe, str]] = {
 LMedS assumes half outliers (4.4.1)."""
 
 
-class ClassicalEstimator:
+class RecipeEstimator:
     """The estimator of a name in `RECIPES`, as a function that can be pickled."""
 
     def __init__(self, name: str) -> None:
@@ -78,12 +79,12 @@ class ClassicalEstimator:
     def __call__(self, x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
         return fit_by_recipe(x1, x2, options, seed, RECIPES[self.__name__][0])
 
-    def __reduce__(self) -> tuple[Callable[[str], "ClassicalEstimator"], tuple[str]]:
+    def __reduce__(self) -> tuple[Callable[[str], "RecipeEstimator"], tuple[str]]:
         """Pickle by name, as functions are: a worker process looks up its own instance."""
-        return classical_estimator, (self.__name__,)
+        return recipe_estimator, (self.__name__,)
 
 
 @cache
-def classical_estimator(name: str) -> ClassicalEstimator:
+def recipe_estimator(name: str) -> RecipeEstimator:
     """Return the estimator of a name in `RECIPES`, always the same object."""
-    return ClassicalEstimator(name)
+    return RecipeEstimator(name)

@@ -17,7 +17,7 @@ FIRST = cast("int", np.int64(0))
 """Start of the first block: 0, by definition. Numba types a literal 0 separately, and would compile kernels twice."""
 
 RANSAC, MSAC, MSAC_LINEAR, MLESAC, LMEDS, GEMAN_MCCLURE = range(6)
-"""Kinds of `Loss`, one for each penalty below."""
+"""Kinds of `Loss`, one for each penalty below. A new score needs a number here and a branch in `_cost`."""
 
 
 class Loss(NamedTuple):
@@ -39,27 +39,27 @@ Score = Callable[[FloatArray, float, FloatArray | None], Loss]
 
 
 def ransac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return the number of outliers as a `Loss`: 1 for each match beyond the threshold (thesis 3.20, 4.4)."""
+    """Return the `Loss` that counts outliers: 1 for each match beyond the threshold (thesis 3.20, 4.4)."""
     return Loss(RANSAC, threshold * threshold, threshold * threshold, 1.0)
 
 
 def msac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return the squared distance, at most the squared threshold, as a `Loss` (Torr and Zisserman 2000)."""
+    """Return the `Loss` of squared distances, at most the squared threshold (Torr and Zisserman 2000)."""
     return Loss(MSAC, threshold * threshold, threshold * threshold, threshold * threshold)
 
 
 def msac_linear(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return the distance, at most the threshold, as a `Loss` (thesis 4.5 as printed)."""
+    """Return the `Loss` of distances, at most the threshold (thesis 4.5 as printed)."""
     return Loss(MSAC_LINEAR, threshold * threshold, threshold * threshold, threshold)
 
 
 def lmeds(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return the median of the squared distances as a `Loss` (Rousseeuw 1984; thesis 4.4.1)."""
+    """Return the `Loss` that is the median of the squared distances (Rousseeuw 1984; thesis 4.4.1)."""
     return Loss(LMEDS, threshold * threshold, np.inf, np.inf)
 
 
 def geman_mcclure(_points: FloatArray, threshold: float, _best: FloatArray | None, *, scale: float) -> Loss:
-    """Return r^2 / (r^2 + c^2) as a `Loss`, c = `scale` thresholds (Geman and McClure 1987)."""
+    """Return the `Loss` r^2 / (r^2 + c^2), c = `scale` thresholds (Geman and McClure 1987)."""
     return Loss(GEMAN_MCCLURE, threshold * threshold, np.inf, 1.0, (scale * threshold) ** -2)
 
 

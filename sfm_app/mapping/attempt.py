@@ -51,15 +51,15 @@ class MappingOptions:
     few_lost: float = 0.05
     """Share of unregistered photos that is few there. Chosen by hand."""
     enough_share: float = 0.9
-    """Share of the photos of a group that ends the search for a better seed. Chosen by hand."""
+    """Share of the photos of a group that counts as most, and ends the search for a better seed. Chosen by hand."""
     confirmed_share: float = 0.5
-    """The same when two seeds place equally many photos. Chosen by hand."""
+    """The same when the two largest models, of any mapper, place equally many photos. Chosen by hand."""
     min_photos: int = 3
     """Least photos for learning a camera, for further groups, and for a scale in the global mapper."""
     equal_tolerance: float = 0.01
     """Relative difference of supports below which models count as equal. Chosen by hand."""
     max_contradicted_share: float = 0.01
-    """Share of the inliers of F that may contradict a complete model. Chosen by hand."""
+    """Share of the inliers of F that may contradict a complete model, or a camera that photos share. Chosen by hand."""
     max_focal_deviation: float = 0.01
     """Relative standard deviation of a focal up to which mapping holds it fixed. Chosen by hand."""
     fully_mapped_photos: int = 250

@@ -47,7 +47,7 @@ class AdjustmentOptions:
     most_matches: int = 1000
     """Most matches of one pair; more are not independent, and would let one pair outvote all others. With 300, errors
     and deviations are half as large again (docs/algorithms.md, Self-calibration, Tried and left out)."""
-    conflict: float = 3.0
+    quarter_weight_gain: float = 3.0
     """Log-likelihood gain from own cameras at which a pair's weight is a quarter. By definition of chi^2 with two
     degrees of freedom, noise alone gains as much once in twenty times: exp(-3)."""
     own_camera_sigmas: tuple[float, ...] = (0.3, 0.15, 0.15, 0.2, 0.2)
@@ -236,7 +236,7 @@ class State:
     sigma: float
     """Standard deviation of a Sampson distance."""
     scale: float = 1.0
-    """How many times larger the pairs' disagreement is than their noise explains, >= 1."""
+    """How many times larger the gains from own cameras are than noise explains, >= 1; `conflict` in the evidence."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -379,7 +379,7 @@ def _weigh_pairs(state: State, system: tuple[FloatArray, FloatArray]) -> State:
     """
     gains = _reduce_to_cameras(system).gains
     scale = max(1.0, float(np.quantile(gains, 0.25)) / 0.288) if len(gains) else 1.0
-    return replace(state, weights=(1.0 + gains / (ADJUSTMENT.conflict * scale)) ** -2, scale=scale)
+    return replace(state, weights=(1.0 + gains / (ADJUSTMENT.quarter_weight_gain * scale)) ** -2, scale=scale)
 
 
 def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> tuple[FloatArray, ...]:

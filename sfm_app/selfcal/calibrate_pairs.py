@@ -119,7 +119,7 @@ class Fit:
         gains = pair_information(self.matches, state).gains / (scale * self.matches.redundancy)
         H = replace(self, state=state).evidence.H + np.diag(self.prior.precision.ravel())
         volume = 0.5 * float(np.linalg.slogdet(lift_eigenvalues(H))[1] - np.sum(np.log(self.prior.precision)))
-        bounded = float(np.sum(gains / (1.0 + gains / ADJUSTMENT.conflict)))
+        bounded = float(np.sum(gains / (1.0 + gains / ADJUSTMENT.quarter_weight_gain)))
         return bounded + self.prior.cost(state.thetas) + volume - self.priors.log_odds(self.free)
 
 

@@ -90,7 +90,7 @@ class VoteTables:
 
 @kernel
 def _ratios(pair: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return `constraints.singular_value_ratio` (A, B) for cameras (A, 5) and (B, 5) without distortion."""
+    """Return `consensus.singular_value_ratio` (A, B) for cameras (A, 5) and (B, 5) without distortion."""
     k1, k2, G = np.empty(5), np.empty(5), np.empty((3, 3))
     ratios = np.empty((len(first), len(second)))
     for i in range(len(first)):

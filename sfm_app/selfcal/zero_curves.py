@@ -140,15 +140,15 @@ def _calibrate_from_matches(
         "weight": float(np.sum(fit.state.weights)),
         "votes_kept": adjusted.vote_share,
     }
-    undetermined, conflict = peak.undetermined_reason(weights), _conflict_reason(adjusted)
-    answer, spread = (peak.theta, 0.0) if conflict else (theta, evidence["log_focal_spread"])
+    undetermined, disagreement = peak.undetermined_reason(weights), _disagreement_reason(adjusted)
+    answer, spread = (peak.theta, 0.0) if disagreement else (theta, evidence["log_focal_spread"])
     reason = undetermined and (critical_motion(fit) or undetermined)
     reason = reason or rejection_reason(answer, spread, pairs.size)
     if reason:
         return guess_calibration(pairs.size, reason, evidence)
-    if conflict:
+    if disagreement:
         calibration = calibration_from_parameters(np.append(peak.theta, theta[KAPPA]), pairs.size, METHOD)
-        return replace(downgrade_to_estimate(calibration, conflict), evidence=evidence)
+        return replace(downgrade_to_estimate(calibration, disagreement), evidence=evidence)
     photos = tuple(pairs.photos[k] for k in usable.indices[adjusted.rows]) if pairs.photos else ()
     calibration = replace(
         calibration_from_parameters(theta, pairs.size, METHOD),
@@ -236,7 +236,7 @@ def _convert_to_sides(pairs: CameraPairs, usable: Pairs) -> tuple[Matches, Float
     return Matches(inliers, np.zeros((count, 2), np.int64), photos, side), usable.F
 
 
-def _conflict_reason(adjusted: _Adjustment) -> str:
+def _disagreement_reason(adjusted: _Adjustment) -> str:
     """Return why the matches and the consensus of their F's disagree on the camera; empty where they agree."""
     ratio = float(np.exp(abs(adjusted.fit.state.thetas[0, LOG_FOCAL] - adjusted.peak.theta[LOG_FOCAL])))
     if ratio >= ZERO_CURVES.another_focal:

@@ -11,9 +11,19 @@ from numpy.typing import NDArray
 from sfm_app.geometry.triangles import select_faces, split_fans
 from sfm_app.settings import TextureSettings
 from sfm_app.texture.appearance import doubtful_border, outlier_mask, photo_gains
-from sfm_app.texture.charts import Charts, Layout, absorb_small_charts, block_of_faces, lay_out, make_charts
+from sfm_app.texture.charts import (
+    SQUARE_CORNERS,
+    Charts,
+    Layout,
+    absorb_small_charts,
+    block_of_faces,
+    lay_out,
+    make_charts,
+    square_texels,
+    vertex_colors,
+)
 from sfm_app.texture.pages import CheckedViews, ParallelMap, Store, TexturePlan, fill_background, paint_blocks
-from sfm_app.texture.seams import SQUARE_CORNERS, Blend, blend_weights, level_seams, square_texels, vertex_colors
+from sfm_app.texture.seams import Blend, blend_weights, level_seams
 from sfm_app.texture.sightings import (
     NONE,
     Facets,
@@ -81,17 +91,17 @@ def texture_surface(
 def _score_photo(
     views: Sequence[PhotoView], store: Store, mesh: Facets, hidden: OcclusionTest, photo: int
 ) -> FaceView | Rejected:
-    name, view = f"look{photo}", views[photo]
+    name, view = f"view{photo}", views[photo]
     kept = store.recall(name)
     if kept is not None and "face" in kept:
-        return FaceView(kept["face"], kept["worth"], kept["color"], float(kept["sharpness"]))
+        return FaceView(kept["face"], kept["score"], kept["color"], float(kept["sharpness"]))
     try:
         picture, used = store.photo(view), store.usable_pixels(view)
     except OSError as err:
         return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
     face_view = score_faces(view, picture, used, mesh, hidden)
     face, sharpness = face_view.face, np.array(face_view.sharpness)
-    store.keep(name, {"face": face, "worth": face_view.score, "color": face_view.color, "sharpness": sharpness})
+    store.keep(name, {"face": face, "score": face_view.score, "color": face_view.color, "sharpness": sharpness})
     return face_view
 
 
@@ -126,14 +136,16 @@ def _plan(
 ) -> TexturePlan:  # fmt: skip
     block_of = block_of_faces(mesh)
 
-    def place() -> tuple[Charts, tuple[Layout, IndexArray, IntArray]]:
+    def lay_out_charts() -> tuple[Charts, tuple[Layout, IndexArray, IntArray]]:
         charts = make_charts(chosen, np.array([view.row for view in views]), mesh, options.max_atlas_px / 2, block_of)
         return charts, lay_out(charts, block_of, mesh, options)
 
-    def mix() -> Blend:
+    def blend_photos() -> Blend:
         return level_seams(blend_weights(chosen, checked.sightings, mesh), checked.sightings, checked.gains, mesh)
 
-    (charts, (layout, cells, block_of_page)), blend = spread(lambda job: job(), (place, mix), "planning the texture")
+    (charts, (layout, cells, block_of_page)), blend = spread(
+        lambda job: job(), (lay_out_charts, blend_photos), "planning the texture"
+    )
     corners, page = charts.corners * layout.scale, np.zeros(len(chosen), np.int32)
     drawn = chosen != NONE
     corners[drawn] += layout.shift[charts.chart_of_face[drawn]][:, None, :]

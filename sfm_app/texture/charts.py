@@ -1,4 +1,4 @@
-"""Charts of a texture, and their layout on the pages of each block of the surface."""
+"""Charts of a texture, squares of triangles without a photo, and the layout of both on the pages of each block."""
 
 from dataclasses import dataclass, replace
 
@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 from sfm_app.geometry.triangles import morton_order
 from sfm_app.jit import kernel
 from sfm_app.settings import TextureSettings
-from sfm_app.texture.seams import block_sizes, squares
+from sfm_app.texture.seams import solve_ties
 from sfm_app.texture.sightings import NONE, Facets, IntArray, Sightings, components
 from sfm_app.texture.views import project
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 # Charts: connected triangles of one photo, laid out by their projection in that photo.
 # The photo is the parametrization: nothing is stretched, and a texel is a pixel. Triangles that a photo sees do not
-# overlap in it, except at the rims of occluders; overlapping triangles get charts of their own.
+# overlap in it, except at the outlines of occluders; overlapping triangles get charts of their own.
 
 Views = tuple[IndexArray, IndexArray, IntArray, NDArray[np.float32]]
 """The views by triangle, for kernels: starts, rows, photo and score of each row."""
@@ -26,11 +26,17 @@ CELL = 4
 """Side of a cell of the profiles, in texels."""
 MARGIN = 2
 """Width of the margin of a chart, in texels."""
+SQUARE = 2
+"""Side of the square of a triangle without a photo, in texels; bilinear interpolation inside it is exact."""
+SQUARE_CORNERS = np.array([[0.5, 0.5], [1.5, 0.5], [0.5, 1.5]])
+"""Corners of a triangle in its square, on the centers of texels."""
+SQUARES_ACROSS = 64
+"""Most squares along a side of a rectangle of squares."""
 
 
 @dataclass(frozen=True, slots=True)
 class LayoutOptions:
-    """Charts, their packing, and blocks."""
+    """Charts, their packing, blocks, and triangles without a photo."""
 
     most_layers: int = 4
     """Layers of overlapping triangles that are separated; further ones share their pixels."""
@@ -43,6 +49,10 @@ class LayoutOptions:
     """Below this scale the texture would be too coarse; pages are added instead."""
     block_triangles: int = 400_000
     """Most triangles of a block. Chosen by hand: twice the triangles of a mesh by default, so that those have one."""
+    previous_color: float = 1e-4
+    """Weight of the previous color of a vertex without a photo, relative to 1 per neighbor, for isolated parts."""
+    rounding: float = 5e-3
+    """Rounding of a corner, in texels: single precision on the largest page gives a thousandth. Chosen by hand."""
 
 
 OPTIONS = LayoutOptions()
@@ -207,6 +217,69 @@ def _is_usable(views: Views, photo: int, faces: IntArray) -> bool:
     return True
 
 
+# Triangles without a photo: their vertices get colors from the photos around, and each triangle a square of texels.
+# The squares of a block form rectangles, which are packed with the charts.
+
+
+def vertex_colors(mesh: Facets, painted: BoolArray, corner_colors: FloatArray) -> FloatArray:
+    """Compute colors (V, 3) in 0..255, diffused from painted triangles and their corners (S, 3, 3) to the others."""
+    faces, size = mesh.faces[painted], len(mesh.vertices)
+    count = np.bincount(faces.ravel(), minlength=size)
+    sums = [np.bincount(faces.ravel(), corner_colors[..., channel].ravel(), size) for channel in range(3)]
+    known = count > 0
+    colors = mesh.surface.colors.astype(np.float64)
+    colors[known] = np.stack(sums, axis=1)[known] / count[known, None]
+    free = np.full(size, -1, np.int64)
+    free[~known] = np.arange(size - known.sum())
+    if known.all() or not known.any():
+        return colors
+    ends = free[mesh.edges]
+    inner = (ends >= 0).all(axis=1)
+    border = (ends >= 0).any(axis=1) & ~inner
+    outside = np.where(ends[border, 0] < 0, mesh.edges[border, 0], mesh.edges[border, 1])
+    inside = ends[border].max(axis=1)
+    hold = np.asarray(OPTIONS.previous_color + np.bincount(inside, minlength=int((~known).sum())), np.float64)
+    right = OPTIONS.previous_color * colors[~known]
+    for channel in range(3):
+        right[:, channel] += np.bincount(inside, colors[outside, channel], len(right))
+    spread = solve_ties(ends[inner, 0], ends[inner, 1], np.ones(int(inner.sum())), hold, right)
+    colors[~known] = np.clip(spread, 0, 255)
+    return colors
+
+
+def rectangle_sizes(triangles: int) -> NDArray[np.int32]:
+    """Return (B, 2) widths and heights in texels of rectangles with one square per triangle."""
+    sizes = []
+    for start in range(0, triangles, SQUARES_ACROSS * SQUARES_ACROSS):
+        count = min(triangles - start, SQUARES_ACROSS * SQUARES_ACROSS)
+        columns = min(SQUARES_ACROSS, int(np.ceil(np.sqrt(count))))
+        sizes.append((columns * SQUARE, -(-count // columns) * SQUARE))
+    return np.array(sizes, np.int32).reshape(-1, 2)
+
+
+def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int) -> IndexArray:
+    """Return (N, 3) page, x and y of the square of each triangle, row by row in rectangles at (B, 3) page, x, y."""
+    parts = [np.empty((0, 3), np.int64)]
+    for number, ((page, left, top), (width, _)) in enumerate(zip(places, sizes, strict=True)):
+        count = min(triangles - number * SQUARES_ACROSS * SQUARES_ACROSS, SQUARES_ACROSS * SQUARES_ACROSS)
+        row, column = np.divmod(np.arange(count), width // SQUARE)
+        parts.append(np.column_stack([np.full(count, page), left + SQUARE * column, top + SQUARE * row]))
+    return np.concatenate(parts).astype(np.int64)
+
+
+def are_squares(corners: FloatArray) -> BoolArray:
+    """Mark triangles (T,) with the corners (T, 3, 2) of a square, in texels of single precision."""
+    first = np.floor(corners[:, :1])
+    return np.asarray((np.abs(corners - first - SQUARE_CORNERS) < OPTIONS.rounding).all(axis=(1, 2)))
+
+
+def square_texels(corner_colors: FloatArray) -> NDArray[np.uint8]:
+    """Return (N, 2, 2, 3) texels whose bilinear interpolation gives colors (N, 3, 3) at `SQUARE_CORNERS`."""
+    a, b, c = (corner_colors[:, k] for k in range(3))
+    texels = np.stack([np.stack([a, b], axis=1), np.stack([c, b + c - a], axis=1)], axis=1)
+    return np.asarray(np.round(np.clip(texels, 0, 255)), np.uint8)
+
+
 # Packing of charts onto pages, as in Tetris (Levy et al., SIGGRAPH 2002, section 4).
 # Each chart has a profile of its upper and lower side. It is placed on the horizon of the charts already on the
 # page, as close to the top as possible. Tall charts come first.
@@ -227,7 +300,7 @@ class Layout:
 
 
 def pack(
-    charts: Charts, blocks: IntArray, max_atlas_px: int, max_pages: int, largest_scale: float = 1.0
+    charts: Charts, rectangles: IntArray, max_atlas_px: int, max_pages: int, largest_scale: float = 1.0
 ) -> tuple[Layout, IntArray]:
     """Place charts, in pixels of the photos, and rectangles (B, 2) in texels, which are never scaled, on few pages.
 
@@ -239,7 +312,7 @@ def pack(
     area = float(np.sum(np.abs(turn[charts.chart_of_face != NONE])) / 2)
     scale = min(largest_scale, float(np.sqrt(OPTIONS.fill * max_pages * max_atlas_px**2 / max(area, 1.0))))
     while True:
-        packed = _try_to_pack(charts, blocks, scale, max_atlas_px, max_pages)
+        packed = _try_to_pack(charts, rectangles, scale, max_atlas_px, max_pages)
         if packed is not None:
             return packed
         if scale > OPTIONS.least_scale:
@@ -249,21 +322,21 @@ def pack(
 
 
 def _try_to_pack(
-    charts: Charts, blocks: IntArray, scale: float, max_atlas_px: int, max_pages: int
+    charts: Charts, rectangles: IntArray, scale: float, max_atlas_px: int, max_pages: int
 ) -> tuple[Layout, IntArray] | None:
     count = len(charts.photo)
     origin, cells, starts, low, high = _profiles(charts, scale)
-    block_cells = -(-blocks // CELL)
-    area = float(np.sum(high - low)) + float(np.sum(block_cells.astype(np.int64).prod(axis=1)))
-    widest = max((int(c) for c in np.concatenate([cells[:, 0], block_cells[:, 0]])), default=1)
+    rectangle_cells = -(-rectangles // CELL)
+    area = float(np.sum(high - low)) + float(np.sum(rectangle_cells.astype(np.int64).prod(axis=1)))
+    widest = max((int(c) for c in np.concatenate([cells[:, 0], rectangle_cells[:, 0]])), default=1)
     page_cells = max_atlas_px // CELL
     width = page_cells if scale < 1.0 else min(page_cells, max(widest, int(np.ceil(np.sqrt(area / OPTIONS.fill)))))
     if widest > page_cells or area > max_pages * page_cells * width:
         return None
-    starts = np.concatenate([starts, starts[-1] + np.cumsum(block_cells[:, 0])])
-    low = np.concatenate([low, np.zeros(int(block_cells[:, 0].sum()), np.int64)])
-    high = np.concatenate([high, np.repeat(block_cells[:, 1], block_cells[:, 0]).astype(np.int64)])
-    heights = np.concatenate([cells[:, 1], block_cells[:, 1]]).astype(np.int64)
+    starts = np.concatenate([starts, starts[-1] + np.cumsum(rectangle_cells[:, 0])])
+    low = np.concatenate([low, np.zeros(int(rectangle_cells[:, 0].sum()), np.int64)])
+    high = np.concatenate([high, np.repeat(rectangle_cells[:, 1], rectangle_cells[:, 0]).astype(np.int64)])
+    heights = np.concatenate([cells[:, 1], rectangle_cells[:, 1]]).astype(np.int64)
     order = np.lexsort((np.arange(len(heights)), -heights))
     place = np.full((len(heights), 3), NONE, np.int32)
     horizon = np.zeros((max_pages, width), np.int64)
@@ -385,7 +458,7 @@ def lay_out(
     unseen = np.flatnonzero(charts.chart_of_face == NONE)
     faces = [np.flatnonzero(block_of == block) for block in range(int(block_of.max(initial=0)) + 1)]
     parts = [_part(charts, own) for own in faces]
-    rests = [block_sizes(int((part.chart_of_face == NONE).sum())) for _, part in parts]
+    rests = [rectangle_sizes(int((part.chart_of_face == NONE).sum())) for _, part in parts]
     packed = [
         pack(part, rest, options.max_atlas_px, options.max_pages) for (_, part), rest in zip(parts, rests, strict=True)
     ]

@@ -22,8 +22,8 @@ BAND = 512
 """Rows of a page whose texels get owners at once. Chosen by hand: a few for each of two workers."""
 LEVELS_PER_GRAY = 256
 """Levels of the integer sums per gray level."""
-GROUP_NAME = "pages"
-"""Name of the checkpoint in the store."""
+CHECKPOINT_NAME = "pages"
+"""Name of the unfinished pages in the store."""
 
 Spread = Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]]
 """Calls a function for every number, possibly in parallel, and returns the results in order."""
@@ -49,7 +49,7 @@ class Store(Protocol):
         """Return the arrays kept under a name, or None."""
 
     def keep(self, name: str, /, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Keep arrays, by their names, under the name of a group, replacing it, complete or not at all."""
+        """Keep named arrays under one name, in place of earlier ones; all of them or none."""
 
 
 # First every texel gets an owner: the triangle around it or, in the margin of a chart, the nearest one. Then each
@@ -127,15 +127,16 @@ def paint(  # noqa: PLR0913
     corners: FloatArray,
     points: FloatArray,
     shares: NDArray[np.float32],
-    rims: BoolArray,
+    open_edges: BoolArray,
     owner: IntArray,
     total: IntArray,
 ) -> None:
     """Add one photo (height, width, 3) to a page, with its camera row at this size.
 
     `triangles` (N,) are those of the page with a share of the photo, `shares` (N, 3, 4) its weight at each corner and
-    the offsets of its channels in gray levels, `rims` (N, 3) edges from corner k to k + 1 without a visible triangle
-    across. The brightness is the inverse of the gains. Corners (T, 3, 2) are in texels, points (N, 3, 3) in the scene.
+    the offsets of its channels in gray levels, `open_edges` (N, 3) whether the edge from corner k to k + 1 has no
+    visible triangle across. The brightness is the inverse of the gains. Corners (T, 3, 2) are in texels, points
+    (N, 3, 3) in the scene.
     """
     height, width = owner.shape
     part, least = np.empty(3), np.empty(3)
@@ -144,7 +145,7 @@ def paint(  # noqa: PLR0913
         ax, ay = corners[f, 0, 0], corners[f, 0, 1]
         bx, by = corners[f, 1, 0] - ax, corners[f, 1, 1] - ay
         cx, cy = corners[f, 2, 0] - ax, corners[f, 2, 1] - ay
-        _set_insets(corners[f], rims[n], abs(bx * cy - by * cx), least)
+        _set_insets(corners[f], open_edges[n], abs(bx * cy - by * cx), least)
         x0, x1 = int(min(0.0, bx, cx) + ax - MARGIN - 1), int(max(0.0, bx, cx) + ax + MARGIN + 1)
         y0, y1 = int(min(0.0, by, cy) + ay - MARGIN - 1), int(max(0.0, by, cy) + ay + MARGIN + 1)
         for y in range(max(y0, 0), min(y1, height - 1) + 1):
@@ -198,17 +199,17 @@ def _add(
 
 
 @kernel
-def _set_insets(corner: FloatArray, rim: BoolArray, double_area: float, least: FloatArray) -> None:
-    """Set lower bounds of barycentric coordinates that keep texels away from rims; other edges have none.
+def _set_insets(corner: FloatArray, is_open: BoolArray, double_area: float, least: FloatArray) -> None:
+    """Set lower bounds of barycentric coordinates that keep texels away from open edges; other edges have none.
 
-    At a rim, pixels mix with the background. Texels closer to it than 1.5 texels, or 0.3 of the triangle's height,
-    repeat the color at that distance.
+    At an open edge, pixels mix with the background. Texels closer to it than 1.5 texels, or 0.3 of the triangle's
+    height, repeat the color at that distance.
     """
     for k in range(3):
         a, b = (k + 1) % 3, (k + 2) % 3
         length = np.hypot(corner[b, 0] - corner[a, 0], corner[b, 1] - corner[a, 1])
         height_px = max(double_area / max(length, 1e-9), 1e-9)
-        least[k] = min(1.5 / height_px, 0.3) if rim[a] else -9.0
+        least[k] = min(1.5 / height_px, 0.3) if is_open[a] else -9.0
 
 
 @kernel
@@ -299,7 +300,7 @@ class Pages:
         """Fill empty canvases from the checkpoint of a killed run at the same block."""
         self.canvases, self.has = canvases, np.zeros(photos, np.bool_)
         self._store, self._lock, self._block = store, Lock(), block
-        kept = store.recall(GROUP_NAME)
+        kept = store.recall(CHECKPOINT_NAME)
         if kept is not None and kept.get("block") == block:
             self.has[:] = kept["has"]
             for number, page in enumerate(canvases):
@@ -318,7 +319,7 @@ class Pages:
     def _keep(self) -> None:
         start = time.monotonic()
         totals = {f"page{number}": page.total for number, page in enumerate(self.canvases)}
-        self._store.keep(GROUP_NAME, {"block": np.array(self._block), "has": self.has, **totals})
+        self._store.keep(CHECKPOINT_NAME, {"block": np.array(self._block), "has": self.has, **totals})
         end = time.monotonic()
         self._due_s = end + max(CHECKPOINTS.every_s, (end - start) / CHECKPOINTS.most_time)
 
@@ -414,7 +415,7 @@ def _paint_photo(
     if not len(triangles):
         return
     beside = plan.mesh.neighbors[triangles]
-    rims = (beside == NONE) | (plan.checked.sightings.find(photo, beside) == NONE)
+    open_edges = (beside == NONE) | (plan.checked.sightings.find(photo, beside) == NONE)
     view, scale = views[photo], plan.layout.scale
     if scale < 1.0:
         view = view.with_size(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
@@ -422,7 +423,7 @@ def _paint_photo(
     with pages.lock_canvases(photo) as canvases:
         for number, page in zip(numbers, canvases, strict=True):
             own = plan.page[triangles] == number
-            content = triangles[own], plan.corners, points[own], shares[own], rims[own]
+            content = triangles[own], plan.corners, points[own], shares[own], open_edges[own]
             paint(pixels, view.row, 1.0 / plan.checked.gains[photo], *content, page.owner, page.total)
 
 

@@ -1,4 +1,4 @@
-"""Blending and leveling of photos at seams, and colors of triangles without a photo."""
+"""Weights that blend photos at seams, and offsets that level their colors; `pages` applies both."""
 
 from dataclasses import dataclass, replace
 
@@ -7,19 +7,12 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.texture.sightings import NONE, Facets, IntArray, Sightings, distinct
-from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
-
-SQUARE_CORNERS = np.array([[0.5, 0.5], [1.5, 0.5], [0.5, 1.5]])
-"""Corners of a triangle in its square, on the centers of texels."""
-CELL = 2
-"""Side of the square of a triangle without a photo, in texels; bilinear interpolation inside it is exact."""
-BLOCK = 64
-"""Most squares along a side of a block."""
+from sfm_app.types.arrays import FloatArray, IndexArray
 
 
 @dataclass(frozen=True, slots=True)
 class SeamOptions:
-    """Weights of the blend, and of the least squares of offsets and colors."""
+    """Weights of the blend, and of the least squares of offsets."""
 
     rings: int = 3
     """Rings of vertices on either side of a seam over which photos are blended."""
@@ -29,10 +22,6 @@ class SeamOptions:
     """Weight of differences of offsets along a chart, relative to 1 for differences at seams."""
     prior: float = 1e-3
     """Weight of zero offsets."""
-    previous_color: float = 1e-4
-    """Weight of the previous color of a vertex without a photo, relative to 1 per neighbor, for isolated parts."""
-    rounding: float = 5e-3
-    """Rounding of a corner, in texels: single precision on the largest page gives a thousandth. Chosen by hand."""
 
 
 OPTIONS = SeamOptions()
@@ -196,7 +185,7 @@ def _multiply(
 def _gaps(
     blend: Blend, sightings: Sightings, gains: FloatArray, mesh: Facets
 ) -> tuple[IndexArray, IndexArray, FloatArray]:
-    """Return (M,) nodes where photos meet, (M,) the heaviest node there, and (M, 3) its color minus that of the first.
+    """Return (M,) nodes where photos meet, (M,) the heaviest node there, and (M, 3) its photo's color minus the node's.
 
     Colors are compared on triangles at the vertex with usable views of both photos; pairs without any are omitted.
     """
@@ -250,62 +239,3 @@ def _ties(blend: Blend, mesh: Facets) -> tuple[IndexArray, IndexArray]:
         start.append(ends[:, 0])
         end.append(ends[:, 1])
     return np.concatenate(start), np.concatenate(end)
-
-
-def vertex_colors(mesh: Facets, painted: BoolArray, corner_colors: FloatArray) -> FloatArray:
-    """Compute colors (V, 3) in 0..255, diffused from painted triangles and their corners (S, 3, 3) to the others."""
-    faces, size = mesh.faces[painted], len(mesh.vertices)
-    count = np.bincount(faces.ravel(), minlength=size)
-    sums = [np.bincount(faces.ravel(), corner_colors[..., channel].ravel(), size) for channel in range(3)]
-    known = count > 0
-    colors = mesh.surface.colors.astype(np.float64)
-    colors[known] = np.stack(sums, axis=1)[known] / count[known, None]
-    free = np.full(size, -1, np.int64)
-    free[~known] = np.arange(size - known.sum())
-    if known.all() or not known.any():
-        return colors
-    ends = free[mesh.edges]
-    inner = (ends >= 0).all(axis=1)
-    rim = (ends >= 0).any(axis=1) & ~inner
-    outside = np.where(ends[rim, 0] < 0, mesh.edges[rim, 0], mesh.edges[rim, 1])
-    inside = ends[rim].max(axis=1)
-    hold = np.asarray(OPTIONS.previous_color + np.bincount(inside, minlength=int((~known).sum())), np.float64)
-    right = OPTIONS.previous_color * colors[~known]
-    for channel in range(3):
-        right[:, channel] += np.bincount(inside, colors[outside, channel], len(right))
-    spread = solve_ties(ends[inner, 0], ends[inner, 1], np.ones(int(inner.sum())), hold, right)
-    colors[~known] = np.clip(spread, 0, 255)
-    return colors
-
-
-def block_sizes(triangles: int) -> NDArray[np.int32]:
-    """Return (B, 2) widths and heights in texels of blocks with one square per triangle."""
-    sizes = []
-    for start in range(0, triangles, BLOCK * BLOCK):
-        count = min(triangles - start, BLOCK * BLOCK)
-        columns = min(BLOCK, int(np.ceil(np.sqrt(count))))
-        sizes.append((columns * CELL, -(-count // columns) * CELL))
-    return np.array(sizes, np.int32).reshape(-1, 2)
-
-
-def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int) -> IndexArray:
-    """Return (N, 3) page, x and y of the square of each triangle, row by row through blocks at (B, 3) page, x, y."""
-    parts = [np.empty((0, 3), np.int64)]
-    for number, ((page, left, top), (width, _)) in enumerate(zip(places, sizes, strict=True)):
-        count = min(triangles - number * BLOCK * BLOCK, BLOCK * BLOCK)
-        row, column = np.divmod(np.arange(count), width // CELL)
-        parts.append(np.column_stack([np.full(count, page), left + CELL * column, top + CELL * row]))
-    return np.concatenate(parts).astype(np.int64)
-
-
-def are_squares(corners: FloatArray) -> BoolArray:
-    """Mark triangles (T,) with the corners (T, 3, 2) of a square, in texels of single precision."""
-    first = np.floor(corners[:, :1])
-    return np.asarray((np.abs(corners - first - SQUARE_CORNERS) < OPTIONS.rounding).all(axis=(1, 2)))
-
-
-def square_texels(corner_colors: FloatArray) -> NDArray[np.uint8]:
-    """Return (N, 2, 2, 3) texels whose bilinear interpolation gives colors (N, 3, 3) at `SQUARE_CORNERS`."""
-    a, b, c = (corner_colors[:, k] for k in range(3))
-    texels = np.stack([np.stack([a, b], axis=1), np.stack([c, b + c - a], axis=1)], axis=1)
-    return np.asarray(np.round(np.clip(texels, 0, 255)), np.uint8)

@@ -133,7 +133,7 @@ MIN_COSINE = 0.1
 """Smallest cosine of the viewing angle; from more oblique views, few pixels would be stretched over the triangle."""
 BORDER_PX = 2.0
 """Width of the unused border of a photo, where resampling and demosaicing are incomplete."""
-MASK_RIM_PX = 1.0
+MASK_MARGIN_PX = 1.0
 """A triangle this close to a masked pixel is not used, because colors are interpolated between pixels."""
 
 
@@ -143,10 +143,10 @@ class SightingOptions:
 
     slack: float = 1.0
     """Slack of the occlusion test, in median edge lengths, so that the surface's roughness hides nothing."""
-    rim_rings: int = 2
+    hidden_rings: int = 2
     """Rings of triangles around hidden ones with a lower score: where the surface is off by a pixel, they show the
     foreground or background."""
-    rim_factor: float = 0.5
+    ring_factor: float = 0.5
     """Factor on their score per ring."""
     sharpness_range: tuple[float, float] = (0.2, 1.0)
     """Smallest and largest factor on the scores of a photo."""
@@ -184,22 +184,22 @@ def score_faces(
     occluded = _occluded_mask(near[candidates], mesh, partial(hidden, view.center, OPTIONS.slack * mesh.spacing))
     visible = candidates[~occluded]
     face, score = near[visible], score[visible]
-    _lower_rims(face, score, mesh)
+    _lower_near_hidden(face, score, mesh)
     usable = score > 0
     return FaceView(face[usable].astype(np.int32), score[usable], color[visible[usable]], sharpness(photo, used))
 
 
-def _lower_rims(face: IndexArray, score: NDArray[np.float32], mesh: Facets) -> None:
+def _lower_near_hidden(face: IndexArray, score: NDArray[np.float32], mesh: Facets) -> None:
     """Lower the scores of visible triangles, in place, ring by ring from the hidden ones."""
     inner = np.arange(len(face))
-    for _ in range(OPTIONS.rim_rings):
+    for _ in range(OPTIONS.hidden_rings):
         corners = mesh.faces[face[inner]]
         vertices, at = number_vertices(corners)
         whole = np.bincount(at.ravel(), minlength=len(vertices)) == mesh.valence[vertices]
         inside = whole[at].all(axis=1)
         beyond = np.ones(len(face), np.bool_)
         beyond[inner[inside]] = False
-        score[beyond] *= OPTIONS.rim_factor
+        score[beyond] *= OPTIONS.ring_factor
         inner = inner[inside]
 
 
@@ -291,14 +291,14 @@ def _drop_masked(
         for k in range(3):
             v = faces[f, k]
             corner[k, 0], corner[k, 1], _ = project(camera, vertices[v, 0], vertices[v, 1], vertices[v, 2])
-        top = int(min(corner[0, 1], corner[1, 1], corner[2, 1]) - MASK_RIM_PX)
-        bottom = int(max(corner[0, 1], corner[1, 1], corner[2, 1]) + MASK_RIM_PX) + 1
+        top = int(min(corner[0, 1], corner[1, 1], corner[2, 1]) - MASK_MARGIN_PX)
+        bottom = int(max(corner[0, 1], corner[1, 1], corner[2, 1]) + MASK_MARGIN_PX) + 1
         for y in range(max(top, 0), min(bottom, masked.shape[0] - 1)):
-            left, right = _span(corner, y - MASK_RIM_PX, y + 1 + MASK_RIM_PX)
+            left, right = _span(corner, y - MASK_MARGIN_PX, y + 1 + MASK_MARGIN_PX)
             if left > right:
                 continue
-            x0 = max(int(left - MASK_RIM_PX), 0)
-            x1 = min(int(right + MASK_RIM_PX) + 1, masked.shape[1] - 1)
+            x0 = max(int(left - MASK_MARGIN_PX), 0)
+            x1 = min(int(right + MASK_MARGIN_PX) + 1, masked.shape[1] - 1)
             if x0 < x1 and masked[y + 1, x1] - masked[y, x1] - masked[y + 1, x0] + masked[y, x0] > 0:
                 score[f] = 0.0
                 break

@@ -42,7 +42,7 @@ def as_model(name, places):
 
 def test_the_first_file_is_the_one_to_open_and_all_lie_in_one_folder(name, write, model):
     files = write(model, "a model.v2")
-    assert next(iter(files)) == f"a model.v2.{EXPORTERS[name].ending}"
+    assert next(iter(files)) == f"a model.v2.{EXPORTERS[name].suffix}"
     assert all(isinstance(data, bytes) and data for data in files.values())
     assert all("/" not in file and "\\" not in file for file in files)
 
@@ -59,7 +59,7 @@ def test_same_model_same_bytes_in_any_thread_and_the_model_is_left_alone(write, 
 
 
 def test_the_shape_survives(name, write, model, tmp_path):
-    if EXPORTERS[name].ending not in READABLE:
+    if EXPORTERS[name].suffix not in READABLE:
         pytest.skip(f"trimesh does not read {name}")
     files = write(model, "model")
     for file, data in files.items():

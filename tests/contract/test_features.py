@@ -43,7 +43,11 @@ def place(rendered, tmp_path_factory):
 
 def found(method, place, out, pairs=PAIRS, workers=1, masks=False, **matching):
     root, photos, _ = place
-    settings = {"workers": workers, "matching": matching, "photos": {"masks": str(root / "masks") if masks else ""}}
+    settings = {
+        "workers": workers,
+        "matching": {"max_image_size_px": 320, **matching},
+        "photos": {"masks": str(root / "masks") if masks else ""},
+    }
     out.mkdir(exist_ok=True)
     with open_run(out, Settings.from_mapping(settings), None) as run:
         for name in ("photos", "masks"):

@@ -15,8 +15,9 @@ from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
 from sfm_app.synthetic.scenes import courtyard
 
 QUICK = ["--quality", "draft", "--set", "depth.max_image_size_px=240", "--faces", "3000", "-q", "--workers", "2"]
-if "SFM_APP_FAULTS" not in os.environ:  # a quarter of a run, thirty times
-    QUICK += ["--set", "report=false", "--set", "matching.enlarge_below=100"]
+if "SFM_APP_FAULTS" not in os.environ:  # half of a run, thirty times
+    QUICK += ["--set", "report=false", "--set", "matching.enlarge_below=100", "--set", "matching.max_image_size_px=320"]
+    QUICK += ["--set", "depth.max_image_size_px=160", "--faces", "1000"]
 
 
 def cases(all_of_them, always):

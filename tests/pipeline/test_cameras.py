@@ -16,9 +16,11 @@ from sfm_app.synthetic.scenes import courtyard
 
 pytestmark = pytest.mark.slow
 
+QUICK = {"quality": "draft", "report": False, "matching": {"max_image_size_px": 360}}
+
 
 def run(photos, out, **values):
-    return reconstruct(photos, out, Settings.from_mapping({**values, "report": False}), last="scene")
+    return reconstruct(photos, out, Settings.from_mapping(QUICK | values), last="scene")
 
 
 def contradicted(done, stage):
@@ -100,7 +102,7 @@ def test_portrait_and_landscape_are_one_camera(upright_photos, tmp_path, told):
             else:
                 photo.rotate(-turn, expand=True).save(tmp_path / "photos" / name, quality=95)
 
-    done = run(tmp_path / "photos", tmp_path / "out", quality="draft")
+    done = run(tmp_path / "photos", tmp_path / "out")
     [found] = done.calibration.cameras.values()
 
     assert len(done.scene.registered) == 8 and found.K[0, 0] == pytest.approx(truth.camera.K[0, 0], rel=0.02)

@@ -17,7 +17,7 @@ from sfm_app.synthetic.cameras import camera_center
 
 pytestmark = pytest.mark.slow
 
-NO_REPORT = {"quality": "draft", "report": False}
+NO_REPORT = {"quality": "draft", "report": False, "matching": {"max_image_size_px": 360}}
 """Drawing its figures would take as long as the rest of the scene."""
 DRAFT = Settings.from_mapping(NO_REPORT)
 FIRST = 5

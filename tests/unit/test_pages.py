@@ -18,7 +18,6 @@ import pytest
 
 import sfm_app
 from sfm_app import errors, plugins
-from sfm_app.cli.options import parse_assignment
 from sfm_app.cli.program import main
 from sfm_app.errors import SfmError
 from sfm_app.plugins import installed_plugins, load_plugins
@@ -51,24 +50,10 @@ def flags():
     return {flag for command in commands for parameter in command.params for flag in parameter.opts}
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_commands_that_are_printed_have_these_flags(page):
-    """In a span of code or a block, after `sfm-app`, up to the end of the command."""
-    calls = re.findall(r"sfm-app (?:[a-z]+ )[^`\n#|;&]*", read(page))
-    printed = {flag for call in calls for flag in re.findall(r"(?<!\S)--[a-z-]+", call)}
-    assert printed <= flags() | {"--help", "--version"}
-
-
 def test_flags_that_are_named_are_there():
     printed = {flag for page in FOR_USERS for flag in re.findall(r"`(--[a-z-]+)", read(page))}
     assert len(printed) > 10
     assert printed - NOT_OURS <= flags()
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_settings_that_are_printed_can_be_set(page):
-    for assignment in re.findall(r"--set ([a-z_]+\.[a-z_]+=[^\s`]+)", read(page)):
-        Settings.from_mapping(parse_assignment(assignment))
 
 
 @pytest.mark.parametrize("page", PAGES)

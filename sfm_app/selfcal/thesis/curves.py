@@ -1,12 +1,112 @@
-"""Zero curves: the roots of one pair's constraint, swept over a parameter (thesis 5.8.3)."""
+"""Zero curves: the roots of one pair's constraint, swept over a parameter (thesis 5.8.3).
+
+With a and p of `selfcal.consensus`, thesis (5.25) is  2 tr((EE')^2) - tr(EE')^2 = (s1^2 - s2^2)^2 = a^2 - 4p. It is
+never negative: with noise its zeros are isolated points, and the thesis's "zero curve" is the real part of a pair of
+complex roots.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.selfcal.consensus import center_polynomials, focal_polynomials
 from sfm_app.selfcal.pairs import Pairs
 from sfm_app.types.arrays import FloatArray
+
+VANISHED = 1e-12
+"""A polynomial is zero when it is this small beside the terms whose difference it is. Double precision leaves 1e-16;
+the margin was chosen by hand (docs/algorithms.md, The thesis's methods)."""
+
+
+def focal_polynomials(pairs: Pairs, fx: FloatArray, center: tuple[float, float]) -> FloatArray:
+    """Return thesis (5.27): a^2 - 4p as a quartic in fy^2, for swept fx (S,) and a fixed center (u, v).
+
+    Coefficients (P, S, 5), lowest power first; all zero where the constraint holds for any fy.
+    """
+    u, v = center
+    C = np.array([[1.0, 0.0, u], [0.0, 1.0, v], [0.0, 0.0, 1.0]])
+    G = (C.T @ pairs.F @ C) ** 2
+    x = (fx**2)[None, :]
+    one = np.ones_like(x)
+    a = _stack(
+        x**2 * _column(G[:, 0, 0]) + x * _column(G[:, 0, 2] + G[:, 2, 0]) + one * _column(G[:, 2, 2]),
+        x * _column(G[:, 0, 1] + G[:, 1, 0]) + one * _column(G[:, 1, 2] + G[:, 2, 1]),
+        one * _column(G[:, 1, 1]),
+    )
+    n1, n2 = (
+        _stack(
+            x * _column(e[:, 1] - v * e[:, 2]) ** 2,
+            one * _column(e[:, 0] - u * e[:, 2]) ** 2 + x * _column(e[:, 2]) ** 2,
+        )
+        for e in (pairs.e1, pairs.e2)
+    )
+    return _constraint_polynomial(a, n1, n2, pairs.product)
+
+
+def center_polynomials(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
+    """Return thesis (5.28): a^2 - 4p as an octic in v, for swept u (S,) and fixed focals (fx, fy).
+
+    Coefficients (P, S, 9), lowest power first; all zero where the constraint holds for any v.
+    """
+    x, y = focal[0] ** 2, focal[1] ** 2
+    F = pairs.F[:, None, :, :]
+    t = u[None, :]
+    g13, g31 = F[..., 0, 2] + t * F[..., 0, 0], F[..., 2, 0] + t * F[..., 0, 0]
+    g23, g32 = F[..., 1, 2] + t * F[..., 1, 0], F[..., 2, 1] + t * F[..., 0, 1]
+    g33 = F[..., 2, 2] + t * (F[..., 0, 2] + F[..., 2, 0]) + t**2 * F[..., 0, 0]
+    fixed = x * x * F[..., 0, 0] ** 2 + x * y * (F[..., 0, 1] ** 2 + F[..., 1, 0] ** 2) + y * y * F[..., 1, 1] ** 2
+    zero = np.zeros_like(g33)
+    a = _pad(_stack(fixed + zero), 5)
+    for factor, low, slope in (
+        (x, g13, F[..., 0, 1]),
+        (x, g31, F[..., 1, 0]),
+        (y, g23, F[..., 1, 1]),
+        (y, g32, F[..., 1, 1]),
+    ):
+        line = _stack(low, slope + zero)
+        a += factor * _pad(_multiply(line, line), 5)
+    corner = _stack(g33, g23 + g32, F[..., 1, 1] + zero)
+    a += _multiply(corner, corner)
+    n1, n2 = (_epipole_polynomial(e[:, None, :], t, x, y) for e in (pairs.e1, pairs.e2))
+    return _constraint_polynomial(a, n1, n2, pairs.product)
+
+
+def _epipole_polynomial(e: FloatArray, t: FloatArray, x: float, y: float) -> FloatArray:
+    """Return |adj(K) e|^2 as a quadratic in v."""
+    fixed = y * (e[..., 0] - t * e[..., 2]) ** 2 + x * y * e[..., 2] ** 2
+    one = np.ones_like(fixed)
+    line = _stack(e[..., 1] * one, -e[..., 2] * one)
+    return _pad(_stack(fixed), 3) + x * _multiply(line, line)
+
+
+def _constraint_polynomial(a: FloatArray, n1: FloatArray, n2: FloatArray, product: FloatArray) -> FloatArray:
+    square = _multiply(a, a)
+    minors = 4.0 * (product**2)[:, None, None] * _multiply(n1, n2)
+    difference = square - _pad(minors, square.shape[-1])
+    size = np.max(np.abs(square), axis=-1, keepdims=True)
+    vanished = np.max(np.abs(difference), axis=-1, keepdims=True) <= VANISHED * size
+    return np.where(vanished, 0.0, difference)
+
+
+def _column(values: FloatArray) -> FloatArray:
+    return values[:, None]
+
+
+def _stack(*coefficients: FloatArray) -> FloatArray:
+    return np.stack(coefficients, axis=-1)
+
+
+def _pad(polynomial: FloatArray, length: int) -> FloatArray:
+    padded: NDArray[np.float64] = np.zeros((*polynomial.shape[:-1], length))
+    padded[..., : polynomial.shape[-1]] = polynomial
+    return padded
+
+
+def _multiply(p: FloatArray, q: FloatArray) -> FloatArray:
+    product = np.zeros((*np.broadcast_shapes(p.shape[:-1], q.shape[:-1]), p.shape[-1] + q.shape[-1] - 1))
+    for power in range(p.shape[-1]):
+        product[..., power : power + q.shape[-1]] += p[..., power, None] * q
+    return product
+
 
 # All roots of many real polynomials (thesis 5.8.3): eigenvalues of companion matrices, followed along a sweep.
 

@@ -3,24 +3,20 @@ import json
 import re
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-import sfm_app
 from benchmarks.cameras.methods import methods
 from benchmarks.cameras.score import Model, TruePhoto
 from benchmarks.common.photo_sets import photo_set, steps, stride
 from benchmarks.common.processes import run_command
 from benchmarks.corpus import command as corpus
-from benchmarks.corpus import kept_runs, tuning_sets
+from benchmarks.corpus import kept_runs
 from benchmarks.corpus.bars import demands, unreported_fold
-from benchmarks.corpus.report import corpus_page
 from benchmarks.corpus.score import Doubt, claimed_errors, parameter_counts, parameter_errors, walk_figures
 from benchmarks.corpus.trajectory import offset_errors, order_scores
-from benchmarks.corpus.tuning_sets import GROUPS, groups_table, seen_sets, unseen_rows
 from sfm_app.camera.models import camera_matrix
 from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at
 
@@ -140,23 +136,6 @@ def test_one_parameter_of_twenty_may_be_off_and_no_exception_passes():
     broken = demands([bad], [*fine[1:], stated_row(9.0, "yes", 16.0)])
     assert [demand.met for demand in broken] == [False] * 5
     assert not demands([run_row(**{"exit code": None})], fine)[0].met
-
-
-def test_sets_that_constants_have_seen_are_left_out():
-    rows = [run_row(photos="kitti51"), run_row(photos="castle-P19 crop:460,200"), run_row(photos="merton1")]
-    assert [row["photos"] for row in unseen_rows(rows, seen_sets())] == ["kitti51"]
-    ransac = next(row for row in groups_table(rows) if row["stand in"] == "fundamental")
-    assert ransac["bars met on sets not seen"] == "2 of 2"
-    assert "Left out: " in corpus_page("", rows[1:], []) and "None of those above." in corpus_page("", rows[1:], [])
-
-
-def test_groups_of_constants_name_modules_that_there_are():
-    package = Path(sfm_app.__file__).parent
-    for group in GROUPS.values():
-        for module in group.modules:
-            path = package / module.replace(".", "/")
-            assert path.is_dir() or path.with_suffix(".py").is_file(), module
-    assert set(tuning_sets.STRECHA) < set(seen_sets())
 
 
 def photos_in(folder, count, size=(40, 30)):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.lenses.command import methods_for, page
-from benchmarks.lenses.models import STRONG, fisheye_case, measure, perspective_case
+from benchmarks.lenses.models import measure
 from benchmarks.lenses.radius import projection_of, radius_error_percent
 from sfm_app.synthetic.cameras import Lens, make_camera, make_wide_camera
 from sfm_app.synthetic.photo_folder import Truth

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from benchmarks.synthetic.detail_scenes import HIGH, WIDTH, carving, pebbles, relief, straight, tree, tube
+from benchmarks.synthetic.detail_scenes import straight, tube
 from benchmarks.synthetic.houses import DEPTH_M
 from benchmarks.synthetic.scenes import build_scene, scene_views
 from benchmarks.synthetic.town import (
@@ -18,8 +18,6 @@ from benchmarks.synthetic.town import (
     TownPhotos,
     place_house,
     plan_houses,
-    town,
-    town_of,
     town_views,
     walk_town,
 )

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.colmap.backend import json_options, pycolmap, translate_errors
+from sfm_app.colmap.backend import pycolmap, translate_errors
 from sfm_app.colmap.bundle import adjust
-from sfm_app.colmap.database import SQUARE_PIXELS, TWO_FOCALS, camera_params
 from sfm_app.colmap.model import (
     cameras_by_photo,
     focal_px,
@@ -95,12 +94,6 @@ def test_a_part_of_a_model_can_be_adjusted_and_the_whole_stays(synthetic):
     assert all(0 < deviations["fx"] < 20 for deviations in adjusted.deviations.values())
 
 
-def test_camera_parameters_of_both_models():
-    K = np.array([[800.0, 0, 310], [0, 1250.0, 240], [0, 0, 1]])
-    assert camera_params(K, TWO_FOCALS, -0.1) == [800, 1250, 310, 240, -0.1, 0, 0, 0]
-    assert camera_params(K, SQUARE_PIXELS) == [1000, 310, 240, 0]
-
-
 def test_what_colmap_raises_becomes_one_of_ours():
     with (
         pytest.raises(BackendError, match=r"COLMAP failed while reading: .*cannot find it") as caught,
@@ -110,11 +103,6 @@ def test_what_colmap_raises_becomes_one_of_ours():
     assert isinstance(caught.value.__cause__, ValueError)
     with pytest.raises(ConfigError), translate_errors("reading"):
         raise ConfigError("ours stays ours")
-
-
-def test_options_become_plain_values():
-    options = json_options(pycolmap.FeatureMatchingOptions().todict())
-    assert options["sift"]["max_ratio"] == 0.8 and isinstance(options["type"], str)
 
 
 def test_points_and_cameras_of_a_model_on_disk(synthetic, tmp_path):
@@ -165,12 +153,3 @@ def test_points_fall_on_the_pixels_of_their_tracks_and_photos_look_from_their_ce
     true = {image.name: image.projection_center() for image in model.images.values()}
     assert np.allclose(found.centers, [true[name] for name in found.photos])
     assert found.sizes.tolist() == [[1000, 800]] * 8 and found.metric
-
-
-def test_a_model_without_points_has_empty_arrays(synthetic):
-    model, _ = synthetic()
-    for key in list(model.points3D):
-        model.delete_point3D(key)
-    found = model_arrays(model, metric=False)
-    assert found.points.shape == (0, 3) and not found.metric and found.track_pixels.shape == (0, 2)
-    assert found.track_points.shape == (0,) and found.errors_px == pytest.approx([])

@@ -11,21 +11,9 @@ from sfm_app.colmap.wide_views import split_wide_photos, view_name, write_model,
 from sfm_app.photos.masks import save_mask
 from sfm_app.progress import SilentProgress
 from sfm_app.stereo import rank_neighbors
+from tests.unit.colored_photos import SIZE, colors_of, make_model, write_photos
 
-SIZE = 240, 160
-CAMERAS = {
-    "fisheye": ("OPENCV_FISHEYE", [87.5, 88.0, 120.5, 79.0, 0.02, -0.003, 0.0, 0.0]),
-    "thin prism": ("THIN_PRISM_FISHEYE", [87.5, 88.0, 120.5, 79.0, 0.02, -0.003, 2e-3, 1e-3, 0, 0, 1e-3, 0]),
-    "panorama": ("EQUIRECTANGULAR", [240.0, 120.0]),
-    "plain": ("OPENCV", [210.0, 207.5, 120.5, 79.0, 0.05, -0.01, 0.0, 0.0]),
-    "strong barrel": ("OPENCV", [130.0, 130.0, 120.0, 80.0, -0.2, 0.025, 0.0, 0.0]),
-}
 NAMES = ("a.png", "sub/b.png", "c.png")
-
-
-def colors_of(rays):
-    """Colors (..., 3) of rays of any length: each channel is an axis."""
-    return np.round(127.5 + 120.0 * rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.uint8)
 
 
 def rays_of(shape, K, R):
@@ -35,33 +23,9 @@ def rays_of(shape, K, R):
 
 
 def make_place(root, kind):
-    """Three photos whose colors are directions in the world, and their model with points all round."""
-    rng = np.random.default_rng(0)
-    name, params = CAMERAS[kind]
-    size = (240, 120) if kind == "panorama" else SIZE
-    camera = pycolmap.Camera(camera_id=1, model=name, width=size[0], height=size[1], params=params)
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(camera)
-    X = rng.normal(size=(300, 3))
-    X *= 6.0 / np.linalg.norm(X, axis=1, keepdims=True)
-    tracks = [pycolmap.Track() for _ in X]
-    pixels = np.stack(np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5), -1).reshape(-1, 2)
-    rays = np.array(camera.cam_ray_from_img(pixels))
-    for index, photo in enumerate(NAMES, start=1):
-        R = cv2.Rodrigues(np.array([0.1, 0.3, 0.05]) * index)[0]
-        t = -R @ np.array([0.4 * index, 0.1, 0.0])
-        x = np.array(camera.img_from_cam(X @ R.T + t))
-        seen = np.flatnonzero(np.isfinite(x).all(axis=1) & (x > 0).all(axis=1) & (x < size).all(axis=1))
-        for row, point in enumerate(seen):
-            tracks[point].add_element(index, row)
-        image = pycolmap.Image(name=photo, keypoints=x[seen], camera_id=1, image_id=index)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(R), t))
-        colors = colors_of(np.nan_to_num(rays, nan=1.0) @ R).reshape(size[1], size[0], 3)
-        (root / "photos" / photo).parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(root / "photos" / photo), colors[..., ::-1])
-    for point, track in zip(X, tracks, strict=True):
-        if track.length() > 1:
-            model.add_point3D(point, track, np.array([1, 2, 3], np.uint8))
+    """Three photos and their model."""
+    model = make_model([kind], NAMES)
+    write_photos(model, root / "photos")
     (root / "sparse").mkdir()
     model.write(root / "sparse")
     return model
@@ -74,7 +38,9 @@ def fill(root, masks=None, largest=1000):
     return lenses, read_views(root / "dense")
 
 
-@pytest.mark.parametrize(("kind", "count"), [("fisheye", 4), ("thin prism", 4), ("panorama", 6), ("strong barrel", 2)])
+@pytest.mark.parametrize(
+    ("kind", "count"), [("wide fisheye", 4), ("wide prism", 4), ("panorama", 6), ("strong barrel", 2)]
+)
 def test_views_show_the_directions_of_the_photo(tmp_path, kind, count):
     make_place(tmp_path, kind)
     _, views = fill(tmp_path)
@@ -89,7 +55,7 @@ def test_views_show_the_directions_of_the_photo(tmp_path, kind, count):
         assert np.mean(wrong) < 2.0 and np.quantile(wrong, 0.999) < 12
 
 
-@pytest.mark.parametrize("kind", ["fisheye", "panorama"])
+@pytest.mark.parametrize("kind", ["wide fisheye", "panorama"])
 def test_points_are_seen_where_they_project(tmp_path, kind):
     model = make_place(tmp_path, kind)
     _, views = fill(tmp_path)
@@ -123,7 +89,7 @@ def mask_left(root, columns):
 
 
 def test_masked_pixels_are_masked_in_every_view(tmp_path):
-    make_place(tmp_path, "fisheye")
+    make_place(tmp_path, "wide fisheye")
     mask_left(tmp_path, SIZE[0] // 2)
     lenses, views = fill(tmp_path, tmp_path / "masks")
 
@@ -138,7 +104,7 @@ def test_masked_pixels_are_masked_in_every_view(tmp_path):
 
 
 def test_ordinary_lenses_are_left_to_colmap(tmp_path):
-    make_place(tmp_path, "fisheye")
+    make_place(tmp_path, "wide fisheye")
     model = pycolmap.Reconstruction(tmp_path / "sparse")
     camera = model.cameras[1]
     camera.model = pycolmap.CameraModelId.OPENCV
@@ -148,7 +114,7 @@ def test_ordinary_lenses_are_left_to_colmap(tmp_path):
 
 
 def test_large_views_are_scaled_down_without_aliasing(tmp_path):
-    make_place(tmp_path, "fisheye")
+    make_place(tmp_path, "wide fisheye")
     lenses, views = fill(tmp_path, largest=120)
     assert max(max(view.width, view.height) for view in views) == 120
     assert all(view.K[0, 0] < 120.0 for view in views) and len(lenses[1].views) == 4
@@ -180,7 +146,7 @@ def test_photos_of_a_plain_lens_keep_their_names(plain, side):
 
 
 def test_views_of_a_fisheye_are_those_of_the_workspace(tmp_path):
-    make_place(tmp_path, "fisheye")
+    make_place(tmp_path, "wide fisheye")
     _, views = fill(tmp_path)
     found = LargerViews(tmp_path / "sparse", tmp_path / "photos", None, views[1:], 120)
     rendered = {name: rest for photo in found.photos for name, *rest in found.render(photo)}

@@ -170,13 +170,6 @@ def test_a_claim_may_be_rounded_and_photos_may_be_unsure(claimed, deviation, con
     assert FocalClaim(claimed, 3, 1850.0, deviation).is_contradicted == contradicted
 
 
-def test_the_text_has_both_numbers_and_what_happened():
-    assert FocalClaim(1200.0, 3, 1850.0, 20.0).text == (
-        "EXIF says 1200 px, the photos say 1850 +- 20: they were cropped or zoomed"
-    )
-    assert "through another lens" in FocalClaim(1850.0, 3, 1200.0, 20.0).text
-
-
 class Said(SilentProgress):
     """Progress that keeps what is said."""
 

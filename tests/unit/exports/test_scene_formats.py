@@ -15,8 +15,7 @@ from sfm_app.camera_files import read_given_cameras
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.formats.gltf import FLIP
 from sfm_app.geometry.poses import Similarity
-
-from .conftest import colors_of
+from tests.unit.colored_photos import colors_of
 
 EXACT_PX, RELATIVE = 1e-6, 1e-6
 MOVED = Similarity(3.5, cv2.Rodrigues(np.array([0.3, -0.2, 0.5]))[0], np.array([10.0, -2.0, 4.0]))

@@ -9,7 +9,7 @@ import pytest
 
 from sfm_app.fundamental.loop import GUIDED, UNGUIDED, BestModel, Recipe, SamplingPlan, draw_until_better, run_loop
 from sfm_app.fundamental.points import prepare
-from sfm_app.fundamental.pretests import NO_PRETEST, FullVerification, RandomizedTdd
+from sfm_app.fundamental.pretests import NO_PRETEST, FullScoring, RandomizedTdd
 from sfm_app.fundamental.samples import random_state
 from sfm_app.fundamental.scores import geman_mcclure, mlesac, msac, penalty, ransac, squared_distances
 from sfm_app.settings import EpipolarSettings
@@ -302,7 +302,7 @@ def test_a_renewed_measure_scores_the_best_model_anew(scripted):
 def test_tests_are_reviewed_and_told_of_every_trial_and_model(scripted):
     told = []
 
-    class Nosy(FullVerification):
+    class Nosy(FullScoring):
         review = 40
 
         def learn(self, trials):
@@ -311,7 +311,7 @@ def test_tests_are_reviewed_and_told_of_every_trial_and_model(scripted):
         def expect(self, share):
             told.append(round(share, 1))
 
-    scripted(replace(PLAIN, verifier=Nosy), (50, 1.0), max_trials=100)
+    scripted(replace(PLAIN, pretest=Nosy), (50, 1.0), max_trials=100)
     assert told == [40, 10, 0.5, 40, 10]
 
 
@@ -321,7 +321,7 @@ def test_an_outlier_in_front_does_not_spoil_a_randomized_test():
     inlier = np.empty(300, dtype=bool)
     inlier[m.rows] = pair.is_inlier
     spoilt = replace(m, points=np.asfortranarray(m.points[np.argsort(inlier)]))  # all outliers come first
-    found = run_loop(spoilt, options(), 0, replace(PLAIN, verifier=RandomizedTdd))
+    found = run_loop(spoilt, options(), 0, replace(PLAIN, pretest=RandomizedTdd))
     near = squared_distances(spoilt.points, found.F.reshape(9)) < (3 / m.unit_px) ** 2
     assert near[np.sort(inlier)].mean() > 0.9
 

@@ -11,7 +11,7 @@ from sfm_app.fundamental.pretests import (
     MODELS_PER_SAMPLE,
     SPRT,
     BailOut,
-    FullVerification,
+    FullScoring,
     PreTest,
     RandomizedTdd,
     SequentialTest,
@@ -59,7 +59,7 @@ def test_tdd_beginning_at_its_own_match_reaches_the_stated_confidence():
     pretest = RandomizedTdd(count, 7).pretest
     pass_rate = passes(pretest, rng.permutation(count) < share * count).mean()
     trials = math.ceil(RandomizedTdd(count, 7).required_trials(share, 0.9))
-    plain = math.ceil(FullVerification(count, 7).required_trials(share, 0.9))
+    plain = math.ceil(FullScoring(count, 7).required_trials(share, 0.9))
 
     def missed(trials):
         found = (rng.uniform(size=(runs, trials)) < share**7) & (rng.uniform(size=(runs, trials)) < pass_rate)
@@ -70,7 +70,7 @@ def test_tdd_beginning_at_its_own_match_reaches_the_stated_confidence():
 
 
 def test_full_verification_has_no_test_and_plain_trials():
-    test = FullVerification(100, 8)
+    test = FullScoring(100, 8)
     assert len(test.pretest.least_inliers) == 0
     assert test.required_trials(0.5, 0.99) == pytest.approx(required_trials(0.5**8, 0.99))
     test.expect(0.3)

@@ -283,7 +283,7 @@ def graph_of_poses(dropped=None, poses=None):
 def test_every_photo_without_a_place_has_a_reason():
     views = ViewGraph({(1, 2): fit(40), (1, 3): fit(17), (2, 3): fit(20), (4, 5): fit(30), (2, 7): fit(25)}, {})
 
-    reasons = unregistered_reasons({1, 2}, [(7, 8, 9)], photo_graph(9), views, graph_of_poses())
+    reasons = unregistered_reasons({1, 2}, [(7, 8, 9)], photo_graph(10, blank=(10,)), views, graph_of_poses())
 
     assert reasons == {
         "3.jpg": "could not be placed: 20 inliers with the nearest placed photo",
@@ -293,6 +293,7 @@ def test_every_photo_without_a_place_has_a_reason():
         "7.jpg": "belongs to another model, of 3 photos",
         "8.jpg": "belongs to another model, of 3 photos",
         "9.jpg": "belongs to another model, of 3 photos",
+        "10.jpg": "no features were found in it",
     }
 
 

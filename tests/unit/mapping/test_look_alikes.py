@@ -195,11 +195,6 @@ def test_photos_far_apart_do_not_meet(walls):
     assert all((a < 10) == (b < 10) for a, b in find_expected_overlaps(walls.finish()[0]))
 
 
-@pytest.mark.slow
-def test_a_model_without_points_has_no_meetings():
-    assert find_expected_overlaps(pycolmap.Reconstruction()) == {}
-
-
 def two_streets(walls, length=24, alike=(10.0, 14.0)):
     """Two walks along different walls in one place; both see the same house in the middle."""
     low, high = alike

@@ -1,6 +1,5 @@
 """Masks: which file is whose, what in it counts as masked, and that it lies on the photo as people see it."""
 
-import os
 from dataclasses import replace
 
 import numpy as np

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm_app.selfcal.consensus import center_polynomials, focal_polynomials, singular_value_ratio
+from sfm_app.selfcal.consensus import singular_value_ratio
 from sfm_app.selfcal.pairs import prepare
+from sfm_app.selfcal.thesis.curves import center_polynomials, focal_polynomials
 from sfm_app.types import CameraPairs
 
 seeds = st.integers(0, 2**32 - 1)

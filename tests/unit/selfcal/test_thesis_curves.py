@@ -5,14 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm_app.selfcal.consensus import center_polynomials, focal_polynomials
 from sfm_app.selfcal.pairs import prepare
 from sfm_app.selfcal.thesis import curves
 from sfm_app.selfcal.thesis.curves import (
     center_curves,
+    center_polynomials,
     companion_roots,
     degeneracy,
     focal_curves,
+    focal_polynomials,
     swept_roots,
     usable_curves,
 )

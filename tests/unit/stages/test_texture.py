@@ -82,18 +82,18 @@ def test_nothing_is_seen_of_what_is_masked_at_any_size(tmp_path, scale):
 
 def test_arrays_come_back_by_name_and_damaged_ones_count_as_none(tmp_path):
     files = FileStore(tmp_path, tmp_path / "parts")
-    assert files.recall("look0") is None
+    assert files.recall("view0") is None
 
-    files.keep("look0", {"worth": np.arange(3), "sharpness": np.array(0.5)})
-    files.keep("look0", {"worth": np.arange(4)})
+    files.keep("view0", {"score": np.arange(3), "sharpness": np.array(0.5)})
+    files.keep("view0", {"score": np.arange(4)})
 
-    assert list(files.recall("look0")) == ["worth"]
-    assert files.recall("look0")["worth"].tolist() == [0, 1, 2, 3]
+    assert list(files.recall("view0")) == ["score"]
+    assert files.recall("view0")["score"].tolist() == [0, 1, 2, 3]
     (path,) = (tmp_path / "parts").iterdir()
     path.write_bytes(path.read_bytes()[:50])
-    assert files.recall("look0") is None
+    assert files.recall("view0") is None
     path.write_bytes(b"")
-    assert files.recall("look0") is None
+    assert files.recall("view0") is None
 
 
 def test_the_digest_of_a_surface_is_that_of_all_its_parts():
@@ -113,9 +113,9 @@ def test_nothing_is_used_that_was_found_with_something_else(tmp_path, monkeypatc
     found = []
 
     def texture_surface(surface, views, store, hidden, options, spread):
-        found.append(store.recall("look0"))
+        found.append(store.recall("view0"))
         if len(found) == 1:
-            store.keep("look0", {"worth": np.arange(3)})
+            store.keep("view0", {"score": np.arange(3)})
             raise KeyboardInterrupt
         return Model(surface), {}
 

@@ -87,7 +87,7 @@ def whole():
 def test_an_interrupted_texture_resumes(whole, monkeypatch, photos, options, rest):
     monkeypatch.setattr(pages, "CHECKPOINTS", replace(pages.CHECKPOINTS, **options))
     album = interrupted_after(photos)
-    assert (pages.GROUP_NAME in album.kept) == bool(options)
+    assert (pages.CHECKPOINT_NAME in album.kept) == bool(options)
 
     model, figures = textured(album)
 
@@ -103,10 +103,10 @@ def test_large_pages_are_saved_less_often(monkeypatch):
     work = pages.Pages([], 40, album)
     kept_after = []
     for photo in range(40):
-        before = album.kept.pop(pages.GROUP_NAME, None)
+        before = album.kept.pop(pages.CHECKPOINT_NAME, None)
         assert before is None or before["has"].sum() == photo
         with work.lock_canvases(photo):
             pass
-        kept_after += [photo] if pages.GROUP_NAME in album.kept else []
+        kept_after += [photo] if pages.CHECKPOINT_NAME in album.kept else []
 
     assert kept_after == [0, 20]

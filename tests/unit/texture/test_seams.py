@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from painted_box import sightings, strip
 
-from sfm_app.texture.seams import blend_weights, block_sizes, level_seams, solve_ties, square_texels, squares
+from sfm_app.texture.charts import rectangle_sizes, square_texels, squares
+from sfm_app.texture.seams import blend_weights, level_seams, solve_ties
 
 
 def test_weights_blend_near_the_seam_only():
@@ -60,7 +61,7 @@ def test_squares_show_three_colors_exactly():
 
 
 def test_squares_never_share_a_texel():
-    sizes = block_sizes(9000)
+    sizes = rectangle_sizes(9000)
     places = np.array([[k, 0, 0] for k in range(len(sizes))], np.int32)
     found = squares(places, sizes, 9000)
     assert len(np.unique(found, axis=0)) == 9000

@@ -11,7 +11,7 @@ from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
-from sfm_app.stages import export
+from sfm_app.stages import files
 
 
 @pytest.fixture
@@ -20,9 +20,9 @@ def run(tmp_path):
 
 
 def test_the_manifest_says_how_large_the_files_are_and_how_good_the_pictures(textured_ball, run):
-    paths = export.make(textured_ball, MetricFrame(), run)
+    paths = files.make(textured_ball, MetricFrame(), run)
 
-    assert paths == export.load(run)
+    assert paths == files.load(run)
     assert [path.name for path in paths] == ["model.ply", "model.glb"]
     for path in paths:
         assert path.read_bytes() == EXPORTERS[path.suffix[1:]].write(textured_ball, "model")[path.name]
@@ -34,5 +34,5 @@ def test_the_manifest_says_how_large_the_files_are_and_how_good_the_pictures(tex
 
 
 def test_without_a_texture_it_says_nothing_about_pictures(ball, run):
-    export.make(ball, MetricFrame(), run)
+    files.make(ball, MetricFrame(), run)
     assert list(run.statistics) == ["bytes"]
