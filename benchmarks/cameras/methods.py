@@ -29,6 +29,8 @@ class Method:
     """`OURS`, or one of `STOCK`."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the program that differ from its defaults; of stock, camera_model and camera_params if it is told."""
+    without: str = ""
+    """Hypothesis about the photos that is switched off; such a run resumes a finished one at its scene."""
 
 
 def methods(also: Mapping[str, Mapping[str, Any]], *, ours_only: bool = False) -> list[Method]:
@@ -37,19 +39,27 @@ def methods(also: Mapping[str, Mapping[str, Any]], *, ours_only: bool = False) -
     return ours if ours_only else ours + [Method(kind, kind) for kind in STOCK]
 
 
+def ablations(names: Sequence[str]) -> list[Method]:
+    """List the program without each hypothesis."""
+    return [Method(f"{OURS}, without {name}", OURS, {"scene": {"without": [name]}}, name) for name in names]
+
+
 def rotate_methods(these: Sequence[Method], repetition: int) -> list[Method]:
     """Start every repetition with another method, so that none always meets a cold or a busy machine."""
     first = repetition % len(these)
     return [*these[first:], *these[:first]]
 
 
-def run(method: Method, photos: PhotoSet, out: Path, limit_s: float | None = None) -> Row:
-    """Run a method from scratch into OUT, and return its times, its peak memory and the reason if it failed.
+def run(method: Method, photos: PhotoSet, out: Path, limit_s: float | None = None, finished: Path | None = None) -> Row:
+    """Run a method into OUT, and return its times, its peak memory and the reason if it failed.
 
-    After `limit_s` the process is killed, together with its children.
+    It starts from scratch, or from a copy of a finished run with other settings. After `limit_s` the process is killed,
+    together with its children.
     """
     shutil.rmtree(out, ignore_errors=True)
     out.parent.mkdir(parents=True, exist_ok=True)
+    if finished is not None:
+        shutil.copytree(finished, out, symlinks=True)
     ours = method.settings if method.kind == OURS else {}
     settings = merge_nested({"photos": {"cameras": photos.cameras if photos.cameras_given else "auto"}}, ours)
     cap = MatchSettings(**settings.get("matching", {})).max_image_size_px

@@ -2,10 +2,12 @@
 
     python -m benchmarks.corpus DATA --cache CACHE --keep
     python -m benchmarks.corpus DATA --cache CACHE --sets merton1 "kitchen1000 every:5" --ours-only
+    python -m benchmarks.corpus DATA --cache CACHE --keep --ours-only --without learned-cameras finer-features
     python -m benchmarks.corpus DATA --cache CACHE --score-only
 
 --keep continues an interrupted command: what has been run with the same program, settings and photos is not
-run again. --score-only runs nothing and makes the table from the runs in CACHE.
+run again. --score-only runs nothing and makes the table from the runs in CACHE. --without runs the scene once more
+without a hypothesis about the photos, on the sets where it was tried.
 """
 
 import argparse
@@ -13,10 +15,11 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import get_args
 
 from benchmarks.cameras.bars import BARS, verdict
 from benchmarks.cameras.measure import FEW_PHOTOS, OWN_CAMERA_SETS, score_run, warm_up
-from benchmarks.cameras.methods import STOCK, Method, methods
+from benchmarks.cameras.methods import STOCK, Method, ablations, methods
 from benchmarks.cameras.score import true_photos
 from benchmarks.cameras.worker import INCREMENTAL, OURS
 from benchmarks.common import photo_sets
@@ -24,9 +27,10 @@ from benchmarks.common.command_line import new_parser, overrides
 from benchmarks.common.photo_sets import FORMATS, PhotoSet, photo_set, steps
 from benchmarks.common.results import RESULTS, Row, document, finite_or_none, write
 from benchmarks.corpus.bars import required_bars, unreported_fold
-from benchmarks.corpus.kept_runs import FinishedRun, reusable_run, run_and_record, run_key
+from benchmarks.corpus.kept_runs import FinishedRun, reusable_run, run_and_record, run_key, trials
 from benchmarks.corpus.report import add_comparisons, corpus_page
 from benchmarks.corpus.score import OFFSETS, corpus_figures, fold_lines
+from sfm_app.settings import HypothesisName
 
 ABOUT = (
     "The same pixels for all: photos saved anew as PNG, upright, no EXIF; every run in a process of its own, once. "
@@ -76,6 +80,7 @@ def score(method: Method, photos: PhotoSet, out: Path, data: Path, done: Finishe
         calibration = out / "calibration.json"
         if calibration.exists():
             row["cameras"] = len(json.loads(calibration.read_text(encoding="utf-8"))["cameras"])
+        row["trials"] = trials(out)
         row["made by"] = None if done.key == run_key(method, photos) else "another program, or settings"
     stated = [{"photos": photos.name, "method": method.name} | one for one in stated]
     return {name: finite_or_none(value) for name, value in row.items()}, stated
@@ -119,13 +124,16 @@ def run_all(args: argparse.Namespace, these: Sequence[Method]) -> Iterator[tuple
             stated: list[Row] = []
             try:
                 photos = load_set(title, args)
-                out = args.cache / "corpus" / photos.folder.name / method.name.replace(" ", "_")
+                folder = args.cache / "corpus" / photos.folder.name
+                out, finished = folder / method.name.replace(" ", "_"), folder / OURS if method.without else None
+                if finished and method.without not in {trial["name"] for trial in trials(finished)}:
+                    continue
                 done = reusable_run(method, photos, out, args)
                 if done is None and args.score_only:
                     continue
                 if done is None:
                     compiled = compiled or compile_kernels(args, these)
-                    done = run_and_record(method, photos, out, 60 * args.limit_min)
+                    done = run_and_record(method, photos, out, 60 * args.limit_min, finished)
                 row, stated = score(method, photos, out, args.data, done)
             except Exception as error:  # runs unattended: measure the next set anyway
                 row = failed_row(title, method, error)
@@ -157,7 +165,11 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("data", type=Path, help="folder with NAME/images and, where known, NAME/cameras.json")
     parser.add_argument("--cache", type=Path, required=True, help="keeps copies of photos and the last run of each")
     parser.add_argument("--sets", nargs="+", metavar="SET", help='"NAME" or "NAME CHANGE"; all by default')
-    parser.add_argument("--without", nargs="*", default=[], metavar="SET", help="sets to skip")
+    parser.add_argument("--skip", nargs="*", default=[], metavar="SET", help="sets to skip")
+    parser.add_argument(
+        "--without", nargs="*", default=[], choices=get_args(HypothesisName), metavar="NAME",
+        help="hypotheses to switch off, one by one: " + ", ".join(get_args(HypothesisName)),
+    )  # fmt: skip
     parser.add_argument("--stock", nargs="*", default=[INCREMENTAL], choices=STOCK, help="stock mappers")
     parser.add_argument("--ours-only", action="store_true", help="skip stock pycolmap")
     parser.add_argument("--also", nargs="*", default=(), metavar="TABLE.KEY=VALUE", help="run ours with it, too")
@@ -175,7 +187,7 @@ def parse_arguments() -> argparse.Namespace:
     """Read the command line, and resolve which sets to run."""
     args = parser().parse_args()
     wanted = args.sets or default_titles(args.data)
-    args.sets = [title for title in wanted if title not in args.without and title.partition(" ")[0] not in args.without]
+    args.sets = [title for title in wanted if title not in args.skip and title.partition(" ")[0] not in args.skip]
     return args
 
 
@@ -184,6 +196,7 @@ def main() -> None:
     args = parse_arguments()
     stock = () if args.ours_only else args.stock
     these = [method for method in methods(overrides(args.also)) if method.kind == OURS or method.name in stock]
+    these += ablations(args.without)
     rows: list[Row] = []
     stated: list[Row] = []
     page = ""

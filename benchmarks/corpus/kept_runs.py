@@ -54,11 +54,23 @@ def reusable_run(method: Method, photos: PhotoSet, out: Path, args: argparse.Nam
     return before if args.keep and before.key == run_key(method, photos) and not cut_short else None
 
 
-def run_and_record(method: Method, photos: PhotoSet, out: Path, limit_s: float) -> FinishedRun:
-    """Run a method, and record its result."""
-    done = FinishedRun(run_key(method, photos), run(method, photos, out, limit_s))
+def run_and_record(
+    method: Method, photos: PhotoSet, out: Path, limit_s: float, finished: Path | None = None
+) -> FinishedRun:
+    """Run a method, from a copy of a finished run if there is one, and record its result."""
+    done = FinishedRun(run_key(method, photos), run(method, photos, out, limit_s, finished))
     record_run(out, done)
     return done
+
+
+def trials(out: Path) -> list[Row]:
+    """Return the hypotheses that the run in OUT tried; none if it has no scene."""
+    try:
+        stages = json.loads((out / "manifest.json").read_text(encoding="utf-8"))["stages"]
+    except (OSError, ValueError, KeyError):
+        return []
+    listed: list[Row] = stages.get("scene", {}).get("counts", {}).get("hypotheses", [])
+    return listed
 
 
 def record_run(out: Path, done: FinishedRun) -> None:
