@@ -160,6 +160,11 @@ class SceneSettings(Section):
     )
     min_points: int = Field(30, ge=6, le=10000, description="a model with fewer points counts as failed")
     without: tuple[HypothesisName, ...] = Field((), description="hypotheses about the photos that are not tried")
+    hypotheses_s: float = Field(
+        3600.0,
+        ge=0,
+        description="time for hypotheses about the photos, in seconds; the report names those that had none left",
+    )
     photo_rotation_deg: Literal["auto", 0, 90, 180, 270] = Field(
         "auto", description="clockwise rotation that makes most photos upright, in degrees"
     )

@@ -80,6 +80,10 @@ class Hypothesis:
     """Most times that it is tried, as long as it is accepted."""
 
 
+FIRST = "first-pass"
+"""Name of the trial that all hypotheses are compared with."""
+
+
 def reconstruct(
     evidence: Evidence, run: RunContext, mappers: Mappers = MAPPERS, hypotheses: Iterable[Hypothesis] | None = None
 ) -> Outcome:
@@ -88,9 +92,7 @@ def reconstruct(
         write_match_graph(run.workspace.database, evidence.matches)
     mapper, start = Mapper(run, mappers), time.monotonic()
     first = mapper.map(evidence)
-    trial = Trial(
-        "first-pass", "", True, (0, first.photos), (0.0, first.support), time.monotonic() - start, first.notes
-    )
+    trial = Trial(FIRST, "", True, (0, first.photos), (0.0, first.support), time.monotonic() - start, first.notes)
     best = improve(replace(first, trials=(trial,)), mapper, HYPOTHESES if hypotheses is None else hypotheses)
     joins = mapper.judge_places(best.models)[0]  # without these the photos fall apart
     doubtful = tuple(dict.fromkeys((*best.graph.doubtful, *joins)))  # finer features may have named them
@@ -99,12 +101,18 @@ def reconstruct(
 
 def improve(best: Outcome, mapper: Mapper, hypotheses: Iterable[Hypothesis]) -> Outcome:
     """Try hypotheses in turn, each as long as it is accepted; return the outcome that explains most."""
+    options = mapper.run.settings.scene
     for hypothesis in hypotheses:
-        if hypothesis.name in mapper.run.settings.scene.without:
+        if hypothesis.name in options.without:
             continue
         for _ in range(hypothesis.repeats):
             reason = hypothesis.reason(best, mapper)
             if not reason:
+                break
+            if sum(trial.seconds for trial in best.trials if trial.name != FIRST) >= options.hypotheses_s:
+                late = _trial(hypothesis, reason, best, best, 0.0, accepted=False)
+                failure = f"no time was left, of {options.hypotheses_s:g} s"
+                best = replace(best, trials=(*best.trials, replace(late, notes=(), failure=failure)))
                 break
             best, accepted = _try(hypothesis, reason, best, mapper)
             if not accepted:

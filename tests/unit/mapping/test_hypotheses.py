@@ -73,6 +73,18 @@ def test_a_hypothesis_that_is_switched_off_is_not_tried(synthetic, run, cameras,
     assert trials_of(found) == [("first-pass", True, "3 photos")]
 
 
+def test_what_no_time_is_left_for_is_named(synthetic, run, cameras, mapped):
+    few = without(with_camera(synthetic.copy(), TRUE), [6])
+    seen = mapped(few)
+    found = mapped.outcome(cameras(), run(hypotheses_s=0))
+    assert len(seen) == 1 and found.main.model is few
+    assert [(trial.name, trial.failure) for trial in found.trials[1:3]] == [
+        ("colmap-defaults", "no time was left, of 0 s"),
+        ("learned-cameras", "no time was left, of 0 s"),
+    ]
+    assert not any(trial.accepted for trial in found.trials[1:])
+
+
 @pytest.fixture
 def fails():
     """Makes a hypothesis that maps nothing, and raises."""
