@@ -125,7 +125,10 @@ def test_a_photo_blurred_beyond_use_is_left_out(spoil):
     assert left_out(*SHARP, spoil(sensor_photo(9))) == {4: "blurred beyond use"}
 
 
-@pytest.mark.parametrize("spoil", [lambda i: i.filter(ImageFilter.GaussianBlur(3)), lambda i: smeared(i, 8)])
+@pytest.mark.parametrize(
+    "spoil",
+    [lambda i: i.filter(ImageFilter.GaussianBlur(3)), pytest.param(lambda i: smeared(i, 8), marks=pytest.mark.slow)],
+)
 def test_a_photo_that_is_a_little_blurred_stays(spoil):
     assert left_out(*SHARP, spoil(sensor_photo(9))) == {}
 

@@ -46,7 +46,7 @@ def test_the_pose_is_a_rotation_and_a_baseline_within_the_options(seed):
     assert 0.05 <= np.linalg.norm(pair.t) <= 0.5
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(5))
 def test_points_behind_a_camera_are_not_matches(seed):
     # cameras far apart and turned anywhere: many points project into image 2 from behind
     wide = PairOptions(points=100, max_rotation_deg=180.0, max_baseline=3.0)
