@@ -127,20 +127,20 @@ def test_eight_copies_of_one_photo(courtyard, folder, tmp_path):
 
 
 def test_two_groups_of_photos_give_the_larger_one(courtyard, heap, folder, tmp_path):
-    for photo in courtyard.iterdir():
+    for photo in sorted(courtyard.iterdir())[:5]:
         shutil.copy(photo, folder / f"court_{photo.name}")
-    for photo in sorted(heap.iterdir())[:3]:
+    for photo in sorted(heap.iterdir())[:2]:
         shutil.copy(photo, folder / f"heap_{photo.name}")
 
     result, out = run(folder, tmp_path, "--json")
 
     assert result.exit_code == 0, result.stderr
     scene = json.loads(result.stdout)["scene"]
-    assert (scene["registered"], scene["of"]) == (6, 9)
-    assert sorted(scene["unregistered"]) == [f"heap_view_{k:02d}.jpg" for k in range(3)]
+    assert (scene["registered"], scene["of"]) == (5, 7)
+    assert sorted(scene["unregistered"]) == ["heap_view_00.jpg", "heap_view_01.jpg"]
     assert (out / "sparse").is_dir()
     told = call("run", folder, "-o", out, "--until", "scene", "-v").stdout
-    assert all(f"heap_view_{k:02d}.jpg" in told for k in range(3))
+    assert "heap_view_00.jpg" in told and "heap_view_01.jpg" in told
 
 
 def test_a_time_stamp_does_not_stop_the_camera(courtyard, folder, tmp_path):
