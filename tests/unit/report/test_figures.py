@@ -91,12 +91,11 @@ def test_a_guess_is_drawn_without_pairs(panel, tmp_path):
 
 @pytest.mark.slow
 def test_of_many_cameras_the_first_are_drawn(panel, tmp_path):
-    for count in (1, OPTIONS.most_cameras + 1):
-        draw_calibration(tmp_path / f"{count}.svg", [panel._replace(name=f"camera-{k}") for k in range(count)])
-    text = (tmp_path / f"{OPTIONS.most_cameras + 1}.svg").read_text()
-    assert f"camera-{OPTIONS.most_cameras - 1}, one of {OPTIONS.most_cameras + 1}" in text
+    count = OPTIONS.most_cameras + 1
+    draw_calibration(tmp_path / "many.svg", [panel._replace(name=f"camera-{k}") for k in range(count)])
+    text = (tmp_path / "many.svg").read_text()
+    assert f"camera-{OPTIONS.most_cameras - 1}, one of {count}" in text
     assert f"camera-{OPTIONS.most_cameras}," not in text
-    assert "camera-0" not in (tmp_path / "1.svg").read_text()
 
 
 SAYS = {
