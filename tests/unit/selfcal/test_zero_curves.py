@@ -162,9 +162,9 @@ def test_seed_changes_the_spread_only(views):
 
 
 def with_other_pairs(shots, seed):
-    """28 pairs of one camera among 378 of photos that have no camera in common, and the true K."""
-    right, focals = shots(8, seed, points=400), np.random.default_rng(seed + 100).normal(np.log(620), 0.3, 28)
-    wrong = shots(28, seed + 50, focal=np.exp(focals), center=(0.5, 0.2), points=80, noise_px=2.0)
+    """28 pairs of one camera among 153 of photos that have no camera in common, and the true K."""
+    right, focals = shots(8, seed, points=400), np.random.default_rng(seed + 100).normal(np.log(620), 0.3, 18)
+    wrong = shots(18, seed + 50, focal=np.exp(focals), center=(0.5, 0.2), points=80, noise_px=2.0)
     inliers = (*right.pairs.inliers, *wrong.pairs.inliers)
     ids = (*right.pairs.photos, *((i + 8, j + 8) for i, j in wrong.pairs.photos))
     Fs = np.concatenate([right.pairs.Fs, wrong.pairs.Fs])

@@ -304,7 +304,6 @@ def test_the_fine_surface_is_kept_for_a_normal_map_and_changes_nothing_else(dens
     corners = vertices[faces]
     outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert np.mean(np.sum(outward * corners.mean(axis=1), axis=1) > 0) > 0.999
-    assert make_with_map(place, workers=1, **options).fine_surface.read_bytes() == fine
 
     whole = mesh.digest(kept)
     kept.fine_surface.write_bytes(fine[:-1])
