@@ -11,9 +11,7 @@ import sfm_app
 def finished(rendered, tmp_path_factory):
     """Make a folder with photos/ and a finished run out/."""
     place = tmp_path_factory.mktemp("pages")
-    (place / "photos").mkdir()
-    for path in sorted(rendered[0].iterdir())[1:6]:
-        shutil.copy(path, place / "photos")
+    shutil.copytree(rendered[0], place / "photos")
     sfm_app.reconstruct(place / "photos", place / "out")
     return place
 

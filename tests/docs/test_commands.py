@@ -8,7 +8,8 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from sfm_app.cli.program import main, options
+from sfm_app.cli import options
+from sfm_app.cli.program import main
 from sfm_app.colmap import backend
 from tests.docs.pages import PAGES, ROOT, SHELL, blocks, commands
 

@@ -161,10 +161,8 @@ def decide(made, run):
 
 
 HEALED = [
-    ("model.glb", ()), ("texture/texture.npz", ("--from", "files")), ("surface/surface.npz", ("--from", "texture")),
-    ("dense/stereo/depth_maps/view_02.jpg.geometric.bin", ("--from", "mesh")),
-    ("surface/fused.ply", ("--from", "mesh")), ("sparse/points3D.bin", ()),
-    ("view_graph.npz", ("--from", "scene", "--until", "scene")),
+    ("model.glb", ()), ("surface/surface.npz", ("--from", "texture")),
+    ("dense/stereo/depth_maps/view_02.jpg.geometric.bin", ("--from", "mesh")), ("sparse/points3D.bin", ()),
     ("calibration.json", ("--until", "scene")), ("manifest.json", ("--until", "intrinsics")),
 ]  # fmt: skip
 

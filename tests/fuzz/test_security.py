@@ -84,8 +84,7 @@ def test_the_ear_at_the_network_hears(tmp_path):
 
 NAMES = (
     "';drop table images;--\".jpg", "%s%n{0}{name}.jpg", "a\nb\r.jpg", "\x1b[31m\x1b]0;title\x07.jpg",
-    "[red]bold[/].jpg", "<script>alert(1)</script>.jpg", "-o --help.jpg", "$(touch x)`touch x`.jpg",
-    "\u202egpj.exe.jpg",
+    "[red]bold[/].jpg", "<script>alert(1)</script>.jpg", "-o --help.jpg", "\u202e$(touch x)`touch x`gpj.exe.jpg",
 )  # fmt: skip
 
 
@@ -98,7 +97,7 @@ def named(photos, tmp_path):
     return folder, originals
 
 
-@pytest.mark.parametrize("at", [0, 4, 5])
+@pytest.mark.parametrize("at", [0, 4])
 def test_names_are_nothing_but_names(named, tmp_path, at):
     folder, originals = named
     names = NAMES[at : at + len(originals)]

@@ -110,37 +110,37 @@ def test_a_panorama(folder, tmp_path):
     assert "do not determine it" in said and "the camera only turned" in said
 
 
-def test_eight_copies_of_one_photo(courtyard, folder, tmp_path):
+def test_twenty_copies_of_one_photo(courtyard, folder, tmp_path):
     """Half of them byte by byte, the others compressed more or less."""
     with Image.open(courtyard / "view_02.jpg") as photo:
         small = photo.crop((120, 90, 360, 270))
-        for k in range(8):
-            small.save(folder / f"{k}.jpg", quality=90 if k < 4 else 65 + k)
+        for k in range(20):
+            small.save(folder / f"{k:02d}.jpg", quality=90 if k < 10 else 65 + k)
 
     result, out = run(folder, tmp_path)
     assert result.exit_code == 3
-    assert "only one usable photo" in result.stderr and "7 copies of another" in result.stderr
+    assert "only one usable photo" in result.stderr and "19 copies of another" in result.stderr
 
     result, out = run(folder, tmp_path, "--keep-low-quality")
-    ends_with(result, "8 copies of one photo")
-    ends_with(call("calibrate", folder, "-o", out, "--keep-low-quality"), "8 copies of one photo")
+    ends_with(result, "20 copies of one photo")
+    ends_with(call("calibrate", folder, "-o", out, "--keep-low-quality"), "20 copies of one photo")
 
 
 def test_two_groups_of_photos_give_the_larger_one(courtyard, heap, folder, tmp_path):
-    for photo in courtyard.iterdir():
+    for photo in sorted(courtyard.iterdir())[:5]:
         shutil.copy(photo, folder / f"court_{photo.name}")
-    for photo in sorted(heap.iterdir())[:3]:
+    for photo in sorted(heap.iterdir())[:2]:
         shutil.copy(photo, folder / f"heap_{photo.name}")
 
     result, out = run(folder, tmp_path, "--json")
 
     assert result.exit_code == 0, result.stderr
     scene = json.loads(result.stdout)["scene"]
-    assert (scene["registered"], scene["of"]) == (6, 9)
-    assert sorted(scene["unregistered"]) == [f"heap_view_{k:02d}.jpg" for k in range(3)]
+    assert (scene["registered"], scene["of"]) == (5, 7)
+    assert sorted(scene["unregistered"]) == ["heap_view_00.jpg", "heap_view_01.jpg"]
     assert (out / "sparse").is_dir()
     told = call("run", folder, "-o", out, "--until", "scene", "-v").stdout
-    assert all(f"heap_view_{k:02d}.jpg" in told for k in range(3))
+    assert "heap_view_00.jpg" in told and "heap_view_01.jpg" in told
 
 
 def test_a_time_stamp_does_not_stop_the_camera(courtyard, folder, tmp_path):

@@ -32,6 +32,8 @@ from sfm_app.texture import pages
 
 QUICK = {"quality": "draft", "report": False, "depth": {"max_image_size_px": 360}, "mesh": {"poisson_depth": 8}}
 DRAFT = Settings.from_mapping(QUICK)
+SMALL = {"max_image_size_px": 360}
+SMALLER = "--set", "matching.max_image_size_px=360"
 
 
 @pytest.fixture(scope="module")
@@ -225,7 +227,9 @@ def test_one_worker_and_two_give_the_same_bytes(rendered, tmp_path):
     outs = []
     for workers in (1, 2):
         out = tmp_path / str(workers)
-        settings = Settings.from_mapping({"quality": "draft", "report": False, "workers": workers, "seed": 5})
+        settings = Settings.from_mapping(
+            {"quality": "draft", "report": False, "workers": workers, "seed": 5, "matching": SMALL}
+        )
         sfm_app.reconstruct(rendered[0], out, settings, last="scene")
         outs.append(out)
     sparse = [f"sparse/{part}.bin" for part in ("cameras", "images", "points3D")]
@@ -235,7 +239,7 @@ def test_one_worker_and_two_give_the_same_bytes(rendered, tmp_path):
 
 def test_calibrate_prints_json(rendered):
     photos, truth = rendered
-    result = CliRunner().invoke(main, ["calibrate", str(photos), "--json", "-q", "--quality", "draft"])
+    result = CliRunner().invoke(main, ["calibrate", str(photos), "--json", "-q", "--quality", "draft", *SMALLER])
     assert result.exit_code == 0, result.stderr
     (camera,) = json.loads(result.stdout).values()
     assert camera["identifiable"] is True and focal_error_percent(np.array(camera["K"]), truth) < 2.0
@@ -244,7 +248,15 @@ def test_calibrate_prints_json(rendered):
 def test_the_literal_methods_give_points_that_open(rendered, tmp_path):
     """`--until scale` with the methods as they stand in print."""
     out = tmp_path / "out"
-    literal = ["--estimator", "lev-ransac-thesis", "--calibrator", "zero-curves-thesis", "--set", "report=false"]
+    literal = [
+        "--estimator",
+        "lev-ransac-thesis",
+        "--calibrator",
+        "zero-curves-thesis",
+        "--set",
+        "report=false",
+        *SMALLER,
+    ]
     flags = ["-o", str(out), "--quality", "draft", *literal, "--until", "scale", "--json", "-q"]
 
     result = CliRunner().invoke(main, ["run", str(rendered[0]), *flags])
@@ -266,7 +278,7 @@ def test_the_literal_methods_give_points_that_open(rendered, tmp_path):
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are another thing there")
 def test_a_terminated_run_says_so_and_goes_on(rendered, tmp_path):
     command = [sys.executable, "-m", "sfm_app", "run", str(rendered[0]), "-o", str(tmp_path / "out"), "-q"]
-    command += ["--quality", "draft", "--set", "report=false"]
+    command += ["--quality", "draft", "--set", "report=false", *SMALLER]
     # a run to the end: what is asked of it must not be done before the signal comes, however busy the machine is
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
         while not (tmp_path / "out" / "database.db").exists() and process.poll() is None:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from hypothesis import given as given_values
+from hypothesis import settings
 from hypothesis import strategies as st
 
 from sfm_app.camera.bearings import RAY, bearings
@@ -200,6 +201,7 @@ VALUES = st.recursive(
 )
 
 
+@settings(max_examples=40)
 @given_values(st.dictionaries(KEYS, VALUES, min_size=1, max_size=6))
 def test_values_of_any_kind_end_in_cameras_or_in_one_error(tmp_path_factory, values):
     path = tmp_path_factory.getbasetemp() / "any.json"
@@ -209,6 +211,7 @@ def test_values_of_any_kind_end_in_cameras_or_in_one_error(tmp_path_factory, val
         assert err.hint
 
 
+@settings(max_examples=60)
 @given_values(st.binary(max_size=200))
 def test_bytes_of_any_kind_end_in_cameras_or_in_one_error(tmp_path_factory, data):
     with contextlib.suppress(InputError):

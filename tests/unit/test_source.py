@@ -4,6 +4,8 @@ import ast
 import re
 from pathlib import Path
 
+import pytest
+
 import sfm_app
 from benchmarks import size
 from benchmarks.sensitivity.constants import ROOMS, assignments
@@ -44,12 +46,14 @@ def silent(text):
     return [name for name, about in constants(text).items() if not SOURCE.search(about)]
 
 
+@pytest.mark.slow
 def test_every_constant_says_where_it_comes_from():
     modules = texts(*ROOMS)
     assert sum(len(constants(text)) for text in modules.values()) > 100
     assert [(module, name) for module, text in modules.items() for name in silent(text)] == []
 
 
+@pytest.mark.slow
 def test_pages_and_commands_that_constants_refer_to_exist():
     page = (ROOT / "docs" / "algorithms.md").read_text(encoding="utf-8")
     for name, about in (

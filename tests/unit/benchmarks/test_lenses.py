@@ -47,7 +47,7 @@ def test_stock_is_told_the_lens_of_the_folder():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 2, 5])
+@pytest.mark.parametrize("seed", [0, 2])
 def test_the_model_of_a_perspective_lens_is_found(seed):
     row = measure("plain", seed, hold_out=False)
     assert row["right"] == 1 and row["needless"] == 0 and row["file"] == "OPENCV"
@@ -55,7 +55,7 @@ def test_the_model_of_a_perspective_lens_is_found(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 4, 8])
+@pytest.mark.parametrize("seed", [0, 8])
 def test_a_fisheye_stays_one_and_its_radius_is_accurate(seed):
     row = measure("fisheye", seed, hold_out=False)
     assert row["file"] == "OPENCV_FISHEYE" and "prism" not in row["free"]

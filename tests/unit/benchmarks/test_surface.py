@@ -1,11 +1,9 @@
 import numpy as np
 import pytest
 
-from benchmarks.surface.measure import cost
 from benchmarks.surface.photos import likeness, psnr_db
 from benchmarks.surface.rendered.truth import seen_places, truth_scores
 from benchmarks.surface.sparse_poisson import points_ply
-from benchmarks.surface.worker import StageCost
 from sfm_app.geometry.poses import Similarity
 from sfm_app.synthetic.cameras import Views, axis_rotation, look_at, make_camera
 from sfm_app.synthetic.photo_folder import Truth
@@ -108,20 +106,6 @@ def test_likeness_counts_covered_pixels_alone():
     assert found.not_black == pytest.approx(2 / 3) and found.psnr_db > 80
     covered[:, :59] = False
     assert np.isnan(likeness(Picture(photo, covered), photo).psnr_db), "40 pixels say nothing"
-
-
-def test_cost_is_that_of_all_stages_but_the_files():
-    said = {
-        "scene": StageCost("", 50.0, 900), "depth_maps": StageCost("", 10.0, 500), "mesh": StageCost("", 7.5, 700),
-        "texture": StageCost("", 2.0, 400), "files": StageCost("", 1.0, 300),
-    }  # fmt: skip
-    row = cost(said)
-    stages = [name for name in ("depth_maps", "mesh", "texture") if f"s of {name}" in row]
-    assert {"depth_maps", "mesh"} <= set(stages)
-    assert row["seconds together"] == sum(said[name].seconds for name in stages)
-    assert row["MB mesh"] == 700 and row["s of files"] == 1.0 and row["failed"] == ""
-    stopped = cost({"scene": StageCost("", 50.0, 900), "depth_maps": StageCost("depth_maps: no", None, 100)})
-    assert stopped["failed"] == "depth_maps: no" and stopped["seconds together"] is None
 
 
 def test_points_are_written_as_colmap_reads_them(tmp_path):

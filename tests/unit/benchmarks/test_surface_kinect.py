@@ -20,6 +20,7 @@ from benchmarks.surface.sets import SCANNED, surface_set
 from sfm_app.geometry.poses import Similarity
 from sfm_app.synthetic.cameras import Camera, axis_rotation, camera_center, look_at
 from sfm_app.types import Surface
+from tests.unit.benchmarks.test_surface import joined
 
 CELL = 0.015
 SIZE = np.array([1.7, 1.2, 1.5])
@@ -74,12 +75,6 @@ def wall(corner, u, v):
     """A rectangle with two triangles."""
     vertices = np.array([corner, np.add(corner, u), np.add(np.add(corner, u), v), np.add(corner, v)], float)
     return vertices, np.array([[0, 1, 2], [0, 2, 3]])
-
-
-def joined(parts):
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts[:-1])])
-    faces = [faces + start for (_, faces), start in zip(parts, starts, strict=True)]
-    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
 
 
 def room():
@@ -143,7 +138,7 @@ def area_share(*names):
 )
 def test_walls_that_are_moved_count_by_the_limits_and_icp_moves_them_back(truth, moved, accurate, complete):
     walls = room()
-    vertices, faces = joined([walls[name] for name in walls if name != "ceiling"])
+    vertices, faces = joined(*(walls[name] for name in walls if name != "ceiling"))
     found = scores(truth, vertices + np.array([moved, 0.0, 0.0]), faces)
     moved_area = area_share("left", "right")
     # floor, back and front stay in their planes; only strips of the width of the shift leave the room
@@ -159,7 +154,7 @@ def test_walls_that_are_moved_count_by_the_limits_and_icp_moves_them_back(truth,
 
 def test_a_larger_room_is_scaled_back_by_icp(truth):
     walls = room()
-    vertices, faces = joined([walls[name] for name in walls if name != "ceiling"])
+    vertices, faces = joined(*(walls[name] for name in walls if name != "ceiling"))
     found = scores(truth, 1.03 * vertices, faces)
     assert found["ICP: scaled by %"] == pytest.approx(-2.91, abs=0.25)
     assert 2.1 < found["median cm"] < 2.4 and found["ICP: median cm"] < 0.3, "3 % of half of the room's depth"
@@ -167,12 +162,12 @@ def test_a_larger_room_is_scaled_back_by_icp(truth):
 
 def test_what_is_missing_costs_completeness_and_what_is_invented_accuracy(truth):
     walls = room()
-    half = scores(truth, *joined([walls["left"], walls["right"], walls["floor"]]))
+    half = scores(truth, *joined(walls["left"], walls["right"], walls["floor"]))
     assert half["accuracy 3 cm %"] > 99
     x, y, _ = truth.scan.points.T
     there = (np.abs(x) > SIZE[0] / 2 - 0.05) | (y < -SIZE[1] / 2 + 0.05)
     assert half["completeness 5 cm %"] == pytest.approx(100 * there.mean(), abs=0.5) and 50 < 100 * there.mean() < 85
-    more = scores(truth, *joined(list(walls.values())))
+    more = scores(truth, *joined(*walls.values()))
     whole = 2 * (SIZE[0] * SIZE[1] + SIZE[1] * SIZE[2] + SIZE[0] * SIZE[2])
     ceiling, inner = 100 * SIZE[0] * SIZE[2] / whole, 100 * (SIZE[0] - 0.2) * (SIZE[2] - 0.2) / whole
     assert more["accuracy 3 cm %"] == pytest.approx(100 - ceiling, abs=2.0), "a hole of the scan counts"

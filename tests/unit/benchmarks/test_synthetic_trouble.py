@@ -21,6 +21,8 @@ from benchmarks.synthetic.trouble import (
 from sfm_app.synthetic.cameras import Views, camera_center, make_camera, pixel_rays
 from sfm_app.synthetic.shapes import Body
 
+pytestmark = pytest.mark.slow
+
 
 @cache
 def plans():
@@ -53,7 +55,6 @@ def written(plan, folder):
     return photos
 
 
-@pytest.mark.slow
 def test_every_trouble_comes_up_and_few_at_a_time():
     met = {kind for plan in plans() for kind in plan.troubles}
     assert met == set(KINDS)
@@ -62,7 +63,6 @@ def test_every_trouble_comes_up_and_few_at_a_time():
     assert all(PHOTOS[0] <= len(plan.views.cameras) <= PHOTOS[1] for plan in plans())
 
 
-@pytest.mark.slow
 def test_cameras_are_those_of_the_trouble():
     for plan in plans():
         focals = {round(camera.K[0, 0], 6) for camera in plan.views.cameras.values()}
@@ -76,7 +76,6 @@ def test_cameras_are_those_of_the_trouble():
         pixel_rays(first)  # a lens that folds raises
 
 
-@pytest.mark.slow
 def test_a_lens_pushes_the_farthest_corner_by_what_is_asked_and_zooming_keeps_the_bend():
     camera = with_distortion(make_camera(640, 480, 1.0, center=(0.4, 0.55)), -0.08)
     corner = np.array([640.0, 0.0])
@@ -86,7 +85,6 @@ def test_a_lens_pushes_the_farthest_corner_by_what_is_asked_and_zooming_keeps_th
     assert with_zoom(camera, 2.0).K[1, 1] == 2 * camera.K[1, 1] and with_zoom(camera, 2.0).K[0, 2] == camera.K[0, 2]
 
 
-@pytest.mark.slow
 def test_motion_blur_smears_along_its_direction_and_keeps_the_light():
     image = np.zeros((31, 31, 3))
     image[15, 15] = 1.0
@@ -98,7 +96,6 @@ def test_motion_blur_smears_along_its_direction_and_keeps_the_light():
     assert np.array_equal(apply_motion_blur(image, 0.0, 1.0), image)
 
 
-@pytest.mark.slow
 def test_what_moves_is_seen_elsewhere_and_the_rest_stays(tmp_path):
     plan = small(plan_with("moving object"), photos=1)
     name = "view_00.jpg"
@@ -115,7 +112,6 @@ def test_what_moves_is_seen_elsewhere_and_the_rest_stays(tmp_path):
     assert np.allclose(cam_from_thing(np.column_stack([R, t]), moving.spoiling.thing_at[name])[:, 3], R @ ahead + t)
 
 
-@pytest.mark.slow
 def test_the_folder_is_rendered_alike_twice_and_a_thing_stands_on_its_foot(tmp_path):
     plan = small(plan_with("motion blur"))
     write_troubled_folder(tmp_path / "a", plan)

@@ -33,7 +33,6 @@ from benchmarks.thesis.chapter5.sequences import (
 from benchmarks.thesis.chapter5.setups import Trial
 from benchmarks.thesis.chapter5.slices import SCALES, focal_slice
 from benchmarks.thesis.chapter5.sweep_claims import CurveClaim, check_levels
-from benchmarks.thesis.corners import load_corners
 from sfm_app.camera.models import camera_matrix
 from sfm_app.geometry.epipolar import sampson_distance
 from sfm_app.selfcal.thesis.constraint_forms import essential
@@ -255,11 +254,3 @@ def test_a_claim_is_judged_level_by_level(ransac, verdict):
     assert found["LEV-RANSAC is over three times as fast as RANSAC"].verdict == verdict
     assert found["LEV-RANSAC is faster than all others"].verdict == "not measured"
     assert "msac" in found["LEV-RANSAC is faster than all others"].numbers
-
-
-def test_corners_are_paired_by_the_points_they_show(tmp_path):
-    (tmp_path / "001.corners").write_text("1 2\n3 4\n5 6\n")
-    (tmp_path / "002.corners").write_text("10 20\n30 40\n")
-    (tmp_path / "nview-corners").write_text("2 0 *\n0 * 1\n* 1 1\n1 1 *\n")
-    x1, x2 = load_corners(tmp_path, 1, 2)
-    assert x1.tolist() == [[5, 6], [3, 4]] and x2.tolist() == [[10, 20], [30, 40]]

@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from sfm_app.api import Run
-from sfm_app.camera.models import camera_matrix, panorama_matrix
+from sfm_app.camera.models import camera_matrix
 from sfm_app.cli import commands
 from sfm_app.cli.commands import SCENES
 from sfm_app.cli.outcome import demo_steps, outcome_lines, run_lines, run_steps, run_summary
@@ -165,15 +165,6 @@ def test_every_parameter_stands_beside_its_deviation():
         "Assumed, since the photos do not determine it: square pixels.",
         "best initial pairs of photos: a.jpg + b.jpg, b.jpg + c.jpg, c.jpg + 4",
     ]
-
-
-def test_fisheyes_and_panoramas_have_their_field_of_view():
-    wide = camera_matrix(500.0 / np.radians(60.0), 500.0 / np.radians(60.0), 500.0, 400.0)
-    fisheye = Calibration(wide, 1000, 800, "lens", True, projection="fisheye", fisheye=(0.0, 0.0, 0.0, 0.0))
-    panorama = Calibration(panorama_matrix((1000, 500)), 1000, 500, "panorama", True, projection="equirectangular")
-    lines = [line.strip() for line in intrinsics_lines(Intrinsics({"one": fisheye, "two": panorama}))]
-    assert lines[1] == "a fisheye that sees 120 degrees from left to right, 96 from top to bottom"
-    assert lines[2:] == ["camera      two: 360-degree panoramas, 1000 x 500 px"]
 
 
 def test_a_given_camera_is_marked():

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from sfm_app.cli import output
-from sfm_app.cli.terminal import Terminal, per_minute
+from sfm_app.cli.terminal import Terminal
 from sfm_app.pipeline import NAMES
 
 LONG = "the photos contradict it: " + ", ".join(f"photo_{k:03}.jpg" for k in range(40))
@@ -136,10 +136,6 @@ def test_bars_fit_into_the_terminal(monkeypatch, columns):
         display.finish_stage(12.0, 10)
     assert paper.getvalue().count("\n") == 1 and len(paper.getvalue().rstrip()) <= columns
     assert "depth maps" in screen.getvalue() and "12.0 s" in screen.getvalue()
-
-
-def test_slow_work_has_two_digits():
-    assert [per_minute(1.0), per_minute(0.05), per_minute(0.17)] == ["60", "3.0", "10"]
 
 
 @pytest.fixture

@@ -44,7 +44,7 @@ def check_picture(path, K, R, frame, used=None):
     assert np.mean(wrong) < 2.5 and np.quantile(wrong, 0.99) < 12
 
 
-@pytest.mark.parametrize("name", ["colmap", "colmap-text", "splat"])
+@pytest.mark.parametrize("name", ["colmap", pytest.param("colmap-text", marks=pytest.mark.slow), "splat"])
 @pytest.mark.parametrize("kinds", [("lens", "other"), ("pinhole",), ("fisheye",), ("panorama", "lens")], ids="+".join)
 def test_colmap_reads_photos_without_distortion(make_run, frame, name, kinds):
     run = make_run(*kinds, until="scene")

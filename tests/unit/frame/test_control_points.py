@@ -113,7 +113,9 @@ def test_the_deviation_of_the_scale_covers_its_error(count):
     assert np.mean(np.abs(normalized) > 3) <= 0.02
 
 
-@pytest.mark.parametrize(("count", "wrong"), [(5, (2,)), (8, (1, 5)), (11, (0, 3, 7))])
+@pytest.mark.parametrize(
+    ("count", "wrong"), [(5, (2,)), (8, (1, 5)), pytest.param(11, (0, 3, 7), marks=pytest.mark.slow)]
+)
 def test_wrong_points_are_named(count, wrong):
     rng, named, falsely = np.random.default_rng(2), 0, 0
     for _ in range(40):
@@ -124,7 +126,7 @@ def test_wrong_points_are_named(count, wrong):
     assert falsely <= 1
 
 
-@pytest.mark.parametrize("count", [5, 8, 12])
+@pytest.mark.parametrize("count", [5, 8, pytest.param(12, marks=pytest.mark.slow)])
 def test_good_points_are_kept(count):
     rng = np.random.default_rng(3)
     kept = [agreeing_points(places, TRUE(places) + 0.01 * rng.normal(size=places.shape)).all()

@@ -50,7 +50,7 @@ def photograph(side, rng, blur_px=0.7, size=300):
     return np.clip(np.round(photo), 0, 255).astype(np.uint8), corners[:, :2] / corners[:, 2:]
 
 
-@pytest.mark.parametrize(("side", "limit"), [(45, 0.0012), (90, 0.0003)])
+@pytest.mark.parametrize(("side", "limit"), [pytest.param(45, 0.0012, marks=pytest.mark.slow), (90, 0.0003)])
 def test_a_side_is_exact_through_blur_and_tone_curve(side, limit):
     rng, ratios, errors = np.random.default_rng(5), [], []
     for _ in range(8):

@@ -64,7 +64,7 @@ def choose(rotations, centers, scenery):
     return select_roll(roll_hypotheses(rotations, centers), rotations, centers, scenery)
 
 
-@pytest.fixture(scope="module", params=["corner", "facade"])
+@pytest.fixture(scope="module", params=["corner", pytest.param("facade", marks=pytest.mark.slow)])
 def rendered(request):
     """Six small photos of a rendered scene with y up, as rotations, centers and what they show."""
     scene, views = prepare(build_scene(request.param)), scene_views(request.param)

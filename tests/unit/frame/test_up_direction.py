@@ -37,7 +37,7 @@ def found_up(scene, segments=None, points=None, turn_deg=None):
     return up_direction(scene.rotations, scene.centers, shown(scene, points), segments, turn_deg)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_vertical_edges_say_where_up_is_better_than_the_cameras(build_house, seed):
     scene = build_house(HAND_HELD, aim_y=3.5, seed=seed)
     upright = found_up(scene)
@@ -60,6 +60,7 @@ def test_clutter_does_not_pass_for_vertical_edges(build_house):
     assert found_up(scene).method == ROLL
 
 
+@pytest.mark.slow
 def test_a_set_that_is_turned_as_a_whole(build_house):
     upright_set = build_house(HAND_HELD, sweep_deg=90.0)
     turned = build_house([roll - 90 for roll in HAND_HELD], sweep_deg=90.0)
@@ -113,7 +114,7 @@ def test_cameras_that_nobody_held_level_stand_on_the_ground(build_house):
     assert error_deg(upright.up, scene.up) < 1
 
 
-@pytest.mark.parametrize("level_deg", [20.0, -15.0])
+@pytest.mark.parametrize("level_deg", [20.0, pytest.param(-15.0, marks=pytest.mark.slow)])
 def test_the_front_faces_the_viewer(build_house, level_deg):
     scene = build_house(HAND_HELD, level_deg=level_deg)
     upright = found_up(scene)

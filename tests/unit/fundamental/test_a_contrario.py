@@ -61,17 +61,17 @@ def test_mismatches_never_pair_a_point_with_its_partner():
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
-@pytest.mark.parametrize("count", [20, 40, 60, 100, 200])
+@pytest.mark.parametrize("count", [20, 60, 200])
 def test_random_matches_are_rejected(name, count):
     size, reasons = np.array([1600.0, 1200.0]), []
-    for seed in range(8):
+    for seed in range(6):
         rng = np.random.default_rng([count, seed])
         fit = ESTIMATORS[name][0](*(rng.uniform(size=(2, count, 2)) * size), OPTIONS, seed)
         assert isinstance(fit, Rejected), fit.inlier_count
         reasons.append(fit.reason)
     assert set(reasons) <= {"inliers no better than chance", "too few inliers"}
     # the median looks at no threshold: what it finds may have no inliers to speak of
-    assert reasons.count("inliers no better than chance") >= 4 or name == "lmeds"
+    assert reasons.count("inliers no better than chance") >= 3 or name == "lmeds"
 
 
 @pytest.mark.parametrize(("true", "false"), [(20, 0), (20, 10), (25, 25), (30, 60), (60, 140)])

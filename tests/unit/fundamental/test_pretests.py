@@ -106,7 +106,7 @@ def test_bail_out_table_of_few_matches_is_empty():
 
 
 RUNS, COUNT = 20_000, 600
-CASES = [(0.8, 0.05), (0.5, 0.05), (0.5, 0.2), (0.3, 0.02)]
+CASES = [pytest.param(0.8, 0.05, marks=pytest.mark.slow), (0.5, 0.05), (0.5, 0.2), (0.3, 0.02)]
 
 
 def decisions(test, share, *, runs=RUNS, seed=0):

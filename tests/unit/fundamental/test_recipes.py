@@ -75,11 +75,11 @@ def test_the_still_scene_wins_over_an_object_that_moves():
     assert found >= 9
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_long_searches_give_the_same_bytes(seed):
     pair = make_pair(PairOptions(points=600, outliers=0.7, sigma_px=1.0), seed)
     settings = EpipolarSettings(max_error_px=2.0, max_trials=2000)
-    fits = [fit_lev_ransac(pair.x1, pair.x2, settings, seed) for _ in range(5)]
+    fits = [fit_lev_ransac(pair.x1, pair.x2, settings, seed) for _ in range(3)]
     assert isinstance(fits[0], EpipolarFit)
     assert fits[0].trials > 300
     assert {(fit.F.tobytes(), fit.inliers.tobytes(), fit.priors.tobytes(), fit.trials) for fit in fits} == {
@@ -150,7 +150,7 @@ def turn_error_deg(E):
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("wrong", [0, 150, 500])
+@pytest.mark.parametrize("wrong", [0, 150, pytest.param(500, marks=pytest.mark.slow)])
 def test_right_matches_are_told_from_wrong_ones(seed, wrong):
     x1, x2 = matches_of(seed, wrong=wrong)
     found = fit_lev_ransac_rays(lines_of(x1, x2), DEFAULTS, seed)

@@ -22,7 +22,7 @@ from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import SceneSettings, Settings
 from sfm_app.types import Calibration, EpipolarFit, Evidence, Intrinsics, LookAlikes
 
-PHOTOS, PART = 90, 30
+PHOTOS, PART = 72, 24
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def test_pairs_that_the_pose_graph_has_dropped_do_not_refuse_a_join(group, start
     rng = np.random.default_rng(2)
     evidence = group.evidence
     rows, fits = dict(evidence.matches.matches), dict(evidence.views.fits)
-    for a, b in rng.permutation([(a, b) for a in range(1, 30) for b in range(60, PHOTOS) if (a, b) not in rows])[:200]:
+    for a, b in rng.permutation([(a, b) for a in range(1, 24) for b in range(48, PHOTOS) if (a, b) not in rows])[:200]:
         count = min(300, *(len(evidence.matches.keypoints[photo]) for photo in (a, b)))
         pair = int(a), int(b)
         rows[pair] = np.column_stack([np.arange(count)] * 2).astype(np.uint32)

@@ -58,7 +58,7 @@ def test_parts_of_one_size_are_in_the_order_of_their_photos():
     assert parts({(4, 5): 100, (1, 2): 50}, [1, 2, 4, 5]) == [(1, 2), (4, 5)]
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(6))
 def test_the_order_in_which_pairs_come_does_not_matter(seed):
     rng = np.random.default_rng(seed)
     worths = {pair: int(rng.integers(-60, 90)) for pair in combinations(range(9), 2) if rng.random() < 0.6}

@@ -203,8 +203,11 @@ def apart(graph, names=None):
     return [abs(place[graph.images[a].name] - place[graph.images[b].name]) for a, b in graph.matches]
 
 
-def test_photos_are_matched_with_those_that_show_the_same(matched):
+def test_photos_are_matched_with_those_that_show_the_same_by_any_number_of_workers(matched):
     graph, run = matched()
+    two = matched(workers=2)[0].matches
+    assert list(graph.matches) == list(two)
+    assert all(np.array_equal(rows, two[pair]) for pair, rows in graph.matches.items())
     asked = run.statistics["matched_pairs"]
     assert PHOTOS < asked < 0.6 * PHOTOS * (PHOTOS - 1) / 2
     gaps = apart(graph)
@@ -218,12 +221,6 @@ def test_names_that_say_nothing_do_not_matter(matched):
     graph, _ = matched(names=names)
     gaps = apart(graph, names)
     assert gaps.count(1) == PHOTOS - 1 and gaps.count(2) >= PHOTOS - 4
-
-
-def test_any_number_of_workers_matches_the_same(matched):
-    one, two = matched(workers=1)[0], matched(workers=2)[0]
-    assert list(one.matches) == list(two.matches)
-    assert all(np.array_equal(rows, two.matches[pair]) for pair, rows in one.matches.items())
 
 
 def test_photos_with_other_features_are_chosen_by_their_pictures(matched):

@@ -19,6 +19,7 @@ from sfm_app.photos.panoramas import (
 from sfm_app.synthetic.cameras import Views, look_at, panorama_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
 from sfm_app.synthetic.scenes import courtyard
+from tests.unit.colored_photos import colors_of
 
 XMP = b"<x:xmpmeta xmlns:x='adobe:ns:meta/'><rdf:Description %s/></x:xmpmeta>"
 
@@ -89,11 +90,6 @@ def test_other_panoramas_are_refused_with_a_reason(rendered, tmp_path, entries, 
 
 
 WIDTH = 512
-
-
-def colors_of(rays):
-    """Colors (..., 3) of rays of any length: each channel is an axis."""
-    return np.round(127.5 + 120.0 * rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.uint8)
 
 
 def panorama(width=WIDTH):

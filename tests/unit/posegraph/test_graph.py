@@ -354,7 +354,7 @@ def test_the_direction_points_to_where_the_matches_lie_before_both_cameras(two_v
         assert views.errors_deg(views.R, found)[1] < 3.0
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", range(10))
 def test_few_and_wild_matches_never_raise(two_views, seed):
     """Whatever is near the sampled direction may be gone once the pose is fitted."""
     views = two_views(seed, right=0, false=16, noise_px=0.0)

@@ -11,7 +11,6 @@ from sfm_app.estimation.fitting import to_calibration
 from sfm_app.report.figures import (
     OPTIONS,
     Panel,
-    calibration_text,
     center_plane,
     check_figure,
     draw_calibration,
@@ -92,19 +91,11 @@ def test_a_guess_is_drawn_without_pairs(panel, tmp_path):
 
 @pytest.mark.slow
 def test_of_many_cameras_the_first_are_drawn(panel, tmp_path):
-    for count in (1, OPTIONS.most_cameras + 1):
-        draw_calibration(tmp_path / f"{count}.svg", [panel._replace(name=f"camera-{k}") for k in range(count)])
-    text = (tmp_path / f"{OPTIONS.most_cameras + 1}.svg").read_text()
-    assert f"camera-{OPTIONS.most_cameras - 1}, one of {OPTIONS.most_cameras + 1}" in text
+    count = OPTIONS.most_cameras + 1
+    draw_calibration(tmp_path / "many.svg", [panel._replace(name=f"camera-{k}") for k in range(count)])
+    text = (tmp_path / "many.svg").read_text()
+    assert f"camera-{OPTIONS.most_cameras - 1}, one of {count}" in text
     assert f"camera-{OPTIONS.most_cameras}," not in text
-    assert "camera-0" not in (tmp_path / "1.svg").read_text()
-
-
-def test_the_words_leave_no_line_empty(panel):
-    lines = calibration_text(panel.camera).splitlines()
-    assert lines[0] == "Known: the photos agree on this camera."
-    assert "± 4:" in lines[1]
-    assert all(lines)
 
 
 SAYS = {
@@ -181,12 +172,6 @@ def test_an_error_of_the_lens_model_appears_in_its_cells(camera, make_pairs):
     assert np.mean(grid.shift_px[there], axis=0) == pytest.approx([0.0, 0.5], abs=0.17)
     assert grid.clear[there].all() and np.mean(grid.clear[~there]) < 0.1
     assert np.nanmean(np.abs(grid.shift_px[~there])) < 0.08
-
-
-def test_without_pairs_all_cells_are_empty(camera):
-    nothing = CameraPairs.from_Fs(np.zeros((0, 3, 3)), (camera.width, camera.height))
-    grid = residual_grid(epipolar_residuals(nothing, camera), (camera.width, camera.height))
-    assert np.isnan(grid.size_px).all() and not grid.clear.any()
 
 
 @pytest.mark.parametrize("camera", ["perspective"], indirect=True)

@@ -40,10 +40,6 @@ def of_two(shots):
     return shots(8, 2, focal=[1000.0] * 4 + [1500.0] * 4)
 
 
-def test_no_photos_are_no_cameras():
-    assert cameras_of(NO_PAIRS) == []
-
-
 @pytest.mark.parametrize("together", [True, False])
 @pytest.mark.parametrize("count", [1, 5])
 def test_photos_without_pairs_have_the_usual_guess(count, together):

@@ -197,11 +197,9 @@ def test_a_ball_in_blocks_is_the_ball(dense, ball, tmp_path):
 def test_refined_with_photos_that_show_nothing_a_ball_stays_a_ball(dense, tmp_path, block_points):
     place = copied(dense, tmp_path)
     found, counts = made(place, max_image_size_px=1600, block_points=block_points)
-    again, _ = made(place, workers=1, max_image_size_px=1600, block_points=block_points)
     assert_closed(found)
     assert np.percentile(np.abs(np.linalg.norm(found.vertices, axis=1) - 1), 95) < 0.015
     assert ("blocks" in counts) == (block_points == FEW_BLOCKS) == ("refined_triangles" not in counts)
-    np.testing.assert_array_equal(again.vertices, found.vertices)
 
 
 def test_a_refinement_that_fails_leaves_the_surface(dense, ball, tmp_path, monkeypatch):
@@ -307,7 +305,6 @@ def test_the_fine_surface_is_kept_for_a_normal_map_and_changes_nothing_else(dens
     corners = vertices[faces]
     outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert np.mean(np.sum(outward * corners.mean(axis=1), axis=1) > 0) > 0.999
-    assert make_with_map(place, workers=1, **options).fine_surface.read_bytes() == fine
 
     whole = hash_surface(kept)
     kept.fine_surface.write_bytes(fine[:-1])

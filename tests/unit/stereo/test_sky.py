@@ -22,10 +22,15 @@ class Photo:
     """(H, W) sky or plain wall, without a depth."""
 
 
+def view_from(x):
+    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    return View(f"{x:.2f}", K, np.eye(3), np.array([-x, 0, 0]), WIDTH, HEIGHT)
+
+
 def photograph(x, gray_of_blank, backdrop):
     """Return a photo from (x, 0, 0): a textured ground, a textured tower, and a backdrop."""
-    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    view = View(f"{x:.2f}", K, np.eye(3), np.array([-x, 0, 0]), WIDTH, HEIGHT)
+    view = view_from(x)
+    K = view.K
     v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     ray = np.stack([(u - K[0, 2]) / FOCAL, (v - K[1, 2]) / FOCAL])
     with np.errstate(divide="ignore"):
@@ -134,7 +139,7 @@ def test_one_photo_does_not_vote_about_itself():
 
 
 def test_partners_are_near_and_far():
-    partners = spread_partners([photograph(x, 220.0, sky).view for x in np.linspace(0, 5, 40)], 0)
+    partners = spread_partners([view_from(x) for x in np.linspace(0, 5, 40)], 0)
 
     assert len(partners) == len(set(partners)) == 16
     assert partners[0] == 1
