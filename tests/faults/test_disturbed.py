@@ -22,12 +22,12 @@ SAYS = {
 }
 CHANGES = [(what, share) for what in SAYS for share in (0.1, 0.3, 0.5, 0.7, 0.9)]
 LIMITS_KB = {  # of a file, from the end of a stage on
-    "": (2, 60, 400, 1500),
+    "": (2, 60, 400, 1200),
     "match_graph": (20, 200),
     "view_graph": (100, 300),
     "scene": (30, 100, 300),
     "depth_maps": (60, 1000),
-    "texture": (60, 150),
+    "texture": (60, 120),
 }
 
 
