@@ -15,7 +15,7 @@ from sfm_app.camera.models import guessed_camera_matrix
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import write_match_graph
 from sfm_app.colmap.model import cameras_by_photo, posed_photo_ids
-from sfm_app.errors import ClusterError, SfmError
+from sfm_app.errors import BackendError
 from sfm_app.mapping.attempt import (
     MAPPING,
     Attempt,
@@ -129,9 +129,7 @@ def _try(hypothesis: Hypothesis, reason: str, best: Outcome, mapper: Mapper) -> 
             accepted = hypothesis.is_better(other, best, mapper)
             trials.append(_trial(hypothesis, reason, best, other, time.monotonic() - start, accepted=accepted))
             best, start = other if accepted else best, time.monotonic()
-    except ClusterError:  # the same command would give another scene on a cluster that stays
-        raise
-    except SfmError as err:  # the best outcome is not lost with it
+    except BackendError as err:  # the best outcome is not lost with it; errors of ours are not hidden
         failure = str(err)
     if failure or len(trials) == len(first.trials):
         trial = _trial(hypothesis, reason, best, best, time.monotonic() - start, accepted=False)

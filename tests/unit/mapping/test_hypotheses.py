@@ -10,7 +10,7 @@ from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundle import adjust
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import posed_photo_ids
-from sfm_app.errors import BackendError, ClusterError
+from sfm_app.errors import BackendError, ClusterError, NumericalError
 from sfm_app.mapping.attempt import Attempt, PairSupport
 from sfm_app.mapping.hypotheses import HYPOTHESES, OPTIONS, learned_intrinsics
 from sfm_app.mapping.passes import Mapper, Mappers, Outcome, Trial
@@ -109,10 +109,11 @@ def test_a_hypothesis_that_fails_costs_nothing_and_is_named(synthetic, run, came
     assert trial.failure == trial.to_dict()["failure"] == "the disk is full"
 
 
-def test_a_hypothesis_whose_cluster_is_gone_is_not_skipped(synthetic, run, cameras, mapped, fails):
+@pytest.mark.parametrize("error", [ClusterError("the scheduler is gone"), NumericalError("a bug")])
+def test_a_lost_cluster_and_a_bug_of_ours_are_not_hidden(synthetic, run, cameras, mapped, fails, error):
     mapped(with_camera(synthetic.copy(), TRUE))
-    with pytest.raises(ClusterError, match="scheduler"):
-        mapped.outcome(cameras(), run(), hypotheses=[fails(ClusterError("the scheduler is gone"))])
+    with pytest.raises(type(error), match=str(error)):
+        mapped.outcome(cameras(), run(), hypotheses=[fails(error)])
 
 
 def test_every_hypothesis_can_be_switched_off():
