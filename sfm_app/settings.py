@@ -169,6 +169,12 @@ class SceneSettings(Section):
         "auto", description="clockwise rotation that makes most photos upright, in degrees"
     )
 
+    @field_validator("without", mode="before")
+    @classmethod
+    def split_names(cls, names: object) -> object:
+        """Return the names of a text, which commas separate, as a list."""
+        return [name.strip() for name in names.split(",") if name.strip()] if isinstance(names, str) else names
+
 
 class ScaleSettings(Section):
     """Real size: known lengths and places in the scene. Poses and depth do not depend on it."""

@@ -10,7 +10,7 @@ from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundle import adjust
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import posed_photo_ids
-from sfm_app.errors import BackendError, ClusterError, NumericalError
+from sfm_app.errors import BackendError, ClusterError, ConfigError, NumericalError
 from sfm_app.mapping.attempt import Attempt, PairSupport
 from sfm_app.mapping.hypotheses import HYPOTHESES, OPTIONS, learned_intrinsics
 from sfm_app.mapping.passes import Mapper, Mappers, Outcome, Trial
@@ -118,6 +118,10 @@ def test_a_lost_cluster_and_a_bug_of_ours_are_not_hidden(synthetic, run, cameras
 
 def test_every_hypothesis_can_be_switched_off():
     assert tuple(one.name for one in HYPOTHESES) == get_args(HypothesisName)
+    for names in ("two-cameras", "two-cameras, finer-features", ["two-cameras"]):
+        assert Settings.from_mapping({"scene": {"without": names}}).scene.without[0] == "two-cameras"
+    with pytest.raises(ConfigError, match="finer-features"):
+        Settings.from_mapping({"scene": {"without": "nonsense"}})
 
 
 # False joins.
