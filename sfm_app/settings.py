@@ -130,9 +130,20 @@ class CalibrationSettings(Section):
 
 HypothesisName = Literal[
     "false-joins", "colmap-defaults", "other-focals", "camera-per-photo", "two-cameras", "learned-cameras",
-    "merged-models", "finer-features",
+    "merged-models", "finer-features", "mapped-anew",
 ]  # fmt: skip
-"""Names of `mapping.hypotheses`."""
+HYPOTHESES: Mapping[HypothesisName, str] = {
+    "false-joins": "leaving out the ambiguous pairs",
+    "colmap-defaults": "COLMAP's default pipeline",
+    "other-focals": "other focal lengths",
+    "camera-per-photo": "a camera for each photo (a zoom, or several devices)",
+    "two-cameras": "two cameras",
+    "learned-cameras": "mapping again with the cameras of the model",
+    "merged-models": "merging models",
+    "finer-features": "finer features for unplaced photos",
+    "mapped-anew": "mapping all photos again",
+}
+"""Hypotheses about the photos, see `mapping.hypotheses`, in words for people."""
 
 
 class SceneSettings(Section):

@@ -151,14 +151,12 @@ class PairSupport:
     """Inliers that the model does not explain."""
 
 
-def explained_pairs(
-    model: Reconstruction, matches: MatchGraph, views: ViewGraph, max_error_px: float
-) -> dict[PairId, PairSupport]:
+def explained_pairs(model: Reconstruction, evidence: Evidence, max_error_px: float) -> dict[PairId, PairSupport]:
     """Return how well a model explains every pair of its photos."""
     explained = {}
-    for pair, posed in _posed_pairs(model, matches):
+    for pair, posed in _posed_pairs(model, evidence.matches):
         fits_model = posed.inlier_mask(MAPPING.loose_factor * max_error_px)
-        fit = views.fits.get(pair)
+        fit = evidence.views.fits.get(pair)
         contradicted = int(np.count_nonzero(fit.inliers & ~fits_model)) if fit else 0
         explained[pair] = PairSupport(int(np.count_nonzero(fits_model)), fit.inlier_count if fit else 0, contradicted)
     return explained
@@ -204,8 +202,9 @@ def _posed_pairs(model: Reconstruction, matches: MatchGraph) -> Iterator[tuple[P
 
 
 def support(explained: Mapping[PairId, PairSupport]) -> float:
-    """Return the score of a model: its explained matches, of which each further one of a pair counts less."""
-    return float(np.sum(saturate([pair.matches for pair in explained.values()])))
+    """Return the score of a model: matches that it explains, less those that it contradicts, saturated by pair."""
+    pairs = explained.values()
+    return float(np.sum(saturate([pair.matches for pair in pairs]) - saturate([pair.contradicted for pair in pairs])))
 
 
 def saturate(matches: Sequence[int]) -> FloatArray:
@@ -504,7 +503,7 @@ def judge_model(
     if model is None or placed < 2 or model.num_points3D() < run.settings.scene.min_points:
         return NoModel(mapper, note)
     try:
-        explained = explain(model, evidence.matches, evidence.views, run.settings.epipolar.max_error_px)
+        explained = explain(model, evidence, run.settings.epipolar.max_error_px)
     except FAILURES as err:
         logger.info("a model could not be judged", exc_info=err)
         return NoModel(mapper, f"{note}, but it could not be scored: {error_reason(err)}")

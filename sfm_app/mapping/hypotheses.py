@@ -21,15 +21,16 @@ from sfm_app.mapping.attempt import (
     Attempt,
     NoModel,
     are_many_unregistered,
-    best_attempt,
     choice_reason,
-    judge_model,
+    explained_pairs,
+    support,
 )
 from sfm_app.mapping.feature_retry import STEPS, Steps, find_finer_evidence, lost_photos
 from sfm_app.mapping.look_alikes import OVERLAPS, with_false_joins
-from sfm_app.mapping.passes import MAPPERS, Mapper, Mappers, Outcome, Trial, guess_again, guessed_intrinsics
+from sfm_app.mapping.passes import FIRST, MAPPERS, Mapper, Mappers, Outcome, Trial, guess_again, guessed_intrinsics
 from sfm_app.mapping.split_and_merge import merge_into_main, split_attempt
 from sfm_app.runtime.context import RunContext
+from sfm_app.settings import HYPOTHESES, HypothesisName
 from sfm_app.types import Calibration, Evidence, Intrinsics
 
 
@@ -53,10 +54,6 @@ class HypothesisOptions:
     """With fewer photos, a camera per photo fits almost anything. Chosen by hand."""
     max_photos: int = 100
     """With more photos, a pass costs more than it promises. Chosen by hand."""
-    max_remaining_share: float = 0.5
-    """Share of the contradictions that may remain with a camera per photo. Chosen on `benchmarks.trouble`."""
-    share_tolerance: float = 0.002
-    """Largest increase of the contradicted share by two cameras instead of one per photo. Chosen by hand."""
 
 
 OPTIONS = HypothesisOptions()
@@ -66,22 +63,14 @@ OPTIONS = HypothesisOptions()
 class Hypothesis:
     """Something that may explain the photos better."""
 
-    name: str
+    name: HypothesisName
     """In the manifest, and in the setting that switches it off."""
-    title: str
-    """What is tried; for people."""
     reason: Callable[[Outcome, Mapper], str]
     """Why it is worth trying, given the best outcome; empty where it is not."""
     outcomes: Callable[[Outcome, Mapper], Iterator[Outcome]]
     """Maps the evidence that it changes."""
-    is_better: Callable[[Outcome, Outcome, Mapper], bool]
-    """Whether an outcome of it replaces the best one."""
     repeats: int = 1
     """Most times that it is tried, as long as it is accepted."""
-
-
-FIRST = "first-pass"
-"""Name of the trial that all hypotheses are compared with."""
 
 
 def reconstruct(
@@ -93,8 +82,13 @@ def reconstruct(
     mapper, start = Mapper(run, mappers), time.monotonic()
     first = mapper.map(evidence)
     trial = Trial(FIRST, "", True, (0, first.photos), (0.0, first.support), time.monotonic() - start, first.notes)
-    best = improve(replace(first, trials=(trial,)), mapper, HYPOTHESES if hypotheses is None else hypotheses)
-    joins = mapper.judge_places(best.models)[0]  # without these the photos fall apart
+    best = improve(replace(first, trials=(trial,)), mapper, ALL if hypotheses is None else hypotheses)
+    return with_doubtful_joins(best, mapper)
+
+
+def with_doubtful_joins(best: Outcome, mapper: Mapper) -> Outcome:
+    """Name the pairs that merge two places of its models, and without which its photos fall apart."""
+    joins = mapper.judge_places(best.models)[0]
     doubtful = tuple(dict.fromkeys((*best.graph.doubtful, *joins)))  # finer features may have named them
     return replace(best, graph=replace(best.graph, doubtful=doubtful))
 
@@ -109,7 +103,7 @@ def improve(best: Outcome, mapper: Mapper, hypotheses: Iterable[Hypothesis]) -> 
             reason = hypothesis.reason(best, mapper)
             if not reason:
                 break
-            if sum(trial.seconds for trial in best.trials if trial.name != FIRST) >= options.hypotheses_s:
+            if sum(trial.seconds for trial in best.trials if trial.is_hypothesis) >= options.hypotheses_s:
                 late = _trial(hypothesis, reason, best, best, 0.0, accepted=False)
                 failure = f"no time was left, of {options.hypotheses_s:g} s"
                 best = replace(best, trials=(*best.trials, replace(late, notes=(), failure=failure)))
@@ -122,11 +116,12 @@ def improve(best: Outcome, mapper: Mapper, hypotheses: Iterable[Hypothesis]) -> 
 
 def _try(hypothesis: Hypothesis, reason: str, best: Outcome, mapper: Mapper) -> tuple[Outcome, bool]:
     """Return the best outcome with or without a hypothesis, and whether the hypothesis was accepted."""
-    mapper.run.progress.say(f"{reason}; trying {hypothesis.title}")
+    mapper.run.progress.say(f"{reason}; trying {HYPOTHESES[hypothesis.name]}")
     first, trials, failure, start = best, list(best.trials), "", time.monotonic()
     try:
         for other in hypothesis.outcomes(best, mapper):
-            accepted = hypothesis.is_better(other, best, mapper)
+            accepted = is_better(other, best, mapper)
+            trials += [replace(inner, name=f"{hypothesis.name}: {inner.name}") for inner in other.trials]
             trials.append(_trial(hypothesis, reason, best, other, time.monotonic() - start, accepted=accepted))
             best, start = other if accepted else best, time.monotonic()
     except BackendError as err:  # the best outcome is not lost with it; errors of ours are not hidden
@@ -145,8 +140,41 @@ def _trial(
     return Trial(hypothesis.name, reason, accepted, photos, (best.support, other.support), seconds, other.notes)
 
 
-def _explains_more(other: Outcome, best: Outcome, _: Mapper) -> bool:
-    return other.support > best.support
+def is_better(other: Outcome, best: Outcome, mapper: Mapper) -> bool:
+    """Return whether an outcome replaces the best one: the judge of all hypotheses.
+
+    The one that explains more wins, unless it merges two places that the other one separates: look-alikes explain more,
+    and are wrong.
+    """
+    explains_more = _explains_more(other, best)
+    winner, loser = (other, best) if explains_more else (best, other)
+    return explains_more is not _separates_places(loser, winner, mapper)
+
+
+def _explains_more(other: Outcome, best: Outcome) -> bool:
+    """Return whether a main model explains more on the same evidence; if equal, more photos, then fewer cameras win."""
+    if other.main is None or best.main is None:
+        return best.main is None and other.main is not None
+    ours, theirs = best.support, other.support
+    if other.evidence.matches is not best.evidence.matches:
+        ours = _support_of(best.main, other)
+        theirs = _support_of(other.main, other)
+    if abs(theirs - ours) > MAPPING.equal_tolerance * max(theirs, ours):
+        return theirs > ours
+    return (other.photos, -other.cameras) > (best.photos, -best.cameras)
+
+
+def _support_of(model: Attempt, outcome: Outcome) -> float:
+    max_error_px = outcome.run.settings.epipolar.max_error_px
+    return support(explained_pairs(model.model, outcome.evidence, max_error_px))
+
+
+def _separates_places(other: Outcome, best: Outcome, mapper: Mapper) -> bool:
+    """Return whether most photos of a model with two merged places stay, and half of its missing overlaps at most."""
+    joins, missing = mapper.judge_places(best.models)
+    if not joins or other.photos < MAPPING.enough_share * best.photos:
+        return False
+    return 2 * mapper.judge_places(other.models)[1] <= missing
 
 
 # Two different places merged in one model: the pairs that hold them together are left out.
@@ -159,13 +187,6 @@ def _false_joins_reason(best: Outcome, mapper: Mapper) -> str:
 def _without_false_joins(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
     marked = replace(best, graph=with_false_joins(best.graph, mapper.judge_places(best.models)[0]))
     yield mapper.map(marked.trusted).with_earlier(marked)
-
-
-def _separates_places(other: Outcome, best: Outcome, mapper: Mapper) -> bool:
-    """Return whether most photos stay together, and half of the missing overlaps at most are left."""
-    if other.photos < MAPPING.enough_share * best.photos:
-        return False
-    return 2 * mapper.judge_places(other.models)[1] <= mapper.judge_places(best.models)[1]
 
 
 # A rival where the evidence for our model is weak.
@@ -193,24 +214,16 @@ def photos_with_geometry(evidence: Evidence) -> set[int]:
 def _map_rival(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
     rival = mapper.mappers.map_rival(best.trusted, mapper.run)
     if isinstance(rival, NoModel):
-        yield replace(best, models=(), notes=(rival.note,), reason="")
-        return
-    both = [attempt for attempt in (best.main, rival) if attempt is not None]
-    if best_attempt(both) is not rival:
-        yield replace(best, models=(rival,), notes=(rival.note,), reason="")
+        yield replace(best, models=(), notes=(rival.note,), reason="", trials=())
         return
     parts = split_attempt(rival)
     taken = {photo for part in parts for photo in posed_photo_ids(part.model)}
     others = [model for model in best.models if taken.isdisjoint(posed_photo_ids(model.model))]
     models = tuple(sorted((*parts, *others), key=lambda attempt: (-attempt.photos, -attempt.support)))
+    both = [attempt for attempt in (best.main, rival) if attempt is not None]
     reason = choice_reason(rival, both, len(best.evidence.matches.images))
     graph = mapper.with_poses_of(models, best)
-    yield replace(best, models=models, graph=graph, notes=(rival.note,), reason=reason)
-
-
-def _is_chosen(rival: Outcome, _best: Outcome, _: Mapper) -> bool:
-    """Return whether the rival, as a whole, explains more; parts of it may have fewer photos than our model."""
-    return bool(rival.reason)
+    yield replace(best, models=models, graph=graph, notes=(rival.note,), reason=reason, trials=())
 
 
 # Other focals, where a wrong guess may be why photos that match others are unregistered.
@@ -253,9 +266,7 @@ def _with_camera_per_photo(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
     intrinsics = _camera_per_photo(best)
     if intrinsics is not None:
         own = mapper.map(replace(best.trusted, intrinsics=intrinsics)).with_earlier(best)
-        better = improve(own, mapper, [RIVAL])
-        notes = chain(own.notes, *(trial.notes for trial in better.trials))
-        yield replace(better, notes=tuple(notes), trials=best.trials)
+        yield improve(own, mapper, [RIVAL])
 
 
 def _camera_per_photo(best: Outcome) -> Intrinsics | None:
@@ -284,14 +295,6 @@ def _camera_per_photo(best: Outcome) -> Intrinsics | None:
 def _free_names(name: str, taken: Collection[str]) -> Iterable[str]:
     """Return the name itself, then numbered variants of it that are not taken."""
     return chain([name], (other for number in count(2) if (other := f"{name} #{number}") not in taken))
-
-
-def _camera_per_photo_explains_more(own: Outcome, shared: Outcome, _: Mapper) -> bool:
-    """Return whether a camera per photo explains more matches, and registers more photos or removes contradictions."""
-    if own.main is None or shared.main is None or own.photos < shared.photos or own.support <= shared.support:
-        return False
-    least = OPTIONS.max_remaining_share * _contradicted_share(shared.main)
-    return own.photos > shared.photos or _contradicted_share(own.main) <= least
 
 
 def _contradicted_share(model: Attempt) -> float:
@@ -344,16 +347,6 @@ def _split_at_gap(focals: Mapping[str, float]) -> list[list[str]]:
         return []
     gap = int(np.argmax(np.diff(np.log([focals[name] for name in names])))) + 1
     return [names[:gap], names[gap:]] if 2 <= gap <= len(names) - 2 else []
-
-
-def _two_cameras_suffice(two: Outcome, own: Outcome, _: Mapper) -> bool:
-    """Return whether a model with two cameras explains the matches as well as one with a camera per photo."""
-    if two.main is None or own.main is None or two.photos < own.photos:
-        return False
-    explains_as_much = two.support >= (1.0 - MAPPING.equal_tolerance) * own.support
-    return explains_as_much and (
-        _contradicted_share(two.main) <= _contradicted_share(own.main) + OPTIONS.share_tolerance
-    )
 
 
 # The cameras of the model, which correct the relative poses.
@@ -414,11 +407,7 @@ def _merged(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
     models = merge_into_main(best.models, best.trusted, mapper.run)
     if len(models) < len(best.models):
         graph = mapper.with_poses_of(models[:1], best)
-        yield replace(best, models=models, graph=graph, notes=(models[0].note,), reason=models[0].note)
-
-
-def _has_fewer_models(other: Outcome, best: Outcome, _: Mapper) -> bool:
-    return len(other.models) < len(best.models)
+        yield replace(best, models=models, graph=graph, notes=(models[0].note,), reason=models[0].note, trials=())
 
 
 # Finer features, for photos that are unregistered.
@@ -432,44 +421,19 @@ def _lost_reason(best: Outcome, mapper: Mapper) -> str:
 def _with_finer_features(best: Outcome, mapper: Mapper, steps: Steps = STEPS) -> Iterator[Outcome]:
     finer = find_finer_evidence(best, mapper.run, steps)
     if finer is not None:
-        yield replace(reconstruct(*finer, mapper.mappers, FIRST_LOOK), trials=best.trials)
+        yield reconstruct(*finer, mapper.mappers, FIRST_LOOK)
 
 
-def _places_and_explains_more(second: Outcome, first: Outcome, _: Mapper) -> bool:
-    if second.photos <= first.photos:
-        return False
-    mains = [one for one in (first.main, second.main) if one is not None]
-    models = [judge_model(second.evidence, one.mapper, one.note, one.model, second.run) for one in mains]
-    return best_attempt(models) is models[-1]
-
-
-RIVAL = Hypothesis(
-    "colmap-defaults",
-    "COLMAP's default pipeline",
-    lambda best, _: rival_reason(best.main, best.trusted),
-    _map_rival,
-    _is_chosen,
-)
+RIVAL = Hypothesis("colmap-defaults", lambda best, _: rival_reason(best.main, best.trusted), _map_rival)
 FIRST_LOOK = (
-    Hypothesis(
-        "false-joins", "without the ambiguous pairs", _false_joins_reason, _without_false_joins, _separates_places,
-        repeats=OVERLAPS.max_passes,
-    ),
+    Hypothesis("false-joins", _false_joins_reason, _without_false_joins, repeats=OVERLAPS.max_passes),
     RIVAL,
-    Hypothesis("other-focals", "other focal lengths", _focal_reason, _with_other_focals, _explains_more),
-    Hypothesis(
-        "camera-per-photo", "one camera per photo", _shared_camera_reason, _with_camera_per_photo,
-        _camera_per_photo_explains_more,
-    ),
-    Hypothesis("two-cameras", "two cameras", _two_cameras_reason, _with_two_cameras, _two_cameras_suffice),
-    Hypothesis(
-        "learned-cameras", "the cameras of the model", _learning_reason, _with_learned_cameras, _explains_more,
-        repeats=OPTIONS.max_passes,
-    ),
-    Hypothesis("merged-models", "to merge them", _merge_reason, _merged, _has_fewer_models),
-)  # fmt: skip
-FINER_FEATURES = Hypothesis(
-    "finer-features", "finer features", _lost_reason, _with_finer_features, _places_and_explains_more
+    Hypothesis("other-focals", _focal_reason, _with_other_focals),
+    Hypothesis("camera-per-photo", _shared_camera_reason, _with_camera_per_photo),
+    Hypothesis("two-cameras", _two_cameras_reason, _with_two_cameras),
+    Hypothesis("learned-cameras", _learning_reason, _with_learned_cameras, repeats=OPTIONS.max_passes),
+    Hypothesis("merged-models", _merge_reason, _merged),
 )
-HYPOTHESES = (*FIRST_LOOK, FINER_FEATURES)
+FINER_FEATURES = Hypothesis("finer-features", _lost_reason, _with_finer_features)
+ALL = (*FIRST_LOOK, FINER_FEATURES)
 """In the order of their costs: cheap ones first."""

@@ -28,9 +28,18 @@ from sfm_app.mapping.attempt import (
     model_poses,
     support,
 )
-from sfm_app.mapping.hypotheses import FINER_FEATURES, FIRST_LOOK, improve, reconstruct, rival_reason
+from sfm_app.mapping.hypotheses import (
+    ALL,
+    FINER_FEATURES,
+    FIRST_LOOK,
+    Hypothesis,
+    improve,
+    reconstruct,
+    rival_reason,
+    with_doubtful_joins,
+)
 from sfm_app.mapping.look_alikes import joined_pairs, judge_places
-from sfm_app.mapping.passes import Mapper, Outcome, write_graph
+from sfm_app.mapping.passes import MAPPERS, Mapper, Outcome, write_graph
 from sfm_app.mapping.split_and_merge import split_attempt
 from sfm_app.matching.pairs import find_same_matches
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
@@ -41,8 +50,6 @@ logger = logging.getLogger("sfm_app")
 
 GROWN = "grown"
 """Name of this mapper in the manifest."""
-TWO_PLACES = "two different places are merged in the model"
-"""The doubt of a grown model with false joins."""
 
 
 def find_cameras(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
@@ -66,24 +73,19 @@ STEPS = Steps()
 
 def map_new_photos(evidence: Evidence, run: RunContext, earlier: Earlier, steps: Steps = STEPS) -> Outcome:
     """Return the earlier model with the new photos, or new models of all photos where these explain more."""
-    best = _grown_or_whole(evidence, run, earlier, steps)
-    return improve(best, Mapper(run), [FINER_FEATURES])
-
-
-def _grown_or_whole(evidence: Evidence, run: RunContext, earlier: Earlier, steps: Steps) -> Outcome:
     grown, doubt = _grow(evidence, run, earlier, steps)
     run.record(grown_from=0 if grown is None else len(earlier.known), mapped_again_because=doubt)
-    if grown is not None and not doubt:
-        return grown
-    run.progress.say(f"mapping all photos again (reason: {doubt})")
-    cameras = steps.find_cameras(evidence.matches, evidence.views, run)
-    whole = steps.reconstruct(replace(evidence, intrinsics=cameras), run, hypotheses=FIRST_LOOK)
-    both = [outcome.models[0] for outcome in (grown, whole) if outcome is not None and outcome.models]
-    is_folded = doubt == TWO_PLACES and bool(whole.models)  # look-alikes explain more, and are wrong
-    if grown is None or is_folded or best_attempt(both) is not grown.models[0]:
-        return whole
-    write_graph(grown.graph, grown.evidence, run)
-    return replace(grown, trials=(*whole.trials, *grown.trials))
+
+    def map_anew(hypotheses: Sequence[Hypothesis]) -> Outcome:
+        cameras = steps.find_cameras(evidence.matches, evidence.views, run)
+        return steps.reconstruct(replace(evidence, intrinsics=cameras), run, hypotheses=hypotheses)
+
+    if grown is None:
+        run.progress.say(f"mapping all photos again (reason: {doubt})")
+        return map_anew(ALL)
+    anew = Hypothesis("mapped-anew", lambda *_: doubt, lambda *_: iter([map_anew(FIRST_LOOK)]))
+    mapper = Mapper(run, replace(MAPPERS, judge_places=steps.judge_places))
+    return with_doubtful_joins(improve(grown, mapper, [anew, FINER_FEATURES]), mapper)
 
 
 def _grow(evidence: Evidence, run: RunContext, earlier: Earlier, steps: Steps) -> tuple[Outcome | None, str]:
@@ -109,7 +111,7 @@ def _grow(evidence: Evidence, run: RunContext, earlier: Earlier, steps: Steps) -
     if unconnected:  # COLMAP does not take photos without a pair in the database
         placed = [photo for photo in placed if photo not in unconnected]
         start = submodel(start, placed)
-    before = support(explained_pairs(start, trusted.matches, trusted.views, epipolar.max_error_px))
+    before = support(explained_pairs(start, trusted, epipolar.max_error_px))
     model = _place(start, Group(connected, trusted, graph), run)
     how = f"{len(placed)} photos were known"
     attempt = judge_model(trusted, GROWN, how, model, run)
@@ -132,7 +134,7 @@ def _doubt(attempt: Attempt, placed: Collection[int], before: float, evidence: E
     if after < (1.0 - MAPPING.equal_tolerance) * before:
         return "the model explains fewer matches of the known photos than the earlier one"
     if steps.judge_places((attempt,))[0]:
-        return TWO_PLACES
+        return "two different places are merged in the model"
     return steps.rival_reason(attempt, evidence)
 
 

@@ -41,11 +41,16 @@ from sfm_app.types.camera import PERSPECTIVE
 logger = logging.getLogger("sfm_app")
 
 
+FIRST = "first-pass"
+"""Name of the trial that all hypotheses are compared with."""
+
+
 @dataclass(frozen=True, slots=True)
 class Trial:
     """A hypothesis that was tried, and what it gained."""
 
     name: str
+    """Of the hypothesis; "outer: inner" within another one."""
     reason: str
     """Why it was tried; for people."""
     accepted: bool
@@ -58,6 +63,11 @@ class Trial:
     """How its models were made; for people."""
     failure: str = ""
     """Why it failed, for people; empty if it did not."""
+
+    @property
+    def is_hypothesis(self) -> bool:
+        """Whether this is neither the first pass nor a part of another trial."""
+        return self.name != FIRST and ":" not in self.name
 
     def to_dict(self) -> dict[str, Json]:
         """Return JSON values."""
@@ -100,6 +110,11 @@ class Outcome:
     def support(self) -> float:
         """Support of the main model; 0 without one."""
         return self.models[0].support if self.models else 0.0
+
+    @property
+    def cameras(self) -> int:
+        """Number of cameras of the main model; 0 without one."""
+        return len(set(map(self.evidence.camera_name, posed_photo_ids(self.models[0].model)))) if self.models else 0
 
     @property
     def trusted(self) -> Evidence:

@@ -7,6 +7,7 @@ from typing import Any
 from sfm_app.camera.bearings import field_of_view_deg
 from sfm_app.camera.models import calibration_from_model
 from sfm_app.frame.sighted_points import Distance
+from sfm_app.settings import HYPOTHESES
 from sfm_app.types import Calibration, CameraModel, Intrinsics, Scene
 from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE, GIVEN, KEPT, PERSPECTIVE
 from sfm_app.wording import format_length, list_names
@@ -215,16 +216,6 @@ MAPPERS = {
     "colmap": "by COLMAP's default pipeline",
     "parts": "in parts, then joined",
     "grown": "by adding the new photos to the earlier model",
-}
-HYPOTHESES = {
-    "false-joins": "leaving out the ambiguous pairs",
-    "colmap-defaults": "COLMAP's default pipeline",
-    "other-focals": "other focal lengths",
-    "camera-per-photo": "a camera for each photo (a zoom, or several devices)",
-    "two-cameras": "two cameras",
-    "learned-cameras": "mapping again with the cameras of the model",
-    "merged-models": "merging models",
-    "finer-features": "finer features for unplaced photos",
 }
 DOUBTS = ("look_alikes", "perhaps_look_alikes", "jumps", "weakly_joined")
 UNSURE_ODDS = 10.0

@@ -8,7 +8,7 @@ import pytest
 
 from sfm_app.colmap.database import open_database, write_match_graph
 from sfm_app.mapping.attempt import Attempt, NoModel, PairSupport, explained_pairs
-from sfm_app.mapping.hypotheses import FIRST_LOOK, HYPOTHESES, improve, reconstruct
+from sfm_app.mapping.hypotheses import ALL, FIRST_LOOK, improve, reconstruct
 from sfm_app.mapping.passes import Mapper, Mappers, Outcome
 from sfm_app.types import Evidence, PoseGraph
 
@@ -18,7 +18,7 @@ EMPTY = PoseGraph({}, {}, ())
 
 
 def hypothesis(name):
-    return next(one for one in HYPOTHESES if one.name == name)
+    return next(one for one in ALL if one.name == name)
 
 
 def with_camera(model, params):
@@ -65,7 +65,7 @@ class Fakes:
         self.mappers = Mappers(map_rival=lambda *_: NoModel("colmap", "no rival"))
 
     def attempt(self, model, mapper="incremental"):
-        explained = explained_pairs(model, self.synthetic.matches, self.synthetic.views, 1.5)
+        explained = explained_pairs(model, self.synthetic.evidence(None), 1.5)
         return Attempt(mapper, model, explained, f"{model.num_reg_images()} photos")
 
     def __call__(self, *models):
@@ -94,7 +94,7 @@ class Fakes:
 
         def map_rival(evidence, run):
             calls.append(evidence.intrinsics)
-            explained = explained_pairs(model, evidence.matches, evidence.views, 1.5)
+            explained = explained_pairs(model, evidence, 1.5)
             return Attempt("colmap", model, explained, "the rival")
 
         self.mappers = replace(self.mappers, map_rival=map_rival)

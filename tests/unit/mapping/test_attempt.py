@@ -181,7 +181,7 @@ def test_coverage_is_the_share_of_cells_that_the_points_could_fill():
 
 
 def explained(model, synthetic, views=None):
-    return explained_pairs(model, synthetic.matches, views or synthetic.views, 1.5)
+    return explained_pairs(model, replace(synthetic.evidence(), views=views or synthetic.views), 1.5)
 
 
 def turned(model, photo, degrees):
@@ -236,7 +236,7 @@ def test_a_pair_without_F_contradicts_nothing_but_counts(synthetic):
 def test_a_model_does_not_explain_matches_that_nobody_made(synthetic):
     rows = {pair: row[100:] for pair, row in synthetic.matches.matches.items()}
     matches = MatchGraph(synthetic.matches.images, synthetic.matches.keypoints, rows)
-    found = explained_pairs(synthetic.model, matches, ViewGraph({}, {}), 1.5)
+    found = explained_pairs(synthetic.model, Evidence(matches, ViewGraph({}, {}), None), 1.5)
     assert sum(pair.matches for pair in found.values()) < 0.3 * 20 * len(found)
 
 

@@ -12,10 +12,10 @@ from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.errors import BackendError, ClusterError, ConfigError, NumericalError
 from sfm_app.mapping.attempt import Attempt, PairSupport
-from sfm_app.mapping.hypotheses import HYPOTHESES, OPTIONS, learned_intrinsics
+from sfm_app.mapping.hypotheses import ALL, OPTIONS, is_better, learned_intrinsics
 from sfm_app.mapping.passes import Mapper, Mappers, Outcome, Trial
 from sfm_app.posegraph.graph import LOOKS_ALIKE
-from sfm_app.settings import HypothesisName, Settings
+from sfm_app.settings import HYPOTHESES, HypothesisName, Settings
 from sfm_app.types import Evidence, LookAlikes, MatchedImage, MatchGraph, PoseGraph, ViewGraph
 from tests.unit.mapping.fakes import (
     AGAINST,
@@ -117,7 +117,7 @@ def test_a_lost_cluster_and_a_bug_of_ours_are_not_hidden(synthetic, run, cameras
 
 
 def test_every_hypothesis_can_be_switched_off():
-    assert tuple(one.name for one in HYPOTHESES) == get_args(HypothesisName)
+    assert {*(one.name for one in ALL), "mapped-anew"} == set(get_args(HypothesisName)) == HYPOTHESES.keys()
     for names in ("two-cameras", "two-cameras, finer-features", ["two-cameras"]):
         assert Settings.from_mapping({"scene": {"without": names}}).scene.without[0] == "two-cameras"
     with pytest.raises(ConfigError, match="finer-features"):
@@ -225,15 +225,16 @@ def test_a_rival_of_other_photos_does_not_win_by_our_own_model(synthetic, run, c
     assert trials_of(found)[1] == ("colmap-defaults", False, "the rival")
 
 
-def test_a_rival_is_compared_as_a_whole_and_then_cut(synthetic, run, cameras, mapped):
+def test_a_rival_is_cut_and_its_largest_part_compared(synthetic, run, cameras, mapped):
     rival = Attempt("colmap", synthetic.copy(), joined(GOOD, AGAINST), "the rival")
     mapped.mappers = replace(mapped.mappers, map_rival=lambda *_: rival)
-    ours = Attempt("incremental", without(synthetic.copy(), [5, 6]), {(1, 2): GOOD, (2, 3): GOOD, (3, 4): GOOD}, "")
-
-    found = mapped.improve(mapped.best(cameras(**GUESS), run(), ours), hypothesis("colmap-defaults"))
-
-    assert ours.support >= found.support and trials_of(found) == [("colmap-defaults", True, "the rival")]
-    assert [posed_photo_ids(model.model) for model in found.models] == [[1, 2, 3], [4, 5, 6]]
+    more, less = ({(1, 2): GOOD, (2, 3): GOOD, (3, 4): GOOD}, {(1, 2): GOOD, (2, 3): GOOD})
+    for explained, cut in ((more, False), (less, True)):
+        ours = Attempt("incremental", without(synthetic.copy(), [5, 6]), explained, "")
+        found = mapped.improve(mapped.best(cameras(**GUESS), run(), ours), hypothesis("colmap-defaults"))
+        assert trials_of(found) == [("colmap-defaults", cut, "the rival")]
+        parts = [posed_photo_ids(model.model) for model in found.models]
+        assert parts == ([[1, 2, 3], [4, 5, 6]] if cut else [[1, 2, 3, 4]])
 
 
 def test_good_evidence_needs_no_rival(synthetic, run, cameras, mapped):
@@ -377,19 +378,45 @@ def test_every_photo_gets_a_guess_of_its_own_that_begins_where_mapping_ended(syn
     )
 
 
-@pytest.mark.parametrize(
-    ("own", "better"),
-    [
-        ([attempt(photos(6), 5, 110)], True),
-        ([attempt(photos(6), 6, 110)], False),
-        ([attempt(photos(6), 5, 100)], False),
-        ([attempt(photos(5), 5, 110)], False),
-        ([attempt(photos(7), 10, 110)], True),
-        ([], False),
-    ],
-)
-def test_it_is_taken_where_it_explains_more_and_contradictions_go(own, better):
-    assert PER_PHOTO.is_better(best_of(*own), best_of(attempt(photos(6), 10)), None) is better
+@pytest.fixture
+def judged(cameras):
+    """Whether the judge prefers a model to one of 6 photos; `places` are the judgments of the places of both."""
+
+    def make(other, best=None, places=(), **intrinsics):
+        judgments = dict(zip(("other", "best"), places, strict=False))
+        outcomes = [
+            best_of(*models, number=9, intrinsics=cameras(**GUESS))
+            for models in (other, [attempt(photos(6), 0, 1000, 1000)] if best is None else best)
+        ]
+        outcomes[0] = replace(outcomes[0], evidence=replace(outcomes[1].evidence, **intrinsics))
+        names = dict(zip((one.models for one in outcomes), ("other", "best"), strict=True))
+        mapper = SimpleNamespace(judge_places=lambda models: judgments.get(names[models], ([], 0)))
+        return is_better(*outcomes, mapper)
+
+    return make
+
+
+def test_the_judge_prefers_what_explains_more(judged):
+    assert judged([attempt(photos(5), 0, 2000)]) and not judged([attempt(photos(7), 0, 500)])
+    assert not judged([attempt(photos(6), 50, 1030)])  # contradictions count against it
+    assert judged([attempt(photos(2), 0, 1)], best=[])
+    assert not judged([]) and not judged([], best=[])
+
+
+def test_of_models_that_explain_equally_much_the_judge_prefers_more_photos_then_fewer_cameras(judged, cameras):
+    equal = [attempt(photos(6), 0, 1001)]
+    each = SimpleNamespace(camera_name=lambda image: image.name)
+    assert judged([attempt(photos(7), 0, 999)]) and not judged([attempt(photos(5), 0, 1001)])
+    assert not judged(equal) and not judged(equal, intrinsics=each)
+    assert judged([attempt(photos(6), 0, 5000)], intrinsics=each)
+
+
+def test_the_judge_prefers_places_apart(judged):
+    join = LookAlikes(((1, 4),), 0.9)
+    folded, fewer = [attempt(photos(6), 0, 5000)], [attempt(photos(6), 0, 500)]
+    assert judged(fewer, places=(([], 10), ([join], 20))) and not judged(folded, places=(([join], 20), ([], 10)))
+    assert not judged(fewer, places=(([join], 11), ([join], 20)))  # too few of the missing overlaps go
+    assert not judged([attempt(photos(5), 0, 500)], places=(([], 0), ([join], 20)))  # too many photos go
 
 
 @pytest.fixture
@@ -429,14 +456,16 @@ def test_photos_of_a_zoom_are_mapped_with_a_camera_each(run, cameras, mapped, zo
     found = mapped.outcome(cameras(**GUESS), run(), hypotheses=[PER_PHOTO])
     assert asked == [1, 6]
     assert len(found.evidence.intrinsics.cameras) == 6 and cameras_in(run().workspace.database) == 6
-    assert trials_of(found)[1:] == [("camera-per-photo", True, "6 cameras", "no rival")]
-    assert found.trials[1].reason == "a shared camera does not fit"
+    assert trials_of(found)[1:] == [
+        ("camera-per-photo: colmap-defaults", False, "no rival"), ("camera-per-photo", True, "6 cameras"),
+    ]  # fmt: skip
+    assert found.trials[2].reason == "a shared camera does not fit"
 
 
 def test_photos_of_one_camera_keep_it_and_so_does_the_database(run, cameras, mapped, zoom):
     asked, guess = zoom(right=False), cameras(**GUESS)
     found = mapped.outcome(guess, run(), hypotheses=[replace(PER_PHOTO, reason=lambda *_: "a doubt")])
-    assert asked == [1, 6] and trials_of(found)[1][:2] == ("camera-per-photo", False)
+    assert asked == [1, 6] and trials_of(found)[-1][:2] == ("camera-per-photo", False)
     assert found.evidence.intrinsics is guess and cameras_in(run().workspace.database) == 1
 
 
@@ -476,21 +505,6 @@ def test_two_cameras_are_tried_only_where_a_camera_per_photo_is_better(after_cam
     focals = [1000.0, 1300.0, 1010.0, 1310.0, 990.0, 1290.0]
     assert TWO.reason(after_camera_per_photo(focals), None)
     assert TWO.reason(after_camera_per_photo(focals, accepted=False), None) == ""
-
-
-@pytest.mark.parametrize(
-    ("two", "as_good"),
-    [
-        ([attempt(photos(6), 0, 1000, 1000)], True),
-        ([attempt(photos(6), 2, 1000, 1000)], True),
-        ([attempt(photos(6), 3, 1000, 1000)], False),
-        ([attempt(photos(6), 0, 800, 1000)], False),
-        ([attempt(photos(5), 0, 1000, 1000)], False),
-        ([], False),
-    ],
-)
-def test_two_cameras_are_taken_where_they_explain_as_much(two, as_good):
-    assert TWO.is_better(best_of(*two), best_of(attempt(photos(6), 0, 1000, 1000)), None) is as_good
 
 
 # The cameras of the model.

@@ -36,7 +36,7 @@ def grow(synthetic, cameras, run, tmp_path):
         def reconstruct(evidence, run, *, hypotheses):
             models = ()
             if whole:
-                explained = explained_pairs(whole, evidence.matches, evidence.views, 1.5)
+                explained = explained_pairs(whole, evidence, 1.5)
                 models = (Attempt("incremental", whole, explained, "all again"),)
             trial = Trial("first-pass", "", True, (0, 6), (0.0, 9.0), 1.0, ("all again",))
             return Outcome(models, EMPTY, evidence, evidence.intrinsics, run, trials=(trial,))
@@ -111,19 +111,21 @@ def test_the_grown_model_stays_where_all_again_explains_less(grow, synthetic):
     )
     assert figures["mapped_again_because"] == "a doubt"
     assert found.models[0].mapper == "grown" and found.models[0].photos == 6
-    assert trials_of(found) == [("first-pass", True, "all again")]
+    assert trials_of(found) == [("mapped-anew: first-pass", True, "all again"), ("mapped-anew", False)]
 
 
-@pytest.mark.parametrize(("left", "mapper"), [((1, 2, 3), "incremental"), ((), "grown")])
-def test_a_grown_model_with_two_places_in_one_stays_only_where_nothing_else_is_found(grow, synthetic, left, mapper):
+@pytest.mark.parametrize(("anew", "mapper"), [([], "incremental"), (None, "grown")])
+def test_a_grown_model_with_two_places_in_one_stays_only_where_nothing_else_is_found(grow, synthetic, anew, mapper):
+    join = LookAlikes(((1, 6),), 0.9)
     found, figures = grow(
         submodel(synthetic.model, [1, 2, 3, 4]),
         (1, 2, 3, 4),
-        whole=left and submodel(synthetic.model, left),
-        judge_places=lambda _: ([LookAlikes(((1, 6),), 0.9)], 12),
+        whole=None if anew is None else synthetic.copy(),
+        judge_places=lambda models: ([join], 12) if models[:1] and models[0].mapper == "grown" else ([], 0),
     )
     assert figures["mapped_again_because"] == "two different places are merged in the model"
     assert found.models[0].mapper == mapper
+    assert found.graph.doubtful == (() if mapper == "incremental" else (join,))
 
 
 def test_known_pairs_are_not_estimated_again(synthetic, cameras):

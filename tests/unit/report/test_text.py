@@ -9,7 +9,6 @@ import pytest
 from sfm_app.camera.bearings import field_of_view_deg
 from sfm_app.camera.models import camera_matrix
 from sfm_app.report.text import (
-    HYPOTHESES,
     center_text,
     field_text,
     focal_text,
@@ -19,7 +18,7 @@ from sfm_app.report.text import (
     scene_summary,
     verdict,
 )
-from sfm_app.settings import HypothesisName
+from sfm_app.settings import HYPOTHESES, HypothesisName
 from sfm_app.types import Calibration, CameraModel, Scene
 
 
