@@ -74,7 +74,7 @@ def calibrate(matches: MatchGraph, seed: int) -> Calibration:
     with tempfile.TemporaryDirectory() as folder, make_executor(1) as executor:
         run = RunContext(Settings(seed=seed), Workspace(Path(folder)), load_plugins(), executor, 1, fingerprint="one")
         views = view_graph.make(matches, run)
-        return find_intrinsics(matches, views, run)[0].main
+        return find_intrinsics(matches, views, run).main
 
 
 def measure(k1: float, *, more: bool, seeds: int) -> Row:

@@ -1,7 +1,7 @@
 """Cameras of all photos from the fundamental matrices of their pairs, by the chosen calibrator."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -89,9 +89,7 @@ def _is_bent(pair: PairId, known: Mapping[int, Calibration], views: ViewGraph, m
     return max(abs(known[photo].radial) for photo in pair) >= OPTIONS.min_radial
 
 
-def find_intrinsics(
-    matches: MatchGraph, views: ViewGraph, run: RunContext
-) -> tuple[Intrinsics, Sequence[CalibratedCamera]]:
+def find_intrinsics(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
     """Find K and lens of every camera, and the camera of every photo; unidentifiable cameras become a guess."""
     sample = sample_pairs(views, len(matches.images))
     run.record(pairs_asked=len(sample.fits))
@@ -105,13 +103,18 @@ def find_intrinsics(
     for group, lens in views.lenses.items():  # they precede the fundamental matrices
         cameras.append(CalibratedCamera(group, tuple(image.id for image in images if image.group == group), lens))
     report_claims({camera.name: _exif_claim(camera, matches) for camera in cameras}, run)
-    cameras = sorted(_take_given_cameras(cameras, matches, run), key=lambda one: (-len(one.photos), one.name))
-    intrinsics = Intrinsics(
-        cameras={camera.name: explain_failure(camera, views) for camera in cameras},
-        camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
-        photos={image.id: image.name for image in images},
+    cameras = _take_given_cameras(cameras, matches, run)
+    return to_intrinsics((replace(camera, found=explain_failure(camera, views)) for camera in cameras), matches)
+
+
+def to_intrinsics(cameras: Iterable[CalibratedCamera], matches: MatchGraph) -> Intrinsics:
+    """Return the cameras of all photos, that of the most photos first."""
+    ordered = sorted(cameras, key=lambda one: (-len(one.photos), one.name))
+    return Intrinsics(
+        cameras={camera.name: camera.found for camera in ordered},
+        camera_of={matches.images[photo].name: camera.name for camera in ordered for photo in camera.photos},
+        photos={image.id: image.name for image in matches.images.values()},
     )
-    return intrinsics, cameras
 
 
 def sample_pairs(views: ViewGraph, photos: int) -> ViewGraph:

@@ -175,6 +175,25 @@ def to_calibration(estimate: LensEstimate, size: tuple[int, int]) -> Calibration
     )  # fmt: skip
 
 
+def find_views(
+    matches: MatchGraph,
+    run: RunContext,
+    lenses: Mapping[str, Calibration],
+    known: Mapping[PairId, EpipolarFit | Rejected] = MappingProxyType({}),
+) -> ViewGraph:
+    """Return the geometry of every pair with matches; those that are not known are fitted."""
+    fitted = fit_pairs(matches, [pair for pair in matches.matches if pair not in known], run, lenses)
+    graph = to_view_graph({pair: fitted.get(pair) or (known[pair], 0) for pair in matches.matches}, lenses)
+    run.record(
+        kept=len(graph.fits),
+        rejected=graph.reasons,
+        degenerate=sum(bool(fit.degeneracy) for fit in graph.fits.values()),
+        inliers=sum(fit.inlier_count for fit in graph.fits.values()),
+        stationary=sum(count for _, count in fitted.values()),
+    )
+    return graph
+
+
 def fit_pairs(
     matches: MatchGraph, pairs: Sequence[PairId], run: RunContext, lenses: Mapping[str, Calibration]
 ) -> dict[PairId, PairFit]:
@@ -287,9 +306,9 @@ def read_part(path: Path, pairs: Sequence[PairId]) -> dict[PairId, PairFit] | No
     try:
         arrays = load_arrays(path)
         graph = ViewGraph.from_arrays(arrays)
-        all_results: dict[PairId, EpipolarFit | Rejected] = {**graph.fits, **graph.rejected}
+        results = graph.results
         still = {(int(a), int(b)): int(count) for a, b, count in arrays["still"]}
-        return {pair: (all_results[pair], still[pair]) for pair in pairs}
+        return {pair: (results[pair], still[pair]) for pair in pairs}
     except Exception:  # decoders of damaged bytes raise all kinds of errors
         return None
 

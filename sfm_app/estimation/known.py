@@ -6,11 +6,22 @@ from dataclasses import replace
 from typing import Any
 
 from sfm_app.camera_files import run_camera
-from sfm_app.estimation.calibrating import find_intrinsics, photo_pairs, to_whole_photo
+from sfm_app.estimation.calibrating import find_intrinsics, photo_pairs, to_intrinsics, to_whole_photo
+from sfm_app.estimation.fitting import find_views
 from sfm_app.estimation.given_cameras import CENTERS, Contradiction, find_contradictions, focal_claim
 from sfm_app.runtime.context import Earlier, RunContext
 from sfm_app.selfcal import CalibratedCamera, calibrate_photo_set
-from sfm_app.types import Calibration, EpipolarFit, Intrinsics, MatchedImage, MatchGraph, PairId, Rejected, ViewGraph
+from sfm_app.types import (
+    Calibration,
+    EpipolarFit,
+    Evidence,
+    Intrinsics,
+    MatchedImage,
+    MatchGraph,
+    PairId,
+    Rejected,
+    ViewGraph,
+)
 
 # Wide lenses and fundamental matrices of an earlier run.
 
@@ -31,15 +42,15 @@ def known_lenses(matches: MatchGraph, before: ViewGraph, earlier: Earlier) -> di
 
 def known_fits(
     matches: MatchGraph, before: ViewGraph, same: Collection[PairId], lenses: Mapping[str, Calibration]
-) -> dict[PairId, tuple[EpipolarFit | Rejected, int]]:
-    """Return the fits of pairs with the same matches and lenses; their stationary matches are not counted."""
+) -> dict[PairId, EpipolarFit | Rejected]:
+    """Return the fits of pairs with the same matches and lenses."""
     groups = {image.group for image in matches.images.values()}
     unchanged = {group for group in groups if _text(before.lenses.get(group)) == _text(lenses.get(group))}
-    all_results: dict[PairId, EpipolarFit | Rejected] = {**before.fits, **before.rejected}
+    results = before.results
     return {
-        pair: (all_results[pair], 0)
+        pair: results[pair]
         for pair in same
-        if pair in all_results and all(matches.images[photo].group in unchanged for photo in pair)
+        if pair in results and all(matches.images[photo].group in unchanged for photo in pair)
     }
 
 
@@ -53,31 +64,41 @@ METHOD = "earlier run"
 """Source of a camera: the last adjustment of a run with other photos."""
 
 
-def find_or_keep_intrinsics(
-    matches: MatchGraph, views: ViewGraph, run: RunContext
-) -> tuple[Intrinsics, Sequence[CalibratedCamera]]:
+def find_or_keep_intrinsics(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
     """Return the cameras of all photos: refined ones of an earlier run that nothing contradicts, and new ones."""
     known = {} if run.earlier is None or run.given.source else known_cameras(matches, views, run, run.earlier)
     if not known:
         return find_intrinsics(matches, views, run)
-    images = matches.images.values()
-    cameras = [
-        CalibratedCamera(group, tuple(image.id for image in images if image.group == group), camera)
-        for group, camera in known.items()
-    ]
-    if others := {image.id: image for image in images if image.group not in known}:
-        new = find_intrinsics(*_part(matches, views, others), run)[1]
-        if not all(camera.found.is_estimated for camera in new):  # pairs with the known cameras may tell more
+    new = Intrinsics({})
+    if others := {image.id: image for image in matches.images.values() if image.group not in known}:
+        new = find_intrinsics(*_part(matches, views, others), run)
+        if not all(
+            camera.is_estimated for camera in new.cameras.values()
+        ):  # pairs with the known cameras may tell more
             return find_intrinsics(matches, views, run)
-        cameras += new
     run.record(kept_cameras=sorted(known))
-    cameras = sorted(cameras, key=lambda one: (-len(one.photos), one.name))
-    intrinsics = Intrinsics(
-        cameras={camera.name: camera.found for camera in cameras},
-        camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
-        photos={image.id: image.name for image in images},
-    )
-    return intrinsics, cameras
+    members: dict[str, list[int]] = {}
+    for image in matches.images.values():
+        members.setdefault(image.group if image.group in known else new.camera_name(image), []).append(image.id)
+    cameras = {**known, **new.cameras}
+    return to_intrinsics((CalibratedCamera(name, tuple(ids), cameras[name]) for name, ids in members.items()), matches)
+
+
+# Evidence of more matches.
+
+
+def find_evidence(matches: MatchGraph, run: RunContext, known: Evidence) -> Evidence:
+    """Return the evidence of matches of which some are known: other pairs are fitted, and unknown cameras found.
+
+    Where pairs determine the cameras of half of the photos, more pairs change little.
+    """
+    same = {pair for pair, rows in matches.matches.items() if known.matches.matches.get(pair) is rows}
+    results = known.views.results
+    views = find_views(matches, run, known.views.lenses, {pair: results[pair] for pair in same if pair in results})
+    estimated = [known.camera(photo).is_estimated for photo in known.matches.images]
+    if 2 * sum(estimated) >= len(estimated) or same.issuperset(views.fits):
+        return Evidence(matches, views, known.intrinsics)
+    return Evidence(matches, views, find_intrinsics(matches, views, run))
 
 
 def known_cameras(matches: MatchGraph, views: ViewGraph, run: RunContext, earlier: Earlier) -> dict[str, Calibration]:

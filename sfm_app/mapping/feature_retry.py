@@ -14,15 +14,14 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import read_features, write_match_graph
 from sfm_app.colmap.model import posed_photo_ids
-from sfm_app.estimation.calibrating import find_intrinsics
-from sfm_app.estimation.fitting import fit_pairs, to_view_graph
+from sfm_app.estimation.known import find_evidence
 from sfm_app.mapping.attempt import are_many_unregistered
 from sfm_app.mapping.passes import Outcome
 from sfm_app.matching.features import fill_database
 from sfm_app.plugins import SIFT_DSP
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import SubWorkspace
-from sfm_app.types import Evidence, Intrinsics, MatchGraph, PairId, ViewGraph
+from sfm_app.types import Evidence, MatchGraph, PairId
 from sfm_app.types.arrays import FloatArray
 
 Rows = NDArray[np.uint32]
@@ -90,7 +89,7 @@ class Steps:
     """Steps of the search; tests pass others."""
 
     fill_database: Callable[..., object] = fill_database
-    find_intrinsics: Callable[..., tuple[Intrinsics, object]] = find_intrinsics
+    find_evidence: Callable[[MatchGraph, RunContext, Evidence], Evidence] = find_evidence
 
 
 STEPS = Steps()
@@ -146,19 +145,6 @@ def find_finer_evidence(best: Outcome, run: RunContext, steps: Steps = STEPS) ->
         matches, enriched = add_matches(first.matches, *read_features(finer.workspace.database))
     if not enriched:
         return None
-    fitted = to_view_graph(fit_pairs(matches, enriched, run, first.views.lenses))
-    if not fitted.fits:  # such as of a photo of something else
-        return None
-    views = _with_fits(first.views, fitted, set(enriched))
-    # where pairs determine the cameras of half of the photos, more pairs change little
-    estimated = [first.camera(photo).is_estimated for photo in first.matches.images]
-    is_calibrated = 2 * sum(estimated) >= len(estimated)
-    intrinsics = first.intrinsics if is_calibrated else steps.find_intrinsics(matches, views, run)[0]
-    return Evidence(matches, views, intrinsics), run
-
-
-def _with_fits(views: ViewGraph, fitted: ViewGraph, pairs: Collection[PairId]) -> ViewGraph:
-    """Return the view graph with new fits of some pairs."""
-    fits = {pair: fit for pair, fit in views.fits.items() if pair not in pairs} | dict(fitted.fits)
-    rejected = {pair: why for pair, why in views.rejected.items() if pair not in pairs} | dict(fitted.rejected)
-    return ViewGraph(dict(sorted(fits.items())), rejected, views.lenses)
+    evidence = steps.find_evidence(matches, run, first)
+    # none such as of a photo of something else
+    return (evidence, run) if any(pair in evidence.views.fits for pair in enriched) else None

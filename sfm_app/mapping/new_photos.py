@@ -54,7 +54,7 @@ GROWN = "grown"
 
 def find_cameras(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
     """Find the cameras of all photos anew; the record of the run stays."""
-    return find_intrinsics(matches, views, replace(run, statistics={}))[0]
+    return find_intrinsics(matches, views, replace(run, statistics={}))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,7 @@
 """intrinsics: ViewGraph -> Intrinsics."""
 
+from collections import Counter
+
 from sfm_app.estimation.known import find_or_keep_intrinsics
 from sfm_app.products import write_intrinsics
 from sfm_app.runtime.context import RunContext
@@ -8,11 +10,12 @@ from sfm_app.types import Calibration, Intrinsics, MatchGraph, ViewGraph
 
 def make(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
     """Find the cameras, write them to calibration.json and record their figures."""
-    intrinsics, cameras = find_or_keep_intrinsics(matches, views, run)
+    intrinsics = find_or_keep_intrinsics(matches, views, run)
+    photos = Counter(intrinsics.camera_of.values())
     run.record(
         cameras={name: _summary(camera) for name, camera in intrinsics.cameras.items()},
-        photos={camera.name: len(camera.photos) for camera in cameras},
-        identifiable=sum(camera.found.identifiable for camera in cameras),
+        photos={name: photos[name] for name in intrinsics.cameras},
+        identifiable=sum(camera.identifiable for camera in intrinsics.cameras.values()),
     )
     write_intrinsics(intrinsics, run.workspace)
     return intrinsics

@@ -3,7 +3,7 @@
 import shutil
 
 from sfm_app.estimation.diagnosis import diagnose_scene
-from sfm_app.estimation.fitting import find_lenses, fit_pairs, to_view_graph
+from sfm_app.estimation.fitting import find_lenses, find_views
 from sfm_app.estimation.known import known_fits, known_lenses
 from sfm_app.matching.pairs import find_same_matches
 from sfm_app.products import read_view_graph, write_view_graph
@@ -23,16 +23,7 @@ def make(matches: MatchGraph, run: RunContext) -> ViewGraph:
         lenses = find_lenses(matches, run, known_lenses(matches, earlier, run.earlier))
         known = known_fits(matches, earlier, find_same_matches(matches, run.earlier).pairs, lenses)
         run.record(known_pairs=len(known))
-    fitted = fit_pairs(matches, [pair for pair in matches.matches if pair not in known], run, lenses)
-    fits = {pair: known[pair] if pair in known else fitted[pair] for pair in matches.matches}
-    graph = to_view_graph(fits, lenses)
-    run.record(
-        kept=len(graph.fits),
-        rejected=graph.reasons,
-        degenerate=sum(bool(fit.degeneracy) for fit in graph.fits.values()),
-        inliers=sum(fit.inlier_count for fit in graph.fits.values()),
-        stationary=sum(count for _, count in fits.values()),
-    )
+    graph = find_views(matches, run, lenses, known)
     if not graph.fits:
         raise diagnose_scene(matches, graph, run.settings.matching).error()
     write_view_graph(graph, run.workspace)

@@ -59,6 +59,11 @@ class ViewGraph:
     bearing vectors."""
 
     @property
+    def results(self) -> dict[PairId, EpipolarFit | Rejected]:
+        """The fit of every pair, or the reason for its absence."""
+        return {**self.fits, **self.rejected}
+
+    @property
     def reasons(self) -> dict[str, int]:
         """How often each reason of rejection occurred, most frequent first."""
         return dict(Counter(r.reason for r in self.rejected.values()).most_common())

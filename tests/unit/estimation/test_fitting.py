@@ -52,7 +52,7 @@ def run(tmp_path):
 def test_a_fisheye_is_found_before_fundamental_matrices_and_becomes_the_camera(run):
     matches = photos_through(WIDE)
     views = view_graph.make(matches, run)
-    intrinsics, _ = find_intrinsics(matches, views, run)
+    intrinsics = find_intrinsics(matches, views, run)
 
     assert run.statistics["lenses"] == {"960x640": "a fisheye with 204 degrees along the longer side"}
     assert read_view_graph(run.workspace).lenses["960x640"].to_dict() == views.lenses["960x640"].to_dict()
@@ -86,7 +86,7 @@ def test_a_given_fisheye_takes_the_place_of_the_one_that_is_found_and_is_checked
         "from": "a file", "kept": True, "checked": True, "contradicted": []
     }  # fmt: skip
     views = view_graph.make(matches, right)
-    intrinsics, _ = find_intrinsics(matches, views, right)
+    intrinsics = find_intrinsics(matches, views, right)
     assert intrinsics.main.is_kept and intrinsics.main.focal_px == 270.5
     wrong = given(run, replace(WIDE, K=WIDE.K * [[1.1], [1.1], [1.0]]))
     assert find_lenses(matches, wrong)["960x640"].method == "given"
@@ -107,8 +107,8 @@ def test_a_given_perspective_camera_is_checked_by_the_calibrator(run):
     matches = photos_through(PLAIN, 6, away=14.0)
     wrong = given(run, replace(PLAIN, K=PLAIN.K * [[1.2], [1.2], [1.0]]))
     views = view_graph.make(matches, wrong)
-    intrinsics, cameras = find_intrinsics(matches, views, wrong)
-    assert [(camera.name, camera.found.method) for camera in cameras] == [("960x640", "given")]
+    intrinsics = find_intrinsics(matches, views, wrong)
+    assert [(name, camera.method) for name, camera in intrinsics.cameras.items()] == [("960x640", "given")]
     assert intrinsics.main.focal_px == pytest.approx(1080.0)
     [said] = run.statistics["given_cameras"]["960x640"]["contradicted"][:1]
     assert said["what"] == "focal length" and said["found_px"] == pytest.approx(900.0, rel=0.02)
