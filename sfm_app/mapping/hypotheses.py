@@ -152,7 +152,10 @@ def is_better(other: Outcome, best: Outcome, mapper: Mapper) -> bool:
 
 
 def _explains_more(other: Outcome, best: Outcome) -> bool:
-    """Return whether a main model explains more on the same evidence; if equal, more photos, then fewer cameras win."""
+    """Return whether a main model explains more on the same evidence.
+
+    Of models that explain about equally much, the one with more photos, then the one with fewer cameras wins.
+    """
     if other.main is None or best.main is None:
         return best.main is None and other.main is not None
     ours, theirs = best.support, other.support
@@ -161,7 +164,7 @@ def _explains_more(other: Outcome, best: Outcome) -> bool:
         theirs = _support_of(other.main, other)
     if abs(theirs - ours) > MAPPING.equal_tolerance * max(theirs, ours):
         return theirs > ours
-    return (other.photos, -other.cameras) > (best.photos, -best.cameras)
+    return (other.photos, -other.cameras, theirs) > (best.photos, -best.cameras, ours)
 
 
 def _support_of(model: Attempt, outcome: Outcome) -> float:

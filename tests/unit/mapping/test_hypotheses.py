@@ -407,7 +407,7 @@ def test_of_models_that_explain_equally_much_the_judge_prefers_more_photos_then_
     equal = [attempt(photos(6), 0, 1001)]
     each = SimpleNamespace(camera_name=lambda image: image.name)
     assert judged([attempt(photos(7), 0, 999)]) and not judged([attempt(photos(5), 0, 1001)])
-    assert not judged(equal) and not judged(equal, intrinsics=each)
+    assert judged(equal) and not judged([attempt(photos(6), 0, 999)]) and not judged(equal, intrinsics=each)
     assert judged([attempt(photos(6), 0, 5000)], intrinsics=each)
 
 
