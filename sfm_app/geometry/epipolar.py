@@ -289,23 +289,18 @@ def decompose_essential(E: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
     return [(R, sign * t) for R in (U @ W @ Vt, U @ W.T @ Vt) for sign in (1.0, -1.0)]
 
 
-def relative_pose(
-    E: FloatArray, x1: FloatArray, x2: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Choose the one of the four poses of E with most points in front of both cameras.
+def relative_pose(E: FloatArray, x1: FloatArray, x2: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return R (3, 3) and t (3,) of view 2 from view 1: of the four poses of E, the one with most points in front.
 
-    x1, x2 (N, 2) are normalized image points (K^-1 x)_1,2. Returns R (3, 3) and t (3,) of view 2 from view 1, X (N, 3)
-    in the frame of view 1, and (N,) whether a point lies in front of both cameras.
+    x1, x2 (N, 2) are normalized image points (K^-1 x)_1,2.
     """
-    poses = []
-    for R, t in decompose_essential(E):
-        X = triangulate(np.eye(3, 4), np.column_stack([R, t]), x1, x2)
-        finite = np.isfinite(X[:, 2])
-        with np.errstate(invalid="ignore"):  # some BLAS warn of points at infinity, others do not
-            in_front = finite & (X[:, 2] > 0) & ((X @ R.T + t)[:, 2] > 0)
-        poses.append((int(np.count_nonzero(in_front)), R, t, X, in_front))
-    _, R, t, X, in_front = max(poses, key=lambda pose: pose[0])
-    return R, t, X, in_front
+    rays = [np.column_stack([x, np.ones(len(x))]) for x in (x1, x2)]
+
+    def points_in_front(pose: tuple[FloatArray, FloatArray]) -> int:
+        first, second = _ray_depths(*rays, *pose)
+        return int(np.count_nonzero((first > 0) & (second > 0)))
+
+    return max(decompose_essential(E), key=points_in_front)
 
 
 # Epipolar geometry through known lenses, by rays: q' F p = 0, also where rays look backwards. The eight-point method
@@ -358,7 +353,11 @@ def fit_rays(p: FloatArray, q: FloatArray, weights: FloatArray | None = None) ->
 
 def depths(lines: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the depths (N,) in either view, as multiples of the rays, at which the rays of matches are closest."""
-    h1, h2 = lines[:, FIRST] @ R.T, lines[:, SECOND]
+    return _ray_depths(lines[:, FIRST], lines[:, SECOND], R, t)
+
+
+def _ray_depths(rays1: FloatArray, rays2: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+    h1, h2 = rays1 @ R.T, rays2
     # least squares of d1 h1 + t = d2 h2
     a, b, c = (h1 * h1).sum(1), (h1 * h2).sum(1), (h2 * h2).sum(1)
     p, q = h1 @ t, h2 @ t
@@ -405,7 +404,11 @@ class TwoViewSeed:
 
 def two_view_seed(E: FloatArray, x1: FloatArray, x2: FloatArray) -> TwoViewSeed:
     """Decompose E and triangulate all its inliers (N, 2), points of the plane z = 1."""
-    return _judge_seed(*relative_pose(nearest_essential(E), x1, x2))
+    R, t = relative_pose(nearest_essential(E), x1, x2)
+    X = triangulate(np.eye(3, 4), np.column_stack([R, t]), x1, x2)
+    with np.errstate(invalid="ignore"):  # some BLAS warn of points at infinity, others do not
+        in_front = np.isfinite(X[:, 2]) & (X[:, 2] > 0) & ((X @ R.T + t)[:, 2] > 0)
+    return _judge_seed(R, t, X, in_front)
 
 
 def ray_seed(R: FloatArray, t: FloatArray, lines: FloatArray) -> TwoViewSeed:

@@ -236,7 +236,7 @@ def _estimate_poses(few: Matches, Fs: FloatArray, thetas: FloatArray) -> FloatAr
             (undistort_points(points, thetas[camera]) - K[:2, 2]) / K[[0, 1], [0, 1]]
             for points, camera, K in ((x[:, :2], first, K1), (x[:, 2:], second, K2))
         ]
-        R, t, _, _ = relative_pose(essential_from_fundamental(Fs[pair], K1, K2), *rays)
+        R, t = relative_pose(essential_from_fundamental(Fs[pair], K1, K2), *rays)
         poses[pair] = np.concatenate([R.ravel(), t / np.linalg.norm(t)])
     return poses
 

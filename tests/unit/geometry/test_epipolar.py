@@ -307,11 +307,11 @@ def test_the_pose_comes_back_from_the_essential_matrix(angles, t, seed):
     t /= np.linalg.norm(t)
     R = Rotation.from_euler("xyz", angles).as_matrix()
     X, x1, x2 = scene(seed, R, t)
-    found_R, found_t, found_X, in_front = relative_pose(-3.0 * cross_matrix(t) @ R, x1, x2)
+    found_R, found_t = relative_pose(-3.0 * cross_matrix(t) @ R, x1, x2)
     assert np.allclose(found_R, R, atol=1e-6)
     assert np.allclose(found_t, t, atol=1e-6)
-    assert in_front.all()
-    assert np.allclose(found_X, X, rtol=1e-3, atol=1e-3)
+    both = two_view_seed(-3.0 * cross_matrix(t) @ R, x1, x2)
+    assert both.in_front == 1.0 and np.allclose(both.points, X, rtol=1e-3, atol=1e-3)
 
 
 @given(st.tuples(angle, angle, angle), st.tuples(component, component, st.floats(0.1, 1)))
@@ -360,5 +360,5 @@ def test_a_seed_tells_a_narrow_and_a_contradictory_pair():
 def test_points_at_infinity_are_in_front_of_no_camera(monkeypatch):
     points = np.array([[np.inf] * 3, [0.1, 0.2, 3.0]])
     monkeypatch.setattr("sfm_app.geometry.epipolar.triangulate", lambda *_: points)
-    in_front = relative_pose(cross_matrix([0.0, 0.0, 1.0]), np.zeros((2, 2)), np.zeros((2, 2)))[3]
-    assert in_front.tolist() == [False, True]
+    seed = two_view_seed(cross_matrix([0.0, 0.0, 1.0]), np.zeros((2, 2)), np.zeros((2, 2)))
+    assert seed.in_front == 0.5 and not seed.usable[0]
