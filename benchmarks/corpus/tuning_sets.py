@@ -35,25 +35,25 @@ GROUPS: Mapping[str, Group] = {
     ),
     "chance, degeneracy, watermarks": Group(
         ("fundamental.a_contrario", "fundamental.degeneracy"), FIRST_EIGHT,
-        "rendered planes, panoramas and logos", "docs/algorithms.md, All estimators: looked at on all real sets",
+        "rendered planes, panoramas and logos", "docs/algorithms/lev-ransac.md: looked at on all real sets",
     ),
     "photos left out, bare photos": Group(
-        ("photos", "estimation.diagnosis"), FIRST_EIGHT, "rendered walls", "docs/algorithms.md, Why there is no scene",
+        ("photos", "estimation.diagnosis"), FIRST_EIGHT, "rendered walls", "docs/algorithms/mapping.md",
     ),
     "self-calibration: consensus, weights, priors, verdict": Group(
         ("selfcal",), FIRST_EIGHT, "rendered walks, lenses and orbits; synthetic calibrations",
-        "docs/algorithms.md, Self-calibration names single sets; the rest is not written down",
+        "docs/algorithms/zero-curves.md; sets are not written down",
     ),
     "relative poses, loops, guided pairs": Group(
-        ("posegraph",), WITH_TRUTH, "", "docs/algorithms.md, From K to relative poses",
+        ("posegraph",), WITH_TRUTH, "", "docs/algorithms/relative-poses.md",
     ),
     "mapping: seeds, choice of the model, joins, hypotheses": Group(
         ("mapping", "colmap.mapping", "colmap.tasks"), FIRST_EIGHT, "",
-        "docs/algorithms.md, Mapping; sets are not written down",
+        "docs/algorithms/mapping.md; sets are not written down",
     ),
     "bundle adjustment: priors, misfit, settling": Group(
         ("bundle.normal_equations", "bundle.lens_evidence", "colmap.bundle"), WITH_TRUTH, "",
-        "docs/algorithms.md, Bundle adjustment; rendered folders only checked it",
+        "docs/algorithms/bundle-adjustment.md; rendered folders only checked it",
     ),
     "upright: cues, lines, roll": Group(
         ("frame",),
@@ -61,12 +61,12 @@ GROUPS: Mapping[str, Group] = {
     ),
     "votes that a camera must keep, pairs that are listened to": Group(
         ("selfcal.zero_curves",), (*FIRST_EIGHT, "fox50", "kitchen25", "oats23", "books21"), "",
-        "docs/algorithms.md, Wrong pairs in the majority; without fox50 the bound would be the same",
+        "docs/algorithms/zero-curves.md, 2; without fox50 the bound would be the same",
     ),
     "one camera, several, or each its own; letterbox": Group(
         ("selfcal.other_cameras", "selfcal.priors", "photos.probe"),
         ("reichstag10",), "120 random scenes of cameras",
-        "docs/algorithms.md, Several cameras; the random scenes alone give the same thresholds",
+        "docs/algorithms/zero-curves.md, 6; the random scenes alone give the same thresholds",
     ),
     "when a focal counts as known: its deviation, its lead and the votes it wins": Group(
         ("selfcal.consensus",), (), "benchmarks.trouble, seeds 0 to 180, 1000 to 1035 and 2000 to 2139",
@@ -75,28 +75,28 @@ GROUPS: Mapping[str, Group] = {
     "two cameras of one size": Group(
         ("selfcal.other_cameras", "selfcal.groups"), ("kitchen25",),
         "120 random scenes; trouble.py, seeds 0 to 64",
-        "docs/algorithms.md, Several cameras; the photo sets only checked it",
+        "docs/algorithms/zero-curves.md, 6; the photo sets only checked it",
     ),
     "finer features": Group(
         ("mapping.feature_retry", "built_in"), ("dinoSparseRing",), "",
-        "docs/algorithms.md, Mapping; six other sets, thinned out, only checked it",
+        "docs/algorithms/mapping.md; six other sets, thinned out, only checked it",
     ),
     "a camera for each photo in mapping, scale that hangs on few points": Group(
         ("mapping.hypotheses", "mapping.split_and_merge"),
         ("temple16", "dinoSparseRing", "castle-P19"), "trouble.py, seeds 0 to 180 and 1000 to 1031",
-        "docs/algorithms.md, Mapping; the photo sets chose only when a scale is called open",
+        "docs/algorithms/mapping.md; the photo sets chose only when a scale is called open",
     ),
     "look-alikes": Group(
         ("posegraph.look_alikes",), ("oats23", "books21", "kitchen1000"), "",
-        "docs/algorithms.md, Look-alikes; either of the first two finds the other, every 15th photo of the third",
+        "docs/algorithms/look-alikes.md; either of the first two finds the other, every 15th photo of the third",
     ),
     "starts of poses, pairs on a plane, passes, other focals": Group(
         ("posegraph.pair_pose", "posegraph.graph", "mapping.hypotheses"), ("dinoSparseRing", "kitchen25"), "",
-        "docs/algorithms.md, From K to relative poses, Mapping; castle-P19, fountain-P11, temple16 as before",
+        "docs/algorithms/relative-poses.md, mapping.md; castle-P19, fountain-P11, temple16 as before",
     ),
     "depth, surface, texture (no figure of this table)": Group(
         ("stereo", "meshing", "texture"), (*STRECHA, "temple16", "kermit11"), "the rendered statue, facade and corner",
-        "docs/algorithms.md, Depth and surface; surface-fresh.md has other rendered scenes",
+        "docs/algorithms/surface.md; surface-fresh.md has other rendered scenes",
     ),
 }  # fmt: skip
 

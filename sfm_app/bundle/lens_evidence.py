@@ -51,8 +51,8 @@ if TYPE_CHECKING:
 
 MISFIT = 4.0
 """Ratio of the errors of cameras to those that independent noise explains: lens models are inexact, and errors of
-neighboring observations are correlated. Chosen on photo sets with known cameras (docs/algorithms.md, Bundle
-adjustment)."""
+neighboring observations are correlated. Chosen on photo sets with known cameras
+(docs/algorithms/bundle-adjustment.md)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +60,8 @@ class LensOptions:
     """Limits of the estimate and of the choice of a family."""
 
     undetermined_share: float = 0.5
-    """A part keeps its value unless the photos shrink its prior deviation below this share (docs/algorithms.md, Bundle
-    adjustment)."""
+    """A part keeps its value unless the photos shrink its prior deviation below this share
+    (docs/algorithms/bundle-adjustment.md)."""
     few_photos: float = 2.0
     """Factor on the deviations of cameras with few photos, whose misfit does not average out. Chosen by hand."""
     sweeps: int = 5

@@ -91,7 +91,7 @@ PERSPECTIVE_PARTS = (
     Part("k3", (K3,), ABSENT, 0.03, 0.1, powers=(6,), needs=("k1", "k2"), exact=True),
     Part("k4 k5 k6", (K4, K5, K6), ABSENT, 0.05, 0.05, powers=(2, 4, 6), needs=("k1", "k2", "k3"), exact=True),
 )
-"""Center, aspect and k1 as in `camera.models`; others: docs/algorithms.md, Bundle adjustment. Chosen by hand."""
+"""Center, aspect and k1 as in `camera.models`; others: docs/algorithms/bundle-adjustment.md. Chosen by hand."""
 FISHEYE_PARTS = (
     _CENTER,
     _ASPECT,
@@ -102,7 +102,7 @@ FISHEYE_PARTS = (
     Part("thin prism", (SX, SY), ABSENT, 0.002, 0.05, powers=(1, 1), needs=("p1 p2",), exact=True),
 )
 """An equidistant lens is the usual one. At 175 degrees a stereographic lens has k1 0.19 and k2 0.05 of the radius, an
-equisolid one k1 -0.1. docs/algorithms.md, Bundle adjustment. Chosen by hand."""
+equisolid one k1 -0.1. docs/algorithms/bundle-adjustment.md. Chosen by hand."""
 PARTS = {PERSPECTIVE: PERSPECTIVE_PARTS, FISHEYE: FISHEYE_PARTS, PANORAMA: PERSPECTIVE_PARTS}
 """By family; of a panorama, none is estimated."""
 COUNT = len(PERSPECTIVE_PARTS)

@@ -26,7 +26,7 @@ POSE = 6
 
 @dataclass(frozen=True, slots=True)
 class ReductionOptions:
-    """Limits of the reduction (docs/algorithms.md, Bundle adjustment)."""
+    """Limits of the reduction (docs/algorithms/bundle-adjustment.md)."""
 
     min_information: float = 1e-11
     """Share of a point's information below which a direction counts as undetermined: rounding leaves this much of the

@@ -18,12 +18,12 @@ CENTER, ASPECT, LENS, FOCAL = range(4)
 """Parts of a camera that the photos may free from their usual values: the middle, square pixels, no lens, a claim."""
 NARROW = {CENTER: 0.012, ASPECT: 0.002, LENS: 0.005}
 """Standard deviations about the usual value: of the center in longer sides, of log fy/fx, of k1.
-docs/algorithms.md, Self-calibration, 3; by hand."""
+docs/algorithms/zero-curves.md, 3; by hand."""
 WIDE = {CENTER: 0.15, ASPECT: 0.25, LENS: 0.2}
-"""The same for freed parts. docs/algorithms.md, Self-calibration, 3; by hand."""
+"""The same for freed parts. docs/algorithms/zero-curves.md, 3; by hand."""
 FREE_SHARE = {CENTER: 0.3, ASPECT: 0.05, LENS: 0.5, FOCAL: 0.3}
 """Share of photo sets in which the wide prior is the right one; for FOCAL, in which a claim is wrong.
-docs/algorithms.md, Self-calibration, 3; by hand."""
+docs/algorithms/zero-curves.md, 3; by hand."""
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:

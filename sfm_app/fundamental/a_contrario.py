@@ -12,12 +12,12 @@ from sfm_app.types.arrays import FloatArray
 
 MOST_FALSE_ALARMS = 1e-2
 """Expected number of models with as much support in random matches, above which support counts as chance.
-docs/algorithms.md, All estimators. Chosen by hand; not measured on its own."""
+docs/algorithms/lev-ransac.md. Chosen by hand; not measured on its own."""
 
 
 def model_false_alarms(squared: FloatArray, wrong: FloatArray, threshold: float) -> float:
     """Return the expected number of models with as much support in random matches, from squared distances."""
-    fractions = 1.0, 0.5, 0.25  # precise inliers are stronger evidence; docs/algorithms.md, All estimators
+    fractions = 1.0, 0.5, 0.25  # precise inliers are stronger evidence; docs/algorithms/lev-ransac.md
     alarms = []
     for fraction in fractions:
         inliers = int(np.count_nonzero(squared <= (fraction * threshold) ** 2))

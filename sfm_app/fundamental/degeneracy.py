@@ -170,9 +170,9 @@ class DegeneracyOptions:
     """When matches count as degenerate."""
 
     line_sample: int = 4
-    """Matches that fix the parameters of F that a line leaves free. Counted (docs/algorithms.md, All estimators)."""
+    """Matches that fix the parameters of F that a line leaves free. Counted (docs/algorithms/lev-ransac.md)."""
     parallax_sample: int = 2
-    """Matches that fix the parameters of F that a plane leaves free. Counted (docs/algorithms.md, All estimators)."""
+    """Matches that fix the parameters of F that a plane leaves free. Counted (docs/algorithms/lev-ransac.md)."""
     off_line: float = 2.0
     """Distance in thresholds beyond which a match is off the line. Chosen by hand, as `OFF_PLANE`."""
     extent_quantiles: tuple[float, float] = (0.01, 0.99)
@@ -180,7 +180,7 @@ class DegeneracyOptions:
     focals: tuple[float, float, int] = (0.4, 6.0, 60)
     """Focal lengths that a rotation may have, in sides of the box around the points: range, number. Chosen by hand."""
     least_parallax_share: float = 0.05
-    """Share of the inliers off the plane below which a rotation counts as one (docs/algorithms.md, All estimators).
+    """Share of the inliers off the plane below which a rotation counts as one (docs/algorithms/lev-ransac.md).
     Mismatches on rows of bricks agree with a vanishing point as epipole far more often than by chance."""
     rotation_tolerance: float = 0.05
     """Largest relative stretch of a rotation's homography, for some focal length. Chosen by hand."""
@@ -335,16 +335,16 @@ class WatermarkOptions:
     """When matches that stay in place are no part of the scene."""
 
     peak: float = 1.0
-    """Largest displacement at the peak, in units of keypoint noise (docs/algorithms.md, All estimators)."""
+    """Largest displacement at the peak, in units of keypoint noise (docs/algorithms/lev-ransac.md)."""
     stationary: float = 2.0
-    """Largest displacement of a stationary match, in the same unit (docs/algorithms.md, All estimators)."""
+    """Largest displacement of a stationary match, in the same unit (docs/algorithms/lev-ransac.md)."""
     ring: float = 4.0
-    """Outer radius of the ring around the peak, in the same unit (docs/algorithms.md, All estimators)."""
+    """Outer radius of the ring around the peak, in the same unit (docs/algorithms/lev-ransac.md)."""
     least_peak: int = 8
     """Least number of matches at the peak; the estimator copes with fewer. Chosen by hand."""
     most_lost: float = 0.2
     """Largest share of the stationary matches, or of the others, that the scene loses with a logo
-    (docs/algorithms.md, All estimators). Chosen by hand."""
+    (docs/algorithms/lev-ransac.md). Chosen by hand."""
     cells: int = 8
     """Cells of a photo along each side. Chosen by hand."""
     wide_share: float = 0.25

@@ -33,19 +33,19 @@ from sfm_app.types.arrays import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class LevRansacOptions:
-    """Scales and limits, chosen together on the Strecha sets (docs/algorithms.md, Fundamental matrices).
+    """Scales and limits, chosen together on the Strecha sets (docs/algorithms/lev-ransac.md).
 
     `python -m benchmarks.fundamental --real DATA --ablation` measures the parts they belong to.
     """
 
     coarse: float = 0.25
-    """Scale c in thresholds for models of samples (docs/algorithms.md, Fundamental matrices)."""
+    """Scale c in thresholds for models of samples (docs/algorithms/lev-ransac.md)."""
     fine: float = 0.1
-    """Scale c in thresholds for optimized models (docs/algorithms.md, Fundamental matrices)."""
+    """Scale c in thresholds for optimized models (docs/algorithms/lev-ransac.md)."""
     algebraic_reach: float = 2.0
-    """Thresholds within which matches take part in the local 8-point fit (docs/algorithms.md, Fundamental matrices)."""
+    """Thresholds within which matches take part in the local 8-point fit (docs/algorithms/lev-ransac.md)."""
     sampson_reach: float = 4.0
-    """Thresholds within which they take part in the local Sampson steps (docs/algorithms.md, Fundamental matrices)."""
+    """Thresholds within which they take part in the local Sampson steps (docs/algorithms/lev-ransac.md)."""
     local_matches: int = 1000
     """Most matches in local optimization; on the Strecha sets with six seeds (benchmarks/README.md)."""
     local_steps: tuple[int, int] = (5, 3)
@@ -57,9 +57,9 @@ class LevRansacOptions:
     final_steps: int = 12
     """Most steps of the final fit. Chosen by hand."""
     evidence_scale: float = 1400.0
-    """Samples to wait are the square of this over z; on the Strecha sets (docs/algorithms.md, Fundamental matrices)."""
+    """Samples to wait are the square of this over z; on the Strecha sets (docs/algorithms/lev-ransac.md)."""
     most_patience: float = 3000.0
-    """Samples to wait where the evidence is poor, z below 26 (docs/algorithms.md, Fundamental matrices)."""
+    """Samples to wait where the evidence is poor, z below 26 (docs/algorithms/lev-ransac.md)."""
     least_patience: float = 250.0
     """Samples to wait where half of the matches are not explained; a quarter of them are drawn from the rest. Chosen on
     pairs with two motions: `python -m benchmarks.fundamental --two-motions 100`."""

@@ -127,7 +127,7 @@ def bail_out_table(count: int, inlier_share: float) -> IndexArray:
 
 MODEL_COST = {7: 160.0, 8: 160.0}
 """t_M: time for a sample and its models over the time to check one match, by sample size; measured, 1.1 us and 7 ns
-(docs/algorithms.md, Fundamental matrices)."""
+(docs/algorithms/fundamental-matrices.md)."""
 MODELS_PER_SAMPLE = {7: 2.45, 8: 1.0}
 """m_S, by sample size; measured. The thesis prints 2.3 (4.4.4)."""
 
@@ -137,15 +137,15 @@ class SprtOptions:
     """First guesses and limits of the sequential test. Chosen by hand."""
 
     first_epsilon: float = 0.1
-    """First epsilon: few inliers (docs/algorithms.md, Fundamental matrices)."""
+    """First epsilon: few inliers (docs/algorithms/fundamental-matrices.md)."""
     first_delta: float = 0.01
-    """First delta: few chance inliers near epipolar lines (docs/algorithms.md, Fundamental matrices)."""
+    """First delta: few chance inliers near epipolar lines (docs/algorithms/fundamental-matrices.md)."""
     most_epsilon: float = 0.999
     """Largest epsilon: beyond it the logarithm of 1 - epsilon is useless."""
     prior_weight: float = 100.0
     """Weight of the first delta, in checked matches."""
     delta_tolerance: float = 0.05
-    """Relative change of delta that calls for a new test (docs/algorithms.md, Fundamental matrices)."""
+    """Relative change of delta that calls for a new test (docs/algorithms/fundamental-matrices.md)."""
     review: int = 100
     """Largest number of trials between two updates of delta."""
 

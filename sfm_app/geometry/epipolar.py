@@ -383,7 +383,7 @@ def _normalize(h: FloatArray) -> FloatArray:
 
 GOOD_ANGLE_DEG = 12.0
 """Triangulation angle in degrees beyond which seeds do not get better: depth is well determined, and matches get rarer.
-docs/algorithms.md, Mapping. Chosen by hand."""
+docs/algorithms/mapping.md. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 EIGENVALUE_FLOOR = 1e-13
 """Eigenvalues below this, of a matrix scaled to a unit diagonal, are zeros with rounding errors: some hundred sums of
-doubles. docs/algorithms.md, Where numbers end."""
+doubles. docs/algorithms/bundle-adjustment.md."""
 PIVOT_FLOOR = 1e-10
 """Share of a pivot that elimination must leave for a solution to move along it: a smaller pivot multiplies the rounding
-of later steps by more than a million. It follows from double precision. docs/algorithms.md, Where numbers end."""
+of later steps by more than a million. It follows from double precision. docs/algorithms/bundle-adjustment.md."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class SystemOptions:
     """Share of nonzero entries above which it is: such systems fill up in elimination. Chosen by hand for speed."""
     ridges: tuple[float, ...] = (1e-13, 1e-11, 1e-9, 1e-7)
     """Shares by which the diagonal of a large system is raised, one after the other. They follow from double precision.
-    docs/algorithms.md, Where numbers end."""
+    docs/algorithms/bundle-adjustment.md."""
 
 
 OPTIONS = SystemOptions()

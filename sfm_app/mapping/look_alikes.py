@@ -118,7 +118,7 @@ def sides(pairs: Sequence[PairId], matches: MatchGraph) -> tuple[list[int], list
 
 @dataclass(frozen=True, slots=True)
 class OverlapOptions:
-    """Expected overlaps of photos, and false joins; docs/algorithms.md, Overlaid places."""
+    """Expected overlaps of photos, and false joins; docs/algorithms/look-alikes.md."""
 
     candidates: int = 40
     """Photos nearby that a photo is compared with. Chosen by hand."""

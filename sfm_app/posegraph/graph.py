@@ -33,7 +33,7 @@ LOOKS_ALIKE = "equal things in different places"
 
 @dataclass(frozen=True, slots=True)
 class GuidedOptions:
-    """Poses with a known rotation; docs/algorithms.md, From K to relative poses."""
+    """Poses with a known rotation; docs/algorithms/relative-poses.md."""
 
     samples: int = 200
     """Samples of two matches, each of which gives a direction. Chosen by hand."""
@@ -121,7 +121,7 @@ def sample_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> Flo
 
 @dataclass(frozen=True, slots=True)
 class GraphOptions:
-    """Which pairs stay; docs/algorithms.md, From K to relative poses."""
+    """Which pairs stay; docs/algorithms/relative-poses.md."""
 
     min_in_front: float = 0.75
     """Least share of the inliers of a pair in front of both cameras. Chosen by hand."""

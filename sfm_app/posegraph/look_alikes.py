@@ -33,7 +33,7 @@ from sfm_app.types.arrays import FloatArray, IndexArray
 
 @dataclass(frozen=True, slots=True)
 class LookAlikeOptions:
-    """Detection of look-alikes; docs/algorithms.md, Look-alikes, has the measurements."""
+    """Detection of look-alikes; docs/algorithms/look-alikes.md has the measurements."""
 
     min_other_photos: int = 2
     """Photos besides those of the pair in which a known keypoint has partners. Chosen by hand."""

@@ -35,7 +35,7 @@ from sfm_app.types.camera import PERSPECTIVE
 
 @dataclass(frozen=True, slots=True)
 class PoseOptions:
-    """Thresholds for the pose of a pair; docs/algorithms.md, From K to relative poses."""
+    """Thresholds for the pose of a pair; docs/algorithms/relative-poses.md."""
 
     turns_deg: tuple[float, ...] = (-55.0, -30.0, -12.0, 12.0, 30.0, 55.0)
     """Turns about the scene that initial poses try. Chosen on a long-lens orbit; more turns give the same pose
@@ -112,7 +112,7 @@ def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray,
 
 SIGMAS_PX = (0.5, 0.2)
 """Scales of the Cauchy loss, one after the other: keypoints are accurate to about 0.2 px. Measured;
-docs/algorithms.md, From K to relative poses."""
+docs/algorithms/relative-poses.md."""
 STEPS = 12
 """Largest number of steps at each scale. Chosen by hand."""
 DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e6)

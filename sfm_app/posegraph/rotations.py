@@ -157,7 +157,7 @@ def _make_network(
 
 @dataclass(frozen=True, slots=True)
 class AveragingOptions:
-    """Rotation averaging; docs/algorithms.md, From K to relative poses."""
+    """Rotation averaging; docs/algorithms/relative-poses.md."""
 
     loop_deg: float = 5.0
     """The rotations of a loop agree if the angle of their product is smaller. Chosen by hand."""

@@ -33,7 +33,7 @@ CAMERA = 5
 PAIR = 2 * CAMERA + POSE_DOF
 """Parameters of a pair: two cameras and a pose, by definition."""
 ROBUST_SCALE = 3.0
-"""c of the robust cost, in sigma. docs/algorithms.md, Self-calibration, 2; by hand."""
+"""c of the robust cost, in sigma. docs/algorithms/zero-curves.md, 2; by hand."""
 OVERFLOW_LIMIT = 1e60
 """Squared distances in sigma^2, or derivatives, above this are not finite; its square is, in double precision."""
 _STEP = 1e-6
@@ -46,7 +46,7 @@ class AdjustmentOptions:
 
     most_matches: int = 1000
     """Most matches of one pair; more are not independent, and would let one pair outvote all others. With 300, errors
-    and deviations are half as large again (docs/algorithms.md, Self-calibration, Tried and left out)."""
+    and deviations are half as large again (docs/algorithms/zero-curves.md, 2)."""
     quarter_weight_gain: float = 3.0
     """Log-likelihood gain from own cameras at which a pair's weight is a quarter. By definition of chi^2 with two
     degrees of freedom, noise alone gains as much once in twenty times: exp(-3)."""

@@ -46,7 +46,7 @@ from sfm_app.types.camera import named_correlations
 
 @dataclass(frozen=True, slots=True)
 class FitOptions:
-    """Rounds of the fit, and its uncertainty. Sections are those of Self-calibration in docs/algorithms.md."""
+    """Rounds of the fit, and its uncertainty. Sections are those of docs/algorithms/zero-curves.md."""
 
     few_matches: int = 100
     """Matches per pair until the cameras have nearly converged; by hand."""

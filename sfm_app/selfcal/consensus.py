@@ -66,7 +66,7 @@ ANY_PIXELS = (*SQUARE_PIXELS, LOG_ASPECT)
 
 @dataclass(frozen=True, slots=True)
 class ConsensusOptions:
-    """Search and verdict. Sections are those of Self-calibration in docs/algorithms.md."""
+    """Search and verdict. Sections are those of docs/algorithms/zero-curves.md."""
 
     first_steps: tuple[float, ...] = (0.05, 0.03, 0.03, 0.05)
     """First steps of a local search along theta; by hand."""

@@ -47,7 +47,7 @@ definition of the constraint (thesis 5.2.4)."""
 
 @dataclass(frozen=True, slots=True)
 class GroupOptions:
-    """Focals on a grid, and the verdict on a camera of several. Section 6 of Self-calibration in docs/algorithms.md."""
+    """Focals on a grid, and the verdict on a camera of several. Section 6 of docs/algorithms/zero-curves.md."""
 
     focals: int = 41
     """Focals on the grid of a camera, 7 % apart. Section 6; by hand."""

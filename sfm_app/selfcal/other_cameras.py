@@ -25,7 +25,7 @@ from sfm_app.types.arrays import FloatArray, IndexArray
 
 @dataclass(frozen=True, slots=True)
 class FocalSplitOptions:
-    """Division by focal. Section 6 of Self-calibration in docs/algorithms.md. Chosen by hand."""
+    """Division by focal. Section 6 of docs/algorithms/zero-curves.md. Chosen by hand."""
 
     sigma: float = 0.03
     """Width of the votes, in r: focals 3 % apart still agree, those 10 % apart do not."""
@@ -346,7 +346,7 @@ class CameraPerPhotoOptions:
     least_photos: int = 5
     """Photos below which the pairs that are not held out do not determine the focal of a photo; by hand."""
     folds: int = 5
-    """Parts of the pairs that are held out in turn (docs/algorithms.md, Self-calibration, 6); by hand."""
+    """Parts of the pairs that are held out in turn (docs/algorithms/zero-curves.md, 6); by hand."""
     explained_share: float = 0.88
     """Share of all votes from which on a camera explains the photos: one camera wins 0.94, ten 0.68."""
     least_gain: float = 0.05

@@ -37,7 +37,7 @@ CalibrateFunction = Callable[[CameraPairs, CalibrationSettings, int], Calibratio
 
 @dataclass(frozen=True, slots=True)
 class SplitOptions:
-    """When photos of one group are of several cameras. Section 6 of Self-calibration in docs/algorithms.md."""
+    """When photos of one group are of several cameras. Section 6 of docs/algorithms/zero-curves.md."""
 
     least_photos: int = 4
     """Photos below which a group is not split: too few to tell which of them disagree; by hand."""

@@ -45,12 +45,12 @@ class PriorOptions:
     """Standard deviation of log f among photos of one folder; chosen on reichstag10 and random scenes."""
     undetermined: float = 0.5
     """A part is undetermined unless the pairs shrink the deviation of its narrow prior below this share.
-    docs/algorithms.md, Self-calibration, 3; by hand."""
+    docs/algorithms/zero-curves.md, 3; by hand."""
     held_factor: float = 1e-3
     """Factor on the prior deviation of an undetermined part, which stays at its usual value; by hand."""
     least_redundancy: float = 0.25
-    """Least share of redundant constraints for freeing more: three pairs fit almost any center. docs/algorithms.md,
-    Self-calibration, 3; by hand."""
+    """Least share of redundant constraints for freeing more: three pairs fit almost any center.
+    docs/algorithms/zero-curves.md, 3; by hand."""
     straight: float = 1e-6
     """Deviation of k1, and share of distorted photos, without a lens: practically zero; by hand."""
 

@@ -53,7 +53,7 @@ METHOD = "zero-curves"
 
 @dataclass(frozen=True, slots=True)
 class ZeroCurveOptions:
-    """Choice of pairs, and agreement of consensus and matches. Sections of Self-calibration in docs/algorithms.md."""
+    """Choice of pairs, and agreement of consensus and matches. Sections of docs/algorithms/zero-curves.md."""
 
     few_pairs: int = 3
     """Pairs up to which almost any center fits: without matches the center is held as for uncropped photos; by hand."""

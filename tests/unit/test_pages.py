@@ -25,7 +25,11 @@ from sfm_app.settings import QUALITY_PRESETS, EpipolarSettings, MatchSettings, S
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
 ROOT = Path(__file__).parents[2]
-LIBRARIES = [path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "docs" / "libraries").glob("*.md"))]
+ABOUT_MODULES = [
+    path.relative_to(ROOT).as_posix()
+    for folder in ("algorithms", "libraries")
+    for path in sorted((ROOT / "docs" / folder).glob("*.md"))
+]
 PAGES = ["README.md"] + [
     page
     for path in sorted((ROOT / "docs").rglob("*.md"))
@@ -91,7 +95,7 @@ def modules_named_on(page):
     return re.findall(rf"`((?:{packages})(?:(?:/\w+)+(?:\.\w+)?|\.\w+\.\w+))`", read(page))
 
 
-@pytest.mark.parametrize("page", ["CONTRIBUTING.md", *LIBRARIES])
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", *ABOUT_MODULES])
 def test_modules_that_are_named_exist(page):
     for name in modules_named_on(page):
         pkgutil.resolve_name(f"sfm_app.{name.removesuffix('.py').replace('/', '.')}")

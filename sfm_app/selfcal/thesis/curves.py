@@ -14,7 +14,7 @@ from sfm_app.types.arrays import FloatArray
 
 VANISHED = 1e-12
 """A polynomial is zero when it is this small beside the terms whose difference it is. Double precision leaves 1e-16;
-the margin was chosen by hand (docs/algorithms.md, The thesis's methods)."""
+the margin was chosen by hand (docs/algorithms/self-calibration.md)."""
 
 
 def focal_polynomials(pairs: Pairs, fx: FloatArray, center: tuple[float, float]) -> FloatArray:

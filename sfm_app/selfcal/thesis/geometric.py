@@ -16,7 +16,7 @@ from sfm_app.types.arrays import FloatArray
 
 METHOD = "geometric"
 LEAST_RESIDUAL_PX = 1e-3
-"""Least residual: it bounds the weight of exact matches. docs/algorithms.md, The thesis's methods; by hand."""
+"""Least residual: it bounds the weight of exact matches. docs/algorithms/self-calibration.md; by hand."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:

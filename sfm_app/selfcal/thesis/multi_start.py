@@ -19,8 +19,8 @@ SAMPLE = 3
 CONFIDENCE = 0.95
 """Probability that any one triple is drawn (thesis 5.6.3)."""
 MOST_STARTS = 4000
-"""MaxIter grows with the cube of the number of pairs; from 22 pairs on this is the limit (docs/algorithms.md, The
-thesis's methods); by hand."""
+"""MaxIter grows with the cube of the number of pairs; from 22 pairs on this is the limit
+(docs/algorithms/self-calibration.md); by hand."""
 FOCAL_RANGE = (0.1, 3.0)
 """Focals that count, in image widths: thesis (5.29) ends at 3. The lower end was chosen by hand."""
 USUAL_FOCAL = (1.0, 0.5)

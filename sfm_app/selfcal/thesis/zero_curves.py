@@ -16,10 +16,10 @@ from sfm_app.types.arrays import FloatArray
 # The point where most zero curves meet, or the points, where several cameras took the photos (thesis 5.8.4).
 
 SEPARATION = 1.25
-"""Peaks with focals sqrt(fx fy) within this factor are one. docs/algorithms.md, The thesis's methods; by hand."""
+"""Peaks with focals sqrt(fx fy) within this factor are one. docs/algorithms/self-calibration.md; by hand."""
 LEAST_SHARE = 0.5
 """A peak has at least this share of the highest one's support; accidental meeting points mostly have less.
-docs/algorithms.md, The thesis's methods; by hand."""
+docs/algorithms/self-calibration.md; by hand."""
 
 
 class Meeting(NamedTuple):
