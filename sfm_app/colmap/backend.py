@@ -166,7 +166,9 @@ def has_running_call() -> bool:
     return any(thread.name == THREAD_NAME for thread in threading.enumerate())
 
 
-def run_interruptible(call: Callable[[pycolmap.CancellationToken], None], poll: Callable[[], None]) -> None:
+def run_interruptible(
+    call: Callable[[pycolmap.CancellationToken], Result], poll: Callable[[], None] = lambda: None
+) -> Result:
     """Run a long COLMAP call in a thread, so that Ctrl-C cancels its token; `poll` is called twice a second."""
     token = pycolmap.CancellationToken()
     with ThreadPoolExecutor(1, thread_name_prefix="colmap") as thread:

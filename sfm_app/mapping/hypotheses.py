@@ -22,6 +22,7 @@ from sfm_app.mapping.attempt import (
     NoModel,
     are_many_unregistered,
     choice_reason,
+    doubt,
     explained_pairs,
     support,
 )
@@ -48,8 +49,6 @@ class HypothesisOptions:
     """Share of unregistered photos above which other focals are tried. Chosen by hand."""
     max_photos_for_focals: int = 60
     """Photos above which no other focals are tried. Chosen by hand."""
-    min_contradicted_share: float = 0.05
-    """Share of contradicting inliers of F above which a rival is tried; right models have 0.1 to 3 %. Measured."""
     min_photos: int = 5
     """With fewer photos, a camera per photo fits almost anything. Chosen by hand."""
     max_photos: int = 100
@@ -197,16 +196,7 @@ def _without_false_joins(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
 
 def rival_reason(model: Attempt | None, evidence: Evidence) -> str:
     """Return why a rival is worth trying, given the main model; empty where the evidence is good."""
-    if model is None:
-        return "no photo is registered"
-    cameras = evidence.intrinsics.cameras
-    if not all(cameras[name].is_estimated for name in map(evidence.camera_name, evidence.matches.images)):
-        return "the pairs do not determine a camera"
-    connected = photos_with_geometry(evidence)
-    if are_many_unregistered(len(connected) - model.photos, len(connected)):
-        return f"unregistered photos with matches: {len(connected) - model.photos}"
-    share = _contradicted_share(model)
-    return f"{100 * share:.0f} % of the matches contradict the model" if share > OPTIONS.min_contradicted_share else ""
+    return "no photo is registered" if model is None else doubt(model, len(photos_with_geometry(evidence)), evidence)
 
 
 def photos_with_geometry(evidence: Evidence) -> set[int]:
@@ -224,7 +214,7 @@ def _map_rival(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
     others = [model for model in best.models if taken.isdisjoint(posed_photo_ids(model.model))]
     models = tuple(sorted((*parts, *others), key=lambda attempt: (-attempt.photos, -attempt.support)))
     both = [attempt for attempt in (best.main, rival) if attempt is not None]
-    reason = choice_reason(rival, both, len(best.evidence.matches.images))
+    reason = choice_reason(rival, both)
     graph = mapper.with_poses_of(models, best)
     yield replace(best, models=models, graph=graph, notes=(rival.note,), reason=reason, trials=())
 
@@ -261,7 +251,7 @@ def _shared_camera_reason(best: Outcome, mapper: Mapper) -> str:
     photos = max(best.photos, len(photos_with_geometry(best.trusted)))
     if not OPTIONS.min_photos <= photos <= OPTIONS.max_photos or _camera_per_photo(best) is None:
         return ""
-    is_contradicted = _contradicted_share(best.main) > MAPPING.max_contradicted_share
+    is_contradicted = best.main.contradicted_share > MAPPING.guessed_contradicted_share
     return "a shared camera does not fit" if is_contradicted or _focal_reason(best, mapper) else ""
 
 
@@ -298,11 +288,6 @@ def _camera_per_photo(best: Outcome) -> Intrinsics | None:
 def _free_names(name: str, taken: Collection[str]) -> Iterable[str]:
     """Return the name itself, then numbered variants of it that are not taken."""
     return chain([name], (other for number in count(2) if (other := f"{name} #{number}") not in taken))
-
-
-def _contradicted_share(model: Attempt) -> float:
-    inliers = sum(pair.inliers for pair in model.explained.values())
-    return sum(pair.contradicted for pair in model.explained.values()) / max(inliers, 1)
 
 
 # Two cameras instead of one per photo.

@@ -143,17 +143,15 @@ def _place(start: Reconstruction, group: Group, run: RunContext) -> Reconstructi
     unplaced = len(set(group.photos).difference(placed))
     if not unplaced:
         return submodel(start, placed)
-    models = list[Reconstruction | None]()
     run.progress.start("mapping", unplaced)
     try:
         with translate_errors("mapping photos"):
-            run_interruptible(lambda token: models.append(_extend(start, group, run, token)), lambda: None)
+            return run_interruptible(lambda token: _extend(start, group, run, token))
     except BackendError as err:  # all photos are mapped again
         logger.info("the earlier model could not be extended: %s", err)
         return None
     finally:
         run.progress.finish()
-    return models[0]
 
 
 def _extend(start: Reconstruction, group: Group, run: RunContext, token: CancellationToken) -> Reconstruction | None:

@@ -108,7 +108,7 @@ def map_in_parts(
         return [NoModel(MAPPER, f"in {len(parts)} parts: failed, {error_reason(err)}")], ()
     best = best_attempt(attempts)
     if best is not None and best.photos < photos:
-        attempts += [replace(one, mapper=MAPPER) for one in complete_attempt(group, best, run)]
+        attempts.append(replace(complete_attempt(group, best, run), mapper=MAPPER))
     run.record(parts=[*run.statistics.get("parts", []), part_figures(group, joined, attempts)])
     remove_parts(run)
     return attempts, ()

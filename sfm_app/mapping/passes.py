@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cache
 
 from sfm_app.camera.models import GUESSED_FOCAL, guessed_camera_matrix
-from sfm_app.colmap.backend import Reconstruction, run_interruptible, translate_errors
+from sfm_app.colmap.backend import run_interruptible, translate_errors
 from sfm_app.colmap.database import keep_raw_matches, write_calibrations, write_pose_graph
 from sfm_app.colmap.mapping import copy_database, map_with_colmap_defaults
 from sfm_app.colmap.model import posed_photo_ids
@@ -134,20 +134,18 @@ RIVAL, RIVAL_FOLDER, RIVAL_NOTE = "colmap", "rival", "COLMAP's default pipeline"
 def map_rival(evidence: Evidence, run: RunContext) -> Attempt | NoModel:
     """Map the same matches with COLMAP's default pipeline and stated focals, and score the model like any other."""
     scratch = run.workspace.root / RIVAL_FOLDER
-    models: list[Reconstruction | None] = []
     try:
         with translate_errors("mapping photos with COLMAP's defaults"):
             copy_database(run.workspace.database, scratch)
             write_calibrations(scratch / "database.db", evidence.matches, guessed_intrinsics(evidence.intrinsics))
             keep_raw_matches(scratch / "database.db", evidence.matches.matches)
-            run_interruptible(
-                lambda token: models.append(map_with_colmap_defaults(run.workspace.photos, scratch, run.seed, token)),
-                lambda: None,
+            model = run_interruptible(
+                lambda token: map_with_colmap_defaults(run.workspace.photos, scratch, run.seed, token)
             )
     except BackendError as err:  # our own model is not lost with it
         logger.info("the rival failed: %s", err)
         return NoModel(RIVAL, f"{RIVAL_NOTE}: failed, {err}")
-    return judge_model(evidence, RIVAL, RIVAL_NOTE, models[0], run)
+    return judge_model(evidence, RIVAL, RIVAL_NOTE, model, run)
 
 
 def guessed_intrinsics(intrinsics: Intrinsics, sides: float = GUESSED_FOCAL) -> Intrinsics:
@@ -206,7 +204,7 @@ class Mapper:
             notes += [attempt.note for attempt in attempts]
             best = best_attempt(attempts)
             if best is not None:
-                reasons[best.note] = choice_reason(best, attempts, len(photos))
+                reasons[best.note] = choice_reason(best, attempts)
                 parts = split_attempt(best)
                 models += parts
                 if len(parts) > 1:

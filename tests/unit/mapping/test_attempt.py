@@ -1,6 +1,5 @@
 """Seeds, support, reasons, and the mappers of one group."""
 
-import threading
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -13,6 +12,7 @@ from sfm_app.errors import BackendError
 from sfm_app.geometry.epipolar import eight_point
 from sfm_app.mapping import attempt as module
 from sfm_app.mapping.attempt import (
+    NOT_NEEDED,
     Attempt,
     ColmapMappers,
     Group,
@@ -24,7 +24,6 @@ from sfm_app.mapping.attempt import (
     choice_reason,
     coverage,
     explained_pairs,
-    likely_needs_one_mapper,
     map_group,
     model_poses,
     pairs_to_map,
@@ -393,26 +392,25 @@ def test_what_gave_no_model_is_never_better():
 
 
 COUNT = 10
+ENOUGH = "it explains enough: {} % of the matches contradict it"
 
 
 @pytest.fixture
 def try_out(run, cameras):
-    """What is tried on ten photos in a chain when mappers place so many photos; runs the two side by side.
+    """What is tried on ten photos in a chain when mappers place so many photos.
 
-    Seeds are the pairs (1, 2), (2, 3), ... in this order; `grown` says what becomes of each. A mapper that is `late`
-    waits until the other one is done.
+    Seeds are the pairs (1, 2), (2, 3), ... in this order; `grown` says what becomes of each.
     """
 
     def make(
         grown,
         at_once=None,
-        late="",
         count=COUNT,
         points=500,
         contradicted=0,
         completed=0,
         settled=False,
-        sure=False,
+        guess=False,
         **scene,
     ):
         images = {key: MatchedImage(key, f"{key}.jpg", "one", 1024, 768) for key in range(1, count + 1)}
@@ -424,15 +422,14 @@ def try_out(run, cameras):
             for key in range(1, count)
         }
         matches = MatchGraph(images, keypoints, dict.fromkeys(poses, rows))
-        evidence = Evidence(matches, ViewGraph({}, {}), cameras(spread={"fx": 1.0} if sure else {}))
+        evidence = Evidence(
+            matches, ViewGraph({}, {}), cameras(identifiable=not guess, method="guess" if guess else "zero-curves")
+        )
         group = Group(tuple(images), evidence, PoseGraph(poses, {}, ()))
-        done, calls = {"global": threading.Event(), "incremental": threading.Event()}, []
+        calls = []
 
         def finish(mapper, result):
-            if mapper == late:
-                assert done[{"global": "incremental", "incremental": "global"}[mapper]].wait(10)
             calls.append(mapper)
-            done[mapper].set()
             return result
 
         def grow(database, photo_dir, start, scratch, options, tick, token):
@@ -466,66 +463,43 @@ def summary(found):
 
 @pytest.mark.slow
 def test_both_mappers_are_tried_and_one_good_model_is_enough(try_out):
-    found, _ = try_out([9, 10], at_once=3)
-    assert summary(found) == [("incremental", 9), ("global", 3)]
+    found, calls = try_out([9, 10], at_once=3)
+    assert summary(found) == [("incremental", 9), ("global", 3)] and calls == ["incremental", "global"]
     assert [attempt.note for attempt in found] == ["from 1.jpg + 2.jpg: 9 photos", "all at once: 3 photos"]
     assert found[0].support == 50 and found[0].model.num_reg_images() == 9
 
 
 @pytest.mark.slow
-def test_where_it_is_easy_the_other_mapper_begins_only_if_it_is_needed(try_out):
-    found, calls = try_out([10], at_once=10, sure=True)
+def test_a_flawless_model_makes_the_other_mapper_needless(try_out):
+    found, calls = try_out([10], at_once=10)
     assert summary(found) == [("incremental", 10), ("global", 0)] and calls == ["incremental"]
-    found, calls = try_out([9], at_once=10, sure=True)
-    assert summary(found) == [("incremental", 9), ("global", 10)] and calls == ["incremental", "global"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("deviation", "dropped", "easy"), [(1.0, 0, True), (1.0, 5, True), (1.0, 6, False), (50.0, 0, False)]
-)
-def test_it_is_easy_with_known_cameras_and_few_contradictions(cameras, deviation, dropped, easy):
-    images = {key: MatchedImage(key, f"{key}.jpg", "one", 1024, 768) for key in range(1, 102)}
-    pose = RelativePose(np.eye(3), np.eye(3)[0], np.ones(40, np.bool_), 20.0, 1.0)
-    pairs = [(key, key + 1) for key in range(1, 101)]
-    graph = PoseGraph(dict.fromkeys(pairs[dropped:], pose), dict.fromkeys(pairs[:dropped], ""), ())
-    known = cameras()
-    sure = {name: replace(one, spread={"fx": deviation}) for name, one in known.cameras.items()}
-    evidence = Evidence(MatchGraph(images, {}, {}), ViewGraph({}, {}), replace(known, cameras=sure))
-    assert likely_needs_one_mapper(Group(tuple(images), evidence, graph)) is easy
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("late", ["global", "incremental"])
-def test_a_flawless_model_makes_the_other_one_needless_whether_or_not_it_is_there(try_out, late):
-    found, _ = try_out([10], at_once=10 if late == "incremental" else None)
-    assert summary(found) == [("incremental", 10), ("global", 0)]
     assert found[1].note == "all at once: not needed"
 
 
 @pytest.mark.slow
-def test_a_model_of_all_photos_that_matches_contradict_is_not_flawless(try_out):
-    assert summary(try_out([10], at_once=10, contradicted=2)[0]) == [("incremental", 10), ("global", 10)]
-    assert summary(try_out([10], at_once=10, contradicted=1)[0]) == [("incremental", 10), ("global", 0)]
+@pytest.mark.parametrize(("guess", "contradicted", "flawless"), [
+    (False, 10, True), (False, 11, False), (True, 1, True), (True, 2, False),
+])  # fmt: skip
+def test_a_model_of_all_photos_that_matches_contradict_is_not_flawless(try_out, guess, contradicted, flawless):
+    found, _ = try_out([10], at_once=10, contradicted=contradicted, guess=guess)
+    assert summary(found) == [("incremental", 10), ("global", 0 if flawless else 10)]
 
 
 @pytest.mark.slow
 def test_a_contradicted_model_that_says_enough_makes_the_other_one_needless(try_out):
-    found, _ = try_out([10], at_once=10, contradicted=2, settled=True)
+    found, _ = try_out([10], at_once=10, contradicted=20, settled=True)
     assert summary(found) == [("incremental", 10), ("global", 0)]
-    assert found[1].note == "all at once: not needed"
 
 
 @pytest.mark.slow
 def test_why_a_model_was_taken_is_said():
     best, rival, nothing = attempt(10, 1000), attempt(9, 900), NoModel("global", "")
     contradicted = Attempt("global", model(10), {(0, 1): PairSupport(90, 100, 10)}, "")
-    assert choice_reason(best, [best, nothing], 10) == "it registers all 10 photos, and almost no match contradicts it"
-    assert choice_reason(contradicted, [contradicted, nothing], 10) == "no other attempt gave a model"
-    assert choice_reason(contradicted, [contradicted], 10) == "it explains enough; no other model was needed"
-    assert (
-        choice_reason(best, [rival, best], 11) == "it explains 2000 matches with 10 photos, the second best 1800 with 9"
-    )
+    assert choice_reason(best, [best, NoModel("global", NOT_NEEDED)]) == ENOUGH.format("0.0")
+    assert choice_reason(contradicted, [contradicted, nothing]) == "no other attempt gave a model"
+    assert choice_reason(contradicted, [contradicted]) == ENOUGH.format("10.0")
+    more = "it explains 2000 matches with 10 photos, the second best 1800 with 9"
+    assert choice_reason(best, [rival, best]) == more
 
 
 @pytest.mark.slow
@@ -551,14 +525,6 @@ def test_a_global_mapper_that_fails_leaves_the_other_model(try_out):
 def test_seeds_are_tried_until_one_grows(try_out, grown, at_once, counts):
     found, _ = try_out(grown, at_once, max_init_pairs=5)
     assert [placed(attempt) for attempt in found] == counts
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("late", ["global", "incremental"])
-def test_it_does_not_matter_which_mapper_is_done_first(try_out, late):
-    found, calls = try_out([4, 7, 7, 7], at_once=4, late=late)
-    assert calls[:2] == (["incremental", "global"] if late == "global" else ["global", "incremental"])
-    assert summary(found) == [("incremental", 4), ("global", 4), ("incremental", 7), ("incremental", 7)]
 
 
 @pytest.mark.slow
