@@ -130,7 +130,8 @@ class CalibrationSettings(Section):
 
 HypothesisName = Literal[
     "false-joins", "colmap-defaults", "other-focals", "camera-per-photo", "two-cameras", "learned-cameras",
-    "merged-models", "finer-features", "mapped-anew",
+    "merged-models", "finer-features", "mapped-anew", "look-alikes", "global-mapper", "splits", "lens-families",
+    "rolling-shutter",
 ]  # fmt: skip
 HYPOTHESES: Mapping[HypothesisName, str] = {
     "false-joins": "leaving out the ambiguous pairs",
@@ -142,8 +143,14 @@ HYPOTHESES: Mapping[HypothesisName, str] = {
     "merged-models": "merging models",
     "finer-features": "finer features for unplaced photos",
     "mapped-anew": "mapping all photos again",
+    "look-alikes": "leaving out pairs of look-alikes",
+    "global-mapper": "COLMAP's global mapper",
+    "splits": "splitting a model whose parts contradict each other",
+    "lens-families": "other lens models",
+    "rolling-shutter": "a rolling shutter",
 }
-"""Hypotheses about the photos, see `mapping.hypotheses`, in words for people."""
+"""Hypotheses about the photos in words for people; up to "mapped-anew" those of `mapping.hypotheses`, the others within
+a pass or after the last."""
 
 
 class SceneSettings(Section):
@@ -179,6 +186,10 @@ class SceneSettings(Section):
     photo_rotation_deg: Literal["auto", 0, 90, 180, 270] = Field(
         "auto", description="clockwise rotation that makes most photos upright, in degrees"
     )
+
+    def tries(self, hypothesis: HypothesisName) -> bool:
+        """Return whether a hypothesis is not switched off."""
+        return hypothesis not in self.without
 
     @field_validator("without", mode="before")
     @classmethod

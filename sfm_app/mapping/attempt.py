@@ -328,7 +328,7 @@ def map_group(
     neither places most photos, the next seeds follow. `is_sufficient` accepts a doubtful incremental model.
     """
     options, mapper, photos = run.settings.scene, _GroupMapper(group, run, colmap), len(group.photos)
-    with_global = options.mapper != "incremental" and photos >= MAPPING.min_photos
+    with_global = options.mapper != "incremental" and options.tries("global-mapper") and photos >= MAPPING.min_photos
     seeds = rank_seeds(group, options.min_seed_angle_deg)
     seeds = seeds[: options.max_init_pairs] if options.mapper != "global" or not with_global else []
     with translate_errors("mapping photos"):

@@ -96,7 +96,7 @@ def improve(best: Outcome, mapper: Mapper, hypotheses: Iterable[Hypothesis]) -> 
     """Try hypotheses in turn, each as long as it is accepted; return the outcome that explains most."""
     options = mapper.run.settings.scene
     for hypothesis in hypotheses:
-        if hypothesis.name in options.without:
+        if not options.tries(hypothesis.name):
             continue
         for _ in range(hypothesis.repeats):
             reason = hypothesis.reason(best, mapper)
@@ -209,7 +209,7 @@ def _map_rival(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
     if isinstance(rival, NoModel):
         yield replace(best, models=(), notes=(rival.note,), reason="", trials=())
         return
-    parts = split_attempt(rival)
+    parts = split_attempt(rival, mapper.run)
     taken = {photo for part in parts for photo in posed_photo_ids(part.model)}
     others = [model for model in best.models if taken.isdisjoint(posed_photo_ids(model.model))]
     models = tuple(sorted((*parts, *others), key=lambda attempt: (-attempt.photos, -attempt.support)))

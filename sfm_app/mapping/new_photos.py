@@ -42,7 +42,7 @@ from sfm_app.mapping.look_alikes import joined_pairs, judge_places
 from sfm_app.mapping.passes import MAPPERS, Mapper, Outcome, write_graph
 from sfm_app.mapping.split_and_merge import split_attempt
 from sfm_app.matching.pairs import find_same_matches
-from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
+from sfm_app.posegraph import build_pose_graph
 from sfm_app.runtime.context import Earlier, RunContext
 from sfm_app.types import Evidence, Intrinsics, LookAlikes, MatchGraph, PoseGraph, ViewGraph
 
@@ -102,8 +102,7 @@ def _grow(evidence: Evidence, run: RunContext, earlier: Earlier, steps: Steps) -
         return None, f"the earlier model holds only {len(placed)} of {len(matches.images)} photos"
     epipolar = run.settings.epipolar
     known = model_poses(start, matches, epipolar.max_error_px, epipolar.min_inliers)
-    options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, run.seed)
-    graph = steps.build_pose_graph(evidence, options, run.map, known)
+    graph = steps.build_pose_graph(evidence, Mapper(run).pose_options, run.map, known)
     write_graph(graph, evidence, run)
     trusted = evidence.without(joined_pairs(graph.look_alikes))
     connected = max(graph.groups, key=lambda photos: len(set(photos).intersection(placed)), default=())
@@ -121,12 +120,14 @@ def _grow(evidence: Evidence, run: RunContext, earlier: Earlier, steps: Steps) -
     others = _map_others(graph, {*now, *connected}, trusted, run)
     reason = f"{how}, and {len(unplaced & now)} of {len(unplaced)} others were registered"
     outcome = Outcome((attempt, *others), graph, evidence, evidence.intrinsics, run, (attempt.note,), reason)
-    return outcome, _doubt(attempt, placed, before, trusted, steps)
+    return outcome, _doubt(attempt, placed, before, trusted, run, steps)
 
 
-def _doubt(attempt: Attempt, placed: Collection[int], before: float, evidence: Evidence, steps: Steps) -> str:
+def _doubt(
+    attempt: Attempt, placed: Collection[int], before: float, evidence: Evidence, run: RunContext, steps: Steps
+) -> str:
     """Return why a model grown from photos `placed`, with the support `before`, is unreliable; empty if it is not."""
-    parts = split_attempt(attempt)
+    parts = split_attempt(attempt, run)
     if len(parts) != 1 or parts[0].photos != attempt.photos:
         return "matches contradict the joins of its parts"
     inside = set(placed)
@@ -169,5 +170,5 @@ def _map_others(graph: PoseGraph, taken: Collection[int], evidence: Evidence, ru
     for photos in graph.groups:
         if len(photos) >= MAPPING.min_photos and not set(photos).intersection(taken):
             best = best_attempt(map_group(Group(photos, evidence, graph), run))
-            models += split_attempt(best) if best is not None else []
+            models += split_attempt(best, run) if best is not None else []
     return sorted(models, key=lambda attempt: (-attempt.photos, -attempt.support))

@@ -205,7 +205,7 @@ class Mapper:
             best = best_attempt(attempts)
             if best is not None:
                 reasons[best.note] = choice_reason(best, attempts)
-                parts = split_attempt(best)
+                parts = split_attempt(best, self.run)
                 models += parts
                 if len(parts) > 1:
                     cuts += [", ".join(evidence.matches.names(sorted(posed_photo_ids(one.model)))) for one in parts]
@@ -240,7 +240,8 @@ class Mapper:
     def pose_options(self) -> PoseGraphOptions:
         """Options of relative poses."""
         epipolar = self.run.settings.epipolar
-        return PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, self.run.seed)
+        look_alikes = self.run.settings.scene.tries("look-alikes")
+        return PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, self.run.seed, look_alikes)
 
     def with_poses_of(self, models: Sequence[Attempt], outcome: Outcome) -> PoseGraph:
         """Return the pose graph with poses from other models, whose tracks later steps complete along its pairs."""

@@ -74,8 +74,10 @@ def sound_parts(explained: Mapping[PairId, PairSupport], photos: Iterable[int]) 
     return sorted(parts, key=lambda members: (-len(members), members))
 
 
-def split_attempt(attempt: Attempt) -> list[Attempt]:
+def split_attempt(attempt: Attempt, run: RunContext) -> list[Attempt]:
     """Divide a model where more matches contradict than support its joins; small parts are left out."""
+    if not run.settings.scene.tries("splits"):
+        return [attempt]
     parts = sound_parts(attempt.explained, posed_photo_ids(attempt.model))
     if len(parts) == 1:
         return [attempt]

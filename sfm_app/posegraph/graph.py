@@ -153,6 +153,8 @@ class PoseGraphOptions:
     min_inliers: int
     """A pair with fewer is dropped."""
     seed: int
+    look_alikes: bool = True
+    """Whether pairs of look-alikes are left out."""
 
 
 def build_pose_graph(
@@ -166,7 +168,7 @@ def build_pose_graph(
     poses, dropped = _split_plausible(estimates, options.min_inliers)
     poses |= known
     cameras = {photo: evidence.camera(photo) for photo in matches.images}
-    look_alikes = find_look_alikes(matches, poses, cameras)
+    look_alikes = find_look_alikes(matches, poses if options.look_alikes else {}, cameras)
     _drop_pairs([pair for join in look_alikes.joins for pair in join.pairs], LOOKS_ALIKE, poses, dropped)
     estimator.rotations, angles = average_pair_rotations(
         poses, {pair for pair, fit in views.fits.items() if fit.degeneracy}

@@ -57,11 +57,16 @@ def _adjust_models(
     """Return the adjusted models, and the manifest's entry about the rolling shutter of the first, if it has one."""
     database, family = outcome.run.workspace.database, run.settings.scene.camera_model
     rules = [camera_rules(attempt.model, names, outcome.calibrated, family) for attempt in outcome.models]
+    tries = run.settings.scene.tries
     with run.step("adjusting all cameras"):
         adjusted = [
-            adjust_or_keep(attempt.model, database, rule, families_known=attempt.mapper == GROWN)
+            adjust_or_keep(
+                attempt.model, database, rule, families_known=attempt.mapper == GROWN or not tries("lens-families")
+            )
             for attempt, rule in zip(outcome.models, rules, strict=True)
         ]
+    if not tries("rolling-shutter"):
+        return adjusted, {}
     followed = [
         follow_shutter(one, outcome.evidence.matches, database, run.progress, rule)
         for one, rule in zip(adjusted, rules, strict=True)

@@ -470,6 +470,12 @@ def test_both_mappers_are_tried_and_one_good_model_is_enough(try_out):
 
 
 @pytest.mark.slow
+def test_the_global_mapper_can_be_switched_off(try_out):
+    found, calls = try_out([9], at_once=10, without=["global-mapper"])
+    assert summary(found) == [("incremental", 9)] and calls == ["incremental"]
+
+
+@pytest.mark.slow
 def test_a_flawless_model_makes_the_other_mapper_needless(try_out):
     found, calls = try_out([10], at_once=10)
     assert summary(found) == [("incremental", 10), ("global", 0)] and calls == ["incremental"]

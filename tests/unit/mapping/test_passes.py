@@ -90,24 +90,25 @@ def test_the_usual_guess_replaces_no_given_camera(cameras):
     assert [camera.method for camera in told] == ["given", "guess"]
 
 
-def test_a_model_whose_join_is_contradicted_gives_its_parts(synthetic):
+def test_a_model_whose_join_is_contradicted_gives_its_parts(synthetic, run):
     attempt = Attempt("global", synthetic.copy(), joined(GOOD, AGAINST), "how")
-    first, second = split_attempt(attempt)
+    first, second = split_attempt(attempt, run())
     assert [posed_photo_ids(part.model) for part in (first, second)] == [[1, 2, 3], [4, 5, 6]]
     assert set(first.explained) == {(1, 2), (1, 3), (2, 3)} and set(second.explained) == {(4, 5), (4, 6), (5, 6)}
     assert (first.mapper, first.note) == ("global", "how")
     assert attempt.photos == 6  # the model itself is as it was
+    assert split_attempt(attempt, run(without=["splits"])) == [attempt]
     assert 90 < first.model.num_points3D() <= 100
 
 
-def test_a_model_whose_join_holds_stays_as_it_is(synthetic):
+def test_a_model_whose_join_holds_stays_as_it_is(synthetic, run):
     attempt = Attempt("global", synthetic.copy(), joined(GOOD, FOR), "how")
-    assert split_attempt(attempt) == [attempt]
+    assert split_attempt(attempt, run()) == [attempt]
 
 
-def test_lonely_photos_and_lesser_pairs_are_left_out(synthetic):
+def test_lonely_photos_and_lesser_pairs_are_left_out(synthetic, run):
     pairs = {(1, 2): GOOD, (1, 3): GOOD, (4, 5): GOOD}
-    [part] = split_attempt(Attempt("global", synthetic.copy(), pairs, "how"))
+    [part] = split_attempt(Attempt("global", synthetic.copy(), pairs, "how"), run())
     assert posed_photo_ids(part.model) == [1, 2, 3]
 
 
