@@ -27,7 +27,7 @@ from sfm_app.synthetic.compare import (
     surface_coverage,
     surface_error,
 )
-from sfm_app.synthetic.photo_folder import Truth, add_missing_photos, load_truth, save_truth
+from sfm_app.synthetic.photo_folder import Truth, load_truth, save_truth, write_photo_folder
 from sfm_app.synthetic.render import comparison_image
 from sfm_app.synthetic.scenes import courtyard, statue, statue_views
 from sfm_app.synthetic.shapes import SyntheticScene
@@ -125,7 +125,7 @@ def render_photos(
     truth = Truth(dict(views.cameras), dict(views.cam_from_world), built.vertices, built.faces)
     out.mkdir(parents=True, exist_ok=True)
     save_truth(truth, out)  # first: it identifies the photos of a killed demo
-    return add_missing_photos(photos, built, views, processes=worker_count(settings.workers), progress=progress)
+    return write_photo_folder(photos, built, views, processes=worker_count(settings.workers), progress=progress)
 
 
 def _is_of(truth: Truth, views: Views) -> bool:
