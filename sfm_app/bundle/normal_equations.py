@@ -59,20 +59,10 @@ def whiten_points(by_point: FloatArray, point: NDArray[np.int64], points: int) -
             H[:, i, j] = np.bincount(point, products[:, i, j], points)
     diagonal = np.einsum("pii->pi", H)
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    unit = H / (scale[:, :, None] * scale[:, None, :])
-    # the pivots of the Cholesky decomposition
-    second = unit[:, 1, 1] - unit[:, 1, 0] ** 2
-    across = unit[:, 2, 1] - unit[:, 2, 0] * unit[:, 1, 0]
-    third = unit[:, 2, 2] - unit[:, 2, 0] ** 2 - across**2 / np.maximum(second, REDUCTION.min_information)
-    fixed = (unit[:, 0, 0] > 0.0) & (second > REDUCTION.min_information) & (third > REDUCTION.min_information)
-    W, rank = np.zeros((points, 3, 3)), np.full(points, 3)
-    W[fixed] = np.linalg.inv(np.linalg.cholesky(H[fixed]))
-    values, vectors = np.linalg.eigh(unit[~fixed])
+    values, vectors = np.linalg.eigh(H / (scale[:, :, None] * scale[:, None, :]))
     determined = values > REDUCTION.min_information
     gains = np.where(determined, np.where(determined, values, 1.0) ** -0.5, 0.0)
-    W[~fixed] = gains[:, :, None] * vectors.transpose(0, 2, 1) / scale[~fixed, None, :]
-    rank[~fixed] = np.count_nonzero(determined, axis=1)
-    return W, rank
+    return gains[:, :, None] * vectors.transpose(0, 2, 1) / scale[:, None, :], np.count_nonzero(determined, axis=1)
 
 
 def free_pose_columns(R: FloatArray, t: FloatArray) -> NDArray[np.int64]:

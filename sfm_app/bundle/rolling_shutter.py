@@ -28,7 +28,7 @@ from sfm_app.bundle.normal_equations import (
 from sfm_app.camera.projection import CAMERA, FX, FY, project_points
 from sfm_app.geometry.least_squares import inverse_of_positive
 from sfm_app.numerical import MAD_TO_SIGMA
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import FloatArray
 
 # Projection of points into photos whose rows are read one after the other. Ours; to first order in the motion of
 # the camera, the model is that of Hedborg et al. 2012.
@@ -185,22 +185,6 @@ class ShutterBundle:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ShutterSystem:
-    """Normal equations S x = g of the unknowns besides the points."""
-
-    S: FloatArray
-    g: FloatArray
-    observed: Linearized
-    photo: IndexArray
-    """(N,) of each observation."""
-    free: IndexArray
-    offsets: slice
-    """Which unknowns are offsets."""
-    redundancy: int
-    """Number of measurements less that of poses and points."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class ShutterStep:
     """Solution of the normal equations."""
 
@@ -215,10 +199,10 @@ class ShutterStep:
     """(I, 6) of the offsets, without MISFIT."""
 
 
-def shutter_system(
+def shutter_step(
     model: ShutterBundle, precision: FloatArray, pull: FloatArray, scale_px: float, *, held: bool
-) -> ShutterSystem:
-    """Eliminate the points (Schur complement), in the Gauss-Newton approximation.
+) -> ShutterStep:
+    """Return a step of Gauss and Newton; the deviation is at least that of the sandwich estimator, photos as clusters.
 
     `precision` (n,) is of the priors on the unknowns, in 1 / px^2; `pull` (n,) is precisions times distances to their
     means; `held` tells whether the readout is known.
@@ -237,34 +221,36 @@ def shutter_system(
     blocks = np.column_stack([bundle.photo, photos + bundle.photo, first, first + 1, np.full(len(r), last)])
     usable = usable_mask(bundle, r, projected.depth)
     observed = linearize(bundle, (r, by_view, projected.by_point), blocks, usable, model.unknowns, scale_px)
-    S = observed.eliminate_points().toarray() + np.diag(precision + REDUCTION.damping)
+    return _solve(model, observed, precision, pull, held=held)
+
+
+def _solve(
+    model: ShutterBundle, observed: Linearized, precision: FloatArray, pull: FloatArray, *, held: bool
+) -> ShutterStep:
+    bundle, n, photos = model.bundle, model.unknowns, len(model.bundle.R)
     poses, offsets = free_pose_columns(bundle.R, bundle.t), slice(POSE * photos, (POSE + VELOCITY) * photos)
-    free = np.concatenate([poses, np.arange(offsets.start, BLOCK * last + (not held))])
-    redundancy = 2 * observed.used - int(np.sum(observed.rank)) - len(poses)
+    free = np.concatenate([poses, np.arange(offsets.start, n - BLOCK + (not held))])
+    S = observed.eliminate_points().toarray() + np.diag(precision + REDUCTION.damping)
     g = observed.by_view.T @ observed.drop_points(observed.r) + pull
-    return ShutterSystem(S, g, observed, bundle.photo, free, offsets, redundancy)
-
-
-def solve_step(system: ShutterSystem) -> ShutterStep:
-    """Return the step; the deviation is at least that of the sandwich estimator with photos as clusters."""
-    n, free, observed = len(system.g), system.free, system.observed
-    inverse = inverse_of_positive(system.S[np.ix_(free, free)])
+    inverse = inverse_of_positive(S[np.ix_(free, free)])
     views, influence, variances = np.zeros(n), np.zeros(n), np.zeros(n)
-    views[free] = np.einsum("ij,j->i", inverse, system.g[free])
+    views[free] = np.einsum("ij,j->i", inverse, g[free])
     variances[free] = np.diag(inverse)
-    if free[-1] == n - BLOCK:
+    if not held:
         influence[free] = inverse[:, -1]
     rest = observed.r - observed.by_view @ views
     residue, influences = observed.drop_points(rest), observed.drop_points(observed.by_view @ influence)
-    noise2 = float(
-        (np.sum(residue**2) + REDUCTION.usual_count * REDUCTION.usual_noise_px**2)
-        / (max(system.redundancy, 0) + REDUCTION.usual_count)
-    )
-    by_photo = np.bincount(system.photo, np.sum((influences * residue).reshape(-1, 2), axis=1))
+    redundancy = max(2 * observed.used - int(np.sum(observed.rank)) - len(poses), 0) + REDUCTION.usual_count
+    noise2 = float((np.sum(residue**2) + REDUCTION.usual_count * REDUCTION.usual_noise_px**2) / redundancy)
+    by_photo = np.bincount(bundle.photo, np.sum((influences * residue).reshape(-1, 2), axis=1))
     deviation = MISFIT * np.sqrt(max(noise2 * variances[n - BLOCK], float(np.sum(by_photo**2))))
-    offsets = noise2 * variances[system.offsets].reshape(-1, VELOCITY)
-    points = observed.unwhiten(observed.by_point.T @ rest)
-    return ShutterStep(views, points, float(np.sqrt(noise2)), float(deviation), offsets)
+    return ShutterStep(
+        views,
+        observed.unwhiten(observed.by_point.T @ rest),
+        float(np.sqrt(noise2)),
+        float(deviation),
+        noise2 * variances[offsets].reshape(-1, VELOCITY),
+    )
 
 
 def apply_shutter_step(model: ShutterBundle, step: ShutterStep, share: float) -> ShutterBundle:
@@ -376,7 +362,7 @@ def estimate_readout(
     for _ in range(OPTIONS.steps):
         expected = _expected_offsets(model, problem, shake)
         terms = _prior_terms(model, expected, problem, noise_px)
-        step = solve_step(shutter_system(model, *terms, scale_px, held=problem.held))
+        step = shutter_step(model, *terms, scale_px, held=problem.held)
         noise_px = step.noise_px
         before = _cost(model, expected, problem, noise_px)
         model, after = _take_step(model, step, expected, problem, before)
