@@ -117,19 +117,10 @@ class MetricFrame:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        similarity = self.from_model
-        return {
-            "scale": similarity.scale,
-            "R": similarity.R.tolist(),
-            "t": similarity.t.tolist(),
-            "unit": "meter" if self.is_metric else "arbitrary",
-            "deviation": self.deviation,
-            "source": self.source,
-            "evidence": [asdict(one) for one in self.evidence],
-            "contradictions": list(self.contradictions),
-            "crs": self.crs,
-            "offset": list(self.offset),
-        }
+        values, similarity = asdict(self), self.from_model
+        del values["from_model"]
+        frame = {"scale": similarity.scale, "R": similarity.R.tolist(), "t": similarity.t.tolist()}
+        return frame | {"unit": "meter" if self.is_metric else "arbitrary"} | values
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "MetricFrame":

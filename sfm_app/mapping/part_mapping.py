@@ -356,16 +356,6 @@ FOLDER, STOP = "parts", "stop"
 
 
 @dataclass(frozen=True, slots=True)
-class PartTask:
-    """One part to map: small, since its inputs are files that every worker can read."""
-
-    folder: str
-    """Holds the inputs, and gets the models."""
-    photos: str
-    """Folder with the photos; COLMAP requires it."""
-
-
-@dataclass(frozen=True, slots=True)
 class PartResult:
     """Models of a part."""
 
@@ -384,8 +374,16 @@ def map_parts(
     """Map parts side by side, except those that a killed run has finished; failed ones have no models."""
     place = run.workspace.root / FOLDER
     (place / STOP).unlink(missing_ok=True)
-    members = (part_of_group(group, part.photos) for part in parts)
-    tasks = [_prepare_part(one, mapped, place, run, stop_at_false_joins=stop_at_false_joins) for one in members]
+    tasks: list[MappingTask] = []
+    for part in parts:
+        members = part_of_group(group, part.photos)
+        followed = frozenset(pair for pair in members.graph.poses if pair in mapped.poses)
+        write_inputs(place / INPUTS, PartInputs(members, followed, run.settings, stop_at_false_joins))
+        folder = place / digest_file(place / INPUTS)[:16]
+        folder.mkdir(exist_ok=True)
+        replace_file(place / INPUTS, folder / INPUTS)
+        # small, since its inputs are files that every worker can read
+        tasks.append({"scratch": str(folder), "photos": str(run.workspace.photos), "seed": 0})
     try:
         return run.map(Task(map_part), tasks, f"mapping {len(parts)} parts")
     except BaseException:  # also Ctrl-C: the processes end when they see the file
@@ -393,26 +391,12 @@ def map_parts(
         raise
 
 
-def _prepare_part(
-    members: Group, mapped: PoseGraph, place: Path, run: RunContext, *, stop_at_false_joins: bool
-) -> PartTask:
-    """Write the inputs of a part into a folder named by their digest."""
-    beside = place / INPUTS
-    followed = frozenset(pair for pair in members.graph.poses if pair in mapped.poses)
-    write_inputs(beside, PartInputs(members, followed, run.settings, stop_at_false_joins))
-    folder = place / digest_file(beside)[:16]
-    folder.mkdir(exist_ok=True)
-    replace_file(beside, folder / INPUTS)
-    return PartTask(str(folder), str(run.workspace.photos))
-
-
-def map_part(task: PartTask) -> PartResult:
-    """Map one part in a separate process, and wait for it. Depends on nothing but the task."""
-    folder = Path(task.folder)
+def map_part(task: MappingTask) -> PartResult:
+    """Map the part in the folder `scratch` in a separate process, and wait for it. Depends on nothing but the task."""
+    folder = Path(task["scratch"])
     if not (folder / RESULT).exists():
-        work: MappingTask = {"scratch": task.folder, "photos": task.photos, "seed": 0}
         try:
-            with start_worker("sfm_app.mapping.part_process", work) as process:
+            with start_worker("sfm_app.mapping.part_process", task) as process:
                 while not process.has_ended(0.2):
                     if (folder.parent / STOP).exists():
                         return PartResult((), "", ("stopped",))
