@@ -48,16 +48,6 @@ def test_errors_of_K_are_those_of_the_thesis(photos):
     assert center_error_percent(K, truth) == pytest.approx(5.0)
 
 
-def test_with_several_cameras_K_is_judged_by_its_photo(photos):
-    truth = photos[1]
-    tele = make_camera(120, 80, focal_widths=2.1, center=(0.5, 0.5))
-    mixed = replace(truth, cameras={**truth.cameras, "view_02.jpg": tele})
-    assert focal_error_percent(tele.K, mixed, "view_02.jpg") == center_error_percent(tele.K, mixed, "view_02.jpg") == 0
-    assert focal_error_percent(tele.K, mixed, "view_00.jpg") == pytest.approx(100.0)
-    with pytest.raises(ValueError, match="several cameras"):
-        focal_error_percent(tele.K, mixed)
-
-
 @pytest.mark.parametrize("wrong", [0, 3])
 def test_wrong_photos_do_not_spoil_the_alignment(wrong):
     rng = np.random.default_rng(5)
