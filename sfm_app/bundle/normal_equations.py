@@ -155,8 +155,8 @@ class Linearized:
 
 
 def linearize(
-    bundle: Bundle, projected: tuple[FloatArray, FloatArray, FloatArray], blocks: IndexArray,
-    usable: NDArray[np.bool_], unknowns: int, scale_px: float,
+    bundle: Bundle, projected: tuple[FloatArray, FloatArray, FloatArray], blocks: IndexArray, unknowns: int,
+    scale_px: float, depth: FloatArray | None = None,
 ) -> Linearized:  # fmt: skip
     """Weigh residuals and derivatives, and whiten the points.
 
@@ -164,10 +164,13 @@ def linearize(
         projected: residuals (N, 2), derivatives (N, 2, 6k) by k blocks of six unknowns, and (N, 2, 3) by points.
         blocks: (N, k) numbers of these blocks, ascending.
         unknowns: number of all unknowns besides the points.
+        depth: as of `usable_mask`.
     """
     from scipy.sparse import bsr_array
 
-    r, by_view, by_point, used = weigh(*projected, usable, scale_px)
+    # points behind their camera, or in its principal plane, would distort everything near them
+    r, by_view, by_point, used = weigh(*projected, usable_mask(bundle, projected[0], depth), scale_px)
+    del projected  # nearly half of the memory
     whiten, rank = whiten_points(by_point, bundle.point, len(bundle.X))
     by_point = np.einsum("nki,nji->nkj", by_point, whiten[bundle.point])
     (count, k), rows = blocks.shape, np.arange(len(r) + 1)
@@ -243,15 +246,10 @@ def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
     """
     from scipy.sparse import bsr_array, eye_array
 
-    with np.errstate(all="ignore"):
-        predicted, by_camera, by_pose, by_point = project(bundle)
-        r, by_view = residuals(bundle, predicted), np.concatenate([by_pose, by_camera], 2)
     photos, poses, cameras = len(bundle.R), POSE * len(bundle.R), CAMERA * len(bundle.params)
     first = photos + CAMERA // BLOCK * bundle.camera[bundle.photo]
     blocks = np.column_stack([bundle.photo, first, first + 1])
-    # points behind their camera, or in its principal plane, would distort everything near them
-    usable = usable_mask(bundle, r)
-    observed = linearize(bundle, (r, by_view, by_point), blocks, usable, poses + cameras, scale_px)
+    observed = linearize(bundle, _residuals_and_derivatives(bundle), blocks, poses + cameras, scale_px)
     J, B, BJ = observed.by_view, observed.by_point, observed.products
     S = observed.eliminate_points() + REDUCTION.damping * eye_array(poses + cameras, format="csr")
     by_camera = S[poses:].toarray()
@@ -269,7 +267,8 @@ def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
     pose_step, pose_response = np.zeros(poses), np.zeros((poses, cameras))
     pose_step[free], pose_response[free] = response[:, -1], response[:, :-1]
     residue = rest - observed.drop_points(J @ np.append(pose_step, np.zeros(cameras)))
-    by_photo = bsr_array((residue.reshape(-1, 2, 1), bundle.photo, np.arange(len(r) + 1)), shape=(2 * len(r), photos))
+    rows = np.arange(len(bundle.x) + 1)
+    by_photo = bsr_array((residue.reshape(-1, 2, 1), bundle.photo, rows), shape=(len(residue), photos))
     products = by_photo.T @ J - (by_photo.T @ B) @ BJ
     return ReducedSystem(
         H=H,
@@ -279,10 +278,17 @@ def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
         pose_response=pose_response,
         point_step=observed.unwhiten(B.T @ observed.r).ravel(),
         observed=observed,
-        lost=len(r) - observed.used,
+        lost=len(bundle.x) - observed.used,
         scores=products @ np.vstack([-pose_response, np.eye(cameras)]),
         open_points=int(np.count_nonzero(observed.rank < 3)),
     )
+
+
+def _residuals_and_derivatives(bundle: Bundle) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return residuals (N, 2), and derivatives by pose and camera (N, 2, 18) and by point (N, 2, 3)."""
+    with np.errstate(all="ignore"):
+        predicted, by_camera, by_pose, by_point = project(bundle)
+        return residuals(bundle, predicted), np.concatenate([by_pose, by_camera], 2), by_point
 
 
 def apply_step(bundle: Bundle, params: FloatArray, poses: FloatArray, points: FloatArray) -> Bundle:

@@ -219,8 +219,8 @@ def shutter_step(
         by_view = np.concatenate([projected.by_pose, projected.by_motion, by_camera, by_readout], 2)
     first, last = 2 * photos + CAMERA // BLOCK * bundle.camera[bundle.photo], model.unknowns // BLOCK - 1
     blocks = np.column_stack([bundle.photo, photos + bundle.photo, first, first + 1, np.full(len(r), last)])
-    usable = usable_mask(bundle, r, projected.depth)
-    observed = linearize(bundle, (r, by_view, projected.by_point), blocks, usable, model.unknowns, scale_px)
+    derivatives = r, by_view, projected.by_point
+    observed = linearize(bundle, derivatives, blocks, model.unknowns, scale_px, projected.depth)
     return _solve(model, observed, precision, pull, held=held)
 
 

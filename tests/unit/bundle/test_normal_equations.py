@@ -138,7 +138,7 @@ def measured():
 def test_points_are_eliminated_as_by_the_pseudoinverse_of_all_derivatives(measured):
     bundle, derivatives, blocks = measured
     used = np.arange(SEEN) % 7 > 0
-    found = linearize(bundle, derivatives, blocks, used, UNKNOWNS, scale_px=2.0)
+    found = linearize(bundle, derivatives, blocks, UNKNOWNS, 2.0, depth=np.where(used, 1.0, -1.0))
     r, by_view, by_point, _ = weigh(*derivatives, used, 2.0)
     J, Jp = np.zeros((SEEN, 2, UNKNOWNS)), np.zeros((SEEN, 2, 3 * POINTS))
     for k in range(SEEN):
