@@ -28,73 +28,13 @@ class ScaleEvidence:
     photos: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class AgreedScale:
-    """The scale that most of the evidence supports."""
-
-    scale: float
-    deviation: float
-    """Relative standard deviation; covers half of the difference of two contradicting scales."""
-    used: tuple[ScaleEvidence, ...]
-    contradictions: tuple[str, ...]
-
-
-def agree(evidence: Sequence[ScaleEvidence], shape: float = 0.0) -> AgreedScale:
-    """Return the weighted mean of at least one scale, without scales that contradict the others.
-
-    The scale farthest from the mean of the others is dropped while it differs by more than `CONTRADICTION` and two
-    others remain. Of two contradicting scales, the more exact one counts, and the deviation covers half of the
-    difference.
-
-    `shape` is the relative deviation of the model's proportions, which more evidence does not reduce.
-    """
-    used, contradictions = list(evidence), []
-    while len(used) > 2:
-        differences = [_difference(one, _mean([other for other in used if other is not one]), shape) for one in used]
-        worst = int(np.argmax(differences))
-        if differences[worst] <= CONTRADICTION:
-            break
-        outlier = used.pop(worst)
-        contradictions.append(_contradiction(outlier, _mean(used), f"the {len(used)} others"))
-    mean = _mean(used)
-    if len(used) == 2 and _difference(used[0], used[1], shape) > CONTRADICTION:
-        best, other = sorted(used, key=lambda one: one.deviation)
-        contradictions.append(_contradiction(other, best, best.name))
-        half = abs(np.log(other.scale / best.scale)) / 2
-        mean, used = replace(best, deviation=max(best.deviation, float(half))), [best]
-    return AgreedScale(mean.scale, float(np.hypot(mean.deviation, shape)), tuple(used), tuple(contradictions))
-
-
-def _mean(evidence: Sequence[ScaleEvidence]) -> ScaleEvidence:
-    """Return the weighted mean of logarithms, with a deviation that covers the scatter."""
-    logs = np.log([one.scale for one in evidence])
-    weights = 1.0 / np.square([one.deviation for one in evidence])
-    mean = float(weights @ logs / weights.sum())
-    freedom = max(len(logs) - 1, 1)
-    inflation = max(1.0, float(np.sqrt(weights @ (logs - mean) ** 2 / freedom)))
-    return ScaleEvidence("", float(np.exp(mean)), inflation / float(np.sqrt(weights.sum())))
-
-
-def _difference(one: ScaleEvidence, other: ScaleEvidence, shape: float) -> float:
-    """Return the difference of two scales in standard deviations."""
-    expected = np.linalg.norm([one.deviation, other.deviation, shape])
-    return abs(float(np.log(one.scale / other.scale))) / float(expected)
-
-
-def _contradiction(one: ScaleEvidence, against: ScaleEvidence, name: str) -> str:
-    share = 100.0 * (one.scale / against.scale - 1.0)
-    return (
-        f"{one.name} contradicts {name}: by it, the model is {abs(share):.2g} % {'larger' if share > 0 else 'smaller'}"
-    )
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class MetricFrame:
     """A similarity from the frame of OUT/sparse into that of all exported files, y up in both."""
 
     from_model: Similarity = IDENTITY
     deviation: float | None = None
-    """Relative standard deviation of the unit, the meter; None if the unit is arbitrary."""
+    """Relative standard deviation of the unit, the meter; None if it is arbitrary."""
     source: str = ""
     """Names of the evidence in use, for people; empty without any."""
     evidence: tuple[ScaleEvidence, ...] = ()
@@ -138,6 +78,59 @@ class MetricFrame:
             values["crs"],
             (east, north, up),
         )
+
+
+def agree(evidence: Sequence[ScaleEvidence], shape: float = 0.0) -> MetricFrame:
+    """Return the frame by the weighted mean of the scales, without those that contradict the others.
+
+    Without evidence, the unit is arbitrary. The scale farthest from the mean of the others is dropped while it differs
+    by more than `CONTRADICTION` and two others remain. Of two contradicting scales, the more exact one counts, and the
+    deviation covers half of the difference. `shape` is the relative deviation of the model's proportions, which more
+    evidence does not reduce.
+    """
+    if not evidence:
+        return MetricFrame()
+    used, contradictions = list(evidence), []
+    while len(used) > 2:
+        differences = [_difference(one, _mean([other for other in used if other is not one]), shape) for one in used]
+        worst = int(np.argmax(differences))
+        if differences[worst] <= CONTRADICTION:
+            break
+        outlier = used.pop(worst)
+        contradictions.append(_contradiction(outlier, _mean(used), f"the {len(used)} others"))
+    mean = _mean(used)
+    if len(used) == 2 and _difference(used[0], used[1], shape) > CONTRADICTION:
+        best, other = sorted(used, key=lambda one: one.deviation)
+        contradictions.append(_contradiction(other, best, best.name))
+        half = abs(np.log(other.scale / best.scale)) / 2
+        mean, used = replace(best, deviation=max(best.deviation, float(half))), [best]
+    similarity = IDENTITY if mean.scale == 1.0 else Similarity(mean.scale, np.eye(3), np.zeros(3))
+    source = ", ".join(one.name for one in used)
+    deviation = float(np.hypot(mean.deviation, shape))
+    return MetricFrame(similarity, deviation, source, tuple(evidence), tuple(contradictions))
+
+
+def _mean(evidence: Sequence[ScaleEvidence]) -> ScaleEvidence:
+    """Return the weighted mean of logarithms, with a deviation that covers the scatter."""
+    logs = np.log([one.scale for one in evidence])
+    weights = 1.0 / np.square([one.deviation for one in evidence])
+    mean = float(weights @ logs / weights.sum())
+    freedom = max(len(logs) - 1, 1)
+    inflation = max(1.0, float(np.sqrt(weights @ (logs - mean) ** 2 / freedom)))
+    return ScaleEvidence("", float(np.exp(mean)), inflation / float(np.sqrt(weights.sum())))
+
+
+def _difference(one: ScaleEvidence, other: ScaleEvidence, shape: float) -> float:
+    """Return the difference of two scales in standard deviations."""
+    expected = np.linalg.norm([one.deviation, other.deviation, shape])
+    return abs(float(np.log(one.scale / other.scale))) / float(expected)
+
+
+def _contradiction(one: ScaleEvidence, against: ScaleEvidence, name: str) -> str:
+    share = 100.0 * (one.scale / against.scale - 1.0)
+    return (
+        f"{one.name} contradicts {name}: by it, the model is {abs(share):.2g} % {'larger' if share > 0 else 'smaller'}"
+    )
 
 
 def move_model(model: Model, similarity: Similarity) -> Model:
