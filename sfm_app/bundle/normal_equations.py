@@ -143,7 +143,9 @@ class Linearized:
 
     def eliminate_points(self) -> "sparse.csr_array":
         """Return the matrix (V, V) of the unknowns besides the points (Schur complement)."""
-        return (self.by_view.T @ self.by_view - self.products.T @ self.products).tocsr()
+        from scipy.sparse import csr_array
+
+        return csr_array(self.by_view.T @ self.by_view - self.products.T @ self.products)
 
     def drop_points(self, values: FloatArray) -> FloatArray:
         """Return values (2N,) less their part that the best shift of the points explains."""
@@ -259,7 +261,8 @@ def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
     response = solve_sparse_positive(S[free][:, free], np.column_stack([by_camera[:, free].T, gradient[free]]))
     across = np.einsum("ij,jk->ik", by_camera[:, free], response)
     H, g = by_camera[:, poses:] - across[:, :-1], gradient[poses:] - across[:, -1]
-    H = project_to_psd(0.5 * (H + H.T), J.power(2).sum(axis=0)[poses:])
+    before = np.asarray(J.power(2).sum(axis=0), np.float64)
+    H = project_to_psd(0.5 * (H + H.T), before[poses:])
     step = solve_positive(H, g[:, None])[:, 0]
     explained = np.sum(gradient[free] * response[:, -1]) + np.sum(g * step)
     noise = max(float(np.sum(rest**2) - explained), 0.0) + REDUCTION.usual_count * REDUCTION.usual_noise_px**2
