@@ -127,7 +127,8 @@ def _fit_on_ground(
     cameras: FloatArray, enu: FloatArray, up: FloatArray, origin: GpsPosition
 ) -> Georeference | Rejected:
     axes = perpendicular_basis(up)
-    z, w = _to_complex(cameras @ axes.T), _to_complex(enu)
+    # horizontal components as x + iy
+    z, w = (np.asarray(points[:, 0] + 1j * points[:, 1], np.complex128) for points in (cameras @ axes.T, enu))
     spread = float(MAD_TO_SIGMA * np.median(np.abs(w - (np.median(w.real) + 1j * np.median(w.imag)))))
     limit = max(OPTIONS.max_residual_m, OPTIONS.max_residual_share * spread)
     agreeing = _inlier_mask(z, w, limit)
@@ -152,11 +153,6 @@ def _fit_on_ground(
     height = float(np.median(enu[:, 2] - scale * cameras @ up))
     fit = Similarity(scale, R, np.array([b.real, b.imag, height]))
     return Georeference(fit, origin, used, len(places), rms, float(deviation))
-
-
-def _to_complex(points: FloatArray) -> NDArray[np.complex128]:
-    """Return the horizontal components of points (N, 2 or 3) as x + iy."""
-    return np.asarray(points[:, 0] + 1j * points[:, 1], np.complex128)
 
 
 def _inlier_mask(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: float) -> NDArray[np.bool_]:

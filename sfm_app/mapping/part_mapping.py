@@ -2,7 +2,6 @@
 
 import json
 import logging
-import shutil
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from heapq import heappop, heappush
@@ -411,8 +410,3 @@ def map_part(task: MappingTask) -> PartResult:
         tuple(result["tried"]),
         tuple(LookAlikes(tuple(map(tuple, join["pairs"])), join["missing"]) for join in result["false_joins"]),
     )
-
-
-def remove_parts(run: RunContext) -> None:
-    """Remove the folders of all parts."""
-    shutil.rmtree(run.workspace.root / FOLDER, ignore_errors=True)
