@@ -227,17 +227,15 @@ def project(bundle: Bundle) -> tuple[FloatArray, FloatArray, FloatArray, FloatAr
     return projected.x, projected.by_camera, by_pose, np.einsum("nij,njk->nik", projected.by_point, R)
 
 
-def predict(bundle: Bundle) -> FloatArray:
-    """Return the predictions of `project` (N, 2), without derivatives."""
+def residuals(bundle: Bundle, predicted: FloatArray | None = None) -> FloatArray:
+    """Return observed less predicted positions (N, 2), in pixels, by `project` or anew; in panoramas the short way."""
     rows = bundle.camera[bundle.photo]
-    rotated = np.einsum("nij,nj->ni", bundle.R[bundle.photo], bundle.X[bundle.point])
-    return image_points(rotated + bundle.t[bundle.photo], bundle.params[rows], bundle.family[rows])
-
-
-def residuals(bundle: Bundle, predicted: FloatArray) -> FloatArray:
-    """Return observed less predicted positions (N, 2), in pixels; in panoramas the short way round."""
-    rows = bundle.camera[bundle.photo]
-    return wrap_residuals(bundle.x - predicted, bundle.params[rows], bundle.family[rows])
+    cameras = bundle.params[rows], bundle.family[rows]
+    with np.errstate(all="ignore"):
+        if predicted is None:
+            rotated = np.einsum("nij,nj->ni", bundle.R[bundle.photo], bundle.X[bundle.point])
+            predicted = image_points(rotated + bundle.t[bundle.photo], *cameras)
+        return wrap_residuals(bundle.x - predicted, *cameras)
 
 
 def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
@@ -322,8 +320,7 @@ def best_step(bundle: Bundle, reduced: ReducedSystem, params: FloatArray, scale_
 
 def cost(bundle: Bundle, scale_px: float) -> float:
     """Return half the sum of the loss of `reduce`; lost observations count with a residual of `lost_px`."""
-    with np.errstate(all="ignore"):
-        r = residuals(bundle, predict(bundle))
+    r = residuals(bundle)
     return loss(r, usable_mask(bundle, r), scale_px)
 
 
@@ -348,9 +345,7 @@ def usable_mask(bundle: Bundle, r: FloatArray, depth: FloatArray | None = None) 
 
 def lost_points(bundle: Bundle) -> NDArray[np.bool_]:
     """Return the mask (P,) of points with a lost observation."""
-    with np.errstate(all="ignore"):
-        r = residuals(bundle, predict(bundle))
-    return np.bincount(bundle.point[~usable_mask(bundle, r)], minlength=len(bundle.X)) > 0
+    return np.bincount(bundle.point[~usable_mask(bundle, residuals(bundle))], minlength=len(bundle.X)) > 0
 
 
 def weigh(

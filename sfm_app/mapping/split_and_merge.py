@@ -1,7 +1,7 @@
 """Cut models at joins that matches contradict, merge models of one group, and find loose joins."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -135,23 +135,18 @@ def _merge_pair(first: Attempt, second: Attempt, evidence: Evidence, run: RunCon
 def shared_points(first: Reconstruction, second: Reconstruction, matches: MatchGraph, views: ViewGraph) -> FloatArray:
     """Return (N, 6) points that both models hold, in the frame of the first and of the second; each only once."""
     here, there = points_by_keypoint(first), points_by_keypoint(second)
+    photos_here, photos_there = ({photo for photo, _ in keypoints} for keypoints in (here, there))
     points = {}
-    for a, b in _pairs_between(views, {photo for photo, _ in here}, {photo for photo, _ in there}):
-        pair = min(a, b), max(a, b)
-        for row in matches.matches[pair][views.fits[pair].inliers]:
+    for pair, fit in views.fits.items():
+        a, b = pair if pair[0] in photos_here else pair[::-1]
+        if a not in photos_here or b not in photos_there:
+            continue
+        for row in matches.matches[pair][fit.inliers]:
             row_of = dict(zip(pair, map(int, row), strict=True))
             one, other = here.get((a, row_of[a])), there.get((b, row_of[b]))
             if one is not None and other is not None:
                 points[one[0]] = np.concatenate([one[1], other[1]])
     return np.array([points[key] for key in sorted(points)]).reshape(-1, 6)
-
-
-def _pairs_between(views: ViewGraph, here: set[int], there: set[int]) -> Iterator[tuple[int, int]]:
-    for a, b in views.fits:
-        if a in here and b in there:
-            yield a, b
-        elif b in here and a in there:
-            yield b, a
 
 
 # Loose scales. The relative scale of a third photo comes from points that all three see. Where a part shares hardly any
