@@ -20,14 +20,8 @@ from sfm_app.runtime.parallel import worker_count
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import ArcOptions, Camera, Lens, Views, arc, camera_center, make_camera, make_wide_camera
-from sfm_app.synthetic.compare import (
-    center_error_percent,
-    focal_error_percent,
-    surface_accuracy,
-    surface_coverage,
-    surface_error,
-)
-from sfm_app.synthetic.photo_folder import Truth, add_missing_photos, load_truth, save_truth
+from sfm_app.synthetic.compare import center_error_percent, focal_error_percent, surface_errors
+from sfm_app.synthetic.photo_folder import Truth, load_truth, save_truth, write_photo_folder
 from sfm_app.synthetic.render import comparison_image
 from sfm_app.synthetic.scenes import courtyard, statue, statue_views
 from sfm_app.synthetic.shapes import SyntheticScene
@@ -125,7 +119,7 @@ def render_photos(
     truth = Truth(dict(views.cameras), dict(views.cam_from_world), built.vertices, built.faces)
     out.mkdir(parents=True, exist_ok=True)
     save_truth(truth, out)  # first: it identifies the photos of a killed demo
-    return add_missing_photos(photos, built, views, processes=worker_count(settings.workers), progress=progress)
+    return write_photo_folder(photos, built, views, processes=worker_count(settings.workers), progress=progress)
 
 
 def _is_of(truth: Truth, views: Views) -> bool:
@@ -161,7 +155,7 @@ def evaluate(run: Run, scene: Scene, model: Model, truth: Truth, seconds: tuple[
     centers = {name: camera_center(pose) for name, pose in scene.cam_from_world.items()}
     surface, pages = model.surface, model.texture.pages if model.texture else ()
     reports = [run.report_path] if run.report_path is not None else []
-    mesh = surface.vertices, surface.faces, centers, truth
+    to_truth, to_mesh = surface_errors(surface.vertices, surface.faces, centers, truth)
     return DemoResult(
         photos=len(truth.cam_from_world),
         registered=len(scene.registered),
@@ -172,9 +166,9 @@ def evaluate(run: Run, scene: Scene, model: Model, truth: Truth, seconds: tuple[
         refined_focal_error_percent=round(focal_error_percent(refined, truth), 3),
         center_error_percent=round(center_error_percent(K, truth), 3),
         refined_center_error_percent=round(center_error_percent(refined, truth), 3),
-        surface_error_percent=round(100 * surface_error(*mesh), 3),
-        surface_accuracy_percent=round(100 * surface_accuracy(*mesh), 1),
-        surface_coverage_percent=round(100 * surface_coverage(*mesh), 1),
+        surface_error_percent=round(100 * float(np.median(to_truth)), 3),
+        surface_accuracy_percent=round(100 * float(np.mean(to_truth <= 0.005)), 1),
+        surface_coverage_percent=round(100 * float(np.mean(to_mesh <= 0.01)), 1),
         triangles=len(surface.faces),
         pages_px=[[page.shape[1], page.shape[0]] for page in pages],
         seconds_rendering=round(seconds[0], 1),

@@ -28,7 +28,7 @@ from sfm_app.products import read_texture
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import Views, look_at, panorama_camera
-from sfm_app.synthetic.compare import surface_accuracy, surface_coverage
+from sfm_app.synthetic.compare import surface_errors
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder
 
 SCENES = ("courtyard", "facade")
@@ -84,11 +84,11 @@ def surface_row(photos: Path, out: Path, truth: Truth) -> Row:
     show_log(loud)
     surface = read_texture(Workspace(out)).surface
     centers = {name: np.asarray(image.projection_center()) for name, image in placed_photos(out).items()}
-    shape = surface.vertices, surface.faces, centers, truth
+    to_truth, to_mesh = surface_errors(surface.vertices, surface.faces, centers, truth)
     return {
         "triangles": len(surface.faces),
-        "surface %": round(100.0 * surface_accuracy(*shape), 1),
-        "coverage %": round(100.0 * surface_coverage(*shape), 1),
+        "surface %": round(100.0 * float(np.mean(to_truth <= 0.005)), 1),
+        "coverage %": round(100.0 * float(np.mean(to_mesh <= 0.01)), 1),
     }
 
 

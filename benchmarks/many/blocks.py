@@ -32,7 +32,7 @@ from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import depth_maps, mesh, texture
 from sfm_app.synthetic.cameras import make_camera
-from sfm_app.synthetic.photo_folder import PhotoOptions, add_missing_photos
+from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
 from sfm_app.types import Surface
 
 ABOUT = (
@@ -62,7 +62,7 @@ def prepare(count: int, walk: int, megapixels: float, cache: Path) -> Path:
     if (out / "scene.pickle").exists():
         return out
     town, views = town_of(options), town_views(camera, options, count)
-    add_missing_photos(rendered, town, views, PhotoOptions(supersampling=1), processes=WORKERS)
+    write_photo_folder(rendered, town, views, PhotoOptions(supersampling=1), processes=WORKERS)
     (out / "photos").mkdir(parents=True)
     for name in views.cam_from_world:
         link_or_copy(rendered / name, out / "photos")

@@ -24,7 +24,7 @@ from sfm_app.colmap.model import poses_and_points
 from sfm_app.pipeline import NAMES
 from sfm_app.settings import QUALITY_PRESETS
 from sfm_app.synthetic.cameras import Camera, Views, make_camera
-from sfm_app.synthetic.photo_folder import PhotoOptions, add_missing_photos
+from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
 
 ABOUT = (
     "`sfm-app run` on the first photos of a walk through a rendered town, as a user types it, with two workers. "
@@ -40,7 +40,7 @@ COLUMNS = ("photos", "of pairs", "placed", "models", "parts", "focal %", "center
 def render(views: Views, options: TownPhotos, folder: Path) -> None:
     """Render the photos that are missing."""
     if any(not (folder / name).exists() for name in views.cam_from_world):
-        add_missing_photos(folder, town_of(options), views, PhotoOptions(supersampling=1), processes=WORKERS)
+        write_photo_folder(folder, town_of(options), views, PhotoOptions(supersampling=1), processes=WORKERS)
 
 
 def measure(count: int, rendered: Path, camera: Camera, views: Views, args: argparse.Namespace) -> Row:

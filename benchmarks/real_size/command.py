@@ -23,7 +23,7 @@ from sfm_app.colmap.backend import Reconstruction
 from sfm_app.colmap.model import poses_and_points
 from sfm_app.geometry.poses import Similarity, umeyama
 from sfm_app.synthetic.cameras import Views, camera_center
-from sfm_app.synthetic.photo_folder import PhotoOptions, add_missing_photos
+from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
 
 ABOUT = (
     "Error of the size, in percent, against the true camera centers, and of the deviation that is stated; center mm: "
@@ -51,7 +51,7 @@ def measure(scene: str, seed: int, args: argparse.Namespace) -> Iterator[Row]:
     place = args.cache / f"{scene}-{seed}"
     measured = add_markers(plain, views, side)
     # edges along the pixels lie between few rays
-    add_missing_photos(place / "photos", measured, views, PhotoOptions(supersampling=4, seed=seed), processes=2)
+    write_photo_folder(place / "photos", measured, views, PhotoOptions(supersampling=4, seed=seed), processes=2)
     vertices = plain.vertices
     if problem := run_program(place, args.quality, "--markers", f"{side}m"):
         yield {"method": "sfm-app", "scene": scene, "seed": seed, "by": "markers", "failed": problem}

@@ -14,21 +14,21 @@ from numpy.typing import NDArray
 from sfm_app.bundle.lens_evidence import MISFIT
 from sfm_app.bundle.lens_parts import LOG_ASPECT, LOG_FOCAL, LensPriors, step_cameras
 from sfm_app.bundle.normal_equations import (
+    BLOCK,
     POSE,
     REDUCTION,
     Bundle,
+    Linearized,
     apply_step,
     free_pose_columns,
+    linearize,
     loss,
     usable_mask,
-    weigh,
-    whiten_points,
 )
 from sfm_app.camera.projection import CAMERA, FX, FY, project_points
 from sfm_app.geometry.least_squares import inverse_of_positive
-from sfm_app.jit import kernel
 from sfm_app.numerical import MAD_TO_SIGMA
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import FloatArray
 
 # Projection of points into photos whose rows are read one after the other. Ours; to first order in the motion of
 # the camera, the model is that of Hedborg et al. 2012.
@@ -152,9 +152,7 @@ def local_fit_weights(offsets: FloatArray, degree: int) -> tuple[FloatArray, Flo
     return np.asarray(solution[:, 0]), np.asarray(solution[:, 1] / unit[:, None])
 
 
-# Normal equations of a bundle behind a rolling shutter: poses, motions, cameras and the readout, points eliminated.
-# Unlike in `normal_equations`, a dense matrix is filled point by point: with the motions there are twice as many
-# unknowns to a photo, for which sparse products take ten times as long.
+# Normal equations of a bundle behind a rolling shutter: poses, offsets, cameras and the readout, points eliminated.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,33 +177,11 @@ class ShutterBundle:
 
     @property
     def unknowns(self) -> int:
-        """Number of unknowns besides the points: poses, offsets, cameras with log focal and log aspect, readout."""
-        return (POSE + VELOCITY) * len(self.bundle.R) + CAMERA * len(self.bundle.params) + 1
+        """Number of unknowns besides the points: poses, offsets, cameras with log focal and log aspect, readout.
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ShutterSystem:
-    """Normal equations S x = g of the unknowns besides the points."""
-
-    S: FloatArray
-    g: FloatArray
-    r: FloatArray
-    """(N, 2) weighted residuals."""
-    by_view: FloatArray
-    """(N, 2, 25) weighted derivatives by pose, offset, camera and readout."""
-    columns: IndexArray
-    """(N, 25) their unknowns."""
-    by_point: FloatArray
-    """(N, 2, 3) weighted derivatives by whitened points."""
-    whiten: FloatArray
-    """(P, 3, 3)"""
-    photo: IndexArray
-    point: IndexArray
-    free: IndexArray
-    offsets: slice
-    """Which unknowns are offsets."""
-    redundancy: int
-    """Number of measurements less that of poses and points."""
+        The readout is the first of a block (`BLOCK`); the rest of the block is unused.
+        """
+        return (POSE + VELOCITY) * len(self.bundle.R) + CAMERA * len(self.bundle.params) + BLOCK
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,149 +199,69 @@ class ShutterStep:
     """(I, 6) of the offsets, without MISFIT."""
 
 
-def linearize(
+def shutter_step(
     model: ShutterBundle, precision: FloatArray, pull: FloatArray, scale_px: float, *, held: bool
-) -> ShutterSystem:
-    """Eliminate the points (Schur complement), in the Gauss-Newton approximation.
+) -> ShutterStep:
+    """Return a step of Gauss and Newton; the deviation is at least that of the sandwich estimator, photos as clusters.
 
     `precision` (n,) is of the priors on the unknowns, in 1 / px^2; `pull` (n,) is precisions times distances to their
     means; `held` tells whether the readout is known.
     """
-    bundle, n = model.bundle, model.unknowns
-    r, by_view, by_point = _weighted_derivatives(model, scale_px)
-    whiten, rank = whiten_points(by_point, bundle.point, len(bundle.X))
-    by_point = np.einsum("nki,nji->nkj", by_point, whiten[bundle.point])
-    columns = _unknown_columns(model)
-    half, g = np.zeros((n, n)), np.zeros(n)
-    order = np.argsort(bundle.point, kind="stable")
-    starts = np.searchsorted(bundle.point[order], np.arange(len(bundle.X) + 1))
-    add_points((order, starts), columns, r, by_view, by_point, half, g)
-    S = half + half.T - np.diag(np.diag(half)) + np.diag(precision + REDUCTION.damping)
-    poses = free_pose_columns(bundle.R, bundle.t)
-    free = np.concatenate([poses, np.arange(POSE * len(bundle.R), n - held)])
-    redundancy = 2 * int(np.count_nonzero(r.any(axis=1))) - int(np.sum(rank)) - len(poses)
-    offsets = slice(POSE * len(bundle.R), (POSE + VELOCITY) * len(bundle.R))
-    return ShutterSystem(
-        S, g + pull, r, by_view, columns, by_point, whiten, bundle.photo, bundle.point, free, offsets, redundancy
-    )  # fmt: skip
-
-
-def _unknown_columns(model: ShutterBundle) -> IndexArray:
-    """Return the unknowns (N, 25) of each observation."""
     bundle, photos = model.bundle, len(model.bundle.R)
-    camera = (POSE + VELOCITY) * photos + CAMERA * bundle.camera[bundle.photo]
-    blocks = [
-        POSE * bundle.photo[:, None] + np.arange(POSE),
-        POSE * photos + VELOCITY * bundle.photo[:, None] + np.arange(VELOCITY),
-        camera[:, None] + np.arange(CAMERA),
-        np.full((len(bundle.x), 1), model.unknowns - 1),
-    ]
-    return np.hstack(blocks)
-
-
-def _weighted_derivatives(model: ShutterBundle, scale_px: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return weighted residuals (N, 2), and derivatives by views (N, 2, 25) and points (N, 2, 3).
-
-    Lost observations are 0.
-    """
-    bundle = model.bundle
     with np.errstate(all="ignore"):
         projected = project_rows(bundle, model.share, model.motion)
         r = bundle.x - projected.x
         by_camera, params = projected.by_camera.copy(), bundle.params[bundle.camera[bundle.photo]]
         by_fx, by_fy = by_camera[:, :, FX] * params[:, FX, None], by_camera[:, :, FY] * params[:, FY, None]
         by_camera[:, :, LOG_FOCAL], by_camera[:, :, LOG_ASPECT] = by_fx + by_fy, 0.5 * (by_fy - by_fx)
-        by_readout = np.einsum("nij,nj->ni", projected.by_motion, model.velocity[bundle.photo])[:, :, None]
+        by_readout = np.zeros((len(r), 2, BLOCK))
+        by_readout[:, :, 0] = np.einsum("nij,nj->ni", projected.by_motion, model.velocity[bundle.photo])
         by_view = np.concatenate([projected.by_pose, projected.by_motion, by_camera, by_readout], 2)
-    return weigh(r, by_view, projected.by_point, usable_mask(bundle, r, projected.depth), scale_px)[:3]
+    first, last = 2 * photos + CAMERA // BLOCK * bundle.camera[bundle.photo], model.unknowns // BLOCK - 1
+    blocks = np.column_stack([bundle.photo, photos + bundle.photo, first, first + 1, np.full(len(r), last)])
+    derivatives = r, by_view, projected.by_point
+    observed = linearize(bundle, derivatives, blocks, model.unknowns, scale_px, projected.depth)
+    return _solve(model, observed, precision, pull, held=held)
 
 
-@kernel
-def add_points(
-    rows: tuple[IndexArray, IndexArray], columns: IndexArray, r: FloatArray, by_view: FloatArray, by_point: FloatArray,
-    half: FloatArray, g: FloatArray,
-) -> None:  # fmt: skip
-    """Add J'J - A'A and J'r - A'b of all points, A and b being J and r projected onto the point.
-
-    Args:
-        rows: (N,) observations sorted by point, and (P + 1,) start of each point.
-        half: (n, n) changed in place: each pair of unknowns in one of its two places.
-        g: (n,) changed in place.
-    """
-    order, starts = rows
-    width, n = columns.shape[1], len(g)
-    A, b = np.zeros((3, n)), np.zeros(3)
-    touched, marked = np.zeros(n, np.int64), np.zeros(n, np.bool_)
-    for point in range(len(starts) - 1):
-        count = 0
-        b[:] = 0.0
-        for place in range(starts[point], starts[point + 1]):
-            k = order[place]
-            u, v = by_point[k, 0], by_point[k, 1]
-            for j in range(3):
-                b[j] += u[j] * r[k, 0] + v[j] * r[k, 1]
-            for one in range(width):
-                column, x, y = columns[k, one], by_view[k, 0, one], by_view[k, 1, one]
-                if not marked[column]:
-                    marked[column], touched[count] = True, column
-                    count += 1
-                g[column] += x * r[k, 0] + y * r[k, 1]
-                for j in range(3):
-                    A[j, column] += u[j] * x + v[j] * y
-                for two in range(one + 1):
-                    half[column, columns[k, two]] += x * by_view[k, 0, two] + y * by_view[k, 1, two]
-        for one in range(count):
-            column = touched[one]
-            x, y, z = A[0, column], A[1, column], A[2, column]
-            g[column] -= x * b[0] + y * b[1] + z * b[2]
-            for two in range(one + 1):
-                other = touched[two]
-                half[column, other] -= x * A[0, other] + y * A[1, other] + z * A[2, other]
-        for one in range(count):
-            marked[touched[one]] = False
-            A[:, touched[one]] = 0.0
-
-
-def solve_step(system: ShutterSystem) -> ShutterStep:
-    """Return the step; the deviation is at least that of the sandwich estimator with photos as clusters."""
-    n, free = len(system.g), system.free
-    inverse = inverse_of_positive(system.S[np.ix_(free, free)])
+def _solve(
+    model: ShutterBundle, observed: Linearized, precision: FloatArray, pull: FloatArray, *, held: bool
+) -> ShutterStep:
+    bundle, n, photos = model.bundle, model.unknowns, len(model.bundle.R)
+    poses, offsets = free_pose_columns(bundle.R, bundle.t), slice(POSE * photos, (POSE + VELOCITY) * photos)
+    free = np.concatenate([poses, np.arange(offsets.start, n - BLOCK + (not held))])
+    S = observed.eliminate_points().toarray() + np.diag(precision + REDUCTION.damping)
+    g = observed.by_view.T @ observed.drop_points(observed.r) + pull
+    inverse = inverse_of_positive(S[np.ix_(free, free)])
     views, influence, variances = np.zeros(n), np.zeros(n), np.zeros(n)
-    views[free] = np.einsum("ij,j->i", inverse, system.g[free])
+    views[free] = np.einsum("ij,j->i", inverse, g[free])
     variances[free] = np.diag(inverse)
-    if free[-1] == n - 1:
+    if not held:
         influence[free] = inverse[:, -1]
-    points, residue = _back_substitute(system, views, system.r)
-    _, influences = _back_substitute(system, -influence, np.zeros_like(system.r))
-    noise2 = float(
-        (np.sum(residue**2) + REDUCTION.usual_count * REDUCTION.usual_noise_px**2)
-        / (max(system.redundancy, 0) + REDUCTION.usual_count)
+    rest = observed.r - observed.by_view @ views
+    residue, influences = observed.drop_points(rest), observed.drop_points(observed.by_view @ influence)
+    redundancy = max(2 * observed.used - int(np.sum(observed.rank)) - len(poses), 0) + REDUCTION.usual_count
+    noise2 = float((np.sum(residue**2) + REDUCTION.usual_count * REDUCTION.usual_noise_px**2) / redundancy)
+    by_photo = np.bincount(bundle.photo, np.sum((influences * residue).reshape(-1, 2), axis=1))
+    deviation = MISFIT * np.sqrt(max(noise2 * variances[n - BLOCK], float(np.sum(by_photo**2))))
+    return ShutterStep(
+        views,
+        observed.unwhiten(observed.by_point.T @ rest),
+        float(np.sqrt(noise2)),
+        float(deviation),
+        noise2 * variances[offsets].reshape(-1, VELOCITY),
     )
-    by_photo = np.bincount(system.photo, np.sum(influences * residue, axis=1))
-    deviation = MISFIT * np.sqrt(max(noise2 * variances[-1], float(np.sum(by_photo**2))))
-    offsets = noise2 * variances[system.offsets].reshape(-1, VELOCITY)
-    moved = np.einsum("pji,pj->pi", system.whiten, points)
-    return ShutterStep(views, moved, float(np.sqrt(noise2)), float(deviation), offsets)
-
-
-def _back_substitute(system: ShutterSystem, views: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the best step of the whitened points (P, 3) after one of the views, and the remaining r (N, 2)."""
-    residue = r - np.einsum("nij,nj->ni", system.by_view, views[system.columns])
-    along = np.einsum("nij,ni->nj", system.by_point, residue)
-    sums = [np.bincount(system.point, along[:, j], len(system.whiten)) for j in range(3)]
-    points = np.array(sums, np.float64).T
-    return points, residue - np.einsum("nij,nj->ni", system.by_point, points[system.point])
 
 
 def apply_shutter_step(model: ShutterBundle, step: ShutterStep, share: float) -> ShutterBundle:
     """Return the model after a share, in (0, 1], of a step."""
     bundle = model.bundle
-    poses, offsets, cameras = np.split(share * step.views[:-1], np.cumsum([POSE, VELOCITY]) * len(bundle.R))
+    poses, offsets, cameras = np.split(share * step.views[:-BLOCK], np.cumsum([POSE, VELOCITY]) * len(bundle.R))
     params = step_cameras(bundle.params, cameras.reshape(-1, CAMERA))
     return replace(
         model,
         bundle=apply_step(bundle, params, poses.reshape(-1, POSE), share * step.points),
-        readout=model.readout + share * float(step.views[-1]),
+        readout=model.readout + share * float(step.views[-BLOCK]),
         offsets=model.offsets + offsets.reshape(-1, VELOCITY),
     )
 
@@ -466,7 +362,7 @@ def estimate_readout(
     for _ in range(OPTIONS.steps):
         expected = _expected_offsets(model, problem, shake)
         terms = _prior_terms(model, expected, problem, noise_px)
-        step = solve_step(linearize(model, *terms, scale_px, held=problem.held))
+        step = shutter_step(model, *terms, scale_px, held=problem.held)
         noise_px = step.noise_px
         before = _cost(model, expected, problem, noise_px)
         model, after = _take_step(model, step, expected, problem, before)
@@ -504,8 +400,8 @@ def _prior_terms(
 ) -> tuple[FloatArray, FloatArray]:
     """Return precisions (n,) of the priors, in 1 / px^2, and precisions times distances to the prior means."""
     poses, offsets = np.zeros(POSE * len(model.bundle.R)), problem.priors.prior_offsets(model.bundle.params)
-    precision = np.concatenate([poses, expected.ravel() ** -2.0, problem.precision.ravel(), [0.0]])
-    distance = np.concatenate([poses, -model.offsets.ravel(), offsets.ravel(), [0.0]])
+    precision = np.concatenate([poses, expected.ravel() ** -2.0, problem.precision.ravel(), np.zeros(BLOCK)])
+    distance = np.concatenate([poses, -model.offsets.ravel(), offsets.ravel(), np.zeros(BLOCK)])
     return noise_px**2 * precision, noise_px**2 * precision * distance
 
 

@@ -26,13 +26,13 @@ from sfm_app.types import (
 # Wide lenses and fundamental matrices of an earlier run.
 
 
-def mostly_known_groups(matches: MatchGraph, earlier: Earlier) -> dict[str, tuple[list[MatchedImage], int]]:
-    """Return the camera groups with most photos known: their photos, and the number of known ones."""
+def mostly_known_groups(matches: MatchGraph, earlier: Earlier) -> dict[str, list[MatchedImage]]:
+    """Return the photos of the camera groups with most photos known."""
     groups: dict[str, list[MatchedImage]] = {}
     for _, image in sorted(matches.images.items()):
         groups.setdefault(image.group, []).append(image)
-    counts = {group: sum(image.name in earlier.known for image in images) for group, images in groups.items()}
-    return {group: (images, counts[group]) for group, images in groups.items() if counts[group] > 0.5 * len(images)}
+    known = {group: sum(image.name in earlier.known for image in images) for group, images in groups.items()}
+    return {group: images for group, images in groups.items() if known[group] > 0.5 * len(images)}
 
 
 def known_lenses(matches: MatchGraph, before: ViewGraph, earlier: Earlier) -> dict[str, Calibration | None]:
@@ -107,7 +107,7 @@ def known_cameras(matches: MatchGraph, views: ViewGraph, run: RunContext, earlie
         return {}
     values = json.loads(earlier.place.scene.read_text(encoding="utf-8"))
     cameras = {}
-    for group, (images, _) in mostly_known_groups(matches, earlier).items():
+    for group, images in mostly_known_groups(matches, earlier).items():
         names = {values["camera_of"].get(image.name, group) for image in images if image.name in earlier.known}
         camera = refined_camera(values["cameras"].get(group)) if names == {group} else None
         if camera is not None and not _is_contradicted(camera, images, matches, views, run, earlier.known):

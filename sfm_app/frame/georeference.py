@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.poses import Similarity, perpendicular_basis, robust_similarity
+from sfm_app.geometry.poses import Similarity, draw_pairs, perpendicular_basis, robust_similarity
 from sfm_app.numerical import FAILURES, MAD_TO_SIGMA
 from sfm_app.types import GpsPosition, Rejected
 from sfm_app.types.arrays import FloatArray
@@ -128,7 +127,8 @@ def _fit_on_ground(
     cameras: FloatArray, enu: FloatArray, up: FloatArray, origin: GpsPosition
 ) -> Georeference | Rejected:
     axes = perpendicular_basis(up)
-    z, w = _to_complex(cameras @ axes.T), _to_complex(enu)
+    # horizontal components as x + iy
+    z, w = (np.asarray(points[:, 0] + 1j * points[:, 1], np.complex128) for points in (cameras @ axes.T, enu))
     spread = float(MAD_TO_SIGMA * np.median(np.abs(w - (np.median(w.real) + 1j * np.median(w.imag)))))
     limit = max(OPTIONS.max_residual_m, OPTIONS.max_residual_share * spread)
     agreeing = _inlier_mask(z, w, limit)
@@ -155,18 +155,10 @@ def _fit_on_ground(
     return Georeference(fit, origin, used, len(places), rms, float(deviation))
 
 
-def _to_complex(points: FloatArray) -> NDArray[np.complex128]:
-    """Return the horizontal components of points (N, 2 or 3) as x + iy."""
-    return np.asarray(points[:, 0] + 1j * points[:, 1], np.complex128)
-
-
 def _inlier_mask(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: float) -> NDArray[np.bool_]:
     """Find the inliers of the best pair by truncated squared residuals, then refit until they no longer change."""
-    pairs = np.array(list(combinations(range(len(z)), 2)), np.intp)
-    if len(pairs) > OPTIONS.max_pairs:
-        pairs = np.random.default_rng(0).permutation(pairs)[: OPTIONS.max_pairs]
     best, least = np.ones(len(z), bool), np.inf
-    for pair in pairs:
+    for pair in draw_pairs(len(z), OPTIONS.max_pairs):
         if abs(w[pair[0]] - w[pair[1]]) < 1e-6 or abs(z[pair[0]] - z[pair[1]]) < 1e-140:  # smaller squares underflow
             continue
         a, b = _fit_complex_line(z[pair], w[pair])

@@ -247,15 +247,10 @@ def write_marker_page(
 ) -> int:
     """Write a page of markers, dark squares of `side_m` meters, to a PDF or SVG file, and return their number.
 
-    Raise a ConfigError if no marker fits on the page or a name is unknown, an InputError if the file cannot be written.
+    Raise a ConfigError if no marker fits on the page, an InputError if the file cannot be written.
     """
     if path.suffix.lower() not in (".pdf", ".svg"):
         raise ConfigError(f"a page of markers is a PDF or SVG file, not {path.name}", hint="write -o markers.pdf")
-    if family not in FAMILIES or paper not in PAGES_MM:
-        raise ConfigError(
-            f"no family of markers is named '{family}'" if family not in FAMILIES else f"no paper is named '{paper}'",
-            hint=f"known: {', '.join(FAMILIES if family not in FAMILIES else PAGES_MM)}",
-        )
     places = marker_places(side_m, len(draw_pattern(family, 0)), paper)
     count = len(load_dictionary(family).bytesList)
     places = places[: max(min(PAGE.max_markers, count - first), 0)]

@@ -28,26 +28,68 @@ class ScaleEvidence:
     photos: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class AgreedScale:
-    """The scale that most of the evidence supports."""
+@dataclass(frozen=True, slots=True, eq=False)
+class MetricFrame:
+    """A similarity from the frame of OUT/sparse into that of all exported files, y up in both."""
 
-    scale: float
-    deviation: float
-    """Relative standard deviation; covers half of the difference of two contradicting scales."""
-    used: tuple[ScaleEvidence, ...]
-    contradictions: tuple[str, ...]
+    from_model: Similarity = IDENTITY
+    deviation: float | None = None
+    """Relative standard deviation of the unit, the meter; None if it is arbitrary."""
+    source: str = ""
+    """Names of the evidence in use, for people; empty without any."""
+    evidence: tuple[ScaleEvidence, ...] = ()
+    contradictions: tuple[str, ...] = ()
+    """Evidence that contradicts the rest, one sentence each."""
+    crs: str = ""
+    """Coordinate system of ground control points; empty without any."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """East, north and up of the frame's origin in that system: x is east, y up and z south of it."""
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether the unit is the meter."""
+        return self.deviation is not None
+
+    @property
+    def changes(self) -> bool:
+        """Whether exported files differ in frame from OUT/sparse."""
+        return self.from_model is not IDENTITY
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        values, similarity = asdict(self), self.from_model
+        del values["from_model"]
+        frame = {"scale": similarity.scale, "R": similarity.R.tolist(), "t": similarity.t.tolist()}
+        return frame | {"unit": "meter" if self.is_metric else "arbitrary"} | values
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "MetricFrame":
+        """Read the values of `to_dict`."""
+        R, t = np.array(values["R"], np.float64), np.array(values["t"], np.float64)
+        similarity = Similarity(float(values["scale"]), R, t)
+        unchanged = similarity.scale == 1.0 and (np.eye(3) == R).all() and not t.any()
+        east, north, up = map(float, values["offset"])
+        return cls(
+            IDENTITY if unchanged else similarity,
+            values["deviation"],
+            values["source"],
+            tuple(ScaleEvidence(**one) for one in values["evidence"]),
+            tuple(values["contradictions"]),
+            values["crs"],
+            (east, north, up),
+        )
 
 
-def agree(evidence: Sequence[ScaleEvidence], shape: float = 0.0) -> AgreedScale:
-    """Return the weighted mean of at least one scale, without scales that contradict the others.
+def agree(evidence: Sequence[ScaleEvidence], shape: float = 0.0) -> MetricFrame:
+    """Return the frame by the weighted mean of the scales, without those that contradict the others.
 
-    The scale farthest from the mean of the others is dropped while it differs by more than `CONTRADICTION` and two
-    others remain. Of two contradicting scales, the more exact one counts, and the deviation covers half of the
-    difference.
-
-    `shape` is the relative deviation of the model's proportions, which more evidence does not reduce.
+    Without evidence, the unit is arbitrary. The scale farthest from the mean of the others is dropped while it differs
+    by more than `CONTRADICTION` and two others remain. Of two contradicting scales, the more exact one counts, and the
+    deviation covers half of the difference. `shape` is the relative deviation of the model's proportions, which more
+    evidence does not reduce.
     """
+    if not evidence:
+        return MetricFrame()
     used, contradictions = list(evidence), []
     while len(used) > 2:
         differences = [_difference(one, _mean([other for other in used if other is not one]), shape) for one in used]
@@ -62,7 +104,10 @@ def agree(evidence: Sequence[ScaleEvidence], shape: float = 0.0) -> AgreedScale:
         contradictions.append(_contradiction(other, best, best.name))
         half = abs(np.log(other.scale / best.scale)) / 2
         mean, used = replace(best, deviation=max(best.deviation, float(half))), [best]
-    return AgreedScale(mean.scale, float(np.hypot(mean.deviation, shape)), tuple(used), tuple(contradictions))
+    similarity = IDENTITY if mean.scale == 1.0 else Similarity(mean.scale, np.eye(3), np.zeros(3))
+    source = ", ".join(one.name for one in used)
+    deviation = float(np.hypot(mean.deviation, shape))
+    return MetricFrame(similarity, deviation, source, tuple(evidence), tuple(contradictions))
 
 
 def _mean(evidence: Sequence[ScaleEvidence]) -> ScaleEvidence:
@@ -86,67 +131,6 @@ def _contradiction(one: ScaleEvidence, against: ScaleEvidence, name: str) -> str
     return (
         f"{one.name} contradicts {name}: by it, the model is {abs(share):.2g} % {'larger' if share > 0 else 'smaller'}"
     )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MetricFrame:
-    """A similarity from the frame of OUT/sparse into that of all exported files, y up in both."""
-
-    from_model: Similarity = IDENTITY
-    deviation: float | None = None
-    """Relative standard deviation of the unit, the meter; None if the unit is arbitrary."""
-    source: str = ""
-    """Names of the evidence in use, for people; empty without any."""
-    evidence: tuple[ScaleEvidence, ...] = ()
-    contradictions: tuple[str, ...] = ()
-    """Evidence that contradicts the rest, one sentence each."""
-    crs: str = ""
-    """Coordinate system of ground control points; empty without any."""
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """East, north and up of the frame's origin in that system: x is east, y up and z south of it."""
-
-    @property
-    def is_metric(self) -> bool:
-        """Whether the unit is the meter."""
-        return self.deviation is not None
-
-    @property
-    def changes(self) -> bool:
-        """Whether exported files differ in frame from OUT/sparse."""
-        return self.from_model is not IDENTITY
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        similarity = self.from_model
-        return {
-            "scale": similarity.scale,
-            "R": similarity.R.tolist(),
-            "t": similarity.t.tolist(),
-            "unit": "meter" if self.is_metric else "arbitrary",
-            "deviation": self.deviation,
-            "source": self.source,
-            "evidence": [asdict(one) for one in self.evidence],
-            "contradictions": list(self.contradictions),
-            "crs": self.crs,
-            "offset": list(self.offset),
-        }
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> "MetricFrame":
-        """Read the values of `to_dict`."""
-        R, t = np.array(values["R"], np.float64), np.array(values["t"], np.float64)
-        similarity = Similarity(float(values["scale"]), R, t)
-        unchanged = similarity.scale == 1.0 and (np.eye(3) == R).all() and not t.any()
-        east, north, up = map(float, values["offset"])
-        return cls(
-            IDENTITY if unchanged else similarity,
-            values["deviation"],
-            values["source"],
-            tuple(ScaleEvidence(**one) for one in values["evidence"]),
-            tuple(values["contradictions"]),
-            values["crs"],
-            (east, north, up),
-        )
 
 
 def move_model(model: Model, similarity: Similarity) -> Model:

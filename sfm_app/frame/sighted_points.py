@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from PIL import Image
 
 from sfm_app.colmap.backend import Reconstruction, translate_errors
 from sfm_app.colmap.model import focal_px, posed_images, seen_points, viewing_rays
+from sfm_app.geometry.poses import draw_pairs
 from sfm_app.types import Photo
 from sfm_app.types.arrays import FloatArray
 
@@ -103,11 +103,8 @@ def ray_information(place: FloatArray, centers: FloatArray, rays: FloatArray, fo
 
 def _inliers_of_pairs(centers: FloatArray, rays: FloatArray, focals: FloatArray) -> NDArray[np.bool_] | None:
     """Return the inliers (N,) of the best pair of rays; None if no pair meets in front of its cameras."""
-    pairs = np.array(list(combinations(range(len(rays)), 2)), np.intp)
-    if len(pairs) > OPTIONS.max_pairs:
-        pairs = np.random.default_rng(0).permutation(pairs)[: OPTIONS.max_pairs]
     best, least = None, np.inf
-    for pair in pairs:
+    for pair in draw_pairs(len(rays), OPTIONS.max_pairs):
         if np.linalg.norm(np.cross(*rays[pair])) < np.sin(np.radians(OPTIONS.min_angle_deg)):
             continue
         place = _intersect(centers[pair], rays[pair], focals[pair])

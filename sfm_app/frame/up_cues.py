@@ -206,13 +206,6 @@ class Surfaces:
     """(N,) log brightness minus its mean over the neighborhood."""
 
 
-def small_picture(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return a gray photo (H, W), reduced in size."""
-    shrink = min(1.0, CUE_OPTIONS.picture_px / max(gray.shape))
-    size = (max(1, round(gray.shape[1] * shrink)), max(1, round(gray.shape[0] * shrink)))
-    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
 def fit_surfaces(
     points: FloatArray, brightness: FloatArray, visible: Sequence[NDArray[np.int64]], centers: FloatArray
 ) -> Surfaces:

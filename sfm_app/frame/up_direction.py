@@ -70,22 +70,13 @@ class UpOptions:
 OPTIONS = UpOptions()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Plane:
-    """A plane that many points lie on."""
-
-    normal: FloatArray
-    """(3,) unit vector on the side of the given axis."""
-    share: float
-    """Share of inliers, 0 to 1."""
-    deviation_deg: float
-    """Standard deviation of the normal, from the scatter of the points."""
-
-
-def dominant_plane(points: FloatArray, axis: FloatArray, between_deg: tuple[float, float]) -> Plane | None:
+def dominant_plane(
+    points: FloatArray, axis: FloatArray, between_deg: tuple[float, float]
+) -> tuple[FloatArray, float] | None:
     """Find the plane with most points whose normal is at a given angle to an axis; None without enough inliers.
 
     RANSAC with a fixed seed, then least squares on the inliers. `axis` is a unit vector (3,), angles are in [0, 90].
+    The unit normal (3,) is on its side, with a standard deviation in degrees from the scatter of the points.
     """
     rng = np.random.default_rng(0)
     cloud = points[rng.permutation(len(points))[: OPTIONS.max_points]]
@@ -102,16 +93,16 @@ def dominant_plane(points: FloatArray, axis: FloatArray, between_deg: tuple[floa
         near = np.abs(component_along(cloud - a, normal)) < reach
         if np.count_nonzero(near) > most:
             best, most = near, float(np.count_nonzero(near))
-    return None if best is None else _fit_plane(cloud[best], axis, float(best.mean()))
+    return None if best is None else _fit_plane(cloud[best], axis)
 
 
-def _fit_plane(points: FloatArray, axis: FloatArray, share: float) -> Plane:
+def _fit_plane(points: FloatArray, axis: FloatArray) -> tuple[FloatArray, float]:
     spread = points - points.mean(axis=0)
     scatter = np.einsum("ni,nj->ij", spread, spread)
     small, middle, _ = np.linalg.eigvalsh(scatter)
     # rounding may leave the least eigenvalue of coplanar points below zero
     deviation = np.degrees(np.arctan2(np.sqrt(max(small, 0.0) / len(points)), np.sqrt(max(middle, 1e-30))))
-    return Plane(smallest_eigenvector(scatter, axis), share, float(deviation))
+    return smallest_eigenvector(scatter, axis), float(deviation)
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +143,7 @@ class Scenery:
     visible: tuple[NDArray[np.int64], ...]
     """Per photo, the indices of its visible points."""
     pictures: tuple[NDArray[np.uint8] | None, ...]
-    """Per photo its `small_picture`, or None."""
+    """Per photo its small gray picture, or None."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -240,18 +231,18 @@ def up_direction(
     roll = selection.roll
     lines = find_vanishing_direction(roll.up, segments)
     if lines is not None:
-        level = level_direction(lines.direction, segments)
+        vertical, deviation_deg = lines
+        level = level_direction(vertical, segments)
         if level is None:
-            return UpEstimate(lines.direction, None, LINES, lines.deviation_deg, selection)
-        frame, deviation_deg = fit_orthogonal_frame(lines.direction, level, segments)
+            return UpEstimate(vertical, None, LINES, deviation_deg, selection)
+        frame, deviation_deg = fit_orthogonal_frame(vertical, level, segments)
         # verticals alone and all edges together have different errors; their angle measures both
-        gap_deg = float(axis_angle_deg(frame[0], lines.direction))
+        gap_deg = float(axis_angle_deg(frame[0], vertical))
         return UpEstimate(frame[0], frame[1], LINES, float(np.hypot(deviation_deg, gap_deg)), selection)
-    ground = (
-        dominant_plane(scenery.points, roll.up, OPTIONS.floor_deg) if roll.spread_deg > OPTIONS.unsure_deg else None
-    )
-    if ground is not None:
-        return UpEstimate(ground.normal, None, GROUND, ground.deviation_deg, selection)
+    if roll.spread_deg > OPTIONS.unsure_deg:
+        ground = dominant_plane(scenery.points, roll.up, OPTIONS.floor_deg)
+        if ground is not None:
+            return UpEstimate(ground[0], None, GROUND, ground[1], selection)
     return UpEstimate(roll.up, None, ROLL, roll.deviation_deg, selection)
 
 
@@ -263,7 +254,7 @@ def viewer_direction(upright: UpEstimate, rotations: FloatArray, points: FloatAr
         towards = perpendicular_basis(up)[0]
     axis, source = upright.level, LINES
     if axis is None and (wall := dominant_plane(points, up, OPTIONS.wall_deg)) is not None:
-        axis, source = normalize(perpendicular_component(wall.normal, up)), WALL
+        axis, source = normalize(perpendicular_component(wall[0], up)), WALL
     if axis is None:
         return towards, CAMERAS
     sides = np.stack([axis, np.cross(up, axis), -axis, np.cross(axis, up)])

@@ -22,9 +22,9 @@ from sfm_app.colmap.model import (
 )
 from sfm_app.errors import NumericalError
 from sfm_app.frame.georeference import Georeference, georeference, position_from_enu
-from sfm_app.frame.up_cues import small_picture
+from sfm_app.frame.up_cues import CUE_OPTIONS
 from sfm_app.frame.up_direction import LINES, Scenery, UpEstimate, odds, up_direction, viewer_direction, viewer_frame
-from sfm_app.frame.vanishing_points import Segments, concatenate_segments, line_segments, segment_planes
+from sfm_app.frame.vanishing_points import Segments, concatenate_segments, line_segments, segment_planes, shrink
 from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import FAILURES, Json, error_reason
 from sfm_app.runtime.context import RunContext
@@ -162,7 +162,7 @@ def extract_cues(path: Path, turn_deg: int = 0) -> PhotoCues:
     if picture is None:
         return PhotoCues(np.zeros((0, 4)), None)
     gray = np.asarray(picture, np.uint8)
-    return PhotoCues(line_segments(gray), np.rot90(small_picture(gray), -turn_deg // 90))
+    return PhotoCues(line_segments(gray), np.rot90(shrink(gray, CUE_OPTIONS.picture_px), -turn_deg // 90))
 
 
 def _orientation_entry(upright: UpEstimate, front: str) -> dict[str, Json]:

@@ -5,6 +5,7 @@ the unit normal of the plane represents a segment, and the segments of all posed
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -48,10 +49,8 @@ OPTIONS = LineOptions()
 
 def line_segments(gray: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Find line segments (N, 4) x1, y1, x2, y2 in a gray photo, longest first, by LSD (von Gioi et al. 2010)."""
-    longer = max(gray.shape)
-    shrink = min(1.0, OPTIONS.longer_side_px / longer)
-    size = (max(1, round(gray.shape[1] * shrink)), max(1, round(gray.shape[0] * shrink)))
-    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA) if shrink < 1.0 else gray
+    small = shrink(gray, OPTIONS.longer_side_px)
+    size = small.shape[::-1]
     detected = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(small)[0]
     if detected is None:
         return np.zeros((0, 4))
@@ -63,8 +62,14 @@ def line_segments(gray: NDArray[np.uint8]) -> NDArray[np.float64]:
     return np.asarray(segments[order] * np.tile([gray.shape[1] / size[0], gray.shape[0] / size[1]], 2), np.float64)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Segments:
+def shrink(gray: NDArray[np.uint8], longer_side_px: int) -> NDArray[np.uint8]:
+    """Return a gray photo (H, W) whose longer side is at most this long."""
+    scale = min(1.0, longer_side_px / max(gray.shape))
+    size = (max(1, round(gray.shape[1] * scale)), max(1, round(gray.shape[0] * scale)))
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+class Segments(NamedTuple):
     """Line segments of several photos, in the world."""
 
     normals: FloatArray
@@ -75,25 +80,6 @@ class Segments:
     """(N,) weights, the lengths in pixels."""
     photos: NDArray[np.int64]
     """(N,) number of each segment's photo."""
-
-    def __len__(self) -> int:
-        return len(self.normals)
-
-    def take(self, chosen: NDArray[np.bool_]) -> "Segments":
-        """Return the chosen segments."""
-        return Segments(self.normals[chosen], self.middles[chosen], self.lengths[chosen], self.photos[chosen])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class VanishingDirection:
-    """A direction of many lines."""
-
-    direction: FloatArray
-    """(3,) unit vector."""
-    deviation_deg: float
-    """Standard deviation by the jackknife over photos; inf with a single photo."""
-    share: float
-    """Length of its segments, as a share of all."""
 
 
 def segment_planes(first: FloatArray, second: FloatArray, photo: int, scale_px: float) -> Segments:
@@ -106,14 +92,8 @@ def segment_planes(first: FloatArray, second: FloatArray, photo: int, scale_px: 
 
 def concatenate_segments(parts: list[Segments]) -> Segments:
     """Join the segments of several photos."""
-    if not parts:
-        return Segments(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
-    return Segments(
-        np.concatenate([part.normals for part in parts]),
-        np.concatenate([part.middles for part in parts]),
-        np.concatenate([part.lengths for part in parts]),
-        np.concatenate([part.photos for part in parts]),
-    )
+    nothing = Segments(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
+    return Segments(*map(np.concatenate, zip(nothing, *parts, strict=True)))
 
 
 def _residuals_deg(direction: FloatArray, segments: Segments) -> FloatArray:
@@ -123,9 +103,12 @@ def _residuals_deg(direction: FloatArray, segments: Segments) -> FloatArray:
     return np.asarray(np.degrees(np.arcsin(np.clip(sine / np.maximum(away, 1e-9), 0.0, 1.0))), np.float64)
 
 
-def find_vanishing_direction(start: FloatArray, segments: Segments) -> VanishingDirection | None:
-    """Find the direction of most segments near a unit vector (3,), from a grid refined with Welsch weights, or None."""
-    if len(segments) < OPTIONS.min_segments or not segments.lengths.sum() > 0.0:
+def find_vanishing_direction(start: FloatArray, segments: Segments) -> tuple[FloatArray, float] | None:
+    """Find the direction (3,) of most segments near a unit vector (3,), from a grid refined with Welsch weights.
+
+    Its standard deviation, in degrees, is by the jackknife over photos, and inf with a single photo.
+    """
+    if len(segments.normals) < OPTIONS.min_segments or not segments.lengths.sum() > 0.0:
         return None
     grid = spherical_cap(start, OPTIONS.search_deg, OPTIONS.step_deg)
     support = np.array([_support(direction, segments, OPTIONS.widths_deg[0]) for direction in grid])
@@ -141,8 +124,9 @@ def level_direction(up: FloatArray, segments: Segments) -> FloatArray | None:
     vector (3,) in the world.
     """
     on_horizon = np.abs(component_along(segments.normals, up)) > np.cos(np.radians(OPTIONS.separation_deg))
-    level = segments.take(~on_horizon & (_residuals_deg(up, segments) > OPTIONS.separation_deg / 2))
-    if len(level) < OPTIONS.min_segments:
+    chosen = ~on_horizon & (_residuals_deg(up, segments) > OPTIONS.separation_deg / 2)
+    level = Segments(*(column[chosen] for column in segments))
+    if len(level.normals) < OPTIONS.min_segments:
         return None
     e1, e2 = perpendicular_basis(up)
     angles = np.radians(np.arange(0.0, 180.0))
@@ -244,8 +228,8 @@ def _sum_per_photo(segments: Segments, values: FloatArray) -> FloatArray:
 
 def _verify_direction(
     direction: FloatArray, grid: FloatArray, support: FloatArray, segments: Segments
-) -> VanishingDirection | None:
-    """Return the direction with its evidence if it stands out from the directions of the grid far from it."""
+) -> tuple[FloatArray, float] | None:
+    """Return the direction with its deviation if it stands out from the directions of the grid far from it."""
     along = _residuals_deg(direction, segments) < OPTIONS.widths_deg[0]
     share = float(segments.lengths[along].sum() / segments.lengths.sum())
     far = axis_angle_deg(grid, direction) > OPTIONS.separation_deg
@@ -261,8 +245,7 @@ def _verify_direction(
     matrices = _scatter_matrices(direction, segments, OPTIONS.widths_deg[-1])
     total = matrices.sum(axis=0)
     without = [smallest_eigenvector(total - matrix, direction) for matrix in matrices if matrix.any()]
-    deviation_deg = _jackknife(axis_angle_deg(np.reshape(without, (-1, 3)), direction))
-    return VanishingDirection(direction, deviation_deg, share)
+    return direction, _jackknife(axis_angle_deg(np.reshape(without, (-1, 3)), direction))
 
 
 def _jackknife(moves: FloatArray) -> float:

@@ -294,10 +294,10 @@ def relative_pose(E: FloatArray, x1: FloatArray, x2: FloatArray) -> tuple[FloatA
 
     x1, x2 (N, 2) are normalized image points (K^-1 x)_1,2.
     """
-    rays = [np.column_stack([x, np.ones(len(x))]) for x in (x1, x2)]
+    rays1, rays2 = (np.column_stack([x, np.ones(len(x))]) for x in (x1, x2))
 
     def points_in_front(pose: tuple[FloatArray, FloatArray]) -> int:
-        first, second = _ray_depths(*rays, *pose)
+        first, second = _ray_depths(rays1, rays2, *pose)
         return int(np.count_nonzero((first > 0) & (second > 0)))
 
     return max(decompose_essential(E), key=points_in_front)

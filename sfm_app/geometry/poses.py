@@ -152,6 +152,12 @@ def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
     return umeyama(a[agreeing], b[agreeing])
 
 
+def draw_pairs(count: int, most: int) -> NDArray[np.intp]:
+    """List all pairs (P, 2) of `count` points, or `most` of them, drawn with a fixed seed."""
+    pairs = np.column_stack(np.triu_indices(count, 1))
+    return np.random.default_rng(0).permutation(pairs)[:most] if len(pairs) > most else pairs
+
+
 def _triples(count: int) -> NDArray[np.intp]:
     """List all triples of `count` points, or 500 of them, drawn with a fixed seed."""
     most, rng = 500, np.random.default_rng(0)

@@ -176,9 +176,7 @@ class _SharedPhotos:
 
     def agreement(self, similarity: Similarity) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
         """Return (n,) which photos agree, their angles in degrees, and their shifts by the distance of their points."""
-        rotated = np.einsum("nij,kj->nik", self.Rb, similarity.R)
-        traces = np.einsum("nij,nij->n", self.Ra, rotated)
-        angles = np.degrees(np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0)))
+        angles = _angles_deg(self.Ra, np.einsum("nij,kj->nik", self.Rb, similarity.R))
         shifts = np.linalg.norm(similarity(self.cb) - self.ca, axis=1) / self.distance
         return (angles <= OPTIONS.agreement_deg) & (shifts <= OPTIONS.agreement_shift), angles, shifts
 
@@ -191,6 +189,11 @@ class _SharedPhotos:
             return robust_similarity(self.Xb[chosen], self.Xa[chosen])
         except FAILURES:  # on a line
             return similarity
+
+
+def _angles_deg(R: FloatArray, S: FloatArray) -> FloatArray:
+    """Return the angles (N,) between rotations (N, 3, 3)."""
+    return np.asarray(np.degrees(np.arccos(np.clip((np.einsum("nij,nij->n", R, S) - 1.0) / 2.0, -1.0, 1.0))))
 
 
 def _observation_keys(model: PlacedPhotos, photos: IndexArray) -> tuple[IndexArray, IndexArray]:
@@ -301,10 +304,9 @@ def align_fragments(fragments: Sequence[Fragment], joins: Sequence[Join]) -> Ali
 
 def difference(join: Join, expected: Similarity, radii: Sequence[float]) -> JoinError:
     """Return the difference of a join from another similarity; radii are in units of each fragment."""
-    cosine = (np.trace(expected.R.T @ join.similarity.R) - 1.0) / 2.0
     smaller = min(radii[join.first], expected.scale * radii[join.second])
     return JoinError(
-        float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))),
+        float(_angles_deg(expected.R[None], join.similarity.R[None])[0]),
         float(np.log(join.similarity.scale / expected.scale)),
         float(np.linalg.norm(join.similarity(join.middle) - expected(join.middle))) / max(smaller, 1e-300),
     )
@@ -339,11 +341,8 @@ def _robust_potentials(
     count: int, edges: NDArray[np.int64], steps: FloatArray, strengths: FloatArray, sizes: FloatArray
 ) -> FloatArray:
     """Return (count, k) values with the least distances to steps (J, k), second less first, along edges (J, 2)."""
-    groups = DisjointGroups(range(count))
-    for a, b in edges.tolist():
-        groups.join(a, b)
-    held = sorted({min(members) for members in groups.members.values()})
-    free = np.setdiff1d(np.arange(count), held)
+    groups = connected_groups(((a, b) for a, b in edges.tolist()), range(count))
+    free = np.setdiff1d(np.arange(count), [min(group) for group in groups])
     A = np.zeros((len(edges), count))
     A[np.arange(len(edges)), edges[:, 1]] += 1.0
     A[np.arange(len(edges)), edges[:, 0]] -= 1.0
@@ -428,8 +427,7 @@ def _sound_observations(
 ) -> tuple[FloatArray, IndexArray, IndexArray, IndexArray]:
     """Return the points, and the observations by photos whose pose in this model is that of the merged one."""
     rows = np.searchsorted(photos, model.photos)
-    traces = np.einsum("nij,nij->n", model.R, R[rows])
-    angles = np.degrees(np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0)))
+    angles = _angles_deg(model.R, R[rows])
     at = np.searchsorted(model.photos, model.photo)
     distances = np.linalg.norm(model.X[model.point] - model.centers[at], axis=1)
     median_distance = float(np.median(distances)) if len(distances) else 1.0

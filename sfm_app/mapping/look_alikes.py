@@ -303,19 +303,14 @@ def find_false_joins(
         apart = {pair for pair, one in overlaps.items() if sides[pair[0]] != sides[pair[1]] and _affinity(one) < 0}
         here = _cut_sides({photo: sides[photo] for photo in chain(*apart)}, photos, strengths)
         across = {pair: one for pair, one in overlaps.items() if {here.get(photo) for photo in pair} == {True, False}}
-        missing = _missing_share(across.values())
+        expected = sum(one.expected for one in across.values())
+        missing = 1.0 - sum(one.shared for one in across.values()) / max(expected, 1)
         if len(across.keys() & non_overlapping.keys()) >= OVERLAPS.min_pairs and missing >= OVERLAPS.min_missing:
             pairs = {pair for pair in strengths if here[pair[0]] != here[pair[1]]}
             strengths = {pair: strength for pair, strength in strengths.items() if pair not in pairs}
             joins += [LookAlikes(join, missing) for join in group_doubted_pairs(pairs, strengths)]
         remaining = {(a, b): one for (a, b), one in remaining.items() if sides[a] == sides[b]}
     return joins
-
-
-def _missing_share(overlaps: Iterable[ExpectedOverlap]) -> float:
-    """Return the share of the expected cells that photos do not share."""
-    counts = [(one.expected, one.shared) for one in overlaps]
-    return 1.0 - sum(shared for _, shared in counts) / max(sum(expected for expected, _ in counts), 1)
 
 
 def _is_significant(pair: PairSupport | None) -> bool:

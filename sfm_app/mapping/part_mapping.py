@@ -2,8 +2,7 @@
 
 import json
 import logging
-import shutil
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from heapq import heappop, heappush
 from pathlib import Path
@@ -237,24 +236,11 @@ INPUTS, RESULT = "inputs.npz", "result.json"
 Arrays = dict[str, NDArray[Any]]
 
 
-def pairs_of_parts(pairs: Iterable[PairId], parts: Sequence[Sequence[int]]) -> list[list[PairId]]:
-    """Return the pairs within each part, in their order; parts may share photos."""
-    members: dict[int, set[int]] = {}
-    for number, photos in enumerate(parts):
-        for photo in photos:
-            members.setdefault(photo, set()).add(number)
-    pairs_by_part: list[list[PairId]] = [[] for _ in parts]
-    nowhere: set[int] = set()
-    for a, b in pairs:
-        for number in members.get(a, nowhere) & members.get(b, nowhere):
-            pairs_by_part[number].append((a, b))
-    return pairs_by_part
-
-
-def part_of_group(group: Group, photos: Sequence[int], pairs: Sequence[PairId]) -> Group:
-    """Return the data of some photos of a group; `pairs` are those with matches among them."""
-    evidence, poses = group.evidence, group.graph.poses
+def part_of_group(group: Group, photos: Sequence[int]) -> Group:
+    """Return the data of some photos of a group."""
+    evidence, poses, members = group.evidence, group.graph.poses, set(photos)
     matches, fits = evidence.matches, evidence.views.fits
+    pairs = [pair for pair in matches.matches if members.issuperset(pair)]
     images = {photo: matches.images[photo] for photo in photos}
     names = {image.name: evidence.camera_name(photo) for photo, image in images.items()}
     cameras = {name: camera for name, camera in evidence.intrinsics.cameras.items() if name in set(names.values())}
@@ -320,20 +306,6 @@ def read_inputs(path: Path) -> PartInputs:
     return PartInputs(part, mapped, Settings.from_mapping(known["settings"]), known["asked"])
 
 
-PlainJoin = tuple[list[list[int]], float]
-"""Pairs of a false join, and the missing share across it, as in JSON."""
-
-
-def joins_to_plain(joins: Sequence[LookAlikes]) -> list[PlainJoin]:
-    """Return false joins as plain values for JSON."""
-    return [([list(pair) for pair in join.pairs], join.missing) for join in joins]
-
-
-def joins_from_plain(values: Sequence[PlainJoin]) -> tuple[LookAlikes, ...]:
-    """Rebuild from `joins_to_plain`."""
-    return tuple(LookAlikes(tuple((a, b) for a, b in pairs), missing) for pairs, missing in values)
-
-
 def _match_arrays(matches: MatchGraph) -> Arrays:
     keypoints, rows = list(matches.keypoints.values()), list(matches.matches.values())
     return {
@@ -356,49 +328,30 @@ def _matches_from_arrays(images: Mapping[int, MatchedImage], arrays: Mapping[str
     )
 
 
+POSE_FIELDS = ("R", "t", "angle_deg", "in_front", "kind", "guided")
+"""Fields of `RelativePose` with an array for all pairs; only the inliers differ in number."""
+
+
 def _pose_arrays(graph: PoseGraph) -> Arrays:
     poses = list(graph.poses.values())
-    return {
+    return {f"pose_{name}": np.array([getattr(pose, name) for pose in poses]) for name in POSE_FIELDS} | {
         "pose_pairs": np.array(list(graph.poses), np.int64).reshape(-1, 2),
-        "pose_R": np.array([pose.R for pose in poses]).reshape(-1, 3, 3),
-        "pose_t": np.array([pose.t for pose in poses]).reshape(-1, 3),
         "pose_counts": np.array([len(pose.inliers) for pose in poses], np.int64),
         "pose_inliers": np.concatenate([*(pose.inliers for pose in poses), np.zeros(0, bool)]),
-        "pose_angle_deg": np.array([pose.angle_deg for pose in poses], np.float64),
-        "pose_in_front": np.array([pose.in_front for pose in poses], np.float64),
-        "pose_kind": np.array([pose.kind for pose in poses], np.str_),
-        "pose_guided": np.array([pose.guided for pose in poses], np.bool_),
     }
 
 
 def _poses_from_arrays(arrays: Mapping[str, NDArray[Any]]) -> dict[PairId, RelativePose]:
-    columns = (
-        arrays["pose_R"],
-        arrays["pose_t"],
-        np.split(arrays["pose_inliers"], np.cumsum(arrays["pose_counts"]))[:-1],
-        arrays["pose_angle_deg"].tolist(),
-        arrays["pose_in_front"].tolist(),
-        arrays["pose_kind"].tolist(),
-        arrays["pose_guided"].tolist(),
-    )
-    pairs = map(tuple, arrays["pose_pairs"].tolist())
-    return {pair: RelativePose(*values) for pair, *values in zip(pairs, *columns, strict=True)}
+    R, t, *others = (arrays[f"pose_{name}"] for name in POSE_FIELDS)
+    inliers = np.split(arrays["pose_inliers"], np.cumsum(arrays["pose_counts"]))[:-1]
+    poses = map(RelativePose, R, t, inliers, *(values.tolist() for values in others))
+    return dict(zip(map(tuple, arrays["pose_pairs"].tolist()), poses, strict=True))
 
 
 logger = logging.getLogger("sfm_app")
 
 FOLDER, STOP = "parts", "stop"
 """Folder of the parts, and the file in it that stops them all."""
-
-
-@dataclass(frozen=True, slots=True)
-class PartTask:
-    """One part to map: small, since its inputs are files that every worker can read."""
-
-    folder: str
-    """Holds the inputs, and gets the models."""
-    photos: str
-    """Folder with the photos; COLMAP requires it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -420,9 +373,16 @@ def map_parts(
     """Map parts side by side, except those that a killed run has finished; failed ones have no models."""
     place = run.workspace.root / FOLDER
     (place / STOP).unlink(missing_ok=True)
-    within = pairs_of_parts(group.evidence.matches.matches, [part.photos for part in parts])
-    members = (part_of_group(group, part.photos, pairs) for part, pairs in zip(parts, within, strict=True))
-    tasks = [_prepare_part(one, mapped, place, run, stop_at_false_joins=stop_at_false_joins) for one in members]
+    tasks: list[MappingTask] = []
+    for part in parts:
+        members = part_of_group(group, part.photos)
+        followed = frozenset(pair for pair in members.graph.poses if pair in mapped.poses)
+        write_inputs(place / INPUTS, PartInputs(members, followed, run.settings, stop_at_false_joins))
+        folder = place / digest_file(place / INPUTS)[:16]
+        folder.mkdir(exist_ok=True)
+        replace_file(place / INPUTS, folder / INPUTS)
+        # small, since its inputs are files that every worker can read
+        tasks.append({"scratch": str(folder), "photos": str(run.workspace.photos), "seed": 0})
     try:
         return run.map(Task(map_part), tasks, f"mapping {len(parts)} parts")
     except BaseException:  # also Ctrl-C: the processes end when they see the file
@@ -430,26 +390,12 @@ def map_parts(
         raise
 
 
-def _prepare_part(
-    members: Group, mapped: PoseGraph, place: Path, run: RunContext, *, stop_at_false_joins: bool
-) -> PartTask:
-    """Write the inputs of a part into a folder named by their digest."""
-    beside = place / INPUTS
-    followed = frozenset(pair for pair in members.graph.poses if pair in mapped.poses)
-    write_inputs(beside, PartInputs(members, followed, run.settings, stop_at_false_joins))
-    folder = place / digest_file(beside)[:16]
-    folder.mkdir(exist_ok=True)
-    replace_file(beside, folder / INPUTS)
-    return PartTask(str(folder), str(run.workspace.photos))
-
-
-def map_part(task: PartTask) -> PartResult:
-    """Map one part in a separate process, and wait for it. Depends on nothing but the task."""
-    folder = Path(task.folder)
+def map_part(task: MappingTask) -> PartResult:
+    """Map the part in the folder `scratch` in a separate process, and wait for it. Depends on nothing but the task."""
+    folder = Path(task["scratch"])
     if not (folder / RESULT).exists():
-        work: MappingTask = {"scratch": task.folder, "photos": task.photos, "seed": 0}
         try:
-            with start_worker("sfm_app.mapping.part_process", work) as process:
+            with start_worker("sfm_app.mapping.part_process", task) as process:
                 while not process.has_ended(0.2):
                     if (folder.parent / STOP).exists():
                         return PartResult((), "", ("stopped",))
@@ -462,10 +408,5 @@ def map_part(task: PartTask) -> PartResult:
         tuple(str(folder / name) for name in result["models"]),
         result["mapper"],
         tuple(result["tried"]),
-        joins_from_plain(result["false_joins"]),
+        tuple(LookAlikes(tuple(map(tuple, join["pairs"])), join["missing"]) for join in result["false_joins"]),
     )
-
-
-def remove_parts(run: RunContext) -> None:
-    """Remove the folders of all parts."""
-    shutil.rmtree(run.workspace.root / FOLDER, ignore_errors=True)

@@ -2,6 +2,7 @@
 
 import json
 import tempfile
+from dataclasses import asdict
 from functools import cache
 from os.path import relpath
 from pathlib import Path
@@ -13,7 +14,7 @@ from sfm_app.colmap.worker_process import MappingTask, serve
 from sfm_app.files import replace_atomically
 from sfm_app.mapping.attempt import MAPPING, Attempt, best_attempt, map_group
 from sfm_app.mapping.look_alikes import judge_places
-from sfm_app.mapping.part_mapping import INPUTS, RESULT, joins_to_plain, read_inputs
+from sfm_app.mapping.part_mapping import INPUTS, RESULT, read_inputs
 from sfm_app.mapping.split_and_merge import sound_parts
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
@@ -48,7 +49,7 @@ def work(task: MappingTask) -> None:
         "models": [] if best is None else _write_models(best, folder),
         "mapper": "" if best is None else best.mapper,
         "tried": [one.note for one in attempts],
-        "false_joins": [] if best is None else joins_to_plain(judge(best)),
+        "false_joins": [] if best is None else [asdict(join) for join in judge(best)],
     }
     with replace_atomically(folder / RESULT) as path:
         path.write_text(json.dumps(result), encoding="utf-8", newline="\n")

@@ -1,6 +1,7 @@
 """Map a large group in parts: the steps in order, and when their model is as good as one of the whole group."""
 
 import logging
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -31,7 +32,7 @@ from sfm_app.mapping.joins import (
     loop_errors,
     merge_fragments,
 )
-from sfm_app.mapping.part_mapping import Part, PartResult, cut_group, map_parts, remove_parts
+from sfm_app.mapping.part_mapping import FOLDER, Part, PartResult, cut_group, map_parts
 from sfm_app.numerical import FAILURES, Json, error_reason
 from sfm_app.runtime.context import RunContext
 from sfm_app.settings import SceneSettings
@@ -110,7 +111,7 @@ def map_in_parts(
     if best is not None and best.photos < photos:
         attempts.append(replace(complete_attempt(group, best, run), mapper=MAPPER))
     run.record(parts=[*run.statistics.get("parts", []), part_figures(group, joined, attempts)])
-    remove_parts(run)
+    shutil.rmtree(run.workspace.root / FOLDER, ignore_errors=True)
     return attempts, ()
 
 

@@ -1,9 +1,8 @@
 """Cut models at joins that matches contradict, merge models of one group, and find loose joins."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from heapq import heappop, heappush
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -138,23 +137,18 @@ def _merge_pair(first: Attempt, second: Attempt, evidence: Evidence, run: RunCon
 def shared_points(first: Reconstruction, second: Reconstruction, matches: MatchGraph, views: ViewGraph) -> FloatArray:
     """Return (N, 6) points that both models hold, in the frame of the first and of the second; each only once."""
     here, there = points_by_keypoint(first), points_by_keypoint(second)
+    photos_here, photos_there = ({photo for photo, _ in keypoints} for keypoints in (here, there))
     points = {}
-    for a, b in _pairs_between(views, {photo for photo, _ in here}, {photo for photo, _ in there}):
-        pair = min(a, b), max(a, b)
-        for row in matches.matches[pair][views.fits[pair].inliers]:
+    for pair, fit in views.fits.items():
+        a, b = pair if pair[0] in photos_here else pair[::-1]
+        if a not in photos_here or b not in photos_there:
+            continue
+        for row in matches.matches[pair][fit.inliers]:
             row_of = dict(zip(pair, map(int, row), strict=True))
             one, other = here.get((a, row_of[a])), there.get((b, row_of[b]))
             if one is not None and other is not None:
                 points[one[0]] = np.concatenate([one[1], other[1]])
     return np.array([points[key] for key in sorted(points)]).reshape(-1, 6)
-
-
-def _pairs_between(views: ViewGraph, here: set[int], there: set[int]) -> Iterator[tuple[int, int]]:
-    for a, b in views.fits:
-        if a in here and b in there:
-            yield a, b
-        elif b in here and a in there:
-            yield b, a
 
 
 # Loose scales. The relative scale of a third photo comes from points that all three see. Where a part shares hardly any
@@ -183,47 +177,24 @@ def weakly_joined_parts(model: Reconstruction) -> list[list[str]]:
 
 def _joining_order(visibility: "csr_array") -> list[tuple[int, int]]:
     """Return the photos from the third on in joining order, each with its number of shared points."""
+    from scipy.sparse import csr_array, triu
+
     points, photos = visibility.shape
     if photos < 3 or points == 0:
         return []
-    growth = _Growth(visibility)
-    for photo in growth.best_pair():
-        growth.join(photo)
-    joined = []
-    while growth.remaining:
-        count, photo = heappop(growth.waiting)
-        if photo in growth.remaining and -count == growth.known[photo]:
-            joined.append((photo, -count))
-            growth.join(photo)
-    return joined
-
-
-class _Growth:
-    """Photos that have joined a model, and how many points the others share with it."""
-
-    def __init__(self, visibility: "csr_array") -> None:
-        self.visibility, self.by_photo = visibility, visibility.T.tocsr()
-        points, photos = visibility.shape
-        self.views = np.zeros(points, np.int64)
-        self.known = np.zeros(photos, np.int64)
-        """Points seen by a photo and by two that have joined."""
-        self.remaining = set(range(photos))
-        self.waiting = [(0, photo) for photo in range(photos)]
-        """Heap of photos by their number of known points; entries that have changed are out of date."""
-
-    def best_pair(self) -> tuple[int, int]:
-        from scipy.sparse import csr_array, triu
-
-        together = csr_array(triu(self.by_photo @ self.visibility, k=1)).tocoo()
-        i, j = together.coords
-        best = np.lexsort((j, i, -together.data))[:1]
-        return (int(i[best[0]]), int(j[best[0]])) if len(best) else (0, 1)
-
-    def join(self, photo: int) -> None:
-        own = self.by_photo.indices[self.by_photo.indptr[photo] : self.by_photo.indptr[photo + 1]]
-        self.views[own] += 1
-        newly_known = self.visibility[own[self.views[own] == 2]]  # the points that have just become known
-        for other, more in zip(*np.unique(newly_known.indices, return_counts=True), strict=True):
-            self.known[other] += more
-            heappush(self.waiting, (-int(self.known[other]), int(other)))
-        self.remaining.discard(photo)
+    by_photo = visibility.T.tocsr()
+    together = csr_array(triu(by_photo @ visibility, k=1)).tocoo()
+    i, j = together.coords
+    best = np.lexsort((j, i, -together.data))[:1]
+    # by point, the joined photos that see it; by photo, the points that it and two joined photos see
+    views, known = np.zeros(points, np.int64), np.zeros(photos, np.int64)
+    remaining, joined = np.ones(photos, np.bool_), list[tuple[int, int]]()
+    pair = [int(photo) for photo in (*i[best], *j[best])] or [0, 1]
+    while len(joined) < photos:
+        photo = pair[len(joined)] if len(joined) < 2 else int(np.argmax(np.where(remaining, known, -1)))
+        joined.append((photo, int(known[photo])))
+        remaining[photo] = False
+        own = by_photo.indices[by_photo.indptr[photo] : by_photo.indptr[photo + 1]]
+        views[own] += 1
+        known += np.bincount(visibility[own[views[own] == 2]].indices, minlength=photos)
+    return joined[2:]

@@ -8,9 +8,8 @@ import numpy as np
 from sfm_app.colmap.model import sparse_model
 from sfm_app.frame.control_points import ControlFit, fit_control_points
 from sfm_app.frame.known_lengths import control_places, distance_evidence, marker_evidence
-from sfm_app.frame.scale import GPS, IDENTITY, MetricFrame, ScaleEvidence, agree, move_model
+from sfm_app.frame.scale import GPS, MetricFrame, ScaleEvidence, agree, move_model
 from sfm_app.frame.sighted_points import PosedPhotos
-from sfm_app.geometry.poses import Similarity
 from sfm_app.products import write_frame
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import PhotoSet, Scene
@@ -81,15 +80,10 @@ def _control_evidence(
 
 def _agreed_frame(evidence: Sequence[ScaleEvidence], control: ControlFit | None, shape: float) -> MetricFrame:
     """Return the frame by the agreed scale; ground control points also give its place and directions."""
-    if not evidence:
-        return MetricFrame()
-    agreed = agree(evidence, shape)
-    similarity = IDENTITY if agreed.scale == 1.0 else Similarity(agreed.scale, np.eye(3), np.zeros(3))
-    source = ", ".join(one.name for one in agreed.used)
-    frame = MetricFrame(similarity, agreed.deviation, source, tuple(evidence), agreed.contradictions)
+    frame = agree(evidence, shape)
     if control is None:
         return frame
-    difference = abs(float(np.log(agreed.scale / control.from_model.scale)))
+    difference = abs(float(np.log(frame.from_model.scale / control.from_model.scale)))
     return replace(
         frame,
         from_model=control.from_model,

@@ -17,61 +17,32 @@ SAMPLES = 20_000
 """Points sampled on a surface."""
 
 
-def focal_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
-    """Return e_focal of thesis section 5.5.3: mean error of fx and fy in percent of the truth.
-
-    Raises:
-        ValueError: the photos have several cameras, and `photo` names none of them.
-    """
-    true = truth.cameras[photo].K if photo else truth.K
-    return float(50.0 * sum(abs(K[i, i] / true[i, i] - 1.0) for i in (0, 1)))
+def focal_error_percent(K: FloatArray, truth: Truth) -> float:
+    """Return e_focal of thesis section 5.5.3: mean error of fx and fy in percent of the truth, `Truth.K`."""
+    return float(50.0 * sum(abs(K[i, i] / truth.K[i, i] - 1.0) for i in (0, 1)))
 
 
-def center_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
+def center_error_percent(K: FloatArray, truth: Truth) -> float:
     """Return e_OC of thesis section 5.5.3: mean error of the optical center's x and y in percent of the truth."""
-    true = truth.cameras[photo].K if photo else truth.K
-    return float(50.0 * sum(abs(K[i, 2] / true[i, 2] - 1.0) for i in (0, 1)))
+    return float(50.0 * sum(abs(K[i, 2] / truth.K[i, 2] - 1.0) for i in (0, 1)))
 
 
-def surface_error(
-    vertices: FloatArray, faces: IndexArray, centers: Mapping[str, FloatArray], truth: Truth, samples: int = SAMPLES
-) -> float:
-    """Return the median distance of a reconstructed surface to the true one, as a share of the scene's size.
+def surface_errors(
+    vertices: FloatArray, faces: IndexArray, centers: Mapping[str, FloatArray], truth: Truth
+) -> tuple[FloatArray, FloatArray]:
+    """Return distances of a reconstructed surface to the true one, and of the true one to it, in scene sizes.
 
-    The reconstruction is aligned with the truth by the similarity between the camera centers. The scene's size is the
-    diagonal of the bounding box of the true surface that the photos see. The median ignores missing parts: see
-    `surface_coverage`.
+    The reconstruction is aligned with the truth by the similarity between the camera centers. The first distances are
+    of points spread evenly over its area, the second those of `seen_points`. The scene's size is the diagonal of the
+    bounding box of the true surface that the photos see.
 
     Raises:
         ValueError: fewer than 3 common photos, or the surface has no area.
         NumericalError: the camera centers lie on a line.
     """
-    return float(np.median(_distances_to_truth(vertices, faces, centers, truth, samples)))
-
-
-def surface_accuracy(
-    vertices: FloatArray, faces: IndexArray, centers: Mapping[str, FloatArray], truth: Truth, tolerance: float = 0.005
-) -> float:
-    """Return the share of a reconstructed surface, by area, that lies within `tolerance` scene sizes of the true one.
-
-    Arguments and errors are those of `surface_error`.
-    """
-    return float(np.mean(_distances_to_truth(vertices, faces, centers, truth) <= tolerance))
-
-
-def surface_coverage(
-    vertices: FloatArray, faces: IndexArray, centers: Mapping[str, FloatArray], truth: Truth, tolerance: float = 0.01
-) -> float:
-    """Return the share of the visible true surface within `tolerance` scene sizes of the reconstructed surface.
-
-    Every pixel of the photos that sees the surface has the same weight.
-
-    Arguments and errors are those of `surface_error`.
-    """
-    aligned = align_centers(centers, truth)(vertices)
-    if not areas(aligned, faces).sum() > 0:
-        raise ValueError("the surface has no area")
-    return float(np.mean(surface_distances(seen_points(truth), aligned, faces) <= tolerance * scene_size(truth)))
+    aligned, size = align_centers(centers, truth)(vertices), scene_size(truth)
+    to_truth = surface_distances(sample_surface(aligned, faces, SAMPLES)[0], truth.vertices, truth.faces)
+    return to_truth / size, surface_distances(seen_points(truth), aligned, faces) / size
 
 
 def scene_size(truth: Truth) -> float:
@@ -109,19 +80,12 @@ def align_centers(centers: Mapping[str, FloatArray], truth: Truth) -> Similarity
     return robust_similarity(a, b)
 
 
-def sample_surface(vertices: FloatArray, faces: IndexArray, count: int, seed: int = 0) -> FloatArray:
-    """Return (count, 3) points drawn uniformly by area from triangles (T, 3) of vertices (V, 3)."""
-    return sample_triangles(vertices, faces, count, seed)[0]
-
-
-def sample_triangles(
-    vertices: FloatArray, faces: IndexArray, count: int, seed: int = 0
-) -> tuple[FloatArray, IndexArray]:
-    """Sample a surface as `sample_surface` does, with the triangle (count,) of each point."""
+def sample_surface(vertices: FloatArray, faces: IndexArray, count: int) -> tuple[FloatArray, IndexArray]:
+    """Return points (count, 3) spread uniformly over triangles (T, 3) of vertices (V, 3), and the triangle of each."""
     area = areas(vertices, faces)
     if not area.sum() > 0:
         raise ValueError("the surface has no area")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     chosen = rng.choice(len(faces), count, p=area / area.sum())
     corners = vertices[faces[chosen]]
     u, v = rng.uniform(size=(2, count, 1))
@@ -135,11 +99,3 @@ def surface_distances(points: FloatArray, vertices: FloatArray, faces: IndexArra
     """Return (N,) distances from points (N, 3) to the triangles, in single precision."""
     queries = load_open3d().core.Tensor(points.astype(np.float32))
     return np.asarray(ray_caster(vertices, faces).compute_distance(queries).numpy(), dtype=np.float64)
-
-
-def _distances_to_truth(
-    vertices: FloatArray, faces: IndexArray, centers: Mapping[str, FloatArray], truth: Truth, samples: int = SAMPLES
-) -> FloatArray:
-    """Return (samples,) distances from uniform samples of a reconstructed surface to the true one, in scene sizes."""
-    points = sample_surface(align_centers(centers, truth)(vertices), faces, samples)
-    return surface_distances(points, truth.vertices, truth.faces) / scene_size(truth)

@@ -197,22 +197,6 @@ def make_tracks(options: TrackOptions, seed: int, max_setups: int = MAX_SETUPS) 
     raise ConfigError("no random cameras see the same points", hint="lower max_rotation_deg or max_shift")
 
 
-def pair_matches(
-    tracks: Tracks, outliers: Mapping[tuple[int, int], float] | None = None, outlier_range_px: float = 256.0,
-    seed: int = 0,
-) -> Iterator[tuple[tuple[int, int], FloatArray]]:  # fmt: skip
-    """Yield each pair of cameras and its matches (N, 4) x1, y1, x2, y2 in pixels; some have shares of outliers."""
-    shares = outliers or {}
-    check_ranges(
-        "synthetic correspondences",
-        outliers=set(shares) <= set(tracks.pairs) and all(0 <= share < 1 for share in shares.values()),
-    )
-    for i, j in tracks.pairs:
-        rng = np.random.default_rng([seed, 554, i, j])
-        x2, _ = _with_outliers(tracks.x[j], shares.get((i, j), 0.0), outlier_range_px, rng)
-        yield (i, j), np.column_stack([tracks.x[i], x2])
-
-
 def random_rotation(rng: np.random.Generator, max_angle_deg: float) -> FloatArray:
     """Return (3, 3) rotation about a uniformly random axis by a uniformly random angle."""
     return axis_rotation(_random_direction(rng), rng.uniform(0.0, max_angle_deg))

@@ -1,7 +1,7 @@
 """Render photo folders with ground truth; InputError for a folder that cannot be read or written."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
@@ -15,9 +15,10 @@ from PIL import Image
 
 from sfm_app.errors import InputError
 from sfm_app.files import replace_atomically
+from sfm_app.formats.meshes import triangles
 from sfm_app.progress import Progress, SilentProgress, track
 from sfm_app.synthetic.cameras import Camera, Lens, Views, camera_center, check_ranges
-from sfm_app.synthetic.render import GAMMA, PreparedScene, prepare, render_scene
+from sfm_app.synthetic.render import GAMMA, prepare, render_scene
 from sfm_app.synthetic.shapes import SyntheticScene
 from sfm_app.types.arrays import FloatArray
 
@@ -84,59 +85,39 @@ class Truth:
 
 
 def write_photo_folder(
-    folder: Path, scene: SyntheticScene, views: Views, options: PhotoOptions | None = None,
-    progress: Progress | None = None,
-) -> Truth:  # fmt: skip
-    """Render one JPEG without EXIF per view into a folder; `save_truth` writes the truth elsewhere."""
-    work = _FolderWork(folder, prepare(scene), views, options or PhotoOptions())
-    numbers = range(len(views.cam_from_world))
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for k in track(progress or SilentProgress(), numbers, "rendering photos", len(numbers)):
-            work.write_photo(k)
-    except OSError as err:
-        raise InputError(f"cannot write photos to {folder}: {err}", hint="choose another folder") from err
-    return Truth(dict(views.cameras), dict(views.cam_from_world), scene.vertices, scene.faces)
-
-
-def add_missing_photos(
     folder: Path, scene: SyntheticScene, views: Views, options: PhotoOptions | None = None, processes: int = 1,
     progress: Progress | None = None,
 ) -> Truth:  # fmt: skip
-    """Render the missing photos of a folder in parallel processes; the bytes are those of `write_photo_folder`.
+    """Render the missing photos of a folder, a JPEG without EXIF per view; `save_truth` writes the truth elsewhere.
 
     Other photos of the folder must be of the same scene, views and options, which is not checked. A script with more
     than one process needs a `__main__` guard.
     """
     missing = [k for k, name in enumerate(views.cam_from_world) if not (folder / name).exists()]
-    arguments, shown = (folder, scene, views, options or PhotoOptions()), progress or SilentProgress()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if processes == 1 and missing:
-            _start_process(*arguments)
-            for k in track(shown, missing, "rendering photos", len(missing)):
-                _write_in_process(k)
-        elif missing:
-            # a fork would copy the locks of Open3D's threads, but not the threads; Windows waits for 61 processes
-            with ProcessPoolExecutor(
-                min(processes, len(missing), 61), get_context("spawn"), _start_process, arguments
-            ) as pool:
-                done = pool.map(_write_in_process, missing)
-                for _ in track(shown, done, "rendering photos", len(missing)):
-                    pass
+        if missing:
+            done = _render(missing, processes, folder, scene, views, options or PhotoOptions())
+            for _ in track(progress or SilentProgress(), done, "rendering photos", len(missing)):
+                pass
     except OSError as err:
         raise InputError(f"cannot write photos to {folder}: {err}", hint="choose another folder") from err
-    finally:
-        _WORK.clear()
     return Truth(dict(views.cameras), dict(views.cam_from_world), scene.vertices, scene.faces)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+def _render(missing: list[int], processes: int, *work: Any) -> Iterator[None]:
+    if processes == 1:
+        yield from map(_FolderWork(*work).write_photo, missing)
+        return
+    # a fork would copy the locks of Open3D's threads, but not the threads; Windows waits for 61 processes
+    count = min(processes, len(missing), 61)
+    with ProcessPoolExecutor(count, get_context("spawn"), _start_process, work) as pool:
+        yield from pool.map(_write_in_process, missing)
+
+
 class _FolderWork:
-    folder: Path
-    prepared: PreparedScene
-    views: Views
-    options: PhotoOptions
+    def __init__(self, folder: Path, scene: SyntheticScene, views: Views, options: PhotoOptions) -> None:
+        self.folder, self.prepared, self.views, self.options = folder, prepare(scene), views, options
 
     def write_photo(self, number: int) -> None:
         """Render and write one photo, by its place among the views; the file is complete or missing."""
@@ -148,16 +129,16 @@ class _FolderWork:
             Image.fromarray(photo).save(path, format="JPEG", quality=self.options.quality)
 
 
-_WORK: dict[str, _FolderWork] = {}
-"""The work of this process, under "work"; set once at its start."""
+_WORK: list[_FolderWork] = []
+"""The work of this process, set once at its start."""
 
 
-def _start_process(folder: Path, scene: SyntheticScene, views: Views, options: PhotoOptions) -> None:
-    _WORK["work"] = _FolderWork(folder, prepare(scene), views, options)
+def _start_process(*work: Any) -> None:
+    _WORK.append(_FolderWork(*work))
 
 
 def _write_in_process(number: int) -> None:
-    _WORK["work"].write_photo(number)
+    _WORK[0].write_photo(number)
 
 
 def develop(image: FloatArray, options: PhotoOptions, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -219,18 +200,13 @@ def _camera_from_dict(image: Mapping[str, Any]) -> Camera:
     return Camera(K, int(image["width"]), int(image["height"]), lens)
 
 
-_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
-
-
 def _to_ply(vertices: FloatArray, faces: NDArray[np.int64]) -> bytes:
     header = (
         "ply\nformat binary_little_endian 1.0\n"
         f"element vertex {len(vertices)}\nproperty double x\nproperty double y\nproperty double z\n"
         f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
-    rows = np.empty(len(faces), dtype=_FACE)
-    rows["count"], rows["corners"] = 3, faces
-    return header.encode("ascii") + vertices.astype("<f8").tobytes() + rows.tobytes()
+    return header.encode("ascii") + vertices.astype("<f8").tobytes() + triangles(faces).tobytes()
 
 
 def _from_ply(data: bytes) -> tuple[FloatArray, NDArray[np.int64]]:
@@ -238,5 +214,5 @@ def _from_ply(data: bytes) -> tuple[FloatArray, NDArray[np.int64]]:
     lines = data[:end].decode("ascii").splitlines()
     counts = [int(line.split()[2]) for line in lines if line.startswith("element")]
     vertices = np.frombuffer(data, "<f8", 3 * counts[0], end).reshape(-1, 3)
-    faces = np.frombuffer(data, _FACE, counts[1], end + vertices.nbytes)["corners"]
-    return vertices.copy(), faces.astype(np.int64)
+    faces = np.frombuffer(data, triangles(np.empty((0, 3), np.int64)).dtype, counts[1], end + vertices.nbytes)
+    return vertices.copy(), faces["vertex_indices"].astype(np.int64)

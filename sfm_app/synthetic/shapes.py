@@ -129,9 +129,7 @@ def carve(
 
 def assemble(parts: Sequence[Shape], keep_texture: bool = False) -> Shape:
     """Join several shapes; with `keep_texture`, equal parts look equal, else the texture continues across them."""
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    vertices = np.concatenate([part.vertices for part in parts])
-    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
+    vertices, faces = _stack([(part.vertices, part.faces) for part in parts])
     texture = np.concatenate([part.texture for part in parts]) if keep_texture else vertices
     return Shape(vertices, faces, np.concatenate([part.normals for part in parts]), texture)
 
@@ -192,15 +190,18 @@ def _outer_radius(
 def grid(a: FloatArray, b: FloatArray) -> tuple[FloatArray, IndexArray]:
     """Return the points (N, 2) of a grid, and two triangles (T, 3) for each of its squares."""
     points = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
-    corner = (np.arange(len(a) - 1)[:, None] * len(b) + np.arange(len(b) - 1)).ravel()
-    right, up = corner + len(b), corner + 1
-    return points, np.concatenate([np.stack([corner, right, right + 1], -1), np.stack([corner, right + 1, up], -1)])
+    return points, _strips(len(a) - 1, len(b), len(a))
+
+
+def _stack(parts: Sequence[tuple[FloatArray, IndexArray]]) -> tuple[FloatArray, IndexArray]:
+    """Return the vertices of several meshes, and their triangles."""
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    faces = [faces + start for (_, faces), start in zip(parts, starts[:-1], strict=True)]
+    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
 
 
 def _build_shape(parts: list[tuple[FloatArray, IndexArray]]) -> Shape:
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-    vertices = np.concatenate([vertices for vertices, _ in parts])
-    faces = np.concatenate([faces + start for (_, faces), start in zip(parts, starts[:-1], strict=True)])
+    vertices, faces = _stack(parts)
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     proper = np.linalg.norm(cross, axis=1) > 1e-12  # not at the poles of a revolved profile
@@ -446,6 +447,4 @@ class SyntheticScene:
     @property
     def faces(self) -> NDArray[np.int64]:
         """(T, 3) vertex indices of all bodies."""
-        counts = [len(body.shape.vertices) for body in self.bodies]
-        starts = np.cumsum([0, *counts[:-1]])
-        return np.concatenate([body.shape.faces + start for body, start in zip(self.bodies, starts, strict=True)])
+        return _stack([(body.shape.vertices, body.shape.faces) for body in self.bodies])[1]

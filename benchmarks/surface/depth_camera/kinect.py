@@ -92,7 +92,7 @@ def kinect_scores(surface: Surface, poses: Mapping[str, Pose], truth: KinectTrut
         "cameras turned deg": round(float(np.median(offset.rotation_deg)), 2),
         "scan: rough cm": _cm(np.nanmedian(truth.scan.roughness)),
     }
-    samples = sample_surface(surface.vertices, surface.faces, count)
+    samples, _ = sample_surface(surface.vertices, surface.faces, count)
     row |= _figures(surface, samples, offset.world, truth, sorted(poses))
     moved = offset.world(samples)
     try:

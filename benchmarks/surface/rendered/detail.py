@@ -46,7 +46,7 @@ def detail_scores(surface: Surface, centers: Mapping[str, FloatArray], truth: Tr
     if not len(surface.faces):
         return {}
     size, aligned = scene_size(truth), align_centers(centers, truth)(surface.vertices)
-    points = sample_surface(aligned, surface.faces, SAMPLES)
+    points, _ = sample_surface(aligned, surface.faces, SAMPLES)
     to_truth = surface_distances(points, truth.vertices, truth.faces) / size
     seen = sights_of(truth, *sample_with_normals(truth, 3 * SAMPLES))
     to_found = surface_distances(seen.places[seen.count >= 2], aligned, surface.faces) / size

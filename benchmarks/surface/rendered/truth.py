@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from benchmarks.common.results import Row
 from sfm_app.synthetic.cameras import camera_center
-from sfm_app.synthetic.compare import align_centers, sample_surface, sample_triangles, scene_size, surface_distances
+from sfm_app.synthetic.compare import align_centers, sample_surface, scene_size, surface_distances
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.synthetic.render import cast_rays, ray_caster
 from sfm_app.types import Surface
@@ -39,7 +39,7 @@ def truth_scores(surface: Surface, centers: Mapping[str, FloatArray], truth: Tru
     if not len(surface.faces):
         return dict.fromkeys(names)
     size, aligned = scene_size(truth), align_centers(centers, truth)(surface.vertices)
-    to_truth = surface_distances(sample_surface(aligned, surface.faces, SAMPLES), truth.vertices, truth.faces) / size
+    to_truth = surface_distances(sample_surface(aligned, surface.faces, SAMPLES)[0], truth.vertices, truth.faces) / size
     to_found = surface_distances(seen, aligned, surface.faces) / size
     accuracy, completeness = float(np.mean(to_truth <= ACCURATE)), float(np.mean(to_found <= COMPLETE))
     both = 2.0 * accuracy * completeness / max(accuracy + completeness, 1e-9)
@@ -119,7 +119,7 @@ def sample_with_normals(truth: Truth, samples: int) -> tuple[FloatArray, FloatAr
         truth: truth of the rendered photos.
         samples: number of points.
     """
-    places, face = sample_triangles(truth.vertices, truth.faces, samples)
+    places, face = sample_surface(truth.vertices, truth.faces, samples)
     corners = truth.vertices[truth.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     unit = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-12)

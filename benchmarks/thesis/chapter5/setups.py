@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.thesis.chapter5.fits import Fits, FloatArray, robust_fits, with_outlying_fits
 from benchmarks.thesis.chapter5.sequences import ImageSequence
 from benchmarks.thesis.corners import with_outliers
-from sfm_app.synthetic.correspondences import TrackOptions, make_tracks, pair_matches
+from sfm_app.synthetic.correspondences import TrackOptions, Tracks, make_tracks
 from sfm_app.types.photos import PairId
 
 NOISE_PX = 0.5
@@ -38,6 +38,18 @@ class Trial(NamedTuple):
     size: tuple[int, int]
     K: FloatArray
     """(3, 3) true camera matrix."""
+
+
+def pair_matches(
+    tracks: Tracks, outliers: Mapping[PairId, float] | None = None, reach_px: float = REACH_PX, seed: int = 0
+) -> Iterator[tuple[PairId, FloatArray]]:
+    """Yield each pair of cameras and its matches (N, 4) x1, y1, x2, y2 in pixels; some have shares of outliers."""
+    shares = outliers or {}
+    for i, j in tracks.pairs:
+        rng, x2 = np.random.default_rng([seed, 554, i, j]), tracks.x[j].copy()
+        wrong = np.sort(rng.permutation(len(x2))[: round(shares.get((i, j), 0.0) * len(x2))])
+        x2[wrong] += rng.uniform(-reach_px, reach_px, (len(wrong), 2))
+        yield (i, j), np.column_stack([tracks.x[i], x2])
 
 
 def matching_outliers(seed: int) -> Iterator[Trial]:

@@ -12,13 +12,13 @@ from benchmarks.common.results import Row
 from benchmarks.thesis.chapter5.fits import Fits, FloatArray, robust_fits, with_outlying_fits
 from benchmarks.thesis.chapter5.lab import FigureResult, Lab
 from benchmarks.thesis.chapter5.panels import Panel, draw, panel_rows
-from benchmarks.thesis.chapter5.setups import HEAVY_OUTLIER_SHARE, NOISE_PX, REACH_PX
+from benchmarks.thesis.chapter5.setups import HEAVY_OUTLIER_SHARE, NOISE_PX, REACH_PX, pair_matches
 from benchmarks.thesis.chapter5.slices import parallel_pair
 from benchmarks.thesis.claims import Claim, verdict
 from sfm_app.selfcal.pairs import Pairs, prepare
 from sfm_app.selfcal.thesis.curves import center_curves, degeneracy, focal_curves, usable_curves
 from sfm_app.selfcal.thesis.zero_curves import meeting_point
-from sfm_app.synthetic.correspondences import TrackOptions, make_tracks, pair_matches
+from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import CameraPairs
 
 RANGE, SAMPLES = 3.0, 100

@@ -37,7 +37,7 @@ from sfm_app.camera.models import camera_matrix
 from sfm_app.geometry.epipolar import sampson_distance
 from sfm_app.selfcal.thesis.constraint_forms import essential
 from sfm_app.synthetic.cameras import axis_rotation
-from sfm_app.synthetic.correspondences import TrackOptions, make_tracks, pair_matches
+from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import Calibration
 
 K = camera_matrix(800.0, 900.0, 250.0, 200.0)
@@ -84,13 +84,13 @@ def test_a_sequence_of_corners_has_the_pairs_that_share_enough(tmp_path, monkeyp
 
 def test_outliers_spoil_a_fit_to_all_and_no_robust_one(tracks):
     pair, share = (0, 1), {(0, 1): 0.3}
-    spoilt = dict(pair_matches(tracks, share, seed=2))
+    spoilt = dict(setups.pair_matches(tracks, share, seed=2))
     exact = tracks.pairs[pair]
 
     def error(F):
         return sampson_distance(F, exact.exact_x1, exact.exact_x2).mean()
 
-    clean = robust_fits(dict(pair_matches(tracks)), seed=0)
+    clean = robust_fits(dict(setups.pair_matches(tracks)), seed=0)
     assert error(clean[pair].F) < 0.3 and error(robust_fits({pair: spoilt[pair]}, seed=0)[pair].F) < 0.3
     assert error(fit_to_all(spoilt[pair]).F) > 2.0 > 0.3 > error(fit_to_all(np.hstack([exact.x1, exact.x2])).F)
     mixed = with_outlying_fits(clean, {pair: spoilt[pair]})
@@ -254,3 +254,18 @@ def test_a_claim_is_judged_level_by_level(ransac, verdict):
     assert found["LEV-RANSAC is over three times as fast as RANSAC"].verdict == verdict
     assert found["LEV-RANSAC is faster than all others"].verdict == "not measured"
     assert "msac" in found["LEV-RANSAC is faster than all others"].numbers
+
+
+def test_matches_of_all_pairs_with_outliers_in_chosen_ones():
+    tracks = make_tracks(TrackOptions(corrupted_pairs=3), seed=5)
+    shares = {(0, 2): 0.25, (1, 4): 0.5}
+    found = dict(setups.pair_matches(tracks, shares, reach_px=100.0, seed=1))
+    again = dict(setups.pair_matches(tracks, {(0, 2): 0.25}, reach_px=100.0, seed=1))
+
+    assert list(found) == list(tracks.pairs)
+    for (i, j), matches in found.items():
+        assert matches.shape == (200, 4) and np.array_equal(matches[:, :2], tracks.x[i])
+        off = matches[:, 2:] - tracks.x[j]
+        assert np.count_nonzero(off.any(axis=1)) == 200 * shares.get((i, j), 0) and np.abs(off).max() <= 100.0
+    assert 52 < (found[1, 4][:, 2:] - tracks.x[4]).std() * 2**0.5 < 63, "uniform in +-100 has a deviation of 57.7"
+    assert np.array_equal(found[0, 2], again[0, 2]), "a pair's outliers do not depend on the others"

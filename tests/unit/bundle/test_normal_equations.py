@@ -1,19 +1,21 @@
 """Normal equations: of bundles that determine everything, and of others; elimination of points; widths."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sfm_app.bundle.normal_equations import (
     REDUCTION,
     Bundle,
-    Linearized,
     cost,
-    eliminate_points,
     elimination_width,
+    linearize,
     lost_points,
     project,
     reduce,
     usable_mask,
+    weigh,
 )
 from sfm_app.camera.projection import PERSPECTIVE
 
@@ -118,63 +120,53 @@ def test_what_cannot_be_seen_costs_more_than_what_is_off():
     assert cost(bundle, SCALE_PX) > 3 * SCALE_PX * REDUCTION.lost_px > 10 * cost(off, SCALE_PX)
 
 
-PHOTOS, CAMERAS, POINTS, SEEN, DAMPING = 5, 3, 20, 60, 1e-3
+PHOTOS, CAMERAS, POINTS, SEEN = 5, 3, 20, 60
+UNKNOWNS = 6 * PHOTOS + 12 * CAMERAS
 
 
 @pytest.fixture
-def bundle():
+def measured():
     """Observations in any order, some points twice in a photo or never, photos of several cameras, one of none."""
     rng = np.random.default_rng(0)
-    photo = rng.integers(0, PHOTOS - 1, SEEN)
-    point = rng.integers(0, POINTS - 2, SEEN)
-    by_point = np.zeros((SEEN, 2, 3))
-    for p in np.unique(point):
-        rows = np.flatnonzero(point == p)
-        columns = min(3, 2 * len(rows))
-        by_point[rows, :, :columns] = np.linalg.qr(rng.normal(size=(2 * len(rows), columns)))[0].reshape(-1, 2, columns)
-    by_view = rng.normal(size=(SEEN, 2, 18))
-    return Linearized(photo, photo % CAMERAS, point, by_view, by_point, (PHOTOS, CAMERAS, POINTS))
+    photo, point = rng.integers(0, PHOTOS - 1, SEEN), rng.integers(0, POINTS - 2, SEEN)
+    half = PHOTOS + 2 * (photo % CAMERAS)
+    derivatives = rng.normal(size=(SEEN, 2)), rng.normal(size=(SEEN, 2, 18)), rng.normal(size=(SEEN, 2, 3))
+    still = bundle_of(np.zeros((POINTS, 3)), *ring(PHOTOS))
+    return replace(still, photo=photo, point=point), derivatives, np.column_stack([photo, half, half + 1])
 
 
-def dense(bundle):
-    """The derivatives by all poses and cameras, and by all points."""
-    J, Jp = np.zeros((SEEN, 2, 6 * PHOTOS + 12 * CAMERAS)), np.zeros((SEEN, 2, 3 * POINTS))
+def test_points_are_eliminated_as_by_the_pseudoinverse_of_all_derivatives(measured):
+    bundle, derivatives, blocks = measured
+    used = np.arange(SEEN) % 7 > 0
+    found = linearize(bundle, derivatives, blocks, UNKNOWNS, 2.0, depth=np.where(used, 1.0, -1.0))
+    r, by_view, by_point, _ = weigh(*derivatives, used, 2.0)
+    J, Jp = np.zeros((SEEN, 2, UNKNOWNS)), np.zeros((SEEN, 2, 3 * POINTS))
     for k in range(SEEN):
-        first = 6 * bundle.photo[k], 6 * PHOTOS + 12 * bundle.camera[k]
-        J[k, :, first[0] : first[0] + 6] = bundle.by_view[k, :, :6]
-        J[k, :, first[1] : first[1] + 12] = bundle.by_view[k, :, 6:]
-        Jp[k, :, 3 * bundle.point[k] : 3 * bundle.point[k] + 3] = bundle.by_point[k]
-    return J.reshape(2 * SEEN, -1), Jp.reshape(2 * SEEN, -1)
+        J[k, :, (6 * blocks[k, :, None] + np.arange(6)).ravel()] = by_view[k].T
+        Jp[k, :, 3 * bundle.point[k] + np.arange(3)] = by_point[k].T
+    J, Jp = J.reshape(2 * SEEN, -1), Jp.reshape(2 * SEEN, -1)
+    left = np.eye(2 * SEEN) - Jp @ np.linalg.pinv(Jp)
+
+    assert np.allclose(found.eliminate_points().toarray(), J.T @ left @ J, atol=1e-9)
+    assert np.allclose(found.drop_points(found.r), left @ r.ravel(), atol=1e-9)
+    best = found.unwhiten(found.by_point.T @ found.r).ravel()
+    assert np.allclose(Jp @ best, r.ravel() - left @ r.ravel(), atol=1e-9)
+    assert found.used == used.sum() and found.rank.sum() == np.linalg.matrix_rank(Jp)
 
 
-def test_the_matrix_is_that_of_all_derivatives_without_the_points(bundle):
-    J, Jp = dense(bundle)
-    expected = J.T @ J - J.T @ Jp @ Jp.T @ J + DAMPING * np.eye(J.shape[1])
-    S, rows = eliminate_points(bundle, DAMPING)
-    assert np.allclose(S.toarray(), expected[: 6 * PHOTOS, : 6 * PHOTOS], atol=1e-12)
-    assert np.allclose(rows, expected[6 * PHOTOS :], atol=1e-12)
-
-
-def test_products_are_those_of_all_derivatives(bundle):
-    J, Jp = dense(bundle)
-    rng = np.random.default_rng(1)
-    values, change = rng.normal(size=(SEEN, 2)), rng.normal(size=J.shape[1])
-    moved = bundle.move(change[: 6 * PHOTOS], change[6 * PHOTOS :])
-    assert np.allclose(bundle.sum_by_point(values).ravel(), Jp.T @ values.ravel(), atol=1e-12)
-    assert np.allclose(bundle.sum_by_view(values), J.T @ values.ravel(), atol=1e-12)
-    assert np.allclose(bundle.drop_points(values).ravel(), values.ravel() - Jp @ Jp.T @ values.ravel(), atol=1e-12)
-    assert np.allclose(moved.ravel(), J @ change, atol=1e-12)
-    assert np.allclose(bundle.camera_squares(), (J[:, 6 * PHOTOS :] ** 2).sum(axis=0), atol=1e-12)
-
-
-def test_scores_are_the_shares_of_the_photos_in_what_is_left(bundle):
-    J, Jp = dense(bundle)
-    rng = np.random.default_rng(2)
-    give, left_over = rng.normal(size=(6 * PHOTOS, 12 * CAMERAS)), rng.normal(size=(SEEN, 2))
-    follow = J @ np.vstack([-give, np.eye(12 * CAMERAS)])
-    products = (follow - Jp @ Jp.T @ follow) * left_over.ravel()[:, None]
-    expected = [products.reshape(SEEN, 2, -1)[bundle.photo == i].sum(axis=(0, 1)) for i in range(PHOTOS)]
-    assert np.allclose(bundle.score(give, left_over), expected, atol=1e-12)
+@pytest.mark.parametrize("cameras", [1, 3])
+def test_scores_are_the_shares_of_the_photos_in_the_gradient(cameras):
+    lenses = {"params": np.tile(CAMERA, (cameras, 1)), "camera": np.arange(6) % cameras}
+    bundle = replace(bundle_of(box(), *ring(6)), family=np.tile(FAMILY, cameras), **lenses)
+    found = reduce(bundle, SCALE_PX)
+    observed, n = found.observed, 12 * cameras
+    changes = np.column_stack([[*found.pose_step, *[0.0] * n], np.vstack([-found.pose_response, np.eye(n)])])
+    moved = observed.by_view @ changes
+    left, follow = np.split(observed.drop_points(np.column_stack([observed.r, moved])), [2], axis=1)
+    products = (follow * (left[:, :1] - left[:, 1:])).reshape(-1, 2, n).sum(axis=1)
+    expected = [products[bundle.photo == photo].sum(axis=0) for photo in range(6)]
+    tolerance = 1e-9 * np.abs(found.scores).max()
+    assert np.allclose(found.scores, expected, atol=tolerance) and np.allclose(sum(expected), found.g, atol=tolerance)
 
 
 def observations(tracks):

@@ -14,12 +14,11 @@ from sfm_app.bundle.rolling_shutter import (
     ShutterBundle,
     apply_shutter_step,
     estimate_readout,
-    linearize,
     move_to_middle_row,
     path_velocities,
     project_rows,
     shutter_cost,
-    solve_step,
+    shutter_step,
 )
 from sfm_app.camera.projection import CAMERA, PERSPECTIVE
 from sfm_app.synthetic.cameras import Camera, make_camera
@@ -212,7 +211,7 @@ def test_steps_lead_to_where_only_the_noise_is_left(model):
     for _ in range(6):
         pull = np.zeros_like(precision)
         pull[offsets] = -precision[offsets] * model.offsets.ravel()
-        step = solve_step(linearize(model, precision, pull, SCALE_PX, held=True))
+        step = shutter_step(model, precision, pull, SCALE_PX, held=True)
         model = apply_shutter_step(model, step, 1.0)
 
     assert shutter_cost(model, SCALE_PX) < 0.1 * before and 0.2 < step.noise_px < 0.35
@@ -223,8 +222,8 @@ def test_priors_hold_what_they_are_sure_of(model):
     precision = np.zeros(model.unknowns)
     offsets = slice(POSE * 9, 2 * POSE * 9)
     precision[offsets] = 1e12
-    free = solve_step(linearize(model, 0.0 * precision, 0.0 * precision, SCALE_PX, held=False))
-    held = solve_step(linearize(model, precision, 0.0 * precision, SCALE_PX, held=False))
+    free = shutter_step(model, 0.0 * precision, 0.0 * precision, SCALE_PX, held=False)
+    held = shutter_step(model, precision, 0.0 * precision, SCALE_PX, held=False)
     assert np.abs(free.views[offsets]).max() > 1e-4 and np.abs(held.views[offsets]).max() < 1e-6
     assert held.deviation < free.deviation
 

@@ -146,8 +146,6 @@ def test_markers_do_not_touch_each_other_or_the_margin(paper, side):
     ("change", "says"),
     [
         ({"side_m": 0.5}, "no marker of 50 cm fits"),
-        ({"family": "qr"}, "no family of markers"),
-        ({"paper": "b5"}, "no paper"),
         ({"first": 5000}, "or none has number 5000"),
     ],
 )

@@ -14,31 +14,31 @@ def pieces(scales, deviation=0.01):
     return [ScaleEvidence(f"marker {k}", scale, deviation) for k, scale in enumerate(scales)]
 
 
-def test_one_is_taken_as_it_is():
+def test_one_is_taken_as_it_is_and_none_leaves_the_unit_open():
     found = agree(pieces([2.0]))
-    assert (found.scale, found.deviation) == pytest.approx((2.0, 0.01))
-    assert found.contradictions == ()
+    assert (found.from_model.scale, found.deviation) == pytest.approx((2.0, 0.01))
+    assert found.contradictions == () and not agree([]).is_metric
 
 
 def test_the_deviation_of_the_mean_covers_the_truth():
     rng, normalized = np.random.default_rng(0), []
     for _ in range(300):
         found = agree(pieces(3.0 * np.exp(0.01 * rng.normal(size=5))))
-        normalized.append(np.log(found.scale / 3.0) / found.deviation)
+        normalized.append(np.log(found.from_model.scale / 3.0) / found.deviation)
     assert 0.6 < np.std(normalized) < 1.2
 
 
 def test_a_wrong_one_among_three_is_named_and_left_out():
     found = agree(pieces([2.0, 2.01, 2.5]))
-    assert found.scale == pytest.approx(2.005, rel=1e-3)
-    assert [one.name for one in found.used] == ["marker 0", "marker 1"]
+    assert found.from_model.scale == pytest.approx(2.005, rel=1e-3)
+    assert found.source == "marker 0, marker 1" and len(found.evidence) == 3
     assert found.contradictions == ("marker 2 contradicts the 2 others: by it, the model is 25 % larger",)
 
 
 def test_two_that_contradict_are_named_and_the_deviation_covers_half_of_the_difference():
     exact, vague = ScaleEvidence("marker 1", 2.0, 0.001), ScaleEvidence("GPS", 2.4, 0.02)
     found = agree([vague, exact])
-    assert found.scale == 2.0
+    assert found.from_model.scale == 2.0
     assert found.deviation == pytest.approx(np.log(1.2) / 2)
     assert found.contradictions == ("GPS contradicts marker 1: by it, the model is 20 % larger",)
 

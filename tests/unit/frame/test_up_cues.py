@@ -15,7 +15,6 @@ from sfm_app.frame.up_cues import (
     roll_hypotheses,
     sky_asymmetry,
     slope_asymmetry,
-    small_picture,
 )
 from sfm_app.frame.up_direction import CUES, OPTIONS, Cue, Scenery, odds, select_roll
 from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at, pixel_rays
@@ -224,8 +223,3 @@ def test_nats_grow_with_the_cue_and_with_the_points_and_end():
 def test_odds_are_rounded_and_end():
     assert (odds(0.0), odds(np.log(123.4))) == (1.0, 120.0)
     assert 1e6 < odds(np.inf) < 1.3e6
-
-
-@pytest.mark.parametrize(("size", "small"), [((1000, 1500), (171, 256)), ((40, 90), (40, 90))])
-def test_a_small_picture_keeps_its_shape(size, small):
-    assert small_picture(np.zeros(size, np.uint8)).shape == small

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm_app.frame.vanishing_points import line_segments
+from sfm_app.frame.vanishing_points import line_segments, shrink
 
 
 @pytest.mark.parametrize("size", [(600, 400), (3000, 2000)])
@@ -25,3 +25,8 @@ def test_edges_of_a_tilted_square(size):
 
 def test_no_edges_no_segments():
     assert line_segments(np.full((300, 400), 90, np.uint8)).shape == (0, 4)
+
+
+@pytest.mark.parametrize(("size", "small"), [((1000, 1500), (171, 256)), ((40, 90), (40, 90))])
+def test_a_photo_is_shrunk_in_its_shape(size, small):
+    assert shrink(np.zeros(size, np.uint8), 256).shape == small

@@ -1,6 +1,7 @@
 """Cuts of a group into parts, and the files of a part."""
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -8,12 +9,11 @@ import pytest
 from sfm_app.mapping.attempt import Group
 from sfm_app.mapping.part_mapping import (
     OPTIONS,
+    RESULT,
     PartInputs,
     cut_group,
-    joins_from_plain,
-    joins_to_plain,
     link_weights,
-    pairs_of_parts,
+    map_part,
     part_of_group,
     read_inputs,
     write_inputs,
@@ -112,23 +112,16 @@ def group_of(street):
 
 def test_a_part_of_a_group_has_what_concerns_its_photos(street):
     group = group_of(street)
-    pairs, _ = pairs_of_parts(group.evidence.matches.matches, [(3, 4, 5), (5, 6)])
-    part = part_of_group(group, (3, 4, 5), pairs)
+    part = part_of_group(group, (3, 4, 5))
     own = part.evidence
     assert list(own.matches.images) == list(own.matches.keypoints) == [3, 4, 5]
     assert list(own.matches.matches) == list(own.views.fits) == list(part.graph.poses) == [(3, 4), (3, 5), (4, 5)]
     assert part.graph.groups == ((3, 4, 5),) and list(own.intrinsics.cameras) == ["one"]
 
 
-def test_pairs_belong_to_every_part_that_has_both_photos():
-    pairs = [(1, 2), (2, 3), (3, 4), (1, 4), (4, 5)]
-    assert pairs_of_parts(pairs, [(1, 2, 3), (2, 3, 4), (9,)]) == [[(1, 2), (2, 3)], [(2, 3), (3, 4)], []]
-
-
 def test_inputs_are_read_back_as_they_were(street, tmp_path):
     group = group_of(street)
-    (pairs,) = pairs_of_parts(group.evidence.matches.matches, [range(21, 41)])
-    part = part_of_group(group, range(21, 41), pairs)
+    part = part_of_group(group, range(21, 41))
     settings = Settings.from_mapping({"seed": 7, "scene": {"part_photos": 33}})
 
     write_inputs(
@@ -155,6 +148,9 @@ def test_inputs_are_read_back_as_they_were(street, tmp_path):
     assert read_back.intrinsics.to_dict() == given.intrinsics.to_dict()
 
 
-def test_false_joins_travel_as_plain_values():
-    joins = (LookAlikes(((1, 2), (3, 4)), 0.875), LookAlikes(((5, 6),), 0.5))
-    assert joins_from_plain(json.loads(json.dumps(joins_to_plain(joins)))) == joins
+def test_a_finished_part_is_read_with_its_false_joins(tmp_path):
+    joins = LookAlikes(((1, 2), (3, 4)), 0.875), LookAlikes(((5, 6),), 0.5)
+    result = {"models": ["model-0"], "mapper": "usual", "tried": [], "false_joins": [asdict(join) for join in joins]}
+    (tmp_path / RESULT).write_text(json.dumps(result))
+    found = map_part({"scratch": str(tmp_path), "photos": "", "seed": 0})
+    assert found.false_joins == joins and found.models == (str(tmp_path / "model-0"),)

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfm_app.errors import ConfigError
-from sfm_app.synthetic.correspondences import PairOptions, TrackOptions, make_pair, make_tracks, pair_matches
+from sfm_app.synthetic.correspondences import PairOptions, TrackOptions, make_pair, make_tracks
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -142,21 +142,3 @@ def test_the_setups_are_those_of_the_thesis(seed):
 def test_a_seed_keeps_its_setup_whatever_corrupts_it(change):
     one, other = make_tracks(TrackOptions(), 3), make_tracks(TrackOptions(**change), 3)
     assert np.array_equal(one.X, other.X) and np.array_equal(one.K, other.K) and np.array_equal(one.R, other.R)
-
-
-def test_matches_of_all_pairs_with_outliers_in_chosen_ones():
-    tracks = make_tracks(TrackOptions(corrupted_pairs=3), seed=5)
-    shares = {(0, 2): 0.25, (1, 4): 0.5}
-    found = dict(pair_matches(tracks, shares, outlier_range_px=100.0, seed=1))
-    again = dict(pair_matches(tracks, {(0, 2): 0.25}, outlier_range_px=100.0, seed=1))
-
-    assert list(found) == list(tracks.pairs)
-    for (i, j), matches in found.items():
-        assert matches.shape == (200, 4) and np.array_equal(matches[:, :2], tracks.x[i])
-        off = matches[:, 2:] - tracks.x[j]
-        assert np.count_nonzero(off.any(axis=1)) == 200 * shares.get((i, j), 0) and np.abs(off).max() <= 100.0
-    assert 52 < (found[1, 4][:, 2:] - tracks.x[4]).std() * 2**0.5 < 63, "uniform in +-100 has a deviation of 57.7"
-    assert np.array_equal(found[0, 2], again[0, 2]), "a pair's outliers do not depend on the others"
-    for wrong in ({(2, 0): 0.1}, {(0, 1): 1.0}):
-        with pytest.raises(ConfigError, match="outliers"):
-            list(pair_matches(tracks, wrong))

@@ -10,7 +10,6 @@ from sfm_app.errors import ConfigError, InputError
 from sfm_app.synthetic.cameras import Camera, Lens, Views, make_camera
 from sfm_app.synthetic.photo_folder import (
     PhotoOptions,
-    add_missing_photos,
     develop,
     load_truth,
     save_truth,
@@ -49,7 +48,7 @@ def test_the_folder_holds_photos_and_nothing_else(photos):
 def test_the_same_seed_gives_the_same_bytes(photos, still_life, four_views, tmp_path):
     folder, _ = photos
     progress = Counter()
-    write_photo_folder(tmp_path / "again", still_life, four_views, PhotoOptions(seed=3), progress)
+    write_photo_folder(tmp_path / "again", still_life, four_views, PhotoOptions(seed=3), progress=progress)
     write_photo_folder(tmp_path / "other", still_life, four_views, PhotoOptions(seed=4))
     for path in folder.iterdir():
         assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes()
@@ -62,7 +61,7 @@ def test_missing_photos_are_added_with_the_same_bytes(processes, photos, still_l
     folder, truth = photos
     (tmp_path / "view_01.jpg").write_bytes(b"left as it is")
     progress = Counter()
-    found = add_missing_photos(tmp_path, still_life, four_views, PhotoOptions(seed=3), processes, progress)
+    found = write_photo_folder(tmp_path, still_life, four_views, PhotoOptions(seed=3), processes, progress)
 
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in folder.iterdir())
     for path in folder.iterdir():
@@ -71,7 +70,7 @@ def test_missing_photos_are_added_with_the_same_bytes(processes, photos, still_l
     assert progress.seen == [("rendering photos", 3), 1, 1, 1, "done"]
     assert list(found.cam_from_world) == list(truth.cam_from_world)
     progress.seen.clear()
-    add_missing_photos(tmp_path, still_life, four_views, PhotoOptions(seed=3), processes, progress)
+    write_photo_folder(tmp_path, still_life, four_views, PhotoOptions(seed=3), processes, progress)
     assert progress.seen == [], "nothing is missing"
 
 
