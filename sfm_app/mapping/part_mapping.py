@@ -5,6 +5,7 @@ import logging
 import shutil
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from heapq import heappop, heappush
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.worker_process import MappingTask, start_worker
+from sfm_app.colmap.worker_process import start_worker
 from sfm_app.errors import BackendError
 from sfm_app.files import digest_file, load_arrays, replace_atomically
 from sfm_app.mapping.attempt import Group
@@ -445,11 +446,12 @@ def _prepare_part(
 
 def map_part(task: PartTask) -> PartResult:
     """Map one part in a separate process, and wait for it. Depends on nothing but the task."""
+    from sfm_app.mapping.part_process import work  # it imports this module
+
     folder = Path(task.folder)
     if not (folder / RESULT).exists():
-        work: MappingTask = {"scratch": task.folder, "photos": task.photos, "seed": 0}
         try:
-            with start_worker("sfm_app.mapping.part_process", work) as process:
+            with start_worker(partial(work, task)) as process:
                 while not process.has_ended(0.2):
                     if (folder.parent / STOP).exists():
                         return PartResult((), "", ("stopped",))

@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from itertools import combinations
 from pathlib import Path
 from threading import Lock
 from typing import TypeVar
@@ -23,14 +24,14 @@ from sfm_app.colmap.features import (
     count_features,
     enter_rows,
     exhaustive_pairs,
-    find_and_match,
     find_in_chunk,
+    find_sift,
     match_chunk,
     match_chunk_apart,
     photos_without_features,
     write_snapshot,
 )
-from sfm_app.colmap.worker_process import ProcessGroup, SiftOption
+from sfm_app.colmap.worker_process import ProcessGroup, ProgressReporter, SiftOption, run_worker
 from sfm_app.errors import InputError, PluginError
 from sfm_app.files import load_arrays, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.numerical import Json
@@ -369,7 +370,8 @@ def find_all_features(method: FeatureMethod, run: RunContext, pairs: Sequence[Pa
         return find_in_chunks(method.sift, list(names.values()), run)
     if method.sift is not None:
         settings = SiftSettings(place.photos, run.mask_dir, options, method.sift)
-        return find_and_match(place.database, settings, list(names.values()), run.workers, run.progress, ())
+        find = partial(find_sift, place.database, settings, list(names.values()), run.workers, ProgressReporter())
+        return run_worker(find, "finding features", run.progress)
     if not resume_or_clear(place.feature_parts, run.fingerprint):
         mark_unfinished(place.feature_parts, run.fingerprint)
     find_features(method, names, run)
@@ -378,15 +380,11 @@ def find_all_features(method: FeatureMethod, run: RunContext, pairs: Sequence[Pa
 
 def match_pairs(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Json]:
     """Match pairs of photos with known features, except those of a killed run; see `fill_database`."""
-    place, options = run.workspace, run.settings.matching
     if pairs is not None and not pairs:
         return {}
-    if method.sift is not None and (run.spread or run.workers > 1):
-        return match_in_chunks(method.sift, pairs, run)
     if method.sift is not None:
-        settings = SiftSettings(place.photos, None, options, method.sift)
-        return find_and_match(place.database, settings, [], 1, run.progress, pairs)
-    _match(method, all_pairs(photo_names(place.database)) if pairs is None else pairs, run)
+        return match_in_chunks(method.sift, pairs, run)
+    _match(method, all_pairs(photo_names(run.workspace.database)) if pairs is None else pairs, run)
     return {}
 
 
@@ -397,8 +395,7 @@ def forget_features(run: RunContext) -> None:
 
 def all_pairs(photos: Sequence[int] | Mapping[int, str]) -> list[PairId]:
     """Return all pairs of photos, the smaller id first."""
-    ids = sorted(photos)
-    return [(first, second) for place, first in enumerate(ids) for second in ids[place + 1 :]]
+    return list(combinations(sorted(photos), 2))
 
 
 def _match(method: FeatureMethod, pairs: Sequence[PairId], run: RunContext) -> None:

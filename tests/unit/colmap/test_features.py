@@ -6,6 +6,7 @@ from contextlib import closing
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 
@@ -17,8 +18,8 @@ from sfm_app.colmap.features import (
     SiftSettings,
     enter_rows,
     exhaustive_pairs,
-    find_and_match,
     find_in_chunk,
+    find_sift,
     match_chunk,
     match_chunk_apart,
     photos_without_features,
@@ -61,7 +62,10 @@ def made(tmp_path_factory):
     create_database(place / "empty.db", PhotoSet(place / "photos", tuple(photos), (), None))
     shutil.copyfile(place / "empty.db", place / "whole.db")
     settings = SiftSettings(place / "photos", None, OPTIONS)
-    find_and_match(place / "whole.db", settings, [photo.name for photo in photos], 1, SilentProgress())
+    find_sift(place / "whole.db", settings, [photo.name for photo in photos], 1, SilentProgress())
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.skip_geometric_verification, matching.num_threads = True, 1
+    pycolmap.match_exhaustive(place / "whole.db", matching_options=matching, device=pycolmap.Device.cpu)
     return place
 
 
@@ -161,9 +165,7 @@ def find(place, database, **options):
     photos = PhotoSet(place, tuple(Photo(name, *SIZE, "g") for name in (RICH, POOR, EMPTY)))
     if not database.exists():
         create_database(database, photos)
-    find_and_match(
-        database, SiftSettings(place, None, MatchSettings(**options)), (RICH, POOR, EMPTY), 1, SilentProgress(), ()
-    )
+    find_sift(database, SiftSettings(place, None, MatchSettings(**options)), (RICH, POOR, EMPTY), 1, SilentProgress())
     graph = read_match_graph(database, photos)
     return {graph.images[key].name: at for key, at in graph.keypoints.items()}
 
