@@ -6,7 +6,7 @@ its files are read, because COLMAP hangs on some damaged ones.
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,11 @@ def _read_json(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
+def hash_files(*names: str) -> Callable[[Workspace], str]:
+    """Return the function that hashes these files, and those in these folders, of an output folder."""
+    return lambda place: digest_files(place.root, *names)
+
+
 # photos.json: the photos, those left out, and hashes of the 8-bit copies.
 
 
@@ -71,9 +76,8 @@ def read_copy_hashes(place: Workspace) -> Mapping[str, str | None]:
     return copies
 
 
-def hash_photos(place: Workspace) -> str:
-    """Return a hash of photos.json, which holds hashes of the copies."""
-    return digest_files(place.root, place.photo_set.name)
+hash_photos = hash_files("photos.json")
+"""It holds hashes of the copies."""
 
 
 # database.db: keypoints and matches. COLMAP writes it.
@@ -106,9 +110,7 @@ def read_view_graph(place: Workspace) -> ViewGraph:
     return ViewGraph.from_arrays(load_arrays(place.view_graph))
 
 
-def hash_view_graph(place: Workspace) -> str:
-    """Return a hash of view_graph.npz."""
-    return digest_files(place.root, place.view_graph.name)
+hash_view_graph = hash_files("view_graph.npz")
 
 
 # calibration.json: the cameras before mapping.
@@ -124,9 +126,7 @@ def read_intrinsics(place: Workspace) -> Intrinsics:
     return Intrinsics.from_dict(_read_json(place.calibration))
 
 
-def hash_intrinsics(place: Workspace) -> str:
-    """Return a hash of calibration.json."""
-    return digest_files(place.root, place.calibration.name)
+hash_intrinsics = hash_files("calibration.json")
 
 
 # sparse/ and scene.json: COLMAP's model, and what it cannot hold.
@@ -170,9 +170,7 @@ def read_scene(place: Workspace) -> Scene:
     return replace(scene, gps_deviation=values.get("gps_deviation"))
 
 
-def hash_scene(place: Workspace) -> str:
-    """Return a hash of the main model and scene.json."""
-    return digest_files(place.root, place.sparse.name, place.scene.name)
+hash_scene = hash_files("sparse", "scene.json")
 
 
 # scale.json: the frame of exported files.
@@ -188,9 +186,7 @@ def read_frame(place: Workspace) -> MetricFrame:
     return MetricFrame.from_dict(_read_json(place.scale))
 
 
-def hash_frame(place: Workspace) -> str:
-    """Return a hash of scale.json."""
-    return digest_files(place.root, place.scale.name)
+hash_frame = hash_files("scale.json")
 
 
 # surface/surface.npz, and surface/fine.npz for normal maps.

@@ -15,6 +15,7 @@ from rich.table import Column
 from rich.text import Text
 
 from sfm_app.cli.output import STAGE_TITLES, WIDTH, fold_lines, terminal_width, to_printable
+from sfm_app.progress import Progress
 
 LONG_STAGE_S, SILENCE_S, LINE_EVERY_S = 10.0, 5.0, 30.0
 """Seconds of a stage from which on its speed is printed; without a bar, seconds until the title of a stage is printed,
@@ -27,7 +28,7 @@ LABEL_COLUMNS, BAR_COLUMNS, TITLE_COLUMNS = 32, 16, 38
 INDENT = " " * 6
 
 
-class Terminal:
+class Terminal(Progress):
     """Progress on stderr: a line per stage and a bar on a terminal, a few more lines elsewhere, nothing when quiet.
 
     On a terminal the bar moves as long as a stage runs. Elsewhere, `check_silence` prints the title of a long stage.
