@@ -14,7 +14,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from typing import IO, TypeAlias, TypeVar
+from typing import IO, TypeAlias, TypeVar, cast
 
 from sfm_app.colmap.backend import log_level, show_log
 from sfm_app.errors import BackendError
@@ -87,8 +87,9 @@ def start_worker(call: Callable[[], object]) -> Iterator[WorkerProcess]:
     ):
         try:
             with contextlib.suppress(OSError):  # the process has failed already; `check` reports why
-                pickle.dump(call, process.stdin)  # type: ignore[arg-type] - a pipe
-                process.stdin.flush()  # type: ignore[union-attr]
+                pipe = cast(IO[bytes], process.stdin)
+                pickle.dump(call, pipe)
+                pipe.flush()
             yield WorkerProcess(process, output)
         finally:
             if process.poll() is None:

@@ -19,6 +19,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from importlib.metadata import PackageNotFoundError, entry_points, version
@@ -29,7 +30,6 @@ from typing import IO, Any, TypeVar
 from sfm_app.errors import BackendError, ClusterError, ConfigError
 from sfm_app.files import digest_file, replace_atomically
 from sfm_app.operating_system import cpu_seconds, end_group, end_own_group, group_options, watch_parent
-from sfm_app.runtime.parallel import RemoteExecutor
 from sfm_app.settings import LOCAL_ADDRESS, ClusterSettings
 from sfm_app.tasks import Shared, Task
 
@@ -402,8 +402,6 @@ class Cluster:
         Raises:
             ClusterError: the scheduler is gone, or it has had no workers for too long.
         """
-        from concurrent.futures import CancelledError
-
         from distributed import KilledWorker
         from distributed.comm import CommClosedError
 
@@ -539,24 +537,12 @@ class _Flight:
     future: Any = field(default=None)
 
 
-class ClusterExecutor(RemoteExecutor):
+class ClusterExecutor(ThreadPoolExecutor):
     """Threads of this process, and a cluster for tasks; on this machine, `workers` is also the most tasks at once."""
 
     def __init__(self, cluster: Cluster, workers: int) -> None:
         super().__init__(max_workers=workers, thread_name_prefix="sfm")
         self.cluster, self.workers = cluster, workers
-
-    def with_threads(self, workers: int) -> "ClusterExecutor":
-        """Return an executor of the same cluster with another number of threads."""
-        return ClusterExecutor(self.cluster, workers)
-
-    def threads_elsewhere(self) -> int:
-        """Return how many tasks the cluster does at once."""
-        return self.cluster.threads()
-
-    def cpu_seconds_elsewhere(self) -> float:
-        """Return the CPU seconds of all tasks that the cluster has finished."""
-        return self.cluster.cpu_seconds
 
     def spread(self, task: Task[Result], items: Iterable[Any]) -> Iterator[Result]:
         """Yield the results of a task in the order of the items, which are drawn only as they are needed.
@@ -603,40 +589,30 @@ class _Spreading:
         call = Call(self.probe, self.function, self.serializer.serialize(items))
         return _Flight(items, self.cluster.submit(call, next(self._keys)))
 
-    def _land(self, flight: _Flight) -> Iterator[Any]:
+    def _land(self, flight: _Flight, *, again: bool = False) -> Iterator[Any]:
+        """Yield the results of a call; if it lost its workers, its items are sent once more (`again`), each alone."""
         reply = self._wait(flight)
+        if reply is None and again:
+            raise ClusterError(
+                f"{self.name} of {describe_item(flight.items[0])} ended every worker that tried: perhaps their memory "
+                "was full",
+                hint="give workers more memory, or use --quality draft; the same command resumes",
+            )
         if reply is None:  # calls that waited on the lost workers count as lost, too: find the one to blame
             for item in flight.items:
-                yield from self._land_alone(item)
+                yield from self._land(self._send([item]), again=True)
             return
         done = deserialize(reply.results, remove=True) if reply.results is not None else []
         if done:
             best = OPTIONS.call_s * len(done) / max(reply.seconds, 1e-6)
             self._size = max(1, min(OPTIONS.most_items, int(best), 2 * self._size))
         yield from done
-        rest = flight.items[len(done) :]
         if reply.error is not None and reply.is_machine_error:
             logger.info("this process does %s, since a worker failed: %s", self.name, reply.error, exc_info=reply.error)
-            for item in rest:
+            for item in flight.items[len(done) :]:
                 yield self.executor.submit(self.task, item).result()
         elif reply.error is not None:
             raise reply.error
-
-    def _land_alone(self, item: Any) -> Iterator[Any]:
-        """Yield the result of an item that lost its workers, sent once more and alone."""
-        flight = self._send([item])
-        reply = self._wait(flight)
-        if reply is None:
-            raise ClusterError(
-                f"{self.name} of {describe_item(item)} ended every worker that tried: perhaps their memory was full",
-                hint="give workers more memory, or use --quality draft; the same command resumes",
-            )
-        if reply.error is not None and not reply.is_machine_error:
-            raise reply.error
-        if reply.error is not None or reply.results is None:
-            yield self.executor.submit(self.task, item).result()
-        else:
-            yield from deserialize(reply.results, remove=True)
 
     def _wait(self, flight: _Flight) -> Reply | None:
         """Return the reply of a call; an unfit worker is removed, and the call is sent again."""
