@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from heapq import heappop, heappush
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -446,12 +447,10 @@ def _prepare_part(
 
 def map_part(task: PartTask) -> PartResult:
     """Map one part in a separate process, and wait for it. Depends on nothing but the task."""
-    from sfm_app.mapping.part_process import work  # it imports this module
-
     folder = Path(task.folder)
     if not (folder / RESULT).exists():
         try:
-            with start_worker(partial(work, task)) as process:
+            with start_worker(partial(_work, task)) as process:
                 while not process.has_ended(0.2):
                     if (folder.parent / STOP).exists():
                         return PartResult((), "", ("stopped",))
@@ -466,6 +465,10 @@ def map_part(task: PartTask) -> PartResult:
         tuple(result["tried"]),
         joins_from_plain(result["false_joins"]),
     )
+
+
+def _work(task: PartTask) -> None:
+    import_module("sfm_app.mapping.part_process").work(task)  # it imports this module
 
 
 def remove_parts(run: RunContext) -> None:
