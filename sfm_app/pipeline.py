@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sfm_app import products
 from sfm_app.camera_files import read_given_cameras
+from sfm_app.colmap.dense import digest_maps
 from sfm_app.engine.execution import Pipeline
 from sfm_app.engine.stage import Products, Stage
 from sfm_app.frame.control_points import read_control_points
@@ -82,7 +83,7 @@ DEPTH_MAPS: Stage[Path] = Stage(
     files=("dense",),
     make=lambda given, run: depth_maps.make(given[SCENE], run),
     load=lambda _, run: depth_maps.load(run),
-    digest=depth_maps.digest,
+    digest=lambda place: digest_maps(place.dense),
 )
 MESH: Stage[Surface] = Stage(
     name="mesh",
@@ -109,7 +110,7 @@ FILES: Stage[tuple[Path, ...]] = Stage(
     files=("model.ply", "model.glb"),
     make=lambda given, run: files.make(given[TEXTURE], given[SCALE], run),
     load=lambda _, run: files.load(run),
-    digest=files.digest,
+    digest=products.hash_files("model.ply", "model.glb"),
 )
 
 PIPELINE = Pipeline(PHOTOS, (MATCH_GRAPH, VIEW_GRAPH, INTRINSICS, SCENE, SCALE, DEPTH_MAPS, MESH, TEXTURE, FILES))

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import Reconstruction, check_written, translate_errors
 from sfm_app.colmap.database import digest_matches, is_sound, read_match_graph
 from sfm_app.colmap.model import read_scene as read_colmap_scene
-from sfm_app.files import digest_files, is_below, load_arrays, replace_atomically
+from sfm_app.files import digest_files, is_below, load_arrays, replace_atomically, replace_folder
 from sfm_app.frame.scale import MetricFrame
 from sfm_app.numerical import json_text
-from sfm_app.operating_system import move
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.types import (
     Intrinsics,
@@ -135,20 +134,11 @@ hash_intrinsics = hash_files("calibration.json")
 def write_sparse_models(models: Sequence[Reconstruction], place: Workspace) -> None:
     """Write the main model, the first, to OUT/sparse and the others to OUT/other_models/1, 2, ..., each atomically."""
     shutil.rmtree(place.other_models, ignore_errors=True)
-    for number, model in enumerate(models[1:], start=1):
-        _write_sparse_model(model, place.other_models / str(number))
-    _write_sparse_model(models[0], place.sparse)
-
-
-def _write_sparse_model(model: Reconstruction, target: Path) -> None:
-    beside = target.with_name(f".{target.name}")
-    shutil.rmtree(beside, ignore_errors=True)
-    beside.mkdir(parents=True)
-    with translate_errors("writing the sparse model"):
-        model.write(beside)
-        check_written(*beside.iterdir())
-    shutil.rmtree(target, ignore_errors=True)
-    move(beside, target)
+    targets = (place.sparse, *(place.other_models / str(number) for number in range(1, len(models))))
+    for model, target in reversed(list(zip(models, targets, strict=True))):  # the main model is last
+        with replace_folder(target) as draft, translate_errors("writing the sparse model"):
+            model.write(draft)
+            check_written(*draft.iterdir())
 
 
 def write_scene(scene: Scene, place: Workspace) -> None:

@@ -248,23 +248,16 @@ def _weigh(words: Sequence[IndexArray], size: int) -> "csr_array":
 # and with any number of threads.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Vocabulary:
-    """Visual words: the centers of clusters of descriptors."""
-
-    words: NDArray[np.float32]
-    """(K, 128) whole numbers, 0 to 255."""
-
-    def __len__(self) -> int:
-        return len(self.words)
-
-    def quantize(self, descriptors: DescriptorArray) -> IndexArray:
-        """Return (N,) the nearest word of each descriptor (N, 128)."""
-        return _nearest(descriptors.astype(np.float32), self.words)
+def nearest_words(words: NDArray[np.float32], descriptors: DescriptorArray) -> IndexArray:
+    """Return (N,) the nearest word of each descriptor (N, 128)."""
+    return _nearest(descriptors.astype(np.float32), words)
 
 
-def learn_vocabulary(descriptors: DescriptorArray, size: int, seed: int) -> Vocabulary:
-    """Learn at most `size` words by k-means in two levels from descriptors (N, 128), N > 0, of all photos."""
+def learn_vocabulary(descriptors: DescriptorArray, size: int, seed: int) -> NDArray[np.float32]:
+    """Learn visual words by k-means in two levels from descriptors (N, 128), N > 0, of all photos.
+
+    Returns (K, 128), K <= `size`, the centers of clusters: whole numbers, 0 to 255.
+    """
     rng = np.random.default_rng(seed)
     most = min(len(descriptors), OPTIONS.samples_per_word * size)
     data = descriptors[np.sort(rng.permutation(len(descriptors))[:most])].astype(np.float32)
@@ -273,7 +266,7 @@ def learn_vocabulary(descriptors: DescriptorArray, size: int, seed: int) -> Voca
     parts = [data[nearest == k] for k in range(len(branches))]
     shares = [max(1, round(size * len(part) / len(data))) for part in parts]
     leaves = [_cluster(part, share, rng) for part, share in zip(parts, shares, strict=True) if len(part)]
-    return Vocabulary(np.unique(np.concatenate(leaves), axis=0))
+    return np.unique(np.concatenate(leaves), axis=0)
 
 
 def _cluster(data: NDArray[np.float32], count: int, rng: np.random.Generator) -> NDArray[np.float32]:

@@ -285,10 +285,7 @@ def _resize(picture: NDArray[np.uint8], view: View) -> NDArray[np.uint8]:
 def read_photo_and_depth(dense_dir: Path, name: str) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Return the undistorted photo (H, W, 3) RGB and its confirmed depths (H, W), <= 0 where there is none.
 
-    Raises:
-        ValueError: the name leads out of the workspace, or the file is no photo.
-        OSError: the photo does not exist.
-        BackendError: the depth map cannot be read.
+    ValueError if the name leads out of the workspace, or the file is no photo.
     """
     if not is_below(name):
         raise ValueError(f"{name} is not in {dense_dir}")

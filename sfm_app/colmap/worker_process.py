@@ -51,11 +51,7 @@ class WorkerProcess:
         return self.process.poll() is not None
 
     def check(self, doing: str) -> None:
-        """Wait for the process to end, and check that it succeeded.
-
-        Raises:
-            BackendError: the process failed, or it was killed.
-        """
+        """Wait for the process to end, and raise a BackendError if it failed or was killed."""
         code = self.process.wait()
         if not code:
             return

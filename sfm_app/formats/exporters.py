@@ -114,11 +114,7 @@ def missing_package(package: str, module: str) -> str:
 
 
 def check_writable(model: Model) -> None:
-    """Check that a model can be written.
-
-    Raises:
-        ReconstructionError: there is neither a triangle nor a point, or coordinates are not finite.
-    """
+    """Raise a ReconstructionError for a model without triangles and points, or with coordinates that are not finite."""
     if not len(model.surface.vertices):
         raise ReconstructionError(
             "there is nothing to write: the model has no points", hint="take more photos with more overlap"

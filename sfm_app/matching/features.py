@@ -240,7 +240,7 @@ Item = TypeVar("Item")
 
 
 def find_in_chunks(sift: Mapping[str, SiftOption], names: Sequence[str], run: RunContext) -> dict[str, Json]:
-    """Find features of photos that have none on a cluster; return the options in force. Errors as `match_in_chunks`."""
+    """Find features of photos that have none on a cluster; return the options in force."""
     chosen = set(names)
     missing = [name for name in photos_without_features(run.workspace.database).values() if name in chosen]
     parts = chunks(missing, CHUNKS.most_photos, run.spread)
@@ -251,10 +251,6 @@ def match_in_chunks(sift: Mapping[str, SiftOption], pairs: Sequence[PairId] | No
     """Match pairs, all if None, on a cluster or in processes of this machine, except those in the database.
 
     Returns the options in force.
-
-    Raises:
-        BackendError: COLMAP failed.
-        ClusterError: the cluster is gone.
     """
     database = run.workspace.database
     every = exhaustive_pairs(sorted(photo_names(database))) if pairs is None else list(pairs)
@@ -348,11 +344,7 @@ def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId
     """Find features of photos and match them, in the run's database; return the options in force, for the manifest.
 
     Features are computed in the photos of `pairs` only, with the smaller id first; for None, all photos and all pairs.
-    Without any pair, all photos get features.
-
-    Raises:
-        PluginError: the method raises, or returns invalid results.
-        BackendError: COLMAP failed.
+    Without any pair, all photos get features. PluginError if the method raises, or returns invalid results.
     """
     in_force = find_all_features(method, run, pairs)
     in_force |= match_pairs(method, run, pairs)

@@ -285,10 +285,7 @@ def depth_colors(depth: FloatArray) -> tuple[ByteArray, tuple[float, float]]:
     """Return the colors (H, W, 3) RGB of depths, yellow near and violet far, and the depths at both ends.
 
     Colors are even in 1 / depth, as disparities are: otherwise the near half of a scene has one color. Unknown depths
-    are <= 0 or not finite.
-
-    Raises:
-        ValueError: no pixel has a depth.
+    are <= 0 or not finite; ValueError if all are.
     """
     known = np.isfinite(depth) & (depth > 0.0)
     if not known.any():

@@ -116,11 +116,7 @@ class Serializer(contextlib.AbstractContextManager["Serializer"]):
 
 
 def deserialize(message: Serialized, *, remove: bool = False) -> Any:
-    """Return a value, and `remove` its file.
-
-    Raises:
-        OSError: the file cannot be read here, or has another hash.
-    """
+    """Return a value, and `remove` its file; OSError if that cannot be read here, or has another hash."""
     if not message.path:
         return _Unpickler(io.BytesIO(message.data)).load()
     value = _load(message.path, message.digest)
@@ -370,11 +366,7 @@ class Cluster:
             )
 
     def ask_all(self, question: Any, *about: Any) -> dict[str, Any]:
-        """Return the answer of each reachable worker, by its address.
-
-        Raises:
-            ClusterError: none answers, or one does not have the program.
-        """
+        """Return the answer of each reachable worker, by its address; ClusterError if none has the program."""
         try:
             answers = dict(self.client.run(question, *about, on_error="return"))
         except Exception as err:  # the scheduler itself could not ask
@@ -397,11 +389,7 @@ class Cluster:
             raise self.make_loss_error() from err
 
     def wait(self, future: Any, what: str) -> Reply | None:
-        """Return the reply of a call; None if each worker that tried it ended.
-
-        Raises:
-            ClusterError: the scheduler is gone, or it has had no workers for too long.
-        """
+        """Return the reply of a call; None if each worker that tried it ended."""
         from distributed import KilledWorker
         from distributed.comm import CommClosedError
 

@@ -31,12 +31,7 @@ def make_executor(workers: int, like: Executor | None = None) -> Executor:
 
 @contextmanager
 def open_executor(settings: Settings, folder: Path, progress: Progress) -> Iterator[tuple[Executor, int]]:
-    """Provide the executor of a run, and its number of workers; both end with the block, and `folder` is removed.
-
-    Raises:
-        ConfigError: Dask is not installed.
-        ClusterError: the cluster does not answer, or it has workers that cannot be used.
-    """
+    """Provide the executor of a run, and its number of workers; both end with the block, and `folder` is removed."""
     if not settings.cluster.address:
         workers = worker_count(settings.workers)
         with make_executor(workers) as threads:
