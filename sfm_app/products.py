@@ -56,8 +56,7 @@ def write_photo_list(photos: PhotoSet, copies: Mapping[str, str | None], place: 
     """Write photos.json; `copies` are the hashes of 8-bit copies by name, None for photos without one."""
     unusable = [asdict(photo) for photo in photos.unusable]
     values = {"photos": [photo.to_dict() for photo in photos.photos], "unusable": unusable, "copies": copies}
-    with replace_atomically(place.photo_set) as path:
-        path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8", newline="\n")
+    _write_json(place.photo_set, values)
 
 
 def read_photo_list(place: Workspace) -> PhotoSet:

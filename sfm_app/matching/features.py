@@ -36,7 +36,7 @@ from sfm_app.errors import InputError, PluginError
 from sfm_app.files import load_arrays, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.numerical import Json
 from sfm_app.photos.masks import read_mask
-from sfm_app.photos.panoramas import PanoramaViews
+from sfm_app.photos.panoramas import PanoramaViews, shrink
 from sfm_app.plugins import FeatureMethod
 from sfm_app.progress import Progress, SilentProgress, track
 from sfm_app.runtime.context import RunContext
@@ -52,8 +52,7 @@ from sfm_app.types import Features, PairId
 def find_features(method: FeatureMethod, names: Mapping[int, str], run: RunContext) -> None:
     """Write the features of photos without a part, and keypoints to the database; PluginError if invalid."""
     place, panoramas = run.workspace, panorama_names(run.workspace.database)
-    folders = _Folders(place.photos, run.mask_dir, place.feature_parts)
-    find = Task(_find_and_save, method, run.settings.matching, folders)
+    find = Task(_find_and_save, method, run.settings.matching, place.photos, run.mask_dir, place.feature_parts)
     photos = [
         _PhotoFile(photo, name, name in panoramas)
         for photo, name in names.items()
@@ -66,13 +65,6 @@ def find_features(method: FeatureMethod, names: Mapping[int, str], run: RunConte
 
 
 @dataclass(frozen=True, slots=True)
-class _Folders:
-    photos: Path
-    masks: Path | None
-    parts: Path
-
-
-@dataclass(frozen=True, slots=True)
 class _PhotoFile:
     id: int
     name: str
@@ -80,20 +72,20 @@ class _PhotoFile:
 
 
 def _find_and_save(
-    method: FeatureMethod, options: MatchSettings, folders: _Folders, photo: _PhotoFile
+    method: FeatureMethod, options: MatchSettings, photos: Path, masks: Path | None, parts: Path, photo: _PhotoFile
 ) -> tuple[int, NDArray[np.float32]]:
-    pixels = read_pixels(folders.photos / photo.name)
+    pixels = read_pixels(photos / photo.name)
     features, to_photo, size = _find_in_photo(method, photo.name, pixels, options, panorama=photo.panorama)
     keypoints = features.keypoints * to_photo
-    if folders.masks is not None:
-        mask = read_mask(folders.masks, photo.name)
+    if masks is not None:
+        mask = read_mask(masks, photo.name)
         column, row = np.clip(keypoints.astype(np.int64), 0, np.array(size) - 1).T
         unmasked = mask[row, column]
         features, keypoints = features.select(unmasked), keypoints[unmasked]
     rows = np.arange(min(len(keypoints), options.max_features))
     features = features.select(rows)
     values = {f"value_{name}": value for name, value in features.values.items()}
-    with replace_atomically(part_path(photo.id, folders.parts)) as beside:
+    with replace_atomically(part_path(photo.id, parts)) as beside:
         np.savez(beside, allow_pickle=False, size=np.array(features.size), keypoints=features.keypoints, **values)
     return photo.id, keypoints[rows].astype(np.float32)
 
@@ -105,12 +97,7 @@ def _find_in_photo(
     height, width = pixels.shape[:2]
     if panorama:
         return _find_in_views(method, name, pixels, options), np.ones(2), (width, height)
-    longer = max(width, height)
-    if longer > options.max_image_size_px:
-        scale = options.max_image_size_px / longer
-        size = max(1, round(width * scale)), max(1, round(height * scale))
-        pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
-    features = _find_and_check(method, name, pixels, options)
+    features = _find_and_check(method, name, shrink(pixels, options.max_image_size_px / max(width, height)), options)
     return features, np.array([width / features.size[0], height / features.size[1]]), (width, height)
 
 
