@@ -41,8 +41,6 @@ Result = TypeVar("Result")
 class TransferOptions:
     """Sizes and times of the work on a cluster."""
 
-    small_bytes: int = 500_000
-    """Larger values travel as files; the scheduler forwards smaller ones. Chosen by hand."""
     look_s: float = 2.0
     """Seconds between two counts of the workers. Chosen by hand."""
     connecting_s: float = 10.0
@@ -66,16 +64,6 @@ SHARED, PATH = "shared", "path"
 """Kinds of values that are not pickled themselves."""
 
 
-@dataclass(frozen=True, slots=True)
-class Serialized:
-    """A pickled value, in memory or in a file."""
-
-    data: bytes
-    path: str = ""
-    """File that has the value instead; empty where `data` has it."""
-    digest: str = ""
-
-
 class Serializer(contextlib.AbstractContextManager["Serializer"]):
     """Serializes values for processes that share a folder; each shared value is one file until the block ends."""
 
@@ -91,17 +79,11 @@ class Serializer(contextlib.AbstractContextManager["Serializer"]):
         for _, path, _ in self._shared.values():
             path.unlink(missing_ok=True)
 
-    def serialize(self, value: object) -> Serialized:
-        """Return a value as bytes, or as a file if it is large."""
+    def serialize(self, value: object) -> bytes:
+        """Return a value as bytes, in which paths are absolute: workers have another current folder."""
         buffer = io.BytesIO()
         _Pickler(buffer, self).dump(value)
-        data = buffer.getvalue()
-        if len(data) <= OPTIONS.small_bytes:
-            return Serialized(data)
-        path = self.folder / f"value-{secrets.token_hex(8)}.pickle"
-        with replace_atomically(path) as draft:
-            draft.write_bytes(data)
-        return Serialized(b"", str(path), hashlib.blake2b(data).hexdigest())
+        return buffer.getvalue()
 
     def share(self, value: Shared[Any]) -> tuple[str, str]:
         """Return path and hash of the file of a shared value; the first call writes it."""
@@ -115,19 +97,12 @@ class Serializer(contextlib.AbstractContextManager["Serializer"]):
         return str(known[1]), known[2]
 
 
-def deserialize(message: Serialized, *, remove: bool = False) -> Any:
-    """Return a value, and `remove` its file; OSError if that cannot be read here, or has another hash."""
-    if not message.path:
-        return _Unpickler(io.BytesIO(message.data)).load()
-    value = _load(message.path, message.digest)
-    if remove:
-        Path(message.path).unlink(missing_ok=True)
-    return value
+def deserialize(data: bytes) -> Any:
+    """Return a value; OSError if the file of a shared one cannot be read here, or has another hash."""
+    return _Unpickler(io.BytesIO(data)).load()
 
 
 class _Pickler(pickle.Pickler):
-    """Replaces shared values by their files, and makes paths absolute: workers have another current folder."""
-
     def __init__(self, file: IO[bytes], serializer: Serializer) -> None:
         super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
         self._serializer = serializer
@@ -146,14 +121,10 @@ class _Unpickler(pickle.Unpickler):
 
 @lru_cache(maxsize=2)  # the shared values of two steps. Chosen by hand
 def _read_shared(path: str, digest: str) -> Shared[Any]:
-    return Shared(_load(path, digest))
-
-
-def _load(path: str, digest: str) -> Any:
     if digest_file(Path(path)) != digest:
         raise OSError(f"{path} is not the file that was sent")
     with Path(path).open("rb") as file:
-        return _Unpickler(file).load()
+        return Shared(_Unpickler(file).load())
 
 
 # Versions that have to agree on all machines, so that the same seed gives the same bytes.
@@ -220,16 +191,17 @@ class Call:
     """A task and some of its items."""
 
     probe: Probe
-    function: Serialized
-    items: Serialized
+    function: bytes
+    items: bytes
+    """Both serialized."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
     """Results of a call, and its cost."""
 
-    results: Serialized | None = None
-    """Of the items before the first one that failed."""
+    results: bytes = b""
+    """Of the items before the first one that failed, serialized."""
     error: Exception | None = None
     """Of the first item that failed."""
     is_machine_error: bool = False
@@ -550,7 +522,7 @@ class _Spreading:
     def __init__(self, executor: ClusterExecutor, task: Task[Any], serializer: Serializer) -> None:
         self.executor, self.cluster, self.task, self.serializer = executor, executor.cluster, task, serializer
         self.probe = self.cluster.probe()
-        self.function: Serialized = serializer.serialize(task)
+        self.function = serializer.serialize(task)
         self.name = getattr(task.func, "__name__", "task").lstrip("_")
         self._keys = (f"sfm-{self.name}-{secrets.token_hex(6)}-{number}" for number in count())
         self._size = 1
@@ -590,7 +562,7 @@ class _Spreading:
             for item in flight.items:
                 yield from self._land(self._send([item]), again=True)
             return
-        done = deserialize(reply.results, remove=True) if reply.results is not None else []
+        done = deserialize(reply.results)
         if done:
             best = OPTIONS.call_s * len(done) / max(reply.seconds, 1e-6)
             self._size = max(1, min(OPTIONS.most_items, int(best), 2 * self._size))
