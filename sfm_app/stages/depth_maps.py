@@ -62,11 +62,6 @@ def make(scene: Scene, run: RunContext) -> Path:
     return dense_dir
 
 
-def load(run: RunContext) -> Path:
-    """Return the dense workspace."""
-    return run.workspace.dense
-
-
 def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None:
     """Undistort photos and masks, unless a killed run has left a workspace from the same inputs."""
     model = [(file.name, blake2b(file.read_bytes()).hexdigest()) for file in sorted(scene.model_dir.glob("*.bin"))]

@@ -17,8 +17,3 @@ def make(model: Model, frame: MetricFrame, run: RunContext) -> tuple[Path, ...]:
         sizes = [[page.shape[1], page.shape[0]] for page in model.texture.pages]
         run.record(pages_px=sizes, jpeg_quality=JPEG_QUALITY)
     return paths
-
-
-def load(run: RunContext) -> tuple[Path, ...]:
-    """Return the paths of the model's files."""
-    return run.model_paths(NAME)
