@@ -9,7 +9,7 @@ import numpy as np
 
 from sfm_app.camera.models import guessed_camera_matrix
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.database import SQUARE_PIXELS, open_database
+from sfm_app.colmap.database import SQUARE_PIXELS, camera_params, open_database
 from sfm_app.types import Calibration, MatchGraph, ViewGraph
 
 METHOD = "view-graph calibration"
@@ -61,8 +61,7 @@ def _reset_cameras(path: Path) -> None:
     with open_database(path) as database, pycolmap.DatabaseTransaction(database):
         for camera in database.read_all_cameras():
             camera.model = getattr(pycolmap.CameraModelId, SQUARE_PIXELS)
-            (focal, _, cx), (_, _, cy), _ = guessed_camera_matrix((camera.width, camera.height))
-            camera.params = [focal, cx, cy, 0.0]
+            camera.params = camera_params(guessed_camera_matrix((camera.width, camera.height)), SQUARE_PIXELS)
             camera.has_prior_focal_length = False
             database.update_camera(camera)
 

@@ -46,8 +46,7 @@ class Terminal(Progress):
         self.bars = Bars(
             TextColumn("  {task.description}", table_column=Column(width=LABEL_COLUMNS, no_wrap=True)),
             BarColumn(bar_width=BAR_COLUMNS),
-            StepsColumn(table_column=Column(no_wrap=True)),
-            TimeColumn(table_column=Column(no_wrap=True)),
+            StateColumn(table_column=Column(no_wrap=True)),
             console=self.console,
             get_time=clock,
             transient=True,
@@ -171,23 +170,15 @@ class Terminal(Progress):
             self.task, self.has_work = None, False
 
 
-class StepsColumn(ProgressColumn):
-    """Steps done, of all steps; empty if their number is unknown."""
-
-    def render(self, task: Task) -> Text:
-        """Return the text of a bar."""
-        return MofNCompleteColumn().render(task) if task.total else Text("")
-
-
-class TimeColumn(ProgressColumn):
-    """Elapsed time and time left."""
+class StateColumn(ProgressColumn):
+    """Steps done, of all steps if their number is known, elapsed time and time left."""
 
     def render(self, task: Task) -> Text:
         """Return the text of a bar."""
         minutes, seconds = divmod(int(task.elapsed or 0.0), 60)
-        elapsed = f"{minutes}:{seconds:02}"
+        steps = f"{MofNCompleteColumn().render(task)} " if task.total else ""
         remaining = remaining_text(task)
-        return Text(f"{elapsed}, {remaining}" if remaining else elapsed)
+        return Text(f"{steps}{minutes}:{seconds:02}{f', {remaining}' if remaining else ''}")
 
 
 def progress_text(task: Task) -> str:

@@ -35,7 +35,17 @@ from sfm_app.bundle.lens_parts import (
 )
 from sfm_app.bundle.normal_equations import Bundle, best_step, cost, elimination_width, reduce
 from sfm_app.camera.models import PARAMETERS, TERMS, TWO_FOCALS
-from sfm_app.camera.projection import CAMERA, CX, CY, FISHEYE, FX, FY, K1, PANORAMA, PERSPECTIVE
+from sfm_app.camera.projection import (
+    CAMERA,
+    CX,
+    CY,
+    FISHEYE,
+    FX,
+    FY,
+    K1,
+    PANORAMA,
+    PERSPECTIVE,
+)
 from sfm_app.colmap.backend import all_cameras, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import finite_mask, posed_images, submodel

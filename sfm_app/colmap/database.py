@@ -24,12 +24,14 @@ from sfm_app.types import (
     PoseGraph,
     RelativePose,
 )
-from sfm_app.types.camera import EQUIRECTANGULAR, PERSPECTIVE
+from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE
 
 SQUARE_PIXELS = "SIMPLE_RADIAL"
 """f, cx, cy, k: the model for mapping with one focal; a second radial term diverges on the first photos."""
-PANORAMA = "EQUIRECTANGULAR"
-"""width, height: COLMAP's model of panoramas."""
+TWO_FOCALS = "OPENCV"
+"""fx, fy, cx, cy, k1, k2, p1, p2: COLMAP's smallest model with two focals and lens distortion."""
+WIDE_MODELS = {FISHEYE: "OPENCV_FISHEYE", EQUIRECTANGULAR: "EQUIRECTANGULAR"}
+"""COLMAP's models of projections that are not perspective."""
 
 KINDS = {
     "calibrated": "CALIBRATED", "uncalibrated": "UNCALIBRATED", "planar": "PLANAR", "rotation": "PANORAMIC"
@@ -118,7 +120,7 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
 
 def panorama_names(path: Path) -> frozenset[str]:
     """Return the names of the photos that are equirectangular panoramas."""
-    model = pycolmap.CameraModelId.__members__[PANORAMA]
+    model = pycolmap.CameraModelId.__members__[WIDE_MODELS[EQUIRECTANGULAR]]
     with open_database(path) as database:
         cameras = {camera.camera_id for camera in database.read_all_cameras() if camera.model == model}
         return frozenset(image.name for image in database.read_all_images() if image.camera_id in cameras)
@@ -231,13 +233,13 @@ def _guess_calibration(photo: Photo | MatchedImage) -> Calibration:
 
 def _write_camera(database: pycolmap.Database, camera_id: int, calibration: Calibration) -> None:
     """Write or replace a camera, and the rig of one sensor that COLMAP requires for it."""
-    name, params = model_for_mapping(calibration)
+    name = camera_model(calibration)
     camera = pycolmap.Camera(
         camera_id=camera_id,
         model=pycolmap.CameraModelId.__members__[name],
         width=calibration.width,
         height=calibration.height,
-        params=params,
+        params=params_of_calibration(calibration),
         has_prior_focal_length=calibration.is_estimated,
     )
     if database.exists_camera(camera_id):
@@ -256,17 +258,34 @@ def _write_frame(database: pycolmap.Database, image: pycolmap.Image) -> None:
     database.write_frame(frame, use_frame_id=True)
 
 
-def model_for_mapping(calibration: Calibration) -> tuple[str, list[float]]:
-    """Return COLMAP's smallest camera model for a calibration, and its parameters; one focal for square pixels."""
+def camera_model(calibration: Calibration) -> str:
+    """Return COLMAP's name of the smallest camera model for a calibration."""
+    if calibration.distortion:
+        return model_of_calibration(calibration)[0]
+    if calibration.projection in WIDE_MODELS:
+        return WIDE_MODELS[calibration.projection]
+    # largest |fy/fx - 1| of square pixels: calibrators give no more where the photos show no other aspect
+    K, tolerance = calibration.K, 0.0 if calibration.is_given else 0.005
+    square = "aspect" in calibration.held or K[0, 0] == K[1, 1] or abs(K[1, 1] / K[0, 0] - 1.0) < tolerance
+    return SQUARE_PIXELS if square else TWO_FOCALS
+
+
+def params_of_calibration(calibration: Calibration) -> list[float]:
+    """Return the parameters of the model that `camera_model` names."""
     if calibration.projection == EQUIRECTANGULAR:
-        return PANORAMA, [float(calibration.width), float(calibration.height)]
-    if calibration.projection == PERSPECTIVE and not calibration.distortion:
-        (fx, _, cx), (_, fy, cy), _ = calibration.K.tolist()
-        # largest |fy/fx - 1| of square pixels: calibrators give no more where the photos show no other aspect
-        tolerance = 0.0 if calibration.is_given else 0.005
-        if "aspect" in calibration.held or fx == fy or abs(fy / fx - 1.0) < tolerance:
-            return SQUARE_PIXELS, [(fx * fy) ** 0.5, cx, cy, calibration.radial]
-    return model_of_calibration(calibration)
+        return [float(calibration.width), float(calibration.height)]
+    if calibration.distortion:
+        return model_of_calibration(calibration)[1]
+    params = camera_params(calibration.K, camera_model(calibration), calibration.radial)
+    return [*params[:4], *calibration.fisheye] if calibration.projection == FISHEYE else params
+
+
+def camera_params(K: NDArray[np.float64], camera_model: str, radial: float = 0.0) -> list[float]:
+    """Return parameters of a COLMAP model with one or two focals, from K (3, 3) in pixels and the first radial term."""
+    fx, fy, cx, cy = (float(K[row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    if camera_model == SQUARE_PIXELS:
+        return [(fx * fy) ** 0.5, cx, cy, radial]
+    return [fx, fy, cx, cy, radial, 0.0, 0.0, 0.0]
 
 
 def _pair(pair_id: int) -> PairId:

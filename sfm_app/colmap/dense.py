@@ -1,6 +1,8 @@
 """COLMAP's dense workspace: undistorted photos, their masks, depth maps and normal maps."""
 
-from collections.abc import Sequence
+import secrets
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from math import ceil
 from pathlib import Path
@@ -12,7 +14,8 @@ from numpy.typing import NDArray
 from sfm_app.colmap import tasks
 from sfm_app.colmap.backend import all_images, check_written, pycolmap, translate_errors
 from sfm_app.colmap.worker_process import run_worker
-from sfm_app.files import digest_files, is_below, replace_atomically
+from sfm_app.files import digest_files, is_below
+from sfm_app.operating_system import replace_file
 from sfm_app.photos.masks import mask_path, read_mask, save_mask
 from sfm_app.progress import Progress
 from sfm_app.settings import MOST_LEVELS
@@ -204,7 +207,7 @@ def read_normals(dense_dir: Path, view: View) -> NDArray[np.float32]:
     """Read the normals (H, W, 3) of a view."""
     with translate_errors(f"reading the normal map of {view.name}"):
         stored = pycolmap.NormalMap()
-        stored.read(normals_file(dense_dir, view))
+        stored.read(_map_path(dense_dir, NORMALS, view))
     planes = np.array(stored.to_array(), np.float32)
     height, width = planes.shape[:2]
     return np.ascontiguousarray(planes.reshape(3, height, width).transpose(1, 2, 0))
@@ -214,10 +217,11 @@ def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
     """Write the confirmed depths (H, W) and the normals (H, W, 3) of a view, as COLMAP's fusion expects them."""
     # pycolmap takes (H, W, 3) but stores the bytes unchanged, while COLMAP keeps x, y and z in planes.
     planes = np.ascontiguousarray(maps.normals.transpose(2, 0, 1)).reshape(maps.normals.shape)
-    target = normals_file(dense_dir, view)
-    with translate_errors(f"writing the normal map of {view.name}"), replace_atomically(target) as path:
+    with (
+        translate_errors(f"writing the normal map of {view.name}"),
+        _atomic_path(_map_path(dense_dir, NORMALS, view)) as path,
+    ):
         pycolmap.NormalMap.from_array(planes).write(path)
-        check_written(path)
     write_depth(dense_dir, view, maps.depth)
 
 
@@ -255,23 +259,20 @@ def digest_maps(dense_dir: Path) -> str:
 
 
 def _read_depth_format(dense_dir: Path, folder: str, view: View, kind: Kind) -> NDArray[np.float32]:
-    return _read_depth_file(_map_path(dense_dir, folder, view, kind), view.name)
-
-
-def _read_depth_file(path: Path, name: str) -> NDArray[np.float32]:
-    with translate_errors(f"reading the depth map of {name}"):
+    with translate_errors(f"reading the depth map of {view.name}"):
         stored = pycolmap.DepthMap()
-        stored.read(path)
+        stored.read(_map_path(dense_dir, folder, view, kind))
     return np.array(stored.to_array(), np.float32)
 
 
 def _write_depth_format(dense_dir: Path, folder: str, view: View, values: NDArray[np.float32], kind: Kind) -> None:
     known = values[values > 0]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
-    target = _map_path(dense_dir, folder, view, kind)
-    with translate_errors(f"writing the depth map of {view.name}"), replace_atomically(target) as path:
+    with (
+        translate_errors(f"writing the depth map of {view.name}"),
+        _atomic_path(_map_path(dense_dir, folder, view, kind)) as path,
+    ):
         pycolmap.DepthMap.from_array(np.ascontiguousarray(values), low, high).write(path)
-        check_written(path)
 
 
 def _map_path(dense_dir: Path, folder: str, view: View, kind: Kind = "geometric") -> Path:
@@ -282,14 +283,30 @@ def _resize(picture: NDArray[np.uint8], view: View) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(picture, (view.width, view.height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
+@contextmanager
+def _atomic_path(target: Path) -> Iterator[Path]:
+    """Provide a temporary path beside `target`, and rename it to `target` once everything is written."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    beside = target.with_name(f".{secrets.token_hex(4)}.{target.name}")  # two machines may write the same map
+    yield beside
+    check_written(beside)
+    replace_file(beside, target)
+
+
 def read_photo_and_depth(dense_dir: Path, name: str) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Return the undistorted photo (H, W, 3) RGB and its confirmed depths (H, W), <= 0 where there is none.
 
-    ValueError if the name leads out of the workspace, or the file is no photo.
+    Raises:
+        ValueError: the name leads out of the workspace, or the file is no photo.
+        OSError: the photo does not exist.
+        BackendError: the depth map cannot be read.
     """
     if not is_below(name):
         raise ValueError(f"{name} is not in {dense_dir}")
     image = _decode(dense_dir, name, cv2.IMREAD_COLOR_RGB)
     if image is None:
         raise ValueError(f"{name} is no photo")
-    return image, _read_depth_file(dense_dir / "stereo" / DEPTHS / f"{name}.geometric.bin", name)
+    with translate_errors(f"reading the depth map of {name}"):
+        stored = pycolmap.DepthMap()
+        stored.read(dense_dir / "stereo" / DEPTHS / f"{name}.geometric.bin")
+    return image, np.array(stored.to_array(), np.float32)

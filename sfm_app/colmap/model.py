@@ -110,9 +110,9 @@ def cameras_by_photo(model: pycolmap.Reconstruction) -> dict[int, MappedCamera]:
 
 
 def _mapped_camera(camera: pycolmap.Camera) -> MappedCamera:
-    K = scale_matrix(camera)
     if camera.is_spherical():
-        return MappedCamera(K)
+        return MappedCamera(panorama_matrix((camera.width, camera.height)))
+    K = np.asarray(camera.calibration_matrix(), np.float64)
     terms = [camera.params[k] for k in camera.extra_params_idxs()]
     if camera.is_perspective_fisheye():
         if camera.model.name == "THIN_PRISM_FISHEYE":

@@ -19,9 +19,6 @@ from sfm_app.photos.masks import read_mask, save_mask
 from sfm_app.photos.panoramas import resample, shrink
 from sfm_app.types.arrays import BoolArray, FloatArray
 
-ViewNames = Mapping[str, Sequence[str]]
-"""Names of the views of each photo, by its name."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WideLens:
@@ -80,54 +77,20 @@ def parse_view_name(name: str) -> tuple[str, int]:
 def write_model(model_dir: Path, lenses: Mapping[int, WideLens], dense_dir: Path) -> list[tuple[str, int]]:
     """Write the model of all views into a dense workspace; return the name and the camera's id of each photo."""
     with translate_errors("writing the model of perspective views"):
-        model = pycolmap.Reconstruction(model_dir)
-        photos = sorted((image.name, image.camera_id) for image in all_images(model) if image.has_pose)
-        names = {name: [view_name(name, k) for k in range(len(lenses[key].views))] for name, key in photos}
+        model, view_model = pycolmap.Reconstruction(model_dir), pycolmap.Reconstruction()
+        images = sorted((image for image in all_images(model) if image.has_pose), key=lambda image: image.name)
+        ids = add_view_cameras(view_model, lenses)
+        tracks = {point: pycolmap.Track() for point in sorted(model.points3D)}
+        for image in images:
+            lens = lenses[image.camera_id]
+            for number in range(len(lens.views)):
+                _add_view(view_model, model, image, lens, number, ids[image.camera_id, number], tracks)
+        for point, track in tracks.items():
+            if track.length():
+                view_model.add_point3D(model.points3D[point].xyz, track, model.points3D[point].color)
         (dense_dir / "sparse").mkdir(parents=True, exist_ok=True)
-        make_view_model(model, lenses, names, observed=False).write(dense_dir / "sparse")
-        return photos
-
-
-def make_view_model(
-    model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames, *, observed: bool
-) -> pycolmap.Reconstruction:
-    """Return the model of the views, with the points that a view shows.
-
-    Their keypoints are those of the photos (`observed`), or else the projections of the points.
-    """
-    view_model = pycolmap.Reconstruction()
-    cameras = add_view_cameras(view_model, lenses)
-    tracks = {point: pycolmap.Track() for point in sorted(model.points3D)}
-    posed = (image for image in all_images(model) if image.has_pose)
-    for image in sorted(posed, key=lambda image: image.name):
-        tracked = [point for point in image.points2D if point.has_point3D()]
-        pixels = np.array([point.xy for point in tracked], np.float64).reshape(-1, 2)
-        X = np.array([model.points3D[point.point3D_id].xyz for point in tracked], np.float64).reshape(-1, 3)
-        for number, view in enumerate(lenses[image.camera_id].views):
-            pose = view.R @ image.cam_from_world().matrix()
-            if observed:
-                rays = np.asarray(model.cameras[image.camera_id].cam_ray_from_img(pixels), np.float64).reshape(-1, 3)
-                projected = rays @ view.R.T @ view.K.T
-            else:
-                projected = (X @ pose[:, :3].T + pose[:, 3]) @ view.K.T
-            with np.errstate(divide="ignore", invalid="ignore"):
-                x = projected[:, :2] / projected[:, 2:]
-            inside = np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1)
-            shown = np.flatnonzero((projected[:, 2] > 0.0) & inside)
-            image_id = view_model.num_images() + 1
-            for index, row in enumerate(shown):
-                tracks[tracked[row].point3D_id].add_element(image_id, index)
-            added = pycolmap.Image(
-                name=names[image.name][number], keypoints=x[shown], camera_id=cameras[image.camera_id, number],
-                image_id=image_id,
-            )  # fmt: skip
-            view_model.add_image_with_trivial_frame(added, pycolmap.Rigid3d(pose))
-    for point_id, track in tracks.items():
-        if track.length():
-            old = model.points3D[point_id]
-            view_model.add_point3D_with_id(point_id, pycolmap.Point3D(xyz=old.xyz, color=old.color, track=track))
-    view_model.update_point_3d_errors()
-    return view_model
+        view_model.write(dense_dir / "sparse")
+        return [(image.name, image.camera_id) for image in images]
 
 
 def write_views(name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | None, dense_dir: Path) -> None:
@@ -217,3 +180,30 @@ def add_view_cameras(view_model: pycolmap.Reconstruction, lenses: Mapping[int, W
             )  # fmt: skip
             view_model.add_camera_with_trivial_rig(camera)
     return ids
+
+
+def _add_view(
+    view_model: pycolmap.Reconstruction,
+    model: pycolmap.Reconstruction,
+    image: pycolmap.Image,
+    lens: WideLens,
+    number: int,
+    camera_id: int,
+    tracks: Mapping[int, pycolmap.Track],
+) -> None:
+    """Add a view of a photo to the model of the views, and its points to their tracks, by id of the point."""
+    view = lens.views[number]
+    pose = view.R @ image.cam_from_world().matrix()
+    points = [point.point3D_id for point in image.points2D if point.has_point3D()]
+    X = np.array([model.points3D[point].xyz for point in points], np.float64).reshape(-1, 3)
+    projected = (X @ pose[:, :3].T + pose[:, 3]) @ view.K.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = projected[:, :2] / projected[:, 2:]
+    shown = np.flatnonzero((projected[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1))
+    image_id = view_model.num_images() + 1
+    for index, row in enumerate(shown):
+        tracks[points[row]].add_element(image_id, index)
+    added = pycolmap.Image(
+        name=view_name(image.name, number), keypoints=x[shown], camera_id=camera_id, image_id=image_id
+    )
+    view_model.add_image_with_trivial_frame(added, pycolmap.Rigid3d(pose))

@@ -7,7 +7,7 @@ import pytest
 
 from sfm_app.bundle.lens_parts import CameraRule
 from sfm_app.bundle.normal_equations import reduce
-from sfm_app.camera.models import calibration_from_model
+from sfm_app.camera.models import calibration_from_model, camera_matrix
 from sfm_app.camera.projection import CAMERA, FISHEYE, FX, K1, K2, K3, P1, PANORAMA
 from sfm_app.colmap import bundle
 from sfm_app.colmap.backend import pycolmap
@@ -21,7 +21,7 @@ from sfm_app.colmap.bundle import (
     solve,
     write_camera,
 )
-from sfm_app.colmap.database import open_database
+from sfm_app.colmap.database import camera_params, open_database
 from sfm_app.errors import BackendError, NumericalError
 from sfm_app.estimation.given_cameras import find_contradictions
 from sfm_app.numerical import json_text
@@ -52,9 +52,9 @@ def test_squeezed_photos_have_two_focals_others_one(mapped):
     squeezed = [900.0, 1200.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0]
     square = adjust(*mapped(noise_px=1.0)).model.cameras[1].params
     assert square[0] == pytest.approx(square[1], rel=1e-3)
-    model, database = mapped(squeezed)
+    (model, database), start = mapped(squeezed), camera_matrix(890, 1190, 500, 400)
     model.cameras[1].model = pycolmap.CameraModelId.OPENCV
-    model.cameras[1].params = [890.0, 1190.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0]
+    model.cameras[1].params = camera_params(start, "OPENCV")
     found = adjust(model, database).model.cameras[1].params
     assert found[:2] == pytest.approx([900, 1200], rel=0.003)
 
