@@ -176,9 +176,9 @@ class StateColumn(ProgressColumn):
     def render(self, task: Task) -> Text:
         """Return the text of a bar."""
         minutes, seconds = divmod(int(task.elapsed or 0.0), 60)
-        steps = f"{MofNCompleteColumn().render(task)} " if task.total else ""
+        steps = [MofNCompleteColumn().render(task), " "] if task.total else []
         remaining = remaining_text(task)
-        return Text(f"{steps}{minutes}:{seconds:02}{f', {remaining}' if remaining else ''}")
+        return Text.assemble(*steps, f"{minutes}:{seconds:02}{f', {remaining}' if remaining else ''}")
 
 
 def progress_text(task: Task) -> str:
