@@ -133,7 +133,7 @@ def photo_names(path: Path) -> dict[int, str]:
 
 
 def unmatched_pairs(path: Path, pairs: Sequence[PairId]) -> list[PairId]:
-    """Return the pairs, smaller id first, without an entry of matches in the database, not even an empty one."""
+    """Return the pairs, with ids in any order, without an entry of matches in the database, not even an empty one."""
     with open_database(path) as database:
         return [pair for pair in pairs if not database.exists_matches(*pair)]
 

@@ -279,13 +279,9 @@ _MATCHING = threading.Lock()
 class SiftInputs:
     """Inputs that all chunks share."""
 
-    snapshot: Path
-    """Database with the photos and nothing else."""
-    features: Path
-    """Database with the features of all photos, for matching."""
     settings: SiftSettings
     folder: Path
-    """Folder for files of new rows, in the output folder."""
+    """Folder for two databases, see `write_inputs`, and for files of new rows, in the output folder."""
     scratch: Path | None = None
     """Folder for temporary databases, on a disk of this machine; None for the usual one."""
 
@@ -301,7 +297,18 @@ class Part:
     """COLMAP's options."""
 
 
-def write_snapshot(database: Path, target: Path, without: Sequence[str]) -> None:
+PHOTOS_ONLY, WITH_FEATURES = "photos.db", "features.db"
+"""Databases for all chunks: the photos and nothing else; the photos with their features, for matching."""
+
+
+def write_inputs(database: Path, inputs: SiftInputs) -> None:
+    """Write the databases for all chunks of work on a database."""
+    inputs.folder.mkdir(parents=True)
+    _write_snapshot(database, inputs.folder / PHOTOS_ONLY, (*FEATURES, *MATCHES))
+    _write_snapshot(database, inputs.folder / WITH_FEATURES, MATCHES)
+
+
+def _write_snapshot(database: Path, target: Path, without: Sequence[str]) -> None:
     """Copy a database that nobody writes to, atomically, for reading over a network; tables `without` stay empty."""
     with translate_errors("copying the database"), replace_atomically(target) as beside:
         with contextlib.closing(sqlite3.connect(database)) as source:
@@ -323,7 +330,7 @@ def match_chunk(inputs: SiftInputs, pairs: Sequence[PairId], progress: Progress 
     """Match pairs of photos by their ids, in this order, and leave their rows in a file."""
     photos = sorted({photo for pair in pairs for photo in pair})
     with translate_errors("matching photos"), _MATCHING, _scratch_copy(inputs) as database:
-        _copy_rows(database, inputs.features, FEATURES, photos)
+        _copy_rows(database, inputs.folder / WITH_FEATURES, FEATURES, photos)
         in_force = match_sift(database, inputs.settings.options, pairs, progress or SilentProgress())
         return Part(_leave_rows(database, MATCHES, inputs.folder), len(pairs), in_force)
 
@@ -371,7 +378,7 @@ def exhaustive_pairs(photos: Sequence[int]) -> list[PairId]:
 @contextlib.contextmanager
 def _scratch_copy(inputs: SiftInputs) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="sfm-app-sift-", dir=inputs.scratch) as scratch:
-        yield Path(shutil.copyfile(inputs.snapshot, Path(scratch) / inputs.snapshot.name))
+        yield Path(shutil.copy(inputs.folder / PHOTOS_ONLY, scratch))
 
 
 def _leave_rows(database: Path, tables: Sequence[str], folder: Path) -> Path:

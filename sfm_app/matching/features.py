@@ -29,7 +29,7 @@ from sfm_app.colmap.features import (
     match_chunk,
     match_chunk_apart,
     photos_without_features,
-    write_snapshot,
+    write_inputs,
 )
 from sfm_app.colmap.worker_process import ProcessGroup, ProgressReporter, SiftOption, run_worker
 from sfm_app.errors import InputError, PluginError
@@ -240,9 +240,8 @@ def match_in_chunks(sift: Mapping[str, SiftOption], pairs: Sequence[PairId] | No
     Returns the options in force.
     """
     database = run.workspace.database
-    every = exhaustive_pairs(sorted(photo_names(database))) if pairs is None else list(pairs)
-    unmatched = set(unmatched_pairs(database, [(min(pair), max(pair)) for pair in every]))
-    missing = [pair for pair in every if (min(pair), max(pair)) in unmatched]
+    wanted = exhaustive_pairs(sorted(photo_names(database))) if pairs is None else pairs
+    missing = unmatched_pairs(database, wanted)
     features = count_features(database)
     pair_s = CHUNKS.feature_s * max(sum(features) / max(len(features), 1), 1.0)
     most = min(max(int(CHUNKS.chunk_s / pair_s), CHUNKS.least_pairs), CHUNKS.most_pairs)
@@ -291,7 +290,10 @@ def _do_in_chunks(
     shutil.rmtree(folder, ignore_errors=True)
     if not parts:
         return in_force
-    inputs = _write_inputs(folder, sift, run, with_features=tables is MATCHES)
+    masks = run.mask_dir.absolute() if run.mask_dir else None
+    settings = SiftSettings(place.photos.absolute(), masks, run.settings.matching, dict(sift))
+    inputs = SiftInputs(settings, folder.absolute())
+    write_inputs(place.database, inputs)
     run.progress.start(label, sum(len(part) for part in parts))
     try:
         for part in ordered_map(run.executor, prepare(inputs), parts, ahead=run.workers):
@@ -302,26 +304,6 @@ def _do_in_chunks(
         run.progress.finish()
         shutil.rmtree(folder, ignore_errors=True)
     return in_force
-
-
-def _write_inputs(folder: Path, sift: Mapping[str, SiftOption], run: RunContext, *, with_features: bool) -> SiftInputs:
-    place, folder = run.workspace, folder.absolute()
-    folder.mkdir(parents=True)
-    inputs = SiftInputs(
-        folder / "photos.db",
-        folder / "features.db",
-        SiftSettings(
-            place.photos.absolute(),
-            run.mask_dir.absolute() if run.mask_dir else None,
-            run.settings.matching,
-            dict(sift),
-        ),
-        folder,
-    )
-    write_snapshot(place.database, inputs.snapshot, (*FEATURES, *MATCHES))
-    if with_features:
-        write_snapshot(place.database, inputs.features, MATCHES)
-    return inputs
 
 
 # All features and matches, by COLMAP's SIFT or by a plug-in of two functions.
