@@ -259,14 +259,10 @@ def camera_tables(contents: RunContents) -> list[CameraTable]:
     return tables
 
 
-def _lens_rows(after: Any) -> list[tuple[str, str, str]]:
-    names = [name for name in after.deviations if name not in PLACES_IN_K]
-    first = len(after.params) - len(names)
-    return [
-        (name, "", value_text(after.params[first + k], after.deviations[name], 4))
-        for k, name in enumerate(names)
-        if first >= 0 and after.params[first + k]
-    ]
+def _lens_rows(after: CameraModel) -> list[tuple[str, str, str]]:
+    terms = zip(PARAMETERS.get(after.model, ()), after.params, strict=False)
+    known = [(name, value) for name, value in terms if value and name not in PLACES_IN_K and name in after.deviations]
+    return [(name, "", value_text(value, after.deviations[name], 4)) for name, value in known]
 
 
 def value_text(value: float, deviation: float | None, digits: int = 1) -> str:
