@@ -46,11 +46,6 @@ class RunScene(Scene):
         with open_run(self.out, Settings(), None) as run:
             return stored_arrays(run)
 
-    @classmethod
-    def from_scene(cls, scene: Scene, out: Path) -> "RunScene":
-        """Return a scene with the output folder of its arrays."""
-        return cls(**{field.name: getattr(scene, field.name) for field in fields(Scene)}, out=out)
-
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Run:
@@ -178,7 +173,10 @@ def _as_run(run: RunContext, products: "Products", last: str, report: Path | Non
     manifest: dict[str, Any] = run.workspace.manifest.read()
     # a run of an earlier version may lack a stage
     done = [stage for stage in pipeline.PIPELINE.stages_until(last) if stage.name in manifest["stages"]]
-    scene = RunScene.from_scene(products[pipeline.SCENE], run.workspace.root) if pipeline.SCENE in done else None
+    scene = None
+    if pipeline.SCENE in done:
+        found = products[pipeline.SCENE]
+        scene = RunScene(**{field.name: getattr(found, field.name) for field in fields(Scene)}, out=run.workspace.root)
     return Run(
         out=run.workspace.root,
         calibration=products[pipeline.INTRINSICS] if pipeline.INTRINSICS in done else None,

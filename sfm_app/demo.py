@@ -2,10 +2,10 @@
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -77,10 +77,6 @@ class DemoResult:
     seconds_rendering: float
     seconds_reconstruction: float
     files: list[str]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON values."""
-        return asdict(self)
 
 
 def run_demo(out: Path, scene: str, settings: Settings, progress: Progress) -> tuple[Run, DemoResult]:

@@ -31,13 +31,13 @@ from sfm_app.colmap.surface import FUSED, open_points, positions
 from sfm_app.colmap.wide_views import WideLens, render_views, save_picture
 from sfm_app.engine.stage import Products, Stage, check_undamaged, resume_hint
 from sfm_app.errors import InputError
-from sfm_app.files import replace_atomically
+from sfm_app.files import replace_atomically, replace_folder
 from sfm_app.formats.scenes import plain_names
 from sfm_app.frame.scale import GPS, MetricFrame, move_model
 from sfm_app.frame.sighted_points import Distance, PosedPhotos, measure_distance
 from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import json_text
-from sfm_app.operating_system import is_link, move
+from sfm_app.operating_system import is_link
 from sfm_app.photos.masks import mask_path, save_mask
 from sfm_app.pipeline import MESH, SCALE, SCENE, TEXTURE
 from sfm_app.runtime.context import RunContext
@@ -65,11 +65,7 @@ def export_frame(run: RunContext) -> Similarity | None:
 
 
 def check_finished(run: RunContext, stages: Sequence[Stage[object]], what: str, otherwise: str = "") -> None:
-    """Check that stages of a run are finished; messages say `what` is exported, and hints what `otherwise`.
-
-    Raises:
-        InputError: there is no run, or a stage is missing (the message names it).
-    """
+    """Check that stages of a run are finished (InputError); messages say `what` is exported, hints what `otherwise`."""
     place = run.workspace
     place.manifest.check_begun()
     for stage in stages:
@@ -272,25 +268,11 @@ def fill_folder(target: Path, about: Callable[[], Mapping[str, object]]) -> Iter
     The target may be an earlier export; `about` returns the entries of the record besides the files, at the end.
     """
     check_replaceable(target)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    draft = target.with_name(f".{target.name}.unfinished")
-    shutil.rmtree(draft, ignore_errors=True)
-    draft.mkdir()
-    try:
+    with replace_folder(target) as draft:
         yield draft
         with replace_atomically(draft / RECORD) as path:
             path.write_text(json_text({**about(), "files": _list_files(draft)}), encoding="utf-8", newline="\n")
         check_replaceable(target)  # it may have changed
-        if target.exists():
-            old = target.with_name(f".{target.name}.old")
-            shutil.rmtree(old, ignore_errors=True)
-            move(target, old)
-            move(draft, target)
-            shutil.rmtree(old, ignore_errors=True)
-        else:
-            move(draft, target)
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
 
 
 def check_replaceable(target: Path) -> None:

@@ -13,7 +13,7 @@ from zipfile import ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.operating_system import is_link, replace_file
+from sfm_app.operating_system import is_link, move, replace_file
 
 UNFINISHED = "unfinished.txt"
 """Marker in a folder that a stage is filling: the fingerprint of the inputs."""
@@ -29,6 +29,23 @@ def replace_atomically(target: Path) -> Iterator[Path]:
         replace_file(draft, target)
     finally:
         draft.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def replace_folder(target: Path) -> Iterator[Path]:
+    """Provide an empty folder beside `target`, which replaces it when the block ends without an error."""
+    draft, old = (target.with_name(f".{target.name}.{state}") for state in ("unfinished", "old"))
+    shutil.rmtree(draft, ignore_errors=True)
+    shutil.rmtree(old, ignore_errors=True)
+    draft.mkdir(parents=True)
+    try:
+        yield draft
+        if target.exists():
+            move(target, old)
+        move(draft, target)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
 
 
 def resume_or_clear(folder: Path, made_from: str) -> bool:

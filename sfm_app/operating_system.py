@@ -307,8 +307,7 @@ def end_at_exit() -> None:
     """End this process at once when a library calls `exit`, skipping the handlers registered so far.
 
     If a library calls `exit` in a thread (libjpeg, on a full disk), its handlers destroy data while other threads use
-    it;
-    these threads may then wait for each other for ever.
+    it; these threads may then wait for each other for ever.
     """
     if lacks(Ability.EXIT_HANDLERS):
         return

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sfm_app import products
 from sfm_app.camera_files import read_given_cameras
+from sfm_app.colmap.dense import digest_maps
 from sfm_app.engine.execution import Pipeline
 from sfm_app.engine.stage import Products, Stage
 from sfm_app.frame.control_points import read_control_points
@@ -81,8 +82,8 @@ DEPTH_MAPS: Stage[Path] = Stage(
     settings=("depth",),
     files=("dense",),
     make=lambda given, run: depth_maps.make(given[SCENE], run),
-    load=lambda _, run: depth_maps.load(run),
-    digest=depth_maps.digest,
+    load=lambda _, run: run.workspace.dense,
+    digest=lambda place: digest_maps(place.dense),
 )
 MESH: Stage[Surface] = Stage(
     name="mesh",
@@ -102,14 +103,15 @@ TEXTURE: Stage[Model] = Stage(
     load=lambda _, run: products.read_texture(run.workspace),
     digest=products.hash_texture,
 )
+MODEL_FILES = ("model.ply", "model.glb")
 FILES: Stage[tuple[Path, ...]] = Stage(
     name="files",
     takes=(SCALE, TEXTURE),
     settings=(),
-    files=("model.ply", "model.glb"),
+    files=MODEL_FILES,
     make=lambda given, run: files.make(given[TEXTURE], given[SCALE], run),
-    load=lambda _, run: files.load(run),
-    digest=files.digest,
+    load=lambda _, run: tuple(run.workspace.root / name for name in MODEL_FILES),
+    digest=products.hash_files(*MODEL_FILES),
 )
 
 PIPELINE = Pipeline(PHOTOS, (MATCH_GRAPH, VIEW_GRAPH, INTRINSICS, SCENE, SCALE, DEPTH_MAPS, MESH, TEXTURE, FILES))

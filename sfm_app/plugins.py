@@ -95,10 +95,6 @@ class MakeDepthMaps(Protocol):
     def __call__(self, task: "DepthTask", /) -> list[Rejected | None]: ...
 
 
-def _no_reason() -> str:
-    return ""
-
-
 @dataclass(frozen=True, slots=True)
 class DepthMethod:
     """A named method for depth maps."""
@@ -106,7 +102,7 @@ class DepthMethod:
     name: str
     make: MakeDepthMaps
     summary: str = ""
-    unavailable: Callable[[], str] = _no_reason
+    unavailable: Callable[[], str] = str
     """Reason why it cannot run on this machine; empty if it can."""
 
 
@@ -118,7 +114,7 @@ class FeatureMethod:
     find: FindFeatures | None = None
     match: MatchFeatures | None = None
     summary: str = ""
-    unavailable: Callable[[], str] = _no_reason
+    unavailable: Callable[[], str] = str
     sift: Mapping[str, bool | int | float] | None = None
     """In place of functions: options of COLMAP's SIFT extraction that differ from its defaults."""
 
@@ -182,31 +178,22 @@ class Plugins:
         return _look_up(self.calibrators, name, "calibrator")
 
     def exporter(self, name: str) -> Exporter:
-        """Return a file format for models; ConfigError where it is unknown or cannot run here."""
-        return _check_available(_look_up(self.exporters, name, "file format"))
+        """Return a file format for models; ConfigError where it is unknown or cannot be used here."""
+        return _look_up_available(self.exporters, name, "file format", INSTALL_HINT)
 
     def scene_exporter(self, name: str) -> SceneExporter:
         """Return a format for scenes; ConfigError as in `exporter`."""
-        return _check_available(_look_up(self.scene_exporters, name, "format for scenes"))
+        return _look_up_available(self.scene_exporters, name, "format for scenes", INSTALL_HINT)
 
     def feature_method(self, name: str) -> FeatureMethod:
-        """Return a feature method; ConfigError where it is unknown or cannot run here."""
-        method = _look_up(self.features, name, "feature method")
-        if reason := method.unavailable():
-            hint = f"'{SIFT}' runs everywhere"
-            raise ConfigError(f"the feature method '{name}' cannot run here: {reason}", hint=hint)
-        return method
+        """Return a feature method; ConfigError as in `exporter`."""
+        return _look_up_available(self.features, name, "feature method", f"'{SIFT}' runs everywhere")
 
     def depth_method(self, name: str) -> tuple[DepthMethod, str]:
         """Return a depth method, or with "auto" the best that runs here, and why; ConfigError as in `exporter`."""
         if name != AUTO:
-            method = _look_up(self.depth_methods, name, "depth method")
-            if reason := method.unavailable():
-                raise ConfigError(
-                    f"the depth method '{name}' cannot run here: {reason}",
-                    hint=f"'{AUTO}' chooses the best method of this machine, '{CPU}' runs everywhere",
-                )
-            return method, "chosen in the settings"
+            hint = f"'{AUTO}' chooses the best method of this machine, '{CPU}' runs everywhere"
+            return _look_up_available(self.depth_methods, name, "depth method", hint), "chosen in the settings"
         # an installed method has preference
         others = [method for method in self.depth_methods.values() if method.name != CPU]
         reasons = {method.name: method.unavailable() for method in others}
@@ -277,12 +264,13 @@ def _index_by_name(results: Iterable[Iterable[Part]], others: Iterable[str] = ()
     return MappingProxyType(by_name)
 
 
-Format = TypeVar("Format", Exporter, SceneExporter)
+Available = TypeVar("Available", Exporter, SceneExporter, DepthMethod, FeatureMethod)
 
 
-def _check_available(part: Format) -> Format:
+def _look_up_available(parts: Mapping[str, Available], name: str, kind: str, hint: str) -> Available:
+    part = _look_up(parts, name, kind)
     if reason := part.unavailable():
-        raise ConfigError(f"the file format '{part.name}' cannot be written here: {reason}", hint=INSTALL_HINT)
+        raise ConfigError(f"the {kind} '{name}' cannot be used here: {reason}", hint=hint)
     return part
 
 

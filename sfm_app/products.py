@@ -6,7 +6,7 @@ its files are read, because COLMAP hangs on some damaged ones.
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import Reconstruction, check_written, translate_errors
 from sfm_app.colmap.database import digest_matches, is_sound, read_match_graph
 from sfm_app.colmap.model import read_scene as read_colmap_scene
-from sfm_app.files import digest_files, is_below, load_arrays, replace_atomically
+from sfm_app.files import digest_files, is_below, load_arrays, replace_atomically, replace_folder
 from sfm_app.frame.scale import MetricFrame
 from sfm_app.numerical import json_text
-from sfm_app.operating_system import move
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.types import (
     Intrinsics,
@@ -45,6 +44,11 @@ def _read_json(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
+def hash_files(*names: str) -> Callable[[Workspace], str]:
+    """Return the function that hashes these files, and those in these folders, of an output folder."""
+    return lambda place: digest_files(place.root, *names)
+
+
 # photos.json: the photos, those left out, and hashes of the 8-bit copies.
 
 
@@ -52,8 +56,7 @@ def write_photo_list(photos: PhotoSet, copies: Mapping[str, str | None], place: 
     """Write photos.json; `copies` are the hashes of 8-bit copies by name, None for photos without one."""
     unusable = [asdict(photo) for photo in photos.unusable]
     values = {"photos": [photo.to_dict() for photo in photos.photos], "unusable": unusable, "copies": copies}
-    with replace_atomically(place.photo_set) as path:
-        path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8", newline="\n")
+    _write_json(place.photo_set, values)
 
 
 def read_photo_list(place: Workspace) -> PhotoSet:
@@ -71,9 +74,8 @@ def read_copy_hashes(place: Workspace) -> Mapping[str, str | None]:
     return copies
 
 
-def hash_photos(place: Workspace) -> str:
-    """Return a hash of photos.json, which holds hashes of the copies."""
-    return digest_files(place.root, place.photo_set.name)
+hash_photos = hash_files("photos.json")
+"""It holds hashes of the copies."""
 
 
 # database.db: keypoints and matches. COLMAP writes it.
@@ -106,9 +108,7 @@ def read_view_graph(place: Workspace) -> ViewGraph:
     return ViewGraph.from_arrays(load_arrays(place.view_graph))
 
 
-def hash_view_graph(place: Workspace) -> str:
-    """Return a hash of view_graph.npz."""
-    return digest_files(place.root, place.view_graph.name)
+hash_view_graph = hash_files("view_graph.npz")
 
 
 # calibration.json: the cameras before mapping.
@@ -124,9 +124,7 @@ def read_intrinsics(place: Workspace) -> Intrinsics:
     return Intrinsics.from_dict(_read_json(place.calibration))
 
 
-def hash_intrinsics(place: Workspace) -> str:
-    """Return a hash of calibration.json."""
-    return digest_files(place.root, place.calibration.name)
+hash_intrinsics = hash_files("calibration.json")
 
 
 # sparse/ and scene.json: COLMAP's model, and what it cannot hold.
@@ -135,20 +133,11 @@ def hash_intrinsics(place: Workspace) -> str:
 def write_sparse_models(models: Sequence[Reconstruction], place: Workspace) -> None:
     """Write the main model, the first, to OUT/sparse and the others to OUT/other_models/1, 2, ..., each atomically."""
     shutil.rmtree(place.other_models, ignore_errors=True)
-    for number, model in enumerate(models[1:], start=1):
-        _write_sparse_model(model, place.other_models / str(number))
-    _write_sparse_model(models[0], place.sparse)
-
-
-def _write_sparse_model(model: Reconstruction, target: Path) -> None:
-    beside = target.with_name(f".{target.name}")
-    shutil.rmtree(beside, ignore_errors=True)
-    beside.mkdir(parents=True)
-    with translate_errors("writing the sparse model"):
-        model.write(beside)
-        check_written(*beside.iterdir())
-    shutil.rmtree(target, ignore_errors=True)
-    move(beside, target)
+    targets = (place.sparse, *(place.other_models / str(number) for number in range(1, len(models))))
+    for model, target in reversed(list(zip(models, targets, strict=True))):  # the main model is last
+        with replace_folder(target) as draft, translate_errors("writing the sparse model"):
+            model.write(draft)
+            check_written(*draft.iterdir())
 
 
 def write_scene(scene: Scene, place: Workspace) -> None:
@@ -170,9 +159,7 @@ def read_scene(place: Workspace) -> Scene:
     return replace(scene, gps_deviation=values.get("gps_deviation"))
 
 
-def hash_scene(place: Workspace) -> str:
-    """Return a hash of the main model and scene.json."""
-    return digest_files(place.root, place.sparse.name, place.scene.name)
+hash_scene = hash_files("sparse", "scene.json")
 
 
 # scale.json: the frame of exported files.
@@ -188,9 +175,7 @@ def read_frame(place: Workspace) -> MetricFrame:
     return MetricFrame.from_dict(_read_json(place.scale))
 
 
-def hash_frame(place: Workspace) -> str:
-    """Return a hash of scale.json."""
-    return digest_files(place.root, place.scale.name)
+hash_frame = hash_files("scale.json")
 
 
 # surface/surface.npz, and surface/fine.npz for normal maps.

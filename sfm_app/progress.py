@@ -1,13 +1,13 @@
 """Progress of long work, whatever displays it."""
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, TypeVar
 
 Item = TypeVar("Item")
 
 
-class Progress(Protocol):
-    """A display of progress: the command line has one on stderr, a library call none."""
+class Progress:
+    """A display of progress, which shows only what a subclass shows; the command line has one on stderr."""
 
     def stage(self, name: str, note: str = "") -> None:
         """Announce a stage; the note says why it is skipped or repeated."""
@@ -28,26 +28,8 @@ class Progress(Protocol):
         """Finish the work started last."""
 
 
-class SilentProgress:
+class SilentProgress(Progress):
     """A display that shows nothing."""
-
-    def stage(self, name: str, note: str = "") -> None:
-        """Show nothing."""
-
-    def finish_stage(self, seconds: float, photos: int = 0) -> None:
-        """Show nothing."""
-
-    def say(self, text: str) -> None:
-        """Show nothing."""
-
-    def start(self, label: str, total: int) -> None:
-        """Show nothing."""
-
-    def advance(self, steps: int = 1) -> None:
-        """Show nothing."""
-
-    def finish(self) -> None:
-        """Show nothing."""
 
 
 class Step(NamedTuple):

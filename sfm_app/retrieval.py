@@ -248,39 +248,27 @@ def _weigh(words: Sequence[IndexArray], size: int) -> "csr_array":
 # and with any number of threads.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Vocabulary:
-    """Visual words: the centers of clusters of descriptors."""
+def learn_vocabulary(descriptors: DescriptorArray, size: int, seed: int) -> NDArray[np.float32]:
+    """Learn visual words by k-means in two levels from descriptors (N, 128), N > 0, of all photos.
 
-    words: NDArray[np.float32]
-    """(K, 128) whole numbers, 0 to 255."""
-
-    def __len__(self) -> int:
-        return len(self.words)
-
-    def quantize(self, descriptors: DescriptorArray) -> IndexArray:
-        """Return (N,) the nearest word of each descriptor (N, 128)."""
-        return _nearest(descriptors.astype(np.float32), self.words)
-
-
-def learn_vocabulary(descriptors: DescriptorArray, size: int, seed: int) -> Vocabulary:
-    """Learn at most `size` words by k-means in two levels from descriptors (N, 128), N > 0, of all photos."""
+    Returns (K, 128), K <= `size`, the centers of clusters: whole numbers, 0 to 255.
+    """
     rng = np.random.default_rng(seed)
     most = min(len(descriptors), OPTIONS.samples_per_word * size)
     data = descriptors[np.sort(rng.permutation(len(descriptors))[:most])].astype(np.float32)
     branches = _cluster(data, min(OPTIONS.branches, max(1, size // 2)), rng)
-    nearest = _nearest(data, branches)
+    nearest = nearest_words(branches, data)
     parts = [data[nearest == k] for k in range(len(branches))]
     shares = [max(1, round(size * len(part) / len(data))) for part in parts]
     leaves = [_cluster(part, share, rng) for part, share in zip(parts, shares, strict=True) if len(part)]
-    return Vocabulary(np.unique(np.concatenate(leaves), axis=0))
+    return np.unique(np.concatenate(leaves), axis=0)
 
 
 def _cluster(data: NDArray[np.float32], count: int, rng: np.random.Generator) -> NDArray[np.float32]:
     """Return the centers of clusters, rounded to whole numbers; fewer where there are fewer data."""
     centers = np.unique(data[rng.permutation(len(data))[:count]], axis=0)
     for _ in range(OPTIONS.rounds):
-        nearest = _nearest(data, centers)
+        nearest = nearest_words(centers, data)
         order = np.argsort(nearest, kind="stable")
         used, starts = np.unique(nearest[order], return_index=True)
         sums = np.add.reduceat(data[order].astype(np.int64), starts, axis=0)
@@ -292,13 +280,13 @@ def _cluster(data: NDArray[np.float32], count: int, rng: np.random.Generator) ->
     return centers
 
 
-def _nearest(data: NDArray[np.float32], centers: NDArray[np.float32]) -> IndexArray:
-    """Return (N,) rows of the centers that are nearest to the data (N, 128); of equal ones the first."""
-    half = 0.5 * np.einsum("kd,kd->k", centers, centers)
-    nearest = np.empty(len(data), np.int64)
-    for start in range(0, len(data), 4096):
+def nearest_words(words: NDArray[np.float32], descriptors: NDArray[np.uint8 | np.float32]) -> IndexArray:
+    """Return (N,) rows of the words that are nearest to the descriptors (N, 128); of equal ones the first."""
+    half = 0.5 * np.einsum("kd,kd->k", words, words)
+    nearest = np.empty(len(descriptors), np.int64)
+    for start in range(0, len(descriptors), 4096):
         part = slice(start, start + 4096)
-        nearest[part] = np.argmax(data[part] @ centers.T - half, axis=1)
+        nearest[part] = np.argmax(descriptors[part].astype(np.float32) @ words.T - half, axis=1)
     return nearest
 
 

@@ -91,7 +91,7 @@ def test_without_cuda_auto_says_why_and_the_name_alone_is_an_error(monkeypatch):
 
     assert (method.name, "built without CUDA" in why) == ("cpu", True)
     with pytest.raises(
-        ConfigError, match="'patch-match' cannot run here: this pycolmap was built without CUDA"
+        ConfigError, match="'patch-match' cannot be used here: this pycolmap was built without CUDA"
     ) as caught:
         plugins.depth_method("patch-match")
     assert "cpu" in caught.value.hint

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING, Any, get_args
@@ -165,7 +166,7 @@ def demo(out: Path | None, scene: str, opens: bool | None, **flags: Any) -> None
         run, result = run_demo(folder, scene, settings, progress)
     interactive = sys.stdout.isatty() and not quiet
     if flags["as_json"]:
-        print_json(result.to_dict())
+        print_json(asdict(result))
     else:
         print_text(demo_lines(result))
         if interactive:
@@ -257,11 +258,7 @@ def known_formats() -> "dict[str, Exporter | SceneExporter]":
 
 
 def choose_format(name: str, target: Path | None) -> str:
-    """Return the name of a format; an empty name stands for the suffix of the target.
-
-    Raises:
-        ConfigError: there is no such format, or neither a name nor a suffix.
-    """
+    """Return the name of a format; an empty one stands for the suffix of the target; ConfigError for an unknown one."""
     formats = known_formats()
     suffix = target.suffix.removeprefix(".").lower() if target is not None else ""
     if not name and suffix:  # a format of that name has priority over others with that suffix

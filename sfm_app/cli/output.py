@@ -5,6 +5,7 @@ import re
 import shutil
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from textwrap import wrap
 from threading import Thread
@@ -110,26 +111,20 @@ def table(rows: Mapping[str, str]) -> list[str]:
     return [f"{name:{width}}  {text}" for name, text in rows.items()]
 
 
-def open_browser(address: str) -> bool:
-    """Open an address in the user's browser; return False if there is none.
+def open_browser(address: str) -> None:
+    """Open an address in the user's browser, if there is one.
 
     Without a screen, Python would start a text browser in this terminal. Some browsers block until their window
     closes: a thread calls them.
     """
     if sys.platform.startswith("linux") and not any(map(os.environ.get, SCREEN_VARIABLES)):
-        return False
+        return
     import webbrowser
 
-    errors = []
-
     def call() -> None:
-        try:
-            if not webbrowser.open(address):
-                errors.append("no browser")
-        except (webbrowser.Error, OSError) as err:
-            errors.append(str(err))
+        with suppress(webbrowser.Error, OSError):
+            webbrowser.open(address)
 
     thread = Thread(target=call, daemon=True)
     thread.start()
     thread.join(BROWSER_WAIT_S)
-    return not errors

@@ -15,6 +15,7 @@ from rich.table import Column
 from rich.text import Text
 
 from sfm_app.cli.output import STAGE_TITLES, WIDTH, fold_lines, terminal_width, to_printable
+from sfm_app.progress import Progress
 
 LONG_STAGE_S, SILENCE_S, LINE_EVERY_S = 10.0, 5.0, 30.0
 """Seconds of a stage from which on its speed is printed; without a bar, seconds until the title of a stage is printed,
@@ -27,7 +28,7 @@ LABEL_COLUMNS, BAR_COLUMNS, TITLE_COLUMNS = 32, 16, 38
 INDENT = " " * 6
 
 
-class Terminal:
+class Terminal(Progress):
     """Progress on stderr: a line per stage and a bar on a terminal, a few more lines elsewhere, nothing when quiet.
 
     On a terminal the bar moves as long as a stage runs. Elsewhere, `check_silence` prints the title of a long stage.
@@ -45,8 +46,7 @@ class Terminal:
         self.bars = Bars(
             TextColumn("  {task.description}", table_column=Column(width=LABEL_COLUMNS, no_wrap=True)),
             BarColumn(bar_width=BAR_COLUMNS),
-            StepsColumn(table_column=Column(no_wrap=True)),
-            TimeColumn(table_column=Column(no_wrap=True)),
+            StateColumn(table_column=Column(no_wrap=True)),
             console=self.console,
             get_time=clock,
             transient=True,
@@ -170,23 +170,15 @@ class Terminal:
             self.task, self.has_work = None, False
 
 
-class StepsColumn(ProgressColumn):
-    """Steps done, of all steps; empty if their number is unknown."""
-
-    def render(self, task: Task) -> Text:
-        """Return the text of a bar."""
-        return MofNCompleteColumn().render(task) if task.total else Text("")
-
-
-class TimeColumn(ProgressColumn):
-    """Elapsed time and time left."""
+class StateColumn(ProgressColumn):
+    """Steps done, of all steps if their number is known, elapsed time and time left."""
 
     def render(self, task: Task) -> Text:
         """Return the text of a bar."""
         minutes, seconds = divmod(int(task.elapsed or 0.0), 60)
-        elapsed = f"{minutes}:{seconds:02}"
+        steps = [MofNCompleteColumn().render(task), " "] if task.total else []
         remaining = remaining_text(task)
-        return Text(f"{elapsed}, {remaining}" if remaining else elapsed)
+        return Text.assemble(*steps, f"{minutes}:{seconds:02}{f', {remaining}' if remaining else ''}")
 
 
 def progress_text(task: Task) -> str:

@@ -129,11 +129,7 @@ def _is_ours(err: Exception) -> bool:
 
 
 def check_written(*files: Path) -> None:
-    """Check that the disk has a free megabyte after COLMAP has written files: COLMAP does not report a full disk.
-
-    Raises:
-        OSError: the disk takes no more bytes.
-    """
+    """Raise an OSError unless a megabyte is free after COLMAP has written files: it does not report a full disk."""
     longest = max((file.stat().st_size for file in files), default=0)
     with tempfile.TemporaryFile(dir=files[0].parent) as probe:
         probe.seek(longest)

@@ -225,10 +225,7 @@ def adjust_in_rounds(
 ) -> Rounds:
     """Refine cameras, poses, points and tracks of a model in place, until they no longer change.
 
-    The cameras are of FILE_MODELS; without a graph of all matches, the tracks stay.
-
-    Raises:
-        NumericalError: the adjustment diverges.
+    The cameras are of FILE_MODELS; without a graph of all matches, the tracks stay. NumericalError if it diverges.
     """
     points, open_points = model.num_points3D(), []
     for _ in range(OPTIONS.rounds):
@@ -480,10 +477,7 @@ def adjust(
     In each round, poses and points are eliminated, and the likelihood of the cameras is weighed against their priors.
     The cameras make the resulting step. Poses and points follow linearly; after a long step COLMAP's solver refines
     them. Then tracks are completed and filtered. The given model is not changed; with `families_known`, an earlier
-    adjustment has chosen between fisheye and perspective lenses.
-
-    Raises:
-        NumericalError: the adjustment diverges.
+    adjustment has chosen between fisheye and perspective lenses. NumericalError if it diverges.
     """
     model = pycolmap.Reconstruction(model)
     for camera in all_cameras(model):

@@ -106,20 +106,16 @@ def create_database(path: Path, photos: PhotoSet) -> None:
 
 def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
     """Return keypoints and raw matches of every photo in the database, which was made from these photos."""
-    by_name = {photo.name: photo for photo in photos.photos}
-    with open_database(path) as database:
-        images, keypoints = {}, {}
-        for entry in sorted(database.read_all_images(), key=lambda entry: entry.image_id):
-            photo = by_name[entry.name]
-            images[entry.image_id] = MatchedImage(
-                entry.image_id, photo.name, photo.group, photo.width, photo.height,
-                photo.exif_focal_px, photo.gps, photo.turn_deg, photo.shown, photo.projection, photo.time_s,
-            )  # fmt: skip
-            rows = np.asarray(database.read_keypoints(entry.image_id), np.float64)
-            keypoints[entry.image_id] = rows[:, :2].copy() if len(rows) else np.zeros((0, 2))  # a white wall
-        pair_ids, indices = database.read_all_matches()
-    matches = {_pair(key): np.asarray(row, np.uint32) for key, row in zip(pair_ids, indices, strict=True) if len(row)}
-    return MatchGraph(images, keypoints, dict(sorted(matches.items())))
+    by_name, images = {photo.name: photo for photo in photos.photos}, {}
+    for key, name in photo_names(path).items():
+        photo = by_name[name]
+        images[key] = MatchedImage(
+            key, photo.name, photo.group, photo.width, photo.height,
+            photo.exif_focal_px, photo.gps, photo.turn_deg, photo.shown, photo.projection, photo.time_s,
+        )  # fmt: skip
+    found, matches = read_features(path)
+    keypoints = {key: found.get(key, np.zeros((0, 2))) for key in images}  # none on a white wall
+    return MatchGraph(images, keypoints, {pair: rows for pair, rows in sorted(matches.items()) if len(rows)})
 
 
 def panorama_names(path: Path) -> frozenset[str]:
@@ -137,7 +133,7 @@ def photo_names(path: Path) -> dict[int, str]:
 
 
 def unmatched_pairs(path: Path, pairs: Sequence[PairId]) -> list[PairId]:
-    """Return the pairs, smaller id first, without an entry of matches in the database, not even an empty one."""
+    """Return the pairs, with ids in any order, without an entry of matches in the database, not even an empty one."""
     with open_database(path) as database:
         return [pair for pair in pairs if not database.exists_matches(*pair)]
 

@@ -3,6 +3,7 @@
 import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from math import ceil
 from pathlib import Path
 
@@ -10,8 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.colmap import tasks
 from sfm_app.colmap.backend import all_images, check_written, pycolmap, translate_errors
-from sfm_app.colmap.worker_process import UndistortTask, run_worker
+from sfm_app.colmap.worker_process import run_worker
 from sfm_app.files import digest_files, is_below
 from sfm_app.operating_system import replace_file
 from sfm_app.photos.masks import mask_path, read_mask, save_mask
@@ -89,16 +91,8 @@ def undistort(
 ) -> None:
     """Write undistorted photos and the matching model into a dense workspace; larger photos are scaled down."""
     (dense_dir / "images").mkdir(parents=True, exist_ok=True)
-    task: UndistortTask = {
-        "do": "undistort",
-        "dense": str(dense_dir),
-        "model": str(model_dir),
-        "photos": str(photo_dir),
-        "max_side_px": max_side_px,
-        "workers": workers,
-        "output": "COLMAP",
-    }
-    run_worker(task, "undistorting photos", progress)
+    call = partial(tasks.undistort, dense_dir, model_dir, photo_dir, max_side_px, workers)
+    run_worker(call, "undistorting photos", progress)
 
 
 def read_views(dense_dir: Path) -> list[View]:

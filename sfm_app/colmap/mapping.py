@@ -6,11 +6,13 @@ that decided whether a model was right.
 
 import shutil
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from pathlib import Path
 
+from sfm_app.colmap import tasks
 from sfm_app.colmap.backend import Cancellation, all_cameras, check_written, largest_model, pycolmap
 from sfm_app.colmap.database import SQUARE_PIXELS
-from sfm_app.colmap.worker_process import TASKS, DefaultMappingTask, GlobalMappingTask, start_worker
+from sfm_app.colmap.worker_process import start_worker
 
 
 def map_incrementally(
@@ -55,14 +57,8 @@ def map_globally(
 
     COLMAP has no way to stop this, so it runs in a separate process. The folder, from `copy_database`, is removed.
     """
-    task: GlobalMappingTask = {
-        "do": "map_globally",
-        "scratch": str(scratch),
-        "photos": str(photo_dir),
-        "seed": seed,
-        "names": list(names),
-    }
-    return _map_in_process(task, "mapping all photos at once", token)
+    call = partial(tasks.map_globally, scratch, photo_dir, seed, names)
+    return _map_in_process(call, scratch, "mapping all photos at once", token)
 
 
 def map_with_colmap_defaults(
@@ -72,21 +68,15 @@ def map_with_colmap_defaults(
 
     Only the raw matches and the guess are ours. Result and errors are those of `map_globally`.
     """
-    task: DefaultMappingTask = {
-        "do": "map_with_defaults",
-        "scratch": str(scratch),
-        "photos": str(photo_dir),
-        "seed": seed,
-    }
-    return _map_in_process(task, "mapping photos by its defaults", token)
+    call = partial(tasks.map_with_defaults, scratch, photo_dir, seed)
+    return _map_in_process(call, scratch, "mapping photos by its defaults", token)
 
 
 def _map_in_process(
-    task: GlobalMappingTask | DefaultMappingTask, doing: str, token: Cancellation
+    call: Callable[[], None], scratch: Path, doing: str, token: Cancellation
 ) -> pycolmap.Reconstruction | None:
-    scratch = Path(task["scratch"])
     try:
-        with start_worker(TASKS, task) as process:
+        with start_worker(call) as process:
             while not process.has_ended(0.1):
                 if token.is_cancelled:
                     return None

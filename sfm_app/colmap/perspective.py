@@ -4,6 +4,7 @@ import shutil
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -12,10 +13,11 @@ from numpy.typing import NDArray
 
 from sfm_app.camera.perspective_views import PerspectiveView, center_view
 from sfm_app.camera.projection import FX
+from sfm_app.colmap import tasks
 from sfm_app.colmap.backend import check_written, pycolmap, translate_errors
 from sfm_app.colmap.model import finite_points, point_arrays, posed_images
 from sfm_app.colmap.wide_views import WideLens, add_view_cameras, parse_view_name, perspective_lenses, render_views
-from sfm_app.colmap.worker_process import UndistortTask, run_worker
+from sfm_app.colmap.worker_process import run_worker
 from sfm_app.operating_system import replace_file
 from sfm_app.progress import Progress
 from sfm_app.stereo import View
@@ -186,16 +188,9 @@ def write_bundle(model_dir: Path, photo_dir: Path, file: Path, workers: int, pro
     scratch = file.with_name(".pmvs")
     try:
         scratch.mkdir()
-        task: UndistortTask = {
-            "do": "undistort",
-            "dense": str(scratch),
-            "model": str(model_dir),
-            "photos": str(photo_dir),
-            "max_side_px": -1,  # any size
-            "workers": workers,
-            "output": "PMVS",
-        }
-        run_worker(task, "writing Bundler's file", progress)
+        any_size = -1
+        call = partial(tasks.undistort, scratch, model_dir, photo_dir, any_size, workers, layout="PMVS")
+        run_worker(call, "writing Bundler's file", progress)
         replace_file(scratch / "pmvs/bundle.rd.out", file)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)

@@ -1,13 +1,15 @@
 """COLMAP's fusion of depth maps, Poisson surface reconstruction from the fused points, and mesh simplification."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.colmap import tasks
 from sfm_app.colmap.backend import translate_errors
-from sfm_app.colmap.worker_process import FuseTask, PoissonTask, SimplifyTask, run_worker
+from sfm_app.colmap.worker_process import run_worker
 from sfm_app.types import Surface
 
 FUSED = "fused.ply"
@@ -18,15 +20,7 @@ def fuse(dense_dir: Path, min_views: int, box: NDArray[np.float64], target: Path
 
     The cache of maps has `cache_gb`: the less, the more often they are read. 0 holds all, in half the time.
     """
-    task: FuseTask = {
-        "do": "fuse",
-        "dense": str(dense_dir),
-        "target": str(target),
-        "min_views": min_views,
-        "box": box.tolist(),
-        "cache_gb": cache_gb,
-    }
-    run_worker(task, "fusing depth maps")
+    run_worker(partial(tasks.fuse, dense_dir, min_views, box, target, cache_gb), "fusing depth maps")
     target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # photos of each point; not used
 
 
@@ -82,13 +76,7 @@ def poisson_surface(folder: Path, depth: int) -> Surface:
     the finest cell is the largest extent of the points over 2^depth.
     """
     path = folder / "poisson.ply"
-    task: PoissonTask = {
-        "do": "poisson",
-        "points": str(folder / FUSED),
-        "target": str(path),
-        "depth": max(depth, 5),
-    }
-    run_worker(task, "finding the surface")
+    run_worker(partial(tasks.mesh_poisson, folder / FUSED, path, max(depth, 5)), "finding the surface")
     surface = _read(path)
     path.unlink()
     return surface
@@ -104,15 +92,7 @@ def simplify(surface: Surface, most: int, max_error: float, scratch: Path, threa
 
     fine, coarse = scratch / "fine.ply", scratch / "coarse.ply"
     trimesh.Trimesh(surface.vertices, surface.faces, process=False).export(fine)
-    task: SimplifyTask = {
-        "do": "simplify",
-        "mesh": str(fine),
-        "target": str(coarse),
-        "most": most,
-        "max_error": max_error,
-        "threads": threads,
-    }
-    run_worker(task, "simplifying the surface")
+    run_worker(partial(tasks.simplify, fine, coarse, most, max_error, threads), "simplifying the surface")
     simple = _read(coarse)
     fine.unlink()
     coarse.unlink()

@@ -8,12 +8,13 @@ import contextlib
 import json
 import logging
 import os
+import pickle
 import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from typing import IO, Any, Literal, TypeAlias, TypedDict, TypeVar
+from collections.abc import Callable, Iterator
+from typing import IO, TypeAlias, TypeVar, cast
 
 from sfm_app.colmap.backend import log_level, show_log
 from sfm_app.errors import BackendError
@@ -21,119 +22,26 @@ from sfm_app.numerical import Json
 from sfm_app.operating_system import crash_name, end_at_exit, has_run_out, ignore_interrupts, watch_parent
 from sfm_app.progress import Progress, SilentProgress
 
-TASKS = "sfm_app.colmap.tasks"
 REPORT_FD = 3
-"""File descriptor for messages of a worker process to its parent."""
+"""File descriptor for messages of a worker process to its parent: lines of JSON."""
+RESULT = "result"
+"""Message with the pickled result of the call, in hexadecimal digits."""
 
 SiftOption: TypeAlias = bool | int | float
 """Value of an option of COLMAP's SIFT."""
-Task = TypeVar("Task", bound=Mapping[str, object])
-"""One of the tasks below; its values are valid JSON."""
-
-
-class FeatureTask(TypedDict):
-    """Arguments of `features.find_and_match`."""
-
-    do: Literal["find_and_match"]
-    database: str
-    photos: str
-    masks: str | None
-    names: list[str]
-    options: dict[str, Any]
-    """Dump of `MatchSettings`."""
-    workers: int
-    sift: dict[str, SiftOption]
-    pairs: list[list[int]] | None
-
-
-class MatchTask(TypedDict):
-    """Arguments of `features.match_chunk`."""
-
-    do: Literal["match_chunk"]
-    snapshot: str
-    features: str
-    photos: str
-    options: dict[str, Any]
-    sift: dict[str, SiftOption]
-    folder: str
-    pairs: list[list[int]]
-
-
-class MappingTask(TypedDict):
-    """Arguments of a mapper."""
-
-    scratch: str
-    photos: str
-    seed: int
-
-
-class GlobalMappingTask(MappingTask):
-    """Arguments of `mapping.map_globally`."""
-
-    do: Literal["map_globally"]
-    names: list[str]
-
-
-class DefaultMappingTask(MappingTask):
-    """Arguments of `mapping.map_with_colmap_defaults`."""
-
-    do: Literal["map_with_defaults"]
-
-
-class UndistortTask(TypedDict):
-    """Arguments of `dense.undistort`."""
-
-    do: Literal["undistort"]
-    dense: str
-    model: str
-    photos: str
-    max_side_px: int
-    workers: int
-    output: Literal["COLMAP", "PMVS"]
-    """COLMAP's name of the layout of the workspace."""
-
-
-class FuseTask(TypedDict):
-    """Arguments of `surface.fuse`."""
-
-    do: Literal["fuse"]
-    dense: str
-    target: str
-    min_views: int
-    box: list[list[float]]
-    cache_gb: float
-
-
-class PoissonTask(TypedDict):
-    """Arguments of `surface.poisson_surface`."""
-
-    do: Literal["poisson"]
-    points: str
-    target: str
-    depth: int
-
-
-class SimplifyTask(TypedDict):
-    """Arguments of `surface.simplify`."""
-
-    do: Literal["simplify"]
-    mesh: str
-    target: str
-    most: int
-    max_error: float
-    threads: int
+Result = TypeVar("Result")
 
 
 class WorkerProcess:
     """A running worker process."""
 
-    def __init__(self, process: "subprocess.Popen[str]", output: IO[bytes]) -> None:
+    def __init__(self, process: "subprocess.Popen[bytes]", output: IO[bytes]) -> None:
         self.process, self._output = process, output
 
     def messages(self) -> Iterator[dict[str, Json]]:
         """Yield the messages of the process, until it ends."""
         for line in self.process.stdout or ():
-            if line.endswith("\n"):  # else the process was killed while writing it
+            if line.endswith(b"\n"):  # else the process was killed while writing it
                 yield json.loads(line)
 
     def has_ended(self, wait_s: float) -> bool:
@@ -143,11 +51,7 @@ class WorkerProcess:
         return self.process.poll() is not None
 
     def check(self, doing: str) -> None:
-        """Wait for the process to end, and check that it succeeded.
-
-        Raises:
-            BackendError: the process failed, or it was killed.
-        """
+        """Wait for the process to end, and raise a BackendError if it failed or was killed."""
         code = self.process.wait()
         if not code:
             return
@@ -165,20 +69,23 @@ class WorkerProcess:
 
 
 @contextlib.contextmanager
-def start_worker(module: str, task: Mapping[str, object]) -> Iterator[WorkerProcess]:
-    """Start a process that runs a module, which calls `serve`, on a task; kill it at the end of the block."""
-    command = [sys.executable, "-P", "-m", module]  # -P: nothing is imported from the current folder
+def start_worker(call: Callable[[], object]) -> Iterator[WorkerProcess]:
+    """Start a process that makes a call, which is pickled and so of a module's function; kill it with the block."""
     level = log_level()
+    # -P: nothing is imported from the current folder
+    command = [sys.executable, "-P", "-m", "sfm_app.colmap.worker_process", str(level), str(os.getpid())]
     # the output goes to a file: nothing reads a pipe while the process runs, and a full pipe would block it forever
     with (
         tempfile.TemporaryFile() as output,
         subprocess.Popen(  # noqa: S603 - our module
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=None if level else output, encoding="utf-8"
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=None if level else output
         ) as process,
     ):
         try:
             with contextlib.suppress(OSError):  # the process has failed already; `check` reports why
-                print(json.dumps({"log_level": level, "parent": os.getpid(), **task}), file=process.stdin, flush=True)
+                pipe = cast(IO[bytes], process.stdin)
+                pickle.dump(call, pipe)
+                pipe.flush()
             yield WorkerProcess(process, output)
         finally:
             if process.poll() is None:
@@ -191,20 +98,23 @@ class ProcessGroup:
     def __init__(self) -> None:
         self._running, self._lock, self._has_ended = set[WorkerProcess](), threading.Lock(), False
 
-    def run(self, task: Mapping[str, object], doing: str, progress: Progress) -> dict[str, Json]:
-        """Run a task to its end or that of the group, as `run_worker` does."""
-        with start_worker(TASKS, task) as process:
+    def run(self, call: Callable[[], Result], doing: str, progress: Progress) -> Result:
+        """Make a call in a process, which ends with the group, and return its result; errors name what it was `doing`.
+
+        The call shows its progress by a `ProgressReporter`.
+        """
+        with start_worker(call) as process:
             with self._lock:
                 self._running.add(process)
                 if self._has_ended:
                     process.process.kill()
             try:
-                results = relay(process, progress)
+                messages = relay(process, progress)
                 process.check(doing)
             finally:
                 with self._lock:
                     self._running.discard(process)
-        return results
+        return pickle.loads(bytes.fromhex(str(messages[RESULT])))  # type: ignore[no-any-return]  # noqa: S301 - ours
 
     def stop(self) -> None:
         """Stop all processes, and those that start later."""
@@ -214,28 +124,25 @@ class ProcessGroup:
                 process.process.kill()
 
 
-def run_worker(task: Mapping[str, object], doing: str, progress: Progress | None = None) -> dict[str, Json]:
-    """Run one of COLMAP's tasks in a process, and return its results; error messages say what it was `doing`."""
-    with start_worker(TASKS, task) as process:
-        results = relay(process, progress or SilentProgress())
-        process.check(doing)
-    return results
+def run_worker(call: Callable[[], Result], doing: str, progress: Progress | None = None) -> Result:
+    """Make a call in a process of its own, and return its result, as `ProcessGroup.run` does."""
+    return ProcessGroup().run(call, doing, progress or SilentProgress())
 
 
-def serve(work: Callable[[Task], None]) -> None:
-    """Do the task in the worker process, and end when its parent does."""
+def serve(level: int, parent: int) -> None:
+    """Make the call in the worker process, report its result, and end when the parent does."""
     ignore_interrupts()
     end_at_exit()
     os.dup2(sys.stdout.fileno(), REPORT_FD)
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # output of libraries must not mix with the reports
     logging.captureWarnings(capture=True)  # -v shows what this process prints
-    line = sys.stdin.readline()
-    if not line:
+    show_log(level)
+    try:
+        call: Callable[[], object] = pickle.load(sys.stdin.buffer)  # noqa: S301 - from our parent
+    except EOFError:
         return
-    task = json.loads(line)
-    show_log(task["log_level"])
-    watch_parent(task["parent"], lambda: os._exit(1))
-    work(task)
+    watch_parent(parent, lambda: os._exit(1))
+    report(**{RESULT: pickle.dumps(call()).hex()})
 
 
 def report(**message: Json) -> None:
@@ -276,3 +183,7 @@ def relay(process: WorkerProcess, progress: Progress) -> dict[str, Json]:
     finally:
         progress.finish()
     return results
+
+
+if __name__ == "__main__":
+    serve(int(sys.argv[1]), int(sys.argv[2]))

@@ -60,11 +60,7 @@ class Products:
         return self._source
 
     def __getitem__(self, stage: Stage[Product]) -> Product:
-        """Return the product of a stage.
-
-        Raises:
-            DamagedProductError: the files of the stage have changed, or cannot be read.
-        """
+        """Return the product of a stage; DamagedProductError if its files have changed, or cannot be read."""
         if stage.name not in self._known:
             with check_undamaged(stage, self._run):
                 self._known[stage.name] = stage.load(self, self._run)

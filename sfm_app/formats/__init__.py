@@ -4,34 +4,15 @@ A new built-in format is a writing function in a module of this package, and a r
 """
 
 from functools import partial
-from importlib import import_module
-from typing import Any
 
+from sfm_app.formats.draco import write_draco
 from sfm_app.formats.exporters import CLOUD, Exporter, SceneExporter, missing_package
 from sfm_app.formats.gltf import write_glb
+from sfm_app.formats.laz import write_laz
 from sfm_app.formats.meshes import write_cloud_ply, write_obj, write_ply, write_stl
-from sfm_app.formats.scenes import (
-    write_bundler,
-    write_cameras,
-    write_colmap,
-    write_colmap_text,
-    write_nerfstudio,
-    write_opencv,
-    write_splat,
-)
+from sfm_app.formats.scenes import write_bundler, write_cameras, write_colmap, write_nerfstudio, write_opencv
+from sfm_app.formats.usd import write_usd, write_usdz
 
-
-def _load_later(module: str, function: str) -> Any:
-    """Return a writer whose module is imported when it writes, since few exports need it."""
-
-    def write(*arguments: Any) -> Any:
-        return getattr(import_module(f"sfm_app.formats.{module}"), function)(*arguments)
-
-    return write
-
-
-_draco, _laz = _load_later("draco", "write_draco"), _load_later("laz", "write_laz")
-_usd, _usdz = _load_later("usd", "write_usd"), _load_later("usd", "write_usdz")
 _no_usd = partial(missing_package, "usd-core", "pxr")
 _no_draco = partial(missing_package, "DracoPy", "DracoPy")
 _no_laz = partial(missing_package, "laspy[lazrs]", "lazrs")
@@ -47,14 +28,18 @@ _MODELS = (
         "binary STL in millimeters, z up, no colors; programs for 3D printers",
         holds_points=False,
     ),
-    Exporter("draco", _draco, "glb", "GLB compressed by Draco, a quarter of the size; web viewers", _no_draco),
-    Exporter("usdz", _usdz, "usdz", "USD and its texture in one file; Apple's Quick Look, Blender", _no_usd),
-    Exporter("usd", _usd, "usd", "binary USD with JPEG pages; Blender, Houdini, Omniverse", _no_usd),
+    Exporter("draco", write_draco, "glb", "GLB compressed by Draco, a quarter of the size; web viewers", _no_draco),
+    Exporter("usdz", write_usdz, "usdz", "USD and its texture in one file; Apple's Quick Look, Blender", _no_usd),
+    Exporter("usd", write_usd, "usd", "binary USD with JPEG pages; Blender, Houdini, Omniverse", _no_usd),
 )
 _SCENES = (
     SceneExporter("colmap", write_colmap, "folder images/, sparse/0: undistorted photos, COLMAP's binary model"),
-    SceneExporter("colmap-text", write_colmap_text, "the same with COLMAP's model as text"),
-    SceneExporter("splat", write_splat, "as colmap, optical centers in the middle, which some splat trainers expect"),
+    SceneExporter("colmap-text", partial(write_colmap, text=True), "the same with COLMAP's model as text"),
+    SceneExporter(
+        "splat",
+        partial(write_colmap, centered=True),
+        "as colmap, optical centers in the middle, which some splat trainers expect",
+    ),
     SceneExporter("nerfstudio", write_nerfstudio, "folder with transforms.json, images/ and the points; nerfstudio"),
     SceneExporter(
         "bundler", write_bundler, "folder with bundle.out, list.txt and photos as in splat, by COLMAP's writer"
@@ -64,7 +49,7 @@ _SCENES = (
     ),
     SceneExporter("opencv", write_opencv, "folder with a YAML file per camera, with its photos' poses, for OpenCV"),
     SceneExporter("cloud-ply", write_cloud_ply, "the dense cloud as PLY; CloudCompare, MeshLab", "cloud.ply", CLOUD),
-    SceneExporter("laz", _laz, "the dense cloud as compressed LAS; PDAL, QGIS", "cloud.laz", CLOUD, _no_laz),
+    SceneExporter("laz", write_laz, "the dense cloud as compressed LAS; PDAL, QGIS", "cloud.laz", CLOUD, _no_laz),
 )
 EXPORTERS = {exporter.name: exporter for exporter in _MODELS}
 SCENE_EXPORTERS = {exporter.name: exporter for exporter in _SCENES}

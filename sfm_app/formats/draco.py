@@ -98,11 +98,7 @@ def _compressed_primitive(
     corners = np.asarray(decoded.faces)
     indices = {"componentType": COMPONENTS[np.dtype(np.uint32)], "count": int(corners.size), "type": "SCALAR"}
     extension = {"bufferView": glb.add_view(data), "attributes": ids}
-    return {
-        "attributes": attributes,
-        "indices": glb.add("accessors", indices),
-        "extensions": {DRACO: extension},
-    }
+    return {"attributes": attributes, "indices": glb.add("accessors", indices), "extensions": {DRACO: extension}}
 
 
 def _accessor(named: str, values: NDArray[np.generic]) -> dict[str, Any]:

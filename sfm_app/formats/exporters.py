@@ -31,10 +31,6 @@ class WriteModel(Protocol):
     def __call__(self, model: Model, name: str, /) -> Mapping[str, bytes]: ...
 
 
-def _no_reason() -> str:
-    return ""
-
-
 @dataclass(frozen=True, slots=True)
 class Exporter:
     """A file format for models."""
@@ -44,7 +40,7 @@ class Exporter:
     suffix: str
     """Suffix, without dot, of the file to open."""
     summary: str = ""
-    unavailable: Callable[[], str] = _no_reason
+    unavailable: Callable[[], str] = str
     """Why this machine cannot write it; empty if it can."""
     holds_points: bool = True
     """Whether it stores points and cameras, too."""
@@ -104,7 +100,7 @@ class SceneExporter:
     """Usual name of its file; empty if it fills a folder."""
     needs: str = SCENE
     """`SCENE` or `CLOUD`."""
-    unavailable: Callable[[], str] = _no_reason
+    unavailable: Callable[[], str] = str
 
     @property
     def suffix(self) -> str:
@@ -118,11 +114,7 @@ def missing_package(package: str, module: str) -> str:
 
 
 def check_writable(model: Model) -> None:
-    """Check that a model can be written.
-
-    Raises:
-        ReconstructionError: there is neither a triangle nor a point, or coordinates are not finite.
-    """
+    """Raise a ReconstructionError for a model without triangles and points, or with coordinates that are not finite."""
     if not len(model.surface.vertices):
         raise ReconstructionError(
             "there is nothing to write: the model has no points", hint="take more photos with more overlap"

@@ -173,11 +173,7 @@ def decimals(vertices: NDArray[np.float64]) -> int:
 
 
 def write_stl(model: Model, name: str) -> Mapping[str, bytes]:
-    """Write the triangles of a model, without colors; its unit is taken for a meter, and y, which points up, becomes z.
-
-    Raises:
-        ReconstructionError: the model is not finite, or has no triangles.
-    """
+    """Write the triangles of a model without colors; its unit is taken for a meter, and y, which is up, becomes z."""
     import trimesh  # slow to load, and few need it
 
     check_writable(model)

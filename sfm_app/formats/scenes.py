@@ -82,23 +82,16 @@ def write_cameras(scene: FinishedScene, target: Path) -> None:
 MODEL = "sparse/0"
 
 
-def write_colmap(scene: FinishedScene, target: Path) -> None:
-    """Write undistorted photos and COLMAP's binary model into a folder."""
-    _write_folder(scene, target)
+def write_colmap(scene: FinishedScene, target: Path, *, text: bool = False, centered: bool = False) -> None:
+    """Write undistorted photos and COLMAP's model, binary or as text, into a folder.
 
-
-def write_colmap_text(scene: FinishedScene, target: Path) -> None:
-    """Write undistorted photos and COLMAP's model as text into a folder."""
-    _write_folder(scene, target, text=True)
-
-
-def write_splat(scene: FinishedScene, target: Path) -> None:
-    """Write the folder of `write_colmap`, with every optical center in the middle of its photo.
-
-    Some trainers read the focal length only. A crop around the optical center would lose much of a cropped photo, so
-    the photo is rotated instead, as if the camera had looked at its middle.
+    `centered` puts every optical center in the middle of its photo, since some trainers read the focal length only. A
+    crop around the optical center would lose much of a cropped photo, so the photo is rotated instead, as if the camera
+    had looked at its middle.
     """
-    _write_folder(scene, target, centered=True)
+    views = scene.perspective(centered=centered)
+    views.write_photos(target)
+    views.write_colmap(target / MODEL, text=text)
 
 
 def write_bundler(scene: FinishedScene, target: Path) -> None:
@@ -111,12 +104,6 @@ def write_bundler(scene: FinishedScene, target: Path) -> None:
     views.write_bundle(target / "bundle.out")
     lines = "".join(f"images/{photo.image}\n" for photo in views.photos)
     (target / "list.txt").write_text(lines, encoding="ascii", newline="\n")
-
-
-def _write_folder(scene: FinishedScene, target: Path, *, text: bool = False, centered: bool = False) -> None:
-    views = scene.perspective(centered=centered)
-    views.write_photos(target)
-    views.write_colmap(target / MODEL, text=text)
 
 
 # The folder that nerfstudio trains from: transforms.json, photos, masks and the sparse points.
@@ -163,11 +150,7 @@ def frame(photo: PerspectivePhoto) -> dict[str, Any]:
 
 
 def write_opencv(scene: FinishedScene, target: Path) -> None:
-    """Write a YAML file into a folder for each camera that OpenCV has a model for.
-
-    Raises:
-        InputError: OpenCV has a model for none of the cameras.
-    """
+    """Write a YAML file into a folder for each camera that OpenCV has a model for; InputError if it has for none."""
     result = scene.scene
     files = dict(zip(result.cameras, plain_names(list(result.cameras)), strict=True))
     reasons = {}
@@ -190,8 +173,7 @@ def write_opencv(scene: FinishedScene, target: Path) -> None:
 def opencv_lens(camera: CameraModel) -> tuple[str, NDArray[np.float64]]:
     """Return OpenCV's name of the lens, and its coefficients: k1 k2 p1 p2 k3 k4 k5 k6, or four of a fisheye.
 
-    Raises:
-        ValueError: OpenCV has no such lens.
+    ValueError if OpenCV has no such lens.
     """
     calibration = calibration_from_model(camera.model, camera.params, (camera.width, camera.height))
     if calibration.projection == EQUIRECTANGULAR:

@@ -4,14 +4,16 @@ import json
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from heapq import heappop, heappush
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.worker_process import MappingTask, start_worker
+from sfm_app.colmap.worker_process import start_worker
 from sfm_app.errors import BackendError
 from sfm_app.files import digest_file, load_arrays, replace_atomically
 from sfm_app.mapping.attempt import Group
@@ -355,6 +357,14 @@ FOLDER, STOP = "parts", "stop"
 
 
 @dataclass(frozen=True, slots=True)
+class PartTask:
+    """A part to map; its inputs are in a file that every worker can read."""
+
+    folder: str
+    photos: str
+
+
+@dataclass(frozen=True, slots=True)
 class PartResult:
     """Models of a part."""
 
@@ -373,7 +383,7 @@ def map_parts(
     """Map parts side by side, except those that a killed run has finished; failed ones have no models."""
     place = run.workspace.root / FOLDER
     (place / STOP).unlink(missing_ok=True)
-    tasks: list[MappingTask] = []
+    tasks: list[PartTask] = []
     for part in parts:
         members = part_of_group(group, part.photos)
         followed = frozenset(pair for pair in members.graph.poses if pair in mapped.poses)
@@ -381,8 +391,7 @@ def map_parts(
         folder = place / digest_file(place / INPUTS)[:16]
         folder.mkdir(exist_ok=True)
         replace_file(place / INPUTS, folder / INPUTS)
-        # small, since its inputs are files that every worker can read
-        tasks.append({"scratch": str(folder), "photos": str(run.workspace.photos), "seed": 0})
+        tasks.append(PartTask(str(folder), str(run.workspace.photos)))
     try:
         return run.map(Task(map_part), tasks, f"mapping {len(parts)} parts")
     except BaseException:  # also Ctrl-C: the processes end when they see the file
@@ -390,12 +399,12 @@ def map_parts(
         raise
 
 
-def map_part(task: MappingTask) -> PartResult:
-    """Map the part in the folder `scratch` in a separate process, and wait for it. Depends on nothing but the task."""
-    folder = Path(task["scratch"])
+def map_part(task: PartTask) -> PartResult:
+    """Map the part of a task in a separate process, and wait for it. Depends on nothing but the task."""
+    folder = Path(task.folder)
     if not (folder / RESULT).exists():
         try:
-            with start_worker("sfm_app.mapping.part_process", task) as process:
+            with start_worker(partial(_work, task)) as process:
                 while not process.has_ended(0.2):
                     if (folder.parent / STOP).exists():
                         return PartResult((), "", ("stopped",))
@@ -410,3 +419,7 @@ def map_part(task: MappingTask) -> PartResult:
         tuple(result["tried"]),
         tuple(LookAlikes(tuple(map(tuple, join["pairs"])), join["missing"]) for join in result["false_joins"]),
     )
+
+
+def _work(task: PartTask) -> None:
+    import_module("sfm_app.mapping.part_process").work(task)  # it imports this module

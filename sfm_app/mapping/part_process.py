@@ -10,11 +10,10 @@ from pathlib import Path
 from sfm_app.colmap.backend import check_written, translate_errors
 from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
 from sfm_app.colmap.model import posed_photo_ids, submodel
-from sfm_app.colmap.worker_process import MappingTask, serve
 from sfm_app.files import replace_atomically
 from sfm_app.mapping.attempt import MAPPING, Attempt, best_attempt, map_group
 from sfm_app.mapping.look_alikes import judge_places
-from sfm_app.mapping.part_mapping import INPUTS, RESULT, read_inputs
+from sfm_app.mapping.part_mapping import INPUTS, RESULT, PartTask, read_inputs
 from sfm_app.mapping.split_and_merge import sound_parts
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
@@ -23,9 +22,9 @@ from sfm_app.runtime.workspace import SubWorkspace, Workspace
 from sfm_app.types import PoseGraph
 
 
-def work(task: MappingTask) -> None:
+def work(task: PartTask) -> None:
     """Map the part in the folder of the task, and write its models and notes beside its inputs."""
-    folder, photos = Path(task["scratch"]), Path(task["photos"])
+    folder, photos = Path(task.folder), Path(task.photos)
     inputs = read_inputs(folder / INPUTS)
     judge = cache(lambda attempt: judge_places([attempt])[0])
     enough = MAPPING.enough_share * len(inputs.part.photos)
@@ -67,7 +66,3 @@ def _write_models(best: Attempt, folder: Path) -> list[str]:
             submodel(best.model, photos).write(target)
             check_written(*target.iterdir())
     return names
-
-
-if __name__ == "__main__":
-    serve(work)

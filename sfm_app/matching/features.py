@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from itertools import combinations
 from pathlib import Path
 from threading import Lock
 from typing import TypeVar
@@ -23,19 +24,19 @@ from sfm_app.colmap.features import (
     count_features,
     enter_rows,
     exhaustive_pairs,
-    find_and_match,
     find_in_chunk,
+    find_sift,
     match_chunk,
     match_chunk_apart,
     photos_without_features,
-    write_snapshot,
+    write_inputs,
 )
-from sfm_app.colmap.worker_process import ProcessGroup, SiftOption
+from sfm_app.colmap.worker_process import ProcessGroup, ProgressReporter, SiftOption, run_worker
 from sfm_app.errors import InputError, PluginError
 from sfm_app.files import load_arrays, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.numerical import Json
 from sfm_app.photos.masks import read_mask
-from sfm_app.photos.panoramas import PanoramaViews
+from sfm_app.photos.panoramas import PanoramaViews, shrink
 from sfm_app.plugins import FeatureMethod
 from sfm_app.progress import Progress, SilentProgress, track
 from sfm_app.runtime.context import RunContext
@@ -51,8 +52,7 @@ from sfm_app.types import Features, PairId
 def find_features(method: FeatureMethod, names: Mapping[int, str], run: RunContext) -> None:
     """Write the features of photos without a part, and keypoints to the database; PluginError if invalid."""
     place, panoramas = run.workspace, panorama_names(run.workspace.database)
-    folders = _Folders(place.photos, run.mask_dir, place.feature_parts)
-    find = Task(_find_and_save, method, run.settings.matching, folders)
+    find = Task(_find_and_save, method, run.settings.matching, place.photos, run.mask_dir, place.feature_parts)
     photos = [
         _PhotoFile(photo, name, name in panoramas)
         for photo, name in names.items()
@@ -65,13 +65,6 @@ def find_features(method: FeatureMethod, names: Mapping[int, str], run: RunConte
 
 
 @dataclass(frozen=True, slots=True)
-class _Folders:
-    photos: Path
-    masks: Path | None
-    parts: Path
-
-
-@dataclass(frozen=True, slots=True)
 class _PhotoFile:
     id: int
     name: str
@@ -79,20 +72,20 @@ class _PhotoFile:
 
 
 def _find_and_save(
-    method: FeatureMethod, options: MatchSettings, folders: _Folders, photo: _PhotoFile
+    method: FeatureMethod, options: MatchSettings, photos: Path, masks: Path | None, parts: Path, photo: _PhotoFile
 ) -> tuple[int, NDArray[np.float32]]:
-    pixels = read_pixels(folders.photos / photo.name)
+    pixels = read_pixels(photos / photo.name)
     features, to_photo, size = _find_in_photo(method, photo.name, pixels, options, panorama=photo.panorama)
     keypoints = features.keypoints * to_photo
-    if folders.masks is not None:
-        mask = read_mask(folders.masks, photo.name)
+    if masks is not None:
+        mask = read_mask(masks, photo.name)
         column, row = np.clip(keypoints.astype(np.int64), 0, np.array(size) - 1).T
         unmasked = mask[row, column]
         features, keypoints = features.select(unmasked), keypoints[unmasked]
     rows = np.arange(min(len(keypoints), options.max_features))
     features = features.select(rows)
     values = {f"value_{name}": value for name, value in features.values.items()}
-    with replace_atomically(part_path(photo.id, folders.parts)) as beside:
+    with replace_atomically(part_path(photo.id, parts)) as beside:
         np.savez(beside, allow_pickle=False, size=np.array(features.size), keypoints=features.keypoints, **values)
     return photo.id, keypoints[rows].astype(np.float32)
 
@@ -104,12 +97,7 @@ def _find_in_photo(
     height, width = pixels.shape[:2]
     if panorama:
         return _find_in_views(method, name, pixels, options), np.ones(2), (width, height)
-    longer = max(width, height)
-    if longer > options.max_image_size_px:
-        scale = options.max_image_size_px / longer
-        size = max(1, round(width * scale)), max(1, round(height * scale))
-        pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
-    features = _find_and_check(method, name, pixels, options)
+    features = _find_and_check(method, name, shrink(pixels, options.max_image_size_px / max(width, height)), options)
     return features, np.array([width / features.size[0], height / features.size[1]]), (width, height)
 
 
@@ -239,7 +227,7 @@ Item = TypeVar("Item")
 
 
 def find_in_chunks(sift: Mapping[str, SiftOption], names: Sequence[str], run: RunContext) -> dict[str, Json]:
-    """Find features of photos that have none on a cluster; return the options in force. Errors as `match_in_chunks`."""
+    """Find features of photos that have none on a cluster; return the options in force."""
     chosen = set(names)
     missing = [name for name in photos_without_features(run.workspace.database).values() if name in chosen]
     parts = chunks(missing, CHUNKS.most_photos, run.spread)
@@ -250,15 +238,10 @@ def match_in_chunks(sift: Mapping[str, SiftOption], pairs: Sequence[PairId] | No
     """Match pairs, all if None, on a cluster or in processes of this machine, except those in the database.
 
     Returns the options in force.
-
-    Raises:
-        BackendError: COLMAP failed.
-        ClusterError: the cluster is gone.
     """
     database = run.workspace.database
-    every = exhaustive_pairs(sorted(photo_names(database))) if pairs is None else list(pairs)
-    unmatched = set(unmatched_pairs(database, [(min(pair), max(pair)) for pair in every]))
-    missing = [pair for pair in every if (min(pair), max(pair)) in unmatched]
+    wanted = exhaustive_pairs(sorted(photo_names(database))) if pairs is None else pairs
+    missing = unmatched_pairs(database, wanted)
     features = count_features(database)
     pair_s = CHUNKS.feature_s * max(sum(features) / max(len(features), 1), 1.0)
     most = min(max(int(CHUNKS.chunk_s / pair_s), CHUNKS.least_pairs), CHUNKS.most_pairs)
@@ -307,7 +290,10 @@ def _do_in_chunks(
     shutil.rmtree(folder, ignore_errors=True)
     if not parts:
         return in_force
-    inputs = _write_inputs(folder, sift, run, with_features=tables is MATCHES)
+    masks = run.mask_dir.absolute() if run.mask_dir else None
+    settings = SiftSettings(place.photos.absolute(), masks, run.settings.matching, dict(sift))
+    inputs = SiftInputs(settings, folder.absolute())
+    write_inputs(place.database, inputs)
     run.progress.start(label, sum(len(part) for part in parts))
     try:
         for part in ordered_map(run.executor, prepare(inputs), parts, ahead=run.workers):
@@ -320,26 +306,6 @@ def _do_in_chunks(
     return in_force
 
 
-def _write_inputs(folder: Path, sift: Mapping[str, SiftOption], run: RunContext, *, with_features: bool) -> SiftInputs:
-    place, folder = run.workspace, folder.absolute()
-    folder.mkdir(parents=True)
-    inputs = SiftInputs(
-        folder / "photos.db",
-        folder / "features.db",
-        SiftSettings(
-            place.photos.absolute(),
-            run.mask_dir.absolute() if run.mask_dir else None,
-            run.settings.matching,
-            dict(sift),
-        ),
-        folder,
-    )
-    write_snapshot(place.database, inputs.snapshot, (*FEATURES, *MATCHES))
-    if with_features:
-        write_snapshot(place.database, inputs.features, MATCHES)
-    return inputs
-
-
 # All features and matches, by COLMAP's SIFT or by a plug-in of two functions.
 
 
@@ -347,11 +313,7 @@ def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId
     """Find features of photos and match them, in the run's database; return the options in force, for the manifest.
 
     Features are computed in the photos of `pairs` only, with the smaller id first; for None, all photos and all pairs.
-    Without any pair, all photos get features.
-
-    Raises:
-        PluginError: the method raises, or returns invalid results.
-        BackendError: COLMAP failed.
+    Without any pair, all photos get features. PluginError if the method raises, or returns invalid results.
     """
     in_force = find_all_features(method, run, pairs)
     in_force |= match_pairs(method, run, pairs)
@@ -369,7 +331,8 @@ def find_all_features(method: FeatureMethod, run: RunContext, pairs: Sequence[Pa
         return find_in_chunks(method.sift, list(names.values()), run)
     if method.sift is not None:
         settings = SiftSettings(place.photos, run.mask_dir, options, method.sift)
-        return find_and_match(place.database, settings, list(names.values()), run.workers, run.progress, ())
+        find = partial(find_sift, place.database, settings, list(names.values()), run.workers, ProgressReporter())
+        return run_worker(find, "finding features", run.progress)
     if not resume_or_clear(place.feature_parts, run.fingerprint):
         mark_unfinished(place.feature_parts, run.fingerprint)
     find_features(method, names, run)
@@ -378,15 +341,11 @@ def find_all_features(method: FeatureMethod, run: RunContext, pairs: Sequence[Pa
 
 def match_pairs(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Json]:
     """Match pairs of photos with known features, except those of a killed run; see `fill_database`."""
-    place, options = run.workspace, run.settings.matching
     if pairs is not None and not pairs:
         return {}
-    if method.sift is not None and (run.spread or run.workers > 1):
-        return match_in_chunks(method.sift, pairs, run)
     if method.sift is not None:
-        settings = SiftSettings(place.photos, None, options, method.sift)
-        return find_and_match(place.database, settings, [], 1, run.progress, pairs)
-    _match(method, all_pairs(photo_names(place.database)) if pairs is None else pairs, run)
+        return match_in_chunks(method.sift, pairs, run)
+    _match(method, all_pairs(photo_names(run.workspace.database)) if pairs is None else pairs, run)
     return {}
 
 
@@ -397,8 +356,7 @@ def forget_features(run: RunContext) -> None:
 
 def all_pairs(photos: Sequence[int] | Mapping[int, str]) -> list[PairId]:
     """Return all pairs of photos, the smaller id first."""
-    ids = sorted(photos)
-    return [(first, second) for place, first in enumerate(ids) for second in ids[place + 1 :]]
+    return list(combinations(sorted(photos), 2))
 
 
 def _match(method: FeatureMethod, pairs: Sequence[PairId], run: RunContext) -> None:

@@ -18,6 +18,7 @@ from sfm_app.retrieval import (
     count_shared_keypoints,
     describe_picture,
     learn_vocabulary,
+    nearest_words,
     pairs_in_order,
     pairs_nearby,
     pool_descriptors,
@@ -105,7 +106,7 @@ def _similar_pairs(
     with run.step("visual words"):
         size = min(OPTIONS.most_words, max(OPTIONS.fewest_words, OPTIONS.words_per_photo * len(photos)))
         vocabulary = learn_vocabulary(pooled, size, run.seed)
-    words = run.map(vocabulary.quantize, largest, "words of photos")
+    words = run.map(partial(nearest_words, vocabulary), largest, "words of photos")
     ranked = rank_similar(words, len(vocabulary), OPTIONS.ranked * count)
     candidates = _candidates([[photos[k] for k in row] for row in ranked], photos, count, choosers)
     previews = {photo: one[: OPTIONS.preview_features] for photo, one in zip(photos, largest, strict=True)}
@@ -161,11 +162,7 @@ def match_probable_pairs(method: FeatureMethod, load: Callable[[], MatchGraph], 
     """Match pairs of photos that look alike or lie beside each other, then pairs that these suggest.
 
     Pairs of photos of an earlier run keep their matches. `load` reads the match graph as it is now. Returns the options
-    in force.
-
-    Raises:
-        PluginError: the method raises, or returns invalid results.
-        BackendError: COLMAP failed.
+    in force; errors as of `fill_database`.
     """
     initial = load()
     known = run.earlier.known if run.earlier is not None else frozenset[str]()

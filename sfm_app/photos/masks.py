@@ -125,12 +125,9 @@ def _binarize(image: Image.Image) -> Image.Image:
     """Return white where any channel is nonzero and the pixel is opaque."""
     if image.mode.startswith("I") or image.mode == "F":
         used = np.asarray(image) != 0
-    elif image.mode in ("1", "L") and "transparency" not in image.info:
-        used = np.asarray(image.convert("L")) > 0
-    elif image.mode in ("RGB", "CMYK", "YCbCr", "LAB", "HSV") and "transparency" not in image.info:
-        used = np.asarray(image.convert("RGB")).any(axis=2)
     else:
-        channels = np.asarray(image.convert("RGBA"))
+        plain = image.convert("RGB") if image.mode in ("CMYK", "YCbCr", "LAB", "HSV") else image
+        channels = np.asarray(plain.convert("RGBA"))
         used = channels[..., :3].any(axis=2) & (channels[..., 3] > 0)
     return _black_and_white(used)
 

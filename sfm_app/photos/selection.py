@@ -47,8 +47,6 @@ class SelectionOptions:
     the width gives more; saving a picture again, smaller or as JPEG, gives less."""
     min_contrast: float = 4.0
     """Least contrast in gray levels of pictures that are compared."""
-    block_rows: int = 512
-    """Photos that are compared with all others at once."""
     blurred: float = 0.85
     """Least share of their slope that edges of a blurred photo keep after one more blur. Sharp photos: 0.33 to 0.70. At
     0.85, a blur of 0.8 % of the width or a smear of 2.5 %, 1 to 5 % of the inliers remain."""
@@ -156,13 +154,17 @@ def _fingerprint_reading(options: PhotoSettings) -> str:
 
 def drop_duplicates(stats: Sequence[PhotoStats]) -> tuple[list[Photo], list[UnusablePhoto]]:
     """Return one photo per picture, and its copies, in the given order; photos with a mask, then large ones stay."""
+    from scipy.spatial import cKDTree
+
     photos = [one.photo for one in stats]
     order = sorted(range(len(photos)), key=lambda k: (not photos[k].mask, -photos[k].width * photos[k].height, k))
     small = np.array([one.thumbnail for one in stats], np.float32).reshape(len(stats), SIDE_PX**2)
     contrast = small.std(axis=1)
     originals: set[int] = set()
     original_of: dict[int, int] = {}
-    similar = _similar_rows(small, OPTIONS.max_difference * np.maximum(contrast, OPTIONS.min_contrast))
+    limits = OPTIONS.max_difference * np.maximum(contrast, OPTIONS.min_contrast)
+    # rounding must not lose a row: the differences are computed again below
+    similar = cKDTree(small).query_ball_point(small, 1.01 * SIDE_PX * limits + 1e-3, return_sorted=True)
     for k in order:
         others = [j for j in similar[k] if j in originals] if contrast[k] >= OPTIONS.min_contrast else []
         rms = np.sqrt(np.mean((small[others] - small[k]) ** 2, axis=1)) / max(contrast[k], OPTIONS.min_contrast)
@@ -174,18 +176,6 @@ def drop_duplicates(stats: Sequence[PhotoStats]) -> tuple[list[Photo], list[Unus
         UnusablePhoto(photos[k].path, f"the same picture as {photos[original_of[k]].path}") for k in sorted(original_of)
     ]
     return [photos[k] for k in sorted(originals)], copies
-
-
-def _similar_rows(small: NDArray[np.float32], limits: NDArray[np.floating]) -> list[list[int]]:
-    """Return for each row of (N, D) the rows with an RMS difference below its limit, or hardly above."""
-    exact = small.astype(np.float64)
-    squares, similar = np.einsum("nd,nd->n", exact, exact), []
-    for start in range(0, len(exact), OPTIONS.block_rows):
-        part = slice(start, start + OPTIONS.block_rows)
-        distances = squares[part, None] + squares - 2.0 * exact[part] @ exact.T
-        close = distances < (1.01 * limits[part, None]) ** 2 * exact.shape[1] + 1e-3
-        similar += [np.flatnonzero(row).tolist() for row in close]
-    return similar
 
 
 def drop_unusable(stats: Sequence[PhotoStats]) -> tuple[list[PhotoStats], list[UnusablePhoto]]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sfm_app.photos.decode import UnreadableError
 from sfm_app.photos.files import is_video, read_head
+from sfm_app.photos.panoramas import shrink
 from sfm_app.types.arrays import BoolArray, FloatArray
 
 Picture = NDArray[np.uint8]
@@ -81,7 +82,6 @@ class Video:
 
     def small_frames(self) -> Iterator[tuple[int, Picture]]:
         """Yield gray pictures of the sampled frames, with a longer side of 480 pixels, with their numbers."""
-        size: tuple[int, int] | None = None
         for number in self._grab_frames():
             if number % self.stride:
                 continue
@@ -91,10 +91,7 @@ class Video:
             if not picture.any():
                 self.black += 1
                 continue
-            if size is None:
-                shrink = min(1.0, 480 / max(picture.shape[:2]))
-                size = max(1, round(picture.shape[1] * shrink)), max(1, round(picture.shape[0] * shrink))
-            small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+            small = shrink(picture, 480 / max(picture.shape[:2]))
             yield number, np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY) if small.ndim == 3 else small, np.uint8)
 
     def jpegs(self, numbers: Sequence[int]) -> Iterator[tuple[int, bytes]]:

@@ -1,10 +1,11 @@
 """Products in an output folder, read for the page; unfinished and damaged stages are left out."""
 
+import base64
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from sfm_app import products
 from sfm_app.errors import SfmError
@@ -17,14 +18,6 @@ logger = logging.getLogger("sfm_app")
 
 UNREADABLE = (SfmError, OSError, ArithmeticError, ValueError, LookupError, TypeError)
 Product = TypeVar("Product")
-
-
-class Problem(NamedTuple):
-    """The error that ended a run."""
-
-    message: str
-    hint: str
-    photos: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,12 +35,10 @@ class RunContents:
     """Frame of exported files; without a known scale, that of the scene."""
 
     @property
-    def problem(self) -> "Problem | None":
-        """The error that ended the last run; None if it finished."""
-        entry = self.manifest.get(PROBLEM)
-        if not entry:
-            return None
-        return Problem(entry.get("message", ""), entry.get("hint", ""), entry.get("photos", {}))
+    def problem(self) -> Mapping[str, Any] | None:
+        """Message, hint, and reason by photo of the error that ended the last run; None if it finished."""
+        entry: Mapping[str, Any] | None = self.manifest.get(PROBLEM)
+        return entry
 
     @property
     def is_metric(self) -> bool:
@@ -112,3 +103,8 @@ def _read(
     except UNREADABLE as err:  # the page shows the other stages
         logger.info("the report leaves out stage %s", stage, exc_info=err)
         return None
+
+
+def data_address(kind: str, data: bytes) -> str:
+    """Return bytes as an address that a page holds itself; `kind` is their type, such as "image/png"."""
+    return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"

@@ -1,6 +1,5 @@
 """Tables of the page: figures at a glance, warnings, cameras, pairs, stages, and a row per photo."""
 
-import base64
 import io
 import logging
 import math
@@ -15,7 +14,7 @@ from PIL import Image
 
 from sfm_app.camera.models import PARAMETERS
 from sfm_app.colmap.model import ModelFigures
-from sfm_app.report.contents import RunContents
+from sfm_app.report.contents import RunContents, data_address
 from sfm_app.report.text import (
     SOURCES,
     WARNING,
@@ -260,14 +259,10 @@ def camera_tables(contents: RunContents) -> list[CameraTable]:
     return tables
 
 
-def _lens_rows(after: Any) -> list[tuple[str, str, str]]:
-    names = [name for name in after.deviations if name not in PLACES_IN_K]
-    first = len(after.params) - len(names)
-    return [
-        (name, "", value_text(after.params[first + k], after.deviations[name], 4))
-        for k, name in enumerate(names)
-        if first >= 0 and after.params[first + k]
-    ]
+def _lens_rows(after: CameraModel) -> list[tuple[str, str, str]]:
+    terms = zip(PARAMETERS.get(after.model, ()), after.params, strict=False)
+    known = [(name, value) for name, value in terms if value and name not in PLACES_IN_K and name in after.deviations]
+    return [(name, "", value_text(value, after.deviations[name], 4)) for name, value in known]
 
 
 def value_text(value: float, deviation: float | None, digits: int = 1) -> str:
@@ -420,8 +415,8 @@ def embedded_pictures(contents: RunContents) -> Mapping[str, str]:
     """Return small pictures of all photos as data addresses, by name."""
     names, folder = photo_names(contents), contents.run.workspace.photos
     side = picture_side(max(len(names), 1))
-    pictures = contents.run.map(lambda name: _address(picture(folder / name, side)), names, "pictures of the report")
-    return dict(zip(names, pictures, strict=True))
+    jpegs = contents.run.map(lambda name: picture(folder / name, side), names, "pictures of the report")
+    return {name: data_address("image/jpeg", jpeg) for name, jpeg in zip(names, jpegs, strict=True) if jpeg}
 
 
 def picture_side(count: int) -> int:
@@ -442,7 +437,3 @@ def picture(path: Path, side: int) -> bytes:
         logger.info("no picture of %s", path.name, exc_info=err)
         return b""
     return file.getvalue()
-
-
-def _address(jpeg: bytes) -> str:
-    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii") if jpeg else ""

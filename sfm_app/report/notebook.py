@@ -1,6 +1,5 @@
 """A finished run in a notebook: a picture of the model, and the figures at a glance."""
 
-import base64
 from html import escape
 
 import cv2
@@ -11,7 +10,7 @@ from sfm_app.camera.models import camera_matrix
 from sfm_app.formats.frusta import center, scene_size
 from sfm_app.frame.scale import move_model
 from sfm_app.products import read_texture
-from sfm_app.report.contents import UNREADABLE, RunContents
+from sfm_app.report.contents import UNREADABLE, RunContents, data_address
 from sfm_app.report.findings import glance
 from sfm_app.report.scene_view import view_points
 from sfm_app.synthetic.cameras import Camera
@@ -32,8 +31,8 @@ def run_html(contents: RunContents) -> str:
     )
     picture, image = model_picture(contents), ""
     if picture is not None:
-        data = base64.b64encode(cv2.imencode(".png", picture[..., ::-1])[1].tobytes()).decode("ascii")
-        image = f"<img src='data:image/png;base64,{data}' alt='the model' width='{picture.shape[1]}'>"
+        address = data_address("image/png", cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
+        image = f"<img src='{address}' alt='the model' width='{picture.shape[1]}'>"
     return f"<div>{image}<table>{rows}</table></div>"
 
 

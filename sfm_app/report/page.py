@@ -110,11 +110,7 @@ class LargeParts:
 
 
 def read_run(run: RunContext) -> RunContents:
-    """Return the products of a run.
-
-    Raises:
-        InputError: the folder holds no run.
-    """
+    """Return the products of a run; InputError if the folder holds none."""
     run.workspace.manifest.check_begun()
     return read_contents(run)
 

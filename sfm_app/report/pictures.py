@@ -1,6 +1,5 @@
 """Pictures of the report: figures and depth maps."""
 
-import base64
 import io
 import logging
 import tempfile
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from sfm_app.colmap.dense import read_photo_and_depth
 from sfm_app.colmap.model import ModelFigures
-from sfm_app.report.contents import UNREADABLE, RunContents
+from sfm_app.report.contents import UNREADABLE, RunContents, data_address
 from sfm_app.report.figures import OPTIONS, draw_intrinsics
 from sfm_app.types.arrays import FloatArray
 
@@ -80,7 +79,7 @@ def _draw_cameras(contents: RunContents) -> PageFigure | None:
     count, most = len(views.fits), OPTIONS.most_pairs
     if count > most:
         text += f" Of {count} pairs, the figure shows at most {most} of each camera, those of most weight."
-    return PageFigure("Votes, curves and lens", text, _address(data))
+    return PageFigure("Votes, curves and lens", text, data_address("image/png", data))
 
 
 def _draw_pairs(contents: RunContents) -> PageFigure | None:
@@ -212,11 +211,7 @@ def _png(draw: Callable[["Figure"], None], size: tuple[float, float]) -> str:
         figure = Figure(figsize=size, layout="constrained")
         draw(figure)
         figure.savefig(file, format="png", dpi=130, metadata={"Software": None})
-    return _address(file.getvalue())
-
-
-def _address(data: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(data).decode("ascii")
+    return data_address("image/png", file.getvalue())
 
 
 # Some photos beside their depth maps, in colors from near to far.
@@ -283,18 +278,14 @@ def _draw(dense: Path, name: str, share: float) -> DepthPicture | None:
         logger.info("no picture of the depths of %s", name, exc_info=err)
         return None
     text = f"{100 * share:.0f} % of it has a depth, from {near:.3g} (yellow) to {far:.3g} (violet)"
-    address = "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
-    return DepthPicture(name, text, address, (2 * size[0], size[1]))
+    return DepthPicture(name, text, data_address("image/jpeg", data.tobytes()), (2 * size[0], size[1]))
 
 
 def depth_colors(depth: FloatArray) -> tuple[ByteArray, tuple[float, float]]:
     """Return the colors (H, W, 3) RGB of depths, yellow near and violet far, and the depths at both ends.
 
     Colors are even in 1 / depth, as disparities are: otherwise the near half of a scene has one color. Unknown depths
-    are <= 0 or not finite.
-
-    Raises:
-        ValueError: no pixel has a depth.
+    are <= 0 or not finite; ValueError if all are.
     """
     known = np.isfinite(depth) & (depth > 0.0)
     if not known.any():

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +15,7 @@ from sfm_app.formats.frusta import center, frustum_depth, scene_size
 from sfm_app.formats.gltf import FLIP, write_glb
 from sfm_app.frame.scale import move_model
 from sfm_app.numerical import Json
+from sfm_app.photos.panoramas import shrink
 from sfm_app.products import read_texture
 from sfm_app.report.contents import UNREADABLE, RunContents
 from sfm_app.types import Frustum, Model
@@ -93,18 +93,9 @@ def lighten(model: Model) -> Model:
     """Return a textured model with smaller pages."""
     if model.texture is None:
         return model
-    pages = tuple(_shrink(page, LIGHT_PAGE_PX) for page in model.texture.pages)
-    maps = tuple(_shrink(one, LIGHT_PAGE_PX // 2) for one in model.texture.normal_maps)
+    pages = tuple(shrink(page, LIGHT_PAGE_PX / max(page.shape)) for page in model.texture.pages)
+    maps = tuple(shrink(one, LIGHT_PAGE_PX // 2 / max(one.shape)) for one in model.texture.normal_maps)
     return replace(model, texture=replace(model.texture, pages=pages, normal_maps=maps))
-
-
-def _shrink(page: NDArray[np.uint8], most: int) -> NDArray[np.uint8]:
-    height, width = page.shape[:2]
-    scale = most / max(height, width)
-    if scale >= 1.0:
-        return page
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    return np.asarray(cv2.resize(page, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _sample(points: Model) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:

@@ -49,13 +49,7 @@ class PointLevels:
         return [end - start for start, end in zip(self.cuts[:-1], self.cuts[1:], strict=True)]
 
     def pack(self, level: int) -> bytes:
-        """Return a level as bytes: x, y, z of all its points as little-endian floats, then their colors.
-
-        Raises:
-            IndexError: there is no such level.
-        """
-        if not 0 <= level < len(self.cuts) - 1:
-            raise IndexError(f"there is no level {level}")
+        """Return a level as bytes: x, y, z of all its points as little-endian floats, then their colors."""
         part = slice(self.cuts[level], self.cuts[level + 1])
         return self.places[part].astype("<f4").tobytes() + self.colors[part].tobytes()
 
@@ -275,11 +269,7 @@ class ViewHandler(BaseHTTPRequestHandler):
 
 
 def open_server(resources: RunResources, port: int = 0) -> ViewServer:
-    """Start to listen, and return the server; port 0 stands for any free port.
-
-    Raises:
-        ConfigError: the port cannot be used.
-    """
+    """Start to listen, and return the server; port 0 is any free one, ConfigError for one that cannot be used."""
     try:
         return ViewServer(resources, port)
     except (OSError, OverflowError) as err:

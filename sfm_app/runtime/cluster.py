@@ -19,6 +19,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from importlib.metadata import PackageNotFoundError, entry_points, version
@@ -29,7 +30,6 @@ from typing import IO, Any, TypeVar
 from sfm_app.errors import BackendError, ClusterError, ConfigError
 from sfm_app.files import digest_file, replace_atomically
 from sfm_app.operating_system import cpu_seconds, end_group, end_own_group, group_options, watch_parent
-from sfm_app.runtime.parallel import RemoteExecutor
 from sfm_app.settings import LOCAL_ADDRESS, ClusterSettings
 from sfm_app.tasks import Shared, Task
 
@@ -41,8 +41,6 @@ Result = TypeVar("Result")
 class TransferOptions:
     """Sizes and times of the work on a cluster."""
 
-    small_bytes: int = 500_000
-    """Larger values travel as files; the scheduler forwards smaller ones. Chosen by hand."""
     look_s: float = 2.0
     """Seconds between two counts of the workers. Chosen by hand."""
     connecting_s: float = 10.0
@@ -66,16 +64,6 @@ SHARED, PATH = "shared", "path"
 """Kinds of values that are not pickled themselves."""
 
 
-@dataclass(frozen=True, slots=True)
-class Serialized:
-    """A pickled value, in memory or in a file."""
-
-    data: bytes
-    path: str = ""
-    """File that has the value instead; empty where `data` has it."""
-    digest: str = ""
-
-
 class Serializer(contextlib.AbstractContextManager["Serializer"]):
     """Serializes values for processes that share a folder; each shared value is one file until the block ends."""
 
@@ -91,17 +79,11 @@ class Serializer(contextlib.AbstractContextManager["Serializer"]):
         for _, path, _ in self._shared.values():
             path.unlink(missing_ok=True)
 
-    def serialize(self, value: object) -> Serialized:
-        """Return a value as bytes, or as a file if it is large."""
+    def serialize(self, value: object) -> bytes:
+        """Return a value as bytes, in which paths are absolute: workers have another current folder."""
         buffer = io.BytesIO()
         _Pickler(buffer, self).dump(value)
-        data = buffer.getvalue()
-        if len(data) <= OPTIONS.small_bytes:
-            return Serialized(data)
-        path = self.folder / f"value-{secrets.token_hex(8)}.pickle"
-        with replace_atomically(path) as draft:
-            draft.write_bytes(data)
-        return Serialized(b"", str(path), hashlib.blake2b(data).hexdigest())
+        return buffer.getvalue()
 
     def share(self, value: Shared[Any]) -> tuple[str, str]:
         """Return path and hash of the file of a shared value; the first call writes it."""
@@ -115,23 +97,12 @@ class Serializer(contextlib.AbstractContextManager["Serializer"]):
         return str(known[1]), known[2]
 
 
-def deserialize(message: Serialized, *, remove: bool = False) -> Any:
-    """Return a value, and `remove` its file.
-
-    Raises:
-        OSError: the file cannot be read here, or has another hash.
-    """
-    if not message.path:
-        return _Unpickler(io.BytesIO(message.data)).load()
-    value = _load(message.path, message.digest)
-    if remove:
-        Path(message.path).unlink(missing_ok=True)
-    return value
+def deserialize(data: bytes) -> Any:
+    """Return a value; OSError if the file of a shared one cannot be read here, or has another hash."""
+    return _Unpickler(io.BytesIO(data)).load()
 
 
 class _Pickler(pickle.Pickler):
-    """Replaces shared values by their files, and makes paths absolute: workers have another current folder."""
-
     def __init__(self, file: IO[bytes], serializer: Serializer) -> None:
         super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
         self._serializer = serializer
@@ -150,14 +121,10 @@ class _Unpickler(pickle.Unpickler):
 
 @lru_cache(maxsize=2)  # the shared values of two steps. Chosen by hand
 def _read_shared(path: str, digest: str) -> Shared[Any]:
-    return Shared(_load(path, digest))
-
-
-def _load(path: str, digest: str) -> Any:
     if digest_file(Path(path)) != digest:
         raise OSError(f"{path} is not the file that was sent")
     with Path(path).open("rb") as file:
-        return _Unpickler(file).load()
+        return Shared(_Unpickler(file).load())
 
 
 # Versions that have to agree on all machines, so that the same seed gives the same bytes.
@@ -224,16 +191,17 @@ class Call:
     """A task and some of its items."""
 
     probe: Probe
-    function: Serialized
-    items: Serialized
+    function: bytes
+    items: bytes
+    """Both serialized."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
     """Results of a call, and its cost."""
 
-    results: Serialized | None = None
-    """Of the items before the first one that failed."""
+    results: bytes = b""
+    """Of the items before the first one that failed, serialized."""
     error: Exception | None = None
     """Of the first item that failed."""
     is_machine_error: bool = False
@@ -370,11 +338,7 @@ class Cluster:
             )
 
     def ask_all(self, question: Any, *about: Any) -> dict[str, Any]:
-        """Return the answer of each reachable worker, by its address.
-
-        Raises:
-            ClusterError: none answers, or one does not have the program.
-        """
+        """Return the answer of each reachable worker, by its address; ClusterError if none has the program."""
         try:
             answers = dict(self.client.run(question, *about, on_error="return"))
         except Exception as err:  # the scheduler itself could not ask
@@ -397,13 +361,7 @@ class Cluster:
             raise self.make_loss_error() from err
 
     def wait(self, future: Any, what: str) -> Reply | None:
-        """Return the reply of a call; None if each worker that tried it ended.
-
-        Raises:
-            ClusterError: the scheduler is gone, or it has had no workers for too long.
-        """
-        from concurrent.futures import CancelledError
-
+        """Return the reply of a call; None if each worker that tried it ended."""
         from distributed import KilledWorker
         from distributed.comm import CommClosedError
 
@@ -539,24 +497,12 @@ class _Flight:
     future: Any = field(default=None)
 
 
-class ClusterExecutor(RemoteExecutor):
+class ClusterExecutor(ThreadPoolExecutor):
     """Threads of this process, and a cluster for tasks; on this machine, `workers` is also the most tasks at once."""
 
     def __init__(self, cluster: Cluster, workers: int) -> None:
         super().__init__(max_workers=workers, thread_name_prefix="sfm")
         self.cluster, self.workers = cluster, workers
-
-    def with_threads(self, workers: int) -> "ClusterExecutor":
-        """Return an executor of the same cluster with another number of threads."""
-        return ClusterExecutor(self.cluster, workers)
-
-    def threads_elsewhere(self) -> int:
-        """Return how many tasks the cluster does at once."""
-        return self.cluster.threads()
-
-    def cpu_seconds_elsewhere(self) -> float:
-        """Return the CPU seconds of all tasks that the cluster has finished."""
-        return self.cluster.cpu_seconds
 
     def spread(self, task: Task[Result], items: Iterable[Any]) -> Iterator[Result]:
         """Yield the results of a task in the order of the items, which are drawn only as they are needed.
@@ -576,7 +522,7 @@ class _Spreading:
     def __init__(self, executor: ClusterExecutor, task: Task[Any], serializer: Serializer) -> None:
         self.executor, self.cluster, self.task, self.serializer = executor, executor.cluster, task, serializer
         self.probe = self.cluster.probe()
-        self.function: Serialized = serializer.serialize(task)
+        self.function = serializer.serialize(task)
         self.name = getattr(task.func, "__name__", "task").lstrip("_")
         self._keys = (f"sfm-{self.name}-{secrets.token_hex(6)}-{number}" for number in count())
         self._size = 1
@@ -603,40 +549,30 @@ class _Spreading:
         call = Call(self.probe, self.function, self.serializer.serialize(items))
         return _Flight(items, self.cluster.submit(call, next(self._keys)))
 
-    def _land(self, flight: _Flight) -> Iterator[Any]:
+    def _land(self, flight: _Flight, *, again: bool = False) -> Iterator[Any]:
+        """Yield the results of a call; if it lost its workers, its items are sent once more (`again`), each alone."""
         reply = self._wait(flight)
+        if reply is None and again:
+            raise ClusterError(
+                f"{self.name} of {describe_item(flight.items[0])} ended every worker that tried: perhaps their memory "
+                "was full",
+                hint="give workers more memory, or use --quality draft; the same command resumes",
+            )
         if reply is None:  # calls that waited on the lost workers count as lost, too: find the one to blame
             for item in flight.items:
-                yield from self._land_alone(item)
+                yield from self._land(self._send([item]), again=True)
             return
-        done = deserialize(reply.results, remove=True) if reply.results is not None else []
+        done = deserialize(reply.results)
         if done:
             best = OPTIONS.call_s * len(done) / max(reply.seconds, 1e-6)
             self._size = max(1, min(OPTIONS.most_items, int(best), 2 * self._size))
         yield from done
-        rest = flight.items[len(done) :]
         if reply.error is not None and reply.is_machine_error:
             logger.info("this process does %s, since a worker failed: %s", self.name, reply.error, exc_info=reply.error)
-            for item in rest:
+            for item in flight.items[len(done) :]:
                 yield self.executor.submit(self.task, item).result()
         elif reply.error is not None:
             raise reply.error
-
-    def _land_alone(self, item: Any) -> Iterator[Any]:
-        """Yield the result of an item that lost its workers, sent once more and alone."""
-        flight = self._send([item])
-        reply = self._wait(flight)
-        if reply is None:
-            raise ClusterError(
-                f"{self.name} of {describe_item(item)} ended every worker that tried: perhaps their memory was full",
-                hint="give workers more memory, or use --quality draft; the same command resumes",
-            )
-        if reply.error is not None and not reply.is_machine_error:
-            raise reply.error
-        if reply.error is not None or reply.results is None:
-            yield self.executor.submit(self.task, item).result()
-        else:
-            yield from deserialize(reply.results, remove=True)
 
     def _wait(self, flight: _Flight) -> Reply | None:
         """Return the reply of a call; an unfit worker is removed, and the call is sent again."""

@@ -127,14 +127,9 @@ class RunContext:
         """Add figures to the stage's statistics: plain numbers, strings, lists and dicts."""
         self.statistics.update(figures)
 
-    def model_paths(self, name: str) -> tuple[Path, ...]:
-        """Return the paths of a model in the output folder, one per standard format."""
-        return tuple(self.workspace.root / f"{name}.{suffix}" for suffix in STANDARD_FORMATS)
-
     def write_model(self, model: Model, name: str) -> tuple[Path, ...]:
         """Write a model in every standard format under this name, and record the sizes of the files."""
-        paths = self.model_paths(name)
-        for suffix in STANDARD_FORMATS:
-            save_files(self.plugins.exporter(suffix).write(model, name), self.workspace.root)
+        written = (self.plugins.exporter(suffix).write(model, name) for suffix in STANDARD_FORMATS)
+        paths = tuple(path for files in written for path in save_files(files, self.workspace.root))
         self.record(bytes={path.name: path.stat().st_size for path in paths})
         return paths

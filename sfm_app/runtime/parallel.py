@@ -1,40 +1,20 @@
 """One concurrent.futures.Executor for all work, and its results in the order of the items."""
 
 import shutil
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from sfm_app.operating_system import usable_cores
 from sfm_app.progress import Progress
+from sfm_app.runtime.cluster import ClusterExecutor, connect, local_workers
 from sfm_app.settings import Settings
 from sfm_app.tasks import Task
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-
-
-class RemoteExecutor(ThreadPoolExecutor, ABC):
-    """Threads of this process, and workers elsewhere for tasks, such as `runtime.cluster.ClusterExecutor`."""
-
-    @abstractmethod
-    def with_threads(self, workers: int) -> "RemoteExecutor":
-        """Return an executor with the same workers elsewhere and another number of threads."""
-
-    @abstractmethod
-    def spread(self, task: Task[Result], items: Iterable[Any]) -> Iterator[Result]:
-        """Yield the results of a task in the order of the items."""
-
-    @abstractmethod
-    def threads_elsewhere(self) -> int:
-        """Return how many tasks the workers elsewhere do at once."""
-
-    @abstractmethod
-    def cpu_seconds_elsewhere(self) -> float:
-        """Return the CPU seconds of all tasks finished elsewhere."""
 
 
 def worker_count(setting: int) -> int:
@@ -43,27 +23,20 @@ def worker_count(setting: int) -> int:
 
 
 def make_executor(workers: int, like: Executor | None = None) -> Executor:
-    """Make a thread pool, which shares the workers elsewhere of `like`: numba, OpenCV and COLMAP release the GIL."""
-    if isinstance(like, RemoteExecutor):
-        return like.with_threads(workers)
+    """Make a thread pool, which shares the cluster of `like`: numba, OpenCV and COLMAP release the GIL."""
+    if isinstance(like, ClusterExecutor):
+        return ClusterExecutor(like.cluster, workers)
     return ThreadPoolExecutor(max_workers=workers, thread_name_prefix="sfm")
 
 
 @contextmanager
 def open_executor(settings: Settings, folder: Path, progress: Progress) -> Iterator[tuple[Executor, int]]:
-    """Provide the executor of a run, and its number of workers; both end with the block, and `folder` is removed.
-
-    Raises:
-        ConfigError: Dask is not installed.
-        ClusterError: the cluster does not answer, or it has workers that cannot be used.
-    """
+    """Provide the executor of a run, and its number of workers; both end with the block, and `folder` is removed."""
     if not settings.cluster.address:
         workers = worker_count(settings.workers)
         with make_executor(workers) as threads:
             yield threads, workers
         return
-    from sfm_app.runtime.cluster import ClusterExecutor, connect, local_workers
-
     workers = local_workers(settings.cluster.address) or worker_count(settings.workers)
     if not local_workers(settings.cluster.address):
         address, wait_s = settings.cluster.address, settings.cluster.wait_s
@@ -88,7 +61,7 @@ def ordered_map(
     If the caller stops early or an item fails, calls that have not begun are canceled. Only a `Task` leaves this
     process, and a cluster chooses its own number in flight.
     """
-    if isinstance(executor, RemoteExecutor) and isinstance(function, Task):
+    if isinstance(executor, ClusterExecutor) and isinstance(function, Task):
         yield from executor.spread(function, items)
         return
     waiting: list[Future[Result]] = []
@@ -106,9 +79,9 @@ def ordered_map(
 
 def threads_elsewhere(executor: Executor) -> int:
     """Return how many tasks other processes do at once for an executor; 0 without such processes."""
-    return executor.threads_elsewhere() if isinstance(executor, RemoteExecutor) else 0
+    return executor.cluster.threads() if isinstance(executor, ClusterExecutor) else 0
 
 
 def cpu_seconds_elsewhere(executor: Executor) -> float:
     """Return the CPU seconds of all tasks that other processes have finished for an executor."""
-    return executor.cpu_seconds_elsewhere() if isinstance(executor, RemoteExecutor) else 0.0
+    return executor.cluster.cpu_seconds if isinstance(executor, ClusterExecutor) else 0.0

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from sfm_app.colmap.dense import (
     DenseStore,
     MaskUndistorter,
-    digest_maps,
     drop_estimates,
     has_masks,
     map_file,
@@ -30,7 +29,6 @@ from sfm_app.errors import ReconstructionError
 from sfm_app.files import fingerprint, load_arrays, mark_finished, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.meshing.visibility import SKY
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.workspace import Workspace
 from sfm_app.stereo import DepthTask, View, rank_neighbors
 from sfm_app.stereo.sky import PhotoAreas, blank_areas, count_votes, find_skies, sky_pixels
 from sfm_app.tasks import Shared, Task
@@ -62,16 +60,6 @@ def make(scene: Scene, run: RunContext) -> Path:
     write_fusion_views(dense_dir, views)
     mark_finished(dense_dir)
     return dense_dir
-
-
-def load(run: RunContext) -> Path:
-    """Return the dense workspace."""
-    return run.workspace.dense
-
-
-def digest(place: Workspace) -> str:
-    """Return a hash of the undistorted photos and their maps."""
-    return digest_maps(place.dense)
 
 
 def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None:

@@ -2,11 +2,9 @@
 
 from pathlib import Path
 
-from sfm_app.files import digest_files
 from sfm_app.formats.exporters import JPEG_QUALITY
 from sfm_app.frame.scale import MetricFrame, move_model
-from sfm_app.runtime.context import STANDARD_FORMATS, RunContext
-from sfm_app.runtime.workspace import Workspace
+from sfm_app.runtime.context import RunContext
 from sfm_app.types import Model
 
 NAME = "model"
@@ -19,13 +17,3 @@ def make(model: Model, frame: MetricFrame, run: RunContext) -> tuple[Path, ...]:
         sizes = [[page.shape[1], page.shape[0]] for page in model.texture.pages]
         run.record(pages_px=sizes, jpeg_quality=JPEG_QUALITY)
     return paths
-
-
-def load(run: RunContext) -> tuple[Path, ...]:
-    """Return the paths of the model's files."""
-    return run.model_paths(NAME)
-
-
-def digest(place: Workspace) -> str:
-    """Return a hash of the model's files."""
-    return digest_files(place.root, *(f"{NAME}.{suffix}" for suffix in STANDARD_FORMATS))

@@ -259,7 +259,7 @@ def open_page(monkeypatch):
             monkeypatch.delenv(name, raising=False)
         for name, value in variables.items():
             monkeypatch.setenv(name, value)
-        return output.open_browser("http://127.0.0.1:1/")
+        output.open_browser("http://127.0.0.1:1/")
 
     return call
 
@@ -271,19 +271,21 @@ def open_page(monkeypatch):
 )  # fmt: skip
 def test_no_text_browser_takes_over_the_terminal(open_page, platform, variables, opens):
     pages = []
-    assert open_page(lambda address: pages.append(address) or True, platform, **variables) is opens
+    open_page(pages.append, platform, **variables)
     assert len(pages) == opens
 
 
+@pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_machine_without_a_browser_is_no_error(open_page):
     def fail(_):
         raise webbrowser.Error("none")
 
-    assert open_page(fail, DISPLAY=":0") is False and open_page(lambda _: False, DISPLAY=":0") is False
+    open_page(fail, DISPLAY=":0")
 
 
 def test_a_browser_that_blocks_does_not_block_the_program(open_page, monkeypatch):
     closed = threading.Event()
     monkeypatch.setattr(output, "BROWSER_WAIT_S", 0.05)
-    assert open_page(lambda _: closed.wait(60), BROWSER="viewer %s") is True and not closed.is_set()
+    open_page(lambda _: closed.wait(60), BROWSER="viewer %s")
+    assert not closed.is_set()
     closed.set()

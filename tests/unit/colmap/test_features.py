@@ -6,6 +6,7 @@ from contextlib import closing
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 
@@ -17,12 +18,12 @@ from sfm_app.colmap.features import (
     SiftSettings,
     enter_rows,
     exhaustive_pairs,
-    find_and_match,
     find_in_chunk,
+    find_sift,
     match_chunk,
     match_chunk_apart,
     photos_without_features,
-    write_snapshot,
+    write_inputs,
 )
 from sfm_app.colmap.worker_process import ProcessGroup
 from sfm_app.errors import BackendError
@@ -61,16 +62,16 @@ def made(tmp_path_factory):
     create_database(place / "empty.db", PhotoSet(place / "photos", tuple(photos), (), None))
     shutil.copyfile(place / "empty.db", place / "whole.db")
     settings = SiftSettings(place / "photos", None, OPTIONS)
-    find_and_match(place / "whole.db", settings, [photo.name for photo in photos], 1, SilentProgress())
+    find_sift(place / "whole.db", settings, [photo.name for photo in photos], 1, SilentProgress())
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.skip_geometric_verification, matching.num_threads = True, 1
+    pycolmap.match_exhaustive(place / "whole.db", matching_options=matching, device=pycolmap.Device.cpu)
     return place
 
 
 def inputs_of(place, database, folder):
-    folder.mkdir()
-    settings = SiftSettings(place / "photos", None, OPTIONS)
-    inputs = SiftInputs(folder / "photos.db", folder / "features.db", settings, folder)
-    write_snapshot(database, inputs.snapshot, (*FEATURES, *MATCHES))
-    write_snapshot(database, inputs.features, MATCHES)
+    inputs = SiftInputs(SiftSettings(place / "photos", None, OPTIONS), folder)
+    write_inputs(database, inputs)
     return inputs
 
 
@@ -92,7 +93,7 @@ def test_chunks_give_what_colmap_gives_for_all_at_once(made, tmp_path):
     assert any(a > b for a, b in pairs)
     for chunk in chunks(pairs, 700, 1):
         enter_rows(database, match_chunk(inputs, chunk).path, MATCHES)
-    assert unmatched_pairs(database, [(min(pair), max(pair)) for pair in pairs]) == []
+    assert unmatched_pairs(database, pairs) == []
     with open_database(database) as reader:
         assert reader.num_matches() > 1000
     assert digest_matches(database) == digest_matches(made / "whole.db")
@@ -161,9 +162,7 @@ def find(place, database, **options):
     photos = PhotoSet(place, tuple(Photo(name, *SIZE, "g") for name in (RICH, POOR, EMPTY)))
     if not database.exists():
         create_database(database, photos)
-    find_and_match(
-        database, SiftSettings(place, None, MatchSettings(**options)), (RICH, POOR, EMPTY), 1, SilentProgress(), ()
-    )
+    find_sift(database, SiftSettings(place, None, MatchSettings(**options)), (RICH, POOR, EMPTY), 1, SilentProgress())
     graph = read_match_graph(database, photos)
     return {graph.images[key].name: at for key, at in graph.keypoints.items()}
 

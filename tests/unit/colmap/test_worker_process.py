@@ -1,16 +1,19 @@
 """Parts of COLMAP in processes of their own: what they say, how they fail, and that they end."""
 
 import contextlib
+import importlib
 import os
 import signal
 import subprocess
 import sys
 import time
+from functools import partial
+from types import SimpleNamespace
 
 import psutil
 import pytest
 
-from sfm_app.colmap.worker_process import relay, start_worker
+from sfm_app.colmap.worker_process import run_worker, start_worker
 from sfm_app.errors import BackendError
 from sfm_app.operating_system import Ability
 
@@ -19,67 +22,49 @@ POSIX = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such 
 
 CHILD = """
 import os, signal, sys, time
-from sfm_app.colmap.worker_process import ProgressReporter, report, serve
+from sfm_app.colmap.worker_process import ProgressReporter, report
 
-def work(task):
+def work(number=0):
     {work}
-
-serve(work)
 """
 
 
 @pytest.fixture
 def child(tmp_path, monkeypatch):
-    """A module that does something in a process of its own, by its name."""
+    """A function of a module that a process of its own can import."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    monkeypatch.syspath_prepend(tmp_path)
 
     def make(work):
         (tmp_path / "some_child.py").write_text(CHILD.format(work=work))
-        return "some_child"
+        monkeypatch.delitem(sys.modules, "some_child", raising=False)
+        return importlib.import_module("some_child").work
 
     return make
 
 
-def call(module, **task):
-    with start_worker(module, task) as process:
-        found = list(process.messages())
-        process.check("working")
-    return found
-
-
-def test_a_process_gets_its_task_and_reports_what_it_found_and_not_what_libraries_print(child):
-    work = "print('hello'); os.system('echo hello'); report(twice=2 * task['number'])"
-    assert call(child(work), number=21) == [{"twice": 42}]
+def test_a_process_returns_the_result_of_its_call_and_not_what_libraries_print(child):
+    work = "print('hello'); os.system('echo hello'); return {(1, 2): 2 * number}"
+    assert run_worker(partial(child(work), 21), "working") == {(1, 2): 42}
 
 
 def test_nothing_is_imported_from_the_current_folder(child, tmp_path, monkeypatch):
+    work = child("return 'well'")
     for name in ("json", "zlib", "numpy", "pycolmap"):
         (tmp_path / "here").mkdir(exist_ok=True)
         (tmp_path / "here" / f"{name}.py").write_text("raise SystemExit('got in')")
     monkeypatch.chdir(tmp_path / "here")
-    assert call(child("report(well=True)")) == [{"well": True}]
+    assert run_worker(work, "working") == "well"
 
 
 def test_progress_comes_through(child):
-    class Seen(list):
-        def start(self, label, total):
-            self.append((label, total))
-
-        def advance(self, steps=1):
-            self.append(steps)
-
-        def finish(self):
-            self.append("end")
-
-    seen = Seen()
-    module = child(
-        "bar = ProgressReporter(); bar.start('photos', 7); bar.advance(3); bar.finish(); report(a=1); report(b=2)"
+    seen = []
+    progress = SimpleNamespace(
+        start=lambda *begun: seen.append(begun), advance=seen.append, finish=lambda: seen.append("end")
     )
-
-    with start_worker(module, {}) as process:
-        found = relay(process, seen)
-
-    assert (seen[:3], found) == ([("photos", 7), 3, "end"], {"a": 1, "b": 2})
+    work = child("bar = ProgressReporter(); bar.start('photos', 7); bar.advance(3); bar.finish(); return 5")
+    assert run_worker(work, "working", progress) == 5
+    assert seen[:3] == [("photos", 7), 3, "end"]
 
 
 @pytest.mark.parametrize(
@@ -98,11 +83,11 @@ def test_progress_comes_through(child):
 )
 def test_a_process_that_fails_is_an_error_with_its_last_line(child, work, message):
     with pytest.raises(BackendError, match=message):
-        call(child(work))
+        run_worker(child(work), "working")
 
 
 def test_a_process_is_ended_with_the_block(child):
-    with start_worker(child("report(begun=True); time.sleep(600)"), {}) as process:
+    with start_worker(child("report(begun=True); time.sleep(600)")) as process:
         next(process.messages())
         assert not process.has_ended(0.0)
     assert process.process.returncode == (1 if sys.platform == "win32" else -signal.SIGKILL)
@@ -112,12 +97,13 @@ def test_a_process_is_ended_with_the_block(child):
 def test_a_process_ends_when_the_one_that_started_it_is_killed(child, without, taken):
     without(*taken)
     parent = (
-        "import sys; from sfm_app.colmap.worker_process import start_worker\n"
-        "with start_worker(sys.argv[1], {}) as process:\n"
+        "from sfm_app.colmap.worker_process import start_worker\n"
+        "from some_child import work\n"
+        "with start_worker(work) as process:\n"
         "    for message in process.messages(): print(message['me'], flush=True)"
     )
-    command = [sys.executable, "-c", parent, child("report(me=os.getpid()); time.sleep(600)")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    child("report(me=os.getpid()); time.sleep(600)")
+    with subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True) as process:
         orphan = int(process.stdout.readline())
         process.kill()
 

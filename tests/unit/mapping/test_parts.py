@@ -12,7 +12,7 @@ from sfm_app.errors import BackendError, ClusterError
 from sfm_app.geometry.poses import umeyama
 from sfm_app.mapping import parts
 from sfm_app.mapping.attempt import Attempt, Group, NoModel, PairSupport, best_attempt
-from sfm_app.mapping.part_mapping import FOLDER, PartResult, map_part
+from sfm_app.mapping.part_mapping import FOLDER, PartResult, PartTask, map_part
 from sfm_app.mapping.parts import map_in_parts, part_size, parts_suffice
 from sfm_app.plugins import load_plugins
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
@@ -191,6 +191,6 @@ def test_parts_with_false_joins_are_not_joined_unless_nobody_asks(start, monkeyp
 def test_a_task_is_small_and_travels(tmp_path):
     import pickle
 
-    task = {"scratch": str(tmp_path), "photos": str(tmp_path / "photos"), "seed": 0}
+    task = PartTask(str(tmp_path), str(tmp_path / "photos"))
     assert len(pickle.dumps((map_part, task))) < 1000
     assert pickle.loads(pickle.dumps((map_part, task))) == (map_part, task)  # noqa: S301

@@ -157,7 +157,7 @@ def test_a_method_that_cannot_run_here_is_refused_before_any_work():
 
     plugins = load_plugins([SimpleNamespace(sfm_features=sfm_features)], installed=False)
     assert list(plugins.features)[:2] == ["sift", "sift-dsp"]
-    with pytest.raises(ConfigError, match="'gone' cannot run here: no such chip"):
+    with pytest.raises(ConfigError, match="'gone' cannot be used here: no such chip"):
         plugins.feature_method("gone")
     with pytest.raises(ConfigError, match="no feature method is named 'surf'"):
         plugins.feature_method("surf")

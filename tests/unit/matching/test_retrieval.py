@@ -8,6 +8,7 @@ from sfm_app.retrieval import (
     count_shared_keypoints,
     describe_picture,
     learn_vocabulary,
+    nearest_words,
     pool_descriptors,
     rank_similar,
 )
@@ -25,7 +26,7 @@ def street(seed=0, noise=6.0):
 
 def words_of(photos, size=300):
     vocabulary = learn_vocabulary(pool_descriptors(photos, 10_000), size, seed=0)
-    return vocabulary, [vocabulary.quantize(one) for one in photos]
+    return vocabulary, [nearest_words(vocabulary, one) for one in photos]
 
 
 def test_the_rank_similar_photos_are_the_neighbors():
@@ -51,8 +52,8 @@ def test_words_are_whole_numbers_and_descriptors_belong_to_the_nearest():
     photos = street()
     vocabulary, words = words_of(photos)
     assert 200 <= len(vocabulary) <= 320
-    assert np.array_equal(vocabulary.words, np.rint(vocabulary.words))
-    distances = np.linalg.norm(photos[3][:, None].astype(float) - vocabulary.words, axis=2)
+    assert np.array_equal(vocabulary, np.rint(vocabulary))
+    distances = np.linalg.norm(photos[3][:, None].astype(float) - vocabulary, axis=2)
     chosen = distances[np.arange(SEEN), words[3]]
     assert np.array_equal(chosen, distances.min(axis=1))
 

@@ -77,11 +77,8 @@ def test_the_first_level_is_spread_over_the_scene():
     assert abs(x.mean() / 100_000 - 0.5) < 0.02 and x.min() < 100 and x.max() > 99_900
 
 
-def test_a_level_that_is_not_there_is_an_error_and_no_points_are_no_levels():
+def test_no_points_are_no_levels():
     assert point_levels(surface(0)).counts == []
-    for level in (-1, 1):
-        with pytest.raises(IndexError, match="no level"):
-            point_levels(surface(5)).pack(level)
 
 
 def test_the_page_its_model_and_its_points_have_addresses(resources):

@@ -195,7 +195,7 @@ def test_no_map_at_all_is_an_error_with_the_reason(scene):
 
 
 def test_a_method_that_cannot_run_is_an_error_before_anything_is_touched(scene):
-    with pytest.raises(ConfigError, match="'gone' cannot run here: no such chip"):
+    with pytest.raises(ConfigError, match="'gone' cannot be used here: no such chip"):
         run_stage(scene, Method(), method="gone")
     with pytest.raises(ConfigError, match="no depth method is named 'sgm'"):
         run_stage(scene, Method(), method="sgm")

@@ -4,9 +4,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from sfm_app.engine.stage import Products
 from sfm_app.formats import EXPORTERS
 from sfm_app.formats.exporters import JPEG_QUALITY
 from sfm_app.frame.scale import MetricFrame
+from sfm_app.pipeline import FILES
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
@@ -22,7 +24,7 @@ def run(tmp_path):
 def test_the_manifest_says_how_large_the_files_are_and_how_good_the_pictures(textured_ball, run):
     paths = files.make(textured_ball, MetricFrame(), run)
 
-    assert paths == files.load(run)
+    assert paths == FILES.load(Products(run), run)
     assert [path.name for path in paths] == ["model.ply", "model.glb"]
     for path in paths:
         assert path.read_bytes() == EXPORTERS[path.suffix[1:]].write(textured_ball, "model")[path.name]
