@@ -22,7 +22,6 @@ from sfm_app.mapping.attempt import (
     NoModel,
     are_many_unregistered,
     choice_reason,
-    doubt,
     explained_pairs,
     support,
 )
@@ -41,8 +40,6 @@ class HypothesisOptions:
 
     other_focals: tuple[float, ...] = (0.6, 2.4, 4.8)
     """Guesses of the focal besides the usual one, in longer sides: steps of a factor of two. Chosen by hand."""
-    max_passes: int = 3
-    """Most passes with the cameras of the model before; dinoSparseRing needs two. Measured."""
     focal_tolerance: float = 0.01
     """Relative change of a focal in mapping above which another pass is worth it. Chosen by hand."""
     min_unregistered_share: float = 0.25
@@ -53,6 +50,8 @@ class HypothesisOptions:
     """With fewer photos, a camera per photo fits almost anything. Chosen by hand."""
     max_photos: int = 100
     """With more photos, a pass costs more than it promises. Chosen by hand."""
+    max_remaining_share: float = 0.5
+    """Share of the contradictions that may remain with more cameras. Chosen on `benchmarks.trouble`."""
 
 
 OPTIONS = HypothesisOptions()
@@ -153,10 +152,14 @@ def is_better(other: Outcome, best: Outcome, mapper: Mapper) -> bool:
 def _explains_more(other: Outcome, best: Outcome) -> bool:
     """Return whether a main model explains more on the same evidence.
 
-    Of models that explain about equally much, the one with more photos, then the one with fewer cameras wins.
+    Of models that explain about equally much, the one with more photos, then the one with fewer cameras wins. More
+    cameras must place more photos or remove contradictions.
     """
     if other.main is None or best.main is None:
         return best.main is None and other.main is not None
+    most = OPTIONS.max_remaining_share * best.main.contradicted_share
+    if other.cameras > best.cameras and other.photos <= best.photos and other.main.contradicted_share > most:
+        return False  # with a camera of its own, a photo fits more than it should
     ours, theirs = best.support, other.support
     if other.evidence.matches is not best.evidence.matches:
         ours = _support_of(best.main, other)
@@ -194,9 +197,14 @@ def _without_false_joins(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
 # A rival where the evidence for our model is weak.
 
 
-def rival_reason(model: Attempt | None, evidence: Evidence) -> str:
-    """Return why a rival is worth trying, given the main model; empty where the evidence is good."""
-    return "no photo is registered" if model is None else doubt(model, len(photos_with_geometry(evidence)), evidence)
+def _rival_reason(best: Outcome, _: Mapper) -> str:
+    if best.main is None:
+        return "no photo is registered"
+    connected = len(photos_with_geometry(best.trusted))
+    if best.photos < MAPPING.enough_share * connected:
+        return f"unregistered photos with matches: {connected - best.photos}"
+    share = best.main.contradicted_share
+    return f"{100 * share:.0f} % of the matches contradict the model" if share > MAPPING.max_contradicted_share else ""
 
 
 def photos_with_geometry(evidence: Evidence) -> set[int]:
@@ -412,15 +420,15 @@ def _with_finer_features(best: Outcome, mapper: Mapper, steps: Steps = STEPS) ->
         yield reconstruct(*finer, mapper.mappers, FIRST_LOOK)
 
 
-RIVAL = Hypothesis("colmap-defaults", lambda best, _: rival_reason(best.main, best.trusted), _map_rival)
+RIVAL = Hypothesis("colmap-defaults", _rival_reason, _map_rival)
 FIRST_LOOK = (
     Hypothesis("false-joins", _false_joins_reason, _without_false_joins, repeats=OVERLAPS.max_passes),
-    RIVAL,
     Hypothesis("other-focals", _focal_reason, _with_other_focals),
     Hypothesis("camera-per-photo", _shared_camera_reason, _with_camera_per_photo),
     Hypothesis("two-cameras", _two_cameras_reason, _with_two_cameras),
-    Hypothesis("learned-cameras", _learning_reason, _with_learned_cameras, repeats=OPTIONS.max_passes),
+    Hypothesis("learned-cameras", _learning_reason, _with_learned_cameras),
     Hypothesis("merged-models", _merge_reason, _merged),
+    RIVAL,
 )
 FINER_FEATURES = Hypothesis("finer-features", _lost_reason, _with_finer_features)
 ALL = (*FIRST_LOOK, FINER_FEATURES)

@@ -21,6 +21,7 @@ from sfm_app.mapping.attempt import (
     Attempt,
     Group,
     best_attempt,
+    doubt,
     explained_pairs,
     is_focal_accurate,
     judge_model,
@@ -34,8 +35,8 @@ from sfm_app.mapping.hypotheses import (
     FIRST_LOOK,
     Hypothesis,
     improve,
+    photos_with_geometry,
     reconstruct,
-    rival_reason,
     with_doubtful_joins,
 )
 from sfm_app.mapping.look_alikes import joined_pairs, judge_places
@@ -64,7 +65,7 @@ class Steps:
     find_cameras: Callable[[MatchGraph, ViewGraph, RunContext], Intrinsics] = find_cameras
     reconstruct: Callable[..., Outcome] = reconstruct
     build_pose_graph: Callable[..., PoseGraph] = build_pose_graph
-    rival_reason: Callable[[Attempt, Evidence], str] = rival_reason
+    doubt: Callable[[Attempt, int, Evidence], str] = doubt
     judge_places: Callable[[Sequence[Attempt]], tuple[list[LookAlikes], int]] = judge_places
 
 
@@ -136,7 +137,7 @@ def _doubt(
         return "the model explains fewer matches of the known photos than the earlier one"
     if steps.judge_places((attempt,))[0]:
         return "two different places are merged in the model"
-    return steps.rival_reason(attempt, evidence)
+    return steps.doubt(attempt, len(photos_with_geometry(evidence)), evidence)
 
 
 def _place(start: Reconstruction, group: Group, run: RunContext) -> Reconstruction | None:

@@ -48,6 +48,12 @@ def trials_of(outcome):
     return [(trial.name, trial.accepted, *trial.notes) for trial in outcome.trials]
 
 
+def trial_of(outcome, name):
+    """The only trial of a hypothesis."""
+    [trial] = [trial for trial in outcome.trials if trial.name == name]
+    return trial
+
+
 def joined(inside, between):
     """What a model of photos 1 to 3 and 4 to 6 explains within and between these."""
     pairs = {(a, b): inside for part in ((1, 2, 3), (4, 5, 6)) for a in part for b in part if a < b}

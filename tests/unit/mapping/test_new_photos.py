@@ -107,7 +107,7 @@ def test_the_grown_model_stays_where_all_again_explains_less(grow, synthetic):
         submodel(synthetic.model, [1, 2, 3, 4]),
         (1, 2, 3, 4),
         whole=submodel(synthetic.model, [1, 2, 3]),
-        rival_reason=lambda *_: "a doubt",
+        doubt=lambda *_: "a doubt",
     )
     assert figures["mapped_again_because"] == "a doubt"
     assert found.models[0].mapper == "grown" and found.models[0].photos == 6
