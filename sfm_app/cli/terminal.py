@@ -176,9 +176,9 @@ class StateColumn(ProgressColumn):
     def render(self, task: Task) -> Text:
         """Return the text of a bar."""
         minutes, seconds = divmod(int(task.elapsed or 0.0), 60)
-        steps = [MofNCompleteColumn().render(task), " "] if task.total else []
         remaining = remaining_text(task)
-        return Text.assemble(*steps, f"{minutes}:{seconds:02}{f', {remaining}' if remaining else ''}")
+        time_text = f"{minutes}:{seconds:02}{f', {remaining}' if remaining else ''}"
+        return Text.assemble(MofNCompleteColumn().render(task), f" {time_text}") if task.total else Text(time_text)
 
 
 def progress_text(task: Task) -> str:

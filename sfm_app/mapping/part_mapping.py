@@ -357,14 +357,6 @@ FOLDER, STOP = "parts", "stop"
 
 
 @dataclass(frozen=True, slots=True)
-class PartTask:
-    """A part to map; its inputs are in a file that every worker can read."""
-
-    folder: str
-    photos: str
-
-
-@dataclass(frozen=True, slots=True)
 class PartResult:
     """Models of a part."""
 
@@ -383,28 +375,26 @@ def map_parts(
     """Map parts side by side, except those that a killed run has finished; failed ones have no models."""
     place = run.workspace.root / FOLDER
     (place / STOP).unlink(missing_ok=True)
-    tasks: list[PartTask] = []
+    folders = list[Path]()  # small, since the inputs in them are files that every worker can read
     for part in parts:
         members = part_of_group(group, part.photos)
         followed = frozenset(pair for pair in members.graph.poses if pair in mapped.poses)
         write_inputs(place / INPUTS, PartInputs(members, followed, run.settings, stop_at_false_joins))
-        folder = place / digest_file(place / INPUTS)[:16]
-        folder.mkdir(exist_ok=True)
-        replace_file(place / INPUTS, folder / INPUTS)
-        tasks.append(PartTask(str(folder), str(run.workspace.photos)))
+        folders.append(place / digest_file(place / INPUTS)[:16])
+        folders[-1].mkdir(exist_ok=True)
+        replace_file(place / INPUTS, folders[-1] / INPUTS)
     try:
-        return run.map(Task(map_part), tasks, f"mapping {len(parts)} parts")
+        return run.map(Task(map_part, run.workspace.photos), folders, f"mapping {len(parts)} parts")
     except BaseException:  # also Ctrl-C: the processes end when they see the file
         (place / STOP).touch()
         raise
 
 
-def map_part(task: PartTask) -> PartResult:
-    """Map the part of a task in a separate process, and wait for it. Depends on nothing but the task."""
-    folder = Path(task.folder)
+def map_part(photos: Path, folder: Path) -> PartResult:
+    """Map the part in a folder in a separate process, and wait for it; depends on nothing but the folders."""
     if not (folder / RESULT).exists():
         try:
-            with start_worker(partial(_work, task)) as process:
+            with start_worker(partial(_work, photos, folder)) as process:
                 while not process.has_ended(0.2):
                     if (folder.parent / STOP).exists():
                         return PartResult((), "", ("stopped",))
@@ -421,5 +411,5 @@ def map_part(task: PartTask) -> PartResult:
     )
 
 
-def _work(task: PartTask) -> None:
-    import_module("sfm_app.mapping.part_process").work(task)  # it imports this module
+def _work(photos: Path, folder: Path) -> None:
+    import_module("sfm_app.mapping.part_process").work(photos, folder)  # it imports this module

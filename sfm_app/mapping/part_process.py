@@ -13,7 +13,7 @@ from sfm_app.colmap.model import posed_photo_ids, submodel
 from sfm_app.files import replace_atomically
 from sfm_app.mapping.attempt import MAPPING, Attempt, best_attempt, map_group
 from sfm_app.mapping.look_alikes import judge_places
-from sfm_app.mapping.part_mapping import INPUTS, RESULT, PartTask, read_inputs
+from sfm_app.mapping.part_mapping import INPUTS, RESULT, read_inputs
 from sfm_app.mapping.split_and_merge import sound_parts
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
@@ -22,9 +22,8 @@ from sfm_app.runtime.workspace import SubWorkspace, Workspace
 from sfm_app.types import PoseGraph
 
 
-def work(task: PartTask) -> None:
-    """Map the part in the folder of the task, and write its models and notes beside its inputs."""
-    folder, photos = Path(task.folder), Path(task.photos)
+def work(photos: Path, folder: Path) -> None:
+    """Map the part in a folder, and write its models and notes beside its inputs."""
     inputs = read_inputs(folder / INPUTS)
     judge = cache(lambda attempt: judge_places([attempt])[0])
     enough = MAPPING.enough_share * len(inputs.part.photos)

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,6 @@ from sfm_app.mapping.part_mapping import (
     OPTIONS,
     RESULT,
     PartInputs,
-    PartTask,
     cut_group,
     link_weights,
     map_part,
@@ -153,5 +153,5 @@ def test_a_finished_part_is_read_with_its_false_joins(tmp_path):
     joins = LookAlikes(((1, 2), (3, 4)), 0.875), LookAlikes(((5, 6),), 0.5)
     result = {"models": ["model-0"], "mapper": "usual", "tried": [], "false_joins": [asdict(join) for join in joins]}
     (tmp_path / RESULT).write_text(json.dumps(result))
-    found = map_part(PartTask(str(tmp_path), ""))
+    found = map_part(Path(), tmp_path)
     assert found.false_joins == joins and found.models == (str(tmp_path / "model-0"),)

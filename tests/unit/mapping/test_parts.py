@@ -12,7 +12,7 @@ from sfm_app.errors import BackendError, ClusterError
 from sfm_app.geometry.poses import umeyama
 from sfm_app.mapping import parts
 from sfm_app.mapping.attempt import Attempt, Group, NoModel, PairSupport, best_attempt
-from sfm_app.mapping.part_mapping import FOLDER, PartResult, PartTask, map_part
+from sfm_app.mapping.part_mapping import FOLDER, PartResult, map_part
 from sfm_app.mapping.parts import map_in_parts, part_size, parts_suffice
 from sfm_app.plugins import load_plugins
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
@@ -20,6 +20,7 @@ from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import SceneSettings, Settings
+from sfm_app.tasks import Task
 from sfm_app.types import Calibration, EpipolarFit, Evidence, Intrinsics, LookAlikes
 
 PHOTOS, PART = 72, 24
@@ -90,9 +91,9 @@ def test_parts_become_one_exact_model_with_all_photos_whatever_the_workers(town,
 def test_a_part_that_fails_is_left_to_the_others(start, monkeypatch):
     made = []
 
-    def some_fail(tasks):
-        made.append(tasks)
-        return PartResult((), "", ("failed: no memory",)) if len(made) == 2 else map_part(tasks)
+    def some_fail(photos, folder):
+        made.append(folder)
+        return PartResult((), "", ("failed: no memory",)) if len(made) == 2 else map_part(photos, folder)
 
     monkeypatch.setattr("sfm_app.mapping.part_mapping.map_part", some_fail)
     found, run = start(1)
@@ -191,6 +192,6 @@ def test_parts_with_false_joins_are_not_joined_unless_nobody_asks(start, monkeyp
 def test_a_task_is_small_and_travels(tmp_path):
     import pickle
 
-    task = PartTask(str(tmp_path), str(tmp_path / "photos"))
-    assert len(pickle.dumps((map_part, task))) < 1000
-    assert pickle.loads(pickle.dumps((map_part, task))) == (map_part, task)  # noqa: S301
+    task = Task(map_part, tmp_path / "photos")
+    assert len(pickle.dumps((task, tmp_path))) < 1000
+    assert pickle.loads(pickle.dumps(task)).args == (tmp_path / "photos",)  # noqa: S301
