@@ -22,7 +22,7 @@ from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import ArcOptions, Camera, Lens, Views, arc, camera_center, make_camera, make_wide_camera
 from sfm_app.synthetic.compare import center_error_percent, focal_error_percent, surface_errors
 from sfm_app.synthetic.photo_folder import Truth, load_truth, save_truth, write_photo_folder
-from sfm_app.synthetic.render import comparison_image
+from sfm_app.synthetic.render import PreparedModel, comparison_image
 from sfm_app.synthetic.scenes import courtyard, statue, statue_views
 from sfm_app.synthetic.shapes import SyntheticScene
 from sfm_app.types import CameraModel, Model, Scene
@@ -134,7 +134,8 @@ def draw(model: Model, scene: Scene, out: Path) -> None:
     name = names[len(names) // 2]
     camera = camera_of(scene.cameras[scene.camera_of[name]])
     photo = np.asarray(Image.open(out / "photos" / name).convert("RGB"))
-    Image.fromarray(comparison_image(photo, model, camera, scene.cam_from_world[name])).save(out / "model.png")
+    picture = comparison_image(photo, PreparedModel(model), camera, scene.cam_from_world[name])
+    Image.fromarray(picture).save(out / "model.png")
 
 
 def camera_of(model: CameraModel) -> Camera:

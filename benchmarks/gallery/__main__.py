@@ -19,7 +19,7 @@ from benchmarks.surface.photos import placed_photos
 from benchmarks.surface.sets import RENDERED, finished_model, surface_set
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import Camera
-from sfm_app.synthetic.render import orbited_pose, prepare_model, render_model, render_shape
+from sfm_app.synthetic.render import PreparedModel, orbited_pose, render_model, render_shape
 from sfm_app.types.surface import Model
 
 Pixels = NDArray[np.uint8]
@@ -62,7 +62,7 @@ def draw(model: Model, out: Path, pose: Pose, with_photo: bool) -> Pixels:
         pose: from where.
         with_photo: whether the photo stands at the left, and the model from its place at the right.
     """
-    prepared, images = prepare_model(model), placed_photos(out)
+    prepared, images = PreparedModel(model), placed_photos(out)
     image = images[sorted(images)[pose.photo]]
     camera = image.camera
     if camera is None:

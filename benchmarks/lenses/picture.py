@@ -21,7 +21,7 @@ from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import ArcOptions, Camera, Lens, arc
 from sfm_app.synthetic.compare import surface_errors
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder
-from sfm_app.synthetic.render import comparison_image, prepare_model
+from sfm_app.synthetic.render import PreparedModel, comparison_image
 from sfm_app.synthetic.scenes import courtyard
 
 SIZE, CENTER, RADIUS_PX = (800, 600), (410.0, 296.0), 300.0
@@ -67,7 +67,7 @@ def draw(out: Path, name: str) -> NDArray[np.uint8]:
     camera = Camera(camera_matrix(fx, fy, cx, cy), found.width, found.height, Lens("equidistant", tuple(terms)))
     pixels = np.asarray(Image.open(out / "photos" / name).convert("RGB"))
     return comparison_image(
-        pixels, prepare_model(read_texture(Workspace(out))), camera, image.cam_from_world().matrix()
+        pixels, PreparedModel(read_texture(Workspace(out))), camera, image.cam_from_world().matrix()
     )
 
 

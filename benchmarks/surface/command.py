@@ -48,7 +48,7 @@ from benchmarks.surface.sets import (
 )
 from benchmarks.surface.worker import run_stages
 from sfm_app.settings import Settings
-from sfm_app.synthetic.render import prepare_model
+from sfm_app.synthetic.render import PreparedModel
 
 ABOUT = (
     "Photos only, through the whole program. Rendered scenes: the mesh is moved onto the truth by the camera centers; "
@@ -90,7 +90,7 @@ def measure(photos: SurfaceSet, out: Path, args: argparse.Namespace) -> Row:
     row |= {"placed": len(names), "triangles": len(model.surface.faces), **file_sizes(out)}
     row["texture pages"] = len(model.texture.pages) if model.texture else 0
     row["seconds per photo"] = round(row["seconds together"] / len(names), 2)
-    prepared = prepare_model(model)
+    prepared = PreparedModel(model)
     if is_wanted(args.pictures, photos.name):
         save_page(model_page(out, names[len(names) // 2], prepared), args.results / f"{args.name}-{photos.name}.png")
     if photos.truth is not None and photos.scene is not None:

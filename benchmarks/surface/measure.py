@@ -27,7 +27,7 @@ from benchmarks.surface.sparse_poisson import sparse_surfaces
 from benchmarks.surface.worker import StageCost
 from sfm_app.errors import SfmError
 from sfm_app.synthetic.photo_folder import Truth
-from sfm_app.synthetic.render import PreparedModel, prepare_model
+from sfm_app.synthetic.render import PreparedModel
 from sfm_app.synthetic.shapes import SyntheticScene
 from sfm_app.types import Surface
 
@@ -99,7 +99,7 @@ def score_left_out(
     for name in names:
         target = out.with_name(f"{out.name}-left-out")
         try:
-            without = prepare_model(remake_without(out, target, name, settings, geometry_too=geometry_too))
+            without = PreparedModel(remake_without(out, target, name, settings, geometry_too=geometry_too))
         except SfmError as error:
             return {"left out": f"without {name}: {error}"}
         psnr = likenesses(without, out, [name])[name].psnr_db

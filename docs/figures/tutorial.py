@@ -22,7 +22,7 @@ from sfm_app.products import read_texture
 from sfm_app.report.pictures import depth_colors
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.synthetic.cameras import Camera
-from sfm_app.synthetic.render import prepare_model, render_model, render_shape
+from sfm_app.synthetic.render import PreparedModel, render_model, render_shape
 
 PICTURES = Path(__file__).parents[1] / "pictures"
 SHOWN, HEIGHT = 8, 220
@@ -51,7 +51,7 @@ def draw_steps(out: Path) -> None:
     factor = depth.shape[1] / found.width
     K = np.diag([factor, factor, 1.0]) @ found.K
     camera, pose = Camera(K, depth.shape[1], depth.shape[0]), run.scene.cam_from_world[name]
-    model = prepare_model(read_texture(Workspace(out)))
+    model = PreparedModel(read_texture(Workspace(out)))
     size = depth.shape[1], depth.shape[0]
     parts = [
         cv2.resize(photo, size, interpolation=cv2.INTER_AREA),

@@ -147,10 +147,19 @@ class Scenery:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RollSelection:
-    """The chosen hypothesis of roll, and its odds."""
+class UpEstimate:
+    """The up direction of a scene, and its evidence."""
 
+    up: FloatArray
+    """(3,) unit vector in the world."""
+    level: FloatArray | None
+    """(3,) main horizontal direction of the lines, perpendicular to `up`; None without one."""
+    method: str
+    """Source of `up`: `LINES`, `ROLL`, `GROUND` or `GPS`."""
+    deviation_deg: float
+    """Standard deviation of `up`, from its evidence."""
     roll: Roll
+    """Up from the cameras alone, for the chosen turn of the photos."""
     evidence: Mapping[str, float]
     """Log odds of up against down by cue, in nats; negative for a contradicting cue."""
     sign_log_odds: float
@@ -158,8 +167,18 @@ class RollSelection:
     axis_log_odds: float
     """Log odds of the vertical against the other one."""
 
+    @property
+    def angle_to_roll_deg(self) -> float:
+        """Angle between `up` and up from the cameras alone, in degrees."""
+        return float(axis_angle_deg(self.up, self.roll.up))
 
-def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArray, scenery: Scenery) -> RollSelection:
+    def with_up(self, up: FloatArray, deviation_deg: float) -> "UpEstimate":
+        """Return a copy with up from GPS, a unit vector (3,) in the world whose sign is certain."""
+        sure = replace(self, sign_log_odds=np.inf, axis_log_odds=np.inf)
+        return replace(sure, up=up, level=None, method=GPS, deviation_deg=deviation_deg)
+
+
+def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArray, scenery: Scenery) -> UpEstimate:
     """Choose the vertical by roll and ledges, then its upper end by all cues; the rolls are in order of their turns."""
     surfaces = fit_surfaces(scenery.points, scenery.brightness, scenery.visible, centers)
     ledges = [slope_asymmetry(roll.up, rotations, scenery.pictures) for roll in rolls[:2]]
@@ -181,42 +200,12 @@ def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArra
     for_up = down.cost - up.cost + sum(evidence.values())
     if for_up < 0:
         up, evidence = down, {name: -nats for name, nats in evidence.items()}
-    return RollSelection(up, evidence, abs(for_up), abs(gap))
+    return UpEstimate(up.up, None, ROLL, up.deviation_deg, up, evidence, abs(for_up), abs(gap))
 
 
 def odds(nats: float) -> float:
     """Return log odds as odds to one, with two digits."""
     return float(f"{np.exp(min(nats, OPTIONS.highest_nats)):.2g}")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class UpEstimate:
-    """The up direction of a scene, and its evidence."""
-
-    up: FloatArray
-    """(3,) unit vector in the world."""
-    level: FloatArray | None
-    """(3,) main horizontal direction of the lines, perpendicular to `up`; None without one."""
-    method: str
-    """Source of `up`: `LINES`, `ROLL`, `GROUND` or `GPS`."""
-    deviation_deg: float
-    """Standard deviation of `up`, from its evidence."""
-    selection: RollSelection
-
-    @property
-    def roll(self) -> Roll:
-        """Up from the cameras alone, for the chosen turn of the photos."""
-        return self.selection.roll
-
-    @property
-    def angle_to_roll_deg(self) -> float:
-        """Angle between `up` and up from the cameras alone, in degrees."""
-        return float(axis_angle_deg(self.up, self.roll.up))
-
-    def with_up(self, up: FloatArray, deviation_deg: float) -> "UpEstimate":
-        """Return a copy with up from GPS, a unit vector (3,) in the world whose sign is certain."""
-        sure = RollSelection(self.roll, self.selection.evidence, np.inf, np.inf)
-        return replace(self, up=up, level=None, method=GPS, deviation_deg=deviation_deg, selection=sure)
 
 
 def up_direction(
@@ -225,25 +214,27 @@ def up_direction(
     """Find up from vertical lines near that of the cameras' roll, or else from the ground or the roll."""
     rolls = roll_hypotheses(rotations, centers)
     if turn_deg is None:
-        selection = select_roll(rolls, rotations, centers, scenery)
+        upright = select_roll(rolls, rotations, centers, scenery)
     else:
-        selection = RollSelection(rolls[turn_deg // 90], {}, np.inf, np.inf)
-    roll = selection.roll
+        roll = rolls[turn_deg // 90]
+        upright = UpEstimate(roll.up, None, ROLL, roll.deviation_deg, roll, {}, np.inf, np.inf)
+    roll = upright.roll
     lines = find_vanishing_direction(roll.up, segments)
     if lines is not None:
         vertical, deviation_deg = lines
         level = level_direction(vertical, segments)
         if level is None:
-            return UpEstimate(vertical, None, LINES, deviation_deg, selection)
+            return replace(upright, up=vertical, method=LINES, deviation_deg=deviation_deg)
         frame, deviation_deg = fit_orthogonal_frame(vertical, level, segments)
         # verticals alone and all edges together have different errors; their angle measures both
         gap_deg = float(axis_angle_deg(frame[0], vertical))
-        return UpEstimate(frame[0], frame[1], LINES, float(np.hypot(deviation_deg, gap_deg)), selection)
+        deviation_deg = float(np.hypot(deviation_deg, gap_deg))
+        return replace(upright, up=frame[0], level=frame[1], method=LINES, deviation_deg=deviation_deg)
     if roll.spread_deg > OPTIONS.unsure_deg:
         ground = dominant_plane(scenery.points, roll.up, OPTIONS.floor_deg)
         if ground is not None:
-            return UpEstimate(ground[0], None, GROUND, ground[1], selection)
-    return UpEstimate(roll.up, None, ROLL, roll.deviation_deg, selection)
+            return replace(upright, up=ground[0], method=GROUND, deviation_deg=ground[1])
+    return upright
 
 
 def viewer_direction(upright: UpEstimate, rotations: FloatArray, points: FloatArray) -> tuple[FloatArray, str]:

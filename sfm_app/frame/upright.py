@@ -166,16 +166,15 @@ def extract_cues(path: Path, turn_deg: int = 0) -> PhotoCues:
 
 
 def _orientation_entry(upright: UpEstimate, front: str) -> dict[str, Json]:
-    selection = upright.selection
     return {
         "up": upright.method,
         "up_deviation_deg": round(upright.deviation_deg, 3) if np.isfinite(upright.deviation_deg) else None,
         "off_camera_roll_deg": round(upright.angle_to_roll_deg, 2),
         "camera_roll_spread_deg": round(upright.roll.spread_deg, 2),
         "photos_turned_deg": upright.roll.turn_deg,
-        "up_sign_odds": odds(selection.sign_log_odds),
-        "up_axis_odds": odds(selection.axis_log_odds),
-        "up_evidence_nats": {name: round(nats, 1) for name, nats in selection.evidence.items()},
+        "up_sign_odds": odds(upright.sign_log_odds),
+        "up_axis_odds": odds(upright.axis_log_odds),
+        "up_evidence_nats": {name: round(nats, 1) for name, nats in upright.evidence.items()},
         "front": front,
     }
 

@@ -154,8 +154,12 @@ def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
 
 def draw_pairs(count: int, most: int) -> NDArray[np.intp]:
     """List all pairs (P, 2) of `count` points, or `most` of them, drawn with a fixed seed."""
-    pairs = np.column_stack(np.triu_indices(count, 1))
-    return np.random.default_rng(0).permutation(pairs)[:most] if len(pairs) > most else pairs
+    starts = np.cumsum([0, *range(count - 1, 0, -1)])  # numbers of the pairs that begin with each point
+    chosen = np.arange(starts[-1])
+    if len(chosen) > most:
+        chosen = np.random.default_rng(0).permutation(len(chosen))[:most]
+    first = np.searchsorted(starts, chosen, side="right") - 1
+    return np.column_stack([first, chosen - starts[first] + first + 1]).astype(np.intp)
 
 
 def _triples(count: int) -> NDArray[np.intp]:

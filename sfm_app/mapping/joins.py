@@ -406,20 +406,16 @@ def merge_fragments(fragments: Sequence[Fragment], frames: Mapping[int, Similari
 def _choose_poses(
     fragments: Sequence[Fragment], models: Mapping[int, PlacedPhotos]
 ) -> tuple[IndexArray, FloatArray, FloatArray, IndexArray]:
-    best: dict[int, tuple[tuple[bool, int, int], int, int]] = {}
-    for number, model in models.items():
-        for row, photo in enumerate(model.photos.tolist()):
-            rank = photo in fragments[number].own, len(model.photos), -number
-            if photo not in best or rank > best[photo][0]:
-                best[photo] = rank, number, row
-    photos = sorted(best)
-    chosen = [best[photo][1:] for photo in photos]
-    return (
-        np.array(photos, np.int64),
-        np.array([models[number].R[row] for number, row in chosen]).reshape(-1, 3, 3),
-        np.array([models[number].centers[row] for number, row in chosen]).reshape(-1, 3),
-        np.array([number for number, _ in chosen], np.int64),
-    )
+    photo = np.concatenate([model.photos for model in models.values()])
+    number = np.concatenate([np.full(len(model.photos), k) for k, model in models.items()])
+    size = np.concatenate([np.full(len(model.photos), len(model.photos)) for model in models.values()])
+    own = np.array([one in fragments[k].own for one, k in zip(photo.tolist(), number.tolist(), strict=True)], np.bool_)
+    order = np.lexsort((number, -size, ~own, photo))
+    photos, first = np.unique(photo[order], return_index=True)
+    R = np.concatenate([model.R for model in models.values()])
+    centers = np.concatenate([model.centers for model in models.values()])
+    best = order[first]
+    return photos, R[best], centers[best], number[best]
 
 
 def _sound_observations(

@@ -14,7 +14,7 @@ from sfm_app.report.contents import UNREADABLE, RunContents, data_address
 from sfm_app.report.findings import glance
 from sfm_app.report.scene_view import view_points
 from sfm_app.synthetic.cameras import Camera
-from sfm_app.synthetic.render import orbited_pose, render_model
+from sfm_app.synthetic.render import PreparedModel, orbited_pose, render_model
 from sfm_app.types import Frustum, Model
 
 WIDTH_PX, SUPERSAMPLING = 640, 2
@@ -57,7 +57,7 @@ def model_cutout(contents: RunContents) -> NDArray[np.uint8] | None:
         return _draw_points(points, camera, middle.cam_from_world)
     pose = orbited_pose(middle.cam_from_world, model.surface, 20.0)  # from the photo itself, a model looks flat
     size = camera.width // SUPERSAMPLING, camera.height // SUPERSAMPLING
-    fine = render_model(model, camera, pose)
+    fine = render_model(PreparedModel(model), camera, pose)
     covered = fine.covered.astype(np.float32)[..., None]
     # only covered samples count, so that outlines do not get darker
     alpha = cv2.resize(covered, size, interpolation=cv2.INTER_AREA)[..., None]

@@ -69,7 +69,7 @@ class Truth:
     def camera(self) -> Camera:
         """The camera of all photos; ValueError if there are several."""
         first, *others = self.cameras.values()
-        if any(_camera_values(camera) != _camera_values(first) for camera in others):
+        if any(_camera_entry(camera) != _camera_entry(first) for camera in others):
             raise ValueError("the photos were taken with several cameras")
         return first
 
@@ -156,9 +156,8 @@ def save_truth(truth: Truth, folder: Path) -> None:
     """Write truth.json (x ~ K d(R X + t) with lens distortion d) and surface.ply into a folder without photos."""
     images = []
     for name, pose in truth.cam_from_world.items():
-        width, height, K, lens = _camera_values(truth.cameras[name])
         rows = {"R": pose[:, :3].tolist(), "t": pose[:, 3].tolist()}
-        images.append({"file": name, "width": width, "height": height, "K": K, "lens": asdict(lens)} | rows)
+        images.append({"file": name} | _camera_entry(truth.cameras[name]) | rows)
     text = {
         "convention": "x ~ K d(R X + t); world to camera; x right, y down, z forward; pixel centers at +0.5; "
         "d: the lens, x on the plane whose unit is the focal length",
@@ -188,8 +187,8 @@ def load_truth(folder: Path) -> Truth:
         raise InputError(f"no truth in {folder}: {err}", hint="it holds truth.json and surface.ply") from err
 
 
-def _camera_values(camera: Camera) -> tuple[int, int, list[list[float]], Lens]:
-    return camera.width, camera.height, camera.K.tolist(), camera.lens
+def _camera_entry(camera: Camera) -> dict[str, Any]:
+    return {"width": camera.width, "height": camera.height, "K": camera.K.tolist(), "lens": asdict(camera.lens)}
 
 
 def _camera_from_dict(image: Mapping[str, Any]) -> Camera:

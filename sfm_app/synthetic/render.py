@@ -190,13 +190,11 @@ LAMP = np.array([-0.45, -0.65, -1.0]) / np.linalg.norm([-0.45, -0.65, -1.0])
 """Direction from a face to the lamp, in the camera's frame: over the photographer's left shoulder."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class PreparedModel:
-    """A model prepared for rendering many pictures."""
+    """A model with its ray-casting structure, built once for all pictures."""
 
-    model: Model
-    rays: Any
-    """Open3D RaycastingScene; None if there are no triangles."""
+    def __init__(self, model: Model) -> None:
+        self.model, self.rays = model, ray_caster(model.surface.vertices, model.surface.faces)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -213,29 +211,22 @@ class Picture:
         return np.where(self.covered[..., None], self.colors, np.array(background, np.uint8))
 
 
-def prepare_model(model: Model) -> PreparedModel:
-    """Build the ray-casting structure once for all pictures."""
-    surface = model.surface
-    return PreparedModel(model, ray_caster(surface.vertices, surface.faces) if len(surface.faces) else None)
-
-
-def render_model(model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
+def render_model(prepared: PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
     """Render the model at a pose (3, 4), unlit in the colors of its texture or else of its vertices, from both sides.
 
     Each pixel is sampled once at its center, so a texture much finer than the pixels causes aliasing.
     """
     directions = pixel_rays(camera) @ cam_from_world[:, :3]
-    return render_rays(model, camera_center(cam_from_world), directions.reshape(camera.height, camera.width, 3))
+    return render_rays(prepared, camera_center(cam_from_world), directions.reshape(camera.height, camera.width, 3))
 
 
-def render_rays(model: Model | PreparedModel, origin: FloatArray, directions: FloatArray) -> Picture:
+def render_rays(prepared: PreparedModel, origin: FloatArray, directions: FloatArray) -> Picture:
     """Render as `render_model` does, with rays from one origin (3,) and a direction (H, W, 3) per pixel."""
-    prepared = model if isinstance(model, PreparedModel) else prepare_model(model)
     shape = directions.shape[:2]
-    if prepared.rays is None:
-        return Picture(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.bool_))
     hits = cast_rays(prepared.rays, origin, directions.reshape(-1, 3))
     covered = np.isfinite(hits["t_hit"]).reshape(shape)
+    if not covered.any():
+        return Picture(np.zeros((*shape, 3), np.uint8), covered)
     face = np.where(covered, hits["primitive_ids"].reshape(shape), 0).astype(np.int64)
     uv = hits["primitive_uvs"].reshape(*shape, 2).astype(np.float64)
     weights = np.concatenate([1.0 - uv.sum(axis=-1, keepdims=True), uv], axis=-1)
@@ -248,13 +239,9 @@ def render_rays(model: Model | PreparedModel, origin: FloatArray, directions: Fl
     return Picture(np.where(covered[..., None], colors, 0).astype(np.uint8), covered)
 
 
-def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
+def render_shape(prepared: PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
     """Render the untextured shape at a pose (3, 4) in gray with flat shading; reddish from inside."""
-    prepared = model if isinstance(model, PreparedModel) else prepare_model(model)
-    shape = camera.height, camera.width
-    if prepared.rays is None:
-        return Picture(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.bool_))
-    R = cam_from_world[:, :3]
+    shape, R = (camera.height, camera.width), cam_from_world[:, :3]
     directions = pixel_rays(camera) @ R
     hits = cast_rays(prepared.rays, camera_center(cam_from_world), directions)
     normals = hits["primitive_normals"].astype(np.float64)
@@ -266,9 +253,8 @@ def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: F
     return Picture(np.round(colors).astype(np.uint8).reshape(*shape, 3), covered.reshape(shape))
 
 
-def comparison_image(photo: Colors, model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Colors:
+def comparison_image(photo: Colors, prepared: PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Colors:
     """Return a photo and the model from its camera, RGB; below, the model and its untextured shape from the side."""
-    prepared = model if isinstance(model, PreparedModel) else prepare_model(model)
     size = camera.width, camera.height
     fine = Camera(np.diag([2, 2, 1.0]) @ camera.K, 2 * size[0], 2 * size[1], camera.lens)
     aside = orbited_pose(cam_from_world, prepared.model.surface, 25.0)

@@ -90,7 +90,7 @@ def test_what_is_near_is_down(build_house, turn_deg):
         upright = found_up(scene, concatenate_segments([]), np.concatenate([scene.points, ground]))
         assert upright.method == ROLL  # a sure roll needs no ground
         assert error_deg(upright.up, up) < 8
-        assert 3 < upright.selection.sign_log_odds < 7
+        assert 3 < upright.sign_log_odds < 7
 
 
 @pytest.mark.parametrize("turn_deg", [90, 180])
@@ -98,7 +98,7 @@ def test_who_knows_how_the_photos_are_turned_is_believed(build_house, turn_deg):
     scene = build_house(HAND_HELD, sweep_deg=90.0)
     upright = found_up(scene, turn_deg=turn_deg)
     assert upright.roll.turn_deg == turn_deg
-    assert upright.selection.sign_log_odds == upright.selection.axis_log_odds == np.inf
+    assert upright.sign_log_odds == upright.axis_log_odds == np.inf
     # what has to be turned clockwise to be upright has its top on the left
     top = {90: [-1, 0], 180: [0, 1]}[turn_deg]
     assert (scene.rotations @ upright.up)[:, :2].mean(axis=0) == pytest.approx(top, abs=0.15)

@@ -1,5 +1,7 @@
 """Rotations, poses and similarities."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sfm_app.errors import NumericalError
-from sfm_app.geometry.poses import Similarity, retract, robust_similarity, umeyama, write_essential
+from sfm_app.geometry.poses import Similarity, draw_pairs, retract, robust_similarity, umeyama, write_essential
 
 
 def random_similarity(rng):
@@ -93,3 +95,9 @@ def test_small_steps_are_first_order():
         across = np.array([(retract(pose, 1e-7 * e)[9:] - t) / 1e-7 for e in np.eye(5)[3:]])
         np.testing.assert_allclose(across @ across.T, np.eye(2), atol=1e-6)
         np.testing.assert_allclose(across @ t, 0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("count", "most"), [(0, 5), (1, 5), (2, 5), (5, 10), (6, 10), (400, 30)])
+def test_pairs_are_all_or_some_of_them_each_once(count, most):
+    every, drawn = list(combinations(range(count), 2)), [tuple(pair) for pair in draw_pairs(count, most).tolist()]
+    assert drawn == every if len(every) <= most else len(drawn) == len(set(drawn)) == most and set(drawn) < set(every)

@@ -108,7 +108,7 @@ def textured(page, *, pages=1):
 
 
 def test_a_model_without_texture_has_the_colors_of_its_vertices():
-    picture = render.render_model(Model(square()), CAMERA, STRAIGHT)
+    picture = render.render_model(render.PreparedModel(Model(square())), CAMERA, STRAIGHT)
     assert np.array_equal(picture.covered, np.arange(40)[None, :].repeat(20, axis=0) >= 20)
     share = (np.arange(20) + 0.5) / 20
     assert np.allclose(picture.colors[:, 20:, 0], np.round(250 * (1 - share))[:, None], atol=1)
@@ -120,14 +120,20 @@ def test_a_model_without_texture_has_the_colors_of_its_vertices():
 def test_a_page_of_the_size_of_its_pixels_is_shown_texel_by_texel(pages):
     """One texel per pixel: half a texel off, or an upside-down page, would be noticed."""
     page = np.random.default_rng(0).integers(0, 256, (20, 20, 3)).astype(np.uint8)
-    picture = render.render_model(textured(page, pages=pages), CAMERA, STRAIGHT)
+    picture = render.render_model(render.PreparedModel(textured(page, pages=pages)), CAMERA, STRAIGHT)
     assert np.abs(picture.colors[:, 20:].astype(int) - page).max() <= 2
     assert np.abs(picture.colors[:, 20:].astype(int) - np.roll(page, 1, axis=1)).mean() > 40
 
 
+def test_a_model_without_triangles_is_not_visible():
+    points = render.PreparedModel(Model(square(np.zeros((0, 3), np.int64))))
+    for picture in (render.render_model(points, CAMERA, STRAIGHT), render.render_shape(points, CAMERA, STRAIGHT)):
+        assert picture.colors.shape == (20, 40, 3) and not picture.covered.any() and not picture.colors.any()
+
+
 def test_the_bare_shape_is_gray_outside_and_reddish_inside():
-    outside = render.render_shape(Model(square()), CAMERA, STRAIGHT)
-    inside = render.render_shape(Model(square(FACES[:, ::-1])), CAMERA, STRAIGHT)
+    outside = render.render_shape(render.PreparedModel(Model(square())), CAMERA, STRAIGHT)
+    inside = render.render_shape(render.PreparedModel(Model(square(FACES[:, ::-1]))), CAMERA, STRAIGHT)
     assert np.array_equal(outside.covered, inside.covered)
     gray, red = outside.colors[outside.covered], inside.colors[inside.covered]
     assert np.all(gray[:, 0] == gray[:, 1]) and np.all(gray[:, 0] == gray[:, 2])
@@ -137,7 +143,9 @@ def test_the_bare_shape_is_gray_outside_and_reddish_inside():
 def test_beside_a_photo_stand_the_model_from_its_camera_from_aside_and_its_bare_shape():
     camera = Camera(np.array([[20.0, 0, 40.0], [0, 20.0, 20.0], [0, 0, 1]]), 80, 40)
     photo = np.full((80, 160, 3), (10, 200, 30), np.uint8)
-    page = render.comparison_image(photo, textured(np.full((8, 8, 3), (200, 40, 30), np.uint8)), camera, STRAIGHT)
+    page = render.comparison_image(
+        photo, render.PreparedModel(textured(np.full((8, 8, 3), (200, 40, 30), np.uint8))), camera, STRAIGHT
+    )
     views = {"photo": page[:40, :80], "model": page[:40, 80:], "aside": page[40:, :80], "shape": page[40:, 80:]}
     seen = {name: np.any(view != 255, axis=2) for name, view in views.items()}
 
