@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_app.estimation.diagnosis import diagnose_fits, inliers_by_degeneracy
+from sfm_app.estimation.fitting import find_views
 from sfm_app.estimation.given_cameras import (
     FocalClaim,
     assign_cameras,
@@ -24,6 +25,7 @@ from sfm_app.types import (
     Calibration,
     CameraPairs,
     EpipolarFit,
+    Evidence,
     Intrinsics,
     MatchedImage,
     MatchGraph,
@@ -105,6 +107,20 @@ def find_intrinsics(matches: MatchGraph, views: ViewGraph, run: RunContext) -> I
     report_claims({camera.name: _exif_claim(camera, matches) for camera in cameras}, run)
     cameras = _take_given_cameras(cameras, matches, run)
     return to_intrinsics((replace(camera, found=explain_failure(camera, views)) for camera in cameras), matches)
+
+
+def find_evidence(matches: MatchGraph, run: RunContext, known: Evidence) -> Evidence:
+    """Return the evidence of matches of which some are known: other pairs are fitted, and unknown cameras found.
+
+    Where pairs determine the cameras of half of the photos, more pairs change little.
+    """
+    same = {pair for pair, rows in matches.matches.items() if known.matches.matches.get(pair) is rows}
+    results = known.views.results
+    views = find_views(matches, run, known.views.lenses, {pair: results[pair] for pair in same if pair in results})
+    estimated = [known.camera(photo).is_estimated for photo in known.matches.images]
+    if 2 * sum(estimated) >= len(estimated) or same.issuperset(views.fits):
+        return Evidence(matches, views, known.intrinsics)
+    return Evidence(matches, views, find_intrinsics(matches, views, run))
 
 
 def to_intrinsics(cameras: Iterable[CalibratedCamera], matches: MatchGraph) -> Intrinsics:

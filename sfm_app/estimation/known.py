@@ -7,14 +7,12 @@ from typing import Any
 
 from sfm_app.camera_files import run_camera
 from sfm_app.estimation.calibrating import find_intrinsics, photo_pairs, to_intrinsics, to_whole_photo
-from sfm_app.estimation.fitting import find_views
 from sfm_app.estimation.given_cameras import CENTERS, Contradiction, find_contradictions, focal_claim
 from sfm_app.runtime.context import Earlier, RunContext
 from sfm_app.selfcal import CalibratedCamera, calibrate_photo_set
 from sfm_app.types import (
     Calibration,
     EpipolarFit,
-    Evidence,
     Intrinsics,
     MatchedImage,
     MatchGraph,
@@ -82,23 +80,6 @@ def find_or_keep_intrinsics(matches: MatchGraph, views: ViewGraph, run: RunConte
         members.setdefault(image.group if image.group in known else new.camera_name(image), []).append(image.id)
     cameras = {**known, **new.cameras}
     return to_intrinsics((CalibratedCamera(name, tuple(ids), cameras[name]) for name, ids in members.items()), matches)
-
-
-# Evidence of more matches.
-
-
-def find_evidence(matches: MatchGraph, run: RunContext, known: Evidence) -> Evidence:
-    """Return the evidence of matches of which some are known: other pairs are fitted, and unknown cameras found.
-
-    Where pairs determine the cameras of half of the photos, more pairs change little.
-    """
-    same = {pair for pair, rows in matches.matches.items() if known.matches.matches.get(pair) is rows}
-    results = known.views.results
-    views = find_views(matches, run, known.views.lenses, {pair: results[pair] for pair in same if pair in results})
-    estimated = [known.camera(photo).is_estimated for photo in known.matches.images]
-    if 2 * sum(estimated) >= len(estimated) or same.issuperset(views.fits):
-        return Evidence(matches, views, known.intrinsics)
-    return Evidence(matches, views, find_intrinsics(matches, views, run))
 
 
 def known_cameras(matches: MatchGraph, views: ViewGraph, run: RunContext, earlier: Earlier) -> dict[str, Calibration]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import read_features, write_match_graph
 from sfm_app.colmap.model import posed_photo_ids
-from sfm_app.estimation.known import find_evidence
+from sfm_app.estimation.calibrating import find_evidence
 from sfm_app.mapping.attempt import are_many_unregistered
 from sfm_app.mapping.passes import Outcome
 from sfm_app.matching.features import fill_database

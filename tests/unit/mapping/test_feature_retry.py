@@ -13,7 +13,7 @@ from sfm_app.api import open_run
 from sfm_app.colmap.database import write_keypoints, write_matches
 from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.errors import BackendError, ClusterError
-from sfm_app.estimation import known
+from sfm_app.estimation import calibrating
 from sfm_app.mapping.attempt import Attempt, explained_pairs
 from sfm_app.mapping.feature_retry import (
     OPTIONS,
@@ -119,7 +119,7 @@ def test_finer_features_add_matches_and_geometry(first, finer):
 @pytest.mark.slow
 def test_cameras_that_were_not_known_are_found_anew(first, finer, cameras, monkeypatch):
     (_, steps), anew = finer(), cameras(focal=1200.0)
-    monkeypatch.setattr(known, "find_intrinsics", lambda *_: anew)
+    monkeypatch.setattr(calibrating, "find_intrinsics", lambda *_: anew)
     guessed = replace(first, calibrated=cameras(method="guess", identifiable=False))
     assert find_finer_evidence(guessed, first.run, steps)[0].intrinsics is anew
 
