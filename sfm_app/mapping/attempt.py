@@ -334,8 +334,8 @@ def map_group(
     with translate_errors("mapping photos"):
         results = [mapper.from_seed(seed) for seed in seeds[:1]]
         if with_global:
-            attempts = [one for one in results if isinstance(one, Attempt)]
-            is_enough = any(not doubt(one, photos, group.evidence) or is_sufficient(one) for one in attempts)
+            first = best_attempt(results)
+            is_enough = first is not None and (not doubt(first, photos, group.evidence) or is_sufficient(first))
             results.append(NoModel("global", NOT_NEEDED) if is_enough else mapper.all_at_once())
         for seed in seeds[1:]:
             if _has_placed_enough(results, photos):

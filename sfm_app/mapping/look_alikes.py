@@ -5,7 +5,7 @@ pairs that hold the sides together, the least cut between them, are wrong.
 """
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush
 from itertools import chain
@@ -303,14 +303,17 @@ def find_false_joins(
         apart = {pair for pair, one in overlaps.items() if sides[pair[0]] != sides[pair[1]] and _affinity(one) < 0}
         here = _cut_sides({photo: sides[photo] for photo in chain(*apart)}, photos, strengths)
         across = {pair: one for pair, one in overlaps.items() if {here.get(photo) for photo in pair} == {True, False}}
-        expected = sum(one.expected for one in across.values())
-        missing = 1.0 - sum(one.shared for one in across.values()) / max(expected, 1)
+        missing = _missing_share(across.values())
         if len(across.keys() & non_overlapping.keys()) >= OVERLAPS.min_pairs and missing >= OVERLAPS.min_missing:
             pairs = {pair for pair in strengths if here[pair[0]] != here[pair[1]]}
             strengths = {pair: strength for pair, strength in strengths.items() if pair not in pairs}
             joins += [LookAlikes(join, missing) for join in group_doubted_pairs(pairs, strengths)]
         remaining = {(a, b): one for (a, b), one in remaining.items() if sides[a] == sides[b]}
     return joins
+
+
+def _missing_share(overlaps: Collection[ExpectedOverlap]) -> float:
+    return 1.0 - sum(one.shared for one in overlaps) / max(sum(one.expected for one in overlaps), 1)
 
 
 def _is_significant(pair: PairSupport | None) -> bool:
