@@ -2,11 +2,14 @@
 
     python -m benchmarks.trouble --cache CACHE --folders 200 --keep
     python -m benchmarks.trouble --cache CACHE --only 17 42
+    python -m benchmarks.trouble --cache CACHE --folders 100 --keep --without learned-cameras finer-features
 
-A seed determines a folder. With --keep, runs of the same program are reused.
+A seed determines a folder. With --keep, runs of the same program are reused. --without runs the scene once more without
+a hypothesis about the photos, in the folders where it was tried.
 """
 
 import argparse
+import json
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -14,10 +17,11 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from threading import Lock
+from typing import get_args
 
 import numpy as np
 
-from benchmarks.cameras.methods import Method
+from benchmarks.cameras.methods import Method, ablations
 from benchmarks.cameras.score import TruePhoto, accuracy, read_models
 from benchmarks.cameras.worker import OURS
 from benchmarks.common.command_line import new_parser
@@ -26,9 +30,11 @@ from benchmarks.common.outputs import read_initial_cameras, read_refined_cameras
 from benchmarks.common.photo_sets import PhotoSet
 from benchmarks.common.processes import run_command
 from benchmarks.common.results import RESULTS, Row, document, table, write
-from benchmarks.corpus.kept_runs import FinishedRun, load_finished_run, record_run, run_key
+from benchmarks.corpus.kept_runs import FinishedRun, load_finished_run, record_run, run_key, trials
+from benchmarks.corpus.report import GAINS_TEXT, hypothesis_rows
 from benchmarks.corpus.score import Doubt, parameter_errors
 from benchmarks.synthetic.trouble import KINDS, troubled_folder, write_troubled_folder
+from sfm_app.settings import HypothesisName
 from sfm_app.synthetic.photo_folder import Truth, load_truth, save_truth
 
 ABOUT = (
@@ -60,24 +66,43 @@ def load_folder(seed: int, cache: Path) -> tuple[Path, Truth, tuple[str, ...]]:
     return photos, load_truth(truth), plan.troubles
 
 
-def run_folder(seed: int, args: argparse.Namespace) -> Row:
-    """Run the program on one folder, and score the result."""
+def run_folder(seed: int, args: argparse.Namespace) -> list[Row]:
+    """Run the program on one folder, and without each hypothesis that is left out, and score the results."""
     photos, truth, troubles = load_folder(seed, args.cache)
-    out = args.cache / "trouble" / "runs" / f"{seed:05d}"
-    key = run_key(Method(OURS), PhotoSet(photos.name, photos, {}))
-    done = load_finished_run(out)
-    if done is None or not args.keep or done.key != key:
-        shutil.rmtree(out, ignore_errors=True)
-        command = [sys.executable, "-m", "sfm_app", "run", str(photos), "-o", str(out), "--until", "scene", "--quiet"]
-        code, last = run_command(
-            [*command, *(["--workers", str(args.workers)] if args.workers else [])], 60 * args.limit_min
-        )
-        done = FinishedRun(key, {"exit code": code, "last": last if code else ""})
-        record_run(out, done)
-    row = {"method": OURS, "seed": seed, "troubles": ", ".join(troubles) or "none"} | done.said
-    row |= score_run(out, truth)
-    print(f"{seed}: {summary_line(row)}", file=sys.stderr, flush=True)
-    return row
+    whole = args.cache / "trouble" / "runs" / f"{seed:05d}"
+    rows = []
+    for method in (Method(OURS), *ablations(args.without)):
+        out = whole.with_name(f"{whole.name}-without-{method.without}") if method.without else whole
+        if method.without and method.without not in {trial["name"] for trial in trials(whole)}:
+            continue
+        key = run_key(method, PhotoSet(photos.name, photos, {}))
+        done = load_finished_run(out)
+        if done is None or not args.keep or done.key != key:
+            shutil.rmtree(out, ignore_errors=True)
+            command = [
+                sys.executable,
+                "-m",
+                "sfm_app",
+                "run",
+                str(photos),
+                "-o",
+                str(out),
+                "--until",
+                "scene",
+                "--quiet",
+            ]
+            if method.without:
+                shutil.copytree(whole, out)
+                command += ["--set", f"scene.without={method.without}"]
+            command += ["--workers", str(args.workers)] if args.workers else []
+            code, last = run_command(command, 60 * args.limit_min)
+            done = FinishedRun(key, {"exit code": code, "last": last if code else ""})
+            record_run(out, done)
+        row = {"method": method.name, "photos": f"{seed:05d}", "seed": seed, "troubles": ", ".join(troubles) or "none"}
+        row |= done.said | score_run(out, truth) | {"trials": trials(out)}
+        print(f"{seed}: {method.name}: {summary_line(row)}", file=sys.stderr, flush=True)
+        rows.append(row)
+    return rows
 
 
 def summary_line(row: Row) -> str:
@@ -101,8 +126,11 @@ def score_run(out: Path, truth: Truth) -> Row:
     after = [row["in sd"] for row in stated if row["when"] == "after" and row["in sd"] is not None]
     return {
         "placed": f"{found['registered']}/{found['of']}",
+        "registered": found["registered"],
+        "map + BA": scene_seconds(out),
         "share placed": round(found["registered"] / found["of"], 3),
         "models": found["models"],
+        "AUC@1": found["AUC@1"],
         "AUC@5": found["AUC@5"],
         **known_cameras(out, photos, "before"),
         **known_cameras(out, photos, "after", [row for row in stated if row["when"] == "after"]),
@@ -110,6 +138,16 @@ def score_run(out: Path, truth: Truth) -> Row:
         "beyond 3 sd": sum(value > 3 for value in after),
         "worst in sd": max(after, default=None),
     }
+
+
+def scene_seconds(out: Path) -> float | None:
+    """Return the CPU seconds of the scene in OUT; None without one."""
+    try:
+        stages = json.loads((out / "manifest.json").read_text(encoding="utf-8"))["stages"]
+    except (OSError, ValueError, KeyError):
+        return None
+    seconds: float | None = stages.get("scene", {}).get("cpu_seconds")
+    return seconds
 
 
 def known_cameras(out: Path, photos: dict[str, TruePhoto], when: str, stated: Sequence[Row] = ()) -> Row:
@@ -177,7 +215,8 @@ def demands(rows: Sequence[Row]) -> list[Row]:
 
 
 def page(rows: Sequence[Row]) -> str:
-    """Return the tables: requirements, results by trouble, and the folders that are far off."""
+    """Return the tables: requirements, results by trouble, the folders that are far off, and gains of hypotheses."""
+    gains, rows = hypothesis_rows(rows), [row for row in rows if row["method"] == OURS]
     far = [row for row in rows if row["exit code"] not in EXPECTED or row["wrong"] or row["wrong after"]]
     shown = (
         "seed", "troubles", "exit code", "last", "placed", "AUC@5", "known", "focal %", "known after", "focal % after",
@@ -190,6 +229,7 @@ def page(rows: Sequence[Row]) -> str:
         table([*trouble_rows(rows)]),
     ]
     parts += ["## Folders that failed, or whose camera is known and wrong\n", table(far, shown) if far else "None.\n"]
+    parts += ["## What each hypothesis gains\n", GAINS_TEXT, table(gains)] if gains else []
     return "\n".join(parts)
 
 
@@ -208,6 +248,10 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--jobs", type=int, default=1, help="folders at a time")
     parser.add_argument("--workers", type=int, default=0, help="workers of each run; 0: one per core")
     parser.add_argument("--limit-min", type=float, default=15.0, metavar="M", help="time limit of a run in minutes")
+    parser.add_argument(
+        "--without", nargs="*", default=[], choices=get_args(HypothesisName), metavar="NAME",
+        help="run the scene again without each of these, in the folders where it was tried",
+    )  # fmt: skip
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--name", default="trouble", help="name of the result files")
     return parser
@@ -219,8 +263,8 @@ def main() -> None:
     seeds = args.only or [args.seed + k for k in range(args.folders)]
     rows: list[Row] = []
     with ThreadPoolExecutor(args.jobs) as pool:
-        for row in pool.map(partial(run_folder, args=args), seeds):
-            rows.append(row)
+        for of_folder in pool.map(partial(run_folder, args=args), seeds):
+            rows += of_folder
             found = document("trouble", ABOUT, {"jobs": args.jobs, "workers": args.workers}, {"seeds": seeds}, rows)
             write(args.results, args.name, found, page(rows))
     print(page(rows))

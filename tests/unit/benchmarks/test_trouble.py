@@ -50,7 +50,7 @@ def test_what_is_called_a_guess_is_not_wrong(tmp_path):
 
 def folder_row(seed=1, troubles="plane, zoom", **figures):
     fine = {
-        "seed": seed, "troubles": troubles, "exit code": 0, "last": "", "placed": "6/6", "share placed": 1.0,
+        "method": "sfm-app", "photos": f"{seed:05d}", "seed": seed, "troubles": troubles, "exit code": 0, "last": "", "placed": "6/6", "share placed": 1.0,
         "AUC@5": 0.8, "known": "6/6", "focal %": 0.5, "wrong": 0, "known after": "6/6", "focal % after": 0.4,
         "wrong after": 0, "stated": 4, "beyond 3 sd": 0, "worst in sd": 1.0,
     }  # fmt: skip
@@ -74,3 +74,13 @@ def test_only_a_scene_or_a_reason_why_there_is_none_is_expected(code, fails):
     rows = [folder_row(**{"exit code": code, "last": "error: unexpected ValueError: x"})]
     assert (met(rows)[0] == "no") is fails
     assert ("unexpected ValueError" in trouble.page(rows)) is fails
+
+
+def test_the_absence_of_a_hypothesis_is_counted_in_the_folders_where_it_was_tried():
+    trial = {"name": "finer-features", "accepted": True, "seconds": 2.5}
+    whole = folder_row(trials=[trial], registered=6)
+    without = folder_row(method="sfm-app, without finer-features", registered=4, **{"AUC@5": 0.5})
+    page = trouble.page([whole, folder_row(2), without])
+    assert "| all | 2 |" in page  # without it, a folder is not counted twice
+    [gain] = [line for line in page.split("\n") if line.startswith("| finer-features |")]
+    assert [cell.strip() for cell in gain.split("|")[1:9]] == ["finer-features", "1", "1", "2.5", "1", "2", "0", "0.3"]
