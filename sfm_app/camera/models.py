@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.camera import projection as families
 from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE, GIVEN, PERSPECTIVE, Calibration
 
 GUESSED_FOCAL = 1.2
@@ -42,24 +43,6 @@ def panorama_matrix(size: tuple[int, int]) -> NDArray[np.float64]:
     return camera_matrix(size[0] / (2.0 * np.pi), size[1] / np.pi, size[0] / 2, size[1] / 2)
 
 
-def rays(x: NDArray[np.float64], K: NDArray[np.float64], radial: float = 0.0) -> NDArray[np.float64]:
-    """Undistort pixels (N, 2) to points (N, 2) of the plane z = 1, for a lens x_d = x_u (1 + radial r_u^2).
-
-    Uses Newton's method from the distorted radius. A barrel lens folds where r (1 + radial r^2) stops growing with r;
-    pixels beyond the fold are mapped to it.
-    """
-    distorted = (x - K[:2, 2]) / np.diag(K)[:2]
-    if radial == 0.0:
-        return np.asarray(distorted, np.float64)
-    radius = np.hypot(distorted[:, 0], distorted[:, 1])
-    fold = (-3.0 * radial) ** -0.5 if radial < 0.0 else np.inf
-    r = np.minimum(radius / (1.0 + max(radial, 0.0) * radius**2), fold)
-    for _ in range(10):
-        slope = np.maximum(1.0 + 3.0 * radial * r * r, 0.2)  # the slope is 0 at the fold; limits chosen by hand
-        r = np.minimum(r - (r * (1.0 + radial * r * r) - radius) / slope, fold)
-    return np.asarray(distorted * np.divide(r, radius, out=np.ones_like(r), where=radius > 0)[:, None], np.float64)
-
-
 SHARED = ("k1", "k2", "p1", "p2", "k3", "k4")
 TERMS: Mapping[str, tuple[str, ...]] = {PERSPECTIVE: (*SHARED, "k5", "k6"), FISHEYE: (*SHARED, "sx1", "sy1")}
 """Names of the eight terms of `Calibration.distortion`, by projection."""
@@ -80,6 +63,10 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "EQUIRECTANGULAR": ("w", "h"),
 }
 """Names of the parameters of the supported models, in COLMAP's order. By definition."""
+
+
+FAMILIES = {PERSPECTIVE: families.PERSPECTIVE, FISHEYE: families.FISHEYE, EQUIRECTANGULAR: families.PANORAMA}
+"""Families of `camera.projection`, by projection."""
 
 
 def projection_of_model(model: str) -> str:
@@ -128,7 +115,7 @@ def with_terms(camera: Calibration, terms: Sequence[float]) -> Calibration:
 
 
 def distortion_terms(camera: Calibration) -> NDArray[np.float64]:
-    """Return (8,) all terms of a perspective or fisheye camera, in the order of `TERMS`."""
+    """Return (8,) all terms of a camera, in the order of `TERMS`; zeros of a panorama."""
     if camera.distortion:
         return np.array(camera.distortion, np.float64)
     terms = np.zeros(8)
@@ -137,6 +124,12 @@ def distortion_terms(camera: Calibration) -> NDArray[np.float64]:
     else:
         terms[0] = camera.radial
     return terms
+
+
+def params_of_calibration(camera: Calibration) -> NDArray[np.float64]:
+    """Return the parameters (12,) of a camera, as in `camera.projection`."""
+    K = panorama_matrix((camera.width, camera.height)) if camera.projection == EQUIRECTANGULAR else camera.K
+    return np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], distortion_terms(camera)])
 
 
 def model_of_calibration(camera: Calibration) -> tuple[str, list[float]]:

@@ -30,11 +30,10 @@ from sfm_app.bundle.lens_parts import (
     choices_of_model,
     consistent_choices,
     fit_to_model,
-    params_of_calibration,
     part_names,
 )
 from sfm_app.bundle.normal_equations import Bundle, best_step, cost, elimination_width, reduce
-from sfm_app.camera.models import PARAMETERS, TERMS, TWO_FOCALS
+from sfm_app.camera.models import PARAMETERS, TERMS, TWO_FOCALS, params_of_calibration
 from sfm_app.camera.projection import (
     CAMERA,
     CX,

@@ -8,8 +8,8 @@ from typing import NamedTuple, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.camera.bearings import BEARING, RAY
 from sfm_app.camera.models import camera_matrix, panorama_matrix
+from sfm_app.camera.projection import BEARING, RAY
 from sfm_app.colmap.backend import all_images, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.geometry.epipolar import TwoViewSeed

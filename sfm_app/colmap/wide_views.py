@@ -35,10 +35,9 @@ class WideLens:
 
     def locate(self, rays: FloatArray) -> FloatArray:
         """Return the pixels (N, 2) of rays (N, 3) of the camera's frame; -1 for rays that the photos do not show."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x = image_points(rays, np.tile(self.params, (len(rays), 1)), np.full(len(rays), self.family))
-            shown = rays[:, 2] >= self.least_cosine * np.linalg.norm(rays, axis=1)
-            shown &= np.all((x >= 0.0) & (x <= self.size), axis=1)
+        x = image_points(rays, self.params, self.family)
+        shown = rays[:, 2] >= self.least_cosine * np.linalg.norm(rays, axis=1)
+        shown &= np.all((x >= 0.0) & (x <= self.size), axis=1)
         return np.where(shown[:, None], x, -1.0)
 
 
@@ -156,8 +155,8 @@ def _shown_rays(camera: pycolmap.Camera) -> FloatArray:
     x, y = np.meshgrid(np.linspace(0.0, camera.width, grid), np.linspace(0.0, camera.height, grid))
     pixels = np.column_stack([x.ravel(), y.ravel()])
     rays, family = np.array(camera.cam_ray_from_img(pixels), np.float64), camera_family(camera)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        projected = image_points(rays, np.tile(read_camera(camera), (len(rays), 1)), np.full(len(rays), family))
+    with np.errstate(invalid="ignore"):
+        projected = image_points(rays, read_camera(camera), family)
         # if a pixel is far from the projection of its ray, the lens shows nothing or folds (limit chosen by hand);
         # the seam of a panorama is at both of its borders
         sound = (family == PANORAMA) | (np.linalg.norm(projected - pixels, axis=1) < 0.5)
