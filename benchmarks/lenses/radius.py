@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sfm_app.camera import bearings
 from sfm_app.camera import projection as families
-from sfm_app.camera.models import params_of_calibration
+from sfm_app.camera.models import row_of_calibration
 from sfm_app.camera.projection import image_points
 from sfm_app.synthetic.cameras import Camera, pixel_rays
 from sfm_app.types import Calibration
@@ -47,7 +47,7 @@ def projection_of(camera: Calibration) -> Project:
 
     def project(rays: FloatArray) -> FloatArray:
         return np.where(
-            rays[:, 2:] > 1e-6, image_points(rays, params_of_calibration(camera), families.PERSPECTIVE), np.nan
+            rays[:, 2:] > 1e-6, image_points(rays, row_of_calibration(camera), families.PERSPECTIVE), np.nan
         )
 
     return project

@@ -20,8 +20,8 @@ from sfm_app.camera.models import (
     TWO_FOCALS,
     WIDE,
     camera_matrix,
-    params_of_calibration,
     projection_of_model,
+    row_of_calibration,
     with_terms,
 )
 from sfm_app.camera.projection import (
@@ -287,7 +287,7 @@ class CameraRule:
         """Return the user's parameters (12,); None if they are not of this family."""
         if self.given is None or FAMILIES[self.given.projection] != family:
             return None
-        return params_of_calibration(self.given)
+        return row_of_calibration(self.given)
 
     def parts(self, family: int) -> BoolArray | None:
         """Return (7,) the parts of the model besides its center; None if it is open, or not of this family."""

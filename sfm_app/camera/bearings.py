@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sfm_app.camera.models import FAMILIES, params_of_calibration
+from sfm_app.camera.models import FAMILIES, row_of_calibration
 from sfm_app.camera.projection import (
     K1,
     LEAST_SLOPE,
@@ -28,7 +28,7 @@ def bearings(x: FloatArray, camera: Calibration) -> FloatArray:
     Rays of a perspective camera end on the plane z = 1, and their derivatives leave out the distortion; others have
     length 1.
     """
-    lines = image_rays(x, params_of_calibration(camera), FAMILIES[camera.projection])
+    lines = image_rays(x, row_of_calibration(camera), FAMILIES[camera.projection])
     if camera.projection == PERSPECTIVE:
         lines[:, SLOPES] = 0.0
         lines[:, 3], lines[:, 7] = 1.0 / camera.K[0, 0], 1.0 / camera.K[1, 1]
@@ -40,7 +40,7 @@ def project(points: FloatArray, camera: Calibration) -> FloatArray:
 
     Distortion of a perspective lens is left out, and terms of a fisheye that are not radial.
     """
-    params, family = params_of_calibration(camera), FAMILIES[camera.projection]
+    params, family = row_of_calibration(camera), FAMILIES[camera.projection]
     params[[P1, P2, SX, SY] if camera.projection == FISHEYE else slice(K1, None)] = 0.0
     x = image_points(points, params, family)
     if camera.projection == EQUIRECTANGULAR:
@@ -78,7 +78,7 @@ def radius_px(theta: FloatArray, camera: Calibration) -> FloatArray:
     """
     if camera.projection == EQUIRECTANGULAR:
         return np.asarray(theta * camera.width / (2.0 * np.pi), np.float64)
-    params, family = params_of_calibration(camera), FAMILIES[camera.projection]
+    params, family = row_of_calibration(camera), FAMILIES[camera.projection]
     fold = fold_radius(lens_terms(params), family, LEAST_SLOPE)
     limit = fold if camera.projection == FISHEYE else np.arctan(fold)
     return np.where(theta <= limit, camera.focal_px * radius_at(np.minimum(theta, limit), params, family), np.nan)

@@ -38,7 +38,7 @@ def guessed_camera_matrix(size: tuple[int, int], focal_px: float | None = None) 
     return camera_matrix(focal, focal, size[0] / 2, size[1] / 2)
 
 
-def panorama_matrix(size: tuple[int, int]) -> NDArray[np.float64]:
+def panorama_matrix(size: tuple[float, float]) -> NDArray[np.float64]:
     """Return the (3, 3) matrix with the scale of an equirectangular photo at its center, in pixels per radian."""
     return camera_matrix(size[0] / (2.0 * np.pi), size[1] / np.pi, size[0] / 2, size[1] / 2)
 
@@ -67,6 +67,13 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
 
 FAMILIES = {PERSPECTIVE: families.PERSPECTIVE, FISHEYE: families.FISHEYE, EQUIRECTANGULAR: families.PANORAMA}
 """Families of `camera.projection`, by projection."""
+INDEX = {name: k for terms in TERMS.values() for k, name in enumerate((*TWO_FOCALS, *terms))}
+"""Index in a row (12,) of `camera.projection` of each parameter but f, w and h."""
+FILE_MODELS = {
+    families.PERSPECTIVE: ("OPENCV", "FULL_OPENCV"),
+    families.FISHEYE: ("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"),
+}
+"""Models of refined and written cameras, by family; the smaller one first."""
 
 
 def projection_of_model(model: str) -> str:
@@ -74,6 +81,29 @@ def projection_of_model(model: str) -> str:
     if model == "EQUIRECTANGULAR":
         return EQUIRECTANGULAR
     return FISHEYE if "FISHEYE" in model else PERSPECTIVE
+
+
+def row_of_model(model: str, params: Sequence[float]) -> NDArray[np.float64]:
+    """Return a camera with a model and parameters of COLMAP as a row (12,) of `camera.projection`."""
+    row = np.zeros(families.CAMERA)
+    if model == "EQUIRECTANGULAR":
+        return _row(panorama_matrix((params[0], params[1])), row[4:])
+    for name, value in zip(PARAMETERS[model], params, strict=True):
+        row[[families.FX, families.FY] if name == "f" else INDEX[name]] = value
+    return row
+
+
+def params_of_row(row: NDArray[np.float64], model: str) -> list[float]:
+    """Return the parameters of a model of COLMAP that holds a row (12,) but for its aspect."""
+    fx, fy, cx, cy = row[:4]
+    values = {"f": (fx * fy) ** 0.5, "w": 2.0 * cx, "h": 2.0 * cy}
+    return [float(values[name] if name in values else row[INDEX[name]]) for name in PARAMETERS[model]]
+
+
+def file_model(row: NDArray[np.float64], family: int) -> str:
+    """Return the smallest of FILE_MODELS that holds a row (12,) of a perspective camera or a fisheye."""
+    small, large = FILE_MODELS[family]
+    return large if np.delete(row, [INDEX[name] for name in PARAMETERS[small]]).any() else small
 
 
 def calibration_from_model(model: str, params: Sequence[float], size: tuple[int, int]) -> Calibration:
@@ -89,19 +119,15 @@ def calibration_from_model(model: str, params: Sequence[float], size: tuple[int,
         raise ValueError(f"the camera model {model} is not supported: only {', '.join(PARAMETERS)}")
     if len(params) != len(names):
         raise ValueError(f"{model} has {len(names)} parameters ({', '.join(names)}), not {len(params)}")
-    values = dict(zip(names, (float(value) for value in params), strict=True))
     projection = projection_of_model(model)
     if projection == EQUIRECTANGULAR:
-        if not all(size):
-            size = int(values["w"]), int(values["h"])
+        size = size if all(size) else (int(params[0]), int(params[1]))
         return Calibration(panorama_matrix(size), *size, GIVEN, identifiable=True, projection=projection)
-    fx, fy = (values.get(name, values.get("f", 0.0)) for name in ("fx", "fy"))
-    if not (np.isfinite(list(values.values())).all() and fx > 0.0 and fy > 0.0):
+    row = row_of_model(model, params)
+    if not np.isfinite(row).all() or row[:2].min() <= 0.0:
         raise ValueError(f"the parameters of {model} are not those of a camera: {', '.join(map(str, params))}")
-    plain = Calibration(
-        camera_matrix(fx, fy, values["cx"], values["cy"]), *size, GIVEN, identifiable=True, projection=projection
-    )
-    return with_terms(plain, tuple(values.get(name, 0.0) for name in TERMS[projection]))
+    plain = Calibration(camera_matrix(*row[:4].tolist()), *size, GIVEN, identifiable=True, projection=projection)
+    return with_terms(plain, row[4:].tolist())
 
 
 def with_terms(camera: Calibration, terms: Sequence[float]) -> Calibration:
@@ -126,19 +152,11 @@ def distortion_terms(camera: Calibration) -> NDArray[np.float64]:
     return terms
 
 
-def params_of_calibration(camera: Calibration) -> NDArray[np.float64]:
-    """Return the parameters (12,) of a camera, as in `camera.projection`."""
-    K = panorama_matrix((camera.width, camera.height)) if camera.projection == EQUIRECTANGULAR else camera.K
-    return np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], distortion_terms(camera)])
+def row_of_calibration(camera: Calibration) -> NDArray[np.float64]:
+    """Return a camera as a row (12,) of `camera.projection`."""
+    panorama = camera.projection == EQUIRECTANGULAR
+    return _row(panorama_matrix((camera.width, camera.height)) if panorama else camera.K, distortion_terms(camera))
 
 
-def model_of_calibration(camera: Calibration) -> tuple[str, list[float]]:
-    """Return the smallest of COLMAP's models with two focals that holds a camera, and its parameters."""
-    values = dict(zip(TERMS[camera.projection], distortion_terms(camera).tolist(), strict=True))
-    values |= {"fx": camera.K[0, 0], "fy": camera.K[1, 1], "cx": camera.K[0, 2], "cy": camera.K[1, 2]}
-    fisheye = camera.projection == FISHEYE
-    models = ("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE") if fisheye else ("OPENCV", "FULL_OPENCV")
-    for model in models:
-        if not any(value for name, value in values.items() if name not in PARAMETERS[model]):
-            break
-    return model, [float(values[name]) for name in PARAMETERS[model]]
+def _row(K: NDArray[np.float64], terms: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *terms])

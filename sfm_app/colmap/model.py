@@ -8,8 +8,8 @@ from typing import NamedTuple, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.camera.models import camera_matrix, panorama_matrix
-from sfm_app.camera.projection import BEARING, RAY
+from sfm_app.camera.models import camera_matrix, panorama_matrix, row_of_model
+from sfm_app.camera.projection import BEARING, K1, K2, K3, K4, RAY
 from sfm_app.colmap.backend import all_images, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.geometry.epipolar import TwoViewSeed
@@ -112,13 +112,11 @@ def cameras_by_photo(model: pycolmap.Reconstruction) -> dict[int, MappedCamera]:
 def _mapped_camera(camera: pycolmap.Camera) -> MappedCamera:
     if camera.is_spherical():
         return MappedCamera(panorama_matrix((camera.width, camera.height)))
-    K = np.asarray(camera.calibration_matrix(), np.float64)
-    terms = [camera.params[k] for k in camera.extra_params_idxs()]
+    row = row_of_model(camera.model.name, camera.params)
+    K = camera_matrix(*row[:4].tolist())
     if camera.is_perspective_fisheye():
-        if camera.model.name == "THIN_PRISM_FISHEYE":
-            terms = [terms[k] for k in (0, 1, 4, 5)]
-        return MappedCamera(K, fisheye=tuple(float(term) for term in terms))
-    return MappedCamera(K, float(terms[0]))
+        return MappedCamera(K, fisheye=tuple(row[[K1, K2, K3, K4]].tolist()))
+    return MappedCamera(K, float(row[K1]))
 
 
 def color_points(model: pycolmap.Reconstruction, photo_dir: Path, workers: int) -> None:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_app.bundle.normal_equations import REDUCTION, Bundle, apply_step, project, reduce, residuals
 from sfm_app.camera.bearings import bearings
-from sfm_app.camera.models import FAMILIES, PARAMETERS, calibration_from_model, params_of_calibration
+from sfm_app.camera.models import FAMILIES, PARAMETERS, calibration_from_model, row_of_calibration
 from sfm_app.camera.projection import (
     CAMERA,
     FISHEYE,
@@ -69,7 +69,7 @@ def test_pixels_and_rays_are_those_of_colmap(name):
         model=pycolmap.CameraModelId.__members__[name], width=size[0], height=size[1], params=params
     )
     camera = calibration_from_model(name, params, size)
-    row, family = params_of_calibration(camera), FAMILIES[camera.projection]
+    row, family = row_of_calibration(camera), FAMILIES[camera.projection]
     x = np.random.default_rng(3).uniform(0.0, size, (300, 2))
     rays = image_rays(x, row, family)[:, :3]
     expected = np.asarray(truth.cam_ray_from_img(x))
