@@ -52,7 +52,7 @@ def _write_fits(path: Path, matches: MatchGraph, views: ViewGraph) -> None:
         for pair, fit in views.fits.items():
             geometry = pycolmap.TwoViewGeometry()
             geometry.config = kinds.PLANAR_OR_PANORAMIC if fit.degeneracy else kinds.UNCALIBRATED
-            geometry.F = fit.F
+            geometry.F = fit.matrix
             geometry.inlier_matches = np.ascontiguousarray(matches.matches[pair][fit.inliers])
             database.write_two_view_geometry(*pair, geometry)
 

@@ -83,7 +83,7 @@ def projection_of_model(model: str) -> str:
     return FISHEYE if "FISHEYE" in model else PERSPECTIVE
 
 
-def row_of_model(model: str, params: Sequence[float]) -> NDArray[np.float64]:
+def row_of_model(model: str, params: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a camera with a model and parameters of COLMAP as a row (12,) of `camera.projection`."""
     row = np.zeros(families.CAMERA)
     if model == "EQUIRECTANGULAR":

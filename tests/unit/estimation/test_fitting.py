@@ -19,7 +19,7 @@ from sfm_app.runtime.workspace import Workspace
 from sfm_app.selfcal.wide_lens import LensEstimate
 from sfm_app.settings import Settings
 from sfm_app.stages import view_graph
-from sfm_app.types import Calibration, EpipolarFit, GivenCameras, MatchedImage, MatchGraph, Rejected
+from sfm_app.types import Calibration, GivenCameras, MatchedImage, MatchGraph, RayFit, Rejected
 
 SIZE = (960, 640)
 K = np.array([[270.0, 0.0, 485.0], [0.0, 270.0, 316.0], [0.0, 0.0, 1.0]])
@@ -151,6 +151,6 @@ def test_pairs_of_a_wide_lens_and_another_camera_are_fitted_by_rays():
     assert ray_estimator([plain, plain], {"wide": WIDE}) is None
     fit = ray_estimator([wide, plain], {"wide": WIDE})
     matches = photos_through(WIDE, 2)
-    assert fit is not None and isinstance(fit(*matches.points((1, 2)), Settings().epipolar, 0), (EpipolarFit, Rejected))
+    assert fit is not None and isinstance(fit(*matches.points((1, 2)), Settings().epipolar, 0), (RayFit, Rejected))
     both = ray_estimator([wide, wide], {"wide": WIDE})
-    assert both is not None and isinstance(both(*matches.points((1, 2)), Settings().epipolar, 0), EpipolarFit)
+    assert both is not None and isinstance(both(*matches.points((1, 2)), Settings().epipolar, 0), RayFit)
