@@ -34,15 +34,12 @@ from sfm_app.bundle.lens_parts import (
 )
 from sfm_app.bundle.normal_equations import Bundle, best_step, cost, elimination_width, reduce
 from sfm_app.camera.models import (
-    FAMILIES,
     FILE_MODELS,
     INDEX,
     PARAMETERS,
     file_model,
     params_of_row,
-    projection_of_model,
     row_of_calibration,
-    row_of_model,
 )
 from sfm_app.camera.projection import (
     CX,
@@ -55,7 +52,7 @@ from sfm_app.camera.projection import (
 )
 from sfm_app.colmap.backend import all_cameras, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.model import finite_mask, posed_images, submodel
+from sfm_app.colmap.model import camera_family, finite_mask, posed_images, read_camera, submodel
 from sfm_app.errors import NumericalError
 from sfm_app.numerical import FAILURES, Json, error_reason, finite_entries
 from sfm_app.types import Calibration
@@ -67,16 +64,6 @@ from sfm_app.types.camera import named_correlations
 Rules = Mapping[int, CameraRule]
 """The user's rules, by camera id; cameras without a rule are free."""
 NO_RULES: Rules = MappingProxyType({})
-
-
-def camera_family(camera: pycolmap.Camera) -> int:
-    """Return the family of a camera, as in `Bundle`."""
-    return FAMILIES[projection_of_model(camera.model.name)]
-
-
-def read_camera(camera: pycolmap.Camera) -> FloatArray:
-    """Return the parameters (12,) of a camera, as in `Bundle`."""
-    return row_of_model(camera.model.name, camera.params)
 
 
 def write_camera(camera: pycolmap.Camera, params: FloatArray, family: int) -> None:

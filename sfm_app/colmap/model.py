@@ -8,8 +8,9 @@ from typing import NamedTuple, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.camera.models import camera_matrix, panorama_matrix, row_of_model
-from sfm_app.camera.projection import BEARING, K1, K2, K3, K4, RAY
+from sfm_app.camera.bearings import bearings_of_row
+from sfm_app.camera.models import FAMILIES, camera_matrix, projection_of_model, row_of_model
+from sfm_app.camera.projection import FISHEYE, K1, K2, K3, K4, RAY
 from sfm_app.colmap.backend import all_images, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.geometry.epipolar import TwoViewSeed
@@ -77,18 +78,19 @@ def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray
     return views
 
 
+def camera_family(camera: pycolmap.Camera) -> int:
+    """Return the family of a camera, as in `camera.projection`."""
+    return FAMILIES[projection_of_model(camera.model.name)]
+
+
+def read_camera(camera: pycolmap.Camera) -> NDArray[np.float64]:
+    """Return the parameters (12,) of a camera, as in `camera.projection`."""
+    return row_of_model(camera.model.name, camera.params)
+
+
 def bearing_vectors(camera: pycolmap.Camera, x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return bearing vectors (N, 9) of pixels (N, 2), as `camera.bearings` does."""
-    if camera.is_perspective_fisheye() or camera.is_spherical():
-        # step of the derivatives: curvature and rounding in double precision cost about 1e-9 of them
-        step_px = 1e-3
-        steps = np.vstack([x + step for step in ([0.0, 0.0], [step_px, 0.0], [0.0, step_px])])
-        here, right, down = np.asarray(camera.cam_ray_from_img(steps), np.float64).reshape(3, -1, 3)
-        return np.hstack([here, (right - here) / step_px, (down - here) / step_px])
-    lines = np.zeros((len(x), BEARING))
-    lines[:, :2], lines[:, 2] = np.asarray(camera.cam_from_img(x), np.float64).reshape(-1, 2), 1.0
-    lines[:, 3], lines[:, 7] = 1.0 / camera.focal_length_x, 1.0 / camera.focal_length_y
-    return lines
+    return bearings_of_row(x, read_camera(camera), camera_family(camera))
 
 
 def posed_photo_ids(model: pycolmap.Reconstruction) -> list[int]:
@@ -110,11 +112,8 @@ def cameras_by_photo(model: pycolmap.Reconstruction) -> dict[int, MappedCamera]:
 
 
 def _mapped_camera(camera: pycolmap.Camera) -> MappedCamera:
-    if camera.is_spherical():
-        return MappedCamera(panorama_matrix((camera.width, camera.height)))
-    row = row_of_model(camera.model.name, camera.params)
-    K = camera_matrix(*row[:4].tolist())
-    if camera.is_perspective_fisheye():
+    row, K = read_camera(camera), scale_matrix(camera)
+    if camera_family(camera) == FISHEYE:
         return MappedCamera(K, fisheye=tuple(row[[K1, K2, K3, K4]].tolist()))
     return MappedCamera(K, float(row[K1]))
 
@@ -191,9 +190,7 @@ def seen_points(model: pycolmap.Reconstruction, most: int) -> SeenPoints:
 
 def scale_matrix(camera: pycolmap.Camera) -> NDArray[np.float64]:
     """Return K (3, 3) of a camera; of a panorama, the scale at its center."""
-    if camera.is_spherical():
-        return panorama_matrix((camera.width, camera.height))
-    return np.asarray(camera.calibration_matrix(), np.float64)
+    return camera_matrix(*read_camera(camera)[:4].tolist())
 
 
 def viewing_rays(model: pycolmap.Reconstruction, image_id: int, x: NDArray[np.float64]) -> NDArray[np.float64]:

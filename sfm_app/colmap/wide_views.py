@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from sfm_app.camera.perspective_views import PerspectiveView, cover_rays
 from sfm_app.camera.projection import FISHEYE, FX, PANORAMA, SEEN_ANGLE, image_points
 from sfm_app.colmap.backend import all_images, pycolmap, translate_errors
-from sfm_app.colmap.bundle import camera_family, read_camera
 from sfm_app.colmap.dense import MASKS, shrink_mask
+from sfm_app.colmap.model import camera_family, read_camera
 from sfm_app.colmap.tasks import JPEG_QUALITY
 from sfm_app.files import replace_atomically
 from sfm_app.photos.masks import read_mask, save_mask

@@ -11,17 +11,8 @@ import numpy as np
 
 from sfm_app.camera.models import camera_matrix
 from sfm_app.camera.projection import (
-    CAMERA,
     FISHEYE,
-    FX,
-    FY,
-    K1,
-    K2,
-    K3,
-    K4,
     MOST_RADIUS,
-    P1,
-    P2,
     PANORAMA,
     PERSPECTIVE,
     RAY,
@@ -100,10 +91,8 @@ class Lens:
     @property
     def _params(self) -> FloatArray:
         """(12,) of a camera with the focal length 1."""
-        params = np.zeros(CAMERA)
-        params[[FX, FY]], params[[P1, P2]] = 1.0, self.tangential
-        params[[K1, K2, K3, K4][: len(self.radial)]] = self.radial
-        return params
+        k1, k2, k3, k4 = (*self.radial, 0.0, 0.0, 0.0, 0.0)[:4]
+        return np.array([1.0, 1.0, 0.0, 0.0, k1, k2, *self.tangential, k3, k4, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,13 +15,12 @@ from sfm_app.colmap.bundle import (
     LOSS_SCALE_PX,
     adjust,
     adjust_or_keep,
-    camera_family,
     read_bundle,
-    read_camera,
     solve,
     write_camera,
 )
 from sfm_app.colmap.database import open_database
+from sfm_app.colmap.model import camera_family, read_camera
 from sfm_app.errors import BackendError, NumericalError
 from sfm_app.estimation.given_cameras import find_contradictions
 from sfm_app.numerical import json_text
