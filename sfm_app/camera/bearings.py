@@ -4,8 +4,6 @@ import numpy as np
 
 from sfm_app.camera.models import FAMILIES, row_of_calibration
 from sfm_app.camera.projection import (
-    FX,
-    FY,
     K1,
     LEAST_SLOPE,
     P1,
@@ -30,15 +28,10 @@ def bearings(x: FloatArray, camera: Calibration) -> FloatArray:
     Rays of a perspective camera end on the plane z = 1, and their derivatives leave out the distortion; others have
     length 1.
     """
-    return bearings_of_row(x, row_of_calibration(camera), FAMILIES[camera.projection])
-
-
-def bearings_of_row(x: FloatArray, row: FloatArray, family: int) -> FloatArray:
-    """Return `bearings` for a camera as a row (12,) of `camera.projection`."""
-    lines = image_rays(x, row, family)
-    if family == FAMILIES[PERSPECTIVE]:
+    lines = image_rays(x, row_of_calibration(camera), FAMILIES[camera.projection])
+    if camera.projection == PERSPECTIVE:
         lines[:, SLOPES] = 0.0
-        lines[:, 3], lines[:, 7] = 1.0 / row[FX], 1.0 / row[FY]
+        lines[:, 3], lines[:, 7] = 1.0 / camera.K[0, 0], 1.0 / camera.K[1, 1]
     return lines
 
 

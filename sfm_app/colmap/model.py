@@ -8,9 +8,8 @@ from typing import NamedTuple, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.camera.bearings import bearings_of_row
 from sfm_app.camera.models import FAMILIES, camera_matrix, projection_of_model, row_of_model
-from sfm_app.camera.projection import FISHEYE, K1, K2, K3, K4, RAY
+from sfm_app.camera.projection import BEARING, FISHEYE, K1, K2, K3, K4, PERSPECTIVE, RAY
 from sfm_app.colmap.backend import all_images, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.geometry.epipolar import TwoViewSeed
@@ -90,7 +89,16 @@ def read_camera(camera: pycolmap.Camera) -> NDArray[np.float64]:
 
 def bearing_vectors(camera: pycolmap.Camera, x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return bearing vectors (N, 9) of pixels (N, 2), as `camera.bearings` does."""
-    return bearings_of_row(x, read_camera(camera), camera_family(camera))
+    if camera_family(camera) != PERSPECTIVE:
+        # step of the derivatives: curvature and rounding in double precision cost about 1e-9 of them
+        step_px = 1e-3
+        steps = np.vstack([x + step for step in ([0.0, 0.0], [step_px, 0.0], [0.0, step_px])])
+        here, right, down = np.asarray(camera.cam_ray_from_img(steps), np.float64).reshape(3, -1, 3)
+        return np.hstack([here, (right - here) / step_px, (down - here) / step_px])
+    lines = np.zeros((len(x), BEARING))
+    lines[:, :2], lines[:, 2] = np.asarray(camera.cam_from_img(x), np.float64).reshape(-1, 2), 1.0
+    lines[:, 3], lines[:, 7] = 1.0 / camera.focal_length_x, 1.0 / camera.focal_length_y
+    return lines
 
 
 def posed_photo_ids(model: pycolmap.Reconstruction) -> list[int]:
