@@ -5,7 +5,7 @@ import numpy as np
 from sfm_app.camera.models import FAMILIES, row_of_calibration
 from sfm_app.camera.projection import (
     K1,
-    LEAST_SLOPE,
+    OPTIONS,
     P1,
     P2,
     RAY,
@@ -48,7 +48,7 @@ def project(points: FloatArray, camera: Calibration) -> FloatArray:
     if camera.projection == PERSPECTIVE:
         return np.where(points[:, 2:] > 0.0, x, np.nan)
     theta = np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2])
-    return np.where((theta <= fold_radius(lens_terms(params), family, LEAST_SLOPE))[:, None], x, np.nan)
+    return np.where((theta <= fold_radius(lens_terms(params), family, OPTIONS.least_slope))[:, None], x, np.nan)
 
 
 def depths_along(points: FloatArray, camera: Calibration) -> FloatArray:
@@ -79,7 +79,7 @@ def radius_px(theta: FloatArray, camera: Calibration) -> FloatArray:
     if camera.projection == EQUIRECTANGULAR:
         return np.asarray(theta * camera.width / (2.0 * np.pi), np.float64)
     params, family = row_of_calibration(camera), FAMILIES[camera.projection]
-    fold = fold_radius(lens_terms(params), family, LEAST_SLOPE)
+    fold = fold_radius(lens_terms(params), family, OPTIONS.least_slope)
     limit = fold if camera.projection == FISHEYE else np.arctan(fold)
     return np.where(theta <= limit, camera.focal_px * radius_at(np.minimum(theta, limit), params, family), np.nan)
 

@@ -30,17 +30,6 @@ NEAR_AXIS = 1e-5
 term is its square. By definition: the root of double precision, rounded."""
 SEEN_ANGLE = 0.5 * np.pi
 """Largest angle to the optical axis that a fisheye shows: COLMAP 4.2 projects nothing behind it. By definition."""
-RADIUS_STEPS, SHIFT_STEPS = 30, 50
-"""Most steps for the radius, and for the terms that are not radial: each multiplies the error by 0.01 at most. Chosen
-by hand, and counted."""
-LAST_STEP, PRECISION = 1e-9, 1e-13
-"""Changes in focal lengths below which these steps end: Newton's method doubles the digits. Chosen by hand."""
-LEAST_SLOPE = 0.05
-"""Least slope of the distorted radius: below it, the lens is near its fold. Chosen by hand."""
-MOST_RADIUS = 12.0
-"""Radius in focal lengths up to which a perspective lens is searched for a fold: 85 degrees. Chosen by hand."""
-RADII = 2048
-"""Number of radii of this search. Chosen by hand."""
 RAY, SLOPES, RADIUS = slice(0, 3), slice(3, 9), 9
 """Entries of `unproject_point`. By definition."""
 BEARING = 9
@@ -48,6 +37,27 @@ BEARING = 9
 EQUIDISTANT_BELOW = 1e-6
 """Exponents nearer to 0 are taken as 0: the series agree to double precision."""
 
+
+class UnprojectionOptions(NamedTuple):
+    """Limits of unprojection; a named tuple, as kernels read it."""
+
+    radius_steps: int = 30
+    """Most steps of Newton's method for the radius. Chosen by hand."""
+    last_step: float = 1e-9
+    """Step in focal lengths below which it is the last one: the digits double. Chosen by hand."""
+    shift_steps: int = 50
+    """Most steps for the terms that are not radial. Counted: each multiplies the error by 0.01 at most."""
+    last_shift: float = 1e-13
+    """Change in focal lengths below which these end. Chosen by hand."""
+    least_slope: float = 0.05
+    """Least slope of the distorted radius: below it, the lens is near its fold. Chosen by hand."""
+    most_radius: float = 12.0
+    """Radius in focal lengths up to which a perspective lens is searched for a fold: 85 degrees. Chosen by hand."""
+    radii: int = 2048
+    """Number of radii of this search. Chosen by hand."""
+
+
+OPTIONS = UnprojectionOptions()
 Two = tuple[float, float]
 Terms = tuple[float, float, float, float, float, float, float, float]
 """Parameters of a camera from k1 on. Kernels pass tuples, as numba counts the references to every array."""
@@ -177,7 +187,7 @@ def _undistort_radius(radius: float, terms: Terms, family: int, end: End, guess:
         if beyond >= 0.0:
             return float(fold + rate * beyond)
     low, high, r = 0.0, fold, min(guess, fold)
-    for _ in range(RADIUS_STEPS):
+    for _ in range(OPTIONS.radius_steps):
         factor, slope, _ = radial_factor(r * r, terms, family)
         error = r * factor - radius
         if error < 0.0:
@@ -187,7 +197,7 @@ def _undistort_radius(radius: float, terms: Terms, family: int, end: End, guess:
         step = error / max(factor + 2.0 * r * r * slope, least_slope)
         if not low <= r - step <= high:
             r = 0.5 * (low + high)
-        elif abs(step) < LAST_STEP:
+        elif abs(step) < OPTIONS.last_step:
             return float(r - step)
         else:
             r -= step
@@ -201,13 +211,13 @@ def _remove_shift(x: float, y: float, terms: Terms, family: int, end: End) -> Tw
     if p1 == 0.0 and p2 == 0.0 and (family == PERSPECTIVE or (sx == 0.0 and sy == 0.0)):
         return x, y
     a, b = x, y
-    for _ in range(SHIFT_STEPS):
+    for _ in range(OPTIONS.shift_steps):
         radius = np.hypot(a, b)
         scale = _undistort_radius(radius, terms, family, end, radius) / radius if radius > 0.0 else 1.0
         shift_x, shift_y = distort_point(scale * a, scale * b, 0.0, terms, family)
         change = max(abs(x - shift_x - a), abs(y - shift_y - b))
         a, b = x - shift_x, y - shift_y
-        if change < PRECISION:
+        if change < OPTIONS.last_shift:
             break
     return a, b
 
@@ -222,14 +232,14 @@ def _grows(r: float, terms: Terms, family: int, least_slope: float) -> bool:
 def fold_radius(terms: Terms, family: int, least_slope: float) -> float:
     """Return the radius before distortion up to which the slope of the distorted one is at least `least_slope`.
 
-    A fisheye ends at pi, a perspective lens with more than one radial term at `MOST_RADIUS`.
+    A fisheye ends at pi, a perspective lens with more than one radial term at `OPTIONS.most_radius`.
     """
     most = np.pi if family == FISHEYE else np.inf
     k1 = terms[0]
     if _has_one_term(terms, family):
         return min(np.sqrt((least_slope - 1.0) / (3.0 * k1)), most) if k1 < 0.0 else most
-    step = min(most, MOST_RADIUS) / (RADII - 1)
-    for k in range(1, RADII):
+    step = min(most, OPTIONS.most_radius) / (OPTIONS.radii - 1)
+    for k in range(1, OPTIONS.radii):
         if not _grows(k * step, terms, family, least_slope):
             low, high = (k - 1) * step, k * step
             for _ in range(50):  # as many halvings as numbers in double precision have bits
@@ -239,7 +249,7 @@ def fold_radius(terms: Terms, family: int, least_slope: float) -> float:
                 else:
                     high = middle
             return low
-    return min(most, MOST_RADIUS)
+    return min(most, OPTIONS.most_radius)
 
 
 # Many points.
@@ -359,7 +369,7 @@ def image_rays(x: FloatArray, camera: FloatArray, family: int) -> FloatArray:
 @kernel
 def _unproject_all(x: FloatArray, camera: FloatArray, family: int) -> FloatArray:
     terms, focals = lens_terms(camera), (camera[FX], camera[FY])
-    end = fold_radius(terms, family, LEAST_SLOPE), LEAST_SLOPE, 0.0
+    end = fold_radius(terms, family, OPTIONS.least_slope), OPTIONS.least_slope, 0.0
     rays, out = np.empty((len(x), BEARING)), np.empty(BEARING + 1)
     for i in range(len(x)):
         point = (x[i, 0] - camera[CX]) / camera[FX], (x[i, 1] - camera[CY]) / camera[FY]

@@ -12,7 +12,7 @@ import numpy as np
 from sfm_app.camera.models import camera_matrix
 from sfm_app.camera.projection import (
     FISHEYE,
-    MOST_RADIUS,
+    OPTIONS,
     PANORAMA,
     PERSPECTIVE,
     RAY,
@@ -67,7 +67,7 @@ class Lens:
         fold = fold_radius(lens_terms(params), family, 0.0)
         last = np.array([fold if family == FISHEYE else np.arctan(fold)])
         hidden = np.hypot(*points.T) > radius_at(last, params, family)
-        if hidden.any() and fold < (np.pi if family == FISHEYE else MOST_RADIUS):
+        if hidden.any() and fold < (np.pi if family == FISHEYE else OPTIONS.most_radius):
             terms = ", ".join(f"{k:g}" for k in self.radial)
             raise ConfigError(f"synthetic camera: a radial distortion of {terms} folds within the photo")
         if self.projection in CURVES:

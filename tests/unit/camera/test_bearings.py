@@ -8,7 +8,7 @@ from sfm_app.camera.models import calibration_from_model, camera_matrix, panoram
 from sfm_app.camera.projection import (
     FISHEYE,
     K1,
-    LEAST_SLOPE,
+    OPTIONS,
     PERSPECTIVE,
     RAY,
     fold_radius,
@@ -53,7 +53,7 @@ def test_a_fisheye_looks_backwards() -> None:
 
 def test_a_lens_that_folds_shows_nothing_beyond_its_fold() -> None:
     folding = Calibration(K, 800, 600, "test", True, projection="fisheye", fisheye=(-0.2, 0.0, 0.0, 0.0))
-    fold = fold_radius((-0.2, *[0.0] * 7), FISHEYE, LEAST_SLOPE)
+    fold = fold_radius((-0.2, *[0.0] * 7), FISHEYE, OPTIONS.least_slope)
     assert 1.1 < fold < np.sqrt(1.0 / 0.6)
     for theta, seen in ((fold - 0.05, True), (fold + 0.05, False)):
         assert np.isfinite(bearings.project(np.array([[np.sin(theta), 0.0, np.cos(theta)]]), folding)).all() == seen
