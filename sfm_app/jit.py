@@ -39,6 +39,11 @@ def kernel(function: Function) -> Function:
     return _compile(function, fastmath=False)
 
 
+def inlined_kernel(function: Function) -> Function:
+    """Compile a kernel into each kernel that calls it, where constant arguments remove branches."""
+    return _compile(function, fastmath=False, forceinline=True)
+
+
 def summing_kernel(function: Function) -> Function:
     """Compile a kernel whose sums may be vectorized: several times faster, the same bytes on one kind of processor.
 

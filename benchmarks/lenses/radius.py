@@ -6,6 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.camera import bearings
+from sfm_app.camera import projection as families
+from sfm_app.camera.models import row_of_calibration
+from sfm_app.camera.projection import image_points
 from sfm_app.synthetic.cameras import Camera, pixel_rays
 from sfm_app.types import Calibration
 from sfm_app.types.camera import PERSPECTIVE
@@ -43,11 +46,8 @@ def projection_of(camera: Calibration) -> Project:
         return lambda rays: bearings.project(rays, camera)
 
     def project(rays: FloatArray) -> FloatArray:
-        ahead = rays[:, 2] > 1e-6
-        points = np.full((len(rays), 2), np.nan)
-        plane = rays[ahead, :2] / rays[ahead, 2:]
-        plane = plane * (1.0 + camera.radial * (plane**2).sum(axis=1, keepdims=True))
-        points[ahead] = plane * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
-        return points
+        return np.where(
+            rays[:, 2:] > 1e-6, image_points(rays, row_of_calibration(camera), families.PERSPECTIVE), np.nan
+        )
 
     return project

@@ -23,7 +23,7 @@ from benchmarks.cameras.worker import INCREMENTAL, OURS, RESULT
 from benchmarks.common.command_line import new_parser
 from benchmarks.common.photo_sets import PhotoSet
 from benchmarks.common.results import RESULTS, Row, document, table, write
-from sfm_app.camera.models import rays
+from sfm_app.camera.projection import PERSPECTIVE, image_rays
 
 FloatArray = NDArray[np.float64]
 Source = Callable[[FloatArray, FloatArray], FloatArray]
@@ -41,7 +41,8 @@ ABOUT = (
 
 def barrel_source(pixels: FloatArray, K: FloatArray) -> FloatArray:
     """Return where a barrel lens's pixels lie in the photo without a lens; corners move inwards, so none is lost."""
-    return rays(pixels, K, BARREL_K1) @ K[:2, :2].T + K[:2, 2]
+    camera = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], BARREL_K1, *[0.0] * 7])
+    return image_rays(pixels, camera, PERSPECTIVE)[:, :2] @ K[:2, :2].T + K[:2, 2]
 
 
 def fisheye_source(pixels: FloatArray, K: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from sfm_app.camera.models import guessed_camera_matrix
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.database import SQUARE_PIXELS, camera_params, open_database
+from sfm_app.colmap.database import open_database
 from sfm_app.types import Calibration, MatchGraph, ViewGraph
 
 METHOD = "view-graph calibration"
@@ -52,7 +52,7 @@ def _write_fits(path: Path, matches: MatchGraph, views: ViewGraph) -> None:
         for pair, fit in views.fits.items():
             geometry = pycolmap.TwoViewGeometry()
             geometry.config = kinds.PLANAR_OR_PANORAMIC if fit.degeneracy else kinds.UNCALIBRATED
-            geometry.F = fit.F
+            geometry.F = fit.matrix
             geometry.inlier_matches = np.ascontiguousarray(matches.matches[pair][fit.inliers])
             database.write_two_view_geometry(*pair, geometry)
 
@@ -60,8 +60,9 @@ def _write_fits(path: Path, matches: MatchGraph, views: ViewGraph) -> None:
 def _reset_cameras(path: Path) -> None:
     with open_database(path) as database, pycolmap.DatabaseTransaction(database):
         for camera in database.read_all_cameras():
-            camera.model = getattr(pycolmap.CameraModelId, SQUARE_PIXELS)
-            camera.params = camera_params(guessed_camera_matrix((camera.width, camera.height)), SQUARE_PIXELS)
+            camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
+            K = guessed_camera_matrix((camera.width, camera.height))
+            camera.params = [K[0, 0], *K[:2, 2], 0.0]
             camera.has_prior_focal_length = False
             database.update_camera(camera)
 

@@ -11,6 +11,7 @@ import numpy as np
 from sfm_app.camera.models import (
     ASPECT,
     CENTER,
+    FAMILIES,
     FREE_SHARE,
     LENS,
     NARROW,
@@ -19,8 +20,8 @@ from sfm_app.camera.models import (
     TWO_FOCALS,
     WIDE,
     camera_matrix,
-    distortion_terms,
     projection_of_model,
+    row_of_calibration,
     with_terms,
 )
 from sfm_app.camera.projection import (
@@ -47,7 +48,6 @@ from sfm_app.camera.projection import (
 )
 from sfm_app.geometry.least_squares import NormalPriors, binary_choices
 from sfm_app.types import Calibration
-from sfm_app.types import camera as kinds
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 LOG_FOCAL, LOG_ASPECT = FX, FY
@@ -259,8 +259,6 @@ def step_cameras(params: FloatArray, step: FloatArray) -> FloatArray:
     return result
 
 
-FAMILIES = {kinds.PERSPECTIVE: PERSPECTIVE, kinds.FISHEYE: FISHEYE, kinds.EQUIRECTANGULAR: PANORAMA}
-"""Families by projection."""
 PROJECTIONS = {family: projection for projection, family in FAMILIES.items()}
 
 
@@ -289,7 +287,7 @@ class CameraRule:
         """Return the user's parameters (12,); None if they are not of this family."""
         if self.given is None or FAMILIES[self.given.projection] != family:
             return None
-        return params_of_calibration(self.given)
+        return row_of_calibration(self.given)
 
     def parts(self, family: int) -> BoolArray | None:
         """Return (7,) the parts of the model besides its center; None if it is open, or not of this family."""
@@ -302,12 +300,6 @@ class CameraRule:
 
 
 NO_RULE = CameraRule()
-
-
-def params_of_calibration(camera: Calibration) -> FloatArray:
-    """Return a perspective or fisheye camera as the parameters (12,) of `Bundle`."""
-    K = camera.K
-    return np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], distortion_terms(camera)])
 
 
 def calibration_from_params(

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.camera import projection as families
 from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE, GIVEN, PERSPECTIVE, Calibration
 
 GUESSED_FOCAL = 1.2
@@ -37,27 +38,9 @@ def guessed_camera_matrix(size: tuple[int, int], focal_px: float | None = None) 
     return camera_matrix(focal, focal, size[0] / 2, size[1] / 2)
 
 
-def panorama_matrix(size: tuple[int, int]) -> NDArray[np.float64]:
+def panorama_matrix(size: tuple[float, float]) -> NDArray[np.float64]:
     """Return the (3, 3) matrix with the scale of an equirectangular photo at its center, in pixels per radian."""
     return camera_matrix(size[0] / (2.0 * np.pi), size[1] / np.pi, size[0] / 2, size[1] / 2)
-
-
-def rays(x: NDArray[np.float64], K: NDArray[np.float64], radial: float = 0.0) -> NDArray[np.float64]:
-    """Undistort pixels (N, 2) to points (N, 2) of the plane z = 1, for a lens x_d = x_u (1 + radial r_u^2).
-
-    Uses Newton's method from the distorted radius. A barrel lens folds where r (1 + radial r^2) stops growing with r;
-    pixels beyond the fold are mapped to it.
-    """
-    distorted = (x - K[:2, 2]) / np.diag(K)[:2]
-    if radial == 0.0:
-        return np.asarray(distorted, np.float64)
-    radius = np.hypot(distorted[:, 0], distorted[:, 1])
-    fold = (-3.0 * radial) ** -0.5 if radial < 0.0 else np.inf
-    r = np.minimum(radius / (1.0 + max(radial, 0.0) * radius**2), fold)
-    for _ in range(10):
-        slope = np.maximum(1.0 + 3.0 * radial * r * r, 0.2)  # the slope is 0 at the fold; limits chosen by hand
-        r = np.minimum(r - (r * (1.0 + radial * r * r) - radius) / slope, fold)
-    return np.asarray(distorted * np.divide(r, radius, out=np.ones_like(r), where=radius > 0)[:, None], np.float64)
 
 
 SHARED = ("k1", "k2", "p1", "p2", "k3", "k4")
@@ -82,11 +65,45 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
 """Names of the parameters of the supported models, in COLMAP's order. By definition."""
 
 
+FAMILIES = {PERSPECTIVE: families.PERSPECTIVE, FISHEYE: families.FISHEYE, EQUIRECTANGULAR: families.PANORAMA}
+"""Families of `camera.projection`, by projection."""
+INDEX = {name: k for terms in TERMS.values() for k, name in enumerate((*TWO_FOCALS, *terms))}
+"""Index in a row (12,) of `camera.projection` of each parameter but f, w and h."""
+FILE_MODELS = {
+    families.PERSPECTIVE: ("OPENCV", "FULL_OPENCV"),
+    families.FISHEYE: ("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"),
+}
+"""Models of refined and written cameras, by family; the smaller one first."""
+
+
 def projection_of_model(model: str) -> str:
     """Return the projection of one of `PARAMETERS`."""
     if model == "EQUIRECTANGULAR":
         return EQUIRECTANGULAR
     return FISHEYE if "FISHEYE" in model else PERSPECTIVE
+
+
+def row_of_model(model: str, params: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a camera with a model and parameters of COLMAP as a row (12,) of `camera.projection`."""
+    row = np.zeros(families.CAMERA)
+    if model == "EQUIRECTANGULAR":
+        return _row(panorama_matrix((params[0], params[1])), row[4:])
+    for name, value in zip(PARAMETERS[model], params, strict=True):
+        row[[families.FX, families.FY] if name == "f" else INDEX[name]] = value
+    return row
+
+
+def params_of_row(row: NDArray[np.float64], model: str) -> list[float]:
+    """Return the parameters of a model of COLMAP that holds a row (12,) but for its aspect."""
+    fx, fy, cx, cy = row[:4]
+    values = {"f": (fx * fy) ** 0.5, "w": 2.0 * cx, "h": 2.0 * cy}
+    return [float(values[name] if name in values else row[INDEX[name]]) for name in PARAMETERS[model]]
+
+
+def file_model(row: NDArray[np.float64], family: int) -> str:
+    """Return the smallest of FILE_MODELS that holds a row (12,) of a perspective camera or a fisheye."""
+    small, large = FILE_MODELS[family]
+    return large if np.delete(row, [INDEX[name] for name in PARAMETERS[small]]).any() else small
 
 
 def calibration_from_model(model: str, params: Sequence[float], size: tuple[int, int]) -> Calibration:
@@ -102,19 +119,15 @@ def calibration_from_model(model: str, params: Sequence[float], size: tuple[int,
         raise ValueError(f"the camera model {model} is not supported: only {', '.join(PARAMETERS)}")
     if len(params) != len(names):
         raise ValueError(f"{model} has {len(names)} parameters ({', '.join(names)}), not {len(params)}")
-    values = dict(zip(names, (float(value) for value in params), strict=True))
     projection = projection_of_model(model)
     if projection == EQUIRECTANGULAR:
-        if not all(size):
-            size = int(values["w"]), int(values["h"])
+        size = size if all(size) else (int(params[0]), int(params[1]))
         return Calibration(panorama_matrix(size), *size, GIVEN, identifiable=True, projection=projection)
-    fx, fy = (values.get(name, values.get("f", 0.0)) for name in ("fx", "fy"))
-    if not (np.isfinite(list(values.values())).all() and fx > 0.0 and fy > 0.0):
+    row = row_of_model(model, params)
+    if not np.isfinite(row).all() or row[:2].min() <= 0.0:
         raise ValueError(f"the parameters of {model} are not those of a camera: {', '.join(map(str, params))}")
-    plain = Calibration(
-        camera_matrix(fx, fy, values["cx"], values["cy"]), *size, GIVEN, identifiable=True, projection=projection
-    )
-    return with_terms(plain, tuple(values.get(name, 0.0) for name in TERMS[projection]))
+    plain = Calibration(camera_matrix(*row[:4].tolist()), *size, GIVEN, identifiable=True, projection=projection)
+    return with_terms(plain, row[4:].tolist())
 
 
 def with_terms(camera: Calibration, terms: Sequence[float]) -> Calibration:
@@ -128,7 +141,7 @@ def with_terms(camera: Calibration, terms: Sequence[float]) -> Calibration:
 
 
 def distortion_terms(camera: Calibration) -> NDArray[np.float64]:
-    """Return (8,) all terms of a perspective or fisheye camera, in the order of `TERMS`."""
+    """Return (8,) all terms of a camera, in the order of `TERMS`; zeros of a panorama."""
     if camera.distortion:
         return np.array(camera.distortion, np.float64)
     terms = np.zeros(8)
@@ -139,13 +152,11 @@ def distortion_terms(camera: Calibration) -> NDArray[np.float64]:
     return terms
 
 
-def model_of_calibration(camera: Calibration) -> tuple[str, list[float]]:
-    """Return the smallest of COLMAP's models with two focals that holds a camera, and its parameters."""
-    values = dict(zip(TERMS[camera.projection], distortion_terms(camera).tolist(), strict=True))
-    values |= {"fx": camera.K[0, 0], "fy": camera.K[1, 1], "cx": camera.K[0, 2], "cy": camera.K[1, 2]}
-    fisheye = camera.projection == FISHEYE
-    models = ("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE") if fisheye else ("OPENCV", "FULL_OPENCV")
-    for model in models:
-        if not any(value for name, value in values.items() if name not in PARAMETERS[model]):
-            break
-    return model, [float(values[name]) for name in PARAMETERS[model]]
+def row_of_calibration(camera: Calibration) -> NDArray[np.float64]:
+    """Return a camera as a row (12,) of `camera.projection`."""
+    panorama = camera.projection == EQUIRECTANGULAR
+    return _row(panorama_matrix((camera.width, camera.height)) if panorama else camera.K, distortion_terms(camera))
+
+
+def _row(K: NDArray[np.float64], terms: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *terms])

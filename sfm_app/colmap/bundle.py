@@ -30,25 +30,29 @@ from sfm_app.bundle.lens_parts import (
     choices_of_model,
     consistent_choices,
     fit_to_model,
-    params_of_calibration,
     part_names,
 )
 from sfm_app.bundle.normal_equations import Bundle, best_step, cost, elimination_width, reduce
-from sfm_app.camera.models import PARAMETERS, TERMS, TWO_FOCALS
+from sfm_app.camera.models import (
+    FILE_MODELS,
+    INDEX,
+    PARAMETERS,
+    file_model,
+    params_of_row,
+    row_of_calibration,
+)
 from sfm_app.camera.projection import (
-    CAMERA,
     CX,
     CY,
     FISHEYE,
     FX,
     FY,
-    K1,
     PANORAMA,
     PERSPECTIVE,
 )
 from sfm_app.colmap.backend import all_cameras, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.model import finite_mask, posed_images, submodel
+from sfm_app.colmap.model import camera_family, finite_mask, posed_images, read_camera, submodel
 from sfm_app.errors import NumericalError
 from sfm_app.numerical import FAILURES, Json, error_reason, finite_entries
 from sfm_app.types import Calibration
@@ -57,37 +61,9 @@ from sfm_app.types.camera import named_correlations
 
 # COLMAP's models as the arrays of our bundle adjustment, and back.
 
-PLACES: dict[str, tuple[int, ...]] = {name: (k,) for k, name in enumerate((*TWO_FOCALS, *TERMS["perspective"]))}
-PLACES |= {name: (k,) for k, name in enumerate((*TWO_FOCALS, *TERMS["fisheye"]))} | {"f": (FX, FY), "k": (K1,)}
-"""Indices in `Bundle.params` by COLMAP's names of parameters."""
-FILE_MODELS = {
-    PERSPECTIVE: {name: PARAMETERS[name] for name in ("OPENCV", "FULL_OPENCV")},
-    FISHEYE: {name: PARAMETERS[name] for name in ("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE")},
-}
-"""COLMAP's models of refined cameras, with their parameters; the smaller one first."""
-EQUIRECTANGULAR = "EQUIRECTANGULAR"
 Rules = Mapping[int, CameraRule]
 """The user's rules, by camera id; cameras without a rule are free."""
 NO_RULES: Rules = MappingProxyType({})
-
-
-def camera_family(camera: pycolmap.Camera) -> int:
-    """Return the family of a camera, as in `Bundle`."""
-    if camera.model.name == EQUIRECTANGULAR:
-        return PANORAMA
-    return FISHEYE if "FISHEYE" in camera.model.name else PERSPECTIVE
-
-
-def read_camera(camera: pycolmap.Camera) -> FloatArray:
-    """Return the parameters (12,) of a camera, as in `Bundle`."""
-    params = np.zeros(CAMERA)
-    if camera_family(camera) == PANORAMA:
-        width, height = camera.width, camera.height
-        params[[FX, FY, CX, CY]] = width / (2.0 * np.pi), height / np.pi, width / 2.0, height / 2.0
-        return params
-    for name, value in zip(camera.params_info.split(", "), camera.params, strict=True):
-        params[list(PLACES[name])] = value
-    return params
 
 
 def write_camera(camera: pycolmap.Camera, params: FloatArray, family: int) -> None:
@@ -96,17 +72,7 @@ def write_camera(camera: pycolmap.Camera, params: FloatArray, family: int) -> No
         return
     name = file_model(params, family)
     camera.model = pycolmap.CameraModelId.__members__[name]
-    camera.params = [float(params[PLACES[key][0]]) for key in FILE_MODELS[family][name]]
-
-
-def file_model(params: FloatArray, family: int) -> str:
-    """Return COLMAP's name of the file model of a perspective or fisheye camera (12,)."""
-    models = FILE_MODELS[family]
-    for name, keys in models.items():
-        rest = np.delete(params, [PLACES[key][0] for key in keys])
-        if not rest.any():
-            return name
-    return list(models)[-1]
+    camera.params = params_of_row(params, name)
 
 
 def read_bundle(model: pycolmap.Reconstruction, rules: Rules = NO_RULES) -> tuple[list[int], Bundle]:
@@ -539,7 +505,7 @@ def _uncertainty(
     correlations: dict[int, dict[str, float]] = {}
     for row, camera_id in enumerate(rounds.ids):
         names = _adjusted_names(rounds, row)
-        places = [PLACES[name][0] for name in names]
+        places = [INDEX[name] for name in names]
         entries = {name: float(lenses.deviations[row][place]) for name, place in zip(names, places, strict=True)}
         deviations[camera_id] = finite_entries(entries)
         determined[camera_id] = part_names(int(rounds.bundle.family[row]), lenses.determined[row])
@@ -553,7 +519,7 @@ def _adjusted_names(rounds: Rounds, row: int) -> tuple[str, ...]:
     is_fixed = rounds.bundle.fixed is not None and bool(rounds.bundle.fixed[row])
     if family not in FILE_MODELS or is_fixed:
         return ()
-    return tuple(FILE_MODELS[family][file_model(rounds.lenses.params[row], family)])
+    return PARAMETERS[file_model(rounds.lenses.params[row], family)]
 
 
 def apply_rules(model: pycolmap.Reconstruction, rules: Rules) -> None:
@@ -569,7 +535,7 @@ def apply_rules(model: pycolmap.Reconstruction, rules: Rules) -> None:
         if PANORAMA in (family, new_family):
             continue
         if rule.given is not None and rule.is_kept:
-            params = params_of_calibration(rule.given)
+            params = row_of_calibration(rule.given)
         elif new_family != family:
             reach = np.hypot(camera.width, camera.height) / (2.0 * np.sqrt(before[FX] * before[FY]))
             other = convert_lens(before, family, float(reach))

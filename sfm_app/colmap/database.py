@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.camera.models import guessed_camera_matrix, model_of_calibration
+from sfm_app.camera.models import FAMILIES, file_model, guessed_camera_matrix, params_of_row, row_of_calibration
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.geometry.epipolar import cross_matrix
 from sfm_app.types import (
@@ -239,7 +239,7 @@ def _write_camera(database: pycolmap.Database, camera_id: int, calibration: Cali
         model=pycolmap.CameraModelId.__members__[name],
         width=calibration.width,
         height=calibration.height,
-        params=params_of_calibration(calibration),
+        params=params_of_row(row_of_calibration(calibration), name),
         has_prior_focal_length=calibration.is_estimated,
     )
     if database.exists_camera(camera_id):
@@ -261,31 +261,13 @@ def _write_frame(database: pycolmap.Database, image: pycolmap.Image) -> None:
 def camera_model(calibration: Calibration) -> str:
     """Return COLMAP's name of the smallest camera model for a calibration."""
     if calibration.distortion:
-        return model_of_calibration(calibration)[0]
+        return file_model(row_of_calibration(calibration), FAMILIES[calibration.projection])
     if calibration.projection in WIDE_MODELS:
         return WIDE_MODELS[calibration.projection]
     # largest |fy/fx - 1| of square pixels: calibrators give no more where the photos show no other aspect
     K, tolerance = calibration.K, 0.0 if calibration.is_given else 0.005
     square = "aspect" in calibration.held or K[0, 0] == K[1, 1] or abs(K[1, 1] / K[0, 0] - 1.0) < tolerance
     return SQUARE_PIXELS if square else TWO_FOCALS
-
-
-def params_of_calibration(calibration: Calibration) -> list[float]:
-    """Return the parameters of the model that `camera_model` names."""
-    if calibration.projection == EQUIRECTANGULAR:
-        return [float(calibration.width), float(calibration.height)]
-    if calibration.distortion:
-        return model_of_calibration(calibration)[1]
-    params = camera_params(calibration.K, camera_model(calibration), calibration.radial)
-    return [*params[:4], *calibration.fisheye] if calibration.projection == FISHEYE else params
-
-
-def camera_params(K: NDArray[np.float64], camera_model: str, radial: float = 0.0) -> list[float]:
-    """Return parameters of a COLMAP model with one or two focals, from K (3, 3) in pixels and the first radial term."""
-    fx, fy, cx, cy = (float(K[row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    if camera_model == SQUARE_PIXELS:
-        return [(fx * fy) ** 0.5, cx, cy, radial]
-    return [fx, fy, cx, cy, radial, 0.0, 0.0, 0.0]
 
 
 def _pair(pair_id: int) -> PairId:

@@ -8,8 +8,8 @@ from typing import NamedTuple, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.camera.bearings import BEARING, RAY
-from sfm_app.camera.models import camera_matrix, panorama_matrix
+from sfm_app.camera.models import FAMILIES, camera_matrix, projection_of_model, row_of_model
+from sfm_app.camera.projection import BEARING, FISHEYE, K1, K2, K3, K4, PERSPECTIVE, RAY
 from sfm_app.colmap.backend import all_images, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.geometry.epipolar import TwoViewSeed
@@ -77,9 +77,19 @@ def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray
     return views
 
 
+def camera_family(camera: pycolmap.Camera) -> int:
+    """Return the family of a camera, as in `camera.projection`."""
+    return FAMILIES[projection_of_model(camera.model.name)]
+
+
+def read_camera(camera: pycolmap.Camera) -> NDArray[np.float64]:
+    """Return the parameters (12,) of a camera, as in `camera.projection`."""
+    return row_of_model(camera.model.name, camera.params)
+
+
 def bearing_vectors(camera: pycolmap.Camera, x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return bearing vectors (N, 9) of pixels (N, 2), as `camera.bearings` does."""
-    if camera.is_perspective_fisheye() or camera.is_spherical():
+    if camera_family(camera) != PERSPECTIVE:
         # step of the derivatives: curvature and rounding in double precision cost about 1e-9 of them
         step_px = 1e-3
         steps = np.vstack([x + step for step in ([0.0, 0.0], [step_px, 0.0], [0.0, step_px])])
@@ -110,15 +120,10 @@ def cameras_by_photo(model: pycolmap.Reconstruction) -> dict[int, MappedCamera]:
 
 
 def _mapped_camera(camera: pycolmap.Camera) -> MappedCamera:
-    if camera.is_spherical():
-        return MappedCamera(panorama_matrix((camera.width, camera.height)))
-    K = np.asarray(camera.calibration_matrix(), np.float64)
-    terms = [camera.params[k] for k in camera.extra_params_idxs()]
-    if camera.is_perspective_fisheye():
-        if camera.model.name == "THIN_PRISM_FISHEYE":
-            terms = [terms[k] for k in (0, 1, 4, 5)]
-        return MappedCamera(K, fisheye=tuple(float(term) for term in terms))
-    return MappedCamera(K, float(terms[0]))
+    row, K = read_camera(camera), scale_matrix(camera)
+    if camera_family(camera) == FISHEYE:
+        return MappedCamera(K, fisheye=tuple(row[[K1, K2, K3, K4]].tolist()))
+    return MappedCamera(K, float(row[K1]))
 
 
 def color_points(model: pycolmap.Reconstruction, photo_dir: Path, workers: int) -> None:
@@ -193,9 +198,7 @@ def seen_points(model: pycolmap.Reconstruction, most: int) -> SeenPoints:
 
 def scale_matrix(camera: pycolmap.Camera) -> NDArray[np.float64]:
     """Return K (3, 3) of a camera; of a panorama, the scale at its center."""
-    if camera.is_spherical():
-        return panorama_matrix((camera.width, camera.height))
-    return np.asarray(camera.calibration_matrix(), np.float64)
+    return camera_matrix(*read_camera(camera)[:4].tolist())
 
 
 def viewing_rays(model: pycolmap.Reconstruction, image_id: int, x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -103,8 +103,6 @@ def _compensate(
     inverse[tracked] = known
     middle = move_to_middle_row(rays / inverse[:, None], share, motion)
     place = int(bundle.camera[row])
-    params, family = np.tile(bundle.params[place], (len(x), 1)), np.full(len(x), bundle.family[place])
-    with np.errstate(all="ignore"):
-        moved = image_points(middle, params, family)
+    moved = image_points(middle, bundle.params[place], int(bundle.family[place]))
     shown = np.isfinite(moved).all(axis=1, keepdims=True)
     return np.where(shown, moved, x)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from sfm_app.camera.perspective_views import PerspectiveView, cover_rays
 from sfm_app.camera.projection import FISHEYE, FX, PANORAMA, SEEN_ANGLE, image_points
 from sfm_app.colmap.backend import all_images, pycolmap, translate_errors
-from sfm_app.colmap.bundle import camera_family, read_camera
 from sfm_app.colmap.dense import MASKS, shrink_mask
+from sfm_app.colmap.model import camera_family, read_camera
 from sfm_app.colmap.tasks import JPEG_QUALITY
 from sfm_app.files import replace_atomically
 from sfm_app.photos.masks import read_mask, save_mask
@@ -35,10 +35,9 @@ class WideLens:
 
     def locate(self, rays: FloatArray) -> FloatArray:
         """Return the pixels (N, 2) of rays (N, 3) of the camera's frame; -1 for rays that the photos do not show."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x = image_points(rays, np.tile(self.params, (len(rays), 1)), np.full(len(rays), self.family))
-            shown = rays[:, 2] >= self.least_cosine * np.linalg.norm(rays, axis=1)
-            shown &= np.all((x >= 0.0) & (x <= self.size), axis=1)
+        x = image_points(rays, self.params, self.family)
+        shown = rays[:, 2] >= self.least_cosine * np.linalg.norm(rays, axis=1)
+        shown &= np.all((x >= 0.0) & (x <= self.size), axis=1)
         return np.where(shown[:, None], x, -1.0)
 
 
@@ -156,8 +155,8 @@ def _shown_rays(camera: pycolmap.Camera) -> FloatArray:
     x, y = np.meshgrid(np.linspace(0.0, camera.width, grid), np.linspace(0.0, camera.height, grid))
     pixels = np.column_stack([x.ravel(), y.ravel()])
     rays, family = np.array(camera.cam_ray_from_img(pixels), np.float64), camera_family(camera)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        projected = image_points(rays, np.tile(read_camera(camera), (len(rays), 1)), np.full(len(rays), family))
+    with np.errstate(invalid="ignore"):
+        projected = image_points(rays, read_camera(camera), family)
         # if a pixel is far from the projection of its ray, the lens shows nothing or folds (limit chosen by hand);
         # the seam of a panorama is at both of its borders
         sound = (family == PANORAMA) | (np.linalg.norm(projected - pixels, axis=1) < 0.5)

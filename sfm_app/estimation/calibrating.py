@@ -25,6 +25,7 @@ from sfm_app.types import (
     Calibration,
     CameraPairs,
     EpipolarFit,
+    EpipolarGeometry,
     Evidence,
     Intrinsics,
     MatchedImage,
@@ -66,11 +67,11 @@ def select_inliers_through_lens(
 ) -> ViewGraph:
     """Choose the inliers of pairs through the lenses of known cameras; return the same graph where none bends."""
     known = {photo: camera.found for camera in cameras for photo in camera.photos if camera.found.is_estimated}
-    pairs = [pair for pair, fit in views.fits.items() if not fit.degeneracy and _is_bent(pair, known, views, matches)]
+    pairs = [pair for pair, fit in views.fits.items() if not fit.degeneracy and _is_bent(pair, fit, known)]
     if not pairs:
         return views
 
-    def choose(pair: PairId) -> EpipolarFit:
+    def choose(pair: PairId) -> EpipolarGeometry:
         fit = views.fits[pair]
         try:
             matched = Pair(matches.points(pair), [known[photo] for photo in pair], run.settings.epipolar.max_error_px)
@@ -85,8 +86,8 @@ def select_inliers_through_lens(
     return replace(views, fits={pair: selected.get(pair, fit) for pair, fit in views.fits.items()})
 
 
-def _is_bent(pair: PairId, known: Mapping[int, Calibration], views: ViewGraph, matches: MatchGraph) -> bool:
-    if not known.keys() >= set(pair) or any(matches.images[photo].group in views.lenses for photo in pair):
+def _is_bent(pair: PairId, fit: EpipolarGeometry, known: Mapping[int, Calibration]) -> bool:
+    if not isinstance(fit, EpipolarFit) or not known.keys() >= set(pair):
         return False
     return max(abs(known[photo].radial) for photo in pair) >= OPTIONS.min_radial
 
@@ -198,12 +199,21 @@ def to_whole_photo(camera: CalibratedCamera, image: MatchedImage) -> CalibratedC
     return replace(camera, found=replace(camera.found, K=K, width=image.width, height=image.height))
 
 
-def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> PhotoPairs:
-    """Return the pairs of some photos that are not degenerate, in pixels of the pictures inside their bars."""
+def photo_pairs(
+    images: list[MatchedImage], matches: MatchGraph, views: ViewGraph, kind: type[EpipolarGeometry] = EpipolarFit
+) -> PhotoPairs:
+    """Return the pairs of some photos that are not degenerate, in pixels of the pictures inside their bars.
+
+    The matrices of the kind `RayFit` are of bearing vectors.
+    """
     ids = {image.id for image in images}
-    fits = {pair: fit for pair, fit in views.fits.items() if ids.issuperset(pair) and not fit.degeneracy}
+    fits = {
+        pair: fit
+        for pair, fit in views.fits.items()
+        if ids.issuperset(pair) and isinstance(fit, kind) and not fit.degeneracy
+    }
     return PhotoPairs(
-        Fs=np.array([fit.F for fit in fits.values()], np.float64).reshape(-1, 3, 3),
+        Fs=np.array([fit.matrix for fit in fits.values()], np.float64).reshape(-1, 3, 3),
         weights=pair_weights(np.array([fit.inlier_count for fit in fits.values()], np.int64)),
         photos=tuple(fits),
         inliers=tuple(np.hstack(matches.points(pair))[fit.inliers] for pair, fit in fits.items()),
@@ -214,6 +224,8 @@ def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGrap
     ).with_origins({image.id: image.shown[:2] for image in images if image.shown})
 
 
-def camera_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> CameraPairs:
-    """Return the input of a calibrator for the photos of one camera."""
-    return photo_pairs(images, matches, views).to_camera_pairs([image.id for image in images])
+def camera_pairs(
+    images: list[MatchedImage], matches: MatchGraph, views: ViewGraph, kind: type[EpipolarGeometry] = EpipolarFit
+) -> CameraPairs:
+    """Return `photo_pairs` as the input of a calibrator for the photos of one camera."""
+    return photo_pairs(images, matches, views, kind).to_camera_pairs([image.id for image in images])

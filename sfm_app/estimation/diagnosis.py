@@ -15,7 +15,7 @@ from sfm_app.fundamental.degeneracy import ONLY_A_LOGO, SAME_PHOTO
 from sfm_app.fundamental.estimate import count_matches_off_plane
 from sfm_app.posegraph.rotations import connected_groups
 from sfm_app.settings import EpipolarSettings, MatchSettings
-from sfm_app.types import MatchedImage, MatchGraph, PairId, ViewGraph
+from sfm_app.types import EpipolarFit, MatchedImage, MatchGraph, PairId, ViewGraph
 
 Cause = Literal["copies", "texture", "logo", "nothing", "rotation", "planar", "collinear", "unclear"]
 
@@ -108,14 +108,13 @@ def diagnose_depth(
     kinds = inliers_by_degeneracy(views, photos)
     if kinds[""] >= kinds.total() / 2:
         return None
-    determined = [pair for pair in _pairs_among(views, photos) if not views.fits[pair].degeneracy]
-    with_lens = {photo for photo, image in matches.images.items() if image.group in views.lenses}
+    determined = {pair: views.fits[pair] for pair in _pairs_among(views, photos) if not views.fits[pair].degeneracy}
     # with a known lens, no plane is degenerate
     parallax = sum(
-        count_matches_off_plane(*matches.points(pair), views.fits[pair].F, options)
-        if with_lens.isdisjoint(pair)
-        else views.fits[pair].inlier_count
-        for pair in determined
+        count_matches_off_plane(*matches.points(pair), fit.F, options)
+        if isinstance(fit, EpipolarFit)
+        else fit.inlier_count
+        for pair, fit in determined.items()
     )
     if parallax >= OPTIONS.min_parallax * kinds.total():
         return None

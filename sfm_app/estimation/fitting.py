@@ -13,8 +13,7 @@ from sfm_app.camera.models import camera_matrix, guessed_camera_matrix, panorama
 from sfm_app.errors import ConfigError
 from sfm_app.estimation.given_cameras import assign_cameras, report_checks
 from sfm_app.files import load_arrays, mark_unfinished, replace_atomically, resume_or_clear
-from sfm_app.fundamental import FitFundamentalLike
-from sfm_app.fundamental.degeneracy import find_stationary, fit_moving, is_widespread, one_per_cell
+from sfm_app.fundamental.degeneracy import Fit, find_stationary, fit_moving, is_widespread, one_per_cell
 from sfm_app.fundamental.rays import fit_lev_ransac_rays
 from sfm_app.numerical import FAILURES
 from sfm_app.plugins import Estimator
@@ -24,7 +23,7 @@ from sfm_app.runtime.parallel import ordered_map
 from sfm_app.selfcal.wide_lens import LensEstimate, find_lens, needs_fisheye, shows_panoramas
 from sfm_app.settings import EpipolarSettings, Settings
 from sfm_app.tasks import Task
-from sfm_app.types import Calibration, EpipolarFit, MatchedImage, MatchGraph, PairId, Rejected, ViewGraph
+from sfm_app.types import Calibration, EpipolarGeometry, MatchedImage, MatchGraph, PairId, RayFit, Rejected, ViewGraph
 from sfm_app.types.arrays import BoolArray, FloatArray
 from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE
 
@@ -50,7 +49,7 @@ LENS = LensOptions()
 
 NONE_KNOWN: Mapping[str, Calibration | None] = MappingProxyType({})
 
-PairFit = tuple[EpipolarFit | Rejected, int]
+PairFit = tuple[EpipolarGeometry | Rejected, int]
 """Fit of a pair, or why there is none, and the number of its matches that are stationary in the picture."""
 
 PART = 64
@@ -179,7 +178,7 @@ def find_views(
     matches: MatchGraph,
     run: RunContext,
     lenses: Mapping[str, Calibration],
-    known: Mapping[PairId, EpipolarFit | Rejected] = MappingProxyType({}),
+    known: Mapping[PairId, EpipolarGeometry | Rejected] = MappingProxyType({}),
 ) -> ViewGraph:
     """Return the geometry of every pair with matches; those that are not known are fitted."""
     fitted = fit_pairs(matches, [pair for pair in matches.matches if pair not in known], run, lenses)
@@ -243,7 +242,7 @@ def _fit_pair(
         return Rejected("the computation failed"), 0
 
 
-def ray_estimator(images: Sequence[MatchedImage], lenses: Mapping[str, Calibration]) -> FitFundamentalLike | None:
+def ray_estimator(images: Sequence[MatchedImage], lenses: Mapping[str, Calibration]) -> Fit | None:
     """Return an estimator by bearing vectors for a pair; None without a wide lens. The other camera is a guess."""
     if not any(image.group in lenses for image in images):
         return None
@@ -251,7 +250,7 @@ def ray_estimator(images: Sequence[MatchedImage], lenses: Mapping[str, Calibrati
     guesses = [Calibration(guessed_camera_matrix(size), *size, "guess", identifiable=False) for size in sizes]
     cameras = [lenses.get(image.group, guess) for image, guess in zip(images, guesses, strict=True)]
 
-    def fit(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
+    def fit(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> RayFit | Rejected:
         lines = np.hstack([bearings(x, camera) for x, camera in zip((x1, x2), cameras, strict=True)])
         return fit_lev_ransac_rays(lines, options, seed)
 
@@ -263,7 +262,7 @@ def to_view_graph(
 ) -> ViewGraph:
     """Return the view graph of fitted and rejected pairs."""
     return ViewGraph(
-        fits={pair: fit for pair, (fit, _) in results.items() if isinstance(fit, EpipolarFit)},
+        fits={pair: fit for pair, (fit, _) in results.items() if isinstance(fit, EpipolarGeometry)},
         rejected={pair: fit for pair, (fit, _) in results.items() if isinstance(fit, Rejected)},
         lenses=lenses,
     )

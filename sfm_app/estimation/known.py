@@ -12,7 +12,7 @@ from sfm_app.runtime.context import Earlier, RunContext
 from sfm_app.selfcal import CalibratedCamera, calibrate_photo_set
 from sfm_app.types import (
     Calibration,
-    EpipolarFit,
+    EpipolarGeometry,
     Intrinsics,
     MatchedImage,
     MatchGraph,
@@ -40,7 +40,7 @@ def known_lenses(matches: MatchGraph, before: ViewGraph, earlier: Earlier) -> di
 
 def known_fits(
     matches: MatchGraph, before: ViewGraph, same: Collection[PairId], lenses: Mapping[str, Calibration]
-) -> dict[PairId, EpipolarFit | Rejected]:
+) -> dict[PairId, EpipolarGeometry | Rejected]:
     """Return the fits of pairs with the same matches and lenses."""
     groups = {image.group for image in matches.images.values()}
     unchanged = {group for group in groups if _text(before.lenses.get(group)) == _text(lenses.get(group))}
@@ -120,7 +120,7 @@ def _is_contradicted(
     contradictions = []
     if claim is not None and claim.is_contradicted and not (before is not None and before.is_contradicted):
         contradictions.append(claim.text)
-    if not contradictions and images[0].group not in views.lenses:
+    if not contradictions:
         contradictions += [one.text for one in _pair_contradictions(camera, new, matches, views, run)]
     for text in contradictions:
         run.progress.say(f"the new photos contradict the earlier camera {images[0].group}: {text}")

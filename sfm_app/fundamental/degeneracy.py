@@ -14,7 +14,7 @@ from sfm_app.fundamental.scores import FIRST, Loss, penalty, squared_distances
 from sfm_app.fundamental.solvers import decompose_symmetric
 from sfm_app.jit import kernel
 from sfm_app.settings import EpipolarSettings
-from sfm_app.types import EpipolarFit, Rejected
+from sfm_app.types import EpipolarFit, EpipolarGeometry, Rejected
 from sfm_app.types.arrays import BoolArray, FloatArray
 
 # Dominant plane: the plane with most of a model's inliers, and the matches off it. Hartley and Zisserman (2004),
@@ -324,7 +324,7 @@ def _search_epipole(
 # [t]x for any t, so that enough of its matches hide the rotation. A scene may stay in place, too. A logo differs by
 # its peak: displacements of a scene vary smoothly, and are 0 no more often than any value near 0.
 
-Fit = Callable[[FloatArray, FloatArray, EpipolarSettings, int], EpipolarFit | Rejected]
+Fit = Callable[[FloatArray, FloatArray, EpipolarSettings, int], EpipolarGeometry | Rejected]
 
 SAME_PHOTO = "the same photo twice, or nearly"
 ONLY_A_LOGO = "nothing in common but a logo or time stamp"
@@ -386,7 +386,7 @@ def is_widespread(points: FloatArray, keypoints: FloatArray, size: tuple[int, in
 def fit_moving(
     fit: Fit, points: tuple[FloatArray, FloatArray], stationary: BoolArray, wide: bool, options: EpipolarSettings,
     seed: int,
-) -> EpipolarFit | Rejected:  # fmt: skip
+) -> EpipolarGeometry | Rejected:  # fmt: skip
     """Estimate the epipolar geometry of the moving matches; the stationary ones are no inliers and have prior 0.
 
     Where the camera moved without rotation, distant objects stay in place, too. Widespread stationary matches that
@@ -395,9 +395,9 @@ def fit_moving(
     """
     x1, x2 = points
     moving = fit(x1[~stationary], x2[~stationary], options, seed)
-    if not isinstance(moving, EpipolarFit):
+    if isinstance(moving, Rejected):
         return Rejected(SAME_PHOTO if wide else ONLY_A_LOGO)
-    if wide and not moving.degeneracy:
+    if wide and isinstance(moving, EpipolarFit) and not moving.degeneracy:
         points_in_place = np.asfortranarray(np.hstack([x1[stationary], x2[stationary]]))
         agreeing = (
             squared_distances(points_in_place, np.ascontiguousarray(moving.F).reshape(9)) <= options.max_error_px**2

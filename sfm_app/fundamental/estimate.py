@@ -130,7 +130,7 @@ def _assess_model(
     squared_px = squared_distances(np.asfortranarray(np.hstack([x1, x2])), F_px.reshape(9))
     accepted = squared_px <= options.max_error_px**2
     return EpipolarFit(
-        F=F_px,
+        F_px,
         inliers=accepted,
         priors=prior_validity(points, f, threshold, sigma_from_inliers=True)[matches.rows],
         trials=trials,

@@ -26,7 +26,7 @@ from sfm_app.geometry.epipolar import (
     squared_distances,
 )
 from sfm_app.settings import EpipolarSettings
-from sfm_app.types import EpipolarFit, Rejected
+from sfm_app.types import RayFit, Rejected
 from sfm_app.types.arrays import FloatArray, IndexArray
 
 
@@ -52,7 +52,7 @@ class RayOptions:
 OPTIONS = RayOptions()
 
 
-def fit_lev_ransac_rays(lines: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
+def fit_lev_ransac_rays(lines: FloatArray, options: EpipolarSettings, seed: int) -> RayFit | Rejected:
     """Estimate E of a pair with known lenses from matches, many of which may be wrong."""
     _, first = np.unique(np.hstack([lines[:, FIRST], lines[:, SECOND]]).round(9), axis=0, return_index=True)
     rng = np.random.default_rng(seed)
@@ -71,7 +71,7 @@ def fit_lev_ransac_rays(lines: FloatArray, options: EpipolarSettings, seed: int)
     all_squared = squared_distances(E[None], lines)[0]
     accepted = all_squared <= options.max_error_px**2
     rms, kind = math.sqrt(float(all_squared[accepted].mean())), _find_degeneracy(E, distinct[inliers], options)
-    return EpipolarFit(E, accepted, validity(lines, E, options.max_error_px), trials, rms, kind)
+    return RayFit(E, accepted, validity(lines, E, options.max_error_px), trials, rms, kind)
 
 
 def validity(lines: FloatArray, E: FloatArray, threshold: float) -> FloatArray:

@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.camera.bearings import bearings, plane_points
+from sfm_app.camera.bearings import bearings
 from sfm_app.colmap.backend import CancellationToken, Reconstruction, run_interruptible, translate_errors
 from sfm_app.colmap.mapping import copy_database, incremental_options, map_globally, map_incrementally
 from sfm_app.colmap.model import model_from_seed, placed_views
@@ -110,10 +110,10 @@ def triangulate_seed(candidate: Candidate, evidence: Evidence) -> TwoViewSeed:
     """Return the pose and triangulated points of a candidate."""
     pose, cameras = candidate.pose, [evidence.camera(photo) for photo in candidate.pair]
     points = evidence.matches.points(candidate.pair)
+    lines = [bearings(x[pose.inliers], camera) for x, camera in zip(points, cameras, strict=True)]
     if any(camera.projection != PERSPECTIVE for camera in cameras):
-        lines = np.hstack([bearings(x[pose.inliers], camera) for x, camera in zip(points, cameras, strict=True)])
-        return ray_seed(pose.R, pose.t, lines)
-    x1, x2 = (plane_points(x[pose.inliers], camera) for x, camera in zip(points, cameras, strict=True))
+        return ray_seed(pose.R, pose.t, np.hstack(lines))
+    x1, x2 = (one[:, :2] for one in lines)
     return two_view_seed(cross_matrix(pose.t) @ pose.R, x1, x2)
 
 

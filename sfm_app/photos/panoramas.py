@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from PIL.ExifTags import Base
 
-from sfm_app.camera.bearings import RAY, bearings, project
+from sfm_app.camera.bearings import bearings, project
 from sfm_app.camera.models import panorama_matrix
 from sfm_app.camera.perspective_views import PerspectiveView, cover_rays
+from sfm_app.camera.projection import RAY
 from sfm_app.photos.decode import DecodedPhoto, UnreadableError
 from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import EQUIRECTANGULAR, Calibration

@@ -14,7 +14,7 @@ from sfm_app.numerical import FAILURES
 from sfm_app.posegraph.look_alikes import find_look_alikes
 from sfm_app.posegraph.pair_pose import Pair, estimate_pose, is_in_front, pose_distances, refine_pose
 from sfm_app.posegraph.rotations import average_rotations, check_loops, connected_groups
-from sfm_app.types import EpipolarFit, Evidence, PairId, PoseGraph, RelativePose
+from sfm_app.types import EpipolarGeometry, Evidence, PairId, PoseGraph, RelativePose
 from sfm_app.types.arrays import FloatArray
 
 logger = logging.getLogger("sfm_app")
@@ -199,7 +199,7 @@ class _PoseEstimator:
         cameras = [self.evidence.camera(photo) for photo in pair]
         return Pair(self.evidence.matches.points(pair), cameras, self.options.max_error_px)
 
-    def from_fit(self, item: tuple[PairId, EpipolarFit]) -> RelativePose | str | None:
+    def from_fit(self, item: tuple[PairId, EpipolarGeometry]) -> RelativePose | str | None:
         try:
             return estimate_pose(self._pair(item[0]), item[1])
         except FAILURES as err:

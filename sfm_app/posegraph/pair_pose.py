@@ -24,7 +24,7 @@ from sfm_app.geometry.epipolar import (
 from sfm_app.geometry.least_squares import DECREASE, INCREASE, DampingRange
 from sfm_app.geometry.poses import POSE_DOF, retract, write_essential
 from sfm_app.jit import kernel
-from sfm_app.types import Calibration, EpipolarFit, RelativePose
+from sfm_app.types import Calibration, EpipolarFit, EpipolarGeometry, RelativePose
 from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import PERSPECTIVE
 
@@ -252,17 +252,18 @@ class Pair:
         self.max_error_px = max_error_px
         self.trusted = all(camera.is_estimated or camera.method == "exif" for camera in cameras)
 
-    def initial_pose(self, fit: EpipolarFit) -> Pose:
+    def initial_pose(self, fit: EpipolarGeometry) -> Pose:
         """Return R and t from F and the cameras, before refinement."""
         inliers, E = self.lines[fit.inliers], self.essential_matrix(fit)
         chosen = inliers[np.linspace(0, len(inliers) - 1, min(len(inliers), OPTIONS.sample_size)).astype(np.int64)]
         poses = decompose_essential(nearest_essential(E))
         return max(poses, key=lambda pose: int(np.count_nonzero(is_in_front(chosen, *pose))))
 
-    def essential_matrix(self, fit: EpipolarFit) -> FloatArray:
+    def essential_matrix(self, fit: EpipolarGeometry) -> FloatArray:
         """Return E from F and the cameras, with singular values that noise makes unequal."""
         (first, second), inliers = self.cameras, self.lines[fit.inliers]
-        if any(camera.projection != PERSPECTIVE for camera in self.cameras):  # by eight points with errors in pixels
+        is_wide = any(camera.projection != PERSPECTIVE for camera in self.cameras)
+        if is_wide or not isinstance(fit, EpipolarFit):  # by eight points with errors in pixels
             E = fit_rays(inliers[:, FIRST], inliers[:, SECOND])
             for _ in range(OPTIONS.reweighted_fits):
                 E = fit_rays(inliers[:, FIRST], inliers[:, SECOND], gradients(E, inliers) ** -2.0)
@@ -301,7 +302,7 @@ class Pair:
         return "planar" if on_plane >= OPTIONS.clear_share * len(used) else "calibrated"
 
 
-def estimate_pose(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
+def estimate_pose(pair: Pair, fit: EpipolarGeometry) -> RelativePose | None:
     """Estimate the relative pose of F; None if too few matches agree. With a guessed camera, the inliers of F stay."""
     R, t = pair.initial_pose(fit)
     if not pair.trusted:
@@ -311,7 +312,7 @@ def estimate_pose(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
     return pair.pose(R, t, inliers) if np.count_nonzero(inliers) >= OPTIONS.min_inliers else None
 
 
-def _refine_best_start(pair: Pair, fit: EpipolarFit, start: Pose) -> Pose:
+def _refine_best_start(pair: Pair, fit: EpipolarGeometry, start: Pose) -> Pose:
     """Return the refined pose that the inliers of F fit best, of those with the points in front of both cameras.
 
     Another start than F must be clearly better and lose no inliers: of the two poses that a plane allows, the wrong one

@@ -23,7 +23,7 @@ from sfm_app.selfcal.calibrate_pairs import undistort_pairs
 from sfm_app.selfcal.consensus import Consensus
 from sfm_app.selfcal.pairs import Pairs, prepare
 from sfm_app.selfcal.thesis.curves import center_curves, focal_curves
-from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchGraph, ViewGraph
+from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Intrinsics, MatchGraph, RayFit, ViewGraph
 from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE
 
@@ -451,7 +451,8 @@ def draw_intrinsics(path: Path, matches: MatchGraph, views: ViewGraph, intrinsic
     panels = []
     for name, camera in intrinsics.cameras.items():
         if own := [image for image in images if intrinsics.camera_name(image) == name]:
-            panels.append(Panel(name, camera, camera_pairs(own, matches, views)))
+            kind = EpipolarFit if camera.projection == PERSPECTIVE else RayFit
+            panels.append(Panel(name, camera, camera_pairs(own, matches, views, kind)))
     draw_calibration(path, sorted(panels, key=lambda panel: -len(panel.pairs.Fs)))
 
 

@@ -20,6 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
+from sfm_app.camera.projection import BEARING, RADIUS
 from sfm_app.fundamental.solvers import mirror
 from sfm_app.geometry.least_squares import DampingRange, damped_step, solve_each
 from sfm_app.geometry.poses import POSE_DOF, retract, write_essential
@@ -71,14 +72,14 @@ DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e8)
 
 @kernel
 def _distance(p: FloatArray, q: FloatArray, E: FloatArray) -> float:
-    """Return the distance r of the rays p of view 1 and q of view 2, each (7,) as `pairs.write_ray` writes it."""
+    """Return the distance r of the rays p of view 1 and q of view 2, each (10,) as `pairs.write_ray` writes it."""
     l0 = E[0, 0] * p[0] + E[0, 1] * p[1] + E[0, 2]
     l1 = E[1, 0] * p[0] + E[1, 1] * p[1] + E[1, 2]
     l2 = E[2, 0] * p[0] + E[2, 1] * p[1] + E[2, 2]
     k0 = E[0, 0] * q[0] + E[1, 0] * q[1] + E[2, 0]
     k1 = E[0, 1] * q[0] + E[1, 1] * q[1] + E[2, 1]
-    g0, g1 = p[2] * k0 + p[4] * k1, p[3] * k0 + p[5] * k1
-    h0, h1 = q[2] * l0 + q[4] * l1, q[3] * l0 + q[5] * l1
+    g0, g1 = p[3] * k0 + p[4] * k1, p[6] * k0 + p[7] * k1
+    h0, h1 = q[3] * l0 + q[4] * l1, q[6] * l0 + q[7] * l1
     return float((q[0] * l0 + q[1] * l1 + l2) / np.sqrt(g0 * g0 + g1 * g1 + h0 * h0 + h1 * h1 + 1e-300))
 
 
@@ -88,7 +89,7 @@ def distances(
 ) -> FloatArray:
     """Return (M,) signed Sampson distances; pair k has the matches ends[k] to ends[k + 1] - 1."""
     E, first, second = np.empty((3, 3)), np.empty(5), np.empty(5)
-    p, q = np.empty(7), np.empty(7)
+    p, q = np.empty(BEARING + 1), np.empty(BEARING + 1)
     signed = np.empty(len(matches))
     for k in range(len(poses)):
         write_essential(poses[k], E)
@@ -126,7 +127,7 @@ def pair_systems(
     A, b = np.zeros((len(poses), PAIR, PAIR)), np.zeros((len(poses), PAIR))
     # derivatives are finite differences: index 0 is unchanged, 1 to 5 have one parameter moved
     lenses, Es = np.empty((2, 1 + CAMERA, 5)), np.empty((1 + POSE_DOF, 3, 3))
-    rays, J = np.empty((2, 1 + CAMERA, 7)), np.empty(PAIR)
+    rays, J = np.empty((2, 1 + CAMERA, BEARING + 1)), np.empty(PAIR)
     for k in range(len(poses)):
         shared = cameras[k, 0] == cameras[k, 1]
         J[:] = 0.0
@@ -168,11 +169,11 @@ def _write_cameras(theta: FloatArray, lenses: FloatArray) -> None:
 
 @kernel
 def _write_rays(x: float, y: float, lenses: FloatArray, rays: FloatArray) -> None:
-    """Write the ray of a pixel through each of `lenses` (6, 5) into `rays` (6, 7); the first initializes the others."""
+    """Write the ray of a pixel through each of `lenses` (6, 5) into `rays` (6, 10); the first starts the others."""
     guess = -1.0
     for j in range(1 + CAMERA):
         write_ray(x, y, lenses[j], guess, rays[j])
-        guess = rays[0, 6]
+        guess = rays[0, RADIUS]
 
 
 @kernel

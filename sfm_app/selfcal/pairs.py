@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfm_app.camera.models import camera_matrix, guessed_camera_matrix
+from sfm_app.camera.projection import BEARING, CX, CY, FX, FY, K1, PERSPECTIVE, fold_radius, unproject_point
 from sfm_app.jit import kernel
 from sfm_app.types import Calibration, CameraPairs
 from sfm_app.types.arrays import FloatArray, IndexArray
@@ -126,74 +127,43 @@ def _distinct_indices(scaled: FloatArray) -> IndexArray:
     return np.array(sorted(first.values()), dtype=np.int64)
 
 
-# The lens, with one radial term (ours; the thesis has none), is COLMAP's SIMPLE_RADIAL: x_d = x_u (1 + k1 r_u^2)
-# about the optical center, r_u in focal lengths. While the focal is sought, its parameter is kappa = k1 / f^2, with f
-# and lengths in longer sides: the displacement of a point must not depend on the focal under trial.
+# The lens, with one radial term (ours; the thesis has none), is COLMAP's SIMPLE_RADIAL. While the focal is sought, its
+# parameter is kappa = k1 / f^2, with f and lengths in longer sides: the displacement of a point must not depend on the
+# focal under trial.
 
 LOG_FOCAL, CENTER_U, CENTER_V, LOG_ASPECT, KAPPA = range(5)
 """Parameters theta of a camera: log f with f = sqrt(fx fy), center from the middle, log fy/fx, kappa."""
 LEAST_SLOPE = 0.2
-"""Least slope of the distorted over the undistorted radius; a lens with less would fold, and is linear; by hand."""
+"""Least slope of the distorted over the undistorted radius: a lens that would fold goes on with it, so that distances
+do not jump while parameters change; by hand."""
 
 
 @kernel
 def write_camera(theta: FloatArray, camera: FloatArray) -> None:
-    """Write fx, fy, u, v, k1 of the parameters (5,) into `camera` (5,)."""
-    f, half = np.exp(theta[0]), np.exp(0.5 * theta[3])
-    camera[0], camera[1], camera[2], camera[3] = f / half, f * half, theta[1], theta[2]
-    camera[4] = theta[4] * f * f
-
-
-@kernel
-def undistort_radius(radius: float, k1: float, guess: float) -> float:
-    """Return the radius r_u of a distorted one, both in focal lengths, by Newton's method from `guess`."""
-    if k1 == 0.0 or radius < 1e-9:
-        return radius
-    if k1 < 0.0:
-        last = np.sqrt((LEAST_SLOPE - 1.0) / (3.0 * k1))
-        beyond = radius - last * (1.0 + k1 * last * last)
-        if beyond >= 0.0:
-            return float(last + beyond / LEAST_SLOPE)
-    r = guess
-    for _ in range(20):  # three or four are enough but for the strongest pincushions
-        slope = max(1.0 + 3.0 * k1 * r * r, LEAST_SLOPE)
-        step = (r * (1.0 + k1 * r * r) - radius) / slope
-        r -= step
-        if abs(step) < 1e-13:
-            break
-    return r
+    """Write fx, fy, cx, cy, k1 of the parameters (5,) into `camera` (5,)."""
+    f, half = np.exp(theta[LOG_FOCAL]), np.exp(0.5 * theta[LOG_ASPECT])
+    camera[FX], camera[FY], camera[CX], camera[CY] = f / half, f * half, theta[CENTER_U], theta[CENTER_V]
+    camera[K1] = theta[KAPPA] * f * f
 
 
 @kernel
 def write_ray(x: float, y: float, camera: FloatArray, guess: float, out: FloatArray) -> None:
-    """Write the point (a, b) of the plane z = 1 that the pixel x, y sees, its derivatives, and r_u.
-
-    `out` (7,) is a, b, da/dx, da/dy, db/dx, db/dy, r_u; `guess` is r_u of a similar camera, negative for none.
-    """
-    a, b = (x - camera[2]) / camera[0], (y - camera[3]) / camera[1]
-    r2 = a * a + b * b
-    radius, k1 = np.sqrt(r2), camera[4]
-    if guess < 0.0:
-        guess = radius / (1.0 + k1 * r2) if k1 > 0.0 else radius
-    r = undistort_radius(radius, k1, guess)
-    scale = r / radius if radius > 1e-9 else 1.0
-    radial = 1.0 / max(1.0 + 3.0 * k1 * r * r, LEAST_SLOPE)
-    bend = (radial - scale) / r2 if r2 > 1e-18 else 0.0
-    out[0], out[1] = scale * a, scale * b
-    out[2], out[3] = (scale + bend * a * a) / camera[0], bend * a * b / camera[1]
-    out[4], out[5] = bend * a * b / camera[0], (scale + bend * b * b) / camera[1]
-    out[6] = r
+    """Write the ray of a pixel through a camera (5,) into `out` (10,), as `camera.projection.unproject_point`."""
+    terms = (camera[K1], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    end = (fold_radius(terms, PERSPECTIVE, LEAST_SLOPE), LEAST_SLOPE, 1.0 / LEAST_SLOPE)
+    point = (x - camera[CX]) / camera[FX], (y - camera[CY]) / camera[FY]
+    unproject_point(point, (camera[FX], camera[FY]), terms, PERSPECTIVE, end, guess, out)
 
 
 @kernel
 def undistort_kernel(points: FloatArray, theta: FloatArray) -> FloatArray:
     """Return (N, 2) undistorted points of a camera (5,); both count from the middle of the photo."""
-    camera, out, straight = np.empty(5), np.empty(7), np.empty_like(points)
+    camera, out, straight = np.empty(5), np.empty(BEARING + 1), np.empty_like(points)
     write_camera(theta, camera)
     for i in range(len(points)):
         write_ray(points[i, 0], points[i, 1], camera, -1.0, out)
-        straight[i, 0] = out[0] * camera[0] + camera[2]
-        straight[i, 1] = out[1] * camera[1] + camera[3]
+        straight[i, 0] = out[0] * camera[FX] + camera[CX]
+        straight[i, 1] = out[1] * camera[FY] + camera[CY]
     return straight
 
 

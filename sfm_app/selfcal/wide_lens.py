@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.camera.models import camera_matrix, rays
+from sfm_app.camera import projection as families
+from sfm_app.camera.projection import RAY, Fisheye, image_rays
 from sfm_app.geometry.epipolar import FIRST, SECOND, decompose_essential, fit_rays, signed_distances, squared_distances
 from sfm_app.geometry.least_squares import damped_step, inverse_of_positive, solve_each
 from sfm_app.geometry.poses import POSE_DOF, retract, write_essential
@@ -31,8 +32,6 @@ STEP = 1e-6
 """Step of finite differences in parameters: curvature and rounding in double precision cost about 1e-6 of them."""
 RAY_STEP = 1e-5
 """The same in points, in longer sides: errors of about 1e-10 of the derivatives in double precision."""
-EQUIDISTANT_BELOW = 1e-6
-"""Exponents nearer to 0 are taken as 0: the series agree to double precision."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,56 +109,6 @@ REFINEMENT = LensRefinementOptions()
 
 
 @dataclass(frozen=True, slots=True)
-class Fisheye:
-    """A lens with one focal, in any unit of length.
-
-    A ray at the angle theta to the optical axis comes to lie at the radius, in focal lengths::
-
-        r = tan(e theta) / e (e > 0),    theta (e = 0),    sin(-e theta) / -e (e < 0).
-
-    e = 1 is a perspective lens, 1/2 stereographic, 0 equidistant, -1/2 equisolid, -1 orthographic. All have the same
-    scale about the center, the focal length.
-    """
-
-    focal: float
-    exponent: float
-    center: tuple[float, float] = (0.0, 0.0)
-
-    def radius(self, theta: FloatArray) -> FloatArray:
-        """Return the radius about the center of rays at angles `theta` (N,), in radians, to the optical axis."""
-        e = self.exponent
-        if abs(e) < EQUIDISTANT_BELOW:
-            return np.asarray(self.focal * theta, np.float64)
-        return np.asarray(self.focal * (np.tan(e * theta) / e if e > 0 else np.sin(-e * theta) / -e), np.float64)
-
-    def angle(self, radius: FloatArray) -> FloatArray:
-        """Return the angle to the optical axis, in radians; points beyond the image circle lie on it."""
-        r, e = np.asarray(radius) / self.focal, self.exponent
-        if abs(e) < EQUIDISTANT_BELOW:
-            return np.asarray(np.minimum(r, np.pi), np.float64)
-        angle = np.arctan(e * r) / e if e > 0 else np.arcsin(np.minimum(-e * r, 1.0)) / -e
-        return np.asarray(np.minimum(angle, np.pi), np.float64)
-
-    def rays(self, points: FloatArray) -> FloatArray:
-        """Return (N, 3) directions of length 1 of points (N, 2)."""
-        about = points - np.array(self.center)
-        radius = np.hypot(about[:, 0], about[:, 1])
-        theta = self.angle(radius)
-        along = np.divide(np.sin(theta), radius, out=np.full_like(radius, 1.0 / self.focal), where=radius > 0.0)
-        return np.column_stack([about * along[:, None], np.cos(theta)])
-
-    def project(self, rays: FloatArray) -> FloatArray:
-        """Return (N, 2) points of rays (N, 3) of any length."""
-        side = np.hypot(rays[:, 0], rays[:, 1])
-        radius = self.radius(np.arctan2(side, rays[:, 2]))
-        return rays[:, :2] * np.divide(radius, side, out=np.zeros_like(side), where=side > 0.0)[:, None] + self.center
-
-    def field_deg(self, width: float) -> float:
-        """Return the angle between the rays to both ends of a width about the center, in degrees."""
-        return float(2.0 * np.degrees(self.angle(np.array([0.5 * width]))[0]))
-
-
-@dataclass(frozen=True, slots=True)
 class RadialLens:
     """A perspective lens with one radial term, as COLMAP's SIMPLE_RADIAL, in any unit of length."""
 
@@ -169,8 +118,8 @@ class RadialLens:
 
     def rays(self, points: FloatArray) -> FloatArray:
         """Return (N, 3) directions of length 1 of points (N, 2)."""
-        plane = rays(points, camera_matrix(self.focal, self.focal, *self.center), self.radial)
-        directions = np.column_stack([plane, np.ones(len(plane))])
+        camera = np.array([self.focal, self.focal, *self.center, self.radial, *[0.0] * 7])
+        directions = image_rays(points, camera, families.PERSPECTIVE)[:, RAY]
         return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True), np.float64)
 
 
@@ -180,9 +129,8 @@ class Equirectangular:
 
     def rays(self, points: FloatArray) -> FloatArray:
         """Return (N, 3) directions of length 1 of points (N, 2)."""
-        longitude, latitude = 2.0 * np.pi * np.asarray(points, np.float64).T
-        level = np.cos(latitude)
-        return np.column_stack([level * np.sin(longitude), np.sin(latitude), level * np.cos(longitude)])
+        per_radian = 0.5 / np.pi
+        return image_rays(points, np.array([per_radian, per_radian, *[0.0] * 10]), families.PANORAMA)[:, RAY]
 
 
 Lens = Fisheye | RadialLens
@@ -529,8 +477,9 @@ def _fit_radial(lens: Fisheye, reach: float) -> tuple[float, float, float] | Non
     if theta[-1] >= SEARCH.widest_perspective:
         return None
     plain, radius = np.tan(theta), lens.radius(theta)
-    terms, *_ = np.linalg.lstsq(np.column_stack([plain, plain**3]), radius, rcond=None)
-    departure = float(np.max(np.abs(terms[0] * plain + terms[1] * plain**3 - radius)))
+    curves = np.column_stack([plain, plain**3])
+    terms, *_ = np.linalg.lstsq(curves, radius, rcond=None)
+    departure = float(np.max(np.abs(curves @ terms - radius)))
     return float(terms[0]), float(terms[1] / terms[0]), departure
 
 

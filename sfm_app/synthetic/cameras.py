@@ -10,10 +10,24 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sfm_app.camera.models import camera_matrix
+from sfm_app.camera.projection import (
+    FISHEYE,
+    OPTIONS,
+    PANORAMA,
+    PERSPECTIVE,
+    RAY,
+    Fisheye,
+    fold_radius,
+    image_points,
+    image_rays,
+    lens_terms,
+    radius_at,
+)
 from sfm_app.errors import ConfigError
 from sfm_app.types.arrays import FloatArray
 
-NEWTON_STEPS = 100
+CURVES = {"stereographic": 0.5, "equisolid": -0.5}
+"""Projections that are none of COLMAP's, and their exponents in `Fisheye`."""
 PROJECTIONS = ("perspective", "stereographic", "equidistant", "equisolid", "equirectangular")
 
 
@@ -29,13 +43,15 @@ class Lens:
     projection: str = "perspective"
     """One of `PROJECTIONS`."""
     radial: tuple[float, ...] = ()
-    """k1, k2, ...: with "perspective" those of COLMAP's OPENCV, with "equidistant" of its OPENCV_FISHEYE."""
+    """k1, k2, ...: of "equidistant" at most the four of COLMAP's OPENCV_FISHEYE, else three as of its FULL_OPENCV."""
     tangential: tuple[float, float] = (0.0, 0.0)
     """p1, p2."""
 
     def __post_init__(self) -> None:
         if self.projection not in PROJECTIONS:
             raise ConfigError(f"synthetic lens: unknown projection {self.projection}", hint=", ".join(PROJECTIONS))
+        if len(self.radial) > (most := 4 if self.projection == "equidistant" else 3):
+            raise ConfigError(f"synthetic lens: {self.projection} has at most {most} radial terms")
 
     @property
     def k1(self) -> float:
@@ -44,89 +60,39 @@ class Lens:
 
     def rays(self, points: FloatArray) -> FloatArray:
         """Return directions (N, 3) of image points (N, 2), z = 1 with "perspective", else of length 1; NaN without."""
-        if self.projection == "equirectangular":
-            longitude, latitude = points.T
-            level = np.cos(latitude)
-            return np.column_stack([level * np.sin(longitude), np.sin(latitude), level * np.cos(longitude)])
-        plain = self._undistort(points)
-        if self.projection == "perspective":
-            return np.column_stack([plain, np.ones(len(plain))])
-        radius = np.hypot(*plain.T)
-        theta = self._angle(radius)
-        scale = np.divide(np.sin(theta), radius, out=np.ones_like(radius), where=radius > 0)
-        return np.column_stack([plain * scale[:, None], np.cos(theta)])
+        family, params = self._family, self._params
+        rays = image_rays(points, params, family)[:, RAY]
+        if family == PANORAMA:
+            return rays
+        fold = fold_radius(lens_terms(params), family, 0.0)
+        last = np.array([fold if family == FISHEYE else np.arctan(fold)])
+        hidden = np.hypot(*points.T) > radius_at(last, params, family)
+        if hidden.any() and fold < (np.pi if family == FISHEYE else OPTIONS.most_radius):
+            terms = ", ".join(f"{k:g}" for k in self.radial)
+            raise ConfigError(f"synthetic camera: a radial distortion of {terms} folds within the photo")
+        if self.projection in CURVES:
+            curve, plane = Fisheye(1.0, CURVES[self.projection]), rays[:, :2]
+            hidden = np.hypot(*plane.T) > curve.radius(np.array([np.pi]))
+            rays = curve.rays(plane)
+        return np.where(hidden[:, None], np.nan, rays)
 
     def project(self, rays: FloatArray) -> FloatArray:
         """Return image points (N, 2) of rays (N, 3) of any length; with "perspective", in front of the camera."""
-        side = np.hypot(rays[:, 0], rays[:, 1])
-        if self.projection == "equirectangular":
-            level = np.hypot(rays[:, 0], rays[:, 2])
-            return np.column_stack([np.arctan2(rays[:, 0], rays[:, 2]), np.arctan2(rays[:, 1], level)])
-        radius = self._radius(np.arctan2(side, rays[:, 2]))
-        plain = rays[:, :2] * np.divide(radius, side, out=np.zeros_like(side), where=side > 0)[:, None]
-        return plain * self._factor(np.hypot(*plain.T))[:, None] + self._shift(plain)
+        if self.projection in CURVES:
+            plane = Fisheye(1.0, CURVES[self.projection]).project(rays)
+            rays = np.column_stack([plane, np.ones(len(plane))])
+        return image_points(rays, self._params, self._family)
 
-    def _radius(self, theta: FloatArray) -> FloatArray:
-        if self.projection == "perspective":
-            return np.asarray(np.tan(theta))
-        if self.projection == "stereographic":
-            return np.asarray(2.0 * np.tan(theta / 2.0))
-        return theta if self.projection == "equidistant" else np.asarray(2.0 * np.sin(theta / 2.0))
+    @property
+    def _family(self) -> int:
+        """Family of the camera; of a lens in `CURVES`, that of its distortion."""
+        return {"equidistant": FISHEYE, "equirectangular": PANORAMA}.get(self.projection, PERSPECTIVE)
 
-    def _angle(self, radius: FloatArray) -> FloatArray:
-        if self.projection == "stereographic":
-            return np.asarray(2.0 * np.arctan(radius / 2.0))
-        if self.projection == "equidistant":
-            return np.where(radius <= math.pi, radius, np.nan)
-        with np.errstate(invalid="ignore"):
-            return np.asarray(2.0 * np.arcsin(radius / 2.0))
-
-    def _factor(self, radius: FloatArray, slope: bool = False) -> FloatArray:
-        """Return the distorted over the undistorted radius, or its derivative by the undistorted one."""
-        total = np.ones_like(radius)
-        for power, k in enumerate(self.radial, start=1):
-            total += (2 * power + 1 if slope else 1) * k * radius ** (2 * power)
-        return total
-
-    def _shift(self, plain: FloatArray) -> FloatArray:
-        (p1, p2), (x, y) = self.tangential, plain.T
-        square = x * x + y * y
-        return np.column_stack(
-            [2.0 * p1 * x * y + p2 * (square + 2.0 * x * x), p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y]
-        )
-
-    def _undistort(self, points: FloatArray) -> FloatArray:
-        if not any(self.tangential):
-            return self._undistort_radius(points)
-        plain = points
-        for _ in range(NEWTON_STEPS):
-            before, plain = plain, self._undistort_radius(points - self._shift(plain))
-            if np.max(np.abs(plain - before), initial=0.0) < 1e-14:
-                break
-        return plain
-
-    def _undistort_radius(self, points: FloatArray) -> FloatArray:
-        """Return (N, 2) points without the radial terms, on the branch through the center."""
-        distorted = np.hypot(points[:, 0], points[:, 1])
-        r = distorted.copy()
-        if any(self.radial):
-            self._check_fold(float(distorted.max(initial=0.0)))
-        for _ in range(NEWTON_STEPS if any(self.radial) else 0):
-            step = (r * self._factor(r) - distorted) / np.maximum(
-                self._factor(r, slope=True), 1e-3
-            )  # finite near the fold
-            r -= step
-            if np.all(np.abs(step) <= 2.0 * np.finfo(np.float64).eps * r):
-                break
-        return points * np.divide(r, distorted, out=np.ones_like(r), where=distorted > 0)[:, None]
-
-    def _check_fold(self, largest: float) -> None:
-        """Check that the distorted radius grows with the undistorted one up to the largest of the photo."""
-        radius = np.linspace(0.0, 4.0 * max(largest, 1e-9), 100_001)
-        ends = np.flatnonzero(self._factor(radius, slope=True) <= 0.0)
-        if len(ends) and (radius * self._factor(radius))[ends[0]] <= largest:
-            terms = ", ".join(f"{k:g}" for k in self.radial)
-            raise ConfigError(f"synthetic camera: a radial distortion of {terms} folds within the photo")
+    @property
+    def _params(self) -> FloatArray:
+        """(12,) of a camera with the focal length 1."""
+        k1, k2, k3, k4 = (*self.radial, 0.0, 0.0, 0.0, 0.0)[:4]
+        return np.array([1.0, 1.0, 0.0, 0.0, k1, k2, *self.tangential, k3, k4, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,7 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.camera.perspective_views import PerspectiveView
-from sfm_app.camera.projection import FISHEYE, PERSPECTIVE, shown_angle
+from sfm_app.camera.projection import (
+    CX,
+    CY,
+    FISHEYE,
+    FX,
+    FY,
+    PERSPECTIVE,
+    distort_point,
+    lens_terms,
+    plane_point,
+    radial_factor,
+    shown_angle,
+)
 from sfm_app.errors import ReconstructionError
 from sfm_app.jit import kernel
 from sfm_app.types import CameraModel
@@ -132,47 +144,30 @@ def _largest_angle(camera: FloatArray, width: float, height: float) -> float:
 @kernel
 def project(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Project a world point through a camera row: pixel, and depth or, of a fisheye, distance; 0 if invisible."""
-    depth = camera[22] * x + camera[23] * y + camera[24] * z + camera[25]
-    u = camera[14] * x + camera[15] * y + camera[16] * z + camera[17]
-    v = camera[18] * x + camera[19] * y + camera[20] * z + camera[21]
+    Z = camera[22] * x + camera[23] * y + camera[24] * z + camera[25]
+    X = camera[14] * x + camera[15] * y + camera[16] * z + camera[17]
+    Y = camera[18] * x + camera[19] * y + camera[20] * z + camera[21]
     if camera[KIND] == ANGULAR:
-        return _project_fisheye(camera, u, v, depth)
-    if depth <= 0.0:
-        return 0.0, 0.0, 0.0
-    u, v = u / depth, v / depth
-    k1, k2, p1, p2 = camera[4], camera[5], camera[6], camera[7]
-    r2 = u * u + v * v
-    if camera[KIND] == RATIONAL:
-        if r2 > camera[LIMIT]:
+        if X == 0.0 and Y == 0.0 and Z <= 0.0:
             return 0.0, 0.0, 0.0
-        radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * camera[8]))) / (
-            1.0 + r2 * (camera[9] + r2 * (camera[10] + r2 * camera[11]))
-        )
-    else:
-        # derivative of the distorted radius: near 0, the distortion folds
-        if 1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2) < 0.1:
-            return 0.0, 0.0, 0.0
-        radial = 1.0 + r2 * (k1 + k2 * r2)
-    ud = u * radial + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u)
-    vd = v * radial + 2.0 * p2 * u * v + p1 * (r2 + 2.0 * v * v)
-    return camera[0] * ud + camera[2], camera[1] * vd + camera[3], depth
+        return _through_lens(camera, FISHEYE, X, Y, Z, np.sqrt(X * X + Y * Y + Z * Z))
+    return _through_lens(camera, PERSPECTIVE, X, Y, Z, Z) if Z > 0.0 else (0.0, 0.0, 0.0)
 
 
 @kernel
-def _project_fisheye(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Project a point in the camera frame through COLMAP's THIN_PRISM_FISHEYE; see `project`."""
-    side = np.hypot(x, y)
-    theta = np.arctan2(side, z)
-    r2 = theta * theta
-    if r2 > camera[LIMIT] or (side == 0.0 and z <= 0.0):
+def _through_lens(
+    camera: FloatArray, family: int, X: float, Y: float, Z: float, depth: float
+) -> tuple[float, float, float]:
+    """Project a point of the camera's frame at a depth; see `project`."""
+    u, v = plane_point(X, Y, Z, family)
+    r2 = u * u + v * v
+    terms = lens_terms(camera)
+    factor, slope, _ = radial_factor(r2, terms, family)
+    # near 0, the derivative of the distorted radius: the lens folds
+    if r2 > camera[LIMIT] or (camera[KIND] == OPENCV and factor + 2.0 * r2 * slope < 0.1):
         return 0.0, 0.0, 0.0
-    gain = theta / side if side > 0.0 else 0.0
-    u, v = gain * x, gain * y
-    p1, p2 = camera[6], camera[7]
-    radial = 1.0 + r2 * (camera[4] + r2 * (camera[5] + r2 * (camera[8] + r2 * camera[9])))
-    ud = u * radial + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u) + camera[10] * r2
-    vd = v * radial + 2.0 * p2 * u * v + p1 * (r2 + 2.0 * v * v) + camera[11] * r2
-    return camera[0] * ud + camera[2], camera[1] * vd + camera[3], np.hypot(side, z)
+    x, y = distort_point(u, v, factor, terms, family)
+    return camera[FX] * x + camera[CX], camera[FY] * y + camera[CY], depth
 
 
 @kernel

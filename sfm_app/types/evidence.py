@@ -16,26 +16,47 @@ from sfm_app.types.photos import MatchGraph, PairId
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class EpipolarFit:
-    """A fundamental matrix with its evidence."""
+class EpipolarGeometry:
+    """The matrix of a pair with its evidence: an `EpipolarFit` or a `RayFit`."""
 
-    F: NDArray[np.float64]
-    """(3, 3), rank 2, Frobenius norm 1; x2' F x1 = 0 in pixels, or of bearing vectors where a lens is known before (see
-    `ViewGraph.lenses`)."""
+    matrix: NDArray[np.float64]
+    """(3, 3), rank 2, Frobenius norm 1."""
     inliers: NDArray[np.bool_]
-    """(N,) per match: within the threshold of the returned F."""
+    """(N,) per match: within the threshold of the matrix."""
     priors: NDArray[np.float64]
     """(N,) in [0, 1] per match: its validity according to the estimator; p(v_i) of the thesis, largest value 1."""
     trials: int
     rms_px: float
     """Root mean square Sampson distance of the inliers."""
     degeneracy: str = ""
-    """Why F is not determined by these matches ("collinear", "planar", "rotation"); empty when it is."""
+    """Why the matches do not determine it ("collinear", "planar", "rotation"); empty when they do."""
 
     @property
     def inlier_count(self) -> int:
-        """Number of matches that agree with F."""
+        """Number of matches that agree with the matrix."""
         return int(np.count_nonzero(self.inliers))
+
+
+class EpipolarFit(EpipolarGeometry):
+    """A fundamental matrix with its evidence."""
+
+    __slots__ = ()
+
+    @property
+    def F(self) -> NDArray[np.float64]:
+        """(3, 3), rank 2, Frobenius norm 1; x2' F x1 = 0 in pixels."""
+        return self.matrix
+
+
+class RayFit(EpipolarGeometry):
+    """An essential matrix of known lenses with its evidence, where one is wide and F does not exist."""
+
+    __slots__ = ()
+
+    @property
+    def E(self) -> NDArray[np.float64]:
+        """(3, 3), Frobenius norm 1; q' E p = 0 for bearing vectors p of view 1 and q of view 2."""
+        return self.matrix
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +73,13 @@ class Rejected:
 class ViewGraph:
     """One epipolar geometry, or the reason for its absence, for every matched pair."""
 
-    fits: Mapping[PairId, EpipolarFit]
+    fits: Mapping[PairId, EpipolarGeometry]
     rejected: Mapping[PairId, Rejected]
     lenses: Mapping[str, Calibration] = field(default_factory=dict)
-    """Cameras with a wide lens, by camera group, estimated from curved epipolar lines. The F of their pairs are of
-    bearing vectors."""
+    """Cameras with a wide lens, by camera group, estimated from curved epipolar lines; their pairs have a `RayFit`."""
 
     @property
-    def results(self) -> dict[PairId, EpipolarFit | Rejected]:
+    def results(self) -> dict[PairId, EpipolarGeometry | Rejected]:
         """The fit of every pair, or the reason for its absence."""
         return {**self.fits, **self.rejected}
 
@@ -73,7 +93,8 @@ class ViewGraph:
         fits = list(self.fits.values())
         return {
             "pairs": np.array(list(self.fits), np.uint32).reshape(-1, 2),
-            "F": np.array([fit.F for fit in fits]).reshape(-1, 3, 3),
+            "matrices": np.array([fit.matrix for fit in fits]).reshape(-1, 3, 3),
+            "of_rays": np.array([isinstance(fit, RayFit) for fit in fits], np.bool_),
             "match_counts": np.array([len(fit.inliers) for fit in fits], np.int64),
             "inliers": np.concatenate([fit.inliers for fit in fits] or [np.zeros(0, bool)]),
             "priors": np.concatenate([fit.priors for fit in fits] or [np.zeros(0)]),
@@ -91,14 +112,16 @@ class ViewGraph:
         """Rebuild from `to_arrays`."""
         cuts = np.cumsum(arrays["match_counts"])
         columns = (
-            arrays["F"],
+            arrays["matrices"],
             np.split(arrays["inliers"], cuts)[:-1],
             np.split(arrays["priors"], cuts)[:-1],
             arrays["trials"].tolist(),
             arrays["rms_px"].tolist(),
             arrays["degeneracy"].tolist(),
         )
-        fits = {_pair(row): EpipolarFit(*values) for row, *values in zip(arrays["pairs"], *columns, strict=True)}
+        kinds = [RayFit if of_rays else EpipolarFit for of_rays in arrays["of_rays"]]
+        rows = zip(kinds, arrays["pairs"], *columns, strict=True)
+        fits = {_pair(row): kind(*values) for kind, row, *values in rows}
         rejected = zip(arrays["rejected_pairs"], arrays["rejected_reasons"].tolist(), strict=True)
         lenses = {
             group: Calibration.from_dict(json.loads(text))

@@ -11,8 +11,9 @@ from hypothesis import given as given_values
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from sfm_app.camera.bearings import RAY, bearings
+from sfm_app.camera.bearings import bearings
 from sfm_app.camera.models import PARAMETERS, calibration_from_model
+from sfm_app.camera.projection import RAY
 from sfm_app.camera_files import MODEL_IDS, read_given_cameras
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.errors import InputError

@@ -12,12 +12,12 @@ import numpy as np
 import psutil
 import pytest
 
-from sfm_app.jit import PARENT, kernel, summing_kernel, warming_up
+from sfm_app.jit import PARENT, inlined_kernel, kernel, summing_kernel, warming_up
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize("decorator", [kernel, summing_kernel])
+@pytest.mark.parametrize("decorator", [inlined_kernel, kernel, summing_kernel])
 def test_a_kernel_compiles_where_nothing_can_be_cached(monkeypatch, decorator):
     real = numba.njit
 

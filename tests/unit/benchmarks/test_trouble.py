@@ -50,7 +50,8 @@ def test_what_is_called_a_guess_is_not_wrong(tmp_path):
 
 def folder_row(seed=1, troubles="plane, zoom", **figures):
     fine = {
-        "method": "sfm-app", "photos": f"{seed:05d}", "seed": seed, "troubles": troubles, "exit code": 0, "last": "", "placed": "6/6", "share placed": 1.0,
+        "method": "sfm-app", "photos": f"{seed:05d}", "seed": seed,
+        "troubles": troubles, "exit code": 0, "last": "", "placed": "6/6", "share placed": 1.0,
         "AUC@5": 0.8, "known": "6/6", "focal %": 0.5, "wrong": 0, "known after": "6/6", "focal % after": 0.4,
         "wrong after": 0, "stated": 4, "beyond 3 sd": 0, "worst in sd": 1.0,
     }  # fmt: skip

@@ -4,8 +4,18 @@ import numpy as np
 import pytest
 
 from sfm_app.camera import bearings
-from sfm_app.camera.models import calibration_from_model, camera_matrix, panorama_matrix, rays
-from sfm_app.camera.projection import project_points
+from sfm_app.camera.models import calibration_from_model, camera_matrix, panorama_matrix
+from sfm_app.camera.projection import (
+    FISHEYE,
+    K1,
+    OPTIONS,
+    PERSPECTIVE,
+    RAY,
+    fold_radius,
+    image_points,
+    image_rays,
+    lens_terms,
+)
 from sfm_app.types import Calibration
 
 K = np.array([[200.0, 0.0, 400.0], [0.0, 210.0, 300.0], [0.0, 0.0, 1.0]])
@@ -43,7 +53,7 @@ def test_a_fisheye_looks_backwards() -> None:
 
 def test_a_lens_that_folds_shows_nothing_beyond_its_fold() -> None:
     folding = Calibration(K, 800, 600, "test", True, projection="fisheye", fisheye=(-0.2, 0.0, 0.0, 0.0))
-    fold = bearings.fold_angle(folding)
+    fold = fold_radius((-0.2, *[0.0] * 7), FISHEYE, OPTIONS.least_slope)
     assert 1.1 < fold < np.sqrt(1.0 / 0.6)
     for theta, seen in ((fold - 0.05, True), (fold + 0.05, False)):
         assert np.isfinite(bearings.project(np.array([[np.sin(theta), 0.0, np.cos(theta)]]), folding)).all() == seen
@@ -55,38 +65,34 @@ def test_a_perspective_camera_sees_nothing_behind_it_and_its_scale_is_its_mean_f
 
 
 TERMS = np.array([-0.1, 0.02, 0.001, -0.002, 0.01, 0.02, -0.001, 0.001])
-FAMILIES = {"perspective": 0, "fisheye": 1}
 
 
-@pytest.mark.parametrize("projection", FAMILIES)
-def test_undistortion_inverts_the_projection_of_bundle_adjustment(projection):
+@pytest.mark.parametrize("family", [PERSPECTIVE, FISHEYE])
+@pytest.mark.parametrize("shift", [0.0, 1.0])
+def test_a_ray_comes_back_through_all_terms(family, shift):
     points = np.random.default_rng(0).uniform([-0.8, -0.8, 1.0], [0.8, 0.8, 1.2], (200, 3))
-    params = np.tile([1.0, 1.0, 0.0, 0.0, *TERMS], (200, 1))
-    x = project_points(points, params, np.full(200, FAMILIES[projection])).x
-    w = bearings.undistort(x, TERMS, projection)
-    side = np.hypot(points[:, 0], points[:, 1])
-    length = np.arctan2(side, points[:, 2]) if projection == "fisheye" else side / points[:, 2]
-    assert np.abs(w - points[:, :2] * (length / side)[:, None]).max() < 1e-9
+    terms = TERMS * [1.0, 1.0, shift, shift, 1.0, 1.0, *([shift] * 2 if family == FISHEYE else [1.0] * 2)]
+    camera = np.array([1.0, 1.0, 0.0, 0.0, *terms])
+    rays = image_rays(image_points(points, camera, family), camera, family)[:, :3]
+    length = points[:, 2] if family == PERSPECTIVE else np.linalg.norm(points, axis=1)
+    assert np.abs(rays - points / length[:, None]).max() < 1e-13
 
 
 def test_points_beyond_the_fold_lie_on_it():
-    terms = np.array([-0.3, *[0.0] * 7])
-    fold = bearings.fold_radius(terms, "perspective")
-    assert 0.95 < fold / np.sqrt(1.0 / 0.9) <= 1.0
-    w = bearings.undistort(np.array([[0.5, 0.0], [5.0, 0.0]]), terms, "perspective")
-    assert w[1, 0] == pytest.approx(fold, rel=1e-6)
-    assert w[0, 0] * float(bearings.radial_factor(w[:1, 0], terms, "perspective")[0]) == pytest.approx(0.5)
+    camera = np.array([1.0, 1.0, 0.0, 0.0, -0.3, *[0.0] * 7])
+    fold = fold_radius(lens_terms(camera), PERSPECTIVE, 0.0)
+    assert fold == pytest.approx(np.sqrt(1.0 / 0.9))
+    inside, beyond = image_rays(np.array([[0.5, 0.0], [5.0, 0.0]]), camera, PERSPECTIVE)[:, 0]
+    assert 0.95 < beyond / fold < 1.0
+    assert inside * (1.0 - 0.3 * inside**2) == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("projection", FAMILIES)
-@pytest.mark.parametrize("shifted", [False, True])
-def test_steps_end_where_more_of_them_change_nothing(projection, shifted, monkeypatch):
-    terms = TERMS * ([1.0] * 8 if shifted else [1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
-    points = np.random.default_rng(1).uniform(-1.5, 1.5, (500, 2))
-    monkeypatch.setattr(bearings, "OPTIONS", bearings.UndistortionOptions(precision=0.0))
-    exact = bearings.undistort(points, terms, projection)
-    monkeypatch.undo()
-    assert np.abs(bearings.undistort(points, terms, projection) - exact).max() <= 1e-14
+@pytest.mark.parametrize("more", [0.0, 1e-9])
+@pytest.mark.parametrize("family", [PERSPECTIVE, FISHEYE])
+def test_a_fold_is_found_with_one_term_and_with_many(family, more):
+    # the slope is 1 - 0.9 r^2
+    assert fold_radius((-0.3, more, *[0.0] * 6), family, 0.1) == pytest.approx(1.0, abs=1e-7)
+    assert fold_radius((0.3, more, *[0.0] * 6), family, 0.1) >= np.pi
 
 
 SIZE = (1000, 800)
@@ -108,7 +114,7 @@ def model(name, *params):
 )
 def test_the_curve_is_that_of_the_rays(camera):
     x = np.column_stack([np.linspace(500.0, 990.0, 40), np.full(40, 400.0)])
-    rays = bearings.bearings(x, camera)[:, bearings.RAY]
+    rays = bearings.bearings(x, camera)[:, RAY]
     radius = bearings.radius_px(np.arctan2(rays[:, 0], rays[:, 2]), camera)
     assert np.abs(radius - (x[:, 0] - 500.0)).max() < 1e-6
 
@@ -144,7 +150,7 @@ def test_deviations_of_focal_and_k1_add_up():
     assert bearings.radius_deviation_px(theta, model("SIMPLE_PINHOLE", 500.0, 500.0, 400.0)) == pytest.approx([0.0])
 
 
-RAY_K = camera_matrix(900.0, 850.0, 480.0, 330.0)
+RAY_CAMERA = np.array([900.0, 850.0, 480.0, 330.0, *[0.0] * 8])
 
 
 @pytest.mark.parametrize("radial", [-0.3, -0.05, 0.0, 0.2, 1.5])
@@ -152,5 +158,6 @@ def test_rays_come_back_through_the_lens(radial):
     straight = np.random.default_rng(0).uniform(-0.55, 0.55, (200, 2))
     straight[0] = 0.0
     bent = straight * (1 + radial * (straight**2).sum(axis=1, keepdims=True))
-    found = rays(bent * [900, 850] + [480, 330], RAY_K, radial)
+    camera = RAY_CAMERA + radial * (np.arange(12) == K1)
+    found = image_rays(bent * [900, 850] + [480, 330], camera, PERSPECTIVE)[:, :2]
     assert np.allclose(found, straight, atol=1e-10)

@@ -7,6 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_app.bundle.normal_equations import REDUCTION, Bundle, apply_step, project, reduce, residuals
+from sfm_app.camera.bearings import bearings
+from sfm_app.camera.models import FAMILIES, PARAMETERS, calibration_from_model, row_of_calibration
 from sfm_app.camera.projection import (
     CAMERA,
     FISHEYE,
@@ -14,6 +16,7 @@ from sfm_app.camera.projection import (
     PERSPECTIVE,
     angle_limit,
     image_points,
+    image_rays,
     project_points,
     radius_at,
 )
@@ -52,6 +55,27 @@ def test_points_come_to_lie_where_colmap_puts_them(family):
     camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=params)
     found = projected(points, CAMERAS[family], family).x
     assert found == pytest.approx(np.asarray(camera.img_from_cam(points)), abs=1e-6)
+
+
+VALUES = {"f": 800.0, "fx": 800.0, "fy": 810.0, "cx": 510.0, "cy": 390.0, "k1": -0.05, "k2": 0.02, "p1": 1e-3}
+VALUES |= {"p2": -2e-3, "k3": 0.004, "k4": -0.002, "k5": 0.01, "k6": 0.003, "sx1": 2e-3, "sy1": -1e-3, "w": 1000.0}
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_pixels_and_rays_are_those_of_colmap(name):
+    size = (1000, 500 if name == "EQUIRECTANGULAR" else 800)
+    params = [(VALUES | {"h": 500.0})[key] for key in PARAMETERS[name]]
+    truth = pycolmap.Camera(
+        model=pycolmap.CameraModelId.__members__[name], width=size[0], height=size[1], params=params
+    )
+    camera = calibration_from_model(name, params, size)
+    row, family = row_of_calibration(camera), FAMILIES[camera.projection]
+    x = np.random.default_rng(3).uniform(0.0, size, (300, 2))
+    rays = image_rays(x, row, family)[:, :3]
+    expected = np.asarray(truth.cam_ray_from_img(x))
+    assert rays / np.linalg.norm(rays, axis=1)[:, None] == pytest.approx(expected, abs=1e-9)
+    assert image_points(expected, row, family) == pytest.approx(np.asarray(truth.img_from_cam(expected)), abs=1e-9)
+    assert bearings(x, camera)[:, :3] == pytest.approx(rays, abs=1e-15)
 
 
 def test_positions_without_derivatives_are_the_same_for_cameras_of_all_families():

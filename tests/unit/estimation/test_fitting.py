@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.camera.bearings import fisheye_radius, project
+from sfm_app.camera.bearings import project, radius_px
+from sfm_app.camera.projection import Fisheye
 from sfm_app.errors import ConfigError
 from sfm_app.estimation.calibrating import find_intrinsics
 from sfm_app.estimation.fitting import describe_lens, find_lenses, ray_estimator, to_calibration
@@ -15,10 +16,10 @@ from sfm_app.products import read_view_graph
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
-from sfm_app.selfcal.wide_lens import Fisheye, LensEstimate
+from sfm_app.selfcal.wide_lens import LensEstimate
 from sfm_app.settings import Settings
 from sfm_app.stages import view_graph
-from sfm_app.types import Calibration, EpipolarFit, GivenCameras, MatchedImage, MatchGraph, Rejected
+from sfm_app.types import Calibration, GivenCameras, MatchedImage, MatchGraph, RayFit, Rejected
 
 SIZE = (960, 640)
 K = np.array([[270.0, 0.0, 485.0], [0.0, 270.0, 316.0], [0.0, 0.0, 1.0]])
@@ -59,7 +60,7 @@ def test_a_fisheye_is_found_before_fundamental_matrices_and_becomes_the_camera(r
     camera = intrinsics.main
     assert (camera.projection, camera.method, camera.identifiable) == ("fisheye", "lens", True)
     theta = np.linspace(0.1, 1.6, 20)
-    assert np.abs(camera.focal_px * fisheye_radius(theta, camera) - 270.0 * theta).max() < 0.003 * SIZE[0]
+    assert np.abs(radius_px(theta, camera) - 270.0 * theta).max() < 0.003 * SIZE[0]
     assert all(fit.inlier_count > 200 for fit in views.fits.values())
 
 
@@ -135,7 +136,7 @@ def test_four_terms_describe_every_lens_of_the_family(exponent):
     estimate = LensEstimate(lens, tuple(map(tuple, (np.eye(4) * 1e-8).tolist())), 0.9, 0.4, 12, SIZE)
     camera = to_calibration(estimate, SIZE)
     theta = np.linspace(0.0, np.radians(87.0), 100)
-    assert np.abs(camera.focal_px * fisheye_radius(theta, camera) - lens.radius(theta)).max() < 0.05
+    assert np.abs(radius_px(theta, camera) - lens.radius(theta)).max() < 0.05
     assert camera.identifiable and "174 degrees" in describe_lens(camera)
 
 
@@ -150,6 +151,6 @@ def test_pairs_of_a_wide_lens_and_another_camera_are_fitted_by_rays():
     assert ray_estimator([plain, plain], {"wide": WIDE}) is None
     fit = ray_estimator([wide, plain], {"wide": WIDE})
     matches = photos_through(WIDE, 2)
-    assert fit is not None and isinstance(fit(*matches.points((1, 2)), Settings().epipolar, 0), (EpipolarFit, Rejected))
+    assert fit is not None and isinstance(fit(*matches.points((1, 2)), Settings().epipolar, 0), (RayFit, Rejected))
     both = ray_estimator([wide, wide], {"wide": WIDE})
-    assert both is not None and isinstance(both(*matches.points((1, 2)), Settings().epipolar, 0), EpipolarFit)
+    assert both is not None and isinstance(both(*matches.points((1, 2)), Settings().epipolar, 0), RayFit)

@@ -16,7 +16,7 @@ from sfm_app.fundamental.recipes import RECIPES, median_sigma, recipe_estimator
 from sfm_app.geometry.epipolar import cross_matrix, decompose_essential, sampson_distance
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
-from sfm_app.types import Calibration, EpipolarFit, Rejected
+from sfm_app.types import Calibration, EpipolarFit, RayFit, Rejected
 from tests.unit.fundamental.conftest import UNIT, plane_scene
 
 OPTIONS = EpipolarSettings(max_error_px=1.96, max_trials=20_000)
@@ -154,10 +154,10 @@ def turn_error_deg(E):
 def test_right_matches_are_told_from_wrong_ones(seed, wrong):
     x1, x2 = matches_of(seed, wrong=wrong)
     found = fit_lev_ransac_rays(lines_of(x1, x2), DEFAULTS, seed)
-    assert isinstance(found, EpipolarFit) and found.degeneracy == ""
+    assert isinstance(found, RayFit) and found.degeneracy == ""
     assert 0.93 < found.inliers[:200].mean() <= 1.0
     assert wrong == 0 or 0.0 < found.inliers[200:].mean() < 0.08
-    assert 0.0 < turn_error_deg(found.F) < 1.0
+    assert 0.0 < turn_error_deg(found.E) < 1.0
     assert 0.2 < found.rms_px < 0.7
 
 
@@ -171,12 +171,12 @@ def test_pixels_lose_what_rays_keep():
 def test_same_seed_same_result():
     lines = lines_of(*matches_of())
     first, second = (fit_lev_ransac_rays(lines, DEFAULTS, 5) for _ in range(2))
-    assert np.array_equal(first.F, second.F) and np.array_equal(first.inliers, second.inliers)
+    assert np.array_equal(first.E, second.E) and np.array_equal(first.inliers, second.inliers)
 
 
 def test_a_turn_on_the_spot_is_named():
     found = fit_lev_ransac_rays(lines_of(*matches_of(wrong=0, t=np.zeros(3))), DEFAULTS, 0)
-    assert isinstance(found, EpipolarFit) and found.degeneracy == "rotation"
+    assert isinstance(found, RayFit) and found.degeneracy == "rotation"
 
 
 @pytest.mark.parametrize("count", [0, 5, 15, 300])
@@ -198,6 +198,6 @@ def test_equal_matches_count_once():
 def test_priors_tell_how_far_matches_move_the_fit():
     x1, x2 = matches_of(wrong=50)
     lines = lines_of(x1, x2)
-    chances = validity(lines, fit_lev_ransac_rays(lines, DEFAULTS, 0).F, DEFAULTS.max_error_px)
+    chances = validity(lines, fit_lev_ransac_rays(lines, DEFAULTS, 0).E, DEFAULTS.max_error_px)
     assert chances.max() == 1.0 and chances.min() >= 0.0
     assert np.median(chances[:200]) > 0.5 > np.mean(chances[200:])

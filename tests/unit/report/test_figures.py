@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm_app.camera.projection import Fisheye
 from sfm_app.errors import ConfigError
 from sfm_app.estimation.fitting import to_calibration
 from sfm_app.report.figures import (
@@ -21,7 +22,7 @@ from sfm_app.report.figures import (
     vote_shares,
 )
 from sfm_app.selfcal.pairs import prepare
-from sfm_app.selfcal.wide_lens import Fisheye, LensEstimate
+from sfm_app.selfcal.wide_lens import LensEstimate
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import Calibration, CameraPairs
 

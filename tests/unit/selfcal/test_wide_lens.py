@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import sfm_app
+from sfm_app.camera.projection import Fisheye
 from sfm_app.geometry.epipolar import signed_distances, squared_distances
-from sfm_app.selfcal.wide_lens import Fisheye, bearings_through, find_lens, redundancy, search_rays, shows_panoramas
+from sfm_app.selfcal.wide_lens import bearings_through, find_lens, redundancy, search_rays, shows_panoramas
 
 THETA = np.linspace(0.0, 1.4, 8)
 

@@ -4,12 +4,12 @@ import io
 
 import numpy as np
 
-from sfm_app.types import Calibration, EpipolarFit, Rejected, ViewGraph
+from sfm_app.types import Calibration, EpipolarFit, RayFit, Rejected, ViewGraph
 
 
-def fit(n, degeneracy=""):
+def fit(n, degeneracy="", kind=EpipolarFit):
     rng = np.random.default_rng(n)
-    return EpipolarFit(rng.normal(size=(3, 3)), rng.random(n) < 0.5, rng.random(n), n, 0.5, degeneracy)
+    return kind(rng.normal(size=(3, 3)), rng.random(n) < 0.5, rng.random(n), n, 0.5, degeneracy)
 
 
 def through_file(graph):
@@ -39,11 +39,13 @@ def test_wide_lenses_survive_with_it():
     lens = Calibration(
         np.diag([300.0, 300.0, 1.0]), 800, 600, "lens", True, projection="fisheye", fisheye=(0.1, 0, 0, 0)
     )
-    graph = ViewGraph({(1, 2): fit(5)}, {}, {"800x600": lens})
+    graph = ViewGraph({(1, 2): fit(5, kind=RayFit), (1, 3): fit(6)}, {}, {"800x600": lens})
 
     back, _ = through_file(graph)
 
     assert back.lenses["800x600"].to_dict() == lens.to_dict()
+    assert np.array_equal(back.fits[1, 2].E, graph.fits[1, 2].E) and not hasattr(back.fits[1, 2], "F")
+    assert np.array_equal(back.fits[1, 3].F, graph.fits[1, 3].F) and not hasattr(back.fits[1, 3], "E")
 
 
 def test_an_empty_view_graph_survives_too():
