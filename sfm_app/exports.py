@@ -168,7 +168,7 @@ class StoredScene:
     def perspective(self, *, centered: bool = False) -> "StoredPhotos":
         """Return the undistorted photos; `centered` puts the optical center in the middle."""
         views = StoredPhotos(self.scene, self._model, self._run, centered=centered)
-        self.images |= {view.image: view.photo for view in views.photos}
+        self.images |= {view.name: view.photo for view in views.photos}
         return views
 
     def record_entries(self, file_format: str) -> dict[str, object]:
@@ -201,7 +201,7 @@ class StoredPhotos:
         views = perspective_photos(self._model, self._lenses, self._names)
         if not self._has_masks:
             return views
-        return tuple(replace(view, mask=mask_path(Path(), view.image).name) for view in views)
+        return tuple(replace(view, mask=mask_path(Path(), view.name).name) for view in views)
 
     @property
     def _mask_dir(self) -> Path | None:

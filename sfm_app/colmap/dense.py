@@ -114,12 +114,10 @@ def read_views(dense_dir: Path) -> list[View]:
 def _view(model: pycolmap.Reconstruction, image: pycolmap.Image) -> View:
     camera = model.cameras[image.camera_id]
     ids = sorted({point.point3D_id for point in image.points2D if point.has_point3D()})
-    pose = image.cam_from_world().matrix()
     return View(
         name=image.name,
         K=np.array(camera.calibration_matrix(), np.float64),
-        R=np.array(pose[:, :3], np.float64),
-        t=np.array(pose[:, 3], np.float64),
+        cam_from_world=np.array(image.cam_from_world().matrix(), np.float64),
         width=camera.width,
         height=camera.height,
         point_ids=np.array(ids, np.int64),

@@ -19,6 +19,7 @@ from sfm_app.colmap.worker_process import UndistortTask, run_worker
 from sfm_app.operating_system import replace_file
 from sfm_app.progress import Progress
 from sfm_app.stereo import View
+from sfm_app.types import PosedPhoto
 from sfm_app.types.arrays import FloatArray
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
 
@@ -64,7 +65,7 @@ def perspective_photos(
 ) -> tuple[PerspectivePhoto, ...]:
     """Return the views of all posed photos, by name of the photo."""
     return tuple(
-        PerspectivePhoto(name, image.name, view.K, view.width, view.height, view.R @ image.cam_from_world().matrix())
+        PerspectivePhoto(name, view.K, view.R @ image.cam_from_world().matrix(), view.width, view.height, image.name)
         for image in sorted(posed_images(model), key=lambda image: image.name)
         for name, view in zip(names[image.name], lenses[image.camera_id].views, strict=True)
     )
@@ -121,8 +122,8 @@ def all_points(model: pycolmap.Reconstruction) -> PointCloud:
     return PointCloud(*point_arrays(finite_points(model)))
 
 
-LargerView = tuple[str, NDArray[np.float64], NDArray[np.uint8], NDArray[np.bool_]]
-"""Name of a view, its K (3, 3) in pixels, its gray levels (H, W), and the mask (H, W) of usable pixels."""
+LargerView = tuple[PosedPhoto, NDArray[np.uint8], NDArray[np.bool_]]
+"""A view at another size, its gray levels (H, W), and the mask (H, W) of usable pixels."""
 
 
 class LargerViews:
@@ -137,16 +138,17 @@ class LargerViews:
             lenses = perspective_lenses(model, max_side_px)
             images = {image.name: image for image in posed_images(model)}
         parts: dict[int, dict[int, PerspectiveView]] = {}
-        self._camera, self._numbers = dict[str, int](), dict[str, dict[int, str]]()
+        self._camera, self._poses = dict[str, int](), dict[str, dict[int, View]]()
         for view in views:
             # a single view has the name of its photo
             name, number = (view.name, 0) if view.name in images else parse_view_name(view.name)
             image = images[name]
             R = view.R @ image.cam_from_world().matrix()[:, :3].T
-            focal_px = float(lenses[image.camera_id].params[FX])
-            parts.setdefault(image.camera_id, {}).setdefault(number, _resize(view, R, focal_px, max_side_px))
+            larger = _resize(view, float(lenses[image.camera_id].params[FX]), max_side_px)
+            part = PerspectiveView(R, larger.K, larger.width, larger.height)
+            parts.setdefault(image.camera_id, {}).setdefault(number, part)
             self._camera[name] = image.camera_id
-            self._numbers.setdefault(name, {})[number] = view.name
+            self._poses.setdefault(name, {})[number] = larger
         self._order = {key: sorted(numbers) for key, numbers in parts.items()}
         self._lenses = {
             key: replace(lenses[key], views=tuple(parts[key][k] for k in order)) for key, order in self._order.items()
@@ -160,22 +162,20 @@ class LargerViews:
 
     def render(self, photo: str) -> Iterator[LargerView]:
         """Yield the views of a photo."""
-        camera_id, names = self._camera[photo], self._numbers[photo]
+        camera_id, poses = self._camera[photo], self._poses[photo]
         lens, maps = self._lenses[camera_id], self._maps.camera_maps(camera_id)
         with translate_errors(f"reading {photo}"):
             pictures = render_views(photo, lens, self._photo_dir, self._mask_dir, maps)
-            for number, view, (pixels, shown) in zip(self._order[camera_id], lens.views, pictures, strict=True):
-                if number in names:
+            for number, (pixels, shown) in zip(self._order[camera_id], pictures, strict=True):
+                if number in poses:
                     gray = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), np.uint8)
-                    yield names[number], view.K, gray, shown
+                    yield poses[number], gray, shown
 
 
-def _resize(view: View, R: NDArray[np.float64], focal_px: float, max_side_px: int) -> PerspectiveView:
+def _resize(view: View, focal_px: float, max_side_px: int) -> View:
     """Return a view in the resolution of its photo, or smaller if its longest side is limited."""
     scale = min(max_side_px / max(view.width, view.height), focal_px / float(view.K[0, 0]))
-    width, height = max(1, round(scale * view.width)), max(1, round(scale * view.height))
-    K = np.diag([width / view.width, height / view.height, 1.0]) @ view.K
-    return PerspectiveView(R, np.asarray(K, np.float64), width, height)
+    return view.resize(max(1, round(scale * view.width)), max(1, round(scale * view.height)))
 
 
 def write_bundle(model_dir: Path, photo_dir: Path, file: Path, workers: int, progress: Progress) -> None:

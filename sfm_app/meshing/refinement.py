@@ -90,8 +90,9 @@ def finest_pixels(vertices: FloatArray, photos: Sequence[RefinePhoto], share: fl
     """Return (V,) the size of a pixel at each vertex in the closest photo with it in view, even hidden, or infinity."""
     sizes = np.full(len(vertices), np.inf)
     for photo in photos:
-        pixels = project_vertices(vertices, photo.projection(share))
-        _keep_finest(pixels, photo.size_at(share), photo.focal_px, photo.gray.shape[1], sizes)
+        full, small = photo.posed, photo.posed_at(share)
+        pixels = project_vertices(vertices, small.projection)
+        _keep_finest(pixels, (small.height, small.width), full.focal_px, full.width, sizes)
     return sizes
 
 
@@ -187,11 +188,12 @@ def _improve(
 
 def look(surface: Surface, photo: RefinePhoto, share: float) -> Sight:
     """Return a photo at a share of its resolution, and the surface in it; NOTHING where the photo is masked."""
-    raster = rasterize(surface.vertices, surface.faces, photo.projection(share), photo.size_at(share))
-    masked = photo.mask_at(share)
+    posed = photo.posed_at(share)
+    size = posed.width, posed.height
+    raster, masked = rasterize(surface.vertices, surface.faces, posed), photo.mask_at(size)
     if masked is not None:
         raster.depth[masked], raster.face[masked] = np.inf, NOTHING
-    return Sight(photo.level(share), raster)
+    return Sight(posed, photo.image_at(size), raster)
 
 
 class Sights:

@@ -7,7 +7,7 @@ resumes at the missing blocks.
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +17,11 @@ from sfm_app.colmap.dense import read_color, read_depth
 from sfm_app.colmap.surface import FUSED, poisson_surface, positions, simplify, write_points
 from sfm_app.errors import ReconstructionError
 from sfm_app.files import fingerprint, load_arrays, mark_unfinished, replace_atomically, resume_or_clear
-from sfm_app.geometry.triangles import Clusters, border_angle, cluster, median_edge_length, select_faces, vertex_normals
+from sfm_app.geometry.triangles import Clusters, cluster, median_edge_length, select_faces, vertex_normals
 from sfm_app.meshing.blocks import Partition, Split, close_cracks, split_points, weld
 from sfm_app.meshing.cleaning import Support, drop_islands, make_manifold, trim
 from sfm_app.meshing.octree import CELLS, Cube, cell_sizes, choose_cell, count_bent, count_cells, cube_around
-from sfm_app.meshing.visibility import CONFIRMED, NO_EVIDENCE, DepthView, Paint, judge, sample_colors
+from sfm_app.meshing.visibility import CONFIRMED, NO_EVIDENCE, Paint, judge, sample_colors
 from sfm_app.operating_system import move
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_count, block_workers
@@ -178,11 +178,11 @@ class SurfaceJudge:
 
     def judge(self, view: View) -> Judgment:
         """Return the judgment of a photo on the vertices in view."""
-        eye = DepthView(view.K, view.R, view.t, read_depth(self.dense_dir, view, "geometric"), view.sample_px)
-        near = self.clusters.find_in_cone(eye.center, eye.axis, eye.widest_angle)
+        depth = read_depth(self.dense_dir, view, "geometric")
+        near = self.clusters.find_in_cone(view.center, view.axis, view.widest_angle)
         points, normals = self.surface.vertices[near], self.normals[near]
-        verdict = judge(points, normals, eye, self.tolerance)
-        paint = sample_colors(points, normals, verdict, eye, read_color(self.dense_dir, view))
+        verdict = judge(points, normals, view, depth, view.sample_px, self.tolerance)
+        paint = sample_colors(points, normals, verdict, view, read_color(self.dense_dir, view))
         judged = verdict != NO_EVIDENCE
         return near[judged], verdict[judged], Paint(paint.total[judged], paint.weight[judged])
 
@@ -367,8 +367,7 @@ def _photos_in_reach(views: Sequence[View], farthest: Sequence[float], bounds: F
     blocks = Clusters(np.arange(len(bounds)), np.arange(len(bounds) + 1), centers, radii)
     near: list[list[View]] = [[] for _ in bounds]
     for view, far in zip(views, farthest, strict=True):
-        bare = replace(view, point_ids=np.empty(0, np.int64), points=np.empty((0, 3)))
-        for number in blocks.find_in_cone(view.center, view.R[2], border_angle(view.K, view.width, view.height)):
-            if (centers[number] - view.center) @ view.R[2] - radii[number] <= far:
-                near[number].append(bare)
+        for number in blocks.find_in_cone(view.center, view.axis, view.widest_angle):
+            if (centers[number] - view.center) @ view.axis - radii[number] <= far:
+                near[number].append(view.bare)
     return near

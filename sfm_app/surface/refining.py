@@ -37,16 +37,16 @@ class Originals:
     def read(self, views: Sequence[View], max_side_px: int, spread: Spread = map) -> list[RefinePhoto]:
         """Return the photos without distortion, in the order of the views."""
         larger = LargerViews(self.model_dir, self.photo_dir, self.mask_dir, views, max_side_px)
-        photos, poses, known = larger.photos, {view.name: view for view in views}, dict[str, RefinePhoto]()
+        photos, known = larger.photos, dict[str, RefinePhoto]()
 
-        def look(number: int) -> list[tuple[str, RefinePhoto]]:
+        def look(number: int) -> list[RefinePhoto]:
             return [
-                (name, RefinePhoto(K, poses[name].R, poses[name].t, gray, None if shown.all() else ~shown))
-                for name, K, gray, shown in larger.render(photos[number])
+                RefinePhoto(posed, gray, None if shown.all() else ~shown)
+                for posed, gray, shown in larger.render(photos[number])
             ]
 
         for rendered in spread(look, range(len(photos))):
-            known.update(rendered)
+            known |= {photo.posed.name: photo for photo in rendered}
         return [known[view.name] for view in views]
 
 

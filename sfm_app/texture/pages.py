@@ -418,7 +418,7 @@ def _paint_photo(
     open_edges = (beside == NONE) | (plan.checked.sightings.find(photo, beside) == NONE)
     view, scale = views[photo], plan.layout.scale
     if scale < 1.0:
-        view = view.with_size(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
+        view = view.resize(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
     pixels, points = store.photo(view), plan.mesh.vertices[plan.mesh.faces[triangles]]
     with pages.lock_canvases(photo) as canvases:
         for number, page in zip(numbers, canvases, strict=True):

@@ -31,8 +31,8 @@ from sfm_app.types.photos import (
     PhotoSet,
     UnusablePhoto,
 )
-from sfm_app.types.scene import CameraModel, ControlPoint, ControlPoints, Scene, SceneArrays
-from sfm_app.types.surface import Frustum, Model, Surface, Texture
+from sfm_app.types.scene import CameraModel, ControlPoint, ControlPoints, PosedPhoto, Scene, SceneArrays
+from sfm_app.types.surface import Model, Surface, Texture
 
 __all__ = [
     "Calibration",
@@ -44,7 +44,6 @@ __all__ = [
     "Evidence",
     "Features",
     "Frame",
-    "Frustum",
     "GivenCameras",
     "GpsPosition",
     "Intrinsics",
@@ -57,6 +56,7 @@ __all__ = [
     "PhotoPairs",
     "PhotoSet",
     "PoseGraph",
+    "PosedPhoto",
     "Rejected",
     "RelativePose",
     "Scene",

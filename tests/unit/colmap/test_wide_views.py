@@ -140,26 +140,26 @@ def test_photos_of_a_plain_lens_keep_their_names(plain, side):
     found = LargerViews(place / "sparse", place / "photos", None, [views["c.png"], views["a.png"]], side)
     assert found.photos == ["a.png", "c.png"]
     for photo in found.photos:
-        ((name, K, gray, used),) = found.render(photo)
-        assert name == photo and max(gray.shape) <= side and max(gray.shape) > 0.9 * min(side, SIZE[0])
-        assert used.mean() > 0.98 and np.quantile(errors(gray, K, views[photo].R, used), 0.999) < 6
+        ((posed, gray, used),) = found.render(photo)
+        assert posed.name == photo and max(gray.shape) <= side and max(gray.shape) > 0.9 * min(side, SIZE[0])
+        assert used.mean() > 0.98 and np.quantile(errors(gray, posed.K, posed.R, used), 0.999) < 6
 
 
 def test_views_of_a_fisheye_are_those_of_the_workspace(tmp_path):
     make_place(tmp_path, "wide fisheye")
     _, views = fill(tmp_path)
     found = LargerViews(tmp_path / "sparse", tmp_path / "photos", None, views[1:], 120)
-    rendered = {name: rest for photo in found.photos for name, *rest in found.render(photo)}
+    rendered = {posed.name: (posed, *rest) for photo in found.photos for posed, *rest in found.render(photo)}
     assert found.photos == sorted(NAMES) and sorted(rendered) == sorted(view.name for view in views[1:])
     for view in views[1:]:
-        K, gray, used = rendered[view.name]
-        assert max(gray.shape) <= 120 and np.quantile(errors(gray, K, view.R, used), 0.99) < 12
+        posed, gray, used = rendered[view.name]
+        assert max(gray.shape) <= 120 and np.quantile(errors(gray, posed.K, posed.R, used), 0.99) < 12
 
 
 def test_masked_pixels_are_not_used(plain):
     place, views = plain
     mask_left(place, 100)
     larger = LargerViews(place / "sparse", place / "photos", place / "masks", [views["a.png"]], 240)
-    ((_, _, gray, used),) = larger.render("a.png")
+    ((_, gray, used),) = larger.render("a.png")
     share = np.mean(used, axis=0)
     assert gray.shape == used.shape and share[:75].max() == 0.0 and share[-100:].min() > 0.9

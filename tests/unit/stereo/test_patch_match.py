@@ -78,7 +78,7 @@ slope = st.floats(-1.0, 1.0)
 
 def view_with(fx=100.0, fy=100.0, skew=0.0, sample_px=0.5) -> View:
     K = np.array([[fx, skew, 15], [0, fy, 10], [0, 0, 1]])
-    return View("v", K, np.eye(3), np.zeros(3), 30, 20, sample_px=sample_px)
+    return View("v", K, np.eye(3, 4), 30, 20, sample_px=sample_px)
 
 
 def plane_depth(view: View, normal: np.ndarray, distance: float) -> np.ndarray:

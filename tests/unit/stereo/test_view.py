@@ -16,7 +16,7 @@ from sfm_app.stereo.view import (
 def view_at(center, points, ids=None, focal=500.0) -> View:
     ids = np.arange(len(points)) if ids is None else np.asarray(ids)
     K = np.array([[focal, 0, 320], [0, focal, 240], [0, 0, 1]])
-    return View("v", K, np.eye(3), -np.array(center, float), 640, 480, ids, points[ids])
+    return View("v", K, np.column_stack([np.eye(3), -np.array(center, float)]), 640, 480, ids, points[ids])
 
 
 @pytest.fixture

@@ -40,7 +40,7 @@ def test_projection_is_that_of_bundle_adjustment(model):
     expected = project_points(points, np.tile(full, (200, 1)), np.full(200, family)).x
     np.testing.assert_allclose(found[:, :2], expected, atol=1e-8)
     assert (found[:, 2] > 0.0).all()
-    half = view.with_size(SIZE[0] // 2, SIZE[1] // 2)
+    half = view.resize(SIZE[0] // 2, SIZE[1] // 2)
     smaller = np.array([project(half.row, *((point - pose[:, 3]) @ R)) for point in points])
     np.testing.assert_allclose(2.0 * smaller[:, :2], expected, atol=1e-8)
     behind = np.array([1e-3, 0.0, -1.0]) - pose[:, 3]
