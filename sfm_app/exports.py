@@ -20,7 +20,6 @@ from sfm_app.colmap.dense import shrink_mask
 from sfm_app.colmap.model import model_arrays, posed_images, read_model, sparse_model
 from sfm_app.colmap.perspective import (
     PixelMaps,
-    ViewNames,
     all_points,
     full_size_lenses,
     perspective_photos,
@@ -28,7 +27,7 @@ from sfm_app.colmap.perspective import (
     write_view_model,
 )
 from sfm_app.colmap.surface import FUSED, open_points, positions
-from sfm_app.colmap.wide_views import WideLens, render_views, save_picture
+from sfm_app.colmap.wide_views import ViewNames, WideLens, render_views, save_picture
 from sfm_app.engine.stage import Products, Stage, check_undamaged, resume_hint
 from sfm_app.errors import InputError
 from sfm_app.files import replace_atomically

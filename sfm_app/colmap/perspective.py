@@ -14,7 +14,14 @@ from sfm_app.camera.perspective_views import PerspectiveView, center_view
 from sfm_app.camera.projection import FX
 from sfm_app.colmap.backend import check_written, pycolmap, translate_errors
 from sfm_app.colmap.model import finite_points, point_arrays, posed_images
-from sfm_app.colmap.wide_views import WideLens, add_view_cameras, parse_view_name, perspective_lenses, render_views
+from sfm_app.colmap.wide_views import (
+    ViewNames,
+    WideLens,
+    make_view_model,
+    parse_view_name,
+    perspective_lenses,
+    render_views,
+)
 from sfm_app.colmap.worker_process import UndistortTask, run_worker
 from sfm_app.operating_system import replace_file
 from sfm_app.progress import Progress
@@ -22,9 +29,6 @@ from sfm_app.stereo import View
 from sfm_app.types import PosedPhoto
 from sfm_app.types.arrays import FloatArray
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
-
-ViewNames = Mapping[str, Sequence[str]]
-"""Names of the views of each photo, by its name."""
 
 
 def full_size_lenses(model: pycolmap.Reconstruction, *, centered: bool) -> dict[int, WideLens]:
@@ -76,45 +80,16 @@ def write_view_model(
     text: bool = False,
 ) -> None:  # fmt: skip
     """Write COLMAP's model of the views into a new or existing folder, as text or binary."""
+
+    def keypoint_rays(image: pycolmap.Image, tracked: Sequence[pycolmap.Point2D]) -> FloatArray:
+        pixels = np.array([point.xy for point in tracked], np.float64).reshape(-1, 2)
+        return np.asarray(model.cameras[image.camera_id].cam_ray_from_img(pixels), np.float64).reshape(-1, 3)
+
     folder.mkdir(parents=True, exist_ok=True)
     with translate_errors("writing the model of undistorted photos"):
-        view_model = make_view_model(model, lenses, names)
+        view_model = make_view_model(model, lenses, names, keypoint_rays)
         view_model.write_text(folder) if text else view_model.write(folder)
     check_written(*folder.iterdir())
-
-
-def make_view_model(
-    model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames
-) -> pycolmap.Reconstruction:
-    """Return the model of the views; points keep their ids, and points that no view shows are left out."""
-    view_model = pycolmap.Reconstruction()
-    cameras = add_view_cameras(view_model, lenses)
-    tracks = {point: pycolmap.Track() for point in sorted(model.points3D)}
-    for image in sorted(posed_images(model), key=lambda image: image.name):
-        tracked = [point for point in image.points2D if point.has_point3D()]
-        pixels = np.array([point.xy for point in tracked], np.float64).reshape(-1, 2)
-        rays = np.asarray(model.cameras[image.camera_id].cam_ray_from_img(pixels), np.float64).reshape(-1, 3)
-        for number, view in enumerate(lenses[image.camera_id].views):
-            projected = rays @ view.R.T @ view.K.T
-            with np.errstate(divide="ignore", invalid="ignore"):
-                x = projected[:, :2] / projected[:, 2:]
-            inside = np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1)
-            shown = np.flatnonzero((projected[:, 2] > 0.0) & inside)
-            image_id = view_model.num_images() + 1
-            for index, row in enumerate(shown):
-                tracks[tracked[row].point3D_id].add_element(image_id, index)
-            camera_id = cameras[image.camera_id, number]
-            added = pycolmap.Image(
-                name=names[image.name][number], keypoints=x[shown], camera_id=camera_id, image_id=image_id
-            )
-            pose = pycolmap.Rigid3d(view.R @ image.cam_from_world().matrix())
-            view_model.add_image_with_trivial_frame(added, pose)
-    for point_id, track in tracks.items():
-        if track.length():
-            old = model.points3D[point_id]
-            view_model.add_point3D_with_id(point_id, pycolmap.Point3D(xyz=old.xyz, color=old.color, track=track))
-    view_model.update_point_3d_errors()
-    return view_model
 
 
 def all_points(model: pycolmap.Reconstruction) -> PointCloud:
