@@ -8,6 +8,7 @@ from typing import Literal, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.epipolar import triangulation_angle_deg
 from sfm_app.settings import DepthSettings
 from sfm_app.types import PosedPhoto
 from sfm_app.types.arrays import FloatArray, IndexArray
@@ -149,7 +150,7 @@ def _rank(index: int, others: Sequence[int], views: Sequence[View], count: int) 
     weights: dict[int, FloatArray] = {}
     for number in map(int, others):
         other = views[number]
-        angles = triangulation_angles_deg(view.center, other.center, view.points)
+        angles = triangulation_angle_deg(view.points, view.center, other.center)
         if angles.max(initial=0.0) >= 1e-6:  # parts of one wide photo have the same center up to rounding
             shared = np.isin(view.point_ids, other.point_ids, assume_unique=True)
             weights[number] = np.where(shared, point_weights(view, other, view.points), 0.0)
@@ -167,18 +168,10 @@ def _rank(index: int, others: Sequence[int], views: Sequence[View], count: int) 
 
 def point_weights(view: View, other: View, points: FloatArray) -> FloatArray:
     """Weigh points (N, 3) in the world by triangulation angle and scale: (N,) in [0, 1], 1 for the best match."""
-    angle_deg = triangulation_angles_deg(view.center, other.center, points)
+    angle_deg = triangulation_angle_deg(points, view.center, other.center)
     spread_deg = np.where(angle_deg < BEST_ANGLE_DEG, BEST_ANGLE_DEG / 3, 1.25 * BEST_ANGLE_DEG)
     weight = np.exp(-0.5 * ((angle_deg - BEST_ANGLE_DEG) / spread_deg) ** 2)
     depth, other_depth = view.depths(points), other.depths(points)
     in_front = (depth > 0) & (other_depth > 0)
     scale = np.divide(view.K[0, 0] * other_depth, other.K[0, 0] * depth, out=np.ones_like(depth), where=in_front)
     return np.asarray(np.where(in_front, weight * np.minimum(scale, 1 / scale), 0.0))
-
-
-def triangulation_angles_deg(center1: FloatArray, center2: FloatArray, points: FloatArray) -> FloatArray:
-    """Return (N,) angles in degrees between the rays from points (N, 3) to two centers (3,)."""
-    ray1, ray2 = points - center1, points - center2
-    # atan2 keeps small angles exact, where arccos of a rounded cosine does not
-    sine = np.linalg.norm(np.cross(ray1, ray2), axis=1)
-    return np.asarray(np.degrees(np.arctan2(sine, np.sum(ray1 * ray2, axis=1))))

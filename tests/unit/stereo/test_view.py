@@ -9,7 +9,6 @@ from sfm_app.stereo.view import (
     point_weights,
     rank_neighbors,
     region,
-    triangulation_angles_deg,
 )
 
 
@@ -23,13 +22,6 @@ def view_at(center, points, ids=None, focal=500.0) -> View:
 def points() -> np.ndarray:
     rng = np.random.default_rng(0)
     return np.column_stack([rng.uniform(-1, 1, (100, 2)), rng.uniform(9, 11, 100)])
-
-
-@pytest.mark.parametrize("angle_deg", [1e-6, 8.0, 90.0, 135.0])
-def test_angles_are_exact(angle_deg):
-    angle = np.radians(angle_deg)
-    centers = np.array([1.0, 0, 0]), np.array([np.cos(angle), np.sin(angle), 0])
-    np.testing.assert_allclose(triangulation_angles_deg(*centers, np.zeros((1, 3))), angle_deg, rtol=1e-9)
 
 
 def test_prefers_good_angles_to_narrow_and_wide_ones(points):
