@@ -171,8 +171,8 @@ class DenseStore:
 
     def read_estimate(self, view: View) -> DepthEstimate:
         """Read the photometric map of a view."""
-        confidence = _read_depth_format(self.dense_dir, CONFIDENCES, view, "photometric")
-        return DepthEstimate(self.read_depth(view), confidence)
+        confidences = _map_path(self.dense_dir, CONFIDENCES, view, "photometric")
+        return DepthEstimate(self.read_depth(view), _read_depth_format(confidences, view.name))
 
     def read_depth(self, view: View, kind: Kind = "photometric") -> NDArray[np.float32]:
         """Read the depths of a map of a view."""
@@ -180,7 +180,13 @@ class DenseStore:
 
     def read_maps(self, view: View) -> DepthMap:
         """Read the geometric maps of a view."""
-        return DepthMap(self.read_depth(view, "geometric"), read_normals(self.dense_dir, view))
+        with translate_errors(f"reading the normal map of {view.name}"):
+            stored = pycolmap.NormalMap()
+            stored.read(normals_file(self.dense_dir, view))
+        planes = np.array(stored.to_array(), np.float32)
+        height, width = planes.shape[:2]
+        normals = np.ascontiguousarray(planes.reshape(3, height, width).transpose(1, 2, 0))
+        return DepthMap(self.read_depth(view, "geometric"), normals)
 
     def write_proposal(self, view: View, depth: NDArray[np.float32]) -> None:
         """Write proposed depths (H, W) of the plain areas of a view, 0 where unknown."""
@@ -198,35 +204,20 @@ class DenseStore:
         _write_depth_format(self.dense_dir, DEPTHS, view, estimate.depth, "photometric")
 
     def write_maps(self, view: View, maps: DepthMap) -> None:
-        """Write the geometric maps of a view."""
-        write_maps(self.dense_dir, view, maps)
+        """Write the confirmed depths (H, W) and the normals (H, W, 3) of a view, as COLMAP's fusion expects them."""
+        # pycolmap takes (H, W, 3) but stores the bytes unchanged, while COLMAP keeps x, y and z in planes.
+        planes = np.ascontiguousarray(maps.normals.transpose(2, 0, 1)).reshape(maps.normals.shape)
+        with (
+            translate_errors(f"writing the normal map of {view.name}"),
+            _atomic_path(normals_file(self.dense_dir, view)) as path,
+        ):
+            pycolmap.NormalMap.from_array(planes).write(path)
+        write_depth(self.dense_dir, view, maps.depth)
 
 
 def read_depth(dense_dir: Path, view: View, kind: Kind) -> NDArray[np.float32]:
     """Read a depth map (H, W): 0 where unknown, MASKED where the photo is masked, SKY where it shows the sky."""
-    return _read_depth_format(dense_dir, DEPTHS, view, kind)
-
-
-def read_normals(dense_dir: Path, view: View) -> NDArray[np.float32]:
-    """Read the normals (H, W, 3) of a view."""
-    with translate_errors(f"reading the normal map of {view.name}"):
-        stored = pycolmap.NormalMap()
-        stored.read(_map_path(dense_dir, NORMALS, view))
-    planes = np.array(stored.to_array(), np.float32)
-    height, width = planes.shape[:2]
-    return np.ascontiguousarray(planes.reshape(3, height, width).transpose(1, 2, 0))
-
-
-def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
-    """Write the confirmed depths (H, W) and the normals (H, W, 3) of a view, as COLMAP's fusion expects them."""
-    # pycolmap takes (H, W, 3) but stores the bytes unchanged, while COLMAP keeps x, y and z in planes.
-    planes = np.ascontiguousarray(maps.normals.transpose(2, 0, 1)).reshape(maps.normals.shape)
-    with (
-        translate_errors(f"writing the normal map of {view.name}"),
-        _atomic_path(_map_path(dense_dir, NORMALS, view)) as path,
-    ):
-        pycolmap.NormalMap.from_array(planes).write(path)
-    write_depth(dense_dir, view, maps.depth)
+    return _read_depth_format(_map_path(dense_dir, DEPTHS, view, kind), view.name)
 
 
 def write_depth(dense_dir: Path, view: View, depth: NDArray[np.float32]) -> None:
@@ -262,10 +253,10 @@ def digest_maps(dense_dir: Path) -> str:
     return digest_files(dense_dir, *MAPS)
 
 
-def _read_depth_format(dense_dir: Path, folder: str, view: View, kind: Kind) -> NDArray[np.float32]:
-    with translate_errors(f"reading the depth map of {view.name}"):
+def _read_depth_format(path: Path, photo: str) -> NDArray[np.float32]:
+    with translate_errors(f"reading the depth map of {photo}"):
         stored = pycolmap.DepthMap()
-        stored.read(_map_path(dense_dir, folder, view, kind))
+        stored.read(path)
     return np.array(stored.to_array(), np.float32)
 
 
@@ -279,7 +270,7 @@ def _write_depth_format(dense_dir: Path, folder: str, view: View, values: NDArra
         pycolmap.DepthMap.from_array(np.ascontiguousarray(values), low, high).write(path)
 
 
-def _map_path(dense_dir: Path, folder: str, view: View, kind: Kind = "geometric") -> Path:
+def _map_path(dense_dir: Path, folder: str, view: View, kind: Kind) -> Path:
     return dense_dir / "stereo" / folder / f"{view.name}.{kind}{view.level or ''}.bin"
 
 
@@ -310,7 +301,4 @@ def read_photo_and_depth(dense_dir: Path, name: str) -> tuple[NDArray[np.uint8],
     image = _decode(dense_dir, name, cv2.IMREAD_COLOR_RGB)
     if image is None:
         raise ValueError(f"{name} is no photo")
-    with translate_errors(f"reading the depth map of {name}"):
-        stored = pycolmap.DepthMap()
-        stored.read(dense_dir / "stereo" / DEPTHS / f"{name}.geometric.bin")
-    return image, np.array(stored.to_array(), np.float32)
+    return image, _read_depth_format(dense_dir / "stereo" / DEPTHS / f"{name}.geometric.bin", name)

@@ -1,11 +1,10 @@
 """Refinement of a surface by photos, from coarse to fine, in a few Gauss-Newton steps each."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from threading import Lock
-from typing import Any
 
 import numpy as np
 
@@ -14,11 +13,10 @@ from sfm_app.geometry.triangles import morton_order, unique_edges, vertex_normal
 from sfm_app.jit import kernel
 from sfm_app.meshing.agreement import NOTHING, Pull, RefinePhoto, Sight, compare, project_vertices, rasterize
 from sfm_app.meshing.fairness import Neighbors, find_displacements
+from sfm_app.tasks import Spread
 from sfm_app.types import Surface
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-Spread = Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]]
-"""Calls a function for every number, possibly in parallel, and returns the results in order."""
 MOST_KEPT_PX = 100_000_000
 """Pixels of the photos that `Sights` keeps: 2 GB."""
 

@@ -1,15 +1,16 @@
 """Views of photos, their depth maps, the input of every depth-map method, and the neighbors of each view."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Protocol, TypeVar
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.epipolar import triangulation_angle_deg
 from sfm_app.settings import DepthSettings
+from sfm_app.tasks import ParallelMap
 from sfm_app.types import PosedPhoto
 from sfm_app.types.arrays import FloatArray, IndexArray
 
@@ -19,7 +20,6 @@ GrayImage = NDArray[np.uint8]
 """(H, W)."""
 Kind = Literal["photometric", "geometric", "proposed"]
 """COLMAP's names for a depth map before and after the check against the other photos; and proposals for plain areas."""
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,12 +91,6 @@ class DepthStore(Protocol):
     def write_estimate(self, view: View, estimate: DepthEstimate, /) -> None: ...
     def write_maps(self, view: View, maps: DepthMap, /) -> None: ...
     def write_proposal(self, view: View, depth: DepthArray, /) -> None: ...
-
-
-class ParallelMap(Protocol):
-    """Applies a function to items in parallel and returns the results in order; a label names the progress."""
-
-    def __call__(self, function: Callable[[int], Result], items: Sequence[int], label: str, /) -> list[Result]: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,10 +11,11 @@ from sfm_app.colmap.perspective import LargerViews
 from sfm_app.files import load_arrays, replace_atomically
 from sfm_app.geometry.triangles import number_vertices
 from sfm_app.meshing.agreement import RefinePhoto
-from sfm_app.meshing.refinement import Refinement, Spread, refine
+from sfm_app.meshing.refinement import Refinement, refine
 from sfm_app.numerical import FAILURES, error_reason
 from sfm_app.settings import MeshSettings
 from sfm_app.stereo import View, rank_neighbors
+from sfm_app.tasks import Spread
 from sfm_app.types import Surface
 
 PARTNERS = 3

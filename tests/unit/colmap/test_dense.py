@@ -21,7 +21,6 @@ from sfm_app.colmap.dense import (
     undistort,
     used_pixels,
     write_fusion_views,
-    write_maps,
 )
 from sfm_app.colmap.surface import FUSED, fuse, open_points, poisson_surface, positions, simplify
 from sfm_app.errors import BackendError
@@ -70,7 +69,7 @@ def workspace(tmp_path_factory):
         rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(view.K).T @ view.R
         depth = ((DISTANCE - NORMAL @ view.center) / (rays @ NORMAL)).astype(np.float32)
         normals = np.broadcast_to((-view.R @ NORMAL).astype(np.float32), (*depth.shape, 3))
-        write_maps(place / "dense", view, DepthMap(depth, normals))
+        DenseStore(place / "dense").write_maps(view, DepthMap(depth, normals))
     write_fusion_views(place / "dense", views)
     return place / "dense", views
 
@@ -108,7 +107,7 @@ def test_maps_come_back_as_they_were(workspace):
     maps = DepthMap(rng.uniform(1, 2, (90, 120)).astype(np.float32), rng.normal(size=(90, 120, 3)).astype(np.float32))
     store = DenseStore(dense)
     assert not store.has(view, "geometric")
-    write_maps(dense, view, maps)
+    DenseStore(dense).write_maps(view, maps)
     np.testing.assert_array_equal(read_depth(dense, view, "geometric"), maps.depth)
     assert (store.has(view, "geometric"), store.has(view, "photometric")) == (True, False)
 
@@ -292,7 +291,7 @@ def test_without_masks_all_is_used(place, tmp_path):
     depth = np.full((view.height, view.width), 3.0, np.float32)
     assert used_pixels(tmp_path, view) is None
     DenseStore(tmp_path).write_estimate(view, DepthEstimate(depth, depth / 4))
-    write_maps(tmp_path, view, DepthMap(depth, np.zeros((*depth.shape, 3), np.float32)))
+    DenseStore(tmp_path).write_maps(view, DepthMap(depth, np.zeros((*depth.shape, 3), np.float32)))
     mask_depths(tmp_path, view)
     assert (DenseStore(tmp_path).read_estimate(view).depth == 3).all()
     assert (read_depth(tmp_path, view, "geometric") == 3).all()
@@ -321,7 +320,7 @@ def test_nothing_is_fused_from_what_is_masked(dense):
     normals = np.zeros((*used_pixels(folder, views["1.png"]).shape, 3), np.float32)
     normals[..., 2] = -1
     for view in views.values():
-        write_maps(folder, view, DepthMap(np.full(normals.shape[:2], 4.0, np.float32), normals))
+        DenseStore(folder).write_maps(view, DepthMap(np.full(normals.shape[:2], 4.0, np.float32), normals))
         mask_depths(folder, view)
         mask_depths(folder, view)  # a killed run does it twice
     view = views["1.png"]
