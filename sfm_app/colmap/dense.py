@@ -61,7 +61,7 @@ def used_pixels(dense_dir: Path, view: View) -> BoolArray | None:
 def _undistort_mask(used: BoolArray, camera: pycolmap.Camera, view: View) -> BoolArray:
     """Return the mask (H, W) of an undistorted photo: a pixel is used if all original pixels under it are."""
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(view.K).T
+    rays = view.rays(np.column_stack([x.ravel(), y.ravel()]))
     with translate_errors(f"undistorting the mask of {view.name}"):
         pixels = np.floor(camera.img_from_cam(rays)).astype(np.int64).reshape(view.height, view.width, 2)
     col, row = pixels[..., 0], pixels[..., 1]

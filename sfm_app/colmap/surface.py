@@ -78,15 +78,14 @@ def positions(records: NDArray[np.void]) -> NDArray[np.float64]:
 def poisson_surface(folder: Path, depth: int) -> Surface:
     """Return Poisson's closed surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points of a folder.
 
-    All vertices have the same color. The depth of the octree is raised to 5, with which small surfaces are fine enough;
-    the finest cell is the largest extent of the points over 2^depth.
+    All vertices have the same color. The finest cell is the largest extent of the points over 2^depth.
     """
     path = folder / "poisson.ply"
     task: PoissonTask = {
         "do": "poisson",
         "points": str(folder / FUSED),
         "target": str(path),
-        "depth": max(depth, 5),
+        "depth": depth,
     }
     run_worker(task, "finding the surface")
     surface = _read(path)

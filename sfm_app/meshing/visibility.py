@@ -10,10 +10,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.types import PosedPhoto
-from sfm_app.types.arrays import FloatArray
-
-DepthArray = NDArray[np.float32]
-"""(H, W) depth along the optical axis in scene units, 0 where unknown."""
+from sfm_app.types.arrays import DepthArray, FloatArray
 
 NO_EVIDENCE, CONFIRMED, SEEN_THROUGH, EMPTY = range(4)
 SKY = -2.0

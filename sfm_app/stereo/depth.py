@@ -18,9 +18,9 @@ from sfm_app.stereo.patch_match import (
 )
 from sfm_app.stereo.plain_areas import enclosed_pixels, fill_planar_areas, plain_walls, surfaceless_areas
 from sfm_app.stereo.rectify import depths_from_disparities, disparities, rectify
-from sfm_app.stereo.view import DepthArray, DepthEstimate, DepthMap, GrayImage, View
+from sfm_app.stereo.view import DepthEstimate, DepthMap, GrayImage, View
 from sfm_app.types import Rejected
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import DepthArray, FloatArray
 
 
 @dataclass(frozen=True, slots=True)

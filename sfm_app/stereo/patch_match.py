@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel, summing_kernel
-from sfm_app.stereo.view import DepthArray, GrayImage, View
-from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.stereo.view import GrayImage, View
+from sfm_app.types.arrays import BoolArray, DepthArray, FloatArray
 
 PlaneArray = NDArray[np.float32]
 """(H, W, 3): inverse depth q and its slopes, q + qu du + qv dv at (du, dv) pixels away; q = 0 where unknown."""

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.stereo.view import DepthArray, GrayImage, View
+from sfm_app.stereo.view import GrayImage, View
 from sfm_app.types import Rejected
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import DepthArray, FloatArray, IndexArray
 
 DISPARITY_STEP = 16
 """OpenCV requires multiples of this number of disparities."""
@@ -162,8 +162,7 @@ def _bounds(rotation: FloatArray, view: View) -> FloatArray:
     """Return lowest and highest theta and phi of a photo, (2, 2); the full range of phi if it contains an epipole."""
     s, e = np.linspace(0, 1, 33), np.ones(33)
     border = np.concatenate([np.stack(side, -1) for side in ((s, 0 * e), (s, e), (0 * e, s), (e, s))])
-    pixels = np.column_stack([border * [view.width, view.height], np.ones(len(border))])
-    theta, phi = _directions(pixels @ np.linalg.inv(view.K).T @ view.R @ rotation.T)
+    theta, phi = _directions(view.rays(border * [view.width, view.height]) @ view.R @ rotation.T)
     low, high = np.array([theta.min(), phi.min()]), np.array([theta.max(), phi.max()])
     for sign, end in ((1.0, 0.0), (-1.0, np.pi)):
         epipole = sign * (view.K @ view.R @ rotation[0])

@@ -12,10 +12,8 @@ from sfm_app.geometry.epipolar import triangulation_angle_deg
 from sfm_app.settings import DepthSettings
 from sfm_app.tasks import ParallelMap
 from sfm_app.types import PosedPhoto
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import DepthArray, FloatArray, IndexArray
 
-DepthArray = NDArray[np.float32]
-"""(H, W) depth along the optical axis in scene units, 0 where unknown."""
 GrayImage = NDArray[np.uint8]
 """(H, W)."""
 Kind = Literal["photometric", "geometric", "proposed"]

@@ -237,8 +237,6 @@ class BlockTask:
     number: int
     bounds: FloatArray
     """(2, 3) bounds of its points and halo."""
-    cell: float
-    """Side of the finest cells."""
     cube: Cube
     options: MeshSettings
     tolerance: float
@@ -282,7 +280,7 @@ def mesh_in_blocks(
     partners = rank_partners(views)
     tasks = [
         BlockTask(folder, own, dense_dir, originals, near, {view.name: partners[view.name] for view in near},
-                  k, bounds[k], cell, cubes[k], options, run.settings.depth.consistency, least,
+                  k, bounds[k], cubes[k], options, run.settings.depth.consistency, least,
                   run.settings.texture.normal_map)
         for k, near in enumerate(_photos_in_reach(views, farthest, bounds))
     ]  # fmt: skip

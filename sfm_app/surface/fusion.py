@@ -137,8 +137,7 @@ def sample_points(dense_dir: Path, view: View) -> FloatArray:
     depth = read_depth(dense_dir, view, "geometric")[::STRIDE, ::STRIDE]
     rows, columns = depth.shape
     x, y = np.meshgrid(STRIDE * np.arange(columns) + view.sample_px, STRIDE * np.arange(rows) + view.sample_px)
-    rays = np.stack([x, y, np.ones_like(x)], axis=2) @ np.linalg.inv(view.K).T
-    points: FloatArray = (rays * depth[..., None] - view.t) @ view.R
+    points: FloatArray = (view.rays(np.stack([x, y], axis=2)) * depth[..., None] - view.t) @ view.R
     return points[depth > 0]
 
 

@@ -80,13 +80,17 @@ class PosedPhoto:
     @property
     def widest_angle(self) -> float:
         """Upper bound in radians of the angle between the axis and the rays of the photo."""
-        corners = np.array([[x, y, 1.0] for x in (-1.0, self.width + 1.0) for y in (-1.0, self.height + 1.0)])
-        rays = np.linalg.solve(self.K, corners.T).T
+        corners = np.array([[x, y] for x in (-1.0, self.width + 1.0) for y in (-1.0, self.height + 1.0)])
+        rays = self.rays(corners)
         return float(np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2]).max())
 
     def depths(self, points: FloatArray) -> FloatArray:
         """Return (N,) the depths along the optical axis of points (N, 3) in the world."""
         return np.asarray(points @ self.R[2] + self.t[2])
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """Return the rays (..., 3) of pixels (..., 2) in the frame of the camera, at depth 1."""
+        return np.concatenate([pixels, np.ones((*pixels.shape[:-1], 1))], axis=-1) @ np.linalg.inv(self.K).T
 
     def resize(self, width: int, height: int) -> Self:
         """Return the photo at another size in pixels."""

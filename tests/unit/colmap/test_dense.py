@@ -165,7 +165,7 @@ def test_the_surface_has_the_shape_of_the_points_whatever_came_before(workspace)
     assert np.count_nonzero(inside) > 100
     assert np.percentile(np.abs(surface.vertices[inside] @ NORMAL - DISTANCE), 90) < 0.02
     assert surface.colors.shape == surface.vertices.shape and not (dense / "poisson.ply").exists()
-    poisson_surface(dense, 2)
+    poisson_surface(dense, 5)
     again = poisson_surface(dense, 6)
     np.testing.assert_array_equal(again.vertices, surface.vertices)
     np.testing.assert_array_equal(again.faces, surface.faces)
@@ -212,7 +212,7 @@ def test_points_in_one_spot_give_a_surface_without_triangles(tmp_path):
     header += "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
     header += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
     (tmp_path / FUSED).write_text(header + "1 1 1 0 0 1 9 9 9\n" * 120)
-    surface = poisson_surface(tmp_path, 2)
+    surface = poisson_surface(tmp_path, 5)
     assert (surface.vertices.shape, surface.faces.shape, surface.colors.shape) == ((0, 3), (0, 3), (0, 3))
 
 

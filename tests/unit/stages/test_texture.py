@@ -13,7 +13,7 @@ from sfm_app.products import read_texture, write_texture
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import texture
-from sfm_app.stages.texture import FileStore, read_photo, surface_digest
+from sfm_app.stages.texture import FileStore, surface_digest
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import CameraModel, Model, Surface, Texture
 
@@ -58,8 +58,9 @@ def test_photos_are_rgb_and_of_the_view_s_size(tmp_path):
     gray = np.zeros((40, 60), np.uint8)
     gray[:, 30:] = 200
     Image.fromarray(gray).save(tmp_path / "a.png")
-    np.testing.assert_array_equal(read_photo(tmp_path, VIEW), np.repeat(gray[:, :, None], 3, axis=2))
-    small = read_photo(tmp_path, VIEW.resize(20, 10))
+    files = FileStore(tmp_path, tmp_path / "parts")
+    np.testing.assert_array_equal(files.photo(VIEW), np.repeat(gray[:, :, None], 3, axis=2))
+    small = files.photo(VIEW.resize(20, 10))
     assert small.shape == (10, 20, 3)
     assert (small[:, :10] == 0).all()
     assert (small[:, 10:] == 200).all()
