@@ -63,7 +63,7 @@ def _undistort_mask(used: BoolArray, camera: pycolmap.Camera, view: View) -> Boo
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     rays = view.rays(np.column_stack([x.ravel(), y.ravel()]))
     with translate_errors(f"undistorting the mask of {view.name}"):
-        pixels = np.floor(camera.img_from_cam(rays)).astype(np.int64).reshape(view.height, view.width, 2)
+        pixels = np.floor(np.asarray(camera.img_from_cam(rays))).astype(np.int64).reshape(view.height, view.width, 2)
     col, row = pixels[..., 0], pixels[..., 1]
     height, width = used.shape
     inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)

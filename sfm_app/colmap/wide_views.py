@@ -111,11 +111,8 @@ def make_view_model(
         tracked = [point for point in image.points2D if point.has_point3D()]
         rays = rays_of(image, tracked)
         for number, view in enumerate(lenses[image.camera_id].views):
-            projected = rays @ view.R.T @ view.K.T
-            with np.errstate(divide="ignore", invalid="ignore"):
-                x = projected[:, :2] / projected[:, 2:]
-            inside = np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1)
-            shown = np.flatnonzero((projected[:, 2] > 0.0) & inside)
+            x, is_shown = _project(rays, view)
+            shown = np.flatnonzero(is_shown)
             image_id = view_model.num_images() + 1
             for index, row in enumerate(shown):
                 tracks[tracked[row].point3D_id].add_element(image_id, index)
@@ -176,10 +173,15 @@ def _one_view(camera: pycolmap.Camera, max_side_px: int) -> PerspectiveView | No
     options.max_image_size = max_side_px
     flat = pycolmap.undistort_camera(options, camera)
     view = PerspectiveView(np.eye(3), np.array(flat.calibration_matrix()), flat.width, flat.height)
+    return view if np.mean(_project(rays, view)[1]) >= 1.0 - 0.1 else None
+
+
+def _project(rays: FloatArray, view: PerspectiveView) -> tuple[FloatArray, BoolArray]:
+    """Return the pixels (N, 2) of rays (N, 3) in a view, and (N,) whether it shows them."""
+    projected = rays @ view.R.T @ view.K.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        x = (rays @ view.K.T)[:, :2] / rays[:, 2:]
-    inside = (rays[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1)
-    return view if np.mean(inside) >= 1.0 - 0.1 else None
+        x = projected[:, :2] / projected[:, 2:]
+    return x, (projected[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1)
 
 
 def _make_lens(camera: pycolmap.Camera, single: PerspectiveView | None, max_side_px: int) -> WideLens:

@@ -90,7 +90,8 @@ class PosedPhoto:
 
     def rays(self, pixels: FloatArray) -> FloatArray:
         """Return the rays (..., 3) of pixels (..., 2) in the frame of the camera, at depth 1."""
-        return np.concatenate([pixels, np.ones((*pixels.shape[:-1], 1))], axis=-1) @ np.linalg.inv(self.K).T
+        homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:-1], 1))], axis=-1)
+        return np.asarray(homogeneous @ np.linalg.inv(self.K).T)
 
     def resize(self, width: int, height: int) -> Self:
         """Return the photo at another size in pixels."""
