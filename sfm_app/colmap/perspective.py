@@ -23,10 +23,10 @@ from sfm_app.colmap.wide_views import (
     render_views,
 )
 from sfm_app.colmap.worker_process import UndistortTask, run_worker
+from sfm_app.meshing.agreement import RefinePhoto
 from sfm_app.operating_system import replace_file
 from sfm_app.progress import Progress
 from sfm_app.stereo import View
-from sfm_app.types import PosedPhoto
 from sfm_app.types.arrays import FloatArray
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
 
@@ -97,10 +97,6 @@ def all_points(model: pycolmap.Reconstruction) -> PointCloud:
     return PointCloud(*point_arrays(finite_points(model)))
 
 
-LargerView = tuple[PosedPhoto, NDArray[np.uint8], NDArray[np.bool_]]
-"""A view at another size, its gray levels (H, W), and the mask (H, W) of usable pixels."""
-
-
 class LargerViews:
     """Undistorts the photos of a dense workspace again, at another size, but no larger than the photo."""
 
@@ -135,7 +131,7 @@ class LargerViews:
         """Names of the photos, those of the same camera together: they show the same pixels."""
         return sorted(self._camera, key=lambda photo: (self._camera[photo], photo))
 
-    def render(self, photo: str) -> Iterator[LargerView]:
+    def render(self, photo: str) -> Iterator[RefinePhoto]:
         """Yield the views of a photo."""
         camera_id, poses = self._camera[photo], self._poses[photo]
         lens, maps = self._lenses[camera_id], self._maps.camera_maps(camera_id)
@@ -144,7 +140,7 @@ class LargerViews:
             for number, (pixels, shown) in zip(self._order[camera_id], pictures, strict=True):
                 if number in poses:
                     gray = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), np.uint8)
-                    yield poses[number], gray, shown
+                    yield RefinePhoto(poses[number], gray, None if shown.all() else ~shown)
 
 
 def _resize(view: View, focal_px: float, max_side_px: int) -> View:

@@ -111,24 +111,20 @@ def sort_points(
     return blocks
 
 
-@dataclass(frozen=True, slots=True)
-class RecordCells:
-    """The `PointCells` of the fused points, which may exceed the memory."""
+def choose_record_cell(
+    sizes: Sequence[float], read: Callable[[], Iterable[NDArray[np.void]]], least: float = CELLS.least_points
+) -> float:
+    """Return the result of `choose_cell` for fused points, which may exceed the memory: `read` yields their parts."""
 
-    read: Callable[[], Iterable[NDArray[np.void]]]
-    """Yields their records, part by part."""
-
-    def points_per_cell(self, cell: float) -> float:
-        """Return the mean number of points in an occupied cell."""
-        counts = [(len(part), count_cells(positions(part), cell)) for part in self.read()]
-        points, occupied = np.sum(counts, axis=0)
+    def points_per_cell(cell: float) -> float:
+        points, occupied = np.sum([(len(part), count_cells(positions(part), cell)) for part in read()], axis=0)
         return float(points / occupied)
 
-    def bent_share(self, cell: float) -> float:
-        """Return the share of cells whose normals differ."""
-        counts = [count_bent(positions(part), _normals(part), cell) for part in self.read()]
-        bent, several = np.sum(counts, axis=0)
+    def bent_share(cell: float) -> float:
+        bent, several = np.sum([count_bent(positions(part), _normals(part), cell) for part in read()], axis=0)
         return float(bent / max(several, 1))
+
+    return choose_cell(sizes, points_per_cell, bent_share, least)
 
 
 def _normals(records: NDArray[np.void]) -> FloatArray:
@@ -273,7 +269,7 @@ def mesh_in_blocks(
         )
         own = sort_points(points, partition, folder)
         sizes = sizes_for_blocks(own.bounds, options.poisson_depth)
-        cell = choose_cell(sizes, RecordCells(lambda: map(own.read, range(len(own.bounds)))))
+        cell = choose_record_cell(sizes, lambda: map(own.read, range(len(own.bounds))))
     bounds = with_halo(own.bounds, cell)
     cubes = [cube_around(low, high, cell) for low, high in bounds]
     farthest = run.map(Task(farthest_depth, dense_dir), views, "measuring depths")

@@ -40,13 +40,7 @@ class Originals:
         larger = LargerViews(self.model_dir, self.photo_dir, self.mask_dir, views, max_side_px)
         photos, known = larger.photos, dict[str, RefinePhoto]()
 
-        def look(number: int) -> list[RefinePhoto]:
-            return [
-                RefinePhoto(posed, gray, None if shown.all() else ~shown)
-                for posed, gray, shown in larger.render(photos[number])
-            ]
-
-        for rendered in spread(look, range(len(photos))):
+        for rendered in spread(lambda number: list(larger.render(photos[number])), range(len(photos))):
             known |= {photo.posed.name: photo for photo in rendered}
         return [known[view.name] for view in views]
 
