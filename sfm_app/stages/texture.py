@@ -60,7 +60,7 @@ class FileStore:
 
     def photo(self, view: PhotoView) -> NDArray[np.uint8]:
         """Return the RGB picture (H, W, 3) of a view, scaled down by averaging; masked pixels are filled."""
-        with Image.open(self.photo_dir / view.source) as image:
+        with Image.open(self.photo_dir / view.photo) as image:
             photo = np.asarray(image.convert("RGB"))
         if view.part is not None:
             photo = show_part(photo, view.part)
@@ -75,7 +75,7 @@ class FileStore:
         """Return the usable pixels (H, W) of a view; None without masks."""
         if self.mask_dir is None:
             return None
-        used = read_mask(self.mask_dir, view.source)
+        used = read_mask(self.mask_dir, view.photo)
         return used if view.part is None else mask_part(used, view.part)
 
     def recall(self, name: str) -> dict[str, NDArray[np.generic]] | None:

@@ -36,31 +36,26 @@ KINDS = {
 class PhotoView(PosedPhoto):
     """A posed photo with its lens, or a perspective view into a panorama."""
 
-    distortion: tuple[float, ...] = ()
-    """Parameters as in a camera row, after fx, fy, cx, cy; the others are 0."""
+    photo: str
+    """Name of the photo that it shows."""
+    distortion: tuple[float, ...] = (0.0,) * (LENS - 4)
+    """The parameters of a camera row after fx, fy, cx, cy."""
     kind: float = OPENCV
     limit: float = np.inf
     """Squared radius before distortion at the end of the image: squared tangent or angle."""
     part: PerspectiveView | None = None
     """The view into the panorama `photo`; None for a whole photo."""
-    photo: str = ""
-    """Name of the photo, if it differs from the view's."""
 
     @property
     def lens(self) -> tuple[float, ...]:
         """(12,) as in a camera row."""
-        known = *map(float, (self.K[0, 0], self.K[1, 1], self.K[0, 2], self.K[1, 2])), *self.distortion
-        return (*known, *(0.0,) * (LENS - len(known)))
+        fx, fy, cx, cy = (float(self.K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        return (fx, fy, cx, cy, *self.distortion)
 
     @property
     def row(self) -> FloatArray:
         """(26,) lens and pose for the kernels."""
         return np.concatenate([self.lens, [self.kind, self.limit], self.cam_from_world.ravel()])
-
-    @property
-    def source(self) -> str:
-        """Name of the photo of the view."""
-        return self.photo or self.name
 
     @property
     def widest_angle(self) -> float:
@@ -77,12 +72,12 @@ def photo_view(name: str, camera: CameraModel, cam_from_world: FloatArray) -> Ph
     lens[list(columns)] = camera.params
     limit = np.inf if kind == OPENCV else _image_limit(lens, kind, camera.width, camera.height)
     K, terms = camera_matrix(*lens[:4]), tuple(lens[4:].tolist())
-    return PhotoView(name, K, cam_from_world, camera.width, camera.height, terms, kind, limit)
+    return PhotoView(name, K, cam_from_world, camera.width, camera.height, name, terms, kind, limit)
 
 
 def part_view(name: str, photo: str, part: PerspectiveView, cam_from_world: FloatArray) -> PhotoView:
     """Return a perspective view, given in the frame of the panorama `photo`, whose pose is [R | t] (3, 4)."""
-    return PhotoView(name, part.K, part.R @ cam_from_world, part.width, part.height, part=part, photo=photo)
+    return PhotoView(name, part.K, part.R @ cam_from_world, part.width, part.height, photo, part=part)
 
 
 def _image_limit(lens: FloatArray, kind: float, width: int, height: int) -> float:

@@ -21,7 +21,7 @@ POSE = np.eye(3, 4)
 SURFACE = Surface(np.eye(3), np.array([[0, 1, 2]]), np.full((3, 3), 9, np.uint8))
 
 
-VIEW = PhotoView("a.png", camera_matrix(50.0, 50.0, 30.0, 20.0), np.eye(3, 4), 60, 40)
+VIEW = PhotoView("a.png", camera_matrix(50.0, 50.0, 30.0, 20.0), np.eye(3, 4), 60, 40, "a.png")
 
 
 def run_of(place, fingerprint="", **settings):

@@ -60,7 +60,8 @@ def around(count=9, size=(320, 240), height=1.6, k1=-0.05):
         right /= np.linalg.norm(right)
         R = np.stack([right, np.cross(forward, right), forward])
         K = camera_matrix(1.3 * size[0], 1.3 * size[0], size[0] / 2 + 3.0, size[1] / 2 - 2.0)
-        views.append(PhotoView(f"{len(views):03}.png", K, np.column_stack([R, -R @ center]), *size, (k1, 0.01)))
+        name, lens = f"{len(views):03}.png", (k1, 0.01, 0, 0, 0, 0, 0, 0)
+        views.append(PhotoView(name, K, np.column_stack([R, -R @ center]), *size, name, lens))
     return views
 
 

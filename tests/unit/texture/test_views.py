@@ -73,7 +73,7 @@ def test_views_cover_a_whole_panorama():
 
     views = photo_views(scene)
 
-    assert [view.source for view in views] == ["sub/a.jpg"] * 6 and len({view.name for view in views}) == 6
+    assert [view.photo for view in views] == ["sub/a.jpg"] * 6 and len({view.name for view in views}) == 6
     for view in views:
         np.testing.assert_allclose(view.center, -pose[:, :3].T @ pose[:, 3], atol=1e-12)
     X = np.random.default_rng(0).normal(size=(500, 3)) * 4.0
@@ -91,7 +91,7 @@ def test_a_part_view_has_the_rays_of_its_part():
 
     u, v, _ = project(view.row, *(part.rays()[30, 40] * 5.0))
 
-    assert (u, v) == pytest.approx((40.5, 30.5), abs=1e-9) and view.source == "a"
+    assert (u, v) == pytest.approx((40.5, 30.5), abs=1e-9) and view.photo == "a"
 
 
 def test_other_camera_models_are_refused():
