@@ -33,7 +33,7 @@ from sfm_app.errors import InputError
 from sfm_app.files import replace_atomically
 from sfm_app.formats.scenes import plain_names
 from sfm_app.frame.scale import GPS, MetricFrame, move_model
-from sfm_app.frame.sighted_points import Distance, SightedModel, measure_distance
+from sfm_app.frame.sighted_points import Distance, PosedPhotos, measure_distance
 from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import json_text
 from sfm_app.operating_system import is_link, move
@@ -109,7 +109,7 @@ def stored_distance(run: RunContext, ends: NDArray[np.float64]) -> Distance:
     frame = stored_frame(run)
     a, b = frame.from_model.inverse()(ends)
     with check_undamaged(SCENE, run):
-        model = SightedModel(run.workspace.sparse).sightlines()
+        model = PosedPhotos(run.workspace.sparse).sightlines()
     return measure_distance(a, b, model, frame.from_model.scale, frame.deviation)
 
 

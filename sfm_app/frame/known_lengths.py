@@ -7,8 +7,8 @@ import numpy as np
 from sfm_app.frame.markers import find_markers_in_file, marker_scales
 from sfm_app.frame.scale import ScaleEvidence
 from sfm_app.frame.sighted_points import (
+    PosedPhotos,
     Sight,
-    SightedModel,
     SightedPoint,
     Sightlines,
     layout_scale,
@@ -37,7 +37,7 @@ def distance_evidence(distances: Sequence[tuple[str, str, str]], model: Sightlin
     return evidence
 
 
-def marker_evidence(posed: SightedModel, run: RunContext, problems: list[str]) -> list[ScaleEvidence]:
+def marker_evidence(posed: PosedPhotos, run: RunContext, problems: list[str]) -> list[ScaleEvidence]:
     """Return the scale by each printed marker, and add unusable markers to the problems."""
     options = run.settings.scale
     names = sorted(posed.names)
@@ -53,7 +53,7 @@ def marker_evidence(posed: SightedModel, run: RunContext, problems: list[str]) -
 
 
 def control_places(
-    photos: PhotoSet, posed: SightedModel, given: ControlPoints, problems: list[str]
+    photos: PhotoSet, posed: PosedPhotos, given: ControlPoints, problems: list[str]
 ) -> dict[str, SightedPoint]:
     """Return the place in the model of each ground control point that its marks determine, and add problems."""
     names, located = named_photos(photos.photos), dict[str, SightedPoint]()

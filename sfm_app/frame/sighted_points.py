@@ -202,7 +202,7 @@ def measure_distance(
     return Distance(value, float(spread), deviation is not None)
 
 
-class SightedModel:
+class PosedPhotos:
     """The posed photos of a COLMAP model on disk; raises a BackendError if the model cannot be read."""
 
     def __init__(self, model_dir: Path) -> None:

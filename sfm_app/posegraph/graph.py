@@ -2,9 +2,10 @@
 
 import logging
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +14,13 @@ from sfm_app.numerical import FAILURES
 from sfm_app.posegraph.look_alikes import find_look_alikes
 from sfm_app.posegraph.pair_pose import Pair, estimate_pose, is_in_front, pose_distances, refine_pose
 from sfm_app.posegraph.rotations import average_rotations, check_loops, connected_groups
-from sfm_app.tasks import ParallelMap
 from sfm_app.types import EpipolarFit, Evidence, PairId, PoseGraph, RelativePose
 from sfm_app.types.arrays import FloatArray
 
 logger = logging.getLogger("sfm_app")
+
+ParallelMap = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
+"""Results of a function in the order of its arguments, computed in parallel; the text labels a progress bar."""
 
 CONTRADICTS, BEHIND, TOO_FEW = "contradicts other pairs", "points behind a camera", "too few matches fit the cameras"
 NOT_COMPUTABLE = "its pose cannot be computed"

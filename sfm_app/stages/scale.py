@@ -9,7 +9,7 @@ from sfm_app.colmap.model import sparse_model
 from sfm_app.frame.control_points import ControlFit, fit_control_points
 from sfm_app.frame.known_lengths import control_places, distance_evidence, marker_evidence
 from sfm_app.frame.scale import GPS, IDENTITY, MetricFrame, ScaleEvidence, agree, move_model
-from sfm_app.frame.sighted_points import SightedModel
+from sfm_app.frame.sighted_points import PosedPhotos
 from sfm_app.geometry.poses import Similarity
 from sfm_app.products import write_frame
 from sfm_app.runtime.context import RunContext
@@ -29,7 +29,7 @@ def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
         evidence.append(ScaleEvidence(GPS, 1.0, max(scene.gps_deviation, 1e-4), len(scene.registered)))
     control: ControlFit | None = None
     if options.distances or options.markers or run.control_points:
-        posed = SightedModel(scene.model_dir)
+        posed = PosedPhotos(scene.model_dir)
         if options.distances:
             evidence += distance_evidence(options.distances, posed.sightlines())
         if options.markers:
@@ -64,7 +64,7 @@ def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
 
 
 def _control_evidence(
-    photos: PhotoSet, posed: SightedModel, run: RunContext, evidence: list[ScaleEvidence], problems: list[str]
+    photos: PhotoSet, posed: PosedPhotos, run: RunContext, evidence: list[ScaleEvidence], problems: list[str]
 ) -> ControlFit | None:
     """Return the fit to ground control points, and add to the evidence and the problems."""
     located = control_places(photos, posed, run.control_points, problems)
