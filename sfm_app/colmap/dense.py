@@ -1,7 +1,7 @@
 """COLMAP's dense workspace: undistorted photos, their masks, depth maps and normal maps."""
 
 import secrets
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from math import ceil
 from pathlib import Path
@@ -18,6 +18,7 @@ from sfm_app.photos.masks import mask_path, read_mask, save_mask
 from sfm_app.progress import Progress
 from sfm_app.settings import MOST_LEVELS
 from sfm_app.stereo import DepthEstimate, DepthMap, Kind, View
+from sfm_app.tasks import Shared
 from sfm_app.types.arrays import BoolArray
 
 MASKS = "masks"
@@ -28,23 +29,26 @@ MAPS = ("sparse", "images", f"stereo/{DEPTHS}", f"stereo/{NORMALS}")
 """Folders from which a finished workspace is read."""
 
 
-class MaskUndistorter:
-    """Writes masks of undistorted photos; pickled as the paths of its inputs."""
+def cameras_of_photos(model_dir: Path) -> dict[str, pycolmap.Camera]:
+    """Return the camera of each photo of a model, by name."""
+    with translate_errors("reading the model"):
+        model = pycolmap.Reconstruction(model_dir)
+        return {image.name: model.cameras[image.camera_id] for image in all_images(model)}
 
-    def __init__(self, model_dir: Path, mask_dir: Path, dense_dir: Path) -> None:
-        self._inputs = model_dir, mask_dir, dense_dir
-        with translate_errors("reading the model"):
-            model = pycolmap.Reconstruction(model_dir)
-            self._cameras = {image.name: model.cameras[image.camera_id] for image in all_images(model)}
 
-    def __reduce__(self) -> tuple[type["MaskUndistorter"], tuple[Path, Path, Path]]:
-        return MaskUndistorter, self._inputs
-
-    def __call__(self, view: View) -> None:
-        """Write the mask of an undistorted photo."""
-        _, mask_dir, dense_dir = self._inputs
-        used = _undistort_mask(read_mask(mask_dir, view.name), self._cameras[view.name], view)
-        save_mask(dense_dir / MASKS, view.name, used)
+def undistort_mask(cameras: Shared[Mapping[str, pycolmap.Camera]], mask_dir: Path, dense_dir: Path, view: View) -> None:
+    """Write the mask of an undistorted photo: a pixel is used if all original pixels under it are."""
+    used, camera = read_mask(mask_dir, view.name), cameras.value[view.name]
+    x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    rays = view.rays(np.column_stack([x.ravel(), y.ravel()]))
+    with translate_errors(f"undistorting the mask of {view.name}"):
+        pixels = np.floor(np.asarray(camera.img_from_cam(rays))).astype(np.int64).reshape(view.height, view.width, 2)
+    col, row = pixels[..., 0], pixels[..., 1]
+    height, width = used.shape
+    inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
+    whole = _erode(used, ceil(max(camera.focal_length_x / view.K[0, 0], camera.focal_length_y / view.K[1, 1])))
+    shown = shrink_mask(inside & whole[row.clip(0, height - 1), col.clip(0, width - 1)])
+    save_mask(dense_dir / MASKS, view.name, shown)
 
 
 def has_masks(dense_dir: Path) -> bool:
@@ -56,19 +60,6 @@ def used_pixels(dense_dir: Path, view: View) -> BoolArray | None:
     """Return the mask (H, W) of an undistorted photo, true where pixels may be used; None without mask."""
     place = dense_dir / MASKS
     return read_mask(place, view.name) if mask_path(place, view.name).exists() else None
-
-
-def _undistort_mask(used: BoolArray, camera: pycolmap.Camera, view: View) -> BoolArray:
-    """Return the mask (H, W) of an undistorted photo: a pixel is used if all original pixels under it are."""
-    x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
-    rays = view.rays(np.column_stack([x.ravel(), y.ravel()]))
-    with translate_errors(f"undistorting the mask of {view.name}"):
-        pixels = np.floor(np.asarray(camera.img_from_cam(rays))).astype(np.int64).reshape(view.height, view.width, 2)
-    col, row = pixels[..., 0], pixels[..., 1]
-    height, width = used.shape
-    inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
-    whole = _erode(used, ceil(max(camera.focal_length_x / view.K[0, 0], camera.focal_length_y / view.K[1, 1])))
-    return shrink_mask(inside & whole[row.clip(0, height - 1), col.clip(0, width - 1)])
 
 
 def shrink_mask(used: BoolArray) -> BoolArray:

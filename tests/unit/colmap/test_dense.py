@@ -1,5 +1,6 @@
 """The dense workspace: views, maps, masks, fusion and surfaces."""
 
+import pickle
 from dataclasses import replace
 
 import cv2
@@ -12,13 +13,14 @@ from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.dense import (
     MASKED,
     DenseStore,
-    MaskUndistorter,
+    cameras_of_photos,
     drop_estimates,
     mask_depths,
     read_depth,
     read_gray,
     read_views,
     undistort,
+    undistort_mask,
     used_pixels,
     write_fusion_views,
 )
@@ -27,6 +29,7 @@ from sfm_app.errors import BackendError
 from sfm_app.photos.masks import save_mask
 from sfm_app.progress import SilentProgress
 from sfm_app.stereo import DepthEstimate, DepthMap
+from sfm_app.tasks import Shared
 from sfm_app.types import Surface
 
 pytestmark = pytest.mark.slow
@@ -260,8 +263,9 @@ def dense(place, tmp_path):
     root, _ = place
     undistort(root / "sparse", root / "photos", tmp_path, 120, 1, SilentProgress())
     views = read_views(tmp_path)
+    cameras = pickle.loads(pickle.dumps(cameras_of_photos(root / "sparse")))  # noqa: S301 - as for another process
     for view in views:
-        MaskUndistorter(root / "sparse", root / "masks", tmp_path)(view)
+        undistort_mask(Shared(cameras), root / "masks", tmp_path, view)
     return tmp_path, {view.name: view for view in views}
 
 
