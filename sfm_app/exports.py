@@ -20,7 +20,6 @@ from sfm_app.colmap.dense import shrink_mask
 from sfm_app.colmap.model import model_arrays, posed_images, read_model, sparse_model
 from sfm_app.colmap.perspective import (
     PixelMaps,
-    ViewNames,
     all_points,
     full_size_lenses,
     perspective_photos,
@@ -28,7 +27,7 @@ from sfm_app.colmap.perspective import (
     write_view_model,
 )
 from sfm_app.colmap.surface import FUSED, open_points, positions
-from sfm_app.colmap.wide_views import WideLens, render_views, save_picture
+from sfm_app.colmap.wide_views import ViewNames, WideLens, render_views, save_picture
 from sfm_app.engine.stage import Products, Stage, check_undamaged, resume_hint
 from sfm_app.errors import InputError
 from sfm_app.files import replace_atomically, replace_folder
@@ -164,7 +163,7 @@ class StoredScene:
     def perspective(self, *, centered: bool = False) -> "StoredPhotos":
         """Return the undistorted photos; `centered` puts the optical center in the middle."""
         views = StoredPhotos(self.scene, self._model, self._run, centered=centered)
-        self.images |= {view.image: view.photo for view in views.photos}
+        self.images |= {view.name: view.photo for view in views.photos}
         return views
 
     def record_entries(self, file_format: str) -> dict[str, object]:
@@ -197,7 +196,7 @@ class StoredPhotos:
         views = perspective_photos(self._model, self._lenses, self._names)
         if not self._has_masks:
             return views
-        return tuple(replace(view, mask=mask_path(Path(), view.image).name) for view in views)
+        return tuple(replace(view, mask=mask_path(Path(), view.name).name) for view in views)
 
     @property
     def _mask_dir(self) -> Path | None:

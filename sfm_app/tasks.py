@@ -1,10 +1,16 @@
 """Tasks that another machine can do: a named function, and large values for it."""
 
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 Value = TypeVar("Value")
 Result = TypeVar("Result")
+
+ParallelMap = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
+"""Applies a function to all items, possibly in parallel, and returns results in order; the label names the progress."""
+Spread = Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]]
+"""Calls a function for every number, possibly in parallel, and returns the results in order."""
 
 
 class Task(partial[Result]):

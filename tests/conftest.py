@@ -17,7 +17,7 @@ from sfm_app.operating_system import VARIABLE
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
 from sfm_app.synthetic.photo_folder import load_truth, save_truth, write_photo_folder
 from sfm_app.synthetic.scenes import courtyard
-from sfm_app.types import Frustum, Model, Surface, Texture
+from sfm_app.types import Model, PosedPhoto, Surface, Texture
 
 # the time of an example depends on how busy the machine is
 settings.register_profile("untimed", deadline=None)
@@ -102,7 +102,7 @@ def cloud(ball) -> Model:
     """Make a point cloud of the ball's vertices, with three cameras around it that look at the middle."""
     K = np.array([[800.0, 0, 310], [0, 820, 250], [0, 0, 1]])
     poses = orbit(make_camera(640, 480), 3, 120.0, 4.0, (0.0, 0.0, 0.0)).cam_from_world
-    cameras = tuple(Frustum(name, K, pose, 640, 480) for name, pose in poses.items())
+    cameras = tuple(PosedPhoto(name, K, pose, 640, 480) for name, pose in poses.items())
     return Model(Surface(ball.surface.vertices, np.zeros((0, 3), np.int64), ball.surface.colors), cameras=cameras)
 
 

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.geometry.triangles import border_angle, cluster
+from sfm_app.geometry.triangles import cluster
 from sfm_app.meshing.ray_casting import Occluders, load_open3d
 from sfm_app.synthetic.cameras import Camera, Views, camera_center
-from sfm_app.types import CameraModel, Scene
+from sfm_app.types import CameraModel, PosedPhoto, Scene
 
 FloatArray = NDArray[np.float64]
 POINTS_PER_PHOTO = 150
@@ -69,7 +69,8 @@ def _observations(
         depth = scene.cast_rays(open3d.core.Tensor(rays), nthreads=1)["t_hit"].numpy()
         points.append((center + depth[:, None] * ways)[depth < REACH_M])
     where = np.concatenate(points)
-    near, angle = cluster(where[:, None, :]), border_angle(camera.K, camera.width, camera.height)
+    photo = PosedPhoto("", camera.K, np.eye(3, 4), camera.width, camera.height)
+    near, angle = cluster(where[:, None, :]), photo.widest_angle
     found = []
     for pose in views.cam_from_world.values():
         which = near.find_in_cone(camera_center(pose), pose[2, :3], angle)

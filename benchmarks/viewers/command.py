@@ -26,9 +26,9 @@ from benchmarks.common.command_line import add_pictures, is_wanted, new_parser
 from benchmarks.common.results import RESULTS, document, table, write
 from sfm_app.colmap.model import sparse_model
 from sfm_app.formats import EXPORTERS
-from sfm_app.formats.frusta import center, scene_size
+from sfm_app.formats.frusta import scene_size
 from sfm_app.meshing.ray_casting import load_open3d
-from sfm_app.types import Frustum, Model, Surface, Texture
+from sfm_app.types import Model, PosedPhoto, Surface, Texture
 
 Row = dict[str, Any]
 
@@ -65,7 +65,7 @@ class Subject:
     name: str
     glb: Path
     ply: Path
-    cameras: tuple[Frustum, ...] = ()
+    cameras: tuple[PosedPhoto, ...] = ()
     orientation: Mapping[str, Any] | None = None
     run: str = ""
 
@@ -243,11 +243,11 @@ def center_offset(corners: np.ndarray, area: np.ndarray) -> float:
     return float(np.linalg.norm(middle))
 
 
-def facing_share(vertices: np.ndarray, normals: np.ndarray, cameras: Sequence[Frustum]) -> float:
+def facing_share(vertices: np.ndarray, normals: np.ndarray, cameras: Sequence[PosedPhoto]) -> float:
     """Return the share of the vertices whose normal faces one of the cameras."""
     looks = np.zeros(len(vertices), bool)
     for camera in cameras:
-        looks |= np.sum((center(camera) - vertices) * normals, axis=1) > 0
+        looks |= np.sum((camera.center - vertices) * normals, axis=1) > 0
     return float(looks.mean())
 
 

@@ -30,7 +30,7 @@ def map_sequentially(function, items, _):
 @pytest.fixture
 def task(tmp_path):
     (tmp_path / "stereo").mkdir()
-    views = [View(f"{k}.jpg", np.eye(3), np.eye(3), np.zeros(3), 10, 10) for k in range(3)]
+    views = [View(f"{k}.jpg", np.eye(3), np.eye(3, 4), 10, 10) for k in range(3)]
     options = DepthSettings(min_agreeing=3, max_image_size_px=700)
     return DepthTask(tmp_path, views, [[1, 2], [0], []], options, Store(), map_sequentially)
 

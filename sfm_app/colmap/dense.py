@@ -1,7 +1,7 @@
 """COLMAP's dense workspace: undistorted photos, their masks, depth maps and normal maps."""
 
 import secrets
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from math import ceil
@@ -20,6 +20,7 @@ from sfm_app.photos.masks import mask_path, read_mask, save_mask
 from sfm_app.progress import Progress
 from sfm_app.settings import MOST_LEVELS
 from sfm_app.stereo import DepthEstimate, DepthMap, Kind, View
+from sfm_app.tasks import Shared
 from sfm_app.types.arrays import BoolArray
 
 MASKS = "masks"
@@ -30,23 +31,26 @@ MAPS = ("sparse", "images", f"stereo/{DEPTHS}", f"stereo/{NORMALS}")
 """Folders from which a finished workspace is read."""
 
 
-class MaskUndistorter:
-    """Writes masks of undistorted photos; pickled as the paths of its inputs."""
+def cameras_of_photos(model_dir: Path) -> dict[str, pycolmap.Camera]:
+    """Return the camera of each photo of a model, by name."""
+    with translate_errors("reading the model"):
+        model = pycolmap.Reconstruction(model_dir)
+        return {image.name: model.cameras[image.camera_id] for image in all_images(model)}
 
-    def __init__(self, model_dir: Path, mask_dir: Path, dense_dir: Path) -> None:
-        self._inputs = model_dir, mask_dir, dense_dir
-        with translate_errors("reading the model"):
-            model = pycolmap.Reconstruction(model_dir)
-            self._cameras = {image.name: model.cameras[image.camera_id] for image in all_images(model)}
 
-    def __reduce__(self) -> tuple[type["MaskUndistorter"], tuple[Path, Path, Path]]:
-        return MaskUndistorter, self._inputs
-
-    def __call__(self, view: View) -> None:
-        """Write the mask of an undistorted photo."""
-        _, mask_dir, dense_dir = self._inputs
-        used = _undistort_mask(read_mask(mask_dir, view.name), self._cameras[view.name], view)
-        save_mask(dense_dir / MASKS, view.name, used)
+def undistort_mask(cameras: Shared[Mapping[str, pycolmap.Camera]], mask_dir: Path, dense_dir: Path, view: View) -> None:
+    """Write the mask of an undistorted photo: a pixel is used if all original pixels under it are."""
+    used, camera = read_mask(mask_dir, view.name), cameras.value[view.name]
+    x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    rays = view.rays(np.column_stack([x.ravel(), y.ravel()]))
+    with translate_errors(f"undistorting the mask of {view.name}"):
+        pixels = np.floor(np.asarray(camera.img_from_cam(rays))).astype(np.int64).reshape(view.height, view.width, 2)
+    col, row = pixels[..., 0], pixels[..., 1]
+    height, width = used.shape
+    inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
+    whole = _erode(used, ceil(max(camera.focal_length_x / view.K[0, 0], camera.focal_length_y / view.K[1, 1])))
+    shown = shrink_mask(inside & whole[row.clip(0, height - 1), col.clip(0, width - 1)])
+    save_mask(dense_dir / MASKS, view.name, shown)
 
 
 def has_masks(dense_dir: Path) -> bool:
@@ -58,19 +62,6 @@ def used_pixels(dense_dir: Path, view: View) -> BoolArray | None:
     """Return the mask (H, W) of an undistorted photo, true where pixels may be used; None without mask."""
     place = dense_dir / MASKS
     return read_mask(place, view.name) if mask_path(place, view.name).exists() else None
-
-
-def _undistort_mask(used: BoolArray, camera: pycolmap.Camera, view: View) -> BoolArray:
-    """Return the mask (H, W) of an undistorted photo: a pixel is used if all original pixels under it are."""
-    x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(view.K).T
-    with translate_errors(f"undistorting the mask of {view.name}"):
-        pixels = np.floor(camera.img_from_cam(rays)).astype(np.int64).reshape(view.height, view.width, 2)
-    col, row = pixels[..., 0], pixels[..., 1]
-    height, width = used.shape
-    inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
-    whole = _erode(used, ceil(max(camera.focal_length_x / view.K[0, 0], camera.focal_length_y / view.K[1, 1])))
-    return shrink_mask(inside & whole[row.clip(0, height - 1), col.clip(0, width - 1)])
 
 
 def shrink_mask(used: BoolArray) -> BoolArray:
@@ -108,12 +99,10 @@ def read_views(dense_dir: Path) -> list[View]:
 def _view(model: pycolmap.Reconstruction, image: pycolmap.Image) -> View:
     camera = model.cameras[image.camera_id]
     ids = sorted({point.point3D_id for point in image.points2D if point.has_point3D()})
-    pose = image.cam_from_world().matrix()
     return View(
         name=image.name,
         K=np.array(camera.calibration_matrix(), np.float64),
-        R=np.array(pose[:, :3], np.float64),
-        t=np.array(pose[:, 3], np.float64),
+        cam_from_world=np.array(image.cam_from_world().matrix(), np.float64),
         width=camera.width,
         height=camera.height,
         point_ids=np.array(ids, np.int64),
@@ -167,8 +156,8 @@ class DenseStore:
 
     def read_estimate(self, view: View) -> DepthEstimate:
         """Read the photometric map of a view."""
-        confidence = _read_depth_format(self.dense_dir, CONFIDENCES, view, "photometric")
-        return DepthEstimate(self.read_depth(view), confidence)
+        confidences = _map_path(self.dense_dir, CONFIDENCES, view, "photometric")
+        return DepthEstimate(self.read_depth(view), _read_depth_format(confidences, view.name))
 
     def read_depth(self, view: View, kind: Kind = "photometric") -> NDArray[np.float32]:
         """Read the depths of a map of a view."""
@@ -176,7 +165,13 @@ class DenseStore:
 
     def read_maps(self, view: View) -> DepthMap:
         """Read the geometric maps of a view."""
-        return DepthMap(self.read_depth(view, "geometric"), read_normals(self.dense_dir, view))
+        with translate_errors(f"reading the normal map of {view.name}"):
+            stored = pycolmap.NormalMap()
+            stored.read(normals_file(self.dense_dir, view))
+        planes = np.array(stored.to_array(), np.float32)
+        height, width = planes.shape[:2]
+        normals = np.ascontiguousarray(planes.reshape(3, height, width).transpose(1, 2, 0))
+        return DepthMap(self.read_depth(view, "geometric"), normals)
 
     def write_proposal(self, view: View, depth: NDArray[np.float32]) -> None:
         """Write proposed depths (H, W) of the plain areas of a view, 0 where unknown."""
@@ -194,35 +189,20 @@ class DenseStore:
         _write_depth_format(self.dense_dir, DEPTHS, view, estimate.depth, "photometric")
 
     def write_maps(self, view: View, maps: DepthMap) -> None:
-        """Write the geometric maps of a view."""
-        write_maps(self.dense_dir, view, maps)
+        """Write the confirmed depths (H, W) and the normals (H, W, 3) of a view, as COLMAP's fusion expects them."""
+        # pycolmap takes (H, W, 3) but stores the bytes unchanged, while COLMAP keeps x, y and z in planes.
+        planes = np.ascontiguousarray(maps.normals.transpose(2, 0, 1)).reshape(maps.normals.shape)
+        with (
+            translate_errors(f"writing the normal map of {view.name}"),
+            _atomic_path(normals_file(self.dense_dir, view)) as path,
+        ):
+            pycolmap.NormalMap.from_array(planes).write(path)
+        write_depth(self.dense_dir, view, maps.depth)
 
 
 def read_depth(dense_dir: Path, view: View, kind: Kind) -> NDArray[np.float32]:
     """Read a depth map (H, W): 0 where unknown, MASKED where the photo is masked, SKY where it shows the sky."""
-    return _read_depth_format(dense_dir, DEPTHS, view, kind)
-
-
-def read_normals(dense_dir: Path, view: View) -> NDArray[np.float32]:
-    """Read the normals (H, W, 3) of a view."""
-    with translate_errors(f"reading the normal map of {view.name}"):
-        stored = pycolmap.NormalMap()
-        stored.read(_map_path(dense_dir, NORMALS, view))
-    planes = np.array(stored.to_array(), np.float32)
-    height, width = planes.shape[:2]
-    return np.ascontiguousarray(planes.reshape(3, height, width).transpose(1, 2, 0))
-
-
-def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
-    """Write the confirmed depths (H, W) and the normals (H, W, 3) of a view, as COLMAP's fusion expects them."""
-    # pycolmap takes (H, W, 3) but stores the bytes unchanged, while COLMAP keeps x, y and z in planes.
-    planes = np.ascontiguousarray(maps.normals.transpose(2, 0, 1)).reshape(maps.normals.shape)
-    with (
-        translate_errors(f"writing the normal map of {view.name}"),
-        _atomic_path(_map_path(dense_dir, NORMALS, view)) as path,
-    ):
-        pycolmap.NormalMap.from_array(planes).write(path)
-    write_depth(dense_dir, view, maps.depth)
+    return _read_depth_format(_map_path(dense_dir, DEPTHS, view, kind), view.name)
 
 
 def write_depth(dense_dir: Path, view: View, depth: NDArray[np.float32]) -> None:
@@ -258,10 +238,10 @@ def digest_maps(dense_dir: Path) -> str:
     return digest_files(dense_dir, *MAPS)
 
 
-def _read_depth_format(dense_dir: Path, folder: str, view: View, kind: Kind) -> NDArray[np.float32]:
-    with translate_errors(f"reading the depth map of {view.name}"):
+def _read_depth_format(path: Path, photo: str) -> NDArray[np.float32]:
+    with translate_errors(f"reading the depth map of {photo}"):
         stored = pycolmap.DepthMap()
-        stored.read(_map_path(dense_dir, folder, view, kind))
+        stored.read(path)
     return np.array(stored.to_array(), np.float32)
 
 
@@ -275,7 +255,7 @@ def _write_depth_format(dense_dir: Path, folder: str, view: View, values: NDArra
         pycolmap.DepthMap.from_array(np.ascontiguousarray(values), low, high).write(path)
 
 
-def _map_path(dense_dir: Path, folder: str, view: View, kind: Kind = "geometric") -> Path:
+def _map_path(dense_dir: Path, folder: str, view: View, kind: Kind) -> Path:
     return dense_dir / "stereo" / folder / f"{view.name}.{kind}{view.level or ''}.bin"
 
 
@@ -306,7 +286,4 @@ def read_photo_and_depth(dense_dir: Path, name: str) -> tuple[NDArray[np.uint8],
     image = _decode(dense_dir, name, cv2.IMREAD_COLOR_RGB)
     if image is None:
         raise ValueError(f"{name} is no photo")
-    with translate_errors(f"reading the depth map of {name}"):
-        stored = pycolmap.DepthMap()
-        stored.read(dense_dir / "stereo" / DEPTHS / f"{name}.geometric.bin")
-    return image, np.array(stored.to_array(), np.float32)
+    return image, _read_depth_format(dense_dir / "stereo" / DEPTHS / f"{name}.geometric.bin", name)

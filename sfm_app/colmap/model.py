@@ -15,7 +15,7 @@ from sfm_app.colmap.database import open_database
 from sfm_app.geometry.epipolar import TwoViewSeed
 from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import finite_entries
-from sfm_app.types import CameraModel, Frustum, Model, PairId, Scene, SceneArrays, Surface
+from sfm_app.types import CameraModel, Model, PairId, PosedPhoto, Scene, SceneArrays, Surface
 
 
 def finite_mask(xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -283,11 +283,11 @@ def sparse_model(model_dir: Path) -> Model:
     return Model(Surface(xyz, np.zeros((0, 3), np.int64), colors), cameras=cameras)
 
 
-def _frustum(image: pycolmap.Image, camera: pycolmap.Camera) -> Frustum:
+def _frustum(image: pycolmap.Image, camera: pycolmap.Camera) -> PosedPhoto:
     K, pose = scale_matrix(camera), image.cam_from_world().matrix()
     if camera.is_spherical():  # drawn as a view of 90 degrees to its front
         K = camera_matrix(camera.width / 2, camera.width / 2, camera.width / 2, camera.height / 2)
-    return Frustum(image.name, K, np.asarray(pose, np.float64), camera.width, camera.height)
+    return PosedPhoto(image.name, K, np.asarray(pose, np.float64), camera.width, camera.height)
 
 
 class RefinedCamera(TypedDict, total=False):

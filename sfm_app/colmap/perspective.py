@@ -16,16 +16,21 @@ from sfm_app.camera.projection import FX
 from sfm_app.colmap import tasks
 from sfm_app.colmap.backend import check_written, pycolmap, translate_errors
 from sfm_app.colmap.model import finite_points, point_arrays, posed_images
-from sfm_app.colmap.wide_views import WideLens, add_view_cameras, parse_view_name, perspective_lenses, render_views
+from sfm_app.colmap.wide_views import (
+    ViewNames,
+    WideLens,
+    make_view_model,
+    parse_view_name,
+    perspective_lenses,
+    render_views,
+)
 from sfm_app.colmap.worker_process import run_worker
+from sfm_app.meshing.agreement import RefinePhoto
 from sfm_app.operating_system import replace_file
 from sfm_app.progress import Progress
 from sfm_app.stereo import View
 from sfm_app.types.arrays import FloatArray
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
-
-ViewNames = Mapping[str, Sequence[str]]
-"""Names of the views of each photo, by its name."""
 
 
 def full_size_lenses(model: pycolmap.Reconstruction, *, centered: bool) -> dict[int, WideLens]:
@@ -66,7 +71,7 @@ def perspective_photos(
 ) -> tuple[PerspectivePhoto, ...]:
     """Return the views of all posed photos, by name of the photo."""
     return tuple(
-        PerspectivePhoto(name, image.name, view.K, view.width, view.height, view.R @ image.cam_from_world().matrix())
+        PerspectivePhoto(name, view.K, view.R @ image.cam_from_world().matrix(), view.width, view.height, image.name)
         for image in sorted(posed_images(model), key=lambda image: image.name)
         for name, view in zip(names[image.name], lenses[image.camera_id].views, strict=True)
     )
@@ -77,54 +82,21 @@ def write_view_model(
     text: bool = False,
 ) -> None:  # fmt: skip
     """Write COLMAP's model of the views into a new or existing folder, as text or binary."""
+
+    def keypoint_rays(image: pycolmap.Image, tracked: Sequence[pycolmap.Point2D]) -> FloatArray:
+        pixels = np.array([point.xy for point in tracked], np.float64).reshape(-1, 2)
+        return np.asarray(model.cameras[image.camera_id].cam_ray_from_img(pixels), np.float64).reshape(-1, 3)
+
     folder.mkdir(parents=True, exist_ok=True)
     with translate_errors("writing the model of undistorted photos"):
-        view_model = make_view_model(model, lenses, names)
+        view_model = make_view_model(model, lenses, names, keypoint_rays)
         view_model.write_text(folder) if text else view_model.write(folder)
     check_written(*folder.iterdir())
-
-
-def make_view_model(
-    model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames
-) -> pycolmap.Reconstruction:
-    """Return the model of the views; points keep their ids, and points that no view shows are left out."""
-    view_model = pycolmap.Reconstruction()
-    cameras = add_view_cameras(view_model, lenses)
-    tracks = {point: pycolmap.Track() for point in sorted(model.points3D)}
-    for image in sorted(posed_images(model), key=lambda image: image.name):
-        tracked = [point for point in image.points2D if point.has_point3D()]
-        pixels = np.array([point.xy for point in tracked], np.float64).reshape(-1, 2)
-        rays = np.asarray(model.cameras[image.camera_id].cam_ray_from_img(pixels), np.float64).reshape(-1, 3)
-        for number, view in enumerate(lenses[image.camera_id].views):
-            projected = rays @ view.R.T @ view.K.T
-            with np.errstate(divide="ignore", invalid="ignore"):
-                x = projected[:, :2] / projected[:, 2:]
-            inside = np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1)
-            shown = np.flatnonzero((projected[:, 2] > 0.0) & inside)
-            image_id = view_model.num_images() + 1
-            for index, row in enumerate(shown):
-                tracks[tracked[row].point3D_id].add_element(image_id, index)
-            camera_id = cameras[image.camera_id, number]
-            added = pycolmap.Image(
-                name=names[image.name][number], keypoints=x[shown], camera_id=camera_id, image_id=image_id
-            )
-            pose = pycolmap.Rigid3d(view.R @ image.cam_from_world().matrix())
-            view_model.add_image_with_trivial_frame(added, pose)
-    for point_id, track in tracks.items():
-        if track.length():
-            old = model.points3D[point_id]
-            view_model.add_point3D_with_id(point_id, pycolmap.Point3D(xyz=old.xyz, color=old.color, track=track))
-    view_model.update_point_3d_errors()
-    return view_model
 
 
 def all_points(model: pycolmap.Reconstruction) -> PointCloud:
     """Return the finite points of a model, in order of ids."""
     return PointCloud(*point_arrays(finite_points(model)))
-
-
-LargerView = tuple[str, NDArray[np.float64], NDArray[np.uint8], NDArray[np.bool_]]
-"""Name of a view, its K (3, 3) in pixels, its gray levels (H, W), and the mask (H, W) of usable pixels."""
 
 
 class LargerViews:
@@ -139,16 +111,17 @@ class LargerViews:
             lenses = perspective_lenses(model, max_side_px)
             images = {image.name: image for image in posed_images(model)}
         parts: dict[int, dict[int, PerspectiveView]] = {}
-        self._camera, self._numbers = dict[str, int](), dict[str, dict[int, str]]()
+        self._camera, self._poses = dict[str, int](), dict[str, dict[int, View]]()
         for view in views:
             # a single view has the name of its photo
             name, number = (view.name, 0) if view.name in images else parse_view_name(view.name)
             image = images[name]
             R = view.R @ image.cam_from_world().matrix()[:, :3].T
-            focal_px = float(lenses[image.camera_id].params[FX])
-            parts.setdefault(image.camera_id, {}).setdefault(number, _resize(view, R, focal_px, max_side_px))
+            larger = _resize(view, float(lenses[image.camera_id].params[FX]), max_side_px)
+            part = PerspectiveView(R, larger.K, larger.width, larger.height)
+            parts.setdefault(image.camera_id, {}).setdefault(number, part)
             self._camera[name] = image.camera_id
-            self._numbers.setdefault(name, {})[number] = view.name
+            self._poses.setdefault(name, {})[number] = larger
         self._order = {key: sorted(numbers) for key, numbers in parts.items()}
         self._lenses = {
             key: replace(lenses[key], views=tuple(parts[key][k] for k in order)) for key, order in self._order.items()
@@ -160,24 +133,22 @@ class LargerViews:
         """Names of the photos, those of the same camera together: they show the same pixels."""
         return sorted(self._camera, key=lambda photo: (self._camera[photo], photo))
 
-    def render(self, photo: str) -> Iterator[LargerView]:
+    def render(self, photo: str) -> Iterator[RefinePhoto]:
         """Yield the views of a photo."""
-        camera_id, names = self._camera[photo], self._numbers[photo]
+        camera_id, poses = self._camera[photo], self._poses[photo]
         lens, maps = self._lenses[camera_id], self._maps.camera_maps(camera_id)
         with translate_errors(f"reading {photo}"):
             pictures = render_views(photo, lens, self._photo_dir, self._mask_dir, maps)
-            for number, view, (pixels, shown) in zip(self._order[camera_id], lens.views, pictures, strict=True):
-                if number in names:
+            for number, (pixels, shown) in zip(self._order[camera_id], pictures, strict=True):
+                if number in poses:
                     gray = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), np.uint8)
-                    yield names[number], view.K, gray, shown
+                    yield RefinePhoto(poses[number], gray, None if shown.all() else ~shown)
 
 
-def _resize(view: View, R: NDArray[np.float64], focal_px: float, max_side_px: int) -> PerspectiveView:
+def _resize(view: View, focal_px: float, max_side_px: int) -> View:
     """Return a view in the resolution of its photo, or smaller if its longest side is limited."""
     scale = min(max_side_px / max(view.width, view.height), focal_px / float(view.K[0, 0]))
-    width, height = max(1, round(scale * view.width)), max(1, round(scale * view.height))
-    K = np.diag([width / view.width, height / view.height, 1.0]) @ view.K
-    return PerspectiveView(R, np.asarray(K, np.float64), width, height)
+    return view.resize(max(1, round(scale * view.width)), max(1, round(scale * view.height)))
 
 
 def write_bundle(model_dir: Path, photo_dir: Path, file: Path, workers: int, progress: Progress) -> None:

@@ -72,11 +72,10 @@ def positions(records: NDArray[np.void]) -> NDArray[np.float64]:
 def poisson_surface(folder: Path, depth: int) -> Surface:
     """Return Poisson's closed surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points of a folder.
 
-    All vertices have the same color. The depth of the octree is raised to 5, with which small surfaces are fine enough;
-    the finest cell is the largest extent of the points over 2^depth.
+    All vertices have the same color. The finest cell is the largest extent of the points over 2^depth.
     """
     path = folder / "poisson.ply"
-    run_worker(partial(tasks.mesh_poisson, folder / FUSED, path, max(depth, 5)), "finding the surface")
+    run_worker(partial(tasks.mesh_poisson, folder / FUSED, path, depth), "finding the surface")
     surface = _read(path)
     path.unlink()
     return surface

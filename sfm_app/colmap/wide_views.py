@@ -1,6 +1,6 @@
 """Photos of wide lenses in COLMAP's dense workspace, as several perspective views if one would lose too much."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,14 +10,19 @@ from numpy.typing import NDArray
 
 from sfm_app.camera.perspective_views import PerspectiveView, cover_rays
 from sfm_app.camera.projection import FISHEYE, FX, PANORAMA, SEEN_ANGLE, image_points
-from sfm_app.colmap.backend import all_images, pycolmap, translate_errors
+from sfm_app.colmap.backend import pycolmap, translate_errors
 from sfm_app.colmap.dense import MASKS, shrink_mask
-from sfm_app.colmap.model import camera_family, read_camera
+from sfm_app.colmap.model import camera_family, posed_images, read_camera
 from sfm_app.colmap.tasks import JPEG_QUALITY
 from sfm_app.files import replace_atomically
 from sfm_app.photos.masks import read_mask, save_mask
 from sfm_app.photos.panoramas import resample, shrink
 from sfm_app.types.arrays import BoolArray, FloatArray
+
+ViewNames = Mapping[str, Sequence[str]]
+"""Names of the views of each photo, by its name."""
+RaysOfKeypoints = Callable[[pycolmap.Image, Sequence[pycolmap.Point2D]], FloatArray]
+"""Returns the rays (N, 3) of keypoints of a photo in the camera's frame, of any length."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +63,7 @@ def perspective_lenses(model: pycolmap.Reconstruction, max_side_px: int) -> dict
 
 def _single_views(model: pycolmap.Reconstruction, max_side_px: int) -> dict[int, PerspectiveView | None]:
     """Return the single view of every camera with posed photos, by its id; None where one loses too much."""
-    used = sorted({image.camera_id for image in all_images(model) if image.has_pose})
+    used = sorted({image.camera_id for image in posed_images(model)})
     return {camera_id: _one_view(model.cameras[camera_id], max_side_px) for camera_id in used}
 
 
@@ -76,20 +81,51 @@ def parse_view_name(name: str) -> tuple[str, int]:
 def write_model(model_dir: Path, lenses: Mapping[int, WideLens], dense_dir: Path) -> list[tuple[str, int]]:
     """Write the model of all views into a dense workspace; return the name and the camera's id of each photo."""
     with translate_errors("writing the model of perspective views"):
-        model, view_model = pycolmap.Reconstruction(model_dir), pycolmap.Reconstruction()
-        images = sorted((image for image in all_images(model) if image.has_pose), key=lambda image: image.name)
-        ids = add_view_cameras(view_model, lenses)
-        tracks = {point: pycolmap.Track() for point in sorted(model.points3D)}
-        for image in images:
-            lens = lenses[image.camera_id]
-            for number in range(len(lens.views)):
-                _add_view(view_model, model, image, lens, number, ids[image.camera_id, number], tracks)
-        for point, track in tracks.items():
-            if track.length():
-                view_model.add_point3D(model.points3D[point].xyz, track, model.points3D[point].color)
+        model = pycolmap.Reconstruction(model_dir)
+        photos = {image.name: image.camera_id for image in sorted(posed_images(model), key=lambda image: image.name)}
+        names = {
+            name: [view_name(name, number) for number in range(len(lenses[camera_id].views))]
+            for name, camera_id in photos.items()
+        }
+
+        def points_in_camera(image: pycolmap.Image, tracked: Sequence[pycolmap.Point2D]) -> FloatArray:
+            pose = image.cam_from_world().matrix()
+            X = np.array([model.points3D[point.point3D_id].xyz for point in tracked], np.float64).reshape(-1, 3)
+            return np.asarray(X @ pose[:, :3].T + pose[:, 3])
+
         (dense_dir / "sparse").mkdir(parents=True, exist_ok=True)
-        view_model.write(dense_dir / "sparse")
-        return [(image.name, image.camera_id) for image in images]
+        make_view_model(model, lenses, names, points_in_camera).write(dense_dir / "sparse")
+        return list(photos.items())
+
+
+def make_view_model(
+    model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames, rays_of: RaysOfKeypoints
+) -> pycolmap.Reconstruction:
+    """Return the model of the views; points keep their ids, and points that no view shows are left out."""
+    view_model = pycolmap.Reconstruction()
+    cameras = _add_view_cameras(view_model, lenses)
+    tracks = {point: pycolmap.Track() for point in sorted(model.points3D)}
+    for image in sorted(posed_images(model), key=lambda image: image.name):
+        tracked = [point for point in image.points2D if point.has_point3D()]
+        rays = rays_of(image, tracked)
+        for number, view in enumerate(lenses[image.camera_id].views):
+            x, is_shown = _project(rays, view)
+            shown = np.flatnonzero(is_shown)
+            image_id = view_model.num_images() + 1
+            for index, row in enumerate(shown):
+                tracks[tracked[row].point3D_id].add_element(image_id, index)
+            camera_id = cameras[image.camera_id, number]
+            added = pycolmap.Image(
+                name=names[image.name][number], keypoints=x[shown], camera_id=camera_id, image_id=image_id
+            )
+            pose = pycolmap.Rigid3d(view.R @ image.cam_from_world().matrix())
+            view_model.add_image_with_trivial_frame(added, pose)
+    for point_id, track in tracks.items():
+        if track.length():
+            old = model.points3D[point_id]
+            view_model.add_point3D_with_id(point_id, pycolmap.Point3D(xyz=old.xyz, color=old.color, track=track))
+    view_model.update_point_3d_errors()
+    return view_model
 
 
 def write_views(name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | None, dense_dir: Path) -> None:
@@ -135,10 +171,15 @@ def _one_view(camera: pycolmap.Camera, max_side_px: int) -> PerspectiveView | No
     options.max_image_size = max_side_px
     flat = pycolmap.undistort_camera(options, camera)
     view = PerspectiveView(np.eye(3), np.array(flat.calibration_matrix()), flat.width, flat.height)
+    return view if np.mean(_project(rays, view)[1]) >= 1.0 - 0.1 else None
+
+
+def _project(rays: FloatArray, view: PerspectiveView) -> tuple[FloatArray, BoolArray]:
+    """Return the pixels (N, 2) of rays (N, 3) in a view, and (N,) whether it shows them."""
+    projected = rays @ view.R.T @ view.K.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        x = (rays @ view.K.T)[:, :2] / rays[:, 2:]
-    inside = (rays[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1)
-    return view if np.mean(inside) >= 1.0 - 0.1 else None
+        x = projected[:, :2] / projected[:, 2:]
+    return x, (projected[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1)
 
 
 def _make_lens(camera: pycolmap.Camera, single: PerspectiveView | None, max_side_px: int) -> WideLens:
@@ -166,7 +207,9 @@ def _shown_rays(camera: pycolmap.Camera) -> FloatArray:
     return np.asarray(rays[sound], np.float64)
 
 
-def add_view_cameras(view_model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens]) -> dict[tuple[int, int], int]:
+def _add_view_cameras(
+    view_model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens]
+) -> dict[tuple[int, int], int]:
     """Add a camera for every view, and return its id by the camera of the photo and the number of the view."""
     ids = dict[tuple[int, int], int]()
     for camera_id, lens in sorted(lenses.items()):
@@ -179,30 +222,3 @@ def add_view_cameras(view_model: pycolmap.Reconstruction, lenses: Mapping[int, W
             )  # fmt: skip
             view_model.add_camera_with_trivial_rig(camera)
     return ids
-
-
-def _add_view(
-    view_model: pycolmap.Reconstruction,
-    model: pycolmap.Reconstruction,
-    image: pycolmap.Image,
-    lens: WideLens,
-    number: int,
-    camera_id: int,
-    tracks: Mapping[int, pycolmap.Track],
-) -> None:
-    """Add a view of a photo to the model of the views, and its points to their tracks, by id of the point."""
-    view = lens.views[number]
-    pose = view.R @ image.cam_from_world().matrix()
-    points = [point.point3D_id for point in image.points2D if point.has_point3D()]
-    X = np.array([model.points3D[point].xyz for point in points], np.float64).reshape(-1, 3)
-    projected = (X @ pose[:, :3].T + pose[:, 3]) @ view.K.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        x = projected[:, :2] / projected[:, 2:]
-    shown = np.flatnonzero((projected[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1))
-    image_id = view_model.num_images() + 1
-    for index, row in enumerate(shown):
-        tracks[points[row]].add_element(image_id, index)
-    added = pycolmap.Image(
-        name=view_name(image.name, number), keypoints=x[shown], camera_id=camera_id, image_id=image_id
-    )
-    view_model.add_image_with_trivial_frame(added, pycolmap.Rigid3d(pose))

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.types import Frustum, Model
+from sfm_app.types import Model, PosedPhoto
 from sfm_app.types.arrays import FloatArray, IndexArray
 
 CAMERA_COLOR = (255, 96, 32)
@@ -19,7 +19,7 @@ def camera_lines(model: Model) -> tuple[FloatArray, IndexArray]:
     cameras = model.cameras
     if not cameras:
         return np.zeros((0, 3)), np.zeros((0, 2), np.int64)
-    depth = frustum_depth(np.array([center(camera) for camera in cameras]), model.surface.vertices)
+    depth = frustum_depth(np.array([camera.center for camera in cameras]), model.surface.vertices)
     corners = np.concatenate([frustum_corners(camera, depth) for camera in cameras])
     starts = 5 * np.arange(len(cameras), dtype=np.int64)
     return corners, (starts[:, None, None] + np.array(FRUSTUM_EDGES)).reshape(-1, 2)
@@ -38,17 +38,12 @@ def camera_colors(count: int) -> NDArray[np.uint8]:
     return np.tile(np.array(CAMERA_COLOR, np.uint8), (count, 1))
 
 
-def center(camera: Frustum) -> FloatArray:
-    """Return the center of a camera, (3,)."""
-    return np.asarray(-camera.cam_from_world[:, :3].T @ camera.cam_from_world[:, 3])
-
-
-def frustum_corners(camera: Frustum, depth: float) -> FloatArray:
+def frustum_corners(camera: PosedPhoto, depth: float) -> FloatArray:
     """Return (5, 3) the camera's center and the corners of its image at this depth, clockwise from the top left."""
     pixels = [(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)]
     rays = np.linalg.solve(camera.K, np.column_stack([np.array(pixels, np.float64), np.ones(4)]).T).T
     corners = np.concatenate([np.zeros((1, 3)), depth * rays])
-    return np.asarray((corners - camera.cam_from_world[:, 3]) @ camera.cam_from_world[:, :3])
+    return np.asarray((corners - camera.t) @ camera.R)
 
 
 def frustum_depth(centers: FloatArray, points: FloatArray) -> float:

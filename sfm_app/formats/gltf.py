@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.formats.exporters import NORMAL_TYPE, check_writable, jpeg, normal_picture, pages_in_use, split_corners
-from sfm_app.formats.frusta import CAMERA_COLOR, camera_lines, center, frustum_depth
+from sfm_app.formats.frusta import CAMERA_COLOR, camera_lines, frustum_depth
 from sfm_app.geometry.triangles import corner_tangents, unit_normals
-from sfm_app.types import Frustum, Model, Texture
+from sfm_app.types import Model, PosedPhoto, Texture
 
 # The container of binary glTF 2.0 (ISO/IEC 12113): a JSON tree, followed by one buffer of arrays.
 
@@ -84,6 +84,13 @@ class Glb:
 UNLIT = "KHR_materials_unlit"
 FLIP = np.diag([1.0, -1.0, -1.0])
 """COLMAP's camera looks along +z with y down, glTF's camera along -z with y up."""
+
+
+def opengl_pose(photo: PosedPhoto) -> NDArray[np.float64]:
+    """Return (4, 4) the pose of a photo, from the axes of glTF's and OpenGL's camera to the world."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = photo.R.T @ FLIP, photo.center
+    return pose
 
 
 def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
@@ -193,18 +200,16 @@ def add_cameras(glb: Glb, model: Model) -> list[int]:
     }
     mesh = glb.add("meshes", {"name": "cameras", "primitives": [primitive]})
     nodes = [glb.add("nodes", {"name": "cameras", "mesh": mesh})]
-    near = 0.1 * frustum_depth(np.array([center(camera) for camera in model.cameras]), model.surface.vertices)
+    near = 0.1 * frustum_depth(np.array([camera.center for camera in model.cameras]), model.surface.vertices)
     return nodes + [glb.add("nodes", _camera_node(glb, camera, near)) for camera in model.cameras]
 
 
-def _camera_node(glb: Glb, camera: Frustum, near: float) -> dict[str, Any]:
+def _camera_node(glb: Glb, camera: PosedPhoto, near: float) -> dict[str, Any]:
     """Add a glTF camera at the photo's pose and return its node; glTF's principal point is central."""
     lens = {
         "yfov": float(2 * np.arctan(camera.height / (2 * camera.K[1, 1]))),
         "aspectRatio": float(camera.width / camera.K[0, 0] * camera.K[1, 1] / camera.height),
         "znear": near,
     }
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = camera.cam_from_world[:, :3].T @ FLIP, center(camera)
     number = glb.add("cameras", {"name": camera.name, "type": "perspective", "perspective": lens})
-    return {"name": camera.name, "camera": number, "matrix": matrix.T.ravel().tolist()}
+    return {"name": camera.name, "camera": number, "matrix": opengl_pose(camera).T.ravel().tolist()}

@@ -12,12 +12,12 @@ from sfm_app.camera.models import PARAMETERS, calibration_from_model, distortion
 from sfm_app.errors import InputError
 from sfm_app.files import replace_atomically
 from sfm_app.formats.exporters import FinishedScene
-from sfm_app.formats.gltf import FLIP
+from sfm_app.formats.gltf import opengl_pose
 from sfm_app.formats.meshes import cloud_ply
 from sfm_app.numerical import json_text
 from sfm_app.types import CameraModel, Scene
 from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE
-from sfm_app.types.scene import PerspectivePhoto
+from sfm_app.types.scene import PerspectivePhoto, camera_center
 
 # Names of files that every program can read.
 
@@ -60,7 +60,7 @@ def write_cameras(scene: FinishedScene, target: Path) -> None:
         name: {
             "camera": result.camera_of[name],
             "cam_from_world": pose.tolist(),
-            "center": (-pose[:, :3].T @ pose[:, 3]).tolist(),
+            "center": camera_center(pose).tolist(),
         }
         for name, pose in result.cam_from_world.items()
     }
@@ -102,7 +102,7 @@ def write_bundler(scene: FinishedScene, target: Path) -> None:
     views = scene.perspective(centered=True)
     views.write_photos(target)
     views.write_bundle(target / "bundle.out")
-    lines = "".join(f"images/{photo.image}\n" for photo in views.photos)
+    lines = "".join(f"images/{photo.name}\n" for photo in views.photos)
     (target / "list.txt").write_text(lines, encoding="ascii", newline="\n")
 
 
@@ -138,10 +138,8 @@ def intrinsics(photo: PerspectivePhoto) -> dict[str, float]:
 
 def frame(photo: PerspectivePhoto) -> dict[str, Any]:
     """Return the file and the pose of a photo."""
-    R, t = photo.cam_from_world[:, :3], photo.cam_from_world[:, 3]
-    world_from_cam = np.eye(4)
-    world_from_cam[:3, :3], world_from_cam[:3, 3] = R.T @ FLIP, -R.T @ t
-    entry: dict[str, Any] = {"file_path": f"images/{photo.image}", "transform_matrix": world_from_cam.tolist()}
+    pose = opengl_pose(photo).tolist()
+    entry: dict[str, Any] = {"file_path": f"images/{photo.name}", "transform_matrix": pose}
     return entry | ({"mask_path": f"masks/{photo.mask}"} if photo.mask else {})
 
 

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.formats.exporters import NORMAL_SUFFIX, check_writable, jpeg, normal_picture, pages_in_use
-from sfm_app.formats.frusta import center, frustum_depth
-from sfm_app.formats.gltf import FLIP, linear_colors
+from sfm_app.formats.frusta import frustum_depth
+from sfm_app.formats.gltf import linear_colors, opengl_pose
 from sfm_app.geometry.triangles import unit_normals
-from sfm_app.types import Frustum, Model, Surface, Texture
+from sfm_app.types import Model, PosedPhoto, Surface, Texture
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
@@ -187,7 +187,7 @@ def add_points(stage: "Usd.Stage", model: Model) -> None:
     surface = model.surface
     points = UsdGeom.Points.Define(stage, f"{ROOT}/points")
     points.CreatePointsAttr(_vectors(surface.vertices))
-    centers = np.array([center(camera) for camera in model.cameras] or [np.zeros(3)])
+    centers = np.array([camera.center for camera in model.cameras] or [np.zeros(3)])
     width = 2e-3 * frustum_depth(centers, surface.vertices)  # by hand
     points.CreateWidthsAttr(Vt.FloatArray([width]))
     points.SetWidthsInterpolation(UsdGeom.Tokens.constant)
@@ -209,12 +209,11 @@ def add_cameras(stage: "Usd.Stage", model: Model) -> None:
         lens.CreateVerticalApertureAttr(film["height"])
         lens.CreateHorizontalApertureOffsetAttr(film["right"])
         lens.CreateVerticalApertureOffsetAttr(film["up"])
-        matrix = np.eye(4)  # of rows, as USD multiplies
-        matrix[:3, :3], matrix[3, :3] = FLIP @ camera.cam_from_world[:, :3], center(camera)
+        matrix = opengl_pose(camera).T  # USD multiplies rows
         UsdGeom.Xformable(lens).AddTransformOp().Set(Gf.Matrix4d(matrix.tolist()))
 
 
-def film_of(camera: Frustum) -> dict[str, float]:
+def film_of(camera: PosedPhoto) -> dict[str, float]:
     """Return the film of a camera in millimeters: focal, width, height, and its middle's offset right and up."""
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
     focal = FILM_MM * fx / camera.width

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sfm_app.geometry.poses import Similarity
-from sfm_app.types import Frustum, Model
+from sfm_app.types import Model, PosedPhoto
 
 GPS = "GPS of the photos"
 CONTRADICTION = 4.0
@@ -139,8 +139,8 @@ def move_model(model: Model, similarity: Similarity) -> Model:
     return replace(model, surface=surface, cameras=tuple(_move_camera(one, similarity) for one in model.cameras))
 
 
-def _move_camera(camera: Frustum, similarity: Similarity) -> Frustum:
+def _move_camera(camera: PosedPhoto, similarity: Similarity) -> PosedPhoto:
     """Return a camera in the target frame: lengths in the camera's frame scale, too, and rays stay."""
-    R = camera.cam_from_world[:, :3] @ similarity.R.T
-    t = similarity.scale * camera.cam_from_world[:, 3] - R @ similarity.t
+    R = camera.R @ similarity.R.T
+    t = similarity.scale * camera.t - R @ similarity.t
     return replace(camera, cam_from_world=np.column_stack([R, t]))

@@ -255,12 +255,12 @@ def triangulate(P1: FloatArray, P2: FloatArray, x1: FloatArray, x2: FloatArray) 
 
 
 def triangulation_angle_deg(X: FloatArray, center1: FloatArray, center2: FloatArray) -> FloatArray:
-    """Return the angle (N,) between the two rays to each point (N, 3), in degrees in [0, 180]."""
+    """Return the angle (N,) between the two rays to each point (N, 3), in degrees in [0, 180]; 0 at infinity."""
     ray1, ray2 = X - center1, X - center2
-    with np.errstate(invalid="ignore"):
-        cosine = (ray1 * ray2).sum(axis=1) / (np.linalg.norm(ray1, axis=1) * np.linalg.norm(ray2, axis=1))
-    angles: FloatArray = np.degrees(np.arccos(np.clip(np.nan_to_num(cosine, nan=1.0), -1.0, 1.0)))
-    return angles
+    with np.errstate(invalid="ignore", over="ignore"):
+        sine, cosine = np.linalg.norm(np.cross(ray1, ray2), axis=1), np.sum(ray1 * ray2, axis=1)
+    # atan2 keeps small angles exact, where arccos of a rounded cosine does not
+    return np.where(np.isfinite(sine), np.degrees(np.arctan2(sine, cosine)), 0.0)
 
 
 def essential_from_fundamental(F: FloatArray, K1: FloatArray, K2: FloatArray) -> FloatArray:

@@ -270,10 +270,3 @@ def morton_order(points: FloatArray) -> IndexArray:
         for axis in range(3):
             code |= ((grid[:, axis] >> bit) & 1) << (3 * bit + axis)
     return np.argsort(code, kind="stable")
-
-
-def border_angle(K: FloatArray, width: float, height: float) -> float:
-    """Return the largest angle in radians between the optical axis and the border of a photo without distortion."""
-    corners = np.array([[x, y, 1.0] for x in (-1.0, width + 1.0) for y in (-1.0, height + 1.0)])
-    rays = np.linalg.solve(K, corners.T).T
-    return float(np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2]).max())

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.meshing.visibility import PosedPhoto
+from sfm_app.types import PosedPhoto
 from sfm_app.types.arrays import FloatArray, IndexArray
 
 Gray = NDArray[np.float32]
@@ -36,57 +36,34 @@ LEAST_FACING = 0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RefinePhoto(PosedPhoto):
+class RefinePhoto:
     """A posed photo and its gray levels."""
 
+    posed: PosedPhoto
     gray: NDArray[np.uint8]
     """(H, W)."""
     masked: NDArray[np.bool_] | None = None
     """(H, W) masked pixels."""
 
-    def size_at(self, share: float) -> tuple[int, int]:
-        """Return height and width at a share of the full resolution."""
-        height, width = self.gray.shape
-        return max(2, round(share * height)), max(2, round(share * width))
+    def posed_at(self, share: float) -> PosedPhoto:
+        """Return the pose and the camera at a share of the full resolution."""
+        width, height = (max(2, round(share * side)) for side in (self.posed.width, self.posed.height))
+        return self.posed.resize(width, height)
 
-    def projection(self, share: float) -> FloatArray:
-        """Return the (3, 4) projection matrix at a share of the full resolution."""
-        (height, width), full = self.size_at(share), self.gray.shape
-        scale = np.diag([width / full[1], height / full[0], 1.0])
-        return np.asarray(scale @ self.K @ np.column_stack([self.R, self.t]))
-
-    def mask_at(self, share: float) -> NDArray[np.bool_] | None:
-        """Return the mask at a share of the full resolution: pixels of which any part is masked."""
+    def mask_at(self, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+        """Return the mask at a size (W, H): pixels of which any part is masked."""
         if self.masked is None:
             return None
-        size = self.size_at(share)[::-1]
         return np.asarray(cv2.resize(self.masked.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0)
 
-    def level(self, share: float) -> "PhotoLevel":
-        """Return the photo at a share of its resolution, smoothed, with its gradients."""
-        height, width = self.size_at(share)
+    def image_at(self, size: tuple[int, int]) -> Gray:
+        """Return (H, W, 3) smooth gray levels at a size (W, H), and their derivatives by x and by y, per pixel."""
         small = self.gray
-        if (height, width) != small.shape:
-            small = np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+        if size != small.shape[::-1]:
+            small = np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_AREA), np.uint8)
         gray = np.asarray(cv2.GaussianBlur(small.astype(np.float32), (0, 0), 0.6), np.float32)  # chosen on `ornament`
         by_x, by_y = (cv2.Sobel(gray, cv2.CV_32F, *axis, ksize=3, scale=1.0 / 8.0) for axis in ((1, 0), (0, 1)))
-        projection = self.projection(share)
-        rays = np.asarray(np.linalg.inv(projection[:, :3]), np.float64)
-        return PhotoLevel(projection, self.center, rays, np.stack([gray, by_x, by_y], axis=-1, dtype=np.float32))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PhotoLevel:
-    """A photo at one resolution."""
-
-    projection: FloatArray
-    """(3, 4) K [R | t]."""
-    center: FloatArray
-    """(3,) in the world."""
-    rays: FloatArray
-    """(3, 3) from pixels (x, y, 1) to rays in the world, at depth 1."""
-    image: Gray
-    """(H, W, 3) gray levels, and their derivatives by x and by y, per pixel."""
+        return np.stack([gray, by_x, by_y], axis=-1, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,10 +76,11 @@ class Raster:
     """(H, W) triangle; NOTHING without surface, or where the photo sees its back."""
 
 
-def rasterize(vertices: FloatArray, faces: IndexArray, projection: FloatArray, size: tuple[int, int]) -> Raster:
-    """Draw a surface, its triangles counterclockwise from outside, into a photo (height, width) at pixel centers."""
+def rasterize(vertices: FloatArray, faces: IndexArray, photo: PosedPhoto) -> Raster:
+    """Draw a surface, its triangles counterclockwise from outside, into a photo at pixel centers."""
+    size = photo.height, photo.width
     nearness, face = np.zeros(size, np.float32), np.full(size, NOTHING, np.int32)
-    _draw(project_vertices(vertices, projection), faces, nearness, face)
+    _draw(project_vertices(vertices, photo.projection), faces, nearness, face)
     with np.errstate(divide="ignore"):
         return Raster(np.float32(1.0) / nearness, face)
 
@@ -185,29 +163,32 @@ class Pull:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """A photo, and the surface in it."""
+    """A photo at one resolution, and the surface in it."""
 
-    level: PhotoLevel
+    photo: PosedPhoto
+    image: Gray
+    """(H, W, 3), see `RefinePhoto.image_at`."""
     raster: Raster
 
 
 def compare(vertices: FloatArray, faces: IndexArray, normals: Gray, here: Sight, others: Iterable[Sight]) -> Pull:
     """Return the pull of the differences between a photo and others; the normals (T, 3) are those of the triangles."""
-    pull, level, raster = Pull.zeros(len(vertices)), here.level, here.raster
+    pull, raster, center = Pull.zeros(len(vertices)), here.raster, here.photo.center
+    rays = np.linalg.inv(here.photo.projection[:, :3])  # from pixels (x, y, 1) to rays in the world, at depth 1
     shape = raster.depth.shape
     g, h = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     views = np.empty((*shape, 3), np.float32)
     sums = np.empty((7, shape[1]))
     for other in others:
-        H, p = other.level.projection[:, :3] @ level.rays, other.level.projection @ np.append(level.center, 1.0)
+        P = other.photo.projection
         _look_through(
-            (raster.depth, raster.face, normals), (H, p), (level.rays, level.center - other.level.center),
-            (other.level.image, other.raster.depth), views,
+            (raster.depth, raster.face, normals), (P[:, :3] @ rays, P @ np.append(center, 1.0)),
+            (rays, center - other.photo.center), (other.image, other.raster.depth), views,
         )  # fmt: skip
-        correlation, pixels = _weigh(level.image, views, sums, g, h)
+        correlation, pixels = _weigh(here.image, views, sums, g, h)
         pull.correlation += correlation
         pull.pixels += pixels
-    _sum_up((vertices, faces), (raster.face, raster.depth), (level.rays, level.center), (g, h), (pull.g, pull.h))
+    _sum_up((vertices, faces), (raster.face, raster.depth), (rays, center), (g, h), (pull.g, pull.h))
     return pull
 
 

@@ -132,17 +132,16 @@ def trim(surface: Surface, support: Support, max_gap_triangles: float, least: fl
     """Keep the parts that photos confirm and do not see through, bridge small gaps, and smooth the border."""
     enough = support.confirmed >= TRIM.least_confirmed * (support.confirmed + support.empty)
     is_supported = (support.confirmed > 0) & ~support.is_free & enough
-    sign, edges = np.where(is_supported, 1.0, -1.0), unique_edges(surface.faces)
-    bridged = bridge_gaps(surface, sign, support.is_free, max_gap_triangles, edges)
-    smooth = smooth_support(surface, bridged, TRIM.smoothing, edges)
-    whole = bridge_gaps(surface, smooth, support.is_free, max_gap_triangles, edges)
-    return cut(surface, drop_doubtful_parts(surface, whole, support.confirmed, least, edges), edges)
+    sign, (edges, edge_of) = np.where(is_supported, 1.0, -1.0), unique_edges(surface.faces)
+    bridged = bridge_gaps(surface, edges, sign, support.is_free, max_gap_triangles)
+    whole = bridge_gaps(surface, edges, smooth_support(edges, bridged), support.is_free, max_gap_triangles)
+    return cut(surface, drop_doubtful_parts(edges, whole, support.confirmed, least), (edges, edge_of))
 
 
 def bridge_gaps(
-    surface: Surface, support: FloatArray, free: NDArray[np.bool_], max_width: float, known: Edges | None = None
+    surface: Surface, edges: IndexArray, support: FloatArray, free: NDArray[np.bool_], max_width: float
 ) -> FloatArray:
-    """Add support to small unsupported patches that hardly any photo sees through.
+    """Add support to small unsupported patches, by the edges (E, 2), that hardly any photo sees through.
 
     The support (V,) is positive where photos confirm the surface; `free` marks where they see through it. It becomes 1
     on patches of at most `max_width`, in edge lengths of their rim; their length is not limited.
@@ -152,7 +151,6 @@ def bridge_gaps(
     inside = support > 0
     if not inside.any() or inside.all():
         return support
-    edges, _ = known or unique_edges(surface.faces)
     length = np.linalg.norm(surface.vertices[edges[:, 0]] - surface.vertices[edges[:, 1]], axis=1)
     ends_inside = inside[edges].sum(axis=1)
     outer = edges[ends_inside == 0]
@@ -170,28 +168,26 @@ def bridge_gaps(
 
 
 def drop_doubtful_parts(
-    surface: Surface, support: FloatArray, confirmed: NDArray[np.int32], least: float, known: Edges | None = None
+    edges: IndexArray, support: FloatArray, confirmed: NDArray[np.int32], least: float
 ) -> FloatArray:
-    """Remove the support of connected parts that too few photos confirm on average.
+    """Remove the support of parts, connected by edges (E, 2), that too few photos confirm on average.
 
     Examples are fragments around outlines: two or three photos agree by chance, and the gaps between are bridged. The
     mean number of photos that confirm a vertex, by their number (V,) at each, has to reach `least`.
     """
     from scipy.sparse.csgraph import connected_components
 
-    edges, _ = known or unique_edges(surface.faces)
     inside = support > 0
     count, part = connected_components(_graph(edges[inside[edges].all(axis=1)], len(support)), directed=False)
     mean = np.bincount(part, confirmed, count) / np.bincount(part, minlength=count)
     return np.where(inside & (mean[part] < least), -1.0, support)
 
 
-def smooth_support(surface: Surface, support: FloatArray, steps: int, known: Edges | None = None) -> FloatArray:
-    """Average the support over each vertex and its neighbors, (V,), to smooth the border."""
-    edges, _ = known or unique_edges(surface.faces)
+def smooth_support(edges: IndexArray, support: FloatArray) -> FloatArray:
+    """Average the support (V,) over each vertex and its neighbors by the edges (E, 2), to smooth the border."""
     graph = _graph(edges, len(support))
     neighbors = np.maximum(np.bincount(edges.ravel(), minlength=len(support)), 1)
-    for _ in range(steps):
+    for _ in range(TRIM.smoothing):
         support = 0.5 * support + 0.5 * (graph @ support + graph.T @ support) / neighbors
     return support
 

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import log
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,16 +69,6 @@ def cell_sizes(extent: float, depth: int) -> Iterator[float]:
         yield CELLS.margin * extent / 2.0**level
 
 
-class PointCells(Protocol):
-    """Figures of the cells of a grid over oriented points."""
-
-    def points_per_cell(self, cell: float) -> float:
-        """Return the mean number of points in an occupied cell of that side."""
-
-    def bent_share(self, cell: float) -> float:
-        """Return the share of cells of that side whose normals differ."""
-
-
 def count_cells(points: FloatArray, cell: float) -> int:
     """Return how many cells of a grid hold points; points (N, 3)."""
     keys = np.sort(_number_cells(points, cell))
@@ -100,19 +89,23 @@ def _number_cells(points: FloatArray, cell: float) -> NDArray[np.int64]:
     return np.asarray((at[:, 0] << 42) + (at[:, 1] << 21) + at[:, 2])
 
 
-def choose_cell(sizes: Sequence[float], cells: PointCells, least: float = CELLS.least_points) -> float:
+def choose_cell(
+    sizes: Sequence[float], points_per_cell: Callable[[float], float], bent_share: Callable[[float], float],
+    least: float = CELLS.least_points,
+) -> float:  # fmt: skip
     """Return the side of Poisson's finest cells by the density of the points; smaller where surfaces are bent.
 
     Thin things and ornaments are lost in cells of several points, walls are not. The sizes are the finest first, each
-    twice the one before; `least` is the smallest mean number of points in an occupied cell.
+    twice the one before. Of the cells of a side, `points_per_cell` returns the mean number of points in an occupied
+    one, at least `least`, and `bent_share` the share with normals that differ.
     """
-    density = cache(cells.points_per_cell)
+    density = cache(points_per_cell)
     fine, coarse = (find_size(sizes, density, points) for points in (least, max(least, CELLS.most_points)))
     if fine == coarse:
         return fine
-    if (bent_if_coarse := cells.bent_share(2.0 * coarse)) <= CELLS.bent_share:
+    if (bent_if_coarse := bent_share(2.0 * coarse)) <= CELLS.bent_share:
         return coarse
-    if (bent_if_fine := cells.bent_share(2.0 * fine)) >= CELLS.bent_share:
+    if (bent_if_fine := bent_share(2.0 * fine)) >= CELLS.bent_share:
         return fine
     share = log(CELLS.bent_share / max(bent_if_fine, 1e-6)) / log(bent_if_coarse / max(bent_if_fine, 1e-6))
     return float(fine * (coarse / fine) ** share)

@@ -1,11 +1,10 @@
 """Refinement of a surface by photos, from coarse to fine, in a few Gauss-Newton steps each."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from threading import Lock
-from typing import Any
 
 import numpy as np
 
@@ -14,11 +13,10 @@ from sfm_app.geometry.triangles import morton_order, unique_edges, vertex_normal
 from sfm_app.jit import kernel
 from sfm_app.meshing.agreement import NOTHING, Pull, RefinePhoto, Sight, compare, project_vertices, rasterize
 from sfm_app.meshing.fairness import Neighbors, find_displacements
+from sfm_app.tasks import Spread
 from sfm_app.types import Surface
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-Spread = Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]]
-"""Calls a function for every number, possibly in parallel, and returns the results in order."""
 MOST_KEPT_PX = 100_000_000
 """Pixels of the photos that `Sights` keeps: 2 GB."""
 
@@ -90,8 +88,9 @@ def finest_pixels(vertices: FloatArray, photos: Sequence[RefinePhoto], share: fl
     """Return (V,) the size of a pixel at each vertex in the closest photo with it in view, even hidden, or infinity."""
     sizes = np.full(len(vertices), np.inf)
     for photo in photos:
-        pixels = project_vertices(vertices, photo.projection(share))
-        _keep_finest(pixels, photo.size_at(share), photo.focal_px, photo.gray.shape[1], sizes)
+        full, small = photo.posed, photo.posed_at(share)
+        pixels = project_vertices(vertices, small.projection)
+        _keep_finest(pixels, (small.height, small.width), full.focal_px, full.width, sizes)
     return sizes
 
 
@@ -187,11 +186,12 @@ def _improve(
 
 def look(surface: Surface, photo: RefinePhoto, share: float) -> Sight:
     """Return a photo at a share of its resolution, and the surface in it; NOTHING where the photo is masked."""
-    raster = rasterize(surface.vertices, surface.faces, photo.projection(share), photo.size_at(share))
-    masked = photo.mask_at(share)
+    posed = photo.posed_at(share)
+    size = posed.width, posed.height
+    raster, masked = rasterize(surface.vertices, surface.faces, posed), photo.mask_at(size)
     if masked is not None:
         raster.depth[masked], raster.face[masked] = np.inf, NOTHING
-    return Sight(photo.level(share), raster)
+    return Sight(posed, photo.image_at(size), raster)
 
 
 class Sights:

@@ -8,12 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.triangles import border_angle
 from sfm_app.jit import kernel
-from sfm_app.types.arrays import FloatArray
-
-DepthArray = NDArray[np.float32]
-"""(H, W) depth along the optical axis in scene units, 0 where unknown."""
+from sfm_app.types import PosedPhoto
+from sfm_app.types.arrays import DepthArray, FloatArray
 
 NO_EVIDENCE, CONFIRMED, SEEN_THROUGH, EMPTY = range(4)
 SKY = -2.0
@@ -22,64 +19,21 @@ THROUGH = 3.0
 """A photo sees through a point if its depths lie at least this many tolerances behind the point."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PosedPhoto:
-    """A posed photo without distortion, x ~ K (R X + t), pixel centers at +0.5."""
-
-    K: FloatArray
-    """(3, 3) camera matrix in pixels."""
-    R: FloatArray
-    """(3, 3) rotation of cam_from_world."""
-    t: FloatArray
-    """(3,) translation of cam_from_world."""
-
-    @property
-    def center(self) -> FloatArray:
-        """(3,) center of projection in the world."""
-        return np.asarray(-self.R.T @ self.t)
-
-    @property
-    def focal_px(self) -> float:
-        """Pixels per unit of length at depth 1, the mean of both directions."""
-        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DepthView(PosedPhoto):
-    """A posed photo and its depth map."""
-
-    depth: DepthArray
-    """0 where unknown, SKY at the sky; negative, too, where the photo is masked."""
-    sample_px: float
-    """Position inside the pixel at which a depth is sampled, in x and y; 0.5 is the pixel's center."""
-
-    @property
-    def projection(self) -> FloatArray:
-        """(3, 4) K [R | t]; its last row gives the depth."""
-        return np.asarray(self.K @ np.column_stack([self.R, self.t]))
-
-    @property
-    def axis(self) -> FloatArray:
-        """(3,) unit viewing direction in the world."""
-        return np.asarray(self.R[2])
-
-    @property
-    def widest_angle(self) -> float:
-        """Upper bound in radians of the angle between the axis and the rays of the photo."""
-        return border_angle(self.K, self.depth.shape[1], self.depth.shape[0])
-
-
-def judge(points: FloatArray, normals: FloatArray, eye: DepthView, tolerance: float) -> NDArray[np.uint8]:
+def judge(
+    points: FloatArray, normals: FloatArray, photo: PosedPhoto, depth: DepthArray, sample_px: float, tolerance: float
+) -> NDArray[np.uint8]:
     """Judge points on a surface: CONFIRMED, SEEN_THROUGH, EMPTY or NO_EVIDENCE.
 
     A point is CONFIRMED if it faces the photo and the surrounding depths agree with its own within the relative
     tolerance. It is SEEN_THROUGH if its pixel shows the sky, or if all four surrounding depths lie well behind it. It
     is EMPTY if it faces the photo and no depth around it is known. Hidden and masked points give NO_EVIDENCE.
 
-    The normals (N, 3) are unit vectors; the tolerance is a relative difference in depth.
+    The normals (N, 3) are unit vectors; the tolerance is a relative difference in depth. The depth map has SKY where
+    the photo shows the sky, and other negative values where it is masked; `sample_px` is the position of a depth in its
+    pixel, in x and y, 0.5 at the center.
     """
     verdict = np.zeros(len(points), np.uint8)
-    _judge(points, normals, eye.projection, eye.center, eye.depth, np.array([eye.sample_px, tolerance]), verdict)
+    _judge(points, normals, photo.projection, photo.center, depth, np.array([sample_px, tolerance]), verdict)
     return verdict
 
 
@@ -166,15 +120,12 @@ class Paint:
 
 
 def sample_colors(
-    points: FloatArray, normals: FloatArray, verdict: NDArray[np.uint8], eye: DepthView, image: ColorImage
+    points: FloatArray, normals: FloatArray, verdict: NDArray[np.uint8], photo: PosedPhoto, image: ColorImage
 ) -> Paint:
     """Sample colors of one photo at the points that it confirms; their weight is the area of a unit patch in pixels."""
-    paint = Paint.zeros(len(points))
-    scale = np.array(image.shape[:2]) / eye.depth.shape
-    projection = np.diag([scale[1], scale[0], 1.0]) @ eye.projection
-    _sample(
-        points, normals, verdict == CONFIRMED, projection, eye.center, eye.focal_px**2, image, paint.total, paint.weight
-    )
+    paint, confirmed = Paint.zeros(len(points)), verdict == CONFIRMED
+    P, center, scale = photo.projection, photo.center, photo.focal_px**2
+    _sample(points, normals, confirmed, P, center, scale, image, paint.total, paint.weight)
     return paint
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.camera.models import camera_matrix
-from sfm_app.formats.frusta import center, scene_size
+from sfm_app.formats.frusta import scene_size
 from sfm_app.frame.scale import move_model
 from sfm_app.products import read_texture
 from sfm_app.report.contents import UNREADABLE, RunContents, data_address
@@ -15,7 +15,7 @@ from sfm_app.report.findings import glance
 from sfm_app.report.scene_view import view_points
 from sfm_app.synthetic.cameras import Camera
 from sfm_app.synthetic.render import PreparedModel, orbited_pose, render_model
-from sfm_app.types import Frustum, Model
+from sfm_app.types import Model, PosedPhoto
 
 WIDTH_PX, SUPERSAMPLING = 640, 2
 POINT_PX = 2
@@ -74,7 +74,7 @@ def _surface(contents: RunContents) -> Model | None:
         return None
 
 
-def _scaled_camera(photo: Frustum, width: int) -> Camera:
+def _scaled_camera(photo: PosedPhoto, width: int) -> Camera:
     """Return a pinhole camera at a photo's pose, for a picture of this width; a wide lens shows its middle."""
     scale, height = width / photo.width, max(1, round(width / photo.width * photo.height))
     K = np.diag([scale, scale, 1.0]) @ photo.K
@@ -90,7 +90,7 @@ def _draw_points(model: Model, camera: Camera, pose: NDArray[np.float64]) -> NDA
     picture = np.zeros((size[1], size[0], 4), np.uint8)
     X = model.surface.vertices @ pose[:, :3].T + pose[:, 3]
     middle = model.surface.vertices.mean(axis=0)
-    least = 1e-3 * scene_size(np.array([center(photo) for photo in model.cameras] + [middle]))
+    least = 1e-3 * scene_size(np.array([photo.center for photo in model.cameras] + [middle]))
     ahead = np.flatnonzero(X[:, 2] > least)
     order = ahead[np.argsort(-X[ahead, 2], kind="stable")]
     x = X[order] @ camera.K.T

@@ -17,6 +17,7 @@ from sfm_app.colmap.model import ModelFigures
 from sfm_app.report.contents import UNREADABLE, RunContents, data_address
 from sfm_app.report.figures import OPTIONS, draw_intrinsics
 from sfm_app.types.arrays import FloatArray
+from sfm_app.types.scene import camera_center
 
 # Figures: cameras, matched pairs of photos, the scene from above, and lengths of tracks.
 
@@ -116,10 +117,9 @@ def _draw_above(contents: RunContents, figures: ModelFigures | None) -> PageFigu
     scene = contents.scene
     if scene is None or figures is None or not scene.cam_from_world:
         return None
-    poses = {name: np.asarray(pose) for name, pose in scene.cam_from_world.items()}
-    centers = {name: -pose[:, :3].T @ pose[:, 3] for name, pose in poses.items()}
+    centers = {name: camera_center(pose) for name, pose in scene.cam_from_world.items()}
     at = np.array(list(centers.values()))
-    looks = np.array([pose[2, :3] for pose in poses.values()])
+    looks = np.array([pose[2, :3] for pose in scene.cam_from_world.values()])
     ends = [(centers[a], centers[b]) for a, b in _strongest_pairs(contents, centers)]
 
     def draw(figure: "Figure") -> None:

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.model import sparse_model
-from sfm_app.formats.frusta import center, frustum_depth, scene_size
-from sfm_app.formats.gltf import FLIP, write_glb
+from sfm_app.formats.frusta import frustum_depth, scene_size
+from sfm_app.formats.gltf import opengl_pose, write_glb
 from sfm_app.frame.scale import move_model
 from sfm_app.numerical import Json
 from sfm_app.photos.panoramas import shrink
 from sfm_app.products import read_texture
 from sfm_app.report.contents import UNREADABLE, RunContents
-from sfm_app.types import Frustum, Model
+from sfm_app.types import Model, PosedPhoto
 
 logger = logging.getLogger("sfm_app")
 
@@ -60,7 +60,7 @@ def view_frame(contents: RunContents, points: Model, photos: Sequence[str]) -> d
         "cameras": [_camera(camera, rows.get(camera.name)) for camera in points.cameras],
         "middle": middle,
         "size": size,
-        "depth": frustum_depth(np.array([center(camera) for camera in points.cameras]), points.surface.vertices),
+        "depth": frustum_depth(np.array([camera.center for camera in points.cameras]), points.surface.vertices),
         "unit": "m" if contents.is_metric else "",
         "fromModel": {"scale": similarity.scale, "R": similarity.R.ravel().tolist(), "t": similarity.t.tolist()},
     }
@@ -107,7 +107,7 @@ def _sample(points: Model) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
 def _bounds(points: Model) -> tuple[list[float], float]:
     places = points.surface.vertices
     if not len(places):
-        places = np.array([center(camera) for camera in points.cameras]).reshape(-1, 3)
+        places = np.array([camera.center for camera in points.cameras]).reshape(-1, 3)
     if not len(places):
         return [0.0, 0.0, 0.0], 1.0
     middle = np.median(places, axis=0)
@@ -115,14 +115,12 @@ def _bounds(points: Model) -> tuple[list[float], float]:
     return middle.tolist(), scene_size(places) or 1.0
 
 
-def _camera(camera: Frustum, row: int | None) -> dict[str, Any]:
+def _camera(camera: PosedPhoto, row: int | None) -> dict[str, Any]:
     """Return pose and field of view of a photo; the matrix is by columns, of a camera that looks along -z."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = camera.cam_from_world[:, :3].T @ FLIP, center(camera)
     return {
         "name": camera.name,
         "row": row,
-        "matrix": matrix.T.ravel().round(7).tolist(),
+        "matrix": opengl_pose(camera).T.ravel().round(7).tolist(),
         "across": float(camera.width / (2 * camera.K[0, 0])),
         "down": float(camera.height / (2 * camera.K[1, 1])),
     }

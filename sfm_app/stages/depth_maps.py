@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sfm_app.colmap.dense import (
     DenseStore,
-    MaskUndistorter,
+    cameras_of_photos,
     drop_estimates,
     has_masks,
     map_file,
@@ -21,6 +21,7 @@ from sfm_app.colmap.dense import (
     read_gray,
     read_views,
     undistort,
+    undistort_mask,
     write_depth,
     write_fusion_views,
 )
@@ -72,8 +73,9 @@ def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None
         if lenses is None:
             undistort(scene.model_dir, run.workspace.photos, dense_dir, largest, run.workers, run.progress)
             if run.mask_dir is not None:
-                undistort_mask = MaskUndistorter(scene.model_dir, run.mask_dir, dense_dir)
-                run.map(Task(undistort_mask), read_views(dense_dir), "undistorting masks")
+                cameras = Shared(cameras_of_photos(scene.model_dir))
+                task = Task(undistort_mask, cameras, run.mask_dir, dense_dir)
+                run.map(task, read_views(dense_dir), "undistorting masks")
         else:
             project = Task(_project_wide_photo, Shared(lenses), run.workspace.photos, run.mask_dir, dense_dir)
             run.map(project, write_model(scene.model_dir, lenses, dense_dir), "projecting wide photos")

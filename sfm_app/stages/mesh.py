@@ -12,7 +12,7 @@ from sfm_app.colmap.surface import FUSED, open_points, positions
 from sfm_app.errors import ReconstructionError
 from sfm_app.files import digest_files, is_made_from
 from sfm_app.meshing.cleaning import drop_islands, make_manifold, trim
-from sfm_app.meshing.octree import CELLS, cell_sizes, choose_cell, cube_around
+from sfm_app.meshing.octree import CELLS, cell_sizes, cube_around
 from sfm_app.meshing.refinement import STEPS
 from sfm_app.products import write_surface
 from sfm_app.progress import track
@@ -22,8 +22,8 @@ from sfm_app.runtime.parallel import ordered_map
 from sfm_app.stereo import View
 from sfm_app.surface.blocks import (
     EVERYWHERE,
-    RecordCells,
     SurfaceJudge,
+    choose_record_cell,
     judge_view,
     mesh_in_blocks,
     simplify_mesh,
@@ -88,7 +88,7 @@ def _span(points: NDArray[np.void], run: RunContext) -> Surface:
     max_cells = np.inf if options.max_image_size_px else 1.6 * options.faces
     sizes = list(cell_sizes(extent, options.poisson_depth))
     with run.step("finding the surface"):
-        cell = choose_cell(sizes, RecordCells(lambda: [points]), max(CELLS.least_points, len(xyz) / max_cells))
+        cell = choose_record_cell(sizes, lambda: [points], max(CELLS.least_points, len(xyz) / max_cells))
         cube = cube_around(bounds[0], bounds[1], cell)
         region = with_halo(bounds, cell) if options.trim else EVERYWHERE
         surface, raw = span_surface(points, region, cube, run.workspace.surface)

@@ -59,14 +59,23 @@ class FileStore:
         self.photo_dir, self.folder, self.mask_dir = photo_dir, folder, mask_dir
 
     def photo(self, view: PhotoView) -> NDArray[np.uint8]:
-        """Return the RGB picture (H, W, 3) of a view, without masked colors."""
-        return read_photo(self.photo_dir, view, self.usable_pixels(view))
+        """Return the RGB picture (H, W, 3) of a view, scaled down by averaging; masked pixels are filled."""
+        with Image.open(self.photo_dir / view.photo) as image:
+            photo = np.asarray(image.convert("RGB"))
+        if view.part is not None:
+            photo = show_part(photo, view.part)
+        used = self.usable_pixels(view)
+        if used is not None:
+            photo = fill_masked(photo, used)
+        if photo.shape[1::-1] != (view.width, view.height):
+            photo = np.asarray(Image.fromarray(photo).resize((view.width, view.height), Image.Resampling.BOX))
+        return photo
 
     def usable_pixels(self, view: PhotoView) -> NDArray[np.bool_] | None:
         """Return the usable pixels (H, W) of a view; None without masks."""
         if self.mask_dir is None:
             return None
-        used = read_mask(self.mask_dir, view.source)
+        used = read_mask(self.mask_dir, view.photo)
         return used if view.part is None else mask_part(used, view.part)
 
     def recall(self, name: str) -> dict[str, NDArray[np.generic]] | None:
@@ -104,16 +113,3 @@ def photo_views(scene: Scene) -> list[PhotoView]:
         parts = panorama_parts((camera.width, camera.height))
         photos += [part_view(f"{name}.{number}", name, part, pose) for number, part in enumerate(parts, 1)]
     return photos
-
-
-def read_photo(photo_dir: Path, view: PhotoView, used: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
-    """Return the RGB picture (H, W, 3) of a view, scaled down by averaging; unused pixels are filled."""
-    with Image.open(photo_dir / view.source) as image:
-        photo = np.asarray(image.convert("RGB"))
-    if view.part is not None:
-        photo = show_part(photo, view.part)
-    if used is not None:
-        photo = fill_masked(photo, used)
-    if photo.shape[1::-1] != (view.width, view.height):
-        photo = np.asarray(Image.fromarray(photo).resize((view.width, view.height), Image.Resampling.BOX))
-    return photo

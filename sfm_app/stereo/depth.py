@@ -18,9 +18,9 @@ from sfm_app.stereo.patch_match import (
 )
 from sfm_app.stereo.plain_areas import enclosed_pixels, fill_planar_areas, plain_walls, surfaceless_areas
 from sfm_app.stereo.rectify import depths_from_disparities, disparities, rectify
-from sfm_app.stereo.view import DepthArray, DepthEstimate, DepthMap, GrayImage, View
+from sfm_app.stereo.view import DepthEstimate, DepthMap, GrayImage, View
 from sfm_app.types import Rejected
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import DepthArray, FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +74,10 @@ def match_depths(
             break
     if not depths:
         return Rejected(reason)
-    merged, _ = merge_hypotheses(np.stack(depths), np.stack(parallaxes), tolerance)
+    merged = merge_hypotheses(np.stack(depths), np.stack(parallaxes), tolerance)
     planes = fit_planes(merged)
     planes[..., 0] = np.divide(1, merged, out=np.zeros_like(merged), where=merged > 0)
-    cost = improve_planes(planes, centered, image, neighbors, sweeps=1)  # a second sweep improves 1 % of the pixels
+    cost = improve_planes(planes, centered, image, neighbors)
     mean = cv2.blur(image, (3, 3))
     cost[(mean <= OPTIONS.clipped_gray) | (mean >= 255 - OPTIONS.clipped_gray)] = NO_MATCH
     # at the view's position inside the pixel
@@ -87,20 +87,17 @@ def match_depths(
     return DepthEstimate(depth, np.where(known, np.maximum(1 - cost, 0), np.float32(0)))
 
 
-def merge_hypotheses(
-    depths: NDArray[np.float32], parallaxes: NDArray[np.float32], tolerance: float
-) -> tuple[DepthArray, NDArray[np.uint8]]:
+def merge_hypotheses(depths: NDArray[np.float32], parallaxes: NDArray[np.float32], tolerance: float) -> DepthArray:
     """Fuse depths (N, H, W) of all neighbors, 0 where unknown, with their parallaxes (N, H, W) in pixels.
 
     At each pixel, the largest-weight group of depths within the relative tolerance of one of them wins and is averaged.
     The weight of a depth is its squared parallax, which is inversely proportional to its variance.
 
-    Return (H, W) the depth, 0 where no neighbor has one, and (H, W) the number of neighbors that agree with it.
+    Return (H, W) the depth, 0 where no neighbor has one.
     """
     depth = np.zeros(depths.shape[1:], np.float32)
-    support = np.zeros(depths.shape[1:], np.uint8)
-    _merge(depths, parallaxes, tolerance, depth, support)
-    return depth, support
+    _merge(depths, parallaxes, tolerance, depth)
+    return depth
 
 
 @kernel
@@ -109,7 +106,6 @@ def _merge(
     parallaxes: NDArray[np.float32],
     tolerance: float,
     depth: DepthArray,
-    support: NDArray[np.uint8],
 ) -> None:
     count, height, width = depths.shape
     for row in range(height):
@@ -119,18 +115,16 @@ def _merge(
                 z = depths[i, row, col]
                 if z <= 0:
                     continue
-                weight, mean, members = 0.0, 0.0, 0
+                weight, mean = 0.0, 0.0
                 for j in range(count):
                     other = depths[j, row, col]
                     if other > 0 and abs(other - z) <= tolerance * z:
                         w = parallaxes[j, row, col] ** 2
                         weight += w
                         mean += w / other  # disparity noise is inverse-depth noise
-                        members += 1
                 if weight > heaviest:
                     heaviest = weight
                     depth[row, col] = weight / mean
-                    support[row, col] = members
 
 
 def count_maps(

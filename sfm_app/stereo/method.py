@@ -11,10 +11,10 @@ from sfm_app.stereo.depth import OPTIONS as DEPTH_OPTIONS
 from sfm_app.stereo.depth import confirm_depths, match_depths
 from sfm_app.stereo.plane_proposals import add_depths, agreed_proposals, propose_planes
 from sfm_app.stereo.sky import blank_areas, near_pixels
-from sfm_app.stereo.view import DepthArray, DepthEstimate, DepthMap, DepthStore, DepthTask, GrayImage, View
+from sfm_app.stereo.view import DepthEstimate, DepthMap, DepthStore, DepthTask, GrayImage, View
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Rejected
-from sfm_app.types.arrays import BoolArray
+from sfm_app.types.arrays import BoolArray, DepthArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,9 +204,8 @@ def fill_from_coarse(fine: DepthMap, view: View, coarse: DepthMap, small: View, 
     known = coarse.depth[i, j] > 0
     row, col, i, j, x, y = (values[known] for values in (row, col, i, j, x, y))
     depth, normals = coarse.depth[i, j].astype(np.float64), coarse.normals[i, j].astype(np.float64)
-    K_inv = np.linalg.inv(small.K)
-    coarse_ray = np.stack([j + small.sample_px, i + small.sample_px, np.ones(len(i))], axis=1) @ K_inv.T
-    fine_ray = np.stack([x, y, np.ones(len(x))], axis=1) @ K_inv.T
+    coarse_ray = small.rays(np.stack([j, i], axis=1) + small.sample_px)
+    fine_ray = small.rays(np.stack([x, y], axis=1))
     with np.errstate(divide="ignore", invalid="ignore"):
         slant = np.einsum("nk,nk->n", normals, coarse_ray) / np.einsum("nk,nk->n", normals, fine_ray)
     slant = np.where(np.abs(slant - 1.0) <= OPTIONS.most_slant, slant, 1.0)

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.stereo.view import DepthArray, GrayImage
-from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
+from sfm_app.stereo.view import GrayImage
+from sfm_app.types.arrays import BoolArray, DepthArray, FloatArray, IndexArray
 
 
 @dataclass(frozen=True, slots=True)

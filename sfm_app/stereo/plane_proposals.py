@@ -15,8 +15,8 @@ from sfm_app.stereo.depth import count_maps
 from sfm_app.stereo.patch_match import RADIUS_PX, fit_planes, plane_normals
 from sfm_app.stereo.plain_areas import OPTIONS as AREA_OPTIONS
 from sfm_app.stereo.plain_areas import consensus_plane, convex_hull, enclosed_pixels, uniform_areas
-from sfm_app.stereo.view import DepthArray, DepthMap, GrayImage, View
-from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.stereo.view import DepthMap, GrayImage, View
+from sfm_app.types.arrays import BoolArray, DepthArray, FloatArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.stereo.view import DepthArray, GrayImage, View
+from sfm_app.stereo.view import GrayImage, View
 from sfm_app.types import Rejected
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import DepthArray, FloatArray, IndexArray
 
 DISPARITY_STEP = 16
 """OpenCV requires multiples of this number of disparities."""
@@ -61,7 +61,7 @@ class Rectification:
     disparities: int
 
     def warp(self, reference: GrayImage, neighbor: GrayImage, views: tuple[View, View]) -> tuple[GrayImage, GrayImage]:
-        """Warp both photos, which may be smaller than their views, to the canvas; black where they have no pixels."""
+        """Warp both photos to the canvas; black where they have no pixels."""
         left = self._warp(reference, views[0], 0.0)
         return left, self._warp(neighbor, views[1], self.offset_px)
 
@@ -69,8 +69,7 @@ class Rectification:
         columns = np.arange(self.size[0]) + 0.5 - self.disparities - shift_px
         theta = self.theta_max - columns / self.columns_per_rad
         phi = self.phi_min + (np.arange(self.size[1]) + 0.5)[:, None] / self.rows_per_rad
-        scale = np.diag([image.shape[1] / view.width, image.shape[0] / view.height, 1.0])
-        M = (scale @ view.K @ view.R @ self.rotation.T).astype(np.float32)
+        M = (view.K @ view.R @ self.rotation.T).astype(np.float32)
         cos, sin = np.cos(theta).astype(np.float32), np.sin(theta).astype(np.float32)
         across = np.sin(phi).astype(np.float32), np.cos(phi).astype(np.float32)
         x, y, w = (cos * row[0] + sin * (across[0] * row[1] + across[1] * row[2]) for row in M)
@@ -93,7 +92,7 @@ def rectify(reference: View, neighbor: View) -> Rectification | Rejected:
     angles = _triangulation_angles(reference, neighbor, rotation)
     if len(angles) < OPTIONS.min_points:
         return Rejected("too few sparse points")
-    per_rad = float(np.sqrt(reference.K[0, 0] * reference.K[1, 1]))
+    per_rad = reference.focal_px
     most, margin_px = OPTIONS.max_disparities, OPTIONS.margin_px
     near, far = _angle_range(angles, (most - 2 * margin_px) / per_rad)
     left, right = _bounds(rotation, reference), _bounds(rotation, neighbor)
@@ -142,7 +141,7 @@ def _directions(rays: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _triangulation_angles(reference: View, neighbor: View, rotation: FloatArray) -> FloatArray:
     """Return (N,) triangulation angles, in radians, of the reference's sparse points in front of both photos."""
-    ahead = (reference.depths > 0) & (reference.points @ neighbor.R[2] + neighbor.t[2] > 0)
+    ahead = (reference.depths(reference.points) > 0) & (neighbor.depths(reference.points) > 0)
     points = reference.points[ahead]
     return np.asarray(
         _directions((points - neighbor.center) @ rotation.T)[0]
@@ -163,8 +162,7 @@ def _bounds(rotation: FloatArray, view: View) -> FloatArray:
     """Return lowest and highest theta and phi of a photo, (2, 2); the full range of phi if it contains an epipole."""
     s, e = np.linspace(0, 1, 33), np.ones(33)
     border = np.concatenate([np.stack(side, -1) for side in ((s, 0 * e), (s, e), (0 * e, s), (e, s))])
-    pixels = np.column_stack([border * [view.width, view.height], np.ones(len(border))])
-    theta, phi = _directions(pixels @ np.linalg.inv(view.K).T @ view.R @ rotation.T)
+    theta, phi = _directions(view.rays(border * [view.width, view.height]) @ view.R @ rotation.T)
     low, high = np.array([theta.min(), phi.min()]), np.array([theta.max(), phi.max()])
     for sign, end in ((1.0, 0.0), (-1.0, np.pi)):
         epipole = sign * (view.K @ view.R @ rotation[0])
@@ -210,11 +208,7 @@ def depths_from_disparities(
     Return (H, W) depths, 0 where unknown or outside the neighbor, and (H, W) the parallax in pixels, to which their
     relative accuracy is proportional.
     """
-    K_inv = np.linalg.inv(reference.K)
-    to_rectified = rectification.rotation @ reference.R.T @ K_inv
-    # x of the neighbor = M x z + m for the pixel x of the reference at depth z
-    M = neighbor.K @ neighbor.R @ reference.R.T @ K_inv
-    m = neighbor.K @ (neighbor.t - neighbor.R @ reference.R.T @ reference.t)
+    to_rectified = rectification.rotation @ reference.R.T @ np.linalg.inv(reference.K)
     size = np.array([reference.height, reference.width, neighbor.height, neighbor.width])
     depth = np.zeros((reference.height, reference.width), np.float32)
     parallax = np.zeros_like(depth)
@@ -222,7 +216,8 @@ def depths_from_disparities(
     canvas = np.array(
         [r.baseline, r.theta_max, r.phi_min, r.columns_per_rad, r.rows_per_rad, r.disparities, r.offset_px]
     )
-    _lift(disparity, canvas, to_rectified, np.column_stack([M, m]), reference.sample_px, size, depth, parallax)
+    into_neighbor = reference.projection_into(neighbor)
+    _lift(disparity, canvas, to_rectified, into_neighbor, reference.sample_px, size, depth, parallax)
     return depth, parallax
 
 

@@ -7,9 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.triangles import border_angle
-from sfm_app.stereo.view import DepthArray, GrayImage, View
-from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
+from sfm_app.stereo.view import GrayImage, View
+from sfm_app.types.arrays import BoolArray, DepthArray, FloatArray, IndexArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,9 +124,9 @@ def _to_cells(values: NDArray[np.float32]) -> NDArray[np.float32]:
 def spread_partners(views: Sequence[View], index: int) -> list[int]:
     """Return the photos that vote about a photo: they share directions with it, from near and far positions."""
     own = views[index]
-    axes, centers = np.stack([view.R[2] for view in views]), np.stack([view.center for view in views])
-    widest = np.array([border_angle(view.K, view.width, view.height) for view in views])
-    shared = np.arccos(np.clip(axes @ own.R[2], -1, 1)) < widest + widest[index]
+    axes, centers = np.stack([view.axis for view in views]), np.stack([view.center for view in views])
+    widest = np.array([view.widest_angle for view in views])
+    shared = np.arccos(np.clip(axes @ own.axis, -1, 1)) < widest + widest[index]
     distance = np.linalg.norm(centers - own.center, axis=1)
     partners = np.flatnonzero(shared & (distance > OPTIONS.same_place * distance.max()))
     partners = partners[np.argsort(distance[partners], kind="stable")]

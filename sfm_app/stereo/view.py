@@ -1,38 +1,29 @@
 """Views of photos, their depth maps, the input of every depth-map method, and the neighbors of each view."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Protocol, TypeVar
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.epipolar import triangulation_angle_deg
 from sfm_app.settings import DepthSettings
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.tasks import ParallelMap
+from sfm_app.types import PosedPhoto
+from sfm_app.types.arrays import DepthArray, FloatArray, IndexArray
 
-DepthArray = NDArray[np.float32]
-"""(H, W) depth along the optical axis in scene units, 0 where unknown."""
 GrayImage = NDArray[np.uint8]
 """(H, W)."""
 Kind = Literal["photometric", "geometric", "proposed"]
 """COLMAP's names for a depth map before and after the check against the other photos; and proposals for plain areas."""
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """A posed photo without distortion: x ~ K (R X + t), pixel centers at +0.5."""
+class View(PosedPhoto):
+    """A photo of the dense workspace, or a perspective view into one of a wide lens, with its sparse points."""
 
-    name: str
-    K: FloatArray
-    """(3, 3) camera matrix in pixels; rows and columns may have different focal lengths, skew is allowed."""
-    R: FloatArray
-    """(3, 3) rotation of cam_from_world."""
-    t: FloatArray
-    """(3,) translation of cam_from_world."""
-    width: int
-    height: int
     point_ids: IndexArray = field(default_factory=lambda: np.empty(0, np.int64))
     """(M,) ids of the sparse points that this photo observes, ascending."""
     points: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
@@ -43,19 +34,9 @@ class View:
     """Number of halvings of the photo."""
 
     @property
-    def center(self) -> FloatArray:
-        """(3,) center of projection in the world."""
-        return np.asarray(-self.R.T @ self.t)
-
-    @property
-    def depths(self) -> FloatArray:
-        """(M,) depths of the sparse points."""
-        return np.asarray(self.points @ self.R[2] + self.t[2])
-
-    @property
-    def projection(self) -> FloatArray:
-        """(3, 4) projection matrix K [R | t]."""
-        return np.asarray(self.K @ np.column_stack([self.R, self.t]))
+    def bare(self) -> "View":
+        """The view without its sparse points, for other processes."""
+        return replace(self, point_ids=np.empty(0, np.int64), points=np.empty((0, 3)))
 
     def projection_into(self, other: "View") -> FloatArray:
         """Return P (3, 4): the pixel (x, y) at depth z has the homogeneous pixel P (x z, y z, z, 1) in another view."""
@@ -66,8 +47,7 @@ class View:
     def halve(self, level: int) -> "View":
         """Return the view of the photo halved `level` >= 1 times; depths are at pixel centers."""
         width, height = (max(1, side >> level) for side in (self.width, self.height))
-        scale = np.diag([width / self.width, height / self.height, 1.0])
-        return replace(self, K=scale @ self.K, width=width, height=height, sample_px=0.5, level=level)
+        return replace(self.resize(width, height), sample_px=0.5, level=level)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,12 +89,6 @@ class DepthStore(Protocol):
     def write_estimate(self, view: View, estimate: DepthEstimate, /) -> None: ...
     def write_maps(self, view: View, maps: DepthMap, /) -> None: ...
     def write_proposal(self, view: View, depth: DepthArray, /) -> None: ...
-
-
-class ParallelMap(Protocol):
-    """Applies a function to items in parallel and returns the results in order; a label names the progress."""
-
-    def __call__(self, function: Callable[[int], Result], items: Sequence[int], label: str, /) -> list[Result]: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,7 +142,7 @@ def _rank(index: int, others: Sequence[int], views: Sequence[View], count: int) 
     weights: dict[int, FloatArray] = {}
     for number in map(int, others):
         other = views[number]
-        angles = triangulation_angles_deg(view.center, other.center, view.points)
+        angles = triangulation_angle_deg(view.points, view.center, other.center)
         if angles.max(initial=0.0) >= 1e-6:  # parts of one wide photo have the same center up to rounding
             shared = np.isin(view.point_ids, other.point_ids, assume_unique=True)
             weights[number] = np.where(shared, point_weights(view, other, view.points), 0.0)
@@ -186,18 +160,10 @@ def _rank(index: int, others: Sequence[int], views: Sequence[View], count: int) 
 
 def point_weights(view: View, other: View, points: FloatArray) -> FloatArray:
     """Weigh points (N, 3) in the world by triangulation angle and scale: (N,) in [0, 1], 1 for the best match."""
-    angle_deg = triangulation_angles_deg(view.center, other.center, points)
+    angle_deg = triangulation_angle_deg(points, view.center, other.center)
     spread_deg = np.where(angle_deg < BEST_ANGLE_DEG, BEST_ANGLE_DEG / 3, 1.25 * BEST_ANGLE_DEG)
     weight = np.exp(-0.5 * ((angle_deg - BEST_ANGLE_DEG) / spread_deg) ** 2)
-    depth, other_depth = points @ view.R[2] + view.t[2], points @ other.R[2] + other.t[2]
+    depth, other_depth = view.depths(points), other.depths(points)
     in_front = (depth > 0) & (other_depth > 0)
     scale = np.divide(view.K[0, 0] * other_depth, other.K[0, 0] * depth, out=np.ones_like(depth), where=in_front)
     return np.asarray(np.where(in_front, weight * np.minimum(scale, 1 / scale), 0.0))
-
-
-def triangulation_angles_deg(center1: FloatArray, center2: FloatArray, points: FloatArray) -> FloatArray:
-    """Return (N,) angles in degrees between the rays from points (N, 3) to two centers (3,)."""
-    ray1, ray2 = points - center1, points - center2
-    # atan2 keeps small angles exact, where arccos of a rounded cosine does not
-    sine = np.linalg.norm(np.cross(ray1, ray2), axis=1)
-    return np.asarray(np.degrees(np.arctan2(sine, np.sum(ray1 * ray2, axis=1))))

@@ -7,7 +7,7 @@ resumes at the missing blocks.
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +17,11 @@ from sfm_app.colmap.dense import read_color, read_depth
 from sfm_app.colmap.surface import FUSED, poisson_surface, positions, simplify, write_points
 from sfm_app.errors import ReconstructionError
 from sfm_app.files import fingerprint, load_arrays, mark_unfinished, replace_atomically, resume_or_clear
-from sfm_app.geometry.triangles import Clusters, border_angle, cluster, median_edge_length, select_faces, vertex_normals
+from sfm_app.geometry.triangles import Clusters, cluster, median_edge_length, select_faces, vertex_normals
 from sfm_app.meshing.blocks import Partition, Split, close_cracks, split_points, weld
 from sfm_app.meshing.cleaning import Support, drop_islands, make_manifold, trim
 from sfm_app.meshing.octree import CELLS, Cube, cell_sizes, choose_cell, count_bent, count_cells, cube_around
-from sfm_app.meshing.visibility import CONFIRMED, NO_EVIDENCE, DepthView, Paint, judge, sample_colors
+from sfm_app.meshing.visibility import CONFIRMED, NO_EVIDENCE, Paint, judge, sample_colors
 from sfm_app.operating_system import move
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_count, block_workers
@@ -111,24 +111,20 @@ def sort_points(
     return blocks
 
 
-@dataclass(frozen=True, slots=True)
-class RecordCells:
-    """The `PointCells` of the fused points, which may exceed the memory."""
+def choose_record_cell(
+    sizes: Sequence[float], read: Callable[[], Iterable[NDArray[np.void]]], least: float = CELLS.least_points
+) -> float:
+    """Return the result of `choose_cell` for fused points, which may exceed the memory: `read` yields their parts."""
 
-    read: Callable[[], Iterable[NDArray[np.void]]]
-    """Yields their records, part by part."""
-
-    def points_per_cell(self, cell: float) -> float:
-        """Return the mean number of points in an occupied cell."""
-        counts = [(len(part), count_cells(positions(part), cell)) for part in self.read()]
-        points, occupied = np.sum(counts, axis=0)
+    def points_per_cell(cell: float) -> float:
+        points, occupied = np.sum([(len(part), count_cells(positions(part), cell)) for part in read()], axis=0)
         return float(points / occupied)
 
-    def bent_share(self, cell: float) -> float:
-        """Return the share of cells whose normals differ."""
-        counts = [count_bent(positions(part), _normals(part), cell) for part in self.read()]
-        bent, several = np.sum(counts, axis=0)
+    def bent_share(cell: float) -> float:
+        bent, several = np.sum([count_bent(positions(part), _normals(part), cell) for part in read()], axis=0)
         return float(bent / max(several, 1))
+
+    return choose_cell(sizes, points_per_cell, bent_share, least)
 
 
 def _normals(records: NDArray[np.void]) -> FloatArray:
@@ -178,11 +174,11 @@ class SurfaceJudge:
 
     def judge(self, view: View) -> Judgment:
         """Return the judgment of a photo on the vertices in view."""
-        eye = DepthView(view.K, view.R, view.t, read_depth(self.dense_dir, view, "geometric"), view.sample_px)
-        near = self.clusters.find_in_cone(eye.center, eye.axis, eye.widest_angle)
+        depth = read_depth(self.dense_dir, view, "geometric")
+        near = self.clusters.find_in_cone(view.center, view.axis, view.widest_angle)
         points, normals = self.surface.vertices[near], self.normals[near]
-        verdict = judge(points, normals, eye, self.tolerance)
-        paint = sample_colors(points, normals, verdict, eye, read_color(self.dense_dir, view))
+        verdict = judge(points, normals, view, depth, view.sample_px, self.tolerance)
+        paint = sample_colors(points, normals, verdict, view, read_color(self.dense_dir, view))
         judged = verdict != NO_EVIDENCE
         return near[judged], verdict[judged], Paint(paint.total[judged], paint.weight[judged])
 
@@ -237,8 +233,6 @@ class BlockTask:
     number: int
     bounds: FloatArray
     """(2, 3) bounds of its points and halo."""
-    cell: float
-    """Side of the finest cells."""
     cube: Cube
     options: MeshSettings
     tolerance: float
@@ -275,14 +269,14 @@ def mesh_in_blocks(
         )
         own = sort_points(points, partition, folder)
         sizes = sizes_for_blocks(own.bounds, options.poisson_depth)
-        cell = choose_cell(sizes, RecordCells(lambda: map(own.read, range(len(own.bounds)))))
+        cell = choose_record_cell(sizes, lambda: map(own.read, range(len(own.bounds))))
     bounds = with_halo(own.bounds, cell)
     cubes = [cube_around(low, high, cell) for low, high in bounds]
     farthest = run.map(Task(farthest_depth, dense_dir), views, "measuring depths")
     partners = rank_partners(views)
     tasks = [
         BlockTask(folder, own, dense_dir, originals, near, {view.name: partners[view.name] for view in near},
-                  k, bounds[k], cell, cubes[k], options, run.settings.depth.consistency, least,
+                  k, bounds[k], cubes[k], options, run.settings.depth.consistency, least,
                   run.settings.texture.normal_map)
         for k, near in enumerate(_photos_in_reach(views, farthest, bounds))
     ]  # fmt: skip
@@ -367,8 +361,7 @@ def _photos_in_reach(views: Sequence[View], farthest: Sequence[float], bounds: F
     blocks = Clusters(np.arange(len(bounds)), np.arange(len(bounds) + 1), centers, radii)
     near: list[list[View]] = [[] for _ in bounds]
     for view, far in zip(views, farthest, strict=True):
-        bare = replace(view, point_ids=np.empty(0, np.int64), points=np.empty((0, 3)))
-        for number in blocks.find_in_cone(view.center, view.R[2], border_angle(view.K, view.width, view.height)):
-            if (centers[number] - view.center) @ view.R[2] - radii[number] <= far:
-                near[number].append(bare)
+        for number in blocks.find_in_cone(view.center, view.axis, view.widest_angle):
+            if (centers[number] - view.center) @ view.axis - radii[number] <= far:
+                near[number].append(view.bare)
     return near

@@ -7,7 +7,7 @@ that all blocks together are little more work than the whole.
 import shutil
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +80,7 @@ def plan_fusion(
 ) -> list[FusionTask]:
     """Divide the space that the depth maps show into blocks."""
     pixels, whole = sum(view.width * view.height for view in views), region(views)
-    bare = [replace(view, point_ids=np.empty(0, np.int64), points=np.empty((0, 3))) for view in views]
+    bare = [view.bare for view in views]
     samples = run.map(Task(sample_points, dense_dir), bare, "measuring depths")
     inside = [part[((part >= whole[0]) & (part <= whole[1])).all(axis=1)] for part in samples]
     partition = split_points(np.concatenate(inside), -(-pixels // MOST_PIXELS))
@@ -137,8 +137,7 @@ def sample_points(dense_dir: Path, view: View) -> FloatArray:
     depth = read_depth(dense_dir, view, "geometric")[::STRIDE, ::STRIDE]
     rows, columns = depth.shape
     x, y = np.meshgrid(STRIDE * np.arange(columns) + view.sample_px, STRIDE * np.arange(rows) + view.sample_px)
-    rays = np.stack([x, y, np.ones_like(x)], axis=2) @ np.linalg.inv(view.K).T
-    points: FloatArray = (rays * depth[..., None] - view.t) @ view.R
+    points: FloatArray = (view.rays(np.stack([x, y], axis=2)) * depth[..., None] - view.t) @ view.R
     return points[depth > 0]
 
 

@@ -11,10 +11,11 @@ from sfm_app.colmap.perspective import LargerViews
 from sfm_app.files import load_arrays, replace_atomically
 from sfm_app.geometry.triangles import number_vertices
 from sfm_app.meshing.agreement import RefinePhoto
-from sfm_app.meshing.refinement import Refinement, Spread, refine
+from sfm_app.meshing.refinement import Refinement, refine
 from sfm_app.numerical import FAILURES, error_reason
 from sfm_app.settings import MeshSettings
 from sfm_app.stereo import View, rank_neighbors
+from sfm_app.tasks import Spread
 from sfm_app.types import Surface
 
 PARTNERS = 3
@@ -37,16 +38,10 @@ class Originals:
     def read(self, views: Sequence[View], max_side_px: int, spread: Spread = map) -> list[RefinePhoto]:
         """Return the photos without distortion, in the order of the views."""
         larger = LargerViews(self.model_dir, self.photo_dir, self.mask_dir, views, max_side_px)
-        photos, poses, known = larger.photos, {view.name: view for view in views}, dict[str, RefinePhoto]()
+        photos, known = larger.photos, dict[str, RefinePhoto]()
 
-        def look(number: int) -> list[tuple[str, RefinePhoto]]:
-            return [
-                (name, RefinePhoto(K, poses[name].R, poses[name].t, gray, None if shown.all() else ~shown))
-                for name, K, gray, shown in larger.render(photos[number])
-            ]
-
-        for rendered in spread(look, range(len(photos))):
-            known.update(rendered)
+        for rendered in spread(lambda number: list(larger.render(photos[number])), range(len(photos))):
+            known |= {photo.posed.name: photo for photo in rendered}
         return [known[view.name] for view in views]
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.triangles import select_faces, split_fans
 from sfm_app.settings import TextureSettings
+from sfm_app.tasks import ParallelMap
 from sfm_app.texture.appearance import doubtful_border, outlier_mask, photo_gains
 from sfm_app.texture.charts import (
     SQUARE_CORNERS,
@@ -22,7 +23,7 @@ from sfm_app.texture.charts import (
     square_texels,
     vertex_colors,
 )
-from sfm_app.texture.pages import CheckedViews, ParallelMap, Store, TexturePlan, fill_background, paint_blocks
+from sfm_app.texture.pages import CheckedViews, Store, TexturePlan, fill_background, paint_blocks
 from sfm_app.texture.seams import Blend, blend_weights, level_seams
 from sfm_app.texture.sightings import (
     NONE,

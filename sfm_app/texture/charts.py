@@ -9,7 +9,7 @@ from sfm_app.geometry.triangles import morton_order
 from sfm_app.jit import kernel
 from sfm_app.settings import TextureSettings
 from sfm_app.texture.seams import solve_ties
-from sfm_app.texture.sightings import NONE, Facets, IntArray, Sightings, components
+from sfm_app.texture.sightings import NONE, Facets, IntArray, Sightings, components, span
 from sfm_app.texture.views import project
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
@@ -374,19 +374,7 @@ def _outline(of: IntArray, corners: FloatArray, starts: IndexArray, low: IndexAr
         left = min(corners[f, 0, 0], corners[f, 1, 0], corners[f, 2, 0]) - MARGIN
         right = max(corners[f, 0, 0], corners[f, 1, 0], corners[f, 2, 0]) + MARGIN
         for column in range(max(int(left // CELL), 0), min(int(right // CELL) + 1, columns)):
-            x0, x1 = column * CELL - MARGIN, (column + 1) * CELL + MARGIN
-            top, bottom = np.inf, -np.inf
-            for k in range(3):
-                ax, ay = corners[f, k, 0], corners[f, k, 1]
-                bx, by = corners[f, (k + 1) % 3, 0], corners[f, (k + 1) % 3, 1]
-                if max(ax, bx) < x0 or min(ax, bx) > x1:
-                    continue
-                if ax == bx:
-                    top, bottom = min(top, ay, by), max(bottom, ay, by)
-                    continue
-                for x in (x0, x1):
-                    y = ay + min(max((x - ax) / (bx - ax), 0.0), 1.0) * (by - ay)
-                    top, bottom = min(top, y), max(bottom, y)
+            top, bottom = span(corners[f], 1, column * CELL - MARGIN, (column + 1) * CELL + MARGIN)
             if top <= bottom:
                 low[first + column] = min(low[first + column], int((top - MARGIN) // CELL))
                 high[first + column] = max(high[first + column], int((bottom + MARGIN) // CELL) + 1)

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.triangles import corner_tangents, unit_normals
 from sfm_app.jit import kernel
+from sfm_app.tasks import ParallelMap
 from sfm_app.texture.charts import are_squares
-from sfm_app.texture.pages import ParallelMap, owners, set_shares
+from sfm_app.texture.pages import owners, set_shares
 from sfm_app.texture.sightings import NONE, IntArray
 from sfm_app.types import Model, Surface, Texture
 from sfm_app.types.arrays import FloatArray

@@ -1,7 +1,7 @@
 """Pages of a texture: their texels get owners, photos are painted on them, and gaps are filled."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
+from sfm_app.tasks import ParallelMap, Spread
 from sfm_app.texture.charts import MARGIN, Charts, Layout
 from sfm_app.texture.seams import Blend
 from sfm_app.texture.sightings import NONE, Facets, IntArray, Sightings
@@ -25,12 +26,8 @@ LEVELS_PER_GRAY = 256
 CHECKPOINT_NAME = "pages"
 """Name of the unfinished pages in the store."""
 
-Spread = Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]]
-"""Calls a function for every number, possibly in parallel, and returns the results in order."""
 Page = tuple[NDArray[np.uint8], BoolArray]
 """Colors (H, W, 3), and (H, W) whether a texel has one."""
-ParallelMap = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
-"""Applies a function to all items, possibly in parallel, and returns results in order; the label names the progress."""
 
 
 class Store(Protocol):
@@ -418,7 +415,7 @@ def _paint_photo(
     open_edges = (beside == NONE) | (plan.checked.sightings.find(photo, beside) == NONE)
     view, scale = views[photo], plan.layout.scale
     if scale < 1.0:
-        view = view.with_size(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
+        view = view.resize(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
     pixels, points = store.photo(view), plan.mesh.vertices[plan.mesh.faces[triangles]]
     with pages.lock_canvases(photo) as canvases:
         for number, page in zip(numbers, canvases, strict=True):

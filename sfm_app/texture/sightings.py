@@ -294,7 +294,7 @@ def _drop_masked(
         top = int(min(corner[0, 1], corner[1, 1], corner[2, 1]) - MASK_MARGIN_PX)
         bottom = int(max(corner[0, 1], corner[1, 1], corner[2, 1]) + MASK_MARGIN_PX) + 1
         for y in range(max(top, 0), min(bottom, masked.shape[0] - 1)):
-            left, right = _span(corner, y - MASK_MARGIN_PX, y + 1 + MASK_MARGIN_PX)
+            left, right = span(corner, 0, y - MASK_MARGIN_PX, y + 1 + MASK_MARGIN_PX)
             if left > right:
                 continue
             x0 = max(int(left - MASK_MARGIN_PX), 0)
@@ -305,22 +305,21 @@ def _drop_masked(
 
 
 @kernel
-def _span(corner: FloatArray, top: float, bottom: float) -> tuple[float, float]:
-    """Return the smallest and largest x of a triangle (3, 2) between two heights; (inf, -inf) if they miss it."""
-    left, right = np.inf, -np.inf
+def span(corner: FloatArray, axis: int, low: float, high: float) -> tuple[float, float]:
+    """Return the least and largest coordinate along an axis of the part of a triangle (3, 2) in a strip.
+
+    The other coordinate is from `low` to `high` in the strip. (inf, -inf) if it misses the triangle.
+    """
+    least, largest, across = np.inf, -np.inf, 1 - axis
     for k in range(3):
-        ax, ay, bx, by = corner[k, 0], corner[k, 1], corner[(k + 1) % 3, 0], corner[(k + 1) % 3, 1]
-        if max(ay, by) < top or min(ay, by) > bottom:
+        a, b = corner[k, across], corner[(k + 1) % 3, across]
+        if max(a, b) < low or min(a, b) > high:
             continue
-        first = last = 0.0
-        if ay != by:
-            first, last = (top - ay) / (by - ay), (bottom - ay) / (by - ay)
-        else:
-            last = 1.0
+        first, last = ((low - a) / (b - a), (high - a) / (b - a)) if a != b else (0.0, 1.0)
         for part in (min(max(first, 0.0), 1.0), min(max(last, 0.0), 1.0)):
-            x = ax + part * (bx - ax)
-            left, right = min(left, x), max(right, x)
-    return left, right
+            place = corner[k, axis] + part * (corner[(k + 1) % 3, axis] - corner[k, axis])
+            least, largest = min(least, place), max(largest, place)
+    return least, largest
 
 
 @kernel

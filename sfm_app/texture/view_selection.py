@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.triangles import areas
 from sfm_app.jit import kernel
 from sfm_app.texture.sightings import NONE, Facets, IntArray, Sightings
 from sfm_app.types.arrays import IndexArray
@@ -39,9 +40,8 @@ def choose_photos(sightings: Sightings, mesh: Facets) -> IntArray:
     _keep_best(sightings.starts, sightings.face, sightings.score, labels, values)
     loss = np.log(np.maximum(values[:, :1], 1e-30) / np.maximum(values, 1e-30))
     corners, spacing = mesh.vertices[mesh.faces], max(mesh.spacing, 1e-300)
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     # square root of each triangle's area relative to an equilateral one with median edges
-    size = np.sqrt(0.5 * np.linalg.norm(across, axis=1) / (np.sqrt(3.0) / 4.0 * spacing**2))[:, None]
+    size = np.sqrt(areas(mesh.vertices, mesh.faces) / (np.sqrt(3.0) / 4.0 * spacing**2))[:, None]
     cost = (OPTIONS.price_of_detail * size * np.minimum(loss, OPTIONS.max_loss)).astype(np.float32)
     # (T, 3) lengths of the edges from corner k to k + 1, in median edge lengths
     price = np.asarray(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2) / spacing, np.float32)

@@ -1,11 +1,12 @@
 """Views for texturing: lens and pose of a photo, and kernels that project and sample."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.camera.models import camera_matrix
 from sfm_app.camera.perspective_views import PerspectiveView
 from sfm_app.camera.projection import (
     CX,
@@ -22,7 +23,7 @@ from sfm_app.camera.projection import (
 )
 from sfm_app.errors import ReconstructionError
 from sfm_app.jit import kernel
-from sfm_app.types import CameraModel
+from sfm_app.types import CameraModel, PosedPhoto
 from sfm_app.types.arrays import FloatArray
 
 LENS = 12
@@ -44,55 +45,34 @@ KINDS = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PhotoView:
-    """A registered photo and its camera, or a perspective view into a panorama."""
+class PhotoView(PosedPhoto):
+    """A posed photo with its lens, or a perspective view into a panorama."""
 
-    name: str
-    lens: tuple[float, ...]
-    """Parameters as in a camera row, at least the first four; the others are 0."""
-    cam_from_world: FloatArray
-    """(3, 4) [R | t]."""
-    width: int
-    height: int
+    photo: str
+    """Name of the photo that it shows."""
+    distortion: tuple[float, ...] = (0.0,) * (LENS - 4)
+    """The parameters of a camera row after fx, fy, cx, cy."""
     kind: float = OPENCV
     limit: float = np.inf
     """Squared radius before distortion at the end of the image: squared tangent or angle."""
     part: PerspectiveView | None = None
     """The view into the panorama `photo`; None for a whole photo."""
-    photo: str = ""
-    """Name of the photo, if it differs from the view's."""
+
+    @property
+    def lens(self) -> tuple[float, ...]:
+        """(12,) as in a camera row."""
+        fx, fy, cx, cy = (float(self.K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        return (fx, fy, cx, cy, *self.distortion)
 
     @property
     def row(self) -> FloatArray:
         """(26,) lens and pose for the kernels."""
-        lens = (*self.lens, *(0.0,) * (LENS - len(self.lens)))
-        return np.concatenate([lens, [self.kind, self.limit], self.cam_from_world.ravel()])
-
-    @property
-    def source(self) -> str:
-        """Name of the photo of the view."""
-        return self.photo or self.name
-
-    @property
-    def center(self) -> FloatArray:
-        """(3,) center of projection in the world."""
-        return np.asarray(-self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3], np.float64)
-
-    @property
-    def axis(self) -> FloatArray:
-        """(3,) unit vector of the optical axis, in the world."""
-        return np.asarray(self.cam_from_world[2, :3], np.float64)
+        return np.concatenate([self.lens, [self.kind, self.limit], self.cam_from_world.ravel()])
 
     @property
     def widest_angle(self) -> float:
         """Upper bound in radians of the angle between the axis and the visible rays."""
         return _widest_angle(self.lens, self.kind, self.limit, self.width, self.height)
-
-    def with_size(self, width: int, height: int) -> "PhotoView":
-        """Return the same view for a photo of another size in pixels."""
-        sx, sy = width / self.width, height / self.height
-        fx, fy, cx, cy, *rest = self.lens
-        return replace(self, lens=(fx * sx, fy * sy, cx * sx, cy * sy, *rest), width=width, height=height)
 
 
 def photo_view(name: str, camera: CameraModel, cam_from_world: FloatArray) -> PhotoView:
@@ -103,13 +83,13 @@ def photo_view(name: str, camera: CameraModel, cam_from_world: FloatArray) -> Ph
     lens = np.zeros(LENS)
     lens[list(columns)] = camera.params
     limit = np.inf if kind == OPENCV else _image_limit(lens, kind, camera.width, camera.height)
-    return PhotoView(name, tuple(lens.tolist()), cam_from_world, camera.width, camera.height, kind, limit)
+    K, terms = camera_matrix(*lens[:4]), tuple(lens[4:].tolist())
+    return PhotoView(name, K, cam_from_world, camera.width, camera.height, name, terms, kind, limit)
 
 
 def part_view(name: str, photo: str, part: PerspectiveView, cam_from_world: FloatArray) -> PhotoView:
     """Return a perspective view, given in the frame of the panorama `photo`, whose pose is [R | t] (3, 4)."""
-    lens = part.K[0, 0], part.K[1, 1], part.K[0, 2], part.K[1, 2]
-    return PhotoView(name, lens, part.R @ cam_from_world, part.width, part.height, part=part, photo=photo)
+    return PhotoView(name, part.K, part.R @ cam_from_world, part.width, part.height, photo, part=part)
 
 
 def _image_limit(lens: FloatArray, kind: float, width: int, height: int) -> float:
@@ -123,7 +103,7 @@ def _image_limit(lens: FloatArray, kind: float, width: int, height: int) -> floa
 @cache
 def _widest_angle(lens: tuple[float, ...], kind: float, limit: float, width: int, height: int) -> float:
     """Return the largest angle from the axis of visible rays in all directions, plus two steps."""
-    row = PhotoView("", lens, np.eye(3, 4), width, height, kind, limit).row
+    row = np.concatenate([lens, [kind, limit], np.eye(3, 4).ravel()])
     return min(np.pi, _largest_angle(row, width, height) + 2.0 * np.pi / ANGLES)
 
 

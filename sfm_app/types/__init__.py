@@ -33,8 +33,8 @@ from sfm_app.types.photos import (
     PhotoSet,
     UnusablePhoto,
 )
-from sfm_app.types.scene import CameraModel, ControlPoint, ControlPoints, Scene, SceneArrays
-from sfm_app.types.surface import Frustum, Model, Surface, Texture
+from sfm_app.types.scene import CameraModel, ControlPoint, ControlPoints, PosedPhoto, Scene, SceneArrays
+from sfm_app.types.surface import Model, Surface, Texture
 
 __all__ = [
     "Calibration",
@@ -47,7 +47,6 @@ __all__ = [
     "Evidence",
     "Features",
     "Frame",
-    "Frustum",
     "GivenCameras",
     "GpsPosition",
     "Intrinsics",
@@ -60,6 +59,7 @@ __all__ = [
     "PhotoPairs",
     "PhotoSet",
     "PoseGraph",
+    "PosedPhoto",
     "RayFit",
     "Rejected",
     "RelativePose",

@@ -6,3 +6,5 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+DepthArray = NDArray[np.float32]
+"""(H, W) depth along the optical axis in scene units, 0 where unknown."""

@@ -1,12 +1,14 @@
 """A COLMAP model with its figures, control points, and the arrays of exporters."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sfm_app.types.arrays import FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,6 +33,75 @@ class CameraModel:
         """Return JSON values."""
         plain = {field.name: getattr(self, field.name) for field in fields(self)}
         return plain | {"K": self.K.tolist(), "params": list(self.params), "determined": list(self.determined)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedPhoto:
+    """A photo with a pose, without distortion: x ~ K (R X + t), pixel centers at +0.5."""
+
+    name: str
+    K: FloatArray
+    """(3, 3) camera matrix in pixels; rows and columns may have different focal lengths, skew is allowed."""
+    cam_from_world: FloatArray
+    """(3, 4) [R | t]; x right, y down, z forward."""
+    width: int
+    height: int
+
+    @property
+    def R(self) -> FloatArray:
+        """(3, 3) rotation of cam_from_world."""
+        return self.cam_from_world[:, :3]
+
+    @property
+    def t(self) -> FloatArray:
+        """(3,) translation of cam_from_world."""
+        return self.cam_from_world[:, 3]
+
+    @property
+    def center(self) -> FloatArray:
+        """(3,) center of projection in the world."""
+        return camera_center(self.cam_from_world)
+
+    @property
+    def axis(self) -> FloatArray:
+        """(3,) unit vector of the optical axis in the world."""
+        return self.cam_from_world[2, :3]
+
+    @property
+    def projection(self) -> FloatArray:
+        """(3, 4) K [R | t]; its last row gives the depth."""
+        return self.K @ self.cam_from_world
+
+    @property
+    def focal_px(self) -> float:
+        """Pixels per unit of length at depth 1, the mean of both directions."""
+        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
+
+    @property
+    def widest_angle(self) -> float:
+        """Upper bound in radians of the angle between the axis and the rays of the photo."""
+        corners = np.array([[x, y] for x in (-1.0, self.width + 1.0) for y in (-1.0, self.height + 1.0)])
+        rays = self.rays(corners)
+        return float(np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2]).max())
+
+    def depths(self, points: FloatArray) -> FloatArray:
+        """Return (N,) the depths along the optical axis of points (N, 3) in the world."""
+        return np.asarray(points @ self.R[2] + self.t[2])
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """Return the rays (..., 3) of pixels (..., 2) in the frame of the camera, at depth 1."""
+        homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:-1], 1))], axis=-1)
+        return np.asarray(homogeneous @ np.linalg.inv(self.K).T)
+
+    def resize(self, width: int, height: int) -> Self:
+        """Return the photo at another size in pixels."""
+        K = np.diag([width / self.width, height / self.height, 1.0]) @ self.K
+        return replace(self, K=K, width=width, height=height)
+
+
+def camera_center(cam_from_world: FloatArray) -> FloatArray:
+    """Return (3,) the center of projection in the world of a camera with the pose [R | t] (3, 4)."""
+    return -cam_from_world[:, :3].T @ cam_from_world[:, 3]
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,19 +172,14 @@ class PointCloud:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PerspectivePhoto:
-    """An undistorted photo, or one of several perspective views into a photo of a wide lens."""
+class PerspectivePhoto(PosedPhoto):
+    """An undistorted photo, or one of several perspective views into a photo of a wide lens, in the export's frame.
 
-    image: str
-    """Name of its file: letters, digits, - and _, then .jpg, without folders."""
+    Its name is that of its file: letters, digits, - and _, then .jpg, without folders.
+    """
+
     photo: str
     """Name of the photo that it shows."""
-    K: NDArray[np.float64]
-    """(3, 3) in pixels; centers of pixels at +0.5."""
-    width: int
-    height: int
-    cam_from_world: NDArray[np.float64]
-    """(3, 4) [R | t] in the frame of the export; x right, y down, z forward."""
     mask: str = ""
 
 

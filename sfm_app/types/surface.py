@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.types.scene import PosedPhoto
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
@@ -34,22 +36,9 @@ class Texture:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frustum:
-    """Intrinsics and pose of a photo in the scene."""
-
-    name: str
-    K: NDArray[np.float64]
-    """(3, 3) in pixels, without lens distortion."""
-    cam_from_world: NDArray[np.float64]
-    """(3, 4) [R | t]."""
-    width: int
-    height: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Model:
     """A surface with or without a texture, or points (a surface without triangles) and the cameras that saw them."""
 
     surface: Surface
     texture: Texture | None = None
-    cameras: tuple[Frustum, ...] = ()
+    cameras: tuple[PosedPhoto, ...] = ()

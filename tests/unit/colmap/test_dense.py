@@ -1,5 +1,6 @@
 """The dense workspace: views, maps, masks, fusion and surfaces."""
 
+import pickle
 from dataclasses import replace
 
 import cv2
@@ -12,22 +13,23 @@ from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.dense import (
     MASKED,
     DenseStore,
-    MaskUndistorter,
+    cameras_of_photos,
     drop_estimates,
     mask_depths,
     read_depth,
     read_gray,
     read_views,
     undistort,
+    undistort_mask,
     used_pixels,
     write_fusion_views,
-    write_maps,
 )
 from sfm_app.colmap.surface import FUSED, fuse, open_points, poisson_surface, positions, simplify
 from sfm_app.errors import BackendError
 from sfm_app.photos.masks import save_mask
 from sfm_app.progress import SilentProgress
 from sfm_app.stereo import DepthEstimate, DepthMap
+from sfm_app.tasks import Shared
 from sfm_app.types import Surface
 
 pytestmark = pytest.mark.slow
@@ -70,7 +72,7 @@ def workspace(tmp_path_factory):
         rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(view.K).T @ view.R
         depth = ((DISTANCE - NORMAL @ view.center) / (rays @ NORMAL)).astype(np.float32)
         normals = np.broadcast_to((-view.R @ NORMAL).astype(np.float32), (*depth.shape, 3))
-        write_maps(place / "dense", view, DepthMap(depth, normals))
+        DenseStore(place / "dense").write_maps(view, DepthMap(depth, normals))
     write_fusion_views(place / "dense", views)
     return place / "dense", views
 
@@ -108,7 +110,7 @@ def test_maps_come_back_as_they_were(workspace):
     maps = DepthMap(rng.uniform(1, 2, (90, 120)).astype(np.float32), rng.normal(size=(90, 120, 3)).astype(np.float32))
     store = DenseStore(dense)
     assert not store.has(view, "geometric")
-    write_maps(dense, view, maps)
+    DenseStore(dense).write_maps(view, maps)
     np.testing.assert_array_equal(read_depth(dense, view, "geometric"), maps.depth)
     assert (store.has(view, "geometric"), store.has(view, "photometric")) == (True, False)
 
@@ -166,7 +168,7 @@ def test_the_surface_has_the_shape_of_the_points_whatever_came_before(workspace)
     assert np.count_nonzero(inside) > 100
     assert np.percentile(np.abs(surface.vertices[inside] @ NORMAL - DISTANCE), 90) < 0.02
     assert surface.colors.shape == surface.vertices.shape and not (dense / "poisson.ply").exists()
-    poisson_surface(dense, 2)
+    poisson_surface(dense, 5)
     again = poisson_surface(dense, 6)
     np.testing.assert_array_equal(again.vertices, surface.vertices)
     np.testing.assert_array_equal(again.faces, surface.faces)
@@ -213,7 +215,7 @@ def test_points_in_one_spot_give_a_surface_without_triangles(tmp_path):
     header += "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
     header += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
     (tmp_path / FUSED).write_text(header + "1 1 1 0 0 1 9 9 9\n" * 120)
-    surface = poisson_surface(tmp_path, 2)
+    surface = poisson_surface(tmp_path, 5)
     assert (surface.vertices.shape, surface.faces.shape, surface.colors.shape) == ((0, 3), (0, 3), (0, 3))
 
 
@@ -261,8 +263,9 @@ def dense(place, tmp_path):
     root, _ = place
     undistort(root / "sparse", root / "photos", tmp_path, 120, 1, SilentProgress())
     views = read_views(tmp_path)
+    cameras = pickle.loads(pickle.dumps(cameras_of_photos(root / "sparse")))  # noqa: S301 - as for another process
     for view in views:
-        MaskUndistorter(root / "sparse", root / "masks", tmp_path)(view)
+        undistort_mask(Shared(cameras), root / "masks", tmp_path, view)
     return tmp_path, {view.name: view for view in views}
 
 
@@ -292,7 +295,7 @@ def test_without_masks_all_is_used(place, tmp_path):
     depth = np.full((view.height, view.width), 3.0, np.float32)
     assert used_pixels(tmp_path, view) is None
     DenseStore(tmp_path).write_estimate(view, DepthEstimate(depth, depth / 4))
-    write_maps(tmp_path, view, DepthMap(depth, np.zeros((*depth.shape, 3), np.float32)))
+    DenseStore(tmp_path).write_maps(view, DepthMap(depth, np.zeros((*depth.shape, 3), np.float32)))
     mask_depths(tmp_path, view)
     assert (DenseStore(tmp_path).read_estimate(view).depth == 3).all()
     assert (read_depth(tmp_path, view, "geometric") == 3).all()
@@ -321,7 +324,7 @@ def test_nothing_is_fused_from_what_is_masked(dense):
     normals = np.zeros((*used_pixels(folder, views["1.png"]).shape, 3), np.float32)
     normals[..., 2] = -1
     for view in views.values():
-        write_maps(folder, view, DepthMap(np.full(normals.shape[:2], 4.0, np.float32), normals))
+        DenseStore(folder).write_maps(view, DepthMap(np.full(normals.shape[:2], 4.0, np.float32), normals))
         mask_depths(folder, view)
         mask_depths(folder, view)  # a killed run does it twice
     view = views["1.png"]

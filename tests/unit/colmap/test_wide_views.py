@@ -128,10 +128,11 @@ def plain(tmp_path):
     return tmp_path, {view.name: view for view in read_views(tmp_path / "dense")}
 
 
-def errors(gray, K, R, used):
-    """How far gray levels are from those of the directions."""
-    expected = cv2.cvtColor(colors_of(rays_of(gray.shape, K, R)), cv2.COLOR_RGB2GRAY)
-    return np.abs(gray.astype(int) - expected)[used]
+def errors(photo):
+    """How far gray levels of pixels without mask are from those of the directions."""
+    expected = cv2.cvtColor(colors_of(rays_of(photo.gray.shape, photo.posed.K, photo.posed.R)), cv2.COLOR_RGB2GRAY)
+    off = np.abs(photo.gray.astype(int) - expected)
+    return off.ravel() if photo.masked is None else off[~photo.masked]
 
 
 @pytest.mark.parametrize("side", [120, 2000])
@@ -140,26 +141,29 @@ def test_photos_of_a_plain_lens_keep_their_names(plain, side):
     found = LargerViews(place / "sparse", place / "photos", None, [views["c.png"], views["a.png"]], side)
     assert found.photos == ["a.png", "c.png"]
     for photo in found.photos:
-        ((name, K, gray, used),) = found.render(photo)
-        assert name == photo and max(gray.shape) <= side and max(gray.shape) > 0.9 * min(side, SIZE[0])
-        assert used.mean() > 0.98 and np.quantile(errors(gray, K, views[photo].R, used), 0.999) < 6
+        (larger,) = found.render(photo)
+        longest = max(larger.gray.shape)
+        assert larger.posed.name == photo and 0.9 * min(side, SIZE[0]) < longest <= side
+        assert larger.gray.shape == (larger.posed.height, larger.posed.width)
+        assert errors(larger).size > 0.98 * larger.gray.size and np.quantile(errors(larger), 0.999) < 6
 
 
 def test_views_of_a_fisheye_are_those_of_the_workspace(tmp_path):
     make_place(tmp_path, "wide fisheye")
     _, views = fill(tmp_path)
     found = LargerViews(tmp_path / "sparse", tmp_path / "photos", None, views[1:], 120)
-    rendered = {name: rest for photo in found.photos for name, *rest in found.render(photo)}
+    rendered = {larger.posed.name: larger for photo in found.photos for larger in found.render(photo)}
     assert found.photos == sorted(NAMES) and sorted(rendered) == sorted(view.name for view in views[1:])
     for view in views[1:]:
-        K, gray, used = rendered[view.name]
-        assert max(gray.shape) <= 120 and np.quantile(errors(gray, K, view.R, used), 0.99) < 12
+        larger = rendered[view.name]
+        np.testing.assert_array_equal(larger.posed.R, view.R)
+        assert max(larger.gray.shape) <= 120 and np.quantile(errors(larger), 0.99) < 12
 
 
 def test_masked_pixels_are_not_used(plain):
     place, views = plain
     mask_left(place, 100)
     larger = LargerViews(place / "sparse", place / "photos", place / "masks", [views["a.png"]], 240)
-    ((_, _, gray, used),) = larger.render("a.png")
-    share = np.mean(used, axis=0)
-    assert gray.shape == used.shape and share[:75].max() == 0.0 and share[-100:].min() > 0.9
+    (photo,) = larger.render("a.png")
+    share = np.mean(~photo.masked, axis=0)
+    assert photo.gray.shape == photo.masked.shape and share[:75].max() == 0.0 and share[-100:].min() > 0.9

@@ -10,7 +10,7 @@ from pxr import Ar, Gf, Usd, UsdGeom, UsdShade
 
 from sfm_app.camera.models import camera_matrix
 from sfm_app.formats.usd import write_usd, write_usdz
-from sfm_app.types import Frustum, Model
+from sfm_app.types import Model, PosedPhoto
 
 
 def open_stage(files, folder):
@@ -93,7 +93,7 @@ def test_files_in_a_package_are_plain_and_aligned(textured_ball):
 
 def test_a_camera_shows_points_where_the_photo_does(cloud, tmp_path):
     K = camera_matrix(800.0, 820.0, 290.0, 255.0)
-    cameras = tuple(Frustum(f"sub/ä {c.name}", K, c.cam_from_world, 640, 480) for c in cloud.cameras)
+    cameras = tuple(PosedPhoto(f"sub/ä {c.name}", K, c.cam_from_world, 640, 480) for c in cloud.cameras)
     stage = open_stage(write_usd(Model(cloud.surface, cameras=cameras), "points"), tmp_path)
 
     points = UsdGeom.Points(stage.GetPrimAtPath("/model/points"))

@@ -339,8 +339,15 @@ def test_triangulation_and_angles_of_parallel_and_perpendicular_rays():
     center = np.array([1.0, 0, 0])
     X = triangulate(np.eye(3, 4), np.column_stack([np.eye(3), -center]), np.zeros((1, 2)), np.zeros((1, 2)))
     assert np.abs(X).max() > 1e9
-    assert triangulation_angle_deg(X, np.zeros(3), center)[0] == pytest.approx(0, abs=1e-3)
-    assert triangulation_angle_deg(np.array([[0.5, 0, 0.5]]), np.zeros(3), center)[0] == pytest.approx(90)
+    infinite = np.array([[np.inf, 0, 1], [np.nan, 1, 1], [1e200, 1e190, 1e200]])
+    assert triangulation_angle_deg(np.vstack([X, infinite]), np.zeros(3), center) == pytest.approx(0, abs=1e-3)
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 1e-6, 8.0, 90.0, 135.0])
+def test_angles_are_exact(angle_deg):
+    angle = np.radians(angle_deg)
+    centers = np.array([1.0, 0, 0]), np.array([np.cos(angle), np.sin(angle), 0])
+    np.testing.assert_allclose(triangulation_angle_deg(np.zeros((1, 3)), *centers), angle_deg, rtol=1e-9)
 
 
 def test_a_seed_tells_a_narrow_and_a_contradictory_pair():

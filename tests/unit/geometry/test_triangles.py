@@ -5,7 +5,6 @@ import pytest
 
 from sfm_app.geometry.triangles import (
     areas,
-    border_angle,
     bucket_order,
     cluster,
     corner_angles,
@@ -95,12 +94,6 @@ def test_few_are_in_a_narrow_cone_and_none_behind_it(triangles):
     assert len(balls.find_in_cone(150 * axis, axis, np.radians(30))) == 0
     nothing = np.empty((0, 3, 3))
     assert len(cluster(nothing).find_in_cone(np.zeros(3), axis, 1.0)) == len(morton_order(nothing[:, 0])) == 0
-
-
-def test_the_border_of_a_photo_is_that_of_its_corners():
-    K = np.array([[100.0, 0, 40], [0, 100, 30], [0, 0, 1]])
-    assert np.degrees(border_angle(K, 80, 60)) == pytest.approx(np.degrees(np.arctan(0.5)), abs=1.0)
-    assert border_angle(K, 80, 60) > np.arctan(0.5)
 
 
 TANGENT_SQUARE = SQUARE[:4]

@@ -7,7 +7,7 @@ import numpy as np
 from sfm_app.meshing.agreement import RefinePhoto
 from sfm_app.synthetic import shapes
 from sfm_app.synthetic.cameras import look_at
-from sfm_app.types import Surface
+from sfm_app.types import PosedPhoto, Surface
 
 SIDE = 160
 FOCAL_PX = 320.0
@@ -43,7 +43,7 @@ def photo_of(eye, height):
     for _ in range(30):  # fixed point: the height of the place that the ray meets
         place = center + rays * ((height(place[..., 0], place[..., 1]) - center[2]) / rays[..., 2])[..., None]
     gray = gray_at(place[..., 0], place[..., 1])
-    return RefinePhoto(K, R, t, np.clip(np.round(gray), 0, 255).astype(np.uint8))
+    return RefinePhoto(PosedPhoto("", K, pose, SIDE, SIDE), np.clip(np.round(gray), 0, 255).astype(np.uint8))
 
 
 @dataclass(frozen=True)

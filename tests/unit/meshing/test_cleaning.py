@@ -19,6 +19,10 @@ from sfm_app.meshing.cleaning import (
 from sfm_app.types import Surface
 
 
+def edges(surface):
+    return unique_edges(surface.faces)[0]
+
+
 def nowhere(surface):
     return np.zeros(len(surface.vertices), bool)
 
@@ -50,7 +54,7 @@ def test_gaps_are_closed_up_to_their_width(sheet, radius, closed):
     surface = sheet(30)
     inside = np.linalg.norm(surface.vertices - [15, 15, 0], axis=1) > radius
 
-    found = bridge_gaps(surface, np.where(inside, 1.0, -1.0), nowhere(surface), 12.0)
+    found = bridge_gaps(surface, edges(surface), np.where(inside, 1.0, -1.0), nowhere(surface), 12.0)
 
     assert np.all(found > 0) == closed
     assert np.all(found[inside] > 0)
@@ -61,7 +65,7 @@ def test_long_and_narrow_gaps_are_closed_and_broad_ones_beside_them_stay(sheet):
     x, y = surface.vertices[:, 0], surface.vertices[:, 1]
     narrow, broad = (np.abs(x - 5) < 1.5) & (y > 3) & (y < 37), (x > 15) & (x < 35) & (y > 10) & (y < 30)
 
-    found = bridge_gaps(surface, np.where(narrow | broad, -1.0, 1.0), nowhere(surface), 6.0)
+    found = bridge_gaps(surface, edges(surface), np.where(narrow | broad, -1.0, 1.0), nowhere(surface), 6.0)
 
     assert np.all(found[narrow] > 0)
     assert np.all(found[broad] < 0)
@@ -71,7 +75,7 @@ def test_gaps_that_photos_see_through_stay_open(sheet):
     surface = sheet(20)
     hole = np.linalg.norm(surface.vertices - [10, 10, 0], axis=1) < 2.5
 
-    assert np.all((bridge_gaps(surface, np.where(hole, -1.0, 1.0), hole, 12.0) < 0) == hole)
+    assert np.all((bridge_gaps(surface, edges(surface), np.where(hole, -1.0, 1.0), hole, 12.0) < 0) == hole)
 
 
 @pytest.mark.parametrize(("free_rows", "closed"), [(1, True), (5, False)])
@@ -80,7 +84,7 @@ def test_a_gap_is_the_way_around_an_edge_where_photos_see_through_a_part_of_it(s
     y = surface.vertices[:, 1]
     band = (y > 5) & (y < 21)  # 15 rows
 
-    found = bridge_gaps(surface, np.where(band, -1.0, 1.0), band & (y < 5.5 + free_rows), 20.0)
+    found = bridge_gaps(surface, edges(surface), np.where(band, -1.0, 1.0), band & (y < 5.5 + free_rows), 20.0)
 
     assert np.all(found[band] > 0) == closed
 
@@ -90,7 +94,7 @@ def test_parts_that_few_photos_confirm_are_dropped(sheet, together):
     x = surface.vertices[:, 0]
     confirmed = np.select([x < 20, x < 60], [3, 2], np.arange(len(x)) % 2 * 3).astype(np.int32)  # 3, 2, 1.5
 
-    found = drop_doubtful_parts(surface, np.ones(len(x)), confirmed, 2.0)
+    found = drop_doubtful_parts(edges(surface), np.ones(len(x)), confirmed, 2.0)
 
     np.testing.assert_array_equal(found > 0, x < 60)
 
@@ -127,7 +131,7 @@ def test_smoothing_takes_the_teeth_off_a_border_and_keeps_its_place(sheet):
     teeth = np.where(y % 4 < 2, 3.0, -3.0)
     support = np.where(x > 20.5 + teeth, 1.0, -1.0)
 
-    found = cut(surface, smooth_support(surface, support, 20))
+    found = cut(surface, smooth_support(edges(surface), support))
 
     border = [found.vertices[np.abs(found.vertices[:, 1] - row) < 0.3, 0].min() for row in range(8, 33)]
     assert np.std(border) < 0.5

@@ -13,6 +13,9 @@ class Cells:
         self.points, self.normals = points, normals
         self.sizes = list(cell_sizes(np.ptp(points, axis=0).max(), 12))
 
+    def choose(self, **least):
+        return choose_cell(self.sizes, self.points_per_cell, self.bent_share, **least)
+
     def points_per_cell(self, cell):
         return len(self.points) / count_cells(self.points, cell)
 
@@ -45,7 +48,7 @@ def test_cells_of_a_plane_hold_as_many_points_as_wanted(wanted, width):
 def test_cells_do_not_jump_as_a_far_point_enlarges_the_box():
     flat = plane(30_000)
     sides = [
-        choose_cell(cells.sizes, cells)
+        cells.choose()
         for far in np.linspace(0, 2, 21)
         for cells in [Cells(np.vstack([flat.points, [1 + far, 0, 0]]), np.vstack([flat.normals, [0, 0, 1]]))]
     ]
@@ -58,7 +61,7 @@ def test_cells_are_large_on_walls_and_small_where_there_are_rods():
     held = []
     for share in shares:
         cells = plane(bump=share)
-        held.append(cells.points_per_cell(choose_cell(cells.sizes, cells)))
+        held.append(cells.points_per_cell(cells.choose()))
 
     assert 0.9 * CELLS.most_points < held[0] < 1.1 * CELLS.most_points
     assert 0.9 * CELLS.least_points < held[-1] < 1.1 * CELLS.least_points
@@ -68,7 +71,7 @@ def test_cells_are_large_on_walls_and_small_where_there_are_rods():
 
 def test_between_the_two_about_as_many_cells_are_bent_as_may_be():
     cells = plane(bump=0.03)
-    cell = choose_cell(cells.sizes, cells)
+    cell = cells.choose()
 
     assert CELLS.least_points < cells.points_per_cell(cell) < CELLS.most_points
     assert 0.5 * CELLS.bent_share < cells.bent_share(2 * cell) < 2.0 * CELLS.bent_share
@@ -77,7 +80,7 @@ def test_between_the_two_about_as_many_cells_are_bent_as_may_be():
 def test_more_points_are_held_where_fewer_triangles_are_wanted():
     cells = plane()
 
-    assert 7.2 < cells.points_per_cell(choose_cell(cells.sizes, cells, least=8.0)) < 8.8
+    assert 7.2 < cells.points_per_cell(cells.choose(least=8.0)) < 8.8
 
 
 def test_where_no_size_holds_enough_it_is_the_coarsest():

@@ -129,14 +129,15 @@ def test_a_pixel_is_as_large_as_the_distance_makes_it():
 
     assert near == pytest.approx(1.9 / 320.0, rel=0.05) and np.isinf(nowhere)
     assert finest_pixels(points, scene.photos, 0.5)[0] == pytest.approx(2 * near, rel=0.02)
-    assert scene.photos[0].size_at(0.5) == (SIDE // 2, SIDE // 2)
+    half = scene.photos[0].posed_at(0.5)
+    assert (half.width, half.height) == (SIDE // 2, SIDE // 2)
 
 
 def drawn(made, seconds=0.0, most_px=10_000):
     def look(number):
         time.sleep(seconds)
         made.append(number)
-        return Sight(None, Raster(np.full((10, 10), number, np.float32), np.zeros((10, 10), np.int32)))
+        return Sight(None, None, Raster(np.full((10, 10), number, np.float32), np.zeros((10, 10), np.int32)))
 
     return Sights(look, most_px)
 

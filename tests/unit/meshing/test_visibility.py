@@ -1,5 +1,7 @@
 """What a depth map says about points, and the colors that it lends them."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
@@ -9,23 +11,34 @@ from sfm_app.meshing.visibility import (
     NO_EVIDENCE,
     SEEN_THROUGH,
     SKY,
-    DepthView,
     Paint,
     judge,
     sample_colors,
 )
+from sfm_app.types import PosedPhoto
 
 FACING = np.array([[0.0, 0.0, -1.0]])
 
 
+@dataclass(frozen=True)
+class Eye:
+    """A photo and its depth map."""
+
+    photo: PosedPhoto
+    depth: np.ndarray
+
+    def judge(self, points, normals):
+        return judge(points, normals, self.photo, self.depth, 0.5, 0.01)
+
+
 @pytest.fixture
 def eye():
-    """FaceViews along +z at a wall 10 away, that is empty on the right and 5 away at the bottom."""
+    """It looks along +z at a wall 10 away, that is empty on the right and 5 away at the bottom."""
     depth = np.full((60, 80), 10.0, np.float32)
     depth[:, 60:] = 0
     depth[40:] = 5
     K = np.array([[100.0, 0, 40], [0, 100, 30], [0, 0, 1]])
-    return DepthView(K, np.eye(3), np.zeros(3), depth, 0.5)
+    return Eye(PosedPhoto("", K, np.eye(3, 4), 80, 60), depth)
 
 
 @pytest.mark.parametrize(
@@ -44,12 +57,12 @@ def eye():
     ],
 )
 def test_verdicts(eye, point, verdict):
-    assert judge(np.array([point]), FACING, eye, 0.01) == verdict
+    assert eye.judge(np.array([point]), FACING) == verdict
 
 
 def test_the_back_of_a_surface_is_not_confirmed(eye):
-    assert judge(np.array([[0, 0, 10.0]]), -FACING, eye, 0.01) == NO_EVIDENCE
-    assert judge(np.array([[3, 0, 10.0]]), -FACING, eye, 0.01) == NO_EVIDENCE
+    assert eye.judge(np.array([[0, 0, 10.0]]), -FACING) == NO_EVIDENCE
+    assert eye.judge(np.array([[3, 0, 10.0]]), -FACING) == NO_EVIDENCE
 
 
 def test_what_is_masked_says_nothing(eye):
@@ -57,7 +70,7 @@ def test_what_is_masked_says_nothing(eye):
     eye.depth[:20, 60:] = -1
     points = np.array([[3, -1.5, 10.0], [3, 0, 10.0], [1.95, -1.5, 10.0], [1.95, -1.5, 9.0]])
 
-    verdict = judge(points, FACING.repeat(4, axis=0), eye, 0.01)
+    verdict = eye.judge(points, FACING.repeat(4, axis=0))
 
     assert verdict.tolist() == [NO_EVIDENCE, EMPTY, CONFIRMED, NO_EVIDENCE]
 
@@ -68,7 +81,7 @@ def test_what_stands_before_the_sky_is_seen_through_from_both_sides(eye):
     points = np.array([[3, -1.5, 10.0], [0.6, -0.3, 2.0], [2.01, -1.5, 10.0], [1.99, -1.5, 10.0]])
 
     for facing, beside in ((FACING, CONFIRMED), (-FACING, NO_EVIDENCE)):
-        verdict = judge(points, facing.repeat(4, axis=0), eye, 0.01)
+        verdict = eye.judge(points, facing.repeat(4, axis=0))
 
         assert verdict.tolist() == [SEEN_THROUGH, SEEN_THROUGH, SEEN_THROUGH, beside]
 
@@ -79,17 +92,13 @@ def test_colors_are_those_of_the_pixels_and_the_closer_photo_weighs_more(eye):
     points = np.array([[0, 0, 10.0], [0.5, -1, 10.0], [3, 0, 10.0]])
     normals = np.repeat(FACING, 3, axis=0)
 
-    paint = sample_colors(points, normals, judge(points, normals, eye, 0.01), eye, image)
-    near = DepthView(np.diag([2.0, 2, 1]) @ eye.K, eye.R, eye.t, np.full((120, 160), 10.0, np.float32), 0.5)
+    paint = sample_colors(points, normals, eye.judge(points, normals), eye.photo, image)
+    near = Eye(eye.photo.resize(160, 120), np.full((120, 160), 10.0, np.float32))
     white = np.full((120, 160, 3), 255, np.uint8)
-    closer = sample_colors(points, normals, judge(points, normals, near, 0.01), near, white)
+    closer = sample_colors(points, normals, near.judge(points, normals), near.photo, white)
 
     np.testing.assert_allclose(paint.mean_colors(points)[:, 0], [79, 89, 89], atol=1)
     np.testing.assert_allclose(closer.weight[:2], 4 * paint.weight[:2])
-    large = sample_colors(
-        points, normals, judge(points, normals, eye, 0.01), eye, image.repeat(2, axis=0).repeat(2, axis=1)
-    )
-    np.testing.assert_allclose(large.total[:2], paint.total[:2], rtol=0.02)
     both = Paint.zeros(3)
     both.add(np.arange(3), paint)
     both.add(np.arange(3), closer)

@@ -8,7 +8,7 @@ import pytest
 from sfm_app.report import notebook
 from sfm_app.report.findings import Fact
 from sfm_app.synthetic.cameras import arc, make_camera
-from sfm_app.types import Frustum, Model, Surface
+from sfm_app.types import Model, PosedPhoto, Surface
 
 
 @pytest.fixture
@@ -18,7 +18,7 @@ def shown(monkeypatch):
     def make(points, facts=()):
         views = arc(make_camera(64, 48))
         cameras = tuple(
-            Frustum(name, views.cameras[name].K, pose, 64, 48) for name, pose in views.cam_from_world.items()
+            PosedPhoto(name, views.cameras[name].K, pose, 64, 48) for name, pose in views.cam_from_world.items()
         )
         surface = Surface(points, np.zeros((0, 3), np.int64), np.full((len(points), 3), 40, np.uint8))
         monkeypatch.setattr(notebook, "view_points", lambda _: Model(surface, cameras=cameras))

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm_app.colmap.dense import write_maps
+from sfm_app.colmap.dense import DenseStore
 from sfm_app.report.pictures import MOST_SHOWN, UNKNOWN, depth_colors, depth_pictures, spread_names
 from sfm_app.stereo import DepthMap, View
 
@@ -20,8 +20,8 @@ def dense(tmp_path):
     (tmp_path / "images" / "<b>.jpg").write_bytes(cv2.imencode(".jpg", photo)[1].tobytes())
     depth = np.full((60, 1200), 2.0, np.float32)
     depth[:, 600:], depth[:, 1000:] = 8.0, 0.0
-    view = View("<b>.jpg", np.eye(3), np.eye(3), np.zeros(3), 1200, 60)
-    write_maps(tmp_path, view, DepthMap(depth, np.ones((60, 1200, 3), np.float32)))
+    view = View("<b>.jpg", np.eye(3), np.eye(3, 4), 1200, 60)
+    DenseStore(tmp_path).write_maps(view, DepthMap(depth, np.ones((60, 1200, 3), np.float32)))
     return tmp_path
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.dense import map_file, read_views, write_fusion_views, write_maps
+from sfm_app.colmap.dense import DenseStore, map_file, read_views, write_fusion_views
 from sfm_app.colmap.surface import open_points, positions
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.triangles import areas, unique_edges, vertex_normals
@@ -77,7 +77,7 @@ def dense(tmp_path_factory):
     (place / "images").mkdir()
     for view in read_views(place):
         cv2.imwrite(str(place / "images" / view.name), np.full((HEIGHT, WIDTH, 3), (40, 90, 200), np.uint8))
-        write_maps(place, view, true_maps(view))
+        DenseStore(place).write_maps(view, true_maps(view))
     write_fusion_views(place, read_views(place))
     return place
 
@@ -162,7 +162,7 @@ def test_maps_that_agree_on_nothing_give_an_error_that_says_so(dense, tmp_path):
     shutil.copytree(dense, poor)
     for view, factor in zip(read_views(poor)[:3], (1.0, 1.6, 2.7), strict=True):
         maps = true_maps(view)
-        write_maps(poor, view, DepthMap(maps.depth * np.float32(factor), maps.normals))
+        DenseStore(poor).write_maps(view, DepthMap(maps.depth * np.float32(factor), maps.normals))
     for view in read_views(poor)[3:]:
         map_file(poor, view).unlink()
     write_fusion_views(poor, read_views(poor))

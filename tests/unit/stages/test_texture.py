@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sfm_app.camera.models import camera_matrix
 from sfm_app.photos.masks import save_mask
 from sfm_app.products import read_texture, write_texture
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import texture
-from sfm_app.stages.texture import FileStore, read_photo, surface_digest
+from sfm_app.stages.texture import FileStore, surface_digest
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import CameraModel, Model, Surface, Texture
 
@@ -20,7 +21,7 @@ POSE = np.eye(3, 4)
 SURFACE = Surface(np.eye(3), np.array([[0, 1, 2]]), np.full((3, 3), 9, np.uint8))
 
 
-VIEW = PhotoView("a.png", (50.0, 50.0, 30.0, 20.0, 0, 0, 0, 0), np.eye(3, 4), 60, 40)
+VIEW = PhotoView("a.png", camera_matrix(50.0, 50.0, 30.0, 20.0), np.eye(3, 4), 60, 40, "a.png")
 
 
 def run_of(place, fingerprint="", **settings):
@@ -57,8 +58,9 @@ def test_photos_are_rgb_and_of_the_view_s_size(tmp_path):
     gray = np.zeros((40, 60), np.uint8)
     gray[:, 30:] = 200
     Image.fromarray(gray).save(tmp_path / "a.png")
-    np.testing.assert_array_equal(read_photo(tmp_path, VIEW), np.repeat(gray[:, :, None], 3, axis=2))
-    small = read_photo(tmp_path, VIEW.with_size(20, 10))
+    files = FileStore(tmp_path, tmp_path / "parts")
+    np.testing.assert_array_equal(files.photo(VIEW), np.repeat(gray[:, :, None], 3, axis=2))
+    small = files.photo(VIEW.resize(20, 10))
     assert small.shape == (10, 20, 3)
     assert (small[:, :10] == 0).all()
     assert (small[:, 10:] == 200).all()
@@ -73,7 +75,7 @@ def test_nothing_is_seen_of_what_is_masked_at_any_size(tmp_path, scale):
     save_mask(tmp_path / "masks", "a.png", used)
     files = FileStore(tmp_path, tmp_path / "parts", tmp_path / "masks")
 
-    seen = files.photo(VIEW.with_size(round(60 * scale), round(40 * scale)))
+    seen = files.photo(VIEW.resize(round(60 * scale), round(40 * scale)))
 
     np.testing.assert_array_equal(files.usable_pixels(VIEW), used)
     assert (seen == (20, 120, 90)).all()

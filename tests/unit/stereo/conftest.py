@@ -55,13 +55,13 @@ def make_view(plane):
     def make(center, name="a", turn=(0.0, 0.0, 0.0), size=(240, 180), sample_px=0.5) -> View:
         R = cv2.Rodrigues(np.array(turn, float))[0]
         K = np.array([[230.0, 0, 117], [0, 226.0, 92], [0, 0, 1]])
-        view = View(name, K, R, -R @ np.array(center, float), *size, sample_px=sample_px)
+        pose = np.column_stack([R, -R @ np.array(center, float)])
         grid = np.stack(np.meshgrid(np.linspace(-2, 2, 41), np.linspace(-2, 2, 41)), axis=-1).reshape(-1, 2)
         points = np.column_stack([grid, (plane.distance - grid @ plane.normal[:2]) / plane.normal[2]])
-        seen = points @ view.R.T + view.t
+        seen = points @ R.T + pose[:, 3]
         pixels = seen @ K.T
         pixels = pixels[:, :2] / pixels[:, 2:]
         ids = np.flatnonzero((seen[:, 2] > 0) & np.all((pixels > 0) & (pixels < size), axis=1))
-        return View(name, K, R, view.t, *size, ids.astype(np.int64), points[ids], sample_px)
+        return View(name, K, pose, *size, ids.astype(np.int64), points[ids], sample_px)
 
     return make

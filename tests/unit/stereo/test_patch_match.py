@@ -37,7 +37,8 @@ def seeds(plane, setting):
 
 @pytest.mark.slow
 def test_the_plane_spreads_from_seeds(plane, setting, seeds):
-    (_, once), (planes, cost) = ((own := seeds.copy(), improve_planes(own, *setting, sweeps)) for sweeps in (1, 2))
+    planes = seeds.copy()
+    cost = improve_planes(planes, *setting)
 
     inside = np.zeros(cost.shape, bool)
     inside[25:-25, 45:-45] = True
@@ -45,8 +46,6 @@ def test_the_plane_spreads_from_seeds(plane, setting, seeds):
     error = np.abs(planes[..., 0] * plane.depth(setting[0]) - 1)[known]
     assert known.sum() > 0.95 * inside.sum()
     assert 1e-5 < np.median(error) < 4e-3  # 0.1 px of a disparity of 28 px
-    assert np.all(cost <= once)
-    assert cost.mean() < once.mean()
 
 
 @pytest.mark.slow
@@ -54,7 +53,7 @@ def test_wrong_depths_are_costly(plane, setting):
     planes = np.zeros((*setting[1].shape, 3), np.float32)
     planes[:, :120, 0] = 2.0 / plane.depth(setting[0])[:, :120]
 
-    cost = improve_planes(planes, *setting, 1)
+    cost = improve_planes(planes, *setting)
 
     wrong = planes[..., 0] * plane.depth(setting[0]) > 1.2
     assert wrong.sum() > 1000
@@ -67,8 +66,8 @@ def test_a_flat_photo_correlates_with_nothing_and_one_hidden_view_does_not_matte
     view, photo, others = setting
     hidden = [(others[0][0], np.zeros_like(others[0][1])), *others[1:]]
 
-    assert np.all(improve_planes(seeds.copy(), view, np.full_like(photo, 128), others, 2) >= 0.95)
-    assert np.median(improve_planes(seeds.copy(), view, photo, hidden, 2)[30:-30, 50:-50]) < 0.3
+    assert np.all(improve_planes(seeds.copy(), view, np.full_like(photo, 128), others) >= 0.95)
+    assert np.median(improve_planes(seeds.copy(), view, photo, hidden)[30:-30, 50:-50]) < 0.3
 
 
 # Planes through depth maps.
@@ -78,7 +77,7 @@ slope = st.floats(-1.0, 1.0)
 
 def view_with(fx=100.0, fy=100.0, skew=0.0, sample_px=0.5) -> View:
     K = np.array([[fx, skew, 15], [0, fy, 10], [0, 0, 1]])
-    return View("v", K, np.eye(3), np.zeros(3), 30, 20, sample_px=sample_px)
+    return View("v", K, np.eye(3, 4), 30, 20, sample_px=sample_px)
 
 
 def plane_depth(view: View, normal: np.ndarray, distance: float) -> np.ndarray:

@@ -31,7 +31,8 @@ def turned(x: float, y: float, z: float) -> np.ndarray:
 def view_at(center, rotation=None, points=None) -> View:
     R = np.eye(3) if rotation is None else rotation
     points = np.empty((0, 3)) if points is None else points
-    return View("v", K, R, -R @ np.array(center, float), 320, 240, np.arange(len(points)), points)
+    pose = np.column_stack([R, -R @ np.array(center, float)])
+    return View("v", K, pose, 320, 240, np.arange(len(points)), points)
 
 
 def cloud() -> np.ndarray:

@@ -24,7 +24,7 @@ class Photo:
 
 def view_from(x):
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    return View(f"{x:.2f}", K, np.eye(3), np.array([-x, 0, 0]), WIDTH, HEIGHT)
+    return View(f"{x:.2f}", K, np.column_stack([np.eye(3), [-x, 0, 0]]), WIDTH, HEIGHT)
 
 
 def photograph(x, gray_of_blank, backdrop):

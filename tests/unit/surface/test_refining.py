@@ -19,7 +19,7 @@ def make_views(count):
     points = np.random.default_rng(0).normal((0.0, 0.0, 8.0), 1.0, (50, 3))
     K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
     return [
-        View(f"{k}.jpg", K, np.eye(3), np.array([-0.6 * k, 0.0, 0.0]), 100, 100, np.arange(50), points)
+        View(f"{k}.jpg", K, np.column_stack([np.eye(3), [-0.6 * k, 0, 0]]), 100, 100, np.arange(50), points)
         for k in range(count)
     ]
 

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 
+from sfm_app.camera.models import camera_matrix
 from sfm_app.meshing.ray_casting import Occluders
 from sfm_app.settings import TextureSettings
 from sfm_app.texture.assemble import texture_surface
@@ -58,8 +59,9 @@ def around(count=9, size=(320, 240), height=1.6, k1=-0.05):
         right = np.cross(forward, [0.0, 1.0, 0.0])
         right /= np.linalg.norm(right)
         R = np.stack([right, np.cross(forward, right), forward])
-        lens = (1.3 * size[0], 1.3 * size[0], size[0] / 2 + 3.0, size[1] / 2 - 2.0, k1, 0.01, 0.0, 0.0)
-        views.append(PhotoView(f"{len(views):03}.png", lens, np.column_stack([R, -R @ center]), *size))
+        K = camera_matrix(1.3 * size[0], 1.3 * size[0], size[0] / 2 + 3.0, size[1] / 2 - 2.0)
+        name, lens = f"{len(views):03}.png", (k1, 0.01, 0, 0, 0, 0, 0, 0)
+        views.append(PhotoView(name, K, np.column_stack([R, -R @ center]), *size, name, lens))
     return views
 
 
@@ -67,7 +69,7 @@ def around(count=9, size=(320, 240), height=1.6, k1=-0.05):
 def photograph(view):
     """(height, width, 3) uint8: each pixel's ray through the lens, intersected with the box."""
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
-    fx, fy, cx, cy, k1, k2, _, _ = view.lens
+    fx, fy, cx, cy, k1, k2, *_ = view.lens
     distorted = np.column_stack([(x.ravel() - cx) / fx, (y.ravel() - cy) / fy])
     plane = distorted.copy()
     for _ in range(30):

@@ -40,7 +40,7 @@ def test_projection_is_that_of_bundle_adjustment(model):
     expected = project_points(points, np.tile(full, (200, 1)), np.full(200, family)).x
     np.testing.assert_allclose(found[:, :2], expected, atol=1e-8)
     assert (found[:, 2] > 0.0).all()
-    half = view.with_size(SIZE[0] // 2, SIZE[1] // 2)
+    half = view.resize(SIZE[0] // 2, SIZE[1] // 2)
     smaller = np.array([project(half.row, *((point - pose[:, 3]) @ R)) for point in points])
     np.testing.assert_allclose(2.0 * smaller[:, :2], expected, atol=1e-8)
     behind = np.array([1e-3, 0.0, -1.0]) - pose[:, 3]
@@ -73,7 +73,7 @@ def test_views_cover_a_whole_panorama():
 
     views = photo_views(scene)
 
-    assert [view.source for view in views] == ["sub/a.jpg"] * 6 and len({view.name for view in views}) == 6
+    assert [view.photo for view in views] == ["sub/a.jpg"] * 6 and len({view.name for view in views}) == 6
     for view in views:
         np.testing.assert_allclose(view.center, -pose[:, :3].T @ pose[:, 3], atol=1e-12)
     X = np.random.default_rng(0).normal(size=(500, 3)) * 4.0
@@ -91,7 +91,7 @@ def test_a_part_view_has_the_rays_of_its_part():
 
     u, v, _ = project(view.row, *(part.rays()[30, 40] * 5.0))
 
-    assert (u, v) == pytest.approx((40.5, 30.5), abs=1e-9) and view.source == "a"
+    assert (u, v) == pytest.approx((40.5, 30.5), abs=1e-9) and view.photo == "a"
 
 
 def test_other_camera_models_are_refused():
