@@ -337,11 +337,7 @@ def export_scene(
         >>> sorted(path.name for path in folder.iterdir())
         ['export.json', 'images', 'sparse']
     """
-    from sfm_app.exports import (
-        StoredScene,  # loads COLMAP
-        check_cloud,
-        fill_folder,
-    )
+    from sfm_app.exports import StoredScene, check_cloud, fill_folder  # loads COLMAP
 
     exporter = load_plugins().scene_exporter(file_format)
     place = Path(target) if target is not None else Path(out)

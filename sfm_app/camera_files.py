@@ -360,32 +360,25 @@ def _read_json(text: str) -> tuple[str, Cameras]:
         raise ValueError(f"it is not valid JSON: {err}") from None
     if not isinstance(values, Mapping):
         raise ValueError("its JSON is not an object")
-    if "cameras" in values and "camera_of" in values:
-        return "sfm-app", _read_run_file(values)
-    if is_run_camera(values):
-        camera = run_camera(values)
-        return "sfm-app", ({"": camera} if camera is not None else {}, {})
-    if is_opencv_camera(values):
-        return "OpenCV", ({"": opencv_camera(values)}, {})
-    for form, fits, read in _BY_NAME:
+    if "cameras" in values and "camera_of" in values:  # calibration.json or scene.json of a run
+        camera_of = {str(photo): str(name) for photo, name in values["camera_of"].items()}
+        return "sfm-app", (dict(_read_by_name(values["cameras"], run_camera)), camera_of)
+    for form, fits, read in _ENTRIES:
+        if fits(values):
+            camera = read(values)
+            return form, ({"": camera} if camera is not None else {}, {})
+    for form, fits, read in _ENTRIES:
         if values and all(isinstance(entry, Mapping) and fits(entry) for entry in values.values()):
             return form, (dict(_read_by_name(values, read)), {})
     raise ValueError("its JSON is of no known form")
 
 
-def _read_run_file(values: Mapping[str, Any]) -> Cameras:
-    """Read calibration.json or scene.json of a run."""
-    entries = {str(name): run_camera(entry) for name, entry in values["cameras"].items()}
-    known = {name: camera for name, camera in entries.items() if camera is not None}
-    return known, {str(photo): str(name) for photo, name in values["camera_of"].items()}
-
-
-_BY_NAME: tuple[tuple[str, Callable[..., bool], Callable[..., Calibration | None]], ...] = (
+_ENTRIES: tuple[tuple[str, Callable[..., bool], Callable[..., Calibration | None]], ...] = (
     ("sfm-app", is_run_camera, run_camera),
     ("OpenSfM", lambda values: "projection_type" in values, opensfm_camera),
     ("OpenCV", is_opencv_camera, opencv_camera),
 )
-"""Forms of JSON with cameras by name: the test and the reader of an entry."""
+"""Forms of a camera in JSON, alone or by name: the test and the reader."""
 
 
 def _read_by_name(

@@ -131,5 +131,4 @@ def run_stages(
     if run.settings.scale.control_points:
         run = replace(run, control_points=read_control_points(Path(run.settings.scale.control_points)))
     source = read_source(photo_dir, place.root, options, partial(ordered_map, run.executor, ahead=4 * run.workers))
-    source.check_settings(run.settings)
     return PIPELINE.run(source, run, first, last, targets)

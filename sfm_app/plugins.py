@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from types import MappingProxyType, ModuleType
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import pluggy
@@ -32,38 +32,22 @@ hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
 
 
-class FitFundamental(Protocol):
-    """Estimates one fundamental matrix; x1, x2 are finite (N, 2) pixels; the same seed gives the same result."""
+FitFundamental = Callable[[FloatArray, FloatArray, EpipolarSettings, int], EpipolarFit | Rejected]
+"""Estimates one fundamental matrix; x1, x2 are finite (N, 2) pixels; the same seed, the last, gives the same result."""
+Calibrate = Callable[[CameraPairs, CalibrationSettings, int], Calibration]
+"""Estimates one camera matrix from the fundamental matrices of pairs that share it; same seed, same result.
 
-    def __call__(
-        self, x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int, /
-    ) -> EpipolarFit | Rejected: ...
+Never raises on data: an undetermined camera has ``identifiable=False`` and a reason. ValueError on malformed arrays;
+`sfm_app.selfcal.pairs.prepare` checks them."""
+FindFeatures = Callable[[NDArray[np.uint8], MatchSettings], Features]
+"""Finds the features of one picture, the best first; the same picture gives the same bytes, in any thread.
 
-
-class Calibrate(Protocol):
-    """Estimates one camera matrix from the fundamental matrices of pairs that share it; same seed, same result.
-
-    Never raises on data: an undetermined camera has ``identifiable=False`` and a reason. ValueError on malformed
-    arrays; `sfm_app.selfcal.pairs.prepare` checks them.
-    """
-
-    def __call__(self, pairs: CameraPairs, options: CalibrationSettings, seed: int, /) -> Calibration: ...
-
-
-class FindFeatures(Protocol):
-    """Finds the features of one picture, the best first; the same picture gives the same bytes, in any thread.
-
-    The picture is (H, W, 3) RGB of 8 bits, at most `max_image_size_px` long. The caller downscales the photo, scales
-    the keypoints back to its pixels, and drops masked ones and those beyond `max_features`.
-    """
-
-    def __call__(self, picture: NDArray[np.uint8], options: MatchSettings, /) -> Features: ...
-
-
-class MatchFeatures(Protocol):
-    """Matches the features of two pictures: returns (M, 2) rows, each at most once; same features, same result."""
-
-    def __call__(self, first: Features, second: Features, options: MatchSettings, /) -> NDArray[np.integer[Any]]: ...
+The picture is (H, W, 3) RGB of 8 bits, at most `max_image_size_px` long. The caller downscales the photo, scales the
+keypoints back to its pixels, and drops masked ones and those beyond `max_features`."""
+MatchFeatures = Callable[[Features, Features, MatchSettings], NDArray[np.integer[Any]]]
+"""Matches the features of two pictures: returns (M, 2) rows, each at most once; same features, same result."""
+MakeDepthMaps = Callable[["DepthTask"], list[Rejected | None]]
+"""Writes geometric depth and normal maps to the workspace; returns None per view, or why it has no map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,12 +71,6 @@ class Calibrator:
     summary: str = ""
     together: bool = False
     """Whether the program's own method then splits groups that disagree, and uses pairs between cameras."""
-
-
-class MakeDepthMaps(Protocol):
-    """Writes geometric depth and normal maps to the workspace; returns None per view, or why it has no map."""
-
-    def __call__(self, task: "DepthTask", /) -> list[Rejected | None]: ...
 
 
 @dataclass(frozen=True, slots=True)

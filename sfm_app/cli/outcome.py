@@ -55,11 +55,6 @@ def run_summary(run: Run) -> dict[str, Any]:
         "report": str(run.report_path) if run.report_path else None,
         "seconds": {name: stage["seconds"] for name, stage in stages.items()},
     }
-    return summary | _model_summary(run, counts)
-
-
-def _model_summary(run: Run, counts: Mapping[str, Any]) -> dict[str, Any]:
-    summary: dict[str, Any] = {}
     if run.scene:
         points = [str(path) for path in _model_files(run, "scale")]
         summary["scene"] = {**scene_summary(run.scene, counts.get("scene", {})), "files": points}
@@ -68,7 +63,7 @@ def _model_summary(run: Run, counts: Mapping[str, Any]) -> dict[str, Any]:
     if run.mesh_path:
         files = [str(path) for path in _model_files(run, "files")]
         texture = {key: counts["files"][key] for key in ("pages_px", "jpeg_quality") if key in counts["files"]}
-        summary["mesh"] = {"triangles": model_triangles(_stages(run)), **texture, "files": files}
+        summary["mesh"] = {"triangles": model_triangles(stages), **texture, "files": files}
     return summary
 
 

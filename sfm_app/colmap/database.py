@@ -91,28 +91,31 @@ def remove_database(path: Path) -> None:
 
 
 def create_database(path: Path, photos: PhotoSet) -> None:
-    """Enter photos and cameras in a fixed order.
+    """Make a database of photos and cameras in a fixed order.
 
     Feature extraction would enter them in the order in which its threads finish, which differs from run to run.
     """
-    with open_database(path) as database:
-        for camera_id, members in enumerate(photos.groups.values(), start=1):
-            _write_camera(database, camera_id, _guess_calibration(members[0]))
-            for photo in sorted(members, key=lambda photo: photo.name):
-                image = pycolmap.Image(name=photo.name, camera_id=camera_id)
-                image.image_id = database.write_image(image)
-                _write_frame(database, image)
+    images = {key: matched_image(key, photo) for key, photo in enumerate(ordered_photos(photos), start=1)}
+    write_match_graph(path, MatchGraph(images, {}, {}))
+
+
+def ordered_photos(photos: PhotoSet) -> list[Photo]:
+    """Return the photos in the order of their ids: by group, then by name."""
+    return [photo for group in photos.groups.values() for photo in sorted(group, key=lambda photo: photo.name)]
+
+
+def matched_image(key: int, photo: Photo) -> MatchedImage:
+    """Return a photo with its id."""
+    return MatchedImage(
+        key, photo.name, photo.group, photo.width, photo.height,
+        photo.exif_focal_px, photo.gps, photo.turn_deg, photo.shown, photo.projection, photo.time_s,
+    )  # fmt: skip
 
 
 def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
     """Return keypoints and raw matches of every photo in the database, which was made from these photos."""
-    by_name, images = {photo.name: photo for photo in photos.photos}, {}
-    for key, name in photo_names(path).items():
-        photo = by_name[name]
-        images[key] = MatchedImage(
-            key, photo.name, photo.group, photo.width, photo.height,
-            photo.exif_focal_px, photo.gps, photo.turn_deg, photo.shown, photo.projection, photo.time_s,
-        )  # fmt: skip
+    by_name = {photo.name: photo for photo in photos.photos}
+    images = {key: matched_image(key, by_name[name]) for key, name in photo_names(path).items()}
     found, matches = read_features(path)
     keypoints = {key: found.get(key, np.zeros((0, 2))) for key in images}  # none on a white wall
     return MatchGraph(images, keypoints, {pair: rows for pair, rows in sorted(matches.items()) if len(rows)})
@@ -225,7 +228,7 @@ def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) 
         connection.execute("DELETE FROM cameras WHERE camera_id > ?", (len(ids),))
 
 
-def _guess_calibration(photo: Photo | MatchedImage) -> Calibration:
+def _guess_calibration(photo: MatchedImage) -> Calibration:
     """Return a guess of the camera of a photo; that of a panorama is exact."""
     size = photo.width, photo.height
     return Calibration(guessed_camera_matrix(size), *size, "guess", False, projection=photo.projection)

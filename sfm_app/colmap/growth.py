@@ -9,10 +9,10 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 from sfm_app.colmap.backend import all_points, pycolmap
-from sfm_app.colmap.database import write_match_graph
+from sfm_app.colmap.database import matched_image, ordered_photos, write_match_graph
 from sfm_app.colmap.model import pose_photo, posed_images, unposed_model
 from sfm_app.files import replace_atomically
-from sfm_app.types import MatchedImage, MatchGraph, PhotoSet
+from sfm_app.types import MatchGraph, PhotoSet
 
 COPIES = (
     ("SELECT * FROM keypoints", "INSERT INTO keypoints VALUES (?, ?, ?, ?)", lambda key: (key,)),
@@ -30,15 +30,10 @@ def grow_database(path: Path, earlier: Path, photos: PhotoSet, known: Collection
         earlier_ids = dict(connection.execute("SELECT name, image_id FROM images"))
         last = max([0, *earlier_ids.values(), *(seq for (seq,) in connection.execute(LAST_ID))])
     ids = {name: key for name, key in earlier_ids.items() if name in known}
-    members = [photo for group in photos.groups.values() for photo in sorted(group, key=lambda photo: photo.name)]
+    members = ordered_photos(photos)
     new = [photo.name for photo in members if photo.name not in ids]
     ids |= {name: key for key, name in enumerate(new, start=last + 1)}
-    images = {
-        ids[photo.name]: MatchedImage(
-            ids[photo.name], photo.name, photo.group, photo.width, photo.height, projection=photo.projection
-        )
-        for photo in members
-    }
+    images = {ids[photo.name]: matched_image(ids[photo.name], photo) for photo in members}
     with replace_atomically(path) as beside:
         write_match_graph(beside, MatchGraph(images, {}, {}))
         _copy_rows(beside, earlier, {key for name, key in ids.items() if name in known})

@@ -20,15 +20,12 @@ SCENE, CLOUD = "scene", "cloud"
 """Input of a scene format: cameras, poses and sparse points; or the dense cloud, too."""
 
 
-class WriteModel(Protocol):
-    """Makes model files by name: first the one to open (`name` with the format's suffix), then those it refers to.
+WriteModel = Callable[[Model, str], Mapping[str, bytes]]
+"""Makes model files by name: first the one to open (the name given, with the format's suffix), then those it refers to.
 
-    Takes a surface with a texture (pages of pictures, perhaps with normal maps), a surface with a color per vertex, or
-    points and cameras. The same model gives the same bytes. ReconstructionError: the model is empty, or has no
-    triangles and the format needs them.
-    """
-
-    def __call__(self, model: Model, name: str, /) -> Mapping[str, bytes]: ...
+Takes a surface with a texture (pages of pictures, perhaps with normal maps), a surface with a color per vertex, or
+points and cameras. The same model gives the same bytes. ReconstructionError: the model is empty, or has no triangles
+and the format needs them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,10 +80,8 @@ class FinishedScene(Protocol):
         """Show the user a message."""
 
 
-class WriteScene(Protocol):
-    """Writes a scene to a file, or into an empty folder; the same scene gives the same bytes."""
-
-    def __call__(self, scene: FinishedScene, target: Path, /) -> None: ...
+WriteScene = Callable[[FinishedScene, Path], None]
+"""Writes a scene to a file, or into an empty folder; the same scene gives the same bytes."""
 
 
 @dataclass(frozen=True, slots=True)

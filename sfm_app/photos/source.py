@@ -16,7 +16,7 @@ from sfm_app.operating_system import is_link, link_or_copy
 from sfm_app.photos.decode import UnreadableError, large_photo_lock, read_picture, rotate_to_sensor, upright_image
 from sfm_app.photos.files import is_video, list_files, read_head, resolve_file
 from sfm_app.photos.masks import list_masks
-from sfm_app.settings import PhotoSettings, Settings
+from sfm_app.settings import PhotoSettings
 from sfm_app.types import Photo, PhotoSet
 
 Stamp = tuple[int, int]
@@ -45,11 +45,6 @@ class Source:
     def fingerprint(self) -> str:
         """Hash of the path, the files and the masks."""
         return fingerprint(str(self.path.resolve()), self.files, self.masks)
-
-    def check_settings(self, settings: Settings) -> None:
-        """Check that the settings suit the source; raise a ConfigError if a video has a list of images."""
-        if self.video and settings.photos.images:
-            raise ConfigError("--images lists photos of a folder, not frames of a video", hint="leave --images out")
 
     def content_hash(self, photos: PhotoSet) -> str:
         """Return a hash of the used photos and their masks, without camera groups, which do not affect features."""
@@ -84,6 +79,8 @@ def read_source(path: Path, out: Path, options: PhotoSettings, spread: ParallelM
     """List the input files and compute their hashes; raise an InputError if the photos or the masks cannot be used."""
     video, mask_dir = is_video(read_head(path)), Path(options.masks) if options.masks else None
     listed = Path(options.images) if options.images else None
+    if video and listed is not None:
+        raise ConfigError("--images lists photos of a folder, not frames of a video", hint="leave --images out")
     names = [""] if video else list_files(path, out, listed, closed=() if mask_dir is None else (mask_dir,))
     mask_names = [] if mask_dir is None else list_masks(mask_dir, path, out)
     paths = [path / name for name in names] + [mask_dir / name for name in mask_names if mask_dir is not None]

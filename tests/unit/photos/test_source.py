@@ -12,7 +12,7 @@ from sfm_app.errors import ConfigError, InputError
 from sfm_app.operating_system import Ability, lacks
 from sfm_app.photos.decode import UnreadableError
 from sfm_app.photos.source import assign_names, is_laid_out, lay_out, read_source
-from sfm_app.settings import PhotoSettings, Settings
+from sfm_app.settings import PhotoSettings
 from sfm_app.types import Photo, PhotoSet
 
 
@@ -59,12 +59,10 @@ def test_photos_that_change_under_a_run_are_seen(folder, tmp_path, change, says)
 
 
 def test_a_video_has_no_list_of_photos(folder, tmp_path):
-    photos = source_of(folder, tmp_path / "out")
-    listed = Settings.from_mapping({"photos": {"images": "list.txt"}})
-    photos.check_settings(listed)
-    replace(photos, video=True).check_settings(Settings())
+    (tmp_path / "a.mp4").write_bytes(b"\0\0\0\x18ftypisom")
+    assert source_of(tmp_path / "a.mp4", tmp_path / "out").video
     with pytest.raises(ConfigError, match="--images"):
-        replace(photos, video=True).check_settings(listed)
+        source_of(tmp_path / "a.mp4", tmp_path / "out", images="list.txt")
 
 
 def test_a_photo_is_the_same_if_bytes_size_group_and_mask_are(folder, tmp_path):
