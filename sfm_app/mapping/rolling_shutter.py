@@ -1,6 +1,7 @@
 """Follow the rolling shutter of a video: measure its readout, compensate the keypoints, adjust again, and repeat."""
 
 import logging
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -74,7 +75,7 @@ def _frame_numbers(images: Sequence[MatchedImage]) -> dict[int, float] | None:
 
 @dataclass(frozen=True, slots=True)
 class Readout:
-    """Measured shutter of a video."""
+    """Shutter of a video; its times are NaN where it was not measured."""
 
     readout: float
     """Seconds; negative where the last row is read first."""
@@ -87,24 +88,14 @@ class Readout:
     def to_dict(self) -> dict[str, Json]:
         """Return plain values for the manifest, in milliseconds."""
         figures = {"readout": self.readout, "deviation": self.deviation, "interval": self.interval}
-        rounded: dict[str, Json] = {f"{name}_ms": round(1e3 * value, 4) for name, value in figures.items()}
+        measured = {name: value for name, value in figures.items() if not math.isnan(value)}
+        rounded: dict[str, Json] = {f"{name}_ms": round(1e3 * value, 4) for name, value in measured.items()}
         return rounded | {"compensated": not self.refused} | ({"because": self.refused} if self.refused else {})
-
-
-@dataclass(frozen=True, slots=True)
-class Unmeasured:
-    """A video without a measurement of its shutter."""
-
-    reason: str
-
-    def to_dict(self) -> dict[str, Json]:
-        """Return plain values for the manifest."""
-        return {"compensated": False, "because": self.reason}
 
 
 def follow_shutter(
     adjusted: Adjustment, matches: MatchGraph, database: Path, progress: Progress, rules: Rules = NO_RULES
-) -> tuple[Adjustment, Readout | Unmeasured | None]:
+) -> tuple[Adjustment, Readout | None]:
     """Return the model as a global shutter would have given it, and the measurement of the shutter.
 
     The given adjustment is returned where the photos are not known to be frames of a video, where they are too many,
@@ -117,7 +108,8 @@ def follow_shutter(
     if frames is None:
         return adjusted, None
     if len(images) > OPTIONS.max_frames:
-        return adjusted, Unmeasured(f"more than {OPTIONS.max_frames} frames would take too long to measure")
+        reason = f"more than {OPTIONS.max_frames} frames would take too long to measure"
+        return adjusted, Readout(math.nan, math.nan, math.nan, reason)
     progress.say(f"measuring the shutter of the video, with {len(images)} frames")
     try:
         with translate_errors("measuring the shutter"):
