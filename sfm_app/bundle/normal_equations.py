@@ -199,8 +199,6 @@ class ReducedSystem:
     point_step: FloatArray
     """(3P,) best change of the points with fixed poses and cameras."""
     observed: Linearized
-    lost: int
-    """Number of lost observations: behind their camera, or not finite."""
     scores: FloatArray
     """(I, 12C) contributions of each photo to g, with poses and points eliminated; they add up to g."""
     open_points: int
@@ -279,7 +277,6 @@ def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
         pose_response=pose_response,
         point_step=observed.unwhiten(B.T @ observed.r).ravel(),
         observed=observed,
-        lost=len(bundle.x) - observed.used,
         scores=products @ np.vstack([-pose_response, np.eye(cameras)]),
         open_points=int(np.count_nonzero(observed.rank < 3)),
     )

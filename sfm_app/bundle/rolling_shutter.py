@@ -322,7 +322,6 @@ class ReadoutEstimate:
     """(I, 6) of each photo during the readout: velocity as in `PathVelocities`, times readout."""
     shake: FloatArray
     """(2,) size of the offsets of turns and moves, in deviations of the path's velocities times readout."""
-    noise_px: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -371,7 +370,7 @@ def estimate_readout(
             OPTIONS.shake_converged
         ):
             break
-    return ReadoutEstimate(model.readout, step.deviation, model.bundle, model.motion, shake, noise_px)
+    return ReadoutEstimate(model.readout, step.deviation, model.bundle, model.motion, shake)
 
 
 def _follow_path(model: ShutterBundle, problem: _Problem) -> ShutterBundle:

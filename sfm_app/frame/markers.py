@@ -282,13 +282,10 @@ def marker_places(side_m: float, cells: int, paper: str) -> list[tuple[float, fl
 
 def _draw(places: list[tuple[float, float]], side: float, family: str, first: int, paper: str, suffix: str) -> bytes:
     from matplotlib import rc_context
-    from matplotlib.backends.backend_pdf import FigureCanvasPdf
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
     (width, height), margin, ruler = PAGES_MM[paper], PAGE.margin_mm, PAGE.ruler_mm
     figure = Figure(figsize=(width / 25.4, height / 25.4))
-    (FigureCanvasPdf if suffix == "pdf" else FigureCanvasSVG)(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0, width), ylim=(0, height), aspect="equal")
     axes.set_axis_off()

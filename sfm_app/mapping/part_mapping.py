@@ -235,7 +235,8 @@ def _best_across(pairs: Sequence[PairId], links: Links) -> set[int]:
 
 INPUTS, RESULT = "inputs.npz", "result.json"
 """Files in the folder of a part: its inputs and its result."""
-Arrays = dict[str, NDArray[Any]]
+POSE_FIELDS = ("R", "t", "angle_deg", "in_front", "kind", "guided")
+"""Fields of `RelativePose` with an array for all pairs; only the inliers differ in number."""
 
 
 def part_of_group(group: Group, photos: Sequence[int]) -> Group:
@@ -282,9 +283,14 @@ def write_inputs(path: Path, inputs: PartInputs) -> None:
         "settings": inputs.settings.model_dump(mode="json"),
         "asked": inputs.stop_at_false_joins,
     }
-    arrays = _match_arrays(evidence.matches) | _pose_arrays(part.graph)
+    matches, poses = evidence.matches, part.graph.poses
+    arrays: dict[str, NDArray[Any]] = {"known": np.array(json_text(known))}
+    arrays["mapped"] = np.array(sorted(inputs.mapped), np.int64).reshape(-1, 2)
+    arrays |= {f"keypoints_{photo}": x.astype(np.float64) for photo, x in matches.keypoints.items()}
+    arrays |= {f"matches_{a}_{b}": rows.astype(np.uint32) for (a, b), rows in matches.matches.items()}
     arrays |= {f"view_{name}": array for name, array in evidence.views.to_arrays().items()}
-    arrays |= {"mapped": np.array(sorted(inputs.mapped), np.int64).reshape(-1, 2), "known": np.array(json_text(known))}
+    arrays |= {f"inliers_{a}_{b}": pose.inliers for (a, b), pose in poses.items()}
+    arrays |= {f"pose_{name}": np.array([getattr(pose, name) for pose in poses.values()]) for name in POSE_FIELDS}
     with replace_atomically(path) as beside, beside.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
 
@@ -294,60 +300,24 @@ def read_inputs(path: Path) -> PartInputs:
     arrays = load_arrays(path)
     known = json.loads(str(arrays["known"]))
     images = {image["id"]: MatchedImage(**image) for image in known["images"]}
+    keypoints = {photo: x for (photo,), x in _numbered_arrays(arrays, "keypoints").items()}
+    matches = {(a, b): rows for (a, b), rows in _numbered_arrays(arrays, "matches").items()}
     views = {name.removeprefix("view_"): array for name, array in arrays.items() if name.startswith("view_")}
-    part = Group(
-        tuple(known["photos"]),
-        Evidence(
-            _matches_from_arrays(images, arrays),
-            ViewGraph.from_arrays(views),
-            Intrinsics.from_dict(known["intrinsics"]),
-        ),
-        PoseGraph(_poses_from_arrays(arrays), {}, (tuple(known["photos"]),)),
-    )
-    mapped = frozenset((int(a), int(b)) for a, b in arrays["mapped"])
-    return PartInputs(part, mapped, Settings.from_mapping(known["settings"]), known["asked"])
-
-
-def _match_arrays(matches: MatchGraph) -> Arrays:
-    keypoints, rows = list(matches.keypoints.values()), list(matches.matches.values())
-    return {
-        "keypoint_photos": np.array(list(matches.keypoints), np.int64),
-        "keypoint_counts": np.array([len(x) for x in keypoints], np.int64),
-        "keypoints": np.concatenate([*keypoints, np.zeros((0, 2))]),
-        "match_pairs": np.array(list(matches.matches), np.int64).reshape(-1, 2),
-        "match_counts": np.array([len(row) for row in rows], np.int64),
-        "matches": np.concatenate([*rows, np.zeros((0, 2), np.uint32)]).astype(np.uint32),
-    }
-
-
-def _matches_from_arrays(images: Mapping[int, MatchedImage], arrays: Mapping[str, NDArray[Any]]) -> MatchGraph:
-    keypoints = np.split(arrays["keypoints"], np.cumsum(arrays["keypoint_counts"]))[:-1]
-    rows = np.split(arrays["matches"], np.cumsum(arrays["match_counts"]))[:-1]
-    return MatchGraph(
-        images,
-        dict(zip(arrays["keypoint_photos"].tolist(), keypoints, strict=True)),
-        dict(zip(map(tuple, arrays["match_pairs"].tolist()), rows, strict=True)),
-    )
-
-
-POSE_FIELDS = ("R", "t", "angle_deg", "in_front", "kind", "guided")
-"""Fields of `RelativePose` with an array for all pairs; only the inliers differ in number."""
-
-
-def _pose_arrays(graph: PoseGraph) -> Arrays:
-    poses = list(graph.poses.values())
-    return {f"pose_{name}": np.array([getattr(pose, name) for pose in poses]) for name in POSE_FIELDS} | {
-        "pose_pairs": np.array(list(graph.poses), np.int64).reshape(-1, 2),
-        "pose_counts": np.array([len(pose.inliers) for pose in poses], np.int64),
-        "pose_inliers": np.concatenate([*(pose.inliers for pose in poses), np.zeros(0, bool)]),
-    }
-
-
-def _poses_from_arrays(arrays: Mapping[str, NDArray[Any]]) -> dict[PairId, RelativePose]:
+    intrinsics = Intrinsics.from_dict(known["intrinsics"])
+    evidence = Evidence(MatchGraph(images, keypoints, matches), ViewGraph.from_arrays(views), intrinsics)
     R, t, *others = (arrays[f"pose_{name}"] for name in POSE_FIELDS)
-    inliers = np.split(arrays["pose_inliers"], np.cumsum(arrays["pose_counts"]))[:-1]
-    poses = map(RelativePose, R, t, inliers, *(values.tolist() for values in others))
-    return dict(zip(map(tuple, arrays["pose_pairs"].tolist()), poses, strict=True))
+    inliers = _numbered_arrays(arrays, "inliers")
+    poses = map(RelativePose, R, t, inliers.values(), *(values.tolist() for values in others))
+    photos = tuple(known["photos"])
+    graph = PoseGraph({(a, b): pose for (a, b), pose in zip(inliers, poses, strict=True)}, {}, (photos,))
+    mapped = frozenset((int(a), int(b)) for a, b in arrays["mapped"])
+    return PartInputs(Group(photos, evidence, graph), mapped, Settings.from_mapping(known["settings"]), known["asked"])
+
+
+def _numbered_arrays(arrays: Mapping[str, NDArray[Any]], kind: str) -> dict[tuple[int, ...], NDArray[Any]]:
+    """Return the arrays of a kind, by the photo or the pair in their names."""
+    names = [name for name in arrays if name.startswith(f"{kind}_")]
+    return {tuple(map(int, name.split("_")[1:])): arrays[name] for name in names}
 
 
 logger = logging.getLogger("sfm_app")

@@ -1,6 +1,7 @@
 """Follow the rolling shutter of a video: measure its readout, compensate the keypoints, adjust again, and repeat."""
 
 import logging
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -43,25 +44,18 @@ logger = logging.getLogger("sfm_app")
 NUMBERED = re.compile(r"(.*?)(\d+)")
 
 
-@dataclass(frozen=True, slots=True)
-class FrameTimes:
-    """Times of the frames of a video."""
+def frame_times(images: Sequence[MatchedImage]) -> tuple[dict[int, float], float] | None:
+    """Return the times of photos named by number, by id, and the interval between frames of their video, in seconds.
 
-    times: Mapping[int, float]
-    """Seconds, by photo id."""
-    interval: float
-    """Between two frames of the video, in seconds."""
-
-
-def frame_times(images: Sequence[MatchedImage]) -> FrameTimes | None:
-    """Return the times of photos named by number; None where they are not known to be frames of one video."""
+    None where they are not known to be frames of one video.
+    """
     numbers = _frame_numbers(images)
     times = {image.id: image.time_s for image in images if image.time_s is not None}
     if numbers is None or len(times) < len(images) or len(images) < OPTIONS.min_frames:
         return None
     order = sorted(numbers, key=numbers.__getitem__)
     seconds, steps = (np.diff([of[key] for key in order]) for of in (times, numbers))
-    return FrameTimes(times, float(np.median(seconds / steps))) if (seconds > 0.0).all() else None
+    return (times, float(np.median(seconds / steps))) if (seconds > 0.0).all() else None
 
 
 def _frame_numbers(images: Sequence[MatchedImage]) -> dict[int, float] | None:
@@ -74,7 +68,7 @@ def _frame_numbers(images: Sequence[MatchedImage]) -> dict[int, float] | None:
 
 @dataclass(frozen=True, slots=True)
 class Readout:
-    """Measured shutter of a video."""
+    """Shutter of a video; its times are NaN where it was not measured."""
 
     readout: float
     """Seconds; negative where the last row is read first."""
@@ -87,24 +81,14 @@ class Readout:
     def to_dict(self) -> dict[str, Json]:
         """Return plain values for the manifest, in milliseconds."""
         figures = {"readout": self.readout, "deviation": self.deviation, "interval": self.interval}
-        rounded: dict[str, Json] = {f"{name}_ms": round(1e3 * value, 4) for name, value in figures.items()}
+        measured = {name: value for name, value in figures.items() if not math.isnan(value)}
+        rounded: dict[str, Json] = {f"{name}_ms": round(1e3 * value, 4) for name, value in measured.items()}
         return rounded | {"compensated": not self.refused} | ({"because": self.refused} if self.refused else {})
-
-
-@dataclass(frozen=True, slots=True)
-class Unmeasured:
-    """A video without a measurement of its shutter."""
-
-    reason: str
-
-    def to_dict(self) -> dict[str, Json]:
-        """Return plain values for the manifest."""
-        return {"compensated": False, "because": self.reason}
 
 
 def follow_shutter(
     adjusted: Adjustment, matches: MatchGraph, database: Path, progress: Progress, rules: Rules = NO_RULES
-) -> tuple[Adjustment, Readout | Unmeasured | None]:
+) -> tuple[Adjustment, Readout | None]:
     """Return the model as a global shutter would have given it, and the measurement of the shutter.
 
     The given adjustment is returned where the photos are not known to be frames of a video, where they are too many,
@@ -116,30 +100,32 @@ def follow_shutter(
     frames = frame_times(images)
     if frames is None:
         return adjusted, None
+    times, interval = frames
     if len(images) > OPTIONS.max_frames:
-        return adjusted, Unmeasured(f"more than {OPTIONS.max_frames} frames would take too long to measure")
+        reason = f"more than {OPTIONS.max_frames} frames would take too long to measure"
+        return adjusted, Readout(math.nan, math.nan, math.nan, reason)
     progress.say(f"measuring the shutter of the video, with {len(images)} frames")
     try:
         with translate_errors("measuring the shutter"):
-            rounds = _compensate(adjusted, frames, database, rules)
+            rounds = _compensate(adjusted, times, database, rules)
     except FAILURES as err:
         logger.info("the shutter could not be measured", exc_info=err)
         return adjusted, None
     compensated, estimate = rounds[-1]
-    refused = _reason_to_refuse(adjusted, compensated, estimate, frames)
-    readout = Readout(estimate.readout, estimate.deviation, frames.interval, refused)
+    refused = _reason_to_refuse(adjusted, compensated, estimate, interval)
+    readout = Readout(estimate.readout, estimate.deviation, interval, refused)
     return (adjusted if refused else compensated), readout
 
 
 def _compensate(
-    adjusted: Adjustment, frames: FrameTimes, database: Path, rules: Rules
+    adjusted: Adjustment, times: Mapping[int, float], database: Path, rules: Rules
 ) -> Sequence[tuple[Adjustment, ReadoutEstimate]]:
     """Return the adjusted models of all rounds with their readouts; an insignificant one has the given model."""
     rounds: list[tuple[Adjustment, ReadoutEstimate]] = []
     keypoints, current = read_keypoints(adjusted.model), adjusted
     estimate: ReadoutEstimate | None = None
     for _ in range(OPTIONS.rounds):
-        before, estimate = estimate, measure_readout(current, keypoints, frames.times, estimate)
+        before, estimate = estimate, measure_readout(current, keypoints, times, estimate)
         if abs(estimate.readout) <= estimate.deviation:
             return [*rounds, (adjusted, estimate)]
         current = adjust_or_keep(straighten_model(current.model, estimate, keypoints), database, rules)
@@ -150,14 +136,12 @@ def _compensate(
     return rounds
 
 
-def _reason_to_refuse(
-    adjusted: Adjustment, compensated: Adjustment, estimate: ReadoutEstimate, frames: FrameTimes
-) -> str:
-    if OPTIONS.significance * estimate.deviation >= frames.interval:
+def _reason_to_refuse(adjusted: Adjustment, compensated: Adjustment, estimate: ReadoutEstimate, interval: float) -> str:
+    if OPTIONS.significance * estimate.deviation >= interval:
         return "the motion of the camera does not determine it"
     if abs(estimate.readout) < OPTIONS.significance * estimate.deviation:
         return "it is not significant"
-    if abs(estimate.readout) > OPTIONS.longest * frames.interval:
+    if abs(estimate.readout) > OPTIONS.longest * interval:
         return "it would be longer than a frame lasts"
     if compensated.failure:
         return f"the adjustment failed: {compensated.failure}"

@@ -58,11 +58,9 @@ def seen_points(truth: Truth) -> FloatArray:
     for name, pose in truth.cam_from_world.items():
         camera = truth.cameras[name]
         shrink = 96 / max(camera.width, camera.height)
-        K, size = (
-            np.diag([shrink, shrink, 1.0]) @ camera.K,
-            (round(camera.width * shrink), round(camera.height * shrink)),
-        )
-        directions = pixel_rays(Camera(K, *size, camera.lens)) @ pose[:, :3]
+        size = round(camera.width * shrink), round(camera.height * shrink)
+        small = Camera(np.diag([shrink, shrink, 1.0]) @ camera.K, *size, camera.lens)
+        directions = pixel_rays(small) @ pose[:, :3]
         depth = cast_rays(caster, camera_center(pose), directions)["t_hit"].astype(np.float64)
         hit = np.isfinite(depth)
         parts.append(camera_center(pose) + directions[hit] * depth[hit, None])

@@ -89,7 +89,7 @@ def test_whatever_is_seen_the_answer_is_numbers(scene):
 def test_a_point_at_infinity_still_says_how_the_cameras_are_turned_and_keeps_its_depth():
     far = np.vstack([box(), [[1e11, 0, 1e12]]])
     near, both = reduce(bundle_of(box(), *ring(6)), SCALE_PX), reduce(bundle_of(far, *walk(6)), SCALE_PX)
-    assert (near.open_points, near.lost) == (0, 0) and (both.open_points, both.lost) == (1, 0)
+    assert (near.open_points, near.observed.used) == (0, 360) and (both.open_points, both.observed.used) == (1, 366)
     ray = far[-1] / np.linalg.norm(far[-1])
     assert abs(both.point_step[-3:] @ ray) < 1e-3 * np.linalg.norm(far[-1])
 
@@ -98,7 +98,7 @@ def test_points_of_which_nothing_is_open_count_as_before():
     bundle = bundle_of(box(), *ring(6))
     more = bundle_of(np.vstack([box(), [[0, 0, -50.0]]]), *ring(6))
     found, other = reduce(bundle, SCALE_PX), reduce(more, SCALE_PX)
-    assert (other.lost, other.open_points) == (6, 1), "behind all six photos, it says nothing"
+    assert (other.observed.used, other.open_points) == (360, 1), "behind all six photos, it says nothing"
     # noise differs, as observations come in another order
     assert np.diag(other.H) == pytest.approx(np.diag(found.H), rel=0.05)
     assert np.array_equal(other.point_step[-3:], np.zeros(3))
