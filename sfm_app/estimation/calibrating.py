@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm_app.camera.bearings import bearings
 from sfm_app.estimation.diagnosis import diagnose_fits, inliers_by_degeneracy
 from sfm_app.estimation.fitting import find_views
 from sfm_app.estimation.given_cameras import (
@@ -16,8 +17,8 @@ from sfm_app.estimation.given_cameras import (
     report_claims,
     shown_share,
 )
+from sfm_app.fundamental.rays import select_inliers
 from sfm_app.numerical import FAILURES
-from sfm_app.posegraph.pair_pose import Pair, estimate_pose
 from sfm_app.retrieval import choose_by_rank
 from sfm_app.runtime.context import RunContext
 from sfm_app.selfcal import CalibratedCamera, calibrate_photo_set, pair_weights
@@ -74,13 +75,13 @@ def select_inliers_through_lens(
     def choose(pair: PairId) -> EpipolarGeometry:
         fit = views.fits[pair]
         try:
-            matched = Pair(matches.points(pair), [known[photo] for photo in pair], run.settings.epipolar.max_error_px)
-            pose = estimate_pose(matched, fit)
+            both = zip(matches.points(pair), pair, strict=True)
+            lines = np.hstack([bearings(x, known[photo]) for x, photo in both])
+            inliers = select_inliers(lines, fit.inliers, run.settings.epipolar.max_error_px)
         except FAILURES as err:
             logger.info("the inliers of pair %s could not be selected through the lens", pair, exc_info=err)
             return fit
-        keeps_inliers = pose is not None and pose.inlier_count >= OPTIONS.min_kept * fit.inlier_count
-        return replace(fit, inliers=pose.inliers) if pose is not None and keeps_inliers else fit
+        return replace(fit, inliers=inliers) if inliers.sum() >= OPTIONS.min_kept * fit.inlier_count else fit
 
     selected = dict(zip(pairs, run.map(choose, pairs, "matches through the lens"), strict=True))
     return replace(views, fits={pair: selected.get(pair, fit) for pair, fit in views.fits.items()})

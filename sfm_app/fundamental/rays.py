@@ -27,7 +27,7 @@ from sfm_app.geometry.epipolar import (
 )
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import RayFit, Rejected
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +72,13 @@ def fit_lev_ransac_rays(lines: FloatArray, options: EpipolarSettings, seed: int)
     accepted = all_squared <= options.max_error_px**2
     rms, kind = math.sqrt(float(all_squared[accepted].mean())), _find_degeneracy(E, distinct[inliers], options)
     return RayFit(E, accepted, validity(lines, E, options.max_error_px), trials, rms, kind)
+
+
+def select_inliers(lines: FloatArray, inliers: BoolArray, threshold: float) -> BoolArray:
+    """Return (N,) the matches within a threshold of the F of rays that explains most inliers; no focal is assumed."""
+    F = fit_rays(lines[inliers][:, FIRST], lines[inliers][:, SECOND])
+    F = _optimize_locally(lines, F, threshold, is_calibrated=False)
+    return np.asarray(squared_distances(F[None], lines)[0] <= threshold**2, np.bool_)
 
 
 def validity(lines: FloatArray, E: FloatArray, threshold: float) -> FloatArray:
@@ -127,14 +134,15 @@ def _draw(rng: np.random.Generator, chances: FloatArray | None, count: int) -> I
     return np.argpartition(keys, RAY_SAMPLE_SIZE, axis=1)[:, :RAY_SAMPLE_SIZE]
 
 
-def _optimize_locally(lines: FloatArray, E: FloatArray, threshold: float) -> FloatArray:
+def _optimize_locally(lines: FloatArray, E: FloatArray, threshold: float, *, is_calibrated: bool = True) -> FloatArray:
     """Refit to all matches with weights by the cost at the coarse scale, then at the fine one."""
     p, q = lines[:, FIRST], lines[:, SECOND]
     for scale, steps in zip((LEV_RANSAC.coarse, LEV_RANSAC.fine), LEV_RANSAC.local_steps, strict=True):
         for _ in range(steps):
             squared, slope = squared_distances(E[None], lines)[0], gradients(E, lines)
             weights = (1.0 + squared / (scale * threshold) ** 2) ** -2 * slope**-2
-            E = nearest_essential(fit_rays(p, q, weights))
+            F = fit_rays(p, q, weights)
+            E = nearest_essential(F) if is_calibrated else F
     return np.asarray(E / np.linalg.norm(E), np.float64)
 
 
