@@ -8,9 +8,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.synthetic.houses import assemble
 from sfm_app.synthetic.cameras import ArcOptions, Camera, Views, arc
 from sfm_app.synthetic.scenes import BRICK, LEAVES, LIMESTONE, PAVING, SANDSTONE, TERRACOTTA, WOOD
-from sfm_app.synthetic.shapes import Body, Material, Shape, SyntheticScene, assemble, ball, box, grid, ground, revolve
+from sfm_app.synthetic.shapes import Body, Material, Shape, SyntheticScene, ball, box, grid, ground, revolve
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]

@@ -15,7 +15,6 @@ from sfm_app.synthetic.shapes import (
     Material,
     Pattern,
     Shape,
-    assemble,
 )
 
 FloatArray = NDArray[np.float64]
@@ -33,6 +32,15 @@ BOX_SIDES = np.array([
     [[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]],
 ])  # fmt: skip
 """Corners of a box, 0 for from and 1 for to along x, y and z, of its sides that face x, -x, y, -y and z."""
+
+
+def assemble(parts: Sequence[Shape], keep_texture: bool = False) -> Shape:
+    """Join several shapes; with `keep_texture`, equal parts look equal, else the texture continues across them."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
+    texture = np.concatenate([part.texture for part in parts]) if keep_texture else vertices
+    return Shape(vertices, faces, np.concatenate([part.normals for part in parts]), texture)
 
 
 def quads(corners: FloatArray) -> Shape:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.synthetic.detail_scenes import garden, garden_views, ornament, ornament_views, railing, railing_views
+from benchmarks.synthetic.houses import assemble
 from benchmarks.synthetic.town import TownPhotos, town, town_views
 from benchmarks.synthetic.walks import WallWalkOptions, wall_walk
 from sfm_app.errors import ConfigError
@@ -35,7 +36,6 @@ from sfm_app.synthetic.shapes import (
     Material,
     Shape,
     SyntheticScene,
-    assemble,
     ball,
     box,
     ground,

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.synthetic.houses import BRIGHT, DEPTH_M, WALLS, Span, draw_material, house, panels
+from benchmarks.synthetic.houses import BRIGHT, DEPTH_M, WALLS, Span, assemble, draw_material, house, panels
 from sfm_app.errors import ConfigError
 from sfm_app.synthetic.cameras import Camera, Views
-from sfm_app.synthetic.shapes import Body, Color, Pattern, Shape, SyntheticScene, assemble, ball, box, ground, revolve
+from sfm_app.synthetic.shapes import Body, Color, Pattern, Shape, SyntheticScene, ball, box, ground, revolve
 
 FloatArray = NDArray[np.float64]
 Random = np.random.Generator

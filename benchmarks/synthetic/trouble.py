@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from benchmarks.synthetic.houses import assemble
 from benchmarks.synthetic.walks import orbit
 from sfm_app.errors import InputError
 from sfm_app.synthetic.cameras import (
@@ -42,7 +43,7 @@ from sfm_app.synthetic.scenes import (
     TERRACOTTA,
     WOOD,
 )
-from sfm_app.synthetic.shapes import Body, Material, Shape, SyntheticScene, assemble, ball, box, ground, revolve, torus
+from sfm_app.synthetic.shapes import Body, Material, Shape, SyntheticScene, ball, box, ground, revolve, torus
 
 Random = np.random.Generator
 FloatArray = NDArray[np.float64]

@@ -127,13 +127,6 @@ def carve(
     return _build_shape([(vertices.reshape(-1, 3), _strips(segments, rows, segments))])
 
 
-def assemble(parts: Sequence[Shape], keep_texture: bool = False) -> Shape:
-    """Join several shapes; with `keep_texture`, equal parts look equal, else the texture continues across them."""
-    vertices, faces = _stack([(part.vertices, part.faces) for part in parts])
-    texture = np.concatenate([part.texture for part in parts]) if keep_texture else vertices
-    return Shape(vertices, faces, np.concatenate([part.normals for part in parts]), texture)
-
-
 def ground(x: tuple[float, float], z: tuple[float, float], unevenness: float, spacing: float = 0.1) -> Shape:
     """Return an uneven floor around y = 0."""
     xs, zs = (np.linspace(a, b, 1 + max(1, round((b - a) / spacing))) for a, b in (x, z))

@@ -6,11 +6,12 @@ import pytest
 from benchmarks.surface.rendered import detail
 from benchmarks.surface.rendered.detail import detail_scores
 from benchmarks.synthetic.detail_scenes import straight, tube
+from benchmarks.synthetic.houses import assemble
 from sfm_app.synthetic.cameras import Views, look_at, make_camera
 from sfm_app.synthetic.compare import scene_size
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.synthetic.scenes import LIMESTONE
-from sfm_app.synthetic.shapes import Body, SyntheticScene, assemble, box, ground
+from sfm_app.synthetic.shapes import Body, SyntheticScene, box, ground
 from sfm_app.types import Surface
 
 ROD = straight((0.9, 0.1, 0.0), (0.9, 1.2, 0.0), 0.01)
