@@ -6,8 +6,7 @@ import threading
 import traceback
 import zlib  # before pycolmap, whose own deflate symbols otherwise break every later use of zlib in this process
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
-from concurrent.futures import TimeoutError as NotYet
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -150,11 +149,9 @@ def run_in_daemon_thread(call: Callable[[], Result]) -> Result:
             future.set_exception(err)
 
     threading.Thread(target=run, name=THREAD_NAME, daemon=True).start()
-    while True:
-        with contextlib.suppress(NotYet):
-            return future.result(timeout=0.2)
-        if future.done():
-            return future.result()
+    while wait([future], timeout=0.2).not_done:
+        pass
+    return future.result()
 
 
 def has_running_call() -> bool:
@@ -170,16 +167,12 @@ def run_interruptible(
     with ThreadPoolExecutor(1, thread_name_prefix="colmap") as thread:
         future = thread.submit(call, token)
         try:
-            while True:
-                try:
-                    return future.result(timeout=0.5)
-                except NotYet:
-                    if future.done():
-                        raise
-                    poll()
+            while wait([future], timeout=0.5).not_done:
+                poll()
         except KeyboardInterrupt:
             token.cancel()
             raise
+        return future.result()
 
 
 def run_with_progress(

@@ -24,14 +24,12 @@ from sfm_app.types import (
     PoseGraph,
     RelativePose,
 )
-from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE
+from sfm_app.types.camera import EQUIRECTANGULAR, PERSPECTIVE
 
 SQUARE_PIXELS = "SIMPLE_RADIAL"
 """f, cx, cy, k: the model for mapping with one focal; a second radial term diverges on the first photos."""
-TWO_FOCALS = "OPENCV"
-"""fx, fy, cx, cy, k1, k2, p1, p2: COLMAP's smallest model with two focals and lens distortion."""
-WIDE_MODELS = {FISHEYE: "OPENCV_FISHEYE", EQUIRECTANGULAR: "EQUIRECTANGULAR"}
-"""COLMAP's models of projections that are not perspective."""
+PANORAMA = "EQUIRECTANGULAR"
+"""w, h: the model of panoramas."""
 
 KINDS = {
     "calibrated": "CALIBRATED", "uncalibrated": "UNCALIBRATED", "planar": "PLANAR", "rotation": "PANORAMIC"
@@ -123,7 +121,7 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
 
 def panorama_names(path: Path) -> frozenset[str]:
     """Return the names of the photos that are equirectangular panoramas."""
-    model = pycolmap.CameraModelId.__members__[WIDE_MODELS[EQUIRECTANGULAR]]
+    model = pycolmap.CameraModelId.__members__[PANORAMA]
     with open_database(path) as database:
         cameras = {camera.camera_id for camera in database.read_all_cameras() if camera.model == model}
         return frozenset(image.name for image in database.read_all_images() if image.camera_id in cameras)
@@ -263,14 +261,14 @@ def _write_frame(database: pycolmap.Database, image: pycolmap.Image) -> None:
 
 def camera_model(calibration: Calibration) -> str:
     """Return COLMAP's name of the smallest camera model for a calibration."""
-    if calibration.distortion:
-        return file_model(row_of_calibration(calibration), FAMILIES[calibration.projection])
-    if calibration.projection in WIDE_MODELS:
-        return WIDE_MODELS[calibration.projection]
+    if calibration.projection == EQUIRECTANGULAR:
+        return PANORAMA
     # largest |fy/fx - 1| of square pixels: calibrators give no more where the photos show no other aspect
     K, tolerance = calibration.K, 0.0 if calibration.is_given else 0.005
     square = "aspect" in calibration.held or K[0, 0] == K[1, 1] or abs(K[1, 1] / K[0, 0] - 1.0) < tolerance
-    return SQUARE_PIXELS if square else TWO_FOCALS
+    if square and calibration.projection == PERSPECTIVE and not calibration.distortion:
+        return SQUARE_PIXELS
+    return file_model(row_of_calibration(calibration), FAMILIES[calibration.projection])
 
 
 def _pair(pair_id: int) -> PairId:

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import (
     SQUARE_PIXELS,
-    TWO_FOCALS,
     camera_model,
     create_database,
     digest_matches,
@@ -146,7 +145,7 @@ def test_only_a_k_that_is_known_counts_as_prior_knowledge(stored):
     one, same, two = cameras_of(path)
     assert (one.model.name, list(one.params), one.has_prior_focal_length) == (SQUARE_PIXELS, [130, 66, 41, 0], True)
     assert one.camera_id == same.camera_id
-    assert (two.model.name, two.has_prior_focal_length) == (TWO_FOCALS, False)
+    assert (two.model.name, two.has_prior_focal_length) == ("OPENCV", False)
     assert list(two.params) == [120, 90, 50, 50, 0, 0, 0, 0]
 
 
@@ -155,8 +154,8 @@ def test_only_a_k_that_is_known_counts_as_prior_knowledge(stored):
     [
         (calibration(aspect=1.02, held=("aspect",)), SQUARE_PIXELS),
         (calibration(aspect=1.004), SQUARE_PIXELS),
-        (calibration(aspect=1.006, held=("center",)), TWO_FOCALS),
-        (calibration(aspect=1 / 1.006), TWO_FOCALS),
+        (calibration(aspect=1.006, held=("center",)), "OPENCV"),
+        (calibration(aspect=1 / 1.006), "OPENCV"),
     ],
 )
 def test_pixels_are_square_where_the_photos_ask_for_nothing_else(found, model):
