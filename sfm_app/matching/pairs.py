@@ -13,6 +13,7 @@ from sfm_app.matching.features import match_pairs, read_pixels
 from sfm_app.numerical import Json
 from sfm_app.plugins import FeatureMethod
 from sfm_app.retrieval import (
+    DescriptorArray,
     choose_by_rank,
     count_preview_matches,
     count_shared_keypoints,
@@ -32,7 +33,6 @@ from sfm_app.types import MatchedImage, MatchGraph, PairId
 # The largest features of all photos become visual words. Photos with common words are compared in previews, and
 # matched where they seem to overlap, with neighbors in name, time and GPS. A second round follows the matches.
 
-DescriptorArray = NDArray[np.uint8]
 ReadDescriptors = Callable[[int], DescriptorArray]
 """Returns (N, 128) descriptors of a photo, the largest features first."""
 

@@ -117,13 +117,16 @@ def epipolar_residuals(pairs: CameraPairs, camera: Calibration) -> EpipolarResid
 
 def residual_grid(residuals: EpipolarResiduals, size: tuple[int, int]) -> ResidualGrid:
     """Return the residuals by cell of photos of this size (width, height) in pixels."""
+    from scipy.stats import binned_statistic
+
     side = max(size) / OPTIONS.residual_cells
     columns, rows = (max(1, round(length / side)) for length in size)
     count = rows * columns
     places = np.clip(residuals.x / np.array(size) * [columns, rows], 0, [columns - 1, rows - 1]).astype(np.int64)
     cells = places[..., 1] * columns + places[..., 0]
     many = np.bincount(cells.ravel(), minlength=count).reshape(rows, columns) >= OPTIONS.least_keypoints
-    sizes = _medians(np.abs(residuals.distances_px), cells, count).reshape(rows, columns)
+    both, edges = np.tile(np.abs(residuals.distances_px), 2), (-0.5, count - 0.5)
+    sizes = binned_statistic(cells.ravel(), both, "median", count, edges).statistic.reshape(rows, columns)
     shift, deviation = _mean_shifts(residuals, cells, count)
     shift, deviation = shift.reshape(rows, columns, 2), deviation.reshape(rows, columns, 2)
     clear = many & (np.hypot(*np.moveaxis(shift, 2, 0)) > 2.0 * np.hypot(*np.moveaxis(deviation, 2, 0)))
@@ -144,17 +147,6 @@ def _mean_shifts(residuals: EpipolarResiduals, cells: NDArray[np.int64], count: 
     pull = np.asarray(A.T @ distances, np.float64) / noise**2
     shift = np.einsum("ij,j->i", covariance, pull)
     return shift.reshape(count, 2), np.sqrt(np.diag(covariance)).reshape(count, 2)
-
-
-def _medians(values: FloatArray, cells: NDArray[np.int64], count: int) -> FloatArray:
-    """Return (count,) medians of the values of matches by the cells of both keypoints; NaN without any."""
-    medians = np.full(count, np.nan)
-    both = np.tile(values, 2)
-    order = np.argsort(cells.ravel(), kind="stable")
-    used, starts = np.unique(cells.ravel()[order], return_index=True)
-    for cell, group in zip(used, np.split(both[order], starts[1:]) if len(used) else (), strict=True):
-        medians[cell] = np.median(group)
-    return medians
 
 
 def _matrix_of_rays(F: FloatArray, lines: FloatArray, camera: Calibration) -> FloatArray:
