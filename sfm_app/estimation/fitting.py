@@ -1,7 +1,7 @@
 """Fundamental matrices of pairs of photos, by the chosen estimator; fits of a killed run are reused."""
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -18,7 +18,7 @@ from sfm_app.fundamental.rays import fit_lev_ransac_rays
 from sfm_app.numerical import FAILURES
 from sfm_app.plugins import Estimator
 from sfm_app.progress import track
-from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.context import Earlier, RunContext
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.selfcal.wide_lens import LensEstimate, find_lens, needs_fisheye, shows_panoramas
 from sfm_app.settings import EpipolarSettings, Settings
@@ -318,3 +318,38 @@ def _stationary_matches(matched: MatchedPair, settings: Settings) -> BoolArray:
         return np.zeros(len(matched.points[0]), bool)
     shrunk = max(first.width, first.height) / settings.matching.max_image_size_px
     return find_stationary(*matched.points, unit_px=max(1.0, shrunk))
+
+
+# Wide lenses and fundamental matrices of an earlier run.
+
+
+def mostly_known_groups(matches: MatchGraph, earlier: Earlier) -> dict[str, list[MatchedImage]]:
+    """Return the photos of the camera groups with most photos known."""
+    groups: dict[str, list[MatchedImage]] = {}
+    for _, image in sorted(matches.images.items()):
+        groups.setdefault(image.group, []).append(image)
+    known = {group: sum(image.name in earlier.known for image in images) for group, images in groups.items()}
+    return {group: images for group, images in groups.items() if known[group] > 0.5 * len(images)}
+
+
+def known_lenses(matches: MatchGraph, before: ViewGraph, earlier: Earlier) -> dict[str, Calibration | None]:
+    """Return the lenses of mostly known camera groups in the earlier view graph: wide ones, None for the usual ones."""
+    return {group: before.lenses.get(group) for group in mostly_known_groups(matches, earlier)}
+
+
+def known_fits(
+    matches: MatchGraph, before: ViewGraph, same: Collection[PairId], lenses: Mapping[str, Calibration]
+) -> dict[PairId, EpipolarGeometry | Rejected]:
+    """Return the fits of pairs with the same matches and lenses."""
+    groups = {image.group for image in matches.images.values()}
+    unchanged = {group for group in groups if _text(before.lenses.get(group)) == _text(lenses.get(group))}
+    results = before.results
+    return {
+        pair: results[pair]
+        for pair in same
+        if pair in results and all(matches.images[photo].group in unchanged for photo in pair)
+    }
+
+
+def _text(lens: Calibration | None) -> str:
+    return "" if lens is None else str(lens.to_dict())

@@ -2,7 +2,7 @@
 
 from collections import Counter
 
-from sfm_app.estimation.known import find_or_keep_intrinsics
+from sfm_app.estimation.calibrating import find_or_keep_intrinsics
 from sfm_app.products import write_intrinsics
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, ViewGraph

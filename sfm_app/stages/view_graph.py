@@ -3,8 +3,7 @@
 import shutil
 
 from sfm_app.estimation.diagnosis import diagnose_scene
-from sfm_app.estimation.fitting import find_lenses, find_views
-from sfm_app.estimation.known import known_fits, known_lenses
+from sfm_app.estimation.fitting import find_lenses, find_views, known_fits, known_lenses
 from sfm_app.matching.pairs import find_same_matches
 from sfm_app.products import read_view_graph, write_view_graph
 from sfm_app.runtime.context import GIVEN_CAMERAS, RunContext

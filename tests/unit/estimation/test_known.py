@@ -9,8 +9,9 @@ import pytest
 
 from sfm_app.camera.models import camera_matrix
 from sfm_app.colmap.database import write_match_graph
-from sfm_app.estimation import known as module
-from sfm_app.estimation.known import find_or_keep_intrinsics, known_cameras, known_fits, known_lenses, refined_camera
+from sfm_app.estimation import calibrating as module
+from sfm_app.estimation.calibrating import find_or_keep_intrinsics, known_cameras, refined_camera
+from sfm_app.estimation.fitting import known_fits, known_lenses
 from sfm_app.matching.pairs import find_same_matches, pairs_with_new_photos
 from sfm_app.selfcal import CalibratedCamera
 from sfm_app.settings import Settings
