@@ -1,4 +1,4 @@
-"""Cameras of all photos: by the chosen calibrator from the fundamental matrices of their pairs, or of an earlier run."""
+"""Cameras of all photos: by the chosen calibrator from fundamental matrices, or from an earlier run."""
 
 import json
 import logging
@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from sfm_app.camera.bearings import bearings
 from sfm_app.camera_files import run_camera
 from sfm_app.estimation.diagnosis import diagnose_fits, inliers_by_degeneracy
 from sfm_app.estimation.fitting import find_views, mostly_known_groups
@@ -78,12 +77,13 @@ def select_inliers_through_lens(
     if not pairs:
         return views
 
+    max_error_px = run.settings.epipolar.max_error_px
+
     def choose(pair: PairId) -> EpipolarGeometry:
         fit = views.fits[pair]
         try:
-            both = zip(matches.points(pair), pair, strict=True)
-            lines = np.hstack([bearings(x, known[photo]) for x, photo in both])
-            inliers = select_inliers(lines, fit.inliers, run.settings.epipolar.max_error_px)
+            lenses = [known[photo] for photo in pair]
+            inliers = select_inliers(matches.points(pair), lenses, fit.inliers, max_error_px)
         except FAILURES as err:
             logger.info("the inliers of pair %s could not be selected through the lens", pair, exc_info=err)
             return fit

@@ -5,10 +5,12 @@ matches as bearing vectors in pixels, see `camera.bearings`; `E` is of rays, q' 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from sfm_app.camera.bearings import bearings
 from sfm_app.fundamental.a_contrario import MOST_FALSE_ALARMS, model_false_alarms
 from sfm_app.fundamental.estimate import CHANCE, NO_MODEL, TOO_FEW_INLIERS, TOO_FEW_MATCHES
 from sfm_app.fundamental.lev_ransac import OPTIONS as LEV_RANSAC
@@ -26,7 +28,7 @@ from sfm_app.geometry.epipolar import (
     squared_distances,
 )
 from sfm_app.settings import EpipolarSettings
-from sfm_app.types import RayFit, Rejected
+from sfm_app.types import Calibration, RayFit, Rejected
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 
@@ -47,6 +49,8 @@ class RayOptions:
     """Share of the inliers that a rotation explains, as in `posegraph.pair_pose`."""
     rotation_factor: float = 2.0
     """Thresholds within which it explains them, as in `posegraph.pair_pose`."""
+    rounds: int = 4
+    """Fits that select inliers through lenses."""
 
 
 OPTIONS = RayOptions()
@@ -74,11 +78,16 @@ def fit_lev_ransac_rays(lines: FloatArray, options: EpipolarSettings, seed: int)
     return RayFit(E, accepted, validity(lines, E, options.max_error_px), trials, rms, kind)
 
 
-def select_inliers(lines: FloatArray, inliers: BoolArray, threshold: float) -> BoolArray:
-    """Return (N,) the matches within a threshold of the F of rays that explains most inliers; no focal is assumed."""
-    F = fit_rays(lines[inliers][:, FIRST], lines[inliers][:, SECOND])
-    F = _optimize_locally(lines, F, threshold, is_calibrated=False)
-    return np.asarray(squared_distances(F[None], lines)[0] <= threshold**2, np.bool_)
+def select_inliers(
+    points: Sequence[FloatArray], cameras: Sequence[Calibration], inliers: BoolArray, threshold: float
+) -> BoolArray:
+    """Return (N,) the matches (N, 2), (N, 2) that agree with the F of rays of some of them; no focal is assumed."""
+    lines = np.hstack([bearings(x, camera) for x, camera in zip(points, cameras, strict=True)])
+    agreeing, slope = inliers, np.ones(len(lines))
+    for _ in range(OPTIONS.rounds):
+        F = fit_rays(lines[:, FIRST], lines[:, SECOND], agreeing * slope**-2.0)
+        agreeing, slope = squared_distances(F[None], lines)[0] <= threshold**2, gradients(F, lines)
+    return agreeing
 
 
 def validity(lines: FloatArray, E: FloatArray, threshold: float) -> FloatArray:
@@ -134,15 +143,14 @@ def _draw(rng: np.random.Generator, chances: FloatArray | None, count: int) -> I
     return np.argpartition(keys, RAY_SAMPLE_SIZE, axis=1)[:, :RAY_SAMPLE_SIZE]
 
 
-def _optimize_locally(lines: FloatArray, E: FloatArray, threshold: float, *, is_calibrated: bool = True) -> FloatArray:
+def _optimize_locally(lines: FloatArray, E: FloatArray, threshold: float) -> FloatArray:
     """Refit to all matches with weights by the cost at the coarse scale, then at the fine one."""
     p, q = lines[:, FIRST], lines[:, SECOND]
     for scale, steps in zip((LEV_RANSAC.coarse, LEV_RANSAC.fine), LEV_RANSAC.local_steps, strict=True):
         for _ in range(steps):
             squared, slope = squared_distances(E[None], lines)[0], gradients(E, lines)
             weights = (1.0 + squared / (scale * threshold) ** 2) ** -2 * slope**-2
-            F = fit_rays(p, q, weights)
-            E = nearest_essential(F) if is_calibrated else F
+            E = nearest_essential(fit_rays(p, q, weights))
     return np.asarray(E / np.linalg.norm(E), np.float64)
 
 
