@@ -35,12 +35,10 @@ class RetryOptions:
     """Keypoints nearer than this count as one; about the noise of SIFT. Chosen by hand."""
     max_ratio: float = 0.85
     """Largest ratio of the distances to the best and the second best descriptor. Chosen on dinoSparseRing."""
-    all_pairs: int = 30
-    """Up to this number of photos, unregistered ones are matched with all others. Chosen by hand."""
     neighbors: int = 8
-    """Photos with most raw matches that each is matched with in larger sets. Chosen by hand."""
+    """Photos with most raw matches that each unregistered photo is matched with. Chosen by hand."""
     in_order: int = 2
-    """Photos before and after it by name that each is matched with there. Chosen by hand."""
+    """Photos before and after it by name that each is matched with. Chosen by hand."""
 
 
 OPTIONS = RetryOptions()
@@ -106,19 +104,17 @@ def lost_photos(best: Outcome, run: RunContext) -> list[int]:
 
 def candidate_pairs(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
     """Return pairs of lost photos with each other and with their likely neighbors."""
-    photos = sorted(matches.images)
-    if len(photos) <= OPTIONS.all_pairs:
-        return [(a, b) for k, a in enumerate(photos) for b in photos[k + 1 :] if a in lost or b in lost]
-    matched: dict[int, Counter[int]] = {photo: Counter() for photo in photos}
+    counts: Counter[tuple[int, int]] = Counter()
     for (a, b), rows in matches.matches.items():
-        matched[a][b], matched[b][a] = len(rows), len(rows)
-    by_name = sorted(photos, key=lambda photo: matches.images[photo].name)
-    place = {photo: k for k, photo in enumerate(by_name)}
-    pairs = set()
+        counts[a, b] = counts[b, a] = len(rows)
+    by_name = sorted(matches.images, key=lambda photo: matches.images[photo].name)
+    place, pairs = {photo: k for k, photo in enumerate(by_name)}, set[PairId]()
     for photo in lost:
-        in_order = by_name[max(0, place[photo] - OPTIONS.in_order) : place[photo] + OPTIONS.in_order + 1]
-        likely = sorted(matched[photo], key=lambda other: (-matched[photo][other], other))[: OPTIONS.neighbors]
-        pairs |= {(min(photo, other), max(photo, other)) for other in (*in_order, *likely) if other != photo}
+        others = [other for other in by_name if other != photo]
+        in_order = sorted(others, key=lambda other: abs(place[other] - place[photo]))
+        likely = sorted(in_order, key=lambda other: -counts[photo, other])[: OPTIONS.neighbors]
+        near = [other for other in others if abs(place[other] - place[photo]) <= OPTIONS.in_order]
+        pairs |= {(min(photo, other), max(photo, other)) for other in (*near, *likely)}
     return sorted(pairs)
 
 

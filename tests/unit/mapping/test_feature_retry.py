@@ -186,12 +186,14 @@ def test_in_small_sets_a_lost_photo_is_matched_with_all_others():
 
 
 @pytest.mark.slow
-def test_in_large_sets_it_is_matched_with_its_neighbors():
+def test_it_is_matched_with_its_neighbors_and_where_it_has_few_matches_with_more_in_order():
     graph = photos(100, [((50, k), 100 + k) for k in range(80, 100)] + [((10, 50), 500)])
     found = candidate_pairs([50], graph)
     near = {(48, 50), (49, 50), (50, 51), (50, 52)}
     likely = {(10, 50)} | {(50, k) for k in range(93, 100)}
     assert found == sorted(near | likely)
+    unmatched = candidate_pairs([50], photos(100, [((10, 50), 500)]))
+    assert unmatched == sorted({(10, 50)} | {(k, 50) for k in range(46, 50)} | {(50, k) for k in range(51, 54)})
 
 
 @pytest.mark.parametrize(("count", "lost", "seen"), [(59, 1, 1), (100, 4, 0), (100, 5, 5)])
