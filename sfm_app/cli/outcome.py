@@ -47,14 +47,14 @@ def run_summary(run: Run) -> dict[str, Any]:
     summary: dict[str, Any] = {
         "out": str(run.out),
         "photos": {key: photos.get(key, {}) for key in ("usable", "unusable", "notes")},
-        **({"video": photos["video"]} if "video" in photos else {}),
         "masks": photos.get("masks"),
         "pairs": {key: counts.get("view_graph", {}).get(key) for key in ("kept", "rejected")},
-        **({"given_cameras": given_cameras} if given_cameras else {}),
         "calibration": intrinsics_summary(run.calibration) if run.calibration else None,
         "report": str(run.report_path) if run.report_path else None,
         "seconds": {name: stage["seconds"] for name, stage in stages.items()},
     }
+    optional = {"video": photos.get("video"), "given_cameras": given_cameras}
+    summary |= {name: value for name, value in optional.items() if value}
     if run.scene:
         points = [str(path) for path in _model_files(run, "scale")]
         summary["scene"] = {**scene_summary(run.scene, counts.get("scene", {})), "files": points}
