@@ -87,20 +87,11 @@ def rasterize(vertices: FloatArray, faces: IndexArray, photo: PosedPhoto) -> Ras
 
 def project_vertices(vertices: FloatArray, projection: FloatArray) -> FloatArray:
     """Return pixels x, y and 1 / depth (V, 3) of vertices (V, 3); the last is -1 behind the photo."""
-    pixels = np.empty((len(vertices), 3))
-    _project(vertices, projection, pixels)
-    return pixels
-
-
-@kernel
-def _project(vertices: FloatArray, P: FloatArray, pixels: FloatArray) -> None:
-    for k in range(len(vertices)):
-        x, y, z = vertices[k, 0], vertices[k, 1], vertices[k, 2]
-        w = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
-        near = 1.0 / w if w > 1e-6 else -1.0  # in scene units; by definition: rounding
-        pixels[k, 0] = near * (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3])
-        pixels[k, 1] = near * (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3])
-        pixels[k, 2] = near
+    x, y, z = vertices.T
+    u, v, depth = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in projection)
+    # in scene units; by definition: rounding
+    near = np.divide(1.0, depth, out=np.full(len(depth), -1.0), where=depth > 1e-6)
+    return np.stack([near * u, near * v, near], axis=1)
 
 
 @kernel

@@ -54,9 +54,10 @@ class Neighbors:
 
     def edge_lengths(self, vertices: FloatArray) -> FloatArray:
         """Return (V,) the mean length of the edges at each vertex (V, 3); 0 without any."""
-        lengths = np.zeros(len(vertices))
-        _mean_lengths(self.starts, self.others, vertices, lengths)
-        return lengths
+        count = np.diff(self.starts)
+        own = np.repeat(np.arange(len(vertices)), count)
+        lengths = np.linalg.norm(vertices[own] - vertices[self.others], axis=1)
+        return np.bincount(own, lengths, len(vertices)) / np.maximum(count, 1)
 
 
 def find_displacements(
@@ -79,18 +80,6 @@ def find_displacements(
     displacements = np.zeros(len(vertices))
     _solve(neighbors.starts, neighbors.others, stiff, weight, g, bend, end, displacements)
     return displacements
-
-
-@kernel
-def _mean_lengths(starts: IndexArray, others: IndexArray, vertices: FloatArray, lengths: FloatArray) -> None:
-    for v in range(len(lengths)):
-        total = 0.0
-        for k in range(starts[v], starts[v + 1]):
-            square = 0.0
-            for axis in range(3):
-                square += (vertices[v, axis] - vertices[others[k], axis]) ** 2
-            total += np.sqrt(square)
-        lengths[v] = total / max(starts[v + 1] - starts[v], 1)
 
 
 @kernel

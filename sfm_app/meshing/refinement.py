@@ -10,7 +10,6 @@ import numpy as np
 
 from sfm_app.geometry.poses import normalize
 from sfm_app.geometry.triangles import morton_order, unique_edges, vertex_normals
-from sfm_app.jit import kernel
 from sfm_app.meshing.agreement import NOTHING, Pull, RefinePhoto, Sight, compare, project_vertices, rasterize
 from sfm_app.meshing.fairness import Neighbors, find_displacements
 from sfm_app.tasks import Spread
@@ -89,48 +88,27 @@ def finest_pixels(vertices: FloatArray, photos: Sequence[RefinePhoto], share: fl
     sizes = np.full(len(vertices), np.inf)
     for photo in photos:
         full, small = photo.posed, photo.posed_at(share)
-        pixels = project_vertices(vertices, small.projection)
-        _keep_finest(pixels, (small.height, small.width), full.focal_px, full.width, sizes)
+        x, y, near = project_vertices(vertices, small.projection).T
+        shown = (near > 0.0) & (x > 0.0) & (x < small.width) & (y > 0.0) & (y < small.height)
+        size = 1.0 / (near[shown] * full.focal_px * small.width / full.width)
+        sizes[shown] = np.minimum(sizes[shown], size)
     return sizes
-
-
-@kernel
-def _keep_finest(
-    pixels: FloatArray, shape: tuple[int, int], focal_px: float, full_width: int, sizes: FloatArray
-) -> None:
-    """Reduce the size of a pixel at each vertex to that of a photo, where smaller; `pixels` are x, y, 1 / depth."""
-    height, width = shape
-    for v in range(len(sizes)):
-        x, y, near = pixels[v, 0], pixels[v, 1], pixels[v, 2]
-        if near > 0.0 and 0.0 < x < width and 0.0 < y < height:
-            sizes[v] = min(sizes[v], 1.0 / (near * focal_px * width / full_width))
 
 
 def split_long_edges(surface: Surface, longest: FloatArray) -> Surface:
     """Return the surface with long edges divided in the middle; the smaller limit (V,) of both ends decides."""
     edges, edge_of = unique_edges(surface.faces)
-    middle = np.full(len(edges), -1)
-    count = _number_long(edges, surface.vertices, longest, middle)
-    one, other = edges[middle >= 0].T
+    one, other = edges.T
+    lengths = np.linalg.norm(surface.vertices[other] - surface.vertices[one], axis=1)
+    is_long = lengths > np.minimum(longest[one], longest[other])
+    one, other, middle = one[is_long], other[is_long], np.full(len(edges), -1)
+    middle[is_long] = len(surface.vertices) + np.arange(len(one))
     colors = (surface.colors[one].astype(np.uint16) + surface.colors[other]) // 2
     return Surface(
         np.concatenate([surface.vertices, (surface.vertices[one] + surface.vertices[other]) / 2.0]),
-        _divide_triangles(surface.faces, middle[edge_of]) if count else surface.faces,
+        _divide_triangles(surface.faces, middle[edge_of]) if len(one) else surface.faces,
         np.concatenate([surface.colors, colors.astype(np.uint8)]),
     )
-
-
-@kernel
-def _number_long(edges: IndexArray, vertices: FloatArray, longest: FloatArray, middle: IndexArray) -> int:
-    """Fill in the numbers of the new vertices in the middle of long edges; return their number."""
-    count = 0
-    for k in range(len(edges)):
-        a, b = edges[k, 0], edges[k, 1]
-        x, y, z = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
-        if np.sqrt(x * x + y * y + z * z) > min(longest[a], longest[b]):
-            middle[k] = len(vertices) + count
-            count += 1
-    return count
 
 
 def _divide_triangles(faces: IndexArray, middle: IndexArray) -> IndexArray:

@@ -85,14 +85,16 @@ def outlier_mask(sightings: Sightings, gains: FloatArray, neighbors: IntArray) -
         across = neighbors[face]
         beside = np.where(across == NONE, NONE, row_of[across])
         row_of[face] = NONE
-        smooth = deviation[rows].copy()
+        smooth = deviation[rows]
         for _ in range(4):  # about the number of adjacent triangles that make an outlier
-            before = smooth.copy()
-            _average_neighbors(before, beside, smooth)
-        _mark(smooth, beside, outlier[rows])
-    outlier &= np.diff(sightings.face_starts)[sightings.face] >= LEAST_VIEWS
-    _keep_majority(sightings.face_starts, sightings.face_rows, outlier)
-    return outlier
+            smooth = _average_known(smooth, beside).astype(np.float32)
+        far = smooth > OUTLIER_FACTOR
+        outlier[rows] = far | ((beside != NONE) & far[beside]).any(axis=1)  # it may cover neighbors in part
+    views = np.diff(sightings.face_starts)
+    outlier &= views[sightings.face] >= LEAST_VIEWS
+    # without agreement of more than half of the photos none is an outlier
+    agreeing = np.bincount(sightings.face[~outlier], minlength=sightings.triangles)
+    return np.asarray(outlier & (2 * agreeing > views)[sightings.face])
 
 
 @kernel
@@ -137,41 +139,6 @@ def _deviations(
         median_far = LEVELS + median(level, count)
         for k in range(count):
             deviation[here[k]] = far[k] / median_far
-
-
-@kernel
-def _average_neighbors(before: NDArray[np.float32], beside: IndexArray, after: NDArray[np.float32]) -> None:
-    for f in range(len(before)):
-        total, count = before[f], 1
-        for k in range(3):
-            g = beside[f, k]
-            if g != NONE:
-                total += before[g]
-                count += 1
-        after[f] = total / count
-
-
-@kernel
-def _mark(deviation: NDArray[np.float32], beside: IndexArray, outlier: BoolArray) -> None:
-    """Mark triangles with a large deviation, and their neighbors, which the outlier may cover in part."""
-    for f in range(len(deviation)):
-        outlier[f] = deviation[f] > OUTLIER_FACTOR
-        for k in range(3):
-            g = beside[f, k]
-            if g != NONE and deviation[g] > OUTLIER_FACTOR:
-                outlier[f] = True
-
-
-@kernel
-def _keep_majority(starts: IndexArray, rows: IndexArray, outlier: BoolArray) -> None:
-    """Keep all photos of a triangle if at most half would remain: without agreement none is an outlier."""
-    for f in range(len(starts) - 1):
-        inliers, total = 0, starts[f + 1] - starts[f]
-        for row in rows[starts[f] : starts[f + 1]]:
-            inliers += not outlier[row]
-        if 2 * inliers <= total:
-            for row in rows[starts[f] : starts[f + 1]]:
-                outlier[row] = False
 
 
 # Borders without a surface: depth maps reach over the outlines of objects, by the same pixels in every photo, so that

@@ -100,30 +100,14 @@ def ranges(starts: IndexArray, ends: IndexArray) -> IndexArray:
 
 def components(group: IndexArray, neighbors: IntArray) -> tuple[IntArray, int]:
     """Find connected triangles of equal group (T,): component (T,), -1 where the group is -1, and their number."""
-    of = np.full(len(group), NONE, np.int32)
-    return of, _flood(group, neighbors, of)
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
 
-
-@kernel
-def _flood(group: IndexArray, neighbors: IntArray, of: IntArray) -> int:
-    stack = np.empty(len(group), np.int64)
-    count = 0
-    for seed in range(len(group)):
-        if group[seed] == NONE or of[seed] != NONE:
-            continue
-        stack[0], top = seed, 1
-        of[seed] = count
-        while top:
-            top -= 1
-            f = stack[top]
-            for k in range(3):
-                g = neighbors[f, k]
-                if g != NONE and of[g] == NONE and group[g] == group[f]:
-                    of[g] = count
-                    stack[top] = g
-                    top += 1
-        count += 1
-    return count
+    of, size, shown = np.full(len(group), NONE, np.int32), len(group), group != NONE
+    face, side = np.nonzero((neighbors != NONE) & (group[neighbors] == group[:, None]) & shown[:, None])
+    ties = coo_array((np.ones(len(face), np.bool_), (face, neighbors[face, side])), (size, size))
+    parts, of[shown] = np.unique(connected_components(ties, directed=False)[1][shown], return_inverse=True)
+    return of, len(parts)
 
 
 OcclusionTest = Callable[[FloatArray, float, FloatArray], BoolArray]
@@ -417,17 +401,7 @@ def make_sightings(
     """List views by photo and by triangle: `counts` (P,) of them per photo, with triangles (N,) ascending in each."""
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     face_starts = np.concatenate([[0], np.cumsum(np.bincount(face, minlength=triangles))]).astype(np.int64)
-    rows = np.empty(len(face), np.int64)
-    _rank(face, face_starts[:-1].copy(), rows)
-    return Sightings(starts, face, score, colors, face_starts, rows)
-
-
-@kernel
-def _rank(face: IntArray, next_place: IndexArray, rows: IndexArray) -> None:
-    """Sort rows by triangle, by counting."""
-    for row in range(len(face)):
-        rows[next_place[face[row]]] = row
-        next_place[face[row]] += 1
+    return Sightings(starts, face, score, colors, face_starts, bucket_order(face, triangles))
 
 
 @kernel

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from sfm_app.geometry.triangles import areas
 from sfm_app.jit import kernel
 from sfm_app.texture.sightings import NONE, Facets, IntArray, Sightings
-from sfm_app.types.arrays import IndexArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +36,14 @@ def choose_photos(sightings: Sightings, mesh: Facets) -> IntArray:
     """Choose the photo of each triangle, (T,), among its views with a positive score; -1 for none."""
     triangles, candidates = sightings.triangles, min(OPTIONS.candidates, sightings.photos)
     labels, values = np.full((triangles, candidates), NONE, np.int32), np.zeros((triangles, candidates), np.float32)
-    _keep_best(sightings.starts, sightings.face, sightings.score, labels, values)
+    # the best photos of each triangle; ties go to the lower index
+    usable = sightings.face_rows[sightings.score[sightings.face_rows] > 0]
+    order = usable[np.lexsort((-sightings.score[usable], sightings.face[usable]))]
+    face = sightings.face[order]
+    rank = np.arange(len(face)) - np.searchsorted(face, face)
+    best = rank < candidates
+    at = face[best], rank[best]
+    labels[at], values[at] = sightings.photo[order[best]], sightings.score[order[best]]
     loss = np.log(np.maximum(values[:, :1], 1e-30) / np.maximum(values, 1e-30))
     corners, spacing = mesh.vertices[mesh.faces], max(mesh.spacing, 1e-300)
     # square root of each triangle's area relative to an equilateral one with median edges
@@ -48,8 +54,12 @@ def choose_photos(sightings: Sightings, mesh: Facets) -> IntArray:
     # (T, 3) the column of each triangle in its neighbor's row of `neighbors`
     own = np.arange(triangles)[:, None, None]
     back = np.asarray(np.argmax(mesh.neighbors[mesh.neighbors] == own, axis=2), np.int32)
-    same = np.full((triangles, 3, candidates), NONE, np.int8)
-    _match_labels(labels, mesh.neighbors, same)
+    # (T, 3, candidates) the column of the labels of each neighbor among those of the triangle, -1 for none
+    same = np.empty((triangles, 3, candidates), np.int8)
+    for column in range(candidates):
+        label = np.where(mesh.neighbors == NONE, NONE, labels[mesh.neighbors, column])
+        match = (labels[:, None] == label[..., None]) & (label != NONE)[..., None]
+        same[..., column] = np.where(match.any(axis=2), match.argmax(axis=2), NONE)
     chosen = np.full(triangles, NONE, np.int32)
     messages = np.zeros((triangles, 3, candidates), np.float32)
     for _ in range(OPTIONS.rounds):
@@ -60,39 +70,6 @@ def choose_photos(sightings: Sightings, mesh: Facets) -> IntArray:
         if not _improve(labels, cost, mesh.neighbors, price, chosen):
             break
     return chosen
-
-
-@kernel
-def _keep_best(
-    starts: IndexArray, face: IntArray, score: NDArray[np.float32], labels: IntArray, values: NDArray[np.float32]
-) -> None:
-    """Keep the photos of largest score for each triangle, best first; ties go to the lower index."""
-    last = labels.shape[1] - 1
-    for p in range(len(starts) - 1):
-        for row in range(starts[p], starts[p + 1]):
-            f = face[row]
-            if score[row] <= values[f, last]:
-                continue
-            at = last
-            while at > 0 and score[row] > values[f, at - 1]:
-                values[f, at], labels[f, at] = values[f, at - 1], labels[f, at - 1]
-                at -= 1
-            values[f, at], labels[f, at] = score[row], p
-
-
-@kernel
-def _match_labels(labels: IntArray, neighbors: IntArray, same: NDArray[np.int8]) -> None:
-    """Fill in same[f, k, n], the column of the n-th label of neighbor k among the labels of f; -1 for none."""
-    triangles, count = labels.shape
-    for f in range(triangles):
-        for k in range(3):
-            g = neighbors[f, k]
-            if g == NONE:
-                continue
-            for n in range(count):
-                for m in range(count):
-                    if labels[g, n] != NONE and labels[f, m] == labels[g, n]:
-                        same[f, k, n] = m
 
 
 @kernel
