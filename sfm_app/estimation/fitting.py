@@ -325,9 +325,7 @@ def _stationary_matches(matched: MatchedPair, settings: Settings) -> BoolArray:
 
 def mostly_known_groups(matches: MatchGraph, earlier: Earlier) -> dict[str, list[MatchedImage]]:
     """Return the photos of the camera groups with most photos known."""
-    groups: dict[str, list[MatchedImage]] = {}
-    for _, image in sorted(matches.images.items()):
-        groups.setdefault(image.group, []).append(image)
+    groups = matches.groups
     known = {group: sum(image.name in earlier.known for image in images) for group, images in groups.items()}
     return {group: images for group, images in groups.items() if known[group] > 0.5 * len(images)}
 
