@@ -6,7 +6,7 @@ The functions for one program raise ValueError where a file is damaged, or a cam
 import json
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -263,8 +263,6 @@ def opensfm_camera(values: Mapping[str, Any]) -> Calibration:
 # Cameras of earlier runs: calibration.json, scene.json, and what `sfm-app calibrate --json` prints.
 # Only cameras that the photos of that run determined are used; the others are guesses.
 
-FIELDS = {field.name for field in fields(Calibration)}
-
 
 def is_run_camera(values: Mapping[str, Any]) -> bool:
     """Return whether the values are those of one camera of a run."""
@@ -280,13 +278,12 @@ def run_camera(values: Mapping[str, Any]) -> Calibration | None:
         return replace(camera, spread=spread, correlations=correlations)
     if not values["identifiable"]:
         return None
-    known = {name: value for name, value in values.items() if name in FIELDS}
-    camera = Calibration.from_dict({"evidence": {}, **known, "held": (), "key_pairs": (), "method": GIVEN})
+    camera = Calibration.from_dict({**values, "evidence": {}, "held": (), "key_pairs": (), "method": GIVEN})
     if camera.projection not in PROJECTIONS or camera.K.shape != (3, 3) or not min(np.diag(camera.K)) > 0.0:
         raise ValueError("its values are not those of a camera")
-    if not np.isfinite([*camera.K.ravel(), camera.radial, *camera.fisheye, *camera.distortion]).all():
+    if not np.isfinite([*camera.K.ravel(), *camera.distortion]).all() or len(camera.distortion) > 8:
         raise ValueError("its values are not those of a camera")
-    return replace(camera, evidence={})
+    return camera
 
 
 # Recognize the form of a calibration file by its content, and read it.

@@ -11,7 +11,8 @@ import numpy as np
 from PIL import Image
 
 from sfm_app.api import Run, reconstruct
-from sfm_app.camera.models import calibration_from_model
+from sfm_app.camera.models import projection_of_model, row_of_model
+from sfm_app.camera.projection import K1
 from sfm_app.errors import InputError
 from sfm_app.products import read_texture
 from sfm_app.progress import Progress
@@ -140,8 +141,8 @@ def draw(model: Model, scene: Scene, out: Path) -> None:
 
 def camera_of(model: CameraModel) -> Camera:
     """Return the camera of the renderer for an estimated camera; of lenses, it has that of a fisheye."""
-    known = calibration_from_model(model.model, model.params, (model.width, model.height))
-    lens = Lens("equidistant", tuple(known.fisheye)) if known.projection == "fisheye" else Lens()
+    k1, k2, _, _, k3, k4, *_ = row_of_model(model.model, model.params)[K1:].tolist()
+    lens = Lens("equidistant", (k1, k2, k3, k4)) if projection_of_model(model.model) == "fisheye" else Lens()
     return Camera(model.K, model.width, model.height, lens)
 
 

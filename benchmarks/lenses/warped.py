@@ -24,6 +24,7 @@ from benchmarks.common.command_line import new_parser
 from benchmarks.common.photo_sets import PhotoSet
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from sfm_app.camera.projection import PERSPECTIVE, image_rays
+from sfm_app.types import Intrinsics
 
 FloatArray = NDArray[np.float64]
 Source = Callable[[FloatArray, FloatArray], FloatArray]
@@ -104,9 +105,9 @@ def lens_found(out: Path) -> str:
     path = out / "calibration.json"
     if not path.exists():
         return ""
-    cameras = json.loads(path.read_text(encoding="utf-8"))["cameras"].values()
+    cameras = Intrinsics.from_dict(json.loads(path.read_text(encoding="utf-8"))).cameras.values()
     return ", ".join(
-        camera["projection"] if camera["fisheye"] else f"{camera['projection']} {camera['radial']:+.3f}"
+        camera.projection if camera.projection == "fisheye" else f"{camera.projection} {camera.radial:+.3f}"
         for camera in cameras
     )
 

@@ -22,7 +22,6 @@ from sfm_app.camera.models import (
     camera_matrix,
     projection_of_model,
     row_of_calibration,
-    with_terms,
 )
 from sfm_app.camera.projection import (
     CAMERA,
@@ -313,8 +312,10 @@ def calibration_from_params(
     spread = {name: float(deviations[k]) for name, k in (("fx", FX), ("fy", FY), ("cx", CX), ("cy", CY), ("k1", K1))}
     spread = {name: value for name, value in spread.items() if np.isfinite(value)}
     held = tuple(name for name in ("center", "aspect", "k1") if name not in determined)
-    plain = Calibration(K, *size, "adjustment", identifiable=True, projection=PROJECTIONS[family], spread=spread)
-    return replace(with_terms(plain, params[K1:].tolist()), held=held)
+    return Calibration(
+        K, *size, "adjustment", True, projection=PROJECTIONS[family], distortion=tuple(params[K1:].tolist()),
+        spread=spread, held=held,
+    )  # fmt: skip
 
 
 def fit_to_model(params: FloatArray, parts: BoolArray, family: int) -> FloatArray:

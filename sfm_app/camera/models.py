@@ -5,7 +5,6 @@ fisheye of THIN_PRISM_FISHEYE (Kannala and Brandt 2006; Weng et al. 1992).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +40,12 @@ def guessed_camera_matrix(size: tuple[int, int], focal_px: float | None = None) 
 def panorama_matrix(size: tuple[float, float]) -> NDArray[np.float64]:
     """Return the (3, 3) matrix with the scale of an equirectangular photo at its center, in pixels per radian."""
     return camera_matrix(size[0] / (2.0 * np.pi), size[1] / np.pi, size[0] / 2, size[1] / 2)
+
+
+def panorama_camera(size: tuple[int, int]) -> Calibration:
+    """Return the camera of panoramas of (width, height) pixels."""
+    spread = dict.fromkeys(TWO_FOCALS, 0.0)
+    return Calibration(panorama_matrix(size), *size, "panorama", True, projection=EQUIRECTANGULAR, spread=spread)
 
 
 SHARED = ("k1", "k2", "p1", "p2", "k3", "k4")
@@ -87,7 +92,7 @@ def row_of_model(model: str, params: Sequence[float] | NDArray[np.float64]) -> N
     """Return a camera with a model and parameters of COLMAP as a row (12,) of `camera.projection`."""
     row = np.zeros(families.CAMERA)
     if model == "EQUIRECTANGULAR":
-        return _row(panorama_matrix((params[0], params[1])), row[4:])
+        return row_of_calibration(panorama_camera((int(params[0]), int(params[1]))))
     for name, value in zip(PARAMETERS[model], params, strict=True):
         row[[families.FX, families.FY] if name == "f" else INDEX[name]] = value
     return row
@@ -126,37 +131,15 @@ def calibration_from_model(model: str, params: Sequence[float], size: tuple[int,
     row = row_of_model(model, params)
     if not np.isfinite(row).all() or row[:2].min() <= 0.0:
         raise ValueError(f"the parameters of {model} are not those of a camera: {', '.join(map(str, params))}")
-    plain = Calibration(camera_matrix(*row[:4].tolist()), *size, GIVEN, identifiable=True, projection=projection)
-    return with_terms(plain, row[4:].tolist())
-
-
-def with_terms(camera: Calibration, terms: Sequence[float]) -> Calibration:
-    """Return a perspective camera or fisheye with the eight distortion `terms` of `TERMS`, in the smallest form."""
-    k1, k2, p1, p2, k3, k4, *last = (float(term) for term in terms)
-    if camera.projection == FISHEYE:
-        more = any((p1, p2, *last))
-        return replace(camera, radial=0.0, fisheye=(k1, k2, k3, k4), distortion=tuple(terms) if more else ())
-    more = any((k2, p1, p2, k3, k4, *last))
-    return replace(camera, radial=k1, fisheye=(), distortion=tuple(terms) if more else ())
-
-
-def distortion_terms(camera: Calibration) -> NDArray[np.float64]:
-    """Return (8,) all terms of a camera, in the order of `TERMS`; zeros of a panorama."""
-    if camera.distortion:
-        return np.array(camera.distortion, np.float64)
-    terms = np.zeros(8)
-    if camera.projection == FISHEYE:
-        terms[[0, 1, 4, 5]] = camera.fisheye or (0.0, 0.0, 0.0, 0.0)
-    else:
-        terms[0] = camera.radial
-    return terms
+    K, terms = camera_matrix(*row[:4].tolist()), tuple(row[4:].tolist())
+    return Calibration(K, *size, GIVEN, identifiable=True, projection=projection, distortion=terms)
 
 
 def row_of_calibration(camera: Calibration) -> NDArray[np.float64]:
     """Return a camera as a row (12,) of `camera.projection`."""
     panorama = camera.projection == EQUIRECTANGULAR
-    return _row(panorama_matrix((camera.width, camera.height)) if panorama else camera.K, distortion_terms(camera))
-
-
-def _row(K: NDArray[np.float64], terms: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *terms])
+    K = panorama_matrix((camera.width, camera.height)) if panorama else camera.K
+    row = np.zeros(families.CAMERA)
+    row[:4] = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    row[4 : 4 + len(camera.distortion)] = camera.distortion
+    return row

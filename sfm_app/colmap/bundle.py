@@ -37,7 +37,7 @@ from sfm_app.camera.models import FILE_MODELS, INDEX, PARAMETERS, file_model, pa
 from sfm_app.camera.projection import CX, CY, FISHEYE, FX, FY, PANORAMA, PERSPECTIVE
 from sfm_app.colmap.backend import all_cameras, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.model import camera_family, finite_mask, posed_images, read_camera, submodel
+from sfm_app.colmap.model import RefinedCamera, camera_family, finite_mask, posed_images, read_camera, submodel
 from sfm_app.errors import NumericalError
 from sfm_app.numerical import FAILURES, Json, error_reason, finite_entries
 from sfm_app.types import Calibration
@@ -402,12 +402,8 @@ class Adjustment:
     """The refined model, and the uncertainty of its cameras."""
 
     model: pycolmap.Reconstruction
-    deviations: dict[int, dict[str, float]]
-    """Standard deviations by camera id, as in `CameraModel`."""
-    determined: dict[int, tuple[str, ...]]
-    """Parameters that the photos determine, by camera id, as in `CameraModel`."""
-    correlations: dict[int, dict[str, float]] = field(default_factory=dict)
-    """Correlations of parameters by camera id, as in `CameraModel`; lacks cameras without any."""
+    refined: dict[int, RefinedCamera]
+    """By camera id."""
     failure: str = ""
     """Why the adjustment failed, and left the given model without deviations; empty if it succeeded."""
     held: tuple[int, ...] = ()
@@ -448,7 +444,7 @@ def adjust(
     lenses = record_lenses(model, rounds, families.rivals)
     estimates = given_estimates(model, rounds, rules)
     return Adjustment(
-        model, *_uncertainty(rounds), held=held, open_points=open_points, lenses=lenses, estimates=estimates
+        model, refined_cameras(rounds), held=held, open_points=open_points, lenses=lenses, estimates=estimates
     )
 
 
@@ -461,8 +457,8 @@ def adjust_or_keep(
             return adjust(model, database, rules, families_known=families_known)
     except FAILURES as err:
         logger.info("the last adjustment failed", exc_info=err)
-        unknown: dict[int, dict[str, float]] = {camera_id: {} for camera_id in photos_per_camera(model)}
-        return Adjustment(model, unknown, dict.fromkeys(unknown, ()), failure=error_reason(err))
+        unknown = RefinedCamera(deviations={}, determined=(), correlations={})
+        return Adjustment(model, dict.fromkeys(photos_per_camera(model), unknown), failure=error_reason(err))
 
 
 def drop_infinite_points(model: pycolmap.Reconstruction) -> None:
@@ -480,22 +476,19 @@ def find_correspondences(model: pycolmap.Reconstruction, database: Path) -> pyco
         return pycolmap.DatabaseCache.create(db, options).correspondence_graph
 
 
-def _uncertainty(
-    rounds: Rounds,
-) -> tuple[dict[int, dict[str, float]], dict[int, tuple[str, ...]], dict[int, dict[str, float]]]:
-    """Return deviations, determined parts and correlations, by camera id."""
-    lenses = rounds.lenses
-    deviations: dict[int, dict[str, float]] = {}
-    determined: dict[int, tuple[str, ...]] = {}
-    correlations: dict[int, dict[str, float]] = {}
+def refined_cameras(rounds: Rounds) -> dict[int, RefinedCamera]:
+    """Return the uncertainty of all cameras, by id."""
+    lenses, refined = rounds.lenses, {}
     for row, camera_id in enumerate(rounds.ids):
         names = _adjusted_names(rounds, row)
         places = [INDEX[name] for name in names]
         entries = {name: float(lenses.deviations[row][place]) for name, place in zip(names, places, strict=True)}
-        deviations[camera_id] = finite_entries(entries)
-        determined[camera_id] = part_names(int(rounds.bundle.family[row]), lenses.determined[row])
-        correlations[camera_id] = named_correlations(names, lenses.mean_squares[row][np.ix_(places, places)])
-    return deviations, determined, correlations
+        refined[camera_id] = RefinedCamera(
+            deviations=finite_entries(entries),
+            determined=part_names(int(rounds.bundle.family[row]), lenses.determined[row]),
+            correlations=named_correlations(names, lenses.mean_squares[row][np.ix_(places, places)]),
+        )
+    return refined
 
 
 def _adjusted_names(rounds: Rounds, row: int) -> tuple[str, ...]:

@@ -266,7 +266,7 @@ def camera_model(calibration: Calibration) -> str:
     # largest |fy/fx - 1| of square pixels: calibrators give no more where the photos show no other aspect
     K, tolerance = calibration.K, 0.0 if calibration.is_given else 0.005
     square = "aspect" in calibration.held or K[0, 0] == K[1, 1] or abs(K[1, 1] / K[0, 0] - 1.0) < tolerance
-    if square and calibration.projection == PERSPECTIVE and not calibration.distortion:
+    if square and calibration.projection == PERSPECTIVE and not calibration.has_more_terms:
         return SQUARE_PIXELS
     return file_model(row_of_calibration(calibration), FAMILIES[calibration.projection])
 

@@ -3,13 +3,13 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, TypedDict
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.camera.models import FAMILIES, camera_matrix, projection_of_model, row_of_model
-from sfm_app.camera.projection import BEARING, FISHEYE, K1, K2, K3, K4, PERSPECTIVE, RAY
+from sfm_app.camera.projection import BEARING, FISHEYE, K1, PERSPECTIVE, RAY
 from sfm_app.colmap.backend import all_images, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.geometry.epipolar import TwoViewSeed
@@ -106,24 +106,17 @@ def posed_photo_ids(model: pycolmap.Reconstruction) -> list[int]:
     return [image.image_id for image in posed_images(model)]
 
 
-class MappedCamera(NamedTuple):
-    """A camera after mapping; see `Calibration`."""
-
-    K: NDArray[np.float64]
-    radial: float = 0.0
-    fisheye: tuple[float, ...] = ()
-
-
-def cameras_by_photo(model: pycolmap.Reconstruction) -> dict[int, MappedCamera]:
-    """Return the camera of every posed photo, by photo id."""
-    return {image.image_id: _mapped_camera(model.cameras[image.camera_id]) for image in posed_images(model)}
+def cameras_by_photo(
+    model: pycolmap.Reconstruction,
+) -> dict[int, tuple[NDArray[np.float64], tuple[float, ...]]]:
+    """Return K (3, 3) and `Calibration.distortion` of every posed photo, by id: k1; of a fisheye, all radial terms."""
+    return {image.image_id: _matrix_and_terms(model.cameras[image.camera_id]) for image in posed_images(model)}
 
 
-def _mapped_camera(camera: pycolmap.Camera) -> MappedCamera:
-    row, K = read_camera(camera), scale_matrix(camera)
-    if camera_family(camera) == FISHEYE:
-        return MappedCamera(K, fisheye=tuple(row[[K1, K2, K3, K4]].tolist()))
-    return MappedCamera(K, float(row[K1]))
+def _matrix_and_terms(camera: pycolmap.Camera) -> tuple[NDArray[np.float64], tuple[float, ...]]:
+    k1, k2, _, _, k3, k4, *_ = read_camera(camera)[K1:].tolist()
+    is_fisheye = camera_family(camera) == FISHEYE
+    return scale_matrix(camera), (k1, k2, 0.0, 0.0, k3, k4) if is_fisheye else (k1,)
 
 
 def color_points(model: pycolmap.Reconstruction, photo_dir: Path, workers: int) -> None:

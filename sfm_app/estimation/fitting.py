@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from sfm_app.camera.bearings import SHARES, bearings, deviation_key, field_of_view_deg
-from sfm_app.camera.models import camera_matrix, guessed_camera_matrix, panorama_matrix, projection_of_model
+from sfm_app.camera.models import camera_matrix, guessed_camera_matrix, panorama_camera, projection_of_model
 from sfm_app.errors import ConfigError
 from sfm_app.estimation.given_cameras import assign_cameras, report_checks
 from sfm_app.files import load_arrays, mark_unfinished, replace_atomically, resume_or_clear
@@ -29,8 +29,8 @@ from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE
 
 logger = logging.getLogger("sfm_app")
 
-METHOD, PANORAMA = "lens", "panorama"
-"""Sources of a camera: curved epipolar lines, and the photos themselves."""
+METHOD = "lens"
+"""Source of a camera: curved epipolar lines."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,11 +81,8 @@ def find_lenses(
         run.record(given_camera_notes=list(given.notes))
     for note in given.notes:
         run.progress.say(note)
-    groups: dict[str, list[MatchedImage]] = {}
-    for _, image in sorted(matches.images.items()):
-        groups.setdefault(image.group, []).append(image)
     lenses, checked = {}, {}
-    for group, images in groups.items():
+    for group, images in matches.groups.items():
         given_camera = given.cameras.get(group)
         if given_camera is not None:
             is_wide = given_camera.projection == FISHEYE
@@ -113,19 +110,12 @@ def _find_lens(images: Sequence[MatchedImage], matches: MatchGraph, run: RunCont
     """Return the camera of a group with a wide lens; None where a perspective camera is enough."""
     size = images[0].width, images[0].height
     if images[0].projection == EQUIRECTANGULAR:
-        return panorama(size)
+        return panorama_camera(size)
     model = run.settings.scene.camera_model
     if model != "auto":
         is_fisheye = projection_of_model(model) == FISHEYE
         return _search_lens(images, matches, run, is_wide=True) if is_fisheye else None
     return _search_lens(images, matches, run, is_wide=False) if run.settings.calibration.lens else None
-
-
-def panorama(size: tuple[int, int]) -> Calibration:
-    """Return the camera of panoramas of (width, height) pixels."""
-    spread = dict.fromkeys(("fx", "fy", "cx", "cy"), 0.0)
-    K = panorama_matrix(size)
-    return Calibration(K, *size, PANORAMA, identifiable=True, projection=EQUIRECTANGULAR, spread=spread)
 
 
 def _search_lens(
@@ -136,7 +126,7 @@ def _search_lens(
     pairs = [np.hstack(matches.points(pair)) for pair in matches.matches if ids.issuperset(pair)]
     try:
         if not is_wide and shows_panoramas(pairs, size, run.seed):
-            return panorama(size)
+            return panorama_camera(size)
         estimate = find_lens(pairs, size, run.seed) if is_wide or needs_fisheye(pairs, size, run.seed) else None
     except FAILURES as err:
         logger.info("the lens of a group could not be estimated", exc_info=err)
@@ -151,7 +141,7 @@ def to_calibration(estimate: LensEstimate, size: tuple[int, int]) -> Calibration
     farthest = float(np.max(np.hypot(*(corners - np.array(lens.center)).T)))
     theta = np.linspace(0.0, float(lens.angle(np.array([farthest]))[0]), LENS.angles + 1)[1:]
     powers = theta[:, None] ** (2.0 * np.arange(1, LENS.terms + 1) + 1.0)
-    terms = np.linalg.lstsq(powers, lens.radius(theta) / lens.focal - theta, rcond=None)[0]
+    k1, k2, k3, k4 = np.linalg.lstsq(powers, lens.radius(theta) / lens.focal - theta, rcond=None)[0].tolist()
     deviations = np.sqrt(np.diag(np.array(estimate.covariance)))
     radius_px = float(np.max(estimate.radius_deviation_px(theta)))
     determined = radius_px <= LENS.max_deviation * side
@@ -167,7 +157,7 @@ def to_calibration(estimate: LensEstimate, size: tuple[int, int]) -> Calibration
         identifiable=determined,
         reason="" if determined else "the pairs determine the lens only roughly",
         projection=FISHEYE,
-        fisheye=tuple(terms.tolist()),
+        distortion=(k1, k2, 0.0, 0.0, k3, k4),
         spread={"fx": focal_px, "fy": focal_px, "cx": float(deviations[2]), "cy": float(deviations[3])},
         held=("aspect",),
         evidence=evidence,
@@ -325,9 +315,7 @@ def _stationary_matches(matched: MatchedPair, settings: Settings) -> BoolArray:
 
 def mostly_known_groups(matches: MatchGraph, earlier: Earlier) -> dict[str, list[MatchedImage]]:
     """Return the photos of the camera groups with most photos known."""
-    groups: dict[str, list[MatchedImage]] = {}
-    for _, image in sorted(matches.images.items()):
-        groups.setdefault(image.group, []).append(image)
+    groups = matches.groups
     known = {group: sum(image.name in earlier.known for image in images) for group, images in groups.items()}
     return {group: images for group, images in groups.items() if known[group] > 0.5 * len(images)}
 

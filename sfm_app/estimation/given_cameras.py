@@ -40,11 +40,8 @@ def assign_cameras(matches: MatchGraph, given: GivenCameras, *, keep: bool) -> A
     """
     if not given:
         return AssignedCameras()
-    groups: dict[str, list[MatchedImage]] = {}
-    for _, image in sorted(matches.images.items()):
-        groups.setdefault(image.group, []).append(image)
     cameras, notes, rejections = {}, [], []
-    for group, images in groups.items():
+    for group, images in matches.groups.items():
         if images[0].projection == EQUIRECTANGULAR:
             continue  # nothing about a panorama is unknown
         name, reason = _choose_name(group, images, given)

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.camera.models import PARAMETERS, calibration_from_model, distortion_terms
+from sfm_app.camera.models import PARAMETERS, projection_of_model, row_of_model
+from sfm_app.camera.projection import K1
 from sfm_app.errors import InputError
 from sfm_app.files import replace_atomically
 from sfm_app.formats.exporters import FinishedScene
@@ -173,11 +174,10 @@ def opencv_lens(camera: CameraModel) -> tuple[str, NDArray[np.float64]]:
 
     ValueError if OpenCV has no such lens.
     """
-    calibration = calibration_from_model(camera.model, camera.params, (camera.width, camera.height))
-    if calibration.projection == EQUIRECTANGULAR:
+    projection, terms = projection_of_model(camera.model), row_of_model(camera.model, camera.params)[K1:]
+    if projection == EQUIRECTANGULAR:
         raise ValueError("OpenCV has no model of a panorama")
-    terms = distortion_terms(calibration)
-    if calibration.projection != FISHEYE:
+    if projection != FISHEYE:
         return "perspective", terms
     if terms[[2, 3, 6, 7]].any():
         raise ValueError("OpenCV's fisheye has no tangential and thin prism terms")

@@ -377,14 +377,14 @@ def learned_intrinsics(best: Outcome) -> Intrinsics:
     with translate_errors("reading cameras"):
         learned = cameras_by_photo(best.main.model)
     cameras = dict(intrinsics.cameras)
-    for photo, camera in learned.items():
+    for photo, (K, distortion) in learned.items():
         name = best.evidence.camera_name(photo)
         earlier = intrinsics.cameras[name]
         if earlier.is_kept:
             continue
         # mapping holds a lens with all terms as it was given
-        lens = earlier if earlier.distortion else replace(earlier, radial=camera.radial, fisheye=camera.fisheye)
-        cameras[name] = replace(lens, K=camera.K, identifiable=True, reason="", method="mapping")
+        lens = earlier if earlier.has_more_terms else replace(earlier, distortion=distortion)
+        cameras[name] = replace(lens, K=K, identifiable=True, reason="", method="mapping")
     return replace(intrinsics, cameras=cameras)
 
 

@@ -13,12 +13,11 @@ from PIL import Image
 from PIL.ExifTags import Base
 
 from sfm_app.camera.bearings import bearings, project
-from sfm_app.camera.models import panorama_matrix
+from sfm_app.camera.models import panorama_camera
 from sfm_app.camera.perspective_views import PerspectiveView, cover_rays
 from sfm_app.camera.projection import RAY
 from sfm_app.photos.decode import DecodedPhoto, UnreadableError
 from sfm_app.types.arrays import FloatArray
-from sfm_app.types.camera import EQUIRECTANGULAR, Calibration
 
 # Recognition of equirectangular photos, whose columns are longitudes and whose rows are latitudes. Ours.
 # Cameras and stitchers name the projection in the file (Google's Photo Sphere metadata, `GPano`). Without metadata, a
@@ -200,7 +199,7 @@ class PanoramaViews:
 
     def to_panorama(self, x: FloatArray, view: int) -> FloatArray:
         """Return (N, 2) pixels of the panorama for (N, 2) pixels of a view."""
-        return project(self._rays(x, view), _camera(self.size))
+        return project(self._rays(x, view), panorama_camera(self.size))
 
     def is_nearest(self, x: FloatArray, view: int) -> NDArray[np.bool_]:
         """Return (N,) whether no other view's axis is nearer to each of the (N, 2) pixels of a view."""
@@ -237,24 +236,20 @@ def _axes(longitude: FloatArray, latitude: float) -> FloatArray:
 def panorama_parts(size: tuple[int, int]) -> list[PerspectiveView]:
     """Return the texture views of a panorama of (width, height): faces of a cube, in its own resolution."""
     x, y = np.meshgrid(np.linspace(0.0, size[0], OPTIONS.grid), np.linspace(0.0, size[1], OPTIONS.grid))
-    rays = bearings(np.column_stack([x.ravel(), y.ravel()]), _camera(size))[:, RAY]
+    rays = bearings(np.column_stack([x.ravel(), y.ravel()]), panorama_camera(size))[:, RAY]
     return cover_rays(rays, size[0] / (2.0 * np.pi), size[0])
 
 
 def show_part(panorama: NDArray[np.uint8], part: PerspectiveView) -> NDArray[np.uint8]:
     """Return the picture (h, w, 3) of a view of a panorama (H, W, 3)."""
     height, width = panorama.shape[:2]
-    at = part.locate(partial(project, camera=_camera((width, height))))
+    at = part.locate(partial(project, camera=panorama_camera((width, height))))
     return resample(panorama, at, (width, height), wraps=True)
 
 
 def mask_part(used: NDArray[np.bool_], part: PerspectiveView) -> NDArray[np.bool_]:
     """Return the usable pixels (h, w) of a view of a panorama with usable pixels (H, W)."""
     height, width = used.shape
-    at = part.locate(partial(project, camera=_camera((width, height))))
+    at = part.locate(partial(project, camera=panorama_camera((width, height))))
     column, row = np.moveaxis(at.astype(np.int64), -1, 0)
     return np.asarray(used[row.clip(0, height - 1), column.clip(0, width - 1)])
-
-
-def _camera(size: tuple[int, int]) -> Calibration:
-    return Calibration(panorama_matrix(size), *size, "panorama", True, projection=EQUIRECTANGULAR)

@@ -186,7 +186,7 @@ def calibration_from_parameters(
     focal, half = float(np.exp(theta[LOG_FOCAL])), float(np.exp(0.5 * theta[LOG_ASPECT]))
     cx, cy = unit * theta[CENTER_U] + size[0] / 2, unit * theta[CENTER_V] + size[1] / 2
     K = camera_matrix(unit * focal / half, unit * focal * half, float(cx), float(cy))
-    return Calibration(K, *size, method, identifiable=True, radial=float(theta[KAPPA]) * focal**2)
+    return Calibration(K, *size, method, identifiable=True, distortion=(float(theta[KAPPA]) * focal**2,))
 
 
 def downgrade_to_estimate(calibration: Calibration, reason: str) -> Calibration:

@@ -275,7 +275,7 @@ def _fall_back_to_guess(camera: CalibratedCamera, pairs: PhotoPairs) -> Calibrat
     if not np.isfinite(claim):
         return calibration if camera.family >= 0 else guess_calibration(size, calibration.reason, calibration.evidence)
     K = guessed_camera_matrix(size, claim)
-    return replace(calibration, K=K, method="exif", radial=0.0, spread={}, correlations={}, held=())
+    return replace(calibration, K=K, method="exif", distortion=(), spread={}, correlations={}, held=())
 
 
 def _claimed_focal(camera: CalibratedCamera, pairs: PhotoPairs) -> float:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.bundle import Adjustment, adjust_or_keep
-from sfm_app.colmap.model import RefinedCamera, color_points, posed_images, posed_photo_ids, read_scene
+from sfm_app.colmap.model import color_points, posed_images, posed_photo_ids, read_scene
 from sfm_app.errors import ReconstructionError
 from sfm_app.estimation.diagnosis import diagnose_depth, diagnose_scene
 from sfm_app.estimation.given_cameras import camera_rules, given_and_found, refined_claims, report_checks, report_claims
@@ -90,10 +90,12 @@ def _finish_scene(outcome: Outcome, run: RunContext) -> Scene:
     write_sparse_models(models, run.workspace)
     members = [posed_photo_ids(model) for model in models]
     reasons = unregistered_reasons(set(members[0]), members[1:], matches, views, outcome.graph)
-    scene = read_scene(run.workspace.sparse, names, reasons, refined_cameras(adjusted[0], names))
+    ids = {names[image.name]: image.camera_id for image in posed_images(adjusted[0].model)}
+    refined = {name: adjusted[0].refined[key] for name, key in ids.items()}
+    scene = read_scene(run.workspace.sparse, names, reasons, refined)
     scene = replace(scene, gps_deviation=gps_deviation(orientations[0]))
     write_scene(scene, run.workspace)
-    lenses = {name: adjusted[0].lenses.get(key) for name, key in _camera_ids(adjusted[0], names).items()}
+    lenses = {name: adjusted[0].lenses.get(key) for name, key in ids.items()}
     run.record(
         **shutter,
         registered=len(scene.registered),
@@ -166,19 +168,3 @@ def _adjustment_problems(adjusted: Sequence[Adjustment], names: Mapping[str, str
         "points_left_open": main.open_points,
     }
     return {key: value for key, value in problems.items() if value}
-
-
-def _camera_ids(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, int]:
-    return {names[image.name]: image.camera_id for image in posed_images(adjusted.model)}
-
-
-def refined_cameras(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, RefinedCamera]:
-    """Return deviations, determined parameters and correlations of the refined cameras, by name."""
-    return {
-        name: {
-            "deviations": adjusted.deviations[camera_id],
-            "determined": adjusted.determined[camera_id],
-            "correlations": adjusted.correlations.get(camera_id, {}),
-        }
-        for name, camera_id in _camera_ids(adjusted, names).items()
-    }

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.camera.models import camera_matrix
+from sfm_app.camera.models import camera_matrix, row_of_model
 from sfm_app.camera.perspective_views import PerspectiveView
 from sfm_app.camera.projection import (
     CX,
@@ -35,13 +35,8 @@ ANGLES = 360
 """Rays from the axis to the back, half a degree apart, that are searched for the widest angle of a photo."""
 OPENCV, RATIONAL, ANGULAR = 0.0, 1.0, 2.0
 """Kinds of lenses: polynomial perspective, rational perspective, fisheye."""
-KINDS = {
-    "OPENCV": (OPENCV, (0, 1, 2, 3, 4, 5, 6, 7)),
-    "FULL_OPENCV": (RATIONAL, (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11)),
-    "OPENCV_FISHEYE": (ANGULAR, (0, 1, 2, 3, 4, 5, 8, 9)),
-    "THIN_PRISM_FISHEYE": (ANGULAR, (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11)),
-}
-"""Kind of COLMAP's models, and the columns of their parameters in a camera row."""
+KINDS = {"OPENCV": OPENCV, "FULL_OPENCV": RATIONAL, "OPENCV_FISHEYE": ANGULAR, "THIN_PRISM_FISHEYE": ANGULAR}
+"""Kinds of COLMAP's models."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,9 +74,7 @@ def photo_view(name: str, camera: CameraModel, cam_from_world: FloatArray) -> Ph
     """Return the view of a photo with the pose [R | t] (3, 4); a ReconstructionError names an unknown camera model."""
     if camera.model not in KINDS:
         raise ReconstructionError(f"texturing does not support the camera model {camera.model}")
-    kind, columns = KINDS[camera.model]
-    lens = np.zeros(LENS)
-    lens[list(columns)] = camera.params
+    kind, lens = KINDS[camera.model], row_of_model(camera.model, camera.params)
     limit = np.inf if kind == OPENCV else _image_limit(lens, kind, camera.width, camera.height)
     K, terms = camera_matrix(*lens[:4]), tuple(lens[4:].tolist())
     return PhotoView(name, K, cam_from_world, camera.width, camera.height, name, terms, kind, limit)

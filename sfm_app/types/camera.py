@@ -32,18 +32,13 @@ class Calibration:
     """False when the fundamental matrices do not determine K; K is then a guess."""
     reason: str = ""
     """Why K is not identifiable; empty when it is."""
-    radial: float = 0.0
-    """k1 of COLMAP's SIMPLE_RADIAL: x_d = x_u (1 + k1 r^2) with r in focal lengths; 0 where it was not estimated. Only
-    with the projection "perspective"."""
     projection: str = PERSPECTIVE
     """One of `PROJECTIONS`. With "equirectangular", a whole turn is as wide as the photo, and K only states the scale
     at its middle."""
-    fisheye: tuple[float, ...] = ()
-    """k1, ..., k4 of COLMAP's OPENCV_FISHEYE with the projection "fisheye": the radius in focal lengths is
-    theta (1 + k1 theta^2 + ... + k4 theta^8), theta the angle to the optical axis. Empty otherwise."""
     distortion: tuple[float, ...] = ()
-    """The eight terms of COLMAP's FULL_OPENCV or THIN_PRISM_FISHEYE in their order, where the user gave a camera with
-    more terms than `radial` or `fisheye`; these two then hold its radial terms as far as they go. Empty otherwise."""
+    """Terms k1, k2, p1, p2, k3, k4, k5, k6 of COLMAP's FULL_OPENCV, or with sx1, sy1 at the end of its
+    THIN_PRISM_FISHEYE; those that are left out at the end are 0. Before bundle adjustment, photos determine k1 of a
+    perspective lens and k1 to k4 of a fisheye; the user may give all."""
     spread: Mapping[str, float] = field(default_factory=dict)
     """Standard deviations where the calibrator estimates them: "fx", "fy", "cx", "cy" in pixels, "k1"."""
     correlations: Mapping[str, float] = field(default_factory=dict)
@@ -73,7 +68,18 @@ class Calibration:
     @property
     def is_bent(self) -> bool:
         """Whether a perspective lens distorts, so that F does not describe its pairs exactly."""
-        return bool(self.radial or self.distortion)
+        return self.projection == PERSPECTIVE and any(self.distortion)
+
+    @property
+    def radial(self) -> float:
+        """k1 of a perspective lens: x_d = x_u (1 + k1 r^2) with r in focal lengths; 0 of others."""
+        return self.distortion[0] if self.is_bent else 0.0
+
+    @property
+    def has_more_terms(self) -> bool:
+        """Whether the user gave terms that are not estimated before bundle adjustment."""
+        terms = self.distortion
+        return any((*terms[2:4], *terms[6:]) if self.projection == FISHEYE else terms[1:])
 
     @property
     def focal_px(self) -> float:
@@ -85,20 +91,21 @@ class Calibration:
         plain = {field.name: getattr(self, field.name) for field in fields(self)}
         tables = {"K": self.K.tolist(), "spread": dict(self.spread), "evidence": dict(self.evidence)}
         tables["correlations"] = dict(self.correlations)
-        lists = {"held": list(self.held), "fisheye": list(self.fisheye), "distortion": list(self.distortion)}
-        if not self.distortion:
-            del plain["distortion"], lists["distortion"]
+        lists = {"held": list(self.held), "distortion": list(self.distortion)}
         return plain | tables | lists | {"key_pairs": [list(pair) for pair in self.key_pairs]}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Calibration":
-        """Rebuild from `to_dict`."""
+        """Rebuild from `to_dict`; entries of other names are left out."""
+        known = {field.name: values[field.name] for field in fields(cls) if field.name in values}
         pairs = tuple((int(first), int(second)) for first, second in values["key_pairs"])
         tables = {name: finite_entries(values[name]) for name in ("spread", "evidence")}
         tables["correlations"] = finite_entries(values.get("correlations", {}))  # older files have none
         plain = {"K": np.array(values["K"], np.float64), "held": tuple(values["held"]), "key_pairs": pairs}
-        terms = {name: tuple(values.get(name, ())) for name in ("fisheye", "distortion")}
-        return cls(**{**values, **tables, **plain, **terms})
+        # older files have k1 of a perspective lens, or k1 to k4 of a fisheye
+        k1, k2, k3, k4 = values.get("fisheye") or (values.get("radial", 0.0), 0.0, 0.0, 0.0)
+        terms = tuple(values.get("distortion", (k1, k2, 0.0, 0.0, k3, k4)))
+        return cls(**{**known, **tables, **plain, "distortion": terms})
 
 
 @dataclass(frozen=True, slots=True)

@@ -154,6 +154,14 @@ class MatchGraph:
     matches: Mapping[PairId, NDArray[np.uint32]]
     """Per pair: (M, 2) keypoint indices in image 1 and image 2."""
 
+    @property
+    def groups(self) -> dict[str, list[MatchedImage]]:
+        """Photos by camera group, in the order of their ids."""
+        groups: dict[str, list[MatchedImage]] = {}
+        for _, image in sorted(self.images.items()):
+            groups.setdefault(image.group, []).append(image)
+        return groups
+
     def names(self, photos: Iterable[int]) -> list[str]:
         """Return the names of photos."""
         return [self.images[photo].name for photo in photos]

@@ -151,10 +151,11 @@ def test_a_panorama_of_opensfm(tmp_path):
 KEYS = st.sampled_from([
     "a", "K", "camera_matrix", "dist", "width", "height", "data", "projection_type", "focal", "focal_x", "k1",
     "cameras", "camera_of", "identifiable", "projection", "fisheye", "spread", "params", "model", "image_size",
+    "distortion",
 ])  # fmt: skip
 """Keys of all forms."""
 KNOWN = Calibration(
-    np.array([[900.5, 0, 501.25], [0, 901.5, 373.0], [0, 0, 1]]), 1000, 750, "zero-curves", True, radial=-0.0625,
+    np.array([[900.5, 0, 501.25], [0, 901.5, 373.0], [0, 0, 1]]), 1000, 750, "zero-curves", True, distortion=(-0.0625,),
     spread={"fx": 3.5, "k1": 0.01}, held=("aspect",), key_pairs=((1, 4),), evidence={"pairs": 12.0},
 )  # fmt: skip
 GUESS = Calibration(np.diag([1200.0, 1200.0, 1.0]), 1000, 750, "guess", False, "an orbit")
@@ -188,7 +189,7 @@ def test_a_single_camera_of_a_run_is_no_camera_of_opencv(tmp_path):
     with pytest.raises(InputError, match="holds no known camera"):
         given(tmp_path / "guess.json", json.dumps(GUESS.to_dict()))
     with pytest.raises(InputError, match="not those of a camera"):
-        given(tmp_path / "nan.json", json.dumps(KNOWN.to_dict() | {"radial": float("nan")}))
+        given(tmp_path / "nan.json", json.dumps(KNOWN.to_dict() | {"distortion": [float("nan")]}))
 
 
 VALUES = st.recursive(
@@ -259,8 +260,17 @@ def test_missing_files_and_folders_without_cameras_are_named(tmp_path):
         read_given_cameras(tmp_path)
 
 
-def test_models_go_to_the_smallest_form_that_holds_them():
+def test_terms_that_are_not_estimated_are_known():
     plain = calibration_from_model("FULL_OPENCV", [900, 900, 500, 400, -0.1, *[0.0] * 7], (WIDTH, HEIGHT))
     fisheye = calibration_from_model("THIN_PRISM_FISHEYE", [400, 400, 500, 400, 0.1, *[0.0] * 7], (WIDTH, HEIGHT))
-    assert (plain.radial, plain.distortion) == (-0.1, ())
-    assert (fisheye.fisheye, fisheye.distortion) == ((0.1, 0.0, 0.0, 0.0), ())
+    bent = calibration_from_model("RADIAL", [900, 500, 400, -0.1, 0.01], (WIDTH, HEIGHT))
+    prism = calibration_from_model("THIN_PRISM_FISHEYE", [400, 400, 500, 400, *[0.0] * 7, 1e-3], (WIDTH, HEIGHT))
+    assert (plain.radial, fisheye.radial, fisheye.distortion[0]) == (-0.1, 0.0, 0.1)
+    assert [one.has_more_terms for one in (plain, fisheye, bent, prism)] == [False, False, True, True]
+
+
+def test_older_files_of_a_run_have_k1_or_the_terms_of_a_fisheye(tmp_path):
+    older = {name: value for name, value in KNOWN.to_dict().items() if name != "distortion"}
+    assert only(tmp_path / "k1.json", json.dumps(older | {"radial": -0.25, "fisheye": []})).radial == -0.25
+    wide = older | {"radial": 0.0, "fisheye": [0.1, 0.2, 0.3, 0.4], "projection": "fisheye"}
+    assert only(tmp_path / "wide.json", json.dumps(wide)).distortion == (0.1, 0.2, 0.0, 0.0, 0.3, 0.4)

@@ -14,7 +14,7 @@ from sfm_app.types import Calibration
 def calibration(camera, focal=1.0):
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= focal
-    return Calibration(K, camera.width, camera.height, "zero-curves", True, radial=camera.radial)
+    return Calibration(K, camera.width, camera.height, "zero-curves", True, distortion=(camera.radial,))
 
 
 def error(true, found, reach_px=1e9):

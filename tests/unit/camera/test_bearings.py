@@ -21,7 +21,9 @@ from sfm_app.types import Calibration
 K = np.array([[200.0, 0.0, 400.0], [0.0, 210.0, 300.0], [0.0, 0.0, 1.0]])
 CAMERAS = {
     "perspective": Calibration(K, 800, 600, "test", True),
-    "fisheye": Calibration(K, 800, 600, "test", True, projection="fisheye", fisheye=(0.08, -0.01, 0.002, 0.0)),
+    "fisheye": Calibration(
+        K, 800, 600, "test", True, projection="fisheye", distortion=(0.08, -0.01, 0.0, 0.0, 0.002, 0.0)
+    ),
     "equirectangular": Calibration(K, 800, 600, "test", True, projection="equirectangular"),
 }
 PIXELS = np.random.default_rng(0).uniform([20.0, 20.0], [780.0, 580.0], (200, 2))
@@ -45,14 +47,14 @@ def test_derivatives_agree_with_differences(name: str) -> None:
 
 
 def test_a_fisheye_looks_backwards() -> None:
-    wide = Calibration(K, 800, 600, "test", True, projection="fisheye", fisheye=(0.0, 0.0, 0.0, 0.0))
+    wide = Calibration(K, 800, 600, "test", True, projection="fisheye", distortion=(0.0,))
     behind = np.array([[np.sin(1.9), 0.0, np.cos(1.9)]])
     assert np.allclose(bearings.project(behind, wide), [[400.0 + 200.0 * 1.9, 300.0]])
     assert np.allclose(bearings.bearings(bearings.project(behind, wide), wide)[:, :3], behind)
 
 
 def test_a_lens_that_folds_shows_nothing_beyond_its_fold() -> None:
-    folding = Calibration(K, 800, 600, "test", True, projection="fisheye", fisheye=(-0.2, 0.0, 0.0, 0.0))
+    folding = Calibration(K, 800, 600, "test", True, projection="fisheye", distortion=(-0.2,))
     fold = fold_radius((-0.2, *[0.0] * 7), FISHEYE, OPTIONS.least_slope)
     assert 1.1 < fold < np.sqrt(1.0 / 0.6)
     for theta, seen in ((fold - 0.05, True), (fold + 0.05, False)):

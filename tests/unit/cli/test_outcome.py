@@ -26,7 +26,7 @@ from tests.unit.cli.test_terminal import LONG, check_text
 K = camera_matrix(500.0, 510.0, 480.0, 410.0)
 KNOWN = Calibration(
     K, 1000, 800, "zero-curves", True,
-    radial=-0.05, spread={"fx": 1.25, "fy": 2.0, "cx": 3.0, "cy": 4.0, "k1": 0.01}, held=("aspect",),
+    distortion=(-0.05,), spread={"fx": 1.25, "fy": 2.0, "cx": 3.0, "cy": 4.0, "k1": 0.01}, held=("aspect",),
     key_pairs=((1, 2), (2, 3), (3, 4), (4, 5)),
 )  # fmt: skip
 GUESS = Calibration(K, 1000, 800, "guess", False, "an orbit", held=("center",))
@@ -211,7 +211,7 @@ def test_json_has_every_figure_of_a_camera():
     assert camera["field_of_view_deg"] == pytest.approx([93.27, 78.07], abs=0.01)
     changed = dict.fromkeys(("field_of_view_deg", "key_pairs"))
     assert camera | changed == KNOWN.to_dict() | changed
-    assert (camera["radial"], camera["spread"]["k1"], camera["held"]) == (-0.05, 0.01, ["aspect"])
+    assert (camera["distortion"], camera["spread"]["k1"], camera["held"]) == ([-0.05], 0.01, ["aspect"])
     assert (camera["identifiable"], camera["reason"], camera["key_pairs"][0]) == (True, "", ["1", "2"])
 
 

@@ -37,9 +37,9 @@ NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 def test_focal_center_and_lens_are_found_as_far_off_as_stated(mapped, radial):
     true = [900.0, 900.0, 530.0, 380.0, radial, 0.0, 0.0, 0.0]
     found = adjust(*mapped(true, start=(880.0, 500.0, 400.0, radial)))
-    camera, deviations = found.model.cameras[1], found.deviations[1]
+    camera, deviations = found.model.cameras[1], found.refined[1]["deviations"]
 
-    assert "center" in found.determined[1] and camera.params[:2] == pytest.approx([900, 900], rel=0.002)
+    assert "center" in found.refined[1]["determined"] and camera.params[:2] == pytest.approx([900, 900], rel=0.002)
     assert camera.params[2:4] == pytest.approx([530, 380], abs=3)
     assert camera.params[4] == pytest.approx(radial, abs=0.01)
     for name, value, truth in zip(NAMES, camera.params, true, strict=True):
@@ -68,7 +68,7 @@ def test_the_camera_with_most_photos_does_not_free_one_of_a_single_photo(mapped)
     found = adjust(model, database)
 
     assert found.model.images[lone].has_pose
-    assert "center" in found.determined[1] and "center" not in found.determined[2]
+    assert "center" in found.refined[1]["determined"] and "center" not in found.refined[2]["determined"]
     assert found.model.cameras[2].params[2:4].tolist() == [500.0, 400.0]
     for key, tolerance in ((1, 0.003), (2, 0.01)):
         assert found.model.cameras[key].mean_focal_length() == pytest.approx(900, rel=tolerance)
@@ -173,8 +173,8 @@ def test_cameras_of_three_families_are_adjusted_together_and_named_with_their_ri
     assert cameras[3].params.tolist() == [1000.0, 500.0]
     assert 0.9 * before < found.model.compute_num_observations() <= 1.1 * before
     assert 0.2 < found.model.compute_mean_reprojection_error() < 0.5
-    assert found.deviations[3] == {} and found.determined[3] == ()
-    assert set(found.deviations[2]) == {"fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"}
+    assert found.refined[3]["deviations"] == {} and found.refined[3]["determined"] == ()
+    assert set(found.refined[2]["deviations"]) == {"fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"}
     lenses = found.lenses
     models = [lenses[key].chosen.model for key in (1, 2, 3)]
     assert models == ["SIMPLE_PINHOLE", "SIMPLE_FISHEYE", "EQUIRECTANGULAR"]
@@ -243,7 +243,7 @@ def test_a_kept_camera_stays_to_the_last_bit_and_its_photos_say_whether_it_is_ri
     camera = found.model.cameras[1]
     assert camera.model.name == "OPENCV" and camera.params.tolist() == TRUE
     assert 0.25 < found.model.compute_mean_reprojection_error() < 0.5
-    assert found.deviations[1] == {} and found.determined[1] == () and found.held == ()
+    assert found.refined[1]["deviations"] == {} and found.refined[1]["determined"] == () and found.held == ()
     assert found.estimates[1].focal_px == pytest.approx(900.0, rel=0.005)
     assert find_contradictions(rule.given, found.estimates[1]) == []
 
@@ -312,7 +312,7 @@ ASTRAY = {
 def test_points_that_have_gone_astray_do_not_end_it_and_the_camera_is_found(mapped, case):
     model, database = mapped()
     found = adjust(ASTRAY[case](model), database)
-    camera, deviations = found.model.cameras[1], found.deviations[1]
+    camera, deviations = found.model.cameras[1], found.refined[1]["deviations"]
     assert not found.failure and not found.held
     assert abs(camera.params[0] - 900) < 3 * deviations["fx"] and deviations["fx"] < 20
     assert found.model.num_points3D() > 250
@@ -326,7 +326,7 @@ def test_a_photo_that_no_pair_in_the_database_connects_stays_in_the_model(mapped
             known.delete_two_view_geometry(1, other)
     found = adjust(model, database)
     assert sorted(found.model.reg_image_ids()) == [1, 2, 3, 4, 5, 6]
-    assert abs(found.model.cameras[1].params[0] - 900) < 3 * found.deviations[1]["fx"]
+    assert abs(found.model.cameras[1].params[0] - 900) < 3 * found.refined[1]["deviations"]["fx"]
 
 
 def test_photos_from_one_place_leave_numbers_or_the_model_as_it_was(mapped):
@@ -336,9 +336,9 @@ def test_photos_from_one_place_leave_numbers_or_the_model_as_it_was(mapped):
         pose.translation = pose.rotation.matrix() @ (model.images[1].cam_from_world().inverse().translation * -1.0)
         model.frames[image.frame_id].set_cam_from_world(image.camera_id, pose)
     found = adjust_or_keep(model, database)
-    assert found.failure or found.deviations[1]["fx"] > 1.0
+    assert found.failure or found.refined[1]["deviations"]["fx"] > 1.0
     assert np.isfinite(found.model.cameras[1].params).all()
-    assert all(np.isfinite(list(values.values())).all() for values in found.deviations.values())
+    assert all(np.isfinite(list(one["deviations"].values())).all() for one in found.refined.values())
 
 
 def test_a_model_that_loses_its_points_stays_as_mapping_left_it(mapped):
@@ -354,7 +354,7 @@ def test_a_model_that_loses_its_points_stays_as_mapping_left_it(mapped):
 
     assert found.model is model and "points" in found.failure
     assert found.model.cameras[1].params.tolist() == [880.0, 500.0, 400.0, 0.0]
-    assert (found.deviations, found.determined) == ({1: {}}, {1: ()})
+    assert found.refined == {1: {"deviations": {}, "determined": (), "correlations": {}}}
 
 
 def test_a_camera_without_a_focal_length_stays_as_mapping_left_it(mapped):

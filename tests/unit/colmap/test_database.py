@@ -165,7 +165,7 @@ def test_pixels_are_square_where_the_photos_ask_for_nothing_else(found, model):
 @pytest.mark.parametrize(("aspect", "place"), [(1.0, 3), (0.75, 4)])
 def test_the_lens_is_handed_on(stored, aspect, place):
     path, photos, _, _ = stored
-    found = calibration(aspect=aspect, radial=-0.2)
+    found = calibration(aspect=aspect, distortion=(-0.2,))
     write_calibrations(path, read_match_graph(path, photos), Intrinsics({"one": found, "two": TWO}))
     camera = cameras_of(path)[0]
     assert camera.params[place] == -0.2 and not np.any(camera.params[place + 1 :])

@@ -80,7 +80,7 @@ def test_cameras_are_read_with_their_first_radial_term(synthetic, name, params, 
         camera.params = params
     found = cameras_by_photo(model)
     assert sorted(found) == [1, 3]
-    for K, radial, _ in found.values():
+    for K, (radial,) in found.values():
         assert (K[0, 0], K[1, 1], K[0, 2], K[1, 2], radial) == (*focals, 510.0, 390.0, -0.1)
 
 
@@ -91,7 +91,7 @@ def test_a_part_of_a_model_can_be_adjusted_and_the_whole_stays(synthetic):
     found = adjusted.model
     assert posed_photo_ids(found) == sorted(found.images) == [1, 3, 4] and posed_photo_ids(model) == [1, 2, 3, 4, 5, 6]
     assert all(point.track.length() >= 2 for point in found.points3D.values()) and found.num_points3D() > 350
-    assert all(0 < deviations["fx"] < 20 for deviations in adjusted.deviations.values())
+    assert all(0 < one["deviations"]["fx"] < 20 for one in adjusted.refined.values())
 
 
 def test_what_colmap_raises_becomes_one_of_ours():

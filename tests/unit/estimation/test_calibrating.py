@@ -67,7 +67,7 @@ def bent(tmp_path_factory):
 
 
 def camera(K, radial, *, identifiable=True):
-    found = Calibration(K, 1200, 900, "zero-curves", identifiable, radial=radial)
+    found = Calibration(K, 1200, 900, "zero-curves", identifiable, distortion=(radial,))
     return [CalibratedCamera("one", PHOTOS, found)]
 
 

@@ -23,7 +23,7 @@ from sfm_app.types import Calibration, GivenCameras, MatchedImage, MatchGraph, R
 
 SIZE = (960, 640)
 K = np.array([[270.0, 0.0, 485.0], [0.0, 270.0, 316.0], [0.0, 0.0, 1.0]])
-WIDE = Calibration(K, *SIZE, "truth", True, projection="fisheye", fisheye=(0.0, 0.0, 0.0, 0.0))
+WIDE = Calibration(K, *SIZE, "truth", True, projection="fisheye", distortion=(0.0,))
 PLAIN = Calibration(np.array([[900.0, 0, 480], [0, 900, 320], [0, 0, 1]]), *SIZE, "truth", True)
 
 

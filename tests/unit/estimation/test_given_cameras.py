@@ -131,8 +131,9 @@ def test_photos_that_do_not_determine_a_camera_contradict_nothing():
     assert find_contradictions(camera(), found(1400.0, identifiable=False)) == []
 
 
-def wide(focal, fisheye, **values):
-    return camera(focal, projection="fisheye", fisheye=fisheye, **values)
+def wide(focal, radial, **values):
+    k1, k2, k3, k4 = radial
+    return camera(focal, projection="fisheye", distortion=(k1, k2, 0.0, 0.0, k3, k4), **values)
 
 
 def test_wide_lenses_are_compared_by_their_curves():

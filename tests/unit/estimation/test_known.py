@@ -76,7 +76,7 @@ def test_pairs_of_known_photos_are_not_matched_again():
 
 @pytest.fixture
 def lens():
-    return Calibration(np.eye(3), 100, 80, "lens", True, projection="fisheye", fisheye=(0.1, 0.0, 0.0, 0.0))
+    return Calibration(np.eye(3), 100, 80, "lens", True, projection="fisheye", distortion=(0.1,))
 
 
 def test_fits_stay_where_matches_and_lenses_are_the_same(lens):
@@ -86,7 +86,7 @@ def test_fits_stay_where_matches_and_lenses_are_the_same(lens):
     same = {(1, 2), (1, 3), (2, 3), (1, 4)}
     assert known_fits(matches, before, same, {"wide": lens}).keys() == {(1, 2), (1, 3), (2, 3)}
     assert known_fits(matches, before, same, {}).keys() == {(1, 2)}
-    other = replace(lens, fisheye=(0.2, 0.0, 0.0, 0.0))
+    other = replace(lens, distortion=(0.2,))
     assert known_fits(matches, before, same, {"wide": other}).keys() == {(1, 2)}
     assert known_fits(matches, before, {(2, 3)}, {"wide": lens})[2, 3] is before.rejected[2, 3]
 

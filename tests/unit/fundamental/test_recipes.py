@@ -124,7 +124,7 @@ def test_patience_falls_as_matches_off_the_plane_come_in():
 
 
 FISHEYE_K = np.array([[280.0, 0.0, 480.0], [0.0, 280.0, 320.0], [0.0, 0.0, 1.0]])
-LENS = Calibration(FISHEYE_K, 960, 640, "lens", True, projection="fisheye", fisheye=(0.0, 0.0, 0.0, 0.0))
+LENS = Calibration(FISHEYE_K, 960, 640, "lens", True, projection="fisheye", distortion=(0.0,))
 SIZE = np.array([960.0, 640.0])
 R = Rotation.from_euler("xyz", [5.0, -15.0, 4.0], degrees=True).as_matrix()
 T = np.array([0.8, 0.2, 0.3])

@@ -52,7 +52,7 @@ POINTS = 120
 
 
 def known(radial=0.0, key_pairs=(), K=K):
-    return Calibration(K, 640, 480, "zero-curves", True, radial=radial, key_pairs=key_pairs)
+    return Calibration(K, 640, 480, "zero-curves", True, distortion=(radial,), key_pairs=key_pairs)
 
 
 def two_views(radial=0.0):

@@ -595,7 +595,7 @@ def test_what_is_learned_is_focal_center_and_lens(synthetic, cameras, mapped_as)
 def test_of_given_cameras_nothing_is_learned_where_they_are_kept_and_all_terms_stay(synthetic, cameras, mapped_as):
     terms = (-0.07, 0.02, 0.001, -0.002, 0.0, 0.0, 0.0, 0.0)
     kept = cameras(FOCAL * 1.1, method="kept")
-    given = cameras(FOCAL * 1.1, method="given", radial=-0.07, distortion=terms)
+    given = cameras(FOCAL * 1.1, method="given", distortion=terms)
     model = with_camera(synthetic.copy(), [1300.0, 500.0, 390.0, -0.01])
     assert learned_intrinsics(mapped_as(model, kept)).main is kept.main
     found = learned_intrinsics(mapped_as(model, given)).main

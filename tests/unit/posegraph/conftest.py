@@ -28,7 +28,7 @@ def projected(X, R, t, radial=0.0, K=K):
 
 
 def camera(radial=0.0, **others):
-    return Calibration(K, *SIZE, **{"method": "zero-curves", "identifiable": True, "radial": radial, **others})
+    return Calibration(K, *SIZE, **{"method": "zero-curves", "identifiable": True, "distortion": (radial,), **others})
 
 
 @dataclass(frozen=True)

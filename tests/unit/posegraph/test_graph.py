@@ -251,7 +251,7 @@ def test_a_pair_whose_inliers_lie_in_one_point_has_no_pose_and_the_others_have_t
     views = photos.views
     photos.match((1, 2), np.random.default_rng(0).uniform(0, 700, (40, 2)), np.full((40, 2), 300.0))
     fits = {**views.fits, (1, 2): EpipolarFit(np.diag([1.0, 1.0, 0.0]), np.ones(40, bool), np.ones(40), 1, 0.1)}
-    bent = Intrinsics({"one": Calibration(K, 1000, 750, "zero-curves", True, radial=-1e-3)})
+    bent = Intrinsics({"one": Calibration(K, 1000, 750, "zero-curves", True, distortion=(-1e-3,))})
     graph = build_pose_graph(Evidence(photos.matches, ViewGraph(fits, views.rejected), bent), OPTIONS, in_turn)
     assert graph.dropped == {(1, 2): NOT_COMPUTABLE}
     assert sorted(graph.poses) == [(1, 3), (2, 3)] and graph.groups == ((1, 2, 3),)

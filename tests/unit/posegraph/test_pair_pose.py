@@ -145,7 +145,7 @@ def test_a_turn_explains_matches_without_parallax_and_no_others(two_views):
 
 WIDE = {
     "fisheye": Calibration(np.array([[300.0, 0, 400], [0, 300, 300], [0, 0, 1]]), 800, 600, "lens", True,
-                           projection="fisheye", fisheye=(0.05, 0.0, 0.0, 0.0)),
+                           projection="fisheye", distortion=(0.05,)),
     "equirectangular": Calibration(np.eye(3), 800, 400, "panorama", True, projection="equirectangular"),
 }  # fmt: skip
 

@@ -14,7 +14,7 @@ CAMERAS = {
     "perspective": Calibration(K, 1000, 800, "zero-curves", True, spread={"fx": 4.0, "fy": 4.0, "cx": 3.0, "cy": 3.0}),
     "fisheye": Calibration(
         camera_matrix(420.0, 420.0, 510.0, 390.0), 1000, 800, "lens", True,
-        projection="fisheye", fisheye=(-0.02, 0.0, 0.0, 0.0), spread={"fx": 1.0},
+        projection="fisheye", distortion=(-0.02,), spread={"fx": 1.0},
     ),
     "equirectangular": Calibration(
         panorama_matrix((1000, 500)), 1000, 500, "panorama", True, projection="equirectangular"

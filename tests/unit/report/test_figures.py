@@ -178,7 +178,7 @@ def test_an_error_of_the_lens_model_appears_in_its_cells(camera, make_pairs):
 @pytest.mark.parametrize("camera", ["perspective"], indirect=True)
 def test_a_distorted_lens_is_undone_first(camera, make_pairs):
     """Matches that a barrel lens bent leave no more than noise, once it is known."""
-    bent = replace(camera, radial=-0.1)
+    bent = replace(camera, distortion=(-0.1,))
 
     def bend(x):
         about = (x - camera.K[:2, 2]) / 800.0

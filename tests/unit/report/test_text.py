@@ -42,8 +42,8 @@ def test_the_focal_says_how_sure_it_is_and_how_wide_it_sees():
 
 
 def test_wide_lenses_say_what_they_see():
-    wide = camera(fx=400.0, fy=400.0, projection="fisheye", fisheye=(0.0, 0.0, 0.0, 0.0))
-    narrow = camera(fx=900.0, fy=900.0, projection="fisheye", fisheye=(0.0, 0.0, 0.0, 0.0))
+    wide = camera(fx=400.0, fy=400.0, projection="fisheye", distortion=(0.0,))
+    narrow = camera(fx=900.0, fy=900.0, projection="fisheye", distortion=(0.0,))
     panorama = camera(projection="equirectangular")
 
     assert focal_text(wide) == (
@@ -55,7 +55,7 @@ def test_wide_lenses_say_what_they_see():
 
 
 def test_distortion_widens_the_field():
-    assert "sees 98 degrees" in field_text(camera(radial=-0.1))
+    assert "sees 98 degrees" in field_text(camera(distortion=(-0.1,)))
 
 
 @pytest.mark.parametrize(
@@ -76,17 +76,20 @@ def test_a_guess_says_what_it_is_and_why():
 
 
 def test_lens_and_assumptions_are_empty_without_content():
-    plain, bent = camera(), camera(radial=-0.12, spread={"k1": 0.004}, held=("center", "aspect"))
+    plain, bent = camera(), camera(distortion=(-0.12,), spread={"k1": 0.004}, held=("center", "aspect"))
     assert (lens_text(plain), held_text(plain)) == ("", "")
     assert lens_text(bent) == "The lens bends lines outwards (barrel), k1 -0.120 +- 0.004."
     assert held_text(bent).endswith("optical center near the middle of the photo, square pixels.")
     assert held_text(camera(held=("center",), identifiable=False)) == ""
-    assert lens_text(camera(radial=-0.003, held=("k1",))) == ""
+    assert lens_text(camera(distortion=(-0.003,), held=("k1",))) == ""
 
 
 def test_a_distortion_within_its_deviation_has_no_direction():
-    assert lens_text(camera(radial=0.002, spread={"k1": 0.004})) == "The lens hardly bends lines, k1 0.002 +- 0.004."
-    assert "pincushion" in lens_text(camera(radial=0.009, spread={"k1": 0.004}))
+    assert (
+        lens_text(camera(distortion=(0.002,), spread={"k1": 0.004}))
+        == "The lens hardly bends lines, k1 0.002 +- 0.004."
+    )
+    assert "pincushion" in lens_text(camera(distortion=(0.009,), spread={"k1": 0.004}))
 
 
 K = np.array([[900.0, 0, 320], [0, 901.0, 240], [0, 0, 1]])

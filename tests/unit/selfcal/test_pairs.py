@@ -164,7 +164,7 @@ def test_without_its_lens_a_camera_has_the_true_fundamental_matrices():
     K, views = tracks.K[0], list(tracks.pairs.values())
     bent = [np.hstack([bend(view.x1, K), bend(view.x2, K)]) for view in views]
     pairs = CameraPairs(tracks.F, np.ones(len(views)), tracks.size, tuple(tracks.pairs), tuple(bent))
-    camera = Calibration(K, *tracks.size, "zero-curves", True, radial=K1)
+    camera = Calibration(K, *tracks.size, "zero-curves", True, distortion=(K1,))
     found = undistort_pairs(pairs, camera)
     for F, view, straight in zip(found.Fs, views, found.inliers, strict=True):
         np.testing.assert_allclose(straight, np.hstack([view.exact_x1, view.exact_x2]), atol=1e-6)
@@ -174,5 +174,5 @@ def test_without_its_lens_a_camera_has_the_true_fundamental_matrices():
 
 def test_without_a_lens_or_matches_nothing_changes():
     pairs = CameraPairs.from_Fs(np.eye(3)[None], (640, 480))
-    bent = Calibration(np.eye(3), 640, 480, "zero-curves", True, radial=K1)
+    bent = Calibration(np.eye(3), 640, 480, "zero-curves", True, distortion=(K1,))
     assert undistort_pairs(pairs, bent) is pairs

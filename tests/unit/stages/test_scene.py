@@ -257,23 +257,3 @@ def test_what_the_model_does_not_hold_is_written_down(tmp_path):
     assert found["cameras"]["one"]["deviations"] == {"fx": 1.5, "cx": 2.5}
     assert (found["cameras"]["one"]["K"], found["cameras"]["one"]["determined"]) == (K.tolist(), ["center"])
     assert (found["camera_of"], found["unregistered"]) == ({"a.jpg": "one"}, {"b.jpg": "blurred"})
-
-
-def test_what_is_known_of_refined_cameras_goes_by_their_names():
-    images = {
-        key: SimpleNamespace(image_id=key, name=f"{key}.jpg", camera_id=7 if key < 3 else 8, has_pose=key != 4)
-        for key in range(1, 5)
-    }
-    adjusted = SimpleNamespace(
-        model=SimpleNamespace(images=images),
-        deviations={7: {"fx": 1.0}, 8: {"fx": 2.0}},
-        determined={7: ("k1",), 8: ()},
-        correlations={7: {"fx k1": 0.5}},
-    )
-
-    found = scene.refined_cameras(adjusted, {"1.jpg": "a", "2.jpg": "a", "3.jpg": "b", "4.jpg": "c"})
-
-    assert found == {
-        "a": {"deviations": {"fx": 1.0}, "determined": ("k1",), "correlations": {"fx k1": 0.5}},
-        "b": {"deviations": {"fx": 2.0}, "determined": (), "correlations": {}},
-    }

@@ -36,9 +36,7 @@ def test_a_view_graph_survives_its_file():
 
 
 def test_wide_lenses_survive_with_it():
-    lens = Calibration(
-        np.diag([300.0, 300.0, 1.0]), 800, 600, "lens", True, projection="fisheye", fisheye=(0.1, 0, 0, 0)
-    )
+    lens = Calibration(np.diag([300.0, 300.0, 1.0]), 800, 600, "lens", True, projection="fisheye", distortion=(0.1,))
     graph = ViewGraph({(1, 2): fit(5, kind=RayFit), (1, 3): fit(6)}, {}, {"800x600": lens})
 
     back, _ = through_file(graph)
