@@ -132,15 +132,15 @@ class Evidence:
         return np.asarray(trials[allowed], np.bool_)
 
     def choose(self, free: BoolArray) -> BoolArray:
-        """Return the most probable choice (C, 4): each camera in turn takes its best one, until none changes."""
-        while True:
-            before = free
+        """Return the most probable choice (C, 4): each camera in turn takes its best one, until a choice returns."""
+        seen = set[bytes]()
+        while free.tobytes() not in seen:
+            seen.add(free.tobytes())
             for camera in range(len(free)):
                 _, step, covariance = self.posterior(free)
                 trials, posterior = self.camera_posteriors(free, camera, step, covariance)
                 free = trials[np.argmax(posterior.log_evidence)]
-            if np.array_equal(free, before):
-                return free
+        return free
 
     def undetermined_parts(self, free: BoolArray) -> BoolArray:
         """Return (C, 4) the parts that are not freed, not narrowed by the pairs, and not contradicted by them."""
