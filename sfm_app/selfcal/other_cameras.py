@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_app.selfcal.consensus import Consensus, find_peak
+from sfm_app.selfcal.consensus import CONSENSUS, Consensus, find_peak
 from sfm_app.selfcal.groups import VoteTables, consensus_places, log_focal_grid
 from sfm_app.selfcal.pairs import LOG_FOCAL
 from sfm_app.selfcal.priors import PRIORS
@@ -38,10 +38,6 @@ class DivisionOptions:
     """Most pairs that are compared: a table takes 50 kB a pair; by hand."""
     folds: int = 5
     """Parts of the pairs that are held out in turn; by hand."""
-    rarity: float = 50.0
-    """Folders of one or two cameras for one with a camera per photo, as for pixels that are not square; by hand."""
-    sure: float = 0.95
-    """Probability above which fewer cameras are certain, the usual one."""
 
 
 DIVISION = DivisionOptions()
@@ -88,8 +84,8 @@ def divide_photos(
     shared = max(chain([usual], others), key=lambda grid: grid.fit(few))
     fold, grids = np.random.default_rng(seed).permutation(len(rows)) % DIVISION.folds, {shared, usual}
     two, each = few if known else shared.two_cameras(), np.arange(len(everyone))
-    log_priors = log_probability(two) - log_probability(few), -float(np.log(DIVISION.rarity))
-    labels, is_doubtful, doubt = few, False, float(np.log(1.0 / DIVISION.sure - 1.0))
+    log_priors = log_probability(two) - log_probability(few), -float(np.log(CONSENSUS.rarity))
+    labels, is_doubtful, doubt = few, False, float(np.log(1.0 - CONSENSUS.sure))
     for more, log_prior in zip((two, each), log_priors, strict=True):
         fitted = max(grid.fit(more) for grid in grids) - shared.fit(labels)
         # a gain that is missing on the fitted pairs will not appear on those held out

@@ -17,7 +17,6 @@ from sfm_app.geometry.epipolar import (
     triangulation_angle_deg,
 )
 from sfm_app.geometry.poses import retract
-from sfm_app.posegraph.graph import refine_direction
 from sfm_app.posegraph.pair_pose import (
     OPTIONS,
     SIGMAS_PX,
@@ -318,12 +317,3 @@ def test_matches_without_extent_give_no_starts():
     used = np.zeros((5, 4))
     assert list(turned_starts(used, np.zeros((3, 3)))) == []
     assert list(turned_starts(used, cross_matrix(np.array([0.0, 0.0, 1.0])))) == []
-
-
-def test_with_the_rotation_held_the_direction_is_found_from_nearby():
-    pair, _, R, t = orbit_pair(3, 20.0)
-    aside = Rotation.from_rotvec([0.0, 0.1, 0.1]).as_matrix() @ t
-    for sign in (1.0, -1.0):
-        found = refine_direction(pair, R, sign * aside)
-        assert 0.0 < np.degrees(np.arccos(sign * found @ t)) < 1.0
-        assert np.linalg.norm(found) == pytest.approx(1.0)
