@@ -59,6 +59,13 @@ class PoseOptions:
     """Least cosine to the optical axis of unit rays in tests for planes: z = 1 stretches the noise. Chosen by hand."""
     reweighted_fits: int = 2
     """Fits of E to rays with weights from the fit before. Chosen by hand."""
+    sigmas_px: tuple[float, float] = (0.5, 0.2)
+    """Scales of the Cauchy loss of a refinement, one after the other: keypoints are accurate to about 0.2 px.
+    Measured."""
+    steps: int = 12
+    """Largest number of steps at each scale. Chosen by hand."""
+    gain: float = 1e-6
+    """Relative decrease of the cost below which they end. Chosen by hand."""
 
 
 OPTIONS = PoseOptions()
@@ -105,15 +112,8 @@ def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray,
 
 # Refinement. F has seven parameters, a relative pose five: with K known, the other two no longer fit noise.
 
-SIGMAS_PX = (0.5, 0.2)
-"""Scales of the Cauchy loss, one after the other: keypoints are accurate to about 0.2 px. Measured;
-docs/algorithms.md, From K to relative poses."""
-STEPS = 12
-"""Largest number of steps at each scale. Chosen by hand."""
 DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e6)
 """Damping of the Levenberg-Marquardt steps. Chosen by hand."""
-GAIN = 1e-6
-"""Relative decrease of the cost below which they end. Chosen by hand."""
 _DIFFERENCE_STEP = 1e-6
 """Step of the parameters for finite differences. Chosen by hand."""
 
@@ -121,8 +121,8 @@ _DIFFERENCE_STEP = 1e-6
 def refine_pose(lines: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Refine R (3, 3) and t (3,) for bearing vectors (N, 18) by robust least squares of Sampson distances."""
     pose = np.concatenate([R.ravel(), t / np.linalg.norm(t)])
-    for sigma in SIGMAS_PX:
-        pose = _descend(lines, pose, sigma)
+    for sigma in OPTIONS.sigmas_px:
+        pose = _descend(lines, pose, sigma, OPTIONS.steps, OPTIONS.gain)
     return pose[:9].reshape(3, 3).copy(), pose[9:].copy()
 
 
@@ -190,9 +190,9 @@ def _system(lines: FloatArray, pose: FloatArray, sigma: float) -> tuple[FloatArr
 
 
 @kernel
-def _descend(lines: FloatArray, pose: FloatArray, sigma: float) -> FloatArray:
+def _descend(lines: FloatArray, pose: FloatArray, sigma: float, steps: int, gain: float) -> FloatArray:
     cost, damping = _cost(lines, pose, sigma), DAMPING.first
-    for _ in range(STEPS):
+    for _ in range(steps):
         A, b = _system(lines, pose, sigma)
         before, improved = cost, False
         while damping < DAMPING.most and not improved:
@@ -204,7 +204,7 @@ def _descend(lines: FloatArray, pose: FloatArray, sigma: float) -> FloatArray:
                 damping = max(DECREASE * damping, DAMPING.least)
             else:
                 damping *= INCREASE
-        if not improved or before - cost < GAIN * before:
+        if not improved or before - cost < gain * before:
             break
     return pose
 
@@ -351,7 +351,7 @@ def _is_known(pose: Pose, tried: Sequence[Pose]) -> bool:
 
 
 def _pose_cost(used: FloatArray, R: FloatArray, t: FloatArray) -> float:
-    return float(np.sum(np.log1p((pose_distances(used, R, t) / SIGMAS_PX[-1]) ** 2)))
+    return float(np.sum(np.log1p((pose_distances(used, R, t) / OPTIONS.sigmas_px[-1]) ** 2)))
 
 
 def is_in_front(used: FloatArray, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:

@@ -19,7 +19,6 @@ from sfm_app.geometry.epipolar import (
 from sfm_app.geometry.poses import retract
 from sfm_app.posegraph.pair_pose import (
     OPTIONS,
-    SIGMAS_PX,
     Pair,
     estimate_pose,
     is_in_front,
@@ -230,7 +229,7 @@ def test_no_pose_nearby_explains_the_matches_better(two_views):
 
     def cost(pose):
         squared = pose_distances(views.lines, pose[:9].reshape(3, 3), pose[9:]) ** 2
-        return np.log1p(squared / SIGMAS_PX[-1] ** 2).sum()
+        return np.log1p(squared / OPTIONS.sigmas_px[-1] ** 2).sum()
 
     end = np.concatenate([R.ravel(), t])
     nearby = [cost(retract(end, 2e-4 * rng.normal(size=5))) for _ in range(100)]
