@@ -84,8 +84,8 @@ class ConsensusOptions:
     """Tops of the grid that a local search begins from; by hand."""
     sigmas: tuple[float, float] = (0.05, 0.02)
     """Widths of a vote, in r: the first finds a peak, the second refines and compares it. Section 1; by hand."""
-    own_sigma_range: tuple[float, float] = (0.01, 0.02)
-    """Bounds of the last width, in r, which follows the data; with less, fits snap to single pairs; by hand."""
+    own_sigma_range: tuple[float, float] = (0.005, 0.02)
+    """Bounds of the last width, in r, which follows the data; by hand."""
     own_sigma_factor: float = 1.5
     """That width in medians of r: half of the agreeing pairs give more than half their vote. Section 1; by hand."""
     min_agreeing: float = 2.25
@@ -100,6 +100,8 @@ class ConsensusOptions:
     """Least margin as a share of the votes for K: many pairs may barely distinguish focals. Section 5; by hand."""
     resamples: int = 25
     """Resamples of the Bayesian bootstrap. Section "without matches"; by hand."""
+    stable_sigma: float = 0.01
+    """Least width of resampled fits, in r: below it they snap to single pairs; by hand."""
     rarity: float = 50.0
     """Photo sets for one whose pixels are not square, or whose photos have a camera each. Sections 1 and 6; by hand."""
     sure: float = 0.95
@@ -379,7 +381,7 @@ def resample_peak(consensus: Consensus, theta: FloatArray, free: Sequence[int], 
         drawn = weights * rng.exponential(size=len(weights))
         drawn *= np.sum(weights) / np.sum(drawn)
         resampled = Consensus(consensus.pairs, consensus.center_sigma, drawn)
-        thetas.append(resampled.climb(theta, free, (sigma,))[0])
+        thetas.append(resampled.climb(theta, free, (max(sigma, CONSENSUS.stable_sigma),))[0])
     return np.array(thetas)
 
 

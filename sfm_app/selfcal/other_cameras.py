@@ -10,7 +10,7 @@ fitted to four fifths of the pairs and predicts the rest: more focals fit any pa
 ones. A hypothesis with more cameras is chosen if it is more probable a posteriori.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from math import lgamma
@@ -82,20 +82,31 @@ def divide_photos(
     usual = FocalGrid(tables, rows, np.zeros(5), members)
     others = (FocalGrid(tables, rows, theta, members) for theta in starts)
     shared = max(chain([usual], others), key=lambda grid: grid.fit(few))
-    fold, grids = np.random.default_rng(seed).permutation(len(rows)) % DIVISION.folds, {shared, usual}
-    two, each = few if known else shared.two_cameras(), np.arange(len(everyone))
-    log_priors = log_probability(two) - log_probability(few), -float(np.log(CONSENSUS.rarity))
-    labels, is_doubtful, doubt = few, False, float(np.log(1.0 - CONSENSUS.sure))
-    for more, log_prior in zip((two, each), log_priors, strict=True):
-        fitted = max(grid.fit(more) for grid in grids) - shared.fit(labels)
+    fold = np.random.default_rng(seed).permutation(len(rows)) % DIVISION.folds
+    two = few if known else shared.two_cameras()
+    hypotheses = (
+        (two, log_probability(two) - log_probability(few)),
+        (np.arange(len(everyone)), -float(np.log(CONSENSUS.rarity))),
+    )
+    labels, is_doubtful = _choose(few, hypotheses, {shared, usual}, fold)
+    return Division(dict(zip(everyone, labels.tolist(), strict=True)), shared.cameras(labels), is_doubtful)
+
+
+def _choose(
+    labels: IndexArray, hypotheses: Iterable[tuple[IndexArray, float]], grids: "set[FocalGrid]", fold: IndexArray
+) -> tuple[IndexArray, bool]:
+    """Return the most probable cameras (N,), and whether more are possible; a hypothesis has its log-prior odds."""
+    is_doubtful, doubt = False, float(np.log(1.0 - CONSENSUS.sure))
+    for more, log_prior in hypotheses:
+        before, after = (max(grid.fit(one) for grid in grids) for one in (labels, more))
         # a gain that is missing on the fitted pairs will not appear on those held out
-        if fitted + log_prior <= doubt or np.array_equal(more, labels):
+        if after - before + log_prior <= doubt or np.array_equal(more, labels):
             continue
         before, after = (max(grid.held_out(one, fold) for grid in grids) for one in (labels, more))
         log_odds = after - before + log_prior
         is_doubtful = log_odds <= 0.0 and (is_doubtful or log_odds > doubt)
         labels = more if log_odds > 0.0 else labels
-    return Division(dict(zip(everyone, labels.tolist(), strict=True)), shared.cameras(labels), is_doubtful)
+    return labels, is_doubtful
 
 
 def log_probability(labels: IndexArray) -> float:

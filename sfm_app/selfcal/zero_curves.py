@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_app.camera.models import CENTER, LENS, NARROW
+from sfm_app.camera.models import LENS
 from sfm_app.selfcal.adjustment import Matches
 from sfm_app.selfcal.calibrate_pairs import (
     Fit,
@@ -56,6 +56,8 @@ METHOD = "zero-curves"
 class ZeroCurveOptions:
     """Choice of pairs, and agreement of consensus and matches. Sections of Self-calibration in docs/algorithms.md."""
 
+    uncropped_sigma: float = 0.02
+    """Standard deviation of the center of uncropped photos from the middle, in widths; by hand."""
     votes_sigma: float = 0.01
     """Width of the votes that compare the adjusted camera with the peak, in r; by hand."""
     least_vote_share: float = 0.8
@@ -96,7 +98,8 @@ def _calibrate_from_fundamentals(
     """Find the camera from the matrices alone: the peak of the consensus."""
     side = float(max(pairs.size))
     # almost any center fits so few pairs: it stays that of uncropped photos
-    center_sigma = min(options.center_sigma, NARROW[CENTER]) if len(usable) == LEAST_PAIRS else options.center_sigma
+    uncropped = len(usable) == LEAST_PAIRS
+    center_sigma = min(options.center_sigma, ZERO_CURVES.uncropped_sigma) if uncropped else options.center_sigma
     consensus = Consensus(usable, center_sigma * pairs.size[0] / side)
     peak = find_peak(consensus)
     resampled = resample_peak(consensus, peak.theta, peak.free, peak.sigma, seed)
