@@ -17,12 +17,37 @@ from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, EpipolarGeometry, Rejected
 from sfm_app.types.arrays import BoolArray, FloatArray
 
+
+@dataclass(frozen=True, slots=True)
+class DegeneracyOptions:
+    """When matches count as degenerate."""
+
+    off: float = 2.0
+    """Distance in thresholds beyond which a match is off a plane, a line or a rotation. Chosen by hand."""
+    clear_share: float = 0.95
+    """Share of the inliers that a plane or a rotation must explain to be one. Chosen by hand."""
+    line_sample: int = 4
+    """Matches that fix the parameters of F that a line leaves free. Counted (docs/algorithms/lev-ransac.md)."""
+    parallax_sample: int = 2
+    """Matches that fix the parameters of F that a plane leaves free. Counted (docs/algorithms/lev-ransac.md)."""
+    extent_quantiles: tuple[float, float] = (0.01, 0.99)
+    """Quantiles that bound the points of a view, without a few gross outliers. Chosen by hand."""
+    focals: tuple[float, float, int] = (0.4, 6.0, 60)
+    """Focal lengths that a rotation may have, in sides of the box around the points: range, number. Chosen by hand."""
+    least_parallax_share: float = 0.05
+    """Share of the inliers off the plane below which a rotation counts as one (docs/algorithms/lev-ransac.md).
+    Mismatches on rows of bricks agree with a vanishing point as epipole far more often than by chance."""
+    rotation_tolerance: float = 0.05
+    """Largest relative stretch of a rotation's homography, for some focal length. Chosen by hand."""
+
+
+DEGENERACY = DegeneracyOptions()
+
+
 # Dominant plane: the plane with most of a model's inliers, and the matches off it. Hartley and Zisserman (2004),
 # Result 13.6, as a regression whose weights are ours. Where one homography H explains the matches, every F = [e]x H
 # does, for any epipole e. Only matches off the plane are evidence for an epipole.
 
-OFF_PLANE = 2.0
-"""Transfer distance in thresholds beyond which a match is off the plane. Chosen by hand."""
 _MOST_SCORED = 300
 """Inliers that sampled planes and lines are scored on, and a dominant plane is fitted to. Chosen by hand."""
 
@@ -165,30 +190,6 @@ def _squared_transfer_distances(points: FloatArray, H: FloatArray) -> FloatArray
 # more matches off the line, or off the plane, than expected by chance.
 
 
-@dataclass(frozen=True, slots=True)
-class DegeneracyOptions:
-    """When matches count as degenerate."""
-
-    line_sample: int = 4
-    """Matches that fix the parameters of F that a line leaves free. Counted (docs/algorithms/lev-ransac.md)."""
-    parallax_sample: int = 2
-    """Matches that fix the parameters of F that a plane leaves free. Counted (docs/algorithms/lev-ransac.md)."""
-    off_line: float = 2.0
-    """Distance in thresholds beyond which a match is off the line. Chosen by hand, as `OFF_PLANE`."""
-    extent_quantiles: tuple[float, float] = (0.01, 0.99)
-    """Quantiles that bound the points of a view, without a few gross outliers. Chosen by hand."""
-    focals: tuple[float, float, int] = (0.4, 6.0, 60)
-    """Focal lengths that a rotation may have, in sides of the box around the points: range, number. Chosen by hand."""
-    least_parallax_share: float = 0.05
-    """Share of the inliers off the plane below which a rotation counts as one (docs/algorithms/lev-ransac.md).
-    Mismatches on rows of bricks agree with a vanishing point as epipole far more often than by chance."""
-    rotation_tolerance: float = 0.05
-    """Largest relative stretch of a rotation's homography, for some focal length. Chosen by hand."""
-
-
-DEGENERACY = DegeneracyOptions()
-
-
 def find_degeneracy(
     points: FloatArray, F: FloatArray, inliers: BoolArray, wrong: FloatArray, threshold: float, centers: FloatArray
 ) -> str:
@@ -200,11 +201,11 @@ def find_degeneracy(
     """
     chance = accidental_share(wrong, threshold)
     for view in range(2):
-        off_line = off_line_mask(points, inliers, view, DEGENERACY.off_line * threshold)
+        off_line = off_line_mask(points, inliers, view, DEGENERACY.off * threshold)
         if _can_be_chance(off_line, inliers, DEGENERACY.line_sample, chance):
             return "collinear"
     H = dominant_homography(np.asfortranarray(points[inliers]), F, threshold)
-    off_plane = transfer_distance(H, points) > OFF_PLANE * threshold
+    off_plane = transfer_distance(H, points) > DEGENERACY.off * threshold
     planar = _can_be_chance(off_plane, inliers, DEGENERACY.parallax_sample, chance)
     parallax = np.count_nonzero(off_plane & inliers) / np.count_nonzero(inliers)
     if (planar or parallax < DEGENERACY.least_parallax_share) and is_rotation(H, points, centers):
@@ -275,7 +276,7 @@ def recover_epipole(
         return None
     chosen = np.asfortranarray(points[np.flatnonzero(inliers)[:_MOST_SCORED]])
     H = dominant_homography(chosen, F, threshold)
-    off_plane = np.flatnonzero(transfer_distance(H, points) > OFF_PLANE * threshold)
+    off_plane = np.flatnonzero(transfer_distance(H, points) > DEGENERACY.off * threshold)
     if len(off_plane) < 2:
         return None
     best = np.empty(9)

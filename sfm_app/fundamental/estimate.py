@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfm_app.fundamental.a_contrario import MOST_FALSE_ALARMS, model_false_alarms, squared_mismatch_distances
-from sfm_app.fundamental.degeneracy import OFF_PLANE, dominant_homography, find_degeneracy, transfer_distance
+from sfm_app.fundamental.degeneracy import DEGENERACY, dominant_homography, find_degeneracy, transfer_distance
 from sfm_app.fundamental.leverage import prior_validity
 from sfm_app.fundamental.loop import Recipe, run_loop
 from sfm_app.fundamental.points import Matches, check_points, prepare
@@ -91,7 +91,7 @@ def count_matches_off_plane(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options:
     f = np.ascontiguousarray(in_frame / np.linalg.norm(in_frame))
     agreeing = np.asfortranarray(matches.points[squared_distances(matches.points, f.reshape(9)) <= threshold**2])
     H = dominant_homography(agreeing, f, threshold)
-    return int(np.count_nonzero(transfer_distance(H, agreeing) > OFF_PLANE * threshold))
+    return int(np.count_nonzero(transfer_distance(H, agreeing) > DEGENERACY.off * threshold))
 
 
 def _to_frame(F: ArrayLike, unit_px: float, center: FloatArray) -> FloatArray:

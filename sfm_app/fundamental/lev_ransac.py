@@ -19,7 +19,7 @@ from sfm_app.fundamental.a_contrario import (
     model_false_alarms,
     squared_mismatch_distances,
 )
-from sfm_app.fundamental.degeneracy import OFF_PLANE, dominant_homography, recover_epipole, transfer_distance
+from sfm_app.fundamental.degeneracy import DEGENERACY, dominant_homography, recover_epipole, transfer_distance
 from sfm_app.fundamental.estimate import fit_by_recipe
 from sfm_app.fundamental.leverage import prior_validity
 from sfm_app.fundamental.loop import Recipe
@@ -88,7 +88,7 @@ def search_patience(points: FloatArray, F: FloatArray, threshold: float) -> floa
     ):
         return math.inf
     H = dominant_homography(np.asfortranarray(points[inliers]), F, threshold)
-    off_plane = transfer_distance(H, points) > OFF_PLANE * threshold
+    off_plane = transfer_distance(H, points) > DEGENERACY.off * threshold
     count, agreeing = np.count_nonzero(off_plane), np.count_nonzero(off_plane & inliers)
     chance = accidental_share(wrong, threshold)
     z = (agreeing - count * chance) / math.sqrt(count * chance * (1 - chance) + 1)

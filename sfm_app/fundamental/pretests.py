@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from sfm_app.fundamental.samples import required_trials
+from sfm_app.fundamental.samples import SAMPLE_SIZE, required_trials
 from sfm_app.types.arrays import IndexArray
 
 # Every pre-test is one list: how many of the first m matches must be inliers for the check of a hypothesis to continue.
@@ -125,17 +125,16 @@ def bail_out_table(count: int, inlier_share: float) -> IndexArray:
 # ratio of "bad" to "good" is multiplied up match by match; above A the model is rejected, which happens to a good one
 # with a probability of at most 1/A.
 
-MODEL_COST = {7: 160.0, 8: 160.0}
-"""t_M: time for a sample and its models over the time to check one match, by sample size; measured, 1.1 us and 7 ns
-(docs/algorithms/fundamental-matrices.md)."""
-MODELS_PER_SAMPLE = {7: 2.45, 8: 1.0}
-"""m_S, by sample size; measured. The thesis prints 2.3 (4.4.4)."""
-
 
 @dataclass(frozen=True, slots=True)
 class SprtOptions:
-    """First guesses and limits of the sequential test. Chosen by hand."""
+    """Times, first guesses and limits of the sequential test; guesses and limits were chosen by hand."""
 
+    model_cost: float = 160.0
+    """t_M: time for a sample and its models over the time to check one match; measured, 1.1 us and 7 ns
+    (docs/algorithms/fundamental-matrices.md)."""
+    models: tuple[float, float] = (2.45, 1.0)
+    """m_S: models through a sample of seven and of eight; measured. The thesis prints 2.3 (4.4.4)."""
     first_epsilon: float = 0.1
     """First epsilon: few inliers (docs/algorithms/fundamental-matrices.md)."""
     first_delta: float = 0.01
@@ -214,7 +213,7 @@ def design(epsilon: float, delta: float, sample_size: int) -> SequentialTest:
         return SequentialTest(epsilon, delta, math.inf)
     # C: average increment of the log-likelihood ratio per match of a bad model
     gain = (1 - delta) * math.log((1 - delta) / (1 - epsilon)) + delta * math.log(delta / epsilon)
-    cost = MODEL_COST[sample_size] * gain / MODELS_PER_SAMPLE[sample_size] + 1
+    cost = SPRT.model_cost * gain / SPRT.models[sample_size - SAMPLE_SIZE] + 1
     threshold = cost
     for _ in range(20):
         threshold = cost + math.log(threshold)

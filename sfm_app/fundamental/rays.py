@@ -12,6 +12,7 @@ import numpy as np
 
 from sfm_app.camera.bearings import bearings
 from sfm_app.fundamental.a_contrario import MOST_FALSE_ALARMS, model_false_alarms
+from sfm_app.fundamental.degeneracy import DEGENERACY
 from sfm_app.fundamental.estimate import CHANCE, NO_MODEL, TOO_FEW_INLIERS, TOO_FEW_MATCHES
 from sfm_app.fundamental.lev_ransac import OPTIONS as LEV_RANSAC
 from sfm_app.fundamental.leverage import cook_distances, mad_sigma, priors, studentized_residuals
@@ -45,10 +46,6 @@ class RayOptions:
     """Matches that samples are scored on."""
     mismatches: int = 8
     """Shifts of the partners that measure chance."""
-    clear_share: float = 0.95
-    """Share of the inliers that a rotation explains, as in `posegraph.pair_pose`."""
-    rotation_factor: float = 2.0
-    """Thresholds within which it explains them, as in `posegraph.pair_pose`."""
     rounds: int = 4
     """Fits that select inliers through lenses."""
 
@@ -172,7 +169,7 @@ def _mismatch_distances(E: FloatArray, lines: FloatArray) -> FloatArray:
 
 def _find_degeneracy(E: FloatArray, inliers: FloatArray, options: EpipolarSettings) -> str:
     """Return "rotation" if one of the two rotations of E explains the inliers alone."""
-    within = OPTIONS.rotation_factor * options.max_error_px
+    within = DEGENERACY.off * options.max_error_px
     rotations = (decompose_essential(E)[0][0], decompose_essential(E)[2][0])
     shares = [float(np.mean(rotation_residuals(inliers, R) <= within)) for R in rotations]
-    return "rotation" if max(shares) >= OPTIONS.clear_share else ""
+    return "rotation" if max(shares) >= DEGENERACY.clear_share else ""

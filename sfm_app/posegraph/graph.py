@@ -37,12 +37,6 @@ class GuidedOptions:
 
     samples: int = 200
     """Samples of two matches, each of which gives a direction. Chosen by hand."""
-    min_kept_share: float = 0.9
-    """Share of its inliers that a pose must keep with the rotation of the other pairs. Chosen by hand."""
-    held_rounds: int = 8
-    """Rounds of reweighted least squares with fixed rotation. Chosen by hand."""
-    held_sigma: float = 0.2
-    """Scale of their loss, in inlier thresholds. Chosen by hand."""
     near_thresholds: float = 3.0
     """Largest distance of the matches that are refined, in inlier thresholds. Chosen by hand."""
     min_in_front: float = 0.95
@@ -67,15 +61,11 @@ def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> Relat
     if np.count_nonzero(near) < min_inliers:
         return None
     refined_R, refined_t = refine_pose(pair.lines[near], R, t)
+    if np.degrees(Rotation.from_matrix(R.T @ refined_R).magnitude()) > GUIDED.max_rotation_deg:
+        refined_R, refined_t = R, t
     inliers = pair.inliers(refined_R, refined_t)
     if np.count_nonzero(inliers) < min_inliers:
         return None
-    if np.degrees(Rotation.from_matrix(R.T @ refined_R).magnitude()) > GUIDED.max_rotation_deg:
-        free = np.count_nonzero(inliers)
-        refined_R, refined_t = R, refine_direction(pair, R, t)
-        inliers = pair.inliers(refined_R, refined_t)
-        if np.count_nonzero(inliers) < max(min_inliers, GUIDED.min_kept_share * free):
-            return None
     pose = pair.pose(refined_R, refined_t, inliers, guided=True)
     return pose if pose.in_front >= GUIDED.min_in_front and pose.kind != "rotation" else None
 
@@ -83,21 +73,6 @@ def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> Relat
 def _epipolar_normals(pair: Pair, R: FloatArray) -> FloatArray:
     """Return (N, 3), for each match the vector that the translation is perpendicular to, given R."""
     return np.asarray(np.cross(pair.lines[:, FIRST] @ R.T, pair.lines[:, SECOND]), np.float64)
-
-
-def refine_direction(pair: Pair, R: FloatArray, t: FloatArray) -> FloatArray:
-    """Refine the unit direction of translation t (3,) by robust least squares of the distances, with R fixed."""
-    normals = _epipolar_normals(pair, R)
-    best = t
-    for _ in range(GUIDED.held_rounds):
-        distances = pose_distances(pair.lines, R, best) / (GUIDED.held_sigma * pair.max_error_px)
-        algebraic = np.abs(np.einsum("ni,i->n", normals, best))
-        # Sampson's distance is the algebraic one over its gradient, which hardly changes with t
-        gradients = np.where(distances > 0, algebraic / np.maximum(distances, 1e-12), 1.0)
-        weights = 1.0 / (np.maximum(gradients, 1e-12) ** 2 * (1.0 + distances**2))
-        _, axes = np.linalg.eigh(np.einsum("n,ni,nj->ij", weights, normals, normals))
-        best = axes[:, 0] * np.sign(axes[:, 0] @ t or 1.0)
-    return np.asarray(best, np.float64)
 
 
 def sample_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> FloatArray | None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.camera.bearings import bearings, pixels_per_radian
-from sfm_app.fundamental.degeneracy import OFF_PLANE, dominant_homography, transfer_distance
+from sfm_app.fundamental.degeneracy import DEGENERACY, dominant_homography, transfer_distance
 from sfm_app.geometry.epipolar import (
     FIRST,
     SECOND,
@@ -40,20 +40,15 @@ class PoseOptions:
     turns_deg: tuple[float, ...] = (-55.0, -30.0, -12.0, 12.0, 30.0, 55.0)
     """Turns about the scene that initial poses try. Chosen on a long-lens orbit; more turns give the same pose
     there."""
-    planar_matches: int = 8
-    """Least matches for a homography: twice the number that its eight parameters need."""
-    clear_share: float = 0.95
-    """A pair is planar, or a rotation, if this share of its inliers fits that. Chosen by hand."""
-    sample_size: int = 200
-    """Points that decide between the four poses of an essential matrix. Chosen by hand."""
-    min_inliers: int = 8
-    """Least number of inliers that determine a pose. Chosen by hand."""
+    min_matches: int = 8
+    """Least matches for a pose or a homography: twice the number that the eight parameters of the latter need."""
     min_in_front: float = 0.9
     """Least share of inliers in front of both cameras for a pose from another start than F. Chosen by hand."""
     min_improvement: float = 0.01
     """Relative decrease of the cost that such a pose needs. Chosen by hand."""
     screened: int = 60
-    """Inliers to which other starts are fitted first. Chosen by hand."""
+    """Inliers that choose among the four poses of an essential matrix, and that starts are fitted to first. Chosen by
+    hand."""
     promising: float = 1.2
     """Largest ratio of their cost there to the best one, for a fit to all inliers. Chosen by hand."""
     same_pose: float = 0.01
@@ -64,6 +59,13 @@ class PoseOptions:
     """Least cosine to the optical axis of unit rays in tests for planes: z = 1 stretches the noise. Chosen by hand."""
     reweighted_fits: int = 2
     """Fits of E to rays with weights from the fit before. Chosen by hand."""
+    sigmas_px: tuple[float, float] = (0.5, 0.2)
+    """Scales of the Cauchy loss of a refinement, one after the other: keypoints are accurate to about 0.2 px.
+    Measured."""
+    steps: int = 12
+    """Largest number of steps at each scale. Chosen by hand."""
+    gain: float = 1e-6
+    """Relative decrease of the cost below which they end. Chosen by hand."""
 
 
 OPTIONS = PoseOptions()
@@ -71,7 +73,7 @@ OPTIONS = PoseOptions()
 
 def planar_starts(used: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Yield up to four R and t that explain inliers (N, 4), points of the plane z = 1 in both views, by one plane."""
-    if len(used) < OPTIONS.planar_matches:
+    if len(used) < OPTIONS.min_matches:
         return
     try:
         H, _ = cv2.findHomography(used[:, :2], used[:, 2:], 0)
@@ -110,15 +112,8 @@ def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray,
 
 # Refinement. F has seven parameters, a relative pose five: with K known, the other two no longer fit noise.
 
-SIGMAS_PX = (0.5, 0.2)
-"""Scales of the Cauchy loss, one after the other: keypoints are accurate to about 0.2 px. Measured;
-docs/algorithms/relative-poses.md."""
-STEPS = 12
-"""Largest number of steps at each scale. Chosen by hand."""
 DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e6)
 """Damping of the Levenberg-Marquardt steps. Chosen by hand."""
-GAIN = 1e-6
-"""Relative decrease of the cost below which they end. Chosen by hand."""
 _DIFFERENCE_STEP = 1e-6
 """Step of the parameters for finite differences. Chosen by hand."""
 
@@ -126,8 +121,8 @@ _DIFFERENCE_STEP = 1e-6
 def refine_pose(lines: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Refine R (3, 3) and t (3,) for bearing vectors (N, 18) by robust least squares of Sampson distances."""
     pose = np.concatenate([R.ravel(), t / np.linalg.norm(t)])
-    for sigma in SIGMAS_PX:
-        pose = _descend(lines, pose, sigma)
+    for sigma in OPTIONS.sigmas_px:
+        pose = _descend(lines, pose, sigma, OPTIONS.steps, OPTIONS.gain)
     return pose[:9].reshape(3, 3).copy(), pose[9:].copy()
 
 
@@ -195,9 +190,9 @@ def _system(lines: FloatArray, pose: FloatArray, sigma: float) -> tuple[FloatArr
 
 
 @kernel
-def _descend(lines: FloatArray, pose: FloatArray, sigma: float) -> FloatArray:
+def _descend(lines: FloatArray, pose: FloatArray, sigma: float, steps: int, gain: float) -> FloatArray:
     cost, damping = _cost(lines, pose, sigma), DAMPING.first
-    for _ in range(STEPS):
+    for _ in range(steps):
         A, b = _system(lines, pose, sigma)
         before, improved = cost, False
         while damping < DAMPING.most and not improved:
@@ -209,7 +204,7 @@ def _descend(lines: FloatArray, pose: FloatArray, sigma: float) -> FloatArray:
                 damping = max(DECREASE * damping, DAMPING.least)
             else:
                 damping *= INCREASE
-        if not improved or before - cost < GAIN * before:
+        if not improved or before - cost < gain * before:
             break
     return pose
 
@@ -255,7 +250,7 @@ class Pair:
     def initial_pose(self, fit: EpipolarGeometry) -> Pose:
         """Return R and t from F and the cameras, before refinement."""
         inliers, E = self.lines[fit.inliers], self.essential_matrix(fit)
-        chosen = inliers[np.linspace(0, len(inliers) - 1, min(len(inliers), OPTIONS.sample_size)).astype(np.int64)]
+        chosen = _screen(inliers)
         poses = decompose_essential(nearest_essential(E))
         return max(poses, key=lambda pose: int(np.count_nonzero(is_in_front(chosen, *pose))))
 
@@ -291,15 +286,15 @@ class Pair:
 
     def kind(self, used: FloatArray, R: FloatArray, t: FloatArray, angle_deg: float) -> str:
         """Return `RelativePose.kind` by the inliers `used` (N, 18) and their median triangulation angle."""
-        within = OFF_PLANE * self.max_error_px
-        if angle_deg < OPTIONS.rotation_deg and np.mean(rotation_residuals(used, R) <= within) >= OPTIONS.clear_share:
+        within, clear = DEGENERACY.off * self.max_error_px, DEGENERACY.clear_share
+        if angle_deg < OPTIONS.rotation_deg and np.mean(rotation_residuals(used, R) <= within) >= clear:
             return "rotation"
         ahead, unit = points_ahead(used), pixels_per_radian(self.lines.reshape(-1, 9))
-        if len(ahead) < (1.0 - OPTIONS.clear_share) * len(used):
+        if len(ahead) < (1.0 - clear) * len(used):
             return "calibrated"
         H = dominant_homography(np.asfortranarray(ahead), cross_matrix(t) @ R, self.max_error_px / unit)
         on_plane = np.count_nonzero(transfer_distance(H, ahead) <= within / unit)
-        return "planar" if on_plane >= OPTIONS.clear_share * len(used) else "calibrated"
+        return "planar" if on_plane >= clear * len(used) else "calibrated"
 
 
 def estimate_pose(pair: Pair, fit: EpipolarGeometry) -> RelativePose | None:
@@ -309,7 +304,7 @@ def estimate_pose(pair: Pair, fit: EpipolarGeometry) -> RelativePose | None:
         return pair.pose(R, t, fit.inliers)
     R, t = _refine_best_start(pair, fit, (R, t))
     inliers = pair.inliers(R, t)
-    return pair.pose(R, t, inliers) if np.count_nonzero(inliers) >= OPTIONS.min_inliers else None
+    return pair.pose(R, t, inliers) if np.count_nonzero(inliers) >= OPTIONS.min_matches else None
 
 
 def _refine_best_start(pair: Pair, fit: EpipolarGeometry, start: Pose) -> Pose:
@@ -327,7 +322,7 @@ def _refine_best_start(pair: Pair, fit: EpipolarGeometry, start: Pose) -> Pose:
         lowest, most = np.inf, 0
     ahead = points_ahead(used)
     planar = planar_starts(ahead) if fit.degeneracy == "planar" else ()
-    few = used[np.linspace(0, len(used) - 1, min(len(used), OPTIONS.screened)).astype(np.int64)]
+    few = _screen(used)
     promising, tried = np.inf, [best]
     for other in (best, *turned_starts(ahead, pair.essential_matrix(fit)), *planar):
         R, t = refine_pose(few, *other)
@@ -344,6 +339,11 @@ def _refine_best_start(pair: Pair, fit: EpipolarGeometry, start: Pose) -> Pose:
     return best
 
 
+def _screen(used: FloatArray) -> FloatArray:
+    """Return `screened` matches at most, evenly chosen."""
+    return used[np.linspace(0, len(used) - 1, min(len(used), OPTIONS.screened)).astype(np.int64)]
+
+
 def _is_known(pose: Pose, tried: Sequence[Pose]) -> bool:
     """Return whether a pose was tried; t and -t have the same epipolar lines."""
     R, t = pose
@@ -352,7 +352,7 @@ def _is_known(pose: Pose, tried: Sequence[Pose]) -> bool:
 
 
 def _pose_cost(used: FloatArray, R: FloatArray, t: FloatArray) -> float:
-    return float(np.sum(np.log1p((pose_distances(used, R, t) / SIGMAS_PX[-1]) ** 2)))
+    return float(np.sum(np.log1p((pose_distances(used, R, t) / OPTIONS.sigmas_px[-1]) ** 2)))
 
 
 def is_in_front(used: FloatArray, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:

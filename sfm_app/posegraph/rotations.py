@@ -61,8 +61,6 @@ class CorrectionOptions:
 
     contradicts_deg: float = 10.0
     """Angle from which a pair contradicts the rotations. Chosen by hand: right pairs are below 5 degrees."""
-    same_deg: float = 5.0
-    """Angle up to which two pairs ask for the same turn."""
     min_pairs: int = 3
     """Contradicting pairs that have to agree on a turn."""
     unit: float = 1000.0
@@ -97,7 +95,7 @@ def find_corrections(
     while unexplained.any():
         seed = int(np.argmax(np.where(unexplained, strengths, -1.0)))
         alike, reverse = (
-            unexplained & (np.degrees((turns * turn).magnitude()) < CORRECTIONS.same_deg)
+            unexplained & (np.degrees((turns * turn).magnitude()) < AVERAGING.agreement_deg)
             for turn in (turns[seed].inv(), turns[seed])
         )
         group = _find_linked(count, edges, alike | reverse, seed)
@@ -159,8 +157,8 @@ def _make_network(
 class AveragingOptions:
     """Rotation averaging; docs/algorithms/relative-poses.md."""
 
-    loop_deg: float = 5.0
-    """The rotations of a loop agree if the angle of their product is smaller. Chosen by hand."""
+    agreement_deg: float = 5.0
+    """Largest angle of the product of rotations along a loop that agree, and of two equal turns. Chosen by hand."""
     scale_deg: float = 3.0
     """Scale of the robust sum of squares (Geman and McClure). Chosen by hand."""
     sum_rounds: int = 15
@@ -175,10 +173,6 @@ class AveragingOptions:
     """Loops that are checked at once, to bound the memory. Chosen by hand."""
     dense_photos: int = 400
     """Most photos for which a dense system costs less than conjugate gradients. Counted."""
-    step_precision: float = 1e-6
-    """Relative precision of one step by conjugate gradients. Chosen by hand."""
-    max_iterations: int = 2000
-    """Most iterations of one step: the next rounds correct the rest. Chosen by hand."""
 
 
 AVERAGING = AveragingOptions()
@@ -267,7 +261,7 @@ def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArr
         first, second, across = (turns[column] for column in loops[start : start + AVERAGING.loop_block].T)
         products = np.einsum("nji,njk,nkl->nil", across, second, first)
         agree[start : start + AVERAGING.loop_block] = (
-            np.degrees(Rotation.from_matrix(products).magnitude()) < AVERAGING.loop_deg
+            np.degrees(Rotation.from_matrix(products).magnitude()) < AVERAGING.agreement_deg
         )
     return loops, agree
 
@@ -338,7 +332,4 @@ def _solve_steps(count: int, edges: IndexArray, residuals: FloatArray, factors: 
     if count <= AVERAGING.dense_photos:
         return np.asarray(np.linalg.solve(L.toarray(), b), np.float64)
     inverse = sparse.diags_array(1.0 / L.diagonal())
-    solved = [
-        cg(L, column, rtol=AVERAGING.step_precision, maxiter=AVERAGING.max_iterations, M=inverse)[0] for column in b.T
-    ]
-    return np.column_stack(solved)
+    return np.column_stack([cg(L, column, M=inverse)[0] for column in b.T])

@@ -49,13 +49,11 @@ class FitOptions:
     """Rounds of the fit, and its uncertainty. Sections are those of docs/algorithms/zero-curves.md."""
 
     few_matches: int = 100
-    """Matches per pair until the cameras have nearly converged; by hand."""
+    """Matches per pair that choose its pose and adjust the cameras until these nearly converge; by hand."""
     first_rounds: int = 8
     """Rounds before the fits of several starts are compared; by hand."""
     last_rounds: int = 12
     """Rounds with all matches; by hand."""
-    pose_matches: int = 30
-    """Matches that choose among the four poses of an E; by hand."""
     evidence_rounds: int = 3
     """Most rounds of choosing the free parameters by the evidence and adjusting again; by hand."""
     jackknife_groups: int = 8
@@ -231,7 +229,7 @@ def _estimate_poses(few: Matches, Fs: FloatArray, thetas: FloatArray) -> FloatAr
     poses = np.empty((len(Fs), 12))
     for pair, (first, second) in enumerate(few.cameras):
         K1, K2 = intrinsic_matrix(thetas[first]), intrinsic_matrix(thetas[second])
-        x = subsample_rows(few.pair_matches(pair), FITTING.pose_matches)
+        x = subsample_rows(few.pair_matches(pair), FITTING.few_matches)
         rays = [
             (undistort_points(points, thetas[camera]) - K[:2, 2]) / K[[0, 1], [0, 1]]
             for points, camera, K in ((x[:, :2], first, K1), (x[:, 2:], second, K2))

@@ -102,10 +102,10 @@ class ConsensusOptions:
     """Resamples of the Bayesian bootstrap. Section "without matches"; by hand."""
     stable_sigma: float = 0.01
     """Least width of resampled fits, in r: below it they snap to single pairs; by hand."""
-    aspect_gain: float = float(np.log(50))
-    """Least gain of a free aspect, in votes: one photo set in fifty has other pixels. Section 1; by hand."""
-    doubtful_aspect_gain: float = float(np.log(50 * 0.05))
-    """Gain, in votes, above which square pixels are less than 95 % sure; 47 answers of `benchmarks.trouble`."""
+    rarity: float = 50.0
+    """Photo sets for one whose pixels are not square, or whose photos have a camera each. Sections 1 and 6; by hand."""
+    sure: float = 0.95
+    """Probability above which the usual is certain, the usual one; 47 answers of `benchmarks.trouble`."""
     max_log_focal_spread: float = 0.1
     """Largest standard deviation of log f; beyond it a guess is as good a start. Section 5; by hand."""
     identified_log_focal_spread: float = 0.02
@@ -118,8 +118,6 @@ class ConsensusOptions:
     Chosen on the same 109 cameras, section 5."""
     safe_support: float = 0.8
     """Share of all votes that K then needs: a cause of missing votes may bias the others. Chosen with it."""
-    edge: float = 1.02
-    """Factor within which a focal counts as being at an end of the range; by hand."""
 
 
 CONSENSUS = ConsensusOptions()
@@ -423,7 +421,7 @@ class ConsensusPeak:
     @property
     def aspect_reason(self) -> str:
         """Why square pixels make the answer an estimate; empty where they do not."""
-        doubtful = LOG_ASPECT not in self.free and self.gain >= CONSENSUS.doubtful_aspect_gain
+        doubtful = LOG_ASPECT not in self.free and self.gain >= np.log(CONSENSUS.rarity * (1.0 - CONSENSUS.sure))
         return "the pixels may not be square" if doubtful else ""
 
     def rival_reason(self, weights: FloatArray) -> str:
@@ -461,7 +459,7 @@ def find_peak(consensus: Consensus) -> ConsensusPeak:
     sigmas = (residual_sigma(consensus, free[0].theta),)
     theta, value = consensus.climb(square[0].theta, SQUARE_PIXELS, sigmas)
     gain = max(consensus.climb(start, ANY_PIXELS, sigmas)[1] for start in (theta, free[0].theta)) - value
-    if gain >= CONSENSUS.aspect_gain:
+    if gain >= np.log(CONSENSUS.rarity):
         return _examine(consensus, free, free_profile, ANY_PIXELS, gain)
     return _examine(consensus, square, profile, SQUARE_PIXELS, gain)
 
@@ -489,7 +487,8 @@ def uncertainty_reason(log_focal_spread: float, *, one_of_many: bool = False) ->
 def rejection_reason(theta: FloatArray, log_focal_spread: float, size: tuple[int, int]) -> str:
     """Return why an agreed answer, log f, u, v, ... in longer sides from the middle, is rejected; or nothing."""
     focal, (low, high) = float(np.exp(theta[LOG_FOCAL])), CONSENSUS.focal_range
-    if not low * CONSENSUS.edge < focal < high / CONSENSUS.edge:
+    half_step = (high / low) ** (0.5 / (CONSENSUS.focals - 1))
+    if not low * half_step < focal < high / half_step:
         return f"the focal is at the end of the range: {focal:.2f} times the longer side"
     if np.any(np.abs(theta[CENTER_U : CENTER_V + 1]) > 0.5 * np.array(size) / max(size)):
         return "the optical center lies outside the photo"

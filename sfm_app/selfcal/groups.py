@@ -51,10 +51,6 @@ class GroupOptions:
 
     focals: int = 41
     """Focals on the grid of a camera, 7 % apart. Section 6; by hand."""
-    grid_sigma: float = 0.05
-    """Width of the votes on the grid, in r: neighbors still vote for each other; by hand."""
-    most_pairs: int = 1500
-    """Most pairs that vote for focals of single photos: a table takes 13 kB a pair; by hand."""
     message_rounds: int = 30
     """Most rounds of max-sum message passing; by hand."""
     damping: float = 0.5
@@ -69,9 +65,9 @@ class GroupOptions:
 GROUPS = GroupOptions()
 
 
-def log_focal_grid() -> FloatArray:
-    """Return (G,) log focals of the grid, in longer sides."""
-    return np.log(np.geomspace(*CONSENSUS.focal_range, GROUPS.focals))
+def log_focal_grid(count: int) -> FloatArray:
+    """Return (count,) log focals in equal steps, in longer sides."""
+    return np.log(np.geomspace(*CONSENSUS.focal_range, count))
 
 
 class VoteTables:
@@ -116,52 +112,10 @@ def _minor(x: float, y: float, w: float, k: FloatArray) -> float:
     return float((k[1] * (x - k[2] * w)) ** 2 + (k[0] * (y - k[3] * w)) ** 2 + (k[0] * k[1] * w) ** 2)
 
 
-class FocalGrid:
-    """Votes of undistorted pairs for the focals of their two photos, on a common grid.
-
-    Ours: the consensus of thesis 5.8.4 on the focals alone. `rows` (P,) vote; `theta` (5,) has the center and aspect of
-    all photos; `members` (P, 2) are photos, counted from 0.
-    """
-
-    def __init__(self, tables: VoteTables, rows: IndexArray, theta: FloatArray, members: IndexArray) -> None:
-        self.members, self.grid = members, log_focal_grid()
-        trials = np.repeat(theta[None], GROUPS.focals, axis=0)
-        trials[:, LOG_FOCAL] = self.grid
-        trials[:, -1] = 0.0
-        self.votes = np.array([tables.votes(int(row), trials, trials, GROUPS.grid_sigma) for row in rows])
-
-    def places(self, cameras: IndexArray, rows: IndexArray) -> IndexArray:
-        """Return (C,) grid indices of the focals on which the pairs `rows` agree, given the camera of each photo."""
-        usual = ((self.grid - PRIORS.usual_log_focal) / PRIORS.focal_spread) ** 2
-        one = np.einsum("pgg->g", self.votes[rows]) - 0.5 * usual
-        priors = -0.5 * ((self.grid - self.grid[np.argmax(one)]) / PRIORS.family_spread) ** 2
-        if np.max(cameras) == 0:
-            return np.array([np.argmax(one)])
-        own = np.tile(priors, (int(np.max(cameras)) + 1, 1))
-        return _consensus_places(own, ((*cameras[self.members[row]], self.votes[row]) for row in rows))
-
-    def pair_votes(self, places: IndexArray) -> FloatArray:
-        """Return (P,) votes of the pairs if photo k has the focal at `places[k]`."""
-        first, second = places[self.members].T
-        return np.asarray(self.votes[np.arange(len(self.votes)), first, second], np.float64)
-
-    def fitted_votes(self, cameras: IndexArray) -> float:
-        """Return the sum of the votes for the focals on which all pairs agree, given the camera of each photo."""
-        return float(np.sum(self.pair_votes(self.places(cameras, np.arange(len(self.votes)))[cameras])))
-
-    def held_out_votes(self, cameras: IndexArray, fold: IndexArray) -> FloatArray:
-        """Return (P,) votes of every pair for the focals on which the pairs of the other folds (P,) agree."""
-        votes = np.zeros(len(self.votes))
-        for number in np.unique(fold):
-            out = fold == number
-            votes[out] = self.pair_votes(self.places(cameras, np.flatnonzero(~out))[cameras])[out]
-        return votes
-
-
 # The choice of focals: one grid index for every camera.
 
 
-def _consensus_places(own: FloatArray, tables: Iterable[tuple[int, int, FloatArray]]) -> IndexArray:
+def consensus_places(own: FloatArray, tables: Iterable[tuple[int, int, FloatArray]]) -> IndexArray:
     """Return `best_places` for votes of pairs: camera i of view 1, camera j of view 2, and a table (G, G) of votes."""
     between: dict[tuple[int, int], FloatArray] = {}
     for i, j, table in tables:
@@ -354,7 +308,7 @@ def _convert_to_units(
 
 def _find_focals(thetas: FloatArray, unknown: BoolArray, tables: VoteTables, priors: CameraPriors) -> FloatArray:
     trials = np.repeat(thetas[:, None], GROUPS.focals, axis=1)
-    trials[unknown, :, LOG_FOCAL] = log_focal_grid() + np.log(priors.sides[unknown])[:, None]
+    trials[unknown, :, LOG_FOCAL] = log_focal_grid(GROUPS.focals) + np.log(priors.sides[unknown])[:, None]
     usual = trials[..., LOG_FOCAL] - np.log(priors.sides)[:, None] - PRIORS.usual_log_focal
     own = -0.5 * (usual / PRIORS.focal_spread) ** 2
     hinted = np.isfinite(priors.hints)
@@ -365,7 +319,7 @@ def _find_focals(thetas: FloatArray, unknown: BoolArray, tables: VoteTables, pri
         for pair, (i, j) in enumerate(tables.members)
     )
     chosen = thetas.copy()
-    chosen[:, LOG_FOCAL] = trials[np.arange(len(thetas)), _consensus_places(own, votes), LOG_FOCAL]
+    chosen[:, LOG_FOCAL] = trials[np.arange(len(thetas)), consensus_places(own, votes), LOG_FOCAL]
     return chosen
 
 

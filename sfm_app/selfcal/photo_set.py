@@ -16,9 +16,11 @@ from sfm_app.numerical import FAILURES, error_reason
 from sfm_app.selfcal.calibrate_pairs import undistort_pairs
 from sfm_app.selfcal.consensus import Consensus
 from sfm_app.selfcal.groups import CameraGroup, VoteTables, calibrate_cameras
-from sfm_app.selfcal.other_cameras import cross_validate, divide_photos, peak_cameras, split_by_focal
+from sfm_app.selfcal.other_cameras import divide_photos, peak_cameras
 from sfm_app.selfcal.pairs import (
     ESTIMATE,
+    KAPPA,
+    LOG_FOCAL,
     calibration_from_parameters,
     downgrade_to_estimate,
     guess_calibration,
@@ -36,23 +38,6 @@ CalibrateFunction = Callable[[CameraPairs, CalibrationSettings, int], Calibratio
 
 
 @dataclass(frozen=True, slots=True)
-class SplitOptions:
-    """When photos of one group are of several cameras. Section 6 of docs/algorithms/zero-curves.md."""
-
-    least_photos: int = 4
-    """Photos below which a group is not split: too few to tell which of them disagree; by hand."""
-    same_focal: float = 0.03
-    """Parts of a group whose log f differ by less are one camera. Section 6; by hand."""
-    many_parts: int = 3
-    """Parts from which on their borders are uncertain, as for a zoom, so that no part is relied on; by hand."""
-    least_distortion: float = 0.01
-    """|k1| from which on photos are undistorted before they are tested for one camera; by hand."""
-
-
-SPLITTING = SplitOptions()
-
-
-@dataclass(frozen=True, slots=True)
 class CalibratedCamera:
     """One camera of the set."""
 
@@ -61,8 +46,8 @@ class CalibratedCamera:
     found: Calibration
     family: int = -1
     """Number of the group, where each of its photos has its own camera; else -1."""
-    part_count: int = 1
-    """Number of cameras that its group was split into."""
+    divided: bool = False
+    """Whether its group has two cameras."""
 
 
 def calibrate_photo_set(
@@ -107,41 +92,24 @@ def _calibrate_alone(
 def _split_and_calibrate(
     whole: Sequence[CalibratedCamera], pairs: PhotoPairs, options: CalibrationSettings, seed: int
 ) -> list[CalibratedCamera]:
-    """Divide groups whose photos disagree, and calibrate all; a group with two parts of one focal stays whole."""
+    """Divide groups whose photos disagree, and calibrate all."""
     families = _mixed_padded_groups(whole, pairs, seed)
-    parts = [
+    parts = (
         _split_by_photo(camera, len(whole) + families[camera.name], pairs)
         if camera.name in families
         else _split_group(camera, number, pairs, options, seed)
         for number, camera in enumerate(whole)
-    ]
-    calibrated = _calibrate_from_all_pairs(list(chain.from_iterable(parts)), pairs, options)
-    focals = {camera.name: camera.found.focal_px for camera in calibrated if camera.found.is_estimated}
-    groups = [
-        [camera]
-        if split[0].family < 0 and _has_equal_focals([focals[p.name] for p in split if p.name in focals])
-        else split
-        for camera, split in zip(whole, parts, strict=True)
-    ]
-    if sum(map(len, groups)) == len(calibrated):
-        return calibrated
-    return _calibrate_from_all_pairs(list(chain.from_iterable(groups)), pairs, options)
-
-
-def _has_equal_focals(focals: Sequence[float]) -> bool:
-    return bool(np.any(np.diff(np.sort(np.log(focals))) < SPLITTING.same_focal))
+    )
+    return _calibrate_from_all_pairs(list(chain.from_iterable(parts)), pairs, options)
 
 
 def _split_group(
     camera: CalibratedCamera, number: int, pairs: PhotoPairs, options: CalibrationSettings, seed: int
 ) -> list[CalibratedCamera]:
     """Return the camera itself, the cameras that its photos are divided among, or one for each photo."""
-    if len(camera.photos) < SPLITTING.least_photos:
-        return [camera]
-    own, calibration = pairs.to_camera_pairs(camera.photos), camera.found
+    calibration = camera.found
+    own = undistort_pairs(pairs.to_camera_pairs(camera.photos), calibration)
     side = float(max(own.size))
-    if abs(calibration.radial) > SPLITTING.least_distortion:
-        own = undistort_pairs(own, calibration)
     ready = prepare(own, unit_px=side, origin_px=(own.size[0] / 2, own.size[1] / 2))
     if len(ready) == 0:
         return [camera]
@@ -150,18 +118,13 @@ def _split_group(
         starts.append(np.append(parameters_from_calibration(calibration, side)[:4], 0.0))
     tables = VoteTables(ready.F, np.zeros((len(ready), 2), np.int64), ready.weights)
     photos = [own.photos[ready.indices[k]] for k in tables.indices]
-    thetas, labels = split_by_focal(tables, photos, starts)
-    if cross_validate(tables, photos, starts, labels, seed).is_camera_per_photo:
+    division = divide_photos(tables, photos, starts, seed)
+    if division.is_camera_per_photo:
         return _split_by_photo(camera, number, pairs)
-    if len(thetas) == 1:
-        two = divide_photos(tables, photos, starts)
-        if two is None or not two.is_possible:
-            return [camera]
-        if not two.is_certain:
-            doubt = "the photos may come from two cameras" if calibration.identifiable else ""
-            return [replace(camera, found=downgrade_to_estimate(calibration, doubt))]
-        thetas, labels = two.cameras, two.labels
-    return _parts(camera, thetas, _confirmed_labels(labels, photos), pairs)
+    if len(division.cameras) == 1:
+        doubt = "the photos may come from two cameras" if division.is_doubtful and calibration.identifiable else ""
+        return [replace(camera, found=downgrade_to_estimate(calibration, doubt))]
+    return _parts(camera, division.cameras, _confirmed_labels(division.labels, photos), pairs)
 
 
 def _confirmed_labels(labels: Mapping[int, int], photos: Sequence[PairId]) -> dict[int, int]:
@@ -178,14 +141,14 @@ def _parts(
     names, size = _names(camera, pairs), pairs.sizes[camera.photos[0]]
     parts = []
     for part, theta in enumerate(thetas):
-        members = tuple(photo for photo in camera.photos if labels.get(photo) == part)
-        theta[4] = camera.found.radial / np.exp(2.0 * theta[0])
+        theta[KAPPA] = camera.found.radial / np.exp(2.0 * theta[LOG_FOCAL])
         calibration = calibration_from_parameters(theta, size, camera.found.method)
-        parts.append(CalibratedCamera(next(names), members, calibration, part_count=len(thetas)))
+        if members := tuple(photo for photo in camera.photos if labels.get(photo) == part):
+            parts.append(CalibratedCamera(next(names), members, calibration, divided=True))
     rest = tuple(photo for photo in camera.photos if photo not in labels)
     if rest:
         unknown = guess_calibration(size, "no usable pair assigns these photos to a camera", {})
-        parts.append(CalibratedCamera(next(names), rest, unknown, part_count=len(thetas)))
+        parts.append(CalibratedCamera(next(names), rest, unknown, divided=True))
     return parts
 
 
@@ -219,7 +182,7 @@ def _mixed_padded_groups(whole: Sequence[CalibratedCamera], pairs: PhotoPairs, s
         ready = prepare(padded, unit_px=1.0, origin_px=(0.0, 0.0))
         tables = VoteTables(ready.F, np.zeros((len(ready), 2), np.int64), ready.weights)
         photos = [pairs.photos[rows[k]] for k in ready.indices]
-        if len(photos) and cross_validate(tables, photos, [], labels, seed).is_camera_per_photo:
+        if len(photos) and divide_photos(tables, photos, [], seed, labels).is_camera_per_photo:
             families |= dict.fromkeys((camera.name for camera in groups), number)
     return families
 
@@ -246,23 +209,12 @@ def _calibrate_from_all_pairs(
             known=camera.found.identifiable and bool(camera.found.evidence),
             hint_px=_claimed_focal(camera, pairs),
             family=camera.family,
-            divided=camera.part_count > 1,
+            divided=camera.divided,
         )
         for camera in cameras
     ]
     calibrations = calibrate_cameras(groups, everything, members, options, METHOD)
-    return [
-        replace(one, found=_downgrade_if_zoom(one, calibration))
-        for one, calibration in zip(cameras, calibrations, strict=True)
-    ]
-
-
-def _downgrade_if_zoom(camera: CalibratedCamera, calibration: Calibration) -> Calibration:
-    """Return the calibration, as an estimate for one of many parts of a group, as a zoom has them."""
-    if not calibration.identifiable or camera.part_count < SPLITTING.many_parts:
-        return calibration
-    reason = f"photos of one size split into {camera.part_count} cameras, which suggests a zoom lens"
-    return downgrade_to_estimate(calibration, reason)
+    return [replace(one, found=found) for one, found in zip(cameras, calibrations, strict=True)]
 
 
 def _fall_back_to_guess(camera: CalibratedCamera, pairs: PhotoPairs) -> Calibration:

@@ -47,12 +47,11 @@ class PriorOptions:
     """A part is undetermined unless the pairs shrink the deviation of its narrow prior below this share.
     docs/algorithms/zero-curves.md, 3; by hand."""
     held_factor: float = 1e-3
-    """Factor on the prior deviation of an undetermined part, which stays at its usual value; by hand."""
+    """Factor on the prior deviation of a part that stays at its usual value: it is undetermined, or a lens that the
+    settings exclude. Share of the latter, too; by hand."""
     least_redundancy: float = 0.25
     """Least share of redundant constraints for freeing more: three pairs fit almost any center.
     docs/algorithms/zero-curves.md, 3; by hand."""
-    straight: float = 1e-6
-    """Deviation of k1, and share of distorted photos, without a lens: practically zero; by hand."""
 
 
 PRIORS = PriorOptions()
@@ -80,7 +79,7 @@ class CameraPriors:
         wide = self.center_sigma
         deviation[:, CENTER_U : CENTER_U + 2] = (np.where(free[:, CENTER], wide, NARROW[CENTER]) * self.sides)[:, None]
         deviation[:, LOG_ASPECT] = np.where(free[:, ASPECT], WIDE[ASPECT], NARROW[ASPECT])
-        k1 = np.where(free[:, LENS], WIDE[LENS], NARROW[LENS]) if self.lens else PRIORS.straight
+        k1 = np.where(free[:, LENS], WIDE[LENS], NARROW[LENS]) if self.lens else PRIORS.held_factor * NARROW[LENS]
         deviation[:, KAPPA] = k1 / np.exp(2.0 * thetas[:, LOG_FOCAL])
         if held is not None:
             for place, columns in COLUMNS.items():
@@ -93,7 +92,7 @@ class CameraPriors:
         total = 0.0
         for place, share in FREE_SHARE.items():
             counts = np.isfinite(self.hints) if place == FOCAL else np.ones(len(self.sides), np.bool_)
-            freed = share if place != LENS or self.lens else PRIORS.straight
+            freed = share if place != LENS or self.lens else PRIORS.held_factor
             total += float(np.sum(np.log(np.where(free[counts, place], freed, 1.0 - freed))))
         return total
 
@@ -132,15 +131,15 @@ class Evidence:
         return np.asarray(trials[allowed], np.bool_)
 
     def choose(self, free: BoolArray) -> BoolArray:
-        """Return the most probable choice (C, 4): each camera in turn takes its best one, until none changes."""
-        while True:
-            before = free
+        """Return the most probable choice (C, 4): each camera in turn takes its best one, until a choice returns."""
+        seen = set[bytes]()
+        while free.tobytes() not in seen:
+            seen.add(free.tobytes())
             for camera in range(len(free)):
                 _, step, covariance = self.posterior(free)
                 trials, posterior = self.camera_posteriors(free, camera, step, covariance)
                 free = trials[np.argmax(posterior.log_evidence)]
-            if np.array_equal(free, before):
-                return free
+        return free
 
     def undetermined_parts(self, free: BoolArray) -> BoolArray:
         """Return (C, 4) the parts that are not freed, not narrowed by the pairs, and not contradicted by them."""

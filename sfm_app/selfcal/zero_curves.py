@@ -22,6 +22,7 @@ from sfm_app.selfcal.calibrate_pairs import (
     undistorted_fundamentals,
 )
 from sfm_app.selfcal.consensus import (
+    CONSENSUS,
     Consensus,
     ConsensusPeak,
     deviation,
@@ -55,8 +56,6 @@ METHOD = "zero-curves"
 class ZeroCurveOptions:
     """Choice of pairs, and agreement of consensus and matches. Sections of docs/algorithms/zero-curves.md."""
 
-    few_pairs: int = 3
-    """Pairs up to which almost any center fits: without matches the center is held as for uncropped photos; by hand."""
     uncropped_sigma: float = 0.02
     """Standard deviation of the center of uncropped photos from the middle, in widths; by hand."""
     votes_sigma: float = 0.01
@@ -71,10 +70,6 @@ class ZeroCurveOptions:
     """A contradicted camera is adjusted again, only to pairs with r below this at the peak. Chosen on the same sets."""
     most_adjusted: int = 800
     """Pairs to whose matches a camera is adjusted; all pairs vote for it and judge it; by hand."""
-    another_focal: float = 1.25
-    """Factor by which focals of the consensus and of the matches may differ. Section 5; by hand."""
-    restart_distance: float = float(np.log(1.1))
-    """Distance in log f of the consensus of undistorted pairs from which on it is another start; by hand."""
 
 
 ZERO_CURVES = ZeroCurveOptions()
@@ -102,9 +97,9 @@ def _calibrate_from_fundamentals(
 ) -> Calibration:
     """Find the camera from the matrices alone: the peak of the consensus."""
     side = float(max(pairs.size))
-    center_sigma = options.center_sigma
-    if len(usable) <= ZERO_CURVES.few_pairs:
-        center_sigma = min(center_sigma, ZERO_CURVES.uncropped_sigma)
+    # almost any center fits so few pairs: it stays that of uncropped photos
+    uncropped = len(usable) == LEAST_PAIRS
+    center_sigma = min(options.center_sigma, ZERO_CURVES.uncropped_sigma) if uncropped else options.center_sigma
     consensus = Consensus(usable, center_sigma * pairs.size[0] / side)
     peak = find_peak(consensus)
     resampled = resample_peak(consensus, peak.theta, peak.free, peak.sigma, seed)
@@ -208,7 +203,7 @@ def _adjust(pairs: CameraPairs, usable: Pairs, priors: CameraPriors, before: _Ad
         consensus = Consensus(_prepare(CameraPairs(straight, usable.weights, pairs.size)), priors.center_sigma)
     if fit.free[0, LENS] or (before is not None and before.fit.free[0, LENS]):
         peak = find_peak(consensus)
-    if abs(peak.theta[LOG_FOCAL] - fit.state.thetas[0, LOG_FOCAL]) > ZERO_CURVES.restart_distance:
+    if abs(peak.theta[LOG_FOCAL] - fit.state.thetas[0, LOG_FOCAL]) > np.log(CONSENSUS.rival_ratio):
         restart = np.append(peak.theta, fit.state.thetas[0, KAPPA])
         fit = fit_cameras(matches.select(rows), Fs[rows], [fit.state.thetas, restart[None]], priors)
     return _Adjustment(fit, rows, consensus, peak)
@@ -239,7 +234,7 @@ def _convert_to_sides(pairs: CameraPairs, usable: Pairs) -> tuple[Matches, Float
 def _disagreement_reason(adjusted: _Adjustment) -> str:
     """Return why the matches and the consensus of their F's disagree on the camera; empty where they agree."""
     ratio = float(np.exp(abs(adjusted.fit.state.thetas[0, LOG_FOCAL] - adjusted.peak.theta[LOG_FOCAL])))
-    if ratio >= ZERO_CURVES.another_focal:
+    if ratio >= CONSENSUS.rival_ratio:
         return f"the matches give another focal than the fundamental matrices, by a factor of {ratio:.1f}"
     if adjusted.is_contradicted:
         percent = 100 * adjusted.vote_share

@@ -7,8 +7,6 @@ import pytest
 
 from sfm_app.fundamental.pretests import (
     BLOCK,
-    MODEL_COST,
-    MODELS_PER_SAMPLE,
     SPRT,
     BailOut,
     FullScoring,
@@ -122,10 +120,10 @@ def test_threshold_solves_its_equation_and_is_where_the_time_is_least(epsilon, d
     log_a = design(epsilon, delta, 7).log_threshold
     gain = (1 - delta) * math.log((1 - delta) / (1 - epsilon)) + delta * math.log(delta / epsilon)
     a = math.exp(log_a)
-    assert a == pytest.approx(MODEL_COST[7] * gain / MODELS_PER_SAMPLE[7] + 1 + log_a)
+    assert a == pytest.approx(SPRT.model_cost * gain / SPRT.models[0] + 1 + log_a)
 
     def time(a):  # Chum and Matas 2008: samples over 1 - 1/A, each with its models and log A / C matches per model
-        return (MODEL_COST[7] + MODELS_PER_SAMPLE[7] * (1 + math.log(a)) / gain) / (1 - 1 / a)
+        return (SPRT.model_cost + SPRT.models[0] * (1 + math.log(a)) / gain) / (1 - 1 / a)
 
     assert time(a) < min(time(1.3 * a), time(a / 1.3))
 

@@ -1,6 +1,7 @@
 """The choice of free parameters, and hierarchical priors."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -185,3 +186,19 @@ def test_a_claim_comes_before_the_family():
     assert found.precision[0, 0] > 10 * found.precision[1, 0]
     freed = prior([0, 0, 0], free_focal=True, hints=np.array([3.0, np.nan, np.nan]))
     assert freed.mean[0, 0] == freed.mean[1, 0]
+
+
+class TurningEvidence(Evidence):
+    """Always finds the opposite choice more probable."""
+
+    def posterior(self, _):
+        return 0.0, np.zeros(5), np.eye(5)
+
+    def camera_posteriors(self, free, *_):
+        return ~free[None], SimpleNamespace(log_evidence=np.zeros(1))
+
+
+def test_choices_that_return_end_the_search():
+    turning = TurningEvidence(np.zeros((1, 5)), np.eye(5), np.zeros(5), 4.0, CameraPriors(np.ones(1), NO_CLAIM))
+    free = np.array([[True, False, False, True]])
+    np.testing.assert_array_equal(turning.choose(free), free)
