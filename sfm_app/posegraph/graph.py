@@ -37,6 +37,8 @@ class GuidedOptions:
 
     samples: int = 200
     """Samples of two matches, each of which gives a direction. Chosen by hand."""
+    min_kept_share: float = 0.9
+    """Share of its inliers that a pose must keep with the rotation of the other pairs. Chosen by hand."""
     near_thresholds: float = 3.0
     """Largest distance of the matches that are refined, in inlier thresholds. Chosen by hand."""
     min_in_front: float = 0.95
@@ -61,9 +63,12 @@ def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> Relat
     if np.count_nonzero(near) < min_inliers:
         return None
     refined_R, refined_t = refine_pose(pair.lines[near], R, t)
-    if np.degrees(Rotation.from_matrix(R.T @ refined_R).magnitude()) > GUIDED.max_rotation_deg:
-        refined_R, refined_t = R, t
     inliers = pair.inliers(refined_R, refined_t)
+    if np.degrees(Rotation.from_matrix(R.T @ refined_R).magnitude()) > GUIDED.max_rotation_deg:
+        least = GUIDED.min_kept_share * np.count_nonzero(inliers)
+        refined_R, refined_t, inliers = R, t, pair.inliers(R, t)
+        if np.count_nonzero(inliers) < least:
+            return None
     if np.count_nonzero(inliers) < min_inliers:
         return None
     pose = pair.pose(refined_R, refined_t, inliers, guided=True)
