@@ -123,34 +123,19 @@ def sample_colors(
     points: FloatArray, normals: FloatArray, verdict: NDArray[np.uint8], photo: PosedPhoto, image: ColorImage
 ) -> Paint:
     """Sample colors of one photo at the points that it confirms; their weight is the area of a unit patch in pixels."""
-    paint, confirmed = Paint.zeros(len(points)), verdict == CONFIRMED
-    P, center, scale = photo.projection, photo.center, photo.focal_px**2
-    _sample(points, normals, confirmed, P, center, scale, image, paint.total, paint.weight)
+    (height, width), at = image.shape[:2], np.flatnonzero(verdict == CONFIRMED)
+    x, y, z = points[at].T
+    x, y, z = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in photo.projection)
+    u, v = x / z - 0.5, y / z - 0.5
+    shown = (u >= 0) & (u < width - 1) & (v >= 0) & (v < height - 1)
+    at, u, v, z = at[shown], u[shown], v[shown], z[shown]
+    ray = photo.center - points[at]
+    facing = (normals[at] * ray).sum(axis=1) / np.linalg.norm(ray, axis=1)
+    share = facing * photo.focal_px**2 / (z * z)
+    col, row = u.astype(np.int64), v.astype(np.int64)
+    right, down = (u - col)[:, None], (v - row)[:, None]
+    upper = image[row, col] * (1 - right) + image[row, col + 1] * right
+    lower = image[row + 1, col] * (1 - right) + image[row + 1, col + 1] * right
+    paint = Paint.zeros(len(points))
+    paint.total[at], paint.weight[at] = share[:, None] * (upper * (1 - down) + lower * down), share
     return paint
-
-
-@kernel
-def _sample(  # noqa: PLR0913
-    points: FloatArray, normals: FloatArray, confirmed: NDArray[np.bool_], P: FloatArray, center: FloatArray,
-    scale: float, image: ColorImage, total: NDArray[np.float32], weight: NDArray[np.float32],
-) -> None:  # fmt: skip
-    height, width = image.shape[0], image.shape[1]
-    for k in range(len(points)):
-        if not confirmed[k]:
-            continue
-        X, Y, Z = points[k, 0], points[k, 1], points[k, 2]
-        z = P[2, 0] * X + P[2, 1] * Y + P[2, 2] * Z + P[2, 3]
-        u = (P[0, 0] * X + P[0, 1] * Y + P[0, 2] * Z + P[0, 3]) / z - 0.5
-        v = (P[1, 0] * X + P[1, 1] * Y + P[1, 2] * Z + P[1, 3]) / z - 0.5
-        col, row = int(np.floor(u)), int(np.floor(v))
-        if not (0 <= col < width - 1 and 0 <= row < height - 1):
-            continue
-        x, y, w = center[0] - X, center[1] - Y, center[2] - Z
-        facing = (normals[k, 0] * x + normals[k, 1] * y + normals[k, 2] * w) / np.sqrt(x * x + y * y + w * w)
-        share = facing * scale / (z * z)
-        weight[k] = share
-        right, down = u - col, v - row
-        for c in range(3):
-            upper = image[row, col, c] * (1 - right) + image[row, col + 1, c] * right
-            lower = image[row + 1, col, c] * (1 - right) + image[row + 1, col + 1, c] * right
-            total[k, c] = share * (upper * (1 - down) + lower * down)

@@ -280,26 +280,14 @@ def fit_planes(depth: DepthArray) -> PlaneArray:
 
 def plane_normals(planes: PlaneArray, view: View) -> NDArray[np.float32]:
     """Return (H, W, 3) unit normals in the camera frame that point to the camera; 0 where the inverse depth is 0."""
+    row, col = np.nonzero(planes[..., 0] > 0)
+    q, a, b = planes[row, col].astype(np.float64).T
+    # n'K^-1 (u, v, 1) = q + a (u - u0) + b (v - v0) for all u, v
+    c = q - a * (col + view.sample_px) - b * (row + view.sample_px)
+    n = np.stack([a * K[0] + b * K[1] + c * K[2] for K in view.K.T], axis=1)
     normals = np.zeros_like(planes)
-    _find_normals(planes, view.K, view.sample_px, normals)
+    normals[row, col] = -n / np.linalg.norm(n, axis=1, keepdims=True)
     return normals
-
-
-@kernel
-def _find_normals(planes: PlaneArray, K: FloatArray, sample: float, normals: NDArray[np.float32]) -> None:
-    for row in range(planes.shape[0]):
-        for col in range(planes.shape[1]):
-            a, b = float(planes[row, col, 1]), float(planes[row, col, 2])
-            q = float(planes[row, col, 0])
-            if q <= 0:
-                continue
-            # n'K^-1 (u, v, 1) = q + a (u - u0) + b (v - v0) for all u, v
-            c = q - a * (col + sample) - b * (row + sample)
-            x = a * K[0, 0] + b * K[1, 0] + c * K[2, 0]
-            y = a * K[0, 1] + b * K[1, 1] + c * K[2, 1]
-            z = a * K[0, 2] + b * K[1, 2] + c * K[2, 2]
-            length = np.sqrt(x * x + y * y + z * z)
-            normals[row, col, 0], normals[row, col, 1], normals[row, col, 2] = -x / length, -y / length, -z / length
 
 
 @kernel

@@ -196,7 +196,7 @@ def _disagreement(
             disagreement[f] += far[k] / count
 
 
-def _average_known(values: FloatArray, neighbors: IntArray) -> FloatArray:
+def _average_known(values: NDArray[np.floating], neighbors: IntArray) -> FloatArray:
     known = np.isfinite(values)
     total, count = np.where(known, values, 0.0), known.astype(np.float64)
     for beside in neighbors.T:

@@ -30,7 +30,6 @@ FindNormals = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.fl
 # viewer do. MikkTSpace normalizes none of them, and makes the bitangent from the interpolated two.
 
 
-@kernel
 def interpolate_frames(
     owner: IntArray, top: int, corners: FloatArray, points: FloatArray, frames: FloatArray
 ) -> tuple[NDArray[np.float32], FloatArray]:
@@ -39,74 +38,42 @@ def interpolate_frames(
     `owner` (h, W) is the triangle of each texel in rows of a page from `top` on, -1 for none. The corners (T, 3, 2) are
     in texels, the points (T, 3, 3) in the scene; the frames (T, 3, 3, 3) come from `corner_frames`.
     """
-    count, n, part = np.count_nonzero(owner != NONE), 0, np.empty(3)
-    texel_points, texel_frames = np.empty((count, 3), np.float32), np.empty((count, 3, 3))
+    face, parts = owner[owner != NONE], np.empty((np.count_nonzero(owner != NONE), 3))
+    _set_all_shares(owner, top, corners, parts)
+    first, second, third = parts.T[:, :, None]
+    texel_points = first * points[face, 0] + second * points[face, 1] + third * points[face, 2]
+    first, second, third = first[..., None], second[..., None], third[..., None]
+    mixed = first * frames[face, 0] + second * frames[face, 1] + third * frames[face, 2]
+    length = np.linalg.norm(mixed, axis=2, keepdims=True)
+    return texel_points.astype(np.float32), mixed / np.where(length > 0.0, length, 1.0)
+
+
+@kernel
+def _set_all_shares(owner: IntArray, top: int, corners: FloatArray, parts: FloatArray) -> None:
+    """Write the barycentric coordinates (N, 3) of all texels with an owner, row by row."""
+    n = 0
     for y in range(owner.shape[0]):
         for x in range(owner.shape[1]):
-            f = owner[y, x]
-            if f == NONE:
-                continue
-            set_shares(corners[f], x + 0.5, top + y + 0.5, part)
-            for axis in range(3):
-                texel_points[n, axis] = _mix(part, points[f, :, axis])
-            _set_frame(part, frames[f], texel_frames[n])
-            n += 1
-    return texel_points, texel_frames
-
-
-@kernel
-def _set_frame(part: FloatArray, frames: FloatArray, frame: FloatArray) -> None:
-    for row in range(3):
-        length = 0.0
-        for axis in range(3):
-            frame[row, axis] = _mix(part, frames[:, row, axis])
-            length += frame[row, axis] ** 2
-        frame[row] /= np.sqrt(length) if length > 0.0 else 1.0
-
-
-@kernel
-def _mix(part: FloatArray, values: FloatArray) -> float:
-    return float(part[0] * values[0] + part[1] * values[1] + part[2] * values[2])
-
-
-@kernel
-def encode(owner: IntArray, frames: FloatArray, normals: NDArray[np.float32]) -> tuple[NDArray[np.uint8], int]:
-    """Return the texels (h, w, 3) of rows of a normal map, and how many have a fine normal (N, 3), not 0."""
-    texels = np.empty((*owner.shape, 3), np.uint8)
-    n, own, one = 0, 0, np.empty(3)
-    for y in range(owner.shape[0]):
-        for x in range(owner.shape[1]):
-            one[0] = one[1] = 0.0
-            one[2] = 1.0
             if owner[y, x] != NONE:
-                own += _solve(frames[n], normals[n], one)
+                set_shares(corners[owner[y, x]], x + 0.5, top + y + 0.5, parts[n])
                 n += 1
-            for axis in range(3):
-                texels[y, x, axis] = int(np.floor(128.0 + 127.5 * one[axis]))
-    return texels, own
 
 
-@kernel
-def _solve(frame: FloatArray, normal: NDArray[np.float32], one: FloatArray) -> bool:
-    """Set the unit vector of a normal in a frame; return False for a flat frame or a normal behind the surface."""
-    t, b, n = frame
-    volume = _span(t, b, n)
-    if np.abs(volume) < 1e-6:
-        return False
+def encode(owner: IntArray, frames: FloatArray, normals: NDArray[np.float32]) -> tuple[NDArray[np.uint8], int]:
+    """Return the texels (h, w, 3) of rows of a normal map, and how many have a fine normal (N, 3), not 0.
+
+    Flat frames, and normals behind the surface, give the normal of the surface.
+    """
+    t, b, n = frames[:, 0], frames[:, 1], frames[:, 2]
     # Cramer's rule, since interpolated frames are not at right angles
-    u, v, w = _span(normal, b, n) / volume, _span(t, normal, n) / volume, _span(t, b, normal) / volume
-    if not w > 0.0:
-        return False
-    length = np.sqrt(u * u + v * v + w * w)
-    one[0], one[1], one[2] = u / length, v / length, w / length
-    return True
-
-
-@kernel
-def _span(a: NDArray[np.floating], b: NDArray[np.floating], c: NDArray[np.floating]) -> float:
-    """Return the signed volume of three vectors, positive if right-handed."""
-    x, y, z = b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]
-    return float(a[0] * x + a[1] * y + a[2] * z)
+    volumes = ((t, b, n), (normals, b, n), (t, normals, n), (t, b, normals))
+    whole, *parts = ((one * np.cross(two, three)).sum(axis=1) for one, two, three in volumes)
+    local = np.stack(parts, axis=1) / np.where(np.abs(whole) < 1e-6, np.inf, whole)[:, None]
+    own = local[:, 2] > 0.0
+    local[~own] = 0.0, 0.0, 1.0
+    directions = np.zeros((*owner.shape, 3)) + np.array([0.0, 0.0, 1.0])
+    directions[owner != NONE] = local / np.linalg.norm(local, axis=1, keepdims=True)
+    return np.floor(128.0 + 127.5 * directions).astype(np.uint8), int(np.count_nonzero(own))
 
 
 def bake_normals(model: Model, find: FindNormals, spread: ParallelMap, band: int = BAND) -> tuple[Model, float]:

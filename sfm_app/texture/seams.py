@@ -172,10 +172,9 @@ def _seam_pairs(blend: Blend, size: int) -> tuple[IndexArray, IndexArray]:
     """Return all nodes but the heaviest at each vertex, and for each node the heaviest."""
     order = np.lexsort((-blend.weight, blend.vertex))
     heads = np.full(size, -1, np.int64)
-    ranked = blend.vertex[order]
-    first = np.concatenate([[True], ranked[1:] != ranked[:-1]]) if len(ranked) else np.empty(0, bool)
-    heads[ranked[first]] = order[first]
-    others = order[~first]
+    vertices, first = np.unique(blend.vertex[order], return_index=True)
+    heads[vertices] = order[first]
+    others = np.delete(order, first)
     return others, heads[blend.vertex[others]]
 
 

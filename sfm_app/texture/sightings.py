@@ -105,7 +105,7 @@ def components(group: IndexArray, neighbors: IntArray) -> tuple[IntArray, int]:
 
     of, size, shown = np.full(len(group), NONE, np.int32), len(group), group != NONE
     face, side = np.nonzero((neighbors != NONE) & (group[neighbors] == group[:, None]) & shown[:, None])
-    ties = coo_array((np.ones(len(face), np.bool_), (face, neighbors[face, side])), (size, size))
+    ties = coo_array((np.ones(len(face), bool), (face, neighbors[face, side])), (size, size))
     parts, of[shown] = np.unique(connected_components(ties, directed=False)[1][shown], return_inverse=True)
     return of, len(parts)
 
@@ -401,7 +401,7 @@ def make_sightings(
     """List views by photo and by triangle: `counts` (P,) of them per photo, with triangles (N,) ascending in each."""
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     face_starts = np.concatenate([[0], np.cumsum(np.bincount(face, minlength=triangles))]).astype(np.int64)
-    return Sightings(starts, face, score, colors, face_starts, bucket_order(face, triangles))
+    return Sightings(starts, face, score, colors, face_starts, bucket_order(face.astype(np.int64), triangles))
 
 
 @kernel
