@@ -12,7 +12,7 @@ from PIL import Image
 
 from sfm_app.api import Run, reconstruct
 from sfm_app.camera.models import projection_of_model, row_of_model
-from sfm_app.camera.projection import K1
+from sfm_app.camera.rows import K1
 from sfm_app.errors import InputError
 from sfm_app.products import read_texture
 from sfm_app.progress import Progress

@@ -34,7 +34,7 @@ from benchmarks.lenses.radius import radius_error_percent
 from sfm_app.bundle.lens_evidence import estimate_lenses
 from sfm_app.bundle.lens_parts import PARTS, model_name
 from sfm_app.bundle.normal_equations import Bundle, best_step, project, reduce, residuals
-from sfm_app.camera.projection import FISHEYE, PERSPECTIVE
+from sfm_app.camera.rows import FISHEYE, PERSPECTIVE
 from sfm_app.colmap.backend import pycolmap, show_log
 from sfm_app.colmap.bundle import LOSS_SCALE_PX, Adjustment, adjust, lens_priors, read_bundle
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.camera import bearings
-from sfm_app.camera import projection as families
+from sfm_app.camera import rows as families
 from sfm_app.camera.models import row_of_calibration
 from sfm_app.camera.projection import image_points
 from sfm_app.synthetic.cameras import Camera, pixel_rays

@@ -23,7 +23,8 @@ from benchmarks.cameras.worker import INCREMENTAL, OURS, RESULT
 from benchmarks.common.command_line import new_parser
 from benchmarks.common.photo_sets import PhotoSet
 from benchmarks.common.results import RESULTS, Row, document, table, write
-from sfm_app.camera.projection import PERSPECTIVE, image_rays
+from sfm_app.camera.projection import image_rays
+from sfm_app.camera.rows import PERSPECTIVE
 from sfm_app.types import Intrinsics
 
 FloatArray = NDArray[np.float64]

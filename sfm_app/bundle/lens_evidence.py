@@ -26,22 +26,8 @@ from sfm_app.bundle.lens_parts import (
     step_cameras,
 )
 from sfm_app.bundle.normal_equations import ReducedSystem
-from sfm_app.camera.projection import (
-    CAMERA,
-    CX,
-    CY,
-    FISHEYE,
-    FX,
-    FY,
-    K1,
-    K2,
-    K3,
-    K4,
-    PANORAMA,
-    PERSPECTIVE,
-    angle_limit,
-    radius_at,
-)
+from sfm_app.camera.projection import angle_limit, radius_at
+from sfm_app.camera.rows import CAMERA, CX, CY, FISHEYE, FX, FY, K1, K2, K3, K4, PANORAMA, PERSPECTIVE
 from sfm_app.geometry.least_squares import cavity, inverse_of_positive, posteriors
 from sfm_app.types.arrays import BoolArray, FloatArray
 

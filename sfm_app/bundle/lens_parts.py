@@ -23,7 +23,8 @@ from sfm_app.camera.models import (
     projection_of_model,
     row_of_calibration,
 )
-from sfm_app.camera.projection import (
+from sfm_app.camera.projection import SEEN_ANGLE, angle_limit
+from sfm_app.camera.rows import (
     CAMERA,
     CX,
     CY,
@@ -40,10 +41,8 @@ from sfm_app.camera.projection import (
     P2,
     PANORAMA,
     PERSPECTIVE,
-    SEEN_ANGLE,
     SX,
     SY,
-    angle_limit,
 )
 from sfm_app.geometry.least_squares import NormalPriors, binary_choices
 from sfm_app.types import Calibration

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.camera.projection import CAMERA, PANORAMA, image_points, project_points, wrap_residuals
+from sfm_app.camera.projection import image_points, project_points, wrap_residuals
+from sfm_app.camera.rows import CAMERA, PANORAMA
 from sfm_app.geometry.least_squares import project_to_psd, solve_positive, solve_sparse_positive
 from sfm_app.types.arrays import FloatArray, IndexArray
 

@@ -25,7 +25,8 @@ from sfm_app.bundle.normal_equations import (
     loss,
     usable_mask,
 )
-from sfm_app.camera.projection import CAMERA, FX, FY, project_points
+from sfm_app.camera.projection import project_points
+from sfm_app.camera.rows import CAMERA, FX, FY
 from sfm_app.geometry.least_squares import inverse_of_positive
 from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.types.arrays import FloatArray

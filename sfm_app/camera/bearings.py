@@ -3,21 +3,8 @@
 import numpy as np
 
 from sfm_app.camera.models import FAMILIES, row_of_calibration
-from sfm_app.camera.projection import (
-    K1,
-    OPTIONS,
-    P1,
-    P2,
-    RAY,
-    SLOPES,
-    SX,
-    SY,
-    fold_radius,
-    image_points,
-    image_rays,
-    lens_terms,
-    radius_at,
-)
+from sfm_app.camera.projection import OPTIONS, RAY, SLOPES, fold_radius, image_points, image_rays, lens_terms, radius_at
+from sfm_app.camera.rows import K1, P1, P2, SX, SY
 from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, Calibration
 
@@ -56,12 +43,6 @@ def depths_along(points: FloatArray, camera: Calibration) -> FloatArray:
     if camera.projection in {EQUIRECTANGULAR, FISHEYE}:
         return np.asarray(np.linalg.norm(points, axis=1), np.float64)
     return np.asarray(points[:, 2], np.float64)
-
-
-def pixels_per_radian(lines: FloatArray) -> float:
-    """Return the scale at the center of the photo, the focal of a perspective camera, from `bearings` (N, 9), N > 0."""
-    lengths = np.linalg.norm(lines[:, SLOPES].reshape(-1, 3), axis=1)
-    return float(np.mean(1.0 / lengths))
 
 
 # The curve of a lens: the radius in the photo over the angle to the optical axis, and the field of view.

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.camera import projection as families
+from sfm_app.camera import rows as families
 from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE, GIVEN, PERSPECTIVE, Calibration
 
 GUESSED_FOCAL = 1.2
@@ -71,9 +71,9 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
 
 
 FAMILIES = {PERSPECTIVE: families.PERSPECTIVE, FISHEYE: families.FISHEYE, EQUIRECTANGULAR: families.PANORAMA}
-"""Families of `camera.projection`, by projection."""
+"""Families of `camera.rows`, by projection."""
 INDEX = {name: k for terms in TERMS.values() for k, name in enumerate((*TWO_FOCALS, *terms))}
-"""Index in a row (12,) of `camera.projection` of each parameter but f, w and h."""
+"""Index in a row (12,) of `camera.rows` of each parameter but f, w and h."""
 FILE_MODELS = {
     families.PERSPECTIVE: ("OPENCV", "FULL_OPENCV"),
     families.FISHEYE: ("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"),
@@ -89,7 +89,7 @@ def projection_of_model(model: str) -> str:
 
 
 def row_of_model(model: str, params: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a camera with a model and parameters of COLMAP as a row (12,) of `camera.projection`."""
+    """Return a camera with a model and parameters of COLMAP as a row (12,) of `camera.rows`."""
     row = np.zeros(families.CAMERA)
     if model == "EQUIRECTANGULAR":
         return row_of_calibration(panorama_camera((int(params[0]), int(params[1]))))
@@ -136,7 +136,7 @@ def calibration_from_model(model: str, params: Sequence[float], size: tuple[int,
 
 
 def row_of_calibration(camera: Calibration) -> NDArray[np.float64]:
-    """Return a camera as a row (12,) of `camera.projection`."""
+    """Return a camera as a row (12,) of `camera.rows`."""
     panorama = camera.projection == EQUIRECTANGULAR
     K = panorama_matrix((camera.width, camera.height)) if panorama else camera.K
     row = np.zeros(families.CAMERA)

@@ -14,17 +14,29 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sfm_app.camera.rows import (
+    CAMERA,
+    CX,
+    CY,
+    FISHEYE,
+    FX,
+    FY,
+    K1,
+    K2,
+    K3,
+    K4,
+    K5,
+    K6,
+    P1,
+    P2,
+    PANORAMA,
+    PERSPECTIVE,
+    SX,
+    SY,
+)
 from sfm_app.jit import inlined_kernel, kernel
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-FX, FY, CX, CY, K1, K2, P1, P2, K3, K4, K5, K6 = range(12)
-"""Indices of the parameters of a perspective camera, as in COLMAP's FULL_OPENCV; the first ten also of a fisheye."""
-SX, SY = K5, K6
-"""Indices of sx1 and sy1 of a fisheye, as in COLMAP's THIN_PRISM_FISHEYE."""
-CAMERA = 12
-"""Number of parameters of a camera. By definition."""
-PERSPECTIVE, FISHEYE, PANORAMA = range(3)
-"""Families of cameras. A panorama has fx and fy in pixels per radian, cx and cy in pixels, and none of them is free."""
 NEAR_AXIS = 1e-5
 """Slope below which a ray counts as the optical axis of a fisheye, where its derivatives are 0/0: the first neglected
 term is its square. By definition: the root of double precision, rounded."""

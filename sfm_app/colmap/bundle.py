@@ -34,7 +34,7 @@ from sfm_app.bundle.lens_parts import (
 )
 from sfm_app.bundle.normal_equations import Bundle, best_step, cost, elimination_width, reduce
 from sfm_app.camera.models import FILE_MODELS, INDEX, PARAMETERS, file_model, params_of_row, row_of_calibration
-from sfm_app.camera.projection import CX, CY, FISHEYE, FX, FY, PANORAMA, PERSPECTIVE
+from sfm_app.camera.rows import CX, CY, FISHEYE, FX, FY, PANORAMA, PERSPECTIVE
 from sfm_app.colmap.backend import all_cameras, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import RefinedCamera, camera_family, finite_mask, posed_images, read_camera, submodel

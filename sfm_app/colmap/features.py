@@ -28,7 +28,6 @@ from sfm_app.files import replace_atomically
 from sfm_app.numerical import Json
 from sfm_app.photos.decode import read_picture, upright_image
 from sfm_app.photos.masks import read_mask
-from sfm_app.photos.panoramas import PanoramaViews
 from sfm_app.progress import Progress, SilentProgress, track
 from sfm_app.settings import MatchSettings
 from sfm_app.types import PairId
@@ -193,6 +192,8 @@ def _find_in_panorama(
     path: Path, extraction: pycolmap.FeatureExtractionOptions
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Return keypoints (N, 3), x and y in pixels of the panorama and the scale in a view, and descriptors (N, 128)."""
+    from sfm_app.photos.panoramas import PanoramaViews  # other processes of COLMAP need no compiler
+
     pixels = np.asarray(upright_image(read_picture(path)).convert("RGB"), np.uint8)
     views = PanoramaViews.cover((pixels.shape[1], pixels.shape[0]), extraction.max_image_size)
     pixels = views.shrink(pixels)

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.camera.models import FAMILIES, camera_matrix, projection_of_model, row_of_model
-from sfm_app.camera.projection import BEARING, FISHEYE, K1, PERSPECTIVE, RAY
+from sfm_app.camera.projection import BEARING, RAY
+from sfm_app.camera.rows import FISHEYE, K1, PERSPECTIVE
 from sfm_app.colmap.backend import all_images, all_points, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.geometry.epipolar import TwoViewSeed

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.camera.perspective_views import PerspectiveView, center_view
-from sfm_app.camera.projection import FX
+from sfm_app.camera.rows import FX
 from sfm_app.colmap import tasks
 from sfm_app.colmap.backend import check_written, pycolmap, translate_errors
 from sfm_app.colmap.model import finite_points, point_arrays, posed_images

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.camera.perspective_views import PerspectiveView, cover_rays
-from sfm_app.camera.projection import FISHEYE, FX, PANORAMA, SEEN_ANGLE, image_points
+from sfm_app.camera.projection import SEEN_ANGLE, image_points
+from sfm_app.camera.rows import FISHEYE, FX, PANORAMA
 from sfm_app.colmap.backend import pycolmap, translate_errors
 from sfm_app.colmap.dense import MASKS, shrink_mask
 from sfm_app.colmap.model import camera_family, posed_images, read_camera

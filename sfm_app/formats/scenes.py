@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.camera.models import PARAMETERS, projection_of_model, row_of_model
-from sfm_app.camera.projection import K1
+from sfm_app.camera.rows import K1
 from sfm_app.errors import InputError
 from sfm_app.files import replace_atomically
 from sfm_app.formats.exporters import FinishedScene

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfm_app.camera.bearings import pixels_per_radian
 from sfm_app.errors import NumericalError
 from sfm_app.types.arrays import FloatArray
 
@@ -363,6 +362,12 @@ def _ray_depths(rays1: FloatArray, rays2: FloatArray, R: FloatArray, t: FloatArr
     p, q = h1 @ t, h2 @ t
     determinant = np.maximum(a * c - b * b, 1e-300)
     return (b * q - c * p) / determinant, (a * q - b * p) / determinant
+
+
+def pixels_per_radian(lines: FloatArray) -> float:
+    """Return the scale at the center of the photo, the focal of a perspective camera, from bearings (N, 9), N > 0."""
+    lengths = np.linalg.norm(lines[:, 3:9].reshape(-1, 3), axis=1)
+    return float(np.mean(1.0 / lengths))
 
 
 def rotation_residuals(lines: FloatArray, R: FloatArray) -> FloatArray:

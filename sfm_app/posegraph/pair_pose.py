@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.camera.bearings import bearings, pixels_per_radian
+from sfm_app.camera.bearings import bearings
 from sfm_app.fundamental.degeneracy import DEGENERACY, dominant_homography, transfer_distance
 from sfm_app.geometry.epipolar import (
     FIRST,
@@ -19,6 +19,7 @@ from sfm_app.geometry.epipolar import (
     fit_rays,
     gradients,
     nearest_essential,
+    pixels_per_radian,
     rotation_residuals,
 )
 from sfm_app.geometry.least_squares import DECREASE, INCREASE, DampingRange

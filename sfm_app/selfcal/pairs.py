@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfm_app.camera.models import camera_matrix, guessed_camera_matrix
-from sfm_app.camera.projection import BEARING, CX, CY, FX, FY, K1, PERSPECTIVE, fold_radius, unproject_point
+from sfm_app.camera.projection import BEARING, fold_radius, unproject_point
+from sfm_app.camera.rows import CX, CY, FX, FY, K1, PERSPECTIVE
 from sfm_app.jit import kernel
 from sfm_app.types import Calibration, CameraPairs
 from sfm_app.types.arrays import FloatArray, IndexArray

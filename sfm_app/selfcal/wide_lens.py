@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.camera import projection as families
+from sfm_app.camera import rows as families
 from sfm_app.camera.projection import RAY, Fisheye, image_rays
 from sfm_app.geometry.epipolar import FIRST, SECOND, decompose_essential, fit_rays, signed_distances, squared_distances
 from sfm_app.geometry.least_squares import damped_step, inverse_of_positive, solve_each

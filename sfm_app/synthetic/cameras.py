@@ -11,10 +11,7 @@ import numpy as np
 
 from sfm_app.camera.models import camera_matrix
 from sfm_app.camera.projection import (
-    FISHEYE,
     OPTIONS,
-    PANORAMA,
-    PERSPECTIVE,
     RAY,
     Fisheye,
     fold_radius,
@@ -23,6 +20,7 @@ from sfm_app.camera.projection import (
     lens_terms,
     radius_at,
 )
+from sfm_app.camera.rows import FISHEYE, PANORAMA, PERSPECTIVE
 from sfm_app.errors import ConfigError
 from sfm_app.types.arrays import FloatArray
 

@@ -8,19 +8,8 @@ from numpy.typing import NDArray
 
 from sfm_app.camera.models import camera_matrix, row_of_model
 from sfm_app.camera.perspective_views import PerspectiveView
-from sfm_app.camera.projection import (
-    CX,
-    CY,
-    FISHEYE,
-    FX,
-    FY,
-    PERSPECTIVE,
-    distort_point,
-    lens_terms,
-    plane_point,
-    radial_factor,
-    shown_angle,
-)
+from sfm_app.camera.projection import distort_point, lens_terms, plane_point, radial_factor, shown_angle
+from sfm_app.camera.rows import CX, CY, FISHEYE, FX, FY, PERSPECTIVE
 from sfm_app.errors import ReconstructionError
 from sfm_app.jit import kernel
 from sfm_app.types import CameraModel, PosedPhoto

@@ -8,7 +8,7 @@ import pytest
 from sfm_app.bundle.lens_evidence import estimate_lenses
 from sfm_app.bundle.lens_parts import PERSPECTIVE_PARTS, LensPriors
 from sfm_app.bundle.normal_equations import Bundle, project, reduce
-from sfm_app.camera.projection import CAMERA, PERSPECTIVE
+from sfm_app.camera.rows import CAMERA, PERSPECTIVE
 
 SIZE = np.array([1000.0, 800.0])
 PLAIN = (900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0)

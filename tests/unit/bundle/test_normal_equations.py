@@ -17,7 +17,7 @@ from sfm_app.bundle.normal_equations import (
     usable_mask,
     weigh,
 )
-from sfm_app.camera.projection import PERSPECTIVE
+from sfm_app.camera.rows import PERSPECTIVE
 
 CAMERA = np.array([[900.0, 900.0, 500.0, 400.0, *[0.0] * 8]])
 FAMILY = np.array([PERSPECTIVE])

@@ -20,7 +20,7 @@ from sfm_app.bundle.rolling_shutter import (
     shutter_cost,
     shutter_step,
 )
-from sfm_app.camera.projection import CAMERA, PERSPECTIVE
+from sfm_app.camera.rows import CAMERA, PERSPECTIVE
 from sfm_app.synthetic.cameras import Camera, make_camera
 
 INTERVAL_S, POINTS, DEPTHS, NOISE_PX = 0.1, 500, (2.0, 8.0), 0.3

@@ -5,17 +5,9 @@ import pytest
 
 from sfm_app.camera import bearings
 from sfm_app.camera.models import calibration_from_model, camera_matrix, panorama_matrix
-from sfm_app.camera.projection import (
-    FISHEYE,
-    K1,
-    OPTIONS,
-    PERSPECTIVE,
-    RAY,
-    fold_radius,
-    image_points,
-    image_rays,
-    lens_terms,
-)
+from sfm_app.camera.projection import OPTIONS, RAY, fold_radius, image_points, image_rays, lens_terms
+from sfm_app.camera.rows import FISHEYE, K1, PERSPECTIVE
+from sfm_app.geometry.epipolar import pixels_per_radian
 from sfm_app.types import Calibration
 
 K = np.array([[200.0, 0.0, 400.0], [0.0, 210.0, 300.0], [0.0, 0.0, 1.0]])
@@ -63,7 +55,7 @@ def test_a_lens_that_folds_shows_nothing_beyond_its_fold() -> None:
 
 def test_a_perspective_camera_sees_nothing_behind_it_and_its_scale_is_its_mean_focal() -> None:
     assert np.isnan(bearings.project(np.array([[0.1, 0.2, -1.0]]), CAMERAS["perspective"])).all()
-    assert bearings.pixels_per_radian(bearings.bearings(PIXELS, CAMERAS["perspective"])) == pytest.approx(205.0)
+    assert pixels_per_radian(bearings.bearings(PIXELS, CAMERAS["perspective"])) == pytest.approx(205.0)
 
 
 TERMS = np.array([-0.1, 0.02, 0.001, -0.002, 0.01, 0.02, -0.001, 0.001])

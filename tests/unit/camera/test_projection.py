@@ -9,17 +9,8 @@ from scipy.spatial.transform import Rotation
 from sfm_app.bundle.normal_equations import REDUCTION, Bundle, apply_step, project, reduce, residuals
 from sfm_app.camera.bearings import bearings
 from sfm_app.camera.models import FAMILIES, PARAMETERS, calibration_from_model, row_of_calibration
-from sfm_app.camera.projection import (
-    CAMERA,
-    FISHEYE,
-    PANORAMA,
-    PERSPECTIVE,
-    angle_limit,
-    image_points,
-    image_rays,
-    project_points,
-    radius_at,
-)
+from sfm_app.camera.projection import angle_limit, image_points, image_rays, project_points, radius_at
+from sfm_app.camera.rows import CAMERA, FISHEYE, PANORAMA, PERSPECTIVE
 from sfm_app.colmap.backend import pycolmap
 
 BENT = (900.0, 950.0, 510.0, 390.0, -0.1, 0.05, 0.002, -0.003, 0.01, 0.02, -0.01, 0.005)

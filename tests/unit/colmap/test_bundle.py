@@ -8,7 +8,7 @@ import pytest
 from sfm_app.bundle.lens_parts import CameraRule
 from sfm_app.bundle.normal_equations import reduce
 from sfm_app.camera.models import calibration_from_model, camera_matrix
-from sfm_app.camera.projection import CAMERA, FISHEYE, FX, K1, K2, K3, P1, PANORAMA
+from sfm_app.camera.rows import CAMERA, FISHEYE, FX, K1, K2, K3, P1, PANORAMA
 from sfm_app.colmap import bundle
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundle import (

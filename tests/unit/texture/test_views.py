@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from painted_box import around
 
-from sfm_app.camera.projection import FISHEYE, PERSPECTIVE, project_points
+from sfm_app.camera.projection import project_points
+from sfm_app.camera.rows import FISHEYE, PERSPECTIVE
 from sfm_app.errors import ReconstructionError
 from sfm_app.photos.panoramas import panorama_parts
 from sfm_app.stages.texture import photo_views
