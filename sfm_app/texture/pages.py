@@ -224,26 +224,57 @@ def _clamp_coordinates(part: FloatArray, least: FloatArray) -> None:
 def _finish_page(page: Canvas) -> Page:
     """Return the page in 8-bit RGB, black at texels without an owner, and (H, W) whether a texel has an owner."""
     rounded = np.empty(page.total.shape, np.uint8)
-    for row, total in zip(rounded, page.total, strict=True):  # a page of sums is large
-        row[:] = np.clip((total + LEVELS_PER_GRAY // 2) // LEVELS_PER_GRAY, 0, 255)
+    _round_levels(page.total, rounded)
     return rounded, page.owner != NONE
+
+
+@kernel
+def _round_levels(total: IntArray, rounded: NDArray[np.uint8]) -> None:
+    for y in range(total.shape[0]):
+        for x in range(total.shape[1]):
+            for channel in range(3):
+                level = (total[y, x, channel] + LEVELS_PER_GRAY // 2) // LEVELS_PER_GRAY
+                rounded[y, x, channel] = min(max(level, 0), 255)
 
 
 def fill_background(page: NDArray[np.uint8], painted: BoolArray) -> NDArray[np.uint8]:
     """Fill unpainted texels with the mean painted color of the smallest block around them, as mipmaps have it."""
     if painted.all() or min(page.shape[:2]) < 2:
         return page
-    height, width = page.shape[0] // 2, page.shape[1] // 2
-    total, count = np.zeros((height, width, 3), np.uint16), np.zeros((height, width, 1), np.uint16)
-    for dy, dx in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        block = np.s_[dy : 2 * height : 2, dx : 2 * width : 2]
-        count += painted[block][..., None]
-        total += page[block] * painted[block][..., None]
-    coarse = fill_background((total // np.maximum(count, 1)).astype(np.uint8), count[..., 0] > 0)
-    row, column = (
-        np.minimum(np.arange(side) // 2, half - 1) for side, half in ((page.shape[0], height), (page.shape[1], width))
-    )
-    return np.where(painted[..., None], page, coarse[row][:, column])
+    shape = page.shape[0] // 2, page.shape[1] // 2
+    means, known = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.bool_)
+    _average_blocks(page, painted, means, known)
+    filled = page.copy()
+    _fill_gaps(fill_background(means, known), painted, filled)
+    return filled
+
+
+@kernel
+def _average_blocks(page: NDArray[np.uint8], painted: BoolArray, means: NDArray[np.uint8], known: BoolArray) -> None:
+    """Write the mean painted color of each block of 2 x 2 texels, and whether it has one."""
+    for y in range(known.shape[0]):
+        for x in range(known.shape[1]):
+            count = 0
+            for k in range(4):
+                count += painted[2 * y + k // 2, 2 * x + k % 2]
+            known[y, x] = count > 0
+            for channel in range(3):
+                total = 0
+                for k in range(4):
+                    if painted[2 * y + k // 2, 2 * x + k % 2]:
+                        total += page[2 * y + k // 2, 2 * x + k % 2, channel]
+                means[y, x, channel] = total // max(count, 1)
+
+
+@kernel
+def _fill_gaps(coarse: NDArray[np.uint8], painted: BoolArray, page: NDArray[np.uint8]) -> None:
+    for y in range(page.shape[0]):
+        for x in range(page.shape[1]):
+            if not painted[y, x]:
+                for channel in range(3):
+                    page[y, x, channel] = coarse[
+                        min(y // 2, coarse.shape[0] - 1), min(x // 2, coarse.shape[1] - 1), channel
+                    ]
 
 
 @dataclass(frozen=True, slots=True)
