@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.jit import kernel
 from sfm_app.texture.sightings import NONE, Facets, IntArray, Sightings, distinct
 from sfm_app.types.arrays import FloatArray, IndexArray
 
@@ -106,32 +107,79 @@ def level_seams(blend: Blend, sightings: Sightings, gains: FloatArray, mesh: Fac
 def solve_ties(
     one: IndexArray, other: IndexArray, weights: FloatArray, hold: float | FloatArray, right: FloatArray
 ) -> FloatArray:
-    """Solve (graph Laplacian of the edges + hold) x = right (N, 3) by at most 100 steps of conjugate gradients.
-
-    They are scaled by the diagonal. `hold` is a number or (N,).
-    """
+    """Solve (graph Laplacian of the edges + hold) x = right (N, 3) by conjugate gradients; hold is a number or (N,)."""
     from scipy.sparse import coo_matrix
 
     size = len(right)
-    diagonal = (np.bincount(one, weights, size) + np.bincount(other, weights, size) + hold)[:, None]
+    diagonal = np.bincount(one, weights, size) + np.bincount(other, weights, size) + hold
     rows, columns = np.concatenate([one, other]), np.concatenate([other, one])
     ties = coo_matrix((np.concatenate([weights, weights]), (rows, columns)), shape=(size, size)).tocsr()
-    x, residual = np.zeros((size, 3)), right
-    direction = residual / diagonal
-    energy = (residual * direction).sum(axis=0)
-    tolerance = 1e-2 * 1e-2 * energy
-    for _ in range(100):
-        if (energy <= tolerance).all():
-            break
-        product = diagonal * direction - ties @ direction
-        curvature = (direction * product).sum(axis=0)
-        step = np.divide(energy, curvature, out=np.zeros(3), where=curvature > 0.0)
-        x += step * direction
-        residual = residual - step * product
-        scaled, before = residual / diagonal, energy
-        energy = (residual * scaled).sum(axis=0)
-        direction = scaled + np.divide(energy, before, out=np.zeros(3), where=before > 0.0) * direction
+    x = np.zeros((size, 3))
+    _solve(ties.indptr, ties.indices, ties.data, np.asarray(diagonal), np.ascontiguousarray(right), x)
     return x
+
+
+@kernel
+def _solve(
+    starts: NDArray[np.int32], others: NDArray[np.int32], weights: FloatArray, diagonal: FloatArray, right: FloatArray,
+    x: FloatArray,
+) -> None:  # fmt: skip
+    """Solve (diagonal - weights) x = right by at most 100 steps of conjugate gradients, scaled by the diagonal."""
+    size, channels = len(right), 3
+    residual, direction, product = right.copy(), np.empty_like(right), np.empty_like(right)
+    tolerance, step = np.zeros(channels), np.zeros(channels)
+    energy = _precondition(residual, diagonal, direction)
+    for c in range(channels):  # assigning rows compiles for a second
+        tolerance[c] = 1e-2 * 1e-2 * energy[c]
+    for _ in range(100):
+        if energy[0] <= tolerance[0] and energy[1] <= tolerance[1] and energy[2] <= tolerance[2]:
+            break
+        curvature = _multiply(starts, others, weights, diagonal, direction, product)
+        before = energy
+        for c in range(channels):
+            step[c] = energy[c] / curvature[c] if curvature[c] > 0.0 else 0.0
+        for n in range(size):
+            for c in range(channels):
+                x[n, c] += step[c] * direction[n, c]
+                residual[n, c] -= step[c] * product[n, c]
+        energy = _precondition(residual, diagonal, product)
+        for c in range(channels):
+            step[c] = energy[c] / before[c] if before[c] > 0.0 else 0.0
+        for n in range(size):
+            for c in range(channels):
+                direction[n, c] = product[n, c] + step[c] * direction[n, c]
+
+
+@kernel
+def _precondition(residual: FloatArray, diagonal: FloatArray, scaled: FloatArray) -> FloatArray:
+    """Write the residual over the diagonal; return (3,) the products of both."""
+    energy = np.zeros(3)
+    for n in range(len(residual)):
+        for c in range(3):
+            scaled[n, c] = residual[n, c] / diagonal[n]
+            energy[c] += residual[n, c] * scaled[n, c]
+    return energy
+
+
+@kernel
+def _multiply(
+    starts: NDArray[np.int32], others: NDArray[np.int32], weights: FloatArray, diagonal: FloatArray,
+    direction: FloatArray, product: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """Write the product of the matrix and a direction; return (3,) the products of both."""
+    curvature = np.zeros(3)
+    for n in range(len(diagonal)):
+        red, green, blue = diagonal[n] * direction[n, 0], diagonal[n] * direction[n, 1], diagonal[n] * direction[n, 2]
+        for k in range(starts[n], starts[n + 1]):
+            weight, other = weights[k], others[k]
+            red -= weight * direction[other, 0]
+            green -= weight * direction[other, 1]
+            blue -= weight * direction[other, 2]
+        product[n, 0], product[n, 1], product[n, 2] = red, green, blue
+        curvature[0] += direction[n, 0] * red
+        curvature[1] += direction[n, 1] * green
+        curvature[2] += direction[n, 2] * blue
+    return curvature
 
 
 def _gaps(
