@@ -9,7 +9,7 @@ from sfm_app.camera.models import calibration_from_model
 from sfm_app.frame.sighted_points import Distance
 from sfm_app.settings import HYPOTHESES
 from sfm_app.types import Calibration, CameraModel, Intrinsics, Scene
-from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE, GIVEN, KEPT, PERSPECTIVE
+from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE, GIVEN, KEPT
 from sfm_app.wording import format_length, list_names
 
 # A calibration in everyday words.
@@ -36,40 +36,6 @@ def field_text(camera: Calibration) -> str:
     return f"a fisheye that {field}" if camera.projection == FISHEYE and max(across, down) >= 90.0 else field
 
 
-def verdict(camera: Calibration) -> str:
-    """Return whether K is known; if not, why, and the source of the values."""
-    if camera.is_given:
-        return "Given: the user knows this camera."
-    if camera.identifiable:
-        return "Known: the photos agree on this camera."
-    source = SOURCES.get(camera.method, camera.method)
-    return f"Not known: these photos do not determine the camera: {camera.reason}. Its values are {source}."
-
-
-def focal_text(camera: Calibration) -> str:
-    """Return focal length and field of view."""
-    if camera.projection == EQUIRECTANGULAR:
-        return f"360-degree panoramas, {camera.width} x {camera.height} px."
-    focal = f"Focal length {camera.focal_px:.0f} px{_deviation(camera, 'fx')}"
-    tall = camera.K[0, 0] / camera.K[1, 1]
-    shape = (
-        "" if "aspect" in camera.held or abs(tall - 1) < 5e-4 else f"; its pixels are {tall:.3f} times as high as wide"
-    )
-    return f"{focal}: {'the camera ' if camera.projection == PERSPECTIVE else ''}{field_text(camera)}{shape}."
-
-
-def center_text(camera: Calibration) -> str:
-    """Return the optical center relative to the middle of the photo; empty for panoramas."""
-    if camera.projection == EQUIRECTANGULAR:
-        return ""
-    right, below = camera.K[0, 2] - camera.width / 2, camera.K[1, 2] - camera.height / 2
-    if max(abs(right), abs(below)) < 0.5:
-        return "Optical center in the middle of the photo."
-    across = f"{abs(right):.0f} px{_deviation(camera, 'cx')} {'right' if right > 0 else 'left'} of"
-    down = f"{abs(below):.0f} px{_deviation(camera, 'cy')} {'below' if below > 0 else 'above'}"
-    return f"Optical center {across} and {down} the middle of the photo."
-
-
 def lens_text(camera: Calibration) -> str:
     """Return the radial distortion; empty if there is none or the photos do not determine it."""
     if camera.radial == 0.0 or "k1" in camera.held:
@@ -86,11 +52,6 @@ def held_text(camera: Calibration) -> str:
     if not camera.held or not camera.identifiable:
         return ""
     return "Assumed, since the photos do not determine it: " + ", ".join(HELD.get(n, n) for n in camera.held) + "."
-
-
-def _deviation(camera: Calibration, name: str) -> str:
-    value = camera.spread.get(name, 0.0)
-    return f" +- {value:.0f}" if value >= 1.5 else f" +- {value:.1f}" if value > 0 else ""
 
 
 def duration_text(seconds: float) -> str:
@@ -125,15 +86,21 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
     many = len(intrinsics.cameras) > 1
     lines = []
     for name, camera in intrinsics.cameras.items():
-        lines.append(f"camera      {f'{name}: ' if many else ''}{_camera_text(camera)}")
+        first, *others = camera_texts(camera)
+        lines.append(f"camera      {f'{name}: ' if many else ''}{first}")
         photos = [photo for photo, of in intrinsics.camera_of.items() if of == name]
         if many and photos:
             lines.append(f"            took {list_names(photos, NAMES_SHOWN)}")
-        lines += [f"            {text}" for text in _property_texts(camera, intrinsics.photos)]
+        if camera.key_pairs:
+            named = [[intrinsics.photos.get(key, str(key)) for key in pair] for pair in camera.key_pairs[:3]]
+            others.append(f"best initial pairs of photos: {', '.join(' + '.join(pair) for pair in named)}")
+        lines += [f"            {text}" for text in others]
     return lines
 
 
-def _property_texts(camera: Calibration, photos: Mapping[int, str]) -> Iterator[str]:
+def camera_texts(camera: Calibration) -> Iterator[str]:
+    """Yield a calibration, one text per property: K first, then its source, field of view, lens and assumptions."""
+    yield _camera_text(camera)
     if not camera.identifiable:
         source = SOURCES.get(camera.method, camera.method)
         yield f"these photos do not determine it ({camera.reason}): {source}"
@@ -142,10 +109,6 @@ def _property_texts(camera: Calibration, photos: Mapping[int, str]) -> Iterator[
     if camera.projection != EQUIRECTANGULAR:
         yield field_text(camera)
     yield from filter(None, (lens_text(camera), held_text(camera)))
-    if camera.key_pairs:
-        named = [[photos.get(key, str(key)) for key in pair] for pair in camera.key_pairs[:3]]
-        best = ", ".join(f"{first} + {second}" for first, second in named)
-        yield f"best initial pairs of photos: {best}"
 
 
 def _camera_text(camera: Calibration) -> str:
