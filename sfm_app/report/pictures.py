@@ -238,23 +238,13 @@ class DepthPicture:
     """Width and height in pixels, so that the layout is stable while it loads."""
 
 
-@dataclass(frozen=True, slots=True)
-class DepthPictures:
-    """Some photos with their depth maps."""
-
-    pictures: Sequence[DepthPicture]
-    count: int
-    """Photos, or views of wide photos, with a depth map."""
-
-
-def depth_pictures(contents: RunContents) -> DepthPictures | None:
-    """Return some photos beside their depth maps; None without depth maps."""
+def depth_pictures(contents: RunContents) -> list[DepthPicture]:
+    """Return some photos beside their depth maps."""
     coverage: Mapping[str, float] = contents.counts("depth_maps").get("coverage", {})
     dense = contents.run.workspace.dense
     chosen = spread_names(sorted(coverage), MOST_SHOWN)
     drawn = contents.run.map(lambda name: _draw(dense, name, coverage[name]), chosen, "depth maps of the report")
-    pictures = [picture for picture in drawn if picture is not None]
-    return DepthPictures(pictures, len(coverage)) if pictures else None
+    return [picture for picture in drawn if picture is not None]
 
 
 def spread_names(names: Sequence[str], most: int) -> list[str]:
