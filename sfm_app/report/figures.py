@@ -44,8 +44,8 @@ class FigureOptions:
     """Samples along each zero curve; with fewer, steep curves look ragged. By hand."""
     vote_sigma: float = 0.05
     """Width of a vote, in units of r as in `Consensus`: the wider one of the search. By hand."""
-    ellipse_deviations: float = 3.0
-    """Standard deviations of the ellipse: at most 1 % of true values lie outside. By convention."""
+    bar_deviations: float = 3.0
+    """Standard deviations on both sides of the estimate. By convention."""
     band_deviations: float = 2.0
     """Standard deviations on both sides of the lens curve. By convention."""
     most_cameras: int = 4
@@ -172,48 +172,21 @@ def center_plane(camera: Calibration, pairs: Pairs) -> ParameterPlane:
 def _draw_plane(axes: "Axes", plane: ParameterPlane, camera: Calibration, pairs: Pairs) -> None:
     shades = vote_shares(plane, camera, pairs)
     axes.imshow(shades, extent=plane.extent, origin="lower", cmap="inferno", vmin=0, vmax=1, interpolation="bilinear")
-    _draw_curves(axes, plane, plane.extent, OPTIONS.curve_samples)
-    marker, label = ("o", "estimate") if camera.identifiable else ("X", "a guess")
-    axes.plot(*plane.estimate, marker, markersize=12, fillstyle="none", color=MARK, markeredgewidth=1.6, label=label)
-    axes.set(title=plane.title, xlabel=plane.labels[0], ylabel=plane.labels[1], aspect="equal")
-    if camera.identifiable and min(plane.spread) > 0:
-        _enlarge(axes, plane, camera)
-    axes.legend(loc="lower right", labelcolor=CURVE, framealpha=0.6, facecolor="black", edgecolor="none")
-
-
-def _draw_curves(axes: "Axes", plane: ParameterPlane, extent: tuple[float, float, float, float], samples: int) -> None:
-    """Draw the part of all curves within `extent`; many curves are faint."""
-    left, right, bottom, top = extent
-    x = _midpoints(left, right, samples)
-    y = _mask_jumps(plane.curves(x), min(bottom, top), max(bottom, top))
-    axes.plot(x, y.T, color=CURVE, linewidth=0.6, alpha=float(np.clip(12.0 / max(len(y), 1), 0.2, 0.8)))
-    axes.set(xlim=(left, right), ylim=(bottom, top))
-
-
-def _enlarge(axes: "Axes", plane: ParameterPlane, camera: Calibration) -> None:
-    """Draw the ellipse of the deviations, enlarged in an inset if it is small."""
-    from matplotlib.patches import Ellipse
-
-    (x, y), (dx, dy) = plane.estimate, (OPTIONS.ellipse_deviations * value for value in plane.spread)
     left, right, bottom, top = plane.extent
-    target = axes
-    if max(dx / abs(right - left), dy / abs(top - bottom)) < 0.1:  # by hand
-        reach = 2.5 * max(dx, dy)
-        window = (x - reach, x + reach, y - np.sign(top - bottom) * reach, y + np.sign(top - bottom) * reach)
-        target = axes.inset_axes((0.63, 0.63, 0.35, 0.35))
-        target.set_facecolor("#20123a")
-        _draw_curves(target, plane, window, 60)
-        target.tick_params(colors=CURVE, labelsize=7)
-        target.locator_params(nbins=3)
-        axes.indicate_inset_zoom(target, edgecolor=GUIDE)
-    label = f"{OPTIONS.ellipse_deviations:.0f} standard deviations"
-    if plane.names[0] == "fx" and ("aspect" in camera.held or camera.K[0, 0] == camera.K[1, 1]):
-        # pixels are assumed square: fx and fy have the same error
-        target.plot((x - dx, x + dx), (y - dy, y + dy), color=MARK, linewidth=1.8, label=label)
-    else:
-        target.add_patch(Ellipse((x, y), 2 * dx, 2 * dy, fill=False, edgecolor=MARK, linewidth=1.4, label=label))
-    if target is not axes:
-        axes.plot([], [], color=MARK, linewidth=1.6, label=f"{label} (enlarged)")
+    x = _midpoints(left, right, OPTIONS.curve_samples)
+    y = _mask_jumps(plane.curves(x), min(bottom, top), max(bottom, top))
+    # many curves are faint
+    axes.plot(x, y.T, color=CURVE, linewidth=0.6, alpha=float(np.clip(12.0 / max(len(y), 1), 0.2, 0.8)))
+    across, down = (OPTIONS.bar_deviations * deviation for deviation in plane.spread)
+    marker, label = ("o", "estimate") if camera.identifiable else ("X", "a guess")
+    label += f" ± {OPTIONS.bar_deviations:.0f} standard deviations" if min(plane.spread) > 0 else ""
+    axes.errorbar(
+        *plane.estimate, xerr=across, yerr=down, fmt=marker, markersize=12, fillstyle="none", color=MARK,
+        markeredgewidth=1.6, label=label,
+    )  # fmt: skip
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+    axes.set(title=plane.title, xlabel=plane.labels[0], ylabel=plane.labels[1])
+    axes.legend(loc="lower right", labelcolor=CURVE, framealpha=0.6, facecolor="black", edgecolor="none")
 
 
 def vote_shares(plane: ParameterPlane, camera: Calibration, pairs: Pairs) -> FloatArray:

@@ -204,13 +204,13 @@ def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
 
 def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
     """Yield the scene as lines of text; `counts` are figures of the stage."""
-    summary = scene_summary(scene, counts)
+    placed = len(scene.registered)
     yield (
-        f"scene       {summary['registered']} of {summary['of']} photos placed, {scene.points} points, "
-        f"mean reprojection error {summary['mean_reprojection_px']} px"
+        f"scene       {placed} of {placed + len(scene.unregistered)} photos placed, {scene.points} points, "
+        f"mean reprojection error {round(scene.mean_reprojection_px, 3)} px"
     )
-    yield from (f"            {text}" for text in _remark_lines(summary, counts))
-    named = {name for names in summary.get("other_models", ()) for name in names}
+    yield from (f"            {text}" for text in _remark_lines(counts))
+    named = {name for names in counts.get("other_models", ()) for name in names}
     for name, reason in scene.unregistered.items():
         if name not in named:
             yield f"            not placed: {name}: {reason}"
@@ -222,13 +222,13 @@ def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
     yield from (f"            {text}" for text in contradiction_lines(counts))
 
 
-def _remark_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]:
-    if summary.get("mapper") in MAPPERS:
-        yield from _mapping_lines(summary, counts)
-    for photos in summary.get("cut_apart", ()):
+def _remark_lines(counts: Mapping[str, Any]) -> Iterator[str]:
+    if counts.get("mapper") in MAPPERS:
+        yield from _mapping_lines(counts)
+    for photos in counts.get("cut_apart", ()):
         yield f"split, because more matches contradict the connection than support it: {photos}"
-    yield from _doubt_lines(summary)
-    for number, names in enumerate(summary.get("other_models", ()), start=1):
+    yield from _doubt_lines(counts)
+    for number, names in enumerate(counts.get("other_models", ()), start=1):
         yield f"another model of {len(names)} photos in other_models/{number}: {list_names(names, NAMES_SHOWN)}"
     explained, against = counts.get("explained_matches", 0), counts.get("contradicted_matches", 0)
     if against > 0.1 * (explained + against):
@@ -236,14 +236,14 @@ def _remark_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iter
             f"beware: {100 * against / (explained + against):.0f} % of the matches between these photos contradict "
             "the model; look for places that look alike"
         )
-    yield from _shutter_lines(summary.get("shutter", {}))
-    yield from _adjustment_warnings(summary.get("adjustment", {}))
-    yield from _orientation_lines(summary.get("orientation", {}))
+    yield from _shutter_lines(counts.get("shutter", {}))
+    yield from _adjustment_warnings(counts.get("adjustment", {}))
+    yield from _orientation_lines(counts.get("orientation", {}))
 
 
-def _mapping_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]:
+def _mapping_lines(counts: Mapping[str, Any]) -> Iterator[str]:
     because = f": {counts['mapper_reason']}" if counts.get("mapper_reason") else ""
-    yield f"mapped {MAPPERS[summary['mapper']]}{because}"
+    yield f"mapped {MAPPERS[counts['mapper']]}{because}"
     for joins in (one["dropped_joins"] for one in counts.get("parts", ()) if one["dropped_joins"]):
         yield f"rejected joins between parts, which other joins or matches contradict: {len(joins)}"
     for trial in counts.get("hypotheses", ()):
@@ -253,7 +253,7 @@ def _mapping_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Ite
             failed = f"it failed: {trial['failure']}" if trial["failure"] else "it is no better"
             result = gain if trial["accepted"] else failed
             yield f"tried {HYPOTHESES[trial['name']]}, because {trial['reason']}: {result}"
-    if dropped := sum(summary.get("pairs_dropped", {}).values()):
+    if dropped := sum(counts.get("pairs_dropped", {}).values()):
         yield f"rejected pairs of photos that contradict the others: {dropped}"
 
 
@@ -279,25 +279,25 @@ def _adjustment_warnings(adjustment: Mapping[str, Any]) -> Iterator[str]:
         yield f"beware: these photos do not determine camera {name}; it keeps its values from mapping"
 
 
-def _doubt_lines(summary: Mapping[str, Any]) -> Iterator[str]:
-    for join in summary.get("look_alikes", ()):
+def _doubt_lines(counts: Mapping[str, Any]) -> Iterator[str]:
+    for join in counts.get("look_alikes", ()):
         here, there = (list_names(names, NAMES_SHOWN) for names in join["between"])
         yield (
             f"look-alikes separated, {join['pairs']} pairs of photos: {here} | {there} "
             f"({100 * join['missing']:.0f} % of the expected overlap is missing)"
         )
-    for join in summary.get("perhaps_look_alikes", ()):
+    for join in counts.get("perhaps_look_alikes", ()):
         here, there = (list_names(names, NAMES_SHOWN) for names in join["between"])
         yield (
             f"beware: a loop, or look-alikes: {join['pairs']} pairs match {here} with {there}, "
             "but no photos between them confirm it"
         )
-    for names in summary.get("weakly_joined", ()):
+    for names in counts.get("weakly_joined", ()):
         yield (
             f"beware: few points determine the distance of {list_names(names, NAMES_SHOWN)} from the rest; "
             "take more photos between them"
         )
-    for before, after in summary.get("jumps", ()):
+    for before, after in counts.get("jumps", ()):
         yield f"beware: a jump between the consecutive photos {before} and {after}; in a video, a sign of look-alikes"
 
 
