@@ -2,6 +2,7 @@
 
 import platform
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 from sfm_app.colmap.backend import has_cuda
@@ -28,39 +29,31 @@ def examine() -> dict[str, str]:
         "missing in this system": ", ".join(missing_abilities()) or "nothing",
         **versions(),
         "COLMAP with CUDA": "yes" if has_cuda() else "no",
-        "depth maps": _depth_maps(),
-        "ray casting (Open3D)": _open3d(),
-        "plug-ins": _plugins(),
+        "depth maps": _try(_depth_method),
+        "ray casting (Open3D)": _try(lambda: f"works, {load_open3d().__version__}"),
+        "plug-ins": _try(_count_methods),
     }
 
 
-def _depth_maps() -> str:
+def _try(examine_part: Callable[[], str]) -> str:
     try:
-        method, reason = load_plugins().depth_method("auto")
+        return examine_part()
     except SfmError as err:
-        return f"broken: {err}"
+        return f"broken: {err}; {err.hint}"
+
+
+def _depth_method() -> str:
+    method, reason = load_plugins().depth_method("auto")
     return f"{method.name} ({reason})"
 
 
-def _open3d() -> str:
-    try:
-        return f"works, {load_open3d().__version__}"
-    except SfmError as err:
-        return f"{err}; {err.hint}"
-
-
-def _plugins() -> str:
-    try:
-        methods = load_plugins()
-    except SfmError as err:
-        return f"broken: {err}"
-    return ", ".join(
-        f"{len(parts)} {name}"
-        for name, parts in (
-            ("feature methods", methods.features),
-            ("estimators", methods.estimators),
-            ("calibrators", methods.calibrators),
-            ("formats", {**methods.exporters, **methods.scene_exporters}),
-            ("depth methods", methods.depth_methods),
-        )
-    )
+def _count_methods() -> str:
+    methods = load_plugins()
+    parts = {
+        "feature methods": methods.features,
+        "estimators": methods.estimators,
+        "calibrators": methods.calibrators,
+        "formats": {**methods.exporters, **methods.scene_exporters},
+        "depth methods": methods.depth_methods,
+    }
+    return ", ".join(f"{len(part)} {name}" for name, part in parts.items())

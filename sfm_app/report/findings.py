@@ -17,11 +17,9 @@ from sfm_app.report.contents import RunContents, data_address
 from sfm_app.report.text import (
     SOURCES,
     WARNING,
-    contradiction_lines,
     duration_text,
     intrinsics_lines,
-    scale_lines,
-    scene_lines,
+    result_lines,
 )
 from sfm_app.runtime.workspace import model_triangles
 from sfm_app.settings import Settings
@@ -163,14 +161,7 @@ def _unit_fact(contents: RunContents) -> Fact:
 
 def remarks(contents: RunContents) -> tuple[list[str], list[str]]:
     """Return the warnings of a run, each with a remedy, and its other remarks."""
-    lines = list(intrinsics_lines(contents.intrinsics)) if contents.intrinsics is not None else []
-    for stage in ("view_graph", "intrinsics"):
-        lines += contradiction_lines(contents.counts(stage))
-    if contents.scene is not None:
-        lines += scene_lines(contents.scene, contents.counts("scene"))
-    if "scale" in contents.stages:
-        lines += scale_lines(contents.counts("scale"))
-    texts = [plain_text(line) for line in lines]
+    texts = [plain_text(line) for line in result_lines(contents.intrinsics, contents.scene, contents.stages)]
     warnings = [text.removeprefix(WARNING) for text in texts if text.startswith(WARNING)]
     others = [text for text in texts if not text.startswith((WARNING, UNKNOWN_CAMERA))]
     return warnings + unknown_cameras(contents), others

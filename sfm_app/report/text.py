@@ -171,6 +171,20 @@ def distance_text(distance: Distance) -> str:
     return f"{format_length(distance.value)} +- {format_length(distance.deviation)}"
 
 
+# A whole run.
+
+
+def result_lines(intrinsics: Intrinsics | None, scene: Scene | None, stages: Mapping[str, Any]) -> list[str]:
+    """Return cameras, scene and size as lines of text; `stages` are the records of the manifest."""
+    counts = {name: stage["counts"] for name, stage in stages.items()}
+    lines = intrinsics_lines(intrinsics) if intrinsics is not None else []
+    for stage in ("view_graph", "intrinsics"):
+        lines += [f"            {text}" for text in contradiction_lines(counts.get(stage, {}))]
+    if scene is not None:
+        lines += scene_lines(scene, counts.get("scene", {}))
+    return [*lines, *scale_lines(counts["scale"])] if "scale" in counts else lines
+
+
 # Summaries of a run's scene: lines of text, and plain values for --json.
 
 MAPPERS = {
