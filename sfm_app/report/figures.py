@@ -83,11 +83,10 @@ def residual_grid(x: FloatArray, distances_px: FloatArray, size: tuple[int, int]
     from scipy.stats import binned_statistic_2d
 
     side = max(size) / OPTIONS.residual_cells
-    cells, edges = [max(1, round(length / side)) for length in size], [(0, length) for length in size]
-    medians, counts = (
-        binned_statistic_2d(*x.T, distances_px, name, cells, edges).statistic.T for name in ("median", "count")
-    )
-    return np.where(counts >= OPTIONS.least_keypoints, medians, np.nan)
+    edges = [np.linspace(0.0, length, max(1, round(length / side)) + 1) for length in size]
+    medians = binned_statistic_2d(x[:, 0], x[:, 1], distances_px, "median", edges).statistic
+    counts = np.histogram2d(x[:, 0], x[:, 1], edges)[0]
+    return np.where(counts >= OPTIONS.least_keypoints, medians, np.nan).T
 
 
 def _matrix_of_rays(F: FloatArray, lines: FloatArray, camera: Calibration) -> FloatArray:
@@ -298,8 +297,7 @@ def _draw_residuals(part: "SubFigure", axes: "Axes", camera: Calibration, pairs:
     axes.set(xlim=extent[:2], ylim=extent[2:], aspect="equal", facecolor="#e8e8e8")
     axes.set(xlabel="across the photo, px", ylabel="down the photo, px")
     x, distances = epipolar_residuals(pairs, camera)
-    grid = residual_grid(x, distances, size)
-    if np.isnan(grid).all():
+    if not len(x) or np.isnan(grid := residual_grid(x, distances, size)).all():
         axes.set_title("Residuals: no pair of photos is from this camera alone")
         return
     image = axes.imshow(grid, extent=extent, cmap="YlOrBr", vmin=0.0, interpolation="nearest")
