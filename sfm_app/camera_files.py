@@ -3,6 +3,7 @@
 The functions for one program raise ValueError where a file is damaged, or a camera is not supported.
 """
 
+import io
 import json
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -54,16 +55,16 @@ def read_colmap_text(text: str) -> dict[str, Calibration]:
 
 def read_colmap_binary(data: bytes) -> dict[str, Calibration]:
     """Return the cameras of a cameras.bin by their ids."""
-    cameras, reader = {}, _Reader(data)
-    (count,) = reader.take("<Q")
+    cameras, stream = {}, io.BytesIO(data)
+    (count,) = _take(stream, "<Q")
     if count > 1_000_000:
         raise ValueError(DAMAGED)
     for _ in range(int(count)):
-        camera_id, model_id, width, height = reader.take("<IiQQ")
+        camera_id, model_id, width, height = _take(stream, "<IiQQ")
         if model_id not in MODEL_IDS:
             raise ValueError(f"camera {camera_id} has a model that is not supported: only {', '.join(PARAMETERS)}")
         model = MODEL_IDS[int(model_id)]
-        params = reader.take(f"<{len(PARAMETERS[model])}d")
+        params = _take(stream, f"<{len(PARAMETERS[model])}d")
         cameras[str(camera_id)] = calibration_from_model(model, params, (int(width), int(height)))
     return cameras
 
@@ -91,39 +92,24 @@ def _text_images(text: str) -> Iterator[tuple[str, str]]:
 
 
 def _binary_images(data: bytes) -> Iterator[tuple[str, str]]:
-    reader = _Reader(data)
-    (count,) = reader.take("<Q")
+    stream = io.BytesIO(data)
+    (count,) = _take(stream, "<Q")
     for _ in range(int(count)):
-        *_, camera_id = reader.take("<I7dI")
-        name = reader.take_text()
-        (points,) = reader.take("<Q")
-        reader.skip(24 * int(points))
-        yield name, str(camera_id)
+        *_, camera_id = _take(stream, "<I7dI")
+        name = bytearray()
+        while (letter := _take(stream, "c")[0]) != b"\0":
+            name += letter
+        (points,) = _take(stream, "<Q")
+        stream.seek(24 * int(points), io.SEEK_CUR)
+        yield name.decode("utf-8", "replace"), str(camera_id)
 
 
-class _Reader:
-    """Reads bytes one value after the other; ValueError at their end."""
-
-    def __init__(self, data: bytes) -> None:
-        self.data, self.place = data, 0
-
-    def take(self, form: str) -> tuple[float, ...]:
-        start = self.place
-        self.skip(struct.calcsize(form))
-        return struct.unpack_from(form, self.data, start)
-
-    def take_text(self) -> str:
-        end = self.data.find(b"\0", self.place, self.place + 4096)
-        if end < 0:
-            raise ValueError(DAMAGED)
-        text = self.data[self.place : end].decode("utf-8", "replace")
-        self.place = end + 1
-        return text
-
-    def skip(self, count: int) -> None:
-        if self.place + count > len(self.data):
-            raise ValueError(DAMAGED)
-        self.place += count
+def _take(stream: io.BytesIO, form: str) -> tuple[Any, ...]:
+    """Return the next values of a stream, by a format of `struct`; ValueError at its end."""
+    data = stream.read(struct.calcsize(form))
+    if len(data) < struct.calcsize(form):
+        raise ValueError(DAMAGED)
+    return struct.unpack(form, data)
 
 
 # Cameras as OpenCV writes them: camera matrix and distortion coefficients in JSON, YAML or XML.

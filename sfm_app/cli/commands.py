@@ -1,7 +1,10 @@
 """All commands. What takes long to import is imported when a command runs, so that --help prints at once."""
 
 import os
+import platform
+import shutil
 import sys
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from time import monotonic
@@ -20,7 +23,7 @@ from sfm_app.cli.options import (
     settings_options,
 )
 from sfm_app.cli.output import STAGE_TITLES, file_lines, open_browser, print_json, print_lines, print_text, table
-from sfm_app.errors import ConfigError
+from sfm_app.errors import ConfigError, SfmError
 from sfm_app.wording import parse_length, parse_point
 
 if TYPE_CHECKING:
@@ -37,6 +40,8 @@ STAGES = tuple(STAGE_TITLES)
 MARKER_FAMILIES = tuple(name for name in get_args(setting_field("scale.marker_family").annotation) if name != "auto")
 PAPERS = ("a4", "a3", "letter")
 SHELLS = ("bash", "zsh", "fish")
+GIGABYTE, MB_PER_GB = 2**30, 2**30 / 1e6
+ENOUGH_DISK = 2 * GIGABYTE
 
 
 @click.command()
@@ -294,10 +299,65 @@ def measure(out: Path, a: str, b: str, as_json: bool) -> None:
 @json_option
 def doctor(as_json: bool) -> None:
     """Check this machine and the installed libraries."""
-    from sfm_app.cli.doctor import examine
-
     state = examine()
     print_json(state) if as_json else print_text(table(state))
+
+
+def examine() -> dict[str, str]:
+    """Return the state of this machine and of the installed libraries, one line each."""
+    from sfm_app.colmap.backend import has_cuda
+    from sfm_app.engine.stage import versions
+    from sfm_app.operating_system import free_memory_mb, missing_abilities
+    from sfm_app.runtime.parallel import worker_count
+
+    disk = shutil.disk_usage(Path.cwd()).free
+    return {
+        "python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",
+        "cores": str(worker_count(0)),
+        "memory": f"{free_memory_mb() / MB_PER_GB:.0f} GB free",
+        "free disk here": f"{disk / GIGABYTE:.0f} GB"
+        + ("" if disk > ENOUGH_DISK else "; low: dense stereo needs about 2 GB"),
+        "missing in this system": ", ".join(missing_abilities()) or "nothing",
+        **versions(),
+        "COLMAP with CUDA": "yes" if has_cuda() else "no",
+        "depth maps": _try(_depth_method),
+        "ray casting (Open3D)": _try(_open3d),
+        "plug-ins": _try(_count_methods),
+    }
+
+
+def _open3d() -> str:
+    from sfm_app.meshing.ray_casting import load_open3d
+
+    return f"works, {load_open3d().__version__}"
+
+
+def _try(examine_part: Callable[[], str]) -> str:
+    try:
+        return examine_part()
+    except SfmError as err:
+        return f"broken: {err}; {err.hint}"
+
+
+def _depth_method() -> str:
+    from sfm_app.plugins import load_plugins
+
+    method, reason = load_plugins().depth_method("auto")
+    return f"{method.name} ({reason})"
+
+
+def _count_methods() -> str:
+    from sfm_app.plugins import load_plugins
+
+    methods = load_plugins()
+    parts = {
+        "feature methods": methods.features,
+        "estimators": methods.estimators,
+        "calibrators": methods.calibrators,
+        "formats": {**methods.exporters, **methods.scene_exporters},
+        "depth methods": methods.depth_methods,
+    }
+    return ", ".join(f"{len(part)} {name}" for name, part in parts.items())
 
 
 @click.command()

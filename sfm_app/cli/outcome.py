@@ -12,13 +12,11 @@ from sfm_app.cli.output import WIDTH, file_lines
 from sfm_app.report.text import (
     SOURCES,
     WARNING,
-    contradiction_lines,
     duration_text,
     field_text,
-    intrinsics_lines,
     intrinsics_summary,
+    result_lines,
     scale_lines,
-    scene_lines,
     scene_summary,
 )
 from sfm_app.runtime.workspace import model_triangles
@@ -70,16 +68,9 @@ def run_summary(run: Run) -> dict[str, Any]:
 def run_lines(run: Run) -> list[str]:
     """Return all figures of a run as lines of text."""
     summary = run_summary(run)
-    lines = [*_input_lines(summary)]
-    if run.calibration:
-        lines += intrinsics_lines(run.calibration)
-        for stage in ("view_graph", "intrinsics"):
-            lines += [f"{INDENT}{text}" for text in contradiction_lines(_counts(run, stage))]
+    lines = [*_input_lines(summary), *result_lines(run.calibration, run.scene, _stages(run))]
     if run.scene:
-        lines += scene_lines(run.scene, _counts(run, "scene"))
-        lines += [f"{INDENT}points and cameras: {line}" for line in file_lines(_model_files(run, "scale"))]
-    if "scale" in summary:
-        lines += scale_lines(summary["scale"])
+        lines += [f"points      {line}" for line in file_lines(_model_files(run, "scale"))]
     if run.mesh_path:
         lines.append(f"mesh        {summary['mesh']['triangles']} triangles{_texture_text(summary['mesh'])}")
         lines += [f"{INDENT}{line}" for line in file_lines(_model_files(run, "files"))]

@@ -8,8 +8,7 @@ from functools import partial
 from sfm_app.formats.draco import write_draco
 from sfm_app.formats.exporters import CLOUD, Exporter, SceneExporter, missing_package
 from sfm_app.formats.gltf import write_glb
-from sfm_app.formats.laz import write_laz
-from sfm_app.formats.meshes import write_cloud_ply, write_obj, write_ply, write_stl
+from sfm_app.formats.meshes import write_cloud_ply, write_laz, write_obj, write_ply, write_stl
 from sfm_app.formats.scenes import write_bundler, write_cameras, write_colmap, write_nerfstudio, write_opencv
 from sfm_app.formats.usd import write_usd, write_usdz
 

@@ -1,6 +1,7 @@
 """Exporters: what each file format offers, and the parts that formats share."""
 
 import io
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.errors import ReconstructionError
-from sfm_app.types import Model, Scene
+from sfm_app.types import Model, Scene, Texture
 from sfm_app.types.arrays import IndexArray
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
 
@@ -167,3 +168,22 @@ def split_corners(faces: IndexArray, uv: NDArray[np.float32]) -> tuple[IndexArra
 def pages_in_use(pages: NDArray[np.int32]) -> list[int]:
     """Return the numbers of the pages that triangles lie on, ascending."""
     return [int(page) for page in np.unique(pages)]
+
+
+def page_files(model: Model, name: str) -> dict[int, str]:
+    """Return the files of the pages of texture in use by their numbers; empty without textured triangles."""
+    if model.texture is None or not len(model.surface.faces):
+        return {}
+    stem = re.sub(r"\s", "_", name)  # many readers end file names at a blank
+    return {page: f"{stem}_{page}.jpg" for page in pages_in_use(model.texture.page)}
+
+
+def normal_file(picture: str) -> str:
+    """Return the file of the normal map of a page of texture."""
+    return f"{Path(picture).stem}_normals.{NORMAL_SUFFIX}"
+
+
+def page_pictures(texture: Texture, pages: Mapping[int, str]) -> dict[str, bytes]:
+    """Return the pictures of the pages of `page_files` and their normal maps, if any, by file."""
+    pictures, maps = {file: jpeg(texture.pages[page]) for page, file in pages.items()}, texture.normal_maps
+    return pictures | {normal_file(file): normal_picture(maps[page]) for page, file in pages.items() if maps}

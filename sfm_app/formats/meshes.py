@@ -1,4 +1,4 @@
-"""Meshes as PLY, OBJ and STL."""
+"""Meshes as PLY, OBJ and STL, and clouds as PLY and LAZ."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.errors import ReconstructionError
-from sfm_app.formats.exporters import NORMAL_SUFFIX, FinishedScene, check_writable, jpeg, normal_picture, pages_in_use
+from sfm_app.formats.exporters import FinishedScene, check_writable, normal_file, page_files, page_pictures
 from sfm_app.formats.frusta import append_cameras, camera_dots, scene_size
 from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Model, Texture
@@ -87,6 +87,24 @@ def cloud_ply(cloud: PointCloud) -> bytes:
     return header({"vertex": rows}).encode("ascii") + rows.tobytes()
 
 
+def write_laz(scene: FinishedScene, target: Path) -> None:
+    """Write the dense cloud as compressed LAS with colors, exact to a hundred-millionth of its size; needs laspy."""
+    import laspy
+
+    cloud = scene.cloud()
+    head = laspy.LasHeader(point_format=2, version="1.2")  # the first version with colors: every reader knows it
+    head.creation_date = None  # same cloud, same bytes
+    head.generating_software = "sfm_app"
+    extent = float(np.ptp(cloud.points, axis=0).max()) or 1.0
+    step = float(10.0 ** np.ceil(np.log10(extent / 2e9)))  # 32 bits hold the longest side
+    head.offsets, head.scales = cloud.points.min(axis=0), np.full(3, step)
+    las = laspy.LasData(head)
+    las.x, las.y, las.z = cloud.points.T
+    las.red, las.green, las.blue = cloud.colors.T.astype(np.uint16) * 257  # LAS has 16-bit colors
+    with target.open("wb") as file:
+        las.write(file, do_compress=True, laz_backend=laspy.LazBackend.Lazrs)
+
+
 # Wavefront OBJ, with materials (MTL) and texture pages (JPEG) in separate files.
 
 DIGITS = 6
@@ -101,23 +119,18 @@ def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
     The files are the OBJ and, with a texture, the MTL, a JPEG per page, and the normal map, if any.
     """
     check_writable(model)
-    texture = model.texture if len(model.surface.faces) else None
-    stem = re.sub(r"\s", "_", name)  # many readers end file names at a blank
-    text = ["# sfm_app\n", *_vertex_lines(model, with_colors=texture is None)]
+    pages = page_files(model, name)
+    text = ["# sfm_app\n", *_vertex_lines(model, with_colors=not pages)]
     files: dict[str, bytes] = {}
-    if texture is None:
-        if len(model.surface.faces):
-            corners = model.surface.faces + 1
-            text.append(format_rows("f %d//%d %d//%d %d//%d\n", np.repeat(corners, 2, axis=1)))
-    else:
-        used = pages_in_use(texture.page)
-        pages = {page: f"{stem}_{page}.jpg" for page in used}
-        text += [f"mtllib {stem}.mtl\n", *_textured_lines(model, texture, used)]
-        maps = {page: f"{stem}_{page}_normals.{NORMAL_SUFFIX}" for page in used if texture.normal_maps}
+    if model.texture is not None and pages:
+        library = re.sub(r"\s", "_", f"{name}.mtl")
+        text += [f"mtllib {library}\n", *_textured_lines(model, model.texture, list(pages))]
+        maps = {page: normal_file(file) for page, file in pages.items() if model.texture.normal_maps}
         materials = (_material(page, file, maps.get(page, "")) for page, file in pages.items())
-        files[f"{stem}.mtl"] = "\n".join(materials).encode()
-        files |= {file: jpeg(texture.pages[page]) for page, file in pages.items()}
-        files |= {file: normal_picture(texture.normal_maps[page]) for page, file in maps.items()}
+        files = {library: "\n".join(materials).encode(), **page_pictures(model.texture, pages)}
+    elif len(model.surface.faces):
+        corners = model.surface.faces + 1
+        text.append(format_rows("f %d//%d %d//%d %d//%d\n", np.repeat(corners, 2, axis=1)))
     return {f"{name}.obj": "".join(text).encode(), **files}
 
 

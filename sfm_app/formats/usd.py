@@ -5,7 +5,6 @@ all viewers know.
 """
 
 import io
-import re
 import tempfile
 import zipfile
 from collections.abc import Mapping
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.formats.exporters import NORMAL_SUFFIX, check_writable, jpeg, normal_picture, pages_in_use
+from sfm_app.formats.exporters import check_writable, normal_file, page_files, page_pictures
 from sfm_app.formats.frusta import frustum_depth
 from sfm_app.formats.gltf import linear_colors, opengl_pose
 from sfm_app.geometry.triangles import unit_normals
@@ -39,34 +38,14 @@ def write_usd(model: Model, name: str) -> Mapping[str, bytes]:
     with tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch:
         path = Path(scratch) / "model.usdc"
         _write_stage(path, model, pages)
-        return {f"{name}.usd": path.read_bytes(), **_pictures(model, pages)}
+        pictures = page_pictures(model.texture, pages) if model.texture is not None else {}
+        return {f"{name}.usd": path.read_bytes(), **pictures}
 
 
 def write_usdz(model: Model, name: str) -> Mapping[str, bytes]:
     """Write the files of `write_usd` into one uncompressed package."""
     stage, *pages = write_usd(model, "model").items()
     return {f"{name}.usdz": pack({"model.usdc": stage[1], **dict(pages)})}
-
-
-def page_files(model: Model, name: str) -> dict[int, str]:
-    """Return the files of the pages of texture by their numbers; empty without a texture."""
-    if model.texture is None or not len(model.surface.faces):
-        return {}
-    stem = re.sub(r"\s", "_", name)
-    return {page: f"{stem}_{page}.jpg" for page in pages_in_use(model.texture.page)}
-
-
-def normal_file(picture: str) -> str:
-    """Return the file of the normal map of a page of texture."""
-    return f"{Path(picture).stem}_normals.{NORMAL_SUFFIX}"
-
-
-def _pictures(model: Model, pages: Mapping[int, str]) -> dict[str, bytes]:
-    if model.texture is None:
-        return {}
-    pictures = {file: jpeg(model.texture.pages[page]) for page, file in pages.items()}
-    maps = model.texture.normal_maps
-    return pictures | {normal_file(file): normal_picture(maps[page]) for page, file in pages.items() if maps}
 
 
 def pack(files: Mapping[str, bytes]) -> bytes:

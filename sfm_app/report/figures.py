@@ -11,14 +11,12 @@ from textwrap import fill
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera.bearings import bearings, corner_angle, radius_deviation_px, radius_px
 from sfm_app.errors import ConfigError
 from sfm_app.estimation.calibrating import camera_pairs
-from sfm_app.geometry.epipolar import FIRST, SECOND, fit_rays, gradients
-from sfm_app.geometry.least_squares import inverse_of_positive
-from sfm_app.report.text import center_text, focal_text, held_text, lens_text, verdict
+from sfm_app.geometry.epipolar import FIRST, SECOND, fit_rays, gradients, signed_distances
+from sfm_app.report.text import camera_texts
 from sfm_app.selfcal.calibrate_pairs import undistort_pairs
 from sfm_app.selfcal.consensus import Consensus
 from sfm_app.selfcal.pairs import Pairs, prepare
@@ -40,18 +38,14 @@ class FigureOptions:
     """Cells of residuals along the longer side of the photo. By hand."""
     least_keypoints: int = 12
     """Least number of keypoints in a cell that is drawn. By hand."""
-    prior_px: float = 0.3
-    """Prior standard deviation of an error of the lens model; it damps shifts that relative poses absorb. By hand."""
-    least_noise_px: float = 0.02
-    """Least standard deviation of a distance. By hand."""
     refits: int = 3
     """Fits of the epipolar geometry through a lens with distortion, each with weights of the last. By hand."""
     curve_samples: int = 400
     """Samples along each zero curve; with fewer, steep curves look ragged. By hand."""
     vote_sigma: float = 0.05
     """Width of a vote, in units of r as in `Consensus`: the wider one of the search. By hand."""
-    ellipse_deviations: float = 3.0
-    """Standard deviations of the ellipse: at most 1 % of true values lie outside. By convention."""
+    bar_deviations: float = 3.0
+    """Standard deviations on both sides of the estimate. By convention."""
     band_deviations: float = 2.0
     """Standard deviations on both sides of the lens curve. By convention."""
     most_cameras: int = 4
@@ -62,91 +56,37 @@ class FigureOptions:
 
 OPTIONS = FigureOptions()
 
-# Residuals of matches over the photo, through the calibrated lens and before bundle adjustment.
-# The signed Sampson distance of a match is linear in the errors of its two pixels: d = a1 . v1 + a2 . v2, with a1 and
-# a2 the gradient of the epipolar constraint by the pixels of the two photos, of length 1 together. If all photos share
-# a camera, the part of v that does not depend on the match is the error of the lens model. All matches together
-# determine it for every cell of the photo, except for shifts of the whole photo, which relative poses absorb.
+# Residuals of matches over the photo, through the calibrated lens and before bundle adjustment. Where they are larger
+# than elsewhere, the lens model errs.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EpipolarResiduals:
-    """Residuals of N matches of photos by one camera."""
+def epipolar_residuals(pairs: CameraPairs, camera: Calibration) -> tuple[FloatArray, FloatArray]:
+    """Return the pixels (2N, 2) of all inliers in both photos, and their Sampson distances (2N,) in pixels.
 
-    x: FloatArray
-    """(2, N, 2) pixels in photo 1 and photo 2."""
-    along: FloatArray
-    """(2, N, 2) a1 and a2: gradient of the distance by each pixel coordinate."""
-    distances_px: FloatArray
-    """(N,) signed Sampson distances."""
-    repeats: float = 1.0
-    """Pairs per photo: so often may the error of one keypoint count."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ResidualGrid:
-    """Residuals by cell of the photo, rows from the top."""
-
-    shift_px: FloatArray
-    """(R, C, 2) mean error of keypoints, right and down; NaN for few keypoints."""
-    clear: NDArray[np.bool_]
-    """(R, C) whether it exceeds two standard deviations."""
-    size_px: FloatArray
-    """(R, C) median absolute distance of the matches; NaN for few keypoints."""
+    Matrices of a perspective camera are of pixels, others of rays.
+    """
+    x, distances = [np.zeros((0, 2))], [np.zeros(0)]
+    for F, match in zip(pairs.Fs, pairs.inliers, strict=False):
+        if len(match):
+            points = np.asarray(match, np.float64).reshape(-1, 2, 2).transpose(1, 0, 2)
+            lines = np.hstack([bearings(one, camera) for one in points])
+            x += [*points]
+            distances += 2 * [np.abs(signed_distances(_matrix_of_rays(F, lines, camera), lines))]
+    return np.concatenate(x), np.concatenate(distances)
 
 
-def epipolar_residuals(pairs: CameraPairs, camera: Calibration) -> EpipolarResiduals:
-    """Return the residuals of all inliers; matrices of a perspective camera are of pixels, others of rays."""
-    x, along, distances = [np.zeros((2, 0, 2))], [np.zeros((2, 0, 2))], [np.zeros(0)]
-    matched = ((F, np.asarray(x, np.float64)) for F, x in zip(pairs.Fs, pairs.inliers, strict=False) if len(x))
-    for F, match in matched:
-        points = match[:, :2], match[:, 2:]
-        lines = np.hstack([bearings(one, camera) for one in points])
-        E = _matrix_of_rays(F, lines, camera)
-        length = gradients(E, lines)
-        line2, line1 = lines[:, FIRST] @ E.T, lines[:, SECOND] @ E
-        slopes1 = np.einsum("nki,ni->nk", lines[:, 3:9].reshape(-1, 2, 3), line1)
-        slopes2 = np.einsum("nki,ni->nk", lines[:, 12:18].reshape(-1, 2, 3), line2)
-        x.append(np.stack(points))
-        along.append(np.stack([slopes1, slopes2]) / length[:, None])
-        distances.append(np.einsum("ni,ni->n", lines[:, SECOND], line2) / length)
-    photos = {photo for pair in pairs.photos for photo in pair}
-    repeats = max(2.0 * len(pairs.photos) / len(photos), 1.0) if photos else 1.0
-    return EpipolarResiduals(np.concatenate(x, 1), np.concatenate(along, 1), np.concatenate(distances), repeats)
+def residual_grid(x: FloatArray, distances_px: FloatArray, size: tuple[int, int]) -> FloatArray:
+    """Return medians (R, C) of the distances (N,) at pixels (N, 2), by cell of photos of this size (width, height).
 
-
-def residual_grid(residuals: EpipolarResiduals, size: tuple[int, int]) -> ResidualGrid:
-    """Return the residuals by cell of photos of this size (width, height) in pixels."""
-    from scipy.stats import binned_statistic
+    Rows go down from the top; NaN for few keypoints.
+    """
+    from scipy.stats import binned_statistic_2d
 
     side = max(size) / OPTIONS.residual_cells
-    columns, rows = (max(1, round(length / side)) for length in size)
-    count = rows * columns
-    places = np.clip(residuals.x / np.array(size) * [columns, rows], 0, [columns - 1, rows - 1]).astype(np.int64)
-    cells = places[..., 1] * columns + places[..., 0]
-    many = np.bincount(cells.ravel(), minlength=count).reshape(rows, columns) >= OPTIONS.least_keypoints
-    both, edges = np.tile(np.abs(residuals.distances_px), 2), (-0.5, count - 0.5)
-    sizes = binned_statistic(cells.ravel(), both, "median", count, edges).statistic.reshape(rows, columns)
-    shift, deviation = _mean_shifts(residuals, cells, count)
-    shift, deviation = shift.reshape(rows, columns, 2), deviation.reshape(rows, columns, 2)
-    clear = many & (np.hypot(*np.moveaxis(shift, 2, 0)) > 2.0 * np.hypot(*np.moveaxis(deviation, 2, 0)))
-    return ResidualGrid(np.where(many[..., None], shift, np.nan), clear, np.where(many, sizes, np.nan))
-
-
-def _mean_shifts(residuals: EpipolarResiduals, cells: NDArray[np.int64], count: int) -> tuple[FloatArray, FloatArray]:
-    """Return shifts (count, 2) of keypoints by cell, by least squares over all matches, and their deviations."""
-    from scipy import sparse
-
-    distances, matches = residuals.distances_px, len(residuals.distances_px)
-    columns = (2 * cells[..., None] + np.arange(2)).transpose(1, 0, 2).reshape(matches, 4)
-    values = residuals.along.transpose(1, 0, 2).reshape(matches, 4)
-    rows = np.repeat(np.arange(matches), 4)
-    A = sparse.csr_array((values.ravel(), (rows, columns.ravel())), shape=(matches, 2 * count))
-    noise = max(float(np.sqrt(residuals.repeats * np.mean(distances**2))) if matches else 0.0, OPTIONS.least_noise_px)
-    covariance = inverse_of_positive((A.T @ A).toarray() / noise**2 + np.eye(2 * count) / OPTIONS.prior_px**2)
-    pull = np.asarray(A.T @ distances, np.float64) / noise**2
-    shift = np.einsum("ij,j->i", covariance, pull)
-    return shift.reshape(count, 2), np.sqrt(np.diag(covariance)).reshape(count, 2)
+    edges = [np.linspace(0.0, length, max(1, round(length / side)) + 1) for length in size]
+    medians = binned_statistic_2d(x[:, 0], x[:, 1], distances_px, "median", edges).statistic
+    counts = np.histogram2d(x[:, 0], x[:, 1], edges)[0]
+    return np.where(counts >= OPTIONS.least_keypoints, medians, np.nan).T
 
 
 def _matrix_of_rays(F: FloatArray, lines: FloatArray, camera: Calibration) -> FloatArray:
@@ -231,48 +171,21 @@ def center_plane(camera: Calibration, pairs: Pairs) -> ParameterPlane:
 def _draw_plane(axes: "Axes", plane: ParameterPlane, camera: Calibration, pairs: Pairs) -> None:
     shades = vote_shares(plane, camera, pairs)
     axes.imshow(shades, extent=plane.extent, origin="lower", cmap="inferno", vmin=0, vmax=1, interpolation="bilinear")
-    _draw_curves(axes, plane, plane.extent, OPTIONS.curve_samples)
-    marker, label = ("o", "estimate") if camera.identifiable else ("X", "a guess")
-    axes.plot(*plane.estimate, marker, markersize=12, fillstyle="none", color=MARK, markeredgewidth=1.6, label=label)
-    axes.set(title=plane.title, xlabel=plane.labels[0], ylabel=plane.labels[1], aspect="equal")
-    if camera.identifiable and min(plane.spread) > 0:
-        _enlarge(axes, plane, camera)
-    axes.legend(loc="lower right", labelcolor=CURVE, framealpha=0.6, facecolor="black", edgecolor="none")
-
-
-def _draw_curves(axes: "Axes", plane: ParameterPlane, extent: tuple[float, float, float, float], samples: int) -> None:
-    """Draw the part of all curves within `extent`; many curves are faint."""
-    left, right, bottom, top = extent
-    x = _midpoints(left, right, samples)
-    y = _mask_jumps(plane.curves(x), min(bottom, top), max(bottom, top))
-    axes.plot(x, y.T, color=CURVE, linewidth=0.6, alpha=float(np.clip(12.0 / max(len(y), 1), 0.2, 0.8)))
-    axes.set(xlim=(left, right), ylim=(bottom, top))
-
-
-def _enlarge(axes: "Axes", plane: ParameterPlane, camera: Calibration) -> None:
-    """Draw the ellipse of the deviations, enlarged in an inset if it is small."""
-    from matplotlib.patches import Ellipse
-
-    (x, y), (dx, dy) = plane.estimate, (OPTIONS.ellipse_deviations * value for value in plane.spread)
     left, right, bottom, top = plane.extent
-    target = axes
-    if max(dx / abs(right - left), dy / abs(top - bottom)) < 0.1:  # by hand
-        reach = 2.5 * max(dx, dy)
-        window = (x - reach, x + reach, y - np.sign(top - bottom) * reach, y + np.sign(top - bottom) * reach)
-        target = axes.inset_axes((0.63, 0.63, 0.35, 0.35))
-        target.set_facecolor("#20123a")
-        _draw_curves(target, plane, window, 60)
-        target.tick_params(colors=CURVE, labelsize=7)
-        target.locator_params(nbins=3)
-        axes.indicate_inset_zoom(target, edgecolor=GUIDE)
-    label = f"{OPTIONS.ellipse_deviations:.0f} standard deviations"
-    if plane.names[0] == "fx" and ("aspect" in camera.held or camera.K[0, 0] == camera.K[1, 1]):
-        # pixels are assumed square: fx and fy have the same error
-        target.plot((x - dx, x + dx), (y - dy, y + dy), color=MARK, linewidth=1.8, label=label)
-    else:
-        target.add_patch(Ellipse((x, y), 2 * dx, 2 * dy, fill=False, edgecolor=MARK, linewidth=1.4, label=label))
-    if target is not axes:
-        axes.plot([], [], color=MARK, linewidth=1.6, label=f"{label} (enlarged)")
+    x = _midpoints(left, right, OPTIONS.curve_samples)
+    y = _mask_jumps(plane.curves(x), min(bottom, top), max(bottom, top))
+    # many curves are faint
+    axes.plot(x, y.T, color=CURVE, linewidth=0.6, alpha=float(np.clip(12.0 / max(len(y), 1), 0.2, 0.8)))
+    across, down = (OPTIONS.bar_deviations * deviation for deviation in plane.spread)
+    marker, label = ("o", "estimate") if camera.identifiable else ("X", "a guess")
+    label += f" ± {OPTIONS.bar_deviations:.0f} standard deviations" if min(plane.spread) > 0 else ""
+    axes.errorbar(
+        *plane.estimate, xerr=across, yerr=down, fmt=marker, markersize=12, fillstyle="none", color=MARK,
+        markeredgewidth=1.6, label=label,
+    )  # fmt: skip
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+    axes.set(title=plane.title, xlabel=plane.labels[0], ylabel=plane.labels[1])
+    axes.legend(loc="lower right", labelcolor=CURVE, framealpha=0.6, facecolor="black", edgecolor="none")
 
 
 def vote_shares(plane: ParameterPlane, camera: Calibration, pairs: Pairs) -> FloatArray:
@@ -383,26 +296,13 @@ def _draw_residuals(part: "SubFigure", axes: "Axes", camera: Calibration, pairs:
     extent = (0.0, float(size[0]), float(size[1]), 0.0)
     axes.set(xlim=extent[:2], ylim=extent[2:], aspect="equal", facecolor="#e8e8e8")
     axes.set(xlabel="across the photo, px", ylabel="down the photo, px")
-    residuals = epipolar_residuals(pairs, camera)
-    grid = residual_grid(residuals, size)
-    if np.isnan(grid.size_px).all():
+    x, distances = epipolar_residuals(pairs, camera)
+    if not len(x) or np.isnan(grid := residual_grid(x, distances, size)).all():
         axes.set_title("Residuals: no pair of photos is from this camera alone")
         return
-    image = axes.imshow(grid.size_px, extent=extent, cmap="YlOrBr", vmin=0.0, interpolation="nearest", alpha=0.85)
+    image = axes.imshow(grid, extent=extent, cmap="YlOrBr", vmin=0.0, interpolation="nearest")
     part.colorbar(image, ax=axes, label="median distance from the epipolar line, px", shrink=0.8)
-    rows, columns = grid.size_px.shape
-    x, y = np.meshgrid((np.arange(columns) + 0.5) * size[0] / columns, (np.arange(rows) + 0.5) * size[1] / rows)
-    lengths = np.hypot(*np.moveaxis(grid.shift_px, 2, 0))
-    longest = float(np.nanmax(lengths)) or 1.0
-    scale = longest / (0.9 * size[0] / columns)
-    for chosen, color in ((~grid.clear, QUIET), (grid.clear, "#111111")):
-        u, v = (np.where(chosen, grid.shift_px[..., k], np.nan) for k in (0, 1))
-        axes.quiver(x, y, u, v, angles="xy", scale_units="xy", scale=scale, color=color, width=0.0035, pivot="middle")
-    axes.set_title(
-        f"Residuals of {len(residuals.distances_px)} matches. Colors: their size. Arrows: mean shift per cell,\n"
-        f"the longest is {longest:.2g} px; black ones are significant",
-        fontsize=9.5,
-    )
+    axes.set_title(f"Residuals of {len(x) // 2} matches")
 
 
 # The whole figure.
@@ -472,8 +372,7 @@ def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
 
 def calibration_text(camera: Calibration) -> str:
     """Return a calibration in words, one line per property."""
-    texts = (verdict(camera), focal_text(camera), center_text(camera), lens_text(camera), held_text(camera))
-    return "\n".join(fill(text, 150) for text in texts if text).replace("+-", "±")
+    return "\n".join(fill(text, 150) for text in camera_texts(camera)).replace("+-", "±")
 
 
 def weightiest(pairs: CameraPairs, most: int) -> CameraPairs:

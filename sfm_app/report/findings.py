@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +17,9 @@ from sfm_app.report.contents import RunContents, data_address
 from sfm_app.report.text import (
     SOURCES,
     WARNING,
-    contradiction_lines,
     duration_text,
     intrinsics_lines,
-    scale_lines,
-    scene_lines,
+    result_lines,
 )
 from sfm_app.runtime.workspace import model_triangles
 from sfm_app.settings import Settings
@@ -43,7 +40,6 @@ class CorrelationTable:
     names: Sequence[str]
     rows: Sequence[Sequence[float | None]]
     """(n, n), the lower triangle; None elsewhere, and for unknown values."""
-    texts: Sequence[str]
 
 
 def correlation_table(before: Calibration, after: CameraModel | None) -> CorrelationTable | None:
@@ -72,23 +68,7 @@ def _table(source: str, names: Sequence[str], values: Mapping[str, float]) -> Co
         [values.get(correlation_key(names[j], names[i])) if j < i else None for j in range(len(names))]
         for i in range(len(names))
     ]
-    return CorrelationTable(source, labels, rows, _sentences(labels, rows))
-
-
-def _sentences(names: Sequence[str], rows: Sequence[Sequence[float | None]]) -> list[str]:
-    pairs = [(value, names[j], names[i]) for j, i in combinations(range(len(names)), 2) if (value := rows[i][j])]
-    pairs.sort(key=lambda pair: -abs(pair[0]))
-    strong = [pair for pair in pairs if abs(pair[0]) >= 0.5]  # a quarter of the variance is common. By hand
-    texts = [
-        f"{first} and {second} move {'together' if value > 0 else 'against each other'}: {correlation_text(value)}"
-        for value, first, second in strong[:3]
-    ]
-    if len(strong) > len(texts):
-        texts.append(f"and {len(strong) - len(texts)} more pairs of parameters")
-    if not texts and pairs:
-        value, first, second = pairs[0]
-        texts = [f"no strong correlation; the strongest is {first} with {second}, {correlation_text(value)}"]
-    return texts
+    return CorrelationTable(source, labels, rows)
 
 
 def correlation_text(value: float) -> str:
@@ -129,17 +109,6 @@ class CameraTable:
     texts: Sequence[str]
     correlations: CorrelationTable | None = None
     """None if unknown, or if the photos determine one parameter only."""
-
-
-@dataclass(frozen=True, slots=True)
-class StageRow:
-    """The cost of a stage."""
-
-    name: str
-    seconds: float
-    cpu_seconds: float
-    peak_mb: float
-    share: float
 
 
 def glance(contents: RunContents) -> list[Fact]:
@@ -192,14 +161,7 @@ def _unit_fact(contents: RunContents) -> Fact:
 
 def remarks(contents: RunContents) -> tuple[list[str], list[str]]:
     """Return the warnings of a run, each with a remedy, and its other remarks."""
-    lines = list(intrinsics_lines(contents.intrinsics)) if contents.intrinsics is not None else []
-    for stage in ("view_graph", "intrinsics"):
-        lines += contradiction_lines(contents.counts(stage))
-    if contents.scene is not None:
-        lines += scene_lines(contents.scene, contents.counts("scene"))
-    if "scale" in contents.stages:
-        lines += scale_lines(contents.counts("scale"))
-    texts = [plain_text(line) for line in lines]
+    texts = [plain_text(line) for line in result_lines(contents.intrinsics, contents.scene, contents.stages)]
     warnings = [text.removeprefix(WARNING) for text in texts if text.startswith(WARNING)]
     others = [text for text in texts if not text.startswith((WARNING, UNKNOWN_CAMERA))]
     return warnings + unknown_cameras(contents), others
@@ -218,20 +180,11 @@ def unknown_cameras(contents: RunContents) -> list[str]:
     cameras = contents.intrinsics.cameras if contents.intrinsics is not None else {}
     after = contents.scene.cameras if contents.scene is not None else {}
     return [
-        _unknown_text(f" {name}" if len(cameras) > 1 else "", camera, after.get(name))
+        f"Pairs of photos do not determine the camera{f' {name}' if len(cameras) > 1 else ''}: {camera.reason}. "
+        f"A focal of {camera.focal_px:.0f} px is {SOURCES.get(camera.method, camera.method)}. What to do: {REMEDY}."
         for name, camera in cameras.items()
         if not camera.identifiable and (name in after or not after)
     ]
-
-
-def _unknown_text(name: str, camera: Calibration, after: CameraModel | None) -> str:
-    source = SOURCES.get(camera.method, camera.method)
-    text = f"Pairs of photos do not determine the camera{name}: {camera.reason}. "
-    text += f"A focal of {camera.focal_px:.0f} px is {source}"
-    if after is not None and "fx" in after.deviations:
-        focal = value_text(after.K[0, 0], after.deviations["fx"])
-        text += f"; the last bundle adjustment of all photos gives {focal} px"
-    return f"{text}. What to do: {REMEDY}."
 
 
 def camera_tables(contents: RunContents) -> list[CameraTable]:
@@ -278,37 +231,16 @@ def dropped_pairs(contents: RunContents) -> list[tuple[str, int]]:
     return [*rejected.items(), *later.items()]
 
 
-@dataclass(frozen=True, slots=True)
-class Comparison:
-    """Two runs side by side."""
-
-    other: str
-    rows: Sequence[tuple[str, str, str]]
-    """Name, value in this run, value in the other run."""
-
-
-def compare(contents: RunContents, other: RunContents) -> Comparison:
-    """Return figures, costs and differing settings of two runs."""
-    facts = [{fact.name: f"{fact.value} {fact.note}".strip() for fact in glance(one)} for one in (contents, other)]
-    costs = [
-        {f"{row.name}, CPU seconds": f"{row.cpu_seconds:.1f}" for row in stage_rows(one)} for one in (contents, other)
-    ]
-    here, there = facts[0] | costs[0], facts[1] | costs[1]
+def compare(contents: RunContents, other: RunContents) -> list[tuple[str, str, str]]:
+    """Return the name and both values of the figures, costs and differing settings of two runs."""
+    here, there = (
+        {fact.name: f"{fact.value} {fact.note}".strip() for fact in glance(one)}
+        | {f"{name}, CPU seconds": f"{stage.get('cpu_seconds', 0.0):.1f}" for name, stage in one.stages.items()}
+        for one in (contents, other)
+    )
     rows = [(name, here.get(name, ""), there.get(name, "")) for name in {**here, **there}]
     settings = [one.manifest.get("settings", {}) for one in (contents, other)]
-    rows += [(f"setting {name}", mine, theirs) for name, mine, theirs in sorted(_differences(*settings))]
-    return Comparison(other.run.workspace.root.resolve().name, rows)
-
-
-def stage_rows(contents: RunContents) -> list[StageRow]:
-    """Return the cost of each stage."""
-    whole = sum(stage["seconds"] for stage in contents.stages.values()) or 1.0
-    return [
-        StageRow(
-            name, stage["seconds"], stage.get("cpu_seconds", 0.0), stage.get("peak_mb", 0.0), stage["seconds"] / whole
-        )
-        for name, stage in contents.stages.items()
-    ]
+    return rows + [(f"setting {name}", mine, theirs) for name, mine, theirs in sorted(_differences(*settings))]
 
 
 def changed_settings(contents: RunContents) -> list[tuple[str, str, str]]:

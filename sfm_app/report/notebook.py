@@ -29,20 +29,11 @@ def run_html(contents: RunContents) -> str:
         f"<td style='text-align:left'>{escape(f'{fact.value} {fact.note}'.strip())}</td></tr>"
         for fact in glance(contents)
     )
-    picture, image = model_picture(contents), ""
+    picture, image = model_cutout(contents), ""
     if picture is not None:
-        address = data_address("image/png", cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
+        address = data_address("image/png", cv2.imencode(".png", picture[..., [2, 1, 0, 3]])[1].tobytes())
         image = f"<img src='{address}' alt='the model' width='{picture.shape[1]}'>"
     return f"<div>{image}<table>{rows}</table></div>"
-
-
-def model_picture(contents: RunContents) -> NDArray[np.uint8] | None:
-    """Return a picture (H, W, 3) RGB of the model, or of its points, on white; None if no photo is placed."""
-    cutout = model_cutout(contents)
-    if cutout is None:
-        return None
-    share = cutout[..., 3:] / 255.0
-    return np.asarray(np.round(share * cutout[..., :3] + (1.0 - share) * 255.0), np.uint8)
 
 
 def model_cutout(contents: RunContents) -> NDArray[np.uint8] | None:

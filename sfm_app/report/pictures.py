@@ -19,7 +19,7 @@ from sfm_app.report.figures import OPTIONS, draw_intrinsics
 from sfm_app.types.arrays import FloatArray
 from sfm_app.types.scene import camera_center
 
-# Figures: cameras, matched pairs of photos, the scene from above, and lengths of tracks.
+# Figures: cameras, matched pairs of photos, and the scene from above.
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger("sfm_app")
 
 LONGEST_TRACK = 12
-"""Photos of a track; longer tracks share the last bar. By hand."""
+"""Photos of a track; longer tracks share the last color. By hand."""
 INK, ACCENT, BAD = "#444444", "#c2410c", "#b91c1c"
 
 
@@ -50,7 +50,6 @@ def page_figures(contents: RunContents, figures: ModelFigures | None) -> dict[st
         "cameras": lambda: _draw_cameras(contents),
         "pairs": lambda: _draw_pairs(contents),
         "above": lambda: _draw_above(contents, figures),
-        "tracks": lambda: _draw_tracks(figures),
     }
     drawn = {}
     for name, draw in sections.items():
@@ -131,7 +130,8 @@ def _draw_above(contents: RunContents, figures: ModelFigures | None) -> PageFigu
 
     text = (
         "Left: the cameras from above, their viewing directions, and lines between photos that share matches. "
-        "Right: the points, and the number of photos that see each."
+        "Right: the points, and the number of photos that see each. "
+        f"{int((figures.tracks > 2).sum())} of {len(figures.tracks)} points are seen by three photos or more."
     )
     return PageFigure("Seen from above", text, _png(draw, (11.0, 5.2)))
 
@@ -184,23 +184,6 @@ def _frame(axes: "Axes", at: FloatArray, places: FloatArray) -> None:
     axes.set_ylim(middle[1] + reach, middle[1] - reach)
 
 
-def _draw_tracks(figures: ModelFigures | None) -> PageFigure | None:
-    if figures is None or not len(figures.tracks):
-        return None
-    counts = np.bincount(np.minimum(figures.tracks, LONGEST_TRACK), minlength=LONGEST_TRACK + 1)[2:]
-
-    def draw(figure: "Figure") -> None:
-        axes = figure.add_subplot()
-        names = [str(k) for k in range(2, LONGEST_TRACK)] + [f"{LONGEST_TRACK}+"]
-        axes.bar(names, counts, color="#0f766e")
-        axes.set(xlabel="photos that see a point", ylabel="points")
-        axes.spines[["top", "right"]].set_visible(False)
-
-    sure = int(counts[1:].sum())
-    text = f"{sure} of {int(counts.sum())} points have three or more observations, which confirm each other."
-    return PageFigure("Observations per point", text, _png(draw, (6.4, 2.8)))
-
-
 def _png(draw: Callable[["Figure"], None], size: tuple[float, float]) -> str:
     """Return a figure of this size in inches as a data address."""
     from matplotlib import rc_context
@@ -238,23 +221,13 @@ class DepthPicture:
     """Width and height in pixels, so that the layout is stable while it loads."""
 
 
-@dataclass(frozen=True, slots=True)
-class DepthPictures:
-    """Some photos with their depth maps."""
-
-    pictures: Sequence[DepthPicture]
-    count: int
-    """Photos, or views of wide photos, with a depth map."""
-
-
-def depth_pictures(contents: RunContents) -> DepthPictures | None:
-    """Return some photos beside their depth maps; None without depth maps."""
+def depth_pictures(contents: RunContents) -> list[DepthPicture]:
+    """Return some photos beside their depth maps."""
     coverage: Mapping[str, float] = contents.counts("depth_maps").get("coverage", {})
     dense = contents.run.workspace.dense
     chosen = spread_names(sorted(coverage), MOST_SHOWN)
     drawn = contents.run.map(lambda name: _draw(dense, name, coverage[name]), chosen, "depth maps of the report")
-    pictures = [picture for picture in drawn if picture is not None]
-    return DepthPictures(pictures, len(coverage)) if pictures else None
+    return [picture for picture in drawn if picture is not None]
 
 
 def spread_names(names: Sequence[str], most: int) -> list[str]:

@@ -6,7 +6,7 @@ import os
 import re
 import shlex
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from http import HTTPStatus
@@ -17,7 +17,6 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.errors import ConfigError
 from sfm_app.numerical import Json
@@ -32,35 +31,22 @@ from sfm_app.types import Model, Surface
 # Points in levels, from a coarse sample of the whole scene to all points.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PointLevels:
-    """Points in an order in which each prefix is spread over the scene."""
-
-    places: NDArray[np.float32]
-    """(N, 3)"""
-    colors: NDArray[np.uint8]
-    """(N, 3) sRGB"""
-    cuts: Sequence[int]
-    """Start of each level, and end of the last one."""
-
-    @property
-    def counts(self) -> list[int]:
-        """Points of each level."""
-        return [end - start for start, end in zip(self.cuts[:-1], self.cuts[1:], strict=True)]
-
-    def pack(self, level: int) -> bytes:
-        """Return a level as bytes: x, y, z of all its points as little-endian floats, then their colors."""
-        part = slice(self.cuts[level], self.cuts[level + 1])
-        return self.places[part].astype("<f4").tobytes() + self.colors[part].tobytes()
+POINT_BYTES = 15
+"""Of a point in a level: x, y, z as little-endian floats, and three bytes of sRGB."""
 
 
-def point_levels(points: Surface, first: int = 20_000) -> PointLevels:
-    """Return colored points in levels, in an order drawn with a fixed seed; `first` points in the first level."""
+def point_levels(points: Surface, first: int = 20_000) -> list[bytes]:
+    """Return colored points in levels, in an order drawn with a fixed seed; `first` points in the first level.
+
+    Each level has twice the points of the one before: first all their places, then all their colors.
+    """
     order = np.random.default_rng(0).permutation(len(points.vertices))[:4_000_000]  # 60 MB
-    cuts = [0]
-    while cuts[-1] < len(order):
-        cuts.append(min(len(order), cuts[-1] + first * 2 ** (len(cuts) - 1)))
-    return PointLevels(points.vertices[order].astype(np.float32), points.colors[order], cuts)
+    cuts = [first * (2**level - 1) for level in range(1, 30) if first * (2**level - 1) < len(order)]
+    return [
+        points.vertices[part].astype("<f4").tobytes() + points.colors[part].tobytes()
+        for part in np.split(order, cuts)
+        if len(part)
+    ]
 
 
 # Resources of the page. A request names a number, never a file, so it cannot reach files outside OUT.
@@ -103,9 +89,9 @@ class RunResources:
         return render_page(self.contents, LargeParts(pictures, self._view(), is_served=True)).encode("utf-8")
 
     @cached_property
-    def levels(self) -> PointLevels | None:
+    def levels(self) -> list[bytes]:
         """The points from coarse to fine."""
-        return point_levels(self.points.surface) if self.points is not None else None
+        return point_levels(self.points.surface) if self.points is not None else []
 
     @cached_property
     def light(self) -> bytes:
@@ -137,8 +123,7 @@ class RunResources:
 
     def _find_numbered(self, kind: str, number: int) -> Resource | None:
         if kind == "points":
-            levels = self.levels
-            return Resource(BYTES, levels.pack(number)) if levels and number < len(levels.counts) else None
+            return Resource(BYTES, self.levels[number]) if number < len(self.levels) else None
         if number >= len(self.names):
             return None
         side = SMALL_PX if kind == "pictures" else LARGE_PX
@@ -151,12 +136,12 @@ class RunResources:
 
     def _view(self) -> dict[str, Json] | None:
         """Return the data of the 3D view, with addresses instead of model and points."""
-        if self.points is None or self.levels is None:
+        if self.points is None:
             return None
         models = ["model.glb"] if model_file(self.contents) is not None else []
         large: dict[str, Json] = {
             "models": ["light.glb", *models] if self._is_large() else models,
-            "levels": self.levels.counts,
+            "levels": [len(level) // POINT_BYTES for level in self.levels],
             "photos": "photos",
             "out": shlex.quote(str(self.contents.run.workspace.root)),
         }

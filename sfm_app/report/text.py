@@ -9,7 +9,7 @@ from sfm_app.camera.models import calibration_from_model
 from sfm_app.frame.sighted_points import Distance
 from sfm_app.settings import HYPOTHESES
 from sfm_app.types import Calibration, CameraModel, Intrinsics, Scene
-from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE, GIVEN, KEPT, PERSPECTIVE
+from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE, GIVEN, KEPT
 from sfm_app.wording import format_length, list_names
 
 # A calibration in everyday words.
@@ -36,40 +36,6 @@ def field_text(camera: Calibration) -> str:
     return f"a fisheye that {field}" if camera.projection == FISHEYE and max(across, down) >= 90.0 else field
 
 
-def verdict(camera: Calibration) -> str:
-    """Return whether K is known; if not, why, and the source of the values."""
-    if camera.is_given:
-        return "Given: the user knows this camera."
-    if camera.identifiable:
-        return "Known: the photos agree on this camera."
-    source = SOURCES.get(camera.method, camera.method)
-    return f"Not known: these photos do not determine the camera: {camera.reason}. Its values are {source}."
-
-
-def focal_text(camera: Calibration) -> str:
-    """Return focal length and field of view."""
-    if camera.projection == EQUIRECTANGULAR:
-        return f"360-degree panoramas, {camera.width} x {camera.height} px."
-    focal = f"Focal length {camera.focal_px:.0f} px{_deviation(camera, 'fx')}"
-    tall = camera.K[0, 0] / camera.K[1, 1]
-    shape = (
-        "" if "aspect" in camera.held or abs(tall - 1) < 5e-4 else f"; its pixels are {tall:.3f} times as high as wide"
-    )
-    return f"{focal}: {'the camera ' if camera.projection == PERSPECTIVE else ''}{field_text(camera)}{shape}."
-
-
-def center_text(camera: Calibration) -> str:
-    """Return the optical center relative to the middle of the photo; empty for panoramas."""
-    if camera.projection == EQUIRECTANGULAR:
-        return ""
-    right, below = camera.K[0, 2] - camera.width / 2, camera.K[1, 2] - camera.height / 2
-    if max(abs(right), abs(below)) < 0.5:
-        return "Optical center in the middle of the photo."
-    across = f"{abs(right):.0f} px{_deviation(camera, 'cx')} {'right' if right > 0 else 'left'} of"
-    down = f"{abs(below):.0f} px{_deviation(camera, 'cy')} {'below' if below > 0 else 'above'}"
-    return f"Optical center {across} and {down} the middle of the photo."
-
-
 def lens_text(camera: Calibration) -> str:
     """Return the radial distortion; empty if there is none or the photos do not determine it."""
     if camera.radial == 0.0 or "k1" in camera.held:
@@ -86,11 +52,6 @@ def held_text(camera: Calibration) -> str:
     if not camera.held or not camera.identifiable:
         return ""
     return "Assumed, since the photos do not determine it: " + ", ".join(HELD.get(n, n) for n in camera.held) + "."
-
-
-def _deviation(camera: Calibration, name: str) -> str:
-    value = camera.spread.get(name, 0.0)
-    return f" +- {value:.0f}" if value >= 1.5 else f" +- {value:.1f}" if value > 0 else ""
 
 
 def duration_text(seconds: float) -> str:
@@ -125,15 +86,21 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
     many = len(intrinsics.cameras) > 1
     lines = []
     for name, camera in intrinsics.cameras.items():
-        lines.append(f"camera      {f'{name}: ' if many else ''}{_camera_text(camera)}")
+        first, *others = camera_texts(camera)
+        lines.append(f"camera      {f'{name}: ' if many else ''}{first}")
         photos = [photo for photo, of in intrinsics.camera_of.items() if of == name]
         if many and photos:
             lines.append(f"            took {list_names(photos, NAMES_SHOWN)}")
-        lines += [f"            {text}" for text in _property_texts(camera, intrinsics.photos)]
+        if camera.key_pairs:
+            named = [[intrinsics.photos.get(key, str(key)) for key in pair] for pair in camera.key_pairs[:3]]
+            others.append(f"best initial pairs of photos: {', '.join(' + '.join(pair) for pair in named)}")
+        lines += [f"            {text}" for text in others]
     return lines
 
 
-def _property_texts(camera: Calibration, photos: Mapping[int, str]) -> Iterator[str]:
+def camera_texts(camera: Calibration) -> Iterator[str]:
+    """Yield a calibration, one text per property: K first, then its source, field of view, lens and assumptions."""
+    yield _camera_text(camera)
     if not camera.identifiable:
         source = SOURCES.get(camera.method, camera.method)
         yield f"these photos do not determine it ({camera.reason}): {source}"
@@ -142,10 +109,6 @@ def _property_texts(camera: Calibration, photos: Mapping[int, str]) -> Iterator[
     if camera.projection != EQUIRECTANGULAR:
         yield field_text(camera)
     yield from filter(None, (lens_text(camera), held_text(camera)))
-    if camera.key_pairs:
-        named = [[photos.get(key, str(key)) for key in pair] for pair in camera.key_pairs[:3]]
-        best = ", ".join(f"{first} + {second}" for first, second in named)
-        yield f"best initial pairs of photos: {best}"
 
 
 def _camera_text(camera: Calibration) -> str:
@@ -208,6 +171,20 @@ def distance_text(distance: Distance) -> str:
     return f"{format_length(distance.value)} +- {format_length(distance.deviation)}"
 
 
+# A whole run.
+
+
+def result_lines(intrinsics: Intrinsics | None, scene: Scene | None, stages: Mapping[str, Any]) -> list[str]:
+    """Return cameras, scene and size as lines of text; `stages` are the records of the manifest."""
+    counts = {name: stage["counts"] for name, stage in stages.items()}
+    lines = intrinsics_lines(intrinsics) if intrinsics is not None else []
+    for stage in ("view_graph", "intrinsics"):
+        lines += [f"            {text}" for text in contradiction_lines(counts.get(stage, {}))]
+    if scene is not None:
+        lines += scene_lines(scene, counts.get("scene", {}))
+    return [*lines, *scale_lines(counts["scale"])] if "scale" in counts else lines
+
+
 # Summaries of a run's scene: lines of text, and plain values for --json.
 
 MAPPERS = {
@@ -241,13 +218,13 @@ def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
 
 def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
     """Yield the scene as lines of text; `counts` are figures of the stage."""
-    summary = scene_summary(scene, counts)
+    placed = len(scene.registered)
     yield (
-        f"scene       {summary['registered']} of {summary['of']} photos placed, {scene.points} points, "
-        f"mean reprojection error {summary['mean_reprojection_px']} px"
+        f"scene       {placed} of {placed + len(scene.unregistered)} photos placed, {scene.points} points, "
+        f"mean reprojection error {round(scene.mean_reprojection_px, 3)} px"
     )
-    yield from (f"            {text}" for text in _remark_lines(summary, counts))
-    named = {name for names in summary.get("other_models", ()) for name in names}
+    yield from (f"            {text}" for text in _remark_lines(counts))
+    named = {name for names in counts.get("other_models", ()) for name in names}
     for name, reason in scene.unregistered.items():
         if name not in named:
             yield f"            not placed: {name}: {reason}"
@@ -259,13 +236,13 @@ def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
     yield from (f"            {text}" for text in contradiction_lines(counts))
 
 
-def _remark_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]:
-    if summary.get("mapper") in MAPPERS:
-        yield from _mapping_lines(summary, counts)
-    for photos in summary.get("cut_apart", ()):
+def _remark_lines(counts: Mapping[str, Any]) -> Iterator[str]:
+    if counts.get("mapper") in MAPPERS:
+        yield from _mapping_lines(counts)
+    for photos in counts.get("cut_apart", ()):
         yield f"split, because more matches contradict the connection than support it: {photos}"
-    yield from _doubt_lines(summary)
-    for number, names in enumerate(summary.get("other_models", ()), start=1):
+    yield from _doubt_lines(counts)
+    for number, names in enumerate(counts.get("other_models", ()), start=1):
         yield f"another model of {len(names)} photos in other_models/{number}: {list_names(names, NAMES_SHOWN)}"
     explained, against = counts.get("explained_matches", 0), counts.get("contradicted_matches", 0)
     if against > 0.1 * (explained + against):
@@ -273,14 +250,14 @@ def _remark_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iter
             f"beware: {100 * against / (explained + against):.0f} % of the matches between these photos contradict "
             "the model; look for places that look alike"
         )
-    yield from _shutter_lines(summary.get("shutter", {}))
-    yield from _adjustment_warnings(summary.get("adjustment", {}))
-    yield from _orientation_lines(summary.get("orientation", {}))
+    yield from _shutter_lines(counts.get("shutter", {}))
+    yield from _adjustment_warnings(counts.get("adjustment", {}))
+    yield from _orientation_lines(counts.get("orientation", {}))
 
 
-def _mapping_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]:
+def _mapping_lines(counts: Mapping[str, Any]) -> Iterator[str]:
     because = f": {counts['mapper_reason']}" if counts.get("mapper_reason") else ""
-    yield f"mapped {MAPPERS[summary['mapper']]}{because}"
+    yield f"mapped {MAPPERS[counts['mapper']]}{because}"
     for joins in (one["dropped_joins"] for one in counts.get("parts", ()) if one["dropped_joins"]):
         yield f"rejected joins between parts, which other joins or matches contradict: {len(joins)}"
     for trial in counts.get("hypotheses", ()):
@@ -290,7 +267,7 @@ def _mapping_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Ite
             failed = f"it failed: {trial['failure']}" if trial["failure"] else "it is no better"
             result = gain if trial["accepted"] else failed
             yield f"tried {HYPOTHESES[trial['name']]}, because {trial['reason']}: {result}"
-    if dropped := sum(summary.get("pairs_dropped", {}).values()):
+    if dropped := sum(counts.get("pairs_dropped", {}).values()):
         yield f"rejected pairs of photos that contradict the others: {dropped}"
 
 
@@ -316,25 +293,25 @@ def _adjustment_warnings(adjustment: Mapping[str, Any]) -> Iterator[str]:
         yield f"beware: these photos do not determine camera {name}; it keeps its values from mapping"
 
 
-def _doubt_lines(summary: Mapping[str, Any]) -> Iterator[str]:
-    for join in summary.get("look_alikes", ()):
+def _doubt_lines(counts: Mapping[str, Any]) -> Iterator[str]:
+    for join in counts.get("look_alikes", ()):
         here, there = (list_names(names, NAMES_SHOWN) for names in join["between"])
         yield (
             f"look-alikes separated, {join['pairs']} pairs of photos: {here} | {there} "
             f"({100 * join['missing']:.0f} % of the expected overlap is missing)"
         )
-    for join in summary.get("perhaps_look_alikes", ()):
+    for join in counts.get("perhaps_look_alikes", ()):
         here, there = (list_names(names, NAMES_SHOWN) for names in join["between"])
         yield (
             f"beware: a loop, or look-alikes: {join['pairs']} pairs match {here} with {there}, "
             "but no photos between them confirm it"
         )
-    for names in summary.get("weakly_joined", ()):
+    for names in counts.get("weakly_joined", ()):
         yield (
             f"beware: few points determine the distance of {list_names(names, NAMES_SHOWN)} from the rest; "
             "take more photos between them"
         )
-    for before, after in summary.get("jumps", ()):
+    for before, after in counts.get("jumps", ()):
         yield f"beware: a jump between the consecutive photos {before} and {after}; in a video, a sign of look-alikes"
 
 

@@ -242,7 +242,7 @@ def test_model_files_stand_with_their_sizes_the_one_to_open_first(tmp_path):
     lines = [line.strip() for line in run_lines(run)]
     start = lines.index("mesh        7 triangles, texture 4096 x 2048 and 512 x 512 px, JPEG quality 90")
     assert lines[start + 1 : start + 3] == [f"{tmp_path}/model.glb  4 kB", f"{tmp_path}/model.ply  2.3 MB"]
-    assert lines[start - 2] == f"points and cameras: {tmp_path}/points.glb  20 bytes"
+    assert lines[start - 1] == f"points      {tmp_path}/points.glb  20 bytes"
     assert lines[-1] == "seconds     scale 60.0, mesh 60.0, files 60.0; total 180.0"
     scene, mesh = (run_summary(run)[part]["files"] for part in ("scene", "mesh"))
     assert scene == [f"{tmp_path}/points.glb"] and mesh == [f"{tmp_path}/model.glb", f"{tmp_path}/model.ply"]

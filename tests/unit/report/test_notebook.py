@@ -30,15 +30,16 @@ def shown(monkeypatch):
 
 def test_points_are_drawn_where_the_photo_in_the_middle_shows_them(shown):
     rng = np.random.default_rng(0)
-    picture = notebook.model_picture(shown(rng.uniform(-1, 1, (500, 3)) * [1, 0.5, 1] + [0, 1, 0]))
-    assert picture.shape == (480, 640, 3)
-    assert 200 < (picture[..., 0] < 100).sum() < 2100  # most of 500 squares of four pixels
-    rows, columns = np.nonzero(picture[..., 0] < 100)
+    picture = notebook.model_cutout(shown(rng.uniform(-1, 1, (500, 3)) * [1, 0.5, 1] + [0, 1, 0]))
+    assert picture.shape == (480, 640, 4)
+    rows, columns = np.nonzero(picture[..., 3])
+    assert 200 < len(rows) < 2100  # most of 500 squares of four pixels
+    assert (picture[rows, columns] == [40, 40, 40, 255]).all()
     assert 100 < rows.mean() < 380 and 200 < columns.mean() < 440
 
 
 def test_points_behind_the_camera_are_not_drawn(shown):
-    assert (notebook.model_picture(shown(np.array([[0.0, 1.0, 500.0]]))) == 255).all()
+    assert not notebook.model_cutout(shown(np.array([[0.0, 1.0, 500.0]]))).any()
 
 
 def test_text_in_the_table_is_escaped(shown):

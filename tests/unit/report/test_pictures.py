@@ -34,8 +34,8 @@ def contents(dense, **coverage):
 def test_a_photo_stands_beside_its_depths_and_small(dense):
     found = depth_pictures(contents(dense, **{"<b>.jpg": 0.833, "gone.jpg": 0.5}))
 
-    [picture] = found.pictures
-    assert found.count == 2 and picture.name == "<b>.jpg"
+    [picture] = found
+    assert picture.name == "<b>.jpg"
     assert picture.text == "83 % of it has a depth, from 2 (yellow) to 8 (violet)"
     data = np.frombuffer(base64.b64decode(picture.address.partition(",")[2]), np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB).astype(int)
@@ -48,8 +48,8 @@ def test_a_photo_stands_beside_its_depths_and_small(dense):
 
 
 def test_nothing_is_shown_before_there_are_depth_maps(dense):
-    assert depth_pictures(contents(dense)) is None
-    assert depth_pictures(contents(dense, **{"../images/<b>.jpg": 0.5})) is None
+    assert depth_pictures(contents(dense)) == []
+    assert depth_pictures(contents(dense, **{"../images/<b>.jpg": 0.5})) == []
 
 
 def test_colors_are_even_in_disparity_and_single_wrong_depths_do_not_matter():

@@ -22,6 +22,7 @@ from sfm_app.report.server import (
     JPEG,
     LARGE_PX,
     LOOPBACK,
+    POINT_BYTES,
     SMALL_PX,
     RunResources,
     open_server,
@@ -55,15 +56,16 @@ def surface(count):
     return Surface(places, np.zeros((0, 3), np.int64), colors)
 
 
-def unpack(data, count):
+def unpack(data):
+    count = len(data) // POINT_BYTES
     return np.frombuffer(data, "<f4", 3 * count).reshape(-1, 3), np.frombuffer(data, np.uint8, offset=12 * count)
 
 
 def test_levels_have_every_point_once_with_its_color():
     found = point_levels(surface(150), first=20)
 
-    assert found.counts == [20, 40, 80, 10]
-    parts = [unpack(found.pack(level), count) for level, count in enumerate(found.counts)]
+    assert [len(level) // POINT_BYTES for level in found] == [20, 40, 80, 10]
+    parts = [unpack(level) for level in found]
     x = np.concatenate([places[:, 0] for places, _ in parts])
     colors = np.concatenate([colors.reshape(-1, 3) for _, colors in parts])
     np.testing.assert_array_equal(np.sort(x), np.arange(150))
@@ -73,12 +75,12 @@ def test_levels_have_every_point_once_with_its_color():
 
 def test_the_first_level_is_spread_over_the_scene():
     found = point_levels(surface(100_000))
-    x = unpack(found.pack(0), found.counts[0])[0][:, 0]
+    x = unpack(found[0])[0][:, 0]
     assert abs(x.mean() / 100_000 - 0.5) < 0.02 and x.min() < 100 and x.max() > 99_900
 
 
 def test_no_points_are_no_levels():
-    assert point_levels(surface(0)).counts == []
+    assert point_levels(surface(0)) == []
 
 
 def test_the_page_its_model_and_its_points_have_addresses(resources):
