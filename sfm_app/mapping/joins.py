@@ -10,7 +10,7 @@ from sfm_app.colmap.joined_model import PlacedPhotos
 from sfm_app.geometry.poses import Similarity, robust_similarity
 from sfm_app.numerical import FAILURES
 from sfm_app.posegraph.pair_pose import is_in_front, pose_distances
-from sfm_app.posegraph.rotations import DisjointGroups, average_rotations, connected_groups
+from sfm_app.posegraph.rotations import average_rotations, connected_groups, partners_of
 from sfm_app.types import MatchGraph, PairId, ViewGraph
 from sfm_app.types.arrays import FloatArray, IndexArray
 
@@ -208,10 +208,7 @@ class AcrossJoins:
 
     def __init__(self, matches: MatchGraph, views: ViewGraph, max_error_px: float) -> None:
         self.matches, self.views, self.max_error_px = matches, views, max_error_px
-        self.partners: dict[int, list[int]] = {}
-        for a, b in views.fits:
-            self.partners.setdefault(a, []).append(b)
-            self.partners.setdefault(b, []).append(a)
+        self.partners = partners_of(views.fits)
 
     def count(self, join: Join, fragments: Sequence[Fragment]) -> tuple[int, int]:
         """Return how many matches a join explains, and how many inliers it contradicts, without shared photos."""
@@ -239,9 +236,8 @@ class AcrossJoins:
         alone = there - here
         ranked = [
             (-self.views.fits[min(i, j), max(i, j)].inlier_count, i, j)
-            for i in sorted(here - there)
-            for j in self.partners.get(i, ())
-            if j in alone
+            for i in here - there
+            for j in alone.intersection(self.partners.get(i, ()))
         ]
         return [(i, j) for _, i, j in sorted(ranked)[: OPTIONS.max_checked]]
 
@@ -353,38 +349,6 @@ def _robust_potentials(
         errors = np.linalg.norm(A @ values - steps, axis=1) / sizes
         weights = strengths / np.maximum(errors, OPTIONS.min_error)
     return values
-
-
-def loop_errors(fragments: Sequence[Fragment], joins: Sequence[Join]) -> list[tuple[tuple[int, ...], JoinError]]:
-    """Return the error around each loop that a join closes with the tree of the strongest, and its fragments."""
-    groups, neighbors = DisjointGroups(range(len(fragments))), dict[int, list[tuple[int, Similarity]]]()
-    radii = [fragment.radius for fragment in fragments]
-    loops, closing = [], []
-    for join in sorted(joins, key=lambda join: (-join.weight, join.first, join.second)):
-        if groups.join(join.first, join.second):
-            neighbors.setdefault(join.first, []).append((join.second, join.similarity))
-            neighbors.setdefault(join.second, []).append((join.first, join.similarity.inverse()))
-        else:
-            closing.append(join)
-    for join in closing:
-        path, similarity = _path(neighbors, join.first, join.second)
-        loops.append((path, difference(join, similarity, radii)))
-    return loops
-
-
-def _path(
-    neighbors: Mapping[int, Sequence[tuple[int, Similarity]]], start: int, end: int
-) -> tuple[tuple[int, ...], Similarity]:
-    """Return the fragments on the path along the tree, and the similarity from the frame of its end to its start."""
-    waiting: list[tuple[tuple[int, ...], Similarity]] = [((start,), Similarity(1.0, np.eye(3), np.zeros(3)))]
-    while waiting:
-        path, so_far = waiting.pop()
-        if path[-1] == end:
-            return path, so_far
-        waiting += [
-            ((*path, other), so_far.compose(step)) for other, step in neighbors[path[-1]] if other not in path[-2:-1]
-        ]
-    raise ValueError("no joins lead from one fragment to the other")
 
 
 def merge_fragments(fragments: Sequence[Fragment], frames: Mapping[int, Similarity]) -> PlacedPhotos:

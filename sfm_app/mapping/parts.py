@@ -29,7 +29,6 @@ from sfm_app.mapping.joins import (
     JoinError,
     align_fragments,
     find_join,
-    loop_errors,
     merge_fragments,
 )
 from sfm_app.mapping.part_mapping import FOLDER, Part, PartResult, cut_group, map_parts
@@ -180,7 +179,6 @@ def _merge(group: Group, joined: JoinedParts, run: RunContext) -> list[MappingRe
 def part_figures(group: Group, joined: JoinedParts, attempts: Sequence[MappingResult]) -> dict[str, Json]:
     """Return the figures of the manifest about the parts of a group."""
     aligned = joined.alignment
-    loops = loop_errors(joined.fragments, [join for join, _ in (*aligned.kept, *aligned.dropped)])
     return {
         "parts": [
             {
@@ -198,7 +196,6 @@ def part_figures(group: Group, joined: JoinedParts, attempts: Sequence[MappingRe
             *(_join_entry(join, joined, off) | {"because": "contradicts other joins"} for join, off in aligned.dropped),
             *(_join_entry(join, joined) | {"because": "matches contradict it"} for join in joined.refused),
         ],
-        "loops": [{"through": [joined.fragments[k].part for k in path]} | _error_entry(error) for path, error in loops],
         "left_out": [joined.fragments[k].part for k in range(len(joined.fragments)) if k not in aligned.frames],
         "models": [one.note for one in attempts if isinstance(one, Attempt)],
     }
@@ -215,8 +212,7 @@ def _join_entry(join: Join, joined: JoinedParts, error: JoinError | None = None)
         "explained": join.explained,
         "contradicted": join.contradicted,
     }
-    return entry if error is None else entry | _error_entry(error)
-
-
-def _error_entry(error: JoinError) -> dict[str, Json]:
-    return {"off_deg": round(error.off_deg, 3), "off_scale": round(error.scale, 4), "off_shift": round(error.shift, 4)}
+    if error is None:
+        return entry
+    off = {"off_deg": round(error.off_deg, 3), "off_scale": round(error.scale, 4), "off_shift": round(error.shift, 4)}
+    return entry | off

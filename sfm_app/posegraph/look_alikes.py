@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from sfm_app.camera.bearings import bearings, depths_along, project
 from sfm_app.geometry.epipolar import FIRST, SECOND, depths
-from sfm_app.posegraph.rotations import DisjointGroups, average_rotations
+from sfm_app.posegraph.rotations import DisjointGroups, average_rotations, partners_of
 from sfm_app.types import Calibration, LookAlikes, MatchGraph, PairId, RelativePose
 from sfm_app.types.arrays import FloatArray, IndexArray
 
@@ -133,10 +133,7 @@ def backbone(covered: Mapping[PairId, float]) -> set[PairId]:
     Groups of photos grow along the best pairs. When two of them join, the pair that joins them is the weakest one on
     the path between any photo of the one and any of the other.
     """
-    partners: dict[int, list[int]] = {photo: [] for pair in covered for photo in pair}
-    for a, b in covered:
-        partners[a].append(b)
-        partners[b].append(a)
+    partners = partners_of(covered)
     groups, chosen = DisjointGroups(partners), set()
     for a, b in sorted(covered, key=lambda pair: (-covered[pair], pair)):
         joining = groups.join(a, b)
@@ -344,7 +341,7 @@ def find_look_alikes(
     along = {pair: poses[pair] for pair in sorted(trusted)}
     weights = {pair: float(pose.inlier_count) for pair, pose in along.items()}
     rotations, _ = average_rotations({pair: pose.R for pair, pose in along.items()}, weights)
-    partners = _partners(trusted)
+    partners = partners_of(trusted)
     judged = [_judge_join(join, partners, rotations, places) for join in group_doubted_pairs(doubted, trusted)]
     joins = [join for join, verdict in judged if verdict == ALIKE]
     doubtful = tuple(join for join, verdict in judged if verdict == EITHER)
@@ -375,7 +372,7 @@ def _build_tracks(visibility: Visibility, pairs: Iterable[PairId]) -> FeatureTra
 
 def group_doubted_pairs(doubted: Iterable[PairId], trusted: Iterable[PairId]) -> list[tuple[PairId, ...]]:
     """Group doubted pairs that join the same two places: their photos are the same or joined by a trusted pair."""
-    neighbors = _partners(trusted)
+    neighbors = partners_of(trusted)
     waiting, groups = dict.fromkeys(sorted(doubted)), []
     while waiting:
         join = [next(iter(waiting))]
@@ -410,18 +407,10 @@ def _is_confirmed(same: int, tracked: int) -> bool:
     return tracked > 0 and same >= OPTIONS.confirmed_share * tracked
 
 
-def _partners(pairs: Iterable[PairId]) -> dict[int, set[int]]:
-    partners: dict[int, set[int]] = {}
-    for a, b in pairs:
-        partners.setdefault(a, set()).add(b)
-        partners.setdefault(b, set()).add(a)
-    return partners
-
-
 def _judge_join(
     join: tuple[PairId, ...], partners: Mapping[int, set[int]], rotations: Mapping[int, FloatArray], places: Depths
 ) -> tuple[LookAlikes, str]:
-    claimed = _partners(join)
+    claimed = partners_of(join)
     counts = [
         count_missing_cells(photo, claimed[photo], partners[photo], places)
         for photo in sorted(claimed)

@@ -10,7 +10,7 @@ from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.joined_model import PlacedPhotos, adjust_joined, read_placed, write_placed
 from sfm_app.colmap.model import poses_and_points
 from sfm_app.geometry.poses import Similarity, umeyama
-from sfm_app.mapping.joins import AcrossJoins, Fragment, Join, align_fragments, find_join, loop_errors, merge_fragments
+from sfm_app.mapping.joins import AcrossJoins, Fragment, Join, align_fragments, find_join, merge_fragments
 
 
 def difference_of(found, true):
@@ -138,17 +138,6 @@ def test_a_street_folded_onto_another_is_found_by_its_loop(ring):
     found = align_fragments(fragments, [*plain, chord])
     assert [join for join, _ in found.dropped] == [chord]
     assert len(found.frames) == COUNT and off(found.frames, true)[0] < 2.0
-
-
-def test_errors_around_loops_name_the_loop(ring):
-    fragments, _, joins = ring
-    plain = [join for join in joins if (join.second - join.first) in (1, COUNT - 1)]
-    ((way, error),) = loop_errors(fragments, plain)
-    assert sorted(way) == list(range(COUNT))
-    assert 0.0 < error.off_deg < 3.0 and abs(error.scale) < 0.1 and 0.0 < error.shift < 0.5
-    wrong = replace(plain[0], similarity=WRONG["scale"](plain[0].similarity), photos=1, explained=0)
-    ((_, error),) = loop_errors(fragments, [wrong, *plain[1:]])
-    assert error.scale == pytest.approx(np.log(1.6), abs=0.1)
 
 
 def test_what_no_join_connects_has_no_frame(ring):
