@@ -362,7 +362,7 @@ def _normal_equations(matches: Matches, state: State) -> tuple[FloatArray, Float
 
 def _reduce_to_cameras(system: tuple[FloatArray, FloatArray]) -> Information:
     """Return the information of the pairs about their cameras, and the gains g = b' H^-1 b / 2 (see `_weigh_pairs`)."""
-    H, b, _, _ = _eliminate_poses(*system, 0.0)
+    H, b, _, _ = eliminate_poses(*system, 0.0)
     own = np.diag(np.tile(np.array(ADJUSTMENT.own_camera_sigmas) ** -2.0, 2))
     gains = 0.5 * np.einsum("pi,pi->p", b, solve_each(H + own, b[..., None])[..., 0])
     return Information(H, b, gains)
@@ -383,16 +383,16 @@ def _weigh_pairs(state: State, system: tuple[FloatArray, FloatArray]) -> State:
     return replace(state, weights=(1.0 + gains / (ADJUSTMENT.quarter_weight_gain * scale)) ** -2, scale=scale)
 
 
-def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> tuple[FloatArray, ...]:
-    """Eliminate the poses from the systems of all pairs (`pair_systems`) by the Schur complement::
+def eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> tuple[FloatArray, ...]:
+    """Eliminate the poses, the last unknowns, from the systems of all pairs (`pair_systems`) by the Schur complement::
 
         A = | U   W |     (U - W V^-1 W') d_cameras = b_cameras - W V^-1 b_pose
             | W'  V |
 
-    The damping of V is relative to its diagonal. Return the reduced Hessians (P, 10, 10) and gradients (P, 10), and
-    for back substitution V^-1 W' (P, 5, 10) and V^-1 b_pose (P, 5).
+    The damping of V is relative to its diagonal. Return the reduced Hessians (P, n, n) and gradients (P, n) of the n
+    parameters of cameras, and for back substitution V^-1 W' (P, 5, n) and V^-1 b_pose (P, 5).
     """
-    n = 2 * CAMERA
+    n = b.shape[1] - POSE_DOF
     V = A[:, n:, n:].copy()
     diagonal = np.arange(V.shape[-1])
     # few or degenerate matches leave a pose undetermined: the damping must not vanish beside the largest entry
@@ -413,7 +413,7 @@ def _take_step(
 
     def attempt(damping: float) -> State | None:
         # cameras from all pairs and the prior, then each pose from its pair
-        hessians, gradients, pose_by_cameras, pose_alone = _eliminate_poses(*system, damping)
+        hessians, gradients, pose_by_cameras, pose_alone = eliminate_poses(*system, damping)
         H, g = matches.assemble(Information(hessians, gradients, np.empty(0)), factors)
         H += np.diag(prior.precision.ravel())
         g += (prior.precision * (prior.mean - state.thetas)).ravel()
