@@ -26,7 +26,6 @@ from sfm_app.mapping.joins import (
     Alignment,
     Fragment,
     Join,
-    JoinError,
     align_fragments,
     find_join,
     merge_fragments,
@@ -191,9 +190,9 @@ def part_figures(group: Group, joined: JoinedParts, attempts: Sequence[MappingRe
             }
             for number, (part, result) in enumerate(zip(joined.parts, joined.results, strict=True))
         ],
-        "joins": [_join_entry(join, joined, off) for join, off in aligned.kept],
+        "joins": [_join_entry(join, joined) for join in aligned.kept],
         "dropped_joins": [
-            *(_join_entry(join, joined, off) | {"because": "contradicts other joins"} for join, off in aligned.dropped),
+            *(_join_entry(join, joined) | {"because": "contradicts other joins"} for join in aligned.dropped),
             *(_join_entry(join, joined) | {"because": "matches contradict it"} for join in joined.refused),
         ],
         "left_out": [joined.fragments[k].part for k in range(len(joined.fragments)) if k not in aligned.frames],
@@ -201,18 +200,12 @@ def part_figures(group: Group, joined: JoinedParts, attempts: Sequence[MappingRe
     }
 
 
-def _join_entry(join: Join, joined: JoinedParts, error: JoinError | None = None) -> dict[str, Json]:
-    entry: dict[str, Json] = {
+def _join_entry(join: Join, joined: JoinedParts) -> dict[str, Json]:
+    return {
         "between": [joined.fragments[join.first].part, joined.fragments[join.second].part],
         "photos": join.photos,
         "shared": join.shared,
         "points": join.points,
-        "deviation_deg": round(join.off_deg, 3),
-        "deviation": round(join.off, 4),
         "explained": join.explained,
         "contradicted": join.contradicted,
     }
-    if error is None:
-        return entry
-    off = {"off_deg": round(error.off_deg, 3), "off_scale": round(error.scale, 4), "off_shift": round(error.shift, 4)}
-    return entry | off

@@ -361,6 +361,11 @@ def is_in_front(used: FloatArray, R: FloatArray, t: FloatArray) -> NDArray[np.bo
     return (first > 0) & (second > 0)
 
 
+def explained_mask(lines: FloatArray, R: FloatArray, t: FloatArray, max_error_px: float) -> NDArray[np.bool_]:
+    """Return a mask (N,) of the matches (N, 18) that lie on their epipolar lines, in front of both cameras."""
+    return (pose_distances(lines, R, t) <= max_error_px) & is_in_front(lines, R, t)
+
+
 def ray_angles_deg(used: FloatArray, R: FloatArray) -> FloatArray:
     """Return (N,) degrees between the two rays of each match (N, 18): the triangulation angles if t fits."""
     h1, h2 = used[:, FIRST] @ R.T, used[:, SECOND]
