@@ -15,7 +15,7 @@ tracks and paths of photos are connected. Both are needed: a wide baseline misse
 tracks.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -346,8 +346,8 @@ def find_look_alikes(
     joins = [join for join, verdict in judged if verdict == ALIKE]
     doubtful = tuple(join for join, verdict in judged if verdict == EITHER)
     others = poses.keys() - best - {pair for join in joins for pair in join.pairs}
-    weak = sorted(pair for pair in others if tracks.is_contradicted_by(pair, rows_of[pair], OPTIONS.min_tracked_nearby))
-    complete = tuple(_add_weak_pairs(join, weak, trusted) for join in joins)
+    weak = {pair for pair in others if tracks.is_contradicted_by(pair, rows_of[pair], OPTIONS.min_tracked_nearby)}
+    complete = tuple(_add_weak_pairs(join, weak, partners) for join in joins)
     return LookAlikeVerdict(complete, doubtful, tracks)
 
 
@@ -377,30 +377,27 @@ def group_doubted_pairs(doubted: Iterable[PairId], trusted: Iterable[PairId]) ->
     while waiting:
         join = [next(iter(waiting))]
         del waiting[join[0]]
-        for a, b in join:
-            ends = ((c, d) for c in sorted({a, *neighbors.get(a, ())}) for d in sorted({b, *neighbors.get(b, ())}))
-            adjacent = [pair for c, d in ends if (pair := (min(c, d), max(c, d))) in waiting]
+        for known in join:
+            adjacent = _pairs_beside(known, neighbors, waiting)
             for pair in adjacent:
-                waiting.pop(pair, None)
-            join += dict.fromkeys(adjacent)
+                del waiting[pair]
+            join += adjacent
         groups.append(tuple(sorted(join)))
     return groups
 
 
-def _add_weak_pairs(join: LookAlikes, weak: list[PairId], trusted: Iterable[PairId]) -> LookAlikes:
-    """Move the weak pairs between the two places of a join from the list into the join."""
-    close = {frozenset(pair) for pair in trusted}
-    also = [pair for pair in weak if any(_has_same_ends(pair, other, close) for other in join.pairs)]
-    weak[:] = [pair for pair in weak if pair not in also]
+def _pairs_beside(known: PairId, neighbors: Mapping[int, set[int]], among: Collection[PairId]) -> list[PairId]:
+    """Return those `among` pairs that join the same two places as a known one."""
+    first, second = ({photo, *neighbors.get(photo, ())} for photo in known)
+    ends = ((min(a, b), max(a, b)) for a in sorted(first) for b in sorted(second))
+    return list(dict.fromkeys(pair for pair in ends if pair in among))
+
+
+def _add_weak_pairs(join: LookAlikes, weak: set[PairId], partners: Mapping[int, set[int]]) -> LookAlikes:
+    """Move the weak pairs between the two places of a join from the set into the join."""
+    also = {pair for known in join.pairs for pair in _pairs_beside(known, partners, weak)}
+    weak -= also
     return replace(join, pairs=tuple(sorted((*join.pairs, *also))))
-
-
-def _has_same_ends(pair: PairId, other: PairId, close: set[frozenset[int]]) -> bool:
-    def is_same_place(a: int, b: int) -> bool:
-        return a == b or frozenset((a, b)) in close
-
-    (a, b), (c, d) = pair, other
-    return (is_same_place(a, c) and is_same_place(b, d)) or (is_same_place(a, d) and is_same_place(b, c))
 
 
 def _is_confirmed(same: int, tracked: int) -> bool:
