@@ -164,8 +164,10 @@ class Consensus:
             theta[places] = free
             return -_value(self._packed, self.weights, self.center_sigma, theta, sigma)
 
-        options = {"initial_simplex": simplex[:, places], "xatol": 1e-5, "fatol": 1e-6, "maxiter": 300}
-        end = minimize(cost, simplex[0, places], method="Nelder-Mead", options=options)
+        end = minimize(
+            cost, simplex[0, places], method="Nelder-Mead",
+            options={"initial_simplex": simplex[:, places], "xatol": 1e-5, "fatol": 1e-6, "maxiter": 300},
+        )  # fmt: skip
         theta[places] = end.x
         return theta, -float(end.fun)
 

@@ -16,9 +16,17 @@ from numpy.typing import NDArray
 
 from sfm_app.camera import projection as families
 from sfm_app.camera.projection import RAY, Fisheye, image_rays
-from sfm_app.geometry.epipolar import FIRST, SECOND, decompose_essential, fit_rays, signed_distances, squared_distances
+from sfm_app.geometry.epipolar import (
+    FIRST,
+    SECOND,
+    cross_matrix,
+    decompose_essential,
+    fit_rays,
+    signed_distances,
+    squared_distances,
+)
 from sfm_app.geometry.least_squares import damped_step, inverse_of_positive, solve_each
-from sfm_app.geometry.poses import POSE_DOF, retract, write_essential
+from sfm_app.geometry.poses import POSE_DOF, retract, write_nearby_essentials
 from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.selfcal.adjustment import DAMPING, ROBUST_SCALE, eliminate_poses
 from sfm_app.types.arrays import FloatArray, IndexArray
@@ -285,11 +293,13 @@ def _normal_equations(matches: Sequence[FloatArray], state: State, sigma: float)
 
 
 def _pair_system(x: FloatArray, lenses: list[Lens], pose: FloatArray, sigma: float) -> System:
-    (lens, *steps), E = lenses, _essential(pose)
+    Es = np.empty((1 + POSE_DOF, 3, 3))
+    write_nearby_essentials(pose, STEP, Es)
+    (lens, *steps), (E, *turned) = lenses, Es
     pair = bearings_through(lens, x)
     r = signed_distances(E, pair)
     by_lens = [signed_distances(E, bearings_through(other, x)) - r for other in steps]
-    by_pose = [signed_distances(_essential(retract(pose, STEP * axis)), pair) - r for axis in np.eye(POSE_DOF)]
+    by_pose = [signed_distances(other, pair) - r for other in turned]
     J, r = np.column_stack(by_lens + by_pose) / (STEP * sigma), r / sigma
     weights = (1.0 + (r / ROBUST_SCALE) ** 2) ** -2
     return (J * weights[:, None]).T @ J, -J.T @ (weights * r)
@@ -309,14 +319,8 @@ def pair_costs(matches: Sequence[FloatArray], state: State, sigma: float) -> Flo
 
 def _distances(matches: Sequence[FloatArray], state: State) -> list[FloatArray]:
     lens = state.lens
-    pairs = zip(matches, state.poses, strict=True)
-    return [signed_distances(_essential(pose), bearings_through(lens, x)) for x, pose in pairs]
-
-
-def _essential(pose: FloatArray) -> FloatArray:
-    E = np.empty((3, 3))
-    write_essential(pose, E)
-    return E
+    Es = [cross_matrix(pose[9:]) @ pose[:9].reshape(3, 3) for pose in state.poses]
+    return [signed_distances(E, bearings_through(lens, x)) for E, x in zip(Es, matches, strict=True)]
 
 
 @dataclass(frozen=True, slots=True)
